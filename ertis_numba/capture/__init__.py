@@ -1,4 +1,4 @@
-"""From sensors to the journal: what a capture does between the driver and the file."""
+"""Capture of measurements from sensors into a journal."""
 
 from ertis_numba.capture.session import CaptureCounts, Session
 

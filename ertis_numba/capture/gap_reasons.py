@@ -11,7 +11,8 @@ DROPPED: Final = "the sensor dropped it, as its buffer was not read in time"
 DISK_BUSY: Final = "the sensor dropped it, as a busy disk delayed reading"
 NOT_TRIGGERED: Final = "the sensor was not triggered"
 
-_MIN_BUSY_S = 0.05  # a sensor's buffer holds a block or two, so it runs over after about one interval between pulses
+# A sensor's buffer holds one or two blocks, so it overflows after about one interval between pulses.
+_MIN_BUSY_S = 0.05
 
 
 def gap_reason(event: Arrived) -> str:

@@ -1,4 +1,4 @@
-"""Threads that take blocks from sensors: one for each, so that none waits for another or for the disk."""
+"""Reader threads, one per sensor, so that no sensor waits for another or for the disk."""
 
 import math
 import queue
@@ -25,21 +25,21 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class Arrived:
-    """A measurement is here.
+    """A received measurement.
 
     Attributes
     ----------
     sensor : str
     block : Block
     count : int
-        Number of the measurement among those of this sensor: of the commands that it was given, or else what it has
-        counted itself, from 0 and without end.
+        Number of the measurement among those of this sensor: the number of the command, or else the sensor's own
+        counter, without wrap-around.
     tick : int or None
-        Of the command, which all sensors share; None where SYNC pulses trigger.
+        Number of the command, which all sensors share; None with SYNC pulses.
     skipped : int
         Numbers that the sensor counted since the previous block, but whose blocks did not arrive.
     damaged : bool
-        Whether blocks were rejected since the one before.
+        True if blocks were rejected since the previous one.
     waited_s : float
         Time since the previous block in which the reader waited for the disk.
     """
@@ -55,21 +55,21 @@ class Arrived:
 
 @dataclass(frozen=True, slots=True)
 class MeasurementFailed:
-    """A measurement that was asked for did not come."""
+    """A commanded measurement that did not arrive."""
 
     sensor: str
     count: int
     tick: int
     reason: str
-    """For the recording: short."""
+    """Short reason for the recording."""
 
     text: str
-    """For whoever watches."""
+    """Full reason for users."""
 
 
 @dataclass(frozen=True, slots=True)
 class Note:
-    """Something that whoever watches should know."""
+    """Note for users."""
 
     sensor: str
     text: str
@@ -77,14 +77,14 @@ class Note:
 
 @dataclass(frozen=True, slots=True)
 class Restarted:
-    """A sensor's counter has begun anew, as after a power cut that nobody has noticed."""
+    """A sensor's counter has restarted, for example after an unnoticed power cut."""
 
     sensor: str
 
 
 @dataclass(frozen=True, slots=True)
 class Returned:
-    """A sensor was unplugged and is back."""
+    """A sensor was unplugged and is connected again."""
 
     sensor: str
     away_s: float
@@ -92,7 +92,7 @@ class Returned:
 
 @dataclass(frozen=True, slots=True)
 class SensorEnded:
-    """A sensor gives no more."""
+    """A sensor that delivers no more measurements."""
 
     sensor: str
     error: Exception | None
@@ -103,15 +103,15 @@ Event = Arrived | MeasurementFailed | Note | Restarted | Returned | SensorEnded
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TriggerClock:
-    """When commands are given: ticks that all sensors share.
+    """Times of commands: ticks that all sensors share.
 
     Attributes
     ----------
     start_s : float
-        Of the first, by `time.monotonic`.
+        Time of the first tick, by `time.monotonic`.
     rate_hz : float
     n : int, optional
-        Measurements that each sensor is to give.
+        Number of measurements of each sensor.
     """
 
     start_s: float
@@ -120,21 +120,21 @@ class TriggerClock:
 
 
 class SensorReader(threading.Thread):
-    """Takes the blocks of one sensor, and survives that it is unplugged.
+    """Thread that receives the blocks of one sensor, and reconnects after it was unplugged.
 
-    Nothing else may use the sensor while this runs.
+    Nothing else may use the sensor meanwhile.
 
     Parameters
     ----------
     sensor : str
-    sonar : Sonar
-        Configured, and armed if pulses trigger it.
-    pace : Pace, optional
-        Of commands; SYNC pulses trigger where there is none.
+    sonar : SonarDriver
+        Configured driver, armed if pulses trigger it.
+    pace : TriggerClock, optional
+        Times of commands; None with SYNC pulses.
     patience_s : float
-        How long a sensor may be silent or away.
+        Timeout for a silent or unplugged sensor.
     events : queue.Queue
-        Where everything goes; while it is full the sensor waits.
+        Queue of all events; while it is full, the sensor waits.
     """
 
     def __init__(
@@ -151,22 +151,22 @@ class SensorReader(threading.Thread):
         self._patience_s, self._events = patience_s, events
         self._stop_asked = threading.Event()
         self._abandoned = threading.Event()
-        self._counter: int | None = None  # of the latest block
+        self._counter: int | None = None  # Counter of the latest block.
         self._count = 0
         self._rejected = 0
-        self._waited_s = 0.0  # for room in the queue, since the latest block
+        self._waited_s = 0.0  # Time spent waiting for room in the queue since the latest block.
 
     def stop(self) -> None:
-        """Take the measurement that has begun, and no more."""
+        """Stop after the current measurement."""
         self._stop_asked.set()
 
     def abandon(self) -> None:
-        """Stop, and let go of what cannot be handed over: nobody takes it any more."""
+        """Stop, and discard undelivered events, which no thread reads any more."""
         self._stop_asked.set()
         self._abandoned.set()
 
     def run(self) -> None:
-        """Take blocks until asked to stop, or until the sensor has gone for good."""
+        """Receive blocks until stopped, or until the sensor has failed permanently."""
         error: Exception | None = None
         try:
             if self._pace is None:
@@ -201,7 +201,7 @@ class SensorReader(threading.Thread):
                 return
 
     def _may_stop(self) -> bool:
-        """Whether to stop listening: not within a measurement, of which the rest comes or whose deadline passes."""
+        """Return True if listening may stop: not within a measurement that still arrives or whose deadline passes."""
         return self._abandoned.is_set() or (self._stop_asked.is_set() and not self._sonar.receiver.missing)
 
     def _command(self, pace: TriggerClock) -> None:
@@ -229,7 +229,7 @@ class SensorReader(threading.Thread):
             tick = max(tick + 1, late)
 
     def _count_on(self, block: Block) -> int:
-        """Follow the sensor's own count, and return how many numbers it skipped."""
+        """Extend the sensor's own counter, and return the number of skipped counts."""
         step = 1
         if self._counter is not None:
             step = (block.counter - self._counter) % COUNTERS

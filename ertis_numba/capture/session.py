@@ -1,4 +1,4 @@
-"""A capture: sensors in, durable measurements out."""
+"""Capture session: receives measurements from sensors and stores them durably."""
 
 import queue
 import secrets
@@ -31,14 +31,14 @@ from ertis_numba.settings import Settings
 
 __all__ = ["CaptureCounts", "Session", "Sink"]
 
-_WAITING_BYTES = 40_000_000  # of blocks that wait for the disk; then sensors wait
-_RECENT_S = 3.0  # over which the rate is told
+_WAITING_BYTES = 40_000_000  # Limit on blocks that wait for the disk; sensors wait beyond it.
+_RECENT_S = 3.0  # Interval of the reported rate.
 _NO_ROOM = "there was no room for it"
-_GROUPS = 16  # that are still open: sensors deliver what they measured together at different times
+_GROUPS = 16  # Limit on open groups: sensors deliver simultaneous measurements at different times.
 
 
 class Sink(Protocol):
-    """Where measurements become durable, such as a `Journal`, or are kept until another node has them."""
+    """Destination that stores measurements durably, such as a `Journal`, or until another node has them."""
 
     def add_sensor(
         self,
@@ -49,28 +49,28 @@ class Sink(Protocol):
         translation_m: Sequence[float] | None = ...,
         rotation_xyzw: Sequence[float] | None = ...,
     ) -> None:
-        """Tell of a sensor before its first measurement."""
+        """Register a sensor before its first measurement."""
 
     def append(self, entries: Sequence[Entry]) -> Sequence[Entry] | None:
-        """Store measurements; when this returns they are durable: all of them, or those that it returns."""
+        """Store measurements; on return, all of them are durable, or those that it returns."""
 
     def note_gap(self, sensor: str, first: int, last: int, reason: str, *, session_id: int) -> None:
-        """Store which of a sensor's numbers are missing, and why."""
+        """Store missing numbers of a sensor with their reason."""
 
 
 @dataclass(slots=True)
 class CaptureCounts:
-    """What became of one sensor's measurements so far.
+    """Counts of one sensor's measurements.
 
     Attributes
     ----------
     stored : int
-        Durable.
+        Durable measurements.
     missing : Counter of str
-        Numbers that are missing, by reason.
+        Missing numbers, by reason.
     unplugged : int
     skipped : int
-        Commands that were not given, as the sensor was still busy with the one before.
+        Skipped commands, because the sensor was still busy.
     """
 
     stored: int = 0
@@ -78,16 +78,16 @@ class CaptureCounts:
     unplugged: int = 0
     skipped: int = 0
     times_s: deque[float] = field(default_factory=lambda: deque(maxlen=64))
-    """When the latest were stored, by `time.monotonic`."""
+    """Times at which the latest were stored, by `time.monotonic`."""
 
     @property
     def lost(self) -> int:
-        """All that is missing."""
+        """Number of all missing measurements."""
         return sum(self.missing.values())
 
     @property
     def rate_hz(self) -> float:
-        """Measurements per second, lately."""
+        """Recent rate of measurements per second."""
         now_s = time.monotonic()
         recent_s = [time_s for time_s in self.times_s if now_s - time_s < _RECENT_S]
         return (len(recent_s) - 1) / max(recent_s[-1] - recent_s[0], 1e-9) if len(recent_s) > 1 else 0.0
@@ -95,54 +95,54 @@ class CaptureCounts:
 
 @dataclass(slots=True)
 class _Track:
-    """Where one sensor's numbers are."""
+    """Sequence numbers of one sensor."""
 
-    sequence: int | None = None  # of the latest that is stored or known to be missing
+    sequence: int | None = None  # Number of the latest stored or missing measurement.
     first_pulse: int | None = None
-    tick: int = -1  # of the latest command
-    why: str = ""  # measurements are missing, where that is known
-    passed: bool = False  # whether a pulse beyond the last that is wanted has come
+    tick: int = -1  # Number of the latest command.
+    why: str = ""  # Reason for missing measurements, if known.
+    passed: bool = False  # True once a pulse beyond the last requested one has arrived.
 
 
 class Session:
-    """Takes measurements of sensors, makes them durable, and tells of them.
+    """Capture session: receives measurements from sensors, stores them durably, and reports them.
 
-    Numbers in the sequence are those of the commands that a sensor was given, or else of the pulses since its first:
-    one that is missing is a measurement that is.
+    Sequence numbers are those of the commands, or else of the pulses since the first: a missing number is a missing
+    measurement.
 
     Parameters
     ----------
-    sonars : dict of str to Sonar
-        Configured, by the names that the recording is to have; armed one after the other in this order, but for those
-        that are only listened to.
+    sonars : dict of str to SonarDriver
+        Configured drivers by their names in the recording. They are armed one after the other in this order, except
+        passive ones.
     settings : Settings
-        Of all of them.
+        Common settings.
     trigger : {"command", "sync"}
     rate_hz : float
-        Of commands.
+        Rate of commands.
     n : int, optional
-        Measurements of each sensor, or pulses; until it is stopped by default.
+        Number of measurements of each sensor, or of pulses; unlimited by default.
     duration_s : float, optional
     patience_s : float
-        How long a sensor may be silent or unplugged before it is given up.
+        Timeout for a silent or unplugged sensor.
     mounting : dict of str to (translation_m, rotation_xyzw), optional
-        Where sensors are, as in `ertis_numba.journal.Journal.add_sensor`; at the origin by default.
+        Positions and orientations, as in `ertis_numba.journal.Journal.add_sensor`; unknown by default.
     session_id : int, optional
-        Number of this run, without which the sequence of another could not be told from this one's; drawn by default.
+        Identifier that distinguishes the sequence numbers of sessions; random by default.
     on_stored : callable, optional
-        Called with the entries of each commit, when they are durable.
+        Called with the entries of each commit, once they are durable.
     on_note : callable, optional
-        Called with the sensor's name and a line about it.
+        Called with the sensor's name and a line.
     on_back : callable, optional
         Called with the sensor's name and the seconds that it was unplugged.
     on_tick : callable, optional
-        Called some ten times a second.
+        Called about ten times a second.
 
     Attributes
     ----------
-    counts : dict of str to Counts
+    counts : dict of str to CaptureCounts
     complete, incomplete : int
-        Pulses of which all sensors have delivered, and others.
+        Number of pulses with measurements of all sensors, and of others.
     """
 
     def __init__(  # noqa: PLR0913  how to measure, when to end, and whom to tell
@@ -164,7 +164,7 @@ class Session:
     ) -> None:
         checks.choice("trigger", trigger, ("command", "sync"))
         if not sonars:
-            raise ArgumentError("no sensor is given to capture from; give at least one")
+            raise ArgumentError("sonars is empty; give at least one sensor")
         self._sonars, self._settings, self._mounting = dict(sonars), settings, dict(mounting or {})
         self._synced = trigger == "sync"
         self._rate_hz = checks.between("rate", rate_hz, 1e-3, 1e3)
@@ -180,26 +180,26 @@ class Session:
         self._errors: dict[str, Exception] = {}
         self._tracks = {sensor: _Track() for sensor in sonars}
         self._pulses: SyncCounts[Arrived] = SyncCounts(list(sonars), shortest_s=settings.recording.duration_s)
-        self._waiting: list[Entry] = []  # to be stored together
+        self._waiting: list[Entry] = []  # Entries to store together.
         self._groups: dict[int, int] = {}
-        self._closed = -(2**63)  # the latest group that is not open any more
+        self._closed = -(2**63)  # Latest closed group.
         self._ended: set[str] = set()
         self.counts = {sensor: CaptureCounts() for sensor in sonars}
         self.complete = self.incomplete = 0
 
     def stop(self) -> None:
-        """End after the measurement that has begun; may be called from a signal handler or another thread."""
+        """End after the current measurement; a signal handler or another thread may call this."""
         self._stop.set()
 
     def run(self, sink: Sink) -> None:
-        """Capture until it is done.
+        """Capture until the session ends.
 
         Raises
         ------
         SonarError
-            Sensors were given up; what the others delivered is stored.
+            Sensors have failed permanently; the measurements of the others are stored.
         DataError
-            Nothing more can be stored; what was told of is.
+            Nothing more can be stored; reported measurements are durable.
         """
         n_bytes = 4 * self._settings.recording.n_samples
         events: queue.Queue[Event] = queue.Queue(max(2, _WAITING_BYTES // n_bytes))
@@ -255,7 +255,7 @@ class Session:
             self._close_group(sync_count)
 
     def _done(self) -> bool:
-        """Whether every sensor that is still there has delivered the last pulse, or a later one."""
+        """Return True if every remaining sensor has delivered the last pulse, or a later one."""
         if self._n is None or not self._synced:
             return False
         return all(self._tracks[sensor].passed for sensor in self._sonars if sensor not in self._ended)
@@ -278,8 +278,8 @@ class Session:
                 case Note(sensor, text):
                     self._on_note(sensor, text)
                 case Restarted(sensor):
-                    ready += self._begin_anew(sensor, "the sensor began anew")
-                    self._on_note(sensor, "has begun to count anew")
+                    ready += self._begin_anew(sensor, "the sensor restarted")
+                    self._on_note(sensor, "has restarted its counter")
                 case Returned(sensor, away_s):
                     self.counts[sensor].unplugged += 1
                     ready += self._begin_anew(sensor, "the sensor was unplugged")
@@ -298,12 +298,12 @@ class Session:
         track.tick = tick
 
     def _begin_anew(self, sensor: str, why: str) -> list[tuple[Arrived, int]]:
-        """Return what was held of a sensor; what it counts from now on is compared with the others anew."""
+        """Return the held blocks of a sensor; its counter is compared with the others again."""
         self._tracks[sensor].why = why
         return self._pulses.forget(sensor)
 
     def _store(self, sink: Sink, ready: list[tuple[Arrived, int]]) -> None:
-        """Make measurements durable, then tell of them."""
+        """Store measurements durably, then report them."""
         for event, number in ready:
             entry = self._entry(sink, event, number)
             if entry is not None:
@@ -311,7 +311,7 @@ class Session:
         self._append(sink)
 
     def _append(self, sink: Sink) -> None:
-        """Make durable what waits for it."""
+        """Store waiting entries durably."""
         entries, self._waiting = self._waiting, []
         if not entries:
             return
@@ -329,7 +329,7 @@ class Session:
         self._on_stored(entries)
 
     def _entry(self, sink: Sink, event: Arrived, number: int) -> Entry | None:
-        """Return what is to be stored of a block, None beyond the last pulse; note what is missing before it."""
+        """Return the entry of a block, None beyond the last pulse; note the missing numbers before it."""
         track, block = self._tracks[event.sensor], event.block
         sequence = event.count
         if self._synced:
@@ -342,32 +342,32 @@ class Session:
             if sequence >= end:
                 return None
         if track.sequence is not None:
-            sequence = max(sequence, track.sequence + 1)  # a number is never given twice
+            sequence = max(sequence, track.sequence + 1)  # A number is never used twice.
         track.sequence, track.why = sequence, ""
         stamp = Stamp(
             sensor=event.sensor,
             sequence=sequence,
             sync_count=number,
             session_id=self._session_id,
-            timestamp_ns=block.arrived.realtime_ns - self._record_ns,  # a block follows when all of it is recorded
+            timestamp_ns=block.arrived.realtime_ns - self._record_ns,  # A block arrives when all of it is recorded.
             timestamp_uncertainty_ns=min(block.arrived.uncertainty_ns, 2**32 - 1),
         )
         measurement = Measurement(block.data, self._settings, stamp)
         return Entry(measurement=measurement, monotonic_ns=block.arrived.monotonic_ns)
 
     def _miss_until(self, sink: Sink, sensor: str, stop: int, why: str) -> None:
-        """Note that what was not stored before a number is missing."""
+        """Note that the unstored numbers before a number are missing."""
         track = self._tracks[sensor]
         first = 0 if track.sequence is None else track.sequence + 1
         if first < stop:
-            self._append(sink)  # what was measured before the gap comes before it
+            self._append(sink)  # Earlier measurements come before the gap.
             sink.note_gap(sensor, first, stop - 1, why, session_id=self._session_id)
             self.counts[sensor].missing[why] += stop - first
             track.sequence = stop - 1
 
     def _group(self, sync_count: int) -> None:
         if sync_count <= self._closed:
-            return  # it was counted when it was closed
+            return  # It was counted when it was closed.
         self._groups[sync_count] = self._groups.get(sync_count, 0) + 1
         while len(self._groups) > _GROUPS:
             self._close_group(min(self._groups))
@@ -381,7 +381,7 @@ class Session:
 
 
 def _all_of(events: "queue.Queue[Event]") -> list[Event]:
-    """Return what has come, or what comes within a tenth of a second."""
+    """Return arrived events, and those that arrive within a tenth of a second."""
     found: list[Event] = []
     try:
         found.append(events.get(timeout=0.1))

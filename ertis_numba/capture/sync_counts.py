@@ -1,4 +1,4 @@
-"""Which pulse of the SYNC chain a block belongs to."""
+"""Assignment of blocks to pulses of the SYNC chain."""
 
 import statistics
 from collections import Counter, deque
@@ -9,12 +9,12 @@ __all__ = ["SyncCounts"]
 
 Item = TypeVar("Item")
 
-_NEAR = 0.4  # of the interval between pulses: what arrives within it is of the same pulse
-_PULSES = 64  # that are remembered: some seconds
-_VOTES = 3  # blocks that decide about an offset: one may be late, where a host or a sensor is busy
-_HELD_S = 0.5  # that blocks wait at most for that
-_DOUBTS = 5  # blocks in a row that must speak against an offset before it is changed …
-_DOUBTED_S = 5.0  # … and that wait for it at most
+_NEAR = 0.4  # Share of the interval between pulses: blocks within it belong to the same pulse.
+_PULSES = 64  # Number of kept pulses: some seconds.
+_VOTES = 3  # Number of blocks that decide an offset: one may be late because of a busy host or sensor.
+_HELD_S = 0.5  # Limit on the time that blocks wait for the decision.
+_DOUBTS = 5  # Number of successive contradicting blocks that change an offset …
+_DOUBTED_S = 5.0  # … and the limit on the time that they wait.
 
 
 @dataclass(slots=True)
@@ -26,42 +26,41 @@ class _Held(Generic[Item]):
 
 @dataclass(slots=True)
 class _SensorPulses(Generic[Item]):
-    offset: int | None = None  # from the sensor's own counter to the pulse's number
+    offset: int | None = None  # Offset from the sensor's own counter to the pulse number.
     held: list[_Held[Item]] = field(default_factory=list)
 
 
 class SyncCounts(Generic[Item]):
-    """Gives blocks of several sensors the number of the pulse that triggered them.
+    """Assignment of pulse numbers to the blocks of several sensors.
 
-    Each sensor counts its own triggers. The counters agree but for an offset, as the sensors are armed one after the
-    other, one that was unplugged has missed pulses, and so has one that was still measuring. Offsets are found by the
-    times at which blocks arrive: chained sensors measure within microseconds, pulses are 50 ms or more apart. As a
-    block may arrive late, the majority of three decides. From then on the counter does, until five blocks in
-    a row have arrived at other times than others of their number.
+    Each sensor counts its own triggers. The counters differ by an offset: sensors are armed one after the other, and an
+    unplugged or busy sensor misses pulses. Offsets are found from the times of arrival: chained sensors measure within
+    microseconds, and pulses are at least 50 ms apart. Because a block may arrive late, the majority of three decides.
+    From then on the counter decides, until five successive blocks contradict the times of the other sensors.
 
     Parameters
     ----------
     sensors : list of str
-        In the order in which they are armed: the first one hears every pulse that any other hears.
+        Sensors in the order in which they are armed: the first receives every pulse that any other receives.
     shortest_s : float
-        Least interval between pulses.
+        Minimum interval between pulses.
 
     Attributes
     ----------
     realigned : int
-        How often the offset of a sensor had to be changed.
+        Number of changed offsets.
     """
 
     def __init__(self, sensors: list[str], *, shortest_s: float) -> None:
         self._sensors: dict[str, _SensorPulses[Item]] = {name: _SensorPulses() for name in sensors}
         self._first = sensors[0]
         self._shortest_ns = round(shortest_s * 1e9)
-        self._pulses: dict[int, int] = {}  # number: time of its first block
+        self._pulses: dict[int, int] = {}  # Time of the first block, by pulse number.
         self._intervals_ns: deque[float] = deque(maxlen=_PULSES)
         self.realigned = 0
 
     def forget(self, sensor: str) -> list[tuple[Item, int]]:
-        """Compare a sensor anew: it has missed pulses, or begun to count anew. Return what was held of it."""
+        """Align a sensor again, after it has missed pulses or restarted its counter; return its held blocks."""
         state = self._sensors[sensor]
         found: list[tuple[Item, int]] = []
         if state.held and self._decided(sensor, state, state.held[-1].arrived_ns, at_once=True):
@@ -70,26 +69,26 @@ class SyncCounts(Generic[Item]):
         return found
 
     def add(self, sensor: str, item: Item, counter: int, arrived_ns: int) -> list[tuple[Item, int]]:
-        """Take a block and return those whose pulse is known now, with its number.
+        """Add a block, and return the blocks whose pulse is now known, with its number.
 
         Parameters
         ----------
         sensor : str
         item : object
-            Whatever is to be returned.
+            Object to return.
         counter : int
-            The sensor's own, without wrap-around.
+            The sensor's own counter, without wrap-around.
         arrived_ns : int
-            By a clock that never steps.
+            Time by a monotonic clock.
         """
         self._sensors[sensor].held.append(_Held(item, counter, arrived_ns))
         return self.release(arrived_ns)
 
     def release(self, now_ns: int, *, at_once: bool = False) -> list[tuple[Item, int]]:
-        """Return what need not wait any longer; with ``at_once`` everything, by the best guess there is."""
+        """Return blocks that need not wait any longer; with ``at_once`` all of them, with their most likely numbers."""
         found: list[tuple[Item, int]] = []
         progress = True
-        while progress:  # one sensor's block may be what another one waited for
+        while progress:  # A block of one sensor may resolve that of another.
             progress = False
             for name, state in self._sensors.items():
                 if not state.held or not self._decided(name, state, now_ns, at_once=at_once):
@@ -109,15 +108,15 @@ class SyncCounts(Generic[Item]):
 
     @property
     def interval_ns(self) -> float:
-        """Time between pulses, the shortest possible while it is not known."""
+        """Interval between pulses; the minimum while it is unknown."""
         return statistics.median(self._intervals_ns) if self._intervals_ns else float(self._shortest_ns)
 
     def _decided(self, name: str, state: _SensorPulses[Item], now_ns: int, *, at_once: bool) -> bool:
-        """Decide about the offset of a sensor that holds blocks; return whether it is known now."""
+        """Determine the offset of a sensor with held blocks; return True if it is now known."""
         waited = at_once or now_ns - state.held[0].arrived_ns > _HELD_S * 1e9
         if not self._pulses:
             if name == self._first or waited:
-                state.offset = -state.held[0].counter  # the first pulse is number 0
+                state.offset = -state.held[0].counter  # The first pulse is number 0.
             return state.offset is not None
         if state.offset is not None:
             doubted_s = (now_ns - state.held[0].arrived_ns) / 1e9
@@ -128,7 +127,7 @@ class SyncCounts(Generic[Item]):
         elif len(state.held) < _VOTES and not waited and not self._is_alone:
             return False
         if not self._intervals_ns and not waited:
-            return False  # how near is near, is not known yet
+            return False  # The tolerance is not known yet.
         voted = self._voted(state.held, waited=waited)
         if voted is not None:
             self.realigned += state.offset not in {None, voted}
@@ -137,11 +136,11 @@ class SyncCounts(Generic[Item]):
 
     @property
     def _is_alone(self) -> bool:
-        """Whether there is no sensor to compare another with."""
+        """Return True if there is no other sensor to compare with."""
         return len(self._sensors) == 1
 
     def _voted(self, held: list[_Held[Item]], *, waited: bool) -> int | None:
-        """Return the offset that most blocks speak for by their times, None while it is too early to say."""
+        """Return the offset with the most votes by time of arrival, None while it is too early."""
         votes = Counter(
             number - each.counter
             for each in held
@@ -153,17 +152,17 @@ class SyncCounts(Generic[Item]):
         return offset if waited or 2 * count > len(held) else None
 
     def _number(self, arrived_ns: int, *, waited: bool) -> int | None:
-        """Return the pulse that a block belongs to by its time, None if that cannot be said yet."""
+        """Return the pulse of a block by its time, None while it is unknown."""
         number = min(self._pulses, key=lambda each: abs(self._pulses[each] - arrived_ns))
         away_ns = arrived_ns - self._pulses[number]
         if abs(away_ns) <= _NEAR * self.interval_ns:
             return number
         earlier = [each for each, time_ns in self._pulses.items() if time_ns <= arrived_ns]
         later = [each for each, time_ns in self._pulses.items() if time_ns > arrived_ns]
-        if earlier and later:  # a pulse that no other sensor has delivered, between two that one has
+        if earlier and later:  # No other sensor has delivered this pulse, but pulses before and after it.
             return self._between(max(earlier), min(later), arrived_ns)
         if later or waited or self._is_alone or all(state.offset is None for state in self._sensors.values()):
-            return number + round(away_ns / self.interval_ns)  # counted by the interval
+            return number + round(away_ns / self.interval_ns)  # The interval gives the number.
         return None
 
     def _between(self, first: int, last: int, time_ns: int) -> int:
@@ -173,7 +172,7 @@ class SyncCounts(Generic[Item]):
         return min(max(first + round(share * (last - first)), first + 1), last - 1)
 
     def _agrees(self, held: _Held[Item], offset: int) -> bool:
-        """Whether no other block's time speaks against an offset."""
+        """Return True if no other block's time contradicts an offset."""
         known_ns = self._pulses.get(held.counter + offset)
         return known_ns is None or abs(held.arrived_ns - known_ns) <= self.interval_ns / 2
 

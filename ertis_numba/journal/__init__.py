@@ -1,4 +1,4 @@
-"""Where measurements become durable before anything else is done with them. The only door to sqlite3."""
+"""Journals, which store measurements durably before any other use; the only package that imports sqlite3."""
 
 from ertis_numba.journal._journal import SUFFIX, Journal
 from ertis_numba.journal._records import Entry, JournalGap, JournalKey, JournalSensor, require_same

@@ -1,4 +1,4 @@
-"""What is in a journal."""
+"""Content of a journal."""
 
 import os
 import re
@@ -16,7 +16,7 @@ from ertis_numba.journal._tables import COMPLETE_VERSION, selection
 __all__ = ["SUFFIX", "Contents"]
 
 SUFFIX: Final = ".journal"
-"""End of the name of a journal, after that of its recording."""
+"""Suffix of a journal, after the name of its recording."""
 
 _SELECTION: Final = selection("measurements", "WHERE id = ?")
 
@@ -34,7 +34,7 @@ def _own_name(journal: str, target: str) -> str:
 
 
 class Contents:
-    """An open journal, as far as it is read."""
+    """An open journal for reading."""
 
     path: Path
     target: Path
@@ -46,7 +46,8 @@ class Contents:
         self._turn = threading.RLock()
         self._sensors: dict[str, JournalSensor] = {}
         self._ids: dict[str, int] = {}
-        self._unusable: dict[int, tuple[str, str, int]] = {}  # name, reason and measurements, by number
+        # Name, reason and number of measurements, by sensor number.
+        self._unusable: dict[int, tuple[str, str, int]] = {}
         self._last: dict[tuple[str, int], int] = {}
         self._n_entries = self._held_bytes = 0
         self._identity = 0
@@ -54,7 +55,7 @@ class Contents:
     def _load(self) -> None:
         rows = self._database.execute(selection("journal"))
         if len(rows) != 1:
-            raise DamagedError(f"{self.path} is damaged, it has no header; copy it again if you can")
+            raise DamagedError(f"{self.path} is damaged: it has no header; copy it again if you can")
         target, self.source, _ = checked(self.path, "the journal", rows[0])
         self.target = self.path.parent / _own_name(self.path.name, os.fsdecode(target))
         self._identity = rows[0][-1]
@@ -63,7 +64,7 @@ class Contents:
                 self._register(row[0], JournalSensor.from_row(self.path, row))
             except DamagedError:
                 raise
-            except (ArgumentError, DataError) as error:  # the settings of one sensor must not lock up the others
+            except (ArgumentError, DataError) as error:  # The settings of one sensor must not block the others.
                 self._unusable[row[0]] = row[1], str(error), 0
         names = {number: name for name, number in self._ids.items()}
         counts = self._database.execute(
@@ -75,45 +76,45 @@ class Contents:
                 self._unusable[number] = name, reason, before + count
                 continue
             if number not in names:
-                raise DamagedError(f"{self.path} is damaged, it has no sensor {number}; copy it again if you can")
+                raise DamagedError(f"{self.path} is damaged: it has no sensor {number}; copy it again if you can")
             self._last[names[number], session_id] = last
             self._n_entries += count
             self._held_bytes += count * self._sensors[names[number]].n_bytes
         n_rows, n_listed = self._count_rows(), self._n_entries + sum(count for *_, count in self._unusable.values())
         if n_rows != n_listed:
             raise DamagedError(
-                f"{self.path} is damaged, it lists {n_listed} measurements and has {n_rows}; copy it again if you can"
+                f"{self.path} is damaged: it lists {n_listed} measurements and has {n_rows}; copy it again if you can"
             )
 
     def _count_rows(self) -> int:
-        """Count measurements in the table, as the index was: damage to one of these two trees is noticed."""
+        """Count the rows of the table, to compare with the index: a difference reveals damage to one of the two trees."""
         ((version,),) = self._database.execute("PRAGMA user_version")
         if version == COMPLETE_VERSION:
-            # Rows may be deleted from the front, so that the first number is not always 1; apart from each other, each
-            # takes one look.
+            # Rows may have been deleted from the front, so that the first number is not always 1. Apart from that,
+            # one look at each end is enough.
             rows = self._database.execute(
                 "SELECT ifnull((SELECT max(id) FROM measurements) - (SELECT min(id) FROM measurements) + 1, 0)"
             )
-        else:  # numbers have holes: every page of the table is looked at, without the words
+        else:  # The numbers have holes, so every page of the table is read, without the samples.
             try:
                 rows = self._database.execute("SELECT count(*) FROM measurements NOT INDEXED")
-            except DamagedError:  # of some pages; who reads what is in them is told so, and the others are sound
+            except DamagedError:  # Some pages are damaged. Reading their rows reports it, and the others are sound.
                 return self._n_entries + sum(count for *_, count in self._unusable.values())
         return int(rows[0][0])
 
     @property
     def sensors(self) -> Mapping[str, JournalSensor]:
-        """Sensors by name, in the order in which they came."""
+        """Sensors by name, in order of registration."""
         return MappingProxyType(self._sensors)
 
     @property
     def unusable(self) -> Mapping[str, tuple[str, int]]:
-        """Sensors whose settings this version cannot use, by name: the reason, and the number of measurements."""
+        """Sensors with unusable settings, by name: the reason, and the number of measurements."""
         return MappingProxyType({name: (reason, count) for name, reason, count in self._unusable.values()})
 
     @property
     def gaps(self) -> tuple[JournalGap, ...]:
-        """What was noted to be missing, in that order."""
+        """Noted gaps, in order."""
         with self._turn:
             rows = self._database.execute(selection("gaps", "ORDER BY id"))
         names = {number: name for name, number in self._ids.items()}
@@ -125,7 +126,7 @@ class Contents:
         )
 
     def index(self, sensor: str | None = None) -> list[JournalKey]:
-        """Return which measurements there are, of one sensor or of all, in order of arrival; none is read."""
+        """Return the keys of measurements of one sensor or of all, in order of arrival, without reading them."""
         number = None if sensor is None else self._ids[self._sensor(sensor).name]
         with self._turn:
             rows = self._database.execute(
@@ -138,7 +139,7 @@ class Contents:
         )
 
     def newest(self, n_max: int) -> list[tuple[str, int, int, int]]:
-        """Return sensor, epoch, number and CRC-32 of the newest measurements, without reading their words."""
+        """Return sensor, session_id, number and CRC-32 of the newest measurements, without reading their data."""
         with self._turn:
             rows = self._database.execute(
                 "SELECT sensor, epoch, sequence, crc32 FROM measurements ORDER BY id DESC LIMIT ?", (n_max,)
@@ -147,12 +148,12 @@ class Contents:
         return [(names[number], *rest) for number, *rest in reversed(rows) if number in names]
 
     def find(self, sensor: str, session_id: int, sequence: int) -> JournalKey:
-        """Return where a measurement is.
+        """Return the key of a measurement.
 
         Raises
         ------
         DamagedError
-            There is none of this number.
+            There is no measurement with this number.
         """
         with self._turn:
             rows = self._database.execute(
@@ -166,14 +167,14 @@ class Contents:
         return JournalKey(rows[0][0], sensor, session_id, sequence)
 
     def entry(self, key: JournalKey) -> Entry:
-        """Return a measurement, whose words are read-only.
+        """Return a measurement, whose data is read-only.
 
         Raises
         ------
         DamagedError
-            It is not what was written.
+            The measurement does not match its CRC-32.
         DataError
-            It cannot be read.
+            The measurement cannot be read.
         """
         with self._turn:
             rows = self._database.execute(_SELECTION, (key.place,))
@@ -185,12 +186,12 @@ class Contents:
         return self._sensors[key.sensor].entry(self.path, rows[0])
 
     def entries(self, sensor: str | None = None) -> Iterator[Entry]:
-        """Yield the measurements of one sensor or of all, in order of arrival; each is read when it is asked for.
+        """Yield the measurements of one sensor or of all, in order of arrival, each read when it is requested.
 
         Raises
         ------
         DamagedError
-            A measurement is not what was written; `index` and `entry` get at the others.
+            A measurement does not match its CRC-32; `index` and `entry` give access to the others.
         DataError
             The disk fails.
         """
@@ -217,6 +218,6 @@ class Contents:
         self.close()
 
     def close(self) -> None:
-        """Close the journal; closing twice does no harm."""
+        """Close the journal; closing twice is harmless."""
         with self._turn:
             self._database.close()

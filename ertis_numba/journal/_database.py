@@ -1,4 +1,4 @@
-"""One SQLite file that belongs to one process, and what SQLite says in the words of this package."""
+"""SQLite file for exclusive use by one process, with errors in the form of this package."""
 
 import os
 import sqlite3
@@ -16,18 +16,18 @@ from ertis_numba.journal._tables import APPLICATION_ID, TABLES, VERSION, layout
 
 __all__ = ["LOG_BYTES", "PAGE_BYTES", "Database"]
 
-PAGE_BYTES: Final = 32_768  # of 4 to 64 KiB, it takes the least time for measurements of 128 KiB to 1 MiB
-LOG_BYTES: Final = 4_194_304  # of the write-ahead log; then what is in it moves to the main file
+PAGE_BYTES: Final = 32_768  # Among 4 to 64 KiB, the fastest for measurements of 128 KiB to 1 MiB.
+LOG_BYTES: Final = 4_194_304  # Size of the write-ahead log at which its content moves to the main file.
 _CACHE_KIB: Final = 4096
-_HEADER: Final = struct.Struct(">8s5I")  # of the rollback journal, see https://sqlite.org/fileformat.html
+_HEADER: Final = struct.Struct(">8s5I")  # Header of the rollback journal, see https://sqlite.org/fileformat.html
 _CHUNK_BYTES: Final = 1_048_576
 _MAGIC: Final = b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7"
 
 _SETUP: Final = (
     "PRAGMA cell_size_check = ON",
-    # What a commit wrote has reached the disk when it returns. NORMAL would leave that to the next checkpoint.
+    # A commit is on disk when it returns. NORMAL would leave that to the next checkpoint.
     "PRAGMA synchronous = FULL",
-    "PRAGMA fullfsync = ON",  # on macOS, where fsync leaves it in the disk's cache
+    "PRAGMA fullfsync = ON",  # On macOS, fsync alone leaves data in the disk's cache.
     f"PRAGMA wal_autocheckpoint = {LOG_BYTES // PAGE_BYTES}",
     f"PRAGMA journal_size_limit = {LOG_BYTES}",
     f"PRAGMA cache_size = -{_CACHE_KIB}",
@@ -45,51 +45,51 @@ _REPORTED: Final = {
 
 
 class Database:
-    """An SQLite file with the tables of a journal, which no other process can open meanwhile.
+    """SQLite file with the tables of a journal, which no other process can open meanwhile.
 
-    SQLite holds a lock of the operating system on the file, which ends with the process, however that ends.
+    SQLite holds a lock of the operating system on the file, which ends with the process.
 
     Parameters
     ----------
     path : Path
-        It has to exist. An empty file gets its tables, if ``empty`` is set.
+        Existing file. An empty file gets its tables if ``empty`` is set.
     empty : bool
 
     Attributes
     ----------
     is_new : bool
-        It was empty.
+        The file was empty.
     """
 
     def __init__(self, path: Path, *, empty: bool) -> None:
         self._path = path
-        self._writes_once = False  # as far as is known
-        self._is_log_named = False  # whether the folder durably has the name of the log that is written
+        self._writes_once = False  # As far as is known.
+        self._is_log_named = False  # True once the name of the written log is durable in its folder.
         self._is_folder_synced = True
-        self._ends: dict[str, int] = {}  # of the tables before a commit, until it is known to be one
+        self._ends: dict[str, int] = {}  # Ends of the tables before a commit, until its result is known.
         with self._reported():
             self._file = before = path.stat()
-            if not before.st_size and not empty:  # to lock it would make a database of it
-                raise DataError(f"{path} is empty; give a journal that 'ertis capture' left")
-            for log, least_bytes in _smallest(path):  # SQLite would throw the log away, or make up the rest with zeros
+            if not before.st_size and not empty:  # Locking would turn it into a database.
+                raise DataError(f"{path} is empty; give a journal left by 'ertis capture'")
+            for log, least_bytes in _smallest(path):  # SQLite would discard the log, or fill the rest with zeros.
                 if before.st_size < least_bytes:
                     raise DamagedError(
                         f"{path} has {before.st_size} bytes, too few to go with its log {log.name}: it was cut short; "
                         "copy both again"
                     )
             uri = f"file:{quote(os.fsencode(path.absolute()))}?mode=rw"
-            # Who uses a journal sees to it that two threads do not use it at once.
+            # Callers ensure that only one thread uses a journal at a time.
             self._connection = sqlite3.connect(uri, uri=True, timeout=0, isolation_level=None, check_same_thread=False)
         try:
             with self._reported():
                 self.is_new = self._take(before, empty=empty)
         except BaseException:
             self._connection.close()
-            self._require_there(before)  # which would explain the error
+            self._require_there(before)  # A missing file would explain the error.
             raise
 
     def _take(self, before: os.stat_result, *, empty: bool) -> bool:
-        """Lock the file, and make sure of what it is before anything in it changes."""
+        """Lock the file, and identify it before anything in it changes."""
         self.execute(f"PRAGMA page_size = {PAGE_BYTES}")
         self.execute("PRAGMA locking_mode = EXCLUSIVE")
         self.execute("BEGIN EXCLUSIVE")
@@ -101,14 +101,14 @@ class Database:
         )
         is_new = bool(empty and application == version == n_tables == 0)
         if not is_new and application != APPLICATION_ID:
-            raise DataError(f"{self._path} is an SQLite file, but not a journal; give one that 'ertis capture' left")
+            raise DataError(f"{self._path} is an SQLite file, but not a journal; give one left by 'ertis capture'")
         if version > VERSION:
             raise FormatVersionError(
-                f"{self._path} has format version {version}, this package reads up to {VERSION}; update ertis-numba"
+                f"{self._path} has format version {version}, but this package reads up to {VERSION}; update ertis-numba"
             )
         for statement in _SETUP:
             self.execute(statement)
-        if is_new:  # after locking_mode: then its index is in memory, and no -shm is made
+        if is_new:  # After locking_mode, the log's index is in memory, and no -shm file is created.
             self.execute("PRAGMA journal_mode = WAL")
         return is_new
 
@@ -141,37 +141,39 @@ class Database:
         self._is_folder_synced = True
 
     def write_once(self) -> None:
-        """Have commits write to the main file at once, from now on, and for ever.
+        """Switch to a rollback journal permanently, so that commits write to the main file at once.
 
-        Until then they write to the log, which takes one sync, and move what is in it to the main file when it is full.
-        Where each commit fills the log, that is to write all twice. From now on a rollback journal keeps what the pages
-        that change were like; new rows take new pages, of which nothing has to be kept. A commit takes four syncs.
+        Before, commits write to the log with one sync, and a full log is moved to the main file. If each commit fills
+        the log, all data is written twice. A rollback journal keeps the old content of changed pages; new rows take new
+        pages, whose content need not be kept. A commit then takes four syncs.
 
         Raises
         ------
         DataError
-            The disk is full or fails. All is as before.
+            The disk is full or fails. Nothing has changed.
         """
         if not self._writes_once:
             self._roll_back_by("DELETE")
             self._writes_once = True
-            self._is_folder_synced = self._is_log_named = False  # the old log must not come back, the new one stay
+            # The old log must not reappear, and the new one must stay.
+            self._is_folder_synced = self._is_log_named = False
 
     def _roll_back_by(self, mode: str) -> None:
-        """Go over to a rollback journal, which commits leave with a void header, as nobody else can have the file.
+        """Switch to a rollback journal, which commits leave with a void header, because no other process can open the
+        file.
 
-        When the file is closed, DELETE removes it by its name.
+        DELETE removes it by name when the file is closed.
         """
         if self.execute(f"PRAGMA journal_mode = {mode}") != [(mode.lower(),)]:
-            raise DataError(f"{self._path} cannot do without its log; close it, and try again")
+            raise DataError(f"{self._path} cannot switch from its log; close it, and try again")
 
     def require_name(self) -> None:
-        """Refuse to go on with a file that has lost its name: what is written to it could not be found again.
+        """Refuse to continue with a file that has lost its name, because new data could not be found again.
 
         Raises
         ------
-        InUseError
-            It has.
+        JournalInUseError
+            The file has lost its name.
         """
         self._require_there(self._file)
 
@@ -185,35 +187,35 @@ class Database:
         return True
 
     def _require_there(self, before: os.stat_result) -> None:
-        """Refuse a file that has lost its name: who had locked it may have sealed and removed it."""
+        """Refuse a file that has lost its name: the process that had locked it may have sealed and removed it."""
         now = self._path.stat() if self._path.exists() else None
         if now is None or (now.st_dev, now.st_ino) != (before.st_dev, before.st_ino):
-            raise JournalInUseError(f"{self._path} was removed or replaced by another process; look again")
+            raise JournalInUseError(f"{self._path} was removed or replaced by another process; check the folder again")
 
     def execute(self, statement: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
         """Run a statement and return its rows.
 
         Raises
         ------
-        InUseError
-            Another process has the journal.
+        JournalInUseError
+            Another process has the journal open.
         DamagedError
-            The file is not what was written.
+            The file is damaged.
         DataError
-            The disk is full, fails or may not be written, the file is closed.
+            The disk is full, fails or is not writable, or the file is closed.
         """
         with self._reported():
             return self._connection.execute(statement, values).fetchall()
 
     @contextmanager
     def transaction(self) -> Iterator[None]:
-        """Make what happens in the block durable when it ends, all or nothing; when it raises, no row was added."""
+        """Make the block's changes durable at its end, all or none; after an error, no row was added."""
         self._sync_folder()
         self._withdraw()
         with self._all_or_nothing():
             self._ends = self._find_ends()
             yield
-        if not self._is_log_named:  # the first commit has made the log
+        if not self._is_log_named:  # The first commit has created the log.
             self._is_folder_synced = False
             self._sync_folder()
             self._is_log_named = True
@@ -225,23 +227,23 @@ class Database:
         try:
             yield
             self.execute("COMMIT")
-        except BaseException:  # Ctrl-C, too
-            with suppress(sqlite3.Error):  # the first error is the one to tell
+        except BaseException:  # This includes Ctrl-C.
+            with suppress(sqlite3.Error):  # The first error is the one to report.
                 if self._connection.in_transaction:
                     self._connection.execute("ROLLBACK")
-            with suppress(DataError):  # the next transaction tries it again
+            with suppress(DataError):  # The next transaction tries it again.
                 self._withdraw()
             raise
 
     def _find_ends(self) -> dict[str, int]:
-        """Return the highest number of a row in each table that there is."""
+        """Return the highest row number of each table."""
         names = {name for (name,) in self.execute("SELECT name FROM sqlite_schema WHERE type = 'table'")}
         tables = [table for table in TABLES if table in names]
         ends = (self.execute(f"SELECT ifnull(max(id), 0) FROM {table}")[0][0] for table in tables)  # noqa: S608  our own
         return dict(zip(tables, ends, strict=True))
 
     def _withdraw(self) -> None:
-        """Delete what a commit has added that failed all the same: in its very last step, when all was written."""
+        """Delete the rows of a commit that failed in its very last step, when all was written."""
         if ends := self._ends:
             self._ends = {}
             try:
@@ -253,7 +255,7 @@ class Database:
                 raise
 
     def lay_out(self) -> None:
-        """Make the tables; to be called in a transaction."""
+        """Create the tables, within a transaction."""
         for statement in layout():
             self.execute(statement)
 
@@ -275,38 +277,38 @@ class Database:
                 copy.close()
 
     def leave_log(self) -> None:
-        """Bring all to the main file, and remove the log: then closing touches no file by its name.
+        """Move everything to the main file and remove the log, so that closing touches no file by name.
 
-        Only closing may follow: a commit that is cut off could not be rolled back any more.
+        Only closing may follow: an interrupted commit could not be rolled back any more.
 
         Raises
         ------
         DataError
             The disk is full or fails. The log stays.
         """
-        for statement in ("BEGIN IMMEDIATE", "COMMIT"):  # rolls back what a disk that failed has left
+        for statement in ("BEGIN IMMEDIATE", "COMMIT"):  # This rolls back the remains of a failed disk.
             self.execute(statement)
         self._roll_back_by("PERSIST")
         beside(self._path, "-journal").unlink(missing_ok=True)
 
     def close(self) -> None:
-        """Close the file; closing twice does no harm."""
+        """Close the file; closing twice is harmless."""
         self._connection.close()
 
     @contextmanager
     def _reported(self) -> Iterator[None]:
-        """Tell errors in the words of this package, in a line that names the file."""
+        """Raise errors in the form of this package, in a line with the name of the file."""
         try:
             yield
         except sqlite3.Error as error:
             code = getattr(error, "sqlite_errorcode", None)
-            if code is None:  # what Python's own module has to say
+            if code is None:  # Errors of Python's own module have no code.
                 if "closed" in str(error):
                     raise DataError(f"{self._path} is closed; open it again") from error
                 if isinstance(error, sqlite3.ProgrammingError | sqlite3.InterfaceError):
                     raise
                 code = sqlite3.SQLITE_CORRUPT
-            code &= 0xFF  # without what SQLite adds to a code
+            code &= 0xFF  # Extended codes add further bits.
             if code in {sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED}:
                 raise JournalInUseError(
                     f"{self._path} is in use by another process, a capture or its sealing; wait until that has ended"
@@ -314,14 +316,14 @@ class Database:
             reported = _REPORTED.get(code, "cannot be used ({}); check the disk")
             kind = DamagedError if code == sqlite3.SQLITE_CORRUPT else DataError
             raise kind(f"{self._path} {reported.format(_line(error))}") from error
-        except UnicodeError as error:  # from texts that are damaged
+        except UnicodeError as error:  # Damaged text raises this error.
             raise DamagedError(f"{self._path} {_REPORTED[sqlite3.SQLITE_CORRUPT].format(_line(error))}") from error
         except OSError as error:
-            raise DataError(f"{self._path}: {error.strerror}; give a journal that 'ertis capture' left") from error
+            raise DataError(f"{self._path}: {error.strerror}; give a journal left by 'ertis capture'") from error
 
 
 def _smallest(path: Path) -> Iterator[tuple[Path, int]]:
-    """Yield the logs beside a file, and how long the file has to be for each."""
+    """Yield the logs beside a file, and the minimum length of the file for each."""
     log = beside(path, "-wal")
     if log.exists() and log.stat().st_size:
         yield log, PAGE_BYTES

@@ -12,8 +12,8 @@ from ertis_numba.journal._tally import TALLY
 
 __all__ = ["LOGS", "beside", "disk_errors", "free_name", "keep_damaged_log", "rename_orphans", "unlink_all"]
 
-LOGS: Final = ("-wal", "-journal")  # what SQLite may leave when it is killed, and what may be all that is left
-_NOTES: Final = ("-shm", TALLY, LIMIT)  # which mean nothing without the journal
+LOGS: Final = ("-wal", "-journal")  # Files that SQLite may leave when it is killed, and that may contain data.
+_NOTES: Final = ("-shm", TALLY, LIMIT)  # Files without meaning if the journal is gone.
 
 
 def beside(path: Path, end: str) -> Path:
@@ -33,7 +33,7 @@ def free_name(path: Path, end: str) -> Path:
 def keep_damaged_log(path: Path, content: bytes) -> Path | None:
     """Keep a copy of a damaged log; return its path, or None if there is one with the same content.
 
-    Earlier copies stay: they may be all that is left of other measurements.
+    Earlier copies stay: they may contain the only data of other measurements.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Journals: measurements as they arrive, durable one commit at a time."""
+"""Journals: measurements as received, made durable in commits."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -23,20 +23,20 @@ __all__ = ["SUFFIX", "Journal"]
 
 
 class Journal(Rows):
-    """Measurements that are durable, until they are sealed into a recording.
+    """Durable measurements until they are sealed into a recording.
 
-    Make it by `create` or `open`, and close it after use, or use it in a ``with`` statement. No other process can
+    Create it with `create` or `open`, and close it after use, or use it in a ``with`` statement. No other process can
     open it meanwhile. Threads may share it.
 
     Attributes
     ----------
     path : Path
     target : Path
-        The recording to be made of it.
+        Recording to be made of it.
     source : str
-        Where the measurements come from.
+        Origin of the measurements.
     tally : Tally
-        Highest numbers that were stored.
+        Highest stored numbers.
     remark : str
         Files that `create` has renamed; empty if there were none.
     """
@@ -52,33 +52,33 @@ class Journal(Rows):
 
     @classmethod
     def create(cls, path: str | Path, *, target: str | Path, source: str = "") -> Self:
-        """Make a journal.
+        """Create a journal.
 
         Parameters
         ----------
         path : str or Path
-            By convention the name of the recording and `SUFFIX`, beside it.
+            By convention the name of the recording with `SUFFIX`, beside it.
         target : str or Path
-            The recording to be made of it; a relative path counts from the folder of the journal.
+            Recording to be made of it; a relative path counts from the folder of the journal.
         source : str
-            Where the measurements come from.
+            Origin of the measurements.
 
         Raises
         ------
         ArgumentError
-            There is a journal already.
+            A journal exists already.
         DataError
-            It cannot be written.
+            The journal is not writable.
         """
         path = Path(path)
         try:
             os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
         except FileExistsError as error:
             raise ArgumentError(
-                f"{path} exists, an interrupted capture left it; run 'ertis recover {path}', or give another name"
+                f"{path} exists from an interrupted capture; run 'ertis recover {path}', or give another name"
             ) from error
         except OSError as error:
-            raise DataError(f"{path}: {error.strerror}; give a place that can be written") from error
+            raise DataError(f"{path}: {error.strerror}; give a writable folder") from error
         try:
             remark = rename_orphans(path)
             made = cls(path, Database(path, empty=True))
@@ -95,14 +95,14 @@ class Journal(Rows):
 
     @classmethod
     def open(cls, path: str | Path) -> Self:
-        """Open a journal, whatever ended the process that wrote it.
+        """Open a journal, regardless of how the process that wrote it ended.
 
         Raises
         ------
-        InUseError
+        JournalInUseError
             Another process has it open.
         DataError
-            There is none, it is damaged, or cannot be written.
+            It does not exist, is damaged, or not writable.
         FormatVersionError
             A newer version wrote it.
         """
@@ -110,7 +110,7 @@ class Journal(Rows):
         log = read_log(path)
         if log is not None and log.is_cut:
             choose_log(path, log)
-        # A process that is killed right after it made the file leaves an empty one, or one without tables.
+        # A process that is killed right after it created the file leaves an empty one, or one without tables.
         opened = cls(path, Database(path, empty=path.name.endswith(SUFFIX)))
         try:
             is_new = opened._database.is_new
@@ -122,12 +122,12 @@ class Journal(Rows):
             acked = limit_of(path)
             if acked is not None:
                 with disk_errors(path):
-                    opened.tally.limit(acked)  # what is above is no loss
+                    opened.tally.limit(acked)  # Rows above the limit are not a loss.
             damage = rescue(opened, opened._database, log)
             if damage:
                 opened.tally.note_damage(damage)
             if acked is not None:
-                opened._obey_limit(acked)  # also by rows that were rescued
+                opened._obey_limit(acked)  # This includes rescued rows.
         except BaseException:
             opened.close()
             raise
@@ -165,7 +165,7 @@ class Journal(Rows):
             (gap.sensor, gap.session_id) for gap in self.gaps
         }
         with self._database.transaction():
-            self._database.execute(f"PRAGMA user_version = {VERSION}")  # numbers of rows may have holes now
+            self._database.execute(f"PRAGMA user_version = {VERSION}")  # Row numbers may have holes now.
             for sensor, session_id in sorted(runs):
                 above = self._ids[sensor], session_id, acked.get((sensor, session_id), -1)
                 self._database.execute(
@@ -209,7 +209,7 @@ class Journal(Rows):
                 self.tally.begin(identity)
 
     def free_log(self) -> None:
-        """Move the content of the log to the main file and cut the log, which gives its room back to the disk.
+        """Move the content of the log to the main file and truncate the log, which frees its disk space.
 
         Raises
         ------
@@ -220,29 +220,32 @@ class Journal(Rows):
             self._database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
 
     def remove(self) -> None:
-        """Close the journal and remove it: what is in it is in a recording, or is nothing."""
+        """Close the journal and remove it: its content is in a recording, or it is empty."""
         with self._turn:
             try:
                 with suppress(DataError):
                     self._release()
                 self.tally.close()
-                unlink_all(self.path)  # the log stays where the disk was too full to take it in, and means nothing then
+                # If the disk was too full to merge the log, it stays, and has no meaning without the journal.
+                unlink_all(self.path)
             finally:
                 self.close()
             fsync(self.path.parent)
 
     def set_aside(self, end: str = "damaged") -> Path:
-        """Close the journal and give it a name that ends in ``.damaged``, which nobody seals again; return that.
+        """Close the journal and rename it with the suffix ``.damaged``, which is never sealed again.
+
+        Return the new path.
 
         Parameters
         ----------
         end : str
-            Another end of the name.
+            Another suffix.
 
         Raises
         ------
         DataError
-            The disk is full or fails. The journal has its name still.
+            The disk is full or fails. The journal keeps its name.
         """
         with self._turn:
             try:
@@ -256,18 +259,18 @@ class Journal(Rows):
         return aside
 
     def close(self) -> None:
-        """Close the journal; closing twice does no harm."""
+        """Close the journal; closing twice is harmless."""
         with self._turn:
             is_ours = self._database.has_name
             super().close()
-            # Without a log, all is in the main file, which tells itself what is damaged.
+            # Without a log, the main file detects its own damage.
             if is_ours and not self.damage and not any(beside(self.path, end).exists() for end in LOGS):
                 with suppress(OSError):
                     self.tally.remove()
             self.tally.close()
 
     def _release(self) -> None:
-        """Make the file ready to lose its name; it stays locked where the system lets an open file lose it."""
+        """Prepare the file for renaming; it stays locked on systems that allow renaming an open file."""
         if os.name == "nt":
             self.close()
         else:

@@ -16,7 +16,7 @@ from ertis_numba.errors import DamagedError, DataError
 __all__ = ["LIMIT", "limit_of", "note_limit"]
 
 LIMIT: Final = "-limit"
-"""End of the name of the file, after that of the journal."""
+"""Suffix of the file, after the name of the journal."""
 
 
 def note_limit(path: Path, acked: Mapping[tuple[str, int], int]) -> None:
@@ -59,13 +59,13 @@ def limit_of(path: Path) -> dict[tuple[str, int], int] | None:
     except FileNotFoundError:
         return None
     except OSError as error:
-        raise DataError(f"{place}: {error.strerror}; allow reading it") from error
+        raise DataError(f"{place}: {error.strerror}; make it readable") from error
     except (ValueError, KeyError, TypeError):
         is_sound = False
     if not is_sound:
         raise DamagedError(
-            f"{place} is damaged; remove it to seal all rows that {path.name} shows, although another recording may "
-            "hold some of them"
+            f"{place} is damaged; remove it to seal all rows in {path.name}, although another recording may "
+            "contain some of them"
         )
     return limit
 

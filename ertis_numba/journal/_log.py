@@ -20,8 +20,8 @@ from ertis_numba.journal._database import PAGE_BYTES
 __all__ = ["WriteAheadLog", "read_log"]
 
 _HEADER_BYTES: Final = 32
-_FRAME: Final = struct.Struct(">6I")  # page, pages after a commit or 0, two salts, two checksums
-_MAGIC: Final = 0x377F0682  # with the last bit set, checksums read big-endian words
+_FRAME: Final = struct.Struct(">6I")  # Page, pages after a commit or 0, two salts, two checksums.
+_MAGIC: Final = 0x377F0682  # With the last bit set, checksums read big-endian words.
 _VERSION: Final = 3_007_000
 _PAGE_BYTES: Final = range(512, 65_537)
 
@@ -98,7 +98,7 @@ def read_log(path: Path) -> WriteAheadLog | None:
         content=content,
         n_read=n_read,
         n_frames=int(commits[-1]) + 1 if len(commits) else 0,
-        # A header that was cut off begins a new generation: all of the one before is in the main file.
+        # A truncated header begins a new generation: the previous one is completely in the main file.
         n_lost_commits=_count_lost(commits[commits >= n_read], sound) if is_begun else 0,
     )
 
@@ -169,7 +169,7 @@ def _advance(check: NDArray[np.uint32], n_pairs: int) -> NDArray[np.uint32]:
     """Return checksums after ``n_pairs`` further pairs of zero words."""
     low, middle, high = (int(step[-1]) for step in _steps(n_pairs + 1))
     step = np.array([[low, middle], [middle, high]], np.uint32)
-    return check @ step  # symmetric
+    return check @ step  # The matrix is symmetric.
 
 
 @cache

@@ -20,12 +20,12 @@ from ertis_numba.journal._log import WriteAheadLog
 
 try:
     import fcntl
-except ImportError:  # Windows
+except ImportError:  # fcntl does not exist on Windows.
     fcntl = None  # type: ignore[assignment]
 
 __all__ = ["choose_log"]
 
-_LOCK_BYTES: Final = (0x40000000, 512)  # of SQLite, see https://sqlite.org/lockingv3.html
+_LOCK_BYTES: Final = (0x40000000, 512)  # Lock bytes of SQLite, see https://sqlite.org/lockingv3.html
 
 
 def choose_log(path: Path, log: WriteAheadLog) -> None:

@@ -1,4 +1,4 @@
-"""What goes into a journal and comes out of it: sensors, measurements and gaps, and the rows they are."""
+"""Sensors, measurements and gaps of a journal, and their rows."""
 
 import zlib
 from collections.abc import Sequence
@@ -20,8 +20,8 @@ from ertis_numba.settings import Air, Settings
 __all__ = ["Entry", "JournalGap", "JournalKey", "JournalSensor", "checked", "require_same"]
 
 _INT64 = (-(2**63), 2**63 - 1)
-_UNKNOWN = 7 * (0.0,)  # stands for an unknown mounting: translation, and a rotation that no mounting has
-_MAX_BYTES = 999_000_000  # of one measurement: SQLite's limit, less the rest of the row
+_UNKNOWN = 7 * (0.0,)  # Represents an unknown mounting: translation, and a rotation that no mounting has.
+_MAX_BYTES = 999_000_000  # Limit on one measurement: SQLite's limit, minus the rest of the row.
 
 
 @dataclass(slots=True, eq=False)
@@ -31,11 +31,12 @@ class Entry:
     Attributes
     ----------
     measurement : Measurement
-        Sensor, epoch and sequence number are the key; choose an epoch at random whenever sequence numbers start again.
+        Sensor, session_id and sequence number are the key. Choose a random session_id whenever sequence numbers
+        restart.
     monotonic_ns : int
-        When it arrived, by a clock that nobody sets.
+        Time of arrival, by a monotonic clock.
     crc32 : int, optional
-        Of the words, little-endian; `Journal.append` fills it in where it is not given.
+        CRC-32 of the data, little-endian; `Journal.append` fills it in if it is not given.
     """
 
     measurement: Measurement
@@ -44,7 +45,7 @@ class Entry:
 
 
 class JournalKey(NamedTuple):
-    """Which measurement a row is; ``place`` counts all of a journal in order of arrival."""
+    """Key of a measurement; ``place`` counts all rows of a journal in order of arrival."""
 
     place: int
     sensor: str
@@ -54,7 +55,7 @@ class JournalKey(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class JournalGap:
-    """Sequence numbers of a run of a sensor that are missing, ``first`` and ``last`` included, and why."""
+    """Missing sequence numbers of a sensor's session, ``first`` and ``last`` included, with the reason."""
 
     sensor: str
     first: int
@@ -69,7 +70,7 @@ class JournalGap:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JournalSensor:
-    """A sensor whose measurements a journal takes.
+    """Sensor of a journal.
 
     Attributes
     ----------
@@ -78,13 +79,13 @@ class JournalSensor:
         They depend on no file.
     firmware : str
     translation_m : (x, y, z), or None
-        Where it is; None if its mounting is unknown.
+        Position; None if its mounting is unknown.
     rotation_xyzw : (x, y, z, w), or None
-        The unit quaternion that turns the sensor frame into that of the surroundings.
+        Unit quaternion that rotates the sensor frame into the frame of the surroundings.
     shape : tuple of int
-        Of the words of a measurement.
+        Shape of a measurement's data.
     dtype : dtype
-        Of the words, little-endian.
+        Type of the data, little-endian.
     """
 
     name: str
@@ -105,7 +106,7 @@ class JournalSensor:
         translation_m: Sequence[float] | None = None,
         rotation_xyzw: Sequence[float] | None = None,
     ) -> Self:
-        """Return a sensor, or refuse what no recording could hold."""
+        """Return a sensor; refuse one that a recording cannot contain."""
         settings = storable(settings)
         words = sample_format(settings)
         place = mounting(checks.sensor_name(name), translation_m, rotation_xyzw)
@@ -120,24 +121,24 @@ class JournalSensor:
         )
         if made.n_bytes > _MAX_BYTES:
             raise ArgumentError(
-                f"a measurement of sensor {name} has {made.n_bytes / 1e6:.0f} MB, which a journal cannot hold; give "
-                f"fewer samples, {_MAX_BYTES / 1e6:.0f} MB at most"
+                f"a measurement of sensor {name} has {made.n_bytes / 1e6:.0f} MB, but the limit of a journal is "
+                f"{_MAX_BYTES / 1e6:.0f} MB; give fewer samples"
             )
         return made
 
     @property
     def n_bytes(self) -> int:
-        """Size of one measurement's words."""
+        """Size of one measurement's data."""
         return int(np.prod(self.shape)) * self.dtype.itemsize
 
     def row(self) -> tuple[Any, ...]:
-        """Return what stands in the table."""
+        """Return the row in the table."""
         place = (*(self.translation_m or _UNKNOWN[:3]), *(self.rotation_xyzw or _UNKNOWN[3:]))
         return (self.name, self.settings.to_toml(), self.firmware, *place)
 
     @classmethod
     def from_row(cls, path: Path, row: Sequence[Any]) -> Self:
-        """Return what stands in the table of a journal."""
+        """Return the sensor of a row."""
         name, text, firmware, *place = checked(path, "a sensor", row)
         try:
             settings = received_settings(text, f"{path}: settings of sensor {name}")
@@ -148,7 +149,7 @@ class JournalSensor:
         return cls.of(name, settings, firmware=firmware, translation_m=place[:3], rotation_xyzw=place[3:])
 
     def entry_row(self, entry: Entry, sensor_id: int) -> tuple[Any, ...]:
-        """Return what stands in the table of measurements; refuse words that are not those of this sensor."""
+        """Return the row of a measurement; refuse data that does not match this sensor."""
         stamp, air = entry.measurement.stamp, entry.measurement.settings.air
         words = self._words(entry.measurement.data)
         if entry.crc32 is None:
@@ -171,29 +172,29 @@ class JournalSensor:
     def _words(self, words: NDArray[np.unsignedinteger[Any]]) -> NDArray[np.unsignedinteger[Any]]:
         checks.shape(f"a measurement of sensor {self.name}", words.shape, self.shape)
         if words.dtype.newbyteorder("<") != self.dtype:
-            raise ArgumentError(f"a measurement of sensor {self.name} holds {words.dtype}; give {self.dtype.name}")
+            raise ArgumentError(f"a measurement of sensor {self.name} contains {words.dtype}; give {self.dtype.name}")
         return np.ascontiguousarray(words, dtype=self.dtype)
 
     def entry(self, path: Path, row: Sequence[Any]) -> Entry:
-        """Return what stands in the table of measurements of a journal.
+        """Return the measurement of a row.
 
         Raises
         ------
         DamagedError
-            It is not what was written.
+            The row is damaged.
         """
         *values, words = row
         what = f"measurement {row[3]} of sensor {self.name}"
         _, session_id, sequence, sync_count, time_ns, uncertainty_ns, monotonic_ns, *air, crc32 = checked(
             path, what, values
         )
-        if not isinstance(words, bytes):  # the record of their type is damaged
+        if not isinstance(words, bytes):  # The recorded type is damaged.
             words = b""
         got = zlib.crc32(words)
         if got != crc32 or len(words) != self.n_bytes:
             raise DamagedError(
-                f"{path}: {what} has CRC-32 {got:08x}, its record says {crc32:08x}: the journal is damaged; copy it "
-                "again if you can"
+                f"{path}: {what} has CRC-32 {got:08x}, but its record states {crc32:08x}: the journal is "
+                "damaged; copy it again if you can"
             )
         settings = self.settings
         if (given := Air(temperature_c=air[0], humidity_percent=air[1], pressure_pa=air[2])) != settings.air:
@@ -211,19 +212,19 @@ class JournalSensor:
 
 
 def checked(path: Path, what: str, row: Sequence[Any]) -> list[Any]:
-    """Return the values of a row without its number and its CRC-32, once that has been compared."""
+    """Return the values of a row without its number and its CRC-32, after a check of the CRC-32."""
     _, *values, wanted = row
     got = row_crc32(values)
     if got != wanted:
         raise DamagedError(
-            f"{path}: the record of {what} has CRC-32 {got}, wanted {wanted!r}: the journal is damaged; copy it "
-            "again if you can"
+            f"{path}: the record of {what} has CRC-32 {got}, but should have {wanted!r}: the journal is damaged; "
+            "copy it again if you can"
         )
     return values
 
 
 def require_same(sensor: JournalSensor, settings: Settings) -> None:
-    """Refuse what the settings of a sensor do not describe: all but the air must be equal."""
+    """Refuse settings that differ from those of the sensor in more than the air."""
     came = self_contained(settings)
     for name in ("array", "call", "recording"):
         if getattr(came, name) != getattr(sensor.settings, name):

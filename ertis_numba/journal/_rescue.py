@@ -64,7 +64,7 @@ def rescue(journal: "Journal", database: Database, log: WriteAheadLog | None) ->
     n_commits = log.n_lost_commits if log is not None else 0
     try:
         missing = list(_missing(journal))
-    except DamagedError:  # of a record of a gap, without which nothing is sealed
+    except DamagedError:  # A damaged record of a gap prevents sealing.
         return ""
     if not n_commits and not missing:
         return ""
@@ -82,9 +82,9 @@ def rescue(journal: "Journal", database: Database, log: WriteAheadLog | None) ->
     is_complete = found is not None and found.is_complete
     unrecorded += _note(
         journal, _missing(journal) if is_complete else missing
-    )  # or what the sensor skipped would be lost
+    )  # Otherwise numbers skipped by the sensor would be lost.
     if kept and not (unrecorded or missing or found is None or found.entries or found.gaps or found.lost):
-        kept.unlink(missing_ok=True)  # only rows that were deleted meanwhile
+        kept.unlink(missing_ok=True)  # Only rows that were deleted meanwhile are missing.
     return "; ".join(unrecorded)
 
 
@@ -206,7 +206,7 @@ def _add(journal: "Journal", found: _Found) -> list[str]:
                 rotation_xyzw=sensor.rotation_xyzw,
             )
     for entry in found.entries:
-        with suppress(ArgumentError):  # what a crash before has left in the log may be there already
+        with suppress(ArgumentError):  # The log left by an earlier crash may contain it already.
             journal.append([entry])
     journal.note_gaps([gap for gap in found.gaps if gap.sensor in journal.sensors])
     return [f"{found.n_unreadable} measurements whose numbers cannot be read"] if found.n_unreadable else []

@@ -1,4 +1,4 @@
-"""How much a journal may take of a disk, so that it can be sealed there."""
+"""Disk space that a journal may use so that it can still be sealed."""
 
 import shutil
 from collections.abc import Sequence
@@ -11,37 +11,37 @@ from ertis_numba.journal._database import LOG_BYTES, PAGE_BYTES
 
 __all__ = ["left", "recording_bytes", "require"]
 
-_SPARE_BYTES: Final = RESERVED_BYTES + 1_000_000  # what sealing wants to keep free while it writes, and a little more
-_SENSOR_BYTES: Final = 150_000  # a recording's tables: 90 kB were measured, and the settings may be longer
-_ROW_BYTES: Final = 150  # in these tables
-_KEPT_PAGES: Final = 6  # that a commit changes, beside one for each of its measurements
+_SPARE_BYTES: Final = RESERVED_BYTES + 1_000_000  # Slightly more than sealing keeps free while it writes.
+_SENSOR_BYTES: Final = 150_000  # Tables of a recording: 90 kB were measured, and settings may be longer.
+_ROW_BYTES: Final = 150  # Bytes per row in these tables.
+_KEPT_PAGES: Final = 6  # Pages that a commit changes, in addition to one for each measurement.
 
 
 def recording_bytes(words_bytes: int, *, n_rows: int, n_sensors: int) -> int:
-    """Return about how long a recording will be."""
+    """Return the approximate length of a recording."""
     return words_bytes + n_rows * _ROW_BYTES + n_sensors * _SENSOR_BYTES
 
 
 def require(path: Path, target: Path, *, sizes_bytes: Sequence[int], seals_bytes: int) -> None:
-    """Refuse measurements after which a journal could no longer be sealed.
+    """Refuse measurements after which a journal could not be sealed any more.
 
-    The disk of ``target`` has to have room for the recording of all that is in the journal, and some to spare;
-    that of the journal for what is in the log now, which moves to the main file, and for the new measurements,
-    first in the log and then in the main file; or, without a log, for these and the pages that change.
+    The disk of ``target`` needs room for the recording of the whole journal, and a reserve. The disk of the journal
+    needs room for the log, which moves to the main file. It also needs room for the new measurements, first in the log
+    and then in the main file; or, without a log, for them and the changed pages.
 
     Parameters
     ----------
     path, target : Path
-        The journal and the recording to be made of it.
+        Journal, and recording to be made of it.
     sizes_bytes : sequence of int
-        Words of each measurement that is to be added.
+        Size of each new measurement.
     seals_bytes : int
         Length of the recording with them.
 
     Raises
     ------
-    NoRoomError
-        There is too little room.
+    DiskFullError
+        There is not enough free space.
     """
     log = path.with_name(f"{path.name}-wal")
     grows_bytes = sum((size // PAGE_BYTES + 2) * PAGE_BYTES for size in sizes_bytes)
@@ -53,20 +53,20 @@ def require(path: Path, target: Path, *, sizes_bytes: Sequence[int], seals_bytes
         free_bytes = shutil.disk_usage(folder).free
         if free_bytes < wanted_bytes:
             raise DiskFullError(
-                f"{folder} has {free_bytes / 1e6:.1f} MB free, wanted {wanted_bytes / 1e6:.1f} MB so that {path.name} "
-                "can be sealed with more in it; what it holds is safe: end the capture, or free some space"
+                f"{folder} has {free_bytes / 1e6:.1f} MB free, but {wanted_bytes / 1e6:.1f} MB are needed to "
+                f"seal {path.name} with more in it; its content is safe: end the capture, or free some space"
             )
 
 
 def left(path: Path, target: Path, *, seals_bytes: int) -> int:
-    """Return how many more bytes of words a journal can take, whose recording would be ``seals_bytes`` long by now."""
+    """Return the remaining capacity of a journal in bytes, if its recording would be ``seals_bytes`` long by now."""
     wanted = _wanted(path, target, LOG_BYTES, seals_bytes)
     rooms = [shutil.disk_usage(folder).free - wanted_bytes for folder, wanted_bytes in wanted.items()]
-    return max(0, min(rooms) // (3 - len(rooms)))  # on one disk, each byte needs room twice
+    return max(0, min(rooms) // (3 - len(rooms)))  # On one disk, each byte needs space twice.
 
 
 def _wanted(path: Path, target: Path, journal_bytes: int, seals_bytes: int) -> dict[Path, int]:
-    """Return what is wanted in each folder, or in one of them for both if they are on the same disk."""
+    """Return the space needed in each folder, or in one of them for both if they are on the same disk."""
     folders = path.absolute().parent, target.absolute().parent
     target_bytes = seals_bytes + _SPARE_BYTES
     try:

@@ -1,4 +1,4 @@
-"""Sensors, measurements and gaps of an open journal, as they are added and deleted."""
+"""Insertion and deletion of sensors, measurements and gaps of an open journal."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -21,12 +21,12 @@ _INSERTION: Final = insertion("measurements")
 
 
 class Rows(Contents):
-    """An open journal, as far as its rows change.
+    """An open journal for changes.
 
     Attributes
     ----------
     tally : Tally
-        Highest numbers that were stored.
+        Highest stored numbers.
     """
 
     def __init__(self, path: Path, database: Database) -> None:
@@ -43,55 +43,55 @@ class Rows(Contents):
         translation_m: Sequence[float] | None = None,
         rotation_xyzw: Sequence[float] | None = None,
     ) -> None:
-        """Say of what sensor measurements will come; at any time before its first one.
+        """Register a sensor at any time before its first measurement.
 
         Parameters
         ----------
         name : str
         settings : Settings
-            Those of its measurements, whose air may differ. Layout files are written out.
+            Settings of its measurements, whose air may differ. The journal contains the content of layout files.
         firmware : str
         translation_m : sequence of 3 float, optional
-            Where it is: x, y, z. Its mounting is unknown if neither this nor ``rotation_xyzw`` is given.
+            Position x, y, z. The mounting is unknown if neither this nor ``rotation_xyzw`` is given.
         rotation_xyzw : sequence of 4 float, optional
-            The unit quaternion that turns the sensor frame into that of the surroundings.
+            Unit quaternion that rotates the sensor frame into the frame of the surroundings.
 
         Raises
         ------
         ArgumentError
-            The journal has it, or no recording could hold this.
+            The sensor is registered already, or a recording cannot contain it.
         DataError
-            The journal cannot be written.
+            The journal is not writable.
         """
         made = JournalSensor.of(
             name, settings, firmware=firmware, translation_m=translation_m, rotation_xyzw=rotation_xyzw
         )
         with self._turn:
             if name in self._sensors:
-                raise ArgumentError(f"sensor {name!r} is in {self.path} already; give each sensor a name of its own")
+                raise ArgumentError(f"sensor {name!r} is in {self.path} already; give each sensor its own name")
             with self._database.transaction():
                 self._insert("sensors", made.row())
             self._register(len(self._ids) + len(self._unusable) + 1, made)
 
     def append(self, entries: Sequence[Entry]) -> None:
-        """Make measurements durable: when this returns they are, all of them; when it raises, none is there.
+        """Store measurements durably, all or none.
 
         Parameters
         ----------
         entries : sequence of Entry
-            Of any sensors in any order. The sequence numbers of a sensor rise within an epoch. Their
-            ``crc32`` is filled in where it is None.
+            Measurements of any sensors in any order. The sequence numbers of a sensor rise within a session. ``crc32``
+            is filled in if it is None.
 
         Raises
         ------
         ArgumentError
-            A measurement does not fit to its sensor, or its number does not rise.
-        NoRoomError
+            A measurement does not match its sensor, or its number does not rise.
+        DiskFullError
             The disk is full, or nearly so, and nothing was written. More can be appended once there is room.
         DataError
-            The disk is full or fails. What was appended before is still there.
-        InUseError
-            Somebody has removed the journal, or put another in its place.
+            The disk is full or fails. Earlier measurements are still there.
+        JournalInUseError
+            Another process has removed or replaced the journal.
         """
         with self._turn:
             last = dict(self._last)
@@ -116,7 +116,7 @@ class Rows(Contents):
                 self.tally.grow(*run, number, last[run])
 
     def _row(self, entry: Entry, last: dict[tuple[str, int], int]) -> tuple[Any, ...]:
-        """Return the row of a measurement, whose number is to be above the one in ``last``."""
+        """Return the row of a measurement, whose number must be above the one in ``last``."""
         stamp, settings = entry.measurement.stamp, entry.measurement.settings
         sensor = self._sensor(stamp.sensor)
         if settings is not self._accepted.get(sensor.name):
@@ -126,27 +126,27 @@ class Rows(Contents):
         key = (sensor.name, stamp.session_id)
         if stamp.sequence <= last.get(key, -1):
             raise ArgumentError(
-                f"measurement {stamp.sequence} of sensor {sensor.name} comes after {last[key]}; give them in order, or "
-                "with another epoch"
+                f"measurement {stamp.sequence} of sensor {sensor.name} follows {last[key]}; give rising numbers, "
+                "or another session_id"
             )
         last[key] = stamp.sequence
         return row
 
     def note_gap(self, sensor: str, first: int, last: int, reason: str, *, session_id: int) -> None:
-        """Say durably why sequence numbers of a run of a sensor are missing, ``first`` and ``last`` included.
+        """Note the reason for missing numbers of a sensor's session durably, ``first`` and ``last`` included.
 
         Raises
         ------
         ArgumentError
-            There is no such sensor or epoch, ``last`` comes before ``first``, or the reason is no line of at most 64
+            The sensor or session is unknown, ``last`` comes before ``first``, or the reason is not a line of at most 64
             bytes.
         DataError
-            The journal cannot be written.
+            The journal is not writable.
         """
         self.note_gaps([JournalGap(sensor, first, last, reason, session_id)])
 
     def note_gaps(self, gaps: Sequence[JournalGap]) -> None:
-        """Say durably what is missing, all of it or nothing.
+        """Note gaps durably, all or none.
 
         Raises
         ------
@@ -167,29 +167,29 @@ class Rows(Contents):
                 self.tally.grow(gap.sensor, gap.session_id, gap.first, gap.last)
 
     def discard(self, sensor: str, session_id: int, up_to: int) -> int:
-        """Delete measurements of a run of a sensor that others hold by now, and gaps; durably, all or nothing.
+        """Delete measurements of a sensor's session that another node has stored, and gaps; durably, all or none.
 
-        From the first time on, the numbers of rows have holes, as those of several sensors lie between each other; so
-        whoever opens the journal counts rows instead, and a package that cannot refuses it (format version 2).
+        After the first call, row numbers have holes, because rows of several sensors are interleaved. Readers then
+        count rows instead, and earlier versions of this package refuse the journal (format version 2).
 
         Parameters
         ----------
         sensor : str
         session_id : int
         up_to : int
-            The last sequence number to be deleted. Of a gap that goes on beyond it, everything stays.
+            Last sequence number to delete. A gap that extends beyond it stays whole.
 
         Returns
         -------
         int
-            Measurements that were deleted.
+            Number of deleted measurements.
 
         Raises
         ------
         ArgumentError
-            There is no such sensor.
+            The sensor is unknown.
         DataError
-            The journal cannot be written.
+            The journal is not writable.
         """
         known = self._sensor(sensor)
         which = self._ids[known.name], session_id, up_to
@@ -218,7 +218,7 @@ class Rows(Contents):
         self._database.execute(insertion(table), (*values, row_crc32(values)))
 
     def room(self) -> int:
-        """Return how many more bytes of words can be appended such that all can still be sealed, about.
+        """Return the approximate number of data bytes that can be appended so that all can still be sealed.
 
         Raises
         ------
@@ -229,7 +229,7 @@ class Rows(Contents):
             return _room.left(self.path, self.target, seals_bytes=self._seals_bytes())
 
     def _seals_bytes(self, more_bytes: int = 0, n_more: int = 0) -> int:
-        """Return about how long the recording will be, with some measurements more."""
+        """Return the approximate length of the recording with additional measurements."""
         return _room.recording_bytes(
             self._held_bytes + more_bytes, n_rows=len(self) + n_more, n_sensors=len(self._sensors)
         )

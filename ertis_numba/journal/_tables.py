@@ -1,4 +1,4 @@
-"""What a journal holds: its tables and their version."""
+"""Tables of a journal, and their version."""
 
 import struct
 import zlib
@@ -19,13 +19,13 @@ __all__ = [
 ]
 
 APPLICATION_ID: Final = 0x6552544A
-"""``eRTJ``: what SQLite keeps in the header of the file, beside the version."""
+"""``eRTJ``, stored by SQLite in the header of the file, beside the version."""
 
 VERSION: Final = 2
-"""The highest of a journal: 1 until measurements are discarded from it, 2 from then on."""
+"""Highest version of a journal: 1 until measurements are discarded from it, 2 afterwards."""
 
 COMPLETE_VERSION: Final = 1
-"""Of a journal whose rows have no holes in their numbers, but for what is missing from the front."""
+"""Version of a journal whose row numbers have no holes, except at the front."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,14 +51,14 @@ class Column:
 _ID = Column("id", "INTEGER", "order of arrival, from 1")
 _CHECK = Column("row_crc32", "INTEGER", "CRC-32 over the columns before it without id")
 _SENSOR = Column("sensor", "INTEGER", "id of the sensor")
-_SESSION_ID = Column("epoch", "INTEGER", "run of the sensor, chosen at random whenever sequence numbers start again")
+_SESSION_ID = Column("epoch", "INTEGER", "session of the sensor, random for each restart of sequence numbers")
 
 TABLES: Final[Mapping[str, tuple[Column, ...]]] = {
     "journal": (
         _ID,
         Column("target", "BLOB", "recording to be made, from the folder of the journal; bytes of a path"),
-        Column("source", "TEXT", "where the measurements come from"),
-        Column("created", "TEXT", "when the journal was made, ISO 8601"),
+        Column("source", "TEXT", "origin of the measurements"),
+        Column("created", "TEXT", "time of creation, ISO 8601"),
         _CHECK,
     ),
     "sensors": (
@@ -66,7 +66,7 @@ TABLES: Final[Mapping[str, tuple[Column, ...]]] = {
         Column("name", "TEXT", "name or serial number"),
         Column("settings", "TEXT", "settings as TOML; they hold the array itself"),
         Column("firmware", "TEXT", "version of the sensor's firmware"),
-        Column("x_m", "REAL", "where the sensor is", "m"),
+        Column("x_m", "REAL", "position of the sensor", "m"),
         Column("y_m", "REAL", "the same", "m"),
         Column("z_m", "REAL", "the same", "m"),
         Column(
@@ -83,11 +83,11 @@ TABLES: Final[Mapping[str, tuple[Column, ...]]] = {
         _ID,
         _SENSOR,
         _SESSION_ID,
-        Column("sequence", "INTEGER", "number given at capture; it rises within an epoch of a sensor"),
+        Column("sequence", "INTEGER", "number given at capture; it rises within a session of a sensor"),
         Column("sync_count", "INTEGER", "pulse of the SYNC chain, equal for sensors that emitted together"),
         Column("timestamp_ns", "INTEGER", "start of the emission", "nanoseconds since 1970-01-01T00:00:00"),
         Column("timestamp_uncertainty_ns", "INTEGER", "uncertainty of timestamp_ns", "ns"),
-        Column("monotonic_ns", "INTEGER", "when it arrived, by a clock that nobody sets", "ns"),
+        Column("monotonic_ns", "INTEGER", "time of arrival, by a monotonic clock", "ns"),
         Column("temperature_c", "REAL", "air temperature", "degree_Celsius"),
         Column("humidity_percent", "REAL", "relative humidity", "percent"),
         Column("pressure_pa", "REAL", "air pressure", "Pa"),
@@ -101,14 +101,14 @@ TABLES: Final[Mapping[str, tuple[Column, ...]]] = {
         _SESSION_ID,
         Column("first", "INTEGER", "first missing sequence number"),
         Column("last", "INTEGER", "last missing sequence number"),
-        Column("reason", "TEXT", "why they are missing"),
+        Column("reason", "TEXT", "reason"),
         _CHECK,
     ),
 }
 
 
 def layout() -> Iterable[str]:
-    """Yield the statements that make the tables, and one that finds a measurement by its key."""
+    """Yield the statements that create the tables, and the index of keys."""
     for table, columns in TABLES.items():
         kinds = ", ".join(
             f"{column.name} {column.kind} {'PRIMARY KEY' if column is _ID else 'NOT NULL'}" for column in columns
@@ -133,8 +133,8 @@ def selection(table: str, where: str = "") -> str:
 def row_crc32(values: Iterable[float | str | bytes | None]) -> int:
     """Return the CRC-32 of a row.
 
-    It is over the values one after the other: of each a letter for its type, the number of bytes as a little-endian
-    32-bit integer, and the bytes. The types are ``I`` for an integer, in decimal digits, after a ``-`` where it is
+    It covers the values one after the other. Each value has a letter for its type, the number of bytes as a
+    little-endian 32-bit integer, and the bytes. The types are ``I`` for an integer in decimal digits with a ``-`` if
     negative; ``R`` for a real number, as a little-endian double; ``T`` for text in UTF-8; ``B`` for bytes; and ``N``
     for NULL, without bytes.
     """
@@ -152,7 +152,7 @@ def _bytes_of(value: float | str | bytes | None) -> tuple[bytes, bytes]:
         case int():
             return b"I", b"%d" % value
         case float():
-            return b"R", struct.pack("<d", value + 0.0)  # SQLite stores -0.0 as 0.0
+            return b"R", struct.pack("<d", value + 0.0)  # SQLite stores -0.0 as 0.0.
         case str():
             return b"T", value.encode()
         case _:

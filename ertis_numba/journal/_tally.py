@@ -16,14 +16,14 @@ from typing import Any, Final
 __all__ = ["TALLY", "Mark", "Tally"]
 
 TALLY: Final = "-tally"
-"""End of the name of the file, after that of the journal."""
+"""Suffix of the file, after the name of the journal."""
 
-_BLOCK_BYTES: Final = 512  # which a disk writes as a whole
+_BLOCK_BYTES: Final = 512  # A disk writes a block as a whole.
 
 
 @dataclass(slots=True)
 class Mark:
-    """Numbers of one run of a sensor.
+    """Numbers of one session of a sensor.
 
     Attributes
     ----------
@@ -154,13 +154,13 @@ class Tally:
     def _write(self, place: int, block: dict[str, Any]) -> None:
         text = json.dumps(block, ensure_ascii=False).encode()
         line = b"%08x %s" % (zlib.crc32(text), text)
-        if len(line) >= _BLOCK_BYTES:  # the longest names are not counted
+        if len(line) >= _BLOCK_BYTES:  # Sessions with the longest names are not counted.
             return
         os.lseek(self._descriptor, place * _BLOCK_BYTES, os.SEEK_SET)
         os.write(self._descriptor, line.ljust(_BLOCK_BYTES - 1) + b"\n")
 
     def close(self) -> None:
-        """Close the file; closing twice does no harm."""
+        """Close the file; closing twice is harmless."""
         if self._descriptor >= 0:
             os.close(self._descriptor)
             self._descriptor = -1

@@ -1,4 +1,4 @@
-"""Sealing in a process of its own: HDF5 that meets a full disk takes its process with it."""
+"""Sealing in a separate process, because HDF5 can crash its process on a full disk."""
 
 import json
 import os
@@ -21,28 +21,28 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True, slots=True)
 class Sealed:
-    """What became of a journal.
+    """Result of sealing a journal.
 
     Attributes
     ----------
     journal : Path
     recording : Path or None
-        None where nothing had been measured.
+        None if the journal had no measurement.
     measurements : int
-        In the recording.
+        Number in the recording.
     missing : int
-        Measurements that the recording says to be missing; of those, …
+        Number of missing measurements; of those, …
     damaged : int
         … were damaged in the journal.
     set_aside : Path or None
         New path of the journal if it has damaged or refused measurements; otherwise the journal was removed.
     lost : int
-        Missing numbers that the journal had noted before its log was damaged: each of a stored measurement, or of a
-        gap, or skipped by the sensor.
+        Missing numbers that the journal had noted before its log was damaged: each of a stored measurement, of a gap,
+        or skipped by the sensor.
     damage : str
         Losses from a damaged log that no gap of the recording covers; empty if there are none.
     refused : dict of str to str
-        Sensors whose measurements no recording can hold, and the reasons.
+        Sensors whose measurements a recording cannot contain, with reasons.
     """
 
     journal: Path
@@ -57,7 +57,7 @@ class Sealed:
 
     @property
     def remark(self) -> str:
-        """What is not as its user would expect, in a line; empty where all is well."""
+        """Irregularities in one line; empty if there are none."""
         if self.recording is None and not self.refused:
             return f"{self.journal}: no measurement was captured"
         reported = []
@@ -82,33 +82,33 @@ def seal_apart(
     rests: float | None = None,
     progress: Progress = lambda _done, _of: None,
 ) -> Sealed:
-    """Make the recording of a journal in a process of its own; see `ertis_numba.storage.sealing.seal`.
+    """Make the recording of a journal in a separate process; see `ertis_numba.storage.sealing.seal`.
 
-    Ctrl-C in a terminal does not reach that process. Whatever ends it, the measurements are in the journal or in the
-    recording, and it can be called again.
+    Ctrl-C in a terminal does not reach that process. Regardless of its end, the measurements are in the journal or in
+    the recording, and sealing can be repeated.
 
     Parameters
     ----------
     journal : Path
     overwrite : bool
-        Replace a file of the recording's name, even if it holds something else.
+        Replace an existing file, even if it has other content.
     rests : float, optional
-        Let others have the processors first, and the disk for so many times as long as each little step takes.
+        Yield the processors, and rest after each step for this multiple of its duration.
     progress : callable, optional
-        Called with the number of measurements that are written and that of all, at most some hundred times.
+        Called with the number of written measurements and of all measurements, about a hundred times.
 
     Raises
     ------
-    InUseError
-        Another process has the journal.
+    JournalInUseError
+        Another process has the journal open.
     DataError
-        It failed; the journal is still there.
+        Sealing failed; the journal is still there.
     OSError
         No process can be started.
     KeyboardInterrupt
-        The process was ended; the text of this error says where the measurements are.
+        The process was ended; the message names the place of the measurements.
     """
-    # -P: a file in the current folder that is named like one of Python's must not be taken for it.
+    # -P: Python must not import a file of the current folder in place of a standard module.
     command = [sys.executable, "-P", "-m", "ertis_numba.storage.sealing_process", "--json"]
     reported: dict[str, Any] = {}
     try:
@@ -124,7 +124,7 @@ def seal_apart(
 
 
 def _run(command: list[str], reported: dict[str, Any], progress: Progress) -> str:
-    """Run a process, put the result that it tells into ``reported``, and return how it ended."""
+    """Run a process, put its result into ``reported``, and return a description of its end."""
     with subprocess.Popen(  # noqa: S603  this very package
         command,
         stdin=subprocess.DEVNULL,
@@ -133,7 +133,8 @@ def _run(command: list[str], reported: dict[str, Any], progress: Progress) -> st
         text=True,
         errors="backslashreplace",
         start_new_session=True,
-        creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),  # what Windows has for a session
+        # Windows has process groups instead of sessions.
+        creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
     ) as process:
         stated: deque[str] = deque(maxlen=1)
         listener = Thread(target=_listen, args=(process.stderr, stated), daemon=True)
@@ -146,20 +147,20 @@ def _run(command: list[str], reported: dict[str, Any], progress: Progress) -> st
             raise
         process.wait()
         listener.join()
-    return f"ended with {process.returncode}, " + (f"saying {stated[0]!r}" if stated else "saying nothing")
+    return f"ended with {process.returncode}, " + (f"printing {stated[0]!r}" if stated else "printing nothing")
 
 
 def _listen(stream: IO[str] | None, stated: deque[str]) -> None:
-    """Keep the last line: of a traceback, that is the error."""
+    """Keep the last line, which is the error of a traceback."""
     stated.extend(line.strip() for line in stream or () if line.strip())
 
 
 def _take(stream: IO[str] | None, reported: dict[str, Any], progress: Progress) -> None:
-    """Pass progress on until the process has no more to tell."""
+    """Forward progress until the process ends its output."""
     for line in stream or ():
         try:
             report = json.loads(line)
-        except ValueError:  # what is killed may have told half of it
+        except ValueError:  # A killed process may have printed half a line.
             continue
         if "of" in report:
             progress(report["done"], report["of"])
@@ -168,7 +169,7 @@ def _take(stream: IO[str] | None, reported: dict[str, Any], progress: Progress) 
 
 
 def _end(process: "subprocess.Popen[str]") -> None:
-    """Ask a process to end, such that it leaves nothing half-written where that can be asked."""
+    """Ask a process to end cleanly where the system allows it."""
     if os.name == "posix":
         process.send_signal(signal.SIGINT)
     else:
@@ -181,8 +182,8 @@ def _sealed(reported: dict[str, Any]) -> Sealed:
 
 
 def _where(journal: Path, reported: dict[str, Any]) -> str:
-    """Say where the measurements are after an interrupt, which may have come too late to matter."""
+    """Return the place of the measurements after an interrupt, which may have come too late."""
     if "recording" not in reported:
-        return f"the measurements are safe in {journal}; seal them by 'ertis recover {journal}'"
+        return f"the measurements are safe in {journal}; recover them with 'ertis recover {journal}'"
     sealed = _sealed(reported)
     return sealed.remark or f"the measurements are in {sealed.recording}"

@@ -1,4 +1,4 @@
-"""Files: recordings and energyscapes. The only door to h5py."""
+"""Files of recordings and energyscapes; the only package that imports h5py."""
 
 from ertis_numba.atomic_files import atomic_write, check_target
 from ertis_numba.storage._reader import file_kind, sensor_names

@@ -11,9 +11,10 @@ from ertis_numba.storage.structure import require_attributes, stored_bytes
 
 __all__ = ["fault_of"]
 
-_MAX_BYTES: Final = 16 * 2**20  # of a dataset that no table names
+_MAX_BYTES: Final = 16 * 2**20  # Limit for a dataset that no table names.
 _DIMS: Final = {variable.name: variable.dims for variable in (*RECORDING, *RECORDING_OF_PCM)}
-_UNREADABLE: Final = (OSError, RuntimeError, LookupError, AttributeError, TypeError, ValueError)  # h5py on damage
+# Errors of h5py for damaged files.
+_UNREADABLE: Final = (OSError, RuntimeError, LookupError, AttributeError, TypeError, ValueError)
 
 
 def fault_of(path: Path) -> str:
@@ -68,7 +69,7 @@ def _fault(file: h5py.File, item: h5py.Group | h5py.Dataset) -> str:
 
 
 def _only_counts(item: h5py.Dataset) -> bool:
-    """Return whether a dataset is an axis without values, which stores nothing."""
+    """Return True if a dataset is an axis without values, which stores nothing."""
     is_here = not (item.is_virtual or item.external)
     return bool(item.is_scale and is_here and not item.id.get_storage_size())
 

@@ -1,4 +1,4 @@
-"""Which sequence numbers are missing, and why."""
+"""Missing sequence numbers with their reasons."""
 
 import bisect
 from collections.abc import Iterable, Iterator, Sequence
@@ -10,13 +10,13 @@ Range = tuple[int, int]
 Hole = tuple[int, int, str]
 
 UNKNOWN = "not among the measurements given"
-"""Reason of a gap of which nobody said more."""
+"""Reason of a gap without a noted reason."""
 
-_END = 2**63  # beyond all sequence numbers
+_END = 2**63  # Above all sequence numbers.
 
 
 class Missing(NamedTuple):
-    """Sequence numbers of a run of a sensor that are missing, ``first`` and ``last`` included, and why."""
+    """Missing sequence numbers of a sensor's session, ``first`` and ``last`` included, with the reason."""
 
     first: int
     last: int
@@ -25,26 +25,26 @@ class Missing(NamedTuple):
 
 
 class Runs:
-    """The sequence numbers of a sensor, of each of its runs, and what is missing among them."""
+    """Sequence numbers of a sensor's sessions, and the missing ones."""
 
     def __init__(self) -> None:
         self._numbers: dict[int, Numbers] = {}
 
     def holds(self, number: int, session_id: int) -> bool:
-        """Return whether a number of a run has come."""
+        """Return True if a number of a session has arrived."""
         return session_id in self._numbers and number in self._numbers[session_id]
 
     def add(self, number: int, session_id: int) -> None:
-        """Take the next number of a run."""
+        """Add the next number of a session."""
         self._numbers.setdefault(session_id, Numbers()).add(number)
 
     def missing(self, noted: Iterable[Missing]) -> list[Missing]:
-        """Return what is missing, in order of the runs: as they came, then those of which only gaps are known.
+        """Return the missing numbers in the order of the sessions: as they arrived, then those with gaps only.
 
         Parameters
         ----------
         noted : iterable of Missing
-            What somebody knows about.
+            Noted gaps.
         """
         known: dict[int, list[Hole]] = {}
         for first, last, reason, session_id in noted:
@@ -57,12 +57,12 @@ class Runs:
 
 
 class Numbers:
-    """The sequence numbers of one run of a sensor, as they come, and what is missing among them.
+    """Sequence numbers of one session of a sensor, in order of arrival, and the missing ones.
 
     Attributes
     ----------
     jumps : list of (first, last)
-        Missing from one number to the next.
+        Missing numbers between successive ones.
     """
 
     def __init__(self) -> None:
@@ -70,14 +70,14 @@ class Numbers:
         self._first: int | None = None
         self._last = 0
         self._highest = -1
-        self._skipped: list[Range] = []  # below the highest, when that came; some may have come late
-        self._late: set[int] = set()  # what did not rise
+        self._skipped: list[Range] = []  # Below the highest number at that time; some may have arrived late.
+        self._late: set[int] = set()  # Numbers that did not rise.
 
     def __contains__(self, number: int) -> bool:
         return number in self._late or (number <= self._highest and not any(_shared((number, number), self._skipped)))
 
     def add(self, number: int) -> None:
-        """Take the next number."""
+        """Add the next number."""
         if self._first is None:
             self._first = number
         elif number > self._last + 1:
@@ -91,16 +91,15 @@ class Numbers:
         self._last = number
 
     def missing(self, noted: Iterable[Hole]) -> list[Hole]:
-        """Return what is missing, in order: first, last and reason; neighbours with one reason are one.
+        """Return the missing numbers in order: first, last and reason; neighbours with one reason are merged.
 
-        Where the numbers rise, what is noted is missing if it lies outside of them or in a jump. Where they do not,
-        as in a recording whose writer gave no epochs, nothing shows which of two equal ones is meant, and all that is
-        noted is missing.
+        If the numbers rise, a noted gap is missing as far as it lies outside of them or in a jump. Otherwise, as in
+        recordings without session identifiers, equal numbers cannot be told apart, and all noted gaps are missing.
 
         Parameters
         ----------
         noted : iterable of (first, last, reason)
-            What somebody knows about. Where two overlap, the one that begins first is believed.
+            Noted gaps. If two overlap, the one that begins first has priority.
         """
         known = list(_disjoint(noted))
         if self._first is not None and not self._late:
@@ -120,7 +119,7 @@ def _disjoint(noted: Iterable[Hole]) -> Iterator[Hole]:
 
 
 def _shared(given: Range, others: Sequence[Range]) -> Iterator[Range]:
-    """Yield what a range has in common with others, which are in order and do not overlap."""
+    """Yield the intersection of a range with other ranges, which are in order and do not overlap."""
     for index in range(bisect.bisect_left(others, given[0], key=lambda other: other[1]), len(others)):
         first, last = others[index]
         if first > given[1]:
@@ -129,7 +128,7 @@ def _shared(given: Range, others: Sequence[Range]) -> Iterator[Range]:
 
 
 def _less(given: Range, others: Sequence[Range]) -> Iterator[Range]:
-    """Yield what a range has beyond others, which are in order and do not overlap."""
+    """Yield the difference between a range and other ranges, which are in order and do not overlap."""
     begin, end = given
     for first, last in _shared(given, others):
         if first > begin:

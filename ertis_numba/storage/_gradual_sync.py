@@ -1,4 +1,4 @@
-"""Work on files that leaves the disk to others: little of it at a time."""
+"""File operations in small steps, which leave the disk to others in between."""
 
 import os
 import time
@@ -9,24 +9,24 @@ from typing import Final
 
 __all__ = ["GradualSync", "shrinking"]
 
-_NICE: Final = 19  # the lowest priority that there is
+_NICE: Final = 19  # The lowest priority.
 _STEP_BYTES: Final = 4_000_000
 _SHRINK_BYTES: Final = 32_000_000
 _MAX_REST_S: Final = 0.5
 
 
 class GradualSync:
-    """Brings a file that grows to the disk step by step, and rests after each.
+    """Gradual sync of a growing file, with a rest after each step.
 
-    What gathers in memory goes to the disk at once when it is synced, and whoever wants to sync a little file then
-    has to wait for all of it: a commit beside it took 370 ms instead of 47.
+    A single sync would write all buffered data at once, and a sync of another small file would have to wait for it: a
+    commit beside it took 370 ms instead of 47 ms.
 
     Parameters
     ----------
     path : Path
-        It may not be there yet.
+        The file may not exist yet.
     rests : float
-        How many times as long as a step the rest after it is.
+        Rest after a step, relative to its duration.
     """
 
     def __init__(self, path: Path, rests: float) -> None:
@@ -36,7 +36,7 @@ class GradualSync:
             os.nice(_NICE)
 
     def __call__(self) -> None:
-        """Do a step if it is time for one."""
+        """Do a step, if due."""
         try:
             n_bytes = self._path.stat().st_size
         except FileNotFoundError:
@@ -59,11 +59,11 @@ def _sync_data(path: Path) -> None:
 
 @contextmanager
 def shrinking(path: Path, rests: float) -> Iterator[None]:
-    """If the block removes a file, give its room back little by little: to free GB at once keeps the disk busy."""
+    """Truncate a file in steps if the block removes it: freeing gigabytes at once keeps the disk busy."""
     if os.name != "posix" or not path.exists():
         yield
         return
-    # To close a file that SQLite has open in this process would end its locks: this one is closed after it.
+    # Closing a file that SQLite has open in this process would release its locks, so this one is closed afterwards.
     descriptor = os.open(path, os.O_RDWR)
     try:
         yield

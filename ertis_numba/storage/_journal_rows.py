@@ -1,4 +1,4 @@
-"""A journal as a recording would hold it."""
+"""Rows of a journal, as a recording would contain them."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ _DAMAGED = "damaged in the journal"
 
 @dataclass(frozen=True, slots=True)
 class Damage:
-    """A measurement that cannot be read: its place among those of its sensor, its number, and what is wrong."""
+    """Unreadable measurement: its index among those of its sensor, its number, and the damage."""
 
     index: int
     sequence: int
@@ -22,13 +22,13 @@ class Damage:
 
 
 class JournalRows:
-    """The measurements of one sensor of a journal, without those that are damaged.
+    """Measurements of one sensor of a journal, without damaged ones.
 
-    What it says beside them counts once all have been read.
+    The attributes are valid once all measurements have been read.
 
     Attributes
     ----------
-    keys : list of Key
+    keys : list of JournalKey
     damaged : list of Damage
     """
 
@@ -42,7 +42,7 @@ class JournalRows:
         self.damaged: list[Damage] = []
 
     def __len__(self) -> int:
-        """Return how many there are, with those that are damaged."""
+        """Return the number of measurements, damaged ones included."""
         return len(self.keys)
 
     def __iter__(self) -> Iterator[Entry]:
@@ -50,7 +50,7 @@ class JournalRows:
         for index, key in enumerate(self.keys):
             try:
                 entry = self._journal.entry(key)
-            except DamagedError as error:  # others may pass: nothing is lost yet
+            except DamagedError as error:  # Another error may be temporary: nothing is lost yet.
                 self.damaged.append(Damage(index, key.sequence, str(error)))
                 continue
             self._numbers.add(key.sequence, key.session_id)
@@ -58,7 +58,7 @@ class JournalRows:
 
     @property
     def missing(self) -> list[Missing]:
-        """What is missing, in order; with what is damaged."""
+        """Missing numbers in order, damaged ones included."""
         lost = [
             Missing(item.sequence, item.sequence, _DAMAGED, self.keys[item.index].session_id) for item in self.damaged
         ]

@@ -22,7 +22,7 @@ _Found: TypeAlias = tuple[NDArray[np.float64], NDArray[np.float64]] | tuple[None
 
 
 def describe_mounting(group: h5py.Group, place: Mapping[str, NDArray[np.float64]]) -> None:
-    """Store a mounting, as `ertis_numba.geometry.mounting` returns it, or that it is unknown."""
+    """Store a mounting, in the form of `ertis_numba.geometry.mounting`, or the fact that it is unknown."""
     describe(group, {"mounting": _GIVEN if place else _UNKNOWN, **place})
 
 

@@ -1,4 +1,4 @@
-"""What the readers of both kinds of file share: opening, refusing, and taking rows one by one."""
+"""Base class of the readers of both kinds of file."""
 
 import errno
 import hashlib
@@ -24,12 +24,14 @@ from ertis_numba.storage.truth import Truth, read_truth
 __all__ = ["FileReader", "file_kind", "sensor_names"]
 
 Item = TypeVar("Item")
-_UNREADABLE = (OSError, RuntimeError, LookupError, AttributeError, TypeError, ValueError)  # h5py on odd contents
-_SYSTEM_ERROR = re.compile(r"errno = (\d+), error message = '(.*?)'")  # amid what HDF5 says
-_PASSING = (errno.EIO, errno.ENXIO, errno.ENODEV, errno.ENOMEM, errno.ETIMEDOUT)  # others may come of damaged addresses
-_LEFT_OPEN = "already open for write"  # a mark in the file, which a program that is killed leaves behind
-_OMITTED = {"word"}  # where there is one of them
-_MAX_NAMES = 64  # of sensors, in an error
+# Errors of h5py for damaged files.
+_UNREADABLE = (OSError, RuntimeError, LookupError, AttributeError, TypeError, ValueError)
+_SYSTEM_ERROR = re.compile(r"errno = (\d+), error message = '(.*?)'")  # Part of HDF5's own message.
+# Other errors may result from damaged addresses.
+_PASSING = (errno.EIO, errno.ENXIO, errno.ENODEV, errno.ENOMEM, errno.ETIMEDOUT)
+_LEFT_OPEN = "already open for write"  # HDF5 marks a file as open, and a killed program leaves the mark.
+_OMITTED = {"word"}  # The axis is left out if its length is one.
+_MAX_NAMES = 64  # Limit on sensors in an error.
 _STORED_END = re.compile(r"stored_eof = (\d+)")
 _A = {"recording": "a recording", "energyscape": "an energyscape file"}
 
@@ -60,7 +62,7 @@ def sensor_names(path: str | Path) -> tuple[str, ...]:
 
 
 class FileReader(Sequence[Item]):
-    """A file of one row per measurement, as a sequence that reads a row when asked for it; slices are lists.
+    """File with one row per measurement, as a sequence that reads a row on access; slices are lists.
 
     Close it after use, or use it in a ``with`` statement.
 
@@ -68,15 +70,15 @@ class FileReader(Sequence[Item]):
     ----------
     path : Path
     sensor : str
-        Whose rows these are.
+        Sensor of these rows.
     sensors : tuple of str
         All sensors in the file, in its order.
     settings : Settings
         They depend on no other file.
     truth : Truth or None
-        What the rows should show, where they come from a simulation.
+        Ground truth of simulated measurements.
     attributes : dict
-        The attributes of the file: uuid, source, date_created and others.
+        Attributes of the file: uuid, source, date_created and others.
     """
 
     _kind: ClassVar[str]
@@ -108,23 +110,23 @@ class FileReader(Sequence[Item]):
             raise
 
     def _look(self) -> None:
-        """Find out which variables a sensor should have, where there are several ways."""
+        """Determine the variables of the sensor, if there are alternatives."""
 
     @abstractmethod
     def _item(self, index: int) -> Item:
-        """Return one row as what flows."""
+        """Return one row as a measurement or an energyscape."""
 
     @abstractmethod
     def _load(self) -> None:
-        """Read what one kind of file has beyond its rows."""
+        """Read the parts beyond rows that one kind of file has."""
 
     @abstractmethod
     def _sizes(self) -> dict[str, int]:
-        """Return the length that the settings, or the axes in the file, give to each axis."""
+        """Return the length of each axis, from the settings or from the file."""
 
     @property
     def uuid(self) -> str:
-        """Identity of the content: two files with the same one hold the same."""
+        """Identity of the content: files with the same identity have the same content."""
         return str(self.attributes.get("uuid", ""))
 
     def sha256(self) -> str:
@@ -133,7 +135,7 @@ class FileReader(Sequence[Item]):
             return hashlib.file_digest(file, "sha256").hexdigest()
 
     def stamps(self) -> list[Stamp]:
-        """Return the stamps of all measurements, which are not read themselves."""
+        """Return the stamps of all measurements, without reading the measurements."""
         with self._reading():
             return self._rows.stamps(self.sensor)
 
@@ -167,7 +169,7 @@ class FileReader(Sequence[Item]):
         self.close()
 
     def close(self) -> None:
-        """Close the file; closing twice does no harm."""
+        """Close the file; closing twice is harmless."""
         self._file.close()
 
     def _reading(self) -> AbstractContextManager[None]:
@@ -182,7 +184,7 @@ class FileReader(Sequence[Item]):
     def _choose(self, sensor: str | None) -> str:
         names = ", ".join(self.sensors[:_MAX_NAMES]) + ", …" * (len(self.sensors) > _MAX_NAMES)
         if sensor is None and len(self.sensors) != 1:
-            raise ArgumentError(f"{self.path} holds {len(self.sensors)} sensors; choose one of {names} (--sensor)")
+            raise ArgumentError(f"{self.path} contains {len(self.sensors)} sensors; choose one of {names} (--sensor)")
         if sensor is not None and sensor not in self.sensors:
             raise ArgumentError(f"{self.path} has no sensor {sensor!r}; choose one of {names}")
         return self.sensors[0] if sensor is None else sensor
@@ -200,7 +202,7 @@ class FileReader(Sequence[Item]):
         for variable in self._table:
             if variable.optional and variable.name not in self._group:
                 continue
-            if not sizes.keys() >= set(variable.dims) - _OMITTED:  # its length is its own
+            if not sizes.keys() >= set(variable.dims) - _OMITTED:  # Its length is free.
                 continue
             wanted = tuple(sizes[dim] for dim in variable.dims if dim in sizes)
             shape = self._group[variable.name].shape
@@ -212,14 +214,14 @@ class FileReader(Sequence[Item]):
         got = content_sha256(self._group, self._table)
         if got != wanted:
             raise DamagedError(
-                f"{self.path}: the content of sensor {self.sensor} has SHA-256 {got[:8]}…, its record says "
+                f"{self.path}: the content of sensor {self.sensor} has SHA-256 {got[:8]}…, but the file states "
                 f"{str(wanted)[:8]}…: the file is damaged; copy it again"
             )
 
 
 @contextmanager
 def _reading(file: h5py.File, path: Path) -> Iterator[None]:
-    """Name the file in errors, and call what the library cannot read damaged."""
+    """Name the file in errors, and report errors of h5py as damage."""
     try:
         yield
     except DataError as error:
@@ -249,20 +251,22 @@ def _open(path: Path) -> h5py.File:
     if n_bytes == 0:
         raise DataError(f"{path} is empty; give a recording or an energyscape file")
     if not h5py.is_hdf5(path):
-        raise DataError(f"{path} is not an HDF5 file; give a recording or an energyscape file, import raw words first")
+        raise DataError(
+            f"{path} is not an HDF5 file; give a recording or an energyscape file, or import raw words first"
+        )
     try:
         return h5py.File(path, "r")
     except BlockingIOError as error:
-        raise DataError(f"{path} is in use by another program, which writes it; close it there first") from error
+        raise DataError(f"{path} is open for writing in another program; close it there first") from error
     except OSError as error:
         if _LEFT_OPEN in str(error):
             raise DataError(
-                f"{path} is in use by another program, which writes it, or was when that was killed; close it there, "
-                "or copy it again"
+                f"{path} is open for writing in another program, or that program was killed; close it there, or "
+                "copy the file"
             ) from error
         wanted = _STORED_END.search(str(error))
         amount = f" of {wanted[1]}" if wanted else ""
-        raise DataError(f"{path} is cut short or damaged, it has {n_bytes}{amount} bytes; copy it again") from error
+        raise DataError(f"{path} is cut short or damaged: it has {n_bytes}{amount} bytes; copy it again") from error
 
 
 def _kind(file: h5py.File, path: Path, wanted: str) -> str:
@@ -274,11 +278,11 @@ def _kind(file: h5py.File, path: Path, wanted: str) -> str:
         raise DataError(f"{path} is HDF5, but not of this package; give {wanted}")
     if version > FORMAT_VERSION:
         raise FormatVersionError(
-            f"{path} has format version {version}, this package reads up to {FORMAT_VERSION}; update ertis-numba"
+            f"{path} has format version {version}, but this package reads up to {FORMAT_VERSION}; update ertis-numba"
         )
     return str(kind)
 
 
 def _reason(error: BaseException) -> str:
-    text = str(error.args[0]) if error.args else ""  # str() of a KeyError is quoted
+    text = str(error.args[0]) if error.args else ""  # str() of a KeyError adds quotes.
     return text.partition("\n")[0] or type(error).__name__

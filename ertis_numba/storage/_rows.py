@@ -36,7 +36,7 @@ _LIMITS = {
 
 
 class RowWriter:
-    """Appends measurements to the variables of a sensor.
+    """Writer of measurements to the variables of a sensor.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ class RowWriter:
     data : str
         Name of the variable with one array per measurement.
     numbered : bool
-        Whether a sequence number comes only once in an epoch.
+        Require sequence numbers to be unique within a session.
     """
 
     def __init__(self, group: h5py.Group, data: str, *, numbered: bool) -> None:
@@ -69,7 +69,7 @@ class RowWriter:
         self._require_new(stamps["sequence"], stamps["session_id"])
         require_free_space(self._folder, stored.nbytes)
         self._data.resize(self._n_rows + 1, axis=0)
-        # A chunk as it is: a row is a chunk, and no filter gains anything on one-bit noise.
+        # A row is a chunk, written as it is: no filter compresses one-bit noise.
         self._data.id.write_direct_chunk((self._n_rows, *[0] * stored.ndim), stored)
         self._n_rows += 1
         self.runs.add(stamps["sequence"], stamps["session_id"])
@@ -82,8 +82,8 @@ class RowWriter:
     def _require_new(self, sequence: int, session_id: int) -> None:
         if self._numbered and self.runs.holds(sequence, session_id):
             raise ArgumentError(
-                f"measurement {self._n_rows} has sequence {sequence} of epoch {session_id}, which one before it has; give "
-                "each measurement of a sensor a number of its own (Stamp.sequence)"
+                f"measurement {self._n_rows} has sequence {sequence} of session {session_id}, like an earlier "
+                "one; give each measurement of a sensor its own number (Stamp.sequence)"
             )
 
     def flush(self) -> None:
@@ -100,7 +100,7 @@ class RowWriter:
 
 
 class RowReader:
-    """Reads measurements back and checks each against its CRC-32."""
+    """Reader of measurements, which checks each against its CRC-32."""
 
     def __init__(self, group: h5py.Group, data: str) -> None:
         self._group = group
@@ -115,14 +115,14 @@ class RowReader:
         Raises
         ------
         DamagedError
-            It is not what was written.
+            The array does not match its CRC-32.
         """
         row = np.asarray(self._data[index])
         wanted, got = int(self._group["crc32"][index]), zlib.crc32(row.data)
         if got != wanted:
             raise DamagedError(
-                f"measurement {index} has CRC-32 {got:08x}, its record says {wanted:08x}: the file is damaged; "
-                "copy it again"
+                f"measurement {index} has CRC-32 {got:08x}, but the file states {wanted:08x}: the file is "
+                "damaged; copy it again"
             )
         return row
 

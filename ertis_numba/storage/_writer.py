@@ -1,4 +1,4 @@
-"""What the writers of both kinds of file share: a part file, rows, and reading back."""
+"""Base class of the writers of both kinds of file: part file, rows, and verification."""
 
 import os
 import re
@@ -36,9 +36,9 @@ Item = TypeVar("Item", Measurement, Energyscape)
 
 
 class Writer(ABC, Generic[Item]):
-    """Writes rows as they come; the file appears when the ``with`` block ends well, or not at all.
+    """Writer of rows; the file appears when the ``with`` block ends without an error.
 
-    Rows of several sensors may come in any order; each sensor gets a group of its own.
+    Rows of several sensors may come in any order; each sensor has its own group.
     """
 
     _kind: ClassVar[str]
@@ -66,21 +66,21 @@ class Writer(ABC, Generic[Item]):
 
     @abstractmethod
     def _begin(self, group: h5py.Group, first: Item) -> None:
-        """Lay out the group of a sensor for items like ``first``, which is not yet written."""
+        """Lay out the group of a sensor for items like ``first``, which is not written yet."""
 
     @abstractmethod
     def _row(self, item: Item) -> tuple[NDArray[Any], dict[str, float]]:
-        """Return the array of an item and what it adds to the columns; refuse what does not fit."""
+        """Return the array and the columns of an item; refuse an item that does not match the others."""
 
     def _data_of(self, group: h5py.Group) -> str:  # noqa: ARG002  what overrides it looks into it
         """Return the variable with one array per measurement."""
         return self._data
 
     def _complete(self, group: h5py.Group, rows: RowWriter) -> None:
-        """Write what is known at the end only."""
+        """Write the parts that are known only at the end."""
 
     def _truth_of(self, sensor: str, group: h5py.Group) -> Truth | TruthLog | None:  # noqa: ARG002  what overrides it needs both
-        """Return what the rows of a sensor should show, where it is known."""
+        """Return the ground truth of a sensor, if known."""
         return self._truth.get(sensor)
 
     def __enter__(self) -> Self:
@@ -96,9 +96,9 @@ class Writer(ABC, Generic[Item]):
         Raises
         ------
         ArgumentError
-            It does not fit to the ones before it or to its settings.
+            The measurement does not match earlier ones or its settings.
         DataError
-            The disk is full or cannot be written.
+            The disk is full or not writable.
         """
         if self._file is None:
             raise ArgumentError(f"{self.path} is not open for writing; use the writer in a with statement")
@@ -119,10 +119,10 @@ class Writer(ABC, Generic[Item]):
 
     @contextmanager
     def _open_part(self) -> Iterator[h5py.File]:
-        """Yield the part file; complete, close and compare it when the block ends well."""
+        """Yield the part file; complete, close and compare it when the block ends without an error."""
         require_free_space(self.path.parent, 0)
         with self._naming_file():
-            # The newer layout has a checksum in every table, so that a damaged one is noticed.
+            # The newer layout has a checksum in every table, which reveals damage.
             file = h5py.File(self._part, "w", track_order=True, libver=("v110", "v110"))
         try:
             yield file
@@ -131,16 +131,17 @@ class Writer(ABC, Generic[Item]):
                 file.close()
                 self._compare()
         except BaseException:
-            # Closing writes what is still in memory, and HDF5 that cannot do so takes the process with
-            # it (h5py issue 914). An emptied file gives back the room for it on a full disk.
-            with suppress(OSError, RuntimeError):  # the first error is the one to tell
+            # Closing writes buffered data. If that fails, HDF5 crashes the process (h5py issue 914). Emptying the file
+            # first
+            # frees the necessary space on a full disk.
+            with suppress(OSError, RuntimeError):  # The first error is the one to report.
                 os.truncate(self._part, 0)
                 file.close()
             raise
 
     def _finish(self, file: h5py.File) -> None:
         if not self._rows:
-            raise ArgumentError(f"{self.path} would hold no measurement; give at least one")
+            raise ArgumentError(f"{self.path} would contain no measurement; give at least one")
         self._require_sensors("truth", self._truth)
         contents = {sensor: self._finish_sensor(file, sensor) for sensor in self._rows}
         describe(
@@ -157,7 +158,7 @@ class Writer(ABC, Generic[Item]):
         )
 
     def _finish_sensor(self, file: h5py.File, sensor: str) -> str:
-        """Write what is known at the end only, and return the SHA-256 of the sensor's content."""
+        """Write the parts that are known only at the end, and return the SHA-256 of the sensor's content."""
         rows, group = self._rows[sensor], file[sensor_path(sensor)]
         rows.flush()
         self._complete(group, rows)
@@ -169,16 +170,16 @@ class Writer(ABC, Generic[Item]):
         return content
 
     def _require_sensors(self, name: str, given: Iterable[str]) -> None:
-        """Refuse what was given for a sensor of which nothing came: it would be lost."""
+        """Refuse data of a sensor without measurements, because it would be lost."""
         for sensor in given:
             if sensor not in self._rows:
                 raise ArgumentError(
-                    f"{name} is given for sensor {sensor!r}, of which no measurement came; "
-                    f"{self.path} would hold {', '.join(self._rows)}"
+                    f"{name} is given for sensor {sensor!r}, which has no measurement; {self.path} would contain "
+                    f"{', '.join(self._rows)}"
                 )
 
     def _compare(self) -> None:
-        """Read every row back from the closed file and compare it with what was given."""
+        """Read all rows back from the closed file, and compare them with the given ones."""
         with h5py.File(self._part, "r") as file:
             for sensor, written in self._rows.items():
                 group = file[sensor_path(sensor)]
@@ -187,17 +188,17 @@ class Writer(ABC, Generic[Item]):
                 for index in range(len(rows)):
                     check = zlib.crc32(rows.row(index).data, check)
                 if (len(rows), check) != (len(written), written.check):
-                    raise DataError(f"{self.path} reads back differently than it was written; check the disk")
+                    raise DataError(f"{self.path} reads back with other content than written; check the disk")
 
     @contextmanager
     def _naming_file(self) -> Iterator[None]:
         try:
             yield
-        except (OSError, RuntimeError) as error:  # h5py raises both when the disk fails
+        except (OSError, RuntimeError) as error:  # h5py raises both when the disk fails.
             raise DataError(f"{self.path} cannot be written ({_reason(error)}); {remedy(error)}") from error
 
 
 def _reason(error: Exception) -> str:
-    """Return the system's words, which HDF5 hides in the middle of its own."""
+    """Return the system's error message, which HDF5 embeds in its own."""
     inner = re.search(r"error message = '(.*?)'", str(error))
     return inner[1] if inner else str(error).partition("\n")[0]

@@ -1,4 +1,4 @@
-"""Recordings: measurements as they came from the microphones, and what is needed to process them."""
+"""Recordings: measurements as recorded, with everything that processing needs."""
 
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
@@ -40,14 +40,14 @@ JOURNAL_DAMAGE = "journal_damage"
 """Attribute of a recording: losses of its journal that no gap covers."""
 
 Mounting = tuple[Sequence[float], Sequence[float]]
-"""Where a sensor is, x, y, z in m, and how it is turned, a unit quaternion x, y, z, w."""
+"""Position of a sensor, x, y, z in m, and its orientation, a unit quaternion x, y, z, w."""
 
 _AIR = {"temperature": "temperature_c", "humidity": "humidity_percent", "pressure": "pressure_pa"}
 
 
 @dataclass(frozen=True, slots=True)
 class RecordingGap:
-    """Sequence numbers of a run of the sensor that are missing, ``first`` and ``last`` included, and why."""
+    """Missing sequence numbers of a sensor's session, ``first`` and ``last`` included, with the reason."""
 
     first: int
     last: int
@@ -56,7 +56,7 @@ class RecordingGap:
 
 
 class RecordingWriter(Writer[Measurement]):
-    """Writes a recording measurement by measurement; use it in a ``with`` statement.
+    """Writer of a recording, one measurement at a time; use it in a ``with`` statement.
 
     Measurements of several sensors may come in any order.
 
@@ -64,19 +64,19 @@ class RecordingWriter(Writer[Measurement]):
     ----------
     path : str or Path
     settings : Settings, optional
-        For a recording of one sensor; those of the first measurement of each sensor by default. Layout
-        files are written out into the recording.
+        For a recording of one sensor; by default those of the first measurement of each sensor. The recording contains
+        the content of layout files.
     overwrite : bool
-        Replace a file of this name.
+        Replace an existing file.
     source : str
-        Where the measurements come from.
+        Origin of the measurements.
     truth : mapping of str to Truth or TruthLog, optional
-        What each simulated sensor should show, by its name. A log may grow while measurements are written.
+        Ground truth of each simulated sensor, by name. A log may grow while measurements are written.
     mounting : mapping of str to (translation_m, rotation_xyzw), optional
-        Where each sensor is and how it is turned, by its name: x, y, z in metres, and the unit
-        quaternion x, y, z, w that turns the sensor frame into that of the surroundings. Unknown by default.
+        Position and orientation of each sensor, by name: x, y, z in metres, and the unit quaternion x, y, z, w that
+        rotates the sensor frame into the frame of the surroundings. Unknown by default.
     firmware : mapping of str to str, optional
-        Version of each sensor's firmware, by its name.
+        Version of each sensor's firmware, by name.
     """
 
     _kind: ClassVar[str] = "recording"
@@ -105,16 +105,16 @@ class RecordingWriter(Writer[Measurement]):
         self._noted: dict[str, list[Missing]] = {}
 
     def note_gap(self, sensor: str, first: int, last: int, reason: str, session_id: int = 0) -> None:
-        """Say why sequence numbers are missing, ``first`` and ``last`` included; in any order, at any time.
+        """Note the reason for missing sequence numbers, ``first`` and ``last`` included; in any order, at any time.
 
-        They may also lie before the first measurement of the sensor or after its last one. What is there
-        after all is no gap; of other gaps, the reason is "not among the measurements given". ``session_id`` is that of the
-        stamps of the run.
+        They may also lie before the first measurement of the sensor or after its last one. A number that arrives after
+        all is not a gap. Other gaps have the reason "not among the measurements given". ``session_id`` is that of the
+        stamps.
 
         Raises
         ------
         ArgumentError
-            ``last`` comes before ``first``, or the reason is no line of at most 64 bytes.
+            ``last`` comes before ``first``, or the reason is not a line of at most 64 bytes.
         """
         checks.sequence_gap(first, last, reason)
         self._noted.setdefault(sensor, []).append(
@@ -125,8 +125,8 @@ class RecordingWriter(Writer[Measurement]):
         sensor = first.stamp.sensor
         if self._given is not None and self._settings:
             raise ArgumentError(
-                f"settings are given for one sensor, but measurements came of {', '.join(self._settings)} "
-                f"and {sensor}; give none, so that each has its own"
+                f"settings are given for one sensor, but there are measurements of {', '.join(self._settings)} "
+                f"and {sensor}; give none, so that each sensor keeps its own"
             )
         given = self._given or first.settings
         settings = self._settings[sensor] = storable(given)
@@ -145,22 +145,24 @@ class RecordingWriter(Writer[Measurement]):
         return item.data, {name: getattr(air, field) for name, field in _AIR.items()}
 
     def _require_same(self, sensor: str, settings: Settings) -> None:
-        """Refuse what one set of settings cannot describe: all but the air must be equal."""
+        """Refuse settings that differ from the first in more than the air."""
         if settings is self._checked.get(sensor):
             return
         came = self_contained(settings)
         for name in ("array", "call", "recording"):
             if getattr(came, name) != getattr(self._settings[sensor], name):
-                raise ArgumentError(f"a measurement has other {name} settings than the recording; write it to its own")
+                raise ArgumentError(
+                    f"a measurement has other {name} settings than the recording; write it to its own recording"
+                )
         self._checked[sensor] = settings
 
     def _require_words(self, item: Measurement) -> None:
-        """Refuse words that would be stored as others, and what no pipeline would take."""
+        """Refuse samples of another type, and samples that no pipeline accepts."""
         name, wanted = f"measurement {len(self._rows[item.stamp.sensor])}", self._formats[item.stamp.sensor].dtype
-        if not np.can_cast(item.data.dtype, wanted, "equiv"):  # which passes another byte order
+        if not np.can_cast(item.data.dtype, wanted, "equiv"):  # This allows another byte order.
             raise ArgumentError(
-                f"{name} holds {item.data.dtype} words, its settings want {wanted.name}; convert them, or give the "
-                "settings that it was recorded with"
+                f"{name} contains {item.data.dtype} samples, but its settings give {wanted.name}; convert them, "
+                "or give the settings of the recording"
             )
         if wanted.kind == "f":
             checks.finite_array(name, item.data)
@@ -229,7 +231,7 @@ def lay_out_sensor(group: h5py.Group, settings: Settings, *, firmware: str, moun
 
 
 def _data_and_table(*, pdm: bool) -> tuple[str, tuple[Variable, ...]]:
-    """Return the variable with the words, and all that a sensor has."""
+    """Return the name of the samples' variable, and the table of all variables."""
     return ("pdm", RECORDING) if pdm else ("pcm", RECORDING_OF_PCM)
 
 
@@ -241,7 +243,7 @@ def _sizes(settings: Settings) -> dict[str, int]:
 
 
 def _copies(layout: Layout) -> dict[str, NDArray[Any]]:
-    """Return the arrays that repeat the settings for programs that read no TOML."""
+    """Return the arrays that repeat the settings for programs without a TOML parser."""
     return {
         "microphone_position": layout.positions_m,
         "microphone_enabled": layout.enabled.astype(np.int8),
@@ -251,22 +253,22 @@ def _copies(layout: Layout) -> dict[str, NDArray[Any]]:
 
 
 def _identity(sensor: str, settings: Settings, firmware: str) -> dict[str, Any]:
-    """Return who the sensor is."""
+    """Return the identity of the sensor."""
     return {"serial_number": sensor, "model": settings.array.layout, "firmware": firmware, "frame_id": sensor}
 
 
 class RecordingReader(FileReader[Measurement]):
-    """A recording as a sequence of measurements, read one at a time.
+    """A recording as a sequence of measurements, read on access.
 
     Attributes
     ----------
-    gaps : tuple of Gap
+    gaps : tuple of RecordingGap
     firmware : str
-        Its version; empty where it is not known.
+        Version of the sensor's firmware; empty if unknown.
     translation_m : (3,) float64, or None
-        Where the sensor is; None if its mounting is unknown.
+        Position of the sensor; None if its mounting is unknown.
     rotation_xyzw : (4,) float64, or None
-        The unit quaternion that turns the sensor frame into that of the surroundings, or None with it.
+        Unit quaternion that rotates the sensor frame into the frame of the surroundings, or None.
     """
 
     _kind: ClassVar[str] = "recording"
@@ -301,21 +303,21 @@ class RecordingReader(FileReader[Measurement]):
         return _sizes(self.settings)
 
     def _require_agreement(self) -> None:
-        """Refuse a file whose arrays say something else than its settings, which are what is used."""
+        """Refuse a file whose arrays contradict its settings, which processing uses."""
         came, words = self._group[self._data].dtype, sample_format(self.settings)
         if came != words.dtype:
             raise DataError(
-                f"{self.path}: {self._data} holds {came}, the settings in the file want {words.dtype} "
+                f"{self.path}: {self._data} contains {came}, but the settings in the file give {words.dtype} "
                 f"(recording.encoding {self.settings.recording.encoding!r}); change the settings with it"
             )
         for name, wanted in _copies(microphones(self.settings.array)).items():
             values = self._group[name][:]
-            wrong = np.argwhere(values != wanted)  # NaN, too
+            wrong = np.argwhere(values != wanted)  # This includes NaN.
             if wrong.size:
                 place = tuple(wrong[0])
                 raise DataError(
-                    f"{self.path}: {name} of channel {place[0]} is {values[place]:g}, the settings in the file say "
-                    f"{wanted[place]:g}; change the settings with it"
+                    f"{self.path}: {name} of channel {place[0]} is {values[place]:g}, but the settings in the "
+                    f"file give {wanted[place]:g}; change the settings with it"
                 )
 
 
@@ -326,7 +328,11 @@ def open_recording(path: str | Path, *, sensor: str | None = None) -> RecordingR
     ----------
     path : str or Path
     sensor : str, optional
-        Which one, where a file holds several.
+        Name of the sensor; required if the file contains several.
+
+    Returns
+    -------
+    RecordingReader
 
     Raises
     ------
@@ -335,7 +341,13 @@ def open_recording(path: str | Path, *, sensor: str | None = None) -> RecordingR
     FormatVersionError
         A newer version wrote it.
     ArgumentError
-        There is no such sensor, or there are several and none is chosen.
+        The file does not contain this sensor, or contains several and none is given.
+
+    Examples
+    --------
+    >>> import ertis_numba as ertis
+    >>> with ertis.open_recording("reflectors.h5") as recording:  # doctest: +SKIP
+    ...     first = recording[0]
     """
     return RecordingReader(path, sensor=sensor)
 
@@ -350,15 +362,20 @@ def write_recording(
     truth: Mapping[str, Truth | TruthLog] | None = None,
     mounting: Mapping[str, Mounting] | None = None,
 ) -> Path:
-    """Write measurements as they come and return the path; the arguments are those of `RecordingWriter`.
+    """Write measurements and return the path; the arguments are those of `RecordingWriter`.
 
     Raises
     ------
     ArgumentError
-        There is no measurement, one does not fit to the others or to its settings, has the sequence number of another,
-        or holds what is no number; or the file exists.
+        There is no measurement, one does not match the others or its settings, repeats a sequence number, or contains
+        NaN or infinity; or the file exists.
     DataError
-        The disk is full or cannot be written.
+        The disk is full or not writable.
+
+    Examples
+    --------
+    >>> import ertis_numba as ertis
+    >>> ertis.write_recording("copy.h5", ertis.open_recording("reflectors.h5"))  # doctest: +SKIP
     """
     with RecordingWriter(
         path, settings=settings, overwrite=overwrite, source=source, truth=truth, mounting=mounting

@@ -1,7 +1,7 @@
-"""What the files hold: the table of each kind of file, and its version.
+"""Variables and format version of each kind of file.
 
-Both kinds are HDF5 and netCDF-4 at once: every axis is a dimension scale, so that xarray, h5dump
-and MATLAB show the same names. One group ``/sensors/<name>`` holds one sensor.
+Both kinds are HDF5 and netCDF-4 at once: every axis is a dimension scale, so that xarray, h5dump and MATLAB show the
+same names. One group ``/sensors/<name>`` holds one sensor.
 """
 
 import hashlib
@@ -45,8 +45,8 @@ __all__ = [
 
 CONVENTIONS: Final = "CF-1.11 ertis-1.0"
 FORMAT_VERSION: Final = 2  # version 1 used the names of FORMER_NAMES
-CHUNK_ROWS: Final = 512  # of the columns that hold one number per measurement
-_TIME_CHUNK_ROWS: Final = 4096  # of the axis, which programs read as a whole
+CHUNK_ROWS: Final = 512  # Applies to columns with one number per measurement.
+_TIME_CHUNK_ROWS: Final = 4096  # Applies to the axis, which programs read as a whole.
 _COLUMN_TEXT_BYTES: Final = 64
 _MAX_CHUNK_BYTES: Final = 2**32 - 1
 _DIGEST_ITEMS: Final = 2**20
@@ -55,20 +55,20 @@ _UNLIMITED: Final = ("time", "gap")
 
 @dataclass(frozen=True, slots=True)
 class Variable:
-    """One array of a file.
+    """Array of a file.
 
     Attributes
     ----------
     name : str
     dims : tuple of str
-        Its axes. A variable named like its only axis is the coordinate of that axis.
+        Axes. A variable with the name of its only axis is the coordinate of that axis.
     dtype : str
-        NumPy type, ``str`` for text, or empty where the settings decide.
+        NumPy type, ``str`` for text, or empty if the settings determine it.
     about : str
     units : str
-        As UDUNITS writes it; empty for numbers without a unit.
+        Unit in the notation of UDUNITS; empty for numbers without a unit.
     optional : bool
-        Older files do not have it.
+        True if older files lack it.
     """
 
     name: str
@@ -84,8 +84,8 @@ STAMPS: Final = (
     Variable("time_uncertainty", ("time",), "<u4", "uncertainty of time", "ns"),
     Variable("sequence", ("time",), "<i8", "number given at capture; a gap is a loss"),
     Variable("sync_count", ("time",), "<i8", "pulse of the SYNC chain, equal for sensors that emitted together"),
-    Variable("session_id", ("time",), "<i8", "run of the sensor that gave the sequence numbers"),
-    Variable("crc32", ("time",), "<u4", "CRC-32 of the row of pdm, pcm or energy, as its bytes lie in the file"),
+    Variable("session_id", ("time",), "<i8", "session of the sensor that gave the sequence numbers"),
+    Variable("crc32", ("time",), "<u4", "CRC-32 of the row of pdm, pcm or amplitude, as its bytes lie in the file"),
 )
 
 _SETTINGS = Variable("settings", (), "str", "settings as TOML; they hold the array itself")
@@ -101,12 +101,12 @@ RECORDING: Final = (
     Variable("microphone_position", ("microphone", "axis"), "<f8", "x, y, z in the sensor frame", "m"),
     Variable("microphone_enabled", ("microphone",), "|i1", "1 where the channel carries a microphone that is used"),
     Variable("calibration_gain", ("microphone",), "<f8", "sensitivity; signals are divided by it"),
-    Variable("calibration_delay", ("microphone",), "<f8", "lateness; it is taken out", "s"),
+    Variable("calibration_delay", ("microphone",), "<f8", "delay; it is compensated", "s"),
     Variable("call", ("call_sample",), "<f4", "emitted sweep, full scale 1"),
     Variable("gap_first", ("gap",), "<i8", "first missing sequence number"),
     Variable("gap_last", ("gap",), "<i8", "last missing sequence number"),
-    Variable("gap_reason", ("gap",), "str", "why they are missing"),
-    Variable("gap_session_id", ("gap",), "<i8", "run of the sensor that would have given the numbers", optional=True),
+    Variable("gap_reason", ("gap",), "str", "reason"),
+    Variable("gap_session_id", ("gap",), "<i8", "session of the missing numbers", optional=True),
 )
 
 RECORDING_OF_PCM: Final = tuple(
@@ -115,33 +115,37 @@ RECORDING_OF_PCM: Final = tuple(
     else variable
     for variable in RECORDING
 )
-"""Of microphones that give numbers instead of bits."""
+"""Variables of a recording with PCM microphones."""
 
 ENERGYSCAPE: Final = (
     *STAMPS,
     Variable("amplitude", ("time", "direction", "range"), "", "envelope; 1 is a full-scale echo in every microphone"),
     Variable("azimuth", ("direction",), "<f8", "azimuth, from x forward towards y", "radian"),
     Variable("elevation", ("direction",), "<f8", "elevation, from the horizontal plane towards z", "radian"),
-    Variable("range", ("range",), "<f8", "half of the way of the sound", "m"),
+    Variable("range", ("range",), "<f8", "half the path of the sound", "m"),
     _SETTINGS,
 )
 
 TRUTH: Final = (
     Variable("scene", (), "str", "scene as TOML"),
-    Variable("name", ("measurement", "target"), "str", "what the reflectors are in the scene"),
+    Variable("name", ("measurement", "target"), "str", "names of the reflectors in the scene"),
     Variable("azimuth", ("measurement", "target"), "<f8", "azimuth of the reflectors", "radian"),
     Variable("elevation", ("measurement", "target"), "<f8", "elevation of the reflectors", "radian"),
     Variable("range", ("measurement", "target"), "<f8", "distance of the reflectors from the sensor's origin", "m"),
     Variable("level", ("measurement", "target"), "<f8", "level of the echo below the strongest of the own call", "dB"),
     Variable("velocity", ("measurement", "target", "axis"), "<f8", "x, y, z in the frame of the sensor", "m/s"),
     Variable(
-        "emitter", ("measurement", "target"), "str", "sensor whose call it returns, if not its own", optional=True
+        "emitter",
+        ("measurement", "target"),
+        "str",
+        "sensor whose call the reflector returns, if not its own",
+        optional=True,
     ),
 )
-"""In the group ``truth`` of a sensor."""
+"""Variables of the group ``truth`` of a sensor."""
 
 FORMER_NAMES: Final = {"amplitude": "energy", "session_id": "epoch", "gap_session_id": "gap_epoch"}
-"""Variables that have another name in files of format version 1."""
+"""Names that variables have in files of format version 1."""
 
 
 class SensorGroup(h5py.Group):  # type: ignore[misc]  # h5py has no annotations
@@ -179,19 +183,19 @@ def lay_out(
     dtypes: Mapping[str, str | np.dtype[Any]] | None = None,
     texts: Mapping[str, str] | None = None,
 ) -> None:
-    """Make the variables of ``table`` in ``group``, with a named scale for each of their axes.
+    """Create the variables of ``table`` in ``group``, with a named scale for each axis.
 
     Parameters
     ----------
     group : h5py.Group
     table : iterable of Variable
     sizes : mapping of str to int
-        Length of each axis. One that is left out is left out of every variable, unless it is one
-        that grows with the file; rows along time are chunks of their own where a row is an array.
+        Length of each axis. Variables omit an axis without a length, unless it grows with the file. If rows along time
+        are arrays, each is a chunk.
     dtypes : mapping of str to str or dtype, optional
         Types that the table leaves open, or other ones.
     texts : mapping of str to str, optional
-        What the variables that are one text hold.
+        Content of the variables that are one text.
     """
     scales: dict[str, h5py.Dataset] = {}
     variables = [(variable, _dims(variable, sizes)) for variable in table]
@@ -229,12 +233,12 @@ def _dataset(
     chunks = (rows,) if len(dims) == 1 else (1, *shape[1:])
     if math.prod(chunks) * np.dtype(kind).itemsize > _MAX_CHUNK_BYTES:
         wanted = " × ".join(f"{size} {dim}s" for dim, size in zip(dims[1:], shape[1:], strict=True))
-        raise ArgumentError(f"{name} of {wanted} exceeds the 4 GiB that HDF5 can hold in one piece; give fewer")
+        raise ArgumentError(f"{name} of {wanted} exceeds the 4 GiB limit of HDF5 for one chunk; give fewer")
     return group.create_dataset(name, (0, *shape[1:]), kind, maxshape=(None, *shape[1:]), chunks=chunks)
 
 
 def _scale_without_values(group: h5py.Group, dim: str, size: int) -> h5py.Dataset:
-    """Make the scale of an axis that only counts, in the way netCDF-4 does: it takes no room."""
+    """Create the scale of an axis without values, as netCDF-4 does; it needs no space."""
     shape, growing = ((0,), {"maxshape": (None,), "chunks": (CHUNK_ROWS,)}) if dim in _UNLIMITED else ((size,), {})
     scale = group.create_dataset(dim, shape, np.dtype(">f4"), **growing)
     scale.make_scale(f"This is a netCDF dimension but not a netCDF variable. {size:10d}")
@@ -249,21 +253,21 @@ def describe(owner: h5py.File | h5py.Group | h5py.Dataset, attributes: Mapping[s
     """
     for name, value in attributes.items():
         if isinstance(value, str):
-            text = value.encode("utf-8", "backslashreplace")  # file names may be no text at all
+            text = value.encode("utf-8", "backslashreplace")  # File names may not be valid text.
             owner.attrs.create(name, text, dtype=text_type(len(text)))
         else:
             owner.attrs[name] = value
 
 
 def plain(value: object) -> object:
-    """Return what an attribute holds as Python has it."""
+    """Return the value of an attribute as a Python object."""
     if isinstance(value, bytes):
         return value.decode(errors="replace")
     return value.item() if isinstance(value, np.generic) else value
 
 
 def text_type(n_bytes: int) -> np.dtype[Any]:
-    """Return the type of a text in UTF-8 that always takes ``n_bytes``, one at least."""
+    """Return the type of a UTF-8 text with a fixed length of ``n_bytes``, at least one."""
     made: np.dtype[Any] = h5py.string_dtype("utf-8", max(1, n_bytes))
     return made
 
@@ -271,9 +275,8 @@ def text_type(n_bytes: int) -> np.dtype[Any]:
 def content_sha256(group: h5py.Group, table: Iterable[Variable]) -> str:
     """Return the SHA-256 over the variables of a sensor, in hexadecimal.
 
-    Of those with one array per measurement, only the CRC-32 of each row goes in. So all of a file can
-    be checked, in parts, without reading all of it first. The truth follows where there is one: its
-    seed, then its variables.
+    For variables with one array per measurement, it covers only the CRC-32 of each row. A file can therefore be checked
+    in parts, without reading all of it first. The seed and the variables of the truth follow, if there is one.
     """
     digest = hashlib.sha256()
     _digest(digest, group, table)
@@ -288,7 +291,7 @@ def _digest(digest: "hashlib._Hash", group: h5py.Group, table: Iterable[Variable
         if variable.dtype and (variable.name in group or not variable.optional):
             dataset = group[variable.name]
             digest.update(dataset.name.rsplit("/", 1)[-1].encode())  # as stored, so that older files stay valid
-            # In parts: the truth of many measurements with many reflectors exceeds the memory.
+            # The truth of many measurements may exceed the memory, so it is read in parts.
             rows = max(1, _DIGEST_ITEMS // max(1, math.prod(dataset.shape[1:])))
             for first in range(0, dataset.shape[0], rows) if dataset.shape else ():
                 digest.update(np.asarray(dataset[first : first + rows]).tobytes())
@@ -297,13 +300,13 @@ def _digest(digest: "hashlib._Hash", group: h5py.Group, table: Iterable[Variable
 
 
 def content_uuid(contents: Mapping[str, str]) -> str:
-    """Return the identity of a file: a UUID of version 8, which its content makes (RFC 9562, section 5.8).
+    """Return the identity of a file: a UUID of version 8 that its content determines (RFC 9562, section 5.8).
 
     Parameters
     ----------
     contents : mapping of str to str
-        `content_sha256` of each sensor, by name. The name of a single sensor does not count; nor does
-        the order in which several were written.
+        `content_sha256` of each sensor, by name. Neither the name of a single sensor nor the order of several has an
+        effect.
     """
     (content,) = contents.values() if len(contents) == 1 else (_joined(contents),)
     made = bytearray(bytes.fromhex(content)[:16])
@@ -329,14 +332,14 @@ def sensor_path(name: str) -> str:
 
 
 def date_created() -> str:
-    """Return the time as ISO 8601, or that of SOURCE_DATE_EPOCH, so that builds can be repeated."""
+    """Return the time as ISO 8601, or SOURCE_DATE_EPOCH for reproducible builds."""
     fixed = os.environ.get("SOURCE_DATE_EPOCH")
     now = datetime.fromtimestamp(int(fixed), UTC) if fixed else datetime.now(UTC)
     return now.strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
 def software_versions() -> dict[str, str]:
-    """Return the versions of what computes a result."""
+    """Return the versions of the packages that compute a result."""
     return {name: _version(name) for name in ("ertis-numba", "numba", "numpy", "scipy")}
 
 

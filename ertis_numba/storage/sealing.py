@@ -1,11 +1,11 @@
-"""Sealing: a journal becomes a recording, and goes.
+"""Sealing: a journal becomes a recording and is removed.
 
-As a process of its own::
+Run it as a separate process::
 
-    python -m ertis_numba.storage.sealing REC.h5.journal
+python -m ertis_numba.storage.sealing REC.h5.journal
 
-so that HDF5, which takes its process with it where a disk fails (h5py issue 914), takes nothing else with it. It may
-be killed at any moment and run again: the recording is the same.
+HDF5 can crash its process when a disk fails (h5py issue 914); a separate process confines this. It may be killed and
+run again at any time: the recording is the same.
 """
 
 import sys
@@ -37,44 +37,45 @@ from ertis_numba.storage.schema import sensor_path
 __all__ = ["REFUSED", "TOKEN", "seal"]
 
 REFUSED = "refused"
-"""End of the name of a journal that is kept because no recording can hold some sensor in it."""
+"""Suffix of a journal that is kept because a recording cannot contain one of its sensors."""
 
-MAX_HISTORY = 16_000  # characters; an attribute of HDF5 takes 65,536 bytes
+MAX_HISTORY = 16_000  # Characters; an attribute of HDF5 is limited to 65,536 bytes.
 
 TOKEN = "sealing"  # noqa: S105
-"""Of the part file: who has the journal is the only one to write it."""
+"""Mode of the part file: the owner of the journal is the only writer."""
 
 Progress = Callable[[int, int], None]
 
 
 def seal(path: str | Path, *, overwrite: bool = False, progress: Progress = lambda _done, _of: None) -> Sealed:
-    """Make the recording of a journal; when it is complete, verified and on the disk, remove the journal.
+    """Make the recording of a journal, verify and sync it, and then remove the journal.
 
-    Measurements that are damaged in the journal are gaps of the recording, and the journal is kept under another name.
-    The journal is also kept if no recording can hold one of its sensors; the other sensors are sealed. Measurements
+    Measurements damaged in the journal become gaps of the recording, and the journal is kept under another name. The
+    journal is also kept if a recording cannot contain one of its sensors; the other sensors are sealed. Measurements
     that were sealed before are not written again.
 
     Parameters
     ----------
     path : str or Path
     overwrite : bool
-        Replace a file of the recording's name, even if it holds something else.
+        Replace an existing file, even if it has other content.
     progress : callable, optional
-        Called with the number of measurements that are written and that of all.
+        Called with the number of written measurements and of all measurements.
 
     Raises
     ------
-    InUseError
-        Another process has the journal.
+    JournalInUseError
+        Another process has the journal open.
     DataError
-        The journal cannot be read, or the recording not be written, or one of its name holds something else. The
-        journal stays.
+        The journal cannot be read, the recording cannot be written, or its name is taken by other content. The journal
+        stays.
     ArgumentError
-        There can be no file of that name.
+        The recording cannot have this name.
     """
     path = Path(path)
     before = path.with_name(path.name.removesuffix(SUFFIX))
-    if not path.exists() and before != path and _made_of(path, before):  # killed after the journal went
+    # A process was killed after it had removed the journal.
+    if not path.exists() and before != path and _made_of(path, before):
         return _reported(path, before)
     with Journal.open(path) as journal:
         target = journal.target
@@ -82,17 +83,17 @@ def seal(path: str | Path, *, overwrite: bool = False, progress: Progress = lamb
         rows = {name: JournalRows(journal, name) for name in journal.sensors}
         refused = _refused(journal, rows)
         if refused and not any(map(len, rows.values())):
-            damage = _damage(journal, rows)  # which goes with the tally
+            damage = _damage(journal, rows)  # The damage is recorded in the tally, which is removed with the journal.
             return Sealed(path, None, set_aside=journal.set_aside(REFUSED), damage=damage, refused=refused)
         if not len(journal):
             _require_nothing_lost(journal)
             journal.remove()
             return Sealed(path, None)
         if target.is_file() and _holds(target, journal, rows):
-            for place in (target, target.parent):  # who wrote it may have been killed before it did this
+            for place in (target, target.parent):  # The writer may have been killed before it did this.
                 fsync(place)
         elif target.is_file() and not overwrite:
-            raise DataError(f"{target} exists and holds something else than {path}; move it, or give --force")
+            raise DataError(f"{target} exists with other content than {path}; move it, or give --force")
         else:
             _write(journal, rows, refused, overwrite=overwrite, progress=progress)
         n_damaged = sum(len(held.damaged) for held in rows.values())
@@ -104,7 +105,7 @@ def seal(path: str | Path, *, overwrite: bool = False, progress: Progress = lamb
 
 
 def _require_nothing_lost(journal: Journal) -> None:
-    """Refuse to remove an empty journal that has held measurements before its log was damaged."""
+    """Refuse to remove an empty journal that contained measurements before its log was damaged."""
     lost = [journal.damage] if journal.damage else []
     lost += [f"{gap.first} to {gap.last} of sensor {gap.sensor}" for gap in journal.gaps if gap.reason == LOST]
     if lost:
@@ -127,7 +128,7 @@ def _damage(journal: Journal, rows: dict[str, JournalRows]) -> str:
 
 
 def _refused(journal: Journal, rows: dict[str, JournalRows]) -> dict[str, str]:
-    """Return the reasons why a recording cannot hold some sensors, by name, and remove these sensors from the rows."""
+    """Return the reasons why a recording cannot contain some sensors, by name, and remove these sensors from the rows."""
     refused = {name: reason for name, (reason, count) in journal.unusable.items() if count}
     for name, held in list(rows.items()):
         first = next(iter(held), None)
@@ -139,7 +140,7 @@ def _refused(journal: Journal, rows: dict[str, JournalRows]) -> dict[str, str]:
 
 
 def _refusal(sensor: JournalSensor, first: Measurement) -> str:
-    """Return the reason why a recording cannot hold a sensor, from a trial in memory; empty if it can."""
+    """Return the reason why a recording cannot contain a sensor, from a trial in memory; empty if it can."""
     try:
         with h5py.File("trial", "w", driver="core", backing_store=False, libver=("v110", "v110")) as trial:
             lay_out_sensor(
@@ -148,7 +149,7 @@ def _refusal(sensor: JournalSensor, first: Measurement) -> str:
                 firmware=sensor.firmware,
                 mounting=mounted(sensor.name, sensor.translation_m, sensor.rotation_xyzw),
             )
-    except MemoryError:  # which may pass
+    except MemoryError:  # The lack of memory may be temporary.
         raise
     except Exception as error:  # noqa: BLE001  whatever it is, it must not keep the others from being sealed
         return " ".join(str(error).split()) or type(error).__name__
@@ -156,12 +157,12 @@ def _refusal(sensor: JournalSensor, first: Measurement) -> str:
 
 
 def _origin(path: Path) -> str:
-    """Return what a recording says of the journal that it was made of."""
-    return f"sealed from {path.name.encode(errors='backslashreplace').decode()}"  # which may be no text at all
+    """Return the origin of a recording for its attributes."""
+    return f"sealed from {path.name.encode(errors='backslashreplace').decode()}"  # The name may not be valid text.
 
 
 def _made_of(path: Path, recording: Path) -> bool:
-    """Whether a file is the recording that was made of a journal of this name, which is gone."""
+    """Return True if a file is the recording of a removed journal with this name."""
     try:
         with open_recording(recording, sensor=sensor_names(recording)[0]) as reader:
             history = str(reader.attributes.get("history", ""))
@@ -172,10 +173,11 @@ def _made_of(path: Path, recording: Path) -> bool:
 
 class _Sealer(RecordingWriter):
     _part_token: ClassVar[str | None] = TOKEN
-    _numbered: ClassVar[bool] = False  # the journal's index keeps numbers apart, and nothing must keep the rest from it
+    # The journal's index keeps numbers unique, and damage must not prevent sealing the rest.
+    _numbered: ClassVar[bool] = False
 
     def say(self, history: str) -> None:
-        """Say what happened to the measurements."""
+        """Add a line to the history."""
         self._attributes["history"] = history
 
     def report_damage(self, damage: str) -> None:
@@ -183,10 +185,12 @@ class _Sealer(RecordingWriter):
         self._attributes[JOURNAL_DAMAGE] = damage
 
     def _require_words(self, item: Measurement) -> None:
-        """Take what came: the journal has looked at its type, and what is no number must not keep the rest from it."""
+        """Accept all samples: the journal has checked their type, and non-finite numbers must not prevent sealing the
+        rest.
+        """
 
     def _require_sensors(self, name: str, given: Iterable[str]) -> None:
-        """Take what is known of sensors of which nothing comes: the history tells of them."""
+        """Accept data of sensors without measurements: the history mentions them."""
 
 
 def _write(
@@ -221,7 +225,7 @@ def _write(
 
 
 def _absent(rows: dict[str, JournalRows]) -> Iterator[str]:
-    """Yield what there is to say of sensors that a recording cannot hold, as it would have no measurement of them."""
+    """Yield lines on sensors that are absent from a recording because they have no measurement."""
     for name, held in rows.items():
         if len(held) == len(held.damaged):
             yield f"sensor {name} has no measurement"
@@ -229,7 +233,7 @@ def _absent(rows: dict[str, JournalRows]) -> Iterator[str]:
 
 
 def _holds(target: Path, journal: Journal, rows: dict[str, JournalRows]) -> bool:
-    """Whether a file is the recording of a journal, whole and undamaged."""
+    """Return True if a file is the complete, undamaged recording of a journal."""
     try:
         names = sensor_names(target)
         return set(names) <= set(rows) and all(
@@ -266,7 +270,7 @@ def _reported(
     set_aside: Path | None = None,
     refused: dict[str, str] | None = None,
 ) -> Sealed:
-    """Return what a recording has come to."""
+    """Return the result of sealing."""
     n_measurements = n_missing = n_lost = 0
     damage = ""
     for name in sensor_names(recording):

@@ -1,4 +1,4 @@
-"""Seal a journal: make the recording of it, and remove it."""
+"""Seal a journal: make its recording, and remove it."""
 
 import argparse
 import json
@@ -20,29 +20,29 @@ __all__ = ["FAILED", "INTERRUPTED", "IN_USE", "NOTHING", "main"]
 FAILED, INTERRUPTED = 1, 130
 
 NOTHING = 66
-"""Exit code where nothing was measured: EX_NOINPUT of sysexits.h. The journal is gone."""
+"""Exit code for a journal without measurements: EX_NOINPUT of sysexits.h. The journal is removed."""
 
 IN_USE = 75
-"""Exit code where another process has the journal: EX_TEMPFAIL of sysexits.h, try again later."""
+"""Exit code for a journal that another process has open: EX_TEMPFAIL of sysexits.h, try again later."""
 
-_STEPS = 100  # in which progress is told
+_STEPS = 100  # Number of progress reports.
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Seal a journal and return an exit code: 0 done, `FAILED`, `NOTHING`, `IN_USE` or `INTERRUPTED`.
 
-    The path of the recording goes to stdout, errors in a line to stderr. With ``--json``, stdout has lines of one
-    object each: progress (``done``, ``of``), and at last what is in `Sealed`, or ``error`` and ``in_use``.
+    The path of the recording goes to stdout, and errors go to stderr in one line. With ``--json``, stdout has one
+    object per line: progress (``done``, ``of``), and at the end the fields of `Sealed`, or ``error`` and ``in_use``.
     """
     parser = argparse.ArgumentParser(
         "python -m ertis_numba.storage.sealing", description=(__doc__ or "").partition("\n")[0]
     )
     parser.add_argument("journal", type=Path)
-    parser.add_argument("--force", action="store_true", help="replace a file of the recording's name")
+    parser.add_argument("--force", action="store_true", help="replace an existing recording")
     parser.add_argument(
-        "--rests", type=float, help="let others have the processors, and the disk for so many times as long as a step"
+        "--rests", type=float, help="yield the processors, and rest after each step for this multiple of its duration"
     )
-    parser.add_argument("--json", action="store_true", help="tell progress and result as lines of JSON")
+    parser.add_argument("--json", action="store_true", help="print progress and result as JSON lines")
     given = parser.parse_args(arguments)
     recording = given.journal.with_name(given.journal.name.removesuffix(SUFFIX))
     pace = None if given.rests is None else GradualSync(temporary_path(recording, TOKEN), given.rests)
@@ -92,8 +92,8 @@ def _emit_event(report: dict[str, object]) -> None:
 
 
 def _say(text: str, stream: TextIO) -> None:
-    with suppress(OSError):  # who listened may have been killed: the recording is made all the same
-        stream.write(text.encode(errors="backslashreplace").decode() + "\n")  # file names may be no text at all
+    with suppress(OSError):  # The reader may have been killed: the recording is made all the same.
+        stream.write(text.encode(errors="backslashreplace").decode() + "\n")  # File names may not be valid text.
         stream.flush()
 
 

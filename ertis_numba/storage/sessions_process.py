@@ -1,6 +1,6 @@
-"""Say which runs of which sensors recordings hold, and up to which number, as JSON.
+"""Print the sessions of all sensors in recordings, with their highest numbers, as JSON.
 
-In a process of its own, for who may not load HDF5.
+It runs as a separate process for programs that must not load HDF5.
 """
 
 import argparse
@@ -17,7 +17,7 @@ __all__ = ["main", "runs_of"]
 
 
 def runs_of(path: Path) -> list[tuple[str, int, int]]:
-    """Return the runs in a recording: sensor, epoch, and the highest number that is held or noted to be missing."""
+    """Return the sessions in a recording: sensor, session_id, and the highest stored or missing number."""
     found: list[tuple[str, int, int]] = []
     for sensor in sensor_names(path):
         with open_recording(path, sensor=sensor) as reader:
@@ -33,7 +33,7 @@ def runs_of(path: Path) -> list[tuple[str, int, int]]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print ``[[sensor, session_id, last], …]`` of all recordings given, and return an exit code.
 
-    Files that are no recordings are left out; a recording that cannot be read is an error, told in a line on stderr.
+    Files that are not recordings are skipped; an unreadable recording is an error, printed in one line on stderr.
     """
     parser = argparse.ArgumentParser("python -m ertis_numba.storage.sessions_process", description=__doc__)
     parser.add_argument("recordings", type=Path, nargs="*")

@@ -19,13 +19,13 @@ from ertis_numba.storage.schema import TRUTH, Variable
 
 __all__ = ["child", "require_attributes", "require_variables", "sensors_of", "stored_bytes"]
 
-MAX_SENSORS: Final = 1024  # as a central node takes
-MAX_MEMBERS: Final = 256  # of a group: variables, and the scales of their axes
+MAX_SENSORS: Final = 1024  # Equal to the limit of a central node.
+MAX_MEMBERS: Final = 256  # Limit on the members of a group: variables, and the scales of their axes.
 MAX_ATTRIBUTES: Final = 256
 MAX_ATTRIBUTE_BYTES: Final = 65_536
 MAX_TEXT_BYTES: Final = {"settings": Settings.max_bytes, "scene": 16 * 2**20, "name": 4096}
 MAX_COLUMN_TEXT_BYTES: Final = 64
-MAX_COMPRESSION: Final = 1032  # of deflate
+MAX_COMPRESSION: Final = 1032  # Limit of deflate.
 MAX_ROW_BYTES: Final = 2**32 - 1
 
 
@@ -152,14 +152,14 @@ def _require_kind(dataset: h5py.Dataset, variable: Variable) -> None:
     if is_text:
         largest = MAX_TEXT_BYTES.get(variable.name, MAX_COLUMN_TEXT_BYTES)
         fits = dtype.kind == "S" and dtype.itemsize <= largest
-    else:  # in older files, some have other sizes
+    else:  # In older files, some have other sizes.
         kinds = "iuf" if not variable.dtype else "iu" if np.dtype(variable.dtype).kind in "iu" else "f"
         fits = dtype.kind in kinds and dtype.itemsize <= 8
     if not fits:
         wanted = f"text of up to {largest} bytes" if is_text else variable.dtype or "numbers"
         raise DamagedError(f"{dataset.name} holds {str(dtype)[:80]}, wanted {wanted}; copy it again")
     n_axes = len(variable.dims)
-    # A word axis is left out where there is one word.
+    # The word axis is left out if there is one word.
     if dataset.shape is None or not (dataset.ndim == n_axes or (variable.dims[2:] and dataset.ndim == n_axes - 1)):
         raise DamagedError(
             f"{dataset.name} has shape {dataset.shape}, wanted ({', '.join(variable.dims)}); copy it again"

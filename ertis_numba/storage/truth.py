@@ -1,4 +1,4 @@
-"""What a simulated sensor should show."""
+"""Ground truth of simulated sensors."""
 
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -27,9 +27,9 @@ _FIELDS = {
     "velocity": "velocity_m_s",
 }
 _TEXTS = ("name", "emitter")
-_ANGLES = ("azimuth", "elevation")  # radians in the file, as its other angles
-_MAX_SEED = 2**63 - 1  # what an attribute holds
-_BLOCK_ROWS = 512  # measurements whose reflectors are in memory at a time
+_ANGLES = ("azimuth", "elevation")  # The file stores radians, as for its other angles.
+_MAX_SEED = 2**63 - 1  # Limit of an attribute.
+_BLOCK_ROWS = 512  # Limit on the measurements whose reflectors are in memory.
 _RECORD = np.dtype(
     [("row", "<i8"), ("target", "<i4"), *((name, "<i4") for name in _TEXTS)]
     + [(name, "<f8", 3 if name == "velocity" else ()) for name in _FIELDS]
@@ -38,17 +38,17 @@ _RECORD = np.dtype(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Truth:
-    """What a simulated sensor should show.
+    """Ground truth of a simulated sensor.
 
     Attributes
     ----------
     scene : str
-        The scene as TOML.
+        Scene as TOML.
     seed : int
     reflectors : tuple of tuple of Reflector
-        Those of each measurement, the strongest first.
+        Reflectors of each measurement, the strongest first.
     left_out : tuple of str
-        Effects that were not simulated, although they change the image a little.
+        Omitted effects that change the image slightly.
     """
 
     scene: str
@@ -63,17 +63,17 @@ class Truth:
 
 
 class TruthLog:
-    """Truth that grows measurement by measurement, in a temporary file; use it in a ``with`` statement.
+    """Ground truth that grows with each measurement, in a temporary file; use it in a ``with`` statement.
 
     Parameters
     ----------
     scene : str
-        The scene as TOML.
+        Scene as TOML.
     seed : int
     left_out : tuple of str
-        Effects that were not simulated, although they change the image a little.
+        Omitted effects that change the image slightly.
     folder : Path, optional
-        Folder of the temporary file, which has no name and goes with the process; the system's own by default.
+        Folder of the temporary file, which has no name and ends with the process; the system's own by default.
     """
 
     def __init__(self, scene: str, seed: int, *, left_out: tuple[str, ...] = (), folder: Path | None = None) -> None:
@@ -95,7 +95,7 @@ class TruthLog:
         return self
 
     def __exit__(self, *_: object) -> None:
-        with suppress(OSError):  # of a full disk, which has been reported
+        with suppress(OSError):  # An error of a full disk was reported before.
             self._file.close()
 
     def __len__(self) -> int:
@@ -117,7 +117,7 @@ class TruthLog:
 
     def append(self, reflectors: Sequence[Reflector]) -> None:
         """Add the reflectors of the next measurement, the strongest first."""
-        if reflectors is not self._last[0]:  # a scene at rest gives the same again and again
+        if reflectors is not self._last[0]:  # A static scene repeats the same reflectors.
             self._last = reflectors, self._encoded(reflectors)
         records = self._last[1].copy()
         records["row"] = self._rows
@@ -168,12 +168,12 @@ class TruthLog:
 
 
 def write_truth(group: h5py.Group, truth: Truth | TruthLog, n_measurements: int) -> None:
-    """Write what a sensor should show into its group.
+    """Write the ground truth of a sensor into its group.
 
     Raises
     ------
     ArgumentError
-        The truth is about another number of measurements.
+        The truth has another number of measurements.
     """
     if isinstance(truth, Truth):
         with TruthLog(truth.scene, truth.seed, left_out=truth.left_out) as log:
@@ -183,11 +183,11 @@ def write_truth(group: h5py.Group, truth: Truth | TruthLog, n_measurements: int)
         return
     if len(truth) != n_measurements:
         raise ArgumentError(
-            f"the truth of sensor {group.name.rpartition('/')[2]} is about {len(truth)} measurements, "
-            f"the file holds {n_measurements}; give the reflectors of each"
+            f"the truth of sensor {group.name.rpartition('/')[2]} has {len(truth)} measurements, but the file "
+            f"has {n_measurements}; give the reflectors of each"
         )
     texts = {field: truth.texts(field) for field in _TEXTS}
-    if not any(texts["emitter"]):  # files of a single sensor are the same as ever
+    if not any(texts["emitter"]):  # Files of a single sensor stay as in earlier versions.
         del texts["emitter"]
     kinds: dict[str, Any] = {field: text_type(max(map(len, column), default=0)) for field, column in texts.items()}
     sizes = {"measurement": n_measurements, "target": truth.n_targets, "axis": 3}
@@ -195,7 +195,7 @@ def write_truth(group: h5py.Group, truth: Truth | TruthLog, n_measurements: int)
     table = [variable for variable in TRUTH if not variable.optional or variable.name in texts]
     lay_out(made, table, sizes=sizes, dtypes=kinds, texts={"scene": truth.scene})
     describe(made, {"seed": truth.seed, "effects_left_out": " ".join(truth.left_out)})
-    if not truth.n_targets:  # HDF5 has no room, and needs none, for nothing
+    if not truth.n_targets:  # HDF5 cannot store an empty array of this shape, and need not.
         return
     columns = {field: np.array(column, dtype=kinds[field]) for field, column in texts.items()}
     for rows, records in truth.blocks():
@@ -209,7 +209,7 @@ def write_truth(group: h5py.Group, truth: Truth | TruthLog, n_measurements: int)
 
 
 def read_truth(group: h5py.Group) -> Truth | None:
-    """Return what a sensor should show, where it is known, from its group."""
+    """Return the ground truth from a sensor's group, if there is one."""
     if "truth" not in group:
         return None
     group = group["truth"]
@@ -232,7 +232,7 @@ def read_truth(group: h5py.Group) -> Truth | None:
                 for target in range(n_targets)
             )
         )
-    left_out = str(plain(group.attrs.get("effects_left_out", b"")))  # of older files, unknown
+    left_out = str(plain(group.attrs.get("effects_left_out", b"")))  # Unknown for older files.
     return Truth(
         scene=group["scene"][()].decode(),
         seed=int(group.attrs["seed"]),

@@ -1,4 +1,4 @@
-"""What is missing in a recording or a journal, and what is damaged."""
+"""Verification of recordings and journals: missing and damaged measurements."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -18,20 +18,20 @@ _SQLITE = b"SQLite format 3\0"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SensorReport:
-    """What was found of one sensor.
+    """Result for one sensor.
 
     Attributes
     ----------
     sensor : str
     measurements : int
-        Those that are damaged included.
-    gaps : tuple of Gap
-        Sequence numbers that are missing, and why.
+        Number of measurements, damaged ones included.
+    gaps : tuple of RecordingGap
+        Missing sequence numbers with their reasons.
     damaged : tuple of Damage
     disordered : tuple of int
-        Places, counted from 0, of measurements whose sequence number is not above the one before of the same epoch.
+        Indices of measurements whose sequence number is not above the previous one of the session.
     fault : str
-        Why nothing of this sensor can be read; empty elsewhere.
+        Reason why nothing of this sensor can be read; otherwise empty.
     remark : str
         Damage to the file, or losses from its journal that no gap covers, of any sensor; empty if there are none.
     """
@@ -46,25 +46,25 @@ class SensorReport:
 
     @property
     def missing(self) -> int:
-        """Sequence numbers that are missing."""
+        """Number of missing sequence numbers."""
         return sum(gap.last - gap.first + 1 for gap in self.gaps)
 
     @property
     def whole(self) -> bool:
-        """Whether all is there and as it was written."""
+        """True if all measurements are present and intact."""
         return not (self.gaps or self.damaged or self.disordered or self.fault or self.remark)
 
 
 def verify(path: str | Path) -> list[SensorReport]:
-    """Read all of a recording or a journal, and return what is missing or damaged, for each sensor.
+    """Read a whole recording or journal, and return missing and damaged measurements for each sensor.
 
-    In a recording, that is the hash over the content of each sensor, the CRC-32 of each measurement, and the order
-    of the sequence numbers; in a journal, the CRC-32 of each record and each measurement.
+    A recording is checked by the hash over the content of each sensor, the CRC-32 of each measurement, and the order of
+    the sequence numbers. A journal is checked by the CRC-32 of each record and each measurement.
 
     Raises
     ------
     DataError
-        The file cannot be read at all, the disk fails, or another process has the journal.
+        The file cannot be read at all, the disk fails, or another process has the journal open.
     """
     path = Path(path)
     if _is_journal(path):
@@ -86,7 +86,7 @@ def verify(path: str | Path) -> list[SensorReport]:
     structure = fault_of(path)
     reports = [_of_recording(path, name, structure) for name in names]
     if all(report.fault for report in reports):
-        raise DataError(reports[0].fault if reports else f"{path} holds no sensor; copy it again")
+        raise DataError(reports[0].fault if reports else f"{path} contains no sensor; copy it again")
     return reports
 
 
@@ -101,7 +101,7 @@ def _is_journal(path: Path) -> bool:
 def _of_recording(path: Path, sensor: str, structure: str) -> SensorReport:
     try:
         recording = open_recording(path, sensor=sensor)
-    except ForeignDataError:  # such a file was not written by this package: nothing of it is worth a look
+    except ForeignDataError:  # This package did not write the file, so no part of it is examined.
         raise
     except (ArgumentError, DataError) as error:
         return SensorReport(sensor=sensor, fault=str(error))
@@ -129,7 +129,7 @@ def _journal_damage(recording: RecordingReader) -> str:
 
 
 def _disordered(numbers: Iterable[tuple[int, int]]) -> tuple[int, ...]:
-    """Return the places of the numbers that are not above the one before of the same epoch."""
+    """Return the indices of numbers that are not above the previous one of the session."""
     last: dict[int, int] = {}
     found = []
     for index, (session_id, number) in enumerate(numbers):
