@@ -87,7 +87,7 @@ class Contents:
             )
 
     def _count_rows(self) -> int:
-        """Count the rows of the table, to compare with the index: a difference reveals damage to one of the two trees."""
+        """Count the rows of the table; a difference from the index reveals damage to one of the two trees."""
         ((version,),) = self._database.execute("PRAGMA user_version")
         if version == COMPLETE_VERSION:
             # Rows may have been deleted from the front, so that the first number is not always 1. Apart from that,

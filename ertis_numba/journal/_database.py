@@ -159,10 +159,9 @@ class Database:
             self._is_folder_synced = self._is_log_named = False
 
     def _roll_back_by(self, mode: str) -> None:
-        """Switch to a rollback journal, which commits leave with a void header, because no other process can open the
-        file.
+        """Switch to a rollback journal.
 
-        DELETE removes it by name when the file is closed.
+        Commits leave it with a void header, because no other process can open the file. DELETE removes it by name when the file is closed.
         """
         if self.execute(f"PRAGMA journal_mode = {mode}") != [(mode.lower(),)]:
             raise DataError(f"{self._path} cannot switch from its log; close it, and try again")

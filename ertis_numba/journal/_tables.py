@@ -8,9 +8,9 @@ from typing import Final
 
 __all__ = [
     "APPLICATION_ID",
+    "COMPLETE_VERSION",
     "TABLES",
     "VERSION",
-    "COMPLETE_VERSION",
     "Column",
     "insertion",
     "layout",

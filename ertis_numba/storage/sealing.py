@@ -128,7 +128,7 @@ def _damage(journal: Journal, rows: dict[str, JournalRows]) -> str:
 
 
 def _refused(journal: Journal, rows: dict[str, JournalRows]) -> dict[str, str]:
-    """Return the reasons why a recording cannot contain some sensors, by name, and remove these sensors from the rows."""
+    """Return the reasons why a recording cannot contain some sensors, and remove these sensors from the rows."""
     refused = {name: reason for name, (reason, count) in journal.unusable.items() if count}
     for name, held in list(rows.items()):
         first = next(iter(held), None)
@@ -185,9 +185,7 @@ class _Sealer(RecordingWriter):
         self._attributes[JOURNAL_DAMAGE] = damage
 
     def _require_words(self, item: Measurement) -> None:
-        """Accept all samples: the journal has checked their type, and non-finite numbers must not prevent sealing the
-        rest.
-        """
+        """Accept all samples: the journal has checked their type; non-finite numbers must not prevent sealing."""
 
     def _require_sensors(self, name: str, given: Iterable[str]) -> None:
         """Accept data of sensors without measurements: the history mentions them."""
