@@ -229,7 +229,7 @@ def test_a_folder_that_cannot_be_written(tmp_path, folder):
 )
 def test_the_remedy_fits_the_cause(folder, monkeypatch, command, message):
     monkeypatch.chdir(folder)
-    monkeypatch.setattr("ertis_numba.storage._writer.require_room", lambda *_: None)  # there is none in /sys
+    monkeypatch.setattr("ertis_numba.storage._writer.require_free_space", lambda *_: None)  # there is none in /sys
     done = CliRunner().invoke(cli, command.split())
     assert done.exit_code == 1
     assert done.stderr.startswith(f"ertis: error: {message}"), done.stderr

@@ -142,7 +142,7 @@ for name in ("fcntl", "termios", "tty"):
 import ertis_numba
 from ertis_cli.main import main
 
-print(ertis_numba.Emulator.__name__, ertis_numba.Setup.__name__, ertis_numba.Sonar.__name__, flush=True)
+print(ertis_numba.Emulator.__name__, ertis_numba.Setup.__name__, ertis_numba.SonarDriver.__name__, flush=True)
 main()
 """
 

@@ -132,7 +132,7 @@ def test_what_is_refused(tmp_path, monkeypatch):
     with pytest.raises(ArgumentError, match=r"a.xml exists; give another name"):
         export(tmp_path / "a.h5", noise(count=1))
     assert [item.name for item in tmp_path.iterdir()] == ["a.xml"]
-    monkeypatch.setattr("ertis_numba.atomic_files.SPARE_BYTES", 2**62)
+    monkeypatch.setattr("ertis_numba.atomic_files.RESERVED_BYTES", 2**62)
     with pytest.raises(DataError, match=r"MB free, wanted .* of it to spare; free some space"):
         export(tmp_path / "b.h5", noise(count=1))
     assert [item.name for item in tmp_path.iterdir()] == ["a.xml"]

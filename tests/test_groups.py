@@ -22,9 +22,9 @@ class Platform:
         self.shift = {}  # of its count
         self.runs = dict(runs)  # sensor: epoch
 
-    def know(self, before_ns=3 * 10**9 // 2):
+    def register(self, before_ns=3 * 10**9 // 2):
         for sensor in self.runs:
-            self.groups.know(sensor, 10**12 - before_ns)
+            self.groups.register(sensor, 10**12 - before_ns)
 
     def pulse(self, number, *, without=(), late=0):
         at_ns = 10**12 + number * INTERVAL_NS
@@ -52,16 +52,16 @@ class Platform:
 @pytest.fixture
 def four():
     made = Platform(*((name, 1) for name in "abcd"))
-    made.know()
+    made.register()
     return made
 
 
 def test_no_group_is_whole_while_sensors_still_come():
     platform = Platform(("a", 1))
-    platform.know(0)
+    platform.register(0)
     platform.pulse(0)
     platform.runs["b"] = 1
-    platform.know(0)
+    platform.register(0)
     platform.pulse(0, without=("a",))
     assert not platform.closed
     platform.wait(25)
@@ -105,7 +105,7 @@ def test_a_clock_that_steps_by_an_hour_flags_the_group_and_moves_nothing(four):
 
 def test_counts_of_several_runs_are_aligned_by_time():
     platform = Platform(("a", 1), ("b", 2))
-    platform.know()
+    platform.register()
     platform.shift["b"] = -7  # it was armed seven pulses later
     for number in range(20):
         platform.pulse(number)
@@ -116,7 +116,7 @@ def test_counts_of_several_runs_are_aligned_by_time():
 @pytest.mark.parametrize("shift", [-1, 1])
 def test_a_lost_or_double_pulse_flags_groups_and_the_others_go_on(shift):
     platform = Platform(("a", 1), ("b", 2), ("c", 3))
-    platform.know()
+    platform.register()
     for number in range(60):
         platform.shift["b"] = shift if number >= 20 else 0
         platform.pulse(number)
@@ -137,7 +137,7 @@ def test_a_lost_or_double_pulse_flags_groups_and_the_others_go_on(shift):
 
 def test_a_clock_step_of_a_run_of_its_own_moves_nothing():
     platform = Platform(("a", 1), ("b", 2))
-    platform.know()
+    platform.register()
     for number in range(30):
         platform.ahead["b"] = HOUR_NS if number >= 15 else 0
         platform.pulse(number)
@@ -148,7 +148,7 @@ def test_a_clock_step_of_a_run_of_its_own_moves_nothing():
 
 def test_a_clock_that_is_ahead_from_the_start_does_not_keep_a_sensor_apart():
     platform = Platform(("a", 1), ("b", 2))
-    platform.know()
+    platform.register()
     for number in range(10):
         platform.pulse(number, without=("b",))
     platform.ahead["b"] = HOUR_NS
@@ -178,7 +178,7 @@ def test_runs_that_come_and_go_are_forgotten(four):
 def test_a_clock_that_is_behind_is_told_from_measurements_that_are_old():
     """A computer without a battery starts in the past; what it sends is as new as what the others send."""
     platform = Platform(("a", 1), ("b", 2))
-    platform.know()
+    platform.register()
     for number in range(10):
         platform.pulse(number, without=("b",))
     platform.ahead["b"] = -HOUR_NS
@@ -191,7 +191,7 @@ def test_a_clock_that_is_behind_is_told_from_measurements_that_are_old():
 
 def test_a_node_that_catches_up_keeps_its_own_times():
     platform = Platform(("a", 1), ("b", 2))
-    platform.know()
+    platform.register()
     for number in range(40):
         platform.pulse(number, without=("b",))
     for number in range(40):  # b sends what it has kept, ten times as fast
@@ -215,7 +215,7 @@ def test_a_node_that_catches_up_keeps_its_own_times():
 )
 def test_a_sensor_that_says_anything_takes_nobody_elses_groups(wrong):
     platform = Platform(("a", 1), ("b", 2))
-    platform.know()
+    platform.register()
     values = {"timestamp_ns": 10**18, "monotonic_ns": 0, "sync_count": 0}
     for number in range(600):
         at_ns = 10**12 + number * INTERVAL_NS
@@ -233,12 +233,12 @@ def test_a_sensor_that_says_anything_takes_nobody_elses_groups(wrong):
 
 def test_runs_that_come_after_a_sensor_that_says_anything_find_each_other():
     platform = Platform(("evil", 9))
-    platform.know()
+    platform.register()
     for number in range(300):
         platform.shift["evil"] = number * 10**6
         platform.pulse(number)
     platform.runs = {"a": 1, "b": 2}
-    platform.know()
+    platform.register()
     for number in range(300, 400):
         platform.pulse(number)
     platform.wait(440)

@@ -136,7 +136,7 @@ def test_commands_of_a_page(place, name):
 def test_python_on_concepts(place):
     run_here(place, "example reflectors")
     (code,) = python_in(page("concepts"))
-    reported = run(place, sys.executable, "-W", "error", "-c", code + "\nprint(image.energy.shape[0])")
+    reported = run(place, sys.executable, "-W", "error", "-c", code + "\nprint(image.amplitude.shape[0])")
     assert reported.stdout.strip() == "81"
 
 

@@ -133,7 +133,7 @@ BAD = {
     ),
     "gap of no run": (
         lambda journal: journal.note_gap("left", 1, 2, "x", session_id=-1),
-        "epoch is -1; give a whole number from 0",
+        "session_id is -1; give a whole number from 0",
     ),
     "no reason": (
         lambda journal: journal.note_gap("left", 1, 2, "", session_id=1),
@@ -178,7 +178,7 @@ BAD = {
     ),
     "session_id": (
         lambda journal: journal.append([spoilt(session_id=2**63)]),
-        "epoch is 9223372036854775808; give a whole number from 0",
+        "session_id is 9223372036854775808; give a whole number from 0",
     ),
     "stamp": (
         lambda journal: journal.append([spoilt(timestamp_uncertainty_ns=2**32)]),

@@ -37,7 +37,7 @@ def state(file):
 
 def spoil_energy(file):
     with h5py.File(file, "r+") as images:
-        images["sensors/eRTIS-7/energy"][1, 3, 5] += 1.0
+        images["sensors/eRTIS-7/amplitude"][1, 3, 5] += 1.0
 
 
 def spoil_head(file):

@@ -97,7 +97,7 @@ def test_an_event_is_one_line_that_programs_can_take_apart(lines):
         "conflict", sensor="front", session_id=7, sequence=41, text="both are kept", of=None
     )
     time, *rest = stream.getvalue().rstrip("\n").split(" ", 1)
-    assert rest == ['warning conflict sensor=front epoch=7 sequence=41 text="both are kept"']
+    assert rest == ['warning conflict sensor=front session_id=7 sequence=41 text="both are kept"']
     assert len(time) == len("2026-11-22T04:31:00.123Z")
     assert time.endswith("Z")
 

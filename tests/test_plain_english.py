@@ -31,7 +31,7 @@ BANNED = {
     "ear": "receiver",
     "energy": "amplitude",
     "energies": "amplitudes",
-    "epoch": "session_id",
+    "session_id": "session_id",
     "film": "playback",
     "know": "register",
     "known": "registered",

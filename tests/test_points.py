@@ -27,7 +27,7 @@ OTHERS = [("fast", beamformer) for beamformer in ("coherence_factor", "dmas", "c
 
 def noise(directions, range_m=(0.9, 1.2), seed=1):
     image = image_of([], directions=directions, range_m=range_m)
-    values = np.abs(np.random.default_rng(seed).standard_normal(image.energy.shape)) + 0.01
+    values = np.abs(np.random.default_rng(seed).standard_normal(image.amplitude.shape)) + 0.01
     return image.replace(energy=values.astype(np.float32))
 
 
@@ -37,7 +37,7 @@ def position_m(azimuth_deg, elevation_deg, range_m):
 
 def reference(image, *, top, min_level_db):
     """The same, bin by bin."""
-    energy, spacing_m = image.energy, image.range_m[1] - image.range_m[0]
+    energy, spacing_m = image.amplitude, image.range_m[1] - image.range_m[0]
     directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
     neighbours = neighbours_of(directions)
     reach, found = round(0.04 / spacing_m), []
@@ -68,8 +68,8 @@ def test_is_the_reference(directions, min_level_db):
     assert len(expected) > 2
     # Maxima of noise are no reflectors: where their correction is large, it is as wrong as the table of the pulse.
     np.testing.assert_allclose(cloud.position_m, expected[:, :3], atol=1e-4)
-    np.testing.assert_allclose(cloud.energy, expected[:, 3], rtol=1e-4)
-    assert cloud.position_m.dtype == cloud.energy.dtype == np.float32
+    np.testing.assert_allclose(cloud.amplitude, expected[:, 3], rtol=1e-4)
+    assert cloud.position_m.dtype == cloud.amplitude.dtype == np.float32
     assert cloud.settings is image.settings
     assert cloud.stamp is image.stamp
     assert cloud.uncertainty_m.shape == (len(cloud), 2)
@@ -79,15 +79,15 @@ def test_is_the_reference(directions, min_level_db):
 def test_of_much_noise_the_strongest_are_found():
     image = noise("3d:800")
     cloud = PointExtractor(image.settings, top=10)(image)
-    assert np.count_nonzero(image.energy > image.energy.max() / 10) > 640  # of which only these are looked at
+    assert np.count_nonzero(image.amplitude > image.amplitude.max() / 10) > 640  # of which only these are looked at
     expected = reference(image, top=10, min_level_db=-20.0)
     np.testing.assert_allclose(cloud.position_m, expected[:, :3], atol=1e-5)
-    np.testing.assert_allclose(cloud.energy, expected[:, 3], rtol=1e-5)
+    np.testing.assert_allclose(cloud.amplitude, expected[:, 3], rtol=1e-5)
 
 
 def test_of_two_equal_bins_the_first_counts():
-    image = noise("2d:31").replace(energy=np.zeros(noise("2d:31").energy.shape, np.float32))
-    image.energy[10:12, 40] = 1.0
+    image = noise("2d:31").replace(energy=np.zeros(noise("2d:31").amplitude.shape, np.float32))
+    image.amplitude[10:12, 40] = 1.0
     (point,) = PointExtractor(image.settings)(image).position_m
     assert np.arctan2(point[1], point[0]) == pytest.approx(image.azimuth_rad[10:12].mean(), abs=1e-3)
 
@@ -99,7 +99,7 @@ def test_reflectors_are_where_they_are(directions, within_m):
     cloud = PointExtractor(image.settings)(image)
     assert len(cloud) == len(reflectors)
     for point, energy, (azimuth_deg, elevation_deg, range_m, amplitude) in zip(
-        cloud.position_m, cloud.energy, reflectors, strict=True
+        cloud.position_m, cloud.amplitude, reflectors, strict=True
     ):
         assert np.linalg.norm(point - position_m(azimuth_deg, elevation_deg, range_m)) < within_m
         assert energy == pytest.approx(amplitude, rel=0.05)
@@ -135,10 +135,10 @@ def test_silence_and_short_images_have_no_points(n_ranges):
 
 def test_the_input_is_left_alone():
     image = noise("3d:100")
-    before = image.energy.copy()
-    image.energy.flags.writeable = False
+    before = image.amplitude.copy()
+    image.amplitude.flags.writeable = False
     PointExtractor(image.settings)(image)
-    np.testing.assert_array_equal(image.energy, before)
+    np.testing.assert_array_equal(image.amplitude, before)
 
 
 def test_platform_frame_turns_then_shifts():
@@ -216,8 +216,8 @@ def test_uncertainty_goes_with_range_level_and_noise():
     # It goes with the distance as well, and the aperture is foreshortened.
     ratio = 2 * 1.2 * np.cos(np.radians(12.3)) / np.cos(np.radians(33.3))
     assert second[1] == pytest.approx(ratio * first[1], rel=0.05)
-    louder = image.replace(energy=np.where(image.energy < 0.1, 2 * image.energy, image.energy))
-    assert np.median(image.energy) < 0.1
+    louder = image.replace(energy=np.where(image.amplitude < 0.1, 2 * image.amplitude, image.amplitude))
+    assert np.median(image.amplitude) < 0.1
     assert extractor(louder).uncertainty_m[0] == pytest.approx(2 * first, rel=1e-3)
 
 
@@ -230,7 +230,7 @@ def test_only_noise_of_delay_and_sum_is_told_by_its_median(method, beamformer):
     )
     with Pipeline(settings, device="numpy") as pipeline:
         image = pipeline.process(words_of_noise(settings, 1))
-    ratio = np.median(image.energy) / np.sqrt(np.mean(np.square(image.energy, dtype=float)))
+    ratio = np.median(image.amplitude) / np.sqrt(np.mean(np.square(image.amplitude, dtype=float)))
     is_rayleigh = beamformer == "delay_and_sum"
     assert (ratio == pytest.approx(np.sqrt(np.log(2)), rel=0.02)) == is_rayleigh
     uncertainty_m = PointExtractor(settings)(image).uncertainty_m

@@ -273,7 +273,7 @@ BAD = {
     ),
     "session_id": (
         lambda node: node.note_gap("left", 1, 2, "x", session_id=-1),
-        "epoch is -1; give a whole number from 0",
+        "session_id is -1; give a whole number from 0",
     ),
     "name": (lambda node: node.add_sensor("a" * 65, TINY), "sensor name 'a{65}' has 65 characters; give 64 at most"),
     "longer than the memory": (

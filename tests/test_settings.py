@@ -180,7 +180,7 @@ def test_nothing_can_be_changed_in_place():
         ("[accuracy]\nbeam_taps = 3", r"accuracy\.beam_taps '3' is unknown.*known are 0, 2, 4, 6"),
         ("[accuracy]\nbeam_density = 1", r"accuracy\.beam_density is 1; give a number from 1\.1 to 8"),
         ("[accuracy]\nstop_band_db = 30", r"accuracy\.stopband_attenuation_db is 30; give a number from 40 to 140"),
-        ("[accuracy]\nfocal_zones 0", r"accuracy\.focal_zones is 0; give a whole number from 1 to"),
+        ("[accuracy]\nfocal_zones = 0", r"accuracy\.focal_zones is 0; give a whole number from 1 to"),
         (
             "[accuracy]\ninterpolation = 'linear'\ndelay_taps = 4",
             r"accuracy\.delay_taps is 4, but interpolation 'linear' takes 2; leave it out",

@@ -249,7 +249,7 @@ with SensorNode(address, spool=folder) as node:
         node.add_sensor(sensor, TINY)
     for number in range(10**9):
         for sensor in ("left", "right"):
-            kept = node.append(entries(1, sensor=sensor, first=number, epoch=epoch, seed=number))
+            kept = node.append(entries(1, sensor=sensor, first=number, session_id=session_id, seed=number))
             print(sensor, number, kept[0].crc32, flush=True)
 """
 

@@ -92,8 +92,8 @@ def test_gaps_epochs_and_air(tmp_path):
         assert [m.settings.air for m in recording] == [SMALL.air] * 2 + [warm.air] + [SMALL.air] * 3
         assert recording.settings.air == SMALL.air
     with h5py.File(tmp_path / "rec.h5") as file:
-        assert file["sensors/sensor/epoch"][:].tolist() == [session_id for _, session_id in runs]
-        assert file["sensors/sensor/gap_epoch"][:].tolist() == [7, 2**40]
+        assert file["sensors/sensor/session_id"][:].tolist() == [session_id for _, session_id in runs]
+        assert file["sensors/sensor/gap_session_id"][:].tolist() == [7, 2**40]
 
 
 def test_columns_pass_the_end_of_a_chunk(tmp_path):
@@ -182,7 +182,7 @@ def test_replay_gives_the_same_bits_for_any_number_of_threads(tmp_path, directio
             pipeline = Pipeline(settings, threads=threads)
             write_energyscapes(tmp_path / "img.h5", map(pipeline.process, recording), overwrite=True)
             with h5py.File(tmp_path / "img.h5") as file:
-                amplitudes.append(file["sensors/eRTIS-7/energy"][:].tobytes())
+                amplitudes.append(file["sensors/eRTIS-7/amplitude"][:].tobytes())
     assert amplitudes[0] == amplitudes[1] == amplitudes[2]
 
 
@@ -297,7 +297,7 @@ def test_measurements_that_cannot_be_written(tmp_path, measurements, message):
             "timestamp_ns is 9223372036854775808; give a whole number from -9223372036854775808",
         ),
         (Stamp(sync_count=-(2**63) - 1), "sync_count is -9223372036854775809; give"),
-        (Stamp(session_id=2**63), "epoch is 9223372036854775808; give"),
+        (Stamp(session_id=2**63), "session_id is 9223372036854775808; give"),
     ],
     ids=["sequence", "negative sequence", "half a sequence", "time", "pulse", "session_id"],
 )
@@ -320,7 +320,7 @@ def numbered(*numbers, session_id=0):
     ids=["at once", "rising", "falling", "highest", "late"],
 )
 def test_a_number_comes_once_in_a_run(tmp_path, numbers, place):
-    message = rf"measurement {place} has sequence {numbers[place]} of epoch 0, which one before it has; give each"
+    message = rf"measurement {place} has sequence {numbers[place]} of session 0, like an earlier one; give each"
     with pytest.raises(ArgumentError, match=message):
         write_recording(tmp_path / "rec.h5", numbered(*numbers))
     given = [*numbered(*numbers[:place]), *numbered(*numbers[place:], session_id=1)]

@@ -262,7 +262,7 @@ def test_settings_that_were_changed(path):
 
 def test_no_room(tmp_path, monkeypatch):
     free = shutil.disk_usage(tmp_path).free
-    monkeypatch.setattr(atomic_files, "SPARE_BYTES", 2 * free)
+    monkeypatch.setattr(atomic_files, "RESERVED_BYTES", 2 * free)
     with pytest.raises(
         DataError, match=r"MB free, wanted [\d.]+ MB for what is next, \d+ MB of it to spare; free some"
     ):

@@ -76,8 +76,8 @@ def test_each_sensor_has_gaps_and_epochs_of_its_own(tmp_path):
     with open_recording(tmp_path / "rec.h5", sensor="right") as right:
         assert right.gaps == ()
     with h5py.File(tmp_path / "rec.h5") as file:
-        assert file["sensors/left/epoch"][:].tolist() == [0, 3, 3]
-        assert file["sensors/right/epoch"][:].tolist() == [0, 0, 0]
+        assert file["sensors/left/session_id"][:].tolist() == [0, 3, 3]
+        assert file["sensors/right/session_id"][:].tolist() == [0, 0, 0]
 
 
 def uuid_of(path, sensor):

@@ -24,7 +24,7 @@ _AXES = ("azimuth_rad", "elevation_rad", "range_m")
 def write_npz(path: Path, images: Iterable[Energyscape], count: int | None) -> None:
     """Write the images of one sensor, as they come where their number is known.
 
-    Energies are (time, direction, range); then come axes, stamps (time,), and sensor and settings as texts.
+    Amplitudes are (time, direction, range); then come axes, stamps (time,), and sensor and settings as texts.
 
     Raises
     ------
@@ -35,7 +35,7 @@ def write_npz(path: Path, images: Iterable[Energyscape], count: int | None) -> N
         gathered = list(images)
         images, count = gathered, len(gathered)
     with zipfile.ZipFile(path, "w") as archive:
-        with archive.open("energy.npy", "w", force_zip64=True) as member:
+        with archive.open("amplitude.npy", "w", force_zip64=True) as member:
             first, stamps = _write_amplitude(member, images, count)
         arrays: dict[str, Any] = {name: getattr(first, name) for name in _AXES}
         arrays |= {name: np.array([getattr(stamp, name) for stamp in stamps], dtype=np.int64) for name in _STAMPS}

@@ -30,7 +30,7 @@ settings = SHORT.replace(processing=SHORT.processing.replace(directions="3d:700"
 settings = tuned(settings, precision=sys.argv[1])
 for threads in (1, 2, 3, 4):
     image = Pipeline(settings, threads=threads).process(noise(settings))
-    print(hashlib.sha256(image.energy.tobytes()).hexdigest())
+    print(hashlib.sha256(image.amplitude.tobytes()).hexdigest())
 """
 
 MODULATE = """
