@@ -28,10 +28,10 @@ def image(sequence=0, *, sensor="front", reflectors=(), sync_count=None, **stamp
     """An image with reflectors: (azimuth in degrees, range in m, amplitude)."""
     grid = direction_grid(SETTINGS.processing)
     amplitude = np.full((len(grid), len(RANGE_M)), 1e-4, np.float32)
-    for azimuth_deg, range_m, amplitude in reflectors:
+    for azimuth_deg, range_m, peak in reflectors:
         across = (grid.azimuth_rad - np.radians(azimuth_deg)) / np.radians(6)
         along = (RANGE_M - range_m) / 0.02
-        amplitude += (amplitude * np.exp(-0.5 * (across[:, None] ** 2 + along**2))).astype(np.float32)
+        amplitude += (peak * np.exp(-0.5 * (across[:, None] ** 2 + along**2))).astype(np.float32)
     stamp = Stamp(
         sensor=sensor,
         sequence=sequence,

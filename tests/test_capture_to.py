@@ -127,8 +127,13 @@ def test_measurements_of_two_sensors_reach_the_central_node(tmp_path, words):
     assert [final[name] for name in ("refused", "overwritten", "damaged", "unacked", "reconnects")] == [0] * 5
     acked_through = [each for each in events if each["event"] == "acked_through" and each["sensor"] == "one"]
     assert acked_through[-1] == {
-        "event": "acked_through", "sensor": "one", "session_id": session_id, "acked_through": 3, "status": "stored", "dropped": []
-    }  # fmt: skip
+        "event": "acked_through",
+        "sensor": "one",
+        "session_id": session_id,
+        "acked_through": 3,
+        "status": "stored",
+        "dropped": [],
+    }
     assert not list(tmp_path.glob("*.h5*"))
 
 

@@ -27,7 +27,7 @@ def test_images_points_and_raw_words_are_those_of_the_pipeline():
     with driven(device="cpu") as loop, Application(loop.processing.address) as application:
         application.subscribe("energyscape", "points", "raw", credit=8)
         loop.until(lambda: loop.processing.status().subscribers)
-        loop.processing.know(hello(**place), SHORT)
+        loop.processing.register(hello(**place), SHORT)
         loop.offer()
         loop.until(lambda: application.read() or len(application.got) == 3)
     assert application.kinds() == ["Image", "Points", "Raw"]
@@ -60,7 +60,7 @@ def test_options_change_what_a_sensor_says():
     ):
         application.subscribe("energyscape")
         loop.until(lambda: application.read() or application.others)
-        loop.processing.know(hello(), SHORT)
+        loop.processing.register(hello(), SHORT)
         loop.offer()
         loop.until(lambda: application.read() or application.got)
     ((image, amplitude),) = application.got
@@ -76,7 +76,7 @@ def test_options_change_what_a_sensor_says():
 def test_overload_drops_the_oldest_and_counts_each():
     with driven() as loop:
         for sensor in ("a", "b"):
-            loop.processing.know(hello(sensor), SHORT)
+            loop.processing.register(hello(sensor), SHORT)
         for _ in range(30):  # before any worker is ready
             loop.offer("a")
         assert loop.processing.counts("a").dropped == {"the workers were getting ready": 28}
@@ -107,7 +107,7 @@ def test_two_workers_publish_in_the_order_of_measurements():
     with driven(workers=2) as loop, Application(loop.processing.address) as application:
         application.subscribe("energyscape", credit=64)
         loop.until(lambda: application.read() or application.others)
-        loop.processing.know(hello(), SHORT)
+        loop.processing.register(hello(), SHORT)
         loop.until(lambda: len(loop.workers("idle")) == 2)
         chosen = loop.processing._runner._chosen  # noqa: SLF001  as under a load that takes longer to build up
         chosen.mode = chosen.many
@@ -127,12 +127,12 @@ def test_other_settings_of_a_sensor_make_other_images_and_what_waited_is_counted
     with driven() as loop, Application(loop.processing.address) as application:
         application.subscribe("energyscape", credit=8)
         loop.until(lambda: application.read() or application.others)
-        loop.processing.know(hello(), SHORT)
+        loop.processing.register(hello(), SHORT)
         loop.offer()
         loop.settle()
         loop.offer()
         loop.offer()
-        loop.processing.know(hello(settings=WIDE), WIDE)
+        loop.processing.register(hello(settings=WIDE), WIDE)
         loop.offer()
         loop.settle()
         warmer = Air(temperature_c=35.0)
@@ -153,7 +153,7 @@ def test_other_settings_of_a_sensor_make_other_images_and_what_waited_is_counted
 
 def test_what_is_under_way_at_the_end_is_counted():
     with driven() as loop:
-        loop.processing.know(hello(), SHORT)
+        loop.processing.register(hello(), SHORT)
         loop.offer()
         loop.offer()
     counts = loop.processing.counts("front")
@@ -162,7 +162,7 @@ def test_what_is_under_way_at_the_end_is_counted():
 
 def test_the_end_waits_for_what_is_under_way():
     with driven() as loop:
-        loop.processing.know(hello(), SHORT)
+        loop.processing.register(hello(), SHORT)
         loop.offer()
         loop.processing.close(60.0)
     assert loop.processing.counts("front").published == 1
@@ -201,7 +201,7 @@ def test_points_are_made_only_where_somebody_wants_them():
         application.subscribe("points", sensors=("left",))
         loop.until(lambda: loop.processing.status().subscribers)
         for sensor in ("left", "right"):
-            loop.processing.know(hello(sensor), SHORT)
+            loop.processing.register(hello(sensor), SHORT)
             loop.offer(sensor)
         loop.settle()
         loop.until(lambda: application.read() or application.got)
@@ -224,7 +224,7 @@ def test_missed_error_budget_is_logged_once_per_sensor():
     silence[::2] = ~silence[::2]
     with driven(device="cpu") as loop:
         for sensor in ("loud", "quiet"):
-            loop.processing.know(hello(sensor), SHORT)
+            loop.processing.register(hello(sensor), SHORT)
         for _ in range(3):
             loop.offer("loud")
             loop.offer("quiet", silence)

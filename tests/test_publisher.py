@@ -19,7 +19,7 @@ from tests.driven import Application, driven, hello
 def serving(**options):
     """Processing whose sensor is ready, and an application."""
     with driven(**options) as loop, Application(loop.processing.address) as application:
-        loop.processing.know(hello(), SHORT)
+        loop.processing.register(hello(), SHORT)
         loop.until(lambda: loop.workers("idle"))
         yield loop, application
 
@@ -54,7 +54,7 @@ def test_without_credit_the_latest_waits_and_what_it_replaces_is_counted():
 
 def test_each_product_of_each_sensor_waits_by_itself():
     with serving() as (loop, application):
-        loop.processing.know(hello("left"), SHORT)
+        loop.processing.register(hello("left"), SHORT)
         subscribed(loop, application, "raw", "energyscape", credit=1)
         for sensor in ("front", "left", "front", "left"):
             loop.offer(sensor)
@@ -76,7 +76,7 @@ def test_each_product_of_each_sensor_waits_by_itself():
 
 def test_sensors_and_products_are_those_that_were_asked_for():
     with serving() as (loop, application):
-        loop.processing.know(hello("left"), SHORT)
+        loop.processing.register(hello("left"), SHORT)
         subscribed(loop, application, "energyscape", sensors=("left",), credit=8)
         for sensor in ("front", "left"):
             loop.offer(sensor)
@@ -123,10 +123,10 @@ def test_a_sensor_may_change_as_often_as_it_likes():
         subscribed(loop, application, "energyscape", "raw", credit=64)
         for number in range(300):  # each describes what products of it are about
             place = {"translation_m": (float(number), 0.0, 0.0)}
-            loop.processing.know(hello("left", **place), SHORT)
+            loop.processing.register(hello("left", **place), SHORT)
             application.keep()  # a busy machine takes longer for all of them than who is silent is waited for
             if number % 100 == 0:
-                loop.processing.know(hello("front", **place), SHORT)
+                loop.processing.register(hello("front", **place), SHORT)
                 publish(loop, 1)
         loop.processing.publish_status(Status(version="1", pid=1, host="here", address="x", state="processing"))
         publish(loop, 1)
@@ -208,7 +208,7 @@ class TestKeys:
     def test_a_listed_application_is_served_until_its_key_is_removed(self, pairs, tmp_path):
         keys = ServerKeys(pairs["central"], tmp_path / "allow.toml")
         with driven(keys=keys) as loop, self.connected(loop, pairs, "viewer") as application:
-            loop.processing.know(hello(), SHORT)
+            loop.processing.register(hello(), SHORT)
             subscribed(loop, application, "energyscape", "status", credit=8)
             publish(loop, 1)
             loop.until(lambda: application.read() or application.got)

@@ -235,7 +235,7 @@ def test_images_of_a_real_publisher_which_dies_and_comes_back(keys):
     )
     processing.start()
     with contextlib.closing(processing), Subscriber(processing.address, keys=keys["known"]) as subscriber:
-        processing.know(messages.Hello(sensor="front", session_id=7, next_sequence=0, settings_crc32=0), SETTINGS)
+        processing.register(messages.Hello(sensor="front", session_id=7, next_sequence=0, settings_crc32=0), SETTINGS)
         turned(processing, lambda: processing.status().subscribers)
         images = offered(processing, subscriber, range(3))
         # Whoever kills it must know it: it is nobody's business otherwise.

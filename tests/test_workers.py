@@ -47,7 +47,7 @@ def is_gone(pid):
 
 def test_a_measurement_whose_worker_is_killed_is_processed_by_the_next():
     with driven() as loop:
-        loop.processing.know(hello(), SHORT)
+        loop.processing.register(hello(), SHORT)
         pid = stop_and_offer(loop)
         os.kill(pid, signal.SIGKILL)
         loop.settle()
@@ -61,7 +61,7 @@ def test_a_measurement_whose_worker_is_killed_is_processed_by_the_next():
 
 def test_a_worker_that_is_killed_while_idle_takes_nothing_with_it():
     with driven() as loop:
-        loop.processing.know(hello(), SHORT)
+        loop.processing.register(hello(), SHORT)
         for _ in range(3):
             loop.until(lambda: loop.workers("idle"))
             loop.offer()
@@ -75,7 +75,7 @@ def test_a_worker_that_is_killed_while_idle_takes_nothing_with_it():
 
 def test_a_measurement_that_two_workers_hang_over_is_kept_in_quarantine(tmp_path):
     with driven(deadline_s=0.2, workers=2, quarantine=tmp_path) as loop:
-        loop.processing.know(hello(), SHORT)
+        loop.processing.register(hello(), SHORT)
         loop.until(lambda: len(loop.workers("idle")) == 2)
         for worker in loop.workers("idle"):
             os.kill(worker.pid, signal.SIGSTOP)
@@ -98,7 +98,7 @@ def test_a_sensor_whose_measurements_fail_pauses_and_the_others_go_on(monkeypatc
     monkeypatch.setattr("ertis_numba.network.processing.circuit_breaker._PAUSE_S", 0.5)
     with driven() as loop:
         for sensor in ("bad", "good"):
-            loop.processing.know(hello(sensor), SHORT)
+            loop.processing.register(hello(sensor), SHORT)
         loop.until(lambda: loop.workers("idle"))
         runner = loop.processing._runner  # noqa: SLF001  to have measurements fail
         with monkeypatch.context() as patch:
@@ -154,7 +154,7 @@ def test_a_quarantine_ends_though_its_disk_does_not_answer(tmp_path, monkeypatch
 
 def test_a_kind_that_is_forgotten_while_a_worker_gets_ready_for_it_is_forgotten_there():
     with driven() as loop:
-        loop.processing.know(hello(), SHORT)
+        loop.processing.register(hello(), SHORT)
         loop.until(lambda: loop.workers("idle"))
         runner = loop.processing._runner  # noqa: SLF001
         (worker,) = runner._workers  # noqa: SLF001
@@ -171,7 +171,7 @@ def test_a_kind_that_is_forgotten_while_a_worker_gets_ready_for_it_is_forgotten_
 
 def test_a_worker_that_does_not_die_at_once_holds_nobody_up(monkeypatch):
     with driven() as loop:
-        loop.processing.know(hello(), SHORT)
+        loop.processing.register(hello(), SHORT)
         loop.until(lambda: loop.workers("idle"))
         (worker,) = loop.processing._runner._workers  # noqa: SLF001  to have it seem to end slowly
         child = worker.child
@@ -195,13 +195,13 @@ class TestSensors:
 
     def test_air_that_changes_slowly_makes_no_pipeline_of_each_measurement(self):
         sensors, kinds, _ = self.sensors()
-        sensors.know(hello(), SHORT)
+        sensors.register(hello(), SHORT)
         first = SHORT.air.temperature_c
         for number in range(1000):
             sensors.kind_of(data(temperature_c=first + number / 500))
             assert abs(sensors["front"].settings.air.temperature_c - first - number / 500) <= 0.5
         assert len(kinds) <= 5
-        sensors.know(hello(), SHORT)  # it connects again
+        sensors.register(hello(), SHORT)  # it connects again
         sensors.kind_of(data(temperature_c=first + 2))
         assert len(kinds) <= 5
         assert sensors.kind_of(data(humidity_percent=float("nan"))) is None
@@ -209,18 +209,18 @@ class TestSensors:
     def test_images_that_are_too_large_are_refused_before_anything_is_made(self):
         sensors, kinds, log = self.sensors()
         wide = SHORT.processing.replace(directions="3d:1000000", range_m=(0.4, 1.4))
-        sensors.know(hello(), SHORT.replace(processing=wide))
+        sensors.register(hello(), SHORT.replace(processing=wide))
         assert sensors.kind_of(data()) is None
         assert kinds == []
         ((event, fields),) = log.lines
         assert (event, "256 MB at most" in fields["text"]) == ("unusable", True)
-        sensors.know(hello("good"), SHORT.replace(processing=SHORT.processing.replace(directions="3000")))
+        sensors.register(hello("good"), SHORT.replace(processing=SHORT.processing.replace(directions="3000")))
         assert len(kinds) == 1
 
     def test_a_pipeline_that_could_not_be_made_is_tried_again_after_a_while(self, monkeypatch):
         sensors, kinds, _ = self.sensors()
         now_s = time.monotonic()
-        sensors.know(hello(), SHORT)
+        sensors.register(hello(), SHORT)
         kind = sensors.kind_of(data())
         for after_s in (70.0, 140.0):
             sensors.failed(kind.number, "no memory")
@@ -230,16 +230,16 @@ class TestSensors:
             sensors.tick()
             assert sensors.kind_of(data()) is kind
         sensors.failed(kind.number, "no memory")
-        sensors.know(hello(), SHORT)
+        sensors.register(hello(), SHORT)
         assert sensors.kind_of(data()) is None
         monkeypatch.setattr(time, "monotonic", lambda: now_s + 151.0)
-        sensors.know(hello(), SHORT)
+        sensors.register(hello(), SHORT)
         assert kinds == [kind] * 4
 
 
 def test_a_measurement_of_the_wrong_size_is_dropped_and_the_worker_lives():
     with driven() as loop:
-        loop.processing.know(hello(), SHORT)
+        loop.processing.register(hello(), SHORT)
         loop.offer(words=MEASUREMENT.data[:-1])
         loop.offer()
         loop.settle()
@@ -250,7 +250,7 @@ def test_a_measurement_of_the_wrong_size_is_dropped_and_the_worker_lives():
 
 def test_a_worker_that_raises_is_asked_twice_and_lives():
     with driven() as loop:
-        loop.processing.know(hello(), SHORT)
+        loop.processing.register(hello(), SHORT)
         loop.until(lambda: loop.workers("idle"))
         runner = loop.processing._runner  # noqa: SLF001  to have a worker make a mistake
         runner._workers[0].child.pipe.send(Release(kind=1))  # noqa: SLF001  it has no pipeline: KeyError
@@ -265,8 +265,8 @@ def test_a_worker_that_raises_is_asked_twice_and_lives():
 def test_settings_that_no_pipeline_can_use_are_dropped_by_reason_and_other_sensors_go_on():
     unusable = SHORT.replace(processing=SHORT.processing.replace(range_m=(9.0, 9.5)))  # beyond the record
     with driven() as loop:
-        loop.processing.know(hello("bad", unusable), unusable)
-        loop.processing.know(hello("good"), SHORT)
+        loop.processing.register(hello("bad", unusable), unusable)
+        loop.processing.register(hello("good"), SHORT)
         for _ in range(2):
             loop.offer("bad")
             loop.offer("good")
@@ -281,7 +281,7 @@ import sys
 sys.path[:0] = {path!r}
 from tests.driven import driven, hello, SHORT
 with driven(workers=2) as loop:
-    loop.processing.know(hello(), SHORT)
+    loop.processing.register(hello(), SHORT)
     loop.until(lambda: len(loop.workers("idle")) == 2)
     status = loop.processing.status()
     print(*(worker.pid for worker in status.workers), status.publisher_pid, flush=True)

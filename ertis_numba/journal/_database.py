@@ -161,7 +161,8 @@ class Database:
     def _roll_back_by(self, mode: str) -> None:
         """Switch to a rollback journal.
 
-        Commits leave it with a void header, because no other process can open the file. DELETE removes it by name when the file is closed.
+        Commits leave it with a void header, because no other process can open the file. DELETE
+        removes it by name when the file is closed.
         """
         if self.execute(f"PRAGMA journal_mode = {mode}") != [(mode.lower(),)]:
             raise DataError(f"{self._path} cannot switch from its log; close it, and try again")
