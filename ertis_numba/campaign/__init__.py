@@ -1,4 +1,4 @@
-"""Campaigns: many recordings to energyscapes, on all cores or on a cluster.
+"""Campaigns: processing of many recordings to energyscapes, on all cores or on a cluster.
 
 Each recording becomes a file of its own, complete or not at all, so that a campaign that was ended at any moment goes
 on where it stopped. Workers are processes that know nothing of each other: one that dies takes its recording with it

@@ -1,4 +1,4 @@
-"""The course of a campaign: who does what next, and what became of each recording."""
+"""Course of a campaign: order of the work, and the result of each recording."""
 
 from collections import deque
 from collections.abc import Generator, Iterator, Sequence
@@ -27,7 +27,7 @@ _AHEAD: Final = 2  # recordings that are looked at while others are made, so tha
 
 @dataclass(slots=True, eq=False)
 class _Case:
-    """A recording in hand."""
+    """Recording in progress."""
 
     found: Source
     target: Path
@@ -40,7 +40,7 @@ class _Case:
 
 
 class Campaign:
-    """Makes an energyscape file of each recording in a folder.
+    """Processing of many recordings to energyscape files in a folder.
 
     Whatever the number of workers, the files are the same, bit by bit but for the date in them: a plan is settled once
     for all recordings with the same settings, and neither depends on threads. One that is there already is left alone
@@ -75,7 +75,10 @@ class Campaign:
         if workers is not None:
             checks.integer("workers", workers, 1)
             if scheduler is not None:
-                raise ArgumentError("workers are given and a scheduler, which has its own; give one of both")
+                raise ArgumentError(
+                    "workers and scheduler exclude each other, because a scheduler has its own workers; give one of "
+                    "them"
+                )
         self.folder, self._options = Path(folder), options or CampaignOptions()
         targets = outputs(recordings, self.folder)
         self._names = {target.name for target in targets}
@@ -89,13 +92,13 @@ class Campaign:
 
     @property
     def workers(self) -> int:
-        """How many processes of this machine share it: no more than there are recordings."""
+        """Number of processes on this machine: at most one per recording."""
         cores = usable_cores()
         chosen = self._workers or (1 if self._options.device == "cuda" else cores // (self._options.threads or 1))
         return max(1, min(chosen, len(self._names)))
 
     def run(self) -> Generator[Event]:
-        """Process, and yield what happens; close the iterator to end all work at once.
+        """Process, and yield events; close the iterator to end all work at once.
 
         Raises
         ------
@@ -126,14 +129,14 @@ class Campaign:
         return ProcessPool(self.workers)
 
     def _feed(self, pool: WorkerPool) -> bool:
-        """Give orders to whoever is free; return whether there is anything to wait for."""
+        """Give orders to free workers; return True if there is something to wait for."""
         while pool.free > 0 and (pair := self._next(pool)) is not None:
             self._given[pair[0].number] = pair
             pool.give(pair[0])
         return bool(self._given)
 
     def _next(self, pool: WorkerPool) -> tuple[WorkOrder, _Case] | None:
-        """Return what is to be done next: what is nearest to its end comes first."""
+        """Return the next order: work that is nearest to its end comes first."""
         if self._ready:
             case = self._ready.popleft()
             return self._order("check" if case.is_there else "make", self._pending_output(case, pool.size)), case
@@ -146,7 +149,7 @@ class Campaign:
         return None
 
     def _to_plan(self, n_workers: int) -> tuple[WorkOrder, _Case] | None:
-        """Return an order to plan, unless all that is to be planned for has to wait."""
+        """Return a planning order, unless all planning has to wait."""
         for case in self._unplanned:
             settings = next(each for each in case.wanted.values() if self._plans.of(each) is None)
             if (kind := self._plans.begin(settings)) is not None:
@@ -231,7 +234,7 @@ class Campaign:
             yield from self._forward(case)
 
     def _found_there(self, case: _Case, sensors: dict[str, Any]) -> Iterator[Event]:
-        """Let go of what is made, unless there is something to find out of how it was made."""
+        """Release an existing output, unless its processing has to be examined."""
         if not self._options.is_thorough:
             yield case.ended("there")
             return
@@ -248,7 +251,7 @@ class Campaign:
             yield from self._forward(each)
 
     def _forward(self, case: _Case) -> Iterator[Event]:
-        """Bring a case to where it is made, as far as its plans are known."""
+        """Move a case to processing, once its plans are known."""
         plans = [self._plans.of(settings) for settings in case.wanted.values()]
         failed = [plan for plan in plans if isinstance(plan, str)]
         if failed:

@@ -1,4 +1,4 @@
-"""What happens in a campaign."""
+"""Events of a campaign."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,7 +11,7 @@ Outcome = Literal["made", "there", "passed over", "failed"]
 
 @dataclass(frozen=True, slots=True)
 class Begun:
-    """A recording is processed from now on."""
+    """Processing of a recording has begun."""
 
     recording: Path
     measurements: int
@@ -19,7 +19,7 @@ class Begun:
 
 @dataclass(frozen=True, slots=True)
 class Advanced:
-    """So many measurements of a recording are done."""
+    """Number of processed measurements of a recording."""
 
     recording: Path
     done: int
@@ -27,7 +27,7 @@ class Advanced:
 
 @dataclass(frozen=True, slots=True)
 class RecordingEnded:
-    """What became of a recording.
+    """Result of a recording.
 
     Attributes
     ----------

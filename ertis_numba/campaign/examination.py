@@ -1,4 +1,4 @@
-"""What the plan of a sensor is expected to err by and to take, and what it does err by."""
+"""Predicted and measured error and time of a sensor's plan."""
 
 from collections.abc import Iterator
 from dataclasses import asdict
@@ -26,7 +26,7 @@ def examine(
     verify: bool,
     heard: Planner | None = None,
 ) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield what there is to say of a sensor's plan, as JSON can hold it: ``plan``, then ``verified``.
+    """Yield the examination of a sensor's plan for JSON: ``plan``, then ``verified``.
 
     Parameters
     ----------
@@ -50,7 +50,9 @@ def examine(
     """
     settings = pipeline.settings
     if settings.processing.method == "paper":
-        raise ArgumentError("a plan is asked for, and method 'paper' has none; give 'fast', or leave it out")
+        raise ArgumentError(
+            "--explain or --verify needs a plan, but method 'paper' has none; give 'fast', or leave it out"
+        )
     kernel_set = kernels.load(pipeline.device)
     n_threads = kernel_set.max_threads if threads is None else threads
     planners = {
@@ -66,7 +68,7 @@ def examine(
 
 
 def _plan(planners: dict[str, Planner], settings: Settings) -> dict[str, Any]:
-    """Return a plan and what is expected of it."""
+    """Return a plan with its predictions."""
     chosen = {name: planner.chosen(settings.accuracy) for name, planner in planners.items()}
     safe, signal_model = chosen["safe"], chosen["texture"]
     return {
@@ -93,7 +95,7 @@ def _plan(planners: dict[str, Planner], settings: Settings) -> dict[str, Any]:
 
 
 def _plane_waves(model: ErrorModel, settings: Settings) -> list[dict[str, float]] | None:
-    """Return what plane wavefronts are wrong by at both ends of the range axis; None where they are not plane."""
+    """Return the errors of plane wavefronts at both ends of the range axis; None for spherical wavefronts."""
     if settings.processing.wavefront != "plane":
         return None
     return [
@@ -124,8 +126,8 @@ def _require_budget(sensor: str, error_db: float, settings: Settings) -> None:
     allowed_db = settings.accuracy.max_error_db
     if not error_db <= allowed_db:
         raise DataError(
-            f"image of sensor {sensor} errs by {error_db:.1f} dB, allowed are {allowed_db:g} dB; give a lower "
-            "--max-error, or leave more of [accuracy] open"
+            f"image of sensor {sensor} has an error of {error_db:.1f} dB, but the limit is {allowed_db:g} dB; "
+            "give a lower --max-error, or leave more of [accuracy] open"
         )
 
 

@@ -1,4 +1,4 @@
-"""Whether an energyscape file that is there already is what would be made."""
+"""Comparison of an existing energyscape file with the output to be made."""
 
 import hashlib
 from collections.abc import Mapping
@@ -19,11 +19,11 @@ _ODD = (OSError, RuntimeError, LookupError, AttributeError, TypeError, ValueErro
 
 
 class _ExistingOutput(EnergyscapeReader):
-    """What a file has to tell of how it was made."""
+    """Reader of an existing output and its provenance."""
 
     @property
     def dtype(self) -> str:
-        """Type of its images."""
+        """Type of its amplitudes."""
         return str(self._group["amplitude"].dtype.name)
 
     @property
@@ -38,7 +38,7 @@ class _ExistingOutput(EnergyscapeReader):
         return [self.translation_m.tolist(), self.rotation_xyzw.tolist()]
 
     def require_whole(self) -> None:
-        """Refuse images that are not what was written."""
+        """Refuse images that do not match their checksums."""
         with self._reading():
             for index in range(len(self)):
                 self._rows.row(index)
@@ -49,7 +49,7 @@ def _digest(*parts: bytes) -> str:
 
 
 def look_at(target: Path, recording: RecordingReader, dtype: str) -> dict[str, Any] | None:
-    """Return what there is of an energyscape file that was made of a recording: its sensors' settings and axes.
+    """Return the description of an existing output of a recording: settings and axes of its sensors.
 
     ``differs`` in it says why it is something else, or that it is damaged; it is empty where only settings can be
     different. None is returned where there is no file. A ``recording`` is never to be replaced.
@@ -61,14 +61,14 @@ def look_at(target: Path, recording: RecordingReader, dtype: str) -> dict[str, A
     except DamagedError:
         return {"differs": "is damaged"}
     except (ErtisError, *_ODD):
-        return {"differs": "is no energyscape file that can be read"}
+        return {"differs": "is not a readable energyscape file"}
     if not found["differs"] and made_of != recording.sha256():  # last, as it reads all of it
-        return {"differs": "was made of another file of the same recording"}
+        return {"differs": "was made from another file of the same recording"}
     return found
 
 
 def _read(target: Path, recording: RecordingReader, dtype: str) -> tuple[dict[str, Any], object]:
-    """Return what a file is, and the SHA-256 of the file that it was made of."""
+    """Return the description of a file, and the SHA-256 of the file that it was made from."""
     if file_kind(target) == "recording":
         return {"differs": "is a recording", "recording": True}, None
     sensors: dict[str, Any] = {}
@@ -91,27 +91,27 @@ def _read(target: Path, recording: RecordingReader, dtype: str) -> tuple[dict[st
 
 def _differs(made: _ExistingOutput, recording: RecordingReader, dtype: str) -> str:
     if made.attributes.get("recording_uuid") != recording.uuid:
-        return "was made of another recording"
+        return "was made from another recording"
     for name, wanted in software_versions().items():
         came = made.attributes.get(f"{name.replace('-', '_')}_version", "unknown")
         if came != wanted:
-            return f"was made by {name} {came}, this is {wanted}"
+            return f"was made by {name} {came}, but this is {wanted}"
     if made.dtype != dtype:
-        return f"holds {made.dtype}, wanted {dtype}"
+        return f"contains {made.dtype}, not {dtype}"
     return ""
 
 
 def difference(
     made: dict[str, Any], wanted: dict[str, Settings], mounting: Mapping[str, Mounting] | None = None
 ) -> str:
-    """Return why a file is not what these settings would make of its sensors; empty if it is.
+    """Return the difference between a file and the output of these settings; empty if there is none.
 
     Only a ``mounting`` that is given is compared; that of the recording is in the file already.
     """
     if made["differs"]:
         return str(made["differs"])
     if list(made["sensors"]) != list(wanted):
-        return f"holds sensor {', '.join(made['sensors'])}, wanted {', '.join(wanted)}"
+        return f"contains sensor {', '.join(made['sensors'])}, not {', '.join(wanted)}"
     for name, settings in wanted.items():
         held = made["sensors"][name]
         found = _changed(Settings.from_toml(held["settings"], "settings"), self_contained(settings))
@@ -126,7 +126,7 @@ def difference(
 
 
 def _changed(made: Settings, wanted: Settings) -> str:
-    """Return what is different; a plan may have settled whatever was left open."""
+    """Return the changed settings; a plan may have completed open ones."""
     opened = made.replace(accuracy=_reopened(made.accuracy, wanted.accuracy))
     if wanted.processing.wavefront == "auto":
         opened = opened.replace(processing=opened.processing.replace(wavefront="auto"))

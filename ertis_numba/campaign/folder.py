@@ -1,4 +1,4 @@
-"""The folder that a campaign writes into: one campaign at a time, and nothing half-written stays."""
+"""Output folder of a campaign: one campaign at a time, without half-written files."""
 
 import errno
 import os
@@ -16,7 +16,7 @@ _PART = re.compile(r"(.+)\.[0-9a-f]{8}\.part")  # as `atomic.replacing` names th
 
 @contextmanager
 def sole(folder: Path) -> Iterator[None]:
-    """Make a folder unless it is there, and be the only campaign that writes into it until the block ends.
+    """Create a folder unless it exists, and lock it for this campaign until the block ends.
 
     The system forgets it when the process ends, however it does.
 
@@ -38,7 +38,7 @@ def sole(folder: Path) -> Iterator[None]:
         except OSError as error:
             if error.errno in {errno.EWOULDBLOCK, errno.EACCES}:
                 raise ArgumentError(
-                    f"output {folder} is written into by another campaign; wait for it, or give another folder"
+                    f"output folder {folder} is in use by another campaign; wait for it, or give another folder"
                 ) from None
             # Some file systems of a network have no locks: better none than no campaign.
         yield
@@ -47,13 +47,13 @@ def sole(folder: Path) -> Iterator[None]:
 
 
 def final_name(name: str) -> str:
-    """Return the name that a file has in the end, whether it is half-written or not."""
+    """Return the final name of a file, which may be half-written."""
     part = _PART.fullmatch(name)
     return part[1] if part else name
 
 
 def clear_parts(folder: Path, targets: Collection[str]) -> None:
-    """Remove what writers that were killed have left of files of these names."""
+    """Remove half-written files of killed writers with these names."""
     with os.scandir(folder) as entries:
         names = [entry.name for entry in entries]
     for name in names:

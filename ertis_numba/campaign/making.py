@@ -1,4 +1,4 @@
-"""One recording to its energyscape file, in whatever process: the same for one and for many."""
+"""Processing of one recording to its energyscape file, the same in any process."""
 
 import itertools
 import statistics
@@ -29,17 +29,17 @@ _Checks = tuple[str, CallMatch | None]
 
 
 class Making:
-    """A recording that is ready to be made into energyscapes: nothing is written yet."""
+    """A recording that is ready to be processed; nothing is written yet."""
 
     def __init__(
         self, recordings: Sequence[RecordingReader], runs: Sequence[SensorRun], writer: EnergyscapeWriter
     ) -> None:
         self._recordings, self._runs, self._writer = recordings, runs, writer
         self.measurements = sum(map(len, recordings))
-        """How many there are."""
+        """Number of measurements."""
 
     def run(self) -> Generator[int]:
-        """Make the file; yield how many measurements are done. Closed before its end, it leaves no file."""
+        """Write the file; yield the number of processed measurements. Closed before its end, it leaves no file."""
         done = 0
         with self._writer:
             for run, recording in zip(self._runs, self._recordings, strict=True):
@@ -48,7 +48,7 @@ class Making:
                     yield done
 
     def report(self) -> dict[str, Any]:
-        """Return what was made, as ``--json`` has it; what there is to say of a single sensor stands outside, too."""
+        """Return the report of ``--json``; the entries of a single sensor also stand at the top level."""
         rows = [
             {"sensor": recording.sensor, **run.report()}
             for recording, run in zip(self._recordings, self._runs, strict=True)
@@ -77,7 +77,7 @@ def making(
     warn: Callable[[str], None] = lambda _: None,
     show: _Show = lambda *_: None,
 ) -> Iterator[Making]:
-    """Open a recording, and look at every sensor of it, so that what cannot be done is refused before anything is.
+    """Open a recording and check every sensor, so that errors are reported before any processing.
 
     Parameters
     ----------
@@ -92,8 +92,8 @@ def making(
     max_bytes : float, optional
         See `SensorRun`.
     warn : callable
-        Called with a line for each sensor that has faulty microphones, whose echoes do not match the
-        call, or whose images may exceed the error budget.
+        Called with a line for each sensor that has faulty microphones, whose echoes do not match the call, or whose
+        images may exceed the error budget.
     show : callable
         Called with the name of a sensor and what was found out of its plan, as soon as it was.
 
@@ -136,7 +136,7 @@ def checked(
     pipelines: _Pipelines,
     warn: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
-    """Look at every sensor of a recording as `making` does, and make nothing; return what was found out of the plans.
+    """Check every sensor of a recording as `making` does, without processing; return the examined plans.
 
     Parameters
     ----------
@@ -165,7 +165,7 @@ def checked(
 
 
 def _wavefront(planner: Planner, recording: RecordingReader, show: _Show) -> dict[str, float]:
-    """Return, and show, the error of plane wavefronts at the first range if it exceeds the budget."""
+    """Return, and report, the error of plane wavefronts at the first range if it exceeds the budget."""
     settings = planner.settings
     if settings.processing.wavefront != "plane":
         return {}
@@ -180,14 +180,14 @@ def _wavefront(planner: Planner, recording: RecordingReader, show: _Show) -> dic
 def _begin_checks(
     stack: ExitStack, recordings: Sequence[RecordingReader], settings: Sequence[Settings]
 ) -> list[Future[_Checks]]:
-    """Begin the checks of all sensors' signals in a thread, beside the planning and loading of pipelines."""
+    """Start the checks of all sensors' signals in a thread, parallel to planning and loading of pipelines."""
     thread = ThreadPoolExecutor(1, thread_name_prefix="ertis-checks")
     stack.callback(thread.shutdown, cancel_futures=True)  # an interruption does not wait for other sensors
     return [thread.submit(_check, *each) for each in zip(recordings, settings, strict=True)]
 
 
 def _check(recording: RecordingReader, settings: Settings) -> _Checks:
-    """Return what is wrong with the microphones of a sensor, empty if nothing is, and the match of its call."""
+    """Return the faults of a sensor's microphones, empty if there are none, and the match of its call."""
     first = recording[0]
     faults = faults_of(f"{recording.path}: sensor {recording.sensor}", replace(first, settings=settings))
     others = (recording[index] for index in range(1, len(recording)))

@@ -1,4 +1,4 @@
-"""Workers of a dask cluster that is there already, for more than one machine."""
+"""Workers of an existing dask cluster, for several machines."""
 
 import queue
 import secrets
@@ -21,7 +21,7 @@ _REPORT_INTERVAL_S: Final = 0.5
 
 
 class Members:
-    """See `Crew`: the workers of a dask scheduler, with no more recordings in hand than there are workers.
+    """`WorkerPool` of the workers of a dask scheduler, with at most one recording in progress per worker.
 
     They need this package and what it computes with, of the same versions, and have to see the files under the same
     names. What a lost worker had, dask starts again on another, a few times. Whoever reaches a scheduler can run code
@@ -58,19 +58,19 @@ class Members:
 
     @property
     def size(self) -> int:
-        """See `Crew`."""
+        """Number of orders in progress at once."""
         return self._size
 
     @property
     def free(self) -> int:
-        """See `Crew`."""
+        """Number of orders that can be given now."""
         return max(0, self._size - len(self._futures))  # workers may have been lost
 
     def limit(self, size: int) -> None:
-        """See `Crew`; each worker of a cluster has its own device."""
+        """Do nothing: each worker of a cluster has its own device."""
 
     def give(self, order: WorkOrder) -> None:
-        """See `Crew`."""
+        """Run an order; never blocks."""
         future = self._client.submit(
             follow_there,
             order.do,
@@ -84,10 +84,11 @@ class Members:
         future.add_done_callback(lambda done, number=order.number: self._reported.put(_news(number, done)))
 
     def wait(self, timeout_s: float) -> list[News]:
-        """See `Crew`."""
+        """Return news, or nothing after a while."""
         if self._client.status != "running":
             raise NetworkError(
-                f"the dask scheduler at {self._address} is gone; what is made stays, give another to go on"
+                f"the dask scheduler at {self._address} is gone; finished output stays. Give another scheduler "
+                "to continue"
             )
         self._look()
         try:
@@ -102,18 +103,18 @@ class Members:
         return news
 
     def close(self) -> None:
-        """See `Crew`: dask cannot end a thread, but the work notices that nobody wants it any more."""
+        """End all work: dask cannot end a thread, but the work notices that no one waits for it."""
         with self._stack:
             if self._client.status == "running":
                 self._client.cancel(list(self._futures.values()), force=True)
 
     def _advance(self, event: tuple[Any, dict[str, Any]]) -> None:
-        """Take what a task tells; in a thread of the client."""
+        """Process a message of a task; runs in the thread of the client."""
         _, reported = event
         self._reported.put(News(reported["number"], reported["done"]))
 
     def _look(self) -> None:
-        """Count the workers again, now and then."""
+        """Count the workers again from time to time."""
         if time.monotonic() < self._looked_s + _LOOK_S:
             return
         self._looked_s = time.monotonic()
@@ -124,27 +125,29 @@ class Members:
 
 
 def _news(number: int, future: cluster.Future) -> News:
-    """Return what a task has come to; in a thread of the client."""
+    """Return the result of a task; runs in the thread of the client."""
     try:
         return News(number, result=future.result(timeout=_CONNECT_S))
     except CancelledError:
-        return News(number, result={"error": "the cluster has let go of it; process again", "by_chance": True})
+        return News(number, result={"error": "the cluster has dropped it; process again", "by_chance": True})
     except Exception as error:  # noqa: BLE001  whatever it was, somebody waits to hear of it
         text = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
         return News(number, result={"error": text, "by_chance": True})
 
 
 class _UnwantedError(Exception):
-    """Nobody waits for what a task does."""
+    """No one waits for the result of a task."""
 
 
 def follow_there(do: str, about: dict[str, Any], topic: str, number: int) -> dict[str, Any]:
-    """Follow an order as `work.follow` does, on a worker of the cluster; ``topic`` is where it tells how far it is."""
+    """Run an order on a worker of the cluster, as `work.follow` does; ``topic`` receives its progress."""
     here = cluster.current_worker()
     for name, wanted in about["versions"].items():
         came = software_versions()[name]
         if came != wanted:
-            return {"error": f"worker {here.address} has {name} {came}, wanted {wanted}; install the same everywhere"}
+            return {
+                "error": f"worker {here.address} has {name} {came}, not {wanted}; install the same version everywhere"
+            }
     reported_s = 0.0
 
     def notify(done: int) -> None:

@@ -1,4 +1,4 @@
-"""The options of a campaign, and what a worker is told to do, as JSON can hold it."""
+"""Options of a campaign, and orders to workers, in the form of JSON."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -11,12 +11,12 @@ from ertis_numba.storage.recording import Mounting
 __all__ = ["HOW", "MAX_BYTES", "CampaignOptions", "Do", "News", "WorkOrder", "WorkerPool"]
 
 MAX_BYTES: Final = 256e6
-"""Of images that wait to be written, of all workers together."""
+"""Limit on images that wait to be written, of all workers together."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CampaignOptions:
-    """How each recording is to be processed.
+    """Options for processing each recording.
 
     Attributes
     ----------
@@ -40,8 +40,8 @@ class CampaignOptions:
     explain : bool
         Tell the plan of each sensor, its predicted error and time, as ``plan`` of what was made.
     verify : bool
-        Measure the error of each sensor's first measurement, ``verified`` of what was made; a recording fails if it
-        is beyond the budget.
+        Measure the error of each sensor's first measurement, ``verified`` of what was made; a recording fails if it is
+        beyond the budget.
     """
 
     settings: Callable[[Settings], Settings] = lambda recorded: recorded
@@ -63,12 +63,12 @@ class CampaignOptions:
 
     @property
     def is_thorough(self) -> bool:
-        """Whether there is more to find out of a recording than what its image is, even of one that is made already."""
+        """True if the options need more than the image of a recording, even for an existing output."""
         return self.strict or self.explain or self.verify
 
 
 HOW: Final = ("dtype", "batch", "strict", "overwrite", "mounting", "explain", "verify")
-"""What an order has of `CampaignOptions` as it is."""
+"""Fields of `CampaignOptions` that an order contains unchanged."""
 
 
 Do = Literal["look", "plan", "make", "check"]
@@ -76,7 +76,7 @@ Do = Literal["look", "plan", "make", "check"]
 
 @dataclass(frozen=True, slots=True)
 class WorkOrder:
-    """Something for a worker to do.
+    """Order to a worker.
 
     Attributes
     ----------
@@ -93,7 +93,7 @@ class WorkOrder:
 
 @dataclass(frozen=True, slots=True)
 class News:
-    """What a worker tells of an order.
+    """Message of a worker about an order.
 
     Attributes
     ----------
@@ -111,24 +111,24 @@ class News:
 
 
 class WorkerPool(Protocol):
-    """Those who follow orders."""
+    """Executors of orders."""
 
     @property
     def size(self) -> int:
-        """How many orders are followed at a time."""
+        """Number of orders in progress at once."""
 
     @property
     def free(self) -> int:
-        """How many more may be given now; none where more are followed than there are to be."""
+        """Number of orders that can be given now; zero if more are in progress than allowed."""
 
     def limit(self, size: int) -> None:
-        """Follow fewer orders at a time from now on; those that were given are followed to their end."""
+        """Reduce the number of orders in progress; those given are finished."""
 
     def give(self, order: WorkOrder) -> None:
-        """Have something done; returns at once."""
+        """Run an order; never blocks."""
 
     def wait(self, timeout_s: float) -> list[News]:
-        """Return what there is to tell, or nothing after a while."""
+        """Return news, or nothing after a while."""
 
     def close(self) -> None:
         """End all work at once."""

@@ -1,4 +1,4 @@
-"""What settings leave open is settled once, for all recordings that share them."""
+"""Plans that complete open settings once for all recordings with the same settings."""
 
 import hashlib
 from collections.abc import Mapping
@@ -10,7 +10,7 @@ __all__ = ["Plans"]
 
 
 class Plans:
-    """Plans by the settings that they are for, and which are being made.
+    """Plans by their settings, and the plans in progress.
 
     Were it not for them, workers that have measured other costs could choose other plans, and files would depend on who
     made them.
@@ -22,11 +22,11 @@ class Plans:
         self._under_way: dict[bytes, bool] = {}  # settings, and whether their kind is new
 
     def of(self, settings: Settings) -> Accuracy | str | None:
-        """Return the plan for settings, or why there can be none, or None as long as it is not known."""
+        """Return the plan for settings, or an error text, or None while it is not known."""
         return self._found.get(_key(settings))
 
     def begin(self, settings: Settings) -> Literal["new", "known"] | None:
-        """Say that settings are planned for from now on; return whether their kind is new, None if they have to wait.
+        """Register that settings are being planned; return True if their kind is new, None if they have to wait.
 
         A kind is all but the air. New ones come one after the other: kernels that are compiled by several processes at
         once could spoil each other's cache.
@@ -38,7 +38,7 @@ class Plans:
         return "new" if new else "known"
 
     def end(self, settings: Settings, reported: Mapping[str, Any]) -> None:
-        """Take what came of it; what went wrong by chance is tried again by whoever wants the same plan."""
+        """Store the result; after a temporary error, the next request plans again."""
         key = _key(settings)
         self._under_way.pop(key)
         if "by_chance" in reported:

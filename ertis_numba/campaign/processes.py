@@ -1,4 +1,4 @@
-"""Workers of this machine: processes that are started, fed, and started again when they have died."""
+"""Worker processes on this machine: start, orders, restart after death."""
 
 import json
 import queue
@@ -23,7 +23,7 @@ _LAST_WORDS: Final = 20  # lines
 
 @dataclass(slots=True, eq=False)
 class _WorkerProcess:
-    """A process, and what it does at present."""
+    """A process, and its current order."""
 
     process: "subprocess.Popen[str]"
     order: WorkOrder | None = None
@@ -34,7 +34,7 @@ class _WorkerProcess:
 
 
 class ProcessPool:
-    """See `Crew`: Python processes that are new interpreters, not forks, which OpenMP and HDF5 would not survive.
+    """`WorkerPool` of new Python interpreters rather than forks, which OpenMP and HDF5 would not survive.
 
     Ctrl-C in a terminal does not reach them; they end with this process, however that ends.
 
@@ -62,27 +62,27 @@ class ProcessPool:
 
     @property
     def size(self) -> int:
-        """See `Crew`."""
+        """Number of orders in progress at once."""
         return self._size
 
     @property
     def free(self) -> int:
-        """See `Crew`."""
+        """Number of orders that can be given now."""
         return max(0, self._size - sum(worker.order is not None for worker in self._workers))
 
     @property
     def doing(self) -> dict[int, str]:
-        """What each process works on, by its number in the system: the path of a recording, or nothing."""
+        """Work of each process, by process identifier: the path of a recording, or nothing."""
         return {worker.process.pid: _path(worker.order) for worker in self._workers}
 
     def limit(self, size: int) -> None:
-        """See `Crew`; whoever is busy ends when it is done, as far as there are too many."""
+        """Reduce the number of processes; a busy one ends after its order, if there are too many."""
         self._size = min(self._size, size)
         for worker in [worker for worker in self._workers if worker.order is None][self._size :]:
             self._end(worker)
 
     def give(self, order: WorkOrder) -> None:
-        """See `Crew`."""
+        """Run an order; never blocks."""
         worker = next((worker for worker in self._workers if worker.order is None), None) or self._start()
         worker.order, worker.begun = order, False
         stdin = worker.process.stdin
@@ -92,7 +92,7 @@ class ProcessPool:
                 stdin.flush()
 
     def wait(self, timeout_s: float) -> list[News]:
-        """See `Crew`."""
+        """Return news, or nothing after a while."""
         try:
             reported = [self._reported.get(timeout=timeout_s)]
         except queue.Empty:
@@ -102,7 +102,7 @@ class ProcessPool:
         return [news for worker, line in reported if (news := self._heard(worker, line)) is not None]
 
     def close(self) -> None:
-        """See `Crew`."""
+        """End all work at once."""
         for worker in self._workers:
             worker.process.kill()  # all of them first
         for worker in list(self._workers):
@@ -165,17 +165,17 @@ class ProcessPool:
         if not worker.ready:
             self._stillborn += 1
         if self._stillborn >= _MAX_STILLBORN:
-            raise DeviceError(f"processes to work in end at once: the last one {how}; try 'ertis process' on one file")
+            raise DeviceError(f"worker processes end at once: the last one {how}; try 'ertis process' on one file")
         if order is not None and not worker.begun:
             self.give(order)
             return None
         if order is None:
             return None
-        text = f"{_path(order)}: the process that worked on it {how}; where memory runs out, give fewer --workers"
+        text = f"{_path(order)}: its worker process {how}; if memory runs out, give fewer --workers"
         return News(order.number, result={"error": text, "by_chance": True})
 
     def _end(self, worker: _WorkerProcess) -> None:
-        """End a process at once and let go of it."""
+        """End a process at once and release it."""
         self._workers.remove(worker)
         worker.process.kill()
         worker.process.wait()
@@ -196,5 +196,5 @@ def _how_it_ended(worker: _WorkerProcess) -> str:
     if code < 0:
         with suppress(ValueError):
             return f"was ended by {signal.Signals(-code).name}"
-    stated = f", saying {worker.stated[-1]!r}" if worker.stated else ""
+    stated = f", printing {worker.stated[-1]!r}" if worker.stated else ""
     return f"ended with {code}{stated}"

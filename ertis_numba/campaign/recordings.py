@@ -1,4 +1,4 @@
-"""Which recordings there are, and what they are to become."""
+"""Recordings to process, and the names of their output files."""
 
 import glob
 import os
@@ -11,12 +11,12 @@ from ertis_numba.errors import ArgumentError, DataError
 __all__ = ["SUFFIX", "Source", "find", "outputs"]
 
 SUFFIX = ".energy.h5"
-"""Of the energyscape file of a recording."""
+"""Suffix of a recording's energyscape file."""
 
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """A file that is to be processed.
+    """File to process.
 
     Attributes
     ----------
@@ -31,10 +31,10 @@ class Source:
 
 
 def find(given: Iterable[str | Path]) -> list[Source]:
-    """Return the files that are meant, each once, in the order given.
+    """Return the named files, each once, in the order given.
 
-    A file counts rather than links to it, which may come to mean another one. What a pattern or a folder has that is
-    no file, as a link to what is gone, is left to whoever opens it to tell.
+    A file counts rather than links to it, which may come to mean another one. What a pattern or a folder has that is no
+    file, as a link to what is gone, is left to whoever opens it to tell.
 
     Parameters
     ----------
@@ -63,24 +63,24 @@ def _meant(text: str) -> Sequence[Source]:
     if path.is_dir():
         paths = sorted(each for each in path.glob("*.h5") if _may_be_meant(each))
         if not paths:
-            raise DataError(f"folder {path} has no *.h5 in it; give a folder with recordings, or a pattern")
+            raise DataError(f"folder {path} contains no *.h5; give a folder with recordings, or a pattern")
     elif path.exists() or not glob.has_magic(text):
         return [Source(path)]
     else:
         every = map(Path, glob.glob(text, recursive=True))  # noqa: PTH207
         paths = sorted(each for each in every if _may_be_meant(each))
         if not paths:
-            raise DataError(f"no file is named like {text}; give another pattern")
+            raise DataError(f"no file matches {text}; give another pattern")
     return [Source(each, named=False) for each in paths]
 
 
 def _may_be_meant(path: Path) -> bool:
-    """Whether a path is a file, or a link to one that is gone."""
+    """Return True for a file, or a broken link to one."""
     return path.is_file() or not path.exists()
 
 
 def outputs(recordings: Sequence[Source], folder: Path) -> list[Path]:
-    """Return the file in ``folder`` that each recording is to become.
+    """Return the output file in ``folder`` for each recording.
 
     Raises
     ------
@@ -88,9 +88,9 @@ def outputs(recordings: Sequence[Source], folder: Path) -> list[Path]:
         Two would become the same, or one would replace another recording; there can be no such folder.
     """
     if folder.exists() and not folder.is_dir():
-        raise ArgumentError(f"output {folder} is a file, and several recordings need a folder; give another name")
+        raise ArgumentError(f"output {folder} is a file, but several recordings need a folder; give another name")
     if not folder.parent.is_dir():
-        raise ArgumentError(f"output {folder}: there is no folder {folder.parent}; make it or give another")
+        raise ArgumentError(f"output {folder}: folder {folder.parent} does not exist; create it or give another")
     named = {os.path.realpath(found.path) for found in recordings if found.named}  # others may be energyscape files
     taken: dict[str, Path] = {}
     targets = []
@@ -99,11 +99,11 @@ def outputs(recordings: Sequence[Source], folder: Path) -> list[Path]:
         name = os.path.normcase(target)
         if name in taken:
             raise ArgumentError(
-                f"{taken[name]} and {found.path} would both become {target}; process them into folders of their own"
+                f"{taken[name]} and {found.path} would both become {target}; process them into separate folders"
             )
         if os.path.realpath(target) in named:
             raise ArgumentError(
-                f"{found.path} would become {target}, which is to be processed itself; give another folder"
+                f"{found.path} would become {target}, which is itself to be processed; give another folder"
             )
         taken[name] = found.path
         targets.append(target)

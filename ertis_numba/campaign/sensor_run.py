@@ -1,4 +1,4 @@
-"""The measurements of one sensor, through its pipeline, into a file."""
+"""Processing of one sensor's measurements into a file."""
 
 import itertools
 import statistics
@@ -23,25 +23,25 @@ __all__ = ["SensorRun", "faults_of"]
 
 
 def faults_of(name: str, measurement: Measurement) -> str:
-    """Return what is wrong with the microphones, and what to do about it, in a line; it is empty if nothing is."""
+    """Return the faults of the microphones with the remedy, in one line; empty if there are none."""
     report = health(measurement)
     if not report.faults:
         return ""
     if report.record_faults:
         details = "; ".join(f"{item.fault}: {item.detail or item.measured}" for item in report.record_faults)
         remedy = report.record_faults[0].remedy
-        return f"{name} has faults in its record ({details}); {remedy}, or see 'ertis info --health'"
+        return f"{name} has faults in its recording ({details}); {remedy}, or see 'ertis info --health'"
     every = all(channel.faults for channel in report.channels)
     remedies = dict.fromkeys(item.remedy for item in report.findings)
     remedy = "check its cable and supply" if every else next(iter(remedies))
     if remedy == DISABLE:
         channels = sorted({channel.channel for channel in report.channels if channel.faults})
-        remedy = f"leave them out by --without {','.join(map(str, channels))}"
+        remedy = f"exclude them with --without {','.join(map(str, channels))}"
     return f"{name} has faulty microphones ({report.verdict()}); {remedy}, or see 'ertis info --health'"
 
 
 class SensorRun:
-    """The pipeline of one sensor, what was told of it, and how long it took for each measurement.
+    """Pipeline of one sensor, its predictions, and the time of each measurement.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ class SensorRun:
         self._size = max(1, min(batch, int((max_bytes or MAX_BYTES) / image_bytes)))
 
     def known(self, measurement: Measurement) -> Measurement:
-        """Return a measurement as it is now known: a settings file may know better what array, call or air it was."""
+        """Return a measurement with its known settings: a settings file may correct array, call or air."""
         return replace(measurement, settings=self.pipeline.settings)
 
     def write(self, recording: RecordingReader, writer: EnergyscapeWriter) -> Iterator[None]:
@@ -106,7 +106,7 @@ class SensorRun:
         return images
 
     def report(self) -> dict[str, Any]:
-        """Return what was done, as ``--json`` has it."""
+        """Return the report of ``--json``."""
         return {
             "measurements": len(self.times_ms),
             "directions": len(self.pipeline.grid),
@@ -119,7 +119,7 @@ class SensorRun:
 
 
 def _require_same_air(measurement: Measurement, settings: Settings) -> None:
-    """Refuse a measurement in other air, whose ranges would not be those of the axis."""
+    """Refuse a measurement in other air, whose ranges would differ from the axis."""
     came, wanted = measurement.settings.air, settings.air
     if came != wanted:
         raise DataError(

@@ -1,4 +1,4 @@
-"""What workers do: look at a recording, plan how to process it, make its energyscapes, or check those that are there.
+"""Work of the workers: examine a recording, plan its processing, process it, or check existing energyscapes.
 
 Each takes and returns what JSON can hold, so that it runs in any process of any machine that sees the files.
 """
@@ -33,7 +33,7 @@ _kept: dict[_Key, Pipeline] = {}  # that nobody uses at present
 
 
 def follow(do: str, about: Mapping[str, Any], notify: ReportProgress = lambda _: None) -> dict[str, Any]:
-    """Follow an order, and return what came of it; what is expected to fail is told as ``error``.
+    """Run an order, and return its result; expected errors are returned as ``error``.
 
     Parameters
     ----------
@@ -51,14 +51,14 @@ def follow(do: str, about: Mapping[str, Any], notify: ReportProgress = lambda _:
 
 
 def _in_a_line(error: OSError | MemoryError) -> str:
-    """Return an error of the system with the remedy, and with the name that a file was to have in the end."""
+    """Return an error of the system with its remedy, with the final name of a file."""
     if isinstance(error, OSError) and error.strerror and error.filename is not None:
         return f"{final_name(os.fsdecode(error.filename))}: {error.strerror}; {remedy(error)}"
     return " ".join(str(error).split()) or type(error).__name__
 
 
 def _look(about: Mapping[str, Any], _: ReportProgress) -> dict[str, Any]:
-    """Say what a recording holds, and what of it is made already."""
+    """Return the content of a recording, and its existing output."""
     path = Path(about["path"])
     if not about["named"] and file_kind(path) == "energyscape":
         return {"passed_over": True}
@@ -73,7 +73,7 @@ def _look(about: Mapping[str, Any], _: ReportProgress) -> dict[str, Any]:
 
 
 def _plan(about: Mapping[str, Any], _: ReportProgress) -> dict[str, Any]:
-    """Settle what settings leave open; ``warm`` also compiles what it takes, which whoever comes later finds."""
+    """Complete open settings; ``warm`` also compiles the kernels for later use."""
     settings = Settings.from_toml(about["settings"], "settings")
     threads = _threads(about, settings)
     if not about["warm"]:
@@ -90,7 +90,7 @@ def _plan(about: Mapping[str, Any], _: ReportProgress) -> dict[str, Any]:
 
 
 def _make(about: Mapping[str, Any], notify: ReportProgress) -> dict[str, Any]:
-    """Make the energyscape file of a recording."""
+    """Write the energyscape file of a recording."""
     options, how = _how(about)
     warnings: list[str] = []
     with making(
@@ -109,14 +109,14 @@ def _make(about: Mapping[str, Any], notify: ReportProgress) -> dict[str, Any]:
 
 
 def _check(about: Mapping[str, Any], _: ReportProgress) -> dict[str, Any]:
-    """Say of a recording whose energyscapes are there what would have been said before they were made."""
+    """Return the messages for a recording with existing energyscapes that processing would have given."""
     options, how = _how(about)
     warnings: list[str] = []
     return {**checked(Path(about["path"]), options, warn=warnings.append, **how), "warnings": warnings}
 
 
 def _how(about: Mapping[str, Any]) -> tuple[CampaignOptions, dict[str, Any]]:
-    """Return the options, the settings of each sensor and where pipelines come from."""
+    """Return the options, the settings of each sensor and the source of pipelines."""
     settings = {name: Settings.from_toml(text, f"settings of {name}") for name, text in about["sensors"].items()}
     threads = _threads(about, next(iter(settings.values())))
     options = CampaignOptions(**{name: about[name] for name in HOW}, threads=threads)
@@ -125,7 +125,7 @@ def _how(about: Mapping[str, Any]) -> tuple[CampaignOptions, dict[str, Any]]:
 
 
 def _threads(about: Mapping[str, Any], settings: Settings) -> int | None:
-    """Return how many threads a measurement may have, where workers share the cores of a machine."""
+    """Return the number of threads per measurement, if workers share the cores of a machine."""
     if about["threads"] is not None or settings.processing.method == "paper":
         return None if about["threads"] is None else int(about["threads"])
     largest = kernels.load(about["device"]).max_threads
@@ -134,7 +134,7 @@ def _threads(about: Mapping[str, Any], settings: Settings) -> int | None:
 
 @contextmanager
 def _pipelines(settings: Sequence[Settings], device: str, threads: int | None) -> Iterator[list[Pipeline]]:
-    """Yield a pipeline for each of the settings, those of the recording before where they are the same.
+    """Yield a pipeline for each of the settings, reusing the previous recording's if the settings are the same.
 
     Who uses one has it for itself. No more are kept than were used last, so that memory does not grow with the number
     of recordings.
@@ -156,7 +156,7 @@ def _pipelines(settings: Sequence[Settings], device: str, threads: int | None) -
 
 
 def _keep(pipelines: Mapping[_Key, Pipeline]) -> None:
-    """Keep pipelines for who asks next, in place of those of the same settings that another thread has made."""
+    """Keep pipelines for later requests, replacing those of the same settings."""
     with _turn:
         spare = [_kept.pop(key) for key in pipelines if key in _kept]
         _kept.update(pipelines)

@@ -1,4 +1,4 @@
-"""A process that follows orders, lines of JSON: ``python -m ertis_numba.campaign.worker_process``.
+"""Worker process that runs orders from JSON lines: ``python -m ertis_numba.campaign.worker_process``.
 
 It ends at once when nobody gives orders any more.
 """
@@ -68,7 +68,7 @@ class _Process:
 
 
 def main() -> None:
-    """Follow orders from stdin, and tell on stdout what came of them."""
+    """Run orders from stdin, and print their results on stdout."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # it is the other process that says when to end
     out = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # whatever else prints must not get between

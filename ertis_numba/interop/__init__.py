@@ -1,4 +1,4 @@
-"""Foreign formats."""
+"""Readers and writers of foreign formats."""
 
 from ertis_numba.interop._export import FORMATS, TOPICS, export, files_of, format_of
 from ertis_numba.interop.pcm import PcmReader, open_pcm

@@ -1,6 +1,6 @@
-"""Microphone signals of Acoular and for it: an HDF5 file of them, and an XML file of the array.
+"""Microphone signals for and from Acoular: an HDF5 file of signals, and an XML file of the array.
 
-What `acoular.TimeSamples` and `acoular.MicGeom` of Acoular 24 to 26 read (https://www.acoular.org).
+The files follow `acoular.TimeSamples` and `acoular.MicGeom` of Acoular 24 to 26 (https://www.acoular.org).
 """
 
 from dataclasses import asdict
@@ -25,7 +25,7 @@ __all__ = ["read_acoular", "write_acoular"]
 
 
 def write_acoular(path: Path, geometry: Path, measurement: Measurement) -> None:
-    """Write the signals of a measurement, and the positions of the microphones that they come from.
+    """Write the signals of a measurement, and the positions of its microphones.
 
     Signals are divided by the calibrated gains; calibrated delays are left in. Positions are in the sensor frame, x
     forward, y left and z up, in metres.
@@ -33,7 +33,7 @@ def write_acoular(path: Path, geometry: Path, measurement: Measurement) -> None:
     layout = microphones(measurement.settings.array)
     signals = signals_of(measurement)
     geometry.write_text(_xml(layout), encoding="utf-8")
-    require_free_space(path.parent, signals.nbytes)  # HDF5 on a full disk can take the process with it
+    require_free_space(path.parent, signals.nbytes)  # HDF5 can crash the process on a full disk.
     with h5py.File(path, "w") as file:
         samples = file.create_dataset("time_data", data=signals.T)
         samples.attrs["sample_freq"] = measurement.settings.signal_rate_hz
@@ -45,10 +45,10 @@ def write_acoular(path: Path, geometry: Path, measurement: Measurement) -> None:
 
 
 def read_acoular(path: Path) -> tuple[float, NDArray[Any], Settings | None]:
-    """Return the rate in hertz, the signals, (sample, channel), and the settings of a file that `write_acoular` made.
+    """Return the sample rate in Hz, the signals, (sample, channel), and the settings of a file from `write_acoular`.
 
-    The settings are those of what is in the file: only the microphones that were enabled, without gains, which the
-    signals were divided by, and ranges counted in its samples. Of other files they are None.
+    The settings describe the file's content: only enabled microphones, without gains, because the signals are divided
+    by them, and ranges counted in its samples. For other files they are None.
 
     Raises
     ------
@@ -69,7 +69,8 @@ def read_acoular(path: Path) -> tuple[float, NDArray[Any], Settings | None]:
         raise DataError(f"{path}: {error}") from error
     except (OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
         raise DataError(
-            f"{path} holds no time_data with a sample_freq; give a file of Acoular, or a recording to 'ertis process'"
+            f"{path} contains no time_data with a sample_freq; give a file of Acoular, or process a recording "
+            "with 'ertis process'"
         ) from error
     if rates_hz.size != 1:
         raise DataError(f"{path}: sample_freq is {rates_hz.tolist()}; give one number, the rate in Hz")
@@ -88,7 +89,7 @@ def read_acoular(path: Path) -> tuple[float, NDArray[Any], Settings | None]:
 
 
 def _of_signals(settings: Settings, rate_hz: float) -> Settings:
-    """Return the settings of a recording for the signals that were made of it."""
+    """Return the settings of a recording for the signals computed from it."""
     layout, step = microphones(settings.array), round(settings.recording.sample_rate_hz / rate_hz)
     array = Array(
         layout=layout.name,

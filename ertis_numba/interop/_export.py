@@ -16,7 +16,7 @@ from ertis_numba.interop._mountings import Mountings, checked
 __all__ = ["FORMATS", "TOPICS", "Format", "export", "files_of", "format_of"]
 
 TOPICS: Final = ("points", "image", "sonar_image")
-"""What MCAP can hold of a sensor."""
+"""Products of a sensor in MCAP."""
 _POINTS = (
     *("x", "y", "z", "intensity", "uncertainty_range", "uncertainty_across"),
     *("sensor", "sequence", "sec", "nanosec"),
@@ -65,11 +65,11 @@ FORMATS: Final = {
     ),
     "acoular": Format(ending=".h5", holds=("time_data", "metadata")),
 }
-"""Formats by name; ``docs/export.md`` says what each keeps."""
+"""Formats by name; the how-to guide on exports states the content of each."""
 
 
 def format_of(path: str | Path, name: str | None = None) -> str:
-    """Return the name of the format of a file to write: the one given, or else by its ending.
+    """Return the name of the format to write: the given one, or by the suffix of the file.
 
     Raises
     ------
@@ -85,7 +85,7 @@ def format_of(path: str | Path, name: str | None = None) -> str:
 
 
 def files_of(path: str | Path, name: str) -> tuple[Path, ...]:
-    """Return the files that an export makes: for ``acoular`` also that of the array, with the ending ``.xml``.
+    """Return the files of an export: for ``acoular`` also that of the array, with the suffix ``.xml``.
 
     Raises
     ------
@@ -96,7 +96,7 @@ def files_of(path: str | Path, name: str) -> tuple[Path, ...]:
         return (Path(path),)
     files = Path(path), Path(path).with_suffix(".xml")
     if files[0] == files[1]:
-        raise ArgumentError(f"{path} is where the array would be written, beside the signals; give a name in .h5")
+        raise ArgumentError(f"{path} is also the name of the array's file; give a name that ends in .h5")
     return files
 
 
@@ -170,14 +170,14 @@ def export(
             else:
                 _write_points(name, parts[0], _energyscapes(items), checked(mounting), chosen, finding, text=text)
     except OSError as error:
-        if isinstance(error, ErtisError):  # of what the images come from
+        if isinstance(error, ErtisError):  # Errors of the images' source pass unchanged.
             raise
         raise DataError(f"{path} cannot be written ({error.strerror or error}); {remedy(error)}") from error
     return paths
 
 
 def _require_options(name: str, given: Mapping[str, object]) -> None:
-    """Refuse options that a format has no use for; None is one that is not given."""
+    """Refuse options that a format does not use; None stands for an option that is not given."""
     for option, value in given.items():
         if value is not None and option not in FORMATS[name].options:
             *others, last = [other for other, each in FORMATS.items() if option in each.options]
@@ -187,7 +187,7 @@ def _require_options(name: str, given: Mapping[str, object]) -> None:
             )
 
 
-# Writers are imported when they are needed: they bring scipy.spatial, and one of them an extra.
+# Writers are imported when they are needed: they import scipy.spatial, and one of them needs an extra.
 
 
 def _write_signals(path: Path, geometry: Path, items: Iterable[Energyscape | Measurement]) -> None:
@@ -197,7 +197,7 @@ def _write_signals(path: Path, geometry: Path, items: Iterable[Energyscape | Mea
     if len(several) != 1 or not isinstance(several[0], Measurement):
         came = f"{'no' if not several else 'more than one'} measurement" if len(several) != 1 else "an energyscape"
         raise ArgumentError(
-            f"format 'acoular' holds signals of one measurement, and {came} came; give one (--measurement)"
+            f"format 'acoular' contains signals of one measurement, but {came} was given; give one (--measurement)"
         )
     write_acoular(path, geometry, several[0])
 
@@ -237,11 +237,13 @@ def _write_points(
 
 
 def _energyscapes(items: Iterable[Energyscape | Measurement]) -> Iterator[Energyscape]:
-    """Yield energyscapes; refuse measurements, and that there are none."""
+    """Yield energyscapes; refuse measurements, and an empty sequence."""
     count = 0
     for count, item in enumerate(items, 1):  # noqa: B007  it is used below
         if not isinstance(item, Energyscape):
-            raise ArgumentError("a measurement is given, wanted energyscapes; process it first (Pipeline.process)")
+            raise ArgumentError(
+                "a measurement is given, but energyscapes are needed; process it first (Pipeline.process)"
+            )
         yield item
     if not count:
         raise ArgumentError("no energyscape is given; give at least one")

@@ -36,8 +36,11 @@ _STATIC, _STATIC_TYPE = "/tf_static", "tf2_msgs/msg/TFMessage"
 _SONAR_SUFFIX = "_sonar"
 _HALF = math.sqrt(0.5)
 _SONAR_TURN = (_HALF, 0.0, _HALF, 0.0)
-"""The frame of marine_acoustic_msgs in that of the sensor: z forward, x up, y right; half a turn about their middle."""
-_FLOAT32, _DTYPE_FLOAT32 = 7, 8  # of PointField, of SonarImageData
+"""Frame of marine_acoustic_msgs relative to that of the sensor: z forward, x up, y right.
+
+Half a turn about their middle.
+"""
+_FLOAT32, _DTYPE_FLOAT32 = 7, 8  # Constants of PointField and of SonarImageData.
 _POINT_STEP = 16
 _PROFILE = """- history: 1
   depth: {depth}
@@ -50,14 +53,14 @@ _PROFILE = """- history: 1
   avoid_ros_namespace_conventions: false
 """
 _FOREVER = "{sec: 9223372036, nsec: 854775807}"
-_TRANSIENT_LOCAL, _VOLATILE = 1, 2  # of rmw_qos_durability_policy_t
+_TRANSIENT_LOCAL, _VOLATILE = 1, 2  # Constants of rmw_qos_durability_policy_t.
 _NAMED = re.compile(r"[^A-Za-z0-9]+")
 
 
 def write_mcap(
     path: Path, images: Iterable[Energyscape], find: Find, mountings: Mountings, *, topics: Collection[str]
 ) -> None:
-    """Write the messages of images as they come.
+    """Write the messages of images as they arrive.
 
     Raises
     ------
@@ -69,14 +72,14 @@ def write_mcap(
         from mcap.writer import Writer  # noqa: PLC0415  an extra
         from mcap_ros2 import _dynamic  # noqa: F401, PLC0415  the same
     with path.open("wb") as file:
-        writer: Any = Writer(file)  # whose annotations are partial
+        writer: Any = Writer(file)  # The annotations of mcap are partial.
         writer.start(profile="ros2", library="ertis-numba")
         _Bag(writer, find, mountings, topics).write(images)
         writer.finish()
 
 
 class _Bag:
-    """What is being written: its topics, and the sensors that have come."""
+    """MCAP file in progress: its topics and sensors."""
 
     def __init__(self, writer: Any, find: Find, mountings: Mountings, topics: Collection[str]) -> None:
         self._writer, self._find, self._mountings = writer, find, mountings
@@ -87,7 +90,7 @@ class _Bag:
         self._pictures: dict[str, tuple[Energyscape, Picture]] = {}
 
     def write(self, images: Iterable[Energyscape]) -> None:
-        """Write all messages, those on where sensors are last: only then are all sensors known."""
+        """Write all messages; the positions of sensors come last, when all sensors are known."""
         earliest: Stamp | None = None
         for image in images:
             stamp, sensor = image.stamp, image.stamp.sensor
@@ -102,7 +105,7 @@ class _Bag:
             self._add(_STATIC, _STATIC_TYPE, self._transforms(earliest), earliest)
 
     def _greet(self, image: Energyscape) -> None:
-        """Find a name for the topics of a sensor, and keep its settings."""
+        """Choose a name for the topics of a sensor, and keep its settings."""
         sensor = checks.sensor_name(image.stamp.sensor)
         name = _NAMED.sub("_", sensor).strip("_")
         name = f"sensor_{name}" if not name[:1].isalpha() else name
@@ -117,7 +120,7 @@ class _Bag:
         if kind not in self._schemas:
             self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", schema(kind).encode())
         if topic not in self._channels:
-            # Whoever listens for /tf_static gets nothing from a player that does not keep it for those who come late.
+            # Late subscribers of /tf_static get nothing from a player that does not keep its messages.
             depth, durability = (1, _TRANSIENT_LOCAL) if topic == _STATIC else (10, _VOLATILE)
             profile = _PROFILE.format(depth=depth, durability=durability, forever=_FOREVER)
             self._channels[topic] = self._writer.register_channel(

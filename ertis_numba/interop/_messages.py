@@ -1,4 +1,4 @@
-"""Definitions of ROS 2 messages, and what encodes them.
+"""Definitions of ROS 2 messages, and their encoder.
 
 Fields, types and constants are those of ``common_interfaces`` and ``geometry2`` (both the same from Humble on),
 ``rcl_interfaces``, and of ``marine_msgs`` 2.1.0 of the Applied Physics Laboratory, University of Washington. They are
@@ -107,12 +107,12 @@ float32[] ranges
 marine_acoustic_msgs/SonarImageData image
 """,
 }
-"""Each message by itself; other messages in it have the name of their package."""
+"""Definition of each message; nested messages have the name of their package."""
 _RULE = "=" * 80
 
 
 def schema(name: str) -> str:
-    """Return the definition of a message and of all in it, as MCAP has them (``ros2msg`` in its registry)."""
+    """Return the definition of a message with all nested ones, as MCAP requires (``ros2msg`` in its registry)."""
     first, *others = _with_needed(name)
     parts = [DEFINITIONS[first].lstrip()]
     parts += [f"MSG: {other.replace('/msg/', '/')}{DEFINITIONS[other]}" for other in others]
@@ -120,9 +120,9 @@ def schema(name: str) -> str:
 
 
 def _with_needed(name: str) -> list[str]:
-    """Return a message, and those in it, each once."""
+    """Return a message with its nested ones, each once."""
     found = [name]
-    for each in found:  # which grows meanwhile
+    for each in found:  # The list grows meanwhile.
         for line in DEFINITIONS[each].split("\n"):
             package, slash, message = line.partition(" ")[0].removesuffix("[]").partition("/")
             needed = f"{package}/msg/{message}"
@@ -133,9 +133,9 @@ def _with_needed(name: str) -> list[str]:
 
 @functools.cache
 def encoder(name: str) -> Callable[[dict[str, Any]], bytes]:
-    """Return what makes CDR, as ROS 2 has it, of a message: a dict for each message in it."""
-    # The writer of mcap-ros2-support has no way to give a topic the metadata that its profile asks for, and what
-    # encodes has no name without an underscore.
+    """Return the CDR encoder of a message, as in ROS 2: a message is a dict."""
+    # The writer of mcap-ros2-support cannot give a topic the metadata that its profile requires, and its encoder
+    # has no public name.
     from mcap_ros2._dynamic import serialize_dynamic  # noqa: PLC0415  an extra
 
     return serialize_dynamic(name, schema(name))[name]

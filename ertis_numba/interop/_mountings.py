@@ -1,4 +1,4 @@
-"""Where sensors are on their platform, as far as somebody said."""
+"""Mountings of sensors on their platform, as far as they are known."""
 
 from collections.abc import Mapping, Sequence
 from typing import Final, TypeAlias
@@ -8,11 +8,11 @@ from ertis_numba.geometry import mounting
 __all__ = ["PLATFORM", "Mounting", "Mountings", "checked"]
 
 Mounting: TypeAlias = tuple[tuple[float, float, float], tuple[float, float, float, float]]
-"""x, y, z in m, and the unit quaternion x, y, z, w that turns the sensor frame into the platform's."""
+"""Position x, y, z in m, and the unit quaternion x, y, z, w that rotates the sensor frame into that of the platform."""
 Mountings: TypeAlias = Mapping[str, Mounting]
-"""By the name of the sensor."""
+"""Mountings by name of the sensor."""
 PLATFORM: Final = "base_link"
-"""Frame of the platform, by the name that REP 105 gives it."""
+"""Name of the platform's frame in REP 105."""
 
 
 def checked(given: Mapping[str, tuple[Sequence[float], Sequence[float]]] | None) -> Mountings:
@@ -21,7 +21,7 @@ def checked(given: Mapping[str, tuple[Sequence[float], Sequence[float]]] | None)
     Raises
     ------
     ArgumentError
-        One is none.
+        A mounting is invalid.
     """
     made = {}
     for sensor, (translation_m, rotation_xyzw) in (given or {}).items():

@@ -1,6 +1,6 @@
-"""Energyscapes as NPZ: a ZIP archive of NumPy's own arrays, which need no pickle to be read.
+"""Energyscapes as NPZ: a ZIP archive of NumPy arrays, readable without pickle.
 
-NEP 1, A simple file format for NumPy arrays; what `numpy.savez` writes.
+NEP 1, A simple file format for NumPy arrays; the format of `numpy.savez`.
 """
 
 import itertools
@@ -22,14 +22,14 @@ _AXES = ("azimuth_rad", "elevation_rad", "range_m")
 
 
 def write_npz(path: Path, images: Iterable[Energyscape], count: int | None) -> None:
-    """Write the images of one sensor, as they come where their number is known.
+    """Write the images of one sensor, as they arrive if their number is known.
 
-    Amplitudes are (time, direction, range); then come axes, stamps (time,), and sensor and settings as texts.
+    Amplitudes are (time, direction, range). The axes, the stamps (time,), and sensor and settings as texts follow.
 
     Raises
     ------
     ArgumentError
-        One has another sensor, other axes or settings than the first, or not as many came as were told.
+        An image has another sensor, other axes or settings than the first, or their number differs from ``count``.
     """
     if count is None:
         gathered = list(images)
@@ -58,12 +58,12 @@ def _write_amplitude(file: IO[bytes], images: Iterable[Energyscape], count: int)
         file.write(np.ascontiguousarray(image.amplitude, dtype="<f4").data.cast("B"))
         stamps.append(image.stamp)
     if len(stamps) != count:
-        raise ArgumentError(f"{len(stamps)} energyscapes came, {count} were told of; give as many")
+        raise ArgumentError(f"{len(stamps)} energyscapes were given, but count is {count}; give as many")
     return first, stamps
 
 
 def _require_same(image: Energyscape, first: Energyscape) -> None:
-    """Refuse an image that the axes and settings of the first are not true for."""
+    """Refuse an image whose axes or settings differ from the first."""
     if image.stamp.sensor != first.stamp.sensor:
         raise ArgumentError(
             f"sensors {first.stamp.sensor} and {image.stamp.sensor} cannot share the axes of one npz; choose one "

@@ -1,4 +1,4 @@
-"""Energyscapes as grey pictures, one pixel for each direction and range or for each direction."""
+"""Energyscapes as grey pictures, with one pixel per direction and range or per direction."""
 
 import math
 
@@ -13,15 +13,15 @@ from ertis_numba.geometry import FAR, spacing_rad, unit_vectors, unrolled_rad
 __all__ = ["DYNAMIC_RANGE_DB", "Picture"]
 
 DYNAMIC_RANGE_DB = 40.0
-"""Below the strongest, at which a pixel is black."""
-_MAX_PIXELS = 1000  # along a side of a map
+"""Level relative to the strongest at which a pixel is black."""
+_MAX_PIXELS = 1000  # Along a side of a map.
 
 
 class Picture:
-    """Makes pictures of images with the directions of one.
+    """Converter of images with the same directions to pictures.
 
-    A planar image becomes a picture of azimuth, from the left, and of range, from below. One with elevations becomes a
-    map of azimuth and elevation as the sensor sees it: the strongest over range of the nearest direction.
+    A planar image becomes a picture of azimuth, from the left, and of range, from below. An image with elevations
+    becomes a map of azimuth and elevation as the sensor sees it: the maximum over range of the nearest direction.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ class Picture:
         self._map = None if image.is_planar else _map(image)
 
     def __call__(self, amplitude: NDArray[np.float32]) -> NDArray[np.uint8]:
-        """Return the picture of energies, (direction, range): (row, column) uint8, 255 the strongest."""
+        """Return the picture of amplitudes, (direction, range): (row, column) uint8, 255 for the strongest."""
         shown = amplitude if self._map is None else amplitude.max(axis=1, keepdims=True)
         level_db = below_strongest_db(shown, DYNAMIC_RANGE_DB)
         grey = np.rint(255 * (1 + level_db / DYNAMIC_RANGE_DB)).astype(np.uint8)
@@ -43,7 +43,7 @@ class Picture:
 
 
 def _map(image: Energyscape) -> NDArray[np.int64]:
-    """Return the direction that each pixel shows, the number of directions where it shows none: (row, column) int64."""
+    """Return the direction of each pixel, or the number of directions for pixels without one: (row, column) int64."""
     directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
     tree = KDTree(directions)
     apart_rad = spacing_rad(directions) or math.pi

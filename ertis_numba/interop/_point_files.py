@@ -28,7 +28,7 @@ POINT_FIELDS: Final = {
     "sec": "<i4",
     "nanosec": "<u4",
 }
-"""What PLY and PCD hold of each point. Neither has integers of 64 bits that all readers know."""
+"""Columns of each point in PLY and PCD. Neither has 64-bit integers that all readers know."""
 _PLY_TYPES = {"<f4": "float", "<u2": "ushort", "<u4": "uint", "<i4": "int"}
 CSV_COLUMNS: Final = {
     "sensor": "sensor",
@@ -43,7 +43,7 @@ CSV_COLUMNS: Final = {
     "uncertainty_range_m": "uncertainty_range",
     "uncertainty_across_m": "uncertainty_across",
 }
-"""Columns of CSV, and which they are in the table of points."""
+"""Columns of CSV, and their names in the table of points."""
 _HEADING = "Point cloud of ertis-numba"
 
 
@@ -87,7 +87,7 @@ def write_pcd(path: Path, table: PointTable, *, text: bool) -> None:
         f"COUNT {' '.join('1' for _ in kinds)}",
         f"WIDTH {count}",
         "HEIGHT 1",
-        "VIEWPOINT 0 0 0 1 0 0 0",  # the points are where they are: a viewer would move them by another one
+        "VIEWPOINT 0 0 0 1 0 0 0",  # Points are in the given frame: a viewer would transform them by another viewpoint.
         f"POINTS {count}",
         f"DATA {'ascii' if text else 'binary'}",
     ]
@@ -106,7 +106,7 @@ def write_csv(path: Path, table: PointTable) -> None:
 
 
 def _about(table: PointTable) -> list[str]:
-    """Return what stands in comments, a word and its value each: no name may end a line of the header."""
+    """Return the comments, each a word and its value: a name must not end a line of the header."""
     numbered = [f"sensor {number} {checks.sensor_name(name)}" for number, name in enumerate(table.sensors)]
     return [_HEADING, f"frame {table.frame}", *numbered]
 
@@ -115,7 +115,7 @@ def _write(path: Path, head: list[str], rows: NDArray[np.void], *, text: bool) -
     with path.open("wb") as file:
         file.write("\n".join([*head, ""]).encode("ascii"))
         if text:
-            # NumPy writes the fewest digits from which the same float32 is read.
+            # NumPy writes the fewest digits that give the same float32.
             columns = [rows[name].astype(str) for name in POINT_FIELDS]
             file.write("".join(f"{' '.join(row)}\n" for row in zip(*columns, strict=True)).encode("ascii"))
         else:

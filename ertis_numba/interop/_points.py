@@ -1,4 +1,4 @@
-"""The points of several measurements as one table."""
+"""Points of several measurements as one table."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from ertis_numba.interop._mountings import PLATFORM, Mountings
 __all__ = ["Find", "PointTable", "ros_time"]
 
 Find: TypeAlias = Callable[[Energyscape], PointCloud]
-"""Returns the points of an image, in the frame of its sensor."""
+"""Function that returns the points of an image, in the sensor frame."""
 
 _POINT: Final = np.dtype(
     [
@@ -29,16 +29,16 @@ _MAX_SEC = 2**31 - 1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointTable:
-    """Points of several measurements, a row each.
+    """Points of several measurements, one row each.
 
     Attributes
     ----------
     rows : (point,) structured
         x, y, z and their uncertainty in metres, intensity, number of the sensor, and the stamp of the measurement.
     sensors : tuple of str
-        By their numbers.
+        Names by number.
     frame : str
-        Of x, y and z: the platform's where it is known how the sensors are mounted, else that of the only sensor.
+        Frame of x, y and z: the platform's if the mountings are known, otherwise that of the only sensor.
     """
 
     rows: NDArray[np.void]
@@ -47,12 +47,12 @@ class PointTable:
 
     @classmethod
     def of(cls, images: Iterable[Energyscape], find: Find, mountings: Mountings) -> "PointTable":
-        """Gather the points of images.
+        """Collect the points of images.
 
         Raises
         ------
         ArgumentError
-            There are several sensors, and it is not known where each of them is.
+            There are several sensors with unknown mountings.
         """
         numbers: dict[str, int] = {}
         parts = [np.empty(0, _POINT)]
@@ -62,16 +62,16 @@ class PointTable:
             frames = {PLATFORM if name in mountings else name for name in numbers}
             if len(frames) > 1:
                 raise ArgumentError(
-                    f"where sensors {', '.join(numbers)} are on their platform is not known, wanted one frame for "
-                    "all points; choose one (--sensor), or give their --mounting"
+                    f"the mountings of sensors {', '.join(numbers)} on their platform are unknown, but all "
+                    "points need one frame; choose one (--sensor), or give their --mounting"
                 )
         frame = PLATFORM if numbers.keys() & mountings.keys() else next(iter(numbers), PLATFORM)
         return cls(np.concatenate(parts), tuple(numbers), frame)
 
     def columns(self, dtypes: dict[str, str]) -> NDArray[np.void]:
-        """Return some columns, packed, in the types that a format has for them.
+        """Return some columns, packed, in the types of a format.
 
-        ``sec`` and ``nanosec`` are the time of the measurement as ROS 2 has it.
+        ``sec`` and ``nanosec`` are the time of the measurement in the form of ROS 2.
 
         Raises
         ------
@@ -84,7 +84,9 @@ class PointTable:
             column: NDArray[Any] = times[name] if name in times else self.rows[name]
             made[name] = column.astype(dtype)
             if not np.array_equal(made[name], column, equal_nan=column.dtype.kind == "f"):
-                raise ArgumentError(f"{name} of a measurement is {column.max()}, more than the format holds; use csv")
+                raise ArgumentError(
+                    f"{name} of a measurement is {column.max()}, above the limit of the format; use csv"
+                )
         return made
 
     def _ros_times(self) -> dict[str, NDArray[np.int64]]:
@@ -116,7 +118,7 @@ def _rows(cloud: PointCloud, number: int, mountings: Mountings) -> NDArray[np.vo
 
 
 def ros_time(stamp: Stamp) -> tuple[int, int]:
-    """Return the time of a measurement as ROS 2 has it (builtin_interfaces/msg/Time): seconds and nanoseconds.
+    """Return the time of a measurement in the form of ROS 2 (builtin_interfaces/msg/Time): seconds and nanoseconds.
 
     Raises
     ------
@@ -130,6 +132,4 @@ def ros_time(stamp: Stamp) -> tuple[int, int]:
 
 
 def _no_ros_time(sequence: int, timestamp_ns: int) -> ArgumentError:
-    return ArgumentError(
-        f"measurement {sequence} has the time {timestamp_ns} ns, wanted one from 1970 to 2038; use npz or csv"
-    )
+    return ArgumentError(f"measurement {sequence} has the time {timestamp_ns} ns, outside 1970 to 2038; use npz or csv")

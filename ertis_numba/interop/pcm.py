@@ -1,4 +1,4 @@
-"""Multichannel PCM of arrays whose microphones give numbers: WAV, and the HDF5 files of Acoular."""
+"""Multichannel PCM of arrays with sampled microphones: WAV, and HDF5 files of Acoular."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -27,7 +27,7 @@ _LARGEST = float(np.finfo(np.float32).max)
 
 @dataclass(frozen=True, slots=True)
 class _PcmFile:
-    """What a file says of itself."""
+    """Header of a file."""
 
     path: Path
     rate_hz: float
@@ -38,10 +38,10 @@ class _PcmFile:
 
 
 class PcmReader:
-    """The measurements of files of PCM, one after the other; one file is read at a time.
+    """Reader of the measurements in PCM files, one file at a time.
 
-    The SYNC count, which is not in such files, is the number of the measurement. Numbers of 8 and 16 bits become int16,
-    all others float32, of which 24 bits and single precision are all.
+    The number of the measurement replaces the SYNC count, which such files lack. 8-bit and 16-bit numbers become int16,
+    all others float32 with its precision of 24 bits.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ class PcmReader:
         start_ns: int,
     ) -> None:
         if not paths:
-            raise ArgumentError("no file of PCM is given; give at least one")
+            raise ArgumentError("no PCM file is given; give at least one")
         self._files = [_look(path) for path in paths]
         first = self._files[0]
         self._require_alike()
@@ -77,7 +77,7 @@ class PcmReader:
         _require_channels(first, known)
         self._skipped = round(checks.between("skip_s", skip_s, 0.0, _LONGEST_S) * first.rate_hz)
         shortest = min(file.n_samples for file in self._files) - self._skipped
-        # From one emission to the next there may be a part of a sample, which would add up.
+        # An interval between emissions may contain a fraction of a sample, which must not accumulate.
         self._period = float(shortest)
         if length_s is not None:
             checks.positive("length_s", length_s)
@@ -114,11 +114,11 @@ class PcmReader:
                 sequence += 1
 
     def _start(self, number: int) -> int:
-        """Return where a measurement begins in its file."""
+        """Return the first sample of a measurement in its file."""
         return self._skipped + round(number * self._period)
 
     def _whole(self, file: _PcmFile) -> int:
-        """Return how many measurements a file holds."""
+        """Return the number of measurements in a file."""
         if self._n_samples < 1:
             return 0
         count = int((file.n_samples - self._skipped) / self._period) + 1
@@ -131,9 +131,9 @@ class PcmReader:
             if count < 1 or self._n_samples < 1:
                 rate_hz = first.rate_hz
                 raise DataError(
-                    f"{file.path} lasts {file.n_samples / rate_hz:.4g} s, wanted {self._skipped / rate_hz:.4g} s to "
-                    f"be skipped and a measurement of {max(self._n_samples, 1) / rate_hz:.4g} s; skip less (--skip) "
-                    "or give a shorter --length"
+                    f"{file.path} lasts {file.n_samples / rate_hz:.4g} s, but {self._skipped / rate_hz:.4g} s to "
+                    f"skip and a measurement of {max(self._n_samples, 1) / rate_hz:.4g} s are needed; skip less "
+                    "(--skip) or give a shorter --length"
                 )
 
     def _require_alike(self) -> None:
@@ -162,7 +162,7 @@ def open_pcm(
 ) -> PcmReader:
     """Open files of multichannel PCM: WAV, or Acoular's HDF5 (``time_data`` and its ``sample_freq``).
 
-    Such numbers need no demodulation, and the chain begins after it.
+    PCM needs no demodulation, so the chain begins after it.
 
     Parameters
     ----------
@@ -205,7 +205,7 @@ def open_pcm(
 def _known(settings: Settings | None, first: _PcmFile) -> Settings:
     known = settings or first.settings
     if known is None:
-        raise ArgumentError(f"{first.path} says nothing of its array and call; give settings")
+        raise ArgumentError(f"{first.path} contains no array and call; give settings")
     return known
 
 
@@ -223,16 +223,16 @@ def _require_channels(first: _PcmFile, settings: Settings) -> None:
 
 
 def _fitted(settings: Settings, recording: Recording, first: _PcmFile) -> Settings:
-    """Return settings for another recording, with ranges that suit it."""
+    """Return settings for another recording, with matching ranges."""
     call = settings.call
     if recording.sample_rate_hz <= 2 * call.high_frequency_hz:
         raise DataError(
-            f"{first.path} has {recording.sample_rate_hz:g} Hz, too few for a call that reaches "
-            f"{call.high_frequency_hz:g} Hz; give the call that was emitted, or record faster than twice its frequency"
+            f"{first.path} has a sample rate of {recording.sample_rate_hz:g} Hz, too low for a call up to "
+            f"{call.high_frequency_hz:g} Hz; give the emitted call, or record at more than twice its frequency"
         )
     if recording.duration_s <= call.duration_s:
         raise DataError(
-            f"a measurement of {first.path} has {1e3 * recording.duration_s:.4g} ms, the call alone lasts "
+            f"a measurement of {first.path} has {1e3 * recording.duration_s:.4g} ms, but the call alone lasts "
             f"{1e3 * call.duration_s:.4g} ms; give a longer --length, or skip less (--skip)"
         )
     return settings.replace(recording=recording, processing=fit_ranges(settings.processing, recording, call))
@@ -254,23 +254,23 @@ def _read(path: Path) -> tuple[float, NDArray[Any], Settings | None]:
         with path.open("rb"):
             pass
     except OSError as error:
-        raise DataError(f"{path}: {error.strerror}; give a file of PCM") from error
+        raise DataError(f"{path}: {error.strerror}; give a PCM file") from error
     if path.suffix.lower() in _ACOULAR:
         return read_acoular(path)
     return *read_wav(path), None
 
 
 def _words(file: _PcmFile, numbers: NDArray[Any], samples: slice, enabled: NDArray[np.bool_]) -> NDArray[Any]:
-    """Return some of the numbers as a recording holds them; in disabled channels, what is no number becomes 0."""
+    """Return samples in the type of a recording; non-finite samples of disabled channels become 0."""
     numbers = numbers[samples]
-    if numbers.dtype.itemsize == 1:  # of WAV they have no sign
+    if numbers.dtype.itemsize == 1:  # 8-bit WAV samples are unsigned.
         middle = _MIDDLE_OF_BYTES if numbers.dtype.kind == "u" else 0
         return ((numbers.astype(np.int16) - middle) * 256).astype("<i2")
     if file.encoding == "int16":
         return numbers.astype("<i2")
     if numbers.dtype.kind == "i":
         return (numbers / 2.0 ** (8 * numbers.dtype.itemsize - 1)).astype("<f4")
-    with np.errstate(over="ignore"):  # which is refused below
+    with np.errstate(over="ignore"):  # The check below refuses the result.
         words = numbers.astype("<f4")
     broken = ~np.isfinite(words)
     words[broken & ~enabled] = 0

@@ -1,4 +1,4 @@
-"""Raw eRTIS files: nothing but PDM words, little-endian, without a header."""
+"""Raw eRTIS files: little-endian PDM words without a header."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -13,20 +13,20 @@ from ertis_numba.settings import PRESETS, Settings
 __all__ = ["RawReader", "open_raw"]
 
 
-_END = 2**63  # of sequence numbers
+_END = 2**63  # Limit of sequence numbers.
 
 
 class RawReader:
-    """The measurements of raw files, one after the other.
+    """Reader of the measurements in raw files.
 
-    Time and SYNC count are not in such files: they are 0 and the number of the measurement.
+    Such files have no time and no SYNC count: they are 0 and the number of the measurement.
 
     Parameters
     ----------
     paths : sequence of Path
-        Each holds one measurement or more.
+        Files with one measurement or more each.
     settings : Settings
-        What the files do not say: array, call and length of a measurement.
+        Settings that the files lack: array, call and length of a measurement.
     sensor : str
     first : sequence of int, optional
         Sequence number of the first measurement of each file, rising; by default they are counted from 0.
@@ -34,7 +34,7 @@ class RawReader:
     Raises
     ------
     DataError
-        A file is missing, empty, holds no whole measurements, or more than there are numbers for.
+        A file is missing, empty, contains incomplete measurements, or more than there are numbers.
     """
 
     def __init__(
@@ -51,11 +51,11 @@ class RawReader:
         for path, count, start, following in zip(paths, counts, starts, starts[1:], strict=False):
             if start + count > following:
                 raise DataError(
-                    f"{path} holds {count} measurements, and the next file is number {following}; give the files "
-                    "themselves in their order"
+                    f"{path} contains {count} measurements, but the next file is number {following}; give the "
+                    "files themselves in their order"
                 )
         if starts[-1] + counts[-1] > _END:
-            raise DataError(f"{paths[-1]} is number {starts[-1]}, which no recording can hold; give it a smaller one")
+            raise DataError(f"{paths[-1]} is number {starts[-1]}, above the limit of recordings; give it a smaller one")
         self._files = list(zip(paths, counts, starts, strict=True))
 
     def __len__(self) -> int:
@@ -73,11 +73,11 @@ class RawReader:
                     yield Measurement(words, self.settings, stamp)
 
     def _count(self, path: Path) -> int:
-        """Return how many measurements a file holds; refuse one that does not hold whole ones."""
+        """Return the number of measurements in a file; refuse incomplete ones."""
         if path.is_dir():
             raise DataError(f"{path} is a folder; give a file of raw words")
         try:
-            with path.open("rb") as file:  # stat would not tell whether it may be read
+            with path.open("rb") as file:  # stat does not show whether the file is readable.
                 n_bytes = file.seek(0, 2)
         except OSError as error:
             raise DataError(f"{path}: {error.strerror}; give a file of raw words") from error
@@ -88,7 +88,7 @@ class RawReader:
         if not n_bytes:
             raise DataError(f"{path} is empty, {wanted}; record it again")
         if n_bytes % self._format.dtype.itemsize:
-            raise DataError(f"{path} has {n_bytes} bytes, which are no whole words, {wanted}; copy it again")
+            raise DataError(f"{path} has {n_bytes} bytes, which is not a multiple of a word, {wanted}; copy it again")
         raise DataError(f"{path} has {n_bytes} bytes, {wanted}; {_remedy(n_bytes, self._format)}")
 
     def _words(self) -> str:
@@ -99,7 +99,7 @@ _OTHERWISE = "copy it again if it is cut short, or give the number of words of a
 
 
 def _remedy(n_bytes: int, words: SampleFormat) -> str:
-    """Return what to do about a file of another length: another preset, where one fits."""
+    """Return the remedy for a file of another length: another preset, if one fits."""
     tick_bytes = words.n_bytes // words.shape[0]
     lengths = {name.partition("_")[0]: Settings.from_preset(name).recording.n_samples for name in PRESETS}
     fitting = [f"{length}_…" for length, n_samples in lengths.items() if n_bytes % (tick_bytes * n_samples) == 0]

@@ -17,12 +17,12 @@ _RECORDING: dict[str, float] = {
     "microphoneSamples": 163_840,
     "microphoneSampleFrequency": 4_500_000,
     "callSampleFrequency": 450_000,
-    "callDuration": 2.5,  # ms
+    "callDuration": 2.5,  # Milliseconds.
     "callMinimumFrequency": 25_000,
     "callMaximumFrequency": 50_000,
     "callEmissions": 1,
 }
-"""What rtisdev 2.16.0 takes where a file of recording settings leaves it out."""
+"""Defaults of rtisdev 2.16.0 for settings that a file of recording settings omits."""
 _PROCESSING = (
     "microphoneLayout",
     "minRange",
@@ -35,15 +35,15 @@ _PROCESSING = (
     "elevationHighLimit",
 )
 _DUMPED = {"dacSampleFrequency": "callSampleFrequency", "nDirections": "directions"}
-"""Names in ``dict(RTISSettings)``, which users write to JSON as well, for those in files of settings."""
-_AZIMUTHS, _ELEVATIONS = "directionsAzimuth", "directionsElevation"  # radians, in dict(RTISSettings)
+"""Names in ``dict(RTISSettings)``, which users also write to JSON, by those in settings files."""
+_AZIMUTHS, _ELEVATIONS = "directionsAzimuth", "directionsElevation"  # Radians, in dict(RTISSettings).
 _NOT_HELD = {
     "callCustom": "give --preset to process it as a sweep",
     "directionsCustom": "take it out, and give --directions when processing",
     "delayMatrixCustom": "take it out",
     "rangesCustom": "take it out, and give --range when processing",
 }
-"""Keys that name other files, with what to do."""
+"""Keys that name other files, with the remedy."""
 _KNOWN = {*_RECORDING, *_PROCESSING, *_DUMPED, *_NOT_HELD, "elevation2DAngle", _AZIMUTHS, _ELEVATIONS}
 
 
@@ -55,13 +55,13 @@ def open_rtis_folder(
     air: Air | None = None,
     sensor: str = "sensor",
 ) -> RawReader:
-    """Open a folder with the measurements that a program on RTIS Dev has saved.
+    """Open a folder of measurements saved by an RTIS Dev program.
 
-    RTIS Dev hands out the words of a measurement, and its examples write each to a file ``NAME<number>.bin``; the
-    number becomes the sequence number, so that a missing file is a gap. Settings are read from JSON files beside them:
-    those of recording (``microphoneSamples``, ``callMinimumFrequency`` and others), those of processing
-    (``microphoneLayout``, ``maxRange`` and others), or all of ``dict(RTISSettings)`` in one, as rtisdev 2.16.0 (PyPI)
-    reads and yields them. Filters, cleaning and beamforming are not taken over.
+    RTIS Dev returns the words of a measurement, and its examples write each to a file ``NAME<number>.bin``. The number
+    becomes the sequence number, so that a missing file is a gap. Settings are read from JSON files beside them, as
+    rtisdev 2.16.0 (PyPI) reads and returns them: recording settings (``microphoneSamples``, ``callMinimumFrequency``
+    and others), processing settings (``microphoneLayout``, ``maxRange`` and others), or all of ``dict(RTISSettings)``
+    in one. Filters, cleaning and beamforming are not used.
 
     Parameters
     ----------
@@ -78,8 +78,8 @@ def open_rtis_folder(
     Raises
     ------
     DataError
-        There are no measurements, their order is not known, or settings are missing, contradict each other or
-        cannot be held in a recording.
+        There are no measurements, their order is not known, or settings are missing, contradict each other or cannot be
+        held in a recording.
     ArgumentError
         A setting has a value that cannot be used.
     """
@@ -88,7 +88,7 @@ def open_rtis_folder(
     reported = _settings_in(folder)
     layout = layout or reported.get("microphoneLayout")
     if layout is None:
-        raise DataError(f"{folder} does not say which array it was (microphoneLayout); give --layout")
+        raise DataError(f"{folder} does not name its array (microphoneLayout); give --layout")
     if not isinstance(layout, str):
         raise ArgumentError(f"{folder}: microphoneLayout is {layout!r}; give the name of an array, or --layout")
     if preset is not None:
@@ -96,7 +96,7 @@ def open_rtis_folder(
     elif reported.keys() & {*_RECORDING, "callCustom"}:
         settings = _recorded(folder, reported)
     else:
-        raise DataError(f"{folder} holds no recording settings of RTIS Dev (.json); give --preset")
+        raise DataError(f"{folder} contains no recording settings of RTIS Dev (.json); give --preset")
     processing = _processed(folder, reported, settings.processing)
     settings = settings.replace(array=Array(layout=layout), air=air or Air(), processing=processing)
     return RawReader(paths, settings, sensor=sensor, first=first)
@@ -117,15 +117,15 @@ def _measurements(folder: Path) -> tuple[list[Path], list[int]]:
         return paths, [int(digits[0] or 0)]
     if len(names) != 1 or not all(digits) or len({int(number) for number in digits}) != len(paths):
         raise DataError(
-            f"{folder}: the order of its {len(paths)} .bin files is not known, wanted names like NAME<number>.bin; "
-            "give the files themselves in their order"
+            f"{folder}: the order of its {len(paths)} .bin files is unknown, because their names are not like "
+            "NAME<number>.bin; give the files themselves in their order"
         )
     ordered = sorted(zip(map(int, digits), paths, strict=True))
     return [path for _, path in ordered], [number for number, _ in ordered]
 
 
 def _settings_in(folder: Path) -> dict[str, Any]:
-    """Return the settings in all JSON files of a folder, by the names of files of settings."""
+    """Return the settings in all JSON files of a folder, by their names in settings files."""
     reported: dict[str, Any] = {}
     sources: dict[str, Path] = {}
     for path in sorted(folder.glob("*.json")):
@@ -208,9 +208,9 @@ def _angles_rad(folder: Path, reported: dict[str, Any], name: str) -> list[float
 
 
 def _refuse(folder: Path, reported: dict[str, Any], *names: str) -> None:
-    """Refuse settings that lie in other files."""
+    """Refuse settings that are stored in other files."""
     for name in names:
         if name in reported:
             raise DataError(
-                f"{folder}: {name} is the file {reported[name]!r}, which a recording cannot hold; {_NOT_HELD[name]}"
+                f"{folder}: {name} is the file {reported[name]!r}, which a recording cannot contain; {_NOT_HELD[name]}"
             )
