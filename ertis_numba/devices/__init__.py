@@ -1,18 +1,13 @@
-"""Sensors: the wire protocol, the driver, and devices that are emulated. The only door to pyserial.
+"""Sensors: wire protocol, driver, and emulated devices; the only package that imports pyserial.
 
-=========== ===================================================================================
-module      what it has
-=========== ===================================================================================
-sonar       `Sonar`, the driver
-setup       `Setup`, what a sensor is told; `call_codes` and `call_hash` of its call
-ports       `find_ports`, `resolve`, `Port`
-survey      `survey`, which asks all ports at once
-bits        `BitCheck`, whether words can be what microphones sent
-commands    `Command` and its answers
-blocks      `Block`, `Instant`, `encode_block`
-protocol    `Receiver`, blocks out of bytes
-emulator    `Emulator`, `Quirks`, `SyncChain`; `emulator.faults` has `Faults`
-=========== ===================================================================================
+=========== =================================================================================== module      contents
+=========== =================================================================================== sonar
+`SonarDriver`, the driver setup       `Setup`, the configuration of a sensor; `call_codes` and `call_hash` of its call
+ports       `find_ports`, `resolve`, `Port` survey      `survey`, which probes all ports at once bits        `BitCheck`,
+which detects samples that microphones cannot have sent commands    `Command` and its answers blocks      `Block`,
+`Instant`, `encode_block` protocol    `BlockReceiver`, which extracts blocks from bytes emulator    `Emulator`,
+`Quirks`, `SyncChain`; `emulator.faults` has `Faults` ===========
+===================================================================================
 
 Importing this package loads none of them.
 """

@@ -1,8 +1,8 @@
-"""Whether a block of PDM words can be what 32 microphones sent, told from its bits alone.
+"""Plausibility check of PDM data from 32 microphones, based on its bits alone.
 
-The wire has no checksum, and where as many bytes are lost as added within a block its header and footer stand right.
-But the bits of a sigma-delta modulator are far from chance: they change more often than chance would have it, their
-mean follows the sound, and neither stops from one sample to the next in all channels. `splices` has the rest.
+The wire protocol has no checksum: if a block loses as many bytes as it gains, its header and footer still match. But
+bits of a sigma-delta modulator are far from random. They change more often than random bits, their mean follows the
+sound, and they never stop in all channels from one sample to the next. `splices` adds another check.
 """
 
 from typing import Any
@@ -19,45 +19,48 @@ __all__ = ["BitCheck"]
 
 Floats = NDArray[np.floating[Any]]
 
-_EVERY = 32  # means of which medians are taken; of those over channels every eighth. All would take half a millisecond
+# Medians use every 32nd mean; those over channels use every eighth. Using all would take half a millisecond.
+_EVERY = 32
 # Of white bits the mean square of a mean of 31 is 1/31, and the mean product of neighbours less that square is:
 _WHITE_PRODUCT = -1 / MEAN_OF
-# How far both stray by chance. Products of a real sensor are -0.30 and less, in its direct sound -0.19 where the power
-# is that of white bits; those of simulated sensors, in loud noise, -0.17. In overload the power is higher.
+# Range of both by chance. Products of a real sensor are at most -0.30, or -0.19 in its direct sound, where the power
+# is that of white bits; those of simulated sensors in loud noise, -0.17. In overload the power is higher.
 _POWER_RANGE, _PRODUCT_REACH = (0.012, 0.06), 0.09
 _UNSHAPED, _SHAPED = -0.1, -0.25
-_OFF = (0.2, 0.5)  # of a channel, full scale 1; text has 0.3 to 0.4, and wind may do that to products of -0.2
-_WHITE_MEANS = 16  # in a row; sounds have 3, and overload by what is above 100 kHz, which microphones do not hear, 12
+_OFF = (0.2, 0.5)  # Per channel, full scale 1; text has 0.3 to 0.4, and wind may shift products to -0.2.
+# Number in a row; sounds have 3, and overload by frequencies above 100 kHz, which microphones cannot hear, 12.
+_WHITE_MEANS = 16
 
-_EQUAL_WORDS = 4096  # half a period in overload lasts 112, a push of thirty times full scale that fades in 0.1 ms 1530
-_AROUND = 8  # samples before and after them
-_AS_EVER = (0.3, 0.7)  # share of bits there that differ; next to overload, which comes and goes, few do as a rule
+# Half a period in overload lasts 112; a pulse of thirty times full scale that decays in 0.1 ms, 1530.
+_EQUAL_WORDS = 4096
+_AROUND = 8  # Samples before and after them.
+_AS_EVER = (0.3, 0.7)  # Share of differing bits there; near overload, which comes and goes gradually, few differ.
 
 
 class BitCheck:
-    """Tells blocks that cannot be what the microphones sent.
+    """Detector of blocks that microphones cannot have sent.
 
     Parameters
     ----------
     n_samples : int
         Words of a block.
     pdm_rate_hz : float
-        At the slower clock of 1.125 MHz neither splices nor stretches of noise can be told from sound.
+        At the slower clock of 1.125 MHz, neither splices nor stretches of noise can be distinguished from sound.
     enabled : (channel,) bool, optional
-        Channels that have a microphone; all by default.
+        Channels with a microphone; all by default.
     splices : bool
-        Look for places where words are missing or do not belong, too. That finds nearly all of them. What is told
-        from them is what simulated sensors hear and what one real sensor does, in the one measurement that is public.
+        Also detect missing and misplaced words. This finds nearly all of them. False alarms were tested with simulated
+        sensors and with the only public measurement of a real one.
 
     Attributes
     ----------
     density : (channel,) float64 or None
-        Share of ones in the block that was checked last; 0 or 1 is a stuck microphone, which is no reason to reject.
+        Share of ones in the last checked block; 0 or 1 is a stuck microphone, which is no reason for rejection.
 
     Raises
     ------
     ArgumentError
-        A number is out of range, or ``enabled`` is not of 32 channels.
+        A number is out of range, or ``enabled`` does not have 32 channels.
     """
 
     def __init__(
@@ -83,11 +86,11 @@ class BitCheck:
         self._splices = Splices(n_samples, pdm_rate_hz) if splices and self._is_fast else None
 
     def check(self, words: NDArray[np.uint32]) -> str | None:
-        """Return why a block cannot be right, or None.
+        """Return the reason for rejecting a block, or None.
 
-        ``constant bits``: no channel changes, all along or over a stretch that begins and ends at once. ``density``:
-        most channels have too many ones or zeros, and change as no modulator does. ``noise``: the bits are those of
-        chance, all along or over a stretch. ``splice``: words are missing or do not belong here.
+        ``constant bits``: no channel changes, in the whole block or in a stretch with abrupt ends. ``density``: most
+        channels have too many ones or zeros, and change unlike a modulator. ``noise``: the bits are random, in the
+        whole block or in a stretch. ``splice``: words are missing or misplaced.
 
         Parameters
         ----------
@@ -102,7 +105,7 @@ class BitCheck:
         checks.shape("words", words.shape, (self._n_samples,))
         if words.dtype != np.uint32:
             raise ArgumentError(f"words are {words.dtype}; give uint32")
-        self._words[:, 0] = words  # a copy of its own: the kernels would be compiled once more for read-only arrays
+        self._words[:, 0] = words  # This copy avoids another compilation of the kernels for read-only arrays.
         np.bitwise_xor(self._words[1:], self._words[:-1], out=self._changes[1:])
         mean, change = self._mean(self._words), self._change(self._changes)
         ones = np.rint((self._n_samples + MEAN_OF * mean.sum(axis=1, dtype=np.float64)) / 2)
@@ -110,9 +113,9 @@ class BitCheck:
         moving = self._enabled & (self.density > 0) & (self.density < 1)
         if not moving.any():
             return "constant bits" if self._enabled.any() else None
-        # Not by BLAS, whose threads take longer to meet on busy cores than all of this takes.
+        # BLAS is avoided: on busy cores, its threads take longer to synchronise than the whole computation.
         weights = (moving / moving.sum()).astype(np.float32)
-        share = np.einsum("m,mn->n", weights, change)[1:-2]  # 1 where all bits change each time, -1 where none does
+        share = np.einsum("m,mn->n", weights, change)[1:-2]  # 1 if all bits change each time, -1 if none does.
         power = np.einsum("m,mn->n", weights, np.square(mean, out=self._squares))[1:-2]
         if self._stops(share, moving):
             return "constant bits"
@@ -121,9 +124,9 @@ class BitCheck:
         return "splice" if self._splices and self._splices.found(self._words, mean, moving) else None
 
     def _stops(self, share: Floats, moving: NDArray[np.bool_]) -> bool:
-        """Whether there are long runs of equal words that begin and end among words like any others, or with the block.
+        """Return True if long runs of equal words begin and end among varying words, or with the block.
 
-        In overload, too, words may be equal, but modulators enter and leave it one after the other.
+        Words may also be equal in overload, but modulators enter and leave it one after the other.
         """
         if _longest(share < -1 + 0.5 / (CHANNELS * MEAN_OF)) < _EQUAL_WORDS // MEAN_OF - 3:
             return False
@@ -139,7 +142,7 @@ class BitCheck:
         return False
 
     def _chance(self, mean: Floats, power: Floats, product: Floats) -> str | None:
-        """Return ``density`` or ``noise`` where bits are not those of modulators, all along or over a stretch.
+        """Return ``density`` or ``noise`` if bits are not those of modulators, in the whole block or in a stretch.
 
         Parameters
         ----------

@@ -1,6 +1,6 @@
-"""Measurements as they come from a sensor, and when.
+"""Measurements in the form of a sensor's blocks, with arrival times.
 
-A measurement comes as a block: header, counter, PDM words, footer; nothing in it tells its length or its time.
+A block consists of header, counter, PDM words and footer; it contains neither its length nor its time.
 """
 
 from dataclasses import dataclass
@@ -21,27 +21,27 @@ FOOTER: Final = 792_823_410
 """Last word of a block."""
 
 FRAME_BYTES: Final = 12
-"""Header, counter and footer."""
+"""Bytes of header, counter and footer."""
 
 CHANNELS: Final = 32
-"""Microphones, each of which has a bit of every word."""
+"""Number of microphones; each has one bit of every word."""
 
 COUNTERS: Final = 2**32
-"""Numbers that a counter runs through before it begins anew."""
+"""Range of a counter before it wraps around."""
 
 
 @dataclass(frozen=True, slots=True)
 class Instant:
-    """When something arrived.
+    """Time of an arrival.
 
     Attributes
     ----------
     realtime_ns : int
         Nanoseconds since 1970-01-01 UTC.
     monotonic_ns : int
-        By a clock that nobody sets.
+        Time by a monotonic clock.
     uncertainty_ns : int
-        How long it may have lain there before.
+        Longest possible delay before it was read.
     """
 
     realtime_ns: int
@@ -56,11 +56,11 @@ class Block:
     Attributes
     ----------
     counter : int
-        As the sensor sent it.
-    words : (sample,) uint32
-        Memory of its own, not to be written.
+        Number from the sensor.
+    data : (sample,) uint32
+        PDM words in separate, read-only memory.
     arrived : Instant
-        Of its first byte.
+        Arrival of its first byte.
     """
 
     counter: int
@@ -69,7 +69,7 @@ class Block:
 
 
 def encode_block(counter: int, words: NDArray[np.uint32]) -> bytes:
-    """Return a measurement as a sensor sends it.
+    """Return a measurement in the form that a sensor sends.
 
     Parameters
     ----------

@@ -1,6 +1,6 @@
-"""What is said to a sensor and what it answers, as bytes (facts: rtisdev 2.16.0, the makers' public package).
+"""Commands to a sensor and its answers, as bytes (facts: rtisdev 2.16.0, the makers' public package).
 
-A command is a line ``!X,i,j,k``. Every one but `A`, measure now, is answered by a number of 32 bits.
+A command is a line ``!X,i,j,k``. A number of 32 bits answers each command except `A`, measure now.
 """
 
 import re
@@ -28,50 +28,50 @@ __all__ = [
 ]
 
 CODES: Final = "YGFDECLIHJKBA"
-"""Commands by their letter, in the order in which a sensor is set up."""
+"""Commands by their letter, in the order of a configuration."""
 
 LENGTH_STEP: Final = 32_768
-"""Measurements are so many words long, or a multiple."""
+"""Step of the length of measurements, in bytes."""
 
 MAX_WORDS: Final = 16_777_216
-"""Of one measurement."""
+"""Limit on the words of one measurement."""
 
 PDM_RATES_HZ: Final = (ERTIS_PDM_RATE_HZ, 1_125_000.0)
-"""Clocks by the mode that selects them: ultrasonic and audible."""
+"""PDM clock rates by mode: ultrasonic and audible."""
 
 DAC_RATES_HZ: Final = (160_000, 2_000_000)
-"""Slowest and fastest at which a call is played."""
+"""Lowest and highest sample rate of a call."""
 
 DAC_SAMPLES: Final = (64, 65_535)
-"""Of the shortest and of the longest call."""
+"""Number of samples of the shortest and of the longest call."""
 
 DAC_CODE_MAX: Final = 4_095
-"""Of a sample of the call: 12 bits."""
+"""Largest sample code of the call: 12 bits."""
 
 PINS: Final = (1, 2)
 """SYNC inputs."""
 
 MAX_NUMBER: Final = 2**32 - 1
-"""Of the numbers of commands and answers."""
+"""Largest number in commands and answers."""
 
 _LINE: Final = re.compile(rb"!([A-Z]),(\d{1,10}),(\d{1,10}),(\d{1,10})\n?")
 
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """One line to a sensor.
+    """One command to a sensor.
 
     Attributes
     ----------
     code : str
         One of `CODES`.
     first, second, third : int
-        0 to 2³² − 1; those that a command has no use for are 0.
+        0 to 2³² − 1; unused numbers are 0.
 
     Raises
     ------
     ArgumentError
-        There is no such command, or a number does not fit into 32 bits.
+        The command does not exist, or a number does not fit into 32 bits.
     """
 
     code: str
@@ -85,12 +85,12 @@ class Command:
             checks.integer(f"{name} number of command {self.code}", getattr(self, name), 0, MAX_NUMBER)
 
     def encode(self) -> bytes:
-        """Return the line with its end."""
+        """Return the line with its line end."""
         return b"!%s,%d,%d,%d\n" % (self.code.encode(), self.first, self.second, self.third)
 
     @classmethod
     def decode(cls, line: bytes) -> Self:
-        """Read a line, with its end or without.
+        """Decode a line, with or without its line end.
 
         Raises
         ------
@@ -101,14 +101,14 @@ class Command:
         numbers = [int(group) for group in match.groups()[1:]] if match else []
         if match is None or match[1].decode() not in CODES or max(numbers) > MAX_NUMBER:
             raise DataError(
-                f"{line[:40]!r} is no command; a command is '!X,i,j,k' with X one of {CODES} and whole numbers "
-                f"from 0 to {MAX_NUMBER}"
+                f"{line[:40]!r} is not a command; a command is '!X,i,j,k' with X one of {CODES} and whole "
+                f"numbers from 0 to {MAX_NUMBER}"
             )
         return cls(match[1].decode(), *numbers)
 
     @property
     def about(self) -> str:
-        """What it does, in words."""
+        """Description of the command."""
         first, second = self.first, self.second
         switched = "on" if first else "off"
         emitting = "active" if first else "passive"
@@ -132,12 +132,12 @@ class Command:
 
     @property
     def answers(self) -> bool:
-        """Whether a number comes back; after `A` a block comes instead."""
+        """True if a number answers it; a block follows `A` instead."""
         return self.code != "A"
 
 
 def encode_answer(value: int) -> bytes:
-    """Return what a sensor answers: four bytes, least significant first.
+    """Return a sensor's answer: four bytes, least significant first.
 
     Raises
     ------
@@ -148,7 +148,7 @@ def encode_answer(value: int) -> bytes:
 
 
 def decode_answer(data: bytes) -> int:
-    """Return the number that a sensor answered.
+    """Return the number in a sensor's answer.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Which blocks carry the number that the sensor gave them."""
+"""Validation of the counters in blocks."""
 
 import bisect
 import statistics
@@ -11,62 +11,62 @@ from ertis_numba.devices.blocks import COUNTERS, Block
 __all__ = ["BURST", "CounterCheck"]
 
 BURST: Final = 0.75
-"""Of the shortest interval: what comes later than this after a block's first byte is of another trigger."""
+"""Share of the shortest interval: bytes that arrive later than this after a block's first byte belong to another
+trigger.
+"""
 
-_MAX_HELD = 3  # blocks that contradict each other; memory is what they cost
-_AHEAD = 8  # numbers by which a jump may be more than the time allows: bytes wait in buffers
-_UNHEARD = 4  # triggers in a row of which nothing may have come, where no later block tells
-_INTERVALS = 8  # remembered; of these …
-_ALIKE = 6  # … so many …
-_REGULAR = 0.03  # … are so near their median, as a share of it, where triggers are regular
-_FAR = 10  # intervals beyond which the median is too coarse to count them
-_NEAR = 0.15  # of an interval: farther from a whole number of them, something has come late
+_MAX_HELD = 3  # Limit on contradicting blocks, which occupy memory.
+_AHEAD = 8  # Allowed excess of a jump over the elapsed time, in numbers: bytes wait in buffers.
+_UNHEARD = 4  # Allowed number of successive triggers without a trace, if no later block decides.
+_INTERVALS = 8  # Number of kept intervals; of these …
+_ALIKE = 6  # … this many …
+_REGULAR = 0.03  # … lie this close to their median, relative to it, if triggers are regular.
+_FAR = 10  # Number of intervals beyond which the median is too coarse to count them.
+_NEAR = 0.15  # Share of an interval: a larger deviation from a whole number means a late arrival.
 
 
 @dataclass(frozen=True, slots=True)
 class _Entry:
-    """A block with what tells about its number: all the bytes rejected before it, and the burst that it began in."""
+    """Block with evidence on its number: all bytes rejected before it, and the burst in which it began."""
 
     counter: int
     rejected: float
     burst: int
-    block: Block | None = None  # None where it stands for a counter that was set
+    block: Block | None = None  # None for a counter that was set.
 
 
 class CounterCheck:
-    """Tells numbers that were sent from numbers that were damaged.
+    """Detector of damaged counters.
 
-    Nothing in a block says that its counter is right. What says so is other blocks:
+    A block contains no evidence that its counter is correct, so other blocks are compared:
 
-    1. The next number directly behind its predecessor, not a byte rejected between them, is right.
-    2. So is a number that is ahead by as many as there were triggers since. Where these are regular they are counted by
-       the clock, else by the bursts in which bytes came, damaged ones included: a sensor that is triggered
-       sends at once and then is silent.
-    3. Another number is held until the blocks after it decide. Two that agree in the sense of 1 and 2 are right, and so
-       are three that follow each other, whatever was taken before them. So the count is found again after any loss,
-       and after a sensor began anew.
-    4. A number between the last right one and a later one is right if the time between them has room for it.
+    1. A number directly after its predecessor, without a rejected byte between them, is correct. 2. A number that is
+    ahead by the number of triggers is correct. Regular triggers are counted by the clock, others by the bursts in which
+    bytes arrived, damaged ones included: a triggered sensor sends at once and is then silent. 3. Any other number is
+    held until later blocks decide. Two that agree in the sense of 1 and 2 are correct, and so are three successive
+    ones, regardless of earlier numbers. This recovers the count after any loss, and after a sensor has restarted. 4. A
+    number between the last correct one and a later one is correct if the time between them has room for it.
 
-    A block is held for three others at most, and a number that is the last one's again is a copy.
+    A block is held for at most three others. A repeated number is a copy.
 
     Parameters
     ----------
     shortest_s : float
-        Time from one trigger to the next at least.
+        Minimum time between triggers.
     expected : int, optional
-        Number of the first block; it or the one after is right. Any by default.
+        Number of the first block; it or the following one is correct. Any by default.
 
     Attributes
     ----------
     lost : int
-        Numbers skipped between those that were right.
+        Numbers skipped between correct ones.
     """
 
     def __init__(self, *, shortest_s: float, expected: int | None = None) -> None:
         self.lost = 0
         self._shortest_ns = shortest_s * 1e9
-        self._bursts = 0  # before those in the list
-        self._burst_ns: list[int] = []  # beginning of each since the last block
+        self._bursts = 0  # Before those in the list.
+        self._burst_ns: list[int] = []  # Start of each burst since the last block.
         self._intervals_ns: deque[float] = deque(maxlen=_INTERVALS)
         self._held: list[_Entry] = []
         self._decided: list[tuple[Block, bool]] = []
@@ -76,22 +76,22 @@ class CounterCheck:
 
     @property
     def held(self) -> int:
-        """Blocks that are not decided."""
+        """Number of undecided blocks."""
         return len(self._held)
 
     def expect(self, counter: int) -> list[tuple[Block, bool]]:
-        """Say that ``counter``, or the number after it, comes next; return what was held, none of it right."""
+        """Set the next number to ``counter`` or its successor; return the held blocks, none of which is correct."""
         self._reject_held()
         self._last = _Entry((counter - 1) % COUNTERS, 0.0, self._bursts + len(self._burst_ns))
         return self._results()
 
     def heard(self, at_ns: int) -> None:
-        """Note that bytes came, whatever they are."""
+        """Register that bytes arrived."""
         if not self._burst_ns or at_ns - self._burst_ns[-1] >= BURST * self._shortest_ns:
             self._burst_ns.append(at_ns)
 
     def judge(self, block: Block, rejected: float) -> list[tuple[Block, bool]]:
-        """Return all blocks that are decided by this one, in the order in which they came, and whether they are right.
+        """Return all blocks that this one decides, in order of arrival, and True for each correct one.
 
         Parameters
         ----------
@@ -101,7 +101,7 @@ class CounterCheck:
         """
         place = bisect.bisect_right(self._burst_ns, block.arrived.monotonic_ns) - 1
         self._bursts += max(place, 0)
-        # What has come since is all of this block, even if it came late.
+        # All later bytes belong to this block, even if it is late.
         self._burst_ns = self._burst_ns[max(place, 0) :][:1]
         entry = _Entry(block.counter, rejected, self._bursts + 1, block)
         if self._last is None:
@@ -113,7 +113,7 @@ class CounterCheck:
         return self._results()
 
     def finish(self) -> list[tuple[Block, bool]]:
-        """Decide what is held, now that no other block will: what is ahead by few more than the triggers is right."""
+        """Decide the held blocks at the end of the stream: a number slightly ahead of the triggers is correct."""
         for entry in self._held:
             last = self._last
             if last is None or self._is_near(last, entry):
@@ -143,7 +143,7 @@ class CounterCheck:
         else:
             is_full = len(held) == _MAX_HELD
             if is_full:
-                self._intervals_ns.clear()  # it may be the clock that is wrong: triggers have become others
+                self._intervals_ns.clear()  # The triggers may have changed, so that the clock is wrong.
             if any(self._is_between(last, each, entry) for each in held):
                 self._settle([], entry)
             elif is_full:
@@ -153,7 +153,7 @@ class CounterCheck:
             self._held.append(entry)
 
     def _settle(self, sure: list[_Entry], end: _Entry) -> None:
-        """Decide what is held: right is what is ``sure``, and what fits before that, or before ``end``."""
+        """Decide held blocks: correct are those that are ``sure``, and those that fit before them, or before ``end``."""
         held, self._held = self._held, []
         for index, entry in enumerate(held):
             following = next((later for later in held[index:] if later in sure), end)
@@ -169,7 +169,7 @@ class CounterCheck:
         if last is None or not self._has_room(last, entry):
             return
         ahead = _ahead(last, entry)
-        if last.block is None:  # whether a sensor that is set to n counts from n or n + 1 is its own affair
+        if last.block is None:  # A sensor that is set to n may count from n or from n + 1.
             self.lost += max(0, ahead - 1 - (ahead != entry.burst - last.burst))
         else:
             self.lost += ahead - 1
@@ -185,7 +185,7 @@ class CounterCheck:
         self._held.clear()
 
     def _as_triggered(self, first: _Entry, second: _Entry) -> bool:
-        """Whether numbers went on by as many as there were triggers."""
+        """Return True if numbers advanced by the number of triggers."""
         ahead = _ahead(first, second)
         if first.block is None:
             return 1 <= ahead <= 2 or 0 <= ahead - (second.burst - first.burst) <= 1
@@ -195,7 +195,7 @@ class CounterCheck:
         return self._by_clock(first, second) or max(1, second.burst - first.burst)
 
     def _by_clock(self, first: _Entry, second: _Entry) -> int | None:
-        """Return how many regular triggers there were, None where they are not regular or that is not clear."""
+        """Return the number of regular triggers, None if they are irregular or ambiguous."""
         if len(self._intervals_ns) < _INTERVALS:
             return None
         typical_ns = statistics.median(self._intervals_ns)
@@ -207,17 +207,17 @@ class CounterCheck:
         return count if 1 <= count <= _FAR and abs(passed - count) <= _NEAR else None
 
     def _is_between(self, first: _Entry, second: _Entry, third: _Entry) -> bool:
-        """Whether a number goes between two that are right, as it does where one is missing."""
+        """Return True if a number lies between two correct ones, so that a missing one is plausible."""
         if _ahead(first, second) == 1 == _ahead(second, third):
             return True
         return self._fits(first, second) and self._fits(second, third)
 
     def _fits(self, first: _Entry, second: _Entry) -> bool:
-        """Whether nothing speaks against two numbers both being right."""
+        """Return True if nothing contradicts that two numbers are both correct."""
         return self._has_room(first, second) and self._by_clock(first, second) in {None, _ahead(first, second)}
 
     def _is_near(self, first: _Entry, second: _Entry) -> bool:
-        """Whether it is the next number, or few triggers left no trace."""
+        """Return True for the next number, or if only a few triggers left no trace."""
         ahead = _ahead(first, second)
         if ahead == 1:
             return self._by_clock(first, second) in {None, 1}
@@ -225,7 +225,7 @@ class CounterCheck:
         return self._fits(first, second) and ahead - traces <= _UNHEARD
 
     def _has_room(self, first: _Entry, second: _Entry) -> bool:
-        """Whether so many triggers may have come between two blocks, of which all that sent anything were heard."""
+        """Return True if that many triggers fit between two blocks, assuming that all bursts were received."""
         bursts = max(1, second.burst - first.burst)
         if first.block is None:
             return 1 <= _ahead(first, second) <= _AHEAD + bursts
@@ -234,7 +234,7 @@ class CounterCheck:
 
 
 def _directly(first: _Entry, second: _Entry) -> bool:
-    """Whether a number is the next one and its block, too."""
+    """Return True for the next number whose block follows directly."""
     return _ahead(first, second) == 1 and second.rejected == first.rejected and first.block is not None
 
 

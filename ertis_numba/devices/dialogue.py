@@ -1,4 +1,4 @@
-"""What is said to a sensor, and told from what it still sends: commands with their answers."""
+"""Exchange of commands and answers with a sensor that may still send other data."""
 
 import errno
 import logging
@@ -13,30 +13,30 @@ from ertis_numba.errors import SonarError
 __all__ = ["Dialogue"]
 
 _ANSWER_BYTES = 4
-_GROUP = 16  # commands sent at once: their 250 bytes fit the smallest of buffers
-_QUIET_S = 0.1  # without a byte: then a sensor has measured and sent what it had begun
+_GROUP = 16  # Number of commands sent at once: their 250 bytes fit into the smallest buffer.
+_QUIET_S = 0.1  # Time without a byte after which a sensor has finished its measurement.
 _MAX_BYTES = 2**30
 
 _log = logging.getLogger("ertis_numba")
 
 
 class Dialogue(SerialLine):
-    """A line on which commands are sent and answered.
+    """Serial line with commands and answers.
 
-    Nothing tells an answer from four bytes of a measurement but that nothing comes with it.
+    An answer differs from four bytes of a measurement only in that nothing follows it.
 
     Parameters
     ----------
     path : str
     timeout_s : float
-        How long an answer may take.
+        Timeout of an answer.
     stop : callable
         See `SerialLine`.
 
     Attributes
     ----------
     dropped : int
-        Bytes that belonged to nothing that was asked for.
+        Bytes without a request.
     """
 
     def __init__(self, path: str, *, timeout_s: float, stop: Callable[[], bool]) -> None:
@@ -45,7 +45,7 @@ class Dialogue(SerialLine):
         self._timeout_s = timeout_s
 
     def drain(self, *, within_s: float, repeat: Command | None = None) -> int:
-        """Drop what comes until nothing does, and return how many bytes that were.
+        """Drop bytes until none arrive, and return their number.
 
         Parameters
         ----------
@@ -69,13 +69,13 @@ class Dialogue(SerialLine):
                 self.dropped += count
                 return count
             if now - began > within_s:
-                raise sonar_error(f"{self.path} keeps sending whatever it is told; is it an eRTIS?", errno.ETIMEDOUT)
+                raise sonar_error(f"{self.path} keeps sending after a stop command; is it an eRTIS?", errno.ETIMEDOUT)
             if repeat is not None and now - reported > 2 * _QUIET_S:
                 self.send(repeat.encode())
                 reported = now
 
     def quieten(self, command: Command, *, within_s: float) -> None:
-        """Send the command that ends a stream, and drop what still comes, its answer among that."""
+        """Send the command that ends a stream, and drop all bytes that still arrive, including its answer."""
         before = self.dropped
         self.send(command.encode())
         count = self.drain(within_s=max(within_s, 4 * _QUIET_S), repeat=command)
@@ -84,8 +84,8 @@ class Dialogue(SerialLine):
     def ask(self, command: Command, *, alone: bool = True) -> int:
         """Send a command and return its answer.
 
-        What has come before is dropped. If more than an answer comes, it was the rest of something else: then the
-        command is sent again once that has ended.
+        Earlier bytes are dropped. If more than an answer arrives, it belonged to something else, and the command is
+        sent again afterwards.
 
         Parameters
         ----------
@@ -117,7 +117,7 @@ class Dialogue(SerialLine):
                 )
 
     def ask_twice(self, command: Command) -> int:
-        """Return an answer that came twice: four bytes of something else may look like one, but not again.
+        """Return an answer that arrived twice: four other bytes may look like an answer once, but not twice.
 
         Raises
         ------
@@ -133,7 +133,7 @@ class Dialogue(SerialLine):
         return first
 
     def ask_all(self, commands: Sequence[Command]) -> None:
-        """Send many commands, a few at a time, and take their answers.
+        """Send many commands, a few at a time, and receive their answers.
 
         Raises
         ------
@@ -148,7 +148,7 @@ class Dialogue(SerialLine):
                 raise self._no_answer(group[n_answers], data[len(data) - rest :])
 
     def notify(self, setup: Setup, *, counter: int) -> None:
-        """Send the setup, the call only if the sensor holds another one, and the number of the next measurement.
+        """Send the setup, including the call if the sensor has another one, and the number of the next measurement.
 
         Raises
         ------
@@ -163,15 +163,15 @@ class Dialogue(SerialLine):
             held = self.ask(Command("L"))
             if held != wanted:
                 raise SonarError(
-                    f"{self.path} was sent a call with hash {wanted:#06x} and holds one with {held:#06x}; plug it out "
-                    "and in, and try again (for an emulated one, 'ertis emulate' prints the reason)"
+                    f"{self.path} was sent a call with hash {wanted:#06x} but has one with {held:#06x}; unplug "
+                    "it, plug it in again and retry (for an emulated one, 'ertis emulate' prints the reason)"
                 )
             _log.info("%s: a call of %d samples was sent", self.path, len(setup.codes))
         for command in (*setup.after_call(), Command("B", counter)):
             self.ask(command)
 
     def _answers(self, count: int) -> bytes:
-        """Return so many answers, or fewer if nothing comes for a time."""
+        """Return the requested number of answers, or fewer after a timeout."""
         data = b""
         latest = time.monotonic()
         while len(data) < count * _ANSWER_BYTES and time.monotonic() - latest <= self._timeout_s:
@@ -183,7 +183,7 @@ class Dialogue(SerialLine):
     def _no_answer(self, command: Command, data: bytes) -> SonarError:
         instead = f", but sends {data!r}" if data else ""
         return sonar_error(
-            f"{self.path} does not answer {command.about!r} within {self._timeout_s:g} s{instead}; "
-            "is it an eRTIS, and has it power?",
+            f"{self.path} does not answer {command.about!r} within {self._timeout_s:g} s{instead}; is it an "
+            "eRTIS, and is its power on?",
             errno.ETIMEDOUT,
         )

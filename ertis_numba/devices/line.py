@@ -1,4 +1,4 @@
-"""One open serial port: bytes, and the instants when they came."""
+"""An open serial port: bytes with their times of arrival."""
 
 import errno
 import logging
@@ -18,22 +18,23 @@ try:
     import termios
 
     _CANNOT_OPEN: tuple[type[Exception], ...] = (OSError, termios.error)
-except ImportError:  # not POSIX
+except ImportError:  # Not available outside POSIX.
     _CANNOT_OPEN = (OSError,)
 
 __all__ = ["SerialLine", "closed_error", "sonar_error"]
 
-_BAUD = 115_200  # which means nothing to USB
-_PIECE = 65_536  # bytes
-_CHUNKS = 16  # reads for a piece: a system gives 4095 bytes at a time, and single ones shall not add up to seconds
-_SLICE_S = 0.005  # how long a read waits, and so how long a byte can have lain there unseen
-_USB_FRAME_NS = 1_000_000  # a device may wait so long before the host asks it
+_BAUD = 115_200  # USB ignores it.
+_PIECE = 65_536  # Bytes.
+# Limit on reads per piece: a system returns 4095 bytes at a time, and single bytes must not add up to seconds.
+_CHUNKS = 16
+_SLICE_S = 0.005  # Timeout of a read, and therefore the longest time that a byte waits unread.
+_USB_FRAME_NS = 1_000_000  # Longest time that a device waits before the host polls it.
 _WRITE_S = 1.0
-_IN_USE = (errno.EBUSY, "is in use by another program; end that one")
-_MISSING = (errno.ENOENT, "is not there any more; plug the device in again")
+_IN_USE = (errno.EBUSY, "is in use by another program; end that program")
+_MISSING = (errno.ENOENT, "does not exist any more; plug the device in again")
 _NOT_ALLOWED = (
     errno.EACCES,
-    "may not be used by this user; join its group ('sudo usermod -a -G dialout $USER') and log in again",
+    "requires permission; join its group ('sudo usermod -a -G dialout $USER') and log in again",
 )
 _OPEN_ERRORS = {
     errno.EBUSY: _IN_USE,
@@ -50,20 +51,21 @@ _log = logging.getLogger("ertis_numba")
 
 
 class SerialLine:
-    """A serial port that nobody else has open.
+    """Serial port for exclusive use.
 
-    Only `close` may be called from another thread than the rest.
+    Other threads may call only `close`.
 
     Parameters
     ----------
     path : str
     stop : callable
-        Asked before each read and write, some hundred times a second; once it is true they raise.
+        Called before each read and write, some hundred times a second; once it returns True, these raise an error.
 
     Raises
     ------
     SonarError
-        The port cannot be opened. Its ``errno`` is ENOENT, EBUSY, EACCES, or EINVAL where it is no serial port.
+        The port cannot be opened. Its ``errno`` is ENOENT, EBUSY, EACCES, or EINVAL for a path that is not a serial
+        port.
     """
 
     def __init__(self, path: str, *, stop: Callable[[], bool]) -> None:
@@ -72,11 +74,11 @@ class SerialLine:
         self._lock = threading.Lock()
         self._port = _opened(path)
         self._buffer = memoryview(bytearray(_PIECE))
-        self._empty_ns = time.monotonic_ns()  # when nothing lay there last
+        self._empty_ns = time.monotonic_ns()  # Last time without waiting bytes.
 
     @property
     def waiting(self) -> int:
-        """Bytes that lie there."""
+        """Number of waiting bytes."""
         with self._lock:
             self._check()
             try:
@@ -85,13 +87,13 @@ class SerialLine:
                 raise self._gone() from error
 
     def receive(self, missing: int) -> tuple[bytes, Instant]:
-        """Return what comes within some milliseconds, perhaps nothing, and when its first byte was there.
+        """Return bytes that arrive within some milliseconds, perhaps none, and the time of the first.
 
         Parameters
         ----------
         missing : int
-            Bytes that are still to come of something; 0 where a next thing may begin, whose first byte is then
-            returned by itself as soon as it comes, unless it has been lying there.
+            Bytes that are still to come of something; 0 where a next thing may begin, whose first byte is then returned
+            by itself as soon as it comes, unless it has been lying there.
 
         Raises
         ------
@@ -131,12 +133,14 @@ class SerialLine:
             try:
                 self._write(data)
             except serial.SerialTimeoutException:
-                raise sonar_error(f"{self.path} takes no commands; plug it out and in", errno.ETIMEDOUT) from None
+                raise sonar_error(
+                    f"{self.path} accepts no commands; unplug it and plug it in again", errno.ETIMEDOUT
+                ) from None
             except OSError as error:
                 raise self._gone() from error
 
     def close(self, last: bytes = b"") -> None:
-        """Close the port, after some last bytes if it still takes them."""
+        """Close the port, after sending some last bytes if possible."""
         with self._lock:
             try:
                 if last and self._port.is_open:
@@ -147,9 +151,9 @@ class SerialLine:
                 self._port.close()
 
     def _read(self, size: int) -> bytes:
-        """Return up to ``size`` bytes, as many as come without a pause.
+        """Return up to ``size`` bytes that arrive without a pause.
 
-        Where the port is a file, this takes a sixth less of a processor than pyserial's own loop.
+        For a file descriptor, this takes a sixth less processor time than pyserial's own loop.
         """
         if os.name != "posix":
             return bytes(self._port.read(size))
@@ -166,7 +170,7 @@ class SerialLine:
         return bytes(self._buffer[:read])
 
     def _write(self, data: bytes) -> None:
-        """Write all of it, by means of this module: pyserial's own fail from the 1024th open file on."""
+        """Write all bytes with this module's own loop: pyserial's fails from the 1024th open file on."""
         if os.name != "posix":
             self._port.write(data)
             return
@@ -187,24 +191,25 @@ class SerialLine:
 
 
 def sonar_error(text: str, code: int) -> SonarError:
-    """Return an error whose ``errno`` tells programs what its text tells people."""
+    """Return an error whose ``errno`` states for programs the reason in its text."""
     error = SonarError(text)
     error.errno = code
     return error
 
 
 def closed_error(path: str) -> SonarError:
-    """Return what is raised where a port is used after it was closed."""
+    """Return the error for using a closed port."""
     return SonarError(f"{path} was closed; open it again")
 
 
 def _is_ready(descriptor: int, *, to_write: bool, within_s: float) -> bool:
-    """Whether it can be read or written, or has failed."""
+    """Return True if the descriptor is readable or writable, or has failed."""
     if hasattr(select, "poll"):
         poll = select.poll()
         poll.register(descriptor, select.POLLOUT if to_write else select.POLLIN)
         return bool(poll.poll(1000 * within_s))
-    readers, writers = ([], [descriptor]) if to_write else ([descriptor], [])  # only of the first 1024 files
+    # select supports only the first 1024 descriptors.
+    readers, writers = ([], [descriptor]) if to_write else ([descriptor], [])
     return any(select.select(readers, writers, [], within_s))
 
 
@@ -214,6 +219,6 @@ def _opened(path: str) -> serial.Serial:
             path, _BAUD, timeout=_SLICE_S, write_timeout=_WRITE_S, exclusive=True if os.name == "posix" else None
         )
     except _CANNOT_OPEN as error:
-        unknown = (errno.EINVAL, f"is no serial port that can be used ({error}); give another one")
+        unknown = (errno.EINVAL, f"is not a usable serial port ({error}); give another one")
         code, text = _OPEN_ERRORS.get(getattr(error, "errno", None) or 0, unknown)
         raise sonar_error(f"{path} {text}", code) from error

@@ -1,4 +1,4 @@
-"""Where emulated devices are found: stable links to their ports, like those of ``/dev/serial/by-id``."""
+"""Stable links to the ports of emulated devices, like those of ``/dev/serial/by-id``."""
 
 import os
 import time
@@ -12,19 +12,19 @@ from ertis_numba.errors import ArgumentError, SonarError
 
 try:
     import fcntl
-except ImportError:  # not POSIX
+except ImportError:  # Not available outside POSIX.
     _HAS_TERMINALS = False
 else:
     _HAS_TERMINALS = True
 
 __all__ = ["HeldLink", "emulated_folder", "is_held", "require_terminals"]
 
-_LOOKS_S = 0.1  # how long at most a lock is waited for that may be of one who only looks
+_LOOKS_S = 0.1  # Longest wait for a lock that a mere check may hold.
 _RETRY_S = 0.002
 
 
 def require_terminals() -> None:
-    """Refuse to emulate where there is nothing to emulate with.
+    """Refuse to emulate on a system without pseudo terminals.
 
     Raises
     ------
@@ -44,15 +44,15 @@ def emulated_folder() -> Path:
     if given:
         return Path(given)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # that there is no such folder on this machine, and which one is taken instead
+        warnings.simplefilter("ignore")  # The library warns if this machine has no such folder and another one is used.
         return Path(platformdirs.user_runtime_dir("ertis")) / "emulated"
 
 
 class HeldLink:
-    """A symbolic link that belongs to one emulated device while that lives.
+    """Symbolic link that belongs to one emulated device during its life.
 
-    What a killed one left is replaced. Whether it was killed tells a lock on a hidden file beside the link: that the
-    port exists says nothing, since the system gives its number to the next who asks for one.
+    A link left by a killed device is replaced. A lock on a hidden file beside the link shows if the device is alive.
+    The existence of the port does not, because the system reuses its number.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ class HeldLink:
         require_terminals()
         self.path = path
         if os.path.lexists(path) and not (path.is_symlink() and str(path.readlink()).startswith("/dev/")):
-            raise ArgumentError(f"link {path} exists and leads to no port; give another name")
+            raise ArgumentError(f"link {path} exists but is not a link to a port; give another name")
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         self._lock_path = path.with_name(f".{path.name}.lock")
         self._lock = self._locked()
@@ -83,7 +83,7 @@ class HeldLink:
             lock = os.open(self._lock_path, os.O_CREAT | os.O_RDWR, 0o600)
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                # Its owner may have taken the file away between the two calls: then the lock is one of nothing.
+                # The owner may have removed the file between the two calls, and the lock would then be ineffective.
                 with suppress(FileNotFoundError):
                     if os.path.samestat(os.fstat(lock), self._lock_path.stat()):
                         return lock
@@ -91,39 +91,39 @@ class HeldLink:
                 if time.monotonic() > latest_s:
                     os.close(lock)
                     raise ArgumentError(
-                        f"link {self.path} belongs to an emulated device that runs; end that one, or give another name"
+                        f"link {self.path} belongs to a running emulated device; end that one, or give another name"
                     ) from None
-                time.sleep(_RETRY_S)  # `is_held` holds it for an instant
+                time.sleep(_RETRY_S)  # `is_held` holds the lock for an instant.
             os.close(lock)
 
     def point_to(self, port: str) -> None:
-        """Lead to a port; whoever looks finds the old one or the new one."""
+        """Point the link to a port atomically."""
         new = self.path.with_name(f".{self.path.name}.new")
         new.unlink(missing_ok=True)
         new.symlink_to(port)
         new.replace(self.path)
 
     def clear(self) -> None:
-        """Take the link away, as happens when a device is unplugged."""
+        """Remove the link, as when a device is unplugged."""
         self.path.unlink(missing_ok=True)
 
     def release(self) -> None:
-        """Take the link away for good."""
+        """Remove the link permanently."""
         self.clear()
         self._lock_path.unlink(missing_ok=True)
         os.close(self._lock)
 
 
 def is_held(link: Path) -> bool:
-    """Whether a link leads to what it was made for, as all do but one that a killed emulator left.
+    """Return True if a link belongs to a running device, and False if a killed emulator left it.
 
-    Its pseudo terminal's number is soon that of somebody's shell. See `HeldLink`.
+    The number of its pseudo terminal may soon belong to a shell. See `HeldLink`.
     """
     if not link.name:
         return True
     try:
         lock = os.open(link.with_name(f".{link.name}.lock"), os.O_RDONLY)
-    except OSError:  # no link of an emulator
+    except OSError:  # It is not a link of an emulator.
         return True
     try:
         fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)

@@ -1,4 +1,4 @@
-"""Which serial ports there are, and which of them is meant."""
+"""Serial ports, and the selection of one by name."""
 
 import errno
 import os
@@ -24,11 +24,11 @@ class Port:
     Attributes
     ----------
     path : str
-        What is opened, such as ``/dev/ttyACM0``; another one after the device was plugged in again.
+        Path to open, such as ``/dev/ttyACM0``; it may change when the device is plugged in again.
     link : str
-        A name that stays the same, such as one in ``/dev/serial/by-id``; empty if there is none.
+        Stable name, such as one in ``/dev/serial/by-id``; empty if there is none.
     serial_number : str
-        Of the USB device; the name of an emulated one. Empty if it is not known.
+        Serial number of the USB device, or name of an emulated one. Empty if unknown.
     description : str
     emulated : bool
     """
@@ -45,18 +45,18 @@ class Port:
 
     @property
     def may_be_sonar(self) -> bool:
-        """Whether it is of the kind that an eRTIS has: one that was not asked for may be spoken to."""
+        """True for the kind of port of an eRTIS, which may be probed without a request."""
         return self.emulated or Path(self.path).name.startswith(_CDC_ACM)
 
     @property
     def names(self) -> set[str]:
-        """What it may be called by."""
+        """Names that select it."""
         given = (self.path, self.link, Path(self.path).name, Path(self.link).name, self.serial_number)
         return {name for name in given if name}
 
 
 def find_ports() -> list[Port]:
-    """Return the serial ports of USB devices, then those of emulated devices that run."""
+    """Return the serial ports of USB devices, then those of running emulated devices."""
     return [*_usb_ports(), *_emulated_ports()]
 
 
@@ -71,7 +71,7 @@ def resolve(port: str) -> Port:
     found = find_ports()
     named = [item for item in found if port in item.names]
     if len({item.path for item in named}) > 1:
-        raise sonar_error(f"{port!r} are {len(named)} ports: {_listed(named)}; give the path of one", errno.EINVAL)
+        raise sonar_error(f"{port!r} matches {len(named)} ports: {_listed(named)}; give the path of one", errno.EINVAL)
     if named:
         return named[0]
     path = os.path.realpath(port)
@@ -79,18 +79,18 @@ def resolve(port: str) -> Port:
         link = os.path.abspath(port) if Path(port).is_symlink() else ""  # noqa: PTH100  which follows no link
         same = [item for item in found if item.path == path]
         return replace(same[0], link=link or same[0].link) if same else Port(path=path, link=link)
-    if any(info.device == port for info in list_ports.comports()):  # not of USB, and no file: as Windows has it
+    if any(info.device == port for info in list_ports.comports()):  # Not a USB port and not a file, as on Windows.
         return Port(path=port)
     there_are = (
-        f"give one of those that there are: {_listed(found)}"
+        f"choose one of {_listed(found)}"
         if found
-        else "none is plugged in: look at its cable, or start an emulated one with 'ertis emulate'"
+        else "no port exists: check the cable, or start an emulated one with 'ertis emulate'"
     )
-    raise sonar_error(f"there is no serial port {port!r}; {there_are}", errno.ENOENT)
+    raise sonar_error(f"serial port {port!r} does not exist; {there_are}", errno.ENOENT)
 
 
 def find_again(port: Port) -> Port:
-    """Return where a device is that was plugged in again: by its serial number, by its link, or at the same path.
+    """Return the port of a device that was plugged in again: by its serial number, by its link, or at the same path.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Measurements out of the bytes that a sensor sends: no input, no output and no clock in here."""
+"""Extraction of measurements from the bytes of a sensor, without input, output or clock."""
 
 import math
 from collections import Counter, deque
@@ -15,15 +15,15 @@ __all__ = ["Block", "BlockParser", "BlockReceiver", "Instant"]
 
 _HEADER: Final = HEADER.to_bytes(4, "little")
 _FOOTER: Final = FOOTER.to_bytes(4, "little")
-_MAX_SKIPPED = 256  # numbers by which a block that cut another one short is ahead of it
+_MAX_SKIPPED = 256  # Limit on the numbers that a block skips after it has cut another one short.
 
 
 class BlockParser:
-    """Finds blocks in a stream of bytes, however it is cut into pieces: framing only.
+    """Parser of blocks in a stream of bytes, for any division into pieces: framing only.
 
-    A block is header, counter, words, footer. What has a header but no footer is searched again from just behind
-    the header, so that damage costs no block but its own. Two damaged blocks may by chance have the right length
-    together; the second one's header tells, which came later and has a number to come.
+    A block is header, counter, words, footer. After a header without a footer, the parser searches again directly
+    behind that header, so that damage costs only its own block. Two damaged blocks may have the correct length together
+    by chance; the header of the second one reveals this, because it arrived later and its number is still to come.
 
     ``bytes fed = n_bytes · blocks returned + rejected.total() + pending`` at any time.
 
@@ -39,8 +39,7 @@ class BlockParser:
     n_bytes : int
         Of a whole block.
     rejected : Counter of str
-        Bytes by reason: ``no header``, ``footer``, ``cut short``. Each is counted once, with the header that led
-        to it.
+        Bytes by reason: ``no header``, ``footer``, ``cut short``. Each is counted once, with the header that led to it.
     rejected_blocks : Counter of str
         Headers by the reason for which no block was found behind them.
     """
@@ -50,41 +49,41 @@ class BlockParser:
         self.rejected: Counter[str] = Counter()
         self.rejected_blocks: Counter[str] = Counter()
         self._n_samples, self._apart_ns = n_samples, apart_s * 1e9
-        self._data = bytearray()  # begins with a header, or is the beginning of one
-        self._reason = "no header"  # for which bytes up to the next header are rejected
-        self._position = 0  # of the first of them in the stream
-        self._pieces: deque[tuple[int, Instant]] = deque()  # where each ends in the stream, and when it arrived
+        self._data = bytearray()  # Begins with a header, or with a part of one.
+        self._reason = "no header"  # Reason for rejecting bytes up to the next header.
+        self._position = 0  # Position of the first byte in the stream.
+        self._pieces: deque[tuple[int, Instant]] = deque()  # End of each piece in the stream, and its time of arrival.
 
     @property
     def pending(self) -> int:
-        """Bytes of the block that has begun."""
+        """Number of bytes of the incomplete block."""
         return len(self._data)
 
     @property
     def missing(self) -> int:
-        """Bytes still wanted of the block that has begun, 0 between blocks."""
+        """Number of missing bytes of the incomplete block, 0 between blocks."""
         return self.n_bytes - len(self._data) if self._data else 0
 
     def feed(self, data: bytes, arrived: Instant) -> list[Block]:
-        """Return the blocks that ``data``, which arrived all at once, completes."""
+        """Return the blocks that ``data`` completes; all of it arrived at once."""
         self.add(data, arrived)
         return list(iter(self.take, None))
 
     def expire(self) -> None:
-        """Give up the block that has begun, since its deadline has passed; what came after may have begun another."""
+        """Abandon the incomplete block after its deadline; later bytes may have begun another."""
         if len(self._data) >= len(_HEADER):
             self._abandon("cut short")
         else:
             self._drop(len(self._data), self._reason)
 
     def add(self, data: bytes, arrived: Instant) -> None:
-        """Take bytes in; `take` the blocks then until there is none."""
+        """Add bytes; then call `take` until it returns None."""
         if data:
             self._data += data
             self._pieces.append((self._position + len(self._data), arrived))
 
     def take(self) -> Block | None:
-        """Return the next whole block, or None where there is none yet."""
+        """Return the next complete block, or None."""
         while True:
             if not self._data.startswith(_HEADER):
                 self._search(0)
@@ -96,7 +95,7 @@ class BlockParser:
             self._abandon(reason)
 
     def _fault(self) -> str | None:
-        """Return why what lies there is no block, None if it is one."""
+        """Return the reason why the data is not a block, None if it is one."""
         footer = self.n_bytes - len(_FOOTER)
         if self._data[footer : self.n_bytes] != _FOOTER:
             return "footer"
@@ -110,7 +109,7 @@ class BlockParser:
         return None
 
     def _is_apart(self, place: int) -> bool:
-        """Whether a byte came so late that it may be of another block than the first."""
+        """Return True if a byte came so late that it may belong to another block."""
         arrived = next(arrived for end, arrived in self._pieces if end > self._position + place)
         return arrived.monotonic_ns - self._pieces[0][1].monotonic_ns >= self._apart_ns
 
@@ -119,7 +118,7 @@ class BlockParser:
         return int.from_bytes(self._data[place + 4 : place + 8], "little")
 
     def _accept(self) -> Block:
-        # A copy; the view is gone before the buffer changes its size, which it refuses while there is one.
+        # The copy releases the view, because a bytearray with a view cannot change its size.
         words = np.frombuffer(self._data, "<u4", self._n_samples, 8).astype(np.uint32)
         words.flags.writeable = False
         block = Block(self._counter(0), words, self._pieces[0][1])
@@ -128,13 +127,13 @@ class BlockParser:
         return block
 
     def _abandon(self, reason: str) -> None:
-        """Reject the block that has begun and search behind its header."""
+        """Reject the incomplete block and search behind its header."""
         self.rejected_blocks[reason] += 1
         self._reason = reason
         self._search(len(_HEADER))
 
     def _search(self, begin: int) -> None:
-        """Reject what comes before the next header from ``begin`` on; the end may be the beginning of one."""
+        """Reject bytes before the next header from ``begin`` on; the end may be a partial header."""
         place = self._data.find(_HEADER, begin)
         if place < 0:
             place = max(begin, len(self._data) - len(_HEADER) + 1)
@@ -143,7 +142,7 @@ class BlockParser:
         self._drop(place, self._reason)
 
     def _drop(self, count: int, reason: str | None = None) -> None:
-        """Forget the first ``count`` bytes, which a bytearray does without moving the others."""
+        """Remove the first ``count`` bytes, which a bytearray does without moving the others."""
         if count and reason is not None:
             self.rejected[reason] += count
         del self._data[:count]
@@ -153,11 +152,10 @@ class BlockParser:
 
 
 class BlockReceiver:
-    """What can be trusted of a stream: framing, then the counter, then the bits.
+    """Validation of a stream: framing, then the counter, then the bits.
 
-    A block whose number does not follow for certain is held until others decide (see `CounterCheck`), so that `feed`
-    may return several at once, in order. `expect` says which number comes next; call it before each commanded
-    measurement, and none is held.
+    A block with an uncertain number is held until others decide (see `CounterCheck`), so that `feed` may return several
+    at once, in order. `expect` sets the next number; call it before each commanded measurement, and no block is held.
 
     ``bytes fed = n_bytes · (blocks returned + held) + rejected.total() + pending`` at any time.
 
@@ -194,37 +192,37 @@ class BlockReceiver:
 
     @property
     def pending(self) -> int:
-        """Bytes of the block that has begun."""
+        """Number of bytes of the incomplete block."""
         return self._parser.pending
 
     @property
     def missing(self) -> int:
-        """Bytes still wanted of the block that has begun, 0 between blocks."""
+        """Number of missing bytes of the incomplete block, 0 between blocks."""
         return self._parser.missing
 
     @property
     def held(self) -> int:
-        """Blocks about whose number others will decide."""
+        """Number of blocks with an undecided counter."""
         return self._counters.held
 
     @property
     def rejected(self) -> Counter[str]:
-        """Bytes by reason: those of `BlockParser`, ``counter``, and what the check of the bits says."""
+        """Rejected bytes by reason: those of `BlockParser`, ``counter``, and those of the bit check."""
         whole = Counter({reason: count * self.n_bytes for reason, count in self._rejected_blocks.items()})
         return self._parser.rejected + whole
 
     @property
     def rejected_blocks(self) -> Counter[str]:
-        """Blocks by reason."""
+        """Rejected blocks by reason."""
         return self._parser.rejected_blocks + self._rejected_blocks
 
     @property
     def lost(self) -> int:
-        """Numbers that the counter skipped."""
+        """Number of counts that the counter skipped."""
         return self._counters.lost
 
     def feed(self, data: bytes, arrived: Instant) -> list[Block]:
-        """Return the measurements that ``data``, which arrived all at once, completes."""
+        """Return the measurements that ``data`` completes; all of it arrived at once."""
         good: list[Block] = []
         if data:
             self._counters.heard(arrived.monotonic_ns)
@@ -234,9 +232,9 @@ class BlockReceiver:
         return good
 
     def expire(self) -> list[Block]:
-        """Give up the block that has begun, since its deadline has passed.
+        """Abandon the incomplete block after its deadline.
 
-        Where none has begun, nothing more is waited for: what is held and fits the time is returned.
+        Between blocks, return the held blocks that fit the elapsed time.
         """
         if self.missing:
             self._parser.expire()
@@ -244,14 +242,14 @@ class BlockReceiver:
         return self._settle(self._counters.finish())
 
     def finish(self) -> list[Block]:
-        """Return what is held and fits the time: the stream has ended."""
+        """Return the held blocks that fit the elapsed time, because the stream has ended."""
         self._clear()
         return self._settle(self._counters.finish())
 
     def expect(self, counter: int) -> None:
-        """Say that ``counter``, or the number after it, comes next, as from a counter that was set.
+        """Set the next number to ``counter`` or its successor, after the counter was set.
 
-        What has begun and what is held is given up: it is of the time before.
+        Incomplete and held blocks are discarded: they belong to the time before.
         """
         self._clear()
         self._settle(self._counters.expect(counter))
@@ -261,7 +259,7 @@ class BlockReceiver:
             self._parser.expire()
 
     def _settle(self, decided: list[tuple[Block, bool]]) -> list[Block]:
-        """Return those that are good in every respect, and count the others."""
+        """Return valid blocks, and count the others."""
         good = []
         for block, follows in decided:
             reason = (self._bits(block.data) if self._bits else None) if follows else "counter"

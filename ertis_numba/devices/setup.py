@@ -1,4 +1,4 @@
-"""What a sensor is told before it measures."""
+"""Configuration of a sensor."""
 
 from dataclasses import dataclass
 from typing import Self
@@ -33,13 +33,13 @@ def call_codes(call: Call) -> NDArray[np.uint16]:
 
 
 def call_hash(codes: NDArray[np.uint16]) -> int:
-    """Return the XOR of all codes, which is what a sensor answers to `L`."""
+    """Return the XOR of all codes, which is a sensor's answer to `L`."""
     return int(np.bitwise_xor.reduce(codes, initial=0))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Setup:
-    """All that a sensor is told before it measures; `Setup.of` takes it from settings.
+    """Complete configuration of a sensor; `Setup.of` derives it from settings.
 
     Attributes
     ----------
@@ -48,22 +48,28 @@ class Setup:
     pdm_rate_hz : float
         One of `PDM_RATES_HZ`.
     codes : (sample,) uint16
-        The call.
+        Samples of the call.
     dac_rate_hz : int
-        Rate at which it is played.
+        Sample rate of the call.
     emissions : int
         Calls per measurement.
     active : bool
-        Whether the call is emitted, unless a single measurement says otherwise.
+        True if measurements emit the call by default.
     pin : {1, 2}
         SYNC input.
     amplifier : bool
-        Whether the high-voltage amplifier is on, without which nothing is emitted.
+        True if the high-voltage amplifier is on; without it, nothing is emitted.
 
     Raises
     ------
     ArgumentError
-        A sensor cannot do it.
+        A sensor does not support it.
+
+    Examples
+    --------
+    >>> import ertis_numba as ertis
+    >>> ertis.Setup.of(ertis.Settings.from_preset("default_25_50")).n_samples
+    163840
     """
 
     n_samples: int
@@ -79,8 +85,8 @@ class Setup:
         _check_length(self.n_samples)
         if self.pdm_rate_hz not in PDM_RATES_HZ:
             raise ArgumentError(
-                f"recording.sample_rate_hz is {self.pdm_rate_hz:.10g}; a sensor's clocks are "
-                f"{PDM_RATES_HZ[0]:.0f} and {PDM_RATES_HZ[1]:.0f}: give one of them"
+                f"recording.sample_rate_hz is {self.pdm_rate_hz:.10g}, but a sensor's clocks are "
+                f"{PDM_RATES_HZ[0]:.0f} and {PDM_RATES_HZ[1]:.0f}; give one of them"
             )
         object.__setattr__(self, "dac_rate_hz", _dac_rate_hz(self.dac_rate_hz))
         _check_codes(self.codes, self.dac_rate_hz)
@@ -93,10 +99,10 @@ class Setup:
 
     @classmethod
     def of(cls, settings: Settings, *, active: bool = True, pin: int = 1, emissions: int = 1) -> Self:
-        """Return what a sensor has to be told for ``settings``.
+        """Return the configuration for ``settings``.
 
-        Where nothing is to be emitted the amplifier is off, too, though a call is loaded: ``dataclasses.replace(setup,
-        amplifier=True)`` lets single measurements be active.
+        For passive measurements the amplifier is off, too, although a call is loaded: ``dataclasses.replace(setup,
+        amplifier=True)`` allows single measurements to be active.
 
         Raises
         ------
@@ -106,7 +112,7 @@ class Setup:
         recording, call = settings.recording, settings.call
         _check_array(settings.array)
         if not recording.is_pdm:
-            raise ArgumentError(f"recording.encoding is {recording.encoding!r}; a sensor gives bits: give 'pdm'")
+            raise ArgumentError(f"recording.encoding is {recording.encoding!r}, but a sensor sends bits; give 'pdm'")
         return cls(
             n_samples=recording.n_samples,
             pdm_rate_hz=recording.sample_rate_hz,
@@ -120,11 +126,11 @@ class Setup:
 
     @property
     def n_bytes(self) -> int:
-        """Of the words of one measurement; a block has `FRAME_BYTES` more."""
+        """Bytes of one measurement; a block has `FRAME_BYTES` more."""
         return 4 * self.n_samples
 
     def before_call(self) -> list[Command]:
-        """Return what comes first: nothing triggers, then lengths and rates."""
+        """Return the first commands: trigger off, then lengths and rates."""
         return [
             Command("J", 0, self.pin),
             Command("G", self.n_bytes),
@@ -138,7 +144,7 @@ class Setup:
         return [Command("C", index, code) for index, code in enumerate(self.codes.tolist())]
 
     def after_call(self) -> list[Command]:
-        """Return what comes last; then the counter may be set and the trigger switched on."""
+        """Return the last commands; afterwards the counter may be set and the trigger switched on."""
         return [Command("I", self.emissions), Command("K", int(self.amplifier)), Command("H", int(self.active))]
 
 
@@ -147,23 +153,25 @@ def _check_length(n_samples: int) -> None:
     if n_samples % LENGTH_STEP or n_samples > MAX_WORDS:
         near = min(max(round(n_samples / LENGTH_STEP), 1) * LENGTH_STEP, MAX_WORDS)
         raise ArgumentError(
-            f"recording.n_samples is {n_samples}; a sensor measures multiples of {LENGTH_STEP} up to "
-            f"{MAX_WORDS}: give {near}"
+            f"recording.n_samples is {n_samples}, but a sensor measures multiples of {LENGTH_STEP} up to "
+            f"{MAX_WORDS}; give {near}"
         )
 
 
 def _check_array(array: Array) -> None:
     layout = microphones(array)
     if layout.word_bits != CHANNELS:
-        raise ArgumentError(f"array.word_bits is {layout.word_bits}; a sensor's words have {CHANNELS}: give that")
+        raise ArgumentError(
+            f"array.word_bits is {layout.word_bits}, but a sensor's words have {CHANNELS}; give {CHANNELS}"
+        )
     if len(layout.enabled) > CHANNELS:
         raise ArgumentError(
-            f"array has {len(layout.enabled)} channels; a sensor has {CHANNELS}: give so many positions, or fewer"
+            f"array has {len(layout.enabled)} channels, but a sensor has {CHANNELS}; give at most {CHANNELS} positions"
         )
 
 
 def _dac_rate_hz(rate_hz: float) -> int:
-    """Return a rate at which the converter can play."""
+    """Return a sample rate that the converter supports."""
     slowest_hz, fastest_hz = DAC_RATES_HZ
     if not (float(rate_hz).is_integer() and slowest_hz <= rate_hz <= fastest_hz):
         raise ArgumentError(
@@ -178,8 +186,8 @@ def _check_codes(codes: NDArray[np.uint16], rate_hz: int) -> None:
     fewest, largest = DAC_SAMPLES
     if not fewest <= len(codes) <= largest:
         raise ArgumentError(
-            f"call has {len(codes)} samples; a sensor plays {fewest} to {largest}: give a call.duration_s from "
-            f"{(fewest - 1) / rate_hz:.3g} to {(largest - 1) / rate_hz:.3g}"
+            f"call has {len(codes)} samples, but a sensor plays {fewest} to {largest}; give a call.duration_s "
+            f"from {(fewest - 1) / rate_hz:.3g} to {(largest - 1) / rate_hz:.3g}"
         )
     if codes.max() > DAC_CODE_MAX:
-        raise ArgumentError(f"codes reach {codes.max()}; a sensor's converter takes 0 to {DAC_CODE_MAX}")
+        raise ArgumentError(f"codes reach {codes.max()}, but a sensor's converter accepts 0 to {DAC_CODE_MAX}")

@@ -1,4 +1,4 @@
-"""The driver: measurements out of a sensor on a serial port."""
+"""Driver of a sensor on a serial port."""
 
 import logging
 import threading
@@ -22,7 +22,7 @@ from ertis_numba.errors import ArgumentError, SonarDisconnectedError, SonarError
 
 __all__ = ["SonarDriver"]
 
-_TRANSFER_BYTES_PER_S = 5e6  # at least
+_TRANSFER_BYTES_PER_S = 5e6  # Lower limit.
 _MARGIN_S = 0.5
 _RETRY_S = 0.05
 
@@ -30,14 +30,20 @@ _log = logging.getLogger("ertis_numba")
 
 
 class SonarDriver:
-    """A sensor; make it by `SonarDriver.open`, and use it in a ``with`` statement or `close` it.
+    """A sensor; create it with `SonarDriver.open`, and use it in a ``with`` statement or `close` it.
 
-    Only `close` may be called from another thread than the rest.
+    Other threads may call only `close`.
 
     Attributes
     ----------
     firmware : str
-        Such as ``1.2.3``; empty where the sensor was opened to listen only.
+        Version such as ``1.2.3``; empty for a sensor that was opened as passive.
+
+    Examples
+    --------
+    >>> with SonarDriver.open("/dev/ttyACM0") as sonar:  # doctest: +SKIP
+    ...     sonar.configure(Setup.of(settings))
+    ...     block = sonar.measure()
     """
 
     def __init__(
@@ -50,9 +56,9 @@ class SonarDriver:
         self._passive = passive
         self._closing = threading.Event()
         self._configured: tuple[Setup, BlockReceiver] | None = None
-        self._next = 0  # number of the measurement that comes next
+        self._next = 0  # Number of the next measurement.
         self._is_armed = False
-        self._is_late = False  # a measurement was given up and may still come
+        self._is_late = False  # An abandoned measurement may still arrive.
         self._dropped = 0
         self._line = self._opened(port, lambda: self._closing.is_set() or stop())
         self._line.stop = self._closing.is_set
@@ -61,7 +67,7 @@ class SonarDriver:
     def open(
         cls, port: str, *, timeout_s: float = 1.0, passive: bool = False, stop: Callable[[], bool] = lambda: False
     ) -> Self:
-        """Open a sensor, end what an earlier program has left running, and ask for its firmware.
+        """Open a sensor, stop an unfinished measurement of an earlier program, and query its firmware.
 
         Parameters
         ----------
@@ -103,28 +109,28 @@ class SonarDriver:
 
     @property
     def passive(self) -> bool:
-        """Whether nothing is ever sent to it."""
+        """True if nothing is ever sent to it."""
         return self._passive
 
     @property
     def receiver(self) -> BlockReceiver:
-        """What was received, lost and rejected since `configure`."""
+        """Counts of received, lost and rejected blocks since `configure`."""
         return self._state()[1]
 
     @property
     def dropped(self) -> int:
-        """Bytes that came when nothing was to come; the receiver has not seen them."""
+        """Number of unexpected bytes, which the receiver has not seen."""
         return self._dropped + self._line.dropped
 
     @property
     def deadline_s(self) -> float:
-        """How long a measurement may take: to be recorded, to come at 5 MB/s, and half a second."""
+        """Timeout of a measurement: its duration, its transfer at 5 MB/s, and half a second."""
         setup = self._state()[0]
         transfer_s = (setup.n_bytes + FRAME_BYTES) / _TRANSFER_BYTES_PER_S
         return setup.n_samples / setup.pdm_rate_hz + transfer_s + _MARGIN_S
 
     def call_hash(self) -> int:
-        """Return the hash of the call that the sensor holds."""
+        """Return the hash of the sensor's call."""
         self._speak()
         return self._line.ask(Command("L"))
 
@@ -136,10 +142,10 @@ class SonarDriver:
         bits: Callable[[NDArray[np.uint32]], str | None] | None = None,
         stop: Callable[[], bool] = lambda: False,
     ) -> None:
-        """Tell the sensor all that it has to know; the trigger stays off.
+        """Configure the sensor; the trigger stays off.
 
-        The call is sent only if the sensor holds another one. To a sensor that was opened to listen nothing is sent:
-        then this says what will come.
+        The call is sent only if the sensor has another one. Nothing is sent to a passive sensor: the setup then
+        describes its measurements.
 
         Parameters
         ----------
@@ -194,33 +200,33 @@ class SonarDriver:
         active = setup.active if active is None else active
         if active and not setup.amplifier:
             raise ArgumentError(
-                "active is True, but the sensor was set up with its amplifier off and would emit nothing; configure a "
-                "setup with amplifier=True"
+                "active is True, but the sensor is configured with its amplifier off and would emit nothing; "
+                "configure a setup with amplifier=True"
             )
         if self._is_armed:
             raise SonarError(
-                f"{self.port} is armed, and SYNC pulses measure; take what they do by listen(), or disarm()"
+                f"{self.port} is armed, and SYNC pulses trigger it; receive its measurements with listen(), or disarm()"
             )
         if self._line.waiting:
             self._line.drain(within_s=deadline_s)
-        if self._is_late:  # should that measurement still come, its number tells
+        if self._is_late:  # If that measurement still arrives, its number identifies it.
             self._line.ask(Command("B", self._next))
         receiver.expect(self._next)
         self._line.send(Command("A", int(active)).encode())
-        self._next, self._is_late = (self._next + 1) % COUNTERS, True  # whatever becomes of it, its number is used up
+        self._next, self._is_late = (self._next + 1) % COUNTERS, True  # Its number is used, even if it fails.
         began, read = time.monotonic(), 0
         while time.monotonic() - began <= deadline_s:
             data, arrived = self._line.receive(receiver.missing)
             read += len(data)
             blocks = receiver.feed(data, arrived)
             if data and not (blocks or receiver.missing):
-                blocks = receiver.finish()  # no other block will come to decide
+                blocks = receiver.finish()  # No other block will decide.
             if blocks:
                 return self._counted(blocks[-1])
         receiver.expire()
         raise SonarError(
-            f"{self.port}: no whole measurement within {deadline_s:.2f} s; {read} of {setup.n_bytes + FRAME_BYTES} "
-            "bytes came: measure again, and look at the cable if that happens often"
+            f"{self.port}: no complete measurement within {deadline_s:.2f} s; {read} of "
+            f"{setup.n_bytes + FRAME_BYTES} bytes arrived: measure again, and check the cable if this repeats"
         )
 
     def arm(self) -> None:
@@ -234,13 +240,13 @@ class SonarDriver:
         self._line.ask(Command("J", 1, setup.pin), alone=False)
 
     def disarm(self) -> None:
-        """Let SYNC pulses do nothing; a measurement that is still on its way is dropped."""
+        """Ignore SYNC pulses; a measurement on its way is dropped."""
         self._speak()
         self._line.quieten(Command("J", 0, self._state()[0].pin), within_s=self.deadline_s)
         self._is_armed = False
 
     def listen(self, *, stop: Callable[[], bool], timeout_s: float) -> Iterator[Block]:
-        """Yield triggered measurements as they come.
+        """Yield triggered measurements as they arrive.
 
         Parameters
         ----------
@@ -285,9 +291,9 @@ class SonarDriver:
         yield from map(self._counted, receiver.finish())
 
     def reconnect(self, *, within_s: float, stop: Callable[[], bool] = lambda: False) -> bool:
-        """Wait for a sensor that was unplugged, and set it up again as it was.
+        """Wait for an unplugged sensor, and configure it again as before.
 
-        It is found by its serial number, by its link, or else by its path. Its measurements are counted on.
+        It is found by its serial number, by its link, or otherwise by its path. Its numbers continue.
 
         Parameters
         ----------
@@ -314,7 +320,7 @@ class SonarDriver:
         self._hang_up()
         while not abandoned():
             if time.monotonic() - began > within_s:
-                raise SonarDisconnectedError(f"{self.port} did not come back within {within_s:g} s: {last}")
+                raise SonarDisconnectedError(f"{self.port} did not return within {within_s:g} s: {last}")
             try:
                 port = find_again(self._port)
                 self._line, self._port = self._opened(port, abandoned), port
@@ -328,7 +334,7 @@ class SonarDriver:
                 _log.info("%s is back after %.2f s", self._port, time.monotonic() - began)
                 break
         if self._closing.is_set():
-            self._hang_up()  # what close() has not seen
+            self._hang_up()  # close() has not seen this line.
         return not abandoned()
 
     def close(self) -> None:
@@ -337,7 +343,7 @@ class SonarDriver:
         self._line.close(Command("J", 0, self._state()[0].pin).encode() if self._is_armed else b"")
 
     def _opened(self, port: Port, stop: Callable[[], bool]) -> Dialogue:
-        """Return the line to a sensor that is quiet and has told its firmware."""
+        """Return the line to a quiet sensor, with its firmware version."""
         line = Dialogue(port.path, timeout_s=self._timeout_s, stop=stop)
         if self._passive:
             return line
@@ -356,7 +362,7 @@ class SonarDriver:
         self._line.dropped = 0
 
     def _go_on(self) -> None:
-        """Set up a sensor that has lost its power, as it was."""
+        """Configure a sensor again after a power loss."""
         if self._configured is None:
             return
         setup, receiver = self._configured
@@ -369,7 +375,7 @@ class SonarDriver:
 
     def _speak(self) -> None:
         if self._passive:
-            raise SonarError(f"{self.port} was opened to listen only; open it without passive")
+            raise SonarError(f"{self.port} is open as passive; open it without passive")
 
     def _require_armed(self) -> None:
         if self._closing.is_set():
@@ -383,14 +389,14 @@ class SonarDriver:
         return self._configured
 
     def _counted(self, block: Block) -> Block:
-        """Return a block after it was noted that the next number is due."""
+        """Return a block after advancing the next number."""
         self._next, self._is_late = (block.counter + 1) % COUNTERS, False
         return block
 
     def _nothing_whole(self, read: int, setup: Setup, timeout_s: float) -> SonarError:
         if not read:
-            return SonarError(f"{self.port}: nothing came within {timeout_s:g} s; look at the trigger and its cable")
+            return SonarError(f"{self.port}: nothing arrived within {timeout_s:g} s; check the trigger and its cable")
         return SonarError(
-            f"{self.port}: {read} bytes came within {timeout_s:g} s, but no whole measurement of "
-            f"{setup.n_samples} samples; give the length that it is set to"
+            f"{self.port}: {read} bytes arrived within {timeout_s:g} s, but no complete measurement of "
+            f"{setup.n_samples} samples; give the length that the sensor is set to"
         )

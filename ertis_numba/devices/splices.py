@@ -1,13 +1,13 @@
-"""Places in PDM words where some are missing or do not belong.
+"""Detection of missing and misplaced PDM words.
 
-A sigma-delta modulator keeps the running sum of its errors small, so that below some 150 kHz its bits hold sound and
-little else. At a splice the sum of each microphone m jumps by some A_m (a missing bit is worth 1), which is heard as an
-impulse: of any sign, in all microphones, at one and the same sample. No sound does that: from ahead it is alike in all
-of them, from aside it comes to one after the other, and above 90 kHz microphones hear next to nothing.
+A sigma-delta modulator keeps the running sum of its errors small, so that below about 150 kHz its bits contain little
+except sound. At a splice, the sum of each microphone m jumps by some A_m (a missing bit counts 1), which appears as an
+impulse: of any sign, in all microphones, at the same sample. Sound has no such impulse. From ahead it is equal in all
+microphones, from the side it reaches them one after the other, and above 90 kHz microphones hear almost nothing.
 
-A real eRTIS alters single words itself: in the one measurement that is public, ten words have in their upper 16 bits
-those of other microphones. So bits that differ in a single word, flipped ones too, are no reason to reject a block: an
-impulse counts where it is in three bytes of the four.
+A real eRTIS alters single words itself: in the only public measurement, the upper 16 bits of ten words are those of
+other microphones. Differences in a single word, including flipped bits, are therefore no reason to reject a block: an
+impulse counts if it occurs in three of the four bytes.
 """
 
 import itertools
@@ -25,37 +25,38 @@ __all__ = ["MEAN_OF", "Filter", "Splices"]
 Floats = NDArray[np.floating[Any]]
 
 MEAN_OF = 31
-"""Samples over which means of bits are taken."""
+"""Number of samples in means of bits."""
 
-_MIN_RATE_HZ = 4e6  # at the slower clock modulators are quiet below 40 kHz only, where sound is
-_BAND_HZ, _TAPS = (90e3, 130e3), 207  # above all calls, below the noise that modulators push upwards
+_MIN_RATE_HZ = 4e6  # At the slower clock, modulators are quiet only below 40 kHz, where sound is.
+_BAND_HZ, _TAPS = (90e3, 130e3), 207  # Above all calls, below the modulators' shaped noise.
 _HIGH_BAND_HZ, _HIGH_TAPS = (125e3, 180e3), 151
 _KAISER = 4.0
-_STEP = 30  # samples of the words: 150 kHz, which leaves 75 to 150 kHz in order
-_EVERY = 16  # samples of the band of which the noise is a median
-_SPAN = 4  # samples of the band, in which all of an impulse lies
-_LEVEL_SPAN = 32  # the same, over which the level is a median
-_APART = 6  # the same, between stretches that are looked at one by one
-_MAX = 8  # stretches, those that stand out most first
-_RISE = 2.0  # of the power over the level, to be looked at; that of noise reaches 1.6
-_FINE_STEP, _REACH = 5, 40  # samples of the words: of the band about an impulse, and how far off its sample may be
-_LANES, _MIN_LANES, _MIN_CHANNELS = 4, 3, 4  # bytes of a word, how many of them, and channels in each
+_STEP = 30  # Samples of the words per sample of the band: 150 kHz, which preserves 75 to 150 kHz.
+_EVERY = 16  # Step, in samples of the band, of the values whose median is the noise.
+_SPAN = 4  # Samples of the band that contain a whole impulse.
+_LEVEL_SPAN = 32  # The same, for the median level.
+_APART = 6  # The same, between stretches that are examined separately.
+_MAX = 8  # Limit on stretches, most prominent first.
+_RISE = 2.0  # Power relative to the level above which a stretch is examined; that of noise reaches 1.6.
+_FINE_STEP, _REACH = 5, 40  # Samples of the words: step of the band near an impulse, and search range of its sample.
+_LANES, _MIN_LANES, _MIN_CHANNELS = 4, 3, 4  # Bytes of a word, minimum number of them, and minimum channels in each.
 
-# What makes an impulse a splice, and where 98 % of those of the real measurement lie. Of 28,000 impulses in clicks as
-# microphones hear them, below 100 kHz, none was taken for one; a hundred would have been but for one of these bounds.
-_NOISE = (0.03, 0.35)  # of a size: lower, and there is no microphone; higher, and there is no telling. 0.09
-_MIN_OVER_NOISE, _SIZE = 2.0, (0.45, 4.0)  # 0.75 to 1.7; a few bytes too many make 4
-_LANE_POWER, _LANE_OVER_NOISE = 0.2, 5.0  # mean square in the third of the lanes: 0.4 to 1.7; in altered words 0.04
-_ALONE = (0.85, 1.25)  # share of the power about it that it explains: 0.99 to 1.03
-_MIN_AT_ONCE = 0.62  # share of its power that is in phase: 0.88 to 0.99; in sounds from aside 0.5 to 0.6
-_MAX_ALIKE = 0.4  # share of its power that is the same in all channels: 0 to 0.16; in sounds from ahead 1
-_SPECTRUM = (0.8, 1.35)  # its size in the higher band by that in the lower: 0.97 to 1.12; in sounds 0.2 to 0.7
-_MAX_OVER_LEVEL = 8.0  # of the level there, over that of the whole block
-_LOUDEST, _LOUDEST_SHARE = 0.35, 0.8  # full scale 1, in most channels: overload breaks the shaping of noise, too
+# Limits for a splice, and the range of 98 % of those in the real measurement. Among 28,000 impulses in clicks
+# below 100 kHz, as microphones hear them, none was classified as one. Without one of these limits, a hundred were.
+_NOISE = (0.03, 0.35)  # Level: below it, there is no microphone; above it, detection is impossible. Typically 0.09.
+_MIN_OVER_NOISE, _SIZE = 2.0, (0.45, 4.0)  # Typically 0.75 to 1.7; several added bytes give 4.
+_LANE_POWER, _LANE_OVER_NOISE = 0.2, 5.0  # Mean square in the third of the lanes: 0.4 to 1.7; in altered words 0.04.
+_ALONE = (0.85, 1.25)  # Share of the surrounding power that it explains: 0.99 to 1.03.
+_MIN_AT_ONCE = 0.62  # Share of its power in phase: 0.88 to 0.99; for sounds from the side 0.5 to 0.6.
+_MAX_ALIKE = 0.4  # Share of its power common to all channels: 0 to 0.16; for sounds from ahead 1.
+# Its size in the higher band relative to that in the lower: 0.97 to 1.12; for sounds 0.2 to 0.7.
+_SPECTRUM = (0.8, 1.35)
+_MAX_OVER_LEVEL = 8.0  # Level there relative to that of the whole block.
+_LOUDEST, _LOUDEST_SHARE = 0.35, 0.8  # Full scale 1, in most channels: overload also destroys noise shaping.
 
 
 class Filter:
-    """Filters the bits of all channels and keeps every so many samples, on one thread.
+    """Decimation filter of the bits of all channels, on one thread.
 
     Parameters
     ----------
@@ -82,7 +83,7 @@ class Filter:
 
 
 class Splices:
-    """Looks for impulses in all channels at once, in a band that holds neither sound nor much noise.
+    """Detector of impulses in all channels at once, in a band with little sound and noise.
 
     Parameters
     ----------
@@ -107,18 +108,18 @@ class Splices:
         self._fits = [(shape / np.sum(shape**2, axis=0)).astype(np.float32) for shape in shapes]
         self._amplitude = float(np.mean(np.sum(shapes[0] ** 2, axis=0)))
         self._high = _analytic(_HIGH_BAND_HZ, pdm_rate_hz, _HIGH_TAPS).real.astype(np.float32)
-        # Variance of a size that is fitted to noise of which the band's samples have a variance of 1.
+        # Variance of a size fitted to noise with unit variance per sample of the band.
         alike = np.correlate(band.real, band.real, "full") / np.sum(band.real**2)
         fit = self._fits[0][:, _REACH]
         self._noise_gain = float(fit @ _by_lag(alike, at[:, None] - at) @ fit)
 
     @staticmethod
     def can_distinguish(pdm_rate_hz: float) -> bool:
-        """Return whether there is such a band at this clock."""
+        """Return True if this clock has such a band."""
         return pdm_rate_hz >= _MIN_RATE_HZ
 
     def found(self, words: NDArray[np.uint32], mean: Floats, moving: NDArray[np.bool_]) -> bool:
-        """Return whether there is a splice.
+        """Return True if there is a splice.
 
         Parameters
         ----------
@@ -132,7 +133,7 @@ class Splices:
             return False
         band = self._filter(words)
         some = np.abs(band[:, self._edge : -self._edge : _EVERY])
-        noise = np.partition(some, some.shape[1] // 2, axis=1)[:, some.shape[1] // 2] / 0.6745  # if it is Gaussian
+        noise = np.partition(some, some.shape[1] // 2, axis=1)[:, some.shape[1] // 2] / 0.6745  # For Gaussian noise.
         moving = moving & (noise > 0)
         counts = moving.reshape(_LANES, -1).sum(axis=1)
         lanes = np.flatnonzero(counts >= _MIN_CHANNELS)
@@ -156,17 +157,17 @@ class Splices:
     def _is_splice(
         self, words: NDArray[np.uint32], mean: Floats, moving: NDArray[np.bool_], at: int, variance: float
     ) -> bool:
-        """Return whether the impulse near sample ``at`` is a splice; ``variance`` is that of sizes by noise alone.
+        """Return True if the impulse near sample ``at`` is a splice; ``variance`` is that of sizes by noise alone.
 
-        Impulses of any size are fitted to each channel, all at the sample where they explain most, and others in
-        quadrature, which is what a sound adds that comes a little earlier or later to some microphones.
+        Impulses of any size are fitted to each channel, all at the sample where they explain most. Quadrature
+        components represent sound, which reaches some microphones slightly earlier or later.
         """
         if not _NOISE[0] < math.sqrt(variance) < _NOISE[1] or _is_loud(mean[moving], at):
             return False
         at = min(max(at, self._reach + _REACH), self._n_samples - self._reach - _REACH - 1)
         octets = words[at - self._reach : at + self._reach + 1].view(np.uint8)
         bits = np.unpackbits(octets, axis=1, bitorder="little").T.astype(np.float32) * 2 - 1
-        # Lane by lane: BLAS leaves products of this size to one thread, and its threads take long to meet.
+        # Lane by lane: BLAS uses one thread for products of this size, and its threads synchronise slowly.
         band = (bits.reshape(_LANES, -1, bits.shape[1]) @ self._bank).reshape(CHANNELS, -1)[moving]
         in_phase = band @ self._fits[0]
         place = int(np.argmax(np.sum(in_phase**2, axis=0)))
@@ -193,7 +194,7 @@ class Splices:
 
 
 def _is_loud(mean: Floats, at: int) -> bool:
-    """Return whether modulators may be in overload near a sample."""
+    """Return True if modulators may be in overload near a sample."""
     place = at // MEAN_OF
     loudest = np.max(np.abs(mean[:, max(place - 3, 0) : place + 5]), axis=1)
     return bool(np.quantile(loudest, _LOUDEST_SHARE) > _LOUDEST)

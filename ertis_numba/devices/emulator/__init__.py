@@ -1,4 +1,4 @@
-"""Emulated sensors on pseudo terminals, with a SYNC line and with faults: what tests and ``ertis emulate`` speak to."""
+"""Emulated sensors on pseudo terminals, with a SYNC line and with faults, for tests and ``ertis emulate``."""
 
 from ertis_numba.devices.emulator.device import Emulator
 from ertis_numba.devices.emulator.mainboard import Quirks

@@ -1,4 +1,4 @@
-"""An emulated eRTIS on a pseudo terminal, which sends the words that it is given."""
+"""An emulated eRTIS on a pseudo terminal, which sends given samples."""
 
 import os
 import select
@@ -21,67 +21,74 @@ from ertis_numba.devices.links import HeldLink, require_terminals
 __all__ = ["Emulator"]
 
 _SECOND_NS = 1_000_000_000
-_MAX_UNREAD = 1_000  # answers; then the device takes no more commands
-_PACE_S = 2e-3  # a slow device sends portions of so long
-_CATCH_UP_NS = 20_000_000  # of what a busy machine has missed
+_MAX_UNREAD = 1_000  # Limit on unread answers, above which the device accepts no more commands.
+_PACE_S = 2e-3  # Interval between the portions of a slow device.
+_CATCH_UP_NS = 20_000_000  # Limit on the delay that a device catches up on a busy machine.
 _PATIENCE_S = 10.0
 
 
 class Emulator:
-    """One device. It lives until it is closed; use it in a ``with`` statement.
+    """Emulated device, active until it is closed; use it in a ``with`` statement.
 
-    Every measurement gets the next number of the device's counter. A measurement that is triggered by a command, or
-    by `trigger` without a number, has the words of this number, those that are given being used in turn: the counter
-    tells which words a block has to hold. With a number of a pulse it has the words of that, so that all devices of a
-    SYNC chain hear the same moment whatever their counters are.
+    Each measurement gets the next number of the device's counter. A measurement triggered by a command, or by `trigger`
+    without a number, contains the samples of this number, cyclically: the counter identifies the samples of a block.
+    With a pulse number it contains the samples of the pulse, so that all devices of a SYNC chain measure the same time
+    regardless of their counters.
 
-    Its first byte comes when it has been recorded, the length by the clock after its trigger; then as fast as the host
-    reads. The next may be recorded meanwhile. A trigger while it records is ignored. Two measurements wait for a
-    reader; others are dropped as a whole, and the counter goes on. Answers and measurements leave in the order in
-    which they came about, so an answer waits for the measurements before it.
+    Its first byte is sent when the recording ends, the length of the measurement after its trigger, and the rest as
+    fast as the host reads. The next one may be recorded meanwhile. A trigger during a recording is ignored. Two
+    measurements wait for a reader; others are dropped as a whole, and the counter continues. Answers and measurements
+    leave in order, so an answer waits for earlier measurements.
 
-    A command that is none is answered by 0. The authors' code for Linux sends ``J`` with four numbers and that for
-    Windows ``A`` without the end of the line: both are taken.
+    The device answers an invalid command with 0. The authors' code for Linux sends ``J`` with four numbers, and that
+    for Windows ``A`` without a line end: the device accepts both.
 
     Parameters
     ----------
     words : sequence of (sample,) uint32
-        One array per measurement. If the host asks for another length, they are cut or go on from their beginning.
+        One array per measurement, cut or repeated to the length that the host requests.
     passive : sequence of (sample,) uint32, optional
-        The same for measurements without emission, which are those that are asked for and active ones while the
-        amplifier is off. By default they have the words of active ones.
+        The same for measurements without emission: passive ones, and active ones while the amplifier is off. By default
+        they use ``words``.
     name : str
     faults : Faults, optional
-        What happens to the bytes of measurements.
+        Faults of the line.
     link : Path, optional
-        A symbolic link that leads to the port while the device is plugged in.
+        Symbolic link to the port while the device is plugged in.
     log : TextIO, optional
-        Gets a line of JSON per measurement before its first byte leaves: name, index of the words, counter, active or
-        not, CRC-32 of the words as little-endian bytes, fault (empty if nothing was done to it, "dropped", or in the
-        words of `Faults`) and time_ns since 1970. Those that may not have been read when the device is unplugged get
-        another line, whose fault is "unplugged"; the last line about a measurement holds. Lines about the device itself
-        have an event instead, "unplugged" or "plugged in".
+        Receives a JSON line per measurement before its first byte is sent: name, index of the samples, counter, active
+        or not, CRC-32 of the samples as little-endian bytes, fault (empty, "dropped", or as in `Faults`) and time_ns
+        since 1970. Measurements that may not have been read when the device is unplugged get another line with the
+        fault "unplugged"; the last line about a measurement counts. Lines about the device itself have an event
+        instead, "unplugged" or "plugged in".
     accepts : callable, optional
         Called with a `DeviceConfig`, the call and the record that the host has configured. If it returns False, the
         device reports a wrong hash of the call and does not measure. By default, every configuration is accepted.
     quirks : Quirks
         May be replaced at any time.
     on_port : callable, optional
-        Is called with the port when the device is there again, by the device's thread, for which it must not wait.
+        Called with the new port when the device is plugged in again, from the device's thread; it must not wait for
+        that thread.
 
     Attributes
     ----------
     port : str
         Path of the pseudo terminal. It may change when the device is plugged in again.
     error : Exception or None
-        What has ended the device before its time: words that could not be read or a log that could not be written.
+        Error that has ended the device: unreadable samples or a failing log.
 
     Raises
     ------
     ArgumentError
-        There are no words, or not of uint32; or the link belongs to another.
+        There are no samples, they are not uint32, or the link belongs to another device.
     SonarError
         This system has no pseudo terminals.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> with Emulator([np.zeros(4096, np.uint32)], name="front") as device:  # doctest: +SKIP
+    ...     print(device.port)
     """
 
     def __init__(
@@ -103,7 +110,7 @@ class Emulator:
         self._on_port, self._accepts = on_port, accepts
         self._held = None if link is None else HeldLink(link)
         self.error: Exception | None = None
-        self._refused = 0  # before it was unplugged
+        self._refused = 0  # Before it was unplugged.
         self._changed = threading.Condition()
         self._wish_plugged = True
         self._back_ns: int | None = None
@@ -125,16 +132,16 @@ class Emulator:
 
     @property
     def registers(self) -> Registers:
-        """What it was told since it was powered up, which it is when it is plugged in."""
+        """Settings received since power-up, which happens when it is plugged in."""
         return self._board.registers
 
     @property
     def refused(self) -> int:
-        """Commands that were none, and those whose numbers the device cannot use."""
+        """Number of invalid commands, and of those with unusable numbers."""
         return self._refused + self._board.refused
 
     def close(self) -> None:
-        """Hang up for good and take the link away; closing twice does no harm."""
+        """Hang up permanently and remove the link; closing twice is harmless."""
         with self._changed:
             self._closing = True
             self._wake()
@@ -144,9 +151,9 @@ class Emulator:
             self._held = None
 
     def trigger(self, pulse: int | None = None, *, at_ns: int | None = None) -> bool:
-        """Take a SYNC pulse, at whichever pin the device listens to, and tell whether it starts a measurement.
+        """Receive a SYNC pulse at the selected pin, and return True if it starts a measurement.
 
-        It does not while the device is unplugged or records, or its external trigger is off.
+        It does not start one while the device is unplugged or records, or while its external trigger is off.
 
         Parameters
         ----------
@@ -165,11 +172,14 @@ class Emulator:
             return taken
 
     def unplug(self, for_s: float | None = None) -> None:
-        """Go away, until `replug` or for a time. Whoever has the port open gets a hang-up, and the link goes."""
+        """Unplug the device, until `replug` or for a time.
+
+        A program with an open port gets a hang-up, and the link disappears.
+        """
         self._wish(plugged=False, back_ns=None if for_s is None else time.monotonic_ns() + int(for_s * _SECOND_NS))
 
     def replug(self) -> None:
-        """Come back as after power-up, on a new pseudo terminal."""
+        """Plug the device in again as after power-up, on a new pseudo terminal."""
         self._wish(plugged=True, back_ns=None)
 
     def _wish(self, *, plugged: bool, back_ns: int | None) -> None:
@@ -182,13 +192,13 @@ class Emulator:
 
     def _wake(self) -> None:
         if not self._ended:
-            with suppress(BlockingIOError):  # it has been woken often enough
+            with suppress(BlockingIOError):  # Enough wake-ups are pending.
                 os.write(self._wakeup_socket, b"!")
 
     def _forget(self) -> None:
         self._board = Mainboard(self._measurements, self._accepts)
-        self._sent = Output(deque())  # the latest measurement
-        self._pause_ns = 0  # nothing is sent before
+        self._sent = Output(deque())  # Latest measurement.
+        self._pause_ns = 0  # Nothing is sent before.
 
     def _plug_in(self) -> None:
         self._forget()
@@ -198,7 +208,7 @@ class Emulator:
             self._held.point_to(self.port)
 
     def _pull_out(self) -> None:
-        """Hang up, and log what may not have been read."""
+        """Hang up, and log measurements that may not have been read."""
         if self._terminal is None:
             return
         if self._terminal.unread:
@@ -218,7 +228,7 @@ class Emulator:
             self.error = error
         with self._changed:
             if self.error is not None:
-                self._forget()  # to log what is lost may be what has failed
+                self._forget()  # The log itself may have failed.
             self._pull_out()
             self._ended = True
             os.close(self._woken)
@@ -238,7 +248,7 @@ class Emulator:
                 os.read(self._woken, 4096)
 
     def _step(self, ready: list[int], now_ns: int) -> tuple[bool, list[int], list[int], int | None]:
-        """Do what is due; return whether the device came back, what to wait for, and until when."""
+        """Do pending work; return True if the device came back, the descriptors to wait for, and the next deadline."""
         came_back = self._follow_wish(now_ns)
         terminal, board = self._terminal, self._board
         full = False
@@ -247,7 +257,7 @@ class Emulator:
                 board.take(terminal.read(), self.quirks, now_ns)
             board.go_on(self.quirks, now_ns)
             full = self._send(terminal, now_ns)
-        if terminal is None or terminal is not self._terminal:  # a fault may have unplugged it
+        if terminal is None or terminal is not self._terminal:  # A fault may have unplugged it.
             return came_back, [], [], self._back_ns
         pause_ns = self._pause_ns if board.outputs and not full else None
         due_ns = min((each for each in (board.due_ns, self._back_ns, pause_ns) if each is not None), default=None)
@@ -255,7 +265,7 @@ class Emulator:
         return came_back, master if len(board.outputs) < _MAX_UNREAD else [], master if full else [], due_ns
 
     def _follow_wish(self, now_ns: int) -> bool:
-        """Plug in or pull out, as was asked for; tell whether the device came back."""
+        """Plug in or unplug as requested; return True if the device came back."""
         if self._back_ns is not None and now_ns >= self._back_ns:
             self._wish_plugged, self._back_ns = True, None
         if (self._terminal is not None) == self._wish_plugged:
@@ -269,7 +279,7 @@ class Emulator:
         return self._wish_plugged
 
     def _send(self, terminal: Terminal, now_ns: int) -> bool:
-        """Send what goes; return whether that ended because nobody has read."""
+        """Send as much as possible; return True if no one has read."""
         outputs = self._board.outputs
         while outputs and now_ns >= self._pause_ns:
             pieces = outputs[0].pieces
@@ -289,7 +299,7 @@ class Emulator:
         return False
 
     def _write(self, terminal: Terminal, piece: memoryview, pieces: Pieces, now_ns: int) -> bool:
-        """Write of a piece what goes, and tell whether that was anything; the rest is put back."""
+        """Write a piece as far as possible, and return True if any byte was written; the rest is put back."""
         rate = self.quirks.bytes_per_s
         n_bytes = terminal.write(piece if rate is None else piece[: max(1, int(_PACE_S * rate))])
         if n_bytes < len(piece):

@@ -1,4 +1,4 @@
-"""Faults of a line, drawn by chance: what a cable, a hub and a full buffer do to the bytes of a block."""
+"""Random faults of a line: effects of a cable, a hub and a full buffer on the bytes of a block."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,40 +12,40 @@ from ertis_numba.devices.blocks import FRAME_BYTES
 __all__ = ["KINDS", "BlockFault", "Faults", "Spoilt", "Stall", "Unplug"]
 
 KINDS: Final = ("flip", "duplicate", "lose", "add", "swap", "cut", "drop", "stall", "unplug")
-"""What may happen to a block, in the order in which it does."""
+"""Possible faults of a block, in the order of their application."""
 
 _SHORT_READS: Final = "short_reads"
-_MAX_BYTES: Final = 4095  # of a piece, a terminal's buffer; and of a loss
+_MAX_BYTES: Final = 4095  # Limit on a piece, the size of a terminal's buffer, and on a loss.
 _PARTS: Final = {"header": 0, "counter": 4, "footer": -4}
 _WORD: Final = 4
 
 
 @dataclass(frozen=True, slots=True)
 class Stall:
-    """Nothing is sent for so long."""
+    """Pause in sending."""
 
     duration_s: float
 
 
 @dataclass(frozen=True, slots=True)
 class Unplug:
-    """The sensor goes; nothing of this block comes after it."""
+    """Removal of the sensor; nothing of this block follows."""
 
 
 @dataclass(frozen=True, slots=True)
 class BlockFault:
-    """One thing that was done to a block.
+    """One fault in a block.
 
     Attributes
     ----------
     kind : str
         One of `KINDS`.
     place : int
-        First byte that it concerns, counted in what the faults before it have left.
+        First affected byte, counted after earlier faults.
     n_bytes : int
-        How many it concerns.
+        Number of affected bytes.
     detail : str
-        For a flip the part of the block, for a swap where the bytes were added again.
+        For a flip the part of the block, for a swap the place of the added bytes.
     """
 
     kind: str
@@ -60,14 +60,14 @@ class BlockFault:
 
 @dataclass(frozen=True, slots=True)
 class Spoilt:
-    """A block as it is to be sent.
+    """A block to be sent, with faults.
 
     Attributes
     ----------
     pieces : tuple of bytes, Stall or Unplug
         In this order.
-    faults : tuple of Fault
-        What was done; empty where the block is untouched.
+    faults : tuple of BlockFault
+        Applied faults; empty for an unchanged block.
     """
 
     pieces: tuple[bytes | Stall | Unplug, ...]
@@ -75,7 +75,7 @@ class Spoilt:
 
     @property
     def note(self) -> str:
-        """All faults in words, such as ``lose 37 at 120, stall 0 at 400``; empty where there are none."""
+        """All faults as text, such as ``lose 37 at 120, stall 0 at 400``; empty if there are none."""
         return ", ".join(map(str, self.faults))
 
     @property
@@ -85,20 +85,20 @@ class Spoilt:
 
 
 class Faults:
-    """Draws faults, the same ones for the same seed and the same blocks.
+    """Random generator of faults; the same seed and blocks give the same faults.
 
-    ``flip``: a byte is changed, half of the time in header, counter or footer. ``duplicate``: the block comes twice.
-    ``lose``: bytes are cut out, half of the time whole words. ``add``: random bytes get in. ``swap``: bytes are lost
-    in one place and as many random ones added in another, so that the length stays. ``cut``: the rest never comes;
-    ``drop``: nothing of it comes. ``stall``: a pause. ``unplug``: the sensor goes in the middle. Each is drawn by
-    itself, so that a block may have several.
+    ``flip``: a byte is changed, half of the time in header, counter or footer. ``duplicate``: the block is sent twice.
+    ``lose``: bytes are cut out, half of the time whole words. ``add``: random bytes are inserted. ``swap``: bytes are
+    lost in one place and as many random ones added in another, so that the length stays. ``cut``: the rest is never
+    sent; ``drop``: nothing of it is sent. ``stall``: a pause. ``unplug``: the sensor is removed in the middle. Each is
+    drawn independently, so that a block may have several.
 
     Parameters
     ----------
     seed : int
     kinds : mapping of str to float
-        Probability per block of each of `KINDS`, 0 by default. ``short_reads``: True for pieces of 1 to 4,095 bytes
-        by chance, which is no fault; else pieces are as long as can be.
+        Probability per block of each of `KINDS`, 0 by default. ``short_reads``: True for pieces of 1 to 4,095 bytes by
+        chance, which is no fault; else pieces are as long as can be.
     longest_stall_s : float
 
     Raises
@@ -122,7 +122,7 @@ class Faults:
         self._faults: list[BlockFault] = []
 
     def spoil(self, block: bytes) -> Spoilt:
-        """Return a block as it is to be sent, and what was done to it."""
+        """Return a block to be sent, with its faults."""
         self._faults = []
         data = bytearray(block)
         drawn = {kind for kind, hit in zip(KINDS, self._random.random(len(KINDS)) < self._chances, strict=True) if hit}
@@ -155,7 +155,7 @@ class Faults:
         return int(self._random.integers(len(data)))
 
     def _length(self) -> int:
-        """Return a number of bytes: each order of magnitude as often as the others."""
+        """Return a number of bytes, with equal probability for each order of magnitude."""
         return int(_MAX_BYTES ** self._random.random())
 
     def _bytes(self, count: int) -> bytes:
@@ -206,7 +206,7 @@ class Faults:
         data.clear()
 
     def _pieces(self, data: bytearray) -> list[bytes]:
-        """Return pieces that a terminal takes at once."""
+        """Return pieces that fit into a terminal's buffer."""
         pieces, begin = [], 0
         while begin < len(data):
             length = int(self._random.integers(1, _MAX_BYTES + 1)) if self._short_reads else _MAX_BYTES

@@ -1,4 +1,4 @@
-"""What an emulated device does, without a port, a thread or a clock of its own."""
+"""Behaviour of an emulated device, without a port, a thread or a clock."""
 
 from collections import deque
 from collections.abc import Callable
@@ -18,27 +18,27 @@ __all__ = ["Accepts", "Mainboard", "Quirks"]
 Accepts = Callable[[DeviceConfig], bool]
 """Return True if measurements exist for a configuration."""
 
-_LEFT_NS = 20_000_000  # an unfinished line that is a whole command is taken after so long
-_CONFIG_COMMANDS = frozenset("CDEFG")  # commands that change the call or the record
-_BUFFERED = 2  # measurements that wait for a reader
+_LEFT_NS = 20_000_000  # An unfinished line that is a complete command is accepted after this time.
+_CONFIG_COMMANDS = frozenset("CDEFG")  # Commands that change the call or the record.
+_BUFFERED = 2  # Limit on measurements that wait for a reader.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Quirks:
-    """What a device does wrong apart from its data.
+    """Faulty behaviour of a device apart from its data.
 
     Attributes
     ----------
     silent : bool
-        It does what commands say, but answers nothing.
+        Obey commands, but answer nothing.
     wrong_hash : bool
-        It tells a wrong hash of the call, however often that is loaded.
+        Report a wrong hash of the call, however often it is loaded.
     answer_delay_s : float
-        How long each answer takes.
+        Delay of each answer.
     bytes_per_s : float, optional
-        How fast it sends; as fast as the host reads by default.
+        Data rate; as fast as the host reads by default.
     away_s : float
-        How long it is gone when a fault unplugs it.
+        Time until it returns after a fault has unplugged it.
     """
 
     silent: bool = False
@@ -61,11 +61,11 @@ class _PendingRecording:
     counter: int
     active: bool
     n_samples: int
-    output: Output | None = None  # made while it is recorded
+    output: Output | None = None  # Created during the recording.
 
 
 class Mainboard:
-    """Obeys commands and records, from power-up until it is pulled out.
+    """Device that obeys commands and records, from power-up until it is unplugged.
 
     Parameters
     ----------
@@ -88,19 +88,20 @@ class Mainboard:
         self.outputs: deque[Output] = deque()
         self.refused = 0
         self._measurements, self._accepts = measurements, accepts
-        self._is_new = self._is_loaded = self._is_refused = False  # a configuration, a complete call, the configuration
+        # A new configuration, a complete call, a refused configuration.
+        self._is_new = self._is_loaded = self._is_refused = False
         self._lines = CommandReader()
-        self._left_ns: int | None = None  # when an unfinished line is taken
+        self._left_ns: int | None = None  # Time at which an unfinished line is accepted.
         self._recording: _PendingRecording | None = None
 
     @property
     def due_ns(self) -> int | None:
-        """When to go on, if there is something to go on with."""
+        """Time of the next pending work, if any."""
         dues_ns = (self._left_ns, None if self._recording is None else self._recording.due_ns)
         return min((due_ns for due_ns in dues_ns if due_ns is not None), default=None)
 
     def take(self, data: bytes, quirks: Quirks, now_ns: int) -> None:
-        """Do what the host says."""
+        """Process bytes from the host."""
         for line in self._lines.feed(data):
             self._obey(line, quirks, now_ns)
         self._left_ns = now_ns + _LEFT_NS if _command(self._lines.unfinished) else None
@@ -112,7 +113,7 @@ class Mainboard:
             return
         answer = None if command is None else self.registers.answer(command)
         self.refused += answer is None
-        answer = answer or 0  # nothing better is known for what is refused
+        answer = answer or 0  # The answer of a real device to refused commands is unknown.
         if command is not None and command.code in _CONFIG_COMMANDS:
             self._is_new, self._is_loaded = True, command.code == "C"
             self._is_refused = self._is_refused and not self._is_loaded
@@ -122,7 +123,7 @@ class Mainboard:
             self.outputs.append(Output(deque([Stall(quirks.answer_delay_s), memoryview(encode_answer(answer))])))
 
     def begin(self, *, active: bool, at_ns: int, index: int | None = None) -> bool:
-        """Start to record, unless that goes on already; return whether it was started."""
+        """Start to record, unless a recording is in progress; return True if it was started."""
         if self._recording is not None or self._refuses(judge=True):
             return False
         registers = self.registers
@@ -145,7 +146,7 @@ class Mainboard:
         return self._is_refused
 
     def go_on(self, quirks: Quirks, now_ns: int) -> None:
-        """Do what is due: a line that nobody will end, a measurement that is complete."""
+        """Do pending work: an unfinished line, a complete measurement."""
         if self._left_ns is not None and now_ns >= self._left_ns:
             self._left_ns = None
             self._obey(self._lines.take(), quirks, now_ns)
@@ -162,7 +163,7 @@ class Mainboard:
             self._measurements.notify(output, "dropped")
 
     def lose(self) -> None:
-        """Be pulled out: log what is not going to be sent."""
+        """Unplug: log the measurements that will not be sent."""
         waiting = list(self.outputs)
         if self._recording is not None:
             waiting.append(self._output(self._recording))
@@ -170,7 +171,7 @@ class Mainboard:
             self._measurements.notify(output, "unplugged")
 
     def _output(self, recording: _PendingRecording) -> Output:
-        """Return what is to be sent of a measurement; it is made once."""
+        """Return the output of a measurement; it is created once."""
         if recording.output is None:
             recording.output = self._measurements.output(
                 recording.index, recording.counter, active=recording.active, n_samples=recording.n_samples
@@ -179,9 +180,9 @@ class Mainboard:
 
 
 def _command(line: bytes) -> Command | None:
-    """Return the command in a line, or None if there is none."""
+    """Return the command in a line, or None for an invalid one."""
     if line.startswith(b"!J"):
-        line = b",".join(line.split(b",")[:4])  # the authors' code for Linux sends a number more
+        line = b",".join(line.split(b",")[:4])  # The authors' code for Linux sends another number.
     try:
         return Command.decode(line)
     except DataError:

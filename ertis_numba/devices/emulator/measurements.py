@@ -1,4 +1,4 @@
-"""What an emulated device sends: its measurements with what happens to them, and the log of that."""
+"""Output of an emulated device: its measurements with their faults, and their log."""
 
 import json
 import threading
@@ -21,21 +21,21 @@ __all__ = ["Measurements", "Output", "Pieces", "Words"]
 
 Words = NDArray[np.uint32]
 Pieces = deque[memoryview | Stall | Unplug]
-"""What to do one after the other."""
+"""Sequence of pieces and actions."""
 
-_LOGGING = threading.Lock()  # devices may share a log
+_LOGGING = threading.Lock()  # Devices may share a log.
 
 
 @dataclass(slots=True, eq=False)
 class Output:
-    """Something to be sent; a measurement has an entry, which is its line in the log."""
+    """Output of a device; a measurement has an entry, which is its line in the log."""
 
     pieces: Pieces
     entry: dict[str, Any] = field(default_factory=dict)
 
 
 class Measurements:
-    """Measurements to be sent in turn; for the arguments see `Emulator`."""
+    """Measurements to send cyclically; for the arguments see `Emulator`."""
 
     def __init__(
         self,
@@ -58,12 +58,12 @@ class Measurements:
         self._name, self._faults, self._log = name, faults, log
 
     def output(self, index: int, counter: int, *, active: bool, n_samples: int) -> Output:
-        """Return measurement ``index`` in the length that is asked for, under a number."""
+        """Return measurement ``index`` in the requested length, with a number."""
         given = self._words[active]
         index %= len(given)
         words = given[index]
         if len(words) != n_samples:
-            words = np.resize(words, n_samples)  # cuts, or goes on from the beginning
+            words = np.resize(words, n_samples)  # Cuts, or repeats from the beginning.
         entry = {"name": self._name, "index": index, "counter": counter, "active": active, "fault": ""}
         if self._log is not None:
             entry["crc32"] = zlib.crc32(np.ascontiguousarray(words, dtype="<u4").data)
@@ -75,14 +75,14 @@ class Measurements:
         return Output(deque(pieces), entry | {"fault": spoilt.note})
 
     def notify(self, output: Output, fault: str = "") -> None:
-        """Write the line of a measurement into the log, at once, with what else has happened to it."""
+        """Write the line of a measurement to the log, with further events."""
         if self._log is None or not output.entry:
             return
         faults = ", ".join(filter(None, (output.entry["fault"], fault)))
         _write(self._log, output.entry | {"fault": faults})
 
     def note(self, event: str) -> None:
-        """Write a line about the device itself into the log."""
+        """Write a line about the device itself to the log."""
         if self._log is not None:
             _write(self._log, {"name": self._name, "event": event})
 

@@ -1,4 +1,4 @@
-"""What an emulated device remembers of what it was told, and what it answers."""
+"""Registers of an emulated device, and its answers."""
 
 from dataclasses import dataclass
 
@@ -23,10 +23,10 @@ from ertis_numba.settings import Call
 __all__ = ["FIRMWARE", "DeviceConfig", "Registers"]
 
 FIRMWARE = 0x00_01_00_00
-"""Version that emulated devices answer, 1.0.0: bytes 2, 1 and 0."""
+"""Firmware version of emulated devices, 1.0.0: bytes 2, 1 and 0."""
 
 _DONE = 1
-_NUMBERS = {  # by command: which register takes the first number, and from where to where
+_NUMBERS = {  # By command: register and range of the first number.
     "G": ("n_bytes", 4 * LENGTH_STEP, 4 * MAX_WORDS),
     "F": ("clock", 0, 1),
     "D": ("dac_rate_hz", *DAC_RATES_HZ),
@@ -64,10 +64,10 @@ class DeviceConfig:
 
 
 class Registers:
-    """State of a device, at first as after power-up.
+    """State of a device, initially as after power-up.
 
-    What a real device starts with is known of the amplifier (on) and the external trigger (off); the rest is a guess.
-    So is what settings answer: here 1; what the device refuses is not done, and answered by 0.
+    The initial state of a real device is known for the amplifier (on) and the external trigger (off); the rest is
+    assumed. So are the answers to settings, here 1. A refused command has no effect, and the answer is 0.
 
     Attributes
     ----------
@@ -100,12 +100,12 @@ class Registers:
 
     @property
     def n_samples(self) -> int:
-        """Words of one measurement."""
+        """Number of words in one measurement."""
         return self.n_bytes // 4
 
     @property
     def duration_ns(self) -> int:
-        """How long a measurement takes."""
+        """Duration of a measurement."""
         return self.n_samples * 1_000_000_000 // round(PDM_RATES_HZ[self.clock])
 
     @property
@@ -120,7 +120,7 @@ class Registers:
         return int(np.bitwise_xor.reduce(self.codes[: self.n_codes], initial=0))
 
     def answer(self, command: Command) -> int | None:
-        """Do what a command says; return what the device answers, or None if it refuses."""
+        """Run a command; return the device's answer, or None for a refused command."""
         first, second = command.first, command.second
         if command.code in {"Y", "L"}:
             return FIRMWARE if command.code == "Y" else self.hash

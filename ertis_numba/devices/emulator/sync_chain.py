@@ -1,4 +1,4 @@
-"""The SYNC line: pulses at a steady rate to emulated devices, one after the other."""
+"""SYNC line: pulses at a steady rate to emulated devices, one after the other."""
 
 import threading
 import time
@@ -16,13 +16,13 @@ _SECOND_NS = 1_000_000_000
 
 
 class SyncChain:
-    """Triggers emulated devices at a rate until it is stopped; use it in a ``with`` statement, or `start` it.
+    """Trigger of emulated devices at a steady rate; use it in a ``with`` statement, or `start` it.
 
-    Deadlines are absolute, so the rate does not drift; a pulse that comes too late for the next is left out. Each
-    device gets a pulse `SYNC_STEP_S` after the one before it, which only shows in what it reckons with: the step is far
-    below what can be timed here. Where the words come from a scene, they carry it already.
+    Deadlines are absolute, so the rate does not drift; a pulse that would be too late for the next is skipped. Each
+    device gets a pulse `SYNC_STEP_S` after the previous device. This only matters in its own timestamps, because the
+    step is far below the resolution here. Samples from a scene contain it already.
 
-    Pulses are numbered from the first that a device took. All devices send the words of the same number.
+    Pulses are numbered from the first that a device accepted. All devices send the samples of the same number.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ class SyncChain:
         self.stop()
 
     def start(self) -> None:
-        """Send the first pulse a period from now; to start twice does no harm."""
+        """Send the first pulse after one period; starting twice is harmless."""
         if self._thread is None:
             self._stopped.clear()
             self._thread = threading.Thread(target=self._run, name="SYNC chain", daemon=True)

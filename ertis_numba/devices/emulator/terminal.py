@@ -1,26 +1,26 @@
-"""The pseudo terminal of an emulated device, and what comes in through it."""
+"""Pseudo terminal of an emulated device, and its input."""
 
 import array
 import os
 import re
 from contextlib import suppress
 
-with suppress(ImportError):  # not POSIX: see `links.require_terminals`
+with suppress(ImportError):  # Not available outside POSIX: see `links.require_terminals`.
     import fcntl
     import termios
     import tty
 
 __all__ = ["CommandReader", "Terminal"]
 
-_LONGEST_LINE = 256  # more without an end is no command
+_LONGEST_LINE = 256  # A longer text without a line end is not a command.
 _LINE = re.compile(rb"[^!\n]+(?=!)|!?[^!\n]*\n|![^!\n]*(?=!)")
 
 
 class Terminal:
-    """A pseudo terminal that does nothing to the bytes.
+    """Raw pseudo terminal.
 
-    The side of the host stays open here, so that a host may open and close it for every command. What nobody has read
-    then waits in the system's buffer, some 12 kB; that of a real port would be gone.
+    The host's side stays open here, so that a host may open and close it for every command. Unread bytes then wait in
+    the system's buffer of about 12 kB; a real port would discard them.
 
     Attributes
     ----------
@@ -37,14 +37,14 @@ class Terminal:
         self.port = os.ttyname(self._slave)
 
     def read(self) -> bytes:
-        """Return what came, perhaps nothing."""
+        """Return available bytes, perhaps none."""
         try:
             return os.read(self.master, 65_536)
         except BlockingIOError:
             return b""
 
     def write(self, data: memoryview) -> int:
-        """Write what goes without waiting, and return how many bytes that was."""
+        """Write without waiting, and return the number of written bytes."""
         try:
             return os.write(self.master, data)
         except BlockingIOError:
@@ -52,29 +52,29 @@ class Terminal:
 
     @property
     def unread(self) -> int:
-        """Bytes that the host could read now."""
+        """Number of bytes that the host could read now."""
         count = array.array("i", [0])
         fcntl.ioctl(self._slave, termios.FIONREAD, count)
         return count[0]
 
     def close(self) -> None:
-        """Hang up: whoever has the port open notices."""
+        """Hang up: a program with the open port notices."""
         os.close(self.master)
         os.close(self._slave)
 
 
 class CommandReader:
-    """Cuts what comes into command lines.
+    """Splitter of input into command lines.
 
-    A command ends with its line. The authors' code for Windows sends a measurement without an end: that is one as soon
-    as the next begins, or when it has been left for a while.
+    A command ends with its line. The authors' code for Windows sends a measurement command without a line end: it is
+    complete once the next one begins, or after a while.
     """
 
     def __init__(self) -> None:
         self._rest = b""
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Return the lines that are complete, without their ends."""
+        """Return the complete lines, without their ends."""
         self._rest += data
         lines = []
         while found := _LINE.match(self._rest):
@@ -86,10 +86,10 @@ class CommandReader:
 
     @property
     def unfinished(self) -> bytes:
-        """What has come of the next line."""
+        """Beginning of the next line."""
         return self._rest.strip()
 
     def take(self) -> bytes:
-        """Return what has come of the next line, as if it had ended."""
+        """Return the beginning of the next line as if it had ended."""
         line, self._rest = self._rest, b""
         return line.strip()
