@@ -11,9 +11,7 @@ from ertis_numba.devices.blocks import COUNTERS, Block
 __all__ = ["BURST", "CounterCheck"]
 
 BURST: Final = 0.75
-"""Share of the shortest interval: bytes that arrive later than this after a block's first byte belong to another
-trigger.
-"""
+"""Share of the shortest interval. Bytes later than this after a block's first byte belong to another trigger."""
 
 _MAX_HELD = 3  # Limit on contradicting blocks, which occupy memory.
 _AHEAD = 8  # Allowed excess of a jump over the elapsed time, in numbers: bytes wait in buffers.
@@ -153,7 +151,7 @@ class CounterCheck:
             self._held.append(entry)
 
     def _settle(self, sure: list[_Entry], end: _Entry) -> None:
-        """Decide held blocks: correct are those that are ``sure``, and those that fit before them, or before ``end``."""
+        """Decide held blocks: the ``sure`` ones are correct, and those that fit before them or before ``end``."""
         held, self._held = self._held, []
         for index, entry in enumerate(held):
             following = next((later for later in held[index:] if later in sure), end)

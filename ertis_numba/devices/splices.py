@@ -226,7 +226,7 @@ def _level(power: Floats) -> Floats:
 
 
 def _tops(above: NDArray[np.int64], power: Floats, level: Floats) -> list[int]:
-    """Return where the third of the lanes rises most in each stretch of what is above, the highest first."""
+    """Return the maxima of the third-highest lane in each stretch above the limit, the highest first."""
     if not len(above):
         return []
     rise = np.sort(power[:, above] / level[:, above], axis=0)[-_MIN_LANES]

@@ -1,4 +1,4 @@
-"""Which sensors there are: all ports asked at once."""
+"""Survey of connected sensors: all ports are probed at once."""
 
 import errno
 from collections.abc import Iterable
@@ -18,18 +18,18 @@ _STATES: dict[int | None, State] = {errno.EBUSY: "in use", errno.EACCES: "not al
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Answer:
-    """What became of asking a port.
+    """Result of probing a port.
 
     Attributes
     ----------
     port : Port
     state : {"ready", "in use", "not allowed", "no answer"}
     firmware : str
-        Empty unless the sensor is ready, as with the next.
+        Firmware version; empty unless the sensor is ready.
     call_hash : int or None
-        Of the call that it holds.
+        Hash of the sensor's call; None unless the sensor is ready.
     error : SonarError or None
-        Why it is not ready.
+        Reason why it is not ready.
     """
 
     port: Port
@@ -40,15 +40,15 @@ class Answer:
 
 
 def survey(ports: Iterable[Port], *, timeout_s: float = 0.3) -> list[Answer]:
-    """Ask ports whether there is a sensor, in less than a second.
+    """Probe ports for sensors, in less than a second.
 
-    A measurement that goes on for a host that has ended is ended by that; those in use are left alone.
+    This stops a measurement for a host that has ended; ports in use are skipped.
 
     Parameters
     ----------
     ports : iterable of Port
     timeout_s : float
-        How long an answer may take.
+        Timeout of an answer.
     """
 
     def ask(port: Port) -> Answer:
