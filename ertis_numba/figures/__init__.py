@@ -1,9 +1,8 @@
-"""Pictures of energyscapes and of what they are made from, and of what exactness costs.
+"""Figures of energyscapes, signals and arrays, and of accuracy versus processing time.
 
-They are drawn without pyplot, so that no global state and no window system is needed. As x is forward, y left and z up
-in the sensor frame (REP-103), positive azimuth is on the left: a sector is seen from above, a map and an array out of
-the sensor's eyes. Each function returns a figure; `save` writes it to a file. Besides this package only the live view
-uses Matplotlib.
+Figures do not use pyplot, so they need no global state and no window system. As x is forward, y left and z up in the
+sensor frame (REP-103), positive azimuth is on the left: a sector is seen from above, a map and an array from the
+sensor. Each function returns a figure; `save` writes it to a file. Only the live view also uses Matplotlib.
 """
 
 from collections.abc import Sequence
@@ -49,9 +48,9 @@ def plot(
 ) -> Figure:
     """Draw an energyscape.
 
-    A planar image becomes a sector in metres. An image with elevations becomes two: the maximum over
-    range as a map of azimuth and elevation, and the maximum over elevation as a sector. An image of
-    one direction becomes a curve over range.
+    A planar image becomes a sector in metres. An image with elevations becomes two: the maximum over range as a map of
+    azimuth and elevation, and the maximum over elevation as a sector. An image of one direction becomes a curve over
+    range.
 
     Parameters
     ----------
@@ -62,8 +61,8 @@ def plot(
         Reflectors to mark and list, as `find_peaks` returns them.
     side_lobes : bool
         Show the side lobes of an image with elevations, too. By default, what lies
-        `ertis_numba.analysis.side_lobes.SIDE_LOBE_DB` below the strongest of about the same range is left out: a maximum
-        over directions would otherwise show an arc at the range of each echo.
+        `ertis_numba.analysis.side_lobes.SIDE_LOBE_DB` below the strongest of about the same range is left out: a
+        maximum over directions would otherwise show an arc at the range of each echo.
     **look
         ``theme``, ``columns`` and ``font``: see `StyleOptions`.
 

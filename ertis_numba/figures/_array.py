@@ -1,4 +1,4 @@
-"""Where the microphones are, and how loud each direction is heard when they are steered to one."""
+"""Layout and beam pattern of an array."""
 
 import math
 from collections.abc import Sequence

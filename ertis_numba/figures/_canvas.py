@@ -1,4 +1,4 @@
-"""What pictures of levels share: the raster, its scale of colours, the reflectors in it and their list."""
+"""Common parts of pictures of levels: raster, colour bar, marked reflectors and their list."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -31,7 +31,7 @@ _LEVEL_EMS = 5.8  # what a scale that lies takes, with its ticks and its label
 
 @dataclass(frozen=True, slots=True)
 class Canvas:
-    """The choices of one picture."""
+    """Choices of one picture."""
 
     style: Style
     dynamic_range_db: float
@@ -60,7 +60,7 @@ class Canvas:
         )
 
     def level_db(self, amplitude: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the level below the strongest, cut at the dynamic range."""
+        """Return the level relative to the strongest, limited to the dynamic range."""
         return below_strongest_db(amplitude, self.dynamic_range_db)
 
     def show(
@@ -83,7 +83,10 @@ class Canvas:
         axes.grid(color=self.style.faint, alpha=0.3, linewidth=0.6 * self.style.line_pt)
 
     def mark_peaks(self, axes: Axes, place: Callable[[Peak], tuple[float, float] | None]) -> None:
-        """Ring the reflectors where ``place`` says and number them, the strongest on top; the limits must be final."""
+        """Mark and number the reflectors at the positions from ``place``, the strongest on top.
+
+        Axis limits must be final.
+        """
         style = self.style
         frame = axes.bbox.padded(1.0)
         places = [(number, at) for number, peak in enumerate(self.peaks, 1) if (at := place(peak)) is not None]
@@ -112,7 +115,7 @@ class Canvas:
         )
 
     def side(self, page: FigurePage, box: PageBox, shown: AxesImage, *, label: str = "dB re strongest") -> Figure:
-        """Put the scale of colours into its box, and the list of reflectors under it; return the figure."""
+        """Draw the colour bar into its box, and the list of reflectors below it; return the figure."""
         style, em_pt = self.style, self.style.em_pt
         height_pt = min(16 * em_pt, (0.45 if self._rows() else _SHARE_ALONE) * box.height)
         upright = height_pt >= _LABEL_EMS * em_pt and box.width < 30 * em_pt

@@ -1,4 +1,4 @@
-"""An image of one direction: level over range."""
+"""Image of one direction: level over range."""
 
 from matplotlib.figure import Figure
 

@@ -1,4 +1,4 @@
-"""What the matched filter leaves of each microphone: level over range."""
+"""Matched-filter output of each microphone: level over range."""
 
 import numpy as np
 from matplotlib.axes import Axes

@@ -1,4 +1,4 @@
-"""What exactness costs: error against time of many plans."""
+"""Accuracy versus processing time of many plans."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""What the microphones of a measurement heard: signals, and signals after the call's matched filter."""
+"""Signals of the microphones, before and after the matched filter."""
 
 from dataclasses import dataclass
 
@@ -21,7 +21,7 @@ _MAX_SAMPLES = 2**19  # of the record, 0.1 s of an eRTIS: what a picture can sho
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MicrophoneTraces:
-    """Something over time or range, of each microphone.
+    """Values of each microphone over time or range.
 
     Attributes
     ----------

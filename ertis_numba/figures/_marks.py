@@ -1,4 +1,4 @@
-"""Names beside points, none over another."""
+"""Labels beside points, without overlaps."""
 
 import math
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ def name_points(
     colour: str,
     bold: bool = False,
 ) -> None:
-    """Write names beside points, the first ones nearest; where there is no room, none.
+    """Write labels beside points, the first ones nearest; omit those without room.
 
     The limits of the axes must be final. What was written into them before is kept free.
 
@@ -87,7 +87,7 @@ def _free(
     taken: Sequence[Bbox],
     page: BboxBase,
 ) -> tuple[float, float] | None:
-    """Return an offset in points at which a name covers nothing that is taken."""
+    """Return an offset in points at which a label covers nothing."""
     for turn_deg in _TURNS_DEG:
         turn = math.radians(turn_deg)
         offset_pt = (

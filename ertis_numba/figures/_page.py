@@ -1,4 +1,4 @@
-"""Where things stand on a page, in points from its lower left corner: the heading, the pictures, their scale."""
+"""Layout of a page, in points from its lower left corner: heading, pictures, colour bar."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -28,18 +28,18 @@ class PageBox:
     height: float
 
     def inset(self, *, left: float = 0.0, right: float = 0.0, bottom: float = 0.0, top: float = 0.0) -> "PageBox":
-        """Return what is left of it within margins."""
+        """Return the box within margins."""
         return PageBox(self.left + left, self.bottom + bottom, self.width - left - right, self.height - bottom - top)
 
     def fitted(self, ratio: float) -> "PageBox":
-        """Return the largest box in it whose height is ``ratio`` of its width, in the middle at the top."""
+        """Return the largest inner box with a given ratio of height to width, centred at the top."""
         width = min(self.width, self.height / ratio)
         height = width * ratio
         return PageBox(self.left + (self.width - width) / 2, self.bottom + self.height - height, width, height)
 
 
 class FigurePage:
-    """A figure with its heading.
+    """Figure with its heading.
 
     Parameters
     ----------
@@ -149,7 +149,7 @@ def lay_out(
     below_pt: float,
     side_tall_pt: float = 0.0,
 ) -> tuple[FigurePage, list[PageBox], PageBox]:
-    """Return a page, the boxes of its pictures and that of what goes with them.
+    """Return a page, the boxes of its pictures and that of their colour bar and list.
 
     On a wide page the pictures stand beside each other and the rest to their right, on a narrow one all stands below
     each other.

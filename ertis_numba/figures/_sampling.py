@@ -1,4 +1,4 @@
-"""From directions and ranges to the pixels of a raster."""
+"""Resampling from directions and ranges to the pixels of a raster."""
 
 import math
 
@@ -28,7 +28,7 @@ _THIN = 0.005  # of the range, to either side: ranges within it would be too thi
 
 
 def centres(first: float, last: float, step: float) -> NDArray[np.float64]:
-    """Return the middles of about such steps from one end to the other, which may be the smaller: (step,) float64."""
+    """Return the centres of steps of about a given size between two ends in any order: (step,) float64."""
     count = max(1, round(abs(last - first) / step))
     return np.asarray(first + (np.arange(count) + 0.5) * (last - first) / count)
 
@@ -48,7 +48,7 @@ def join_ranges(
 def thickened(
     range_m: NDArray[np.float64], level_db: NDArray[np.float32]
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Return the ranges and levels to draw: what is too thin to be seen becomes a hundredth of its range thick."""
+    """Return the ranges and levels to draw; a thin image becomes a hundredth of its range thick."""
     first_m, last_m = float(range_m[0]), float(range_m[-1])
     half_m = _THIN * last_m
     if last_m - first_m >= 2 * half_m:
@@ -166,7 +166,7 @@ def volume_raster(
 def _around(
     directions: NDArray[np.float64], looks: NDArray[np.float64]
 ) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
-    """Return the nearest directions of each look and their weights, NaN where none is near: both (look, nearest)."""
+    """Return the nearest directions of each look and their weights, NaN if none is near: both (look, nearest)."""
     nearest = min(_NEAREST, len(directions))
     distance, place = cKDTree(directions).query(looks, k=nearest)
     distance = distance.reshape(-1, nearest)
@@ -178,7 +178,7 @@ def _around(
 
 
 def flattened(image: Energyscape, level_db: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Return rising azimuths and their levels, (direction, range): the strongest where there are several elevations.
+    """Return rising azimuths and their levels, (direction, range): the maximum over elevations.
 
     They run on without a jump, and if they go all around the first is the last as well, a turn later.
     """

@@ -1,4 +1,4 @@
-"""The sector: azimuth and range as a plan in metres."""
+"""Sector: azimuth and range as a plan in metres."""
 
 import math
 from collections.abc import Callable
@@ -27,7 +27,7 @@ _MIN_RATIO, _MAX_RATIO = 0.3, 0.95  # of height to width
 
 
 def draw(canvas: Canvas, image: Energyscape, *, side_lobes: bool) -> Figure:
-    """Draw an image; of several elevations the strongest."""
+    """Draw an image; the maximum over elevations."""
     hidden = not (image.is_planar or side_lobes)
     image = without_side_lobes(image) if hidden else image
     azimuth_rad, level_db = flattened(image, canvas.level_db(image.amplitude))
@@ -42,7 +42,7 @@ def draw(canvas: Canvas, image: Energyscape, *, side_lobes: bool) -> Figure:
 def height_of(
     canvas: Canvas, azimuth_rad: NDArray[np.float64], range_m: NDArray[np.float64]
 ) -> Callable[[float], float]:
-    """Return the function from the width of a sector to its height, both with the names around it, in points."""
+    """Return the function from the width of a sector to its height, both with the labels around it, in points."""
     left, right, bottom, top = _extent(_ends(azimuth_rad), range_m)
     ratio = min(_MAX_RATIO, max(_MIN_RATIO, (top - bottom) / (right - left)))
     em_pt = canvas.style.em_pt
@@ -95,7 +95,7 @@ def _place_of(peak: Peak) -> tuple[float, float]:
 def _fan(
     azimuth_rad: NDArray[np.float64], level_db: NDArray[np.float32]
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Return the directions and levels to draw: what is too thin to be seen becomes two degrees wide."""
+    """Return the directions and levels to draw; a thin image becomes two degrees wide."""
     ends_rad = _ends(azimuth_rad)
     if ends_rad[0] == azimuth_rad[0]:
         return azimuth_rad, level_db
@@ -125,7 +125,7 @@ def _extent(azimuth_rad: NDArray[np.float64], range_m: NDArray[np.float64]) -> t
 def _rings(
     canvas: Canvas, axes: Axes, azimuth_rad: NDArray[np.float64], range_m: NDArray[np.float64], *, half_m: float
 ) -> None:
-    """Draw rings and their names, of ranges of the image or half a pixel off."""
+    """Draw rings and their labels, at ranges of the image or half a pixel off."""
     last_m, size_pt = range_m[-1], canvas.style.tick_pt
     arc = np.linspace(azimuth_rad[0], azimuth_rad[-1], 361)
     # Names stand beside the first edge, outside of the sector, or under or over it where that edge runs level.
@@ -170,7 +170,7 @@ def _rays(canvas: Canvas, axes: Axes, azimuth_rad: NDArray[np.float64], range_m:
 
 
 def _side(towards: float, before: str, behind: str) -> str:
-    """Return on which side of its point a name stands, so that it goes outwards."""
+    """Return the side of a label on which it points outwards."""
     return "center" if abs(towards) < 0.3 else behind if towards > 0 else before
 
 

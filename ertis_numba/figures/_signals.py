@@ -1,4 +1,4 @@
-"""What the microphones heard: a trace of each, and a spectrogram."""
+"""Signals of the microphones: a trace of each, and a spectrogram."""
 
 import math
 
@@ -74,7 +74,7 @@ def draw(canvas: Canvas, measurement: Measurement, *, microphone: int | None) ->
 
 
 def chosen(heard: MicrophoneTraces, microphone: int | None) -> MicrophoneTraces:
-    """Return what one microphone heard, or all.
+    """Return the traces of one microphone, or of all.
 
     Raises
     ------
@@ -93,7 +93,7 @@ def chosen(heard: MicrophoneTraces, microphone: int | None) -> MicrophoneTraces:
 
 
 def row_ticks(axes: Axes, channels: NDArray[np.int64], *, height_pt: float, em_pt: float) -> None:
-    """Name the rows 0, 1, … of an axis by their channels, as many as fit."""
+    """Label the rows 0, 1, … of an axis with their channels, as many as fit."""
     step = max(1, math.ceil(len(channels) * 1.6 * em_pt / height_pt))
     step = next(nice for nice in (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024) if nice >= step)
     places = np.arange(0, len(channels), step)

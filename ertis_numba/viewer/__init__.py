@@ -1,7 +1,7 @@
-"""Live view in the browser. The only door to viser.
+"""Live view in the browser; the only package that imports viser.
 
-A source has images: `Live` those that a central node publishes, `Playback` those of a file. `ViewedScene` makes of them what is
-to be drawn, without a browser. `Viewer` hands that to the page and does what is chosen there.
+A source provides images: `Live` those that a central node publishes, `Playback` those of a file. `ViewedScene` computes
+the drawn objects from them, without a browser. `Viewer` shows these on the page and applies the choices made there.
 """
 
 import importlib
@@ -38,7 +38,7 @@ _HOMES = {"Film": "_film", "Live": "_live", "View": "_view"}
 
 
 def __getattr__(name: str) -> Any:
-    """Load what brings HDF5, ZeroMQ or viser when it is asked for (PEP 562)."""
+    """Import modules that load HDF5, ZeroMQ or viser on first access (PEP 562)."""
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     with extra("view", "the live view needs viser and websockets"):

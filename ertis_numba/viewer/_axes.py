@@ -1,4 +1,4 @@
-"""The axes of a picture of range and azimuth: where things are in it, and rings, rays and names, drawn once."""
+"""Axes of a picture of range and azimuth: coordinates, rings, rays and labels, drawn once."""
 
 import io
 import math
@@ -17,25 +17,25 @@ if TYPE_CHECKING:
 __all__ = ["PAGE", "SIDE_PX", "Ink", "Place", "draw_axes", "draw_text"]
 
 PAGE: Final = (11, 13, 18)
-"""Colour of what is not the image: red, green, blue."""
+"""Background colour: red, green, blue."""
 SIDE_PX: Final = 44
-"""On either side of the sector, for names."""
+"""Margin at the sides of the sector, for labels."""
 
 _FAINT: Final = "#9aa0b0"
 _DPI: Final = 100
 _LETTERS: Final[dict[str, Any]] = {"color": _FAINT, "fontsize": 8.5}
 _LINE: Final[dict[str, Any]] = {"color": _FAINT, "alpha": 0.4, "linewidth": 0.7}
 _TEXT_PT: Final = 11.0
-_ROOF_PX, _FLOOR_PX = 26, 66  # above and below the sector, for the names of rays, and of rings and the scale of colours
-_SCALE_PX: Final = 10  # height of the scale of colours
-_RING_PX: Final = 36  # between rings at least, so that their names have room
-_APART_PX: Final = 2  # between names at least
-_MIN_RATIO, _MAX_RATIO = 0.25, 1.0  # of the sector's height to its width
+_ROOF_PX, _FLOOR_PX = 26, 66  # Margins above and below the sector: labels of rays; labels of rings, and the colour bar.
+_SCALE_PX: Final = 10  # Height of the colour bar.
+_RING_PX: Final = 36  # Minimum distance of rings, with room for their labels.
+_APART_PX: Final = 2  # Minimum distance of labels.
+_MIN_RATIO, _MAX_RATIO = 0.25, 1.0  # Height of the sector relative to its width.
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where the sector is in the picture.
+    """Position of the sector in the picture.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class Place:
 
     @classmethod
     def of(cls, azimuth_rad: NDArray[np.float64], range_m: tuple[float, float], width_px: int) -> "Place":
-        """Return where a sector fits into a picture of a width."""
+        """Return the position of a sector in a picture of a given width."""
         arc = np.linspace(azimuth_rad[0], azimuth_rad[-1], 361)
         right_m = -np.outer(range_m, np.sin(arc))
         ahead_m = np.outer(range_m, np.cos(arc))
@@ -82,26 +82,26 @@ class Place:
 
     @property
     def extent_m(self) -> tuple[float, float, float, float]:
-        """Where the sector begins and ends to the right of the sensor and ahead of it."""
+        """Extent of the sector, to the right of the sensor and ahead of it."""
         left, top, right, bottom = self.box_px
         (x, y), scale = self.sensor_px, self.scale_px_m
         return (left - x) / scale, (right - x) / scale, (y - bottom) / scale, (y - top) / scale
 
     def pixel_of(self, azimuth_deg: float, range_m: float) -> tuple[float, float]:
-        """Return where a place is in the picture, in pixels from its upper left corner: x to the right, y down."""
+        """Return the pixel of a position, from the upper left corner: x to the right, y down."""
         (x, y), scale = self.sensor_px, self.scale_px_m
         azimuth_rad = math.radians(azimuth_deg)
         return x - range_m * math.sin(azimuth_rad) * scale, y - range_m * math.cos(azimuth_rad) * scale
 
     def place_of(self, x_px: float, y_px: float) -> tuple[float, float]:
-        """Return azimuth in degrees and range in metres of a place in the picture; the inverse of `pixel_of`."""
+        """Return azimuth in degrees and range in metres of a pixel; the inverse of `pixel_of`."""
         (x, y), scale = self.sensor_px, self.scale_px_m
         right_m, ahead_m = (x_px - x) / scale, (y - y_px) / scale
         return math.degrees(math.atan2(-right_m, ahead_m)), math.hypot(right_m, ahead_m)
 
     @property
     def scale_px(self) -> tuple[int, int, int, int]:
-        """Left, right, top and bottom of the scale of colours."""
+        """Left, right, top and bottom of the colour bar."""
         across_px = min(240, self.width_px - 2 * SIDE_PX)
         left = (self.width_px - across_px) // 2
         return left, left + across_px, self.height_px - 32, self.height_px - 32 + _SCALE_PX
@@ -109,7 +109,7 @@ class Place:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ink:
-    """What is drawn over a picture.
+    """Overlay of a picture.
 
     Attributes
     ----------
@@ -131,7 +131,7 @@ class Ink:
 
 
 def draw_axes(place: Place, fan_rad: NDArray[np.float64], range_m: tuple[float, float], dynamic_range_db: float) -> Ink:
-    """Draw rings in metres, rays in degrees, the sensor, and the numbers of the scale of colours.
+    """Draw rings in metres, rays in degrees, the sensor, and the numbers of the colour bar.
 
     Parameters
     ----------
@@ -157,10 +157,10 @@ def draw_axes(place: Place, fan_rad: NDArray[np.float64], range_m: tuple[float, 
 
 
 def _draw_rings(axes: Axes, place: Place, first_deg: float, last_deg: float, range_m: tuple[float, float]) -> None:
-    """Draw rings with their names, but those that would lie on another's: in a narrow window they have many digits."""
+    """Draw rings with their labels, except overlapping ones: in a narrow window the labels have many digits."""
     arc_deg = np.linspace(first_deg, last_deg, 181)
-    named_deg = first_deg if last_deg - first_deg < 350 else -135  # where no ray has its name
-    level = abs(first_deg + 90) < 20  # then the names of rings stand under the edge, else beside it
+    named_deg = first_deg if last_deg - first_deg < 350 else -135  # No ray has its label there.
+    level = abs(first_deg + 90) < 20  # The labels of rings then stand below the edge, otherwise beside it.
     (low_m, high_m), half_m = range_m, 0.5 / place.scale_px_m
     rings = max(1, min(6, int((high_m - low_m) * place.scale_px_m / _RING_PX)))
     named: list[BboxBase] = []
@@ -180,7 +180,7 @@ def _draw_rings(axes: Axes, place: Place, first_deg: float, last_deg: float, ran
 
 
 def _draw_rays(axes: Axes, place: Place, first_deg: float, last_deg: float, range_m: tuple[float, float]) -> None:
-    """Draw rays with their names."""
+    """Draw rays with their labels."""
     step_deg = 15 if last_deg - first_deg < 100 else 30
     first, last = math.ceil((first_deg - 1e-6) / step_deg), math.floor((last_deg + 1e-6) / step_deg)
     for ray_deg in sorted({180 - (180 - number * step_deg) % 360 for number in range(first, last + 1)}):
@@ -193,7 +193,7 @@ def _draw_rays(axes: Axes, place: Place, first_deg: float, last_deg: float, rang
 
 
 def draw_text(place: Place, text: str) -> Ink:
-    """Draw a text in the middle of the picture, where there is nothing to draw."""
+    """Draw a text in the middle of an empty picture."""
     figure, axes = _sheet(place)
     at_px = place.width_px / 2, place.height_px / 2
     axes.text(*at_px, text, color=_FAINT, fontsize=_TEXT_PT, ha="center", va="center", parse_math=False)
@@ -201,7 +201,7 @@ def draw_text(place: Place, text: str) -> Ink:
 
 
 def _sheet(place: Place) -> tuple[Figure, Axes]:
-    """Return what is drawn on, in pixels from the upper left corner."""
+    """Return the drawing surface, in pixels from the upper left corner."""
     figure = Figure(figsize=(place.width_px / _DPI, place.height_px / _DPI), dpi=_DPI)
     axes = figure.add_axes((0, 0, 1, 1), frameon=False)
     axes.set_xlim(0, place.width_px)

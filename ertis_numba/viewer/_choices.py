@@ -1,4 +1,4 @@
-"""What can be chosen while looking, and the colours of levels."""
+"""Choices that users make in the viewer, and the colours of levels."""
 
 import functools
 from dataclasses import dataclass
@@ -20,38 +20,38 @@ __all__ = [
 ]
 
 COLOURS: Final = ("inferno", "viridis", "cividis", "magma")
-"""Maps of colours that are perceptually uniform, by their names in Matplotlib."""
+"""Perceptually uniform colour maps, by their names in Matplotlib."""
 
 LOWEST_THRESHOLD_DB: Final = -60.0
-"""Level of the weakest points that can be shown."""
+"""Lowest level of points that can be shown."""
 
 DYNAMIC_RANGE_DB: Final = (10.0, 80.0)
-"""Least and most dynamic range of pictures."""
+"""Minimum and maximum dynamic range of pictures."""
 
 MAX_DECAY_S: Final = 10.0
-"""Longest time for which points stay."""
+"""Maximum persistence of points."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Choices:
-    """What can be chosen while looking.
+    """Choices that users make in the viewer.
 
     Attributes
     ----------
     threshold_db : float
-        Level below the strongest of an image, from which on points are shown; at most 0.
+        Lowest level of shown points relative to the strongest of an image; at most 0.
     dynamic_range_db : float
-        What lies further below the strongest has the colour of silence.
+        Levels below this, relative to the strongest, have the darkest colour.
     range_m : (first, last), optional
         Window of the range axis; all of it by default.
     decay_s : float
-        For how long points stay while they fade; 0 for those of the latest image alone.
+        Time in which points fade; 0 shows points of the latest image only.
     colours : {"inferno", "viridis", "cividis", "magma"}
 
     Raises
     ------
     ArgumentError
-        A number is out of its bounds, or the map of colours is unknown.
+        A number is out of its bounds, or the colour map is unknown.
     """
 
     threshold_db: float = -20.0
@@ -71,5 +71,5 @@ class Choices:
 
 @functools.cache
 def colour_table(colours: str) -> NDArray[np.uint8]:
-    """Return the colours of a map from silence to the strongest: (256, 3) uint8."""
+    """Return the colours of a map, the lowest level first: (256, 3) uint8."""
     return np.asarray(mpl.colormaps[colours](np.arange(256), bytes=True)[:, :3], dtype=np.uint8)

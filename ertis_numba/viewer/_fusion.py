@@ -1,4 +1,4 @@
-"""What several sensors see, as one image on the platform's level."""
+"""Fusion of the images of several sensors in the horizontal plane of the platform."""
 
 import math
 from collections.abc import Sequence
@@ -12,20 +12,20 @@ from ertis_numba.viewer._shapes import Pose, Sector
 
 __all__ = ["Fusion", "is_level"]
 
-_PIXELS: Final = 400  # along the longer side
-_TILT: Final = math.sin(math.radians(0.5))  # of an upright axis, below which a sensor is level
+_PIXELS: Final = 400  # Along the longer side.
+_TILT: Final = math.sin(math.radians(0.5))  # Vertical component of an axis, below which a sensor is horizontal.
 
 
 def is_level(pose: Pose) -> bool:
-    """Whether a sensor looks into the level of the platform, such that its image can lie in it."""
+    """Return True if the image plane of a sensor lies in the horizontal plane of the platform."""
     x, y, _, _ = pose.rotation_xyzw
     return 2 * math.hypot(x, y) < _TILT
 
 
 class Fusion:
-    """Joins planar images of sensors that are level: at each place of the platform the strongest counts.
+    """Fusion of planar images of horizontal sensors: the maximum at each point of the platform.
 
-    Levels are those below the strongest of each sensor, as in its own picture.
+    Levels are relative to the strongest of each sensor, as in its own picture.
 
     Parameters
     ----------

@@ -35,8 +35,8 @@ def with_legend(page: str, title: str, frame: DrawnFrame | None) -> str:
     """
     sensors = [] if frame is None else [*frame.sensors.items()][:_MAX_PICTURES]
     pictures = "".join(
-        f"<div>{html.escape(name)}, latest image: dB re strongest</div>"
-        f'<img alt="range and azimuth" src="{_source(drawn.picture)}">'
+        f'<div>{html.escape(name)}, latest image: dB re strongest</div><img alt="range and azimuth" '
+        f'src="{_source(drawn.picture)}">'
         for name, drawn in sensors
     )
     legend = f'<div id="ertis-legend"><h1>{html.escape(title)}</h1>{pictures}</div>'
@@ -47,7 +47,7 @@ def with_legend(page: str, title: str, frame: DrawnFrame | None) -> str:
 
 
 def _source(picture: NDArray[np.uint8]) -> str:
-    """Return a picture as the address of an image that holds it."""
+    """Return a picture as a data URL."""
     target = io.BytesIO()
     matplotlib.image.imsave(target, picture, format="png")
     return f"data:image/png;base64,{base64.b64encode(target.getvalue()).decode()}"

@@ -1,4 +1,4 @@
-"""Images as a central node publishes them: the latest of each sensor."""
+"""Images published by a central node: the latest of each sensor."""
 
 import threading
 import time
@@ -22,12 +22,12 @@ __all__ = ["Live"]
 
 _LOOK_S: Final = 0.1
 _STOP_S: Final = 2.0
-_SOON_S: Final = 3.0  # after which it is told that nobody answers, or that there is no sensor of a name
-_INTERVALS: Final = 9  # from which the usual one is taken: so that a single pause does not count
+_SOON_S: Final = 3.0  # Delay before missing answers or sensors are reported.
+_INTERVALS: Final = 9  # Number of intervals for the median, so that a single pause has no effect.
 
 
 class Live:
-    """Subscribes in a thread of its own and keeps the latest image of each sensor, so that no queue grows.
+    """Subscriber in a separate thread that keeps the latest image of each sensor, so that no queue grows.
 
     Parameters
     ----------
@@ -64,15 +64,15 @@ class Live:
         self.title = address
         self.received = 0
         self._notes: deque[str] = deque(maxlen=16)
-        # The status says which sensors there are; where nobody asks for some, it would only take the room of images.
+        # The status lists the sensors. If all are subscribed, it would only take the bandwidth of images.
         products: tuple[Product, ...] = ("energyscape", "status") if sensors else ("energyscape",)
         self._subscriber: Subscriber[Item] = Subscriber(
             address, sensors=sensors, products=products, keys=keys, on_note=self._notes.append
         )
         self._wanted = set([sensors] if isinstance(sensors, str) else sensors or ())
         self._begun_s = time.monotonic()
-        self._connected_s: float | None = None  # when it was first
-        self._is_reported = False  # that nobody answers
+        self._connected_s: float | None = None  # Time of the first connection.
+        self._is_reported = False  # The missing answer.
         self._turn = threading.Lock()
         self._waiting: dict[str, Arrival] = {}
         self._arrived_s: dict[str, deque[float]] = {}
@@ -90,33 +90,33 @@ class Live:
 
     @property
     def dropped(self) -> int:
-        """How many images the central node has dropped, as this was too slow."""
+        """Number of images that the central node has dropped because this viewer was too slow."""
         return self._subscriber.counts.dropped
 
     @property
     def skipped(self) -> int:
-        """How many images have come and were not shown, as a later one of the same sensor came before."""
+        """Number of received images that were not shown, because a later one of the same sensor replaced them."""
         return self._superseded
 
     @property
     def clock_s(self) -> float:
-        """Now, by the clock of the times of images."""
+        """Current time, by the clock of the images."""
         return time.monotonic()
 
     @property
     def state(self) -> str:
-        """What to tell of the connection."""
+        """Description of the connection."""
         return "live" if self.connected else "waiting for the central node"
 
     @property
     def connected(self) -> bool:
-        """Whether a central node answers."""
+        """True if a central node answers."""
         return self._subscriber.connected
 
     def notes(self) -> list[str]:
-        """Return what has happened to the connection since this was asked last.
+        """Return new events of the connection.
 
-        What happens before anybody has answered is kept for a while: `take` raises that it was refused.
+        Events before the first answer are delayed, because `take` raises a refusal.
         """
         waited_s = time.monotonic() - self._begun_s
         if self._connected_s is None and not self.connected and (waited_s < _SOON_S or self._failure is not None):
@@ -132,7 +132,7 @@ class Live:
         return reported
 
     def take(self) -> list[ReceivedImage]:
-        """Return the images that have come since this was asked last, the latest of each sensor.
+        """Return new images, the latest of each sensor.
 
         Raises
         ------
@@ -156,17 +156,17 @@ class Live:
         ]
 
     def latency_s(self, taken: Sequence[ReceivedImage]) -> float | None:
-        """Return from the emission to now, of the oldest of some images; None where their time is not known."""
+        """Return the time since the emission of the oldest of some images; None without timestamps."""
         known_ns = [each.image.stamp.timestamp_ns for each in taken if each.image.stamp.is_timed]
         return (time.time_ns() - min(known_ns)) / 1e9 if known_ns else None
 
     def _find_sensors(self, status: Status) -> None:
-        """Tell, once, which of the sensors that were asked for there are not."""
+        """Report, once, the requested sensors that do not exist."""
         if not self._wanted or self._connected_s is None or time.monotonic() - self._connected_s < _SOON_S:
             return
         missing, self._wanted = self._wanted - status.sensors.keys(), set()
         if missing:
-            there = f"there are {', '.join(sorted(status.sensors))}" if status.sensors else "there is none"
+            there = f"choose one of {', '.join(sorted(status.sensors))}" if status.sensors else "no sensor is connected"
             self._notes.append(f"no sensor {', '.join(map(repr, sorted(missing)))} yet; {there}")
 
     def _run(self) -> None:

@@ -1,4 +1,4 @@
-"""Whom a page is served to: browsers that have it from here, not pages of other sites in the same browser."""
+"""Protection of the page: it serves browsers that opened it here, not pages of other sites in the same browser."""
 
 import contextlib
 import hmac
@@ -19,25 +19,25 @@ if TYPE_CHECKING:
 __all__ = ["is_loopback", "own_pages"]
 
 _PORTS = {"http": 80, "https": 443}
-_COOKIE = "ertis_view"  # and the port, as cookies do not tell the ports of a host apart
+_COOKIE = "ertis_view"  # The name also contains the port, because cookies do not distinguish the ports of a host.
 _REFUSAL = "Open the address that 'ertis view' printed, with its token.\n"
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a host, however it is spelled, cannot be reached from another machine."""
+    """Return True if a host, in any spelling, cannot be reached from another machine."""
     bare = host.lower().strip("[]")
     return addresses.is_loopback(f"tcp://[{bare}]:0" if ":" in bare else f"tcp://{bare}:0")
 
 
 @contextlib.contextmanager
 def own_pages(host: str, token: str | None = None) -> Iterator[None]:
-    """Let a server that is made in this block refuse pages of other sites, which a browser lets connect to any host.
+    """Make a server created in this block refuse pages of other sites, which a browser lets connect to any host.
 
     With a token, it also refuses browsers that have never opened an address with ``?token=``. A cookie keeps the token.
 
-    A browser says of what site a page is (Origin, RFC 6454) and where it connects to (Host). Of a page from here, both
-    are the same. On loopback it is the name of a loopback host, too: another site may let its own name lead there.
-    viser takes all of them, and has no option.
+    A browser sends the site of a page (Origin, RFC 6454) and the server that it connects to (Host). For a page from
+    here, both are the same. On loopback, the host must also be a loopback name, because another site may resolve its
+    own name to this machine. viser accepts all of them, and has no option.
     """
     serve = websockets.asyncio.server.serve
     local = is_loopback(host)
@@ -46,7 +46,9 @@ def own_pages(host: str, token: str | None = None) -> Iterator[None]:
         def refuse_others(connection: "ServerConnection", request: "Request") -> "Response | None":
             origins, hosts = (request.headers.get_all(name) for name in ("Origin", "Host"))
             if not _is_own(origins, hosts, local=local):
-                return connection.respond(http.HTTPStatus.FORBIDDEN, "This page is for those who have it from here.\n")
+                return connection.respond(
+                    http.HTTPStatus.FORBIDDEN, "This page requires the address printed by 'ertis view'.\n"
+                )
             given = None if token is None else _token_of(request)
             if token is not None and not hmac.compare_digest(given or "", token):
                 return connection.respond(http.HTTPStatus.FORBIDDEN, _REFUSAL)
@@ -54,7 +56,7 @@ def own_pages(host: str, token: str | None = None) -> Iterator[None]:
             if token is not None and answer is not None:
                 name = _cookie_of(request)
                 answer.headers["Set-Cookie"] = f"{name}={token}; HttpOnly; SameSite=Strict; Path=/"
-                answer.headers["Referrer-Policy"] = "no-referrer"  # the address has the token
+                answer.headers["Referrer-Policy"] = "no-referrer"  # The address contains the token.
             return answer
 
         return serve(*arguments, process_request=refuse_others, **options)
@@ -86,7 +88,7 @@ def _cookie_of(request: "Request") -> str:
 
 
 def _is_own(origins: list[str], hosts: list[str], *, local: bool) -> bool:
-    """Whether a request comes of a page from here, or of a program, which has no origin."""
+    """Return True if a request comes from a page of this server, or from a program, which has no origin."""
     if not origins:
         return True
     if len(origins) > 1 or len(hosts) != 1:
@@ -96,6 +98,6 @@ def _is_own(origins: list[str], hosts: list[str], *, local: bool) -> bool:
         here = urllib.parse.urlsplit(f"{origin.scheme}://{hosts[0]}")
         default = _PORTS.get(origin.scheme)
         same = (origin.hostname, origin.port or default) == (here.hostname, here.port or default)
-    except ValueError:  # no port, or no address
+    except ValueError:  # No port, or an invalid address.
         return False
     return default is not None and origin.hostname is not None and same and (not local or is_loopback(origin.hostname))

@@ -1,4 +1,4 @@
-"""The page in the browser: what is drawn and chosen there, handed to viser and taken from it."""
+"""Page in the browser, built with viser: drawn objects and controls."""
 
 import contextlib
 import html
@@ -24,16 +24,16 @@ if TYPE_CHECKING:
 
 __all__ = ["ControlRequest", "ViewerPage"]
 
-_PANEL_PX, _PICTURES_PX = 330, 560  # the latter such that pictures are shown pixel by pixel
+_PANEL_PX, _PICTURES_PX = 330, 560  # The width of pictures shows them pixel by pixel.
 _SMALL: Final = "<div style='margin:0 0.8em 0.6em;font-size:0.85em;color:#9aa0b0'>{}</div>"
 _RANGE: Final = "Range"
 _TOKEN_BYTES: Final = 24
-_STEPS: Final = 100  # of the window of ranges
+_STEPS: Final = 100  # Steps of the range window.
 
 
 @dataclass(frozen=True, slots=True)
 class ControlRequest:
-    """What somebody wants: the name of a control, its value, and who is to get a file."""
+    """Request of a user: the name of a control, its value, and the browser that gets a file."""
 
     name: str
     value: Any = None
@@ -44,30 +44,30 @@ Orders: TypeAlias = "SimpleQueue[ControlRequest | None]"
 
 
 class ViewerPage:
-    """Serves the page; what is chosen there goes into a queue.
+    """Server of the page; choices made there go into a queue.
 
     Parameters
     ----------
     host : str
     port : int
-        0 for any that is free.
+        0 selects a free one.
     orders : queue.SimpleQueue
     title : str
-        What is shown.
+        Name of the source.
     choices : Choices
-        What to begin with.
+        Initial choices.
     n_moments : int, optional
         Length of the time line; there is none by default.
 
     Attributes
     ----------
     is_seen : bool
-        A browser has come.
+        True once a browser has connected.
 
     Raises
     ------
     NetworkError
-        Nothing can be served there.
+        The address cannot be used.
     """
 
     def __init__(
@@ -75,13 +75,13 @@ class ViewerPage:
     ) -> None:
         _require_free(host, port)
         self._orders, self.is_seen = orders, False
-        self._chosen: dict[str, Any] = {}  # the controls of what is chosen, by its name
+        self._chosen: dict[str, Any] = {}  # Controls of the choices, by name.
         self._token = None if is_loopback(host) else secrets.token_urlsafe(_TOKEN_BYTES)
         with _silence(), own_pages(host, self._token):
             self._server = _Server(host=host, port=port, label=f"ertis view: {title}", verbose=False)
-        if port and self._server.get_port() != port:  # viser goes on to the next that is free
+        if port and self._server.get_port() != port:  # viser uses the next free port.
             self.close()
-            raise _taken(host, port, "it was taken meanwhile")
+            raise _taken(host, port, "the port was taken meanwhile")
         self._server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         self._space = Space(self._server)
         self._shown: dict[str, viser.GuiImageHandle] = {}
@@ -117,7 +117,7 @@ class ViewerPage:
         return f"http://{shown}:{self._server.get_port()}/{token}"
 
     def show(self, frame: DrawnFrame, place: int = 0) -> None:
-        """Draw a frame, and where it is on the time line."""
+        """Draw a frame, and update the time line."""
         with self._server.atomic():
             self._space.show(frame)
             for name, drawn in frame.sensors.items():
@@ -125,11 +125,11 @@ class ViewerPage:
                 if name not in self._shown:
                     with self._pictures:
                         self._shown[name] = self._server.gui.add_image(drawn.picture, label=label, format="png")
-                    for order, (_, each) in enumerate(sorted(self._shown.items())):  # whichever came first
+                    for order, (_, each) in enumerate(sorted(self._shown.items())):  # Sensors may arrive in any order.
                         each.order = order
                 shown = self._shown[name]
                 shown.label, shown.visible = label, True
-                if shown.image is not drawn.picture:  # it is encoded and sent to all browsers
+                if shown.image is not drawn.picture:  # Assigning it encodes and sends it to all browsers.
                     shown.image = drawn.picture
             for name in self._shown.keys() - frame.sensors.keys():
                 self._shown[name].visible = False
@@ -137,7 +137,7 @@ class ViewerPage:
                 self._line.value = place
 
     def notify(self, rows: Mapping[str, tuple[str, str]], *, playing: bool) -> None:
-        """Tell counters and times: by their names what they are and their values."""
+        """Show counters and times: label and value by name."""
         cells = "".join(
             f"<tr><td style='color:#9aa0b0;padding-right:1em'>{html.escape(label)}</td>"
             f"<td data-name='{name}' style='font-variant-numeric:tabular-nums'>{html.escape(value)}</td></tr>"
@@ -151,24 +151,24 @@ class ViewerPage:
             self._play.label = label
 
     def serializer(self) -> Any:
-        """Return what keeps all that is drawn in the scene from now on."""
+        """Return a serializer of everything that is drawn from now on."""
         return self._server.get_scene_serializer()
 
     def report_recordings(self, n_bytes: Mapping[Hashable, int]) -> None:
-        """Tell each browser whether it is recording, and how much of the most there can be: by the browser's number."""
+        """Show in each browser the state and size of its recording."""
         for number, (button, reported) in [*self._recorders.items()]:
             here = n_bytes.get(number)
             largest = f"at most {MAX_BYTES / 1e6:g} MB"
             label = "Begin HTML recording" if here is None else "End HTML recording"
             content = _SMALL.format(largest if here is None else f"{here / 1e6:.1f} MB, {largest}")
-            with contextlib.suppress(RuntimeError):  # the browser has just left
+            with contextlib.suppress(RuntimeError):  # The browser has just disconnected.
                 if button.label != label:
                     button.label = label
                 if reported.content != content:
                     reported.content = content
 
     def close(self) -> None:
-        """Serve no longer."""
+        """Stop serving."""
         with _silence():
             self._server.stop()
 
@@ -181,7 +181,7 @@ class ViewerPage:
             gui.add_slider("Dynamic range (dB)", *DYNAMIC_RANGE_DB, 1.0, choices.dynamic_range_db), "dynamic_range_db"
         )
         self._range: Any = gui.add_multi_slider(_RANGE, 0.0, 1.0, 1 / _STEPS, (0.0, 1.0), min_range=2 / _STEPS)
-        self._range.visible = False  # until it is known how far images reach
+        self._range.visible = False  # Hidden until the extent of images is known.
         self._obey(self._range, "range_m")
         self._obey(gui.add_slider("Decay (s)", 0.0, MAX_DECAY_S, 0.1, choices.decay_s), "decay_s")
         self._obey(gui.add_dropdown("Colours", COLOURS, initial_value=choices.colours), "colours")
@@ -193,7 +193,7 @@ class ViewerPage:
         self._server.on_client_disconnect(self._forget)
 
     def _greet(self, client: viser.ClientHandle) -> None:
-        """Give a browser what is its own: nobody ends the recording of another."""
+        """Add the controls of one browser: it cannot end the recording of another."""
         self.is_seen = True
         with self._saving:
             button = client.gui.add_button("Begin HTML recording")
@@ -211,7 +211,7 @@ class ViewerPage:
         return button
 
     def _obey(self, control: Any, name: str) -> None:
-        """Pass on what somebody chooses, not what this sets itself."""
+        """Forward a choice of a user, but not a value set by the program."""
 
         def chosen(event: Any) -> None:
             if event.client is not None:
@@ -221,14 +221,14 @@ class ViewerPage:
         self._chosen[name] = control
 
     def put_back(self, choices: Choices) -> None:
-        """Show in the controls what is chosen, where somebody has typed what cannot be."""
+        """Restore the controls after an invalid input."""
         for name, control in self._chosen.items():
             value = getattr(choices, name, None)
             if value is not None and control.value != value:
                 control.value = value
 
     def limit_range(self, farthest_m: float, window_m: tuple[float, float] | None) -> None:
-        """Say how far images reach, and which window of that is shown."""
+        """Set the limits of the range window, and the shown window."""
         far_m = max(farthest_m, 0.0 if window_m is None else window_m[1])
         step_m = round_step(far_m, _STEPS)
         top_m = math.ceil(far_m / step_m - 1e-9) * step_m
@@ -245,19 +245,19 @@ class ViewerPage:
 
 
 class _Server(viser.ViserServer):
-    """Speaks to nobody but browsers that come to it."""
+    """Server without connections to other hosts."""
 
     def request_share_url(self, verbose: bool = True) -> None:  # noqa: FBT001, FBT002  as viser has it
-        """Share nothing: a page could ask for a tunnel to a host of viser's makers."""
+        """Do nothing: a page could otherwise request a tunnel to a host of viser's makers."""
 
 
 def _silence() -> contextlib.redirect_stdout[io.StringIO]:
-    """Return what keeps viser from saying on stdout that it begins and ends, whatever one asks for."""
+    """Return a console that keeps viser from printing on stdout."""
     return contextlib.redirect_stdout(io.StringIO())
 
 
 def _require_free(host: str, port: int) -> None:
-    """Refuse what cannot be listened at: viser would try other ports without end."""
+    """Refuse an address in use: viser would otherwise try further ports without end."""
     try:
         for family, kind, protocol, _, address in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM):
             with socket.socket(family, kind, protocol) as tried:
@@ -269,4 +269,4 @@ def _require_free(host: str, port: int) -> None:
 
 
 def _taken(host: str, port: int, why: str) -> NetworkError:
-    return NetworkError(f"nothing can be served at {host}:{port} ({why}); give another host or port")
+    return NetworkError(f"cannot serve the page at {host}:{port} ({why}); give another host or port")

@@ -1,4 +1,4 @@
-"""A live view that is held: what comes meanwhile, and which of it a step shows."""
+"""Paused live view, with single steps."""
 
 from typing import TYPE_CHECKING, Final
 
@@ -9,44 +9,44 @@ if TYPE_CHECKING:
 
 __all__ = ["Pause"]
 
-_STEP_S: Final = 1.0  # at most, from the first image of a step until it is shown
-_TOGETHER: Final = 0.5  # of the shortest interval, in which all images of one moment are emitted
+_STEP_S: Final = 1.0  # Limit on the time from the first image of a step until it is shown.
+_TOGETHER: Final = 0.5  # Share of the shortest interval: images within it belong to the same time step.
 
 
 class Pause:
-    """Keeps the latest image of each sensor while a live view is held, such that a step shows all sensors at once.
+    """Latest image of each sensor during a pause, so that a step shows all sensors at once.
 
     Attributes
     ----------
     since_s : float or None
-        When what is shown was held, by the clock of the source; None while nothing is.
+        Start of the pause, by the clock of the source; None while it is not paused.
     n_held : int
-        How many images came meanwhile and were not shown.
+        Number of images that arrived meanwhile and were not shown.
     """
 
     def __init__(self) -> None:
         self.since_s: float | None = None
         self.n_held = 0
         self._steps = 0
-        self._first_s: float | None = None  # when the first image of a step came
-        self._due_s: dict[str, float] = {}  # from when on each sensor is overdue
-        self._latest: dict[str, ReceivedImage] = {}  # of each, which is not shown
-        self._new: dict[str, ReceivedImage] = {}  # of them, those since the step
+        self._first_s: float | None = None  # Arrival of the first image of a step.
+        self._due_s: dict[str, float] = {}  # Time from which each sensor is overdue.
+        self._latest: dict[str, ReceivedImage] = {}  # Images that are not shown.
+        self._new: dict[str, ReceivedImage] = {}  # Images since the step.
 
     def toggle(self, now_s: float) -> None:
-        """Hold what is shown, or go on."""
+        """Pause, or continue."""
         self.since_s = now_s if self.since_s is None else None
         self._steps, self._first_s = 0, None
         self._latest, self._new = {}, {}
 
     def step(self, now_s: float) -> None:
-        """Show the next measurement of all sensors, and hold that."""
+        """Show the next measurement of all sensors, and pause again."""
         if self.since_s is None:
             self.toggle(now_s)
         self._steps += 1
 
     def shown(self, taken: "Sequence[ReceivedImage]", now_s: float) -> "list[ReceivedImage]":
-        """Return what is to be shown of what came: all of it, or while this is held the images of a step."""
+        """Return the images to show: all new ones, or during a pause those of a step."""
         came = {each.image.stamp.sensor: each for each in taken}
         self._due_s |= {name: each.due_s for name, each in came.items()}
         if self.since_s is None:
@@ -60,14 +60,14 @@ class Pause:
             self._first_s = now_s
         if self._first_s is None or not (self._is_whole(now_s) or now_s - self._first_s >= _STEP_S):
             return []
-        shown = [*self._latest.values()]  # also of a sensor that measures less often than the others
+        shown = [*self._latest.values()]  # This includes sensors that measure less often than others.
         self.n_held -= len(shown)
         self.since_s, self._steps, self._first_s = now_s, self._steps - 1, None
         self._latest, self._new = {}, {}
         return shown
 
     def _is_whole(self, now_s: float) -> bool:
-        """Whether there is an image of each sensor that sends, all of one moment."""
+        """Return True if there is an image of each active sensor, all of one time step."""
         newest_ns = max(each.image.stamp.timestamp_ns for each in self._new.values())
         between_s = min((each.interval_s for each in self._new.values() if each.interval_s is not None), default=1.0)
         first_ns = newest_ns - _TOGETHER * 1e9 * between_s

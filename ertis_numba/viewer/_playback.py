@@ -1,4 +1,4 @@
-"""Images of a file along its time: recordings are processed while they are shown."""
+"""Playback of a file: recordings are processed while they are shown."""
 
 import atexit
 import threading
@@ -30,7 +30,7 @@ _LOOK_S: Final = 1 / 60
 
 
 class Playback:
-    """A recording or an energyscape file as moments, one of which is shown.
+    """A recording or an energyscape file as time steps, one of which is shown.
 
     Parameters
     ----------
@@ -38,34 +38,34 @@ class Playback:
     sensors : str or sequence of str, optional
         All by default.
     device : {"auto", "cpu", "cuda", "numpy"}
-        What processes recordings.
+        Device that processes recordings.
     loop : bool
-        Begin anew at the end.
+        Repeat at the end.
     mounting : mapping of str to (translation_m, rotation_xyzw), optional
         Poses of sensors on their platform, in place of those in the file.
 
     Attributes
     ----------
     path : Path
-    time_steps : tuple of Moment
+    time_steps : tuple of TimeStep
     place, shown : int
-        Number of the moment that is due, and of the one that was taken last.
+        Number of the time step that is due, and of the last one taken.
     anew : bool
-        What was taken last stands alone: what was taken before is of another time, as after `seek`.
+        True if the last images are unrelated to earlier ones, as after `seek`.
     playing : bool
     held : bool
-        Time does not begin, as nobody sees it yet; the first moment is made all the same.
+        Time does not start yet, because no browser is connected; the first time step is processed all the same.
     received, skipped : int
-        How many images were made, and moments of which nothing was shown, as there was no time while this played.
+        Number of processed images, and of time steps skipped for lack of time.
 
     Raises
     ------
     DataError
-        The file cannot be read or holds nothing.
+        The file cannot be read or contains nothing.
     ArgumentError
-        There is no such sensor.
+        A sensor does not exist.
     DeviceError
-        There is no such device to process recordings.
+        The device does not exist.
     """
 
     is_playback: Literal[True] = True
@@ -95,7 +95,7 @@ class Playback:
                 self._readers[name] = reader = opened(path, sensor=name)
                 self._stack.callback(reader.close)
             if device == "cuda" and any(isinstance(each, RecordingReader) for each in self._readers.values()):
-                kernels.load(device)  # what is not there is told before anything is shown
+                kernels.load(device)  # A missing device is reported before anything is shown.
             self.time_steps, self._notes = time_steps_of(
                 {name: reader.stamps() for name, reader in self._readers.items()}
             )
@@ -106,9 +106,9 @@ class Playback:
         self.playing, self.place, self.shown, self.anew = True, 0, 0, True
         self.held = False
         self.received = self.skipped = 0
-        self._begun: tuple[float, int] | None = None  # when which moment was due
-        self._made: int | None = None  # None where what is made next stands alone
-        self._jumps = self._plays = self._made_in = 0  # how often somebody went elsewhere, or began or ended a play
+        self._begun: tuple[float, int] | None = None  # Start of the playback: time and time step.
+        self._made: int | None = None  # None for images that stand alone.
+        self._jumps = self._plays = self._made_in = 0  # Number of seeks, and of starts and stops.
         self._ready: dict[str, ReceivedImage] = {}
         self._ready_for, self._ready_anew = 0, True
         self._turn = threading.Lock()
@@ -126,9 +126,9 @@ class Playback:
         self._stack.close()
 
     def _end(self) -> None:
-        """End the thread; while kernels are being compiled that takes some seconds.
+        """End the thread; this takes some seconds during a compilation.
 
-        An interpreter that ends while a thread is in the compiler crashes: LLVM is taken apart under it.
+        An interpreter that ends while a thread is in the compiler crashes, because LLVM is destroyed under it.
         """
         self._closed.set()
         if self._thread is not None:
@@ -137,12 +137,12 @@ class Playback:
 
     @property
     def state(self) -> str:
-        """What to tell of the film."""
+        """Position of the playback."""
         return f"{self.time_steps[self.shown].time_s:.2f} s of {self.time_steps[-1].time_s:.2f} s"
 
     @property
     def clock_s(self) -> float:
-        """The time of the moment that is shown and, while this plays, what has passed since, until the next one."""
+        """Time of the shown time step and, during playback, the time elapsed since, up to the next one."""
         with self._turn:
             shown_s, after = self.time_steps[self.shown].time_s, self.shown + 1
             if not self.playing or self._begun is None:
@@ -151,12 +151,12 @@ class Playback:
             return min(max(self._due_s(self._begun, time.monotonic()), shown_s), next_s)
 
     def notes(self) -> list[str]:
-        """Return what there is to know of the times in the file, once."""
+        """Return notes on the times in the file, once."""
         reported, self._notes = self._notes, []
         return reported
 
     def play(self, *, playing: bool) -> None:
-        """Go on, from the beginning where this is at the end; or stay."""
+        """Start the playback, from the beginning if it has ended; or stop it."""
         with self._turn:
             if playing and self.place == len(self.time_steps) - 1:
                 self._jump(0)
@@ -164,7 +164,7 @@ class Playback:
             self._plays += 1
 
     def seek(self, place: int) -> None:
-        """Show a moment next, and go on from there."""
+        """Show a time step next, and continue from there."""
         with self._turn:
             self._jump(min(max(place, 0), len(self.time_steps) - 1))
 
@@ -174,11 +174,11 @@ class Playback:
         self._plays += 1
 
     def take(self) -> list[ReceivedImage]:
-        """Return the images of the moment that was due last, nothing where they were taken.
+        """Return the images of the time step that was due last, nothing if they were taken.
 
-        At recorded speed: moments for which there was no time are skipped and counted. Of a sensor that measured in
-        them the last image is returned; after `seek`, of each sensor the last one at or before the moment. Images are
-        made in a thread, as the first takes long where kernels are to be compiled.
+        Playback has the recorded speed: time steps without enough time are skipped and counted. The last image of a
+        sensor in them is returned; after `seek`, of each sensor the last one at or before the time step. A thread
+        processes the images, because the first takes long if kernels are compiled.
 
         Raises
         ------
@@ -188,7 +188,7 @@ class Playback:
         if self._thread is None:
             self._thread = threading.Thread(target=self._run, name="ertis-film", daemon=True)
             self._thread.start()
-            atexit.register(self._end)  # where nobody closes this
+            atexit.register(self._end)  # For callers that do not close it.
         with self._turn:
             if self._failure is not None:
                 raise self._failure
@@ -198,15 +198,15 @@ class Playback:
         return ready
 
     def at(self, place: int) -> list[ReceivedImage]:
-        """Return the images of a moment."""
+        """Return the images of a time step."""
         return [self._taken(name, place, number) for name, number in self.time_steps[place].measurements]
 
     def latency_s(self, _: Sequence[ReceivedImage]) -> float | None:
-        """Return None: what was recorded is as old as it is."""
+        """Return None: the age of a recording is not of interest."""
         return None
 
     def _run(self) -> None:
-        """Make images of the moment that is due, until this is closed."""
+        """Process the images of the time step that is due, until closed."""
         try:
             while not self._closed.is_set():
                 with self._turn:
@@ -222,7 +222,7 @@ class Playback:
                 with self._turn:
                     if made is not None and plays == self._made_in:
                         self.skipped += place - made - len({at for at, _ in due.values()})
-                        self.skipped += bool(self._ready.keys() & taken.keys())  # which nobody took in time
+                        self.skipped += bool(self._ready.keys() & taken.keys())  # They were not taken in time.
                     self._put(place, taken, anew=made is None)
                     self._made_in = plays
                     if jumps == self._jumps:
@@ -231,21 +231,21 @@ class Playback:
             self._failure = error
 
     def _put(self, place: int, taken: dict[str, ReceivedImage], *, anew: bool) -> None:
-        """Have images ready, with those that nobody took yet where they are of the same play."""
+        """Store processed images, with untaken ones of the same playback."""
         self.received += len(taken)
         self._ready_anew = anew or (bool(self._ready) and self._ready_anew)
         self._ready = taken if anew else self._ready | taken
         self._ready_for = place
 
     def _due_s(self, begun: tuple[float, int], now_s: float) -> float:
-        """Return the time of the film that it is now, of a play that began then and there."""
+        """Return the current time of a playback with a given start."""
         begun_s, first = begun
         return self.time_steps[first].time_s + now_s - begun_s
 
     def _advance(self, now_s: float) -> None:
-        """Go to the moment that is due."""
+        """Advance to the time step that is due."""
         if self._begun is None:
-            # Time begins when it is shown, which may take long where kernels are compiled.
+            # Time starts with the first shown image, which may take long if kernels are compiled.
             if self.held or self._made != self.place:
                 return
             self._begun = now_s, self.place
@@ -270,7 +270,7 @@ class Playback:
         return ReceivedImage(image, pose, self.time_steps[place].time_s, self._tracks[name].interval_s)
 
     def _processed(self, name: str, measurement: Measurement) -> Energyscape:
-        """Return the image of a measurement; other air makes other ranges, and another pipeline."""
+        """Return the image of a measurement; other air gives other ranges and needs another pipeline."""
         pipeline = self._pipelines.get(name)
         if pipeline is None or pipeline.settings.air != measurement.settings.air:
             if pipeline is not None:

@@ -1,4 +1,4 @@
-"""The picture of one sensor: range and azimuth, as a plan in metres whose axes are drawn once."""
+"""Picture of one sensor: range and azimuth, as a plan in metres whose axes are drawn once."""
 
 import functools
 import math
@@ -16,17 +16,17 @@ from ertis_numba.viewer._axes import PAGE, SIDE_PX, Ink, Place, draw_axes, draw_
 
 __all__ = ["Polar", "PolarSampling", "cropped", "is_within"]
 
-_SHARES: Final = 256  # in which what lies between two directions is weighed
+_SHARES: Final = 256  # Steps of the interpolation between two directions.
 
 
 def is_within(image: Energyscape, range_m: tuple[float, float] | None) -> bool:
-    """Whether any range of an image lies in a window."""
+    """Return True if a window contains any range of an image."""
     first_m, last_m = (-math.inf, math.inf) if range_m is None else range_m
     return bool(((image.range_m >= first_m - 1e-9) & (image.range_m <= last_m + 1e-9)).any())
 
 
 def cropped(image: Energyscape, range_m: tuple[float, float] | None) -> Energyscape:
-    """Return the part of an image within a window of the range axis; of an empty one the nearest range."""
+    """Return the part of an image within a window of the range axis; the nearest range for an empty one."""
     if range_m is None:
         return image
     first, last = np.searchsorted(image.range_m, [range_m[0] - 1e-9, range_m[1] + 1e-9])
@@ -40,16 +40,16 @@ def cropped(image: Energyscape, range_m: tuple[float, float] | None) -> Energysc
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PolarSampling:
-    """Which directions and ranges some places of a plane show; called, it returns their levels.
+    """Interpolation of levels at points of a plane; call it to get the levels.
 
     Attributes
     ----------
     places : (shown,) intp
-        Which of the places see anything.
+        Points within the image.
     first, second : (shown,) intp
-        Of levels as `Polar.levels` returns them, flat: on either side of the place.
+        Flat indices into the levels of `Polar.levels`, on either side of the point.
     share : (shown,) uint16
-        Of the second, of 256.
+        Weight of the second, of 256.
     """
 
     places: NDArray[np.intp]
@@ -58,7 +58,7 @@ class PolarSampling:
     share: NDArray[np.uint16]
 
     def __call__(self, levels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return the level of each place that sees anything: (shown,) uint8."""
+        """Return the level of each point within the image: (shown,) uint8."""
         flat = levels.reshape(-1)
         first, second = flat[self.first].astype(np.uint16), flat[self.second].astype(np.uint16)
         weighed = first * (_SHARES - self.share) + second * self.share
@@ -66,12 +66,11 @@ class PolarSampling:
 
 
 class Polar:
-    """Makes pictures of images that have the axes of one.
+    """Renderer of images with the same axes.
 
-    As x is forward and y left in the sensor frame, positive azimuth is on the left. Of several elevations the
-    strongest is shown. Levels between two directions are interpolated, but not where they lie so far apart that nobody
-    looked between them; ranges finer than a pixel are joined to their
-    maximum.
+    As x is forward and y left in the sensor frame, positive azimuth is on the left. For several elevations, the maximum
+    is shown. Levels between two directions are interpolated, unless the directions are too far apart. Ranges finer than
+    a pixel are joined to their maximum.
 
     Parameters
     ----------
@@ -98,11 +97,11 @@ class Polar:
             raise ArgumentError("the image ends at range 0; give one with ranges")
         self._fan_rad = azimuth_rad
         is_thin = azimuth_rad[-1] - azimuth_rad[0] < ALONE_RAD
-        if is_thin:  # too thin to be seen
+        if is_thin:  # Too thin to be visible.
             middle = float(azimuth_rad.mean())
             self._fan_rad = np.array([middle - ALONE_RAD, middle + ALONE_RAD])
         self._is_closed = is_closed(azimuth_rad)
-        if self._is_closed:  # what lies between the last and the first is seen, too
+        if self._is_closed:  # The gap between the last and the first direction is covered, too.
             self._fan_rad = np.append(azimuth_rad, azimuth_rad[0] + 2 * math.pi)
         self._reach_rad = np.array([math.inf]) if is_thin else reach_rad(np.diff(self._fan_rad))
         self._place = Place.of(self._fan_rad, self._range_m, width_px)
@@ -113,7 +112,7 @@ class Polar:
 
     @property
     def extent_m(self) -> tuple[float, float, float, float]:
-        """Where `sector` begins and ends to the right of the sensor and ahead of it."""
+        """Extent of `sector`, to the right of the sensor and ahead of it."""
         return self._place.extent_m
 
     @property
@@ -122,15 +121,15 @@ class Polar:
         return self._place.height_px, self._place.width_px
 
     def pixel_of(self, azimuth_deg: float, range_m: float) -> tuple[float, float]:
-        """Return where a place is in the picture, in pixels from its upper left corner: x to the right, y down."""
+        """Return the pixel of a position, from the upper left corner: x to the right, y down."""
         return self._place.pixel_of(azimuth_deg, range_m)
 
     def place_of(self, x_px: float, y_px: float) -> tuple[float, float]:
-        """Return azimuth in degrees and range in metres of a place in the picture; the inverse of `pixel_of`."""
+        """Return azimuth in degrees and range in metres of a pixel; the inverse of `pixel_of`."""
         return self._place.place_of(x_px, y_px)
 
     def levels(self, amplitude: NDArray[np.float32]) -> NDArray[np.uint8]:
-        """Return the levels to draw: (azimuth, range) uint8, 255 the strongest and 0 silence."""
+        """Return the levels to draw: (azimuth, range) uint8, 255 for the strongest and 0 for none."""
         joined = np.maximum.reduceat(amplitude, self._bins, axis=1)
         highest = self._columns.strongest(joined)
         level_db = below_strongest_db(highest, self._dynamic_range_db)
@@ -159,10 +158,10 @@ class Polar:
         return made
 
     def empty(self, window_m: tuple[float, float] | None) -> NDArray[np.uint8]:
-        """Return a picture of nothing, which says that no range lies in a window: (row, column, 3) uint8."""
+        """Return an empty picture with a note that the window contains no range: (row, column, 3) uint8."""
         made = np.full((*self.shape, 3), PAGE, dtype=np.uint8)
         (first_m, last_m), (low_m, high_m) = window_m or (0.0, 0.0), self._range_m
-        text = f"nothing from {first_m:g} to {last_m:g} m:\nthe image has {low_m:.2f} to {high_m:.2f} m"
+        text = f"nothing from {first_m:g} to {last_m:g} m:\nthe image covers {low_m:.2f} to {high_m:.2f} m"
         draw_text(self._place, text).onto(made.reshape(-1, 3))
         return made
 
@@ -171,7 +170,7 @@ class Polar:
         return draw_axes(self._place, self._fan_rad, self._range_m, self._dynamic_range_db)
 
     def sector(self, levels: NDArray[np.uint8], table: NDArray[np.uint8], *, thin: int = 2) -> NDArray[np.uint8]:
-        """Return the image alone, transparent where there is none: (row, column, 4) uint8, one pixel of ``thin``."""
+        """Return the image alone, transparent outside: (row, column, 4) uint8, one pixel of ``thin``."""
         left, top, right, bottom = self._place.box_px
         made = np.zeros((*self.shape, 4), dtype=np.uint8)
         flat = made.reshape(-1, 4)
@@ -180,14 +179,14 @@ class Polar:
         return np.ascontiguousarray(made[top:bottom:thin, left:right:thin])
 
     def _joined_ranges(self, range_m: NDArray[np.float64]) -> NDArray[np.intp]:
-        """Return where ranges that become one begin, such that no two pixels of a line of sight lie within one."""
+        """Return the first of each group of joined ranges, such that no line of sight has two pixels in a group."""
         if len(range_m) < 2:
             return np.zeros(1, dtype=np.intp)
         step_px = float(range_m[1] - range_m[0]) * self._place.scale_px_m
         return np.arange(0, len(range_m), max(1, math.floor(1 / step_px) if step_px < 1 else 1), dtype=np.intp)
 
     def look(self, right_m: NDArray[np.float64], ahead_m: NDArray[np.float64]) -> PolarSampling:
-        """Return which directions and ranges places in the sensor's plane show.
+        """Return the interpolation for points in the sensor's plane.
 
         Parameters
         ----------
@@ -219,7 +218,7 @@ class Polar:
         )
 
     def _look_of_picture(self) -> PolarSampling:
-        """Return which directions and ranges each pixel of the picture shows."""
+        """Return the interpolation for the pixels of the picture."""
         rows, columns = self.shape
         (x, y), scale = self._place.sensor_px, self._place.scale_px_m
         right_m = (np.arange(columns) + 0.5 - x) / scale

@@ -1,4 +1,4 @@
-"""HTML recordings of what is drawn: one for whoever began the view, and one for each browser that asks."""
+"""HTML recordings of the view: one for the command line, and one for each browser that requests it."""
 
 import math
 import threading
@@ -13,26 +13,26 @@ from ertis_numba.atomic_files import atomic_write, check_target
 __all__ = ["MAX_BYTES", "Recordings", "ToBrowser", "ToFile"]
 
 MAX_BYTES: Final = 256_000_000
-"""Of a recording. Its page holds them as text, a third longer, and Chromium takes no text of more than 512 MB."""
+"""Limit on a recording. Its page contains it as text, a third longer, and Chromium accepts no text above 512 MB."""
 _PLAIN_BYTES: Final = 8
 _NOTICE_S: Final = 10.0
 
 
 class RecordingReceiver(Protocol):
-    """Who gets a recording."""
+    """Destination of a recording."""
 
     def full(self) -> None:
-        """Say that it has ended, as it holds all that it can."""
+        """Report that the recording has ended at its size limit."""
 
     def deliver(self, page: str, n_frames: int) -> None:
-        """Take the page; a thread of its own calls this."""
+        """Receive the page; a separate thread calls this."""
 
     def failed(self, error: Exception) -> None:
-        """Take what went wrong with that."""
+        """Report a failure."""
 
 
 class ToFile:
-    """Writes a recording.
+    """File for a recording.
 
     Parameters
     ----------
@@ -40,17 +40,17 @@ class ToFile:
     overwrite : bool
     on_note : callable
     sources : sequence of Path
-        Files that are shown, which are not overwritten whatever is asked for.
+        Files on display, which are never overwritten.
 
     Attributes
     ----------
     n_frames : int or None
-        How many the file holds; None as long as it is not written.
+        Number of frames in the file; None until it is written.
 
     Raises
     ------
     ArgumentError
-        No file can be put there.
+        The file cannot be written there.
     """
 
     def __init__(
@@ -62,8 +62,8 @@ class ToFile:
         self._failure: Exception | None = None
 
     def full(self) -> None:
-        """Note it."""
-        self._on_note(f"{self._path} is full at {MAX_BYTES / 1e6:g} MB: what came until now is written")
+        """Report the full recording."""
+        self._on_note(f"{self._path} is full at {MAX_BYTES / 1e6:g} MB: the view up to now is written")
 
     def deliver(self, page: str, n_frames: int) -> None:
         """Write the file."""
@@ -72,17 +72,17 @@ class ToFile:
         self.n_frames = n_frames
 
     def failed(self, error: Exception) -> None:
-        """Keep it for `check`."""
+        """Keep the error for `check`."""
         self._failure = error
 
     def check(self) -> None:
-        """Raise what went wrong, if anything did."""
+        """Raise the error, if any."""
         if self._failure is not None:
             raise self._failure
 
 
 class ToBrowser:
-    """Sends a recording to the browser that asked for it.
+    """Browser that requested a recording.
 
     Parameters
     ----------
@@ -95,25 +95,25 @@ class ToBrowser:
         self._client, self._name = client, name
 
     def full(self) -> None:
-        """Show it."""
-        self._emit_event("The HTML recording is full", f"at {MAX_BYTES / 1e6:g} MB; what came until now is saved")
+        """Show a notification."""
+        self._emit_event("The HTML recording is full", f"at {MAX_BYTES / 1e6:g} MB; the view up to now is saved")
 
     def deliver(self, page: str, _: int) -> None:
         """Send the file."""
         self._client.send_file_download(self._name, page.encode(), save_immediately=True)
 
     def failed(self, error: Exception) -> None:
-        """Show it: what a browser cannot have is no reason to end a view."""
+        """Show a notification: a failure in one browser does not end the view."""
         self._emit_event("Nothing is saved", str(error))
 
     def _emit_event(self, title: str, text: str) -> None:
-        with suppress(Exception):  # who has left meanwhile
+        with suppress(Exception):  # The browser may have disconnected.
             self._client.add_notification(title, text, auto_close_seconds=_NOTICE_S, color="red")
 
 
 @dataclass(slots=True)
 class _PageRecording:
-    """What is being recorded, how much of it has been counted, and since when what was drawn last is shown."""
+    """State of a recording: serializer, counted frames, and time since the last frame."""
 
     serializer: Any
     receiver: RecordingReceiver
@@ -125,20 +125,20 @@ class _PageRecording:
     finished: Callable[[str], str] = str
 
     def pass_to(self, now_s: float) -> None:
-        """Note how long what was drawn last has been shown."""
+        """Extend the last frame up to now."""
         if now_s > self.shown_s:
             self.serializer.insert_sleep(now_s - self.shown_s)
         self.shown_s = now_s
 
     def count(self) -> None:
-        """Add what was drawn since this was called last; viser has no other way to tell it."""
+        """Add the frames since the last call; viser does not report them."""
         messages, buffers = self.serializer._messages, self.serializer._binary_buffers  # noqa: SLF001
         self.n_bytes += sum(_size(message) for _, message in messages[self.n_messages :])
         self.n_bytes += sum(buffer.nbytes for buffer in buffers[self.n_buffers :])
         self.n_messages, self.n_buffers = len(messages), len(buffers)
 
     def finish(self) -> None:
-        """Make the page and deliver it."""
+        """Build the page and deliver it."""
         try:
             self.receiver.deliver(self.finished(str(self.serializer.as_html(dark_mode=True))), self.n_frames)
         except Exception as error:  # noqa: BLE001  the receiver is to know
@@ -146,12 +146,12 @@ class _PageRecording:
 
 
 class Recordings:
-    """Recordings that are being made, each of all that is drawn from its beginning to its end.
+    """Recordings in progress, each from its beginning to its end.
 
-    Their times are those of any one clock. None passes as long as nothing was drawn.
+    Times come from any one clock. Time does not pass until something was drawn.
 
-    A page is made, and delivered, in a thread of its own: of a long recording that takes seconds, for which a live view
-    would stand still.
+    A separate thread builds and delivers a page, because this takes seconds for a long recording and would stop a live
+    view.
 
     Parameters
     ----------
@@ -172,15 +172,15 @@ class Recordings:
         return key in self._made
 
     def n_bytes(self) -> dict[Hashable, int]:
-        """Return how much each holds."""
+        """Return the size of each recording."""
         return {key: recording.n_bytes for key, recording in self._made.items()}
 
     def begin(self, key: Hashable, receiver: RecordingReceiver, now_s: float = math.inf) -> None:
-        """Begin a recording; where something is shown already, it begins with that, now."""
+        """Begin a recording; it starts with the present frame, if there is one."""
         self._made[key] = _PageRecording(self._serializer(), receiver, now_s)
 
     def end(self, key: Hashable, now_s: float) -> None:
-        """End a recording and deliver it, where there is one."""
+        """End a recording and deliver it, if it exists."""
         recording = self._made.pop(key, None)
         if recording is not None:
             recording.pass_to(now_s)
@@ -190,7 +190,7 @@ class Recordings:
             self._threads.append(thread)
 
     def drop(self, key: Hashable) -> None:
-        """End a recording that nobody wants any longer."""
+        """Discard a recording."""
         recording = self._made.pop(key, None)
         if recording is not None:
             handler = recording.serializer._handler  # noqa: SLF001  viser would first make all of a page
@@ -198,7 +198,7 @@ class Recordings:
                 handler._record_handles.remove(recording.serializer)  # noqa: SLF001
 
     def add(self, *, frames: int) -> None:
-        """Count what was drawn, and how many new frames that was; end recordings that are full with it."""
+        """Add drawn objects and the number of new frames; end recordings that are full."""
         for key, recording in [*self._made.items()]:
             recording.n_frames += frames
             recording.count()
@@ -207,19 +207,19 @@ class Recordings:
                 self.end(key, recording.shown_s)
 
     def pass_to(self, now_s: float) -> None:
-        """Note how long what was drawn last has been shown, before something else is drawn."""
+        """Extend the last frame up to now, before the next is drawn."""
         for recording in self._made.values():
             recording.pass_to(now_s)
 
     def wait(self) -> None:
-        """Wait until all that has ended is delivered."""
+        """Wait until all ended recordings are delivered."""
         for thread in self._threads:
             thread.join()
         self._threads.clear()
 
 
 def _size(value: object) -> int:
-    """Return about how many bytes a message takes, but for arrays, which are kept apart."""
+    """Return the approximate size of a message without its arrays, which are stored separately."""
     if isinstance(value, dict):
         return sum(len(name) + _size(each) for name, each in value.items())
     if isinstance(value, list | tuple):

@@ -1,4 +1,4 @@
-"""Numbers that the page tells beside what is drawn."""
+"""Numbers shown beside the view."""
 
 import time
 from collections import deque
@@ -21,14 +21,14 @@ _NONE: Final = "–"
 
 
 class FrameCounts:
-    """What was drawn.
+    """Counts of frames.
 
     Attributes
     ----------
     shown : int
-        Frames with something new.
+        Frames with a new image.
     latency_s : float or None
-        From the emission to its being drawn.
+        Time from the emission to the display.
     """
 
     def __init__(self) -> None:
@@ -37,14 +37,14 @@ class FrameCounts:
         self._at_s: deque[float] = deque()
 
     def count(self, now_s: float, latency_s: float | None) -> None:
-        """Note that something new was drawn."""
+        """Count a new frame."""
         self.shown += 1
         self.latency_s = latency_s
         self._at_s.append(now_s)
 
     @property
     def rate_hz(self) -> float:
-        """Of late."""
+        """Recent rate."""
         now_s = time.monotonic()
         while self._at_s and now_s - self._at_s[0] > _RATE_S:
             self._at_s.popleft()
@@ -60,11 +60,11 @@ def rows_of(
     n_held: int,
     n_bytes: int | None,
 ) -> dict[str, tuple[str, str]]:
-    """Return what there is to tell, by name: what it is, and its value."""
+    """Return the rows by name: label and value."""
     latest = max((each.stamp for each in sensors.values()), key=lambda stamp: stamp.timestamp_ns, default=Stamp())
     live = source.is_playback is False
     silent = live and bool(sensors) and all(each.overdue for each in sensors.values())
-    latency_s = None if silent else counts.latency_s  # which is of an image of long ago then
+    latency_s = None if silent else counts.latency_s  # It would refer to an old image.
     rows = {
         "state": ("state", _state(source, sensors, paused=paused and live)),
         "frames": ("frames shown", str(counts.shown)),
@@ -87,7 +87,7 @@ def rows_of(
 
 
 def _state(source: "Live | Playback", sensors: Mapping[str, Drawn], *, paused: bool) -> str:
-    """Return the state of the source and, where a live one is connected, whether its sensors send."""
+    """Return the state of the source and, for a connected live source, of its sensors."""
     if paused:
         return f"{source.state}, paused"
     if source.is_playback is True or not source.connected:
@@ -98,13 +98,13 @@ def _state(source: "Live | Playback", sensors: Mapping[str, Drawn], *, paused: b
 
 
 def _age(drawn: Drawn, clock_s: float) -> str:
-    """Return how old what is shown of a sensor is."""
+    """Return the age of a sensor's shown image."""
     age_s = max(0.0, clock_s - drawn.time_s)
     return (f"{age_s:.1f} s" if age_s < _COARSE_S else f"{age_s:.0f} s") + (" (overdue)" if drawn.overdue else "")
 
 
 def _of_each(sensors: Mapping[str, Drawn], reported: Callable[[Drawn], str]) -> str:
-    """Return what is told of each sensor, with its name where there are several."""
+    """Return the values of each sensor, with its name if there are several."""
     several = len(sensors) > 1
     return (
         ", ".join(f"{name} {reported(each)}" if several else reported(each) for name, each in sensors.items()) or _NONE

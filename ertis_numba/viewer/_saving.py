@@ -1,4 +1,4 @@
-"""What is shown, as files: a picture of all sensors, and the points on the platform."""
+"""Files of the present view: a picture of all sensors, and the points on the platform."""
 
 import io
 import tempfile
@@ -44,7 +44,7 @@ def picture_png(frame: DrawnFrame) -> bytes:
 def points_ply(points: list[tuple[Energyscape, PointCloud, Pose | None]]) -> bytes:
     """Return the points of images on the platform as PLY.
 
-    Where it is not known where a sensor is, they are in its own frame.
+    Points of a sensor with unknown mounting are in its own frame.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def points_ply(points: list[tuple[Energyscape, PointCloud, Pose | None]]) -> byt
     mountings = checked(
         {image.stamp.sensor: (pose.translation_m, pose.rotation_xyzw) for image, _, pose in points if pose}
     )
-    found = {image.stamp.sensor: cloud for image, cloud, _ in points}  # those are saved which are drawn
+    found = {image.stamp.sensor: cloud for image, cloud, _ in points}  # Only drawn points are saved.
     table = PointTable.of([image for image, _, _ in points], lambda image: found[image.stamp.sensor], mountings)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "points.ply"

@@ -1,4 +1,4 @@
-"""What to draw: the latest image of each sensor, its points on the platform, and those that fade."""
+"""Drawn objects: the latest image of each sensor, its points on the platform, and fading points."""
 
 import math
 from collections import deque
@@ -20,17 +20,18 @@ from ertis_numba.viewer._shapes import UNTURNED, Dome, Drawn, DrawnFrame, Pose, 
 
 __all__ = ["ViewedScene"]
 
-_MAX_POINTS: Final = 512  # of an image
-_MAX_CLOUDS: Final = 256  # that fade, of a sensor: fifteen a second, for as long as they may stay, and some more
-_FARTHEST_DOME: Final = 0.25  # radius of the dome, by the range that is seen
-_DIM: Final = 0.35  # what is left of the colours of a sensor that is overdue
+_MAX_POINTS: Final = 512  # Limit per image.
+# Limit on fading clouds of a sensor: fifteen per second for the maximum persistence, and some more.
+_MAX_CLOUDS: Final = 256
+_FARTHEST_DOME: Final = 0.25  # Radius of the dome, relative to the visible range.
+_DIM: Final = 0.35  # Remaining brightness of an overdue sensor.
 
 Table: TypeAlias = NDArray[np.uint8]
 
 
 @dataclass(slots=True)
 class _Cloud:
-    """Points of an image, their places on the platform, their levels, their ranges and when they were."""
+    """Points of an image with their positions on the platform, levels, ranges and time."""
 
     points: PointCloud
     position_m: NDArray[np.float32]
@@ -39,7 +40,7 @@ class _Cloud:
     time_s: float
 
     def seen(self, choices: Choices) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
-        """Return which are shown, and the levels of all below the strongest in the window."""
+        """Return True for each shown point, and the levels of all relative to the strongest in the window."""
         low_m, high_m = choices.range_m or (0.0, math.inf)
         within = (self.range_m >= low_m) & (self.range_m <= high_m)
         below_db = self.level_db - self.level_db[within].max(initial=-np.inf)
@@ -48,13 +49,13 @@ class _Cloud:
 
 @dataclass(slots=True)
 class _SensorImages:
-    """What is kept of a sensor; what was drawn last is kept as long as it would come out the same."""
+    """State of a sensor, with its last drawn objects for reuse."""
 
     latest: ReceivedImage
     clouds: deque[_Cloud] = field(default_factory=lambda: deque(maxlen=_MAX_CLOUDS))
     polar: Polar | None = None
     polar_for: tuple[object, ...] = ()
-    outside: bool = False  # of the window
+    outside: bool = False  # The window contains none of it.
     levels: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((1, 1), np.uint8))
     levels_for: tuple[object, ...] = ()
     picture: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((1, 1, 3), np.uint8))
@@ -63,10 +64,10 @@ class _SensorImages:
 
 
 class ViewedScene:
-    """Keeps the latest image of each sensor and makes of it what to draw, with the choices of the moment.
+    """Latest image of each sensor, and the drawn objects for the present choices.
 
-    Points are found once for an image, in all of its ranges; thresholds and windows choose among them, so that what
-    is chosen later changes what is shown already.
+    Points are detected once per image, in all of its ranges; threshold and window then select among them, so that later
+    choices also apply to present images.
 
     Parameters
     ----------
@@ -83,22 +84,22 @@ class ViewedScene:
 
     @property
     def farthest_m(self) -> float:
-        """Last range of all images; 0 as long as there is none."""
+        """Last range of all images; 0 without images."""
         return max((float(kept.latest.image.range_m[-1]) for kept in self._sensors.values()), default=0.0)
 
     def latest(self, choices: Choices) -> list[tuple[Energyscape, PointCloud, Pose | None]]:
-        """Return the images that are shown, those of their points that are drawn, and where their sensors are."""
+        """Return the shown images with their drawn points and the poses of their sensors."""
         return [
             (kept.latest.image, _chosen(kept.clouds[-1].points, kept.clouds[-1].seen(choices)[0]), kept.latest.pose)
             for _, kept in sorted(self._sensors.items())
         ]
 
     def clear(self) -> None:
-        """Forget all that was taken, as where somebody goes to another time of a film."""
+        """Discard all images, as after a seek."""
         self._sensors.clear()
 
     def take(self, taken: ReceivedImage) -> None:
-        """Take an image to be drawn next; points of later times are forgotten, as where a recording begins anew."""
+        """Add an image to draw next; points of later times are discarded, as after a restart of the playback."""
         name = taken.image.stamp.sensor
         kept = self._sensors.get(name)
         if kept is None or not _same_axes(kept.latest.image, taken.image):
@@ -109,7 +110,7 @@ class ViewedScene:
         kept.clouds.append(_cloud_of(self._find(taken.image), taken))
 
     def draw(self, choices: Choices, now_s: float | None = None) -> DrawnFrame:
-        """Return what to draw of the images taken so far.
+        """Return the drawn objects of the present images.
 
         Parameters
         ----------
@@ -143,7 +144,7 @@ class ViewedScene:
         return replace(frame, fused=self._plan_of(fusion, joined, choices), height_m=fusion.height_m)
 
     def _prepare(self, kept: _SensorImages, choices: Choices) -> None:
-        """Find the levels of a sensor's image, where that or what was chosen is another."""
+        """Update the levels of a sensor's image after a new image or choice."""
         image = kept.latest.image
         kept.outside = not is_within(image, choices.range_m)
         if not kept.outside:
@@ -156,14 +157,14 @@ class ViewedScene:
             kept.levels, kept.levels_for = kept.polar.levels(_echoes(image).amplitude), (kept.latest, kept.polar)
 
     def _fusion_of(self, several: list[_SensorImages]) -> Fusion:
-        """Return what joins the images of several sensors, made anew where one has moved or has other axes."""
+        """Return the fusion of several sensors, renewed after a change of pose or axes."""
         pairs = [(kept.polar, kept.latest.pose) for kept in several if kept.polar is not None and kept.latest.pose]
         if self._fusion is None or self._fusion[0] != pairs:
             self._fusion = pairs, Fusion(pairs)
         return self._fusion[1]
 
     def _plan_of(self, fusion: Fusion, several: list[_SensorImages], choices: Choices) -> Sector:
-        """Return the image of several sensors, the same one as long as theirs are."""
+        """Return the fused image of several sensors, the same one while their images are unchanged."""
         made_for = [fusion, choices.colours, *(kept.levels_for for kept in several)]
         if self._plan is None or self._plan[0] != made_for:
             self._plan = made_for, fusion([kept.levels for kept in several], colour_table(choices.colours))
@@ -192,12 +193,12 @@ def _cloud_of(cloud: PointCloud, taken: ReceivedImage) -> _Cloud:
 
 
 def _is_level(taken: ReceivedImage) -> bool:
-    """Whether an image lies in the level of a platform, on which the place of its sensor is known."""
+    """Return True if an image lies in the horizontal plane of a platform, and its pose is known."""
     return taken.pose is not None and taken.image.is_planar and is_level(taken.pose)
 
 
 def _until_s(timely: list[_SensorImages], sensors: dict[str, Drawn], choices: Choices, now_s: float) -> float:
-    """Return when another picture is due though nothing comes: at once where points fade."""
+    """Return the time of the next picture without new images: at once while points fade."""
     if choices.decay_s and any(len(drawn.position_m) for drawn in sensors.values()):
         return now_s
     return min((kept.latest.due_s for kept in timely), default=math.inf)
@@ -211,7 +212,7 @@ def _table(choices: Choices, *, dim: bool) -> Table:
 def _drawn(
     kept: _SensorImages, choices: Choices, now_s: float, pose: Pose | None, *, overdue: bool, alone: bool
 ) -> Drawn:
-    """Return what to draw of a sensor, whose shape is its own if it is ``alone``."""
+    """Return the drawn objects of a sensor, whose shape is separate if it is ``alone``."""
     taken, polar = kept.latest, kept.polar
     assert polar is not None  # noqa: S101  it was prepared
     table = _table(choices, dim=overdue)
@@ -226,7 +227,7 @@ def _drawn(
         elif alone and not kept.outside:
             kept.shape = _dome(cropped(_echoes(taken.image), choices.range_m), choices, table)
     position_m, colours, share_left, n_points = _points(kept.clouds, choices, now_s, table)
-    if pose is None:  # points of sensors that have no frame in common have no place beside each other
+    if pose is None:  # Points of sensors without a common frame cannot be drawn together.
         position_m, colours, share_left = position_m[:0], colours[:0], share_left[:0]
     return Drawn(
         pose=pose,
@@ -245,7 +246,7 @@ def _drawn(
 def _points(
     clouds: deque[_Cloud], choices: Choices, now_s: float, table: Table
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.float32], int]:
-    """Return points on the platform, their colours, what is left of each, and how many are of the latest image."""
+    """Return points on the platform, their colours, their remaining share, and the number from the latest image."""
     places, colours, left, n_points = [np.empty((0, 3), np.float32)], [np.empty((0, 3), np.uint8)], [np.empty(0)], 0
     for cloud in clouds:
         latest = cloud is clouds[-1]
@@ -262,16 +263,16 @@ def _points(
 
 
 def _echoes(image: Energyscape) -> Energyscape:
-    """Return an image without side lobes if it has elevations: their maximum would show an arc at each range."""
+    """Return an image with elevations without its side lobes: their maximum would show an arc at each range."""
     return image if image.is_planar else without_side_lobes(image)
 
 
 def _dome(image: Energyscape, choices: Choices, table: Table) -> Dome:
-    """Return the directions with echoes as loud as the points that are shown."""
+    """Return the directions with echoes as strong as the shown points."""
     level_db = below_strongest_db(image.amplitude.max(axis=1), choices.dynamic_range_db)
     shade = 1 + level_db / choices.dynamic_range_db
     radius_m = _FARTHEST_DOME * float(image.range_m[-1])
-    # Directions that are spread evenly over half a sphere have a square of this side each.
+    # Directions spread evenly over a hemisphere have a square of this side each.
     size_m = radius_m * math.sqrt(2 * math.pi / len(shade))
     seen = (shade > 0) & (level_db >= choices.threshold_db)
     return Dome(

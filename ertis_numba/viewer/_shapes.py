@@ -1,4 +1,4 @@
-"""What is taken from a source, and what is drawn of it."""
+"""Images from a source, and drawn objects."""
 
 import math
 from collections.abc import Sequence
@@ -13,9 +13,9 @@ from ertis_numba.settings import Settings
 
 __all__ = ["UNTURNED", "Dome", "Drawn", "DrawnFrame", "Pose", "ReceivedImage", "Sector"]
 
-_OVERDUE_S: Final = 1.0  # at least, as images come in bursts where a network or a computer is busy
-_UNKNOWN_S: Final = 10.0  # without an image, where a single one has come and nobody knows when the next is due
-_OVERDUE: Final = 3.0  # intervals without an image, after which a sensor is overdue
+_OVERDUE_S: Final = 1.0  # Lower limit, because images arrive in bursts on a busy network or computer.
+_UNKNOWN_S: Final = 10.0  # Time without an image after a single one, whose interval is unknown.
+_OVERDUE: Final = 3.0  # Number of intervals without an image after which a sensor is overdue.
 
 
 _Numbers = Sequence[float] | NDArray[np.float64]
@@ -23,7 +23,7 @@ _Numbers = Sequence[float] | NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """Where a sensor is on its platform.
+    """Pose of a sensor on its platform.
 
     Attributes
     ----------
@@ -45,14 +45,14 @@ class Pose:
         return cls((x, y, z), (i, j, k, w))
 
     def placed(self, position_m: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return places of the sensor's frame in that of the platform: (point, axis) float32."""
+        """Return points of the sensor frame in the frame of the platform: (point, axis) float32."""
         amplitude = np.ones(len(position_m), np.float32)
         cloud = PointCloud(position_m, amplitude, Settings(), Stamp(), self.translation_m, self.rotation_xyzw)
         return cloud.on_platform_m()
 
 
 UNTURNED: Final = Pose()
-"""Where a sensor is drawn of which nobody said where it is, if it is the only one."""
+"""Pose of a single sensor with unknown mounting."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,11 +63,11 @@ class ReceivedImage:
     ----------
     image : Energyscape
     pose : Pose or None
-        None where nobody said where the sensor is.
+        None if the mounting is unknown.
     time_s : float
-        When it was, by the clock that points fade by.
+        Time of the image, by the clock of fading points.
     interval_s : float, optional
-        What usually lies between two images of the sensor, where that is known.
+        Typical interval between images of the sensor, if known.
     """
 
     image: Energyscape
@@ -77,7 +77,7 @@ class ReceivedImage:
 
     @property
     def due_s(self) -> float:
-        """From when on the sensor is overdue, if no other image comes."""
+        """Time from which the sensor is overdue without another image."""
         silent_s = _UNKNOWN_S if self.interval_s is None else max(_OVERDUE_S, _OVERDUE * self.interval_s)
         return self.time_s + silent_s
 
@@ -100,7 +100,7 @@ class Sector:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Dome:
-    """The strongest over range of each direction with an echo, on a sphere around the sensor.
+    """Maximum over range of each direction with an echo, on a sphere around the sensor.
 
     Attributes
     ----------
@@ -118,7 +118,7 @@ class Dome:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drawn:
-    """What to draw of a sensor.
+    """Drawn objects of a sensor.
 
     Attributes
     ----------
@@ -158,7 +158,7 @@ class Drawn:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DrawnFrame:
-    """What to draw of all sensors.
+    """Drawn objects of all sensors.
 
     Attributes
     ----------
@@ -184,7 +184,7 @@ class DrawnFrame:
 
     @property
     def centre_m(self) -> tuple[float, float, float]:
-        """The middle, on the platform, of what the sensors see."""
+        """Centre, on the platform, of the visible area."""
         ahead_m = np.array([[self.range_m / 2, 0, 0]], np.float32)
         middles_m = [drawn.pose.placed(ahead_m)[0] for drawn in self.sensors.values() if drawn.pose is not None]
         x, y, z = np.mean(middles_m, axis=0).tolist() if middles_m else (0.0, 0.0, 0.0)

@@ -1,4 +1,4 @@
-"""The scene in three dimensions: the ground, sensors with their images, and points on the platform."""
+"""Three-dimensional scene: ground, sensors with their images, and points on the platform."""
 
 import math
 from typing import Any, Final
@@ -24,7 +24,7 @@ _NONE: Final = np.zeros((1, 3), np.float32)
 
 
 class Space:
-    """Hands what is to be drawn in three dimensions to viser.
+    """Three-dimensional scene in viser.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ class Space:
         self._show_fused(frame)
 
     def _show_fused(self, frame: DrawnFrame) -> None:
-        """Draw one image of all sensors, where there is one."""
+        """Draw the fused image of all sensors, if there is one."""
         if self._fused is not None:
             self._fused[1].visible = frame.fused is not None
         if frame.fused is None or frame.fused is self._plan:
@@ -65,7 +65,7 @@ class Space:
             self._fused = made_for, _plan(self._scene, "/fused", frame.fused, frame.height_m)
 
     def _look_at(self, frame: DrawnFrame) -> None:
-        """Draw the ground, and set the camera where all of it can be seen, again where more is seen or others join."""
+        """Draw the ground, and position the camera for a complete view; again after the range grows or sensors join."""
         farthest_m, names = max(self._farthest_m, frame.range_m), self._names | frame.sensors.keys()
         if (farthest_m, names) == (self._farthest_m, self._names) or not frame.sensors:
             return
@@ -106,7 +106,7 @@ class Space:
         ]
 
     def _stand(self, position_m: tuple[float, float, float], look_at_m: tuple[float, float, float]) -> None:
-        """Set the camera, that of browsers to come and of those in which nobody has moved it."""
+        """Position the camera of future browsers, and of those whose users have not moved it."""
         first = self._server.initial_camera
         before_m = np.concatenate([first.position, first.look_at])
         first.position, first.look_at = position_m, look_at_m
@@ -121,14 +121,14 @@ class Space:
 
 
 def round_step(length: float, largest: int) -> float:
-    """Return the smallest of 1, 2 and 5 times a power of ten of which no more than so many fit into a length."""
+    """Return the smallest step of 1, 2 or 5 times a power of ten that divides a length into at most so many parts."""
     smallest = length / largest * (1 - 1e-9)
     power = 10.0 ** math.floor(math.log10(smallest))
     return next(each * power for each in (1, 2, 5, 10) if each * power >= smallest)
 
 
 class _Nodes:
-    """What the scene holds of a sensor."""
+    """Scene nodes of a sensor."""
 
     def __init__(self, scene: viser.SceneApi, name: str) -> None:
         self._scene, self._name = scene, name
@@ -152,7 +152,7 @@ class _Nodes:
         self._shown: object = None
 
     def show(self, drawn: Drawn | None, farthest_m: float) -> None:
-        """Draw the sensor, or nothing of it where there is nothing or nobody knows where it is."""
+        """Draw the sensor, or remove it if it has no image or no pose."""
         self._frame.visible = drawn is not None and drawn.pose is not None
         if drawn is None or drawn.pose is None:
             for cloud in self._points:
@@ -178,7 +178,7 @@ class _Nodes:
             self._show_dome(drawn.shape)
 
     def _show_points(self, drawn: Drawn, size_m: float) -> None:
-        """Draw points, the smaller the less is left of them."""
+        """Draw points with sizes that follow their remaining share."""
         sizes = np.ceil(drawn.share_left * len(_SIZES)) - 1
         for number, (cloud, share) in enumerate(zip(self._points, _SIZES, strict=True)):
             chosen = sizes == number
@@ -214,7 +214,7 @@ class _Nodes:
 
 
 def _plan(scene: viser.SceneApi, name: str, sector: Sector, height_m: float = 0.0) -> viser.ImageHandle:
-    """Return an image that lies in the level of its frame, x ahead."""
+    """Return an image in the horizontal plane of its frame, x ahead."""
     west, east, low, high = sector.extent_m
     return scene.add_image(
         name,

@@ -1,4 +1,4 @@
-"""What is shown at once of measurements along time, and which is the last of a sensor."""
+"""Time steps of a file, and the last measurement of each sensor."""
 
 import bisect
 import itertools
@@ -12,7 +12,7 @@ from ertis_numba.frames import Stamp
 __all__ = ["UNTIMED_S", "SensorTimeline", "TimeStep", "time_steps_of", "usual_s"]
 
 UNTIMED_S: Final = 0.1
-"""Between measurements that have no time."""
+"""Interval between measurements without timestamps."""
 _PAUSE_S, _LONGEST_PAUSE_S = 10.0, 600.0  # that is played at least, and at most, whatever is usual
 _PAUSE: Final = 10.0  # of what usually lies between two moments, beyond which it is a pause
 _TOGETHER_NS: Final = 10_000_000  # measurements of several sensors that are shown as one
@@ -20,7 +20,7 @@ _TOGETHER_NS: Final = 10_000_000  # measurements of several sensors that are sho
 
 @dataclass(frozen=True, slots=True)
 class TimeStep:
-    """What is shown at once: one measurement of each sensor at most.
+    """Measurements shown together: at most one per sensor.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class TimeStep:
 
 @dataclass(frozen=True, slots=True)
 class SensorTimeline:
-    """The measurements of a sensor along the moments.
+    """Measurements of a sensor along the time steps.
 
     Attributes
     ----------
@@ -62,22 +62,24 @@ class SensorTimeline:
         return cls(places, numbers, usual_s([time_steps[place].time_s for place in places]))
 
     def last(self, after: int, until: int) -> tuple[int, int] | None:
-        """Return place and number of the last measurement after a moment and at or before another, if there is one."""
+        """Return index and number of the last measurement after one time step and at or before another, if there is
+        one.
+        """
         index = bisect.bisect_right(self.places, until) - 1
         return (self.places[index], self.numbers[index]) if index >= 0 and self.places[index] > after else None
 
 
 def usual_s(times_s: Iterable[float]) -> float | None:
-    """Return what usually lies between two times of several; None of a single one."""
+    """Return the median interval of times; None for a single one."""
     between_s = [after_s - before_s for before_s, after_s in itertools.pairwise(times_s)]
     return statistics.median_low(between_s) if between_s else None
 
 
 def time_steps_of(stamps: dict[str, list[Stamp]]) -> tuple[tuple[TimeStep, ...], list[str]]:
-    """Return the moments of measurements in the order of their times, and notes on times that are not those given.
+    """Return the time steps of measurements in the order of their times, and notes on replaced times.
 
-    Where no clock was set, as in a simulation, times count from whenever. Where some were, the other measurements have
-    no time: they are as far from those beside them as is usual. Where no times are known at all, numbers count.
+    If no clock was set, as in a simulation, times count from an arbitrary start. If some were set, the other
+    measurements have no time: they get the typical distance to their neighbours. Without any times, the numbers count.
     """
     given = {name: [stamp.timestamp_ns for stamp in each] for name, each in stamps.items()}
     known = _known(stamps)
@@ -105,7 +107,7 @@ def time_steps_of(stamps: dict[str, list[Stamp]]) -> tuple[tuple[TimeStep, ...],
 
 
 def _known(stamps: dict[str, list[Stamp]]) -> dict[str, list[bool]]:
-    """Return which measurements have a time that can be compared with those of others."""
+    """Return True for each measurement whose time can be compared with those of others."""
     some_timed = any(stamp.is_timed for each in stamps.values() for stamp in each)
     n_times = {name: len({stamp.timestamp_ns for stamp in each}) for name, each in stamps.items()}
     some_differ = any(count > 1 for count in n_times.values())
@@ -120,7 +122,7 @@ def _known(stamps: dict[str, list[Stamp]]) -> dict[str, list[bool]]:
 
 
 def _placed_ns(given: list[int], known: list[bool], begin_ns: int) -> list[int]:
-    """Return the times of a sensor's measurements; it begins with the others if none of its times is known."""
+    """Return the times of a sensor's measurements; a sensor without known times starts with the others."""
     between = [
         after_ns - before_ns if is_known == was_known and after_ns > before_ns else None
         for (before_ns, after_ns), (was_known, is_known) in zip(
@@ -141,7 +143,7 @@ def _placed_ns(given: list[int], known: list[bool], begin_ns: int) -> list[int]:
 
 
 def _without_pauses(times_s: list[float]) -> tuple[list[float], list[str]]:
-    """Return times between which there is no pause that nobody would wait for, and a note where there was one."""
+    """Return times without long pauses, and a note on shortened ones."""
     between_s = [after_s - before_s for before_s, after_s in itertools.pairwise(times_s)]
     if not between_s:
         return times_s, []
@@ -158,6 +160,6 @@ def _without_pauses(times_s: list[float]) -> tuple[list[float], list[str]]:
 def _unset_note(name: str, known: list[bool]) -> str:
     count = len(known) - sum(known)
     return (
-        f"sensor {name!r}: {count} of {len(known)} measurements have no time, as its clock was not set; they are shown "
-        "as far apart as is usual"
+        f"sensor {name!r}: {count} of {len(known)} measurements have no timestamp, because the clock was not "
+        "set; they are shown at the typical interval"
     )

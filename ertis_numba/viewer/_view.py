@@ -1,4 +1,4 @@
-"""From a source to the page, at the pace of whoever is slower."""
+"""Viewer: moves images from a source to the page, at the pace of the slower one."""
 
 import math
 import queue
@@ -37,31 +37,31 @@ _OURS: Final = "ours"  # of recordings, the one that is not of a browser
 
 
 class Viewer:
-    """Shows what a source has on a page; use it in a ``with`` statement.
+    """Page that shows the images of a source; use it in a ``with`` statement.
 
     Parameters
     ----------
-    source : Live or Film
+    source : Live or Playback
     host : str
         Loopback by default. On any other host the page requires the token in `url`.
     port : int
-        0 for any that is free.
+        0 selects a free one.
     choices : Choices, optional
-        What to begin with.
+        Initial choices.
     on_note : callable, optional
-        Is called with lines on what happens to the source.
+        Called with a line for each event of the source.
 
     Attributes
     ----------
     choices : Choices
-        Those of the moment.
+        Present choices.
     is_local : bool
-        The page cannot be reached from another machine.
+        True if other machines cannot reach the page.
 
     Raises
     ------
     NetworkError
-        Nothing can be served there.
+        The address cannot be used.
     """
 
     def __init__(
@@ -107,22 +107,22 @@ class Viewer:
 
     @property
     def url(self) -> str:
-        """Where a browser finds the page."""
+        """Address of the page for a browser."""
         return self._page.url
 
     def stop(self) -> None:
-        """End `run`; a signal's handler or another thread may call this."""
+        """End `run`; a signal handler or another thread may call this."""
         self._orders.put(None)
 
     def run(self, *, duration_s: float = math.inf, html: Path | None = None, overwrite: bool = False) -> None:
-        """Show until `stop` is called or the time is over.
+        """Show images until `stop` is called or the time is over.
 
         Parameters
         ----------
         duration_s : float
         html : Path, optional
-            Recording of all that was shown, a page that needs neither server nor network; none is written where
-            nothing was.
+            Recording of all that was shown, a page that needs neither server nor network; none is written where nothing
+            was.
         overwrite : bool
             Replace a file of this name.
 
@@ -158,14 +158,14 @@ class Viewer:
         self._finish(time.monotonic())
 
     def prepare(self) -> None:
-        """Make the images of a film's first moment, which takes long where kernels are to be compiled."""
+        """Process the first time step of a playback, which takes long if kernels are compiled."""
         if self._playback is not None:
             self._playback.at(0)
 
     def record(self, html: Path, *, overwrite: bool = False) -> None:
-        """Write a recording of all of a film, as a page that needs neither server nor network.
+        """Write a recording of a whole playback, as a page that needs neither server nor network.
 
-        Where `stop` is called meanwhile nothing is written, and `recorded` stays None.
+        After a call of `stop`, nothing is written, and `recorded` stays None.
 
         Raises
         ------
@@ -176,7 +176,7 @@ class Viewer:
         """
         playback = self._playback
         if playback is None:
-            raise TypeError("a live view is recorded by run")
+            raise TypeError("record needs a file; run records a live view")
         self._begin(html, overwrite=overwrite)
         for place, time_step in enumerate(playback.time_steps):
             self._note_all()
@@ -200,12 +200,12 @@ class Viewer:
 
     @property
     def shown(self) -> int:
-        """How many frames were drawn of something new."""
+        """Number of frames with a new image."""
         return self._counts.shown
 
     @property
     def recorded(self) -> int | None:
-        """How many frames the HTML recording holds that was asked for; None where it is not written."""
+        """Number of frames in the requested HTML recording; None if it is not written."""
         return None if self._file is None else self._file.n_frames
 
     def _stopped(self) -> bool:
@@ -222,7 +222,7 @@ class Viewer:
             self._note(note)
 
     def _completion(self) -> Callable[[str], str]:
-        """Return the function that adds the legend of what is shown now to a saved page."""
+        """Return a function that adds a legend of the present view to a saved page."""
         title, frame = self._source.title, self._frame
         return lambda page: with_legend(page, title, frame)
 
@@ -233,11 +233,11 @@ class Viewer:
 
     @property
     def _begun_s(self) -> float:
-        """When a recording of the view begins: now, or with what is drawn first."""
+        """Start of a recording of the view: now, or with the first drawn frame."""
         return math.inf if self._frame is None else time.monotonic()
 
     def _finish(self, now_s: float) -> None:
-        """Wait for what is still written; a recording in which nothing was drawn is not."""
+        """Wait for pending files; an empty recording is not written."""
         if self._frame is None:
             self._recordings.drop(_OURS)
         self._recordings.end(_OURS, now_s)
@@ -246,14 +246,14 @@ class Viewer:
             self._file.check()
 
     def _fade(self, clock_s: float, until_s: float, place: int) -> None:
-        """Record what changes until something new comes."""
+        """Record fading until the next image."""
         while self._frame is not None and (next_s := max(self._frame.until_s, clock_s + _FADE_S)) < until_s:
             clock_s = next_s
             self._recordings.pass_to(clock_s)
             self._show(clock_s, place, new=False)
 
     def _draw(self, now_s: float) -> None:
-        """Draw what is new or has changed, if anything."""
+        """Draw new or changed objects, if any."""
         taken = self._taken()
         clock_s = self._source.clock_s if self._pause.since_s is None else self._pause.since_s
         frame = self._frame
@@ -274,13 +274,13 @@ class Viewer:
         self._emit_event()
 
     def _show(self, clock_s: float, place: int, *, new: bool) -> None:
-        """Draw what was taken, as it is at a time."""
+        """Draw images as they are at a given time."""
         self._frame, self._clock_drawn_s = self._scene.draw(self.choices, clock_s), clock_s
         self._page.show(self._frame, place)
         self._recordings.add(frames=int(new))
 
     def _taken(self) -> "list[ReceivedImage]":
-        """Return what is to be shown; while a live view is paused that is nothing, but for what steps ask for."""
+        """Return the images to show: none during a pause, except for steps."""
         taken = self._source.take()
         return taken if self._playback is not None else self._pause.shown(taken, self._source.clock_s)
 
@@ -303,7 +303,7 @@ class Viewer:
         self._page.report_recordings(n_bytes)
 
     def _obey(self) -> None:
-        """Do what was ordered; wait a moment for an order."""
+        """Process requests; wait briefly for one."""
         try:
             order = self._orders.get(timeout=_LOOK_S)
             while True:
@@ -348,7 +348,7 @@ class Viewer:
             self._pause.step(self._source.clock_s)
 
     def _save(self, order: ControlRequest) -> None:
-        """Send a file to who asked for it, or say why there is none."""
+        """Send a file to the browser that requested it, or report the reason why there is none."""
         client = order.client
         if client is None:
             return
@@ -365,7 +365,7 @@ class Viewer:
             client.send_file_download(self._name(ending), content, save_immediately=True)
 
     def _record(self, client: Any) -> None:
-        """Begin the recording of a browser, or end it."""
+        """Begin or end the recording of a browser."""
         if client.client_id in self._recordings:
             self._recordings.end(client.client_id, time.monotonic())
         else:
@@ -376,7 +376,7 @@ class Viewer:
         return f"{'live' if self._playback is None else self._playback.path.stem}.{ending}"
 
     def _content(self, name: str, frame: "DrawnFrame") -> tuple[bytes, str]:
-        """Return what a file holds, and its ending."""
+        """Return the content of a file, and its suffix."""
         if name == "picture":
             return picture_png(frame), "png"
         return points_ply(self._scene.latest(self.choices)), "ply"
