@@ -178,7 +178,7 @@ def matched_filter(
     dynamic_range_db: float = 40.0,
     **look: Unpack[StyleOptions],
 ) -> Figure:
-    """Draw what the matched filter leaves of each microphone, over range.
+    """Draw the matched-filter output of each microphone over range.
 
     Arguments are those of `signals`.
     """

@@ -151,7 +151,7 @@ def width_deg(angle_deg: NDArray[np.float64], level_db: NDArray[np.float64], at_
 
 
 def _lines(settings: Settings, frequencies_hz: Sequence[float] | None) -> list[Cut]:
-    """Return the lines to draw: the ends of the call's band and its mean, or what is asked for.
+    """Return the lines to draw: the ends of the call's band and its mean, or the requested frequencies.
 
     Raises
     ------

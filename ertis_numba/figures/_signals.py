@@ -135,7 +135,7 @@ def spectrogram(
 
 
 def _traces(canvas: Canvas, axes: Axes, heard: MicrophoneTraces, loudest: float) -> None:
-    """Draw a row for each trace, the first on top; what is louder than its row is cut off.
+    """Draw a row for each trace, the first on top; louder parts are clipped.
 
     Amplitudes are compressed, so that echoes are seen beside the direct sound, which is 20 to 40 dB louder.
     """

@@ -99,7 +99,7 @@ class _Cut:
         return raster
 
     def height_at(self, canvas: Canvas) -> Callable[[float], float]:
-        """Return the function from the width of the picture to its height, both with what is around it, in points."""
+        """Return the function from the width of the picture to its height, both with labels, in points."""
         em_pt, ratio = canvas.style.em_pt, min(_MAX_RATIO, self._ratio)
         return lambda width_pt: (width_pt - (_LEFT_EMS + _RIGHT_EMS) * em_pt) * ratio + (_FLOOR_EMS + _ROOF_EMS) * em_pt
 

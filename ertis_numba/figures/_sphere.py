@@ -67,7 +67,7 @@ class _Map:
         self._ratio = min(_MAX_RATIO, max(_MIN_RATIO, ratio))
 
     def height(self, width_pt: float) -> float:
-        """Return the height that suits a width, both with what is around the map, in points."""
+        """Return the height for a width, both with the labels around the map, in points."""
         across_pt = width_pt - (_LEFT_EMS + _RIGHT_EMS) * self._em_pt
         return across_pt * self._ratio + (_FLOOR_EMS + _ROOF_EMS) * self._em_pt
 

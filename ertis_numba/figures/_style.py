@@ -1,4 +1,4 @@
-"""How pictures look: colours, letters and sizes, on a screen and in print."""
+"""Styles of figures: colours, letters and sizes, on a screen and in print."""
 
 from dataclasses import dataclass, replace
 from typing import Literal, TypedDict
@@ -23,7 +23,7 @@ _WIDE_EMS = 55.0
 
 
 class StyleOptions(TypedDict, total=False):
-    """What all functions of this package take besides what is drawn.
+    """Style options of all functions of this package.
 
     Attributes
     ----------
@@ -81,7 +81,7 @@ class Style:
         return self.label_pt
 
     def is_wide(self, width_pt: float) -> bool:
-        """Whether pictures stand beside each other on a page of a width, rather than below."""
+        """Return True if pictures on a page of this width stand beside each other."""
         return width_pt >= _WIDE_EMS * self.em_pt
 
 

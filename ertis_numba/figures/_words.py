@@ -1,4 +1,4 @@
-"""What pictures say above themselves: what is seen, of which sensor, when, and with which settings."""
+"""Captions of figures: content, sensor, time and settings."""
 
 import math
 from dataclasses import dataclass
@@ -62,7 +62,7 @@ def of_image(image: Energyscape) -> Heading:
 
 
 def _if_faint(values: NDArray[np.floating]) -> tuple[str, ...]:
-    """Return what to say where there is next to nothing: colours, from the strongest down, look like any picture."""
+    """Return a note on a faint image, whose colours look like those of any picture because they are relative."""
     strongest = float(np.abs(values).max(initial=0.0))
     if not strongest:
         return ("silence: all values are 0",)
