@@ -1,4 +1,4 @@
-"""Say how fast a vehicle may drive by what is nearest in its way: go, slow or stop.
+"""Limit a vehicle's speed by the nearest obstacle in its way: go, slow or stop.
 
 It stops at once, and goes on only when its way has been clear for some images, and by more than what stops it: an echo
 that comes and goes does not make it jerk. No image from one of its sensors for half a second is a reason to stop, too,
@@ -26,7 +26,7 @@ SPEEDS = ("stop", "slow", "go")
 
 
 class Way:
-    """What one sensor says about the way ahead of it."""
+    """State of the way ahead, from one sensor."""
 
     def __init__(self) -> None:
         self.speed = 0
@@ -34,7 +34,7 @@ class Way:
         self._clear = 0
 
     def see(self, nearest_m: float, now_s: float) -> None:
-        """Take the distance of what is nearest in the way."""
+        """Update the distance of the nearest obstacle in the way."""
         self._seen_s = now_s
         allowed = int(nearest_m > STOP_M) + int(nearest_m > SLOW_M)
         if allowed <= self.speed:

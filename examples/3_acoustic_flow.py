@@ -51,7 +51,7 @@ def flow(before: ertis.Energyscape, now: ertis.Energyscape) -> tuple[NDArray[np.
 
 
 def main(address: str, sensor: str) -> None:
-    """Print what comes nearer fastest, of each two successive images."""
+    """Print the fastest approach between two successive images."""
     before: ertis.Energyscape | None = None
     with ertis.Subscriber(address, sensors=[sensor], products=["energyscape"]) as subscriber:
         for image in subscriber:

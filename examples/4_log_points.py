@@ -1,4 +1,4 @@
-"""Write what all sensors of a platform see into one table of points, in the frame of the platform.
+"""Write the points of all sensors of a platform to one table, in the frame of the platform.
 
 The table is a CSV, or an NPZ for NumPy. It appears complete when the log ends: after a number of clouds, or with
 Ctrl-C::

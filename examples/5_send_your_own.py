@@ -1,4 +1,4 @@
-"""Send what one's own program has measured to a central node, which has it on its disk when this ends.
+"""Send measurements of your own program to a central node, which has stored them when the program ends.
 
 ::
 

@@ -77,7 +77,7 @@ def plot(report: dict[str, Any], path: Path) -> None:
 
 
 def _subjects(say: Callable[[str], None]) -> tuple[dict[str, tuple[Measurement, str]], list[str]]:
-    """Return what is measured on, and what cannot be."""
+    """Return the measured subjects, and the unavailable ones."""
     found, left_out = {}, []
     room = subject.real()
     if room is None:
@@ -172,7 +172,7 @@ class _Subject:
 
 
 def beats(one: dict[str, Any], other: dict[str, Any]) -> bool:
-    """Whether a plan errs no more and takes no longer than another, and is better in one of them."""
+    """Return True if a plan has no larger error and no longer time than another, and is better in one of them."""
     pairs = [(one[key], other[key]) for key in ("error_db", "time_ms")]
     return all(a <= b for a, b in pairs) and any(a < b for a, b in pairs)
 

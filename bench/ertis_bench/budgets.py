@@ -76,7 +76,7 @@ def run(*, count: int, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
 
 
 def tried(seed: int) -> dict[str, Any] | None:
-    """Return what became of one random recording; None where its settings have no plan, or its image is silent."""
+    """Return the result for one random recording; None if its settings have no plan, or its image is silent."""
     measurement, scene = measurement_of(seed)
     settings = measurement.settings
     with tempfile.TemporaryDirectory() as folder:

@@ -1,4 +1,4 @@
-"""Captures from emulated sensors, by the commands that users have: what is lost, and when.
+"""Captures from emulated sensors with the user's commands: losses, and their circumstances.
 
 Nothing is looked at but what users see: lines on stdout, exit codes, and what the reader of recordings returns. The
 emulators' log, of what they sent, is the truth.
@@ -38,7 +38,7 @@ def platform(n_sensors: int, *, n_measurements: int) -> Scene:
 
 
 def sustained(source: Path, folder: Path, *, duration_s: float, rate_hz: float) -> Line:
-    """Capture from one sensor, triggered by pulses, and tell what was lost and what it cost."""
+    """Capture from one sensor, triggered by pulses, and report losses and costs."""
     target = folder / "sustained.h5"
     with emulated(source, folder, "--sync-rate", f"{rate_hz:g}") as ports:
         lines = _captured(ports, target, "--trigger", "sync", "--duration", f"{duration_s:g}")
@@ -110,7 +110,9 @@ def _waits_s(plugged_ns: list[int], stored_ns: list[int]) -> list[float]:
 
 
 def kills(source: Path, folder: Path, *, seed: int, count: int) -> Line:
-    """Kill captures at random moments, recover what they left, and tell what was reported and is not there."""
+    """Kill captures at random times, recover their journals, and report measurements that were reported but are
+    missing.
+    """
     random_ = random.Random(seed)  # noqa: S311  as above
     reported = lost = wrong = unreadable = 0
     moments: Counter[str] = Counter()
@@ -144,7 +146,7 @@ def kills(source: Path, folder: Path, *, seed: int, count: int) -> Line:
 
 
 def disk_full(source: Path, folder: Path, disk: Path) -> Line:
-    """Capture to a small disk until it is full, and tell what the command said and what is there."""
+    """Capture to a small disk until it is full, and report the command's output and the stored measurements."""
     target = disk / "full.h5"
     with emulated(source, folder) as ports:
         done = ertis("capture", *_ports(ports), "-o", str(target), "--rate", "20", "--duration", "60", "--json")
@@ -200,7 +202,7 @@ def _captured(ports: list[str], target: Path, *options: str) -> list[Line]:
 
 
 def _killed(ports: list[str], target: Path, *, after_s: float, moments: Counter[str]) -> list[Line]:
-    """Start a capture, kill it some time after its first line, return what it printed; one that seals goes on."""
+    """Start a capture, kill it some time after its first line, and return its output; a sealing process continues."""
     command = [*_ERTIS, "capture", *_ports(ports), "-o", str(target), "--rate", "20", "--json", "--quiet", "-n", "16"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:  # noqa: S603
         assert process.stdout is not None  # noqa: S101  it is a pipe
@@ -228,7 +230,7 @@ def sent_by_emulators(folder: Path) -> dict[tuple[str, int], int]:
 
 
 def _checked(target: Path, reported: list[Line], sent: dict[tuple[str, int], int]) -> Line:
-    """Read a recording and compare it with what was reported and sent.
+    """Read a recording and compare it with the reported and the sent measurements.
 
     Returns
     -------

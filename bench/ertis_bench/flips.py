@@ -119,7 +119,7 @@ def _damage(path: Path, rng: random.Random) -> str:
 
 
 def _judged(read: Callable[[], tuple[object, bool]], wanted: object) -> str:
-    """Judge what was read, and whether something was reported beside it."""
+    """Classify the content that was read, with the errors that were reported."""
     try:
         found, reported = read()
     except ErtisError as error:
@@ -136,7 +136,7 @@ def _judged(read: Callable[[], tuple[object, bool]], wanted: object) -> str:
 
 
 def _made(state: str, folder: Path) -> list[list[Any]]:
-    """Have a process make a state and be killed; return what it was told."""
+    """Have a process create a state and kill it; return the values that it reported."""
     folder.mkdir()
     command = [sys.executable, "-m", "ertis_bench.flips", state, str(folder)]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
@@ -256,7 +256,7 @@ def _measured(path: Path) -> set[tuple[str, int, int]]:
 
 
 def _content(path: Path) -> dict[str, object]:
-    """Return all attributes and arrays of a file, but for what differs between two sealings."""
+    """Return all attributes and arrays of a file, except those that differ between two sealings."""
     found: dict[str, object] = {}
     with h5py.File(path) as file:
         names = ["/"]

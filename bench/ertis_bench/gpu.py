@@ -70,7 +70,7 @@ _MAX_REPORTED = 20  # names of failed tests
 
 @dataclass(frozen=True, slots=True)
 class FinishedProcess:
-    """How a process ended.
+    """Result of a process.
 
     Attributes
     ----------
@@ -85,7 +85,7 @@ class FinishedProcess:
 
     @property
     def last_line(self) -> str:
-        """What it said last."""
+        """Last line of its output."""
         return self.text.strip().rpartition("\n")[2][:600]
 
 
@@ -143,7 +143,7 @@ def newest(results: Path) -> dict[str, Any]:
 
 
 def parts() -> dict[str, Callable[[], dict[str, Any]]]:
-    """Return what is run, in this order: what matters most comes first."""
+    """Return the parts in the order of their importance."""
     return {
         "tests": tested,
         "paper": lambda: part("paper"),

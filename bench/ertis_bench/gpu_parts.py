@@ -1,7 +1,7 @@
-"""What is measured on a GPU: each part runs in a process of its own, ``python -m ertis_bench.gpu_parts NAME FILE``.
+"""Parts of the GPU benchmark, each in a separate process: ``python -m ertis_bench.gpu_parts NAME FILE``.
 
-A part yields rows, and each is written to the file as a line of JSON at once: what was measured before a part failed
-is not lost.
+A part yields rows, and each is written to the file as a line of JSON at once: what was measured before a part failed is
+not lost.
 """
 
 import functools
@@ -54,7 +54,7 @@ _ASKED_OF_SMI = (
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """How much is measured.
+    """Extent of the measurements.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ FULL = Scale()
 
 
 def machine(_: Scale) -> Iterator[dict[str, Any]]:
-    """Yield what the GPU is.
+    """Yield the properties of the GPU.
 
     Raises
     ------
@@ -172,7 +172,7 @@ def side_by_side(scale: Scale) -> Iterator[dict[str, Any]]:
 
 
 def ceilings_of(scale: Scale) -> Iterator[dict[str, Any]]:
-    """Yield what the GPU can do at most, and what delay-and-sum of every direction's own beam reaches of it."""
+    """Yield the limits of the GPU, and the share that delay-and-sum without a beam grid reaches."""
     found = ceilings.ceilings(scale.count, **dict(scale.ceilings))
     rounded = {name: round(value, 1) for name, value in found.items()}
     yield {"ceilings": rounded, **_smi(ceilings.properties()["uuid"])}
@@ -267,7 +267,7 @@ def _version(number: int) -> str:
 
 
 def _smi(uuid: str) -> dict[str, str]:
-    """Return what NVIDIA's own tool says of the GPU; nothing where it is missing."""
+    """Return the output of nvidia-smi for the GPU; empty if the tool is missing."""
     command = ["nvidia-smi", *(["-i", uuid] if uuid else []), f"--query-gpu={','.join(_ASKED_OF_SMI)}"]
     try:
         done = subprocess.run(  # noqa: S603

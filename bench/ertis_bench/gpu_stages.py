@@ -1,4 +1,4 @@
-"""How long each stage of the chain takes on a GPU, by the GPU's own clock."""
+"""Duration of each stage of the chain on a GPU, by the GPU's own clock."""
 
 import dataclasses
 import functools
@@ -100,7 +100,7 @@ class _LaunchStopwatch(Stopwatch):
 
     @property
     def launched_ms(self) -> float:
-        """From the start to the last mark, on the processor's clock."""
+        """Time from the start to the last mark, by the processor's clock."""
         return 1e3 * (self._end_s - self._begin_s)
 
 

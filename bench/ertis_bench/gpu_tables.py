@@ -129,7 +129,7 @@ def _reached(report: dict[str, Any]) -> str:
 
 
 def _verdicts(report: dict[str, Any]) -> str:
-    """Return what became of each part, failures included."""
+    """Return the result of each part, failures included."""
     lines = []
     for name, part in report["parts"].items():
         reported = [part["status"]]

@@ -1,4 +1,4 @@
-"""What a kernel would take on an NVIDIA H200 SXM: arithmetic with published figures, to be put to the test by a GPU."""
+"""Estimated time of a kernel on an NVIDIA H200 SXM: arithmetic with published figures, to be tested on a GPU."""
 
 import math
 from collections.abc import Callable
@@ -49,7 +49,7 @@ Arguments = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class Loop:
-    """What a pass through the main loop of a kernel is for.
+    """Work of one pass through the main loop of a kernel.
 
     Attributes
     ----------

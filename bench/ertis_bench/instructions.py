@@ -1,4 +1,4 @@
-"""What a kernel's machine code does: its way through the code, the loops on it, and their instructions by kind."""
+"""Analysis of a kernel's machine code: its path, the loops on it, and their instructions by kind."""
 
 import re
 from collections import Counter

@@ -43,13 +43,13 @@ _OURS = tuple(str(_PACKAGE / name) for name in ("journal", "storage", "atomic.py
 
 
 def appending(folder: Path, *, seed: int, count: int) -> dict[str, int]:
-    """Kill ``count`` processes that append to journals, and say what was lost of that which they told to be stored.
+    """Kill ``count`` processes that append to journals, and count lost measurements among the reported ones.
 
     Returns
     -------
     dict of str to int
-        ``kills``, measurements ``reported``; of them ``lost`` and ``wrong``; ``unrecorded``, which are there although nobody
-        told of them any more; and ``unexpected``, which are no such measurements.
+        ``kills``, measurements ``reported``; of them ``lost`` and ``wrong``; ``unrecorded``, which are there although
+        nobody told of them any more; and ``unexpected``, which are no such measurements.
     """
     rng = random.Random(seed)  # noqa: S311  nothing is secret
     found = dict.fromkeys(("kills", "told", "lost", "wrong", "untold", "unexpected"), 0)
@@ -80,7 +80,7 @@ def _killed_appending(nursery: "_Nursery", path: Path, rng: random.Random, seed:
 
 
 def _look_into(path: Path, reported: set[tuple[str, int]], seed: int, found: dict[str, int]) -> None:
-    """Count what is in a journal, and remove it."""
+    """Count the content of a journal, and remove it."""
     found["told"] += len(reported)
     if not path.exists():  # killed before it was made
         found["lost"] += len(reported)
@@ -128,7 +128,7 @@ def _words(seed: int, sensor: str, sequence: int) -> NDArray[np.uint32]:
 
 
 def sealing(folder: Path, *, seed: int, count: int) -> dict[str, int]:
-    """Kill ``count`` processes that seal a journal, and say what came of it when it was sealed again at last.
+    """Kill ``count`` processes that seal a journal, and report the result of the final sealing.
 
     Returns
     -------
@@ -177,7 +177,7 @@ def _crash(folder: Path, seed: int) -> None:
 
 
 def _undisturbed(nursery: "_Nursery", crashed: Path, work: Path) -> tuple[int, float, bytes]:
-    """Seal without a kill, and return how many lines and how long that took, and what it made."""
+    """Seal without a kill, and return the number of lines, the duration, and the recording."""
     n_lines, lasts_s, made = 0, 0.0, b""
     for counts in (True, False):
         path = shutil.copytree(crashed, work) / "rec.h5.journal"
@@ -245,12 +245,12 @@ class _Nursery:
         os.kill(self._pid, signal.SIGKILL)
 
     def end(self) -> list[str]:
-        """Wait until the process has ended, and return what else it told."""
+        """Wait until the process has ended, and return the rest of its output."""
         self._ask({"job": None})
         return list(iter(self.line, "ended"))
 
     def line(self) -> str:
-        """Return what the process tells next."""
+        """Return the next line of the process."""
         line = self._output.readline().rstrip("\n")
         if not line or line.startswith("failed"):
             raise RuntimeError(f"a process to be killed {line or 'was lost'}")

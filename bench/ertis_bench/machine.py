@@ -1,4 +1,4 @@
-"""What a time was measured on."""
+"""Description of the machine on which times were measured."""
 
 import os
 import platform

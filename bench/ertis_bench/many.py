@@ -1,4 +1,4 @@
-"""Many recordings at once: what further workers gain, on this machine and as a dask cluster."""
+"""Many recordings at once: gain by further workers, on this machine and as a dask cluster."""
 
 import itertools
 import os
@@ -74,7 +74,7 @@ def _cores() -> int:
 
 
 def _crews(address: str) -> dict[str, dict[str, Any]]:
-    """Return what is compared, by what it is called: arguments of a campaign."""
+    """Return the compared configurations by name, as arguments of a campaign."""
     cores = _cores()
     crews: dict[str, dict[str, Any]] = {"1 worker of 1 thread": {"workers": 1, "threads": 1}}
     if cores > 1:
@@ -87,7 +87,7 @@ def _crews(address: str) -> dict[str, dict[str, Any]]:
 
 
 def _recordings(folder: Path, count: int) -> tuple[Path, str]:
-    """Write recordings whose measurements all differ, of one that was simulated; return also what that is."""
+    """Write recordings with different measurements, derived from a simulated one; return also its description."""
     folder.mkdir()
     first, source = subject.measurement()
     for number in range(count):

@@ -34,7 +34,7 @@ PUBLISHED_MS = {
 
 
 def run(*, count: int, say: Callable[[str], None]) -> dict[str, Any]:
-    """Measure all backends and return the report: machine, rows, and what was measured how.
+    """Measure all backends and return the report: machine, rows, and conditions.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Plans that are worth comparing, and what to call them."""
+"""Plans to compare, with their names."""
 
 from ertis_numba.kernels import KernelSet
 from ertis_numba.settings import INTERPOLATIONS, Accuracy

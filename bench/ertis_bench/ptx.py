@@ -1,4 +1,4 @@
-"""The kernels of the default plan as machine code, and what an H200 would take for them. No GPU is needed.
+"""Machine code of the default plan's kernels, and their estimated time on an H200. No GPU is needed.
 
 Registers and instructions are counted; times are arithmetic with them (`h200`). Nothing is measured here.
 """
@@ -67,7 +67,7 @@ def _settings(directions: int, accuracy: dict[str, Any]) -> Settings:
 
 
 def _plan(settings: Settings) -> dict[str, Any]:
-    """Return what a chain launches, and the times of its parts."""
+    """Return the launches of a chain, and the times of its parts."""
     sizes: dict[str, Any] = {}
 
     def steps(kernels: KernelSet) -> None:
@@ -134,7 +134,7 @@ def _transform_us(n_bytes: float) -> float:
 
 
 def _loops(plans: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the instructions of each main loop, for what one pass is for."""
+    """Return the instructions of each main loop, by the work of one pass."""
     rows = {row["kernel"]: row for plan in plans for row in plan["launches"] if row["kernel"] in h200.LOOPS}
     return [{"kernel": kernel, **_loop(h200.LOOPS[kernel], row["loop"])} for kernel, row in sorted(rows.items())]
 
@@ -193,7 +193,7 @@ def _launching_us(launch: compiling.Launch) -> float:
 
 
 def _ceiling(plan: dict[str, Any]) -> dict[str, Any]:
-    """Return what delay-and-sum would reach of the tighter ceiling: of samples from cache, or of multiply-adds."""
+    """Return the share of the tighter limit that delay-and-sum would reach: samples from cache, or multiply-adds."""
     row = next(row for row in plan["launches"] if row["kernel"] == "delay_and_sum_envelope.fill")
     gpu = h200.GPU
     lanes = 32 * gpu["schedulers"]

@@ -34,7 +34,7 @@ Counted in code for compute capability 9.0 ({made}). Times are arithmetic:
 
 
 def ptx(report: dict[str, Any]) -> str:
-    """Return the launches of each plan, the loops, the totals, and what all of it assumes."""
+    """Return the launches of each plan, the loops, the totals, and the assumptions."""
     parts = ["### Launches"]
     for plan in report["plans"]:
         parts += [_title(plan), _launches(plan)]

@@ -1,4 +1,4 @@
-"""What is lost when things go wrong: faults on the wire, pulled plugs, killed processes, full disks."""
+"""Losses under faults on the wire, pulled plugs, killed processes and full disks."""
 
 import os
 import subprocess
@@ -28,7 +28,7 @@ _DISK_MB = 20
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrialCounts:
-    """How much is tried.
+    """Numbers of trials.
 
     Attributes
     ----------

@@ -95,7 +95,7 @@ _ROWS = (
 
 
 def reliability(report: dict[str, Any]) -> str:
-    """Return what was tried and what became of it, with the seed that tries it again."""
+    """Return the trials and their results, with the seed that repeats them."""
     rows = [_row(texts, report[name]) for name, texts in _ROWS if name in report]
     options = [*(["--long"] if report["long"] else []), *(f"--only {name}" for name in report["only"])]
     made = " ".join(["ertis bench reliability", *options, f"--seed {report['seed']}"])

@@ -32,7 +32,7 @@ _BURST = 10
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tables:
-    """What the kernels of a chain are given, and the image that the processor makes of it.
+    """Arguments of the kernels of a chain, and the processor's image from them.
 
     Attributes
     ----------
@@ -109,7 +109,7 @@ def tables_of(settings: Settings, measurement: Measurement) -> Tables:
 
 @dataclass(frozen=True, slots=True)
 class Library:
-    """What libraries call differently. All else is written alike in all of them: slices, indices, sums, products."""
+    """Differences between libraries; slices, indices, sums and products are the same in all of them."""
 
     upload: Callable[[NDArray[Any]], Any]
     download: Callable[[Any, NDArray[Any]], None]
@@ -231,7 +231,7 @@ _MAKERS = {"CuPy": cupy_library, "PyTorch": torch_library}
 
 
 def is_installed(library: str) -> bool:
-    """Whether one of `LIBRARIES` can be imported."""
+    """Return True if one of `LIBRARIES` can be imported."""
     return importlib.util.find_spec(LIBRARIES[library]) is not None
 
 

@@ -1,4 +1,4 @@
-"""How the time grows with directions, ranges, microphones and threads, and how near the machine's ceilings it is."""
+"""Growth of the time with directions, ranges, microphones and threads, relative to the machine's limits."""
 
 import functools
 from collections.abc import Callable, Iterator
@@ -63,7 +63,7 @@ def run(*, count: int, say: Callable[[str], None]) -> dict[str, Any]:
 
 
 def _series() -> Iterator[tuple[str, str]]:
-    """Directions are varied with direct sums as well, since those tell what delay-and-sum reaches."""
+    """Yield the series. Directions are also varied without a beam grid, which shows the rate of delay-and-sum."""
     for series in (*SERIES, "threads"):
         for plan in [_DEFAULT, *_precisions()] if series == "directions" else [_DEFAULT]:
             yield series, plan
@@ -118,7 +118,7 @@ def _settings(plan: str, *, directions: float, last_range_m: float, microphones:
 
 
 def _ceilings(n_threads: int, count: int) -> dict[str, float]:
-    """Return the best of ``count`` runs: what the machine can do is not an average."""
+    """Return the best of ``count`` runs: a limit is not an average."""
     a, b, out = (np.ones(_STREAM, dtype=np.float32) for _ in range(3))
     n_strands = n_threads * _STRANDS_PER_THREAD
     strands = {"float32": np.empty(n_strands, dtype=np.float32), "int16": np.empty(n_strands, dtype=np.int32)}
@@ -143,10 +143,10 @@ def _ceilings(n_threads: int, count: int) -> dict[str, float]:
 
 
 def reached(rows: list[dict[str, Any]], precision: str, ceiling: dict[str, float]) -> dict[str, Any]:
-    """Return what delay-and-sum with envelope reaches of the ceilings.
+    """Return the share of the limits that delay-and-sum with envelope reaches.
 
-    Its time per direction is the slope of a line through the times over directions; what does not
-    depend on directions, the line's start, is the rest of the chain.
+    Its time per direction is the slope of a line through the times over directions; what does not depend on directions,
+    the line's start, is the rest of the chain.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What a simulated measurement costs with the effects that its scene calls for, and with all of them."""
+"""Cost of a simulated measurement with the relevant effects of its scene, and with all effects."""
 
 import functools
 from collections.abc import Callable

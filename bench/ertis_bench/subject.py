@@ -1,4 +1,4 @@
-"""What is processed in a benchmark."""
+"""Measurements for benchmarks."""
 
 import importlib.metadata
 from pathlib import Path
@@ -17,7 +17,7 @@ _DISTRIBUTION = "rtisdev"
 
 
 def measurement() -> tuple[Measurement, str]:
-    """Return a measurement of the default preset and what it is, for the report.
+    """Return a measurement of the default preset with its description for the report.
 
     It comes from data/synthetic; where this package runs without the repository around it, it is noise.
     """
@@ -28,7 +28,7 @@ def measurement() -> tuple[Measurement, str]:
 
 
 def real() -> tuple[Measurement, str] | None:
-    """Return the one measurement that the package rtisdev has of a room, and what it is; None where that is not.
+    """Return the only measurement of a room in the package rtisdev, with its description; None without the package.
 
     The package's code is not imported.
     """

@@ -52,7 +52,7 @@ _MEANING = {
 
 
 def update(path: Path, name: str, text: str) -> None:
-    """Replace what stands between the markers ``<!-- ertis bench NAME -->`` and its end in a file.
+    """Replace the text between the marker ``<!-- ertis bench NAME -->`` and its end in a file.
 
     Raises
     ------
@@ -105,7 +105,7 @@ def place(path: Path, command: str, parts: Sequence[str] = ()) -> tuple[str, str
 
 
 def paper(report: dict[str, Any]) -> str:
-    """Return the times, the ratios and the paper's own times, and what they include."""
+    """Return the times, the ratios and the paper's own times, with their conditions."""
     found = {(row["backend"], row["directions"]): row for row in report["rows"]}
     backends = list(dict.fromkeys(row["backend"] for row in report["rows"]))
     measured = [[_MEANING[backend], *(_spread(**found[backend, n]) for n in DIRECTIONS)] for backend in backends]
@@ -218,7 +218,7 @@ def _accuracy_conditions(report: dict[str, Any]) -> str:
 
 
 def scaling(report: dict[str, Any]) -> str:
-    """Return one table per series, the ceilings, and what is reached of them."""
+    """Return one table per series, the limits, and the reached shares."""
     series: dict[str, list[list[str]]] = {}
     for row in report["rows"]:
         sums = "" if row["plan"] == "default" else f", every own beam in {row['plan']}"
@@ -252,7 +252,7 @@ def scaling(report: dict[str, Any]) -> str:
 
 
 def simulation(report: dict[str, Any]) -> str:
-    """Return what a measurement takes with some effects and with all, and what each effect costs."""
+    """Return the duration of a measurement with some effects and with all, and the cost of each effect."""
     needed, everything = report["rows"]
     rows = [
         [row["effects"], f"{len(row['on'])}", _spread(**row), f"{1e3 / row['median_ms']:.1f}"]

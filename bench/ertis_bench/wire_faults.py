@@ -1,4 +1,4 @@
-"""Send blocks over a line with faults, and tell what the receiver made of them."""
+"""Blocks on a line with faults, and the receiver's results."""
 
 import zlib
 from collections import Counter
@@ -38,7 +38,7 @@ _KEPT: Final = 64  # emissions, as long as something of them may still be in the
 
 @dataclass(slots=True)
 class BlockReport:
-    """What became of all blocks.
+    """Results for all blocks.
 
     Attributes
     ----------
@@ -55,8 +55,8 @@ class BlockReport:
     twice : int
         Accepted again.
     altered : int
-        Accepted under their number with words of their own, but not all as they were sent: flipped in place, or as
-        many bytes lost as were added. Nothing in the frame tells; the check of the bits may.
+        Accepted under their number with words of their own, but not all as they were sent: flipped in place, or as many
+        bytes lost as were added. Nothing in the frame tells; the check of the bits may.
     lost, pending : int
         As the receiver counts them; ``pending`` with the bytes of what it holds.
     fed : int
@@ -135,7 +135,7 @@ class Wire:
                 self._now_s += len(piece) / self._bytes_per_s
 
     def finish(self) -> BlockReport:
-        """Return what became of all blocks; nothing is sent any more."""
+        """Return the results for all blocks; nothing is sent any more."""
         receiver, report = self._receiver, self.report
         self._take(receiver.finish())
         report.pending = receiver.pending + receiver.held * receiver.n_bytes
@@ -174,7 +174,7 @@ class Wire:
         self.report.untouched_lost += sent.untouched and not sent.delivered
 
     def _take(self, blocks: list[Block]) -> None:
-        """Compare what the receiver accepts with what was sent."""
+        """Compare accepted blocks with the sent ones."""
         report = self.report
         for block in blocks:
             words = block.data.astype("<u4").tobytes()
@@ -203,7 +203,7 @@ def send(
     bits: Callable[[NDArray[np.uint32]], str | None] | None = None,
     progress: Callable[[], object] | None = None,
 ) -> BlockReport:
-    """Send ``n_blocks`` over a line with faults and return what became of them.
+    """Send ``n_blocks`` over a line with faults and return the results.
 
     Parameters
     ----------
@@ -217,8 +217,8 @@ def send(
     kinds : mapping of str to float
         As `Faults` takes them.
     triggers : {"regular", "irregular", "at once"}
-        Every 50 ms; 40 ms apart and 50 ms more on average; all bytes without a moment between them, so that time
-        tells nothing.
+        Every 50 ms; 40 ms apart and 50 ms more on average; all bytes without a moment between them, so that time tells
+        nothing.
     deadline_s : float, optional
         Silence after which what has begun is given up; never by default.
     bits : callable, optional

@@ -62,8 +62,7 @@ class SensorTimeline:
         return cls(places, numbers, usual_s([time_steps[place].time_s for place in places]))
 
     def last(self, after: int, until: int) -> tuple[int, int] | None:
-        """Return index and number of the last measurement after one time step and up to another; None if there is none.
-        """
+        """Return index and number of the last measurement after one time step and up to another, or None."""
         index = bisect.bisect_right(self.places, until) - 1
         return (self.places[index], self.numbers[index]) if index >= 0 and self.places[index] > after else None
 

@@ -1,1 +1,1 @@
-"""What the network does to measurements: figures, faults, and the oracle that judges them."""
+"""Benchmarks of the network: figures, faults, and the oracle that verifies them."""

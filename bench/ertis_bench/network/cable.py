@@ -32,7 +32,7 @@ _QUEUE: Final = 2000  # packets under way; what does not fit is lost, as in any 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Weather:
-    """What a cable does to packets: shares that are lost, repeated and late, and how long all of them take."""
+    """Effects of a cable on packets: shares of lost, repeated and late ones, and the delay of all."""
 
     lose: float = 0.0
     repeat: float = 0.0
@@ -134,7 +134,7 @@ def _turned(addresses: tuple[str, str], number: int) -> tuple[str, str]:
 
 
 def _interface(host: str, name: str, own: str, other: str) -> int:
-    """Make an interface of a host, and return what carries its packets."""
+    """Create an interface of a host, and return the carrier of its packets."""
     end = os.open(_TUN, os.O_RDWR)
     try:
         fcntl.ioctl(end, _TUNSETIFF, struct.pack("16sH", name.encode(), _IFF_TUN | _IFF_NO_PI))

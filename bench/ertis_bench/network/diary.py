@@ -1,4 +1,4 @@
-"""Where a sender writes what it does; whatever ends it, what it wrote is there."""
+"""Diary of a sender, which survives any end of the sender."""
 
 import json
 import os
@@ -12,7 +12,7 @@ __all__ = ["Diary", "DiaryKey", "Row"]
 
 
 class DiaryKey(NamedTuple):
-    """Which measurement."""
+    """Key of a measurement."""
 
     sensor: str
     session_id: int
@@ -20,7 +20,7 @@ class DiaryKey(NamedTuple):
 
 
 class Row(NamedTuple):
-    """What must not change on the way."""
+    """Fields that must not change in transit."""
 
     crc32: int
     sync_count: int
@@ -34,7 +34,7 @@ class Row(NamedTuple):
 
 
 class Diary:
-    """Where a sender writes what it does, line by line.
+    """Diary of a sender, line by line.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ class Diary:
         self._write("kept", *key)
 
     def acked_through(self, sensor: str, session_id: int, acked_through: int, status: str, monotonic_ns: int) -> None:
-        """Write what the sender was told."""
+        """Write an acknowledgement to the diary."""
         self._write("acked_through", sensor, session_id, acked_through, status, monotonic_ns)
 
     def dropped(self, sensor: str, session_id: int, sequence: int, reason: str) -> None:

@@ -1,4 +1,4 @@
-"""What goes wrong in a network, and what becomes of it: killed nodes, bad disks, lost messages, strangers, overload."""
+"""Faults of a network and their consequences: killed nodes, bad disks, lost messages, unauthenticated peers, overload."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ __all__ = ["LONG", "PARTS", "SHORT", "NetworkFaultCounts", "run"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NetworkFaultCounts:
-    """How much is tried.
+    """Numbers of trials.
 
     Attributes
     ----------

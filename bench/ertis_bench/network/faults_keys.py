@@ -1,4 +1,4 @@
-"""Who gets in: every wrong key and role is tried at both addresses of a central node, beside the right ones."""
+"""Access control: every wrong key and role is tried at both addresses of a central node, beside the right ones."""
 
 import contextlib
 import time
@@ -46,7 +46,7 @@ class _Try:
     notes: list[str] = field(default_factory=list)
 
     def note_acked(self, message: Any) -> None:
-        """Note what is settled, and when."""
+        """Note an acknowledgement, with its time."""
         self.acked_through, self.acked_s = max(self.acked_through, message.acked_through), time.monotonic()
         self.diary.acked_through(
             message.sensor, message.session_id, message.acked_through, message.status, time.monotonic_ns()
@@ -72,8 +72,8 @@ def keys(folder: Path, *, seed: int) -> Found:
     -------
     dict
         ``let in``, names of those who got something in or out; ``refused``, as the central node counts them by reason;
-        ``notes``, what the refused nodes were reported; ``removed``, seconds from the removal of a key to the last ack to
-        its owner; and what is in the recordings, of the listed sensor only.
+        ``notes``, what the refused nodes were reported; ``removed``, seconds from the removal of a key to the last ack
+        to its owner; and what is in the recordings, of the listed sensor only.
     """
     archive, allowed = folder / "recordings", folder / "allow.toml"
     archive.mkdir()

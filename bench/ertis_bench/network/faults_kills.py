@@ -79,12 +79,12 @@ class RestartedRecorder:
 
 
 def tracebacks(folder: Path) -> int:
-    """Return how many there are in what processes of a harness have said."""
+    """Return the number of tracebacks in the output of a harness."""
     return sum(path.read_text(errors="replace").count("Traceback (most") for path in folder.glob("*.txt"))
 
 
 def judged(folder: Path, archive: Path, diaries: list[Path], *, kept: list[Path] | None = None) -> Found:
-    """Compare what was sent with what was stored.
+    """Compare the sent measurements with the stored ones.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def centrals(folder: Path, *, seed: int, count: int, rate_hz: float) -> Found:
 
 
 def _killed_itself(node: JsonLinesProcess) -> bool:
-    """Whether a central node has been killed before a line: it has ended, or was started again."""
+    """Return True if a central node was killed before a line: it has ended, or was started again."""
     return not node.running or node.restarts > 0
 
 
@@ -184,7 +184,7 @@ def nodes(folder: Path, *, seed: int, count: int) -> Found:
 
 
 def sealings(folder: Path, *, seed: int, count: int) -> Found:
-    """Kill what seals recordings while the central node goes on, and now and then the central node with it."""
+    """Kill sealing processes while the central node continues, and sometimes the central node with them."""
     rng = random.Random(seed)  # noqa: S311  as above
     record = RestartedRecorder(folder, "--rotate-size", "2")
     diary = folder / "sender.ndjson"

@@ -111,7 +111,7 @@ def _limit(process: JsonLinesProcess, max_bytes: int) -> None:
 
 
 def away(folder: Path, *, seed: int, away_s: float, how: str) -> Found:
-    """Stop a central node for a while, with what a ring in memory can hold in the meantime, and then with more.
+    """Stop a central node for a while: first within the capacity of a ring in memory, then beyond it.
 
     Parameters
     ----------

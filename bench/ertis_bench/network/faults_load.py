@@ -31,7 +31,7 @@ def overload(folder: Path, *, seed: int, duration_s: float) -> Found:
 
 
 def _published(folder: Path, job: SenderJob, *, duration_s: float) -> Found:
-    """Send for a while, and add up what became of it."""
+    """Send for a while, and sum up the results."""
     folder.mkdir()
     diary, warm, images = folder / "sender.ndjson", folder / "warm.ndjson", folder / "images.ndjson"
     with ExitStack() as stack:

@@ -1,4 +1,4 @@
-"""Who ought not to get in, and what ought not to be understood: keys, hostile connections, malformed headers."""
+"""Peers and messages to refuse: keys, hostile connections, malformed headers."""
 
 import contextlib
 import random
@@ -124,7 +124,7 @@ def hostile(folder: Path, *, seed: int, count: int, rate_hz: float = 20.0) -> Fo
 
 
 def record_ended(node: JsonLinesProcess, record: RestartedRecorder) -> Found:
-    """Let a central node end, and look for what it has left."""
+    """Stop a central node, and check its remains."""
     return {"exit code": node.stop()} | record.finish([])
 
 

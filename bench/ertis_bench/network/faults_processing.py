@@ -1,4 +1,4 @@
-"""What goes wrong where images are made: workers that die, pulses that are lost, clocks that are wrong."""
+"""Faults of image processing: dying workers, lost pulses, wrong clocks."""
 
 import os
 import random
@@ -28,7 +28,7 @@ Found = dict[str, Any]
 
 
 def workers(folder: Path, *, seed: int, count: int) -> Found:
-    """Kill workers at random moments, while a central node stores and makes images of what two sensors send."""
+    """Kill workers at random times, while a central node stores and processes the measurements of two sensors."""
     rng = random.Random(seed)  # noqa: S311  a seed is to give the same moments again
     archive, diary, images = folder / "recordings", folder / "sender.ndjson", folder / "images.ndjson"
     archive.mkdir()

@@ -1,4 +1,4 @@
-"""What a central node does on this machine: stores, makes images, and is given too much to do; with keys."""
+"""Performance of a central node on this machine: storage, processing, overload; with keys."""
 
 import tempfile
 import time
@@ -67,7 +67,7 @@ def run(
 
 
 def _keys(folder: Path, sensors: Sequence[str]) -> tuple[list[str], Keys, ClientKeys]:
-    """Make keys, and return options of a central node, what a sensor or an application is told, and an admin's."""
+    """Create keys, and return options of a central node, those of a sensor or an application, and an admin's."""
     pairs = {name: KeyPair.new(name) for name in ("central", "node", "boss")}
     secret = {name: pair.save(folder / "keys")[0] for name, pair in pairs.items()}
     allowed = (
@@ -85,7 +85,7 @@ def _shared(sensors: Sequence[str], n_senders: int) -> list[tuple[str, ...]]:
 
 
 class _Load:
-    """Processor time of processes, and of what they have started."""
+    """Processor time of processes and of their children."""
 
     def __init__(self, **processes: list[int]) -> None:
         self._pids = processes
@@ -105,7 +105,7 @@ def _cpu_s(pids: Sequence[int]) -> float:
 def storage(
     folder: Path, duration_s: float, seed: int, *, n_sensors: int = 8, rate_hz: float = 20.0, n_senders: int = _SENDERS
 ) -> Found:
-    """Store what sensors send, and read all of it again."""
+    """Store the measurements of sensors, and read all of them again."""
     sensors = [f"sensor-{number + 1}" for number in range(n_sensors)]
     options, given, _ = _keys(folder, sensors)
     archive, mark = folder / "recordings", f"storage{time.monotonic_ns()}"
@@ -171,7 +171,7 @@ def processing(
     credit: int = 2,
     scheduler: str | None = None,
 ) -> Found:
-    """Make images of what sensors send, here or on a dask cluster, and compare them in an application."""
+    """Process the measurements of sensors, here or on a dask cluster, and compare the images in an application."""
     sensors = [f"sensor-{number + 1}" for number in range(n_sensors)]
     options, given, boss = _keys(folder, sensors)
     if scheduler is not None:
@@ -243,7 +243,7 @@ def processing(
 
 
 def _since(begun: Found, found: Found) -> Found:
-    """Return accounts without what was there before pipelines were made; faults count all the same."""
+    """Return counts without those from before pipelines were created; faults count all the same."""
     since = {name: found[name] - begun[name] for name in ("sent", "received", "published", "images", "skipped")}
     dropped = {name: count - begun["dropped"].get(name, 0) for name, count in found["dropped"].items()}
     return found | since | {"dropped": {name: count for name, count in dropped.items() if count}}

@@ -85,7 +85,7 @@ def _spread(given: list[HostileHello], count: int | None) -> list[HostileHello]:
 
 
 def _refused(address: str, given: Sequence[HostileHello]) -> list[Found]:
-    """Send hellos, one after the other, and return what became of each."""
+    """Send hellos, one after the other, and return the result of each."""
     found: list[Found] = []
     with ZmtpPeer(address, timeout_s=_WAIT_S) as peer:
         for hello in given:

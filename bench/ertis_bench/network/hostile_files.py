@@ -204,7 +204,7 @@ def _types(name: str) -> Iterator[HostileFile]:
 
 
 def _unwritten(*names: str) -> Callable[[h5py.File, Path], None]:
-    """Return what makes rows that no chunk holds."""
+    """Return a function that creates rows without chunks."""
 
     def spoil(file: h5py.File, _: Path) -> None:
         for name in names:
@@ -214,7 +214,7 @@ def _unwritten(*names: str) -> Callable[[h5py.File, Path], None]:
 
 
 def _flat(name: str, shape: tuple[int, ...]) -> Callable[[h5py.File, Path], None]:
-    """Return what makes a variable of a shape, none of which is written."""
+    """Return a function that creates a variable of a shape without writing it."""
 
     def spoil(file: h5py.File, _: Path) -> None:
         dtype = file[f"{_GROUP}/{name}"].dtype

@@ -36,7 +36,7 @@ class _Read(NamedTuple):
 
 
 def main() -> None:
-    """Try the files and print what was found, as JSON."""
+    """Try the files and print the results as JSON."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--count", type=int)
@@ -56,7 +56,7 @@ def main() -> None:
 
 
 def _warm(good: Path, folder: Path) -> None:
-    """See that the good file is taken; what commands load lazily stays out of the parent."""
+    """Check that the good file is accepted; lazily loaded modules stay out of the parent."""
     for command in ("verify", "info"):
         read = _read(command, good, folder)
         if read.code:

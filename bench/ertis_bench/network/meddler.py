@@ -21,7 +21,7 @@ _SHARE_OF_HEAD: Final = 0.25
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Odds:
-    """What becomes of a kind of message: the share that is lost, repeated, and delayed, by up to ``max_s``."""
+    """Effects on a kind of message: shares that are lost, repeated, and delayed, by up to ``max_s``."""
 
     lose: float = 0.0
     repeat: float = 0.0
@@ -34,7 +34,7 @@ ACKS: Final = {"ack": Odds(lose=0.25, repeat=0.25, delay=0.25), "welcome": Odds(
 
 
 class Meddler:
-    """Passes on what goes to and from an address, or not; use it in a ``with`` statement.
+    """Proxy of an address that loses, repeats and delays messages; use it in a ``with`` statement.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ class Meddler:
         self._plugged.clear()
 
     def mend(self) -> None:
-        """Pass on what has waited, and what comes."""
+        """Forward waiting and later messages without faults."""
         self._plugged.set()
 
     def drop(self) -> None:
@@ -182,7 +182,7 @@ def _later(delay_s: float, sink: socket.socket, data: bytes, turn: threading.Loc
 
 
 def _send(sink: socket.socket, data: bytes, turn: threading.Lock) -> None:
-    """Send in one piece; what cannot be sent any more is lost."""
+    """Send in one piece; messages that cannot be sent any more are lost."""
     if not data:
         return
     with turn, contextlib.suppress(OSError):

@@ -1,8 +1,8 @@
-"""What was sent, by the senders' own logs, against what readers of recordings return.
+"""Comparison of the sent measurements, from the senders' logs, with those that readers of recordings return.
 
 A sender writes a line before and after it hands a measurement over, and whenever it is told what is settled. The file
-is opened to append, so that it holds what was written whatever ends the sender. Nothing here knows of journals, acks
-or ledgers: the words of every measurement are read by `open_recording`, and their CRC-32 is made anew.
+is opened to append, so that it holds what was written whatever ends the sender. Nothing here knows of journals, acks or
+ledgers: the words of every measurement are read by `open_recording`, and their CRC-32 is made anew.
 """
 
 import json
@@ -25,7 +25,7 @@ _UNTOLD: Final = "not among the measurements given"  # what a recording says of 
 
 @dataclass(slots=True)
 class Sent:
-    """What senders say.
+    """Measurements in the senders' diaries.
 
     Attributes
     ----------
@@ -62,7 +62,7 @@ class Sent:
 
 
 def read_diaries(paths: Iterable[Path]) -> Sent:
-    """Return what senders have written; a last line that was cut short is none."""
+    """Return the content of the senders' diaries, without a truncated last line."""
     sent = Sent()
     for path in paths:
         for line in path.read_bytes().splitlines(keepends=True):
@@ -94,7 +94,7 @@ def note(sent: Sent, what: str, sensor: str, session_id: int, number: int, *rest
 
 @dataclass(slots=True)
 class Archived:
-    """What is in the recordings of a folder.
+    """Content of the recordings in a folder.
 
     Attributes
     ----------
@@ -150,7 +150,7 @@ def _measurements(path: Path, found: Archived) -> Iterator[tuple[str, Measuremen
 
 
 def compare(sent: Sent, archived: Archived, promised: AbstractSet[DiaryKey]) -> dict[str, int]:
-    """Say what is wrong.
+    """Return the differences.
 
     Parameters
     ----------
@@ -164,8 +164,8 @@ def compare(sent: Sent, archived: Archived, promised: AbstractSet[DiaryKey]) -> 
     dict of str to int
         ``promised`` and ``stored``. Then what ought to be 0: of what was promised, ``lost`` without a word, and
         ``missing`` with a reason reported; ``wrong``, with other words or another time than were sent; ``twice``;
-        ``unexpected``, never sent; ``silent``, numbers below the highest of a run that neither are there nor told to
-        be missing; ``broken`` recordings; files ``left_over``.
+        ``unexpected``, never sent; ``silent``, numbers below the highest of a run that neither are there nor told to be
+        missing; ``broken`` recordings; files ``left_over``.
     """
     rows = archived.rows
     absent = {key: archived.reason(key) for key in promised if key not in rows}

@@ -28,7 +28,7 @@ Event = dict[str, Any]
 
 
 class JsonLinesProcess:
-    """A process that tells what happens by lines of JSON on stdout; use it in a ``with`` statement.
+    """A process that reports events as lines of JSON on stdout; use it in a ``with`` statement.
 
     Parameters
     ----------
@@ -144,7 +144,7 @@ class JsonLinesProcess:
 
     @property
     def running(self) -> bool:
-        """Whether it has not ended."""
+        """True until it has ended."""
         return self._process.poll() is None
 
     @property
@@ -161,7 +161,7 @@ class JsonLinesProcess:
 
     @property
     def memory_bytes(self) -> int:
-        """What it holds in memory; 0 where that cannot be told."""
+        """Resident memory; 0 if unknown."""
         try:
             pages = Path(f"/proc/{self.node_pid}/statm").read_text("ascii").split()[1]
         except (OSError, IndexError):
@@ -200,7 +200,7 @@ def central(
     max_lines: int | None = None,
     busy: bool = False,
 ) -> JsonLinesProcess:
-    """Start ``ertis record`` or ``ertis serve``, which says on ``central.txt`` in a folder what is wrong.
+    """Start ``ertis record`` or ``ertis serve``, with errors in ``central.txt`` of a folder.
 
     Parameters
     ----------
@@ -235,7 +235,7 @@ def ask(*arguments: str) -> "subprocess.CompletedProcess[str]":
 
 
 def survivors(mark: str) -> dict[int, str]:
-    """Return the processes that have a mark, or were started by such, with what they run; Linux only."""
+    """Return the processes with a mark, and their children, with their command lines; Linux only."""
     found = {}
     wanted = f"{_MARK}={mark}".encode()
     for folder in Path("/proc").glob("[0-9]*"):

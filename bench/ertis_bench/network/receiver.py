@@ -29,7 +29,7 @@ _TOLERANCE: Final = 0.1  # of the largest value: each process chooses its own pl
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReceiverJob:
-    """What a receiver is to do.
+    """Options of a receiver.
 
     Attributes
     ----------
@@ -56,14 +56,14 @@ class ReceiverJob:
         return replace(self, **changes)
 
     def start(self, *, mark: str = "") -> JsonLinesProcess:
-        """Start it; what it says on stderr stands beside its diary."""
+        """Start it; its stderr goes to a file beside its diary."""
         command = [sys.executable, "-m", "ertis_bench.network.receiver", json.dumps(asdict(self))]
         return JsonLinesProcess(command, stated=Path(self.diary).with_suffix(".txt"), mark=mark)
 
 
 @dataclass(slots=True)
 class Received:
-    """What a receiver has written.
+    """Results of a receiver.
 
     Attributes
     ----------
@@ -91,7 +91,7 @@ class Received:
 
 
 def read_received(path: Path) -> Received:
-    """Return what a receiver has written."""
+    """Return the results of a receiver."""
     found = Received()
     for line in path.read_bytes().splitlines(keepends=True) if path.exists() else ():
         if not line.endswith(b"\n"):
@@ -118,7 +118,7 @@ class _Expected:
             return cls(loaded["values"], tuple(loaded["shape"].tolist()))
 
     def spoilt(self, image: Energyscape) -> bool:
-        """Whether an image is not that of its measurement."""
+        """Return True if an image does not match its measurement."""
         if image.amplitude.shape != self.shape:
             return True
         number = image.stamp.sequence % len(self.values)

@@ -42,7 +42,7 @@ _SYNC_OF_FIRST: Final = 1000
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SenderJob:
-    """What a sender is to do.
+    """Options of a sender.
 
     Attributes
     ----------
@@ -107,11 +107,11 @@ class SenderJob:
         return pulse - missed + (self.double_pulse is not None and pulse >= self.double_pulse)
 
     def command(self) -> list[str]:
-        """Return what runs it."""
+        """Return the command that runs it."""
         return [sys.executable, "-m", "ertis_bench.network.sender", json.dumps(asdict(self))]
 
     def start(self, *, mark: str = "") -> JsonLinesProcess:
-        """Start it; what it says on stderr stands beside its diary."""
+        """Start it; its stderr goes to a file beside its diary."""
         return JsonLinesProcess(self.command(), stated=Path(self.diary).with_suffix(".txt"), mark=mark)
 
 
@@ -133,7 +133,7 @@ class _Sender:
     reported: Counter[str] = field(default_factory=Counter)
 
     def acked_through(self, message: Any) -> None:
-        """Note what the node tells to be settled."""
+        """Note an acknowledgement of the node."""
         now_ns = time.monotonic_ns()
         self.diary.acked_through(message.sensor, message.session_id, message.acked_through, message.status, now_ns)
         for sequence, reason in message.dropped:
@@ -141,7 +141,7 @@ class _Sender:
             self.reported[reason] += 1
 
     def note(self, *texts: str) -> None:
-        """Tell what the node tells."""
+        """Report a note of the node."""
         _emit_event(event="note", text=": ".join(texts))
 
     def run(self, node: SensorNode) -> int:

@@ -1,4 +1,4 @@
-"""A central node that makes images: what it says of itself, and whether that adds up to what has come."""
+"""A central node that processes images: its status, and a check of its sums."""
 
 import os
 import time
@@ -53,7 +53,7 @@ def percentile(times_ms: Sequence[float], share: float) -> float:
 
 @dataclass(slots=True)
 class Serve:
-    """``ertis serve``, and what it says of itself meanwhile; use it in a ``with`` statement of `running`.
+    """``ertis serve`` with its output; use it in a ``with`` statement of `running`.
 
     Attributes
     ----------
@@ -107,7 +107,7 @@ class Serve:
 
 
 def accounts(serve: Serve, sent: Sent, received: Received) -> Found:
-    """Add up what became of all measurements.
+    """Sum up the results of all measurements.
 
     Returns
     -------

@@ -152,7 +152,7 @@ ROWS: Final[dict[str, tuple[str, str, str]]] = {
 
 
 def network_faults(report: dict[str, Any]) -> str:
-    """Return what was tried and what became of it, with the seed that tries it again."""
+    """Return the trials and their results, with the seed that repeats them."""
     rows = [row(name, report[name]) for name in ROWS if name in report]
     options = [*(["--long"] if report["long"] else []), *(f"--only {name}" for name in report["only"])]
     made = " ".join(["ertis bench network-faults", *options, f"--seed {report['seed']}"])
@@ -160,7 +160,7 @@ def network_faults(report: dict[str, Any]) -> str:
 
 
 def row(name: str, found: Mapping[str, Any] | None) -> tuple[str, str, str]:
-    """Return what was tried, wanted and found in one of the parts; None where it could not be tried."""
+    """Return trials, limits and results of one part; None if it could not be tried."""
     tried, wanted, became = ROWS[name]
     if found is None:
         return tried.partition(",")[0].partition("{")[0].rstrip(), wanted, _NOT_HERE
@@ -181,7 +181,7 @@ def _all(found: Any) -> str:
 
 
 def network(report: dict[str, Any]) -> str:
-    """Return what a central node does on this machine, beside what it ought to."""
+    """Return the performance of a central node on this machine, beside its targets."""
     rows = [(row["what"], row["goal"], row["found"]) for row in map(_figure, report["rows"])]
     return "\n\n".join(
         [

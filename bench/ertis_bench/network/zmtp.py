@@ -1,4 +1,4 @@
-"""ZeroMQ's own protocol (ZMTP 3.1, without keys) over plain sockets, to say what no honest node would.
+"""ZeroMQ's own protocol (ZMTP 3.1, without keys) over plain sockets, for messages that no honest node sends.
 
 It is written after https://rfc.zeromq.org/spec/37, and shares nothing with what is tested.
 """
@@ -31,12 +31,12 @@ class ZmtpFrame(NamedTuple):
 
     @property
     def more(self) -> bool:
-        """Whether another frame of the same message follows."""
+        """True if another frame of the same message follows."""
         return bool(self.flags & _MORE)
 
     @property
     def is_command(self) -> bool:
-        """Whether it is between the sockets only."""
+        """True for a command between sockets."""
         return bool(self.flags & _COMMAND)
 
     def encode(self) -> bytes:
@@ -137,7 +137,7 @@ class ZmtpPeer:
         self.socket.sendall(b"".join(map(message, messages)))
 
     def receive(self) -> list[bytes]:
-        """Return the next message; what sockets say to each other is answered."""
+        """Return the next message; commands between sockets are answered."""
         body: list[bytes] = []
         while True:
             while self._came:

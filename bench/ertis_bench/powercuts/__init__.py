@@ -1,4 +1,4 @@
-"""Power cuts: disks as they may look after one, and what recovery makes of them."""
+"""Power cuts: possible states of disks after one, and their recovery."""
 
 from ertis_bench.powercuts.trial import SCENARIOS, reason_not_to_try, try_cuts
 

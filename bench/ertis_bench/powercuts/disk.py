@@ -29,14 +29,14 @@ class _FileState:
     """Time, offset and data; without data, a truncation."""
 
     def sync(self, before: int) -> None:
-        """Make durable what was written before a time."""
+        """Make data durable that was written before a time."""
         for time, offset, data in self.pending:
             if time < before:
                 _apply(self.durable, offset, data)
         self.pending = [each for each in self.pending if each[0] >= before]
 
     def fail(self, before: int) -> None:
-        """Lose what was written before a time."""
+        """Lose data that was written before a time."""
         self.pending = [each for each in self.pending if each[0] >= before or each[2] is None]
 
     def after_cut(self, rng: random.Random) -> bytearray:
@@ -183,7 +183,7 @@ class Disk:
             names.add(change)
 
     def cut(self, target: Path, rng: random.Random) -> None:
-        """Write into a new folder what a power cut at this moment may leave."""
+        """Write a possible state of the disk after a power cut into a new folder."""
         order: Order = rng.choice(("any", "journal"))
         names = self._names[order].after_cut(rng)
         target.mkdir()

@@ -1,4 +1,4 @@
-"""The log of what reached a file system, written by a library that is loaded into the commands."""
+"""Log of the operations that reach a file system, written by a library preloaded into the commands."""
 
 import os
 import shutil

@@ -1,4 +1,4 @@
-"""Recovery of a disk after a power cut, by what the commands call, and a comparison with what was acknowledged."""
+"""Recovery of a disk after a power cut, with the functions of the commands, and comparison with the acknowledged data."""
 
 import random
 import zlib
@@ -26,7 +26,7 @@ _SPOOL_RING_BYTES = 1  # everything is read from the disk
 
 
 def recover_capture(disk: Path, sent: Sent, sent_crc32: AbstractSet[int] | None, *, by_command: bool) -> Found:
-    """Recover a capture by what ``ertis recover`` does."""
+    """Recover a capture as ``ertis recover`` does."""
     failed = _recover(disk, by_command=by_command)
     archived = _read(disk)
     found = compare(sent, archived, sent.kept)
@@ -60,14 +60,14 @@ def recover_archive(disk: Path, sent: Sent, rng: random.Random, *, by_command: b
 
 
 def _read(folder: Path) -> Archived:
-    """Read recordings; of what else is there, only a journal ought to be gone."""
+    """Read recordings; of the other files, only a journal may be missing."""
     archived = read_folder(folder)
     archived.left_over = [name for name in archived.left_over if name.endswith(SUFFIX)]
     return archived
 
 
 def _start(folder: Path) -> tuple[int, dict[SensorSession, int]]:
-    """Take a folder up as a central node does, and return how many errors there were and what it knows of runs."""
+    """Open a folder as a central node does, and return the number of errors and the sessions that it knows."""
     try:
         journal_store = JournalStore(folder, "recording", Ledger(folder), lambda _: None)
         acked_through = dict(journal_store.acked_through)

@@ -1,4 +1,4 @@
-"""Power cuts at random moments of commands, and what becomes of what they had acknowledged."""
+"""Power cuts at random times of commands, and the fate of acknowledged measurements."""
 
 import random
 import shutil
@@ -118,7 +118,7 @@ def _cut(
     say: Callable[[str], None],
     keep: Path | None,
 ) -> None:
-    """Cut the power at moments of a run, recover, and count what is wrong."""
+    """Cut the power at several times of a run, recover, and count errors."""
     records = list(logs.read(trace.setting.log))
     acks = [place for place, record in enumerate(records) if record.kind is logs.DiskOperation.ACK]
     found["failed_syncs"] += sum(record.kind is logs.DiskOperation.SYNC_FAIL for record in records)
