@@ -110,9 +110,7 @@ def _waits_s(plugged_ns: list[int], stored_ns: list[int]) -> list[float]:
 
 
 def kills(source: Path, folder: Path, *, seed: int, count: int) -> Line:
-    """Kill captures at random times, recover their journals, and report measurements that were reported but are
-    missing.
-    """
+    """Kill captures at random times, recover their journals, and count lost measurements among the reported ones."""
     random_ = random.Random(seed)  # noqa: S311  as above
     reported = lost = wrong = unreadable = 0
     moments: Counter[str] = Counter()

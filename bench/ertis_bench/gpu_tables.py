@@ -159,8 +159,8 @@ def _machine(report: dict[str, Any]) -> str:
     packages = ", ".join(f"{name} {value}" for name, value in card["packages"].items())
     return (
         f"Measured on {card['name']} ({card['multiprocessors']} multiprocessors, compute capability "
-        f"{card['compute_capability']}; {', '.join(reported)}) beside {host['cpu']}, {host['cores']} cores; {packages}, "
-        f"numba {host['numba']}, python {host['python']}."
+        f"{card['compute_capability']}; {', '.join(reported)}) beside {host['cpu']}, {host['cores']} cores; {packages}"
+        f", numba {host['numba']}, python {host['python']}."
     )
 
 

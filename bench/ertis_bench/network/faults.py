@@ -1,4 +1,4 @@
-"""Faults of a network and their consequences: killed nodes, bad disks, lost messages, unauthenticated peers, overload."""
+"""Faults of a network and their consequences: killed nodes, bad disks, lost messages, hostile peers, overload."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Recovery of a disk after a power cut, with the functions of the commands, and comparison with the acknowledged data."""
+"""Recovery of a disk after a power cut with the commands' functions, and comparison with acknowledged data."""
 
 import random
 import zlib
