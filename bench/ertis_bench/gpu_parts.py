@@ -218,8 +218,8 @@ def _checked(plain: Pipeline, recorded: Pipeline, measurement: Measurement) -> d
     wanted_db = _SAME_DB if plain.settings.accuracy.precision == "float32" else _SAME_16_DB
     if not difference_db <= wanted_db:
         raise DataError(
-            f"image of {len(image.amplitude)} directions on 'cuda' is {difference_db:.1f} dB off that on 'cpu'; the limit "
-            f"is {wanted_db:g} dB: the times would be those of a wrong result"
+            f"image of {len(image.amplitude)} directions on 'cuda' is {difference_db:.1f} dB off that on 'cpu'; the "
+            f"limit is {wanted_db:g} dB: the times would be those of a wrong result"
         )
     return {"error_db": round(error_db, 1), "off_cpu_db": round(difference_db, 1)}
 
