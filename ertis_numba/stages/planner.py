@@ -1,4 +1,4 @@
-"""The cheapest plan whose predicted error keeps a budget."""
+"""Planner: the fastest plan whose predicted error stays within a budget."""
 
 import math
 from collections.abc import Sequence
@@ -21,22 +21,23 @@ from ertis_numba.stages.wavefronts import with_wavefront
 
 __all__ = ["Chosen", "Planner", "complete"]
 
-_USUAL_BYTES = 2**31  # of a plan's signals and delays; larger plans are considered only where no other will do
-_ROUNDED = 1 + 1e-9  # a plan must keep the budget that it was chosen for when it is given back
+_USUAL_BYTES = 2**31  # Memory of a plan's signals and delays. Larger plans are considered only if no smaller one fits.
+_ROUNDED = 1 + 1e-9  # Tolerance, so that a chosen plan meets its own budget when it is read from settings again.
 _ROUNDED_DB = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
 class Chosen:
-    """A plan, and what is expected of it.
+    """Complete plan with its predicted error and time.
 
     Attributes
     ----------
     settings : Settings
-        Their accuracy leaves nothing open.
+        Settings with complete accuracy values.
     parts : dict of str to float
-        Power of each part of the error by that of the exact image; see `accuracy.PARTS`.
+        Error power of each step, relative to the exact image; see `accuracy.PARTS`.
     stages_ms : dict of str to float
+        Predicted time of each stage, in milliseconds.
     """
 
     settings: Settings
@@ -45,22 +46,31 @@ class Chosen:
 
     @property
     def error_db(self) -> float:
-        """Predicted error of the image."""
+        """Predicted error of the image, in decibels relative to the exact image."""
         return decibels(sum(self.parts.values()))
 
     @property
     def time_ms(self) -> float:
-        """Predicted time of one measurement."""
+        """Predicted time of one measurement, in milliseconds."""
         return sum(self.stages_ms.values())
 
 
 def complete(settings: Settings, kernels: KernelSet, *, threads: int, max_bytes: int | None = None) -> Settings:
-    """Return settings whose accuracy and wavefront leave nothing open; see `Planner.choose`.
+    """Return settings with complete accuracy values and a chosen wavefront; see `Planner.choose`.
+
+    Parameters
+    ----------
+    settings : Settings
+    kernels : KernelSet
+    threads : int
+        Number of threads.
+    max_bytes : int, optional
+        Limit on the memory of a plan's signals and delays.
 
     Raises
     ------
     ArgumentError
-        No plan keeps the budget, or the one that is given does not.
+        No plan meets the error budget, or the given plan does not.
     """
     if settings.processing.method == "paper":
         return settings
@@ -71,16 +81,17 @@ def complete(settings: Settings, kernels: KernelSet, *, threads: int, max_bytes:
 
 
 class Planner:
-    """Plans for one kind of measurement on one device.
+    """Planner for one kind of measurement on one device.
 
     Parameters
     ----------
     settings : Settings
-        What their accuracy does not leave open is kept to.
+        Settings to complete. The planner keeps all accuracy values that they contain.
     kernels : KernelSet
     threads : int
-    signal_model : Texture, optional
-        Of what is heard; what errs on the safe side by default.
+        Number of threads for which times are predicted.
+    signal_model : SignalModel, optional
+        Measured signal model; safe values by default.
     max_bytes : int, optional
         Limit on the memory of a plan's signals and delays.
     sensitivity : Sensitivity, optional
@@ -89,7 +100,7 @@ class Planner:
     Raises
     ------
     DeviceError
-        16 bits are asked for, and the device has no dot product for them.
+        ``accuracy.precision`` is ``"int16"``, and the device has no 16-bit dot product.
     """
 
     def __init__(
@@ -115,13 +126,13 @@ class Planner:
 
     @property
     def model(self) -> ErrorModel:
-        """Model of the errors of each step."""
+        """Error model of the processing steps."""
         return self._plans.errors
 
     def _rated(
         self, plans: Sequence[ImagePlan], sizes: Sequence[int], smallest: int, largest: int
     ) -> list[tuple[ImagePlan, dict[str, float]]]:
-        """Return plans that need ``smallest`` to ``largest`` bytes, with the parts of their errors."""
+        """Return plans that need ``smallest`` to ``largest`` bytes, with the error power of each step."""
         return [
             (plan, self._plans.parts(plan))
             for plan, size in zip(plans, sizes, strict=True)
@@ -129,17 +140,18 @@ class Planner:
         ]
 
     def choose(self) -> Chosen:
-        """Return the cheapest plan that keeps the budget.
+        """Return the fastest plan that meets the error budget.
 
         Raises
         ------
         ArgumentError
-            None does; the message has the best there is.
+            No plan meets the budget or fits into memory. The message states the error of the best plan, or the size of
+            the smallest.
         """
         wanted_db = self.settings.accuracy.max_error_db
         allowed = 10 ** (wanted_db / 10) * _ROUNDED
-        # Where no plan is exact enough for an adaptive beamformer's image, the best one is taken, and the budget is
-        # that of the beams; see `ertis_numba.prediction` for the warning.
+        # If no plan is accurate enough for the image of an adaptive beamformer, the best one is chosen, and the budget
+        # applies to its delay-and-sum beams; see `ertis_numba.prediction` for the warning.
         budget = self._sensitivity.beams(allowed)
         with one_thread():
             plans = open_plans(self._plans, budget, has_int16=bool(self._kernels.tile_ranges))
@@ -147,7 +159,7 @@ class Planner:
             limit = _USUAL_BYTES if self._max_bytes is None else self._max_bytes
             rated = self._rated(plans, sizes, 0, limit)
             within = [plan for plan, parts in rated if sum(parts.values()) <= budget]
-            # The usual limit comes first, so that the plan depends on a machine's memory only where it must.
+            # The usual limit comes first, so the plan depends on the memory of the machine only if it must.
             if not within and self._max_bytes is None and max(sizes) > limit:
                 usual, limit = limit, max(limit, available_bytes())
                 rated += self._rated(plans, sizes, usual + 1, limit)
@@ -157,11 +169,11 @@ class Planner:
             has = "this machine has available" if measured else "the limit is"
             raise ArgumentError(
                 f"no plan fits into memory: the smallest needs {min(sizes) / 1e6:.0f} MB, {has} {limit / 1e6:.0f} MB. "
-                "Give a later or shorter processing.range_m, fewer directions or "
-                "microphones, or less of accuracy.oversampling or accuracy.focal_zones"
+                "Shorten processing.range_m or start it at a larger range, give fewer directions or microphones, or "
+                "give a lower accuracy.oversampling or accuracy.focal_zones"
             )
         if within:
-            # By the costs of all threads whatever their number now, so that it does not decide about the plan.
+            # The costs are those of all threads, so the choice does not depend on the current number of threads.
             costs = costs_of(self._kernels, self._kernels.max_threads) if len(within) > 1 else None
             cheapest = min(within, key=lambda plan: self._time(plan, costs)) if costs else within[0]
             return self.chosen(self._accuracy(cheapest))
@@ -169,15 +181,15 @@ class Planner:
         if budget < sum(parts.values()) <= allowed:
             return self.chosen(self._accuracy(plan))
         best = self.chosen(self._accuracy(plan))
-        memory = f", others do not fit into {limit / 1e6:.0f} MB of memory" if len(rated) < len(plans) else ""
-        wider = f"give {math.ceil(best.error_db)} or more, or " if best.error_db <= 0 else ""
+        memory = f"; other plans do not fit into {limit / 1e6:.0f} MB of memory" if len(rated) < len(plans) else ""
+        wider = f"set it to {math.ceil(best.error_db)} or higher, or " if best.error_db <= 0 else ""
         raise ArgumentError(
-            f"accuracy.max_error_db is {wanted_db:g}, and the best that these settings can is {best.error_db:.1f} "
-            f"({_worst(best)}{memory}); {wider}leave more of [accuracy] open"
+            f"accuracy.max_error_db is {wanted_db:g}, but the best plan for these settings has a predicted error of "
+            f"{best.error_db:.1f} dB ({_worst(best)}{memory}); {wider}fix fewer values in [accuracy]"
         )
 
     def chosen(self, accuracy: Accuracy) -> Chosen:
-        """Return what is expected of a complete plan."""
+        """Return a complete plan with its predicted error and time."""
         stages_ms = costs_of(self._kernels, self._threads).stages_ms(self._plans.work(plan_of(accuracy)))
         return Chosen(self.settings.replace(accuracy=accuracy), self._image_parts(accuracy), stages_ms)
 
@@ -187,13 +199,13 @@ class Planner:
             return self._plans.parts(plan_of(accuracy))
 
     def error_db(self, accuracy: Accuracy) -> float:
-        """Return the predicted error of the image for a complete plan."""
+        """Return the predicted image error of a complete plan, in decibels."""
         return decibels(sum(self._image_parts(accuracy).values()))
 
     def keeps_budget_of_images(self, accuracy: Accuracy) -> bool:
-        """Return False if a complete plan of an adaptive beamformer keeps the budget for delay-and-sum beams only.
+        """Return False if a complete plan of an adaptive beamformer meets the budget for delay-and-sum beams only.
 
-        The answer holds for any sound: it depends neither on the texture nor on the sensitivity of this planner.
+        The answer holds for any sound: it depends neither on the signal model nor on the sensitivity of this planner.
         """
         if self.settings.processing.beamformer == "delay_and_sum":
             return True
@@ -222,10 +234,10 @@ class Planner:
 
     @property
     def costs_file(self) -> Path:
-        """Where the costs are kept that predict times; taken away, they are measured again."""
+        """Path of the cached costs that predict times; delete the file to measure them again."""
         return cache_file(self._kernels.device, self._threads, self._kernels.hardware)
 
 
 def _worst(chosen: Chosen) -> str:
     name = max(chosen.parts, key=lambda part: chosen.parts[part])
-    return f"{decibels(chosen.parts[name]):.1f} by {PARTS[name]}"
+    return f"largest part: {decibels(chosen.parts[name]):.1f} dB, {PARTS[name]}"
