@@ -188,9 +188,9 @@ def _rms(values: Iterable[float]) -> float | None:
 class _Lobe:
     """Main lobe of an array.
 
-    Near a reflector, the amplitude falls like ``exp(−k² Δuᵀ C Δu / 2)``. Δu is the difference of the unit vectors, C the
-    weighted covariance of the microphone positions, and k the wave number at the centre of the call. For the shipped
-    layouts, the width at half amplitude is accurate to one tenth.
+    Near a reflector, the amplitude falls like ``exp(−k² Δuᵀ C Δu / 2)``. Δu is the difference of the unit vectors, C is
+    the weighted covariance of the microphone positions, and k is the wave number at the centre of the call. For the
+    shipped layouts, the width at half amplitude is accurate to one tenth.
 
     Attributes
     ----------

@@ -30,8 +30,8 @@ def find_peaks(
     """Return the reflectors of an image, strongest first.
 
     A reflector is a local maximum over directions and ranges that exceeds the side lobes of all stronger reflectors
-    there: see `ertis_numba.analysis.side_lobes.SideLobes`. Each reflector therefore yields one entry, not one per bin of
-    its main lobe or per side lobe. Direction, range and level are interpolated: see
+    there: see `ertis_numba.analysis.side_lobes.SideLobes`. Each reflector therefore yields one entry, not one per bin
+    of its main lobe or per side lobe. Direction, range and level are interpolated: see
     `ertis_numba.analysis.peak_interpolation.PeakInterpolator`.
 
     Parameters
