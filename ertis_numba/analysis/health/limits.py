@@ -36,8 +36,7 @@ MIN_CHANGES = 1e-3
 MAX_SATURATED = 2e-3
 """Share of samples at which 17 equal bits start, or of PCM samples at full scale."""
 MAX_OFFSET = 0.05
-"""Mean relative to full scale: a tenth of the half of full scale that modulators can follow. A real sensor has 0.0002.
-"""
+"""Mean of a channel: a tenth of the half of full scale that modulators can follow. A real sensor has 0.0002."""
 OFFSET_DEVIATIONS = 5.0
 """Limit in standard deviations of the mean of white bits, which matters in short records."""
 # Sound must exceed the noise so far that its absence cannot be chance. The levels of the direct sound differ by 6 dB,
@@ -45,8 +44,8 @@ OFFSET_DEVIATIONS = 5.0
 MIN_RISE_DB = 9.0
 MIN_LEVEL_DB = -12.0
 MAX_TONE_DB = 20.0
-"""Level relative to the surrounding lines. The noise of a real sensor, which rises below 1 kHz, exceeds them by 15 dB,
-and reflectors exceed them by 5 dB."""
+"""Level relative to the surrounding lines. A real sensor's noise, which rises below 1 kHz, has 15 dB, reflectors 5 dB.
+"""
 COMMON_SHARE = 0.5
 """Share of the channels above which a line is sound or comes from the power supply."""
 MAX_GAIN_DB = 5.0
@@ -58,8 +57,7 @@ MAX_WHITE_DB = -3.0
 MAX_FLIPPED_DB = -18.0
 """Level relative to white bits: 1 % of flipped bits has -14 dB, and a microphone's noise of -30 dBFS has -30 dB."""
 MAX_FLIPS_DB = -8.0
-"""Level relative to white bits above which bits are white rather than flipped; it corresponds to 4 % of flipped bits.
-"""
+"""Level relative to white bits above which bits are white rather than flipped: that of 4 % of flipped bits."""
 MAX_STUCK_SAMPLES = 1024
 """Length of a section without a change. A call of 1 kHz that overloads a modulator changes twice as often."""
 MAX_STUCK_NUMBERS = 64
