@@ -207,7 +207,7 @@ class FastChain:
         return heard, self._lead
 
     def process_signals(self, signals: NDArray[np.float64], out: NDArray[np.float32]) -> None:
-        """Fill ``out`` from what would be modulated, (mic, sample) at the PDM rate, full scale 1."""
+        """Compute an image from unmodulated signals: (mic, sample) at the PDM rate, full scale 1."""
         with self._taken(self._threads) as buffers:
             unmodulated, image = self._made_unmodulated(), buffers.lane.target(out)
             heard = np.where(np.abs(signals.T) < _TINY, 0.0, signals.T)  # Smaller values would become denormal numbers.
