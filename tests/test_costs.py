@@ -45,7 +45,7 @@ def test_measured_costs_are_times(device):
 def test_costs_are_kept(measured, caplog):
     with caplog.at_level(logging.INFO, logger="ertis_numba"):
         first = costs.costs_of(CPU, 1)
-    assert "measuring the speed of the kernels of device 'cpu'; the results are cached in" in caplog.text
+    assert "measuring what the kernels of device 'cpu' take here; kept in" in caplog.text
     path = costs.cache_file("cpu", 1)
     assert json.loads(path.read_text("utf-8")) == first.seconds
     assert list(path.parent.iterdir()) == [path]  # nothing half written is left
@@ -124,7 +124,7 @@ def test_a_folder_that_cannot_be_written_does_no_harm(measured, monkeypatch, tmp
     monkeypatch.setenv("ERTIS_CACHE_DIR", str(tmp_path / "file" / "below"))
     with caplog.at_level(logging.INFO, logger="ertis_numba"):
         pipeline = Pipeline(SHORT, device="cpu", threads=1)
-    assert "cannot cache the speed of the kernels in " in caplog.text
+    assert "costs cannot be kept (" in caplog.text
     assert pipeline.process(noise(SHORT)).amplitude.any()
     assert ("cpu", CPU.max_threads) in measured
 

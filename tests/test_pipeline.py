@@ -198,7 +198,7 @@ def test_closed_pipeline_processes_no_more_and_keeps_its_axes(method):
     pipeline.close()
     assert (len(pipeline.grid), len(pipeline.range_m)) == image.amplitude.shape
     for refused in (lambda: pipeline.process(noise(settings)), lambda: pipeline.process_batch([noise(settings)])):
-        with pytest.raises(ArgumentError, match="the pipeline is closed; create a new Pipeline"):
+        with pytest.raises(ArgumentError, match="the pipeline is closed; make another one"):
             refused()
 
 

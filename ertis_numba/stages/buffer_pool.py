@@ -55,7 +55,7 @@ class BufferPool:
         """
         with self._change:
             if self._closed:
-                raise ArgumentError("the pipeline is closed; create a new Pipeline")
+                raise ArgumentError("the pipeline is closed; create another one")
             buffers = self._spare.pop() if self._spare else None
             self._n_busy += 1
         try:

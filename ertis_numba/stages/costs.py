@@ -1,4 +1,4 @@
-"""Time per unit of work of each kernel on this machine, measured once and cached."""
+"""What each stage takes on this machine: measured once by running its kernels, and kept."""
 
 import functools
 import hashlib
@@ -27,12 +27,12 @@ from ertis_numba.kernels import KernelSet
 __all__ = ["Costs", "Work", "cache_file", "costs_of", "measure"]
 
 _LOG = logging.getLogger("ertis_numba")
-_RUNS = 5  # Number of runs; the shortest counts.
-_FLOOR_S = 2e-4  # Shorter runs are repeated.
+_RUNS = 5  # the best of which counts
+_FLOOR_S = 2e-4  # runs shorter than this are repeated
 _MICS, _RANGES = 32, 960
-_MAX_S = 1.0  # Limit per unit of work; a longer time is not a valid measurement.
-_BEYOND = 0.2  # Overlap of the samples of a tile with the next tile, relative to its ranges.
-_PHASES = {"few": 1, "many": 12, "most": 64}  # Between them, the cost of a term is linear in log(phases).
+_MAX_S = 1.0  # of a unit of work: more is no measurement
+_BEYOND = 0.2  # of a tile, by which its samples reach over its ranges
+_PHASES = {"few": 1, "many": 12, "most": 64}  # between them a term costs what a line over the logarithm says
 _FEW_PAIRS, _MANY_PAIRS = 2, 10
 _UNITS = (
     "call",
@@ -56,23 +56,20 @@ _UNITS = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Work:
-    """Amount of work of a plan for one image.
+    """How much a plan has to do for one image.
 
     Attributes
     ----------
     n_mics, n_words, n_samples, n_taps, tap_bits : int
-        Size of the demodulation; ``n_samples`` counts decimated samples.
+        Of the demodulation; samples are those of the signals.
     n_fft, n_bins, n_phases, n_outputs : int
-        Size of the matched filter.
+        Of the matched filter.
     n_directions, n_ranges : int
-        Size of the image.
     n_computed : int
-        Ranges of all tiles. Focal zones and the range axis may end within a tile, so it can exceed ``n_ranges``.
+        Ranges of all tiles, which zones and the end of the range axis do not fill.
     n_beams, n_terms, n_pairs : int
-        Number of summed beams, of terms of each, and of pairs of beam-grid points per direction (0 without a beam
-        grid).
+        Beams that are summed, terms of each, and pairs of nodes that make a direction's beam, 0 without nodes.
     precision : {"float32", "int16"}
-        Data type of the samples in the sums.
     """
 
     n_mics: int
@@ -95,16 +92,16 @@ class Work:
 
 @dataclass(frozen=True, slots=True)
 class Costs:
-    """Time per unit of work of each kernel, in seconds; `stages_ms` defines the units."""
+    """Seconds per unit of work of each kernel; `stages_ms` tells what the units are."""
 
     seconds: dict[str, float]
 
     def stages_ms(self, work: Work) -> dict[str, float]:
-        """Return the predicted time of each stage, in milliseconds."""
+        """Return what each stage is expected to take, in milliseconds."""
         unit = self.seconds
         rows = work.n_mics * work.n_phases
-        # The samples of a tile fit into the L1 cache with few phases, but not even into the L2 cache with many. More
-        # phases are never rated as cheaper, whatever the measurement was.
+        # Samples of a tile, which fit into the first cache level with few phases, and not even into the second with
+        # most. More of them are never taken for cheaper, whatever the clock said.
         terms = np.maximum.accumulate([unit[f"sum_{work.precision}_{name}"] for name in _PHASES])
         term = float(np.interp(math.log2(rows / _MICS), np.log2(list(_PHASES.values())), terms))
         points = work.n_directions * work.n_ranges
@@ -128,18 +125,18 @@ def _transform(n: int) -> float:
 
 
 def costs_of(kernels: KernelSet, threads: int) -> Costs:
-    """Return the costs of a device on this machine; they are measured on first use and cached in `cache_file`."""
+    """Return the costs of a device on this machine; measured at the first time and kept in `cache_file`."""
     if kernels.simulated:
         return Costs(_NOMINAL)
     key = (kernels.device, threads, kernels.hardware)
-    with _ONE_AT_A_TIME:  # Two measurements at the same time would disturb each other.
+    with _ONE_AT_A_TIME:  # two that measured at once would measure each other
         if key not in _KNOWN:
             path = cache_file(*key)
             _KNOWN[key] = _kept(path) or _measured(kernels, threads, path)
         return _KNOWN[key]
 
 
-# Costs of simulated kernels: estimates for a large GPU. They serve the choice of a plan and do not predict times.
+# Where kernels are only simulated: guesses of a large GPU, which choose a plan and tell no times.
 _NOMINAL: dict[str, float] = {
     "call": 1e-5,
     "demodulate_16": 5e-12,
@@ -163,9 +160,9 @@ _KNOWN: dict[tuple[str, int, str], Costs] = {}
 
 
 def cache_file(device: str, threads: int, hardware: str = "") -> Path:
-    """Return the path of the cached costs of a device; delete the file to measure the costs again.
+    """Return where the costs of a device are kept; take the file away to have them measured again.
 
-    The file name depends on the machine, on the GPU if ``hardware`` names one, and on the versions of the libraries.
+    Costs are those of the machine, of a GPU if ``hardware`` names one, and of the libraries' versions.
     """
     machine = [platform.machine(), platform.processor(), platform.node(), os.environ.get("NUMBA_CPU_NAME", "")]
     with suppress(OSError):
@@ -191,7 +188,7 @@ def _kept(path: Path) -> Costs | None:
 
 
 def _measured(kernels: KernelSet, threads: int, path: Path) -> Costs:
-    _LOG.info("measuring the speed of the kernels of device %r; the results are cached in %s", kernels.device, path)
+    _LOG.info("measuring what the kernels of device %r take here; kept in %s", kernels.device, path)
     costs = measure(kernels, threads)
     part: Path | None = None
     try:
@@ -201,7 +198,7 @@ def _measured(kernels: KernelSet, threads: int, path: Path) -> Costs:
             json.dump(costs.seconds, file, indent=1)
         return _first_of(costs, part, path)
     except OSError as error:
-        _LOG.info("cannot cache the speed of the kernels in %s (%s); it will be measured again", path, error)
+        _LOG.info("costs cannot be kept (%s)", error)
         return costs
     finally:
         if part is not None:
@@ -209,24 +206,21 @@ def _measured(kernels: KernelSet, threads: int, path: Path) -> Costs:
 
 
 def _first_of(costs: Costs, part: Path, path: Path) -> Costs:
-    """Cache costs, or return those that another process has cached meanwhile.
-
-    Processes with different costs would choose different plans and compute different images.
-    """
+    """Keep costs, or return those that another process has kept meanwhile: by other costs it plans another image."""
     try:
-        os.link(part, path)  # This fails if the file exists.
+        os.link(part, path)  # which a file that is there prevents
     except FileExistsError:
         kept = _kept(path)
         if kept is not None:
             return kept
         part.replace(path)
-    except OSError:  # The file system has no hard links.
+    except OSError:  # a disk without links
         part.replace(path)
     return costs
 
 
 def measure(kernels: KernelSet, threads: int) -> Costs:
-    """Measure the costs, which takes some tenths of a second, and return them."""
+    """Return the costs, measured now: some tenths of a second."""
     random = np.random.default_rng(1)
     small = 8 if kernels.device == "numpy" else 1
     with _Bench(kernels, threads) as bench:
@@ -235,12 +229,11 @@ def measure(kernels: KernelSet, threads: int) -> Costs:
             **_sums(bench, random, 256 // small),
             **_pairs(bench, random, 1024 // small),
         }
-    # Units of work that the device does not support count as 1 s each.
-    return Costs({name: seconds.get(name, 1.0) for name in _UNITS})
+    return Costs({name: seconds.get(name, 1.0) for name in _UNITS})  # a second each where a device cannot
 
 
 class _Bench:
-    """Timer of kernels, with all arrays in the memory of the device."""
+    """Times kernels on arrays that lie where they read them."""
 
     def __init__(self, kernels: KernelSet, threads: int) -> None:
         self.kernels, self.threads = kernels, threads
@@ -258,7 +251,7 @@ class _Bench:
         self.memory.close()
 
     def best(self, kernel: Callable[..., object], *arguments: object) -> float:
-        """Return the shortest time of several runs, in seconds."""
+        """Return the least time of some runs, in seconds."""
         here = [self.memory.table(each) if isinstance(each, np.ndarray) else each for each in arguments]
 
         def run(count: int) -> float:
@@ -273,7 +266,7 @@ class _Bench:
         return min(run(count) for _ in range(_RUNS))
 
     def transforms(self, signals: NDArray[np.float32], analytic: NDArray[np.complex64]) -> fft.Transforms:
-        """Return the Fourier transforms between two arrays."""
+        """Return the transforms of two arrays."""
         memory = self.memory
         here, there = memory.table(signals), memory.table(analytic)
         return fft.plan(self.kernels.transforms, here, there, zeros=memory.zeros, stream=self._lane.stream)
@@ -285,7 +278,7 @@ def _front(bench: _Bench, random: np.random.Generator) -> dict[str, float]:
     kernels = bench.kernels
     words = random.integers(0, 2**32, (n_samples * factor + n_taps, 1), dtype=np.uint32)
     channels = np.arange(_MICS, dtype=np.int32)
-    # The arrays hold noise: an array of zeros maps to a single page of memory, which always stays in the L1 cache.
+    # Noise, not zeros: what nobody wrote to is one page of memory, which is always in the nearest cache.
     signals = random.standard_normal((_MICS, n_fft), dtype=np.float32)
     tiny = np.zeros((2, 4), dtype=np.complex64)
     found = {"call": bench.best(kernels.envelope, tiny, np.zeros((2, 4), dtype=np.float32))}
@@ -294,7 +287,7 @@ def _front(bench: _Bench, random: np.random.Generator) -> dict[str, float]:
         kernels.demodulate_words, words, channels, taps, np.float32(1), factor, 3, n_samples - 8, signals
     )
     found["demodulate_16"] = took_s / (n_samples * n_taps)
-    # Another kernel would take seconds to compile; a separate measurement gave a factor of 1.4.
+    # Not worth the seconds that another kernel takes to compile; measured by itself it was 1.4 times as much.
     found["demodulate_32"] = 1.4 * found["demodulate_16"]
     out = _complex_noise(random, (_MICS, n_phases, n_out))
     transforms = bench.transforms(signals, out)
@@ -303,13 +296,13 @@ def _front(bench: _Bench, random: np.random.Generator) -> dict[str, float]:
     responses = np.ones((_MICS, n_phases, n_bins), dtype=np.complex64)
     spectra = _complex_noise(random, (_MICS, n_fft // 2 + 1))
     found["fold"] = bench.best(kernels.multiply_and_fold, spectra, responses, 300, out) / (_MICS * n_phases * n_bins)
-    inverse = functools.partial(transforms.inverse, threads=bench.threads)  # In place: values grow and may overflow.
+    inverse = functools.partial(transforms.inverse, threads=bench.threads)  # in place: numbers grow, and may overflow
     found["inverse"] = bench.best(inverse) / (_MICS * n_phases) / _transform(n_out)
     return found
 
 
 def _sums(bench: _Bench, random: np.random.Generator, n_beams: int) -> dict[str, float]:
-    """Return the cost of one term at one range, for each number of phases."""
+    """Return the cost of a term at one range, by the number of phases."""
     found: dict[str, float] = {}
     kernels = bench.kernels
     amplitude = np.empty((n_beams, _RANGES), dtype=np.float32)
@@ -341,13 +334,13 @@ def _complex_noise(random: np.random.Generator, shape: tuple[int, ...]) -> NDArr
 
 
 def _pairs(bench: _Bench, random: np.random.Generator, n_directions: int) -> dict[str, float]:
-    """Return the cost of a pair of beam-grid points at one range, and of one image point."""
+    """Return the cost of a pair of nodes at one range, and of one place in the image."""
     n_nodes, points = 400, n_directions * _RANGES
     kernels = bench.kernels
     amplitude = np.empty((n_directions, _RANGES), dtype=np.float32)
     rows = np.arange(n_directions, dtype=np.int32)
     offsets = np.zeros((n_nodes, 1), dtype=np.int32)
-    first = np.sort(random.integers(0, n_nodes - 80, n_directions)) // 4 * 4  # Some directions share all grid points.
+    first = np.sort(random.integers(0, n_nodes - 80, n_directions)) // 4 * 4  # some directions share all nodes
     took_s: dict[str, list[float]] = {"float32": [], "int16": []}
     for n_pairs in (_FEW_PAIRS, _MANY_PAIRS):
         places = (first[:, None] + 8 * np.arange(n_pairs)).astype(np.int32)
@@ -384,7 +377,7 @@ def _pairs(bench: _Bench, random: np.random.Generator, n_directions: int) -> dic
 def _tiles(
     kernels: KernelSet, n_mics: int, n_phases: int
 ) -> tuple[NDArray[np.int16], NDArray[np.float32], NDArray[np.int32]]:
-    """Return tiles of ones, their scales, and their first ranges."""
+    """Return tiles of ones, their scales and where they start."""
     starts = np.arange(0, _RANGES, kernels.tile_ranges, dtype=np.int32)
     tiles = np.ones((len(starts), n_mics, n_phases, kernels.tile_ranges + 20, 2), dtype=np.int16)
     return tiles, np.ones(len(starts), dtype=np.float32), starts

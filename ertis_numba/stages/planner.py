@@ -1,4 +1,4 @@
-"""Planner: the fastest plan whose predicted error stays within a budget."""
+"""The cheapest plan whose predicted error keeps a budget."""
 
 import math
 from collections.abc import Sequence
@@ -21,23 +21,22 @@ from ertis_numba.stages.wavefronts import with_wavefront
 
 __all__ = ["Chosen", "Planner", "complete"]
 
-_USUAL_BYTES = 2**31  # Memory of a plan's signals and delays. Larger plans are considered only if no smaller one fits.
-_ROUNDED = 1 + 1e-9  # Tolerance, so that a chosen plan meets its own budget when it is read from settings again.
+_USUAL_BYTES = 2**31  # of a plan's signals and delays; larger plans are considered only where no other will do
+_ROUNDED = 1 + 1e-9  # a plan must keep the budget that it was chosen for when it is given back
 _ROUNDED_DB = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
 class Chosen:
-    """Complete plan with its predicted error and time.
+    """A plan, and what is expected of it.
 
     Attributes
     ----------
     settings : Settings
-        Settings with complete accuracy values.
+        Their accuracy leaves nothing open.
     parts : dict of str to float
-        Error power of each step, relative to the exact image; see `accuracy.PARTS`.
+        Power of each part of the error by that of the exact image; see `accuracy.PARTS`.
     stages_ms : dict of str to float
-        Predicted time of each stage, in milliseconds.
     """
 
     settings: Settings
@@ -46,31 +45,22 @@ class Chosen:
 
     @property
     def error_db(self) -> float:
-        """Predicted error of the image, in decibels relative to the exact image."""
+        """Predicted error of the image."""
         return decibels(sum(self.parts.values()))
 
     @property
     def time_ms(self) -> float:
-        """Predicted time of one measurement, in milliseconds."""
+        """Predicted time of one measurement."""
         return sum(self.stages_ms.values())
 
 
 def complete(settings: Settings, kernels: KernelSet, *, threads: int, max_bytes: int | None = None) -> Settings:
-    """Return settings with complete accuracy values and a chosen wavefront; see `Planner.choose`.
-
-    Parameters
-    ----------
-    settings : Settings
-    kernels : KernelSet
-    threads : int
-        Number of threads.
-    max_bytes : int, optional
-        Limit on the memory of a plan's signals and delays.
+    """Return settings whose accuracy and wavefront leave nothing open; see `Planner.choose`.
 
     Raises
     ------
     ArgumentError
-        No plan meets the error budget, or the given plan does not.
+        No plan keeps the budget, or the one that is given does not.
     """
     if settings.processing.method == "paper":
         return settings
@@ -81,17 +71,16 @@ def complete(settings: Settings, kernels: KernelSet, *, threads: int, max_bytes:
 
 
 class Planner:
-    """Planner for one kind of measurement on one device.
+    """Plans for one kind of measurement on one device.
 
     Parameters
     ----------
     settings : Settings
-        Settings to complete. The planner keeps all accuracy values that they contain.
+        What their accuracy does not leave open is kept to.
     kernels : KernelSet
     threads : int
-        Number of threads for which times are predicted.
-    signal_model : SignalModel, optional
-        Measured signal model; safe values by default.
+    signal_model : Texture, optional
+        Of what is heard; what errs on the safe side by default.
     max_bytes : int, optional
         Limit on the memory of a plan's signals and delays.
     sensitivity : Sensitivity, optional
@@ -100,7 +89,7 @@ class Planner:
     Raises
     ------
     DeviceError
-        ``accuracy.precision`` is ``"int16"``, and the device has no 16-bit dot product.
+        16 bits are asked for, and the device has no dot product for them.
     """
 
     def __init__(
@@ -126,7 +115,7 @@ class Planner:
 
     @property
     def model(self) -> ErrorModel:
-        """Error model of the processing steps."""
+        """Model of the errors of each step."""
         return self._plans.errors
 
     def _rated(
@@ -140,18 +129,17 @@ class Planner:
         ]
 
     def choose(self) -> Chosen:
-        """Return the fastest plan that meets the error budget.
+        """Return the cheapest plan that keeps the budget.
 
         Raises
         ------
         ArgumentError
-            No plan meets the budget or fits into memory. The message states the error of the best plan, or the size of
-            the smallest.
+            None does; the message has the best there is.
         """
         wanted_db = self.settings.accuracy.max_error_db
         allowed = 10 ** (wanted_db / 10) * _ROUNDED
-        # If no plan is accurate enough for the image of an adaptive beamformer, the best one is chosen, and the budget
-        # applies to its delay-and-sum beams; see `ertis_numba.prediction` for the warning.
+        # Where no plan is exact enough for an adaptive beamformer's image, the best one is taken, and the budget is
+        # that of the beams; see `ertis_numba.prediction` for the warning.
         budget = self._sensitivity.beams(allowed)
         with one_thread():
             plans = open_plans(self._plans, budget, has_int16=bool(self._kernels.tile_ranges))
@@ -159,7 +147,7 @@ class Planner:
             limit = _USUAL_BYTES if self._max_bytes is None else self._max_bytes
             rated = self._rated(plans, sizes, 0, limit)
             within = [plan for plan, parts in rated if sum(parts.values()) <= budget]
-            # The usual limit comes first, so the plan depends on the memory of the machine only if it must.
+            # The usual limit comes first, so that the plan depends on a machine's memory only where it must.
             if not within and self._max_bytes is None and max(sizes) > limit:
                 usual, limit = limit, max(limit, available_bytes())
                 rated += self._rated(plans, sizes, usual + 1, limit)
@@ -173,7 +161,7 @@ class Planner:
                 "give a lower accuracy.oversampling or accuracy.focal_zones"
             )
         if within:
-            # The costs are those of all threads, so the choice does not depend on the current number of threads.
+            # By the costs of all threads whatever their number now, so that it does not decide about the plan.
             costs = costs_of(self._kernels, self._kernels.max_threads) if len(within) > 1 else None
             cheapest = min(within, key=lambda plan: self._time(plan, costs)) if costs else within[0]
             return self.chosen(self._accuracy(cheapest))
@@ -181,15 +169,15 @@ class Planner:
         if budget < sum(parts.values()) <= allowed:
             return self.chosen(self._accuracy(plan))
         best = self.chosen(self._accuracy(plan))
-        memory = f"; other plans do not fit into {limit / 1e6:.0f} MB of memory" if len(rated) < len(plans) else ""
-        wider = f"set it to {math.ceil(best.error_db)} or higher, or " if best.error_db <= 0 else ""
+        memory = f", others do not fit into {limit / 1e6:.0f} MB of memory" if len(rated) < len(plans) else ""
+        wider = f"give {math.ceil(best.error_db)} or more, or " if best.error_db <= 0 else ""
         raise ArgumentError(
-            f"accuracy.max_error_db is {wanted_db:g}, but the best plan for these settings has a predicted error of "
-            f"{best.error_db:.1f} dB ({_worst(best)}{memory}); {wider}fix fewer values in [accuracy]"
+            f"accuracy.max_error_db is {wanted_db:g}, and the best that these settings can is {best.error_db:.1f} "
+            f"({_worst(best)}{memory}); {wider}leave more of [accuracy] open"
         )
 
     def chosen(self, accuracy: Accuracy) -> Chosen:
-        """Return a complete plan with its predicted error and time."""
+        """Return what is expected of a complete plan."""
         stages_ms = costs_of(self._kernels, self._threads).stages_ms(self._plans.work(plan_of(accuracy)))
         return Chosen(self.settings.replace(accuracy=accuracy), self._image_parts(accuracy), stages_ms)
 
@@ -234,10 +222,10 @@ class Planner:
 
     @property
     def costs_file(self) -> Path:
-        """Path of the cached costs that predict times; delete the file to measure them again."""
+        """Where the costs are kept that predict times; taken away, they are measured again."""
         return cache_file(self._kernels.device, self._threads, self._kernels.hardware)
 
 
 def _worst(chosen: Chosen) -> str:
     name = max(chosen.parts, key=lambda part: chosen.parts[part])
-    return f"largest part: {decibels(chosen.parts[name]):.1f} dB, {PARTS[name]}"
+    return f"{decibels(chosen.parts[name]):.1f} by {PARTS[name]}"

@@ -43,7 +43,7 @@ def measure(image: Energyscape, measurement: Measurement) -> Measured:
     """Return the error of the image of a measurement, relative to the exact image with the same settings.
 
     The exact image is computed in float64, according to the definition of the image's beamformer. If the whole image
-    would take more than about ten seconds, a random sample is compared: directions for plane wavefronts, single points
+    would take more than about ten seconds, a sample is compared: directions for plane wavefronts, single points
     for spherical ones. Bright ones are drawn more often, and each is weighted by the inverse of its probability.
 
     Parameters
