@@ -250,6 +250,15 @@ def cfar_peaks(
     ------
     ArgumentError
         An argument is invalid, or the image has too few ranges.
+
+    Examples
+    --------
+    Detect weak reflectors at any range, with few false alarms::
+
+        with ertis.open_recording("data/synthetic/reflectors.h5") as recording:
+            measurement = recording[0]
+        image = ertis.Pipeline(measurement.settings).process(measurement)
+        peaks = ertis.cfar_peaks(image, false_alarm=1e-6, top=None)
     """
     stands_out = cfar(image, false_alarm=false_alarm, method=method)
     stands_out &= clean(image, within_db=within_db).amplitude > 0

@@ -124,6 +124,19 @@ def compare(image: Energyscape, reflectors: Sequence[Reflector], *, min_level_db
     ------
     ArgumentError
         ``min_level_db`` is above 0.
+
+    Examples
+    --------
+    Compare an image of a simulated scene with its ground truth::
+
+        from ertis_numba.simulation import Point
+
+        scene = ertis.Scene(points=(Point(azimuth_deg=20.0, range_m=1.5),))
+        simulator = ertis.Simulator(scene)
+        measurement = simulator.render(index=0)
+        image = ertis.Pipeline(measurement.settings).process(measurement)
+        comparison = ertis.compare(image, simulator.reflectors(index=0))
+        print(len(comparison.matched), len(comparison.missed), len(comparison.false))
     """
     checks.instance("image", image, Energyscape, "Pipeline.process returns")
     reflectors = list(checks.items("reflectors", reflectors, Reflector, "RecordingReader.reflectors returns"))

@@ -57,6 +57,16 @@ def find_peaks(
     ArgumentError
         ``top`` is below 1, ``min_level_db`` is above 0, ``where`` has another shape than the image, or
         ``false_alarm`` is not between 0 and 1.
+
+    Examples
+    --------
+    Print the three strongest reflectors of a recording's first measurement::
+
+        with ertis.open_recording("data/synthetic/reflectors.h5") as recording:
+            measurement = recording[0]
+        image = ertis.Pipeline(measurement.settings).process(measurement)
+        for peak in ertis.find_peaks(image, top=3):
+            print(f"{peak.range_m:.2f} m at {peak.azimuth_deg:.0f}°, {peak.level_db:.1f} dB")
     """
     checks.instance("image", image, Energyscape, "Pipeline.process returns")
     top = image.amplitude.size if top is None else checks.integer("top", top, 1)

@@ -47,6 +47,15 @@ class PointExtractor:
     ------
     ArgumentError
         ``top`` is below 1, ``min_level_db`` is above 0, or the directions of the settings are not available.
+
+    Examples
+    --------
+    Compute the point cloud of every measurement of a recording::
+
+        with ertis.open_recording("data/synthetic/reflectors.h5") as recording:
+            pipeline = ertis.Pipeline(recording.settings)
+            extract = ertis.PointExtractor(pipeline.settings, pipeline.grid)
+            clouds = [extract(pipeline.process(measurement)) for measurement in recording]
     """
 
     def __init__(

@@ -66,6 +66,14 @@ def health(measurement: Measurement) -> Health:
     ------
     DataError
         The samples do not match the settings.
+
+    Examples
+    --------
+    Print the faults of an array::
+
+        with ertis.open_recording("data/synthetic/reflectors.h5") as recording:
+            report = ertis.health(recording[0])
+        print(report.verdict() or "no faults")
     """
     checks.instance("measurement", measurement, Measurement, "a recording holds")
     settings, enabled = measurement.settings, np.flatnonzero(microphones(measurement.settings.array).enabled)
