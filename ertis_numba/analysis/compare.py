@@ -104,9 +104,9 @@ def compare(image: Energyscape, reflectors: Sequence[Reflector], *, min_level_db
     - Its direction lies within half a main lobe of the nearest direction of the image.
     - Its level relative to the strongest visible reflector is at least ``min_level_db``.
 
-    Peaks and visible reflectors are assigned one to one. The assignment has as many pairs as possible within 0.1 m and
-    one and a half main lobes, and then the least sum of squared distances (the assignment problem, solved by SciPy
-    after D. F. Crouse, 2016). The number of peaks is limited to that of the reflectors plus 100.
+    Peaks and visible reflectors are assigned one to one. The assignment first maximises the number of pairs within
+    0.1 m and one and a half main lobes, then minimises the sum of squared distances. SciPy solves this assignment
+    problem after D. F. Crouse, 2016. The number of peaks is limited to that of the reflectors plus 100.
 
     Parameters
     ----------
@@ -201,8 +201,8 @@ def _rms(values: Iterable[float]) -> float | None:
 class _Lobe:
     """Main lobe of an array.
 
-    Near a reflector, the amplitude falls like ``exp(−k² Δuᵀ C Δu / 2)``. Δu is the difference of the unit vectors, C is
-    the weighted covariance of the microphone positions, and k is the wave number at the centre of the call. For the
+    Near a reflector, the amplitude falls like ``exp(−k² Δuᵀ C Δu / 2)``. Δu is the difference of the unit vectors, and
+    C is the weighted covariance of the microphone positions. k is the wave number at the centre of the call. For the
     shipped layouts, the width at half amplitude is accurate to one tenth.
 
     Attributes
@@ -293,8 +293,8 @@ def _explained(
 ) -> NDArray[np.bool_]:
     """Return True for each peak caused by a reflector that need not be found there: (peak,) bool.
 
-    Such peaks belong to reflectors that do not count, to mirror images behind the array, or to side lobes of reflectors
-    outside the solid angle, which `find_peaks` cannot predict.
+    Such peaks belong to reflectors that do not count, or to mirror images behind the array. They may also be side lobes
+    of reflectors outside the solid angle, which `find_peaks` cannot predict.
     """
     if not peaks or not reflectors:
         return np.zeros(len(peaks), dtype=np.bool_)

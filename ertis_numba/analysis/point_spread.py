@@ -39,8 +39,8 @@ class PointSpread:
     Attributes
     ----------
     reach_m : float
-        Range offset in metres beyond which the image of the reflector ends. A side lobe is shifted by half of the
-        difference of two paths, which is at most the aperture's radius, and is as long as the pulse.
+        Range offset in metres beyond which the image of the reflector ends. A side lobe is as long as the pulse. Its
+        shift is half of the difference of two paths, which is at most the aperture's radius.
     """
 
     def __init__(self, settings: Settings) -> None:

@@ -9,7 +9,7 @@ the gain at no cost. The fit minimises
 
 over weights and gain. The problem is linear in either, and the fit alternates between them. The gain removes the error
 that all targets share. The remaining error therefore has zero mean over the targets and adds up between microphones
-like noise, so its power is a tight estimate of the image error and not only a bound. The gain corresponds to the
+like noise. Its power is a tight estimate of the image error, not only a bound. The gain corresponds to the
 deapodization of gridding (J. I. Jackson et al., Selection of a convolution function for Fourier inversion using
 gridding, IEEE Trans. Med. Imaging 10, 1991; J. A. Fessler and B. P. Sutton, Nonuniform fast Fourier transforms using
 min-max interpolation, IEEE Trans. Signal Process. 51, 2003).

@@ -24,7 +24,7 @@ class MatchedFilter:
     A beam is needed only at the output ranges, but its delays are much finer than their spacing. One inverse transform
     per phase therefore computes the samples: those of phase p lie ``p / n_phases`` of a step after those of phase 0.
     The one-sided spectrum makes the signals analytic. The filter also divides by the gain of the decimation filter,
-    which is known exactly within the band, and applies the gains of the delay and beam interpolation.
+    which is known exactly within the band. It applies the gains of the delay and beam interpolation as well.
 
     Parameters
     ----------

@@ -75,7 +75,8 @@ def ringing_db(settings: Settings) -> float:
     """Return the level below its peak at which the ringing of the matched filter may be cut off.
 
     The noise of PDM bits masks ringing below the stopband. PCM has no such noise. Sound outside the window may exceed
-    the image by the whole dynamic range, and ringing that is cut off or wraps around must stay below the error budget.
+    the image by the whole dynamic range. Ringing that is cut off or wraps around must still stay below the error
+    budget.
     """
     if not settings.recording.is_pdm:
         return min(_MAX_RINGING_DB, _PCM_RANGE_DB - settings.accuracy.max_error_db)

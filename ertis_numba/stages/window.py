@@ -47,9 +47,9 @@ class TimeWindow:
 def time_window(settings: Settings, *, largest_delay_s: float, n_taps: int, ringing_db: float = 60.0) -> TimeWindow:
     """Return the time window for beams with delays within ``± largest_delay_s``.
 
-    An echo at time t needs the samples from t to the end of the call, and the ringing of the matched filter on both
-    sides. The transform is slightly longer, so wrapped samples lie outside those that are read: the convolution is
-    linear.
+    An echo at time t needs the samples from t on for the duration of the call. The window adds the ringing of the
+    matched filter on both sides. The transform is slightly longer, so wrapped samples lie outside those that are read:
+    the convolution is linear.
 
     Parameters
     ----------

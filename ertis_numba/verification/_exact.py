@@ -1,9 +1,9 @@
 """Exact image in float64, without the approximations of the images that are compared with it.
 
 The samples of the record pass through one transform at the record's own sample rate, long enough to prevent
-wrap-around. Each bin is multiplied by the matched filter of the call, sampled at that rate, and by the phase of the
-exact delay of each microphone. There is no decimation, no interpolation, no focal zone, no plan, and no rounding except
-that of float64.
+wrap-around. Each bin is multiplied by the matched filter of the call at that rate, and by the phase of each
+microphone's exact delay. There is no decimation, no interpolation, no focal zone, no plan, and no rounding except that
+of float64.
 """
 
 import math

@@ -45,8 +45,8 @@ _LOWEST_NOISE_DBFS = -95.0  # Noise in the call's band; rounding to 16 bits has 
 def health(measurement: Measurement) -> Health:
     """Return the health of the microphones and of the record of one measurement.
 
-    The checks cover the enabled channels and the first 524,288 samples. The loud and the quiet eighth of the record are
-    those in which the median channel has the most and the least power in the call's band.
+    The checks cover the enabled channels and the first 524,288 samples. In the loud and the quiet eighth of the record,
+    the median channel has the most and the least power in the call's band.
 
     The dynamic range is ``10 log10(1/2 / noise · B T · N)``: a sine at full scale relative to the noise in the call's
     band, with the gains of matched filter and delay-and-sum. The gain of the matched filter is bandwidth times duration
