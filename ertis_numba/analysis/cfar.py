@@ -116,6 +116,7 @@ def threshold_factor(method: Method, n_reference: int, false_alarm: float) -> fl
 
     Examples
     --------
+    >>> from ertis_numba.analysis.cfar import threshold_factor
     >>> round(threshold_factor("cell_averaging", 32, 1e-4), 2)
     10.67
     """
@@ -236,7 +237,7 @@ def cfar_peaks(
     method : {"ordered_statistic", "cell_averaging", "greatest_of"}
         Estimator of the noise: see `cfar`.
     within_db : float
-        Largest level below the strongest direction of the same range; `SIDE_LOBE_DB` by default.
+        Largest level below the strongest direction of the same range; `SIDE_LOBE_DB`, 10 dB, by default.
     top : int, optional
         Maximum number of reflectors; 10 by default, None for all.
     min_level_db : float
