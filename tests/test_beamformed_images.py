@@ -156,7 +156,8 @@ def test_settings_that_cannot_be(options, reported):
 def test_dmas_of_too_few_microphones(case, order, many):
     settings = cases.CASES[case]
     settings = settings.replace(processing=settings.processing.replace(beamformer="dmas", dmas_order=order))
-    with pytest.raises(ArgumentError, match=rf"dmas_order is {order}, but the array has {many}; give an order of"):
+    message = rf"dmas_order is {order}, but the array has {many}; .*Give a lower order or another"
+    with pytest.raises(ArgumentError, match=message):
         Pipeline(settings)
 
 

@@ -42,7 +42,7 @@ def test_call_match_finds_sweeps_of_the_opposite_direction(modulation, noise):
     found = call_match(heard(REVERSED.replace(modulation=modulation), noise=noise, settings=settings))
     assert not found.matches
     assert found.slope == pytest.approx(-1, abs=0.1)
-    assert f"{modulation} sweep of the opposite direction" in found.warning
+    assert f"{modulation} sweep in the opposite direction" in found.warning
 
 
 @pytest.mark.parametrize(

@@ -254,9 +254,9 @@ def test_silence_stands_out_of_nothing(method):
     [
         ({"false_alarm": 0.0}, "false_alarm is 0; give a number from 1e-09 to 0.5"),
         ({"method": "median"}, "method 'median' is unknown; known are ordered_statistic, cell_averaging, greatest_of"),
-        ({"n_reference": 5}, "n_reference is 5; give an even number, half for each side"),
+        ({"n_reference": 5}, "n_reference is 5; give an even number, with half the bins on each side"),
         ({"n_reference": 2}, "n_reference is 2; give a whole number from 4 to 512"),
-        ({"n_reference": 64}, "image has 37 ranges, and 64 reference bins take 69; give a wider range window"),
+        ({"n_reference": 64}, "image has 37 ranges, but 64 reference bins need 69; give an image with a wider range window"),
     ],
 )
 def test_refuses(arguments, match):

@@ -49,7 +49,7 @@ def test_info_tells_the_health(sick, tmp_path):
     assert lines[9].split()[:4] == ["4", "stuck", "at", "0"]
     assert len({len(line) for line in lines[4:37]}) == 1
     assert lines[37].startswith("not observable ") or lines[37].startswith("fault ")
-    assert any(line.startswith("fault          channel 4: stuck at 0, 0 (limit 0.001); leave them") for line in lines)
+    assert any(line.startswith("fault          channel 4: stuck at 0, 0 (limit 0.001); exclude them") for line in lines)
     image = write_energyscapes(tmp_path / "img.h5", [files.image()])
     done = run("info", image, "--health", code=1)
     assert done.stderr == (

@@ -29,7 +29,7 @@ def test_short_records(n_samples, bits):
     json.dumps(dataclasses.asdict(report), allow_nan=False)
     if n_samples < 256:
         assert {item.state for item in report.channels} == {"unknown"}
-        assert report.unknown == (f"anything: {n_samples} samples are fewer than 256",)
+        assert report.unknown == (f"the state of any microphone: the record has {n_samples} samples, fewer than 256",)
     elif bits == "real":
         assert bool(report.unknown) == (n_samples < 17_000)
     else:
@@ -38,7 +38,7 @@ def test_short_records(n_samples, bits):
 
 def test_one_microphone_has_nothing_to_be_compared_with():
     report = health(cases.noise(cases.CASES["one microphone"]))
-    assert report.unknown == ("a dead microphone: there is no other to compare it with",)
+    assert report.unknown == ("a dead microphone: no other channel is available for comparison",)
     assert report.noise_dbfs == pytest.approx(-19.5, abs=1.5)
 
 
@@ -46,7 +46,9 @@ def test_one_microphone_has_nothing_to_be_compared_with():
 def test_a_band_too_narrow_for_the_record_is_told(call):
     measurement = dataclasses.replace(sound(), settings=sound().settings.replace(call=call))
     assert health(measurement).unknown == (
-        ("dead microphones, tones and noise: 65536 samples do not resolve the call's band",) if call != Call() else ()
+        ("dead microphones, tones and noise: 65536 samples are too few to resolve the call's band",)
+        if call != Call()
+        else ()
     )
 
 
@@ -81,12 +83,12 @@ def test_several_measurements_are_merged():
     assert report.channels[3].tone_hz == sick.channels[3].tone_hz
     assert merge([healthy]) == healthy
     quiet = health(dataclasses.replace(sound(), data=np.random.default_rng(1).integers(0, 256, 65_536, np.uint8)))
-    assert merge([quiet, quiet]).unknown == ("dead microphones: no sound stands out of the noise",)
+    assert merge([quiet, quiet]).unknown == ("dead microphones: no sound exceeds the noise by 9 dB",)
     assert merge([quiet, healthy]).unknown == ()
     assert merge([quiet, healthy]).channels[3].level_db == healthy.channels[3].level_db
-    with pytest.raises(ertis.ArgumentError, match="reports are none; give at least one"):
+    with pytest.raises(ertis.ArgumentError, match="reports is empty; give at least one"):
         merge([])
-    with pytest.raises(ertis.ArgumentError, match="reports are of different channels; give those of one array"):
+    with pytest.raises(ertis.ArgumentError, match="reports have different channels; give reports of one array"):
         merge([healthy, health(real())])
 
 

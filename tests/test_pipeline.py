@@ -137,7 +137,7 @@ def test_output_array_is_reused_and_nothing_else_of_its_size_is_made():
             "cpu",
             None,
             ArgumentError,
-            "processing.range_m ends at 5 m, but the record of 9.102 ms reaches 1.565 m",
+            "processing.range_m ends at 5 m, but the record of 9.102 ms covers 1.565 m",
         ),
         (
             SHORT.replace(processing=Processing(range_m=(0.5, 1.0), directions="2d:0")),

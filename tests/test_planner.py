@@ -115,8 +115,8 @@ def test_16_bits_are_kept_or_refused():
     [
         ({}, "single precision"),
         ({"interpolation": "nearest", "oversampling": 12}, "interpolation of delayed samples"),
-        ({"beam_taps": 2, "beam_density": 1.5}, "interpolation of beams between nodes"),
-        ({"stopband_attenuation_db": 40.0}, "noise that the decimation lets through"),
+        ({"beam_taps": 2, "beam_density": 1.5}, "interpolation between beam-grid points"),
+        ({"stopband_attenuation_db": 40.0}, "noise aliased by the decimation"),
     ],
 )
 def test_a_budget_that_none_keeps_is_refused_with_the_best_there_is(pinned, part):

@@ -78,7 +78,7 @@ def test_explains_in_words(recording, tmp_path):
     bent = run(recording, "-o", tmp_path / "b.h5", "--explain", "--wavefront", "spherical").stderr
     assert "spherical wavefronts, with delays of their own in" in bent
     assert "against spherical ones" not in bent
-    assert "    one set of delays for all ranges of a zone" in bent
+    assert "    one set of delays for each focal zone" in bent
 
 
 def test_explains_simple_interpolation(recording, tmp_path):

@@ -1,4 +1,4 @@
-"""Figures of bits and signals: shares, spectra over time, and lines in them. What they mean is told in health.py."""
+"""Statistics of bits and signals: shares, spectrograms and spectral lines. `health` interprets them."""
 
 from typing import Any, NamedTuple
 
@@ -21,24 +21,24 @@ __all__ = [
 ]
 
 ROUNDING = 1e-14
-"""Power below which spectra in single precision tell nothing, full scale 1."""
-_LONGEST_PATTERN = 32  # samples; no modulator with noise or dither repeats itself over a whole record
-_RUN_DOUBLINGS = 4  # 2⁴ equal neighbours: 17 equal bits
-_SURROUNDINGS = 12  # lines to either side
+"""Power, relative to a full scale of 1, below which spectra in single precision hold only rounding errors."""
+_LONGEST_PATTERN = 32  # Samples. A modulator with noise or dither never repeats a pattern over a whole record.
+_RUN_DOUBLINGS = 4  # 2⁴ equal pairs of neighbours make a run of 17 equal bits.
+_SURROUNDINGS = 12  # Number of lines on either side.
 _BITS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1, bitorder="little")
 
 
 class Shares(NamedTuple):
-    """Of eight channels, each (bit,).
+    """Bit statistics of eight channels.
 
     Attributes
     ----------
-    ones, changes : float64
+    ones, changes : (bit,) float64
         Share of ones, and of samples at which the bit changes.
-    runs : float64
-        Share of places where 17 equal bits begin.
-    repeats : bool
-        Whether the whole record repeats a pattern of 2 to 32 samples.
+    runs : (bit,) float64
+        Share of samples at which 17 equal bits start.
+    repeats : (bit,) bool
+        True if the whole record repeats a pattern of 2 to 32 samples.
     """
 
     ones: NDArray[np.float64]
@@ -48,7 +48,7 @@ class Shares(NamedTuple):
 
 
 def octets_of(words: NDArray[np.unsignedinteger[Any]]) -> NDArray[np.uint8]:
-    """Return words, (sample, word), as (sample, octet), bit b of octet k being channel 8 k + b."""
+    """Return words, (sample, word), as octets, (sample, octet); bit b of octet k is channel 8 k + b."""
     return np.ascontiguousarray(words).view(np.uint8)
 
 
@@ -63,7 +63,13 @@ def signal_of(octets: NDArray[np.uint8], channel: int) -> NDArray[np.float32]:
 
 
 def bit_shares(column: NDArray[np.uint8]) -> Shares:
-    """Return what can be counted in an octet per sample: (sample,) uint8, 33 samples at least."""
+    """Return the bit statistics of eight channels.
+
+    Parameters
+    ----------
+    column : (sample,) uint8
+        One octet per sample, at least 33 samples.
+    """
     differs = column[1:] ^ column[:-1]
     runs = ~differs
     for doubling in range(_RUN_DOUBLINGS):
@@ -81,10 +87,18 @@ def _ones(column: NDArray[np.uint8]) -> NDArray[np.float64]:
 def spectrogram(signal: NDArray[np.float32], *, size: int, n_lines: int) -> NDArray[np.float32]:
     """Return the power of a signal over time and frequency: (segment, line) float32.
 
-    Periodograms under a Hann window, of segments that overlap by half (P. D. Welch, The use of fast Fourier
-    transform for the estimation of power spectra, IEEE Trans. Audio Electroacoust. 15, 1967). All ``size / 2``
-    lines of white noise add up to its mean square, full scale 1. scipy.signal, which has the same, takes
-    longer to import than everything here to run.
+    The result holds periodograms of half-overlapping segments under a Hann window (P. D. Welch, The use of fast Fourier
+    transform for the estimation of power spectra, IEEE Trans. Audio Electroacoust. 15, 1967). The sum over all
+    ``size / 2`` lines of white noise is its mean square, full scale 1. scipy.signal has an equivalent function, but its
+    import takes longer than all computations here.
+
+    Parameters
+    ----------
+    signal : (sample,) float32
+    size : int
+        Length of a segment in samples.
+    n_lines : int
+        Number of lines to return, from frequency 0 on.
     """
     segments = sliding_window_view(signal, size)[:: size // 2]
     window = np.hanning(size + 1)[:-1].astype(np.float32)
@@ -93,15 +107,30 @@ def spectrogram(signal: NDArray[np.float32], *, size: int, n_lines: int) -> NDAr
 
 
 def rises(level_db: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return by how many decibels lines stand out of the median of those around: (mic, line) float64."""
+    """Return the level of each line relative to the median of the surrounding lines, in dB: (mic, line) float64."""
     around = np.pad(level_db, ((0, 0), (_SURROUNDINGS, _SURROUNDINGS)), mode="reflect")
     return np.asarray(level_db - np.median(sliding_window_view(around, 2 * _SURROUNDINGS + 1, axis=1), axis=-1))
 
 
 def common_lines(rise_db: NDArray[np.float64], min_db: float, share: float) -> tuple[NDArray[np.bool_], list[int]]:
-    """Return which lines stand out in more than a share of channels, (line,) bool, and the highest of each group.
+    """Return the lines that stand out in more than a share of the channels.
 
-    One line to either side counts as the same.
+    Adjacent lines count as the same line.
+
+    Parameters
+    ----------
+    rise_db : (mic, line) float64
+        Level of each line relative to the surrounding lines: see `rises`.
+    min_db : float
+        Level above which a line stands out.
+    share : float
+        Share of the channels.
+
+    Returns
+    -------
+    is_common : (line,) bool
+    highest : list of int
+        Highest line of each group of adjacent common lines.
     """
     apart = np.pad(rise_db, ((0, 0), (1, 1)), constant_values=-np.inf)
     near_db = np.max(sliding_window_view(apart, 3, axis=1), axis=-1)
@@ -112,5 +141,5 @@ def common_lines(rise_db: NDArray[np.float64], min_db: float, share: float) -> t
 
 
 def decibels(power: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return levels, none below that of rounding."""
+    """Return levels in dB; powers below `ROUNDING` count as `ROUNDING`."""
     return np.asarray(10 * np.log10(np.maximum(power, ROUNDING)), dtype=np.float64)

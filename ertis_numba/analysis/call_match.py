@@ -1,4 +1,4 @@
-"""Pulse compression of recorded echoes: a check that a recording was made with the call that its settings name."""
+"""Pulse compression of recorded echoes: a check that the recorded call is the call of the settings."""
 
 import itertools
 import math
@@ -20,25 +20,25 @@ from ertis_numba.waveform import call_samples
 __all__ = ["CallMatch", "call_match", "first_call_match"]
 
 MIN_LOSS: Final = 2.8
-"""Ratio of peak powers, another sweep's to the call's, from which the call is said not to match."""
-_MAX_CREST: Final = 12.0  # Peak to mean power around the call's own strongest peak; more is an echo of the call.
+"""Ratio of the peak power of another sweep to that of the call, above which the call does not match."""
+_MAX_CREST: Final = 12.0  # Peak to mean power around the call's own strongest peak; higher values indicate the call.
 _MIN_SNR: Final = 40.0  # Peak to median power after the best filter; noise reaches about 20.
-_MIN_SMEAR: Final = 0.2  # Least extent of a peak that another sweep leaves, relative to the call's duration.
-_TAPERED_S: Final = 0.3e-3  # at each end of the record
+_MIN_SMEAR: Final = 0.2  # Minimum extent of the peak of another sweep, relative to the call's duration.
+_TAPERED_S: Final = 0.3e-3  # Length of the taper at each end of the record.
 _MAX_MICS: Final = 6
-_FEW_MICS: Final = 2  # whose signals choose the sweeps that are compared in all of them
+_FEW_MICS: Final = 2  # Number of microphones that select the sweeps to compare in all microphones.
 _MAX_LIKELY: Final = 16
-_BLOCK: Final = 32  # slopes at a time, whose arrays fit into a cache
-_MAX_SAMPLES: Final = 2**17  # so that long records take no more memory
+_BLOCK: Final = 32  # Number of slopes in a block, whose arrays fit into a cache.
+_MAX_SAMPLES: Final = 2**17  # Limit on the memory of long records.
 _MAX_MEASUREMENTS: Final = 8
 _MAX_SLOPE: Final = 4.0
-_MIN_SLOPE: Final = 0.3  # Shorter sweeps are not distinguished from clicks.
+_MIN_SLOPE: Final = 0.3  # Shorter sweeps cannot be distinguished from clicks.
 _MAX_SLOPES: Final = 400
 
 
 @dataclass(frozen=True, slots=True)
 class CallMatch:
-    """Compression of a measurement's strongest sound by the call's matched filter and by those of other sweeps.
+    """Comparison of the call's matched filter with those of other sweeps, for the strongest sound of a measurement.
 
     Attributes
     ----------
@@ -59,23 +59,23 @@ class CallMatch:
 
     @property
     def warning(self) -> str:
-        """Warning in one line; empty if the echoes match the call."""
+        """One-line warning; empty if the echoes match the call."""
         if self.matches:
             return ""
-        direction = "of the opposite direction" if self.slope < 0 else "in the same direction"
+        direction = "in the opposite direction" if self.slope < 0 else "in the same direction"
         length = abs(self.slope)
         sweep = f"a {self.modulation} sweep {direction}"
         if not 0.9 < length < 1.1:
-            sweep += f" that crosses the call's band {length:.2g} times as slowly"
+            sweep += f" with {length:.2g} times the call's duration over the same band"
         return (
-            f"echoes do not match the call: they look like {sweep}, whose matched filter gives a peak "
+            f"echoes do not match the call of the settings: they look like {sweep}, whose matched filter has a peak "
             f"{self.loss_db:.0f} dB higher. Ranges in the image are wrong; give the emitted call as [call] in a "
             "settings file"
         )
 
 
 def first_call_match(measurements: Iterable[Measurement]) -> CallMatch | None:
-    """Return the match of the first measurement with sound above the noise; None if the first 8 have none."""
+    """Return the match of the first measurement with sound above the noise; None if the first 8 contain no sound."""
     for measurement in itertools.islice(measurements, _MAX_MEASUREMENTS):
         found = call_match(measurement)
         if found is not None:
@@ -84,33 +84,39 @@ def first_call_match(measurements: Iterable[Measurement]) -> CallMatch | None:
 
 
 def call_match(measurement: Measurement) -> CallMatch | None:
-    """Compare the call's matched filter with those of sweeps of other slopes; None if no sound is above the noise.
+    """Compare the call's matched filter with those of sweeps of other slopes.
 
     All filters have the magnitude of the call's spectrum, so a single echo of the call has its highest peak after the
-    call's own filter. Sound is not judged if the call's filter compresses part of it: another sensor may be louder.
+    call's own filter. If the call's filter compresses part of the sound, the call matches, because another sensor may
+    be louder.
 
     Parameters
     ----------
     measurement : Measurement
 
+    Returns
+    -------
+    CallMatch or None
+        None if no sound is above the noise, or the band is too narrow for pulse compression.
+
     Raises
     ------
     DataError
-        The words are not those of the settings.
+        The samples do not match the settings.
     """
     settings = measurement.settings
     spectra, magnitude, own, frequency_hz = _spectra(measurement)
-    if len(frequency_hz) < 8:  # Too narrow a band, or too short a record, for any compression.
+    if len(frequency_hz) < 8:  # The band is too narrow, or the record too short, for pulse compression.
         return None
     call = settings.call
     bandwidth_hz = call.high_frequency_hz - call.low_frequency_hz
     n_fft = scipy.fft.next_fast_len(2 * len(frequency_hz))
-    plain = (spectra * magnitude).astype(np.complex64)  # half the time of double precision
+    plain = (spectra * magnitude).astype(np.complex64)  # Single precision takes half the time of double precision.
     before = _power((spectra * own).astype(np.complex64), n_fft)
     spacing_s = 1 / (n_fft * (frequency_hz[1] - frequency_hz[0]))
     min_half = max(2, round(_MIN_SMEAR * call.duration_s / spacing_s))
     if _snr(before) >= _MIN_SNR and _crest(before, min_half) >= _MAX_CREST:
-        return CallMatch(0.0, 1.0, call.modulation, matches=True)  # no other sweep could change this
+        return CallMatch(0.0, 1.0, call.modulation, matches=True)  # No other sweep can change this result.
     step = max(1 / (bandwidth_hz * call.duration_s), 2 * _MAX_SLOPE / _MAX_SLOPES)
     count = math.ceil(_MAX_SLOPE / step)
     slopes = np.arange(-count, count + 1) * (_MAX_SLOPE / count)
@@ -142,7 +148,7 @@ def call_match(measurement: Measurement) -> CallMatch | None:
 def _spectra(
     measurement: Measurement,
 ) -> tuple[NDArray[Any], NDArray[np.float64], NDArray[np.complex128], NDArray[np.float64]]:
-    """Return the spectra of some microphones in the call's band, the call's magnitude, its filter and frequencies."""
+    """Return spectra of some microphones in the call's band, the call's magnitude, its filter, and frequencies."""
     settings = measurement.settings
     form = sample_format(settings)
     words, _ = form.normalised(form.validated(measurement.data))
@@ -150,7 +156,7 @@ def _spectra(
     channels = np.flatnonzero(microphones(settings.array).enabled).astype(np.int32)
     channels = np.ascontiguousarray(channels[:: max(1, -(-len(channels) // _MAX_MICS))])
     signals = np.empty((len(channels), len(words)), dtype=np.float32)
-    plain = kernels.load("numpy")  # has nothing to compile
+    plain = kernels.load("numpy")  # These kernels need no compilation.
     if settings.recording.is_pdm:
         plain.unpack_bits(words, channels, signals)
     else:
@@ -159,7 +165,7 @@ def _spectra(
     call = settings.call
     rate_hz = settings.recording.sample_rate_hz
     emitted = call_samples(call, rate_hz=rate_hz)
-    # Cut off sharply, a hum below the band would sound like a click at both ends.
+    # Without a taper, a hum below the band would cause clicks at both ends.
     edge = np.arange(len(words)) / (_TAPERED_S * rate_hz)
     signals *= np.sin(np.pi / 2 * np.minimum(1.0, np.minimum(edge, edge[::-1]))).astype(np.float32) ** 2
     n_fft = scipy.fft.next_fast_len(len(words) + len(emitted), real=True)
@@ -173,7 +179,7 @@ def _spectra(
 def _phase_of_sweep(call: Call, frequency_hz: NDArray[np.float64], *, linear: bool) -> NDArray[np.float64]:
     """Return the phase of a sweep's matched filter over the call's band.
 
-    Group delays are measured from the delay at the lowest frequency, which moves peaks and does not widen them.
+    Group delays are relative to the delay at the lowest frequency. This shifts peaks but does not widen them.
     """
     span = frequency_hz - frequency_hz[0]
     if linear:
@@ -186,7 +192,7 @@ def _phase_of_sweep(call: Call, frequency_hz: NDArray[np.float64], *, linear: bo
 def _turned(
     spectra: NDArray[np.complex64], slopes: NDArray[np.float64], curve_rad: NDArray[np.float64], n_fft: int
 ) -> NDArray[np.float32]:
-    """Return the power after the filters of some sweeps: (slope, mic, sample)."""
+    """Return the power after the matched filters of some sweeps: (slope, mic, sample) float32."""
     angles_rad = np.outer(slopes, curve_rad).astype(np.float32)
     filters = np.cos(angles_rad) + np.complex64(1j) * np.sin(angles_rad)
     return _power(filters[:, None] * spectra, n_fft)
@@ -198,13 +204,13 @@ def _power(spectra: NDArray[np.complex64], n_fft: int) -> NDArray[np.float32]:
 
 
 def _snr(power: NDArray[np.float32]) -> float:
-    """Return the peak power relative to the median, the median of the microphones."""
+    """Return the peak power relative to the median power, as the median over microphones."""
     middle = np.median(power, axis=1).astype(np.float64)
     return float(np.median(power.max(axis=1) / np.maximum(middle, 1e-300)))
 
 
 def _crest(power: NDArray[np.float32], half: int) -> float:
-    """Return the peak power relative to the mean within ``half`` samples of it, the median of the microphones."""
+    """Return the peak power relative to the mean within ``half`` samples of it, as the median over microphones."""
     crests = []
     for row in power:
         peak = int(np.argmax(row))

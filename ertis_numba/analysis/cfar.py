@@ -1,4 +1,4 @@
-"""What stands out of its surroundings in range, at a constant false alarm rate (CFAR) that is asked for."""
+"""Detection of bins that stand out along the range, at a constant false alarm rate (CFAR)."""
 
 import math
 from typing import Literal
@@ -19,10 +19,10 @@ __all__ = ["METHODS", "Method", "cfar", "cfar_peaks", "clean", "threshold_factor
 
 Method = Literal["ordered_statistic", "cell_averaging", "greatest_of"]
 METHODS: tuple[Method, ...] = ("ordered_statistic", "cell_averaging", "greatest_of")
-"""How the noise is estimated from the reference bins: OS-CFAR, CA-CFAR and GO-CFAR."""
+"""Estimators of the noise from the reference bins: OS-CFAR, CA-CFAR and GO-CFAR."""
 
-_RANK = 0.75  # of the reference bins: H. Rohling's choice, which a quarter of them may spoil
-_GUARD = 6.0  # resolutions on each side of a bin: a compressed pulse is 26 dB down there, more than what stands out
+_RANK = 0.75  # Rank relative to the number of reference bins, after H. Rohling; a quarter of them may hold reflectors.
+_GUARD = 6.0  # Guard cells on each side, in resolutions: a compressed pulse is 26 dB down there, below the threshold.
 
 
 def cfar(
@@ -32,42 +32,46 @@ def cfar(
     method: Method = "ordered_statistic",
     n_reference: int = 32,
 ) -> NDArray[np.bool_]:
-    """Return which bins stand out of the bins around them in range, at a constant false alarm rate (CFAR).
+    """Detect bins that exceed the noise around them along the range, at a constant false alarm rate (CFAR).
 
-    Each bin is compared with reference bins (training cells) of the same direction, half of them before it and half
-    behind, a resolution ``c / 2B`` apart, so that their noise is independent. Six resolutions on each side of the bin
-    are left out (guard cells), since its own echo reaches there; at both ends of the range axis all reference bins
-    come from one side. In noise whose envelope is a Rayleigh variable, such as that of delay-and-sum, the share of
-    bins that stand out is ``false_alarm``, whatever the level is. Where the level changes it is less on the lower
-    side; what it is on the higher one, and beside reflectors, is in the guide, under "Pictures and reflectors".
+    Each bin is compared with reference bins (training cells) of the same direction, half of them before and half
+    behind it. They are a resolution ``c / 2B`` apart, so their noise is independent. Six resolutions on each side of
+    the bin are guard cells, because its own echo extends there. At both ends of the range axis, all reference bins come
+    from one side.
+
+    In Rayleigh-distributed noise, such as that of delay-and-sum, the share of detected bins is ``false_alarm`` at any
+    noise level. Beside a step of the noise level, the share is smaller on the lower side. The guide, under "Pictures
+    and reflectors", has the share on the higher side and beside reflectors.
 
     Parameters
     ----------
     image : Energyscape
     false_alarm : float
-        1e-9 to 0.5.
+        Probability of a false alarm per bin, 1e-9 to 0.5; 1e-4 by default.
     method : {"ordered_statistic", "cell_averaging", "greatest_of"}
-        The noise is a high rank of the reference bins (OS-CFAR), their mean (CA-CFAR) or the greater mean of two
-        halves (GO-CFAR). The first sees a reflector beside others, up to a quarter of the reference bins; the second
-        sees the weakest single one; the third gives the fewest false alarms where the level changes.
+        Estimator of the noise: a high rank of the reference bins (OS-CFAR), their mean (CA-CFAR) or the greater mean of
+        two halves (GO-CFAR). OS-CFAR detects a reflector beside others that fill up to a quarter of the reference bins.
+        CA-CFAR detects the weakest single reflector. GO-CFAR has the fewest false alarms where the noise level changes.
     n_reference : int
-        Even, 4 to 512.
+        Number of reference bins, an even number from 4 to 512; 32 by default.
 
     Returns
     -------
     (direction, range) bool
+        True for detected bins.
 
     Raises
     ------
     ArgumentError
-        An argument cannot be used, or the image has too few ranges.
+        An argument is invalid, or the image has too few ranges.
     """
     checks.instance("image", image, Energyscape, "Pipeline.process returns")
     factor = threshold_factor(method, n_reference, false_alarm)
     places = _reference(image, n_reference)
     amplitude = image.amplitude
     if method == "ordered_statistic":
-        # A bin is above a multiple of the k-th lowest when it is above that multiple of k of them: nothing is sorted.
+        # A bin exceeds a multiple of the k-th lowest reference bin if it exceeds that multiple of k bins. This needs no
+        # sorting.
         lowered = amplitude / np.float32(math.sqrt(factor))
         beaten = np.zeros(amplitude.shape, dtype=np.uint16)
         for row in places:
@@ -77,40 +81,49 @@ def cfar(
     half = n_reference // 2
     sums = [np.zeros_like(power), np.zeros_like(power)]
     for number, row in enumerate(places):
-        sums[number // half] += np.take(power, row, axis=1)  # indexing takes 17 times as long
+        sums[number // half] += np.take(power, row, axis=1)  # Advanced indexing takes 17 times as long.
     mean = (sums[0] + sums[1]) / n_reference if method == "cell_averaging" else np.maximum(*sums) / half
     return np.asarray(power > np.float32(factor) * mean)
 
 
 def threshold_factor(method: Method, n_reference: int, false_alarm: float) -> float:
-    """Return by what factor the power of a bin must exceed the estimate of the noise.
+    """Return the CFAR threshold: the ratio of a bin's power to the noise estimate above which the bin is detected.
 
-    The noise is the mean of the N reference bins, ``P = (1 + α/N)^−N`` (H. M. Finn and R. S. Johnson, RCA Review 29,
-    1968); the k-th lowest, k = 3N/4, rounded, ``P = Π_{i<k} (N − i) / (N − i + α)`` (H. Rohling, IEEE Trans. AES 19,
-    1983); or the greater mean of the halves of n = N/2,
-    ``P / 2 = (1 + α/n)^−n − Σ_{i<n} C(n+i−1, i) (2 + α/n)^−(n+i)`` (V. G. Hansen and J. H. Sawyers, IEEE Trans. AES
-    16, 1980).
+    The false-alarm probability P depends on the threshold factor α and on the estimator of the noise:
+
+    - Mean of the N reference bins: ``P = (1 + α/N)^−N`` (H. M. Finn and R. S. Johnson, RCA Review 29, 1968).
+    - k-th lowest bin, k = 3N/4, rounded: ``P = Π_{i<k} (N − i) / (N − i + α)`` (H. Rohling, IEEE Trans. AES 19, 1983).
+    - Greater mean of two halves of n = N/2 bins: ``P / 2 = (1 + α/n)^−n − Σ_{i<n} C(n+i−1, i) (2 + α/n)^−(n+i)``
+      (V. G. Hansen and J. H. Sawyers, IEEE Trans. AES 16, 1980).
 
     Parameters
     ----------
     method : {"ordered_statistic", "cell_averaging", "greatest_of"}
     n_reference : int
+        Number of reference bins, an even number from 4 to 512.
     false_alarm : float
+        Probability of a false alarm per bin, 1e-9 to 0.5.
 
     Returns
     -------
     float
-        α.
+        α, a ratio of powers.
 
     Raises
     ------
     ArgumentError
-        An argument cannot be used.
+        An argument is invalid.
+
+    Examples
+    --------
+    >>> from ertis_numba.analysis.cfar import threshold_factor
+    >>> round(threshold_factor("cell_averaging", 32, 1e-4), 2)
+    10.67
     """
     checks.choice("method", method, METHODS)
     checks.between("false_alarm", false_alarm, 1e-9, 0.5)
     if checks.integer("n_reference", n_reference, 4, 512) % 2:
-        raise ArgumentError(f"n_reference is {n_reference}; give an even number, half for each side")
+        raise ArgumentError(f"n_reference is {n_reference}; give an even number, with half the bins on each side")
     if method == "cell_averaging":
         return float(n_reference * (false_alarm ** (-1 / n_reference) - 1))
     log_of = _log_ordered if method == "ordered_statistic" else _log_greatest
@@ -138,7 +151,7 @@ def _log_greatest(factor: float, n_reference: int) -> float:
 
 
 def _reference(image: Energyscape, n_reference: int) -> NDArray[np.intp]:
-    """Return the ranges that each range is compared with, the nearest that there are, rising: (reference, range)."""
+    """Return the nearest reference ranges of each range, in ascending order: (reference, range) intp."""
     n_ranges = len(image.range_m)
     step, guard = 1, 1
     if n_ranges > 1:
@@ -148,8 +161,8 @@ def _reference(image: Energyscape, n_reference: int) -> NDArray[np.intp]:
     needed = step * (n_reference + 2) + 2 * guard + 1
     if n_ranges < needed:
         raise ArgumentError(
-            f"image has {n_ranges} ranges, and {n_reference} reference bins take {needed}; give a wider range window "
-            "or a smaller n_reference"
+            f"image has {n_ranges} ranges, but {n_reference} reference bins need {needed}; give an image with a wider "
+            "range window, or a smaller n_reference"
         )
     here = np.arange(n_ranges)
     before, behind = (np.maximum(room - guard, 0) // step for room in (here, n_ranges - 1 - here))
@@ -167,25 +180,30 @@ def _resolution_m(settings: Settings) -> float:
 
 
 def clean(image: Energyscape, *, within_db: float = 6.0, above_mean_db: float | None = None) -> Energyscape:
-    """Return an image that keeps of each range only the strongest directions; all else becomes 0.
+    """Return an image that keeps only the strongest directions of each range; all other bins become 0.
 
-    What lies further below the strongest direction of its range goes, and with it the side lobes; so do weaker
-    reflectors at the same range. The software of the authors of eRTIS keeps half of the strongest amplitude and twice
-    the mean of the range, which is ``within_db=6, above_mean_db=6`` (rtisdev 2.16.0,
-    ``maxEnergyRangeThresholdMultiplier`` and ``meanEnergyRangeMultiplier``).
+    This removes side lobes, and weaker reflectors at the same range as well. The software of the authors of eRTIS keeps
+    bins above half of the strongest amplitude and above twice the mean of the range. That corresponds to
+    ``within_db=6, above_mean_db=6`` (rtisdev 2.16.0, ``maxEnergyRangeThresholdMultiplier`` and
+    ``meanEnergyRangeMultiplier``).
 
     Parameters
     ----------
     image : Energyscape
     within_db : float
-        Below the strongest of the range, 0 to 1000.
+        Largest level below the strongest direction of the same range, 0 to 1000 dB; 6 by default.
     above_mean_db : float, optional
-        Above the mean amplitude of the range, 0 to 1000; an image of one direction keeps nothing then.
+        Smallest level above the mean amplitude of the range, 0 to 1000 dB; no such limit by default. With this limit,
+        an image of one direction keeps no bin.
+
+    Returns
+    -------
+    Energyscape
 
     Raises
     ------
     ArgumentError
-        A level cannot be used.
+        A level is out of range.
     """
     checks.instance("image", image, Energyscape, "Pipeline.process returns")
     amplitude = image.amplitude
@@ -206,28 +224,42 @@ def cfar_peaks(
     top: int | None = 10,
     min_level_db: float = -200.0,
 ) -> list[Peak]:
-    """Return the reflectors that stand out of the noise around them, strongest first.
+    """Return the reflectors that exceed the noise around them, strongest first.
 
-    As `find_peaks`, of the bins that `cfar` and `clean` leave.
+    The result is that of `find_peaks`, restricted to the bins that `cfar` detects and `clean` keeps.
 
     Parameters
     ----------
     image : Energyscape
     false_alarm : float
-        Of a bin, before its neighbours are looked at: of noise alone there are fewer peaks than this share of the
-        bins, as noise that is above its neighbours is rarer still.
+        Probability of a false alarm per bin, 1e-9 to 0.5; 1e-4 by default. In noise alone, the share of bins that are
+        peaks is smaller, because a peak must also exceed its neighbours.
     method : {"ordered_statistic", "cell_averaging", "greatest_of"}
+        Estimator of the noise: see `cfar`.
     within_db : float
-        Below the strongest of the same range.
+        Largest level below the strongest direction of the same range; `SIDE_LOBE_DB`, 10 dB, by default.
     top : int, optional
-        At most so many; None for all.
+        Maximum number of reflectors; 10 by default, None for all.
     min_level_db : float
-        Level below the strongest reflector at which to stop.
+        Minimum level relative to the strongest reflector; -200 dB by default.
+
+    Returns
+    -------
+    list of Peak
 
     Raises
     ------
     ArgumentError
-        An argument cannot be used, or the image has too few ranges.
+        An argument is invalid, or the image has too few ranges.
+
+    Examples
+    --------
+    Detect weak reflectors at any range, with few false alarms::
+
+        with ertis.open_recording("data/synthetic/reflectors.h5") as recording:
+            measurement = recording[0]
+        image = ertis.Pipeline(measurement.settings).process(measurement)
+        peaks = ertis.cfar_peaks(image, false_alarm=1e-6, top=None)
     """
     stands_out = cfar(image, false_alarm=false_alarm, method=method)
     stands_out &= clean(image, within_db=within_db).amplitude > 0

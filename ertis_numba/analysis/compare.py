@@ -1,4 +1,4 @@
-"""From reflectors found to errors: what an image shows against what it ought to show."""
+"""Comparison of the peaks of an image with the scene's ground truth."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -18,28 +18,28 @@ from ertis_numba.waveform import matched_filter_spectrum
 
 __all__ = ["Comparison", "Errors", "Match", "compare", "errors_of"]
 
-_GATE_M = 0.1  # between a reflector and its peak
-_GATE_HALF_LOBES = 3.0  # one and a half main lobes
-_HALF_AMPLITUDE = math.sqrt(2 * math.log(2))  # where exp(-x² / 2) is a half
-_SLACK_DB = 3.0  # by which a level in the image may differ from the true one
-_MAX_FALSE = 100  # noise alone has thousands of maxima, which tell no more than a hundred
+_GATE_M = 0.1  # Maximum range difference between a reflector and its peak.
+_GATE_HALF_LOBES = 3.0  # Maximum angle between them: one and a half main lobes.
+_HALF_AMPLITUDE = math.sqrt(2 * math.log(2))  # Argument x for which exp(-x² / 2) is one half.
+_SLACK_DB = 3.0  # Tolerance of a level in the image relative to the true level.
+_MAX_FALSE = 100  # Noise alone has thousands of maxima, and more than a hundred add no information.
 _MIN_DB = -1000.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Match:
-    """A reflector and the peak that shows it.
+    """Reflector of the ground truth and the peak assigned to it.
 
     Attributes
     ----------
     reflector : Reflector
     peak : Peak
     angle_deg : float
-        Between the two directions; between the two azimuths where the image is planar.
+        Angle between the two directions in degrees; in a planar image, the angle between the two azimuths.
     range_m : float
-        How much too far the peak is.
+        Range of the peak minus that of the reflector, in metres.
     level_db : float
-        How much too strong the peak is, both below the strongest reflector that was found.
+        Level of the peak minus that of the reflector, each relative to the strongest reflector that was found.
     """
 
     reflector: Reflector
@@ -51,19 +51,19 @@ class Match:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Comparison:
-    """What one image shows against what it ought to show.
+    """Comparison of one image with the ground truth.
 
     Attributes
     ----------
     matched : tuple of Match
-        In the order of the reflectors.
+        Reflectors that were found, in the order of the ground truth.
     missed : tuple of Reflector
-        Those that the image ought to show and does not.
+        Visible reflectors without a peak.
     false : tuple of Peak
-        Those that no reflector explains.
+        Spurious peaks, which no reflector explains.
     explained : tuple of Peak
-        Those of reflectors that do not count, being too weak or outside of the image, of another sensor's call, or
-        mirrored by a plane array.
+        Peaks of reflectors that do not count: too weak, outside of the image, of another sensor's call, or mirrored by
+        a plane array.
     """
 
     matched: tuple[Match, ...]
@@ -74,13 +74,14 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Errors:
-    """Errors over many images.
+    """Errors over several images.
 
     Attributes
     ----------
     measurements, matched, missed, false : int
+        Numbers of images, of reflectors found, of missed reflectors, and of spurious peaks.
     angle_rms_deg, range_bias_m, range_rms_m, level_rms_db : float or None
-        Of what was matched, None if nothing was; the bias is above 0 where peaks are too far.
+        Errors of the matched reflectors, None if there are none. The bias is positive if peaks are too far away.
     """
 
     measurements: int
@@ -94,26 +95,48 @@ class Errors:
 
 
 def compare(image: Energyscape, reflectors: Sequence[Reflector], *, min_level_db: float = -30.0) -> Comparison:
-    """Return which reflectors an image shows, and which it does not.
+    """Compare the peaks of an image with the ground truth of its measurement.
 
-    A reflector counts if the image can show it: it returns the sensor's own call, its range lies on the range axis,
-    its direction within half of the main lobe of the nearest direction, and its level is at least ``min_level_db``
-    below the strongest that counts. Peaks are assigned to those one to one, such that as many as possible lie
-    within 0.1 m and one and a half main lobes, at the least sum of squared distances (the
-    assignment problem, solved by SciPy after D. F. Crouse, 2016). At most 100 peaks more than reflectors are
-    looked for.
+    A reflector is visible, and counts, under these conditions:
+
+    - It returns the sensor's own call.
+    - Its range lies on the range axis.
+    - Its direction lies within half a main lobe of the nearest direction of the image.
+    - Its level relative to the strongest visible reflector is at least ``min_level_db``.
+
+    Peaks and visible reflectors are assigned one to one. The assignment first maximises the number of pairs within
+    0.1 m and one and a half main lobes, then minimises the sum of squared distances. SciPy solves this assignment
+    problem after D. F. Crouse, 2016. The number of peaks is limited to that of the reflectors plus 100.
 
     Parameters
     ----------
     image : Energyscape
     reflectors : sequence of Reflector
-        The truth of the measurement that the image was made from.
+        Ground truth of the measurement that the image was computed from.
     min_level_db : float
+        Minimum level of a reflector, relative to the strongest visible reflector; -30 dB by default.
+
+    Returns
+    -------
+    Comparison
 
     Raises
     ------
     ArgumentError
         ``min_level_db`` is above 0.
+
+    Examples
+    --------
+    Compare an image of a simulated scene with its ground truth::
+
+        from ertis_numba.simulation import Point
+
+        scene = ertis.Scene(points=(Point(azimuth_deg=20.0, range_m=1.5),))
+        simulator = ertis.Simulator(scene)
+        measurement = simulator.render(index=0)
+        image = ertis.Pipeline(measurement.settings).process(measurement)
+        comparison = ertis.compare(image, simulator.reflectors(index=0))
+        print(len(comparison.matched), len(comparison.missed), len(comparison.false))
     """
     checks.instance("image", image, Energyscape, "Pipeline.process returns")
     reflectors = list(checks.items("reflectors", reflectors, Reflector, "RecordingReader.reflectors returns"))
@@ -127,12 +150,13 @@ def compare(image: Energyscape, reflectors: Sequence[Reflector], *, min_level_db
     counts = is_shown & (levels_db >= strongest_db + min_level_db)
     counted = [reflector for reflector, does in zip(reflectors, counts, strict=True) if does]
 
-    # What does not count may still be the strongest in the image, or leak into it.
+    # A reflector that does not count may still be the strongest in the image, or leak into it.
     above_db = float(np.max(levels_db, where=in_range, initial=strongest_db)) - strongest_db if counted else 0.0
     floor_db = max(_MIN_DB, min_level_db - above_db - _SLACK_DB)
     peaks = find_peaks(image, top=len(reflectors) + _MAX_FALSE, min_level_db=floor_db)
     pairs = _assign(image, counted, peaks, lobe)
-    # Peaks are below the strongest peak, reflectors below the strongest reflector: one found gives the step.
+    # Levels of peaks are relative to the strongest peak, those of reflectors to the strongest reflector. A matched pair
+    # determines the offset between the two references.
     step_db = _step_db(pairs, strongest_db if counted else 0.0)
 
     min_db = min_level_db + (strongest_db if counted else 0.0) - step_db
@@ -147,7 +171,13 @@ def compare(image: Energyscape, reflectors: Sequence[Reflector], *, min_level_db
 
 
 def errors_of(comparisons: Iterable[Comparison]) -> Errors:
-    """Return the errors over all reflectors of several images."""
+    """Return the errors over all reflectors of several images.
+
+    Parameters
+    ----------
+    comparisons : iterable of Comparison
+        One comparison per image.
+    """
     given = list(comparisons)
     matches = [match for comparison in given for match in comparison.matched]
     ranges_m = [match.range_m for match in matches]
@@ -169,17 +199,16 @@ def _rms(values: Iterable[float]) -> float | None:
 
 
 class _Lobe:
-    """How far the main lobe of an array reaches.
+    """Main lobe of an array.
 
-    Near a reflector its amplitude falls like ``exp(−k² Δuᵀ C Δu / 2)``: Δu is the difference of the unit
-    vectors, C the weighted covariance of the microphones' positions and k the wave number at the centre of the
-    call. For the shipped layouts this gives the width at half amplitude within a tenth.
+    Near a reflector, the amplitude falls like ``exp(−k² Δuᵀ C Δu / 2)``. Δu is the difference of the unit vectors, and
+    C is the weighted covariance of the microphone positions. k is the wave number at the centre of the call. For the
+    shipped layouts, the width at half amplitude is accurate to one tenth.
 
     Attributes
     ----------
     half_deg : float
-        Half of the width at half amplitude, in the direction in which it is least; infinite for a
-        single microphone.
+        Half of the width at half amplitude in degrees, along the narrowest axis; infinite for a single microphone.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -194,9 +223,9 @@ class _Lobe:
         self.half_deg = math.degrees(1 / largest) if largest else math.inf
 
     def __call__(self, direction_offset: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return how far directions are apart for the array, in halves of its main lobe: (...,) float64.
+        """Return the distance of directions in half main lobes of the array: (...,) float64.
 
-        It is 0 between a direction and its mirror image behind a plane array.
+        The distance is 0 between a direction and its mirror image behind a plane array.
 
         Parameters
         ----------
@@ -207,14 +236,14 @@ class _Lobe:
 
 
 def _in_view(image: Energyscape, reflectors: Sequence[Reflector], lobe: _Lobe) -> NDArray[np.bool_]:
-    """Return which reflectors lie in the solid angle of an image: (reflector,) bool."""
+    """Return True for each reflector within the solid angle of an image: (reflector,) bool."""
     directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
     chords = np.array([np.min(np.linalg.norm(directions - unit, axis=1)) for unit in _units(reflectors)])
     return np.asarray(_degrees_between(chords) <= lobe.half_deg)
 
 
 def _in_range(image: Energyscape, reflectors: Sequence[Reflector]) -> NDArray[np.bool_]:
-    """Return which reflectors lie on the range axis: (reflector,) bool; its ends can be no maximum."""
+    """Return True for each reflector on the range axis, except its ends, which are never maxima: (reflector,) bool."""
     inner_m = image.range_m[1:-1] if len(image.range_m) > 2 else image.range_m
     ranges_m = np.array([reflector.range_m for reflector in reflectors])
     return np.asarray((ranges_m >= inner_m[0]) & (ranges_m <= inner_m[-1]))
@@ -223,19 +252,19 @@ def _in_range(image: Energyscape, reflectors: Sequence[Reflector]) -> NDArray[np
 def _assign(
     image: Energyscape, counted: Sequence[Reflector], peaks: Sequence[Peak], lobe: _Lobe
 ) -> list[tuple[Reflector, Peak]]:
-    """Return which peak shows which reflector."""
+    """Return the pairs of reflectors and peaks."""
     if not counted or not peaks:
         return []
     angles = _angles_deg(image, counted, peaks) / (_GATE_HALF_LOBES * lobe.half_deg)
     ranges = _range_offsets_m(counted, peaks) / _GATE_M
     near = (angles <= 1) & (np.abs(ranges) <= 1)
-    dear = 2.0 * min(near.shape) + 1  # more than all that are near together
+    dear = 2.0 * min(near.shape) + 1  # This cost exceeds the sum over all near pairs.
     rows, columns = scipy.optimize.linear_sum_assignment(np.where(near, angles**2 + ranges**2, dear))
     return [(counted[row], peaks[column]) for row, column in zip(rows, columns, strict=True) if near[row, column]]
 
 
 def _step_db(pairs: Sequence[tuple[Reflector, Peak]], strongest_db: float) -> float:
-    """Return what to add to the level of a peak to compare it with those of reflectors."""
+    """Return the offset that converts levels of peaks to levels of reflectors, in dB."""
     if not pairs:
         return strongest_db
     reflector, peak = max(pairs, key=lambda pair: pair[0].level_db)
@@ -262,10 +291,10 @@ def _explained(
     counts: NDArray[np.bool_],
     step_db: float,
 ) -> NDArray[np.bool_]:
-    """Return which peaks are due to reflectors that need not be found there: (peak,) bool.
+    """Return True for each peak caused by a reflector that need not be found there: (peak,) bool.
 
-    Those are the ones that do not count, the mirror images of all behind the array, and the side lobes
-    of what lies outside of the solid angle, which `find_peaks` cannot know.
+    Such peaks belong to reflectors that do not count, or to mirror images behind the array. They may also be side lobes
+    of reflectors outside the solid angle, which `find_peaks` cannot predict.
     """
     if not peaks or not reflectors:
         return np.zeros(len(peaks), dtype=np.bool_)
@@ -301,5 +330,5 @@ def _angles_deg(image: Energyscape, reflectors: Sequence[Reflector], peaks: Sequ
 
 
 def _range_offsets_m(reflectors: Sequence[Reflector], peaks: Sequence[Peak]) -> NDArray[np.float64]:
-    """Return how much farther peaks are than reflectors: (reflector, peak) float64."""
+    """Return the ranges of peaks minus those of reflectors, in metres: (reflector, peak) float64."""
     return np.subtract.outer([peak.range_m for peak in peaks], [reflector.range_m for reflector in reflectors]).T

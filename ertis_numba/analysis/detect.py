@@ -1,4 +1,4 @@
-"""From energyscapes to reflectors."""
+"""Detection of reflectors in images."""
 
 import math
 
@@ -16,7 +16,7 @@ from ertis_numba.geometry import unit_vectors
 
 __all__ = ["find_peaks", "neighbours_of", "spacing_of"]
 
-_NEIGHBOURS = 8  # directions around one in the plane of a dense grid
+_NEIGHBOURS = 8  # Number of directions around each direction of a dense grid.
 
 
 def find_peaks(
@@ -30,29 +30,43 @@ def find_peaks(
     """Return the reflectors of an image, strongest first.
 
     A reflector is a local maximum over directions and ranges that exceeds the side lobes of all stronger reflectors
-    there, see `ertis_numba.analysis.side_lobes.SideLobes`. So each gives one entry, not one per bin of its main lobe nor
-    one per side lobe. Direction, range and level are interpolated: see
+    there: see `ertis_numba.analysis.side_lobes.SideLobes`. Each reflector therefore yields one entry, not one per bin
+    of its main lobe or per side lobe. Direction, range and level are interpolated: see
     `ertis_numba.analysis.peak_interpolation.PeakInterpolator`.
 
     Parameters
     ----------
     image : Energyscape
     top : int, optional
-        At most so many; None for all.
+        Maximum number of reflectors; 10 by default, None for all.
     min_level_db : float
-        Level below the strongest reflector at which to stop.
+        Minimum level relative to the strongest reflector; -30 dB by default.
     where : (direction, range) bool, optional
-        Bins that may be the maximum of a reflector; all by default.
+        True for bins that may be the maximum of a reflector; all bins by default.
     false_alarm : float, optional
-        Probability that noise alone gives a reflector anywhere in the image. Weaker maxima are left out, except for
+        Probability that noise alone yields a reflector anywhere in the image. Weaker maxima are discarded, except for
         beamformers whose noise is unknown: see `ertis_numba.analysis.noise.threshold_of`. By default, maxima of noise
         count as reflectors.
+
+    Returns
+    -------
+    list of Peak
 
     Raises
     ------
     ArgumentError
         ``top`` is below 1, ``min_level_db`` is above 0, ``where`` has another shape than the image, or
         ``false_alarm`` is not between 0 and 1.
+
+    Examples
+    --------
+    Print the three strongest reflectors of a recording's first measurement::
+
+        with ertis.open_recording("data/synthetic/reflectors.h5") as recording:
+            measurement = recording[0]
+        image = ertis.Pipeline(measurement.settings).process(measurement)
+        for peak in ertis.find_peaks(image, top=3):
+            print(f"{peak.range_m:.2f} m at {peak.azimuth_deg:.0f}°, {peak.level_db:.1f} dB")
     """
     checks.instance("image", image, Energyscape, "Pipeline.process returns")
     top = image.amplitude.size if top is None else checks.integer("top", top, 1)
@@ -67,7 +81,7 @@ def find_peaks(
         where = np.asarray(where)
         checks.shape("where", where.shape, image.amplitude.shape)
         if where.dtype != np.bool_:
-            raise ArgumentError(f"where holds {where.dtype}; give bool, such as image.energy > 0.01")
+            raise ArgumentError(f"where has dtype {where.dtype}; give bool, such as image.amplitude > 0.01")
     places = _local_maxima(image.amplitude, neighbours, floor, where)
     levels = image.amplitude[places[:, 0], places[:, 1]].astype(np.float64)
     order = np.argsort(-levels, kind="stable")
@@ -77,8 +91,8 @@ def find_peaks(
     for k in order:
         if len(found) == top:
             break
-        # Only what comes next in order is compared with what was found, which is few of many candidates, and
-        # with where that really lies: a side lobe is several decibels off when its reflector is half a bin off.
+        # Each candidate is compared only with the few reflectors found before it, at their interpolated positions. The
+        # prediction of a side lobe is several decibels off if its reflector is half a bin off.
         if side_lobes.explain(directions[places[k, 0]], int(places[k, 1]), levels[k]):
             continue
         tops = interpolate(image, places[k : k + 1, 0], places[k : k + 1, 1])
@@ -98,9 +112,9 @@ def find_peaks(
 
 
 def neighbours_of(directions: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return for each direction itself and the nearest others.
+    """Return each direction with its nearest neighbours.
 
-    In a plane these are the ones next to it; elsewhere the eight around it.
+    Directions of a single elevation have two neighbours, others have eight.
 
     Parameters
     ----------
@@ -110,7 +124,7 @@ def neighbours_of(directions: NDArray[np.float64]) -> NDArray[np.int64]:
     Returns
     -------
     (direction, neighbour) int64
-        Fewer neighbours where there are too few directions.
+        Indices of the direction itself and of its neighbours; fewer if there are too few directions.
     """
     count = 2 if np.ptp(directions[:, 2]) == 0 else _NEIGHBOURS
     _, nearest = scipy.spatial.KDTree(directions).query(directions, k=min(count + 1, len(directions)))
@@ -118,9 +132,16 @@ def neighbours_of(directions: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def spacing_of(directions: NDArray[np.float64], neighbours: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the distance from each direction to the nearest other, in radians: (direction,) float64.
+    """Return the distance from each direction to its nearest neighbour, in radians: (direction,) float64.
 
-    Infinite where there is no other. Neighbours are those of `neighbours_of`.
+    The distance is infinite for a single direction.
+
+    Parameters
+    ----------
+    directions : (direction, axis) float64
+        Unit vectors.
+    neighbours : (direction, neighbour) int64
+        Result of `neighbours_of`.
     """
     if neighbours.shape[1] < 2:
         return np.full(len(directions), np.inf)
@@ -130,9 +151,10 @@ def spacing_of(directions: NDArray[np.float64], neighbours: NDArray[np.int64]) -
 def _local_maxima(
     amplitude: NDArray[np.float32], neighbours: NDArray[np.int64], floor: float, where: NDArray[np.bool_] | None
 ) -> NDArray[np.int64]:
-    """Return (peak, [direction, range]) of what is above ``floor`` and not below any neighbour.
+    """Return the local maxima that reach ``floor``: (peak, [direction, range]) int64.
 
-    The first and the last range are no maxima: what rises towards them lies outside of the image.
+    The first and the last range contain no maxima, because an amplitude that rises towards them peaks outside of the
+    image.
     """
     inner = slice(1, -1) if amplitude.shape[1] > 2 else slice(None)
     start = inner.start or 0
@@ -142,12 +164,12 @@ def _local_maxima(
         is_peak &= where[:, inner]
     if start:
         is_peak &= (here >= amplitude[:, :-2]) & (here > amplitude[:, 2:])
-    # Only what is left is compared over directions; that is few.
+    # Only the few remaining bins are compared over directions.
     directions, ranges = np.nonzero(is_peak)
     ranges += start
     around = amplitude[neighbours[directions], ranges[:, None]]
     highest = around.max(axis=1, initial=0.0) <= amplitude[directions, ranges]
-    # Of two equal neighbours the first counts.
+    # The first of two equal neighbours counts.
     equal = (around == amplitude[directions, ranges][:, None]) & (neighbours[directions] < directions[:, None])
     keep = highest & ~equal.any(axis=1)
     return np.stack([directions[keep], ranges[keep]], axis=1)

@@ -1,4 +1,4 @@
-"""The points of images that come one after the other, of any sensors."""
+"""Points of a sequence of images of any sensors."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ __all__ = ["PointFinder", "same_directions"]
 
 
 class PointFinder:
-    """Finds the points of images of any sensors, with an extractor for each as long as it suits.
+    """Point detector for images of any sensors; it reuses the extractor of a sensor while the settings are the same.
 
     Parameters
     ----------
@@ -26,7 +26,7 @@ class PointFinder:
         self._extractors: dict[str, tuple[Energyscape, PointExtractor]] = {}
 
     def __call__(self, image: Energyscape) -> PointCloud:
-        """Return the points of an image, in the frame of its sensor."""
+        """Return the points of an image, in the coordinate frame of its sensor."""
         known = self._extractors.get(image.stamp.sensor)
         if known is None or not _suits(known[0], image):
             grid = Grid(image.azimuth_rad, image.elevation_rad)
@@ -36,13 +36,13 @@ class PointFinder:
 
 
 def _suits(image: Energyscape, other: Energyscape) -> bool:
-    """Whether the extractor of an image is that of another: air and processing may differ."""
+    """Return True if two images can share an extractor; their air and processing may differ."""
     ours, theirs = image.settings, other.settings
     return ours.array == theirs.array and ours.call == theirs.call and same_directions(image, other)
 
 
 def same_directions(image: Energyscape, other: Energyscape) -> bool:
-    """Whether two images have the same directions."""
+    """Return True if two images have the same directions."""
     return all(
         getattr(image, name) is getattr(other, name) or np.array_equal(getattr(image, name), getattr(other, name))
         for name in ("azimuth_rad", "elevation_rad")

@@ -1,4 +1,4 @@
-"""Levels, as pictures show them."""
+"""Levels of images for display."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,12 +7,20 @@ __all__ = ["below_strongest_db"]
 
 
 def below_strongest_db(amplitude: NDArray[np.float32], dynamic_range_db: float) -> NDArray[np.float32]:
-    """Return levels below the strongest, cut at the dynamic range; silence is all floor.
+    """Return levels in dB relative to the strongest amplitude, clipped at the dynamic range.
+
+    All levels of a silent image are at the lower end of the dynamic range.
 
     Parameters
     ----------
     amplitude : float32 of any shape
     dynamic_range_db : float
+        Dynamic range, above 0.
+
+    Returns
+    -------
+    float32 of the same shape
+        Levels from ``-dynamic_range_db`` to 0.
     """
     strongest = np.float32(amplitude.max(initial=0.0)) or np.float32(1)
     floor = np.float32(10 ** (-dynamic_range_db / 20))

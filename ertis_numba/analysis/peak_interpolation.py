@@ -1,4 +1,4 @@
-"""Maxima of an image between its bins."""
+"""Interpolation of the maxima of an image between its bins."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -13,25 +13,26 @@ from ertis_numba.stages.plan_response import deviation_of
 
 __all__ = ["PeakInterpolator", "Tops"]
 
-_ONE_SIDED = 0.25  # mean offset of neighbours relative to their reach, at the edge of a grid
-_LINE = 0.2  # of the widths of a direction's neighbours, below which they lie in a line
-_MAX_CORRECTIONS = 8  # of the error of parabolas: coarse grids need more than fine ones
-_CONVERGED = 1e-5  # change by a correction, in bins of range, in unit vectors and in nepers
-_MAX_DIFFERENCE = 1.0  # in nepers, between samples and those of a single reflector; beyond, they are of several
-_MAX_SHIFT = 0.5  # by a correction, in bins of range and in nepers; beyond, it has not converged
-_DARK = 1e-6  # amplitude, below the side lobes of any array
+_ONE_SIDED = 0.25  # Mean offset of neighbours relative to their distance; above it, a direction is at the grid's edge.
+_LINE = 0.2  # Ratio of the widths of a direction's neighbours, below which they lie on a line.
+_MAX_CORRECTIONS = 8  # Number of corrections of the parabola error; coarse grids need more than fine ones.
+_CONVERGED = 1e-5  # Change by a correction, in range bins, in unit vectors and in nepers.
+_MAX_DIFFERENCE = 1.0  # Deviation in nepers from the samples of a single reflector; beyond it, there are several.
+_MAX_SHIFT = 0.5  # Change by all corrections, in range bins and in nepers; beyond it, they have not converged.
+_DARK = 1e-6  # Amplitude below the side lobes of any array.
 
 
 class Tops(NamedTuple):
-    """Maxima near some bins.
+    """Interpolated maxima near given bins.
 
     Attributes
     ----------
     direction : (place, axis) float64
         Unit vectors.
     range_m, amplitude : (place,) float64
+        Range in metres, and amplitude.
     is_between : (place,) bool
-        True if the direction is interpolated; otherwise it is that of the bin.
+        True if the direction is interpolated; otherwise, it is the direction of the bin.
     """
 
     direction: NDArray[np.float64]
@@ -43,10 +44,10 @@ class Tops(NamedTuple):
 class PeakInterpolator:
     """Interpolator of maxima by parabolas through the logarithm of the amplitude, with a correction of their bias.
 
-    A main lobe is not a parabola. The samples of a reflector at the found position are therefore predicted from array
-    and call, and interpolated as well. The error of that interpolation is subtracted. The correction applies to
-    delay-and-sum of the fast method, and to maxima whose samples match a single reflector. Other maxima keep the result
-    of the parabolas. At 60 dB above the noise, the correction reduces errors from about 4 mm to 0.1 mm.
+    A main lobe is not a parabola. The interpolator therefore predicts the samples of a reflector at the found position
+    from array and call. It interpolates them as well, and subtracts the error of that interpolation. The correction
+    applies to delay-and-sum of the fast method, and to maxima whose samples match a single reflector. Other maxima keep
+    the result of the parabolas. At 60 dB above the noise, the correction reduces errors from about 4 mm to 0.1 mm.
 
     Parameters
     ----------
@@ -54,9 +55,9 @@ class PeakInterpolator:
     directions : (direction, axis) float64
         Unit vectors.
     neighbours : (direction, neighbour) int64
-        As of `ertis_numba.analysis.detect.neighbours_of`.
+        Result of `ertis_numba.analysis.detect.neighbours_of`.
     only : (place,) int64, optional
-        Directions whose maxima are needed; preparing all directions takes longer.
+        Directions whose maxima are needed; all by default, which takes longer to prepare.
     """
 
     def __init__(
@@ -76,13 +77,13 @@ class PeakInterpolator:
         self._deviation = deviation_of(settings, directions)
 
     def __call__(self, image: Energyscape, directions: NDArray[np.int64], ranges: NDArray[np.int64]) -> Tops:
-        """Return the maxima near some bins of an image.
+        """Return the interpolated maxima near given bins of an image.
 
         Parameters
         ----------
         image : Energyscape
         directions, ranges : (place,) int64
-            Bins; the first and the last range are not interpolated.
+            Indices of the bins. Maxima at the first and the last range are not interpolated along the range.
         """
         step_m = float(image.range_m[1] - image.range_m[0]) if len(image.range_m) > 1 else 0.0
         rows, columns = _bins(directions, self._neighbours[directions], ranges, last=len(image.range_m) - 1)
@@ -124,7 +125,7 @@ class PeakInterpolator:
             is_alike = np.abs(difference - difference[:, 1:2]).max(axis=1) < _MAX_DIFFERENCE
             correction = first[active] - self._tops(directions[active], predicted)
             size = np.abs(correction).max(axis=1)
-            is_smaller = size < last[active]  # corrections of noise need not converge
+            is_smaller = size < last[active]  # The corrections of noise need not converge.
             corrected = np.where(is_smaller[:, None], here + correction, here)
             found[active] = np.where(is_alike[:, None], corrected, first[active])
             last[active] = size
@@ -136,13 +137,16 @@ class PeakInterpolator:
         return np.where(is_small[:, None], found, first)
 
     def _tops(self, directions: NDArray[np.int64], logs: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return (place, 5) float64: shift along the range in bins, offset of the direction, logarithm of the level.
+        """Return the maxima of parabolas: (place, 5) float64.
+
+        The columns are the shift along the range in bins, the three components of the direction offset, and the
+        logarithm of the amplitude.
 
         Parameters
         ----------
         directions : (place,) int64
         logs : (place, sample) float64
-            At the bins that `_bins` returns.
+            Logarithms of the amplitude at the bins that `_bins` returns.
         """
         before, level, after = logs[:, 0], logs[:, 1], logs[:, 2]
         curvature = before - 2 * level + after
@@ -161,7 +165,7 @@ class PeakInterpolator:
         step_m: float,
         image: Energyscape,
     ) -> NDArray[np.float64]:
-        """Return the log amplitudes of reflectors at the found positions: (place, sample) float64."""
+        """Return predicted log amplitudes of reflectors at the found positions: (place, sample) float64."""
         middles = self._directions[directions]
         tops = middles + found[:, 1:4]
         tops = tops / np.linalg.norm(tops, axis=1)[:, None]
@@ -177,7 +181,10 @@ class PeakInterpolator:
 def _bins(
     directions: NDArray[np.int64], around: NDArray[np.int64], ranges: NDArray[np.int64], *, last: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return direction and range of the samples at a maximum: along the range, then around; both (place, sample)."""
+    """Return the direction and range indices of the samples of each maximum, both (place, sample) int64.
+
+    The first three samples lie along the range, the others at the neighbouring directions.
+    """
     columns = np.repeat(ranges[:, None], 3 + around.shape[1], axis=1)
     inner = (ranges > 0) & (ranges < last)
     columns[:, 0] -= inner
@@ -187,19 +194,19 @@ def _bins(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Fits:
-    """Fit of a quadric to each direction and its neighbours, over the plane or the line in which they lie.
+    """Fit of a quadric to each direction and its neighbours, over the plane or the line that contains them.
 
     Attributes
     ----------
     axes : (direction, 2, axis) float64
-        Of the plane.
+        Axes of the plane.
     inverse : (direction, 5, neighbour) float64
-        From values to the coefficients of x, y, x², xy and y².
+        Matrix from values to the coefficients of x, y, x², xy and y².
     is_plane : (direction,) bool
         False for a line, on which y is 0.
     reach : (direction,) float64
-        Of the neighbours; 0 where no quadric can be fitted, and at the edge of the grid, whose neighbours lie to one
-        side.
+        Distance of the farthest neighbour. It is 0 if no quadric can be fitted, and at the edge of the grid, where all
+        neighbours lie on one side.
     """
 
     axes: NDArray[np.float64]
@@ -209,7 +216,7 @@ class _Fits:
 
     @classmethod
     def of(cls, directions: NDArray[np.float64], neighbours: NDArray[np.int64], wanted: NDArray[np.int64]) -> "_Fits":
-        """Return those of some directions of a grid."""
+        """Return the fits of some directions of a grid."""
         n_directions, n_samples = len(wanted), neighbours.shape[1]
         if n_samples < 3:
             return cls(
@@ -235,13 +242,13 @@ class _Fits:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return offsets from directions to the maxima of their quadrics, (place, axis) float64, and the rise there.
 
-        Offsets reach no further than the samples. They are 0 where there is no maximum.
+        An offset is 0 if there is no maximum within the distance of the farthest neighbour.
 
         Parameters
         ----------
         directions : (place,) int64
         rises : (place, neighbour) float64
-            From the value at the direction to those at its neighbours.
+            Values at the neighbours minus the value at the direction.
         """
         slope_x, slope_y, xx, xy, yy = np.einsum("pcn,pn->cp", self.inverse[directions], rises)
         xx, yy = 2 * xx, np.where(self.is_plane[directions], 2 * yy, -1.0)

@@ -1,4 +1,4 @@
-"""Point-spread function: the image of a single reflector, from array and call."""
+"""Point-spread function: image of a single reflector, computed from array and call."""
 
 import functools
 import math
@@ -15,16 +15,22 @@ from ertis_numba.waveform import matched_filter_spectrum
 __all__ = ["PULSE_M", "PointSpread"]
 
 PULSE_M = 0.04
-"""Range offset at which a compressed pulse of 25 kHz bandwidth is 26 dB down; it is 40 dB down at 2.5 times that."""
+"""Range offset, in metres, at which a compressed pulse of 25 kHz bandwidth is 26 dB down.
 
-_STEPS_PER_WAVE = 512  # of the table, per wavelength at the edge of the band: linear interpolation errs by 5e-6
+At 2.5 times this offset, it is 40 dB down.
+"""
+
+_STEPS_PER_WAVE = 512  # Table steps per wavelength at the band's edge: linear interpolation has an error of 5e-6.
 
 
 class PointSpread:
-    """Amplitude of a reflector's image at other directions and ranges: delay-and-sum of plane waves.
+    """Point-spread function of delay-and-sum with plane waves.
 
-    ``|Σ_f P(f) Σ_mic w exp(j k(f) (2 Δr − p·Δu))| / n_mics``, where P is the power of the call and w are the array
-    weights, whose mean is 1.
+    The amplitude at a range offset Δr and a direction offset Δu is
+
+    ``|Σ_f P(f) Σ_mic w exp(j k(f) (2 Δr − p·Δu))| / n_mics``,
+
+    where P is the power spectrum of the call, and w are the array weights, whose mean is 1.
 
     Parameters
     ----------
@@ -33,8 +39,8 @@ class PointSpread:
     Attributes
     ----------
     reach_m : float
-        Range offset beyond which the image of the reflector ends. A side lobe shifts by half of the difference of two
-        paths, so by the aperture's radius at most, and is as long as the pulse.
+        Range offset in metres beyond which the image of the reflector ends. A side lobe is as long as the pulse. Its
+        shift is half of the difference of two paths, which is at most the aperture's radius.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -42,7 +48,7 @@ class PointSpread:
         self._positions_m = microphones(settings.array).enabled_positions_m
         self._weights = array_weights(settings)
         self.reach_m = float(np.max(np.linalg.norm(self._positions_m, axis=1))) + PULSE_M
-        # The sum over bins repeats itself after speed / spacing; paths differ by four reaches at most.
+        # The sum over bins has a period of speed / spacing. Paths differ by at most four times ``reach_m``.
         spacing_hz = self._speed_m_s / (6 * self.reach_m)
         n_fft = math.ceil(max(settings.call.duration_s * rate_hz + 1, rate_hz / spacing_hz))
         matched = matched_filter_spectrum(settings, n_fft=n_fft)
@@ -51,7 +57,7 @@ class PointSpread:
         wave_1_m = 2 * math.pi * bins * rate_hz / n_fft / self._speed_m_s
         power = np.abs(matched.values[thinned]) ** 2
         self._carrier_1_m = float(wave_1_m[len(wave_1_m) // 2])
-        # Waves lie evenly, so that sums over them are a Fourier transform, which repeats itself after 6 reaches.
+        # Wave numbers are evenly spaced, so the sum is a Fourier transform, with a period of six times ``reach_m``.
         period_m = 2 * math.pi / float(wave_1_m[1] - wave_1_m[0]) if len(wave_1_m) > 1 else 8 * self.reach_m
         count = 2 ** math.ceil(math.log2(len(wave_1_m) * _STEPS_PER_WAVE))
         self._path_m = np.arange(count) * (period_m / count)
@@ -75,8 +81,9 @@ class PointSpread:
         direction_offset : (place, axis) float64
             Difference of the unit vectors.
         range_offset_m : (place,) float64
+            Difference of the ranges in metres.
         air : Air, optional
-            That of the settings by default.
+            Air of the image; by default, that of the settings.
         deviation : Deviation, optional
             Errors of the beam at each place.
         """
@@ -91,12 +98,12 @@ class PointSpread:
 
     @functools.cached_property
     def _tilted_hz(self) -> NDArray[np.complex128]:
-        """The pulse whose spectrum is weighted by the frequency relative to the carrier."""
+        """Pulse with the spectrum weighted by the frequency relative to the carrier."""
         offset_hz = (self._wave_1_m - self._carrier_1_m) * self._speed_m_s / (2 * math.pi)
         return np.asarray(np.fft.ifft(self._shares * offset_hz, self._count) * self._count * self._turn)
 
     def _at(self, path_m: NDArray[np.float64], pulse: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        """Return a pulse at some paths; that at negative paths is the conjugate."""
+        """Return a pulse at given path differences; the pulse at negative ones is the complex conjugate."""
         found = np.interp(np.abs(path_m), self._path_m, pulse)
         found.imag[path_m < 0] *= -1
         return np.asarray(found)

@@ -1,4 +1,4 @@
-"""From energyscapes to point clouds, fast enough to do so with every image."""
+"""Point clouds of images, computed fast enough for every image of a stream."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,36 +15,47 @@ from ertis_numba.settings import Settings
 __all__ = ["PointExtractor"]
 
 _BINS_OF_POINT = 64
-"""Of noise alone, so many bins are looked at for each point that is wanted, and not a third of the image."""
-_THINNED = 16  # ranges of which one is looked at to tell how strong those are
+"""Maximum number of bins to examine per point; in noise, a third of the image would be candidates otherwise."""
+_THINNED = 16  # One of so many ranges serves to estimate the distribution of amplitudes.
 
 
 class PointExtractor:
-    """Finds the local maxima of images, with tables that are made here, once for a grid.
+    """Extractor of the local maxima of images as points, with tables computed once for a grid.
 
-    A point is a local maximum over directions and ranges that is above what the side lobes of the strongest
-    reflector of about the same range can be. Position and energy are interpolated by parabolas through the logarithm
-    of the energy, as `ertis_numba.find_peaks` does. That is slower and predicts side lobes from the array: it shows
-    weak reflectors beside strong ones of the same range, which are left out here.
+    A point is a local maximum over directions and ranges that exceeds the possible side lobes of the strongest
+    reflector at about the same range. Position and amplitude are interpolated by parabolas through the logarithm of the
+    amplitude, as in `ertis_numba.find_peaks`. The latter is slower and predicts side lobes from the array. It finds
+    weak reflectors beside strong ones at the same range, which this class discards.
 
-    Main lobes are not parabolas, so the error of the parabolas is predicted from array and call, and subtracted. Each
-    point has standard deviations of its position: see `ertis_numba.analysis.uncertainty.PositionUncertainty`.
+    Main lobes are not parabolas, so the extractor predicts the error of the parabolas from array and call, and
+    subtracts it. Each point has standard deviations of its position: see
+    `ertis_numba.analysis.uncertainty.PositionUncertainty`.
 
     Parameters
     ----------
     settings : Settings
-        Their processing names the directions; the air may be another with each image.
+        Settings of the images. The air may differ between images.
     grid : Grid, optional
-        The directions themselves, as where the file that names them is not at hand.
+        Directions of the images; by default, those of the settings. Give a grid if the file of the directions is not
+        available.
     top : int
-        At most so many points of an image, the strongest.
+        Maximum number of points per image; the strongest 256 by default.
     min_level_db : float
-        Below the strongest point of the image, at which to stop.
+        Minimum level relative to the strongest point of the image; -20 dB by default.
 
     Raises
     ------
     ArgumentError
-        ``top`` is below 1, ``min_level_db`` is above 0, or the settings name no grid.
+        ``top`` is below 1, ``min_level_db`` is above 0, or the directions of the settings are not available.
+
+    Examples
+    --------
+    Compute the point cloud of every measurement of a recording::
+
+        with ertis.open_recording("data/synthetic/reflectors.h5") as recording:
+            pipeline = ertis.Pipeline(recording.settings)
+            extract = ertis.PointExtractor(pipeline.settings, pipeline.grid)
+            clouds = [extract(pipeline.process(measurement)) for measurement in recording]
     """
 
     def __init__(
@@ -66,7 +77,7 @@ class PointExtractor:
         Raises
         ------
         ArgumentError
-            The image has not the directions of this grid.
+            The image does not have the directions of this grid.
         """
         checks.instance("image", image, Energyscape, "Pipeline.process returns")
         amplitude = image.amplitude
@@ -87,9 +98,10 @@ class PointExtractor:
     def _maxima(
         self, amplitude: NDArray[np.float32], range_m: NDArray[np.float64]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return direction and range of each maximum.
+        """Return the direction and range indices of all maxima.
 
-        The first and the last range are none: what rises towards them lies outside of the image.
+        The first and the last range contain no maxima, because an amplitude that rises towards them peaks outside of
+        the image.
         """
         n_ranges = amplitude.shape[1]
         none = np.empty(0, dtype=np.int64)
@@ -98,7 +110,7 @@ class PointExtractor:
             return none, none
         floor = np.maximum(side_lobe_floor(profile, range_m), profile.max() * np.float32(self._smallest))
         floor[[0, -1]] = np.inf
-        # Two passes over all of the image, this and the profile, are what takes the time; few bins are left.
+        # This pass over the whole image and that of the profile dominate the time. Few bins remain.
         above = amplitude >= floor
         if np.count_nonzero(above) > _BINS_OF_POINT * self._top:
             above = amplitude >= np.maximum(floor, self._raised(amplitude))
@@ -109,14 +121,14 @@ class PointExtractor:
         directions, ranges = np.divmod(places, n_ranges)
         here, around = flat[places, None], self._neighbours[directions]
         there = amplitude[around, ranges[:, None]]
-        # Of two equal neighbours the first counts.
+        # The first of two equal neighbours counts.
         beaten = (there > here) | ((there == here) & (around < directions[:, None]))
         points = np.flatnonzero(~beaten.any(axis=1))
         strongest = points[np.argsort(-here[points, 0], kind="stable")[: self._top]]
         return directions[strongest], ranges[strongest]
 
     def _raised(self, amplitude: NDArray[np.float32]) -> np.float32:
-        """Return a level above which there are about as many bins of an image as need be looked at."""
+        """Return an amplitude threshold that leaves about the intended number of bins to examine."""
         some = amplitude[:, ::_THINNED].ravel()
         count = min(len(some), max(1, _BINS_OF_POINT * self._top // _THINNED))
         return np.float32(np.partition(some, len(some) - count)[len(some) - count])

@@ -1,4 +1,4 @@
-"""Side lobes of the reflectors in an image: predicted where the array is as designed, and bounded where it is not."""
+"""Side lobes of reflectors in an image: predicted for an array as designed, bounded for a real array."""
 
 import math
 from typing import Final
@@ -13,35 +13,37 @@ from ertis_numba.frames import Energyscape
 __all__ = ["SIDE_LOBE_DB", "SideLobes", "side_lobe_floor", "without_side_lobes"]
 
 SIDE_LOBE_DB = 10.0
-"""Below the strongest of the same range, from which on side lobes are expected.
+"""Level in dB below the strongest direction of the same range at which side lobes are expected.
 
-Those of eRTIS_v3D1 at 25–50 kHz reach -12.3 dB, and -28 dB at ranges that differ by `point_spread.PULSE_M`.
+The side lobes of eRTIS_v3D1 at 25–50 kHz reach -12.3 dB. At ranges that differ by `point_spread.PULSE_M`, they reach
+-28 dB.
 """
 
-_MARGIN: Final = 10 ** (3.0 / 20)  # by which a reflector must exceed the predicted side lobes of stronger ones
+_MARGIN: Final = 10 ** (3.0 / 20)  # Factor by which a reflector must exceed predicted side lobes of stronger ones.
 _FALSE_ALARM: Final = 0.01
-_N_DIRECTIONS: Final = 64  # in which prediction and image are compared
-_N_COMPARED: Final = 8  # reflectors by which the prediction is judged
-# Deviations relative to the mean: up to the first a pattern is as predicted, from the second on it is unknown.
+_N_DIRECTIONS: Final = 64  # Number of directions in which the prediction and the image are compared.
+_N_COMPARED: Final = 8  # Number of reflectors that serve to assess the prediction.
+# Deviations relative to the mean side lobe. Below the first, the prediction is trusted; above the second, it is not.
 _TRUSTED: Final = (0.25, 0.4)
-_N_OFFSETS: Final = 9  # of the range, at which the mean of side lobes is known
+_N_OFFSETS: Final = 9  # Number of range offsets with a tabulated mean of the side lobes.
 # Upper quartiles of the magnitude of a complex normal variable of power 1, and of the magnitude of one component. The
-# main lobes of reflectors take less than a quarter of the directions.
+# main lobes of reflectors cover less than a quarter of the directions, so upper quartiles ignore them.
 _QUARTILE: Final = 0.75
 _QUARTILE_OF_MAGNITUDE: Final = math.sqrt(math.log(4))
 _QUARTILE_OF_COMPONENT: Final = 0.8134
 
 
 class SideLobes:
-    """Test of maxima of an image: each is a reflector, or may be a side lobe of stronger reflectors.
+    """Classifier of the maxima of an image: reflectors, or possible side lobes of stronger reflectors.
 
-    `PointSpread` predicts side lobes for an array as designed and for reflectors that are points. Real microphones,
-    transducers and surfaces change the pattern of the side lobes, but hardly their mean power. So the limit is the sum
-    of what is predicted and of what may deviate from it. The deviation is a sum of many phasors, so its amplitude
-    follows a Rayleigh distribution [1]_: in all of N directions, it stays below ``σ √ln(N / p)`` with a probability of
-    1 - p. The image itself tells σ: its deviation from the prediction at the range in question, but at most the mean
-    of all side lobes that reach this range. Echoes that interfere deviate as well, so the image is first judged by the
-    reflector that it fits best: if the pattern around that one is as predicted, the array is as designed, and σ is 0.
+    `PointSpread` predicts side lobes for an array as designed and for point reflectors. Real microphones, transducers
+    and surfaces change the pattern of the side lobes, but hardly their mean power. The limit is therefore the sum of
+    the prediction and of a possible deviation. The deviation is a sum of many phasors, so its amplitude is
+    Rayleigh-distributed [1]_: in all of N directions, it stays below ``σ √ln(N / p)`` with a probability of 1 - p.
+
+    σ is measured in the image. It is the deviation from the prediction at the same range, and at most the mean of all
+    side lobes that extend to this range. Echoes that interfere deviate as well. The prediction is therefore first
+    compared with the reflector that fits best: if the pattern around it matches, the array is as designed, and σ is 0.
 
     Parameters
     ----------
@@ -49,7 +51,7 @@ class SideLobes:
     directions : (direction, axis) float64
         Unit vectors of the image's directions.
     candidates : (candidate, [direction, range]) int64
-        Places of local maxima, the strongest first.
+        Bins of local maxima, strongest first.
 
     References
     ----------
@@ -63,18 +65,21 @@ class SideLobes:
         self._sampled = directions[self._samples]
         self._factor = math.sqrt(math.log(count / _FALSE_ALARM))
         self._offsets_m = np.linspace(0.0, self._spread.reach_m, _N_OFFSETS)
-        self._mean = np.zeros(_N_OFFSETS)  # of the side lobes of a reflector of amplitude 1, by range offset
+        self._mean = np.zeros(_N_OFFSETS)  # Mean side lobes of a reflector of amplitude 1, for each range offset.
         self._sources: list[tuple[NDArray[np.float64], float, float]] = []
-        self._deviations: dict[int, float] = {}  # by range bin
+        self._deviations: dict[int, float] = {}  # The keys are range bins.
         self._doubt = self._doubt_of(directions, candidates)
 
     def add(self, direction: NDArray[np.float64], range_m: float, amplitude: float) -> None:
-        """Add a reflector, strongest first.
+        """Add a reflector. Reflectors must be added in descending order of amplitude.
 
         Parameters
         ----------
         direction : (axis,) float64
-        range_m, amplitude : float
+            Unit vector.
+        range_m : float
+            Range in metres.
+        amplitude : float
         """
         if not self._sources:
             self._mean = self._mean_around(direction)
@@ -82,13 +87,16 @@ class SideLobes:
         self._deviations.clear()
 
     def explain(self, direction: NDArray[np.float64], range_bin: int, level: float) -> bool:
-        """Return True if a maximum of this amplitude may be a side lobe of the reflectors added so far.
+        """Return True if a maximum may be a side lobe of the reflectors added so far.
 
         Parameters
         ----------
         direction : (axis,) float64
+            Unit vector.
         range_bin : int
+            Index of the range.
         level : float
+            Amplitude of the maximum.
         """
         range_m = float(self._image.range_m[range_bin])
         near = [source for source in self._sources if abs(range_m - source[1]) < self._spread.reach_m]
@@ -105,10 +113,10 @@ class SideLobes:
         return level <= predicted + largest and level <= predicted + self._factor * self._deviation(range_bin)
 
     def _doubt_of(self, directions: NDArray[np.float64], candidates: NDArray[np.int64]) -> float:
-        """Return how far the pattern of side lobes is unknown, from 0 to 1, by the reflector whose pattern fits best.
+        """Return the uncertainty of the side-lobe pattern, from 0 to 1, at the reflector whose pattern fits best.
 
-        Only the strongest maxima of ranges apart from each other are compared: one of them may have no other
-        reflector at its range. Adaptive beamformers have weaker side lobes than predicted, so the limit stays.
+        Only the strongest maxima of separate ranges are compared, because one of them may be the only reflector at its
+        range. Adaptive beamformers have weaker side lobes than predicted, so their uncertainty is 0.
         """
         if self._image.settings.processing.beamformer != "delay_and_sum":
             return 0.0
@@ -153,21 +161,22 @@ class SideLobes:
 
 
 def _deviation_of(measured: NDArray[np.float32], predicted: NDArray[np.float64]) -> float:
-    """Return the standard deviation of complex amplitudes, of which only magnitudes are known."""
+    """Return the standard deviation between complex amplitudes, estimated from their magnitudes."""
     return float(np.quantile(np.abs(measured - predicted), _QUARTILE)) / _QUARTILE_OF_COMPONENT
 
 
 def side_lobe_floor(highest: NDArray[np.float32], range_m: NDArray[np.float64]) -> NDArray[np.float32]:
     """Return the amplitude below which side lobes are expected, for each range: (range,) float32.
 
-    It is `SIDE_LOBE_DB` below the strongest of all ranges within a pulse. This is coarser than `SideLobes`, and quick.
+    The limit lies `SIDE_LOBE_DB` below the strongest amplitude of all ranges within a pulse length. It is coarser than
+    `SideLobes`, but fast.
 
     Parameters
     ----------
     highest : (range,) float32
         Maximum of the image over all directions.
     range_m : (range,) float64
-        At least two, evenly spaced.
+        Range axis in metres: at least two ranges, evenly spaced.
     """
     reach = max(1, round(PULSE_M / float(range_m[1] - range_m[0])))
     around = scipy.ndimage.maximum_filter1d(highest, 2 * reach + 1, mode="nearest")
@@ -175,7 +184,7 @@ def side_lobe_floor(highest: NDArray[np.float32], range_m: NDArray[np.float64]) 
 
 
 def without_side_lobes(image: Energyscape) -> Energyscape:
-    """Return an image whose values below `side_lobe_floor` are 0."""
+    """Return a copy of an image in which amplitudes below `side_lobe_floor` are 0."""
     if len(image.range_m) < 2:
         return image
     floor = side_lobe_floor(image.amplitude.max(axis=0, initial=0.0), image.range_m)

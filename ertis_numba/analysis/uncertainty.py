@@ -19,20 +19,20 @@ from ertis_numba.waveform import matched_noise_spectrum
 
 __all__ = ["PositionUncertainty"]
 
-_WAVES = 64  # of the call's band, from which its widths are computed
-_FLAT = 1e-12  # of the variance of an array, below which it has none
-_UNIFORM = 0.34  # of its width, that 68 % of a uniform distribution lie within on either side of its middle
+_WAVES = 64  # Number of frequencies of the call's band from which its widths are computed.
+_FLAT = 1e-12  # Relative variance of an array below which its extent counts as zero.
+_UNIFORM = 0.34  # A uniform distribution has 68 % of its values within this share of its width around the middle.
 
-# Interpolation subtracts errors of a plan that it predicts. This share of their root mean square is left: errors are
-# taken as straight lines over frequency, and samples are rounded. `ertis bench points` measures it.
+# Interpolation subtracts the predicted errors of a plan. This share of their root mean square remains, because errors
+# are approximated as linear over frequency, and samples are rounded. `ertis bench points` measures it.
 _OF_PREDICTED = 0.02
-# Fractional delays depend on the range if wavefronts are spherical, and are not predicted. Their errors are alike in
-# neighbouring bins, so that they move a maximum by less than noise of the same power.
+# With spherical wavefronts, fractional delays depend on the range and are not predicted. Their errors are alike in
+# neighbouring bins, so they shift a maximum by less than noise of the same power.
 _OF_DELAYS, _OF_ONE_TAP = 0.1, 0.22
 
 
 class _PlanError(NamedTuple):
-    """Errors of a plan as root-mean-square noise, relative to an echo."""
+    """Errors of a plan along the range and across, as root-mean-square noise relative to an echo."""
 
     along: float
     across: float
@@ -53,21 +53,21 @@ class PositionUncertainty:
     - λ is the least variance of the microphones' positions along any direction across the line of sight (H. L. Van
       Trees, Optimum Array Processing, 2002, section 8.4). For an image of one elevation, that direction is the azimuth.
       Array weights w other than uniform replace the covariance C of the positions by ``C(w) C(w²)⁻¹ C(w)``, where the
-      covariances have the weights in brackets. It is the inverse of the covariance of the maximum of a weighted beam,
-      at the same power of noise in the image.
+      covariances have the weights in brackets. This expression is the inverse of the covariance of the maximum of a
+      weighted beam, at the same power of noise in the image.
 
     The noise is estimated from medians of blocks of ranges; the median of a Rayleigh variable is √ln 2 of its root mean
-    square. The lower tercile of these estimates counts, as side lobes of strong echoes raise the others. If echoes
-    fill an image, they count as noise.
+    square. The estimate is the lower tercile, because side lobes of strong echoes raise the others. If echoes fill an
+    image, they count as noise.
 
-    Interpolation subtracts the predicted errors of a complete plan. The plan contributes a measured share of these
-    errors, which is left, as noise. A direction that could not be interpolated, for example at the edge of a grid,
+    Interpolation subtracts the predicted errors of a complete plan. A measured share of these errors remains, and the
+    plan contributes it as noise. A direction that could not be interpolated, for example at the edge of a grid,
     contributes the spacing of the grid.
 
-    A value is infinite if the array cannot resolve that direction. It is NaN if the noise is unknown. This is the case
-    for beamformers other than delay-and-sum, whose noise is not Rayleigh-distributed, and if much of the image
-    is 0, as after `clean`. Errors of layout, temperature and near-field curvature are not included, nor is interference
-    between echoes at the same place.
+    A value is infinite if the array cannot resolve that direction. It is NaN if the noise is unknown: for beamformers
+    other than delay-and-sum, whose noise is not Rayleigh-distributed, and if most of the image is 0, as after `clean`.
+    Errors of layout, temperature and near-field curvature are not included. Interference between echoes at the same
+    position is not included either.
 
     Parameters
     ----------
@@ -93,15 +93,21 @@ class PositionUncertainty:
         amplitude: NDArray[np.float32],
         resolution_rad: NDArray[np.float64],
     ) -> NDArray[np.float32]:
-        """Return standard deviations along range and across: (point, 2) float32, in metres; NaN if they are unknown.
+        """Return the standard deviations of points along the range and across, in metres.
 
         Parameters
         ----------
         image : Energyscape
         position_m : (point, axis) float32
+            Positions in metres.
         amplitude : (point,) float32
         resolution_rad : (point,) float64
-            Spacing of the directions around points whose direction is not interpolated, 0 for others.
+            Spacing of the directions around points whose direction is not interpolated; 0 for others.
+
+        Returns
+        -------
+        (point, 2) float32
+            NaN if the noise is unknown.
         """
         noise = noise_of(image) if len(amplitude) else 0.0
         if not noise:
@@ -127,7 +133,7 @@ class PositionUncertainty:
             return _PlanError(0.0, 0.0)
         echo = SignalModel.echo(self._settings, effective_count(array_weights(self._settings)))
         parts = Planner(self._settings, kernels.load("numpy"), threads=1, signal_model=echo).parts(accuracy)
-        # Half of an error's power changes a magnitude, and so does half of the noise's.
+        # Half of the power of an error changes a magnitude, and so does half of the power of noise.
         delays, beams = (math.sqrt(2 * parts[name]) for name in ("delays", "beams"))
         share = _OF_PREDICTED
         if self._settings.processing.wavefront == "spherical":
@@ -147,12 +153,12 @@ class PositionUncertainty:
         ab = np.einsum("pi,ij,pj->p", sideways, self._covariance_m2, upwards)
         bb = np.einsum("pi,ij,pj->p", upwards, self._covariance_m2, upwards)
         smallest = (aa + bb) / 2 - np.hypot((aa - bb) / 2, ab)
-        # What is left of rounding is no aperture.
+        # A remainder of rounding does not count as aperture.
         return np.asarray(np.where(smallest > _FLAT * (aa + bb), smallest, 0.0))
 
 
 def _effective_covariance_m2(positions_m: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the covariance of the positions of a uniform array whose maxima are as uncertain: (axis, axis) float64."""
+    """Return the position covariance of a uniform array with the same uncertainty of maxima: (axis, axis) float64."""
     if np.all(weights == 1.0):
         return np.asarray(positions_m.T @ positions_m / len(positions_m))
     offset_m = positions_m - weights @ positions_m / len(positions_m)

@@ -1,1 +1,1 @@
-"""The stages of the signal chain: each prepares its tables once and then only calls kernels."""
+"""Stages of the signal chain. Each stage computes its tables once; after that, it only calls kernels."""

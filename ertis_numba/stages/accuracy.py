@@ -1,18 +1,19 @@
-"""By how much an image differs from the exact one: what each choice of a plan adds, before it is made.
+"""Error model: the image error that each step of a plan causes, predicted before processing.
 
 The error is ``‖image − exact‖ / ‖exact‖`` over all directions and ranges, in decibels. The exact image is that of
-`tests/reference.py`: float64, nothing decimated, delays as exact phase shifts.
+`tests/reference.py`: float64, no decimation, delays as exact phase shifts.
 
-Most parts are errors of complex beams that add up like noise: between microphones, because `fitting` leaves hardly any
-error that they share, and between parts. A part whose power is ε of that of a microphone's signal after the matched
-filter therefore adds, to an image whose mean power is ``gain`` times that of uncorrelated microphones,
+Most steps cause errors of complex beams. These errors add up like noise, both between microphones and between steps,
+because `fitting` leaves hardly any error that microphones share. Let ε be the error power of a step, relative to the
+power of a microphone's signal after the matched filter. Let ``gain`` be the mean power of the image, relative to the
+image of uncorrelated microphones. The step then contributes the error power
 
     s ε / gain ,   s = ½ for gain ≤ 1,   s = 1 − ½ / gain beyond.
 
-s is the share of a complex error that changes a magnitude: half of it in noise, where the other half turns the phase,
-which the envelope does not see; more where few coherent echoes make most of the image, since beam and error are then
-sums of the same waves and tend to have one phase. How much brighter coherent echoes make the image is what settings
-cannot tell; a `SignalModel` measures it, and where there is none the model assumes what errs on the safe side.
+s is the share of a complex error that changes a magnitude. In noise it is one half: the other half turns the phase,
+which the envelope does not contain. s is larger if a few coherent echoes dominate the image: beam and error are then
+sums of the same waves and tend to have the same phase. The gain of coherent echoes does not follow from the settings.
+A `SignalModel` measures it; without a measurement, the model assumes safe values.
 """
 
 import math
@@ -33,56 +34,57 @@ __all__ = ["PARTS", "ErrorModel", "SignalModel", "decibels"]
 
 PARTS: Final = {
     "delays": "interpolation of delayed samples",
-    "beams": "interpolation of beams between nodes",
-    "zones": "one set of delays for all ranges of a zone",
+    "beams": "interpolation between beam-grid points",
+    "zones": "one set of delays for each focal zone",
     "samples": "16-bit samples and weights",
-    "filter": "noise that the decimation lets through",
+    "filter": "noise aliased by the decimation",
     "arithmetic": "single precision",
 }
-"""Name of each part of the error, and what it is due to."""
+"""Name and cause of the error of each step."""
 
-_ARITHMETIC = 10 ** (-114 / 10)  # single precision through two transforms and a sum: measured -116 to -130 dB
-_ROUNDING = 10 ** (-114 / 10)  # single precision, relative to all that is transformed: -115 to -140 dB measured
-_SAFE_GAIN = 0.5  # most of the sound comes from where nobody looks
-_SAFE_COLOUR = 2.0  # echoes are strongest at the edges of the band
-_SAFE_CREST = 10 ** (17 / 10)  # one echo in a tile
-_ECHO_CREST = 10 ** (16 / 10)  # one echo in a tile of 96 ranges
-_SAFE_LEVEL = 10 ** (-24 / 10)  # as quiet as a room that eRTIS was tried in
-_UNLIKE = 1.3  # for what differs between images: 1 dB, found over the scenes of tests/test_accuracy.py
-_NOISE_CORNER_HZ = 500e3  # of the shaped noise of eRTIS at 4.5 MHz
+_ARITHMETIC = 10 ** (-114 / 10)  # Single precision through two transforms and a sum: -116 to -130 dB were measured.
+_ROUNDING = 10 ** (-114 / 10)  # Single precision, relative to all transformed samples: -115 to -140 dB were measured.
+_SAFE_GAIN = 0.5  # Most of the sound comes from outside the directions of the image.
+_SAFE_COLOUR = 2.0  # Echoes are strongest at the edges of the band.
+_SAFE_CREST = 10 ** (17 / 10)  # A tile contains one echo.
+_ECHO_CREST = 10 ** (16 / 10)  # A tile of 96 ranges contains one echo.
+_SAFE_LEVEL = 10 ** (-24 / 10)  # Level in a quiet room that eRTIS was tested in.
+_UNLIKE = 1.3  # Margin for differences between images: 1 dB, from the scenes of tests/test_accuracy.py.
+_NOISE_CORNER_HZ = 500e3  # Corner of the shaped noise of eRTIS at 4.5 MHz.
 _NOISE_RATE_HZ = 4.5e6
 
 
 def decibels(power: float) -> float:
-    """Return ``10 log10``, -300 for nothing at all."""
+    """Return a power in decibels, ``10 log10(power)``; -300 for powers below 1e-30."""
     return 10 * math.log10(max(power, 1e-30))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SignalModel:
-    """What the error depends on besides the settings: a few numbers of what is heard.
+    """Signal statistics that the error of an image depends on, besides the settings.
 
     Attributes
     ----------
     shares : (wave,) float64
-        Of the power after the matched filter, at the frequencies of the model; they add up to 1.
+        Distribution of the power after the matched filter over the frequencies of the model; the sum is 1.
     gain : float
-        Mean power of the image by what it would be of microphones that have nothing in common.
+        Mean power of the image, relative to the image of uncorrelated microphones.
     crest : float
-        Largest power of any sample of a tile of ranges, the mean over tiles, by the mean power of samples.
+        Largest sample power in a tile of ranges, averaged over tiles, relative to the mean sample power.
     noise : (bin,) float64
-        Power density of the words from 0 to half their rate, by that of white bits.
+        Power density of the recorded samples from 0 to half the sample rate, relative to white bits.
     level : float
-        Power after the matched filter, in the ranges of the image, by that of white bits.
+        Power after the matched filter in the ranges of the image, relative to white bits.
     places : (quantile,) float64
-        Power of the image at its places, from the darkest to the brightest, by the mean.
+        Quantiles of the power of the image points in ascending order, relative to the mean.
     covariance : (tile, wave, mic, mic) complex128, optional
-        Of what some microphones hear in each tile of ranges, at the frequencies of an estimate of `BeamNodes`.
+        Covariance of the signals of some microphones in each tile of ranges, at the frequencies of an estimate of
+        `BeamNodes`; None by default.
     colour : float
-        By how much more interpolation errs than ``shares`` let expect; 1 where they were measured.
+        Margin on interpolation errors computed from ``shares``; 1 (the default) if ``shares`` was measured.
     loudness : float
         Power of the signals before the matched filter, over all times and frequencies, relative to ``level``. Both are
-        relative to white bits. It is 0 if it was not measured.
+        relative to white bits. It is 0 (the default) if it was not measured.
     """
 
     shares: NDArray[np.float64]
@@ -97,9 +99,9 @@ class SignalModel:
 
     @classmethod
     def unknown(cls, settings: Settings) -> "SignalModel":
-        """Return the texture that is assumed where none was measured: on the safe side."""
+        """Return the safe signal model that is assumed without a measurement."""
         _, shares = matched_noise_spectrum(settings, n_waves=WAVES)
-        if not settings.recording.is_pdm:  # beyond the band there may be as much sound as within
+        if not settings.recording.is_pdm:  # There may be as much sound outside the band as inside.
             return cls(shares, _SAFE_GAIN, _SAFE_CREST, np.ones(2), 1.0, np.ones(1), colour=_SAFE_COLOUR)
         frequency_hz = np.linspace(0, settings.recording.sample_rate_hz / 2, 1025)
         corner_hz = _NOISE_CORNER_HZ * settings.recording.sample_rate_hz / _NOISE_RATE_HZ
@@ -108,20 +110,20 @@ class SignalModel:
 
     @classmethod
     def echo(cls, settings: Settings, n_mics: float) -> "SignalModel":
-        """Return the texture of a single echo, to which all microphones contribute in phase."""
+        """Return the signal model of a single echo that all microphones receive in phase."""
         _, shares = matched_noise_spectrum(settings, n_waves=WAVES)
-        power = shares**2  # that of the echo, beside that of the filter
+        power = shares**2  # The spectrum of the echo times that of the filter.
         return cls(power / power.sum(), float(n_mics), _ECHO_CREST, np.ones(2), 1.0, np.ones(1))
 
 
 class ErrorModel:
-    """The parts of an image's error, each as power by that of the exact image.
+    """Predictor of the error power of each processing step, relative to the power of the exact image.
 
     Parameters
     ----------
     settings : Settings
-    signal_model : Texture, optional
-        Measured; what errs on the safe side by default.
+    signal_model : SignalModel, optional
+        Measured signal model; by default, `SignalModel.unknown`.
     """
 
     def __init__(self, settings: Settings, signal_model: SignalModel | None = None) -> None:
@@ -131,12 +133,12 @@ class ErrorModel:
         self._weights = array_weights(settings)
 
     def delays(self, fit: DelayFit, *, n_mics: float, fractions: NDArray[np.float64] | None = None) -> float:
-        """Return the part of interpolated delays: what the fit leaves at each frequency, weighted by what is heard.
+        """Return the error power of delay interpolation: the residual of the fit, weighted by the signal spectrum.
 
-        What samples are wrong by on average is a filter of the image itself, however coherent echoes are; the
-        simple ways of interpolation weaken it, which changes magnitudes by all of it. Of the rest no two
-        microphones err alike, so that it has no phase in common with the beam. Few microphones average less: the error
-        of a single one is a filter of its own signal.
+        The mean error over all delays acts as a filter on the image itself, whether or not echoes are coherent. With
+        simple interpolation, that filter is an attenuation, and all of it changes magnitudes. The remaining error
+        differs between microphones, so its phase is independent of the beam. With few microphones, it averages out
+        less: the error of a single microphone is a filter on its own signal.
 
         Parameters
         ----------
@@ -144,7 +146,7 @@ class ErrorModel:
         n_mics : float
             Effective number of microphones: see `ertis_numba.geometry.effective_count`.
         fractions : (delay,) float64, optional
-            Fractions of a step in the delays, if the delays are too few to spread evenly.
+            Fractional parts of the delays in steps, if there are too few delays to spread evenly over a step.
         """
         signal_model = self.signal_model
         if fractions is not None:
@@ -158,12 +160,13 @@ class ErrorModel:
         return signal_model.colour * (independent + (0.5 if fit.is_fitted else 1.0) * shared)
 
     def beams(self, nodes: BeamNodes) -> float:
-        """Return the part of interpolated beams, from an estimate of `BeamNodes`.
+        """Return the error power of beam interpolation, from an estimate of `BeamNodes`.
 
-        Without a measurement in the same way as `delays`. With one, from what each tile's sound makes of the errors:
-        beam ``b = hᵀx`` and error ``e = dᵀx`` are sums of the same signals, of covariance R; an envelope errs by
+        Without a measured covariance, the signal spectrum weights the errors, as in `delays`. With a covariance R, the
+        error is computed for each tile: the beam ``b = hᵀx`` and its error ``e = dᵀx`` are sums of the same signals x.
+        The error power of the envelope is
 
-            Re(C_eb)² / C_bb + ½ (C_ee − |C_eb|² / C_bb),   C_eb = dᵀ R h*  and so on.
+            Re(C_eb)² / C_bb + ½ (C_ee − |C_eb|² / C_bb),   C_eb = dᵀ R h*, and likewise C_bb and C_ee.
         """
         covariance = self.signal_model.covariance
         if covariance is None or nodes.is_bent:
@@ -172,7 +175,7 @@ class ErrorModel:
         n_directions = nodes.steering.shape[2]
         beams, errors = np.zeros((2, n_tiles, n_directions))
         both = np.zeros((n_tiles, n_directions), dtype=np.complex128)
-        for wave in range(n_waves):  # one at a time, so that everything stays in the cache
+        for wave in range(n_waves):  # One frequency at a time keeps all arrays in the cache.
             steering, missed = nodes.steering[:, wave], nodes.wrong[:, wave]
             sums = covariance[:, wave] @ np.conj(np.concatenate([steering, missed], axis=1))
             heard, lost = sums[:, :, :n_directions], sums[:, :, n_directions:]
@@ -184,17 +187,18 @@ class ErrorModel:
         return _UNLIKE * float(wrong.sum() / beams.sum())
 
     def zones(self, aperture: Aperture, curvature_2: float, *, sound_speed_m_s: float) -> float:
-        """Return the part of delays that hold for a zone of ranges.
+        """Return the error power of focal zones, whose ranges share one set of delays.
 
-        Where wavefronts have the curvature b = 1/r, a microphone at p is late by ``b (p² − (u·p)²) / 2c``. What all
-        microphones are late by turns the phase of the beam, and shifts its envelope: only the phase at the mean
-        frequency has no effect.
+        A wavefront of curvature b = 1/r reaches a microphone at p with the extra delay ``b (p² − (u·p)²) / 2c``. The
+        mean extra delay of all microphones turns the phase of the beam and shifts its envelope. Only the phase at the
+        mean frequency has no effect on the image.
 
         Parameters
         ----------
         aperture : Aperture
         curvature_2 : float
-            Mean square of what curvatures differ by from those of their zones, in 1/m²: see `zones.squared_curvature`.
+            Mean squared deviation of the curvature from that of its focal zone, in 1/m²: see
+            `focal_zones.squared_curvature`.
         sound_speed_m_s : float
         """
         along_m = aperture.directions @ aperture.positions_m.T
@@ -210,56 +214,59 @@ class ErrorModel:
         return self._of(float(turn_2 @ shares) * curvature_2) + float(shift_2 @ shares) * curvature_2
 
     def plane_waves(self, aperture: Aperture, range_m: float, *, sound_speed_m_s: float) -> float:
-        """Return what plane waves would be wrong by at one range, where spherical ones were wanted; 1 at the most."""
+        """Return the error power of plane wavefronts relative to spherical ones at one range, at most 1."""
         return min(1.0, self.zones(aperture, max(range_m, NEAREST_M) ** -2, sound_speed_m_s=sound_speed_m_s))
 
     def samples(self, *, n_terms: int, terms: float, limit: float, weight_limit: float, taps: float) -> float:
-        """Return the part of 16-bit numbers.
+        """Return the error power of 16-bit samples and weights.
 
-        Parts of samples are off by a number within ± half a step, and so are parts of weights; a step is the tile's
-        largest magnitude by ``limit``, or the largest weight by ``weight_limit``.
+        Rounding moves the real and imaginary parts of samples and weights by up to half a step. The step of samples is
+        the largest magnitude in the tile, divided by ``limit``. The step of weights is the largest weight, divided by
+        ``weight_limit``.
 
         Parameters
         ----------
         n_terms : int
-            Of one microphone.
+            Number of terms of one microphone.
         terms : float
-            Sum of their squared weights, 1 where there is one.
+            Sum of the squared weights of these terms; 1 for a single term.
         limit, weight_limit : float
-            Largest whole number of samples and of weights.
+            Largest integer values of samples and of weights.
         taps : float
-            Sum of the squared weights of the nodes that make a beam, 1 without nodes.
+            Sum of the squared weights of the beam-grid points of a beam; 1 without a beam grid.
         """
         of_samples = terms * self.signal_model.crest / limit**2 / 6
         of_weights = n_terms / weight_limit**2 / 6
         return self._of(taps * (of_samples + of_weights))
 
     def nodes(self, *, n_mics: int, sum_of_terms: float, taps: float, filled: float) -> float:
-        """Return the part of beams of nodes of which 16 bits are kept: 2⁻¹⁵ of what all terms at full scale add up to.
+        """Return the error power of rounding beams at beam-grid points to 16 bits.
+
+        The step is 2⁻¹⁵ of the sum of all terms at full scale.
 
         Parameters
         ----------
         n_mics : int
         sum_of_terms : float
-            Sum of the magnitudes of one microphone's weights, 1 where it has one.
+            Sum of the magnitudes of one microphone's weights; 1 for a single weight.
         taps : float
             As for `samples`.
         filled : float
-            What they add up to by 2³¹, at most 1.
+            Sum of all terms at full scale, relative to 2³¹; at most 1.
         """
         step_2 = self.signal_model.crest * n_mics * (sum_of_terms / filled) ** 2 / 2.0**30
         return self._of(taps * step_2 / 6)
 
     def filter(self, taps: NDArray[np.int16] | NDArray[np.int32]) -> float:
-        """Return the part of what the decimation folds into the band: noise beyond it, through the filter's stop band.
+        """Return the error power of noise that the decimation aliases into the band through the filter's stopband.
 
-        The filter is the one in whole numbers, so that what rounding leaves of its stop band counts. Noise is
-        everywhere, and where the image is darker than that, it changes magnitudes by all of itself.
+        The integer taps of the filter are used, so the stopband includes the effect of rounding. Noise covers the whole
+        image. At image points darker than the noise, all of its power changes magnitudes.
         """
         settings, noise = self._settings, self.signal_model.noise
         low_hz, high_hz = matched_band_hz(settings)
         n_fft = 2 * (len(noise) - 1)
-        n_fft *= max(1, -(-8 * len(taps) // n_fft))  # fine enough for the filter's side lobes
+        n_fft *= max(1, -(-8 * len(taps) // n_fft))  # The bins resolve the side lobes of the filter.
         gain_2 = np.abs(np.fft.rfft(taps / taps.sum(dtype=np.int64), n_fft)) ** 2
         frequency_hz = np.arange(len(gain_2)) * settings.recording.sample_rate_hz / n_fft
         folded = gain_2 * np.interp(frequency_hz, np.linspace(0, frequency_hz[-1], len(noise)), noise)
@@ -268,16 +275,16 @@ class ErrorModel:
         outside = (frequency_hz > rate_hz / 2) & (distance_hz > low_hz) & (distance_hz < high_hz)
         passed = float(folded[outside].sum()) * (frequency_hz[1] - frequency_hz[0]) / (high_hz - low_hz)
         power = _UNLIKE * passed / self.signal_model.level / self.signal_model.gain
-        dark = np.exp(
-            -4 * np.sqrt(self.signal_model.places / max(power, 1e-30))
-        )  # near the mean of Rice's distribution
+        # The exponential approximates the mean of a Rice distribution.
+        dark = np.exp(-4 * np.sqrt(self.signal_model.places / max(power, 1e-30)))
         return float(power * (0.5 + 0.5 * np.mean(dark)))
 
     def arithmetic(self) -> float:
         """Return the error power of single precision.
 
-        PCM microphones may receive the same loud sound outside the band or the window and round it alike, so that their
-        errors add up in a beam. PDM bits are as loud whatever is heard, which the measured figure includes.
+        PCM microphones may receive the same loud sound outside the band or the window. They then round it alike, and
+        their errors add up in a beam. PDM bits have the same power for every sound, and the measured constant includes
+        it.
         """
         if self._settings.recording.is_pdm:
             return _ARITHMETIC / self.signal_model.gain

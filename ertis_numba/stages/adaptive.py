@@ -1,4 +1,4 @@
-"""From analytic signals to the envelopes of beams, by ways that look at how the microphones agree."""
+"""Adaptive beamformers: coherence factor, DMAS and Capon."""
 
 import math
 from collections.abc import Callable
@@ -16,26 +16,26 @@ _Combine = Callable[[NDArray[np.complex64], NDArray[np.float32]], None]
 
 
 class AdaptiveBeamform:
-    """Analytic signals to the energy of every direction and range, by coherence factor, DMAS or Capon.
+    """Adaptive beamformer: amplitude of every direction and range by coherence factor, DMAS or Capon.
 
-    All of them give an echo that reaches all microphones alike the level that delay-and-sum gives it. What
-    each computes is written in `kernels`; they hold no buffers, so several threads may call one at a time.
+    An echo that reaches all microphones alike has the same level as with delay-and-sum. `kernels` defines the
+    computation of each beamformer. The object holds no buffers, so several threads may call it at the same time.
 
     Parameters
     ----------
     processing : Processing
-        Its ``beamformer`` is not ``delay_and_sum``.
+        Settings with a ``beamformer`` other than ``delay_and_sum``.
     kernels : KernelSet
     memory : Memory
     offsets : (direction, mic) int32
-        Where a microphone's first sample lies in a flat array of (mic, phase, sample).
+        Index of each microphone's first sample in a flattened array of (mic, phase, sample).
     weights : (direction, mic) complex64
-        The carrier's phase and the calibration; the magnitudes of a direction add up to about 1.
+        Phase of the carrier and calibration; the magnitudes of a direction add up to about 1.
 
     Raises
     ------
     ArgumentError
-        There are fewer microphones than ``dmas_order``.
+        ``dmas_order`` exceeds the number of microphones.
     """
 
     def __init__(
@@ -71,28 +71,28 @@ def _dmas(kernels: KernelSet, offsets: NDArray[np.int32], roots: NDArray[np.comp
 
 
 def require_order(order: int, n_mics: int) -> None:
-    """Refuse an order of DMAS beyond the number of microphones.
+    """Check that the order of DMAS does not exceed the number of microphones.
 
     Raises
     ------
     ArgumentError
-        It is.
+        The order exceeds the number of microphones.
     """
     if n_mics < order:
         raise ArgumentError(
             f"processing.dmas_order is {order}, but the array has {n_mics} microphone{'s' * (n_mics != 1)}; "
-            "give an order of at most as many, or another processing.beamformer"
+            "the order must not exceed the number of microphones. Give a lower order or another processing.beamformer"
         )
 
 
 def _roots(weights: NDArray[np.complex64], order: int) -> NDArray[np.complex64]:
-    """Return weights of DMAS: roots, too, and divided by the number of products in the sum."""
+    """Return the weights of DMAS: roots of the weights, divided by a root of the number of products in the sum."""
     n_mics = weights.shape[1]
     require_order(order, n_mics)
     exact = weights.astype(np.complex128)
     level = np.abs(exact)
     shrunk = np.power(level, 1 / order - 1, out=np.zeros_like(level), where=level != 0)
-    # Every product has ``order`` of them, so each takes that root of the whole: no sum leaves single precision.
+    # Every product has ``order`` factors, and each factor carries that root of the divisor. No sum overflows float32.
     roots = exact * shrunk * math.comb(n_mics, order) ** (-1 / order)
     return np.asarray(roots, dtype=np.complex64)
 

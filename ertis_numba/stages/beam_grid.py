@@ -1,12 +1,13 @@
-"""Beams of all directions from those of few: a grid of nodes as fine as the aperture can tell directions apart.
+"""Beam grid: interpolation of all beams from beams at a few grid points.
 
-A beam changes with its direction no faster than the array's outermost microphones turn their phase. So beams at
-the nodes of a grid say all there is, once the grid has a few nodes more than the aperture resolves, and any
-other beam is a sum of the nodes around it, by the weights of `fitting`. With 32 microphones and 3000 directions that
-sum has 16 real terms instead of 32 or more complex ones, and there are ten times fewer nodes than directions.
+The aperture limits the rate at which a beam changes with its direction: the outermost microphones turn their phase
+fastest. Beams at the points of a grid are therefore sufficient if the grid is slightly finer than the resolution of
+the aperture. Any other beam is a weighted sum of the beams around it, with the weights of `fitting`. With 32
+microphones and 3000 directions, there are ten times fewer grid points than directions. The weighted sum then has 16
+real terms, instead of 32 or more complex terms for a separate beam.
 
-The grid lies in the array's own axes: a line array needs one, a plane array two. A node is a point of that plane, not
-of the sphere; those outside of the unit circle belong to no direction, and are as good as any to interpolate from.
+The grid lies in the axes of the array: a line array needs one axis, a plane array two. A grid point is a point of that
+plane, not of the sphere. Points outside the unit circle correspond to no direction but serve interpolation equally.
 """
 
 import math
@@ -24,32 +25,32 @@ from ertis_numba.stages.fitting import Spectrum, fit, gain_of, weights_of
 __all__ = ["FEWEST_RANGES", "Aperture", "BeamNodes", "estimated_mics", "require_nodes"]
 
 FEWEST_RANGES = 64
-"""Of an image whose beams are interpolated: the kernels read signals as far."""
+"""Minimum number of ranges of an image with beam interpolation. The kernels read blocks of this many samples."""
 
 
-_FLAT_M = 1e-6  # an axis along which microphones differ by less is none
-_MIN_POWER = 1e-8  # large weights that cancel each other would let 16 bits be heard
-_POLYNOMIALS = 16  # by which weights are interpolated along an axis
-_AT_A_TIME = 4096  # directions
-_MAX_FITTED = 96  # directions and microphones from which gain and error are found
-_WAVES = 17  # frequencies, over which the gain of a microphone is smooth
-_MAX_ESTIMATED, _WAVES_ESTIMATED = 40, 9  # for an error within some tenths of a decibel
-_REACHES = (0.0, 0.3, 0.6, 1.0)  # of the array's, at which near waves are tried
-_FEWEST_EQUATIONS = 120  # microphones by frequencies: weights would suit fewer better than what lies between them
+_FLAT_M = 1e-6  # An axis counts only if the array's extent along it exceeds this.
+_MIN_POWER = 1e-8  # Regularisation. Large weights that cancel each other would amplify the rounding to 16 bits.
+_POLYNOMIALS = 16  # Number of polynomials that interpolate weights along an axis.
+_AT_A_TIME = 4096  # Number of directions in a block.
+_MAX_FITTED = 96  # Maximum number of directions, and of microphones, from which gain and error are computed.
+_WAVES = 17  # Number of frequencies; the gain of a microphone is smooth over frequency.
+_MAX_ESTIMATED, _WAVES_ESTIMATED = 40, 9  # These suffice for an error within some tenths of a decibel.
+_REACHES = (0.0, 0.3, 0.6, 1.0)  # Source distances to try, relative to the radius of the array.
+_FEWEST_EQUATIONS = 120  # Microphones times frequencies. With fewer equations, the weights would overfit.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Aperture:
-    """Microphones and directions in the axes of the array itself.
+    """Microphones and directions in the principal axes of the array.
 
     Attributes
     ----------
     positions_m : (mic, axis) float64
-        Along the axes in which the array extends, the longest first: one for a line, two for a plane.
+        Positions along the axes in which the array extends, longest axis first. A line has one axis, a plane two.
     directions : (direction, axis) float64
-        Components of the unit vectors along them.
+        Components of the unit vectors along these axes.
     square_m2 : (mic,) float64
-        Squared distance from the centre.
+        Squared distance from the array centre, in m².
     """
 
     positions_m: NDArray[np.float64]
@@ -58,100 +59,107 @@ class Aperture:
 
     @classmethod
     def of(cls, positions_m: NDArray[np.float64], directions: NDArray[np.float64]) -> Self:
-        """Return the aperture of microphones, (mic, 3), and unit vectors, (direction, 3)."""
+        """Return the aperture for microphone positions, (mic, 3) in metres, and unit vectors, (direction, 3)."""
         _, extent_m, axes = np.linalg.svd(positions_m, full_matrices=False)
         axes = axes[extent_m > _FLAT_M * math.sqrt(len(positions_m))]
         return cls(positions_m @ axes.T, directions @ axes.T, np.sum(positions_m**2, axis=1))
 
     @property
     def n_axes(self) -> int:
-        """In how many axes the array extends, 0 to 3."""
+        """Number of axes in which the array extends, 0 to 3."""
         return int(self.positions_m.shape[1])
 
     def delays_s(
         self, points: NDArray[np.float64], *, sound_speed_m_s: float, range_m: float = math.inf
     ) -> NDArray[np.float64]:
-        """Return the delays of points of the array's plane: (point, mic) float64.
+        """Return the delays of points in the array's plane, in seconds: (point, mic) float64.
 
-        As `geometry.far_field_delays` and, for a finite range, `geometry.spherical_delays`, of which the distance
-        to a microphone, ``√(r² − 2 r u·p + p²)``, holds for points outside of the unit circle as well.
+        The delays are those of `geometry.far_field_delays` and, for a finite range, of `geometry.spherical_delays`. The
+        distance to a microphone, ``√(r² − 2 r u·p + p²)``, is defined for points outside the unit circle as well.
         """
         along_m = points @ self.positions_m.T
         if math.isinf(range_m):
             return np.asarray(-along_m / sound_speed_m_s)
-        # As a quotient, since the difference of square root and range would lose digits far away.
+        # A quotient keeps the digits that the difference of square root and range would lose at long ranges.
         bent_m = self.square_m2 - 2 * range_m * along_m
         root_m = np.sqrt(np.maximum(range_m**2 + bent_m, 0.0))
         return np.asarray(bent_m / (root_m + range_m) / sound_speed_m_s)
 
     def spacing(self, density: float, *, high_hz: float, sound_speed_m_s: float) -> NDArray[np.float64]:
-        """Return the distance of nodes along each axis: (axis,) float64."""
+        """Return the spacing of grid points along each axis: (axis,) float64."""
         extent_m = np.ptp(self.positions_m, axis=0)
         return np.asarray(sound_speed_m_s / (high_hz * density * extent_m))
 
     def lowest_nodes(self, spacing: NDArray[np.float64], n_taps: int) -> NDArray[np.int64]:
-        """Return the lowest of the nodes around each direction, as its numbers along the axes."""
+        """Return the indices, along each axis, of the lowest grid point around each direction."""
         return np.asarray(np.floor(self.directions / spacing).astype(np.int64) - (n_taps // 2 - 1))
 
     def count_nodes(self, spacing: NDArray[np.float64], n_taps: int) -> int:
-        """Return how many nodes lie around any direction."""
+        """Return the number of grid points that at least one direction uses."""
         lowest = self.lowest_nodes(spacing, n_taps)
-        _, one = np.unique(_numbers(lowest), return_index=True)  # many directions have the same
+        _, one = np.unique(_numbers(lowest), return_index=True)  # Many directions share their grid points.
         return len(np.unique(_numbers(_around(lowest[one], n_taps))))
 
 
 def require_nodes(aperture: Aperture, n_ranges: int) -> None:
-    """Refuse an array or an image whose beams cannot be interpolated.
+    """Check that beams of the array and the image can be interpolated.
 
     Raises
     ------
     ArgumentError
+        The array is neither a line nor a plane, or the image has fewer than `FEWEST_RANGES` ranges.
     """
     if aperture.n_axes not in {1, 2}:
         extent = "has no extent" if aperture.n_axes == 0 else "is neither a line nor a plane"
-        raise ArgumentError(f"accuracy.beam_taps is above 0, but the array {extent}; give 0 or leave it out")
+        raise ArgumentError(
+            f"accuracy.beam_taps is above 0, but the array {extent}. Beam interpolation needs a line or a plane array; "
+            "give 0 or omit accuracy.beam_taps"
+        )
     if n_ranges < FEWEST_RANGES:
         raise ArgumentError(
-            f"accuracy.beam_taps is above 0, but the image has {n_ranges} ranges, fewer than {FEWEST_RANGES}; "
-            "give 0 or leave it out"
+            f"accuracy.beam_taps is above 0, but the image has {n_ranges} ranges. Beam interpolation needs at least "
+            f"{FEWEST_RANGES}; give 0 or omit accuracy.beam_taps"
         )
 
 
 def _around(lowest: NDArray[np.int64], n_taps: int) -> NDArray[np.int64]:
-    """Return the nodes around directions, neighbours along the first axis side by side: (direction, tap, axis)."""
+    """Return the grid points around directions: (direction, tap, axis).
+
+    Neighbours along the first axis are adjacent.
+    """
     steps = np.indices((n_taps,) * lowest.shape[1]).reshape(lowest.shape[1], -1)[::-1].T
     return lowest[:, None, :] + steps
 
 
 def _numbers(nodes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return one number per node, ascending along the first axis of the array first."""
+    """Return one number per grid point; numbers ascend along the first axis of the array first."""
     low = nodes.min(axis=tuple(range(nodes.ndim - 1)))
     extent = nodes.max(axis=tuple(range(nodes.ndim - 1))) - low + 1
     return np.asarray((nodes - low) @ np.concatenate([[1], np.cumprod(extent)[:-1]]))
 
 
 class BeamNodes:
-    """Nodes, and how the beams of all directions are made of theirs.
+    """Beam-grid points, and the weights that interpolate the beams of all directions from them.
 
     Attributes
     ----------
     is_bent : bool
-        Whether errors are those of a spherical wave where they are larger.
+        True if the errors include those of spherical waves.
     steering, wrong : (mic, wave, direction) complex128
-        Of an estimate: plane waves of some directions at some microphones, and by how much they are missed.
+        Plane waves of some directions at some microphones, and their interpolation errors. Estimates only.
     squares : float
-        Sum of a beam's squared weights, the mean over directions.
+        Sum of a beam's squared weights, averaged over directions.
     points : (node, axis) float64
-        In the array's plane.
+        Grid points in the array's plane.
     rows : (direction,) int32
-        The directions in the order in which they are computed: those that share nodes one after the other.
+        Directions in the order of computation; directions that share grid points are adjacent.
     places : (direction, pair) int32
-        Lower node of each pair, in that order; the other one is the next.
+        Lower grid point of each pair, in the order of ``rows``; the other point is the next one.
     weights : (direction, pair, 2) float64
-        In that order.
+        Weights of each pair, in the order of ``rows``.
     frequency_hz, errors : (wave,) float64
-        Of an estimate: power of the error by that of the beam, the mean over uncorrelated microphones and over
-        directions.
+        Frequencies in hertz, and the error power relative to the beam, averaged over uncorrelated microphones and over
+        directions. The errors exist for estimates only.
     """
 
     def __init__(
@@ -172,7 +180,7 @@ class BeamNodes:
         self._sound_speed_m_s = sound_speed_m_s
         spacing = aperture.spacing(density, high_hz=high_hz, sound_speed_m_s=sound_speed_m_s)
         lowest = aperture.lowest_nodes(spacing, n_taps)
-        # A patch looks the same wherever it lies: only where the direction is in it matters.
+        # All patches of grid points are alike, so only the position of the direction within its patch matters.
         self._inside = aperture.directions - lowest * spacing
         patch = _around(np.zeros((1, aperture.n_axes), dtype=np.int64), n_taps)[0] * spacing
         mics, chosen = _mics_and_waves(len(aperture.positions_m), len(spectrum.power), estimate=estimate)
@@ -186,7 +194,7 @@ class BeamNodes:
             gain = self._estimate(
                 lowest[directions] * spacing, patch, self._inside[directions], mics, weights, spectrum
             )
-            # Of near waves those from about as far as the array is wide are bent most in its plane.
+            # Waves from about as far away as the array is wide are curved most in its plane.
             reach_m = math.sqrt(float(aperture.square_m2.max()))
             for distance_m in {max(nearest_m, share * reach_m) for share in _REACHES} if self.is_bent else ():
                 bent = self._bent_errors(
@@ -207,7 +215,7 @@ class BeamNodes:
         _, one, index = np.unique(_numbers(nodes).reshape(-1), return_index=True, return_inverse=True)
         self.points = nodes.reshape(-1, aperture.n_axes)[one] * spacing
         places = index.reshape(len(lowest), -1, 2)[:, :, 0]
-        order = np.argsort(places[:, 0], kind="stable")  # who shares nodes finds them in the first cache level
+        order = np.argsort(places[:, 0], kind="stable")  # Adjacent directions find shared points in the L1 cache.
         self.rows = order.astype(np.int32)
         self.places = np.ascontiguousarray(places[order], np.int32)
         self.weights = np.ascontiguousarray(found[order]).reshape(len(lowest), -1, 2)
@@ -218,10 +226,10 @@ class BeamNodes:
         n_taps: int,
         weights_at: Callable[[NDArray[np.float64]], NDArray[np.float64]],
     ) -> NDArray[np.float64]:
-        """Return the weights of all directions, (direction, tap), from those at points of a cell between nodes.
+        """Return the weights of all directions, (direction, tap), interpolated from points of one grid cell.
 
-        A weight is a sum of waves, at microphones and frequencies. Across a cell they turn by half a period at most,
-        and so polynomials give them in double precision, in a fraction of the time.
+        A weight is a sum of waves over microphones and frequencies. Across a cell, these waves turn by at most half a
+        period. Polynomials therefore reproduce the weights in double precision, in a fraction of the time.
         """
         places = chebyshev.chebpts1(_POLYNOMIALS)
         inverse = np.linalg.inv(chebyshev.chebvander(places, _POLYNOMIALS - 1))
@@ -254,14 +262,14 @@ class BeamNodes:
         weights: NDArray[np.complex128],
         spectrum: Spectrum,
     ) -> NDArray[np.complex128]:
-        """Evaluate what is missed at all frequencies of the spectrum; return the gains there."""
+        """Compute the errors at all frequencies of the spectrum, and return the gains there."""
         self.frequency_hz = spectrum.frequency_hz
         made, wanted = self._waves(patch, mics) @ weights, self._waves(inside, mics)
         gain = gain_of(made, wanted)
         wrong = gain[:, None] * made - wanted
         shape = (len(mics), len(self.frequency_hz), len(inside))
         self.errors = np.mean(np.abs(wrong.reshape(shape)) ** 2, axis=(0, 2))
-        there = self._waves(moved, mics)  # from the lowest node of each patch to the centre of the array
+        there = self._waves(moved, mics)  # Phase from the lowest point of each patch to the centre of the array.
         self.steering, self.wrong = (there * wanted).reshape(shape), (there * wrong).reshape(shape)
         return np.asarray(gain.reshape(shape[:2]))
 
@@ -275,7 +283,7 @@ class BeamNodes:
         weights: NDArray[np.complex128],
         nearest_m: float,
     ) -> NDArray[np.float64]:
-        """Return the errors, (wave,), of waves from a point at ``nearest_m``, made by the weights of plane waves."""
+        """Return the errors, (wave,), of the plane-wave weights for waves from a point at ``nearest_m``."""
         errors = np.zeros(len(self.frequency_hz))
         for k, direction in enumerate(directions):
             points = np.concatenate([moved[k] + patch, self._aperture.directions[direction][None]])
@@ -286,7 +294,7 @@ class BeamNodes:
         return errors / len(directions)
 
     def gain(self, frequency_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """Return the gain of each microphone that goes with the weights: (mic, frequency) complex128."""
+        """Return the gain of each microphone that complements the weights: (mic, frequency) complex128."""
         mics = np.arange(len(self._aperture.positions_m))
         made = self._waves(self._patch, mics) @ self._fitted_weights
         wanted = self._waves(self._inside[self._fitted_directions], mics)
@@ -305,7 +313,7 @@ class BeamNodes:
         delay_s = -self._aperture.positions_m[mics] @ points.T / self._sound_speed_m_s
         turns = delay_s[:, None, :] * (2 * math.pi * self.frequency_hz[:, None])
         waves = np.empty(turns.shape, dtype=np.complex128)
-        np.cos(turns, out=waves.real)  # both take half as long as an exponential function of complex numbers
+        np.cos(turns, out=waves.real)  # Sine and cosine together take half as long as a complex exponential.
         np.sin(turns, out=waves.imag)
         return waves.reshape(-1, len(points))
 
@@ -316,12 +324,12 @@ def estimated_mics(n_mics: int) -> NDArray[np.intp]:
 
 
 def _mics_and_waves(n_mics: int, n_waves: int, *, estimate: bool) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the microphones and the frequencies of the spectrum from which weights are found."""
+    """Return the indices of the microphones and frequencies from which weights are computed."""
     mics = estimated_mics(n_mics) if estimate else _some(n_mics, _MAX_FITTED)
     enough = max(_WAVES_ESTIMATED if estimate else _WAVES, _FEWEST_EQUATIONS // len(mics))
     return mics, _some(n_waves, enough)
 
 
 def _some(count: int, largest: int) -> NDArray[np.intp]:
-    """Return ``largest`` indices at the most, spread evenly."""
+    """Return at most ``largest`` indices, spread evenly over ``count``."""
     return np.unique(np.linspace(0, count - 1, min(count, largest)).astype(np.intp))

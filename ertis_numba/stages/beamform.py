@@ -1,4 +1,4 @@
-"""From analytic signals to the envelopes of beams, by delay-and-sum."""
+"""Delay-and-sum beamforming of analytic signals, with the envelopes of the beams."""
 
 import math
 from collections.abc import Sequence
@@ -16,19 +16,19 @@ from ertis_numba.stages.window import TimeWindow
 
 __all__ = ["Beamform", "BeamformFloat32", "BeamformInt16", "Buffers", "beamform", "require_int16", "whole_limits"]
 
-_WEIGHT_BITS = 12  # leave the samples 13 bits with 32 microphones: both err by about -85 dB then
-_TAP_BITS = 15  # of the weights of nodes, less what their sum needs
-_SAFE = 0.98  # of the largest whole number: rounding must not go beyond it
+_WEIGHT_BITS = 12  # With 32 microphones, 13 bits remain for samples. Both then have errors of about -85 dB.
+_TAP_BITS = 15  # Bits of the weights of grid points, before their sum is taken into account.
+_SAFE = 0.98  # Share of the largest integer in use. Rounding must not exceed the largest integer.
 
 Buffers = tuple[NDArray[Any], ...]
-"""What a call writes to on its way: tiles and their scales, nothing where samples stay in float32."""
+"""Work arrays of one call: tiles and their scales; empty if samples stay in float32."""
 
 
 class Beamform(Protocol):
-    """Analytic signals to the energy of every direction and range."""
+    """Beamformer: computes the amplitude of every direction and range from analytic signals."""
 
     def new_buffers(self) -> Buffers:
-        """Return what one call needs to write to."""
+        """Return new work arrays for one call at a time."""
         ...
 
     def __call__(self, analytic: NDArray[np.complex64], buffers: Buffers, out: NDArray[np.float32]) -> None:
@@ -37,16 +37,17 @@ class Beamform(Protocol):
 
 
 def require_int16(kernels: KernelSet) -> None:
-    """Refuse a device without 16-bit dot products.
+    """Check that the device has a 16-bit dot product.
 
     Raises
     ------
     DeviceError
+        The device has none.
     """
     if not kernels.tile_ranges:
         raise DeviceError(
             "accuracy.precision is 'int16', but this processor has no 16-bit dot product (AVX-512 VNNI or AVX-VNNI); "
-            "give 'float32' or 'auto'"
+            "set accuracy.precision to 'float32' or 'auto'"
         )
 
 
@@ -61,12 +62,20 @@ def beamform(
     n_phases: int,
     threads: int,
 ) -> "BeamformFloat32 | BeamformInt16":
-    """Return the beamformer of a plan; parameters as for `BeamformFloat32`.
+    """Return the delay-and-sum beamformer of a plan.
+
+    Parameters
+    ----------
+    precision : {"float32", "int16"}
+    kernels, memory, window, zones, nodes, threads
+        As for `BeamformFloat32`.
+    n_phases : int
+        Number of phases of the analytic signals.
 
     Raises
     ------
     DeviceError
-        The device has no 16-bit dot product.
+        The precision is ``"int16"``, and the device has no 16-bit dot product.
     """
     if precision == "float32":
         return BeamformFloat32(kernels, memory, window, zones, nodes, threads=threads)
@@ -75,7 +84,7 @@ def beamform(
 
 
 class _NodeTables:
-    """The nodes of directions where kernels read them; ``weights`` are those of the precision."""
+    """Beam-grid tables in device memory; ``weights`` have the data type of the precision."""
 
     def __init__(self, memory: Memory, nodes: BeamNodes, weights: NDArray[Any]) -> None:
         self.places, self.rows = memory.table(nodes.places), memory.table(nodes.rows)
@@ -83,16 +92,20 @@ class _NodeTables:
 
 
 class BeamformFloat32:
-    """See `Beamform`; samples stay in single precision.
+    """Delay-and-sum beamformer on float32 samples; implements `Beamform`.
 
     Parameters
     ----------
-    kernels, memory, window
+    kernels : KernelSet
+    memory : Memory
+    window : TimeWindow
     zones : sequence of Zone
-        Together the whole range axis; of the beams of all directions, or of the nodes.
-    nodes : BeamNodes, optional
-        The zones' beams are those of nodes, and others are interpolated from them.
+        Focal zones that together cover the range axis. Their beams are those of all directions, or of the beam-grid
+        points if there are any.
+    nodes : BeamNodes or None
+        Beam grid from which the beams of all directions are interpolated.
     threads : int
+        Number of threads.
     """
 
     def __init__(
@@ -118,7 +131,7 @@ class BeamformFloat32:
         self._nodes = None if nodes is None else _NodeTables(memory, nodes, nodes.weights.astype(np.float32))
 
     def new_buffers(self) -> Buffers:
-        """See `Beamform`."""
+        """Return no work arrays, since float32 samples need none."""
         return ()
 
     def __call__(
@@ -127,7 +140,7 @@ class BeamformFloat32:
         buffers: Buffers,  # noqa: ARG002
         out: NDArray[np.float32],
     ) -> None:
-        """See `Beamform`."""
+        """Fill ``out``, (direction, range) float32, from ``analytic``, (mic, phase, sample) complex64."""
         for first, stop, offsets, weights in self._zones:
             if self._nodes is None:
                 self._kernels.delay_and_sum_envelope(analytic, offsets, weights, first, stop, out)
@@ -147,17 +160,23 @@ class BeamformFloat32:
 
 
 def whole_limits(sum_of_weights: float) -> tuple[int, int]:
-    """Return the largest whole numbers of weights and of samples, for a sum of weights by the largest of them."""
+    """Return the largest integers of weights and of samples.
+
+    Parameters
+    ----------
+    sum_of_weights : float
+        Sum of the magnitudes of a beam's weights, relative to the largest weight.
+    """
     bits = math.log2(_SAFE) + 31 - math.log2(sum_of_weights)
-    # A sample has 15 bits at most: what few microphones leave over goes to the weights.
+    # A sample has at most 15 bits. With few microphones, the remaining bits go to the weights.
     weight_bits = min(max(_WEIGHT_BITS, math.floor(bits) - 15), math.floor(bits / 2), 15)
-    # One off for rounding.
+    # Subtracting 1 allows for rounding.
     return 2**weight_bits - 1, math.floor(min(2.0 ** (bits - weight_bits), 2.0**15)) - 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _WholeZone:
-    """A zone in whole numbers, and which of all tiles are its own."""
+    """Focal zone with integer weights, and the slice of its tiles."""
 
     tiles: slice
     starts: NDArray[np.int32]
@@ -167,11 +186,11 @@ class _WholeZone:
 
 
 class BeamformInt16:
-    """See `Beamform`; samples go through 16 bits, scaled tile by tile of ranges.
+    """Delay-and-sum beamformer on 16-bit samples, scaled for each tile of ranges; implements `Beamform`.
 
-    The 32-bit sums must hold all terms at full scale: for weights w and samples of magnitudes up to x, that is
-    ``x · Σ|w| ≤ 2³¹``. Weights get 12 bits of it, or half where there is less. Of the beams of nodes the upper
-    16 bits are kept, so that they fill them where the sums fill their 32.
+    The 32-bit sums must hold all terms at full scale. For weights w and samples of magnitudes up to x, the condition is
+    ``x · Σ|w| ≤ 2³¹``. Of the bits available to one product, weights get 12, or half if there are fewer than 24. Beams
+    at beam-grid points keep the upper 16 bits of their sums, so a sum that fills 32 bits fills these 16 bits as well.
     """
 
     def __init__(
@@ -198,7 +217,7 @@ class BeamformInt16:
         for zone in zones:
             mine = range(zone.first, zone.stop, kernels.tile_ranges)
             offsets, weights = zone.table.offsets(width), _pairs(zone.table.weights / self._weight_scale)
-            # Rounding may have added to them, where there are many small ones.
+            # Rounding may have increased a sum of many small weights.
             sums = np.hypot(weights[:, :, 0, 0], weights[:, :, 1, 0], dtype=np.float64).sum(axis=1)
             self._limit = min(self._limit, np.float32(_SAFE * 2**31 / max(1.0, float(sums.max())) - 1))
             self._zones.append(
@@ -222,11 +241,11 @@ class BeamformInt16:
             self._weight_scale = np.float32(self._weight_scale * 2**16 / scale)
 
     def new_buffers(self) -> Buffers:
-        """See `Beamform`."""
+        """Return the tiles and their scales for one call at a time."""
         return self._memory.zeros(self._shape, np.int16), self._memory.zeros(self._shape[:1], np.float32)
 
     def __call__(self, analytic: NDArray[np.complex64], buffers: Buffers, out: NDArray[np.float32]) -> None:
-        """See `Beamform`."""
+        """Fill ``out``, (direction, range) float32, from ``analytic``, (mic, phase, sample) complex64."""
         tiles, scales = buffers
         self._kernels.quantise_tiles(analytic, self._starts, self._limit, tiles, scales)
         for zone in self._zones:
@@ -265,5 +284,5 @@ def _pairs(weights: NDArray[np.complex128]) -> NDArray[np.int16]:
 
 
 def _blocks(threads: int, n_tiles: int) -> int:
-    """Return into how many parts to cut directions: every thread should have two tiles of a part."""
+    """Return the number of blocks of directions such that every thread has about two tiles of a block."""
     return max(1, round(2 * threads / max(1, n_tiles)))

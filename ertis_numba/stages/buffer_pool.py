@@ -28,7 +28,7 @@ class MeasurementBuffers(NamedTuple):
 
 
 class BufferPool:
-    """As many buffers as measurements ever were in progress at once."""
+    """Pool of buffers; it grows to the largest number of measurements in progress at the same time."""
 
     def __init__(self) -> None:
         self._change = threading.Condition()
@@ -38,14 +38,15 @@ class BufferPool:
 
     @contextmanager
     def acquired(self, make: Callable[[], MeasurementBuffers]) -> Iterator[MeasurementBuffers]:
-        """Run the enclosed code with buffers that no other thread uses; `release` them after the lane is done.
+        """Run the enclosed code with buffers that no other thread uses.
 
-        If the enclosed code fails, the buffers are dropped, because kernels may still use them.
+        Call `release` after the lane has finished. If the enclosed code fails, the buffers are discarded, because
+        kernels may still use them.
 
         Parameters
         ----------
         make : callable
-            Returns new buffers; called if none are spare.
+            Function that returns new buffers; called if no buffers are free.
 
         Raises
         ------
@@ -54,7 +55,7 @@ class BufferPool:
         """
         with self._change:
             if self._closed:
-                raise ArgumentError("the pipeline is closed; make another one")
+                raise ArgumentError("the pipeline is closed; create another one")
             buffers = self._spare.pop() if self._spare else None
             self._n_busy += 1
         try:
@@ -64,7 +65,7 @@ class BufferPool:
             raise
 
     def release(self, buffers: MeasurementBuffers | None) -> None:
-        """Return acquired buffers, or None if they were dropped."""
+        """Release acquired buffers to the pool; None stands for discarded ones."""
         with self._change:
             if buffers is not None:
                 self._spare.append(buffers)
@@ -72,7 +73,7 @@ class BufferPool:
             self._change.notify_all()
 
     def close(self) -> None:
-        """Wait until no buffers are in use, and drop all."""
+        """Wait until no buffers are in use, then free all."""
         with self._change:
             self._closed = True
             self._change.wait_for(lambda: not self._n_busy)

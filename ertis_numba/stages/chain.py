@@ -1,4 +1,4 @@
-"""What every method of making an image offers to the pipeline."""
+"""Interface of signal chains, the imaging methods of a pipeline."""
 
 from collections.abc import Iterable
 from typing import Any, Protocol
@@ -12,38 +12,48 @@ __all__ = ["Chain"]
 
 
 class Chain(Protocol):
-    """A signal chain with tables made once, which several threads may use at a time."""
+    """Signal chain. It computes its tables once, and several threads may use it at the same time."""
 
     @property
     def grid(self) -> Grid:
-        """The direction axis of the image."""
+        """Direction axis of the image."""
         ...
 
     @property
     def range_m(self) -> NDArray[np.float64]:
-        """The range axis of the image: (range,) float64."""
+        """Range axis of the image in metres: (range,) float64."""
         ...
 
     def process(
         self, words: NDArray[np.unsignedinteger[Any]], out: NDArray[np.float32], *, threads: int | None = None
     ) -> None:
-        """Fill ``out``, (direction, range) float32, from ``words``, (sample, word), on as many threads or the usual."""
+        """Compute the image of one measurement.
+
+        Parameters
+        ----------
+        words : (sample, word) unsigned integers
+            Recorded samples.
+        out : (direction, range) float32
+            Array to fill with amplitudes.
+        threads : int, optional
+            Number of threads; by default, that of the chain.
+        """
         ...
 
     def process_batch(
         self, words: Iterable[NDArray[np.unsignedinteger[Any]]], outs: Iterable[NDArray[np.float32]]
     ) -> None:
-        """Do as `process` for several measurements, at the same time where that is faster."""
+        """Compute the images of several measurements, in parallel if that is faster; parameters as for `process`."""
         ...
 
     def warm_up(self, words: NDArray[np.unsignedinteger[Any]]) -> None:
-        """Compile or load kernels and make buffers now rather than amid a stream; ``words`` are of silence."""
+        """Compile or load kernels and allocate buffers before a stream starts; ``words`` hold silence."""
         ...
 
     def new_image(self) -> NDArray[np.float32]:
-        """Return an array for an image, (direction, range), that holds anything."""
+        """Return an uninitialised array for an image: (direction, range) float32."""
         ...
 
     def close(self) -> None:
-        """Give back what the chain keeps on its device."""
+        """Free the memory of the chain on its device."""
         ...

@@ -1,4 +1,4 @@
-"""Delays as the kernels take them: which samples each microphone adds to a beam, and their weights."""
+"""Delay tables of the kernels: indices and weights of the samples that each microphone adds to a beam."""
 
 from dataclasses import dataclass
 from typing import Self
@@ -14,14 +14,15 @@ __all__ = ["DelayTable", "Zone"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DelayTable:
-    """Which samples of which phases make up a beam's first range, and their weights.
+    """Samples that contribute to the first range of each beam, and their weights.
 
-    A term is one sample of one microphone; each microphone has as many as its delays are interpolated from.
+    A term is one sample of one microphone. The number of terms of a microphone is the number of taps of the delay
+    interpolation.
 
     Attributes
     ----------
     rows, samples : (beam, term) int64
-        Number of microphone and phase, counted phase by phase, and the sample in it.
+        Row of the sample, ``microphone · n_phases + phase``, and its index in that row.
     weights : (beam, term) complex128
     """
 
@@ -39,17 +40,20 @@ class DelayTable:
         n_phases: int,
         lead: int,
     ) -> Self:
-        """Return the table of ``delays_s``, (beam, mic).
+        """Return the delay table of given delays.
 
         Parameters
         ----------
         delays_s : (beam, mic) float64
+            Delays in seconds.
         amplitudes : (mic,) float64
             Weight of each microphone.
         fit : DelayFit
+            Fractional-delay filters.
         n_phases : int
+            Number of phases of the analytic signals.
         lead : int
-            Sample that lies at the first range.
+            Index of the sample at the first range.
         """
         n_beams, n_mics = delays_s.shape
         first, fractions = fit.split(delays_s)
@@ -60,32 +64,34 @@ class DelayTable:
         return cls(rows.reshape(flat), samples.reshape(flat) + lead, weights.reshape(flat))
 
     def offsets(self, width: int) -> NDArray[np.int32]:
-        """Return where the first sample lies in a flat array of (mic, phase, ``width``).
+        """Return the indices of the first samples in a flattened array of (mic, phase, ``width``).
 
         Raises
         ------
         ArgumentError
-            The array has too many samples to index.
+            A delay reaches before the first sample, or the array has too many samples for 32-bit indices.
         """
         if self.samples.min() < 0:
-            raise ArgumentError("delays reach before the first sample; give a later processing.range_m")
+            raise ArgumentError(
+                "delays reach before the first sample of the record; start processing.range_m at a larger range"
+            )
         last = int(self.rows.max() + 1) * width
         if last > np.iinfo(np.int32).max:
             raise ArgumentError(
-                f"{int(self.rows.max()) + 1} rows of {width} samples, microphones times phases, are too many to index; "
-                "give a shorter range or less accuracy.oversampling"
+                f"the signals have {int(self.rows.max()) + 1} rows (microphones times phases) of {width} samples, too "
+                "many for 32-bit indices; give a shorter processing.range_m or a lower accuracy.oversampling"
             )
         return (self.rows * width + self.samples).astype(np.int32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Zone:
-    """A part of the range axis whose beams have the same delays.
+    """Focal zone: a part of the range axis whose ranges share one set of delays.
 
     Attributes
     ----------
     first, stop : int
-        Ranges.
+        Index of the first range, and index after the last range.
     table : DelayTable
     """
 

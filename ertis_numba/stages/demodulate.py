@@ -1,4 +1,4 @@
-"""From words to signals: of PDM bits or PCM numbers, low-pass, decimate, group delay removed."""
+"""Demodulation of PDM bits or PCM samples to signals: low-pass filter, decimation, and removal of the group delay."""
 
 from typing import Any, Protocol
 
@@ -12,26 +12,26 @@ from ertis_numba.stages.window import TimeWindow
 
 __all__ = ["Demodulate", "DemodulatePdm", "FilterPcm", "demodulation"]
 
-# Of full scale, -260 dB. Signals that decay further become denormal numbers in this stage or the next, and an image of
-# them would take 13 times as long.
+# Samples below -260 dB of full scale count as 0. Smaller values become denormal numbers in this stage or the next, and
+# an image of denormal numbers takes 13 times as long.
 _SILENCE = 1e-13
 
 Room = tuple[NDArray[np.float32], ...]
 
 
 class Demodulate(Protocol):
-    """Words to signals.
+    """Demodulation stage: computes signals from recorded samples.
 
     Attributes
     ----------
     shape : (mic, sample)
-        Of the signals, zeros at the end included.
+        Shape of the signals, including the zeros at the end.
     """
 
     shape: tuple[int, int]
 
     def new_room(self) -> Room:
-        """Return what one measurement at a time is worked on in."""
+        """Return new work arrays for one measurement at a time."""
         ...
 
     def __call__(self, words: NDArray[Any], room: Room, out: NDArray[np.float32]) -> None:
@@ -48,7 +48,7 @@ def demodulation(
     *,
     taps: NDArray[np.int16] | NDArray[np.int32],
 ) -> Demodulate:
-    """Return the stage that suits what the microphones give."""
+    """Return the demodulation stage for the encoding of the recording, PDM or PCM."""
     channels = np.flatnonzero(layout.enabled).astype(np.int32)
     recording, factor = settings.recording, settings.decimation
     if recording.is_pdm:
@@ -57,16 +57,19 @@ def demodulation(
 
 
 class DemodulatePdm:
-    """Bits to signals, in one pass; full scale is 1. See `Demodulate`.
+    """Demodulation of PDM bits in one pass, with a full scale of 1; implements `Demodulate`.
 
     Parameters
     ----------
     channels : (mic,) int32
-    window, kernels, memory
+        Channels of the microphones.
+    window : TimeWindow
+    kernels : KernelSet
+    memory : Memory
     taps : (tap,) int16 or int32
-        Of the low pass, whose sum is a gain of 1.
+        Integer taps of the low-pass filter; their sum corresponds to a gain of 1.
     factor : int
-        Samples of the record per signal sample.
+        Recorded samples per signal sample.
     """
 
     def __init__(
@@ -85,11 +88,11 @@ class DemodulatePdm:
         self.shape = (len(channels), window.n_fft)
 
     def new_room(self) -> Room:
-        """See `Demodulate.new_room`."""
+        """Return no work arrays, since bits are demodulated in one pass."""
         return ()
 
     def __call__(self, words: NDArray[Any], room: Room, out: NDArray[np.float32]) -> None:  # noqa: ARG002
-        """See `Demodulate`."""
+        """Fill ``out``, (mic, sample) float32, from ``words``, (sample, word) unsigned integers."""
         window = self._window
         self._kernel(
             words, self._channels, self._taps, self._scale, self._factor, window.first_sample, window.n_samples, out
@@ -97,14 +100,16 @@ class DemodulatePdm:
 
 
 class FilterPcm:
-    """Numbers to signals: nothing is modulated, but the rate may be higher than signals need. See `Demodulate`.
+    """Low-pass filter and decimation of PCM samples; implements `Demodulate`.
+
+    PCM needs no demodulation, but its sample rate may exceed the signal rate.
 
     Parameters
     ----------
     channels, window, kernels, memory, taps, factor
         As for `DemodulatePdm`.
     full_scale : float
-        What becomes 1.
+        Sample value that becomes 1; 1 by default.
     """
 
     def __init__(
@@ -128,7 +133,7 @@ class FilterPcm:
         self.shape = (len(channels), window.n_fft)
 
     def new_room(self) -> Room:
-        """See `Demodulate.new_room`."""
+        """Return the arrays of unpacked and of decimated samples for one measurement at a time."""
         n_mics = self.shape[0]
         return (
             self._memory.zeros((n_mics, self._n_decimated * self._factor), np.float32),
@@ -136,7 +141,7 @@ class FilterPcm:
         )
 
     def __call__(self, words: NDArray[Any], room: Room, out: NDArray[np.float32]) -> None:
-        """See `Demodulate`."""
+        """Fill ``out``, (mic, sample) float32, from ``words``, (sample, channel)."""
         heard, decimated = room
         self._kernels.unpack_pcm(words, self._channels, self._scale, self._silence, self._first, heard)
         self._kernels.decimate(heard, self._taps, self._factor, decimated)

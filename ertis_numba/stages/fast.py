@@ -1,4 +1,4 @@
-"""The fast chain: only the window of the record, and only the beams, that the image needs."""
+"""Fast signal chain: it processes only the time window and the beams that an image needs."""
 
 import functools
 import math
@@ -41,21 +41,24 @@ _TINY = 1e-30
 
 
 class FastChain:
-    """Demodulate, matched filter, beamform and envelope with tables made once.
+    """Signal chain of demodulation, matched filter, beamformer and envelope, with tables computed once.
 
     Parameters
     ----------
     settings : Settings
-        Their plan leaves nothing open: see `planner`.
+        Settings with a complete plan: see `planner.complete`.
     kernels : KernelSet
     threads : int
+        Default number of threads.
     graphs : bool
-        Whether a GPU records the chain and plays it again.
+        True to record the chain as a CUDA graph on a GPU and replay it; False by default.
 
     Attributes
     ----------
     grid : Grid
+        Directions of the image.
     range_m : (range,) float64
+        Range axis in metres.
 
     Raises
     ------
@@ -153,15 +156,15 @@ class FastChain:
     def process(
         self, words: NDArray[np.unsignedinteger[Any]], out: NDArray[np.float32], *, threads: int | None = None
     ) -> None:
-        """See `Chain.process`."""
+        """Compute the image of one measurement; parameters as for `Chain.process`."""
         self._finish(self._begin(words, out, self._threads if threads is None else threads))
 
     def process_batch(
         self, words: Iterable[NDArray[np.unsignedinteger[Any]]], outs: Iterable[NDArray[np.float32] | None]
     ) -> None:
-        """Do as `process` for several measurements: on a GPU in lanes, on the host side by side with a thread each.
+        """Process several measurements: on a GPU in lanes, on the CPU in parallel with one thread each.
 
-        Without an array in ``outs`` to fill, an image is left where the GPU made it, until the lane's next one.
+        If an item of ``outs`` is None, the image stays in GPU memory until the lane computes its next image.
         """
         pairs = list(zip(words, outs, strict=True))
         if self._memory.n_lanes == 1:
@@ -178,7 +181,10 @@ class FastChain:
                 self._finish(under_way.popleft())
 
     def _side_by_side(self, pairs: list[tuple[NDArray[np.unsignedinteger[Any]], NDArray[np.float32] | None]]) -> None:
-        """Process with a thread for each measurement: threads of one kernel wait for each other after every stage."""
+        """Process each measurement on one thread, because threads of one kernel wait for each other after each stage.
+
+        Fewer measurements than threads are processed one after the other, on all threads.
+        """
         if len(pairs) < self._threads or self._threads == 1:
             for each, out in pairs:
                 self._finish(self._begin(each, out, self._threads))
@@ -190,7 +196,7 @@ class FastChain:
         return ThreadPoolExecutor(self._threads, thread_name_prefix="ertis-batch")
 
     def analytic(self, words: NDArray[np.unsignedinteger[Any]]) -> tuple[NDArray[np.complex64], int]:
-        """Return the analytic signals, (mic, phase, sample), and the sample of the first range."""
+        """Return the analytic signals, (mic, phase, sample), and the index of the sample at the first range."""
         heard = np.empty(self._matched_filter.shape, dtype=np.complex64)
         with self._taken(self._threads) as buffers:
             here = buffers.lane.send(words)
@@ -201,10 +207,10 @@ class FastChain:
         return heard, self._lead
 
     def process_signals(self, signals: NDArray[np.float64], out: NDArray[np.float32]) -> None:
-        """Fill ``out`` from what would be modulated, (mic, sample) at the PDM rate, full scale 1."""
+        """Compute an image from unmodulated signals: (mic, sample) at the PDM rate, full scale 1."""
         with self._taken(self._threads) as buffers:
             unmodulated, image = self._made_unmodulated(), buffers.lane.target(out)
-            heard = np.where(np.abs(signals.T) < _TINY, 0.0, signals.T)  # which would become denormal on its way
+            heard = np.where(np.abs(signals.T) < _TINY, 0.0, signals.T)  # Smaller values would become denormal numbers.
             numbers = buffers.lane.send(np.ascontiguousarray(heard, dtype=np.float32))
             unmodulated(numbers, unmodulated.new_room(), buffers.signals)
             self._image(buffers, image, self._threads)
@@ -212,7 +218,7 @@ class FastChain:
         self._finish(buffers)
 
     def warm_up(self, words: NDArray[np.unsignedinteger[Any]]) -> None:
-        """See `Chain.warm_up`."""
+        """Process ``words`` once in every lane, which compiles kernels and allocates buffers."""
         images = [self.new_image() for _ in range(self._memory.n_lanes)]
         if len(images) == 1:
             self.process(words, images[0])
@@ -220,11 +226,11 @@ class FastChain:
             self.process_batch([words] * len(images), images)
 
     def new_image(self) -> NDArray[np.float32]:
-        """Return an array for an image, (direction, range), that holds anything."""
+        """Return an uninitialised array for an image: (direction, range) float32."""
         return self._memory.image((len(self.grid), len(self.range_m)))
 
     def close(self) -> None:
-        """Give back the memory of the device, when the measurements that are under way are done."""
+        """Wait for measurements in progress, then free the memory of the device."""
         self._pool.close()
         for name in ("_demodulate", "_made_unmodulated", "_matched_filter", "_beamform", "_adaptive"):
             self.__dict__.pop(name, None)
@@ -233,7 +239,7 @@ class FastChain:
     def _begin(
         self, words: NDArray[np.unsignedinteger[Any]], out: NDArray[np.float32] | None, threads: int
     ) -> MeasurementBuffers:
-        """Begin one measurement; its image is in ``out`` when the lane is done."""
+        """Start to process one measurement; its image is in ``out`` once the lane has finished."""
         with self._taken(threads) as buffers:
             here = buffers.lane.send(words)
             image = buffers.lane.target(self._no_image if out is None else out)
@@ -268,7 +274,7 @@ class FastChain:
 
     @functools.cached_property
     def _no_image(self) -> NDArray[np.float32]:
-        """An array of an image's shape and of no size, for images that nobody fetches from a GPU."""
+        """Zero-stride array in the shape of an image, for images that stay on a GPU."""
         return np.broadcast_to(np.float32(0), (len(self.grid), len(self.range_m)))
 
     def _new_buffers(self) -> MeasurementBuffers:

@@ -1,19 +1,18 @@
-"""Waves made of others, by weights that err least: what delays and beams are interpolated by.
+"""Least-squares interpolation of delays and beams.
 
-A sample at a delay between those that are kept, and a beam between those that are computed, are both sums of
-neighbours. For a plane wave of unit amplitude the neighbours are ``E[wave, tap]``, what is wanted is
-``T[wave, target]``, and all that the chain can choose are the weights ``c[tap, target]`` and one gain
-``g[wave]`` that all targets share, which the matched filter takes along for nothing. Both are the ones that
-make
+A sample between stored samples and a beam between computed beams are both weighted sums of their neighbours. For a
+plane wave of unit amplitude, the neighbours are ``E[wave, tap]`` and the targets are ``T[wave, target]``. The free
+parameters are the weights ``c[tap, target]`` and a gain ``g[wave]`` that all targets share; the matched filter applies
+the gain at no cost. The fit minimises
 
     Σ_wave power[wave] · Σ_target |T − g (E c)|²
 
-least: a linear least-squares problem in either, solved in turns. The gain takes away what all targets would be
-wrong by in the same way, so what is left has no mean over the targets and adds up between microphones like
-noise. That is why its power is a tight estimate of the image's error, not only a bound. (The gain is what
-deapodization is to gridding: J. I. Jackson et al., Selection of a convolution function for Fourier inversion
-using gridding, IEEE Trans. Med. Imaging 10, 1991; J. A. Fessler and B. P. Sutton, Nonuniform fast Fourier
-transforms using min-max interpolation, IEEE Trans. Signal Process. 51, 2003.)
+over weights and gain. The problem is linear in either, and the fit alternates between them. The gain removes the error
+that all targets share. The remaining error therefore has zero mean over the targets and adds up between microphones
+like noise. Its power is a tight estimate of the image error, not only a bound. The gain corresponds to the
+deapodization of gridding (J. I. Jackson et al., Selection of a convolution function for Fourier inversion using
+gridding, IEEE Trans. Med. Imaging 10, 1991; J. A. Fessler and B. P. Sutton, Nonuniform fast Fourier transforms using
+min-max interpolation, IEEE Trans. Signal Process. 51, 2003).
 """
 
 import functools
@@ -33,22 +32,23 @@ from ertis_numba.settings import INTERPOLATIONS
 __all__ = ["WAVES", "DelayFit", "Spectrum", "fit", "gain_of", "one_thread", "weights_of"]
 
 WAVES = 40
-"""Frequencies of the spectra that fits and errors are weighted by."""
+"""Number of frequencies of the spectra that weight fits and errors."""
 
-_TURNS = 12  # the error falls by less than 0.1 dB after that
-_MIN_POWER = 1e-14  # of the taps', added to their Gram matrix: keeps weights small where taps are nearly alike
-_TARGETS = 65  # over one step of the samples that are kept
+_TURNS = 12  # Number of iterations; further ones reduce the error by less than 0.1 dB.
+_MIN_POWER = 1e-14  # Regularisation relative to the power of the taps. It keeps weights small if taps are nearly equal.
+_TARGETS = 65  # Number of targets over one step of the stored samples.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Spectrum:
-    """Where the matched filter's output has its power.
+    """Power spectrum of the output of the matched filter.
 
     Attributes
     ----------
     frequency_hz : (wave,) float64
+        Frequencies in hertz.
     power : (wave,) float64
-        Adds up to 1.
+        Share of the power at each frequency; the sum is 1.
     """
 
     frequency_hz: NDArray[np.float64]
@@ -56,12 +56,12 @@ class Spectrum:
 
     @property
     def centre_hz(self) -> float:
-        """Mean frequency."""
+        """Mean frequency in hertz, weighted by power."""
         return float(self.frequency_hz @ self.power)
 
 
 class _OneThread:
-    """Holds BLAS to one thread while anybody is inside, whichever Python thread that is."""
+    """Context manager that limits BLAS to one thread while any Python thread is inside."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -85,7 +85,10 @@ _ONE_THREAD = _OneThread()
 
 
 def one_thread() -> AbstractContextManager[None]:
-    """Keep BLAS to one thread inside: matrices here are small, and on busy cores its threads wait for each other."""
+    """Limit BLAS to one thread inside the context.
+
+    The matrices of the planner are small, and on busy cores the threads of BLAS wait for each other.
+    """
     return _ONE_THREAD
 
 
@@ -97,17 +100,18 @@ def fit(
     real: bool = False,
     min_power: float = _MIN_POWER,
 ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-    """Return the gain and the weights that make ``targets`` of ``taps`` with the least error.
+    """Return the gain and the weights that approximate ``targets`` by ``taps`` with the least error.
 
     Parameters
     ----------
     taps : (wave, tap) complex128
     targets : (wave, target) complex128
     power : (wave,) float64
+        Weight of each frequency.
     real : bool
-        Give real weights only.
+        True to restrict the weights to real values; False by default.
     min_power : float
-        Added to the taps' Gram matrix, by its mean diagonal.
+        Regularisation, added to the diagonal of the Gram matrix of the taps, relative to its mean diagonal.
 
     Returns
     -------
@@ -123,7 +127,7 @@ def fit(
 
 
 def gain_of(made: NDArray[np.complex128], targets: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """Return the gain, (wave,), that brings what was made nearest to the targets; both (wave, target)."""
+    """Return the gain, (wave,), that minimises the distance of ``made`` from the targets; both (wave, target)."""
     return np.asarray(np.sum(np.conj(made) * targets, axis=1) / np.sum(np.abs(made) ** 2, axis=1))
 
 
@@ -136,7 +140,7 @@ def weights_of(
     real: bool = False,
     min_power: float = _MIN_POWER,
 ) -> NDArray[np.complex128]:
-    """Return the weights, (tap, target), that are best with a given gain; parameters as for `fit`."""
+    """Return the optimal weights for a given gain: (tap, target) complex128; other parameters as for `fit`."""
     gained = gain[:, None] * taps
     left = np.conj(gained.T) * power
     gram, right = left @ gained, left @ targets
@@ -147,7 +151,18 @@ def weights_of(
 
 
 class DelayFit:
-    """How a sample at any time is made of samples that are kept at a fixed step.
+    """Fractional-delay filters: interpolation of a sample at any time from samples stored at a fixed step.
+
+    Parameters
+    ----------
+    interpolation : str
+        A name of `ertis_numba.settings.INTERPOLATIONS`.
+    n_taps : int or None
+        Number of taps, if the interpolation does not determine it.
+    step_s : float
+        Time between stored samples, in seconds.
+    spectrum : Spectrum
+        Spectrum that weights the errors.
 
     Attributes
     ----------
@@ -155,10 +170,10 @@ class DelayFit:
     fractions : (target,) float64
         Delays spread evenly over one step, as `split` returns them.
     errors : (wave,) float64
-        Power of the error by that of the sample at each frequency of the spectrum, the variance over delays spread
-        evenly over one step.
+        Error power relative to the sample at each frequency of the spectrum: the variance over delays spread evenly
+        over one step.
     biases : (wave,) float64
-        Power of its mean, which all microphones share; fitted weights leave less of it than others.
+        Power of the mean error, which all microphones share. It is smaller for fitted weights than for others.
     """
 
     def __init__(self, interpolation: str, n_taps: int | None, step_s: float, spectrum: Spectrum) -> None:
@@ -186,11 +201,11 @@ class DelayFit:
 
     @property
     def is_fitted(self) -> bool:
-        """Whether the weights are those that err least."""
+        """True if the weights are those of the least-squares fit."""
         return self._interpolation == "fitted"
 
     def split(self, delays_s: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return the first kept sample that makes each delayed one, and how far after it that lies, in steps."""
+        """Return the first stored sample that contributes to each delayed sample, and the delay after it, in steps."""
         steps = delays_s / self._step_s
         nearest = np.rint(steps) if self.n_taps % 2 else np.floor(steps)
         first = nearest - (self.n_taps - 1) // 2
@@ -205,8 +220,8 @@ class DelayFit:
     def _polynomials(self) -> NDArray[np.complex128]:
         """Chebyshev coefficients of the weights over the fractions of one step: (degree, tap).
 
-        Each weight is a sum of waves, at all frequencies of the spectrum. Their coefficients are Bessel functions of
-        half the phase of a step, and negligible in double precision beyond the degree below.
+        Each weight is a sum of waves at all frequencies of the spectrum. Their coefficients are Bessel functions of
+        half the phase of a step. Beyond the degree below, they are negligible in double precision.
         """
         half_phase = math.pi * float(self._spectrum.frequency_hz.max()) * self._step_s
         degree = math.ceil(1.5 * half_phase) + 20
@@ -221,7 +236,7 @@ class DelayFit:
         return weights_of(self._gain, taps, self._wanted(fractions), self._spectrum.power)
 
     def gain(self, frequency_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """Return the gain that goes with the weights: (frequency,) complex128."""
+        """Return the gain that complements the weights: (frequency,) complex128."""
         if self._interpolation != "fitted":
             return np.ones(len(frequency_hz), dtype=np.complex128)
         made = self._taps(frequency_hz) @ self.weights(self.fractions).T
@@ -229,12 +244,12 @@ class DelayFit:
         return gain_of(made, wanted)
 
     def _simple_weights(self, fractions: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """Return the weights, (tap, target), of the ways of interpolation that know no band."""
+        """Return the weights, (tap, target), of the interpolations that do not depend on the band."""
         if self._interpolation == "nearest":
             return np.ones((1, len(fractions)), dtype=np.complex128)
         nodes = np.arange(self.n_taps)
         shape = np.ones((self.n_taps, len(fractions)))
-        for tap in nodes:  # Lagrange's polynomials; 1 for a single tap, straight lines for two
+        for tap in nodes:  # Lagrange polynomials: constant for a single tap, linear for two.
             for other in nodes[nodes != tap]:
                 shape[tap] *= (fractions - other) / (tap - other)
         carrier = 2j * math.pi * self._spectrum.centre_hz * self._step_s

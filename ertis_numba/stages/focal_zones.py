@@ -1,4 +1,4 @@
-"""Range zones: spherical wavefronts by delays that hold for a stretch of ranges."""
+"""Focal zones: parts of the range axis that share one set of delays, for spherical wavefronts."""
 
 import itertools
 
@@ -8,28 +8,28 @@ from numpy.typing import NDArray
 __all__ = ["NEAREST_M", "squared_curvature", "zone_edges"]
 
 NEAREST_M = 1e-3
-"""What stands for range 0, where a wavefront has no curvature to speak of."""
+"""Distance in metres that replaces range 0, where the curvature of a wavefront is undefined."""
 
-_MIN_M = 1e-9  # a distance, so that it can be divided by
+_MIN_M = 1e-9  # Minimum distance; it prevents a division by zero.
 
 
 def zone_edges(range_m: NDArray[np.float64], count: int) -> list[tuple[int, int, float]]:
-    """Return zones over which the curvature changes by the same amount.
+    """Return focal zones that divide the curvature into equal steps.
 
-    The delay of a microphone at p differs from that of a plane wave by ``p²/2rc`` in the main, so it is steps of
-    1/r, not of r, that make every zone err alike. The delays of a zone are those of its middle curvature.
+    The delay of a microphone at p differs from that of a plane wave by about ``p²/2rc``. Equal steps of 1/r, not of r,
+    therefore give every zone the same error. The delays of a zone are those of its mean curvature.
 
     Parameters
     ----------
     range_m : (range,) float64
-        Ascending.
+        Ranges in metres, ascending.
     count : int
-        Steps of the curvature between the ends. Those that hold no range make no zone.
+        Number of steps of the curvature between the ends. Steps without a range yield no zone.
 
     Returns
     -------
     list of (first, stop, distance)
-        Ranges ``first … stop - 1`` of each zone and the distance in metres whose delays it has.
+        Ranges ``first … stop - 1`` of each zone, and the distance in metres for which its delays are computed.
     """
     bends = 1 / np.maximum(range_m, NEAREST_M)
     span = bends[0] - bends[-1]
@@ -43,7 +43,7 @@ def zone_edges(range_m: NDArray[np.float64], count: int) -> list[tuple[int, int,
 
 
 def squared_curvature(range_m: NDArray[np.float64], edges: list[tuple[int, int, float]]) -> float:
-    """Return by how much curvatures differ from those of their zones: the mean square over ranges, in 1/m²."""
+    """Return the mean squared deviation of the curvature from that of its focal zone, over all ranges, in 1/m²."""
     middle = np.concatenate(
         [np.full(stop - first, 1 / max(distance_m, NEAREST_M)) for first, stop, distance_m in edges]
     )

@@ -1,4 +1,4 @@
-"""From signals to analytic signals, compressed by the call's matched filter."""
+"""Matched filter: pulse compression of signals to analytic signals."""
 
 import math
 from collections.abc import Callable
@@ -15,31 +15,33 @@ from ertis_numba.waveform import filter_response, matched_filter_spectrum
 __all__ = ["Gain", "MatchedFilter"]
 
 Gain = Callable[[NDArray[np.float64]], NDArray[np.complex128]]
-"""Frequencies, (bin,), to gains, (mic, bin) or (1, bin)."""
+"""Function of frequencies in hertz, (bin,), that returns gains, (mic, bin) or (1, bin)."""
 
 
 class MatchedFilter:
-    """Signals to analytic signals, sampled at the output rate in several phases.
+    """Matched filter that returns analytic signals, sampled at the output rate in several phases.
 
-    A beam is wanted at the output ranges only, but with delays much finer than their spacing. So the
-    filtered spectrum is turned back once per phase: phase p holds the samples that lie ``p /
-    n_phases`` of a step after those of phase 0. The one-sided spectrum makes them analytic. The gain
-    of the decimation filter is divided out, since within the band it is known exactly. The gains that go with
-    the interpolation of delays and beams are taken along.
+    A beam is needed only at the output ranges, but its delays are much finer than their spacing. One inverse transform
+    per phase therefore computes the samples: those of phase p lie ``p / n_phases`` of a step after those of phase 0.
+    The one-sided spectrum makes the signals analytic. The filter also divides by the gain of the decimation filter,
+    which is known exactly within the band. It applies the gains of the delay and beam interpolation as well.
 
     Parameters
     ----------
-    settings, window, kernels, memory
+    settings : Settings
+    window : TimeWindow
+    kernels : KernelSet
+    memory : Memory
     taps : (tap,) int16 or int32
-        Of the decimation filter.
+        Integer taps of the decimation filter.
     n_mics : int
     gain : callable
-        Frequencies, (bin,) float64, to gains, (mic, bin) or (1, bin) complex128.
+        Function of frequencies in hertz, (bin,) float64, that returns gains, (mic, bin) or (1, bin) complex128.
 
     Attributes
     ----------
     shape : (mic, phase, sample)
-        Of the analytic signals.
+        Shape of the analytic signals.
     """
 
     def __init__(
@@ -62,7 +64,7 @@ class MatchedFilter:
         )
         phase_s = np.arange(n_phases)[:, None] / (n_phases * settings.output_rate_hz)
         lag_s = window.start_s - window.first_sample / rate_hz + phase_s
-        # Neither transform divides by its length; the forward one's is what the sum of the inverse one lacks.
+        # Neither transform divides by its length. This division by the forward length supplies the missing factor.
         shifted = flat / window.n_fft * np.exp(2j * math.pi * frequency_hz * lag_s)
         self._responses = memory.table((gain(frequency_hz)[:, None, :] * shifted).astype(np.complex64))
         self._first_bin = matched.first_bin
@@ -70,7 +72,7 @@ class MatchedFilter:
         self.shape = (n_mics, n_phases, window.n_outputs)
 
     def __call__(self, transforms: Transforms, out: NDArray[np.complex64], *, threads: int) -> None:
-        """Fill ``out``, (mic, phase, sample) complex64, by ``transforms``, which were made for it."""
+        """Fill ``out``, (mic, phase, sample) complex64, with ``transforms`` that were planned for this array."""
         spectra = transforms.forward(threads=threads)
         self._kernel(spectra, self._responses, self._first_bin, out)
         transforms.inverse(threads=threads)

@@ -1,4 +1,4 @@
-"""Memory that a pipeline needs, predicted before any is allocated."""
+"""Memory of a pipeline, predicted before any of it is allocated."""
 
 from pathlib import Path
 from typing import Final
@@ -15,28 +15,28 @@ _CGROUP_FILES: Final = (
     ("memory.max", "memory.current"),
     ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"),
 )
-"""Limit and use of a control group, of versions 2 and 1."""
+"""Files with the limit and the usage of a control group, for versions 2 and 1."""
 
-# Upper bounds of what was measured for 90 to 1,000,000 directions, 1 to 32 microphones and records of 2 ms to 9 s.
-_OF_DIRECTION: Final = 2500  # tables of beam-grid points that the planner compares
-_OF_DELAY: Final = 75  # a direction and a microphone: delays, offsets, weights, and copies while they are made
-_OF_SAMPLE: Final = 32  # a microphone and a sample of its transform: signal, spectrum, filter
-_OF_POINT: Final = 4  # of an image
+# Bytes: upper bounds of measurements with 90 to 1,000,000 directions, 1 to 32 microphones and records of 2 ms to 9 s.
+_OF_DIRECTION: Final = 2500  # Per direction: tables of the beam grids that the planner compares.
+_OF_DELAY: Final = 75  # Per direction and microphone: delays, offsets and weights, with temporary copies.
+_OF_SAMPLE: Final = 32  # Per microphone and sample of its transform: signal, spectrum and filter.
+_OF_POINT: Final = 4  # Per image point.
 
 
 def available_bytes(meminfo: Path = Path("/proc/meminfo"), cgroup: Path = _CGROUP) -> int:
-    """Return the memory that this process can still allocate, within the limit of its container; 0 if unknown.
+    """Return the memory in bytes that this process can still allocate within its container; 0 if unknown.
 
     Parameters
     ----------
     meminfo, cgroup : Path
-        Sources of the system's available memory and of the control group's limit.
+        File with the available memory of the system, and folder of the control group.
     """
     lines = _read(meminfo).splitlines()
     found = [1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")]
     for limit, used in _CGROUP_FILES:
         numbers = [_read(cgroup / name).strip() for name in (limit, used)]
-        if all(number.isdigit() for number in numbers):  # "max" is no limit
+        if all(number.isdigit() for number in numbers):  # The text "max" stands for no limit.
             found.append(max(0, int(numbers[0]) - int(numbers[1])))
     return min(found, default=0)
 
@@ -49,7 +49,9 @@ def _read(path: Path) -> str:
 
 
 def predicted_bytes(settings: Settings) -> int:
-    """Return the memory for planning and processing, except libraries and the tables of an unusually exact plan.
+    """Return the predicted memory for planning and processing, in bytes.
+
+    It does not include libraries and the tables of an unusually accurate plan.
 
     Raises
     ------
@@ -65,17 +67,17 @@ def predicted_bytes(settings: Settings) -> int:
 
 
 def require_memory(settings: Settings, max_bytes: int) -> int:
-    """Return the memory that remains for the tables of a plan; refuse settings whose pipeline would need too much.
+    """Check the memory of a pipeline against a limit, and return the bytes that remain for the tables of a plan.
 
     Raises
     ------
     ArgumentError
-        The pipeline would need more than ``max_bytes``.
+        The pipeline needs more than ``max_bytes``.
     """
     n_bytes = predicted_bytes(settings)
     if n_bytes > max_bytes:
         raise ArgumentError(
             f"a pipeline for these settings needs about {n_bytes / 1e6:.0f} MB; the limit is {max_bytes / 1e6:.0f} MB. "
-            "Give fewer directions, a shorter processing.range_m, a shorter call or a lower rate"
+            "Give fewer directions, a shorter processing.range_m, a shorter call or a lower sample rate"
         )
     return max_bytes - n_bytes

@@ -1,9 +1,9 @@
-"""The algorithm of the 2019 paper, in plain NumPy and SciPy on one thread.
+"""Algorithm of the 2019 paper, in plain NumPy and SciPy on one thread.
 
-Jansen, Laurijssen, Kerstens, Daems and Steckel describe it as: Butterworth demodulation, band pass, matched
-filter, delay-and-sum with delays of whole samples at the full signal rate, rectification, low pass,
-subsampling. It is kept to compare with, in image and in speed, so it is written as a careful user of
-NumPy would write it: float32 throughout, one call per filter, slices added in place.
+Jansen, Laurijssen, Kerstens, Daems and Steckel describe these steps: Butterworth demodulation, band-pass filter,
+matched filter, delay-and-sum with integer sample delays at the full signal rate, rectification, low-pass filter and
+subsampling. The algorithm is a reference for images and for speed. It is written as a careful user of NumPy would
+write it: float32 throughout, one call per filter, slices added in place.
 """
 
 import math
@@ -23,25 +23,31 @@ from ertis_numba.waveform import call_at
 
 __all__ = ["PaperChain"]
 
-_ORDER = 6  # of all Butterworth filters; the authors' MATLAB notes name it for the first
-_CUTOFF = 2 / 9  # of the signal rate: the authors' 100 kHz at 450 kHz
-_RINGING = 24.0  # in 1 / bandwidth or 1 / lowest frequency: by then the band pass is 100 dB down
-_DIRECTIONS = 16  # beamed and filtered at a time, so that they stay in the caches
+_ORDER = 6  # Order of all Butterworth filters. The authors' MATLAB notes state it for the first filter.
+_CUTOFF = 2 / 9  # Cutoff relative to the signal rate: the authors use 100 kHz at 450 kHz.
+_RINGING = 24.0  # Duration after which the band-pass filter is 100 dB down, in 1 / bandwidth or 1 / lowest frequency.
+_DIRECTIONS = 16  # Number of directions in a block, which stays in the caches.
 
 
 class PaperChain:
-    """Words to image by the paper's algorithm, with tables made once.
+    """Signal chain of the paper, with tables computed once; implements `Chain`.
+
+    Parameters
+    ----------
+    settings : Settings
 
     Attributes
     ----------
     grid : Grid
+        Directions of the image.
     range_m : (range,) float64
-        ``c n / (2 · signal rate)`` for every ``output_decimation``-th sample n within the range window.
+        Range axis in metres: ``c n / (2 · signal rate)`` for every ``output_decimation``-th sample n within the range
+        window.
 
     Raises
     ------
     ArgumentError
-        The range window reaches past the record or holds no sample.
+        The range window extends beyond the record or contains no sample.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -65,14 +71,13 @@ class PaperChain:
         self._make_matched_filter(settings, lead, weights)
 
     def _make_matched_filter(self, settings: Settings, lead: int, weights: NDArray[np.float64]) -> None:
-        """Make the spectrum that correlates with the call and delays by ``lead``.
+        """Compute the spectrum that correlates with the call and delays by ``lead`` samples.
 
-        The call goes through the same recursive filters as the signals. So their phase, and with it
-        their group delay at every frequency, drops out of the correlation, and an echo comes to lie
-        at its arrival.
+        The call passes through the same recursive filters as the signals. Their phase, and therefore their group delay,
+        cancels in the correlation, so an echo appears at its time of arrival.
         """
         call = _filtered_call(settings, self._demodulate)
-        # As long as all that is read, the call and the leads: nothing wraps around into it.
+        # The transform holds all samples that are read, the call and the leads, so nothing wraps around.
         n_needed = self._n_samples + self._low_pass.delay + len(call) + 2 * lead
         self._n_fft: int = scipy.fft.next_fast_len(n_needed, real=True)
         spectrum = scipy.fft.rfft(call, self._n_fft)
@@ -84,28 +89,28 @@ class PaperChain:
     def process_batch(
         self, words: Iterable[NDArray[np.unsignedinteger[Any]]], outs: Iterable[NDArray[np.float32]]
     ) -> None:
-        """Do as `process` for several measurements, one after the other."""
+        """Compute the images of several measurements, one after the other."""
         for each, out in zip(words, outs, strict=True):
             self.process(each, out)
 
     def warm_up(self, words: NDArray[np.unsignedinteger[Any]]) -> None:
-        """See `Chain.warm_up`; there is nothing to compile."""
+        """Do nothing, since this chain has no kernels to compile."""
 
     def new_image(self) -> NDArray[np.float32]:
-        """Return an array for an image, (direction, range), that holds anything."""
+        """Return an uninitialised array for an image: (direction, range) float32."""
         return np.empty((len(self.grid), len(self.range_m)), dtype=np.float32)
 
     def close(self) -> None:
-        """See `Chain.close`; there is nothing to give back."""
+        """Do nothing, since this chain holds no memory on a device."""
 
     def process(
         self,
         words: NDArray[np.unsignedinteger[Any]],
         out: NDArray[np.float32],
         *,
-        threads: int | None = None,  # noqa: ARG002  its own is the only one
+        threads: int | None = None,  # noqa: ARG002  This chain has one thread.
     ) -> None:
-        """See `Chain.process`."""
+        """Compute the image of one measurement on one thread; parameters as for `Chain.process`."""
         unpacked = _unpacked(words, self._channels) if self._is_pdm else _halved(words, self._channels, self._scale)
         signals = self._demodulate(unpacked)
         spectra = scipy.fft.rfft(signals, self._n_fft)
@@ -121,7 +126,7 @@ class PaperChain:
 
 
 def _delay_and_sum(rows: list[NDArray[np.float32]], starts: list[int], out: NDArray[np.float32]) -> None:
-    """Fill ``out``, (sample,) float32, with the sum of each row from its start on."""
+    """Fill ``out``, (sample,) float32, with the sum of all rows, each from its own start."""
     n = len(out)
     out[:] = rows[0][starts[0] : starts[0] + n]
     for row, start in zip(rows[1:], starts[1:], strict=True):
@@ -129,7 +134,7 @@ def _delay_and_sum(rows: list[NDArray[np.float32]], starts: list[int], out: NDAr
 
 
 def _range_axis(settings: Settings, n_samples: int) -> tuple[NDArray[np.float64], slice]:
-    """Return the range axis and which of the record's outputs it holds."""
+    """Return the range axis, and the slice of the outputs of the record that it covers."""
     first_m, last_m = settings.processing.range_m
     step_m = sound_speed_m_s(settings.air) / (2 * settings.output_rate_hz)
     n_outputs = -(-n_samples // settings.output_decimation)
@@ -138,19 +143,20 @@ def _range_axis(settings: Settings, n_samples: int) -> tuple[NDArray[np.float64]
     if stop > n_outputs:
         raise ArgumentError(
             f"processing.range_m ends at {last_m:g} m, but the record of {settings.recording.duration_s * 1e3:.4g} ms "
-            f"reaches {step_m * (n_outputs - 1):.4g} m; give a smaller range"
+            f"covers {step_m * (n_outputs - 1):.4g} m. Shorten processing.range_m or use a longer preset"
         )
     if first >= stop:
         raise ArgumentError(
-            f"processing.range_m {first_m:g} to {last_m:g} m holds no multiple of {step_m:.4g} m; give a longer range"
+            f"processing.range_m, {first_m:g} to {last_m:g} m, contains no multiple of the range step, {step_m:.4g} m. "
+            "Extend processing.range_m"
         )
     return np.arange(first, stop, dtype=np.float64) * step_m, slice(first, stop)
 
 
 def _unpacked(words: NDArray[np.unsignedinteger[Any]], channels: list[int]) -> NDArray[np.float32]:
-    """Return the bits as (mic, sample) float32 of ±½; the matched filter's gain knows of the half.
+    """Return the bits as ±½: (mic, sample) float32. The gain of the matched filter compensates the factor ½.
 
-    Shifts of whole rows of bytes: 1.5 ms where `numpy.unpackbits` and a transposition take 3.6.
+    Shifts of whole rows of bytes take 1.5 ms; `numpy.unpackbits` and a transposition take 3.6 ms.
     """
     octets = np.ascontiguousarray(words.view(np.uint8).reshape(len(words), -1).T)
     signals = np.empty((len(channels), len(words)), dtype=np.float32)
@@ -160,15 +166,15 @@ def _unpacked(words: NDArray[np.unsignedinteger[Any]], channels: list[int]) -> N
 
 
 def _halved(words: NDArray[Any], channels: list[int], scale: np.float32) -> NDArray[np.float32]:
-    """Return PCM as (mic, sample) float32 whose full scale is ±½, as that of bits."""
+    """Return PCM samples with a full scale of ±½, like that of bits: (mic, sample) float32."""
     return np.ascontiguousarray(words[:, channels].T) * scale
 
 
 class _Demodulate:
-    """Low pass at the PDM rate, every ``decimation``-th sample, band pass at the signal rate.
+    """Low-pass filter at the PDM rate, decimation, and band-pass filter at the signal rate.
 
-    Both filters are second-order sections, for which float32 suffices: the image differs by -111 dB from
-    that of float64 and takes 20 % less time. In the form of one polynomial they would be unstable.
+    Both filters are cascades of second-order sections, for which float32 suffices: the image differs by -111 dB from
+    that of float64 and takes 20 % less time. A transfer function of one polynomial would be unstable.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -181,14 +187,14 @@ class _Demodulate:
         self._decimation = settings.decimation
 
     def __call__(self, signals: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Return (…, sample) at the signal rate, in the precision of ``signals``."""
+        """Return the filtered signals at the signal rate, (…, sample), in the precision of ``signals``."""
         low_pass, band_pass = self._low_pass.astype(signals.dtype), self._band_pass.astype(signals.dtype)
         slow = scipy.signal.sosfilt(low_pass, signals)[..., :: self._decimation]
         return np.asarray(scipy.signal.sosfilt(band_pass, slow))
 
 
 def _filtered_call(settings: Settings, demodulate: _Demodulate) -> NDArray[np.float64]:
-    """Return what a microphone of amplitude ±½ makes of the call: (sample,) float64 at the signal rate."""
+    """Return the filtered call as recorded by a microphone of amplitude ±½: (sample,) float64 at the signal rate."""
     call, rate_hz = settings.call, settings.recording.sample_rate_hz
     narrowest_hz = min(call.high_frequency_hz - call.low_frequency_hz, call.low_frequency_hz)
     length_s = call.duration_s + _RINGING / narrowest_hz
@@ -197,16 +203,16 @@ def _filtered_call(settings: Settings, demodulate: _Demodulate) -> NDArray[np.fl
 
 
 class _LowPass:
-    """The low pass of rectified beams, every ``output_decimation``-th sample of it.
+    """Low-pass filter of rectified beams, decimated by ``output_decimation``.
 
-    The paper names neither order nor bandwidth. This is a Butterworth filter of the order of the others,
-    at half of the output rate, or at the call's lowest frequency where that is lower: so the ripple at
-    twice the carrier goes and as much of the range resolution stays as the output can hold.
+    The paper states neither order nor bandwidth. This is a Butterworth filter of the same order as the others. Its
+    cutoff is half the output rate, or the call's lowest frequency if that is lower. It removes the ripple at twice the
+    carrier and keeps the range resolution that the output rate allows.
 
     Attributes
     ----------
     delay : int
-        Its group delay in samples, which is taken out.
+        Group delay in samples, which is compensated.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -218,11 +224,11 @@ class _LowPass:
         self._factor = settings.output_decimation
 
     def __call__(self, rectified: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return envelopes, (direction, output) float32, of beams that are ``delay`` samples longer."""
+        """Return the envelopes, (direction, output) float32, of beams that extend ``delay`` samples further."""
         filtered = scipy.signal.sosfilt(self._sections.astype(np.float32), rectified)
         return np.asarray(filtered[:, self.delay :: self._factor], dtype=np.float32)
 
     def at_peak(self, pulse: NDArray[np.float64]) -> float:
-        """Return the envelope at the peak of a pulse, not rectified, that is centred at sample 0 of a circle."""
+        """Return the envelope at the peak of a pulse that is not rectified and centred at sample 0, cyclically."""
         centred = np.abs(np.roll(pulse, len(pulse) // 2))
         return float(scipy.signal.sosfilt(self._sections, centred)[len(pulse) // 2 + self.delay])

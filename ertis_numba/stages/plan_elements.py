@@ -16,13 +16,13 @@ from ertis_numba.waveform import decimation_taps, integer_taps, matched_band_hz,
 
 __all__ = ["ahead_of", "chain_taps", "delay_fit", "nodes_of", "ringing_db", "spectrum_of", "zones_of"]
 
-_PCM_RANGE_DB = 125.0  # dynamic range within which sound outside the window does not harm an image of PCM
-_MAX_RINGING_DB = 160.0  # single precision rounds off more than lies below
-_SHORT_TAPS_DB = 65.0  # a deeper stop band is lost by rounding taps to 16 bits
+_PCM_RANGE_DB = 125.0  # Dynamic range within which sound outside the window does not affect an image of PCM.
+_MAX_RINGING_DB = 160.0  # Below this level, rounding of single precision exceeds the ringing.
+_SHORT_TAPS_DB = 65.0  # Rounding taps to 16 bits limits the stopband attenuation to this value.
 
 
 def spectrum_of(settings: Settings) -> Spectrum:
-    """Return where the matched filter has its power, as if its input were white."""
+    """Return the power spectrum of the matched filter's output for white input."""
     step, edges_hz = settings.decimation, settings.processing.band_edges_hz
     processing = Processing(range_decimation=step, decimation=step, band_edges_hz=edges_hz)
     recording = Recording(sample_rate_hz=settings.recording.sample_rate_hz)
@@ -31,12 +31,12 @@ def spectrum_of(settings: Settings) -> Spectrum:
 
 @functools.lru_cache(maxsize=8)
 def _spectrum_of(settings: Settings) -> Spectrum:
-    """Return the same object for the same call and rates, so that fits to the spectrum can be cached, too."""
+    """Return the spectrum, as the same object for the same call and rates, so fits to it can be cached as well."""
     return Spectrum(*matched_noise_spectrum(settings, n_waves=WAVES))
 
 
 def nodes_of(settings: Settings, aperture: Aperture, spectrum: Spectrum) -> BeamNodes | None:
-    """Return the beam-grid points of a complete plan; None if every direction has its own beam."""
+    """Return the beam grid of a complete plan; None if every direction has its own beam."""
     plan = settings.accuracy
     if not plan.beam_taps or aperture.n_axes not in {1, 2}:
         return None
@@ -51,14 +51,14 @@ def nodes_of(settings: Settings, aperture: Aperture, spectrum: Spectrum) -> Beam
 
 
 def delay_fit(settings: Settings, spectrum: Spectrum) -> tuple[DelayFit, float]:
-    """Return the fractional-delay filters of a complete plan, and the time between the samples that they take."""
+    """Return the fractional-delay filters of a complete plan, and the time between their input samples in seconds."""
     plan = settings.accuracy
     step_s = 1 / (settings.output_rate_hz * (plan.oversampling or 1))
     return DelayFit(plan.interpolation, plan.delay_taps, step_s, spectrum), step_s
 
 
 def chain_taps(settings: Settings) -> NDArray[np.int16] | NDArray[np.int32]:
-    """Return the decimation filter of a complete plan; PCM that is not decimated needs none."""
+    """Return the integer taps of the decimation filter of a complete plan; a single tap for PCM without decimation."""
     if settings.decimation == 1 and not settings.recording.is_pdm:
         return integer_taps(np.ones(1))
     stopband_attenuation_db = settings.accuracy.stopband_attenuation_db or 60.0
@@ -74,8 +74,9 @@ def chain_taps(settings: Settings) -> NDArray[np.int16] | NDArray[np.int32]:
 def ringing_db(settings: Settings) -> float:
     """Return the level below its peak at which the ringing of the matched filter may be cut off.
 
-    The noise of PDM bits hides ringing below the stop band. PCM has no such noise. Sound outside the window may exceed
-    the image by the whole dynamic range, and ringing that is cut off or wraps around must stay below the error budget.
+    The noise of PDM bits masks ringing below the stopband. PCM has no such noise. Sound outside the window may exceed
+    the image by the whole dynamic range. Ringing that is cut off or wraps around must still stay below the error
+    budget.
     """
     if not settings.recording.is_pdm:
         return min(_MAX_RINGING_DB, _PCM_RANGE_DB - settings.accuracy.max_error_db)
@@ -85,9 +86,9 @@ def ringing_db(settings: Settings) -> float:
 def ahead_of(fit: DelayFit, weights: NDArray[np.float64], step_s: float) -> NDArray[np.float64]:
     """Return each microphone's fractional-delay offset in seconds, positive if earlier: (mic,) float64, or (1,) zeros.
 
-    Without offsets, microphones with equal delays, as straight ahead, would have equal interpolation errors. Multiples
-    of the golden ratio spread the offsets of any few consecutive microphones evenly, in the order of falling array
-    weights, so that those of a few dominant microphones are spread evenly, too.
+    Without offsets, microphones with equal delays, such as those of the direction straight ahead, would have equal
+    interpolation errors. Multiples of the golden ratio spread the offsets of any few consecutive microphones evenly.
+    The order is that of descending array weights, so the offsets of a few dominant microphones are spread evenly, too.
     """
     if not fit.is_fitted:
         return np.zeros(1)
@@ -97,7 +98,7 @@ def ahead_of(fit: DelayFit, weights: NDArray[np.float64], step_s: float) -> NDAr
 
 
 def zones_of(settings: Settings) -> list[tuple[int, int, float]]:
-    """Return first range, the one after the last, and the distance whose delays hold, of each zone of a plan."""
+    """Return the focal zones of a plan: first range, range after the last, and distance in metres of the delays."""
     range_m = time_window(settings, largest_delay_s=0.0, n_taps=1).range_m
     if settings.processing.wavefront == "plane":
         return [(0, len(range_m), math.inf)]

@@ -1,4 +1,4 @@
-"""Complete plans: their predicted errors, their work and their memory."""
+"""Predicted error, work and memory of complete plans."""
 
 import functools
 import math
@@ -26,14 +26,14 @@ __all__ = ["COARSEST_STOP_BAND_DB", "TABLE_BYTES", "Delays", "ImagePlan", "Nodes
 
 COARSEST_STOP_BAND_DB = 40.0
 TABLE_BYTES = 44
-"""Bytes of a delay and a weight, both as computed and as passed to kernels."""
+"""Bytes of a delay and a weight, including both the computed form and the form that kernels read."""
 
-_MANY_FRACTIONS = 16  # delays, in steps of samples times microphones, that reach every fraction of a step
-_MAX_FITS = 288  # four times the number of fits in one search
+_MANY_FRACTIONS = 16  # Microphones times delay range in steps, above which the delays spread evenly over a step.
+_MAX_FITS = 288  # Four times the number of fits in one search.
 
 
 class ImagePlan(NamedTuple):
-    """A complete plan."""
+    """Complete plan: a value for every accuracy setting."""
 
     precision: str
     n_phases: int
@@ -71,10 +71,10 @@ class PlanModel:
     Parameters
     ----------
     settings : Settings
-    signal_model : Texture, optional
-        See `ErrorModel`.
+    signal_model : SignalModel or None
+        Measured signal model; None for safe values, as in `ErrorModel`.
     tile_ranges : int
-        Ranges in a tile of 16-bit numbers.
+        Number of ranges in a tile of 16-bit samples.
 
     Attributes
     ----------
@@ -84,7 +84,7 @@ class PlanModel:
     window : TimeWindow
     n_mics, n_directions : int
     delays, nodes, filter : callable
-        Cached properties of a choice of delayed samples, of beam-grid points and of a stop band.
+        Cached predictions for a delay interpolation, a beam grid and a stopband attenuation.
     """
 
     def __init__(self, settings: Settings, signal_model: SignalModel | None, *, tile_ranges: int) -> None:
@@ -98,7 +98,7 @@ class PlanModel:
         self.aperture = Aperture.of(layout.enabled_positions_m, unit_vectors(grid.azimuth_rad, grid.elevation_rad))
         self._weights = array_weights(settings)
         amplitudes = self._weights / layout.gain[layout.enabled]
-        self._spread = float(np.max(amplitudes**2) / np.mean(amplitudes**2))  # scales suit the largest
+        self._spread = float(np.max(amplitudes**2) / np.mean(amplitudes**2))  # The largest amplitude sets the scale.
         self._n_effective = effective_count(self._weights)
         self.n_directions = len(grid)
         self._speed_m_s = sound_speed_m_s(settings.air)
@@ -120,7 +120,8 @@ class PlanModel:
         parts["arithmetic"] = self.errors.arithmetic()
         if nodes is not None:
             parts["beams"] = nodes.error
-            parts["delays"] *= max(1.0, nodes.squares)  # weights that nearly cancel add up what their nodes err by
+            # Large weights that nearly cancel each other add up the errors of their beam-grid points.
+            parts["delays"] *= max(1.0, nodes.squares)
         if self.settings.processing.wavefront == "spherical":
             parts["zones"] = self.zone_error(plan.focal_zones)
         if plan.precision == "int16":
@@ -152,14 +153,14 @@ class PlanModel:
         )
 
     def n_bytes(self, plan: ImagePlan) -> int:
-        """Return the memory of a plan's signals and delays."""
+        """Return the memory of a plan's signals and delays, in bytes."""
         nodes = self.nodes(plan.beam_taps, plan.density) if plan.beam_taps else None
         n_beams = self.n_directions if nodes is None else nodes.count
         table = TABLE_BYTES * n_beams * self.n_mics * plan.delay_taps * len(self._zones(plan.focal_zones))
         return table + 16 * self.n_mics * plan.n_phases * self.window.n_outputs
 
     def zone_error(self, count: int) -> float:
-        """Return the error power of a number of focal zones."""
+        """Return the error power of a given number of focal zones."""
         curvature_2 = squared_curvature(self.window.range_m, self._zones(count))
         return self._zone_scale * curvature_2
 
@@ -255,13 +256,13 @@ class PlanModel:
 
 @functools.lru_cache(maxsize=_MAX_FITS)
 def _fitted(spectrum: Spectrum, interpolation: str, n_taps: int, step_s: float) -> tuple[DelayFit, NDArray[np.float64]]:
-    """Return a fit and the magnitudes of its weights; kept, as most of a planner's time would go into them."""
+    """Return a fit and the magnitudes of its weights, cached because fits would dominate the time of a planner."""
     fit = DelayFit(interpolation, n_taps, step_s, spectrum)
     return fit, np.abs(fit.weights(fit.fractions))
 
 
 def plan_of(accuracy: Accuracy) -> ImagePlan:
-    """Return a complete plan."""
+    """Return accuracy settings as a plan; missing values get their defaults."""
     return ImagePlan(
         accuracy.precision,
         accuracy.oversampling or 1,

@@ -1,4 +1,4 @@
-"""Beam pattern errors of a plan: deviations of its beams from exact ones, for each microphone."""
+"""Beam errors of a plan: deviations of its beams from exact beams, for each microphone."""
 
 import functools
 import math
@@ -16,19 +16,20 @@ from ertis_numba.stages.plan_elements import ahead_of, delay_fit, nodes_of, spec
 
 __all__ = ["Deviation", "deviation_of"]
 
-_WAVES = 9  # scale on which errors of a plan are smooth
+_WAVES = 9  # Number of frequencies; the errors of a plan are smooth between them.
 
 
 class Deviation(NamedTuple):
-    """Relative error of each beam at each microphone, as a straight line over frequency.
+    """Relative error of each beam at each microphone, as a linear function of frequency.
 
     Attributes
     ----------
     centre_hz : float
+        Centre frequency.
     mean : (direction, mic) complex64
-        Error at the centre.
+        Error at the centre frequency.
     slope_s : (direction, mic) complex64
-        Its change per hertz.
+        Change of the error per hertz.
     """
 
     centre_hz: float
@@ -41,10 +42,10 @@ class Deviation(NamedTuple):
 
 
 def deviation_of(settings: Settings, directions: NDArray[np.float64]) -> Deviation | None:
-    """Return the deviation of a complete plan of the fast method; None if the plan's beams are exact or unknown.
+    """Return the deviation of a complete plan of the fast method; None if the deviation is zero or unknown.
 
-    It covers interpolation between beam-grid points and between stored samples. The latter depends on the range if
-    wavefronts are spherical, and is then left out.
+    It includes interpolation between beam-grid points and between stored samples. With spherical wavefronts, the latter
+    depends on the range and is not included.
 
     Parameters
     ----------

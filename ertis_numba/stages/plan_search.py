@@ -13,21 +13,21 @@ _PHASES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
 _DELAY_TAPS = (1, 2, 3, 4, 5, 6)
 _DENSITIES = {2: (1.5, 2.0, 2.5, 3.0, 4.0), 4: (1.25, 1.5, 1.75, 2.0, 2.5, 3.0), 6: (1.75, 2.0, 2.5, 3.0)}
 _STOP_BANDS_DB = (COARSEST_STOP_BAND_DB, 60.0, 80.0, 100.0, 120.0, 140.0)
-_STOP_BANDS = 3  # number of candidates; more attenuation brings no benefit
-_NEEDLESS = 0.02  # share of the budget below which a part is as good as nothing
-_SMALL = 0.1  # share of the budget for parts that cost little to keep small
+_STOP_BANDS = 3  # Number of candidates; more attenuation brings no benefit.
+_NEEDLESS = 0.02  # Share of the budget below which the error of a step is negligible.
+_SMALL = 0.1  # Share of the budget for steps whose error costs little to reduce.
 
 
 def open_plans(model: PlanModel, budget: float, *, has_int16: bool) -> list[ImagePlan]:
-    """Return the plans that the settings permit, except needlessly exact ones.
+    """Return the plans that the settings permit, except needlessly accurate ones.
 
     Parameters
     ----------
     model : PlanModel
     budget : float
-        Largest error power of a plan.
+        Largest error power of a plan, relative to the exact image.
     has_int16 : bool
-        The device has a dot product of 16-bit numbers.
+        True if the device has a 16-bit dot product.
     """
     given = model.settings.accuracy
     adaptive = model.settings.processing.beamformer != "delay_and_sum"
@@ -56,7 +56,7 @@ def open_plans(model: PlanModel, budget: float, *, has_int16: bool) -> list[Imag
 
 
 def _open_delays(model: PlanModel, budget: float, *, adaptive: bool) -> list[tuple[int, int]]:
-    """Return which samples and taps are worth a try: those that keep the budget and are not needlessly exact."""
+    """Return the candidates for phases and delay taps that meet the budget and are not needlessly accurate."""
     given = model.settings.accuracy
     phases = _PHASES if given.oversampling is None else (given.oversampling,)
     taps = _DELAY_TAPS if given.delay_taps is None else (given.delay_taps,)
@@ -74,7 +74,7 @@ def _open_delays(model: PlanModel, budget: float, *, adaptive: bool) -> list[tup
 
 
 def _open_nodes(model: PlanModel, budget: float, *, adaptive: bool) -> list[tuple[int, float]]:
-    """Return which nodes are worth a try, and that every direction's own beam is."""
+    """Return the candidates for beam taps and density of the beam grid; 0 taps stand for one beam per direction."""
     given = model.settings.accuracy
     flat = model.aperture.n_axes in {1, 2} and len(model.window.range_m) >= FEWEST_RANGES
     if adaptive or given.beam_taps == 0 or not (flat or given.beam_taps):
@@ -82,7 +82,7 @@ def _open_nodes(model: PlanModel, budget: float, *, adaptive: bool) -> list[tupl
     found: list[tuple[int, float]] = [] if given.beam_taps else [(0, given.beam_density or 2.0)]
     for beam_taps in [given.beam_taps] if given.beam_taps else _DENSITIES:
         densities = _DENSITIES[beam_taps] if given.beam_density is None else (given.beam_density,)
-        for density in densities:  # from the coarsest, which is the cheapest, to those that are needlessly exact
+        for density in densities:  # The coarsest grid is the cheapest. The loop ends at needlessly accurate ones.
             if not given.beam_taps and model.count_nodes(beam_taps, density) >= model.n_directions:
                 break
             error = model.nodes(beam_taps, density).error
@@ -94,7 +94,7 @@ def _open_nodes(model: PlanModel, budget: float, *, adaptive: bool) -> list[tupl
 
 
 def _stop_bands_db(model: PlanModel, budget: float) -> list[float]:
-    """Return the stop bands that leave some of the budget to other parts, the best one where none does."""
+    """Return the stopband attenuations whose error is below the budget, or the best one if there are none."""
     if model.settings.accuracy.stopband_attenuation_db is not None:
         return [model.settings.accuracy.stopband_attenuation_db]
     errors = {
@@ -105,7 +105,7 @@ def _stop_bands_db(model: PlanModel, budget: float) -> list[float]:
 
 
 def _zone_count(model: PlanModel, budget: float) -> int:
-    """Return as many zones as keep their part small; it falls with the square of their number."""
+    """Return the number of focal zones that keeps their error small; the error falls with the square of the number."""
     if model.settings.accuracy.focal_zones is not None:
         return model.settings.accuracy.focal_zones
     if model.settings.processing.wavefront == "plane":

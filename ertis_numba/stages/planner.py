@@ -121,7 +121,7 @@ class Planner:
     def _rated(
         self, plans: Sequence[ImagePlan], sizes: Sequence[int], smallest: int, largest: int
     ) -> list[tuple[ImagePlan, dict[str, float]]]:
-        """Return plans that need ``smallest`` to ``largest`` bytes, with the parts of their errors."""
+        """Return plans that need ``smallest`` to ``largest`` bytes, with the error power of each step."""
         return [
             (plan, self._plans.parts(plan))
             for plan, size in zip(plans, sizes, strict=True)
@@ -157,8 +157,8 @@ class Planner:
             has = "this machine has available" if measured else "the limit is"
             raise ArgumentError(
                 f"no plan fits into memory: the smallest needs {min(sizes) / 1e6:.0f} MB, {has} {limit / 1e6:.0f} MB. "
-                "Give a later or shorter processing.range_m, fewer directions or "
-                "microphones, or less of accuracy.oversampling or accuracy.focal_zones"
+                "Shorten processing.range_m or start it at a larger range, give fewer directions or microphones, or "
+                "give a lower accuracy.oversampling or accuracy.focal_zones"
             )
         if within:
             # By the costs of all threads whatever their number now, so that it does not decide about the plan.
@@ -187,13 +187,13 @@ class Planner:
             return self._plans.parts(plan_of(accuracy))
 
     def error_db(self, accuracy: Accuracy) -> float:
-        """Return the predicted error of the image for a complete plan."""
+        """Return the predicted image error of a complete plan, in decibels."""
         return decibels(sum(self._image_parts(accuracy).values()))
 
     def keeps_budget_of_images(self, accuracy: Accuracy) -> bool:
-        """Return False if a complete plan of an adaptive beamformer keeps the budget for delay-and-sum beams only.
+        """Return False if a complete plan of an adaptive beamformer meets the budget for delay-and-sum beams only.
 
-        The answer holds for any sound: it depends neither on the texture nor on the sensitivity of this planner.
+        The answer holds for any sound: it depends neither on the signal model nor on the sensitivity of this planner.
         """
         if self.settings.processing.beamformer == "delay_and_sum":
             return True

@@ -1,4 +1,4 @@
-"""Sensitivity of beamformers: the error of an image relative to that of delay-and-sum beams of the same signals."""
+"""Sensitivity of beamformers: error of their images relative to the error of delay-and-sum beams."""
 
 import math
 from dataclasses import dataclass
@@ -14,13 +14,15 @@ _CAPON = 10.0
 
 @dataclass(frozen=True, slots=True)
 class Sensitivity:
-    """Output error power as a function of the error power of the beams, ``linear · p + (quadratic · p)²``.
+    """Error power of the image as a function of the error power p of the beams: ``linear · p + (quadratic · p)²``.
 
     Attributes
     ----------
     linear : float
+        1 by default, as for delay-and-sum.
     quadratic : float
-        Coefficient of Capon's cancellation of an echo with delay errors; it grows as diagonal loading falls.
+        Coefficient for the cancellation of an echo with delay errors by Capon; it increases as diagonal loading
+        decreases. 0 by default.
     """
 
     linear: float = 1.0
@@ -28,11 +30,12 @@ class Sensitivity:
 
     @classmethod
     def of(cls, processing: Processing, n_mics: int) -> Self:
-        """Return a safe estimate for any sound, from perturbed weights in noise and in scenes of one and of 12 echoes.
+        """Return a safe estimate for any sound.
 
-        DMAS of order n multiplies n signals, so the power of their errors adds up. The coherence factor raises the
-        amplitude to the third power where microphones agree. Capon cancels an echo whose delays err, in proportion to
-        the ratio of the number of microphones to diagonal loading.
+        The estimate results from perturbed weights in noise and in scenes of one echo and of 12 echoes. DMAS of order n
+        multiplies n signals, so the powers of their errors add up. The coherence factor raises the amplitude to the
+        third power where microphones agree. Capon cancels an echo with delay errors, in proportion to the number of
+        microphones divided by the diagonal loading.
         """
         match processing.beamformer:
             case "coherence_factor":

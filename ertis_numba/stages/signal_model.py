@@ -1,4 +1,4 @@
-"""What is heard, in the few numbers that an image's error depends on."""
+"""Signal model of a measurement: the signal statistics that determine the error of an image."""
 
 import math
 from typing import Any
@@ -23,12 +23,12 @@ __all__ = ["ROUGH_DELAY_TAPS", "ROUGH_ZONES", "signal_model_of"]
 ROUGH_DELAY_TAPS = 2
 ROUGH_ZONES = 8
 
-_FEW_DIRECTIONS = "2d:19"  # where no image is made
-_TILE = 96  # ranges
-_MAX_BINS = 2**18  # of an image, of which quantiles are taken
-_MAX_MICS = 8  # whose noise is looked at
+_FEW_DIRECTIONS = "2d:19"  # Directions of the chain if it computes no image.
+_TILE = 96  # Number of ranges.
+_MAX_BINS = 2**18  # Number of image bins from which quantiles are computed.
+_MAX_MICS = 8  # Number of microphones whose noise is measured.
 _SEGMENT = 4096
-_TAPERED = 0.5  # of the ranges, at each end
+_TAPERED = 0.5  # Tapered share of the ranges at each end.
 _QUANTILES = (np.arange(16) + 0.5) / 16
 
 
@@ -40,16 +40,23 @@ def signal_model_of(
     threads: int = 1,
     amplitude: NDArray[np.float32] | None = None,
 ) -> SignalModel:
-    """Return the texture of a measurement that is to be imaged by ``settings``.
+    """Return the signal model of a measurement for an image with given settings.
 
     Parameters
     ----------
     measurement : Measurement
     settings : Settings
+        Settings of the image.
     kernels : KernelSet
     threads : int
+        Number of threads; 1 by default.
     amplitude : (direction, range) float32, optional
-        Delay-and-sum image of the measurement, if there is one already; by default, a rough one is made.
+        Delay-and-sum image of the measurement, if one exists; by default, a rough image is computed.
+
+    Raises
+    ------
+    DataError
+        The samples do not match the settings.
     """
     low_hz, high_hz = matched_band_hz(settings)
     processing = settings.processing.replace(beamformer="delay_and_sum")
@@ -70,7 +77,7 @@ def signal_model_of(
     )
     chain = FastChain(rough, kernels, threads=threads)
     form = sample_format(settings)
-    words, exponent = form.normalised(form.validated(measurement.data))  # all that is measured here is relative
+    words, exponent = form.normalised(form.validated(measurement.data))  # All statistics are relative to the level.
     try:
         heard, lead = chain.analytic(words)
         if amplitude is None:
@@ -84,11 +91,11 @@ def signal_model_of(
     n_mics, n_phases, _ = analytic.shape
     gain = microphones(settings.array).gain[microphones(settings.array).enabled, None]
     series = np.moveaxis(analytic, 1, 2)[:, : len(chain.range_m)].reshape(n_mics, -1)
-    undivided = float(np.mean(np.abs(series) ** 2)) or 1e-30  # as tiles have it
+    undivided = float(np.mean(np.abs(series) ** 2)) or 1e-30  # Power before calibration, like that of the tiles.
     series = (series / gain * array_weights(settings)[:, None]).astype(np.complex64)
     power = float(np.mean(np.abs(series) ** 2)) or 1e-30
     image_power = float(np.mean(np.square(image, dtype=np.float64)))
-    # A tile reaches as far over its ranges as delays do.
+    # A tile extends beyond its ranges by the largest delay.
     starts = range(0, len(chain.range_m), _TILE)
     largest = [np.max(np.abs(heard[:, :, start : start + _TILE + 2 * lead])) ** 2 for start in starts]
     covariance = _covariance(series, settings, n_phases * settings.output_rate_hz)
@@ -108,18 +115,18 @@ def signal_model_of(
 
 
 def _some(image: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return bins that are spread evenly over an image; quantiles of all of a large one would take 0.1 s."""
+    """Return bins spread evenly over an image; quantiles of all bins of a large image would take 0.1 s."""
     return image.ravel()[:: max(1, image.size // _MAX_BINS) | 1]
 
 
 def _shares(series: NDArray[np.complex64], settings: Settings, rate_hz: float) -> NDArray[np.float64]:
-    """Return how power is spread over the frequencies of the model."""
-    # Cut off sharply, what is strong would spread to the edges of the band, where interpolation errs most.
+    """Return the distribution of the power over the frequencies of the model."""
+    # Without a taper, strong echoes at the ends would leak to the edges of the band, where interpolation errors peak.
     edge = np.arange(series.shape[1]) / max(1, series.shape[1] - 1)
     taper = np.sin(np.pi / 2 * np.minimum(1.0, np.minimum(edge, 1 - edge) / _TAPERED)) ** 2
     found = np.sum(np.abs(scipy.fft.fft(series * taper, axis=1)) ** 2, axis=0)
     centres_hz, nominal = matched_noise_spectrum(settings, n_waves=WAVES)
-    # Sampling at this rate has moved the band by a multiple of it.
+    # Sampling at this rate has shifted the band by a multiple of the rate.
     bins = np.rint(centres_hz / rate_hz * len(found)).astype(int)
     half = max(1, int(np.min(np.diff(bins)) // 2)) if len(bins) > 1 else 1
     around = (bins[:, None] + np.arange(-half, half + 1)) % len(found)
@@ -129,7 +136,7 @@ def _shares(series: NDArray[np.complex64], settings: Settings, rate_hz: float) -
 
 
 def _covariance(series: NDArray[np.complex64], settings: Settings, rate_hz: float) -> NDArray[np.complex128]:
-    """Return what microphones have in common, tile by tile: (tile, wave, mic, mic) complex128."""
+    """Return the covariance of the microphones in each tile: (tile, wave, mic, mic) complex128."""
     layout = microphones(settings.array)
     centres_hz, _ = matched_noise_spectrum(settings, n_waves=WAVES)
     mics = estimated_mics(len(series))
@@ -137,9 +144,9 @@ def _covariance(series: NDArray[np.complex64], settings: Settings, rate_hz: floa
     half = length // 2
     padded = np.pad(series[mics], ((0, 0), (half, length + half)))
     tiles = np.lib.stride_tricks.sliding_window_view(padded, length, axis=1)[:, :: max(1, half)]
-    # Cut off sharply, what is strong would spread to the edges of the band, where interpolation errs most.
+    # Without a window, strong echoes at the ends would leak to the edges of the band, where interpolation errors peak.
     spectra = scipy.fft.fft(tiles * np.hanning(length), axis=2)
-    # Sampling has moved the band by multiples of the rate: a bin stands for the frequency that lies in the band.
+    # Sampling has shifted the band by multiples of the rate. Each bin represents its alias within the band.
     bins_hz = np.arange(length) * rate_hz / length
     frequency_hz = bins_hz + rate_hz * np.rint(((centres_hz[0] + centres_hz[-1]) / 2 - bins_hz) / rate_hz)
     late_s = layout.delay_s[layout.enabled][mics, None, None]
@@ -158,7 +165,7 @@ def _white_power(settings: Settings) -> float:
 
 
 def _noise(words: NDArray[Any], settings: Settings, kernels: KernelSet) -> NDArray[np.float64]:
-    """Return the power density of words by that of white bits, from 0 to half of their rate: (bin,) float64."""
+    """Return the power density of samples from 0 to half their rate, relative to white bits: (bin,) float64."""
     channels = np.flatnonzero(microphones(settings.array).enabled).astype(np.int32)
     channels = np.ascontiguousarray(channels[:: max(1, len(channels) // _MAX_MICS)])
     signals = np.empty((len(channels), len(words)), dtype=np.float32)

@@ -1,4 +1,4 @@
-"""The signals of a measurement by themselves, for whoever wants to look at them or take them elsewhere."""
+"""Signals of a measurement, before and after the matched filter, for plots and export."""
 
 import math
 
@@ -25,25 +25,29 @@ def signals_of(
     window: TimeWindow | None = None,
     max_samples: int | None = None,
 ) -> NDArray[np.float32]:
-    """Return the signals of the enabled microphones, low-passed and decimated: (mic, sample) float32, full scale 1.
+    """Return the low-pass filtered and decimated signals of the enabled microphones.
 
-    Sample n is the one at word n times the decimation. They are divided by the calibrated gains;
-    calibrated delays are left in.
+    Signals are divided by the calibrated gains. Calibrated delays are not compensated.
 
     Parameters
     ----------
     measurement : Measurement
     settings : Settings, optional
-        Whose decimation and stop band count; the measurement's own by default.
+        Settings with the decimation and the stopband attenuation; by default, those of the measurement.
     window : TimeWindow, optional
-        Which of the samples; all by default.
+        Window of samples; all samples by default.
     max_samples : int, optional
-        Of the words that are looked at where no window is given.
+        Maximum number of recorded samples to read if there is no window; all by default.
+
+    Returns
+    -------
+    (mic, sample) float32
+        Signals with a full scale of 1. Sample n lies at the recorded sample n times the decimation.
 
     Raises
     ------
     DataError
-        The words are not those of the settings.
+        The samples do not match the settings.
     """
     settings = settings or measurement.settings
     layout = microphones(settings.array)
@@ -52,7 +56,7 @@ def signals_of(
     window = window or TimeWindow(
         range_m=np.zeros(0), first_sample=0, n_samples=count, n_fft=count, n_outputs=0, lead=0, start_s=0.0
     )
-    plain = kernels.load("numpy")  # has nothing to compile; all devices give the same bits of PDM
+    plain = kernels.load("numpy")  # These need no compilation, and all devices return the same signals of PDM.
     memory = plain.memory()
     demodulate = demodulation(settings, layout, window, plain, memory, taps=chain_taps(settings))
     out: NDArray[np.float32] = memory.zeros(demodulate.shape, np.float32)
@@ -62,20 +66,23 @@ def signals_of(
 
 
 def matched_signals_of(measurement: Measurement, *, settings: Settings | None = None) -> NDArray[np.complex64]:
-    """Return the signals of `signals_of` after the call's matched filter: (mic, sample) complex64, analytic.
-
-    An echo of amplitude 1 that begins at sample n has its peak, an envelope of 1, at sample n.
+    """Return the signals of `signals_of` after the call's matched filter.
 
     Parameters
     ----------
     measurement : Measurement
     settings : Settings, optional
-        The measurement's own by default.
+        By default, the settings of the measurement.
+
+    Returns
+    -------
+    (mic, sample) complex64
+        Analytic signals. An echo of amplitude 1 that starts at sample n has its peak there, with an envelope of 1.
 
     Raises
     ------
     DataError
-        The words are not those of the settings.
+        The samples do not match the settings.
     """
     settings = settings or measurement.settings
     signals = signals_of(measurement, settings=settings)

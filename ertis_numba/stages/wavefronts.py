@@ -1,4 +1,4 @@
-"""Error of plane wavefronts against spherical ones, and the choice between both."""
+"""Error of plane wavefronts relative to spherical ones, and the choice between both."""
 
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.geometry import direction_grid, microphones, unit_vectors
@@ -10,7 +10,7 @@ __all__ = ["plane_wave_error_db", "with_wavefront"]
 
 
 def plane_wave_error_db(model: ErrorModel, settings: Settings, range_m: float) -> float:
-    """Return the error of an image at one range by plane wavefronts, relative to one by spherical wavefronts."""
+    """Return the image error of plane wavefronts at one range, in decibels relative to spherical wavefronts."""
     grid = direction_grid(settings.processing)
     positions_m = microphones(settings.array).enabled_positions_m
     aperture = Aperture.of(positions_m, unit_vectors(grid.azimuth_rad, grid.elevation_rad))
@@ -20,7 +20,7 @@ def plane_wave_error_db(model: ErrorModel, settings: Settings, range_m: float) -
 def with_wavefront(settings: Settings, model: ErrorModel) -> Settings:
     """Return settings with spherical wavefronts if plane ones exceed the error budget at the nearest range.
 
-    Adaptive beamformers and the paper's method have plane wavefronts only.
+    Adaptive beamformers and the paper's method support only plane wavefronts.
     """
     processing = settings.processing
     spherical = (

@@ -1,4 +1,4 @@
-"""Which part of the record an image needs, and on which grid its ranges lie."""
+"""Time window of the record that an image needs, and its range axis."""
 
 import math
 from dataclasses import dataclass
@@ -17,21 +17,22 @@ __all__ = ["TimeWindow", "time_window"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TimeWindow:
-    """The signals that an image is made from, and the samples it is read from.
+    """Time window of an image: signal samples to demodulate, and samples after the matched filter.
 
     Attributes
     ----------
     range_m : (range,) float64
+        Range axis in metres.
     first_sample, n_samples : int
-        Signal samples to demodulate.
+        First signal sample to demodulate, and their number.
     n_fft : int
         Length of the transform: ``output_decimation`` times ``n_outputs``.
     n_outputs : int
-        Samples of each phase.
+        Number of samples of each phase.
     lead : int
-        Sample of phase 0 that lies at the first range.
+        Index of the sample of phase 0 at the first range.
     start_s : float
-        Time of sample 0 of phase 0.
+        Time of sample 0 of phase 0, in seconds.
     """
 
     range_m: NDArray[np.float64]
@@ -44,13 +45,21 @@ class TimeWindow:
 
 
 def time_window(settings: Settings, *, largest_delay_s: float, n_taps: int, ringing_db: float = 60.0) -> TimeWindow:
-    """Return the window for beams whose delays stay within ``± largest_delay_s``.
+    """Return the time window for beams with delays within ``± largest_delay_s``.
 
-    ``n_taps`` is the length of the decimation filter, which lets the record reach over its ends.
+    An echo at time t needs the samples from t on for the duration of the call. The window adds the ringing of the
+    matched filter on both sides. The transform is slightly longer, so wrapped samples lie outside those that are read:
+    the convolution is linear.
 
-    An echo at time t needs the samples from t on for as long as the call lasts, and the matched
-    filter's ringing on both sides, until it is ``ringing_db`` down. The transform is a little longer than that, so
-    what wraps around in it falls outside of the samples that are read: the convolution is linear.
+    Parameters
+    ----------
+    settings : Settings
+    largest_delay_s : float
+        Largest magnitude of a beam's delays, in seconds.
+    n_taps : int
+        Length of the decimation filter, by which the filtered signals extend beyond the ends of the record.
+    ringing_db : float
+        Level below the peak at which the ringing of the matched filter is cut off; 60 by default.
 
     Raises
     ------
@@ -63,7 +72,8 @@ def time_window(settings: Settings, *, largest_delay_s: float, n_taps: int, ring
     if last_m > record_m:
         raise ArgumentError(
             f"processing.range_m ends at {last_m:g} m, but the record of "
-            f"{settings.recording.duration_s * 1e3:.4g} ms reaches {record_m:.4g} m; give a smaller range"
+            f"{settings.recording.duration_s * 1e3:.4g} ms covers {record_m:.4g} m. Shorten processing.range_m or "
+            "use a longer preset"
         )
     output_rate_hz = settings.output_rate_hz
     step_m = speed_m_s / (2 * output_rate_hz)

@@ -1,4 +1,4 @@
-"""Beamformers in float64, by their definitions in docs/beamformers.md."""
+"""Reference beamformers in float64, as defined in docs/beamformers.md."""
 
 import math
 from collections.abc import Callable
@@ -10,7 +10,7 @@ from ertis_numba.settings import Processing
 
 __all__ = ["combine"]
 
-_MAX_ELEMENTS = 2**22  # of the covariance matrices that are inverted at a time
+_MAX_ELEMENTS = 2**22  # Maximum number of elements of the covariance matrices in a block.
 
 Delayed = NDArray[np.complex128]
 

@@ -1,8 +1,9 @@
-"""Exact image in float64, without any approximation of the images that are compared with it.
+"""Exact image in float64, without the approximations of the images that are compared with it.
 
-The samples of the record go through one transform at the record's own rate, long enough to prevent wrap-around. Each
-bin is multiplied by the matched filter of the call, sampled at that rate, and turned by the exact delay of each
-microphone. There is no decimation, no interpolation, no focal zone and no plan, and no rounding except that of float64.
+The samples of the record pass through one transform at the record's own sample rate, long enough to prevent
+wrap-around. Each bin is multiplied by the matched filter of the call at that rate, and by the phase of each
+microphone's exact delay. There is no decimation, no interpolation, no focal zone, no plan, and no rounding except that
+of float64.
 """
 
 import math
@@ -39,12 +40,12 @@ class ExactImage:
     Attributes
     ----------
     operations_per_direction : int
-        Estimated count of complex multiplications.
+        Estimated number of complex multiplications per direction.
 
     Raises
     ------
     DataError
-        The words are not those of the settings.
+        The samples do not match the settings.
     """
 
     def __init__(self, image: Energyscape, measurement: Measurement) -> None:
@@ -69,7 +70,7 @@ class ExactImage:
 
     @property
     def operations_per_direction(self) -> int:
-        """Estimated count of complex multiplications per direction."""
+        """Estimated number of complex multiplications per direction."""
         n_mics, n_bins = self._spectra.shape
         if self._settings.processing.wavefront == "spherical":
             count = n_mics * n_bins * len(self._range_m)
@@ -81,12 +82,14 @@ class ExactImage:
         return int(count)
 
     def amplitudes(self, direction: int, ranges: NDArray[np.intp]) -> NDArray[np.float64]:
-        """Return the exact amplitudes of some ranges of one direction: (range,) float64.
+        """Return the exact amplitudes of given ranges of one direction: (range,) float64.
 
         Parameters
         ----------
         direction : int
+            Index of the direction.
         ranges : (range,) intp
+            Indices of the ranges.
         """
         processing = self._settings.processing
         if processing.wavefront == "spherical":
@@ -96,7 +99,8 @@ class ExactImage:
     def _plane(self, direction: int) -> NDArray[np.complex128]:
         """Return the signals delayed for plane waves: (mic, range) complex128.
 
-        Ranges lie a whole number of samples apart, so one inverse transform of the bins, folded, gives all of them.
+        The spacing of the ranges is an integer number of samples, so one inverse transform of the folded bins computes
+        all ranges.
         """
         delay_s = far_field_delays(
             self._positions_m, self._directions[direction : direction + 1], sound_speed_m_s=self._speed_m_s
@@ -108,7 +112,7 @@ class ExactImage:
         for first in range(0, len(self._bins), n_outputs):
             part = turned[:, first : first + n_outputs]
             folded[:, : part.shape[1]] += part
-        # Bin 0 of the transform is the first bin of the band, which turns on by this much from range to range.
+        # Bin 0 of the transform is the first bin of the band. Its phase advances by this factor from range to range.
         carrier = np.exp(2j * math.pi * (self._bins[0] * np.arange(len(self._range_m)) % n_outputs) / n_outputs)
         return np.asarray(
             scipy.fft.ifft(folded, axis=1, norm="forward")[:, : len(self._range_m)] * carrier, np.complex128
@@ -119,7 +123,8 @@ class ExactImage:
         points_m = range_m[:, None] * self._directions[direction]
         paths_m = np.linalg.norm(points_m - self._positions_m[:, None], axis=2) + range_m  # (mic, range)
         at_s = paths_m / self._speed_m_s
-        # Σ_k Y_k exp(jω_k t) with k = a·n + b: a sum over a by a matrix product, then one over b. Both are exact.
+        # Σ_k Y_k exp(jω_k t) with k = a·n + b: a matrix product sums over a, then a second sum runs over b. Both are
+        # exact.
         n = self._tabled.shape[2]
         spacing_rad_s = self._wave_rad_s[1] - self._wave_rad_s[0] if len(self._bins) > 1 else 0.0
         out: NDArray[np.complex128] = np.empty(at_s.shape, dtype=np.complex128)
@@ -141,7 +146,7 @@ class ExactImage:
 
 
 def _transform_length(settings: Settings) -> int:
-    """Return a transform length, a multiple of the samples per range, that holds record, call and ringing."""
+    """Return a transform length for record, call and ringing; it is a multiple of the samples per range."""
     call, (low_hz, high_hz) = settings.call, matched_band_hz(settings)
     edge_hz = min(call.low_frequency_hz - low_hz, high_hz - call.high_frequency_hz)
     rate_hz, step = settings.recording.sample_rate_hz, settings.processing.range_decimation

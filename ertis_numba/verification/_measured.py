@@ -15,18 +15,19 @@ from ertis_numba.verification._peaks import PEAKS, PeakErrors, peak_errors
 
 __all__ = ["Measured", "error_db", "exact_image", "measure", "sampled", "sampled_error_db"]
 
-_MAX_OPERATIONS = 3e9  # complex multiplications: some ten seconds of one core
+_MAX_OPERATIONS = 3e9  # Complex multiplications, which take about ten seconds on one core.
 _QUICK_OPERATIONS = 3e8
 _MIN_DIRECTIONS = 16
 
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """Error of an image relative to the exact image.
+    """Measured error of an image relative to the exact image.
 
     Attributes
     ----------
     error_db : float
+        Norm of the difference relative to the norm of the exact image, in decibels.
     n_directions : int
         Number of compared directions.
     peaks : PeakErrors or None
@@ -39,16 +40,26 @@ class Measured:
 
 
 def measure(image: Energyscape, measurement: Measurement) -> Measured:
-    """Return the error of the image of ``measurement``, relative to the exact image with the same settings.
+    """Return the error of the image of a measurement, relative to the exact image with the same settings.
 
-    The exact image is computed in float64, by the definition of the image's beamformer. If the whole image would take
-    more than about ten seconds, a sample is compared: directions for plane wavefronts, single points for spherical
-    ones. Bright ones are drawn more often, and each is weighted by the inverse of its probability.
+    The exact image is computed in float64, according to the definition of the image's beamformer. If the whole image
+    would take more than about ten seconds, a sample is compared: directions for plane wavefronts, single points
+    for spherical ones. Bright ones are drawn more often, and each is weighted by the inverse of its probability.
+
+    Parameters
+    ----------
+    image : Energyscape
+    measurement : Measurement
+        Measurement that the image was computed from.
+
+    Returns
+    -------
+    Measured
 
     Raises
     ------
     DataError
-        The exact image is silent, or the words are not those of the settings.
+        The exact image is silent, or the samples do not match the settings.
     """
     exact = ExactImage(image, measurement)
     share = _MAX_OPERATIONS / exact.operations_per_direction / len(image.amplitude)
@@ -63,14 +74,22 @@ def measure(image: Energyscape, measurement: Measurement) -> Measured:
 
 
 def sampled_error_db(image: Energyscape, measurement: Measurement, *, max_directions: int) -> float:
-    """Return the error of the image of ``measurement``, measured in a sample of the directions.
+    """Return the error of the image of a measurement in decibels, measured in a sample of the directions.
 
-    Fewer directions are compared if ``max_directions`` would take more than about a second. Bright ones are preferred.
+    Bright directions are preferred. The sample is smaller if ``max_directions`` would take more than about a second.
+
+    Parameters
+    ----------
+    image : Energyscape
+    measurement : Measurement
+        Measurement that the image was computed from.
+    max_directions : int
+        Maximum number of directions to compare.
 
     Raises
     ------
     DataError
-        The exact image is silent in these directions, or the words are not those of the settings.
+        The exact image is silent in these directions, or the samples do not match the settings.
     """
     exact = ExactImage(image, measurement)
     count = min(max_directions, max(_MIN_DIRECTIONS, int(_QUICK_OPERATIONS / exact.operations_per_direction)))
@@ -80,7 +99,7 @@ def sampled_error_db(image: Energyscape, measurement: Measurement, *, max_direct
 
 
 def _measured_in_part(image: Energyscape, exact: ExactImage, *, share: float) -> Measured:
-    """Return the error measured on a share of the directions, or of the image points if wavefronts are spherical."""
+    """Return the error measured on a share of the directions, or of the image points for spherical wavefronts."""
     power = np.square(image.amplitude, dtype=np.float64)
     by_place = image.settings.processing.wavefront == "spherical"
     power = power if by_place else power.sum(axis=1, keepdims=True)
@@ -98,14 +117,25 @@ def _measured_in_part(image: Energyscape, exact: ExactImage, *, share: float) ->
 
 
 def exact_image(image: Energyscape, measurement: Measurement) -> Energyscape:
-    """Return the exact image of a measurement on the axes and with the settings of another image.
+    """Return the exact image of a measurement, with the axes and the settings of another image.
 
-    This computes all directions, without a limit on time. Amplitudes are rounded to float32 at the end.
+    All directions are computed, without a time limit. Amplitudes are rounded to float32 at the end.
+
+    Parameters
+    ----------
+    image : Energyscape
+        Image with the axes and settings to use.
+    measurement : Measurement
+        Measurement that the image was computed from.
+
+    Returns
+    -------
+    Energyscape
 
     Raises
     ------
     DataError
-        The words are not those of the settings.
+        The samples do not match the settings.
     """
     return image.replace(amplitude=_whole(image, ExactImage(image, measurement)).astype(np.float32))
 
@@ -117,7 +147,12 @@ def _whole(image: Energyscape, exact: ExactImage) -> NDArray[np.float64]:
 
 
 def error_db(amplitude: NDArray[np.floating], exact: NDArray[np.floating]) -> float:
-    """Return the norm of the difference relative to the norm of the exact image.
+    """Return the norm of the difference relative to the norm of the exact image, in decibels.
+
+    Parameters
+    ----------
+    amplitude, exact : (direction, range) floating
+        Amplitudes of the image and of the exact image.
 
     Raises
     ------
@@ -127,17 +162,29 @@ def error_db(amplitude: NDArray[np.floating], exact: NDArray[np.floating]) -> fl
     wanted = float(np.linalg.norm(exact.astype(np.float64)))
     if not wanted:
         raise DataError(
-            "the exact image is silent, so no error relative to it can be measured; give a measurement with echoes"
+            "the exact image is silent, so the error relative to it is undefined; give a measurement with echoes"
         )
     difference = float(np.linalg.norm(amplitude.astype(np.float64) - exact))
     return 20 * math.log10(max(1e-15, difference / wanted)) if math.isfinite(difference) else math.inf
 
 
 def sampled(power: NDArray[np.float64], count: int) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Return a sample of the items and their weights in a sum over all: (item,) intp, (item,) float64.
+    """Return a sample of items, and their weights in an estimate of the sum over all items.
 
-    This is systematic sampling; half of the probability is even and half is proportional to power. Neighbours are
-    alike, so drawing at equal steps of the cumulative probability has a smaller error than drawing at random.
+    Half of the probability is uniform, and half is proportional to power. Neighbours are alike, so systematic sampling
+    at equal steps of the cumulative probability has a smaller error than random sampling.
+
+    Parameters
+    ----------
+    power : (item,) float64
+        Power of each item.
+    count : int
+        Number of draws.
+
+    Returns
+    -------
+    chosen : (item,) intp
+    weights : (item,) float64
     """
     total = float(power.sum())
     even = np.full(len(power), 1 / len(power))

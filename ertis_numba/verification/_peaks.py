@@ -15,7 +15,7 @@ __all__ = ["PEAKS", "PeakErrors", "peak_errors"]
 PEAKS = 10
 """Number of strongest reflectors to compare."""
 
-_NEAR_DEG, _NEAR_M = 5.0, 0.02  # half a main lobe and half a pulse: what lies further off is another reflector
+_NEAR_DEG, _NEAR_M = 5.0, 0.02  # Half a main lobe and half a pulse; peaks farther away are other reflectors.
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,9 +25,10 @@ class PeakErrors:
     Attributes
     ----------
     wanted, lost : int
-        Reflectors of the exact image, and those without a near reflector in the other image.
+        Number of reflectors of the exact image, and number of those missed in the other image.
     level_db, range_mm, angle_deg : float or None
-        Largest errors of the found reflectors; levels are relative to the strongest. None if no reflector was found.
+        Largest errors of the reflectors found: level relative to the strongest in dB, range in millimetres, and angle
+        in degrees. None if no reflector was found.
     """
 
     wanted: int
@@ -38,8 +39,16 @@ class PeakErrors:
 
 
 def peak_errors(image: Energyscape, wanted: Sequence[Peak]) -> PeakErrors:
-    """Return the errors of an image at the reflectors of the exact image."""
-    # Twice as many, since those of nearly one level change places, and what was last may be left out.
+    """Return the errors of an image at the reflectors of the exact image.
+
+    Parameters
+    ----------
+    image : Energyscape
+        Image to assess.
+    wanted : sequence of Peak
+        Strongest reflectors of the exact image.
+    """
+    # Reflectors of nearly the same level may change order. Twice the number ensures that the last are included.
     found = find_peaks(image, top=2 * PEAKS, min_level_db=-1000.0)
     errors = [error for peak in wanted if (error := _nearest(peak, found)) is not None]
     level_db, range_m, angle_deg = np.max(np.abs(errors), axis=0).tolist() if errors else (None, None, None)

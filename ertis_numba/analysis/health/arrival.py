@@ -1,4 +1,4 @@
-"""The strongest arrival of a record: its signals after the matched filter, and the wavefront that fits them."""
+"""Strongest arrival of a record: its signals after the matched filter, and the best-fitting wavefront."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -14,12 +14,12 @@ from ertis_numba.waveform import call_samples
 
 __all__ = ["Compressed", "Fit", "compress", "fit_delays", "fit_emitter", "strongest"]
 
-_OVERSAMPLING = 8  # of the envelope
-_PROMINENCE = 6.0  # of the arrival's amplitude, relative to the median over time
+_OVERSAMPLING = 8  # Oversampling of the envelope.
+_PROMINENCE = 6.0  # Minimum amplitude of the arrival, relative to the median over time.
 _FLAT = 0.99
-_TRIALS = 80  # subsets of microphones; half of them may be wrong
-_SINGULAR = 1e-2  # volume of a subset of microphones, relative to the cube of the array
-_DEGENERATE_M = 1e-3  # extent below which an axis of the array has no say
+_TRIALS = 80  # Number of subsets of microphones; half of the microphones may be wrong.
+_SINGULAR = 1e-2  # Minimum volume of a subset of microphones, relative to the cube of the array's extent.
+_DEGENERATE_M = 1e-3  # Minimum extent of an axis of the array that the fit uses.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,12 +31,14 @@ class Compressed:
     bins : (mic, bin) complex128
         Spectrum in the call's band.
     frequency_hz : (bin,) float64
+        Frequencies of the bins, in hertz.
     envelope : (mic, step) float64
     step_s : float
+        Time between steps of the envelope, in seconds.
     start_s : float
-        Time of the first step after the start of the record; negative.
+        Time of the first step relative to the start of the record, in seconds; it may be negative.
     origin_s : float
-        Time to which the phases of the spectrum refer.
+        Time that the phases of the spectrum refer to, in seconds.
     """
 
     bins: NDArray[np.complex128]
@@ -49,17 +51,18 @@ class Compressed:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """A wavefront fitted to delays.
+    """Wavefront fitted to times of arrival.
 
     Attributes
     ----------
     delay_s : (mic,) float64
-        Of the wavefront at each microphone.
+        Time of the wavefront at each microphone, in seconds.
     inliers : (mic,) bool
+        True for microphones that agree with the wavefront.
     spread_s : float
-        Median absolute residual.
+        Median absolute residual, in seconds.
     emission_s : float
-        Time at which the wavefront passes the array's centre, or leaves the emitter.
+        Time at which the wavefront passes the array's centre or leaves the emitter, in seconds.
     """
 
     delay_s: NDArray[np.float64]
@@ -82,14 +85,26 @@ def compress(
     first: int,
     last: int,
 ) -> Compressed:
-    """Return samples ``first`` to ``last`` after the matched filter, from one call's length before the first."""
+    """Return samples ``first`` to ``last`` after the matched filter, starting one call length before the first.
+
+    Parameters
+    ----------
+    signals : callable
+        Function that returns the samples of a channel.
+    channels : sequence of int
+    call : Call
+    rate_hz : float
+        Sample rate.
+    first, last : int
+        Slice of the samples.
+    """
     replica = call_samples(call, rate_hz=rate_hz)
     n_fft = scipy.fft.next_fast_len(last - first + len(replica), real=True)
     low, high = (round(hz * n_fft / rate_hz) for hz in (call.low_frequency_hz, call.high_frequency_hz))
     matched = np.conj(scipy.fft.rfft(replica, n_fft)[low : high + 1])
     matched /= np.sum(np.abs(matched) ** 2) / n_fft
     bins = np.stack([_spectrum(signals(channel)[first:last], n_fft)[low : high + 1] for channel in channels]) * matched
-    # Negative lags stand at the end of the circle: turned to its front by the length of the call.
+    # Negative lags lie at the end of the cyclic result. A roll by the length of the call moves them to the start.
     frequency_hz = np.arange(low, high + 1) * rate_hz / n_fft
     n_steps = 1 << (_OVERSAMPLING * bins.shape[1] - 1).bit_length()
     step_s = n_fft / rate_hz / n_steps
@@ -103,15 +118,24 @@ def _spectrum(signal: NDArray[np.float32], n_fft: int) -> NDArray[np.complex64]:
 
 
 def strongest(found: Compressed, width_s: float) -> tuple[NDArray[np.float64], float] | None:
-    """Return when the strongest arrival reaches each microphone, (mic,) float64, and the middle of them.
+    """Return the times of the strongest arrival at each microphone, and their middle; None if no arrival stands out.
 
-    None is returned where nothing stands out.
+    Parameters
+    ----------
+    found : Compressed
+    width_s : float
+        Largest difference between the times of two microphones, in seconds.
+
+    Returns
+    -------
+    times_s : (mic,) float64
+    middle_s : float
     """
     width = max(1, int(np.ceil(width_s / found.step_s))) + 2
     widened = _highest_around(found.envelope, width)
     common = np.median(widened, axis=0)
     highest = int(np.argmax(common))
-    # The median of maxima is flat around the arrival, whose middle is that of the plateau.
+    # The median of maxima has a plateau around the arrival, and both have the same middle.
     lower = np.flatnonzero(common[highest:] < _FLAT * common[highest])
     middle = highest + (int(lower[0]) if len(lower) else len(common) - highest) // 2
     if common[middle] < _PROMINENCE * np.median(common):
@@ -127,7 +151,7 @@ def strongest(found: Compressed, width_s: float) -> tuple[NDArray[np.float64], f
 
 
 def _highest_around(envelope: NDArray[np.float64], width: int) -> NDArray[np.float64]:
-    """Return the maximum over ``width`` steps to either side, by doubling."""
+    """Return the running maximum over ``width`` steps on either side, computed by doubling."""
     total = 2 * width + 1
     out = np.pad(envelope, ((0, 0), (width, width)))
     reach = 1
@@ -141,16 +165,18 @@ def _highest_around(envelope: NDArray[np.float64], width: int) -> NDArray[np.flo
 def fit_delays(
     times_s: NDArray[np.float64], positions_m: NDArray[np.float64], curvatures: Sequence[float], speed_m_s: float
 ) -> Fit | None:
-    """Return the wavefront that most microphones agree with; None where the array has too few.
+    """Return the wavefront that most microphones agree with; None if the array has too few microphones.
 
     Parameters
     ----------
     times_s : (mic,) float64
+        Times of arrival in seconds.
     positions_m : (mic, 3) float64
-        From the centroid.
+        Positions in metres, relative to the centroid.
     curvatures : sequence of float
         Inverse distances of the source to try, in 1/m.
     speed_m_s : float
+        Speed of sound in m/s.
     """
     _, extent, axes = np.linalg.svd(positions_m - positions_m.mean(axis=0), full_matrices=False)
     used = extent / np.sqrt(len(positions_m)) > _DEGENERATE_M
@@ -171,7 +197,7 @@ def fit_delays(
 
 
 def fit_emitter(times_s: NDArray[np.float64], positions_m: NDArray[np.float64], speed_m_s: float) -> Fit:
-    """Return the wavefront of the emitter at the array's centre, whose only unknown is the time of the emission."""
+    """Return the wavefront of an emitter at the array's centre, whose only unknown is the time of the emission."""
     travel_s = np.linalg.norm(positions_m, axis=1) / speed_m_s
     emission_s = float(np.median(times_s - travel_s))
     return _fit(times_s, emission_s + travel_s, emission_s)
@@ -183,7 +209,7 @@ def _fit(times_s: NDArray[np.float64], fitted_s: NDArray[np.float64], emission_s
 
 
 def _robust(times_s: NDArray[np.float64], places_m: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
-    """Return time at the centre and slopes, by the least median of residuals, then by least squares of those near."""
+    """Return the time at the centre and the slopes: a least-median fit, refined by least squares over the inliers."""
     matrix = np.column_stack([np.ones(len(places_m)), places_m])
     subsets = _subsets(*matrix.shape)
     corners = matrix[subsets]
@@ -203,6 +229,6 @@ def _robust(times_s: NDArray[np.float64], places_m: NDArray[np.float64]) -> tupl
 
 @functools.cache
 def _subsets(n_mics: int, size: int) -> NDArray[np.intp]:
-    """Return the microphones of each trial: (trial, size)."""
+    """Return random subsets of microphones: (trial, size) intp."""
     rng = np.random.default_rng(n_mics)
     return np.argsort(rng.random((_TRIALS, n_mics)), axis=1)[:, :size]

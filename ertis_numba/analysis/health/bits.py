@@ -1,4 +1,4 @@
-"""Checks of single channels on their bits: stuck, saturated, offset."""
+"""Checks on the bits of single PDM channels: stuck, saturated, offset."""
 
 import math
 
@@ -11,13 +11,13 @@ from ertis_numba.analysis.health.report import ChannelHealth
 
 __all__ = ["by_bits"]
 
-_CHANCE_RUN = 20  # places in the longest run that white bits have by chance, which counts in short records
+_CHANCE_RUN = 20  # Samples in the longest run that white bits have by chance, which matters in short records.
 
 
 def by_bits(octets: NDArray[np.uint8], enabled: NDArray[np.int64]) -> list[ChannelHealth]:
-    """Return figures and faults of each channel that need no spectrum."""
+    """Return the statistics and faults of each channel that need no spectrum."""
     shares = {octet: _bits.bit_shares(np.ascontiguousarray(octets[:, octet])) for octet in np.unique(enabled // 8)}
-    # A loud echo clips now and then; a short record may hold a run, or more of ones, by chance.
+    # A loud echo may clip occasionally. In a short record, runs and offsets also occur by chance.
     max_runs = MAX_SATURATED + _CHANCE_RUN / len(octets)
     max_offset = MAX_OFFSET + OFFSET_DEVIATIONS / math.sqrt(len(octets))
     reported = []

@@ -1,4 +1,4 @@
-"""Correlation of each microphone's arrival with the mean of those in line."""
+"""Correlation of each microphone's arrival with the mean of the microphones that agree with the wavefront."""
 
 from dataclasses import dataclass, replace
 
@@ -13,21 +13,21 @@ __all__ = ["Coherence", "aligned", "correlate", "half_bands", "mean_of"]
 
 _LAG_STEP_S = 1e-6
 _NEAR_ZERO_S = 10e-6
-_GATE_PERIODS = 2.0  # of the bandwidth, to either side
+_GATE_PERIODS = 2.0  # Length of the gate on either side, in units of 1 / bandwidth.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Coherence:
-    """Correlation of real signals with a reference, all (mic,) float64.
+    """Correlation of real signals with a reference.
 
     Attributes
     ----------
-    lag_s, peak, coherence
-        Lag of the highest correlation, its value, and the same relative to the powers.
-    at_zero : float64
-        Highest correlation within 10 µs.
-    negative, opposite : float64
-        Highest negative correlation within 10 µs, and the same relative to the powers.
+    lag_s, peak, coherence : (mic,) float64
+        Lag of the highest correlation in seconds, its value, and its value normalised by the powers.
+    at_zero : (mic,) float64
+        Highest correlation at lags within 10 µs.
+    negative, opposite : (mic,) float64
+        Magnitude of the lowest correlation at lags within 10 µs, and the same normalised by the powers.
     """
 
     lag_s: NDArray[np.float64]
@@ -39,13 +39,13 @@ class Coherence:
 
 
 def _halves(found: Compressed, lag_s: float) -> tuple[int, int]:
-    """Return half of the gate and the greatest lag in steps."""
+    """Return half of the gate and the largest lag, both in steps."""
     band_hz = found.frequency_hz[-1] - found.frequency_hz[0]
     return max(4, round(_GATE_PERIODS / band_hz / found.step_s)), int(np.ceil(lag_s / found.step_s))
 
 
 def aligned(found: Compressed, at_s: NDArray[np.float64], lag_s: float) -> NDArray[np.complex128]:
-    """Return the complex baseband of each microphone around its time: (mic, step) complex128."""
+    """Return the complex baseband signal of each microphone around its time ``at_s``: (mic, step) complex128."""
     half, n_steps = sum(_halves(found, lag_s)), found.envelope.shape[1]
     steps = np.arange(-half, half + 1)
     turned = found.bins * np.exp(2j * np.pi * found.frequency_hz * (at_s - found.origin_s)[:, None])
@@ -62,7 +62,7 @@ def half_bands(found: Compressed) -> tuple[Compressed, Compressed]:
 
 
 def mean_of(wide: NDArray[np.complex128], found: Compressed, lag_s: float) -> NDArray[np.complex128]:
-    """Return the mean of microphones of equal power within the gate: (step,) complex128."""
+    """Return the mean of the microphones within the gate, each normalised to equal power: (step,) complex128."""
     _, lags = _halves(found, lag_s)
     gated = wide[:, lags : wide.shape[1] - lags]
     return np.asarray(np.mean(gated / np.sqrt(np.sum(np.abs(gated) ** 2, axis=1))[:, None], axis=0))
@@ -71,7 +71,7 @@ def mean_of(wide: NDArray[np.complex128], found: Compressed, lag_s: float) -> ND
 def correlate(
     wide: NDArray[np.complex128], reference: NDArray[np.complex128], found: Compressed, lag_s: float
 ) -> Coherence:
-    """Return the correlations of microphones with a reference."""
+    """Return the correlations of microphones with a reference, at lags within ``± lag_s``."""
     windows = sliding_window_view(wide, len(reference), axis=1)
     product = windows @ np.conj(reference)
     norm = np.sqrt(np.sum(np.abs(windows) ** 2, axis=2) * np.sum(np.abs(reference) ** 2))

@@ -1,4 +1,4 @@
-"""Examination of one measurement: every check in turn, and the report."""
+"""Health check of one measurement: all checks in turn, and the report."""
 
 import functools
 import math
@@ -38,35 +38,48 @@ from ertis_numba.settings import Settings
 __all__ = ["health"]
 
 _HUM_BLOCK_S = 1e-3
-_DEAF = {"dead", "saturated", "white bits", "duplicate", "stuck at times"}  # which hide what arrives
-_LOWEST_NOISE_DBFS = -95.0  # in the call's band; rounding to 16 bits has -106
+_DEAF = {"dead", "saturated", "white bits", "duplicate", "stuck at times"}  # These faults hide the received sound.
+_LOWEST_NOISE_DBFS = -95.0  # Noise in the call's band; rounding to 16 bits has -106 dBFS.
 
 
 def health(measurement: Measurement) -> Health:
-    """Return the state of the microphones of one measurement.
+    """Return the health of the microphones and of the record of one measurement.
 
-    Only enabled channels are looked at, in the first 524,288 samples. Loud and quiet are the eighths of
-    the record in which the median channel has most and least power in the call's band.
+    The checks cover the enabled channels and the first 524,288 samples. In the loud and the quiet eighth of the record,
+    the median channel has the most and the least power in the call's band.
 
-    The dynamic range is ``10 log10(1/2 / noise · B T · N)``: a sine at full scale, against the noise in the call's
-    band, raised by a matched filter by bandwidth times duration (G. L. Turin, An introduction to matched filters,
-    IRE Trans. Inf. Theory 6, 1960) and by delay and sum by the number of microphones without fault. Of the duration,
-    five eighths of each ramp are taken off, as a Hann ramp has three eighths of the energy.
+    The dynamic range is ``10 log10(1/2 / noise · B T · N)``: a sine at full scale relative to the noise in the call's
+    band, with the gains of matched filter and delay-and-sum. The gain of the matched filter is bandwidth times duration
+    (G. L. Turin, An introduction to matched filters, IRE Trans. Inf. Theory 6, 1960). The gain of delay-and-sum is the
+    number of microphones without fault. The duration excludes five eighths of each ramp, because a Hann ramp has three
+    eighths of the energy.
 
     Parameters
     ----------
     measurement : Measurement
 
+    Returns
+    -------
+    Health
+
     Raises
     ------
     DataError
-        The words are not those of the settings.
+        The samples do not match the settings.
+
+    Examples
+    --------
+    Print the faults of an array::
+
+        with ertis.open_recording("data/synthetic/reflectors.h5") as recording:
+            report = ertis.health(recording[0])
+        print(report.verdict() or "no faults")
     """
     checks.instance("measurement", measurement, Measurement, "a recording holds")
     settings, enabled = measurement.settings, np.flatnonzero(microphones(measurement.settings.array).enabled)
     words = sample_format(settings).validated(measurement.data, any_length=True)[:MAX_SAMPLES]
     if len(words) < MIN_SAMPLES:
-        too_short = f"anything: {len(words)} samples are fewer than {MIN_SAMPLES}"
+        too_short = f"the state of any microphone: the record has {len(words)} samples, fewer than {MIN_SAMPLES}"
         return Health(channels=tuple(ChannelHealth(channel=int(i)) for i in enabled), unknown=(too_short,))
     signal_of: Callable[[int], NDArray[np.float32]]
     columns: Callable[[int], NDArray[Any]]
@@ -78,7 +91,7 @@ def health(measurement: Measurement) -> Health:
     else:
         full, is_float = settings.recording.full_scale, settings.recording.encoding == "float32"
         reported = [by_numbers(i, scaled(words, full, i), is_float=is_float) for i in enabled.tolist()]
-        if is_float:  # of which the amplitudes may be pascals
+        if is_float:  # The unit of float samples may be the pascal.
             full = max(full, *(float(np.abs(words[:, i]).max()) for i in enabled))
         signal_of = functools.partial(scaled, words, full)
         columns, half_scale = functools.partial(_column, words), full
@@ -122,7 +135,7 @@ def _by_words(
     settings: Settings,
     half_scale: float,
 ) -> list[Finding]:
-    """Return what the words themselves show, without a spectrum."""
+    """Return the findings of the checks that need no spectrum."""
     recording, enabled = settings.recording, tuple(found)
     comparable = moved if recording.is_pdm or _have_noise(found.values()) else []
     findings = duplicates(comparable, is_pdm=recording.is_pdm)
@@ -137,7 +150,7 @@ def _by_words(
 
 
 def _with_faults(found: dict[int, ChannelHealth], findings: Iterable[Finding]) -> tuple[ChannelHealth, ...]:
-    """Return the channels with the names of their findings."""
+    """Return the channels with the faults of the findings added."""
     named = dict(found)
     for finding in findings:
         for channel in () if kind_of(finding.fault).of_record else finding.channels:
@@ -151,13 +164,13 @@ def _column(words: NDArray[Any], channel: int) -> NDArray[Any]:
 
 
 def _have_noise(channels: Iterable[ChannelHealth]) -> bool:
-    """Return whether numbers hold noise; without it a symmetrical array hears some echoes alike."""
+    """Return True if PCM samples contain noise; without noise, a symmetrical array may receive identical echoes."""
     levels = [item.noise_dbfs for item in channels if item.noise_dbfs is not None]
     return bool(levels) and statistics.median(levels) > _LOWEST_NOISE_DBFS
 
 
 def _of_channels(channels: Collection[ChannelHealth]) -> list[Finding]:
-    """Return the findings behind the faults that figures of channels show."""
+    """Return the findings for the faults in the statistics of channels."""
     measured: dict[str, tuple[str, float]] = {
         "stuck at": ("changes", MIN_CHANGES),
         "stuck in a pattern": ("changes", MIN_CHANGES),

@@ -1,10 +1,10 @@
-"""Table of the faults that one recording can show: unit of the measured value, and remedy."""
+"""Table of the faults that a recording can show, with the unit of the measured value and the remedy."""
 
 from dataclasses import dataclass
 
 __all__ = ["DISABLE", "KINDS", "FaultKind", "kind_of"]
 
-DISABLE = "leave them out by 'ertis process --without', or by array.disabled in a settings file"
+DISABLE = "exclude them with 'ertis process --without', or with array.disabled in a settings file"
 """Remedy for faults of single channels."""
 
 _LAYOUT = "give the layout of this array as array.layout, with its channels in the order of the bits"
@@ -17,11 +17,11 @@ class FaultKind:
     Attributes
     ----------
     unit : str
-        Unit of the measured value and of its limit; empty for a share or a count.
+        Unit of the measured value and of its limit; empty (the default) for a share or a count.
     remedy : str
-        Imperative sentence without a full stop.
+        Imperative sentence without a full stop; `DISABLE` by default.
     of_record : bool
-        Faults of the whole record rather than of single channels.
+        True for faults of the whole record rather than of single channels; False by default.
     """
 
     unit: str = ""
@@ -49,7 +49,7 @@ KINDS = {
     ),
     "inverted polarity": FaultKind(remedy="swap their wires, or disable them in a layout file"),
     "swapped": FaultKind(unit="µs", remedy=_LAYOUT),
-    "late": FaultKind(unit="µs", remedy="give their lateness as array.delay_s, or disable them in a layout file"),
+    "late": FaultKind(unit="µs", remedy="give their delay as array.delay_s, or disable them in a layout file"),
     "order of channels": FaultKind(unit="µs", remedy=_LAYOUT, of_record=True),
     "order of bytes": FaultKind(unit="dB", remedy="swap the bytes of every number when importing", of_record=True),
     "repeated blocks": FaultKind(
@@ -63,5 +63,5 @@ KINDS = {
 
 
 def kind_of(fault: str) -> FaultKind:
-    """Return the kind of a fault by its name as reports have it."""
+    """Return the kind of a fault, given its name in a report."""
     return KINDS.get(fault) or KINDS[next(name for name in KINDS if fault.startswith(name))]

@@ -1,4 +1,4 @@
-"""Checks of the level and the noise of each channel against the array's median."""
+"""Checks of the level and the noise of each channel, relative to the array's median."""
 
 from collections.abc import Sequence
 
@@ -16,17 +16,17 @@ from ertis_numba.analysis.health.report import ChannelHealth, Finding
 
 __all__ = ["flip_findings", "gain_findings", "in_limit_cycles", "noise_findings"]
 
-_MIN_CHANNELS = 5  # of which a median and a spread can be had
-_DEVIATIONS = 5.0  # of the array's own spread
-_NORMAL = 1.4826  # standard deviations of a normal distribution in a median absolute deviation
-_LOWEST_NOISE_DB = -100.0  # in the call's band; below it lie rounding and the ends of echoes
+_MIN_CHANNELS = 5  # Minimum number for a median and a spread.
+_DEVIATIONS = 5.0  # Limit in standard deviations of the array's own spread.
+_NORMAL = 1.4826  # Ratio of the standard deviation of a normal distribution to its median absolute deviation.
+_LOWEST_NOISE_DB = -100.0  # Noise in the call's band; only rounding and the ends of echoes lie below.
 _MAX_LEVEL_DB = 20.0
-_LIMIT_CYCLE_DB = -120.0  # of PDM, in the call's band: far below the noise of any modulator
+_LIMIT_CYCLE_DB = -120.0  # Noise of PDM in the call's band, far below the noise of any modulator.
 _SHARE_OF_LIMIT_CYCLES = 0.1
 
 
 def in_limit_cycles(quiet_db: NDArray[np.float64]) -> bool:
-    """Return whether so many modulators of PDM repeat themselves without noise that channels cannot be compared."""
+    """Return True if too many PDM modulators are in limit cycles without noise, so channels cannot be compared."""
     return float(np.mean(quiet_db < _LIMIT_CYCLE_DB)) > _SHARE_OF_LIMIT_CYCLES
 
 
@@ -37,13 +37,13 @@ def _limit(values_db: NDArray[np.float64], min_db: float) -> tuple[NDArray[np.fl
 
 
 def gain_findings(channels: Sequence[int], level_db: NDArray[np.float64]) -> list[Finding]:
-    """Return the channels in which one arrival is too loud or too quiet.
+    """Return the channels in which the strongest arrival is too loud or too quiet.
 
     Parameters
     ----------
     channels : sequence of int
     level_db : (channel,) float64
-        Of the arrival; NaN where its waveform is not that of the other channels.
+        Level of the arrival in dB; NaN if its waveform differs from that of the other channels.
     """
     known = np.isfinite(level_db)
     if known.sum() < _MIN_CHANNELS:
@@ -59,15 +59,15 @@ def gain_findings(channels: Sequence[int], level_db: NDArray[np.float64]) -> lis
 def noise_findings(
     channels: Sequence[ChannelHealth], quiet_db: NDArray[np.float64], *, white_db: float | None
 ) -> list[Finding]:
-    """Return the channels with more noise than the others in their own quietest eighth of the record.
+    """Return the channels with more noise than the others, each in its own quietest eighth of the record.
 
     Parameters
     ----------
     channels : sequence of ChannelHealth
     quiet_db : (channel,) float64
-        In the call's band, full scale 1.
+        Noise in the call's band, in dB relative to a full scale of 1.
     white_db : float or None
-        Level of white bits in that band; None of PCM.
+        Level of white bits in that band; None for PCM.
     """
     if len(channels) < 2 or (white_db is not None and in_limit_cycles(quiet_db)):
         return []
@@ -89,15 +89,15 @@ def noise_findings(
 
 
 def flip_findings(channels: Sequence[ChannelHealth], floor_db: NDArray[np.float64]) -> list[Finding]:
-    """Return the channels of PDM whose floor is that of a share of white bits.
+    """Return the PDM channels whose noise floor indicates flipped bits.
 
-    ``p`` flipped bits add ``4 p (1 - p)`` of the power of white bits, at all frequencies alike.
+    A share ``p`` of flipped bits adds ``4 p (1 - p)`` of the power of white bits, equally at all frequencies.
 
     Parameters
     ----------
     channels : sequence of ChannelHealth
     floor_db : (channel,) float64
-        Density of the quietest lines, relative to white bits.
+        Power density of the quietest lines, in dB relative to white bits.
     """
     return [
         Finding(fault="flipped bits", channels=(item.channel,), measured=value, limit=MAX_FLIPPED_DB)

@@ -1,4 +1,4 @@
-"""Checks of single channels on the numbers of PCM: stuck, saturated, offset."""
+"""Checks on the samples of single PCM channels: stuck, saturated, offset."""
 
 import math
 from typing import Any
@@ -11,16 +11,17 @@ from ertis_numba.analysis.health.report import ChannelHealth, Finding
 
 __all__ = ["by_numbers", "scaled", "swapped_bytes"]
 
-_FULL = 1 - 2.0**-15  # of full scale: the largest number of 16 bits; float32 has no end, and clips where it did before
+# The largest 16-bit sample, relative to full scale. float32 has no limit, so it clips at the level of its source.
+_FULL = 1 - 2.0**-15
 
 
 def scaled(words: NDArray[Any], full: float, channel: int) -> NDArray[np.float32]:
-    """Return a channel of PCM whose full scale becomes 1."""
+    """Return the samples of a PCM channel, scaled to a full scale of 1."""
     return np.asarray(np.multiply(words[:, channel], np.float32(1 / full), dtype=np.float32))
 
 
 def by_numbers(channel: int, signal: NDArray[np.float32], *, is_float: bool) -> ChannelHealth:
-    """Return figures and faults of a channel of PCM that need no spectrum."""
+    """Return the statistics and faults of a PCM channel that need no spectrum."""
     changes = float(np.mean(signal[1:] != signal[:-1]))
     level = np.abs(signal)
     peak = float(level.max())
@@ -37,7 +38,7 @@ def by_numbers(channel: int, signal: NDArray[np.float32], *, is_float: bool) -> 
 
 
 def swapped_bytes(words: NDArray[np.int16], channels: tuple[int, ...]) -> list[Finding]:
-    """Return a finding if numbers of 16 bits vary less from one to the next with their bytes swapped."""
+    """Return a finding if consecutive 16-bit samples differ less after a swap of their bytes."""
     roughness = []
     for numbers in (words, words.byteswap()):
         steps = np.diff(numbers[:, list(channels)].astype(np.float64), axis=0)

@@ -1,4 +1,4 @@
-"""Checks of words against words: identical channels, blocks that come twice, stretches without a change."""
+"""Checks for repetition: identical channels, repeated blocks, sections without a change, and hum."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -12,10 +12,10 @@ from ertis_numba.analysis.health.report import Finding
 __all__ = ["duplicates", "hum", "repeated_blocks", "stuck_at_times"]
 
 _MIN_CHANNELS = 4
-_ANCHOR_EVERY = 64  # samples, in the mean
-_MIX = np.uint64(0x9E3779B97F4A7C15)  # the golden ratio in 64 bits, as in SplitMix64
-_SHARE_OF_TWINS = 0.25  # of PCM; a symmetrical array hears some echoes alike, if nothing has noise
-_MIN_CHANGING = 0.25  # of samples in a repeated block that differ from those a few samples earlier
+_ANCHOR_EVERY = 64  # Mean distance of anchors in samples.
+_MIX = np.uint64(0x9E3779B97F4A7C15)  # The golden ratio in 64 bits, as in SplitMix64.
+_SHARE_OF_TWINS = 0.25  # Limit for PCM: without noise, a symmetrical array may receive identical echoes.
+_MIN_CHANGING = 0.25  # Minimum share of samples in a repeated block that differ from those a few samples earlier.
 
 
 def duplicates(columns: Sequence[tuple[int, NDArray[Any]]], *, is_pdm: bool) -> list[Finding]:
@@ -24,8 +24,9 @@ def duplicates(columns: Sequence[tuple[int, NDArray[Any]]], *, is_pdm: bool) -> 
     Parameters
     ----------
     columns : sequence of (channel, samples)
-        Those that are not stuck.
+        Channels that are not stuck, with their samples.
     is_pdm : bool
+        True if the samples are bits.
     """
     groups: dict[bytes, list[int]] = {}
     for channel, column in columns:
@@ -48,7 +49,7 @@ def duplicates(columns: Sequence[tuple[int, NDArray[Any]]], *, is_pdm: bool) -> 
 
 
 def stuck_at_times(columns: Sequence[tuple[int, NDArray[Any]]], *, largest: int) -> list[Finding]:
-    """Return the channels that do not change over a long stretch, though they do elsewhere."""
+    """Return the channels that have a section of more than ``largest`` samples without a change."""
     found = []
     for channel, column in columns:
         changes = np.flatnonzero(column[1:] != column[:-1])
@@ -63,18 +64,19 @@ def stuck_at_times(columns: Sequence[tuple[int, NDArray[Any]]], *, largest: int)
 
 
 def repeated_blocks(words: NDArray[Any], channels: tuple[int, ...]) -> list[Finding]:
-    """Return the longest block of words that comes twice.
+    """Return a finding for the longest block of samples that occurs twice.
 
-    Anchors are samples whose hash with the seven after them ends in six zeros, so that a block that is repeated at any
-    distance has the same anchors. Each distance that at least two pairs of anchors have in common is compared.
+    Anchors are samples whose hash, together with the samples after them, ends in six zeros. A block that is repeated at
+    any distance therefore has the same anchors. The most frequent distances between equal anchors are compared in full.
 
     Parameters
     ----------
     words : (sample, word) or (sample, channel)
     channels : tuple of int
+        Channels to name in the finding.
     """
     n_samples = len(words)
-    # The modulators of a few microphones repeat themselves now and then.
+    # With few microphones, modulators repeat their bits occasionally by chance.
     if n_samples < 2 * MIN_REPEATED_SAMPLES or len(channels) < _MIN_CHANNELS:
         return []
     octets = np.ascontiguousarray(words).view(np.uint8)
@@ -94,7 +96,7 @@ def repeated_blocks(words: NDArray[Any], channels: tuple[int, ...]) -> list[Find
     values = hashed[places]
     order = np.argsort(values, kind="stable")
     same = np.flatnonzero(values[order][1:] == values[order][:-1])
-    # A pattern that goes round and round has anchors without number, and is a fault of its channels instead.
+    # A periodic pattern has very many equal anchors. It is a fault of its channels and is reported as such.
     if not len(same) or len(np.unique(values)) < len(values) / 4:
         return []
     distances, counts = np.unique(places[order][same + 1] - places[order][same], return_counts=True)
@@ -117,15 +119,15 @@ def repeated_blocks(words: NDArray[Any], channels: tuple[int, ...]) -> list[Find
             channels=channels,
             measured=float(longest_block),
             limit=float(MIN_REPEATED_SAMPLES),
-            detail=f"samples {first}-{first + longest_block - 1} come again {distance} samples later",
+            detail=f"samples {first}-{first + longest_block - 1} occur again {distance} samples later",
         )
     ]
 
 
 def _is_cycle(block: NDArray[Any]) -> bool:
-    """Return whether a block goes round in a cycle shorter than the blocks that are reported.
+    """Return True if a block is periodic, with a period shorter than the blocks that are reported.
 
-    Modulators without noise alternate for thousands of samples. Such stretches are equal wherever they occur.
+    Modulators without noise alternate for thousands of samples. All such sections are equal.
     """
     start = block[: 4 * MIN_REPEATED_SAMPLES]
     lags = range(1, min(MIN_REPEATED_SAMPLES, len(start)))
@@ -133,16 +135,16 @@ def _is_cycle(block: NDArray[Any]) -> bool:
 
 
 def hum(columns: Sequence[tuple[int, NDArray[Any]]], *, block: int, full_scale: float) -> list[Finding]:
-    """Return the channels that move slowly while others do not.
+    """Return the channels with low-frequency hum that most other channels do not have.
 
     Parameters
     ----------
     columns : sequence of (channel, samples)
-        Bits, or the numbers of PCM.
+        Channels with their bits or PCM samples.
     block : int
-        Samples of which the mean is taken: some periods of the call.
+        Number of samples to average: several periods of the call.
     full_scale : float
-        Half of the difference between the highest and the lowest number.
+        Half of the difference between the highest and the lowest sample value.
     """
     if not columns or len(columns[0][1]) < 4 * block:
         return []

@@ -1,4 +1,4 @@
-"""State of an array: what the checks report, and its merging over measurements."""
+"""Health report of an array, and the merging of reports over measurements."""
 
 import statistics
 from collections.abc import Iterable, Sequence
@@ -12,19 +12,20 @@ __all__ = ["ChannelHealth", "Finding", "Health", "merge"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finding:
-    """A fault with the value that shows it.
+    """Fault with the measured value that indicates it.
 
     Attributes
     ----------
     fault : str
-        A name of `ertis_numba.analysis.health.kinds.KINDS`.
+        Name of the fault in `ertis_numba.analysis.health.kinds.KINDS`.
     channels : tuple of int
-        The channels that have it; of a fault of the record, all that were examined.
+        Faulty channels; for a fault of the record, all examined channels.
     measured : float
-        The value, which is beyond the limit.
+        Measured value, which is beyond the limit, in the unit of ``unit``.
     limit : float
+        Limit of the measured value.
     detail : str
-        More about it, such as the layout that fits.
+        Further information, such as the layout that fits; empty by default.
     """
 
     fault: str
@@ -46,30 +47,31 @@ class Finding:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChannelHealth:
-    """State and figures of one microphone; figures that cannot be told are None.
+    """Health of one microphone. Statistics that could not be measured are None, the default.
 
     Attributes
     ----------
     channel : int
-        Its bit in the words, counted from 0.
+        Channel, counted from 0; for PDM, the bit in the words.
     faults : tuple of str
-        Of those in `ertis_numba.analysis.health.kinds.KINDS`; PCM is ``stuck at`` any number.
+        Names of faults in `ertis_numba.analysis.health.kinds.KINDS`; empty by default. PCM channels may be ``stuck at``
+        any value.
     offset : float or None
-        Mean of the bits taken as −1 and 1, or of PCM, full scale 1.
+        Mean of the bits as −1 and 1, or of PCM samples relative to full scale.
     changes : float or None
-        Share of samples that differ from the one before.
+        Share of samples that differ from the previous one.
     overload : float or None
-        Share of samples at which 17 equal bits begin, or that are at full scale; of float32, at the highest amplitude
-        of the record.
-    level_db : float or None
-        Of the sound in the call's band while it is loud, the noise taken off and the calibrated gain, beside the
-        median of all channels.
-    noise_dbfs : float or None
-        In the call's band while it is quiet: mean square of the signal, full scale 1; of float32 beyond that, the
+        Share of samples at which 17 equal bits start, or of PCM samples at full scale. For float32, full scale is the
         highest amplitude of the record.
+    level_db : float or None
+        Level of the sound in the call's band in the loud eighth of the record, relative to the median of all channels.
+        The noise is subtracted, and the calibrated gain is compensated.
+    noise_dbfs : float or None
+        Noise in the call's band in the quiet eighth of the record: mean square of the signal relative to full scale.
+        For float32 samples beyond 1, full scale is the highest amplitude of the record.
     tone_hz, tone_db : float or None
-        By how much the highest line stands out of its surroundings, in the mean over time and without lines that
-        most channels hear; and where it is, if it counts as a tone.
+        Frequency of the highest spectral line, if it counts as a tone, and its level relative to the surrounding lines.
+        The spectrum is averaged over time and excludes lines that most channels share.
     """
 
     channel: int
@@ -84,32 +86,32 @@ class ChannelHealth:
 
     @property
     def state(self) -> str:
-        """The faults, ``ok``, or ``unknown`` where the record is too short to tell anything."""
+        """Names of the faults, ``ok``, or ``unknown`` if the record is too short for any check."""
         return ", ".join(self.faults) or ("ok" if self.offset is not None else "unknown")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Health:
-    """State of an array.
+    """Health of an array.
 
     Attributes
     ----------
     channels : tuple of ChannelHealth
-        The enabled ones.
+        Health of the enabled channels.
     measurements : int
-        How many were looked at.
+        Number of examined measurements; 1 by default.
     noise_dbfs : float or None
-        In the call's band: mean over the channels without fault.
+        Noise in the call's band, averaged over the channels without fault.
     dynamic_range_db : float or None
-        From a full-scale echo of the whole call in every microphone down to the noise of the image.
+        Ratio of a full-scale echo of the whole call in every microphone to the noise of the image, in dB.
     tones_hz : tuple of float
-        Lines that most channels hear, which is a fault of none.
+        Frequencies of spectral lines that most channels share; these are not faults of channels.
     unknown : tuple of str
-        What could not be told, by no measurement, and why.
+        Checks that no measurement permitted, with the reason.
     findings : tuple of Finding
-        Each fault of each channel and of the record, with its measured value and its limit.
+        All faults of channels and of the record, with measured values and limits.
     not_observable : tuple of str
-        Faults that this scene does not show, and why: such as the order of channels without a compact arrival.
+        Faults that the scene cannot reveal, with the reason, such as the order of channels without a compact arrival.
     """
 
     channels: tuple[ChannelHealth, ...]
@@ -128,32 +130,41 @@ class Health:
 
     @property
     def faults(self) -> dict[str, tuple[int, ...]]:
-        """The channels of each fault that there is."""
+        """Faulty channels for each fault that was found."""
         names = dict.fromkeys(name for item in self.channels for name in item.faults)
         of_channels = {name: tuple(item.channel for item in self.channels if name in item.faults) for name in names}
         return of_channels | {finding.fault: finding.channels for finding in self.record_faults}
 
     def verdict(self) -> str:
-        """Return what is wrong with which channels as a part of a line; it is empty if nothing is."""
+        """Return a one-line summary of all faults with their channels; empty if there are no faults."""
         total = len(self.channels)
         return "; ".join(f"{name}: {_named(channels, total)}" for name, channels in self.faults.items())
 
 
 def merge(reports: Sequence[Health]) -> Health:
-    """Return the state of an array over several of its measurements.
+    """Merge the health reports of several measurements of one array.
 
-    A fault is one that any of them shows; figures are medians over those that could tell.
+    The result contains every fault of any report. Statistics are medians over the reports that have them.
+
+    Parameters
+    ----------
+    reports : sequence of Health
+        At least one report; all must have the same channels.
+
+    Returns
+    -------
+    Health
 
     Raises
     ------
     ArgumentError
-        There are none, or their channels differ.
+        There are no reports, or their channels differ.
     """
     if not reports:
-        raise ArgumentError("reports are none; give at least one")
+        raise ArgumentError("reports is empty; give at least one report")
     first, *others = ([item.channel for item in report.channels] for report in reports)
     if any(other != first for other in others):
-        raise ArgumentError("reports are of different channels; give those of one array")
+        raise ArgumentError("reports have different channels; give reports of one array")
     return Health(
         channels=tuple(_merged(items) for items in zip(*(report.channels for report in reports), strict=True)),
         measurements=sum(report.measurements for report in reports),
@@ -169,7 +180,7 @@ def merge(reports: Sequence[Health]) -> Health:
 
 
 def _merged(items: Sequence[ChannelHealth]) -> ChannelHealth:
-    """Return what several measurements tell of one channel."""
+    """Return the merged health of one channel."""
     names = ("offset", "changes", "overload", "level_db", "noise_dbfs")
     figures = {name: _median(getattr(item, name) for item in items) for name in names}
     loudest = max(items, key=lambda item: item.tone_db or 0.0)
@@ -183,7 +194,7 @@ def _merged(items: Sequence[ChannelHealth]) -> ChannelHealth:
 
 
 def _worst(findings: Sequence[Finding]) -> tuple[Finding, ...]:
-    """Return one finding for each fault and its channels: the one farthest beyond its limit."""
+    """Return one finding for each fault and its channels: the one farthest from its limit."""
     worst: dict[tuple[str, tuple[int, ...]], Finding] = {}
     for finding in findings:
         key = finding.fault, finding.channels
@@ -198,7 +209,7 @@ def _median(values: Iterable[float | None]) -> float | None:
 
 
 def _named(channels: Sequence[int], total: int) -> str:
-    """Return channels in words, neighbours as from-to."""
+    """Return a text with the channels, in which consecutive channels form ranges."""
     if len(channels) == total:
         return "every channel" if total > 1 else f"channel {channels[0]}"
     ends: list[list[int]] = []

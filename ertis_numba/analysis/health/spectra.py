@@ -1,4 +1,4 @@
-"""Checks of single channels on their spectra over time: dead, idle tone, level and noise."""
+"""Checks on the spectrograms of single channels: dead, idle tone, level and noise."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -16,15 +16,15 @@ from ertis_numba.settings import Settings
 
 __all__ = ["by_spectra"]
 
-_SEGMENTS = 8  # without overlap, so that some are loud and some are quiet
-_LONGEST_SEGMENT = 2**14  # 3.6 ms of an eRTIS, about a call, in lines of 275 Hz
-_MIN_LINES = 8  # in the call's band; with fewer, echoes may cancel at a single microphone by chance
-_FIRST_LINE = 3  # a Hann window leaks an offset into the lines before
-_LOWEST_HZ = 20.0  # that can be heard
-_MIN_SOUND = 1e-3  # of the power; less is the chance of the noise
+_SEGMENTS = 8  # Minimum number of segments without overlap, so that some are loud and some are quiet.
+_LONGEST_SEGMENT = 2**14  # 3.6 ms of an eRTIS, about the length of a call, with lines of 275 Hz.
+_MIN_LINES = 8  # Minimum in the call's band. With fewer lines, echoes may cancel at one microphone by chance.
+_FIRST_LINE = 3  # A Hann window leaks an offset into the lines below.
+_LOWEST_HZ = 20.0  # Lower limit of the audible band.
+_MIN_SOUND = 1e-3  # Minimum share of the power; a smaller share is a chance result of noise.
 _FLOOR_QUANTILE = 0.2
 _TONE_MARGIN_DB = 3.0
-_NEARLY_LOUDEST_DB = 6.0  # below the loudest eighth; weaker sound says less about noisy microphones
+_NEARLY_LOUDEST_DB = 6.0  # Level below the loudest eighth. Weaker sound is less conclusive for noisy microphones.
 
 
 def by_spectra(
@@ -33,7 +33,17 @@ def by_spectra(
     found: Sequence[ChannelHealth],
     settings: Settings,
 ) -> tuple[list[ChannelHealth], tuple[float, ...], tuple[str, ...], list[Finding]]:
-    """Return the channels with figures of spectra, common tones, unknowns, and findings of level and noise."""
+    """Return the channels with spectral statistics, common tones, impossible checks, and findings of level and noise.
+
+    Parameters
+    ----------
+    signal_of : callable
+        Function that returns the samples of a channel.
+    n_samples : int
+    found : sequence of ChannelHealth
+        Channels that are not stuck.
+    settings : Settings
+    """
     call = settings.call
     size = min(_LONGEST_SEGMENT, 2 ** int(math.log2(n_samples / _SEGMENTS)))
     line_hz = settings.recording.sample_rate_hz / size
@@ -42,7 +52,7 @@ def by_spectra(
     if not found:
         return [], (), (), []
     if high - low < _MIN_LINES or low < _FIRST_LINE:
-        why = f"{n_samples} samples do not resolve the call's band"
+        why = f"{n_samples} samples are too few to resolve the call's band"
         return list(found), (), (f"dead microphones, tones and noise: {why}",), []
     spectra = [_bits.spectrogram(signal_of(item.channel), size=size, n_lines=high) for item in found]
     power = np.stack([lines[:, low:].sum(axis=1, dtype=np.float64) for lines in spectra])
@@ -52,7 +62,7 @@ def by_spectra(
     noise_db = _bits.decibels(noise)
     quiet_db = _bits.decibels(np.sort(power, axis=1)[:, :few].mean(axis=1))
     white_db = 10 * math.log10(2 * (high - low) / size)
-    # The quietest lines bound white noise from above: tones and echoes only add to some of them.
+    # The quietest lines are an upper bound of white noise, because tones and echoes only add power.
     quiet = np.argsort(np.median(power, axis=0), kind="stable")[: max(few, 2)]
     density = np.stack([lines[quiet, _FIRST_LINE:].mean(axis=0, dtype=np.float64) for lines in spectra])
     floor_db = _bits.decibels(np.quantile(density, _FLOOR_QUANTILE, axis=1)) + 10 * math.log10(size / 2)
@@ -62,17 +72,17 @@ def by_spectra(
     is_deaf = _deaf(power[:, order], noise, 20 * np.log10(sensitivity), few)
     unknown: tuple[str, ...] = ()
     if len(found) == 1:
-        unknown = ("a dead microphone: there is no other to compare it with",)
+        unknown = ("a dead microphone: no other channel is available for comparison",)
     elif np.median(_bits.decibels(loud) - noise_db) < MIN_RISE_DB:
-        unknown = ("dead microphones: no sound stands out of the noise",)
+        unknown = (f"dead microphones: no sound exceeds the noise by {MIN_RISE_DB:g} dB",)
 
     elif settings.recording.is_pdm and in_limit_cycles(quiet_db):
-        unknown = ("dead microphones: modulators repeat themselves without noise",)
+        unknown = ("dead microphones: the modulators are in limit cycles without noise",)
 
     first = max(_FIRST_LINE, math.ceil(_LOWEST_HZ / line_hz))
-    # In the mean of decibels a tone, which is always there, outdoes echoes, which come and go.
+    # In the mean of decibels, a permanent tone exceeds intermittent echoes.
     rise_db = _bits.rises(np.stack([_bits.decibels(lines[:, first:]).mean(axis=0) for lines in spectra]))
-    # A tone at the limit is beyond it in some channels only, and is common nevertheless.
+    # A common tone near the limit may exceed the limit in some channels only, so the limit has a margin.
     is_common, _ = _bits.common_lines(rise_db, MAX_TONE_DB - _TONE_MARGIN_DB, COMMON_SHARE)
     _, common = _bits.common_lines(rise_db, MAX_TONE_DB, COMMON_SHARE)
     rise_db[:, is_common] = 0.0
@@ -98,19 +108,20 @@ def by_spectra(
 def _deaf(
     power: NDArray[np.float64], noise: NDArray[np.float64], sensitivity_db: NDArray[np.float64], few: int
 ) -> NDArray[np.bool_]:
-    """Return the channels that miss the sound in every eighth that is nearly as loud as the loudest: (mic,) bool.
+    """Return True for each channel without sound in every eighth nearly as loud as the loudest: (mic,) bool.
 
-    Two echoes can cancel at one microphone in a single eighth.
+    A single eighth is not sufficient, because two echoes can cancel at one microphone.
 
     Parameters
     ----------
     power : (mic, segment) float64
-        Segments in the order of their loudness.
+        Power in the call's band, with segments in ascending order of loudness.
     noise : (mic,) float64
+        Power of the noise.
     sensitivity_db : (mic,) float64
-        Calibrated gain.
+        Calibrated gain in dB.
     few : int
-        Segments in an eighth.
+        Number of segments in an eighth.
     """
     is_deaf, loudest_db = np.ones(len(power), bool), math.inf
     for last in range(power.shape[1], few, -few):

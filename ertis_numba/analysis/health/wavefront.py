@@ -1,4 +1,4 @@
-"""Checks of each channel against the wavefront of the strongest arrival: polarity, order, delay, and the emission."""
+"""Checks on the wavefront of the strongest arrival: polarity, order and delay of channels, and time of the emission."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -18,26 +18,26 @@ from ertis_numba.settings import Settings
 __all__ = ["by_wavefront"]
 
 _DESCRIPTIONS = "polarity, order and delay of channels, and a shift of the record"
-_COMPACT_SHARE = 0.75  # of the microphones that a wavefront must fit
-_PERMUTED_SHARE = 0.9  # of those that it fits in another order
-_MIN_INCOMPATIBLE = 0.25  # by which the other order must fit more
-_MIN_PATH_M = 0.2  # of an echo; shorter ones look like the direct sound
-_MIN_DEPTH_M = 0.01  # of the distances from the emitter; on a ring its sound is that of an echo from ahead
-_DIRECT_SPREAD = 0.75  # relative to that of an echo, which has two more unknowns
-_MIN_RECORD_CHANNELS = 12  # fewer fit another order or the emitter by chance
-_PILOTS = 4  # microphones among which the strongest arrival is looked for
-_MAX_SPREAD_S = 3e-6  # of the wavefront, beyond which carriers say nothing
-_HALF_PERIOD_S = 12e-6  # of the highest usual carrier
-_AGREEMENT_S = 8e-6  # of the delays of a swapped pair, or of the halves of the band
+_COMPACT_SHARE = 0.75  # Minimum share of the microphones that a wavefront must fit.
+_PERMUTED_SHARE = 0.9  # Minimum share of the microphones that it must fit in another order.
+_MIN_INCOMPATIBLE = 0.25  # Minimum additional share that the other order must fit.
+_MIN_PATH_M = 0.2  # Minimum path of an echo; shorter paths are indistinguishable from the direct sound.
+_MIN_DEPTH_M = 0.01  # Minimum spread of distances from the emitter. On a ring, its sound equals an echo from ahead.
+_DIRECT_SPREAD = 0.75  # Maximum spread relative to that of an echo, which has two more unknowns.
+_MIN_RECORD_CHANNELS = 12  # Fewer channels fit another order or the emitter by chance.
+_PILOTS = 4  # Number of microphones in which the strongest arrival is searched.
+_MAX_SPREAD_S = 3e-6  # Spread of the wavefront, beyond which the phase of the carrier is not conclusive.
+_HALF_PERIOD_S = 12e-6  # Half a period of the highest usual carrier.
+_AGREEMENT_S = 8e-6  # Tolerance between the delays of a swapped pair, or of the two halves of the band.
 _LAG_S = 60e-6
-_PRESENT = 0.85  # of the usual amplitude
-_DEVIATIONS = 7.5  # of the median absolute residual of the wavefront: five of a normal distribution
+_PRESENT = 0.85  # Minimum correlation relative to the usual value for an arrival at its expected time.
+_DEVIATIONS = 7.5  # Median absolute residuals of the wavefront; five deviations of a normal distribution.
 _COHERENT = 0.85
-_COMPACT_COHERENCE = 0.97  # of the median channel; a single echo has 0.995
-_SAME = 0.95  # coherence of a channel whose delay or level is compared
+_COMPACT_COHERENCE = 0.97  # Minimum coherence of the median channel; a single echo has 0.995.
+_SAME = 0.95  # Minimum coherence of a channel whose delay or level is compared.
 _INVERTED = 0.97
-_OPPOSITE = 1.08  # ratio of negative to positive correlation; a half period of an octave's band has 0.83
-_MAX_SUSPECTS = 0.25  # of the microphones; where more of them disagree, the arrival is to blame
+_OPPOSITE = 1.08  # Minimum ratio of negative to positive correlation; half a period of an octave band has 0.83.
+_MAX_SUSPECTS = 0.25  # Maximum share of microphones; if more disagree, the arrival is the cause.
 
 
 def by_wavefront(
@@ -47,16 +47,17 @@ def by_wavefront(
     *,
     n_samples: int,
 ) -> tuple[list[Finding], tuple[str, ...]]:
-    """Return what the strongest arrival shows, and what it cannot show.
+    """Return the findings from the strongest arrival, and the faults that it cannot reveal.
 
     Parameters
     ----------
     signals : callable
-        Samples of a channel.
+        Function that returns the samples of a channel.
     channels : sequence of int
-        Those that carry sound.
+        Channels that carry sound.
     settings : Settings
     n_samples : int
+        Number of samples of the record.
     """
     layout, speed_m_s = microphones(settings.array), sound_speed_m_s(settings.air)
     positions_m = layout.positions_m[list(channels)]
@@ -66,14 +67,14 @@ def by_wavefront(
     width_s = float(2 * np.linalg.norm(positions_m, axis=1).max(initial=0.0)) / speed_m_s
     arrived = strongest(found, width_s)
     if arrived is None:
-        return [], (f"{_DESCRIPTIONS}: no arrival stands out",)
+        return [], (f"{_DESCRIPTIONS}: no arrival exceeds the background",)
     times_s, middle_s = arrived
     times_s = times_s - layout.delay_s[list(channels)]
     path_m = max(middle_s * speed_m_s, _MIN_PATH_M)
     curvatures = (0.0, 1 / path_m, 2 / path_m)
     echo = fit_delays(times_s, positions_m, curvatures, speed_m_s)
     if echo is None:
-        return [], (f"{_DESCRIPTIONS}: {len(channels)} microphones are too few for a wavefront",)
+        return [], (f"{_DESCRIPTIONS}: {len(channels)} microphones are too few to fit a wavefront",)
     direct = fit_emitter(times_s, positions_m, speed_m_s)
     from_centre_m = np.linalg.norm(positions_m, axis=1)
     is_direct = (
@@ -82,12 +83,12 @@ def by_wavefront(
         and float(np.ptp(from_centre_m)) > _MIN_DEPTH_M
     )
     if not is_direct and middle_s * speed_m_s < _MIN_PATH_M:
-        return [], (f"{_DESCRIPTIONS}: the strongest arrival is too near for a wavefront",)
+        return [], (f"{_DESCRIPTIONS}: the strongest arrival is too near to fit a wavefront",)
     fit = direct if is_direct else echo
     if fit.share < _COMPACT_SHARE:
         enough = len(channels) >= _MIN_RECORD_CHANNELS
         ordered = _other_order(times_s, channels, layout, fit, curvatures, speed_m_s) if enough else []
-        return (ordered, ()) if ordered else ([], (f"{_DESCRIPTIONS}: the strongest arrival is not of one wavefront",))
+        return (ordered, ()) if ordered else ([], (f"{_DESCRIPTIONS}: no single wavefront fits the strongest arrival",))
     findings = []
     if is_direct and len(channels) >= _MIN_RECORD_CHANNELS and abs(direct.emission_s) > MAX_SHIFT_S:
         findings.append(
@@ -100,13 +101,16 @@ def by_wavefront(
             )
         )
     findings += _of_channels(found, times_s, fit, channels, layout)
-    return findings, () if is_direct else ("a shift of the record: no direct sound stands out",)
+    return findings, () if is_direct else ("a shift of the record: the strongest arrival is not the direct sound",)
 
 
 def _loudest(
     signals: Callable[[int], NDArray[np.float32]], channels: Sequence[int], settings: Settings, n_samples: int
 ) -> tuple[int, int]:
-    """Return the samples around the strongest arrival of a few microphones, with a call's length to either side."""
+    """Return the slice of the record around the strongest arrival at a few microphones.
+
+    It extends from one call length before the arrival to two call lengths after it.
+    """
     rate_hz, call = settings.recording.sample_rate_hz, settings.call
     length = round(call.duration_s * rate_hz)
     few = list(channels)[:: max(1, len(channels) // _PILOTS)]
@@ -124,7 +128,7 @@ def _other_order(
     curvatures: tuple[float, ...],
     speed_m_s: float,
 ) -> list[Finding]:
-    """Return the order of channels that fits the arrival, if the given one does not."""
+    """Return a finding if the arrival fits another order of the channels."""
     best: tuple[float, float, str] | None = None
     for name, positions_m in _orders(layout):
         other_m = positions_m[list(channels)]
@@ -140,13 +144,13 @@ def _other_order(
             channels=tuple(channels),
             measured=1e6 * fit.spread_s,
             limit=1e6 * MAX_DELAY_S,
-            detail=f"{best[2]} fits {best[0]:.0%} of the microphones, the given order {fit.share:.0%}",
+            detail=f"{best[2]} fits {best[0]:.0%} of the microphones, the given order fits {fit.share:.0%}",
         )
     ]
 
 
 def _orders(layout: Layout) -> list[tuple[str, NDArray[np.float64]]]:
-    """Return positions of channels in orders that happen: those of shipped layouts, and those of turned words."""
+    """Return the channel positions for common orders: shipped layouts, and words with reversed bits or bytes."""
     n_channels = len(layout.enabled)
     octets = [channel ^ 7 for channel in range(n_channels)]
     orders = [("the reversed order", layout.positions_m[::-1])]
@@ -167,7 +171,7 @@ def _orders(layout: Layout) -> list[tuple[str, NDArray[np.float64]]]:
 def _of_channels(
     found: Compressed, times_s: NDArray[np.float64], fit: Fit, channels: Sequence[int], layout: Layout
 ) -> list[Finding]:
-    """Return the channels whose signal is not where the wavefront is, or upside down."""
+    """Return findings for channels with a delay or gain that differs from the wavefront, or with inverted polarity."""
     picked = list(channels)
     gain, delay_s = layout.gain[picked], layout.delay_s[picked]
     matrix = np.column_stack([np.ones(len(picked)), layout.positions_m[picked]])
@@ -176,13 +180,13 @@ def _of_channels(
         wide = aligned(found, fitted_s + delay_s, _LAG_S) / gain[:, None]
         reference = mean_of(wide[fit.inliers], found, _LAG_S)
         here = correlate(wide, reference, found, _LAG_S)
-        # The carrier gives the delay of those in line; their common slope belongs to the wavefront.
+        # The carrier determines the delays of the inliers; their common slope is a property of the wavefront.
         near = fit.inliers & (np.abs(here.lag_s) < MAX_DELAY_S)
         if near.sum() > matrix.shape[1]:
             fitted_s = fitted_s + matrix @ np.linalg.lstsq(matrix[near], here.lag_s[near], rcond=None)[0]
     if np.median(here.coherence) < _COHERENT:
         return []
-    # Where the lag may be beyond the gate, the channel is aligned by its own peak.
+    # A channel with a lag beyond the gate is aligned to its own peak.
     own = correlate(aligned(found, times_s + delay_s, _LAG_S) / gain[:, None], reference, found, _LAG_S)
     if np.median(own.coherence) < _COMPACT_COHERENCE:
         return []
@@ -196,11 +200,11 @@ def _of_channels(
     if fit.spread_s > _MAX_SPREAD_S:
         return findings
     inverted = (here.opposite >= _INVERTED) & (here.negative > _OPPOSITE * np.maximum(here.peak, own.peak))
-    inverted &= np.abs(times_s - fitted_s) < _HALF_PERIOD_S  # an echo that is late by half a period is none
+    inverted &= np.abs(times_s - fitted_s) < _HALF_PERIOD_S  # An echo delayed by half a period is not inverted.
     moved = ~inverted & (coherence >= _SAME) & (here.at_zero < _PRESENT * usual)
     limit_s = max(MAX_DELAY_S, _DEVIATIONS * fit.spread_s)
     moved &= np.abs(offset_s) > limit_s
-    # Echoes that overlap shift the carrier by a period, but neither the envelope nor both halves of the band with it.
+    # Overlapping echoes may shift the carrier by a period, but not the envelope or both halves of the band alike.
     moved &= np.abs(times_s - fitted_s - offset_s) < _HALF_PERIOD_S
     if moved.any():
         moved &= _in_half_bands(found, fitted_s + delay_s, offset_s, fit.inliers)
@@ -221,7 +225,7 @@ def _of_channels(
 def _in_half_bands(
     found: Compressed, at_s: NDArray[np.float64], offset_s: NDArray[np.float64], inliers: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Return whether each channel has its offset in either half of the band: (mic,) bool."""
+    """Return True for each channel whose offset is the same in both halves of the band: (mic,) bool."""
     agrees = np.ones(len(at_s), bool)
     for half in half_bands(found):
         reference = mean_of(aligned(half, at_s, _LAG_S)[inliers], half, _LAG_S)
@@ -237,7 +241,7 @@ def _moved(
     channels: Sequence[int],
     limit_s: float,
 ) -> list[Finding]:
-    """Return pairs whose delays fit each other's place as swapped, and the others as late."""
+    """Return findings for delayed channels: ``swapped`` for pairs that fit each other's position, else ``late``."""
     findings, left = [], mics.tolist()
     while left:
         mic = left.pop(0)
