@@ -150,7 +150,9 @@ def test_scene_that_would_exceed_the_memory_is_refused_with_its_number(scene, me
 
 def test_measurement_that_would_exceed_the_memory_is_refused_with_its_number(monkeypatch):
     monkeypatch.setattr("ertis_numba.simulation.bounds.MAX_AMPLITUDES", 100)
-    message = r"scene has 1 sound paths to 3 microphones at \d+ frequencies, in total \d+ amplitudes; the limit is 100\."
+    message = (
+        r"scene has 1 sound paths to 3 microphones at \d+ frequencies, in total \d+ amplitudes; the limit is 100\."
+    )
     with pytest.raises(ArgumentError, match=message):
         Engine(scene_of(Point(range_m=0.6)), SENSOR, frozenset({"propagation"})).render()
 

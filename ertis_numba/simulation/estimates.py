@@ -78,9 +78,7 @@ def unequal(sight: Sight, weight: NDArray[np.complex128], reason: str) -> Estima
     """Return the change of the image by weights of the microphones: (mic, frequency)."""
     directions = sight.heard.direction[sight.shown]
     if not len(directions):  # echoes outside the range window may still reach into it, which an A/B render measures
-        return Estimate(
-            change_db=sight.shot.scene.tolerance_db, reason=f"{reason}; the image shows only side lobes"
-        )
+        return Estimate(change_db=sight.shot.scene.tolerance_db, reason=f"{reason}; the image shows only side lobes")
     change = sight.beam_change(directions, weight)
     found = 20 * math.log10(1 + change)
     return Estimate(change_db=found, reason=f"{reason}: beams change by {found:.2f} dB relative to their reflector")

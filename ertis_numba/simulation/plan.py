@@ -122,7 +122,9 @@ def make_plan(scene: Scene) -> EffectPlan:
 def _kept_on(verdict: Verdict) -> Verdict:
     if verdict.forced:
         return verdict
-    return replace(verdict, on=True, coupled=True, reason=f"{verdict.reason}; stays on, because other effects depend on it")
+    return replace(
+        verdict, on=True, coupled=True, reason=f"{verdict.reason}; stays on, because other effects depend on it"
+    )
 
 
 def _indices(scene: Scene) -> list[int]:
