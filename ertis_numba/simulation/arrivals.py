@@ -16,7 +16,7 @@ from ertis_numba.simulation.sensors import Emitter
 from ertis_numba.simulation.snapshot import Snapshot, TransmitterPose
 from ertis_numba.simulation.stopwatch import CostStopwatch
 
-__all__ = ["Arrivals", "arrivals", "echoes", "effect", "emitted", "gains", "transmitter_of", "responses"]
+__all__ = ["Arrivals", "arrivals", "echoes", "effect", "emitted", "gains", "responses", "transmitter_of"]
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]

@@ -47,7 +47,7 @@ class Verdict:
     rehearsed : bool
         True if an A/B render measured the change, because the estimate was too close to the tolerance.
     coupled : bool
-        True if this effect and another one each matter only depending on the other. Both are then on, to be safe.
+        True if the decision about this effect depends on another effect and vice versa. Both are then on, to be safe.
     """
 
     name: str

@@ -18,10 +18,10 @@ _FAR = 0.02  # below this u, the far field is accurate to a few thousandths
 def disc(tilt: Floats, nearness: Floats) -> NDArray[np.complex128]:
     """Return the echo relative to the far-field echo along the normal: complex128, shaped like the arguments.
 
-    The echo is ``∫₀¹ J₀(v √t) exp(-j u t / 2) dt``. This is Kirchhoff's integral over a disc in Fresnel's approximation,
-    as for the field near the focus of a lens (M. Born, E. Wolf, Principles of Optics, 7th edition, section 8.8). On the
-    axis it is ``exp(-j u / 4) sin(u / 4) / (u / 4)``. In the far field, u is 0 and the echo has the pattern of a piston,
-    ``2 J₁(v) / v``.
+    The echo is ``∫₀¹ J₀(v √t) exp(-j u t / 2) dt``. This is Kirchhoff's integral over a disc in Fresnel's
+    approximation, as for the field near the focus of a lens (M. Born, E. Wolf, Principles of Optics, 7th edition,
+    section 8.8). On the axis it is ``exp(-j u / 4) sin(u / 4) / (u / 4)``. In the far field, u is 0 and the echo has
+    the pattern of a piston, ``2 J₁(v) / v``.
 
     Parameters
     ----------

@@ -18,8 +18,8 @@ def doppler(paths: Paths, speed_m_s: float) -> tuple[Floats, Floats]:
     """Return the arrival time of the call's beginning, and its stretch: both (path, mic) float64.
 
     All velocities are constant. Sound that leaves at t₀ meets the moving target at t₁ and the moving microphone at t₂:
-    ``c (t₁ - t₀) = |p + v t₁ - s(t₀)|``, and similarly for t₂. The position of a wall is that at the time of reflection,
-    accurate to first order in v / c for oblique incidence. Amplitudes are those of objects at rest.
+    ``c (t₁ - t₀) = |p + v t₁ - s(t₀)|``, and similarly for t₂. The position of a wall is that at the time of
+    reflection, accurate to first order in v / c for oblique incidence. Amplitudes are those of objects at rest.
 
     The stretch is dt₂/dt₀ at the beginning of the call. It equals the product of the Doppler factors of all moving
     objects (P. M. Morse, K. U. Ingard, Theoretical Acoustics, 1968, chapter 11).

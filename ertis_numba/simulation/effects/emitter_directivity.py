@@ -16,8 +16,8 @@ def emitter_directivity(
 ) -> NDArray[np.float64]:
     """Return the emitter's directivity towards the paths: (path, mic, frequency) float64.
 
-    The model is a circular piston in a baffle, ``2 J₁(v) / v`` with ``v = π d f sin θ / c``, and 0 behind it. The second
-    axis has length 1 if all microphones share the direction to the target.
+    The model is a circular piston in a baffle, ``2 J₁(v) / v`` with ``v = π d f sin θ / c``, and 0 behind it. The
+    second axis has length 1 if all microphones share the direction to the target.
     """
     leaving = paths.leaving[:, :1] if len(paths.targets) and not paths.surface else paths.leaving
     cos = leaving @ paths.transmitter.facing

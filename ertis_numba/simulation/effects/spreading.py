@@ -14,8 +14,8 @@ NEAREST_M = 0.01
 def spreading(paths: Paths) -> NDArray[np.float64]:
     """Return the amplitude gain due to geometric spreading: (path, mic) float64.
 
-    A point re-radiates the sound that it receives, ``1 / (r₁ r₂)``. A plane mirror does not, ``1 / (r₁ + r₂)``. A sphere
-    of radius a lies between the two, ``1 / √(A B)`` with ``A = r₁ + r₂ + 2 r₁ r₂ / (a cos θ)`` and
+    A point re-radiates the sound that it receives, ``1 / (r₁ r₂)``. A plane mirror does not, ``1 / (r₁ + r₂)``. A
+    sphere of radius a lies between the two, ``1 / √(A B)`` with ``A = r₁ + r₂ + 2 r₁ r₂ / (a cos θ)`` and
     ``B = r₁ + r₂ + 2 r₁ r₂ cos θ / a``. Here θ is the angle of incidence; normal incidence gives ``a / (2 r (r + a))``.
     The law describes the widening of a ray tube at a curved mirror (A. D. Pierce, Acoustics, 1989, chapter 8).
     """

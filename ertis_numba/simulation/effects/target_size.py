@@ -37,8 +37,8 @@ def over_surfaces(
 def patterns(paths: Paths, frequency_hz: Floats, speed_m_s: float) -> Floats | NDArray[np.complex128]:
     """Return the gain of echoes due to the size of their targets: (path, mic, frequency), 1 for points.
 
-    Spheres of a few wavelengths follow `rigid_sphere`, and larger ones are mirrors. Discs follow `disc`; their echo is 0
-    unless emitter and microphone lie in the half space that the disc faces. The type is float64, or complex128 if a
+    Spheres of a few wavelengths follow `rigid_sphere`, and larger ones are mirrors. Discs follow `disc`; their echo is
+    0 unless emitter and microphone lie in the half space that the disc faces. The type is float64, or complex128 if a
     target shifts the phase.
     """
     wave = 2 * math.pi / speed_m_s * frequency_hz
