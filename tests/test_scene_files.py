@@ -199,7 +199,10 @@ def test_faults_of_missing_channels_are_refused(tmp_path, channel):
             "[[points]]\nwaypoints = [[0, 0, 0, 0], [1, 999, 0, 0]]",
             r"point\.waypoints speed is 999; give a number from 0",
         ),
-        ("[[points]]\nwaypoints = [[0, 0, 0, 0]]\nvelocity_m_s = [1, 0, 0]", "both waypoints and velocity_m_s; give only one"),
+        (
+            "[[points]]\nwaypoints = [[0, 0, 0, 0]]\nvelocity_m_s = [1, 0, 0]",
+            "both waypoints and velocity_m_s; give only one",
+        ),
         ("[[spheres]]\nrange_m = 1\nradius_m = 0", r"sphere\.radius_m is 0; give a number from 0\.001 to 1000"),
         (
             "[[spheres]]\nrange_m = 1\nradius_m = 1\nreflection_db = 1",
@@ -244,7 +247,10 @@ def test_faults_of_missing_channels_are_refused(tmp_path, channel):
         ("[effects]\nmodulation = false", r"effect 'modulation' cannot be left out \(.*\); remove it from effects"),
         ("sensors = []", "scene has no sensors; give at least one"),
         ("[[sensors]]\n[[sensors]]", "scene has 2 sensors named 'sensor'; name each differently"),
-        ("[[sensors]]\nname = ''", r"sensor\.name is ''; give letters, digits and _, and from the second character also \. @ \+ -"),
+        (
+            "[[sensors]]\nname = ''",
+            r"sensor\.name is ''; give letters, digits and _, and from the second character also \. @ \+ -",
+        ),
         ("[[sensors]]\nyaw_deg = 181", r"sensor\.yaw_deg is 181; give a number from -180 to 180"),
         ("[[sensors]]\npitch_deg = 91", r"sensor\.pitch_deg is 91; give a number from -90 to 90"),
         ("[[sensors]]\nroll_deg = 181", r"sensor\.roll_deg is 181; give a number from -180 to 180"),

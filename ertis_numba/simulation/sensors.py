@@ -227,7 +227,7 @@ class Sensor(Settings, frozen=True, kw_only=True):
             if channel >= len(enabled) or not enabled[channel]:
                 raise ArgumentError(
                     f"sensor {self.name!r} has no microphone on channel {channel}, which electronics lists as faulty; "
-                    f"give channels with a microphone; it has {len(enabled)} channels, counted from 0"
+                    f"give one of its {len(enabled)} channels that has a microphone, counted from 0"
                 )
 
     def path(self) -> Placed:
