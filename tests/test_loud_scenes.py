@@ -92,7 +92,7 @@ def test_bench_fails_where_a_verdict_is_wrong(monkeypatch):
 def test_disc_too_near_for_its_model_is_noted():
     near, far = (Point(range_m=range_m, diameter_m=0.4) for range_m in (0.4, 1.2))
     [note] = make_plan(scene_of(near)).notes
-    assert note.startswith("points[0] is a disc of 0.4 m at 0.4 m from sensor; its echo is accurate from 0.77 m on")
+    assert note.startswith("points[0] is a disc of 0.4 m at 0.4 m from sensor; its echo is accurate only from 0.77 m")
     assert make_plan(scene_of(far)).notes == ()
 
 

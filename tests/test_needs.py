@@ -95,7 +95,7 @@ def test_effects_that_go_in_a_circle_all_stay_on(monkeypatch):
     for name in ("walls", "target_size"):
         assert verdicts[name].on
         assert verdicts[name].coupled
-        assert verdicts[name].reason.endswith("stays on, as others wait for it")
+        assert verdicts[name].reason.endswith("stays on, because other effects depend on it")
 
 
 def test_what_is_not_needed_is_not_imported():

@@ -1,7 +1,7 @@
-"""Scenes with known truth, rendered to the words of their sensors.
+"""Scenes with known ground truth, and their rendering to raw samples.
 
-`render` and `Simulator` are reached as ``ertis_numba.simulation.render``; they bring the compiled kernels in,
-which the description of a scene does not need.
+Import `render` and `Simulator` from ``ertis_numba.simulation.render``. That module loads the compiled kernels, and
+the description of a scene does not need them.
 """
 
 from ertis_numba.simulation.scene import Scene, load_scene

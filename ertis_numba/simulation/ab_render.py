@@ -1,4 +1,4 @@
-"""Two renderings compared: what an effect really changes in an image."""
+"""A/B renders: the change of an image by one effect, measured with two renderings."""
 
 import functools
 import math
@@ -24,15 +24,15 @@ __all__ = ["ABRender", "image_change_db"]
 
 Image = NDArray[np.float32]
 
-_KEPT = 24  # images: most verdicts are about the same effects with one more or less
-_KEPT_BYTES = 2**28  # total of stored images, which are few for large grids
+_KEPT = 24  # images: most verdicts compare sets of effects that differ by one
+_KEPT_BYTES = 2**28  # total size of the stored images; for large grids it allows only a few
 
 
 class ABRender:
-    """Renders and processes measurements of a scene with some effects and with others.
+    """Renders and processes measurements of a scene with two different sets of effects.
 
-    Modulators and converters are included if a signal comes within 6 dB of full scale. Otherwise they are left out: any
-    change of the input changes their noise, which is no change of the image.
+    Modulators and converters are included only if a signal comes within 6 dB of full scale. Otherwise they are left
+    out, because any change of their input changes their noise. A different noise does not count as a changed image.
 
     Parameters
     ----------
@@ -46,11 +46,11 @@ class ABRender:
         self._image = functools.lru_cache(maxsize=kept)(self._imaged)
         self._images = functools.lru_cache(maxsize=max(2, kept // 2))(self._converted)
         self._chain = functools.lru_cache(maxsize=8)(_chain)
-        # All renderings have the same noise, which takes as long as the rest of one.
+        # All renderings share one noise, because drawing it takes as long as the rest of a rendering.
         self._noise = functools.lru_cache(maxsize=1)(_noise)
 
     def change_db(self, index: int, others: frozenset[str], name: str) -> float | None:
-        """Return by how much an effect changes the images of all sensors at the most, in decibels.
+        """Return the greatest change of any sensor's image by an effect, in decibels.
 
         Sensors whose settings yield no image, such as a range window beyond the end of their records, are left out.
         The result is None if no sensor yields an image.
@@ -58,10 +58,11 @@ class ABRender:
         Parameters
         ----------
         index : int
-            Of the measurement.
+            Index of the measurement.
         others : frozenset of str
-            The other effects.
+            The other effects that are simulated.
         name : str
+            The effect to test.
         """
         changes_db = []
         for sensor in self._scene.sensors:
@@ -83,7 +84,7 @@ class ABRender:
         return max(changes_db, default=None)
 
     def _rendered(self, name: str, index: int, active: frozenset[str]) -> NDArray[np.float64]:
-        """Return the input of modulators or converters, with noise: (mic, sample) float64."""
+        """Return the input of the modulators or converters, including noise: (mic, sample) float64."""
         sensor = self._scene.sensor(name)
         signals = Engine(self._scene, sensor, active).signals(index)
         dbfs = sensor.electronics.noise_dbfs
@@ -92,7 +93,7 @@ class ABRender:
         return signals
 
     def _imaged(self, name: str, index: int, active: frozenset[str]) -> tuple[Image, float]:
-        """Return the image of the signals themselves, and their highest amplitude."""
+        """Return the image of the signals before conversion, and their highest amplitude."""
         signals = self._signals(name, index, active)
         chain = self._chain(self._scene.sensor(name).settings())
         image = np.empty((len(chain.grid), len(chain.range_m)), dtype=np.float32)
@@ -100,7 +101,7 @@ class ABRender:
         return image, float(np.abs(signals).max())
 
     def _converted(self, name: str, index: int, active: frozenset[str]) -> list[Image]:
-        """Return two images from the output of modulators or converters, with different dither."""
+        """Return two images from the output of the modulators or converters, with different dither."""
         sensor = self._scene.sensor(name)
         engine, signals = Engine(self._scene, sensor, active), self._signals(name, index, active)
         chain = self._chain(sensor.settings())
@@ -118,21 +119,21 @@ def image_change_db(
     floor: float,
     noise: Image | float = 0.0,
 ) -> float:
-    """Return by how much two images differ at the most.
+    """Return the greatest difference of two images in decibels.
 
-    At each place the difference is taken beside the strongest, over all directions and 5 cm of range, that both
-    images have there, and at least beside ``floor``: ``20 log10(1 + |Δ| / beside)``. So what hides among
-    the side lobes of a stronger echo does not count.
+    The difference at each point is ``20 log10(1 + |Δ| / reference)``. The reference is the strongest amplitude that
+    both images have over all directions and 5 cm of range, but at least ``floor``. A change that is masked by the side
+    lobes of a stronger echo therefore hardly counts.
 
     Parameters
     ----------
     before, after : (direction, range) float32
     spacing_m : float
-        Of the ranges.
+        Spacing of the ranges.
     floor : float
-        The weakest reflector that is to be kept.
+        Amplitude of the weakest reflector to be preserved.
     noise : float or (range,) float32
-        Difference that noise alone makes, which is no change.
+        Difference that noise alone causes; it is subtracted.
     """
     beside = np.maximum(_local(np.minimum(before, after), spacing_m), floor)
     change = np.maximum(np.abs(after - before) - noise, 0.0)
@@ -140,14 +141,14 @@ def image_change_db(
 
 
 def _local(image: Image, spacing_m: float) -> Image:
-    """Return the strongest amplitude over all directions and 5 cm of range: (range,) float32."""
+    """Return the highest amplitude over all directions and 5 cm of range: (range,) float32."""
     strongest = image.max(axis=0)
     near = 2 * math.ceil(min(SAME_RANGE_M / spacing_m, len(strongest))) + 1
     return np.asarray(scipy.ndimage.maximum_filter1d(strongest, near))
 
 
 def _image_bytes(settings: Settings) -> int:
-    """Return the approximate size of an image."""
+    """Return the approximate size of an image in bytes."""
     range_rate_m = 2 * settings.output_rate_hz / sound_speed_m_s(settings.air)
     n_ranges = np.ptp(settings.processing.range_m) * range_rate_m + 1
     return int(4 * len(direction_grid(settings.processing).azimuth_rad) * n_ranges)

@@ -1,4 +1,4 @@
-"""When, how strongly and how filtered every call of a scene reaches every microphone."""
+"""Delay, amplitude and filter of every call of a scene at every microphone."""
 
 import importlib
 from collections.abc import Set as AbstractSet
@@ -16,29 +16,29 @@ from ertis_numba.simulation.sensors import Emitter
 from ertis_numba.simulation.snapshot import Snapshot, TransmitterPose
 from ertis_numba.simulation.stopwatch import CostStopwatch
 
-__all__ = ["Arrivals", "arrivals", "echoes", "effect", "emitted", "gains", "transmitter_of", "responses"]
+__all__ = ["Arrivals", "arrivals", "echoes", "effect", "emitted", "gains", "responses", "transmitter_of"]
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 _TICK_S = 1e-12
-_LONGEST_STRETCH = 2.0  # of a call, as nothing moves at more than a third of the speed of sound
+_LONGEST_STRETCH = 2.0  # of a call; speeds are limited to a third of the speed of sound
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Arrivals:
-    """Copies of one call.
+    """Copies of one call at the microphones.
 
     Attributes
     ----------
     call : Call
     delay_s : (path, mic) float64
-        From the start of the record, the microphone's own lateness included.
-    amplitude : (path, mic, node) float64 or complex128
-        At the frequencies of the nodes, or one node for all; the microphone's sensitivity included.
+        Delay from the start of the record, including the microphone's own delay.
+    amplitude : (path, mic, frequency) float64 or complex128
+        Amplitude at each frequency, or one value for all, including the microphone's sensitivity.
     stretch : (path, mic) float64 or None
-        How long a second of the call lasts, where something moves or clocks differ.
+        Received duration relative to the emitted duration; None if nothing moves and clocks agree.
     emitter : Emitter or None
-        Whose transducer filters the call, where it does.
+        Emitter whose transducer filters the call; None if none does.
     """
 
     call: Call
@@ -49,24 +49,24 @@ class Arrivals:
 
 
 def effect(name: str, function: str | None = None) -> Any:
-    """Return the function of an effect; importing it is what asking for it costs."""
+    """Return the function of an effect; its module is imported at the first call."""
     return getattr(importlib.import_module(f"ertis_numba.simulation.effects.{name}"), function or name)
 
 
 def arrivals(shot: Snapshot, active: AbstractSet[str], frequency_hz: Floats, clock: CostStopwatch) -> list[Arrivals]:
-    """Return all that arrives of calls.
+    """Return all copies of calls that arrive at the microphones.
 
-    Delays are whole picoseconds: far finer than what can be measured, but coarse enough that the last digits of
-    sines and roots, in which processors differ, do not show.
+    Delays are rounded to picoseconds. This is far finer than a measurement can resolve. It is coarse enough to hide the
+    last digits of sines and roots, which differ between processors.
 
     Parameters
     ----------
     shot : Snapshot
     active : set of str
         The effects that are simulated.
-    frequency_hz : (node,) float64
-        Where filters are evaluated.
-    clock : Stopwatch
+    frequency_hz : (frequency,) float64
+        Frequencies at which filters are evaluated.
+    clock : CostStopwatch
     """
     gain, late_s = gains(shot, active, clock)
     found = []
@@ -98,7 +98,7 @@ def arrivals(shot: Snapshot, active: AbstractSet[str], frequency_hz: Floats, clo
 
 
 def transmitter_of(shot: Snapshot, active: AbstractSet[str], number: int) -> TransmitterPose:
-    """Return the emitter of a sensor, at the sensor's origin or beside it."""
+    """Return the emitter of a sensor, at the sensor's origin or at its offset."""
     if "emitter_offset" in active:
         return cast("TransmitterPose", effect("emitter_offset")(shot, number))
     return shot.mouths[number]
@@ -107,14 +107,15 @@ def transmitter_of(shot: Snapshot, active: AbstractSet[str], number: int) -> Tra
 def echoes(
     shot: Snapshot, active: AbstractSet[str], number: int, clock: CostStopwatch, *, n_frequencies: int = 1
 ) -> list[Paths]:
-    """Return the paths of an emitter's call over targets and walls, and the direct path from another sensor's.
+    """Return the paths of an emitter's call over targets and walls.
 
-    ``n_frequencies`` is the number of frequencies at which their amplitudes will be computed.
+    The direct path is included only for the emitter of another sensor. ``n_frequencies`` is the number of frequencies
+    at which amplitudes will be computed.
 
     Raises
     ------
     ArgumentError
-        There are too many paths, or amplitudes.
+        There are too many paths or amplitudes.
     """
     transmitter = transmitter_of(shot, active, number)
     if "walls" in active:
@@ -157,9 +158,9 @@ def responses(
     frequency_hz: Floats,
     clock: CostStopwatch,
 ) -> Floats | Complexes:
-    """Return the gain of a call by distance, air, walls, targets and directivity: (path, mic, node).
+    """Return the gain of a call due to distance, air, walls, targets and directivity: (path, mic, frequency).
 
-    The type is float64, or complex128 if a target turns the phase. `emitted` has the transducer's own response.
+    The type is float64, or complex128 if a target shifts the phase. `emitted` returns the transducer's own response.
     """
     strength = _strength(paths, spreads="spreading" in active)
     amplitude = paths.reflection * strength[:, None, None] * np.ones((*paths.second_m.shape, 1))
@@ -185,17 +186,16 @@ def responses(
 
 
 def emitted(active: AbstractSet[str], emitter: Emitter, frequency_hz: Floats) -> Floats | Complexes:
-    """Return the transducer's response at each frequency of a call: (node,) float64 or complex128."""
+    """Return the transducer's response at each frequency of a call: (frequency,) float64 or complex128."""
     if "emitter_response" in active and emitter.resonance_hz is not None:
         return cast("Complexes", effect("emitter_response")(emitter, frequency_hz))
     return np.ones(len(frequency_hz))
 
 
 def gains(shot: Snapshot, active: AbstractSet[str], clock: CostStopwatch) -> tuple[Floats, Floats]:
-    """Return sensitivity and lateness of the microphones: both (mic,) float64.
+    """Return the sensitivity and the delay of each microphone: both (mic,) float64.
 
-    Both hold the calibration of the settings, which processing takes out, and the spread, which it does
-    not know.
+    Both include the calibration of the settings and the uncalibrated spread. Processing corrects only the calibration.
     """
     gain, late_s = shot.layout.gain[shot.channels], shot.layout.delay_s[shot.channels]
     if "microphone_spread" in active:
@@ -209,9 +209,10 @@ def gains(shot: Snapshot, active: AbstractSet[str], clock: CostStopwatch) -> tup
 
 
 def _strength(paths: Paths, *, spreads: bool) -> Floats:
-    """Return what targets reflect: (path,) float64.
+    """Return the reflected amplitude of each target: (path,) float64.
 
-    From afar a sphere is a point of half of its radius, which the law of its spreading holds already.
+    In the far field a sphere acts as a point whose strength is half of the radius. The spreading law of spheres already
+    includes this factor.
     """
     targets = paths.targets
     if not len(targets):
@@ -252,7 +253,7 @@ def _arrivals(
 ) -> Arrivals:
     """Return copies of a sensor's call, timed by the clock of the receiving sensor.
 
-    Copies that end before the record begins are left out; clocks that differ may cause such copies.
+    Copies that end before the record begins are left out. Clocks that differ can cause such copies.
     """
     sensor = shot.scene.sensors[number]
     if "clock_drift" in active:

@@ -1,4 +1,4 @@
-"""Bounds on the size of a scene."""
+"""Limits on the size of a scene."""
 
 from ertis_numba.errors import ArgumentError
 
@@ -12,25 +12,25 @@ __all__ = [
 ]
 
 MAX_PATHS = 20_000
-"""Limit on the sound paths to one sensor in one measurement; the time of estimates grows with its square."""
+"""Limit on the sound paths to one sensor in one measurement. The time of estimates grows with its square."""
 MAX_MIRROR_POINTS = 2**21
-"""Limit on chains of walls, times mirrored targets: 300 MB with four reflections."""
+"""Limit on chains of walls × mirrored targets: 300 MB with four reflections."""
 MAX_AMPLITUDES = 2**26
-"""Limit on paths, times microphones, times frequencies: about 2 GB during computation."""
+"""Limit on paths × microphones × frequencies: about 2 GB during computation."""
 
 
 def require_few_mirrors(n_walls: int, order: int, n_places: int) -> None:
-    """Raise an error if the mirror images of a scene would exceed the memory.
+    """Raise an error if the mirror images of a scene would need too much memory.
 
     Raises
     ------
     ArgumentError
-        There are more chains of walls, times places, than `MAX_MIRROR_POINTS`.
+        The number of chains of walls × places exceeds `MAX_MIRROR_POINTS`.
     """
     n_chains = sum(n_walls * (n_walls - 1) ** k for k in range(order)) if n_walls else 0
     if n_chains * n_places > MAX_MIRROR_POINTS:
         raise ArgumentError(
-            f"scene has {n_chains * n_places} mirror points, of {n_walls} walls (6 of each box), {n_places} targets "
+            f"the scene has {n_chains * n_places} mirror points, from {n_walls} walls (6 per box), {n_places} targets "
             f"and max_reflections {order}; the limit is {MAX_MIRROR_POINTS}. Lower max_reflections, or give fewer "
             "walls or targets"
         )
@@ -46,22 +46,22 @@ def require_few_paths(n_paths: int) -> None:
     """
     if n_paths > MAX_PATHS:
         raise ArgumentError(
-            f"scene has more than {MAX_PATHS} sound paths to one sensor, which is the limit (got {n_paths} so far). "
+            f"the scene has at least {n_paths} sound paths to one sensor; the limit is {MAX_PATHS}. "
             "Lower max_reflections, or give fewer targets or walls"
         )
 
 
 def require_few_amplitudes(n_paths: int, n_mics: int, n_frequencies: int) -> None:
-    """Raise an error if one measurement of a scene would exceed the memory.
+    """Raise an error if one measurement of a scene would need too much memory.
 
     Raises
     ------
     ArgumentError
-        There are more amplitudes than `MAX_AMPLITUDES`.
+        The number of amplitudes exceeds `MAX_AMPLITUDES`.
     """
     if n_paths * n_mics * n_frequencies > MAX_AMPLITUDES:
         raise ArgumentError(
-            f"scene has {n_paths} sound paths to {n_mics} microphones at {n_frequencies} frequencies, "
+            f"the scene has {n_paths} sound paths to {n_mics} microphones at {n_frequencies} frequencies, in total "
             f"{n_paths * n_mics * n_frequencies} amplitudes; the limit is {MAX_AMPLITUDES}. Lower max_reflections, or "
             "give fewer targets, walls or microphones"
         )

@@ -1,4 +1,4 @@
-"""Converters of microphones that give PCM: noise, rounding and a full scale."""
+"""Analog-to-digital converters of PCM microphones: noise, rounding and clipping."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,19 +9,20 @@ from ertis_numba.settings import Recording
 __all__ = ["QUANTISATION_DBFS", "Converter"]
 
 QUANTISATION_DBFS = {"int16": -20 * np.log10(2.0**15 * np.sqrt(12)), "float32": -150.0}
-"""Root mean square of what rounding adds, full scale 1: a step by √12, or less than any microphone has."""
+"""RMS of the quantisation noise in dBFS: one step / √12 for int16, and a value below any microphone for float32."""
 
 
 class Converter:
-    """Turns the signals of some microphones into numbers, block by block.
+    """Converts the signals of some microphones to PCM samples, block by block.
 
     Parameters
     ----------
     recording : Recording
-        Whose encoding counts.
+        Recording settings; the encoding selects the converter.
     keys : (mic,) uint64
-        Of the noise of each microphone.
+        Seed of each microphone's noise.
     noise_rms : float
+        RMS of the white noise added to each signal, full scale 1.
     """
 
     def __init__(self, recording: Recording, keys: NDArray[np.uint64], noise_rms: float) -> None:
@@ -32,12 +33,12 @@ class Converter:
         self._noise = [np.random.Generator(np.random.Philox(key=int(key))) for key in keys]
 
     def process(self, signals: NDArray[np.float64], *, out: NDArray[np.int16] | NDArray[np.float32]) -> None:
-        """Fill the numbers of the next block; what is beyond full scale is cut off.
+        """Write the samples of the next block; values beyond full scale are clipped.
 
         Parameters
         ----------
         signals : (mic, sample) float64
-            Full scale 1, finite. They may go on after the block.
+            Full scale 1, finite. They may extend beyond the block.
         out : (sample, mic) int16 or float32
         """
         for mic, noise in enumerate(self._noise):
@@ -46,5 +47,5 @@ class Converter:
                 heard = heard + self._noise_rms * noise.standard_normal(len(out))
             if self._rounded:
                 heard = np.rint(heard * self._full_scale)
-            largest = self._full_scale - self._rounded  # +32768 is no number of 16 bits
+            largest = self._full_scale - self._rounded  # +32768 does not fit in 16 bits
             out[:, mic] = np.clip(heard, -self._full_scale, largest)

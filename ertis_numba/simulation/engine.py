@@ -1,4 +1,4 @@
-"""From a scene and its effects to words: PDM bits, or PCM numbers."""
+"""Rendering of a scene with given effects to PDM bits or PCM samples."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -24,8 +24,8 @@ from ertis_numba.simulation.truth import reflectors
 
 __all__ = ["Engine"]
 
-_EVERY = 16  # samples between those whose level is noted: a call at 80 kHz has three of them in a period
-_CHANNELS = 128  # rendered at a time, so that memory does not grow with the array; a multiple of every word
+_EVERY = 16  # samples between those whose level is noted: a call at 80 kHz has three of them per period
+_CHANNELS = 128  # rendered at a time, so that memory does not grow with the array; a multiple of every word size
 
 
 class Engine:
@@ -35,21 +35,21 @@ class Engine:
     ----------
     scene : Scene
     sensor : Sensor
-        One of the scene's.
+        One of the scene's sensors.
     active : frozenset of str
-        The effects.
+        The effects to simulate.
     threads : int, optional
-        All cores by default. The bits do not depend on it.
+        Number of threads; all cores by default. The bits do not depend on it.
 
     Attributes
     ----------
     scene : Scene
     sensor : Sensor
     active : frozenset of str
-    clock : Stopwatch
-        What each effect has cost so far.
+    clock : CostStopwatch
+        Time spent on each effect so far.
     loudest : float
-        The highest amplitude that a modulator or converter has met so far; modulators follow up to about 0.6,
+        Highest amplitude at a modulator or converter so far, full scale 1. Modulators are linear up to about 0.6,
         converters up to 1.
     """
 
@@ -68,9 +68,9 @@ class Engine:
         self._node_hz = synthesis.node_frequencies(max(synthesis.highest_hz(call, rate_hz) for call in calls))
 
     def render(self, index: int = 0) -> Measurement:
-        """Return measurement ``index``; scene, sensor and index decide every bit.
+        """Return measurement ``index``; scene, sensor and index determine every bit.
 
-        Channels without a microphone hold zeros.
+        Channels without a microphone contain zeros.
         """
         shot = self._shot(index)
         form = sample_format(self._settings)
@@ -88,13 +88,13 @@ class Engine:
         return Measurement(words.reshape(form.shape), self._settings, self._stamp(shot, index))
 
     def signals(self, index: int = 0) -> NDArray[np.float64]:
-        """Return what the modulators receive, their own noise apart: (mic, sample) float64, full scale 1."""
+        """Return the input of the modulators without their own noise: (mic, sample) float64, full scale 1."""
         n_samples = self.sensor.recording.n_samples
         blocks = [block[:, : synthesis.BLOCK].copy() for block in self._signals(self._shot(index), index)]
         return np.concatenate(blocks, axis=1)[:, :n_samples]
 
     def reflectors(self, index: int = 0) -> list[Reflector]:
-        """Return what an image of measurement ``index`` should show, strongest first."""
+        """Return the reflectors that an image of measurement ``index`` should show, strongest first."""
         return reflectors(self._shot(index), self.active)
 
     def _shot(self, index: int) -> Snapshot:
@@ -104,14 +104,14 @@ class Engine:
         return shot
 
     def converted(self, signals: NDArray[np.float64], draw: int) -> NDArray[Any]:
-        """Return the output words of modulators or converters for signals with all noise but their own.
+        """Return the raw samples for signals that already contain all noise other than that of the conversion.
 
         Parameters
         ----------
         signals : (mic, sample) float64
             Full scale 1.
         draw : int
-            Decides the dither of modulators.
+            Seed of the modulators' dither.
         """
         form = sample_format(self._settings)
         words = np.zeros(form.shape_2d, form.dtype)
@@ -137,7 +137,7 @@ class Engine:
         )
 
     def _modulate(self, shot: Snapshot, index: int, part: slice, out: NDArray[np.unsignedinteger]) -> None:
-        """Fill the words of some channels."""
+        """Write the PDM words of some channels."""
         mics = np.flatnonzero((shot.channels >= part.start) & (shot.channels < part.stop))
         if not len(mics):
             return
@@ -152,7 +152,7 @@ class Engine:
             out[first : first + len(words)] = words
 
     def _convert(self, shot: Snapshot, index: int, out: NDArray[np.int16] | NDArray[np.float32]) -> None:
-        """Fill the numbers of all channels."""
+        """Write the PCM samples of all channels."""
         converter = Converter(self.sensor.recording, self._keys(index, len(shot.channels)), self._noise_rms())
         numbers = np.empty((synthesis.BLOCK, len(shot.channels)), out.dtype)
         for first, block in zip(_begins(len(out)), self._signals(shot, index), strict=True):

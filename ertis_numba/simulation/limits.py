@@ -1,4 +1,4 @@
-"""Limits of the target models: impossible positions, and notes on inaccurate echoes."""
+"""Validity limits of the target models: impossible positions, and notes on inaccurate echoes."""
 
 import math
 
@@ -16,7 +16,7 @@ _MIN_DISTANCE_M = 1e-3
 
 
 def notes(shot: Snapshot) -> list[str]:
-    """Return a note for each target or source that is too near for its model."""
+    """Return a note for each target or source that is too close for its model."""
     return [*_near_targets(shot), *_near_discs(shot)]
 
 
@@ -35,15 +35,16 @@ def _near_targets(shot: Snapshot) -> list[str]:
         if apart_m < NEAREST_M:
             found.append(
                 f"{name} is {1e3 * apart_m:.2g} mm from an emitter or a microphone of {sensor.name} at "
-                f"{shot.time_s:.3g} s; its level is that at {1e3 * NEAREST_M:g} mm. Move it away from the sensor"
+                f"{shot.time_s:.3g} s; the model uses its level at {1e3 * NEAREST_M:g} mm. Move it away from the sensor"
             )
     return found
 
 
 def _near_discs(shot: Snapshot) -> list[str]:
-    """Return a note for each disc too near for Fresnel's approximation.
+    """Return a note for each disc that is too close for Fresnel's approximation.
 
-    The next term, a phase of ``k a⁴ / (4 r³)`` at the edge of a disc of radius a, must not exceed an eighth of a turn.
+    The first neglected term is a phase of ``k a⁴ / (4 r³)`` at the edge of a disc of radius a. It must not exceed an
+    eighth of a turn.
     """
     targets = shot.targets
     wave = 2 * math.pi * shot.sensor.call.high_frequency_hz / shot.speed_m_s
@@ -51,7 +52,7 @@ def _near_discs(shot: Snapshot) -> list[str]:
     min_m = np.cbrt(wave * (targets.diameter_m / 2) ** 4 / math.pi)
     return [
         f"{targets.names[k]} is a disc of {targets.diameter_m[k]:g} m at {apart_m[k]:.2g} m from {shot.sensor.name}; "
-        f"its echo is accurate from {min_m[k]:.2g} m on. Make it smaller, move it away, or use a wall with size_m"
+        f"its echo is accurate only from {min_m[k]:.2g} m. Make it smaller, move it away, or use a wall with size_m"
         for k in np.flatnonzero((targets.diameter_m > 0) & (apart_m < min_m))
     ]
 
@@ -59,12 +60,12 @@ def _near_discs(shot: Snapshot) -> list[str]:
 def require_clear(shot: Snapshot) -> None:
     """Raise an error for spheres that touch or enclose a microphone of the sensor or an emitter.
 
-    A point has no inside; its echo is bounded, which `notes` reports.
+    Points cannot enclose anything. The echo of a close point is limited, and `notes` reports it.
 
     Raises
     ------
     ArgumentError
-        A surface is closer than 1 mm, or encloses the place.
+        A surface is closer than 1 mm to a microphone or an emitter, or encloses it.
     """
     targets = shot.targets
     places = {f"emitter of {other.name}": place for other, place in _emitters(shot)}

@@ -1,4 +1,4 @@
-"""Bounds on the input amplitude of modulators and converters, computed without rendering."""
+"""Upper bounds on the input amplitude of modulators and converters, computed without rendering."""
 
 import math
 
@@ -16,17 +16,17 @@ __all__ = ["LOUD", "may_be_loud", "peak_bound"]
 Floats = NDArray[np.float64]
 
 LOUD = 0.5
-"""Amplitude from which converters take part in A/B renders: 6 dB below full scale."""
+"""Amplitude at which A/B renders start to include the converters: 6 dB below full scale."""
 _WEAKENING = frozenset(
     {"occlusion", "absorption", "doppler", "emitter_response", "emitter_directivity", "microphone_directivity"}
 )
-_RIPPLE = 1.5  # by which spheres, and emitters beside their arrays, make an echo louder at the most
+_RIPPLE = 1.5  # largest factor by which spheres, or emitters away from the centre of their array, raise an echo
 _NODES = 5  # frequencies at which filters are evaluated
-_CREST = 4.5  # highest of some hundred thousand Gaussian numbers, relative to their root mean square
+_CREST = 4.5  # highest of some hundred thousand Gaussian numbers, relative to their RMS
 
 
 def may_be_loud(shot: Snapshot, active: frozenset[str]) -> bool:
-    """Return True if the signals may come within 6 dB of full scale for some choice of the other effects."""
+    """Return True if the signals may come within 6 dB of full scale for any choice of the other effects."""
     if "spreading" not in active:
         return True
     return _RIPPLE * peak_bound(shot, frozenset(EFFECTS) - _WEAKENING) >= LOUD
@@ -35,13 +35,13 @@ def may_be_loud(shot: Snapshot, active: frozenset[str]) -> bool:
 def peak_bound(shot: Snapshot, active: frozenset[str]) -> float:
     """Return an upper bound on the amplitude at all microphones, relative to full scale.
 
-    Calls that overlap in time add up with their full amplitudes, and noise counts with its crest.
+    The bound adds the full amplitudes of calls that overlap in time, and the crest of the noise.
     """
     return shot.once(("peak", active), lambda: _calls(shot, active) + _steady(shot, active))
 
 
 def _calls(shot: Snapshot, active: frozenset[str]) -> float:
-    """Return the highest sum of the amplitudes of calls that overlap."""
+    """Return the highest sum of the amplitudes of overlapping calls."""
     call = shot.sensor.call
     frequency_hz = np.linspace(call.low_frequency_hz, call.high_frequency_hz, _NODES)
     found = [_changes(entry) for entry in arrivals(shot, active, frequency_hz, CostStopwatch())]
@@ -52,7 +52,7 @@ def _calls(shot: Snapshot, active: frozenset[str]) -> float:
 
 
 def _changes(entry: Arrivals) -> Floats:
-    """Return the times at which copies of a call begin or end at any microphone, and the change of the sum there."""
+    """Return the times at which copies of a call begin or end at any microphone, and the change of the sum then."""
     loudest = np.max(np.abs(entry.amplitude), axis=(1, 2))
     lasts_s = entry.call.duration_s * (1.0 if entry.stretch is None else float(entry.stretch.max(initial=1.0)))
     if entry.emitter is not None:
@@ -62,7 +62,7 @@ def _changes(entry: Arrivals) -> Floats:
 
 
 def _steady(shot: Snapshot, active: frozenset[str]) -> float:
-    """Return the crest of tones and noise."""
+    """Return the peak amplitude of tones and noise."""
     scene, dbfs = shot.scene, shot.sensor.electronics.noise_dbfs
     tones, power = 0.0, 0.0
     if "interference" in active:

@@ -1,4 +1,4 @@
-"""Images in walls, and what stands in the way."""
+"""Mirror images in walls, and occlusion by walls."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,27 +14,27 @@ __all__ = ["Seen", "blocked", "images", "reflected"]
 
 Floats = NDArray[np.float64]
 End = TypeVar("End", TransmitterPose, ReceiverPose)
-_SKIN = 1e-9  # of a leg's length: what touches a wall does not cross it
-# A sensor that hears itself over two walls hears through their very edge; a little aside, one order of the
-# two walls is right in a corner of a room, and none at the corner of a box.
+_SKIN = 1e-9  # of a leg's length: a leg that only touches a wall does not cross it
+# The path from a sensor over two walls back to itself meets exactly their common edge. With a small offset, one order
+# of the two walls is valid in a corner of a room, and none at the corner of a box.
 _NUDGE_M = np.array([1.1e-7, 1.7e-7, 2.3e-7])
 
 
-_Chain = tuple[tuple[int, ...], tuple[Any, ...]]  # walls, and the end with its images in them
+_Chain = tuple[tuple[int, ...], tuple[Any, ...]]  # walls, and the end point with its images in them
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seen(Generic[End]):
-    """One end of paths as places see it, straight or in walls.
+    """One end of the paths to some places, direct or mirrored in walls.
 
     Attributes
     ----------
-    end : Mouth or Ear
-        Itself or its image.
+    end : TransmitterPose or ReceiverPose
+        The end itself or its mirror image.
     exists : (place,) bool
-        Whether the mirror points lie on the walls.
+        True if all mirror points lie on their walls.
     corners_m : (corner, place, axis) float64
-        From the end to the places, both included.
+        Corners of the paths from the end to the places, both included.
     mirrors : tuple of int
         The wall at each inner corner.
     """
@@ -45,24 +45,25 @@ class Seen(Generic[End]):
     mirrors: tuple[int, ...]
 
     def to_corners_m(self, places: NDArray[np.intp]) -> Floats:
-        """Return how far the mirror points are from the end, along the way to some places: (wall, place) float64."""
+        """Return the distances from the end to the mirror points along the paths: (wall, place) float64."""
         legs_m = np.sqrt(np.sum(np.diff(self.corners_m[:, places], axis=0) ** 2, axis=-1))
         return np.asarray(np.cumsum(legs_m, axis=0)[:-1])
 
 
 def images(end: End, places_m: Floats, mirrors: Sequence[Mirror], largest: int) -> list[Seen[End]]:
-    """Return an end and its images of up to ``largest`` reflections that some place sees.
+    """Return an end and its images of up to ``largest`` reflections that are visible from some place.
 
-    The image of an image: ``p' = p - 2 ((p - q)·n) n`` (J. B. Allen, D. A. Berkley, Image method for
-    efficiently simulating small-room acoustics, JASA 65, 1979), kept where every mirror point lies within its
-    wall (J. Borish, Extension of the image model to arbitrary polyhedra, JASA 75, 1984).
+    The image of an image is ``p' = p - 2 ((p - q)·n) n`` (J. B. Allen, D. A. Berkley, Image method for efficiently
+    simulating small-room acoustics, JASA 65, 1979). It is valid where every mirror point lies within its wall
+    (J. Borish, Extension of the image model to arbitrary polyhedra, JASA 75, 1984).
 
     Parameters
     ----------
-    end : Mouth or Ear
+    end : TransmitterPose or ReceiverPose
     places_m : (place, axis) float64
     mirrors : sequence of Mirror
     largest : int
+        Maximum number of reflections.
 
     Raises
     ------
@@ -90,7 +91,7 @@ def reflected(end: End, mirror: Mirror) -> End:
     velocity_m_s = _turned(end.velocity_m_s, normal) + sway_m_s
     sways_m_s = (*(_turned(earlier, normal) for earlier in end.sways_m_s), sway_m_s)
     reflection = end.reflection * mirror.reflection
-    # The sound meets the walls in the order of the images from an emitter, and against it to a microphone.
+    # From an emitter the sound meets the walls in the order of the images; to a microphone, in the reverse order.
     if isinstance(end, TransmitterPose):
         return replace(
             end,
@@ -114,9 +115,9 @@ def reflected(end: End, mirror: Mirror) -> End:
 
 
 def blocked(seen: Seen[End], mirrors: Sequence[Mirror]) -> NDArray[np.bool_]:
-    """Return to which places a wall stands in the way: (place,) bool.
+    """Return True for places whose path is blocked by a wall: (place,) bool.
 
-    A leg is blocked by every wall that it crosses, those apart at which it begins or ends.
+    A leg is blocked by every wall that it crosses, except the walls at which it begins or ends.
     """
     stopped = np.zeros(seen.corners_m.shape[1], dtype=np.bool_)
     touched = (-1, *seen.mirrors, -1)
@@ -129,7 +130,7 @@ def blocked(seen: Seen[End], mirrors: Sequence[Mirror]) -> NDArray[np.bool_]:
 
 
 def _longer(chains: list[_Chain], mirrors: Sequence[Mirror]) -> list[_Chain]:
-    """Return every chain with one more image, in each wall but its last."""
+    """Return every chain extended by one more image, in each wall except its last."""
     return [
         ((*walls, number), (*ends, reflected(ends[-1], mirror)))
         for walls, ends in chains
@@ -139,7 +140,7 @@ def _longer(chains: list[_Chain], mirrors: Sequence[Mirror]) -> list[_Chain]:
 
 
 def _corners(ends: Sequence[End], walls: Sequence[Mirror], places_m: Floats) -> tuple[NDArray[np.bool_], Floats]:
-    """Follow the sound back from the places over the walls to the end itself."""
+    """Trace the sound back from the places over the walls to the end itself."""
     exists = np.ones(len(places_m), dtype=np.bool_)
     corners_m = [places_m]
     for image, mirror in zip(ends[:0:-1], walls[::-1], strict=True):
@@ -151,9 +152,9 @@ def _corners(ends: Sequence[End], walls: Sequence[Mirror], places_m: Floats) -> 
 
 
 def _crossing(start_m: Floats, stop_m: Floats, mirror: Mirror) -> tuple[Floats, Floats]:
-    """Return where lines cross the plane of a wall, as share of the way, and the point.
+    """Return the crossings of lines with the plane of a wall: (place,) and (place, axis) float64.
 
-    (place,) and (place, axis) float64; the share is -1 of those that never do.
+    The first array holds the fraction of the line, −1 for lines parallel to the plane. The second holds the points.
     """
     before = (start_m - mirror.point_m) @ mirror.axes[0]
     after = (stop_m - mirror.point_m) @ mirror.axes[0]
@@ -163,7 +164,7 @@ def _crossing(start_m: Floats, stop_m: Floats, mirror: Mirror) -> tuple[Floats, 
 
 
 def _crossed(share: Floats, point_m: Floats, mirror: Mirror) -> NDArray[np.bool_]:
-    """Return whether lines really cross the wall, by what `_crossing` returned: (place,) bool."""
+    """Return True for lines that cross the wall itself; the arguments are from `_crossing`: (place,) bool."""
     aside_m = np.abs((point_m - mirror.point_m) @ mirror.axes[1:].T)
     inside = np.all(aside_m <= mirror.half_size_m, axis=-1)
     return np.asarray(inside & (share > _SKIN) & (share < 1 - _SKIN))

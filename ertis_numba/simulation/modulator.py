@@ -1,4 +1,4 @@
-"""The sigma-delta modulators in the microphones, from signals to bits."""
+"""Sigma-delta modulators of PDM microphones, from signals to bits."""
 
 import functools
 import itertools
@@ -13,13 +13,13 @@ from ertis_numba.geometry import Layout
 __all__ = ["Modulator", "loop_gains", "noise_transfer"]
 
 _MAX_ORDER = 4
-_OUT_OF_BAND_GAIN = 1.5  # Lee's rule of thumb: one-bit loops with no more gain are stable as a rule, and these are
-_LIMIT = 2.0  # integrators reach 1.7 at half scale; with 8 the loop no longer returns from overload
-_GAIN_STEP = 2.0**-20  # gains as short numbers: no processor's last digit can change a bit
+_OUT_OF_BAND_GAIN = 1.5  # Lee's rule of thumb: one-bit loops up to this gain are usually stable, and these are
+_LIMIT = 2.0  # integrators reach 1.7 at half scale; with a limit of 8 the loop does not recover from overload
+_GAIN_STEP = 2.0**-20  # gains are rounded, so that differences between processors in the last digit change no bit
 
 
 class Modulator:
-    """One modulator per enabled microphone, its state kept from block to block.
+    """One modulator per enabled microphone; its state carries over from block to block.
 
     Parameters
     ----------
@@ -27,16 +27,16 @@ class Modulator:
     keys : (mic,) uint64
         Seed of each microphone's noise and dither.
     noise_rms : (mic,) float64
-        White noise added to each signal, full scale 1; 0 for none, which also costs nothing.
+        RMS of the white noise added to each signal, full scale 1; 0 adds none and takes no time.
     order : int
-        1 to 4.
+        Order of the loop, 1 to 4.
     dither : float
-        Width of the uniform dither at the quantiser, full scale 1. It breaks up idle tones; beyond a
-        half it costs range.
+        Width of the uniform dither at the quantiser, full scale 1. It breaks up idle tones. Values above 0.5 reduce
+        the dynamic range.
     band : float
-        Upper edge of the band where noise is to be low, in cycles per sample.
+        Upper edge of the band in which noise is minimised, in cycles per sample.
     threads : int, optional
-        All cores by default. The bits do not depend on it.
+        Number of threads; all cores by default. The bits do not depend on it.
     """
 
     def __init__(
@@ -62,16 +62,16 @@ class Modulator:
         self._threads = self._kernels.max_threads if threads is None else threads
 
     def process(self, signals: NDArray[np.float64], *, out: NDArray[np.unsignedinteger]) -> None:
-        """Fill the words of the next block; bits without an enabled microphone become 0.
+        """Write the words of the next block; bits without an enabled microphone are set to 0.
 
         Parameters
         ----------
         signals : (mic, sample) float64
-            Full scale 1, finite. Up to about 0.6 the bits follow them; above, the loop overloads and recovers.
-            They may go on after the block.
+            Full scale 1, finite. The bits follow them up to about 0.6; above, the loop overloads and recovers.
+            They may extend beyond the block.
         out : (sample, word) uint8, uint16, uint32 or uint64
         """
-        octets = out.view(np.uint8)  # words are little-endian, as this package's processors are
+        octets = out.view(np.uint8)  # words are little-endian, like the processors that this package supports
         checks.shape("signals", (len(signals), min(signals.shape[1], len(out))), (len(self._states), len(out)))
         checks.shape("out, in bytes,", octets.shape, (len(out), len(self._mics)))
         signals = np.ascontiguousarray(signals, dtype=np.float64)
@@ -83,19 +83,18 @@ class Modulator:
 
 
 def _mics_of_bits(layout: Layout) -> NDArray[np.int32]:
-    """Return the microphone that each bit of a sample's words belongs to, −1 for none: (octet, 8) int32."""
+    """Return the microphone of each bit of a sample's words, −1 for none: (octet, 8) int32."""
     mics = np.full(layout.n_words * layout.word_bits, -1, dtype=np.int32)
     mics[: len(layout.enabled)][layout.enabled] = np.arange(layout.enabled.sum())
     return mics.reshape(-1, 8)
 
 
 def noise_transfer(order: int, band: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return numerator and denominator of the noise transfer function, in powers of 1/z.
+    """Return the numerator and the denominator of the noise transfer function, in powers of 1/z.
 
-    The poles are those of a Butterworth high pass whose gain at half of the rate is 1.5 when all
-    zeros lie at 0 Hz. The zeros then move to the roots of the Legendre polynomial on the band, which
-    makes the noise in it least (R. Schreier, G. C. Temes, Understanding Delta-Sigma Data Converters,
-    IEEE Press 2005, chapter 4).
+    The poles are those of a Butterworth high pass whose gain at half of the sample rate is 1.5 if all zeros lie at
+    0 Hz. The zeros then move to the roots of the Legendre polynomial on the band. This minimises the noise in the
+    band (R. Schreier, G. C. Temes, Understanding Delta-Sigma Data Converters, IEEE Press 2005, chapter 4).
     """
     checks.integer("order", order, 1, _MAX_ORDER)
     checks.between("band", band, 0.0, 0.25)
@@ -114,18 +113,17 @@ def noise_transfer(order: int, band: float) -> tuple[NDArray[np.float64], NDArra
 def loop_gains(order: int, band: float) -> tuple[float, float, float, float, float, float]:
     """Return the gains c1 to c4, r1 and r2 of `modulate_pdm` for a noise transfer function.
 
-    Integrators in cascade with local resonators (r) and all outputs fed forward to the quantiser,
-    together with the input: the signal passes unchanged, without gain or delay, and the integrators
-    carry shaped noise only (J. Silva, U. Moon, J. Steensgaard, G. C. Temes, Wideband low-distortion
-    delta-sigma ADC topology, Electronics Letters 37, 2001). The feed-forward weights follow from the
-    first samples of the loop filter's impulse response, ``1/NTF − 1``. Integrators are scaled by
-    their weights, so that the quantiser takes their plain sum.
+    The loop is a cascade of integrators with local resonators (r). The quantiser receives all integrator outputs and
+    the input. The signal therefore passes without gain or delay, and the integrators carry only shaped noise
+    (J. Silva, U. Moon, J. Steensgaard, G. C. Temes, Wideband low-distortion delta-sigma ADC topology, Electronics
+    Letters 37, 2001). The feed-forward weights follow from the first samples of the loop filter's impulse response,
+    ``1/NTF − 1``. Integrators are scaled by their weights, so that the quantiser receives their plain sum.
     """
     zeros, poles = noise_transfer(order, band)
     loop = np.zeros(order + 1)  # impulse response of poles / zeros
     for n in range(order + 1):
         loop[n] = poles[n] - sum(zeros[k] * loop[n - k] for k in range(1, n + 1))
-    turn = np.zeros(2)  # one resonator per pair of zeros, and none for a zero at 0 Hz
+    turn = np.zeros(2)  # one resonator per pair of zeros; a zero at 0 Hz needs none
     turn[: (order + 1) // 2] = 2 * math.pi * band * _legendre_roots(order)[: (order + 1) // 2]
     resonances = 2 - 2 * np.cos(turn)
     weights = np.zeros(_MAX_ORDER)
@@ -143,7 +141,7 @@ def _legendre_roots(order: int) -> NDArray[np.float64]:
 
 
 def _integrators(order: int, resonances: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the response of unscaled integrators to a unit error: (sample, integrator) float64."""
+    """Return the response of the unscaled integrators to a unit error: (sample, integrator) float64."""
     state = np.zeros(_MAX_ORDER)
     response = np.empty((order, order))
     error = 1.0

@@ -1,39 +1,39 @@
-"""The effects by name, in the order in which they are decided and reported."""
+"""Names of the effects, in the order in which they are decided and reported."""
 
 from typing import Final
 
 __all__ = ["ASKED_FOR", "EFFECTS", "INDISPENSABLE"]
 
 EFFECTS: Final = {
-    "propagation": "sound takes its time, to any part of a sample",
-    "spreading": "amplitude falls with distance",
-    "emitter_offset": "the emitter is away from the centre of the array",
-    "cross_emission": "sensors hear each other's calls",
-    "sync_delay": "each sensor of the SYNC chain starts later",
-    "clock_drift": "sample clocks run fast or slow",
+    "propagation": "propagation delays, including fractions of a sample",
+    "spreading": "decrease of amplitude with distance",
+    "emitter_offset": "offset of the emitter from the centre of the array",
+    "cross_emission": "calls of the other sensors of the scene",
+    "sync_delay": "later start of each sensor along the SYNC chain",
+    "clock_drift": "sample clocks that run fast or slow",
     "walls": "mirror images of emitters and targets in walls",
-    "occlusion": "walls stand between",
-    "target_size": "spheres have a surface, discs face somewhere",
-    "absorption": "air takes the high frequencies",
-    "emitter_response": "the transducer filters the call and rings",
-    "emitter_directivity": "a piston sends ahead",
-    "microphone_directivity": "a port hears ahead",
-    "doppler": "motion shifts and stretches the call",
-    "direct_sound": "microphones hear the emitter beside them",
+    "occlusion": "walls that block sound paths",
+    "target_size": "surfaces of spheres, and size and orientation of discs",
+    "absorption": "absorption of high frequencies by air",
+    "emitter_response": "frequency response and ringing of the transducer",
+    "emitter_directivity": "directivity of the emitter as a circular piston",
+    "microphone_directivity": "directivity of the microphone ports",
+    "doppler": "shift and stretch of the call due to motion",
+    "direct_sound": "direct sound from the emitter to its own microphones",
     "interference": "tones, noise and other sonars",
-    "ambient_noise": "noise from everywhere",
+    "ambient_noise": "diffuse noise from all directions",
     "microphone_noise": "white noise of each microphone",
-    "microphone_spread": "gains and delays that no calibration knows",
+    "microphone_spread": "gains and delays that the calibration does not contain",
     "microphone_faults": "dead and stuck microphones",
-    "modulation": "sigma-delta modulators make bits, converters numbers",
+    "modulation": "conversion to PDM bits or PCM samples",
 }
-"""What each effect is."""
+"""Description of each effect."""
 
 INDISPENSABLE: Final = {
-    "propagation": "an image is made of delays",
-    "modulation": "a recording holds bits or numbers",
+    "propagation": "images are computed from delays",
+    "modulation": "recordings contain bits or samples",
 }
-"""Effects of every scene, and why."""
+"""Effects that every scene needs, and the reason."""
 
 ASKED_FOR: Final = frozenset(
     {
@@ -50,6 +50,6 @@ ASKED_FOR: Final = frozenset(
         "microphone_faults",
     }
 )
-"""Effects that a scene lacks unless a key requests them, such as ``electronics.noise_dbfs``.
+"""Effects that a scene has only if one of its keys requests them, such as ``electronics.noise_dbfs``.
 
-They are simulated even where no image shows them, because recordings hold them."""
+They are simulated even if no image shows them, because recordings contain them."""

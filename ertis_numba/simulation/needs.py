@@ -1,8 +1,8 @@
-"""When an effect matters: for each one, by how much it would change an image, and why.
+"""Table of the estimates: the change of an image by each effect, and the reason.
 
-A change is one of decibels at some place of the image, beside the strongest of the image at that range or beside
-the weakest reflector that it shows. An estimate of None means that the scene holds nothing for the effect
-to act upon.
+A change is the greatest change of any point of the image in decibels. It is relative to the strongest amplitude at that
+range, but at least to the weakest reflector that the image shows. An estimate of None means that nothing in the scene
+is subject to the effect.
 """
 
 from collections.abc import Callable
@@ -35,4 +35,4 @@ ESTIMATES: Final[dict[str, Callable[[Sight], Estimate | None]]] = {
     "microphone_spread": sound_needs.microphone_spread,
     "microphone_faults": sound_needs.microphone_faults,
 }
-"""What is asked about each effect that can be left out."""
+"""Estimate of each effect that can be left out."""

@@ -27,7 +27,7 @@ __all__ = [
 
 
 def spreading(sight: Sight) -> Estimate | None:
-    """Compare levels with those without distance."""
+    """Compare the levels of echoes with those without spreading."""
     if not len(sight.heard):
         return None
     longest_m = float(np.max(sight.heard.delay_s)) * sight.shot.speed_m_s
@@ -45,13 +45,13 @@ def emitter_offset(sight: Sight) -> Estimate | None:
 
 
 def clock_drift(sight: Sight) -> Estimate | None:
-    """Compute the shift of echoes by drift of the sensors' clocks."""
+    """Compute the shift of echoes due to drift of the sensors' clocks."""
     shot = sight.shot
     sensors = shot.scene.sensors
     heard = [shot.number, *sight.emitters(sight.active)]
     if not any(sensors[number].electronics.clock_drift_ppm for number in heard):
         return None
-    worst = Estimate(change_db=0.0, reason="nothing is heard")
+    worst = Estimate(change_db=0.0, reason="no echo arrives")
     for number in sight.emitters(sight.active):
         seen = sight.of_emitter(number, sight.active)
         if not len(seen):
@@ -85,30 +85,30 @@ def walls(sight: Sight) -> Estimate | None:
         return None
     more = sight.echoes(sight.active | {"walls"})
     new = np.array([name not in sight.heard.names for name in more.names], dtype=np.bool_)
-    return ghosts(sight, more, new, "heard by {name} at {range:.2f} m, {level:+.1f} dB beside what is there")
+    return ghosts(sight, more, new, "{name} appears at {range:.2f} m, {level:+.1f} dB relative to the image there")
 
 
 def occlusion(sight: Sight) -> Estimate | None:
-    """Find the strongest echo that a wall hides."""
+    """Find the strongest echo that a wall blocks."""
     if not sight.shot.mirrors:
         return None
     left = sight.echoes(sight.active | {"occlusion"})
     hidden = np.array([name not in left.names for name in sight.heard.names], dtype=np.bool_)
     if not hidden.any():
-        return Estimate(change_db=0.0, reason="no wall stands on any way")
+        return Estimate(change_db=0.0, reason="no wall blocks any path")
     level = hidden * sight.levels(sight.heard) * sight.reach(sight.heard.delay_s)
     worst = int(np.argmax(level))
     open_sight = Sight.of(sight.shot, sight.active | {"occlusion"})
     beside = open_sight.beside(sight.heard.delay_s)
     return Estimate(
         change_db=change_db(level, beside),
-        reason=f"a wall hides {sight.heard.names[worst]}"
+        reason=f"a wall blocks {sight.heard.names[worst]}"
         + (f" and {int(hidden.sum()) - 1} more" if hidden.sum() > 1 else ""),
     )
 
 
 def target_size(sight: Sight) -> Estimate | None:
-    """Compare surfaces with centres, and discs with points."""
+    """Compare echoes from surfaces with those from centres, and echoes of discs with those of points."""
     targets = sight.shot.targets
     if not (np.any(targets.radius_m) or np.any(targets.diameter_m)):
         return None
@@ -127,13 +127,13 @@ def absorption(sight: Sight) -> Estimate | None:
     return filtered(
         sight,
         after,
-        f"{longest_m:.2f} m of air take {from_air[0] * longest_m:.2g} dB at the lower end of the band and "
-        f"{from_air[-1] * longest_m:.2g} dB at the upper",
+        f"{longest_m:.2f} m of air absorb {from_air[0] * longest_m:.2g} dB at the lower end of the band and "
+        f"{from_air[-1] * longest_m:.2g} dB at the upper end",
     )
 
 
 def emitter_directivity(sight: Sight) -> Estimate | None:
-    """Ask how far off the emitters' axes the targets are."""
+    """Compare echoes with those of omnidirectional emitters."""
     sensors = sight.shot.scene.sensors
     diameter_m = max((sensors[number].emitter.diameter_m for number in sight.emitters(sight.active)), default=0.0)
     if not (diameter_m and len(sight.heard)):
@@ -146,7 +146,7 @@ def emitter_directivity(sight: Sight) -> Estimate | None:
 
 
 def microphone_directivity(sight: Sight) -> Estimate | None:
-    """Ask how far off the microphones' axis the sounds arrive."""
+    """Compare echoes with those at omnidirectional microphones."""
     diameter_m = sight.shot.sensor.electronics.microphone_diameter_m
     if not (diameter_m and len(sight.heard)):
         return None
@@ -158,11 +158,10 @@ def microphone_directivity(sight: Sight) -> Estimate | None:
 
 
 def doppler(sight: Sight) -> Estimate | None:
-    """Ask how far the motion of targets and sensors shifts the pulses.
+    """Compute the shift of pulses due to the motion of targets and sensors.
 
-    A call of hyperbolic frequency modulation, stretched by s, is the call shifted by ``-(s - 1) p₀ / p'``, p₀
-    being its first period and p' the growth of its periods with time. In the mean over its frequencies that is so of a
-    linear one, too.
+    A hyperbolic chirp stretched by s equals the chirp shifted by ``-(s - 1) p₀ / p'``. Here p₀ is its first period, and
+    p' the growth of its periods with time. For a linear chirp this holds in the mean over its frequencies.
     """
     shot = sight.shot
     scene = shot.scene
@@ -197,13 +196,13 @@ def doppler(sight: Sight) -> Estimate | None:
 
 
 def _reported_m_s(stretch: float, speed_m_s: float) -> str:
-    """Return the velocity of a reflector that stretches a call so."""
+    """Return the velocity of a reflector that causes a stretch of the call, as text."""
     away_m_s = speed_m_s * (stretch - 1) / (stretch + 1)
     return f"{'going' if away_m_s > 0 else 'coming'} at {abs(away_m_s):.3g} m/s"
 
 
 def _aside_rad(paths: Paths, speed_m_s: float) -> NDArray[np.float64]:
-    """Return by which angle targets move across the line of sight until the sound meets them: (path,) float64."""
+    """Return the angle that targets move across the line of sight until the sound meets them: (path,) float64."""
     if not len(paths.targets):
         return np.zeros(len(paths))
     way = paths.arriving[:, 0]

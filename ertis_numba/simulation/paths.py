@@ -1,4 +1,4 @@
-"""The ways of the sound: from an emitter, by a target or none, to every microphone."""
+"""Sound paths: from an emitter, directly or over a target, to every microphone."""
 
 from dataclasses import dataclass
 
@@ -15,22 +15,22 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Paths:
-    """Ways that share one emitter and one set of microphones, or one image of them.
+    """Paths between one emitter and one set of microphones, or between their mirror images.
 
     Attributes
     ----------
-    transmitter : Mouth
-    receiver : Ear
+    transmitter : TransmitterPose
+    receiver : ReceiverPose
     targets : Targets
-        One per path. Without any there is one path, all of it the second leg.
+        One per path. Without targets there is one direct path, counted as the second leg.
     first_m, second_m : (path, mic) float64
         Lengths of the legs before and after the target.
     leaving, arriving : (path, mic, axis) float64
-        Unit vectors along the first and the last leg, as the sound goes, among the images.
+        Unit vectors along the first and the last leg, in the direction of the sound, between the mirror images.
     transmitter_corners_m, receiver_corners_m : (wall, path) float64
-        How far the mirror points are from either end, along the way.
+        Distances of the mirror points from either end, along the path.
     surface : bool
-        Legs end on the surface of spheres, rather than in their centres.
+        True if legs end on the surface of spheres; False, the default, if they end at the centres.
     """
 
     transmitter: TransmitterPose
@@ -57,12 +57,12 @@ class Paths:
 
     @property
     def length_m(self) -> Floats:
-        """Length of the whole way: (path, mic) float64."""
+        """Total length of each path: (path, mic) float64."""
         return self.first_m + self.second_m
 
     @property
     def reflection(self) -> float:
-        """Amplitude that the walls leave."""
+        """Amplitude reflection factor of all walls of the paths."""
         return self.transmitter.reflection * self.receiver.reflection
 
 
@@ -74,11 +74,11 @@ def by_targets(
     Parameters
     ----------
     first, second : Seen
-        Emitter and microphones, or their images.
+        Emitter and microphones, or their mirror images.
     targets : Targets
-        All of them.
+        All targets of the scene.
     chosen : (path,) int
-        Which of them.
+        Indices of the targets to use.
     """
     return turning(first, second, targets, chosen, targets.positions_m[chosen, None, :], surface=False)
 
@@ -92,7 +92,10 @@ def turning(
     *,
     surface: bool,
 ) -> Paths:
-    """Return the paths that turn at (path, mic, axis) places; the other arguments are those of `by_targets`."""
+    """Return the paths that turn at the places ``turns_m``, (path, mic, axis).
+
+    The other arguments are those of `by_targets`.
+    """
     transmitter, receiver = first.end, second.end
     there_m = turns_m - transmitter.position_m
     back_m = receiver.positions_m - turns_m
@@ -114,16 +117,16 @@ def turning(
 def without_target(
     transmitter: TransmitterPose, receiver: ReceiverPose, targets: Targets, corners_m: Floats | None = None
 ) -> Paths:
-    """Return the one path from an emitter or its image straight to the microphones.
+    """Return the direct path from an emitter or its mirror image to the microphones.
 
     Parameters
     ----------
-    transmitter : Mouth
-    receiver : Ear
+    transmitter : TransmitterPose
+    receiver : ReceiverPose
     targets : Targets
-        All of them.
+        All targets of the scene.
     corners_m : (wall, 1) float64, optional
-        How far the mirror points are from the emitter, along the way.
+        Distances of the mirror points from the emitter, along the path.
     """
     none = np.zeros((0, 1))
     way_m = (receiver.positions_m - transmitter.position_m)[None]
@@ -141,7 +144,7 @@ def without_target(
 
 
 def unit(vectors: Floats) -> Floats:
-    """Return vectors scaled to length 1; those of no length stay as they are."""
+    """Return vectors scaled to length 1; vectors of length 0 are unchanged."""
     length = _length(vectors)[..., None]
     return np.asarray(np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0))
 

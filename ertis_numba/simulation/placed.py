@@ -1,4 +1,4 @@
-"""Where things of a scene are, and how they move."""
+"""Position and motion of the objects of a scene."""
 
 import itertools
 import math
@@ -15,23 +15,24 @@ __all__ = ["Placed", "Vector", "check_vector"]
 
 Vector = tuple[float, float, float]
 _FARTHEST_M = 1e4
-_FASTEST_M_S = 100.0  # a third of the speed of sound: beyond, the air itself gives way
+_FASTEST_M_S = 100.0  # a third of the speed of sound; beyond, air flow around the object would matter
 _STILL: Vector = (0.0, 0.0, 0.0)
 
 
 class Placed(TomlTable, frozen=True, kw_only=True):
-    """Something that has a place in the world frame: x forward, y left, z up.
+    """Object with a position in the world frame: x forward, y left, z up.
 
     Attributes
     ----------
     position_m : (x, y, z), optional
-        When the first measurement begins.
+        Position at the start of the first measurement, in metres.
     azimuth_deg, elevation_deg, range_m : float, optional
-        The same seen from the origin; give either these or ``position_m``.
+        The same position in spherical coordinates about the origin; give either these or ``position_m``.
     velocity_m_s : (x, y, z)
-        Constant velocity in the world frame.
+        Constant velocity in the world frame, in metres per second; 0 by default.
     waypoints : tuple of (time_s, x, y, z)
-        Instead of all these: straight lines between points, rest before the first and after the last.
+        Times in seconds and positions in metres, instead of all of the above. The object moves on straight lines
+        between them, and rests before the first and after the last; none by default.
     """
 
     position_m: Vector | None = None
@@ -47,12 +48,12 @@ class Placed(TomlTable, frozen=True, kw_only=True):
         polar = [value for value in (self.azimuth_deg, self.elevation_deg, self.range_m) if value is not None]
         if (self.position_m is not None) + bool(polar) + bool(self.waypoints) != 1:
             raise ArgumentError(
-                f"{name} has not one place; give position_m, or range_m with azimuth_deg and elevation_deg, or "
-                "waypoints"
+                f"{name} does not have exactly one position; give one of position_m, range_m with azimuth_deg and "
+                "elevation_deg, or waypoints"
             )
         if polar:
             if self.range_m is None:
-                raise ArgumentError(f"{name} has a direction and no range_m; give it, too")
+                raise ArgumentError(f"{name} has a direction but no range_m; give range_m as well")
             checks.between(f"{name}.range_m", self.range_m, 1e-3, _FARTHEST_M)
             checks.between(f"{name}.azimuth_deg", self.azimuth_deg or 0.0, -180.0, 180.0)
             checks.between(f"{name}.elevation_deg", self.elevation_deg or 0.0, -90.0, 90.0)
@@ -60,18 +61,20 @@ class Placed(TomlTable, frozen=True, kw_only=True):
             check_vector(f"{name}.position_m", self.position_m, _FARTHEST_M)
         check_vector(f"{name}.velocity_m_s", self.velocity_m_s, _FASTEST_M_S)
         if self.waypoints and self.velocity_m_s != _STILL:
-            raise ArgumentError(f"{name} has waypoints and velocity_m_s; give one of the two")
+            raise ArgumentError(f"{name} has both waypoints and velocity_m_s; give only one of them")
         for number, (time_s, *place) in enumerate(self.waypoints):
             checks.finite(f"{name}.waypoints[{number}] time", time_s)
             check_vector(f"{name}.waypoints[{number}]", (place[0], place[1], place[2]), _FARTHEST_M)
         for (before_s, *a), (after_s, *b) in itertools.pairwise(self.waypoints):
             if after_s <= before_s:
-                raise ArgumentError(f"{name}.waypoints go from {before_s:g} s to {after_s:g} s; give rising times")
+                raise ArgumentError(
+                    f"{name}.waypoints go from {before_s:g} s to {after_s:g} s; give strictly increasing times"
+                )
             checks.between(f"{name}.waypoints speed", math.dist(a, b) / (after_s - before_s), 0.0, _FASTEST_M_S)
 
     @property
     def moves(self) -> bool:
-        """Whether it ever changes its place."""
+        """True if the object ever changes its position."""
         return self.velocity_m_s != _STILL or len(self.waypoints) > 1
 
     def position_at(self, time_s: float) -> NDArray[np.float64]:
@@ -96,6 +99,6 @@ class Placed(TomlTable, frozen=True, kw_only=True):
 
 
 def check_vector(name: str, vector: Vector, largest: float) -> None:
-    """Refuse a vector with a part beyond ``largest``."""
+    """Raise an error for a vector with a component beyond ±``largest``."""
     for part in vector:
         checks.between(name, part, -largest, largest)

@@ -1,4 +1,4 @@
-"""Which effects a scene calls for."""
+"""Selection of the effects that a scene needs."""
 
 import functools
 import itertools
@@ -20,30 +20,34 @@ __all__ = ["EffectPlan", "Verdict", "make_plan"]
 ABRender = Callable[[int, frozenset[str], str], float | None]
 Rehearse = Callable[[], ABRender]
 
-_INSTANTS, _MAX_CORNERS = 9, 40  # at which a scene in motion is asked, way points apart
-_MAX_TOO_HIGH = 20.0  # no estimate is too high by more, while side lobes that meet make some far too low
-_PART_ALLOWED = 0.5  # of the tolerance in the rendered measurements of a scene in motion, as others may change more
-_MAX_RENDERED = 3  # measurements of a scene in motion that are rendered for one verdict
-_ROUNDS = 6  # two are the rule; effects that wait for each other take more
+_INSTANTS, _MAX_CORNERS = 9, 40  # times at which a moving scene is examined: evenly spaced, and at waypoints
+_MAX_TOO_HIGH = 20.0  # largest factor of an overestimate; side lobes that overlap make some estimates far too low
+_PART_ALLOWED = 0.5  # part of the tolerance allowed in rendered measurements of a moving scene; others may change more
+_MAX_RENDERED = 3  # measurements of a moving scene that are rendered for one verdict
+_ROUNDS = 6  # two usually suffice; effects that depend on each other take more
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Verdict:
-    """Whether one effect is simulated.
+    """Decision about one effect.
 
     Attributes
     ----------
     name : str
+        Name of the effect.
     on : bool
+        True if the effect is simulated.
     reason : str
+        Explanation for the user.
     estimate_db : float or None
-        By how much it changes the image; None where it cannot be left out or finds nothing to act upon.
+        Change of the image in decibels. None if the effect cannot be left out or applies to nothing in the scene.
     forced : bool
-        The scene overrides the estimate: by ``effects``, by a key that requests the effect, or by a tolerance of 0.
+        True if the scene overrides the estimate: by ``effects``, by a key that requests the effect, or by a tolerance
+        of 0.
     rehearsed : bool
-        The estimate was too close to the tolerance, so two renderings were compared: their change stands for it.
+        True if an A/B render measured the change, because the estimate was too close to the tolerance.
     coupled : bool
-        It matters or not as another effect is on or off, and that one as this is; both are on to be safe.
+        True if the decision about this effect depends on another effect and vice versa. Both are then on, to be safe.
     """
 
     name: str
@@ -57,13 +61,14 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class EffectPlan:
-    """The effects that are simulated for a scene, with reasons.
+    """Effects that are simulated for a scene, with reasons.
 
     Attributes
     ----------
     verdicts : tuple of Verdict
+        One per effect.
     notes : tuple of str
-        Limits of the models that the scene exceeds.
+        Validity limits of the models that the scene exceeds.
     """
 
     verdicts: tuple[Verdict, ...]
@@ -76,7 +81,7 @@ class EffectPlan:
 
     @property
     def left_out(self) -> tuple[str, ...]:
-        """The effects that are off, although they change the image."""
+        """The effects that are off although they change the image."""
         return tuple(verdict.name for verdict in self.verdicts if not verdict.on and verdict.estimate_db)
 
 
@@ -86,11 +91,13 @@ def make_plan(scene: Scene) -> EffectPlan:
     Effects that a key of the scene requests are on, see `names.ASKED_FOR`. With a tolerance of 0, all effects that
     apply to something in the scene are on.
 
-    For the others, all sensors are asked, at the beginning, at the end, in between and at way points; the greatest
-    change counts. Effects are estimated one after the other, each in the light of those before it: geometry first, then
-    what filters echoes, then what adds to them; and again in the light of all others, until nothing changes. Where
-    an estimate is not certain enough, the measurements with the greatest estimates are rendered and processed with the
-    effect and without. So is the loudest measurement, because estimates do not model converters.
+    The other effects are estimated for all sensors at the beginning, at the end, in between and at waypoints. The
+    greatest change counts. Effects are estimated one after the other, each given those before it: geometry first, then
+    filters of echoes, then additional sound. Estimation repeats, given all other effects, until no decision changes.
+
+    If an estimate is not certain enough, A/B renders measure the change. They render and process the measurements with
+    the greatest estimates, with and without the effect. They also use the loudest measurement, because estimates do not
+    model converters.
     """
     indices = _indices(scene)
     shots = [(index, snapshot(scene, sensor, index / scene.rate_hz)) for index in indices for sensor in scene.sensors]
@@ -106,7 +113,7 @@ def make_plan(scene: Scene) -> EffectPlan:
         rounds.append(_active(verdicts))
         if rounds[-1] == rounds[-2]:
             return EffectPlan(tuple(verdicts.values()), notes)
-    # They go in a circle: one matters only with the other, which matters only without it.
+    # The decisions oscillate: one effect matters only with the other, and the other only without the first.
     circle = frozenset.union(*rounds[2:]) - frozenset.intersection(*rounds[2:])
     kept = (_kept_on(verdict) if verdict.name in circle else verdict for verdict in verdicts.values())
     return EffectPlan(tuple(kept), notes)
@@ -115,13 +122,15 @@ def make_plan(scene: Scene) -> EffectPlan:
 def _kept_on(verdict: Verdict) -> Verdict:
     if verdict.forced:
         return verdict
-    return replace(verdict, on=True, coupled=True, reason=f"{verdict.reason}; stays on, as others wait for it")
+    return replace(
+        verdict, on=True, coupled=True, reason=f"{verdict.reason}; stays on, because other effects depend on it"
+    )
 
 
 def _indices(scene: Scene) -> list[int]:
-    """Return the measurements for which effects are estimated.
+    """Return the indices of the measurements for which effects are estimated.
 
-    These are the first; in a scene in motion, several more and those at its way points; with clock drift, the last
+    These are the first; in a moving scene, several more and those at its waypoints; with clock drift, the last
     before a SYNC.
     """
     last = scene.count - 1
@@ -143,14 +152,14 @@ def _decided(
     shots: list[tuple[int, Snapshot]],
     rehearse: Rehearse,
 ) -> Verdict:
-    """Return the verdict on one effect beside others."""
+    """Return the verdict on one effect, given the others."""
     if name in INDISPENSABLE:
         return Verdict(name=name, on=True, reason=INDISPENSABLE[name])
     given = scene.effects.get(name)
     forced = True if given is None and (name in ASKED_FOR or not scene.tolerance_db) else given
     estimates = _estimates(name, others, shots)
     if not estimates:
-        reason = f"the scene has nothing for it: {EFFECTS[name]}"
+        reason = f"it applies to nothing in the scene: {EFFECTS[name]}"
         return Verdict(name=name, on=bool(given), reason=reason, forced=given is not None)
     worst = estimates[0][0]
     if forced is not None:
@@ -164,14 +173,14 @@ def _decided(
     return Verdict(
         name=name,
         on=change_db > (_PART_ALLOWED if measured_db is not None and moves else 1.0) * scene.tolerance_db,
-        reason=worst.reason if measured_db is None else f"{worst.reason}; rehearsed",
+        reason=worst.reason if measured_db is None else f"{worst.reason}; change measured by A/B renders",
         estimate_db=change_db,
         rehearsed=measured_db is not None,
     )
 
 
 def _estimates(name: str, active: frozenset[str], shots: list[tuple[int, Snapshot]]) -> list[tuple[Estimate, int]]:
-    """Return the estimates of all shots and the numbers of their measurements, the greatest change first."""
+    """Return the estimates of all snapshots with the indices of their measurements, greatest change first."""
     found = [(ESTIMATES[name](Sight.of(shot, active)), index) for index, shot in shots]
     return sorted(
         ((estimate, index) for estimate, index in found if estimate is not None), key=lambda each: -each[0].change_db
@@ -179,7 +188,7 @@ def _estimates(name: str, active: frozenset[str], shots: list[tuple[int, Snapsho
 
 
 def _loudest(name: str, active: frozenset[str], shots: list[tuple[int, Snapshot]]) -> list[int]:
-    """Return the measurement with the highest bound on its amplitude, if that is within 6 dB of full scale."""
+    """Return the index of the measurement with the highest amplitude bound, if within 6 dB of full scale."""
     peaks = [
         (max(peak_bound(shot, active), peak_bound(shot, active | {name})), index)
         for index, shot in shots
@@ -204,7 +213,7 @@ def _measured_db(
 
 
 def _rehearsals(scene: Scene) -> ABRender:
-    # Loaded here because it brings in the whole signal chain, and most scenes are decided without.
+    # Imported here because it loads the whole signal chain, and most scenes are decided without it.
     from ertis_numba.simulation.ab_render import ABRender  # noqa: PLC0415
 
     return functools.cache(ABRender(scene).change_db)

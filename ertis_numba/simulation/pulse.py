@@ -1,4 +1,4 @@
-"""What the matched filter makes of calls: their band, their pulse and its side lobes."""
+"""Output of the matched filter for calls: the band, the pulse and its side lobes."""
 
 import functools
 import math
@@ -21,14 +21,14 @@ N_NODES = 65
 
 @functools.lru_cache(maxsize=16)
 def match(settings: Settings) -> tuple[MatchedFilterSpectrum, float, int]:
-    """Return the matched filter of the own call, the rate of its signals and the length of its transform."""
+    """Return the matched filter of the sensor's own call, its sample rate and the length of its transform."""
     rate_hz = settings.signal_rate_hz
     n_fft = 2 ** math.ceil(math.log2(2 * settings.call.duration_s * rate_hz))
     return matched_filter_spectrum(settings, n_fft=n_fft), rate_hz, n_fft
 
 
 def matched(settings: Settings, call: Call, emitter: Emitter | None = None) -> NDArray[np.complex128]:
-    """Return a call of amplitude 1, filtered by the sensor's matched filter: (lag,) complex128, from lag 0 on.
+    """Return a call of amplitude 1 after the sensor's matched filter: (lag,) complex128, starting at lag 0.
 
     If an emitter is given, the call includes the response of its transducer.
     """
@@ -46,7 +46,7 @@ def matched(settings: Settings, call: Call, emitter: Emitter | None = None) -> N
 
 @functools.lru_cache(maxsize=16)
 def baseband(settings: Settings, emitter: Emitter | None = None) -> tuple[Floats, NDArray[np.complex128]]:
-    """Return the matched call without its carrier, by lag: (lag,) float64 seconds, (lag,) complex128."""
+    """Return lags in seconds, and the matched call without its carrier: (lag,) float64, (lag,) complex128."""
     pulse = np.fft.fftshift(matched(settings, settings.call, emitter))
     lag_s = (np.arange(len(pulse)) - len(pulse) // 2) / settings.signal_rate_hz
     frequency_hz, power = band(settings)
@@ -55,9 +55,9 @@ def baseband(settings: Settings, emitter: Emitter | None = None) -> tuple[Floats
 
 @functools.lru_cache(maxsize=16)
 def envelope(settings: Settings, emitter: Emitter | None = None) -> tuple[Floats, Floats]:
-    """Return lags from 0 on and the envelope of the matched call: both (lag,) float64.
+    """Return lags of at least 0 and the envelope of the matched call: both (lag,) float64.
 
-    If an emitter is given, whose transducer rings, the envelope is relative to its peak.
+    If an emitter with a ringing transducer is given, the envelope is relative to its peak.
     """
     lag_s, pulse = baseband(settings, emitter)
     middle = len(lag_s) // 2
@@ -67,11 +67,11 @@ def envelope(settings: Settings, emitter: Emitter | None = None) -> tuple[Floats
 
 @functools.lru_cache(maxsize=16)
 def band(settings: Settings) -> tuple[Floats, Floats]:
-    """Return some frequencies of the call's band, and the share of the matched call's power at each."""
+    """Return frequencies of the call's band, and the fraction of the matched call's power at each."""
     rate_hz, n_fft = settings.signal_rate_hz, 32_768  # bins much narrower than a node
     mine = matched_filter_spectrum(settings, n_fft=n_fft)
     frequency_hz = (mine.first_bin + np.arange(len(mine.values))) * rate_hz / n_fft
     edges = np.linspace(*matched_band_hz(settings), N_NODES + 1)
-    # S H is what the image sums; between the edges of its window H is conj(S).
+    # The image sums S H; between the edges of its window H is conj(S).
     power, _ = np.histogram(frequency_hz, edges, weights=np.abs(mine.values) ** 2)
     return (edges[:-1] + edges[1:]) / 2, power / power.sum()

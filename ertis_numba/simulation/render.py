@@ -1,4 +1,4 @@
-"""From a scene to the words that its sensors would record."""
+"""Rendering of a scene to the raw samples that its sensors would record."""
 
 from ertis_numba import checks
 from ertis_numba.frames import Measurement
@@ -14,21 +14,35 @@ __all__ = ["Simulator", "compile_kernels", "render"]
 
 
 class Simulator(Engine):
-    """Renders the measurements of one sensor with the effects that the scene calls for.
+    """Renders the measurements of one sensor with the effects that the scene needs.
 
     Parameters
     ----------
     scene : Scene
     sensor : str, optional
-        The first by default.
-    plan : Plan, optional
-        Which effects; what the scene calls for by default.
+        Name of the sensor; the first of the scene by default.
+    plan : EffectPlan, optional
+        Effects to simulate; `make_plan` chooses them by default.
     threads : int, optional
-        All cores by default. The bits do not depend on it.
+        Number of threads; all cores by default. The bits do not depend on it.
 
     Attributes
     ----------
-    plan : Plan
+    plan : EffectPlan
+        Effects that are simulated, with reasons.
+
+    Raises
+    ------
+    ArgumentError
+        ``scene`` is no `Scene`, the scene has no such sensor, or the scene exceeds a limit.
+
+    Examples
+    --------
+    >>> from ertis_numba.simulation import Point, Scene
+    >>> from ertis_numba.simulation.render import Simulator
+    >>> simulator = Simulator(Scene(points=(Point(range_m=1.0),)))
+    >>> [f"{reflector.range_m:.2f} m" for reflector in simulator.reflectors()]
+    ['1.00 m']
     """
 
     def __init__(
@@ -40,12 +54,34 @@ class Simulator(Engine):
 
 
 def render(scene: Scene, index: int = 0, *, sensor: str | None = None) -> Measurement:
-    """Return one measurement of a scene, of its first sensor by default; see `Simulator` for more of them."""
+    """Return one measurement of a scene; use `Simulator` for several.
+
+    Parameters
+    ----------
+    scene : Scene
+    index : int
+        Index of the measurement; 0 by default.
+    sensor : str, optional
+        Name of the sensor; the first of the scene by default.
+
+    Returns
+    -------
+    Measurement
+        Raw samples with settings, sensor name and time stamps.
+
+    Raises
+    ------
+    ArgumentError
+        ``scene`` is no `Scene`, the scene has no such sensor, or the scene exceeds a limit.
+    """
     return Simulator(scene, sensor=sensor).render(index)
 
 
 def compile_kernels() -> None:
-    """Compile what rendering and rehearsals need, on a scene of one point: those who wait may want to know why."""
+    """Compile the kernels for rendering and A/B renders, on a scene with one point.
+
+    Callers can then report the reason for the delay.
+    """
     sensor = Sensor(
         array=Array(layout="one", positions_m=((0.0, 0.0, 0.0),)),
         recording=Recording(n_samples=20_000),

@@ -1,7 +1,6 @@
-"""What is simulated: the whole content of a scene file.
+"""Scenes: the complete content of a scene file.
 
-Levels and strengths are relative to full scale: an amplitude of 1, or 0 dB, is a signal that would
-keep all PDM bits at one value.
+Levels and strengths are relative to full scale. A signal of amplitude 1, or 0 dB, would hold all PDM bits at one value.
 """
 
 from pathlib import Path
@@ -26,30 +25,39 @@ _MAX_REFLECTIONS = 4
 
 
 class Scene(TomlDocument, frozen=True, kw_only=True):
-    """Sensors and what they hear.
+    """Sensors, and the reflectors and sound sources around them.
 
     Attributes
     ----------
     seed : int
-        Decides noise, dither and the spread of microphones. Measurements of one scene differ by their index alone.
+        Seed of noise, dither and the spread of microphones; 0 by default. Only the index makes measurements of one
+        scene differ.
     rate_hz : float
-        Measurements per second.
+        Measurements per second; 20 by default.
     count : int
-        Number of measurements.
+        Number of measurements; 1 by default.
     sync_every : int
-        Measurements from one SYNC to the next; between SYNCs, sample clocks are not synchronised.
+        Number of measurements from one SYNC to the next; 1 by default. Between SYNCs, sample clocks run freely.
     tolerance_db : float
-        Effects that change no image by more are left out, unless a key of the scene requests them; 0 keeps all.
+        Largest acceptable change of an image in decibels; 0.1 by default. Effects that change no image by more are left
+        out, unless a key of the scene requests them. 0 keeps all effects.
     max_reflections : int
-        Walls that a sound may meet on its way.
+        Maximum number of walls on a sound path, 0 to 4; 2 by default.
     effects : dict of str to bool
-        Decides for effects by name instead of the tolerance.
+        Effects to switch on or off by name, regardless of the tolerance; none by default.
     sensors : tuple of Sensor
-        They emit together. One eRTIS at the origin by default.
+        Sensors, which emit together; one eRTIS at the origin by default.
     points, spheres, walls, boxes
-        What returns the sound.
+        Reflectors; none by default.
     tones, noises, sonars, ambient
-        What else is to be heard.
+        Other sound sources; none by default.
+
+    Examples
+    --------
+    >>> from ertis_numba.simulation import Point, Scene
+    >>> scene = Scene(points=(Point(azimuth_deg=10.0, range_m=1.5),))
+    >>> scene.moves
+    False
     """
 
     former_keys: ClassVar[dict[str, str]] = Sensor.former_keys
@@ -83,22 +91,22 @@ class Scene(TomlDocument, frozen=True, kw_only=True):
             checks.choice("effect", name, EFFECTS)
             if name in INDISPENSABLE and not wanted:
                 raise ArgumentError(
-                    f"effect {name!r} cannot be left out ({INDISPENSABLE[name]}); take it out of effects"
+                    f"effect {name!r} cannot be left out ({INDISPENSABLE[name]}); remove it from effects"
                 )
         if not self.sensors:
-            raise ArgumentError("scene has no sensors; give at least one")
+            raise ArgumentError("the scene has no sensors; give at least one")
         names = [sensor.name for sensor in self.sensors]
         for name in names:
             if names.count(name) > 1:
-                raise ArgumentError(f"scene has {names.count(name)} sensors named {name!r}; name each differently")
+                raise ArgumentError(f"the scene has {names.count(name)} sensors named {name!r}; name each differently")
 
     @property
     def moves(self) -> bool:
-        """Whether anything changes its place."""
+        """True if any object changes its position."""
         return any(thing.moves for thing in self.things())
 
     def things(self) -> tuple[Placed, ...]:
-        """Return all that has a place, the sensors' own among them."""
+        """Return all objects that have a position, including the sensors."""
         targets = (*self.points, *self.spheres, *self.walls, *self.boxes)
         return (*targets, *self.tones, *self.noises, *self.sonars, *(sensor.path() for sensor in self.sensors))
 
@@ -117,7 +125,7 @@ class Scene(TomlDocument, frozen=True, kw_only=True):
         Raises
         ------
         ArgumentError
-            There is none of this name.
+            The scene has no sensor of this name.
         """
         names = [sensor.name for sensor in self.sensors]
         if name is not None:
@@ -125,9 +133,9 @@ class Scene(TomlDocument, frozen=True, kw_only=True):
         return self.sensors[0 if name is None else names.index(name)]
 
     def with_files_of(self, folder: Path) -> Self:
-        """Return a scene that depends on no file of a layout or a call; ``folder`` is that of the files.
+        """Return a scene that contains the layouts and calls of its files.
 
-        So are files of directions.
+        Paths are relative to ``folder``; paths of direction files are resolved but not read.
         """
         sensors = [sensor.resolve_paths(folder) for sensor in self.sensors]
         return self.replace(
@@ -145,15 +153,24 @@ def _read(array: Array) -> Array:
 def load_scene(path: str | Path) -> Scene:
     """Read a scene file.
 
-    Files that it names, of layouts and of directions, are looked for beside it; layouts are written out, so that the
-    scene depends on none.
+    Paths in the file are relative to its folder. Layouts are read and stored in the scene, so that the scene does not
+    depend on layout files.
+
+    Parameters
+    ----------
+    path : str or Path
+        TOML file.
+
+    Returns
+    -------
+    Scene
 
     Raises
     ------
     SettingsError
         The file cannot be read or used.
     ArgumentError
-        A layout cannot be read or used, or a sensor has no such channel.
+        A layout cannot be read or used, or a sensor does not have a channel that the file names.
     """
     path = Path(path)
     scene = Scene.load(path).with_files_of(path.parent)

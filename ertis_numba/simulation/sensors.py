@@ -1,4 +1,4 @@
-"""The sensors of a scene: settings, place, emitter and electronics."""
+"""Sensors of a scene: settings, pose, emitter and electronics."""
 
 import math
 import re
@@ -17,34 +17,42 @@ from ertis_numba.simulation.placed import Placed, Vector, check_vector
 __all__ = ["Electronics", "Emitter", "Sensor"]
 
 _LOUDEST_DB = 120.0
-_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.@+-]*")  # what can stand in a file
+_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.@+-]*")  # characters that are valid in files
 _LARGEST_M = 0.2  # of an emitter or a microphone
-_MAX_OFFSET_M = 10.0  # one housing; whatever stands farther away is a sensor of its own
-_QUALITY_FACTORS = 1e-6, 200.0  # from a film that sends all alike to a bare crystal
+_MAX_OFFSET_M = 10.0  # size of one housing; an emitter farther away belongs to a separate sensor
+_QUALITY_FACTORS = 1e-6, 200.0  # from a film with a flat response to a bare crystal
 _QUALITY_FACTOR = 5.0
 _MAX_DRIFT_PPM = 1000.0
 
 
 class Emitter(TomlTable, frozen=True, kw_only=True):
-    """The loudspeaker, which faces forward.
+    """Loudspeaker of a sensor; it faces forward.
 
     Attributes
     ----------
     level_db : float
-        Amplitude of the call 1 m ahead; full scale of the microphones is 0.
+        Sound pressure level of the call at 1 m on the axis, in decibels relative to full scale of the microphones; 0
+        by default.
     diameter_m : float
-        Of a circular piston, which sends to the sides less the higher the frequency. 0, the default, sends
-        alike in all directions.
+        Diameter of the emitter as a circular piston, in metres. Its beam narrows as the frequency rises. 0, the
+        default, emits equally in all directions.
     direct_sound_db : float, optional
-        Level 1 m from the emitter of what goes to the sensor's own microphones; they hear nothing by default.
+        Level of the direct sound to the sensor's own microphones, at 1 m from the emitter; no direct sound by default.
     silent : bool
-        The sensor only listens.
+        True if the sensor only receives; False by default.
     position_m : (x, y, z)
-        Position in the sensor frame, whose origin is the centroid of the enabled microphones.
+        Position in the sensor frame in metres; the origin by default. The origin is the centroid of the enabled
+        microphones.
     resonance_hz : float, optional
         Resonance of the transducer, which then filters the call and rings; the response is flat by default.
     quality_factor : float, optional
-        Quality factor of the resonance, whose bandwidth is ``resonance_hz / quality_factor``; 5 by default.
+        Quality factor of the resonance, 5 by default. The bandwidth is ``resonance_hz / quality_factor``.
+
+    Examples
+    --------
+    >>> from ertis_numba.simulation import Emitter
+    >>> Emitter(resonance_hz=40e3).resonance_quality
+    5.0
     """
 
     level_db: float = 0.0
@@ -68,7 +76,7 @@ class Emitter(TomlTable, frozen=True, kw_only=True):
             elif self.resonance_hz is None:
                 raise ArgumentError(
                     f"emitter.quality_factor is {self.quality_factor:g}, but the emitter has no resonance; "
-                    "give emitter.resonance_hz, or leave quality_factor out"
+                    "give emitter.resonance_hz, or leave out quality_factor"
                 )
         checks.between("emitter.level_db", self.level_db, -300.0, _LOUDEST_DB)
         checks.between("emitter.diameter_m", self.diameter_m, 0.0, _LARGEST_M)
@@ -82,27 +90,34 @@ class Emitter(TomlTable, frozen=True, kw_only=True):
 
 
 class Electronics(TomlTable, frozen=True, kw_only=True):
-    """The microphones and what they do to the sound.
+    """Microphones, their converters and the sample clock.
 
     Attributes
     ----------
     noise_dbfs : float, optional
-        Root mean square of each microphone's white noise, over the whole band up to half of the
-        record's rate; none by default. In a band B it is lower by ``10 log10(sample_rate / 2 B)`` decibels.
+        RMS of each microphone's white noise in dBFS, over the whole band up to half of the sample rate; no noise by
+        default. Over a bandwidth B it is lower by ``10 log10(sample_rate / 2 B)`` decibels.
     modulator_order : int
-        Order of the sigma-delta modulators, 1 to 4.
+        Order of the sigma-delta modulators, 1 to 4; 4 by default.
     dither : float
-        Width of the uniform dither at the quantiser, full scale 1.
+        Width of the uniform dither at the quantiser, full scale 1; 0.5 by default.
     microphone_diameter_m : float
-        Of the port, as a circular piston; 0, the default, hears alike in all directions.
+        Diameter of the port as a circular piston, in metres. 0, the default, is omnidirectional.
     gain_spread_db, delay_spread_s : float
-        Standard deviation of what the calibration in the settings does not know.
+        Standard deviations of gains and delays that the calibration in the settings does not contain; 0 by default.
     dead_channels : tuple of int
-        Microphones that hear nothing; their modulators run on silence.
+        Channels whose microphones receive no sound; none by default. Their modulators run on silence.
     stuck_low, stuck_high : tuple of int
-        Channels whose bit is always 0 or always 1, or whose number is that at either end of the scale.
+        Channels whose bit is always 0 or always 1, or whose PCM samples are always at either end of the scale; none by
+        default.
     clock_drift_ppm : float
-        Microseconds that the sensor's sample clock gains per second.
+        Drift of the sensor's sample clock in parts per million; a positive value runs fast. 0 by default.
+
+    Examples
+    --------
+    >>> from ertis_numba.simulation import Electronics
+    >>> Electronics(dead_channels=(3,), stuck_low=(7,)).faulty_channels
+    (3, 7)
     """
 
     noise_dbfs: float | None = None
@@ -129,12 +144,12 @@ class Electronics(TomlTable, frozen=True, kw_only=True):
         both = set(self.stuck_low) & set(self.stuck_high)
         if both:
             raise ArgumentError(
-                f"electronics has channel {min(both)} in stuck_low and in stuck_high; give it in one of them"
+                f"electronics has channel {min(both)} in both stuck_low and stuck_high; give it in only one of them"
             )
 
     @property
     def faulty_channels(self) -> tuple[int, ...]:
-        """All channels that carry no sound."""
+        """All channels without sound, in increasing order."""
         return tuple(sorted({*self.dead_channels, *self.stuck_low, *self.stuck_high}))
 
 
@@ -147,22 +162,30 @@ class _Pose(Placed, frozen=True, kw_only=True):
 
 
 class Sensor(Settings, frozen=True, kw_only=True):
-    """A sensor of a scene: its settings, with a name, a pose, an emitter and electronics.
+    """Sensor of a scene: its settings, with a name, a pose, an emitter and electronics.
 
     Attributes
     ----------
     name : str
-        Name in recordings and of the port, different for each sensor.
+        Name in recordings and of the emulated port, different for each sensor; ``sensor`` by default.
     position_m : (x, y, z)
-        Of its origin, in the world frame.
+        Position of the sensor's origin in the world frame, in metres; the origin of the world by default.
     velocity_m_s : (x, y, z)
-        Constant velocity in the world frame.
+        Constant velocity in the world frame, in metres per second; 0 by default.
     waypoints : tuple of (time_s, x, y, z)
-        Instead of position and velocity.
+        Times in seconds and positions in metres, instead of position and velocity; none by default.
     yaw_deg, pitch_deg, roll_deg : float
-        Turn to the left, then nose up, then clockwise seen from behind.
+        Rotation to the left, then nose up, then clockwise as seen from behind, in degrees; 0 by default.
     emitter : Emitter
+        Loudspeaker at the origin of the sensor by default.
     electronics : Electronics
+        Noise-free and fault-free microphones by default.
+
+    Examples
+    --------
+    >>> from ertis_numba.simulation import Sensor
+    >>> Sensor(yaw_deg=90.0).rotation().round(3)[:, 0].tolist()
+    [0.0, 1.0, 0.0]
     """
 
     name: str = "sensor"
@@ -179,7 +202,7 @@ class Sensor(Settings, frozen=True, kw_only=True):
         super().__post_init__()
         if not _NAME.fullmatch(self.name):
             raise ArgumentError(
-                f"sensor.name is {self.name!r}; give letters, digits and _, after the first also . @ + -"
+                f"sensor.name is {self.name!r}; give letters, digits and _, and from the second character also . @ + -"
             )
         checks.between("sensor.yaw_deg", self.yaw_deg, -180.0, 180.0)
         checks.between("sensor.pitch_deg", self.pitch_deg, -90.0, 90.0)
@@ -190,34 +213,36 @@ class Sensor(Settings, frozen=True, kw_only=True):
                 checks.integer(f"electronics.{name}", channel, 0, 1023)
 
     def require_microphones(self) -> None:
-        """Refuse faults of channels that carry no microphone, which only the layout can tell.
+        """Raise an error for faults of channels without a microphone.
+
+        The check is separate because it needs the layout.
 
         Raises
         ------
         ArgumentError
-            There is such a channel.
+            A faulty channel has no microphone.
         """
         enabled = microphones(self.array.replace(disabled=None)).enabled
         for channel in self.electronics.faulty_channels:
             if channel >= len(enabled) or not enabled[channel]:
                 raise ArgumentError(
-                    f"sensor {self.name!r} has no microphone on channel {channel}, which is to be faulty; "
-                    f"give one of its {len(enabled)} channels, counted from 0"
+                    f"sensor {self.name!r} has no microphone on channel {channel}, which electronics lists as faulty; "
+                    f"give one of its {len(enabled)} channels that has a microphone, counted from 0"
                 )
 
     def path(self) -> Placed:
-        """Return the place of its origin, which is that of the world by default."""
+        """Return the position and motion of the sensor's origin; it rests at the origin of the world by default."""
         place = self.position_m if self.position_m is not None or self.waypoints else (0.0, 0.0, 0.0)
         return _Pose(position_m=place, velocity_m_s=self.velocity_m_s, waypoints=self.waypoints)
 
     def settings(self) -> Settings:
-        """Return what its recordings are processed with."""
+        """Return the settings with which its recordings are processed."""
         return Settings(
             array=self.array, call=self.call, recording=self.recording, air=self.air, processing=self.processing
         )
 
     def rotation(self) -> NDArray[np.float64]:
-        """Return the matrix that turns vectors of the sensor frame into the world frame: (3, 3) float64."""
+        """Return the rotation matrix from the sensor frame to the world frame: (3, 3) float64."""
         yaw, pitch, roll = (math.radians(angle) for angle in (self.yaw_deg, self.pitch_deg, self.roll_deg))
         about_z = np.array([[math.cos(yaw), -math.sin(yaw), 0], [math.sin(yaw), math.cos(yaw), 0], [0, 0, 1]])
         about_y = np.array([[math.cos(pitch), 0, -math.sin(pitch)], [0, 1, 0], [math.sin(pitch), 0, math.cos(pitch)]])
@@ -225,7 +250,7 @@ class Sensor(Settings, frozen=True, kw_only=True):
         return np.asarray(about_z @ about_y @ about_x, dtype=np.float64)
 
     def quaternion(self) -> NDArray[np.float64]:
-        """Return the same turn as x, y, z, w: (4,) float64."""
+        """Return the same rotation as a quaternion x, y, z, w: (4,) float64."""
         half = [math.radians(angle) / 2 for angle in (self.yaw_deg, -self.pitch_deg, self.roll_deg)]
         (cz, cy, cx), (sz, sy, sx) = ([function(angle) for angle in half] for function in (math.cos, math.sin))
         return np.array(

@@ -1,4 +1,4 @@
-"""What a sensor's image will show of a scene, estimated without rendering it."""
+"""Estimate of a sensor's image of a scene, computed without rendering."""
 
 import functools
 import math
@@ -22,33 +22,33 @@ from ertis_numba.simulation.stopwatch import CostStopwatch
 __all__ = ["SAME_RANGE_M", "Echoes", "Sight", "change_db"]
 
 Floats = NDArray[np.float64]
-_GEOMETRY = frozenset({"walls", "occlusion", "target_size", "emitter_offset"})  # on which ways of the sound depend
+_GEOMETRY = frozenset({"walls", "occlusion", "target_size", "emitter_offset"})  # effects that change sound paths
 _LAGS, _LAG_DIRECTIONS = 128, 64
 _BEAM_PATHS, _BEAM_DIRECTIONS = 6, 361
-_SHOWN_DB = 40.0  # what an image shows below its strongest reflector, among side lobes
+_SHOWN_DB = 40.0  # dynamic range of an image: weaker reflectors are masked by side lobes
 _ACROSS = 8192
 _SIDE_LOBE = 0.5  # of an array of a few dozen microphones
 _CUT = 0.05
-_TABLE_SIZE = 2**21  # numbers that a table of paths by paths has in memory at a time
-_PEAK = 3.3  # highest of some ten thousand Rayleigh-distributed amplitudes, by their root mean square
+_TABLE_SIZE = 2**21  # elements of a paths × paths table that are in memory at a time
+_PEAK = 3.3  # highest of some ten thousand Rayleigh-distributed amplitudes, relative to their RMS
 SAME_RANGE_M = 0.05
-"""Echoes so close in range count as at the same range."""
-# White noise of the level that modulators of each order leave between 20 and 80 kHz at the clock of eRTIS.
+"""Largest difference of ranges that count as the same range, in metres."""
+# Level of white noise equivalent to the noise of modulators of each order between 20 and 80 kHz at the clock of eRTIS.
 _MODULATOR_DBFS, _MAX_NOISE_DBFS = {1: -22.0, 2: -44.0, 3: -48.0, 4: -58.0}, -10.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Echoes:
-    """Paths as an image shows them.
+    """Echoes in an image, one per path.
 
     Attributes
     ----------
     names : tuple of str
-    gain : (path, node) float64 or complex128
+    gain : (path, frequency) float64 or complex128
     delay_s : (path,) float64
-        To the middle of the array.
+        Delay at the centre of the array.
     direction : (path, axis) float64
-        Where the sound comes from, in the sensor frame.
+        Unit vector towards the source of the sound, in the sensor frame.
     """
 
     names: tuple[str, ...]
@@ -71,22 +71,23 @@ class Echoes:
 
 
 class Sight:
-    """The image of one sensor at one time, with some effects.
+    """Estimated image of one sensor at one time, with given effects.
 
     Parameters
     ----------
     shot : Snapshot
     active : frozenset of str
+        The effects that are simulated.
 
     Attributes
     ----------
-    frequency_hz, power : (node,) float64
-        Of the matched call; the powers add up to 1.
+    frequency_hz, power : (frequency,) float64
+        Frequencies of the matched call, and the fraction of its power at each; the powers add up to 1.
     """
 
     def __init__(self, shot: Snapshot, active: frozenset[str]) -> None:
         self.shot = shot
-        # Paths end in the middle of the array: what microphones hear differs by parts of a percent.
+        # Paths end at the centre of the array: levels at the microphones differ by less than a percent.
         self._middle = shot.at_centre()
         self.active = active
         self.settings = shot.sensor.settings()
@@ -95,48 +96,48 @@ class Sight:
 
     @classmethod
     def of(cls, shot: Snapshot, active: frozenset[str]) -> Self:
-        """Return the sight with some effects; for one moment it is made once."""
+        """Return the estimate with given effects; the snapshot caches it."""
         return shot.once((cls, active), lambda: cls(shot, active))
 
     @functools.cached_property
     def heard(self) -> Echoes:
-        """What arrives of calls: the own one, and those of other sensors where cross-emission is simulated."""
+        """Echoes of the sensor's own call, and of other sensors' calls if cross-emission is simulated."""
         return self.echoes(self.active)
 
     @functools.cached_property
     def shown(self) -> NDArray[np.bool_]:
-        """Which echoes the image shows: (path,) bool."""
+        """True for echoes that the image shows: (path,) bool."""
         level = self.levels(self.heard)
         weakest = max(self.noise, float(level.max(initial=0.0)) * 10 ** (-_SHOWN_DB / 20))
         return np.asarray((level > weakest) & self.inside(self.heard.delay_s))
 
     @functools.cached_property
     def floor(self) -> float:
-        """The weakest reflector that the image shows, or its noise where it shows none."""
+        """Amplitude of the weakest reflector that the image shows, or of its noise if it shows none."""
         return float(np.min(self.levels(self.heard)[self.shown], initial=np.inf)) if self.shown.any() else self.noise
 
     @functools.cached_property
     def noise(self) -> float:
-        """The highest amplitude that the noise of modulators or converters reaches in the image."""
+        """Highest amplitude that the noise of modulators or converters reaches in the image."""
         if not self.settings.recording.is_pdm:
             return self.of_white_noise(QUANTISATION_DBFS[self.settings.recording.encoding])
         order = self.shot.sensor.electronics.modulator_order
-        # Shaped noise rises with the band's share of the clock, by 6 dB per octave and order.
+        # Shaped noise rises with the ratio of band to clock, by 6 dB per octave and order.
         slower = ERTIS_PDM_RATE_HZ / self.settings.recording.sample_rate_hz
         dbfs = _MODULATOR_DBFS[order] + 20 * order * math.log10(slower)
         return self.of_white_noise(min(dbfs, _MAX_NOISE_DBFS))
 
     def echoes(self, active: frozenset[str]) -> Echoes:
-        """Return what arrives of calls with other effects."""
+        """Return the echoes of all calls with other effects."""
         return Echoes.joined([self.of_emitter(number, active) for number in self.emitters(active)])
 
     def emitters(self, active: frozenset[str]) -> list[int]:
-        """Return the numbers of the sensors whose calls arrive with some effects."""
+        """Return the numbers of the sensors whose calls arrive, given some effects."""
         own = [] if self.shot.sensor.emitter.silent else [self.shot.number]
         return own + (effect("cross_emission")(self.shot) if "cross_emission" in active else [])
 
     def of_emitter(self, number: int, active: frozenset[str]) -> Echoes:
-        """Return what arrives of one sensor's call; another call than the own one shows but weakly."""
+        """Return the echoes of one sensor's call; a call that differs from the own one appears only weakly."""
         found = Echoes.joined([self._seen(paths, number, active) for paths in self.paths(number, active)])
         if number == self.shot.number:
             return found
@@ -148,7 +149,7 @@ class Sight:
         )
 
     def paths(self, number: int, active: frozenset[str]) -> list[Paths]:
-        """Return the ways of an emitter's call to the middle of the array."""
+        """Return the paths of an emitter's call to the centre of the array."""
         middle, geometry = self._middle, active & _GEOMETRY
         return middle.once((number, geometry), lambda: echoes(middle, geometry, number, CostStopwatch()))
 
@@ -164,17 +165,18 @@ class Sight:
         )
 
     def levels(self, seen: Echoes) -> Floats:
-        """Return the amplitudes at which an image shows echoes: (path,) float64."""
+        """Return the amplitude of each echo in the image: (path,) float64."""
         return np.asarray(np.abs(seen.gain @ self.power) * self.coverage(seen.direction))
 
     def inside(self, delay_s: Floats) -> NDArray[np.bool_]:
-        """Return whether echoes lie in the image's range window: (path,) bool."""
+        """Return True for echoes in the image's range window: (path,) bool."""
         return np.asarray(self._outside_s(delay_s) == 0)
 
     def reach(self, delay_s: Floats) -> Floats:
-        """Return how much of echoes reaches into the range window: (path,) float64.
+        """Return the fraction of each echo that reaches into the range window: (path,) float64.
 
-        1 of those in it; of others the highest range side lobe of the call beyond their distance from it.
+        It is 1 for echoes in the window. For others it is the highest range side lobe of the call at their distance
+        from the window or beyond.
         """
         return self._lobe(self._outside_s(delay_s))
 
@@ -183,9 +185,9 @@ class Sight:
         return np.maximum(np.maximum(first_s - delay_s, delay_s - last_s), 0.0)
 
     def beside(self, delay_s: Floats, after: Echoes | None = None) -> Floats:
-        """Return the strongest of the image at the ranges of some delays, at least its floor: (path,) float64.
+        """Return the highest amplitude of the image at the ranges of some delays, at least its floor: (path,) float64.
 
-        Range side lobes count, those of echoes outside of the window, too. With the same echoes under
+        Range side lobes count, including those of echoes outside of the window. If ``after`` has the same echoes under
         another effect, the weaker of the two counts.
         """
         level, floor = self.levels(self.heard), self.floor
@@ -202,7 +204,7 @@ class Sight:
 
     @functools.cached_property
     def quietest(self) -> float:
-        """The least that any range of the image shows, its floor at least."""
+        """Lowest of the highest amplitudes at each range of the image, at least its floor."""
         return float(np.min(self.beside(np.linspace(*self._window_s(), _LAGS))))
 
     def _window_s(self) -> tuple[float, float]:
@@ -210,12 +212,12 @@ class Sight:
         return 2 * first_m / self.shot.speed_m_s, 2 * last_m / self.shot.speed_m_s
 
     def _lobe(self, lag_s: Floats) -> Floats:
-        """Return the highest range side lobe of the call at a lag and beyond, 1 at its peak."""
+        """Return the highest range side lobe of the call at a lag or beyond, 1 at its peak."""
         lags_s, envelope = pulse.envelope(self.settings, self._rings)
         return np.asarray(np.interp(lag_s, lags_s, np.maximum.accumulate(envelope[::-1])[::-1]))
 
     def coverage(self, direction: Floats) -> Floats:
-        """Return how much of a wave from a direction the best beam takes: (path,) float64, at most 1."""
+        """Return the gain of the best beam for a wave from each direction: (path,) float64, at most 1."""
         wave = 2 * math.pi * float(self.frequency_hz @ self.power) / self.shot.speed_m_s
         beams = np.exp(-1j * wave * (_directions(self.settings) @ self._positions_m.T))
         taken = np.zeros(len(direction))
@@ -227,22 +229,23 @@ class Sight:
     def of_white_noise(
         self, dbfs: float, *, coherent: bool = False, band_hz: tuple[float, float] | None = None
     ) -> float:
-        """Return the highest amplitude that noise reaches in the image.
+        """Return the highest amplitude that white noise reaches in the image.
 
         Parameters
         ----------
         dbfs : float
-            Root mean square, over the whole band or ``band_hz``.
+            RMS of the noise in dBFS, over the whole band or ``band_hz``.
         coherent : bool
-            The noise comes from one place, so that a beam takes all of it.
+            True if the noise comes from one place; a beam then does not reduce it.
         band_hz : (low, high), optional
+            Band of the noise; the whole band by default.
         """
         matched, rate_hz, n_fft = pulse.match(self.settings)
         heard_hz = (matched.first_bin + np.arange(len(matched.values))) * rate_hz / n_fft
         low_hz, high_hz = band_hz or (0.0, self.settings.recording.sample_rate_hz / 2)
         across_hz = np.linspace(low_hz, high_hz, _ACROSS)
         response = np.interp(across_hz, heard_hz, np.abs(matched.values), left=0.0, right=0.0)
-        # A density σ² / B, one-sided, through the filter, and as the modulus of the analytic signal.
+        # One-sided density σ² / B after the filter, and as the modulus of the analytic signal.
         power = float(np.mean(response**2)) / 2
         mics = 1 if coherent else len(self.shot.channels)
         return float(_PEAK * 10 ** (dbfs / 20) * math.sqrt(power / mics))
@@ -253,25 +256,30 @@ class Sight:
         place = round(frequency_hz * n_fft / rate_hz) - matched.first_bin
         response = np.abs(matched.values)
         inside = 0 <= place < len(response)
-        # Outside of the band the cut from record to window is heard.
+        # Outside of the band, the truncation of the record to the window leaks some of the tone.
         return float(amplitude / 2 * (response[place] if inside else _CUT * response.max()))
 
     def likeness(self, call: Call) -> float:
-        """Return the amplitude of another call, 1 at the microphones, in the image; that of the own call is 1."""
+        """Return the amplitude in the image of another call that has amplitude 1 at the microphones.
+
+        It is relative to the own call.
+        """
         if call == self.settings.call:
             return 1.0
         return float(np.abs(pulse.matched(self.settings, call)).max())
 
     def near_field(self, amplitude: Floats, delay_s: Floats) -> tuple[Floats, Floats]:
-        """Return what beams take at the most, after the image begins, of a sound from within the array.
+        """Return the highest amplitude in any beam of a sound from within the array, after the image begins.
 
         Parameters
         ----------
         amplitude, delay_s : (mic,) float64
+            Amplitude and delay at each microphone.
 
         Returns
         -------
         time_s, level : (time,) float64
+            Times after the start of the record, and the highest amplitude at each.
         """
         begin_s = 2 * self.settings.processing.range_m[0] / self.shot.speed_m_s
         time_s = begin_s + np.linspace(0.0, self.settings.call.duration_s, _LAGS)
@@ -284,12 +292,13 @@ class Sight:
         return time_s, np.asarray(np.max(np.abs(heard @ amplitude) / len(amplitude), axis=1))
 
     def beam_change(self, directions: Floats, weight: NDArray[np.complex128]) -> float:
-        """Return by how much beams on reflectors change, beside the reflector, when microphones are weighted.
+        """Return the greatest change of beams relative to the reflector, when weights apply to the microphones.
 
         Parameters
         ----------
         directions : (path, axis) float64
-        weight : (mic, node) complex128
+            Unit vectors towards the reflectors.
+        weight : (mic, frequency) complex128
         """
         nodes = slice(pulse.N_NODES % 8 // 2, None, 8)
         power = self.power[nodes] / self.power[nodes].sum()
@@ -309,10 +318,10 @@ class Sight:
         return self.shot.layout.positions_m[self.shot.channels]
 
     def envelope_change(self, before: Echoes, after: Echoes, turn_s: Floats | None = None) -> Floats:
-        """Return by how much the same paths with other effects change the image at the most: (path,) float64.
+        """Return the greatest change of the image by the same paths with other effects: (path,) float64.
 
-        By their own envelopes, and, where they meet the side lobes of others, by the turn of their carriers, which is
-        that of the shift where no other is given.
+        The envelope of each path changes. Where a path overlaps the side lobes of others, the phase of its carrier
+        also matters. Its phase shift follows from ``turn_s``, or from the change of the delay by default.
         """
         if not len(before):
             return np.zeros(0)
@@ -321,26 +330,26 @@ class Sight:
         centre_hz = float(self.frequency_hz @ self.power)
         turn = np.where(turn_s * centre_hz < 0.5, 2 * np.abs(np.sin(math.pi * centre_hz * turn_s)), 2.0)
         near_s = np.linspace(-1.5, 1.5, 61) / np.ptp(self.frequency_hz)
-        # Beyond a few pulses the two no longer meet, and the nodes would repeat them.
+        # Beyond a few pulse lengths the two no longer overlap, and the sampled spectrum would repeat them.
         shift_s = np.clip(shift_s, -8 / np.ptp(self.frequency_hz), 8 / np.ptp(self.frequency_hz))
         change = turn * self._met(before)
         turns = np.exp(2j * math.pi * np.outer(self.frequency_hz - self.frequency_hz.mean(), near_s))
         later = np.exp(-2j * math.pi * np.outer(shift_s, self.frequency_hz - self.frequency_hz.mean()))
         was, is_now = before.gain * self.power, after.gain * self.power
         coverage = self.coverage(before.direction)
-        for one, other in ((was, is_now * later), (was / later, is_now)):  # about the one pulse, and about the other
+        for one, other in ((was, is_now * later), (was / later, is_now)):  # around the first pulse, then the second
             own = np.max(np.abs(np.abs(one @ turns) - np.abs(other @ turns)), axis=1) * coverage
             change = np.maximum(change, own)
         return np.asarray(change)
 
     def turn_change(self, seen: Echoes, angle_rad: Floats) -> Floats:
-        """Return what the image changes when echoes come from a little aside: (path,) float64."""
+        """Return the change of the image by a small change of the echoes' directions: (path,) float64."""
         aperture_m = math.sqrt(float(np.mean(np.sum(self._positions_m**2, axis=1))))
         wave = 2 * math.pi * float(self.frequency_hz @ self.power) / self.shot.speed_m_s
         return np.asarray(self.levels(seen) * np.minimum(wave * aperture_m * angle_rad, 1.0))
 
     def _met(self, seen: Echoes) -> Floats:
-        """Return the strongest that paths and side lobes of others have in one place: (path,) float64."""
+        """Return the highest overlap of each path with the side lobes of others: (path,) float64."""
         level, others = self.levels(seen), self.levels(self.heard)
         strongest = np.zeros(len(level))
         for part in _parts(len(level), 3 * len(others)):
@@ -352,12 +361,12 @@ class Sight:
 
 
 def change_db(part: Floats, beside: Floats) -> float:
-    """Return by how many decibels amplitudes change others at the most, 0 where there are none."""
+    """Return the greatest change in decibels of the amplitudes ``beside`` when ``part`` is added; 0 if empty."""
     return float(20 * np.log10(1 + np.max(part / beside, initial=0.0)))
 
 
 def _parts(n_rows: int, n_columns: int) -> Iterator[slice]:
-    """Yield the rows of a table in parts that fit into memory."""
+    """Yield slices of a table's rows that fit into memory."""
     rows = max(1, _TABLE_SIZE // max(1, n_columns))
     return (slice(first, first + rows) for first in range(0, n_rows, rows))
 

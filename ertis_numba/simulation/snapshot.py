@@ -1,4 +1,4 @@
-"""A scene at one instant, in the world frame: where everything is and how it moves."""
+"""Positions and velocities of all objects of a scene at one instant, in the world frame."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
@@ -20,19 +20,19 @@ Found = TypeVar("Found")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TransmitterPose:
-    """An emitter, or its image in walls.
+    """Pose of an emitter, or of its mirror image in walls.
 
     Attributes
     ----------
     position_m, velocity_m_s : (axis,) float64
     facing : (axis,) float64
-        Unit vector.
+        Unit vector along the emitter's axis.
     sways_m_s : tuple of (axis,) float64
-        What the motion of each wall adds to the velocity of the image, from the emitter on.
+        Velocity that the motion of each wall adds to the image, starting at the emitter.
     walls : tuple of str
-        Which the sound meets, in its order.
+        Names of the walls in the order in which the sound meets them.
     reflection : float
-        Amplitude that they leave.
+        Amplitude reflection factor of these walls.
     """
 
     position_m: Floats
@@ -45,20 +45,20 @@ class TransmitterPose:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReceiverPose:
-    """The microphones of a sensor, or their image in walls.
+    """Poses of the microphones of a sensor, or of their mirror image in walls.
 
     Attributes
     ----------
     positions_m : (mic, axis) float64
     centre_m, velocity_m_s : (axis,) float64
     axes : (3, axis) float64
-        The sensor's x, y and z as unit vectors; the image of a right hand is a left one.
+        The sensor's x, y and z as unit vectors. An odd number of reflections makes them left-handed.
     sways_m_s : tuple of (axis,) float64
-        What the motion of each wall adds to the velocity of the image, from the microphones on.
+        Velocity that the motion of each wall adds to the image, starting at the microphones.
     walls : tuple of str
-        Which the sound meets, in its order.
+        Names of the walls in the order in which the sound meets them.
     reflection : float
-        Amplitude that they leave.
+        Amplitude reflection factor of these walls.
     """
 
     positions_m: Floats
@@ -72,20 +72,20 @@ class ReceiverPose:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Targets:
-    """Points and spheres.
+    """Points, discs and spheres of a scene.
 
     Attributes
     ----------
     names : tuple of str
     positions_m, velocities_m_s : (target, axis) float64
     strength : (target,) float64
-        Amplitude of the echo at 1 m from a point, or reflected by a sphere.
+        Amplitude of the echo at 1 m from a point, or amplitude reflection factor of a sphere.
     radius_m : (target,) float64
-        0 for points.
+        Radius of spheres, 0 for points.
     diameter_m : (target,) float64
-        Of discs, 0 for others.
+        Diameter of discs, 0 for others.
     normals : (target, axis) float64
-        Where discs face.
+        Unit normals of discs.
     """
 
     names: tuple[str, ...]
@@ -100,25 +100,26 @@ class Targets:
         return len(self.names)
 
     def chosen(self, places: NDArray[np.intp]) -> Self:
-        """Return some of them: (target,) numbers."""
+        """Return a selection of targets by index: (target,) int."""
         arrays = {each.name: getattr(self, each.name)[places] for each in fields(self)[1:]}
         return replace(self, names=tuple(self.names[k] for k in places), **arrays)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mirror:
-    """A wall.
+    """Wall that reflects sound.
 
     Attributes
     ----------
     name : str
     point_m, velocity_m_s : (axis,) float64
+        Centre of the wall, and its velocity.
     axes : (3, axis) float64
         Normal, width and height as unit vectors.
     half_size_m : (2,) float64
-        Infinite where the wall has no end.
+        Half of width and height; infinite for an unbounded wall.
     reflection : float
-        Amplitude.
+        Amplitude reflection factor.
     """
 
     name: str
@@ -131,28 +132,28 @@ class Mirror:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Snapshot:
-    """What one sensor is about to hear.
+    """Scene at the start of one measurement of one sensor.
 
     Attributes
     ----------
     scene : Scene
     sensor : Sensor
-        The one that listens.
+        The receiving sensor.
     time_s : float
         Start of the emission.
     layout : Layout
-        Its microphones.
+        Microphones of the sensor.
     channels : (mic,) int64
-        Their channels.
-    receiver : Ear
-    mouths : tuple of Mouth
-        One per sensor of the scene.
+        Channels of the microphones.
+    receiver : ReceiverPose
+    mouths : tuple of TransmitterPose
+        Emitters, one per sensor of the scene.
     targets : Targets
     mirrors : tuple of Mirror
     speed_m_s : float
-        Of sound.
+        Speed of sound.
     memory : dict
-        What was found out about this moment, and ends with it.
+        Cache of intermediate results for this snapshot.
     """
 
     scene: Scene
@@ -168,7 +169,7 @@ class Snapshot:
     memory: dict[object, Any] = field(default_factory=dict, repr=False)
 
     def once(self, key: object, make: Callable[[], Found]) -> Found:
-        """Return what ``make`` returned when it was first asked for under this key."""
+        """Return the cached result of ``make`` for this key; the first call computes it."""
         if key not in self.memory:
             self.memory[key] = make()
         found: Found = self.memory[key]
@@ -176,27 +177,27 @@ class Snapshot:
 
     @property
     def number(self) -> int:
-        """Place of the listening sensor in the scene, and on the SYNC chain."""
+        """Index of the receiving sensor in the scene, and on the SYNC chain."""
         return self.scene.sensors.index(self.sensor)
 
     @property
     def transmitter(self) -> TransmitterPose:
-        """The listening sensor's own emitter."""
+        """The receiving sensor's own emitter."""
         return self.mouths[self.number]
 
     def of_mics(self, mics: slice) -> Self:
-        """Return the same with some of the microphones."""
+        """Return a copy with some of the microphones."""
         receiver = replace(self.receiver, positions_m=self.receiver.positions_m[mics])
         return replace(self, receiver=receiver, channels=self.channels[mics], memory={})
 
     def at_centre(self) -> Self:
-        """Return the same with one microphone, in the middle of the array."""
+        """Return a copy with one microphone at the centre of the array."""
         receiver = replace(self.receiver, positions_m=self.receiver.centre_m[None])
         return self.once("centre", lambda: replace(self, receiver=receiver, memory={}))
 
 
 def snapshot(scene: Scene, sensor: Sensor, time_s: float) -> Snapshot:
-    """Return the scene at a time, as a sensor meets it."""
+    """Return the scene at a time in seconds, for one receiving sensor."""
     layout = microphones(sensor.array)
     place, rotation = sensor.path(), sensor.rotation()
     centre_m = place.position_at(time_s)

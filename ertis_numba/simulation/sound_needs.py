@@ -1,4 +1,4 @@
-"""Estimated changes by foreign sound, noise and electronics."""
+"""Estimated changes by other sound sources, noise and electronics."""
 
 import math
 from dataclasses import replace
@@ -23,20 +23,20 @@ __all__ = [
 
 
 def cross_emission(sight: Sight) -> Estimate | None:
-    """Find the strongest that is heard of another sensor's call, walls included."""
+    """Find the strongest arrival of another sensor's call, including paths over walls."""
     if len(sight.shot.scene.sensors) == 1 or not effect("cross_emission")(sight.shot):
         return None
     more = sight.echoes(sight.active | {"cross_emission", *(["walls"] if sight.shot.mirrors else [])})
     own = sight.shot.sensor.name
     foreign = np.array([_emitter(name, own) != own for name in more.names], dtype=np.bool_)
-    return ghosts(sight, more, foreign, "{name} is heard at {range:.2f} m, {level:+.1f} dB beside what is there")
+    return ghosts(sight, more, foreign, "{name} appears at {range:.2f} m, {level:+.1f} dB relative to the image there")
 
 
 def sync_delay(sight: Sight) -> Estimate | None:
-    """Ask how far the calls of others shift, where they are heard."""
+    """Compute the shift of other sensors' calls due to later starts along the SYNC chain."""
     if "cross_emission" not in sight.active:
         return None
-    worst = Estimate(change_db=0.0, reason="nothing of another sensor is heard")
+    worst = Estimate(change_db=0.0, reason="no call of another sensor arrives")
     for number in effect("cross_emission")(sight.shot):
         foreign = sight.of_emitter(number, sight.active)
         late_s = effect("sync_delay")(sight.shot, number)
@@ -46,13 +46,13 @@ def sync_delay(sight: Sight) -> Estimate | None:
         if change > worst.change_db:
             name = sight.shot.scene.sensors[number].name
             worst = Estimate(
-                change_db=change, reason=f"{name} starts {late_s * 1e9:+.0f} ns beside this sensor", sure=200.0
+                change_db=change, reason=f"{name} starts {late_s * 1e9:+.0f} ns relative to this sensor", sure=200.0
             )
     return worst
 
 
 def direct_sound(sight: Sight) -> Estimate | None:
-    """Compare the direct sound that reaches into the image with the reflectors."""
+    """Compare the direct sound in the range window with the reflectors."""
     emitter = sight.shot.sensor.emitter
     if emitter.direct_sound_db is None or emitter.silent:
         return None
@@ -62,7 +62,7 @@ def direct_sound(sight: Sight) -> Estimate | None:
     over_m = sight.settings.call.duration_s * sight.shot.speed_m_s / 2
     return Estimate(
         change_db=change_db(level, sight.beside(time_s)),
-        reason=f"{20 * math.log10(amplitude.mean()):.0f} dB at the microphones, over at {over_m:.2f} m; "
+        reason=f"{20 * math.log10(amplitude.mean()):.0f} dB at the microphones, ends at {over_m:.2f} m; "
         f"the image begins at {sight.settings.processing.range_m[0]:.2f} m",
     )
 
@@ -73,7 +73,7 @@ def interference(sight: Sight) -> Estimate | None:
     if not (scene.tones or scene.noises or scene.sonars):
         return None
     way_from, spread = effect("interference", "way_from"), effect("spreading")
-    total, loudest, reason = 0.0, 0.0, "none is heard in the band"
+    total, loudest, reason = 0.0, 0.0, "no source reaches the band"
     for kind in ("tones", "noises", "sonars"):
         for number, source in enumerate(getattr(scene, kind)):
             paths = way_from(shot, source)
@@ -90,15 +90,15 @@ def interference(sight: Sight) -> Estimate | None:
             if level > loudest:
                 loudest = level
                 level_db = 20 * math.log10(loudest / sight.floor)
-                reason = f"{kind}[{number}] is heard with {level_db:+.1f} dB beside the weakest reflector"
+                reason = f"{kind}[{number}] reaches {level_db:+.1f} dB relative to the weakest reflector"
     return Estimate(change_db=change_db(np.array([total]), np.array([sight.quietest])), reason=reason)
 
 
 def _part_in_window(sight: Sight, sonar: Sonar) -> float:
-    """Return how much of a foreign call reaches into the image, in the measurement where it does most."""
+    """Return the largest fraction of another sonar's call that reaches into the image of any measurement."""
     scene, shot = sight.shot.scene, sight.shot
     if scene.count > 1:
-        return 1.0  # its calls are not synchronised, so some measurement contains one
+        return 1.0  # its calls are not synchronised, so at least one measurement contains one
     way = effect("interference", "way_from")(shot, sonar)
     calls_s = effect("interference", "calls_of")(shot, sonar) + np.mean(way.length_m) / shot.speed_m_s
     return float(np.max(sight.reach(calls_s), initial=0.0))
@@ -122,7 +122,7 @@ def microphone_noise(sight: Sight) -> Estimate | None:
 
 
 def microphone_spread(sight: Sight) -> Estimate | None:
-    """Ask what unknown gains and delays do to main lobe and side lobes."""
+    """Compute the change of main lobe and side lobes by uncalibrated gains and delays."""
     electronics = sight.shot.sensor.electronics
     if not (electronics.gain_spread_db or electronics.delay_spread_s):
         return None
@@ -135,16 +135,18 @@ def microphone_spread(sight: Sight) -> Estimate | None:
 
 
 def microphone_faults(sight: Sight) -> Estimate | None:
-    """Ask what missing microphones do to main lobe and side lobes."""
+    """Compute the change of main lobe and side lobes by faulty microphones."""
     faulty = sight.shot.sensor.electronics.faulty_channels
     if not faulty:
         return None
     hears = effect("microphone_faults")(sight.shot)
     count = int(np.sum(hears == 0))
-    return unequal(sight, hears[:, None] + np.zeros(len(sight.power)), f"{count} of {len(hears)} hear nothing")
+    return unequal(
+        sight, hears[:, None] + np.zeros(len(sight.power)), f"{count} of {len(hears)} microphones receive no sound"
+    )
 
 
 def _emitter(name: str, own: str) -> str:
-    """Return whose call an echo is."""
+    """Return the name of the sensor whose call an echo is."""
     sensor, colon, _ = name.partition(": ")
     return sensor if colon else own

@@ -1,4 +1,4 @@
-"""Sounds that are no echoes: tones, noise, other sonars, and the room itself."""
+"""Sound sources other than echoes: tones, noise, other sonars and ambient noise."""
 
 from ertis_numba import checks
 from ertis_numba.documents import TomlTable
@@ -12,14 +12,20 @@ _HIGHEST_HZ = 1e6
 
 
 class Tone(Placed, frozen=True, kw_only=True):
-    """A steady tone, as of a switching power supply or a leaking valve.
+    """Steady tone, for example of a switching power supply or a leaking valve.
 
     Attributes
     ----------
     frequency_hz : float
-        Frequency of the tone.
+        Frequency in hertz.
     level_db : float
-        Amplitude 1 m from it.
+        Amplitude at 1 m in decibels relative to full scale; −60 by default.
+
+    Examples
+    --------
+    >>> from ertis_numba.simulation import Tone
+    >>> Tone(frequency_hz=40e3, range_m=2.0).level_db
+    -60.0
     """
 
     frequency_hz: float
@@ -32,14 +38,20 @@ class Tone(Placed, frozen=True, kw_only=True):
 
 
 class Noise(Placed, frozen=True, kw_only=True):
-    """A source of broadband noise, as of compressed air.
+    """Source of broadband noise, for example of compressed air.
 
     Attributes
     ----------
     band_hz : (low, high)
-        Band of the noise.
+        Band of the noise in hertz; 20 to 80 kHz by default.
     level_db : float
-        Root mean square in the band, 1 m from it.
+        RMS in the band at 1 m, in decibels relative to full scale; −60 by default.
+
+    Examples
+    --------
+    >>> from ertis_numba.simulation import Noise
+    >>> Noise(range_m=2.0).band_hz
+    (20000.0, 80000.0)
     """
 
     band_hz: tuple[float, float] = (20_000.0, 80_000.0)
@@ -52,17 +64,24 @@ class Noise(Placed, frozen=True, kw_only=True):
 
 
 class Sonar(Placed, frozen=True, kw_only=True):
-    """Another sonar, which nobody has told about the SYNC chain.
+    """Another sonar, not synchronised with the sensors of the scene.
 
     Attributes
     ----------
     call : Call
+        Call of the sonar; the call of eRTIS by default.
     level_db : float
-        Amplitude of its call 1 m from it.
+        Amplitude of its call at 1 m in decibels relative to full scale; −20 by default.
     period_s : float
-        From one call to the next.
+        Time from one call to the next in seconds; 0.05 by default.
     offset_s : float
-        Start of its first call after that of the first measurement.
+        Start of its first call in seconds after the start of the first measurement; 0 by default.
+
+    Examples
+    --------
+    >>> from ertis_numba.simulation import Sonar
+    >>> Sonar(range_m=3.0).period_s
+    0.05
     """
 
     call: Call = Call()
@@ -78,14 +97,20 @@ class Sonar(Placed, frozen=True, kw_only=True):
 
 
 class Ambient(TomlTable, frozen=True, kw_only=True):
-    """Noise that comes from everywhere alike.
+    """Diffuse noise, equally strong from all directions.
 
     Attributes
     ----------
     level_dbfs : float
-        Root mean square in the band at each microphone.
+        RMS in the band at each microphone, in dBFS; −80 by default.
     band_hz : (low, high)
-        Band of the noise.
+        Band of the noise in hertz; 20 to 80 kHz by default.
+
+    Examples
+    --------
+    >>> from ertis_numba.simulation import Ambient
+    >>> Ambient().level_dbfs
+    -80.0
     """
 
     level_dbfs: float = -80.0
@@ -100,4 +125,4 @@ class Ambient(TomlTable, frozen=True, kw_only=True):
 def _check_band(name: str, band_hz: tuple[float, float]) -> None:
     checks.interval(name, band_hz, 1.0, _HIGHEST_HZ)
     if band_hz[0] == band_hz[1]:
-        raise ArgumentError(f"{name} runs from {band_hz[0]:g} Hz to itself; give two different frequencies")
+        raise ArgumentError(f"{name} starts and ends at {band_hz[0]:g} Hz; give two different frequencies")

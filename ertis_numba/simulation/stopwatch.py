@@ -1,4 +1,4 @@
-"""How long each effect takes."""
+"""Measurement of the computation time of each effect."""
 
 import time
 from collections import defaultdict
@@ -9,11 +9,12 @@ __all__ = ["CostStopwatch"]
 
 
 class CostStopwatch:
-    """Adds up milliseconds by name.
+    """Accumulates computation time by name.
 
     Attributes
     ----------
     cost_ms : dict of str to float
+        Milliseconds by name.
     """
 
     def __init__(self) -> None:
@@ -21,7 +22,7 @@ class CostStopwatch:
 
     @contextmanager
     def __call__(self, name: str) -> Iterator[None]:
-        """Count the block towards a name."""
+        """Add the time of the enclosed block to a name."""
         start_s = time.perf_counter()
         try:
             yield

@@ -1,4 +1,4 @@
-"""From arrivals to the signals at the microphones, block by block."""
+"""Synthesis of the signals at the microphones from arrivals, block by block."""
 
 import functools
 import itertools
@@ -20,23 +20,25 @@ __all__ = ["BLOCK", "NODE_HZ", "highest_hz", "node_frequencies", "signals"]
 Floats = NDArray[np.float64]
 
 BLOCK = 32_768
-"""PDM samples made at a time, so that memory does not grow with the record."""
+"""Samples synthesised at a time, so that memory does not grow with the record."""
 NODE_HZ = 1000.0
-"""Filters are evaluated so far apart and run straight between: patterns of pistons of 20 cm hold to 1 %."""
+"""Spacing of the frequencies at which filters are evaluated.
+
+Linear interpolation between them keeps the patterns of 20 cm pistons accurate to 1 %."""
 _RING = 2048  # samples that a filter may ring before and after a call
-_NODES, _FAR_APART_RAD = 4, 0.6  # from the middle: -103 dB at this limit, for both calls of eRTIS
-_STILL = 1e-12  # a stretch that no record is long enough to show
-_DEAF = 10 ** (-90 / 20)  # what lies so far below the top of a call's spectrum is left out
+_NODES, _FAR_APART_RAD = 4, 0.6  # from the middle: an error of −103 dB at this limit, for both calls of eRTIS
+_STILL = 1e-12  # smaller stretches are invisible in any record
+_DEAF = 10 ** (-90 / 20)  # parts of a call's spectrum this far below its maximum are left out
 
 
 def node_frequencies(top_hz: float) -> Floats:
-    """Return where filters are to be evaluated: (node,) float64, from 0 on."""
+    """Return the frequencies at which filters are evaluated, starting at 0: (frequency,) float64."""
     return np.asarray(np.arange(math.ceil(top_hz / NODE_HZ) + 1) * NODE_HZ, dtype=np.float64)
 
 
 @functools.cache
 def highest_hz(call: Call, rate_hz: float) -> float:
-    """Return where a call's spectrum is over: it stays 90 dB below its top, or half of the rate is reached."""
+    """Return the upper end of a call's spectrum, 90 dB below its maximum, at most half of the sample rate."""
     n_fft = scipy.fft.next_fast_len(4 * math.ceil(call.duration_s * rate_hz), real=True)
     spectrum = np.abs(np.fft.rfft(call_at(call, np.arange(n_fft) / rate_hz)))
     return float(np.flatnonzero(spectrum > _DEAF * spectrum.max())[-1] * rate_hz / n_fft)
@@ -45,15 +47,16 @@ def highest_hz(call: Call, rate_hz: float) -> float:
 def signals(
     arrived: Sequence[Arrivals], *, n_samples: int, rate_hz: float, n_mics: int, threads: int, clock: CostStopwatch
 ) -> Iterator[Floats]:
-    """Yield the signals of one block of the record after the other: (mic, sample) float64.
+    """Yield the signals of the record block by block: (mic, sample) float64.
 
-    Every block holds the calls that begin in it, as one spectrum: ``X(f) = S(f) Σ a(f) exp(-2πi f τ)``. So delays are
-    exact, filters are products, and of the spectrum only the bins that a call occupies are computed.
-    What a call leaves over its block goes to the next ones. An array that was yielded is used again, and it may go
-    on after the block of `BLOCK` samples.
+    Each block synthesises the calls that begin in it as one spectrum, ``X(f) = S(f) Σ a(f) exp(-2πi f τ)``. Delays are
+    therefore exact, and filters are products. Only the bins that a call occupies are computed.
+
+    The remainder of a call that extends beyond its block is added to the next blocks. Yielded arrays are reused, and
+    they may extend beyond the `BLOCK` samples of the block.
     """
     delay_samples = [entry.delay_s * rate_hz for entry in arrived]
-    # What begins before the record wraps to the end of the first transform, where nothing is read.
+    # Sound that begins before the record wraps to the end of the first transform, which is never read.
     before = _RING + max((math.ceil(max(0.0, -delay.min(initial=0.0))) for delay in delay_samples), default=0)
     n_fft = _length(arrived, delay_samples, rate_hz, before)
     first_block = [
@@ -86,7 +89,7 @@ def signals(
 
 
 def _length(arrived: Sequence[Arrivals], delay_samples: Sequence[Floats], rate_hz: float, before: int) -> int:
-    """Return the length of a block's transform: room for a block, its calls and what filters add."""
+    """Return the length of a block's transform: the block, its calls and the ringing of filters."""
     call = spread = 0
     step = 1
     for entry, delay in zip(arrived, delay_samples, strict=True):
@@ -101,7 +104,7 @@ def _length(arrived: Sequence[Arrivals], delay_samples: Sequence[Floats], rate_h
 
 
 def _step(call: Call, rate_hz: float) -> int:
-    """Return by how much a call may be sampled more slowly: a power of two, so that several have one in common."""
+    """Return the factor by which a call can be undersampled: a power of two, so that calls share a common multiple."""
     return int(2 ** math.floor(math.log2(max(1.0, rate_hz / (2.2 * highest_hz(call, rate_hz))))))
 
 
@@ -114,14 +117,14 @@ def _add(
     spectra: NDArray[np.complex128],
     threads: int,
 ) -> int:
-    """Add some paths to the spectra of their block; return how many bins they occupy."""
+    """Add some paths to the spectra of their block, and return the number of bins that they occupy."""
     n_bins: int = min(math.ceil(highest_hz(entry.call, rate_hz) * n_fft / rate_hz) + 1, spectra.shape[1])
     out = np.zeros((len(spectra), n_bins), dtype=np.complex128)
     turns, amplitude = delay_samples / n_fft, np.ascontiguousarray(entry.amplitude[chosen])
     kernel_set, nodes_per_bin = kernels.load("cpu"), rate_hz / n_fft / NODE_HZ
 
     def add(call: NDArray[np.complex128], paths: NDArray[np.intp]) -> None:
-        """Add some paths; the kernel accepts real amplitudes, so imaginary parts use a call turned by 90°."""
+        """Add some paths. The kernel accepts real amplitudes, so imaginary parts use the call rotated by 90°."""
         turned = paths[amplitude[paths].imag.any(axis=(1, 2))]
         with kernel_set.threads(threads):
             kernel_set.add_paths(call, turns[paths], amplitude[paths].real.copy(), 0, nodes_per_bin, out)
@@ -154,10 +157,10 @@ def _spectrum(call: Call, rate_hz: float, n_fft: int) -> NDArray[np.complex128]:
 
 
 def _stretched(call: Call, stretch: Floats, rate_hz: float, n_fft: int, n_bins: int) -> NDArray[np.complex128]:
-    """Return the spectra of a call whose seconds last longer or shorter: (mic, bin) complex128.
+    """Return the spectra of a stretched call: (mic, bin) complex128.
 
-    Microphones hear almost the same stretch. Where the last phases of their calls lie within 1.2 rad of each
-    other, four spectra give all others by Lagrange's polynomial through Chebyshev's nodes, to -100 dB.
+    The stretch is almost the same at all microphones. If the final phases of their calls lie within 1.2 rad, four
+    spectra suffice. Lagrange interpolation through Chebyshev nodes yields all others with an error of −100 dB.
     """
     middle, half = (stretch.max() + stretch.min()) / 2, np.ptp(stretch) / 2
     apart_rad = 2 * math.pi * call.high_frequency_hz * call.duration_s * half
@@ -169,12 +172,12 @@ def _stretched(call: Call, stretch: Floats, rate_hz: float, n_fft: int, n_bins: 
     for n, other in itertools.permutations(range(_NODES), 2):
         weights[:, n] *= (places - nodes[other]) / (nodes[n] - nodes[other])
     known = _spectra(call, middle + half * nodes, rate_hz, n_fft, n_bins)
-    # As a product of real matrices: one of complex ones wakes the threads of BLAS, which costs more than it saves.
+    # A product of real matrices: with complex ones BLAS would start its threads, which costs more than it saves.
     return np.asarray((weights @ known.view(np.float64)).view(np.complex128))
 
 
 def _spectra(call: Call, stretch: Floats, rate_hz: float, n_fft: int, n_bins: int) -> NDArray[np.complex128]:
-    """Return the spectrum of the call for each stretch, sampled as slowly as its band allows."""
+    """Return the spectrum of the call for each stretch, computed at the lowest sample rate that its band allows."""
     step = _step(call, rate_hz)
     n_samples = math.ceil(call.duration_s * stretch.max() * rate_hz / step) + 1
     time_s = np.arange(n_samples) * (step / rate_hz) / stretch[:, None]

@@ -1,4 +1,4 @@
-"""What returns the sound: points, spheres, walls and boxes."""
+"""Reflectors: points, spheres, walls and boxes."""
 
 import math
 
@@ -11,21 +11,27 @@ from ertis_numba.simulation.placed import Placed
 
 __all__ = ["Box", "Point", "Sphere", "Wall"]
 
-_LOUDEST_DB = 120.0  # far beyond any overload; the bound catches amplitudes given for levels
+_LOUDEST_DB = 120.0  # far beyond any overload; the limit catches amplitudes given instead of levels
 
 
 class Point(Placed, frozen=True, kw_only=True):
-    """A reflector much smaller than its distance, or a flat round one that faces somewhere.
+    """Reflector much smaller than its distance, or a flat disc with an orientation.
 
     Attributes
     ----------
     strength_db : float
-        Target strength: level of its echo 1 m from it when the call reaches it with level 0.
+        Target strength: level of the echo at 1 m if the call arrives with level 0, in decibels; −20 by default.
     diameter_m : float
-        Of a flat disc, whose echo is the stronger the better it faces both ends of the path. 0, the default, is a
-        point that returns the sound alike in all directions.
+        Diameter of a flat disc in metres. Its echo is strongest if it faces both ends of the path. 0, the default, is a
+        point that reflects equally in all directions.
     facing_deg : (azimuth, elevation), optional
-        Where a disc faces, in the world frame; towards the origin of the world by default.
+        Direction of a disc's normal in the world frame, in degrees; towards the origin of the world by default.
+
+    Examples
+    --------
+    >>> from ertis_numba.simulation import Point
+    >>> Point(azimuth_deg=90.0, range_m=2.0).position_at(0.0).round(6).tolist()
+    [0.0, 2.0, 0.0]
     """
 
     strength_db: float = -20.0
@@ -42,11 +48,11 @@ class Point(Placed, frozen=True, kw_only=True):
             if not self.diameter_m:
                 raise ArgumentError(
                     "point.facing_deg is given, but a point without a diameter reflects equally in all directions; "
-                    "give point.diameter_m for a disc, or leave facing_deg out"
+                    "give point.diameter_m for a disc, or leave out facing_deg"
                 )
 
     def normal_at(self, time_s: float) -> NDArray[np.float64]:
-        """Return the unit vector in which a disc faces: (axis,) float64."""
+        """Return the unit normal of a disc at a time of the scene: (axis,) float64."""
         if self.facing_deg is not None:
             return _direction(*self.facing_deg)
         place = -self.position_at(time_s)
@@ -55,14 +61,20 @@ class Point(Placed, frozen=True, kw_only=True):
 
 
 class Sphere(Placed, frozen=True, kw_only=True):
-    """A smooth hard sphere, much larger than a wavelength.
+    """Smooth rigid sphere.
 
     Attributes
     ----------
     radius_m : float
-        Radius of the sphere.
+        Radius in metres.
     reflection_db : float
-        Level of what it reflects below what reaches it.
+        Level of the reflected sound relative to the incident sound, in decibels, at most 0; 0 by default.
+
+    Examples
+    --------
+    >>> from ertis_numba.simulation import Sphere
+    >>> Sphere(radius_m=0.1, range_m=1.5).reflection_db
+    0.0
     """
 
     radius_m: float
@@ -75,17 +87,23 @@ class Sphere(Placed, frozen=True, kw_only=True):
 
 
 class Wall(Placed, frozen=True, kw_only=True):
-    """A smooth plane that mirrors the sound on both sides.
+    """Smooth plane that reflects sound on both sides.
 
     Attributes
     ----------
     facing_deg : (azimuth, elevation)
-        Its normal.
+        Direction of the normal in the world frame, in degrees.
     size_m : (width, height), optional
-        Around its position; without end by default. The width is horizontal; of a floor it lies across
-        the azimuth that ``facing_deg`` names.
+        Size in metres, centred at its position; unbounded by default. The width is horizontal. For a floor it is
+        perpendicular to the azimuth of ``facing_deg``.
     reflection_db : float
-        Level of the reflected sound relative to the incident sound.
+        Level of the reflected sound relative to the incident sound, in decibels, at most 0; 0 by default.
+
+    Examples
+    --------
+    >>> from ertis_numba.simulation import Wall
+    >>> Wall(position_m=(3.0, 0.0, 0.0), facing_deg=(180.0, 0.0)).axes()[0].round(6).tolist()
+    [-1.0, 0.0, 0.0]
     """
 
     facing_deg: tuple[float, float]
@@ -101,7 +119,7 @@ class Wall(Placed, frozen=True, kw_only=True):
         checks.between("wall.reflection_db", self.reflection_db, -300.0, 0.0)
 
     def axes(self) -> NDArray[np.float64]:
-        """Return normal, width and height as unit vectors: (3, axis) float64."""
+        """Return the unit vectors of normal, width and height: (3, axis) float64."""
         azimuth_rad = math.radians(self.facing_deg[0])
         normal = _direction(*self.facing_deg)
         width = np.array([-math.sin(azimuth_rad), math.cos(azimuth_rad), 0.0])
@@ -109,16 +127,22 @@ class Wall(Placed, frozen=True, kw_only=True):
 
 
 class Box(Placed, frozen=True, kw_only=True):
-    """A box of six walls, standing upright; a room, if the sensors are in it.
+    """Upright box of six walls; a room if the sensors are inside.
 
     Attributes
     ----------
     size_m : (x, y, z)
-        Lengths of the edges before the turn.
+        Lengths of the edges before rotation, in metres.
     yaw_deg : float
-        Turn about the vertical axis.
+        Rotation about the vertical axis in degrees; 0 by default.
     reflection_db : float
-        Level of the reflected sound relative to the incident sound.
+        Level of the reflected sound relative to the incident sound, in decibels, at most 0; 0 by default.
+
+    Examples
+    --------
+    >>> from ertis_numba.simulation import Box
+    >>> len(Box(position_m=(0.0, 0.0, 0.0), size_m=(4.0, 3.0, 2.5)).walls())
+    6
     """
 
     size_m: tuple[float, float, float]
@@ -132,10 +156,10 @@ class Box(Placed, frozen=True, kw_only=True):
         checks.between("box.yaw_deg", self.yaw_deg, -180.0, 180.0)
         checks.between("box.reflection_db", self.reflection_db, -300.0, 0.0)
         if self.waypoints:
-            raise ArgumentError("box has waypoints; give position_m and velocity_m_s")
+            raise ArgumentError("box has waypoints, but boxes support only position_m and velocity_m_s; give these")
 
     def walls(self) -> tuple[Wall, ...]:
-        """Return its sides, facing outwards: front, back, left, right, top, bottom."""
+        """Return the sides of the box, facing outwards: front, back, left, right, top, bottom."""
         yaw_rad = math.radians(self.yaw_deg)
         cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
         length, width, height = self.size_m

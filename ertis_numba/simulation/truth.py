@@ -1,4 +1,4 @@
-"""What the image of a simulated measurement should show."""
+"""Ground truth: the reflectors that the image of a simulated measurement should show."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,13 +17,14 @@ _SILENT = 1e-9  # of the strongest
 
 
 def reflectors(shot: Snapshot, active: frozenset[str]) -> list[Reflector]:
-    """Return the echoes of a sensor's own call for comparison with an image, then those of other sensors' calls.
+    """Return the echoes of a sensor's own call, then those of other sensors' calls, strongest first.
 
-    A reflector stands at half of the way of its sound, in the direction from which the sound comes; by a wall, that
-    is the place of its mirror image. Its level is that of the mean amplitude over the microphones and the
-    call's band, relative to the strongest echo of the own call, and the strongest come first. Its velocity is relative
-    to the sensor, and only along the line of sight where walls are involved. Calls of other sensors reach the image if
-    cross-emission is simulated.
+    The range of a reflector is half of the length of its sound path. Its direction is that from which the sound
+    arrives. For an echo over walls, this is the position of the mirror image.
+
+    Its level is that of the mean amplitude over the microphones and the call's band, relative to the strongest echo of
+    the own call. Its velocity is relative to the sensor; for echoes over walls it is only the component along the line
+    of sight. Calls of other sensors are included if cross-emission is simulated.
     """
     sight = Sight(shot, active)
     levels = {number: _levels(shot, sight, number) for number in sight.emitters(active)}

@@ -1,5 +1,4 @@
-"""What can happen to the sound, one file each.
+"""Effects on the sound, one module each.
 
-None of them decides whether it is needed: `ertis_numba.simulation.needs` asks that, and only what is
-needed is imported.
+`ertis_numba.simulation.needs` estimates which effects matter, and only their modules are imported.
 """

@@ -1,4 +1,4 @@
-"""Noise without end, made in frames."""
+"""Continuous noise, generated in overlapping frames."""
 
 import math
 from collections.abc import Callable
@@ -12,22 +12,22 @@ __all__ = ["FRAME", "OverlappingFrames", "band_bins", "drawn", "window"]
 Floats = NDArray[np.float64]
 
 FRAME = 16_384
-"""Samples of a frame: some milliseconds."""
-_EARLIEST = 2**32  # frames begin before the record, and a seed is no negative number
-_SHARED = 3  # frames that reach from one block into the next
+"""Samples per frame: some milliseconds."""
+_EARLIEST = 2**32  # offset of frame numbers: frames begin before the record, and seeds must not be negative
+_SHARED = 3  # frames that extend from one block into the next
 
 
 class OverlappingFrames:
-    """Sums frames of half overlap; under `window` their powers add up to 1.
+    """Sums frames that overlap by half; with `window`, their powers add up to 1.
 
     Parameters
     ----------
     seed : tuple of int
-        Decides the noise, together with the number of the frame.
+        Seed of the noise, combined with the number of the frame.
     make : function
-        Returns what the microphones hear of one frame, (mic, sample) float64, from a generator.
+        Returns the signals of one frame at the microphones, (mic, sample) float64, from a random generator.
     margin : int
-        Samples by which that begins earlier and ends later than the frame.
+        Number of samples by which these signals begin earlier and end later than the frame.
     """
 
     def __init__(
@@ -37,7 +37,7 @@ class OverlappingFrames:
         self._frames: dict[int, Floats] = {}
 
     def add_to(self, signals: Floats, first: int) -> None:
-        """Add the noise of samples ``first`` and on: (mic, sample) float64, in place."""
+        """Add the noise to ``signals``, which start at sample ``first``, in place: (mic, sample) float64."""
         hop, stop = FRAME // 2, first + signals.shape[1]
         for number in range((first - self._margin) // hop - 1, -(-(stop + self._margin) // hop)):
             begin = number * hop - self._margin
@@ -54,26 +54,26 @@ class OverlappingFrames:
 
 
 def window() -> Floats:
-    """Return half a sine, whose squares add up to 1 over frames of half overlap: (sample,) float64."""
+    """Return a half-sine window: (sample,) float64. Its squares add up to 1 over frames that overlap by half."""
     return np.asarray(np.sin(math.pi * (np.arange(FRAME) + 0.5) / FRAME))
 
 
 def band_bins(band_hz: tuple[float, float], rate_hz: float) -> NDArray[np.int64]:
-    """Return the bins of a frame's spectrum within a band, at least one: (bin,) int64."""
+    """Return the bins of a frame's spectrum in a band, at least one: (bin,) int64."""
     low = math.ceil(band_hz[0] * FRAME / rate_hz)
     high = math.floor(min(band_hz[1], rate_hz / 2) * FRAME / rate_hz)
     return np.arange(low, max(low, high) + 1)
 
 
 def drawn(random: np.random.Generator, bins: NDArray[np.int64], mix: NDArray[np.float64]) -> Floats:
-    """Return frames of noise of root mean square 1 in some bins: (row, sample) float64.
+    """Return frames of noise with an RMS of 1 in some bins: (row, sample) float64.
 
     Parameters
     ----------
     random : numpy.random.Generator
     bins : (bin,) int64
     mix : (bin, row, source) float64
-        Amplitudes by which independent sources make up the rows at each frequency.
+        Mixing matrix from independent sources to rows at each frequency.
     """
     n_sources = mix.shape[2]
     parts = random.standard_normal((2, len(bins), n_sources, 1))

@@ -22,7 +22,7 @@ def clock_drift(shot: Snapshot, number: int, delay_s: Floats, stretch: Floats | 
     ----------
     shot : Snapshot
     number : int
-        Of the sensor that emits.
+        Index of the emitting sensor.
     delay_s : (path, mic) float64
     stretch : (path, mic) float64 or None
     """

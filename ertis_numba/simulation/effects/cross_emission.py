@@ -1,4 +1,4 @@
-"""Sensors hear each other's calls."""
+"""Calls of the other sensors of the scene."""
 
 from ertis_numba.simulation.snapshot import Snapshot
 
@@ -6,10 +6,10 @@ __all__ = ["cross_emission"]
 
 
 def cross_emission(shot: Snapshot) -> list[int]:
-    """Return the numbers of the other sensors that emit.
+    """Return the indices of the other sensors that emit.
 
-    All emit together, so the way of a foreign call is emitter, target, microphone: on an ellipse rather
-    than there and back.
+    All sensors emit at the same time. The call of another sensor follows a bistatic path from its emitter over a target
+    to the microphones.
     """
     return [
         number

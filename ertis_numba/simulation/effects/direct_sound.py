@@ -1,4 +1,4 @@
-"""Microphones hear the emitter beside them."""
+"""Direct sound from the emitter to its own microphones."""
 
 from ertis_numba.simulation.paths import Paths, without_target
 from ertis_numba.simulation.snapshot import Snapshot, TransmitterPose
@@ -7,9 +7,9 @@ __all__ = ["direct_sound"]
 
 
 def direct_sound(shot: Snapshot, transmitter: TransmitterPose) -> Paths:
-    """Return the way from the sensor's own emitter straight to its microphones.
+    """Return the direct path from the sensor's own emitter to its microphones.
 
-    Its level is the emitter's own, ``direct_sound_db``: it creeps along the housing, for which no pattern of
-    the emitter speaks.
+    Its level is a separate setting, ``direct_sound_db``. The sound travels along the housing, so the emitter's
+    directivity does not apply.
     """
     return without_target(transmitter, shot.receiver, shot.targets)

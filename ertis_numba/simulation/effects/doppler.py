@@ -1,4 +1,4 @@
-"""Motion shifts and stretches the call."""
+"""Shift and stretch of the call due to motion."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,26 +9,27 @@ from ertis_numba.simulation.snapshot import ReceiverPose, TransmitterPose
 __all__ = ["doppler"]
 
 Floats = NDArray[np.float64]
-_ROUNDS = 60  # each makes the error smaller by v / c, so that few are used
+_ROUNDS = 60  # each iteration reduces the error by the factor v / c, so that few are needed
 _ENOUGH_S = 1e-16
 _STEP_S = 1e-5
 
 
 def doppler(paths: Paths, speed_m_s: float) -> tuple[Floats, Floats]:
-    """Return when the call's beginning arrives, and how long its seconds last: both (path, mic) float64.
+    """Return the arrival time of the call's beginning, and its stretch: both (path, mic) float64.
 
-    Everything moves steadily. What leaves at t₀ meets the target at t₁, where it then is, and the microphone at
-    t₂: ``c (t₁ - t₀) = |p + v t₁ - s(t₀)|`` and so on; walls are where they are when the sound meets them, to the
-    first order of v / c where it meets them aslant. Amplitudes are those of things at rest. The call is stretched
-    by dt₂/dt₀ at its beginning, which is the product of the Doppler factors of all that moves (P. M. Morse, K. U.
-    Ingard, Theoretical Acoustics, 1968, chapter 11).
+    All velocities are constant. Sound that leaves at t₀ meets the moving target at t₁ and the moving microphone at t₂:
+    ``c (t₁ - t₀) = |p + v t₁ - s(t₀)|``, and similarly for t₂. The position of a wall is that at the time of
+    reflection, accurate to first order in v / c for oblique incidence. Amplitudes are those of objects at rest.
+
+    The stretch is dt₂/dt₀ at the beginning of the call. It equals the product of the Doppler factors of all moving
+    objects (P. M. Morse, K. U. Ingard, Theoretical Acoustics, 1968, chapter 11).
     """
     earlier_s, arrival_s, later_s = (_arrival_s(paths, start_s, speed_m_s) for start_s in (-_STEP_S, 0.0, _STEP_S))
     return arrival_s, (later_s - earlier_s) / (2 * _STEP_S)
 
 
 def _arrival_s(paths: Paths, start_s: float, speed_m_s: float) -> Floats:
-    """Return when what is sent at some time arrives: (path, mic) float64."""
+    """Return the arrival time of sound emitted at a given time: (path, mic) float64."""
     transmitter, receiver = paths.transmitter, paths.receiver
     sent_m = transmitter.position_m + start_s * _own_m_s(transmitter)
     target_m = transmitter.position_m + paths.first_m[..., None] * paths.leaving
@@ -39,7 +40,7 @@ def _arrival_s(paths: Paths, start_s: float, speed_m_s: float) -> Floats:
     )
     for _ in range(_ROUNDS):
         before_s, from_m = arrival_s, sent_m
-        if transmitter_sways:  # a wall is met when the same part of the way is done as if nothing moved
+        if transmitter_sways:  # the sound meets a wall after the same fraction of the path as without motion
             done = (met_s if len(paths.targets) else arrival_s) - start_s
             whole_m = paths.first_m if len(paths.targets) else paths.second_m
             from_m = sent_m + _swayed_m(transmitter, start_s + paths.transmitter_corners_m * _mean(done, whole_m))
@@ -58,12 +59,15 @@ def _arrival_s(paths: Paths, start_s: float, speed_m_s: float) -> Floats:
 
 
 def _own_m_s(end: TransmitterPose | ReceiverPose) -> Floats:
-    """Return the velocity of an image without what the walls add."""
+    """Return the velocity of an image without the contribution of moving walls."""
     return np.asarray(end.velocity_m_s - sum(end.sways_m_s, np.zeros(3)))
 
 
 def _swayed_m(end: TransmitterPose | ReceiverPose, met_s: Floats) -> Floats:
-    """Return how far walls have moved an image when the sound meets them, (wall, path): (path, 1, axis) float64."""
+    """Return the displacement of an image by moving walls: (path, 1, axis) float64.
+
+    ``met_s`` holds the times at which the sound meets the walls, (wall, path).
+    """
     sway_m = np.zeros((met_s.shape[1], 1, 3))
     for velocity_m_s, at_s in zip(end.sways_m_s, met_s, strict=True):
         sway_m += at_s[:, None, None] * velocity_m_s
@@ -71,7 +75,7 @@ def _swayed_m(end: TransmitterPose | ReceiverPose, met_s: Floats) -> Floats:
 
 
 def _mean(time_s: Floats, length_m: Floats) -> Floats:
-    """Return the mean time per length of each path: (path,) float64."""
+    """Return the mean travel time per length of each path: (path,) float64."""
     total_m = np.sum(length_m, axis=1)
     return np.asarray(np.divide(np.sum(time_s, axis=1), total_m, out=np.zeros_like(total_m), where=total_m > 0))
 

@@ -1,4 +1,4 @@
-"""A piston sends ahead."""
+"""Directivity of the emitter as a circular piston."""
 
 import math
 
@@ -14,10 +14,10 @@ __all__ = ["emitter_directivity"]
 def emitter_directivity(
     paths: Paths, diameter_m: float, frequency_hz: NDArray[np.float64], speed_m_s: float
 ) -> NDArray[np.float64]:
-    """Return what the emitter sends into the directions of the paths: (path, mic, frequency) float64.
+    """Return the emitter's directivity towards the paths: (path, mic, frequency) float64.
 
-    A circular piston in a baffle, ``2 J₁(v) / v`` with ``v = π d f sin θ / c``; nothing behind it. One for all
-    microphones where they hear the same target.
+    The model is a circular piston in a baffle, ``2 J₁(v) / v`` with ``v = π d f sin θ / c``, and 0 behind it. The
+    second axis has length 1 if all microphones share the direction to the target.
     """
     leaving = paths.leaving[:, :1] if len(paths.targets) and not paths.surface else paths.leaving
     cos = leaving @ paths.transmitter.facing

@@ -1,4 +1,4 @@
-"""Position of the emitter beside the centre of its array."""
+"""Offset of the emitter from the centre of its array."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ __all__ = ["emitter_offset"]
 
 
 def emitter_offset(shot: Snapshot, number: int) -> TransmitterPose:
-    """Return a sensor's emitter at its mounting place, ``o + R p``.
+    """Return a sensor's emitter at its mounting position, ``o + R p``.
 
     ``o`` is the sensor's origin, ``R`` its rotation and ``p`` the setting ``emitter.position_m``. A path is then
     bistatic: its length is ``|x - (o + R p)| + |x - m|`` for a target x and a microphone m.

@@ -17,7 +17,7 @@ __all__ = ["add_tone", "calls_of", "noise_of", "way_from"]
 
 
 def way_from(shot: Snapshot, source: Placed) -> Paths:
-    """Return the straight way from a source to the microphones; it sends alike in all directions."""
+    """Return the direct path from an omnidirectional source to the microphones."""
     transmitter = TransmitterPose(
         position_m=source.position_at(shot.time_s), velocity_m_s=source.velocity_at(shot.time_s), facing=np.zeros(3)
     )
@@ -25,10 +25,19 @@ def way_from(shot: Snapshot, source: Placed) -> Paths:
 
 
 def add_tone(shot: Snapshot, tone: Tone, signals: NDArray[np.float64], first: int) -> None:
-    """Add ``a / r · sin(2π f (t - r / c))``, t being the time of the scene: (mic, sample) float64, in place."""
+    """Add ``a / r · sin(2π f (t - r / c))`` to the signals in place; t is the time of the scene.
+
+    Parameters
+    ----------
+    shot : Snapshot
+    tone : Tone
+    signals : (mic, sample) float64
+    first : int
+        Index of the first sample in the record.
+    """
     way, rate_hz = way_from(shot, tone), shot.sensor.recording.sample_rate_hz
     amplitude = 10 ** (tone.level_db / 20) * spreading(way)[0]
-    # The whole turns of a long time are taken out before they cost digits.
+    # Whole periods of a long time are removed before they cost precision.
     turns = (tone.frequency_hz * (shot.time_s - way.length_m[0] / shot.speed_m_s)) % 1.0
     swing_rad = 2 * math.pi * tone.frequency_hz / rate_hz * np.arange(first, first + signals.shape[1])
     start_rad = 2 * math.pi * turns
@@ -37,9 +46,9 @@ def add_tone(shot: Snapshot, tone: Tone, signals: NDArray[np.float64], first: in
 
 
 def noise_of(shot: Snapshot, noise: Noise, seed: tuple[int, ...]) -> OverlappingFrames:
-    """Return the noise of one source: the same for all microphones but for delay and ``1 / r``.
+    """Return the noise of one source, equal at all microphones except for delay and ``1 / r``.
 
-    The frame is delayed window and all, so that microphones far apart hear the same.
+    Each frame is delayed together with its window, so that distant microphones receive the same noise.
     """
     way, rate_hz = way_from(shot, noise), shot.sensor.recording.sample_rate_hz
     apart_m = way.length_m[0] - np.linalg.norm(way.transmitter.position_m - shot.receiver.centre_m)
@@ -59,10 +68,10 @@ def noise_of(shot: Snapshot, noise: Noise, seed: tuple[int, ...]) -> Overlapping
 
 
 def calls_of(shot: Snapshot, sonar: Sonar) -> NDArray[np.float64]:
-    """Return when another sonar's calls begin that are heard during the record: (call,) float64.
+    """Return the start times of another sonar's calls that arrive during the record: (call,) float64.
 
-    In seconds after the record begins, so often below 0. Its calls reach the microphones straight; their echoes
-    are far weaker.
+    Times are in seconds after the start of the record, and often negative. Only the direct sound of these calls is
+    modelled, because their echoes are far weaker.
     """
     way_s = float(np.mean(way_from(shot, sonar).length_m)) / shot.speed_m_s
     earliest_s = shot.time_s - way_s - sonar.call.duration_s - sonar.offset_s

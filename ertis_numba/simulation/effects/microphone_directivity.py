@@ -1,4 +1,4 @@
-"""A port hears ahead."""
+"""Directivity of the microphone ports."""
 
 import math
 
@@ -14,10 +14,10 @@ __all__ = ["microphone_directivity"]
 def microphone_directivity(
     paths: Paths, diameter_m: float, frequency_hz: NDArray[np.float64], speed_m_s: float
 ) -> NDArray[np.float64]:
-    """Return what microphones take from the directions of the paths: (path, mic, frequency) float64.
+    """Return the microphones' directivity towards the paths: (path, mic, frequency) float64.
 
-    By reciprocity a circular piston in a baffle, ``2 J₁(v) / v`` with ``v = π d f sin θ / c``, and nothing
-    from behind.
+    By reciprocity the model is a circular piston in a baffle, ``2 J₁(v) / v`` with ``v = π d f sin θ / c``, and 0 from
+    behind.
     """
     cos = -paths.arriving @ paths.receiver.axes[0]
     sin = np.sqrt(np.maximum(1 - cos**2, 0.0))

@@ -10,7 +10,7 @@ __all__ = ["microphone_faults", "stick", "stick_numbers"]
 
 
 def microphone_faults(shot: Snapshot) -> NDArray[np.float64]:
-    """Return 0 for microphones that hear nothing and 1 for others: (mic,) float64."""
+    """Return 0 for faulty microphones and 1 for others: (mic,) float64."""
     return np.where(np.isin(shot.channels, shot.sensor.electronics.faulty_channels), 0.0, 1.0)
 
 
@@ -25,7 +25,7 @@ def stick(octets: NDArray[np.uint8], electronics: Electronics) -> None:
 def stick_numbers(
     numbers: NDArray[np.int16] | NDArray[np.float32], electronics: Electronics, full_scale: float
 ) -> None:
-    """Set stuck channels of PCM to either end of the scale, in place: (sample, channel)."""
+    """Set stuck PCM channels to either end of the scale, in place: (sample, channel)."""
     largest = full_scale - 1 if numbers.dtype.kind == "i" else full_scale
     numbers[:, list(electronics.stuck_low)] = -full_scale
     numbers[:, list(electronics.stuck_high)] = largest

@@ -4,8 +4,8 @@ __all__ = ["microphone_noise"]
 
 
 def microphone_noise(noise_dbfs: float) -> float:
-    """Return the root mean square of the noise over the whole band, full scale 1.
+    """Return the RMS of the noise over the whole band, full scale 1.
 
-    The modulators draw it themselves, from a hash of microphone and sample.
+    The modulators generate the noise themselves, from a hash of microphone and sample.
     """
     return float(10 ** (noise_dbfs / 20))

@@ -1,4 +1,4 @@
-"""Gains and delays that no calibration knows."""
+"""Gains and delays that the calibration does not contain."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +14,8 @@ _GAIN_STEP = 2.0**-20
 def microphone_spread(shot: Snapshot) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the gain and the delay of each microphone: both (mic,) float64.
 
-    Normal in decibels and in seconds; the scene's seed and the name of the sensor decide them for all
-    measurements.
+    They are normally distributed in decibels and in seconds. The scene's seed and the name of the sensor determine them
+    for all measurements.
     """
     electronics = shot.sensor.electronics
     name = int.from_bytes(shot.sensor.name.encode(), "little")

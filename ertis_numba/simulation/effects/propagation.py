@@ -1,4 +1,4 @@
-"""Sound takes its time."""
+"""Propagation delays."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ __all__ = ["propagation"]
 def propagation(paths: Paths, speed_m_s: float) -> NDArray[np.float64]:
     """Return the delays of the paths, ``(r₁ + r₂) / c``: (path, mic) float64, in seconds.
 
-    They are not rounded to samples: the call's spectrum turns by ``exp(-2πi f τ)``, which delays it by
-    any part of a sample and changes the energy of no frequency.
+    Delays are not rounded to samples. The factor ``exp(-2πi f τ)`` in the spectrum delays the call by any fraction of a
+    sample and preserves the energy at each frequency.
     """
     return paths.length_m / speed_m_s

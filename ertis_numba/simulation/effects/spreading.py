@@ -1,4 +1,4 @@
-"""Amplitude falls with distance."""
+"""Decrease of amplitude with distance."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,16 +8,16 @@ from ertis_numba.simulation.paths import Paths
 __all__ = ["NEAREST_M", "spreading"]
 
 NEAREST_M = 0.01
-"""Distance below which amplitudes no longer grow, because emitters, reflectors and microphones have a size."""
+"""Distance below which amplitudes no longer grow, because emitters, reflectors and microphones have a finite size."""
 
 
 def spreading(paths: Paths) -> NDArray[np.float64]:
-    """Return the amplitude that distance leaves: (path, mic) float64.
+    """Return the amplitude gain due to geometric spreading: (path, mic) float64.
 
-    A point spreads anew what it receives, ``1 / (r₁ r₂)``; a mirror does not, ``1 / (r₁ + r₂)``. A sphere of
-    radius a lies between, ``1 / √(A B)`` with ``A = r₁ + r₂ + 2 r₁ r₂ / (a cos θ)`` and ``B = r₁ + r₂ + 2 r₁ r₂
-    cos θ / a``, θ being the angle of incidence: straight on ``a / (2 r (r + a))`` (how a
-    tube of rays opens at a curved mirror; A. D. Pierce, Acoustics, 1989, chapter 8).
+    A point re-radiates the sound that it receives, ``1 / (r₁ r₂)``. A plane mirror does not, ``1 / (r₁ + r₂)``. A
+    sphere of radius a lies between the two, ``1 / √(A B)`` with ``A = r₁ + r₂ + 2 r₁ r₂ / (a cos θ)`` and
+    ``B = r₁ + r₂ + 2 r₁ r₂ cos θ / a``. Here θ is the angle of incidence; normal incidence gives ``a / (2 r (r + a))``.
+    The law describes the widening of a ray tube at a curved mirror (A. D. Pierce, Acoustics, 1989, chapter 8).
     """
     first_m, second_m = paths.first_m, paths.second_m
     if not len(paths.targets):
@@ -29,7 +29,7 @@ def spreading(paths: Paths) -> NDArray[np.float64]:
     is_sphere = paths.targets.radius_m > 0
     radius_m = paths.targets.radius_m[is_sphere, None]
     r1, r2 = first_m[is_sphere], second_m[is_sphere]
-    # The two legs open by twice the angle of incidence.
+    # The angle between the two legs is twice the angle of incidence.
     cos_double = -np.sum(paths.leaving[is_sphere] * paths.arriving[is_sphere], axis=-1)
     cos = np.sqrt(np.maximum((1 + cos_double) / 2, 1e-6))
     along, across = r1 + r2 + 2 * r1 * r2 / (radius_m * cos), r1 + r2 + 2 * r1 * r2 * cos / radius_m

@@ -1,4 +1,4 @@
-"""Spheres have a surface, discs face somewhere."""
+"""Surfaces of spheres, and size and orientation of discs."""
 
 import math
 
@@ -20,13 +20,13 @@ Floats = NDArray[np.float64]
 def over_surfaces(
     first: Seen[TransmitterPose], second: Seen[ReceiverPose], targets: Targets, chosen: NDArray[np.intp]
 ) -> Paths:
-    """Return paths that turn on the surface of spheres rather than in their centre.
+    """Return paths that turn on the surface of spheres instead of at their centres.
 
     The arguments are those of `by_targets`.
 
-    The mirror point lies where the surface's normal halves the angle between the legs; the directions from
-    the centre to both ends stand for those from the surface, which is exact for equal distances and
-    else wrong by the third power of radius by distance.
+    At the mirror point, the surface normal bisects the angle between the legs. The directions from the centre to both
+    ends approximate those from the surface. This is exact for equal distances; otherwise the error is of third order in
+    radius / distance.
     """
     centre_m = targets.positions_m[chosen, None, :]
     outwards = unit(unit(first.end.position_m - centre_m) + unit(second.end.positions_m - centre_m))
@@ -35,10 +35,11 @@ def over_surfaces(
 
 
 def patterns(paths: Paths, frequency_hz: Floats, speed_m_s: float) -> Floats | NDArray[np.complex128]:
-    """Return the gain of echoes by the size of their targets: (path, mic, frequency), 1 for points.
+    """Return the gain of echoes due to the size of their targets: (path, mic, frequency), 1 for points.
 
-    Spheres of a few wavelengths follow `rigid_sphere`, and larger ones are mirrors. Discs follow `disc`; emitter and
-    microphone must lie in the half space that the disc faces. The type is float64, or complex128 if phases turn.
+    Spheres of a few wavelengths follow `rigid_sphere`, and larger ones are mirrors. Discs follow `disc`; their echo is
+    0 unless emitter and microphone lie in the half space that the disc faces. The type is float64, or complex128 if a
+    target shifts the phase.
     """
     wave = 2 * math.pi / speed_m_s * frequency_hz
     targets = paths.targets
@@ -55,7 +56,7 @@ def patterns(paths: Paths, frequency_hz: Floats, speed_m_s: float) -> Floats | N
 
 
 def _disc_pattern(paths: Paths, chosen: NDArray[np.bool_], wave: Floats) -> NDArray[np.complex128]:
-    """Return the gain from the sound at a disc to its echo at each microphone: (disc, mic, frequency) complex128."""
+    """Return the gain of each disc's echo at each microphone: (disc, mic, frequency) complex128."""
     to_receiver, to_transmitter = paths.arriving[chosen], -paths.leaving[chosen]
     normal, radius_m = paths.targets.normals[chosen, None], paths.targets.diameter_m[chosen, None] / 2
     both = to_receiver + to_transmitter

@@ -9,10 +9,9 @@ __all__ = ["walls"]
 def walls(
     shot: Snapshot, transmitter: TransmitterPose
 ) -> tuple[tuple[Seen[TransmitterPose], ...], tuple[Seen[ReceiverPose], ...], tuple[Seen[TransmitterPose], ...]]:
-    """Return an emitter as the targets see it, the microphones as they do, and the emitter as the microphones do.
+    """Return three views: the emitter and the microphones from the targets, and the emitter from the microphones.
 
-    The first of each list is the thing itself, the others are its images, of up to the scene's
-    ``max_reflections`` walls, as far as they can be seen.
+    Each tuple starts with the object itself. Its visible mirror images in up to ``max_reflections`` walls follow.
     """
     largest = shot.scene.max_reflections
     receiver_m = shot.receiver.centre_m[None]
