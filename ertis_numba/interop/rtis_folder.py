@@ -137,7 +137,7 @@ def _settings_in(folder: Path) -> dict[str, Any]:
             name = _DUMPED.get(key, key)
             if name in reported and reported[name] != content[key]:
                 raise DataError(
-                    f"{path}: {key} is {content[key]!r}, but {reported[name]!r} in {sources[name].name}; keep one of them"
+                    f"{path}: {key} is {content[key]!r}, but {reported[name]!r} in {sources[name].name}; keep one"
                 )
             reported[name], sources[name] = content[key], path
     return reported
