@@ -146,7 +146,7 @@ def test_compiles_once(monkeypatch):
 
 def test_refuses_the_simulator(monkeypatch):
     monkeypatch.setattr(compiling, "SIMULATED", True)
-    with pytest.raises(DeviceError, match=r"^kernels are not compiled where they are simulated; unset NUMBA_ENABLE_"):
+    with pytest.raises(DeviceError, match=r"^kernels are not compiled if the GPU is simulated; unset NUMBA_ENABLE_"):
         compiling.recorded(print)
 
 

@@ -1,4 +1,4 @@
-"""Multiply spectra by one filter per phase and fold each product to the length of the output."""
+"""Multiply spectra by one filter per phase, and fold each product to the length of the output."""
 
 import numpy as np
 from numba import njit, prange
