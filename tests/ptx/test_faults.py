@@ -156,7 +156,7 @@ def test_names_the_compiler_that_is_missing(monkeypatch):
     with pytest.raises(DeviceError, match=r"needs numba-cuda, ptxas and nvdisasm, but ptxas is missing; install them"):
         compiling.require_compilers()
     monkeypatch.setattr(compiling, "cuda", types.SimpleNamespace(__file__="numba/cuda/__init__.py"))
-    with pytest.raises(DeviceError, match=r"and numba-cuda is missing; install them with pip install 'ertis-numba\["):
+    with pytest.raises(DeviceError, match=r"but numba-cuda is missing; install them with pip install 'ertis-numba\["):
         compiling.require_compilers()
 
 
