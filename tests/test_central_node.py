@@ -167,7 +167,7 @@ def test_a_measurement_that_is_wrong_is_refused(what, tmp_path):
 HELLOS = {
     "settings of another CRC-32": ({"settings_crc32": 1}, "another CRC-32"),
     "no settings": ({"settings": b"["}, "settings of sensor left"),
-    "no text": ({"settings": b"\xff"}, "are not text"),
+    "no text": ({"settings": b"\xff"}, "not text"),
     "a file for a layout": ({"settings": b'[array]\nlayout = "/etc/passwd"'}, "send its positions"),
     "a file for directions": ({"settings": b'[processing]\ndirections = "x.csv"'}, "name a grid"),
     "a name with a line feed": ({"settings": b'[array]\nlayout = "a\\n"'}, "cannot be printed"),

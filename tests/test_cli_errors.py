@@ -69,9 +69,17 @@ CASES = {
     "info of nothing": ("info folder", 1, "folder is a folder; give a recording or an energyscape file"),
     # processing
     "no directions": ("process rec.h5 -o out.h5 --directions 2d:0", 1, "count of directions '2d:0' is 0; give a whole"),
-    "empty directions": ("process rec.h5 -o out.h5 --directions 3d:", 1, "directions '3d:' has no count; give for"),
-    "unknown directions": ("process rec.h5 -o out.h5 --directions 4d:3", 1, "directions '4d:3' is no grid; give 90"),
-    "empty CSV": ("process rec.h5 -o out.h5 --directions empty.csv", 1, "directions empty.csv has not two numbers"),
+    "empty directions": (
+        "process rec.h5 -o out.h5 --directions 3d:",
+        1,
+        "directions '3d:' has no count; give a number",
+    ),
+    "unknown directions": ("process rec.h5 -o out.h5 --directions 4d:3", 1, "directions '4d:3' is not a grid; give 90"),
+    "empty CSV": (
+        "process rec.h5 -o out.h5 --directions empty.csv",
+        1,
+        "directions empty.csv does not have two numbers",
+    ),
     "missing CSV": ("process rec.h5 -o out.h5 --directions none.csv", 1, "directions none.csv: No such file"),
     "range outside": ("process rec.h5 -o out.h5 --range 1:50", 1, "processing.range_m ends at 50 m, but the record"),
     "range backwards": ("process rec.h5 -o out.h5 --range 3:1", 1, "processing.range_m runs from 3 to 1; give the"),

@@ -75,7 +75,7 @@ def test_settings_without_disabled_microphones_are_written_as_before():
     [
         ((32,), "array.disabled is 32; give a whole number from 0 to 31"),
         ((-1,), "array.disabled is -1; give a whole number from 0"),
-        (tuple(range(32)), "array.disabled leaves none of 32 microphones; name fewer channels"),
+        (tuple(range(32)), "array.disabled disables all 32 microphones; name fewer channels"),
     ],
 )
 def test_disabled_channels_that_cannot_be_are_refused(disabled, message):

@@ -118,9 +118,21 @@ def test_layout_files(tmp_path):
             b"positions_mm = [['a', 'b']]",
             r"layout .*l\.toml, line 1, positions_mm\[0\]\[0\]: Expected `float`, got `str`",
         ),
-        ("l.toml", b"positions_mm = []", r"layout .*l\.toml: positions_mm is not rows of 2 or 3 numbers; give y, z"),
-        ("l.toml", b"positions_mm = [[1, 2], [1, 2, 3]]", r"layout .*l\.toml: positions_mm is not rows of 2 or 3"),
-        ("l.toml", b"positions_mm = [[1]]", r"layout .*l\.toml: positions_mm is not rows of 2 or 3 numbers"),
+        (
+            "l.toml",
+            b"positions_mm = []",
+            r"layout .*l\.toml: positions_mm does not consist of rows of 2 or 3 numbers; give y, z",
+        ),
+        (
+            "l.toml",
+            b"positions_mm = [[1, 2], [1, 2, 3]]",
+            r"layout .*l\.toml: positions_mm does not consist of rows of 2 or 3",
+        ),
+        (
+            "l.toml",
+            b"positions_mm = [[1]]",
+            r"layout .*l\.toml: positions_mm does not consist of rows of 2 or 3 numbers",
+        ),
         ("l.toml", b"positions_mm = [[1, nan]]", r"layout .*l\.toml: positions_mm holds nan at \[0, 2\]; give finite"),
         (
             "l.toml",
@@ -130,14 +142,18 @@ def test_layout_files(tmp_path):
         ("l.toml", b"word_bits = 9\npositions_mm = [[1, 2]]", r"layout .*l\.toml: array\.word_bits '9' is unknown"),
         ("l.toml", b"disabled = [1]\npositions_mm = [[1, 2]]", r"l\.toml: a disabled channel is 1; give a whole .* 0"),
         ("l.toml", b"disabled = [0]\npositions_mm = [[1, 2]]", r"l\.toml: array\.enabled is false for every channel"),
-        ("l.csv", b"1, 2\n3, x\n", r"layout .*l\.csv: could not convert .*x'; give rows of numbers parted by commas"),
+        (
+            "l.csv",
+            b"1, 2\n3, x\n",
+            r"layout .*l\.csv: could not convert .*x'; give rows of numbers separated by commas",
+        ),
         (
             "l.toml",
             b"positions_mm = [[1, 2], [3, 4], [1, 2]]",
-            r"channels 0 and 2 are in one place; correct one, or name it under 'disabled'",
+            r"channels 0 and 2 have the same position; correct one, or list it under 'disabled'",
         ),
         ("l.toml", b"gain = [1.0]\npositions_mm = [[1, 2], [3, 4]]", r"l\.toml: array\.gain has shape \(1,\)"),
-        ("l.csv", b"# nothing\n", r"layout .*l\.csv: positions_mm is not rows of 2 or 3 numbers"),
+        ("l.csv", b"# nothing\n", r"layout .*l\.csv: positions_mm does not consist of rows of 2 or 3 numbers"),
         ("l.csv", b"1, nan\n", r"layout .*l\.csv: positions_mm holds nan at \[0, 2\]"),
         ("l.csv", b"1, 2\n" * 1025, r"layout .*l\.csv: number of array\.positions_m is 1025; give .* from 1 to 1024"),
     ],
@@ -250,15 +266,19 @@ def test_grid_from_csv(tmp_path):
 @pytest.mark.parametrize(
     ("directions", "text", "message"),
     [
-        ("91", None, r"directions '91' is no grid; give 90, 1850, 3000, 2d:N, 3d:N or a \.csv file"),
-        ("4d:90", None, r"directions '4d:90' is no grid"),
-        ("2d:", None, r"directions '2d:' has no count; give for instance 2d:181"),
-        ("3d:-1", None, r"directions '3d:-1' has no count; give for instance 3d:181"),
+        ("91", None, r"directions '91' is not a grid; give 90, 1850, 3000, 2d:N, 3d:N or a \.csv file"),
+        ("4d:90", None, r"directions '4d:90' is not a grid"),
+        ("2d:", None, r"directions '2d:' has no count; give a number after the colon, such as 2d:181"),
+        ("3d:-1", None, r"directions '3d:-1' has no count; give a number after the colon, such as 3d:181"),
         ("2d:0", None, r"count of directions '2d:0' is 0; give a whole number from 1 to 1000000"),
         ("3d:1000001", None, r"count of directions '3d:1000001' is 1000001; give a whole number from 1 to 1000000"),
         ("none.csv", None, r"directions .*none\.csv: .*; give a readable CSV of azimuth, elevation in degrees"),
-        ("g.csv", "", r"directions .*g\.csv has not two numbers in every row; give azimuth, elevation in degrees"),
-        ("g.csv", "1, 2, 3\n", r"directions .*g\.csv has not two numbers in every row"),
+        (
+            "g.csv",
+            "",
+            r"directions .*g\.csv does not have two numbers in every row; give azimuth, elevation in degrees",
+        ),
+        ("g.csv", "1, 2, 3\n", r"directions .*g\.csv does not have two numbers in every row"),
         ("g.csv", "1, two\n", r"directions .*g\.csv: could not convert .*; give rows of numbers"),
         ("g.csv", "1, nan\n", r"directions .*g\.csv holds nan at \[0, 1\]; give finite numbers"),
         ("g.csv", "1, 2\n0, 91\n", r"directions .*g\.csv: elevation in row 1 is 91; give a number from -90 to 90"),
@@ -388,5 +408,7 @@ def test_directions_go_all_around_where_no_more_is_missing_than_elsewhere(azimut
 def test_metres_in_a_layout_are_refused(tmp_path):
     path = tmp_path / "mine.csv"
     path.write_text("0.02, 0\n0, 0.02\n-0.02, 0\n")
-    with pytest.raises(ArgumentError, match=r"microphones lie within 0\.04 mm, too close .*; give millimetres"):
+    with pytest.raises(
+        ArgumentError, match=r"microphones lie within 0\.04 mm, too close .*; give positions in millimetres"
+    ):
         load_layout(path)

@@ -104,16 +104,16 @@ def _take(name, text):
 @pytest.mark.parametrize("directions", ["/x.csv", "/x.csv/", "x.CSV", "~/x.csv", "..\\x.csv", "x", "", "/etc/passwd"])
 def test_received_settings_name_no_file(directions):
     settings = Settings(processing=Processing(directions=directions))
-    with pytest.raises(SettingsError, match=r"s: processing.directions is .*, a file; name a grid instead"):
+    with pytest.raises(SettingsError, match=r"s: processing.directions is .*, the name of a file; name a grid instead"):
         received_settings(settings.to_toml(), "s")
     assert received_settings(settings.to_toml(), "s", are_applied=True) == settings
-    with pytest.raises(ArgumentError, match="which a recording cannot hold"):
+    with pytest.raises(ArgumentError, match="a recording cannot contain directions"):
         storable(settings)
 
 
 @pytest.mark.parametrize("layout", ["/x.csv", "x.toml", "eRTIS_v3D1.toml", "../eRTIS_v3D1"])
 def test_received_settings_name_no_layout_file(layout):
-    with pytest.raises(SettingsError, match=r"s: array.layout is .*, a file; send its positions instead"):
+    with pytest.raises(SettingsError, match=r"s: array.layout is .*, the name of a file; send its positions instead"):
         received_settings(Settings(array=Array(layout=layout)).to_toml(), "s")
 
 

@@ -158,7 +158,7 @@ BAD = {
     ),
     "directions": (
         lambda journal: journal.add_sensor("b", TINY.replace(processing=TINY.processing.replace(directions="x.csv"))),
-        "processing.directions is the file x.csv, which a recording cannot hold",
+        "processing.directions is the file x.csv, but a recording cannot contain",
     ),
     "size": (
         lambda journal: journal.add_sensor("b", Settings(recording=Recording(n_samples=2**28))),

@@ -151,7 +151,7 @@ def test_emulated_sensor_receives_the_own_waveform(tmp_path, monkeypatch):
 def test_files_that_settings_from_elsewhere_name_are_not_opened(tmp_path):
     np.save(tmp_path / "own.npy", SAMPLES)
     text = f'call.waveform = "{tmp_path / "own.npy"}"'
-    with pytest.raises(SettingsError, match=r"call\.waveform is .*, a file; send its samples instead"):
+    with pytest.raises(SettingsError, match=r"call\.waveform is .*, the name of a file; send its samples instead"):
         received_settings(text, "settings of sensor left")
     kept = received_settings(Settings(call=own(SHORT)).to_toml(), "settings of sensor left")
     assert kept.call == own(SHORT)

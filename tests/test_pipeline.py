@@ -182,7 +182,7 @@ def test_batch_with_a_wrong_measurement_processes_none():
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_graphs_are_refused_where_there_are_none(device):
-    with pytest.raises(ArgumentError, match="graphs is True, and only device 'cuda' has CUDA graphs"):
+    with pytest.raises(ArgumentError, match="graphs is True, but only device 'cuda' has CUDA graphs"):
         Pipeline(SHORT, device, graphs=True)
 
 

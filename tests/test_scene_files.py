@@ -193,7 +193,10 @@ def test_faults_of_missing_channels_are_refused(tmp_path, channel):
             "[[points]]\nrange_m = 1\nfacing_deg = [999, 0]",
             r"point\.facing_deg azimuth is 999; give a number from -180",
         ),
-        ("[[points]]\nwaypoints = [[0, 0, 0, 0], [0, 1, 0, 0]]", r"point\.waypoints go from 0 s to 0 s; give rising"),
+        (
+            "[[points]]\nwaypoints = [[0, 0, 0, 0], [0, 1, 0, 0]]",
+            r"point\.waypoints go from 0 s to 0 s; give strictly increasing",
+        ),
         ("[[points]]\nwaypoints = [[nan, 0, 0, 0]]", r"point\.waypoints\[0\] time is nan; give a finite number"),
         (
             "[[points]]\nwaypoints = [[0, 0, 0, 0], [1, 999, 0, 0]]",

@@ -1,4 +1,4 @@
-"""Fourier transforms, behind one protocol."""
+"""Fourier transforms with one interface for all devices."""
 
 from collections.abc import Callable
 from typing import Any
@@ -20,25 +20,32 @@ def plan(
     zeros: Callable[[tuple[int, ...], DTypeLike], NDArray[Any]],
     stream: Any,
 ) -> Transforms:
-    """Return the transforms of two arrays.
+    """Return the forward and inverse transforms for two arrays.
 
     Parameters
     ----------
     library : {"scipy", "cufft"}
+        Library that computes the transforms.
     signals : (mic, n) float32
-        What the forward transform reads.
+        Input of the forward transform.
     analytic : (mic, phase, n_out) complex64
-        What the inverse transform reads and writes.
-    zeros, stream
-        How to make arrays on a GPU, and where it runs.
+        Input and output of the inverse transform.
+    zeros : callable
+        Returns a new array of zeros of a given shape and type on the device.
+    stream : numba.cuda.Stream or None
+        Stream of the GPU; None on the host.
+
+    Returns
+    -------
+    Transforms
 
     Raises
     ------
     DeviceError
-        A GPU has too little memory.
+        The GPU has too little memory.
     """
     if library == "scipy":
         return ScipyTransforms(signals, analytic)
-    from ertis_numba.fft._cufft import CufftTransforms  # noqa: PLC0415 - CuPy is installed with a GPU only
+    from ertis_numba.fft._cufft import CufftTransforms  # noqa: PLC0415 - CuPy is installed only with GPU support
 
     return CufftTransforms(signals, analytic, zeros=zeros, stream=stream)

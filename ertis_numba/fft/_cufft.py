@@ -1,4 +1,4 @@
-"""Transforms on an NVIDIA GPU, by cuFFT through CuPy, on arrays that are Numba's."""
+"""Transforms of Numba's arrays on an NVIDIA GPU, with cuFFT through CuPy."""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,21 +14,23 @@ __all__ = ["CufftTransforms"]
 
 
 class CufftTransforms:
-    """See `Transforms`. Plans, their work areas and views of the arrays are made here, once; nothing is copied.
+    """Transforms with cuFFT. See `Transforms`.
+
+    Plans, work areas and views of the arrays are created once, and arrays are not copied.
 
     Parameters
     ----------
     signals : (mic, n) float32
     analytic : (mic, phase, n_out) complex64
     zeros : callable
-        Shape and type to a new array of the device.
+        Returns a new array of zeros of a given shape and type on the device.
     stream : numba.cuda.Stream
-        What transforms wait for and what waits for them.
+        Stream on which the transforms run.
 
     Raises
     ------
     DeviceError
-        There is no room for the work areas.
+        The GPU has too little memory for the work areas.
     """
 
     def __init__(
@@ -43,17 +45,17 @@ class CufftTransforms:
         _, n_phases, n_out = analytic.shape
         self._spectra = zeros((n_mics, n // 2 + 1), np.complex64)
         self._stream = cupy.cuda.Stream.from_external(stream)
-        # CuPy's views keep Numba's arrays alive, and cuFFT's plans take no others.
+        # CuPy's views keep Numba's arrays alive, and cuFFT's plans accept no other arrays.
         self._real, self._bins, self._both = (cupy.asarray(array) for array in (signals, self._spectra, analytic))
         try:
-            # Not from CuPy's pool, which would keep the work areas when the plans are gone.
+            # CuPy's memory pool is bypassed, because it would keep the work areas after the plans are deleted.
             with self._stream, cupy.cuda.using_allocator(None):
                 self._forward = cufft.Plan1d(n, cufft.CUFFT_R2C, n_mics)
                 self._inverse = cufft.Plan1d(n_out, cufft.CUFFT_C2C, n_mics * n_phases)
         except (cupy.cuda.memory.OutOfMemoryError, cupy.cuda.runtime.CUDARuntimeError, cufft.CuFFTError) as error:
             raise DeviceError(
-                f"device 'cuda' has no room for transforms of {n_mics * n_phases} rows of {n_out} samples ({error}); "
-                "give a shorter processing.range_m or less accuracy.oversampling, or use device 'cpu'"
+                f"device 'cuda' has too little memory for transforms of {n_mics * n_phases} rows of {n_out} samples "
+                f"({error}); give a shorter processing.range_m or a lower accuracy.oversampling, or use device 'cpu'"
             ) from error
 
     def forward(self, *, threads: int) -> NDArray[np.complex64]:  # noqa: ARG002

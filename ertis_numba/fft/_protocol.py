@@ -1,4 +1,4 @@
-"""What the transforms of every device do."""
+"""Protocol of the Fourier transforms of all devices."""
 
 from typing import Protocol
 
@@ -9,15 +9,15 @@ __all__ = ["Transforms"]
 
 
 class Transforms(Protocol):
-    """The two transforms of the signal chain, along the last axis, single precision, of arrays that stay the same.
+    """Transforms of the signal chain along the last axis, in single precision, for two fixed arrays.
 
-    Both are sums without a factor in front: a signal that goes there and back is larger by the length.
+    Neither transform is normalised: a forward and an inverse transform scale a signal by its length.
     """
 
     def forward(self, *, threads: int) -> NDArray[np.complex64]:
-        """Return the one-sided spectra of the real signals: (mic, n) to (mic, n // 2 + 1)."""
+        """Return the one-sided spectra of the real signals: (mic, n // 2 + 1) complex64."""
         ...
 
     def inverse(self, *, threads: int) -> None:
-        """Replace the spectra in the array of analytic signals, (mic, phase, n), by their signals."""
+        """Transform the spectra in the array of analytic signals, (mic, phase, n), to signals in place."""
         ...

@@ -1,4 +1,4 @@
-"""Transforms on the host, by SciPy's pocketfft."""
+"""Transforms on the host, with SciPy's pocketfft."""
 
 from typing import cast
 
@@ -10,7 +10,10 @@ __all__ = ["ScipyTransforms"]
 
 
 class ScipyTransforms:
-    """See `Transforms`. Where the GPU is simulated its arrays are NumPy's underneath, and are changed in place too."""
+    """Transforms with SciPy. See `Transforms`.
+
+    They also serve the simulated GPU, whose arrays are NumPy arrays underneath and are modified in place as well.
+    """
 
     def __init__(self, signals: NDArray[np.float32], analytic: NDArray[np.complex64]) -> None:
         self._signals, self._analytic = np.asarray(signals), np.asarray(analytic)
@@ -24,4 +27,4 @@ class ScipyTransforms:
         spectra = self._analytic
         result = scipy.fft.ifft(spectra, norm="forward", overwrite_x=True, workers=threads)
         if result is not spectra and not np.shares_memory(result, spectra):
-            spectra[:] = result  # overwrite_x is a permission, not a promise
+            spectra[:] = result  # overwrite_x permits in-place work, but does not guarantee it

@@ -1,7 +1,7 @@
 """Microphone layouts, direction grids and the delays between them.
 
-The sensor frame: x forward (boresight), y to azimuth +90°, z up (elevation +90°). Positions are
-taken from the centroid of the enabled microphones.
+In the sensor frame, x points forward (boresight), y to azimuth +90°, and z up (elevation +90°). Positions are relative
+to the centroid of the enabled microphones.
 """
 
 from ertis_numba.geometry.azimuths import ALONE_RAD, FAR, is_closed, reach_rad, unrolled_rad

@@ -1,4 +1,4 @@
-"""Azimuths side by side: where they begin, how far from each something is known, and whether they go all around."""
+"""Azimuths of a grid: order, gaps between them, and closed circles."""
 
 import math
 
@@ -8,25 +8,25 @@ from numpy.typing import NDArray
 __all__ = ["ALONE_RAD", "FAR", "is_closed", "reach_rad", "unrolled_rad"]
 
 ALONE_RAD = math.radians(1.0)
-"""How far a direction reaches that has none beside it."""
+"""Angle around a direction without neighbours in which its value applies."""
 
 FAR = 1.3
-"""Spacings from the nearest direction, beyond which nothing is known."""
+"""Largest distance from the nearest direction at which its value applies, in spacings."""
 
-_FAR_RAD = math.radians(10.0)  # the same at most, where directions lie wider apart than is usual
-_CLOSED = 1.5  # widest spacings between the last direction and the first, up to which they go all around
+_FAR_RAD = math.radians(10.0)  # limit of the same distance where directions are farther apart than usual
+_CLOSED = 1.5  # largest gap between the last direction and the first of a closed circle, in widest spacings
 _TURN = 2 * math.pi
 
 
 def reach_rad(gaps_rad: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return how far from the nearer of its two directions something is known in each gap: (gap,) float64.
+    """Return the angle from either end of each gap in which the value of that direction applies: (gap,) float64.
 
-    A gap as wide as one beside it is no gap but a coarser part, as grids have that are finer ahead.
+    A gap as wide as a neighbouring one is a coarser part of the grid, as in grids that are finer ahead.
 
     Parameters
     ----------
     gaps_rad : (gap,) float64
-        Between directions, from one to the next.
+        Angles from each direction to the next.
     """
     if len(gaps_rad) < 2:
         return np.full(len(gaps_rad), ALONE_RAD)
@@ -36,19 +36,19 @@ def reach_rad(gaps_rad: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def unrolled_rad(azimuth_rad: NDArray[np.float64], closed_rad: float = 0.0) -> NDArray[np.float64]:
-    """Return azimuths, by whole turns moved such that no gap lies between them that is wider than that around them.
+    """Return azimuths shifted by whole turns so that the widest gap lies outside of their interval.
 
     Parameters
     ----------
     azimuth_rad : (direction,) float64
-        In any order.
+        Azimuths in any order.
     closed_rad : float
-        A gap up to which is none, where directions of other elevations lie between.
+        Gaps up to this width do not count, because directions of other elevations lie in them.
 
     Returns
     -------
     (direction,) float64
-        Within a turn; the middle of the first and the last is from -π to π.
+        Azimuths within one turn; the middle between the first and the last is from −π to π.
     """
     turns = np.floor((azimuth_rad + math.pi) / _TURN)
     within = np.where(np.abs(azimuth_rad) > math.pi + 1e-9, azimuth_rad - _TURN * turns, azimuth_rad)
@@ -62,7 +62,7 @@ def unrolled_rad(azimuth_rad: NDArray[np.float64], closed_rad: float = 0.0) -> N
 
 
 def is_closed(azimuth_rad: NDArray[np.float64]) -> bool:
-    """Whether rising directions go all around, with no more between the last and the first than elsewhere."""
+    """Return True if increasing azimuths form a closed circle, without a wider gap between the last and the first."""
     if len(azimuth_rad) < 3:
         return False
     open_rad = _TURN - float(azimuth_rad[-1] - azimuth_rad[0])

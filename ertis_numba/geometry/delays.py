@@ -1,4 +1,4 @@
-"""When sound from a direction, or from a point, reaches the microphones."""
+"""Delays of sound from a direction, or from a point, at the microphones."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +12,18 @@ def unit_vectors(azimuth_rad: NDArray[np.float64], elevation_rad: NDArray[np.flo
     Parameters
     ----------
     azimuth_rad, elevation_rad : (direction,) float64
+        Angles in radians.
 
     Returns
     -------
     (direction, axis) float64
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from ertis_numba.geometry import unit_vectors
+    >>> unit_vectors(np.radians([90.0]), np.array([0.0])).round(6).tolist()
+    [[0.0, 1.0, 0.0]]
     """
     level = np.cos(elevation_rad)
     return np.stack([level * np.cos(azimuth_rad), level * np.sin(azimuth_rad), np.sin(elevation_rad)], axis=-1)
@@ -24,19 +32,28 @@ def unit_vectors(azimuth_rad: NDArray[np.float64], elevation_rad: NDArray[np.flo
 def far_field_delays(
     positions_m: NDArray[np.float64], directions: NDArray[np.float64], *, sound_speed_m_s: float
 ) -> NDArray[np.float64]:
-    """Return when a plane wave reaches each microphone, after it passed the centroid.
+    """Return the delays of plane waves at each microphone, relative to the centroid.
 
     Parameters
     ----------
     positions_m : (mic, axis) float64
+        Positions relative to the centroid, in metres.
     directions : (direction, axis) float64
         Unit vectors towards the source.
     sound_speed_m_s : float
+        Speed of sound in metres per second.
 
     Returns
     -------
     (direction, mic) float64
         ``−p·u / c`` in seconds.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from ertis_numba.geometry import far_field_delays
+    >>> far_field_delays(np.array([[0.0, 0.1, 0.0]]), np.array([[0.0, 1.0, 0.0]]), sound_speed_m_s=340.0).round(6)
+    array([[-0.000294]])
     """
     return -(directions @ positions_m.T) / sound_speed_m_s
 
@@ -48,23 +65,31 @@ def spherical_delays(
     range_m: float,
     sound_speed_m_s: float,
 ) -> NDArray[np.float64]:
-    """Return when the echo of a point reaches each microphone, after it would reach the centroid.
-
-    As `far_field_delays`, for a point at ``range_m``: ``(‖r u − p‖ − r) / c``.
+    """Return the delays of the echoes of points at each microphone, relative to the centroid.
 
     Parameters
     ----------
     positions_m : (mic, axis) float64
+        Positions relative to the centroid, in metres.
     directions : (direction, axis) float64
-        Unit vectors towards the point.
+        Unit vectors towards the points.
     range_m : float
-        Distance of the point from the centroid.
+        Distance of the points from the centroid, in metres.
     sound_speed_m_s : float
+        Speed of sound in metres per second.
 
     Returns
     -------
     (direction, mic) float64
-        Seconds.
+        ``(‖r u − p‖ − r) / c`` in seconds.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from ertis_numba.geometry import spherical_delays
+    >>> ahead = np.array([[1.0, 0.0, 0.0]])
+    >>> spherical_delays(np.array([[0.0, 0.1, 0.0]]), ahead, range_m=1.0, sound_speed_m_s=340.0).round(7)
+    array([[1.47e-05]])
     """
     points_m = range_m * directions[:, None, :] - positions_m[None, :, :]
     return np.asarray((np.linalg.norm(points_m, axis=-1) - range_m) / sound_speed_m_s)

@@ -16,23 +16,24 @@ from ertis_numba.settings import Processing
 __all__ = ["MAX_DIRECTIONS", "PAPER_GRIDS", "Grid", "direction_grid", "grid_count"]
 
 MAX_DIRECTIONS = 1_000_000
-"""Limit on the directions of a grid."""
+"""Maximum number of directions of a grid."""
 
 PAPER_GRIDS = {
     "90": ("2d:90", (-90.0, 90.0), (0.0, 0.0)),
     "1850": ("3d:1850", (-45.0, 45.0), (-45.0, 45.0)),
     "3000": ("3d:3000", (-90.0, 90.0), (-90.0, 90.0)),
 }
-"""The three grids of the paper: kind, azimuth limits and elevation limits in degrees."""
+"""Kind, azimuth limits and elevation limits in degrees of the paper's three grids."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Grid:
-    """The directions of an image.
+    """Directions of an image.
 
     Attributes
     ----------
     azimuth_rad, elevation_rad : (direction,) float64
+        Angles in radians.
     """
 
     azimuth_rad: NDArray[np.float64]
@@ -48,7 +49,11 @@ def grid_count(name: str | tuple[tuple[float, float], ...]) -> int | None:
     Parameters
     ----------
     name : str or tuple of (azimuth, elevation)
-        As `Processing.directions`.
+        Same as `Processing.directions`.
+
+    Returns
+    -------
+    int or None
 
     Raises
     ------
@@ -61,10 +66,10 @@ def grid_count(name: str | tuple[tuple[float, float], ...]) -> int | None:
     if head not in {"2d", "3d"} or not colon:
         return None
     if not (count.isascii() and count.isdecimal()):
-        raise ArgumentError(f"directions {name[:80]!r} has no count; give for instance {head}:181")
-    if len(count.lstrip("0")) > len(str(MAX_DIRECTIONS)):  # Python refuses to convert some thousand digits
+        raise ArgumentError(f"directions {name[:80]!r} has no count; give a number after the colon, such as {head}:181")
+    if len(count.lstrip("0")) > len(str(MAX_DIRECTIONS)):  # Python does not convert several thousand digits
         raise ArgumentError(
-            f"directions {name[:80]!r} has a count of {len(count)} digits; give {MAX_DIRECTIONS} at most"
+            f"directions {name[:80]!r} has a count of {len(count)} digits; give at most {MAX_DIRECTIONS}"
         )
     return checks.integer(f"count of directions {name!r}", int(count), 1, MAX_DIRECTIONS)
 
@@ -72,9 +77,9 @@ def grid_count(name: str | tuple[tuple[float, float], ...]) -> int | None:
 def direction_grid(processing: Processing) -> Grid:
     """Return the directions that ``processing.directions`` names or lists.
 
-    ``90``, ``1850`` and ``3000`` are the paper's grids. ``2d:N`` is N azimuths in the horizontal
-    plane, both limits included. ``3d:N`` is N cells of equal area between the limits, in rows of
-    equal elevation. Anything else is the path of a CSV file of azimuth, elevation in degrees.
+    ``90``, ``1850`` and ``3000`` are the paper's grids. ``2d:N`` is N azimuths in the horizontal plane, including both
+    limits. ``3d:N`` is N cells of equal area between the limits, in rows of equal elevation. Any other name is the path
+    of a CSV file of azimuth, elevation in degrees.
 
     Parameters
     ----------
@@ -87,7 +92,14 @@ def direction_grid(processing: Processing) -> Grid:
     Raises
     ------
     ArgumentError
-        The name is no grid and no readable file, or the grid is empty.
+        The name is neither a grid nor a readable file, or the grid is empty.
+
+    Examples
+    --------
+    >>> from ertis_numba.settings import Processing
+    >>> from ertis_numba.geometry import direction_grid
+    >>> len(direction_grid(Processing(directions="2d:181")))
+    181
     """
     name = processing.directions
     if not isinstance(name, str):
@@ -113,10 +125,10 @@ def _planar_grid(n_directions: int, limits_deg: tuple[float, float]) -> Grid:
 def _equal_area_grid(
     n_directions: int, azimuth_limits_deg: tuple[float, float], elevation_limits_deg: tuple[float, float]
 ) -> Grid:
-    """Rows of equal elevation, each cut into cells of equal area, after Leopardi's zonal partition.
+    """Return rows of equal elevation, each split into cells of equal area, after Leopardi's zonal partition.
 
-    P. Leopardi, A partition of the unit sphere into regions of equal area and small diameter,
-    ETNA 25 (2006). Here the zones end at the limits, so that the count is met exactly.
+    P. Leopardi, A partition of the unit sphere into regions of equal area and small diameter, ETNA 25 (2006). Here the
+    zones end at the limits, so that the number of cells is exact.
     """
     west, east = np.radians(azimuth_limits_deg)
     low, high = np.sin(np.radians(elevation_limits_deg))
@@ -139,7 +151,9 @@ def _equal_area_grid(
 
 def _csv_grid(path: str) -> Grid:
     if Path(path).suffix.lower() != ".csv":
-        raise ArgumentError(f"directions {path!r} is no grid; give {', '.join(PAPER_GRIDS)}, 2d:N, 3d:N or a .csv file")
+        raise ArgumentError(
+            f"directions {path!r} is not a grid; give {', '.join(PAPER_GRIDS)}, 2d:N, 3d:N or a .csv file"
+        )
     try:
         text = Path(path).read_text("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
@@ -149,7 +163,9 @@ def _csv_grid(path: str) -> Grid:
         ) from error
     rows = csv_rows(f"directions {path}", text)
     if not rows or any(len(row) != 2 for row in rows):
-        raise ArgumentError(f"directions {path} has not two numbers in every row; give azimuth, elevation in degrees")
+        raise ArgumentError(
+            f"directions {path} does not have two numbers in every row; give azimuth, elevation in degrees"
+        )
     angles_rad = np.radians(np.asarray(rows))
     checks.finite_array(f"directions {path}", angles_rad)
     for row, (azimuth_deg, elevation_deg) in enumerate(rows):

@@ -1,4 +1,4 @@
-"""Arrays: where the microphones are, from settings, shipped layouts and files."""
+"""Microphone layouts from settings, files and the package itself."""
 
 import functools
 from dataclasses import dataclass, replace
@@ -29,29 +29,29 @@ __all__ = [
     "written_out",
 ]
 
-_SMALLEST_M = 1e-3  # of several microphones: metres given for millimetres are below it
-_CENTRED_M = 1e-12  # of rounding, in the mean of positions that were centred before
+_SMALLEST_M = 1e-3  # minimum size of an array: metres given instead of millimetres are below it
+_CENTRED_M = 1e-12  # rounding error in the mean of centred positions
 
 
 class LayoutFile(TomlDocument, frozen=True, kw_only=True):
-    """Microphones of an array: the whole content of a layout file.
+    """Microphones of an array: the complete content of a layout file.
 
     Attributes
     ----------
     positions_mm : list of (y, z) or (x, y, z)
-        Positions in the sensor frame, one per channel, in the order of the bits.
+        Positions in the sensor frame in millimetres, one per channel, in the order of the bits.
     name : str
         Name in recordings and pictures; the name of the file by default.
     source : str
-        Origin of the figures, for readers of the file.
+        Origin of the numbers, for readers of the file; empty by default.
     word_bits : {8, 16, 32, 64}
-        Size of one PDM word.
+        Bits of one PDM word; 32 by default.
     disabled : tuple of int
-        Channels without a microphone.
+        Channels without a microphone; none by default.
     gain : tuple of float, optional
-        Calibrated sensitivity of each channel, 1 by default; its signal is divided by it.
+        Calibrated sensitivity of each channel, 1 by default. Processing divides the signal by it.
     delay_s : tuple of float, optional
-        Calibrated lateness of each channel, 0 by default; it is taken out.
+        Calibrated delay of each channel in seconds, 0 by default. Processing compensates for it.
     """
 
     positions_mm: list[list[float]]
@@ -65,19 +65,21 @@ class LayoutFile(TomlDocument, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layout:
-    """The microphones of an array.
+    """Microphones of an array.
 
     Attributes
     ----------
     name : str
     positions_m : (channel, axis) float64
-        From the centroid of the enabled microphones.
+        Positions relative to the centroid of the enabled microphones, in metres.
     enabled : (channel,) bool
+        True for channels with a microphone in use.
     gain : (channel,) float64
         Calibrated sensitivity.
     delay_s : (channel,) float64
-        Calibrated lateness.
+        Calibrated delay in seconds.
     word_bits : int
+        Bits of one PDM word.
     """
 
     name: str
@@ -103,7 +105,7 @@ class Layout:
         return self.positions_m[self.enabled]
 
     def to_array(self) -> Array:
-        """Return settings that hold the positions themselves and so depend on no file."""
+        """Return array settings that contain the positions themselves, and depend on no file."""
         return Array(
             layout=self.name,
             positions_m=tuple((float(x), float(y), float(z)) for x, y, z in self.positions_m),
@@ -125,7 +127,7 @@ def _shipped() -> list[Traversable]:
 
 
 def layout_text(name: str) -> str:
-    """Return the TOML of a shipped layout.
+    """Return the TOML text of a shipped layout.
 
     Raises
     ------
@@ -139,7 +141,7 @@ def layout_text(name: str) -> str:
 def load_layout(name: str | Path) -> Layout:
     """Return a shipped layout, or one from a ``.toml`` or ``.csv`` file.
 
-    A CSV has one row per channel, ``y, z`` or ``x, y, z`` in millimetres, in the order of the bits.
+    A CSV file has one row per channel, ``y, z`` or ``x, y, z`` in millimetres, in the order of the bits.
 
     Parameters
     ----------
@@ -154,6 +156,13 @@ def load_layout(name: str | Path) -> Layout:
     ------
     ArgumentError
         The name is unknown, or the file cannot be read or used.
+
+    Examples
+    --------
+    >>> from ertis_numba.geometry import layout_names, load_layout
+    >>> layout = load_layout(layout_names()[0])
+    >>> layout.positions_m.shape == (len(layout.enabled), 3)
+    True
     """
     path = Path(name)
     if path.suffix.lower() not in {".toml", ".csv"}:
@@ -174,16 +183,17 @@ def load_layout(name: str | Path) -> Layout:
 
 @functools.cache
 def _shipped_array(name: str) -> Array:
-    """Return a shipped layout, whose file is read once."""
+    """Return a shipped layout; its file is read once."""
     return _placed(name, LayoutFile.from_toml(layout_text(name), f"layout {name}"))
 
 
 def _placed(source: str, file: LayoutFile) -> Array:
-    """Return the array of a layout file, checked."""
+    """Return the validated array of a layout file."""
     rows = file.positions_mm
     if not rows or any(len(row) != len(rows[0]) or len(row) not in {2, 3} for row in rows):
         raise ArgumentError(
-            f"layout {source}: positions_mm is not rows of 2 or 3 numbers; give y, z or x, y, z of each channel"
+            f"layout {source}: positions_mm does not consist of rows of 2 or 3 numbers; give y, z or x, y, z of each "
+            "channel"
         )
     positions_m = np.zeros((len(rows), 3))
     positions_m[:, 3 - len(rows[0]) :] = np.asarray(rows, dtype=np.float64) / 1000
@@ -205,22 +215,22 @@ def _placed(source: str, file: LayoutFile) -> Array:
     across_m = float(np.ptp(positions_m[enabled], axis=0).max(initial=0.0)) if enabled.any() else 0.0
     if enabled.sum() > 1 and across_m < _SMALLEST_M:
         raise ArgumentError(
-            f"layout {source}: its microphones lie within {1e3 * across_m:.3g} mm, too close to tell directions; give "
-            "millimetres"
+            f"layout {source}: its microphones lie within {1e3 * across_m:.3g} mm, too close to distinguish "
+            "directions; give positions in millimetres"
         )
     _require_apart(source, positions_m, np.flatnonzero(enabled))
     return made
 
 
 def _require_apart(source: str, positions_m: NDArray[np.float64], channels: NDArray[np.intp]) -> None:
-    """Refuse a file that has two microphones in one place, which is a row that was copied and not changed."""
+    """Raise an error for two microphones in one place, which is probably a copied row that was not changed."""
     first: dict[tuple[float, ...], int] = {}
     for channel in channels.tolist():
         place = tuple(positions_m[channel].tolist())
         if first.setdefault(place, channel) != channel:
             raise ArgumentError(
-                f"layout {source}: channels {first[place]} and {channel} are in one place; correct one, or name it "
-                "under 'disabled' in a .toml"
+                f"layout {source}: channels {first[place]} and {channel} have the same position; correct one, or list "
+                "it under 'disabled' in a .toml file"
             )
 
 
@@ -234,13 +244,20 @@ def microphones(array: Array) -> Layout:
     Returns
     -------
     Layout
-        Positions from the centroid of the enabled microphones; those that ``array.disabled`` leaves out count in it.
+        Positions are relative to the centroid of the layout's microphones, including those in ``array.disabled``.
 
     Raises
     ------
     ArgumentError
         The named layout is unknown or cannot be used, ``array.disabled`` names a channel that it does not have, or no
-        microphone is left.
+        microphone remains.
+
+    Examples
+    --------
+    >>> from ertis_numba.settings import Array
+    >>> from ertis_numba.geometry import microphones
+    >>> int(microphones(Array(disabled=(0, 1))).enabled.sum())
+    30
     """
     fitted = _fitted(array)
     if not array.disabled:
@@ -249,21 +266,19 @@ def microphones(array: Array) -> Layout:
     for channel in array.disabled:
         enabled[checks.integer("array.disabled", channel, 0, len(enabled) - 1)] = False
     if not enabled.any():
-        raise ArgumentError(
-            f"array.disabled leaves none of {int(fitted.enabled.sum())} microphones; name fewer channels"
-        )
+        raise ArgumentError(f"array.disabled disables all {int(fitted.enabled.sum())} microphones; name fewer channels")
     return replace(fitted, enabled=enabled)
 
 
 def _fitted(array: Array) -> Layout:
-    """Return all microphones of an array, the disabled ones among them."""
+    """Return all microphones of an array, including the disabled ones."""
     if array.positions_m is None:
         return load_layout(array.layout)
     positions_m = np.asarray(array.positions_m, dtype=np.float64)
     enabled = np.ones(len(positions_m), dtype=np.bool_) if array.enabled is None else np.asarray(array.enabled)
     centre_m = positions_m[enabled].mean(axis=0)
-    # Positions that are centred already stay as they are to the last bit, so that a layout read from
-    # a recording gives the image that the named one gave.
+    # Positions that are already centred stay the same to the last bit, so that a layout from a recording yields the
+    # same image as the named layout.
     centre_m[np.abs(centre_m) < _CENTRED_M] = 0.0
     centred_m = np.where(enabled[:, None], positions_m - centre_m, 0.0)
     return Layout(
@@ -277,29 +292,29 @@ def _fitted(array: Array) -> Layout:
 
 
 def written_out(array: Array) -> Array:
-    """Return an array whose microphones are written out, so that it depends on no layout file."""
+    """Return array settings with the positions of the microphones, so that they depend on no layout file."""
     if array.positions_m is not None:
         return array
     return _fitted(array).to_array().replace(disabled=array.disabled)
 
 
 def self_contained(settings: Settings) -> Settings:
-    """Return settings whose microphones are written out, so that they depend on no layout file."""
+    """Return settings with the positions of the microphones, so that they depend on no layout file."""
     array = written_out(settings.array)
     return settings if array is settings.array else settings.replace(array=array)
 
 
 def storable(settings: Settings) -> Settings:
-    """Return settings as a recording holds them, which depend on no file.
+    """Return settings in the form that recordings contain, which depends on no file.
 
     Raises
     ------
     ArgumentError
-        The directions are those of a file, or the layout cannot be used.
+        The directions are in a file, or the layout cannot be used.
     """
     if grid_count(settings.processing.directions) is None:
         raise ArgumentError(
-            f"processing.directions is the file {settings.processing.directions}, which a recording cannot hold; "
-            "name a grid, and give the file when processing"
+            f"processing.directions is the file {settings.processing.directions}, but a recording cannot contain "
+            "directions; name a grid, and give the file when processing"
         )
     return self_contained(settings)

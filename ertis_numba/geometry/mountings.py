@@ -1,4 +1,4 @@
-"""Where sensors are on their platform, and how they are turned."""
+"""Mounting of sensors on their platform: position and orientation."""
 
 from collections.abc import Sequence
 
@@ -11,34 +11,41 @@ from ertis_numba.errors import ArgumentError
 __all__ = ["mounting"]
 
 _ORIGIN, _UNTURNED = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
-_UNIT = 1e-6  # of deviation that rounding to six digits leaves
+_UNIT = 1e-6  # deviation from length 1 due to rounding to six digits
 
 
 def mounting(
     sensor: str, translation_m: Sequence[float] | None = None, rotation_xyzw: Sequence[float] | None = None
 ) -> dict[str, NDArray[np.float64]]:
-    """Return the checked mounting of a sensor; empty if it is unknown.
+    """Return the validated mounting of a sensor; empty if it is unknown.
 
-    If only one of the two is given, the sensor is not turned, or at the origin.
+    If only the translation is given, the rotation is the identity. If only the rotation is given, the sensor is at the
+    origin.
 
     Parameters
     ----------
     sensor : str
-        Its name, for errors.
+        Name of the sensor in errors.
     translation_m : sequence of 3 float, optional
-        x, y, z.
+        Position x, y, z in metres.
     rotation_xyzw : sequence of 4 float, optional
-        The unit quaternion that turns the sensor frame into that of the surroundings.
+        Unit quaternion of the rotation from the sensor frame to the frame of the platform.
 
     Returns
     -------
     dict of str to NDArray
-        ``translation_m``: (3,) float64, and ``rotation_xyzw``: (4,) float64; nothing if neither is given.
+        ``translation_m``: (3,) float64, and ``rotation_xyzw``: (4,) float64; empty if neither is given.
 
     Raises
     ------
     ArgumentError
-        A number is missing or not finite, or the quaternion has not length 1.
+        A number is missing or not finite, or the length of the quaternion is not 1.
+
+    Examples
+    --------
+    >>> from ertis_numba.geometry import mounting
+    >>> mounting("left", (0.0, 0.2, 0.0))["rotation_xyzw"].tolist()
+    [0.0, 0.0, 0.0, 1.0]
     """
     if translation_m is None and rotation_xyzw is None:
         return {}

@@ -1,4 +1,4 @@
-"""How far directions lie apart, and which of them share an azimuth."""
+"""Spacing of directions, and grouping of directions by azimuth."""
 
 import math
 from dataclasses import dataclass
@@ -13,19 +13,19 @@ __all__ = ["AzimuthColumns", "azimuth_columns", "spacing_rad"]
 
 Level = TypeVar("Level", bound=np.generic)
 
-_NEAREST_RAD = 1e-9  # directions that are the same have no spacing
-_FINER = 4  # columns of a raster to a spacing: a direction is shown at most an eighth of it aside
+_NEAREST_RAD = 1e-9  # directions closer than this are the same
+_FINER = 4  # columns of a raster per spacing: a direction is displaced by at most an eighth of a spacing
 
 
 def spacing_rad(directions: NDArray[np.float64]) -> float:
-    """Return the usual angle from a direction to its nearest neighbour, half a turn where there is none.
+    """Return the median angle from a direction to its nearest neighbour in radians; π for fewer than two directions.
 
     Parameters
     ----------
     directions : (direction, axis) float64
         Unit vectors.
     """
-    # SciPy's trees take a tenth of a second to import, and a processed measurement needs none.
+    # Importing SciPy's trees takes a tenth of a second, and processing does not need them.
     from scipy.spatial import KDTree  # noqa: PLC0415
 
     if len(directions) < 2:
@@ -36,12 +36,12 @@ def spacing_rad(directions: NDArray[np.float64]) -> float:
 
 @dataclass(frozen=True, slots=True)
 class AzimuthColumns:
-    """Azimuths, and the directions that lie about each.
+    """Azimuths, and the directions near each of them.
 
     Attributes
     ----------
     azimuth_rad : (column,) float64
-        Rising.
+        Azimuths in increasing order.
     """
 
     azimuth_rad: NDArray[np.float64]
@@ -49,20 +49,24 @@ class AzimuthColumns:
     _edges: NDArray[np.intp]
 
     def strongest(self, levels: NDArray[Level]) -> NDArray[Level]:
-        """Return the strongest about each azimuth, (column, ...), of levels (direction, ...)."""
-        ordered = levels[np.append(self._order, self._order[-1])]  # one more, as the last may end there
+        """Return the maximum of levels (direction, ...) near each azimuth: (column, ...)."""
+        ordered = levels[np.append(self._order, self._order[-1])]  # one more, because the last column may end there
         return np.asarray(np.maximum.reduceat(ordered, self._edges, axis=0)[::2])
 
 
 def azimuth_columns(azimuth_rad: NDArray[np.float64], elevation_rad: NDArray[np.float64]) -> AzimuthColumns:
-    """Return the azimuths at which to show directions, and those that lie within half their spacing of each.
+    """Return columns of azimuths for display, each with the directions within half of their spacing.
 
-    Directions of several elevations have azimuths of their own each; where there are many, a raster of a quarter of
-    their spacing stands for them. In a plane each is shown by itself.
+    Directions at several elevations usually have different azimuths. If there are many, a raster with a quarter of
+    their spacing replaces them. Directions in a plane have one column each.
 
     Parameters
     ----------
     azimuth_rad, elevation_rad : (direction,) float64
+
+    Returns
+    -------
+    AzimuthColumns
     """
     order = np.argsort(azimuth_rad, kind="stable")
     rising = azimuth_rad[order]

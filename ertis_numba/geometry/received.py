@@ -1,4 +1,4 @@
-"""Settings from an untrusted source: another machine, or a file of measurements."""
+"""Settings from an untrusted source: another machine, or a recording."""
 
 from ertis_numba.errors import ArgumentError, SettingsError
 from ertis_numba.geometry.grids import grid_count
@@ -9,16 +9,16 @@ __all__ = ["received_settings"]
 
 
 def received_settings(text: bytes | str, source: str, *, are_applied: bool = False) -> Settings:
-    """Parse settings from an untrusted source, and refuse names of files on this machine.
+    """Parse settings from an untrusted source, and reject names of files on this machine.
 
     Parameters
     ----------
     text : bytes or str
-        TOML, in UTF-8.
+        TOML in UTF-8.
     source : str
         Name of the settings in errors.
     are_applied : bool
-        Accept any name as ``processing.directions``, because the directions themselves come with the settings.
+        True to accept any name as ``processing.directions``, because the directions themselves accompany the settings.
 
     Returns
     -------
@@ -35,19 +35,19 @@ def received_settings(text: bytes | str, source: str, *, are_applied: bool = Fal
         try:
             text = text.decode()
         except UnicodeDecodeError as error:
-            raise SettingsError(f"{source} are not text ({error}); give TOML in UTF-8") from error
+            raise SettingsError(f"{source}: not text ({error}); give TOML in UTF-8") from error
     settings = Settings.from_toml(text, source, find_line=False)
     layout, directions = settings.array.layout, settings.processing.directions
     if not layout.isprintable() or not str(directions).isprintable():
-        raise SettingsError(f"{source} have names with characters that cannot be printed; give printable characters")
+        raise SettingsError(f"{source}: a name has characters that cannot be printed; give printable characters")
     if settings.array.positions_m is None and layout not in layout_names():
         raise SettingsError(
-            f"{source}: array.layout is {layout[:80]!r}, a file; send its positions instead, or name one of "
-            f"{', '.join(layout_names())}"
+            f"{source}: array.layout is {layout[:80]!r}, the name of a file; send its positions instead, or name one "
+            f"of {', '.join(layout_names())}"
         )
     if isinstance(settings.call.waveform, str):
         raise SettingsError(
-            f"{source}: call.waveform is {settings.call.waveform[:80]!r}, a file; send its samples instead"
+            f"{source}: call.waveform is {settings.call.waveform[:80]!r}, the name of a file; send its samples instead"
         )
     try:
         count = None if are_applied else grid_count(directions)
@@ -55,6 +55,7 @@ def received_settings(text: bytes | str, source: str, *, are_applied: bool = Fal
         raise SettingsError(f"{source}: {error}") from error
     if isinstance(directions, str) and count is None and not are_applied:
         raise SettingsError(
-            f"{source}: processing.directions is {directions[:80]!r}, a file; name a grid instead, such as 2d:181"
+            f"{source}: processing.directions is {directions[:80]!r}, the name of a file; name a grid instead, such as "
+            "2d:181"
         )
     return settings

@@ -1,4 +1,4 @@
-"""Array weights: real weights of microphones that trade the width of the main lobe for the level of side lobes."""
+"""Array weights: real weights of the microphones that trade a wider main lobe for lower side lobes."""
 
 import math
 
@@ -12,29 +12,40 @@ from ertis_numba.settings import Settings, parse_window
 
 __all__ = ["array_weights", "effective_count"]
 
-_SAMPLES = 4097  # of a window; linear interpolation between them errs by less than 1e-6 of its maximum
+_SAMPLES = 4097  # of a window; the error of linear interpolation between them is below 1e-6 of its maximum
 
 
 def array_weights(settings: Settings) -> NDArray[np.float64]:
     """Return the weight of each enabled microphone, with a mean of 1: (mic,) float64.
 
     A window is a function of the distance from the centre of the array, relative to the radius of the aperture. The
-    aperture ends half of the mean distance between neighbours beyond the outermost microphone, so that no microphone
-    has the weight 0.
+    aperture extends beyond the outermost microphone by half of the mean distance between neighbours, so that no
+    microphone has the weight 0.
 
-    A mean of 1 keeps the level of an echo to which all microphones contribute in phase, as the constraint
-    ``wᴴv = 1`` does for the response in the steered direction (H. L. Van Trees, Optimum Array Processing, 2002,
-    sections 2.6 and 3.1).
+    A mean of 1 preserves the level of an echo to which all microphones contribute in phase. The constraint
+    ``wᴴv = 1`` does the same for the response in the steered direction (H. L. Van Trees, Optimum Array Processing,
+    2002, sections 2.6 and 3.1).
 
     Parameters
     ----------
     settings : Settings
 
+    Returns
+    -------
+    (mic,) float64
+
     Raises
     ------
     ArgumentError
-        ``processing.array_weights`` is a list of another length than the array has channels, or all enabled
+        The length of the list ``processing.array_weights`` differs from the number of channels, or all enabled
         microphones have the weight 0.
+
+    Examples
+    --------
+    >>> from ertis_numba import Settings
+    >>> from ertis_numba.geometry import array_weights
+    >>> float(array_weights(Settings()).mean())
+    1.0
     """
     layout, given = microphones(settings.array), settings.processing.array_weights
     if given == "uniform":
@@ -52,13 +63,24 @@ def array_weights(settings: Settings) -> NDArray[np.float64]:
 def effective_count(weights: NDArray[np.float64]) -> float:
     """Return the number of equally weighted microphones with the same gain over uncorrelated noise, ``(Σw)² / Σw²``.
 
-    It is the white noise gain of the array (Van Trees, section 2.6.2), and the number of microphones if weights are
-    uniform.
+    It is the white noise gain of the array (Van Trees, section 2.6.2). With uniform weights it is the number of
+    microphones.
 
     Parameters
     ----------
     weights : (mic,) float64
-        With a mean of 1.
+        Weights with a mean of 1.
+
+    Returns
+    -------
+    float
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from ertis_numba.geometry import effective_count
+    >>> effective_count(np.ones(32))
+    32.0
     """
     return len(weights) / float(np.mean(weights**2))
 
@@ -70,12 +92,12 @@ def _listed(layout: Layout, given: tuple[float, ...]) -> NDArray[np.float64]:
 
 def _window(layout: Layout, name: str) -> NDArray[np.float64]:
     """Return samples of a window at the microphones."""
-    # SciPy's windows take longer to import than the chain takes to start, and uniform weights need none.
+    # Importing SciPy's windows takes longer than starting the chain, and uniform weights do not need them.
     from scipy.signal import windows  # noqa: PLC0415
 
     taper = parse_window(name)
     if taper.window == "taylor":
-        # Taylor's least number of nearly equal side lobes (Van Trees, section 3.4).
+        # Taylor's minimum number of nearly equal side lobes (Van Trees, section 3.4).
         equal = math.ceil(2 * (math.acosh(10 ** (taper.parameter / 20)) / math.pi) ** 2 + 0.5)
         samples = windows.taylor(_SAMPLES, nbar=equal, sll=taper.parameter)
     elif taper.window == "kaiser":

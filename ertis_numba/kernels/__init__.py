@@ -1,7 +1,7 @@
-"""The kernels of the signal chain, and the only door to Numba.
+"""Kernels of the signal chain; the only package that imports Numba.
 
-`load` returns the kernels of one device as a `KernelSet`. What each kernel does is written once, in
-``_contract``; ``_cpu``, ``_cuda`` and ``_numpy`` hold the twins under the same names.
+`load` returns the kernels of one device as a `KernelSet`. The package ``_contract`` documents each kernel once;
+``_cpu``, ``_cuda`` and ``_numpy`` contain the twins under the same names.
 """
 
 from ertis_numba.kernels._compiling import on_compiling

@@ -1,4 +1,4 @@
-"""Notice of the first compilation in this process; kernels in the cache on disk need none."""
+"""Notification of the first compilation in this process; kernels from the cache on disk cause none."""
 
 from collections.abc import Callable
 
@@ -8,7 +8,18 @@ _callbacks: list[Callable[[], None]] = []
 
 
 def on_compiling(callback: Callable[[], None]) -> Callable[[], None]:
-    """Call a function once, when a kernel is compiled; return a function that withdraws it."""
+    """Register a function to be called once, when a kernel is compiled.
+
+    Parameters
+    ----------
+    callback : callable
+        Called without arguments.
+
+    Returns
+    -------
+    callable
+        Function that unregisters ``callback``.
+    """
     _callbacks.append(callback)
 
     def withdraw() -> None:

@@ -1,4 +1,4 @@
-"""One table from a device's name to its kernels, read once when a pipeline is made."""
+"""Table of the devices and their kernels, read once when a pipeline is created."""
 
 import functools
 import importlib
@@ -19,7 +19,7 @@ DEVICES: Final = {
     "cuda": "ertis_numba.kernels._cuda.gpu",
     "numpy": "ertis_numba.kernels._numpy",
 }
-"""Module of each device's kernels. Importing one is what brings its libraries in."""
+"""Module of each device's kernels. Importing it also imports the device's libraries."""
 
 
 @functools.cache
@@ -29,15 +29,25 @@ def load(device: str = "auto") -> KernelSet:
     Parameters
     ----------
     device : {"auto", "cpu", "cuda", "numpy"}
-        ``cpu`` is Numba on all cores, ``cuda`` Numba on an NVIDIA GPU, ``numpy`` plain and for comparison. ``auto`` is
-        ``cuda`` where there are a GPU and all that it needs, else ``cpu``.
+        ``cpu`` is Numba on all cores, ``cuda`` is Numba on an NVIDIA GPU, and ``numpy`` is plain NumPy for comparison.
+        ``auto``, the default, is ``cuda`` if a GPU and its libraries are available, otherwise ``cpu``.
+
+    Returns
+    -------
+    KernelSet
 
     Raises
     ------
     ArgumentError
         The device is unknown.
     DeviceError
-        The device is known but cannot be used here.
+        The device is known but cannot be used on this machine.
+
+    Examples
+    --------
+    >>> from ertis_numba import kernels
+    >>> kernels.load("numpy").device
+    'numpy'
     """
     checks.choice("device", device, ("auto", *DEVICES))
     if device == "auto":
@@ -51,19 +61,19 @@ def load(device: str = "auto") -> KernelSet:
     except ImportError as error:
         if device != "cuda":
             raise
-        # Numba has announced to drop its own CUDA target; numba-cuda is where it lives on.
+        # Numba will drop its own CUDA target; the package numba-cuda continues it.
         raise DeviceError(
             f"device {device!r} cannot be loaded ({error}); use device 'cpu', or install ertis-numba[cu12] or [cu13]"
         ) from error
-    except RuntimeError as error:  # Numba's, where it can write its cache nowhere
+    except RuntimeError as error:  # raised by Numba if no folder for its cache is writable
         raise DeviceError(
-            f"device {device!r} cannot be set up ({error}); set NUMBA_CACHE_DIR to a folder that can be written"
+            f"device {device!r} cannot be set up ({error}); set NUMBA_CACHE_DIR to a writable folder"
         ) from error
     return kernels
 
 
 def usable() -> tuple[str, ...]:
-    """Return the devices that `load` can load here."""
+    """Return the devices that `load` can load on this machine."""
     found = []
     for device in DEVICES:
         try:
@@ -76,11 +86,11 @@ def usable() -> tuple[str, ...]:
 
 
 def _has_gpu() -> bool:
-    """Whether ``auto`` takes a GPU; looked for only where CuPy tells that somebody meant to use one."""
+    """Return True if ``auto`` selects a GPU; without CuPy, none is searched for."""
     if importlib.util.find_spec("cupy") is None:
         return False
     try:
         return not load("cuda").simulated
-    except Exception as error:  # noqa: BLE001 - whatever a driver may raise, there is a processor
+    except Exception as error:  # noqa: BLE001 - whatever a driver raises, the CPU is available
         _LOG.info("%s", error)
         return False

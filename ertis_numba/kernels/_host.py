@@ -1,4 +1,4 @@
-"""The memory of kernels that run on the processor: arrays of NumPy, used where they are."""
+"""Memory of kernels that run on the CPU: NumPy arrays, used in place."""
 
 import contextlib
 from collections.abc import Callable
@@ -16,7 +16,7 @@ __all__ = ["HostMemory"]
 
 
 class _HostLane:
-    """See `Lane`: nothing is to be brought anywhere, and all that is begun is done at once."""
+    """Lane of the host: no array is copied, and every call finishes before it returns. See `Lane`."""
 
     stream = None
 
@@ -46,13 +46,13 @@ class _HostLane:
 
 
 class HostMemory:
-    """See `Memory`."""
+    """Memory of the host. See `Memory`."""
 
     n_lanes = 1
 
     def __init__(self, *, graphs: bool = False) -> None:
         if graphs:
-            raise ArgumentError("graphs is True, and only device 'cuda' has CUDA graphs; leave it out or give 'cuda'")
+            raise ArgumentError("graphs is True, but only device 'cuda' has CUDA graphs; leave it out or give 'cuda'")
         self._images = ImagePool(lambda shape: np.empty(shape, np.float32))
 
     def table(self, array: Array) -> Array:

@@ -1,7 +1,7 @@
-"""Arrays for images, handed out again when nobody looks at them any more.
+"""Pool of image arrays, reused once nothing refers to them.
 
-To make one takes as long as an image does: its pages come one by one from the operating system, and to pin them for
-a GPU takes longer still.
+Allocating an array takes as long as computing an image, because the operating system provides its pages one by one.
+Pinning them for a GPU takes even longer.
 """
 
 import threading
@@ -13,34 +13,34 @@ from numpy.typing import NDArray
 
 __all__ = ["ImagePool"]
 
-_MAX_BYTES = 2**28  # of all arrays that are kept: who holds on to more images gets arrays of their own
+_MAX_BYTES = 2**28  # total size of pooled arrays; callers that keep more images get separate arrays
 
 
 class _Lease:
-    """What an image refers to as long as anybody looks at it, or at a part of it."""
+    """Base object of an image; it lives as long as the image or any view of it."""
 
     def __init__(self, array: NDArray[np.float32]) -> None:
         self.__array_interface__ = array.__array_interface__
 
 
 class ImagePool:
-    """The images of one pipeline.
+    """Pool of the images of one pipeline.
 
     Parameters
     ----------
     make : callable
-        Shape to a new array that is worth keeping.
+        Returns a new array of a given shape.
     """
 
     def __init__(self, make: Callable[[tuple[int, ...]], NDArray[np.float32]]) -> None:
         self._make = make
-        self._lock = threading.RLock()  # an image may be given back amid a garbage collection
+        self._lock = threading.RLock()  # garbage collection may release an image while the lock is held
         self._spare: list[NDArray[np.float32]] = []
         self._count = 0
         self._closed = False
 
     def take(self, shape: tuple[int, int]) -> NDArray[np.float32]:
-        """Return an array, always of the same shape, that nobody looks at and that holds anything."""
+        """Return an unused, uninitialised array; the shape is the same at every call."""
         with self._lock:
             array = self._spare.pop() if self._spare else None
             if array is None:
@@ -54,7 +54,7 @@ class ImagePool:
         return np.asarray(lease)
 
     def close(self) -> None:
-        """Keep nothing from now on."""
+        """Free all unused arrays, and pool no others."""
         with self._lock:
             self._closed = True
             self._spare.clear()

@@ -1,4 +1,4 @@
-"""What a device is: its kernels, and what else there is to know of it."""
+"""Set of the kernels of one device, and properties of the device."""
 
 import importlib
 from collections.abc import Mapping
@@ -13,23 +13,29 @@ __all__ = ["KERNEL_NAMES", "KernelSet", "twins_in"]
 
 @dataclass(frozen=True, slots=True)
 class KernelSet:
-    """The kernels of one device, and what else there is to know of it.
+    """Kernels of one device, and properties of the device.
+
+    Every attribute that is not listed below is a kernel; its contract documents it.
 
     Attributes
     ----------
     device : str
+        Name of the device, as accepted by `load`.
     hardware : str
-        Name of the GPU; empty for the processor.
+        Name of the GPU; empty for the CPU.
     transforms : {"scipy", "cufft"}
-        What goes with the kernels: see `fft`.
+        Library of the Fourier transforms, see `fft`.
     max_threads : int
+        Maximum number of threads.
     tile_ranges : int
-        Ranges in a tile of the 16-bit kernels; 0 where the device cannot run them.
+        Ranges in a tile of the 16-bit kernels; 0 if the device cannot run them.
     fastest_precision : {"float32", "int16"}
     simulated : bool
-        Whether the device is only played by the processor, far too slowly for anything but tests.
+        True if the CPU simulates the device, which is fast enough only for tests.
     memory : callable
-        Returns a `Memory`; ``graphs`` asks for lanes that record what they run.
+        Returns a `Memory`. With ``graphs=True``, its lanes record and replay their kernels.
+    threads : callable
+        Context manager that limits the number of threads, see `Threads`.
     """
 
     device: str
@@ -63,14 +69,14 @@ class KernelSet:
 
     @classmethod
     def of(cls, twins: Mapping[str, Any], **facts: Any) -> Self:
-        """Return the set of the kernels in ``twins``, by their names; ``facts`` are the other attributes."""
+        """Return the set of the kernels in ``twins``, by name; ``facts`` are the other attributes."""
         return cls(**facts, **{name: twins[name] for name in KERNEL_NAMES})
 
 
 KERNEL_NAMES: Final = tuple(field.name for field in fields(KernelSet) if field.type in vars(_contract).values())
-"""Which attributes of a `KernelSet` are kernels: those with a contract."""
+"""Attributes of a `KernelSet` that are kernels, which means that they have a contract."""
 
 
 def twins_in(package: str) -> dict[str, Any]:
-    """Return the kernels of a package that has one file for each, of the kernel's name."""
+    """Return the kernels of a package with one module per kernel, both of the same name."""
     return {name: getattr(importlib.import_module(f"{package}.{name}"), name) for name in KERNEL_NAMES}

@@ -1,4 +1,4 @@
-"""What a device offers besides kernels: memory for a pipeline, and lanes for its measurements."""
+"""Protocols of a device besides its kernels: memory for a pipeline, and lanes for its measurements."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -13,41 +13,47 @@ Array = TypeVar("Array", bound=NDArray[Any])
 
 
 class Lane(Protocol):
-    """The way of one measurement after the other through the device: words in, kernels, image out.
+    """Queue that processes one measurement at a time: copy the samples in, run kernels, copy the image out.
 
-    What is begun on one lane runs in order. Lanes run beside each other where the device can.
+    Operations on one lane run in order. Lanes run concurrently if the device supports it.
     """
 
     stream: Any
-    """What libraries call a lane: a stream of the GPU; None on the host."""
+    """Stream of the GPU; None on the host."""
 
     def entered(self) -> AbstractContextManager[None]:
         """Run the enclosed kernels of this Python thread on this lane."""
         ...
 
     def send(self, array: Array) -> Array:
-        """Begin to bring an array of the host to where kernels read it; a later one of its kind takes its place."""
+        """Start to copy an array of the host to the device, and return the copy.
+
+        A later array of the same shape and type overwrites the copy.
+        """
         ...
 
     def target(self, out: Array) -> Array:
-        """Return where kernels write what `fetch` brings to ``out``; another of its kind gets the same place."""
+        """Return the array of the device that `fetch` copies to ``out``.
+
+        Arrays ``out`` of the same shape and type share it.
+        """
         ...
 
     def run(self, steps: Callable[[], None]) -> None:
-        """Begin ``steps``, which use the same arrays each time: a lane may record them once and play them again."""
+        """Start ``steps``, which must use the same arrays at each call; a lane may record and replay them."""
         ...
 
     def fetch(self, array: Array, out: Array) -> None:
-        """Begin to bring what `target` returned, or any array of the device, to ``out``."""
+        """Start to copy an array of the device, such as the result of `target`, to ``out``."""
         ...
 
     def wait(self) -> None:
-        """Return when all that was begun is done."""
+        """Block until all operations on this lane are complete."""
         ...
 
 
 class Memory(Protocol):
-    """What one pipeline keeps where its kernels run.
+    """Memory of one pipeline on the device.
 
     Raises
     ------
@@ -56,18 +62,18 @@ class Memory(Protocol):
     """
 
     n_lanes: int
-    """Lanes that keep the device busy; 1 where more would not."""
+    """Number of lanes that keep the device busy; 1 if more are not faster."""
 
     def table(self, array: Array) -> Array:
-        """Return ``array`` where kernels read it. It is not to be changed from now on."""
+        """Return ``array`` on the device. Callers must not modify it afterwards."""
         ...
 
     def zeros(self, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-        """Return a new array where kernels read and write it."""
+        """Return a new array of zeros on the device."""
         ...
 
     def image(self, shape: tuple[int, int]) -> NDArray[np.float32]:
-        """Return an array of the host that nobody else looks at, into which `Lane.fetch` is fast; it holds anything."""
+        """Return an unused, uninitialised array of the host to which `Lane.fetch` is fast."""
         ...
 
     def lane(self) -> Lane:
@@ -75,17 +81,17 @@ class Memory(Protocol):
         ...
 
     def close(self) -> None:
-        """Give back at once what nothing refers to any more."""
+        """Free all unreferenced memory immediately."""
         ...
 
 
 class NewMemory(Protocol):
-    """Makes the memory of a pipeline; with ``graphs`` its lanes record what they run.
+    """Creates the memory of a pipeline; with ``graphs``, its lanes record and replay their kernels.
 
     Raises
     ------
     ArgumentError
-        The device has no graphs.
+        ``graphs`` is True, but the device does not support graphs.
     """
 
     def __call__(self, *, graphs: bool = False) -> Memory: ...
@@ -97,7 +103,7 @@ class Threads(Protocol):
     Raises
     ------
     ArgumentError
-        There are fewer.
+        ``count`` exceeds the number of threads.
     """
 
     def __call__(self, count: int) -> AbstractContextManager[None]: ...

@@ -1,4 +1,4 @@
-"""The kernels in plain NumPy: what the compiled ones are compared with in speed."""
+"""Kernels in plain NumPy, as a reference for the speed of the compiled kernels."""
 
 import contextlib
 import math
@@ -17,8 +17,8 @@ __all__ = ["KERNELS"]
 
 Number = TypeVar("Number", np.float32, np.float64)
 
-_TILE_RANGES = 96  # as many as the compiled kernel has with AVX-512
-_NOISE_UNIT = 1 / math.sqrt((2.0**24 - 1) / 3)  # 1 / rms of a sum of four numbers from 0 to 4095
+_TILE_RANGES = 96  # the same number as in the compiled kernel with AVX-512
+_NOISE_UNIT = 1 / math.sqrt((2.0**24 - 1) / 3)  # 1 / RMS of a sum of four integers from 0 to 4095, without its mean
 
 
 @contextlib.contextmanager
@@ -74,7 +74,7 @@ def demodulate_words(
     stop = min((first + n_outputs - 1) * factor + half + 1, len(words))
     signals = np.empty((len(channels), max(stop - start, 0)), dtype=np.float32)
     unpack_bits(words[start : start + signals.shape[1]], channels, signals)
-    # Sums of whole numbers below 2^24 are exact in float32, in whatever order; those of longer taps in float64.
+    # Sums of integers below 2^24 are exact in float32 in any order; 32-bit taps need float64.
     begin = first * factor - half - start
     if taps.dtype == np.int16:
         out[:, :n_outputs] = _filtered(signals, taps.astype(np.float32), factor, begin, n_outputs)
@@ -87,19 +87,19 @@ def demodulate_words(
 def _filtered(
     signals: NDArray[Number], taps: NDArray[Number], factor: int, start: int, n_outputs: int
 ) -> NDArray[Number]:
-    """Filter with the first tap of output 0 at sample ``start``; samples outside the signals are 0."""
+    """Return filtered and decimated signals; the first tap of output 0 is at sample ``start``. Other samples are 0."""
     needed = (n_outputs - 1) * factor + len(taps)
     padded = np.zeros((len(signals), needed + factor), dtype=signals.dtype)
     source = signals[:, max(start, 0) : max(start + needed, 0)]
     padded[:, max(-start, 0) :][:, : source.shape[1]] = source
-    # The taps cut into rows of one output each: n_taps / factor matrix products over views of the signal.
+    # The taps are split into blocks of ``factor``: n_taps / factor matrix products over views of the signal.
     total = np.zeros((len(signals), n_outputs), dtype=signals.dtype)
     for tap in range(0, len(taps), factor):
         part = taps[tap : tap + factor]
         blocks = padded[:, tap : tap + n_outputs * factor]
         if blocks.shape[1] < n_outputs * factor:
             blocks = np.pad(blocks, ((0, 0), (0, n_outputs * factor - blocks.shape[1])))
-        with np.errstate(invalid="ignore"):  # BLAS may set the flag for lanes that it throws away; these are finite
+        with np.errstate(invalid="ignore"):  # BLAS may set the flag for lanes that it discards; the results are finite
             total += blocks.reshape(len(signals), n_outputs, factor)[:, :, : len(part)] @ part
     return total
 
@@ -127,7 +127,7 @@ def delay_and_sum(signals: Complex, offsets: Index, weights: Complex, out: Compl
     flat = signals.reshape(-1)
     n_ranges = out.shape[1]
     for direction in range(len(out)):
-        # One gathered (mic, range) block and one matrix product beat a loop over microphones by about 2.
+        # One gathered (mic, range) block and one matrix product are about twice as fast as a loop over microphones.
         rows = np.lib.stride_tricks.sliding_window_view(flat, n_ranges)[offsets[direction]]
         np.matmul(weights[direction], rows, out=out[direction])
 
@@ -161,7 +161,7 @@ def interpolated_beams_envelope(
     """See `InterpolatedBeamsEnvelope`."""
     nodes: NDArray[Any] = np.empty((len(offsets), stop - first), dtype=np.complex64)
     delay_and_sum(signals, offsets + np.int32(first), weights, nodes)
-    # Real weights: on floats the matrix product does half the work.
+    # The weights are real, so a matrix product of floats takes half of the operations.
     for direction, pairs in enumerate(places):
         near = np.stack([pairs, pairs + 1], axis=1).reshape(-1)
         beam = tap_weights[direction].reshape(-1) @ nodes[near].view(np.float32)
@@ -224,7 +224,7 @@ def interpolated_beams_envelope_int16(
 
 
 def _whole_beam(tile: Short, offsets: Index, weights: Short) -> NDArray[np.int32]:
-    """Return the beam of one direction, in whole numbers: (part, range) int32."""
+    """Return the beam of one direction in integers: (part, range) int32."""
     flat = tile.reshape(-1, 2).astype(np.int32)
     samples = flat[offsets[:, None] + np.arange(_TILE_RANGES)]  # (term, range, 2)
     return np.asarray(np.einsum("trc,tpc->pr", samples, weights.astype(np.int32)))
@@ -238,7 +238,7 @@ def _level(parts: NDArray[np.int32], scale: np.float32) -> NDArray[np.float32]:
 def _delayed(
     signals: Complex, offsets: Index, weights: Complex, n_ranges: int
 ) -> Iterator[tuple[int, NDArray[np.complex128]]]:
-    """Yield each direction with what its beams are made of, (mic, range) complex128."""
+    """Yield each direction with its delayed and weighted signals, (mic, range) complex128."""
     windows = np.lib.stride_tricks.sliding_window_view(signals.reshape(-1), n_ranges)
     for direction, places in enumerate(offsets):
         yield direction, windows[places] * weights[direction].astype(np.complex128)[:, None]
@@ -260,14 +260,14 @@ def combine_dmas(signals: Complex, offsets: Index, weights: Complex, order: int,
         sums = np.zeros((order + 1, out.shape[1]), dtype=np.complex128)
         sums[0] = 1
         for mic in range(len(z)):
-            sums[1:] += z[mic] * sums[:-1]  # the right side is made first, of sums without this microphone
+            sums[1:] += z[mic] * sums[:-1]  # the right side is computed first, from sums without this microphone
         out[direction] = np.abs(sums[order])
 
 
 def combine_capon(
     signals: Complex, offsets: Index, weights: Complex, n_snapshots: int, loading: float, out: Real
 ) -> None:
-    """See `CombineCapon`; a system of the size of the snapshots, as in the compiled one."""
+    """See `CombineCapon`; the linear system has the size of the number of snapshots, as in the compiled kernel."""
     n_mics, n_ranges = offsets.shape[1], out.shape[1]
     n_snapshots = min(n_snapshots, n_ranges)
     ranges = np.arange(n_ranges)
@@ -311,7 +311,7 @@ def modulate_pdm(
     first: int,
     out: NDArray[np.uint8],
 ) -> None:
-    """See `ModulatePdm`; microphones side by side, samples one after the other."""
+    """See `ModulatePdm`; the loop runs over samples, and vectors over microphones."""
     c1, c2, c3, c4, r1, r2, width, limit = loop
     signals = signals[:, : len(out)]
     noise, dither = _noise_and_dither(keys, first, signals.shape[1])
@@ -319,7 +319,7 @@ def modulate_pdm(
     followed = np.rint((signals + noise_rms[:, None] * _NOISE_UNIT * noise) / grid) * grid
     followed_dithered = followed + width * dither
     s1, s2, s3, s4 = states.T.copy()
-    above = np.zeros((len(signals) + 1, signals.shape[1]), dtype=np.bool_)  # the last row is that of no microphone
+    above = np.zeros((len(signals) + 1, signals.shape[1]), dtype=np.bool_)  # last row: bits without a microphone
     for sample, u in enumerate(followed.T):
         bits = followed_dithered[:, sample] + ((s1 + s2) + (s3 + s4)) >= 0
         above[:-1, sample] = bits
@@ -335,7 +335,7 @@ def modulate_pdm(
 def _noise_and_dither(
     keys: NDArray[np.uint64], first: int, n_samples: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return sums of 12-bit fields about 0, and numbers within ±½, from SplitMix64: both (mic, sample) float64."""
+    """Return zero-mean sums of 12-bit fields, and numbers within ±½, from SplitMix64: both (mic, sample) float64."""
     z = keys[:, None] + np.arange(first, first + n_samples, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)

@@ -1,12 +1,12 @@
-"""Arithmetic of one number at a time, compiled into the kernel that calls it, for its device.
+"""Scalar arithmetic, inlined into the kernels that call it and compiled for their device.
 
-`power`, `magnitude`, `coherent_level`, `between` and the constants serve kernels of the processor and of the GPU. All
-else is for the GPU only: complex numbers that are one load, roots, hashes.
+Kernels of the CPU and of the GPU share `power`, `magnitude`, `coherent_level`, `between` and the constants. All other
+functions are for the GPU only: complex numbers that take a single load, roots and hashes.
 
-Compilers may fuse a product and a sum. Of ``a b + c d`` either product may be fused, with other bits, and on the
-processor it is decided anew each time which of them; of ``(e + a b) + c d`` both are. What runs there is written in the
-second way, whose bits are the same whether a kernel was just compiled or comes from Numba's cache. GPUs' kernels need
-not be: one compiler makes their code, always the same.
+Compilers may fuse a product and a sum. In ``a b + c d`` either product may be fused, with different bits, and on the
+CPU the choice varies between compilations. In ``(e + a b) + c d`` both are fused. CPU kernels use the second form:
+their bits are the same for a kernel just compiled and for one from Numba's cache. GPU kernels do not need it, because a
+single compiler always makes the same code.
 """
 
 import math
@@ -40,25 +40,25 @@ __all__ = [
 _LOW_32, _32 = np.uint64(0xFFFF_FFFF), np.uint64(32)
 _LOW_16, _16 = np.uint32(0xFFFF), np.uint32(16)
 _HALF, _SHIFT = np.int64(1 << 15), np.int64(16)
-_TO_WHOLE = np.float32(1.5 * 2.0**23)  # float32 of this size lie 1 apart: adding it rounds, and halves to the even one
+_TO_WHOLE = np.float32(1.5 * 2.0**23)  # float32 of this size are 1 apart: adding it rounds, and ties go to even
 
 
-# SplitMix64 (G. L. Steele, D. Lea, C. H. Flood, Fast splittable pseudorandom number generators,
-# 2014; the constants are variant 13 of D. Stafford's, as in the generators of S. Vigna)
+# SplitMix64 (G. L. Steele, D. Lea, C. H. Flood, Fast splittable pseudorandom number generators, 2014). The constants
+# are variant 13 by D. Stafford, as in the generators of S. Vigna.
 STEP = np.uint64(0x9E3779B97F4A7C15)
 MIX_1 = np.uint64(0xBF58476D1CE4E5B9)
 MIX_2 = np.uint64(0x94D049BB133111EB)
 _12, _24, _27, _30, _31, _36, _48 = (np.uint64(shift) for shift in (12, 24, 27, 30, 31, 36, 48))
-_FIELD = np.uint64(0xFFF)  # the lower four of 12 bits are a hash's noise, its upper 16 bits its dither
+_FIELD = np.uint64(0xFFF)  # the lower four 12-bit fields of a hash yield noise, the upper 16 bits dither
 NOISE_UNIT = 1 / math.sqrt((4096.0**2 - 1) / 3)
-"""1 / rms of a sum of four numbers from 0 to 4095."""
+"""1 / RMS of a sum of four integers from 0 to 4095, without its mean."""
 TO_GRID = 1.5 * 2.0**32
-"""float64 of this size lie 2⁻²⁰ apart: adding it rounds, on every processor."""
+"""Number at which float64 are 2⁻²⁰ apart: adding it rounds to this grid, on every processor."""
 
 
 @njit(inline="always", cache=True)
 def real_of(sample):
-    """Return the real part of a complex64 given as a uint64, which is how it is one load."""
+    """Return the real part of a complex64 given as a uint64; a uint64 takes a single load."""
     return np.uint32(sample & _LOW_32).view(np.float32)
 
 
@@ -89,7 +89,7 @@ def short_imag_of(sample):
 
 @njit(inline="always", cache=True)
 def short_sample_of(real, imag):
-    """Return two numbers within the range of int16, rounded, as a uint32; of two as near, the even one."""
+    """Return two numbers in the range of int16 as a uint32, rounded; ties go to even."""
     low = np.uint32(np.int32((np.float32(real) + _TO_WHOLE) - _TO_WHOLE))
     high = np.uint32(np.int32((np.float32(imag) + _TO_WHOLE) - _TO_WHOLE))
     return np.uint32((low & _LOW_16) | (high << _16))
@@ -111,13 +111,13 @@ def power(real, imag):
 
 @njit(inline="always", cache=True)
 def magnitude(real, imag):
-    """Return ``√(real² + imag²)``; `abs` guards against overflow and takes ten times as long."""
+    """Return ``√(real² + imag²)``; `abs` also avoids overflow, but takes ten times as long."""
     return math.sqrt(power(real, imag))
 
 
 @njit(inline="always", cache=True)
 def between(low, high, part):
-    """Return what lies ``part`` of the way from one number to another."""
+    """Return the linear interpolation between two numbers at ``part``, from 0 to 1."""
     return low + (high - low) * part
 
 
@@ -125,7 +125,7 @@ def between(low, high, part):
 def coherent_level(real, imag, total_power, count):
     """Return the magnitude of the sum of ``count`` numbers times their coherence factor.
 
-    Rounding must not raise it; where there is nothing, nothing agrees. NaN passes both.
+    The factor is limited to 1, so that rounding errors cannot raise the level, and is 0 for zero power. NaN propagates.
     """
     coherent = power(real, imag)
     total = count * total_power
@@ -135,7 +135,7 @@ def coherent_level(real, imag, total_power, count):
 
 @njit(inline="always", error_model="numpy", cache=True)
 def root_of(real, imag, order):
-    """Return ``x / |x|^(1 − 1 / order)``, 0 for 0, in single precision and without squares of x, which may be lost."""
+    """Return ``x / |x|^(1 − 1 / order)``, 0 for 0, in single precision; x is scaled to avoid underflow."""
     x, y = abs(real), abs(imag)
     largest = max(x, y)
     scale = np.float32(0)
@@ -152,7 +152,7 @@ def root_of(real, imag, order):
 
 @njit(inline="always", cache=True)
 def hash_of(key, sample):
-    """Return SplitMix64 of a key and the number of a sample."""
+    """Return the SplitMix64 hash of a key and a sample index."""
     z = key + np.uint64(sample) * STEP
     z = (z ^ (z >> _30)) * MIX_1
     z = (z ^ (z >> _27)) * MIX_2
@@ -161,12 +161,12 @@ def hash_of(key, sample):
 
 @njit(inline="always", cache=True)
 def dither_of(z):
-    """Return the upper 16 bits of a hash as a number within ±½, exactly."""
+    """Return the upper 16 bits of a hash as an exact number within ±½."""
     return (np.float64(z >> _48) - 32_767.5) * 2.0**-16
 
 
 @njit(inline="always", cache=True)
 def noise_of(z):
-    """Return the sum of the four lower 12-bit fields of a hash, less its mean."""
+    """Return the sum of the four lower 12-bit fields of a hash minus its mean."""
     total = (z & _FIELD) + ((z >> _12) & _FIELD) + ((z >> _24) & _FIELD) + ((z >> _36) & _FIELD)
     return np.float64(total) - 8190.0

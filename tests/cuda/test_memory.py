@@ -84,8 +84,8 @@ def test_too_little_memory_is_told_with_how_much_and_what_to_do(monkeypatch, n_b
         Pipeline(SETTINGS, device="cuda")
     text = str(caught.value)
     assert "\n" not in text
-    assert "MB free, and this pipeline needs" in text
-    assert "give fewer directions, a shorter processing.range_m or less accuracy.oversampling" in text
+    assert "MB free, but this pipeline needs" in text
+    assert "give fewer directions, a shorter processing.range_m or a lower accuracy.oversampling" in text
 
 
 @pytest.mark.parametrize("use", [lambda lane, _: lane.send(np.zeros(5)), lambda _, memory: memory.image((3, 4))])

@@ -146,21 +146,21 @@ def test_compiles_once(monkeypatch):
 
 def test_refuses_the_simulator(monkeypatch):
     monkeypatch.setattr(compiling, "SIMULATED", True)
-    with pytest.raises(DeviceError, match=r"^kernels are not compiled where they are simulated; unset NUMBA_ENABLE_"):
+    with pytest.raises(DeviceError, match=r"^kernels are not compiled if the GPU is simulated; unset NUMBA_ENABLE_"):
         compiling.recorded(print)
 
 
 def test_names_the_compiler_that_is_missing(monkeypatch):
     monkeypatch.setattr(pathfinder, "find_nvidia_binary_utility", lambda _: None)
     monkeypatch.setenv("PATH", "")
-    with pytest.raises(DeviceError, match=r"needs numba-cuda, ptxas and nvdisasm, and ptxas is missing; install them"):
+    with pytest.raises(DeviceError, match=r"needs numba-cuda, ptxas and nvdisasm, but ptxas is missing; install them"):
         compiling.require_compilers()
     monkeypatch.setattr(compiling, "cuda", types.SimpleNamespace(__file__="numba/cuda/__init__.py"))
-    with pytest.raises(DeviceError, match=r"and numba-cuda is missing; install them with pip install 'ertis-numba\["):
+    with pytest.raises(DeviceError, match=r"but numba-cuda is missing; install them with pip install 'ertis-numba\["):
         compiling.require_compilers()
 
 
 def test_tells_why_a_program_refuses():
     code = compiling.code_of(recorded(good), (6, 0))
-    with pytest.raises(DeviceError, match=r'^nvdisasm refuses \(.*"SM60" is deprecated.*\); install'):
+    with pytest.raises(DeviceError, match=r'^nvdisasm fails \(.*"SM60" is deprecated.*\); install'):
         compiling.disassembled(code)

@@ -1,8 +1,8 @@
-"""What every kernel does, whatever device it runs on: the one docstring of each.
+"""Contracts of the kernels, common to all devices; each kernel is documented here once.
 
-Arrays come first, then numbers, then ``out``, which the kernel fills. Nothing is returned and nothing
-is checked: shapes and bounds are the business of the stages, which know them when they are made.
-Arrays are C-contiguous. Axes are named in this order: mic, phase, sample; direction, range.
+Arguments are arrays, then numbers, then the array ``out``, which the kernel fills. Kernels return nothing and check
+nothing: stages check shapes and bounds when they are created. Arrays are C-contiguous. Axes are in the order mic,
+phase, sample; direction, range.
 """
 
 from ertis_numba.kernels._contract.adaptive import CombineCapon, CombineCoherence, CombineDmas

@@ -1,4 +1,4 @@
-"""From analytic signals to envelopes of other beamformers."""
+"""Contracts of the beamformers other than delay-and-sum: analytic signals to envelopes."""
 
 from typing import Protocol
 
@@ -8,10 +8,10 @@ __all__ = ["CombineCapon", "CombineCoherence", "CombineDmas"]
 
 
 class CombineCoherence(Protocol):
-    """Delay-and-sum times the coherence factor of Mallart and Fink (1994), which tells how well microphones agree.
+    """Delay-and-sum times the coherence factor of Mallart and Fink (1994), a measure of agreement of the microphones.
 
     With ``y = weights[direction, mic] · signals.flat[offsets[direction, mic] + range]``,
-    ``out[direction, range] = |Σ y| · |Σ y|² / (M Σ |y|²)`` over the M microphones, and 0 where all are silent.
+    ``out[direction, range] = |Σ y| · |Σ y|² / (M Σ |y|²)`` over the M microphones, and 0 if all are silent.
 
     Parameters
     ----------
@@ -24,24 +24,24 @@ class CombineCoherence(Protocol):
 
 
 class CombineDmas(Protocol):
-    """Delay-multiply-and-sum: sum the products of the roots of all choices of ``order`` microphones.
+    """Delay-multiply-and-sum: sum the products of the roots of all combinations of ``order`` microphones.
 
-    ``out[direction, range] = |e_order(z)|``, the elementary symmetric polynomial of all microphones' z =
-    ``weights[direction, mic] · root(signals.flat[offsets[direction, mic] + range])`` with
+    ``out[direction, range] = |e_order(z)|``, the elementary symmetric polynomial of all microphones'
+    ``z = weights[direction, mic] · root(signals.flat[offsets[direction, mic] + range])``. Here
     ``root(x) = x / |x|^(1 − 1 / order)`` and ``root(0) = 0``.
 
-    It is built up microphone by microphone, ``e_k += z e_(k−1)``, and errs by rounding of ``e_order(|z|)`` at most.
-    Power sums and Newton's identities, the other way, subtract what nearly cancels where one microphone is much
-    louder than all others.
+    The recursion ``e_k += z e_(k−1)`` adds one microphone at a time. Its error is at most the rounding of
+    ``e_order(|z|)``. The alternative, power sums and Newton's identities, suffers from cancellation if one microphone
+    is much louder than all others.
 
     Parameters
     ----------
     signals, offsets
         As in `DelayAndSum`.
     weights : (direction, mic) complex64
-        Of roots.
+        Weights of the roots.
     order : int
-        At least 2, and at most the number of microphones.
+        At least 2, at most the number of microphones.
     out : (direction, range) float32
     """
 
@@ -49,20 +49,21 @@ class CombineDmas(Protocol):
 
 
 class CombineCapon(Protocol):
-    """Combine the microphones with the weights that let a beam's own sound pass and all other sound least.
+    """Combine the microphones with the Capon (minimum-variance distortionless response) weights.
 
-    With y as in `CombineCoherence`, its covariance R over the ``n_snapshots`` ranges about a range (near the ends
-    of the image, the nearest that are in it) and M microphones, ``w = R'⁻¹ 1 / (1ᵀ R'⁻¹ 1)`` with
-    ``R' = R + loading · trace(R) / M · I`` and ``out[direction, range] = |wᴴ y|``; 0 where all are silent.
+    Let y be as in `CombineCoherence`, and R its covariance over the ``n_snapshots`` ranges around a range. Near the
+    ends of the image, R uses the nearest ranges inside it. With M microphones and
+    ``R' = R + loading · trace(R) / M · I``, the weights are ``w = R'⁻¹ 1 / (1ᵀ R'⁻¹ 1)``. The result is
+    ``out[direction, range] = |wᴴ y|``, and 0 if all microphones are silent.
 
     Parameters
     ----------
     signals, offsets, weights
-        As in `DelayAndSum`, but weights of magnitude 1 make ``out`` an amplitude: w adds up to 1.
+        As in `DelayAndSum`. Weights of magnitude 1 make ``out`` an amplitude, because w adds up to 1.
     n_snapshots : int
-        At least 1; more than there are ranges count as all ranges.
+        At least 1; a value above the number of ranges means all ranges.
     loading : float
-        Above 0.
+        Diagonal loading relative to the mean microphone power, above 0.
     out : (direction, range) float32
     """
 

@@ -1,4 +1,4 @@
-"""The arrays that kernels take."""
+"""Array types of the kernels' arguments."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""From analytic signals to envelopes of delay-and-sum."""
+"""Contracts of delay-and-sum: analytic signals to envelopes."""
 
 from typing import Protocol
 
@@ -21,8 +21,8 @@ class DelayAndSum(Protocol):
     """Sum the delayed and weighted signals of all microphones for every direction and range.
 
     ``out[direction, range] = Σ_mic weights[direction, mic] · signals.flat[offsets[direction, mic] + range]``.
-    The offset names microphone, phase and first sample at once; the weight corrects the carrier's
-    phase for what the rounding of the delay left over.
+    The offset selects microphone, phase and first sample at once. The weight corrects the phase of the carrier for the
+    rounding of the delay.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ class DelayAndSum(Protocol):
 
 
 class Envelope(Protocol):
-    """Take the magnitude of analytic beams.
+    """Compute the magnitude of analytic beams.
 
     Parameters
     ----------
@@ -48,10 +48,10 @@ class Envelope(Protocol):
 
 
 class DelayAndSumEnvelope(Protocol):
-    """`DelayAndSum` and `Envelope` in one pass over some ranges, so that no beam is written to memory.
+    """`DelayAndSum` and `Envelope` in one pass over some ranges, without writing beams to memory.
 
     ``out[direction, range] = |Σ_term weights[direction, term] · signals.flat[offsets[direction, term] + range]|``.
-    A term is one sample of one microphone: where delays are interpolated, each microphone has several.
+    A term is one sample of one microphone. If delays are interpolated, each microphone has several terms.
 
     Parameters
     ----------
@@ -69,28 +69,28 @@ class DelayAndSumEnvelope(Protocol):
 
 
 class InterpolatedBeamsEnvelope(Protocol):
-    """Beams of few nodes, from those the beams of all directions, and their envelopes.
+    """Compute beams on a coarse beam grid, interpolate the beams of all directions, and take their envelopes.
 
-    ``nodes[node, range] = Σ_term weights[node, term] · signals.flat[offsets[node, term] + range]`` and
-    ``out[rows[direction], range] = |Σ_pair,k tap_weights[direction, pair, k] · node|`` with the node
-    ``nodes[places[direction, pair] + k, range]``, for k = 0 and 1.
+    ``grid[point, range] = Σ_term weights[point, term] · signals.flat[offsets[point, term] + range]`` and
+    ``out[rows[direction], range] = |Σ_pair,k tap_weights[direction, pair, k] · beam|`` with the beam
+    ``grid[places[direction, pair] + k, range]``, for k = 0 and 1.
 
     Parameters
     ----------
     signals : (mic, phase, sample) complex64
-    offsets : (node, term) int32
-    weights : (node, term) complex64
+    offsets : (point, term) int32
+    weights : (point, term) complex64
     places : (direction, pair) int32
-        The lower node of each pair.
+        The lower beam-grid point of each pair.
     tap_weights : (direction, pair, 2) float32
     rows : (direction,) int32
-        Where each direction belongs in ``out``: those that share nodes should follow each other here.
+        Row of each direction in ``out``. Directions that share beam-grid points should be adjacent here.
     first, stop : int
         Ranges to fill.
     n_blocks : int
-        Into how many parts directions are cut, where there are more threads than tiles of ranges.
+        Number of blocks of directions; several are useful if there are more threads than tiles of ranges.
     out : (direction, range) float32
-        At least 64 ranges, which is how far signals are read.
+        At least 64 ranges, because signals are read that far.
     """
 
     def __call__(
@@ -109,12 +109,11 @@ class InterpolatedBeamsEnvelope(Protocol):
 
 
 class QuantiseTiles(Protocol):
-    """Cut analytic signals into tiles of ranges and store each in 16 bits under its own scale.
+    """Split analytic signals into tiles of ranges, and store each in 16 bits with its own scale.
 
-    ``tiles[tile, mic, phase, k] ≈ signals[mic, phase, starts[tile] + k] / scales[tile]``, rounded, as pairs of
-    real and imaginary part; the largest magnitude of a tile becomes ``limit``. Past the end of the signals
-    tiles are 0. A tile spans decimetres, so an echo keeps its 16 bits however much stronger the
-    reflectors at other ranges are.
+    ``tiles[tile, mic, phase, k] ≈ signals[mic, phase, starts[tile] + k] / scales[tile]``, rounded, as pairs of real and
+    imaginary part. The largest magnitude of a tile becomes ``limit``. Beyond the end of the signals, tiles are 0. A
+    tile spans decimetres, so an echo keeps its 16 bits regardless of stronger reflectors at other ranges.
 
     Parameters
     ----------
@@ -137,15 +136,15 @@ class DelayAndSumEnvelopeInt16(Protocol):
     Parameters
     ----------
     tiles, scales, starts
-        As in `QuantiseTiles`, ``tile_ranges`` apart.
+        As in `QuantiseTiles`; starts are ``tile_ranges`` apart.
     stop : int
-        Ranges from here on are not written.
+        End of the ranges to fill.
     offsets : (direction, term) int32
-        Into one tile, in complex samples.
+        Offsets into one tile, in complex samples.
     weights : (direction, term, 2, 2) int16
         ``((re w, −im w), (im w, re w))``.
     weight_scale : float32
-        Worth of a weight of 1.
+        Value of an integer weight of 1.
     out : (direction, range) float32
     """
 
@@ -165,20 +164,21 @@ class DelayAndSumEnvelopeInt16(Protocol):
 class InterpolatedBeamsEnvelopeInt16(Protocol):
     """`InterpolatedBeamsEnvelope` on the tiles of `QuantiseTiles`, with integer sums.
 
-    Of the sums that are beams of nodes the upper 16 bits are kept, rounded: ``(sum + 2¹⁵) >> 16``.
+    Beams on the beam grid keep the upper 16 bits of their sums, rounded: ``(sum + 2¹⁵) >> 16``.
 
     Parameters
     ----------
     tiles, scales, starts, stop
         As in `DelayAndSumEnvelopeInt16`.
-    offsets : (node, term) int32
-    weights : (node, term, 2, 2) int16
-        As there, of nodes.
+    offsets : (point, term) int32
+    weights : (point, term, 2, 2) int16
+        As there, for beam-grid points.
     places : (direction, pair) int32
+        The lower beam-grid point of each pair.
     tap_weights : (direction, pair, 2) int16
     rows : (direction,) int32
     weight_scale : float32
-        Worth of 1 in the sums over nodes, in units of the tile's scale.
+        Value of 1 in the interpolated sums, in units of the tile's scale.
     n_blocks : int
     out : (direction, range) float32
     """

@@ -1,4 +1,4 @@
-"""From words to analytic signals."""
+"""Contracts of the front end: raw samples to analytic signals."""
 
 from typing import Protocol
 
@@ -18,12 +18,12 @@ __all__ = [
 
 
 class UnpackBits(Protocol):
-    """Turn the bits of PDM words into signals of +1 and −1.
+    """Convert the bits of PDM words to signals of +1 and −1.
 
     Parameters
     ----------
     words : (sample, word) uint8, uint16, uint32 or uint64
-        Channel m is bit ``m % word_bits`` (smallest significant first) of word ``m // word_bits``.
+        Channel m is bit ``m % word_bits`` (least significant first) of word ``m // word_bits``.
     channels : (mic,) int32
         Channel of each microphone.
     out : (mic, sample) float32
@@ -33,9 +33,9 @@ class UnpackBits(Protocol):
 
 
 class UnpackPcm(Protocol):
-    """Turn PCM numbers into signals: ``out[mic, n] = scale · words[first + n, channels[mic]]``, 0 outside the record.
+    """Convert PCM samples to signals: ``out[mic, n] = scale · words[first + n, channels[mic]]``, 0 outside the record.
 
-    Words that are smaller than ``silence`` become 0, before anything is reckoned with them: denormal numbers are slow.
+    Samples with a magnitude below ``silence`` become 0 first, because arithmetic with denormal numbers is slow.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ class UnpackPcm(Protocol):
         Channel of each microphone.
     scale, silence : float32
     first : int
-        Sample of the record, possibly before its begin.
+        First sample of the record to convert; may be negative.
     out : (mic, sample) float32
     """
 
@@ -56,15 +56,16 @@ class UnpackPcm(Protocol):
 class Decimate(Protocol):
     """Filter signals and keep every ``factor``-th sample.
 
-    ``out[mic, n] = Σ_t taps[t] · signals[mic, n · factor + t − (n_taps − 1)]``; samples before the
-    first are 0. The result is late by the group delay of the taps, ``(n_taps − 1) / 2`` input samples.
+    ``out[mic, n] = Σ_t taps[t] · signals[mic, n · factor + t − (n_taps − 1)]``; samples before the first are 0. The
+    result is delayed by the group delay of the taps, ``(n_taps − 1) / 2`` input samples.
 
     Parameters
     ----------
     signals : (mic, sample) float32
     taps : (tap,) float32
-        Symmetric.
+        Symmetric filter taps.
     factor : int
+        Decimation factor.
     out : (mic, n) float32
     """
 
@@ -72,13 +73,13 @@ class Decimate(Protocol):
 
 
 class RemoveGroupDelay(Protocol):
-    """Move signals ahead in time: ``out[mic, n] = signals[mic, n + delay]``, 0 past the end.
+    """Advance signals in time: ``out[mic, n] = signals[mic, n + delay]``, 0 beyond the end.
 
     Parameters
     ----------
     signals : (mic, sample) float32
     delay : int
-        In samples, at least 0.
+        Number of samples, at least 0.
     out : (mic, n) float32
     """
 
@@ -88,16 +89,16 @@ class RemoveGroupDelay(Protocol):
 class DemodulateWords(Protocol):
     """Unpack, decimate and remove the group delay in one pass over the words.
 
-    ``out[mic, n] = scale · Σ_t taps[t] · x[mic, (first + n) · factor + t − (n_taps − 1) / 2]`` with x = ±1
-    from the bits, 0 outside the record. Samples of ``out`` past ``n_outputs`` are set to 0. The sum is one of
-    integers, so every device gives the same bits.
+    ``out[mic, n] = scale · Σ_t taps[t] · x[mic, (first + n) · factor + t − (n_taps − 1) / 2]``. Here x is ±1 from the
+    bits, and 0 outside the record. Samples of ``out`` beyond ``n_outputs`` are set to 0. The sum is over integers, so
+    every device yields the same bits.
 
     Parameters
     ----------
     words, channels
         As in `UnpackBits`.
     taps : (tap,) int16 or int32
-        Symmetric, an odd number; their magnitudes add up to the largest number of their type at most.
+        Symmetric filter taps, an odd number. The sum of their magnitudes must not exceed the maximum of their type.
     scale : float32
     factor, first, n_outputs : int
     out : (mic, sample) float32
@@ -133,14 +134,14 @@ class MultiplyAndFold(Protocol):
     """Multiply spectra by one filter per phase and fold each product to the length of ``out``.
 
     ``out[mic, phase, k] = Σ spectra[mic, first_bin + b] · responses[mic, phase, b]`` over all b with
-    ``(first_bin + b) mod n_out = k``. An inverse transform of ``n_out`` points then samples the
-    filtered signal at the output rate, once per phase: the polyphase form of one long transform.
+    ``(first_bin + b) mod n_out = k``. An inverse transform of ``n_out`` points then samples the filtered signal at the
+    output rate, once per phase. This is the polyphase form of one long transform.
 
     Parameters
     ----------
     spectra : (mic, bin) complex64
     responses : (mic, phase, b) or (1, phase, b) complex64
-        Each microphone's own, or one for all.
+        One filter per microphone, or one for all.
     first_bin : int
     out : (mic, phase, k) complex64
     """

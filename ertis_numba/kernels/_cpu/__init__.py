@@ -1,13 +1,13 @@
-"""The kernels compiled by Numba for all cores of the processor."""
+"""Kernels compiled by Numba for all cores of the CPU."""
 
 import contextlib
 import os
 import threading
 from collections.abc import Iterator
 
-# libgomp's idle threads spin by default and take the cores from SciPy's transforms between two
-# kernels: 1.4 times slower on two cores. Sleeping at once costs a wake-up per kernel: 1.06 times slower than
-# spinning for some microseconds. It reads these once, when Numba first loads it.
+# By default, libgomp's idle threads spin and take the cores from SciPy's transforms between two kernels. This is 1.4
+# times slower on two cores. Sleeping immediately costs a wake-up per kernel, and is 1.06 times slower than spinning for
+# some microseconds. libgomp reads these variables once, when Numba first loads it.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
@@ -25,19 +25,19 @@ __all__ = ["KERNELS", "threading_layer"]
 
 if numba.config.DISABLE_JIT:
     raise DeviceError(
-        "NUMBA_DISABLE_JIT is set, and device 'cpu' is what Numba compiles; unset it or use device 'numpy'"
+        "NUMBA_DISABLE_JIT is set, but device 'cpu' needs Numba's compiler; unset it or use device 'numpy'"
     )
 
 
-class _CompilationListener(event.Listener):  # type: ignore[misc]  # Numba is not looked into
-    """Listener to what Numba compiles; what it loads from its cache is no such event."""
+class _CompilationListener(event.Listener):  # type: ignore[misc]  # Numba has no type hints
+    """Listener to Numba's compilations; loading a kernel from the cache is no such event."""
 
-    def on_start(self, event: object) -> None:  # noqa: ARG002  as Numba calls it
+    def on_start(self, event: object) -> None:  # noqa: ARG002  Numba passes it by name
         """Report that a compilation has begun."""
         _compiling.begun()
 
     def on_end(self, event: object) -> None:
-        """Do nothing."""
+        """Ignore the end of a compilation."""
 
 
 event.register("numba:compile", _CompilationListener())
@@ -47,7 +47,7 @@ _ONE_AT_A_TIME = threading.RLock()
 
 
 def threading_layer() -> str:
-    """Return what Numba shares work among threads with: "omp", "tbb" or "workqueue"; empty until a kernel has run."""
+    """Return Numba's threading layer: "omp", "tbb" or "workqueue"; empty until a parallel kernel has run."""
     try:
         return str(numba.threading_layer())
     except ValueError:  # no parallel kernel has run yet, so no layer is chosen
@@ -55,7 +55,7 @@ def threading_layer() -> str:
 
 
 def _layer_is_reentrant() -> bool:
-    """Whether two Python threads may run parallel kernels at a time; unknown counts as no."""
+    """Return True if two Python threads can run parallel kernels concurrently; False if unknown."""
     return threading_layer() not in {"", "workqueue"}
 
 
@@ -63,8 +63,8 @@ def _layer_is_reentrant() -> bool:
 def threads(count: int) -> Iterator[None]:
     """See `Threads`.
 
-    Numba's workqueue layer, which it falls back to without OpenMP and TBB, aborts the process when two
-    threads meet in it. There, and until the layer is known, one thread runs at a time.
+    Without OpenMP and TBB, Numba falls back to its workqueue layer. That layer aborts the process if two threads use it
+    concurrently. With it, and until the layer is known, one thread runs at a time.
     """
     checks.integer("threads", count, 1, _MAX_THREADS)
     before = numba.get_num_threads()

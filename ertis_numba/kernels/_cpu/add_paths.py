@@ -1,7 +1,7 @@
 """Add delayed and filtered copies of a call's spectrum.
 
-The turn of a delay from bin to bin is one complex multiplication; eight bins run side by side, each eight
-bins further, so that the chain of multiplications is an eighth as long and fills a vector.
+The phase rotation of a delay from bin to bin is one complex multiplication. Eight bins are computed in parallel, and
+each advances by eight bins. The chain of multiplications is thus an eighth as long, and fills a vector.
 """
 
 import math

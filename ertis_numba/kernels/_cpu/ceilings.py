@@ -1,6 +1,6 @@
-"""What this machine can do at most: memory bandwidth and arithmetic, by kernels that do nothing else.
+"""Performance ceilings of this machine: kernels that measure only memory bandwidth or arithmetic throughput.
 
-Only benchmarks use these; they are no part of the signal chain.
+They are for benchmarks, not part of the signal chain.
 """
 
 import numpy as np
@@ -15,11 +15,11 @@ __all__ = ["DOT_16_OPERATIONS", "MULTIPLY_ADD_OPERATIONS", "copy", "dot_16", "mu
 
 _FEATURES = target_features()
 _LANES = 16 if "avx512f" in _FEATURES else 8
-_SUMS = 12  # independent sums: two units with a latency of four want at least eight
+_SUMS = 12  # independent sums: two units with a latency of four need at least eight
 _DOT_LANES = 16 if "avx512vnni" in _FEATURES else 8
 MULTIPLY_ADD_OPERATIONS = 2 * _LANES * _SUMS
 DOT_16_OPERATIONS = 4 * _DOT_LANES * _SUMS
-"""Operations of one turn on one strand; a multiplication and an addition are two."""
+"""Operations of one turn on one strand; a multiply-add counts as two."""
 
 
 @njit(parallel=True, nogil=True, cache=True)
@@ -38,7 +38,7 @@ def triad(a, b, factor, out):
 
 @intrinsic
 def _multiply_add(typing_context, turns, factor, addend):
-    """Return the total of independent sums, each ``sum · factor + addend`` for so many turns."""
+    """Return the total of independent sums after ``turns`` steps of ``sum = sum · factor + addend``."""
     signature = types.float32(turns, factor, addend)
 
     def codegen(context, builder, signature, arguments):
@@ -79,14 +79,14 @@ def _dot_16(typing_context, turns, factor, addend):
 
 
 def _splat(builder, number, vector):
-    """Return a vector of one number."""
+    """Return a vector with a number in every lane."""
     blank, lane = ir.Constant(vector, ir.Undefined), ir.IntType(32)
     first = builder.insert_element(blank, number, ir.Constant(lane, 0))
     return builder.shuffle_vector(first, blank, ir.Constant(ir.VectorType(lane, vector.count), [0] * vector.count))
 
 
 def _run(builder, turns, vector, turn, add):
-    """Take ``turn`` on each of the sums, ``turns`` times, and return the sum of the sums."""
+    """Apply ``turn`` to each of the sums ``turns`` times, and return the sum of the sums."""
     sums = [cgutils.alloca_once(builder, vector) for _ in range(_SUMS)]
     for k, total in enumerate(sums):
         builder.store(ir.Constant(vector, [k] * vector.count), total)

@@ -1,12 +1,12 @@
-"""Combine the microphones with weights of least variance, from covariances over a window of ranges.
+"""Combine the microphones with minimum-variance weights, from covariances over a window of ranges.
 
-A window of K ranges has a covariance of rank K. By the Woodbury identity its loaded inverse needs a K × K
-system only: with the Gram matrix ``G = Yᴴ Y`` and the beams ``s = Yᴴ 1`` of the window's samples Y, (mic,
-K), and ``B = ε I + G``, the solution t of ``B t = s`` gives the output ``ε |t_c| / (M − sᴴ t)`` at range c of the
-window. G holds products of the same signals at lags up to K − 1, which neighbouring windows share.
+A window of K ranges has a covariance of rank K. By the Woodbury identity, its loaded inverse needs only a K × K system.
+Let Y, (mic, K), be the window's samples, ``G = Yᴴ Y`` their Gram matrix, ``s = Yᴴ 1`` their beams, and
+``B = ε I + G``. The solution t of ``B t = s`` yields the output ``ε |t_c| / (M − sᴴ t)`` at range c of the window. G
+contains products of the same signals at lags up to K − 1, which neighbouring windows share.
 
-Sums are in double precision: where the microphones agree, ``sᴴ t`` comes up to M but for a part in M / loading, and
-that part is the denominator.
+Sums are in double precision. If the microphones agree, ``M − sᴴ t`` is smaller than M by a factor of M / loading, and
+it is the denominator.
 """
 
 import math
@@ -16,7 +16,7 @@ from numba import njit, prange
 
 __all__ = ["combine_capon"]
 
-_LANES = 32  # windows that are solved side by side
+_LANES = 32  # windows that are solved in parallel
 
 
 @njit(nogil=True, cache=True, fastmath={"contract"})
@@ -45,9 +45,9 @@ def _sum_lags(flat, offsets, weights, y, beams, lags):
 
 @njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
 def _factor(lags, first, count, epsilon, column):
-    """Fill the lower triangle of ``column``, (K, K, part, lane), with L D of ``B = L D Lᴴ``; 1 / D on its diagonal.
+    """Fill the lower triangle of ``column``, (K, K, part, lane), with L D of ``B = L D Lᴴ``; its diagonal is 1 / D.
 
-    B is Hermitian and, by its loading, positive definite: no pivots are needed.
+    B is Hermitian and, due to its loading, positive definite. Pivoting is not needed.
     """
     n_snapshots = len(lags)
     for j in range(n_snapshots):
@@ -69,7 +69,7 @@ def _factor(lags, first, count, epsilon, column):
 
 @njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
 def _solve(beams, first, count, column, t, fit):
-    """Fill ``t = B⁻¹ s``, (K, part, lane), and ``fit = sᴴ t``, from what `_factor` fills."""
+    """Fill ``t = B⁻¹ s``, (K, part, lane), and ``fit = sᴴ t``, from the result of `_factor`."""
     n_snapshots = len(t)
     fit[:count] = 0
     for i in range(n_snapshots):
@@ -120,13 +120,13 @@ def combine_capon(signals, offsets, weights, n_snapshots, loading, out):
                 trace = 0.0
                 for k in range(first + lane, first + lane + n_snapshots):
                     trace += lags[0, 0, k]
-                # Where there is nothing, any loading gives 0.
+                # Without any power, every loading yields 0.
                 epsilon[lane] = loading * trace / n_mics if trace != 0 else 1.0
             _factor(lags, first, count, epsilon, column)
             _solve(beams, first, count, column, t, fit)
             for lane in range(count):
                 window = first + lane
-                # A window serves the range in its middle; the outermost two also those towards the ends.
+                # A window yields the range in its middle; the outermost two also yield those towards the ends.
                 begin = 0 if window == 0 else middle
                 end = n_snapshots if window == n_windows - 1 else middle + 1
                 scale = epsilon[lane] / (n_mics - fit[lane])

@@ -1,4 +1,4 @@
-"""Sum the microphones and weigh the sum by how well they agree."""
+"""Sum the microphones, and weight the sum by their coherence factor."""
 
 import numpy as np
 from numba import njit, prange
@@ -7,8 +7,8 @@ from ertis_numba.kernels._scalar import coherent_level
 
 __all__ = ["combine_coherence"]
 
-_ZERO = np.float32(0)  # adding it says which product is fused
-_TILE = 256  # ranges whose sums stay in the first cache level while the microphones pass by
+_ZERO = np.float32(0)  # adding it determines which product is fused
+_TILE = 256  # ranges whose sums stay in the L1 cache during the loop over microphones
 
 
 @njit(parallel=True, nogil=True, cache=True, error_model="numpy", fastmath={"contract"})

@@ -1,7 +1,7 @@
-"""Multiply the roots of the microphones' signals with one another and sum the products.
+"""Multiply the roots of the microphones' signals with one another, and sum the products.
 
-The root of a product is the product of roots, so roots are taken once per sample and once per weight,
-not once per direction.
+The root of a product is the product of the roots. Roots are therefore computed once per sample and once per weight, not
+once per direction.
 """
 
 import math
@@ -13,7 +13,7 @@ from ertis_numba.kernels._scalar import magnitude
 
 __all__ = ["combine_dmas"]
 
-_ZERO = np.float32(0)  # adding it says which product is fused
+_ZERO = np.float32(0)  # adding it determines which product is fused
 _TILE = 64  # ranges: the sums of order 8 take 4.6 kB
 _CHUNK = 4096  # samples
 
@@ -23,7 +23,7 @@ def _take_roots(flat, order, roots):
     exponent = (1 / order - 1) / 2
     for chunk in prange((len(flat) + _CHUNK - 1) // _CHUNK):
         for k in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, len(flat))):
-            # In double precision the square of no sample is lost.
+            # In double precision, the squares of samples neither underflow nor overflow.
             x, y = np.float64(flat[k].real), np.float64(flat[k].imag)
             power = x * x + y * y
             if power == 0:
@@ -63,7 +63,7 @@ def combine_dmas(signals, offsets, weights, order, out):
         z = np.empty((2, _TILE), np.float32)
         for first in range(0, n_ranges, _TILE):
             count = min(_TILE, n_ranges - first)
-            # Sums of products of 0, 1, … order microphones, of those that have passed by.
+            # Sums of products of 0, 1, … order of the microphones so far.
             sums = np.zeros((order + 1, 2, _TILE), np.float32)
             sums[0, 0] = 1
             for mic in range(n_mics):

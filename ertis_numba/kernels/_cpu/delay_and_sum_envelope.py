@@ -1,8 +1,8 @@
-"""Delay-and-sum and envelope in one pass, blocked for the registers and the second cache level.
+"""Delay-and-sum and envelope in one pass, blocked for the registers and the L2 cache.
 
-A tile of ranges holds all its sums in registers while the microphones pass by, so that each point costs its load
-and nothing else. Ranges are the outer loop: the signals of one tile (32 microphones, 10 phases, 64 ranges and the
-aperture: 215 kB) stay in the second cache level while all directions of the block read them.
+A tile of ranges keeps all its sums in registers during the loop over microphones, so that each point costs only its
+load. Ranges are the outer loop. The signals of one tile (32 microphones, 10 phases, 64 ranges and the aperture: 215 kB)
+stay in the L2 cache while all directions of the block read them.
 """
 
 import numpy as np
@@ -19,7 +19,7 @@ _BLOCK = 256  # directions whose delays and weights (98 kB at 32 microphones) sh
 
 @intrinsic
 def _beam_tile(typing_context, signals, offsets, weights, direction, first, out, place):
-    """Fill ``out.flat[place : place + TILE]`` with the ranges from ``first`` on; arrays as in `DelayAndSumEnvelope`."""
+    """Fill ``out.flat[place : place + TILE]`` with ranges starting at ``first``; arrays as in `DelayAndSumEnvelope`."""
     signature = types.void(signals, offsets, weights, types.intp, types.intp, out, types.intp)
 
     def codegen(context, builder, signature, arguments):
@@ -37,7 +37,7 @@ def _beam_tile(typing_context, signals, offsets, weights, direction, first, out,
 
 @njit(nogil=True, cache=True, fastmath={"contract"})
 def _beam_short(signals, offsets, weights, direction, first, stop, out):
-    """One direction of an image with fewer ranges than a tile."""
+    """Fill one direction of an image with fewer ranges than a tile."""
     flat = signals.reshape(-1)
     for r in range(first, stop):
         x, y = np.float32(0), np.float32(0)
@@ -53,7 +53,7 @@ def delay_and_sum_envelope(signals, offsets, weights, first, stop, out):
     """See `DelayAndSumEnvelope`."""
     n_directions = out.shape[0]
     n_tiles = (stop - first + TILE - 1) // TILE
-    # Small images get smaller blocks, so that every thread has some.
+    # Small images get smaller blocks, so that every thread gets some.
     block = min(_BLOCK, max(1, n_directions // 16))
     for part in prange((n_directions + block - 1) // block):
         begin, end = part * block, min((part + 1) * block, n_directions)
@@ -68,7 +68,7 @@ def delay_and_sum_envelope(signals, offsets, weights, first, stop, out):
                 out[direction, first:stop] = short[0, first - at : stop - at]
         else:
             for tile in range(n_tiles):
-                # The last tile overlaps the one before and writes the same numbers again.
+                # The last tile overlaps the previous one and writes the same numbers again.
                 at = min(first + tile * TILE, stop - TILE)
                 for direction in range(begin, end):
                     _beam_tile(signals, offsets, weights, direction, at, out, direction * out.shape[1] + at)

@@ -1,7 +1,7 @@
-"""Delay-and-sum and envelope on 16-bit samples, by the processor's 16-bit dot product.
+"""Delay-and-sum and envelope on 16-bit samples, with the CPU's 16-bit dot product.
 
-That is twice the points per instruction and half the bytes per point of the float32 kernel; 2.2 times its speed on one
-Zen 5 core. The sums are exact integers.
+Relative to the float32 kernel, an instruction handles twice the points, and a point takes half the bytes. On one Zen 5
+core it is 2.2 times as fast. The sums are exact integers.
 """
 
 import numpy as np

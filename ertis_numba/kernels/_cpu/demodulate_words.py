@@ -1,10 +1,11 @@
 """Unpack, decimate and remove the group delay in one pass over the PDM words.
 
-A word is a ready-made mask: bit m says whether microphone m takes a tap or not. So one tap of all
-microphones of a word is one masked vector addition, ``sums += bits(word) ? tap : 0``, and since
-``x = 2 · bit − 1``, twice that sum less the sum of the taps is the filtered signal. Taps of 16 bits put 32
-microphones into one vector of AVX-512, whose mask registers take the word as it is. Against a table of
-the filter's response to 10 bits at a time this is about five times faster.
+A word is used directly as a mask: bit m decides if a tap is added for microphone m. One tap of all microphones of a
+word is one masked vector addition, ``sums += bits(word) ? tap : 0``. Since ``x = 2 · bit − 1``, the filtered signal is
+twice that sum minus the sum of the taps.
+
+With 16-bit taps, 32 microphones fit in one vector of AVX-512, and the word is loaded into a mask register unchanged.
+This is about five times as fast as a table of the filter's response to 10 bits at a time.
 """
 
 import numpy as np
@@ -17,17 +18,17 @@ from ertis_numba.kernels._cpu.spans import clear
 
 __all__ = ["demodulate_words"]
 
-_GROUP = 4  # outputs summed side by side: enough chains to hide the latency of an addition
-_TILE = 32  # outputs held before they are turned from (sample, mic) to (mic, sample)
+_GROUP = 4  # outputs summed in parallel: enough chains to hide the latency of an addition
+_TILE = 32  # outputs collected before they are transposed from (sample, mic) to (mic, sample)
 
 
 @intrinsic
 def _sum_masked_taps(typing_context, words, first, step, taps, tile, row):
     """Fill rows ``row … row + _GROUP`` of ``tile`` (output, bit) with the sums of the masked taps.
 
-    ``tile[row + g, bit] = Σ_t taps[t] · bit_of(words.flat[first + g · step + t · n_words])``; n_words is
-    the last axis of ``words``. Written in LLVM's vector types because no loop over bits keeps the
-    sums of a whole word in registers.
+    ``tile[row + g, bit] = Σ_t taps[t] · bit_of(words.flat[first + g · step + t · n_words])``; n_words is the last axis
+    of ``words``. The code uses LLVM's vector types, because no loop over bits keeps the sums of a whole word in
+    registers.
     """
     signature = types.void(words, types.intp, types.intp, taps, tile, types.intp)
 
@@ -81,7 +82,7 @@ def _turn_tile(tile, word, channels, tap_total, scale, begin, end, out):
 
 @njit(nogil=True, cache=True)
 def _filter_at_edge(words, channels, taps, scale, factor, first, begin, end, out):
-    """Fill samples ``begin … end`` of all microphones where taps reach over an end of the record, where x is 0."""
+    """Fill samples ``begin … end`` of all microphones if taps extend beyond an end of the record; x is 0 there."""
     word_bits = words.itemsize * 8
     for mic in range(channels.size):
         word, bit = channels[mic] // word_bits, np.uint64(channels[mic] % word_bits)

@@ -1,8 +1,8 @@
-"""Sums of 16-bit products, many at a time, by the processor's dot-product instruction.
+"""Vectorised sums of 16-bit products, with the CPU's dot-product instruction.
 
-One instruction (``vpdpwssd``) multiplies pairs of 16-bit numbers and adds the two products of each pair to a
-32-bit sum. A complex sample is such a pair: with the weights (re w, −im w) the instruction gives the real part
-of a beam, with (im w, re w) its imaginary part.
+One instruction (``vpdpwssd``) multiplies pairs of 16-bit numbers, and adds the two products of each pair to a 32-bit
+sum. A complex sample is such a pair. The weights (re w, −im w) yield the real part of a beam, and (im w, re w) its
+imaginary part.
 """
 
 from llvmlite import ir
@@ -24,7 +24,7 @@ SHORTS = ir.VectorType(INT16, LANES)
 
 
 class Dot16:
-    """Writes the instructions of one tile: sums of both parts of `VECTORS` vectors of ranges, kept in registers."""
+    """Emits the instructions of one tile: sums of both parts of `VECTORS` vectors of ranges, kept in registers."""
 
     def __init__(self, builder):
         self._builder = builder
@@ -48,7 +48,7 @@ class Dot16:
         return self._builder.bitcast(self.splat(weight, SUMS), PAIRS)
 
     def load(self, pairs, index, vector, align):
-        """Return pairs from ``pairs[index + vector · LANES]`` on."""
+        """Return a vector of pairs starting at ``pairs[index + vector · LANES]``."""
         builder = self._builder
         place = builder.gep(pairs, [builder.add(index, ir.Constant(index.type, vector * LANES))])
         loaded = builder.load(builder.bitcast(place, PAIRS.as_pointer()))
@@ -80,7 +80,7 @@ class Dot16:
                     self.add(part, vector, x, both[part])
 
     def store_levels(self, scale, target):
-        """Write ``scale`` times the magnitude of the sums from ``target`` (float*) on."""
+        """Write ``scale`` times the magnitude of the sums to ``target`` (float*)."""
         builder = self._builder
         scales = self.splat(scale, FLOATS)
         for vector in range(VECTORS):
@@ -91,7 +91,7 @@ class Dot16:
             builder.store(level, builder.bitcast(place, FLOATS.as_pointer())).align = 4
 
     def store_upper_halves(self, target):
-        """Write the upper 16 bits of the sums, rounded, from ``target`` (int16*) on: real, then imaginary parts."""
+        """Write the rounded upper 16 bits of the sums to ``target`` (int16*): real parts, then imaginary parts."""
         builder = self._builder
         half, shift = (ir.Constant(SUMS, [number] * LANES) for number in (1 << 15, 16))
         for part in (0, 1):

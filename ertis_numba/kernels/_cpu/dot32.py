@@ -1,8 +1,8 @@
-"""Sums of complex products in single precision, many at a time.
+"""Vectorised sums of complex products in single precision.
 
-Signals stay interleaved (re, im, re, im …): with ``a = Σ re(w) · x`` and ``b = Σ im(w) · x`` as plain vectors of
-floats, the beam is ``(a_re − b_im, a_im + b_re)``, so a term costs two multiply-adds per vector loaded and no
-shuffle; the parts are put together once, at the end.
+Signals stay interleaved (re, im, re, im …). With ``a = Σ re(w) · x`` and ``b = Σ im(w) · x`` as plain vectors of
+floats, the beam is ``(a_re − b_im, a_im + b_re)``. A term therefore costs two multiply-adds per loaded vector and no
+shuffle. The parts are combined once, at the end.
 """
 
 from llvmlite import ir
@@ -10,7 +10,7 @@ from numba.core import cgutils
 
 __all__ = ["LANES", "TILE", "Dot32", "Planes"]
 
-LANES = 16  # floats in a vector; LLVM splits it where registers are narrower
+LANES = 16  # floats in a vector; LLVM splits it if registers are narrower
 _VECTORS = 8  # per sum: two sums of 8 take half of the 32 registers of AVX-512
 _HALF = LANES // 2  # complex numbers in a vector
 TILE = _VECTORS * _HALF  # ranges
@@ -58,7 +58,7 @@ class _Sums:
 
 
 class Dot32(_Sums):
-    """Writes the instructions of one tile of interleaved samples."""
+    """Emits the instructions of one tile of interleaved samples."""
 
     def __init__(self, builder):
         super().__init__(builder, _VECTORS)
@@ -82,7 +82,7 @@ class Dot32(_Sums):
                     self._add_product(part, vector, x, both[part])
 
     def _parts(self):
-        """Return the real and imaginary parts of the sums, vector by vector."""
+        """Yield the real and imaginary parts of the sums, vector by vector."""
         builder = self._builder
         blank = ir.Constant(FLOATS, ir.Undefined)
         indices = ir.VectorType(INT32, _HALF)
@@ -99,20 +99,20 @@ class Dot32(_Sums):
             self._store(self._magnitude(x, y), target, vector * _HALF)
 
     def store_parts(self, target):
-        """Write the sums from ``target`` (float*) on: real parts, then imaginary ones."""
+        """Write the sums to ``target`` (float*): real parts, then imaginary parts."""
         for vector, x, y in self._parts():
             self._store(x, target, vector * _HALF)
             self._store(y, target, TILE + vector * _HALF)
 
 
 class Planes(_Sums):
-    """Writes the instructions of one tile whose real and imaginary parts lie apart."""
+    """Emits the instructions of one tile with separate real and imaginary parts."""
 
     def __init__(self, builder):
         super().__init__(builder, TILE // LANES)
 
     def add(self, rows, node, weights, entry):
-        """Add ``weights[entry]`` times the beam of ``node`` in ``rows`` (node, part, range)."""
+        """Add ``weights[entry]`` times the beam of grid point ``node`` in ``rows`` (point, part, range)."""
         begin = self._builder.mul(node, ir.Constant(node.type, 2 * TILE))
         weight = self._splat(weights, entry)
         for vector in range(TILE // LANES):

@@ -1,4 +1,4 @@
-"""What the processor that Numba compiles for can do."""
+"""Features of the processor for which Numba compiles."""
 
 from llvmlite import binding
 from numba.core import config
@@ -7,11 +7,10 @@ __all__ = ["target_features"]
 
 
 def target_features() -> frozenset[str]:
-    """Return the names of the target's features, as LLVM writes them.
+    """Return the names of the target's features, as spelled by LLVM.
 
-    Not simply those of this processor: NUMBA_CPU_FEATURES and NUMBA_CPU_NAME compile for another one, such as
-    the oldest of several machines that share a cache, and an instruction that it lacks would abort the
-    compiler.
+    The target may differ from this processor. NUMBA_CPU_FEATURES and NUMBA_CPU_NAME select another one, for example the
+    oldest of several machines that share a cache. An instruction that the target lacks would abort the compiler.
     """
     if config.CPU_FEATURES is not None:
         flags = str(config.CPU_FEATURES).split(",")
@@ -20,5 +19,5 @@ def target_features() -> frozenset[str]:
         return frozenset()
     try:
         return frozenset(name for name, present in binding.get_host_cpu_features().items() if present)
-    except RuntimeError:  # LLVM does not know this system
+    except RuntimeError:  # LLVM does not support this system
         return frozenset()

@@ -1,6 +1,6 @@
-"""Beams of few nodes by delay-and-sum, beams of all directions from those near by; in single precision.
+"""Beams on a coarse grid by delay-and-sum, interpolated to all directions, in single precision.
 
-A tile's nodes stay in the second cache level between the two steps.
+The grid beams of a tile stay in the L2 cache between the two steps.
 """
 
 import numpy as np
@@ -17,7 +17,7 @@ __all__ = ["interpolated_beams_envelope"]
 
 @intrinsic
 def _node_tile(typing_context, signals, offsets, weights, node, first, rows, row):
-    """Fill ``rows[row]``, (part, range) float32, with the beam of a node."""
+    """Fill ``rows[row]``, (part, range) float32, with the beam of a grid point."""
     signature = types.void(signals, offsets, weights, types.intp, types.intp, rows, types.intp)
 
     def codegen(context, builder, signature, arguments):
@@ -35,7 +35,7 @@ def _node_tile(typing_context, signals, offsets, weights, node, first, rows, row
 
 @intrinsic
 def _interpolate_tile(typing_context, rows, skipped, places, weights, direction, out, place):
-    """Fill ``out.flat[place : place + TILE]`` from ``rows``, (node, part, range), of the nodes from ``skipped`` on."""
+    """Fill ``out.flat[place : place + TILE]`` from ``rows``, (point, part, range), whose first point is ``skipped``."""
     signature = types.void(rows, types.intp, places, weights, types.intp, out, types.intp)
 
     def codegen(context, builder, signature, arguments):
@@ -68,7 +68,7 @@ def interpolated_beams_envelope(signals, offsets, weights, places, tap_weights, 
     n_tiles = (stop - first + TILE - 1) // TILE
     block = (n_directions + n_blocks - 1) // n_blocks
     for part in prange(n_tiles * n_blocks):
-        # The last tile overlaps the one before; one that is longer than its zone begins before it.
+        # The last tile overlaps the previous one; a tile that is longer than its focal zone begins before the zone.
         at = max(0, min(first + part // n_blocks * TILE, stop - TILE))
         begin = min(part % n_blocks * block, n_directions)
         end = min(begin + block, n_directions)

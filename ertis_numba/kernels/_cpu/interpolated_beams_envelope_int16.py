@@ -1,8 +1,8 @@
-"""Beams of few nodes by delay-and-sum, beams of all directions from those near by; on 16-bit samples.
+"""Beams on a coarse grid by delay-and-sum, interpolated to all directions, on 16-bit samples.
 
-Both steps go through the processor's 16-bit dot product. In the second a pair is that of two neighbouring nodes at
-one range, so an instruction adds two nodes at once, and loads never cross a cache line. A tile's nodes stay in
-the second cache level between the steps.
+Both steps use the CPU's 16-bit dot product. In the second step, a pair consists of two neighbouring grid points at one
+range. An instruction therefore adds two grid points at once, and loads never cross a cache line. The grid beams of a
+tile stay in the L2 cache between the steps.
 """
 
 import numpy as np
@@ -21,7 +21,7 @@ _LINE = 64  # bytes of a cache line
 
 @intrinsic
 def _address(typing_context, array):
-    """Address of an array's first number; ``array.ctypes.data`` would keep callers out of Numba's cache."""
+    """Return the address of an array's data; ``array.ctypes.data`` would exclude callers from Numba's cache."""
     signature = types.intp(array)
 
     def codegen(context, builder, signature, arguments):
@@ -33,7 +33,7 @@ def _address(typing_context, array):
 
 @intrinsic
 def _node_tile(typing_context, tiles, tile, offsets, weights, node, rows, row):
-    """Fill ``rows[row]``, (part, range) int16, with the beam of a node, its lower 16 bits rounded off."""
+    """Fill ``rows[row]``, (part, range) int16, with the rounded upper 16 bits of the beam of a grid point."""
     signature = types.void(tiles, types.intp, offsets, weights, types.intp, rows, types.intp)
 
     def codegen(context, builder, signature, arguments):
@@ -51,7 +51,10 @@ def _node_tile(typing_context, tiles, tile, offsets, weights, node, rows, row):
 
 @intrinsic
 def _pair_rows(typing_context, rows, lower, pairs, node):
-    """Fill ``pairs[node]`` with the row ``lower`` and above its bits those of the other one: no loop is vectorised."""
+    """Fill ``pairs[node]`` with row ``lower`` in the low bits and the other row in the high bits.
+
+    The code uses LLVM's vector types, because LLVM does not vectorise such a loop.
+    """
     signature = types.void(rows, types.intp, pairs, types.intp)
 
     def codegen(context, builder, signature, arguments):
@@ -80,10 +83,10 @@ def _pair_rows(typing_context, rows, lower, pairs, node):
 
 @intrinsic
 def _interpolate_tile(typing_context, pairs, skipped, places, weights, direction, scale, out, place):
-    """Fill ``out.flat[place : place + RANGES]`` from the pairs of nodes around ``direction``.
+    """Fill ``out.flat[place : place + RANGES]`` from the pairs of grid points around ``direction``.
 
-    ``pairs`` is (node, part, range) int32 from node ``skipped`` on, each number the 16 bits of a node
-    and above them those of the next one.
+    ``pairs`` is (point, part, range) int32, and its first point is ``skipped``. Each number holds a grid point in its
+    low 16 bits and the next one in its high 16 bits.
     """
     signature = types.void(pairs, types.intp, places, weights, types.intp, types.float32, out, types.intp)
 
@@ -114,7 +117,7 @@ def _interpolate_tile(typing_context, pairs, skipped, places, weights, direction
 
 @njit(nogil=True, cache=True)
 def _node_pairs(tiles, tile, offsets, weights, first, last):
-    """Beams of the nodes ``first … last``, each beside the next one: (node, part, range) int32 on whole cache lines."""
+    """Return pairs of beams of the grid points ``first … last``: (point, part, range) int32, aligned to cache lines."""
     raw = np.empty((last - first + 1) * 2 * RANGES + _LINE // 4, np.int32)
     ahead = (-_address(raw) % _LINE) // 4
     pairs = raw[ahead : ahead + (last - first + 1) * 2 * RANGES].reshape(last - first + 1, 2, RANGES)

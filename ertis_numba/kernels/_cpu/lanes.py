@@ -1,8 +1,8 @@
-"""Vectors of the processor's own, for kernels that take each microphone's samples one after the other.
+"""CPU vectors for kernels that are recursive in time, with one lane per microphone.
 
-A `Lanes` holds one number per microphone and lives in registers. Compiled code writes ``a + b * c`` with them
-and every microphone takes the step at once; no loop over microphones that Numba could be given keeps the
-state of a recursion in registers. Nothing is contracted or reordered: all processors give the same bits.
+A `Lanes` holds one number per microphone and stays in registers. Compiled code computes ``a + b * c`` with them for all
+microphones at once. A plain loop over microphones would not keep the state of a recursion in registers. Nothing is
+contracted or reordered, so all processors yield the same bits.
 """
 
 import operator
@@ -17,7 +17,7 @@ from ertis_numba.kernels._cpu.features import target_features
 __all__ = ["LANES", "as_float64", "bits", "clamp", "load", "sign", "splat", "store", "turn_octet"]
 
 LANES = 16 if "avx512f" in target_features() else 8
-"""Microphones side by side: two vectors of AVX-512 or of AVX, as one alone would wait for itself at every step."""
+"""Microphones processed in parallel: two vectors of AVX-512 or of AVX, because one would stall at every step."""
 
 _INT32 = ir.IntType(32)
 
@@ -48,7 +48,7 @@ class _LanesModel(models.PrimitiveModel):
 
 
 def _add_operator(function, dtype, instruction):
-    """Let compiled code apply ``function`` to two `Lanes`."""
+    """Register ``function`` for two `Lanes` in compiled code."""
 
     @intrinsic
     def apply(typing_context, a, b):
@@ -60,7 +60,7 @@ def _add_operator(function, dtype, instruction):
     @overload(function)
     def choose(a, b):
         if isinstance(a, Lanes) and a.dtype == dtype and a == b:
-            return lambda a, b: apply(a, b)  # noqa: PLW0108 - Numba compiles functions of Python's only
+            return lambda a, b: apply(a, b)  # noqa: PLW0108 - Numba compiles only Python functions
         return None
 
 
@@ -107,7 +107,7 @@ def _not_negative(builder, value):
 
 @intrinsic
 def bits(typing_context, lanes):
-    """Return which lanes are at least 0: an integer of `LANES` bits, lane 0 in the lowest."""
+    """Return an integer of `LANES` bits, 1 for lanes that are at least 0; lane 0 is the lowest bit."""
 
     def codegen(context, builder, signature, arguments):
         return builder.bitcast(_not_negative(builder, arguments[0]), ir.IntType(LANES))
@@ -169,8 +169,8 @@ def store(typing_context, lanes, array, row):
 def turn_octet(typing_context, signals, rows, octet, sample, tile, n):
     """Copy 8 samples of 8 signals: ``tile[n + j, 8 · octet + i] = signals[rows[8 · octet + i], sample + j]``.
 
-    All arrays are C-contiguous. Turned in three rounds of exchanges between pairs of vectors, since a load of
-    numbers from eight rows takes as long as eight loads.
+    All arrays are C-contiguous. Three rounds of exchanges between pairs of vectors transpose the samples, because
+    gathering numbers from eight rows takes as long as eight loads.
     """
     signature = types.void(signals, rows, types.intp, types.intp, tile, types.intp)
 
@@ -195,9 +195,9 @@ def turn_octet(typing_context, signals, rows, octet, sample, tile, n):
 
 
 def _turned(builder, octet):
-    """Return 8 vectors of 8 with rows for columns."""
+    """Return 8 vectors of 8, transposed."""
     for step in (1, 2, 4):
-        even = [k ^ step | 8 if k & step else k for k in range(8)]  # 8 and up is the second vector
+        even = [k ^ step | 8 if k & step else k for k in range(8)]  # indices of 8 and above select the second vector
         odd = [k | 8 if k & step else k ^ step for k in range(8)]
         octet = [
             builder.shuffle_vector(
@@ -210,5 +210,5 @@ def _turned(builder, octet):
 
 def _load(builder, pointer):
     vector = builder.load(pointer)
-    vector.align = 8  # NumPy promises no more
+    vector.align = 8  # NumPy guarantees no more
     return vector

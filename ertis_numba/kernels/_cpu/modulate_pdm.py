@@ -1,9 +1,10 @@
-"""Turn signals into the bits of sigma-delta modulators, one per microphone.
+"""Convert signals to the bits of sigma-delta modulators, one per microphone.
 
-Recursive in time, so microphones run side by side: an octet of a word, or two, in one set of vectors, and each
-thread has octets of its own. Noise and dither are a hash of the microphone's key and the number of the
-sample, not a stream: neither the number of threads nor the cut into blocks changes a bit. No fastmath, for
-the same reason. Ten times faster than a loop over one microphone at a time.
+The loop is recursive in time, so microphones are processed in parallel: one or two octets of a word per set of vectors,
+and separate octets per thread. This is ten times as fast as a loop over one microphone at a time.
+
+Noise and dither are a hash of the microphone's key and the sample index, not a stream. The bits therefore depend
+neither on the number of threads nor on the size of blocks. Fastmath is off for the same reason.
 """
 
 import numpy as np
@@ -16,12 +17,12 @@ __all__ = ["modulate_pdm"]
 
 _OCTETS = LANES // 8
 _INTEGRATORS = 4
-_TILE = 256  # samples between two writes of octets: threads that write beside each other wait for each other's lines
+_TILE = 256  # samples between two writes of octets: threads that write to the same cache line wait for each other
 
 _12, _24, _27, _30, _31 = np.uint64(12), np.uint64(24), np.uint64(27), np.uint64(30), np.uint64(31)
 
-# The upper 16 bits of a hash are its dither, four fields of 12 bits its noise.
-_TOP_16 = np.uint64(0x000F_FFF0_0000_0000)  # once shifted right by 12: the upper 16 bits of a fraction of 52
+# The upper 16 bits of a hash yield the dither, and four 12-bit fields the noise.
+_TOP_16 = np.uint64(0x000F_FFF0_0000_0000)  # after a right shift by 12: the upper 16 bits of a 52-bit fraction
 _FIELDS_0_AND_2 = np.uint64(0x0000_000F_FF00_0FFF)
 _LOW_24 = np.uint64(0xFF_FFFF)
 _ONE, _TWO_52 = np.uint64(0x3FF0_0000_0000_0000), np.uint64(0x4330_0000_0000_0000)  # 1 and 2⁵² as float64
@@ -31,7 +32,7 @@ _NOISE_MEAN = 2.0**52 + 4 * 4095 / 2
 
 @njit(inline="always")
 def _hashed(counter):
-    """Return SplitMix64 of the counters."""
+    """Return the SplitMix64 hashes of the counters."""
     z = (counter ^ (counter >> splat(_30))) * splat(MIX_1)
     z = (z ^ (z >> splat(_27))) * splat(MIX_2)
     return z ^ (z >> splat(_31))
@@ -45,7 +46,7 @@ def _dither(z):
 
 @njit(inline="always")
 def _noise(z):
-    """Return the sum of the four 12-bit fields of a hash, less its mean."""
+    """Return the sum of the four 12-bit fields of a hash minus its mean."""
     pairs = (z & splat(_FIELDS_0_AND_2)) + ((z >> splat(_12)) & splat(_FIELDS_0_AND_2))
     total = (pairs & splat(_LOW_24)) + (pairs >> splat(_24))
     return as_float64(total | splat(_TWO_52)) - splat(_NOISE_MEAN)
@@ -65,7 +66,7 @@ def _fill_tile(signals, rows, begin, count, tile):
 
 @njit(nogil=True, cache=True)
 def _run(signals, rows, counters, scales, states, loop, octets, masks, out):
-    """Modulate the microphones of all lanes; ``states`` (integrator, lane) is kept up to date."""
+    """Modulate the microphones of all lanes, and update ``states`` (integrator, lane)."""
     tile, words = np.empty((_TILE, LANES), np.float64), np.empty(_TILE, np.uint16)
     c1, c2, c3, c4 = splat(loop[0]), splat(loop[1]), splat(loop[2]), splat(loop[3])
     r1, r2, dither, low, high = splat(loop[4]), splat(loop[5]), splat(loop[6]), splat(-loop[7]), splat(loop[7])
@@ -103,7 +104,7 @@ def _run(signals, rows, counters, scales, states, loop, octets, masks, out):
 
 @njit(nogil=True, cache=True)
 def _modulate(signals, mics, keys, noise_rms, states, loop, first, octets, out):
-    """Modulate the microphones of as many octets as there are lanes for."""
+    """Modulate the microphones of the octets that fit in the lanes."""
     rows, counters, masks = np.empty(LANES, np.int64), np.empty((1, LANES), np.uint64), np.empty(_OCTETS, np.int64)
     scales, kept = np.empty((1, LANES)), np.empty((_INTEGRATORS, LANES))
     masks[:] = 0
@@ -111,7 +112,7 @@ def _modulate(signals, mics, keys, noise_rms, states, loop, first, octets, out):
         mic = mics[octets[lane // 8], lane % 8]
         if mic >= 0:
             masks[lane // 8] |= 1 << lane % 8
-        mic = max(mic, 0)  # a lane without microphone runs along with the first one, and its bits are masked
+        mic = max(mic, 0)  # a lane without a microphone computes the first one, and its bits are masked
         rows[lane] = mic
         counters[0, lane] = keys[mic] + np.uint64(first) * STEP
         scales[0, lane] = noise_rms[mic] * NOISE_UNIT
@@ -148,5 +149,5 @@ def modulate_pdm(signals, mics, keys, noise_rms, states, loop, first, out):
     for group in prange((len(used) + _OCTETS - 1) // _OCTETS):
         octets = np.empty(_OCTETS, np.int64)
         for k in range(_OCTETS):
-            octets[k] = used[min(group * _OCTETS + k, len(used) - 1)]  # an odd one goes twice, to the same bits
+            octets[k] = used[min(group * _OCTETS + k, len(used) - 1)]  # an odd octet is computed twice
         _modulate(signals, mics, keys, noise_rms, states, loop, first, octets, out)

@@ -5,7 +5,7 @@ from numba import njit, prange
 
 __all__ = ["multiply_spectra"]
 
-_ZERO = np.float32(0)  # adding it says which product is fused
+_ZERO = np.float32(0)  # adding it determines which product is fused
 
 
 @njit(parallel=True, nogil=True, cache=True, fastmath={"contract"})
@@ -14,7 +14,7 @@ def multiply_spectra(spectra, response, out):
     n_mics, n_bins = spectra.shape
     for mic in prange(n_mics):
         for b in range(n_bins):
-            # Written out because Numba's own complex product is never fused to multiply-adds.
+            # Written out, because Numba never fuses its own complex product to multiply-adds.
             x, h = spectra[mic, b], response[b]
             real = (_ZERO + x.real * h.real) - x.imag * h.imag
             imag = (_ZERO + x.real * h.imag) + x.imag * h.real

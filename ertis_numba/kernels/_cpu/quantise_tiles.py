@@ -1,4 +1,4 @@
-"""Cut analytic signals into tiles of ranges and store each in 16 bits under its own scale."""
+"""Split analytic signals into tiles of ranges, and store each in 16 bits with its own scale."""
 
 import math
 
@@ -10,10 +10,10 @@ __all__ = ["quantise_tiles"]
 
 @njit(nogil=True, cache=True)
 def _largest(parts, begin, end, powers, bits):
-    """Largest magnitude of any sample in ``begin … end`` of ``parts``, (mic, phase, 2 samples) float32.
+    """Return the largest magnitude in ``begin … end`` of ``parts``, (mic, phase, 2 samples) float32.
 
-    Non-negative floats are ordered like their bits, and a maximum of integers is one vector
-    instruction where a maximum of floats, for the sake of NaN, is a loop. ``bits`` is a view of ``powers``.
+    Non-negative floats have the same order as their bits. A maximum of integers is one vector instruction, while a
+    maximum of floats is a loop because of NaN. ``bits`` is a view of ``powers``.
     """
     n_mics, n_phases, _ = parts.shape
     largest = np.int32(0)
@@ -30,7 +30,7 @@ def _largest(parts, begin, end, powers, bits):
 
 @njit(nogil=True, cache=True)
 def _round(source, factor, target):
-    """Fill ``target`` with the numbers of ``source``, which may be fewer, times ``factor`` and rounded."""
+    """Fill ``target`` with the rounded products of ``source`` and ``factor``, and with 0 beyond ``source``."""
     for k in range(source.size):
         target[k] = np.int16(np.rint(source[k] * factor))
     for k in range(source.size, target.size):

@@ -1,4 +1,4 @@
-"""Loops of their own for what NumPy would say in a word: its own minimum takes Numba seconds to compile."""
+"""Explicit loops instead of NumPy functions: Numba takes seconds to compile NumPy's minimum."""
 
 import numpy as np
 from numba import njit
@@ -8,7 +8,7 @@ __all__ = ["clear", "node_span"]
 
 @njit(nogil=True, cache=True)
 def node_span(places, begin, end):
-    """Return the lowest and the highest node that the directions ``begin … end`` are made of."""
+    """Return the lowest and the highest beam-grid point that the directions ``begin … end`` use."""
     low, high = np.int64(places[begin, 0]), np.int64(places[begin, 0])
     for direction in range(begin, end):
         for pair in range(places.shape[1]):

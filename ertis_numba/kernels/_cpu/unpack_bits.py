@@ -1,4 +1,4 @@
-"""Turn the bits of PDM words into signals of +1 and −1."""
+"""Convert the bits of PDM words to signals of +1 and −1."""
 
 import numpy as np
 from numba import njit, prange
@@ -14,6 +14,6 @@ def unpack_bits(words, channels, out):
         word = channels[mic] // word_bits
         shift = channels[mic] % word_bits
         for sample in range(words.shape[0]):
-            # Through int64: a shifted uint64 would be mixed with signed numbers as float64.
+            # Converted to int64, because Numba would convert a mix of uint64 and signed numbers to float64.
             bit = np.int64(words[sample, word] >> np.uint64(shift)) & 1
             out[mic, sample] = np.float32(2 * bit - 1)

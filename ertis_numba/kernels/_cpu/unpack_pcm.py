@@ -1,11 +1,11 @@
-"""Turn PCM numbers into signals."""
+"""Convert PCM samples to signals."""
 
 import numpy as np
 from numba import njit, prange
 
 __all__ = ["unpack_pcm"]
 
-_BLOCK = 512  # samples whose words stay in the cache while one microphone after the other is taken out of them
+_BLOCK = 512  # samples that stay in the cache during the loop over microphones
 
 
 @njit(parallel=True, nogil=True, cache=True)

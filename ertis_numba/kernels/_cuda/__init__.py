@@ -1,4 +1,4 @@
-"""The kernels compiled by Numba for NVIDIA's GPUs, or played by its simulator where ``NUMBA_ENABLE_CUDASIM=1``."""
+"""Kernels compiled by Numba for NVIDIA GPUs, or run by its simulator if ``NUMBA_ENABLE_CUDASIM=1``."""
 
 import contextlib
 from collections.abc import Iterator
@@ -14,13 +14,13 @@ __all__ = ["kernel_set"]
 
 @contextlib.contextmanager
 def threads(count: int) -> Iterator[None]:
-    """See `Threads`; one Python thread launches, and the GPU has its own."""
+    """See `Threads`; one Python thread launches kernels, and the GPU has its own threads."""
     checks.integer("threads", count, 1, 1)
     yield
 
 
 def kernel_set(*, hardware: str, transforms: str, memory: NewMemory) -> KernelSet:
-    """Return the kernels, to run on what is called ``hardware``; others as in `KernelSet`."""
+    """Return the kernels of the GPU named ``hardware``; the other arguments are attributes of `KernelSet`."""
     return KernelSet.of(
         twins_in(__name__),
         device="cuda",

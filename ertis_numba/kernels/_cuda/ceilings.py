@@ -1,6 +1,6 @@
-"""What this GPU can do at most: device memory, arithmetic and the first cache level, by kernels that do nothing else.
+"""Performance ceilings of this GPU: kernels that measure only device memory, arithmetic or the L1 cache.
 
-Only benchmarks use these; they are no part of the signal chain.
+They are for benchmarks, not part of the signal chain.
 """
 
 from collections.abc import Callable
@@ -17,21 +17,21 @@ __all__ = ["TURN_LOADS", "TURN_MULTIPLY_ADDS", "ceilings", "load", "multiply_add
 
 _BLOCK = 256
 _WARP = np.uint32(32)
-_BLOCKS_PER_MULTIPROCESSOR = 16  # twice as many as reside at a time
+_BLOCKS_PER_MULTIPROCESSOR = 16  # twice as many as reside at the same time
 _SUMS, _ROUNDS, _LOADS = 8, 16, 8
 TURN_MULTIPLY_ADDS = _SUMS * _ROUNDS
 TURN_LOADS = _LOADS
-"""Of a thread in one turn."""
-_SAMPLES = 2048  # of 8 bytes: they stay in the first cache level of any GPU
+"""Loads per thread and turn."""
+_SAMPLES = 2048  # of 8 bytes: they stay in the L1 cache of any GPU
 _MASK = np.uint32(_SAMPLES - 1)
-_OCCUPY_TURNS = 40_000  # some three milliseconds: a turn is 128 instructions, of one warp
+_OCCUPY_TURNS = 40_000  # about three milliseconds: a turn is 128 instructions per warp
 _TURNS = 2_000
 _COPY_BYTES = 2**28
 
 
 @cuda.jit(cache=True)
 def _multiply_add(turns, factor, addend, out):
-    """Eight sums that do not wait for each other: a multiply-add takes four clocks, and four warps take turns."""
+    """Compute eight independent sums: a multiply-add takes four clocks, and four warps take turns."""
     a = np.float32(cuda.threadIdx.x)
     b, c, d = a + addend, a - addend, a * factor
     e, f, g, h = b + addend, c - addend, b * factor, c * factor
@@ -46,7 +46,7 @@ def _multiply_add(turns, factor, addend, out):
 
 @cuda.jit(cache=True)
 def _load(samples, turns, first, out):
-    """Load 32 samples side by side in a warp, as delay-and-sum does, ``first`` samples after the begin of a line."""
+    """Load 32 adjacent samples per warp, as delay-and-sum does, ``first`` samples after the begin of a cache line."""
     at = np.uint32(np.uint32(cuda.threadIdx.x) % _WARP + np.uint32(first))
     total = np.uint64(0)
     for _ in range(turns):
@@ -65,20 +65,21 @@ def multiply_add(turns: int, out: NDArray[np.float32]) -> None:
 
 
 def load(samples: NDArray[np.uint64], turns: int, first: int, out: NDArray[np.uint64]) -> None:
-    """Load samples from the first cache level, a thread per element of ``out``, (thread,) uint64.
+    """Load samples from the L1 cache, with a thread per element of ``out``, (thread,) uint64.
 
-    ``samples`` are 2048 + 256 of uint64; ``first`` below 16 is how many lie between a line's begin and a warp's first.
+    ``samples`` is an array of 2048 + 256 uint64. ``first``, below 16, is the number of samples between the begin of a
+    cache line and the first sample of a warp.
     """
     launch(_load, *_shape(len(out)), samples, turns, first, out)
 
 
 def occupy(out: NDArray[np.float32]) -> None:
-    """Keep a lane busy for milliseconds, so that what is launched meanwhile runs without a gap; ``out`` as above."""
+    """Keep a lane busy for milliseconds, so that kernels launched meanwhile run without gaps; ``out`` as above."""
     multiply_add(1 if SIMULATED else _OCCUPY_TURNS, out)
 
 
 def properties() -> dict[str, Any]:
-    """Return multiprocessors, compute capability and, for nvidia-smi, the identity of the GPU."""
+    """Return the number of multiprocessors, the compute capability and the UUID of the GPU as used by nvidia-smi."""
     device = cuda.get_current_device()
     return {
         "multiprocessors": 1 if SIMULATED else int(device.MULTIPROCESSOR_COUNT),
@@ -90,19 +91,21 @@ def properties() -> dict[str, Any]:
 def ceilings(
     runs: int, *, turns: int = _TURNS, copy_bytes: int = _COPY_BYTES, threads: int | None = None
 ) -> dict[str, float]:
-    """Return the best of ``runs``: what the GPU can do is not an average.
+    """Return the best result of several runs, because a ceiling is not an average.
 
     Parameters
     ----------
     runs : int
+        Number of runs.
     turns, copy_bytes, threads : int
-        How much of it; as much as fills a GPU by default.
+        Amount of work; enough to fill a GPU by default.
 
     Returns
     -------
     dict
-        ``copy_gb_s``, bytes read and bytes written; ``float32_gop_s``, a multiply-add being two operations;
-        ``load_gb_s`` from the first cache level, warps on a line's begin, and ``load_unaligned_gb_s``, a sample after.
+        ``copy_gb_s`` counts bytes read and bytes written. ``float32_gop_s`` counts a multiply-add as two operations.
+        ``load_gb_s`` is from the L1 cache with warps aligned to cache lines; ``load_unaligned_gb_s`` is for an offset
+        of one sample.
     """
     threads = threads or _BLOCK * _BLOCKS_PER_MULTIPROCESSOR * properties()["multiprocessors"]
     source, target = (cuda.to_device(np.ones(copy_bytes // 4, np.float32)) for _ in range(2))
@@ -118,7 +121,7 @@ def ceilings(
 
 
 def _shape(threads: int) -> tuple[tuple[int], tuple[int]]:
-    """Return blocks, and threads of a block."""
+    """Return the number of blocks, and the number of threads per block."""
     block = min(_BLOCK, threads)
     return (threads // block,), (block,)
 

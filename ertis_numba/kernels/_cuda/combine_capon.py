@@ -1,8 +1,7 @@
-"""Combine the microphones with weights of least variance; the method and its equations are those of the processor's.
+"""Combine the microphones with minimum-variance weights; the method and its equations are those of the CPU kernel.
 
-A thread has a window of ranges. Its matrix is in memory, beside those of the other threads, number by number. The image
-is cut into groups of directions, and threads take one window after the other, so that this stays within `_MAX_BYTES`
-for any image.
+Each thread handles one window of ranges at a time. Its matrix is in global memory, interleaved with those of the other
+threads. The image is split into groups of directions, so that the memory stays within `_MAX_BYTES` for any image.
 """
 
 import math
@@ -17,8 +16,8 @@ from ertis_numba.kernels._scalar import imag_of, real_of
 __all__ = ["combine_capon"]
 
 _BLOCK = 64
-_MAX_BYTES = 2**25  # of the lags, and as many of the matrices
-_MAX_BLOCKS = 65_535  # along the last two axes of a grid
+_MAX_BYTES = 2**25  # for the lags, and the same for the matrices
+_MAX_BLOCKS = 65_535  # limit of the last two axes of a grid
 
 
 @cuda.jit(cache=True)
@@ -48,7 +47,7 @@ def _sum_lags(signals, offsets, weights, first, n_mics, beams, lags):
 
 @cuda.jit(device=True)
 def _factor(lags, direction, first, epsilon, column, thread):
-    """Fill the lower triangle of ``column[i, j, part, thread]`` with L D of ``B = L D Lᴴ``; 1 / D on its diagonal."""
+    """Fill the lower triangle of ``column[i, j, part, thread]`` with L D of ``B = L D Lᴴ``; its diagonal is 1 / D."""
     n_snapshots = column.shape[0]
     for j in range(n_snapshots):
         for i in range(j, n_snapshots):  # the conjugate of B_ji, which is lag i − j at sample j
@@ -101,11 +100,11 @@ def _combine(beams, lags, loading, n_mics, column, t, first, n_directions, out):
         trace = 0.0
         for k in range(window, window + n_snapshots):
             trace += lags[direction, 0, 0, k]
-        # Where there is nothing, any loading gives 0.
+        # Without any power, every loading yields 0.
         epsilon = loading * trace / n_mics if trace != 0.0 else 1.0
         _factor(lags, direction, window, epsilon, column, thread)
         scale = epsilon / (n_mics - _solve(beams, direction, window, column, t, thread))
-        # A window serves the range in its middle; the outermost two also those towards the ends.
+        # A window yields the range in its middle; the outermost two also yield those towards the ends.
         begin = 0 if window == 0 else middle
         end = n_snapshots if window == n_windows - 1 else middle + 1
         for c in range(begin, end):

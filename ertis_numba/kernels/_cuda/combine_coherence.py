@@ -1,4 +1,4 @@
-"""Sum the microphones and weigh the sum by how well they agree."""
+"""Sum the microphones, and weight the sum by their coherence factor."""
 
 import numpy as np
 from numba import cuda
@@ -9,12 +9,12 @@ from ertis_numba.kernels._scalar import coherent_level, imag_of, power, real_of
 
 __all__ = ["combine_coherence"]
 
-_ONE, _ZERO = np.uint64(1), np.float32(0)  # adding 0 says which product is fused
+_ONE, _ZERO = np.uint64(1), np.float32(0)  # adding 0 determines which product is fused
 
 
 @cuda.jit(device=True)
 def _add(sums, sample, w_real, w_imag):
-    """Return the sums of y, in parts, and of its power, with another y added."""
+    """Return the sums of y (real and imaginary part) and of its power, with another y added."""
     real, imag, total = sums
     y_real = (_ZERO + real_of(sample) * w_real) - imag_of(sample) * w_imag
     y_imag = (_ZERO + real_of(sample) * w_imag) + imag_of(sample) * w_real
@@ -28,7 +28,7 @@ def _combine(signals, offsets, weights, n_mics, out):
     place = np.int64(cuda.blockIdx.y * TILE + cuda.threadIdx.x)
     if direction >= np.uint64(out.shape[0]) or place >= n_ranges:
         return
-    # Ranges past the last are read as the last one, and not written.
+    # Ranges beyond the last are read as the last one, and are not written.
     last = n_ranges - 1 - place
     step_1 = np.uint64(min(np.int64(WARP), last))
     step_2 = np.uint64(min(np.int64(2 * WARP), last))

@@ -1,7 +1,7 @@
-"""Multiply the roots of the microphones' signals with one another and sum the products.
+"""Multiply the roots of the microphones' signals with one another, and sum the products.
 
-There is a kernel for each order, whose sums are in registers: an index that is known only when it runs would keep
-them in memory.
+Each order has its own kernel, so that the sums stay in registers. Indices that are known only at run time would force
+them into memory.
 """
 
 import functools
@@ -37,7 +37,7 @@ def _kernel_of(order):
         place = np.int64(cuda.blockIdx.y * WARP + cuda.threadIdx.x)
         if direction >= np.uint64(out.shape[0]) or place >= out.shape[1]:
             return
-        # Sums of products of 1, 2, … order microphones, of those that have passed by.
+        # Sums of products of 1, 2, … order of the microphones so far.
         real = cuda.local.array(order, np.float32)
         imag = cuda.local.array(order, np.float32)
         for k in range(order):

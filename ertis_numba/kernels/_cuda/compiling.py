@@ -1,7 +1,7 @@
-"""The kernels as machine code, compiled for a GPU that need not be there.
+"""Compilation of kernels to machine code, for a GPU that need not be present.
 
-What a chain launches is written down instead of run, so that kernels are compiled with the types that they are launched
-with, and grids and blocks are those of the real work.
+The launches of a chain are recorded instead of run. Kernels are therefore compiled with the types of real launches, and
+grids and blocks are those of real work.
 """
 
 import contextlib
@@ -36,22 +36,22 @@ __all__ = ["Code", "Launch", "code_of", "disassembled", "recorded", "require_com
 
 _NEEDED = "compiling for GPUs needs numba-cuda, ptxas and nvdisasm"
 _REMEDY = "install them with pip install 'ertis-numba[check]'"
-_LOCK = threading.Lock()  # around what is changed in Numba
+_LOCK = threading.Lock()  # held while Numba is patched
 
 
 @dataclass(frozen=True, slots=True)
 class Launch:
-    """A launch of a kernel.
+    """Recorded launch of a kernel.
 
     Attributes
     ----------
     kernel : numba.cuda.dispatcher.CUDADispatcher
     grid, block : tuple of int
-        Blocks of the launch, and threads of a block, by axes.
+        Number of blocks, and threads per block, along each axis.
     types : tuple of numba.types.Type
-        Of the arguments.
+        Types of the arguments.
     arguments : dict
-        By name. What is in the arrays may have changed since, as at any launch.
+        Arguments by name. The contents of arrays may have changed since the launch.
     """
 
     kernel: Any
@@ -62,31 +62,31 @@ class Launch:
 
     @property
     def file(self) -> str:
-        """Name of the module that the kernel stands in, which is that of its contract."""
+        """Name of the kernel's module, which is also the name in its contract."""
         return str(self.kernel.py_func.__module__).rpartition(".")[2]
 
     @property
     def name(self) -> str:
-        """Name of the kernel, and of the module that it stands in."""
+        """Name of the module and of the kernel, joined by a dot."""
         return f"{self.file}.{self.kernel.py_func.__name__.lstrip('_')}"
 
 
 @dataclass(frozen=True, slots=True)
 class Code:
-    """A kernel compiled for one kind of GPU.
+    """Kernel compiled for one compute capability.
 
     Attributes
     ----------
     ptx : str
+        Intermediate code.
     cubin : bytes
-        What the GPU runs.
+        Machine code.
     registers : int
-        Of a thread.
+        Registers per thread.
     shared_bytes : int
-        Of a block.
+        Shared memory per block.
     stack_bytes, spill_bytes : int
-        Of a thread: memory for local arrays, and bytes that instructions move between registers and memory since
-        registers do not suffice.
+        Per thread: memory for local arrays, and bytes moved between registers and memory due to a lack of registers.
     """
 
     ptx: str
@@ -98,7 +98,16 @@ class Code:
 
 
 def recorded(steps: Callable[[KernelSet], object]) -> list[Launch]:
-    """Return what ``steps`` launch with the kernels that they are given, in order. Nothing is launched.
+    """Record the kernel launches of ``steps`` in order, without running them.
+
+    Parameters
+    ----------
+    steps : callable
+        Receives the kernels as a `KernelSet`.
+
+    Returns
+    -------
+    list of Launch
 
     Raises
     ------
@@ -106,21 +115,21 @@ def recorded(steps: Callable[[KernelSet], object]) -> list[Launch]:
         The process was started with NUMBA_ENABLE_CUDASIM=1.
     """
     if SIMULATED:
-        raise DeviceError("kernels are not compiled where they are simulated; unset NUMBA_ENABLE_CUDASIM")
+        raise DeviceError("kernels are not compiled if the GPU is simulated; unset NUMBA_ENABLE_CUDASIM")
     launches: list[Launch] = []
     kernels = kernel_set(hardware="", transforms="scipy", memory=functools.partial(_Memory, launches))
     with _Lane(launches).entered():
-        steps(dataclasses.replace(kernels, simulated=True))  # so that nobody measures them
+        steps(dataclasses.replace(kernels, simulated=True))  # so that no caller measures them
     return launches
 
 
 def code_of(launch: Launch, cc: tuple[int, int]) -> Code:
-    """Return the machine code of a kernel for compute capability ``cc``; compiled once for the same types.
+    """Return the machine code of a kernel for compute capability ``cc``; results are cached by kernel and types.
 
     Raises
     ------
     DeviceError
-        A compiler is missing, or refuses.
+        A compiler is missing or fails.
     """
     require_compilers()
     return _code(launch.kernel, launch.types, cc)
@@ -128,12 +137,12 @@ def code_of(launch: Launch, cc: tuple[int, int]) -> Code:
 
 @functools.cache
 def disassembled(code: Code) -> str:
-    """Return machine code as a text of one instruction per line, with labels.
+    """Return machine code as text with labels and one instruction per line.
 
     Raises
     ------
     DeviceError
-        nvdisasm is missing, or refuses: version 13 knows no GPUs before compute capability 7.5.
+        nvdisasm is missing or fails. Version 13 does not support GPUs before compute capability 7.5.
     """
     with tempfile.TemporaryDirectory() as folder:
         cubin = Path(folder) / "kernel.cubin"
@@ -142,7 +151,7 @@ def disassembled(code: Code) -> str:
 
 
 def require_compilers() -> None:
-    """Refuse to go on where kernels cannot be compiled.
+    """Raise an error if kernels cannot be compiled.
 
     Raises
     ------
@@ -151,14 +160,14 @@ def require_compilers() -> None:
     """
     if not hasattr(cuda, "compile_ptx") or "numba_cuda" not in str(cuda.__file__):
         raise DeviceError(
-            f"compiling for GPUs needs numba-cuda, ptxas and nvdisasm, and numba-cuda is missing; {_REMEDY}"
+            f"compiling for GPUs needs numba-cuda, ptxas and nvdisasm, but numba-cuda is missing; {_REMEDY}"
         )
     for name in ("ptxas", "nvdisasm"):
         _tool(name)
 
 
 class _Lane(Lane):
-    """A lane of the host that writes down what is launched on it."""
+    """Lane of the host that records its launches."""
 
     def __init__(self, launches: list[Launch]) -> None:
         super().__init__(None, np.zeros)
@@ -174,10 +183,10 @@ class _Lane(Lane):
         steps()
 
     def fetch(self, array: Any, out: NDArray[Any]) -> None:
-        """Nothing was computed."""
+        """Copy nothing, because no image was computed."""
 
     def wait(self) -> None:
-        """Nothing was launched."""
+        """Return immediately, because no kernel runs."""
 
     def launch(self, kernel: Any, grid: tuple[int, ...], block: tuple[int, ...], *arguments: Any) -> None:
         types = tuple(_type_of(argument) for argument in arguments)
@@ -191,14 +200,14 @@ class _Memory(HostMemory):
         self._launches = launches
 
     def table(self, array: Array) -> Array:
-        return cast("Array", np.ascontiguousarray(array))  # which arrays of a GPU are
+        return cast("Array", np.ascontiguousarray(array))  # like arrays of a GPU
 
     def lane(self) -> Any:
         return _Lane(self._launches)
 
 
 def _type_of(argument: Any) -> Any:
-    """Return the type that an argument has at a launch: arrays of a GPU can all be written to."""
+    """Return the type of an argument at a launch; arrays of a GPU are always writable."""
     found = numba.typeof(argument)
     return found.copy(readonly=False) if isinstance(argument, np.ndarray) else found
 
@@ -226,7 +235,7 @@ def _code(kernel: Any, types: tuple[Any, ...], cc: tuple[int, int]) -> Code:
 
 @contextlib.contextmanager
 def _device(cc: tuple[int, int]) -> Iterator[None]:
-    """Let Numba, which asks the GPU when a kernel calls functions, believe in one."""
+    """Patch Numba with a fake GPU, whose compute capability it queries if a kernel calls functions."""
     device = SimpleNamespace(compute_capability=cc)
     with _LOCK, mock.patch("numba.cuda.dispatcher.get_current_device", return_value=device):
         yield
@@ -242,12 +251,12 @@ def _tool(name: str) -> str:
 
     found = pathfinder.find_nvidia_binary_utility(name) or shutil.which(name)
     if found is None:
-        raise DeviceError(f"{_NEEDED}, and {name} is missing; {_REMEDY}")
+        raise DeviceError(f"{_NEEDED}, but {name} is missing; {_REMEDY}")
     return str(found)
 
 
 def _run(name: str, *arguments: str) -> "subprocess.CompletedProcess[str]":
     done = subprocess.run([_tool(name), *arguments], capture_output=True, text=True, check=False)  # noqa: S603
     if done.returncode:
-        raise DeviceError(f"{name} refuses ({done.stderr.strip().splitlines()[-1]}); {_REMEDY}")
+        raise DeviceError(f"{name} fails ({done.stderr.strip().splitlines()[-1]}); {_REMEDY}")
     return done

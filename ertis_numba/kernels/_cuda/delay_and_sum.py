@@ -12,14 +12,14 @@ __all__ = ["beams_from", "delay_and_sum"]
 
 @cuda.jit(cache=True)
 def _fill(signals, offsets, weights, n_terms, first, n_ranges, out):
-    """``out``, (direction, range) uint64, has its first range at ``first``; past ``n_ranges`` it is filled with 0."""
+    """Fill ``out``, (direction, range) uint64, whose first range is ``first``; beyond ``n_ranges`` it becomes 0."""
     fill_beams(sample_of, signals, offsets, weights, n_terms, first, 0, n_ranges, out.shape[1], out)
 
 
 def beams_from(signals, offsets, weights, first, n_ranges, out):
-    """Do `delay_and_sum` for ``n_ranges`` ranges from ``first`` on.
+    """Run `delay_and_sum` for ``n_ranges`` ranges starting at ``first``.
 
-    ``out`` is (direction, range) uint64, and may end less than a tile later: there it becomes 0.
+    ``out`` is (direction, range) uint64. It may be longer by less than a tile; the additional ranges become 0.
     """
     grid, tables = beam_grid(out.shape[0], n_ranges), (offsets.reshape(-1), complexes(weights))
     launch(_fill, grid, BLOCK, complexes(signals), *tables, offsets.shape[1], first, n_ranges, out)

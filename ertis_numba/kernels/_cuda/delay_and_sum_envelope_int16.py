@@ -1,4 +1,4 @@
-"""Delay-and-sum and envelope on 16-bit samples: half the bytes per point of the float32 kernel. The sums are exact."""
+"""Delay-and-sum and envelope on 16-bit samples, with half the bytes per point of the float32 kernel and exact sums."""
 
 import numpy as np
 from numba import cuda
@@ -14,9 +14,10 @@ TILE_RANGES = 3 * WARP
 
 @cuda.jit(device=True)
 def sum_short_terms(samples, offsets, weights, n_terms, direction, place):
-    """Return real and imaginary parts of a beam at ``place`` and one and two warps further.
+    """Return the real and imaginary parts of a beam at ``place``, and one and two warps further.
 
-    ``samples`` are pairs of int16 as uint32, and so are ``weights``: ``((re w, −im w), (im w, re w))``; both are flat.
+    ``samples`` and ``weights`` are flat arrays of pairs of int16 as uint32; weights are
+    ``((re w, −im w), (im w, re w))``.
     """
     a_real = a_imag = b_real = b_imag = c_real = c_imag = np.int32(0)
     entry = direction * n_terms
@@ -26,7 +27,7 @@ def sum_short_terms(samples, offsets, weights, n_terms, direction, place):
         at = np.uint32(place + offsets[entry])
         entry += ONE
         p, q, s, t = short_real_of(upper), short_imag_of(upper), short_real_of(lower), short_imag_of(lower)
-        # Of 32 bits each time: Numba's own sums of 32 bits have 64.
+        # Cast to 32 bits at each step, because Numba widens sums of 32-bit integers to 64 bits.
         x = samples[at]
         x_real, x_imag = short_real_of(x), short_imag_of(x)
         a_real = np.int32(np.int32(a_real + p * x_real) + q * x_imag)
@@ -44,7 +45,7 @@ def sum_short_terms(samples, offsets, weights, n_terms, direction, place):
 
 @cuda.jit(device=True)
 def store_tile(out, row, start, stop, scale, sums):
-    """Write the magnitudes of a thread's sums of a tile from range ``start`` on, as far as they lie before ``stop``."""
+    """Write the magnitudes of a thread's sums of a tile that starts at range ``start``, up to ``stop``."""
     a_real, a_imag, b_real, b_imag, c_real, c_imag = sums
     r, end = np.uint64(start + cuda.threadIdx.x), np.uint64(stop)
     if r < end:

@@ -1,7 +1,7 @@
 """Unpack, decimate and remove the group delay in one pass over the PDM words.
 
-The threads of a warp have one output each of up to 32 microphones: the octets that they read are those of one word, and
-the tap is one load for all of them.
+The threads of a warp each compute one output of up to 32 microphones. They read octets of the same word, and share one
+load of the tap.
 """
 
 import numpy as np
@@ -12,13 +12,13 @@ from ertis_numba.kernels._cuda.terms import indexed
 
 __all__ = ["demodulate_words"]
 
-_MICS, _THREADS = 32, 128  # of a block, at most
+_MICS, _THREADS = 32, 128  # maximum per block
 _ONE = np.uint32(1)
 
 
 @cuda.jit(cache=True)
 def _sum_taps(octets, n_samples, n_octets, channels, taps, scale, factor, first, n_outputs, out):
-    """``octets`` are those of all words, flat, ``n_octets`` to a sample."""
+    """Fill one output; ``octets`` is a flat array of the bytes of all words, ``n_octets`` per sample."""
     n = np.int64(cuda.blockIdx.x * cuda.blockDim.y + cuda.threadIdx.y)
     mic = np.int64(cuda.blockIdx.y * cuda.blockDim.x + cuda.threadIdx.x)
     if n >= out.shape[1] or mic >= out.shape[0]:
@@ -33,7 +33,7 @@ def _sum_taps(octets, n_samples, n_octets, channels, taps, scale, factor, first,
         at = np.uint32((start + np.int64(tap)) * n_octets + np.int64(channel >> np.uint32(3)))
         step = np.uint32(n_octets)
         while tap < end:
-            # Of 32 bits each time: Numba's own sums of 32 bits have 64.
+            # Cast to 32 bits at each step, because Numba widens sums of 32-bit integers to 64 bits.
             weight = np.int32(taps[tap])
             above = np.uint8(octets[at] & mask)
             total = np.int32(total + weight) if above else np.int32(total - weight)

@@ -1,4 +1,4 @@
-"""Take the magnitude of analytic beams."""
+"""Compute the magnitude of analytic beams."""
 
 import numpy as np
 from numba import cuda

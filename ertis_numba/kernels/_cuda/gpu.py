@@ -1,4 +1,4 @@
-"""The kernels on the GPU of this machine. Importing this is what looks for one."""
+"""Kernels on the GPU of this machine; importing this module searches for one."""
 
 import importlib
 import importlib.util
@@ -21,11 +21,11 @@ def _hardware() -> str:
     Raises
     ------
     DeviceError
-        There is none, or something is missing that it needs.
+        There is no GPU, or a library that it needs is missing.
     """
     if SIMULATED:
         return "Numba's CUDA simulator"
-    # Looked for first: the target that Numba itself still ships crashes on newer drivers.
+    # Checked first, because the target that Numba itself still ships crashes on newer drivers.
     if importlib.util.find_spec("numba_cuda") is None:
         raise DeviceError(f"device 'cuda' needs numba-cuda, which is not installed; {_REMEDY}")
     if not cuda.is_available():

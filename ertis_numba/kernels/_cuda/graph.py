@@ -1,6 +1,6 @@
-"""CUDA graphs: the launches of a whole chain, recorded once and played again by one call.
+"""CUDA graphs: the launches of a whole chain, recorded once and replayed by one call.
 
-Numba has no graphs of its own; CuPy records whatever is launched on a stream, Numba's kernels and cuFFT's alike.
+Numba does not support graphs. CuPy records all launches on a stream, both of Numba's kernels and of cuFFT.
 """
 
 import contextlib
@@ -11,22 +11,22 @@ __all__ = ["Graph"]
 
 
 class Graph:
-    """Steps that launch the same kernels on the same arrays each time.
+    """Replayable graph of steps that launch the same kernels on the same arrays at each call.
 
     Parameters
     ----------
     stream : numba.cuda.Stream
-        Not the default one, which cannot be recorded.
+        Any stream other than the default one, which cannot be recorded.
     """
 
     def __init__(self, stream: Any) -> None:
-        import cupy  # noqa: PLC0415 - half a second that only those wait for who use graphs
+        import cupy  # noqa: PLC0415 - the import takes half a second, and only graphs need it
 
         self._stream = cupy.cuda.Stream.from_external(stream)
         self._graph: Any = None
 
     def run(self, steps: Callable[[], None]) -> None:
-        """Launch the steps: one by one the first time, which compiles kernels and makes arrays, then as a graph."""
+        """Launch the steps: the first time one by one, which compiles kernels and allocates arrays, then as a graph."""
         if self._graph is not None:
             self._graph.launch(self._stream)
             return
@@ -36,7 +36,7 @@ class Graph:
             try:
                 steps()
             except BaseException:
-                with contextlib.suppress(Exception):  # a stream must not be left recording; what failed is told
+                with contextlib.suppress(Exception):  # a stream must not be left recording; the first error is raised
                     self._stream.end_capture()
                 raise
             self._graph = self._stream.end_capture()

@@ -1,4 +1,4 @@
-"""Beams of few nodes by delay-and-sum, beams of all directions from those near by; in single precision."""
+"""Beams on a coarse grid by delay-and-sum, interpolated to all directions, in single precision."""
 
 import numpy as np
 from numba import cuda
@@ -13,7 +13,7 @@ __all__ = ["interpolated_beams_envelope"]
 
 @cuda.jit(device=True)
 def _add_node(nodes, at, weight, sums):
-    """Return the sums of both parts of four ranges, a warp apart, with a node's added."""
+    """Return the sums of both parts of four ranges, a warp apart, with those of a grid point added."""
     a_real, a_imag, b_real, b_imag, c_real, c_imag, d_real, d_imag = sums
     a, b, c, d = nodes[at], nodes[at + WARPS_1], nodes[at + WARPS_2], nodes[at + WARPS_3]
     return (
@@ -30,7 +30,10 @@ def _add_node(nodes, at, weight, sums):
 
 @cuda.jit(cache=True)
 def _interpolate(nodes, width, places, n_pairs, tap_weights, rows, first, stop, out):
-    """``nodes``, (node, range) uint64 of which ``width`` is a whole number of tiles, and all tables are flat."""
+    """Fill ranges of ``out``; ``nodes`` and all tables are flat.
+
+    ``nodes`` is (point, range) uint64, with ``width`` ranges, which is a multiple of the tile.
+    """
     direction = np.uint64(cuda.blockIdx.x * DIRECTIONS + cuda.threadIdx.y)
     if direction >= np.uint64(rows.size):
         return

@@ -1,4 +1,4 @@
-"""Beams of few nodes by delay-and-sum, beams of all directions from those near by; on 16-bit samples."""
+"""Beams on a coarse grid by delay-and-sum, interpolated to all directions, on 16-bit samples."""
 
 import numpy as np
 from numba import cuda
@@ -15,7 +15,7 @@ _WIDTH = np.uint64(TILE_RANGES)
 
 @cuda.jit(cache=True)
 def _fill_nodes(samples, per_tile, offsets, weights, n_terms, nodes):
-    """``nodes`` are (tile, node, range) pairs of int16 as uint32."""
+    """Fill ``nodes``, (tile, point, range), with pairs of int16 as uint32."""
     node = np.uint64(cuda.blockIdx.x * DIRECTIONS + cuda.threadIdx.y)
     if node >= np.uint64(nodes.shape[1]):
         return
@@ -31,7 +31,10 @@ def _fill_nodes(samples, per_tile, offsets, weights, n_terms, nodes):
 
 @cuda.jit(cache=True)
 def _interpolate(nodes, n_nodes, scales, starts, stop, places, n_pairs, tap_weights, rows, weight_scale, out):
-    """``nodes``, ``places`` and ``tap_weights``, which are pairs of int16 as uint32, are flat."""
+    """Fill ranges of ``out``; ``nodes``, ``places`` and ``tap_weights`` are flat.
+
+    ``nodes`` and ``tap_weights`` contain pairs of int16 as uint32.
+    """
     direction = np.uint64(cuda.blockIdx.x * DIRECTIONS + cuda.threadIdx.y)
     if direction >= np.uint64(rows.size):
         return

@@ -1,4 +1,4 @@
-"""The way of measurements through the GPU: a stream, and arrays that are made once."""
+"""Lanes of the GPU: a stream, and arrays that are allocated once."""
 
 import contextlib
 import threading
@@ -17,28 +17,28 @@ __all__ = ["SIMULATED", "Lane", "current", "launch", "workspace"]
 
 SIMULATED = bool(numba.config.ENABLE_CUDASIM)
 
-numba.config.CUDA_LOW_OCCUPANCY_WARNINGS = 0  # a small image is a small grid: no mistake to be told of
+numba.config.CUDA_LOW_OCCUPANCY_WARNINGS = 0  # a small image needs only a small grid, so a warning would mislead
 
-_MAX_BLOCKS = 65_535  # along all axes of a grid but the first
+_MAX_BLOCKS = 65_535  # limit of all axes of a grid except the first
 
 Allocate = Callable[[tuple[int, ...], DTypeLike], Any]
 
 
 class Lane:
-    """See `kernels.Lane`; also where kernels find room to work in.
+    """Lane of the GPU, which also provides kernels with workspace. See `kernels.Lane`.
 
-    A kernel that needs room for what it hands to the next launch asks `workspace` for it, under a name of its own.
-    What is launched on one stream runs in order, so the next measurement can use the room again.
+    A kernel requests workspace for intermediate results from `workspace`, under a unique name. Launches on one stream
+    run in order, so the next measurement can reuse the workspace.
 
     Parameters
     ----------
     stream : numba.cuda.Stream or 0
-        0 is the stream that waits for all others.
+        0 is the default stream, which synchronises with all others.
     allocate, pin : callable
-        Shape and type to a new array, of the device and of the host's pinned memory.
+        Return a new array of a given shape and type: of the device, and of pinned memory of the host.
     graphs : bool
-        Whether `run` records its steps as a CUDA graph. Without, launching costs the processor some ten
-        microseconds per kernel.
+        True if `run` records its steps as a CUDA graph. Without graphs, a launch takes the CPU about ten microseconds
+        per kernel.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class Lane:
         """See `kernels.Lane.send`."""
         kind = (array.shape, array.dtype.str)
         if kind not in self._staged:
-            # Only from pinned memory does a copy run beside the kernels of other lanes.
+            # Only copies from pinned memory run concurrently with the kernels of other lanes.
             self._staged[kind] = self._pin(array.shape, array.dtype), self._allocate(array.shape, array.dtype)
         staged, here = self._staged[kind]
         np.copyto(staged, array)
@@ -106,7 +106,7 @@ class Lane:
         kernel[grid, block, self.stream](*arguments)
 
     def room(self, name: str, shape: tuple[int, ...], dtype: DTypeLike) -> Any:
-        """Return the array of a name; another one if its shape or type changes."""
+        """Return the array of a given name; a new one replaces it if the shape or the type changes."""
         found = self._rooms.get(name)
         if found is None or found.shape != shape or found.dtype != np.dtype(dtype):
             found = self._rooms[name] = self._allocate(shape, dtype)
@@ -117,27 +117,27 @@ _HERE = threading.local()
 
 
 def current() -> Lane:
-    """Return the lane that this Python thread has entered, or a passing one on the default stream."""
+    """Return the lane that this Python thread has entered, or a temporary one on the default stream."""
     return getattr(_HERE, "lane", None) or Lane()
 
 
 def launch(kernel: Any, grid: tuple[int, ...], block: tuple[int, ...], *arguments: Any) -> None:
-    """Run ``kernel`` with ``grid`` blocks of ``block`` threads, after what was launched on this lane before.
+    """Launch ``kernel`` with ``grid`` blocks of ``block`` threads, after all earlier launches on this lane.
 
     Raises
     ------
     DeviceError
-        No grid has so many blocks.
+        The grid exceeds the limit of blocks.
     """
     if max(grid[1:], default=0) > _MAX_BLOCKS:
         raise DeviceError(
-            f"device 'cuda' would need a grid of {max(grid[1:]):,} blocks, and {_MAX_BLOCKS:,} are the most; "
-            "give a shorter processing.range_m or fewer microphones, or use device 'cpu'"
+            f"device 'cuda' would need a grid of {max(grid[1:]):,} blocks; the limit is {_MAX_BLOCKS:,}. "
+            "Give a shorter processing.range_m or fewer microphones, or use device 'cpu'"
         )
-    if all(grid):  # where there is nothing to do a launch would be an error
+    if all(grid):  # launching an empty grid would be an error
         current().launch(kernel, grid, block, *arguments)
 
 
 def workspace(name: str, shape: tuple[int, ...], dtype: DTypeLike) -> Any:
-    """Return an array of the current lane that holds anything; see `Lane.room`."""
+    """Return an uninitialised array of the current lane; see `Lane.room`."""
     return current().room(name, shape, dtype)

@@ -1,4 +1,4 @@
-"""What a pipeline keeps on the GPU, and the pinned memory of the host that its images arrive in."""
+"""Memory of a pipeline on the GPU, and pinned memory of the host for its images."""
 
 from collections.abc import Callable
 from typing import Any, Final
@@ -19,9 +19,9 @@ _OUT_OF_MEMORY: Final = 2  # CUDA_ERROR_OUT_OF_MEMORY
 
 
 class CudaMemory:
-    """See `Memory`."""
+    """Memory of the GPU. See `Memory`."""
 
-    n_lanes = 3  # one measurement on its way in, one in work, one on its way out
+    n_lanes = 3  # one measurement being copied in, one being processed, one being copied out
 
     def __init__(self, *, graphs: bool = False) -> None:
         self._graphs = graphs
@@ -49,18 +49,18 @@ class CudaMemory:
         """See `Memory.close`."""
         self._images.close()
         if not SIMULATED:
-            cuda.current_context().deallocations.clear()  # Numba puts them off otherwise
+            cuda.current_context().deallocations.clear()  # otherwise Numba defers them
 
     def _array(self, shape: tuple[int, ...], dtype: DTypeLike) -> Any:
         return self._made(_bytes_of(shape, dtype), lambda: cuda.device_array(shape, dtype))
 
     def _pinned(self, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-        """Return an array of the host that cannot be paged out.
+        """Return an array of pinned host memory.
 
         Raises
         ------
         DeviceError
-            It does not fit.
+            The array does not fit.
         """
         try:
             array: NDArray[Any] = cuda.pinned_array(shape, dtype)
@@ -68,18 +68,18 @@ class CudaMemory:
             if int(error.args[0]) != _OUT_OF_MEMORY:
                 raise
             raise DeviceError(
-                f"the host cannot pin {_bytes_of(shape, dtype) / 1e6:,.0f} MB for device 'cuda'; raise its limit of "
+                f"the host cannot pin {_bytes_of(shape, dtype) / 1e6:,.0f} MB for device 'cuda'; raise its limit on "
                 "locked memory, close other pipelines, or use device 'cpu'"
             ) from error
         return array
 
     def _made(self, n_bytes: int, make: Callable[[], Any]) -> Any:
-        """Return what ``make`` allocates, counted.
+        """Return the array that ``make`` allocates, and count its bytes.
 
         Raises
         ------
         DeviceError
-            It does not fit.
+            The array does not fit.
         """
         try:
             made = make()
@@ -88,9 +88,9 @@ class CudaMemory:
                 raise
             free, total = cuda.current_context().get_memory_info()
             raise DeviceError(
-                f"device 'cuda' has {free / 1e6:,.0f} of {total / 1e6:,.0f} MB free, and this pipeline needs "
-                f"at least {n_bytes / 1e6:,.0f} MB more than the {self._bytes / 1e6:,.0f} MB that it has; "
-                "give fewer directions, a shorter processing.range_m or less accuracy.oversampling, close other "
+                f"device 'cuda' has {free / 1e6:,.0f} of {total / 1e6:,.0f} MB free, but this pipeline needs at least "
+                f"{n_bytes / 1e6:,.0f} MB in addition to the {self._bytes / 1e6:,.0f} MB that it already uses; "
+                "give fewer directions, a shorter processing.range_m or a lower accuracy.oversampling, close other "
                 "pipelines, or use device 'cpu'"
             ) from error
         self._bytes += n_bytes

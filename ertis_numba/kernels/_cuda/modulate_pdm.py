@@ -1,7 +1,7 @@
-"""Turn signals into the bits of sigma-delta modulators, one thread per microphone: the loop is recursive in time.
+"""Convert signals to the bits of sigma-delta modulators, with one thread per microphone.
 
-A multiplication and an addition that are rounded once, as compilers for GPUs like them, would change bits: what is
-added to nothing is rounded first.
+The loop is recursive in time. GPU compilers fuse a multiplication and an addition into one operation with a single
+rounding. This would change bits, so products are rounded explicitly.
 """
 
 import numpy as np
@@ -12,7 +12,7 @@ from ertis_numba.kernels._scalar import NOISE_UNIT, TO_GRID, dither_of, hash_of,
 
 __all__ = ["modulate_pdm"]
 
-_MICS = 32  # of a block: few, so that the microphones are spread over the GPU
+_MICS = 32  # per block: few, so that the microphones are spread over the GPU
 _SAMPLES = 128
 
 if SIMULATED:
@@ -38,7 +38,7 @@ def _clamp(x, limit):
 
 @cuda.jit(cache=True)
 def _modulate(signals, keys, noise_rms, states, loop, first, above):
-    """Fill ``above``, (sample, mic) uint8, with 1 where the quantiser says +1."""
+    """Fill ``above``, (sample, mic) uint8, with 1 where the quantiser's output is +1."""
     mic = np.uint64(cuda.grid(1))
     if mic >= np.uint64(above.shape[1]):
         return

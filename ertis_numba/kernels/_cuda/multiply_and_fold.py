@@ -1,4 +1,4 @@
-"""Multiply spectra by one filter per phase and fold each product to the length of the output."""
+"""Multiply spectra by one filter per phase, and fold each product to the length of the output."""
 
 import numpy as np
 from numba import cuda
@@ -13,7 +13,11 @@ _BLOCK = 128
 
 @cuda.jit(cache=True)
 def _fold(spectra, responses, first_bin, ahead, out):
-    """``ahead`` is what the first bin lacks to a multiple of the length of ``out``: a remainder is dear here."""
+    """Fill one bin of ``out``.
+
+    ``ahead`` is the distance from ``first_bin`` to the next multiple of the length of ``out``. It is an argument,
+    because a remainder is expensive on a GPU.
+    """
     k = np.int64(cuda.blockIdx.x * _BLOCK + cuda.threadIdx.x)
     if k >= out.shape[2]:
         return

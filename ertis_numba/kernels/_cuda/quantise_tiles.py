@@ -1,6 +1,6 @@
-"""Cut analytic signals into tiles of ranges and store each in 16 bits under its own scale.
+"""Split analytic signals into tiles of ranges, and store each in 16 bits with its own scale.
 
-Three launches: the largest power of each tile is known to all threads only when one of them has ended.
+There are three launches, because all threads see the largest power of each tile only after a launch has ended.
 """
 
 import math
@@ -13,8 +13,8 @@ from ertis_numba.kernels._scalar import imag_of, power, real_of, short_sample_of
 
 __all__ = ["quantise_tiles"]
 
-_WARP, _ROWS = 32, 4  # of a block
-_ROWS_PER_THREAD = 8  # of those that look for the largest, since they meet at one number in the end
+_WARP, _ROWS = 32, 4  # threads of a block along its two axes
+_ROWS_PER_THREAD = 8  # in the search for the largest power, because all threads update one number in the end
 
 
 @cuda.jit(cache=True)
@@ -26,7 +26,7 @@ def _clear(bits):
 
 @cuda.jit(cache=True)
 def _find_largest(signals, starts, width, bits):
-    """Fill ``bits`` with the largest squared magnitudes; floats that are not negative are ordered like their bits."""
+    """Fill ``bits`` with the largest squared magnitudes; non-negative floats have the same order as their bits."""
     tile = np.uint64(cuda.blockIdx.y)
     row = np.int64(cuda.blockIdx.x * _ROWS * _ROWS_PER_THREAD + cuda.threadIdx.y)
     begin = np.int64(starts[tile])
@@ -40,13 +40,13 @@ def _find_largest(signals, starts, width, bits):
             largest = max(largest, np.float32(power(real_of(x), imag_of(x))).view(np.int32))
             sample += _WARP
         row += _ROWS
-    if largest > bits[tile]:  # most are not, and need not wait for each other
+    if largest > bits[tile]:  # most are not, and avoid the atomic operation
         cuda.atomic.max(bits, tile, largest)
 
 
 @cuda.jit(cache=True)
 def _round(signals, starts, limit, bits, tiles, scales):
-    """``tiles`` are (tile, row, k) uint32: real part in the lower half, imaginary part in the upper one."""
+    """Fill ``tiles``, (tile, row, k) uint32, with real parts in the lower halves and imaginary parts in the upper."""
     tile = np.uint64(cuda.blockIdx.y)
     row = np.uint64(cuda.blockIdx.x * _ROWS + cuda.threadIdx.y)
     if row >= np.uint64(tiles.shape[1]):

@@ -1,4 +1,4 @@
-"""Move signals ahead in time."""
+"""Advance signals in time."""
 
 import numpy as np
 from numba import cuda

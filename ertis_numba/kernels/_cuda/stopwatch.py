@@ -1,6 +1,6 @@
-"""Time between places of a lane, taken by the GPU's own clock.
+"""Time between marks on a lane, measured by the GPU's own clock.
 
-Only benchmarks use this; it is no part of the signal chain.
+It is for benchmarks, not part of the signal chain.
 """
 
 from typing import Any
@@ -13,24 +13,24 @@ __all__ = ["Stopwatch"]
 
 
 class Stopwatch:
-    """Marks on the lane that a Python thread has entered; simulated ones take a millisecond from each to the next."""
+    """Marks on the lane that a Python thread has entered; on a simulated GPU they are one millisecond apart."""
 
     def __init__(self) -> None:
         self._marks: list[tuple[str, Any]] = []
 
     def start(self) -> None:
-        """Forget all marks and begin here."""
+        """Remove all marks, and start the measurement."""
         self._marks.clear()
         self.mark("")
 
     def mark(self, name: str) -> None:
-        """Say that what is called ``name`` ends here; it begins at the mark before."""
+        """Mark the end of the part ``name``, which began at the previous mark."""
         event = cuda.event() if SIMULATED else cuda.event(timing=True)
         event.record(current().stream)
         self._marks.append((name, event))
 
     def read_ms(self) -> dict[str, float]:
-        """Return how long everything took; parts of the same name are added up."""
+        """Return the time of each part in milliseconds; parts of the same name are added up."""
         self._marks[-1][1].synchronize()
         found: dict[str, float] = {}
         for (_, begin), (name, end) in zip(self._marks, self._marks[1:], strict=False):

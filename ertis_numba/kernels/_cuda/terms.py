@@ -1,8 +1,8 @@
 """Sums over the terms of a beam.
 
-A warp has one direction and its threads `RANGES_PER_THREAD` ranges each, that lie a warp apart. So a term's offset and
-weight are one load for all of them, and samples are whole lines of the cache. Complex numbers are uint64 here: a
-complex64 would be loaded in halves. Indices are unsigned: Numba tests signed ones for negative numbers.
+A warp handles one direction, and each thread `RANGES_PER_THREAD` ranges that are a warp apart. All threads share one
+load of a term's offset and weight, and samples are whole cache lines. Complex numbers are uint64 here, because a
+complex64 would take two loads. Indices are unsigned, because Numba tests signed ones for negative numbers.
 """
 
 import numpy as np
@@ -42,35 +42,35 @@ def complexes(array):
 
 
 def indexed(array):
-    """Return a flat array if 32 bits are enough for its indices, as kernels count on.
+    """Return a flat array unchanged after checking that 32-bit indices suffice, as kernels assume.
 
     Raises
     ------
     DeviceError
-        They are not.
+        The array is too large for 32-bit indices.
     """
     if array.size > _MAX_INDEXED:
         raise DeviceError(
-            f"device 'cuda' would have to index {array.size:,} numbers and can {_MAX_INDEXED:,}; "
-            "give a shorter record or range, or use device 'cpu'"
+            f"device 'cuda' would have to index {array.size:,} numbers; the limit is {_MAX_INDEXED:,}. "
+            "Give a shorter record or range, or use device 'cpu'"
         )
     return array
 
 
 def beam_grid(n_directions, n_ranges):
-    """Return the number of blocks for an image: those side by side read the same tile of signals."""
+    """Return the number of blocks for an image along both axes; adjacent blocks read the same tile of signals."""
     return -(-n_directions // DIRECTIONS), -(-n_ranges // TILE)
 
 
 @cuda.jit(device=True)
 def _sum_tile(signals, offsets, weights, n_terms, direction, place):
-    """Return real and imaginary parts of a beam at ``place`` and one, two and three warps further."""
+    """Return the real and imaginary parts of a beam at ``place``, and one, two and three warps further."""
     a_real = a_imag = b_real = b_imag = c_real = c_imag = d_real = d_imag = np.float32(0)
     entry = direction * n_terms
     end = entry + n_terms
     while entry < end:
         weight = weights[entry]
-        at = np.uint32(place + offsets[entry])  # of 32 bits: then an address is one instruction
+        at = np.uint32(place + offsets[entry])  # with 32 bits, an address is one instruction
         entry += ONE
         w_real, w_imag = real_of(weight), imag_of(weight)
         a, b, c, d = signals[at], signals[at + WARPS_1], signals[at + WARPS_2], signals[at + WARPS_3]
@@ -87,7 +87,7 @@ def _sum_tile(signals, offsets, weights, n_terms, direction, place):
 
 @cuda.jit(device=True)
 def _sum_terms(signals, offsets, weights, n_terms, direction, place):
-    """Return real and imaginary part of a beam at ``place``."""
+    """Return the real and the imaginary part of a beam at ``place``."""
     real = imag = np.float32(0)
     entry = direction * n_terms
     end = entry + n_terms
@@ -102,9 +102,9 @@ def _sum_terms(signals, offsets, weights, n_terms, direction, place):
 
 @cuda.jit(device=True)
 def fill_beams(value_of, signals, offsets, weights, n_terms, origin, first, stop, end, out):
-    """Write ``value_of`` both parts of a thread's beams from ``first`` to ``stop``, and of 0 from there to ``end``.
+    """Write ``value_of(real, imag)`` of a thread's beams from ``first`` to ``stop``, and of 0 from there to ``end``.
 
-    The grid begins at ``first``; ``origin`` is where the signals have the range that ``out`` has at 0.
+    The grid begins at ``first``. ``origin`` is the position in the signals of the first range of ``out``.
     """
     direction = np.uint64(cuda.blockIdx.x * DIRECTIONS + cuda.threadIdx.y)
     if direction >= np.uint64(out.shape[0]):
@@ -126,6 +126,6 @@ def fill_beams(value_of, signals, offsets, weights, n_terms, origin, first, stop
             real, imag = _sum_terms(signals, offsets, weights, terms, direction, origin + place)
             out[direction, np.uint64(place)] = value_of(real, imag)
             place += WARP
-        while stop < end and place < end:  # where they are the same argument, no code is made of this
+        while stop < end and place < end:  # if both are the same argument, the compiler removes this loop
             out[direction, np.uint64(place)] = value_of(np.float32(0), np.float32(0))
             place += WARP

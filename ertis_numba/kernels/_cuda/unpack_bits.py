@@ -1,4 +1,4 @@
-"""Turn the bits of PDM words into signals of +1 and −1."""
+"""Convert the bits of PDM words to signals of +1 and −1."""
 
 import numpy as np
 from numba import cuda

@@ -1,4 +1,4 @@
-"""Turn PCM numbers into signals."""
+"""Convert PCM samples to signals."""
 
 import numpy as np
 from numba import cuda
