@@ -1,6 +1,6 @@
-"""Imaging sonar in air: from the one-bit words of a microphone array to energyscapes and reflectors.
+"""Imaging sonar in air: from one-bit microphone data to energyscapes and reflectors.
 
-With the files that ``ertis example reflectors corridor`` copies::
+These examples use the files that ``ertis example reflectors corridor`` copies::
 
     import ertis_numba as ertis
 
@@ -10,13 +10,13 @@ With the files that ``ertis example reflectors corridor`` copies::
     peaks = ertis.find_peaks(image, top=5)
     ertis.plot(image, peaks=peaks).savefig("image.png")
 
-Or from a scene, whose truth is known::
+Simulate a scene and compare the image with its ground truth::
 
     simulator = ertis.Simulator(ertis.load_scene("corridor.toml"))
     image = ertis.Pipeline(simulator.sensor.settings()).process(simulator.render(0))
     comparison = ertis.compare(image, simulator.reflectors(0))
 
-Names are loaded when they are first used: importing the package loads neither Numba nor SciPy.
+Names are imported when they are first used: ``import ertis_numba`` loads neither NumPy, Numba nor SciPy.
 """
 
 import importlib
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from ertis_numba.analysis.detect import find_peaks
     from ertis_numba.analysis.health import health
     from ertis_numba.analysis.points import PointExtractor
+    from ertis_numba.arrays import beamform, demodulate, matched_filter
     from ertis_numba.devices.emulator import Emulator
     from ertis_numba.devices.setup import Setup
     from ertis_numba.devices.sonar import SonarDriver
@@ -49,8 +50,8 @@ if TYPE_CHECKING:
         SonarDisconnectedError,
         SonarError,
     )
-    from ertis_numba.figures import plot
-    from ertis_numba.frames import Energyscape, Measurement, Peak, PointCloud, Reflector, Stamp
+    from ertis_numba.figures import plot, plot_page
+    from ertis_numba.frames import Energyscape, Measurement, MicrophoneSignals, Peak, PointCloud, Reflector, Stamp
     from ertis_numba.geometry import load_layout
     from ertis_numba.interop import export, open_pcm, open_raw, open_rtis_folder
     from ertis_numba.journal import Entry
@@ -85,6 +86,7 @@ __all__ = [
     "JournalInUseError",
     "KeyPair",
     "Measurement",
+    "MicrophoneSignals",
     "NetworkError",
     "Peak",
     "Permission",
@@ -105,25 +107,30 @@ __all__ = [
     "SonarError",
     "Stamp",
     "Subscriber",
+    "beamform",
     "cfar_peaks",
     "compare",
+    "demodulate",
     "export",
     "find_peaks",
     "health",
     "load_layout",
     "load_scene",
+    "matched_filter",
     "open_energyscapes",
     "open_pcm",
     "open_raw",
     "open_recording",
     "open_rtis_folder",
     "plot",
+    "plot_page",
     "render",
     "write_energyscapes",
     "write_recording",
 ]
 
 _HOMES = {
+    "arrays": ("beamform", "demodulate", "matched_filter"),
     "devices.emulator": ("Emulator",),
     "devices.setup": ("Setup",),
     "devices.sonar": ("SonarDriver",),
@@ -145,8 +152,8 @@ _HOMES = {
         "SonarError",
         "SonarDisconnectedError",
     ),
-    "figures": ("plot",),
-    "frames": ("Energyscape", "Measurement", "Peak", "PointCloud", "Reflector", "Stamp"),
+    "figures": ("plot", "plot_page"),
+    "frames": ("Energyscape", "Measurement", "MicrophoneSignals", "Peak", "PointCloud", "Reflector", "Stamp"),
     "geometry": ("load_layout",),
     "interop": ("export", "open_pcm", "open_raw", "open_rtis_folder"),
     "journal": ("Entry",),
@@ -169,7 +176,7 @@ _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
 
 def __getattr__(name: str) -> Any:
-    """Load a public name when it is first asked for (PEP 562)."""
+    """Import a public name at its first use (PEP 562)."""
     if name == "__version__":
         value: Any = _version()
     elif name in _HOME_OF:
@@ -185,9 +192,9 @@ def __dir__() -> list[str]:
 
 
 def _version() -> str:
-    from importlib import metadata  # noqa: PLC0415  takes longer than all the rest of this file
+    from importlib import metadata  # noqa: PLC0415  takes longer to import than the rest of this file
 
     try:
         return metadata.version("ertis-numba")
-    except metadata.PackageNotFoundError:  # run from its source, not installed
+    except metadata.PackageNotFoundError:  # the package runs from its source without being installed
         return "unknown"

@@ -1,4 +1,4 @@
-"""Speed of sound in air, and absorption."""
+"""Speed of sound and absorption in air."""
 
 import math
 
@@ -22,11 +22,11 @@ _VAPOUR_HEAT_RATIO = 1.330
 
 
 def sound_speed_m_s(air: Air) -> float:
-    """Return the speed of sound in humid air in m/s.
+    """Return the speed of sound in humid air.
 
-    An ideal mixture of dry air and water vapour: ``c = sqrt(γ R T / M)``, with the molar mass and
-    the heat capacity of the mixture and the saturation pressure of ISO 9613-1, annex B. Dry air at
-    0 °C gives 331.3 m/s; humidity adds up to about 0.4 % at room temperature.
+    The model is an ideal mixture of dry air and water vapour, ``c = sqrt(γ R T / M)``, with the molar mass and the heat
+    capacity of the mixture and the saturation pressure of ISO 9613-1, annex B. Dry air at 0 °C gives 331.3 m/s;
+    humidity adds up to about 0.4 % at room temperature.
 
     Parameters
     ----------
@@ -35,6 +35,7 @@ def sound_speed_m_s(air: Air) -> float:
     Returns
     -------
     float
+        Metres per second.
     """
     kelvin = _ZERO_C_K + air.temperature_c
     vapour = _water_vapour_fraction(air)
@@ -45,10 +46,10 @@ def sound_speed_m_s(air: Air) -> float:
 
 
 def absorption_db_m(air: Air, frequency_hz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return how much of a plane wave the air takes, in dB/m, at each frequency.
+    """Return the absorption of a plane wave in air in dB/m at each frequency.
 
-    ISO 9613-1:1993, equations 3 to 5 and annex B: classical absorption and rotation, then the relaxation of
-    oxygen and of nitrogen.
+    ISO 9613-1:1993, equations 3 to 5 and annex B: the sum of classical and rotational absorption and of the relaxation
+    of oxygen and of nitrogen.
 
     Parameters
     ----------
@@ -78,4 +79,4 @@ def _water_vapour_fraction(air: Air) -> float:
     kelvin = _ZERO_C_K + air.temperature_c
     saturation: float = 10.0 ** (4.6151 - 6.8346 * (_TRIPLE_POINT_K / kelvin) ** 1.261)
     share = air.humidity_percent / 100 * saturation * _REFERENCE_PRESSURE_PA / air.pressure_pa
-    return min(share, 1.0)  # hot and thin air is all steam, never more
+    return min(share, 1.0)  # Hot and thin air is pure steam at most.

@@ -1,4 +1,4 @@
-"""A file appears under its name complete, or not at all."""
+"""Atomic writing of files: a file appears under its name complete or not at all."""
 
 import errno
 import os
@@ -22,13 +22,13 @@ __all__ = [
     "temporary_path",
 ]
 
-# HDF5 that meets a full disk while it closes a file can take the whole process with it (h5py issue
-# 914), so writing stops while there is still room for its tables.
+# HDF5 can crash the process if the disk becomes full while it closes a file (h5py issue 914). Writing therefore stops
+# while there is still room for its tables.
 RESERVED_BYTES = 8_000_000
 
 _FREE_SPACE_REMEDY = "free some space or write elsewhere"
-_PERMISSION_REMEDY = "see who may use it and its folder, or choose another"
-_MISSING_FOLDER_REMEDY = "see whether its folder is there, or choose another"
+_PERMISSION_REMEDY = "check the permissions of the file and its folder, or choose another"
+_MISSING_FOLDER_REMEDY = "check that its folder exists, or choose another"
 _REMEDIES = {
     errno.EACCES: _PERMISSION_REMEDY,
     errno.EPERM: _PERMISSION_REMEDY,
@@ -43,20 +43,20 @@ _REMEDIES = {
 
 
 def check_target(path: Path, *, overwrite: bool, sources: Iterable[Path] = ()) -> None:
-    """Refuse a path where no file can be put.
+    """Refuse a path to which no file can be written.
 
     Parameters
     ----------
     path : Path
     overwrite : bool
     sources : iterable of Path
-        Files that are read from, which are not overwritten whatever is asked for.
+        Input files, which are never overwritten.
 
     Raises
     ------
     ArgumentError
-        The folder is missing, the path is a folder, a link, a device or a source, or a file is there and
-        may not be replaced.
+        The folder is missing, the path is a folder, a link, a device or a source, or the file exists and
+        ``overwrite`` is False.
     """
     if path.is_dir():
         raise ArgumentError(f"output {path} is a folder; give the name of a file")
@@ -71,53 +71,58 @@ def check_target(path: Path, *, overwrite: bool, sources: Iterable[Path] = ()) -
 
 
 def remedy(error: Exception) -> str:
-    """Return what helps against an error of the system, whose number HDF5 has in the middle of its own words."""
+    """Return advice for an error of the operating system; HDF5 has the error number within its message."""
     inner = re.search(r"errno = (\d+)", str(error))
     number = int(inner[1]) if inner else getattr(error, "errno", None)
-    return _REMEDIES.get(number or 0, "look at the disk, or write elsewhere")
+    return _REMEDIES.get(number or 0, "check the disk, or write elsewhere")
 
 
-def require_free_space(folder: Path, n_bytes: int, *, purpose: str = "what is next") -> None:
-    """Refuse to write ``n_bytes`` into a folder that would then have no room to spare.
+def require_free_space(folder: Path, n_bytes: int, *, purpose: str = "the next data") -> None:
+    """Refuse to write to a disk on which less than `RESERVED_BYTES` would remain.
 
-    Errors name the ``purpose`` of the bytes.
+    Parameters
+    ----------
+    folder : Path
+    n_bytes : int
+    purpose : str
+        Purpose of the bytes, for the error.
 
     Raises
     ------
     DataError
-        The disk is full, or nearly so.
+        The disk is full, or nearly full.
     """
     free, wanted = shutil.disk_usage(folder).free, n_bytes + RESERVED_BYTES
     if free < wanted:
         raise DataError(
-            f"{folder} has {free / 1e6:.1f} MB free, wanted {wanted / 1e6:.1f} MB for {purpose}, "
-            f"{RESERVED_BYTES / 1e6:.0f} MB of it to spare; {_FREE_SPACE_REMEDY}"
+            f"{folder} has {free / 1e6:.1f} MB free, but {wanted / 1e6:.1f} MB are needed for {purpose}, including a "
+            f"reserve of {RESERVED_BYTES / 1e6:.0f} MB; {_FREE_SPACE_REMEDY}"
         )
 
 
 def temporary_path(path: Path, token: str) -> Path:
-    """Return the name under which a file is written that is to become ``path``."""
+    """Return the temporary name under which ``path`` is written."""
     return path.with_name(f"{path.name}.{token}.part")
 
 
 @contextmanager
 def atomic_write(path: Path, *, overwrite: bool = False, token: str | None = None) -> Iterator[Path]:
-    """Yield the name to write to; when the block ends well, that file becomes ``path``.
+    """Yield a temporary name to write to; when the block succeeds, that file is renamed to ``path``.
 
-    The name ends in ``.part`` and is nobody else's, so that two writers never share it. The
-    file reaches the disk before it takes its name. Whatever ends the block, no ``.part`` is left.
+    The temporary name is unique and ends in ``.part``. The file is synchronised with the disk before it is renamed.
+    If the block fails, the temporary file is removed.
 
     Parameters
     ----------
     path : Path
     overwrite : bool
     token : str, optional
-        What makes the name nobody else's; some random digits by default.
+        Unique part of the temporary name; random digits by default.
 
     Raises
     ------
     ArgumentError
-        As `check_target`, before the block and again before the file takes its name.
+        As for `check_target`, before the block and again before the file is renamed.
     OSError
         The file cannot be written; its ``filename`` is ``path``.
     """
@@ -128,33 +133,33 @@ def atomic_write(path: Path, *, overwrite: bool = False, token: str | None = Non
         fsync(part)
         check_target(path, overwrite=overwrite)
         part.replace(path)
-    except BaseException as error:  # Ctrl-C, too, must leave nothing behind
-        with suppress(OSError):  # where nothing can be written, nothing can be removed: what came first is to be told
+    except BaseException as error:  # Ctrl-C must not leave a temporary file either.
+        with suppress(OSError):  # The first error is the one to report.
             part.unlink(missing_ok=True)
         if isinstance(error, OSError) and (str(error.filename) == str(part) or _lacks_filename(error)):
-            error.filename = str(path)  # nobody else knows the name of a part
+            error.filename = str(path)  # The user does not know the temporary name.
         raise
     fsync(path.parent)
 
 
 def _lacks_filename(error: OSError) -> bool:
-    """Whether an error says that a disk is full, but not which file it was that had no room."""
+    """Return True for an error of a full disk that names no file."""
     return error.filename is None and error.errno in {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 
 def make_folder(path: Path, *, parents: bool = False) -> None:
-    """Make a folder and its name durable, even if the folder exists already.
+    """Create a folder, and synchronise its name with the disk even if it exists already.
 
     Parameters
     ----------
     path : Path
     parents : bool
-        Make missing parents, too.
+        Create missing parents, too.
 
     Raises
     ------
     OSError
-        It cannot be made.
+        The folder cannot be created.
     """
     missing = [each for each in path.parents if not each.exists()] if parents else []
     for each in (*reversed(missing), path):
@@ -168,9 +173,9 @@ def make_folder(path: Path, *, parents: bool = False) -> None:
 
 
 def fsync(path: Path) -> None:
-    """Bring a file, or the names in a folder, to the disk."""
+    """Synchronise a file, or the names in a folder, with the disk."""
     if path.is_dir() and os.name != "posix":
-        return  # there, a folder cannot be opened
+        return  # Windows cannot open folders.
     descriptor = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
     try:
         os.fsync(descriptor)

@@ -1,4 +1,4 @@
-"""The wording of argument errors: what came, what was wanted, the remedy."""
+"""Checks of arguments, whose errors name the argument, its value and the accepted values."""
 
 import difflib
 import math
@@ -33,12 +33,12 @@ _SENSOR_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.@+-]{0,254}")
 
 
 def finite(name: str, value: float) -> float:
-    """Return ``value`` as a float; refuse NaN, infinities and what is no number."""
+    """Return ``value`` as a float; refuse NaN, infinities and values that are no numbers."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.number):
         raise ArgumentError(f"{name} is {value!r}; give a number")
     try:
         number = float(value)
-    except OverflowError:  # a whole number of hundreds of digits
+    except OverflowError:  # an integer with hundreds of digits
         number = math.inf
     if not math.isfinite(number):
         raise ArgumentError(f"{name} is {number}; give a finite number")
@@ -83,7 +83,7 @@ def length(name: str, value: str, largest: int) -> None:
 
 
 def choice(name: str, value: object, known: Iterable[object]) -> None:
-    """Refuse a ``value`` that is not among ``known``, naming the nearest one."""
+    """Refuse a ``value`` that is not among ``known``; the error names the most similar one."""
     names = [str(item) for item in known]
     if str(value) in names:
         return
@@ -93,7 +93,7 @@ def choice(name: str, value: object, known: Iterable[object]) -> None:
 
 
 def finite_array(name: str, values: NDArray[np.floating]) -> None:
-    """Refuse an array that holds NaN or infinities, naming the first place."""
+    """Refuse an array that contains NaN or infinities; the error names the first index."""
     bad = np.argwhere(~np.isfinite(values))
     if bad.size:
         place = ", ".join(str(i) for i in bad[0])
@@ -107,13 +107,13 @@ def shape(name: str, actual: tuple[int, ...], wanted: tuple[int, ...]) -> None:
 
 
 def instance(name: str, value: object, wanted: type, source: str) -> None:
-    """Refuse a value of another type; ``source`` says where to get one, such as "Pipeline.process returns"."""
+    """Refuse a value of another type; ``source`` names its origin, such as "Pipeline.process returns"."""
     if not isinstance(value, wanted):
         raise ArgumentError(f"{name} is of type {type(value).__name__}; give {wanted.__name__}, which {source}")
 
 
 def items(name: str, values: Iterable[_ItemType], wanted: type, source: str) -> Iterator[_ItemType]:
-    """Yield values that are all of one type; refuse a single one, and what cannot be iterated."""
+    """Yield values and refuse those of another type; refuse an argument that is no iterable."""
     if not isinstance(values, Iterable):
         raise ArgumentError(f"{name} is of type {type(values).__name__}; give a list of {wanted.__name__}")
     for index, value in enumerate(values):
@@ -122,17 +122,17 @@ def items(name: str, values: Iterable[_ItemType], wanted: type, source: str) -> 
 
 
 def sensor_name(name: str) -> str:
-    """Return the name of a sensor if it can be that of a group in a file."""
+    """Return the name of a sensor if files can have a group of this name."""
     if not _SENSOR_NAME.fullmatch(name):
         raise ArgumentError(
-            f"sensor name {name[:80]!r} cannot stand in a file; give letters, digits and _, after the first also "
-            ". @ + -; 255 characters at most"
+            f"sensor name {name[:80]!r} cannot name a group in a file; give letters, digits and _, after the first "
+            "also . @ + -; at most 255 characters"
         )
     return name
 
 
 def sequence_gap(first: int, last: int, reason: str) -> None:
-    """Refuse sequence numbers from ``first`` to ``last`` that a file cannot say to be missing for this reason."""
+    """Refuse a gap, from sequence number ``first`` to ``last``, that files cannot store with this reason."""
     integer("last missing sequence number", last, integer("first missing sequence number", first, 0), 2**63 - 1)
     if not reason or not reason.isprintable() or len(reason.encode()) > _MAX_REASON_BYTES:
         raise ArgumentError(f"reason of a gap is {reason!r}; give a line of 1 to {_MAX_REASON_BYTES} bytes")

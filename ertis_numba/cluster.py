@@ -1,4 +1,4 @@
-"""A dask cluster: the only door to dask."""
+"""Clients and workers of a dask cluster; the only module that imports dask."""
 
 import asyncio
 import logging
@@ -24,31 +24,32 @@ __all__ = [
     "silence_loggers",
 ]
 
-_TIMEOUT_MARGIN_S: Final = 0.5  # than dask itself gives up, which then knows why
+_TIMEOUT_MARGIN_S: Final = 0.5  # after the timeout of dask, whose error names the cause
 
-# Its own annotations are partial.
+# The annotations of dask are partial.
 Client = Any
 Future = Any
 
 
 @dataclass(frozen=True, slots=True)
 class RemoteError:
-    """What a function that was called at the other end of a `WorkerActor` has raised, in a line."""
+    """Error of a function that a `WorkerActor` called, as text on one line."""
 
     text: str
 
 
 class WorkerActor:
-    """The end of a line that is in a worker: an actor of dask, called by its owner without the scheduler in between.
+    """Actor in a dask worker, which its client calls directly, without the scheduler.
 
-    A task costs a scheduler's decision and two of its batches each way, and its arguments are serialised twice more.
+    An ordinary task needs a decision of the scheduler and two of its batches each way, and its arguments are serialised
+    twice more.
     """
 
     async def call(self, function: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
-        """Return what a function returns, which is called in a thread of its own, or what it has `RemoteError`."""
+        """Call a function in its own thread and return its result, or `RemoteError` if it fails."""
         try:
             return await asyncio.to_thread(function, *arguments, **options)
-        except Exception as error:  # noqa: BLE001  what is raised here is then trouble of the line itself
+        except Exception as error:  # noqa: BLE001  an exception of the actor would count as a failure of the connection
             return RemoteError(f"{type(error).__name__}: {' '.join(str(error).split())[:200]}")
 
 
@@ -66,30 +67,30 @@ def connect(address: str, *, timeout_s: float) -> Client:
         import distributed  # noqa: PLC0415  another package, and not always there
 
     class Client(distributed.Client):  # a scheduler shows this name
-        """One that waits no longer than it may, even for a port that is no scheduler's and never answers."""
+        """Client that respects its timeout even if the port belongs to another service, which never answers."""
 
         async def _start(self, *arguments: Any, **options: Any) -> Any:
             start: Any = super()._start
             try:
                 return await asyncio.wait_for(start(*arguments, **options), timeout_s + _TIMEOUT_MARGIN_S)
             except BaseException:
-                await self._close()  # it would wait for an answer until the process ends, and complain
+                await self._close()  # It would wait until the process ends, and then log an error.
                 raise
 
     try:
         make: Any = Client
         return make(address, timeout=timeout_s, set_as_default=False, name="ertis")
     except (OSError, ValueError, TimeoutError) as error:
-        reported = " ".join(str(error).split())[:200] or f"what is there says nothing in {timeout_s:g} s"
+        reported = " ".join(str(error).split())[:200] or f"no answer within {timeout_s:g} s"
         raise NetworkError(
-            f"no dask scheduler answers at {address} ({reported}); give the address that 'dask scheduler' has printed"
+            f"no dask scheduler answers at {address} ({reported}); give the address that 'dask scheduler' prints"
         ) from error
 
 
 @contextmanager
 def silence_loggers() -> Iterator[None]:
-    """Keep dask from printing, on its own account, what is told otherwise, until the block ends."""
-    import distributed  # noqa: PLC0415, F401  its loggers are made, each with a level, when it is loaded
+    """Silence the loggers of dask within the block; its errors are reported otherwise."""
+    import distributed  # noqa: PLC0415, F401  importing it creates its loggers and sets their levels
 
     names = [name for name in list(logging.root.manager.loggerDict) if name.startswith("distributed.")]
     loggers = [logger for logger in map(logging.getLogger, names) if logger.level != logging.NOTSET]
@@ -109,7 +110,7 @@ def require_workers(client: Client, address: str, *, timeout_s: float) -> None:
     Raises
     ------
     NetworkError
-        It has none.
+        The scheduler has no worker within the timeout.
     """
     try:
         client.wait_for_workers(1, timeout=timeout_s)
@@ -120,12 +121,12 @@ def require_workers(client: Client, address: str, *, timeout_s: float) -> None:
 
 
 class WorkerActors:
-    """Lines to the workers of a scheduler; each ends with the client, or when it is let go of.
+    """Actors in the workers of a scheduler; each ends with the client, or when it is no longer referenced.
 
     Parameters
     ----------
     client : Client
-        Its calls go to workers directly from now on, rather than through the scheduler.
+        From now on, it calls workers directly rather than through the scheduler.
     """
 
     def __init__(self, client: Client) -> None:
@@ -134,15 +135,15 @@ class WorkerActors:
         self._pending: dict[str, tuple[Future, Future]] = {}
 
     def connected(self, addresses: Collection[str], *, timeout_s: float) -> dict[str, tuple[Any, int]]:
-        """Return a new `WorkerActor` to each worker that is reached by now, and the number of its process.
+        """Return a new `WorkerActor` in each worker that answers within the timeout, and the number of its process.
 
-        Of the others those that are asked for the next time, too, go on being waited for: one that is dead, which the
-        scheduler may not know yet, holds up the rest for no longer than the timeout.
+        Workers that do not answer yet are waited for in the next call, if it names them again. A worker that is dead
+        unknown to the scheduler therefore delays the others by no more than the timeout.
         """
-        import distributed  # noqa: PLC0415  it is there, as there is a client
+        import distributed  # noqa: PLC0415  it is installed, since a client exists
 
         wait: Any = distributed.wait
-        with self._client.as_current():  # whose they are
+        with self._client.as_current():  # which owns them
             self._pending = {address: self._pending.get(address) or self._submit(address) for address in addresses}
             with suppress(TimeoutError):
                 wait([future for futures in self._pending.values() for future in futures], timeout=timeout_s)
@@ -164,14 +165,14 @@ def _all_finished(futures: tuple[Future, ...]) -> bool:
 
 def current_worker() -> Any:
     """Return the worker that runs this task."""
-    from distributed import get_worker  # noqa: PLC0415  there is one where this runs
+    from distributed import get_worker  # noqa: PLC0415  this runs in a worker
 
     return get_worker()
 
 
 @contextmanager
 def local_cluster(n_workers: int, *, n_threads: int = 1) -> Iterator[str]:
-    """Yield the address of a scheduler with workers on this machine, which end with the block.
+    """Yield the address of a scheduler with workers on this machine; all end with the block.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Numbers of nature and of the eRTIS hardware, each with its source."""
+"""Physical constants, properties of the eRTIS hardware, and limits, each with its source."""
 
 from typing import Final
 
@@ -18,8 +18,10 @@ STANDARD_HUMIDITY_PERCENT: Final = 50.0
 STANDARD_PRESSURE_PA: Final = 101_325.0  # ISO 9613-1, reference pressure
 
 ERTIS_PDM_RATE_HZ: Final = 4_500_000.0  # eRTIS in ultrasonic mode
-SYNC_STEP_S: Final = 400e-9  # from one sensor of the SYNC chain to the next; Jansen et al., 2019
+SYNC_STEP_S: Final = 400e-9  # delay between neighbours in the SYNC chain; Jansen et al., 2019
 
 MAX_MICROPHONES: Final = 1024
-MAX_NAME_LENGTH: Final = 4096  # characters of a name or path in settings, as PATH_MAX of Linux; HDF5 takes 65,536 bytes
+MAX_NAME_LENGTH: Final = (
+    4096  # characters of a name or path in settings: PATH_MAX of Linux; the limit of HDF5 is 65,536 bytes
+)
 WORD_BITS: Final = (8, 16, 32, 64)

@@ -1,4 +1,4 @@
-"""What this process may compute on."""
+"""Processor cores that this process may use."""
 
 import os
 
@@ -6,5 +6,5 @@ __all__ = ["usable_cores"]
 
 
 def usable_cores() -> int:
-    """Return how many cores this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,10 +1,11 @@
-"""Frozen structures with TOML in and out: what settings, scenes and layouts are made of.
+"""Frozen structures that are read from TOML and written to it: the base of settings, scenes and layouts.
 
-A structure checks itself once, when it is made, in its ``__post_init__``: first that values are of the types of their
-fields, then what they are. Unknown keys are refused.
+A structure checks its values when it is created, in ``__post_init__``: first their types, then their ranges. It refuses
+unknown keys.
 """
 
 import bisect
+import difflib
 import os
 import re
 import reprlib
@@ -16,7 +17,6 @@ from typing import Any, ClassVar, Final, Literal, Self, get_args, get_origin
 import msgspec
 import tomli_w
 
-from ertis_numba import checks
 from ertis_numba.errors import ArgumentError, SettingsError
 
 __all__ = ["MAX_KEY_PARTS", "TomlDocument", "TomlTable"]
@@ -38,14 +38,14 @@ _TYPE_NAMES = {
     "null": "None",
     "str": "text",
 }
-"""What msgspec calls types, in words."""
+"""Descriptions of the types that msgspec names in errors."""
 
 
 class TomlTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A table of a TOML file.
+    """Table of a TOML file.
 
-    Lists may stand for tuples, whole numbers for numbers, those and arrays of NumPy for Python's own, and paths for
-    their text; fields hold what a file would give.
+    Lists are accepted for tuples, integers for floating-point numbers, NumPy numbers and arrays for those of Python,
+    and paths for text. Fields hold the same types as after reading a file.
     """
 
     def __post_init__(self) -> None:
@@ -62,34 +62,99 @@ class TomlTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 
     @classmethod
     def label(cls) -> str:
-        """Return what errors call it."""
+        """Return the name of the table in errors."""
         return cls.__name__.lower().lstrip("_")
 
-    def replace(self, **changes: Any) -> Self:
-        """Return a copy with some fields changed, checked again.
+    def replace(self, path: str = "", value: Any = None, /, **changes: Any) -> Self:
+        """Return a copy with some keys changed, checked again.
+
+        Parameters
+        ----------
+        path : str, optional
+            Key to change, such as ``range_m``, or ``processing.range_m`` in a nested table.
+        value : optional
+            New value of that key.
+        **changes
+            New values by key. Keys of nested tables are given as ``**{"processing.range_m": (0.5, 3)}``. All changes
+            of a table are checked together.
+
+        Returns
+        -------
+        Self
 
         Raises
         ------
         ArgumentError
-            There is no such field, or a value cannot be used.
+            There is no such key, or a value cannot be used.
+
+        Examples
+        --------
+        >>> from ertis_numba import Settings
+        >>> Settings().replace("processing.range_m", (0.5, 3)).processing.range_m
+        (0.5, 3.0)
+        >>> changed = Settings().replace(**{"accuracy.max_error_db": -50, "processing.directions": "2d:181"})
+        >>> changed.accuracy.max_error_db, changed.processing.directions
+        (-50.0, '2d:181')
         """
-        unknown = set(changes) - set(self.__struct_fields__)
-        if unknown:
-            checks.choice(f"{type(self).__name__} field", min(unknown), self.__struct_fields__)
-        return msgspec.structs.replace(self, **changes)
+        if path:
+            changes = {path: value, **changes}
+        own: dict[str, Any] = {}
+        nested: dict[str, dict[str, Any]] = {}
+        for key, new in changes.items():
+            name, dot, inner = key.partition(".")
+            if name not in self.__struct_fields__:
+                raise self._unknown_key(key)
+            if not dot:
+                own[name] = new
+            elif isinstance(own.get(name, getattr(self, name)), TomlTable):
+                nested.setdefault(name, {})[inner] = new
+            else:
+                raise ArgumentError(f"{self.label()} key {key!r} is unknown: {name} is no table; give {name!r}")
+        for name, within in nested.items():
+            table: TomlTable = own.get(name, getattr(self, name))
+            known = {inner.partition(".")[0] for inner in within} <= set(table.__struct_fields__)
+            if not known:
+                wrong = next(inner for inner in within if inner.partition(".")[0] not in table.__struct_fields__)
+                raise self._unknown_key(f"{name}.{wrong}")
+            own[name] = table.replace(**within)
+        return msgspec.structs.replace(self, **own)
+
+    def _paths(self) -> Iterator[str]:
+        """Yield the keys of this table and of those in it."""
+        for name in self.__struct_fields__:
+            yield name
+            value = getattr(self, name)
+            if isinstance(value, TomlTable):
+                yield from (f"{name}.{inner}" for inner in value._paths())  # noqa: SLF001  of its own kind
+
+    def _unknown_key(self, key: str) -> ArgumentError:
+        """Return an error with the most similar keys."""
+        start, dot, inner = key.partition(".")
+        table: TomlTable = getattr(self, start) if dot and start in self.__struct_fields__ else self
+        within = "" if table is self else f" in {start!r}"
+        if within:
+            near = [f"{start}.{path}" for path in difflib.get_close_matches(inner, list(table._paths()), n=3)]
+        else:
+            paths, last = list(self._paths()), key.rpartition(".")[2]
+            near = [path for path in paths if path.rpartition(".")[2] == last]
+            near = near or difflib.get_close_matches(key, paths, n=3)
+            near = near or [path for path in paths if difflib.get_close_matches(last, [path.rpartition(".")[2]])]
+        hint = f" (did you mean {' or '.join(map(repr, near[:3]))}?)" if near else ""
+        known = ", ".join(table.__struct_fields__)
+        return ArgumentError(f"{self.label()} key {key[:80]!r} is unknown{hint}; known{within} are {known}")
 
 
 class TomlDocument(TomlTable, frozen=True, kw_only=True):
-    """A whole TOML file.
+    """Content of a TOML file.
 
     Attributes
     ----------
     former_keys : dict of str to str
-        Names that keys had, and have now: recordings hold documents, and those of before stay readable.
+        Former and present names of keys, so that documents in older recordings stay readable.
     max_bytes : int
         Limit on the length of a document in UTF-8.
     max_items : int
-        Limit on its lines and commas, which bound the time to parse it.
+        Limit on its lines and commas, on which the time to parse it depends.
     """
 
     former_keys: ClassVar[dict[str, str]] = {}
@@ -106,7 +171,7 @@ class TomlDocument(TomlTable, frozen=True, kw_only=True):
         source : str, optional
             Name of the document in errors, such as its path.
         find_line : bool
-            Name the line of an error. This parses the text several times; switch it off for text that nobody edits.
+            Name the line of an error. This parses the text several times; switch it off for text that no one edits.
 
         Raises
         ------
@@ -120,13 +185,13 @@ class TomlDocument(TomlTable, frozen=True, kw_only=True):
         except msgspec.ValidationError as error:
             line = _line_of_error(cls, text, error) if find_line else 0
             raise SettingsError(_document_error(cls, source, error, f", line {line}" if line else "")) from error
-        except msgspec.DecodeError as error:  # a syntax error, which names its line itself
+        except msgspec.DecodeError as error:  # A syntax error names its line itself.
             raise SettingsError(_document_error(cls, source, error)) from error
         except RecursionError as error:
             raise SettingsError(
                 f"{source or cls.label()}: lists or tables are nested too deeply; flatten them"
             ) from error
-        except ValueError as error:  # a number of thousands of digits
+        except ValueError as error:  # a number with thousands of digits
             raise SettingsError(
                 f"{source or cls.label()}: {' '.join(str(error).split())}; give a shorter number"
             ) from error
@@ -151,6 +216,10 @@ class TomlDocument(TomlTable, frozen=True, kw_only=True):
     def load(cls, path: str | Path) -> Self:
         """Read a file.
 
+        Parameters
+        ----------
+        path : str or Path
+
         Raises
         ------
         SettingsError
@@ -160,7 +229,7 @@ class TomlDocument(TomlTable, frozen=True, kw_only=True):
 
     @classmethod
     def _load(cls, path: Path) -> tuple[Self, dict[str, Any]]:
-        """Return what is in a file, and the tables of it as they are written, by the keys of now."""
+        """Return the content of a file, and its tables as written but with the present names of keys."""
         try:
             text = path.read_text(encoding="utf-8-sig")
         except (OSError, UnicodeDecodeError) as error:
@@ -181,7 +250,7 @@ class TomlDocument(TomlTable, frozen=True, kw_only=True):
 
 @cache
 def _type_checking_struct(kind: type[TomlTable]) -> type[msgspec.Struct]:
-    """Return a structure of the same fields that checks their types only; choices are left to their own check."""
+    """Return a structure with the same fields that checks only types; choices are checked elsewhere."""
     fields = [
         (field.name, str if get_origin(field.type) is Literal else field.type) for field in msgspec.structs.fields(kind)
     ]
@@ -189,7 +258,7 @@ def _type_checking_struct(kind: type[TomlTable]) -> type[msgspec.Struct]:
 
 
 def _to_builtin(value: Any) -> Any:
-    """Return what is of NumPy, such as a position that was computed, or a path, as Python's own."""
+    """Convert NumPy numbers and arrays, and paths, to types of Python."""
     if isinstance(value, dict):
         return {key: _to_builtin(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -200,17 +269,17 @@ def _to_builtin(value: Any) -> Any:
 
 
 def _type_error(table: TomlTable, given: dict[str, Any], error: str) -> str:
-    """Return an error of types in the words of this package: the key, what came, what was wanted."""
+    """Return the message of a type error: key, value and accepted types."""
     reason, _, path = error.partition(" - at `$")
     expected = _EXPECTED.match(reason)
-    if expected is None and reason != "Number out of range":  # a table's own, given as a dictionary
+    if expected is None and reason != "Number out of range":  # the error of a table that was given as a dictionary
         return reason
     value: Any = given
     for name, place in _PATH_PART.findall(path):
         value = value[name or int(place)]
     key = f"{table.label()}{path.rstrip('`')}"
     if expected is None:
-        return f"{key} is beyond all numbers; give a finite number"
+        return f"{key} exceeds the range of floating-point numbers; give a finite number"
     if expected[2]:
         return f"{key} has shape ({expected[3]},); give shape ({expected[2]},)"
     field = next(field for field in msgspec.structs.fields(table) if field.name == _PATH_PART.findall(path)[0][0])
@@ -220,7 +289,7 @@ def _type_error(table: TomlTable, given: dict[str, Any], error: str) -> str:
 
 
 def _tables(kind: Any) -> Iterator[type[TomlTable]]:
-    """Yield the tables that a field may hold."""
+    """Yield the table types that a field accepts."""
     if isinstance(kind, type) and issubclass(kind, TomlTable):
         yield kind
     for part in get_args(kind):
@@ -228,7 +297,7 @@ def _tables(kind: Any) -> Iterator[type[TomlTable]]:
 
 
 def _without_none(value: Any) -> Any:
-    """TOML has no null: what is not given is left out."""
+    """Remove keys without a value, because TOML has no null."""
     if isinstance(value, dict):
         return {key: _without_none(item) for key, item in value.items() if item is not None}
     if isinstance(value, list | tuple):
@@ -237,25 +306,25 @@ def _without_none(value: Any) -> Any:
 
 
 def _document_error(kind: type[TomlDocument], source: str | None, error: msgspec.MsgspecError, line: str = "") -> str:
-    """Return an error in the words of this package: where, what came, the remedy."""
+    """Return the message of an error: place, problem and remedy."""
     reason, _, path = str(error).partition(" - at `$")
     path = f", {path.strip('.`')}" if path.strip(".`") else ""
     reason = reason.replace("Object contains unknown field", "unknown key")
     if reason.startswith("Object missing required field "):
         reason = f"{reason.removeprefix('Object missing required field ')} is missing; give it"
-    remedy = "" if ";" in reason else "; correct it or take it out"
+    remedy = "" if ";" in reason else "; correct it or remove it"
     return f"{source or kind.__name__.lower()}{line}{path}: {reason}{remedy}"
 
 
 def _line_of_error(kind: type[TomlDocument], text: str, error: msgspec.ValidationError) -> int:
-    """Return the number of the line that an error is about, counted from 1.
+    """Return the number of the line with the error, counted from 1.
 
-    That is the line in the erring table whose key the error names, or the first line of the table; 0 if there is none.
+    It is the line of the key that the error names, or the first line of the table with the error; 0 if there is none.
     """
     lines = text.splitlines()
     starts = [1, *(n for n, line in enumerate(lines, 1) if n > 1 and _HEADER.match(line))]
     stops = [*starts[1:], len(lines) + 1]
-    # Tables are read one after the other, and what errs once keeps erring: the first one is found by halves.
+    # Tables are read in order, and an error persists as lines are added, so that bisection finds the first wrong table.
     table = bisect.bisect_left(stops[:-1], x=True, key=lambda stop: _error(kind, lines[: stop - 1]) == str(error))
     begin, stop = starts[table], stops[table]
     reported, _, path = str(error).partition(" - at `$")

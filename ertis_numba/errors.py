@@ -1,25 +1,25 @@
-"""Every error this package raises on purpose, in one tree.
+"""Exceptions and warnings of this package.
 
 ::
 
     ErtisError
     ├── ArgumentError (ValueError)       a value given by the caller cannot be used
     │   └── SettingsError                a settings file or structure cannot be used
-    ├── DataError (ValueError)           a file or measurement does not hold what it should
-    │   ├── DamagedError                 it is not what was written, and never will be
+    ├── DataError (ValueError)           a file or measurement has unexpected content
+    │   ├── DamagedError                 its content is damaged; reading it again does not help
     │   ├── ForeignDataError             a file has links, filters, or data under several names or in other files
-    │   ├── FormatVersionError           a file was written by a newer version
+    │   ├── FormatVersionError           a newer version wrote the file
     │   ├── InUseError                   a journal belongs to another process
-    │   └── NoRoomError                  a disk is too full, and nothing was written
-    ├── DeviceError (RuntimeError)       the compute device asked for is not there
+    │   └── NoRoomError                  a disk is full; nothing was written
+    ├── DeviceError (RuntimeError)       the compute device is not available
     ├── SonarError (OSError)             a sensor cannot be opened or does not answer as it should
     │   └── SonarGoneError               it was unplugged
     └── NetworkError (OSError)           another node cannot be reached or does not answer as it should
-        └── RefusedError                 it does not let this one in, or not do what was asked
+        └── RefusedError                 it denies access or rejects a request
 
-Each class also inherits the builtin that a caller would catch without knowing this package. Two warnings stand beside
-them, both ``UserWarning``: ``ErrorBudgetWarning``, for images that may exceed their error budget, and
-``CallMismatchWarning``, for echoes that do not match the call.
+Each class also inherits the built-in exception in brackets. Two warnings, both ``UserWarning``, complete them:
+``ErrorBudgetWarning`` for images that may exceed their error budget, and ``CallMismatchWarning`` for echoes that do not
+match the call.
 """
 
 __all__ = [
@@ -43,7 +43,7 @@ __all__ = [
 
 
 class ErtisError(Exception):
-    """Base of all errors raised on purpose; its text is one line fit to show to a user."""
+    """Base class of all exceptions of this package; the message is one line that can be shown to users."""
 
 
 class ArgumentError(ErtisError, ValueError):
@@ -55,11 +55,11 @@ class SettingsError(ArgumentError):
 
 
 class DataError(ErtisError, ValueError):
-    """A file or a measurement does not hold what it should."""
+    """A file or a measurement has unexpected content."""
 
 
 class DamagedError(DataError):
-    """What is in a file is not what was written; to read it again, as after a fault of the disk, does not help."""
+    """The content of a file is damaged; reading it again does not help."""
 
 
 class ForeignDataError(DataError):
@@ -71,7 +71,7 @@ class FormatVersionError(DataError):
 
 
 class JournalInUseError(DataError):
-    """A journal belongs to another process: a capture that runs, or what seals it."""
+    """A journal is in use by another process, such as a running capture or its sealing."""
 
 
 class DiskFullError(DataError):
@@ -79,7 +79,7 @@ class DiskFullError(DataError):
 
 
 class DeviceError(ErtisError, RuntimeError):
-    """The compute device asked for is not available."""
+    """The compute device is not available."""
 
 
 class SonarError(ErtisError, OSError):
@@ -95,12 +95,12 @@ class NetworkError(ErtisError, OSError):
 
 
 class RefusedError(NetworkError):
-    """Another node does not let this one in, or does not do what was asked."""
+    """Another node denies access or rejects a request."""
 
 
 class ErrorBudgetWarning(UserWarning):
-    """Images may exceed the error budget that the pipeline was made for."""
+    """Images may exceed the error budget of their pipeline."""
 
 
 class CallMismatchWarning(UserWarning):
-    """Echoes are not those of the call that the settings name, so ranges in images are wrong."""
+    """Echoes do not match the call in the settings, so that ranges in images are wrong."""

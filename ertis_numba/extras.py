@@ -1,4 +1,4 @@
-"""Optional dependencies: ``pip install 'ertis-numba[EXTRA]'`` brings them."""
+"""Optional dependencies, which ``pip install 'ertis-numba[EXTRA]'`` installs."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -30,6 +30,6 @@ def extra(name: str, need: str, kind: type[ErtisError] = ArgumentError) -> Itera
         yield
     except ImportError as error:
         if error.name is not None and error.name.partition(".")[0] == "ertis_numba":
-            raise  # a mistake in this package, not a missing extra
+            raise  # a bug in this package, not a missing extra
         reason = " ".join(str(error).split())
         raise kind(f"{need} ({reason}); run \"pip install 'ertis-numba[{name}]'\"") from error

@@ -1,7 +1,8 @@
-"""From measurements to energyscapes."""
+"""Signal chain from measurements to energyscapes."""
 
+import itertools
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
@@ -10,13 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks, kernels
+from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError, CallMismatchWarning, DataError, DeviceError, ErrorBudgetWarning
-from ertis_numba.frames import Energyscape, Measurement
+from ertis_numba.frames import Energyscape, Measurement, MicrophoneSignals
 from ertis_numba.geometry import Grid, microphones
 from ertis_numba.sample_format import sample_format
 from ertis_numba.settings import ERROR_PRESETS_DB, Array, Settings
 from ertis_numba.stages import planner
 from ertis_numba.stages.chain import Chain
+from ertis_numba.stages.costs import PLAN_COSTS, PlanCosts
 from ertis_numba.stages.fast import FastChain
 from ertis_numba.stages.memory import require_memory
 
@@ -26,61 +29,73 @@ if TYPE_CHECKING:
 __all__ = ["Pipeline"]
 
 _CALL_CHECKS: Final = 8
+_GPU_BATCH: Final = 16  # measurements; several times as many as a GPU has lanes
+_MAX_BATCH_BYTES: Final = 2**30
 
 
 class Pipeline:
-    """The whole signal chain for one kind of measurement.
+    """Signal chain for measurements of one sensor.
 
-    Tables and buffers are made here, once. A pipeline may be used by several threads at a time; make one
-    in each process.
+    The constructor chooses the plan, computes tables, allocates buffers and compiles kernels. Several threads may use
+    one pipeline at the same time; each process needs its own.
 
     Parameters
     ----------
     settings : Settings or str or Path
         Settings, or the path of a TOML file with them.
     device : {"auto", "cpu", "cuda", "numpy"}
-        ``auto`` is an NVIDIA GPU, ``cuda``, where there is one and what it needs is installed, else ``cpu``. ``numpy``
-        runs the same algorithm without compiled kernels, for comparison. The paper's method has no compiled kernels.
+        Compute device. ``auto`` is ``cuda``, an NVIDIA GPU, if there is one and its libraries are installed, otherwise
+        ``cpu``. ``numpy`` runs the same algorithm without compiled kernels, for comparison. The paper's method always
+        runs on ``numpy``.
     threads : int, optional
-        Threads of one `process`; all cores by default. Neither the plan nor the result depends on it.
+        Threads of one call of `process`; all cores by default. Neither the plan nor the result depends on it.
     max_error_db : float or {"draft", "standard", "fine", "exact"}, optional
-        Error that the images may have; that of ``settings.accuracy`` by default.
+        Error budget of the images in dB; that of ``settings.accuracy`` by default.
     graphs : bool
-        Whether a GPU records the chain as a CUDA graph, which saves the processor the launches.
+        Record the chain as a CUDA graph, which saves the time to launch its kernels.
     max_bytes : int, optional
-        Limit on the predicted memory, checked before any is allocated. By default, only a plan's tables are limited, to
-        2 GiB, or to the memory that the machine has available if no plan within 2 GiB keeps the error budget.
+        Limit on the predicted memory, checked before any is allocated. By default, only the tables of a plan are
+        limited: to 2 GiB, or to the available memory if no plan within 2 GiB keeps the error budget.
     predict : bool
         Predict the error of the first image, and of each image that is 10 dB fainter than all predicted before. Issue
         an `ErrorBudgetWarning`, once, if images may exceed the budget. A prediction takes some 0.2 s and memory for
-        another image. Records whose prediction takes more than 256 MB have none, and nor has the paper's method.
-        Compare echoes with the call, too, and issue a `CallMismatchWarning` if they do not match.
+        another image. It is omitted if it would need more than 256 MB, and for the paper's method. Also compare echoes
+        with the call, and issue a `CallMismatchWarning` if they do not match.
+    plan : {"nominal", "measured"}
+        Costs of kernels by which the planner chooses the fastest plan. ``nominal`` costs are published with this
+        package: the same settings give the same plan, hence the same bits, on all machines with the same instruction
+        set. ``measured`` costs are those of this machine, measured when they are first needed; the plan is faster on
+        unusual machines. ``settings`` of the pipeline and of its images hold the plan that was chosen.
 
     Attributes
     ----------
     settings : Settings
-        With the plan that was chosen: their accuracy leaves nothing open.
+        Settings with the complete plan in ``accuracy``.
     device : str
-        The device that was chosen.
+        Compute device in use.
     grid : Grid
-        The direction axis of the images.
+        Directions of the images.
     range_m : (range,) float64
-        The range axis of the images.
+        Ranges of the images in metres.
 
     Raises
     ------
     ArgumentError
-        The settings name a layout, grid or range that cannot be used, no plan keeps the limits on error and memory, or
-        the device is unknown or has no graphs.
+        The settings have a layout, grid or range that cannot be used, no plan keeps the limits on error and memory, or
+        the device is unknown or does not support graphs.
     DeviceError
-        The device cannot be used here, or has too little memory.
+        The device is not available, or has too little memory.
 
     Examples
     --------
-    A pipeline holds a GPU's memory until it is closed::
+    Close a pipeline to free its memory, or use it in a ``with`` statement. The command ``ertis example reflectors``
+    copies the recording:
 
-        with Pipeline(recording.settings, device="cuda") as pipeline:
-            images = pipeline.process_batch(recording)
+    >>> import ertis_numba as ertis
+    >>> with ertis.open_recording("reflectors.h5") as recording, ertis.Pipeline(recording.settings) as pipeline:
+    ...     images = pipeline.process_batch(recording)
+    >>> images[0].energy.shape == (len(pipeline.grid), len(pipeline.range_m))
+    True
     """
 
     def __init__(
@@ -93,7 +108,9 @@ class Pipeline:
         graphs: bool = False,
         max_bytes: int | None = None,
         predict: bool = True,
+        plan: PlanCosts = "nominal",
     ) -> None:
+        checks.choice("plan", plan, PLAN_COSTS)
         if isinstance(settings, str | Path):
             settings = Settings.load(settings)
         if not isinstance(settings, Settings):
@@ -107,21 +124,22 @@ class Pipeline:
             max_error_db = ERROR_PRESETS_DB[max_error_db]
         kernel_set = kernels.load(_device_for(settings, device))
         threads = kernel_set.max_threads if threads is None else threads
-        with kernel_set.threads(threads):  # refuses a number that cannot be had
+        with kernel_set.threads(threads):  # refuses an impossible number
             pass
         if max_error_db is not None and settings.processing.method == "paper":
             raise ArgumentError(
-                f"max_error_db is {max_error_db:g}, and processing.method 'paper' has no plans; leave it out or give "
-                "method 'fast'"
+                f"max_error_db is {max_error_db:g}, but processing.method 'paper' has no error budget; leave it out or "
+                "give method 'fast'"
             )
         if max_error_db is not None:
             settings = settings.replace(accuracy=settings.accuracy.replace(max_error_db=float(max_error_db)))
-        settings = planner.complete(settings, kernel_set, threads=threads, max_bytes=left_bytes)
+        settings = planner.complete(settings, kernel_set, threads=threads, max_bytes=left_bytes, plan=plan)
         self.settings = settings
         self.device = kernel_set.device
         self._accepted_settings = settings
         self._format = sample_format(settings)
         self._closed = False
+        self._threads = threads
         self._monitor = (
             _budget_monitor(kernel_set, threads) if predict and settings.processing.method == "fast" else None
         )
@@ -140,17 +158,28 @@ class Pipeline:
         ----------
         measurement : Measurement
         out : (direction, range) float32, optional
-            Where the energy goes; a new array by default. Besides it, only the spectra are allocated anew.
+            Array for the amplitudes; a new one by default.
         threads : int, optional
-            Those of the pipeline by default, and at most those of its device.
+            Number of threads; that of the pipeline by default.
+
+        Returns
+        -------
+        Energyscape
 
         Raises
         ------
         DataError
-            The measurement's array, call, record or air, or its words, are not those of the pipeline's
-            settings.
+            The measurement's array, call, record or air, or its words, are not those of the pipeline's settings.
         ArgumentError
-            ``out`` has another shape or type, or there are fewer threads.
+            ``out`` has another shape or type, or the device has fewer threads.
+
+        Examples
+        --------
+        >>> import ertis_numba as ertis
+        >>> with ertis.open_recording("reflectors.h5") as recording:
+        ...     image = ertis.Pipeline(recording.settings).process(recording[0])
+        >>> bool(image.level_dbfs.max() < 0)
+        True
         """
         checks.instance("measurement", measurement, Measurement, "a recording holds")
         words, exponent = self._words_of(measurement)
@@ -162,20 +191,32 @@ class Pipeline:
         return image
 
     def process_batch(self, measurements: Iterable[Measurement]) -> list[Energyscape]:
-        """Return the energyscapes of several measurements, in their order, bit by bit as `process` gives them.
+        """Return the energyscapes of several measurements, in their order, with the same bits as from `process`.
 
-        A GPU takes one measurement in, works on another and gives back a third at the same time. The cores of a
-        processor each take a measurement of their own, if there are as many; fewer go one after the other.
+        A GPU overlaps transfers and computation of consecutive measurements. On a processor, each core processes a
+        measurement of its own if there are enough of them. `process_many` needs less memory.
 
         Parameters
         ----------
         measurements : iterable of Measurement
-            All are read before the first one is processed, and all images are held in memory.
+            All are read before the first one is processed, and all images are kept in memory.
+
+        Returns
+        -------
+        list of Energyscape
 
         Raises
         ------
         DataError
-            As for `process`; then nothing is processed.
+            As for `process`; nothing is processed then.
+
+        Examples
+        --------
+        >>> import ertis_numba as ertis
+        >>> with ertis.open_recording("reflectors.h5") as recording:
+        ...     images = ertis.Pipeline(recording.settings).process_batch(recording)
+        >>> images[0].stamp.sequence
+        0
         """
         self._require_open()
         batch = list(checks.items("measurements", measurements, Measurement, "a recording holds"))
@@ -191,39 +232,114 @@ class Pipeline:
             self._check_budget(image, measurement)
         return images
 
-    def signals(self, measurement: Measurement, *, matched: bool = False) -> NDArray[Any]:
-        """Return the signals of the enabled microphones before beamforming.
+    def process_many(
+        self, measurements: Iterable[Measurement], *, batch_size: int | None = None
+    ) -> Iterator[Energyscape]:
+        """Return an iterator over the energyscapes of any number of measurements, in their order.
+
+        Memory is bounded: at most one batch of measurements is read ahead, and no image is kept. The bits are those of
+        `process`.
+
+        Parameters
+        ----------
+        measurements : iterable of Measurement
+            Recording, list or generator. It is read one batch at a time, when the next image is asked for.
+        batch_size : int, optional
+            Measurements per batch. By default, one for each thread, or 16 on a GPU, and fewer if a batch would
+            exceed 1 GiB. Give 1 for a live source, whose images should not wait for further measurements.
+
+        Returns
+        -------
+        iterator of Energyscape
+
+        Raises
+        ------
+        DataError
+            As for `process`, when a batch is processed; the images of the batches before have been yielded.
+        ArgumentError
+            ``batch_size`` is below 1, the pipeline is closed, or an item is no measurement.
+
+        Examples
+        --------
+        The command ``ertis example reflectors`` copies the recording:
+
+        >>> import ertis_numba as ertis
+        >>> with ertis.open_recording("reflectors.h5") as recording:
+        ...     pipeline = ertis.Pipeline(recording.settings)
+        ...     loudest = [float(image.energy.max()) for image in pipeline.process_many(recording)]
+        >>> len(loudest) == len(recording)
+        True
+        """
+        self._require_open()
+        size = self._batch_size() if batch_size is None else checks.integer("batch_size", batch_size, 1)
+        return self._batches(checks.items("measurements", measurements, Measurement, "a recording holds"), size)
+
+    def _batches(self, measurements: Iterator[Measurement], size: int) -> Iterator[Energyscape]:
+        while batch := list(itertools.islice(measurements, size)):
+            images = [self.process(batch[0])] if len(batch) == 1 else self.process_batch(batch)
+            batch.clear()
+            images.reverse()
+            while images:  # None is kept: a GPU's images lie in pinned memory that the next ones need.
+                yield images.pop()
+
+    def _batch_size(self) -> int:
+        each_bytes = 4 * len(self.grid) * len(self.range_m) + self._format.n_bytes
+        count = _GPU_BATCH if self.device == "cuda" else self._threads
+        return max(1, min(count, _MAX_BATCH_BYTES // each_bytes))
+
+    def signals(self, measurement: Measurement) -> MicrophoneSignals:
+        """Return the demodulated and the matched-filtered signals of a measurement, with their time axis.
+
+        Use them to put another beamformer behind this front end.
 
         Parameters
         ----------
         measurement : Measurement
-        matched : bool
-            Apply the call's matched filter.
 
         Returns
         -------
-        (mic, sample) float32 or complex64
-            Demodulated signals at ``settings.signal_rate_hz``, divided by the calibrated gains, full scale 1. Matched
-            signals are analytic, and an echo has its peak where it begins.
+        MicrophoneSignals
+            Signals of the enabled microphones at ``settings.signal_rate_hz``.
 
         Raises
         ------
         DataError
             The measurement's array, call, record or air, or its words, are not those of the pipeline's settings.
+
+        Examples
+        --------
+        >>> import ertis_numba as ertis
+        >>> with ertis.open_recording("reflectors.h5") as recording:
+        ...     signals = ertis.Pipeline(recording.settings).signals(recording[0])
+        >>> signals.demodulated.shape == signals.matched.shape == (len(signals.positions_m), len(signals.time_s))
+        True
         """
         from ertis_numba.stages.signals import matched_signals_of, signals_of  # noqa: PLC0415  few want them
 
         self._require_open()
+        checks.instance("measurement", measurement, Measurement, "a recording holds")
         self._require_same_sensor(measurement.settings)
-        return (matched_signals_of if matched else signals_of)(measurement, settings=self.settings)
+        layout, rate_hz = microphones(self.settings.array), self.settings.signal_rate_hz
+        demodulated = signals_of(measurement, settings=self.settings)
+        return MicrophoneSignals(
+            demodulated=demodulated,
+            matched=matched_signals_of(measurement, settings=self.settings),
+            time_s=np.arange(demodulated.shape[1]) / rate_hz,
+            sample_rate_hz=rate_hz,
+            positions_m=layout.enabled_positions_m,
+            delay_s=layout.delay_s[layout.enabled],
+            sound_speed_m_s=sound_speed_m_s(self.settings.air),
+            settings=self.settings,
+            stamp=measurement.stamp,
+        )
 
     @property
     def prediction(self) -> "Prediction | None":
-        """Latest predicted error beside its budget; None before the first image that is not silent."""
+        """Latest predicted error and its budget; None before the first image with sound."""
         return None if self._monitor is None else self._monitor.prediction
 
     def close(self) -> None:
-        """Give back the memory of the device, when threads that are processing are done. Images that were made stay."""
+        """Free the memory of the device once running calls have ended. Images stay valid."""
         if not self._closed:
             self._closed = True
             self._chain.close()
@@ -236,7 +352,7 @@ class Pipeline:
         self.close()
 
     def _check_call(self, measurement: Measurement) -> None:
-        """Compare echoes with the call until a measurement has sound above the noise, in the first few only."""
+        """Compare echoes with the call in the first measurements, until one has sound above the noise."""
         if self._remaining_call_checks <= 0:
             return
         # Imported here because scipy.fft takes longer to import than the fast chain takes to start.
@@ -257,13 +373,13 @@ class Pipeline:
             prediction = self._monitor.check(image, measurement)
             text = prediction.warning if prediction else ""
         except DeviceError as error:
-            text = f"the error of images is not predicted: {error}"
+            text = f"the error of images cannot be predicted: {error}"
         if text:
             self._warned = True
             warnings.warn(text, ErrorBudgetWarning, stacklevel=3)
 
     def _build_chain(self, kernel_set: kernels.KernelSet, threads: int, *, graphs: bool) -> Chain:
-        """Return the chain, its kernels compiled and its buffers made."""
+        """Return the chain with compiled kernels and allocated buffers."""
         try:
             chain = _chain(self.settings, kernel_set, threads, graphs=graphs)
             if not kernel_set.simulated:
@@ -272,12 +388,12 @@ class Pipeline:
             failed = str(error)
         else:
             return chain
-        # Out here, as an error in flight would keep what did not fit, and a smaller pipeline would not fit either.
+        # Raised here, because a pending exception would keep the memory allocated, and a smaller pipeline would fail.
         raise DeviceError(failed)
 
     def _require_open(self) -> None:
         if self._closed:
-            raise ArgumentError("the pipeline is closed; make another one")
+            raise ArgumentError("the pipeline is closed; create another one")
 
     def _energyscape(self, amplitude: NDArray[np.float32], measurement: Measurement) -> Energyscape:
         return Energyscape(
@@ -290,23 +406,25 @@ class Pipeline:
         )
 
     def _words_of(self, measurement: Measurement) -> tuple[NDArray[Any], int]:
-        """Return the words, scaled into the range of single precision, and the exponent of the divisor 2^n."""
+        """Return the words, scaled into the range of single precision, and the exponent n of the divisor 2^n."""
         self._require_open()
         self._require_same_sensor(measurement.settings)
         return self._format.normalised(self._format.validated(measurement.data))
 
     def _require_same_sensor(self, settings: Settings) -> None:
-        """Refuse what the tables were not made for: only how to process may differ."""
+        """Refuse measurements of another sensor; only ``processing`` and ``accuracy`` may differ."""
         if settings is self._accepted_settings:
             return
         for name in ("call", "recording", "air"):
             came, wanted = getattr(settings, name), getattr(self.settings, name)
             if came != wanted:
-                raise DataError(f"measurement has {came}, the pipeline {wanted}; make a pipeline from its settings")
+                raise DataError(
+                    f"measurement has {came}, but the pipeline has {wanted}; create a pipeline from its settings"
+                )
         if settings.array != self.settings.array and not _same_layout(settings.array, self.settings.array):
             raise DataError(
-                f"measurement has array {settings.array.layout!r}, the pipeline another, "
-                f"{self.settings.array.layout!r}; make a pipeline from its settings"
+                f"measurement has array {settings.array.layout!r}, but the pipeline has another, "
+                f"{self.settings.array.layout!r}; create a pipeline from its settings"
             )
         self._accepted_settings = settings
 
@@ -318,7 +436,7 @@ class Pipeline:
 
 
 def _budget_monitor(kernel_set: kernels.KernelSet, threads: int) -> "BudgetMonitor | None":
-    """Return a monitor of the budget; simulated kernels would take minutes for a prediction."""
+    """Return a monitor of the budget; None for simulated kernels, which would take minutes for a prediction."""
     if kernel_set.simulated:
         return None
     # Imported here because scipy.fft takes longer to import than the fast chain takes to start.
@@ -333,7 +451,7 @@ def _rescaled(amplitude: NDArray[np.float32], exponent: int) -> NDArray[np.float
     Raises
     ------
     DataError
-        The image would not fit single precision.
+        The image exceeds single precision.
     """
     if exponent:
         with np.errstate(over="ignore"):
@@ -347,12 +465,12 @@ def _rescaled(amplitude: NDArray[np.float32], exponent: int) -> NDArray[np.float
 
 
 def _device_for(settings: Settings, device: str) -> str:
-    """Return the device to load; the paper's method has NumPy only.
+    """Return the device to load; the paper's method runs only on NumPy.
 
     Raises
     ------
     DeviceError
-        Another one is asked for by name.
+        Another device is requested for the paper's method.
     """
     if settings.processing.method == "fast" or device not in {"auto", *kernels.DEVICES}:
         return device
@@ -364,7 +482,7 @@ def _device_for(settings: Settings, device: str) -> str:
 
 
 def _same_layout(array: Array, other: Array) -> bool:
-    """Whether two arrays are the same microphones, one named and one written out, say."""
+    """Return True if two arrays have the same microphones, even if only one is given by its name."""
     came, wanted = microphones(array), microphones(other)
     return came.word_bits == wanted.word_bits and all(
         np.array_equal(getattr(came, name), getattr(wanted, name))

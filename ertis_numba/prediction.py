@@ -1,4 +1,4 @@
-"""Error predicted for the image of one measurement, and the warning if it may exceed the budget."""
+"""Predicted error of the images of a sensor, and the warning if it may exceed the budget."""
 
 import threading
 from dataclasses import dataclass
@@ -37,7 +37,7 @@ From 32 directions, it was too low by up to 1.6 dB over 156 random settings of `
 """
 
 MAX_MEMORY_BYTES: Final = 2**28
-"""Memory for a prediction, beyond which real-time images are not predicted."""
+"""Limit on the memory for a prediction of real-time images."""
 
 _MAX_DIRECTIONS: Final = 64
 _BYTES_PER_SAMPLE: Final = 32  # signals of a few microphones, as noise is estimated over the whole record
@@ -128,7 +128,7 @@ def planner_of(image: Energyscape, measurement: Measurement, kernels: KernelSet,
     beams = Planner(settings, kernels, threads=threads, signal_model=signal_model, sensitivity=Sensitivity())
     try:
         error_db = sampled_error_db(image, measurement, max_directions=_MAX_DIRECTIONS)
-    except DataError:  # The exact image is silent there, so nothing is known of the image.
+    except DataError:  # The exact image has no sound there, so that its error is undefined.
         return beams
     power = sum(beams.parts(settings.accuracy).values())
     sensitivity = Sensitivity(10 ** (error_db / 10) / power)

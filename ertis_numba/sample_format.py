@@ -1,4 +1,4 @@
-"""What the words of a measurement look like: bits of all microphones at a tick of the PDM clock, or PCM numbers."""
+"""Type and shape of the data of a measurement: PDM words with one bit per microphone, or PCM numbers."""
 
 import math
 from typing import Any, NamedTuple
@@ -12,7 +12,7 @@ from ertis_numba.settings import Settings
 
 __all__ = ["SampleFormat", "sample_format"]
 
-_MAX_EXPONENT = 20  # of two: samples from 1e-6 to 1e6 leave single precision room for squares, products and sums
+_MAX_EXPONENT = 20  # of two: squares, products and sums of samples from 1e-6 to 1e6 stay within single precision
 
 
 class SampleFormat(NamedTuple):
@@ -21,9 +21,9 @@ class SampleFormat(NamedTuple):
     Attributes
     ----------
     dtype : numpy.dtype
-        Little-endian, as they are stored and sent.
+        Little-endian, as in files and messages.
     shape : tuple of int
-        ``(sample,)``, or ``(sample, word)`` where a PDM tick takes several words; ``(sample, channel)`` of PCM.
+        ``(sample,)``, or ``(sample, word)`` if a PDM sample has several words; ``(sample, channel)`` for PCM.
     """
 
     dtype: np.dtype[Any]
@@ -31,58 +31,61 @@ class SampleFormat(NamedTuple):
 
     @property
     def n_bytes(self) -> int:
-        """Size of a measurement."""
+        """Size of a measurement in bytes."""
         return int(np.prod(self.shape)) * self.dtype.itemsize
 
     @property
     def shape_2d(self) -> tuple[int, int]:
-        """The shape with both axes, also where there is one word per sample."""
+        """Shape with two axes, even for one word per sample."""
         return self.shape[0], self.shape[1] if len(self.shape) > 1 else 1
 
     def from_bytes(self, content: bytes | bytearray | memoryview) -> NDArray[Any]:
-        """Return the words that lie in memory, which is not copied.
+        """Return a view of bytes as words.
 
         Raises
         ------
         DataError
-            They are not as many.
+            Their number is wrong.
         """
         if len(content) != self.n_bytes:
-            raise DataError(f"a measurement has {len(content)} bytes, its settings want {self.n_bytes}")
+            raise DataError(
+                f"measurement has {len(content)} bytes, but its settings describe {self.n_bytes}; give the settings "
+                "that it was recorded with"
+            )
         return np.frombuffer(content, self.dtype).reshape(self.shape)
 
     def validated(self, words: NDArray[Any], *, any_length: bool = False) -> NDArray[Any]:
-        """Return words as ``(sample, word)``, in the order and alignment that kernels are compiled for.
+        """Return words of shape ``(sample, word)``, in the memory order and alignment that kernels are compiled for.
 
         Raises
         ------
         DataError
-            Their type or shape is another, or PCM holds a number that is not finite.
+            The type or shape is wrong, or PCM contains a number that is not finite.
         """
         n_samples = len(words) if any_length else self.shape[0]
         shape, rows = (n_samples, *self.shape[1:]), (n_samples, self.shape_2d[1])
         if words.dtype != self.dtype or words.shape not in {shape, rows}:
             raise DataError(
-                f"measurement holds {words.dtype} words of shape {words.shape}; its settings want "
-                f"{self.dtype.name} of shape {shape}: give the settings that it was recorded with"
+                f"measurement has {words.dtype} words of shape {words.shape}, but its settings describe "
+                f"{self.dtype.name} of shape {shape}; give the settings that it was recorded with"
             )
         if self.dtype.kind == "f" and not np.isfinite(words).all():
             sample, channel = np.argwhere(~np.isfinite(words.reshape(rows)))[0].tolist()
             came = words.reshape(rows)[sample, channel]
             raise DataError(f"measurement holds {came} at sample {sample} of channel {channel}; give finite numbers")
-        # Read-only or unaligned arrays would each be a type of their own to compile the kernels for.
+        # Kernels would be compiled again for read-only or unaligned arrays.
         return np.require(words, requirements=["C", "A", "W"]).reshape(rows)
 
     def normalised(self, words: NDArray[Any]) -> tuple[NDArray[Any], int]:
-        """Return words scaled into the range of single precision, and the exponent of the divisor 2^n.
+        """Return words scaled into the range of single precision, and the exponent n of the divisor 2^n.
 
-        Images are linear in the words, so the caller multiplies the image by the same power of two. Only floating-point
-        words are scaled, and only if their largest magnitude is far from 1.
+        Images are linear in the words, so that the caller multiplies the image by the same power of two. Only
+        floating-point words are scaled, and only if their largest magnitude is far from 1.
 
         Parameters
         ----------
         words : array
-            As `validated` returns them.
+            Words from `validated`.
         """
         if self.dtype.kind != "f" or not words.size:
             return words, 0
@@ -94,7 +97,7 @@ class SampleFormat(NamedTuple):
 
 
 def sample_format(settings: Settings) -> SampleFormat:
-    """Return what the words of such measurements look like.
+    """Return the type and shape of measurements with these settings.
 
     Raises
     ------

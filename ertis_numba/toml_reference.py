@@ -1,4 +1,4 @@
-"""Reference of the keys of TOML files, generated from the structures that read them."""
+"""Reference of the keys of TOML files, generated from the structures that read these files."""
 
 import inspect
 import re
@@ -146,6 +146,7 @@ def _table_in(kind: Any) -> type[TomlTable] | None:
 
 
 def _key(field: msgspec.structs.FieldInfo, kind: str, about: str, example: Any) -> KeyReference:
+    kind = kind.partition(", default")[0]
     parts = None if get_origin(field.type) is Literal else _PARTS.search(kind)
     default = field.default if field.default is not msgspec.NODEFAULT else None
     if field.default_factory is not msgspec.NODEFAULT:

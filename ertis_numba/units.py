@@ -1,4 +1,4 @@
-"""Units of quantities, by the suffixes of their names."""
+"""Units of quantities, derived from the suffixes of their names."""
 
 from typing import Final
 

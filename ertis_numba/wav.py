@@ -1,4 +1,4 @@
-"""WAV files: checks of their headers, and their numbers."""
+"""WAV files: checks of the header, and reading of the samples."""
 
 import struct
 import warnings
@@ -12,30 +12,30 @@ from ertis_numba.errors import DataError
 
 __all__ = ["read_wav"]
 
-_UNFINISHED_SIZES = {0, 2**32 - 1}  # sizes that programs write who do not know yet how long it will be
-_RF64 = b"RF64"  # whose sizes are in a chunk of their own
+_UNFINISHED_SIZES = {0, 2**32 - 1}  # sizes that programs write before the length is known
+_RF64 = b"RF64"  # The sizes are in a separate chunk.
 
 
 def read_wav(path: Path) -> tuple[float, NDArray[Any]]:
-    """Return the rate in hertz and the numbers, (sample, channel), which stay on the disk where they can.
+    """Return the sample rate in hertz and the samples, (sample, channel), memory-mapped if possible.
 
     Raises
     ------
     DataError
-        The file is no WAV, has no samples, is cut short, or its header was never finished.
+        The file is not WAV, has no samples, is truncated, or its header was never finished.
     """
     with path.open("rb") as file:
         _require_complete(path, file)
     from scipy.io import wavfile  # noqa: PLC0415  takes long to import, and few need it
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", wavfile.WavFileWarning)  # of chunks that hold no samples
+        warnings.simplefilter("ignore", wavfile.WavFileWarning)  # about chunks without samples
         try:
             try:
                 rate_hz, numbers = wavfile.read(path, mmap=True)
-            except ValueError:  # 24 bits are no number of the processor's, and have to be copied
+            except ValueError:  # samples of 24 bits cannot be mapped
                 rate_hz, numbers = wavfile.read(path)
-        except Exception as error:  # what a reader makes of a strange header may be anything
+        except Exception as error:  # the reader raises any exception for a malformed header
             raise DataError(f"{path} cannot be read ({error}); save it again as WAV") from error
     if not rate_hz or not numbers.size:
         raise DataError(f"{path} has {rate_hz} Hz and {numbers.size} numbers; save it again as WAV")
@@ -43,10 +43,10 @@ def read_wav(path: Path) -> tuple[float, NDArray[Any]]:
 
 
 def _require_complete(path: Path, file: BinaryIO) -> None:
-    """Refuse what is no WAV, and a file that holds less than its header says."""
+    """Refuse files that are not WAV, and files shorter than their header claims."""
     kind, _, form = struct.unpack("<4sI4s", file.read(12).ljust(12, b"\0"))
     if kind not in {b"RIFF", b"RIFX", _RF64} or form != b"WAVE":
-        raise DataError(f"{path} is no WAV file, it begins with {kind!r}; give WAV, or HDF5 of Acoular (.h5)")
+        raise DataError(f"{path} is not a WAV file: it begins with {kind!r}; give WAV, or HDF5 of Acoular (.h5)")
     order = ">" if kind == b"RIFX" else "<"
     wide = frame_bytes = 0
     for name, size, there in _chunks(file, order):
@@ -64,7 +64,7 @@ def _require_complete(path: Path, file: BinaryIO) -> None:
 
 
 def _chunks(file: BinaryIO, order: str) -> Iterator[tuple[bytes, int, int]]:
-    """Yield name, size and what there is of each chunk, in which the file then stands."""
+    """Yield name, size and available bytes of each chunk, with the file positioned at its content."""
     n_bytes = file.seek(0, 2)
     place = 12
     while place + 8 <= n_bytes:
@@ -75,16 +75,18 @@ def _chunks(file: BinaryIO, order: str) -> Iterator[tuple[bytes, int, int]]:
 
 
 def _require_samples(path: Path, size: int, there: int, frame_bytes: int) -> None:
-    """Refuse samples that are not those of the header: ``size`` bytes of them, of which no more are ``there``."""
+    """Refuse samples of ``size`` bytes if the header is unfinished or only fewer bytes are ``there``."""
     if size in _UNFINISHED_SIZES:
         raise DataError(
-            f"{path} has a header that was never finished, as of a recording that was cut off; "
-            "let a program that ignores its lengths save it again"
+            f"{path} has an unfinished header, such as that of an interrupted recording; save it again with a program "
+            "that ignores the lengths in the header"
         )
     if size > there:
-        raise DataError(f"{path} is cut short: it has {there} bytes of samples, its header says {size}; copy it again")
+        raise DataError(
+            f"{path} is truncated: it has {there} bytes of samples, but its header claims {size}; copy it again"
+        )
     if frame_bytes and size % frame_bytes:
         raise DataError(
-            f"{path} has {size} bytes of samples, which are no whole frames of {frame_bytes} bytes; copy it again, or "
-            "save it again as WAV"
+            f"{path} has {size} bytes of samples, not a multiple of its frame size, {frame_bytes} bytes; copy it again "
+            "or save it again as WAV"
         )

@@ -1,4 +1,4 @@
-"""The emitted call, its matched filter and the decimation filter."""
+"""Samples and spectrum of the call, its matched filter, and the decimation filter."""
 
 import functools
 import math
@@ -25,29 +25,29 @@ __all__ = [
     "matched_noise_spectrum",
 ]
 
-_TRANSITION_HZ = 5_000.0  # wide enough that the matched filter rings for 0.4 ms only
-_MIN_TRANSITION = 0.02  # of the decimated rate; the filter's length grows with the inverse
+_TRANSITION_HZ = 5_000.0  # wide enough for the matched filter to ring for only 0.4 ms
+_MIN_TRANSITION = 0.02  # relative to the decimated rate; the length of the filter is proportional to the inverse
 _STOPBAND_ATTENUATION_DB = 60.0
-_STOPBAND_TOLERANCE_DB = 0.5  # by which a filter may miss its stop band
-_WAVEFORM_OVERSAMPLING = 16  # samples of an own waveform for each of its own, between which splines run
+_STOPBAND_TOLERANCE_DB = 0.5  # tolerance of the stopband attenuation
+_WAVEFORM_OVERSAMPLING = 16  # oversampling of a custom waveform before spline interpolation
 _MAX_ROUNDING_ERROR_DB = (
     -50.0
-)  # what rounded taps may change the response by, where the stop band is no deeper than 60 dB
+)  # limit on the change of the response by rounding taps, for a stopband attenuation of up to 60 dB
 
 
 def call_samples(call: Call, *, rate_hz: float | None = None) -> NDArray[np.float64]:
     """Return the emitted call: (sample,) float64, amplitude 1 between its ramps.
 
-    Hyperbolic frequency modulation, ``f(t) = 1 / (1/f₀ + t (1/f₁ − 1/f₀) / T)``, whose phase is
-    ``2π T / (1/f₁ − 1/f₀) · ln(f₀ / f(t))``, from t = 0 to T inclusive (J. J. Kroszczynski, Pulse
-    compression by means of linear-period modulation, Proc. IEEE 57, 1969). Or linear, ``f(t) = f₀ + t (f₁ − f₀) / T``
-    with a phase of ``2π (f₀ t + t² (f₁ − f₀) / 2T)``. An own waveform is interpolated, see `call_at`.
+    Hyperbolic sweeps have the frequency ``f(t) = 1 / (1/f₀ + t (1/f₁ − 1/f₀) / T)`` and the phase
+    ``2π T / (1/f₁ − 1/f₀) · ln(f₀ / f(t))``, from t = 0 to T inclusive (J. J. Kroszczynski, Pulse compression by means
+    of linear-period modulation, Proc. IEEE 57, 1969). Linear sweeps have the frequency ``f(t) = f₀ + t (f₁ − f₀) / T``
+    and the phase ``2π (f₀ t + t² (f₁ − f₀) / 2T)``. Custom waveforms are interpolated; see `call_at`.
 
     Parameters
     ----------
     call : Call
     rate_hz : float, optional
-        Sample rate; the call's own by default.
+        Sample rate in hertz; that of the call by default.
     """
     rate_hz = call.sample_rate_hz if rate_hz is None else rate_hz
     call.require_samples()
@@ -58,10 +58,10 @@ def call_samples(call: Call, *, rate_hz: float | None = None) -> NDArray[np.floa
 
 
 def call_at(call: Call, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the call at any times, 0 outside ``[0, duration_s]``.
+    """Return the call at any times; it is 0 outside ``[0, duration_s]``.
 
-    Between the samples of an own waveform, its Fourier series, 16 times as dense, is joined by cubic splines: at half
-    of the sample rate they miss it by -100 dB, and by less below.
+    A custom waveform is oversampled 16 times by its Fourier series, and then interpolated by cubic splines. Their error
+    is -100 dB at half of the sample rate, and less at lower frequencies.
     """
     inside_s = np.clip(time_s, 0.0, call.duration_s)
     if call.waveform is not None:
@@ -75,11 +75,11 @@ def call_at(call: Call, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @functools.lru_cache(maxsize=8)
 def _interpolator(call: Call) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
-    """Return the function of time that an own waveform samples."""
+    """Return a custom waveform as a function of time."""
     from scipy.interpolate import CubicSpline  # noqa: PLC0415  takes long to import, and few need it
 
     samples = call_samples(call)
-    n_fft = 2 ** math.ceil(math.log2(2 * len(samples)))  # zeros behind it, over which its beginning does not wrap
+    n_fft = 2 ** math.ceil(math.log2(2 * len(samples)))  # zero padding against circular wrap-around
     dense = np.fft.irfft(np.fft.rfft(samples, n_fft), n_fft * _WAVEFORM_OVERSAMPLING) * _WAVEFORM_OVERSAMPLING
     time_s = np.arange((len(samples) - 1) * _WAVEFORM_OVERSAMPLING + 2) / (call.sample_rate_hz * _WAVEFORM_OVERSAMPLING)
     spline: Callable[[NDArray[np.float64]], NDArray[np.float64]] = CubicSpline(time_s, dense[: len(time_s)])
@@ -146,9 +146,10 @@ def matched_band_hz(settings: Settings) -> tuple[float, float]:
 
 
 def matched_guard_s(settings: Settings, *, down_db: float = 60.0) -> float:
-    """Return how long the matched filter rings before the call and after it, until it is ``down_db`` down.
+    """Return the time in seconds that the matched filter rings, until its level has fallen by ``down_db``.
 
-    The edges of its band are raised cosines, whose transform falls with the third power of time.
+    It rings before and after the call. The edges of its band are raised cosines, whose transform falls with the third
+    power of time.
     """
     low_hz, high_hz = matched_band_hz(settings)
     narrowest_hz = min(settings.call.low_frequency_hz - low_hz, high_hz - settings.call.high_frequency_hz)
@@ -179,7 +180,9 @@ def matched_filter_spectrum(settings: Settings, *, n_fft: int, decimation: int |
     decimation = settings.decimation if decimation is None else decimation
     spacing_hz = settings.recording.sample_rate_hz / decimation / n_fft
     low_hz, high_hz = matched_band_hz(settings)
-    last_bin = min(math.floor(high_hz / spacing_hz), n_fft // 2)  # the paper's rates may leave the edge no room
+    last_bin = min(
+        math.floor(high_hz / spacing_hz), n_fft // 2
+    )  # At the rates of the paper, the edge may exceed the Nyquist frequency.
     bins = np.arange(math.ceil(low_hz / spacing_hz), last_bin + 1)
     frequency_hz = bins * spacing_hz
     spectrum = call_spectrum(call, settings, n_fft=n_fft, decimation=decimation)[bins]
@@ -197,16 +200,16 @@ def matched_filter_spectrum(settings: Settings, *, n_fft: int, decimation: int |
 
 
 def matched_noise_spectrum(settings: Settings, *, n_waves: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the power of white noise after the matched filter: frequencies in hertz and shares, both (wave,) float64.
+    """Return frequencies in hertz, and shares of the power of white noise after the matched filter: (wave,) float64.
 
-    The shares add up to 1. Of an echo, whose own spectrum comes on top, the band is a little narrower.
+    The shares add up to 1. The band of an echo, which is weighted by its own spectrum as well, is slightly narrower.
     """
     rate_hz, fine_hz = settings.signal_rate_hz, 4 * settings.call.high_frequency_hz
     n_fft = round(max(8 * math.ceil(settings.call.duration_s * fine_hz), 1024) * rate_hz / fine_hz)
     matched = matched_filter_spectrum(settings, n_fft=n_fft)
     frequency_hz = (matched.first_bin + np.arange(len(matched.values))) * rate_hz / n_fft
     power = np.abs(matched.values) ** 2
-    # Parts of the band rather than single bins: the spectrum of a sweep has ripples.
+    # Bins are grouped, because the spectrum of a sweep has ripples.
     edges = np.linspace(0, len(power), min(n_waves, len(power)) + 1).astype(int)
     shares = np.add.reduceat(power, edges[:-1]) / power.sum()
     centres_hz = np.add.reduceat(frequency_hz, edges[:-1]) / np.diff(edges)
@@ -216,19 +219,22 @@ def matched_noise_spectrum(settings: Settings, *, n_waves: int) -> tuple[NDArray
 def decimation_taps(
     *, sample_rate_hz: float, decimation: int, pass_hz: float, stopband_attenuation_db: float = _STOPBAND_ATTENUATION_DB
 ) -> NDArray[np.float64]:
-    """Return the low-pass filter that guards a decimation: (tap,) float64, sum 1.
+    """Return the anti-aliasing filter of a decimation: (tap,) float64, sum 1.
 
-    A sinc under a Kaiser window (J. F. Kaiser, 1974). What would alias into ``0 … pass_hz`` is
-    damped by ``stopband_attenuation_db``, by half a decibel less at the worst. The length is ``2 k · decimation + 1``, so
-    that the group delay is k samples of the decimated signal exactly.
+    The filter is a sinc under a Kaiser window (J. F. Kaiser, 1974). It attenuates frequencies that would alias into ``0
+    … pass_hz`` by ``stopband_attenuation_db``, with a tolerance of half a decibel. Its length is ``2 k · decimation +
+    1``, so that the group delay is exactly k samples of the decimated signal.
 
     Parameters
     ----------
     sample_rate_hz : float
+        Rate before the decimation in hertz.
     decimation : int
+        Samples before the decimation per sample after it.
     pass_hz : float
-        Upper edge of the band that must stay clean.
+        Upper edge of the band without aliasing, in hertz.
     stopband_attenuation_db : float
+        Stopband attenuation in dB.
 
     Returns
     -------
@@ -237,19 +243,20 @@ def decimation_taps(
     Raises
     ------
     ArgumentError
-        The decimated rate cannot hold ``pass_hz``.
+        The decimated rate is too low for ``pass_hz``.
     """
     rate_hz = sample_rate_hz / decimation
     transition_hz = rate_hz - 2 * pass_hz
     if transition_hz < _MIN_TRANSITION * rate_hz:
         raise ArgumentError(
-            f"decimation {decimation} leaves {rate_hz:g} Hz, too little for signals up to {pass_hz:g} Hz; lower it"
+            f"decimation {decimation} gives a rate of {rate_hz:g} Hz, too low for signals up to {pass_hz:g} Hz; give a "
+            "smaller one"
         )
     width_rad = 2 * math.pi * transition_hz / sample_rate_hz
     wanted = (stopband_attenuation_db - 7.95) / (2.285 * width_rad)
     half = decimation * math.ceil(wanted / 2 / decimation)
     taps = _windowed_sinc(half, decimation, width_rad)
-    # Kaiser's formula is a fit; for some short filters it promises a few decibels too much.
+    # Kaiser's formula is an approximation, which overestimates the attenuation of some short filters.
     folding_hz = np.linspace(rate_hz - pass_hz, min(rate_hz + pass_hz, sample_rate_hz / 2), 256)
     enough = 10 ** ((_STOPBAND_TOLERANCE_DB - stopband_attenuation_db) / 20)
     while decimation > 1 and np.abs(filter_response(taps, folding_hz / sample_rate_hz)).max() > enough:
@@ -259,7 +266,7 @@ def decimation_taps(
 
 
 def _windowed_sinc(half: int, decimation: int, width_rad: float) -> NDArray[np.float64]:
-    stopband_attenuation_db = 7.95 + 2.285 * width_rad * 2 * half  # what this length can do
+    stopband_attenuation_db = 7.95 + 2.285 * width_rad * 2 * half  # the attenuation that this length allows
     beta = (
         0.1102 * (stopband_attenuation_db - 8.7)
         if stopband_attenuation_db > 50
@@ -271,10 +278,10 @@ def _windowed_sinc(half: int, decimation: int, width_rad: float) -> NDArray[np.f
 
 
 def integer_taps(taps: NDArray[np.float64], *, bits: int = 16) -> NDArray[np.int16] | NDArray[np.int32]:
-    """Return a filter in whole numbers whose magnitudes add up to the largest of them at most: (tap,) int16 or int32.
+    """Return a filter with integer taps whose magnitudes add up to at most the largest integer: (tap,) int16 or int32.
 
-    It is a filter of its own rather than an approximation at every sum: rounding some hundred taps to 16 bits changes
-    the response by -65 dB or less, and everything after is exact.
+    Only the taps are rounded; sums over them are exact. Rounding some hundred taps to 16 bits changes the response by
+    -65 dB or less.
 
     Parameters
     ----------
@@ -288,23 +295,23 @@ def integer_taps(taps: NDArray[np.float64], *, bits: int = 16) -> NDArray[np.int
     Raises
     ------
     ArgumentError
-        There are so many taps that rounding them changes the response by more than -50 dB.
+        Rounding so many taps changes the response by more than -50 dB.
     """
     limit = np.iinfo(np.int16 if bits == 16 else np.int32).max
-    scale = max(limit - len(taps) / 2, 0.0) / np.abs(taps).sum()  # rounding adds up to a half a tap
+    scale = max(limit - len(taps) / 2, 0.0) / np.abs(taps).sum()  # Rounding adds up to half a unit per tap.
     whole = np.rint(taps * scale)
     change = np.abs(np.fft.rfft(whole / (whole.sum() or 1.0) - taps, 4 * len(taps))).max()
     change_db = 20 * math.log10(max(change, 1e-20))
     if change_db > _MAX_ROUNDING_ERROR_DB:
         raise ArgumentError(
-            f"decimation filter of {len(taps)} taps is too long for {bits} bits ({change_db:.0f} dB off); "
-            "give a smaller processing.decimation"
+            f"decimation filter of {len(taps)} taps is too long for {bits} bits (rounding changes its response by "
+            f"{change_db:.0f} dB); give a smaller processing.decimation"
         )
     return np.asarray(whole, np.int16) if bits == 16 else np.asarray(whole, np.int32)
 
 
 def filter_response(taps: NDArray[np.float64], frequency: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the gain of a symmetric filter, its group delay removed: (frequency,) float64.
+    """Return the gain of a symmetric filter without its group delay: (frequency,) float64.
 
     ``frequency`` is in cycles per sample of the filter's input.
     """

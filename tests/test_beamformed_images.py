@@ -137,11 +137,11 @@ def test_capon_parts_independent_sources_within_a_beam(device):
         ({"diagonal_loading": math.nan}, r"processing\.diagonal_loading is nan; give a finite number"),
         (
             {"beamformer": "dmas", "method": "paper"},
-            r"processing\.method is 'paper', which can delay_and_sum only; give 'fast' with .*'dmas'",
+            r"processing\.method is 'paper', which supports only .*'delay_and_sum'; give 'fast' with .*'dmas'",
         ),
         (
             {"beamformer": "capon", "wavefront": "spherical"},
-            r"processing\.wavefront is 'spherical', which can delay_and_sum only; give 'plane' with .*'capon'",
+            r"processing\.wavefront is 'spherical', which supports only .*'delay_and_sum'; give 'plane' with .*'capon'",
         ),
     ],
 )

@@ -323,7 +323,7 @@ def test_errors_are_one_line(tmp_path, arguments, message, code):
     ("arguments", "message"),
     [
         (["--duration", "0"], "--duration is 0; give a number above 0"),
-        (["--name", "a/b"], "sensor name 'a/b' cannot stand in a file"),
+        (["--name", "a/b"], "sensor name 'a/b' cannot name a group in a file"),
         (["--to", "tcp://127.0.0.1:9", "--spool", "new/spool"], "there is no serial port 'none'"),
     ],
 )

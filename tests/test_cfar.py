@@ -256,7 +256,10 @@ def test_silence_stands_out_of_nothing(method):
         ({"method": "median"}, "method 'median' is unknown; known are ordered_statistic, cell_averaging, greatest_of"),
         ({"n_reference": 5}, "n_reference is 5; give an even number, with half the bins on each side"),
         ({"n_reference": 2}, "n_reference is 2; give a whole number from 4 to 512"),
-        ({"n_reference": 64}, "image has 37 ranges, but 64 reference bins need 69; give an image with a wider range window"),  # noqa: E501
+        (
+            {"n_reference": 64},
+            "image has 37 ranges, but 64 reference bins need 69; give an image with a wider range window",
+        ),
     ],
 )
 def test_refuses(arguments, match):

@@ -54,7 +54,11 @@ CASES = {
         1,
         "air.temperature_c is nan; give a finite number",
     ),
-    "sensor name": (RAW.format("good.bin") + " --sensor a/b", 1, "sensor name 'a/b' cannot stand in a file; give"),
+    "sensor name": (
+        RAW.format("good.bin") + " --sensor a/b",
+        1,
+        "sensor name 'a/b' cannot name a group in a file; give",
+    ),
     # recordings
     "missing recording": ("process none.h5 -o out.h5", 1, "none.h5: No such file or directory; give a recording"),
     "empty recording": ("process empty.h5 -o out.h5", 1, "empty.h5 is empty; give a recording"),
@@ -221,18 +225,21 @@ def test_a_folder_that_cannot_be_written(tmp_path, folder):
     [
         (
             "process rec.h5 -o /proc/x/",
-            "/proc/x: No such file or directory; see whether its folder is there, or choose",
+            "/proc/x: No such file or directory; check that its folder exists, or choose",
         ),
         (
             "process rec.h5 -o /sys/a/",
-            "/sys/a: Operation not permitted; see who may use it and its folder, or choose",
+            "/sys/a: Operation not permitted; check the permissions of the file and its folder, or choose",
         ),
-        ("process rec.h5 -o /sys/a.h5 --quiet", "/sys/a.h5 cannot be written (Permission denied); see who may use it"),
+        (
+            "process rec.h5 -o /sys/a.h5 --quiet",
+            "/sys/a.h5 cannot be written (Permission denied); check the permissions",
+        ),
         (
             "plot rec.h5 --kind signals -o /sys/a.png",
-            "/sys/a.png: Permission denied; see who may use it and its",
+            "/sys/a.png: Permission denied; check the permissions of the file and its",
         ),
-        ("export img.h5 -o /sys/a.csv", "/sys/a.csv cannot be written (Permission denied); see who may use it"),
+        ("export img.h5 -o /sys/a.csv", "/sys/a.csv cannot be written (Permission denied); check the permissions"),
     ],
 )
 def test_the_remedy_fits_the_cause(folder, monkeypatch, command, message):

@@ -50,7 +50,10 @@ def test_pipelines_take_the_path_of_settings(tmp_path):
         (lambda shown: ertis.find_peaks(shown, false_alarm=2), "false_alarm is 2"),
         (lambda shown: shown.replace(amplitude=shown.amplitude[:, 1:]), r"energy has shape \(91, \d+\); give shape"),
         (lambda shown: shown.replace(elevation_rad=np.zeros(3)), r"elevation_rad has shape \(3,\); give shape \(91,\)"),
-        (lambda shown: shown.replace(engery=shown.amplitude), "an image has no field 'engery'; give some of energy"),
+        (
+            lambda shown: shown.replace(engery=shown.amplitude),
+            r"an image has no field 'engery' \(did you mean 'energy'\?\); give some of energy",
+        ),
     ],
 )
 def test_arguments_of_the_wrong_kind_are_refused_in_a_line(call, message):

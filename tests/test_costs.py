@@ -17,7 +17,7 @@ CPU = kernels.load("cpu")
 @pytest.fixture
 def measured(monkeypatch, tmp_path):
     """A folder of its own, nothing known, and a list that tells how often costs were measured."""
-    found = costs.costs_of(CPU, 1)
+    found = costs.measured_costs(CPU, 1)
     times = []
 
     def once_more(kernel_set, threads):
@@ -44,14 +44,14 @@ def test_measured_costs_are_times(device):
 
 def test_costs_are_kept(measured, caplog):
     with caplog.at_level(logging.INFO, logger="ertis_numba"):
-        first = costs.costs_of(CPU, 1)
-    assert "measuring what the kernels of device 'cpu' take here; kept in" in caplog.text
+        first = costs.measured_costs(CPU, 1)
+    assert "measuring the costs of the kernels of device 'cpu'; they are stored in" in caplog.text
     path = costs.cache_file("cpu", 1)
     assert json.loads(path.read_text("utf-8")) == first.seconds
     assert list(path.parent.iterdir()) == [path]  # nothing half written is left
-    assert costs.costs_of(CPU, 1) is first
+    assert costs.measured_costs(CPU, 1) is first
     forget()
-    assert costs.costs_of(CPU, 1) == first
+    assert costs.measured_costs(CPU, 1) == first
     assert measured == [("cpu", 1)]
 
 
@@ -68,7 +68,7 @@ def test_processes_that_measure_at_once_agree(monkeypatch):
         return found
 
     monkeypatch.setattr(costs, "measure", overtaken)
-    assert costs.costs_of(CPU, 1).seconds == theirs
+    assert costs.measured_costs(CPU, 1).seconds == theirs
     assert list(path.parent.iterdir()) == [path]
 
 
@@ -77,7 +77,7 @@ def test_a_disk_without_links_keeps_costs_as_well(measured, monkeypatch):
         raise PermissionError("no links here")
 
     monkeypatch.setattr(costs.os, "link", refused)
-    first = costs.costs_of(CPU, 1)
+    first = costs.measured_costs(CPU, 1)
     path = costs.cache_file("cpu", 1)
     assert json.loads(path.read_text("utf-8")) == first.seconds
     assert list(path.parent.iterdir()) == [path]
@@ -85,9 +85,9 @@ def test_a_disk_without_links_keeps_costs_as_well(measured, monkeypatch):
 
 
 def test_devices_and_threads_have_costs_of_their_own(measured):
-    costs.costs_of(CPU, 1)
-    costs.costs_of(CPU, 2)
-    costs.costs_of(kernels.load("numpy"), 1)
+    costs.measured_costs(CPU, 1)
+    costs.measured_costs(CPU, 2)
+    costs.measured_costs(kernels.load("numpy"), 1)
     assert measured == [("cpu", 1), ("cpu", 2), ("numpy", 1)]
     assert len(list(costs.cache_file("cpu", 1).parent.iterdir())) == 3
 
@@ -109,12 +109,12 @@ def test_devices_and_threads_have_costs_of_their_own(measured):
     ],
 )
 def test_spoilt_files_are_measured_again(measured, spoil):
-    found = costs.costs_of(CPU, 1)
+    found = costs.measured_costs(CPU, 1)
     path = costs.cache_file("cpu", 1)
     spoilt = spoil(path.read_text("utf-8"))
     path.write_bytes(spoilt if isinstance(spoilt, bytes) else spoilt.encode())
     forget()
-    assert costs.costs_of(CPU, 1) == found
+    assert costs.measured_costs(CPU, 1) == found
     assert len(measured) == 2
     assert json.loads(path.read_text("utf-8")) == found.seconds
 
@@ -123,8 +123,8 @@ def test_a_folder_that_cannot_be_written_does_no_harm(measured, monkeypatch, tmp
     (tmp_path / "file").write_text("no folder", "utf-8")
     monkeypatch.setenv("ERTIS_CACHE_DIR", str(tmp_path / "file" / "below"))
     with caplog.at_level(logging.INFO, logger="ertis_numba"):
-        pipeline = Pipeline(SHORT, device="cpu", threads=1)
-    assert "costs cannot be kept (" in caplog.text
+        pipeline = Pipeline(SHORT, device="cpu", threads=1, plan="measured")
+    assert "measured costs cannot be stored (" in caplog.text
     assert pipeline.process(noise(SHORT)).amplitude.any()
     assert ("cpu", CPU.max_threads) in measured
 
@@ -132,12 +132,12 @@ def test_a_folder_that_cannot_be_written_does_no_harm(measured, monkeypatch, tmp
 @pytest.mark.usefixtures("measured")
 def test_a_folder_in_the_way_of_the_file_does_no_harm():
     costs.cache_file("cpu", 1).mkdir(parents=True)
-    assert costs.costs_of(CPU, 1).seconds
+    assert costs.measured_costs(CPU, 1).seconds
     assert list(costs.cache_file("cpu", 1).parent.iterdir()) == [costs.cache_file("cpu", 1)]
 
 
 def test_more_work_takes_longer():
-    found = costs.costs_of(CPU, 1)
+    found = costs.measured_costs(CPU, 1)
     work = {
         "n_mics": 32, "n_words": 1, "n_samples": 5000, "n_taps": 101, "tap_bits": 16, "n_fft": 6000, "n_bins": 800,
         "n_phases": 2, "n_outputs": 1500, "n_directions": 500, "n_ranges": 1200, "n_computed": 1248, "n_beams": 300,

@@ -133,6 +133,6 @@ def test_what_is_refused(tmp_path, monkeypatch):
         export(tmp_path / "a.h5", noise(count=1))
     assert [item.name for item in tmp_path.iterdir()] == ["a.xml"]
     monkeypatch.setattr("ertis_numba.atomic_files.RESERVED_BYTES", 2**62)
-    with pytest.raises(DataError, match=r"MB free, wanted .* of it to spare; free some space"):
+    with pytest.raises(DataError, match=r"MB free, but .* including a reserve of .*; free some space"):
         export(tmp_path / "b.h5", noise(count=1))
     assert [item.name for item in tmp_path.iterdir()] == ["a.xml"]

@@ -275,7 +275,11 @@ def test_what_is_refused(tmp_path, monkeypatch):
         ([], {}, "no energyscape is given"),
         ([given], {"topics": ["cloud"]}, "topic 'cloud' is unknown; known are points, image, sonar_image"),
         ([given.replace(stamp=Stamp(timestamp_ns=2**62))], {}, "wanted one from 1970 to 2038"),
-        ([given.replace(stamp=Stamp(sensor="a b"))], {}, "sensor name 'a b' cannot stand in a file; give letters"),
+        (
+            [given.replace(stamp=Stamp(sensor="a b"))],
+            {},
+            "sensor name 'a b' cannot name a group in a file; give letters",
+        ),
         (
             [given.replace(stamp=Stamp(sensor=name)) for name in ("a-b", "a.b")],
             {},

@@ -110,7 +110,7 @@ def test_layout_files(tmp_path):
         ("eRTIS_v3D", None, r"layout 'eRTIS_v3D' is unknown .did you mean 'eRTIS_v3D1'.*known are eRTIS_v2, "),
         ("none.toml", None, r"layout .*none\.toml: .*; give a readable file or one of eRTIS_v2, "),
         ("bytes.csv", b"\xff", r"layout .*bytes\.csv: .*; give a readable file or one of"),
-        ("l.toml", b"positions_mm = [", r"layout .*l\.toml: .*; correct it or take it out"),
+        ("l.toml", b"positions_mm = [", r"layout .*l\.toml: .*; correct it or remove it"),
         ("l.toml", b"", r"layout .*l\.toml: `positions_mm` is missing; give it"),
         ("l.toml", b"positions_mm = 3", r"layout .*l\.toml, line 1, positions_mm: Expected `array`, got `int`"),
         (
@@ -141,11 +141,11 @@ def test_layout_files(tmp_path):
         ),
         ("l.toml", b"word_bits = 9\npositions_mm = [[1, 2]]", r"layout .*l\.toml: array\.word_bits '9' is unknown"),
         ("l.toml", b"disabled = [1]\npositions_mm = [[1, 2]]", r"l\.toml: a disabled channel is 1; give a whole .* 0"),
-        ("l.toml", b"disabled = [0]\npositions_mm = [[1, 2]]", r"l\.toml: array\.enabled is false for every channel"),
+        ("l.toml", b"disabled = [0]\npositions_mm = [[1, 2]]", r"l\.toml: array\.enabled is false for all channels"),
         (
             "l.csv",
             b"1, 2\n3, x\n",
-            r"layout .*l\.csv: could not convert .*x'; give rows of numbers separated by commas",
+            r"layout .*l\.csv: could not convert .*x'; give rows of numbers (separated|parted) by commas",
         ),
         (
             "l.toml",

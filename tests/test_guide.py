@@ -44,6 +44,10 @@ RUN_BY = {
     ("many", "python"): ["test_many_docs::test_python_lines"],
     ("network", "$"): ["test_network_page::test_one_machine", "test_network_page::test_several_machines"],
     ("network", "python"): ["test_guide::test_python_on_the_network"],
+    ("numpy", "python"): [
+        "test_numpy_page::test_examples_run",
+        "test_numpy_page::test_own_beamformer_finds_the_reflectors",
+    ],
     ("own-array", "$"): ["test_guide::test_own_array"],
     ("own-array", "python"): ["test_guide::test_own_array"],
     ("plots", "$"): ["test_plot::test_commands_of_the_page"],

@@ -54,7 +54,7 @@ def test_a_band_too_narrow_for_the_record_is_told(call):
 
 @pytest.mark.parametrize("words", [np.zeros(4000, "u4"), np.zeros((4000, 2), "u1"), np.zeros((4000, 1, 1), "u1")])
 def test_words_of_another_array_are_refused(words):
-    with pytest.raises(ertis.DataError, match=r"its settings want uint8 of shape \(4000,\): give the settings"):
+    with pytest.raises(ertis.DataError, match=r"its settings describe uint8 of shape \(4000,\); give the settings"):
         health(dataclasses.replace(sound(), data=words))
 
 

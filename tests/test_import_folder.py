@@ -176,7 +176,7 @@ def test_what_is_refused(tmp_path, made, message):
     [
         (SHORT | {"callDuration": "long"}, PLANAR, "run.1: callDuration is 'long'; give a number"),
         (SHORT | {"microphoneSamples": 0.5}, PLANAR, "microphoneSamples is 0.5; give a whole number"),
-        (SHORT | {"callMinimumFrequency": 50_000}, PLANAR, "call sweeps from 50000 Hz to itself"),
+        (SHORT | {"callMinimumFrequency": 50_000}, PLANAR, "call.stop_frequency_hz are both 50000"),
         (SHORT, PLANAR | {"microphoneLayout": "eRTIS_v9"}, "layout 'eRTIS_v9' is unknown"),
         (SHORT, PLANAR | {"directions": 1.5}, "directions is 1.5; give a whole number"),
         (SHORT, PLANAR | {"microphoneLayout": 5}, "run.1: microphoneLayout is 5; give the name of an array"),
@@ -185,7 +185,11 @@ def test_what_is_refused(tmp_path, made, message):
         (SHORT, PLANAR | {"directionsAzimuth": 3}, "directionsAzimuth is 3; give an angle for each direction"),
         (SHORT, PLANAR | {"directionsAzimuth": ["a"]}, "run.1: directionsAzimuth is 'a'; give a number"),
         (SHORT, PLANAR | {"directionsElevation": 0}, "directionsElevation is 0; give an angle for each direction"),
-        (SHORT | {"microphoneSamples": 11_000}, PLANAR, "recording lasts 2.444 ms, the call alone 2.5 ms; give more"),
+        (
+            SHORT | {"microphoneSamples": 11_000},
+            PLANAR,
+            "recording.n_samples gives a record of 2.444 ms, but the call lasts 2.5 ms; give more",
+        ),
     ],
 )
 def test_values_that_are_refused(tmp_path, recording, processing, message):

@@ -150,7 +150,7 @@ def test_what_was_asked_for_stays(tmp_path):
 
 REFUSED = {
     "no file": (lambda folder: folder / "none.wav", {}, "No such file"),
-    "other kind": (lambda folder: _text(folder / "a.wav"), {}, r"is no WAV file, it begins with b'noth'; give WAV"),
+    "other kind": (lambda folder: _text(folder / "a.wav"), {}, r"is not a WAV file: it begins with b'noth'; give WAV"),
     "cut short": (lambda folder: _cut(folder / "a.wav"), {}, r"has no samples; save it again as WAV"),
     "channels": (
         lambda folder: write_wav(folder / "a.wav", numbers(n_channels=7)),
@@ -198,12 +198,12 @@ REFUSED = {
     "half of it": (
         lambda folder: _changed(folder / "a.wav", lambda content: content[: len(content) // 2]),
         {},
-        r"is cut short: it has \d+ bytes of samples, its header says 192000; copy it again",
+        r"is truncated: it has \d+ bytes of samples, but its header claims 192000; copy it again",
     ),
     "never finished": (
         lambda folder: _changed(folder / "a.wav", lambda content: _with_data_size(content, 0)),
         {},
-        r"has a header that was never finished",
+        r"has an unfinished header",
     ),
     "no samples": (
         lambda folder: write_wav(folder / "a.wav", np.zeros((0, 8), np.int16)),
@@ -213,12 +213,12 @@ REFUSED = {
     "half a frame": (
         lambda folder: _changed(folder / "a.wav", lambda content: _with_data_size(content, 191_996)),
         {},
-        r"has 191996 bytes of samples, which are no whole frames of 64 bytes; copy it again",
+        r"has 191996 bytes of samples, not a multiple of its frame size, 64 bytes; copy it again",
     ),
     "BW64": (
         lambda folder: _changed(folder / "a.wav", lambda content: b"BW64" + content[4:]),
         {},
-        r"is no WAV file, it begins with b'BW64'; give WAV",
+        r"is not a WAV file: it begins with b'BW64'; give WAV",
     ),
     "no channels": (
         lambda folder: _changed(folder / "a.wav", lambda content: content[:22] + b"\0\0" + content[24:]),

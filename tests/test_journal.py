@@ -151,7 +151,7 @@ BAD = {
         lambda journal: journal.add_sensor("left", TINY),
         "sensor 'left' is in .* already; give each sensor a name of its own",
     ),
-    "name": (lambda journal: journal.add_sensor("a/b", TINY), "sensor name 'a/b' cannot stand in a file"),
+    "name": (lambda journal: journal.add_sensor("a/b", TINY), "sensor name 'a/b' cannot name a group in a file"),
     "mounting": (
         lambda journal: journal.add_sensor("b", TINY, rotation_xyzw=(0, 0, 1, 1)),
         "rotation_xyzw of sensor b has length 1.41421; give a unit quaternion",

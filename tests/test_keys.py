@@ -327,8 +327,8 @@ def test_a_key_that_is_allowed_again_has_what_was_said_last():
     ("changes", "told"),
     [
         ({"serials": ()}, "sensor without serials; name those"),
-        ({"serials": ("*",)}, "sensor name '\\*' cannot stand"),
-        ({"serials": ("front", "../x")}, "cannot stand in a file"),
+        ({"serials": ("*",)}, "sensor name '\\*' cannot name a group"),
+        ({"serials": ("front", "../x")}, "cannot name a group in a file"),
         ({"role": "application"}, "has serials and is no sensor"),
         ({"role": "admin"}, "has serials and is no sensor"),
         ({"role": "root", "serials": ()}, "role 'root' is unknown"),

@@ -128,7 +128,9 @@ def test_what_does_not_fit_into_a_file_ends_it_and_keeps_what_came(tmp_path):
     with Publisher(describes_each=True) as publisher, publisher.playing([image(1), shorter, image(3)]):
         done = listen(publisher.address, "-n", 3, "--save", path)
     assert done.exit_code == 1
-    assert "another range_m than the first; write it to its own file" in str(done.stderr) + str(done.exception)
+    assert "range_m of an energyscape differs from that of the first; write it to another file" in str(
+        done.stderr
+    ) + str(done.exception)
     with open_energyscapes(path) as images:
         assert [each.stamp.sequence for each in images] == [1]
 

@@ -200,7 +200,7 @@ def test_settings_that_no_plan_can_keep_are_told_of_each(runs, out, monkeypatch)
     found, pool = run_here(monkeypatch, [runs], out, CampaignOptions(settings=hopeless))
     assert set(outcomes(found).values()) == {"failed"}
     for name, event in found.items():
-        assert event.error.startswith(f"{runs / name}: accuracy.max_error_db is -199, and the best")
+        assert event.error.startswith(f"{runs / name}: accuracy.max_error_db is -199, but the smallest error")
     assert [order.do for order in pool.given].count("plan") == 2  # each tried once
     assert names_in(out) == []
 
@@ -392,7 +392,8 @@ def test_a_folder_that_cannot_be_written_is_told_with_the_remedy(monkeypatch, tm
     reported = work.follow("make", {})
     assert (
         reported["error"]
-        == f"{tmp_path / 'a.energy.h5'}: Read-only file system; see who may use it and its folder, or choose another"
+        == f"{tmp_path / 'a.energy.h5'}: Read-only file system; check the permissions of the file and its "
+        "folder, or choose another"
     )
     assert reported["by_chance"]
 

@@ -166,7 +166,7 @@ def test_files_that_settings_from_elsewhere_name_are_not_opened(tmp_path):
         ({"modulation": "linear"}, "call.waveform and call.modulation are both given"),
         ({"waveform": (0.0, 1.0)}, "call.waveform has 2 samples; give 17 to 4096, at 450000 Hz 9.1 ms at most"),
         ({"waveform": np.ones(MAX_WAVEFORM_SAMPLES + 1)}, "call.waveform has 4097 samples"),
-        ({"waveform": np.zeros(100)}, "call.waveform is silent"),
+        ({"waveform": np.zeros(100)}, "call.waveform contains only 0"),
         ({"waveform": (*SAMPLES, np.nan)}, "call.waveform holds nan"),
         ({"waveform": SAMPLES + 1.0}, "band that reaches 0 Hz; subtract its mean"),
         ({"sample_rate_hz": -1.0}, "call.sample_rate_hz is -1"),
@@ -183,13 +183,13 @@ def test_call_refuses(changes, message):
     ("name", "write", "message"),
     [
         ("own.wav", lambda path: wavfile.write(path, 192_000, np.ones((300, 2), np.int16)), "give one channel"),
-        ("own.wav", lambda path: path.write_bytes(b"RIFF"), "is no WAV file"),
+        ("own.wav", lambda path: path.write_bytes(b"RIFF"), "is not a WAV file"),
         ("own.npy", lambda path: path.write_bytes(b"\x80\x04N."), "cannot be read"),
         ("own.csv", lambda path: path.write_text("a,b"), "cannot be read"),
         ("own.npy", lambda path: np.save(path, np.zeros(2**20)), "the limit is 4194304"),
         ("own.wav", lambda path: path.mkdir(), "no such file"),
         ("own.mp3", lambda path: path.write_bytes(b""), "give a .wav, .csv or .npy file"),
-        ("own.npy", lambda path: np.save(path, np.zeros(100)), "call.waveform is silent"),
+        ("own.npy", lambda path: np.save(path, np.zeros(100)), "call.waveform contains only 0"),
     ],
 )
 def test_settings_refuse_files(tmp_path, name, write, message):

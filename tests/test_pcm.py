@@ -154,9 +154,9 @@ def test_a_journal_that_holds_no_number_is_sealed_all_the_same(tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (np.zeros((3_000, 8), np.float32), r"holds float32 words of shape \(3000, 8\); its settings want int16"),
-        (np.zeros((3_000, 7), np.int16), r"shape \(3000, 7\); its settings want int16 of shape \(3000, 8\)"),
-        (np.zeros(3_000, np.uint32), "holds uint32 words"),
+        (np.zeros((3_000, 8), np.float32), r"has float32 words of shape \(3000, 8\), but its settings describe int16"),
+        (np.zeros((3_000, 7), np.int16), r"shape \(3000, 7\), but its settings describe int16 of shape \(3000, 8\)"),
+        (np.zeros(3_000, np.uint32), "has uint32 words"),
     ],
 )
 def test_other_words_are_refused(words, message):

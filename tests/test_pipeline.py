@@ -198,7 +198,7 @@ def test_closed_pipeline_processes_no_more_and_keeps_its_axes(method):
     pipeline.close()
     assert (len(pipeline.grid), len(pipeline.range_m)) == image.amplitude.shape
     for refused in (lambda: pipeline.process(noise(settings)), lambda: pipeline.process_batch([noise(settings)])):
-        with pytest.raises(ArgumentError, match="the pipeline is closed; make another one"):
+        with pytest.raises(ArgumentError, match="the pipeline is closed; create another one"):
             refused()
 
 
@@ -206,7 +206,7 @@ def test_closed_pipeline_processes_no_more_and_keeps_its_axes(method):
     "words", [np.zeros(10, np.uint32), np.zeros(40_960, np.uint16), np.zeros((40_960, 2), np.uint32)]
 )
 def test_refuses_words_of_other_settings(words):
-    with pytest.raises(DataError, match=r"words of shape .* its settings want uint32 of shape \(40960,\)"):
+    with pytest.raises(DataError, match=r"words of shape .* its settings describe uint32 of shape \(40960,\)"):
         Pipeline(SHORT).process(Measurement(words, SHORT))
 
 
@@ -226,10 +226,16 @@ def test_the_tests_are_these():
     [
         (
             SHORT.replace(air=SHORT.air.replace(temperature_c=-10.0)),
-            r"has Air\(temperature_c=-10.0.*, the pipeline Air",
+            r"has Air\(temperature_c=-10.0.*, but the pipeline has Air",
         ),
-        (SHORT.replace(call=SHORT.call.replace(duration_s=1e-3)), r"has Call\(.*duration_s=0.001.*, the pipeline Call"),
-        (SHORT.replace(array=Array(layout="eRTIS_v2")), "has array 'eRTIS_v2', the pipeline another, 'eRTIS_v3D1'"),
+        (
+            SHORT.replace(call=SHORT.call.replace(duration_s=1e-3)),
+            r"has Call\(.*duration_s=0.001.*, but the pipeline has Call",
+        ),
+        (
+            SHORT.replace(array=Array(layout="eRTIS_v2")),
+            "has array 'eRTIS_v2', but the pipeline has another, 'eRTIS_v3D1'",
+        ),
     ],
 )
 def test_refuses_measurements_it_was_not_made_for(settings, match):

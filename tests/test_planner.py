@@ -121,12 +121,12 @@ def test_16_bits_are_kept_or_refused():
 )
 def test_a_budget_that_none_keeps_is_refused_with_the_best_there_is(pinned, part):
     with pytest.raises(
-        ArgumentError, match=rf"max_error_db is -160, and the best that .*by {part}\); give -\d+ or"
+        ArgumentError, match=rf"max_error_db is -160, but the smallest error .* due to {part}\); give -\d+ or"
     ) as no:
         chosen_for(SMALL, max_error_db=-160.0, **pinned)
     min_db = float(str(no.value).partition("; give ")[2].split()[0])
     assert chosen_for(SMALL, max_error_db=min_db, **pinned).error_db <= min_db
-    with pytest.raises(ArgumentError, match="and the best that"):
+    with pytest.raises(ArgumentError, match="but the smallest error"):
         chosen_for(SMALL, max_error_db=min_db - 1.01, **pinned)
 
 
@@ -148,11 +148,11 @@ def test_the_same_costs_give_the_same_plan():
 
 def test_costs_decide(monkeypatch):
     """Where nothing but sums takes time, beams are interpolated; where interpolation is dear, they are not."""
-    usual = planner.costs_of(CPU, 1)
+    usual = planner.nominal_costs(CPU)
     many = SMALL.replace(processing=SMALL.processing.replace(directions="3d:2000"))
     for dear, wanted in (("sum", True), ("pair", False)):
         seconds = {name: 1e-9 if name.startswith(dear) else 1e-15 for name in usual.seconds}
-        monkeypatch.setattr(planner, "costs_of", lambda _kernels, _threads, seconds=seconds: type(usual)(seconds))
+        monkeypatch.setattr(planner, "nominal_costs", lambda _kernels, seconds=seconds: type(usual)(seconds))
         assert bool(chosen_for(many).settings.accuracy.beam_taps) == wanted
 
 
@@ -169,7 +169,7 @@ def test_complete_plans_are_left_alone():
 def test_complete_plans_that_err_too_much_are_refused():
     plan = error_cases.PLANS["delays 4 1"]
     assert complete(SMALL.replace(accuracy=plan.replace(max_error_db=-20.0)), CPU, threads=1)
-    with pytest.raises(ArgumentError, match=r"max_error_db is -60, and the best that these settings can is -2\d"):
+    with pytest.raises(ArgumentError, match=r"max_error_db is -60, but the smallest error of these settings is -2\d"):
         complete(SMALL.replace(accuracy=plan.replace(max_error_db=-60.0)), CPU, threads=1)
 
 

@@ -125,7 +125,7 @@ def test_refuses_a_plan_that_does_not_keep_its_budget(recording, tmp_path):
     )
     done = run(recording, "-o", output, "--settings", wishes, code=1)
     last = done.stderr.splitlines()[-1]
-    assert last.startswith("ertis: error: accuracy.max_error_db is -35, and the best that these settings can is -")
+    assert last.startswith("ertis: error: accuracy.max_error_db is -35, but the smallest error of these settings is -")
     assert last.endswith("or leave more of [accuracy] open")
     assert sorted(item.name for item in tmp_path.iterdir()) == ["rec.h5", "wishes.toml"]
 

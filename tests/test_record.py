@@ -118,7 +118,7 @@ def test_it_ends_after_its_time(tmp_path):
     [
         (["--rotate-size", "0"], "--rotate-size is 0; give a number from 1 to 1e+09"),
         (["--rotate-every", "0"], "--rotate-every is 0; give a number from 1 to 1e+09"),
-        (["--name", "a/b"], "--name 'a/b' cannot stand in a file; give letters"),
+        (["--name", "a/b"], "--name 'a/b' cannot name a group in a file; give letters"),
         (["--duration", "0"], "--duration is 0; give a number above 0"),
         (["--metrics", "foo"], "--metrics is 'foo'; give HOST:PORT, such as 127.0.0.1:9101"),
         (["--listen", "{taken}"], "is taken by another program; end that or give another --listen"),

@@ -163,7 +163,7 @@ def test_faults_of_missing_channels_are_refused(tmp_path, channel):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("seed = ", "scene.*; correct it or take it out"),
+        ("seed = ", "scene.*; correct it or remove it"),
         ("sede = 1", "scene.*unknown key `sede`; correct it"),
         ("[[points]]\nrange_m = 1\nradius_m = 1", "unknown key `radius_m`; correct it"),
         ("[[walls]]\nrange_m = 1", "`facing_deg` is missing; give it"),
@@ -298,7 +298,7 @@ def test_errors_name_the_line():
 def test_unknown_sensors_and_fields_are_refused():
     with pytest.raises(ArgumentError, match=r"sensor 'x' is unknown; known are sensor"):
         Scene().sensor("x")
-    with pytest.raises(ArgumentError, match=r"Point field 'range' is unknown .did you mean 'range_m'"):
+    with pytest.raises(ArgumentError, match=r"point key 'range' is unknown .did you mean 'range_m'"):
         Point(range_m=1.0).replace(range=1.0)
 
 

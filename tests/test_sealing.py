@@ -204,7 +204,7 @@ def test_no_room_to_seal(tmp_path, monkeypatch, capsys):
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(atomic_files.shutil, "disk_usage", lambda _: usage._replace(free=5_000_000))
     assert main([str(path)]) == 1
-    wanted = "has 5.0 MB free, wanted 8.0 MB for what is next, 8 MB of it to spare; free some space"
+    wanted = "has 5.0 MB free, but 8.0 MB are needed for the next data, including a reserve of 8 MB; free some space"
     assert wanted in capsys.readouterr().err
     monkeypatch.undo()
     assert [item.name for item in tmp_path.iterdir()] == ["rec.h5.journal"]

@@ -135,7 +135,7 @@ def test_tolerance_decides(scene_file):
     ("text", "arguments", "code", "message"),
     [
         (None, (), 1, r"scene\.toml: .*; give a readable scene file"),
-        ("sede = 1", (), 1, r"scene\.toml.*unknown key `sede`; correct it or take it out"),
+        ("sede = 1", (), 1, r"scene\.toml.*unknown key `sede`; correct it or remove it"),
         ("[[sensors]]\narray.layout = 'eRTIS'", (), 1, "layout 'eRTIS' is unknown"),
         ("", ("--sensor", "left"), 1, "sensor 'left' is unknown; known are sensor"),
         ("", ("--tolerance-db", "-1"), 1, "--tolerance-db is -1; give a number from 0 to 60"),

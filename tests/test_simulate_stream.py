@@ -41,7 +41,8 @@ def test_simulation_without_room_is_refused_before_anything_is_computed(path, mo
     assert time.monotonic() - began_s < 20
     assert refused.exit_code == 1
     assert re.search(
-        r"has [\d.]+ MB free, wanted [\d.]+ MB for 1000000000 measurements of 1 sensor, .*; free some", refused.stderr
+        r"has [\d.]+ MB free, but [\d.]+ MB are needed for 1000000000 measurements of 1 sensor, .*; free some",
+        refused.stderr,
     )
     assert not list(path.parent.glob("scene.h5*"))
 

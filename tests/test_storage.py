@@ -271,7 +271,10 @@ def spoilt(**settings):
         (spoilt(array=Array(layout="eRTIS_v2")), "other array settings"),
         (spoilt(call=Call(duration_s=2e-3)), "other call settings"),
         (spoilt(recording=Recording(n_samples=50_000)), "other recording settings"),
-        ([Measurement(noise()[0].data, SMALL, Stamp(sensor="a/b"))], "sensor name 'a/b' cannot stand in a file"),
+        (
+            [Measurement(noise()[0].data, SMALL, Stamp(sensor="a/b"))],
+            "sensor name 'a/b' cannot name a group in a file",
+        ),
         ([Measurement(noise()[0].data[1:], SMALL)], r"measurement 0 has shape \(40959,\); give shape \(40960,\)"),
         (
             [Measurement(noise()[0].data, SMALL, Stamp(timestamp_uncertainty_ns=2**32))],
@@ -382,9 +385,9 @@ def test_what_is_no_number_is_not_recorded(tmp_path, number):
 @pytest.mark.parametrize(
     ("other", "message"),
     [
-        (image(range_m=np.linspace(0.5, 5.1, 400)), "another range_m than the first"),
-        (image(azimuth_deg=np.linspace(-80, 80, 37)), "another azimuth_rad than the first"),
-        (image(settings=Settings()), "other settings than the first"),
+        (image(range_m=np.linspace(0.5, 5.1, 400)), "range_m of an energyscape differs from that of the first"),
+        (image(azimuth_deg=np.linspace(-80, 80, 37)), "azimuth_rad of an energyscape differs from that of the first"),
+        (image(settings=Settings()), "settings of an energyscape differ from those of the first"),
     ],
 )
 def test_energyscapes_that_cannot_be_written(tmp_path, other, message):

@@ -264,7 +264,8 @@ def test_no_room(tmp_path, monkeypatch):
     free = shutil.disk_usage(tmp_path).free
     monkeypatch.setattr(atomic_files, "RESERVED_BYTES", 2 * free)
     with pytest.raises(
-        DataError, match=r"MB free, wanted [\d.]+ MB for what is next, \d+ MB of it to spare; free some"
+        DataError,
+        match=r"MB free, but [\d.]+ MB are needed for the next data, including a reserve of \d+ MB; free some",
     ):
         write_recording(tmp_path / "rec.h5", noise())
     assert not list(tmp_path.iterdir())

@@ -28,7 +28,7 @@ REFUSED = {
     "attribute: 5,000 of /": r"/ has 50\d\d attributes; the limit is 256",
     "names: 5,000 sensors": r"5001 sensors; the limit is 1024",
     "names: the same rows under 201 names": r"has several names in the file",
-    "names: sensor '..'": r"sensor name '..' cannot stand in a file",
+    "names: sensor '..'": r"sensor name '..' cannot name a group in a file",
     "settings: text of 262,145 bytes": r"settings holds \|S262145, wanted text of up to 262144 bytes",
     "settings: directions: '/etc/passwd.csv/'": r"processing.directions is '/etc/passwd.csv/', a file",
     "settings: layout: '/etc/passwd.toml'": r"array.layout is '/etc/passwd.toml', a file",

@@ -160,7 +160,7 @@ def test_readers_of_different_recordings(tmp_path):
     with (
         open_recording(tmp_path / "1.h5") as first,
         open_recording(tmp_path / "2.h5") as second,
-        pytest.raises(ArgumentError, match=r"2.h5 is another recording than .*1.h5; write one file for each"),
+        pytest.raises(ArgumentError, match=r"2.h5 is not the same recording as .*1.h5; write one file for each"),
     ):
         write_energyscapes(tmp_path / "img.h5", [image()], recording=[first, second])
 

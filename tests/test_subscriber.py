@@ -170,7 +170,7 @@ def test_receive_gives_up_after_its_time(publisher):
         ({"products": ["pictures"]}, "product 'pictures' is unknown"),
         ({"products": []}, "products are none; give some of energyscape"),
         ({"sensors": []}, "sensors are 0; give 1 to 32"),
-        ({"sensors": ["a b"]}, "sensor name 'a b' cannot stand"),
+        ({"sensors": ["a b"]}, "sensor name 'a b' cannot name a group"),
         ({"credit": 65}, "credit is 65; give a whole number from 1 to 64"),
     ],
 )

@@ -101,6 +101,34 @@ def accuracy(*, picture: Path | None, **given: Any) -> None:
 
 
 @bench.command()
+@click.option("--count", type=click.IntRange(min=1), default=5, show_default=True, metavar="N", help="Repetitions.")
+@click.option(
+    "--update",
+    "target",
+    type=click.Path(path_type=Path, dir_okay=False, exists=True, writable=True),
+    metavar="nominal_costs.py",
+    help="Write the costs into this file of nominal costs, by which plans are chosen. This changes images.",
+)
+@options.quiet
+@options.as_json
+def costs(*, count: int, target: Path | None, quiet: bool, as_json: bool) -> None:
+    """Measure the costs of the kernels, from which the planner predicts times, beside the nominal costs."""
+    from ertis_bench import costs as benchmark
+
+    if target is not None and target.name != "nominal_costs.py":
+        raise click.BadParameter(
+            f"{target} is not nominal_costs.py; give that of ertis_numba/stages", param_hint="--update"
+        )
+    report = benchmark.run(count=count, say=lambda text: options.say(text, quiet=quiet))
+    if target is not None:
+        benchmark.update(target, report)
+    if as_json:
+        options.print_json(report)
+    elif target is None:
+        click.echo(benchmark.as_markdown(report))
+
+
+@bench.command()
 @_random_settings(200)
 @_update
 @options.quiet

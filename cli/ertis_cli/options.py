@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from ertis_numba.analysis.compare import Comparison
     from ertis_numba.pipeline import Pipeline
     from ertis_numba.settings import Settings
+    from ertis_numba.stages.costs import PlanCosts
 
 __all__ = [
     "CHANNELS",
@@ -43,6 +44,7 @@ __all__ = [
     "pipeline",
     "place",
     "places",
+    "plan",
     "print_json",
     "progress",
     "quiet",
@@ -135,6 +137,14 @@ device: Decorator = click.option(
         "Device that computes; auto chooses cuda (an NVIDIA GPU) where available, otherwise cpu. numpy runs without "
         "compiled kernels."
     ),
+)
+plan: Decorator = click.option(
+    "--plan",
+    type=click.Choice(["nominal", "measured"]),
+    default="nominal",
+    show_default=True,
+    help="Costs by which the fastest plan is chosen: published ones, which give the same images on every machine with "
+    "the same instruction set, or those measured on this machine.",
 )
 force: Decorator = click.option("--force", is_flag=True, help="Overwrite the output.")
 quiet: Decorator = click.option("--quiet", "-q", is_flag=True, help="Print only warnings and errors.")
@@ -245,12 +255,19 @@ def settings_with(
     return settings.replace(accuracy=settings.accuracy.replace(max_error_db=max_error_db))
 
 
-def pipeline(settings: "Settings", *, quiet: bool, device: str = "auto", threads: int | None = None) -> "Pipeline":
+def pipeline(
+    settings: "Settings",
+    *,
+    quiet: bool,
+    device: str = "auto",
+    threads: int | None = None,
+    plan: "PlanCosts" = "nominal",
+) -> "Pipeline":
     """Return a pipeline; print a note if compilation takes long."""
     with note_when_slow(PREPARING, quiet=quiet):
         from ertis_numba.pipeline import Pipeline
 
-        return Pipeline(settings, device=device, threads=threads, predict=False)
+        return Pipeline(settings, device=device, threads=threads, predict=False, plan=plan)
 
 
 def complete_presets(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:  # noqa: ARG001

@@ -65,6 +65,7 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
     metavar="DB|PRESET",
     help="Error budget of images: dB, such as -40, or draft, standard, fine, exact; the settings' own by default.",
 )
+@options.plan
 @click.option("--explain", is_flag=True, help="Print the plan first: its steps, predicted error and time.")
 @click.option(
     "--verify",
@@ -129,6 +130,7 @@ def process(
     array_weights: str | None,
     wavefront: str | None,
     max_error_db: float | None,
+    plan: Literal["nominal", "measured"],
     explain: bool,
     verify: bool,
     settings_file: Path | None,
@@ -183,6 +185,7 @@ def process(
         sensor=sensor,
         dtype=dtype,
         device=device,
+        plan=plan,
         threads=threads,
         batch=batch,
         strict=strict,
@@ -238,7 +241,9 @@ def _process_one(path: Path, target: Path, wanted: "CampaignOptions", *, quiet: 
     @contextmanager
     def pipelines(several: "Sequence[Settings]") -> "Iterator[list[Pipeline]]":
         with ExitStack() as stack:
-            wait = functools.partial(options.pipeline, device=wanted.device, threads=wanted.threads, quiet=quiet)
+            wait = functools.partial(
+                options.pipeline, device=wanted.device, plan=wanted.plan, threads=wanted.threads, quiet=quiet
+            )
             yield [stack.enter_context(wait(settings)) for settings in several]
 
     def show(sensor: str, reported: dict[str, Any]) -> None:

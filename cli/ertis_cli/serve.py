@@ -40,6 +40,7 @@ _FOLDER = click.Path(path_type=Path)
     metavar="DB|PRESET",
     help="Error budget of images: dB, such as -40, or draft, standard, fine, exact; the sensor's own by default.",
 )
+@options.plan
 @options.device
 @click.option(
     "--dtype",
@@ -86,6 +87,7 @@ def serve(
     method: str | None,
     beamformer: str | None,
     max_error_db: float | None,
+    plan: Literal["nominal", "measured"],
     device: str,
     dtype: Literal["float32", "float16"],
     deadline: float,
@@ -126,6 +128,7 @@ def serve(
                 keys=keys,
                 processing={option: value for option, value in changes.items() if value is not None},
                 max_error_db=max_error_db,
+                plan=plan,
                 device=device,
                 workers=workers,
                 threads=threads,

@@ -169,7 +169,8 @@ class Campaign:
 
     def _shares(self, n_workers: int) -> dict[str, Any]:
         share = 1 if self._scheduler is not None else n_workers
-        return {"device": self._options.device, "threads": self._options.threads, "share": share}
+        options = self._options
+        return {"device": options.device, "plan": options.plan, "threads": options.threads, "share": share}
 
     def _pending_output(self, case: _Case, n_workers: int) -> dict[str, Any]:
         options = self._options

@@ -56,7 +56,7 @@ def examine(
     kernel_set = kernels.load(pipeline.device)
     n_threads = kernel_set.max_threads if threads is None else threads
     planners = {
-        "safe": Planner(settings, kernel_set, threads=n_threads),
+        "safe": Planner(settings, kernel_set, threads=n_threads, plan="measured"),  # times are those of this machine
         "texture": heard or planner_of(pipeline.process(first), first, kernel_set, threads=n_threads),
     }
     if explain:
@@ -115,8 +115,8 @@ def _verified(pipeline: Pipeline, first: Measurement, planners: dict[str, Planne
         "sequence": first.stamp.sequence,
         "directions": measured.n_directions,
         "error_db": round(measured.error_db, 2),
-        "predicted_db": round(planners["texture"].chosen(accuracy).error_db, 2),
-        "safe_db": round(planners["safe"].chosen(accuracy).error_db, 2),
+        "predicted_db": round(planners["texture"].error_db(accuracy), 2),
+        "safe_db": round(planners["safe"].error_db(accuracy), 2),
         "max_error_db": accuracy.max_error_db,
         "peaks": measured.peaks and {name: _rounded(value) for name, value in asdict(measured.peaks).items()},
     }

@@ -6,6 +6,7 @@ from typing import Any, Final, Literal, Protocol
 
 from ertis_numba import checks
 from ertis_numba.settings import Settings
+from ertis_numba.stages.costs import PLAN_COSTS, PlanCosts
 from ertis_numba.storage.recording import Mounting
 
 __all__ = ["HOW", "MAX_BYTES", "CampaignOptions", "Do", "News", "WorkOrder", "WorkerPool"]
@@ -26,6 +27,8 @@ class CampaignOptions:
         One only; all of each recording by default.
     dtype : {"float32", "float16"}
     device : {"auto", "cpu", "cuda", "numpy"}
+    plan : {"nominal", "measured"}
+        Costs by which plans are chosen, as for `Pipeline`.
     threads : int, optional
         Of each worker; the workers share the cores by default.
     batch : int
@@ -48,6 +51,7 @@ class CampaignOptions:
     sensor: str | None = None
     dtype: Literal["float32", "float16"] = "float32"
     device: str = "auto"
+    plan: PlanCosts = "nominal"
     threads: int | None = None
     batch: int = 8
     strict: bool = False
@@ -58,6 +62,7 @@ class CampaignOptions:
 
     def __post_init__(self) -> None:
         checks.choice("dtype", self.dtype, ("float32", "float16"))
+        checks.choice("plan", self.plan, PLAN_COSTS)
         checks.choice("device", self.device, ("auto", "cpu", "cuda", "numpy"))
         checks.integer("batch", self.batch, 1)
 

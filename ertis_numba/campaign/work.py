@@ -21,6 +21,7 @@ from ertis_numba.errors import ErtisError
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Settings
 from ertis_numba.stages import planner
+from ertis_numba.stages.costs import PlanCosts
 from ertis_numba.storage import file_kind, open_recording, sensor_names
 
 __all__ = ["follow"]
@@ -78,9 +79,9 @@ def _plan(about: Mapping[str, Any], _: ReportProgress) -> dict[str, Any]:
     threads = _threads(about, settings)
     if not about["warm"]:
         loaded = kernels.load(about["device"])
-        planned = planner.complete(settings, loaded, threads=loaded.max_threads)
+        planned = planner.complete(settings, loaded, threads=loaded.max_threads, plan=about["plan"])
         return {"settings": planned.to_toml(), "device": loaded.device}
-    with _pipelines([settings], about["device"], threads) as (pipeline,):
+    with _pipelines([settings], about["device"], threads, about["plan"]) as (pipeline,):
         planned, device = pipeline.settings, pipeline.device
     with _turn:
         made = _kept.pop((settings.to_toml(), about["device"], threads), None)
@@ -133,7 +134,9 @@ def _threads(about: Mapping[str, Any], settings: Settings) -> int | None:
 
 
 @contextmanager
-def _pipelines(settings: Sequence[Settings], device: str, threads: int | None) -> Iterator[list[Pipeline]]:
+def _pipelines(
+    settings: Sequence[Settings], device: str, threads: int | None, plan: PlanCosts = "nominal"
+) -> Iterator[list[Pipeline]]:
     """Yield a pipeline for each of the settings, reusing the previous recording's if the settings are the same.
 
     Who uses one has it for itself. No more are kept than were used last, so that memory does not grow with the number
@@ -149,7 +152,7 @@ def _pipelines(settings: Sequence[Settings], device: str, threads: int | None) -
     try:
         for key, given in zip(keys, settings, strict=True):
             if key not in found:  # sensors that are alike share theirs
-                found[key] = Pipeline(given, device=device, threads=threads, predict=False)
+                found[key] = Pipeline(given, device=device, threads=threads, predict=False, plan=plan)
         yield [found[key] for key in keys]
     finally:
         _keep(found)

@@ -7,9 +7,10 @@ sensor. Each function returns a figure; `save` writes it to a file. Only the liv
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import IO, Unpack
+from typing import IO, Unpack, overload
 
 import matplotlib as mpl
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ertis_numba import checks
@@ -28,6 +29,7 @@ __all__ = [
     "front",
     "matched_filter",
     "plot",
+    "plot_page",
     "polar",
     "projection",
     "save",
@@ -38,7 +40,94 @@ __all__ = [
 _FORMATS = ("pdf", "png", "svg")
 
 
+@overload
 def plot(
+    image: Energyscape,
+    *,
+    ax: None = None,
+    dynamic_range_db: float = 40.0,
+    peaks: Sequence[Peak] | None = None,
+    side_lobes: bool = False,
+    **look: Unpack[StyleOptions],
+) -> Figure: ...
+@overload
+def plot(
+    image: Energyscape,
+    *,
+    ax: Axes,
+    dynamic_range_db: float = 40.0,
+    peaks: Sequence[Peak] | None = None,
+    side_lobes: bool = False,
+    **look: Unpack[StyleOptions],
+) -> Axes: ...
+def plot(
+    image: Energyscape,
+    *,
+    ax: Axes | None = None,
+    dynamic_range_db: float = 40.0,
+    peaks: Sequence[Peak] | None = None,
+    side_lobes: bool = False,
+    **look: Unpack[StyleOptions],
+) -> Figure | Axes:
+    """Draw an energyscape into given axes, or on a composed page.
+
+    A planar image becomes a sector in metres. An image of one direction becomes a curve over range. On given axes, an
+    image with elevations becomes a map of azimuth and elevation. Without axes, the page is that of `plot_page`.
+
+    Parameters
+    ----------
+    image : Energyscape
+    ax : matplotlib.axes.Axes, optional
+        Rectilinear axes to draw into. Their position and size stay as they are; the limits, the aspect ratio and, for a
+        sector, the frame change. The raster is ``ax.images[-1]``, from which ``figure.colorbar`` makes a colour bar.
+    dynamic_range_db : float, default 40
+        Level below the strongest point at which the colour scale ends, in dB.
+    peaks : sequence of Peak, optional
+        Reflectors to mark, as `find_peaks` returns them; a page lists them, too.
+    side_lobes : bool, default False
+        Show the side lobes of an image with elevations, see `plot_page`.
+    **look
+        ``theme``, ``columns`` and ``font``: see `StyleOptions`. The theme is ``light`` for given axes and ``dark``
+        otherwise.
+
+    Returns
+    -------
+    matplotlib.axes.Axes or matplotlib.figure.Figure
+        ``ax`` if it is given, otherwise the figure.
+
+    Raises
+    ------
+    ArgumentError
+        An argument has another type or value than listed above.
+
+    Examples
+    --------
+    >>> import matplotlib.pyplot as plt
+    >>> import ertis_numba as ertis
+    >>> with ertis.open_recording("reflectors.h5") as recording:
+    ...     image = ertis.Pipeline(recording.settings).process(recording[0])
+    >>> figure, axes = plt.subplots(1, 2)
+    >>> ertis.plot(image, ax=axes[0]) is axes[0]
+    True
+    >>> bar = figure.colorbar(axes[0].images[-1], ax=axes[0], label="dB")
+    """
+    if ax is None:
+        return plot_page(image, dynamic_range_db=dynamic_range_db, peaks=peaks, side_lobes=side_lobes, **look)
+    if not isinstance(ax, Axes) or ax.name != "rectilinear":
+        name = f"{ax.name} axes" if isinstance(ax, Axes) else f"of type {type(ax).__name__}"
+        raise ArgumentError(f"ax is {name}; give rectilinear Axes, such as matplotlib.pyplot.subplots returns")
+    checks.instance("image", image, Energyscape, "Pipeline.process returns")
+    canvas = _canvas(dynamic_range_db, {"theme": "light", **look}, peaks)
+    if len(image.azimuth_rad) == 1:
+        _curve.draw_on(canvas, ax, image)
+    elif image.is_planar:
+        _sector.draw_on(canvas, ax, image, side_lobes=side_lobes)
+    else:
+        _sphere.draw_on(canvas, ax, image, side_lobes=side_lobes)
+    return ax
+
+
+def plot_page(
     image: Energyscape,
     *,
     dynamic_range_db: float = 40.0,
@@ -46,22 +135,22 @@ def plot(
     side_lobes: bool = False,
     **look: Unpack[StyleOptions],
 ) -> Figure:
-    """Draw an energyscape.
+    """Draw an energyscape as a page with a heading, a colour scale and a list of reflectors.
 
-    A planar image becomes a sector in metres. An image with elevations becomes two: the maximum over range as a map of
-    azimuth and elevation, and the maximum over elevation as a sector. An image of one direction becomes a curve over
-    range.
+    A planar image becomes a sector in metres. An image with elevations becomes two pictures: the maximum over range as
+    a map of azimuth and elevation, and the maximum over elevation as a sector. An image of one direction becomes a
+    curve over range.
 
     Parameters
     ----------
     image : Energyscape
-    dynamic_range_db : float
-        What lies further below the strongest has the colour of silence.
+    dynamic_range_db : float, default 40
+        Level below the strongest point at which the colour scale ends, in dB.
     peaks : sequence of Peak, optional
         Reflectors to mark and list, as `find_peaks` returns them.
-    side_lobes : bool
-        Show the side lobes of an image with elevations, too. By default, what lies
-        `ertis_numba.analysis.side_lobes.SIDE_LOBE_DB` below the strongest of about the same range is left out: a
+    side_lobes : bool, default False
+        Show the side lobes of an image with elevations, too. By default, points that lie
+        `ertis_numba.analysis.side_lobes.SIDE_LOBE_DB` below the strongest of about the same range are left out: a
         maximum over directions would otherwise show an arc at the range of each echo.
     **look
         ``theme``, ``columns`` and ``font``: see `StyleOptions`.
@@ -74,7 +163,14 @@ def plot(
     Raises
     ------
     ArgumentError
-        What came is no image, the dynamic range is not positive, or the theme is unknown.
+        An argument has another type or value than listed above.
+
+    Examples
+    --------
+    >>> import ertis_numba as ertis
+    >>> with ertis.open_recording("reflectors.h5") as recording:
+    ...     image = ertis.Pipeline(recording.settings).process(recording[0])
+    >>> ertis.plot_page(image, peaks=ertis.find_peaks(image, top=5)).savefig("image.png")
     """
     canvas = _canvas_of(image, dynamic_range_db, look, peaks)
     if len(image.azimuth_rad) == 1:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -64,14 +65,19 @@ class Canvas:
         return below_strongest_db(amplitude, self.dynamic_range_db)
 
     def show(
-        self, axes: Axes, level_db: NDArray[np.floating], *, extent: tuple[float, float, float, float]
+        self,
+        axes: Axes,
+        level_db: NDArray[np.floating],
+        *,
+        extent: tuple[float, float, float, float],
+        aspect: Literal["auto", "equal"] = "auto",
     ) -> AxesImage:
         """Draw a raster whose NaN are not drawn; ``extent`` is left, right, bottom, top."""
         return axes.imshow(
             level_db,
             extent=extent,
             origin="lower",
-            aspect="auto",
+            aspect=aspect,
             cmap=self.style.colours,
             vmin=-self.dynamic_range_db,
             vmax=0.0,

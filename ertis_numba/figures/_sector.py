@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -20,7 +20,7 @@ from ertis_numba.figures._style import text_width_pt
 from ertis_numba.frames import Energyscape, Peak
 from ertis_numba.geometry import ALONE_RAD
 
-__all__ = ["draw", "draw_into", "height_of"]
+__all__ = ["draw", "draw_into", "draw_on", "height_of"]
 
 _SIDE_EMS, _ROOF_EMS, _FLOOR_EMS = 3.6, 3.0, 2.0  # what names take around the sector
 _MIN_RATIO, _MAX_RATIO = 0.3, 0.95  # of height to width
@@ -60,13 +60,39 @@ def draw_into(
     title: str = "",
 ) -> AxesImage:
     """Draw levels (direction, range), of rising azimuths, as a sector with rings, rays and the reflectors."""
-    azimuth_rad, level_db = _fan(azimuth_rad, level_db)
-    extent = _extent(azimuth_rad, range_m)
-    left, right, bottom, top = extent
+    left, right, bottom, top = _extent(_fan(azimuth_rad, level_db)[0], range_m)
     em_pt = canvas.style.em_pt
     inner = box.inset(left=_SIDE_EMS * em_pt, right=_SIDE_EMS * em_pt, bottom=_FLOOR_EMS * em_pt, top=_ROOF_EMS * em_pt)
     axes = page.axes(inner.fitted((top - bottom) / (right - left)))
     page.caption(box, title)
+    return _paint(canvas, axes, azimuth_rad, range_m, level_db)
+
+
+def draw_on(canvas: Canvas, axes: Axes, image: Energyscape, *, side_lobes: bool) -> None:
+    """Draw an image on given axes, to scale; of several elevations the strongest."""
+    image = image if image.is_planar or side_lobes else without_side_lobes(image)
+    azimuth_rad, level_db = flattened(image, canvas.level_db(image.amplitude))
+    left, right, bottom, top = _extent(_fan(azimuth_rad, level_db)[0], image.range_m)
+    axes.set_xlim(left, right)
+    axes.set_ylim(bottom, top)
+    axes.set_aspect("equal")
+    axes.apply_aspect()  # so that names are placed where they are drawn
+    _paint(canvas, axes, azimuth_rad, image.range_m, level_db, aspect="equal")
+
+
+def _paint(
+    canvas: Canvas,
+    axes: Axes,
+    azimuth_rad: NDArray[np.float64],
+    range_m: NDArray[np.float64],
+    level_db: NDArray[np.float32],
+    *,
+    aspect: Literal["auto", "equal"] = "auto",
+) -> AxesImage:
+    """Draw the sector with rings, rays and reflectors, whatever the axes show otherwise."""
+    azimuth_rad, level_db = _fan(azimuth_rad, level_db)
+    extent = _extent(azimuth_rad, range_m)
+    left, right, bottom, top = extent
     step_m = max(right - left, top - bottom) / PIXELS
     rings_m, levels_db = thickened(*join_ranges(range_m, level_db))
     raster = polar_raster(
@@ -76,13 +102,13 @@ def draw_into(
         left_m=-centres(left, right, step_m),
         ahead_m=centres(bottom, top, step_m),
     )
-    shown = canvas.show(axes, raster, extent=extent)
+    shown = canvas.show(axes, raster, extent=extent, aspect=aspect)
     axes.set_xlim(left, right)
     axes.set_ylim(bottom, top)
     axes.set_axis_off()
     _rings(canvas, axes, azimuth_rad, range_m, half_m=step_m / 2)
     _rays(canvas, axes, azimuth_rad, range_m)
-    triangle: dict[str, Any] = {"marker": "^", "markersize": 0.9 * em_pt, "color": canvas.style.ink}
+    triangle: dict[str, Any] = {"marker": "^", "markersize": 0.9 * canvas.style.em_pt, "color": canvas.style.ink}
     axes.plot(0, 0, **triangle, clip_on=False, scalex=False, scaley=False)
     canvas.mark_peaks(axes, _place_of)
     return shown

@@ -17,10 +17,11 @@ from ertis_numba.figures._sampling import PIXELS, flattened, sphere_raster
 from ertis_numba.frames import Energyscape
 from ertis_numba.geometry import spacing_rad, unit_vectors, unrolled_rad
 
-__all__ = ["draw", "draw_map"]
+__all__ = ["draw", "draw_map", "draw_on"]
 
 _LEFT_EMS, _RIGHT_EMS, _FLOOR_EMS, _ROOF_EMS = 4.6, 1.4, 4.0, 1.8  # what ticks and names take around the map
 _MIN_RATIO, _MAX_RATIO = 0.1, 1.05
+_X, _Y = "azimuth (°)", "elevation (°)"
 
 
 def draw(canvas: Canvas, image: Energyscape, *, side_lobes: bool) -> Figure:
@@ -49,6 +50,15 @@ def draw_map(canvas: Canvas, image: Energyscape, *, side_lobes: bool) -> Figure:
     return canvas.side(page, side, shown)
 
 
+def draw_on(canvas: Canvas, axes: Axes, image: Energyscape, *, side_lobes: bool) -> None:
+    """Draw the maximum over range as a map on given axes."""
+    image = image if image.is_planar or side_lobes else without_side_lobes(image)
+    width_pt = axes.get_window_extent().width * 72 / axes.figure.dpi
+    _Map(canvas, image).paint(axes, canvas.level_db(image.amplitude).max(axis=1), width_pt)
+    axes.set_xlabel(_X)
+    axes.set_ylabel(_Y)
+
+
 class _Map:
     """Azimuth, to the left, and elevation of an image, in degrees."""
 
@@ -73,12 +83,17 @@ class _Map:
 
     def draw_into(self, page: FigurePage, box: PageBox, level_db: NDArray[np.float32], title: str) -> AxesImage:
         """Draw the level of each direction."""
-        em_pt, canvas = self._em_pt, self._canvas
+        em_pt = self._em_pt
         inner = box.inset(
             left=_LEFT_EMS * em_pt, right=_RIGHT_EMS * em_pt, bottom=_FLOOR_EMS * em_pt, top=_ROOF_EMS * em_pt
         )
         page.caption(PageBox(inner.left, box.bottom, inner.width, box.height), title)
-        axes = page.axes(inner.fitted(self._ratio), x="azimuth (°)", y="elevation (°)")
+        axes = page.axes(inner.fitted(self._ratio), x=_X, y=_Y)
+        return self.paint(axes, level_db, inner.width)
+
+    def paint(self, axes: Axes, level_db: NDArray[np.float32], width_pt: float) -> AxesImage:
+        """Draw the level of each direction on axes of a width in points."""
+        canvas = self._canvas
         west, east, low, high = self._west, self._east, self._low, self._high
         step_deg = max(west - east, high - low) / (PIXELS / 2)
         raster = sphere_raster(
@@ -90,7 +105,7 @@ class _Map:
         shown = canvas.show(axes, raster, extent=(west, east, low, high))
         axes.set_xlim(west, east)
         axes.set_ylim(low, high)
-        self._ticks(axes, inner.width)
+        self._ticks(axes, width_pt)
         canvas.grid(axes)
         canvas.mark_peaks(axes, lambda peak: (east + (peak.azimuth_deg - east) % 360.0, peak.elevation_deg))
         return shown

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks
+from ertis_numba.angles import DegreesFromRadians
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry._csv import csv_rows
 from ertis_numba.settings import Processing
@@ -27,8 +28,8 @@ PAPER_GRIDS = {
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Grid:
-    """Directions of an image.
+class Grid(DegreesFromRadians):
+    """Directions of an image; ``azimuth_deg`` and ``elevation_deg`` are the same angles in degrees.
 
     Attributes
     ----------

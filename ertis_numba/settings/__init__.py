@@ -1,8 +1,7 @@
-"""Everything that can be chosen, as frozen structures with TOML in and out.
+"""Settings of a sensor, as frozen structures that are read from TOML and written to it.
 
-A structure checks itself once, when it is made; whoever holds one may rely on it. Unknown keys are
-refused. ``Settings()`` is the default eRTIS measurement; ``Settings.from_preset`` knows the RTIS
-recording presets.
+A structure checks its values when it is created and refuses unknown keys. ``Settings()`` describes the default eRTIS
+measurement; ``Settings.from_preset`` returns the settings of an RTIS recording preset.
 """
 
 from ertis_numba.settings.accuracy import ERROR_PRESETS_DB, INTERPOLATIONS, MAX_FOCAL_ZONES, Accuracy

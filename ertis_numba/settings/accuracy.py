@@ -1,4 +1,4 @@
-"""How exact an image is."""
+"""Accuracy of an image: the error budget and the plan."""
 
 from typing import Literal
 
@@ -9,46 +9,46 @@ from ertis_numba.errors import ArgumentError
 __all__ = ["ERROR_PRESETS_DB", "INTERPOLATIONS", "MAX_FOCAL_ZONES", "Accuracy"]
 
 INTERPOLATIONS = {"fitted": None, "nearest": 1, "carrier": 1, "linear": 2, "cubic": 4}
-"""Ways of making a delayed sample, and how many samples each takes; None where that is a choice."""
+"""Interpolation methods of delayed samples, and the taps of each; None if ``delay_taps`` decides."""
 
 ERROR_PRESETS_DB = {"draft": -20.0, "standard": -35.0, "fine": -60.0, "exact": -100.0}
-"""Error budgets by name."""
+"""Named error budgets in dB."""
 
 MAX_FOCAL_ZONES = 1_000_000
-"""More steps of curvature than an image has ranges, even near the array."""
+"""Limit on the number of focal zones; more than an image has ranges, even near the array."""
 
 
 class Accuracy(TomlTable, frozen=True, kw_only=True):
-    """How exact the image is: an error that it may have, and what shall not be left to the planner.
+    """Error budget of the image, and parts of the plan that the planner shall not choose.
 
-    Whatever is open (``auto`` or None), the planner chooses, such that the image takes the least time on
-    this machine and its predicted error stays within the budget. An energyscape carries the plan that it
-    was made by, with nothing open. ``docs/accuracy.md`` has the equations.
+    The planner chooses all values that are open (``auto`` or None): the fastest plan whose predicted error keeps the
+    budget. Energyscapes hold the complete plan. ``docs/accuracy.md`` has the equations.
 
     Attributes
     ----------
-    max_error_db : float
-        Budget: the norm of the image less the exact one, by that of the exact one. `ERROR_PRESETS_DB` has
-        names for some.
-    precision : {"auto", "float32", "int16"}
-        Of the samples that beams are summed from. ``int16`` needs a processor with a 16-bit dot product.
-    oversampling : int, optional
-        Samples that are kept per range of the energyscape, 1 to 64.
-    interpolation : {"fitted", "nearest", "carrier", "linear", "cubic"}
-        How a delayed sample is made of those kept. ``fitted``: by weights that err least over the call's band.
-        The others are there to be compared with: the nearest sample; the nearest one, its carrier turned
-        to the right phase; straight or by Lagrange's cubic between carriers turned to the right phase.
-    delay_taps : int, optional
-        Samples that it is made of, 1 to 8; the simpler ways of interpolation imply theirs.
-    beam_taps : int, optional
-        Beams are summed for nodes of a grid and those of all directions are interpolated from so many nodes
-        along each axis of the array, 2, 4 or 6; 0 sums every direction's own beam.
-    beam_density : float, optional
-        Nodes by what the aperture resolves at the call's highest frequency, 1.1 to 8.
-    stopband_attenuation_db : float, optional
-        Damping of what the decimation would alias into the call's band, 40 to 140.
-    zones : int, optional
-        Steps of their curvature, from 1 on, where wavefronts are spherical: ranges within one share their delays.
+    max_error_db : float, default -35
+        Error budget in dB, -200 to 0: norm of the difference between the image and the exact image, relative to the
+        norm of the exact image. `ERROR_PRESETS_DB` names some budgets.
+    precision : {"auto", "float32", "int16"}, default "auto"
+        Number format of the samples that are summed to beams. ``int16`` needs a processor with a 16-bit dot product.
+    oversampling : int, optional, default None
+        Samples kept per range of the energyscape, 1 to 64.
+    interpolation : {"fitted", "nearest", "carrier", "linear", "cubic"}, default "fitted"
+        Interpolation of delayed samples. ``fitted`` uses the weights with the least error over the call's band. The
+        others are for comparison: ``nearest`` is the nearest sample, ``carrier`` the nearest sample with its carrier
+        rotated to the right phase, ``linear`` and ``cubic`` are Lagrange polynomials between rotated carriers.
+    delay_taps : int, optional, default None
+        Samples that a delayed sample is interpolated from, 1 to 8. Interpolations other than ``fitted`` determine it.
+    beam_taps : int, optional, default None
+        Beam-grid points along each axis of the array from which a beam is interpolated: 2, 4 or 6. With 0, the beam of
+        every direction is summed itself.
+    beam_density : float, optional, default None
+        Density of the beam grid relative to the resolution of the aperture at the call's highest frequency, 1.1 to 8.
+    stopband_attenuation_db : float, optional, default None
+        Stopband attenuation of the decimation filter in dB, 40 to 140: attenuation of sound that would alias into the
+        call's band.
+    zones : int, optional, default None
+        Number of focal zones for spherical wavefronts, from 1. Ranges within a focal zone share their delays.
     """
 
     max_error_db: float = -35.0
@@ -77,6 +77,6 @@ class Accuracy(TomlTable, frozen=True, kw_only=True):
         implied = INTERPOLATIONS[self.interpolation]
         if implied is not None and self.delay_taps not in {None, implied}:
             raise ArgumentError(
-                f"accuracy.delay_taps is {self.delay_taps}, but interpolation {self.interpolation!r} takes {implied}; "
-                "leave it out"
+                f"accuracy.delay_taps is {self.delay_taps}, but accuracy.interpolation {self.interpolation!r} needs "
+                f"{implied}; leave out delay_taps"
             )

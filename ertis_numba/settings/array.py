@@ -1,4 +1,4 @@
-"""The array: where the microphones are, and how their bits lie in a word."""
+"""Microphone array: positions, calibration and word format."""
 
 import numpy as np
 
@@ -9,30 +9,29 @@ from ertis_numba.errors import ArgumentError
 
 __all__ = ["Array"]
 
-_MAX_COORDINATE_M = 10.0  # of a microphone from the origin: millimetres given for metres go beyond it
+_MAX_COORDINATE_M = 10.0  # A larger coordinate is probably in millimetres.
 
 
 class Array(TomlTable, frozen=True, kw_only=True):
-    """Where the microphones are and how their bits lie in a word.
+    """Microphone array of a sensor: positions, calibration and word format.
 
     Attributes
     ----------
-    layout : str
-        Name of a shipped layout, or the path of a layout file (.toml, .csv). When
-        ``positions_m`` is given it is only a label.
-    positions_m : tuple of (x, y, z), optional
-        Positions in the sensor frame, one per channel, in the order of the bits.
-    enabled : tuple of bool, optional
-        Channels that carry a microphone; all of them by default.
-    gain : tuple of float, optional
-        Calibrated sensitivity of each channel, 1 by default; its signal is divided by it.
-    delay_s : tuple of float, optional
-        Calibrated lateness of each channel, 0 by default; it is taken out.
-    disabled : tuple of int, optional
-        Channels that are left out of every image although they carry a microphone, such as faulty ones; none by
-        default. The origin of images stays that of the whole array.
-    word_bits : {8, 16, 32, 64}
-        Size of one PDM word. An array with more channels uses several words per sample.
+    layout : str, default "eRTIS_v3D1"
+        Name of a shipped layout, or the path of a layout file (.toml, .csv). If ``positions_m`` is given, only a label.
+    positions_m : tuple of (x, y, z), optional, default None
+        Microphone positions in the sensor frame in metres, one per channel, in the order of the bits.
+    enabled : tuple of bool, optional, default None
+        Channels that carry a microphone; all by default.
+    gain : tuple of float, optional, default None
+        Calibrated sensitivity of each channel, 0.001 to 1000; 1 by default. Signals are divided by it.
+    delay_s : tuple of float, optional, default None
+        Calibrated delay of each channel in seconds, -0.001 to 0.001; 0 by default. Images correct it.
+    disabled : tuple of int, optional, default None
+        Channels that images leave out although they carry a microphone, such as faulty ones; none by default. The
+        origin of images stays the centre of the whole array.
+    word_bits : {8, 16, 32, 64}, default 32
+        Bits of one PDM word. An array with more channels has several words per sample.
     """
 
     layout: str = "eRTIS_v3D1"
@@ -62,12 +61,12 @@ class Array(TomlTable, frozen=True, kw_only=True):
         if self.enabled is not None:
             checks.shape("array.enabled", (len(self.enabled),), (n_channels,))
             if not any(self.enabled):
-                raise ArgumentError("array.enabled is false for every channel; enable at least one")
+                raise ArgumentError("array.enabled is false for all channels; enable at least one")
         self._check_per_channel("gain", 1e-3, 1e3)
         self._check_per_channel("delay_s", -1e-3, 1e-3)
 
     def _check_per_channel(self, name: str, low: float, high: float) -> None:
-        """Refuse a list that has not one number in ``[low, high]`` for each channel."""
+        """Refuse a list without exactly one number in ``[low, high]`` for each channel."""
         values = getattr(self, name)
         if values is not None:
             checks.shape(f"array.{name}", (len(values),), (len(self.positions_m or ()),))

@@ -1,4 +1,4 @@
-"""The emitted call: a sweep, or an own waveform."""
+"""Emitted call: a frequency sweep or a custom waveform."""
 
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -13,31 +13,36 @@ from ertis_numba.settings.waveform import band_hz, normalise, read_waveform
 __all__ = ["MAX_CALL_SAMPLES", "Call"]
 
 MAX_CALL_SAMPLES = 2**20
-"""Limit on the samples of a call, about one second at 1 MHz: files store them, and filters make several copies."""
-_BAND_TOLERANCE_HZ = 200.0  # tolerance of the band, which may differ between processors
+"""Limit on the samples of a call, about 1 s at 1 MHz. Files store the samples, and filters need several copies."""
+_BAND_TOLERANCE_HZ = 200.0  # Tolerance of band edges, because their computation may differ between processors.
 
 
 class Call(TomlTable, frozen=True, kw_only=True):
-    """The emitted call: a sweep with a Hann ramp at both ends, or an own waveform.
+    """Emitted call: a sweep with a Hann ramp at both ends, or a custom waveform.
 
     Attributes
     ----------
-    start_frequency_hz, stop_frequency_hz : float
-        First and last instantaneous frequency; eRTIS sweeps downwards.
-    duration_s : float
-        Length of the call, at least 16 samples and one period of its lowest frequency, at most 1 s.
-    sample_rate_hz : float
-        Rate of the converter that plays the call.
-    ramp_fraction : float
-        Share of the call under the Hann ramp at each end, 0 to 0.5.
-    modulation : {"hyperbolic", "linear"}
-        Whether its period or its frequency goes evenly from first to last. eRTIS is hyperbolic: motion only shifts such
-        echoes, where it blurs those of a linear sweep.
-    waveform : str or tuple of float, optional
-        Own waveform instead of a sweep: samples at ``sample_rate_hz``, or the name of a file with them, relative to
-        the folder of the settings. WAV files have a rate of their own. The samples are scaled to a peak of 1. The other
-        keys follow from the samples: the two frequencies are the edges of their band, at -20 dB, and the duration is
-        theirs.
+    start_frequency_hz, stop_frequency_hz : float, default 50000 and 25000
+        Instantaneous frequency at the start and at the end in hertz; eRTIS sweeps downwards.
+    duration_s : float, default 0.0025
+        Duration of the call in seconds: at least 16 samples and one period of its lowest frequency, at most 1 s.
+    sample_rate_hz : float, default 450000
+        Rate of the digital-to-analogue converter in hertz.
+    ramp_fraction : float, default 0.1
+        Fraction of the call under the Hann ramp at each end, 0 to 0.5.
+    modulation : {"hyperbolic", "linear"}, default "hyperbolic"
+        ``hyperbolic`` sweeps change their period at a constant rate, ``linear`` ones their frequency. Motion shifts the
+        echoes of hyperbolic sweeps without blurring them; eRTIS uses these.
+    waveform : str or tuple of float, optional, default None
+        Custom waveform instead of a sweep: 17 to 4096 samples at ``sample_rate_hz``, or the name of a file with
+        samples, relative to the folder of the settings. A WAV file has its own rate. Samples are scaled to a peak of 1.
+        The other keys follow from the samples: the frequencies are the edges of their band at -20 dB.
+
+    Examples
+    --------
+    >>> from ertis_numba.settings import Call
+    >>> Call(start_frequency_hz=80_000.0, stop_frequency_hz=20_000.0).high_frequency_hz
+    80000.0
     """
 
     start_frequency_hz: float = 50_000.0
@@ -52,7 +57,7 @@ class Call(TomlTable, frozen=True, kw_only=True):
         super().__post_init__()
         checks.positive("call.sample_rate_hz", self.sample_rate_hz)
         if isinstance(self.waveform, str):
-            return  # the file is checked when it is read
+            return  # The file is checked when it is read.
         if self.waveform is not None:
             self._derive_from_waveform(self.waveform)
         for name in ("start_frequency_hz", "stop_frequency_hz"):
@@ -64,7 +69,8 @@ class Call(TomlTable, frozen=True, kw_only=True):
                 )
         if self.start_frequency_hz == self.stop_frequency_hz:
             raise ArgumentError(
-                f"call sweeps from {self.start_frequency_hz:g} Hz to itself; give two different frequencies"
+                f"call.start_frequency_hz and call.stop_frequency_hz are both {self.start_frequency_hz:g}; give two "
+                "different frequencies"
             )
         checks.between("call.duration_s", self.duration_s, 16 / self.sample_rate_hz, 1.0)
         if self.duration_s * self.sample_rate_hz > MAX_CALL_SAMPLES:
@@ -95,7 +101,7 @@ class Call(TomlTable, frozen=True, kw_only=True):
         for name, (value, miss) in derived.items():
             given = getattr(self, name)
             if abs(given - value) <= miss:
-                continue  # of settings that were stored
+                continue  # stored settings hold the derived values
             if given != _default(name):
                 raise ArgumentError(
                     f"call.waveform and call.{name} contradict each other ({value:g} and {given:g}); leave out "
@@ -107,14 +113,14 @@ class Call(TomlTable, frozen=True, kw_only=True):
 
     @classmethod
     def from_file(cls, path: str | Path, *, sample_rate_hz: float | None = None) -> Self:
-        """Read a call from a file with its waveform.
+        """Read the waveform of a call from a file.
 
         Parameters
         ----------
         path : str or Path
             WAV of one channel, CSV with one number per line, or NPY with a one-dimensional array.
         sample_rate_hz : float, optional
-            Rate of the samples; that of a WAV file by default, 450 kHz of others.
+            Rate of the samples in hertz; by default the rate in a WAV file, and 450 kHz for other files.
 
         Raises
         ------
@@ -125,7 +131,7 @@ class Call(TomlTable, frozen=True, kw_only=True):
         return cls(waveform=str(path), **given).resolve_paths(Path())
 
     def resolve_paths(self, folder: Path) -> Self:
-        """Return the call with the samples of the file that it names, relative to a folder.
+        """Return the call with the samples of its waveform file, whose name is relative to a folder.
 
         Raises
         ------
@@ -147,7 +153,7 @@ class Call(TomlTable, frozen=True, kw_only=True):
             raise SettingsError(f"{path}: {error}") from error
 
     def require_samples(self) -> None:
-        """Raise an error if the waveform is still the name of a file.
+        """Require a waveform whose file has been read.
 
         Raises
         ------
@@ -162,17 +168,17 @@ class Call(TomlTable, frozen=True, kw_only=True):
 
     @property
     def low_frequency_hz(self) -> float:
-        """Lower edge of the band."""
+        """Lower edge of the band in hertz."""
         self.require_samples()
         return min(self.start_frequency_hz, self.stop_frequency_hz)
 
     @property
     def high_frequency_hz(self) -> float:
-        """Upper edge of the band."""
+        """Upper edge of the band in hertz."""
         self.require_samples()
         return max(self.start_frequency_hz, self.stop_frequency_hz)
 
 
 def _default(name: str) -> Any:
-    """Return the default of a field, which counts as not given."""
+    """Return the default of a field; a field with this value counts as not given."""
     return next(field.default for field in msgspec.structs.fields(Call) if field.name == name)

@@ -1,5 +1,6 @@
-"""How a measurement becomes an energyscape."""
+"""Processing of a measurement into an energyscape."""
 
+import math
 from typing import Final, Literal
 
 from ertis_numba import checks
@@ -11,51 +12,53 @@ from ertis_numba.settings.windows import parse_window
 __all__ = ["MAX_LISTED_DIRECTIONS", "Processing"]
 
 MAX_LISTED_DIRECTIONS: Final = 1000
-"""Limit on the directions in the settings themselves, which recordings and messages hold as text."""
+"""Limit on the directions that settings list; recordings and messages hold settings as text."""
 
 
 class Processing(TomlTable, frozen=True, kw_only=True):
-    """How a measurement becomes an energyscape.
+    """Processing of a measurement into an energyscape.
+
+    The properties ``azimuth_limits_rad`` and ``elevation_limits_rad`` are the limits in radians.
 
     Attributes
     ----------
-    method : {"fast", "paper"}
-        ``fast``: analytic signals, beams at the output ranges only. ``paper``: the algorithm of the
+    method : {"fast", "paper"}, default "fast"
+        ``fast`` uses analytic signals and computes beams at the output ranges only. ``paper`` is the algorithm of the
         2019 paper, for comparison.
-    directions : str or list of (azimuth, elevation)
-        A grid: ``90``, ``1850``, ``3000``, ``2d:N``, ``3d:N``, or the path of a CSV file. Or up to 1000 directions in
-        degrees; in Python also as an array of shape (n, 2).
-    azimuth_limits_deg, elevation_limits_deg : (low, high)
-        Limits of the grids that are named by a count (``2d:N`` and ``3d:N``).
-    range_m : (first, last)
-        Window of the range axis.
-    range_decimation : int
-        Samples of the record per range of the energyscape.
-    band_edges_hz : (low, high), optional
-        Frequencies below and above the call's band at which the matched filter reaches 0. By default, each lies 5 kHz
-        outside the band, or half of the band's lowest frequency if that is less; see ``docs/accuracy.md``.
-    decimation : int, optional
-        Samples of the record per signal sample, a divisor of ``range_decimation``. By default the largest that
-        suits the method and the call's band; see `Settings.decimation`.
-    wavefront : {"plane", "spherical", "auto"}
-        What an echo looks like to the array: ``plane`` as the paper has it, ``spherical`` focuses on each
-        range, which matters nearer than some ten apertures. ``auto`` is ``spherical`` if plane wavefronts exceed the
-        error budget at the first range, and ``plane`` otherwise and for adaptive beamformers.
-    beamformer : {"delay_and_sum", "coherence_factor", "dmas", "capon"}
-        How microphones are combined; ``docs/beamformers.md`` tells what each is good for. All but the first need
-        the fast method and plane wavefronts.
-    dmas_order : int
-        How many microphones ``dmas`` multiplies at a time, 2 to 8.
-    snapshots : int
-        Ranges from which ``capon`` learns what else is heard, 1 to 32.
-    array_weights : str or list of float
-        Weights of microphones, scaled to a mean of 1: ``uniform``; a window of the distance from the centre of the
+    directions : str or list of (azimuth, elevation), default "90"
+        Direction grid: ``90``, ``1850``, ``3000``, ``2d:N``, ``3d:N``, or the path of a CSV file. Or up to 1000
+        directions in degrees; in Python also as an array of shape (n, 2).
+    azimuth_limits_deg, elevation_limits_deg : (low, high), default (-90, 90)
+        Limits of grids with a count (``2d:N`` and ``3d:N``) in degrees.
+    range_m : (first, last), default (0.5, 5)
+        First and last range in metres.
+    range_decimation : int, default 100
+        Samples of the record per range of the energyscape, 1 to 10000.
+    band_edges_hz : (low, high), optional, default None
+        Frequencies in hertz, below and above the call's band, at which the matched filter reaches 0. By default, each
+        lies 5 kHz outside the band, or half of the band's lowest frequency if that is less; see ``docs/accuracy.md``.
+    decimation : int, optional, default None
+        Samples of the record per signal sample, 1 to 1000, a divisor of ``range_decimation``. By default the largest
+        divisor that suits the method and the call's band; see `Settings.decimation`.
+    wavefront : {"plane", "spherical", "auto"}, default "plane"
+        Shape of an echo's wavefront. ``plane`` is that of the paper. ``spherical`` focuses on each range, which matters
+        at ranges below some ten apertures. ``auto`` chooses ``spherical`` if plane wavefronts exceed the error budget
+        at the first range, and ``plane`` otherwise and for adaptive beamformers.
+    beamformer : {"delay_and_sum", "coherence_factor", "dmas", "capon"}, default "delay_and_sum"
+        Combination of the delayed signals; ``docs/beamformers.md`` compares them. All except delay_and_sum need the
+        fast method and plane wavefronts.
+    dmas_order : int, default 2
+        Number of microphone signals that ``dmas`` multiplies at a time, 2 to 8.
+    snapshots : int, default 5
+        Ranges from which ``capon`` estimates its covariance matrix, 1 to 32.
+    array_weights : str or list of float, default "uniform"
+        Weights of the microphones, scaled to a mean of 1: ``uniform``; a window of the distance from the centre of the
         array, ``cosine``, ``hann``, ``hamming``, ``blackman``, ``taylor:DB`` (20 to 80 dB, 30 by default) or
         ``kaiser:BETA`` (0 to 20, 6 by default); or one number per channel, not below 0. For delay_and_sum only; see
         ``docs/beamformers.md``.
-    loading : float
-        White noise that ``capon`` reckons with, by the mean power of a microphone; the more, the more it is
-        like delay-and-sum.
+    loading : float, default 1
+        Diagonal loading of ``capon`` relative to the mean power of a microphone, 1e-6 to 1e6. Larger values approach
+        delay-and-sum.
     """
 
     method: Literal["fast", "paper"] = "fast"
@@ -72,6 +75,18 @@ class Processing(TomlTable, frozen=True, kw_only=True):
     snapshots: int = 5
     diagonal_loading: float = 1.0
     array_weights: str | tuple[float, ...] = "uniform"
+
+    @property
+    def azimuth_limits_rad(self) -> tuple[float, float]:
+        """Limits of the azimuth in radians."""
+        low_deg, high_deg = self.azimuth_limits_deg
+        return math.radians(low_deg), math.radians(high_deg)
+
+    @property
+    def elevation_limits_rad(self) -> tuple[float, float]:
+        """Limits of the elevation in radians."""
+        low_deg, high_deg = self.elevation_limits_deg
+        return math.radians(low_deg), math.radians(high_deg)
 
     def __post_init__(self) -> None:
         shape = getattr(self.directions, "shape", None)  # of an array, before its rows become tuples
@@ -90,8 +105,8 @@ class Processing(TomlTable, frozen=True, kw_only=True):
             checks.interval("processing.band_edges_hz", self.band_edges_hz, 0.0, 1e9)
             if self.method == "paper":
                 raise ArgumentError(
-                    "processing.band_edges_hz is for the fast method only; leave it out, or give processing.method "
-                    "'fast'"
+                    "processing.band_edges_hz is not supported by processing.method 'paper'; leave it out, or give "
+                    "method 'fast'"
                 )
         if self.decimation is not None:
             checks.integer("processing.decimation", self.decimation, 1, 1000)
@@ -103,7 +118,8 @@ class Processing(TomlTable, frozen=True, kw_only=True):
         checks.choice("processing.wavefront", self.wavefront, ("plane", "spherical", "auto"))
         if self.wavefront != "plane" and self.method == "paper":
             raise ArgumentError(
-                f"processing.wavefront is {self.wavefront!r}, which the paper's method knows nothing of; give 'plane'"
+                f"processing.wavefront is {self.wavefront!r}, but processing.method 'paper' supports only plane "
+                "wavefronts; give 'plane', or method 'fast'"
             )
         self._check_beamformer()
         self._check_array_weights()
@@ -139,7 +155,7 @@ class Processing(TomlTable, frozen=True, kw_only=True):
             )
 
     def _check_beamformer(self) -> None:
-        """Refuse what no beamformer can do, and what delay-and-sum alone can."""
+        """Refuse options of beamformers that are out of range, and those that only delay-and-sum supports."""
         checks.choice("processing.beamformer", self.beamformer, ("delay_and_sum", "coherence_factor", "dmas", "capon"))
         checks.integer("processing.dmas_order", self.dmas_order, 2, 8)
         checks.integer("processing.snapshots", self.snapshots, 1, 32)
@@ -149,8 +165,8 @@ class Processing(TomlTable, frozen=True, kw_only=True):
         for name, value, remedy in (("method", "paper", "'fast'"), ("wavefront", "spherical", "'plane'")):
             if getattr(self, name) == value:
                 raise ArgumentError(
-                    f"processing.{name} is {value!r}, which can delay_and_sum only; give {remedy} with "
-                    f"processing.beamformer {self.beamformer!r}"
+                    f"processing.{name} is {value!r}, which supports only processing.beamformer 'delay_and_sum'; give "
+                    f"{remedy} with beamformer {self.beamformer!r}"
                 )
 
 

@@ -1,4 +1,4 @@
-"""Which ranges suit a record and its call."""
+"""Ranges that suit a record and its call."""
 
 import math
 from typing import Any
@@ -10,30 +10,49 @@ from ertis_numba.settings.recording import Recording
 
 __all__ = ["fit_ranges", "max_decimation"]
 
-_MIN_SOUND_SPEED_M_S = 300.0  # a little under sound at -40 °C
-_MIN_RATE_PER_BANDWIDTH = 1.8  # ranges per second by the call's bandwidth
-_MIN_RATE_PER_HIGHEST_FREQUENCY = {"fast": 4.4, "paper": 5.5}  # signal rate by the call's highest frequency
+_MIN_SOUND_SPEED_M_S = 300.0  # slightly below the speed at -40 °C
+_MIN_RATE_PER_BANDWIDTH = 1.8  # ranges per second, relative to the bandwidth of the call
+_MIN_RATE_PER_HIGHEST_FREQUENCY = {
+    "fast": 4.4,
+    "paper": 5.5,
+}  # signal rate relative to the highest frequency of the call
 _MIN_RATE_PER_BAND_EDGE = 2.5  # signal rate relative to the upper edge of the matched filter's band
-_MAX_DECIMATION = 100  # more would need a longer low pass than 16-bit taps can hold
+_MAX_DECIMATION = 100  # A larger one would need more filter taps than 16 bits can represent.
 _MAX_RANGE_DECIMATION = 10_000
 
 
 def fit_ranges(processing: Processing, recording: Recording, call: Call) -> Processing:
     """Return processing with ranges that suit a record and its call.
 
-    The default window ends where the whole echo still fits into the record in any air. A ``range_decimation`` that
-    leaves less than 1.8 ranges per second and hertz of the call's bandwidth gives way to one that suits both: with the
-    3.8 mm of the default, a pulse of 60 kHz can lie between two ranges and lose 2 dB.
+    A default range window is shortened so that whole echoes fit into the record in any air. A ``range_decimation`` that
+    gives fewer than 1.8 ranges per second and hertz of bandwidth is reduced. With the default spacing of 3.8 mm, a
+    pulse of 60 kHz bandwidth could lie between two ranges and lose 2 dB.
+
+    Parameters
+    ----------
+    processing : Processing
+    recording : Recording
+    call : Call
+
+    Returns
+    -------
+    Processing
 
     Raises
     ------
     ArgumentError
-        The record is no longer than the call.
+        The record is not longer than the call.
+
+    Examples
+    --------
+    >>> from ertis_numba.settings import Call, Processing, Recording, suit_ranges
+    >>> suit_ranges(Processing(), Recording(n_samples=65_536), Call()).range_m
+    (0.5, 1.8)
     """
     if recording.duration_s <= call.duration_s:
         raise ArgumentError(
-            f"recording lasts {1e3 * recording.duration_s:.4g} ms, the call alone {1e3 * call.duration_s:.4g} ms; give "
-            "more samples"
+            f"recording.n_samples gives a record of {1e3 * recording.duration_s:.4g} ms, but the call lasts "
+            f"{1e3 * call.duration_s:.4g} ms; give more samples"
         )
     changes: dict[str, Any] = {}
     first_m, last_m = Processing().range_m
@@ -49,7 +68,7 @@ def fit_ranges(processing: Processing, recording: Recording, call: Call) -> Proc
 
 
 def max_decimation(sample_rate_hz: float, call: Call, processing: Processing) -> int:
-    """Return the largest decimation whose low pass needs few taps."""
+    """Return the largest decimation whose low-pass filter needs few taps."""
     min_hz = _MIN_RATE_PER_HIGHEST_FREQUENCY[processing.method] * call.high_frequency_hz
     if processing.band_edges_hz is not None:
         min_hz = max(min_hz, _MIN_RATE_PER_BAND_EDGE * processing.band_edges_hz[1])
@@ -57,7 +76,7 @@ def max_decimation(sample_rate_hz: float, call: Call, processing: Processing) ->
 
 
 def _range_decimation(largest: float, suits: int) -> int:
-    """Return how many samples apart ranges may be: where there is, a multiple of the decimation that suits the call."""
+    """Return a range decimation of at most ``largest``, if possible a multiple of the call's decimation."""
     step = min(max(1, math.floor(largest)), _MAX_RANGE_DECIMATION)
-    suits -= suits % 10 if suits > 10 else 0  # round numbers, as RTIS has them
+    suits -= suits % 10 if suits > 10 else 0  # round numbers, as in RTIS
     return step - step % suits if step > suits else step

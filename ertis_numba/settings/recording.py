@@ -1,4 +1,4 @@
-"""What is recorded, and in which air."""
+"""Record of a measurement, and the air that it is taken in."""
 
 from typing import Literal
 
@@ -13,26 +13,26 @@ from ertis_numba.documents import TomlTable
 
 __all__ = ["DEFAULT_SAMPLES", "ENCODINGS", "Air", "Recording"]
 
-_MAX_SAMPLES = 2**28  # a minute of ultrasound; positions stay within 32 bits
+_MAX_SAMPLES = 2**28  # a minute of ultrasound; indices stay within 32 bits
 DEFAULT_SAMPLES = 163_840
-"""Of one measurement, as RTIS has it."""
+"""Samples of one measurement in RTIS."""
 
 ENCODINGS = ("pdm", "int16", "float32")
-"""Forms of what microphones give: bits, or numbers of PCM."""
+"""Encodings of microphone data: one-bit PDM, or PCM of two types."""
 
 
 class Recording(TomlTable, frozen=True, kw_only=True):
-    """What is recorded of one measurement: how fast, how much, and in which form.
+    """Record of one measurement: rate, length and encoding.
 
     Attributes
     ----------
-    sample_rate_hz : float
-        The PDM clock, or the rate of PCM.
-    n_samples : int
-        Samples of each microphone in one measurement, in which a word of PDM counts as one.
-    encoding : {"pdm", "int16", "float32"}
-        ``pdm``: a bit per microphone, packed into words. ``int16`` and ``float32``: PCM, a number per microphone;
-        full scale is 32768, or 1.
+    sample_rate_hz : float, default 4500000
+        PDM clock or PCM rate in hertz, 1000 to 1e9.
+    n_samples : int, default 163840
+        Samples of each microphone in one measurement.
+    encoding : {"pdm", "int16", "float32"}, default "pdm"
+        ``pdm``: one bit per microphone and sample, packed into words. ``int16`` and ``float32``: PCM, one number per
+        microphone and sample; full scale is 32768 or 1.
     """
 
     sample_rate_hz: float = ERTIS_PDM_RATE_HZ
@@ -47,31 +47,31 @@ class Recording(TomlTable, frozen=True, kw_only=True):
 
     @property
     def duration_s(self) -> float:
-        """Length of one measurement."""
+        """Duration of one measurement in seconds."""
         return self.n_samples / self.sample_rate_hz
 
     @property
     def full_scale(self) -> float:
-        """The number of PCM, or what bits are taken as, that is 1 in signals."""
+        """Value of the data that becomes 1 in signals: 32768 for int16, otherwise 1."""
         return 32_768.0 if self.encoding == "int16" else 1.0
 
     @property
     def is_pdm(self) -> bool:
-        """Whether microphones give bits, which are to be demodulated first."""
+        """True if the data are one-bit PDM."""
         return self.encoding == "pdm"
 
 
 class Air(TomlTable, frozen=True, kw_only=True):
-    """The medium, which sets the speed of sound.
+    """Air, which determines the speed of sound.
 
     Attributes
     ----------
-    temperature_c : float
-        Temperature, -40 to 60.
-    humidity_percent : float
-        Relative humidity.
-    pressure_pa : float
-        Air pressure.
+    temperature_c : float, default 20
+        Temperature in degrees Celsius, -40 to 60.
+    humidity_percent : float, default 50
+        Relative humidity in percent, 0 to 100.
+    pressure_pa : float, default 101325
+        Air pressure in pascals, 10000 to 200000.
     """
 
     temperature_c: float = STANDARD_TEMPERATURE_C

@@ -1,4 +1,4 @@
-"""All settings of one sensor."""
+"""Settings of one sensor: the content of a settings file."""
 
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -17,16 +17,46 @@ __all__ = ["PRESETS", "Settings"]
 
 _PRESET_SAMPLES = {"short": 65_536, "default": DEFAULT_SAMPLES, "long": 294_912}
 _BANDS_HZ = {"20_80": (20_000.0, 80_000.0), "25_50": (25_000.0, 50_000.0)}
-_MAX_OVERSAMPLING = 8  # times the signal rate that is needed: beyond, somebody has made a mistake
-_MAX_BAND_EDGE_RATIO = 4  # of the call's highest frequency
-_MIN_BANDWIDTH_HZ = 100.0  # a narrower band pass would ring for seconds
+_MAX_OVERSAMPLING = 8  # A signal rate of more than 8 times the necessary one is probably a mistake.
+_MAX_BAND_EDGE_RATIO = 4  # relative to the highest frequency of the call
+_MIN_BANDWIDTH_HZ = 100.0  # A narrower band-pass filter would ring for seconds.
 
 PRESETS = tuple(f"{length}_{band}" for length in _PRESET_SAMPLES for band in _BANDS_HZ)
-"""Names of the RTIS recording presets: length of the record and band of the call."""
+"""Names of the RTIS recording presets: length of the record, and band of the call in kHz."""
 
 
 class Settings(TomlDocument, frozen=True, kw_only=True):
-    """All settings of one sensor: the whole content of a settings file."""
+    """Settings of one sensor: the content of a settings file.
+
+    Attributes
+    ----------
+    array : Array
+        Microphone array; the eRTIS array v3D1 by default.
+    call : Call
+        Emitted call; a sweep from 50 to 25 kHz in 2.5 ms by default.
+    recording : Recording
+        Record of a measurement; 163840 one-bit samples at 4.5 MHz by default.
+    air : Air
+        Air, which determines the speed of sound; 20 °C, 50 % relative humidity and 101325 Pa by default.
+    processing : Processing
+        Processing of a measurement into an image; 90 azimuths and ranges from 0.5 to 5 m by default.
+    accuracy : Accuracy
+        Error budget of the image, -35 dB by default, and parts of the plan that the planner shall not choose.
+
+    Raises
+    ------
+    ArgumentError
+        A value cannot be used, by itself or with the others.
+
+    Examples
+    --------
+    >>> from ertis_numba import Settings
+    >>> settings = Settings().replace("processing.range_m", (0.5, 3))
+    >>> settings.processing.range_m, settings.signal_rate_hz
+    ((0.5, 3.0), 225000.0)
+    >>> Settings.from_toml(settings.to_toml()) == settings
+    True
+    """
 
     array: Array = Array()
     call: Call = Call()
@@ -35,8 +65,8 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
     processing: Processing = Processing()
     accuracy: Accuracy = Accuracy()
 
-    max_bytes: ClassVar[int] = 262_144  # an array of 1024 microphones takes 170,000 …
-    max_items: ClassVar[int] = 30_000  # … and 16,500
+    max_bytes: ClassVar[int] = 262_144  # An array of 1024 microphones needs 170,000 bytes …
+    max_items: ClassVar[int] = 30_000  # … and 16,500 items.
     former_keys: ClassVar[dict[str, str]] = {
         "pdm_rate_hz": "sample_rate_hz",
         "stop_band_db": "stopband_attenuation_db",
@@ -47,7 +77,7 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         super().__post_init__()
         if isinstance(self.call.waveform, str):
-            return  # the file is checked when it is read
+            return  # The file is checked when it is read.
         if self.signal_rate_hz <= 2 * self.call.high_frequency_hz:
             raise ArgumentError(
                 f"processing.decimation {self.decimation} leaves signals at "
@@ -57,7 +87,7 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
         swept_hz = self.call.high_frequency_hz - self.call.low_frequency_hz
         if self.processing.method == "paper" and swept_hz < _MIN_BANDWIDTH_HZ:
             raise ArgumentError(
-                f"call sweeps over {swept_hz:g} Hz, too little for the band pass of processing.method 'paper'; "
+                f"call sweeps over {swept_hz:g} Hz, too little for the band-pass filter of processing.method 'paper'; "
                 f"give {_MIN_BANDWIDTH_HZ:g} Hz or more, or method 'fast'"
             )
         self._check_band()
@@ -66,8 +96,8 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
         if self.processing.decimation is None and self.decimation * _MAX_OVERSAMPLING < min(step, self._max_decimation):
             raise ArgumentError(
                 f"processing.range_decimation {step} has no divisor near "
-                f"{self._max_decimation}, the decimation that suits the call; give one that has, such as a "
-                f"multiple of {self._max_decimation}, or give processing.decimation"
+                f"{self._max_decimation}, the decimation that suits the call; give a multiple of "
+                f"{self._max_decimation}, or give processing.decimation"
             )
 
     def _check_band(self) -> None:
@@ -79,7 +109,7 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
         if given[1] > max_hz:
             raise ArgumentError(
                 f"processing.band_edges_hz ends at {given[1]:g} Hz; the limit is {max_hz:g} Hz, four times the call's "
-                "highest frequency, as noise beyond it is not predicted"
+                "highest frequency, because the error model does not predict noise above it"
             )
         highest_hz = self.call.low_frequency_hz - _MIN_BANDWIDTH_HZ
         lowest_hz, nyquist_hz = self.call.high_frequency_hz + _MIN_BANDWIDTH_HZ, self.signal_rate_hz / 2
@@ -91,12 +121,12 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
             )
         if given[1] > nyquist_hz:
             raise ArgumentError(
-                f"processing.band_edges_hz ends at {given[1]:g} Hz, but signals at {self.signal_rate_hz:g} Hz hold "
-                f"at most {nyquist_hz:g} Hz; give a lower edge or a smaller processing.decimation"
+                f"processing.band_edges_hz ends at {given[1]:g} Hz, but signals at {self.signal_rate_hz:g} Hz reach "
+                f"only {nyquist_hz:g} Hz; give a lower edge or a smaller processing.decimation"
             )
 
     def _check_adaptive(self) -> None:
-        """Refuse plans that only sums have."""
+        """Refuse plans that only delay-and-sum supports."""
         if self.processing.beamformer == "delay_and_sum":
             return
         accuracy = self.accuracy
@@ -108,33 +138,65 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
         ):
             if value != wanted:
                 raise ArgumentError(
-                    f"accuracy.{name} is {value!r}, which processing.beamformer {self.processing.beamformer!r} cannot "
-                    f"use; leave it out or give {wanted!r}"
+                    f"accuracy.{name} is {value!r}, which processing.beamformer {self.processing.beamformer!r} does "
+                    f"not support; leave it out or give {wanted!r}"
                 )
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read a file; layouts, calls and directions in other files are relative to its folder.
+        """Read a settings file.
+
+        Parameters
+        ----------
+        path : str or Path
+            TOML file. Names of files in it, of layouts, waveforms and directions, are relative to its folder.
+
+        Returns
+        -------
+        Settings
 
         Raises
         ------
         SettingsError
             The file cannot be read or used.
+
+        Examples
+        --------
+        >>> from pathlib import Path
+        >>> from ertis_numba import Settings
+        >>> size = Path("mine.toml").write_text("processing.directions = '2d:181'")
+        >>> Settings.load("mine.toml").processing.directions
+        '2d:181'
         """
         return super().load(path).resolve_paths(Path(path).parent)
 
     def updated_from_file(self, path: str | Path) -> Self:
-        """Return settings changed by the keys of a file.
+        """Return these settings, changed by the keys of a file.
 
-        An array is replaced as a whole if the file names a layout or positions, and a call if either has an own
+        The array is replaced as a whole if the file has a layout or positions, and the call if either call has a custom
         waveform.
 
-        Files that it names are looked for beside it.
+        Parameters
+        ----------
+        path : str or Path
+            TOML file. Names of files in it are relative to its folder.
+
+        Returns
+        -------
+        Settings
 
         Raises
         ------
         SettingsError
             The file cannot be read or used, by itself or with the rest of these settings.
+
+        Examples
+        --------
+        >>> from pathlib import Path
+        >>> from ertis_numba import Settings
+        >>> size = Path("near.toml").write_text("processing.range_m = [0.3, 1.0]")
+        >>> Settings().changed_by("near.toml").processing.range_m
+        (0.3, 1.0)
         """
         held, tables = self._load(Path(path))
         held = held.resolve_paths(Path(path).parent)
@@ -154,9 +216,9 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
             raise SettingsError(f"{path}: {error}") from error
 
     def resolve_paths(self, folder: Path) -> Self:
-        """Return settings whose files are relative to a folder: of a layout, of directions, and of a call.
+        """Return settings whose files, of layout, directions and waveform, are relative to a folder.
 
-        The waveform of a call is read, because other settings depend on its band.
+        The waveform is read, because other settings depend on its band.
         """
         array, processing = self.array, self.processing
         if array.positions_m is None and Path(array.layout).suffix.lower() in {".csv", ".toml"}:
@@ -168,15 +230,30 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
 
     @classmethod
     def from_preset(cls, name: str, **sections: Any) -> Self:
-        """Return the settings of a recording preset, such as ``default_25_50``.
+        """Return the settings of an RTIS recording preset.
 
-        ``sections`` replace whole sections. If ``processing`` is not among them, its ranges suit record and call,
-        see `fit_ranges`.
+        Parameters
+        ----------
+        name : {"short_20_80", "short_25_50", "default_20_80", "default_25_50", "long_20_80", "long_25_50"}
+            Length of the record, and band of the call in kHz.
+        **sections
+            Sections to replace as a whole, such as ``air=Air(temperature_c=25)``. Unless ``processing`` is among them,
+            its ranges suit record and call; see `fit_ranges`.
+
+        Returns
+        -------
+        Settings
 
         Raises
         ------
         ArgumentError
             The preset is unknown.
+
+        Examples
+        --------
+        >>> from ertis_numba import Settings
+        >>> Settings.from_preset("short_20_80").recording.n_samples
+        65536
         """
         checks.choice("preset", name, PRESETS)
         length, _, band = name.partition("_")
@@ -190,9 +267,9 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
     def decimation(self) -> int:
         """Samples of the record per signal sample.
 
-        Where ``processing.decimation`` leaves it open, the largest divisor of ``range_decimation`` that
-        keeps the signal rate at 4.4 times the call's highest frequency or more, so that the low pass needs
-        few taps; for the paper's integer delays at 5.5 times, which is its 450 kHz for its calls.
+        If ``processing.decimation`` is open, the largest divisor of ``range_decimation`` that keeps the signal rate at
+        4.4 times the call's highest frequency or more, so that the low-pass filter needs few taps. The integer delays
+        of the paper need 5.5 times, which is 450 kHz for its calls.
         """
         given = self.processing.decimation
         if given is not None:
@@ -211,10 +288,10 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
 
     @property
     def signal_rate_hz(self) -> float:
-        """Rate of the demodulated signals."""
+        """Rate of the demodulated signals in hertz."""
         return self.recording.sample_rate_hz / self.decimation
 
     @property
     def output_rate_hz(self) -> float:
-        """Rate at which the energyscape samples its range axis."""
+        """Ranges of the energyscape per second of echo time, in hertz."""
         return self.recording.sample_rate_hz / self.processing.range_decimation

@@ -1,4 +1,4 @@
-"""Own waveforms of the call: samples, from settings or from files."""
+"""Custom waveforms of the call: samples from settings or files."""
 
 import functools
 import math
@@ -15,8 +15,8 @@ from ertis_numba.wav import read_wav
 __all__ = ["MAX_WAVEFORM_SAMPLES", "WAVEFORM_FILES", "band_hz", "normalise", "read_waveform"]
 
 MAX_WAVEFORM_SAMPLES = 4096
-"""Limit on the samples of an own waveform, 9 ms at 450 kHz: settings that hold them and 1024 microphones stay within
-`Settings.max_bytes`."""
+"""Limit on the samples of a custom waveform, 9 ms at 450 kHz. Settings with so many samples and 1024 microphones stay
+within `Settings.max_bytes`."""
 WAVEFORM_FILES = {".wav", ".csv", ".npy"}
 _MAX_FILE_BYTES = 2**22
 _DECIMALS = 7  # decimals of a sample; their rounding error is 20 dB below that of a 20-bit converter
@@ -25,7 +25,7 @@ _BAND_STEP_HZ = 100.0  # step of the edges, so that they do not depend on roundi
 
 
 def read_waveform(path: Path) -> tuple[tuple[float, ...], float | None]:
-    """Return the samples in a file, and their rate if the file holds it.
+    """Return the samples in a file, and their rate if the file contains it.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ def read_waveform(path: Path) -> tuple[tuple[float, ...], float | None]:
     Raises
     ------
     SettingsError
-        The file cannot be read, or holds something else.
+        The file cannot be read, or its content is none of these.
     """
     suffix = path.suffix.lower()
     if suffix not in WAVEFORM_FILES:
@@ -57,7 +57,7 @@ def read_waveform(path: Path) -> tuple[tuple[float, ...], float | None]:
         values = values[:, 0]
     if values.ndim != 1 or values.dtype.kind not in "iuf":
         raise SettingsError(
-            f"call.waveform {path} holds {values.dtype} of shape {values.shape}; give one channel of real numbers"
+            f"call.waveform {path} contains {values.dtype} of shape {values.shape}; give one channel of real numbers"
         )
     # Unsigned bytes are the only WAV samples whose silence is not 0.
     middle = 128.0 if suffix == ".wav" and values.dtype == np.uint8 else 0.0
@@ -89,7 +89,7 @@ def normalise(samples: tuple[float, ...], rate_hz: float) -> tuple[float, ...]:
     checks.finite_array("call.waveform", values)
     peak = float(np.abs(values).max())
     if not peak:
-        raise ArgumentError("call.waveform is silent; give samples other than 0")
+        raise ArgumentError("call.waveform contains only 0; give other samples")
     return tuple(np.round(values / peak, _DECIMALS).tolist())
 
 
@@ -111,7 +111,7 @@ def band_hz(samples: tuple[float, ...], rate_hz: float) -> tuple[float, float]:
     high_hz = math.ceil(strong[-1] / _BAND_STEP_HZ) * _BAND_STEP_HZ
     if low_hz <= 0:
         raise ArgumentError(
-            "call.waveform has a band that reaches 0 Hz; subtract its mean, and remove sound below the call"
+            "call.waveform has a band that reaches 0 Hz; subtract its mean, and filter out lower frequencies"
         )
     if high_hz >= rate_hz / 2:
         raise ArgumentError(

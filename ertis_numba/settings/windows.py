@@ -1,4 +1,4 @@
-"""Names of the windows that ``processing.array_weights`` accepts."""
+"""Window functions of ``processing.array_weights``."""
 
 from typing import Final, NamedTuple
 
@@ -23,18 +23,18 @@ WINDOWS: Final[dict[str, _Parameter | None]] = {
     "taylor": _Parameter(30.0, 20.0, 80.0),
     "kaiser": _Parameter(6.0, 0.0, 20.0),
 }
-"""Windows, and the parameter of those that have one: side-lobe attenuation in dB for Taylor, beta for Kaiser."""
+"""Windows with the default and limits of their parameter: side-lobe attenuation in dB for Taylor, beta for Kaiser."""
 
 
 class ArrayWindow(NamedTuple):
-    """A window with its parameter, which is 0 if it has none."""
+    """Window and its parameter; 0 if it has none."""
 
     window: str
     parameter: float
 
 
 def parse_window(name: str) -> ArrayWindow:
-    """Return the window that a name such as ``hann`` or ``taylor:35`` stands for.
+    """Parse the name of a window, such as ``hann`` or ``taylor:35``.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What each stage takes on this machine: measured once by running its kernels, and kept."""
+"""Costs of the kernels, from which the planner predicts the time of each stage: published or measured here."""
 
 import functools
 import hashlib
@@ -15,7 +15,7 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Self
+from typing import Final, Literal, Self
 
 import numpy as np
 import platformdirs
@@ -23,18 +23,33 @@ from numpy.typing import NDArray
 
 from ertis_numba import fft
 from ertis_numba.kernels import KernelSet
+from ertis_numba.stages.nominal_costs import NOMINAL_COSTS
 
-__all__ = ["Costs", "Work", "cache_file", "costs_of", "measure"]
+__all__ = [
+    "PLAN_COSTS",
+    "UNITS",
+    "Costs",
+    "PlanCosts",
+    "Work",
+    "cache_file",
+    "measure",
+    "measured_costs",
+    "nominal_costs",
+]
+
+PlanCosts = Literal["nominal", "measured"]
+PLAN_COSTS: Final[tuple[PlanCosts, ...]] = ("nominal", "measured")
+"""Costs that plans can be chosen by."""
 
 _LOG = logging.getLogger("ertis_numba")
-_RUNS = 5  # the best of which counts
-_FLOOR_S = 2e-4  # runs shorter than this are repeated
+_RUNS = 5  # The shortest run counts.
+_FLOOR_S = 2e-4  # Shorter runs are repeated.
 _MICS, _RANGES = 32, 960
-_MAX_S = 1.0  # of a unit of work: more is no measurement
-_BEYOND = 0.2  # of a tile, by which its samples reach over its ranges
-_PHASES = {"few": 1, "many": 12, "most": 64}  # between them a term costs what a line over the logarithm says
+_MAX_S = 1.0  # Limit on the cost of a unit of work; a larger value is an error.
+_BEYOND = 0.2  # Samples of a tile beyond its ranges, relative to the tile.
+_PHASES = {"few": 1, "many": 12, "most": 64}  # The cost of a term is interpolated over the logarithm of their number.
 _FEW_PAIRS, _MANY_PAIRS = 2, 10
-_UNITS = (
+UNITS: Final = (
     "call",
     "demodulate_16",
     "demodulate_32",
@@ -56,19 +71,20 @@ _UNITS = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Work:
-    """How much a plan has to do for one image.
+    """Amount of work of a plan for one image.
 
     Attributes
     ----------
     n_mics, n_words, n_samples, n_taps, tap_bits : int
-        Of the demodulation; samples are those of the signals.
+        Demodulation: microphones, words per sample, samples of the signals, filter taps and bits of each tap.
     n_fft, n_bins, n_phases, n_outputs : int
-        Of the matched filter.
+        Matched filter: length of the transform, occupied bins, phases, and samples of each phase.
     n_directions, n_ranges : int
+        Size of the image.
     n_computed : int
-        Ranges of all tiles, which zones and the end of the range axis do not fill.
+        Ranges of all tiles; focal zones and the end of the range axis leave some of them unused.
     n_beams, n_terms, n_pairs : int
-        Beams that are summed, terms of each, and pairs of nodes that make a direction's beam, 0 without nodes.
+        Beams that are summed, terms of each, and pairs of beam-grid points per direction; 0 without a beam grid.
     precision : {"float32", "int16"}
     """
 
@@ -92,16 +108,22 @@ class Work:
 
 @dataclass(frozen=True, slots=True)
 class Costs:
-    """Seconds per unit of work of each kernel; `stages_ms` tells what the units are."""
+    """Cost of each kernel.
+
+    Attributes
+    ----------
+    seconds : dict of str to float
+        Seconds per unit of work, by the names in `UNITS`; `stages_ms` defines the units.
+    """
 
     seconds: dict[str, float]
 
     def stages_ms(self, work: Work) -> dict[str, float]:
-        """Return what each stage is expected to take, in milliseconds."""
+        """Return the predicted time of each stage in milliseconds."""
         unit = self.seconds
         rows = work.n_mics * work.n_phases
-        # Samples of a tile, which fit into the first cache level with few phases, and not even into the second with
-        # most. More of them are never taken for cheaper, whatever the clock said.
+        # The samples of a tile fit into the first cache level with few phases, and not even into the second with many.
+        # More phases never count as cheaper, even if they were measured to be.
         terms = np.maximum.accumulate([unit[f"sum_{work.precision}_{name}"] for name in _PHASES])
         term = float(np.interp(math.log2(rows / _MICS), np.log2(list(_PHASES.values())), terms))
         points = work.n_directions * work.n_ranges
@@ -124,45 +146,38 @@ def _transform(n: int) -> float:
     return n * math.log2(max(n, 2))
 
 
-def costs_of(kernels: KernelSet, threads: int) -> Costs:
-    """Return the costs of a device on this machine; measured at the first time and kept in `cache_file`."""
+def nominal_costs(kernels: KernelSet) -> Costs:
+    """Return the published costs of a device.
+
+    They are the same on every machine, so that plans are the same on all machines with the same instruction set. Their
+    ratios count, not their values: use `measured_costs` to predict times.
+    """
+    return Costs(NOMINAL_COSTS[kernels.device])
+
+
+def measured_costs(kernels: KernelSet, threads: int) -> Costs:
+    """Return the costs of a device on this machine; the first call measures them and stores them in `cache_file`.
+
+    Simulated devices have nominal costs.
+    """
     if kernels.simulated:
-        return Costs(_NOMINAL)
+        return nominal_costs(kernels)
     key = (kernels.device, threads, kernels.hardware)
-    with _ONE_AT_A_TIME:  # two that measured at once would measure each other
+    with _ONE_AT_A_TIME:  # simultaneous measurements would disturb each other
         if key not in _KNOWN:
             path = cache_file(*key)
             _KNOWN[key] = _kept(path) or _measured(kernels, threads, path)
         return _KNOWN[key]
 
 
-# Where kernels are only simulated: guesses of a large GPU, which choose a plan and tell no times.
-_NOMINAL: dict[str, float] = {
-    "call": 1e-5,
-    "demodulate_16": 5e-12,
-    "demodulate_32": 5e-12,
-    "forward": 2e-12,
-    "fold": 1e-11,
-    "inverse": 2e-12,
-    "quantise": 1e-11,
-    "sum_float32_few": 5e-13,
-    "sum_float32_many": 1e-12,
-    "sum_float32_most": 1.4e-12,
-    "sum_int16_few": 1e-12,
-    "sum_int16_many": 2e-12,
-    "sum_int16_most": 2.8e-12,
-    "pair_float32": 1e-12,
-    "pair_int16": 2e-12,
-    "image": 1e-12,
-}
 _ONE_AT_A_TIME = threading.Lock()
 _KNOWN: dict[tuple[str, int, str], Costs] = {}
 
 
 def cache_file(device: str, threads: int, hardware: str = "") -> Path:
-    """Return where the costs of a device are kept; take the file away to have them measured again.
+    """Return the file with the measured costs of a device; delete it to measure them again.
 
-    Costs are those of the machine, of a GPU if ``hardware`` names one, and of the libraries' versions.
+    Its name depends on the machine, the GPU named by ``hardware``, and the versions of the libraries.
     """
     machine = [platform.machine(), platform.processor(), platform.node(), os.environ.get("NUMBA_CPU_NAME", "")]
     with suppress(OSError):
@@ -173,7 +188,7 @@ def cache_file(device: str, threads: int, hardware: str = "") -> Path:
         for name in ("numba-cuda", "cupy-cuda12x", "cupy-cuda13x"):
             with suppress(PackageNotFoundError):
                 versions.append(version(name))
-    digest = hashlib.sha256("\n".join([*machine, *versions, *_UNITS]).encode()).hexdigest()[:12]
+    digest = hashlib.sha256("\n".join([*machine, *versions, *UNITS]).encode()).hexdigest()[:12]
     folder = os.environ.get("ERTIS_CACHE_DIR") or platformdirs.user_cache_dir("ertis-numba", appauthor=False)
     return Path(folder) / f"costs-{device}-{threads}-{digest}.json"
 
@@ -181,14 +196,14 @@ def cache_file(device: str, threads: int, hardware: str = "") -> Path:
 def _kept(path: Path) -> Costs | None:
     try:
         found = json.loads(path.read_text("utf-8"))
-        seconds = {name: float(found[name]) for name in _UNITS}
+        seconds = {name: float(found[name]) for name in UNITS}
     except (OSError, ValueError, KeyError, TypeError):
         return None
     return Costs(seconds) if all(0 < value <= _MAX_S for value in seconds.values()) else None
 
 
 def _measured(kernels: KernelSet, threads: int, path: Path) -> Costs:
-    _LOG.info("measuring what the kernels of device %r take here; kept in %s", kernels.device, path)
+    _LOG.info("measuring the costs of the kernels of device %r; they are stored in %s", kernels.device, path)
     costs = measure(kernels, threads)
     part: Path | None = None
     try:
@@ -198,7 +213,7 @@ def _measured(kernels: KernelSet, threads: int, path: Path) -> Costs:
             json.dump(costs.seconds, file, indent=1)
         return _first_of(costs, part, path)
     except OSError as error:
-        _LOG.info("costs cannot be kept (%s)", error)
+        _LOG.info("measured costs cannot be stored (%s); they are measured again by the next process", error)
         return costs
     finally:
         if part is not None:
@@ -206,21 +221,21 @@ def _measured(kernels: KernelSet, threads: int, path: Path) -> Costs:
 
 
 def _first_of(costs: Costs, part: Path, path: Path) -> Costs:
-    """Keep costs, or return those that another process has kept meanwhile: by other costs it plans another image."""
+    """Store costs, or return those that another process has stored meanwhile, so that both choose the same plan."""
     try:
-        os.link(part, path)  # which a file that is there prevents
+        os.link(part, path)  # fails if the file exists
     except FileExistsError:
         kept = _kept(path)
         if kept is not None:
             return kept
         part.replace(path)
-    except OSError:  # a disk without links
+    except OSError:  # a file system without links
         part.replace(path)
     return costs
 
 
 def measure(kernels: KernelSet, threads: int) -> Costs:
-    """Return the costs, measured now: some tenths of a second."""
+    """Measure the costs of a device and return them; it takes some tenths of a second."""
     random = np.random.default_rng(1)
     small = 8 if kernels.device == "numpy" else 1
     with _Bench(kernels, threads) as bench:
@@ -229,11 +244,11 @@ def measure(kernels: KernelSet, threads: int) -> Costs:
             **_sums(bench, random, 256 // small),
             **_pairs(bench, random, 1024 // small),
         }
-    return Costs({name: seconds.get(name, 1.0) for name in _UNITS})  # a second each where a device cannot
+    return Costs({name: seconds.get(name, 1.0) for name in UNITS})  # A kernel that the device cannot run costs 1 s.
 
 
 class _Bench:
-    """Times kernels on arrays that lie where they read them."""
+    """Timer of kernels on arrays in the memory of the device."""
 
     def __init__(self, kernels: KernelSet, threads: int) -> None:
         self.kernels, self.threads = kernels, threads
@@ -251,7 +266,7 @@ class _Bench:
         self.memory.close()
 
     def best(self, kernel: Callable[..., object], *arguments: object) -> float:
-        """Return the least time of some runs, in seconds."""
+        """Return the shortest time of several runs in seconds."""
         here = [self.memory.table(each) if isinstance(each, np.ndarray) else each for each in arguments]
 
         def run(count: int) -> float:
@@ -273,12 +288,12 @@ class _Bench:
 
 
 def _front(bench: _Bench, random: np.random.Generator) -> dict[str, float]:
-    """Return the costs up to the analytic signals."""
+    """Return the costs of demodulation and matched filter."""
     n_samples, n_taps, factor, n_fft, n_phases, n_out, n_bins = 4000, 101, 20, 6000, 4, 1200, 1000
     kernels = bench.kernels
     words = random.integers(0, 2**32, (n_samples * factor + n_taps, 1), dtype=np.uint32)
     channels = np.arange(_MICS, dtype=np.int32)
-    # Noise, not zeros: what nobody wrote to is one page of memory, which is always in the nearest cache.
+    # Noise, because untouched zeros are a single page of memory, which is always in the nearest cache.
     signals = random.standard_normal((_MICS, n_fft), dtype=np.float32)
     tiny = np.zeros((2, 4), dtype=np.complex64)
     found = {"call": bench.best(kernels.envelope, tiny, np.zeros((2, 4), dtype=np.float32))}
@@ -287,7 +302,7 @@ def _front(bench: _Bench, random: np.random.Generator) -> dict[str, float]:
         kernels.demodulate_words, words, channels, taps, np.float32(1), factor, 3, n_samples - 8, signals
     )
     found["demodulate_16"] = took_s / (n_samples * n_taps)
-    # Not worth the seconds that another kernel takes to compile; measured by itself it was 1.4 times as much.
+    # Compiling another kernel would take seconds; a separate measurement gave a ratio of 1.4.
     found["demodulate_32"] = 1.4 * found["demodulate_16"]
     out = _complex_noise(random, (_MICS, n_phases, n_out))
     transforms = bench.transforms(signals, out)
@@ -296,13 +311,15 @@ def _front(bench: _Bench, random: np.random.Generator) -> dict[str, float]:
     responses = np.ones((_MICS, n_phases, n_bins), dtype=np.complex64)
     spectra = _complex_noise(random, (_MICS, n_fft // 2 + 1))
     found["fold"] = bench.best(kernels.multiply_and_fold, spectra, responses, 300, out) / (_MICS * n_phases * n_bins)
-    inverse = functools.partial(transforms.inverse, threads=bench.threads)  # in place: numbers grow, and may overflow
+    inverse = functools.partial(
+        transforms.inverse, threads=bench.threads
+    )  # In place: the numbers grow and may overflow.
     found["inverse"] = bench.best(inverse) / (_MICS * n_phases) / _transform(n_out)
     return found
 
 
 def _sums(bench: _Bench, random: np.random.Generator, n_beams: int) -> dict[str, float]:
-    """Return the cost of a term at one range, by the number of phases."""
+    """Return the cost of a term at one range for each number of phases."""
     found: dict[str, float] = {}
     kernels = bench.kernels
     amplitude = np.empty((n_beams, _RANGES), dtype=np.float32)
@@ -334,13 +351,13 @@ def _complex_noise(random: np.random.Generator, shape: tuple[int, ...]) -> NDArr
 
 
 def _pairs(bench: _Bench, random: np.random.Generator, n_directions: int) -> dict[str, float]:
-    """Return the cost of a pair of nodes at one range, and of one place in the image."""
+    """Return the cost of a pair of beam-grid points at one range, and of one point of the image."""
     n_nodes, points = 400, n_directions * _RANGES
     kernels = bench.kernels
     amplitude = np.empty((n_directions, _RANGES), dtype=np.float32)
     rows = np.arange(n_directions, dtype=np.int32)
     offsets = np.zeros((n_nodes, 1), dtype=np.int32)
-    first = np.sort(random.integers(0, n_nodes - 80, n_directions)) // 4 * 4  # some directions share all nodes
+    first = np.sort(random.integers(0, n_nodes - 80, n_directions)) // 4 * 4  # Some directions share all points.
     took_s: dict[str, list[float]] = {"float32": [], "int16": []}
     for n_pairs in (_FEW_PAIRS, _MANY_PAIRS):
         places = (first[:, None] + 8 * np.arange(n_pairs)).astype(np.int32)
@@ -377,7 +394,7 @@ def _pairs(bench: _Bench, random: np.random.Generator, n_directions: int) -> dic
 def _tiles(
     kernels: KernelSet, n_mics: int, n_phases: int
 ) -> tuple[NDArray[np.int16], NDArray[np.float32], NDArray[np.int32]]:
-    """Return tiles of ones, their scales and where they start."""
+    """Return tiles of ones, their scales and their first ranges."""
     starts = np.arange(0, _RANGES, kernels.tile_ranges, dtype=np.int32)
     tiles = np.ones((len(starts), n_mics, n_phases, kernels.tile_ranges + 20, 2), dtype=np.int16)
     return tiles, np.ones(len(starts), dtype=np.float32), starts

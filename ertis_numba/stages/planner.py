@@ -1,17 +1,18 @@
-"""The cheapest plan whose predicted error keeps a budget."""
+"""Planner: the fastest plan whose predicted error keeps the budget."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from ertis_numba import checks
 from ertis_numba.errors import ArgumentError
 from ertis_numba.kernels import KernelSet
 from ertis_numba.settings import Accuracy, Settings
 from ertis_numba.stages.accuracy import PARTS, ErrorModel, SignalModel, decibels
 from ertis_numba.stages.adaptive import require_order
 from ertis_numba.stages.beamform import require_int16
-from ertis_numba.stages.costs import Costs, cache_file, costs_of
+from ertis_numba.stages.costs import PLAN_COSTS, Costs, PlanCosts, cache_file, measured_costs, nominal_costs
 from ertis_numba.stages.fitting import one_thread
 from ertis_numba.stages.memory import available_bytes
 from ertis_numba.stages.plan_model import ImagePlan, PlanModel, plan_of
@@ -21,22 +22,25 @@ from ertis_numba.stages.wavefronts import with_wavefront
 
 __all__ = ["Chosen", "Planner", "complete"]
 
-_USUAL_BYTES = 2**31  # of a plan's signals and delays; larger plans are considered only where no other will do
-_ROUNDED = 1 + 1e-9  # a plan must keep the budget that it was chosen for when it is given back
+_USUAL_BYTES = (
+    2**31
+)  # memory of a plan's signals and delays; larger plans are considered only if no other keeps the budget
+_ROUNDED = 1 + 1e-9  # tolerance, so that a complete plan keeps the budget that it was chosen for
 _ROUNDED_DB = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
 class Chosen:
-    """A plan, and what is expected of it.
+    """Plan with its predicted error and time.
 
     Attributes
     ----------
     settings : Settings
-        Their accuracy leaves nothing open.
+        Settings with the complete plan in ``accuracy``.
     parts : dict of str to float
-        Power of each part of the error by that of the exact image; see `accuracy.PARTS`.
+        Power of each part of the error relative to that of the exact image; see `accuracy.PARTS`.
     stages_ms : dict of str to float
+        Predicted time of each stage in milliseconds.
     """
 
     settings: Settings
@@ -45,51 +49,60 @@ class Chosen:
 
     @property
     def error_db(self) -> float:
-        """Predicted error of the image."""
+        """Predicted error of the image in dB."""
         return decibels(sum(self.parts.values()))
 
     @property
     def time_ms(self) -> float:
-        """Predicted time of one measurement."""
+        """Predicted time of one measurement in milliseconds."""
         return sum(self.stages_ms.values())
 
 
-def complete(settings: Settings, kernels: KernelSet, *, threads: int, max_bytes: int | None = None) -> Settings:
-    """Return settings whose accuracy and wavefront leave nothing open; see `Planner.choose`.
+def complete(
+    settings: Settings,
+    kernels: KernelSet,
+    *,
+    threads: int,
+    max_bytes: int | None = None,
+    plan: PlanCosts = "nominal",
+) -> Settings:
+    """Return settings with a complete plan and wavefront; see `Planner.choose`.
 
     Raises
     ------
     ArgumentError
-        No plan keeps the budget, or the one that is given does not.
+        No plan keeps the budget, or the given plan does not keep it.
     """
     if settings.processing.method == "paper":
         return settings
     if settings.processing.wavefront == "auto":
         plane = settings.replace(processing=settings.processing.replace(wavefront="plane"))
         settings = with_wavefront(plane, Planner(plane, kernels, threads=threads, max_bytes=max_bytes).model)
-    return Planner(settings, kernels, threads=threads, max_bytes=max_bytes).choose().settings
+    return Planner(settings, kernels, threads=threads, max_bytes=max_bytes, plan=plan).choose().settings
 
 
 class Planner:
-    """Plans for one kind of measurement on one device.
+    """Planner for the measurements of one sensor on one device.
 
     Parameters
     ----------
     settings : Settings
-        What their accuracy does not leave open is kept to.
+        Values that their accuracy fixes are kept.
     kernels : KernelSet
     threads : int
     signal_model : Texture, optional
-        Of what is heard; what errs on the safe side by default.
+        Signal model of a measurement; a safe one for any sound by default.
     max_bytes : int, optional
         Limit on the memory of a plan's signals and delays.
     sensitivity : Sensitivity, optional
         Sensitivity of the beamformer; by default, a safe estimate for any sound.
+    plan : {"nominal", "measured"}
+        Costs that decide between plans and predict times: published ones, or those measured on this machine.
 
     Raises
     ------
     DeviceError
-        16 bits are asked for, and the device has no dot product for them.
+        The settings ask for int16, and the device has no dot product of 16 bits.
     """
 
     def __init__(
@@ -101,8 +114,11 @@ class Planner:
         signal_model: SignalModel | None = None,
         max_bytes: int | None = None,
         sensitivity: Sensitivity | None = None,
+        plan: PlanCosts = "nominal",
     ) -> None:
+        checks.choice("plan", plan, PLAN_COSTS)
         self.settings = settings
+        self._costs_kind = plan
         self._kernels = kernels
         self._max_bytes = max_bytes
         if settings.accuracy.precision == "int16":
@@ -115,7 +131,7 @@ class Planner:
 
     @property
     def model(self) -> ErrorModel:
-        """Model of the errors of each step."""
+        """Error model of the signal chain."""
         return self._plans.errors
 
     def _rated(
@@ -129,17 +145,17 @@ class Planner:
         ]
 
     def choose(self) -> Chosen:
-        """Return the cheapest plan that keeps the budget.
+        """Return the fastest plan that keeps the budget.
 
         Raises
         ------
         ArgumentError
-            None does; the message has the best there is.
+            No plan keeps the budget; the message has the smallest possible error.
         """
         wanted_db = self.settings.accuracy.max_error_db
         allowed = 10 ** (wanted_db / 10) * _ROUNDED
-        # Where no plan is exact enough for an adaptive beamformer's image, the best one is taken, and the budget is
-        # that of the beams; see `ertis_numba.prediction` for the warning.
+        # If no plan keeps the budget for images of an adaptive beamformer, the most accurate plan is chosen, and the
+        # budget applies to the beams; see `ertis_numba.prediction` for the warning.
         budget = self._sensitivity.beams(allowed)
         with one_thread():
             plans = open_plans(self._plans, budget, has_int16=bool(self._kernels.tile_ranges))
@@ -147,7 +163,7 @@ class Planner:
             limit = _USUAL_BYTES if self._max_bytes is None else self._max_bytes
             rated = self._rated(plans, sizes, 0, limit)
             within = [plan for plan, parts in rated if sum(parts.values()) <= budget]
-            # The usual limit comes first, so that the plan depends on a machine's memory only where it must.
+            # The usual limit comes first, so that the plan rarely depends on the memory of the machine.
             if not within and self._max_bytes is None and max(sizes) > limit:
                 usual, limit = limit, max(limit, available_bytes())
                 rated += self._rated(plans, sizes, usual + 1, limit)
@@ -161,24 +177,24 @@ class Planner:
                 "give a lower accuracy.oversampling or accuracy.focal_zones"
             )
         if within:
-            # By the costs of all threads whatever their number now, so that it does not decide about the plan.
-            costs = costs_of(self._kernels, self._kernels.max_threads) if len(within) > 1 else None
+            # Costs are those of all threads, so that the plan does not depend on the number of threads in use.
+            costs = self._costs(self._kernels.max_threads) if len(within) > 1 else None
             cheapest = min(within, key=lambda plan: self._time(plan, costs)) if costs else within[0]
             return self.chosen(self._accuracy(cheapest))
         plan, parts = min(rated, key=lambda entry: sum(entry[1].values()))
         if budget < sum(parts.values()) <= allowed:
             return self.chosen(self._accuracy(plan))
         best = self.chosen(self._accuracy(plan))
-        memory = f", others do not fit into {limit / 1e6:.0f} MB of memory" if len(rated) < len(plans) else ""
+        memory = f"; more accurate plans exceed {limit / 1e6:.0f} MB of memory" if len(rated) < len(plans) else ""
         wider = f"give {math.ceil(best.error_db)} or more, or " if best.error_db <= 0 else ""
         raise ArgumentError(
-            f"accuracy.max_error_db is {wanted_db:g}, and the best that these settings can is {best.error_db:.1f} "
+            f"accuracy.max_error_db is {wanted_db:g}, but the smallest error of these settings is {best.error_db:.1f} "
             f"({_worst(best)}{memory}); {wider}leave more of [accuracy] open"
         )
 
     def chosen(self, accuracy: Accuracy) -> Chosen:
-        """Return what is expected of a complete plan."""
-        stages_ms = costs_of(self._kernels, self._threads).stages_ms(self._plans.work(plan_of(accuracy)))
+        """Return the predictions for a complete plan."""
+        stages_ms = self._costs(self._threads).stages_ms(self._plans.work(plan_of(accuracy)))
         return Chosen(self.settings.replace(accuracy=accuracy), self._image_parts(accuracy), stages_ms)
 
     def parts(self, accuracy: Accuracy) -> dict[str, float]:
@@ -220,12 +236,17 @@ class Planner:
     def _time(self, plan: ImagePlan, costs: Costs) -> float:
         return sum(costs.stages_ms(self._plans.work(plan)).values())
 
+    def _costs(self, threads: int) -> Costs:
+        if self._costs_kind == "nominal":
+            return nominal_costs(self._kernels)
+        return measured_costs(self._kernels, threads)
+
     @property
     def costs_file(self) -> Path:
-        """Where the costs are kept that predict times; taken away, they are measured again."""
+        """File with the costs measured on this machine; delete it to measure them again."""
         return cache_file(self._kernels.device, self._threads, self._kernels.hardware)
 
 
 def _worst(chosen: Chosen) -> str:
     name = max(chosen.parts, key=lambda part: chosen.parts[part])
-    return f"{decibels(chosen.parts[name]):.1f} by {PARTS[name]}"
+    return f"{decibels(chosen.parts[name]):.1f} due to {PARTS[name]}"

@@ -1,4 +1,4 @@
-"""Energyscape files: what processing a recording gave, with its axes."""
+"""Energyscape files: images of a recording, with their axes."""
 
 import math
 from collections import Counter
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks
+from ertis_numba.angles import DegreesFromRadians
 from ertis_numba.atomic_files import check_target
 from ertis_numba.errors import ArgumentError, DamagedError
 from ertis_numba.frames import Energyscape
@@ -31,7 +32,7 @@ _AXES = {"azimuth": "azimuth_rad", "elevation": "elevation_rad", "range": "range
 
 
 class EnergyscapeWriter(Writer[Energyscape]):
-    """Writes energyscapes one by one; use it in a ``with`` statement.
+    """Writer of an energyscape file, one image at a time; use it in a ``with`` statement.
 
     Energyscapes of several sensors may come in any order.
 
@@ -39,18 +40,18 @@ class EnergyscapeWriter(Writer[Energyscape]):
     ----------
     path : str or Path
     recording : RecordingReader or sequence of RecordingReader, optional
-        What they were made from: one reader, or one for each sensor of the same recording. The file
-        keeps its uuid and SHA-256, and the truth of each measurement an energyscape came from.
+        Recording of the images: one reader, or one for each sensor of the same recording. The file stores its UUID and
+        SHA-256, and the ground truth of the measurements.
     truth : mapping of str to Truth, optional
-        What each sensor should show, by its name, in place of what the recording says.
+        Ground truth by name of the sensor, instead of that of the recording.
     mounting : mapping of str to (translation_m, rotation_xyzw), optional
-        Where each sensor is, by its name, as for `RecordingWriter`, in place of what the recording says. Where neither
-        says it, the file does not either.
+        Mounting by name of the sensor, as for `RecordingWriter`, instead of that of the recording. By default, the file
+        stores the mountings that the recording contains.
     dtype : {"float32", "float16"}
-        float16 halves the file; it keeps three digits down to -84 dB of full scale and fewer below, and
+        Type of the stored amplitudes. float16 halves the file; it has three digits down to -84 dBFS and fewer below.
         netCDF programs cannot read it.
     overwrite : bool
-        Replace a file of this name.
+        Replace an existing file.
     """
 
     _kind: ClassVar[str] = "energyscape"
@@ -86,12 +87,14 @@ class EnergyscapeWriter(Writer[Energyscape]):
         } | self._given
 
     def note_mounting(self, sensor: str, translation_m: Sequence[float], rotation_xyzw: Sequence[float]) -> None:
-        """Say where a sensor is; what is said after its first energyscape counts no more.
+        """Set the mounting of a sensor.
+
+        Call this before the sensor's first energyscape is written; later calls have no effect.
 
         Raises
         ------
         ArgumentError
-            A number is missing or not finite, or the quaternion has not length 1.
+            A number is missing or not finite, or the length of the quaternion is not 1.
         """
         self._given[sensor] = self._mounting[sensor] = mounted(sensor, translation_m, rotation_xyzw)
 
@@ -161,11 +164,13 @@ class EnergyscapeWriter(Writer[Energyscape]):
     def _row(self, item: Energyscape) -> tuple[NDArray[Any], dict[str, float]]:
         first = self._first[item.stamp.sensor]
         if item.settings is not first.settings and item.settings != first.settings:
-            raise ArgumentError("an energyscape has other settings than the first; write it to its own file")
+            raise ArgumentError("settings of an energyscape differ from those of the first; write it to another file")
         for field in _AXES.values():
             ours, theirs = getattr(item, field), getattr(first, field)
             if ours is not theirs and not np.array_equal(ours, theirs):
-                raise ArgumentError(f"an energyscape has another {field} than the first; write it to its own file")
+                raise ArgumentError(
+                    f"{field} of an energyscape differs from that of the first; write it to another file"
+                )
         return item.amplitude, {}
 
     def _finish(self, file: h5py.File) -> None:
@@ -180,26 +185,26 @@ class EnergyscapeWriter(Writer[Energyscape]):
         written = RowReader(group, self._data).stamps(sensor)
         if written == recorded:
             return truth
-        # Some only, or in another order: each takes the truth of the measurement that it came from.
+        # Images may be a part of the recording or in another order; each has the truth of its measurement.
         counts = Counter(recorded)
         for index, stamp in enumerate(written):
             if counts[stamp] != 1:
                 raise ArgumentError(
                     f"energyscape {index} of sensor {sensor} has the stamp of {counts[stamp]} measurements of the "
-                    "recording, wanted 1 to take its truth from; give the recording it came from, or its truth"
+                    "recording, but its ground truth needs exactly 1; give the right recording, or truth"
                 )
         places = {stamp: index for index, stamp in enumerate(recorded)}
         return replace(truth, reflectors=tuple(truth.reflectors[places[stamp]] for stamp in written))
 
 
 def _origin(readers: Sequence[RecordingReader]) -> dict[str, str]:
-    """Return what the file says about the recording that it was made from."""
+    """Return the attributes of the file that describe its recording."""
     if not readers:
         return {"source": "", "history": ""}
     first = readers[0]
     for reader in readers:
         if reader.uuid != first.uuid:
-            raise ArgumentError(f"{reader.path} is another recording than {first.path}; write one file for each")
+            raise ArgumentError(f"{reader.path} is not the same recording as {first.path}; write one file for each")
     return {
         "source": first.path.name,
         "history": f"processed from recording {first.uuid}",
@@ -208,17 +213,19 @@ def _origin(readers: Sequence[RecordingReader]) -> dict[str, str]:
     }
 
 
-class EnergyscapeReader(FileReader[Energyscape]):
-    """An energyscape file as a sequence of energyscapes, read one at a time.
+class EnergyscapeReader(FileReader[Energyscape], DegreesFromRadians):
+    """Energyscape file as a sequence of energyscapes, each read when it is indexed.
+
+    The properties ``azimuth_deg`` and ``elevation_deg`` are the angles in degrees.
 
     Attributes
     ----------
     azimuth_rad, elevation_rad : (direction,) float64
     range_m : (range,) float64
     translation_m : (3,) float64, or None
-        Where the sensor is; None if its mounting is unknown.
+        Position of the sensor in metres; None if its mounting is unknown.
     rotation_xyzw : (4,) float64, or None
-        The unit quaternion that turns the sensor frame into that of the surroundings, or None with it.
+        Unit quaternion that rotates the sensor frame into that of its platform; None if the mounting is unknown.
     predicted_error_db, max_error_db : float, or None
         Error that the error model predicted for the first image, and the budget. None in older files and for images of
         the paper's method.
@@ -283,9 +290,7 @@ def _number(path: Path, name: str, value: Any) -> float:
     except (TypeError, ValueError):
         found = math.nan
     if not math.isfinite(found):
-        raise DamagedError(
-            f"{path}: attribute {name} is {value!r}, wanted a finite number; process the recording again"
-        )
+        raise DamagedError(f"{path}: attribute {name} is {value!r}, not a finite number; process the recording again")
     return found
 
 
@@ -296,14 +301,28 @@ def open_energyscapes(path: str | Path, *, sensor: str | None = None) -> Energys
     ----------
     path : str or Path
     sensor : str, optional
-        Which one, where a file holds several.
+        Name of the sensor, if the file contains several.
+
+    Returns
+    -------
+    EnergyscapeReader
 
     Raises
     ------
     DataError
-        The file is not an energyscape file, is damaged or cut short.
+        The file is not an energyscape file, is damaged or truncated.
     FormatVersionError
-        A newer version wrote it.
+        A newer version wrote the file.
+
+    Examples
+    --------
+    >>> import ertis_numba as ertis
+    >>> with ertis.open_recording("reflectors.h5") as recording:
+    ...     images = list(ertis.Pipeline(recording.settings).process_many(recording))
+    >>> path = ertis.write_energyscapes("images.h5", images, overwrite=True)
+    >>> with ertis.open_energyscapes(path) as reader:
+    ...     len(reader) == len(images)
+    True
     """
     return EnergyscapeReader(path, sensor=sensor)
 
@@ -318,14 +337,33 @@ def write_energyscapes(
     dtype: Literal["float32", "float16"] = "float32",
     overwrite: bool = False,
 ) -> Path:
-    """Write energyscapes as they come and return the path; the arguments are those of `EnergyscapeWriter`.
+    """Write an energyscape file.
+
+    Parameters
+    ----------
+    path : str or Path
+    images : iterable of Energyscape
+        Images of one or several sensors. It is read one image at a time.
+    recording, truth, mounting, dtype, overwrite
+        See `EnergyscapeWriter`.
+
+    Returns
+    -------
+    Path
+        The path.
 
     Raises
     ------
     ArgumentError
-        There is no energyscape, one does not fit to the others, or the file exists.
+        There is no energyscape, settings or axes of a sensor's images differ, or the file exists.
     DataError
         The disk is full or cannot be written.
+
+    Examples
+    --------
+    >>> import ertis_numba as ertis
+    >>> with ertis.open_recording("reflectors.h5") as recording, ertis.Pipeline(recording.settings) as pipeline:
+    ...     path = ertis.write_energyscapes("images.h5", pipeline.process_many(recording), overwrite=True)
     """
     with EnergyscapeWriter(
         path, recording=recording, truth=truth, mounting=mounting, dtype=dtype, overwrite=overwrite

@@ -16,6 +16,7 @@ from ertis_numba.network.processing.slots import POINTS_BYTES
 if TYPE_CHECKING:
     from ertis_numba.network.processing.chain import SharedPipeline
     from ertis_numba.network.processing.pipe_messages import Prepared
+    from ertis_numba.stages.costs import PlanCosts
 
 __all__ = ["ClusterResult", "prepare", "process"]
 
@@ -23,7 +24,7 @@ _KEPT: Final = 8  # Limit on the pipelines of a worker; the least recently used 
 _WORDS = np.dtype("<f4")
 
 _turn = threading.Lock()
-_chains: "OrderedDict[tuple[str, str], SharedPipeline]" = OrderedDict()
+_chains: "OrderedDict[tuple[str, str, str], SharedPipeline]" = OrderedDict()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,10 +47,10 @@ class ClusterResult:
     worker: str
 
 
-def prepare(kind: int, settings: str, device: str) -> "Prepared | str":
+def prepare(kind: int, settings: str, device: str, plan: "PlanCosts" = "nominal") -> "Prepared | str":
     """Create the pipeline of a kind of measurements, unless it exists; return its description, or an error text."""
     try:
-        chain = _chain(settings, device)
+        chain = _chain(settings, device, plan)
         threads = _threads(device)
         took_s, _ = chain.times_s(threads, 1)
     except (ArgumentError, DataError, DeviceError, MemoryError) as error:
@@ -58,12 +59,18 @@ def prepare(kind: int, settings: str, device: str) -> "Prepared | str":
 
 
 def process(
-    settings: str, device: str, dtype: str, words: "bytes | memoryview", *, points: bool
+    settings: str,
+    device: str,
+    dtype: str,
+    words: "bytes | memoryview",
+    *,
+    points: bool,
+    plan: "PlanCosts" = "nominal",
 ) -> "ClusterResult | str":
     """Return the products of a measurement, or an error text."""
     begun_s = time.perf_counter()
     try:
-        chain = _chain(settings, device)
+        chain = _chain(settings, device, plan)
         image = chain.image(words, threads=_threads(device))
     except DataError as error:
         return str(error)
@@ -72,13 +79,13 @@ def process(
     return ClusterResult(amplitude, found, time.perf_counter() - begun_s, _address())
 
 
-def _chain(settings: str, device: str) -> "SharedPipeline":
+def _chain(settings: str, device: str, plan: "PlanCosts") -> "SharedPipeline":
     from ertis_numba.network.processing.chain import SharedPipeline  # noqa: PLC0415  in processes of the cluster alone
 
-    key = (settings, device)
+    key = (settings, device, plan)
     with _turn:
         if key not in _chains:
-            _chains[key] = SharedPipeline(settings, device)
+            _chains[key] = SharedPipeline(settings, device, plan)
         _chains.move_to_end(key)
         while len(_chains) > _KEPT:  # A call that uses the pipeline keeps it until it ends.
             _chains.popitem(last=False)

@@ -15,6 +15,7 @@ from ertis_numba.network.processing.pipe_messages import Prepared
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.sample_format import sample_format
 from ertis_numba.settings import Settings
+from ertis_numba.stages.costs import PlanCosts
 
 __all__ = ["SharedPipeline"]
 
@@ -32,6 +33,7 @@ class SharedPipeline:
     settings : str
         Settings as TOML.
     device : {"auto", "cpu", "cuda", "numpy"}
+    plan : {"nominal", "measured"}
 
     Attributes
     ----------
@@ -42,9 +44,9 @@ class SharedPipeline:
         Layout of the samples in a measurement.
     """
 
-    def __init__(self, settings: str, device: str) -> None:
+    def __init__(self, settings: str, device: str, plan: PlanCosts = "nominal") -> None:
         stated = Settings.from_toml(settings, "settings of a sensor", find_line=False)
-        self.pipeline = Pipeline(stated, device=device, max_bytes=MAX_BYTES, predict=False)
+        self.pipeline = Pipeline(stated, device=device, max_bytes=MAX_BYTES, predict=False, plan=plan)
         self.shape = (len(self.pipeline.grid), len(self.pipeline.range_m))
         self.format = sample_format(self.pipeline.settings)
         self._extractor = PointExtractor(self.pipeline.settings)

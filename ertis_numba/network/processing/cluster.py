@@ -122,7 +122,7 @@ class Cluster:
             for kind in self._kinds.values():
                 if kind.number not in member.asked:
                     member.asked.add(kind.number)
-                    call = partial(there.prepare, kind.number, kind.settings, self._options.device)
+                    call = partial(there.prepare, kind.number, kind.settings, self._options.device, self._options.plan)
                     self._ask(member, call, self._options.prepare_s, "prepared", kind, member)
 
     def forget(self, kind: JobKind) -> None:
@@ -149,7 +149,14 @@ class Cluster:
         attempt = _Attempt(job, self._slot_for(job), member)
         self._attempts.add(attempt)
         member.busy += 1
-        call = partial(there.process, job.kind.settings, self._options.device, self._options.dtype, points=job.points)
+        call = partial(
+            there.process,
+            job.kind.settings,
+            self._options.device,
+            self._options.dtype,
+            points=job.points,
+            plan=self._options.plan,
+        )
         deadline_s = self._options.deadline_s
         self._ask(member, call, deadline_s, "made", attempt, words=bytes_of(job.words), slot=attempt.slot)
 

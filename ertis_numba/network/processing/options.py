@@ -9,6 +9,7 @@ from ertis_numba.errors import ArgumentError
 from ertis_numba.network.addresses import DEFAULT_PUBLISH
 from ertis_numba.network.keys import ServerKeys
 from ertis_numba.settings import Settings
+from ertis_numba.stages.costs import PLAN_COSTS, PlanCosts
 
 __all__ = ["ProcessingOptions"]
 
@@ -28,6 +29,8 @@ class ProcessingOptions:
     max_error_db : float, optional
         Error budget of images; the sensor's own by default.
     device : {"auto", "cpu", "cuda", "numpy"}
+    plan : {"nominal", "measured"}
+        Costs by which plans are chosen, as for `ertis_numba.Pipeline`.
     workers : int, optional
         Number of processes; by default one for each core, or one for a GPU.
     threads : int, optional
@@ -56,6 +59,7 @@ class ProcessingOptions:
     processing: dict[str, Any] = field(default_factory=dict)
     max_error_db: float | None = None
     device: str = "auto"
+    plan: PlanCosts = "nominal"
     workers: int | None = None
     threads: int | None = None
     deadline_s: float = 2.0
@@ -66,6 +70,7 @@ class ProcessingOptions:
     cluster: str | None = None
 
     def __post_init__(self) -> None:
+        checks.choice("plan", self.plan, PLAN_COSTS)
         checks.choice("device", self.device, ("auto", "cpu", "cuda", "numpy"))
         checks.choice("dtype", self.dtype, ("float32", "float16"))
         checks.positive("deadline", self.deadline_s)

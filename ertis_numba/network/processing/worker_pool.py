@@ -201,6 +201,7 @@ class LocalWorkerPool:
                 threads,
                 str(len(self._workers)),
                 str(self._options.deadline_s),
+                self._options.plan,
             ],
         )
         worker.deadline_s = time.monotonic() + _LOADING_S

@@ -29,6 +29,7 @@ from ertis_numba.network.processing.slots import POINTS_BYTES, SlotView
 if TYPE_CHECKING:
     from ertis_numba.network.processing.chain import SharedPipeline
     from ertis_numba.network.processing.pipe import Pipe
+    from ertis_numba.stages.costs import PlanCosts
 
 _DRAIN_S: Final = 0.1
 # Number of deadlines after which a hanging worker ends by itself, if no process is left to kill it.
@@ -41,6 +42,7 @@ class _ImageWorker:
         self._device, self._dtype = arguments[2:4]
         self._threads, self._at_once = int(arguments[4]), int(arguments[5])
         self._deadline_s = float(arguments[6])
+        self._plan: PlanCosts = "measured" if arguments[7] == "measured" else "nominal"
         self._views: dict[int, SlotView] = {}
         self._chains: dict[int, SharedPipeline] = {}
         self._predictions = Predictions(self._device)
@@ -80,7 +82,7 @@ class _ImageWorker:
         from ertis_numba.network.processing.chain import SharedPipeline  # noqa: PLC0415  in this process alone
 
         try:
-            chain = SharedPipeline(order.settings, self._device)
+            chain = SharedPipeline(order.settings, self._device, self._plan)
             times_s = chain.times_s(self._threads, self._at_once) if order.measure else (0.0, 0.0)
             reported = chain.prepared(order.kind, *times_s)
         except (ArgumentError, DataError, DeviceError, MemoryError) as error:

@@ -1,0 +1,110 @@
+"""Examples in docstrings of public names run, and public functions state parameters, results and errors."""
+
+import doctest
+import inspect
+import shutil
+from pathlib import Path
+
+import matplotlib as mpl
+import pytest
+
+import ertis_numba as ertis
+from ertis_numba.frames import MicrophoneSignals
+
+ROOT = Path(__file__).parents[1]
+WITHOUT_EXAMPLE = {
+    # Exceptions and warnings are caught, not called.
+    *(name for name in ertis.__all__ if name.endswith(("Error", "Warning"))),
+    # `Pipeline.signals` returns it and has an example.
+    "MicrophoneSignals",
+    # They need hardware, a network or keys; pages of the guide have examples, which tests run.
+    *("AllowList", "ClientKeys", "Emulator", "Entry", "KeyPair", "Permission", "SensorNode", "ServerKeys", "Setup"),
+    *("Sonar", "Subscriber"),
+    # Pages of the guide have examples, which tests run.
+    *("PointExtractor", "Scene", "Simulator", "cfar_peaks", "compare", "export", "find_peaks", "health", "load_layout"),
+    *("load_scene", "open_pcm", "open_raw", "open_recording", "open_rtis_folder", "render", "write_recording"),
+}
+"""Public names whose docstring has no example, each with its reason."""
+
+DOCUMENTED = [
+    ertis.demodulate,
+    ertis.matched_filter,
+    ertis.beamform,
+    ertis.plot,
+    ertis.plot_page,
+    ertis.open_energyscapes,
+    ertis.write_energyscapes,
+    ertis.Pipeline,
+    ertis.Pipeline.process,
+    ertis.Pipeline.process_batch,
+    ertis.Pipeline.process_many,
+    ertis.Pipeline.signals,
+    ertis.Settings,
+    ertis.Settings.replace,
+    ertis.Settings.load,
+    ertis.Settings.updated_from_file,
+    ertis.Settings.from_preset,
+    ertis.Stamp,
+    ertis.Measurement,
+    ertis.Measurement.to_xarray,
+    ertis.Energyscape,
+    ertis.Energyscape.select,
+    ertis.Energyscape.replace,
+    ertis.Energyscape.to_xarray,
+    ertis.PointCloud,
+    ertis.PointCloud.replace,
+    ertis.PointCloud.to_structured,
+    ertis.Peak,
+    ertis.Reflector,
+]
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """A folder with what ``ertis example reflectors`` copies."""
+    shutil.copy(ROOT / "data" / "synthetic" / "reflectors.h5", tmp_path)
+    monkeypatch.chdir(tmp_path)
+    mpl.use("Agg")
+    return tmp_path
+
+
+def public():
+    """Public objects with the examples in their docstrings and in those of their methods."""
+    finder = doctest.DocTestFinder(exclude_empty=True)
+    for name in ertis.__all__:
+        for test in finder.find(getattr(ertis, name), name, globs={}):
+            if test.examples:
+                yield pytest.param(test, id=test.name)
+
+
+@pytest.mark.usefixtures("place")
+@pytest.mark.parametrize("example", list(public()))
+def test_examples_run(example):
+    runner = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE)
+    shown = []
+    runner.run(example, out=shown.append)
+    assert not runner.failures, "".join(shown)
+
+
+@pytest.mark.parametrize("subject", DOCUMENTED, ids=lambda subject: subject.__qualname__)
+def test_public_names_of_the_array_interface_have_examples(subject):
+    text = inspect.getdoc(subject)
+    assert "Examples\n--------" in text
+    if inspect.isclass(subject):
+        assert "Attributes\n----------" in text
+    elif len(inspect.signature(subject).parameters) > ("self" in inspect.signature(subject).parameters):
+        assert "Parameters\n----------" in text
+    assert not text.startswith(("What", "Which", "Whether", "How", "From", "See"))
+
+
+def test_public_names_have_an_example_or_a_reason():
+    without = {
+        name for name in ertis.__all__ if "Examples\n--------" not in (inspect.getdoc(getattr(ertis, name)) or "")
+    }
+    assert without <= WITHOUT_EXAMPLE <= set(ertis.__all__)
+
+
+def test_signals_have_a_unit_for_each_attribute():
+    text = inspect.getdoc(MicrophoneSignals)
+    for name in MicrophoneSignals.__dataclass_fields__:
+        assert f"\n{name} : " in text

@@ -1,0 +1,62 @@
+"""The examples of ``docs/how-to/numpy.md`` run, and are short."""
+
+import re
+import sys
+
+import pytest
+
+from ertis_numba.analysis.compare import compare
+from ertis_numba.storage import open_recording
+from tests.pages import ROOT, page, python_in, run
+
+PAGE = page("numpy")
+EXAMPLES = python_in(PAGE)
+RECORDING = ROOT / "data" / "synthetic" / "reflectors.h5"
+
+
+@pytest.fixture
+def place(tmp_path):
+    (tmp_path / "reflectors.h5").symlink_to(RECORDING)
+    return tmp_path
+
+
+def test_there_are_short_examples():
+    assert len(EXAMPLES) == 4
+    assert max(len(example.splitlines()) for example in EXAMPLES) <= 12
+    assert max(map(len, "".join(EXAMPLES).splitlines())) <= 120
+
+
+@pytest.mark.parametrize("number", range(4))
+def test_examples_run(place, number):
+    code = "import matplotlib; matplotlib.use('Agg')\n" + EXAMPLES[number]
+    shown = run(place, sys.executable, "-W", "error", "-c", code).stdout
+    if number == 1:
+        assert (place / "numpy.png").stat().st_size > 10_000
+    if number == 2:
+        with open_recording(RECORDING) as recording:
+            assert len(re.findall(r"measurement \d+: -?\d+\.\d dBFS", shown)) == len(recording)
+
+
+def test_own_beamformer_finds_the_reflectors(place):
+    """Its image shows what an image of the pipeline shows."""
+    code = EXAMPLES[0] + (
+        "from ertis_numba.storage import write_energyscapes\n"
+        "near = (signals.range_m >= 0.5) & (signals.range_m <= 5)\n"
+        "made = ertis.Pipeline(signals.settings).process(recording_of(0))\n"
+        "made = made.replace(energy=image[:, near].astype('f4'), azimuth_rad=azimuth_rad,\n"
+        "                    elevation_rad=0 * azimuth_rad, range_m=signals.range_m[near])\n"
+        "write_energyscapes('own.h5', [made])\n"
+    )
+    before = (
+        "import ertis_numba\n"
+        "def recording_of(index):\n"
+        "    with ertis_numba.open_recording('reflectors.h5') as recording:\n"
+        "        return recording[index]\n"
+    )
+    run(place, sys.executable, "-W", "error", "-c", before + code)
+    from ertis_numba.storage import open_energyscapes  # noqa: PLC0415
+
+    with open_recording(RECORDING) as recording, open_energyscapes(place / "own.h5") as images:
+        found = compare(images[0], recording.truth.reflectors[0], min_level_db=-20)
+    assert len(found.matched) >= 3
+    assert not found.missed

@@ -1,0 +1,184 @@
+"""Plans are chosen by nominal costs unless measured ones are asked for."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from ertis_bench import costs as bench_costs
+from ertis_cli.main import cli
+
+from ertis_numba import kernels
+from ertis_numba.campaign import Campaign, CampaignOptions, find
+from ertis_numba.errors import ArgumentError
+from ertis_numba.network.processing import ProcessingOptions as ServeOptions
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.settings import Accuracy
+from ertis_numba.stages import costs, nominal_costs, planner
+from ertis_numba.storage import open_energyscapes, write_recording
+from tests.cases import SHORT, noise
+from tests.files import noise as many_noise
+from tests.pages import ROOT, environment
+
+CPU = kernels.load("cpu")
+MANY = SHORT.replace(processing=SHORT.processing.replace(directions="3d:2000"), accuracy=Accuracy(max_error_db=-35.0))
+PLAN_OF = """
+import json, sys
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.settings import Settings
+
+settings = Settings.from_toml(sys.stdin.read())
+plans = [Pipeline(settings, device="cpu", plan=plan).settings.to_toml() for plan in sys.argv[1:]]
+print(json.dumps(plans))
+"""
+
+
+def costs_where(dear, folder):
+    """Write measured costs in which some kernels take much longer than all others."""
+    seconds = {name: 1e-9 if name.startswith(dear) else 1e-15 for name in costs.UNITS}
+    folder.mkdir()
+    for threads in (1, CPU.max_threads):
+        name = costs.cache_file("cpu", threads).name
+        (folder / name).write_text(json.dumps(seconds), "utf-8")
+    return folder
+
+
+def plans_in_a_process(folder, *names):
+    done = subprocess.run(
+        [sys.executable, "-c", PLAN_OF, *names],
+        input=MANY.to_toml(),
+        env=environment(folder) | {"ERTIS_CACHE_DIR": str(folder)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return json.loads(done.stdout)
+
+
+def test_processes_with_different_measured_costs_choose_the_same_plan_by_default(tmp_path):
+    folders = [costs_where(dear, tmp_path / dear) for dear in ("sum", "pair")]
+    plans = [plans_in_a_process(folder, "nominal", "measured") for folder in folders]
+    (nominal, measured), (other_nominal, other_measured) = plans
+    assert nominal == other_nominal
+    assert measured != other_measured
+    assert "beam_taps = 0" in other_measured
+
+
+def test_the_default_plan_measures_nothing(monkeypatch, tmp_path):
+    monkeypatch.setenv("ERTIS_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(costs, "_KNOWN", {})
+    monkeypatch.setattr(costs, "measure", lambda *_: pytest.fail("costs were measured"))
+    with Pipeline(SHORT, "cpu") as pipeline:
+        pipeline.process(noise(SHORT))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_images_hold_the_plan_that_was_chosen(monkeypatch, tmp_path):
+    monkeypatch.setenv("ERTIS_CACHE_DIR", str(costs_where("pair", tmp_path / "pair")))
+    monkeypatch.setattr(costs, "_KNOWN", {})
+    with Pipeline(MANY, "cpu", plan="measured", predict=False) as pipeline:
+        assert pipeline.settings.accuracy.beam_taps == 0
+        assert pipeline.process(noise(MANY)).settings == pipeline.settings
+    assert Pipeline(MANY, "cpu", predict=False).settings.accuracy.beam_taps > 0
+
+
+def test_nominal_costs_do_not_depend_on_threads_or_hardware():
+    plans = {planner.complete(MANY, CPU, threads=threads).to_toml() for threads in (1, CPU.max_threads)}
+    assert len(plans) == 1
+    assert costs.nominal_costs(CPU).seconds == nominal_costs.NOMINAL_COSTS["cpu"]
+
+
+@pytest.fixture
+def recording(tmp_path, monkeypatch):
+    monkeypatch.setenv("ERTIS_CACHE_DIR", str(costs_where("pair", tmp_path / "cache")))
+    monkeypatch.setattr(costs, "_KNOWN", {})
+    return write_recording(tmp_path / "rec.h5", many_noise(count=2))
+
+
+def made_by(tmp_path, *arguments):
+    target = tmp_path / "img.h5"
+    done = CliRunner().invoke(cli, ["process", *map(str, arguments), "-o", str(target), "--force"])
+    assert done.exit_code == 0, done.stderr
+    with open_energyscapes(target) as images:
+        return images.settings.accuracy
+
+
+@pytest.mark.parametrize("more", [[], ["--workers", "1"]])
+def test_process_chooses_plans_by_the_costs_asked_for(recording, tmp_path, more):
+    grid = ["--directions", "3d:2000", "--range", "0.4:0.9", "--device", "cpu"]
+    if not more:
+        nominal, measured = (made_by(tmp_path, recording, *grid, "--plan", plan) for plan in costs.PLAN_COSTS)
+        assert made_by(tmp_path, recording, *grid) == nominal
+    else:
+        write_recording(tmp_path / "other.h5", many_noise(count=1))
+        found = []
+        for plan in costs.PLAN_COSTS:
+            options = CampaignOptions(
+                settings=lambda recorded: recorded.replace(processing=MANY.processing), device="cpu", plan=plan
+            )
+            folder = tmp_path / plan
+            campaign = Campaign(list(find([tmp_path / "rec.h5", tmp_path / "other.h5"])), folder, options, workers=1)
+            assert all(getattr(event, "outcome", "made") == "made" for event in campaign.run())
+            with open_energyscapes(folder / "rec.energy.h5") as images:
+                found.append(images.settings.accuracy)
+        nominal, measured = found
+    assert nominal.beam_taps > 0
+    assert measured.beam_taps == 0
+
+
+def test_unknown_kinds_of_costs_are_refused():
+    for call in (
+        lambda: Pipeline(SHORT, "cpu", plan="fast"),
+        lambda: CampaignOptions(plan="fast"),
+        lambda: ServeOptions(plan="fast"),
+        lambda: planner.complete(SHORT, CPU, threads=1, plan="fast"),
+    ):
+        with pytest.raises(ArgumentError, match=r"plan 'fast' is unknown.*; known are nominal, measured"):
+            call()
+    assert CliRunner().invoke(cli, ["process", "a.h5", "--plan", "fast"]).exit_code == 2
+
+
+# ---- the table ---------------------------------------------------------------------------------------
+
+
+def test_the_table_is_what_the_command_writes():
+    path = ROOT / "ertis_numba" / "stages" / "nominal_costs.py"
+    assert path.read_text("utf-8") == bench_costs.as_python(nominal_costs.NOMINAL_COSTS)
+    assert set(nominal_costs.NOMINAL_COSTS) == set(kernels.DEVICES)
+    for table in nominal_costs.NOMINAL_COSTS.values():
+        assert set(table) == set(costs.UNITS)
+        assert all(0 < value < 1 for value in table.values())
+
+
+def test_the_command_measures_and_updates_the_table(tmp_path, monkeypatch):
+    seconds = dict.fromkeys(costs.UNITS, 1.23456e-9)
+    monkeypatch.setattr(bench_costs, "measure", lambda *_: costs.Costs(seconds))
+    path = tmp_path / "nominal_costs.py"
+    path.write_text("")
+    done = CliRunner().invoke(cli, ["bench", "costs", "--count", "1", "--update", str(path), "--json", "--quiet"])
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout)["costs"]["cpu"] == dict.fromkeys(costs.UNITS, 1.23e-9)
+    made = {}
+    exec(path.read_text("utf-8"), made)
+    assert made["NOMINAL_COSTS"]["cpu"] == dict.fromkeys(costs.UNITS, 1.23e-9)
+    assert made["NOMINAL_COSTS"]["cuda"] == nominal_costs.NOMINAL_COSTS["cuda"]
+    done = CliRunner().invoke(cli, ["bench", "costs", "--count", "1", "--quiet"])
+    assert "| cpu, here | cpu, nominal |" in done.stdout
+    assert "| sum_float32_few | 1.23 |" in done.stdout
+    other = tmp_path / "README.md"
+    other.write_text("")
+    done = CliRunner().invoke(cli, ["bench", "costs", "--update", str(other)])
+    assert done.exit_code == 2
+    assert "README.md is not nominal_costs.py" in done.stderr.replace("\n", " ")
+
+
+def test_plans_differ_only_in_time():
+    """Both keep the budget, whatever the costs."""
+    images = {}
+    for plan in costs.PLAN_COSTS:
+        with Pipeline(SHORT, "cpu", plan=plan, predict=False) as pipeline:
+            images[plan] = np.asarray(pipeline.process(noise(SHORT))).astype(float)
+    difference = np.linalg.norm(images["nominal"] - images["measured"]) / np.linalg.norm(images["nominal"])
+    assert 20 * np.log10(max(difference, 1e-9)) < SHORT.accuracy.max_error_db + 6

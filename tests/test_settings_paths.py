@@ -1,0 +1,69 @@
+"""One changed number of nested settings needs one call."""
+
+import re
+
+import pytest
+
+from ertis_numba.errors import ArgumentError
+from ertis_numba.settings import Accuracy, Processing, Settings
+from ertis_numba.simulation import Scene
+
+
+def test_a_path_changes_one_nested_value():
+    changed = Settings().replace("processing.range_m", (0.5, 3))
+    assert changed == Settings(processing=Processing(range_m=(0.5, 3.0)))
+    assert Settings().replace("accuracy", Accuracy(max_error_db=-50)) == Settings(accuracy=Accuracy(max_error_db=-50))
+    assert Processing().replace("dmas_order", 3) == Processing().replace(dmas_order=3)
+
+
+def test_several_paths_change_in_one_call_and_are_checked_together():
+    changes = {"processing.decimation": 15, "processing.range_decimation": 150, "accuracy.max_error_db": -50}
+    assert Settings().replace(**changes) == Settings(
+        processing=Processing(decimation=15, range_decimation=150), accuracy=Accuracy(max_error_db=-50)
+    )
+    with pytest.raises(ArgumentError, match=r"processing.decimation is 15; give a divisor"):
+        Settings().replace("processing.decimation", 15)
+
+
+def test_paths_change_tables_that_are_given_beside_them():
+    changed = Settings().replace("processing.dmas_order", 4, processing=Processing(directions="2d:9"))
+    assert changed.processing == Processing(directions="2d:9", dmas_order=4)
+    assert Settings().replace(processing=Processing(dmas_order=4)).processing.dmas_order == 4
+    assert Settings().replace() == Settings()
+
+
+def test_values_that_are_none_can_be_given():
+    fixed = Settings().replace("accuracy.delay_taps", 2)
+    assert fixed.replace("accuracy.delay_taps", None) == Settings()
+
+
+@pytest.mark.parametrize(
+    ("path", "message"),
+    [
+        ("processing.rangem", "settings key 'processing.rangem' is unknown (did you mean 'processing.range_m'"),
+        ("range_m", "settings key 'range_m' is unknown (did you mean 'processing.range_m'?); known are array, call"),
+        ("sample_rate_hz", "did you mean 'call.sample_rate_hz' or 'recording.sample_rate_hz'?"),
+        ("max_error", "did you mean 'accuracy.max_error_db'"),
+        ("procesing.range_m", "did you mean 'processing.range_m'?"),
+        ("accuracy.zzz", "settings key 'accuracy.zzz' is unknown; known in 'accuracy' are max_error_db, precision"),
+        ("zzz", "settings key 'zzz' is unknown; known are array, call, recording, air, processing, accuracy"),
+        ("processing.range_m.first", "processing key 'range_m.first' is unknown: range_m is no table; give 'range_m'"),
+    ],
+)
+def test_unknown_paths_are_refused_in_one_line_with_similar_ones(path, message):
+    with pytest.raises(ArgumentError, match=re.escape(message)) as caught:
+        Settings().replace(path, 1)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 500
+
+
+def test_values_of_paths_are_checked():
+    with pytest.raises(ArgumentError, match=r"accuracy.max_error_db is 3; give a number from -200 to 0"):
+        Settings().replace("accuracy.max_error_db", 3)
+    with pytest.raises(ArgumentError, match=r"processing.range_m is 3"):
+        Settings().replace("processing.range_m", 3)
+
+
+def test_scenes_take_paths_too():
+    changed = Scene().replace("seed", 3)
+    assert changed == Scene(seed=3)
