@@ -361,7 +361,7 @@ class Sight:
 
 
 def change_db(part: Floats, beside: Floats) -> float:
-    """Return the greatest change in decibels of the amplitudes ``beside`` when ``part`` is added; 0 if empty."""
+    """Return the greatest change in decibels of the amplitudes ``beside`` if ``part`` is added; 0 if empty."""
     return float(20 * np.log10(1 + np.max(part / beside, initial=0.0)))
 
 
