@@ -34,7 +34,7 @@ def spacing_rad(directions: NDArray[np.float64]) -> float:
     >>> import numpy as np
     >>> from ertis_numba.geometry import spacing_rad, unit_vectors
     >>> azimuth_rad = np.radians([0.0, 2.0, 4.0])
-    >>> round(np.degrees(spacing_rad(unit_vectors(azimuth_rad, np.zeros(3)))), 6)
+    >>> round(float(np.degrees(spacing_rad(unit_vectors(azimuth_rad, np.zeros(3))))), 6)
     2.0
     """
     # Importing SciPy's trees takes a tenth of a second, and processing does not need them.

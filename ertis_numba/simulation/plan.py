@@ -116,7 +116,7 @@ def make_plan(scene: Scene) -> EffectPlan:
     --------
     >>> from ertis_numba.simulation import Point, Scene
     >>> from ertis_numba.simulation.plan import make_plan
-    >>> "spreading" in make_plan(Scene(points=(Point(range_m=1.0),))).active
+    >>> "spreading" in make_plan(Scene(points=(Point(range_m=2.0),))).active
     True
     """
     indices = _indices(scene)
