@@ -27,6 +27,11 @@ def reach_rad(gaps_rad: NDArray[np.float64]) -> NDArray[np.float64]:
     ----------
     gaps_rad : (gap,) float64
         Angles from each direction to the next.
+
+    Returns
+    -------
+    (gap,) float64
+        Angles in radians.
     """
     if len(gaps_rad) < 2:
         return np.full(len(gaps_rad), ALONE_RAD)
@@ -62,7 +67,20 @@ def unrolled_rad(azimuth_rad: NDArray[np.float64], closed_rad: float = 0.0) -> N
 
 
 def is_closed(azimuth_rad: NDArray[np.float64]) -> bool:
-    """Return True if increasing azimuths form a closed circle, without a wider gap between the last and the first."""
+    """Return True if increasing azimuths form a closed circle, without a wider gap between the last and the first.
+
+    Parameters
+    ----------
+    azimuth_rad : (direction,) float64
+        Azimuths in increasing order.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from ertis_numba.geometry import is_closed
+    >>> is_closed(np.radians(np.arange(0.0, 360.0, 30.0)))
+    True
+    """
     if len(azimuth_rad) < 3:
         return False
     open_rad = _TURN - float(azimuth_rad[-1] - azimuth_rad[0])

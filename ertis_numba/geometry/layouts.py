@@ -118,7 +118,7 @@ class Layout:
 
 @functools.cache
 def layout_names() -> tuple[str, ...]:
-    """Return the names of the shipped layouts."""
+    """Return the names of the shipped layouts in alphabetical order."""
     return tuple(sorted(item.name.removesuffix(".toml") for item in _shipped() if item.name.endswith(".toml")))
 
 
@@ -128,6 +128,11 @@ def _shipped() -> list[Traversable]:
 
 def layout_text(name: str) -> str:
     """Return the TOML text of a shipped layout.
+
+    Parameters
+    ----------
+    name : str
+        One of `layout_names`.
 
     Raises
     ------
@@ -292,20 +297,47 @@ def _fitted(array: Array) -> Layout:
 
 
 def written_out(array: Array) -> Array:
-    """Return array settings with the positions of the microphones, so that they depend on no layout file."""
+    """Return array settings with the positions of the microphones, so that they depend on no layout file.
+
+    Raises
+    ------
+    ArgumentError
+        The layout is unknown, or its file cannot be read or used.
+    """
     if array.positions_m is not None:
         return array
     return _fitted(array).to_array().replace(disabled=array.disabled)
 
 
 def self_contained(settings: Settings) -> Settings:
-    """Return settings with the positions of the microphones, so that they depend on no layout file."""
+    """Return settings with the positions of the microphones, so that they depend on no layout file.
+
+    Raises
+    ------
+    ArgumentError
+        The layout is unknown, or its file cannot be read or used.
+
+    Examples
+    --------
+    >>> from ertis_numba import Settings
+    >>> from ertis_numba.geometry import self_contained
+    >>> len(self_contained(Settings()).array.positions_m)
+    32
+    """
     array = written_out(settings.array)
     return settings if array is settings.array else settings.replace(array=array)
 
 
 def storable(settings: Settings) -> Settings:
     """Return settings in the form that recordings contain, which depends on no file.
+
+    Parameters
+    ----------
+    settings : Settings
+
+    Returns
+    -------
+    Settings
 
     Raises
     ------

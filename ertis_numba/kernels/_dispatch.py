@@ -73,7 +73,13 @@ def load(device: str = "auto") -> KernelSet:
 
 
 def usable() -> tuple[str, ...]:
-    """Return the devices that `load` can load on this machine."""
+    """Return the devices that `load` can load on this machine.
+
+    Returns
+    -------
+    tuple of str
+        Names as accepted by `load`; reasons for missing devices are logged at level INFO.
+    """
     found = []
     for device in DEVICES:
         try:

@@ -67,6 +67,11 @@ def arrivals(shot: Snapshot, active: AbstractSet[str], frequency_hz: Floats, clo
     frequency_hz : (frequency,) float64
         Frequencies at which filters are evaluated.
     clock : CostStopwatch
+        Accumulates the time spent on each effect.
+
+    Returns
+    -------
+    list of Arrivals
     """
     gain, late_s = gains(shot, active, clock)
     found = []
@@ -109,8 +114,18 @@ def echoes(
 ) -> list[Paths]:
     """Return the paths of an emitter's call over targets and walls.
 
-    The direct path is included only for the emitter of another sensor. ``n_frequencies`` is the number of frequencies
-    at which amplitudes will be computed.
+    The direct path is included only for the emitter of another sensor.
+
+    Parameters
+    ----------
+    shot : Snapshot
+    active : set of str
+        The effects that are simulated.
+    number : int
+        Index of the emitting sensor.
+    clock : CostStopwatch
+    n_frequencies : int
+        Number of frequencies at which amplitudes will be computed.
 
     Raises
     ------

@@ -92,8 +92,8 @@ def _mics_of_bits(layout: Layout) -> NDArray[np.int32]:
 def noise_transfer(order: int, band: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the numerator and the denominator of the noise transfer function, in powers of 1/z.
 
-    The poles are those of a Butterworth high pass whose gain at half of the sample rate is 1.5 if all zeros lie at
-    0 Hz. The zeros then move to the roots of the Legendre polynomial on the band. This minimises the noise in the
+    The poles are those of a Butterworth high pass with all zeros at 0 Hz and a gain of 1.5 at half of the sample rate.
+    The zeros then move to the roots of the Legendre polynomial on the band. This minimises the noise in the
     band (R. Schreier, G. C. Temes, Understanding Delta-Sigma Data Converters, IEEE Press 2005, chapter 4).
     """
     checks.integer("order", order, 1, _MAX_ORDER)

@@ -98,6 +98,26 @@ def make_plan(scene: Scene) -> EffectPlan:
     If an estimate is not certain enough, A/B renders measure the change. They render and process the measurements with
     the greatest estimates, with and without the effect. They also use the loudest measurement, because estimates do not
     model converters.
+
+    Parameters
+    ----------
+    scene : Scene
+
+    Returns
+    -------
+    EffectPlan
+
+    Raises
+    ------
+    ArgumentError
+        A surface touches or encloses a microphone or an emitter, or the scene exceeds a limit.
+
+    Examples
+    --------
+    >>> from ertis_numba.simulation import Point, Scene
+    >>> from ertis_numba.simulation.plan import make_plan
+    >>> "spreading" in make_plan(Scene(points=(Point(range_m=2.0),))).active
+    True
     """
     indices = _indices(scene)
     shots = [(index, snapshot(scene, sensor, index / scene.rate_hz)) for index in indices for sensor in scene.sensors]

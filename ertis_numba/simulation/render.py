@@ -34,12 +34,12 @@ class Simulator(Engine):
     Raises
     ------
     ArgumentError
-        ``scene`` is no `Scene`, the scene has no such sensor, or the scene exceeds a limit.
+        ``scene`` is not a `Scene`, the scene has no such sensor, or the scene exceeds a limit.
 
     Examples
     --------
+    >>> from ertis_numba import Simulator
     >>> from ertis_numba.simulation import Point, Scene
-    >>> from ertis_numba.simulation.render import Simulator
     >>> simulator = Simulator(Scene(points=(Point(range_m=1.0),)))
     >>> [f"{reflector.range_m:.2f} m" for reflector in simulator.reflectors()]
     ['1.00 m']
@@ -72,7 +72,14 @@ def render(scene: Scene, index: int = 0, *, sensor: str | None = None) -> Measur
     Raises
     ------
     ArgumentError
-        ``scene`` is no `Scene`, the scene has no such sensor, or the scene exceeds a limit.
+        ``scene`` is not a `Scene`, the scene has no such sensor, or the scene exceeds a limit.
+
+    Examples
+    --------
+    >>> from ertis_numba import render
+    >>> from ertis_numba.simulation import Point, Scene
+    >>> render(Scene(points=(Point(range_m=1.0),))).data.shape
+    (163840,)
     """
     return Simulator(scene, sensor=sensor).render(index)
 

@@ -171,6 +171,16 @@ def load_scene(path: str | Path) -> Scene:
         The file cannot be read or used.
     ArgumentError
         A layout cannot be read or used, or a sensor does not have a channel that the file names.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from tempfile import mkdtemp
+    >>> from ertis_numba import load_scene
+    >>> path = Path(mkdtemp(), "scene.toml")
+    >>> _ = path.write_text("points = [{range_m = 1.0}]")
+    >>> load_scene(path).points[0].range_m
+    1.0
     """
     path = Path(path)
     scene = Scene.load(path).with_files_of(path.parent)

@@ -137,7 +137,7 @@ class Sight:
         return own + (effect("cross_emission")(self.shot) if "cross_emission" in active else [])
 
     def of_emitter(self, number: int, active: frozenset[str]) -> Echoes:
-        """Return the echoes of one sensor's call; a call that differs from the own one appears only weakly."""
+        """Return the echoes of one sensor's call; a call unlike the receiving sensor's appears only weakly."""
         found = Echoes.joined([self._seen(paths, number, active) for paths in self.paths(number, active)])
         if number == self.shot.number:
             return found
@@ -262,7 +262,7 @@ class Sight:
     def likeness(self, call: Call) -> float:
         """Return the amplitude in the image of another call that has amplitude 1 at the microphones.
 
-        It is relative to the own call.
+        It is relative to the sensor's own call.
         """
         if call == self.settings.call:
             return 1.0
@@ -361,7 +361,7 @@ class Sight:
 
 
 def change_db(part: Floats, beside: Floats) -> float:
-    """Return the greatest change in decibels of the amplitudes ``beside`` when ``part`` is added; 0 if empty."""
+    """Return the greatest change in decibels of the amplitudes ``beside`` if ``part`` is added; 0 if empty."""
     return float(20 * np.log10(1 + np.max(part / beside, initial=0.0)))
 
 

@@ -23,8 +23,18 @@ def reflectors(shot: Snapshot, active: frozenset[str]) -> list[Reflector]:
     arrives. For an echo over walls, this is the position of the mirror image.
 
     Its level is that of the mean amplitude over the microphones and the call's band, relative to the strongest echo of
-    the own call. Its velocity is relative to the sensor; for echoes over walls it is only the component along the line
-    of sight. Calls of other sensors are included if cross-emission is simulated.
+    the sensor's own call. Its velocity is relative to the sensor; for echoes over walls it is only the component along
+    the line of sight. Calls of other sensors are included if cross-emission is simulated.
+
+    Parameters
+    ----------
+    shot : Snapshot
+    active : frozenset of str
+        The effects that are simulated.
+
+    Returns
+    -------
+    list of Reflector
     """
     sight = Sight(shot, active)
     levels = {number: _levels(shot, sight, number) for number in sight.emitters(active)}
