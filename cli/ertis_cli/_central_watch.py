@@ -1,4 +1,4 @@
-"""What is told while a central node runs."""
+"""Options and progress reports shared by the commands that run a central node."""
 
 import json
 import sys
@@ -29,15 +29,27 @@ __all__ = ["CentralWatch", "archive", "max_bytes", "name", "report", "rotate_eve
 
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
-name: Decorator = click.option("--name", default="recording", show_default=True, help="Of recordings, before the time.")
+name: Decorator = click.option(
+    "--name", default="recording", show_default=True, help="Name of recordings, followed by the time."
+)
 rotate_size: Decorator = click.option(
-    "--rotate-size", type=float, default=2000.0, show_default=True, metavar="MB", help="Of a recording that is full."
+    "--rotate-size",
+    type=float,
+    default=2000.0,
+    show_default=True,
+    metavar="MB",
+    help="Size at which a new recording starts.",
 )
 rotate_every: Decorator = click.option(
-    "--rotate-every", type=float, default=600.0, show_default=True, metavar="S", help="A new recording after so long."
+    "--rotate-every",
+    type=float,
+    default=600.0,
+    show_default=True,
+    metavar="S",
+    help="Age at which a new recording starts.",
 )
 max_bytes: Decorator = click.option(
-    "--most-bytes", type=int, default=4 * 2**20, show_default=True, help="Of a measurement; longer ones are refused."
+    "--most-bytes", type=int, default=4 * 2**20, show_default=True, help="Largest measurement; larger ones are refused."
 )
 
 _REFRESH_S = 0.5
@@ -45,12 +57,12 @@ _EXPECTED = {"listening", "joined", "left", "resumed", "sealed"}
 
 
 class CentralWatch:
-    """Events as lines of JSON on stdout and of a log on stderr; on a terminal also a line that is drawn anew.
+    """Reporter of a central node: JSON lines on stdout, log lines and, on a terminal, a progress line on stderr.
 
     Parameters
     ----------
     life : Life
-        Of this process.
+        This process.
     quiet, as_json : bool
 
     Attributes
@@ -58,13 +70,16 @@ class CentralWatch:
     life : Life
     quiet, as_json : bool
     recordings : list of str
-        That were made.
+        Sealed recordings.
     """
 
     def __init__(self, life: "Life", *, quiet: bool, as_json: bool) -> None:
         from ertis_numba.network.log import logger, show
 
-        self._out, self._err = JsonLines(sys.stdout), JsonLines(sys.stderr)  # the loop must not wait for who reads them
+        self._out, self._err = (
+            JsonLines(sys.stdout),
+            JsonLines(sys.stderr),
+        )  # a slow reader must not block the event loop
         show(level="CRITICAL" if quiet else "INFO", stream=self._err)
         self._log = logger("central_node")
         self.life, self.quiet, self.as_json = life, quiet, as_json
@@ -76,7 +91,7 @@ class CentralWatch:
             self.event({"event": "restarted", "restarts": life.restarts, "reason": life.reason})
 
     def event(self, event: dict[str, Any]) -> None:
-        """Tell of an event of the central node."""
+        """Report an event of the central node."""
         if event["event"] == "sealed" and event["recording"] is not None:
             self.recordings.append(event["recording"])
         self.life.note(event)
@@ -90,7 +105,7 @@ class CentralWatch:
         (self._log.info if event["event"] in _EXPECTED else self._log.warning)(event["event"], **fields)
 
     def stored(self, sensor: str, session_id: int, sequence: int, crc32: int) -> None:
-        """Tell of a measurement that is durable."""
+        """Report a durable measurement."""
         self._print(
             {"event": "stored", "sensor": sensor, "session_id": session_id, "sequence": sequence, "crc32": crc32}
         )
@@ -99,7 +114,7 @@ class CentralWatch:
         self._out.write(f"{json.dumps(event, allow_nan=False)}\n")
 
     def shows(self, status: "Callable[[], Status]") -> "Self":
-        """Draw a line of what is going on, on a terminal, until the ``with`` block ends."""
+        """Draw a progress line on a terminal until the ``with`` block ends."""
         if self._line:
             self._thread = threading.Thread(target=self._draw, args=(status,), daemon=True)
         return self
@@ -118,7 +133,7 @@ class CentralWatch:
             self._err.write("\r\x1b[K")
 
     def close(self) -> None:
-        """Bring out what is still to be told."""
+        """Write pending lines, and report lines that were dropped."""
         if self._out.lost:
             self._print({"event": "untold", "count": self._out.lost})
         self._out.close()
@@ -130,12 +145,12 @@ class CentralWatch:
 
 
 def archive(folder: Path, name: str, rotate_mb: float, rotate_s: float) -> "Archive":
-    """Return what stores measurements, as options say.
+    """Return an archive that stores measurements according to the options.
 
     Raises
     ------
     ArgumentError
-        One cannot be used.
+        An option has an invalid value.
     """
     from ertis_numba import checks
     from ertis_numba.errors import ArgumentError
@@ -158,21 +173,21 @@ def run(
     metrics: "Metrics | None",
     duration_s: float | None,
 ) -> None:
-    """Be a central node until it is asked to end.
+    """Run a central node until it is asked to end.
 
     Parameters
     ----------
     node : CentralNode
     watch : CentralWatch
     made : list of Path
-        Of `ertis_cli._saving.withdrawn`: folders that it makes.
+        New folders, as yielded by `ertis_cli._saving.withdrawn`; cleared once the node runs.
     metrics : Metrics or None
     duration_s : float or None
 
     Raises
     ------
     ErtisError
-        It cannot begin.
+        The node cannot start.
     """
     with stopped_by_signals() as signals, ExitStack() as stack:
         stack.callback(watch.close)
@@ -186,19 +201,19 @@ def run(
 
 
 def size(n_bytes: float) -> str:
-    """Return how much that is, for people."""
+    """Return a number of bytes as readable text."""
     return f"{n_bytes / 1e9:.1f} GB" if n_bytes >= 1e9 else f"{n_bytes / 1e6:.0f} MB"
 
 
 def report(status: "Status", watch: CentralWatch, *, event: str) -> None:
-    """Tell what has come of it; leave with an exit code of 1 where journals are left.
+    """Report the results of a central node; exit with code 1 if unsealed journals remain.
 
     Parameters
     ----------
     status : Status
     watch : CentralWatch
     event : str
-        Its name.
+        Name of the JSON event.
     """
     import msgspec
 
@@ -240,12 +255,14 @@ def report(status: "Status", watch: CentralWatch, *, event: str) -> None:
         parts += [f"{count} missing ({reason})" for reason, count in each.missing.items()]
         options.say(f"{sensor}: {', '.join(parts)}", quiet=quiet)
     if archive is not None and left:
-        click.echo(f"{options.counted(left, 'journal')} not sealed; seal by 'ertis recover {archive.folder}'", err=True)
+        click.echo(
+            f"{options.counted(left, 'journal')} not sealed; seal with 'ertis recover {archive.folder}'", err=True
+        )
         click.get_current_context().exit(1)
 
 
 def _progress(status: "Status") -> str:
-    """Return what is going on, in a line."""
+    """Return the progress line."""
     sensors = status.sensors.values()
     parts = [
         f"{sum(each.connected for each in sensors)} sensors",

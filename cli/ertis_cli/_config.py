@@ -1,4 +1,4 @@
-"""Where options come from that are not given: environment variables, then a file, then their defaults."""
+"""Values of options that are not on the command line: environment variables, then a file, then defaults."""
 
 import difflib
 import os
@@ -22,14 +22,14 @@ __all__ = [
 ]
 
 _GENERAL = frozenset({"device", "quiet", "threads"})
-"""Options that mean the same in every command: ``ERTIS_THREADS`` is of all."""
+"""Options with the same meaning in every command, such as ``ERTIS_THREADS``."""
 
 _NO_OPTIONS = frozenset(f"ERTIS_{name}" for name in ("BENCH_MARK", "CACHE_DIR", "CONFIG", "EMULATED_DIR", "KEYS_DIR"))
-"""What others of this package read, and what its benchmark knows its processes by."""
+"""Variables that are not options: other parts of the package read them, and benchmarks mark their processes."""
 
 _FILE, _BROKEN = "ertis_cli.config_file", "ertis_cli.config_error"  # keys of click's `Context.meta`
 _WITHOUT = frozenset({"completion", "doctor"})
-"""What runs where the configuration is at fault: every new shell asks for the one, whoever is at a loss the other."""
+"""Commands that run despite an invalid configuration: new shells run ``completion``, ``doctor`` finds faults."""
 
 
 def variable(path: Iterable[str], option: str) -> str:
@@ -38,13 +38,13 @@ def variable(path: Iterable[str], option: str) -> str:
 
 
 def add_variables(command: click.Command, path: tuple[str, ...]) -> None:
-    """Let the options of a command, and of those in it, come from the environment, too.
+    """Let environment variables set the options of a command and its subcommands.
 
     Parameters
     ----------
     command : click.Command
     path : tuple of str
-        Its name, after those of the groups it is in.
+        Names of the groups that contain the command, then its own name.
     """
     for option, parameter in _options(command).items():
         if parameter.envvar is None:
@@ -56,11 +56,11 @@ def add_variables(command: click.Command, path: tuple[str, ...]) -> None:
 
 
 def unknown_variables(group: click.Group, ctx: click.Context) -> Iterator[str]:
-    """Yield a line for each variable that begins like those of commands and is of none, with the one that may be meant.
+    """Yield a message for each ``ERTIS_`` variable that no command reads, with a suggestion.
 
-    Others' may begin so, too: those of a service in a cluster are named after it.
+    Other software may set such variables: a cluster names variables after its services.
     """
-    # Commands are imported only where a variable begins like one of theirs.
+    # A command is imported only if a variable begins with its prefix.
     commands = {variable((name,), ""): name for name in group.list_commands(ctx)}
     general = {variable((), option) for option in _GENERAL}
     for name in sorted(os.environ):
@@ -72,12 +72,12 @@ def unknown_variables(group: click.Group, ctx: click.Context) -> Iterator[str]:
         known = general | _NO_OPTIONS | set(_variables(command) if command else ())
         if name not in known:
             close = difflib.get_close_matches(name, sorted(known), n=1, cutoff=0.8)
-            meant = f"did you mean {close[0]!r}?" if close else "unset it if nobody needs it"
-            yield f"the variable {name} is known to no command; {meant}"
+            meant = f"did you mean {close[0]!r}?" if close else "unset it if no other program needs it"
+            yield f"no command reads the variable {name}; {meant}"
 
 
 def _variables(command: click.Command) -> Iterator[str]:
-    """Yield the variables of a command, and of those in it."""
+    """Yield the variables of a command and its subcommands."""
     for option in _options(command).values():
         yield from [option.envvar] if isinstance(option.envvar, str) else option.envvar or ()
     if isinstance(command, click.Group):
@@ -86,7 +86,7 @@ def _variables(command: click.Command) -> Iterator[str]:
 
 
 def _options(command: click.Command) -> dict[str, click.Option]:
-    """Return options by their long names without dashes."""
+    """Return the options of a command by long name without dashes."""
     return {
         long_name(parameter): parameter
         for parameter in command.params
@@ -95,12 +95,12 @@ def _options(command: click.Command) -> dict[str, click.Option]:
 
 
 def long_name(option: click.Option) -> str:
-    """Return the name of an option that says most, without dashes."""
+    """Return the longest name of an option, without dashes."""
     return max(option.opts, key=len).lstrip("-")
 
 
 def _load(ctx: click.Context, _: click.Parameter, path: Path | None) -> None:
-    """Take the defaults of all commands from a file; whoever needs them is told what is wrong with it."""
+    """Load the defaults of all commands from a file; `require_config` raises its errors later."""
     if path is not None:
         try:
             _take(ctx, path)
@@ -109,7 +109,7 @@ def _load(ctx: click.Context, _: click.Parameter, path: Path | None) -> None:
 
 
 def require_config(ctx: click.Context) -> str:
-    """Refuse to go on without the file of `config`; return what is wrong with it for commands that need none."""
+    """Raise the error of the configuration file; for commands that run without one, return its message."""
     error: click.ClickException | None = ctx.meta.get(_BROKEN)
     if error is None:
         return ""
@@ -129,13 +129,13 @@ def _take(ctx: click.Context, path: Path) -> None:
 
 
 def _defaults(ctx: click.Context, group: click.Group, tables: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Return the defaults of a group's commands, by the names that click has for their parameters."""
+    """Return the defaults of a group's commands by click's parameter names."""
     found: dict[str, Any] = {}
     names = group.list_commands(ctx)
     for name, table in tables.items():
         command = group.get_command(ctx, name)
         if command is None:
-            raise click.ClickException(f"{where}{name!r} is no command; {instead(name, names)}")
+            raise click.ClickException(f"{where}{name!r} is not a command; {instead(name, names)}")
         if not isinstance(table, dict):
             raise click.ClickException(f"{where}{name} is {table!r}; give a table of options, as in [{name}]")
         if isinstance(command, click.Group):
@@ -150,30 +150,30 @@ def _defaults(ctx: click.Context, group: click.Group, tables: Mapping[str, Any],
 
 
 def _value(value: Any) -> Any:
-    """Return a value as click wants it: what is no list is as it would be typed."""
+    """Return a value as click expects it: text as on the command line, a bool, or a list of these."""
     if isinstance(value, list):
         return [_value(each) for each in value]
     return value if isinstance(value, bool) else str(value)
 
 
 def instead(name: str, known: Iterable[str]) -> str:
-    """Return what a name that is not known may mean."""
+    """Return a suggestion for an unknown name: the closest known name, or all known names."""
     known = sorted(known)
     near = difflib.get_close_matches(name, known, n=1)
-    return f"did you mean {near[0]!r}?" if near else f"there are {', '.join(known)}"
+    return f"did you mean {near[0]!r}?" if near else f"choose one of {', '.join(known)}"
 
 
 def typed(name: str) -> bool:
-    """Return whether an option of the running command was typed, by its Python name.
+    """Return True if an option of the running command, given by its Python name, is on the command line.
 
-    A default of the user's own holds where it fits: whoever always wants two workers can still process one recording.
+    Options from variables or a file apply only where they fit: with two workers as default, one recording still works.
     """
     source = click.get_current_context().get_parameter_source(name)
     return source is click.core.ParameterSource.COMMANDLINE
 
 
 def origin(error: click.UsageError) -> str:
-    """Return where a value came from that is not on the command line; empty where it is."""
+    """Return the variable or file that set a value; empty for a value on the command line."""
     ctx, parameter = error.ctx, getattr(error, "param", None)
     if ctx is None or not isinstance(parameter, click.Option) or parameter.name is None:
         return ""
@@ -194,5 +194,5 @@ config = click.option(
     is_eager=True,
     expose_value=False,
     callback=_load,
-    help="Options of commands, in tables of their names; what is given, or in a variable, comes first.",
+    help="Default options, in one table per command; the command line and variables override them.",
 )

@@ -1,4 +1,4 @@
-"""``ertis completion``: commands and options at the press of a key."""
+"""``ertis completion``: shell completion of commands and options."""
 
 import click
 
@@ -9,10 +9,10 @@ __all__ = ["completion"]
 @click.argument("shell", type=click.Choice(["bash", "fish", "zsh"]))
 @click.pass_context
 def completion(ctx: click.Context, *, shell: str) -> None:
-    """Print what makes a shell complete commands and options.
+    """Print a script that completes commands and options in a shell.
 
-    For bash, add eval "$(ertis completion bash)" to ~/.bashrc; for zsh, its like to ~/.zshrc, after 'autoload -U
-    compinit; compinit'; for fish, save what is printed as ~/.config/fish/completions/ertis.fish.
+    For bash, add eval "$(ertis completion bash)" to ~/.bashrc. For zsh, add eval "$(ertis completion zsh)" to ~/.zshrc,
+    after 'autoload -U compinit; compinit'. For fish, save the output as ~/.config/fish/completions/ertis.fish.
     """
     from click.shell_completion import BashComplete, FishComplete, ZshComplete
 

@@ -1,4 +1,4 @@
-"""``ertis devices``: which sensors are plugged in."""
+"""``ertis devices``: list plugged-in and emulated sensors."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -17,16 +17,16 @@ _COLUMNS: dict[str, _tables.Side] = dict.fromkeys(
 
 
 @click.command()
-@click.option("--port", "-p", "names", multiple=True, metavar="PORT", help="Ask this one only; may be repeated.")
+@click.option("--port", "-p", "names", multiple=True, metavar="PORT", help="Query this port only; repeatable.")
 @options.as_json
 def devices(*, names: tuple[str, ...], as_json: bool) -> None:
-    """List the eRTIS devices that are plugged in or emulated.
+    """List plugged-in and emulated eRTIS devices.
 
-    Ports that may be one, which are those of USB CDC-ACM, are asked for their firmware and the hash of their call; one
-    that still measures for a program that has ended is stopped by that. Those that another program uses are listed, but
-    not asked. With --port any other serial port is asked, too, by its path, serial number or name.
+    The command queries USB CDC-ACM ports for their firmware and the hash of their call. This stops a device that still
+    measures for a program that has ended. Ports that another program uses are listed but not queried. With --port, the
+    command also queries any other serial port, given by its path, serial number or name.
 
-    The exit code is 0 even if there is none; with --port it is 1 unless all of them are an eRTIS or in use.
+    The exit code is 0 even if no device is found. With --port, it is 1 unless each port is an eRTIS or in use.
     """
     from ertis_numba.devices.ports import find_ports, resolve
     from ertis_numba.devices.survey import survey
@@ -42,7 +42,7 @@ def devices(*, names: tuple[str, ...], as_json: bool) -> None:
         if not names and answer.error is not None and answer.state != "in use":
             click.echo(str(answer.error), err=True)
     if not listed:
-        click.echo("no eRTIS was found; plug one in, or start an emulated one with 'ertis emulate'", err=True)
+        click.echo("no eRTIS found; plug one in, or start an emulated one with 'ertis emulate'", err=True)
     for answer in answers:
         if names and answer.error is not None and answer.state != "in use":
             raise answer.error

@@ -1,4 +1,4 @@
-"""``ertis example``: scenes, recordings and scripts to try."""
+"""``ertis example``: shipped scenes, recordings and scripts."""
 
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING
@@ -36,7 +36,7 @@ def _complete(ctx: click.Context, param: click.Parameter, incomplete: str) -> li
 def example(*, names: tuple[str, ...], folder: Path, force: bool, quiet: bool, as_json: bool) -> None:
     """List or copy shipped scenes, recordings and scripts.
 
-    NAME is the name of a file, or that name without its suffix: 'reflectors' copies the scene reflectors.toml and its
+    NAME is a file name, or a file name without its suffix: 'reflectors' copies the scene reflectors.toml and its
     recording reflectors.h5. A different file of the same name is overwritten only with --force.
     """
     if not names:
@@ -48,7 +48,7 @@ def example(*, names: tuple[str, ...], folder: Path, force: bool, quiet: bool, a
     for name in names:
         chosen |= _examples.named(name)
     contents = {folder / name: item.read_bytes() for name, item in chosen.items()}
-    # An existing copy stays, so that commands of pages that need the same file can be pasted one after the other.
+    # An existing copy stays, so that commands from several pages can be run one after the other.
     missing = {path: content for path, content in contents.items() if not _holds(path, content)}
     for path in missing:
         check_target(path, overwrite=force)

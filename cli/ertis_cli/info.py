@@ -1,4 +1,4 @@
-"""``ertis info``: what a file holds."""
+"""``ertis info``: contents of a file."""
 
 import re
 from collections.abc import Iterator
@@ -18,8 +18,8 @@ __all__ = ["info"]
 
 _TIME = re.compile(r"(\d{4}-\d\d-\d\d)T(\d\d:\d\d:\d\d)(\.\d+)?(?:Z|\+00:00)")
 _LOOKED_AT = 8
-_WIDTH = 7  # at least
-_COLUMNS = {  # name: digits, of the report and of the table
+_WIDTH = 7  # minimum width of a column
+_COLUMNS = {  # name: digits in the report, and in the table
     "offset": (6, 4),
     "changes": (6, 3),
     "overload": (6, 4),
@@ -32,16 +32,18 @@ _COLUMNS = {  # name: digits, of the report and of the table
 
 @click.command()
 @options.input_file("FILE")
-@click.option("--health", "of_health", is_flag=True, help="The state of the microphones of a recording instead.")
+@click.option(
+    "--health", "of_health", is_flag=True, help="Show array health, the state of each microphone of a recording."
+)
 @options.as_json
 def info(*, path: Path, of_health: bool, as_json: bool) -> None:
-    """Say what a recording or an energyscape file holds.
+    """Show the contents of a recording or an energyscape file.
 
-    In JSON, "sensors" lists what each sensor has; if there is one only, the same also stands beside
-    what is said of the file.
+    In JSON, "sensors" lists the properties of each sensor. If there is only one sensor, the top level repeats its
+    properties.
 
-    With --health, say of each microphone of a recording whether it is ok, dead, stuck, saturated, or has an offset or
-    an idle tone. At most 8 measurements are looked at, evenly spaced. The exit code is 0 whatever is found.
+    With --health, show the state of each microphone of a recording: ok, dead, stuck, saturated, or with an offset or an
+    idle tone. At most 8 measurements, evenly spaced, are examined. The exit code is 0 even if faults are found.
     """
     if of_health:
         _report_health(path, as_json=as_json)
@@ -75,7 +77,7 @@ def info(*, path: Path, of_health: bool, as_json: bool) -> None:
 
 
 def _label(name: str) -> tuple[str, str]:
-    """Return a key in words, and its unit after a space."""
+    """Return a key as a label, and its unit after a space."""
     from ertis_numba.units import unit_of
 
     suffix, unit = unit_of(name)
@@ -165,7 +167,7 @@ def _mounting(reader: "RecordingReader | EnergyscapeReader") -> dict[str, Any]:
 
 
 def _error(reader: "EnergyscapeReader") -> dict[str, Any]:
-    """Return the predicted error and the budget, where a file has them."""
+    """Return the predicted error and the error budget, if the file contains them."""
     if reader.predicted_error_db is None:
         return {}
     texts = {name: getattr(reader, name) for name in ("budget_applies_to", "error_warning")}
@@ -223,7 +225,7 @@ def _health(report: "Health") -> dict[str, Any]:
 
 
 def _health_lines(section: dict[str, Any]) -> Iterator[str]:
-    """Yield what is known of an array."""
+    """Yield the properties of an array."""
     yield f"sensor         {section['sensor']}"
     yield f"measurements   {section['measurements']}, of which {section['looked_at']} looked at"
     yield f"noise          {_cell(section['noise_dbfs'], 1)} dBFS in the call's band"

@@ -1,4 +1,4 @@
-"""``ertis keys``: who is who, and who may do what."""
+"""``ertis keys``: keys of nodes, and the list of allowed keys."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,16 +14,16 @@ __all__ = ["keys"]
 
 _FILE = click.Path(path_type=Path)
 _list_file = click.option(
-    "--list", "listed", type=_FILE, metavar="FILE", help="The list; allow.toml beside the keys by default."
+    "--list", "listed", type=_FILE, metavar="FILE", help="List of allowed keys; allow.toml beside the keys by default."
 )
 
 
 @click.group()
 def keys() -> None:
-    """Make keys, and say who may do what.
+    """Create keys and manage the list of allowed keys.
 
-    Each machine makes keys of its own by 'ertis keys new'. Its public file goes to the central node, where 'ertis keys
-    allow' lists it, and the public file of the central node goes to each machine (--server-key).
+    Create keys on each machine with 'ertis keys new'. Copy the public file of a machine to the central node, and add it
+    to the list with 'ertis keys allow'. Copy the public file of the central node to each machine (--server-key).
 
     \b
     central$  ertis keys new central
@@ -36,10 +36,16 @@ def keys() -> None:
 
 @keys.command()
 @click.argument("name")
-@click.option("--dir", "folder", type=_FILE, metavar="DIR", help="Folder for them; that of this user by default.")
+@click.option(
+    "--dir",
+    "folder",
+    type=_FILE,
+    metavar="DIR",
+    help="Folder for the key files; the key folder of this user by default.",
+)
 @options.as_json
 def new(*, name: str, folder: Path | None, as_json: bool) -> None:
-    """Make keys: NAME.secret.toml, which stays where it is, and NAME.public.toml for others."""
+    """Create a key pair: NAME.secret.toml, to keep, and NAME.public.toml, to give to others."""
     from ertis_numba.network.keys import KeyPair, default_folder
 
     pair = KeyPair.new(name)
@@ -49,8 +55,8 @@ def new(*, name: str, folder: Path | None, as_json: bool) -> None:
             {"name": name, "public": pair.public, "secret_file": str(secret), "public_file": str(public)}
         )
         return
-    click.echo(f"{secret}: keep it, and nobody else may read it")
-    click.echo(f"{public}: for the other side, {pair.public}")
+    click.echo(f"{secret}: secret key; keep it, and let nobody else read it")
+    click.echo(f"{public}: public key for the other side, {pair.public}")
 
 
 @keys.command()
@@ -59,22 +65,24 @@ def new(*, name: str, folder: Path | None, as_json: bool) -> None:
     "--role",
     required=True,
     type=click.Choice(["sensor", "application", "admin"]),
-    help="A sensor sends, an application receives, an admin may do both.",
+    help="A sensor may send, an application may receive, and an admin may do both.",
 )
-@click.option("--serial", "serials", multiple=True, metavar="S", help="Of a sensor that it may send for; repeatable.")
-@click.option("--name", metavar="NAME", help="In the list; that of the file by default.")
+@click.option(
+    "--serial", "serials", multiple=True, metavar="S", help="Name of a sensor that the key may send for; repeatable."
+)
+@click.option("--name", metavar="NAME", help="Name in the list; the name in the file by default.")
 @_list_file
 @options.as_json
 def allow(
     *, key: str, role: str, serials: tuple[str, ...], name: str | None, listed: Path | None, as_json: bool
 ) -> None:
-    """Let a key in, from the next second on; what it was allowed before is replaced."""
+    """Allow a key within a second; earlier permissions of the key are replaced."""
     from ertis_numba.network.allow_list import ROLES, AllowList, Permission
     from ertis_numba.network.keys import public_key
 
     public, named = public_key(key)
     if not (name or named):
-        raise click.UsageError("a key that is not given by its file has no name; give --name")
+        raise click.UsageError("a key that is not given as a file has no name; add --name")
     (chosen,) = (known for known in ROLES if known == role)
     permission = Permission(name=name or named, public=public, role=chosen, serials=serials)
     path = _path(listed)
@@ -88,7 +96,7 @@ def allow(
 @_list_file
 @options.as_json
 def remove(*, who: str, listed: Path | None, as_json: bool) -> None:
-    """Let a key in no more, from the next second on, connected or not."""
+    """Remove a key from the list; it is refused within a second, even if connected."""
     from ertis_numba.network.allow_list import AllowList
 
     path = _path(listed)
@@ -97,14 +105,14 @@ def remove(*, who: str, listed: Path | None, as_json: bool) -> None:
     if as_json:
         options.print_json({"list": str(path), "removed": [_report(permission) for permission in removed]})
         return
-    click.echo(f"{path}: without {', '.join(permission.name for permission in removed)}")
+    click.echo(f"{path}: removed {', '.join(permission.name for permission in removed)}")
 
 
 @keys.command("list")
 @_list_file
 @options.as_json
 def list_(*, listed: Path | None, as_json: bool) -> None:
-    """Show who is let in, and as what."""
+    """List the allowed keys and their roles."""
     from ertis_numba.network.allow_list import AllowList
 
     path = _path(listed)
@@ -127,7 +135,7 @@ def _print(path: Path, permissions: "list[Permission]", *, as_json: bool) -> Non
         options.print_json({"list": str(path), "keys": [_report(permission) for permission in permissions]})
         return
     if not permissions:
-        click.echo(f"{path}: nobody is let in; list keys by 'ertis keys allow'", err=True)
+        click.echo(f"{path}: no key is allowed; add keys with 'ertis keys allow'", err=True)
     widest = max((len(permission.name) for permission in permissions), default=0)
     for each in permissions:
         click.echo(f"{each.name:{widest}}  {each.role:11}  {each.public}  {' '.join(each.serials)}".rstrip())

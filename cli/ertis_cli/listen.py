@@ -1,4 +1,4 @@
-"""``ertis listen``: what a central node publishes, shown or saved."""
+"""``ertis listen``: show or save the products that a central node publishes."""
 
 import importlib
 import math
@@ -28,24 +28,36 @@ _LOOK_S = 0.1
 
 @click.command()
 @click.argument("address", metavar="ADDRESS")
-@click.option("--sensor", "sensors", multiple=True, metavar="NAME", help="Of these only; of all by default.")
+@click.option(
+    "--sensor",
+    "sensors",
+    multiple=True,
+    metavar="NAME",
+    help="Receive products of this sensor only; repeatable; all sensors by default.",
+)
 @click.option(
     "--product",
     "products",
     multiple=True,
     type=click.Choice(_PRODUCTS),
-    help="What to receive; energyscape by default.",
+    help="Product to receive; repeatable; energyscape by default.",
 )
-@click.option("-n", "--count", "n", type=click.IntRange(min=1), metavar="N", help="End after so many.")
-@click.option("--duration", type=float, metavar="S", help="Seconds; until Ctrl-C by default.")
 @click.option(
-    "--save", "target", type=click.Path(path_type=Path), metavar="FILE.h5", help="Write energyscapes, or a recording."
+    "-n", "--count", "n", type=click.IntRange(min=1), metavar="N", help="Number of products to receive before ending."
+)
+@click.option("--duration", type=float, metavar="S", help="Duration; until Ctrl-C by default.")
+@click.option(
+    "--save",
+    "target",
+    type=click.Path(path_type=Path),
+    metavar="FILE.h5",
+    help="Energyscape file or, with --product raw, recording to write.",
 )
 @_network.key
 @_network.server_key
 @options.force
 @options.quiet
-@options.as_json_of("one object a line for each event, the last when it ends")
+@options.as_json_of("one object per line for each event; the last one is a summary")
 def listen(
     *,
     address: str,
@@ -60,20 +72,21 @@ def listen(
     quiet: bool,
     as_json: bool,
 ) -> None:
-    """Show or save what a central node publishes at ADDRESS.
+    """Show or save the products that a central node publishes.
 
-    There is a line for each product, with its nearest reflector, how long ago the sound was emitted and how long the
-    central node had it. What this is too slow for is dropped there and counted. With --save, the energyscapes, or
-    with --product raw the measurements, become a file that appears complete at the end. A central node that goes
-    away is waited for. With --json there is a line for each event, the first when it is connected.
+    ADDRESS is the address at which the central node publishes. The command prints one line per product: the nearest
+    reflector, the time since the emission, and the time spent in the central node. The central node drops and
+    counts products that this command receives too slowly. With --save, the energyscapes, or with --product raw the
+    measurements, are saved to a file that appears complete at the end. If the central node disappears, the command
+    waits for it. With --json, there is one line per event; the first one reports the connection.
     """
     products = tuple(dict.fromkeys(products)) or ("energyscape",)
     if target is not None and (len(products) > 1 or products[0] not in FILED):
-        raise click.UsageError(f"--save makes a file of one product; give --product {' or '.join(FILED)} alone")
+        raise click.UsageError(f"--save writes one product; give only --product {' or '.join(FILED)}")
     _network.require_duration(duration)
     from ertis_numba.network.subscriber import Subscriber
 
-    if "energyscape" in products:  # takes half a second, in which the first images would be dropped
+    if "energyscape" in products:  # import now: it takes half a second, in which the first images would be dropped
         importlib.import_module("ertis_numba.analysis.points")
     keys = _network.client_keys(key, server_key)
     notes: deque[str] = deque()
@@ -105,11 +118,13 @@ def listen(
     if signals.came:
         sys.exit(0 if n is None and duration is None else 128 + signals.came[0])
     if n is not None and subscriber.counts.received < n:
-        raise click.ClickException(f"{subscriber.counts.received} of {n} came in {duration:g} s; give it more time")
+        raise click.ClickException(
+            f"received {subscriber.counts.received} of {n} products in {duration:g} s; give a longer --duration"
+        )
 
 
 def _saved(save: "Write", arrival: "Arrival") -> Exception | None:
-    """Save a product; return why it does not fit to those before, which are kept."""
+    """Save a product; return the error if it does not match earlier products, which are kept."""
     from ertis_numba.errors import ArgumentError
 
     try:

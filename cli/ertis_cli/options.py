@@ -1,4 +1,4 @@
-"""Options and reports that several commands share."""
+"""Options, parameter types and output functions shared by several commands."""
 
 import json
 import sys
@@ -53,7 +53,7 @@ __all__ = [
     "threads",
 ]
 
-_MAX_DEG = 90.0  # of azimuth and elevation, before an array
+_MAX_DEG = 90.0  # limit of azimuth and elevation in front of an array
 Item = TypeVar("Item")
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
@@ -66,7 +66,7 @@ class _Interval(click.ParamType):  # type: ignore[type-arg]  # generic since cli
         if colon:
             with suppress(ValueError):
                 return float(first), float(last)
-        return self.fail(f"{value!r} is no interval, give two numbers as in 0.5:5", param, ctx)
+        return self.fail(f"{value!r} is not an interval; give two numbers, as in 0.5:5", param, ctx)
 
 
 class _Channels(click.ParamType):  # type: ignore[type-arg]  # as above
@@ -75,7 +75,7 @@ class _Channels(click.ParamType):  # type: ignore[type-arg]  # as above
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, ...]:
         with suppress(ValueError):
             return tuple(int(channel) for channel in str(value).split(","))
-        return self.fail(f"{value!r} is not a list of channels; give whole numbers as in 5,12", param, ctx)
+        return self.fail(f"{value!r} is not a list of channels; give integers, as in 5,12", param, ctx)
 
 
 class _Direction(click.ParamType):  # type: ignore[type-arg]  # as above
@@ -89,7 +89,7 @@ class _Direction(click.ParamType):  # type: ignore[type-arg]  # as above
                 if all(-_MAX_DEG <= angle_deg <= _MAX_DEG for angle_deg in angles_deg):
                     return angles_deg
         wanted = f"azimuth and elevation, each from -{_MAX_DEG:g} to {_MAX_DEG:g}, as in 30:0"
-        return self.fail(f"{value!r} is no direction, give {wanted}", param, ctx)
+        return self.fail(f"{value!r} is not a direction; give {wanted}", param, ctx)
 
 
 class _ErrorBudget(click.ParamType):  # type: ignore[type-arg]  # as above
@@ -102,7 +102,9 @@ class _ErrorBudget(click.ParamType):  # type: ignore[type-arg]  # as above
             return ERROR_PRESETS_DB[value]
         with suppress(ValueError):
             return float(value)
-        return self.fail(f"{value!r} is no error, give dB as in -40, or {', '.join(ERROR_PRESETS_DB)}", param, ctx)
+        return self.fail(
+            f"{value!r} is not an error budget; give dB, as in -40, or {', '.join(ERROR_PRESETS_DB)}", param, ctx
+        )
 
 
 CHANNELS = _Channels()
@@ -110,41 +112,41 @@ DIRECTION = _Direction()
 ERROR_BUDGET = _ErrorBudget()
 INTERVAL = _Interval()
 FALSE_ALARM = 1e-3
-"""Probability that noise alone gives a reflector in an image that a command shows."""
+"""Probability that noise alone causes a reflector in one image."""
 PREPARING = "preparing ..."
-"""Note on a slow start."""
+"""Message for a slow start."""
 COMPILING = "a first run compiles kernels, which takes longer ..."
-"""Note on a start that is slow because kernels are compiled."""
+"""Message for a start that compiles kernels."""
 _FILE = click.Path(path_type=Path)
 
 
 def as_json_of(what: str) -> Decorator:
-    """Return the option that prints JSON instead of text, and says what there is an object of."""
+    """Return the option that prints JSON instead of text; its help states the objects that are printed."""
     return click.option("--json", "as_json", is_flag=True, help=f"Print JSON on stdout: {what}.")
 
 
-as_json: Decorator = as_json_of("one object, or one a line where there are several")
+as_json: Decorator = as_json_of("one object, or one per line if there are several")
 device: Decorator = click.option(
     "--device",
     type=click.Choice(["auto", "cpu", "cuda", "numpy"]),
     default="auto",
     show_default=True,
-    help="What computes; auto is cuda, an NVIDIA GPU, where there is one; numpy runs without compiled kernels.",
+    help="Device to compute on; auto chooses cuda (an NVIDIA GPU) if there is one; numpy needs no compiled kernels.",
 )
-force: Decorator = click.option("--force", is_flag=True, help="Overwrite the output.")
+force: Decorator = click.option("--force", is_flag=True, help="Overwrite existing output.")
 quiet: Decorator = click.option(
-    "--quiet", "-q", is_flag=True, help="No progress, no summary; warnings and errors only."
+    "--quiet", "-q", is_flag=True, help="Print warnings and errors only, no progress or summary."
 )
-threads: Decorator = click.option("--threads", type=int, metavar="N", help="Threads; all cores by default.")
+threads: Decorator = click.option("--threads", type=int, metavar="N", help="Number of threads; all cores by default.")
 
 
 def input_file(metavar: str) -> Decorator:
-    """Return the argument that names the file to read."""
+    """Return the argument for the input file."""
     return click.argument("path", metavar=metavar, type=_FILE)
 
 
 def output(text: str) -> Decorator:
-    """Return the option that names the file to write."""
+    """Return the option for the output file."""
     return click.option("--output", "-o", "target", type=_FILE, metavar="FILE", help=text)
 
 
@@ -154,7 +156,7 @@ def measurement(text: str) -> Decorator:
 
 
 def min_level(text: str) -> Decorator:
-    """Return the option that says what is too weak."""
+    """Return the option for the lowest level that is kept, relative to the strongest."""
     return click.option("--min-level", type=float, default=-30.0, show_default=True, metavar="DB", help=text)
 
 
@@ -164,7 +166,7 @@ def sensor(text: str) -> Decorator:
 
 
 def sensors_of(path: Path, sensor: str | None) -> tuple[str, ...]:
-    """Return the sensor that was chosen, or all of a file."""
+    """Return the chosen sensor, or all sensors of a file."""
     from ertis_numba.storage import sensor_names
 
     return sensor_names(path) if sensor is None else (sensor,)
@@ -173,7 +175,7 @@ def sensors_of(path: Path, sensor: str | None) -> tuple[str, ...]:
 def comparisons(
     path: Path, sensor: str, min_level_db: float, *, measurement: int | None = None
 ) -> "Iterator[tuple[int, Comparison]]":
-    """Yield the number of each measurement, or of one, and how its energyscape compares with the truth."""
+    """Yield the index of each measurement, or of one, and the comparison of its energyscape with the ground truth."""
     from ertis_numba.analysis.compare import compare
     from ertis_numba.errors import DataError
     from ertis_numba.storage import open_energyscapes
@@ -181,19 +183,19 @@ def comparisons(
     with open_energyscapes(path, sensor=sensor) as images:
         if images.truth is None:
             raise DataError(
-                f"{path}: sensor {sensor} holds no truth; simulate a scene to get one, and process that recording"
+                f"{path}: sensor {sensor} holds no ground truth; simulate a scene and process that recording"
             )
         for index in places(measurement, len(images)):
             yield index, compare(images[index], images.truth.reflectors[index], min_level_db=min_level_db)
 
 
 def places(index: int | None, count: int) -> Sequence[int]:
-    """Return the place of a measurement in a file of ``count``, or all places where none is chosen."""
+    """Return the index of the chosen measurement of ``count``, or all indices if none is chosen."""
     return range(count) if index is None else [place(index, count)]
 
 
 def place(index: int, count: int) -> int:
-    """Return the place of a measurement in a file of ``count``, or refuse it."""
+    """Return the index of a measurement of ``count``; raise ArgumentError if it is outside the file."""
     from ertis_numba import checks
 
     return checks.integer("--measurement", index, 0, count - 1)
@@ -209,9 +211,8 @@ def settings_with(
 ) -> "Settings":
     """Return the settings of a recording, changed by a settings file and then by options.
 
-    A settings file changes the keys that it holds; a layout or positions replace the array as a whole. ``without`` adds
-    channels to those that are left out. Other options are named like the fields of `Processing`; those that are None
-    change nothing.
+    A settings file changes the keys that it contains; a layout or positions replace the whole array. ``without``
+    disables further channels. Other options are named like the fields of `Processing`; None changes nothing.
     """
     settings = recorded if settings_file is None else recorded.updated_from_file(settings_file)
     if without is not None:
@@ -222,17 +223,18 @@ def settings_with(
     limits = {"azimuth_limits_deg", "elevation_limits_deg"} & given.keys()
     if limits and not isinstance(directions, str):
         raise click.UsageError(
-            f"directions are a list of {len(directions)}; give --directions 2d:N or 3d:N with limits",
+            f"limits need a grid, but directions is a list of {len(directions)}; add --directions 2d:N or 3d:N",
             ctx=click.get_current_context(),
         )
     kind = str(directions).partition(":")[0]
     if kind == "2d" and "elevation_limits_deg" in limits:
         raise click.UsageError(
-            f"directions {directions} lie at elevation 0; give 3d:N with --elevation", ctx=click.get_current_context()
+            f"directions {directions} lie at elevation 0; give --directions 3d:N with --elevation",
+            ctx=click.get_current_context(),
         )
     if limits and kind not in {"2d", "3d"}:
         raise click.UsageError(
-            f"directions {directions} have limits of their own; give 2d:N or 3d:N with limits",
+            f"directions {directions} have fixed limits; give --directions 2d:N or 3d:N with limits",
             ctx=click.get_current_context(),
         )
     settings = settings.replace(processing=settings.processing.replace(**given))
@@ -242,7 +244,7 @@ def settings_with(
 
 
 def pipeline(settings: "Settings", *, quiet: bool, device: str = "auto", threads: int | None = None) -> "Pipeline":
-    """Return a pipeline, and tell who waits for it why."""
+    """Return a pipeline, and print a message if its start is slow."""
     with note_when_slow(PREPARING, quiet=quiet):
         from ertis_numba.pipeline import Pipeline
 
@@ -250,14 +252,14 @@ def pipeline(settings: "Settings", *, quiet: bool, device: str = "auto", threads
 
 
 def complete_presets(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:  # noqa: ARG001
-    """Return the presets that a shell may complete."""
+    """Return the preset names that complete a text in a shell."""
     from ertis_numba.settings import PRESETS
 
     return [name for name in PRESETS if name.startswith(incomplete)]
 
 
 def complete_layouts(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:  # noqa: ARG001
-    """Return the layouts that a shell may complete, and where none is, files."""
+    """Return the layout names that complete a text in a shell, or files if no name does."""
     from ertis_numba.geometry import layout_names
 
     names = [CompletionItem(name) for name in layout_names() if name.startswith(incomplete)]
@@ -265,34 +267,36 @@ def complete_layouts(ctx: click.Context, param: click.Parameter, incomplete: str
 
 
 def note_unlisted_directions(path: Path, sensors: Sequence[str]) -> None:
-    """Say which sensors of an energyscape file have one microphone, and so tell ranges only."""
+    """Print a note for each sensor with a single microphone, whose images have no directions."""
     from ertis_numba.geometry import microphones
     from ertis_numba.storage import open_energyscapes
 
     for name in sensors:
         with open_energyscapes(path, sensor=name) as images:
             if microphones(images.settings.array).enabled.sum() == 1:
-                click.echo(f"note: sensor {name} has one microphone, which tells ranges but no directions", err=True)
+                click.echo(
+                    f"note: sensor {name} has one microphone; its images show ranges but no directions", err=True
+                )
 
 
 def say(text: str, *, quiet: bool) -> None:
-    """Print a line for the user, who may not want it."""
+    """Print a line on stderr, unless ``quiet``."""
     if not quiet:
         click.echo(text, err=True)
 
 
 def counted(count: int, noun: str) -> str:
-    """Return a number of things in words."""
+    """Return a count and its noun, in the plural unless the count is 1."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
 def print_json(report: dict[str, Any]) -> None:
-    """Print one object on stdout."""
+    """Print one JSON object as a line on stdout."""
     click.echo(json.dumps(report, indent=None, allow_nan=False))
 
 
 def progress(items: Iterable[Item], *, length: int, label: str, quiet: bool) -> AbstractContextManager[Iterable[Item]]:
-    """Return ``items`` under a progress bar on stderr, which is hidden where nobody looks."""
+    """Return ``items`` under a progress bar on stderr; no bar is drawn if ``quiet`` or off a terminal."""
     if quiet or not _progress.is_drawn_on(sys.stderr):
         return nullcontext(items)
     return _progress.bar(items, length=length, label=label)
@@ -302,7 +306,7 @@ def progress(items: Iterable[Item], *, length: int, label: str, quiet: bool) -> 
 def note_when_slow(text: str, *, quiet: bool, after_s: float = 1.0) -> Iterator[threading.Timer]:
     """Print ``text`` if the block takes longer than ``after_s``; yield the timer.
 
-    If kernels are compiled in the block, print that once in a command.
+    If the block compiles kernels, print a message, once per command.
     """
     from ertis_numba.kernels import on_compiling
 

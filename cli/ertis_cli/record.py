@@ -1,4 +1,4 @@
-"""``ertis record``: the central node that stores what sensors send."""
+"""``ertis record``: run a central node that stores measurements."""
 
 from pathlib import Path
 
@@ -13,17 +13,17 @@ _FILE = click.Path(path_type=Path)
 
 
 @click.command()
-@click.option("--listen", metavar="ADDRESS", help="Where sensor nodes come; tcp://127.0.0.1:5601 by default.")
+@click.option("--listen", metavar="ADDRESS", help="Address for sensor nodes; tcp://127.0.0.1:5601 by default.")
 @click.option("--output", "-o", "folder", type=_FILE, required=True, metavar="DIR", help="Folder for recordings.")
 @_central_watch.name
 @_central_watch.rotate_size
 @_central_watch.rotate_every
 @_central_watch.max_bytes
-@click.option("--duration", type=float, metavar="S", help="Seconds; until Ctrl-C by default.")
+@click.option("--duration", type=float, metavar="S", help="Duration; until Ctrl-C by default.")
 @_network.key
 @_network.allow
-@click.option("--metrics", metavar="HOST:PORT", help="Serve metrics for Prometheus there.")
-@click.option("--every", is_flag=True, help="With --json: a line for each measurement, too.")
+@click.option("--metrics", metavar="HOST:PORT", help="Serve Prometheus metrics at this address.")
+@click.option("--every", is_flag=True, help="With --json: also print a line for each measurement.")
 @options.quiet
 @options.as_json
 def record(
@@ -42,11 +42,12 @@ def record(
     quiet: bool,
     as_json: bool,
 ) -> None:
-    """Be the central node that stores what sensors send.
+    """Run a central node that stores measurements.
 
-    Sensors send to it by 'ertis capture --to ADDRESS'. What it acknowledges is durable, in a journal in DIR;
-    recordings appear there complete, one after the other, and at the end. What a crash leaves is made a recording when
-    it is started again, or by 'ertis recover'. Ctrl-C ends it; with --json there is a line for each event.
+    Sensors send to it with 'ertis capture --to ADDRESS'. The central node acknowledges a measurement once a journal in
+    DIR contains it durably. Complete recordings appear in DIR one after the other, the last one at the end. After a
+    crash, the next start or 'ertis recover' seals the journals. Ctrl-C ends the node. With --json, there is one line
+    per event.
     """
     life = _supervisor.supervised()
     from ertis_numba.network.addresses import DEFAULT_LISTEN

@@ -1,4 +1,4 @@
-"""``ertis recover``: recordings from what an interrupted capture left."""
+"""``ertis recover``: recover recordings from journals of interrupted captures."""
 
 from dataclasses import asdict
 from itertools import islice
@@ -60,7 +60,7 @@ def _found(place: Path) -> list[Path]:
 
 
 def _seal(journal: Path, *, force: bool, quiet: bool) -> dict[str, Any]:
-    """Seal a journal and return what became of it, as it is printed."""
+    """Seal a journal and return a report of the result."""
     from ertis_numba.errors import DataError, JournalInUseError
     from ertis_numba.journal import seal_apart
 
@@ -94,7 +94,7 @@ def _refusal(report: dict[str, Any]) -> str:
 
 
 def _reported(report: dict[str, Any]) -> str:
-    """Return what became of a journal, in a line."""
+    """Return a line that describes the result for a journal."""
     if "error" in report:
         return f"{report['journal']}: in use by a running capture; left alone"
     if report["recording"] is None and report["refused"]:

@@ -1,4 +1,4 @@
-"""``ertis serve``: the central node that makes images of what sensors send."""
+"""``ertis serve``: run a central node that computes and publishes images."""
 
 from pathlib import Path
 from typing import Any, Literal
@@ -14,29 +14,31 @@ _FOLDER = click.Path(path_type=Path)
 
 
 @click.command()
-@click.option("--listen", metavar="ADDRESS", help="Where sensor nodes come; tcp://127.0.0.1:5601 by default.")
-@click.option("--publish", metavar="ADDRESS", help="Where applications come; tcp://127.0.0.1:5602 by default.")
-@click.option("--record", "folder", type=_FOLDER, metavar="DIR", help="Store measurements there as well.")
+@click.option("--listen", metavar="ADDRESS", help="Address for sensor nodes; tcp://127.0.0.1:5601 by default.")
+@click.option("--publish", metavar="ADDRESS", help="Address for applications; tcp://127.0.0.1:5602 by default.")
+@click.option("--record", "folder", type=_FOLDER, metavar="DIR", help="Also store measurements in this folder.")
 @_central_watch.name
 @_central_watch.rotate_size
 @_central_watch.rotate_every
 @_central_watch.max_bytes
-@click.option("--workers", type=click.IntRange(1, 256), metavar="N", help="Processes; as many as cores by default.")
+@click.option(
+    "--workers", type=click.IntRange(1, 256), metavar="N", help="Number of worker processes; one per core by default."
+)
 @options.threads
-@click.option("--directions", metavar="GRID", help="90, 1850, 3000, 2d:N or 3d:N; the sensor's own by default.")
+@click.option("--directions", metavar="GRID", help="90, 1850, 3000, 2d:N or 3d:N; the sensor's own grid by default.")
 @click.option("--range", "range_m", type=options.INTERVAL, help="First and last range in m.")
-@click.option("--method", type=click.Choice(["fast", "paper"]), help="The sensor's own choice by default.")
+@click.option("--method", type=click.Choice(["fast", "paper"]), help="Processing method; the sensor's own by default.")
 @click.option(
     "--beamformer",
     type=click.Choice(["delay_and_sum", "coherence_factor", "dmas", "capon"]),
-    help="How microphones are combined; the sensor's own choice by default.",
+    help="Beamformer; the sensor's own by default.",
 )
 @click.option(
     "--max-error",
     "max_error_db",
     type=options.ERROR_BUDGET,
     metavar="DB|PRESET",
-    help="Error that images may have, as in -40, or draft, standard, fine, exact; the sensor's own by default.",
+    help="Error budget of images, as in -40, or draft, standard, fine, exact; the sensor's own by default.",
 )
 @options.device
 @click.option(
@@ -44,18 +46,25 @@ _FOLDER = click.Path(path_type=Path)
     type=click.Choice(["float32", "float16"]),
     default="float32",
     show_default=True,
-    help="Of the images that are sent; float16 halves them.",
+    help="Data type of published images; float16 halves their size.",
 )
 @click.option(
-    "--deadline", type=float, default=2.0, show_default=True, metavar="S", help="A worker that takes longer is killed."
+    "--deadline",
+    type=float,
+    default=2.0,
+    show_default=True,
+    metavar="S",
+    help="Time limit per measurement; a slower worker is killed.",
 )
-@click.option("--quarantine", type=_FOLDER, metavar="DIR", help="Keep measurements there that two workers failed at.")
-@click.option("--scheduler", metavar="ADDRESS", help="Use the workers of a dask.distributed cluster.")
-@click.option("--duration", type=float, metavar="S", help="Seconds; until Ctrl-C by default.")
+@click.option(
+    "--quarantine", type=_FOLDER, metavar="DIR", help="Dead-letter folder for measurements that made two workers fail."
+)
+@click.option("--scheduler", metavar="ADDRESS", help="Scheduler of a dask.distributed cluster whose workers to use.")
+@click.option("--duration", type=float, metavar="S", help="Duration; until Ctrl-C by default.")
 @_network.key
 @_network.allow
-@click.option("--metrics", metavar="HOST:PORT", help="Serve metrics for Prometheus there.")
-@click.option("--every", is_flag=True, help="With --json and --record: a line for each measurement, too.")
+@click.option("--metrics", metavar="HOST:PORT", help="Serve Prometheus metrics at this address.")
+@click.option("--every", is_flag=True, help="With --json and --record: also print a line for each measurement.")
 @options.quiet
 @options.as_json
 def serve(
@@ -87,11 +96,12 @@ def serve(
     quiet: bool,
     as_json: bool,
 ) -> None:
-    """Be the central node that makes images of what sensors send.
+    """Run a central node that computes and publishes images.
 
-    Sensors send to it by 'ertis capture --to ADDRESS'; 'ertis listen ADDRESS' shows what it publishes. Where images
-    take longer than measurements to come, the oldest are dropped and counted. With --record, what is acknowledged is
-    durable, as 'ertis record' has it. Ctrl-C ends it; with --json there is a line for each event.
+    Sensors send to it with 'ertis capture --to ADDRESS', and 'ertis listen ADDRESS' shows the published products. If
+    measurements arrive faster than images can be computed, the oldest are dropped and counted. With --record, the node
+    acknowledges a measurement once it is durable, like 'ertis record'. Ctrl-C ends the node. With --json, there is
+    one line per event.
     """
     life = _supervisor.supervised()
     from ertis_numba.network.addresses import DEFAULT_LISTEN, DEFAULT_PUBLISH, at_port
@@ -119,7 +129,9 @@ def serve(
                 deadline_s=deadline,
                 dtype=dtype,
                 quarantine=quarantine,
-                expected=Settings.from_preset("default_25_50"),  # most sensors: images begin with their first
+                expected=Settings.from_preset(
+                    "default_25_50"
+                ),  # most sensors use it; kernels are then ready for their first measurement
                 cluster=scheduler,
             )
         )

@@ -1,4 +1,4 @@
-"""``ertis view``: what sensors see, live or of a file, on a page in the browser."""
+"""``ertis view``: live or recorded images on a page in the browser."""
 
 import gc
 import math
@@ -26,11 +26,11 @@ if TYPE_CHECKING:
 __all__ = ["view"]
 
 _COLOURS = ("inferno", "viridis", "cividis", "magma")
-_LIVE, _PLAYBACK, _PAGE = "an address", "a file that is shown", "a file that --save-html writes as a page"
+_LIVE, _PLAYBACK, _PAGE = "an address", "playback of a file", "a file that --save-html writes as a page"
 _HOST_PORT = re.compile(r"(tcp:)?([^/\\]+:\d{1,5})")
 _PAGES = (".html", ".htm")
 _TWICE_S = 0.5  # between two signals of which the second is not an echo of the first
-_ENDING = "ending when the image at hand is made; Ctrl-C ends at once ..."
+_ENDING = "ending after the current image; press Ctrl-C to end at once ..."
 _ONLY = {
     "host": (_LIVE, _PLAYBACK),
     "port": (_LIVE, _PLAYBACK),
@@ -41,40 +41,61 @@ _ONLY = {
     "server_key": (_LIVE,),
     "device": (_PLAYBACK, _PAGE),
 }
-"""Options that not all have use for, and who has."""
+"""Kinds of views that each of these options is for."""
 
 
 @click.command()
 @click.argument("what", metavar="ADDRESS|REC.h5|IMG.h5")
-@click.option("--sensor", "sensors", multiple=True, metavar="NAME", help="Of these only; of all by default.")
+@click.option(
+    "--sensor",
+    "sensors",
+    multiple=True,
+    metavar="NAME",
+    help="Show this sensor only; repeatable; all sensors by default.",
+)
 @click.option(
     "--host",
     default="127.0.0.1",
     show_default=True,
     help="Host at which to serve the page. If other machines can reach it, the printed address has a token.",
 )
-@click.option("--port", type=click.IntRange(0, 65_535), default=8080, show_default=True, help="0 for any that is free.")
+@click.option(
+    "--port",
+    type=click.IntRange(0, 65_535),
+    default=8080,
+    show_default=True,
+    help="Port of the page; 0 chooses a free port.",
+)
 @click.option(
     "--open/--no-open",
     "opened",
     default=None,
-    help="Open a browser; done by default on a terminal, unless it would run in that itself.",
+    help="Open a browser; the default on a terminal, unless the browser runs in the terminal.",
 )
-@click.option("--threshold", type=float, default=-20.0, show_default=True, metavar="DB", help="Weakest points to show.")
+@click.option(
+    "--threshold",
+    type=float,
+    default=-20.0,
+    show_default=True,
+    metavar="DB",
+    help="Level of the weakest points to show.",
+)
 @click.option(
     "--dynamic-range", type=float, default=40.0, show_default=True, metavar="DB", help="Range of the colours."
 )
 @click.option("--range", "range_m", type=options.INTERVAL, metavar="A:B", help="Window of the range axis in metres.")
-@click.option("--decay", type=float, default=0.0, show_default=True, metavar="S", help="For how long points stay.")
-@click.option("--colours", type=click.Choice(_COLOURS), default="inferno", show_default=True, help="Colours of levels.")
-@click.option("--loop", is_flag=True, help="Begin a file anew at its end.")
-@click.option("--duration", type=float, metavar="S", help="Seconds; until Ctrl-C by default.")
+@click.option(
+    "--decay", type=float, default=0.0, show_default=True, metavar="S", help="Time for which points stay visible."
+)
+@click.option("--colours", type=click.Choice(_COLOURS), default="inferno", show_default=True, help="Colour map.")
+@click.option("--loop", is_flag=True, help="Restart a file at its end.")
+@click.option("--duration", type=float, metavar="S", help="Duration; until Ctrl-C by default.")
 @click.option(
     "--save-html",
     "html",
     type=click.Path(path_type=Path),
     metavar="FILE",
-    help="Write what is shown as a page that needs no server: all of a file at once, or a live view at its end; "
+    help="Write the view as a page that needs no server: a whole file at once, or a live view at its end; "
     "at most 256 MB.",
 )
 @_mountings.mounting
@@ -107,11 +128,11 @@ def view(
     quiet: bool,
     as_json: bool,
 ) -> None:
-    """Show what sensors see on a page in the browser.
+    """Show live or recorded images in a browser.
 
-    ADDRESS is where a central node publishes. Of a file, recordings are processed with their own settings while they
-    are shown, at the speed at which they were recorded. The page shows range and azimuth of each sensor, and all of
-    them on their platform in three dimensions. It needs the extra view, and no other host.
+    ADDRESS is the address at which a central node publishes. A recording is processed with its own settings during
+    playback, and is shown at its original speed. The page shows range versus azimuth for each sensor, and all sensors
+    on their platform in three dimensions. The command needs the extra 'view'; the page loads nothing from other hosts.
     """
     live = _is_address(what)
     _require_use(_LIVE if live else _PLAYBACK if html is None else _PAGE)
@@ -136,7 +157,7 @@ def view(
         nullcontext() if live else _ended(source, signals, quiet=quiet),
         Viewer(
             source,
-            host="127.0.0.1" if at_once else host,  # nobody is to look while a file becomes a page
+            host="127.0.0.1" if at_once else host,  # no other machine may connect while the page is written
             port=0 if at_once else port,
             choices=choices,
             on_note=lambda text: options.say(text, quiet=quiet),
@@ -152,35 +173,33 @@ def view(
         else:
             _emit_event(what, shown, quiet=quiet, as_json=as_json)
             if sys.stderr.isatty() if opened is None else opened:
-                # Some return when they are closed, and others after seconds.
+                # Some browsers return when they are closed, and others only after seconds.
                 asked = {"asked": bool(opened)}
                 threading.Thread(target=_open, args=(shown.url,), kwargs=asked, name="ertis-open", daemon=True).start()
             shown.run(duration_s=math.inf if duration is None else duration, html=html, overwrite=force)
-    gc.freeze()  # to look through all that libraries have made would take a fifth of a second that nobody waits for
+    gc.freeze()  # skips a garbage collection of 0.2 s at exit
     if html is not None:
         _report_recorded(what, html, shown.recorded, quiet=quiet, as_json=as_json)
 
 
 def _is_address(what: str) -> bool:
-    """Whether this is an address rather than a file."""
+    """Return True for an address, and False for a file."""
     live = "://" in what
     host_port = None if live or Path(what).exists() else _HOST_PORT.fullmatch(what)
     if host_port:
-        raise click.UsageError(
-            f"{what!r} is no file; give tcp://{host_port[2]}, if that is where a central node publishes"
-        )
+        raise click.UsageError(f"{what!r} is not a file; for the address of a central node, give tcp://{host_port[2]}")
     return live
 
 
 def _require_use(kind: str) -> None:
-    """Refuse options that would change nothing; a file of settings may hold them for other uses."""
+    """Raise an error for options without effect, unless they come from a configuration file."""
     context = click.get_current_context()
     names = {each.name: each.opts[0] for each in context.command.params}
     for name, kinds in _ONLY.items():
         if kind not in kinds and context.get_parameter_source(name) is ParameterSource.COMMANDLINE:
-            raise click.UsageError(f"{names[name]} is for {' or '.join(kinds)}; leave it out with {kind}", context)
+            raise click.UsageError(f"{names[name]} is for {' or '.join(kinds)}; remove it with {kind}", context)
     if context.params["html"] is None and context.get_parameter_source("force") is ParameterSource.COMMANDLINE:
-        raise click.UsageError("--force is for --save-html; leave it out", context)
+        raise click.UsageError("--force is for --save-html; remove it", context)
 
 
 def _source(
@@ -207,7 +226,7 @@ def _source(
 
 @contextmanager
 def _ended(source: "Live | Playback", signals: Signals, *, quiet: bool) -> Iterator[None]:
-    """Close a source after the block; who waits for that is told why."""
+    """Close a source after the block, and print a message if that takes long."""
     try:
         yield
     finally:
@@ -217,10 +236,10 @@ def _ended(source: "Live | Playback", signals: Signals, *, quiet: bool) -> Itera
 
 @contextmanager
 def _compiling(note: str, signals: Signals, *, quiet: bool, ending: bool = False) -> Iterator[None]:
-    """Tell of a block that takes long, and keep signals until it is done; a second one ends the process at once.
+    """Print a message if the block takes long, and delay signals until its end; a second signal ends the process.
 
-    An exception would break in the compiler or be swallowed there, and an interpreter that ends meanwhile crashes.
-    Where all is ``ending`` anyway, the first signal counts as the second.
+    An exception inside the compiler may crash it or get lost, and the interpreter crashes if it exits meanwhile.
+    If ``ending`` is True, the first signal counts as the second.
     """
     first_s = math.inf if not ending else time.monotonic() if signals.came else -math.inf
 
@@ -232,7 +251,7 @@ def _compiling(note: str, signals: Signals, *, quiet: bool, ending: bool = False
         if math.isinf(first_s):
             first_s = now_s
             signals(number, frame)
-            options.say("ending when that is done; Ctrl-C again ends at once", quiet=quiet)
+            options.say("ending after this step; press Ctrl-C again to end at once", quiet=quiet)
 
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
@@ -246,35 +265,39 @@ def _compiling(note: str, signals: Signals, *, quiet: bool, ending: bool = False
 
 
 def _open(url: str, *, asked: bool) -> None:
-    """Open a browser, unless it would take the terminal and nobody asked for it."""
+    """Open a browser; a browser inside the terminal is opened only if ``asked``."""
     try:
         browser = webbrowser.get()
-    except webbrowser.Error:  # there is none; where the page is was told
+    except webbrowser.Error:  # no browser; the address of the page was already printed
         return
     if asked or _has_window(browser):
         browser.open(url)
 
 
 def _has_window(browser: webbrowser.BaseBrowser) -> bool:
-    """Whether a browser does not run in the terminal, as w3m does: Python begins it in the background."""
+    """Return True if Python starts this browser in the background, unlike terminal browsers such as w3m."""
     if isinstance(browser, webbrowser.GenericBrowser):
         return isinstance(browser, webbrowser.BackgroundBrowser)
     return getattr(browser, "background", True)
 
 
 def _emit_event(what: str, shown: "Viewer", *, quiet: bool, as_json: bool) -> None:
-    """Tell where the page is, and who else may reach it."""
+    """Report the address of the page, and the need for its token."""
     if as_json:
         options.print_json({"event": "viewing", "source": what, "url": shown.url})
     options.say(f"{what} at {shown.url}; Ctrl-C ends", quiet=quiet)
     if not shown.is_local:
-        options.say("other machines need the token in that address; anyone with it can control this view", quiet=quiet)
+        options.say(
+            "other machines need the token in this address; anyone who has it can control this view", quiet=quiet
+        )
 
 
 def _report_recorded(what: str, html: Path, n_frames: int | None, *, quiet: bool, as_json: bool) -> None:
-    """Tell what was written; it is an error if that is nothing."""
+    """Report the written page; raise an error if no image was recorded."""
     if n_frames is None:
-        raise click.ClickException(f"no image of {what} was shown, and {html} is not written; see that sensors send")
+        raise click.ClickException(
+            f"{html} is not written, because no image of {what} was shown; check that sensors send measurements"
+        )
     options.say(f"{html}: {options.counted(n_frames, 'frame')} of {what}", quiet=quiet)
     if as_json:
         options.print_json({"event": "recorded", "source": what, "output": str(html), "frames": n_frames})
