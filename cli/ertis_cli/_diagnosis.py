@@ -226,7 +226,7 @@ def _disk(folder: Path) -> Iterator[InstallationFinding]:
     yield InstallationFinding(
         "disk",
         "good" if sensors else "bad",
-        f"{speed_mb_s:.0f} MB/s durably, slowest 5 MB in {1e3 * max(times_s):.0f} ms: enough for {_so_many(sensors)} at 20 Hz",
+        f"{speed_mb_s:.0f} MB/s durably, slowest 5 MB in {1e3 * max(times_s):.0f} ms: {_so_many(sensors)} at 20 Hz",
         "" if sensors else "record to another disk, or at a lower rate",
     )
 

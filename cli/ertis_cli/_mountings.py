@@ -19,7 +19,7 @@ mounting: "Decorator" = click.option(
     "--mounting",
     type=click.Path(path_type=Path),
     metavar="FILE",
-    help="File with the mountings of sensors on their platform: a scene, its [[sensors]], or a recording with mountings.",
+    help="Mountings of sensors on their platform: a scene, its [[sensors]], or a recording that contains them.",
 )
 
 

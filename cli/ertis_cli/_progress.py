@@ -1,4 +1,4 @@
-"""Bars that say how far something is: where they are drawn, and how they look."""
+"""Progress bars on a terminal."""
 
 import io
 import os
@@ -18,12 +18,12 @@ Item = TypeVar("Item")
 
 
 def is_drawn_on(stream: TextIO) -> bool:
-    """Whether a stream is a terminal that moves its cursor, rather than a file, a pipe or a dumb terminal."""
+    """Return True if a stream is a terminal with cursor control, and not a file, a pipe or a dumb terminal."""
     return stream.isatty() and os.environ.get("TERM", "").lower() not in {"dumb", "unknown"}
 
 
 def bars() -> "Progress":
-    """Return what draws bars on stderr, in colours unless ``NO_COLOR`` is set; use it under `drawn`."""
+    """Return progress bars for stderr, coloured unless ``NO_COLOR`` is set; use them under `drawn`."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -35,14 +35,14 @@ def bars() -> "Progress":
     )
 
     return Progress(
-        TextColumn("{task.description}", markup=False),  # names of files may hold brackets
+        TextColumn("{task.description}", markup=False),  # file names may contain brackets
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
         TextColumn("left", style="progress.remaining"),
         console=Console(file=sys.stderr),
-        redirect_stdout=False,  # which `drawn` does
+        redirect_stdout=False,  # `drawn` does this
         redirect_stderr=False,
         transient=True,
     )
@@ -50,8 +50,8 @@ def bars() -> "Progress":
 
 @contextmanager
 def drawn(progress: "Progress") -> Iterator[None]:
-    """Draw bars until the block ends, and take them away; what is printed on that terminal stands above them."""
-    # Another stdout is for whoever reads it, even while there are bars on stderr.
+    """Draw bars until the block ends, then remove them; text printed on that terminal appears above them."""
+    # Only a stdout on the same terminal is redirected; a file or a pipe keeps its output.
     takes_stdout = _is_one_terminal()
     with progress, ExitStack() as stack:
         above = stack.enter_context(_Above(progress.console, sys.stderr))
@@ -63,7 +63,7 @@ def drawn(progress: "Progress") -> Iterator[None]:
 
 @contextmanager
 def bar(items: Iterable[Item], *, length: int, label: str) -> Iterator[Iterator[Item]]:
-    """Draw a bar over ``items`` while they are used up."""
+    """Draw a bar that advances while ``items`` are consumed."""
     progress = bars()
     task = progress.add_task(label, total=length)
     with drawn(progress):
@@ -77,22 +77,22 @@ def _followed(items: Iterable[Item], progress: "Progress", task: "TaskID") -> It
 
 
 def _is_one_terminal() -> bool:
-    """Whether stdout and stderr are the same terminal."""
+    """Return True if stdout and stderr are the same terminal."""
     try:
         return os.ttyname(sys.stdout.fileno()) == os.ttyname(sys.stderr.fileno())
-    except (OSError, ValueError):  # one of them is no terminal, or no file of the system, as in tests
+    except (OSError, ValueError):  # one of them is not a terminal or, as in tests, has no file descriptor
         return False
 
 
 class _Above(io.TextIOBase):
-    """A stream whose lines stand above bars, unbroken; rich has one, but click writes past what has no encoding."""
+    """Stream whose complete lines appear above bars; rich has one without an encoding, which click bypasses."""
 
-    encoding = "utf-8"  # of no matter, as the terminal's own stream encodes
+    encoding = "utf-8"  # not used, because the terminal's own stream encodes
     errors = "backslashreplace"
 
     def __init__(self, console: "Console", stream: TextIO) -> None:
         self._console, self._stream = console, stream
-        self._turn = threading.RLock()  # a handler of signals may write, too
+        self._turn = threading.RLock()  # a signal handler may write as well
         self._begun = ""
 
     def write(self, text: str) -> int:

@@ -1,4 +1,4 @@
-"""What is written: files that are complete when it ends, or not there, and folders that nothing came of."""
+"""Files that are complete or absent, and removal of new folders after an error."""
 
 import tempfile
 from collections.abc import Callable, Iterator
@@ -15,17 +15,16 @@ if TYPE_CHECKING:
 __all__ = ["PRODUCTS", "saving", "withdrawn"]
 
 PRODUCTS = ("energyscape", "raw")
-"""What there are files for."""
+"""Products that can be saved to files."""
 
 Write = Callable[["Arrival"], None]
 
 
 @contextmanager
 def withdrawn(*folders: Path | None) -> Iterator[list[Path]]:
-    """Yield those of folders that are not there yet; where the block is refused, they are not there afterwards either.
+    """Yield the folders that do not exist yet; if the block raises an error, remove them.
 
-    Clear the list when what is done with them has begun. A folder that holds more than a central node's own files
-    stays.
+    Clear the list once the folders are in use. A folder that contains more than a central node's own files stays.
     """
     missing = [each for folder in folders if folder for each in (folder, *folder.parents) if not each.exists()]
     try:
@@ -43,12 +42,14 @@ def withdrawn(*folders: Path | None) -> Iterator[list[Path]]:
 
 @contextmanager
 def saving(target: Path | None, product: str, *, overwrite: bool) -> Iterator[Write]:
-    """Yield what takes each product; the file is there when the block has ended well.
+    """Yield a function that saves a product; the file appears when the block ends without an error.
 
     Raises
     ------
     ArgumentError
-        The file cannot be put there, or there is nothing to put into it.
+        The file cannot be written, or a product does not match earlier ones.
+    DataError
+        There is no product to save.
     """
     if target is None:
         yield lambda _: None
@@ -61,7 +62,7 @@ def saving(target: Path | None, product: str, *, overwrite: bool) -> Iterator[Wr
             mounted: set[str] = set()
 
             def write(arrival: "Arrival") -> None:
-                image = cast("Energyscape", arrival.item)  # as was asked
+                image = cast("Energyscape", arrival.item)  # the product that was requested
                 if image.stamp.sensor not in mounted:
                     mounted.add(image.stamp.sensor)
                     if arrival.translation_m is not None and arrival.rotation_xyzw is not None:
@@ -74,7 +75,7 @@ def saving(target: Path | None, product: str, *, overwrite: bool) -> Iterator[Wr
 
 
 def _require_place(target: Path) -> None:
-    """Refuse a file of which the folder is missing or cannot be written, before anything is waited for."""
+    """Raise an error now, before any wait, if the folder of a file is missing or not writable."""
     from ertis_numba.errors import ArgumentError
 
     try:
@@ -82,12 +83,12 @@ def _require_place(target: Path) -> None:
             pass
     except OSError as error:
         raise ArgumentError(
-            f"--save {target}: folder {target.parent} cannot be written ({error.strerror}); make it or give another"
+            f"--save {target}: folder {target.parent} cannot be written ({error.strerror}); create it or choose another"
         ) from error
 
 
 def _recording(target: Path, *, overwrite: bool) -> Iterator[Write]:
-    """Yield what takes measurements into a journal, which then becomes a recording, as a capture does it."""
+    """Yield a function that appends measurements to a journal; the journal is then sealed into a recording."""
     from ertis_numba.atomic_files import check_target
     from ertis_numba.errors import DataError
     from ertis_numba.journal import SUFFIX, Entry, Journal, seal_apart
@@ -116,13 +117,17 @@ def _recording(target: Path, *, overwrite: bool) -> Iterator[Write]:
             yield write
         except BaseException:
             if len(journal):
-                click.echo(f"what came is safe in {path}; seal it by 'ertis recover {path}'", err=True)
+                click.echo(
+                    f"the received measurements are safe in {path}; seal them with 'ertis recover {path}'", err=True
+                )
             else:
                 journal.remove()
             raise
         if not len(journal):
             journal.remove()
-            raise DataError(f"{target} would hold no measurement; wait until one comes")
+            raise DataError(
+                f"{target} is not written, because no measurement was received; run the command for a longer time"
+            )
     sealed = seal_apart(path, overwrite=overwrite)
     if sealed.recording is None:
         raise DataError(sealed.remark)

@@ -1,4 +1,4 @@
-"""What is told while measurements are captured, and what ends that."""
+"""Reports of a capture: events, progress and summary."""
 
 import sys
 import threading
@@ -20,16 +20,16 @@ if TYPE_CHECKING:
 __all__ = ["Watch", "report"]
 
 _REFRESH_S = 0.25
-_ALIVE = 0.05  # share of ones, and of zeros, of a microphone that is
+_ALIVE = 0.05  # minimum share of ones, and of zeros, of a working microphone
 
 
 class Watch:
-    """What is told while a capture runs: lines of JSON, notes, and one line that is written again and again.
+    """Reporter of a capture: JSON lines, notes, and a progress line.
 
-    Threads may share it.
+    Several threads may use one reporter.
     """
 
-    word = "stored"  # what has become of a measurement that is told of
+    word = "stored"  # state of a reported measurement
 
     def __init__(self, *, quiet: bool, as_json: bool) -> None:
         self._quiet, self._as_json = quiet, as_json
@@ -41,12 +41,15 @@ class Watch:
         self._checks: dict[str, BitCheck] = {}
 
     def run(self, session: "Session", sink: "Sink", checks: "dict[str, BitCheck]", *, where: str) -> Exception | None:
-        """Run a session, and return what has ended it before its time; ``where`` says where the measurements are."""
+        """Run a session; return the error that ended it early, or None.
+
+        ``where`` is printed on an interruption, and states where the measurements are.
+        """
         self._session, self._checks = session, checks
         begun_s, cpu_s = time.monotonic(), time.process_time()
         try:
             session.run(sink)
-        except (OSError, ValueError) as error:  # what was stored is sealed whatever happened
+        except (OSError, ValueError) as error:  # stored measurements are sealed in any case
             return error
         except (KeyboardInterrupt, SystemExit):
             click.echo(where, err=True)
@@ -58,7 +61,7 @@ class Watch:
         return None
 
     def stored(self, entries: "list[Entry]") -> None:
-        """Tell of measurements that are durable."""
+        """Report durable measurements."""
         if self._as_json:
             for entry in entries:
                 stamp = entry.measurement.stamp
@@ -76,22 +79,22 @@ class Watch:
                 )
 
     def tick(self) -> None:
-        """Draw the line of progress again, if it is time."""
+        """Redraw the progress line when due."""
         if self._line and time.monotonic() >= self._next_s:
             self._next_s = time.monotonic() + _REFRESH_S
             click.echo(f"\r\x1b[K{self._progress()}", err=True, nl=False)
 
     def note(self, sensor: str, text: str) -> None:
-        """Tell what happened to a sensor."""
+        """Report an event of a sensor."""
         if self._as_json:
             self._print({"event": "note", "sensor": sensor, "text": text})
         self._say(f"{sensor}: {text}")
 
     def back(self, sensor: str, away_s: float) -> None:
-        """Tell that a sensor was unplugged and measures again."""
+        """Report that an unplugged sensor measures again."""
         if self._as_json:
             self._print({"event": "back", "sensor": sensor, "away_s": round(away_s, 3)})
-        self._say(f"{sensor}: is back after {away_s:.1f} s")
+        self._say(f"{sensor}: reconnected after {away_s:.1f} s")
 
     def _print(self, event: dict[str, Any]) -> None:
         with self._turn:
@@ -115,11 +118,11 @@ class Watch:
         return "   ".join(parts)[:160]
 
     def _more(self) -> Iterator[str]:
-        """Yield what else there is to tell."""
+        """Yield further parts of the progress line."""
         yield from ()
 
     def _health(self) -> Iterator[tuple[str, str]]:
-        """Yield how many microphones of each sensor give ones and zeros."""
+        """Yield the number of microphones of each sensor that output both ones and zeros."""
         for sensor, check in self._checks.items():
             density = check.density
             if density is not None:
@@ -137,7 +140,10 @@ def report(
     more: dict[str, Any] | None = None,
     n_lost: int = 0,
 ) -> None:
-    """Tell what has come of it; ``more`` is for programs, too, and ``n_lost`` were lost after they had been kept."""
+    """Report the results of a capture.
+
+    ``more`` is added to the JSON output, and ``n_lost`` measurements were lost after they had been captured.
+    """
     counts = session.counts
     several = len(counts) > 1
     stored, lost = (sum(getattr(each, name) for each in counts.values()) for name in ("stored", "lost"))
@@ -149,8 +155,8 @@ def report(
             options.say(f"{sensor}: {count} missing, {reason}", quiet=quiet)
         if each.skipped:
             options.say(
-                f"{sensor}: {each.skipped} commands were left out, as it was still busy with the one before; give a "
-                "lower --rate",
+                f"{sensor}: {each.skipped} commands were skipped, because the sensor was still busy; give a lower "
+                "--rate",
                 quiet=quiet,
             )
     if as_json:

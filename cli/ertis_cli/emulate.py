@@ -256,7 +256,7 @@ def _get_ready(devices: "Sequence[Emulator]", given: "Given", pulse: int) -> Non
 
 
 def _emit_event(name: str, port: str, *, quiet: bool) -> None:
-    options.say(f"{name} is back: {port}", quiet=quiet)
+    options.say(f"{name} reconnected: {port}", quiet=quiet)
 
 
 def _look_after(devices: "Sequence[Emulator]", absences: "list[tuple[float, float]]", ended: threading.Event) -> None:

@@ -39,7 +39,7 @@ _PCM = {".wav", ".h5", ".hdf5", ".hdf"}
     "settings_file",
     metavar="FILE.toml",
     type=click.Path(path_type=Path),
-    help="Settings that differ from those of an eRTIS, such as array and call; --layout and the air options override it.",
+    help="Settings that differ from those of an eRTIS, such as array and call; --layout and air options override it.",
 )
 @click.option(
     "--skip", "skip_s", type=click.FloatRange(min=0), metavar="S", help="PCM: start of the first emission in the file."

@@ -81,7 +81,7 @@ _ONLY = {
 )
 @click.option("--height", type=float, metavar="M", help="Height of the horizontal section of slices; 0 by default.")
 @click.option(
-    "--left", type=float, metavar="M", help="Distance of the vertical section of slices to the left; 0 by default."
+    "--left", type=float, metavar="M", help="Position of the vertical section of slices, to the left; 0 by default."
 )
 @click.option(
     "--microphone", type=int, metavar="BIT", help="Plot only this microphone, for signals and matched-filter."
