@@ -49,7 +49,12 @@ rotate_every: Decorator = click.option(
     help="Age at which a new recording starts.",
 )
 max_bytes: Decorator = click.option(
-    "--most-bytes", type=int, default=4 * 2**20, show_default=True, help="Largest measurement; larger ones are refused."
+    "--most-bytes",
+    "max_bytes",
+    type=int,
+    default=4 * 2**20,
+    show_default=True,
+    help="Largest measurement; larger ones are refused.",
 )
 
 _REFRESH_S = 0.5
