@@ -15,10 +15,7 @@ import ertis_numba as ertis
 
 def main(address: str, path: str) -> None:
     """Send the measurements of a recording with the present time."""
-    recording, session_id = (
-        ertis.open_recording(path),
-        secrets.randbits(63),
-    )  # a new session, because sequence numbers restart
+    recording, session_id = ertis.open_recording(path), secrets.randbits(63)  # numbers restart in a new session
     with recording, ertis.SensorNode(address, on_note=print) as node:  # spool=DIR keeps measurements through a crash
         node.add_sensor("mine", recording.settings)
         for number, found in enumerate(recording):

@@ -60,7 +60,7 @@ _update = click.option(
 
 @click.group()
 def bench() -> None:
-    """Run benchmarks on this machine, and check each result before timing it."""
+    """Run benchmarks, and check each result before timing it."""
 
 
 @bench.command()

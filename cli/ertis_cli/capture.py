@@ -163,7 +163,7 @@ def capture(
     quiet: bool,
     as_json: bool,
 ) -> None:
-    """Record measurements from sensors, or send them to a central node.
+    """Record measurements, or send them to a central node.
 
     Each measurement is written durably to a journal beside the recording before it is reported. The complete recording
     appears at the end. Ctrl-C ends a capture after the current measurement. After a crash, 'ertis recover' seals the

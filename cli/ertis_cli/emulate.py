@@ -101,10 +101,11 @@ def emulate(
     quiet: bool,
     as_json: bool,
 ) -> None:
-    """Emulate the sensors of a scene or a recording until interrupted.
+    """Emulate the sensors of a scene or a recording.
 
     Each sensor is a separate device on a pseudo terminal. The path of the terminal is printed when the device is ready.
-    The device accepts the commands of a real one. It returns simulated or recorded measurements, and repeats them.
+    The device accepts the commands of a real one. It returns simulated or recorded measurements, and repeats them
+    until Ctrl-C ends the command.
     For measurements without emission, the scene is simulated with all sensors silent.
 
     A scene is rendered for the call that 'ertis capture' uploads: the scene's own or that of a preset. Without

@@ -80,7 +80,7 @@ def import_raw(
     quiet: bool,
     as_json: bool,
 ) -> None:
-    """Import raw eRTIS data, or PCM from other arrays, into a recording.
+    """Import raw eRTIS data or PCM into a recording.
 
     Raw data are little-endian words without a header, one measurement after the other. The layout and the preset
     supply the missing information; a preset names the length of a measurement and the band of the call in kHz. A

@@ -15,8 +15,8 @@ from ertis_cli._signals import interruption, obey_signals
 __all__ = ["COMMANDS", "cli", "main"]
 
 COMMANDS = {
-    "bench": ("ertis_cli.bench:bench", "Run benchmarks on this machine, and check each result before timing it."),
-    "capture": ("ertis_cli.capture:capture", "Record measurements from sensors, or send them to a central node."),
+    "bench": ("ertis_cli.bench:bench", "Run benchmarks, and check each result before timing it."),
+    "capture": ("ertis_cli.capture:capture", "Record measurements, or send them to a central node."),
     "compare": ("ertis_cli.compare:compare", "Compare an energyscape file with the scene's ground truth."),
     "completion": ("ertis_cli.completion:completion", "Print a script that completes commands and options in a shell."),
     "demo": ("ertis_cli.demo:demo", "Run four emulated sensors, a central node and an application."),
@@ -24,11 +24,11 @@ COMMANDS = {
     "doctor": ("ertis_cli.doctor:doctor", "Check this installation and suggest fixes."),
     "emulate": (
         "ertis_cli.emulate:emulate",
-        "Emulate the sensors of a scene or a recording until interrupted.",
+        "Emulate the sensors of a scene or a recording.",
     ),
     "example": ("ertis_cli.example:example", "List or copy shipped scenes, recordings and scripts."),
     "export": ("ertis_cli.export:export", "Export images or signals for other programs."),
-    "import": ("ertis_cli.import_raw:import_raw", "Import raw eRTIS data, or PCM from other arrays, into a recording."),
+    "import": ("ertis_cli.import_raw:import_raw", "Import raw eRTIS data or PCM into a recording."),
     "info": ("ertis_cli.info:info", "Show the contents of a recording or an energyscape file."),
     "keys": ("ertis_cli.keys:keys", "Create keys and manage the list of allowed keys."),
     "layout": ("ertis_cli.layout:layout", "List the shipped layouts, or print one as TOML."),
