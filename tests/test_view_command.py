@@ -29,8 +29,14 @@ BIND = socket.socket.bind
     ("arguments", "told"),
     [
         (("missing.h5",), "missing.h5"),
-        (("127.0.0.1:5602",), "'127.0.0.1:5602' is not a file; for the address of a central node, give tcp://127.0.0.1:5602"),
-        (("tcp:127.0.0.1:5602",), "'tcp:127.0.0.1:5602' is not a file; for the address of a central node, give tcp://127.0.0.1:5602"),
+        (
+            ("127.0.0.1:5602",),
+            "'127.0.0.1:5602' is not a file; for the address of a central node, give tcp://127.0.0.1:5602",
+        ),
+        (
+            ("tcp:127.0.0.1:5602",),
+            "'tcp:127.0.0.1:5602' is not a file; for the address of a central node, give tcp://127.0.0.1:5602",
+        ),
         (("IMG", "--save-html", "p.png"), "page format '.png' is unknown; known are .html, .htm"),
         (("IMG", "--sensor", "back"), "back"),
         (("IMG", "--decay", "99"), "--decay is 99; give"),

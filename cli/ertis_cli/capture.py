@@ -60,7 +60,7 @@ _LOOK_S = 0.1  # interval between searches for ports
     "ring_mb",
     type=click.FloatRange(min=0, min_open=True),
     metavar="MB",
-    help="With --to: memory for measurements; 64 by default. Without --spool, a full memory overwrites the oldest.",
+    help="With --to: memory for measurements; 64 by default. When full without --spool, the oldest are overwritten.",
 )
 @_network.key
 @_network.server_key
@@ -82,7 +82,7 @@ _LOOK_S = 0.1  # interval between searches for ports
     metavar="N",
     help="Number of measurements per sensor, or of SYNC pulses.",
 )
-@click.option("--duration", type=float, metavar="S", help="Duration; until Ctrl-C by default.")
+@click.option("--duration", type=float, metavar="S", help="Duration in seconds; until Ctrl-C by default.")
 @click.option(
     "--trigger",
     type=click.Choice(["command", "sync"]),

@@ -45,7 +45,7 @@ _LOOK_S = 0.1
 @click.option(
     "-n", "--count", "n", type=click.IntRange(min=1), metavar="N", help="Number of products to receive before ending."
 )
-@click.option("--duration", type=float, metavar="S", help="Duration; until Ctrl-C by default.")
+@click.option("--duration", type=float, metavar="S", help="Duration in seconds; until Ctrl-C by default.")
 @click.option(
     "--save",
     "target",

@@ -81,7 +81,7 @@ def peaks(
 
     With --detector cfar, a reflector exceeds the noise around it in range, at any level, and is at most 10 dB below the
     strongest echo at its range. The noise is estimated from 32 bins of the same direction (OS-CFAR), so that
-    --false-alarm is the probability that noise alone is listed.
+    --false-alarm is the probability per bin that noise alone is listed.
 
     With --truth, each true reflector comes first, with the errors of its matched peak or as missed. Then come peaks
     that no reflector explains, as false, and peaks of reflectors that do not count, as explained (see

@@ -19,7 +19,7 @@ _FILE = click.Path(path_type=Path)
 @_central_watch.rotate_size
 @_central_watch.rotate_every
 @_central_watch.max_bytes
-@click.option("--duration", type=float, metavar="S", help="Duration; until Ctrl-C by default.")
+@click.option("--duration", type=float, metavar="S", help="Duration in seconds; until Ctrl-C by default.")
 @_network.key
 @_network.allow
 @click.option("--metrics", metavar="HOST:PORT", help="Serve Prometheus metrics at this address.")

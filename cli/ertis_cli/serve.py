@@ -60,7 +60,7 @@ _FOLDER = click.Path(path_type=Path)
     "--quarantine", type=_FOLDER, metavar="DIR", help="Dead-letter folder for measurements that made two workers fail."
 )
 @click.option("--scheduler", metavar="ADDRESS", help="Scheduler of a dask.distributed cluster whose workers to use.")
-@click.option("--duration", type=float, metavar="S", help="Duration; until Ctrl-C by default.")
+@click.option("--duration", type=float, metavar="S", help="Duration in seconds; until Ctrl-C by default.")
 @_network.key
 @_network.allow
 @click.option("--metrics", metavar="HOST:PORT", help="Serve Prometheus metrics at this address.")

@@ -89,7 +89,7 @@ _ONLY = {
 )
 @click.option("--colours", type=click.Choice(_COLOURS), default="inferno", show_default=True, help="Colour map.")
 @click.option("--loop", is_flag=True, help="Restart a file at its end.")
-@click.option("--duration", type=float, metavar="S", help="Duration; until Ctrl-C by default.")
+@click.option("--duration", type=float, metavar="S", help="Duration in seconds; until Ctrl-C by default.")
 @click.option(
     "--save-html",
     "html",
