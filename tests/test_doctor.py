@@ -111,7 +111,7 @@ def test_what_would_permit_to_open_a_port(monkeypatch, group_id, mode, remedy):
         assert reported == remedy
         return
     assert "usermod -aG root" not in reported
-    assert re.search(r"""write 'KERNEL=="ttyACM\*", .*' into /etc/udev/rules.d/\S+\.rules""", reported)
+    assert re.search(r"""write 'KERNEL=="ttyACM\*", .*' to /etc/udev/rules.d/\S+\.rules""", reported)
 
 
 def test_all_extras_are_looked_at(doctor):

@@ -25,7 +25,7 @@ _KINDS = {
     "projection": "azimuth versus elevation, the maximum over range",
     "slices": "a horizontal and a vertical section in metres",
     "signals": "microphone signals and their spectrogram",
-    "matched-filter": "matched-filter output of each microphone",
+    "matched-filter": "output of the matched filter for each microphone",
     "array": "array layout and beam pattern",
 }
 _OF_IMAGES = ("image", "polar", "projection", "slices")
