@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 PYTEST := $(BIN)/python -m pytest
 GPU ?= cu12
 WORKERS ?= 3
-unexport PYTHONDONTWRITEBYTECODE  # hundreds of processes would compile every module anew
+unexport PYTHONDONTWRITEBYTECODE  # otherwise, each of hundreds of processes compiles every module again
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 KERNELS := tests/test_kernels.py tests/test_interpolated_beams.py tests/test_beamformers.py tests/test_modulator.py
 ELSEWHERE := --ignore=tests/cuda --ignore=tests/ptx
@@ -17,22 +17,22 @@ $(VENV)/ready: setup.cfg pyproject.toml
 	$(BIN)/python -m pip install --quiet --editable '.'
 	touch $@
 
-$(VENV)/ready-to-test: $(VENV)/ready  # what tests and checks need: CUDA's compilers are 0.7 GB of it
+$(VENV)/ready-to-test: $(VENV)/ready  # packages for tests and checks, of which CUDA's compilers are 0.7 GB
 	$(BIN)/python -m pip install --quiet --editable '.[test,check,docs]'
 	touch $@
 
 demo: $(VENV)/ready
 	$(BIN)/ertis demo --force
 
-# Times are measured first, while nothing else runs. Then two legs run at a time; each says what it found when it ends.
+# Tests that measure times run first, alone. Then two groups run at a time, and each prints its result when it ends.
 test: $(VENV)/ready-to-test
 	$(PYTEST) -m alone $(ELSEWHERE)
 	$(MAKE) --no-print-directory --jobs 2 --keep-going --output-sync=target test-kernels test-ptx test-host test-simulator
 
-test-kernels: $(VENV)/ready-to-test  # compiles all of them: processes that did so at once could spoil each other's cache
+test-kernels: $(VENV)/ready-to-test  # compile all kernels in one process, because parallel processes could corrupt the cache
 	$(PYTEST) -m "not alone" $(KERNELS)
 
-test-host: test-kernels  # one more worker than two cores: some tests wait for sockets and disks
+test-host: test-kernels  # one worker more than two cores, because some tests wait for sockets and disks
 	$(PYTEST) -m "not alone" --numprocesses $(WORKERS) --dist worksteal $(KERNELS:%=--ignore=%) $(ELSEWHERE)
 
 test-simulator: test-kernels
@@ -49,34 +49,34 @@ check: $(VENV)/ready-to-test
 	$(PYTEST) -q tests/test_plain_english.py
 	$(BIN)/python -m sphinx -q -W --keep-going docs site
 
-docs: $(VENV)/ready-to-test  ## the guide as a site: open site/index.html
+docs: $(VENV)/ready-to-test  ## build the documentation; open site/index.html
 	$(BIN)/python -m sphinx -q -W --keep-going docs site
 
 data: $(VENV)/ready  ## rebuild data/synthetic from its scenes, and the gallery
 	$(BIN)/python data/synthetic/build.py
 	$(BIN)/python data/synthetic/gallery.py
 
-pictures: $(VENV)/ready  ## redraw the pictures of the README; Chromium takes that of the viewer
+pictures: $(VENV)/ready  ## redraw the pictures of the README; the viewer needs Chromium
 	$(BIN)/python -m pip install --quiet --editable '.[view,browser]'
 	$(BIN)/python docs/pictures/build.py
 	$(BIN)/python docs/pictures/view.py
 
-bench: $(VENV)/ready  ## measure this machine and write docs/reference/benchmarks.md
-	$(BIN)/ertis bench paper --update docs/reference/benchmarks.md --update README.md
-	$(BIN)/ertis bench accuracy --update docs/explanation/accuracy.md --update docs/reference/benchmarks.md --plot docs/pictures/front.png
-	$(BIN)/ertis bench factorisation --update docs/explanation/accuracy.md
-	$(BIN)/ertis bench verification --update docs/explanation/accuracy.md
-	$(BIN)/ertis bench points --update docs/explanation/accuracy.md
-	$(BIN)/ertis bench scaling --update docs/reference/benchmarks.md
-	$(BIN)/ertis bench simulation --update docs/reference/benchmarks.md
-	$(BIN)/ertis bench many --update docs/how-to/many.md
-	$(BIN)/ertis bench network --update docs/explanation/network-guarantees.md
+bench: $(VENV)/ready  ## run the benchmarks and update the tables in the documentation
+	$(BIN)/ertis bench paper --update bench/README.md --update README.md
+	$(BIN)/ertis bench accuracy --update README.md --update bench/README.md --plot docs/pictures/front.png
+	$(BIN)/ertis bench factorisation --update docs/accuracy.md
+	$(BIN)/ertis bench verification --update docs/accuracy.md
+	$(BIN)/ertis bench points --update docs/accuracy.md
+	$(BIN)/ertis bench scaling --update bench/README.md
+	$(BIN)/ertis bench simulation --update bench/README.md
+	$(BIN)/ertis bench many --update docs/many.md
+	$(BIN)/ertis bench network --update docs/network.md
 
-soak: $(VENV)/ready  ## hours of faults, kills and full disks; SEED=N for the same ones again
-	$(BIN)/ertis bench reliability --long $(if $(SEED),--seed $(SEED)) --update docs/explanation/reliability.md
-	$(BIN)/ertis bench network-faults --long $(if $(SEED),--seed $(SEED)) --update docs/explanation/network-guarantees.md
+soak: $(VENV)/ready  ## test faults, kills and full disks for hours; SEED=N repeats a run
+	$(BIN)/ertis bench reliability --long $(if $(SEED),--seed $(SEED)) --update docs/reliability.md
+	$(BIN)/ertis bench network-faults --long $(if $(SEED),--seed $(SEED)) --update docs/network.md
 
-gpu: $(VENV)/ready  ## test and measure this machine's NVIDIA GPU, in less than ten minutes; GPU=cu13 for CUDA 13
+gpu: $(VENV)/ready  ## test and time this machine's NVIDIA GPU in less than ten minutes; GPU=cu13 for CUDA 13
 	$(BIN)/python -m pip install --quiet --editable '.[test,$(GPU)]'
 	$(BIN)/ertis bench gpu --results bench/results --update docs/explanation/gpu.md --update README.md
 

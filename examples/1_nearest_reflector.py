@@ -1,4 +1,4 @@
-"""Measure with a sensor and say where the nearest strong reflector is.
+"""Measure with a sensor and print the position of the nearest strong reflector.
 
 Run it with the port of a sensor, real or emulated::
 
@@ -12,7 +12,7 @@ import ertis_numba as ertis
 
 
 def main(port: str) -> None:
-    """Take five measurements, ten a second at most."""
+    """Take five measurements and print the nearest reflector of each."""
     settings = ertis.Settings.from_preset("default_25_50")
     with ertis.SonarDriver.open(port) as sonar, ertis.Pipeline(settings) as pipeline:
         sonar.configure(ertis.Setup.of(settings))

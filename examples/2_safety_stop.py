@@ -1,9 +1,9 @@
-"""Limit a vehicle's speed by the nearest obstacle in its way: go, slow or stop.
+"""Print the allowed speed of a vehicle (go, slow or stop) from the nearest obstacle in its path.
 
-It stops at once, and goes on only when its way has been clear for some images, and by more than what stops it: an echo
-that comes and goes does not make it jerk. No image from one of its sensors for half a second is a reason to stop, too,
-and so is a clock that is half a second away from this machine's. What echoes more than 20 dB weaker than the strongest
-reflector of an image is no point of its cloud: beside a wall, a thin pole is not seen::
+The vehicle stops at once. It drives on only after several images with a clear path, and at a larger distance than the
+one that stops it, so that a flickering echo does not make it jerk. It also stops if one of its sensors sends no image
+for half a second, or if the sensor's clock differs from this machine's by half a second. A point cloud omits echoes
+more than 20 dB below the strongest reflector of an image: a thin pole beside a wall is not detected::
 
     ertis serve &
     ertis capture --port front --to tcp://127.0.0.1:5601 &
@@ -18,7 +18,7 @@ import numpy as np
 import ertis_numba as ertis
 
 STOP_M, SLOW_M = 0.8, 1.6
-CLEARER = 1.25  # by which a band must be exceeded to leave it
+CLEARER = 1.25  # factor by which a distance limit must be exceeded to drive faster
 CLEAR_IMAGES = 3
 HALF_WIDTH_M = 0.4
 SILENCE_S = 0.5
@@ -26,7 +26,7 @@ SPEEDS = ("stop", "slow", "go")
 
 
 class Way:
-    """State of the way ahead, from one sensor."""
+    """Allowed speed according to one sensor."""
 
     def __init__(self) -> None:
         self.speed = 0
@@ -34,7 +34,7 @@ class Way:
         self._clear = 0
 
     def see(self, nearest_m: float, now_s: float) -> None:
-        """Update the distance of the nearest obstacle in the way."""
+        """Update the speed with the distance of the nearest obstacle."""
         self._seen_s = now_s
         allowed = int(nearest_m > STOP_M) + int(nearest_m > SLOW_M)
         if allowed <= self.speed:
@@ -46,13 +46,13 @@ class Way:
             self.speed, self._clear = self.speed + 1, 0
 
     def wait(self, now_s: float) -> None:
-        """Stop if nothing was seen for too long."""
+        """Stop if no image has arrived for too long."""
         if now_s - self._seen_s > SILENCE_S:
             self.speed, self._clear = 0, 0
 
 
 def nearest_in_way_m(cloud: ertis.PointCloud) -> float:
-    """Return how far ahead the nearest point between both sides of the vehicle is."""
+    """Return the distance ahead of the nearest point within the width of the vehicle; infinity without one."""
     x, y, _ = cloud.position_m.T
     return float(np.min(x[(x > 0) & (np.abs(y) < HALF_WIDTH_M)], initial=np.inf))
 
@@ -63,7 +63,7 @@ def main(address: str, *sensors: str) -> None:
     with ertis.Subscriber(address, sensors=sensors, products=["points"]) as subscriber:
         while not subscriber.closed:
             cloud = subscriber.receive(timeout_s=0.1)
-            # An image that took long to come, or comes from a clock that is ahead, says nothing about now.
+            # Ignore late images and images from a clock that is ahead, because they do not show the present.
             if cloud is not None and abs(time.time_ns() - cloud.stamp.timestamp_ns) < 1e9 * SILENCE_S:
                 ways[cloud.stamp.sensor].see(nearest_in_way_m(cloud), time.monotonic())
             for way in ways.values():
@@ -76,7 +76,7 @@ def main(address: str, *sensors: str) -> None:
 
 if __name__ == "__main__":
     if len(sys.argv) < 3:
-        sys.exit("give the address of a central node and the sensors that look ahead")
+        sys.exit("give the address of a central node and the names of the sensors that face ahead")
     try:
         main(*sys.argv[1:])
     except KeyboardInterrupt:

@@ -1,7 +1,8 @@
-"""Say how fast things come nearer, from two successive images: acoustic flow.
+"""Print the speed of approaching objects from two successive images: acoustic flow.
 
-What moves by some millimetres between two images has moved its echo along the range axis. For each direction with an
-echo, the lag at which the two images are most alike, over time, is its radial speed; negative comes nearer::
+If an object moves by some millimetres between two images, its echo moves along the range axis. For each direction with
+an echo, the radial speed is the lag of the highest correlation divided by the time between the images. Negative speeds
+approach::
 
     ertis serve &
     ertis capture --port front --to tcp://127.0.0.1:5601 &
@@ -22,7 +23,7 @@ MIN_LIKENESS = 0.9
 
 
 def flow(before: ertis.Energyscape, now: ertis.Energyscape) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Return the directions whose echoes can be followed, and their radial speeds in m/s."""
+    """Return the directions with a reliable correlation, and their radial speeds in m/s."""
     spacing_m = float(now.range_m[1] - now.range_m[0])
     time_s = (now.stamp.timestamp_ns - before.stamp.timestamp_ns) / 1e9
     half, reach = round(HALF_WINDOW_M / spacing_m), round(FASTEST_M_S * time_s / spacing_m) + 1
@@ -30,7 +31,7 @@ def flow(before: ertis.Energyscape, now: ertis.Energyscape) -> tuple[NDArray[np.
     has_room = (strongest >= half + reach) & (strongest < len(now.range_m) - half - reach)
     has_echo = before.amplitude.max(axis=1) > MIN_LEVEL * before.amplitude.max()
     directions = np.flatnonzero(has_room & has_echo)
-    # Rows of what was there, and of what is there at every lag.
+    # Windows of the earlier image, and of the current image at every lag.
     around = np.arange(-half, half + 1)
     lags = np.arange(-reach, reach + 1)
     centre = strongest[directions, None]
@@ -42,7 +43,7 @@ def flow(before: ertis.Energyscape, now: ertis.Energyscape) -> tuple[NDArray[np.
     best = alike.argmax(axis=1)
     sure = (best > 0) & (best < 2 * reach) & (alike.max(axis=1) > MIN_LIKENESS)
     directions, alike, best = directions[sure], alike[sure], best[sure]
-    # The top of the parabola through the best lag and its neighbours.
+    # The maximum of the parabola through the best lag and its neighbours.
     row = np.arange(len(best))
     left, middle, right = alike[row, best - 1], alike[row, best], alike[row, best + 1]
     curvature = np.minimum(left - 2 * middle + right, -np.finfo(np.float32).tiny)
@@ -51,7 +52,7 @@ def flow(before: ertis.Energyscape, now: ertis.Energyscape) -> tuple[NDArray[np.
 
 
 def main(address: str, sensor: str) -> None:
-    """Print the fastest approach between two successive images."""
+    """Print the fastest approach in each pair of successive images."""
     before: ertis.Energyscape | None = None
     with ertis.Subscriber(address, sensors=[sensor], products=["energyscape"]) as subscriber:
         for image in subscriber:
@@ -72,7 +73,7 @@ def main(address: str, sensor: str) -> None:
 
 if __name__ == "__main__":
     if len(sys.argv) != 3:
-        sys.exit("give the address of a central node and a sensor")
+        sys.exit("give the address of a central node and the name of a sensor")
     try:
         main(*sys.argv[1:])
     except KeyboardInterrupt:

@@ -1,7 +1,7 @@
-"""Write the points of all sensors of a platform to one table, in the frame of the platform.
+"""Log the points of all sensors of a platform to one table, in the frame of the platform.
 
-The table is a CSV, or an NPZ for NumPy. It appears complete when the log ends: after a number of clouds, or with
-Ctrl-C::
+The table is a CSV file, or an NPZ file for NumPy. It appears complete when the log ends, after a given number of clouds
+or with Ctrl-C::
 
     ertis serve &
     ertis capture --port front --port left --to tcp://127.0.0.1:5601 --mounting examples/platform.toml &
@@ -21,13 +21,13 @@ COLUMNS = ("timestamp_ns", "sensor", "sequence", "x_m", "y_m", "z_m", "amplitude
 
 
 class Log:
-    """Keeps clouds, and writes them at the end."""
+    """Log of point clouds in memory, written at the end."""
 
     def __init__(self) -> None:
         self.clouds: list[ertis.PointCloud] = []
 
     def save(self, path: Path) -> None:
-        """Write the table, complete or not at all."""
+        """Write the table; the file appears only when it is complete."""
         with atomic_write(path, overwrite=True) as part:
             if path.suffix == ".npz":
                 with part.open("wb") as file:
@@ -51,7 +51,7 @@ class Log:
 
 
 def main(address: str, path: str, largest: str = "0") -> None:
-    """Log clouds until there are so many, or until Ctrl-C."""
+    """Log clouds until their number reaches ``largest``, or until Ctrl-C; 0 means no limit."""
     log, n = Log(), int(largest)
     with ertis.Subscriber(address, products=["points"]) as subscriber:
         try:
@@ -68,5 +68,5 @@ def main(address: str, path: str, largest: str = "0") -> None:
 
 if __name__ == "__main__":
     if len(sys.argv) not in {3, 4}:
-        sys.exit("give the address of a central node, a file to write (.csv or .npz) and, if you like, a number")
+        sys.exit("give the address of a central node, a file (.csv or .npz) and, optionally, a number of clouds")
     main(*sys.argv[1:])

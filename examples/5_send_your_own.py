@@ -1,4 +1,4 @@
-"""Send measurements of your own program to a central node, which has stored them when the program ends.
+"""Send measurements from your own program to a central node, and wait until they are on its disk.
 
 ::
 
@@ -14,16 +14,16 @@ import ertis_numba as ertis
 
 
 def main(address: str, path: str) -> None:
-    """Send the measurements of a recording as if they were made now."""
-    recording, session_id = ertis.open_recording(path), secrets.randbits(63)  # a new epoch when numbers begin again
-    with recording, ertis.SensorNode(address, on_note=print) as node:  # spool=DIR keeps what a crash would lose
+    """Send the measurements of a recording with the present time."""
+    recording, session_id = ertis.open_recording(path), secrets.randbits(63)  # numbers restart in a new session
+    with recording, ertis.SensorNode(address, on_note=print) as node:  # spool=DIR keeps measurements through a crash
         node.add_sensor("mine", recording.settings)
         for number, found in enumerate(recording):
             stamp = ertis.Stamp(sensor="mine", session_id=session_id, sequence=number, timestamp_ns=time.time_ns())
             made = ertis.Measurement(found.data, found.settings, stamp)
             node.append([ertis.Entry(made, time.monotonic_ns())])
         if not node.flush(timeout_s=10):
-            sys.exit(f"{node.unacked} measurements have not reached {address}; start 'ertis record' there")
+            sys.exit(f"{address} has not acknowledged {node.unacked} measurements; start 'ertis record' there")
         print(f"{node.counts['mine'].stored} stored")
 
 

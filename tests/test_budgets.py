@@ -182,7 +182,7 @@ def test_files_and_reports_name_the_scope_of_the_budget(tmp_path, processing, bu
         assert images.budget_applies_to == scope
         warned = "for delay-and-sum beams only, not for images of capon" in images.error_warning
         assert warned == (scope == "beams" and images.error_warning != "")
-    assert ("keeps it for delay-and-sum beams of the same signals" in done.stderr) == (scope == "beams")
+    assert ("meets it for delay-and-sum beams of the same signals" in done.stderr) == (scope == "beams")
 
 
 @pytest.mark.parametrize("seed", [44, 118])

@@ -453,16 +453,16 @@ def test_commands_are_printed_and_nothing_is_opened(tmp_path):
         check=True,
     )
     assert "!G,655360,0,0         measurement length: 655360 bytes\n" in done.stdout
-    assert "!C,0… to 1125         samples of the call, unless they are loaded already\n" in done.stdout
+    assert "!C,0… to 1125         samples of the call, unless the sensor already has them\n" in done.stdout
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
     ("arguments", "message", "code"),
     [
-        (["--port", "{link}", "--name", "a", "--name", "b"], "2 names are given for 1 ports; give one for each", 2),
+        (["--port", "{link}", "--name", "a", "--name", "b"], "2 names are given for 1 ports; give one --name", 2),
         (["--port", "nowhere"], "there is no serial port 'nowhere'", 1),
-        (["--port", "{link}", "--preset", "default_25_50"], "--preset and --settings both say how to record", 2),
+        (["--port", "{link}", "--preset", "default_25_50"], "--preset and --settings exclude each other; give one", 2),
         (["--port", "{link}", "-o", "settings.toml"], "output settings.toml exists; give another name, or ask", 1),
         (["--port", "{link}", "--port", "{link}"], "is given 2 times; give each sensor once", 2),
         (["--port", "{link}", "--rate", "0"], "rate is 0; give a number from", 1),

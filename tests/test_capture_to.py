@@ -153,7 +153,7 @@ def test_what_never_arrives_is_an_error(tmp_path):
     code, events, err = run(tmp_path, "--to", "tcp://127.0.0.1:9", "-n", 3, "--patience", "0.1")
     assert code == 1
     message = "3 measurements not acknowledged by the central node at tcp://127.0.0.1:9"
-    assert err.splitlines()[-1].startswith(f"ertis: error: {message}, where nobody answers; start 'ertis record' or ")
+    assert err.splitlines()[-1].startswith(f"ertis: error: {message}, which does not answer; start 'ertis record' or ")
     assert (events[-1]["event"], events[-1]["kept"], events[-1]["unacked"]) == ("captured", 3, 3)
 
 
@@ -161,7 +161,7 @@ def test_what_never_arrives_is_an_error(tmp_path):
 def test_a_spool_keeps_what_did_not_arrive_for_the_next_capture(tmp_path):
     code, first, err = run(tmp_path, "--to", "tcp://127.0.0.1:9", "--spool", "spool", "-n", 3, "--patience", "0.1")
     assert code == 0, err
-    assert "3 measurements wait in spool; the next capture with --spool sends what is there" in err
+    assert "3 measurements unacknowledged in spool; the next capture with --spool sends them" in err
     with StandIn() as central:
         code, second, err = run(tmp_path, "--to", central.address, "--spool", "spool", "-n", 2)
     assert code == 0, err
@@ -174,7 +174,7 @@ def test_a_spool_keeps_what_did_not_arrive_for_the_next_capture(tmp_path):
 @pytest.mark.parametrize(
     ("given", "lost", "remedy"),
     [
-        (["--ring"], "overwritten", "give --spool DIR, which keeps them"),
+        (["--ring"], "overwritten", "give --spool DIR to keep measurements"),
         (["--spool", "spool", "--spool-size"], "refused", "give the spool more (--spool-size)"),
     ],
 )
@@ -237,7 +237,7 @@ def test_a_second_signal_ends_it_at_once(tmp_path):
         process.send_signal(signal.SIGINT)
         _, err = process.communicate(timeout=SOON_S)
     assert process.returncode == 130
-    assert "measurements that the central node does not have yet are lost" in err
+    assert "measurements that the central node has not acknowledged are lost" in err
 
 
 @pytest.mark.usefixtures("sensors")
@@ -296,18 +296,18 @@ def test_nodes_that_send_one_sensor_are_told(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message", "code"),
     [
-        (["--to", "tcp://127.0.0.1:9", "-o", "a.h5"], "--to and --output both say where measurements go; give one", 2),
-        (["--spool", "spool"], "--ring, --key and --server-key are about a central node; give --to, too", 2),
-        (["--ring", "1"], "--ring, --key and --server-key are about a central node; give --to, too", 2),
-        (["--to", "tcp://127.0.0.1:9", "--spool-size", "1"], "--spool-size is given without --spool; give its", 2),
+        (["--to", "tcp://127.0.0.1:9", "-o", "a.h5"], "--to and --output exclude each other; give one", 2),
+        (["--spool", "spool"], "--ring, --key and --server-key need a central node; add --to", 2),
+        (["--ring", "1"], "--ring, --key and --server-key need a central node; add --to", 2),
+        (["--to", "tcp://127.0.0.1:9", "--spool-size", "1"], "--spool-size is given without --spool; add --spool", 2),
         (["--to", "here"], "address 'here' cannot be used; give tcp://HOST:PORT", 1),
         (["--to", "tcp://10.1.1.1:5601"], "can be reached from other machines, and there are no keys", 1),
         (["--to", "tcp://127.0.0.1:9", "--spool", "settings.toml"], "settings.toml: File exists; give a folder for", 1),
         (["--to", "tcp://127.0.0.1:9", "--spool", "/proc"], "/proc: No such file or directory; give a folder for", 1),
-        (["--to", "tcp://127.0.0.1:9", "--ring", "0.1"], "--ring is 0.1 MB, and a measurement has 0.131 MB; give", 1),
+        (["--to", "tcp://127.0.0.1:9", "--ring", "0.1"], "--ring is 0.1 MB, but one measurement has 0.131 MB; give", 1),
         (["--to", "tcp://127.0.0.1:9", "--spool", "s", "--spool-size", "1e-9"], "--spool-size is 1e-09 MB, and a", 1),
         (["--mounting", "none.toml"], "none.toml", 1),
-        (["--mounting", "empty.toml"], "does not hold sensor 'one'; add it, or choose one of sensor by --name", 1),
+        (["--mounting", "empty.toml"], "does not contain sensor 'one'; add it, or choose one of sensor with --name", 1),
     ],
 )
 def test_errors_are_one_line(tmp_path, arguments, message, code):

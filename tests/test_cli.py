@@ -453,4 +453,4 @@ def test_one_microphone_tells_no_directions(tmp_path):
     for settings, count in ((SMALL, 0), (alone, 1)):
         path = write_energyscapes(tmp_path / f"{count}.h5", [image(settings=settings)])
         stated = run("peaks", path).stderr
-        assert stated.count("note: sensor sensor has one microphone, which tells ranges but no directions") == count
+        assert stated.count("note: sensor sensor has one microphone; its images show ranges but no directions") == count

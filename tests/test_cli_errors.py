@@ -88,17 +88,21 @@ CASES = {
     "range outside": ("process rec.h5 -o out.h5 --range 1:50", 1, "processing.range_m ends at 50 m, but the record"),
     "range backwards": ("process rec.h5 -o out.h5 --range 3:1", 1, "processing.range_m runs from 3 to 1; give the"),
     "range NaN": ("process rec.h5 -o out.h5 --range nan:1", 1, "processing.range_m is nan; give a finite number"),
-    "no range": ("process rec.h5 -o out.h5 --range 3", 2, "'3' is no interval, give two numbers as in 0.5:5"),
+    "no range": ("process rec.h5 -o out.h5 --range 3", 2, "'3' is not an interval; give two numbers, as in 0.5:5"),
     "limits of a paper grid": (
         "process rec.h5 -o out.h5 --directions 90 --azimuth -9:9",
         2,
-        "directions 90 have limits of their own; give 2d:N or 3d:N with limits; see 'ertis process --help'",
+        "directions 90 have fixed limits; give --directions 2d:N or 3d:N with limits; see 'ertis process --help'",
     ),
-    "limits of a CSV": ("process rec.h5 -o out.h5 --directions mine.csv --azimuth -9:9", 2, "mine.csv have limits of"),
+    "limits of a CSV": (
+        "process rec.h5 -o out.h5 --directions mine.csv --azimuth -9:9",
+        2,
+        "mine.csv have fixed limits",
+    ),
     "elevation of a plane": (
         "process rec.h5 -o out.h5 --directions 2d:9 --elevation 20:50",
         2,
-        "directions 2d:9 lie at elevation 0; give 3d:N with --elevation; see",
+        "directions 2d:9 lie at elevation 0; give --directions 3d:N with --elevation; see",
     ),
     "unknown device": (
         "process rec.h5 -o out.h5 --device tpu",
@@ -145,17 +149,17 @@ CASES = {
     "no truth": (
         "compare img.h5",
         1,
-        "img.h5: sensor sensor holds no truth; simulate a scene to get one, and process that recording",
+        "img.h5: sensor sensor holds no ground truth; simulate a scene and process that recording",
     ),
     "no truth to list": (
         "peaks img.h5 --truth",
         1,
-        "img.h5: sensor sensor holds no truth; simulate a scene to get one",
+        "img.h5: sensor sensor holds no ground truth; simulate a scene",
     ),
     "part of the truth": (
         "peaks truth.h5 --truth --top 3",
         2,
-        "--top leaves out what --truth asks for; give one of them; see 'ertis peaks --help'",
+        "--top would omit reflectors that --truth compares; give one of them; see 'ertis peaks --help'",
     ),
     # usage
     "unknown command": ("prozess", 2, "No such command 'prozess'"),

@@ -23,7 +23,7 @@ CASES = {
     "plot r.h5 -o a.png --kind signals --microphone -1": "--microphone is -1; give a whole number",
     "plot eRTIS_v2 -o a.png --kind array --frequency 0": "--frequency is 0; give a number above 0",
     "plot eRTIS_v2 -o a.png --kind array --steer 100:0": (
-        "Invalid value for '--steer': '100:0' is no direction, give azimuth and elevation, each from -90"
+        "Invalid value for '--steer': '100:0' is not a direction; give azimuth and elevation, each from -90"
     ),
     "process r.h5 -o a.h5 --threads 0": "--threads is 0; give a whole number from 1",
     "plot r.h5 -o a.png -m 5": "--measurement is 5; give",  # as always
@@ -66,4 +66,4 @@ def test_one_number_is_no_direction(folder, monkeypatch):
     monkeypatch.chdir(folder)
     done = CliRunner().invoke(cli, ["plot", "eRTIS_v2", "-o", "a.png", "--kind", "array", "--steer", "30"])
     assert done.exit_code == 2
-    assert "'30' is no direction, give azimuth and elevation, each from -90 to 90, as in 30:0" in done.stderr
+    assert "'30' is not a direction; give azimuth and elevation, each from -90 to 90, as in 30:0" in done.stderr

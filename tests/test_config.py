@@ -80,7 +80,7 @@ def test_some_variables_are_of_all_commands(images):
         ("ERTIS_THREAD", "did you mean 'ERTIS_THREADS'?"),
         ("ERTIS_CACHEDIR", "did you mean 'ERTIS_CACHE_DIR'?"),
         ("ERTIS_KEYS_NEW_DIRR", "did you mean 'ERTIS_KEYS_NEW_DIR'?"),
-        ("ERTIS_PORT_5601_TCP", "unset it if nobody needs it"),  # which may be somebody else's
+        ("ERTIS_PORT_5601_TCP", "unset it if no other program needs it"),  # which may be somebody else's
     ],
 )
 def test_a_variable_of_nothing_is_warned_of(images, name, meant):
@@ -89,7 +89,7 @@ def test_a_variable_of_nothing_is_warned_of(images, name, meant):
     done = ertis("info", "img.h5", "--json", folder=folder, **{name: "3"})
     assert done.returncode == 0
     assert json.loads(done.stdout)
-    assert done.stderr == f"ertis: warning: the variable {name} is known to no command; {meant}\n"
+    assert done.stderr == f"ertis: warning: no command reads the variable {name}; {meant}\n"
 
 
 def test_variables_that_are_no_options_are_known(images):
@@ -110,7 +110,7 @@ def test_variables_that_are_no_options_are_known(images):
     ("line", "message"),
     [
         ("proces a.h5", "No such command 'proces' (did you mean 'process'?); see 'ertis --help'"),
-        ("xyz", "No such command 'xyz' (there are bench, capture, compare, "),
+        ("xyz", "No such command 'xyz' (choose one of bench, capture, compare, "),
     ],
 )
 def test_a_command_that_is_not_known(tmp_path, line, message):
@@ -123,9 +123,9 @@ def test_a_command_that_is_not_known(tmp_path, line, message):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("[proces]\n", "'proces' is no command; did you mean 'process'?"),
+        ("[proces]\n", "'proces' is not a command; did you mean 'process'?"),
         ("[process]\nmax_errors = 1\n", "process has no option 'max_errors'; did you mean 'max-error'?"),
-        ("[keys.new]\nfoo = 1\n", "keys new has no option 'foo'; there are "),
+        ("[keys.new]\nfoo = 1\n", "keys new has no option 'foo'; choose one of "),
         ("process = 3\n", "process is 3; give a table of options, as in [process]"),
         ("[process]\nthreads = 'x'\n", "'x' is not a valid integer (from ertis.toml)"),
         ("[process\n", "give a readable TOML file (--config)"),

@@ -136,7 +136,7 @@ def test_page_without_markers_is_refused():
     assert sorted(gallery.SHOWN) == SCENES
     reported = gallery.replaced("a <!-- scene x -->old<!-- /scene x --> b", "scene x", "new")
     assert reported == "a <!-- scene x -->\nnew\n<!-- /scene x --> b"
-    with pytest.raises(SystemExit, match="the page has no place for 'scene y'; give it <!-- scene y --> and"):
+    with pytest.raises(SystemExit, match="the page has no markers for 'scene y'; add <!-- scene y --> and"):
         gallery.replaced(reported, "scene y", "new")
 
 

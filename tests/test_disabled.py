@@ -179,7 +179,7 @@ def test_advice_on_faulty_microphones_can_be_followed(recording, tmp_path):
 @pytest.mark.parametrize(
     ("channels", "message"),
     [
-        ("x", "'x' is not a list of channels; give whole numbers as in 5,12"),
+        ("x", "'x' is not a list of channels; give integers, as in 5,12"),
         ("40", "array.disabled is 40; give a whole number from 0 to 31"),
     ],
 )

@@ -59,7 +59,7 @@ def test_threads_that_take_turns(doctor, monkeypatch):
 def test_a_slow_disk(doctor, monkeypatch):
     monkeypatch.setattr(_diagnosis, "_commits_s", lambda _: [1.0] * 3)
     assert doctor()["disk"] == [
-        ("bad", "5 MB/s durably, the slowest 5 MB in 1000 ms: less than a sensor at 20 Hz",
+        ("bad", "5 MB/s durably, slowest 5 MB in 1000 ms: less than one sensor at 20 Hz",
          "record to another disk, or at a lower rate"),
     ]  # fmt: skip
 
@@ -81,7 +81,7 @@ def test_a_port_that_may_not_be_opened(doctor, monkeypatch, tmp_path):
     may = os.access
     monkeypatch.setattr(os, "access", lambda which, *how: which != str(path) and may(which, *how))
     state, text, remedy = doctor()["sensors"][0]
-    assert (state, "may not be opened by you" in text) == ("bad", True)
+    assert (state, "lack permission to open" in text) == ("bad", True)
     assert remedy == permission(path)
 
 
@@ -111,7 +111,7 @@ def test_what_would_permit_to_open_a_port(monkeypatch, group_id, mode, remedy):
         assert reported == remedy
         return
     assert "usermod -aG root" not in reported
-    assert re.search(r"""write 'KERNEL=="ttyACM\*", .*' into /etc/udev/rules.d/\S+\.rules""", reported)
+    assert re.search(r"""write 'KERNEL=="ttyACM\*", .*' to /etc/udev/rules.d/\S+\.rules""", reported)
 
 
 def test_all_extras_are_looked_at(doctor):
@@ -137,7 +137,7 @@ def test_an_extra_that_is_not_there_in_full(doctor, monkeypatch):
     monkeypatch.setattr(
         _diagnosis.importlib.util, "find_spec", lambda name: None if name == "websockets" else there(name)
     )
-    assert doctor()["extra view"] == [("note", "not installed", "pip install 'ertis-numba[view]', if you want it")]
+    assert doctor()["extra view"] == [("note", "not installed", "optional: pip install 'ertis-numba[view]'")]
 
 
 def test_a_gpu_that_cannot_be_used(doctor, monkeypatch):
@@ -169,7 +169,7 @@ def test_what_is_broken_hides_nothing_else(doctor, monkeypatch):
 
     monkeypatch.setitem(_diagnosis.CHECKS, "gpu", breaks)
     found = doctor()
-    assert found["gpu"] == [("bad", "could not be looked at: of all things", "tell its authors")]
+    assert found["gpu"] == [("bad", "check failed: of all things", "report this as a bug")]
     assert "disk" in found
 
 
@@ -180,4 +180,4 @@ def test_for_people(tmp_path):
     assert any(line.startswith("ok") for line in lines)
     refused = CliRunner().invoke(cli, ["doctor", "--folder", str(tmp_path / "none")])
     assert refused.exit_code == 1
-    assert "is no folder; give one that is there" in refused.output
+    assert "is not a folder; give an existing folder" in refused.output

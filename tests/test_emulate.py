@@ -193,13 +193,13 @@ def test_the_command_renders_a_scene(emulate, tmp_path):
 @pytest.mark.parametrize(
     ("options", "code", "message"),
     [
-        (["--fault", "lose"], 2, "'lose' is no fault, give a kind and a probability as in lose=0.01"),
+        (["--fault", "lose"], 2, "'lose' is not a fault; give a kind and a probability, as in lose=0.01"),
         (["--fault", "loose=1"], 1, "kind of fault 'loose' is unknown (did you mean 'lose'?)"),
-        (["--count", "3"], 2, "--count is of scenes; a recording has its own"),
-        (["--link", "here"], 2, "--link is of one device, but rec.h5 has 2 sensors; choose one with --sensor"),
+        (["--count", "3"], 2, "--count is for scenes; remove it for a recording"),
+        (["--link", "here"], 2, "--link is for one device, but rec.h5 has 2 sensors; choose one with --sensor"),
         (["--sensor", "middle"], 1, "rec.h5 has no sensor 'middle'; choose one of left, right"),
         (["--sync-rate", "0"], 2, "0.0 is not in the range 0.001<=x<=1000.0"),
-        (["--unplug", "3"], 2, "'3' is no interval"),
+        (["--unplug", "3"], 2, "'3' is not an interval"),
     ],
 )
 def test_the_command_refuses_what_it_cannot_do(recording, options, code, message):

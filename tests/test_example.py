@@ -77,7 +77,7 @@ def test_demo_keeps_files_of_an_earlier_one():
     folder.mkdir()
     (folder / "image.png").write_text("mine")
     reported = run("demo", code=1).stderr
-    assert "image.png exists; give another folder (-o), or ask to overwrite it (--force)" in reported
+    assert "image.png exists; give another folder (--output), or overwrite it (--force)" in reported
     assert (folder / "image.png").read_text() == "mine"
 
 

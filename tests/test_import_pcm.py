@@ -396,8 +396,9 @@ def test_times_and_what_hinders_are_told(tmp_path):
     more = ("--length", 0.015625, "--start", "2026-05-04T14:30:00.5+0200")
     done = CliRunner().invoke(cli, [str(argument) for argument in (*arguments, *more)])
     assert done.exit_code == 0, done.output
-    assert "note: 0.0005208 s at the ends of files are left out" in done.stderr
-    assert "note: it cannot be processed as it is: processing.range_m ends at 50 m, but the record" in done.stderr
+    assert "note: 0.0005208 s at the ends of files were left out" in done.stderr
+    note = "note: this recording cannot be processed with its own settings"
+    assert f"{note}: processing.range_m ends at 50 m, but the record" in done.stderr
     with open_recording(tmp_path / "rec.h5") as recording:
         times_s = [stamp.timestamp_ns / 1e9 for stamp in recording.stamps()]
     assert times_s == pytest.approx([1_777_897_800.5, 1_777_897_800.515625])
@@ -429,14 +430,14 @@ def test_starts_that_no_recording_can_hold(tmp_path, start):
     done = CliRunner().invoke(cli, arguments)
     assert done.exit_code == 2
     assert f"'--start': {start[:16]}" in done.stderr
-    assert "is no time from 1970 to 2262, which a recording can hold; give another" in done.stderr
+    assert "is outside the range of a recording; give a time from 1970 to 2262" in done.stderr
 
 
 def test_a_recording_needs_another_name_than_its_file(tmp_path):
     path = write_acoular(tmp_path / "ac.h5", numbers().astype(np.float32), RATE_HZ)
     done = CliRunner().invoke(cli, ["import", str(path)])
     assert done.exit_code == 2
-    assert f"{path} cannot become a recording of the same name; give another one (--output)" in done.stderr
+    assert f"{path} cannot become a recording of the same name; give another name (--output)" in done.stderr
 
 
 def test_options_of_pcm_are_refused_for_words(tmp_path):
@@ -444,4 +445,4 @@ def test_options_of_pcm_are_refused_for_words(tmp_path):
     for option, value in (("--skip", "1"), ("--length", "1"), ("--start", "2026-05-04T12:30:00")):
         done = CliRunner().invoke(cli, ["import", str(tmp_path / "a.bin"), option, value])
         assert done.exit_code == 2
-        assert f"{option} is for PCM (.wav, .h5); leave it out" in done.stderr
+        assert f"{option} is for PCM (.wav, .h5); remove it" in done.stderr

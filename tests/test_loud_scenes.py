@@ -86,7 +86,7 @@ def test_bench_fails_where_a_verdict_is_wrong(monkeypatch):
     assert {row["effect"] for row in report["wrong"]} <= set(EFFECTS)
     assert done.exit_code
     refused = CliRunner().invoke(cli, ["bench", "simulation", "--verdicts", "2", "--update", __file__])
-    assert "--verdicts writes no table; leave out --update" in refused.stderr
+    assert "--verdicts writes no table; remove --update" in refused.stderr
 
 
 def test_disc_too_near_for_its_model_is_noted():

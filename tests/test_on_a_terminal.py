@@ -226,10 +226,10 @@ def test_help_says_what_json_is():
             about |= {f"{name} {member.name}": option.help for option in member.params if "--json" in option.opts}
     assert all("JSON" in text and "stdout" in text for text in about.values())
     for name in ("capture", "listen"):
-        assert "one object a line for each" in about[f"{name} {name}"]
-    assert "with --watch one a line" in about["status status"]
-    assert "one a line where there are several" in about["process process"]
-    assert "one a line where there are several" in about["info info"]
+        assert "one object per line for each" in about[f"{name} {name}"]
+    assert "with --watch one per line" in about["status status"]
+    assert "one per line if there are several" in about["process process"]
+    assert "one per line if there are several" in about["info info"]
 
 
 def test_every_line_of_json_is_an_object(capsys):

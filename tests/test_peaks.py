@@ -55,8 +55,8 @@ def test_options_of_cfar(images):
 @pytest.mark.parametrize(
     ("options", "code", "match"),
     [
-        ("--false-alarm 1e-3", 2, "--false-alarm is for --detector cfar; give both"),
-        ("--detector cfar --truth", 2, "--truth compares with --detector peaks; leave out one"),
+        ("--false-alarm 1e-3", 2, "--false-alarm needs --detector cfar; add it"),
+        ("--detector cfar --truth", 2, "--truth needs --detector peaks; remove --truth or"),
         ("--detector cfar --false-alarm 2", 1, "--false-alarm is 2; give a number from 1e-09 to 0.5"),
     ],
 )

@@ -76,7 +76,7 @@ def test_explains_in_words(recording, tmp_path):
     assert any(line.startswith("    in total") for line in lines)
     assert lines[-1].startswith("  predicted time")
     bent = run(recording, "-o", tmp_path / "b.h5", "--explain", "--wavefront", "spherical").stderr
-    assert "spherical wavefronts, with delays of their own in" in bent
+    assert "spherical wavefronts, with separate delays in" in bent
     assert "against spherical ones" not in bent
     assert "    one set of delays for each focal zone" in bent
 
@@ -86,7 +86,7 @@ def test_explains_simple_interpolation(recording, tmp_path):
     wishes.write_text('[accuracy]\ninterpolation = "linear"\nbeam_taps = 0\nprecision = "float32"\n', "utf-8")
     reported = run(recording, "-o", tmp_path / "a.h5", "--explain", "--settings", wishes).stderr
     assert "single precision" in reported
-    assert "made of two of them along a straight line" in reported
+    assert "interpolated linearly from two samples" in reported
     assert "every direction's own beam is summed" in reported
 
 
@@ -150,9 +150,9 @@ def test_refuses_a_budget_that_no_plan_keeps(recording, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (["--max-error", "good"], "'good' is no error, give dB as in -40, or draft, standard, fine, exact"),
-        (["--method", "paper", "--explain"], "--explain is for --method fast; the paper's method has no plan"),
-        (["--method", "paper", "--max-error", "fine"], "--max-error is for --method fast"),
+        (["--max-error", "good"], "'good' is not an error budget; give dB, as in -40, or draft, standard, fine, exact"),
+        (["--method", "paper", "--explain"], "--explain needs --method fast; method 'paper' has no plan"),
+        (["--method", "paper", "--max-error", "fine"], "--max-error needs --method fast"),
     ],
 )
 def test_refuses_what_has_no_plan(recording, arguments, reported):

@@ -209,6 +209,6 @@ def test_no_devices_at_all(monkeypatch):
     done = listed()
     assert (done.stdout, done.stderr) == (
         "",
-        "no eRTIS was found; plug one in, or start an emulated one with 'ertis emulate'\n",
+        "no eRTIS found; plug one in, or start an emulated one with 'ertis emulate'\n",
     )
     assert json.loads(listed("--json").stdout) == {"devices": []}

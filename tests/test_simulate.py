@@ -159,7 +159,7 @@ def test_it_says_when_modulators_are_overloaded(tmp_path):
     path.write_text(SCENE.replace(points=(SCENE.points[0].replace(strength_db=10.0),)).to_toml(), encoding="utf-8")
     result = simulate(path)
     assert result.exit_code == 0
-    assert "of full scale, and modulators follow up to 0.6; lower emitter.level_db" in result.stderr
+    assert "of full scale, but modulators follow only up to 0.6; lower emitter.level_db" in result.stderr
 
 
 def test_it_writes_to_no_device_and_no_link(scene_file, tmp_path):

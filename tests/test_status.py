@@ -223,7 +223,7 @@ def test_a_central_node_that_goes_away_is_waited_for(monkeypatch, as_json):
         assert events[1] == {"event": "away", "address": BUSY.address, "text": "it has not answered"}
     else:
         reported = [line for line in result.stdout.splitlines() if line.startswith("away: ")]
-        assert reported == [f"away: {why}; it said before:" for why in ("it has not answered", "it hung up")]
+        assert reported == [f"away: {why}; last status:" for why in ("it has not answered", "it hung up")]
 
 
 def _printed(status):
@@ -260,7 +260,7 @@ def test_a_table_says_all_that_somebody_should_look_at():
 @pytest.mark.parametrize(
     ("recording", "fault", "told"),
     [
-        ("", "", "no recording is begun"),
+        ("", "", "no recording yet"),
         ("", "the disk is full", "nothing can be written"),
         ("a.h5", "", "a.h5 is written, 0 MB in its journal"),
     ],

@@ -138,7 +138,7 @@ def test_recordings_without_a_mounting_are_exported_in_the_sensors_own_frame(tmp
         assert (recording.translation_m, recording.rotation_xyzw) == (None, None)
     done = CliRunner().invoke(cli, ["export", str(path), "-o", str(tmp_path / "a.ply"), "--top", "3"])
     assert done.exit_code == 0, done.stderr
-    assert "note: the mounting of sensor left is unknown; the export is in the frame of the sensor" in done.stderr
+    assert "note: the mounting of sensor left is unknown; the export uses the frame of the sensor" in done.stderr
     assert "frame left" in plyfile.PlyData.read(tmp_path / "a.ply").comments
     info = CliRunner().invoke(cli, ["info", str(path), "--json"])
     assert '"mounting": "unknown"' in info.stdout
@@ -158,7 +158,7 @@ def test_several_sensors_without_a_mounting_are_not_laid_over_one_another(tmp_pa
         assert "frame base_link" in plyfile.PlyData.read(tmp_path / "a.ply").comments
     done = CliRunner().invoke(cli, [*command, "--mounting", str(path), "--force"])
     assert done.exit_code == 1
-    assert "rec.h5 does not hold the mounting of any sensor; give a scene" in done.stderr
+    assert "rec.h5 contains no mounting of a sensor; give a scene" in done.stderr
 
 
 def test_processing_keeps_that_a_mounting_is_unknown(tmp_path):
@@ -248,7 +248,7 @@ def test_process_takes_mountings_that_the_recording_lacks(tmp_path):
                 np.testing.assert_allclose(held, wanted)
     bare = CliRunner().invoke(cli, ["process", str(unknown), "-o", str(tmp_path / "b.h5"), "--mounting", str(unknown)])
     assert bare.exit_code == 1
-    assert "does not hold the mounting of any sensor" in bare.stderr
+    assert "contains no mounting of a sensor" in bare.stderr
 
 
 def test_process_makes_images_anew_for_another_mounting(tmp_path):

@@ -29,29 +29,35 @@ BIND = socket.socket.bind
     ("arguments", "told"),
     [
         (("missing.h5",), "missing.h5"),
-        (("127.0.0.1:5602",), "'127.0.0.1:5602' is no file; give tcp://127.0.0.1:5602, if that is where"),
-        (("tcp:127.0.0.1:5602",), "'tcp:127.0.0.1:5602' is no file; give tcp://127.0.0.1:5602, if that is where"),
+        (
+            ("127.0.0.1:5602",),
+            "'127.0.0.1:5602' is not a file; for the address of a central node, give tcp://127.0.0.1:5602",
+        ),
+        (
+            ("tcp:127.0.0.1:5602",),
+            "'tcp:127.0.0.1:5602' is not a file; for the address of a central node, give tcp://127.0.0.1:5602",
+        ),
         (("IMG", "--save-html", "p.png"), "page format '.png' is unknown; known are .html, .htm"),
         (("IMG", "--sensor", "back"), "back"),
         (("IMG", "--decay", "99"), "--decay is 99; give"),
         (("IMG", "--range", "5:1"), "--range runs from 5 to 1"),
-        (("IMG", "--key", "viewer"), "--key is for an address; leave it out with a file that is shown"),
+        (("IMG", "--key", "viewer"), "--key is for an address; remove it with playback of a file"),
         (("IMG", "--server-key", "key"), "--server-key is for an address"),
         (("IMG", "--threshold", "5"), "--threshold is 5; give a number from -60 to 0"),
         (("IMG", "--save-html", "OTHER"), "other.html exists; give another name, or ask to overwrite it (--force)"),
         (("IMG", "--save-html", "IMG", "--force"), "img.h5 is the input itself; give another name"),
-        (("IMG", "--save-html", "p.html", "--duration", "1"), "--duration is for an address or a file that is shown"),
-        (("IMG", "--save-html", "p.html", "--loop"), "--loop is for a file that is shown; leave it out with a file"),
-        (("IMG", "--save-html", "p.html", "--host", "0.0.0.0"), "--host is for an address or a file that is shown"),
+        (("IMG", "--save-html", "p.html", "--duration", "1"), "--duration is for an address or playback of a file"),
+        (("IMG", "--save-html", "p.html", "--loop"), "--loop is for playback of a file; remove it with a file"),
+        (("IMG", "--save-html", "p.html", "--host", "0.0.0.0"), "--host is for an address or playback of a file"),
         (("IMG", "--save-html", "p.html", "--port", "1"), "--port is for"),
         (("IMG", "--save-html", "p.html", "--no-open"), "--open is for"),
-        (("IMG", "--force"), "--force is for --save-html; leave it out"),
+        (("IMG", "--force"), "--force is for --save-html; remove it"),
         (("IMG", "--duration", "0"), "--duration is 0; give a number above 0"),
         (("tcp://0.0.0.0:5602",), "keys"),
-        (("tcp://127.0.0.1:5602", "--loop"), "--loop is for a file that is shown; leave it out with an address"),
+        (("tcp://127.0.0.1:5602", "--loop"), "--loop is for playback of a file; remove it with an address"),
         (
             ("tcp://127.0.0.1:5602", "--device", "cpu"),
-            "--device is for a file that is shown or a file that --save-html",
+            "--device is for playback of a file or a file that --save-html",
         ),
     ],
 )
@@ -137,7 +143,7 @@ def test_who_interrupts_the_compiler_is_told_that_it_ends_first(tmp_path, monkey
     monkeypatch.setattr(Viewer, "prepare", compiling)
     done = CliRunner().invoke(cli, ["view", str(path), "--save-html", str(tmp_path / "page.html")])
     assert done.exit_code == 128 + signal.SIGINT, (done.stderr, done.exception)
-    assert done.stderr.splitlines()[0] == "ending when that is done; Ctrl-C again ends at once"
+    assert done.stderr.splitlines()[0] == "ending after this step; press Ctrl-C again to end at once"
     assert [each.name for each in tmp_path.iterdir()] == ["img.h5"]
 
 
@@ -148,7 +154,8 @@ def test_a_live_view_without_images_is_no_success(tmp_path):
         done = CliRunner().invoke(cli, command.split())
     assert done.exit_code == 1
     last = done.stderr.splitlines()[-1]
-    assert last.endswith(f"no image of {publisher.address} was shown, and {page} is not written; see that sensors send")
+    reason = f"no image of {publisher.address} was shown; check that sensors send measurements"
+    assert last.endswith(f"{page} is not written, because {reason}")
     assert not page.exists()
 
 

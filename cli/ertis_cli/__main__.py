@@ -6,7 +6,7 @@ _INTERRUPTED = 130
 
 
 def main() -> None:
-    """Install the signal handlers, then load and run the command line; by default, Ctrl-C would print a traceback."""
+    """Install the signal handlers, then run the command line. By default, Ctrl-C would print a traceback."""
     try:
         code = _run()
     except KeyboardInterrupt:  # A signal arrived before the handlers were installed.
@@ -18,8 +18,7 @@ def _run() -> str | int | None:
     import gc
     import signal
 
-    # Imports create hundreds of thousands of permanent objects. A garbage collection of them takes 60 ms.
-    gc.set_threshold(50_000)
+    gc.set_threshold(50_000)  # imports create many permanent objects; scanning them takes 60 ms
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         # Signals end the process at once until the handlers are installed, after some imports.
         signal.signal(signal.SIGINT, signal.SIG_DFL)
@@ -38,7 +37,7 @@ def _run() -> str | int | None:
     except Exception as error:
         if not interruption.caused(error):
             raise
-        # Python turns the exception of a signal into a RuntimeError if it arrives while a class is created.
+        # Python turns the exception of a signal into a RuntimeError while a class is created.
         code = _interrupted() if interruption.code == _INTERRUPTED else interruption.code
     finally:
         interruption.end()

@@ -1,4 +1,4 @@
-"""Output of the commands that run a central node."""
+"""Options and progress reports shared by the commands that run a central node."""
 
 import json
 import sys
@@ -30,7 +30,7 @@ __all__ = ["CentralWatch", "archive", "max_bytes", "name", "report", "rotate_eve
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 name: Decorator = click.option(
-    "--name", default="recording", show_default=True, help="Prefix of the recordings' names, before the time."
+    "--name", default="recording", show_default=True, help="Name of recordings, followed by the time."
 )
 rotate_size: Decorator = click.option(
     "--rotate-size",
@@ -38,7 +38,7 @@ rotate_size: Decorator = click.option(
     default=2000.0,
     show_default=True,
     metavar="MB",
-    help="Size at which a recording is full.",
+    help="Size at which a new recording starts.",
 )
 rotate_every: Decorator = click.option(
     "--rotate-every",
@@ -46,14 +46,15 @@ rotate_every: Decorator = click.option(
     default=600.0,
     show_default=True,
     metavar="S",
-    help="Duration after which a new recording begins.",
+    help="Age at which a new recording starts.",
 )
 max_bytes: Decorator = click.option(
     "--max-bytes",
+    "max_bytes",
     type=int,
     default=4 * 2**20,
     show_default=True,
-    help="Limit on the size of a measurement; larger ones are refused.",
+    help="Largest measurement; larger ones are refused.",
 )
 
 _REFRESH_S = 0.5
@@ -61,7 +62,7 @@ _EXPECTED = {"listening", "joined", "left", "resumed", "sealed"}
 
 
 class CentralWatch:
-    """Events as JSON lines on stdout and as a log on stderr, and a status line on terminals.
+    """Reporter of a central node: JSON lines on stdout, log lines and, on a terminal, a progress line on stderr.
 
     Parameters
     ----------
@@ -74,14 +75,16 @@ class CentralWatch:
     life : Life
     quiet, as_json : bool
     recordings : list of str
-        Names of the finished recordings.
+        Sealed recordings.
     """
 
     def __init__(self, life: "Life", *, quiet: bool, as_json: bool) -> None:
         from ertis_numba.network.log import logger, show
 
-        # The event loop must not wait for readers of these streams.
-        self._out, self._err = JsonLines(sys.stdout), JsonLines(sys.stderr)
+        self._out, self._err = (
+            JsonLines(sys.stdout),
+            JsonLines(sys.stderr),
+        )  # a slow reader must not block the event loop
         show(level="CRITICAL" if quiet else "INFO", stream=self._err)
         self._log = logger("central_node")
         self.life, self.quiet, self.as_json = life, quiet, as_json
@@ -93,7 +96,7 @@ class CentralWatch:
             self.event({"event": "restarted", "restarts": life.restarts, "reason": life.reason})
 
     def event(self, event: dict[str, Any]) -> None:
-        """Print an event of the central node."""
+        """Report an event of the central node."""
         if event["event"] == "sealed" and event["recording"] is not None:
             self.recordings.append(event["recording"])
         self.life.note(event)
@@ -107,7 +110,7 @@ class CentralWatch:
         (self._log.info if event["event"] in _EXPECTED else self._log.warning)(event["event"], **fields)
 
     def stored(self, sensor: str, session_id: int, sequence: int, crc32: int) -> None:
-        """Print a measurement that is on disk."""
+        """Report a durable measurement."""
         self._print(
             {"event": "stored", "sensor": sensor, "session_id": session_id, "sequence": sequence, "crc32": crc32}
         )
@@ -116,7 +119,7 @@ class CentralWatch:
         self._out.write(f"{json.dumps(event, allow_nan=False)}\n")
 
     def shows(self, status: "Callable[[], Status]") -> "Self":
-        """Draw a status line on a terminal until the ``with`` block ends."""
+        """Draw a progress line on a terminal until the ``with`` block ends."""
         if self._line:
             self._thread = threading.Thread(target=self._draw, args=(status,), daemon=True)
         return self
@@ -135,7 +138,7 @@ class CentralWatch:
             self._err.write("\r\x1b[K")
 
     def close(self) -> None:
-        """Print the pending lines."""
+        """Write pending lines, and report lines that were dropped."""
         if self._out.lost:
             self._print({"event": "untold", "count": self._out.lost})
         self._out.close()
@@ -147,12 +150,12 @@ class CentralWatch:
 
 
 def archive(folder: Path, name: str, rotate_mb: float, rotate_s: float) -> "Archive":
-    """Return the archive that the options describe.
+    """Return an archive that stores measurements according to the options.
 
     Raises
     ------
     ArgumentError
-        One cannot be used.
+        An option has an invalid value.
     """
     from ertis_numba import checks
     from ertis_numba.errors import ArgumentError
@@ -182,7 +185,7 @@ def run(
     node : CentralNode
     watch : CentralWatch
     made : list of Path
-        New folders, from `ertis_cli._saving.withdrawn`.
+        New folders, as yielded by `ertis_cli._saving.withdrawn`; cleared once the node runs.
     metrics : Metrics or None
     duration_s : float or None
 
@@ -208,14 +211,14 @@ def size(n_bytes: float) -> str:
 
 
 def report(status: "Status", watch: CentralWatch, *, event: str) -> None:
-    """Print a summary; exit with code 1 if journals are left.
+    """Report the results of a central node; exit with code 1 if unsealed journals remain.
 
     Parameters
     ----------
     status : Status
     watch : CentralWatch
     event : str
-        Name of the summary's event.
+        Name of the JSON event.
     """
     import msgspec
 
@@ -258,13 +261,13 @@ def report(status: "Status", watch: CentralWatch, *, event: str) -> None:
         options.say(f"{sensor}: {', '.join(parts)}", quiet=quiet)
     if archive is not None and left:
         click.echo(
-            f"{options.counted(left, 'journal')} not sealed; recover with 'ertis recover {archive.folder}'", err=True
+            f"{options.counted(left, 'journal')} not sealed; seal with 'ertis recover {archive.folder}'", err=True
         )
         click.get_current_context().exit(1)
 
 
 def _progress(status: "Status") -> str:
-    """Return the status line."""
+    """Return the progress line."""
     sensors = status.sensors.values()
     parts = [
         f"{sum(each.connected for each in sensors)} sensors",

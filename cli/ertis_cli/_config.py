@@ -1,4 +1,4 @@
-"""Sources of options that are not given: environment variables, then a file, then defaults."""
+"""Values of options that are not on the command line: environment variables, then a file, then defaults."""
 
 import difflib
 import os
@@ -22,14 +22,14 @@ __all__ = [
 ]
 
 _GENERAL = frozenset({"device", "quiet", "threads"})
-"""Options with one meaning in all commands: ``ERTIS_THREADS`` applies to each."""
+"""Options with the same meaning in every command, such as ``ERTIS_THREADS``."""
 
 _NO_OPTIONS = frozenset(f"ERTIS_{name}" for name in ("BENCH_MARK", "CACHE_DIR", "CONFIG", "EMULATED_DIR", "KEYS_DIR"))
-"""Variables of other parts of this package, and of its benchmarks."""
+"""Variables that are not options: other parts of the package read them, and benchmarks mark their processes."""
 
 _FILE, _BROKEN = "ertis_cli.config_file", "ertis_cli.config_error"  # Keys of click's `Context.meta`.
 _WITHOUT = frozenset({"completion", "doctor"})
-"""Commands that run despite a faulty configuration file: shell completion and help."""
+"""Commands that run despite an invalid configuration: new shells run ``completion``, ``doctor`` finds faults."""
 
 
 def variable(path: Iterable[str], option: str) -> str:
@@ -38,13 +38,13 @@ def variable(path: Iterable[str], option: str) -> str:
 
 
 def add_variables(command: click.Command, path: tuple[str, ...]) -> None:
-    """Let environment variables set the options of a command and of its subcommands.
+    """Let environment variables set the options of a command and its subcommands.
 
     Parameters
     ----------
     command : click.Command
     path : tuple of str
-        Name of the command, after those of its groups.
+        Names of the groups that contain the command, then its own name.
     """
     for option, parameter in _options(command).items():
         if parameter.envvar is None:
@@ -56,11 +56,11 @@ def add_variables(command: click.Command, path: tuple[str, ...]) -> None:
 
 
 def unknown_variables(group: click.Group, ctx: click.Context) -> Iterator[str]:
-    """Yield a line for each variable that resembles an option's but matches none, with the closest match.
+    """Yield a message for each ``ERTIS_`` variable that no command reads, with a suggestion.
 
-    Variables of other programs may begin alike, such as those of a service in a cluster.
+    Other software may set such variables: a cluster names variables after its services.
     """
-    # A command is imported only if a variable begins like one of its options.
+    # A command is imported only if a variable begins with its prefix.
     commands = {variable((name,), ""): name for name in group.list_commands(ctx)}
     general = {variable((), option) for option in _GENERAL}
     for name in sorted(os.environ):
@@ -72,12 +72,12 @@ def unknown_variables(group: click.Group, ctx: click.Context) -> Iterator[str]:
         known = general | _NO_OPTIONS | set(_variables(command) if command else ())
         if name not in known:
             close = difflib.get_close_matches(name, sorted(known), n=1, cutoff=0.8)
-            meant = f"did you mean {close[0]!r}?" if close else "unset it if no program needs it"
-            yield f"no command has an option for the variable {name}; {meant}"
+            meant = f"did you mean {close[0]!r}?" if close else "unset it if no other program needs it"
+            yield f"no command reads the variable {name}; {meant}"
 
 
 def _variables(command: click.Command) -> Iterator[str]:
-    """Yield the variables of a command and of its subcommands."""
+    """Yield the variables of a command and its subcommands."""
     for option in _options(command).values():
         yield from [option.envvar] if isinstance(option.envvar, str) else option.envvar or ()
     if isinstance(command, click.Group):
@@ -86,7 +86,7 @@ def _variables(command: click.Command) -> Iterator[str]:
 
 
 def _options(command: click.Command) -> dict[str, click.Option]:
-    """Return options by their long names without dashes."""
+    """Return the options of a command by long name without dashes."""
     return {
         long_name(parameter): parameter
         for parameter in command.params
@@ -100,7 +100,7 @@ def long_name(option: click.Option) -> str:
 
 
 def _load(ctx: click.Context, _: click.Parameter, path: Path | None) -> None:
-    """Read the defaults of all commands from a file; errors are kept for commands that need the file."""
+    """Load the defaults of all commands from a file; `require_config` raises its errors later."""
     if path is not None:
         try:
             _take(ctx, path)
@@ -109,7 +109,7 @@ def _load(ctx: click.Context, _: click.Parameter, path: Path | None) -> None:
 
 
 def require_config(ctx: click.Context) -> str:
-    """Refuse to continue without the file of `config`; return its error for commands that do not need it."""
+    """Raise the error of the configuration file; for commands that run without one, return its message."""
     error: click.ClickException | None = ctx.meta.get(_BROKEN)
     if error is None:
         return ""
@@ -129,7 +129,7 @@ def _take(ctx: click.Context, path: Path) -> None:
 
 
 def _defaults(ctx: click.Context, group: click.Group, tables: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Return the defaults of a group's commands, by click's parameter names."""
+    """Return the defaults of a group's commands by click's parameter names."""
     found: dict[str, Any] = {}
     names = group.list_commands(ctx)
     for name, table in tables.items():
@@ -150,31 +150,30 @@ def _defaults(ctx: click.Context, group: click.Group, tables: Mapping[str, Any],
 
 
 def _value(value: Any) -> Any:
-    """Return a value as click expects it: as typed text, unless it is a list."""
+    """Return a value as click expects it: text as on the command line, a bool, or a list of these."""
     if isinstance(value, list):
         return [_value(each) for each in value]
     return value if isinstance(value, bool) else str(value)
 
 
 def instead(name: str, known: Iterable[str]) -> str:
-    """Return a suggestion for an unknown name."""
+    """Return a suggestion for an unknown name: the closest known name, or all known names."""
     known = sorted(known)
     near = difflib.get_close_matches(name, known, n=1)
     return f"did you mean {near[0]!r}?" if near else f"choose one of {', '.join(known)}"
 
 
 def typed(name: str) -> bool:
-    """Return True if an option of the running command was typed, by its Python name.
+    """Return True if an option of the running command, given by its Python name, is on the command line.
 
-    A configured default applies only if it fits the command: with two workers as default, a single recording can still
-    be processed.
+    Options from variables or a file apply only where they fit: with two workers as default, one recording still works.
     """
     source = click.get_current_context().get_parameter_source(name)
     return source is click.core.ParameterSource.COMMANDLINE
 
 
 def origin(error: click.UsageError) -> str:
-    """Return the source of a value that is not on the command line, or an empty text."""
+    """Return the variable or file that set a value; empty for a value on the command line."""
     ctx, parameter = error.ctx, getattr(error, "param", None)
     if ctx is None or not isinstance(parameter, click.Option) or parameter.name is None:
         return ""
@@ -195,5 +194,5 @@ config = click.option(
     is_eager=True,
     expose_value=False,
     callback=_load,
-    help="Configuration file with a table of options per command; typed options and variables override it.",
+    help="Default options, in one table per command; the command line and variables override them.",
 )

@@ -29,11 +29,11 @@ _EXTRAS: Final = {
     "ros": ("mcap", "mcap_ros2"),
     "view": ("viser", "websockets"),
 }
-"""Modules of each extra; a GPU's are checked with it."""
+"""Modules of each extra. The modules for a GPU are checked with the GPU."""
 
 _RULE: Final = 'KERNEL=="ttyACM*", GROUP="dialout", MODE="0660"'
 _SENSOR_MB_S: Final = 13.1
-"""Data rate of a sensor with 20 measurements of 655,360 bytes per second."""
+"""Data rate of a sensor that takes 20 measurements of 655,360 bytes per second."""
 
 _COMMIT_BYTES: Final = 5_000_000
 _COMMITS: Final = 20
@@ -43,15 +43,18 @@ _RUNS: Final = 5
 
 @dataclass(frozen=True, slots=True)
 class InstallationFinding:
-    """Result of one check.
+    """Finding about one part of an installation.
 
     Attributes
     ----------
-    what, text : str
+    what : str
+        Part that was checked.
     state : {"good", "note", "bad"}
-        ``bad`` means that a part does not work.
+        ``bad`` if something does not work.
+    text : str
+        Description of the state.
     remedy : str
-        Empty if no action is needed.
+        Action that fixes the problem; empty by default.
     """
 
     what: str
@@ -124,13 +127,13 @@ def _processor(_folder: Path) -> Iterator[InstallationFinding]:
     yield InstallationFinding(
         "threads",
         "note" if slow else "good",
-        f"Numba's {layer} layer" + (", which runs parallel images in turn" if slow else ""),
+        f"Numba's {layer} layer" + (", which computes only one image at a time" if slow else ""),
         "pip install tbb, or install OpenMP (libgomp1 on Debian, libomp on macOS)" if slow else "",
     )
 
 
 def _silence(n_samples: int) -> "NDArray[np.uint32]":
-    """Return words of alternating bits."""
+    """Return PDM words in which every other sample has all bits set."""
     import numpy as np
 
     return np.where(np.arange(n_samples) % 2, np.uint32(0xFFFFFFFF), np.uint32(0))
@@ -150,7 +153,7 @@ def _gpu(_folder: Path) -> Iterator[InstallationFinding]:
     wanted = importlib.util.find_spec("cupy") is not None
     if not driver and not wanted:
         yield InstallationFinding(
-            "GPU", "note", "no NVIDIA driver", "none is needed; to use one, install ertis-numba[cu12] or [cu13]"
+            "GPU", "note", "no NVIDIA driver", "optional: for an NVIDIA GPU, install ertis-numba[cu12] or [cu13]"
         )
         return
     try:
@@ -170,31 +173,33 @@ def _serial(_folder: Path) -> Iterator[InstallationFinding]:
         yield InstallationFinding(
             "sensors",
             "note",
-            "none connected",
+            "none plugged in",
             "plug one in, or run 'ertis example platform' and 'ertis emulate platform.toml'",
         )
     for port in ports:
         if os.access(port.path, os.R_OK | os.W_OK):
             yield InstallationFinding("sensors", "good", f"{port} can be opened")
         else:
-            yield InstallationFinding("sensors", "bad", f"no permission to open {port}", _permission(Path(port.path)))
+            yield InstallationFinding(
+                "sensors", "bad", f"you lack permission to open {port}", _permission(Path(port.path))
+            )
 
 
 def _permission(path: Path) -> str:
-    """Return the remedy for a port that cannot be opened."""
+    """Return the remedy for a missing permission to use a port."""
     if sys.platform == "win32":
-        return "end the program that uses it"
+        return "close the program that uses it"
     import grp
 
     status = path.stat()
-    # The group of root has far wider permissions, and a group without read and write permission does not help.
+    # Membership of root's group would grant too much. A group without read and write permission would not help.
     if status.st_gid and status.st_mode & 0o060 == 0o060 and status.st_gid not in os.getgroups():
         with suppress(KeyError):
             return f"run 'sudo usermod -aG {grp.getgrgid(status.st_gid).gr_name} $USER' and log in again"
     if sys.platform != "linux":
-        return "ask its owner for group permission to read and write"
+        return "ask the owner of the port to give your group read and write permission"
     return (
-        f"as root, write '{_RULE}' into /etc/udev/rules.d/60-ertis.rules, plug it in again and join the group 'dialout'"
+        f"as root, write '{_RULE}' to /etc/udev/rules.d/60-ertis.rules, join the group 'dialout' and plug it in again"
     )
 
 
@@ -207,31 +212,31 @@ def _disk(folder: Path) -> Iterator[InstallationFinding]:
         "room",
         "note" if scarce else "good",
         f"{free / 1e9:.0f} GB free in {folder}, {free / (60e6 * _SENSOR_MB_S):.0f} min of a sensor at 20 Hz",
-        "give a folder with more free space" if scarce else "",
+        "choose a folder with more free space (--folder)" if scarce else "",
     )
     try:
         times_s = _commits_s(folder)
     except OSError as error:
         yield InstallationFinding(
-            "disk", "bad", f"{folder} is not writable ({error.strerror})", "give a writable folder (--folder)"
+            "disk", "bad", f"{folder} cannot be written ({error.strerror})", "choose a writable folder (--folder)"
         )
         return
     speed_mb_s = 1e-6 * _COMMIT_BYTES * len(times_s) / sum(times_s)
-    sensors = int(speed_mb_s / (2 * _SENSOR_MB_S))  # Each byte is written twice: to a journal, and when it is sealed.
+    sensors = int(speed_mb_s / (2 * _SENSOR_MB_S))  # each byte is written twice: to the journal and to the recording
     yield InstallationFinding(
         "disk",
         "good" if sensors else "bad",
-        f"{speed_mb_s:.0f} MB/s durably, the slowest 5 MB in {1e3 * max(times_s):.0f} ms: {_so_many(sensors)} at 20 Hz",
+        f"{speed_mb_s:.0f} MB/s durably, slowest 5 MB in {1e3 * max(times_s):.0f} ms: {_so_many(sensors)} at 20 Hz",
         "" if sensors else "record to another disk, or at a lower rate",
     )
 
 
 def _so_many(sensors: int) -> str:
-    return {0: "less than one sensor", 1: "a sensor"}.get(sensors, f"{sensors} sensors")
+    return {0: "less than one sensor", 1: "1 sensor"}.get(sensors, f"{sensors} sensors")
 
 
 def _commits_s(folder: Path) -> Sequence[float]:
-    """Return the times that the disk took to sync each of several blocks."""
+    """Return the time in s to write each of several blocks durably."""
     block, times_s = os.urandom(_COMMIT_BYTES), []
     with tempfile.TemporaryFile(dir=folder) as file:
         for _ in range(_COMMITS):
@@ -251,7 +256,7 @@ def _keys(_folder: Path) -> Iterator[InstallationFinding]:
     found = sorted(folder.glob("*.secret.toml")) if folder.is_dir() else []
     if not found:
         yield InstallationFinding(
-            "keys", "note", f"none in {folder}", "create them with 'ertis keys new', if other machines connect"
+            "keys", "note", f"none in {folder}", "create keys with 'ertis keys new' if other machines connect"
         )
     for path in found:
         try:
@@ -271,4 +276,4 @@ CHECKS: Final[dict[str, Callable[[Path], Iterator[InstallationFinding]]]] = {
     "disk": _disk,
     "keys": _keys,
 }
-"""All checks in their order; each gets the folder for recordings."""
+"""Checks in their order; each receives the folder for recordings."""

@@ -66,7 +66,7 @@ class SceneRenderer:
         return _Words(self, name, active=active)
 
     def words(self, name: str, index: int, *, active: bool) -> "NDArray[np.uint32]":
-        """Return the words of a measurement."""
+        """Return the samples of a measurement as words."""
         key = name, active, index % self._scene.count
         with self._turn:
             if key not in self._words:
@@ -113,7 +113,7 @@ class _Words(Sequence["NDArray[np.uint32]"]):
 
 
 class Replayed(Sequence["NDArray[np.uint32]"]):
-    """Words of a recording, read when they are needed."""
+    """Samples of a recording, read on demand."""
 
     def __init__(self, recording: "RecordingReader") -> None:
         self._recording = recording

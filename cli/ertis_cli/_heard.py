@@ -1,4 +1,4 @@
-"""Output of the commands that receive products of a central node."""
+"""Output of ``ertis listen``: products and events of the connection."""
 
 import functools
 import time
@@ -26,12 +26,14 @@ _ROW = "{sensor:12}  {sequence:8d}  {age:>8}  {made_in:>8}  {dropped:7d}  {text}
 
 
 class MicrophoneTable:
-    """Printer of received products: a line for each product, or for each event in JSON."""
+    """Printer of received products: one line per product, or one JSON object per event."""
 
     def __init__(self, *, as_json: bool, quiet: bool) -> None:
         self._as_json, self._quiet = as_json, quiet
         self._reported_names = self._noted = False
-        self._subscribed_s: float | None = None  # None after the first product, or after its absence was reported.
+        self._subscribed_s: float | None = (
+            None  # None once a product has arrived, or the absence of products was reported
+        )
 
     def head(self) -> None:
         """Print the column headings."""
@@ -39,7 +41,7 @@ class MicrophoneTable:
             click.echo(_HEAD)
 
     def subscribed(self, address: str, sensors: tuple[str, ...], products: tuple[str, ...]) -> None:
-        """Report, once, that a publisher answers."""
+        """Report once that a publisher answers."""
         if self._as_json and not self._reported_names:
             options.print_json(
                 {
@@ -61,15 +63,15 @@ class MicrophoneTable:
         if n_received:
             return
         text = (
-            f"no {' and no '.join(products)} has come from {address} yet; is 'ertis capture --to' running? See "
-            "'ertis status'"
+            f"no {' and no '.join(products)} received from {address} yet; is 'ertis capture --to' running? "
+            "Check with 'ertis status'"
         )
         if self._as_json:
             options.print_json({"event": "waiting", "address": address, "text": text})
         options.say(text, quiet=self._quiet)
 
     def unanswered(self, address: str, since_s: float) -> None:
-        """Report, once and after a delay, that there is no answer; `note` then reports the first answer."""
+        """Report once, after a delay, that no node answers; `note` then reports the first connection too."""
         if self._reported_names or self._noted or since_s < _SOON_S:
             return
         self._noted = True
@@ -79,7 +81,7 @@ class MicrophoneTable:
         options.say(text, quiet=self._quiet)
 
     def note(self, text: str) -> None:
-        """Print a change of the connection, except its start."""
+        """Report an event of the connection; the first connection is reported only after a reported wait."""
         was_quiet, self._noted = not self._noted and text == "connected", True
         if was_quiet:
             return
@@ -88,7 +90,7 @@ class MicrophoneTable:
         options.say(text, quiet=self._quiet)
 
     def product(self, arrival: "Arrival", counts: "SubscriberCounts") -> None:
-        """Print a product."""
+        """Print a received product."""
         about, text = self._about(arrival)
         header = arrival.header
         age_s, made_in_s = arrival.age_s, arrival.made_in_s
@@ -134,7 +136,7 @@ class MicrophoneTable:
         options.say(f"{where}{counts.received} received, {counts.dropped} dropped{again}", quiet=self._quiet)
 
     def _about(self, arrival: "Arrival") -> tuple[dict[str, Any], str]:
-        """Return the description of a product, for JSON and as text."""
+        """Return the description of a product, as JSON fields and as text."""
         from ertis_numba.frames import Energyscape, Measurement, PointCloud
         from ertis_numba.network.messages import Group
 
@@ -164,12 +166,12 @@ class MicrophoneTable:
 
     @staticmethod
     def _of_points(product: str, cloud: "PointCloud") -> tuple[dict[str, Any], str]:
-        """Return the number of points, and the nearest one."""
+        """Return the number of points and the nearest point, as JSON fields and as text."""
         import numpy as np
 
         about: dict[str, Any] = {"product": product, "n_points": len(cloud), "nearest": None}
         if not len(cloud):
-            return about, "nothing near"
+            return about, "no reflector"
         x, y, z = cloud.position_m[np.argmin(np.linalg.norm(cloud.position_m, axis=1))].tolist()
         range_m = float(np.linalg.norm((x, y, z)))
         azimuth_deg = float(np.degrees(np.arctan2(y, x)))

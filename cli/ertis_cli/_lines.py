@@ -1,4 +1,4 @@
-"""Non-blocking output to streams with slow or absent readers."""
+"""Non-blocking output stream for readers that are slow or have stopped."""
 
 import os
 import queue
@@ -12,21 +12,21 @@ _CLOSED_S = 5.0
 
 
 class JsonLines:
-    """Stream whose writer never waits for its reader: a thread writes the lines in order.
+    """Stream whose writer never waits for the reader, because a thread writes the texts in order.
 
-    The stream discards and counts new lines if too many wait. A stream without a file descriptor, as in tests, is
+    If too many texts are waiting, new ones are dropped and counted. A stream without a file descriptor, as in tests, is
     written directly.
 
     Parameters
     ----------
     stream : file
     largest : int
-        Limit on waiting texts.
+        Largest number of waiting texts; 65,536 by default.
 
     Attributes
     ----------
     lost : int
-        Number of discarded texts.
+        Number of dropped texts.
     """
 
     def __init__(self, stream: IO[str], *, largest: int = _MAX) -> None:
@@ -36,14 +36,14 @@ class JsonLines:
         try:
             stream.flush()
             self._descriptor: int | None = stream.fileno()
-        except (OSError, ValueError):  # It has no descriptor.
+        except (OSError, ValueError):  # no file descriptor
             self._descriptor = None
         self._writer = threading.Thread(target=self._write, name="lines", daemon=True)
         if self._descriptor is not None:
             self._writer.start()
 
     def write(self, text: str) -> int:
-        """Queue text, and return at once."""
+        """Queue a text, or drop it if the queue is full; return at once."""
         if self._descriptor is None:
             return self._stream.write(text)
         try:
@@ -53,10 +53,10 @@ class JsonLines:
         return len(text)
 
     def flush(self) -> None:
-        """Do nothing: the thread writes text as soon as possible."""
+        """Do nothing, because the thread writes texts as soon as possible."""
 
     def close(self, timeout_s: float = _CLOSED_S) -> None:
-        """Wait, with a timeout, until all text is written."""
+        """Wait until all texts are written, up to ``timeout_s`` for the queue and again for the thread."""
         if self._writer.ident is None:
             return
         try:
@@ -66,12 +66,12 @@ class JsonLines:
         self._writer.join(timeout_s)
 
     def _write(self) -> None:
-        # The stream itself would hold its lock for ever if its reader has stopped.
+        # Bypass the stream: if the reader has stopped, the stream's lock would be held for ever.
         descriptor = -1 if self._descriptor is None else self._descriptor
         while (text := self._waiting.get()) is not None:
             data = memoryview(text.encode(errors="backslashreplace"))
             try:
                 while data:
                     data = data[os.write(descriptor, data) :]
-            except OSError:  # The reader has closed the stream.
+            except OSError:  # the reader has gone
                 continue

@@ -1,4 +1,4 @@
-"""Mountings of sensors: read from a file, and reported if they are unknown."""
+"""Mountings of sensors: read from a file, and reported if unknown."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -19,17 +19,17 @@ mounting: "Decorator" = click.option(
     "--mounting",
     type=click.Path(path_type=Path),
     metavar="FILE",
-    help="Mountings of sensors on their platform: a scene, its [[sensors]], or a recording that holds them.",
+    help="Mountings of sensors on their platform: a scene, its [[sensors]], or a recording that contains them.",
 )
 
 
 def mountings(path: Path | None, sensors: Iterable[str] | None) -> dict[str, Mounting] | None:
-    """Return the mountings of some sensors or all, in a scene those at its start; None without a file.
+    """Return the mountings of some or all sensors, at the start of a scene; return None without a file.
 
     Raises
     ------
     ArgumentError
-        The file does not hold the mounting of a sensor.
+        The file does not contain the mounting of a sensor.
     """
     if path is None:
         return None
@@ -37,7 +37,7 @@ def mountings(path: Path | None, sensors: Iterable[str] | None) -> dict[str, Mou
 
     known = _of_scene(path) if path.suffix.lower() == ".toml" else _of_file(path)
     if not known:
-        raise ArgumentError(f"{path} contains no mounting; give a scene, or its [[sensors]]")
+        raise ArgumentError(f"{path} contains no mounting of a sensor; give a scene, or its [[sensors]]")
     wanted = [*known] if sensors is None else [*sensors]
     for name in wanted:
         if name not in known:

@@ -1,4 +1,4 @@
-"""Translation of parameter names in errors to typed options: ``--min-level``, not ``min_level_db``."""
+"""Replacement of parameter names by option names in errors: ``--min-level`` for ``min_level_db``."""
 
 import functools
 import re
@@ -15,9 +15,9 @@ _UNITS = ("", "_bytes", "_c", "_db", "_deg", "_hz", "_m", "_ms", "_s")
 _NAMED = re.compile(r"(?P<before>option )?(?P<quote>'?)(?P<name>[a-z_]+)(?P=quote)(?= (?:is|holds|runs from)\b)")
 
 
-@functools.cache  # Each command has its own names.
+@functools.cache  # once per command
 def name_options(command: click.Command) -> None:
-    """Make errors about the parameters of a command and of its subcommands name the typed options."""
+    """Let the errors of a command and its subcommands name options as the user types them."""
     if isinstance(command, click.Group):
         for each in command.commands.values():
             name_options(each)
@@ -30,7 +30,7 @@ def _naming(callback: Callable[..., Any]) -> Callable[..., Any]:
     def call(*arguments: Any, **options: Any) -> Any:
         try:
             return callback(*arguments, **options)
-        except ValueError as error:  # The base class of the package's errors, which need not be imported here.
+        except ValueError as error:  # a builtin, so that the package need not be imported
             from ertis_numba.errors import ArgumentError
 
             if isinstance(error, ArgumentError):
@@ -41,7 +41,7 @@ def _naming(callback: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _named(message: str, ctx: click.Context) -> str:
-    """Return a message with the typed option in place of the parameter at its start, if the option was given."""
+    """Return a message with the leading parameter name replaced by the name of the given option."""
     found = _NAMED.match(message)
     if found is None:
         return message

@@ -1,4 +1,4 @@
-"""Options of the network commands."""
+"""Options shared by the network commands."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -16,18 +16,18 @@ __all__ = ["allow", "client_keys", "key", "metrics", "require_duration", "server
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 key: Decorator = click.option(
-    "--key", metavar="FILE|NAME", help="Keys of this node, a .secret.toml from 'ertis keys new', or their name."
+    "--key", metavar="FILE|NAME", help="Secret key of this node: a .secret.toml from 'ertis keys new', or its name."
 )
 server_key: Decorator = click.option(
     "--server-key",
     metavar="FILE|NAME|KEY",
-    help="Public key of the central node, which must prove it.",
+    help="Public key of the central node; a node with another key is refused.",
 )
 allow: Decorator = click.option(
     "--allow",
     type=click.Path(path_type=Path),
     metavar="FILE",
-    help="Allow list of keys; that of 'ertis keys allow' by default.",
+    help="List of allowed keys; the list of 'ertis keys allow' by default.",
 )
 
 
@@ -37,27 +37,25 @@ def server_keys(key: str | None, allow: Path | None) -> "ServerKeys | None":
     Raises
     ------
     SettingsError
-        The keys cannot be used.
+        A key file or the list cannot be used.
     """
     from ertis_numba.network.allow_list import ALLOW_LIST
     from ertis_numba.network.keys import KeyPair, ServerKeys, default_folder
 
     if key is None:
         if allow is not None:
-            raise click.UsageError(
-                "--allow lists allowed keys, but the central node has no key of its own; give --key, too"
-            )
+            raise click.UsageError("--allow has no effect without --key; add --key")
         return None
     return ServerKeys(KeyPair.load(_file(key, "secret")), allow or default_folder() / ALLOW_LIST)
 
 
 def client_keys(key: str | None, server_key: str | None) -> "ClientKeys | None":
-    """Return the keys of a sensor node or an application node, or None if no keys were given.
+    """Return the keys of a sensor node or an application, or None if no keys were given.
 
     Raises
     ------
     SettingsError
-        The keys cannot be used.
+        A key cannot be used.
     """
     from ertis_numba.errors import SettingsError
     from ertis_numba.network.keys import ClientKeys, KeyPair, public_key
@@ -66,7 +64,9 @@ def client_keys(key: str | None, server_key: str | None) -> "ClientKeys | None":
         return None
     if key is None or server_key is None:
         given, other = ("--server-key", "--key") if key is None else ("--key", "--server-key")
-        raise click.UsageError(f"{given} is given without {other}; give both, or neither for nodes on this machine")
+        raise click.UsageError(
+            f"{given} is given without {other}; give both, or neither for a central node on this machine"
+        )
     pair = KeyPair.load(_file(key, "secret"))
     try:
         return ClientKeys(pair, public_key(_file(server_key, "public"))[0])
@@ -75,12 +75,12 @@ def client_keys(key: str | None, server_key: str | None) -> "ClientKeys | None":
 
 
 def metrics(given: str | None, latest: "Callable[[], Status]") -> "Metrics | None":
-    """Return a metrics server, not yet started, or None without the option.
+    """Return a metrics server that has not started, or None without an address.
 
     Raises
     ------
     ArgumentError
-        The address cannot be used.
+        The address is invalid.
     """
     from ertis_numba.errors import ArgumentError
     from ertis_numba.network.addresses import endpoint
@@ -96,7 +96,7 @@ def metrics(given: str | None, latest: "Callable[[], Status]") -> "Metrics | Non
 
 
 def require_duration(given: float | None) -> None:
-    """Refuse an impossible duration before anything is opened.
+    """Check a duration before anything is opened.
 
     Raises
     ------
@@ -110,7 +110,7 @@ def require_duration(given: float | None) -> None:
 
 
 def _file(given: str, what: str) -> str:
-    """Return the file of a key that was given by its name."""
+    """Return the file of a key that was given by name; return any other text unchanged."""
     from ertis_numba.network.keys import default_folder
 
     named = default_folder() / f"{given}.{what}.toml"

@@ -1,4 +1,4 @@
-"""Text descriptions of plans, with predicted and measured errors and times."""
+"""Reports of a plan: its steps, its predicted error and time, and its measured error."""
 
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
@@ -13,27 +13,27 @@ if TYPE_CHECKING:
 __all__ = ["require_plan", "said_of", "wavefront_note"]
 
 _INTERPOLATIONS = {
-    "fitted": "computed from {n} of them with least-squares weights",
-    "nearest": "the nearest of them",
-    "carrier": "the nearest of them, with its carrier rotated to the correct phase",
-    "linear": "interpolated linearly between two of them",
-    "cubic": "interpolated by Lagrange's cubic through four of them",
+    "fitted": "interpolated from {n} samples with least-squares weights",
+    "nearest": "the nearest sample",
+    "carrier": "the nearest sample with its carrier phase corrected",
+    "linear": "interpolated linearly from two samples",
+    "cubic": "interpolated from four samples with a Lagrange cubic",
 }
 _MIN_MS = 0.005
 _PART = "  {name:52}  {safe:>8}  {texture:>14}"
 
 
 def require_plan(settings: "Settings", *, explain: bool, verify: bool, max_error_db: float | None) -> None:
-    """Refuse options that need a plan if the method has none."""
+    """Raise an error for options that need a plan if the method has none."""
     asked = {"--explain": explain, "--verify": verify, "--max-error": max_error_db is not None}
     context = click.get_current_context()
     for name, given in asked.items():
         if given and settings.processing.method == "paper":
-            raise click.UsageError(f"{name} needs --method fast; the paper's method has no plan", context)
+            raise click.UsageError(f"{name} needs --method fast; method 'paper' has no plan", context)
 
 
 def said_of(sensor: str, reported: dict[str, Any]) -> Iterator[str]:
-    """Yield lines on the examination of a sensor's plan."""
+    """Yield the lines that report the plan of a sensor and its errors."""
     if "plan" in reported:
         yield from _explained(sensor, reported["plan"])
     if "wavefront_error_db" in reported:
@@ -48,7 +48,7 @@ def wavefront_note(whose: str, error_db: float, range_m: float) -> str:
     Parameters
     ----------
     whose : str
-        Sensor, or recordings.
+        Sensor, or number of recordings.
     error_db, range_m : float
         Largest error, and the range of it.
     """
@@ -59,53 +59,53 @@ def wavefront_note(whose: str, error_db: float, range_m: float) -> str:
 
 
 def _explained(sensor: str, plan: dict[str, Any]) -> Iterator[str]:
-    """Yield a plan as text, then its errors and times as a table."""
+    """Yield a description of a plan, then its errors as a table, then its time."""
     from ertis_numba.settings import Accuracy
 
     accuracy = Accuracy(**plan["accuracy"])
     sample = _INTERPOLATIONS[accuracy.interpolation].format(n=accuracy.delay_taps)
-    yield f"plan of {sensor}, with an error budget of {accuracy.max_error_db:g} dB:"
+    yield f"plan of {sensor} for an error budget of {accuracy.max_error_db:g} dB:"
     if plan["budget_applies_to"] == "beams":
         yield (
-            "  no plan keeps this budget for every image of this adaptive beamformer; this one keeps it for "
-            "delay-and-sum beams of the same signals"
+            "  no plan guarantees this budget for every image of this adaptive beamformer; "
+            "this plan meets it for delay-and-sum beams of the same signals"
         )
     precision = "16 bits" if accuracy.precision == "int16" else "single precision"
     kept = options.counted(accuracy.oversampling or 1, "sample")
     yield f"  {precision}, {kept} kept per range; a delayed sample is {sample}"
     if accuracy.beam_taps:
         yield (
-            f"  beams interpolated from a beam grid: {accuracy.beam_taps} grid points along each axis of the "
-            f"array, {accuracy.beam_density:g} per resolution cell"
+            f"  beams interpolated from {accuracy.beam_taps} beam-grid points along each axis of the array, "
+            f"{accuracy.beam_density:g} points per resolution cell"
         )
     else:
-        yield "  beams summed for every direction, without a beam grid"
+        yield "  the beam of every direction is summed directly"
     if plan["decimated"]:
         yield f"  decimation with a stopband attenuation of {accuracy.stopband_attenuation_db:g} dB"
     else:
         yield "  PCM without decimation"
     if plan["plane_waves"] is None:
-        zones = options.counted(accuracy.focal_zones or 1, "zone")
-        yield f"  spherical wavefronts, with separate delays in {zones} of ranges"
+        zones = options.counted(accuracy.focal_zones or 1, "focal zone")
+        yield f"  spherical wavefronts, with separate delays in {zones}"
     else:
         ends = " and ".join(f"{end['error_db']:.1f} dB at {end['range_m']:g} m" for end in plan["plane_waves"])
-        yield f"  plane wavefronts, whose error relative to spherical ones is {ends}, in addition to the rest"
+        yield f"  plane wavefronts, with an additional error of {ends} relative to spherical wavefronts"
     yield _PART.format(name="predicted error", safe="planned", signal_model="this recording")
-    total = {"due_to": "in total", **plan}
+    total = {"due_to": "total", **plan}
     for part in (*plan["parts"], total):
         cells = {key: f"{part[f'{name}_db']:.1f} dB" for key, name in (("safe", "safe"), ("texture", "predicted"))}
         yield _PART.format(name=f"  {part['due_to']}", **cells)
     stages = ", ".join(f"{name} {time_ms:.2f}" for name, time_ms in plan["stages_ms"].items() if time_ms >= _MIN_MS)
-    yield f"  predicted time {plan['time_ms']:.2f} ms: {stages}; from the costs in {plan['costs']}"
+    yield f"  predicted time {plan['time_ms']:.2f} ms: {stages}; with the costs in {plan['costs']}"
     if plan["predicted_db"] > accuracy.max_error_db:
         yield (
-            "  warning: this recording is quieter than the plan assumes, and its images may exceed an error of "
+            f"  warning: this recording is quieter than planned for, and the error of its images may exceed "
             f"{accuracy.max_error_db:g} dB; give a lower --max-error"
         )
 
 
 def _checked(sensor: str, verified: dict[str, Any]) -> Iterator[str]:
-    """Yield the measured error beside the predicted one."""
+    """Yield the measured error next to the predicted error."""
     yield (
         f"measurement {verified['sequence']} of {sensor}: error {verified['error_db']:.1f} dB in "
         f"{options.counted(verified['directions'], 'direction')}; predicted {verified['predicted_db']:.1f} dB for this "
@@ -113,7 +113,7 @@ def _checked(sensor: str, verified: dict[str, Any]) -> Iterator[str]:
     )
     peaks = verified["peaks"]
     if peaks is None:
-        yield "  reflectors were not compared, because the whole exact image would take too long to compute"
+        yield "  reflectors were not compared, because the complete exact image would take too long to compute"
         return
     line = f"  {peaks['wanted'] - peaks['lost']} of the strongest {options.counted(peaks['wanted'], 'reflector')} found"
     if peaks["level_db"] is not None:

@@ -1,4 +1,4 @@
-"""Processing of many recordings: selection, progress and results."""
+"""Processing of many recordings: selection, progress and report."""
 
 import glob
 import os
@@ -20,13 +20,13 @@ if TYPE_CHECKING:
 
 __all__ = ["are_meant", "process_many", "summary"]
 
-_MAX_ROWS = 20  # Limit on the rows of a table of all recordings.
+_MAX_ROWS = 20  # limit for a table of all recordings
 _WAVEFRONT = ("wavefront_error_db", "wavefront_error_range_m")
-_MAX_FAILED = 50  # Limit on the failures repeated at the end.
+_MAX_FAILED = 50  # limit for failed recordings in the final table
 
 
 def are_meant(paths: Sequence[str], target: str | None) -> bool:
-    """Return True if the arguments may name several recordings, or a folder for energyscape files."""
+    """Return True if the paths may name several recordings, or the target is a folder."""
     (path, *others) = paths
     return bool(
         others
@@ -46,12 +46,12 @@ def process_many(
     quiet: bool,
     as_json: bool,
 ) -> None:
-    """Process recordings into a folder, and report the result of each."""
+    """Process recordings into a folder, and report the outcome of each."""
     from ertis_numba.campaign import Campaign, find
 
     context = click.get_current_context()
     if target is None:
-        raise click.UsageError("several recordings need a folder for their energyscapes; give one with -o", context)
+        raise click.UsageError("several recordings need an output folder; give one with -o", context)
     recordings = find(paths)
     campaign = Campaign(recordings, target, wanted, workers=workers, scheduler=scheduler)
     report = _Report([found.path for found in recordings], quiet=quiet, as_json=as_json)
@@ -63,7 +63,7 @@ def process_many(
 
 
 def summary(target: Path, rows: Sequence[dict[str, Any]], device: str) -> Iterator[str]:
-    """Yield a line on the output of each sensor."""
+    """Yield a line with the output of each sensor."""
     for row in rows:
         of = f" of {row['sensor']}" if len(rows) > 1 else ""
         yield (
@@ -74,10 +74,10 @@ def summary(target: Path, rows: Sequence[dict[str, Any]], device: str) -> Iterat
 
 
 class _Hidden:
-    """Progress bar that draws nothing."""
+    """Placeholder for progress bars that are not drawn."""
 
     def follow(self, event: "Event") -> None:
-        """Process an event."""
+        """Handle an event of the campaign."""
 
     def say(self, text: str) -> None:
         """Print a line on stderr."""
@@ -85,7 +85,7 @@ class _Hidden:
 
 
 class _Bars(_Hidden):
-    """Progress bars: one over all files, and one over the measurements of each file in progress."""
+    """Progress bars: one over all files, and one over the measurements of each current recording."""
 
     def __init__(self, count: int) -> None:
         self.progress = _progress.bars()
@@ -118,7 +118,7 @@ def _shown(count: int, *, quiet: bool) -> Iterator[_Hidden]:
 
 
 class _Report:
-    """Results of all recordings."""
+    """Reporter of the outcome of recordings."""
 
     def __init__(self, recordings: Sequence[Path], *, quiet: bool, as_json: bool) -> None:
         self._count, self._quiet, self._as_json = len(recordings), quiet, as_json
@@ -130,7 +130,7 @@ class _Report:
         self._failed: list[str] = []
 
     def follow(self, event: "Event", shown: _Hidden) -> None:
-        """Print the result of a recording."""
+        """Report the outcome of a recording as soon as it ends."""
         from ertis_numba.campaign import RecordingEnded
 
         if not isinstance(event, RecordingEnded):
@@ -154,7 +154,7 @@ class _Report:
             options.print_json(_object(event) | ({"error": error} if error else {}))
 
     def close(self) -> None:
-        """Print a summary.
+        """Report the totals.
 
         Raises
         ------
@@ -171,8 +171,8 @@ class _Report:
             options.print_json({"recordings": self._count} | totals | summed)
         if self._failed:
             raise click.ClickException(
-                f"{len(self._failed)} of {options.counted(self._count, 'recording')} failed; fix the errors "
-                "above and process again: finished output stays"
+                f"{len(self._failed)} of {options.counted(self._count, 'recording')} failed; fix the errors above "
+                "and process again: finished recordings are kept"
             )
 
     def _print_wavefronts(self) -> None:
@@ -193,23 +193,23 @@ class _Report:
 
 
 def _named(event: "RecordingEnded") -> str:
-    """Return the reason for a recording's failure, with its name."""
+    """Return the error of a recording with the name of the recording."""
     if not event.error or str(event.recording) in event.error:
         return event.error
     return f"{event.recording}: {event.error}"
 
 
 def _lines(event: "RecordingEnded", *, reported: bool) -> Iterator[str]:
-    """Yield the printed lines; plans only if no object contains them."""
+    """Yield the lines about a recording; plans are left out if JSON contains them."""
     match event.outcome:
         case "made":
             yield from _plan_lines(event, reported=reported)
             yield from summary(event.output, event.made["sensors"], event.made["device"])
         case "there":
             yield from _plan_lines(event, reported=reported)
-            yield f"{event.output}: exists already"
+            yield f"{event.output}: exists already, kept"
         case "passed over":
-            yield f"{event.recording}: an energyscape file, not a recording; passed over"
+            yield f"{event.recording}: an energyscape file, not a recording; skipped"
 
 
 def _plan_lines(event: "RecordingEnded", *, reported: bool) -> Iterator[str]:
@@ -220,7 +220,7 @@ def _plan_lines(event: "RecordingEnded", *, reported: bool) -> Iterator[str]:
 
 
 def _plane_error(row: dict[str, Any]) -> tuple[float, float] | None:
-    """Return the error of a sensor's plane wavefronts and its range, unless an explained plan reports them."""
+    """Return the error of plane wavefronts and its range, unless the report contains a plan."""
     if "plan" in row or _WAVEFRONT[0] not in row:
         return None
     return row[_WAVEFRONT[0]], row[_WAVEFRONT[1]]

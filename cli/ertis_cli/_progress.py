@@ -1,4 +1,4 @@
-"""Progress bars and the terminals that can show them."""
+"""Progress bars on a terminal."""
 
 import io
 import os
@@ -18,12 +18,12 @@ Item = TypeVar("Item")
 
 
 def is_drawn_on(stream: TextIO) -> bool:
-    """Return True for a terminal that moves its cursor, and False for files, pipes and dumb terminals."""
+    """Return True if a stream is a terminal with cursor control, and not a file, a pipe or a dumb terminal."""
     return stream.isatty() and os.environ.get("TERM", "").lower() not in {"dumb", "unknown"}
 
 
 def bars() -> "Progress":
-    """Return a progress display on stderr, without colours if ``NO_COLOR`` is set; use it under `drawn`."""
+    """Return progress bars for stderr, coloured unless ``NO_COLOR`` is set; use them under `drawn`."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -35,14 +35,14 @@ def bars() -> "Progress":
     )
 
     return Progress(
-        TextColumn("{task.description}", markup=False),  # Names of files may contain brackets.
+        TextColumn("{task.description}", markup=False),  # file names may contain brackets
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
         TextColumn("left", style="progress.remaining"),
         console=Console(file=sys.stderr),
-        redirect_stdout=False,  # `drawn` redirects it.
+        redirect_stdout=False,  # `drawn` does this
         redirect_stderr=False,
         transient=True,
     )
@@ -50,8 +50,8 @@ def bars() -> "Progress":
 
 @contextmanager
 def drawn(progress: "Progress") -> Iterator[None]:
-    """Draw bars until the block ends, and then erase them; printed lines appear above the bars."""
-    # A stdout that is not this terminal stays unchanged.
+    """Draw bars until the block ends, then remove them; text printed on that terminal appears above them."""
+    # Only a stdout on the same terminal is redirected; a file or a pipe keeps its output.
     takes_stdout = _is_one_terminal()
     with progress, ExitStack() as stack:
         above = stack.enter_context(_Above(progress.console, sys.stderr))
@@ -63,7 +63,7 @@ def drawn(progress: "Progress") -> Iterator[None]:
 
 @contextmanager
 def bar(items: Iterable[Item], *, length: int, label: str) -> Iterator[Iterator[Item]]:
-    """Draw a bar over ``items`` while they are consumed."""
+    """Draw a bar that advances while ``items`` are consumed."""
     progress = bars()
     task = progress.add_task(label, total=length)
     with drawn(progress):
@@ -80,19 +80,19 @@ def _is_one_terminal() -> bool:
     """Return True if stdout and stderr are the same terminal."""
     try:
         return os.ttyname(sys.stdout.fileno()) == os.ttyname(sys.stderr.fileno())
-    except (OSError, ValueError):  # One of them is not a terminal, or not a file of the system, as in tests.
+    except (OSError, ValueError):  # one of them is not a terminal or, as in tests, has no file descriptor
         return False
 
 
 class _Above(io.TextIOBase):
-    """Stream whose lines appear unbroken above bars; rich has one, but click bypasses streams without an encoding."""
+    """Stream whose complete lines appear above bars; rich has one without an encoding, which click bypasses."""
 
-    encoding = "utf-8"  # The terminal's own stream encodes the text.
+    encoding = "utf-8"  # not used, because the terminal's own stream encodes
     errors = "backslashreplace"
 
     def __init__(self, console: "Console", stream: TextIO) -> None:
         self._console, self._stream = console, stream
-        self._turn = threading.RLock()  # A signal handler may write, too.
+        self._turn = threading.RLock()  # a signal handler may write as well
         self._begun = ""
 
     def write(self, text: str) -> int:

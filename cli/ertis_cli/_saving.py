@@ -1,4 +1,4 @@
-"""Output files that appear complete or not at all, and removal of empty new folders."""
+"""Files that are complete or absent, and removal of new folders after an error."""
 
 import tempfile
 from collections.abc import Callable, Iterator
@@ -15,16 +15,16 @@ if TYPE_CHECKING:
 __all__ = ["PRODUCTS", "saving", "withdrawn"]
 
 PRODUCTS = ("energyscape", "raw")
-"""Products that can be saved."""
+"""Products that can be saved to files."""
 
 Write = Callable[["Arrival"], None]
 
 
 @contextmanager
 def withdrawn(*folders: Path | None) -> Iterator[list[Path]]:
-    """Yield the folders that do not exist yet; remove them afterwards if the block raises an error.
+    """Yield the folders that do not exist yet; if the block raises an error, remove them.
 
-    Clear the list once the folders are in use. A folder with other files than a central node's own stays.
+    Clear the list once the folders are in use. A folder that contains more than a central node's own files stays.
     """
     missing = [each for folder in folders if folder for each in (folder, *folder.parents) if not each.exists()]
     try:
@@ -42,12 +42,14 @@ def withdrawn(*folders: Path | None) -> Iterator[list[Path]]:
 
 @contextmanager
 def saving(target: Path | None, product: str, *, overwrite: bool) -> Iterator[Write]:
-    """Yield a function that saves each product; the file appears if the block succeeds.
+    """Yield a function that saves a product; the file appears when the block ends without an error.
 
     Raises
     ------
     ArgumentError
-        The file cannot be written, or there is nothing to save.
+        The file cannot be written, or a product does not match earlier ones.
+    DataError
+        There is no product to save.
     """
     if target is None:
         yield lambda _: None
@@ -60,7 +62,7 @@ def saving(target: Path | None, product: str, *, overwrite: bool) -> Iterator[Wr
             mounted: set[str] = set()
 
             def write(arrival: "Arrival") -> None:
-                image = cast("Energyscape", arrival.item)  # The subscription requests this product only.
+                image = cast("Energyscape", arrival.item)  # the product that was requested
                 if image.stamp.sensor not in mounted:
                     mounted.add(image.stamp.sensor)
                     if arrival.translation_m is not None and arrival.rotation_xyzw is not None:
@@ -73,7 +75,7 @@ def saving(target: Path | None, product: str, *, overwrite: bool) -> Iterator[Wr
 
 
 def _require_place(target: Path) -> None:
-    """Refuse a file whose folder is missing or not writable, before waiting for anything."""
+    """Raise an error now, before any wait, if the folder of a file is missing or not writable."""
     from ertis_numba.errors import ArgumentError
 
     try:
@@ -81,13 +83,12 @@ def _require_place(target: Path) -> None:
             pass
     except OSError as error:
         raise ArgumentError(
-            f"--save {target}: folder {target.parent} is not writable ({error.strerror}); make it writable or "
-            "give another"
+            f"--save {target}: folder {target.parent} cannot be written ({error.strerror}); create it or choose another"
         ) from error
 
 
 def _recording(target: Path, *, overwrite: bool) -> Iterator[Write]:
-    """Yield a function that stores measurements in a journal, which then becomes a recording."""
+    """Yield a function that appends measurements to a journal; the journal is then sealed into a recording."""
     from ertis_numba.atomic_files import check_target
     from ertis_numba.errors import DataError
     from ertis_numba.journal import SUFFIX, Entry, Journal, seal_apart
@@ -117,14 +118,16 @@ def _recording(target: Path, *, overwrite: bool) -> Iterator[Write]:
         except BaseException:
             if len(journal):
                 click.echo(
-                    f"received measurements are safe in {path}; recover them with 'ertis recover {path}'", err=True
+                    f"the received measurements are safe in {path}; seal them with 'ertis recover {path}'", err=True
                 )
             else:
                 journal.remove()
             raise
         if not len(journal):
             journal.remove()
-            raise DataError(f"{target} would contain no measurement; wait until one arrives")
+            raise DataError(
+                f"{target} is not written, because no measurement was received; run the command for a longer time"
+            )
     sealed = seal_apart(path, overwrite=overwrite)
     if sealed.recording is None:
         raise DataError(sealed.remark)

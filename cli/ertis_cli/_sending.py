@@ -1,4 +1,4 @@
-"""Capture that sends measurements to a central node, and its output."""
+"""Capture that sends measurements to a central node, and its report."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -25,13 +25,13 @@ _COUNTS = ("refused", "overwritten", "damaged", "unacked")
 
 
 class _Watch(Watch):
-    """Output that also covers acknowledgements of the central node."""
+    """Reporter of a capture that also reports acknowledgements of the central node."""
 
     word = "kept"
     node: "SensorNode | None" = None
 
     def acked_through(self, acked_through: "Acknowledged") -> None:
-        """Print the acknowledged measurements."""
+        """Report acknowledged measurements."""
         if self._as_json:
             event = {
                 "event": "acked_through",
@@ -44,7 +44,7 @@ class _Watch(Watch):
             )
 
     def linked(self, text: str) -> None:
-        """Print a change of the connection to the central node."""
+        """Report an event of the connection to the central node."""
         if self._as_json:
             self._print({"event": "note", "text": text})
         self._say(text)
@@ -64,7 +64,7 @@ class Sending:
     settings : Settings
     spool : Path or None
     spool_mb, ring_mb : float or None
-        None selects the defaults of `SensorNode`.
+        Limits in MB; None for the defaults of `SensorNode`.
     quiet, as_json : bool
 
     Attributes
@@ -72,14 +72,14 @@ class Sending:
     address : str
     watch : Watch
     report : dict
-        Result of all measurements, for programs, once `run` has returned.
+        Summary for JSON output, complete once `run` has returned.
     n_lost : int
-        Number of accepted measurements that no node has any more.
+        Number of captured measurements that are lost.
 
     Raises
     ------
     ArgumentError
-        There is no room for a single measurement.
+        The spool or the ring is too small for one measurement.
     """
 
     def __init__(
@@ -104,7 +104,7 @@ class Sending:
         self.n_lost = 0
 
     def node(self, keys: "ClientKeys | None") -> "SensorNode":
-        """Return the sensor node; open it before `run` and close it afterwards."""
+        """Return the sensor node; open it before `run`, and close it afterwards."""
         from ertis_numba.network.sensor_node import SensorNode
 
         self._node = self.watch.node = SensorNode(
@@ -118,20 +118,20 @@ class Sending:
         return self._node
 
     def run(self, session: "Session", checks: "dict[str, BitCheck]", *, patience_s: float) -> Exception | None:
-        """Capture, wait until the central node has everything, and return the error, if any."""
+        """Capture, wait for the acknowledgement of all measurements, and return the error, if any."""
         from ertis_numba.errors import NetworkError
 
         where = (
             f"unacknowledged measurements are safe in {self._spool}; the next capture with --spool sends them"
             if self._spool
-            else "unacknowledged measurements are lost"
+            else "measurements that the central node has not acknowledged are lost"
         )
         failure = self.watch.run(session, self._node, checks, where=where)
-        if self._spool and self._node.central == "away":  # The measurements are safe on disk until the next capture.
+        if self._spool and self._node.central == "away":  # the spooled measurements can be sent later
             patience_s = min(patience_s, _SAFE_S)
         try:
             if not self._node.flush(min(patience_s, _SOON_S)) and patience_s > _SOON_S:
-                self._say(f"waiting up to {patience_s:g} s for the central node; Ctrl-C ends the wait")
+                self._say(f"waiting up to {patience_s:g} s for the central node; press Ctrl-C to stop waiting")
                 self._node.flush(patience_s - _SOON_S)
         except (KeyboardInterrupt, SystemExit):
             click.echo(where, err=True)
@@ -142,7 +142,7 @@ class Sending:
         return failure or (NetworkError(lost) if lost else None)
 
     def _account(self) -> str:
-        """Report the result of all measurements, and return an error if some are lost."""
+        """Summarise all measurements, and return an error message if some are lost."""
         counts = self._node.counts.values()
         total = {
             name: sum(getattr(each, name) for each in counts) for name in (*_COUNTS, "accepted", "stored", "taken")
@@ -155,23 +155,23 @@ class Sending:
             "reconnects": self._node.reconnects,
         }
         for reason, count in dropped.items():
-            self._say(f"{options.counted(count, 'measurement')} dropped by the central node, {reason}")
+            self._say(f"{options.counted(count, 'measurement')} dropped by the central node ({reason})")
         waiting = options.counted(total["unacked"], "measurement")
         if self._spool and total["unacked"]:
-            self._say(f"{waiting} wait in {self._spool}; the next capture with --spool sends what is there")
+            self._say(f"{waiting} unacknowledged in {self._spool}; the next capture with --spool sends them")
         lost = sum(total[name] for name in _COUNTS) - (total["unacked"] if self._spool else 0)
         self.n_lost = lost
         reported = f"{options.counted(lost, 'measurement')} not acknowledged by the central node at {self.address}"
         return f"{reported}{self._remedy()}" if lost else ""
 
     def _remedy(self) -> str:
-        """Return the reason for lost measurements, if known, and the remedy."""
-        if self._node.refusal:  # The refusal contains the remedy.
+        """Return the cause of lost measurements, if known, and the remedy."""
+        if self._node.refusal:  # contains the remedy
             return f": {self._node.refusal}"
         larger = "a larger disk" if "spool_bytes" not in self._sizes else "more (--spool-size)"
-        keep = f"give the spool {larger}" if self._spool else "give --spool DIR, which keeps them on disk"
+        keep = f"give the spool {larger}" if self._spool else "give --spool DIR to keep measurements on disk"
         if self._node.central == "away":
-            return f", where no central node answers; start 'ertis record' or 'ertis serve' there, or {keep}"
+            return f", which does not answer; start 'ertis record' or 'ertis serve' there, or {keep}"
         return f"; {keep}"
 
     def _say(self, text: str) -> None:
@@ -185,5 +185,5 @@ def _require_room(option: str, size_mb: float, settings: "Settings") -> None:
     min_mb = 1e-6 * JournalSensor.of("any", settings).n_bytes
     if size_mb < min_mb:
         raise ArgumentError(
-            f"{option} is {size_mb:g} MB, but a measurement has {min_mb:.3g} MB; give room for several, or leave it out"
+            f"{option} is {size_mb:g} MB, but one measurement has {min_mb:.3g} MB; give a larger size, or remove it"
         )

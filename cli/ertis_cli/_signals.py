@@ -23,9 +23,9 @@ __all__ = [
 ]
 
 _SIGNALS: Final = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
-_TWICE_S = 0.5  # Shorter intervals between signals are repetitions of the first by a shell or terminal.
+_TWICE_S = 0.5  # minimum interval; an earlier signal is a duplicate of the first
 _RETRY_INTERVAL_S = 0.05
-_ENDED = 128  # Exit code of a signal: this and its number.
+_ENDED = 128  # plus the number of the signal
 
 
 class Interruption:
@@ -101,10 +101,10 @@ class Interruption:
         """Repeat a signal once the main thread no longer handles its exception, unless a later signal has arrived."""
         main = threading.main_thread().ident or 0
         while not self._over.wait(_RETRY_INTERVAL_S) and error is self._errors[-1]:
-            handled: Any = sys._current_exceptions().get(main)  # noqa: SLF001  nothing else says what unwinds
-            if isinstance(handled, tuple):  # Python before 3.12 gives a tuple here.
+            handled: Any = sys._current_exceptions().get(main)  # noqa: SLF001  no public function reports the exception
+            if isinstance(handled, tuple):  # until Python 3.11
                 handled = handled[1]
-            if self.caused(handled):  # Clean-up takes as long as it needs.
+            if self.caused(handled):  # the clean-up has no time limit
                 continue
             if hasattr(signal, "pthread_kill"):
                 signal.pthread_kill(main, number)
@@ -161,7 +161,7 @@ class Signals:
         now_s = time.monotonic()
         if self._stop is None:
             return
-        if now_s - self._first_s > _TWICE_S:  # A second signal by the user ends the program.
+        if now_s - self._first_s > _TWICE_S:  # a repeated request ends the program at once
             self.end()
         self._first_s = min(self._first_s, now_s)
         self._stop()

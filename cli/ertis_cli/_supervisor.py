@@ -26,9 +26,8 @@ STABLE_S: Final = 60.0
 """Age of a process from which its end starts a new series of restarts."""
 
 _STOPPING: Final = (signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
-_PR_SET_PDEATHSIG: Final = 1  # Constant of prctl(2).
-# Constant of sigaction(2): the signal was sent by kill, so that the rest of the process group did not get it.
-_SI_USER: Final = 0
+_PR_SET_PDEATHSIG: Final = 1  # of prctl(2)
+_SI_USER: Final = 0  # of sigaction(2): sent by kill to this process only, and not to its group
 
 _allowed = False
 
@@ -70,8 +69,8 @@ class Life(NamedTuple):
 
 
 def allow() -> None:
-    """Allow commands of this process to fork: it runs only the command line and has no threads."""
-    global _allowed  # noqa: PLW0603  a process is the command line or is not
+    """Allow commands to fork, because this process runs only the command line and has no threads."""
+    global _allowed  # noqa: PLW0603  a property of the process
     _allowed = sys.platform == "linux"
 
 
@@ -96,7 +95,7 @@ class _Supervisor:
     def __init__(self) -> None:
         self._waited_for = {each for each in (*_STOPPING, signal.SIGCHLD) if not is_detached(each)}
         self._mask_before = signal.pthread_sigmask(signal.SIG_BLOCK, self._waited_for)
-        # One that is ignored would not be waited for; a handler that never runs makes it count.
+        # An ignored signal would not be delivered to sigwaitinfo; a handler that never runs prevents that.
         self._handlers_before = {each: signal.signal(each, lambda *_: None) for each in self._waited_for}
         self._pid = self._reports = -1
         self._stopping = False
@@ -178,6 +177,6 @@ def end_with(parent: int, number: signal.Signals) -> None:
 
 
 def _fail(text: str) -> NoReturn:
-    remedy = "all acknowledged measurements are stored; run 'ertis recover' to make recordings of them"
+    remedy = "all acknowledged measurements are stored; run 'ertis recover' to seal them into recordings"
     click.echo(f"ertis: error: {text}; {remedy}", err=True)
     sys.exit(1)

@@ -1,4 +1,4 @@
-"""Tables, drawn on a terminal and as plain text elsewhere."""
+"""Tables, drawn on a terminal and printed as plain text elsewhere."""
 
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,8 +17,8 @@ __all__ = ["Side", "TextTable"]
 
 Side = Literal["left", "right"]
 
-_GAP = 2  # Spaces between columns.
-_FOLDED = 16  # Minimum width of a text column if there is not enough room.
+_GAP = 2  # spaces between columns
+_FOLDED = 16  # minimum width of a text column in a narrow terminal
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,10 +28,10 @@ class TextTable:
     Parameters
     ----------
     columns : mapping of str
-        Each heading, and the alignment of its cells: numbers at the right.
+        Headings and the alignment of their cells; numbers are aligned right.
     rows : sequence of sequences of str
     styles : mapping of str, optional
-        Style of cells with these texts, such as ``{"failed": "red"}``.
+        Styles of cells by their text, as in ``{"failed": "red"}``; empty by default.
     """
 
     columns: Mapping[str, Side]
@@ -39,7 +39,7 @@ class TextTable:
     styles: Mapping[str, str] = field(default_factory=dict)
 
     def print(self, *, err: bool = False) -> None:
-        """Print the table, drawn only on a terminal."""
+        """Print the table, drawn on a terminal and as plain text elsewhere."""
         stream = sys.stderr if err else sys.stdout
         if not _progress.is_drawn_on(stream):
             for line in self.lines():
@@ -48,13 +48,13 @@ class TextTable:
         from rich.console import Console
 
         console = Console(file=stream)
-        # If the numbers alone are too wide, the terminal breaks lines rather than cells.
+        # If the numbers alone are too wide, let the terminal wrap lines instead of cells.
         places = range(len(self.columns))
         console.width = max(console.width, sum(map(self._smallest, places)) + _GAP * (len(places) - 1))
         console.print(self)
 
     def lines(self) -> Iterator[str]:
-        """Yield the table as aligned text of any width, for programs."""
+        """Yield the lines of an aligned table of any width, which programs can read as well."""
         widths = [max(map(len, cells)) for cells in self._cells()]
         for row in (tuple(self.columns), *self.rows):
             cells = zip(row, widths, self.columns.values(), strict=True)
@@ -69,7 +69,7 @@ class TextTable:
         is_tight = sum(widths) + _GAP * (len(widths) - 1) > options.max_width
         drawn = Drawn(box=None, pad_edge=False, header_style="bold")
         for place, (heading, side) in enumerate(self.columns.items()):
-            # Text is folded and headings break between words, but numbers stay in one piece.
+            # Text is folded and headings wrap between words, but numbers stay whole.
             width = self._smallest(place) if is_tight and side == "right" else None
             name = " ".join(_words(heading)) if is_tight else heading
             drawn.add_column(name, justify=side, overflow="fold", width=width)
@@ -78,7 +78,7 @@ class TextTable:
         yield drawn
 
     def _cells(self) -> list[tuple[str, ...]]:
-        """Return the cells of each column, its heading first."""
+        """Return the cells of each column, starting with its heading."""
         return list(zip(tuple(self.columns), *self.rows, strict=True))
 
     def _smallest(self, place: int) -> int:

@@ -1,4 +1,4 @@
-"""Output of a running capture."""
+"""Reports of a capture: events, progress and summary."""
 
 import sys
 import threading
@@ -20,13 +20,16 @@ if TYPE_CHECKING:
 __all__ = ["Watch", "report"]
 
 _REFRESH_S = 0.25
-_ALIVE = 0.05  # Minimum share of ones, and of zeros, of a working microphone.
+_ALIVE = 0.05  # minimum share of ones, and of zeros, of a working microphone
 
 
 class Watch:
-    """Output of a running capture: JSON lines, notes, and one status line; thread-safe."""
+    """Reporter of a capture: JSON lines, notes, and a progress line.
 
-    word = "stored"  # State of a reported measurement.
+    Several threads may use one reporter.
+    """
+
+    word = "stored"  # state of a reported measurement
 
     def __init__(self, *, quiet: bool, as_json: bool) -> None:
         self._quiet, self._as_json = quiet, as_json
@@ -38,12 +41,15 @@ class Watch:
         self._checks: dict[str, BitCheck] = {}
 
     def run(self, session: "Session", sink: "Sink", checks: "dict[str, BitCheck]", *, where: str) -> Exception | None:
-        """Run a session, and return the error that ended it early; ``where`` names the place of the measurements."""
+        """Run a session; return the error that ended it early, or None.
+
+        ``where`` is printed on an interruption, and states where the measurements are.
+        """
         self._session, self._checks = session, checks
         begun_s, cpu_s = time.monotonic(), time.process_time()
         try:
             session.run(sink)
-        except (OSError, ValueError) as error:  # Stored measurements are sealed after any error.
+        except (OSError, ValueError) as error:  # stored measurements are sealed in any case
             return error
         except (KeyboardInterrupt, SystemExit):
             click.echo(where, err=True)
@@ -55,7 +61,7 @@ class Watch:
         return None
 
     def stored(self, entries: "list[Entry]") -> None:
-        """Report measurements that are on disk."""
+        """Report durable measurements."""
         if self._as_json:
             for entry in entries:
                 stamp = entry.measurement.stamp
@@ -73,7 +79,7 @@ class Watch:
                 )
 
     def tick(self) -> None:
-        """Redraw the status line, if due."""
+        """Redraw the progress line when due."""
         if self._line and time.monotonic() >= self._next_s:
             self._next_s = time.monotonic() + _REFRESH_S
             click.echo(f"\r\x1b[K{self._progress()}", err=True, nl=False)
@@ -85,10 +91,10 @@ class Watch:
         self._say(f"{sensor}: {text}")
 
     def back(self, sensor: str, away_s: float) -> None:
-        """Report that a sensor was unplugged and measures again."""
+        """Report that an unplugged sensor measures again."""
         if self._as_json:
             self._print({"event": "back", "sensor": sensor, "away_s": round(away_s, 3)})
-        self._say(f"{sensor}: back after {away_s:.1f} s")
+        self._say(f"{sensor}: reconnected after {away_s:.1f} s")
 
     def _print(self, event: dict[str, Any]) -> None:
         with self._turn:
@@ -112,11 +118,11 @@ class Watch:
         return "   ".join(parts)[:160]
 
     def _more(self) -> Iterator[str]:
-        """Yield further parts of the status line."""
+        """Yield further parts of the progress line."""
         yield from ()
 
     def _health(self) -> Iterator[tuple[str, str]]:
-        """Yield the number of working microphones of each sensor."""
+        """Yield the number of microphones of each sensor that output both ones and zeros."""
         for sensor, check in self._checks.items():
             density = check.density
             if density is not None:
@@ -134,7 +140,10 @@ def report(
     more: dict[str, Any] | None = None,
     n_lost: int = 0,
 ) -> None:
-    """Print a summary; ``more`` is also for programs, and ``n_lost`` counts accepted measurements that were lost."""
+    """Report the results of a capture.
+
+    ``more`` is added to the JSON output, and ``n_lost`` measurements were lost after they had been captured.
+    """
     counts = session.counts
     several = len(counts) > 1
     stored, lost = (sum(getattr(each, name) for each in counts.values()) for name in ("stored", "lost"))
@@ -146,8 +155,8 @@ def report(
             options.say(f"{sensor}: {count} missing, {reason}", quiet=quiet)
         if each.skipped:
             options.say(
-                f"{sensor}: {each.skipped} commands were skipped, because the sensor was still busy; give a "
-                "lower --rate",
+                f"{sensor}: {each.skipped} commands were skipped, because the sensor was still busy; give a lower "
+                "--rate",
                 quiet=quiet,
             )
     if as_json:

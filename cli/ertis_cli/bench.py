@@ -1,4 +1,4 @@
-"""Implementation of ``ertis bench``, which generates the performance and accuracy tables of the docs."""
+"""``ertis bench``: benchmarks that produce the tables of the documentation."""
 
 import os
 from collections.abc import Callable
@@ -23,19 +23,19 @@ def _count(default: int) -> Callable[..., Any]:
         default=default,
         show_default=True,
         metavar="N",
-        help="Number of measurements for each case.",
+        help="Measurements per case.",
     )
 
 
 def _seed(about: str, *, default: int = 0) -> Callable[..., Any]:
-    """Return the option ``--seed``, which has a fixed default."""
+    """Return a seed option with a fixed default, so that runs are reproducible."""
     return click.option(
         "--seed", type=click.IntRange(min=0), default=default, show_default=True, metavar="S", help=about
     )
 
 
 def _random_settings(default: int) -> Callable[..., Any]:
-    """Return the options of a campaign over random settings."""
+    """Return the options of a benchmark over random settings."""
     count = click.option(
         "--count",
         type=click.IntRange(min=1),
@@ -54,13 +54,13 @@ _update = click.option(
     multiple=True,
     type=click.Path(path_type=Path, dir_okay=False, exists=True, writable=True),
     metavar="FILE",
-    help="Replace the table between the markers of a Markdown file; repeatable.",
+    help="Replace the table between the markers in a Markdown file; repeatable.",
 )
 
 
 @click.group()
 def bench() -> None:
-    """Measure this machine; results are checked before they are timed."""
+    """Run benchmarks, and check each result before timing it."""
 
 
 @bench.command()
@@ -69,7 +69,7 @@ def bench() -> None:
 @options.quiet
 @options.as_json
 def paper(**given: Any) -> None:
-    """Time the chain from bits to energyscape at the paper's 90, 1850 and 3000 directions."""
+    """Time the whole signal chain at the paper's 90, 1850 and 3000 directions."""
     from ertis_bench import paper as benchmark
 
     _run("paper", benchmark, **given)
@@ -77,23 +77,24 @@ def paper(**given: Any) -> None:
 
 @bench.command()
 @_count(20)
-@click.option("--directions", metavar="GRID", default="3000", show_default=True, help="Same as in 'ertis process'.")
+@click.option(
+    "--directions", metavar="GRID", default="3000", show_default=True, help="Directions, as in 'ertis process'."
+)
 @click.option(
     "--plot",
     "picture",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FRONT.png",
-    help="Plot error against time into this file, overwriting it.",
+    help="Plot error versus time to this file, which is overwritten.",
 )
 @_update
 @options.quiet
 @options.as_json
 def accuracy(*, picture: Path | None, **given: Any) -> None:
-    """Compare accuracy and processing time of about forty plans and the paper's method."""
+    """Measure image error versus time for about forty plans and the paper's method."""
     from ertis_bench import accuracy as benchmark
 
-    # A missing folder is reported now rather than after minutes.
-    if picture and not picture.absolute().parent.is_dir():
+    if picture and not picture.absolute().parent.is_dir():  # refuse now rather than after minutes
         raise click.BadParameter(f"folder {picture.parent} does not exist; create it first", param_hint="--plot")
     report = _run("accuracy", benchmark, **given)
     if picture:
@@ -134,7 +135,7 @@ def costs(*, count: int, target: Path | None, quiet: bool, as_json: bool) -> Non
 @options.quiet
 @options.as_json
 def verification(**given: Any) -> None:
-    """Compare --verify with a slow float64 reference for random settings; nothing is timed."""
+    """Compare --verify with a slow float64 reference over random settings; nothing is timed."""
     from ertis_bench import verification as benchmark
 
     _run("verification", benchmark, **given)
@@ -146,7 +147,7 @@ def verification(**given: Any) -> None:
 @options.quiet
 @options.as_json
 def budgets(**given: Any) -> None:
-    """Count random settings that keep or exceed their error budget, with and without a warning; nothing is timed."""
+    """Count random settings that meet or exceed their error budget, with and without a warning; nothing is timed."""
     from ertis_bench import budgets as benchmark
 
     _run("budgets", benchmark, **given)
@@ -154,19 +155,14 @@ def budgets(**given: Any) -> None:
 
 @bench.command()
 @click.option(
-    "--count",
-    type=click.IntRange(min=1),
-    default=400,
-    show_default=True,
-    metavar="N",
-    help="Number of points for each cell.",
+    "--count", type=click.IntRange(min=1), default=400, show_default=True, metavar="N", help="Points per case."
 )
-@_seed("Seed of the reflector positions.")
+@_seed("Seed of the point positions.")
 @_update
 @options.quiet
 @options.as_json
 def points(**given: Any) -> None:
-    """Compare the errors of points with their uncertainties over grids, budgets and noise; nothing is timed."""
+    """Compare point errors with their stated uncertainties over grids, error budgets and noise; nothing is timed."""
     from ertis_bench import points as benchmark
 
     _run("points", benchmark, **given)
@@ -178,7 +174,7 @@ def points(**given: Any) -> None:
 @options.quiet
 @options.as_json
 def scaling(**given: Any) -> None:
-    """Time the chain for different numbers of directions, ranges, microphones and threads."""
+    """Measure time versus the number of directions, ranges, microphones and threads."""
     from ertis_bench import scaling as benchmark
 
     _run("scaling", benchmark, **given)
@@ -190,13 +186,13 @@ def scaling(**given: Any) -> None:
     "--verdicts",
     type=click.IntRange(min=1),
     metavar="N",
-    help="Instead of timing, add each omitted effect to N random scenes; fail if one changes an image.",
+    help="Instead of timing, restore each effect that was left out of N random scenes; fail if it changes an image.",
 )
 @_update
 @options.quiet
 @options.as_json
 def simulation(*, verdicts: int | None, **given: Any) -> None:
-    """Time the simulation of scenes, with the necessary effects and with all effects."""
+    """Time the simulation with only the relevant effects of a scene, and with all effects."""
     from ertis_bench import simulation as benchmark
 
     if verdicts is None:
@@ -207,7 +203,7 @@ def simulation(*, verdicts: int | None, **given: Any) -> None:
     from ertis_numba.errors import DataError
 
     if given["targets"]:
-        raise click.UsageError("--verdicts writes no table; leave out --update")
+        raise click.UsageError("--verdicts writes no table; remove --update")
     report = run(count=verdicts, say=lambda text: options.say(text, quiet=given["quiet"]))
     if given["as_json"]:
         options.print_json(report)
@@ -221,20 +217,22 @@ def simulation(*, verdicts: int | None, **given: Any) -> None:
 
 
 @bench.command()
-@click.option("--count", type=click.IntRange(min=2), default=24, show_default=True, metavar="N", help="Recordings.")
+@click.option(
+    "--count", type=click.IntRange(min=2), default=24, show_default=True, metavar="N", help="Number of recordings."
+)
 @click.option(
     "--rounds",
     type=click.IntRange(min=1),
     default=5,
     show_default=True,
     metavar="N",
-    help="Number of rounds; all variants run in turn in each round.",
+    help="Rounds over all cases, in turn.",
 )
 @_update
 @options.quiet
 @options.as_json
 def many(**given: Any) -> None:
-    """Time many recordings with one worker, several workers and a dask cluster; all output files are compared."""
+    """Time many recordings with one worker, several workers and a dask cluster, and compare all output files."""
     from ertis_bench import many as benchmark
 
     _run("many", benchmark, **given)
@@ -245,7 +243,7 @@ def many(**given: Any) -> None:
 @options.quiet
 @options.as_json
 def factorisation(**given: Any) -> None:
-    """Count the multiplications per image point, with and without sub-arrays; nothing is timed."""
+    """Count multiplications per image point, with and without sub-arrays; nothing is timed."""
     from ertis_bench import factorisation as benchmark
 
     _run("factorisation", benchmark, **given)
@@ -256,7 +254,7 @@ def factorisation(**given: Any) -> None:
 @options.quiet
 @options.as_json
 def ptx(**given: Any) -> None:
-    """Analyse the GPU kernels' machine code and estimate its time on an H200; no GPU is needed, nothing is timed."""
+    """Compile the GPU kernels and estimate their time on an H200; no GPU is needed, and nothing is timed."""
     from ertis_bench import ptx as benchmark
 
     _run("ptx", benchmark, **given)
@@ -264,28 +262,30 @@ def ptx(**given: Any) -> None:
 
 @bench.command("health")
 @click.option(
-    "--long", is_flag=True, help="Test 1,000 healthy arrays and 30 trials of each fault rather than 40 and one."
+    "--long", is_flag=True, help="Use 1,000 healthy arrays and 30 trials per fault instead of 40 arrays and 1 trial."
 )
 @_seed("Seed of the scenes.")
 @_update
 @options.quiet
 @options.as_json
 def of_health(**given: Any) -> None:
-    """Count false alarms of the health checks on healthy arrays, and correctly named faults."""
+    """Count false alarms of the health checks in healthy arrays, and correctly named faults."""
     from ertis_bench import health as benchmark
 
     _run("health", benchmark, **given)
 
 
 @bench.command()
-@click.option("--long", is_flag=True, help="Run for an hour rather than a minute.")
-@click.option("--seed", type=click.IntRange(min=0), metavar="S", help="Seed of the faults; random by default.")
-@click.option("--only", multiple=True, metavar="PART", help="Run only this part; repeatable. sustained, chain, wire, …")
+@click.option("--long", is_flag=True, help="Run for an hour instead of a minute.")
+@click.option("--seed", type=click.IntRange(min=0), metavar="S", help="Seed of the failures; random by default.")
+@click.option(
+    "--only", multiple=True, metavar="PART", help="Run only this part, such as sustained, chain or wire; repeatable."
+)
 @_update
 @options.quiet
 @options.as_json
 def reliability(*, only: tuple[str, ...], **given: Any) -> None:
-    """Test recovery from wire faults, pulled plugs, kill -9 and full disks; nothing is timed."""
+    """Test failures: transmission faults, unplugged sensors, kill -9 and full disks; nothing is timed."""
     from ertis_bench import reliability as benchmark
 
     from ertis_numba import checks
@@ -301,21 +301,23 @@ def reliability(*, only: tuple[str, ...], **given: Any) -> None:
     "duration_s",
     type=float,
     metavar="S",
-    help="Seconds for each part; 300 for storage and 60 for each other part by default.",
+    help="Duration of each part; by default five minutes for storage and one minute for others.",
 )
 @_seed("Seed of the samples.", default=1)
-@click.option("--only", multiple=True, metavar="PART", help="Run only this part; repeatable. storage, processing, …")
+@click.option(
+    "--only", multiple=True, metavar="PART", help="Run only this part, such as storage or processing; repeatable."
+)
 @click.option(
     "--folder",
     type=click.Path(path_type=Path, file_okay=False, exists=True),
     metavar="DIR",
-    help="Folder with room for the stored data, 220 MB per second.",
+    help="Folder for stored data; needs 220 MB per second of the run.",
 )
 @_update
 @options.quiet
 @options.as_json
 def network(*, only: tuple[str, ...], **given: Any) -> None:
-    """Measure a network of sensor nodes and a central node with keys; every sample and image is checked."""
+    """Measure storage and imaging of a central node with keys, and check every sample and image."""
     from ertis_bench.network import figures as benchmark
 
     from ertis_numba import checks
@@ -328,14 +330,16 @@ def network(*, only: tuple[str, ...], **given: Any) -> None:
 
 
 @bench.command()
-@click.option("--long", is_flag=True, help="Run for two hours rather than two minutes.")
-@click.option("--seed", type=click.IntRange(min=0), metavar="S", help="Seed of the faults; random by default.")
-@click.option("--only", multiple=True, metavar="PART", help="Run only this part; repeatable. centrals, nodes, keys, …")
+@click.option("--long", is_flag=True, help="Run for two hours instead of two minutes.")
+@click.option("--seed", type=click.IntRange(min=0), metavar="S", help="Seed of the failures; random by default.")
+@click.option(
+    "--only", multiple=True, metavar="PART", help="Run only this part, such as centrals, nodes or keys; repeatable."
+)
 @_update
 @options.quiet
 @options.as_json
 def network_faults(*, only: tuple[str, ...], **given: Any) -> None:
-    """Test recovery from network faults: kill -9, bad disks and cables, wrong keys, overload; nothing is timed."""
+    """Test network failures: kill -9, bad disks and cables, wrong keys and overload; nothing is timed."""
     from ertis_bench.network import faults as benchmark
 
     from ertis_numba import checks
@@ -355,13 +359,13 @@ def network_faults(*, only: tuple[str, ...], **given: Any) -> None:
     help="Folder for results, one file per run.",
 )
 @click.option(
-    "--newest", is_flag=True, help="Measure nothing; generate the tables from the newest results. No GPU is needed."
+    "--newest", is_flag=True, help="Measure nothing; write the tables of the newest results. No GPU is needed."
 )
 @_update
 @options.quiet
 @options.as_json
 def gpu(*, newest: bool, **given: Any) -> None:
-    """Test and time this machine's NVIDIA GPU, other libraries and the hardware limits, in under ten minutes."""
+    """Test and time this machine's NVIDIA GPU in less than ten minutes, and compare with other libraries and limits."""
     from ertis_bench import gpu as benchmark
 
     _run("gpu", benchmark, measure=not newest, **given)
@@ -373,8 +377,7 @@ def _run(
     from ertis_bench import tables
 
     parts = given.get("only", ())
-    # A missing marker is reported before minutes of work.
-    places = [(target, *tables.place(target, name, parts)) for target in targets]
+    places = [(target, *tables.place(target, name, parts)) for target in targets]  # refuse before minutes of work
     report: dict[str, Any] = benchmark.run(say=lambda text: options.say(text, quiet=quiet), **given)
     for target, form, marker in places:
         tables.update(target, marker, tables.FORMS[name][form](report))

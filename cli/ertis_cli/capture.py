@@ -1,4 +1,4 @@
-"""Implementation of ``ertis capture``, which records measurements from sensors."""
+"""``ertis capture``: record measurements from sensors."""
 
 import errno
 import re
@@ -38,7 +38,7 @@ _LOOK_S = 0.1  # Interval between searches for ports.
     multiple=True,
     required=True,
     metavar="PORT",
-    help="Path, serial number or name of a sensor; repeatable for several sensors.",
+    help="Path, serial number or name of a sensor; repeat for several sensors.",
 )
 @options.output("Recording to write; SERIAL_TIME.h5 by default.")
 @click.option(
@@ -48,24 +48,21 @@ _LOOK_S = 0.1  # Interval between searches for ports.
     "--spool",
     type=click.Path(path_type=Path),
     metavar="DIR",
-    help="With --to: folder that keeps measurements until the central node has them; memory by default.",
+    help="With --to: keep measurements in this folder until the central node acknowledges them; in memory by default.",
 )
 @click.option(
     "--spool-size",
     "spool_mb",
     type=click.FloatRange(min=0, min_open=True),
     metavar="MB",
-    help="Limit on the size of the spool, above which new measurements are refused; limited by the disk by default.",
+    help="Largest spool; above it, new measurements are refused. Limited by the free disk space by default.",
 )
 @click.option(
     "--ring",
     "ring_mb",
     type=click.FloatRange(min=0, min_open=True),
     metavar="MB",
-    help=(
-        "With --to: number of measurements kept in memory; 64 by default. Without --spool, a full ring discards the "
-        "oldest."
-    ),
+    help="With --to: memory for measurements; 64 by default. When full without --spool, the oldest are overwritten.",
 )
 @_network.key
 @_network.server_key
@@ -85,7 +82,7 @@ _LOOK_S = 0.1  # Interval between searches for ports.
     "n",
     type=click.IntRange(min=1),
     metavar="N",
-    help="Number of measurements of each sensor, or of SYNC pulses.",
+    help="Number of measurements per sensor, or of SYNC pulses.",
 )
 @click.option("--duration", type=float, metavar="S", help="Duration in seconds; until Ctrl-C by default.")
 @click.option(
@@ -93,46 +90,48 @@ _LOOK_S = 0.1  # Interval between searches for ports.
     type=click.Choice(["command", "sync"]),
     default="command",
     show_default=True,
-    help="Trigger of a measurement: this program, or pulses of the SYNC chain.",
+    help="Source of the trigger: a command of this program, or a pulse of the SYNC chain.",
 )
-@click.option("--rate", type=float, default=10.0, show_default=True, metavar="HZ", help="Rate of measurements.")
-@click.option("--pin", type=click.IntRange(1, 2), default=1, show_default=True, help="SYNC input of the sensors.")
-@click.option("--passive", is_flag=True, help="Record without emitting the call.")
-@click.option("--listen-only", is_flag=True, help="Send no settings; another program has configured the sensor.")
+@click.option("--rate", type=float, default=10.0, show_default=True, metavar="HZ", help="Rate of trigger commands.")
 @click.option(
-    "--emissions", type=int, default=1, show_default=True, metavar="N", help="Number of calls per measurement."
+    "--pin", type=click.IntRange(1, 2), default=1, show_default=True, help="Input that receives the SYNC pulses."
 )
+@click.option("--passive", is_flag=True, help="Record without emitting the call.")
+@click.option(
+    "--listen-only", is_flag=True, help="Send nothing to the sensor, because another program has configured it."
+)
+@click.option("--emissions", type=int, default=1, show_default=True, metavar="N", help="Emissions per measurement.")
 @click.option(
     "--preset",
     metavar="NAME",
     shell_complete=options.complete_presets,
-    help="short_, default_ or long_ with 20_80 or 25_50; default_25_50 by default.",
+    help="Record length (short_, default_, long_) and band (20_80, 25_50); default_25_50 by default.",
 )
 @click.option(
     "--layout",
     metavar="NAME",
     shell_complete=options.complete_layouts,
-    help="Array layout: eRTIS_v3D1 (default) or another name, or a .toml or .csv file.",
+    help="Name of a shipped layout, or a .toml or .csv file; eRTIS_v3D1 by default.",
 )
 @click.option(
     "--settings", "settings_file", type=click.Path(path_type=Path), metavar="FILE", help="Settings file (TOML)."
 )
 @click.option("--temperature", type=float, metavar="C", help="Air temperature in °C; 20 by default.")
-@click.option("--name", "names", multiple=True, metavar="NAME", help="Names of the sensors, in the order of the ports.")
+@click.option("--name", "names", multiple=True, metavar="NAME", help="Name of a sensor; repeat in the order of --port.")
 @click.option(
     "--patience",
     type=float,
     default=30.0,
     show_default=True,
     metavar="S",
-    help="Timeout for a silent or unplugged sensor, and for the central node at the end.",
+    help="Longest time to wait for a silent or unplugged sensor, and for the central node at the end.",
 )
 @click.option("--check-bits/--no-check-bits", default=True, show_default=True, help="Refuse data that cannot be PDM.")
-@click.option("--refuse-splices", is_flag=True, help="Also refuse data with missing or misplaced parts.")
-@click.option("--dry-run", is_flag=True, help="Print the commands for the sensor, and exit.")
+@click.option("--refuse-splices", is_flag=True, help="Also refuse data that seem to be cut and joined.")
+@click.option("--dry-run", is_flag=True, help="Print the commands for the sensor, send nothing, and exit.")
 @options.force
 @options.quiet
-@options.as_json_of("one object per line for each measurement and event, and a summary at the end")
+@options.as_json_of("one object per line for each measurement and event; the last one is a summary")
 def capture(
     *,
     ports: tuple[str, ...],
@@ -166,15 +165,15 @@ def capture(
     quiet: bool,
     as_json: bool,
 ) -> None:
-    """Record measurements from sensors.
+    """Record measurements, or send them to a central node.
 
-    Each measurement is written to a journal beside the recording before it is reported. The complete recording appears
-    at the end. Ctrl-C ends a capture after the current measurement. 'ertis recover' recovers measurements after a
-    crash. --json prints a line for each measurement.
+    Each measurement is written durably to a journal beside the recording before it is reported. The complete recording
+    appears at the end. Ctrl-C ends a capture after the current measurement. After a crash, 'ertis recover' seals the
+    journal. With --json, each measurement is reported in one line.
 
-    With --to, measurements go to a central node ('ertis record' or 'ertis serve') instead. They are kept until the
-    central node has stored them. With --spool, each measurement is on disk before it is reported, and the next capture
-    sends measurements left by a crash.
+    With --to, measurements are sent to a central node ('ertis record' or 'ertis serve') and kept until it acknowledges
+    them. With --spool, they are durable before they are reported. After a crash, the next capture sends the remaining
+    measurements of the spool.
     """
     from ertis_numba.devices.setup import Setup
 
@@ -187,7 +186,7 @@ def capture(
     _require_one_each(ports, names)
     _require_one_place(address, target, for_address=(spool, spool_mb, ring_mb, key, server_key))
     if spool_mb is not None and spool is None:
-        raise click.UsageError("--spool-size is given without --spool; give the folder with --spool")
+        raise click.UsageError("--spool-size is given without --spool; add --spool with its folder")
     _network.require_duration(duration)
     from ertis_numba.atomic_files import check_target
     from ertis_numba.capture import Session
@@ -249,7 +248,7 @@ def _record(
     stack: ExitStack,
     overwrite: bool,
 ) -> Exception | None:
-    """Capture into a recording, and return the error that ended the capture early, if any."""
+    """Capture into a recording; return the error that ended it early, or None."""
     from ertis_numba.journal import SUFFIX, Journal
 
     path = target.with_name(f"{target.name}{SUFFIX}")
@@ -258,7 +257,7 @@ def _record(
     )
     if journal.remark:
         click.echo(f"ertis: warning: {journal.remark}", err=True)
-    where = f"the measurements so far are safe in {path}; recover them with 'ertis recover {path}'"
+    where = f"the measurements so far are safe in {path}; seal them with 'ertis recover {path}'"
     failure = watch.run(session, journal, checks, where=where)
     if signals.came and not len(journal):
         journal.remove()
@@ -269,14 +268,14 @@ def _record(
 
 
 def _seal(path: Path, failure: Exception | None, *, overwrite: bool) -> None:
-    """Seal the recording, and report the error that ended the capture last."""
+    """Seal the journal into a recording, then raise the error that ended the capture, if any."""
     from ertis_numba.errors import DataError
     from ertis_numba.journal import seal_apart
 
     try:
         sealed = seal_apart(path, overwrite=overwrite)
     except (OSError, ValueError) as error:
-        reported = f"{error}; the measurements are safe in {path}, recover them with 'ertis recover {path}'"
+        reported = f"{error}; the measurements are safe in {path}; seal them with 'ertis recover {path}'"
         if failure is None:
             raise DataError(reported) from error
         click.echo(f"ertis: error: {reported}", err=True)
@@ -298,7 +297,7 @@ def _note_mounting(path: Path | None, sensors: "Sequence[str]", *, quiet: bool) 
 
 
 def _wait_for(ports: tuple[str, ...], wait_s: float, signals: Signals, *, quiet: bool) -> None:
-    """Wait until all ports exist; raise an error for the first one that is missing after the timeout."""
+    """Wait until all ports exist; raise an error for the first port that is missing after ``wait_s``."""
     from ertis_numba.devices.ports import resolve
     from ertis_numba.errors import SonarError
 
@@ -319,7 +318,7 @@ def _wait_for(ports: tuple[str, ...], wait_s: float, signals: Signals, *, quiet:
 
 @contextmanager
 def _interruptible(signals: Signals) -> "Iterator[Callable[[], bool]]":
-    """Yield a function that returns True after a signal; a failed dialogue then ends the command."""
+    """Yield a function that returns True once a signal has arrived; a failed dialogue then ends the command."""
     from ertis_numba.errors import SonarError
 
     try:
@@ -346,7 +345,7 @@ def _configured(
     check_bits: bool,
     splices: bool,
 ) -> "dict[str, BitCheck]":
-    """Configure the sensors, and return the bit check of each."""
+    """Configure the sensors, and return the check of each sensor's bits."""
     import numpy as np
 
     from ertis_numba.devices.bits import BitCheck
@@ -368,7 +367,7 @@ def _configured(
 
 def _require_one_place(address: str | None, target: Path | None, *, for_address: tuple[object, ...]) -> None:
     if address is None and any(for_address):
-        raise click.UsageError("--spool, --spool-size, --ring, --key and --server-key need a central node; give --to")
+        raise click.UsageError("--spool, --spool-size, --ring, --key and --server-key need a central node; add --to")
     if address is not None and target is not None:
         raise click.UsageError("--to and --output exclude each other; give one of them")
 
@@ -378,7 +377,7 @@ def _require_one_each(ports: tuple[str, ...], names: tuple[str, ...]) -> None:
         if ports.count(port) > 1:
             raise click.UsageError(f"--port {port} is given {ports.count(port)} times; give each sensor once")
     if names and len(names) != len(ports):
-        raise click.UsageError(f"--name is given {len(names)} times for {len(ports)} ports; give one name per port")
+        raise click.UsageError(f"{len(names)} names are given for {len(ports)} ports; give one --name per --port")
     from ertis_numba import checks
 
     for name in names:
@@ -388,7 +387,7 @@ def _require_one_each(ports: tuple[str, ...], names: tuple[str, ...]) -> None:
 def _settings(
     preset: str | None, layout: str | None, settings_file: Path | None, temperature: float | None
 ) -> "Settings":
-    """Return settings from a preset or a file, with the given array and air."""
+    """Return settings from a preset or a file, with the given layout and air temperature."""
     from ertis_numba.settings import Air, Array, Settings
 
     if settings_file is not None and preset is not None:
@@ -403,28 +402,26 @@ def _settings(
 
 
 def _print_commands(setup: "Setup", *, as_json: bool) -> None:
-    """Print the commands for a sensor; the samples of the call take one line."""
+    """Print the commands for a sensor, with all samples of the call in one line."""
     before, call, after = setup.before_call(), setup.call(), setup.after_call()
     if as_json:
         lines = [command.encode().decode().strip() for command in (*before, *call, *after)]
         options.print_json({"commands": lines})
         return
     rows = [(command.encode().decode().strip(), command.about) for command in before]
-    rows.append((f"!C,0… to {len(call) - 1}", "samples of the call, unless they are loaded already"))
+    rows.append((f"!C,0… to {len(call) - 1}", "samples of the call, unless the sensor already has them"))
     rows += [(command.encode().decode().strip(), command.about) for command in after]
     for line, about in rows:
         click.echo(f"{line:20}  {about}")
 
 
 def _named(ports: tuple[str, ...], names: tuple[str, ...], opened: "list[SonarDriver]") -> "dict[str, SonarDriver]":
-    """Return the sensors by name: the given names, the serial numbers, or the names of the ports."""
+    """Return sensors by name: the given names, or else their serial numbers or the names of their ports."""
     known = [sonar.serial_number or Path(port).name for port, sonar in zip(ports, opened, strict=True)]
     chosen = list(names) or [re.sub(r"[^A-Za-z0-9_.@+-]", "_", name) for name in known]
     for name in chosen:
         if chosen.count(name) > 1:
-            raise click.UsageError(
-                f"{chosen.count(name)} sensors have the name {name!r}; give each its own with --name"
-            )
+            raise click.UsageError(f"{chosen.count(name)} sensors are named {name!r}; give each a different --name")
     return dict(zip(chosen, opened, strict=True))
 
 

@@ -1,4 +1,4 @@
-"""Implementation of ``ertis compare``, which compares images with the ground truth."""
+"""``ertis compare``: compare an energyscape file with the ground truth."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -27,16 +27,16 @@ _NUMBERS = (
 
 @click.command()
 @options.input_file("IMG.h5")
-@options.sensor("Compare one sensor only; all sensors of the file by default.")
+@options.sensor("Compare this sensor only; all sensors by default.")
 @options.min_level("Ignore reflectors and peaks below this level, relative to the strongest.")
 @options.as_json
 def compare(*, path: Path, sensor: str | None, min_level: float, as_json: bool) -> None:
     """Compare an energyscape file with the scene's ground truth.
 
     The file must come from a simulated recording, which contains the ground truth. Only reflectors that the image can
-    show count: they lie on its range axis, and within half a main lobe of its directions. A reflector is found if a
-    peak lies within 0.1 m and 1.5 main lobes. A peak is spurious if no reflector explains it. Finding nothing is not an
-    error: the exit code is 0.
+    show count: on its range axis, and within half of the array's main lobe from its directions. A reflector is matched
+    if a peak lies within 0.1 m and 1.5 main lobes of it. A peak is false if no reflector explains it. The exit code
+    is 0 even if nothing is matched.
     """
     from ertis_numba.analysis.compare import errors_of
 

@@ -1,4 +1,4 @@
-"""Implementation of ``ertis completion``, which prints shell completion scripts."""
+"""``ertis completion``: shell completion of commands and options."""
 
 import click
 
@@ -9,7 +9,7 @@ __all__ = ["completion"]
 @click.argument("shell", type=click.Choice(["bash", "fish", "zsh"]))
 @click.pass_context
 def completion(ctx: click.Context, *, shell: str) -> None:
-    """Print shell completion for commands and options.
+    """Print a script that completes commands and options in a shell.
 
     For bash, add eval "$(ertis completion bash)" to ~/.bashrc. For zsh, add eval "$(ertis completion zsh)" to ~/.zshrc,
     after 'autoload -U compinit; compinit'. For fish, save the output as ~/.config/fish/completions/ertis.fish.

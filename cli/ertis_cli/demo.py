@@ -1,4 +1,4 @@
-"""Implementation of ``ertis demo``, which runs the whole system without hardware."""
+"""``ertis demo``: run the whole system without hardware."""
 
 import functools
 import json
@@ -69,9 +69,9 @@ _GAPS: Final = 3
 def demo(*, folder: Path, count: int, force: bool, quiet: bool) -> None:
     """Run four emulated sensors, a central node and an application.
 
-    A sensor node sends the measurements of four sensors on one SYNC chain to a central node. The central node stores
-    them and publishes images to an application. A recording then becomes an image, a list of reflectors and a picture.
-    The demo prints each command, and writes all files to one folder.
+    A sensor node sends the measurements of four sensors on one SYNC chain to a central node, which stores them and
+    publishes images to an application. A recording is then processed into an image, a list of reflectors and a
+    picture. The demo prints each command and writes all files to one folder.
     """
     _make(folder, force=force)
     scene = folder / _SCENE
@@ -113,7 +113,7 @@ def _make(folder: Path, *, force: bool) -> None:
 
     there = [folder / name for name in _WRITTEN if (folder / name).exists() or (folder / name).is_symlink()]
     if there and not force:
-        raise ArgumentError(f"output {there[0]} exists; give another folder (-o), or overwrite it (--force)")
+        raise ArgumentError(f"output {there[0]} exists; give another folder (--output), or overwrite it (--force)")
     for path in there:
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)
@@ -155,7 +155,7 @@ class _DemoRun:
         command = [*_NODE, *map(str, words)]
         done = subprocess.run(command, env=self._environment, preexec_fn=self._bind, check=False)  # noqa: S603
         if done.returncode not in {0, *allowed}:
-            raise click.ClickException(f"'{typed}' ended with {done.returncode}; its error is above")
+            raise click.ClickException(f"'{typed}' ended with exit code {done.returncode}; its error is above")
 
     @contextmanager
     def node(self, *words: object, output: Path) -> Iterator[dict[str, Any]]:
@@ -177,7 +177,9 @@ class _DemoRun:
         try:
             while not (text := output.read_text("utf-8")).endswith("\n"):
                 if process.poll() is not None:
-                    raise click.ClickException(f"'{typed}' ended with {process.returncode}; its error is above")
+                    raise click.ClickException(
+                        f"'{typed}' ended with exit code {process.returncode}; its error is above"
+                    )
                 time.sleep(_LOOK_INTERVAL_S)
             yield json.loads(text.partition("\n")[0])
         finally:

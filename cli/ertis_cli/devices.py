@@ -1,4 +1,4 @@
-"""Implementation of ``ertis devices``, which lists connected sensors."""
+"""``ertis devices``: list plugged-in and emulated sensors."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -17,16 +17,16 @@ _COLUMNS: dict[str, _tables.Side] = dict.fromkeys(
 
 
 @click.command()
-@click.option("--port", "-p", "names", multiple=True, metavar="PORT", help="Probe only this port; repeatable.")
+@click.option("--port", "-p", "names", multiple=True, metavar="PORT", help="Query this port only; repeatable.")
 @options.as_json
 def devices(*, names: tuple[str, ...], as_json: bool) -> None:
-    """List the eRTIS devices that are plugged in or emulated.
+    """List plugged-in and emulated eRTIS devices.
 
-    The command asks each USB CDC-ACM port for its firmware and the hash of its call. It stops a device that still
-    measures for a program that has ended. Ports in use by another program are listed, but not probed. --port probes any
-    serial port, given by path, serial number or name.
+    The command queries USB CDC-ACM ports for their firmware and the hash of their call. This stops a device that still
+    measures for a program that has ended. Ports that another program uses are listed but not queried. With --port, the
+    command also queries any other serial port, given by its path, serial number or name.
 
-    The exit code is 0 even if there is no device. With --port it is 1 unless every port is an eRTIS or in use.
+    The exit code is 0 even if no device is found. With --port, it is 1 unless each port is an eRTIS or in use.
     """
     from ertis_numba.devices.ports import find_ports, resolve
     from ertis_numba.devices.survey import survey

@@ -1,4 +1,4 @@
-"""Implementation of ``ertis emulate``, which emulates devices on pseudo terminals."""
+"""``ertis emulate``: emulated devices on pseudo terminals."""
 
 import json
 import sys
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = ["emulate"]
 
-_LOOK_S = 0.5  # Interval between checks of the devices.
+_LOOK_S = 0.5  # interval between checks of the devices
 
 
 class _Fault(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4 only
@@ -37,7 +37,7 @@ class _Fault(click.ParamType):  # type: ignore[type-arg]  # generic since click 
         try:
             return kind, float(share if equals else "")
         except ValueError:
-            return self.fail(f"{value!r} is not a fault; give a kind and a probability, such as lose=0.01", param, ctx)
+            return self.fail(f"{value!r} is not a fault; give a kind and a probability, as in lose=0.01", param, ctx)
 
 
 @click.command()
@@ -49,18 +49,18 @@ class _Fault(click.ParamType):  # type: ignore[type-arg]  # generic since click 
     metavar="N",
     help="Number of measurements of a scene; the scene's own by default.",
 )
-@click.option("--seed", type=click.IntRange(min=0), metavar="S", help="Seed of the scene's noise and of the faults.")
+@click.option("--seed", type=click.IntRange(min=0), metavar="S", help="Seed of the noise of a scene, and of faults.")
 @click.option(
     "--sync-rate",
     type=click.FloatRange(0.001, 1000.0),
     metavar="HZ",
-    help="Connect the devices to a SYNC line with this many pulses per second.",
+    help="Connect the devices to a SYNC line with this pulse rate.",
 )
 @click.option(
     "--link",
     type=click.Path(path_type=Path),
     metavar="PATH",
-    help="Link to the port of a single device; by default 'ertis devices' finds it by the sensor's name.",
+    help="Symbolic link to the port of a single device; by default, 'ertis devices' finds it by the sensor's name.",
 )
 @click.option(
     "--fault",
@@ -68,7 +68,7 @@ class _Fault(click.ParamType):  # type: ignore[type-arg]  # generic since click 
     type=_Fault(),
     multiple=True,
     metavar="KIND=P",
-    help="Spoil measurements with a probability: flip, duplicate, lose, add, swap, cut, drop, stall or unplug.",
+    help="Inject a fault with a probability: flip, duplicate, lose, add, swap, cut, drop, stall or unplug; repeatable.",
 )
 @click.option(
     "--unplug",
@@ -76,10 +76,14 @@ class _Fault(click.ParamType):  # type: ignore[type-arg]  # generic since click 
     type=options.INTERVAL,
     multiple=True,
     metavar="AT:FOR",
-    help="Unplug the devices after AT seconds, for FOR seconds.",
+    help="Unplug the devices after AT seconds, for FOR seconds; repeatable.",
 )
 @click.option(
-    "--log", "log_path", type=click.Path(path_type=Path), metavar="FILE", help="Append one JSON line per measurement."
+    "--log",
+    "log_path",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Append a line of JSON per measurement to this file.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object per device on stdout.")
 @options.quiet
@@ -97,15 +101,17 @@ def emulate(
     quiet: bool,
     as_json: bool,
 ) -> None:
-    """Emulate the sensors of a scene or of a recording.
+    """Emulate the sensors of a scene or a recording.
 
-    Each sensor is a separate device on a pseudo terminal. The command prints the path of each device that is ready. A
-    device accepts the commands of a real one, and repeats the measurements of the scene or recording. Measurements
-    without emission are simulated with all sensors silent.
+    Each sensor is a separate device on a pseudo terminal. The path of the terminal is printed when the device is ready.
+    The device accepts the commands of a real one. It returns simulated or recorded measurements, and repeats them
+    until Ctrl-C ends the command.
+    For measurements without emission, the scene is simulated with all sensors silent.
 
     A scene is rendered for the call that 'ertis capture' uploads: the scene's own or that of a preset. Without
-    --sync-rate, all measurements with the scene's call are rendered first. With it, each is rendered at its pulse, and
-    the first pulses are slower. A recording has one call only; the sensor refuses to measure with any other.
+    --sync-rate, all measurements with the scene's call are rendered in advance. With --sync-rate, each is rendered at
+    its pulse, and the first pulses are slower. A recording supports only its own call; with any other call, the sensor
+    does not measure.
 
     'ertis capture' can read the mounting of the sensors from the same file: --mounting SCENE.toml|REC.h5.
     """
@@ -114,22 +120,20 @@ def emulate(
     from ertis_numba.devices.links import HeldLink, emulated_folder
 
     kinds = dict(faults)
-    Faults(0, kinds)  # A wrong fault is reported before a scene is rendered.
+    Faults(0, kinds)  # refuse before rendering a scene
     is_scene = path.suffix.lower() == ".toml"
     if count is not None and not is_scene:
-        raise click.UsageError(
-            "--count applies to scenes; a recording has a fixed number of measurements", ctx=click.get_current_context()
-        )
+        raise click.UsageError("--count is for scenes; remove it for a recording", ctx=click.get_current_context())
     with ExitStack() as stack:
         stack.enter_context(broken_off_by_signals())
         names = _names(path, sensor, is_scene=is_scene)
         if link is not None and len(names) > 1:
             raise click.UsageError(
-                f"--link applies to one device, but {path.name} has {len(names)} sensors; choose one with --sensor",
+                f"--link is for one device, but {path.name} has {len(names)} sensors; choose one with --sensor",
                 ctx=click.get_current_context(),
             )
         links = {name: link or emulated_folder() / name for name in names}
-        for each in links.values():  # A link that exists is reported before a scene is rendered.
+        for each in links.values():  # refuse a taken link before rendering
             HeldLink(each).release()
         renderer = _renderer(path, names, count=count, seed=seed, quiet=quiet) if is_scene else None
         if renderer is not None and sync_rate is None:
@@ -168,7 +172,7 @@ def emulate(
 
 
 def _names(path: Path, sensor: str | None, *, is_scene: bool) -> list[str]:
-    """Return the sensors to emulate; raise an error for one that no device can emulate."""
+    """Return the names of the sensors to emulate; raise an error for settings that no device supports."""
     from ertis_numba.devices.setup import Setup
     from ertis_numba.simulation import load_scene
     from ertis_numba.storage import open_recording
@@ -253,11 +257,11 @@ def _get_ready(devices: "Sequence[Emulator]", given: "Given", pulse: int) -> Non
 
 
 def _emit_event(name: str, port: str, *, quiet: bool) -> None:
-    options.say(f"{name} is back: {port}", quiet=quiet)
+    options.say(f"{name} reconnected: {port}", quiet=quiet)
 
 
 def _look_after(devices: "Sequence[Emulator]", absences: "list[tuple[float, float]]", ended: threading.Event) -> None:
-    """Unplug devices when due, until one fails or the user interrupts."""
+    """Unplug devices when due, until one fails or the command is asked to end."""
     began_s = time.monotonic()
     while not ended.is_set():
         for device in devices:

@@ -1,4 +1,4 @@
-"""Implementation of ``ertis example``, which copies scenes, recordings and scripts."""
+"""``ertis example``: shipped scenes, recordings and scripts."""
 
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING
@@ -36,8 +36,8 @@ def _complete(ctx: click.Context, param: click.Parameter, incomplete: str) -> li
 def example(*, names: tuple[str, ...], folder: Path, force: bool, quiet: bool, as_json: bool) -> None:
     """List or copy shipped scenes, recordings and scripts.
 
-    NAME is a file name with or without its suffix: 'reflectors' copies the scene reflectors.toml and its recording
-    reflectors.h5. A different file of the same name is overwritten only with --force.
+    NAME is a file name, or a file name without its suffix: 'reflectors' copies the scene reflectors.toml and its
+    recording reflectors.h5. A different file of the same name is overwritten only with --force.
     """
     if not names:
         _list(as_json=as_json)
@@ -48,7 +48,7 @@ def example(*, names: tuple[str, ...], folder: Path, force: bool, quiet: bool, a
     for name in names:
         chosen |= _examples.named(name)
     contents = {folder / name: item.read_bytes() for name, item in chosen.items()}
-    # An identical copy stays, so that commands from several pages can be pasted one after the other.
+    # An existing copy stays, so that commands from several pages can be run one after the other.
     missing = {path: content for path, content in contents.items() if not _holds(path, content)}
     for path in missing:
         check_target(path, overwrite=force)

@@ -29,7 +29,7 @@ class _Places(click.ParamType):  # type: ignore[type-arg]  # generic since click
         first, colon, last = str(value).partition(":")
         with suppress(ValueError):
             return int(first), int(last if colon else first)
-        return self.fail(f"{value!r} is not a measurement; give a number, or two such as 2:5", param, ctx)
+        return self.fail(f"{value!r} is not a measurement; give one number, or two as in 2:5", param, ctx)
 
 
 @click.command()
@@ -43,30 +43,32 @@ class _Places(click.ParamType):  # type: ignore[type-arg]  # generic since click
     required=True,
     help="File to write: .mcap, .ply, .pcd, .csv, .npz, or .h5 for Acoular, with an .xml beside it.",
 )
-@click.option("--format", "file_format", type=click.Choice(FORMATS), help="Format; by the suffix of OUT by default.")
-@options.sensor("Export one sensor only; all sensors of the file by default.")
+@click.option(
+    "--format", "file_format", type=click.Choice(FORMATS), help="Output format; chosen by the suffix of OUT by default."
+)
+@options.sensor("Export this sensor only; all sensors by default.")
 @click.option(
     "--measurement",
     "-m",
     "places",
     type=_Places(),
     metavar="I|A:B",
-    help="One measurement, counted from 0, or those from A to B; all by default.",
+    help="One measurement, counted from 0, or measurements A to B; all by default.",
 )
 @click.option(
     "--topic",
     "topics",
     type=click.Choice(TOPICS),
     multiple=True,
-    help="Products of a sensor in MCAP; repeatable. All by default.",
+    help="Topic to write to MCAP; repeatable; all by default.",
 )
-@click.option("--top", type=int, metavar="N", help="Limit on the points of an image; 256 by default.")
+@click.option("--top", type=int, metavar="N", help="Largest number of points per image; 256 by default.")
 @click.option(
     "--min-level",
     "min_level_db",
     type=float,
     metavar="DB",
-    help="Omit points below this level relative to the strongest; -20 by default.",
+    help="Omit points below this level, relative to the strongest; -20 by default.",
 )
 @_mountings.mounting
 @click.option("--ascii", "text", is_flag=True, help="Write PLY and PCD as text.")
@@ -89,11 +91,11 @@ def export(
     quiet: bool,
     as_json: bool,
 ) -> None:
-    """Export to the formats of other programs.
+    """Export images or signals for other programs.
 
-    MCAP contains ROS 2 messages; PLY, PCD and CSV contain the points of images; NPZ contains the images of one sensor.
-    The files for Acoular contain the microphone signals of one measurement. A recording is first processed with its own
-    settings, except for Acoular.
+    MCAP contains ROS 2 messages. PLY, PCD and CSV contain the points of images, and NPZ the images of one sensor. The
+    files for Acoular contain the microphone signals of one measurement. Except for Acoular, a recording is first
+    processed with its own settings.
     """
     from ertis_numba import interop
     from ertis_numba.storage import check_target, file_kind, open_energyscapes, open_recording
@@ -111,7 +113,7 @@ def export(
         known = _known(readers, mounting) if "mounting" in fitting else None
         if known is None and mounting is not None:
             raise click.UsageError(
-                f"--mounting applies to formats with points, not to {name}; leave it out", click.get_current_context()
+                f"--mounting is for formats with points, not for {name}; remove it", click.get_current_context()
             )
         items = _Items(readers, places, process=recorded and name != "acoular", quiet=quiet)
         written = interop.export(
@@ -124,7 +126,7 @@ def export(
         )
     if known is not None:
         unknown = [reader.sensor for reader in readers if reader.sensor not in known]
-        remedy = "the export is in the sensor frame; give --mounting FILE for the frame of the platform"
+        remedy = "the export uses the frame of the sensor; give --mounting FILE for the frame of the platform"
         _mountings.note_unknown(unknown, remedy, quiet=quiet)
     measurements, sensors = options.counted(len(items), "measurement"), options.counted(len(readers), "sensor")
     options.say(f"{target}: {measurements} of {sensors} as {name}", quiet=quiet)
@@ -143,7 +145,7 @@ def export(
 def _known(
     readers: "Sequence[RecordingReader | EnergyscapeReader]", given: Path | None
 ) -> "dict[str, _mountings.Mounting]":
-    """Return the mountings of sensors, from the file of --mounting or from the exported file."""
+    """Return the mountings of sensors from the file given with --mounting, or else from the input file."""
     if given is not None:
         return _mountings.mountings(given, [reader.sensor for reader in readers]) or {}
     return {
@@ -154,7 +156,7 @@ def _known(
 
 
 class _Items:
-    """Iterator over the exported items of all sensors, with a progress bar."""
+    """Measurements or images to export, one sensor after the other, under a progress bar."""
 
     def __init__(
         self,
@@ -180,7 +182,7 @@ class _Items:
             yield from self._processed(read) if self._process else read
 
     def _processed(self, measurements: "Iterable[Any]") -> "Iterator[Energyscape]":
-        """Yield images, each processed in the air of its measurement."""
+        """Yield images; each change of the air needs a new pipeline."""
         for settings, group in itertools.groupby(measurements, lambda measurement: measurement.settings):
             with options.pipeline(settings, quiet=self._quiet) as pipeline:
                 for measurement in group:
@@ -188,7 +190,7 @@ class _Items:
 
 
 def _between(places: tuple[int, int] | None, count: int) -> range:
-    """Return the indices from the first to the last requested measurement, or raise a usage error."""
+    """Return the chosen range of measurement indices; raise an error if it is outside the file."""
     if places is None:
         return range(count)
     first, last = (options.place(place, count) for place in places)

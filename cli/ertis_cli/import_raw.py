@@ -1,4 +1,4 @@
-"""Implementation of ``ertis import``, which converts raw words or PCM to a recording."""
+"""``ertis import``: import raw PDM data or PCM into a recording."""
 
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -26,22 +26,20 @@ _PCM = {".wav", ".h5", ".hdf5", ".hdf"}
     "--layout",
     metavar="NAME",
     shell_complete=options.complete_layouts,
-    help="Array layout: eRTIS_v3D1 or another name, or a .toml or .csv file; not needed if a folder names it.",
+    help="Name of a shipped layout, or a .toml or .csv file; not needed if a folder contains it.",
 )
 @click.option(
     "--preset",
     metavar="NAME",
     shell_complete=options.complete_presets,
-    help="short_, default_ or long_ with 20_80 or 25_50; not needed if a folder contains the settings.",
+    help="Record length (short_, default_, long_) and band (20_80, 25_50); not needed if a folder contains settings.",
 )
 @click.option(
     "--settings",
     "settings_file",
     metavar="FILE.toml",
     type=click.Path(path_type=Path),
-    help=(
-        "Settings file (TOML) with array, call and other differences from an eRTIS; --layout and the air override it."
-    ),
+    help="Settings that differ from those of an eRTIS, such as array and call; --layout and air options override it.",
 )
 @click.option(
     "--skip", "skip_s", type=click.FloatRange(min=0), metavar="S", help="PCM: start of the first emission in the file."
@@ -51,13 +49,13 @@ _PCM = {".wav", ".h5", ".hdf5", ".hdf"}
     "length_s",
     type=click.FloatRange(min=0, min_open=True),
     metavar="S",
-    help="PCM: interval between emissions, if a file contains several; one emission per file by default.",
+    help="PCM: time between emissions, if a file contains several; by default, a file is one measurement.",
 )
 @click.option(
     "--start",
     metavar="TIME",
     type=click.DateTime([f"%Y-%m-%dT%H:%M{rest}{zone}" for rest in ("", ":%S", ":%S.%f") for zone in ("", "%z")]),
-    help="PCM: time of the first emission, such as 2026-05-04T12:30 or 12:30:00.5; UTC unless it has an offset.",
+    help="PCM: time of the first emission, as 2026-05-04T12:30 or 12:30:00.5, in UTC unless it has an offset.",
 )
 @click.option("--sensor", metavar="NAME", default="sensor", show_default=True, help="Name of the sensor.")
 @click.option("--temperature", type=float, metavar="C", help="Air temperature in °C; 20 by default.")
@@ -82,16 +80,16 @@ def import_raw(
     quiet: bool,
     as_json: bool,
 ) -> None:
-    """Import raw eRTIS words, or PCM of other arrays, as a recording.
+    """Import raw eRTIS data or PCM into a recording.
 
-    Raw words are little-endian and have no header, one measurement after the other. Array and preset supply the rest; a
-    preset is the length of a measurement and the band of the call in kHz. A settings file can supply all of it. The
-    recording contains these settings.
+    Raw data are little-endian words without a header, one measurement after the other. The layout and the preset
+    supply the missing information; a preset names the length of a measurement and the band of the call in kHz. A
+    settings file can supply all of it instead. The recording then contains these settings.
 
-    Instead of files, give a folder written by an RTIS Dev program: NAME<number>.bin for each measurement, and the
-    settings of recording and processing as JSON.
+    Instead of files, give a folder to which a program based on RTIS Dev has saved. It contains NAME<number>.bin
+    for each measurement, and the settings of recording and processing as JSON.
 
-    Files that end in .wav are multichannel PCM, and so are .h5 files with the time_data of Acoular. Their channels are
+    Files that end in .wav contain multichannel PCM, as do .h5 files with the time_data of Acoular. Their channels are
     the rows of the layout, and their sample rate becomes that of the recording.
     """
     from ertis_numba.storage import check_target, write_recording
@@ -99,10 +97,10 @@ def import_raw(
     is_pcm = all(path.suffix.lower() in _PCM for path in raw)
     for name, parameter in (("--skip", "skip_s"), ("--length", "length_s"), ("--start", "start")):
         if typed(parameter) and not is_pcm:
-            raise click.UsageError(f"{name} applies to PCM (.wav, .h5); leave it out", click.get_current_context())
+            raise click.UsageError(f"{name} is for PCM (.wav, .h5); remove it", click.get_current_context())
     if not is_pcm and any(path.suffix.lower() in _PCM for path in raw):
         raise click.UsageError(
-            "some files are PCM (.wav, .h5) and others raw words; import each kind separately",
+            "some files are PCM (.wav, .h5) and others are raw data; import each kind separately",
             click.get_current_context(),
         )
     folder = raw[0] if len(raw) == 1 and raw[0].is_dir() else None
@@ -125,7 +123,7 @@ def import_raw(
     options.say(f"{target}: {options.counted(len(measurements), 'measurement')}", quiet=quiet)
     rest_s = getattr(measurements, "rest_s", 0.0)
     if rest_s:
-        options.say(f"note: {rest_s:.4g} s at the ends of files are omitted", quiet=quiet)
+        options.say(f"note: {rest_s:.4g} s at the ends of files were left out", quiet=quiet)
     _report_obstacle(measurements.settings, quiet=quiet)
     if as_json:
         options.print_json({"output": str(target), "measurements": len(measurements)})
@@ -135,7 +133,7 @@ def _beside(first: Path) -> Path:
     """Return the default name of the recording."""
     if first.suffix.lower() == ".h5":
         raise click.UsageError(
-            f"the recording of {first} would have the same name; give another one (--output)",
+            f"{first} cannot become a recording of the same name; give another name (--output)",
             click.get_current_context(),
         )
     return first.with_suffix(".h5")
@@ -154,7 +152,8 @@ def _opened_raw(
     if folder is not None:
         if typed("settings_file"):
             raise click.UsageError(
-                "--settings applies to files, and a folder contains settings; leave it out", click.get_current_context()
+                "--settings is for files, and a folder contains its own settings; remove it",
+                click.get_current_context(),
             )
         return open_rtis_folder(folder, layout=layout, preset=preset, sensor=sensor)
     if settings_file is None and (layout is None or preset is None):
@@ -189,14 +188,14 @@ def _since_1970_ns(start: datetime | None) -> int:
     since_1970_ns = (given - datetime.fromtimestamp(0, UTC)) // timedelta(microseconds=1) * 1000
     if not 0 <= since_1970_ns < _END_NS:
         raise click.BadParameter(
-            f"{given.isoformat()} is outside 1970 to 2262, the years that a recording can store; give another time",
+            f"{given.isoformat()} is outside the range of a recording; give a time from 1970 to 2262",
             param_hint="'--start'",
         )
     return since_1970_ns
 
 
 def _report_obstacle(settings: "Settings", *, quiet: bool) -> None:
-    """Print a note now if the recording cannot be processed with its settings."""
+    """Print a note if the recording cannot be processed with its own settings."""
     from ertis_numba.errors import ArgumentError
     from ertis_numba.geometry import direction_grid
     from ertis_numba.stages.window import time_window
@@ -205,7 +204,7 @@ def _report_obstacle(settings: "Settings", *, quiet: bool) -> None:
         direction_grid(settings.processing)
         time_window(settings, largest_delay_s=0.0, n_taps=1)
     except ArgumentError as error:
-        options.say(f"note: it cannot be processed with these settings: {error}", quiet=quiet)
+        options.say(f"note: this recording cannot be processed with its own settings: {error}", quiet=quiet)
 
 
 def _require(option: str) -> None:
@@ -213,7 +212,7 @@ def _require(option: str) -> None:
 
 
 def _settings(layout: str | None, preset: str | None, settings_file: Path | None) -> "Settings":
-    """Return the settings that the files lack, from preset, settings file and options."""
+    """Return the settings from preset, settings file and options."""
     from ertis_numba.settings import Array, Settings
 
     settings = Settings() if preset is None else Settings.from_preset(preset)

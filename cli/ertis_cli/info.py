@@ -1,4 +1,4 @@
-"""Implementation of ``ertis info``, which shows the contents of files."""
+"""``ertis info``: contents of a file."""
 
 import re
 from collections.abc import Iterator
@@ -18,8 +18,8 @@ __all__ = ["info"]
 
 _TIME = re.compile(r"(\d{4}-\d\d-\d\d)T(\d\d:\d\d:\d\d)(\.\d+)?(?:Z|\+00:00)")
 _LOOKED_AT = 8
-_WIDTH = 7  # Minimum width of a column.
-_COLUMNS = {  # Name and digits of each column, in the report and in the table.
+_WIDTH = 7  # minimum width of a column
+_COLUMNS = {  # name: digits in the report, and in the table
     "offset": (6, 4),
     "changes": (6, 3),
     "overload": (6, 4),
@@ -32,15 +32,18 @@ _COLUMNS = {  # Name and digits of each column, in the report and in the table.
 
 @click.command()
 @options.input_file("FILE")
-@click.option("--health", "of_health", is_flag=True, help="Show array health of a recording instead.")
+@click.option(
+    "--health", "of_health", is_flag=True, help="Show array health, the state of each microphone of a recording."
+)
 @options.as_json
 def info(*, path: Path, of_health: bool, as_json: bool) -> None:
     """Show the contents of a recording or an energyscape file.
 
-    In JSON, "sensors" lists the content of each sensor. For a single sensor, the same keys also stand at the top level.
+    In JSON, "sensors" lists the properties of each sensor. If there is only one sensor, the top level repeats its
+    properties.
 
-    --health reports each microphone of a recording as ok, dead, stuck, saturated, with an offset, or with an idle tone.
-    It examines at most 8 measurements, evenly spaced. The exit code is 0 even if a microphone is faulty.
+    With --health, show the state of each microphone of a recording: ok, dead, stuck, saturated, or with an offset or an
+    idle tone. At most 8 measurements, evenly spaced, are examined. The exit code is 0 even if faults are found.
     """
     if of_health:
         _report_health(path, as_json=as_json)
@@ -74,7 +77,7 @@ def info(*, path: Path, of_health: bool, as_json: bool) -> None:
 
 
 def _label(name: str) -> tuple[str, str]:
-    """Return a key as a label, with its unit after a space."""
+    """Return a key as a label, and its unit after a space."""
     from ertis_numba.units import unit_of
 
     suffix, unit = unit_of(name)
@@ -164,7 +167,7 @@ def _mounting(reader: "RecordingReader | EnergyscapeReader") -> dict[str, Any]:
 
 
 def _error(reader: "EnergyscapeReader") -> dict[str, Any]:
-    """Return the predicted error and the budget, if the file contains them."""
+    """Return the predicted error and the error budget, if the file contains them."""
     if reader.predicted_error_db is None:
         return {}
     texts = {name: getattr(reader, name) for name in ("budget_applies_to", "error_warning")}
@@ -222,7 +225,7 @@ def _health(report: "Health") -> dict[str, Any]:
 
 
 def _health_lines(section: dict[str, Any]) -> Iterator[str]:
-    """Yield the lines of an array's health report."""
+    """Yield the properties of an array."""
     yield f"sensor         {section['sensor']}"
     yield f"measurements   {section['measurements']}, of which {section['looked_at']} examined"
     yield f"noise          {_cell(section['noise_dbfs'], 1)} dBFS in the call's band"

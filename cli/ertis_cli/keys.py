@@ -1,4 +1,4 @@
-"""Implementation of ``ertis keys``, which manages keys and permissions."""
+"""``ertis keys``: keys of nodes, and the list of allowed keys."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,16 +14,16 @@ __all__ = ["keys"]
 
 _FILE = click.Path(path_type=Path)
 _list_file = click.option(
-    "--list", "listed", type=_FILE, metavar="FILE", help="Allow list; allow.toml beside the keys by default."
+    "--list", "listed", type=_FILE, metavar="FILE", help="List of allowed keys; allow.toml beside the keys by default."
 )
 
 
 @click.group()
 def keys() -> None:
-    """Create keys and grant permissions.
+    """Create keys and manage the list of allowed keys.
 
-    Each machine creates its own keys with 'ertis keys new'. The central node adds the public file of each machine to
-    its allow list with 'ertis keys allow'. Each machine gets the public file of the central node (--server-key).
+    Create keys on each machine with 'ertis keys new'. Copy the public file of a machine to the central node, and add it
+    to the list with 'ertis keys allow'. Copy the public file of the central node to each machine (--server-key).
 
     \b
     central$  ertis keys new central
@@ -36,10 +36,16 @@ def keys() -> None:
 
 @keys.command()
 @click.argument("name")
-@click.option("--dir", "folder", type=_FILE, metavar="DIR", help="Folder for the keys; the user's own by default.")
+@click.option(
+    "--dir",
+    "folder",
+    type=_FILE,
+    metavar="DIR",
+    help="Folder for the key files; the key folder of this user by default.",
+)
 @options.as_json
 def new(*, name: str, folder: Path | None, as_json: bool) -> None:
-    """Create keys: NAME.secret.toml, which stays on this machine, and NAME.public.toml for other machines."""
+    """Create a key pair: NAME.secret.toml, to keep, and NAME.public.toml, to give to others."""
     from ertis_numba.network.keys import KeyPair, default_folder
 
     pair = KeyPair.new(name)
@@ -49,8 +55,8 @@ def new(*, name: str, folder: Path | None, as_json: bool) -> None:
             {"name": name, "public": pair.public, "secret_file": str(secret), "public_file": str(public)}
         )
         return
-    click.echo(f"{secret}: keep this file secret")
-    click.echo(f"{public}: give this file to the other side, {pair.public}")
+    click.echo(f"{secret}: secret key; keep it, and let nobody else read it")
+    click.echo(f"{public}: public key for the other side, {pair.public}")
 
 
 @keys.command()
@@ -59,10 +65,10 @@ def new(*, name: str, folder: Path | None, as_json: bool) -> None:
     "--role",
     required=True,
     type=click.Choice(["sensor", "application", "admin"]),
-    help="A sensor sends, an application receives, an admin may do both.",
+    help="A sensor may send, an application may receive, and an admin may do both.",
 )
 @click.option(
-    "--serial", "serials", multiple=True, metavar="S", help="Sensor serial that the key may send for; repeatable."
+    "--serial", "serials", multiple=True, metavar="S", help="Name of a sensor that the key may send for; repeatable."
 )
 @click.option("--name", metavar="NAME", help="Name in the list; the name in the file by default.")
 @_list_file
@@ -70,13 +76,13 @@ def new(*, name: str, folder: Path | None, as_json: bool) -> None:
 def allow(
     *, key: str, role: str, serials: tuple[str, ...], name: str | None, listed: Path | None, as_json: bool
 ) -> None:
-    """Allow a key within one second, and replace its earlier permissions."""
+    """Allow a key within a second; earlier permissions of the key are replaced."""
     from ertis_numba.network.allow_list import ROLES, AllowList, Permission
     from ertis_numba.network.keys import public_key
 
     public, named = public_key(key)
     if not (name or named):
-        raise click.UsageError("a key that is not read from a file has no name; give --name")
+        raise click.UsageError("a key that is not given as a file has no name; add --name")
     (chosen,) = (known for known in ROLES if known == role)
     permission = Permission(name=name or named, public=public, role=chosen, serials=serials)
     path = _path(listed)
@@ -90,7 +96,7 @@ def allow(
 @_list_file
 @options.as_json
 def remove(*, who: str, listed: Path | None, as_json: bool) -> None:
-    """Remove a key within one second, even if it is connected."""
+    """Remove a key from the list; it is refused within a second, even if connected."""
     from ertis_numba.network.allow_list import AllowList
 
     path = _path(listed)
@@ -99,14 +105,14 @@ def remove(*, who: str, listed: Path | None, as_json: bool) -> None:
     if as_json:
         options.print_json({"list": str(path), "removed": [_report(permission) for permission in removed]})
         return
-    click.echo(f"{path}: without {', '.join(permission.name for permission in removed)}")
+    click.echo(f"{path}: removed {', '.join(permission.name for permission in removed)}")
 
 
 @keys.command("list")
 @_list_file
 @options.as_json
 def list_(*, listed: Path | None, as_json: bool) -> None:
-    """List allowed keys and their roles."""
+    """List the allowed keys and their roles."""
     from ertis_numba.network.allow_list import AllowList
 
     path = _path(listed)

@@ -1,4 +1,4 @@
-"""Implementation of ``ertis layout``, which lists the shipped array layouts."""
+"""``ertis layout``: shipped array layouts."""
 
 import click
 
@@ -13,7 +13,7 @@ __all__ = ["layout"]
 def layout(*, name: str | None, as_json: bool) -> None:
     """List the shipped layouts, or print one as TOML.
 
-    Save the output to a file, edit it, and give that file as array.layout in settings or scenes, or as --layout.
+    Save the output to a file and edit it. Then use that file as array.layout in settings or scenes, or as --layout.
     """
     from ertis_numba.geometry import layout_names, layout_text, load_layout
 

@@ -1,4 +1,4 @@
-"""Implementation of ``ertis listen``, which prints or saves published products."""
+"""``ertis listen``: show or save the products that a central node publishes."""
 
 import importlib
 import math
@@ -28,28 +28,36 @@ _LOOK_S = 0.1
 
 @click.command()
 @click.argument("address", metavar="ADDRESS")
-@click.option("--sensor", "sensors", multiple=True, metavar="NAME", help="Sensors to receive; all by default.")
+@click.option(
+    "--sensor",
+    "sensors",
+    multiple=True,
+    metavar="NAME",
+    help="Receive products of this sensor only; repeatable; all sensors by default.",
+)
 @click.option(
     "--product",
     "products",
     multiple=True,
     type=click.Choice(_PRODUCTS),
-    help="Products to receive; energyscape by default.",
+    help="Product to receive; repeatable; energyscape by default.",
 )
-@click.option("-n", "--count", "n", type=click.IntRange(min=1), metavar="N", help="End after this many products.")
+@click.option(
+    "-n", "--count", "n", type=click.IntRange(min=1), metavar="N", help="Number of products to receive before ending."
+)
 @click.option("--duration", type=float, metavar="S", help="Duration in seconds; until Ctrl-C by default.")
 @click.option(
     "--save",
     "target",
     type=click.Path(path_type=Path),
     metavar="FILE.h5",
-    help="Write energyscapes, or a recording, to this file.",
+    help="Energyscape file or, with --product raw, recording to write.",
 )
 @_network.key
 @_network.server_key
 @options.force
 @options.quiet
-@options.as_json_of("one object per line for each event, and a summary at the end")
+@options.as_json_of("one object per line for each event; the last one is a summary")
 def listen(
     *,
     address: str,
@@ -64,20 +72,21 @@ def listen(
     quiet: bool,
     as_json: bool,
 ) -> None:
-    """Print or save the products of the central node at ADDRESS.
+    """Show or save the products that a central node publishes.
 
-    Each product takes a line with its nearest reflector, its age since the emission, and its processing time in the
-    central node. The central node drops and counts products that this command is too slow to receive. --save writes the
-    energyscapes, or with --product raw the measurements, to a file that appears complete at the end. The command
-    reconnects to a central node that was away. --json prints a line for each event, the first when it is connected.
+    ADDRESS is the address at which the central node publishes. The command prints one line per product: the nearest
+    reflector, the time since the emission, and the time spent in the central node. The central node drops and
+    counts products that this command receives too slowly. With --save, the energyscapes, or with --product raw the
+    measurements, are saved to a file that appears complete at the end. If the central node disappears, the command
+    waits for it. With --json, there is one line per event; the first one reports the connection.
     """
     products = tuple(dict.fromkeys(products)) or ("energyscape",)
     if target is not None and (len(products) > 1 or products[0] not in FILED):
-        raise click.UsageError(f"--save writes one product; give --product {' or '.join(FILED)} alone")
+        raise click.UsageError(f"--save writes one product; give only --product {' or '.join(FILED)}")
     _network.require_duration(duration)
     from ertis_numba.network.subscriber import Subscriber
 
-    if "energyscape" in products:  # Loading takes half a second, in which the first images would be dropped.
+    if "energyscape" in products:  # import now: it takes half a second, in which the first images would be dropped
         importlib.import_module("ertis_numba.analysis.points")
     keys = _network.client_keys(key, server_key)
     notes: deque[str] = deque()
@@ -110,12 +119,12 @@ def listen(
         sys.exit(0 if n is None and duration is None else 128 + signals.came[0])
     if n is not None and subscriber.counts.received < n:
         raise click.ClickException(
-            f"{subscriber.counts.received} of {n} came in {duration:g} s; give a longer --duration"
+            f"received {subscriber.counts.received} of {n} products in {duration:g} s; give a longer --duration"
         )
 
 
 def _saved(save: "Write", arrival: "Arrival") -> Exception | None:
-    """Save a product; return the reason if it does not fit the earlier ones, which are kept."""
+    """Save a product; return the error if it does not match earlier products, which are kept."""
     from ertis_numba.errors import ArgumentError
 
     try:

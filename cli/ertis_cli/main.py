@@ -1,4 +1,4 @@
-"""Entry point of the ``ertis`` command: command lookup by name, one-line errors and exit codes."""
+"""The ``ertis`` command: find subcommands by name, and turn errors into one line and an exit code."""
 
 import errno
 import gc
@@ -15,37 +15,37 @@ from ertis_cli._signals import interruption, obey_signals
 __all__ = ["COMMANDS", "cli", "main"]
 
 COMMANDS = {
-    "bench": ("ertis_cli.bench:bench", "Measure this machine; results are checked before they are timed."),
-    "capture": ("ertis_cli.capture:capture", "Record measurements from sensors."),
+    "bench": ("ertis_cli.bench:bench", "Run benchmarks, and check each result before timing it."),
+    "capture": ("ertis_cli.capture:capture", "Record measurements, or send them to a central node."),
     "compare": ("ertis_cli.compare:compare", "Compare an energyscape file with the scene's ground truth."),
-    "completion": ("ertis_cli.completion:completion", "Print shell completion for commands and options."),
+    "completion": ("ertis_cli.completion:completion", "Print a script that completes commands and options in a shell."),
     "demo": ("ertis_cli.demo:demo", "Run four emulated sensors, a central node and an application."),
-    "devices": ("ertis_cli.devices:devices", "List eRTIS devices, real and emulated."),
+    "devices": ("ertis_cli.devices:devices", "List plugged-in and emulated eRTIS devices."),
     "doctor": ("ertis_cli.doctor:doctor", "Check this installation and suggest fixes."),
     "emulate": (
         "ertis_cli.emulate:emulate",
-        "Emulate the sensors of a scene or of a recording.",
+        "Emulate the sensors of a scene or a recording.",
     ),
     "example": ("ertis_cli.example:example", "List or copy shipped scenes, recordings and scripts."),
-    "export": ("ertis_cli.export:export", "Export to the formats of other programs."),
-    "import": ("ertis_cli.import_raw:import_raw", "Import raw eRTIS words, or PCM of other arrays."),
+    "export": ("ertis_cli.export:export", "Export images or signals for other programs."),
+    "import": ("ertis_cli.import_raw:import_raw", "Import raw eRTIS data or PCM into a recording."),
     "info": ("ertis_cli.info:info", "Show the contents of a recording or an energyscape file."),
-    "keys": ("ertis_cli.keys:keys", "Create keys and grant permissions."),
+    "keys": ("ertis_cli.keys:keys", "Create keys and manage the list of allowed keys."),
     "layout": ("ertis_cli.layout:layout", "List the shipped layouts, or print one as TOML."),
-    "listen": ("ertis_cli.listen:listen", "Print or save the products of the central node at ADDRESS."),
+    "listen": ("ertis_cli.listen:listen", "Show or save the products that a central node publishes."),
     "peaks": ("ertis_cli.peaks:peaks", "List the reflectors in an energyscape file."),
-    "plot": ("ertis_cli.plot:plot", "Draw a measurement."),
-    "process": ("ertis_cli.process:process", "Process a recording into energyscapes."),
+    "plot": ("ertis_cli.plot:plot", "Plot a measurement or an array."),
+    "process": ("ertis_cli.process:process", "Process recordings into energyscapes."),
     "record": ("ertis_cli.record:record", "Run a central node that stores measurements."),
     "recover": ("ertis_cli.recover:recover", "Recover recordings from journals left by a crash."),
-    "serve": ("ertis_cli.serve:serve", "Run a central node that stores, processes and publishes measurements."),
+    "serve": ("ertis_cli.serve:serve", "Run a central node that computes and publishes images."),
     "settings": ("ertis_cli.settings:settings", "Print every key of a settings, scene, layout or mounting file."),
     "simulate": ("ertis_cli.simulate:simulate", "Simulate a scene and write a recording."),
-    "status": ("ertis_cli.status:status", "Show the live status of the central node at ADDRESS."),
-    "verify": ("ertis_cli.verify:verify", "Check every measurement of a file, and list missing ones."),
-    "view": ("ertis_cli.view:view", "Show images and points in the browser."),
+    "status": ("ertis_cli.status:status", "Show the status of a central node."),
+    "verify": ("ertis_cli.verify:verify", "Check the measurements of a file, and list gaps and damage."),
+    "view": ("ertis_cli.view:view", "Show live or recorded images in a browser."),
 }
-"""Module of each command and first sentence of its help; a command is imported only when it runs."""
+"""Module and summary of each command. A command is imported only when it runs."""
 
 _FAILED, _USAGE, _INTERRUPTED = 1, 2, 130
 
@@ -83,7 +83,7 @@ class _Commands(click.Group):
         standalone_mode: bool = True,  # noqa: FBT001, FBT002  as click has it
         **extra: Any,
     ) -> Any:
-        """Run the command line and exit: 0 done, 1 failed, 2 wrong usage, 130 interrupted."""
+        """Run a command and exit: 0 for success, 1 for failure, 2 for wrong usage, 130 for an interruption."""
         try:
             code = super().main(args, prog_name or "ertis", complete_var, standalone_mode=False, **extra)
         except click.exceptions.NoArgsIsHelpError as error:
@@ -109,7 +109,7 @@ def _is_interruption(error: Exception) -> bool:
 
 
 def _reported(error: Exception) -> tuple[int, str]:
-    """Print an error and return its exit code; re-raise programming errors."""
+    """Return the exit code and the message of an error; raise a programming error again."""
     if isinstance(error, click.UsageError):
         path = error.ctx.command_path if error.ctx else "ertis"
         return _USAGE, f"{error.format_message().rstrip('.')}{_config.origin(error)}; see '{path} --help'"
@@ -123,7 +123,7 @@ def _reported(error: Exception) -> tuple[int, str]:
 
 
 def _of_system(error: Exception) -> str:
-    """Return a one-line message with the remedy for an expected operating-system error, otherwise an empty string."""
+    """Return an operating-system error as file, cause and remedy; return an empty text for an error of the package."""
     from ertis_numba.atomic_files import remedy
     from ertis_numba.errors import ErtisError
 
@@ -131,12 +131,12 @@ def _of_system(error: Exception) -> str:
         return ""
     if error.filename is not None:
         return f"{error.filename}: {error.strerror}; {remedy(error)}"
-    # Only stdout has no name but can be full.
+    # An error without a file name concerns stdout.
     return f"the output is full ({error.strerror}); {remedy(error)}" if error.errno == errno.ENOSPC else ""
 
 
 def _is_expected(error: Exception) -> bool:
-    """Return True for an error that users can fix, and False for a programming error."""
+    """Return True if an error is reported in one line, and False for a programming error."""
     from ertis_numba.errors import ErtisError
 
     return isinstance(error, ErtisError | OSError | MemoryError)
@@ -162,11 +162,11 @@ def _print_version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None
 @_config.config
 @click.pass_context
 def cli(ctx: click.Context) -> None:
-    """Process in-air imaging sonar: from one-bit microphones to energyscapes.
+    """Process in-air imaging sonar, from one-bit microphones to energyscapes.
 
-    Commands print results on stdout and everything else on stderr. Exit codes: 0 done, 1 failed, 2 wrong usage, 130
-    interrupted. An option on the command line overrides its variable, such as ERTIS_PROCESS_MAX_ERROR. A variable
-    overrides the file of --config.
+    Results go to stdout, everything else to stderr. Exit codes: 0 success, 1 failure, 2 wrong usage, 130 interrupted.
+    Options on the command line override environment variables such as ERTIS_PROCESS_MAX_ERROR. Variables override
+    the file given with --config.
     """
     fault = _config.require_config(ctx)
     if fault:
@@ -179,7 +179,7 @@ def main() -> None:
     """Run the command line."""
     obey_signals()
     _supervisor.allow()
-    # Imported libraries create 100,000 permanent objects. Scanning them takes 5 % of the time of a command.
+    # Imports create a hundred thousand permanent objects. Scanning them would take a twentieth of the run time.
     gc.set_threshold(100_000)
     try:
         cli.main()

@@ -1,4 +1,4 @@
-"""Options and reports that several commands share."""
+"""Options, parameter types and output functions shared by several commands."""
 
 import json
 import sys
@@ -55,7 +55,7 @@ __all__ = [
     "threads",
 ]
 
-_MAX_DEG = 90.0  # Limit on azimuth and elevation, in front of the array.
+_MAX_DEG = 90.0  # limit of azimuth and elevation in front of an array
 Item = TypeVar("Item")
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
@@ -68,7 +68,7 @@ class _Interval(click.ParamType):  # type: ignore[type-arg]  # generic since cli
         if colon:
             with suppress(ValueError):
                 return float(first), float(last)
-        return self.fail(f"{value!r} is not an interval; give two numbers, such as 0.5:5", param, ctx)
+        return self.fail(f"{value!r} is not an interval; give two numbers, as in 0.5:5", param, ctx)
 
 
 class _Channels(click.ParamType):  # type: ignore[type-arg]  # as above
@@ -77,7 +77,7 @@ class _Channels(click.ParamType):  # type: ignore[type-arg]  # as above
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, ...]:
         with suppress(ValueError):
             return tuple(int(channel) for channel in str(value).split(","))
-        return self.fail(f"{value!r} is not a list of channels; give whole numbers as in 5,12", param, ctx)
+        return self.fail(f"{value!r} is not a list of channels; give integers, as in 5,12", param, ctx)
 
 
 class _Direction(click.ParamType):  # type: ignore[type-arg]  # as above
@@ -105,7 +105,7 @@ class _ErrorBudget(click.ParamType):  # type: ignore[type-arg]  # as above
         with suppress(ValueError):
             return float(value)
         return self.fail(
-            f"{value!r} is not an error; give dB, such as -40, or {', '.join(ERROR_PRESETS_DB)}", param, ctx
+            f"{value!r} is not an error budget; give dB, as in -40, or {', '.join(ERROR_PRESETS_DB)}", param, ctx
         )
 
 
@@ -114,16 +114,16 @@ DIRECTION = _Direction()
 ERROR_BUDGET = _ErrorBudget()
 INTERVAL = _Interval()
 FALSE_ALARM = 1e-3
-"""Probability of a false reflector in an image of noise."""
+"""Probability that noise alone causes a reflector in one image."""
 PREPARING = "preparing ..."
-"""Note printed when a start is slow."""
-COMPILING = "the first run compiles kernels, which takes longer ..."
-"""Note printed when compilation makes a start slow."""
+"""Message for a slow start."""
+COMPILING = "a first run compiles kernels, which takes longer ..."
+"""Message for a start that compiles kernels."""
 _FILE = click.Path(path_type=Path)
 
 
 def as_json_of(what: str) -> Decorator:
-    """Return the option ``--json``, whose help states the printed objects."""
+    """Return the option that prints JSON instead of text; its help states the objects that are printed."""
     return click.option("--json", "as_json", is_flag=True, help=f"Print JSON on stdout: {what}.")
 
 
@@ -133,21 +133,20 @@ device: Decorator = click.option(
     type=click.Choice(["auto", "cpu", "cuda", "numpy"]),
     default="auto",
     show_default=True,
-    help=(
-        "Device that computes; auto chooses cuda (an NVIDIA GPU) where available, otherwise cpu. numpy runs without "
-        "compiled kernels."
-    ),
+    help="Device to compute on; auto chooses cuda (an NVIDIA GPU) if there is one; numpy needs no compiled kernels.",
 )
 plan: Decorator = click.option(
     "--plan",
     type=click.Choice(["nominal", "measured"]),
     default="nominal",
     show_default=True,
-    help="Costs by which the fastest plan is chosen: published ones, which give the same images on every machine with "
-    "the same instruction set, or those measured on this machine.",
+    help="Costs for the choice of the plan: published ones, which give the same images on every machine with the same "
+    "instruction set, or those measured on this machine.",
 )
-force: Decorator = click.option("--force", is_flag=True, help="Overwrite the output.")
-quiet: Decorator = click.option("--quiet", "-q", is_flag=True, help="Print only warnings and errors.")
+force: Decorator = click.option("--force", is_flag=True, help="Overwrite existing output.")
+quiet: Decorator = click.option(
+    "--quiet", "-q", is_flag=True, help="Print warnings and errors only, no progress or summary."
+)
 threads: Decorator = click.option("--threads", type=int, metavar="N", help="Number of threads; all cores by default.")
 
 
@@ -167,7 +166,7 @@ def measurement(text: str) -> Decorator:
 
 
 def min_level(text: str) -> Decorator:
-    """Return the option for the lowest level to list."""
+    """Return the option for the lowest level that is kept, relative to the strongest."""
     return click.option("--min-level", type=float, default=-30.0, show_default=True, metavar="DB", help=text)
 
 
@@ -177,7 +176,7 @@ def sensor(text: str) -> Decorator:
 
 
 def sensors_of(path: Path, sensor: str | None) -> tuple[str, ...]:
-    """Return the selected sensor, or all sensors of a file."""
+    """Return the chosen sensor, or all sensors of a file."""
     from ertis_numba.storage import sensor_names
 
     return sensor_names(path) if sensor is None else (sensor,)
@@ -186,7 +185,7 @@ def sensors_of(path: Path, sensor: str | None) -> tuple[str, ...]:
 def comparisons(
     path: Path, sensor: str, min_level_db: float, *, measurement: int | None = None
 ) -> "Iterator[tuple[int, Comparison]]":
-    """Yield the number of each selected measurement, and the comparison of its energyscape with the truth."""
+    """Yield the index of each measurement, or of one, and the comparison of its energyscape with the ground truth."""
     from ertis_numba.analysis.compare import compare
     from ertis_numba.errors import DataError
     from ertis_numba.storage import open_energyscapes
@@ -194,19 +193,19 @@ def comparisons(
     with open_energyscapes(path, sensor=sensor) as images:
         if images.truth is None:
             raise DataError(
-                f"{path}: sensor {sensor} has no ground truth; simulate a scene, and process that recording"
+                f"{path}: sensor {sensor} holds no ground truth; simulate a scene and process that recording"
             )
         for index in places(measurement, len(images)):
             yield index, compare(images[index], images.truth.reflectors[index], min_level_db=min_level_db)
 
 
 def places(index: int | None, count: int) -> Sequence[int]:
-    """Return the index of the selected measurement in a file of ``count``, or all indices."""
+    """Return the index of the chosen measurement of ``count``, or all indices if none is chosen."""
     return range(count) if index is None else [place(index, count)]
 
 
 def place(index: int, count: int) -> int:
-    """Return the index of a measurement in a file of ``count``, or raise a usage error."""
+    """Return the index of a measurement of ``count``; raise ArgumentError if it is outside the file."""
     from ertis_numba import checks
 
     return checks.integer("--measurement", index, 0, count - 1)
@@ -222,9 +221,8 @@ def settings_with(
 ) -> "Settings":
     """Return the settings of a recording, updated from a settings file and then from options.
 
-    A settings file replaces the keys that it contains; a layout or positions replace the whole array. ``without`` adds
-    channels to the disabled ones. Other options have the names of `Processing` fields; None keeps the recording's
-    value.
+    A settings file changes the keys that it contains; a layout or positions replace the whole array. ``without``
+    disables further channels. Other options are named like the fields of `Processing`; None changes nothing.
     """
     settings = recorded if settings_file is None else recorded.updated_from_file(settings_file)
     if without is not None:
@@ -235,18 +233,18 @@ def settings_with(
     limits = {"azimuth_limits_deg", "elevation_limits_deg"} & given.keys()
     if limits and not isinstance(directions, str):
         raise click.UsageError(
-            f"the recording lists {len(directions)} directions; give --directions 2d:N or 3d:N to use limits",
+            f"limits need a grid, but directions is a list of {len(directions)}; add --directions 2d:N or 3d:N",
             ctx=click.get_current_context(),
         )
     kind = str(directions).partition(":")[0]
     if kind == "2d" and "elevation_limits_deg" in limits:
         raise click.UsageError(
-            f"directions {directions} have elevation 0; give --directions 3d:N with --elevation",
+            f"directions {directions} lie at elevation 0; give --directions 3d:N with --elevation",
             ctx=click.get_current_context(),
         )
     if limits and kind not in {"2d", "3d"}:
         raise click.UsageError(
-            f"directions {directions} have fixed limits; give --directions 2d:N or 3d:N to use other limits",
+            f"directions {directions} have fixed limits; give --directions 2d:N or 3d:N with limits",
             ctx=click.get_current_context(),
         )
     settings = settings.replace(processing=settings.processing.replace(**given))
@@ -263,7 +261,7 @@ def pipeline(
     threads: int | None = None,
     plan: "PlanCosts" = "nominal",
 ) -> "Pipeline":
-    """Return a pipeline; print a note if compilation takes long."""
+    """Return a pipeline, and print a message if its start is slow."""
     with note_when_slow(PREPARING, quiet=quiet):
         from ertis_numba.pipeline import Pipeline
 
@@ -271,14 +269,14 @@ def pipeline(
 
 
 def complete_presets(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:  # noqa: ARG001
-    """Return preset names for shell completion."""
+    """Return the preset names that complete a text in a shell."""
     from ertis_numba.settings import PRESETS
 
     return [name for name in PRESETS if name.startswith(incomplete)]
 
 
 def complete_layouts(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:  # noqa: ARG001
-    """Return layout names for shell completion, or files if none matches."""
+    """Return the layout names that complete a text in a shell, or files if no name does."""
     from ertis_numba.geometry import layout_names
 
     names = [CompletionItem(name) for name in layout_names() if name.startswith(incomplete)]
@@ -286,34 +284,36 @@ def complete_layouts(ctx: click.Context, param: click.Parameter, incomplete: str
 
 
 def note_unlisted_directions(path: Path, sensors: Sequence[str]) -> None:
-    """Print a note for each sensor with one microphone, which measures ranges only."""
+    """Print a note for each sensor with a single microphone, whose images have no directions."""
     from ertis_numba.geometry import microphones
     from ertis_numba.storage import open_energyscapes
 
     for name in sensors:
         with open_energyscapes(path, sensor=name) as images:
             if microphones(images.settings.array).enabled.sum() == 1:
-                click.echo(f"note: sensor {name} has one microphone, which measures ranges but no directions", err=True)
+                click.echo(
+                    f"note: sensor {name} has one microphone; its images show ranges but no directions", err=True
+                )
 
 
 def say(text: str, *, quiet: bool) -> None:
-    """Print a line unless --quiet is given."""
+    """Print a line on stderr, unless ``quiet``."""
     if not quiet:
         click.echo(text, err=True)
 
 
 def counted(count: int, noun: str) -> str:
-    """Return a number with its noun in the singular or plural."""
+    """Return a count and its noun, in the plural unless the count is 1."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
 def print_json(report: dict[str, Any]) -> None:
-    """Print one JSON object on stdout."""
+    """Print one JSON object as a line on stdout."""
     click.echo(json.dumps(report, indent=None, allow_nan=False))
 
 
 def progress(items: Iterable[Item], *, length: int, label: str, quiet: bool) -> AbstractContextManager[Iterable[Item]]:
-    """Return ``items`` under a progress bar on stderr, which is hidden if stderr is not a terminal."""
+    """Return ``items`` under a progress bar on stderr; no bar is drawn if ``quiet`` or off a terminal."""
     if quiet or not _progress.is_drawn_on(sys.stderr):
         return nullcontext(items)
     return _progress.bar(items, length=length, label=label)
@@ -323,7 +323,7 @@ def progress(items: Iterable[Item], *, length: int, label: str, quiet: bool) -> 
 def note_when_slow(text: str, *, quiet: bool, after_s: float = 1.0) -> Iterator[threading.Timer]:
     """Print ``text`` if the block takes longer than ``after_s``; yield the timer.
 
-    The note on compilation is printed once per command.
+    If the block compiles kernels, print a message, once per command.
     """
     from ertis_numba.kernels import on_compiling
 

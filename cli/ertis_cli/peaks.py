@@ -1,4 +1,4 @@
-"""Implementation of ``ertis peaks``, which lists reflectors."""
+"""``ertis peaks``: reflectors in an energyscape file."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
@@ -18,7 +18,7 @@ __all__ = ["peaks"]
 
 _TOP = 10
 _MIN_LEVEL_DB = -30.0
-_FALSE_ALARM = 1e-4  # Probability per bin, with CFAR.
+_FALSE_ALARM = 1e-4  # per bin, with CFAR
 _PLACE = {"azimuth_deg": "+.2f", "elevation_deg": "+.2f", "range_m": ".3f", "level_db": ".1f"}
 _ERROR = {"angle_deg": ".3f", "range_m": "+.4f", "level_db": "+.2f"}
 _COLUMNS: dict[str, _tables.Side] = {"sensor": "left", **dict.fromkeys(("measurement", *_PLACE), "right")}
@@ -33,21 +33,15 @@ _DIGITS = {"azimuth_deg": 4, "elevation_deg": 4, "angle_deg": 4, "range_m": 6, "
 
 @click.command()
 @options.input_file("IMG.h5")
-@options.sensor("List one sensor only; all sensors of the file by default.")
+@options.sensor("List this sensor only; all sensors by default.")
 @click.option(
-    "--top",
-    type=int,
-    metavar="N",
-    help=f"Limit on the reflectors per measurement; {_TOP} by default, all with --truth.",
+    "--top", type=int, metavar="N", help=f"Largest number per measurement; {_TOP} by default, all with --truth."
 )
 @click.option(
     "--min-level",
     type=float,
     metavar="DB",
-    help=(
-        f"Omit reflectors below this level, relative to the strongest; {_MIN_LEVEL_DB:g} by default, no limit with "
-        "cfar."
-    ),
+    help=f"Lowest level relative to the strongest peak; {_MIN_LEVEL_DB:g} by default, no limit with cfar.",
 )
 @options.measurement("List one measurement only, counted from 0.")
 @click.option(
@@ -55,16 +49,16 @@ _DIGITS = {"azimuth_deg": 4, "elevation_deg": 4, "angle_deg": 4, "range_m": 6, "
     type=click.Choice(["peaks", "cfar"]),
     default="peaks",
     show_default=True,
-    help="Detector: by level (peaks), or by contrast to the surrounding noise (cfar).",
+    help="Detector: peaks compares levels, cfar compares each bin with the noise around it (OS-CFAR).",
 )
 @click.option(
     "--false-alarm",
     type=float,
     metavar="P",
-    help=f"Probability of false alarm per bin, with cfar; {_FALSE_ALARM:g} by default.",
+    help=f"Probability of a false alarm per bin, with cfar; {_FALSE_ALARM:g} by default.",
 )
 @click.option("--all", "everything", is_flag=True, help="Also list maxima that noise alone may cause.")
-@click.option("--truth", is_flag=True, help="Compare with the ground truth of a simulated recording.")
+@click.option("--truth", is_flag=True, help="Compare with the ground truth in the file of a simulated recording.")
 @options.as_json
 def peaks(
     *,
@@ -81,28 +75,36 @@ def peaks(
 ) -> None:
     """List the reflectors in an energyscape file.
 
-    One entry per reflector, the strongest of each measurement first. level_db is relative to the strongest, level_dbfs
-    relative to a full-scale echo in every microphone. The list omits maxima that noise causes in more than one image of
-    1000, unless --all is given. Beamformers other than delay-and-sum have no such limit.
+    There is one entry per reflector, the strongest of each measurement first. level_db is relative to the strongest
+    peak, and level_dbfs to a full-scale echo in every microphone. Maxima that noise alone may cause in
+    one of 1000 images are omitted unless --all is given. This limit exists only for delay-and-sum.
 
-    With --detector cfar, a reflector exceeds the noise around it in range, and is at most 10 dB below the strongest of
-    its range. The noise is estimated from 32 bins of the same direction (OS-CFAR). The rate of false alarms in noise is
-    that of --false-alarm.
+    With --detector cfar, a reflector exceeds the noise around it in range, at any level, and is at most 10 dB below the
+    strongest echo at its range. The noise is estimated from 32 bins of the same direction (OS-CFAR), so that
+    --false-alarm is the probability per bin that noise alone is listed.
 
-    With --truth, each true reflector comes first, with the errors of its peak or as missed. Peaks without a reflector
-    follow as spurious. Peaks of reflectors that do not count are explained (see 'ertis compare --help'). In JSON, each
-    peak has its true reflector or null as "truth", and the flag "false"; "missed" lists the remaining reflectors.
+    With --truth, each true reflector comes first, with the errors of its matched peak or as missed. Then come peaks
+    that no reflector explains, as false, and peaks of reflectors that do not count, as explained (see
+    'ertis compare --help'). In JSON, "truth" of each peak is its true reflector or null, "false" is true or false, and
+    "missed" lists missed reflectors.
     """
     if truth and top is not None:
-        raise click.UsageError("--top and --truth exclude each other; give one of them", click.get_current_context())
+        raise click.UsageError(
+            "--top would omit reflectors that --truth compares; give one of them", click.get_current_context()
+        )
     if detector == "cfar" and truth:
-        raise click.UsageError("--truth needs --detector peaks; leave out one of them", click.get_current_context())
+        raise click.UsageError(
+            "--truth needs --detector peaks; remove --truth or --detector cfar", click.get_current_context()
+        )
     if everything and (truth or detector == "cfar"):
         raise click.UsageError(
-            "--all needs --detector peaks without --truth; leave out one of them", click.get_current_context()
+            "--all is for --detector peaks without --truth; remove --all or the other option",
+            click.get_current_context(),
         )
     if detector != "cfar" and false_alarm is not None:
-        raise click.UsageError("--false-alarm needs --detector cfar; give both", click.get_current_context())
+        raise click.UsageError(
+            "--false-alarm needs --detector cfar; add it, or remove --false-alarm", click.get_current_context()
+        )
     sensors = options.sensors_of(path, sensor)
     options.note_unlisted_directions(path, sensors)
     if truth:
@@ -137,7 +139,7 @@ def peaks(
 def _finder(
     detector: str, top: int, min_level: float | None, false_alarm: float | None, *, everything: bool
 ) -> "Callable[[Energyscape], list[Peak]]":
-    """Return the function that finds the reflectors of an image."""
+    """Return a function that finds the reflectors of an image."""
     if detector == "cfar":
         from ertis_numba.analysis.cfar import cfar_peaks
 
@@ -196,7 +198,7 @@ def _beside_the_truth(place: dict[str, Any], comparison: "Comparison") -> Iterat
 
 
 def _cells(place: dict[str, Any], found: dict[str, Any]) -> tuple[str, ...]:
-    """Return the position of a reflector or a peak as cells."""
+    """Return the cells with the sensor, measurement and position of a reflector or a peak."""
     return (place["sensor"], str(place["measurement"]), *(f"{found[name]:{form}}" for name, form in _PLACE.items()))
 
 
@@ -205,6 +207,6 @@ def _error(match: "Match") -> dict[str, float]:
 
 
 def _rounded(item: Any) -> dict[str, Any]:
-    """Return the fields of a peak, or of a reflector of the sensor's own call, with rounded numbers."""
+    """Return the fields of a peak or a reflector with rounded numbers, without its emitter."""
     fields = {name: value for name, value in asdict(item).items() if name != "emitter"}
     return {name: round(value, _DIGITS[name]) if name in _DIGITS else value for name, value in fields.items()}

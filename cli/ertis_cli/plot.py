@@ -1,4 +1,4 @@
-"""Implementation of ``ertis plot``, which draws a measurement, its image, or an array."""
+"""``ertis plot``: plots of a measurement, of its image, or of an array."""
 
 import re
 from pathlib import Path
@@ -20,13 +20,13 @@ __all__ = ["plot"]
 
 _FORMATS = (".pdf", ".png", ".svg")
 _KINDS = {
-    "image": "best view of the image: a sector, a map and a sector, or a curve",
+    "image": "a sector, a map and a sector, or a curve, depending on the directions",
     "polar": "a sector in metres",
-    "projection": "azimuth and elevation, with the maximum over range",
-    "slices": "cuts in metres, one horizontal and one vertical",
-    "signals": "traces of the microphones and their spectrogram",
-    "matched-filter": "matched-filter output of each microphone",
-    "array": "layout and beam pattern",
+    "projection": "azimuth versus elevation, the maximum over range",
+    "slices": "a horizontal and a vertical section in metres",
+    "signals": "microphone signals and their spectrogram",
+    "matched-filter": "output of the matched filter for each microphone",
+    "array": "array layout and beam pattern",
 }
 _OF_IMAGES = ("image", "polar", "projection", "slices")
 _OF_RECORDINGS = ("signals", "matched-filter")
@@ -41,7 +41,7 @@ _ONLY = {
     "frequency": ("array",),
     "steer": ("array",),
 }
-"""Options that apply to some kinds only, and these kinds."""
+"""Kinds that support each of these options."""
 
 
 @click.command(epilog="Kinds: " + "; ".join(f"{name}: {about}" for name, about in _KINDS.items()) + ".")
@@ -51,11 +51,11 @@ _ONLY = {
     type=click.Choice(list(_KINDS)),
     default="image",
     show_default=True,
-    help="Kind of plot; array also takes settings, a layout file or the name of a layout.",
+    help="Kind of plot; array also accepts settings, a layout file or the name of a layout.",
 )
 @options.output("Picture to write: .png, .svg or .pdf; a .png beside the file by default.")
-@options.sensor("Sensor to draw; required if the file contains several.")
-@options.measurement("Measurement to draw, counted from 0; the first by default.")
+@options.sensor("Sensor to plot; required if the file contains several sensors.")
+@options.measurement("Measurement to plot, counted from 0; the first by default.")
 @click.option(
     "--dynamic-range", type=float, default=40.0, show_default=True, metavar="DB", help="Dynamic range of the colours."
 )
@@ -64,12 +64,12 @@ _ONLY = {
     type=click.Choice(["dark", "light", "paper"]),
     default="dark",
     show_default=True,
-    help="Colour theme; paper is white, with letters at the size of print.",
+    help="Colour theme; paper is white, with font sizes for print.",
 )
 @click.option(
-    "--columns", type=click.IntRange(1, 2), help="Columns of the paper theme: 85 mm for 1, 170 mm for 2 (default)."
+    "--columns", type=click.IntRange(1, 2), help="Width of theme paper: 1 is 85 mm, 2 is 170 mm; 2 by default."
 )
-@click.option("--font", type=click.Choice(["sans", "serif"]), default="sans", show_default=True, help="Letters.")
+@click.option("--font", type=click.Choice(["sans", "serif"]), default="sans", show_default=True, help="Font family.")
 @click.option(
     "--peaks", "top", type=click.IntRange(min=0), metavar="N", help="Number of reflectors to mark; 5 by default."
 )
@@ -77,12 +77,14 @@ _ONLY = {
     "--side-lobes",
     is_flag=True,
     default=None,
-    help="Show the side lobes of images with elevations: levels at least 10 dB below the strongest of their range.",
+    help="Show side lobes in images with elevations: levels 10 dB or more below the strongest at their range.",
 )
-@click.option("--height", type=float, metavar="M", help="Elevation of the horizontal plane of slices; 0 by default.")
-@click.option("--left", type=float, metavar="M", help="Azimuth of the vertical plane of slices; 0 by default.")
+@click.option("--height", type=float, metavar="M", help="Height of the horizontal section of slices; 0 by default.")
 @click.option(
-    "--microphone", type=int, metavar="BIT", help="Draw one microphone only, in signals and matched-filter output."
+    "--left", type=float, metavar="M", help="Position of the vertical section of slices, to the left; 0 by default."
+)
+@click.option(
+    "--microphone", type=int, metavar="BIT", help="Plot only this microphone, for signals and matched-filter."
 )
 @click.option(
     "--frequency",
@@ -90,10 +92,10 @@ _ONLY = {
     type=float,
     multiple=True,
     metavar="HZ",
-    help="Frequency of a beam pattern; up to five times.",
+    help="Frequency of a beam pattern; repeatable up to five times.",
 )
 @click.option(
-    "--steer", type=options.DIRECTION, metavar="AZ:EL", help="Steering direction of beam patterns, in degrees."
+    "--steer", type=options.DIRECTION, metavar="AZ:EL", help="Steering direction of beam patterns in degrees."
 )
 @options.force
 @options.quiet
@@ -120,9 +122,9 @@ def plot(
     quiet: bool,
     as_json: bool,
 ) -> None:
-    """Draw a measurement.
+    """Plot a measurement or an array.
 
-    A recording is first processed with its own settings, for kinds that draw an image.
+    To plot an image of a recording, the recording is first processed with its own settings.
     """
     from ertis_numba import checks, figures
     from ertis_numba.errors import DataError
@@ -140,12 +142,12 @@ def plot(
     for name, value in given.items():
         if value is not None and kind not in _ONLY[name]:
             raise click.UsageError(
-                f"--{name} applies to --kind {', '.join(_ONLY[name])}; leave it out with {kind}",
+                f"--{name} is for --kind {', '.join(_ONLY[name])}; remove it with {kind}",
                 click.get_current_context(),
             )
     if kind != "array":
         _require_no_array(path)
-    if not path.name:  # "." and "/" have no name that a picture could get.
+    if not path.name:  # "." and "/" give no name for the picture
         raise DataError(f"{path} is a folder; give a recording or an energyscape file")
     target = target or path.with_suffix(".png")
     checks.choice("picture format", target.suffix.lower(), _FORMATS)
@@ -219,29 +221,28 @@ def _measurement(path: Path, sensor: str | None, index: int) -> "Measurement":
 
 
 def _require_no_array(path: Path) -> None:
-    """Refuse a file that only ``--kind array`` draws."""
+    """Raise an error for input that only ``--kind array`` supports."""
     from ertis_numba.geometry import layout_names
 
     if path.suffix.lower() in {".csv", ".toml"} or (str(path) in layout_names() and not path.exists()):
         raise click.UsageError(
-            f"{path} has no measurement to draw; give --kind array, or a recording or an energyscape file",
+            f"{path} contains no measurement; give --kind array, or a recording or an energyscape file",
             click.get_current_context(),
         )
 
 
 def _settings(path: Path, sensor: str | None) -> "Settings":
-    """Return the settings of a file, or of the array layout in a file or of that name."""
+    """Return the settings of a file, or default settings with the array of a layout."""
     from ertis_numba.geometry import layout_names
     from ertis_numba.settings import Array, Settings
     from ertis_numba.storage import file_kind, open_energyscapes, open_recording
 
     suffix = path.suffix.lower()
-    # A name without a suffix may be a misspelt layout.
-    is_name = str(path) in layout_names() or not (suffix or path.exists())
+    is_name = str(path) in layout_names() or not (suffix or path.exists())  # a layout, possibly misspelt
     is_layout = is_name or suffix == ".csv" or (suffix == ".toml" and _is_layout(path))
     if sensor is not None and (is_layout or suffix == ".toml"):
         raise click.UsageError(
-            "--sensor applies to files with several sensors; leave it out with settings or a layout",
+            "--sensor is for files with several sensors; remove it with settings or a layout",
             click.get_current_context(),
         )
     if is_layout:
@@ -254,8 +255,8 @@ def _settings(path: Path, sensor: str | None) -> "Settings":
 
 
 def _is_layout(path: Path) -> bool:
-    """Return True if a TOML file has positions at its top level, rather than sections of settings."""
+    """Return True if a TOML file is a layout, with positions at its top level, and not settings."""
     try:
         return bool(re.search(r"^\s*positions_mm\s*=", path.read_text("utf-8"), re.MULTILINE))
     except (OSError, UnicodeDecodeError):
-        return False  # Reading it as settings raises the specific error.
+        return False  # reading it as settings reports the error

@@ -1,4 +1,4 @@
-"""Implementation of ``ertis process``, which processes recordings into energyscapes."""
+"""``ertis process``: process recordings into energyscapes."""
 
 import functools
 from contextlib import ExitStack, closing, contextmanager
@@ -30,43 +30,45 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
     "target",
     type=click.Path(),
     metavar="FILE|DIR",
-    help="Energyscape file to write; REC.energy.h5 beside the recording by default. For several recordings, a folder.",
+    help="Energyscape file to write, REC.energy.h5 beside the recording by default; a folder for several recordings.",
 )
-@options.sensor("Process one sensor only; all sensors of the recording by default.")
+@options.sensor("Process this sensor only; all sensors by default.")
 @click.option(
     "--without",
     type=options.CHANNELS,
-    help="Channels to exclude, such as faulty microphones, counted from 0: 5,12.",
+    help="Channels to exclude, such as those of faulty microphones, counted from 0, as in 5,12.",
 )
 @click.option("--directions", metavar="GRID", help="90, 1850, 3000, 2d:N, 3d:N, or a CSV of azimuth, elevation in °.")
-@click.option("--azimuth", type=options.INTERVAL, help="Limits of 2d:N and 3d:N in °.")
-@click.option("--elevation", type=options.INTERVAL, help="Limits of 3d:N in °.")
+@click.option("--azimuth", type=options.INTERVAL, help="Azimuth limits of 2d:N and 3d:N in °.")
+@click.option("--elevation", type=options.INTERVAL, help="Elevation limits of 3d:N in °.")
 @click.option("--range", "range_m", type=options.INTERVAL, help="First and last range in m.")
-@click.option("--method", type=click.Choice(["fast", "paper"]), help="The recording's own choice by default.")
+@click.option(
+    "--method", type=click.Choice(["fast", "paper"]), help="Processing method; the recording's own by default."
+)
 @click.option(
     "--beamformer",
     type=click.Choice(["delay_and_sum", "coherence_factor", "dmas", "capon"]),
-    help="Beamformer; the recording's own choice by default.",
+    help="Beamformer; the recording's own by default.",
 )
 @click.option(
     "--array-weights",
     metavar="WINDOW",
-    help="Window that weights the microphones, such as uniform, hann or taylor:35; the recording's own by default.",
+    help="Window for the microphone weights, such as uniform, hann or taylor:35; the recording's own by default.",
 )
 @click.option(
     "--wavefront",
     type=click.Choice(["plane", "spherical", "auto"]),
-    help="Wavefront model of an echo; the recording's own choice by default.",
+    help="Wavefront model of echoes; the recording's own by default.",
 )
 @click.option(
     "--max-error",
     "max_error_db",
     type=options.ERROR_BUDGET,
     metavar="DB|PRESET",
-    help="Error budget of images: dB, such as -40, or draft, standard, fine, exact; the settings' own by default.",
+    help="Error budget of images, as in -40, or draft, standard, fine, exact; the settings' own by default.",
 )
 @options.plan
-@click.option("--explain", is_flag=True, help="Print the plan first: its steps, predicted error and time.")
+@click.option("--explain", is_flag=True, help="First print the plan with its predicted error and time.")
 @click.option(
     "--verify",
     is_flag=True,
@@ -77,17 +79,15 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
     "settings_file",
     metavar="FILE.toml",
     type=click.Path(path_type=Path),
-    help="Settings file (TOML) whose keys replace the recording's.",
+    help="Settings file (TOML) whose keys override those of the recording.",
 )
 @click.option(
     "--dtype",
     type=click.Choice(["float32", "float16"]),
     default="float32",
     show_default=True,
-    help=(
-        "Type of the amplitudes. float16 halves the file; it keeps three digits down to -84 dBFS, fewer below, and "
-        "netCDF programs cannot read it."
-    ),
+    help="Data type of images. float16 halves the file; it keeps three digits down to -84 dBFS and fewer below, and "
+    "netCDF programs cannot read it.",
 )
 @click.option("--strict", is_flag=True, help="Refuse recordings with faulty microphones instead of warning.")
 @options.device
@@ -98,7 +98,7 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
     default=8,
     show_default=True,
     metavar="N",
-    help="Number of measurements in progress at once, fewer if images are large; 1 processes one after the other.",
+    help="Number of measurements to process at the same time, fewer for large images; 1 is one after the other.",
 )
 @click.option(
     "--workers",
@@ -109,7 +109,7 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
 @click.option(
     "--scheduler",
     metavar="tcp://HOST:PORT",
-    help="dask scheduler whose workers process several recordings.",
+    help="Dask scheduler whose workers process several recordings.",
 )
 @_mountings.mounting
 @options.force
@@ -146,18 +146,18 @@ def process(
     quiet: bool,
     as_json: bool,
 ) -> None:
-    """Process a recording into energyscapes.
+    """Process recordings into energyscapes.
 
-    Settings come from the recording, then from the settings file, then from the options. The same recording gives the
+    The settings file overrides the settings of the recording, and options override both. The same recording gives the
     same amplitudes, bit by bit, for any number of threads and any batch. All sensors of a recording go into one file,
     each with its own settings.
 
-    For several recordings, a quoted pattern or a folder, -o names a folder for one output file each, processed on all
-    cores. Existing output from the same recording and settings is kept. A failed recording does not stop the others.
-    --json then prints an object per recording and a summary at the end.
+    Several recordings, a pattern in quotes or a folder are processed on all cores into the folder given with -o, one
+    file per recording. Existing results of the same recording and settings are kept. A failed recording does not stop
+    the others. --json then prints one object per recording as it ends, and a summary at the end.
 
-    The fast method chooses the fastest plan whose predicted error is within --max-error. The error is relative to the
-    exact image, over all directions and ranges.
+    The fast method chooses the fastest plan whose predicted error meets --max-error. The error is relative to the exact
+    image, over all directions and ranges.
     """
 
     def changed(recorded: "Settings") -> "Settings":
@@ -208,8 +208,7 @@ def process(
     path = Path(paths[0])
     if target is not None and Path(target).suffix.lower() in _PICTURES:
         raise click.UsageError(
-            f"-o {target} is a picture, but process writes energyscapes; give a .h5 file, and draw it with "
-            "'ertis plot'",
+            f"-o {target} is a picture, but process writes energyscapes; give a .h5 file and plot it with 'ertis plot'",
             click.get_current_context(),
         )
     target_file = Path(target) if target else path.with_suffix(".energy.h5")
@@ -230,7 +229,7 @@ def _note_mountings(path: Path, *, quiet: bool) -> None:
             if images.translation_m is None:
                 unknown.append(name)
     _mountings.note_unknown(
-        unknown, "images are in the sensor frame; give --mounting FILE for the frame of the platform", quiet=quiet
+        unknown, "images use the frame of their sensor; give --mounting FILE for the frame of the platform", quiet=quiet
     )
 
 

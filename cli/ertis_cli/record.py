@@ -1,4 +1,4 @@
-"""Implementation of ``ertis record``, the central node that stores measurements."""
+"""``ertis record``: run a central node that stores measurements."""
 
 from pathlib import Path
 
@@ -22,7 +22,7 @@ _FILE = click.Path(path_type=Path)
 @click.option("--duration", type=float, metavar="S", help="Duration in seconds; until Ctrl-C by default.")
 @_network.key
 @_network.allow
-@click.option("--metrics", metavar="HOST:PORT", help="Address at which to serve Prometheus metrics.")
+@click.option("--metrics", metavar="HOST:PORT", help="Serve Prometheus metrics at this address.")
 @click.option("--every", is_flag=True, help="With --json: also print a line for each measurement.")
 @options.quiet
 @options.as_json
@@ -44,9 +44,10 @@ def record(
 ) -> None:
     """Run a central node that stores measurements.
 
-    Sensor nodes send measurements with 'ertis capture --to ADDRESS'. The node acknowledges a measurement once it is in
-    a journal on disk in DIR. Complete recordings appear there, one after the other. After a crash, the next start or
-    'ertis recover' makes recordings of the journals. Ctrl-C ends the node; --json prints a line for each event.
+    Sensors send to it with 'ertis capture --to ADDRESS'. The central node acknowledges a measurement once a journal in
+    DIR contains it durably. Complete recordings appear in DIR one after the other, the last one at the end. After a
+    crash, the next start or 'ertis recover' seals the journals. Ctrl-C ends the node. With --json, there is one line
+    per event.
     """
     life = _supervisor.supervised()
     from ertis_numba.network.addresses import DEFAULT_LISTEN

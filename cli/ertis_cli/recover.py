@@ -1,4 +1,4 @@
-"""Implementation of ``ertis recover``, which recovers recordings after an interrupted capture."""
+"""``ertis recover``: recover recordings from journals of interrupted captures."""
 
 from dataclasses import asdict
 from itertools import islice
@@ -60,7 +60,7 @@ def _found(place: Path) -> list[Path]:
 
 
 def _seal(journal: Path, *, force: bool, quiet: bool) -> dict[str, Any]:
-    """Seal a journal, and return the result for printing."""
+    """Seal a journal and return a report of the result."""
     from ertis_numba.errors import DataError, JournalInUseError
     from ertis_numba.journal import seal_apart
 
@@ -94,7 +94,7 @@ def _refusal(report: dict[str, Any]) -> str:
 
 
 def _reported(report: dict[str, Any]) -> str:
-    """Return the result for a journal in one line."""
+    """Return a line that describes the result for a journal."""
     if "error" in report:
         return f"{report['journal']}: in use by a running capture; skipped"
     if report["recording"] is None and report["refused"]:

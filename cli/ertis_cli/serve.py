@@ -1,4 +1,4 @@
-"""Implementation of ``ertis serve``, the central node that processes and publishes measurements."""
+"""``ertis serve``: run a central node that computes and publishes images."""
 
 from pathlib import Path
 from typing import Any, Literal
@@ -25,20 +25,20 @@ _FOLDER = click.Path(path_type=Path)
     "--workers", type=click.IntRange(1, 256), metavar="N", help="Number of worker processes; one per core by default."
 )
 @options.threads
-@click.option("--directions", metavar="GRID", help="90, 1850, 3000, 2d:N or 3d:N; the sensor's own by default.")
+@click.option("--directions", metavar="GRID", help="90, 1850, 3000, 2d:N or 3d:N; the sensor's own grid by default.")
 @click.option("--range", "range_m", type=options.INTERVAL, help="First and last range in m.")
-@click.option("--method", type=click.Choice(["fast", "paper"]), help="The sensor's own choice by default.")
+@click.option("--method", type=click.Choice(["fast", "paper"]), help="Processing method; the sensor's own by default.")
 @click.option(
     "--beamformer",
     type=click.Choice(["delay_and_sum", "coherence_factor", "dmas", "capon"]),
-    help="Beamformer; the sensor's own choice by default.",
+    help="Beamformer; the sensor's own by default.",
 )
 @click.option(
     "--max-error",
     "max_error_db",
     type=options.ERROR_BUDGET,
     metavar="DB|PRESET",
-    help="Error budget of images: dB, such as -40, or draft, standard, fine, exact; the sensor's own by default.",
+    help="Error budget of images, as in -40, or draft, standard, fine, exact; the sensor's own by default.",
 )
 @options.plan
 @options.device
@@ -47,7 +47,7 @@ _FOLDER = click.Path(path_type=Path)
     type=click.Choice(["float32", "float16"]),
     default="float32",
     show_default=True,
-    help="Type of the published amplitudes; float16 halves the messages.",
+    help="Data type of published images; float16 halves their size.",
 )
 @click.option(
     "--deadline",
@@ -55,19 +55,16 @@ _FOLDER = click.Path(path_type=Path)
     default=2.0,
     show_default=True,
     metavar="S",
-    help="Timeout of a worker, which is killed after it.",
+    help="Time limit per measurement; a slower worker is killed.",
 )
 @click.option(
-    "--quarantine",
-    type=_FOLDER,
-    metavar="DIR",
-    help="Folder of the dead-letter queue: measurements that made two workers fail.",
+    "--quarantine", type=_FOLDER, metavar="DIR", help="Dead-letter folder for measurements that made two workers fail."
 )
-@click.option("--scheduler", metavar="ADDRESS", help="Use the workers of a dask.distributed cluster.")
+@click.option("--scheduler", metavar="ADDRESS", help="Scheduler of a dask.distributed cluster whose workers to use.")
 @click.option("--duration", type=float, metavar="S", help="Duration in seconds; until Ctrl-C by default.")
 @_network.key
 @_network.allow
-@click.option("--metrics", metavar="HOST:PORT", help="Address at which to serve Prometheus metrics.")
+@click.option("--metrics", metavar="HOST:PORT", help="Serve Prometheus metrics at this address.")
 @click.option("--every", is_flag=True, help="With --json and --record: also print a line for each measurement.")
 @options.quiet
 @options.as_json
@@ -101,12 +98,12 @@ def serve(
     quiet: bool,
     as_json: bool,
 ) -> None:
-    """Run a central node that stores, processes and publishes measurements.
+    """Run a central node that computes and publishes images.
 
-    Sensor nodes send measurements with 'ertis capture --to ADDRESS'; 'ertis listen ADDRESS' prints the published
-    products. If measurements arrive faster than they are processed, the node drops and counts the oldest. With
-    --record, it acknowledges measurements that are on disk, like 'ertis record'. Ctrl-C ends the node; --json prints a
-    line for each event.
+    Sensors send to it with 'ertis capture --to ADDRESS', and 'ertis listen ADDRESS' shows the published products. If
+    measurements arrive faster than images can be computed, the oldest are dropped and counted. With --record, the node
+    acknowledges a measurement once it is durable, like 'ertis record'. Ctrl-C ends the node. With --json, there is
+    one line per event.
     """
     life = _supervisor.supervised()
     from ertis_numba.network.addresses import DEFAULT_LISTEN, DEFAULT_PUBLISH, at_port
@@ -135,8 +132,9 @@ def serve(
                 deadline_s=deadline,
                 dtype=dtype,
                 quarantine=quarantine,
-                # Most sensors use this preset, so that their images begin with the first measurement.
-                expected=Settings.from_preset("default_25_50"),
+                expected=Settings.from_preset(
+                    "default_25_50"
+                ),  # most sensors use it; kernels are then ready for their first measurement
                 cluster=scheduler,
             )
         )

@@ -1,4 +1,4 @@
-"""Implementation of ``ertis settings``, which prints the keys of TOML files."""
+"""``ertis settings``: keys of TOML files."""
 
 import textwrap
 from collections.abc import Iterator
@@ -26,7 +26,7 @@ def settings(*, document: str, as_json: bool) -> None:
     """Print every key of a settings, scene, layout or mounting file.
 
     KIND is settings (the default), scene, layout or mounting. The output is a template: save it, and remove the # from
-    the keys to set. Each key has its description, type, unit, default and an example.
+    the keys to set. The template states the meaning, type, unit and default of each key, with an example.
     """
     from ertis_numba.toml_reference import reference
 

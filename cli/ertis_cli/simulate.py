@@ -1,4 +1,4 @@
-"""Implementation of ``ertis simulate``, which simulates a scene."""
+"""``ertis simulate``: simulate a scene and write a recording."""
 
 from contextlib import ExitStack
 from pathlib import Path
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 __all__ = ["simulate"]
 
-_FOLLOWED = 0.6  # Fraction of full scale that the modulators follow.
-_COLUMN_BYTES = 72  # Bytes of a measurement in addition to its samples: stamp, CRC-32 and air.
-_REFLECTOR_BYTES = 200  # Bytes of a reflector, in the recording and in the temporary file.
+_FOLLOWED = 0.6  # of full scale; larger signals exceed the range of the modulators
+_COLUMN_BYTES = 72  # of a measurement, in addition to its samples: stamp, CRC-32 and air
+_REFLECTOR_BYTES = 200  # of a reflector, in the recording and in the temporary file
 _ROW = "{name:22}  {state:4}  {estimate:>10}  {cost:>8}  {reason}"
 
 
@@ -32,20 +32,18 @@ _ROW = "{name:22}  {state:4}  {estimate:>10}  {cost:>8}  {reason}"
     "--count",
     type=click.IntRange(min=1),
     metavar="N",
-    help="Number of measurements of each sensor; the scene's own by default.",
+    help="Number of measurements per sensor; the scene's own by default.",
 )
 @click.option("--seed", type=click.IntRange(min=0), metavar="S", help="Seed of the noise; the scene's own by default.")
-@options.sensor("Render this sensor only; all by default.")
+@options.sensor("Simulate this sensor only; all sensors by default.")
 @click.option(
     "--tolerance-db",
     type=float,
     metavar="DB",
-    help=(
-        "Omit effects that no key requests and that change no image by more than this; 0 keeps all. The scene's "
-        "own, 0.1, by default."
-    ),
+    help="Omit effects that no key requests and that change no image by more than this; 0 keeps all effects. The "
+    "scene's own by default, which is 0.1 unless set.",
 )
-@click.option("--explain", is_flag=True, help="Print a table of effects: state, reason and cost.")
+@click.option("--explain", is_flag=True, help="Print a table of effects with their state, the reason and the cost.")
 @options.force
 @options.quiet
 @options.as_json
@@ -64,8 +62,9 @@ def simulate(
 ) -> None:
     """Simulate a scene and write a recording.
 
-    The recording contains the samples of the scene's sensors, the scene itself, and the ground truth of each reflector.
-    Only effects that change an image are simulated. Scene, seed, sensor and measurement number determine every bit.
+    The recording contains the data that the scene's sensors would record, the scene itself, and the ground truth: the
+    position at which an image should show each reflector. Only effects that matter in the scene are simulated. Scene,
+    seed, sensor and measurement index determine every bit.
     """
     from ertis_numba.simulation import load_scene
     from ertis_numba.storage import check_target, write_recording
@@ -82,10 +81,10 @@ def simulate(
         from ertis_numba.simulation.render import Simulator, compile_kernels
 
         compile_kernels()
-    with options.note_when_slow("determining the relevant effects ...", quiet=quiet, after_s=3.0):
+    with options.note_when_slow("choosing the effects to simulate ...", quiet=quiet, after_s=3.0):
         plan = make_plan(scene)
         simulators = [Simulator(scene, sensor=name, plan=plan) for name in names]
-        if explain:  # Costs exclude compilation.
+        if explain:  # costs exclude the first call, which compiles
             for simulator in simulators:
                 simulator.render(0)
                 simulator.clock.cost_ms.clear()
@@ -122,7 +121,7 @@ def simulate(
         if simulator.loudest > followed:
             options.say(
                 f"note: signals of {simulator.sensor.name} reach {simulator.loudest:.2g} of full scale, but {by} "
-                f"follow up to {followed:g}; lower emitter.level_db or move objects away",
+                f"follow only up to {followed:g}; lower emitter.level_db or increase distances",
                 quiet=quiet,
             )
     for note in plan.notes:
@@ -162,19 +161,18 @@ def _measurements(
 def _log(scene: "Scene", plan: "EffectPlan", folder: Path) -> "TruthLog":
     from ertis_numba.storage import TruthLog
 
-    # The stored scene contains the decisions, so that the samples stay reproducible even if an A/B render would decide
-    # differently.
+    # Store the verdicts, so that the same data can be rendered even if an A/B render would decide otherwise.
     decided = scene.replace(effects={verdict.name: verdict.on for verdict in plan.verdicts})
     return TruthLog(decided.to_toml(), scene.seed, left_out=plan.left_out, folder=folder)
 
 
 def _mounting(simulator: "Simulator") -> Any:
-    """Return the position and orientation of a sensor at the start of the first measurement."""
+    """Return the position and the rotation of a sensor at the start of the first measurement."""
     return simulator.sensor.path().position_at(0.0), simulator.sensor.quaternion()
 
 
 def _effects(plan: "EffectPlan", simulators: "Sequence[Simulator]") -> list[dict[str, Any]]:
-    """Return the rows of ``--explain``; costs are those of one measurement of one sensor."""
+    """Return the rows of ``--explain``; costs are per measurement and sensor."""
     rendered = len(simulators) * simulators[0].scene.count
     return [
         {
@@ -229,6 +227,6 @@ def _report(target: Path, scene: "Scene", plan: "EffectPlan", firsts: "dict[str,
 
 def _row(reflector: "Reflector") -> dict[str, Any]:
     row = {name: getattr(reflector, name) for name in reflector.__slots__}
-    if not reflector.emitter:  # Nearly all reflectors return the sensor's own call.
+    if not reflector.emitter:  # usual case: an echo of the sensor's own call
         del row["emitter"]
     return {name: round(value, 6) if isinstance(value, float) else value for name, value in row.items()}

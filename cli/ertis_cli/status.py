@@ -1,4 +1,4 @@
-"""Implementation of ``ertis status``, which shows the status of a central node."""
+"""``ertis status``: show the status of a central node."""
 
 import sys
 import time
@@ -27,10 +27,14 @@ _ALARMING = ("away: ", "fault: ")
 @click.argument("address", metavar="ADDRESS")
 @_network.key
 @_network.server_key
-@click.option("--once", is_flag=True, help="Print the status once, also on a terminal.")
-@click.option("--watch", is_flag=True, help="Repeat, also if stdout is not a terminal; with --json as lines.")
-@click.option("--patience", type=float, default=3.0, show_default=True, metavar="S", help="Timeout for an answer.")
-@options.as_json_of("one object; with --watch one line each time")
+@click.option("--once", is_flag=True, help="Show the status once, even on a terminal.")
+@click.option(
+    "--watch",
+    is_flag=True,
+    help="Show the status repeatedly, even without a terminal; with --json, one line each time.",
+)
+@click.option("--patience", type=float, default=3.0, show_default=True, metavar="S", help="Time to wait for an answer.")
+@options.as_json_of("one object; with --watch one per line for each refresh")
 def status(
     *,
     address: str,
@@ -41,10 +45,11 @@ def status(
     patience: float,
     as_json: bool,
 ) -> None:
-    """Show the live status of the central node at ADDRESS.
+    """Show the status of a central node.
 
-    ADDRESS is the address for sensor nodes or for applications. A central node with keys requires those of an
-    application or an admin. The command reconnects to a central node that was away.
+    ADDRESS is the address that sensors send to, or the address at which the central node publishes. On a terminal, the
+    display is refreshed every second. If the central node uses keys, give the key of an application or an admin. If
+    the node disappears, the command waits for it.
     """
     from ertis_numba import checks
     from ertis_numba.network.status_client import Asking
@@ -63,7 +68,7 @@ def status(
 
 
 def _looks(node: "Asking", patience_s: float, *, again: bool) -> "Iterator[tuple[Status, str]]":
-    """Yield the status, or the last one and the reason for no answer; the first request must succeed."""
+    """Yield the current status, or the last one and the reason for a missing answer; the first must be answered."""
     from ertis_numba.errors import NetworkError
 
     now = node.ask(patience_s)
@@ -72,7 +77,7 @@ def _looks(node: "Asking", patience_s: float, *, again: bool) -> "Iterator[tuple
         time.sleep(_REFRESH_S)
         try:
             now, away = node.ask(patience_s), ""
-        except NetworkError as error:  # The central node may start again.
+        except NetworkError as error:  # the node may restart
             away = str(error)
         yield now, away
 
@@ -103,7 +108,7 @@ def _live() -> "Iterator[Any]":
 
 
 def _drawn(now: "Status", away: str = "") -> "Group":
-    """Return the content of `_reported` as a rich table."""
+    """Return the output of `_reported` for drawing with rich."""
     from rich.console import Group
     from rich.text import Text
 
@@ -113,7 +118,7 @@ def _drawn(now: "Status", away: str = "") -> "Group":
 
 
 def _reported(now: "Status", away: str) -> tuple[list[str], _tables.TextTable, list[str]]:
-    """Return the table of sensors with lines above and below; without an answer, the last known ones."""
+    """Return the table of sensors and the lines above and below it; ``away`` marks them as outdated."""
     keys = "with keys" if now.keys else "without keys"
     head = (
         f"{now.address} on {now.host}, {now.state}, up {_seconds(now.uptime_s)}, "
@@ -176,10 +181,10 @@ def _below(now: "Status") -> Iterator[str]:
 
 
 def _writing(archive: "ArchiveStatus", *, fault: bool) -> str:
-    """Return the state of the archive's journal."""
+    """Return the state of the archive's current recording."""
     if not archive.recording:
-        return "nothing can be written" if fault else "no recording open"
-    doing = "is not writable" if fault else "is open"
+        return "not writable" if fault else "no recording yet"
+    doing = "is not writable" if fault else "is being written"
     return f"{archive.recording} {doing}, {size(archive.journal_bytes)} in its journal"
 
 

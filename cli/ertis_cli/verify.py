@@ -1,4 +1,4 @@
-"""Implementation of ``ertis verify``, which checks files for damage and gaps."""
+"""``ertis verify``: check files for gaps and damage."""
 
 from collections.abc import Iterable
 from dataclasses import asdict
@@ -23,11 +23,10 @@ _FAILED, _INCOMPLETE = 1, 3
 @options.as_json
 @click.pass_context
 def verify(ctx: click.Context, *, paths: tuple[Path, ...], quiet: bool, as_json: bool) -> None:
-    """Check every measurement of a file, and list missing ones.
+    """Check the measurements of a file, and list gaps and damage.
 
-    The command compares each measurement of a recording or a journal with its checksum. The exit code is 0 if all
-    measurements are present and intact; 3 if some are missing, damaged or out of order; 1 if a file cannot be read at
-    all.
+    The command compares each measurement of recordings and journals with its checksum. The exit code is 0 if all
+    measurements are present and intact, 3 if some are missing, damaged or out of order, and 1 if a file cannot be read.
     """
     from ertis_numba.errors import ErtisError
     from ertis_numba.storage.verify import verify as verified
@@ -55,7 +54,7 @@ def verify(ctx: click.Context, *, paths: tuple[Path, ...], quiet: bool, as_json:
 
 
 def _line(report: "SensorReport") -> str:
-    """Return the result for a sensor in one line."""
+    """Return a line with the findings for a sensor."""
     if report.fault:
         return f"{report.sensor}: {report.fault}"
     reported = [options.counted(report.measurements, "measurement")]
@@ -72,7 +71,7 @@ def _line(report: "SensorReport") -> str:
 
 
 def _places(places: Iterable[int]) -> str:
-    """Return numbers as text, with neighbours as ranges."""
+    """Return indices as text, with runs of neighbours as ranges."""
     runs: list[list[int]] = []
     for place in places:
         if runs and place == runs[-1][1] + 1:

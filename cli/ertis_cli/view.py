@@ -1,4 +1,4 @@
-"""Implementation of ``ertis view``, which shows images and points in the browser."""
+"""``ertis view``: live or recorded images on a page in the browser."""
 
 import gc
 import math
@@ -26,11 +26,11 @@ if TYPE_CHECKING:
 __all__ = ["view"]
 
 _COLOURS = ("inferno", "viridis", "cividis", "magma")
-_LIVE, _PLAYBACK, _PAGE = "an address", "a file on display", "a file written by --save-html"
+_LIVE, _PLAYBACK, _PAGE = "an address", "playback of a file", "a file that --save-html writes as a page"
 _HOST_PORT = re.compile(r"(tcp:)?([^/\\]+:\d{1,5})")
 _PAGES = (".html", ".htm")
-_TWICE_S = 0.5  # Shorter intervals between signals are repetitions of the first by a shell or terminal.
-_ENDING = "ending after the current image; Ctrl-C ends at once ..."
+_TWICE_S = 0.5  # between two signals of which the second is not an echo of the first
+_ENDING = "ending after the current image; press Ctrl-C to end at once ..."
 _ONLY = {
     "host": (_LIVE, _PLAYBACK),
     "port": (_LIVE, _PLAYBACK),
@@ -41,12 +41,18 @@ _ONLY = {
     "server_key": (_LIVE,),
     "device": (_PLAYBACK, _PAGE),
 }
-"""Options that apply to some sources only, and these sources."""
+"""Kinds of views that each of these options is for."""
 
 
 @click.command()
 @click.argument("what", metavar="ADDRESS|REC.h5|IMG.h5")
-@click.option("--sensor", "sensors", multiple=True, metavar="NAME", help="Sensors to show; all by default.")
+@click.option(
+    "--sensor",
+    "sensors",
+    multiple=True,
+    metavar="NAME",
+    help="Show this sensor only; repeatable; all sensors by default.",
+)
 @click.option(
     "--host",
     default="127.0.0.1",
@@ -61,10 +67,25 @@ _ONLY = {
     help="Port of the page; 0 chooses a free one.",
 )
 @click.option(
+    "--port",
+    type=click.IntRange(0, 65_535),
+    default=8080,
+    show_default=True,
+    help="Port of the page; 0 chooses a free port.",
+)
+@click.option(
     "--open/--no-open",
     "opened",
     default=None,
-    help="Open a browser; done by default on a terminal, except for browsers that run inside the terminal.",
+    help="Open a browser; the default on a terminal, unless the browser runs in the terminal.",
+)
+@click.option(
+    "--threshold",
+    type=float,
+    default=-20.0,
+    show_default=True,
+    metavar="DB",
+    help="Level of the weakest points to show.",
 )
 @click.option(
     "--threshold", type=float, default=-20.0, show_default=True, metavar="DB", help="Lowest level of points to show."
@@ -73,18 +94,19 @@ _ONLY = {
     "--dynamic-range", type=float, default=40.0, show_default=True, metavar="DB", help="Dynamic range of the colours."
 )
 @click.option("--range", "range_m", type=options.INTERVAL, metavar="A:B", help="Window of the range axis in metres.")
-@click.option("--decay", type=float, default=0.0, show_default=True, metavar="S", help="Persistence of points.")
 @click.option(
-    "--colours", type=click.Choice(_COLOURS), default="inferno", show_default=True, help="Colour map of levels."
+    "--decay", type=float, default=0.0, show_default=True, metavar="S", help="Time for which points stay visible."
 )
-@click.option("--loop", is_flag=True, help="Repeat a file at its end.")
+@click.option("--colours", type=click.Choice(_COLOURS), default="inferno", show_default=True, help="Colour map.")
+@click.option("--loop", is_flag=True, help="Restart a file at its end.")
 @click.option("--duration", type=float, metavar="S", help="Duration in seconds; until Ctrl-C by default.")
 @click.option(
     "--save-html",
     "html",
     type=click.Path(path_type=Path),
     metavar="FILE",
-    help="Write a page that needs no server: all of a file at once, or a live view at its end; at most 256 MB.",
+    help="Write the view as a page that needs no server: a whole file at once, or a live view at its end; "
+    "at most 256 MB.",
 )
 @_mountings.mounting
 @_network.key
@@ -116,11 +138,11 @@ def view(
     quiet: bool,
     as_json: bool,
 ) -> None:
-    """Show images and points in the browser.
+    """Show live or recorded images in a browser.
 
-    ADDRESS is the address at which a central node publishes. Recordings are processed with their own settings during
-    playback, at their recorded speed. The page shows range and azimuth of each sensor, and all sensors on their
-    platform in three dimensions. It needs the extra view, and no other host.
+    ADDRESS is the address at which a central node publishes. A recording is processed with its own settings during
+    playback, and is shown at its original speed. The page shows range versus azimuth for each sensor, and all sensors
+    on their platform in three dimensions. The command needs the extra 'view'; the page loads nothing from other hosts.
     """
     live = _is_address(what)
     _require_use(_LIVE if live else _PLAYBACK if html is None else _PAGE)
@@ -145,7 +167,7 @@ def view(
         nullcontext() if live else _ended(source, signals, quiet=quiet),
         Viewer(
             source,
-            host="127.0.0.1" if at_once else host,  # Nobody can connect while a file is written as a page.
+            host="127.0.0.1" if at_once else host,  # no other machine may connect while the page is written
             port=0 if at_once else port,
             choices=choices,
             on_note=lambda text: options.say(text, quiet=quiet),
@@ -161,33 +183,33 @@ def view(
         else:
             _emit_event(what, shown, quiet=quiet, as_json=as_json)
             if sys.stderr.isatty() if opened is None else opened:
-                # Some threads end when they are closed, and others only after seconds.
+                # Some browsers return when they are closed, and others only after seconds.
                 asked = {"asked": bool(opened)}
                 threading.Thread(target=_open, args=(shown.url,), kwargs=asked, name="ertis-open", daemon=True).start()
             shown.run(duration_s=math.inf if duration is None else duration, html=html, overwrite=force)
-    gc.freeze()  # Scanning all objects of the libraries would take a fifth of a second.
+    gc.freeze()  # skips a garbage collection of 0.2 s at exit
     if html is not None:
         _report_recorded(what, html, shown.recorded, quiet=quiet, as_json=as_json)
 
 
 def _is_address(what: str) -> bool:
-    """Return True if the source is an address rather than a file."""
+    """Return True for an address, and False for a file."""
     live = "://" in what
     host_port = None if live or Path(what).exists() else _HOST_PORT.fullmatch(what)
     if host_port:
-        raise click.UsageError(f"{what!r} is not a file; give tcp://{host_port[2]}, if a central node publishes there")
+        raise click.UsageError(f"{what!r} is not a file; for the address of a central node, give tcp://{host_port[2]}")
     return live
 
 
 def _require_use(kind: str) -> None:
-    """Refuse options that have no effect; a configuration file may set them for other sources."""
+    """Raise an error for options without effect, unless they come from a configuration file."""
     context = click.get_current_context()
     names = {each.name: each.opts[0] for each in context.command.params}
     for name, kinds in _ONLY.items():
         if kind not in kinds and context.get_parameter_source(name) is ParameterSource.COMMANDLINE:
-            raise click.UsageError(f"{names[name]} applies to {' or '.join(kinds)}; leave it out with {kind}", context)
+            raise click.UsageError(f"{names[name]} is for {' or '.join(kinds)}; remove it with {kind}", context)
     if context.params["html"] is None and context.get_parameter_source("force") is ParameterSource.COMMANDLINE:
-        raise click.UsageError("--force applies to --save-html; leave it out", context)
+        raise click.UsageError("--force is for --save-html; remove it", context)
 
 
 def _source(
@@ -214,7 +236,7 @@ def _source(
 
 @contextmanager
 def _ended(source: "Live | Playback", signals: Signals, *, quiet: bool) -> Iterator[None]:
-    """Close a source after the block; print the reason for a delay."""
+    """Close a source after the block, and print a message if that takes long."""
     try:
         yield
     finally:
@@ -224,10 +246,10 @@ def _ended(source: "Live | Playback", signals: Signals, *, quiet: bool) -> Itera
 
 @contextmanager
 def _compiling(note: str, signals: Signals, *, quiet: bool, ending: bool = False) -> Iterator[None]:
-    """Print a note if a block takes long, and hold signals until it ends; a second signal ends the process at once.
+    """Print a message if the block takes long, and delay signals until its end; a second signal ends the process.
 
-    An exception inside the compiler would be swallowed, and finalising the interpreter meanwhile would crash. If the
-    program is ``ending`` anyway, the first signal counts as the second.
+    An exception inside the compiler may crash it or get lost, and the interpreter crashes if it exits meanwhile.
+    If ``ending`` is True, the first signal counts as the second.
     """
     first_s = math.inf if not ending else time.monotonic() if signals.came else -math.inf
 
@@ -239,7 +261,7 @@ def _compiling(note: str, signals: Signals, *, quiet: bool, ending: bool = False
         if math.isinf(first_s):
             first_s = now_s
             signals(number, frame)
-            options.say("ending after compilation; Ctrl-C again ends at once", quiet=quiet)
+            options.say("ending after this step; press Ctrl-C again to end at once", quiet=quiet)
 
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
@@ -253,35 +275,39 @@ def _compiling(note: str, signals: Signals, *, quiet: bool, ending: bool = False
 
 
 def _open(url: str, *, asked: bool) -> None:
-    """Open a browser, unless it would take over the terminal without a request."""
+    """Open a browser; a browser inside the terminal is opened only if ``asked``."""
     try:
         browser = webbrowser.get()
-    except webbrowser.Error:  # There is no browser; the address is printed already.
+    except webbrowser.Error:  # no browser; the address of the page was already printed
         return
     if asked or _has_window(browser):
         browser.open(url)
 
 
 def _has_window(browser: webbrowser.BaseBrowser) -> bool:
-    """Return True if a browser opens a window, and False for terminal browsers such as w3m."""
+    """Return True if Python starts this browser in the background, unlike terminal browsers such as w3m."""
     if isinstance(browser, webbrowser.GenericBrowser):
         return isinstance(browser, webbrowser.BackgroundBrowser)
     return getattr(browser, "background", True)
 
 
 def _emit_event(what: str, shown: "Viewer", *, quiet: bool, as_json: bool) -> None:
-    """Print the address of the page, and a note if other machines can reach it."""
+    """Report the address of the page, and the need for its token."""
     if as_json:
         options.print_json({"event": "viewing", "source": what, "url": shown.url})
     options.say(f"{what} at {shown.url}; Ctrl-C ends", quiet=quiet)
     if not shown.is_local:
-        options.say("other machines need the token in that address; anyone with it can control this view", quiet=quiet)
+        options.say(
+            "other machines need the token in this address; anyone who has it can control this view", quiet=quiet
+        )
 
 
 def _report_recorded(what: str, html: Path, n_frames: int | None, *, quiet: bool, as_json: bool) -> None:
-    """Print the written frames; raise an error if there are none."""
+    """Report the written page; raise an error if no image was recorded."""
     if n_frames is None:
-        raise click.ClickException(f"no image of {what} was shown, so {html} is not written; check that sensors send")
+        raise click.ClickException(
+            f"{html} is not written, because no image of {what} was shown; check that sensors send measurements"
+        )
     options.say(f"{html}: {options.counted(n_frames, 'frame')} of {what}", quiet=quiet)
     if as_json:
         options.print_json({"event": "recorded", "source": what, "output": str(html), "frames": n_frames})

@@ -1,9 +1,8 @@
-"""Make the recordings of this folder from its scenes: a part of ``make data``.
+"""Build the recordings of this folder from its scenes, as a part of ``make data``.
 
-Each ``NAME.toml`` becomes ``NAME.h5`` by ``ertis simulate``, and ``NAME.json`` holds the reflectors that
-an image of each sensor should show and the SHA-256 of its words, as little-endian bytes. The words come out the
-same everywhere. A file also names the libraries that wrote it, so its own sum in SHA256SUMS holds for
-the file as it is shipped.
+``ertis simulate`` turns each ``NAME.toml`` into ``NAME.h5``. ``NAME.json`` lists the reflectors that an image of each
+sensor should show, and the SHA-256 of the sensor's samples as little-endian bytes. The samples are the same on every
+machine. A recording also names the libraries that wrote it, so its checksum in SHA256SUMS is that of the shipped file.
 """
 
 import hashlib
@@ -16,11 +15,11 @@ from pathlib import Path
 from ertis_numba import open_recording
 
 HERE = Path(__file__).parent
-DATE = "1767225600"  # 2026-01-01: a recording is not to differ by the day it was made
+DATE = "1767225600"  # 2026-01-01: fixed, so that recordings do not depend on the day of the build
 
 
 def build(folder: Path) -> None:
-    """Write the recordings, their reflectors and the sums of all files to ``folder``."""
+    """Write the recordings, their reflectors and the checksums of all files to ``folder``."""
     for scene in sorted(HERE.glob("*.toml")):
         target = folder / f"{scene.stem}.h5"
         command = [
@@ -49,7 +48,7 @@ def build(folder: Path) -> None:
 
 
 def words_sha256(path: Path, sensor: str) -> str:
-    """Return the SHA-256 of the words of all measurements of a sensor, one after the other."""
+    """Return the SHA-256 of the concatenated samples of all measurements of a sensor."""
     digest = hashlib.sha256()
     with open_recording(path, sensor=sensor) as recording:
         for measurement in recording:
@@ -59,7 +58,7 @@ def words_sha256(path: Path, sensor: str) -> str:
 
 
 def write_sums(folder: Path) -> None:
-    """Write SHA256SUMS, in the form that ``sha256sum --check`` reads."""
+    """Write SHA256SUMS in the format of ``sha256sum --check``."""
     files = sorted(path for path in folder.iterdir() if path.suffix in {".h5", ".json", ".toml"})
     lines = (f"{hashlib.sha256(path.read_bytes()).hexdigest()}  {path.name}\n" for path in files)
     (folder / "SHA256SUMS").write_text("".join(lines), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Draw and measure the scenes of ``scenes/`` for ``docs/how-to/gallery.md``: a part of ``make data``.
+"""Draw and measure the scenes of ``scenes/`` for ``docs/gallery.md``, as a part of ``make data``.
 
 Pictures go to ``docs/pictures/gallery``; tables go between the markers ``<!-- scene NAME -->`` and
 ``<!-- /scene NAME -->``. All else on the page is written by hand.
@@ -26,23 +26,24 @@ PICTURES = ROOT / "docs" / "pictures" / "gallery"
 Takes = dict[str, list[tuple[ertis.Energyscape, list[ertis.Reflector]]]]
 _MIN_LEVELS_DB = (-10.0, -30.0)
 _MAX_MARKS = 8
-_MAX_BYTES = 150_000  # of a picture
-_SHEET = (1.0, 92)  # the share of a figure's width that is shown, and dots per inch
-_FRAME = (0.745, 84)  # the same of the figures of a strip: without colour bar and list
+_MAX_BYTES = 150_000  # size limit of a picture
+_SHEET = (1.0, 92)  # share of a figure's width that is shown, and dots per inch
+_FRAME = (0.745, 84)  # the same for figures side by side: without colour bar and list
 _IN_ORDER = {"microphone_noise": False, "microphone_spread": False, "microphone_faults": False}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Shown:
-    """What is shown of a scene.
+    """Picture of a scene in the gallery.
 
     Attributes
     ----------
     frames : tuple of (sensor, index)
-        The measurements in its picture.
+        Measurements to draw.
     dynamic_range_db : float
+        Range of the colours in dB; 30 by default.
     healthy : bool
-        Another picture shows the same with the microphones in order.
+        Whether a second picture shows the scene without microphone faults; False by default.
     """
 
     frames: tuple[tuple[str, int], ...]
@@ -57,11 +58,11 @@ SHOWN = {
     "two_facing_sensors": Shown(frames=(("west", 0), ("east", 0)), dynamic_range_db=40.0),
     "faulty_array": Shown(frames=(("worn", 0),), healthy=True),
 }
-"""The gallery, in its order."""
+"""Pictures of the gallery, in their order on the page."""
 
 
 def main() -> None:
-    """Draw the pictures and write the tables, of all scenes or of those named on the command line."""
+    """Draw the pictures and write the tables of all scenes, or of scenes named on the command line."""
     PICTURES.mkdir(exist_ok=True)
     for name in sys.argv[1:] or SHOWN:
         scene = ertis.load_scene(SCENES / f"{name}.toml")
@@ -81,7 +82,7 @@ def main() -> None:
 
 
 def take(scene: Scene, plan: EffectPlan) -> Takes:
-    """Return images and truth of all measurements of all sensors."""
+    """Return the images and the ground truth of all measurements, by sensor."""
     takes = {}
     for sensor in scene.sensors:
         simulator, pipeline = ertis.Simulator(scene, sensor=sensor.name, plan=plan), ertis.Pipeline(sensor.settings())
@@ -98,7 +99,7 @@ def draw(stem: str, takes: Takes, shown: Shown) -> None:
         image, truth = takes[sensor][index]
         reported = ertis.compare(image, truth)
         reflectors = [*(match.reflector for match in reported.matched), *reported.missed]
-        # What stands there itself, not what walls show of it.
+        # Mark objects themselves, not their mirror images in walls.
         figures.append(_figure(image, [each for each in reflectors if ">" not in each.name], shown.dynamic_range_db))
     save(figures, PICTURES / f"{stem}.png")
 
@@ -119,7 +120,7 @@ def save(figures: Sequence[Figure], path: Path) -> None:
     for number, part in enumerate(parts):
         strip.paste(part.crop((0, 0, widths[number], part.height)), (sum(widths[:number]), 0))
     strip.save(path, optimize=True)
-    if path.stat().st_size > _MAX_BYTES:  # where colours are many, 256 are enough; where they are few, they show
+    if path.stat().st_size > _MAX_BYTES:  # large pictures have so many colours that 256 of them are enough
         strip.quantize(256, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
@@ -130,7 +131,7 @@ def _raster(figure: Figure, dpi: int) -> Image.Image:
 
 
 def effects_table(plan: EffectPlan) -> str:
-    """Return what ``--explain`` says of the effects for which the scene has something, as Markdown."""
+    """Return the rows of ``--explain`` for the effects that concern the scene, as Markdown."""
     rows = [
         (
             f"`{verdict.name}`",
@@ -145,7 +146,7 @@ def effects_table(plan: EffectPlan) -> str:
 
 
 def errors_table(takes: Takes) -> str:
-    """Return the errors of each sensor, for two levels down to which things count, as Markdown."""
+    """Return the errors of each sensor for two minimum levels, as Markdown."""
     cells = []
     for sensor, level_db in itertools.product(takes, _MIN_LEVELS_DB):
         errors = errors_of(ertis.compare(image, truth, min_level_db=level_db) for image, truth in takes[sensor])
@@ -180,11 +181,11 @@ def _table(head: Sequence[str], align: str, rows: Iterable[Sequence[str]]) -> st
 
 
 def replaced(page: str, marker: str, text: str) -> str:
-    """Return a page with a text between its two markers."""
+    """Return a page with the text between two markers replaced."""
     head, begin, rest = page.partition(f"<!-- {marker} -->")
     _, end, tail = rest.partition(f"<!-- /{marker} -->")
     if not (begin and end):
-        raise SystemExit(f"the page has no place for {marker!r}; give it <!-- {marker} --> and <!-- /{marker} -->")
+        raise SystemExit(f"the page has no markers for {marker!r}; add <!-- {marker} --> and <!-- /{marker} -->")
     return f"{head}{begin}\n{text}\n{end}{tail}"
 
 
