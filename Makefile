@@ -46,7 +46,7 @@ check: $(VENV)/ready-to-test
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(PYTEST) -q tests/test_plain_english.py
+	$(PYTEST) -q tests/test_plain_english.py tests/test_docstring_examples.py
 	$(BIN)/python -m sphinx -q -W --keep-going docs site
 
 docs: $(VENV)/ready-to-test  ## build the documentation; open site/index.html

@@ -94,7 +94,7 @@ class Pipeline:
     >>> import ertis_numba as ertis
     >>> with ertis.open_recording("reflectors.h5") as recording, ertis.Pipeline(recording.settings) as pipeline:
     ...     images = pipeline.process_batch(recording)
-    >>> images[0].energy.shape == (len(pipeline.grid), len(pipeline.range_m))
+    >>> images[0].amplitude.shape == (len(pipeline.grid), len(pipeline.range_m))
     True
     """
 
@@ -266,7 +266,7 @@ class Pipeline:
         >>> import ertis_numba as ertis
         >>> with ertis.open_recording("reflectors.h5") as recording:
         ...     pipeline = ertis.Pipeline(recording.settings)
-        ...     loudest = [float(image.energy.max()) for image in pipeline.process_many(recording)]
+        ...     loudest = [float(image.amplitude.max()) for image in pipeline.process_many(recording)]
         >>> len(loudest) == len(recording)
         True
         """

@@ -38,7 +38,7 @@ def test_images_of_a_cluster_are_measured_and_written(tmp_path):
     assert "workers of the cluster at tcp://" in row["choice"]
     assert row["added_p50_ms"] == row["p50_ms"] - 1.0
     assert row["added_p99_ms"] == row["p99_ms"] - 2.0
-    assert (row["offered_hz"], row["most_hz"], row["most_here_hz"]) == (40.0, 20.0, 40.0)
+    assert (row["offered_hz"], row["max_hz"], row["max_here_hz"]) == (40.0, 20.0, 40.0)
     text = target.read_text("utf-8")
     assert "| a dask cluster on this machine, 2 workers, 90 directions, 4 × 10 Hz for 1 s |" in text
     assert "; 20 images/s of 40 that were offered, 40 by workers of its own. Of a core: central node " in text

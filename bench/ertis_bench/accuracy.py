@@ -99,7 +99,7 @@ def _settings(settings: Settings, directions: str) -> Settings:
 
 
 class _Subject:
-    """One measurement, its exact image and its texture."""
+    """One measurement, its exact image and its signal model."""
 
     def __init__(
         self,

@@ -122,7 +122,7 @@ class Replayed(Sequence["NDArray[np.uint32]"]):
         return len(self._recording)
 
     def __getitem__(self, index: Any) -> Any:
-        return self._recording[index].words
+        return self._recording[index].data
 
     def refusal(self, name: str, config: "DeviceConfig") -> str:
         """Return the reason if the recording does not match this configuration, or an empty text."""

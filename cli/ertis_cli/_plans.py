@@ -20,7 +20,7 @@ _INTERPOLATIONS = {
     "cubic": "interpolated from four samples with a Lagrange cubic",
 }
 _MIN_MS = 0.005
-_PART = "  {name:52}  {safe:>8}  {texture:>14}"
+_PART = "  {name:52}  {safe:>8}  {predicted:>14}"
 
 
 def require_plan(settings: "Settings", *, explain: bool, verify: bool, max_error_db: float | None) -> None:
@@ -90,10 +90,10 @@ def _explained(sensor: str, plan: dict[str, Any]) -> Iterator[str]:
     else:
         ends = " and ".join(f"{end['error_db']:.1f} dB at {end['range_m']:g} m" for end in plan["plane_waves"])
         yield f"  plane wavefronts, with an additional error of {ends} relative to spherical wavefronts"
-    yield _PART.format(name="predicted error", safe="planned", signal_model="this recording")
+    yield _PART.format(name="predicted error", safe="planned", predicted="this recording")
     total = {"due_to": "total", **plan}
     for part in (*plan["parts"], total):
-        cells = {key: f"{part[f'{name}_db']:.1f} dB" for key, name in (("safe", "safe"), ("texture", "predicted"))}
+        cells = {key: f"{part[f'{name}_db']:.1f} dB" for key, name in (("safe", "safe"), ("predicted", "predicted"))}
         yield _PART.format(name=f"  {part['due_to']}", **cells)
     stages = ", ".join(f"{name} {time_ms:.2f}" for name, time_ms in plan["stages_ms"].items() if time_ms >= _MIN_MS)
     yield f"  predicted time {plan['time_ms']:.2f} ms: {stages}; with the costs in {plan['costs']}"

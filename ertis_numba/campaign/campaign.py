@@ -184,7 +184,7 @@ class Campaign:
             **self._shares(n_workers),
             **{name: getattr(options, name) for name in HOW},
             "sensors": planned,
-            "most_bytes": MAX_BYTES / n_workers,
+            "max_bytes": MAX_BYTES / n_workers,
             # Dask starts again what a worker had that was lost, even if all but the news of it had been done.
             "overwrite": options.overwrite or self._scheduler is not None,
         }

@@ -57,7 +57,7 @@ def examine(
     n_threads = kernel_set.max_threads if threads is None else threads
     planners = {
         "safe": Planner(settings, kernel_set, threads=n_threads, plan="measured"),  # times are those of this machine
-        "texture": heard or planner_of(pipeline.process(first), first, kernel_set, threads=n_threads),
+        "signal_model": heard or planner_of(pipeline.process(first), first, kernel_set, threads=n_threads),
     }
     if explain:
         yield "plan", _plan(planners, settings)
@@ -70,7 +70,7 @@ def examine(
 def _plan(planners: dict[str, Planner], settings: Settings) -> dict[str, Any]:
     """Return a plan with its predictions."""
     chosen = {name: planner.chosen(settings.accuracy) for name, planner in planners.items()}
-    safe, signal_model = chosen["safe"], chosen["texture"]
+    safe, signal_model = chosen["safe"], chosen["signal_model"]
     return {
         "accuracy": {name: getattr(settings.accuracy, name) for name in settings.accuracy.__struct_fields__},
         "parts": [
@@ -90,7 +90,7 @@ def _plan(planners: dict[str, Planner], settings: Settings) -> dict[str, Any]:
         "costs": str(planners["safe"].costs_file),
         "budget_applies_to": "image" if planners["safe"].keeps_budget_of_images(settings.accuracy) else "beams",
         "decimated": settings.recording.is_pdm or settings.decimation != 1,
-        "plane_waves": _plane_waves(planners["texture"].model, settings),
+        "plane_waves": _plane_waves(planners["signal_model"].model, settings),
     }
 
 
@@ -115,7 +115,7 @@ def _verified(pipeline: Pipeline, first: Measurement, planners: dict[str, Planne
         "sequence": first.stamp.sequence,
         "directions": measured.n_directions,
         "error_db": round(measured.error_db, 2),
-        "predicted_db": round(planners["texture"].error_db(accuracy), 2),
+        "predicted_db": round(planners["signal_model"].error_db(accuracy), 2),
         "safe_db": round(planners["safe"].error_db(accuracy), 2),
         "max_error_db": accuracy.max_error_db,
         "peaks": measured.peaks and {name: _rounded(value) for name, value in asdict(measured.peaks).items()},

@@ -99,7 +99,7 @@ def _make(about: Mapping[str, Any], notify: ReportProgress) -> dict[str, Any]:
         Path(about["target"]),
         options,
         sensors=list(how["settings"]),
-        max_bytes=about["most_bytes"],
+        max_bytes=about["max_bytes"],
         warn=warnings.append,
         **how,
     ) as work:

@@ -122,7 +122,7 @@ class Energyscape(DegreesFromRadians):
         >>> import ertis_numba as ertis
         >>> with ertis.open_recording("reflectors.h5") as recording:
         ...     image = ertis.Pipeline(recording.settings).process(recording[0])
-        >>> float(image.replace(energy=0 * image.energy).energy.max())
+        >>> float(image.replace(amplitude=0 * image.amplitude).amplitude.max())
         0.0
         """
         return replaced("an image", self, changes)

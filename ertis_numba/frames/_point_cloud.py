@@ -120,7 +120,7 @@ class PointCloud(DegreesFromRadians):
         >>> import numpy as np
         >>> import ertis_numba as ertis
         >>> cloud = ertis.PointCloud(np.ones((2, 3), np.float32), np.ones(2, np.float32), ertis.Settings())
-        >>> cloud.replace(energy=cloud.energy / 2).energy
+        >>> cloud.replace(amplitude=cloud.amplitude / 2).amplitude
         array([0.5, 0.5], dtype=float32)
         """
         return replaced("a point cloud", self, changes)

@@ -195,7 +195,7 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
         >>> from pathlib import Path
         >>> from ertis_numba import Settings
         >>> size = Path("near.toml").write_text("processing.range_m = [0.3, 1.0]")
-        >>> Settings().changed_by("near.toml").processing.range_m
+        >>> Settings().updated_from_file("near.toml").processing.range_m
         (0.3, 1.0)
         """
         held, tables = self._load(Path(path))

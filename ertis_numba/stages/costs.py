@@ -373,11 +373,11 @@ def _pairs(bench: _Bench, random: np.random.Generator, n_directions: int) -> dic
         if kernels.tile_ranges:
             tiles, scales, starts = _tiles(kernels, 1, 1)
             whole = np.ones((n_nodes, 1, 2, 2), dtype=np.int16)
-            whole_taps = np.full((n_directions, n_pairs, 2), 900, dtype=np.int16)
+            integer_taps = np.full((n_directions, n_pairs, 2), 900, dtype=np.int16)
             took_s["int16"].append(
                 bench.best(
                     kernels.interpolated_beams_envelope_int16,
-                    *(tiles, scales, starts, _RANGES, offsets, whole, places, whole_taps, rows, np.float32(1), 1),
+                    *(tiles, scales, starts, _RANGES, offsets, whole, places, integer_taps, rows, np.float32(1), 1),
                     amplitude,
                 )
             )

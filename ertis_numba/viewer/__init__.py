@@ -34,7 +34,7 @@ __all__ = [
     "Viewer",
 ]
 
-_HOMES = {"Film": "_film", "Live": "_live", "View": "_view"}
+_HOMES = {"Live": "_live", "Playback": "_playback", "Viewer": "_view"}
 
 
 def __getattr__(name: str) -> Any:

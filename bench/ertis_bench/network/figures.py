@@ -283,8 +283,8 @@ def _cluster(folder: Path, duration_s: float, seed: int) -> Found:
         "added_p50_ms": there["p50_ms"] - here["p50_ms"],
         "added_p99_ms": there["p99_ms"] - here["p99_ms"],
         "offered_hz": found["there-most"]["sent"] / _CALIBRATION_S,
-        "most_hz": found["there-most"]["published"] / _CALIBRATION_S,
-        "most_here_hz": found["here-most"]["published"] / _CALIBRATION_S,
+        "max_hz": found["there-most"]["published"] / _CALIBRATION_S,
+        "max_here_hz": found["here-most"]["published"] / _CALIBRATION_S,
     }
 
 

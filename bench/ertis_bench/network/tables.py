@@ -216,11 +216,11 @@ def _figure(row: dict[str, Any]) -> dict[str, str]:
             f"{row['images']:,} images here, {row['skipped']} skipped, {row['wrong']} wrong; capture to image p50 "
             f"{row['p50_ms']:.1f} ms, p99 {row['p99_ms']:.1f} ms, slowest {row['slowest_ms']:.0f} ms"
         )
-    if "most_hz" in row:
+    if "max_hz" in row:
         found += (
             f"; beside workers of its own in the same run p50 {row['added_p50_ms']:+.1f} ms, p99 "
             f"{row['added_p99_ms']:+.1f} ms; {row['max_hz']:.0f} images/s of {row['offered_hz']:.0f} that were "
-            f"offered, {row['most_here_hz']:.0f} by workers of its own"
+            f"offered, {row['max_here_hz']:.0f} by workers of its own"
         )
         cpu += "; the cluster's scheduler and workers are not counted"
     return {"what": what, "goal": goal, "found": f"{found}. Of a core: {cpu}"}

@@ -17,7 +17,7 @@ from ertis_bench.network.sender import SenderJob
 from ertis_bench.powercuts.log import DiskOperation, DiskRecord, environment
 from ertis_numba.errors import DataError
 
-__all__ = ["Acknowledged", "Fail", "Setting", "Trace", "capture", "central", "journal", "spool"]
+__all__ = ["AcknowledgedState", "Fail", "Setting", "Trace", "capture", "central", "journal", "spool"]
 
 Fail = tuple[int, int, int] | None
 """Syncs that fail: the first, how many, and a seed."""
@@ -64,7 +64,7 @@ class Setting:
 
 
 @dataclass(slots=True)
-class Acknowledged:
+class AcknowledgedState:
     """Measurements that were acknowledged up to some record of a log.
 
     Attributes

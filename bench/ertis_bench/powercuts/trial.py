@@ -11,7 +11,7 @@ from ertis_bench.powercuts import log as logs
 from ertis_bench.powercuts import scenarios
 from ertis_bench.powercuts.disk import Disk
 from ertis_bench.powercuts.recovery import Found, recover_archive, recover_capture, recover_spool
-from ertis_bench.powercuts.scenarios import Acknowledged, Setting, Trace
+from ertis_bench.powercuts.scenarios import AcknowledgedState, Setting, Trace
 from ertis_numba.errors import DataError
 
 __all__ = ["SCENARIOS", "reason_not_to_try", "try_cuts"]
@@ -126,7 +126,7 @@ def _cut(
     for _ in range(count):
         after_ack = acks and rng.random() < _AFTER_ACK
         moments[rng.choice(acks) if after_ack else rng.randrange(len(records))] += 1
-    disk, acknowledged = Disk(trace.setting.disk), Acknowledged()
+    disk, acknowledged = Disk(trace.setting.disk), AcknowledgedState()
     state = trace.setting.folder / "state"
     for place, record in enumerate(records):
         disk.take(record)
@@ -146,7 +146,7 @@ def _cut(
             shutil.rmtree(state)
 
 
-def _recover(name: str, trace: Trace, state: Path, acknowledged: Acknowledged, rng: random.Random) -> Found:
+def _recover(name: str, trace: Trace, state: Path, acknowledged: AcknowledgedState, rng: random.Random) -> Found:
     by_command = rng.random() < _BY_COMMAND
     if name in ("capture", "journal"):
         return recover_capture(state, acknowledged.sent, trace.sent_crc32, by_command=by_command)

@@ -11,7 +11,7 @@ from ertis_numba.journal import JournalGap as NotedGap
 from ertis_numba.network.central_node._acks import Acks
 from ertis_numba.network.central_node._admission import entry_in, require_room, require_same, source_in
 from ertis_numba.network.central_node._received_items import ReceivedItem, SensorSession, Stored, Twin
-from ertis_numba.network.central_node._roles import Store, Unwanted, Viewer
+from ertis_numba.network.central_node._roles import MeasurementConsumer, Store, Unwanted
 from ertis_numba.network.central_node._sharing import Sharing
 from ertis_numba.network.central_node._streams import PeerConnection, SensorTrack, Stream
 from ertis_numba.network.fields import as_line
@@ -54,7 +54,7 @@ class Intake:
         self,
         *,
         store: Store | None,
-        viewer: Viewer | None,
+        viewer: MeasurementConsumer | None,
         send: Callable[[bytes, Message], None],
         notify: Callable[..., None],
         on_stored: Callable[[list[ReceivedItem]], None] | None,

@@ -109,7 +109,7 @@ class CentralNode:
         self._listen, self._keys, self._archive = listen, keys, archive
         self._images = None if processing is None else Guarded(processing, self._internal)
         self._window = checks.integer("window", window, 1, 1024)
-        self._max_bytes = checks.integer("most_bytes", max_bytes, 4096, 2**31)
+        self._max_bytes = checks.integer("max_bytes", max_bytes, 4096, 2**31)
         self._telling = Telling(on_event, on_stored)
         self._server = ServerSocket(keys)
         self._intake = Intake(

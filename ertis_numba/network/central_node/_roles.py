@@ -10,7 +10,7 @@ from ertis_numba.network.fields import as_line
 from ertis_numba.network.messages import Data, Hello, Message, Refused
 from ertis_numba.settings import Settings
 
-__all__ = ["Store", "Unwanted", "Viewer"]
+__all__ = ["MeasurementConsumer", "Store", "Unwanted"]
 
 
 class Unwanted(Exception):  # noqa: N818  it is an answer
@@ -46,7 +46,7 @@ class Store(Protocol):
         """Queue an item to be stored; never blocks."""
 
 
-class Viewer(Protocol):
+class MeasurementConsumer(Protocol):
     """Interface to consumers of new measurements."""
 
     def register(self, hello: Hello, settings: Settings) -> None:

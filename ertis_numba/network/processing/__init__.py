@@ -2,6 +2,6 @@
 
 from ertis_numba.network.processing.options import ProcessingOptions
 from ertis_numba.network.processing.processing import ImageProcessing
-from ertis_numba.network.processing.queues import SensorCounts
+from ertis_numba.network.processing.queues import ProcessingCounts
 
-__all__ = ["ImageProcessing", "ProcessingOptions", "SensorCounts"]
+__all__ = ["ImageProcessing", "ProcessingCounts", "ProcessingOptions"]

@@ -16,7 +16,7 @@ from ertis_numba.network.processing.dead_letter_queue import DeadLetterQueue, en
 from ertis_numba.network.processing.groups import Groups
 from ertis_numba.network.processing.options import ProcessingOptions
 from ertis_numba.network.processing.publisher import Publisher
-from ertis_numba.network.processing.queues import SUPERSEDED, Queues, SensorCounts
+from ertis_numba.network.processing.queues import SUPERSEDED, ProcessingCounts, Queues
 from ertis_numba.network.processing.reorder_buffer import ReorderBuffer
 from ertis_numba.network.processing.runner import Event, FinishedJob, Job, JobKind, KindFailed, KindReady, Lost, Runner
 from ertis_numba.network.processing.sensors import Sensors
@@ -167,7 +167,7 @@ class ImageProcessing:
             self._publish_of(sensor)
         self._dispatch()
 
-    def counts(self, sensor: str) -> SensorCounts:
+    def counts(self, sensor: str) -> ProcessingCounts:
         """Return the counts of a sensor's measurements."""
         return self._queues.counts_of(sensor)
 

@@ -9,7 +9,7 @@ from ertis_numba.network.messages import Data
 from ertis_numba.network.processing.runner import Job
 from ertis_numba.network.status import Latencies, Percentiles
 
-__all__ = ["SUPERSEDED", "Queues", "SensorCounts"]
+__all__ = ["SUPERSEDED", "ProcessingCounts", "Queues"]
 
 _QUEUE: Final = 2  # Limit on waiting measurements of a sensor; a new one replaces the oldest.
 _REPORTED: Final = 4096  # Limit on kept drops, until they are reported.
@@ -17,7 +17,7 @@ SUPERSEDED: Final = "superseded"
 
 
 @dataclass(slots=True)
-class SensorCounts:
+class ProcessingCounts:
     """Counts of one sensor's measurements.
 
     ``received = published + sum(dropped.values()) + in_flight`` at any time.
@@ -60,16 +60,16 @@ class Queues:
     """
 
     def __init__(self) -> None:
-        self.counts: dict[str, SensorCounts] = {}
+        self.counts: dict[str, ProcessingCounts] = {}
         self.dropped: deque[tuple[str, int, int, str]] = deque(maxlen=_REPORTED)
         self._waiting: dict[str, deque[Job]] = {}
         self._again: deque[Job] = deque()  # Jobs for a second try, before all others.
 
-    def counts_of(self, sensor: str) -> SensorCounts:
+    def counts_of(self, sensor: str) -> ProcessingCounts:
         """Return the counts of a sensor, which begin at 0."""
-        return self.counts.setdefault(sensor, SensorCounts())
+        return self.counts.setdefault(sensor, ProcessingCounts())
 
-    def take_in(self, data: Data) -> SensorCounts:
+    def take_in(self, data: Data) -> ProcessingCounts:
         """Count a received measurement; return the counts of its sensor."""
         counts = self.counts_of(data.sensor)
         counts.received += 1
