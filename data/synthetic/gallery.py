@@ -1,4 +1,4 @@
-"""Draw and measure the scenes of ``scenes/`` for ``docs/gallery.md``, as a part of ``make data``.
+"""Draw and measure the scenes of ``scenes/`` for ``docs/how-to/gallery.md``, as a part of ``make data``.
 
 Pictures go to ``docs/pictures/gallery``; tables go between the markers ``<!-- scene NAME -->`` and
 ``<!-- /scene NAME -->``. All else on the page is written by hand.

@@ -114,7 +114,7 @@ def export(
 ) -> tuple[Path, ...]:
     """Write energyscapes, or the signals of a measurement, for other programs.
 
-    Files appear complete, or not at all. ``docs/export.md`` has the formats, what each keeps, and where they are
+    Files appear complete, or not at all. ``docs/how-to/export.md`` has the formats, what each keeps, and where they are
     defined.
 
     Parameters

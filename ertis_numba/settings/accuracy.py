@@ -22,7 +22,7 @@ class Accuracy(TomlTable, frozen=True, kw_only=True):
     """Error budget of the image, and parts of the plan that the planner shall not choose.
 
     The planner chooses all values that are open (``auto`` or None): the fastest plan whose predicted error keeps the
-    budget. Energyscapes hold the complete plan. ``docs/accuracy.md`` has the equations.
+    budget. Energyscapes hold the complete plan. ``docs/explanation/accuracy.md`` has the equations.
 
     Attributes
     ----------

@@ -36,7 +36,7 @@ class Processing(TomlTable, frozen=True, kw_only=True):
         Samples of the record per range of the energyscape, 1 to 10000.
     band_edges_hz : (low, high), optional, default None
         Frequencies in hertz, below and above the call's band, at which the matched filter reaches 0. By default, each
-        lies 5 kHz outside the band, or half of the band's lowest frequency if that is less; see ``docs/accuracy.md``.
+        lies 5 kHz outside the band, or half of the band's lowest frequency if that is less; see ``docs/explanation/accuracy.md``.
     decimation : int, optional, default None
         Samples of the record per signal sample, 1 to 1000, a divisor of ``range_decimation``. By default the largest
         divisor that suits the method and the call's band; see `Settings.decimation`.
@@ -45,7 +45,7 @@ class Processing(TomlTable, frozen=True, kw_only=True):
         at ranges below some ten apertures. ``auto`` chooses ``spherical`` if plane wavefronts exceed the error budget
         at the first range, and ``plane`` otherwise and for adaptive beamformers.
     beamformer : {"delay_and_sum", "coherence_factor", "dmas", "capon"}, default "delay_and_sum"
-        Combination of the delayed signals; ``docs/beamformers.md`` compares them. All except delay_and_sum need the
+        Combination of the delayed signals; ``docs/explanation/beamformers.md`` compares them. All except delay_and_sum need the
         fast method and plane wavefronts.
     dmas_order : int, default 2
         Number of microphone signals that ``dmas`` multiplies at a time, 2 to 8.
@@ -55,7 +55,7 @@ class Processing(TomlTable, frozen=True, kw_only=True):
         Weights of the microphones, scaled to a mean of 1: ``uniform``; a window of the distance from the centre of the
         array, ``cosine``, ``hann``, ``hamming``, ``blackman``, ``taylor:DB`` (20 to 80 dB, 30 by default) or
         ``kaiser:BETA`` (0 to 20, 6 by default); or one number per channel, not below 0. For delay_and_sum only; see
-        ``docs/beamformers.md``.
+        ``docs/explanation/beamformers.md``.
     loading : float, default 1
         Diagonal loading of ``capon`` relative to the mean power of a microphone, 1e-6 to 1e6. Larger values approach
         delay-and-sum.

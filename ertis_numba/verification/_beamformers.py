@@ -1,4 +1,4 @@
-"""Reference beamformers in float64, as defined in docs/beamformers.md."""
+"""Reference beamformers in float64, as defined in docs/explanation/beamformers.md."""
 
 import math
 from collections.abc import Callable

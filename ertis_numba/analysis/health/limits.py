@@ -1,4 +1,4 @@
-"""Limits beyond which a value is a fault, as documented in docs/health.md."""
+"""Limits beyond which a value is a fault, as documented in docs/how-to/health.md."""
 
 __all__ = [
     "COMMON_SHARE",
