@@ -29,7 +29,8 @@ def gpu_short(report: dict[str, Any]) -> str:
         return "No GPU has run the kernels yet: they are simulated and compiled, and nothing is measured."
     lines = _lines(report)
     times = _times({name: lines[name] for name in (_ONE_AT_A_TIME, _STREAMED, _PAPER)})
-    return f"{times}\n\nMedians on {report['gpu']['name']}, {report['date'][:10]}; docs/explanation/gpu.md has the rest."
+    about = f"Medians on {report['gpu']['name']}, {report['date'][:10]}; docs/explanation/gpu.md has the rest."
+    return f"{times}\n\n{about}"
 
 
 def _rows(report: dict[str, Any], part: str) -> list[dict[str, Any]]:

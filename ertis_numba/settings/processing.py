@@ -36,7 +36,8 @@ class Processing(TomlTable, frozen=True, kw_only=True):
         Samples of the record per range of the energyscape, 1 to 10000.
     band_edges_hz : (low, high), optional, default None
         Frequencies in hertz, below and above the call's band, at which the matched filter reaches 0. By default, each
-        lies 5 kHz outside the band, or half of the band's lowest frequency if that is less; see ``docs/explanation/accuracy.md``.
+        lies 5 kHz outside the band, or half of the band's lowest frequency if that is less; see
+        ``docs/explanation/accuracy.md``.
     decimation : int, optional, default None
         Samples of the record per signal sample, 1 to 1000, a divisor of ``range_decimation``. By default the largest
         divisor that suits the method and the call's band; see `Settings.decimation`.
@@ -45,8 +46,8 @@ class Processing(TomlTable, frozen=True, kw_only=True):
         at ranges below some ten apertures. ``auto`` chooses ``spherical`` if plane wavefronts exceed the error budget
         at the first range, and ``plane`` otherwise and for adaptive beamformers.
     beamformer : {"delay_and_sum", "coherence_factor", "dmas", "capon"}, default "delay_and_sum"
-        Combination of the delayed signals; ``docs/explanation/beamformers.md`` compares them. All except delay_and_sum need the
-        fast method and plane wavefronts.
+        Combination of the delayed signals; ``docs/explanation/beamformers.md`` compares them. All except delay_and_sum
+        need the fast method and plane wavefronts.
     dmas_order : int, default 2
         Number of microphone signals that ``dmas`` multiplies at a time, 2 to 8.
     snapshots : int, default 5

@@ -12,7 +12,9 @@ from ertis_numba.kernels._cuda.memory import CudaMemory
 
 __all__ = ["KERNELS"]
 
-_REMEDY = "use device 'cpu', or install ertis-numba[cu12] or [cu13] on a machine with an NVIDIA GPU: see docs/how-to/cuda.md"
+_REMEDY = (
+    "use device 'cpu', or install ertis-numba[cu12] or [cu13] on a machine with an NVIDIA GPU: see docs/how-to/cuda.md"
+)
 
 
 def _hardware() -> str:
