@@ -122,8 +122,8 @@ def paper(report: dict[str, Any]) -> str:
     return "\n\n".join(
         [
             _table(["ms, mean ± std (median)", *columns], measured),
-            _table(["times faster than `scipy`, by medians", *columns], ratios),
-            _table(["the paper's own, ms, mean ± std", *columns], published),
+            _table(["median time of `scipy` / median time", *columns], ratios),
+            _table(["published in the paper, ms, mean ± std", *columns], published),
             f"Measured on {sentence(report['machine'])}",
             _conditions(report),
             _checked(report),
@@ -142,20 +142,29 @@ def _checked(report: dict[str, Any]) -> str:
 def _conditions(report: dict[str, Any]) -> str:
     first_m, last_m = report["range_m"]
     return (
-        f"The same measurement {report['count']} times, in one process, the backends in turns of {timing.BURST}: "
-        f"{report['words']:,} words of 32 microphones ({report['source']}) to an energyscape of "
-        f"{first_m:g}–{last_m:g} m. Included: everything from the words in memory to the image in memory. Not "
-        "included: reading the file, making the pipeline, compilation, and calls for a fifth of a second, three at "
-        "least, to warm up before each turn; images go to one array that is used again. "
-        "`scipy` runs on one thread, as its filters and sums do anyhow, and over the whole record, as the paper does; "
-        "`numpy` and `cpu` compute the part of the record that the image needs, `cpu` on all cores, `numpy` on one. "
+        f"The same measurement was processed {report['count']} times in one process, in turns of {timing.BURST} per "
+        f"backend: {report['words']:,} words of 32 microphones ({report['source']}) to an energyscape of "
+        f"{first_m:g}–{last_m:g} m. Times include everything from the words in memory to the image in memory. They "
+        "exclude reading the file, creating the pipeline, compilation, and warm-up calls of a fifth of a second (at "
+        "least three) before each turn. Images are written to one array. "
+        "`scipy` runs on one thread, like its filters and sums, and processes the whole record, as the paper does. "
+        "`numpy` and `cpu` process the part of the record that the image needs, `cpu` on all cores, `numpy` on one. "
         "The paper does not state the length of its records."
     )
 
 
 def accuracy(report: dict[str, Any]) -> str:
     """Return all plans of each subject, and how they were measured."""
-    head = ["error, dB", "predicted, dB", "ms (median)", "times faster", "level, dB", "range, mm", "angle, °", "lost"]
+    head = [
+        "error, dB",
+        "predicted, dB",
+        "ms (median)",
+        "time of paper / time",
+        "level, dB",
+        "range, mm",
+        "angle, °",
+        "missed",
+    ]
     parts = []
     for name, rows, paper_ms in _subjects(report):
         cells = [
@@ -183,11 +192,11 @@ def accuracy_front(report: dict[str, Any]) -> str:
             for row in rows
             if row["on_front"] or row["plan"] == PAPER
         ]
-        parts.append(_table([name, "error, dB", "ms (median)", "times faster"], cells))
+        parts.append(_table([name, "error, dB", "ms (median)", "time of paper / time"], cells))
     conditions = (
-        f"Medians of {report['count']} measurements, {report['directions']} directions. Shown are plans that no other "
-        "one beats in both error and time, and the paper's method; docs/reference/benchmarks.md has all of them and "
-        "says how they were measured."
+        f"Medians of {report['count']} measurements, {report['directions']} directions. The table contains the plans "
+        "that no other plan beats in both error and time, and the paper's method. docs/reference/benchmarks.md has all "
+        "plans and the conditions of the measurement."
     )
     return "\n\n".join([*parts, f"Measured on {sentence(report['machine'])}", conditions])
 
@@ -202,18 +211,18 @@ def _subjects(report: dict[str, Any]) -> Iterable[tuple[str, list[dict[str, Any]
 
 def _accuracy_conditions(report: dict[str, Any]) -> str:
     first_m, last_m = report["range_m"]
-    left_out = "".join(f" Left out, as it is not installed here: {name}." for name in report["left_out"])
+    left_out = "".join(f" Not installed here: {name}." for name in report["left_out"])
     return (
-        f"{report['directions']} directions, {first_m:g}–{last_m:g} m, device `cpu`, all threads, the paper's method "
-        f"on one; medians of {report['count']} measurements in turns of {TURN}, calls for a fifth of a second to warm "
-        "up not counted. Bold: no other plan is both faster and more exact. A plan's name has the precision of its "
-        "samples, what a delayed sample is made of and how many samples are kept per range, nodes along each axis of "
-        "the array and their density where beams are interpolated, and the stop band of the decimation; draft, "
-        "standard, fine and exact are what the planner chooses here. Error: norm of the difference by that of the "
-        "exact image, computed in float64 over all directions and ranges. Predicted: by the error model and the "
-        "texture of the measurement, before the image is made. Level, range, angle: largest errors among the "
-        f"strongest {PEAKS} reflectors, levels below the strongest; lost are those of which `find_peaks` shows none "
-        f"within 5° and 2 cm.{left_out}"
+        f"{report['directions']} directions, {first_m:g}–{last_m:g} m, device `cpu`, all threads, but one for the "
+        f"paper's method. Times are medians of {report['count']} measurements in turns of {TURN}, without warm-up "
+        "calls of a fifth of a second. Bold: no other plan is both faster and more accurate. The name of a plan states the "
+        "precision of its samples, the interpolation of a delayed sample and the number of samples kept per range, the "
+        "grid points along each axis of the array and their density if beams are interpolated, and the stopband "
+        "attenuation of the decimation. The planner chose draft, standard, fine and exact here. Error: norm of the "
+        "difference relative to the norm of the exact image, in float64 over all directions and ranges. Predicted: by "
+        "the error model with the signal model of the measurement, before the image is computed. Level, range, angle: "
+        f"largest errors among the strongest {PEAKS} reflectors, with levels relative to the strongest. Missed: "
+        f"reflectors without a peak from `find_peaks` within 5° and 2 cm.{left_out}"
     )
 
 
@@ -221,7 +230,7 @@ def scaling(report: dict[str, Any]) -> str:
     """Return one table per series, the limits, and the reached shares."""
     series: dict[str, list[list[str]]] = {}
     for row in report["rows"]:
-        sums = "" if row["plan"] == "default" else f", every own beam in {row['plan']}"
+        sums = "" if row["plan"] == "default" else f", no beam grid, {row['plan']}"
         name = row["series"].replace("_m", ", m").replace("_", " ") + sums
         series.setdefault(name, []).append([f"{row['value']:g}", _spread(**row), f"{row['n_ranges']}"])
     parts = [_table([name, "ms, mean ± std (median)", "ranges"], rows) for name, rows in series.items()]
@@ -239,13 +248,12 @@ def scaling(report: dict[str, Any]) -> str:
     parts.append(f"Measured on {sentence(report['machine'])}")
     parts.append(
         f"{report['count']} measurements per line, device `cpu`, white noise, the lines of a table in turns of "
-        f"{timing.BURST}. What is not varied stays at 1850 directions, 0.5–5 m, 32 microphones, all threads. The plan "
-        "is the one that settings without any wish give here, chosen anew for each line; where a precision is named, "
-        "every direction's own beam is summed instead, one sample per microphone. A batch is as many measurements at a "
-        "time, and its time that of each. "
-        "Every image was checked against the exact one before it was timed; "
-        "calls for a fifth of a second to warm up are not counted. "
-        "Ceilings are the best of as many runs, over arrays of 64 MiB and in "
+        f"{timing.BURST}. Other values are 1850 directions, 0.5–5 m, 32 microphones and all threads. Each line has "
+        "the default plan for its settings. If a precision is named, every direction is summed without a beam grid, "
+        "with one sample per microphone. A batch is a number of measurements at a time, and its time is that of each. "
+        "Every image was compared with the exact one before it was timed; "
+        "warm-up calls of a fifth of a second are excluded. "
+        "Limits are the best of as many runs, over arrays of 64 MiB and in "
         "registers; a multiplication and an addition are two operations."
     )
     return "\n\n".join(parts)
@@ -265,8 +273,8 @@ def simulation(report: dict[str, Any]) -> str:
     return "\n\n".join(
         [
             _table(["simulated", "effects", "ms, mean ± std (median)", "measurements per second"], rows),
-            f"What the scene calls for takes {report['times_faster']:.1f} times less than everything.",
-            _table(["ms per measurement", "called for", "everything"], costs),
+            f"Time with all effects / time with the relevant effects: {report['times_faster']:.1f}.",
+            _table(["ms per measurement", "relevant effects", "all effects"], costs),
             f"Measured on {sentence(report['machine'])}",
             _scene_conditions(report),
         ]
@@ -276,7 +284,7 @@ def simulation(report: dict[str, Any]) -> str:
 def factorisation(report: dict[str, Any]) -> str:
     """Return products per place: summed directly, from nodes of the whole array, and from those of its parts."""
     parts = list(report["rows"][0]["parts"])
-    head = ["microphones", "directions", "each beam by itself", "nodes of the whole array"]
+    head = ["microphones", "directions", "no beam grid", "beam grid of the whole array"]
     head += [f"of {n} sub-arrays" for n in parts[1:]]
     rows = [
         [str(row["microphones"]), str(row["directions"]), str(row["direct"])]
@@ -290,9 +298,9 @@ def _scene_conditions(report: dict[str, Any]) -> str:
     return (
         f"{report['count']} measurements each, in turns of {timing.BURST}: {report['words']:,} words of 32 "
         "microphones, ten points in free field, and in the same scene a second sensor, walls, a sphere, a disc, "
-        "motion, tones, noise, another sonar and unequal microphones, all too weak to matter. Included: everything "
-        "from the scene to the words in memory. Not included: deciding which effects matter, compilation, and calls "
-        f"to warm up. The images of both differ by {report['change_db']:.2g} dB at the most. `propagation` counts "
+        "motion, tones, noise, another sonar and unequal microphones, all too weak to matter. Times include everything "
+        "from the scene to the words in memory. They exclude the choice of the effects, compilation, and warm-up "
+        f"calls. The images of both differ by {report['change_db']:.2g} dB at the most. `propagation` counts "
         "the transforms that all echoes share."
     )
 
