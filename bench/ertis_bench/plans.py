@@ -55,12 +55,12 @@ nodes along each axis and their density, None where every direction's own beam i
 
 
 def in_words(accuracy: Accuracy) -> str:
-    """Return a complete plan in a few words, such as ``int16, 2 samples of 2 per range, nodes 4 × 1.75, 60 dB``."""
+    """Return a complete plan in a few words, such as ``int16, 2 samples of 2 per range, beam grid 4 × 1.75, 60 dB``."""
     n_phases, n_taps = accuracy.oversampling, accuracy.delay_taps
     fitted = f"{n_taps} {'sample' if n_taps == 1 else 'samples'} of {n_phases} per range"
     parts = [accuracy.precision, _SAMPLES.get(accuracy.interpolation, fitted).format(n=n_phases)]
     if accuracy.beam_taps:
-        parts.append(f"nodes {accuracy.beam_taps} × {accuracy.beam_density:g}")
+        parts.append(f"beam grid {accuracy.beam_taps} × {accuracy.beam_density:g}")
     parts.append(f"{accuracy.stopband_attenuation_db:g} dB")
     if accuracy.focal_zones and accuracy.focal_zones > 1:
         parts.append(f"{accuracy.focal_zones} zones")
