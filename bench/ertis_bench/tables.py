@@ -216,7 +216,7 @@ def _accuracy_conditions(report: dict[str, Any]) -> str:
         f"{report['directions']} directions, {first_m:g}–{last_m:g} m, device `cpu`, all threads, but one for the "
         f"paper's method. Times are medians of {report['count']} measurements in turns of {TURN}, without warm-up "
         "calls of a fifth of a second. Bold: no other plan is both faster and more accurate. The name of a plan states "
-        "the precision of its samples, the interpolation of a delayed sample and the number of samples kept per range, the "
+        "the precision of its samples, the interpolation of a delayed sample, the number of samples kept per range, the "
         "grid points along each axis of the array and their density if beams are interpolated, and the stopband "
         "attenuation of the decimation. The planner chose draft, standard, fine and exact here. Error: norm of the "
         "difference relative to the norm of the exact image, in float64 over all directions and ranges. Predicted: by "
