@@ -64,7 +64,7 @@ def _write_reference(_: Any, page: str, source: list[str]) -> None:
 
 
 def _tables(document: str) -> Iterator[str]:
-    from ertis_numba.reference import reference  # noqa: PLC0415  the paths are set above
+    from ertis_numba.toml_reference import reference  # noqa: PLC0415  the paths are set above
 
     for section in reference(document):
         yield from (f"### {section.header or 'Top level'}".replace("[", "\\["), "", section.about, "")
