@@ -126,7 +126,7 @@ def test_capon_parts_independent_sources_within_a_beam(device):
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "reported"),
     [
         ({"beamformer": "mvdr"}, r"processing\.beamformer 'mvdr' is unknown; known are delay_and_sum, .*capon"),
         ({"dmas_order": 1}, r"processing\.dmas_order is 1; give a whole number from 2 to 8"),

@@ -151,7 +151,7 @@ def test_words_may_be_altered_one_by_one():
         assert check.check(words) is None
 
 
-@pytest.mark.parametrize("most", [2, 256], ids=["bits", "bytes"])
+@pytest.mark.parametrize("largest", [2, 256], ids=["bits", "bytes"])
 def test_flipped_bits_are_not_told_from_what_a_real_sensor_does(largest):
     random = np.random.default_rng(5)
     check = BitCheck(len(REAL), RATE_HZ, splices=True)

@@ -75,7 +75,7 @@ def test_what_is_not_there_is_missed_and_what_should_not_be_is_false():
 
 
 @pytest.mark.parametrize(
-    ("told", "found"),
+    ("reported", "found"),
     [
         (true(3.3, 1.3 + 0.09), True),
         (true(3.3, 1.3 + 0.11), False),

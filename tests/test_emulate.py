@@ -235,7 +235,7 @@ def test_a_scene_is_rendered_for_the_call_that_a_sensor_receives(emulate, tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("source", "told"),
+    ("source", "reported"),
     [
         ("scene", "only received a call that is neither a preset's nor its scene's (50 to 25 kHz in 2.5 ms)"),
         ("recording", "left was recorded with a call of 50 to 25 kHz in 2.5 ms and 32768 samples at 4.5 MHz"),

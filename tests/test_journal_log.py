@@ -76,7 +76,7 @@ def test_flipped_bit_in_the_words_is_reported_by_recover_and_verify(tmp_path, co
 
 
 @pytest.mark.parametrize(
-    ("damaged", "code", "told"),
+    ("damaged", "code", "reported"),
     [
         ("checksum", 0, "4 measurements, 999987 missing"),  # all rows are rescued
         ("words", 3, "3 measurements, 1 missing, up to 1 of them stored, then lost"),

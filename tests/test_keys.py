@@ -163,7 +163,7 @@ def test_a_file_of_a_secret_is_its_owners_from_its_first_byte(folder, monkeypatc
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "reported"),
     [
         ("", "is empty"),
         ('name = "robot"\npublic = "x"\nsecret = "y"\n', "key 'x' is none"),
@@ -324,7 +324,7 @@ def test_a_key_that_is_allowed_again_has_what_was_said_last():
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "reported"),
     [
         ({"serials": ()}, "sensor without serials; name those"),
         ({"serials": ("*",)}, "sensor name '\\*' cannot name a group"),

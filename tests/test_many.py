@@ -337,7 +337,7 @@ class Watched(Here):
         self.in_hand.append(len(self.orders))
 
 
-@pytest.mark.parametrize(("workers", "most"), [(None, 1), (3, 3)])
+@pytest.mark.parametrize(("workers", "largest"), [(None, 1), (3, 3)])
 def test_a_gpu_serves_one_at_a_time(tmp_path, out, monkeypatch, workers, largest):
     """However many orders are in hand when it is known to be a GPU: no more come until there are fewer."""
 

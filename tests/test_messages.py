@@ -104,7 +104,7 @@ def test_a_header_as_it_stands_on_the_wire():
 
 
 @pytest.mark.parametrize(
-    ("header", "told"),
+    ("header", "reported"),
     [
         (b"", "begins with b''; send"),
         (b"eRT", "begins with b'eRT'"),

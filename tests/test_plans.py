@@ -148,7 +148,7 @@ def test_refuses_a_budget_that_no_plan_keeps(recording, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "reported"),
     [
         (["--max-error", "good"], "'good' is not an error budget; give dB, as in -40, or draft, standard, fine, exact"),
         (["--method", "paper", "--explain"], "--explain needs --method fast; method 'paper' has no plan"),

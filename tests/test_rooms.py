@@ -39,7 +39,7 @@ def rooms_of(mouth_m, receiver_m, largest):
 
 
 @pytest.mark.parametrize(("mouth_m", "ear_m"), PLACES)
-@pytest.mark.parametrize(("most", "count"), [(0, 1), (1, 7), (2, 25), (3, 63)])
+@pytest.mark.parametrize(("largest", "count"), [(0, 1), (1, 7), (2, 25), (3, 63)])
 def test_image_sources_agree(mouth_m, receiver_m, largest, count):
     room, scene = rooms_of(mouth_m, receiver_m, largest)
     delay_s, amplitude = sorted_ways(scene, "walls", "occlusion", "spreading", "cross_emission")

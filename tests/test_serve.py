@@ -214,7 +214,7 @@ def test_with_keys_each_node_gets_what_it_is_listed_for(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "reported"),
     [
         (("--publish", "tcp://0.0.0.0:0"), "there are no keys"),
         (("--quarantine", "missing/folder"), "missing/folder: No such file or directory; give a folder"),

@@ -258,7 +258,7 @@ def test_a_table_says_all_that_somebody_should_look_at():
 
 
 @pytest.mark.parametrize(
-    ("recording", "fault", "told"),
+    ("recording", "fault", "reported"),
     [
         ("", "", "no recording yet"),
         ("", "the disk is full", "nothing can be written"),

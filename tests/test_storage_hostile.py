@@ -61,7 +61,7 @@ def test_a_recording_whose_variables_share_their_room_is_refused(tmp_path, monke
 
 
 @pytest.mark.parametrize(
-    ("spoil", "told"),
+    ("spoil", "reported"),
     [
         (lambda extra: extra.create_dataset("bomb", (1_000_000,), "S100000", chunks=(1,)), "the file holds 0"),
         (lambda extra: extra.attrs.update({f"a{number}": 0 for number in range(300)}), "has 300 attributes"),

@@ -91,7 +91,7 @@ def test_what_is_given_counts_more_than_the_recording(recorded, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("given", "told"),
+    ("given", "reported"),
     [
         ({"left": ((0.0, 0.0), TURNED)}, "translation_m of sensor left"),
         ({"left": ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 2.0))}, "rotation_xyzw of sensor left has length 2"),
@@ -105,7 +105,7 @@ def test_mountings_that_cannot_be(tmp_path, given, reported):
 
 
 @pytest.mark.parametrize(
-    ("spoil", "told"),
+    ("spoil", "reported"),
     [
         (lambda attributes: attributes.pop("rotation_xyzw"), "damaged or cut short .*rotation_xyzw"),
         (lambda attributes: attributes.modify("rotation_xyzw", np.full(4, np.nan)), "rotation_xyzw of sensor left"),

@@ -258,7 +258,7 @@ def test_nothing_is_drawn_beyond_the_image():
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "reported"),
     [
         ({"threshold_db": 3.0}, "threshold_db is 3; give a number from -60 to 0"),
         ({"dynamic_range_db": 5.0}, "dynamic_range_db is 5"),

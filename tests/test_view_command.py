@@ -26,7 +26,7 @@ BIND = socket.socket.bind
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "reported"),
     [
         (("missing.h5",), "missing.h5"),
         (

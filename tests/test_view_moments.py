@@ -76,7 +76,7 @@ def test_simulated_times_and_none_are_as_they_were():
 
 
 @pytest.mark.parametrize(
-    ("times_ns", "wanted_s", "told"),
+    ("times_ns", "wanted_s", "reported"),
     [
         (
             [*steps(NOW_NS, 3), NOW_NS + 3600 * 10**9],

@@ -312,7 +312,7 @@ def controls(view):
 
 
 @pytest.mark.parametrize(
-    ("window_m", "shown_m", "top_m", "told"),
+    ("window_m", "shown_m", "top_m", "reported"),
     [
         (None, (0.0, 5.0), 5.0, "Range 0–5 m"),
         ((0.6, 1.0), (0.6, 1.0), 5.0, "Range 0.6–1 m"),
