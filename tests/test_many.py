@@ -106,7 +106,7 @@ def test_what_is_there_is_left_alone(runs, out, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("wanted", "said"),
+    ("wanted", "stated"),
     [
         (CampaignOptions(settings=other), r"was made with other settings \(processing\.range_m of sensor eRTIS-7\)"),
         (CampaignOptions(settings=exact), r"was made with other settings \(accuracy\.oversampling of sensor eRTIS-7\)"),

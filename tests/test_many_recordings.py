@@ -61,7 +61,7 @@ def test_a_file_that_is_not_there_is_left_to_whoever_opens_it():
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("given", "stated"),
     [("runs/*.hdf", "no file is named like runs/"), ("empty", r"folder empty has no \*\.h5 in it")],
 )
 def test_nothing_meant(given, stated):
@@ -75,7 +75,7 @@ def test_each_has_its_own_output():
 
 
 @pytest.mark.parametrize(
-    ("given", "folder", "said"),
+    ("given", "folder", "stated"),
     [
         (["runs/a.h5", "more"], "out", r"runs/a\.h5 and more/a\.h5 would both become out/a\.energy\.h5"),
         (["runs"], "runs/a.h5", r"output runs/a\.h5 is a file, and several recordings need a folder"),

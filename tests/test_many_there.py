@@ -46,7 +46,7 @@ def spoil_head(file):
     file.write_bytes(content)
 
 
-@pytest.mark.parametrize(("spoil", "said"), [(spoil_energy, "is damaged"), (spoil_head, "is damaged")])
+@pytest.mark.parametrize(("spoil", "stated"), [(spoil_energy, "is damaged"), (spoil_head, "is damaged")])
 def test_what_is_damaged_is_told_or_replaced(runs, out, monkeypatch, spoil, stated):
     run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=narrow))
     whole = (out / "a.energy.h5").read_bytes()

@@ -202,7 +202,7 @@ def test_noise_of_one_microphone_does_not_touch_another():
     assert changed.tolist() == [False, True, False]
 
 
-@pytest.mark.parametrize(("order", "least_db"), [(1, 28), (2, 49), (3, 54), (4, 62)])
+@pytest.mark.parametrize(("order", "min_db"), [(1, 28), (2, 49), (3, 54), (4, 62)])
 def test_modulator_keeps_the_band(order, min_db):
     signal = tone(0.5)
     assert in_band_snr_db(modulated(signal[None], order)[0], signal) > min_db

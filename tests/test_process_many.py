@@ -102,7 +102,7 @@ def test_what_errs_too_much_is_not_written(runs, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "said"),
+    ("arguments", "code", "stated"),
     [
         (["runs/a.h5", "runs/b.h5"], 2, "several recordings need an output folder; give one with -o"),
         (["runs"], 2, "several recordings need a folder"),

@@ -2,7 +2,7 @@
 
 Run it as a separate process::
 
-python -m ertis_numba.storage.sealing REC.h5.journal
+python -m ertis_numba.storage.sealing_process REC.h5.journal
 
 HDF5 can crash its process when a disk fails (h5py issue 914); a separate process confines this. It may be killed and
 run again at any time: the recording is the same.

@@ -35,7 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     object per line: progress (``done``, ``of``), and at the end the fields of `Sealed`, or ``error`` and ``in_use``.
     """
     parser = argparse.ArgumentParser(
-        "python -m ertis_numba.storage.sealing", description=(__doc__ or "").partition("\n")[0]
+        "python -m ertis_numba.storage.sealing_process", description=(__doc__ or "").partition("\n")[0]
     )
     parser.add_argument("journal", type=Path)
     parser.add_argument("--force", action="store_true", help="replace an existing recording")

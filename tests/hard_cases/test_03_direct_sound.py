@@ -88,7 +88,7 @@ def test_an_echo_under_the_direct_sound_is_at_its_place(image_of, below_db, rang
     assert image.amplitude[:, elsewhere].max() < image.amplitude.max() / 4
 
 
-@pytest.mark.parametrize(("farther_m", "least_db"), [(0.1, 50), (0.2, 75), (0.3, 90), (0.5, 135), (1.5, 140)])
+@pytest.mark.parametrize(("farther_m", "min_db"), [(0.1, 50), (0.2, 75), (0.3, 90), (0.5, 135), (1.5, 140)])
 def test_direct_sound_dies_out(farther_m, min_db):
     """Of the loudest microphone: -54 dB at 10 cm, -77 at 20, -96 at 30, -143 at 50 and -149 beyond (float32)."""
     image = heard(simulator_of(direct_sound_db=DIRECT_DB))

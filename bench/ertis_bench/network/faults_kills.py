@@ -195,7 +195,7 @@ def sealings(folder: Path, *, seed: int, count: int) -> Found:
         node = stack.enter_context(record.start())
         seen: set[int] = set()
         while killed < count:
-            sealers = [pid for pid, line in survivors(record.mark).items() if "_sealing_process" in line]
+            sealers = [pid for pid, line in survivors(record.mark).items() if "sealing_process" in line]
             fresh = [pid for pid in sealers if pid not in seen]
             if not fresh:
                 if not node.running:
