@@ -194,7 +194,7 @@ def test_a_thread_that_ends_is_noticed(tmp_path, monkeypatch):
         monkeypatch.setattr(Archive, "_store", lambda *_: False)
         opened.give(item_of(from_zero(1)[0]))
         opened.archive._thread.join(WAIT_S)  # noqa: SLF001
-        assert "has ended by a mistake" in opened.archive.stuck
+        assert "the storage thread has ended because of an internal error" in opened.archive.stuck
 
 
 def test_full_recordings_are_sealed_while_it_goes_on(tmp_path):
@@ -451,7 +451,7 @@ def test_a_journal_that_cannot_be_sealed_is_tried_again(tmp_path, monkeypatch):
     in_the_way = path.with_name(path.name.removesuffix(SUFFIX))
     in_the_way.write_text("something else")
     with Opened(tmp_path, seal=True) as opened:
-        assert "exists and holds something else" in opened.until(SealingFailed).text
+        assert "exists with other content" in opened.until(SealingFailed).text
         assert opened.archive.status().sealing_failed >= 1
         in_the_way.unlink()
         opened.until(SealedOne)
@@ -508,7 +508,7 @@ def test_options_that_cannot_be_used_are_refused(options, message, tmp_path):
 
 
 def test_a_folder_that_cannot_be_made_is_refused(tmp_path):
-    with pytest.raises(DataError, match="give a folder that can be written"):
+    with pytest.raises(DataError, match="give a writable folder"):
         Archive(tmp_path / "no" / "folder").open()
 
 

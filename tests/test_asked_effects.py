@@ -93,7 +93,7 @@ def test_effects_left_out_are_in_the_summary_and_in_the_file(tmp_path):
     path.write_text(scene_of(point).to_toml(), encoding="utf-8")
     done = CliRunner().invoke(cli, ["simulate", str(path), "--json"])
     assert done.exit_code == 0
-    assert "left out: doppler; --explain gives the reasons, --tolerance-db 0 keeps all effects\n" in done.stderr
+    assert "doppler; --explain gives the reasons, --tolerance-db 0 keeps all effects\n" in done.stderr
     assert json.loads(done.stdout)["left_out"] == ["doppler"]
     with open_recording(path.with_suffix(".h5")) as recording:
         assert recording.truth.left_out == ("doppler",)

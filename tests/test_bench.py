@@ -92,7 +92,7 @@ def test_scaling_measures_every_series(monkeypatch):
     assert report["ceilings"][-1]["float32_gop_s"] > 1
     assert report["delay_and_sum"][0]["precision"] == "float32"
     text = tables.scaling(report)
-    for name in ("directions", "directions, every own beam in float32", "last range, m", "microphones", "threads"):
+    for name in ("directions", "directions, no beam grid, float32", "last range, m", "microphones", "threads"):
         assert f"| {name} | ms, mean ± std (median) | ranges |" in text
 
 
@@ -257,7 +257,7 @@ def test_accuracy_rates_every_plan_on_both_subjects(tmp_path):
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert full.read_text("utf-8").count("the paper's method |") == 2
     assert "| float32, nearest sample of 2 per range, 40 dB |" in full.read_text("utf-8")
-    assert "docs/reference/benchmarks.md has all of them" in short.read_text("utf-8")
+    assert "docs/reference/benchmarks.md has all plans" in short.read_text("utf-8")
     assert "\nold\n" not in full.read_text("utf-8") + short.read_text("utf-8")
 
 

@@ -125,7 +125,7 @@ def test_recording_whose_settings_say_something_else_is_refused(tmp_path, measur
         text = group["settings"][()].decode().replace('"int16"', '"float32"')
         del group["settings"]
         group.create_dataset("settings", data=np.bytes_(text.encode()))
-    with pytest.raises(DataError, match=r"pcm holds int16, the settings in the file want float32 .*; change the sett"):
+    with pytest.raises(DataError, match=r"pcm contains int16, but the settings in the file give float32 \(recording\.encoding 'float32'\); change the settings with it"):
         open_recording(path)
 
 
@@ -174,7 +174,7 @@ def test_numbers_that_are_none_are_refused(value):
 
 
 def test_a_sensor_of_bits_cannot_be_set_up_for_numbers():
-    with pytest.raises(ArgumentError, match=r"recording\.encoding is 'int16'; a sensor gives bits: give 'pdm'"):
+    with pytest.raises(ArgumentError, match=r"recording\.encoding is 'int16', but a sensor sends bits; give 'pdm'"):
         ertis.Setup.of(Settings().replace(recording=Recording(n_samples=65_536, encoding="int16")))
 
 

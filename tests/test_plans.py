@@ -70,14 +70,14 @@ def test_explains_in_words(recording, tmp_path):
     lines = [
         line for line in lines if not line.startswith(("ertis:", "note:", "eRTIS-7: the error of plane", str(tmp_path)))
     ]
-    assert lines[0] == "plan of eRTIS-7, for an error of -35 dB at the most:"
-    assert "against spherical ones" in plain.stderr
+    assert lines[0] == "plan of eRTIS-7 for an error budget of -35 dB:"
+    assert "relative to spherical wavefronts" in plain.stderr
     assert any(line.startswith("    interpolation of delayed samples") for line in lines)
-    assert any(line.startswith("    in total") for line in lines)
+    assert any(line.startswith("    total") for line in lines)
     assert lines[-1].startswith("  predicted time")
     bent = run(recording, "-o", tmp_path / "b.h5", "--explain", "--wavefront", "spherical").stderr
     assert "spherical wavefronts, with separate delays in" in bent
-    assert "against spherical ones" not in bent
+    assert "relative to spherical wavefronts" not in bent
     assert "    one set of delays for each focal zone" in bent
 
 
@@ -87,7 +87,7 @@ def test_explains_simple_interpolation(recording, tmp_path):
     reported = run(recording, "-o", tmp_path / "a.h5", "--explain", "--settings", wishes).stderr
     assert "single precision" in reported
     assert "interpolated linearly from two samples" in reported
-    assert "every direction's own beam is summed" in reported
+    assert "the beam of every direction is summed directly" in reported
 
 
 @pytest.mark.parametrize("wavefront", ["plane", "spherical"])
@@ -137,13 +137,13 @@ def test_writes_nothing_that_errs_too_much(recording, tmp_path, monkeypatch):
     output = tmp_path / "a.h5"
     done = CliRunner().invoke(cli, ["process", str(recording), "-o", str(output), "--verify"])
     assert done.exit_code == 1
-    assert "image of sensor eRTIS-7 errs by -30.0 dB, allowed are -35 dB; give a lower --max-error" in done.stderr
+    assert "sensor eRTIS-7 has an error of -30.0 dB, but the limit is -35 dB; give a lower --max-error" in done.stderr
     assert not output.exists()
 
 
 def test_refuses_a_budget_that_no_plan_keeps(recording, tmp_path):
     done = run(recording, "-o", tmp_path / "a.h5", "--max-error", -150, code=1)
-    assert done.stderr.splitlines()[-1].startswith("ertis: error: accuracy.max_error_db is -150, and the best")
+    assert done.stderr.splitlines()[-1].startswith("ertis: error: accuracy.max_error_db is -150, but the smallest error")
     assert [item.name for item in tmp_path.iterdir()] == ["rec.h5"]
 
 
@@ -198,4 +198,4 @@ def test_words_of_a_plan():
         stopband_attenuation_db=60.0,
         focal_zones=8,
     )
-    assert in_words(plan) == "int16, 2 samples of 2 per range, nodes 4 × 1.75, 60 dB, 8 zones"
+    assert in_words(plan) == "int16, 2 samples of 2 per range, beam grid 4 × 1.75, 60 dB, 8 zones"

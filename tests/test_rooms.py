@@ -38,7 +38,7 @@ def rooms_of(mouth_m, receiver_m, largest):
     return room, Scene(sensors=sensors, boxes=(box,), max_reflections=largest)
 
 
-@pytest.mark.parametrize(("transmitter_m", "receiver_m"), PLACES)
+@pytest.mark.parametrize(("mouth_m", "receiver_m"), PLACES)
 @pytest.mark.parametrize(("largest", "count"), [(0, 1), (1, 7), (2, 25), (3, 63)])
 def test_image_sources_agree(mouth_m, receiver_m, largest, count):
     room, scene = rooms_of(mouth_m, receiver_m, largest)
@@ -53,7 +53,7 @@ def test_image_sources_agree(mouth_m, receiver_m, largest, count):
     assert_allclose(amplitude * delay_s, (level * way_m)[order] / SPEED_M_S, rtol=1e-4)
 
 
-@pytest.mark.parametrize(("transmitter_m", "receiver_m"), PLACES[:2])
+@pytest.mark.parametrize(("mouth_m", "receiver_m"), PLACES[:2])
 def test_rendered_signals_agree(mouth_m, receiver_m):
     """The call through the other simulator's impulse response, sampled at 450 kHz."""
     room, scene = rooms_of(mouth_m, receiver_m, 2)

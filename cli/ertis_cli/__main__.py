@@ -9,7 +9,7 @@ def main() -> None:
     """Install the signal handlers, then run the command line. By default, Ctrl-C would print a traceback."""
     try:
         code = _run()
-    except KeyboardInterrupt:  # A signal arrived before the handlers were installed.
+    except KeyboardInterrupt:  # before the handlers are installed
         code = _interrupted()
     sys.exit(code)
 
@@ -20,8 +20,7 @@ def _run() -> str | int | None:
 
     gc.set_threshold(50_000)  # imports create many permanent objects; scanning them takes 60 ms
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        # Signals end the process at once until the handlers are installed, after some imports.
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        signal.signal(signal.SIGINT, signal.SIG_DFL)  # until the handlers are installed, after some imports
     from ertis_cli._signals import interruption, leave, obey_signals
 
     obey_signals()

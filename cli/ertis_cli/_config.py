@@ -27,7 +27,7 @@ _GENERAL = frozenset({"device", "quiet", "threads"})
 _NO_OPTIONS = frozenset(f"ERTIS_{name}" for name in ("BENCH_MARK", "CACHE_DIR", "CONFIG", "EMULATED_DIR", "KEYS_DIR"))
 """Variables that are not options: other parts of the package read them, and benchmarks mark their processes."""
 
-_FILE, _BROKEN = "ertis_cli.config_file", "ertis_cli.config_error"  # Keys of click's `Context.meta`.
+_FILE, _BROKEN = "ertis_cli.config_file", "ertis_cli.config_error"  # keys of click's `Context.meta`
 _WITHOUT = frozenset({"completion", "doctor"})
 """Commands that run despite an invalid configuration: new shells run ``completion``, ``doctor`` finds faults."""
 
@@ -137,7 +137,7 @@ def _defaults(ctx: click.Context, group: click.Group, tables: Mapping[str, Any],
         if command is None:
             raise click.ClickException(f"{where}{name!r} is not a command; {instead(name, names)}")
         if not isinstance(table, dict):
-            raise click.ClickException(f"{where}{name} is {table!r}; give a table of options, such as [{name}]")
+            raise click.ClickException(f"{where}{name} is {table!r}; give a table of options, as in [{name}]")
         if isinstance(command, click.Group):
             found[name] = _defaults(ctx, command, table, f"{where}{name} ")
             continue

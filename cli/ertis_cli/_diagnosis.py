@@ -37,7 +37,7 @@ _SENSOR_MB_S: Final = 13.1
 
 _COMMIT_BYTES: Final = 5_000_000
 _COMMITS: Final = 20
-_ROOM_BYTES: Final = 10e9  # A sensor fills this in a quarter of an hour.
+_ROOM_BYTES: Final = 10e9  # a sensor fills it in a quarter of an hour
 _RUNS: Final = 5
 
 

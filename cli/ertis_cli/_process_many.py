@@ -126,7 +126,7 @@ class _Report:
         self._begun_s = time.monotonic()
         self._totals = dict.fromkeys(("made", "there", "passed over", "failed"), 0)
         self._measurements = 0
-        self._wavefronts: list[tuple[float, float]] = []  # Error in dB and its range in metres, of each recording.
+        self._wavefronts: list[tuple[float, float]] = []  # error in dB and its range in metres, of each recording
         self._failed: list[str] = []
 
     def follow(self, event: "Event", shown: _Hidden) -> None:

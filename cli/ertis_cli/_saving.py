@@ -30,7 +30,7 @@ def withdrawn(*folders: Path | None) -> Iterator[list[Path]]:
     try:
         yield missing
     except BaseException:
-        for folder in missing:  # The deepest folders come first.
+        for folder in missing:  # the deepest come first
             with suppress(OSError):
                 found = list(folder.iterdir())
                 if all(path.name.startswith(".ertis-") for path in found):

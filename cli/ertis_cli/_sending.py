@@ -56,7 +56,7 @@ class _Watch(Watch):
 
 
 class Sending:
-    """Capture whose measurements go to a central node.
+    """A capture whose measurements go to a central node.
 
     Parameters
     ----------

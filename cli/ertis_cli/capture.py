@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 __all__ = ["capture"]
 
-_LOOK_S = 0.1  # Interval between searches for ports.
+_LOOK_S = 0.1  # interval between searches for ports
 
 
 @click.command()
@@ -41,9 +41,7 @@ _LOOK_S = 0.1  # Interval between searches for ports.
     help="Path, serial number or name of a sensor; repeat for several sensors.",
 )
 @options.output("Recording to write; SERIAL_TIME.h5 by default.")
-@click.option(
-    "--to", "address", metavar="ADDRESS", help="Central node to send measurements to, instead of a recording."
-)
+@click.option("--to", "address", metavar="ADDRESS", help="Central node to send to, instead of writing a recording.")
 @click.option(
     "--spool",
     type=click.Path(path_type=Path),
@@ -375,7 +373,7 @@ def _require_one_place(address: str | None, target: Path | None, *, for_address:
 def _require_one_each(ports: tuple[str, ...], names: tuple[str, ...]) -> None:
     for port in ports:
         if ports.count(port) > 1:
-            raise click.UsageError(f"--port {port} is given {ports.count(port)} times; give each sensor once")
+            raise click.UsageError(f"port {port} is given {ports.count(port)} times; give each sensor once")
     if names and len(names) != len(ports):
         raise click.UsageError(f"{len(names)} names are given for {len(ports)} ports; give one --name per --port")
     from ertis_numba import checks

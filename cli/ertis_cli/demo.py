@@ -77,11 +77,11 @@ def demo(*, folder: Path, count: int, force: bool, quiet: bool) -> None:
     scene = folder / _SCENE
     (item,) = _examples.named(_SCENE).values()
     scene.write_bytes(item.read_bytes())
-    sensors = {"ERTIS_EMULATED_DIR": str((folder / "sensors").absolute())}  # Links to the emulated sensors go there.
+    sensors = {"ERTIS_EMULATED_DIR": str((folder / "sensors").absolute())}  # links to the emulated sensors
     run = _DemoRun(os.environ | sensors, quiet=quiet)
     ports = [word for name in _SENSORS for word in ("--port", name)]
     with ExitStack() as nodes:
-        emulating = ("emulate", scene, "--sync-rate", "10", "--json")  # stderr is inherited, to show its progress.
+        emulating = ("emulate", scene, "--sync-rate", "10", "--json")  # its progress is shown
         nodes.enter_context(run.node(*emulating, output=folder / "emulate.jsonl"))
         serving = ("serve", "--listen", _ANY_PORT, "--publish", _ANY_PORT, "--record", folder / "recordings")
         central = nodes.enter_context(run.node(*serving, "--json", "--quiet", output=folder / "serve.jsonl"))
@@ -95,14 +95,14 @@ def demo(*, folder: Path, count: int, force: bool, quiet: bool) -> None:
         run("status", central["address"], "--once")
     image = folder / "image.h5"
     recordings = sorted((folder / "recordings").glob("*.h5"))
-    run("verify", *recordings, allowed=(_GAPS,))  # A busy machine may miss a pulse.
+    run("verify", *recordings, allowed=(_GAPS,))  # a busy machine may miss a pulse
     run("process", recordings[0], "--sensor", _SENSORS[0], "--output", image, "--directions", "2d:181")
     run("peaks", image, "--measurement", "0")
     run("plot", image, "--output", folder / "image.png")
 
 
 def _make(folder: Path, *, force: bool) -> None:
-    """Create the folder, and remove the files of an earlier demo.
+    """Make the folder, and remove the files of an earlier demo.
 
     Raises
     ------

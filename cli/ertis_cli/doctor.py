@@ -11,7 +11,7 @@ __all__ = ["doctor"]
 
 _MARKS = {"good": "ok", "note": "note", "bad": "BAD"}
 _STYLES = {"ok": "green", "note": "yellow", "BAD": "red"}
-_COLUMNS: dict[str, _tables.Side] = dict.fromkeys(("", "what", "found", "remedy"), "left")
+_COLUMNS: dict[str, _tables.Side] = dict.fromkeys(("", "what", "found", "what to do"), "left")
 
 
 @click.command()

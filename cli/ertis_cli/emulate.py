@@ -164,7 +164,7 @@ def emulate(
         if sync_rate is not None:
             if renderer is not None:
                 measurements = f"{options.counted(renderer.count, 'measurement')} of each sensor"
-                options.say(f"rendering {measurements} at the pulses; the first round is slower", quiet=quiet)
+                options.say(f"rendering {measurements} as pulses come; the first round is slower", quiet=quiet)
             stack.enter_context(SyncChain(devices, sync_rate, before=partial(_get_ready, devices, given)))
         _look_after(devices, sorted(absences), ended)
     options.say("the emulated sensors have ended", quiet=quiet)
@@ -193,7 +193,7 @@ def _names(path: Path, sensor: str | None, *, is_scene: bool) -> list[str]:
 def _renderer(
     path: Path, names: "Sequence[str]", *, count: int | None, seed: int | None, quiet: bool
 ) -> "SceneRenderer":
-    """Return the simulator of a scene, ready to render; the first run compiles kernels."""
+    """Return the scene, ready to be rendered; the first run compiles kernels."""
     from ertis_cli._emulation import SceneRenderer
     from ertis_numba.simulation import limits, load_scene
     from ertis_numba.simulation.snapshot import snapshot
@@ -213,7 +213,7 @@ def _renderer(
 
 
 def _render_all(renderer: "SceneRenderer", names: "Sequence[str]", *, quiet: bool) -> None:
-    """Render all measurements with the scene's call in advance, so that none is late."""
+    """Render the measurements for the scene's call in advance, so that none is late."""
     options.say(f"rendering {options.counted(renderer.count * len(names), 'measurement')} ...", quiet=quiet)
     todo = ((name, index) for index in range(renderer.count) for name in names)
     with options.progress(todo, length=renderer.count * len(names), label="rendering", quiet=quiet) as shown:
@@ -242,7 +242,7 @@ def _accepts(refusal: "Refusal", name: str, config: "DeviceConfig") -> bool:
 
 
 def _get_ready(devices: "Sequence[Emulator]", given: "Given", pulse: int) -> None:
-    """Render the measurements of a pulse in advance, also for devices that are not yet armed."""
+    """Render the measurements of a pulse in advance, also for devices that are about to be armed."""
     from ertis_numba.errors import ErtisError
 
     registers = {device.name: device.registers for device in devices if device.error is None}

@@ -1,4 +1,4 @@
-"""Implementation of ``ertis export``, which writes formats of other programs."""
+"""``ertis export``: energyscapes and signals for other programs."""
 
 import itertools
 from contextlib import ExitStack, suppress

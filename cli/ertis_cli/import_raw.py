@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 __all__ = ["import_raw"]
 
-_END_NS = 2**63  # The year 2262.
+_END_NS = 2**63  # in the year 2262
 _PCM = {".wav", ".h5", ".hdf5", ".hdf"}
 
 

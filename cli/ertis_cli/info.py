@@ -227,13 +227,13 @@ def _health(report: "Health") -> dict[str, Any]:
 def _health_lines(section: dict[str, Any]) -> Iterator[str]:
     """Yield the properties of an array."""
     yield f"sensor         {section['sensor']}"
-    yield f"measurements   {section['measurements']}, of which {section['looked_at']} examined"
+    yield f"measurements   {section['measurements']}, of which {section['looked_at']} looked at"
     yield f"noise          {_cell(section['noise_dbfs'], 1)} dBFS in the call's band"
     yield f"dynamic range  {_cell(section['dynamic_range_db'], 1)} dB"
     if section["tones_hz"]:
         yield f"common tones   {', '.join(f'{tone_hz / 1000:.1f}' for tone_hz in section['tones_hz'])} kHz"
     for text in section["unknown"]:
-        yield f"not testable   {text}"
+        yield f"cannot tell    {text}"
 
 
 def _finding_lines(section: dict[str, Any]) -> Iterator[str]:
@@ -260,7 +260,7 @@ def _microphones(section: dict[str, Any]) -> _tables.TextTable:
 
 
 def _rounded(value: float | None, digits: int) -> float | None:
-    return None if value is None else round(value, digits) + 0.0  # Adding 0.0 turns -0.0 into 0.0.
+    return None if value is None else round(value, digits) + 0.0  # which turns -0.0 into 0.0
 
 
 def _cell(value: float | None, digits: int) -> str:

@@ -31,5 +31,5 @@ def layout(*, name: str | None, as_json: bool) -> None:
     if as_json:
         options.print_json({"layouts": rows})
         return
-    columns: dict[str, _tables.Side] = {"name": "left", "microphones": "right", "bits per word": "right"}
+    columns: dict[str, _tables.Side] = {"name": "left", "microphones": "right", "bits of a word": "right"}
     _tables.TextTable(columns, [tuple(map(str, row.values())) for row in rows]).print()

@@ -43,7 +43,7 @@ _DIGITS = {"azimuth_deg": 4, "elevation_deg": 4, "angle_deg": 4, "range_m": 6, "
     metavar="DB",
     help=f"Lowest level relative to the strongest peak; {_MIN_LEVEL_DB:g} by default, no limit with cfar.",
 )
-@options.measurement("List one measurement only, counted from 0.")
+@options.measurement("One measurement only, counted from 0.")
 @click.option(
     "--detector",
     type=click.Choice(["peaks", "cfar"]),
@@ -131,7 +131,7 @@ def peaks(
         options.print_json(report)
         return
     if not table.rows:
-        click.echo("no reflector found", err=True)
+        click.echo("nothing found", err=True)
         return
     table.print()
 

@@ -57,7 +57,7 @@ _ONLY = {
 @options.sensor("Sensor to plot; required if the file contains several sensors.")
 @options.measurement("Measurement to plot, counted from 0; the first by default.")
 @click.option(
-    "--dynamic-range", type=float, default=40.0, show_default=True, metavar="DB", help="Dynamic range of the colours."
+    "--dynamic-range", type=float, default=40.0, show_default=True, metavar="DB", help="Range of the colours."
 )
 @click.option(
     "--theme",

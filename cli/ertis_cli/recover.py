@@ -11,7 +11,7 @@ from ertis_cli import options
 
 __all__ = ["recover"]
 
-_STEPS = 100  # Steps of the progress bar.
+_STEPS = 100  # of progress
 _FAILED, _INCOMPLETE = 1, 3
 
 
@@ -32,7 +32,7 @@ def recover(ctx: click.Context, *, places: tuple[Path, ...], force: bool, quiet:
     """
     journals = [journal for place in places for journal in _found(place)]
     if not journals:
-        options.say(f"no journal found in {', '.join(map(str, places))}", quiet=quiet)
+        options.say(f"no journal in {', '.join(map(str, places))}", quiet=quiet)
     reports = []
     for journal in journals:
         report = _seal(journal, force=force, quiet=quiet)
@@ -88,7 +88,7 @@ def _failed(report: dict[str, Any]) -> bool:
 
 
 def _refusal(report: dict[str, Any]) -> str:
-    """Return the reasons why sensors of a journal are missing in its recording, in one line."""
+    """Return the reasons why sensors of a journal are missing in its recording, as one line."""
     reasons = "; ".join(f"no recording can hold sensor {name} ({why})" for name, why in report["refused"].items())
     return f"{report['journal']}: {reasons}; the journal is kept as {report['set_aside']}"
 
@@ -96,11 +96,11 @@ def _refusal(report: dict[str, Any]) -> str:
 def _reported(report: dict[str, Any]) -> str:
     """Return a line that describes the result for a journal."""
     if "error" in report:
-        return f"{report['journal']}: in use by a running capture; skipped"
+        return f"{report['journal']}: in use by a running capture; left alone"
     if report["recording"] is None and report["refused"]:
         return f"{report['journal']}: kept as {report['set_aside']}"
     if report["recording"] is None:
-        return f"{report['journal']}: it contains no measurement; removed"
+        return f"{report['journal']}: no measurement was captured; removed"
     reported = [options.counted(report["measurements"], "measurement"), f"{report['missing']} missing"]
     if report["damaged"]:
         reported.append(f"of which {report['damaged']} damaged; the journal is kept as {report['set_aside']}")

@@ -38,7 +38,7 @@ def settings(*, document: str, as_json: bool) -> None:
 
 
 def _lines(section: "TableReference") -> Iterator[str]:
-    """Yield the lines of a table, all commented out except its header."""
+    """Yield the lines of a table; all but its header are comments."""
     yield from textwrap.wrap(section.about, _WIDTH, initial_indent="# ", subsequent_indent="# ")
     if section.header:
         yield f"# {section.header}"

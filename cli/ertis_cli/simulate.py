@@ -112,8 +112,7 @@ def simulate(
     options.say(_summary(target, scene, n_sensors=len(names), n_reflectors=n_reflectors), quiet=quiet)
     if plan.left_out:
         options.say(
-            f"omitted effects: {', '.join(plan.left_out)}; --explain gives the reasons, --tolerance-db 0 keeps "
-            "all effects",
+            f"left out: {', '.join(plan.left_out)}; --explain gives the reasons, --tolerance-db 0 keeps all effects",
             quiet=quiet,
         )
     for simulator in simulators:

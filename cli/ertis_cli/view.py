@@ -57,14 +57,7 @@ _ONLY = {
     "--host",
     default="127.0.0.1",
     show_default=True,
-    help="Host at which to serve the page. If other machines can reach it, the printed address contains a token.",
-)
-@click.option(
-    "--port",
-    type=click.IntRange(0, 65_535),
-    default=8080,
-    show_default=True,
-    help="Port of the page; 0 chooses a free one.",
+    help="Host at which to serve the page. If other machines can reach it, the printed address has a token.",
 )
 @click.option(
     "--port",
@@ -88,10 +81,7 @@ _ONLY = {
     help="Level of the weakest points to show.",
 )
 @click.option(
-    "--threshold", type=float, default=-20.0, show_default=True, metavar="DB", help="Lowest level of points to show."
-)
-@click.option(
-    "--dynamic-range", type=float, default=40.0, show_default=True, metavar="DB", help="Dynamic range of the colours."
+    "--dynamic-range", type=float, default=40.0, show_default=True, metavar="DB", help="Range of the colours."
 )
 @click.option("--range", "range_m", type=options.INTERVAL, metavar="A:B", help="Window of the range axis in metres.")
 @click.option(
