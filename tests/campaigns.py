@@ -53,7 +53,7 @@ def run_here(monkeypatch, paths, folder, wanted=None, size=2):
     """Process in this process; return what became of each recording, by its name, and the crew."""
     pool = Here(size)
     with monkeypatch.context() as patch:
-        patch.setattr(Campaign, "_crew", lambda _: pool)
+        patch.setattr(Campaign, "_pool", lambda _: pool)
         return ended(Campaign(find(paths), folder, wanted).run()), pool
 
 

@@ -164,7 +164,7 @@ def test_measurements_that_are_missing_are_gaps(captures):
         assert {gap.reason for gap in recording.gaps} == {"it did not arrive in time"}
     assert capture.session.counts["one"].missing == {"it did not arrive in time": 4}
     assert [text.split(":")[1] for _, text in capture.notes] == [
-        " no whole measurement within 0.53 s; 0 of 131084 bytes came"
+        " no complete measurement within 0.53 s; 0 of 131084 bytes arrived"
     ] * 4
 
 
@@ -344,7 +344,7 @@ def test_refused(captures, options, message):
 
 
 def test_without_a_sensor():
-    with pytest.raises(ArgumentError, match="no sensor is given to capture from; give at least one"):
+    with pytest.raises(ArgumentError, match="sonars is empty; give at least one sensor"):
         Session({}, SETTINGS, trigger="command")
 
 
@@ -461,7 +461,7 @@ def test_commands_are_printed_and_nothing_is_opened(tmp_path):
     ("arguments", "message", "code"),
     [
         (["--port", "{link}", "--name", "a", "--name", "b"], "2 names are given for 1 ports; give one --name", 2),
-        (["--port", "nowhere"], "there is no serial port 'nowhere'", 1),
+        (["--port", "nowhere"], "ertis: error: serial port 'nowhere' does not exist", 1),
         (["--port", "{link}", "--preset", "default_25_50"], "--preset and --settings exclude each other; give one", 2),
         (["--port", "{link}", "-o", "settings.toml"], "output settings.toml exists; give another name, or ask", 1),
         (["--port", "{link}", "--port", "{link}"], "is given 2 times; give each sensor once", 2),

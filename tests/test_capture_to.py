@@ -195,7 +195,7 @@ def test_what_the_central_node_drops_is_told(tmp_path):
     reported = [each["dropped"] for each in events if each["event"] == "acked_through" and each["dropped"]]
     assert reported == [[[0, "superseded"], [2, "failed twice"]]]
     assert events[-1]["central"] == {"stored": 0, "accepted": 3, "dropped": {"superseded": 1, "failed twice": 1}}
-    assert "1 measurement dropped by the central node, superseded" in err
+    assert "1 measurement dropped by the central node (superseded)" in err
 
 
 @pytest.mark.usefixtures("sensors")
@@ -305,7 +305,7 @@ def test_nodes_that_send_one_sensor_are_told(tmp_path):
         (["--to", "tcp://127.0.0.1:9", "--spool", "settings.toml"], "settings.toml: File exists; give a folder for", 1),
         (["--to", "tcp://127.0.0.1:9", "--spool", "/proc"], "/proc: No such file or directory; give a folder for", 1),
         (["--to", "tcp://127.0.0.1:9", "--ring", "0.1"], "--ring is 0.1 MB, but one measurement has 0.131 MB; give", 1),
-        (["--to", "tcp://127.0.0.1:9", "--spool", "s", "--spool-size", "1e-9"], "--spool-size is 1e-09 MB, and a", 1),
+        (["--to", "tcp://127.0.0.1:9", "--spool", "s", "--spool-size", "1e-9"], "--spool-size is 1e-09 MB, but one measurement has 0.131 MB", 1),
         (["--mounting", "none.toml"], "none.toml", 1),
         (["--mounting", "empty.toml"], "does not contain sensor 'one'; add it, or choose one of sensor with --name", 1),
     ],
@@ -324,7 +324,7 @@ def test_errors_are_one_line(tmp_path, arguments, message, code):
     [
         (["--duration", "0"], "--duration is 0; give a number above 0"),
         (["--name", "a/b"], "sensor name 'a/b' cannot name a group in a file"),
-        (["--to", "tcp://127.0.0.1:9", "--spool", "new/spool"], "there is no serial port 'none'"),
+        (["--to", "tcp://127.0.0.1:9", "--spool", "new/spool"], "ertis: error: serial port 'none' does not exist"),
     ],
 )
 def test_what_is_refused_was_not_begun(tmp_path, monkeypatch, arguments, message):

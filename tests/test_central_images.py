@@ -25,7 +25,7 @@ class Images:
     def __init__(self):
         self.known, self.offered = [], []
 
-    def know(self, hello, settings):
+    def register(self, hello, settings):
         self.known.append((hello.sensor, settings))
 
     def offer(self, data, words, arrived_ns):

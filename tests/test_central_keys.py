@@ -81,4 +81,4 @@ def test_a_list_of_keys_that_cannot_be_used_is_told(tmp_path):
                 select.select([], [], [], 0.01)
             assert central.status().keys_note == (reported[0] if content == b"[" else "")
     assert str(given.allow) in reported[0]
-    assert reported[1] == "the list of keys can be used again"
+    assert reported[1] == "the allow list can be used again"

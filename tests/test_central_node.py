@@ -141,9 +141,9 @@ def test_air_may_change(tmp_path):
 
 
 WRONG = {
-    "before its hello": ({"session_id": 6}, "hello", "say hello first"),
-    "too short": ({"words": b"1234"}, "message", "has 4 bytes, its settings say 4096"),
-    "of another CRC-32": ({"crc32": 1}, "message", "another CRC-32"),
+    "before its hello": ({"session_id": 6}, "hello", "send hello first"),
+    "too short": ({"words": b"1234"}, "message", "a measurement has 4 bytes, but its settings give 4096"),
+    "of does not match": ({"crc32": 1}, "message", "does not match"),
     "in no air": ({"temperature_c": float("nan")}, "message", "air.temperature_c"),
 }
 
@@ -165,7 +165,7 @@ def test_a_measurement_that_is_wrong_is_refused(what, tmp_path):
 
 
 HELLOS = {
-    "settings of another CRC-32": ({"settings_crc32": 1}, "another CRC-32"),
+    "settings of does not match": ({"settings_crc32": 1}, "does not match"),
     "no settings": ({"settings": b"["}, "settings of sensor left"),
     "no text": ({"settings": b"\xff"}, "not text"),
     "a file for a layout": ({"settings": b'[array]\nlayout = "/etc/passwd"'}, "send its positions"),
@@ -173,7 +173,7 @@ HELLOS = {
     "a name with a line feed": ({"settings": b'[array]\nlayout = "a\\n"'}, "cannot be printed"),
     "a firmware with zeros": ({"firmware": "\0"}, "printable"),
     "a quaternion of length 0": ({"rotation_xyzw": (0.0, 0.0, 0.0, 0.0)}, "rotation_xyzw"),
-    "more than is taken": ({"settings": line(8, 8).replace(recording=Recording(n_samples=2**23))}, "this node takes"),
+    "more than is taken": ({"settings": line(8, 8).replace(recording=Recording(n_samples=2**23))}, "but the limit is"),
     "too much": ({"settings": b"#" * 300_000}, "exceed 262144 bytes"),
 }
 

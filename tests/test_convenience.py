@@ -48,7 +48,7 @@ def test_pipelines_take_the_path_of_settings(tmp_path):
         (lambda _: ertis.Pipeline("missing.toml"), "missing.toml"),
         (lambda shown: ertis.find_peaks(shown.amplitude), "image is of type ndarray; give Energyscape"),
         (lambda shown: ertis.find_peaks(shown, false_alarm=2), "false_alarm is 2"),
-        (lambda shown: shown.replace(amplitude=shown.amplitude[:, 1:]), r"energy has shape \(91, \d+\); give shape"),
+        (lambda shown: shown.replace(amplitude=shown.amplitude[:, 1:]), r"amplitude has shape \(91, \d+\); give shape"),
         (lambda shown: shown.replace(elevation_rad=np.zeros(3)), r"elevation_rad has shape \(3,\); give shape \(91,\)"),
         (
             lambda shown: shown.replace(engery=shown.amplitude),

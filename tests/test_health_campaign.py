@@ -100,7 +100,7 @@ def test_process_warns_of_repeated_blocks_in_one_line(tmp_path):
     path = write_recording(tmp_path / "rec.h5", [measurement])
     options = ["--directions", "2d:5", "--range", "0.8:1.2", "--quiet", "-o", str(tmp_path / "img.h5")]
     done = CliRunner().invoke(cli, ["process", str(path), *options])
-    assert "has faults in its record (repeated blocks: samples " in done.stderr
+    assert "sensor sensor has faults in its recording (repeated blocks" in done.stderr
     assert sum("faulty" in line or "faults" in line for line in done.stderr.splitlines()) == 1
 
 

@@ -184,7 +184,7 @@ def test_greetings_have_limits(monkeypatch):
     greetings = Greetings(lambda *_: None)
     for _ in range(3):
         greetings.offer(_greeting(b"a"))
-    with pytest.raises(Unwanted, match="too many hellos wait to be read; send hello again in a few seconds"):
+    with pytest.raises(Unwanted, match="too many hellos are waiting; send hello again in a few seconds"):
         greetings.offer(_greeting(b"a"))
     with pytest.raises(Unwanted, match="too many hellos wait"):
         greetings.offer(_greeting(b"b", 998))

@@ -154,8 +154,8 @@ def test_one_file_of_many_measurements(tmp_path):
     [
         ({"names": ()}, r"run.1 is a folder; give a file of raw words, or a folder with .bin files of RTIS Dev"),
         ({"names": ("a_1.bin", "b_2.bin")}, "the order of its 2 .bin files is not known, wanted names like NAME<num"),
-        ({"names": ("a.bin", "a1.bin")}, "the order of its 2 .bin files is not known"),
-        ({"names": ("a1.bin", "a01.bin")}, "the order of its 2 .bin files is not known"),
+        ({"names": ("a.bin", "a1.bin")}, r"the order of its 2 \.bin files is unknown, because their names are not like NAME<number>\.bin"),
+        ({"names": ("a1.bin", "a01.bin")}, r"the order of its 2 \.bin files is unknown, because their names are not like NAME<number>\.bin"),
         ({"recording": None}, "run.1 holds no recording settings of RTIS Dev .*; give --preset"),
         ({"processing": None}, r"does not say which array it was \(microphoneLayout\); give --layout"),
         ({"recording": SHORT | {"callEmissions": 2}}, "callEmissions is 2, wanted 1, as an image shows one emission"),

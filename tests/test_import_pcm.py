@@ -194,7 +194,7 @@ REFUSED = {
         {},
         r"b.wav has 96000 Hz, a.wav 192000; import each by itself",
     ),
-    "none": (lambda _: [], {}, "no file of PCM is given"),
+    "none": (lambda _: [], {}, "no PCM file is given"),
     "half of it": (
         lambda folder: _changed(folder / "a.wav", lambda content: content[: len(content) // 2]),
         {},

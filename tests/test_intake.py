@@ -37,7 +37,7 @@ class Viewer:
     def __init__(self):
         self.shown = []
 
-    def know(self, *_):
+    def register(self, *_):
         pass
 
     def offer(self, data, words, _):

@@ -77,7 +77,7 @@ def test_give_up_without_acknowledgements_removes_the_journal(tmp_path):
 def test_open_refuses_a_damaged_limit(tmp_path, text):
     path = crashed(tmp_path)
     path.with_name(f"{path.name}-limit").write_text(text)
-    with pytest.raises(DamagedError, match=r"rec\.h5\.journal-limit is damaged; remove it to seal all rows that rec"):
+    with pytest.raises(DamagedError, match=r"rec\.h5\.journal-limit is damaged; remove it to seal all rows in rec"):
         Journal.open(path)
 
 

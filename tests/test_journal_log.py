@@ -324,6 +324,6 @@ def test_log_without_its_journal_is_set_aside(tmp_path):
 
 def test_journal_that_exists_keeps_its_log(tmp_path):
     path = crashed(tmp_path, entries(COUNT))
-    with pytest.raises(ArgumentError, match="exists, an interrupted capture left it"):
+    with pytest.raises(ArgumentError, match="exists from an interrupted capture"):
         create(tmp_path)
     assert stored(path)[0] == list(range(10, 10 + COUNT))

@@ -33,7 +33,7 @@ def test_what_others_hold_can_be_discarded(tmp_path):
             journal.find("left", EPOCH, 10)
         with pytest.raises(ArgumentError, match=r"sensor 'top' is not in .*; add it first"):
             journal.discard("top", EPOCH, 10)
-        with pytest.raises(ArgumentError, match="measurement 12 of sensor left comes after 12"):
+        with pytest.raises(ArgumentError, match="measurement 12 of sensor left follows 12"):
             journal.append(entries(1, first=12))
     assert version(journal.path) == VERSION
     with Journal.open(journal.path) as journal:

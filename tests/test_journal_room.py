@@ -19,7 +19,7 @@ def test_a_nearly_full_disk_is_left_enough_to_seal(tmp_path, monkeypatch):
         with monkeypatch.context() as patch:
             patch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=9_400_000))
             with pytest.raises(
-                DataError, match=r"has 9.4 MB free, wanted 9.\d MB so that rec.h5.journal can be sealed"
+                DataError, match=r"has 9.4 MB free, but 9.\d MB are needed to seal rec.h5.journal"
             ):
                 journal.append(entries(1, first=20))
             assert journal.room() == 0
@@ -200,5 +200,5 @@ assert os.listdir(sys.argv[1]) == ["rec.h5"]
 def test_what_a_small_disk_has_taken_can_be_sealed_there(tmp_path):
     number, message = on_a_small_disk(tmp_path, APPEND + SEAL)
     assert number > 10
-    assert "MB free, wanted" in message
+    assert "MB free, but" in message
     assert "can be sealed with more in it; what it holds is safe: end the capture, or free some space" in message

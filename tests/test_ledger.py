@@ -55,7 +55,7 @@ def test_ledger_that_cannot_be_read_is_reported_and_left_out(content, tmp_path):
 def test_ledger_of_a_newer_version_is_refused(tmp_path):
     text = b'["ertis-ledger",4]'
     (tmp_path / ".ertis-ledger").write_bytes(b"%08x %s\n" % (zlib.crc32(text), text))
-    with pytest.raises(FormatVersionError, match="has version 4, this package reads 3; update ertis-numba"):
+    with pytest.raises(FormatVersionError, match="has version 4, but this package reads 3; update ertis-numba"):
         Ledger(tmp_path)
 
 
@@ -104,7 +104,7 @@ def test_ledger_keeps_the_newest_runs_of_each_sensor(tmp_path):
 
 def test_a_ledger_that_cannot_be_read_is_refused(tmp_path):
     (tmp_path / ".ertis-ledger").mkdir()
-    with pytest.raises(DataError, match="allow reading it"):
+    with pytest.raises(DataError, match="make it readable"):
         Ledger(tmp_path)
 
 
@@ -115,7 +115,7 @@ def test_a_folder_is_for_one(tmp_path):
     lock.release()
     lock.release()
     Lock(tmp_path).release()
-    with pytest.raises(DataError, match="give a folder that can be written"):
+    with pytest.raises(DataError, match="give a writable folder"):
         Lock(tmp_path / "none")
 
 
@@ -133,5 +133,5 @@ def test_recordings_are_looked_at(tmp_path):
 
 def test_a_recording_that_cannot_be_looked_at_is_told(tmp_path):
     (tmp_path / "bad.h5").write_text(json.dumps([]))
-    with pytest.raises(DataError, match=r"recordings cannot be looked at .*bad\.h5"):
+    with pytest.raises(DataError, match=r"recordings cannot be read .*bad\.h5"):
         read_acked_through([tmp_path / "bad.h5"])

@@ -93,7 +93,7 @@ def test_settings_file_may_list_directions(tmp_path):
         np.testing.assert_allclose(np.degrees(images[0].azimuth_rad), [-30, 0])
     done = CliRunner().invoke(cli, [*arguments, "--force", "--azimuth=-10:10"])
     assert done.exit_code == 2
-    assert "directions are a list of 2; give --directions 2d:N or 3d:N with limits" in done.stderr
+    assert "limits need a grid, but directions is a list of 2; add --directions 2d:N or 3d:N" in done.stderr
 
 
 @pytest.mark.parametrize(

@@ -143,7 +143,7 @@ def test_no_file_of_nothing(tmp_path, product):
         )
     assert done.exit_code == 1
     reasons = {"raw": "is not written, because no measurement was received"}
-    reason = f"none.h5 {reasons.get(product, 'would hold no measurement')}"
+    reason = f"none.h5 {reasons.get(product, 'would contain no measurement')}"
     assert reason in done.stderr or reason in str(done.exception)
     assert not list(tmp_path.iterdir())
 
@@ -211,7 +211,7 @@ def test_a_time_and_a_key_that_cannot_be(tmp_path):
     secret, _ = KeyPair.new("me").save(tmp_path / "keys")
     for arguments, reported in (
         (("--duration", "0"), "--duration is 0; give a number above 0"),
-        (("--key", secret, "--server-key", "abc"), "--server-key: 'abc' is neither a public key nor a file of one"),
+        (("--key", secret, "--server-key", "abc"), "--server-key: 'abc' is neither a public key nor a file with one"),
     ):
         done = listen("tcp://127.0.0.1:1", *arguments)
         assert done.exit_code == 1

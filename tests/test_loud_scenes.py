@@ -117,7 +117,7 @@ def test_sensor_without_an_image_leaves_the_others_to_ab_renders():
 
 
 def test_scenes_in_motion_keep_what_changes_half_of_the_tolerance(monkeypatch):
-    """Of their measurements a few are rendered, and others may change by more."""
+    """Of their measurements a few are rendered, and other users may change by more."""
     scene = beside_an_emitter(-75.0, PCM).replace(effects={"absorption": False}, count=9)
     moving = scene.replace(points=(*scene.points[1:], scene.points[0].replace(velocity_m_s=(0.5, 0.0, 0.0))))
     monkeypatch.setattr(ABRender, "change_db", lambda *_: 0.07)

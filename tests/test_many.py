@@ -347,7 +347,7 @@ def test_a_gpu_serves_one_at_a_time(tmp_path, out, monkeypatch, workers, largest
     pool = Watched(3)
     write_recordings(tmp_path / "many", "abcdefghi", count=1)
     monkeypatch.setattr("tests.campaigns.follow", on_a_gpu)
-    monkeypatch.setattr(Campaign, "_crew", lambda _: pool)
+    monkeypatch.setattr(Campaign, "_pool", lambda _: pool)
     found = ended(Campaign(find([tmp_path / "many"]), out, CampaignOptions(settings=narrow), workers=workers).run())
     assert set(outcomes(found).values()) == {"made"}
     assert max(pool.in_hand) == largest

@@ -18,10 +18,10 @@ def _small(monkeypatch):
     monkeypatch.setattr(many, "_cores", lambda: 1)
 
 
-def test_all_crews_are_timed_and_compared(tmp_path, monkeypatch):
+def test_all_pools_are_timed_and_compared(tmp_path, monkeypatch):
     pool = Campaign._pool  # noqa: SLF001
     chosen = lambda campaign: pool(campaign) if vars(campaign)["_scheduler"] else Here()  # noqa: E731
-    monkeypatch.setattr(Campaign, "_crew", chosen)  # of processes, which take long to start, other tests know
+    monkeypatch.setattr(Campaign, "_pool", chosen)  # of processes, which take long to start, other tests know
     target = tmp_path / "page.md"
     target.write_text("<!-- ertis bench many -->\nold\n<!-- /ertis bench many -->\n", "utf-8")
     done = CliRunner().invoke(
@@ -37,9 +37,9 @@ def test_all_crews_are_timed_and_compared(tmp_path, monkeypatch):
     assert "2 recordings of 2 measurements of data/synthetic/reflectors.h5" in text
 
 
-def test_more_cores_have_more_crews(monkeypatch):
+def test_more_cores_have_more_pools(monkeypatch):
     monkeypatch.setattr(many, "_cores", lambda: 4)
-    crews = many._crews  # noqa: SLF001
+    crews = many._pools  # noqa: SLF001
     assert [tuple(pool.values()) for pool in crews("tcp://x:1").values()] == [
         (1, 1),
         (1, 4),

@@ -83,7 +83,7 @@ def test_workers_of_a_cluster_name_recordings_of_another_call(scheduler, tmp_pat
 
 
 def test_progress_is_told_and_to_close_it_ends_the_work(scheduler, runs, tmp_path, monkeypatch):
-    monkeypatch.setattr(members, "_TELL_S", 0.0)
+    monkeypatch.setattr(members, "_REPORT_INTERVAL_S", 0.0)
     out = tmp_path / "out"
     events = Campaign(find([runs / "b.h5"]), out, WANTED, scheduler=scheduler).run()
     kinds = []
@@ -208,5 +208,5 @@ def test_a_scheduler_that_goes_is_told(runs, tmp_path):
     events = Campaign(find([runs]), tmp_path / "out", WANTED, scheduler=local.scheduler_address).run()
     next(events)
     local.close()
-    with pytest.raises(NetworkError, match=r"is gone; what is made stays"):
+    with pytest.raises(NetworkError, match=r"is gone; finished output stays"):
         list(events)

@@ -33,7 +33,7 @@ def place(tmp_path_factory):
 @pytest.fixture(autouse=True)
 def _there(place, monkeypatch):
     monkeypatch.chdir(place)
-    monkeypatch.setattr(Campaign, "_crew", lambda _: Here())  # which takes less to start
+    monkeypatch.setattr(Campaign, "_pool", lambda _: Here())  # which takes less to start
 
 
 def run(command, code=0):

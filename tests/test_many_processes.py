@@ -90,7 +90,7 @@ def test_a_worker_that_dies_takes_one_recording_with_it(long_runs, tmp_path, cre
         found |= ended([event])
     assert killed
     assert outcomes(found) == {"a.h5": "made", "b.h5": "failed", "c.h5": "made", "d.h5": "made"}
-    assert f"{long_runs / 'b.h5'}: the process that worked on it was ended by SIGKILL" in found["b.h5"].error
+    assert f"{long_runs / 'b.h5'}: its worker process was ended by SIGKILL" in found["b.h5"].error
     assert names_in(out) == ["a.energy.h5", "c.energy.h5", "d.energy.h5"]
     again = ended(Campaign(find([long_runs]), out, CampaignOptions(settings=narrow), workers=1).run())
     assert outcomes(again) == {"a.h5": "there", "b.h5": "made", "c.h5": "there", "d.h5": "there"}
@@ -164,7 +164,7 @@ def test_fewer_are_wanted_while_all_are_busy(size):
 
 def test_processes_that_cannot_begin_are_told(runs, tmp_path, monkeypatch):
     monkeypatch.setattr(processes, "_MODULE", "ertis_numba.no_such_module")
-    with pytest.raises(DeviceError, match=r"end at once: the last one ended with 1, saying .*no_such_module"):
+    with pytest.raises(DeviceError, match=r"worker processes end at once: the last one ended with 1, printing '/work/main/\.venv/bin/python"):
         list(Campaign(find([runs]), tmp_path / "out", workers=1).run())
 
 

@@ -95,7 +95,7 @@ def test_no_recording_is_replaced():
 
 
 def test_workers_and_a_scheduler():
-    with pytest.raises(ArgumentError, match="workers are given and a scheduler"):
+    with pytest.raises(ArgumentError, match="workers and scheduler exclude each other"):
         Campaign(find(["runs"]), "out", workers=2, scheduler="tcp://127.0.0.1:9")
     with pytest.raises(ArgumentError, match="workers is 0; give a whole number of at least 1"):
         Campaign(find(["runs"]), "out", workers=0)

@@ -106,7 +106,7 @@ def test_a_header_as_it_stands_on_the_wire():
 @pytest.mark.parametrize(
     ("header", "reported"),
     [
-        (b"", "begins with b''; send"),
+        (b"", "a header begins with b''"),
         (b"eRT", "begins with b'eRT'"),
         (b"GET / HTTP/1.1", "begins with b'GET '"),
         (b"eRTN", "this node speaks|begins with|cannot be read|version"),
@@ -129,7 +129,7 @@ def test_what_is_no_header_is_refused_in_a_line(header, reported):
 
 @pytest.mark.parametrize("version", [0, 2, 255])
 def test_another_version_is_told_from_garbage(version):
-    with pytest.raises(FormatVersionError, match=f"has version {version} of the protocol, this node speaks 1; use"):
+    with pytest.raises(FormatVersionError, match=f"has protocol version {version}, but this node uses 1; use"):
         decode(MAGIC + bytes([version]) + b"anything")
 
 
@@ -162,7 +162,7 @@ def test_a_message_that_is_not_expected_is_refused():
 )
 def test_a_value_beyond_its_limits_is_refused(field, value):
     header = MAGIC + bytes([VERSION]) + msgspec.msgpack.encode({**msgspec.to_builtins(WHOLE), field: value})
-    with pytest.raises(DataError, match="a header cannot be read"):
+    with pytest.raises(DataError, match="a header cannot be decoded"):
         decode(header)
 
 

@@ -69,7 +69,7 @@ def test_metrics_are_of_this_machine_only(address):
 
 
 def test_an_address_in_use_is_told():
-    with Metrics("127.0.0.1:0", lambda: BUSY) as first, pytest.raises(NetworkError, match="cannot be served at"):
+    with Metrics("127.0.0.1:0", lambda: BUSY) as first, pytest.raises(NetworkError, match="cannot listen at"):
         Metrics(first.address, lambda: BUSY).start()
 
 

@@ -43,7 +43,7 @@ def test_own_beamformer_finds_the_reflectors(place):
         "from ertis_numba.storage import write_energyscapes\n"
         "near = (signals.range_m >= 0.5) & (signals.range_m <= 5)\n"
         "made = ertis.Pipeline(signals.settings).process(recording_of(0))\n"
-        "made = made.replace(energy=image[:, near].astype('f4'), azimuth_rad=azimuth_rad,\n"
+        "made = made.replace(amplitude=image[:, near].astype('f4'), azimuth_rad=azimuth_rad,\n"
         "                    elevation_rad=0 * azimuth_rad, range_m=signals.range_m[near])\n"
         "write_energyscapes('own.h5', [made])\n"
     )

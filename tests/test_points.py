@@ -28,7 +28,7 @@ OTHERS = [("fast", beamformer) for beamformer in ("coherence_factor", "dmas", "c
 def noise(directions, range_m=(0.9, 1.2), seed=1):
     image = image_of([], directions=directions, range_m=range_m)
     values = np.abs(np.random.default_rng(seed).standard_normal(image.amplitude.shape)) + 0.01
-    return image.replace(energy=values.astype(np.float32))
+    return image.replace(amplitude=values.astype(np.float32))
 
 
 def position_m(azimuth_deg, elevation_deg, range_m):
@@ -86,7 +86,7 @@ def test_of_much_noise_the_strongest_are_found():
 
 
 def test_of_two_equal_bins_the_first_counts():
-    image = noise("2d:31").replace(energy=np.zeros(noise("2d:31").amplitude.shape, np.float32))
+    image = noise("2d:31").replace(amplitude=np.zeros(noise("2d:31").amplitude.shape, np.float32))
     image.amplitude[10:12, 40] = 1.0
     (point,) = PointExtractor(image.settings)(image).position_m
     assert np.arctan2(point[1], point[0]) == pytest.approx(image.azimuth_rad[10:12].mean(), abs=1e-3)
@@ -123,14 +123,14 @@ def test_top_and_level_limit_the_cloud():
 @pytest.mark.parametrize("n_ranges", [1, 2, 3, 30])
 def test_silence_and_short_images_have_no_points(n_ranges):
     image = noise("2d:5")
-    short = image.replace(energy=np.zeros((5, n_ranges), np.float32), range_m=image.range_m[:n_ranges])
+    short = image.replace(amplitude=np.zeros((5, n_ranges), np.float32), range_m=image.range_m[:n_ranges])
     extractor = PointExtractor(image.settings)
     cloud = extractor(short)
     assert cloud.position_m.shape == (0, 3)
     assert cloud.uncertainty_m.shape == (0, 2)
     assert len(cloud) == 0
     ramp = np.broadcast_to(np.arange(1, n_ranges + 1, dtype=np.float32), (5, n_ranges)).copy()
-    assert len(extractor(short.replace(energy=ramp))) == 0  # highest at an end, of which nothing is known
+    assert len(extractor(short.replace(amplitude=ramp))) == 0  # highest at an end, of which nothing is known
 
 
 def test_the_input_is_left_alone():
@@ -167,7 +167,7 @@ def test_refuses(arguments, match):
 def test_refuses_an_image_of_another_grid():
     other = Settings(processing=Processing(directions="2d:7"))
     assert len(direction_grid(other.processing)) == 7
-    with pytest.raises(ArgumentError, match="energy has shape"):
+    with pytest.raises(ArgumentError, match="amplitude has shape"):
         PointExtractor(other)(noise("2d:9"))
 
 
@@ -216,7 +216,7 @@ def test_uncertainty_goes_with_range_level_and_noise():
     # It goes with the distance as well, and the aperture is foreshortened.
     ratio = 2 * 1.2 * np.cos(np.radians(12.3)) / np.cos(np.radians(33.3))
     assert second[1] == pytest.approx(ratio * first[1], rel=0.05)
-    louder = image.replace(energy=np.where(image.amplitude < 0.1, 2 * image.amplitude, image.amplitude))
+    louder = image.replace(amplitude=np.where(image.amplitude < 0.1, 2 * image.amplitude, image.amplitude))
     assert np.median(image.amplitude) < 0.1
     assert extractor(louder).uncertainty_m[0] == pytest.approx(2 * first, rel=1e-3)
 

@@ -36,7 +36,7 @@ def run(*arguments, code=0):
 @pytest.fixture
 def here(monkeypatch):
     """No processes, which takes less to start."""
-    monkeypatch.setattr(Campaign, "_crew", lambda _: Here())
+    monkeypatch.setattr(Campaign, "_pool", lambda _: Here())
 
 
 @pytest.mark.usefixtures("here")
@@ -81,7 +81,7 @@ def test_plans_are_told_of_each_and_measured(runs, monkeypatch):
         assert sensor["verified"]["error_db"] <= sensor["verified"]["max_error_db"]
         assert sensor["plan"]["safe_db"] <= -35.0
         assert "lines" not in sensor
-    monkeypatch.setattr(Campaign, "_crew", lambda _: Here())
+    monkeypatch.setattr(Campaign, "_pool", lambda _: Here())
     done = run("runs", "-o", "more", *FAST, "--explain")
     assert done.stderr.count("plan of eRTIS-7, for an error of -35 dB at the most:") == 2
     again = run("runs", "-o", "more", *FAST, "--explain")

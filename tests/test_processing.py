@@ -171,7 +171,7 @@ def test_the_end_waits_for_what_is_under_way():
 def test_an_address_that_is_taken_is_told_in_a_line():
     with driven() as loop:
         other = ImageProcessing(ProcessingOptions(publish=loop.processing.address, device="numpy"))
-        with pytest.raises(NetworkError, match="cannot be listened at"):
+        with pytest.raises(NetworkError, match="is in use by"):
             other.start()
 
 

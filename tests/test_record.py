@@ -121,8 +121,8 @@ def test_it_ends_after_its_time(tmp_path):
         (["--name", "a/b"], "--name 'a/b' cannot name a group in a file; give letters"),
         (["--duration", "0"], "--duration is 0; give a number above 0"),
         (["--metrics", "foo"], "--metrics is 'foo'; give HOST:PORT, such as 127.0.0.1:9101"),
-        (["--listen", "{taken}"], "is taken by another program; end that or give another --listen"),
-        (["--metrics", "{taken}"], "cannot be served at"),
+        (["--listen", "{taken}"], "is in use by another program; end that program or give another --listen"),
+        (["--metrics", "{taken}"], "cannot listen at"),
     ],
 )
 def test_what_is_refused_has_left_nothing(options, message, tmp_path):

@@ -49,7 +49,7 @@ def test_apart_refused(tmp_path):
     ):
         seal_apart(journal.path)
     (tmp_path / "rec.h5").write_text("mine")
-    with pytest.raises(DataError, match="exists and holds something else"):
+    with pytest.raises(DataError, match="exists with other content"):
         seal_apart(journal.path)
     assert seal_apart(journal.path, overwrite=True).measurements == 3
 
@@ -70,13 +70,13 @@ def instead(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("line", "reason"),
     [
-        ("kill -9 $$", "ended with -9, saying nothing; seal it again"),
-        ('echo \'{"done": 1, "o\'; kill -9 $$', "ended with -9, saying nothing; seal it again"),
-        ("echo Traceback >&2; echo; echo 'KeyError: 1' >&2; exit 1", "ended with 1, saying 'KeyError: 1'; seal it"),
-        ("seq 100000 >&2; exit 3", "ended with 3, saying '100000'; seal it again"),  # more than a pipe holds
+        ("kill -9 $$", "ended with -9, printing nothing; seal it again"),
+        ('echo \'{"done": 1, "o\'; kill -9 $$', "ended with -9, printing nothing; seal it again"),
+        ("echo Traceback >&2; echo; echo 'KeyError: 1' >&2; exit 1", "ended with 1, printing 'KeyError: 1'; seal it"),
+        ("seq 100000 >&2; exit 3", "ended with 3, printing '100000'; seal it again"),  # more than a pipe holds
         (
             f"exec {sys.executable} -c 'import os, sys; sys.exit(str(os.getsid(0) == os.getpid()))'",
-            "ended with 1, saying 'True'; seal it again",  # Ctrl-C in a terminal goes to a session
+            "ended with 1, printing 'True'; seal it again",  # Ctrl-C in a terminal goes to a session
         ),
     ],
 )
@@ -100,7 +100,7 @@ def test_apart_and_interrupted(tmp_path, instead, late):
 
     with pytest.raises(KeyboardInterrupt) as error:
         seal_apart(path, progress=interrupt)
-    safe = f"the measurements are safe in {path}; seal them by 'ertis recover {path}'"
+    safe = f"the measurements are safe in {path}; recover them with 'ertis recover {path}'"
     assert str(error.value) == (f"the measurements are in {tmp_path / 'rec.h5'}" if late else safe)
     assert (path.exists(), (tmp_path / "rec.h5").exists()) == (not late, late)
     assert seal(path).measurements == 3
@@ -133,7 +133,7 @@ def test_recover_what_cannot_be_sealed(tmp_path):
     crashed(tmp_path, name="b.h5")
     done = run("recover", tmp_path, "--json", "--quiet", code=1)
     assert done.stderr == (
-        f"ertis: error: {tmp_path}/rec.h5 exists and holds something else than {path}; move it, or give --force\n"
+        f"ertis: error: {tmp_path}/rec.h5 exists with other content than {path}; move it, or give --force\n"
     )
     reported = json.loads(done.stdout)["journals"]
     assert [(report.get("measurements"), "error" in report) for report in reported] == [(3, False), (None, True)]
@@ -171,7 +171,7 @@ def test_recover_is_interrupted(tmp_path, monkeypatch):
     path = crashed(tmp_path)
     monkeypatch.setattr(sealer.subprocess, "Popen", interrupted)
     done = run("recover", path, code=130)
-    assert done.stderr.splitlines()[0] == f"the measurements are safe in {path}; seal them by 'ertis recover {path}'"
+    assert done.stderr.splitlines()[0] == f"the measurements are safe in {path}; recover them with 'ertis recover {path}'"
     monkeypatch.undo()
     assert run("recover", path).stderr == f"{tmp_path}/rec.h5: 3 measurements, 0 missing\n"
 
@@ -195,8 +195,8 @@ def test_a_capture_that_fails_and_cannot_be_sealed(tmp_path, capsys):
     path = crashed(tmp_path)
     (tmp_path / "rec.h5").write_text("mine")
     reported = (
-        f"{tmp_path}/rec.h5 exists and holds something else than {path}; move it, or give --force; "
-        f"the measurements are safe in {path}, seal them by 'ertis recover {path}'"
+        f"{tmp_path}/rec.h5 exists with other content than {path}; move it, or give --force; "
+        f"the measurements are safe in {path}, recover them with 'ertis recover {path}'"
     )
     with pytest.raises(SonarError, match="left: it was unplugged"):
         _seal(path, LOST, overwrite=False)
@@ -223,4 +223,4 @@ def test_a_capture_whose_sealing_is_interrupted(tmp_path, monkeypatch, capsys, f
     monkeypatch.setattr(sealer.subprocess, "Popen", interrupted)
     with pytest.raises(KeyboardInterrupt if failure is None else SonarError):
         _seal(path, failure, overwrite=False)
-    assert capsys.readouterr().err == f"the measurements are safe in {path}; seal them by 'ertis recover {path}'\n"
+    assert capsys.readouterr().err == f"the measurements are safe in {path}; recover them with 'ertis recover {path}'\n"

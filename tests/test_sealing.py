@@ -136,7 +136,7 @@ def test_a_file_with_other_content_is_left_alone(tmp_path, name):
         journal.append(entries())
     OTHERS[name](tmp_path / "rec.h5", [entry.measurement for entry in entries()])
     before = (tmp_path / "rec.h5").read_bytes()
-    with pytest.raises(DataError, match=r"rec.h5 exists and holds something else than .*rec.h5.journal; move it, or"):
+    with pytest.raises(DataError, match=r"rec.h5 exists with other content than .*rec.h5.journal; move it, or"):
         seal(journal.path)
     assert (tmp_path / "rec.h5").read_bytes() == before
     assert seal(journal.path, overwrite=True).measurements == 3

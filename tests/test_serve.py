@@ -244,7 +244,7 @@ def test_what_is_refused_has_left_nothing(tmp_path):
         environment = {**os.environ, "PYTHONPATH": str(Path("cli").absolute())}
         done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=TIMEOUT_S, check=False)
     assert done.returncode == 1
-    assert "is taken by another program; end that or give another --publish" in done.stderr.splitlines()[-1]
+    assert "is in use by another program; end that program or give another --publish" in done.stderr.splitlines()[-1]
     assert not list(tmp_path.iterdir())
 
 

@@ -33,7 +33,7 @@ def test_an_address_that_others_can_reach_needs_keys_on_both_sides():
 
 
 def test_an_address_that_is_in_use_is_told(door):
-    with pytest.raises(NetworkError, match="cannot be listened at"):
+    with pytest.raises(NetworkError, match="is in use by"):
         sockets.server(door.context, door.address, keys=None)
 
 

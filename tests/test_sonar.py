@@ -348,7 +348,7 @@ def test_what_lay_there_is_dropped(sonar, device):
 
 def test_a_measurement_that_comes_too_late(sonar, device):
     device.quirks = Quirks(bytes_per_s=200_000)
-    with pytest.raises(SonarError, match=r"no whole measurement within 0\.53 s; \d+ of 131084 bytes came: measure"):
+    with pytest.raises(SonarError, match=r"no complete measurement within 0\.53 s; \d+ of 131084 bytes arrived: measure"):
         sonar.measure()
     device.quirks = Quirks()
     assert is_block(sonar.measure(), 1, WORDS[1])
@@ -373,7 +373,7 @@ def test_a_measurement_that_comes_in_the_next_one_s_place(pause_s):
 
     with Fake(slow) as device, SonarDriver.open(device.port) as sonar:
         sonar.configure(Setup.of(SETTINGS))
-        with pytest.raises(SonarError, match="; 0 of 131084 bytes came"):
+        with pytest.raises(SonarError, match="; 0 of 131084 bytes arrived"):
             sonar.measure()
         assert is_block(sonar.measure(), 1, WORDS[1])
         assert sonar.receiver.rejected == {"counter": BLOCK_BYTES}
@@ -391,7 +391,7 @@ def test_a_byte_that_is_lost_costs_one_measurement():
 
     with Fake(lossy) as device, SonarDriver.open(device.port) as sonar:
         sonar.configure(Setup.of(SETTINGS))
-        with pytest.raises(SonarError, match="; 131083 of 131084 bytes came"):
+        with pytest.raises(SonarError, match="; 131083 of 131084 bytes arrived"):
             sonar.measure()
         assert is_block(sonar.measure(), 1, WORDS[1])
         assert sonar.receiver.rejected == {"cut short": BLOCK_BYTES - 1}
@@ -410,7 +410,7 @@ def test_a_command_that_is_lost_does_not_shift_the_numbers():
 
     with Fake(deaf_once) as device, SonarDriver.open(device.port) as sonar:
         sonar.configure(Setup.of(SETTINGS))
-        with pytest.raises(SonarError, match="; 0 of 131084 bytes came"):
+        with pytest.raises(SonarError, match="; 0 of 131084 bytes arrived"):
             sonar.measure()
         assert is_block(sonar.measure(), 1, WORDS[1])
 
@@ -419,7 +419,7 @@ def test_a_command_that_is_lost_does_not_shift_the_numbers():
 def test_bits_that_cannot_be_true():
     with SonarDriver.open("left") as sonar:
         sonar.configure(Setup.of(SETTINGS), bits=lambda words: "odd" if np.array_equal(words, WORDS[0]) else None)
-        with pytest.raises(SonarError, match="no whole measurement"):
+        with pytest.raises(SonarError, match="no complete measurement"):
             sonar.measure()
         assert sonar.receiver.rejected_blocks == {"odd": 1}
         assert is_block(sonar.measure(), 1, WORDS[1])
@@ -513,7 +513,7 @@ def test_listening_for_another_length(device):
     registers.n_bytes, registers.armed = 4 * N_SAMPLES, 1
     with SonarDriver.open("left", passive=True) as sonar, SyncChain([device], 50.0):
         sonar.configure(Setup.of(SETTINGS.replace(recording=Recording(n_samples=2 * N_SAMPLES))))
-        with pytest.raises(SonarError, match=r"\d+ bytes came within .* no whole measurement of 65536 samples; give"):
+        with pytest.raises(SonarError, match=r"\d+ bytes arrived within .* no complete measurement of 65536 samples; give"):
             list(sonar.listen(stop=lambda: False, timeout_s=0.1))
 
 

@@ -267,7 +267,7 @@ def spoilt(**settings):
 @pytest.mark.parametrize(
     ("measurements", "message"),
     [
-        ([], "would hold no measurement"),
+        ([], "would contain no measurement"),
         (spoilt(array=Array(layout="eRTIS_v2")), "other array settings"),
         (spoilt(call=Call(duration_s=2e-3)), "other call settings"),
         (spoilt(recording=Recording(n_samples=50_000)), "other recording settings"),

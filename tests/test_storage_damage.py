@@ -121,7 +121,7 @@ def test_a_file_that_a_killed_program_wrote_is_not_called_damaged(path):
 def test_newer_version(path):
     with h5py.File(path, "r+") as file:
         file.attrs["ertis_format_version"] = 2
-    with pytest.raises(FormatVersionError, match="has format version 2, this package reads up to 1; update"):
+    with pytest.raises(FormatVersionError, match="has format version 2, but this package reads up to 1; update"):
         open_recording(path)
 
 

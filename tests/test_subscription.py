@@ -94,10 +94,10 @@ def test_no_images_are_no_silence_where_the_publisher_answers(publisher):
         (lambda p: p.raw(b"\x00" * 40), "header begins with"),
         (lambda p: p.raw(messages.encode(messages.Ping())), "message is 'ping'"),
         (lambda p: p.publish(image(), shape=(31, 17)), r"image has shape \(31, 17\), its axes"),
-        (lambda p: p.publish(image(), dtype="float16"), "31000 bytes came for float16"),
+        (lambda p: p.publish(image(), dtype="float16"), "31000 bytes arrived for float16"),
         (lambda p: p.publish(image(), description=9), "refers to description 9, which has not come"),
-        (lambda p: p.publish(cloud(), n_points=2**60), "16 bytes came for float32 of shape"),
-        (lambda p: p.publish(measurement(), crc32=1), "has another CRC-32 than its header"),
+        (lambda p: p.publish(cloud(), n_points=2**60), "16 bytes arrived for float32 of shape"),
+        (lambda p: p.publish(measurement(), crc32=1), "has does not match than its header"),
         (lambda p: p.tell_all(messages.Report(), b"\xff"), "status cannot be read"),
         (lambda p: p.tell_all(messages.Description(number=0, sensor="front")), "has 0 payloads; send settings and 3"),
         (
