@@ -2,7 +2,7 @@
 
 Run it as a separate process::
 
-python -m ertis_numba.storage.sealing_process REC.h5.journal
+    python -m ertis_numba.storage.sealing_process REC.h5.journal
 
 HDF5 can crash its process when a disk fails (h5py issue 914); a separate process confines this. It may be killed and
 run again at any time: the recording is the same.
@@ -42,7 +42,7 @@ REFUSED = "refused"
 MAX_HISTORY = 16_000  # Characters; an attribute of HDF5 is limited to 65,536 bytes.
 
 TOKEN = "sealing"  # noqa: S105
-"""Mode of the part file: the owner of the journal is the only writer."""
+"""Token in the name of the temporary file. It is fixed, because only the process with the journal writes the file."""
 
 Progress = Callable[[int, int], None]
 
@@ -57,10 +57,16 @@ def seal(path: str | Path, *, overwrite: bool = False, progress: Progress = lamb
     Parameters
     ----------
     path : str or Path
+        Path of the journal.
     overwrite : bool
         Replace an existing file, even if it has other content.
     progress : callable, optional
         Called with the number of written measurements and of all measurements.
+
+    Returns
+    -------
+    Sealed
+        Result.
 
     Raises
     ------
@@ -74,7 +80,7 @@ def seal(path: str | Path, *, overwrite: bool = False, progress: Progress = lamb
     """
     path = Path(path)
     before = path.with_name(path.name.removesuffix(SUFFIX))
-    # A process was killed after it had removed the journal.
+    # An earlier process may have been killed just after it had removed the journal.
     if not path.exists() and before != path and _made_of(path, before):
         return _reported(path, before)
     with Journal.open(path) as journal:
@@ -93,7 +99,7 @@ def seal(path: str | Path, *, overwrite: bool = False, progress: Progress = lamb
             for place in (target, target.parent):  # The writer may have been killed before it did this.
                 fsync(place)
         elif target.is_file() and not overwrite:
-            raise DataError(f"{target} exists with other content than {path}; move it, or give --force")
+            raise DataError(f"{target} exists, but its content differs from {path}; move it, or give --force")
         else:
             _write(journal, rows, refused, overwrite=overwrite, progress=progress)
         n_damaged = sum(len(held.damaged) for held in rows.values())
@@ -157,7 +163,7 @@ def _refusal(sensor: JournalSensor, first: Measurement) -> str:
 
 
 def _origin(path: Path) -> str:
-    """Return the origin of a recording for its attributes."""
+    """Return the first part of a recording's history, which names its journal."""
     return f"sealed from {path.name.encode(errors='backslashreplace').decode()}"  # The name may not be valid text.
 
 
@@ -177,7 +183,7 @@ class _Sealer(RecordingWriter):
     _numbered: ClassVar[bool] = False
 
     def say(self, history: str) -> None:
-        """Add a line to the history."""
+        """Set the history of the recording."""
         self._attributes["history"] = history
 
     def report_damage(self, damage: str) -> None:
@@ -223,7 +229,7 @@ def _write(
 
 
 def _absent(rows: dict[str, JournalRows]) -> Iterator[str]:
-    """Yield lines on sensors that are absent from a recording because they have no measurement."""
+    """Yield parts of the history on sensors without readable measurements, which a recording cannot contain."""
     for name, held in rows.items():
         if len(held) == len(held.damaged):
             yield f"sensor {name} has no measurement"
