@@ -38,8 +38,8 @@ class CampaignOptions:
     strict : bool
         Refuse recordings with faulty microphones instead of warning.
     overwrite : bool
-        Replace existing energyscape files that are damaged or were made with other settings. A complete file from the
-        same recording, settings and versions is always kept.
+        Replace existing energyscape files that are damaged, or that come from another recording, other settings or
+        other versions. A complete file from the same recording, settings and versions is always kept.
     mounting : mapping of str to (translation_m, rotation_xyzw), optional
         Mountings by name of the sensor, instead of those in the recording.
     explain : bool

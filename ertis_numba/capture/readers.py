@@ -94,7 +94,7 @@ class Returned:
 
 @dataclass(frozen=True, slots=True)
 class SensorEnded:
-    """A reader has ended; ``error`` is None if it was stopped."""
+    """A reader has ended; ``error`` is None unless its sensor has failed."""
 
     sensor: str
     error: Exception | None

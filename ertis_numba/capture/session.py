@@ -108,8 +108,8 @@ class _Track:
 class Session:
     """Capture session: receives measurements from sensors, stores them durably, and reports them.
 
-    Commands or SYNC pulses are numbered from 0, and give the sequence numbers. A missing number is therefore a missing
-    measurement.
+    Sequence numbers are those of the commands to a sensor, or of the SYNC pulses since its first one. They start at 0,
+    and a missing number is a missing measurement.
 
     Parameters
     ----------

@@ -132,9 +132,9 @@ def export(
     topics : collection of {"points", "image", "sonar_image"}, optional
         Topics of each sensor in ``mcap``; all by default.
     top : int, optional
-        Number of points per image, see `ertis_numba.analysis.points.PointExtractor`.
+        Maximum number of points per image; the strongest 256 by default.
     min_level_db : float, optional
-        Lowest level of a point in dB, see `ertis_numba.analysis.points.PointExtractor`.
+        Minimum level relative to the strongest point of the image; -20 dB by default.
     text : bool
         Write ``ply`` and ``pcd`` as text.
     overwrite : bool

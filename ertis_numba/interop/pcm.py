@@ -172,7 +172,8 @@ def open_pcm(
     settings : Settings, optional
         Array, call, air, processing and accuracy. Files that `export` wrote contain them. The files determine
         ``recording``. If ``processing.range_decimation`` leaves fewer than 1.8 ranges per second and hertz of the
-        call's bandwidth, it is replaced. The default ``processing.range_m`` ends at the end of the record.
+        call's bandwidth, as the default may, a suitable value replaces it. The default ``processing.range_m`` ends at
+        the end of the record.
     sensor : str
         Name of the sensor.
     skip_s : float
