@@ -34,13 +34,13 @@ _SETUP: Final = (
 )
 
 _REPORTED: Final = {
-    sqlite3.SQLITE_FULL: "has no free space on its disk; free some: committed measurements are safe",
-    sqlite3.SQLITE_IOERR: "cannot be written or read ({}); check the disk: committed measurements are safe",
+    sqlite3.SQLITE_FULL: "has no room on its disk; free some space: what was committed before is safe",
+    sqlite3.SQLITE_IOERR: "cannot be written or read ({}); check the disk: what was committed before is safe",
     sqlite3.SQLITE_READONLY: "cannot be written ({}); allow writing to the file and to its folder",
     sqlite3.SQLITE_CANTOPEN: "cannot be opened ({}); allow reading and writing of the file and of its folder",
     sqlite3.SQLITE_PERM: "cannot be opened ({}); allow reading and writing of the file and of its folder",
     sqlite3.SQLITE_CORRUPT: "is damaged ({}); copy it again if you can",
-    sqlite3.SQLITE_NOTADB: "is not a journal ({}); give a journal left by 'ertis capture'",
+    sqlite3.SQLITE_NOTADB: "is not a journal ({}); give a file that 'ertis capture' left",
 }
 
 
@@ -137,7 +137,7 @@ class Database:
             fsync(self._path.parent)
         except OSError as error:
             raise DataError(
-                f"{self._path.parent}: {error.strerror}; check the disk: committed measurements are safe"
+                f"{self._path.parent}: {error.strerror}; check the disk: what was committed before is safe"
             ) from error
         self._is_folder_synced = True
 
@@ -312,7 +312,7 @@ class Database:
             code &= 0xFF  # Extended codes add further bits.
             if code in {sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED}:
                 raise JournalInUseError(
-                    f"{self._path} is in use by another process, a capture or its sealing; wait until it ends"
+                    f"{self._path} is in use by another process, a capture or its sealing; wait until that has ended"
                 ) from error
             reported = _REPORTED.get(code, "cannot be used ({}); check the disk")
             kind = DamagedError if code == sqlite3.SQLITE_CORRUPT else DataError

@@ -54,7 +54,7 @@ def require(path: Path, target: Path, *, sizes_bytes: Sequence[int], seals_bytes
         if free_bytes < wanted_bytes:
             raise DiskFullError(
                 f"{folder} has {free_bytes / 1e6:.1f} MB free, but {wanted_bytes / 1e6:.1f} MB are needed to "
-                f"seal {path.name} with further measurements; its content is safe: end the capture, or free some space"
+                f"seal {path.name} with more in it; its content is safe: end the capture, or free some space"
             )
 
 

@@ -187,7 +187,7 @@ class Writer(ABC, Generic[Item]):
                 for index in range(len(rows)):
                     check = zlib.crc32(rows.row(index).data, check)
                 if (len(rows), check) != (len(written), written.check):
-                    raise DataError(f"{self.path} does not read back as it was written; check the disk")
+                    raise DataError(f"{self.path} reads back with other content than written; check the disk")
 
     @contextmanager
     def _naming_file(self) -> Iterator[None]:

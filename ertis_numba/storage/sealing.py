@@ -99,7 +99,7 @@ def seal(path: str | Path, *, overwrite: bool = False, progress: Progress = lamb
             for place in (target, target.parent):  # The writer may have been killed before it did this.
                 fsync(place)
         elif target.is_file() and not overwrite:
-            raise DataError(f"{target} exists, but its content differs from {path}; move it, or give --force")
+            raise DataError(f"{target} exists with other content than {path}; move it, or give --force")
         else:
             _write(journal, rows, refused, overwrite=overwrite, progress=progress)
         n_damaged = sum(len(held.damaged) for held in rows.values())
