@@ -169,7 +169,7 @@ def test_numbers_that_are_none_are_refused(value):
     settings = PCM.replace(recording=PCM.recording.replace(encoding="float32"))
     words = np.zeros((3_000, 8), np.float32)
     words[17, 3] = value
-    with pytest.raises(DataError, match=rf"contains {value} at sample 17 of channel 3; give finite numbers"):
+    with pytest.raises(DataError, match=rf"holds {value} at sample 17 of channel 3; give finite numbers"):
         Pipeline(settings).process(ertis.Measurement(words, settings))
 
 
