@@ -102,7 +102,7 @@ class Campaign:
         return max(1, min(chosen, len(self._names)))
 
     def run(self) -> Generator[Event]:
-        """Process, and yield events; close the iterator to end all work at once.
+        """Process the recordings, and yield events; close the iterator to cancel all work.
 
         Raises
         ------

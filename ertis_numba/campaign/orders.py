@@ -132,7 +132,7 @@ class WorkerPool(Protocol):
         """Number of orders that can be given now; zero if more are in progress than allowed."""
 
     def limit(self, size: int) -> None:
-        """Reduce the number of orders in progress; those given are finished."""
+        """Reduce the number of orders in progress at once; running orders finish."""
 
     def give(self, order: WorkOrder) -> None:
         """Run an order; never blocks."""
@@ -141,4 +141,4 @@ class WorkerPool(Protocol):
         """Return messages of workers, or an empty list after a timeout."""
 
     def close(self) -> None:
-        """End all work at once."""
+        """Cancel all orders."""

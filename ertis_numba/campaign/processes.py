@@ -103,7 +103,7 @@ class ProcessPool:
         return [news for worker, line in reported if (news := self._heard(worker, line)) is not None]
 
     def close(self) -> None:
-        """End all work at once."""
+        """Kill all processes."""
         for worker in self._workers:
             worker.process.kill()  # Kill all of them before waiting for any.
         for worker in list(self._workers):

@@ -1,7 +1,7 @@
 """Limit of a journal that has failed: the numbers up to which its measurements were acknowledged.
 
 After a failed sync, the system may show rows that never reach the disk. The central node stores them again in another
-journal. The limit, a small file beside the journal, prevents storing them twice.
+journal. The limit, a small file beside the failed journal, excludes them from it, so that none is stored twice.
 """
 
 import json

@@ -157,7 +157,7 @@ def _refusal(sensor: JournalSensor, first: Measurement) -> str:
             )
     except MemoryError:  # The lack of memory may be temporary.
         raise
-    except Exception as error:  # noqa: BLE001  whatever it is, it must not keep the others from being sealed
+    except Exception as error:  # noqa: BLE001  no error may prevent sealing of other sensors
         return " ".join(str(error).split()) or type(error).__name__
     return ""
 
