@@ -8,9 +8,9 @@ from ertis_numba.storage import Truth, write_energyscapes, write_recording
 from tests.files import image, noise
 
 CASES = {
-    "export i.h5 -o a.mcap --ascii": "option --ascii is given, which format 'mcap' does not have; leave it out, or",
-    "export i.h5 -o a.ply --topic points": "option --topic is given, which format 'ply' does not have; leave it out",
-    "export i.h5 -o a.npz --top 3": "option --top is given, which format 'npz' does not have; leave it out, or write",
+    "export i.h5 -o a.mcap --ascii": "option --ascii is given, but format 'mcap' does not have it; leave it out, or",
+    "export i.h5 -o a.ply --topic points": "option --topic is given, but format 'ply' does not have it; leave it out",
+    "export i.h5 -o a.npz --top 3": "option --top is given, but format 'npz' does not have it; leave it out, or write",
     "export i.h5 -o a.csv --top 0": "--top is 0; give a whole number of at least 1",
     "export i.h5 -o a.csv --min-level 3": "--min-level is 3; give a number from -1000 to 0",
     "peaks i.h5 --top 0": "--top is 0; give a whole number of at least 1",

@@ -19,8 +19,6 @@ WITHOUT_EXAMPLE = {
     "MicrophoneSignals",
     # They need keys or a network; pages of the guide have examples, which tests run.
     *("AllowList", "ClientKeys", "Entry", "KeyPair", "Permission", "ServerKeys"),
-    # They need files of other programs; pages of the guide have examples, which tests run.
-    *("export", "open_pcm", "open_raw", "open_rtis_folder"),
 }
 """Public names whose docstring has no example, each with its reason."""
 

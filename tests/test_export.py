@@ -119,7 +119,7 @@ def test_air_that_changes(tmp_path):
     x_m = [float(row["x_m"]) for row in rows(tmp_path / "a.csv")]
     assert x_m[1] == x_m[2]
     done = run(tmp_path / "rec.h5", "-o", tmp_path / "a.npz", code=1)
-    assert "has another range_m than the first, as in other air" in done.stderr
+    assert "has another range_m than the first, for example because of other air" in done.stderr
     run(tmp_path / "rec.h5", "-o", tmp_path / "b.npz", "-m", "1:2")
 
 
@@ -137,15 +137,15 @@ CASES = {
     "topics of a cloud": (
         "img.h5 -o a.ply --topic points",
         1,
-        "option --topic is given, which format 'ply' does not have; leave it out, or write mcap",
+        "option --topic is given, but format 'ply' does not have it; leave it out, or write mcap",
     ),
-    "text of a table": ("img.h5 -o a.csv --ascii", 1, "option --ascii is given, which format 'csv' does not have"),
+    "text of a table": ("img.h5 -o a.csv --ascii", 1, "option --ascii is given, but format 'csv' does not have it"),
     "points of images": (
         "img.h5 -o a.npz --top -3",
         1,
-        "option --top is given, which format 'npz' does not have; leave it out, or write mcap, ply, pcd or csv",
+        "option --top is given, but format 'npz' does not have it; leave it out, or write mcap, ply, pcd or csv",
     ),
-    "levels of signals": ("rec.h5 -o a.h5 -m 0 --min-level -9", 1, "option --min-level is given, which format"),
+    "levels of signals": ("rec.h5 -o a.h5 -m 0 --min-level -9", 1, "option --min-level is given, but format"),
     "no points": ("img.h5 -o a.csv --top 0", 1, "top is 0; give a whole number of at least 1"),
     "over the input": ("rec.h5 -o rec.h5 --force -m 0", 1, "output rec.h5 is the input itself; give another name"),
     "exists": ("img.h5 -o both.h5 --format csv", 1, "output both.h5 exists; give another name, or ask to overwrite"),
@@ -178,7 +178,7 @@ def test_options_are_those_of_the_format(tmp_path, kind, option):
     if option in FORMATS[kind].options:
         export(target, items, **{option: GIVEN[option]})
         return
-    with pytest.raises(ArgumentError, match=f"option {option!r} is given, which format {kind!r} does not have; leave"):
+    with pytest.raises(ArgumentError, match=f"option {option!r} is given, but format {kind!r} does not have it; leave"):
         export(target, items, **{option: GIVEN[option]})
     assert list(tmp_path.iterdir()) == []
 

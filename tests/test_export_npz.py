@@ -56,7 +56,7 @@ def test_what_cannot_share_axes(tmp_path):
     cold = second.replace(settings=SMALL.replace(air=Air(temperature_c=0.0)))
     for other, message in (
         (second.replace(stamp=Stamp(sensor="other")), "sensors eRTIS-7 and other cannot share the axes"),
-        (second.replace(range_m=second.range_m + 0.1), "another range_m than the first, as in other air"),
+        (second.replace(range_m=second.range_m + 0.1), "another range_m than the first, for example"),
         (second.replace(azimuth_rad=second.azimuth_rad / 2), "another azimuth_rad than the first"),
         (cold, "has other settings than the first; export it to its own npz"),
     ):

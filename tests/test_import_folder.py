@@ -158,11 +158,11 @@ def test_one_file_of_many_measurements(tmp_path):
         ({"names": ("a1.bin", "a01.bin")}, r"the order of its 2 \.bin files is unknown, because their names are not like NAME<number>\.bin"),
         ({"recording": None}, "run.1 holds no recording settings of RTIS Dev .*; give --preset"),
         ({"processing": None}, r"does not say which array it was \(microphoneLayout\); give --layout"),
-        ({"recording": SHORT | {"callEmissions": 2}}, "callEmissions is 2, wanted 1, as an image shows one emission"),
+        ({"recording": SHORT | {"callEmissions": 2}}, "callEmissions is 2, but an image shows only 1 emission"),
         ({"recording": {"callCustom": "bat.csv"}}, "callCustom is the file 'bat.csv', which a recording cannot hold"),
         ({"processing": PLANAR | {"rangesCustom": "r.csv"}}, "rangesCustom is the file 'r.csv', .*give --range when"),
         ({"processing": PLANAR | {"directionsCustom": "d.csv"}}, "directionsCustom is the file"),
-        ({"processing": PLANAR | {"elevation2DAngle": 20}}, "elevation2DAngle is 20, wanted 0; take it out"),
+        ({"processing": PLANAR | {"elevation2DAngle": 20}}, "elevation2DAngle is 20, but only 0 is supported"),
         ({"more": {"z.json": {"callDuration": 3}}}, r"z.json: callDuration is 3, but 2.5 in recording.json; keep one"),
     ],
 )
@@ -201,7 +201,7 @@ def test_json_that_is_refused_or_of_others(tmp_path):
     folder = folder_of(tmp_path, more={"list.json": [1, 2], "other.json": {"weather": "windy"}})
     assert len(open_rtis_folder(folder)) == 2
     (folder / "bad.json").write_text("{")
-    with pytest.raises(DataError, match=r"bad.json: .*; give readable JSON, or take the file away"):
+    with pytest.raises(DataError, match=r"bad.json: .*; give readable JSON, or remove the file"):
         open_rtis_folder(folder)
     with pytest.raises(DataError, match="none: No such file or directory; give a folder of raw files"):
         open_rtis_folder(tmp_path / "none")

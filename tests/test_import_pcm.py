@@ -155,7 +155,7 @@ REFUSED = {
     "channels": (
         lambda folder: write_wav(folder / "a.wav", numbers(n_channels=7)),
         {},
-        r"has 7 channels, array 'ring' has 8; give the layout of its array",
+        r"has 7 channels, but array 'ring' has 8; give a layout with one row for each channel",
     ),
     "slow": (
         lambda folder: write_wav(folder / "a.wav", numbers(), 44_100),
@@ -167,12 +167,12 @@ REFUSED = {
     "nan": (
         lambda folder: write_wav(folder / "a.wav", np.where(np.arange(8) == 3, np.nan, numbers()).astype("f4")),
         {},
-        r"holds nan at sample 0 of channel 3; give finite numbers",
+        r"contains nan at sample 0 of channel 3; give finite numbers",
     ),
     "beyond float32": (
         lambda folder: write_wav(folder / "a.wav", np.where(np.arange(8) == 3, 1e300, numbers())),
         {},
-        r"holds 1e\+300 at sample 0 of channel 3; give numbers up to 3\.403e\+38",
+        r"contains 1e\+300 at sample 0 of channel 3; give numbers up to 3\.403e\+38",
     ),
     "skip for ever": (
         lambda folder: write_wav(folder / "a.wav", numbers()),
@@ -192,7 +192,7 @@ REFUSED = {
     "two rates": (
         lambda folder: [write_wav(folder / "a.wav", numbers()), write_wav(folder / "b.wav", numbers(), 96_000)],
         {},
-        r"b.wav has 96000 Hz, a.wav 192000; import each by itself",
+        r"b.wav has 96000 Hz, but a.wav has 192000; import each file separately",
     ),
     "none": (lambda _: [], {}, "no PCM file is given"),
     "half of it": (

@@ -1,8 +1,7 @@
 """Campaigns: processing of many recordings to energyscapes, on all cores or on a cluster.
 
-Each recording becomes a file of its own, complete or not at all, so that a campaign that was ended at any moment goes
-on where it stopped. Workers are processes that know nothing of each other: one that dies takes its recording with it
-and no other one.
+Each recording becomes one output file, complete or not at all. An interrupted campaign therefore continues at the next
+recording. Workers are independent processes: a crash affects only the recording in progress.
 """
 
 from ertis_numba.campaign.campaign import Campaign

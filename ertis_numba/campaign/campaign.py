@@ -22,7 +22,7 @@ from ertis_numba.settings import Accuracy, Settings
 __all__ = ["Campaign"]
 
 _WAIT_S: Final = 0.5
-_AHEAD: Final = 2  # recordings that are looked at while others are made, so that nobody waits
+_AHEAD: Final = 2  # Recordings inspected in advance, so that no worker waits.
 
 
 @dataclass(slots=True, eq=False)
@@ -42,25 +42,29 @@ class _Case:
 class Campaign:
     """Processing of many recordings to energyscape files in a folder.
 
-    Whatever the number of workers, the files are the same, bit by bit but for the date in them: a plan is settled once
-    for all recordings with the same settings, and neither depends on threads. One that is there already is left alone
-    if it was made of the same recording by the same settings and versions.
+    The files do not depend on the number of workers or threads: only the date in them differs. A plan is chosen once
+    for all recordings with the same settings. An existing file is kept if it was made from the same recording with the
+    same settings and versions.
 
     Parameters
     ----------
     recordings : sequence of Source
-    folder : Path
-        It is made if there is none.
-    options : Options, optional
+        Recordings to process, as `find` returns them.
+    folder : str or Path
+        Output folder. It is created if it does not exist.
+    options : CampaignOptions, optional
+        Options for each recording.
     workers : int, optional
-        Processes on this machine; one for each core by default, of which each has one thread, and one for a GPU.
+        Number of processes on this machine. By default, there is one for a GPU. On CPUs, there are as many as the cores
+        allow with ``options.threads`` threads each, or with 1 if it is None.
     scheduler : str, optional
-        Address of a dask scheduler whose workers do it instead.
+        Address of a dask scheduler. Its workers then replace the processes on this machine.
 
     Raises
     ------
     ArgumentError
-        Two recordings would become the same file, or no files can be put there.
+        Two recordings have the same output file, the folder cannot be created, or both ``workers`` and ``scheduler``
+        are given.
     """
 
     def __init__(
@@ -98,7 +102,7 @@ class Campaign:
         return max(1, min(chosen, len(self._names)))
 
     def run(self) -> Generator[Event]:
-        """Process, and yield events; close the iterator to end all work at once.
+        """Process the recordings, and yield events; close the iterator to cancel all work.
 
         Raises
         ------
@@ -107,7 +111,7 @@ class Campaign:
         DeviceError
             No process can be started, or dask.distributed is missing.
         NetworkError
-            The scheduler does not answer, or not any more.
+            The scheduler does not answer, or the connection to it is lost.
         """
         with sole(self.folder):
             clear_parts(self.folder, self._names)
@@ -129,14 +133,14 @@ class Campaign:
         return ProcessPool(self.workers)
 
     def _feed(self, pool: WorkerPool) -> bool:
-        """Give orders to free workers; return True if there is something to wait for."""
+        """Give orders to free workers; return True if any order is in progress."""
         while pool.free > 0 and (pair := self._next(pool)) is not None:
             self._given[pair[0].number] = pair
             pool.give(pair[0])
         return bool(self._given)
 
     def _next(self, pool: WorkerPool) -> tuple[WorkOrder, _Case] | None:
-        """Return the next order: work that is nearest to its end comes first."""
+        """Return the next order; recordings that are nearest to their end come first."""
         if self._ready:
             case = self._ready.popleft()
             return self._order("check" if case.is_there else "make", self._pending_output(case, pool.size)), case
@@ -163,7 +167,7 @@ class Campaign:
         return WorkOrder(self._n_orders, do, about)
 
     def _paths(self, case: _Case) -> dict[str, Any]:
-        far = self._scheduler is not None  # where the current folder is another one
+        far = self._scheduler is not None  # Its workers may have another current folder.
         path, target = (each.absolute() if far else each for each in (case.found.path, case.target))
         return {"path": str(path), "target": str(target), "named": case.found.named, "dtype": self._options.dtype}
 
@@ -185,7 +189,7 @@ class Campaign:
             **{name: getattr(options, name) for name in HOW},
             "sensors": planned,
             "max_bytes": MAX_BYTES / n_workers,
-            # Dask starts again what a worker had that was lost, even if all but the news of it had been done.
+            # Dask repeats the order of a lost worker, even if only the message about its result was missing.
             "overwrite": options.overwrite or self._scheduler is not None,
         }
 
@@ -205,7 +209,7 @@ class Campaign:
                 return
         if "error" in news.result:
             if order.do == "make" and "by_chance" in news.result:
-                clear_parts(self.folder, {case.target.name})  # that a worker which was killed has left
+                clear_parts(self.folder, {case.target.name})  # A killed worker may have left them.
             yield case.ended("failed", error=news.result["error"])
         elif order.do == "look":
             yield from self._looked(case, news.result)
@@ -235,7 +239,7 @@ class Campaign:
             yield from self._forward(case)
 
     def _found_there(self, case: _Case, sensors: dict[str, Any]) -> Iterator[Event]:
-        """Release an existing output, unless its processing has to be examined."""
+        """Report an existing output, or examine its processing first if the options request that."""
         if not self._options.is_thorough:
             yield case.ended("there")
             return
@@ -245,14 +249,14 @@ class Campaign:
 
     def _planned(self, pool: WorkerPool, case: _Case, reported: dict[str, Any]) -> Iterator[Event]:
         if reported.get("device") == "cuda" and self._workers is None and self._scheduler is None:
-            pool.limit(1)  # a GPU serves one recording faster than it serves several
+            pool.limit(1)  # A GPU processes recordings faster one at a time.
         cases = [case, *self._unplanned]
         self._unplanned.clear()
         for each in cases:
             yield from self._forward(each)
 
     def _forward(self, case: _Case) -> Iterator[Event]:
-        """Move a case to processing, once its plans are known."""
+        """Queue a recording for processing if its plans are known, otherwise for planning."""
         plans = [self._plans.of(settings) for settings in case.wanted.values()]
         failed = [plan for plan in plans if isinstance(plan, str)]
         if failed:
@@ -266,7 +270,7 @@ class Campaign:
 
 
 def _absolute(settings: Settings) -> Settings:
-    """Return settings whose directions can be found from any folder."""
+    """Return settings with an absolute path to the file of directions, if they name one."""
     directions = settings.processing.directions
     if not isinstance(directions, str) or not directions.lower().endswith(".csv"):
         return settings

@@ -32,12 +32,14 @@ class RecordingEnded:
     Attributes
     ----------
     recording, output : Path
+        Recording, and its energyscape file.
     outcome : {"made", "there", "passed over", "failed"}
-        ``there`` is what had been made before, by the same settings and versions.
+        ``there`` means that the output exists, made with the same settings and versions. ``passed over`` means an
+        energyscape file that was not given by name.
     error : str
-        Why it failed, in a line.
+        Reason of a failure in one line; empty otherwise.
     made : dict
-        Measurements, times and more of what was made; of what was there what it was checked for.
+        Measurements, times and other results of a processed recording; results of the checks for an existing output.
     """
 
     recording: Path

@@ -31,22 +31,29 @@ def examine(
     Parameters
     ----------
     pipeline : Pipeline
+        Pipeline of the sensor.
     first : Measurement
-        What the plan is tried on.
+        Measurement with which the plan is examined.
     threads : int, optional
+        Number of threads; all by default.
     explain : bool
         Yield the plan, its predicted error and its predicted time.
     verify : bool
-        Yield the true error of the image of ``first`` beside those that were predicted.
+        Yield the true error of the image of ``first``, with the predicted errors.
     heard : Planner, optional
-        Planner from `planner_of`, if there is one already.
+        Planner from `planner_of`, if it exists already.
+
+    Yields
+    ------
+    tuple of str and dict
+        Name and content of each part.
 
     Raises
     ------
     ArgumentError
-        The settings have no plan.
+        The method has no plan.
     DataError
-        That error exceeds the budget; it is yielded before.
+        The true error exceeds the budget. It is yielded first.
     """
     settings = pipeline.settings
     if settings.processing.method == "paper":
@@ -56,7 +63,8 @@ def examine(
     kernel_set = kernels.load(pipeline.device)
     n_threads = kernel_set.max_threads if threads is None else threads
     planners = {
-        "safe": Planner(settings, kernel_set, threads=n_threads, plan="measured"),  # times are those of this machine
+        # Measured costs give the times on this machine.
+        "safe": Planner(settings, kernel_set, threads=n_threads, plan="measured"),
         "signal_model": heard or planner_of(pipeline.process(first), first, kernel_set, threads=n_threads),
     }
     if explain:
@@ -108,7 +116,7 @@ def _plane_waves(model: ErrorModel, settings: Settings) -> list[dict[str, float]
 
 
 def _verified(pipeline: Pipeline, first: Measurement, planners: dict[str, Planner]) -> dict[str, Any]:
-    """Return the true error of a measurement beside the predicted ones."""
+    """Return the true error of a measurement, with the predicted errors."""
     accuracy = pipeline.settings.accuracy
     measured = verification.measure(pipeline.process(first), first)
     return {

@@ -14,8 +14,8 @@ from ertis_numba.storage.schema import software_versions
 
 __all__ = ["difference", "look_at"]
 
-_OPEN = (None, "auto")  # what settings leave to the planner
-_ODD = (OSError, RuntimeError, LookupError, AttributeError, TypeError, ValueError)  # h5py on odd contents
+_OPEN = (None, "auto")  # Values that let the planner choose.
+_ODD = (OSError, RuntimeError, LookupError, AttributeError, TypeError, ValueError)  # Errors of h5py.
 
 
 class _ExistingOutput(EnergyscapeReader):
@@ -51,8 +51,8 @@ def _digest(*parts: bytes) -> str:
 def look_at(target: Path, recording: RecordingReader, dtype: str) -> dict[str, Any] | None:
     """Return the description of an existing output of a recording: settings and axes of its sensors.
 
-    ``differs`` in it says why it is something else, or that it is damaged; it is empty where only settings can be
-    different. None is returned where there is no file. A ``recording`` is never to be replaced.
+    Return None if the file does not exist. ``differs`` is the reason why the file is not this output, or that it is
+    damaged. It is empty if only the settings can differ. If ``recording`` is True, the file must not be replaced.
     """
     if not target.exists():
         return None
@@ -62,7 +62,7 @@ def look_at(target: Path, recording: RecordingReader, dtype: str) -> dict[str, A
         return {"differs": "is damaged"}
     except (ErtisError, *_ODD):
         return {"differs": "is not a readable energyscape file"}
-    if not found["differs"] and made_of != recording.sha256():  # last, as it reads all of it
+    if not found["differs"] and made_of != recording.sha256():  # Hashing reads the whole file, so it comes last.
         return {"differs": "was made from another file of the same recording"}
     return found
 
@@ -106,7 +106,7 @@ def difference(
 ) -> str:
     """Return the difference between a file and the output of these settings; empty if there is none.
 
-    Only a ``mounting`` that is given is compared; that of the recording is in the file already.
+    A mounting is compared only if it is given in ``mounting``: the file already has that of the recording.
     """
     if made["differs"]:
         return str(made["differs"])
@@ -115,7 +115,8 @@ def difference(
     for name, settings in wanted.items():
         held = made["sensors"][name]
         found = _changed(Settings.from_toml(held["settings"], "settings"), self_contained(settings))
-        if not found and grid_count(settings.processing.directions) is None:  # a file, whose content may be another one
+        # A file of directions may have other content than before.
+        if not found and grid_count(settings.processing.directions) is None:
             grid = direction_grid(settings.processing)
             found = "" if _digest(grid.azimuth_rad.tobytes(), grid.elevation_rad.tobytes()) == held["axes"] else "grid"
         if found:
@@ -126,7 +127,7 @@ def difference(
 
 
 def _changed(made: Settings, wanted: Settings) -> str:
-    """Return the changed settings; a plan may have completed open ones."""
+    """Return the name of the first different setting; ignore settings that a plan has completed."""
     opened = made.replace(accuracy=_reopened(made.accuracy, wanted.accuracy))
     if wanted.processing.wavefront == "auto":
         opened = opened.replace(processing=opened.processing.replace(wavefront="auto"))

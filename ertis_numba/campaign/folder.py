@@ -11,22 +11,22 @@ from ertis_numba.errors import ArgumentError
 
 __all__ = ["clear_parts", "final_name", "sole"]
 
-_PART = re.compile(r"(.+)\.[0-9a-f]{8}\.part")  # as `atomic.replacing` names them
+_PART = re.compile(r"(.+)\.[0-9a-f]{8}\.part")  # Names of `ertis_numba.atomic_files.atomic_write`.
 
 
 @contextmanager
 def sole(folder: Path) -> Iterator[None]:
     """Create a folder unless it exists, and lock it for this campaign until the block ends.
 
-    The system forgets it when the process ends, however it does.
+    The system releases the lock when the process ends, even after a crash.
 
     Raises
     ------
     ArgumentError
-        Another one writes into it.
+        Another campaign writes into the folder.
     """
     folder.mkdir(exist_ok=True)
-    if os.name != "posix":  # a folder cannot be opened there
+    if os.name != "posix":  # Windows cannot open folders, so they cannot be locked.
         yield
         return
     import fcntl  # noqa: PLC0415  not on every system
@@ -40,20 +40,20 @@ def sole(folder: Path) -> Iterator[None]:
                 raise ArgumentError(
                     f"output folder {folder} is in use by another campaign; wait for it, or give another folder"
                 ) from None
-            # Some file systems of a network have no locks: better none than no campaign.
+            # Some network file systems have no locks. The campaign then runs without one.
         yield
     finally:
         os.close(descriptor)
 
 
 def final_name(name: str) -> str:
-    """Return the final name of a file, which may be half-written."""
+    """Return the final name of a file, given its final or temporary name."""
     part = _PART.fullmatch(name)
     return part[1] if part else name
 
 
 def clear_parts(folder: Path, targets: Collection[str]) -> None:
-    """Remove half-written files of killed writers with these names."""
+    """Remove temporary files that killed writers of these targets have left."""
     with os.scandir(folder) as entries:
         names = [entry.name for entry in entries]
     for name in names:

@@ -39,7 +39,7 @@ class Making:
         """Number of measurements."""
 
     def run(self) -> Generator[int]:
-        """Write the file; yield the number of processed measurements. Closed before its end, it leaves no file."""
+        """Write the file, and yield the number of processed measurements; closed early, it leaves no file."""
         done = 0
         with self._writer:
             for run, recording in zip(self._runs, self._recordings, strict=True):
@@ -48,7 +48,7 @@ class Making:
                     yield done
 
     def report(self) -> dict[str, Any]:
-        """Return the report of ``--json``; the entries of a single sensor also stand at the top level."""
+        """Return the report of ``--json``; entries of a single sensor are repeated at the top level."""
         rows = [
             {"sensor": recording.sensor, **run.report()}
             for recording, run in zip(self._recordings, self._runs, strict=True)
@@ -82,27 +82,35 @@ def making(
     Parameters
     ----------
     path, target : Path
-        Recording, and energyscape file to make.
-    options : Options
+        Recording, and its energyscape file.
+    options : CampaignOptions
+        Options for processing.
     sensors : sequence of str
+        Names of the sensors to process.
     settings : mapping of str to Settings, optional
-        To process by; those that ``options`` makes of the recorded ones by default.
+        Settings for each sensor. By default, ``options.settings`` derives them from the recorded settings.
     pipelines : callable
-        Returns a context with a pipeline for each of some settings.
+        Function that takes a sequence of settings, and returns a context manager with one pipeline for each.
     max_bytes : float, optional
-        See `SensorRun`.
+        Limit on images that wait to be written, in bytes. See `SensorRun`.
     warn : callable
         Called with a line for each sensor that has faulty microphones, whose echoes do not match the call, or whose
         images may exceed the error budget.
     show : callable
-        Called with the name of a sensor and what was found out of its plan, as soon as it was.
+        Called with the name of a sensor and each result about its plan.
+
+    Yields
+    ------
+    Making
+        Recording that is ready to be processed.
 
     Raises
     ------
     DataError
-        Microphones are faulty and ``options.strict``; or an image errs by more than its budget and ``options.verify``.
+        Microphones are faulty and ``options.strict`` is set, or the error of an image exceeds its budget and
+        ``options.verify`` is set.
     ErtisError
-        What else is wrong with the recording, its settings or the target.
+        The recording, its settings or the target is invalid.
     """
     with ExitStack() as stack:
         recordings = [stack.enter_context(open_recording(path, sensor=name)) for name in sensors]
@@ -136,23 +144,25 @@ def checked(
     pipelines: _Pipelines,
     warn: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
-    """Check every sensor of a recording as `making` does, without processing; return the examined plans.
+    """Check every sensor of a recording as `making` does, and return the results about plans; write nothing.
 
     Parameters
     ----------
     path : Path
-    options : Options
+        Recording.
+    options : CampaignOptions
+        Options for processing.
     settings : mapping of str to Settings
-        By which its energyscapes were made.
+        Settings with which its energyscapes were made, by sensor.
     pipelines, warn : callable
         As for `making`.
 
     Raises
     ------
     DataError
-        As `making`.
+        As for `making`.
     ErtisError
-        What else is wrong with the recording.
+        The recording is invalid.
     """
     with ExitStack() as stack:
         recordings = [stack.enter_context(open_recording(path, sensor=name)) for name in settings]
@@ -180,9 +190,9 @@ def _wavefront(planner: Planner, recording: RecordingReader, show: _Show) -> dic
 def _begin_checks(
     stack: ExitStack, recordings: Sequence[RecordingReader], settings: Sequence[Settings]
 ) -> list[Future[_Checks]]:
-    """Start the checks of all sensors' signals in a thread, parallel to planning and loading of pipelines."""
+    """Start the checks of all sensors' signals in a thread, in parallel with planning and loading of pipelines."""
     thread = ThreadPoolExecutor(1, thread_name_prefix="ertis-checks")
-    stack.callback(thread.shutdown, cancel_futures=True)  # an interruption does not wait for other sensors
+    stack.callback(thread.shutdown, cancel_futures=True)  # Ctrl-C does not wait for the other sensors.
     return [thread.submit(_check, *each) for each in zip(recordings, settings, strict=True)]
 
 
@@ -226,7 +236,7 @@ def _look_over(
             warn(f"{recording.path}: sensor {recording.sensor}: {run.prediction.warning}; {remedy}")
     if not (options.explain or options.verify):
         return
-    from ertis_numba.campaign.examination import examine  # noqa: PLC0415  it takes time to load, and few want it
+    from ertis_numba.campaign.examination import examine  # noqa: PLC0415  slow to import and rarely used
 
     parts = examine(
         run.pipeline, first, threads=options.threads, explain=options.explain, verify=options.verify, heard=heard

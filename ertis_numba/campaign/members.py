@@ -23,20 +23,21 @@ _REPORT_INTERVAL_S: Final = 0.5
 class Members:
     """`WorkerPool` of the workers of a dask scheduler, with at most one recording in progress per worker.
 
-    They need this package and what it computes with, of the same versions, and have to see the files under the same
-    names. What a lost worker had, dask starts again on another, a few times. Whoever reaches a scheduler can run code
-    on its workers: keep it among machines that trust each other, or use dask's TLS.
+    The workers need the same versions of this package and its dependencies, and access to the files under the same
+    paths. Dask repeats the order of a lost worker on another worker, a few times. Every program that reaches a
+    scheduler can run code on its workers: keep it in a trusted network, or use TLS with dask.
 
     Parameters
     ----------
     address : str
+        Address of the scheduler.
 
     Raises
     ------
     DeviceError
         dask.distributed is not installed.
     NetworkError
-        No scheduler answers, or it has no workers; later, if it is gone.
+        No scheduler answers, or it has no workers. `wait` also raises this error if the connection is lost.
     """
 
     def __init__(self, address: str) -> None:
@@ -46,9 +47,8 @@ class Members:
         self._futures: dict[int, cluster.Future] = {}
         with ExitStack() as stack:
             self._client = cluster.connect(address, timeout_s=_CONNECT_S)
-            stack.enter_context(
-                cluster.silence_loggers()
-            )  # what it would print of a scheduler that is lost is told in a line
+            # Dask would print tracebacks for a lost scheduler, which `wait` reports in one line.
+            stack.enter_context(cluster.silence_loggers())
             stack.callback(self._client.close, timeout=2)
             cluster.require_workers(self._client, address, timeout_s=_CONNECT_S)
             self._size = len(self._client.nthreads())
@@ -64,7 +64,7 @@ class Members:
     @property
     def free(self) -> int:
         """Number of orders that can be given now."""
-        return max(0, self._size - len(self._futures))  # workers may have been lost
+        return max(0, self._size - len(self._futures))  # Workers may have been lost.
 
     def limit(self, size: int) -> None:
         """Do nothing: each worker of a cluster has its own device."""
@@ -84,7 +84,7 @@ class Members:
         future.add_done_callback(lambda done, number=order.number: self._reported.put(_news(number, done)))
 
     def wait(self, timeout_s: float) -> list[News]:
-        """Return news, or nothing after a while."""
+        """Return messages of workers, or an empty list after a timeout."""
         if self._client.status != "running":
             raise NetworkError(
                 f"the dask scheduler at {self._address} is gone; finished output stays. Give another scheduler "
@@ -103,7 +103,7 @@ class Members:
         return news
 
     def close(self) -> None:
-        """End all work: dask cannot end a thread, but the work notices that no one waits for it."""
+        """Cancel all orders: dask cannot end a thread, but a cancelled order stops at its next progress report."""
         with self._stack:
             if self._client.status == "running":
                 self._client.cancel(list(self._futures.values()), force=True)
@@ -120,7 +120,7 @@ class Members:
         self._looked_s = time.monotonic()
         try:
             self._size = max(1, len(self._client.nthreads()))
-        except (OSError, TimeoutError):  # it may come back; if not, the client's status says so
+        except (OSError, TimeoutError):  # The scheduler may return. Otherwise the status of the client changes.
             return
 
 
@@ -129,14 +129,14 @@ def _news(number: int, future: cluster.Future) -> News:
     try:
         return News(number, result=future.result(timeout=_CONNECT_S))
     except CancelledError:
-        return News(number, result={"error": "the cluster has dropped it; process again", "by_chance": True})
-    except Exception as error:  # noqa: BLE001  whatever it was, somebody waits to hear of it
+        return News(number, result={"error": "the cluster has cancelled the order; process again", "by_chance": True})
+    except Exception as error:  # noqa: BLE001  the campaign reports any error
         text = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
         return News(number, result={"error": text, "by_chance": True})
 
 
 class _UnwantedError(Exception):
-    """No one waits for the result of a task."""
+    """The order was cancelled."""
 
 
 def follow_there(do: str, about: dict[str, Any], topic: str, number: int) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Options of a campaign, and orders to workers, in the form of JSON."""
+"""Options of a campaign, and orders to workers, which JSON can represent."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -22,29 +22,31 @@ class CampaignOptions:
     Attributes
     ----------
     settings : callable
-        Returns the settings to process by for those of a recording; they are these themselves by default.
+        Function that returns the settings for processing, given the recorded settings. By default, they are the same.
     sensor : str, optional
-        One only; all of each recording by default.
+        Name of the only sensor to process; all sensors by default.
     dtype : {"float32", "float16"}
+        Type of the stored amplitudes, by default float32.
     device : {"auto", "cpu", "cuda", "numpy"}
+        Device of the pipelines, by default ``auto``.
     plan : {"nominal", "measured"}
         Costs by which plans are chosen, as for `Pipeline`.
     threads : int, optional
-        Of each worker; the workers share the cores by default.
+        Number of threads per worker; by default, the workers share the cores.
     batch : int
-        Measurements worked on at the same time.
+        Number of measurements per batch, by default 8.
     strict : bool
         Refuse recordings with faulty microphones instead of warning.
     overwrite : bool
-        Replace energyscape files that were made otherwise or are damaged. What is whole, and was made of the same
-        recording by the same settings and versions, stays as it is in any case.
+        Replace existing energyscape files that are damaged, or that come from another recording, other settings or
+        other versions. A complete file from the same recording, settings and versions is always kept.
     mounting : mapping of str to (translation_m, rotation_xyzw), optional
-        Mountings of sensors by name, in place of those in the recording.
+        Mountings by name of the sensor, instead of those in the recording.
     explain : bool
-        Tell the plan of each sensor, its predicted error and time, as ``plan`` of what was made.
+        Report the plan of each sensor with its predicted error and time, under the key ``plan``.
     verify : bool
-        Measure the error of each sensor's first measurement, ``verified`` of what was made; a recording fails if it is
-        beyond the budget.
+        Measure the error of each sensor's first image, and report it under the key ``verified``. A recording fails if
+        the error exceeds the budget.
     """
 
     settings: Callable[[Settings], Settings] = lambda recorded: recorded
@@ -68,7 +70,7 @@ class CampaignOptions:
 
     @property
     def is_thorough(self) -> bool:
-        """True if the options need more than the image of a recording, even for an existing output."""
+        """True if an existing output has to be examined as well."""
         return self.strict or self.explain or self.verify
 
 
@@ -86,9 +88,11 @@ class WorkOrder:
     Attributes
     ----------
     number : int
+        Identifier of the order.
     do : {"look", "plan", "make", "check"}
+        Action.
     about : dict
-        As `work` has it.
+        Arguments of the action, see `ertis_numba.campaign.work`.
     """
 
     number: int
@@ -103,11 +107,12 @@ class News:
     Attributes
     ----------
     number : int
-        Of the order.
+        Identifier of the order.
     done : int
-        Measurements that are done so far, where that is all there is to tell.
+        Number of processed measurements, in a progress report.
     result : dict or None
-        What came of it; ``error`` in it is why nothing did, and ``by_chance`` whether that need not be so another time.
+        Result at the end of an order. ``error`` is the reason of a failure, and ``by_chance`` marks a failure that may
+        be temporary.
     """
 
     number: int
@@ -116,7 +121,7 @@ class News:
 
 
 class WorkerPool(Protocol):
-    """Executors of orders."""
+    """Workers that run orders."""
 
     @property
     def size(self) -> int:
@@ -127,13 +132,13 @@ class WorkerPool(Protocol):
         """Number of orders that can be given now; zero if more are in progress than allowed."""
 
     def limit(self, size: int) -> None:
-        """Reduce the number of orders in progress; those given are finished."""
+        """Reduce the number of orders in progress at once; running orders finish."""
 
     def give(self, order: WorkOrder) -> None:
         """Run an order; never blocks."""
 
     def wait(self, timeout_s: float) -> list[News]:
-        """Return news, or nothing after a while."""
+        """Return messages of workers, or an empty list after a timeout."""
 
     def close(self) -> None:
-        """End all work at once."""
+        """Cancel all orders."""

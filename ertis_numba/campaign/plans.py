@@ -12,24 +12,24 @@ __all__ = ["Plans"]
 class Plans:
     """Plans by their settings, and the plans in progress.
 
-    Were it not for them, workers that have measured other costs could choose other plans, and files would depend on who
-    made them.
+    Without them, workers with different measured costs could choose different plans, and the files would depend on the
+    worker.
     """
 
     def __init__(self) -> None:
         self._found: dict[bytes, Accuracy | str] = {}
-        self._kinds: set[bytes] = set()  # of settings whose kernels are compiled
-        self._under_way: dict[bytes, bool] = {}  # settings, and whether their kind is new
+        self._kinds: set[bytes] = set()  # Kinds of settings whose kernels are compiled.
+        self._under_way: dict[bytes, bool] = {}  # True for settings of a new kind.
 
     def of(self, settings: Settings) -> Accuracy | str | None:
         """Return the plan for settings, or an error text, or None while it is not known."""
         return self._found.get(_key(settings))
 
     def begin(self, settings: Settings) -> Literal["new", "known"] | None:
-        """Register that settings are being planned; return True if their kind is new, None if they have to wait.
+        """Register settings as being planned; return ``new`` or ``known`` for their kind, None if they have to wait.
 
-        A kind is all but the air. New ones come one after the other: kernels that are compiled by several processes at
-        once could spoil each other's cache.
+        Settings of one kind differ only in the air. New kinds are planned one at a time, because several processes that
+        compile the same kernels could corrupt the cache.
         """
         key, new = _key(settings), _kind(settings) not in self._kinds
         if key in self._under_way or (new and any(self._under_way.values())):

@@ -17,8 +17,8 @@ from ertis_numba.errors import DeviceError
 __all__ = ["ProcessPool"]
 
 _MODULE: Final = "ertis_numba.campaign.worker_process"
-_MAX_STILLBORN: Final = 3  # that end in a row before they have done anything
-_LAST_WORDS: Final = 20  # lines
+_MAX_STILLBORN: Final = 3  # Limit on successive processes that end before they are ready.
+_LAST_WORDS: Final = 20  # Number of kept lines of stderr.
 
 
 @dataclass(slots=True, eq=False)
@@ -36,16 +36,17 @@ class _WorkerProcess:
 class ProcessPool:
     """`WorkerPool` of new Python interpreters rather than forks, which OpenMP and HDF5 would not survive.
 
-    Ctrl-C in a terminal does not reach them; they end with this process, however that ends.
+    Ctrl-C in a terminal does not reach them. They end with this process, even if it crashes.
 
     Parameters
     ----------
     size : int
+        Number of processes.
 
     Raises
     ------
     DeviceError
-        Later, if processes end before they do anything.
+        Processes end before they are ready; `wait` raises this error.
     """
 
     def __init__(self, size: int) -> None:
@@ -72,7 +73,7 @@ class ProcessPool:
 
     @property
     def doing(self) -> dict[int, str]:
-        """Work of each process, by process identifier: the path of a recording, or nothing."""
+        """Recording in progress of each process, by process identifier; empty for an idle one."""
         return {worker.process.pid: _path(worker.order) for worker in self._workers}
 
     def limit(self, size: int) -> None:
@@ -87,12 +88,12 @@ class ProcessPool:
         worker.order, worker.begun = order, False
         stdin = worker.process.stdin
         if stdin is not None:
-            with suppress(OSError):  # it has died; who reads what it tells will find out
+            with suppress(OSError):  # The process has ended, which `wait` detects.
                 stdin.write(json.dumps({"number": order.number, "do": order.do, "about": order.about}) + "\n")
                 stdin.flush()
 
     def wait(self, timeout_s: float) -> list[News]:
-        """Return news, or nothing after a while."""
+        """Return messages of workers, or an empty list after a timeout."""
         try:
             reported = [self._reported.get(timeout=timeout_s)]
         except queue.Empty:
@@ -102,14 +103,14 @@ class ProcessPool:
         return [news for worker, line in reported if (news := self._heard(worker, line)) is not None]
 
     def close(self) -> None:
-        """End all work at once."""
+        """Kill all processes."""
         for worker in self._workers:
-            worker.process.kill()  # all of them first
+            worker.process.kill()  # Kill all of them before waiting for any.
         for worker in list(self._workers):
             self._end(worker)
 
     def _start(self) -> _WorkerProcess:
-        # -P: a file in the current folder that is named like one of Python's must not be taken for it.
+        # -P: Python must not import a file of the current folder in place of a standard module.
         process = subprocess.Popen(  # noqa: S603  this very package
             [sys.executable, "-P", "-m", _MODULE],
             stdin=subprocess.PIPE,
@@ -119,7 +120,7 @@ class ProcessPool:
             encoding="utf-8",
             errors="backslashreplace",
             start_new_session=True,
-            creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),  # what Windows has for a session
+            creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),  # Windows has no sessions.
         )
         worker = _WorkerProcess(process)
         for work, stream in ((self._listen, process.stdout), (self._overhear, process.stderr)):
@@ -143,7 +144,7 @@ class ProcessPool:
             return self._died(worker)
         try:
             reported: dict[str, Any] = json.loads(line)
-        except ValueError:  # what is killed may have told half of it
+        except ValueError:  # A killed process may have printed half a line.
             return None
         if "number" not in reported:
             worker.ready, self._stillborn = True, 0
@@ -175,7 +176,7 @@ class ProcessPool:
         return News(order.number, result={"error": text, "by_chance": True})
 
     def _end(self, worker: _WorkerProcess) -> None:
-        """End a process at once and release it."""
+        """Kill a process, and close its streams."""
         self._workers.remove(worker)
         worker.process.kill()
         worker.process.wait()
@@ -183,7 +184,7 @@ class ProcessPool:
             thread.join()
         for stream in (worker.process.stdin, worker.process.stdout, worker.process.stderr):
             if stream is not None:
-                with suppress(OSError):  # what it has not read
+                with suppress(OSError):  # The process may not have read its input.
                     stream.close()
 
 

@@ -22,8 +22,8 @@ class Source:
     ----------
     path : Path
     named : bool
-        Whether somebody named it; what a pattern or a folder brought along may be an energyscape file, which is passed
-        over.
+        True for a file given by name, by default True. Files found by a pattern or in a folder may be energyscape
+        files, which are skipped.
     """
 
     path: Path
@@ -31,25 +31,25 @@ class Source:
 
 
 def find(given: Iterable[str | Path]) -> list[Source]:
-    """Return the named files, each once, in the order given.
+    """Return the files to process, each once, in the given order.
 
-    A file counts rather than links to it, which may come to mean another one. What a pattern or a folder has that is no
-    file, as a link to what is gone, is left to whoever opens it to tell.
+    A file is preferred to links to it, whose target may change. Broken links are returned as well: opening them reports
+    the error.
 
     Parameters
     ----------
     given : iterable of str or Path
-        Files, folders, which stand for the ``*.h5`` in them, and patterns, where ``**`` stands for any folders.
+        Files, folders and patterns. A folder stands for its ``*.h5`` files. In a pattern, ``**`` matches any folders.
 
     Raises
     ------
     DataError
-        A folder or a pattern stands for nothing.
+        A folder contains no ``*.h5``, or no file matches a pattern.
     """
     found: dict[str, Source] = {}
     for each in given:
         for one in _meant(str(each)):
-            real = os.path.realpath(one.path)  # resolve() refuses links that go in circles
+            real = os.path.realpath(one.path)  # resolve() refuses circular links.
             known = found.setdefault(real, one)
             found[real] = Source(
                 one.path if known.path.is_symlink() and not one.path.is_symlink() else known.path,
@@ -85,13 +85,15 @@ def outputs(recordings: Sequence[Source], folder: Path) -> list[Path]:
     Raises
     ------
     ArgumentError
-        Two would become the same, or one would replace another recording; there can be no such folder.
+        Two recordings have the same output file, an output would replace another recording, or the folder cannot be
+        created.
     """
     if folder.exists() and not folder.is_dir():
         raise ArgumentError(f"output {folder} is a file, but several recordings need a folder; give another name")
     if not folder.parent.is_dir():
         raise ArgumentError(f"output {folder}: folder {folder.parent} does not exist; create it or give another")
-    named = {os.path.realpath(found.path) for found in recordings if found.named}  # others may be energyscape files
+    # Files found by patterns may be energyscape files.
+    named = {os.path.realpath(found.path) for found in recordings if found.named}
     taken: dict[str, Path] = {}
     targets = []
     for found in recordings:

@@ -46,16 +46,20 @@ class SensorRun:
     Parameters
     ----------
     pipeline : Pipeline
+        Pipeline of the sensor.
     batch : int
-        Measurements worked on at the same time, fewer where images are large.
+        Number of measurements per batch; fewer if the images exceed ``max_bytes``.
     max_bytes : float, optional
-        Of images that wait to be written; `MAX_BYTES` by default.
+        Limit on images that wait to be written, in bytes; `MAX_BYTES` by default.
 
     Attributes
     ----------
     pipeline : Pipeline
+        Pipeline of the sensor.
     times_ms : list of float
+        Processing time of each measurement, in milliseconds.
     reported : dict
+        Results about the plan.
     prediction : Prediction or None
         Predicted error of the first measurement's image; None before it is computed, and for the paper's method.
     call_warning : str
@@ -72,7 +76,7 @@ class SensorRun:
         self._size = max(1, min(batch, int((max_bytes or MAX_BYTES) / image_bytes)))
 
     def known(self, measurement: Measurement) -> Measurement:
-        """Return a measurement with its known settings: a settings file may correct array, call or air."""
+        """Return a measurement with the settings of the pipeline, which may correct its array, call or air."""
         return replace(measurement, settings=self.pipeline.settings)
 
     def write(self, recording: RecordingReader, writer: EnergyscapeWriter) -> Iterator[None]:
@@ -81,7 +85,7 @@ class SensorRun:
         Raises
         ------
         DataError
-            A measurement was taken in other air than the recording says, and nothing else is known of it.
+            The air of a measurement differs from that of the recording, and no settings replace it.
         """
         settings = self.pipeline.settings
         as_recorded = settings.air == recording.settings.air
@@ -92,7 +96,7 @@ class SensorRun:
                     _require_same_air(measurement, settings)
             images = self._processed([self.known(measurement) for measurement in group])
             images.reverse()
-            while images:  # none is kept: a GPU's images lie in memory that the next ones need
+            while images:  # Written images are released: on a GPU, the next batch needs their memory.
                 writer.write(images.pop())
                 yield
 
@@ -119,7 +123,7 @@ class SensorRun:
 
 
 def _require_same_air(measurement: Measurement, settings: Settings) -> None:
-    """Refuse a measurement in other air, whose ranges would differ from the axis."""
+    """Refuse a measurement in other air, because its ranges would differ from the range axis."""
     came, wanted = measurement.settings.air, settings.air
     if came != wanted:
         raise DataError(

@@ -1,6 +1,6 @@
-"""Work of the workers: examine a recording, plan its processing, process it, or check existing energyscapes.
+"""Actions of workers: inspect a recording, plan its processing, process it, or check existing energyscapes.
 
-Each takes and returns what JSON can hold, so that it runs in any process of any machine that sees the files.
+Arguments and results can be represented in JSON, so that an action runs in any process with access to the files.
 """
 
 import functools
@@ -30,7 +30,7 @@ ReportProgress = Callable[[int], None]
 _Key = tuple[str, str, int | None]
 
 _turn = threading.Lock()
-_kept: dict[_Key, Pipeline] = {}  # that nobody uses at present
+_kept: dict[_Key, Pipeline] = {}  # Pipelines that are not in use.
 
 
 def follow(do: str, about: Mapping[str, Any], notify: ReportProgress = lambda _: None) -> dict[str, Any]:
@@ -39,27 +39,29 @@ def follow(do: str, about: Mapping[str, Any], notify: ReportProgress = lambda _:
     Parameters
     ----------
     do : {"look", "plan", "make", "check"}
+        Action.
     about : mapping
+        Arguments of the action.
     notify : callable
-        Called with the number of measurements that are done; what it raises ends the work.
+        Called with the number of processed measurements. An exception that it raises ends the work.
     """
     try:
         return _ORDERS[do](about, notify)
     except ErtisError as error:
         return {"error": " ".join(str(error).split())}
-    except (OSError, MemoryError) as error:  # they need not come another time
+    except (OSError, MemoryError) as error:  # These errors may be temporary.
         return {"error": _in_a_line(error), "by_chance": True}
 
 
 def _in_a_line(error: OSError | MemoryError) -> str:
-    """Return an error of the system with its remedy, with the final name of a file."""
+    """Return an error of the system in one line, with the final name of the file and a remedy."""
     if isinstance(error, OSError) and error.strerror and error.filename is not None:
         return f"{final_name(os.fsdecode(error.filename))}: {error.strerror}; {remedy(error)}"
     return " ".join(str(error).split()) or type(error).__name__
 
 
 def _look(about: Mapping[str, Any], _: ReportProgress) -> dict[str, Any]:
-    """Return the content of a recording, and its existing output."""
+    """Return sensors, settings and number of measurements of a recording, and a description of its existing output."""
     path = Path(about["path"])
     if not about["named"] and file_kind(path) == "energyscape":
         return {"passed_over": True}
@@ -85,7 +87,7 @@ def _plan(about: Mapping[str, Any], _: ReportProgress) -> dict[str, Any]:
         planned, device = pipeline.settings, pipeline.device
     with _turn:
         made = _kept.pop((settings.to_toml(), about["device"], threads), None)
-    if made is not None:  # it is asked for by its plan from now on
+    if made is not None:  # Later orders have the settings with the plan.
         _keep({(planned.to_toml(), about["device"], threads): made})
     return {"settings": planned.to_toml(), "device": device}
 
@@ -110,7 +112,7 @@ def _make(about: Mapping[str, Any], notify: ReportProgress) -> dict[str, Any]:
 
 
 def _check(about: Mapping[str, Any], _: ReportProgress) -> dict[str, Any]:
-    """Return the messages for a recording with existing energyscapes that processing would have given."""
+    """Return the warnings and results that processing would give, for a recording with an existing output."""
     options, how = _how(about)
     warnings: list[str] = []
     return {**checked(Path(about["path"]), options, warn=warnings.append, **how), "warnings": warnings}
@@ -139,19 +141,19 @@ def _pipelines(
 ) -> Iterator[list[Pipeline]]:
     """Yield a pipeline for each of the settings, reusing the previous recording's if the settings are the same.
 
-    Who uses one has it for itself. No more are kept than were used last, so that memory does not grow with the number
-    of recordings.
+    A pipeline has one user at a time. Only the pipelines of the last recording are kept, so that the memory does not
+    grow with the number of recordings.
     """
     keys: list[_Key] = [(each.to_toml(), device, threads) for each in settings]
     with _turn:
         found = {key: _kept.pop(key) for key in keys if key in _kept}
         spare = list(_kept.values())
         _kept.clear()
-    for each in spare:  # first, as there may be no room for both
+    for each in spare:  # Close them first: memory may not suffice for both.
         each.close()
     try:
         for key, given in zip(keys, settings, strict=True):
-            if key not in found:  # sensors that are alike share theirs
+            if key not in found:  # Sensors with the same settings share a pipeline.
                 found[key] = Pipeline(given, device=device, threads=threads, predict=False, plan=plan)
         yield [found[key] for key in keys]
     finally:

@@ -1,6 +1,6 @@
 """Worker process that runs orders from JSON lines: ``python -m ertis_numba.campaign.worker_process``.
 
-It ends at once when nobody gives orders any more.
+The process ends as soon as its input is closed.
 """
 
 import functools
@@ -37,12 +37,12 @@ class _Process:
         while True:
             order = self._orders.get()
             number, about = order["number"], order["about"]
-            self._emit_event(number)  # from now on it is its own fault if this process dies
+            self._emit_event(number)  # From now on, the order counts as the cause if this process ends.
             if order["do"] == "make":
                 self._target = Path(about["target"])
             try:
                 result = follow(order["do"], about, functools.partial(self._advance, number))
-            except Exception as error:  # noqa: BLE001  a mistake in one recording's way must not end the others'
+            except Exception as error:  # noqa: BLE001  an error in one recording must not affect others
                 text = f"{about.get('path', '')}: {type(error).__name__}: {' '.join(str(error).split())}"
                 result = {"error": text, "by_chance": True}
             self._target = None
@@ -60,7 +60,7 @@ class _Process:
     def _listen(self) -> None:
         for line in sys.stdin:
             self._orders.put(json.loads(line))
-        # Whoever gave orders is gone. What is half-written is of no use to the next one.
+        # The parent process has ended. Remove the half-written file, which no other process can use.
         if (target := self._target) is not None:
             with suppress(OSError):
                 clear_parts(target.parent, {target.name})
@@ -69,9 +69,9 @@ class _Process:
 
 def main() -> None:
     """Run orders from stdin, and print their results on stdout."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # it is the other process that says when to end
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # The parent process decides when to end.
     out = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # whatever else prints must not get between
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # Other output must not mix with the messages.
     _Process(out).run()
 
 

@@ -30,18 +30,20 @@ class Arrived:
     Attributes
     ----------
     sensor : str
+        Name of the sensor.
     block : Block
+        Received block.
     count : int
         Number of the measurement among those of this sensor: the number of the command, or else the sensor's own
         counter, without wrap-around.
     tick : int or None
         Number of the command, which all sensors share; None with SYNC pulses.
     skipped : int
-        Numbers that the sensor counted since the previous block, but whose blocks did not arrive.
+        Number of measurements that the sensor counted since the previous block, but that did not arrive; 0 by default.
     damaged : bool
-        True if blocks were rejected since the previous one.
+        True if blocks were rejected since the previous one; False by default.
     waited_s : float
-        Time since the previous block in which the reader waited for the disk.
+        Time in seconds that the reader waited for the disk since the previous block; 0 by default.
     """
 
     sensor: str
@@ -61,15 +63,15 @@ class MeasurementFailed:
     count: int
     tick: int
     reason: str
-    """Short reason for the recording."""
+    """Short reason, for the recording."""
 
     text: str
-    """Full reason for users."""
+    """Full message, for users."""
 
 
 @dataclass(frozen=True, slots=True)
 class Note:
-    """Note for users."""
+    """Message about a sensor, for users."""
 
     sensor: str
     text: str
@@ -84,7 +86,7 @@ class Restarted:
 
 @dataclass(frozen=True, slots=True)
 class Returned:
-    """A sensor was unplugged and is connected again."""
+    """A sensor is connected again, after it was unplugged."""
 
     sensor: str
     away_s: float
@@ -92,7 +94,7 @@ class Returned:
 
 @dataclass(frozen=True, slots=True)
 class SensorEnded:
-    """A sensor that delivers no more measurements."""
+    """A reader has ended; ``error`` is None unless its sensor has failed."""
 
     sensor: str
     error: Exception | None
@@ -108,8 +110,9 @@ class TriggerClock:
     Attributes
     ----------
     start_s : float
-        Time of the first tick, by `time.monotonic`.
+        Time of the first tick by `time.monotonic`, in seconds.
     rate_hz : float
+        Rate of ticks, in Hz.
     n : int, optional
         Number of measurements of each sensor.
     """
@@ -127,12 +130,13 @@ class SensorReader(threading.Thread):
     Parameters
     ----------
     sensor : str
+        Name of the sensor.
     sonar : SonarDriver
         Configured driver, armed if pulses trigger it.
     pace : TriggerClock, optional
         Times of commands; None with SYNC pulses.
     patience_s : float
-        Timeout for a silent or unplugged sensor.
+        Timeout for a silent or unplugged sensor, in seconds.
     events : queue.Queue
         Queue of all events; while it is full, the sensor waits.
     """
@@ -173,7 +177,7 @@ class SensorReader(threading.Thread):
                 self._listen()
             else:
                 self._command(self._pace)
-        except Exception as failure:  # noqa: BLE001  whatever it was, whoever waits for this thread must hear of it
+        except Exception as failure:  # noqa: BLE001  the session reports any error
             error = failure
         self._put(SensorEnded(self._sensor, error))
 
@@ -201,7 +205,7 @@ class SensorReader(threading.Thread):
                 return
 
     def _may_stop(self) -> bool:
-        """Return True if listening may stop: not within a measurement that still arrives or whose deadline passes."""
+        """Return True if listening may stop; a measurement in progress is received first, unless it is overdue."""
         return self._abandoned.is_set() or (self._stop_asked.is_set() and not self._sonar.receiver.missing)
 
     def _command(self, pace: TriggerClock) -> None:
@@ -229,7 +233,7 @@ class SensorReader(threading.Thread):
             tick = max(tick + 1, late)
 
     def _count_on(self, block: Block) -> int:
-        """Extend the sensor's own counter, and return the number of skipped counts."""
+        """Update the count from the sensor's own counter, and return the number of skipped measurements."""
         step = 1
         if self._counter is not None:
             step = (block.counter - self._counter) % COUNTERS

@@ -38,7 +38,7 @@ _GROUPS = 16  # Limit on open groups: sensors deliver simultaneous measurements 
 
 
 class Sink(Protocol):
-    """Destination that stores measurements durably, such as a `Journal`, or until another node has them."""
+    """Destination of measurements: a `Journal`, or a buffer that keeps them until another node has stored them."""
 
     def add_sensor(
         self,
@@ -52,10 +52,10 @@ class Sink(Protocol):
         """Register a sensor before its first measurement."""
 
     def append(self, entries: Sequence[Entry]) -> Sequence[Entry] | None:
-        """Store measurements; on return, all of them are durable, or those that it returns."""
+        """Store measurements; None means that all of them are stored, otherwise return the stored ones."""
 
     def note_gap(self, sensor: str, first: int, last: int, reason: str, *, session_id: int) -> None:
-        """Store missing numbers of a sensor with their reason."""
+        """Store why numbers of a sensor are missing, ``first`` and ``last`` included."""
 
 
 @dataclass(slots=True)
@@ -65,12 +65,13 @@ class CaptureCounts:
     Attributes
     ----------
     stored : int
-        Durable measurements.
+        Number of stored measurements.
     missing : Counter of str
-        Missing numbers, by reason.
+        Number of missing measurements, by reason.
     unplugged : int
+        Number of times that the sensor was unplugged.
     skipped : int
-        Skipped commands, because the sensor was still busy.
+        Number of commands that were skipped because the sensor was still busy.
     """
 
     stored: int = 0
@@ -78,7 +79,7 @@ class CaptureCounts:
     unplugged: int = 0
     skipped: int = 0
     times_s: deque[float] = field(default_factory=lambda: deque(maxlen=64))
-    """Times at which the latest were stored, by `time.monotonic`."""
+    """Times of the latest stored measurements by `time.monotonic`, in seconds."""
 
     @property
     def lost(self) -> int:
@@ -87,7 +88,7 @@ class CaptureCounts:
 
     @property
     def rate_hz(self) -> float:
-        """Recent rate of measurements per second."""
+        """Recent rate of stored measurements, in Hz."""
         now_s = time.monotonic()
         recent_s = [time_s for time_s in self.times_s if now_s - time_s < _RECENT_S]
         return (len(recent_s) - 1) / max(recent_s[-1] - recent_s[0], 1e-9) if len(recent_s) > 1 else 0.0
@@ -97,7 +98,7 @@ class CaptureCounts:
 class _Track:
     """Sequence numbers of one sensor."""
 
-    sequence: int | None = None  # Number of the latest stored or missing measurement.
+    sequence: int | None = None  # Number of the latest measurement, stored or missing.
     first_pulse: int | None = None
     tick: int = -1  # Number of the latest command.
     why: str = ""  # Reason for missing measurements, if known.
@@ -107,8 +108,8 @@ class _Track:
 class Session:
     """Capture session: receives measurements from sensors, stores them durably, and reports them.
 
-    Sequence numbers are those of the commands, or else of the pulses since the first: a missing number is a missing
-    measurement.
+    Sequence numbers are those of the commands to a sensor, or of the SYNC pulses since its first one. They start at 0,
+    and a missing number is a missing measurement.
 
     Parameters
     ----------
@@ -116,23 +117,25 @@ class Session:
         Configured drivers by their names in the recording. They are armed one after the other in this order, except
         passive ones.
     settings : Settings
-        Common settings.
+        Settings of all sensors.
     trigger : {"command", "sync"}
+        Source of triggers: commands of this session, or pulses of the SYNC chain.
     rate_hz : float
-        Rate of commands.
+        Rate of commands in Hz, by default 10.
     n : int, optional
         Number of measurements of each sensor, or of pulses; unlimited by default.
     duration_s : float, optional
+        Duration of the session in seconds; unlimited by default.
     patience_s : float
-        Timeout for a silent or unplugged sensor.
+        Timeout for a silent or unplugged sensor in seconds, by default 30.
     mounting : dict of str to (translation_m, rotation_xyzw), optional
-        Positions and orientations, as in `ertis_numba.journal.Journal.add_sensor`; unknown by default.
+        Mountings by name of the sensor, as in `ertis_numba.journal.Journal.add_sensor`; unknown by default.
     session_id : int, optional
         Identifier that distinguishes the sequence numbers of sessions; random by default.
     on_stored : callable, optional
         Called with the entries of each commit, once they are durable.
     on_note : callable, optional
-        Called with the sensor's name and a line.
+        Called with the sensor's name and a message about it.
     on_back : callable, optional
         Called with the sensor's name and the seconds that it was unplugged.
     on_tick : callable, optional
@@ -141,11 +144,12 @@ class Session:
     Attributes
     ----------
     counts : dict of str to CaptureCounts
+        Counts of each sensor.
     complete, incomplete : int
-        Number of pulses with measurements of all sensors, and of others.
+        Number of pulses with measurements of all sensors, and of some sensors only.
     """
 
-    def __init__(  # noqa: PLR0913  how to measure, when to end, and whom to tell
+    def __init__(  # noqa: PLR0913  trigger, limits and callbacks
         self,
         sonars: Mapping[str, SonarDriver],
         settings: Settings,
@@ -199,7 +203,7 @@ class Session:
         SonarError
             Sensors have failed permanently; the measurements of the others are stored.
         DataError
-            Nothing more can be stored; reported measurements are durable.
+            Further measurements cannot be stored; reported measurements are durable.
         """
         n_bytes = 4 * self._settings.recording.n_samples
         events: queue.Queue[Event] = queue.Queue(max(2, _WAITING_BYTES // n_bytes))
@@ -298,7 +302,7 @@ class Session:
         track.tick = tick
 
     def _begin_anew(self, sensor: str, why: str) -> list[tuple[Arrived, int]]:
-        """Return the held blocks of a sensor; its counter is compared with the others again."""
+        """Align the counter of a sensor with the others again, and return its held blocks."""
         self._tracks[sensor].why = why
         return self._pulses.forget(sensor)
 
@@ -329,7 +333,7 @@ class Session:
         self._on_stored(entries)
 
     def _entry(self, sink: Sink, event: Arrived, number: int) -> Entry | None:
-        """Return the entry of a block, None beyond the last pulse; note the missing numbers before it."""
+        """Return the entry of a block, None beyond the last pulse; store the gap before it."""
         track, block = self._tracks[event.sensor], event.block
         sequence = event.count
         if self._synced:
@@ -356,7 +360,7 @@ class Session:
         return Entry(measurement=measurement, monotonic_ns=block.arrived.monotonic_ns)
 
     def _miss_until(self, sink: Sink, sensor: str, stop: int, why: str) -> None:
-        """Note that the unstored numbers before a number are missing."""
+        """Store a gap for the missing numbers below ``stop``."""
         track = self._tracks[sensor]
         first = 0 if track.sequence is None else track.sequence + 1
         if first < stop:
@@ -381,7 +385,7 @@ class Session:
 
 
 def _all_of(events: "queue.Queue[Event]") -> list[Event]:
-    """Return arrived events, and those that arrive within a tenth of a second."""
+    """Wait up to 0.1 s for an event, and return all events that have arrived."""
     found: list[Event] = []
     try:
         found.append(events.get(timeout=0.1))

@@ -9,12 +9,12 @@ __all__ = ["SyncCounts"]
 
 Item = TypeVar("Item")
 
-_NEAR = 0.4  # Share of the interval between pulses: blocks within it belong to the same pulse.
-_PULSES = 64  # Number of kept pulses: some seconds.
-_VOTES = 3  # Number of blocks that decide an offset: one may be late because of a busy host or sensor.
-_HELD_S = 0.5  # Limit on the time that blocks wait for the decision.
-_DOUBTS = 5  # Number of successive contradicting blocks that change an offset …
-_DOUBTED_S = 5.0  # … and the limit on the time that they wait.
+_NEAR = 0.4  # Relative to the interval between pulses: closer blocks belong to the same pulse.
+_PULSES = 64  # Number of kept pulses, which span some seconds.
+_VOTES = 3  # Number of blocks that decide an offset; a busy host or sensor may delay one.
+_HELD_S = 0.5  # Limit on the time that blocks wait for this decision.
+_DOUBTS = 5  # Number of successive blocks that must contradict an offset before it changes.
+_DOUBTED_S = 5.0  # Limit on the time that these blocks wait.
 
 
 @dataclass(slots=True)
@@ -33,22 +33,22 @@ class _SensorPulses(Generic[Item]):
 class SyncCounts(Generic[Item]):
     """Assignment of pulse numbers to the blocks of several sensors.
 
-    Each sensor counts its own triggers. The counters differ by an offset: sensors are armed one after the other, and an
-    unplugged or busy sensor misses pulses. Offsets are found from the times of arrival: chained sensors measure within
-    microseconds, and pulses are at least 50 ms apart. Because a block may arrive late, the majority of three decides.
-    From then on the counter decides, until five successive blocks contradict the times of the other sensors.
+    Each sensor counts its own triggers. The counters differ by an offset, because sensors are armed one after the other
+    and an unplugged or busy sensor misses pulses. The times of arrival give the offsets: chained sensors measure within
+    microseconds, and pulses are at least 50 ms apart. A block may arrive late, so the majority of three blocks decides.
+    The offset then stays, until the times of five successive blocks contradict it.
 
     Parameters
     ----------
     sensors : list of str
         Sensors in the order in which they are armed: the first receives every pulse that any other receives.
     shortest_s : float
-        Minimum interval between pulses.
+        Minimum interval between pulses, in seconds.
 
     Attributes
     ----------
     realigned : int
-        Number of changed offsets.
+        Number of offsets that were changed.
     """
 
     def __init__(self, sensors: list[str], *, shortest_s: float) -> None:
@@ -74,12 +74,18 @@ class SyncCounts(Generic[Item]):
         Parameters
         ----------
         sensor : str
+            Name of the sensor.
         item : object
-            Object to return.
+            Block, or another object to return.
         counter : int
-            The sensor's own counter, without wrap-around.
+            Counter of the sensor, without wrap-around.
         arrived_ns : int
-            Time by a monotonic clock.
+            Time of arrival by a monotonic clock, in nanoseconds.
+
+        Returns
+        -------
+        list of tuple of object and int
+            Released blocks with the number of their pulse.
         """
         self._sensors[sensor].held.append(_Held(item, counter, arrived_ns))
         return self.release(arrived_ns)
@@ -140,7 +146,7 @@ class SyncCounts(Generic[Item]):
         return len(self._sensors) == 1
 
     def _voted(self, held: list[_Held[Item]], *, waited: bool) -> int | None:
-        """Return the offset with the most votes by time of arrival, None while it is too early."""
+        """Return the offset that most times of arrival support, None while there is no majority."""
         votes = Counter(
             number - each.counter
             for each in held
@@ -152,14 +158,14 @@ class SyncCounts(Generic[Item]):
         return offset if waited or 2 * count > len(held) else None
 
     def _number(self, arrived_ns: int, *, waited: bool) -> int | None:
-        """Return the pulse of a block by its time, None while it is unknown."""
+        """Return the pulse number that a time of arrival indicates, None while it is unknown."""
         number = min(self._pulses, key=lambda each: abs(self._pulses[each] - arrived_ns))
         away_ns = arrived_ns - self._pulses[number]
         if abs(away_ns) <= _NEAR * self.interval_ns:
             return number
         earlier = [each for each, time_ns in self._pulses.items() if time_ns <= arrived_ns]
         later = [each for each, time_ns in self._pulses.items() if time_ns > arrived_ns]
-        if earlier and later:  # No other sensor has delivered this pulse, but pulses before and after it.
+        if earlier and later:  # Other sensors have delivered pulses before and after it only.
             return self._between(max(earlier), min(later), arrived_ns)
         if later or waited or self._is_alone or all(state.offset is None for state in self._sensors.values()):
             return number + round(away_ns / self.interval_ns)  # The interval gives the number.
@@ -172,7 +178,7 @@ class SyncCounts(Generic[Item]):
         return min(max(first + round(share * (last - first)), first + 1), last - 1)
 
     def _agrees(self, held: _Held[Item], offset: int) -> bool:
-        """Return True if no other block's time contradicts an offset."""
+        """Return True unless another block of the same pulse contradicts an offset by its time."""
         known_ns = self._pulses.get(held.counter + offset)
         return known_ns is None or abs(held.arrived_ns - known_ns) <= self.interval_ns / 2
 

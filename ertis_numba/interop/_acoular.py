@@ -53,7 +53,7 @@ def read_acoular(path: Path) -> tuple[float, NDArray[Any], Settings | None]:
     Raises
     ------
     DataError
-        The file is not one of Acoular.
+        The file is not an Acoular file, or its data has another type or shape.
     """
     try:
         with h5py.File(path, "r") as file:

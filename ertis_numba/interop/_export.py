@@ -26,16 +26,16 @@ _FINDING = ("mounting", "top", "min_level_db")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Format:
-    """A format that can be written.
+    """Export format.
 
     Attributes
     ----------
     ending : str
-        Of the file.
+        Suffix of the file.
     holds : tuple of str
-        Names of what is in the file.
+        Names of the fields in the file.
     options : tuple of str
-        Of `export`, which other formats have no use for.
+        Options of `export` that apply to this format, but not to all formats. None by default.
     """
 
     ending: str
@@ -69,12 +69,12 @@ FORMATS: Final = {
 
 
 def format_of(path: str | Path, name: str | None = None) -> str:
-    """Return the name of the format to write: the given one, or by the suffix of the file.
+    """Return the name of the format to write: the given name, or that of the file's suffix.
 
     Raises
     ------
     ArgumentError
-        There is no such format.
+        The name or suffix is unknown.
     """
     if name is None:
         endings = {each.ending: known for known, each in FORMATS.items()}
@@ -90,7 +90,7 @@ def files_of(path: str | Path, name: str) -> tuple[Path, ...]:
     Raises
     ------
     ArgumentError
-        Both would be one.
+        Both files would have the same name.
     """
     if name != "acoular":
         return (Path(path),)
@@ -114,40 +114,52 @@ def export(
 ) -> tuple[Path, ...]:
     """Write energyscapes, or the signals of a measurement, for other programs.
 
-    Files appear complete, or not at all. ``docs/how-to/export.md`` has the formats, what each keeps, and where they are
-    defined.
+    A file appears complete, or not at all. ``docs/how-to/export.md`` describes the formats and their fields.
 
     Parameters
     ----------
     path : str or Path
+        Path of the file.
     items : iterable of Energyscape or of Measurement
-        Energyscapes, of several sensors where the format allows it; for ``acoular`` one measurement. ``mcap`` is
-        written as they come, and so is ``npz`` where they have a length; points of other formats are gathered first.
+        One measurement for ``acoular``, otherwise energyscapes. All formats except ``npz`` can contain several sensors.
+        ``mcap`` is written one image at a time, and so is ``npz`` if ``items`` has a length. Other formats collect all
+        points first.
     file_format : {"mcap", "ply", "pcd", "csv", "npz", "acoular"}, optional
-        By the ending of the path by default.
+        Name of the format; by default that of the suffix of ``path``.
     mounting : mapping of str to (translation_m, rotation_xyzw), optional
-        Where each sensor is on its platform, by its name, as for `RecordingWriter`; points of ``ply``, ``pcd`` and
-        ``csv`` are then in the frame of the platform, else in that of the sensor.
+        Mounting of each sensor on its platform, by name, as for `RecordingWriter`. Points of ``ply``, ``pcd`` and
+        ``csv`` are then in the platform frame, otherwise in the sensor frame.
     topics : collection of {"points", "image", "sonar_image"}, optional
-        What of each sensor goes into ``mcap``; all by default.
-    top, min_level_db : optional
-        Which points: see `ertis_numba.analysis.points.PointExtractor`, whose defaults hold.
+        Topics of each sensor in ``mcap``; all by default.
+    top : int, optional
+        Maximum number of points per image; the strongest 256 by default.
+    min_level_db : float, optional
+        Minimum level relative to the strongest point of the image; -20 dB by default.
     text : bool
-        ``ply`` and ``pcd`` as text.
+        Write ``ply`` and ``pcd`` as text.
     overwrite : bool
-        Replace files of these names.
+        Replace existing files.
 
     Returns
     -------
     tuple of Path
-        The files: one, for ``acoular`` also that of the array, with the ending ``.xml``.
+        Written files. For ``acoular``, the second file describes the array and has the suffix ``.xml``.
 
     Raises
     ------
     ArgumentError
-        There is nothing to write, the format cannot hold it, an option is not one of the format's, or a file exists.
+        There is nothing to write, the format does not support the items or an option, or a file exists.
     DataError
         The disk is full or cannot be written.
+
+    Examples
+    --------
+    >>> import ertis_numba as ertis
+    >>> with ertis.open_recording("reflectors.h5") as recording:
+    ...     images = list(ertis.Pipeline(recording.settings).process_many(recording))
+    >>> for path in ertis.export("points.csv", images, overwrite=True):
+    ...     print(path)
+    points.csv
     """
     if not isinstance(items, Iterable):
         raise ArgumentError(f"items is of type {type(items).__name__}; give a list of Energyscape")
@@ -183,7 +195,7 @@ def _require_options(name: str, given: Mapping[str, object]) -> None:
             *others, last = [other for other, each in FORMATS.items() if option in each.options]
             fitting = f"{', '.join(others)} or {last}" if others else last
             raise ArgumentError(
-                f"option {option!r} is given, which format {name!r} does not have; leave it out, or write {fitting}"
+                f"option {option!r} is given, but format {name!r} does not have it; leave it out, or write {fitting}"
             )
 
 

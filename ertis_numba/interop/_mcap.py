@@ -1,7 +1,7 @@
 """Energyscapes as an MCAP file of ROS 2 messages.
 
-MCAP: its specification and its registry (profile ``ros2``). Frames: REP 103, x forward, y left, z up, in metres and
-radians; REP 105, ``base_link`` for the platform.
+The files follow the MCAP specification and registry (profile ``ros2``). Frames follow REP 103 (x forward, y left, z up,
+in metres and radians) and REP 105 (``base_link`` for the platform).
 """
 
 import math
@@ -38,7 +38,7 @@ _HALF = math.sqrt(0.5)
 _SONAR_TURN = (_HALF, 0.0, _HALF, 0.0)
 """Frame of marine_acoustic_msgs relative to that of the sensor: z forward, x up, y right.
 
-Half a turn about their middle.
+The rotation is 180° about the bisector of the x and z axes.
 """
 _FLOAT32, _DTYPE_FLOAT32 = 7, 8  # Constants of PointField and of SonarImageData.
 _POINT_STEP = 16
@@ -65,12 +65,12 @@ def write_mcap(
     Raises
     ------
     ArgumentError
-        What writes MCAP is not installed, two sensors have one topic, a sensor has a name that is none of a frame, or a
-        time is beyond that of ROS 2.
+        The packages for MCAP are not installed, two sensors would share a topic, the name of a sensor is invalid, or a
+        time is outside the range of ROS 2.
     """
     with extra("ros", "format 'mcap' needs mcap and mcap-ros2-support"):
         from mcap.writer import Writer  # noqa: PLC0415  an extra
-        from mcap_ros2 import _dynamic  # noqa: F401, PLC0415  the same
+        from mcap_ros2 import _dynamic  # noqa: F401, PLC0415  an extra
     with path.open("wb") as file:
         writer: Any = Writer(file)  # The annotations of mcap are partial.
         writer.start(profile="ros2", library="ertis-numba")
@@ -90,7 +90,7 @@ class _Bag:
         self._pictures: dict[str, tuple[Energyscape, Picture]] = {}
 
     def write(self, images: Iterable[Energyscape]) -> None:
-        """Write all messages; the positions of sensors come last, when all sensors are known."""
+        """Write all messages; the transforms come last, because only then are all sensors known."""
         earliest: Stamp | None = None
         for image in images:
             stamp, sensor = image.stamp, image.stamp.sensor
@@ -120,7 +120,7 @@ class _Bag:
         if kind not in self._schemas:
             self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", schema(kind).encode())
         if topic not in self._channels:
-            # Late subscribers of /tf_static get nothing from a player that does not keep its messages.
+            # Late subscribers of /tf_static need messages that the player keeps (transient local).
             depth, durability = (1, _TRANSIENT_LOCAL) if topic == _STATIC else (10, _VOLATILE)
             profile = _PROFILE.format(depth=depth, durability=durability, forever=_FOREVER)
             self._channels[topic] = self._writer.register_channel(

@@ -2,7 +2,7 @@
 
 Fields, types and constants are those of ``common_interfaces`` and ``geometry2`` (both the same from Humble on),
 ``rcl_interfaces``, and of ``marine_msgs`` 2.1.0 of the Applied Physics Laboratory, University of Washington. They are
-written out here since a file carries the definitions of its messages, and neither needs ROS.
+included here because a file contains the definitions of its messages. Neither writer nor file needs ROS.
 """
 
 import functools
@@ -133,9 +133,9 @@ def _with_needed(name: str) -> list[str]:
 
 @functools.cache
 def encoder(name: str) -> Callable[[dict[str, Any]], bytes]:
-    """Return the CDR encoder of a message, as in ROS 2: a message is a dict."""
-    # The writer of mcap-ros2-support cannot give a topic the metadata that its profile requires, and its encoder
-    # has no public name.
+    """Return the encoder of a message to CDR, as in ROS 2; each message is a dict."""
+    # The writer of mcap-ros2-support cannot set the metadata of a topic that the ros2 profile requires, and its
+    # encoder has no public name.
     from mcap_ros2._dynamic import serialize_dynamic  # noqa: PLC0415  an extra
 
     return serialize_dynamic(name, schema(name))[name]

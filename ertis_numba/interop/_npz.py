@@ -1,6 +1,6 @@
 """Energyscapes as NPZ: a ZIP archive of NumPy arrays, readable without pickle.
 
-NEP 1, A simple file format for NumPy arrays; the format of `numpy.savez`.
+The files follow NEP 1 (A simple file format for NumPy arrays), like those of `numpy.savez`.
 """
 
 import itertools
@@ -22,14 +22,15 @@ _AXES = ("azimuth_rad", "elevation_rad", "range_m")
 
 
 def write_npz(path: Path, images: Iterable[Energyscape], count: int | None) -> None:
-    """Write the images of one sensor, as they arrive if their number is known.
+    """Write the images of one sensor; one at a time if ``count`` is given, otherwise collect them first.
 
-    Amplitudes are (time, direction, range). The axes, the stamps (time,), and sensor and settings as texts follow.
+    The amplitudes have the shape (time, direction, range), and the fields of the stamps (time,). The axes, and sensor
+    and settings as texts, follow.
 
     Raises
     ------
     ArgumentError
-        An image has another sensor, other axes or settings than the first, or their number differs from ``count``.
+        Sensor, axes or settings of an image differ from those of the first, or their number differs from ``count``.
     """
     if count is None:
         gathered = list(images)
@@ -72,8 +73,8 @@ def _require_same(image: Energyscape, first: Energyscape) -> None:
     for name in _AXES:
         if not np.array_equal(getattr(image, name), getattr(first, name)):
             raise ArgumentError(
-                f"measurement {image.stamp.sequence} has another {name} than the first, as in other air; export it to "
-                "its own npz (--measurement)"
+                f"measurement {image.stamp.sequence} has another {name} than the first, for example because of other "
+                "air; export it to its own npz (--measurement)"
             )
     if image.settings is not first.settings and image.settings != first.settings:
         raise ArgumentError(

@@ -14,7 +14,7 @@ __all__ = ["DYNAMIC_RANGE_DB", "Picture"]
 
 DYNAMIC_RANGE_DB = 40.0
 """Level relative to the strongest at which a pixel is black."""
-_MAX_PIXELS = 1000  # Along a side of a map.
+_MAX_PIXELS = 1000  # Limit along each side of a map.
 
 
 class Picture:

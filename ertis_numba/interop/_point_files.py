@@ -1,7 +1,7 @@
 """Points as PLY, PCD and CSV.
 
-PLY: G. Turk, The PLY Polygon File Format (1994). PCD: Point Cloud Library, The PCD (Point Cloud Data) file format,
-version 0.7. CSV: RFC 4180, but for the ends of lines.
+The files follow G. Turk, The PLY Polygon File Format (1994); Point Cloud Library, The PCD (Point Cloud Data) file
+format, version 0.7; and RFC 4180 for CSV, except that lines end with a line feed.
 """
 
 import csv
@@ -28,7 +28,7 @@ POINT_FIELDS: Final = {
     "sec": "<i4",
     "nanosec": "<u4",
 }
-"""Columns of each point in PLY and PCD. Neither has 64-bit integers that all readers know."""
+"""Fields of each point in PLY and PCD. Not all readers of these formats support 64-bit integers."""
 _PLY_TYPES = {"<f4": "float", "<u2": "ushort", "<u4": "uint", "<i4": "int"}
 CSV_COLUMNS: Final = {
     "sensor": "sensor",
@@ -53,7 +53,7 @@ def write_ply(path: Path, table: PointTable, *, text: bool) -> None:
     Raises
     ------
     ArgumentError
-        A number is beyond its type, or a sensor has a name that no header can hold.
+        A number exceeds its type, or the name of a sensor is invalid.
     """
     properties = [f"property {_PLY_TYPES[dtype]} {name}" for name, dtype in POINT_FIELDS.items()]
     head = [
@@ -73,7 +73,7 @@ def write_pcd(path: Path, table: PointTable, *, text: bool) -> None:
     Raises
     ------
     ArgumentError
-        A number is beyond its type, or a sensor has a name that no header can hold.
+        A number exceeds its type, or the name of a sensor is invalid.
     """
     kinds = [np.dtype(dtype) for dtype in POINT_FIELDS.values()]
     count = len(table.rows)
@@ -87,7 +87,7 @@ def write_pcd(path: Path, table: PointTable, *, text: bool) -> None:
         f"COUNT {' '.join('1' for _ in kinds)}",
         f"WIDTH {count}",
         "HEIGHT 1",
-        "VIEWPOINT 0 0 0 1 0 0 0",  # Points are in the given frame: a viewer would transform them by another viewpoint.
+        "VIEWPOINT 0 0 0 1 0 0 0",  # Identity: viewers transform the points by the viewpoint.
         f"POINTS {count}",
         f"DATA {'ascii' if text else 'binary'}",
     ]
@@ -106,7 +106,7 @@ def write_csv(path: Path, table: PointTable) -> None:
 
 
 def _about(table: PointTable) -> list[str]:
-    """Return the comments, each a word and its value: a name must not end a line of the header."""
+    """Return the comments of a header, each a key and its value; refuse names that would break a line."""
     numbered = [f"sensor {number} {checks.sensor_name(name)}" for number, name in enumerate(table.sensors)]
     return [_HEADING, f"frame {table.frame}", *numbered]
 
@@ -115,7 +115,7 @@ def _write(path: Path, head: list[str], rows: NDArray[np.void], *, text: bool) -
     with path.open("wb") as file:
         file.write("\n".join([*head, ""]).encode("ascii"))
         if text:
-            # NumPy writes the fewest digits that give the same float32.
+            # NumPy writes the shortest text that reads back as the same float32.
             columns = [rows[name].astype(str) for name in POINT_FIELDS]
             file.write("".join(f"{' '.join(row)}\n" for row in zip(*columns, strict=True)).encode("ascii"))
         else:

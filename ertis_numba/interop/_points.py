@@ -34,11 +34,11 @@ class PointTable:
     Attributes
     ----------
     rows : (point,) structured
-        x, y, z and their uncertainty in metres, intensity, number of the sensor, and the stamp of the measurement.
+        Position and uncertainty in metres, intensity, number of the sensor, and stamp of the measurement.
     sensors : tuple of str
         Names by number.
     frame : str
-        Frame of x, y and z: the platform's if the mountings are known, otherwise that of the only sensor.
+        Frame of the positions: the platform frame if mountings are known, otherwise the frame of the only sensor.
     """
 
     rows: NDArray[np.void]
@@ -52,7 +52,7 @@ class PointTable:
         Raises
         ------
         ArgumentError
-            There are several sensors with unknown mountings.
+            There are several sensors, and the mounting of one of them is unknown.
         """
         numbers: dict[str, int] = {}
         parts = [np.empty(0, _POINT)]
@@ -76,7 +76,7 @@ class PointTable:
         Raises
         ------
         ArgumentError
-            A number is beyond its type, or a time beyond that of ROS 2.
+            A number exceeds its type, or a time is outside the range of ROS 2.
         """
         made = np.empty(len(self.rows), np.dtype(list(dtypes.items())))
         times = self._ros_times() if {"sec", "nanosec"} & dtypes.keys() else {}
@@ -123,7 +123,7 @@ def ros_time(stamp: Stamp) -> tuple[int, int]:
     Raises
     ------
     ArgumentError
-        It lies before 1970 or after 2038.
+        The time is before 1970 or after 2038.
     """
     sec, nanosec = divmod(stamp.timestamp_ns, _NS)
     if not 0 <= sec <= _MAX_SEC:

@@ -1,4 +1,4 @@
-"""Multichannel PCM of arrays with sampled microphones: WAV, and HDF5 files of Acoular."""
+"""Multichannel PCM recordings of microphone arrays: WAV files, and HDF5 files of Acoular."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -27,7 +27,7 @@ _LARGEST = float(np.finfo(np.float32).max)
 
 @dataclass(frozen=True, slots=True)
 class _PcmFile:
-    """Header of a file."""
+    """Properties of a PCM file."""
 
     path: Path
     rate_hz: float
@@ -40,22 +40,23 @@ class _PcmFile:
 class PcmReader:
     """Reader of the measurements in PCM files, one file at a time.
 
-    The number of the measurement replaces the SYNC count, which such files lack. 8-bit and 16-bit numbers become int16,
-    all others float32 with its precision of 24 bits.
+    Such files contain no SYNC count, so it equals the number of the measurement. 8-bit and 16-bit samples become int16.
+    All others become float32, which represents 24-bit and single-precision samples exactly.
 
     Parameters
     ----------
     paths : sequence of Path
-        Of one rate and number of channels. Each holds one measurement, or several of ``length_s``.
+        Files with the same sample rate and number of channels. Each contains one measurement, or several of
+        ``length_s``.
     settings, sensor, skip_s, length_s, start_ns
         See `open_pcm`.
 
     Attributes
     ----------
     settings : Settings
-        With the recording that the files hold.
+        Settings of the measurements, with sample rate, length and encoding of the files.
     rest_s : float
-        What is left over at the ends of files.
+        Total duration of unused samples at the ends of the files, in seconds.
     """
 
     def __init__(
@@ -146,8 +147,8 @@ class PcmReader:
             ):
                 if came != wanted:
                     raise DataError(
-                        f"{file.path} has {_plain(came)} {name}, {first.path.name} {_plain(wanted)}; import each by "
-                        "itself"
+                        f"{file.path} has {_plain(came)} {name}, but {first.path.name} has {_plain(wanted)}; "
+                        "import each file separately"
                     )
 
 
@@ -167,29 +168,44 @@ def open_pcm(
     Parameters
     ----------
     paths : path or sequence of paths
-        All of one rate and number of channels; channel m is row m of the layout.
+        Files with the same sample rate and number of channels. Channel m is row m of the layout.
     settings : Settings, optional
-        Array, call, air, processing and accuracy; not needed for a file that `export` made, which holds them. The
-        recording is that of the files. A ``processing.range_decimation`` that leaves less than 1.8 ranges per second
-        and hertz of the call's bandwidth, as the default may, gives way to one that suits both, and the default
-        ``processing.range_m`` ends where the record does.
+        Array, call, air, processing and accuracy. Files that `export` wrote contain them. The files determine
+        ``recording``. If ``processing.range_decimation`` leaves fewer than 1.8 ranges per second and hertz of the
+        call's bandwidth, as the default may, a suitable value replaces it. The default ``processing.range_m`` ends at
+        the end of the record.
     sensor : str
-        Name to give to the sensor.
+        Name of the sensor.
     skip_s : float
-        When in each file the first emission begins.
+        Start of the first emission in each file, in seconds.
     length_s : float, optional
-        From one emission to the next, where files hold several; by default each holds one, as long as the shortest.
+        Interval between emissions in seconds, for files with several measurements. By default, each file contains one
+        measurement, with the length of the shortest file.
     start_ns : int
-        When the first emission was, in nanoseconds since 1970-01-01 UTC; 0 where it is not known. The others follow by
-        their lengths.
+        Time of the first emission, in nanoseconds since 1970-01-01 UTC; 0 if unknown. The times of the others follow
+        from the length of a measurement.
+
+    Returns
+    -------
+    PcmReader
+        Iterable of measurements with a length.
 
     Raises
     ------
     DataError
-        A file is missing, is of another kind, is shorter than a measurement, or differs from the first in rate or
-        channels; or it has another number of channels than the array.
+        A file is missing, has another format, is shorter than a measurement, or differs from the first in sample rate,
+        encoding or channels. The number of channels differs from that of the array, or the sample rate is too low for
+        the call.
     ArgumentError
-        The rate is too low for the call, or no settings are given nor in the file.
+        No file is given, a value is invalid, or neither the argument nor the file contains settings.
+
+    Examples
+    --------
+    >>> import ertis_numba as ertis
+    >>> with ertis.open_recording("reflectors.h5") as recording:
+    ...     files = ertis.export("signals.h5", [recording[0]], file_format="acoular", overwrite=True)
+    >>> len(ertis.open_pcm("signals.h5"))
+    1
     """
     several = [paths] if isinstance(paths, str | Path) else paths
     return PcmReader(
@@ -217,8 +233,8 @@ def _require_channels(first: _PcmFile, settings: Settings) -> None:
     if first.n_samples == wanted:
         raise DataError(f"{first.path} has {first.n_channels} channels of {wanted} samples; transpose it")
     raise DataError(
-        f"{first.path} has {first.n_channels} channels, array {layout.name!r} has {wanted}; give the layout of its "
-        "array, a row for each channel (--layout)"
+        f"{first.path} has {first.n_channels} channels, but array {layout.name!r} has {wanted}; give a layout with "
+        "one row for each channel (--layout)"
     )
 
 
@@ -278,7 +294,7 @@ def _words(file: _PcmFile, numbers: NDArray[Any], samples: slice, enabled: NDArr
         sample, channel = np.argwhere(broken & enabled)[0].tolist()
         came = numbers[sample, channel]
         raise DataError(
-            f"{file.path} holds {came:g} at sample {samples.start + sample} of channel {channel}; "
+            f"{file.path} contains {came:g} at sample {samples.start + sample} of channel {channel}; "
             + (f"give numbers up to {_LARGEST:.4g}" if np.isfinite(came) else "give finite numbers")
         )
     return words

@@ -19,7 +19,7 @@ _END = 2**63  # Limit of sequence numbers.
 class RawReader:
     """Reader of the measurements in raw files.
 
-    Such files have no time and no SYNC count: they are 0 and the number of the measurement.
+    Such files contain no time and no SYNC count. The time is 0, and the SYNC count is the number of the measurement.
 
     Parameters
     ----------
@@ -29,12 +29,14 @@ class RawReader:
         Settings that the files lack: array, call and length of a measurement.
     sensor : str
     first : sequence of int, optional
-        Sequence number of the first measurement of each file, rising; by default they are counted from 0.
+        Sequence number of the first measurement of each file, rising. By default, measurements are counted from 0.
 
     Raises
     ------
+    ArgumentError
+        No file is given.
     DataError
-        A file is missing, empty, contains incomplete measurements, or more than there are numbers.
+        A file is missing, empty, contains an incomplete measurement, or has more measurements than free numbers.
     """
 
     def __init__(
@@ -107,20 +109,34 @@ def _remedy(n_bytes: int, words: SampleFormat) -> str:
 
 
 def open_raw(paths: Sequence[str | Path] | str | Path, settings: Settings, *, sensor: str = "sensor") -> RawReader:
-    """Open raw files of whole measurements.
+    """Open raw files of complete measurements.
 
     Parameters
     ----------
     paths : path or sequence of paths
+        Files with one measurement or more each.
     settings : Settings
         Array, call and length of a measurement, such as ``Settings.from_preset("default_25_50")``.
     sensor : str
-        Name to give to the sensor.
+        Name of the sensor.
+
+    Returns
+    -------
+    RawReader
+        Iterable of measurements with a length.
 
     Raises
     ------
     DataError
-        A file is missing, empty, or holds no whole measurements.
+        A file is missing, empty, or contains an incomplete measurement.
+
+    Examples
+    --------
+    >>> import ertis_numba as ertis
+    >>> with ertis.open_recording("reflectors.h5") as recording:
+    ...     recording[0].data.tofile("raw.bin")
+    >>> len(ertis.open_raw("raw.bin", recording.settings))
+    1
     """
     several = [paths] if isinstance(paths, str | Path) else paths
     return RawReader([Path(path) for path in several], settings, sensor=sensor)

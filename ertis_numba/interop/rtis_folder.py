@@ -1,4 +1,4 @@
-"""Folders of RTIS Dev: a raw file for each measurement, and the settings as JSON."""
+"""Folders of RTIS Dev: one raw file per measurement, and the settings as JSON."""
 
 import json
 import math
@@ -35,13 +35,13 @@ _PROCESSING = (
     "elevationHighLimit",
 )
 _DUMPED = {"dacSampleFrequency": "callSampleFrequency", "nDirections": "directions"}
-"""Names in ``dict(RTISSettings)``, which users also write to JSON, by those in settings files."""
+"""Names in settings files, by the name in ``dict(RTISSettings)``, which users also write to JSON."""
 _AZIMUTHS, _ELEVATIONS = "directionsAzimuth", "directionsElevation"  # Radians, in dict(RTISSettings).
 _NOT_HELD = {
     "callCustom": "give --preset to process it as a sweep",
-    "directionsCustom": "take it out, and give --directions when processing",
-    "delayMatrixCustom": "take it out",
-    "rangesCustom": "take it out, and give --range when processing",
+    "directionsCustom": "remove it, and give --directions when processing",
+    "delayMatrixCustom": "remove it",
+    "rangesCustom": "remove it, and give --range when processing",
 }
 """Keys that name other files, with the remedy."""
 _KNOWN = {*_RECORDING, *_PROCESSING, *_DUMPED, *_NOT_HELD, "elevation2DAngle", _AZIMUTHS, _ELEVATIONS}
@@ -66,22 +66,39 @@ def open_rtis_folder(
     Parameters
     ----------
     folder : str or Path
+        Folder with ``.bin`` files, and settings in ``.json`` files.
     layout : str, optional
-        Array, in place of the one that the folder names.
+        Name of the array, instead of that in the folder.
     preset : str, optional
-        Length of a measurement and call, in place of those in the folder.
+        Preset for call and length of a measurement, instead of those in the folder.
     air : Air, optional
-        Standard air by default: nothing in the folder tells.
+        Air; standard air by default, because the folder contains no air data.
     sensor : str
-        Name to give to the sensor.
+        Name of the sensor.
+
+    Returns
+    -------
+    RawReader
+        Iterable of measurements with a length.
 
     Raises
     ------
     DataError
-        There are no measurements, their order is not known, or settings are missing, contradict each other or cannot be
-        held in a recording.
+        There are no measurements, or their order is unknown. Settings are missing, contradict each other, or cannot be
+        stored in a recording.
     ArgumentError
-        A setting has a value that cannot be used.
+        The value of a setting is invalid.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import ertis_numba as ertis
+    >>> Path("run").mkdir(exist_ok=True)
+    >>> with ertis.open_recording("reflectors.h5") as recording:
+    ...     recording[0].data.tofile("run/raw1.bin")
+    >>> reader = ertis.open_rtis_folder("run", layout=recording.settings.array.layout, preset="default_25_50")
+    >>> [measurement.stamp.sequence for measurement in reader]
+    [1]
     """
     folder = Path(folder)
     paths, first = _measurements(folder)
@@ -132,7 +149,7 @@ def _settings_in(folder: Path) -> dict[str, Any]:
         try:
             content = json.loads(path.read_text("utf-8-sig"))
         except (OSError, ValueError) as error:
-            raise DataError(f"{path}: {error}; give readable JSON, or take the file away") from error
+            raise DataError(f"{path}: {error}; give readable JSON, or remove the file") from error
         for key in _KNOWN & content.keys() if isinstance(content, dict) else ():
             name = _DUMPED.get(key, key)
             if name in reported and reported[name] != content[key]:
@@ -151,8 +168,8 @@ def _recorded(folder: Path, reported: dict[str, Any]) -> Settings:
     }
     if number["callEmissions"] != 1:
         raise DataError(
-            f"{folder}: callEmissions is {number['callEmissions']:g}, wanted 1, as an image shows one emission; give "
-            "--preset to take the first one"
+            f"{folder}: callEmissions is {number['callEmissions']:g}, but an image shows only 1 emission; give "
+            "--preset to use the first one"
         )
     call = Call(
         start_frequency_hz=number["callMaximumFrequency"],
@@ -174,8 +191,8 @@ def _processed(folder: Path, reported: dict[str, Any], standard: Processing) -> 
 
     if number("elevation2DAngle", 0.0):
         raise DataError(
-            f"{folder}: elevation2DAngle is {reported['elevation2DAngle']:g}, wanted 0; take it out, and give a CSV of "
-            "--directions when processing"
+            f"{folder}: elevation2DAngle is {reported['elevation2DAngle']:g}, but only 0 is supported; remove it, and "
+            "give a CSV of --directions when processing"
         )
     range_m = (number("minRange", standard.range_m[0]), number("maxRange", standard.range_m[1]))
     processing = standard.replace(range_m=range_m)
@@ -203,7 +220,7 @@ def _angles_rad(folder: Path, reported: dict[str, Any], name: str) -> list[float
     """Return the angles of all directions."""
     angles = reported[name]
     if not isinstance(angles, list) or not angles:
-        raise ArgumentError(f"{folder}: {name} is {angles!r}; give an angle for each direction, or take it out")
+        raise ArgumentError(f"{folder}: {name} is {angles!r}; give an angle for each direction, or remove it")
     return [checks.finite(f"{folder}: {name}", angle_rad) for angle_rad in angles]
 
 

@@ -90,12 +90,12 @@ class Contents:
         """Count the rows of the table; a difference from the index reveals damage to one of the two trees."""
         ((version,),) = self._database.execute("PRAGMA user_version")
         if version == COMPLETE_VERSION:
-            # Rows may have been deleted from the front, so that the first number is not always 1. Apart from that,
-            # one look at each end is enough.
+            # Rows may have been deleted from the front, so the first number is not always 1. There are no other
+            # holes, so the first and the last number give the count.
             rows = self._database.execute(
                 "SELECT ifnull((SELECT max(id) FROM measurements) - (SELECT min(id) FROM measurements) + 1, 0)"
             )
-        else:  # The numbers have holes, so every page of the table is read, without the samples.
+        else:  # The numbers have holes, so this reads every page of the table except the samples.
             try:
                 rows = self._database.execute("SELECT count(*) FROM measurements NOT INDEXED")
             except DamagedError:  # Some pages are damaged. Reading their rows reports it, and the others are sound.
@@ -167,7 +167,7 @@ class Contents:
         return JournalKey(rows[0][0], sensor, session_id, sequence)
 
     def entry(self, key: JournalKey) -> Entry:
-        """Return a measurement, whose data is read-only.
+        """Return a measurement with read-only data.
 
         Raises
         ------

@@ -45,37 +45,38 @@ _REPORTED: Final = {
 
 
 class Database:
-    """SQLite file with the tables of a journal, which no other process can open meanwhile.
+    """SQLite file with the tables of a journal, locked against other processes.
 
-    SQLite holds a lock of the operating system on the file, which ends with the process.
+    The lock belongs to the operating system. It ends with the process, even after a crash.
 
     Parameters
     ----------
     path : Path
-        Existing file. An empty file gets its tables if ``empty`` is set.
+        Existing file.
     empty : bool
+        Accept an empty file, which then becomes a new journal.
 
     Attributes
     ----------
     is_new : bool
-        The file was empty.
+        True if the file was empty.
     """
 
     def __init__(self, path: Path, *, empty: bool) -> None:
         self._path = path
-        self._writes_once = False  # As far as is known.
-        self._is_log_named = False  # True once the name of the written log is durable in its folder.
+        self._writes_once = False  # An existing file may already use a rollback journal.
+        self._is_log_named = False  # True once the folder durably contains the name of the log.
         self._is_folder_synced = True
-        self._ends: dict[str, int] = {}  # Ends of the tables before a commit, until its result is known.
+        self._ends: dict[str, int] = {}  # Highest row numbers before a commit whose result is unknown.
         with self._reported():
             self._file = before = path.stat()
             if not before.st_size and not empty:  # Locking would turn it into a database.
                 raise DataError(f"{path} is empty; give a journal left by 'ertis capture'")
-            for log, least_bytes in _smallest(path):  # SQLite would discard the log, or fill the rest with zeros.
+            for log, least_bytes in _smallest(path):  # SQLite would discard the log, or pad with zeros.
                 if before.st_size < least_bytes:
                     raise DamagedError(
-                        f"{path} has {before.st_size} bytes, too few to go with its log {log.name}: it was cut short; "
-                        "copy both again"
+                        f"{path} has {before.st_size} bytes, but its log {log.name} needs at least {least_bytes}: "
+                        "it was truncated; copy both again"
                     )
             uri = f"file:{quote(os.fsencode(path.absolute()))}?mode=rw"
             # Callers ensure that only one thread uses a journal at a time.
@@ -89,7 +90,7 @@ class Database:
             raise
 
     def _take(self, before: os.stat_result, *, empty: bool) -> bool:
-        """Lock the file, and identify it before anything in it changes."""
+        """Lock the file, and check its format before anything in it changes; return True for a new journal."""
         self.execute(f"PRAGMA page_size = {PAGE_BYTES}")
         self.execute("PRAGMA locking_mode = EXCLUSIVE")
         self.execute("BEGIN EXCLUSIVE")
@@ -143,9 +144,9 @@ class Database:
     def write_once(self) -> None:
         """Switch to a rollback journal permanently, so that commits write to the main file at once.
 
-        Before, commits write to the log with one sync, and a full log is moved to the main file. If each commit fills
-        the log, all data is written twice. A rollback journal keeps the old content of changed pages; new rows take new
-        pages, whose content need not be kept. A commit then takes four syncs.
+        Until then, a commit writes to the log with one sync, and a full log is moved to the main file. If each commit
+        fills the log, all data is written twice. A rollback journal stores only the old content of changed pages. New
+        rows use new pages without old content. A commit then needs four syncs.
 
         Raises
         ------
@@ -161,19 +162,19 @@ class Database:
     def _roll_back_by(self, mode: str) -> None:
         """Switch to a rollback journal.
 
-        Commits leave it with a void header, because no other process can open the file. DELETE
-        removes it by name when the file is closed.
+        A commit invalidates its header instead of removing it, because no other process can open the file. With
+        DELETE, it is removed by name when the file is closed.
         """
         if self.execute(f"PRAGMA journal_mode = {mode}") != [(mode.lower(),)]:
             raise DataError(f"{self._path} cannot switch from its log; close it, and try again")
 
     def require_name(self) -> None:
-        """Refuse to continue with a file that has lost its name, because new data could not be found again.
+        """Refuse to continue if the path no longer leads to the open file, because new data would be lost.
 
         Raises
         ------
         JournalInUseError
-            The file has lost its name.
+            The file was removed or replaced.
         """
         self._require_there(self._file)
 
@@ -187,7 +188,7 @@ class Database:
         return True
 
     def _require_there(self, before: os.stat_result) -> None:
-        """Refuse a file that has lost its name: the process that had locked it may have sealed and removed it."""
+        """Refuse a removed or replaced file: the process that had locked it may have sealed it."""
         now = self._path.stat() if self._path.exists() else None
         if now is None or (now.st_dev, now.st_ino) != (before.st_dev, before.st_ino):
             raise JournalInUseError(f"{self._path} was removed or replaced by another process; check the folder again")
@@ -209,7 +210,7 @@ class Database:
 
     @contextmanager
     def transaction(self) -> Iterator[None]:
-        """Make the block's changes durable at its end, all or none; after an error, no row was added."""
+        """Make the changes of the block durable at its end, all or none; an error adds no row."""
         self._sync_folder()
         self._withdraw()
         with self._all_or_nothing():
@@ -243,7 +244,7 @@ class Database:
         return dict(zip(tables, ends, strict=True))
 
     def _withdraw(self) -> None:
-        """Delete the rows of a commit that failed in its very last step, when all was written."""
+        """Delete the rows of a failed commit, whose last step may fail after all rows were written."""
         if ends := self._ends:
             self._ends = {}
             try:
@@ -260,9 +261,9 @@ class Database:
             self.execute(statement)
 
     def copy_to(self, path: Path) -> None:
-        """Copy the present pages of the file.
+        """Copy the current pages of the file.
 
-        The file is not opened a second time: POSIX releases a lock when the process closes any descriptor of the file.
+        The open connection makes the copy. A second descriptor would release the lock when it is closed (POSIX).
 
         Raises
         ------
@@ -279,14 +280,14 @@ class Database:
     def leave_log(self) -> None:
         """Move everything to the main file and remove the log, so that closing touches no file by name.
 
-        Only closing may follow: an interrupted commit could not be rolled back any more.
+        Only `close` may follow, because an interrupted commit could no longer be rolled back.
 
         Raises
         ------
         DataError
             The disk is full or fails. The log stays.
         """
-        for statement in ("BEGIN IMMEDIATE", "COMMIT"):  # This rolls back the remains of a failed disk.
+        for statement in ("BEGIN IMMEDIATE", "COMMIT"):  # They roll back a commit that a disk error has interrupted.
             self.execute(statement)
         self._roll_back_by("PERSIST")
         beside(self._path, "-journal").unlink(missing_ok=True)
@@ -297,12 +298,12 @@ class Database:
 
     @contextmanager
     def _reported(self) -> Iterator[None]:
-        """Raise errors in the form of this package, in a line with the name of the file."""
+        """Raise errors of SQLite as errors of this package, in one line with the name of the file."""
         try:
             yield
         except sqlite3.Error as error:
             code = getattr(error, "sqlite_errorcode", None)
-            if code is None:  # Errors of Python's own module have no code.
+            if code is None:  # Errors of the Python module have no code.
                 if "closed" in str(error):
                     raise DataError(f"{self._path} is closed; open it again") from error
                 if isinstance(error, sqlite3.ProgrammingError | sqlite3.InterfaceError):

@@ -12,8 +12,8 @@ from ertis_numba.journal._tally import TALLY
 
 __all__ = ["LOGS", "beside", "disk_errors", "free_name", "keep_damaged_log", "rename_orphans", "unlink_all"]
 
-LOGS: Final = ("-wal", "-journal")  # Files that SQLite may leave when it is killed, and that may contain data.
-_NOTES: Final = ("-shm", TALLY, LIMIT)  # Files without meaning if the journal is gone.
+LOGS: Final = ("-wal", "-journal")  # A killed process may leave these files with data.
+_NOTES: Final = ("-shm", TALLY, LIMIT)  # Files without use once the journal is removed.
 
 
 def beside(path: Path, end: str) -> Path:
@@ -31,16 +31,16 @@ def free_name(path: Path, end: str) -> Path:
 
 
 def keep_damaged_log(path: Path, content: bytes) -> Path | None:
-    """Keep a copy of a damaged log; return its path, or None if there is one with the same content.
+    """Keep a copy of a damaged log; return its path, or None if a copy with the same content exists.
 
-    Earlier copies stay: they may contain the only data of other measurements.
+    Earlier copies stay, because they may contain the only data of other measurements.
 
     Parameters
     ----------
     path : Path
-        Of the journal.
+        Path of the journal.
     content : bytes
-        Of its log.
+        Content of its log.
 
     Raises
     ------
@@ -74,7 +74,7 @@ def unlink_all(path: Path) -> None:
 
 
 def rename_orphans(path: Path) -> str:
-    """Rename logs of an earlier journal with this name, and return their names as one line."""
+    """Rename logs of an earlier journal with this name, and return a line about them."""
     for end in _NOTES:
         beside(path, end).unlink(missing_ok=True)
     moved = []

@@ -31,14 +31,15 @@ class Journal(Rows):
     Attributes
     ----------
     path : Path
+        Path of the journal.
     target : Path
-        Recording to be made of it.
+        Path of the recording to be made from it.
     source : str
         Origin of the measurements.
     tally : Tally
         Highest stored numbers.
     remark : str
-        Files that `create` has renamed; empty if there were none.
+        Line about files that `create` has renamed; empty if there were none.
     """
 
     def __init__(self, path: Path, database: Database) -> None:
@@ -57,18 +58,18 @@ class Journal(Rows):
         Parameters
         ----------
         path : str or Path
-            By convention the name of the recording with `SUFFIX`, beside it.
+            Path of the journal. By convention, it is the path of the recording followed by `SUFFIX`.
         target : str or Path
-            Recording to be made of it; a relative path counts from the folder of the journal.
+            Path of the recording to be made from it. A relative path starts at the folder of the journal.
         source : str
             Origin of the measurements.
 
         Raises
         ------
         ArgumentError
-            A journal exists already.
+            The path exists already.
         DataError
-            The journal is not writable.
+            The journal cannot be written.
         """
         path = Path(path)
         try:
@@ -100,17 +101,17 @@ class Journal(Rows):
         Raises
         ------
         JournalInUseError
-            Another process has it open.
+            Another process has the journal open.
         DataError
-            It does not exist, is damaged, or not writable.
+            The journal does not exist, is damaged, or is not writable.
         FormatVersionError
-            A newer version wrote it.
+            A newer version of this package wrote the journal.
         """
         path = Path(path)
         log = read_log(path)
         if log is not None and log.is_cut:
             choose_log(path, log)
-        # A process that is killed right after it created the file leaves an empty one, or one without tables.
+        # A process that is killed just after it created the file leaves it empty or without tables.
         opened = cls(path, Database(path, empty=path.name.endswith(SUFFIX)))
         try:
             is_new = opened._database.is_new
@@ -137,15 +138,16 @@ class Journal(Rows):
     def abandon(path: str | Path, acked: Mapping[tuple[str, int], int]) -> None:
         """Limit a closed journal durably to its acknowledged measurements.
 
-        After a failed sync, a journal may show rows that never reach the disk. Close the journal, give it up, and store
+        After a failed sync, a journal may show rows that never reach the disk. Close the journal, abandon it, and store
         the rows that were not acknowledged in another journal. The next process that opens this journal deletes those
         rows first, so that none is stored twice. A journal without acknowledged measurements is removed.
 
         Parameters
         ----------
         path : str or Path
-        acked : mapping of (sensor, epoch) to int
-            Highest acknowledged number of each run that has one.
+            Path of the journal.
+        acked : mapping of (sensor, session_id) to int
+            Highest acknowledged number of each session that has one.
 
         Raises
         ------
@@ -192,7 +194,7 @@ class Journal(Rows):
         Parameters
         ----------
         header : sequence
-            Columns of the table ``journal``, without the first and the last.
+            Columns of the table ``journal``, except the first and the last.
 
         Raises
         ------
@@ -214,7 +216,7 @@ class Journal(Rows):
         Raises
         ------
         DataError
-            The disk fails. What was appended is still there.
+            The disk fails. The stored measurements are safe.
         """
         with self._turn:
             self._database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
@@ -233,14 +235,12 @@ class Journal(Rows):
             fsync(self.path.parent)
 
     def set_aside(self, end: str = "damaged") -> Path:
-        """Close the journal and rename it with the suffix ``.damaged``, which is never sealed again.
-
-        Return the new path.
+        """Close the journal, rename it so that it is never sealed again, and return its new path.
 
         Parameters
         ----------
         end : str
-            Another suffix.
+            New suffix without its dot, by default ``damaged``.
 
         Raises
         ------

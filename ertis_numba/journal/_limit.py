@@ -1,7 +1,7 @@
 """Limit of a journal that has failed: the numbers up to which its measurements were acknowledged.
 
 After a failed sync, the system may show rows that never reach the disk. The central node stores them again in another
-journal. The limit, a small file beside the journal, prevents that they are stored twice.
+journal. The limit, a small file beside the failed journal, excludes them from it, so that none is stored twice.
 """
 
 import json
@@ -25,9 +25,9 @@ def note_limit(path: Path, acked: Mapping[tuple[str, int], int]) -> None:
     Parameters
     ----------
     path : Path
-        Of the journal.
-    acked : mapping of (sensor, epoch) to int
-        Highest acknowledged number of each run; of other runs, nothing was acknowledged.
+        Path of the journal.
+    acked : mapping of (sensor, session_id) to int
+        Highest acknowledged number of each session. No number of other sessions was acknowledged.
 
     Raises
     ------
@@ -46,7 +46,7 @@ def limit_of(path: Path) -> dict[tuple[str, int], int] | None:
     Raises
     ------
     DamagedError
-        The file is not what was written.
+        The file does not match its checksum.
     DataError
         The file cannot be read.
     """

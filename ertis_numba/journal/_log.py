@@ -33,12 +33,13 @@ class WriteAheadLog:
     Attributes
     ----------
     content : bytes
+        Content of the file.
     n_read : int
-        Frames that SQLite reads: up to the last commit before the first wrong checksum.
+        Number of frames that SQLite reads, up to the last commit before the first wrong checksum.
     n_frames : int
-        Frames up to the last commit of this generation of the log, wherever that is.
+        Number of frames up to the last commit of this generation of the log.
     n_lost_commits : int
-        Commits that SQLite will not read although they were synced; the last one of a log never counts.
+        Number of commits that SQLite will not read although they were synced. The last commit of a log never counts.
     """
 
     content: bytes
@@ -55,7 +56,7 @@ class WriteAheadLog:
 
     @property
     def repaired(self) -> bytes:
-        """Copy of the log with checksums of its present content, so that SQLite reads all of it."""
+        """Copy of the log with new checksums, so that SQLite reads all frames."""
         big_endian, page_bytes = _format(self.content)
         frame_bytes = _FRAME.size + page_bytes
         salts = self.content[16:24]
@@ -70,7 +71,7 @@ class WriteAheadLog:
 
 
 def read_log(path: Path) -> WriteAheadLog | None:
-    """Return the write-ahead log beside a journal; None if there is none, or none that SQLite could have written."""
+    """Return the write-ahead log of a journal; None if it does not exist, or if SQLite cannot have written it."""
     try:
         content = path.with_name(f"{path.name}-wal").read_bytes()
     except OSError:
@@ -137,7 +138,7 @@ def _header_check(header: bytes, *, big_endian: bool) -> bytes:
 
 
 def _format(content: bytes) -> tuple[bool, int]:
-    """Return True if checksums read big-endian words, and the size of a page; the size is 0 if this is no log."""
+    """Return True if checksums read big-endian words, and the page size, which is 0 if this is not a log."""
     if len(content) < _HEADER_BYTES:
         return False, 0
     magic, _, page_bytes = struct.unpack_from(">3I", content)
@@ -154,8 +155,8 @@ def _words(frames: bytes, *, big_endian: bool, page_bytes: int) -> NDArray[np.ui
 def _sums(words: NDArray[np.uint32]) -> NDArray[np.uint32]:
     """Return the checksum of each row of words, starting from zero.
 
-    For each pair of words x, y, SQLite takes s ← s + x + t and t ← t + y + s, modulo 2³²: a linear step, so that each
-    pair adds a multiple of itself to the end.
+    For each pair of words x, y, SQLite computes s ← s + x + t and t ← t + y + s, modulo 2³². This step is linear, so
+    each pair contributes a multiple of itself to the result.
     """
     even, odd = words[:, 0::2], words[:, 1::2]
     low, middle, high = _steps(even.shape[1])
@@ -174,7 +175,7 @@ def _advance(check: NDArray[np.uint32], n_pairs: int) -> NDArray[np.uint32]:
 
 @cache
 def _steps(n_pairs: int) -> tuple[NDArray[np.uint32], NDArray[np.uint32], NDArray[np.uint32]]:
-    """Return the powers 0, 1, … of the matrix [[1, 1], [1, 2]]: its three different elements."""
+    """Return the three distinct elements of the powers 0, 1, … of the matrix [[1, 1], [1, 2]]."""
     powers = np.empty((3, n_pairs), np.uint32)
     low, middle, high = 1, 0, 1
     for place in range(n_pairs):

@@ -1,7 +1,7 @@
-"""Choice of the log that a journal with a damaged log is opened with, made on copies.
+"""Choice of a log with which a journal with a damaged log can be opened, tried on copies.
 
-SQLite replays a log up to the first damaged frame. If later frames had been moved to the main file already, that
-puts old pages over new ones and ruins the main file. So copies are opened first.
+SQLite replays a log up to the first damaged frame. If later frames are already in the main file, the replay overwrites
+new pages with old ones and damages the main file. Copies are therefore opened first.
 """
 
 import os
@@ -29,22 +29,23 @@ _LOCK_BYTES: Final = (0x40000000, 512)  # Lock bytes of SQLite, see https://sqli
 
 
 def choose_log(path: Path, log: WriteAheadLog) -> None:
-    """Replace a damaged log that would ruin its journal, and keep the damaged one beside it.
+    """Replace a damaged log that would damage its journal, and keep a copy of it.
 
-    The log stays if the journal is sound with the part that SQLite reads. Otherwise the log is repaired, so that all
-    of it is read, or taken away, whichever leaves a sound journal. A journal that another process uses is left alone.
+    The log stays if the journal is intact with the part that SQLite reads. Otherwise it is replaced by a repaired log,
+    which SQLite reads completely, or removed, whichever gives an intact journal. A journal that another process has
+    open is not changed.
 
     Parameters
     ----------
     path : Path
-        Of the journal.
-    log : Log
-        As it is on the disk.
+        Path of the journal.
+    log : WriteAheadLog
+        Log on the disk.
 
     Raises
     ------
     DamagedError
-        The journal is sound with neither. Nothing has changed.
+        The journal is intact with none of these logs. Nothing has changed.
     DataError
         The disk is full or fails. Nothing has changed.
     """
@@ -56,11 +57,11 @@ def choose_log(path: Path, log: WriteAheadLog) -> None:
             if chosen is not log.content:
                 _install(path, log.content, chosen)
         except OSError as error:
-            raise DataError(f"{path}: {error.strerror}; make room for a copy of it, as its log is damaged") from error
+            raise DataError(f"{path}: {error.strerror}; free space for a copy, because its log is damaged") from error
 
 
 def _sound(path: Path, log: WriteAheadLog) -> bytes:
-    """Return the first content of the log with which a copy of the journal is sound."""
+    """Return the first content of the log with which a copy of the journal is intact."""
     with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
         copy = Path(folder) / path.name
         for content in (log.content, log.repaired, b""):
@@ -88,7 +89,7 @@ def _install(path: Path, damaged: bytes, chosen: bytes) -> None:
 
 @contextmanager
 def _unused(path: Path) -> Iterator[bool]:
-    """Yield whether no other process has the journal open, and keep others out meanwhile."""
+    """Lock the journal during the block; yield False if another process has it open."""
     with path.open("r+b") as file:
         if fcntl is not None:
             first, count = _LOCK_BYTES

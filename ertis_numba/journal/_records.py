@@ -20,8 +20,8 @@ from ertis_numba.settings import Air, Settings
 __all__ = ["Entry", "JournalGap", "JournalKey", "JournalSensor", "checked", "require_same"]
 
 _INT64 = (-(2**63), 2**63 - 1)
-_UNKNOWN = 7 * (0.0,)  # Represents an unknown mounting: translation, and a rotation that no mounting has.
-_MAX_BYTES = 999_000_000  # Limit on one measurement: SQLite's limit, minus the rest of the row.
+_UNKNOWN = 7 * (0.0,)  # Unknown mounting: translation, and a rotation that no mounting has.
+_MAX_BYTES = 999_000_000  # Limit on one measurement: the limit of SQLite, with a margin for the rest of the row.
 
 
 @dataclass(slots=True, eq=False)
@@ -34,9 +34,9 @@ class Entry:
         Sensor, session_id and sequence number are the key. Choose a random session_id whenever sequence numbers
         restart.
     monotonic_ns : int
-        Time of arrival, by a monotonic clock.
+        Time of arrival by a monotonic clock, in nanoseconds.
     crc32 : int, optional
-        CRC-32 of the data, little-endian; `Journal.append` fills it in if it is not given.
+        CRC-32 of the little-endian data. `Journal.append` computes it if it is None, the default.
     """
 
     measurement: Measurement
@@ -76,12 +76,13 @@ class JournalSensor:
     ----------
     name : str
     settings : Settings
-        They depend on no file.
+        Settings of the measurements, independent of other files.
     firmware : str
+        Version of the firmware.
     translation_m : (x, y, z), or None
-        Position; None if its mounting is unknown.
+        Position on the platform, in metres; None if the mounting is unknown.
     rotation_xyzw : (x, y, z, w), or None
-        Unit quaternion that rotates the sensor frame into the frame of the surroundings.
+        Unit quaternion that rotates the sensor frame into the platform frame; None if the mounting is unknown.
     shape : tuple of int
         Shape of a measurement's data.
     dtype : dtype
@@ -212,7 +213,7 @@ class JournalSensor:
 
 
 def checked(path: Path, what: str, row: Sequence[Any]) -> list[Any]:
-    """Return the values of a row without its number and its CRC-32, after a check of the CRC-32."""
+    """Check the CRC-32 of a row, and return its values without number and CRC-32."""
     _, *values, wanted = row
     got = row_crc32(values)
     if got != wanted:

@@ -1,4 +1,4 @@
-"""Rescue of a journal with a damaged log: later commits are read from a repaired copy; lost numbers become gaps."""
+"""Recovery of a journal with a damaged log: a repaired copy gives later commits, and lost numbers become gaps."""
 
 import shutil
 import tempfile
@@ -23,16 +23,17 @@ __all__ = ["LOST", "rescue"]
 LOST: Final = "lost in a damaged journal"
 """Reason of a gap for numbers that the journal had noted before its log was damaged.
 
-The journal held the last of these numbers. The others may be of stored measurements, of gaps, or skipped by the sensor.
+The journal contained the last of these numbers. The others may belong to stored measurements or gaps, or may have been
+skipped by the sensor.
 """
 
 
 @dataclass(slots=True)
 class _Found:
-    """Rows of a repaired copy that the journal does not have.
+    """Rows of a repaired copy that the journal lacks.
 
-    ``lost`` has the measurements with a sound record and damaged words. ``n_unreadable`` counts all other damaged ones.
-    ``is_complete`` means that the numbers of all rows can be read, and that the order of arrival has no holes.
+    ``lost`` contains measurements with intact record and damaged samples. ``n_unreadable`` counts all other damaged
+    ones. ``is_complete`` is True if all rows have readable numbers without holes in the order of arrival.
     """
 
     header: list[Any] = field(default_factory=list)
@@ -50,11 +51,11 @@ def rescue(journal: "Journal", database: Database, log: WriteAheadLog | None) ->
     Parameters
     ----------
     journal : Journal
-        Open; its tally is read.
+        Open journal, with its tally.
     database : Database
-        Of the journal.
-    log : Log or None
-        As it was before the journal was opened.
+        Database of the journal.
+    log : WriteAheadLog or None
+        Log before the journal was opened.
 
     Returns
     -------
@@ -64,7 +65,7 @@ def rescue(journal: "Journal", database: Database, log: WriteAheadLog | None) ->
     n_commits = log.n_lost_commits if log is not None else 0
     try:
         missing = list(_missing(journal))
-    except DamagedError:  # A damaged record of a gap prevents sealing.
+    except DamagedError:  # The record of a gap is damaged, which prevents sealing anyway.
         return ""
     if not n_commits and not missing:
         return ""
@@ -80,16 +81,15 @@ def rescue(journal: "Journal", database: Database, log: WriteAheadLog | None) ->
     if found is not None:
         unrecorded += _note(journal, found.lost)
     is_complete = found is not None and found.is_complete
-    unrecorded += _note(
-        journal, _missing(journal) if is_complete else missing
-    )  # Otherwise numbers skipped by the sensor would be lost.
+    # If all rows were recovered, the numbers between them were skipped by the sensor and are not lost.
+    unrecorded += _note(journal, _missing(journal) if is_complete else missing)
     if kept and not (unrecorded or missing or found is None or found.entries or found.gaps or found.lost):
-        kept.unlink(missing_ok=True)  # Only rows that were deleted meanwhile are missing.
+        kept.unlink(missing_ok=True)  # The log contains only rows that were deleted afterwards.
     return "; ".join(unrecorded)
 
 
 def _note(journal: "Journal", gaps: Iterable[JournalGap]) -> list[str]:
-    """Note lost numbers as gaps, and return the losses of sensors that the journal does not have."""
+    """Note lost numbers as gaps, and return the losses of sensors that the journal does not contain."""
     unrecorded = []
     for gap in list(gaps):
         if gap.sensor in journal.sensors:
@@ -100,7 +100,7 @@ def _note(journal: "Journal", gaps: Iterable[JournalGap]) -> list[str]:
 
 
 def _held(journal: "Journal") -> Iterator[tuple[tuple[str, int], int, int]]:
-    """Yield the numbers that a journal holds or lists as gaps: run, first and last number."""
+    """Yield the numbers of measurements and gaps in a journal: session, first and last number."""
     for key in journal.index():
         yield (key.sensor, key.session_id), key.sequence, key.sequence
     for gap in journal.gaps:
@@ -121,7 +121,7 @@ def _missing(journal: "Journal") -> Iterator[JournalGap]:
 
 
 def _holes(journal: "Journal", gap: JournalGap) -> Iterator[JournalGap]:
-    """Yield the parts of a gap without any number that the journal holds."""
+    """Yield the parts of a gap without numbers that the journal contains."""
     begin = gap.first
     held = sorted((first, last) for run, first, last in _held(journal) if run == (gap.sensor, gap.session_id))
     for first, last in [*held, (gap.last + 1, gap.last + 1)]:
@@ -133,16 +133,16 @@ def _holes(journal: "Journal", gap: JournalGap) -> Iterator[JournalGap]:
 def _read_copy(journal: "Journal", database: Database, log: WriteAheadLog) -> _Found:
     """Read the rows that the journal lacks from a copy of it with the repaired log.
 
-    Each row has a checksum of its own, so a wrong repair does not yield wrong rows.
+    Each row has its own checksum, so a wrong repair cannot give wrong rows.
 
     Raises
     ------
     DataError, OSError
-        There is no room for a copy, or SQLite cannot read it.
+        The disk has no space for a copy, or SQLite cannot read it.
     """
     n_bytes = journal.path.stat().st_size + 2 * len(log.content)
     if shutil.disk_usage(journal.path.parent).free < 2 * n_bytes:
-        raise DataError(f"{journal.path.parent} has no room for a copy of {journal.path.name}; free some space")
+        raise DataError(f"{journal.path.parent} has no space for a copy of {journal.path.name}; free some space")
     with tempfile.TemporaryDirectory(prefix=f".{journal.path.name}.", dir=journal.path.parent) as folder:
         copy = Path(folder) / journal.path.name
         database.copy_to(copy)
@@ -188,7 +188,7 @@ def _read(journal: "Journal", database: Database, repaired: Database) -> _Found:
 
 
 def _is_unbroken(rows: Sequence[tuple[Any, ...]], end: int) -> bool:
-    """Return True if rows that begin with their ids continue after ``end`` without holes."""
+    """Return True if the ids of rows, their first column, continue after ``end`` without holes."""
     return [row[0] for row in rows] == list(range(end + 1, end + 1 + len(rows)))
 
 
@@ -206,7 +206,7 @@ def _add(journal: "Journal", found: _Found) -> list[str]:
                 rotation_xyzw=sensor.rotation_xyzw,
             )
     for entry in found.entries:
-        with suppress(ArgumentError):  # The log left by an earlier crash may contain it already.
+        with suppress(ArgumentError):  # A log left by an earlier crash may contain stored rows.
             journal.append([entry])
     journal.note_gaps([gap for gap in found.gaps if gap.sensor in journal.sensors])
     return [f"{found.n_unreadable} measurements whose numbers cannot be read"] if found.n_unreadable else []

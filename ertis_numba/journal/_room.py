@@ -18,25 +18,25 @@ _KEPT_PAGES: Final = 6  # Pages that a commit changes, in addition to one for ea
 
 
 def recording_bytes(words_bytes: int, *, n_rows: int, n_sensors: int) -> int:
-    """Return the approximate length of a recording."""
+    """Return the approximate size of a recording in bytes."""
     return words_bytes + n_rows * _ROW_BYTES + n_sensors * _SENSOR_BYTES
 
 
 def require(path: Path, target: Path, *, sizes_bytes: Sequence[int], seals_bytes: int) -> None:
     """Refuse measurements after which a journal could not be sealed any more.
 
-    The disk of ``target`` needs room for the recording of the whole journal, and a reserve. The disk of the journal
-    needs room for the log, which moves to the main file. It also needs room for the new measurements, first in the log
-    and then in the main file; or, without a log, for them and the changed pages.
+    The disk of ``target`` needs space for the recording of the whole journal, and a reserve. The disk of the journal
+    needs space to move the log to the main file. It also needs space for the new measurements, once in the log and once
+    in the main file. Without a log, it needs space for them and the changed pages.
 
     Parameters
     ----------
     path, target : Path
-        Journal, and recording to be made of it.
+        Journal, and recording to be made from it.
     sizes_bytes : sequence of int
-        Size of each new measurement.
+        Size of each new measurement, in bytes.
     seals_bytes : int
-        Length of the recording with them.
+        Size of the recording with the new measurements, in bytes.
 
     Raises
     ------
@@ -59,7 +59,7 @@ def require(path: Path, target: Path, *, sizes_bytes: Sequence[int], seals_bytes
 
 
 def left(path: Path, target: Path, *, seals_bytes: int) -> int:
-    """Return the remaining capacity of a journal in bytes, if its recording would be ``seals_bytes`` long by now."""
+    """Return the remaining capacity of a journal in bytes, given the current size of its recording."""
     wanted = _wanted(path, target, LOG_BYTES, seals_bytes)
     rooms = [shutil.disk_usage(folder).free - wanted_bytes for folder, wanted_bytes in wanted.items()]
     return max(0, min(rooms) // (3 - len(rooms)))  # On one disk, each byte needs space twice.
@@ -72,7 +72,7 @@ def _wanted(path: Path, target: Path, journal_bytes: int, seals_bytes: int) -> d
     try:
         same = folders[0].stat().st_dev == folders[1].stat().st_dev
     except OSError as error:
-        raise DataError(f"{error.filename}: {error.strerror}; make the folder of the recording") from error
+        raise DataError(f"{error.filename}: {error.strerror}; create the folder of the recording") from error
     if same:
         return {folders[0]: journal_bytes + target_bytes}
     return dict(zip(folders, (journal_bytes, target_bytes), strict=True))

@@ -48,13 +48,16 @@ class Rows(Contents):
         Parameters
         ----------
         name : str
+            Name of the sensor.
         settings : Settings
-            Settings of its measurements, whose air may differ. The journal contains the content of layout files.
+            Settings of its measurements, whose air may differ. The content of layout files is stored in the journal.
         firmware : str
+            Version of the firmware.
         translation_m : sequence of 3 float, optional
-            Position x, y, z. The mounting is unknown if neither this nor ``rotation_xyzw`` is given.
+            Position x, y, z on the platform, in metres. The mounting is unknown if neither this nor ``rotation_xyzw``
+            is given.
         rotation_xyzw : sequence of 4 float, optional
-            Unit quaternion that rotates the sensor frame into the frame of the surroundings.
+            Unit quaternion that rotates the sensor frame into the platform frame.
 
         Raises
         ------
@@ -87,9 +90,9 @@ class Rows(Contents):
         ArgumentError
             A measurement does not match its sensor, or its number does not rise.
         DiskFullError
-            The disk is full, or nearly so, and nothing was written. More can be appended once there is room.
+            The disk is full or nearly full, and nothing was written. Free some space, and append again.
         DataError
-            The disk is full or fails. Earlier measurements are still there.
+            The disk is full or fails. Earlier measurements are safe.
         JournalInUseError
             Another process has removed or replaced the journal.
         """
@@ -133,7 +136,7 @@ class Rows(Contents):
         return row
 
     def note_gap(self, sensor: str, first: int, last: int, reason: str, *, session_id: int) -> None:
-        """Note the reason for missing numbers of a sensor's session durably, ``first`` and ``last`` included.
+        """Store durably why numbers of a sensor's session are missing, ``first`` and ``last`` included.
 
         Raises
         ------
@@ -146,14 +149,14 @@ class Rows(Contents):
         self.note_gaps([JournalGap(sensor, first, last, reason, session_id)])
 
     def note_gaps(self, gaps: Sequence[JournalGap]) -> None:
-        """Note gaps durably, all or none.
+        """Store gaps durably, all or none.
 
         Raises
         ------
         ArgumentError
-            There is no such sensor.
+            The sensor is unknown.
         DataError
-            The journal cannot be written.
+            The journal is not writable.
         """
         with self._turn:
             rows = [
@@ -175,9 +178,11 @@ class Rows(Contents):
         Parameters
         ----------
         sensor : str
+            Name of the sensor.
         session_id : int
+            Identifier of the session.
         up_to : int
-            Last sequence number to delete. A gap that extends beyond it stays whole.
+            Last sequence number to delete. A gap that extends beyond it is kept unchanged.
 
         Returns
         -------
@@ -194,7 +199,7 @@ class Rows(Contents):
         known = self._sensor(sensor)
         which = self._ids[known.name], session_id, up_to
         with self._turn:
-            # Deleted measurements are not secret. Some builds of SQLite overwrite them, which takes as long as storing.
+            # Deleted measurements need not be erased. Some builds of SQLite overwrite them, as slowly as they store.
             self._database.execute("PRAGMA secure_delete = OFF")
             self._database.require_name()
             with disk_errors(self.tally.path):
@@ -218,18 +223,18 @@ class Rows(Contents):
         self._database.execute(insertion(table), (*values, row_crc32(values)))
 
     def room(self) -> int:
-        """Return the approximate number of data bytes that can be appended so that all can still be sealed.
+        """Return the approximate number of bytes of samples that can be appended while sealing stays possible.
 
         Raises
         ------
         DataError
-            The folder of the recording is not there.
+            The folder of the recording does not exist.
         """
         with self._turn:
             return _room.left(self.path, self.target, seals_bytes=self._seals_bytes())
 
     def _seals_bytes(self, more_bytes: int = 0, n_more: int = 0) -> int:
-        """Return the approximate length of the recording with additional measurements."""
+        """Return the approximate size of the recording with additional measurements."""
         return _room.recording_bytes(
             self._held_bytes + more_bytes, n_rows=len(self) + n_more, n_sensors=len(self._sensors)
         )

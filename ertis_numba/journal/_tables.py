@@ -35,11 +35,13 @@ class Column:
     Attributes
     ----------
     name : str
+        Name of the column.
     kind : str
-        As SQLite names it.
+        Type in the notation of SQLite.
     about : str
+        Description.
     units : str
-        As UDUNITS writes it; empty for numbers without a unit.
+        Unit in the notation of UDUNITS; empty, the default, for numbers without a unit.
     """
 
     name: str
@@ -51,32 +53,32 @@ class Column:
 _ID = Column("id", "INTEGER", "order of arrival, from 1")
 _CHECK = Column("row_crc32", "INTEGER", "CRC-32 over the columns before it without id")
 _SENSOR = Column("sensor", "INTEGER", "id of the sensor")
-_SESSION_ID = Column("epoch", "INTEGER", "session of the sensor, random for each restart of sequence numbers")
+_SESSION_ID = Column("epoch", "INTEGER", "session of the sensor, chosen at random when sequence numbers restart")
 
 TABLES: Final[Mapping[str, tuple[Column, ...]]] = {
     "journal": (
         _ID,
-        Column("target", "BLOB", "recording to be made, from the folder of the journal; bytes of a path"),
-        Column("source", "TEXT", "origin of the measurements"),
-        Column("created", "TEXT", "time of creation, ISO 8601"),
+        Column("target", "BLOB", "path of the recording to be made, relative to the journal's folder, as bytes"),
+        Column("source", "TEXT", "source of the measurements"),
+        Column("created", "TEXT", "creation time of the journal, ISO 8601"),
         _CHECK,
     ),
     "sensors": (
         _ID,
         Column("name", "TEXT", "name or serial number"),
-        Column("settings", "TEXT", "settings as TOML; they hold the array itself"),
+        Column("settings", "TEXT", "settings as TOML, including the array"),
         Column("firmware", "TEXT", "version of the sensor's firmware"),
         Column("x_m", "REAL", "position of the sensor", "m"),
-        Column("y_m", "REAL", "the same", "m"),
-        Column("z_m", "REAL", "the same", "m"),
+        Column("y_m", "REAL", "position of the sensor", "m"),
+        Column("z_m", "REAL", "position of the sensor", "m"),
         Column(
             "rotation_x",
             "REAL",
-            "unit quaternion that turns the sensor frame into that of the surroundings; 0 if unknown",
+            "unit quaternion that rotates the sensor frame into the platform frame; 0 if unknown",
         ),
-        Column("rotation_y", "REAL", "the same"),
-        Column("rotation_z", "REAL", "the same"),
-        Column("rotation_w", "REAL", "the same"),
+        Column("rotation_y", "REAL", "part of the same quaternion"),
+        Column("rotation_z", "REAL", "part of the same quaternion"),
+        Column("rotation_w", "REAL", "part of the same quaternion"),
         _CHECK,
     ),
     "measurements": (
@@ -87,7 +89,7 @@ TABLES: Final[Mapping[str, tuple[Column, ...]]] = {
         Column("sync_count", "INTEGER", "pulse of the SYNC chain, equal for sensors that emitted together"),
         Column("timestamp_ns", "INTEGER", "start of the emission", "nanoseconds since 1970-01-01T00:00:00"),
         Column("timestamp_uncertainty_ns", "INTEGER", "uncertainty of timestamp_ns", "ns"),
-        Column("monotonic_ns", "INTEGER", "time of arrival, by a monotonic clock", "ns"),
+        Column("monotonic_ns", "INTEGER", "time of arrival by a monotonic clock", "ns"),
         Column("temperature_c", "REAL", "air temperature", "degree_Celsius"),
         Column("humidity_percent", "REAL", "relative humidity", "percent"),
         Column("pressure_pa", "REAL", "air pressure", "Pa"),
@@ -101,7 +103,7 @@ TABLES: Final[Mapping[str, tuple[Column, ...]]] = {
         _SESSION_ID,
         Column("first", "INTEGER", "first missing sequence number"),
         Column("last", "INTEGER", "last missing sequence number"),
-        Column("reason", "TEXT", "reason"),
+        Column("reason", "TEXT", "reason of the loss"),
         _CHECK,
     ),
 }
@@ -133,10 +135,14 @@ def selection(table: str, where: str = "") -> str:
 def row_crc32(values: Iterable[float | str | bytes | None]) -> int:
     """Return the CRC-32 of a row.
 
-    It covers the values one after the other. Each value has a letter for its type, the number of bytes as a
-    little-endian 32-bit integer, and the bytes. The types are ``I`` for an integer in decimal digits with a ``-`` if
-    negative; ``R`` for a real number, as a little-endian double; ``T`` for text in UTF-8; ``B`` for bytes; and ``N``
-    for NULL, without bytes.
+    The checksum covers the values in order. Each value is encoded as a letter for its type, the number of bytes as a
+    little-endian 32-bit integer, and the bytes. The types are:
+
+    - ``I``: integer, as decimal digits with a ``-`` if negative
+    - ``R``: real number, as a little-endian double
+    - ``T``: text, as UTF-8
+    - ``B``: bytes
+    - ``N``: NULL, without bytes
     """
     check = 0
     for value in values:

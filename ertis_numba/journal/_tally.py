@@ -1,7 +1,8 @@
-"""Highest numbers that a journal holds, in a file beside it.
+"""Highest numbers that a journal contains, stored in a file beside it.
 
-A damaged log can lose measurements without an error from SQLite. The tally is written after each commit and not synced.
-It never lists a number that the journal has not stored, and after a kill it is complete.
+A damaged log can lose measurements without an error from SQLite, and the tally reveals such losses. It is written
+after each commit, without a sync. It never lists a number that was not stored. If the process is killed, the tally is
+still complete.
 """
 
 import json
@@ -18,7 +19,7 @@ __all__ = ["TALLY", "Mark", "Tally"]
 TALLY: Final = "-tally"
 """Suffix of the file, after the name of the journal."""
 
-_BLOCK_BYTES: Final = 512  # A disk writes a block as a whole.
+_BLOCK_BYTES: Final = 512  # Size of a sector, which a disk writes as a whole.
 
 
 @dataclass(slots=True)
@@ -28,11 +29,13 @@ class Mark:
     Attributes
     ----------
     sensor : str
+        Name of the sensor.
     session_id : int
+        Identifier of the session.
     first, last : int
         First and last number of the stored measurements and gaps.
     discarded : int
-        Number up to which measurements may have been deleted.
+        Number up to which measurements may have been deleted; -1, the default, if none was.
     """
 
     sensor: str
@@ -46,15 +49,17 @@ _FIELDS: Final = tuple(field.name for field in fields(Mark))
 
 
 class Tally:
-    """A file with one block for each run, updated whenever the run grows.
+    """File with one block for each session, updated after each commit.
 
     Parameters
     ----------
     journal : Path
+        Path of the journal.
 
     Attributes
     ----------
-    marks : dict of (sensor, epoch) to Mark
+    marks : dict of (sensor, session_id) to Mark
+        Numbers of each session.
     damage : str
         Known losses that no gap of the journal covers; empty if there are none.
     """
@@ -76,7 +81,7 @@ class Tally:
                 self._begin()
 
     def read(self, identity: int, *, any_journal: bool = False) -> None:
-        """Read an earlier process's tally for the journal of this identity, or for any journal, and continue it."""
+        """Read and continue the tally of an earlier process, for the journal of this identity or for any journal."""
         self._identity = identity
         try:
             content = self.path.read_bytes()
@@ -93,20 +98,20 @@ class Tally:
             self.marks[mark.sensor, mark.session_id] = mark
 
     def grow(self, sensor: str, session_id: int, first: int, last: int) -> None:
-        """Note that numbers are stored; if the disk is full, this is skipped, and their loss would go unnoticed."""
+        """Register stored numbers; errors are ignored, so that the loss of these numbers could go unnoticed."""
         mark = self.marks.setdefault((sensor, session_id), Mark(sensor, session_id, first, last))
         mark.last = max(mark.last, last)
         with suppress(OSError):
             self._put(mark)
 
     def note_damage(self, text: str) -> None:
-        """Keep a description of losses that the journal itself cannot record."""
+        """Store a description of losses that the journal cannot represent as gaps."""
         self.damage = text
         with suppress(OSError):
             self._begin()
 
     def discard(self, sensor: str, session_id: int, up_to: int) -> None:
-        """Note durably that numbers may be deleted.
+        """Register durably that numbers may be deleted.
 
         Raises
         ------
@@ -120,12 +125,12 @@ class Tally:
             os.fsync(self._descriptor)
 
     def limit(self, acked: Mapping[tuple[str, int], int]) -> None:
-        """Remove numbers above the acknowledged ones, because a failed journal was given up above them.
+        """Remove numbers above the acknowledged ones, because a failed journal does not contain them reliably.
 
         Parameters
         ----------
-        acked : mapping of (sensor, epoch) to int
-            Highest acknowledged number of each run that has one.
+        acked : mapping of (sensor, session_id) to int
+            Highest acknowledged number of each session that has one.
 
         Raises
         ------
@@ -154,7 +159,7 @@ class Tally:
     def _write(self, place: int, block: dict[str, Any]) -> None:
         text = json.dumps(block, ensure_ascii=False).encode()
         line = b"%08x %s" % (zlib.crc32(text), text)
-        if len(line) >= _BLOCK_BYTES:  # Sessions with the longest names are not counted.
+        if len(line) >= _BLOCK_BYTES:  # Sensors with very long names have no block.
             return
         os.lseek(self._descriptor, place * _BLOCK_BYTES, os.SEEK_SET)
         os.write(self._descriptor, line.ljust(_BLOCK_BYTES - 1) + b"\n")
@@ -172,7 +177,7 @@ class Tally:
 
 
 def _blocks(content: bytes) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Yield the place and content of each block with a correct CRC-32."""
+    """Yield the index and content of each block with a correct CRC-32."""
     for begin in range(0, len(content), _BLOCK_BYTES):
         check, _, text = content[begin : begin + _BLOCK_BYTES].rstrip().partition(b" ")
         if check == b"%08x" % zlib.crc32(text):

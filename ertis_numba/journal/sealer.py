@@ -26,23 +26,24 @@ class Sealed:
     Attributes
     ----------
     journal : Path
+        Path of the journal.
     recording : Path or None
-        None if the journal had no measurement.
+        Path of the recording; None if the journal had no measurement.
     measurements : int
-        Number in the recording.
+        Number of measurements in the recording, by default 0.
     missing : int
-        Number of missing measurements; of those, …
+        Number of missing measurements according to the recording, by default 0.
     damaged : int
-        … were damaged in the journal.
+        Number of missing measurements that were damaged in the journal, by default 0.
     set_aside : Path or None
-        New path of the journal if it has damaged or refused measurements; otherwise the journal was removed.
+        New path of the journal if it has damaged or refused measurements; otherwise None, and the journal was removed.
     lost : int
-        Missing numbers that the journal had noted before its log was damaged: each of a stored measurement, of a gap,
-        or skipped by the sensor.
+        Number of missing measurements that the journal had noted before its log was damaged, by default 0. Each number
+        belongs to a stored measurement or a gap, or was skipped by the sensor.
     damage : str
         Losses from a damaged log that no gap of the recording covers; empty if there are none.
     refused : dict of str to str
-        Sensors whose measurements a recording cannot contain, with reasons.
+        Reasons why a recording cannot contain the measurements of some sensors, by sensor.
     """
 
     journal: Path
@@ -84,18 +85,24 @@ def seal_apart(
 ) -> Sealed:
     """Make the recording of a journal in a separate process; see `ertis_numba.storage.sealing.seal`.
 
-    Ctrl-C in a terminal does not reach that process. Regardless of its end, the measurements are in the journal or in
-    the recording, and sealing can be repeated.
+    Ctrl-C in a terminal does not reach that process. However it ends, the measurements are in the journal or in the
+    recording, and sealing can be repeated.
 
     Parameters
     ----------
     journal : Path
+        Path of the journal.
     overwrite : bool
         Replace an existing file, even if it has other content.
     rests : float, optional
-        Yield the processors, and rest after each step for this multiple of its duration.
+        Run at low priority, and pause after each step for this multiple of its duration.
     progress : callable, optional
         Called with the number of written measurements and of all measurements, about a hundred times.
+
+    Returns
+    -------
+    Sealed
+        Result.
 
     Raises
     ------
@@ -106,7 +113,7 @@ def seal_apart(
     OSError
         No process can be started.
     KeyboardInterrupt
-        The process was ended; the message names the place of the measurements.
+        The process was interrupted; the message states where the measurements are.
     """
     # -P: Python must not import a file of the current folder in place of a standard module.
     command = [sys.executable, "-P", "-m", "ertis_numba.storage.sealing_process", "--json"]
@@ -124,7 +131,7 @@ def seal_apart(
 
 
 def _run(command: list[str], reported: dict[str, Any], progress: Progress) -> str:
-    """Run a process, put its result into ``reported``, and return a description of its end."""
+    """Run a process, store its result in ``reported``, and return how it ended as text."""
     with subprocess.Popen(  # noqa: S603  this very package
         command,
         stdin=subprocess.DEVNULL,
@@ -151,7 +158,7 @@ def _run(command: list[str], reported: dict[str, Any], progress: Progress) -> st
 
 
 def _listen(stream: IO[str] | None, stated: deque[str]) -> None:
-    """Keep the last line, which is the error of a traceback."""
+    """Keep the last line of stderr, which is the error in a traceback."""
     stated.extend(line.strip() for line in stream or () if line.strip())
 
 
@@ -169,7 +176,7 @@ def _take(stream: IO[str] | None, reported: dict[str, Any], progress: Progress) 
 
 
 def _end(process: "subprocess.Popen[str]") -> None:
-    """Ask a process to end cleanly where the system allows it."""
+    """Interrupt a process, so that it ends cleanly if the system allows that."""
     if os.name == "posix":
         process.send_signal(signal.SIGINT)
     else:
@@ -182,7 +189,7 @@ def _sealed(reported: dict[str, Any]) -> Sealed:
 
 
 def _where(journal: Path, reported: dict[str, Any]) -> str:
-    """Return the place of the measurements after an interrupt, which may have come too late."""
+    """Return a line on where the measurements are after an interrupt; sealing may have ended before it."""
     if "recording" not in reported:
         return f"the measurements are safe in {journal}; recover them with 'ertis recover {journal}'"
     sealed = _sealed(reported)

@@ -23,12 +23,12 @@ def fault_of(path: Path) -> str:
     Raises
     ------
     ForeignDataError
-        A dataset lies in another file.
+        A dataset is stored in another file.
 
     Notes
     -----
-    HDF5 has checksums of everything except the references from variables to their axes. These are therefore compared
-    with the expected names of the axes.
+    HDF5 stores checksums of everything except the references from variables to their axes. The check therefore compares
+    them with the expected names of the axes.
     """
     place = "/"
     try:

@@ -39,7 +39,7 @@ class Runs:
         self._numbers.setdefault(session_id, Numbers()).add(number)
 
     def missing(self, noted: Iterable[Missing]) -> list[Missing]:
-        """Return the missing numbers in the order of the sessions: as they arrived, then those with gaps only.
+        """Return the missing numbers of all sessions: in order of arrival, then sessions of which only gaps are known.
 
         Parameters
         ----------
@@ -93,8 +93,8 @@ class Numbers:
     def missing(self, noted: Iterable[Hole]) -> list[Hole]:
         """Return the missing numbers in order: first, last and reason; neighbours with one reason are merged.
 
-        If the numbers rise, a noted gap is missing as far as it lies outside of them or in a jump. Otherwise, as in
-        recordings without session identifiers, equal numbers cannot be told apart, and all noted gaps are missing.
+        If the numbers rise, the missing part of a noted gap is outside of their interval or in a jump. Otherwise, as in
+        recordings without session identifiers, equal numbers cannot be distinguished, and all noted gaps are missing.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""File operations in small steps, which leave the disk to others in between."""
+"""File operations in small steps, so that other processes can use the disk in between."""
 
 import os
 import time
@@ -16,17 +16,17 @@ _MAX_REST_S: Final = 0.5
 
 
 class GradualSync:
-    """Gradual sync of a growing file, with a rest after each step.
+    """Gradual sync of a growing file, with a pause after each step.
 
-    A single sync would write all buffered data at once, and a sync of another small file would have to wait for it: a
-    commit beside it took 370 ms instead of 47 ms.
+    A single sync would write all buffered data at once, and the sync of another small file would have to wait. A
+    journal's commit then took 370 ms instead of 47 ms.
 
     Parameters
     ----------
     path : Path
-        The file may not exist yet.
+        Path of the file, which need not exist yet.
     rests : float
-        Rest after a step, relative to its duration.
+        Duration of a pause, relative to that of the step.
     """
 
     def __init__(self, path: Path, rests: float) -> None:
@@ -36,7 +36,7 @@ class GradualSync:
             os.nice(_NICE)
 
     def __call__(self) -> None:
-        """Do a step, if due."""
+        """Sync the file if it has grown by one step since the last sync."""
         try:
             n_bytes = self._path.stat().st_size
         except FileNotFoundError:
@@ -59,7 +59,7 @@ def _sync_data(path: Path) -> None:
 
 @contextmanager
 def shrinking(path: Path, rests: float) -> Iterator[None]:
-    """Truncate a file in steps if the block removes it: freeing gigabytes at once keeps the disk busy."""
+    """Truncate a file in steps if the block removes it, because freeing gigabytes at once blocks the disk."""
     if os.name != "posix" or not path.exists():
         yield
         return

@@ -29,7 +29,9 @@ class JournalRows:
     Attributes
     ----------
     keys : list of JournalKey
+        Keys of all measurements, damaged ones included.
     damaged : list of Damage
+        Damaged measurements.
     """
 
     def __init__(self, journal: Journal, sensor: str) -> None:
@@ -50,7 +52,7 @@ class JournalRows:
         for index, key in enumerate(self.keys):
             try:
                 entry = self._journal.entry(key)
-            except DamagedError as error:  # Another error may be temporary: nothing is lost yet.
+            except DamagedError as error:  # Other errors may be temporary, so they are raised.
                 self.damaged.append(Damage(index, key.sequence, str(error)))
                 continue
             self._numbers.add(key.sequence, key.session_id)

@@ -29,13 +29,13 @@ def describe_mounting(group: h5py.Group, place: Mapping[str, NDArray[np.float64]
 def read_mounting(group: h5py.Group, path: Path) -> _Found:
     """Return translation and rotation of a sensor, or None for both if its mounting is unknown.
 
-    Older files have no attribute ``mounting``. They store the origin if no mounting was given. The origin
-    therefore counts as unknown there, unless the sensor was simulated.
+    Older files have no attribute ``mounting``, and store the origin if no mounting was given. In these files, the
+    origin therefore counts as unknown, unless the sensor was simulated.
 
     Raises
     ------
     DamagedError
-        The attributes are no mounting.
+        The attributes are not a valid mounting.
     """
     stated = group.attrs
     status = str(plain(stated["mounting"])) if "mounting" in stated else ""

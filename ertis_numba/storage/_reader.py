@@ -69,14 +69,15 @@ class FileReader(Sequence[Item]):
     Attributes
     ----------
     path : Path
+        Path of the file.
     sensor : str
         Sensor of these rows.
     sensors : tuple of str
         All sensors in the file, in its order.
     settings : Settings
-        They depend on no other file.
+        Settings of the sensor, independent of other files.
     truth : Truth or None
-        Ground truth of simulated measurements.
+        Ground truth of simulated measurements; None if unknown.
     attributes : dict
         Attributes of the file: uuid, source, date_created and others.
     """
@@ -110,7 +111,7 @@ class FileReader(Sequence[Item]):
             raise
 
     def _look(self) -> None:
-        """Determine the variables of the sensor, if there are alternatives."""
+        """Choose the table of variables, if the kind of file has several."""
 
     @abstractmethod
     def _item(self, index: int) -> Item:
@@ -118,7 +119,7 @@ class FileReader(Sequence[Item]):
 
     @abstractmethod
     def _load(self) -> None:
-        """Read the parts beyond rows that one kind of file has."""
+        """Read the parts that only one kind of file has."""
 
     @abstractmethod
     def _sizes(self) -> dict[str, int]:

@@ -41,6 +41,7 @@ class RowWriter:
     Parameters
     ----------
     group : h5py.Group
+        Group of the sensor.
     data : str
         Name of the variable with one array per measurement.
     numbered : bool
@@ -57,7 +58,7 @@ class RowWriter:
         self._n_rows = 0
         self.runs = Runs()
         self.check = 0
-        """CRC-32 over all rows, to compare with what can be read back."""
+        """CRC-32 over all rows, for the comparison with the written file."""
 
     def append(self, row: NDArray[Any], stamp: Stamp, **columns: float) -> None:
         """Append one measurement: its array as one chunk, and its number in every column."""
@@ -69,7 +70,7 @@ class RowWriter:
         self._require_new(stamps["sequence"], stamps["session_id"])
         require_free_space(self._folder, stored.nbytes)
         self._data.resize(self._n_rows + 1, axis=0)
-        # A row is a chunk, written as it is: no filter compresses one-bit noise.
+        # Each row is one chunk without a filter, because filters cannot compress one-bit noise.
         self._data.id.write_direct_chunk((self._n_rows, *[0] * stored.ndim), stored)
         self._n_rows += 1
         self.runs.add(stamps["sequence"], stamps["session_id"])

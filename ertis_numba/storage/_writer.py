@@ -66,20 +66,20 @@ class Writer(ABC, Generic[Item]):
 
     @abstractmethod
     def _begin(self, group: h5py.Group, first: Item) -> None:
-        """Lay out the group of a sensor for items like ``first``, which is not written yet."""
+        """Create the variables of a sensor for items like ``first``; do not write ``first`` yet."""
 
     @abstractmethod
     def _row(self, item: Item) -> tuple[NDArray[Any], dict[str, float]]:
         """Return the array and the columns of an item; refuse an item that does not match the others."""
 
-    def _data_of(self, group: h5py.Group) -> str:  # noqa: ARG002  what overrides it looks into it
+    def _data_of(self, group: h5py.Group) -> str:  # noqa: ARG002  for subclasses
         """Return the variable with one array per measurement."""
         return self._data
 
     def _complete(self, group: h5py.Group, rows: RowWriter) -> None:
         """Write the parts that are known only at the end."""
 
-    def _truth_of(self, sensor: str, group: h5py.Group) -> Truth | TruthLog | None:  # noqa: ARG002  what overrides it needs both
+    def _truth_of(self, sensor: str, group: h5py.Group) -> Truth | TruthLog | None:  # noqa: ARG002  for subclasses
         """Return the ground truth of a sensor, if known."""
         return self._truth.get(sensor)
 
@@ -132,8 +132,7 @@ class Writer(ABC, Generic[Item]):
                 self._compare()
         except BaseException:
             # Closing writes buffered data. If that fails, HDF5 crashes the process (h5py issue 914). Emptying the file
-            # first
-            # frees the necessary space on a full disk.
+            # first frees the necessary space on a full disk.
             with suppress(OSError, RuntimeError):  # The first error is the one to report.
                 os.truncate(self._part, 0)
                 file.close()

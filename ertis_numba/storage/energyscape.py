@@ -39,6 +39,7 @@ class EnergyscapeWriter(Writer[Energyscape]):
     Parameters
     ----------
     path : str or Path
+        Path of the file.
     recording : RecordingReader or sequence of RecordingReader, optional
         Recording of the images: one reader, or one for each sensor of the same recording. The file stores its UUID and
         SHA-256, and the ground truth of the measurements.
@@ -221,17 +222,19 @@ class EnergyscapeReader(FileReader[Energyscape], DegreesFromRadians):
     Attributes
     ----------
     azimuth_rad, elevation_rad : (direction,) float64
+        Directions in the sensor frame, in radians.
     range_m : (range,) float64
+        Ranges in metres.
     translation_m : (3,) float64, or None
         Position of the sensor in metres; None if its mounting is unknown.
     rotation_xyzw : (4,) float64, or None
-        Unit quaternion that rotates the sensor frame into that of its platform; None if the mounting is unknown.
+        Unit quaternion that rotates the sensor frame into the platform frame; None if the mounting is unknown.
     predicted_error_db, max_error_db : float, or None
         Error that the error model predicted for the first image, and the budget. None in older files and for images of
         the paper's method.
     budget_applies_to : str
         ``beams`` if the budget is that of delay-and-sum beams only, because no plan keeps it for images of the adaptive
-        beamformer; otherwise ``image``. Empty if the file does not hold it.
+        beamformer; otherwise ``image``. Empty if the file does not contain it.
     error_warning : str
         Warning that images may exceed the budget; empty if they do not, or if no error was predicted.
     wavefront_error_db : float, or None

@@ -63,9 +63,10 @@ class RecordingWriter(Writer[Measurement]):
     Parameters
     ----------
     path : str or Path
+        Path of the file.
     settings : Settings, optional
-        For a recording of one sensor; by default those of the first measurement of each sensor. The recording contains
-        the content of layout files.
+        Settings of a recording of one sensor; by default those of the first measurement of each sensor. The content of
+        layout files is stored in the recording.
     overwrite : bool
         Replace an existing file.
     source : str
@@ -73,8 +74,8 @@ class RecordingWriter(Writer[Measurement]):
     truth : mapping of str to Truth or TruthLog, optional
         Ground truth of each simulated sensor, by name. A log may grow while measurements are written.
     mounting : mapping of str to (translation_m, rotation_xyzw), optional
-        Position and orientation of each sensor, by name: x, y, z in metres, and the unit quaternion x, y, z, w that
-        rotates the sensor frame into the frame of the surroundings. Unknown by default.
+        Mounting of each sensor on its platform, by name: x, y, z in metres, and the unit quaternion x, y, z, w that
+        rotates the sensor frame into the platform frame. Unknown by default.
     firmware : mapping of str to str, optional
         Version of each sensor's firmware, by name.
     """
@@ -105,11 +106,11 @@ class RecordingWriter(Writer[Measurement]):
         self._noted: dict[str, list[Missing]] = {}
 
     def note_gap(self, sensor: str, first: int, last: int, reason: str, session_id: int = 0) -> None:
-        """Note the reason for missing sequence numbers, ``first`` and ``last`` included; in any order, at any time.
+        """Store why sequence numbers are missing, ``first`` and ``last`` included; in any order, at any time.
 
         They may also lie before the first measurement of the sensor or after its last one. A number that arrives after
-        all is not a gap. Other gaps have the reason "not among the measurements given". ``session_id`` is that of the
-        stamps.
+        all is not a gap. Gaps without a noted reason have the reason "not among the measurements given".
+        ``session_id`` is that of the stamps, by default 0.
 
         Raises
         ------
@@ -198,17 +199,18 @@ def lay_out_sensor(group: h5py.Group, settings: Settings, *, firmware: str, moun
     Parameters
     ----------
     group : h5py.Group
-        Group of the sensor, with the sensor's name.
+        Group of the sensor. Its name is that of the sensor.
     settings : Settings
-        As `storable` returns them.
+        Settings from `ertis_numba.geometry.storable`.
     firmware : str
+        Version of the firmware.
     mounting : mapping of str to array
-        As `ertis_numba.geometry.mounting` returns it; empty if it is unknown.
+        Mounting from `ertis_numba.geometry.mounting`; empty if unknown.
 
     Raises
     ------
     ArgumentError
-        A row is longer than HDF5 can hold.
+        A row exceeds the limit of HDF5.
     """
     layout, words, samples = microphones(settings.array), sample_format(settings), call_samples(settings.call)
     data, table = _data_and_table(pdm=settings.recording.is_pdm)
@@ -263,12 +265,13 @@ class RecordingReader(FileReader[Measurement]):
     Attributes
     ----------
     gaps : tuple of RecordingGap
+        Missing sequence numbers with their reasons.
     firmware : str
         Version of the sensor's firmware; empty if unknown.
     translation_m : (3,) float64, or None
-        Position of the sensor; None if its mounting is unknown.
+        Position of the sensor on its platform, in metres; None if the mounting is unknown.
     rotation_xyzw : (4,) float64, or None
-        Unit quaternion that rotates the sensor frame into the frame of the surroundings, or None.
+        Unit quaternion that rotates the sensor frame into the platform frame; None if the mounting is unknown.
     """
 
     _kind: ClassVar[str] = "recording"
@@ -327,6 +330,7 @@ def open_recording(path: str | Path, *, sensor: str | None = None) -> RecordingR
     Parameters
     ----------
     path : str or Path
+        Path of the file.
     sensor : str, optional
         Name of the sensor; required if the file contains several.
 
@@ -337,17 +341,18 @@ def open_recording(path: str | Path, *, sensor: str | None = None) -> RecordingR
     Raises
     ------
     DataError
-        The file is not a recording, is damaged or cut short.
+        The file is not a recording, is damaged or truncated.
     FormatVersionError
-        A newer version wrote it.
+        A newer version of this package wrote the file.
     ArgumentError
         The file does not contain this sensor, or contains several and none is given.
 
     Examples
     --------
     >>> import ertis_numba as ertis
-    >>> with ertis.open_recording("reflectors.h5") as recording:  # doctest: +SKIP
-    ...     first = recording[0]
+    >>> with ertis.open_recording("reflectors.h5") as recording:
+    ...     recording[0].stamp.sequence
+    0
     """
     return RecordingReader(path, sensor=sensor)
 
@@ -362,7 +367,21 @@ def write_recording(
     truth: Mapping[str, Truth | TruthLog] | None = None,
     mounting: Mapping[str, Mounting] | None = None,
 ) -> Path:
-    """Write measurements and return the path; the arguments are those of `RecordingWriter`.
+    """Write a recording.
+
+    Parameters
+    ----------
+    path : str or Path
+        Path of the file.
+    measurements : iterable of Measurement
+        Measurements of one or several sensors. It is read one measurement at a time.
+    settings, overwrite, source, truth, mounting
+        See `RecordingWriter`.
+
+    Returns
+    -------
+    Path
+        The path.
 
     Raises
     ------
@@ -375,7 +394,8 @@ def write_recording(
     Examples
     --------
     >>> import ertis_numba as ertis
-    >>> ertis.write_recording("copy.h5", ertis.open_recording("reflectors.h5"))  # doctest: +SKIP
+    >>> with ertis.open_recording("reflectors.h5") as recording:
+    ...     path = ertis.write_recording("copy.h5", recording, overwrite=True)
     """
     with RecordingWriter(
         path, settings=settings, overwrite=overwrite, source=source, truth=truth, mounting=mounting

@@ -44,7 +44,7 @@ __all__ = [
 ]
 
 CONVENTIONS: Final = "CF-1.11 ertis-1.0"
-FORMAT_VERSION: Final = 2  # version 1 used the names of FORMER_NAMES
+FORMAT_VERSION: Final = 2  # Version 1 used the names in FORMER_NAMES.
 CHUNK_ROWS: Final = 512  # Applies to columns with one number per measurement.
 _TIME_CHUNK_ROWS: Final = 4096  # Applies to the axis, which programs read as a whole.
 _COLUMN_TEXT_BYTES: Final = 64
@@ -60,15 +60,17 @@ class Variable:
     Attributes
     ----------
     name : str
+        Name of the variable.
     dims : tuple of str
         Axes. A variable with the name of its only axis is the coordinate of that axis.
     dtype : str
         NumPy type, ``str`` for text, or empty if the settings determine it.
     about : str
+        Description, stored as the attribute ``long_name``.
     units : str
-        Unit in the notation of UDUNITS; empty for numbers without a unit.
+        Unit in the notation of UDUNITS; empty, the default, for numbers without a unit.
     optional : bool
-        True if older files lack it.
+        True if older files lack it; False by default.
     """
 
     name: str
@@ -84,11 +86,11 @@ STAMPS: Final = (
     Variable("time_uncertainty", ("time",), "<u4", "uncertainty of time", "ns"),
     Variable("sequence", ("time",), "<i8", "number given at capture; a gap is a loss"),
     Variable("sync_count", ("time",), "<i8", "pulse of the SYNC chain, equal for sensors that emitted together"),
-    Variable("session_id", ("time",), "<i8", "session of the sensor that gave the sequence numbers"),
+    Variable("session_id", ("time",), "<i8", "identifier of the session that gave the sequence numbers"),
     Variable("crc32", ("time",), "<u4", "CRC-32 of the row of pdm, pcm or amplitude, as its bytes lie in the file"),
 )
 
-_SETTINGS = Variable("settings", (), "str", "settings as TOML; they hold the array itself")
+_SETTINGS = Variable("settings", (), "str", "settings as TOML, including the array")
 
 RECORDING: Final = (
     *STAMPS,
@@ -99,13 +101,13 @@ RECORDING: Final = (
     _SETTINGS,
     Variable("microphone", ("microphone",), "<i4", "channel"),
     Variable("microphone_position", ("microphone", "axis"), "<f8", "x, y, z in the sensor frame", "m"),
-    Variable("microphone_enabled", ("microphone",), "|i1", "1 where the channel carries a microphone that is used"),
+    Variable("microphone_enabled", ("microphone",), "|i1", "1 if the channel has a microphone that is used"),
     Variable("calibration_gain", ("microphone",), "<f8", "sensitivity; signals are divided by it"),
-    Variable("calibration_delay", ("microphone",), "<f8", "delay; it is compensated", "s"),
-    Variable("call", ("call_sample",), "<f4", "emitted sweep, full scale 1"),
+    Variable("calibration_delay", ("microphone",), "<f8", "delay of the microphone; signals are advanced by it", "s"),
+    Variable("call", ("call_sample",), "<f4", "emitted call, full scale 1"),
     Variable("gap_first", ("gap",), "<i8", "first missing sequence number"),
     Variable("gap_last", ("gap",), "<i8", "last missing sequence number"),
-    Variable("gap_reason", ("gap",), "str", "reason"),
+    Variable("gap_reason", ("gap",), "str", "reason of the loss"),
     Variable("gap_session_id", ("gap",), "<i8", "session of the missing numbers", optional=True),
 )
 
@@ -119,10 +121,15 @@ RECORDING_OF_PCM: Final = tuple(
 
 ENERGYSCAPE: Final = (
     *STAMPS,
-    Variable("amplitude", ("time", "direction", "range"), "", "envelope; 1 is a full-scale echo in every microphone"),
+    Variable(
+        "amplitude",
+        ("time", "direction", "range"),
+        "",
+        "amplitude of the envelope; 1 is a full-scale echo in every microphone",
+    ),
     Variable("azimuth", ("direction",), "<f8", "azimuth, from x forward towards y", "radian"),
     Variable("elevation", ("direction",), "<f8", "elevation, from the horizontal plane towards z", "radian"),
-    Variable("range", ("range",), "<f8", "half the path of the sound", "m"),
+    Variable("range", ("range",), "<f8", "half of the sound path", "m"),
     _SETTINGS,
 )
 
@@ -132,8 +139,20 @@ TRUTH: Final = (
     Variable("azimuth", ("measurement", "target"), "<f8", "azimuth of the reflectors", "radian"),
     Variable("elevation", ("measurement", "target"), "<f8", "elevation of the reflectors", "radian"),
     Variable("range", ("measurement", "target"), "<f8", "distance of the reflectors from the sensor's origin", "m"),
-    Variable("level", ("measurement", "target"), "<f8", "level of the echo below the strongest of the own call", "dB"),
-    Variable("velocity", ("measurement", "target", "axis"), "<f8", "x, y, z in the frame of the sensor", "m/s"),
+    Variable(
+        "level",
+        ("measurement", "target"),
+        "<f8",
+        "level of the echo, relative to the strongest of the sensor's own call",
+        "dB",
+    ),
+    Variable(
+        "velocity",
+        ("measurement", "target", "axis"),
+        "<f8",
+        "x, y, z in the sensor frame, relative to the sensor",
+        "m/s",
+    ),
     Variable(
         "emitter",
         ("measurement", "target"),
@@ -188,14 +207,16 @@ def lay_out(
     Parameters
     ----------
     group : h5py.Group
+        Group in which to create the variables.
     table : iterable of Variable
+        Variables to create.
     sizes : mapping of str to int
-        Length of each axis. Variables omit an axis without a length, unless it grows with the file. If rows along time
-        are arrays, each is a chunk.
+        Length of each axis. An axis without a length is omitted, unless it grows with the file. If the rows along time
+        are arrays, each row is a chunk.
     dtypes : mapping of str to str or dtype, optional
-        Types that the table leaves open, or other ones.
+        Types by name of the variable, in place of those in the table.
     texts : mapping of str to str, optional
-        Content of the variables that are one text.
+        Content of the text variables, by name.
     """
     scales: dict[str, h5py.Dataset] = {}
     variables = [(variable, _dims(variable, sizes)) for variable in table]
@@ -248,8 +269,8 @@ def _scale_without_values(group: h5py.Group, dim: str, size: int) -> h5py.Datase
 def describe(owner: h5py.File | h5py.Group | h5py.Dataset, attributes: Mapping[str, Any]) -> None:
     """Set attributes.
 
-    Texts have a fixed length, as everywhere in these files: HDF5 keeps others in a heap without
-    checksums, where a damaged length can hold up a reader for ever.
+    Texts have a fixed length, as everywhere in these files. HDF5 stores texts of variable length in a heap without
+    checksums, where a damaged length can block a reader forever.
     """
     for name, value in attributes.items():
         if isinstance(value, str):
@@ -290,7 +311,7 @@ def _digest(digest: "hashlib._Hash", group: h5py.Group, table: Iterable[Variable
     for variable in table:
         if variable.dtype and (variable.name in group or not variable.optional):
             dataset = group[variable.name]
-            digest.update(dataset.name.rsplit("/", 1)[-1].encode())  # as stored, so that older files stay valid
+            digest.update(dataset.name.rsplit("/", 1)[-1].encode())  # The stored name keeps older files valid.
             # The truth of many measurements may exceed the memory, so it is read in parts.
             rows = max(1, _DIGEST_ITEMS // max(1, math.prod(dataset.shape[1:])))
             for first in range(0, dataset.shape[0], rows) if dataset.shape else ():
@@ -300,7 +321,7 @@ def _digest(digest: "hashlib._Hash", group: h5py.Group, table: Iterable[Variable
 
 
 def content_uuid(contents: Mapping[str, str]) -> str:
-    """Return the identity of a file: a UUID of version 8 that its content determines (RFC 9562, section 5.8).
+    """Return the identity of a file, a UUID of version 8 that its content determines (RFC 9562, section 5.8).
 
     Parameters
     ----------
@@ -332,7 +353,7 @@ def sensor_path(name: str) -> str:
 
 
 def date_created() -> str:
-    """Return the time as ISO 8601, or SOURCE_DATE_EPOCH for reproducible builds."""
+    """Return the current time as ISO 8601, or that of SOURCE_DATE_EPOCH for reproducible builds."""
     fixed = os.environ.get("SOURCE_DATE_EPOCH")
     now = datetime.fromtimestamp(int(fixed), UTC) if fixed else datetime.now(UTC)
     return now.strftime("%Y-%m-%dT%H:%M:%SZ")

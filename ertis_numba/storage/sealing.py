@@ -2,7 +2,7 @@
 
 Run it as a separate process::
 
-python -m ertis_numba.storage.sealing_process REC.h5.journal
+    python -m ertis_numba.storage.sealing_process REC.h5.journal
 
 HDF5 can crash its process when a disk fails (h5py issue 914); a separate process confines this. It may be killed and
 run again at any time: the recording is the same.
@@ -42,7 +42,7 @@ REFUSED = "refused"
 MAX_HISTORY = 16_000  # Characters; an attribute of HDF5 is limited to 65,536 bytes.
 
 TOKEN = "sealing"  # noqa: S105
-"""Mode of the part file: the owner of the journal is the only writer."""
+"""Token in the name of the temporary file. It is fixed, because only the process with the journal writes the file."""
 
 Progress = Callable[[int, int], None]
 
@@ -57,10 +57,16 @@ def seal(path: str | Path, *, overwrite: bool = False, progress: Progress = lamb
     Parameters
     ----------
     path : str or Path
+        Path of the journal.
     overwrite : bool
         Replace an existing file, even if it has other content.
     progress : callable, optional
         Called with the number of written measurements and of all measurements.
+
+    Returns
+    -------
+    Sealed
+        Result.
 
     Raises
     ------
@@ -74,7 +80,7 @@ def seal(path: str | Path, *, overwrite: bool = False, progress: Progress = lamb
     """
     path = Path(path)
     before = path.with_name(path.name.removesuffix(SUFFIX))
-    # A process was killed after it had removed the journal.
+    # An earlier process may have been killed just after it had removed the journal.
     if not path.exists() and before != path and _made_of(path, before):
         return _reported(path, before)
     with Journal.open(path) as journal:
@@ -151,13 +157,13 @@ def _refusal(sensor: JournalSensor, first: Measurement) -> str:
             )
     except MemoryError:  # The lack of memory may be temporary.
         raise
-    except Exception as error:  # noqa: BLE001  whatever it is, it must not keep the others from being sealed
+    except Exception as error:  # noqa: BLE001  no error may prevent sealing of other sensors
         return " ".join(str(error).split()) or type(error).__name__
     return ""
 
 
 def _origin(path: Path) -> str:
-    """Return the origin of a recording for its attributes."""
+    """Return the first part of a recording's history, which names its journal."""
     return f"sealed from {path.name.encode(errors='backslashreplace').decode()}"  # The name may not be valid text.
 
 
@@ -177,7 +183,7 @@ class _Sealer(RecordingWriter):
     _numbered: ClassVar[bool] = False
 
     def say(self, history: str) -> None:
-        """Add a line to the history."""
+        """Set the history of the recording."""
         self._attributes["history"] = history
 
     def report_damage(self, damage: str) -> None:
@@ -223,7 +229,7 @@ def _write(
 
 
 def _absent(rows: dict[str, JournalRows]) -> Iterator[str]:
-    """Yield lines on sensors that are absent from a recording because they have no measurement."""
+    """Yield parts of the history on sensors without readable measurements, which a recording cannot contain."""
     for name, held in rows.items():
         if len(held) == len(held.damaged):
             yield f"sensor {name} has no measurement"

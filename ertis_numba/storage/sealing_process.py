@@ -40,7 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("journal", type=Path)
     parser.add_argument("--force", action="store_true", help="replace an existing recording")
     parser.add_argument(
-        "--rests", type=float, help="yield the processors, and rest after each step for this multiple of its duration"
+        "--rests", type=float, help="run at low priority, and pause after each step for this multiple of its duration"
     )
     parser.add_argument("--json", action="store_true", help="print progress and result as JSON lines")
     given = parser.parse_args(arguments)

@@ -1,8 +1,8 @@
 """Bounded access to HDF5 files from untrusted sources.
 
-HDF5 files can point into other files, claim billions of rows that take up no room, and hold the same rows under many
-names. Files of this package do none of that. A reader therefore compares the claimed sizes with the stored data before
-it reads any of them, so that the size of the file bounds time and memory.
+HDF5 files can point into other files, declare billions of rows without storing them, and contain the same rows under
+many names. Files of this package do none of that. A reader therefore compares the declared sizes with the stored data
+before it reads any of them, so that the size of the file limits time and memory.
 """
 
 import math
@@ -30,23 +30,25 @@ MAX_ROW_BYTES: Final = 2**32 - 1
 
 
 def child(group: h5py.Group, name: str, kind: type[Any]) -> Any:
-    """Return a member of a group that lies in the same file and has no other name.
+    """Return a member of a group; refuse links, and members with several names.
 
     Parameters
     ----------
     group : h5py.Group
+        Group that contains the member.
     name : str
+        Name of the member.
     kind : type
-        ``h5py.Group`` or ``h5py.Dataset``.
+        Required type, ``h5py.Group`` or ``h5py.Dataset``.
 
     Raises
     ------
     ForeignDataError
-        It is a link to somewhere else, or has several names.
+        The member is a link, or has several names.
     DamagedError
-        It is something else.
+        The member has another type.
     KeyError
-        There is none.
+        The member does not exist.
     """
     link = group.get(name, getlink=True)
     if isinstance(link, h5py.ExternalLink):
@@ -71,7 +73,7 @@ def sensors_of(file: h5py.File) -> tuple[str, ...]:
     Raises
     ------
     DamagedError
-        There are too many, or a name cannot be that of a sensor.
+        There are too many sensors, or a name is not a valid name of a sensor.
     """
     group = child(file, "sensors", h5py.Group)
     if len(group) > MAX_SENSORS:
@@ -83,12 +85,12 @@ def sensors_of(file: h5py.File) -> tuple[str, ...]:
 
 
 def require_attributes(owner: h5py.File | h5py.Group) -> None:
-    """Refuse attributes that are too many or too long.
+    """Refuse an object with too many attributes, or with one that is too long.
 
     Raises
     ------
     DamagedError
-        There are too many, or one is too long.
+        There are too many attributes, or one is too long.
     """
     n_attributes = h5py.h5a.get_num_attrs(owner.id)
     if n_attributes > MAX_ATTRIBUTES:
@@ -108,16 +110,16 @@ def require_variables(group: h5py.Group, table: Iterable[Variable]) -> None:
     Parameters
     ----------
     group : h5py.Group
-        Of a sensor.
+        Group of a sensor.
     table : iterable of Variable
         Variables that may be read; missing ones are skipped.
 
     Raises
     ------
     ForeignDataError
-        A variable lies elsewhere or is compressed.
+        A variable is stored in another file, or is compressed.
     DamagedError
-        A variable is not stored whole, or has another type or number of axes.
+        A variable is incomplete, or has another type or number of axes.
     """
     if len(group) > MAX_MEMBERS:
         raise DamagedError(f"{group.name} has {len(group)} members; the limit is {MAX_MEMBERS}")
@@ -147,12 +149,12 @@ def _members(group: h5py.Group, table: Iterable[Variable]) -> Iterator[tuple[h5p
 
 
 def _require_kind(dataset: h5py.Dataset, variable: Variable) -> None:
-    """Refuse a type or a number of axes that the table does not name."""
+    """Refuse a type or a number of axes that differs from the table."""
     dtype, is_text = dataset.dtype, variable.dtype == "str"
     if is_text:
         largest = MAX_TEXT_BYTES.get(variable.name, MAX_COLUMN_TEXT_BYTES)
         fits = dtype.kind == "S" and dtype.itemsize <= largest
-    else:  # In older files, some have other sizes.
+    else:  # In older files, some types have another size.
         kinds = "iuf" if not variable.dtype else "iu" if np.dtype(variable.dtype).kind in "iu" else "f"
         fits = dtype.kind in kinds and dtype.itemsize <= 8
     if not fits:
@@ -174,9 +176,9 @@ def stored_bytes(dataset: h5py.Dataset, *, may_be_filtered: bool = False) -> int
     Raises
     ------
     ForeignDataError
-        It is elsewhere or compressed.
+        The dataset is stored in another file, or is compressed.
     DamagedError
-        It is not stored whole.
+        The dataset is incomplete.
     """
     if dataset.is_virtual or dataset.external:
         raise ForeignDataError(f"{dataset.name} lies in other files; copy the data into one file")

@@ -45,10 +45,11 @@ class Truth:
     scene : str
         Scene as TOML.
     seed : int
+        Seed of the simulation.
     reflectors : tuple of tuple of Reflector
         Reflectors of each measurement, the strongest first.
     left_out : tuple of str
-        Omitted effects that change the image slightly.
+        Effects that were not simulated although they change the image slightly; none by default.
     """
 
     scene: str
@@ -70,10 +71,12 @@ class TruthLog:
     scene : str
         Scene as TOML.
     seed : int
+        Seed of the simulation.
     left_out : tuple of str
-        Omitted effects that change the image slightly.
+        Effects that were not simulated although they change the image slightly; none by default.
     folder : Path, optional
-        Folder of the temporary file, which has no name and ends with the process; the system's own by default.
+        Folder of the temporary file, by default that of the system. The file has no name, and is removed with the
+        process.
     """
 
     def __init__(self, scene: str, seed: int, *, left_out: tuple[str, ...] = (), folder: Path | None = None) -> None:
@@ -112,7 +115,7 @@ class TruthLog:
         return self._max_own
 
     def texts(self, field: str) -> list[bytes]:
-        """Return the values of a text field of reflectors, by the number that records hold."""
+        """Return the values of a text field of reflectors, by their number in the records."""
         return [text.encode() for text in self._texts[field]]
 
     def append(self, reflectors: Sequence[Reflector]) -> None:
@@ -173,7 +176,7 @@ def write_truth(group: h5py.Group, truth: Truth | TruthLog, n_measurements: int)
     Raises
     ------
     ArgumentError
-        The truth has another number of measurements.
+        The truth has another number of measurements than the file.
     """
     if isinstance(truth, Truth):
         with TruthLog(truth.scene, truth.seed, left_out=truth.left_out) as log:
@@ -195,7 +198,7 @@ def write_truth(group: h5py.Group, truth: Truth | TruthLog, n_measurements: int)
     table = [variable for variable in TRUTH if not variable.optional or variable.name in texts]
     lay_out(made, table, sizes=sizes, dtypes=kinds, texts={"scene": truth.scene})
     describe(made, {"seed": truth.seed, "effects_left_out": " ".join(truth.left_out)})
-    if not truth.n_targets:  # HDF5 cannot store an empty array of this shape, and need not.
+    if not truth.n_targets:  # There is no data to write.
         return
     columns = {field: np.array(column, dtype=kinds[field]) for field, column in texts.items()}
     for rows, records in truth.blocks():

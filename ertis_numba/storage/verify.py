@@ -23,11 +23,13 @@ class SensorReport:
     Attributes
     ----------
     sensor : str
+        Name of the sensor.
     measurements : int
         Number of measurements, damaged ones included.
     gaps : tuple of RecordingGap
         Missing sequence numbers with their reasons.
     damaged : tuple of Damage
+        Damaged measurements.
     disordered : tuple of int
         Indices of measurements whose sequence number is not above the previous one of the session.
     fault : str
@@ -58,8 +60,8 @@ class SensorReport:
 def verify(path: str | Path) -> list[SensorReport]:
     """Read a whole recording or journal, and return missing and damaged measurements for each sensor.
 
-    A recording is checked by the hash over the content of each sensor, the CRC-32 of each measurement, and the order of
-    the sequence numbers. A journal is checked by the CRC-32 of each record and each measurement.
+    For a recording, this checks the hash over the content of each sensor, the CRC-32 of each measurement, and the order
+    of the sequence numbers. For a journal, it checks the CRC-32 of each record and each measurement.
 
     Raises
     ------
