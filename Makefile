@@ -62,19 +62,19 @@ pictures: $(VENV)/ready  ## redraw the pictures of the README; the viewer needs 
 	$(BIN)/python docs/pictures/view.py
 
 bench: $(VENV)/ready  ## run the benchmarks and update the tables in the documentation
-	$(BIN)/ertis bench paper --update bench/README.md --update README.md
-	$(BIN)/ertis bench accuracy --update README.md --update bench/README.md --plot docs/pictures/front.png
-	$(BIN)/ertis bench factorisation --update docs/accuracy.md
-	$(BIN)/ertis bench verification --update docs/accuracy.md
-	$(BIN)/ertis bench points --update docs/accuracy.md
-	$(BIN)/ertis bench scaling --update bench/README.md
-	$(BIN)/ertis bench simulation --update bench/README.md
-	$(BIN)/ertis bench many --update docs/many.md
-	$(BIN)/ertis bench network --update docs/network.md
+	$(BIN)/ertis bench paper --update docs/reference/benchmarks.md --update README.md
+	$(BIN)/ertis bench accuracy --update docs/reference/benchmarks.md --update docs/explanation/accuracy.md --plot docs/pictures/front.png
+	$(BIN)/ertis bench factorisation --update docs/explanation/accuracy.md
+	$(BIN)/ertis bench verification --update docs/explanation/accuracy.md
+	$(BIN)/ertis bench points --update docs/explanation/accuracy.md
+	$(BIN)/ertis bench scaling --update docs/reference/benchmarks.md
+	$(BIN)/ertis bench simulation --update docs/reference/benchmarks.md
+	$(BIN)/ertis bench many --update docs/how-to/many.md
+	$(BIN)/ertis bench network --update docs/explanation/network-guarantees.md
 
 soak: $(VENV)/ready  ## test faults, kills and full disks for hours; SEED=N repeats a run
-	$(BIN)/ertis bench reliability --long $(if $(SEED),--seed $(SEED)) --update docs/reliability.md
-	$(BIN)/ertis bench network-faults --long $(if $(SEED),--seed $(SEED)) --update docs/network.md
+	$(BIN)/ertis bench reliability --long $(if $(SEED),--seed $(SEED)) --update docs/explanation/reliability.md
+	$(BIN)/ertis bench network-faults --long $(if $(SEED),--seed $(SEED)) --update docs/explanation/network-guarantees.md
 
 gpu: $(VENV)/ready  ## test and time this machine's NVIDIA GPU in less than ten minutes; GPU=cu13 for CUDA 13
 	$(BIN)/python -m pip install --quiet --editable '.[test,$(GPU)]'

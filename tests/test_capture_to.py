@@ -258,7 +258,7 @@ def test_keys(tmp_path):
         assert (code, central.taken) == (1, 2)
         reported = "2 measurements not acknowledged by the central node at tcp://127.0.0.1:"
         assert err.splitlines()[-1].startswith(f"ertis: error: {reported}")
-        assert err.splitlines()[-1].endswith(": the central node does not know this key; have it listed there by "
+        assert err.splitlines()[-1].endswith(": the central node does not know this key; add it there with "
                                              "'ertis keys allow'")  # fmt: skip
 
 
@@ -270,7 +270,7 @@ def test_the_address_of_images_is_told_from_that_of_sensors(tmp_path):
         code, events, err = run(tmp_path, "--to", publisher.address, "-n", 1, "--patience", "1")
     finally:
         publisher.close()
-    remedy = "this address publishes images; give the one that 'ertis serve' prints first, where sensors send"
+    remedy = "this address publishes images; sensor nodes use the first address that 'ertis serve' prints"
     assert any(remedy in each.get("text", "") for each in events)
     assert code == 1
     assert err.splitlines()[-1].endswith(f"not acknowledged by the central node at {publisher.address}: {remedy}")
@@ -285,7 +285,7 @@ def test_nodes_that_send_one_sensor_are_told(tmp_path):
             node.append(entries(1, session_id=session_id))
         for reported in notes:
             assert reported.get(timeout=SOON_S) == (
-                "another sensor node sends sensor left, too; give each a name of its own (--name), or end one"
+                "another sensor node sends sensor left, too; give each its own name (--name), or end one"
             )
         node.append(entries(1, session_id=7))
         assert node.flush(SOON_S)
@@ -301,9 +301,9 @@ def test_nodes_that_send_one_sensor_are_told(tmp_path):
         (["--ring", "1"], "--ring, --key and --server-key need a central node; add --to", 2),
         (["--to", "tcp://127.0.0.1:9", "--spool-size", "1"], "--spool-size is given without --spool; add --spool", 2),
         (["--to", "here"], "address 'here' cannot be used; give tcp://HOST:PORT", 1),
-        (["--to", "tcp://10.1.1.1:5601"], "can be reached from other machines, and there are no keys", 1),
-        (["--to", "tcp://127.0.0.1:9", "--spool", "settings.toml"], "settings.toml: File exists; give a folder for", 1),
-        (["--to", "tcp://127.0.0.1:9", "--spool", "/proc"], "/proc: No such file or directory; give a folder for", 1),
+        (["--to", "tcp://10.1.1.1:5601"], "can be reached from other machines, but there are no keys", 1),
+        (["--to", "tcp://127.0.0.1:9", "--spool", "settings.toml"], "settings.toml: File exists; give a writable spool folder", 1),
+        (["--to", "tcp://127.0.0.1:9", "--spool", "/proc"], "/proc: No such file or directory; give a writable spool folder", 1),
         (["--to", "tcp://127.0.0.1:9", "--ring", "0.1"], "--ring is 0.1 MB, but one measurement has 0.131 MB; give", 1),
         (["--to", "tcp://127.0.0.1:9", "--spool", "s", "--spool-size", "1e-9"], "--spool-size is 1e-09 MB, but one measurement has 0.131 MB", 1),
         (["--mounting", "none.toml"], "none.toml", 1),

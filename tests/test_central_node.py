@@ -143,7 +143,7 @@ def test_air_may_change(tmp_path):
 WRONG = {
     "before its hello": ({"session_id": 6}, "hello", "send hello first"),
     "too short": ({"words": b"1234"}, "message", "a measurement has 4 bytes, but its settings give 4096"),
-    "of does not match": ({"crc32": 1}, "message", "does not match"),
+    "of do not match": ({"crc32": 1}, "message", "does not match"),
     "in no air": ({"temperature_c": float("nan")}, "message", "air.temperature_c"),
 }
 
@@ -165,7 +165,7 @@ def test_a_measurement_that_is_wrong_is_refused(what, tmp_path):
 
 
 HELLOS = {
-    "settings of does not match": ({"settings_crc32": 1}, "does not match"),
+    "settings of do not match": ({"settings_crc32": 1}, "do not match"),
     "no settings": ({"settings": b"["}, "settings of sensor left"),
     "no text": ({"settings": b"\xff"}, "not text"),
     "a file for a layout": ({"settings": b'[array]\nlayout = "/etc/passwd"'}, "send its positions"),
@@ -204,7 +204,7 @@ def test_garbage_is_counted_and_harms_nobody(tmp_path):
         node.measure(*given)
         node.hear_settled(12)
         reported = ""
-        while "has version 2 " not in reported:  # one bit makes no 2 of a 1
+        while "has protocol version 2, " not in reported:  # one bit makes no 2 of a 1
             if not stranger.socket.poll(500):  # who does not read misses answers
                 stranger.socket.send_multipart([b"eRTN\x02more"])
             reported = stranger.hear(Refused).reason
@@ -274,7 +274,7 @@ def test_a_message_that_fails_harms_nobody(tmp_path, monkeypatch):
         with monkeypatch.context() as patch:
             patch.setattr("ertis_numba.network.central_node._intake.Intake.ping", lambda *_: 1 / 0)
             node.send(Ping())
-            assert "a mistake (ZeroDivisionError: division by zero)" in node.hear(Refused).reason
+            assert "the central node has an internal error (ZeroDivisionError: division by zero)" in node.hear(Refused).reason
             node.send(Ping())
             node.hear(Refused)
             node.measure(*given)
@@ -283,7 +283,7 @@ def test_a_message_that_fails_harms_nobody(tmp_path, monkeypatch):
     assert [event["event"] for event in central.events].count("internal") == 1
 
 
-@pytest.mark.parametrize("step", ["read", "require_role", "Door.who"])
+@pytest.mark.parametrize("step", ["read", "require_role", "ServerSocket.who"])
 def test_a_message_that_cannot_be_read_for_a_mistake_is_answered(step, tmp_path, monkeypatch):
     given = entries(2)
     with running(tmp_path) as central, Node(central.address) as node:
@@ -294,7 +294,7 @@ def test_a_message_that_cannot_be_read_for_a_mistake_is_answered(step, tmp_path,
             refused = [node.hear(Refused) for _ in given]
         node.measure(*given)  # the sender has kept them
         node.hear_settled(11)
-    assert all("a mistake (ZeroDivisionError: division by zero)" in each.reason for each in refused)
+    assert all("the central node has an internal error (ZeroDivisionError: division by zero)" in each.reason for each in refused)
     assert {each.sensor for each in refused} == ({"left"} if step == "require_role" else {""})
     assert central.latest.refused["internal"] == 2
     assert [event["event"] for event in central.events].count("internal") == 1

@@ -23,7 +23,7 @@ CASES = {
     # raw words
     "missing raw file": (RAW.format("none.bin"), 1, "none.bin: No such file or directory"),
     "empty raw file": (RAW.format("empty.bin"), 1, "empty.bin is empty, wanted a multiple of 262144"),
-    "odd raw file": (RAW.format("odd.bin"), 1, "odd.bin has 262143 bytes, which are no whole words"),
+    "odd raw file": (RAW.format("odd.bin"), 1, "odd.bin has 262143 bytes, which is not a multiple of a word"),
     "truncated raw file": (RAW.format("cut.bin"), 1, "cut.bin has 262140 bytes, wanted a multiple of 262144"),
     "one good, one bad": (RAW.format("good.bin odd.bin"), 1, "odd.bin has 262143 bytes"),
     "folder for raw file": (RAW.format("folder"), 1, "folder is a folder; give a file of raw words"),
@@ -66,8 +66,8 @@ CASES = {
     "HDF5 of others": ("process other.h5 -o out.h5", 1, "other.h5 is HDF5, but not of this package; give a recording"),
     "energyscapes instead": ("process img.h5 -o out.h5", 1, "img.h5 is an energyscape file, wanted a recording; give"),
     "recording instead": ("peaks rec.h5", 1, "rec.h5 is a recording, wanted an energyscape file; process it first"),
-    "cut short": ("process cut.h5 -o out.h5", 1, "cut.h5 is cut short or damaged, it has"),
-    "newer": ("process newer.h5 -o out.h5", 1, "newer.h5 has format version 9, but this package reads up to 1; update"),
+    "cut short": ("process cut.h5 -o out.h5", 1, "cut.h5 is cut short or damaged: it has"),
+    "newer": ("process newer.h5 -o out.h5", 1, "newer.h5 has format version 9, but this package reads up to 2; update"),
     "damaged words": ("process damaged.h5 -o out.h5", 1, "damaged.h5: measurement 1 has CRC-32"),
     "NaN in calibration": ("process nan.h5 -o out.h5", 1, "nan.h5: calibration_gain of channel 3 is nan, the settings"),
     "info of nothing": ("info folder", 1, "folder is a folder; give a recording or an energyscape file"),
@@ -122,7 +122,7 @@ CASES = {
     # outputs
     "output exists": ("process rec.h5 -o img.h5", 1, "output img.h5 exists; give another name, or ask to overwrite it"),
     "output is a folder": ("process rec.h5 -o folder --force", 1, "output folder is a folder; give the name of a file"),
-    "no such folder": ("process rec.h5 -o none/out.h5", 1, "output none/out.h5: there is no folder none; make it"),
+    "no such folder": ("process rec.h5 -o none/out.h5", 1, "output none/out.h5: folder none does not exist; create it"),
     "output is the input": ("process rec.h5 -o rec.h5 --force", 1, "output rec.h5 is the input itself; give"),
     # looking
     "no such measurement": ("plot img.h5 -o out.png -m 7", 1, "--measurement is 7; give a whole number from 0 to 0"),

@@ -116,7 +116,7 @@ def test_it_takes_no_more_than_it_has_threads(cluster, measurement):
         assert cluster.takes(kind)
         cluster.submit(job_of(measurement, number, kind))
     assert not cluster.takes(kind)
-    with pytest.raises(AssertionError, match=r"a job is submitted that no worker takes; ask takes\(\) first"):
+    with pytest.raises(AssertionError, match=r"a job was submitted that no worker can accept; call takes\(\) first"):
         cluster.submit(job_of(measurement, 2, kind))
     for event in events_of(cluster, 2):
         cluster.release(event.job.slot)
@@ -180,8 +180,8 @@ def test_what_is_not_done_in_time_is_given_up(scheduler, measurement):
     (event,) = events_of(runner)
     assert isinstance(event, Lost)
     assert event.again
-    assert "in time" in event.text
-    assert any("is given nothing more: it was not done in time" in text for text in stated)
+    assert "deadline" in event.text
+    assert any("gets no more jobs: it missed the deadline" in text for text in stated)
     give(runner, job_of(measurement, 1, kind))  # it is reached again, or another takes it
     runner.close()
 

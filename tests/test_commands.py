@@ -68,14 +68,14 @@ def test_whatever_comes_is_a_command_or_refused(line):
 )
 def test_what_is_no_command_is_refused(line):
     with pytest.raises(
-        DataError, match=r"is no command; a command is '!X,i,j,k' with X one of YGFDECLIHJKBA"
+        DataError, match="is not a command; a command is '!X,i,j,k' with X one of YGFDECLIHJKBA and whole numbers from 0 to 4294967295"
     ) as caught:
         Command.decode(line)
     assert "\n" not in str(caught.value)
 
 
 def test_of_a_long_line_the_beginning_is_told():
-    with pytest.raises(DataError, match=r"^b'A{40}' is no command"):
+    with pytest.raises(DataError, match=r"^b'A{40}' is not a command"):
         Command.decode(b"A" * 10_000)
 
 
@@ -236,20 +236,20 @@ def _recording(**changes):
 
 
 REFUSED = [
-    (_recording(n_samples=100_000), "recording.n_samples is 100000; a sensor measures multiples .*: give 98304"),
-    (_recording(n_samples=100), "recording.n_samples is 100; a sensor measures multiples .*: give 32768"),
-    (_recording(n_samples=2**25), "recording.n_samples is 33554432; .* up to 16777216: give 16777216"),
+    (_recording(n_samples=100_000), "recording.n_samples is 100000, but a sensor measures multiples .*; give 98304"),
+    (_recording(n_samples=100), "recording.n_samples is 100, but a sensor measures multiples .*; give 32768"),
+    (_recording(n_samples=2**25), "recording.n_samples is 33554432, but .* up to 16777216; give 16777216"),
     (
         _recording(sample_rate_hz=4_000_000.0),
-        "recording.sample_rate_hz is 4000000; .* are 4500000 and 1125000: give one",
+        "recording.sample_rate_hz is 4000000, but .* are 4500000 and 1125000; give one",
     ),
     (_call(sample_rate_hz=450_000.5), "call.sample_rate_hz is 450000.5; give a whole number from 160000 to 2000000"),
     (_call(sample_rate_hz=159_999.0), "call.sample_rate_hz is 159999; give a whole number from 160000 to 2000000"),
     (_call(sample_rate_hz=2e6 + 1), "call.sample_rate_hz is 2000001; give a whole number from 160000 to 2000000"),
-    (_call(duration_s=1e-4), "call has 46 samples; a sensor plays 64 to 65535: give a call.duration_s from 0.00014 to"),
-    (_call(duration_s=0.15), "call has 67501 samples; a sensor plays 64 to 65535: .* to 0.146"),
-    ({"array": Array(layout="wide", positions_m=WIDE)}, "array has 33 channels; a sensor has 32: give so many"),
-    ({"array": Array(layout="line", positions_m=LINE_8, word_bits=8)}, "array.word_bits is 8; .* have 32: give that"),
+    (_call(duration_s=1e-4), "call has 46 samples, but a sensor plays 64 to 65535; give a call.duration_s from 0.00014 to"),
+    (_call(duration_s=0.15), "call has 67501 samples, but a sensor plays 64 to 65535; .* to 0.146"),
+    ({"array": Array(layout="wide", positions_m=WIDE)}, "array has 33 channels, but a sensor has 32; give at most 32 positions"),
+    ({"array": Array(layout="line", positions_m=LINE_8, word_bits=8)}, "array.word_bits is 8, but .* have 32; give 32"),
 ]
 
 
@@ -285,15 +285,15 @@ CODES = call_codes(Call())
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"n_samples": 100_000}, "n_samples is 100000; a sensor measures multiples of 32768"),
+        ({"n_samples": 100_000}, r"recording\.n_samples is 100000, but a sensor measures multiples of 32768 up to 16777216"),
         ({"n_samples": 0}, "n_samples is 0; give a whole number of at least 1"),
         ({"n_samples": 32_768.0}, "n_samples is 32768.0; give a whole number"),
-        ({"pdm_rate_hz": 4e6}, "sample_rate_hz is 4000000; a sensor's clocks are 4500000 and 1125000"),
+        ({"pdm_rate_hz": 4e6}, "sample_rate_hz is 4000000, but a sensor's clocks are 4500000 and 1125000"),
         ({"dac_rate_hz": 100_000}, "sample_rate_hz is 100000; give a whole number from 160000 to 2000000"),
-        ({"codes": CODES[:63]}, "call has 63 samples; a sensor plays 64 to 65535"),
+        ({"codes": CODES[:63]}, "call has 63 samples, but a sensor plays 64 to 65535"),
         ({"codes": CODES.astype(int)}, r"codes are int64 of shape \(1126,\); give \(sample,\) uint16"),
         ({"codes": CODES[None]}, r"codes are uint16 of shape \(1, 1126\); give \(sample,\) uint16"),
-        ({"codes": CODES + np.uint16(2_000)}, r"codes reach \d+; a sensor's converter takes 0 to 4095"),
+        ({"codes": CODES + np.uint16(2_000)}, r"codes reach \d+, but a sensor's converter accepts 0 to 4095"),
         ({"emissions": 0}, "emissions is 0; give a whole number from 1 to"),
         ({"pin": 3}, "pin is 3; give a whole number from 1 to 2"),
         (

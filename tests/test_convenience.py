@@ -51,8 +51,8 @@ def test_pipelines_take_the_path_of_settings(tmp_path):
         (lambda shown: shown.replace(amplitude=shown.amplitude[:, 1:]), r"amplitude has shape \(91, \d+\); give shape"),
         (lambda shown: shown.replace(elevation_rad=np.zeros(3)), r"elevation_rad has shape \(3,\); give shape \(91,\)"),
         (
-            lambda shown: shown.replace(engery=shown.amplitude),
-            r"an image has no field 'engery' \(did you mean 'energy'\?\); give some of energy",
+            lambda shown: shown.replace(amplitdue=shown.amplitude),
+            r"an image has no field 'amplitdue' \(did you mean 'amplitude'\?\); give some of amplitude",
         ),
     ],
 )

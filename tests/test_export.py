@@ -149,7 +149,7 @@ CASES = {
     "no points": ("img.h5 -o a.csv --top 0", 1, "top is 0; give a whole number of at least 1"),
     "over the input": ("rec.h5 -o rec.h5 --force -m 0", 1, "output rec.h5 is the input itself; give another name"),
     "exists": ("img.h5 -o both.h5 --format csv", 1, "output both.h5 exists; give another name, or ask to overwrite"),
-    "no folder": ("img.h5 -o none/a.csv", 1, "output none/a.csv: there is no folder none; make it or give another"),
+    "no folder": ("img.h5 -o none/a.csv", 1, "output none/a.csv: folder none does not exist; create it or give another"),
 }
 
 

@@ -35,7 +35,7 @@ def test_a_listed_key_is_let_in_as_what_it_is_listed(door, pair, sends, receives
 
 def test_an_unknown_key_is_refused_counted_and_told(door):
     client = door.knock(STRANGER)
-    assert door.reported(client).startswith("the central node does not know this key; have it listed")
+    assert door.reported(client).startswith("the central node does not know this key; add it there with 'ertis keys allow'")
     assert door.monitors[client].final
     assert door.admits(STRANGER) is None
     assert (door.came, +door.gate.refused) == ([], {"unknown key": 2})
@@ -169,13 +169,13 @@ def test_a_self_test_passes_and_counts_nothing(door):
 
 
 def test_a_self_test_fails_where_an_unknown_key_is_let_in(tmp_path):
-    with Door(tmp_path, gate=_LetsIn) as door, pytest.raises(NetworkError, match=r"tcp://127\.0\.0\.1:46639 accepts a node with unknown key"):
+    with Door(tmp_path, gate=_LetsIn) as door, pytest.raises(NetworkError, match=r"accepts a node with unknown key"):
         door.gate.self_test(door.address)
 
 
 def test_a_self_test_fails_where_a_node_without_a_key_is_let_in(door):
     past = sockets.server(door.context, LOOPBACK, keys=None)
-    with pytest.raises(NetworkError, match=r"tcp://127\.0\.0\.1:41455 accepts a node with no key"):
+    with pytest.raises(NetworkError, match=r"accepts a node with no key"):
         door.gate.self_test(sockets.bound(past))
     past.close()
 

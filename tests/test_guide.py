@@ -262,3 +262,12 @@ def test_every_page_is_in_the_guide():
     listed = " ".join(re.findall(r"```{toctree}\n(.*?)```", page("index"), re.DOTALL)).split()
     pages = {str(path.relative_to(DOCS).with_suffix("")) for path in GUIDE} - {"index"}
     assert {name for name in pages if not any(fnmatch.fnmatch(name, entry) for entry in listed)} == set()
+
+
+def test_tables_that_make_updates_have_their_markers():
+    """`make bench` and `make soak` would refuse a page without them, after minutes or hours."""
+    lines = re.findall(r"ertis (bench [\w-]+)(.*)", (ROOT / "Makefile").read_text("utf-8"))
+    updates = [(name, path) for name, rest in lines for path in re.findall(r"--update (\S+)", rest)]
+    assert len(updates) > 10
+    for name, path in updates:
+        assert f"<!-- ertis {name}" in (ROOT / path).read_text("utf-8"), (name, path)

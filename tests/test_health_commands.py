@@ -74,7 +74,7 @@ def test_process_warns_once(faulty, tmp_path):
     done = run("process", faulty, "-o", tmp_path / "img.h5", *FAST)
     assert done.stderr == (
         f"ertis: warning: {faulty}: sensor sensor has faulty microphones (stuck at 0: channel 4; stuck at 1: "
-        "channel 9); leave them out by --without 4,9, or see 'ertis info --health'\n"
+        "channel 9); exclude them with --without 4,9, or see 'ertis info --health'\n"
     )
     assert (tmp_path / "img.h5").exists()
 

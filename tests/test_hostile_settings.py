@@ -186,7 +186,7 @@ def test_greetings_have_limits(monkeypatch):
         greetings.offer(_greeting(b"a"))
     with pytest.raises(Unwanted, match="too many hellos are waiting; send hello again in a few seconds"):
         greetings.offer(_greeting(b"a"))
-    with pytest.raises(Unwanted, match="too many hellos wait"):
+    with pytest.raises(Unwanted, match="too many hellos are waiting"):
         greetings.offer(_greeting(b"b", 998))
     greetings.forget(b"a")
     greetings.offer(_greeting(b"b", 998))

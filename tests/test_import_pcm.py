@@ -160,7 +160,7 @@ REFUSED = {
     "slow": (
         lambda folder: write_wav(folder / "a.wav", numbers(), 44_100),
         {},
-        r"has 44100 Hz, too few for a call that reaches 50000 Hz; give the call that was emitted",
+        r"sample rate of 44100 Hz, too low for a call up to 50000 Hz; give the emitted call",
     ),
     "skip": (lambda folder: write_wav(folder / "a.wav", numbers()), {"skip_s": 1.0}, r"skip less \(--skip\)"),
     "length": (lambda folder: write_wav(folder / "a.wav", numbers()), {"length_s": 1.0}, r"give a shorter --length"),
@@ -228,7 +228,7 @@ REFUSED = {
     "shorter than the call": (
         lambda folder: write_wav(folder / "a.wav", numbers()),
         {"length_s": 1e-3},
-        r"has 1 ms, the call alone lasts 2.5 ms; give a longer --length",
+        r"has 1 ms, but the call alone lasts 2.5 ms; give a longer --length",
     ),
 }
 
@@ -263,7 +263,7 @@ def test_what_is_refused(tmp_path, name):
 
 
 def test_wav_alone_says_too_little(tmp_path):
-    with pytest.raises(ArgumentError, match=r"says nothing of its array and call; give settings"):
+    with pytest.raises(ArgumentError, match=r"contains no array and call; give settings"):
         ertis.open_pcm(write_wav(tmp_path / "a.wav", numbers()))
 
 
@@ -336,7 +336,7 @@ def test_a_rate_may_be_an_array_of_one_number(tmp_path, rate_hz):
         (0.0, r"a\.h5: recording\.sample_rate_hz is 0; give a number from 1000 to 1e\+09"),
         (1e308, r"a\.h5: recording\.sample_rate_hz is 1e\+308; give a number"),
         (np.array([1.0, 2.0]), r"a\.h5: sample_freq is \[1\.0, 2\.0\]; give one number, the rate in Hz"),
-        ("fast", "holds no time_data with a sample_freq"),
+        ("fast", "contains no time_data with a sample_freq"),
     ],
     ids=["nan", "inf", "zero", "huge", "two", "text"],
 )
@@ -355,7 +355,7 @@ def test_data_that_lie_the_other_way_round(tmp_path, options):
 
 def test_other_hdf5_is_refused(tmp_path, measurement):
     path = write_recording(tmp_path / "rec.h5", [measurement])
-    with pytest.raises(DataError, match=r"holds no time_data with a sample_freq; give a file of Acoular"):
+    with pytest.raises(DataError, match=r"contains no time_data with a sample_freq; give a file of Acoular"):
         ertis.open_pcm(path, PCM)
 
 

@@ -192,7 +192,7 @@ def test_a_key_has_fewer_peers_than_there_are_of_all(monkeypatch):
     taken = Taken()
     for peer in (b"a", b"b"):
         taken.greet(peer, session_id=peer[0], key="one")
-    with pytest.raises(Unwanted, match="2 sensor nodes have this key"):
+    with pytest.raises(Unwanted, match="2 sensor nodes already use this key"):
         taken.greet(b"c", key="one")
     taken.greet(b"a", session_id=8, key="one")
     taken.greet(b"c", session_id=7, key="another")

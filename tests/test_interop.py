@@ -45,7 +45,7 @@ def test_word_is_little_endian_and_bit_0_is_channel_0(tmp_path):
     ("n_bytes", "message"),
     [
         (0, r"raw.bin is empty, wanted a multiple of 262144 \(65536 words of 4 bytes\); record it again"),
-        (N_BYTES - 1, r"raw.bin has 262143 bytes, which are no whole words, wanted a multiple of 262144"),
+        (N_BYTES - 1, r"raw.bin has 262143 bytes, which is not a multiple of a word, wanted a multiple of 262144"),
         (
             N_BYTES - 4,
             r"raw.bin has 262140 bytes, wanted a multiple of 262144 .*; copy it again if it is",

@@ -85,7 +85,7 @@ def test_numbers_rise_within_an_epoch(tmp_path):
     with create(tmp_path, given) as journal:
         for late in (given[2], given[0]):
             with pytest.raises(
-                ArgumentError, match="measurement 12 of sensor left follows 12; give rising numbers, or another session_id"
+                ArgumentError, match="measurement 1[02] of sensor left follows 12; give rising numbers, or another session_id"
             ):
                 journal.append([late])
         journal.append(entries(1, first=0, session_id=9))
@@ -98,7 +98,7 @@ def test_numbers_rise_within_an_epoch(tmp_path):
 
 def test_all_of_an_append_or_nothing(tmp_path, monkeypatch):
     with create(tmp_path) as journal:
-        with pytest.raises(ArgumentError, match="comes after"):
+        with pytest.raises(ArgumentError, match="follows 21"):
             journal.append([*entries(2, first=20), *entries(1, first=5)])
         execute = journal._database.execute  # noqa: SLF001  nobody else can ask
 

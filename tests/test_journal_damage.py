@@ -128,7 +128,7 @@ def test_rows_that_only_one_tree_has_lost(tmp_path, tree, discarded):
     page = (root - 1) * PAGE_BYTES
     damaged[page + 3 : page + 5] = (19).to_bytes(2, "big")
     path.write_bytes(damaged)
-    with pytest.raises(DamagedError, match="is damaged, it lists"):
+    with pytest.raises(DamagedError, match="is damaged: it lists"):
         Journal.open(path)
 
 
@@ -271,7 +271,7 @@ def test_a_copy_without_its_log(tmp_path):
 def test_a_journal_that_was_removed_takes_no_more(tmp_path):
     with create(tmp_path, entries(2)) as journal:
         journal.path.unlink()
-        with pytest.raises(JournalInUseError, match="was removed or replaced by another process; look again"):
+        with pytest.raises(JournalInUseError, match="was removed or replaced by another process; check the folder again"):
             journal.append(entries(1, first=20))
 
 
@@ -312,7 +312,7 @@ def test_a_database_of_somebody_else_is_not_touched(tmp_path):
     path = tmp_path / "their.journal"
     spoil(path, "CREATE TABLE x (y)")
     before = path.read_bytes()
-    with pytest.raises(DataError, match="is an SQLite file, but not a journal; give one that 'ertis capture' left"):
+    with pytest.raises(DataError, match="is an SQLite file, but not a journal; give one left by 'ertis capture'"):
         Journal.open(path)
     assert path.read_bytes() == before
 
@@ -332,7 +332,7 @@ def test_sealed_by_another_process_in_the_last_moment(tmp_path, monkeypatch, aga
         return execute(self, statement, values)
 
     monkeypatch.setattr(Database, "execute", too_late)
-    with pytest.raises(JournalInUseError, match="was removed or replaced by another process; look again"):
+    with pytest.raises(JournalInUseError, match="was removed or replaced by another process; check the folder again"):
         Journal.open(path)
     assert path.exists() == again
 

@@ -15,11 +15,11 @@ from tests.journals import ENVIRONMENT, TINY, crashed, create, entries, python, 
 
 OPEN = """
 import sys
-from ertis_numba.errors import InUseError
+from ertis_numba.errors import JournalInUseError
 from ertis_numba.journal import Journal
 try:
     Journal.open(sys.argv[1])
-except InUseError as error:
+except JournalInUseError as error:
     print(error)
 """
 

@@ -201,4 +201,4 @@ def test_what_a_small_disk_has_taken_can_be_sealed_there(tmp_path):
     number, message = on_a_small_disk(tmp_path, APPEND + SEAL)
     assert number > 10
     assert "MB free, but" in message
-    assert "can be sealed with more in it; what it holds is safe: end the capture, or free some space" in message
+    assert "its content is safe: end the capture, or free some space" in message

@@ -65,7 +65,7 @@ def test_only_a_literal_loopback_address_may_do_without_keys(text, loopback):
     if loopback:
         addresses.require_keys(endpoint, keys=None)
     else:
-        with pytest.raises(ArgumentError, match="can be reached from other machines, and there are no keys; make some"):
+        with pytest.raises(ArgumentError, match="can be reached from other machines, but there are no keys; create keys"):
             addresses.require_keys(endpoint, keys=None)
 
 
@@ -122,14 +122,14 @@ def test_keys_are_read_as_they_were_saved_and_nobody_else_can(folder):
 def test_a_secret_that_others_may_use_is_refused(folder, mode):
     secret, _ = PAIR.save(folder)
     secret.chmod(mode)
-    with pytest.raises(SettingsError, match=f"others may use it \\(mode {mode:04o}\\); run 'chmod 600"):
+    with pytest.raises(SettingsError, match=f"other users may read it \\(mode {mode:04o}\\); run 'chmod 600"):
         KeyPair.load(secret)
 
 
 def test_a_folder_that_others_may_use_holds_no_secrets(folder):
     folder.mkdir(mode=0o700)
     folder.chmod(0o750)
-    with pytest.raises(ArgumentError, match="can be used by others \\(mode 0750\\); run 'chmod 700"):
+    with pytest.raises(ArgumentError, match="other users can access .* \\(mode 0750\\); run 'chmod 700"):
         PAIR.save(folder)
     assert not list(folder.iterdir())
 
@@ -201,7 +201,7 @@ def test_a_name_that_is_no_name_of_a_file_is_refused(name):
 def test_a_key_that_is_none_is_refused(key):
     with pytest.raises(ArgumentError, match="give the 40 characters from 'ertis keys list'"):
         ClientKeys(PAIR, key)
-    with pytest.raises(ArgumentError, match="is none"):
+    with pytest.raises(ArgumentError, match="is not a key"):
         _permission(public=key)
 
 
@@ -326,11 +326,11 @@ def test_a_key_that_is_allowed_again_has_what_was_said_last():
 @pytest.mark.parametrize(
     ("changes", "reported"),
     [
-        ({"serials": ()}, "sensor without serials; name those"),
+        ({"serials": ()}, "sensor without serials; name the sensors"),
         ({"serials": ("*",)}, "sensor name '\\*' cannot name a group"),
         ({"serials": ("front", "../x")}, "cannot name a group in a file"),
-        ({"role": "application"}, "has serials and is no sensor"),
-        ({"role": "admin"}, "has serials and is no sensor"),
+        ({"role": "application"}, "robot has serials but is not a sensor"),
+        ({"role": "admin"}, "robot has serials but is not a sensor"),
         ({"role": "root", "serials": ()}, "role 'root' is unknown"),
         ({"name": "a b"}, "cannot be used"),
     ],
@@ -408,7 +408,7 @@ def test_no_key_looks_like_an_option(monkeypatch):
 def test_a_key_without_a_file_needs_a_name(tmp_path):
     result = CliRunner().invoke(keys_command, ["allow", PAIR.public, "--role", "admin"])
     assert result.exit_code == 2
-    assert "give --name" in result.output
+    assert "add --name" in result.output
     _run("allow", PAIR.public, "--role", "admin", "--name", "desk", "--list", str(tmp_path / "other.toml"))
     assert AllowList.load(tmp_path / "other.toml").find(PAIR.public).name == "desk"
 

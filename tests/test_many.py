@@ -221,7 +221,7 @@ def test_sensors_of_a_recording_go_into_its_file(tmp_path, out, monkeypatch):
     found, _ = run_here(monkeypatch, [tmp_path / "two.h5"], out, CampaignOptions(settings=narrow))
     assert [row["sensor"] for row in found["two.h5"].made["sensors"]] == ["eRTIS-7", "left"]
     found, _ = run_here(monkeypatch, [tmp_path / "two.h5"], out, CampaignOptions(settings=narrow, sensor="left"))
-    assert "exists and holds sensor eRTIS-7, left, wanted left" in found["two.h5"].error
+    assert "exists and contains sensor eRTIS-7, left, not left" in found["two.h5"].error
 
 
 def test_faulty_microphones_are_told_or_refused(tmp_path, out, monkeypatch):

@@ -130,10 +130,10 @@ def test_other_versions_are_told(monkeypatch):
     class Elsewhere:
         address = "tcp://far:1"
 
-    monkeypatch.setattr(cluster, "worker", Elsewhere)
+    monkeypatch.setattr(cluster, "current_worker", Elsewhere)
     reported = members.follow_there("look", {"versions": {"numpy": "0.1"}}, "topic", 1)
     assert "worker tcp://far:1 has numpy " in reported["error"]
-    assert "wanted 0.1; install the same everywhere" in reported["error"]
+    assert "not 0.1; install the same version everywhere" in reported["error"]
 
 
 class Dwindling:

@@ -78,8 +78,8 @@ def test_each_has_its_own_output():
     ("given", "folder", "stated"),
     [
         (["runs/a.h5", "more"], "out", r"runs/a\.h5 and more/a\.h5 would both become out/a\.energy\.h5"),
-        (["runs"], "runs/a.h5", r"output runs/a\.h5 is a file, and several recordings need a folder"),
-        (["runs"], "none/out", r"output none/out: there is no folder none"),
+        (["runs"], "runs/a.h5", r"output runs/a\.h5 is a file, but several recordings need a folder"),
+        (["runs"], "none/out", r"output none/out: folder none does not exist"),
     ],
 )
 def test_refused_before_anything_is_made(place, given, folder, stated):
@@ -103,7 +103,7 @@ def test_workers_and_a_scheduler():
 
 def test_one_campaign_at_a_time(place):
     with sole(place / "out"):
-        with pytest.raises(ArgumentError, match="is written into by another campaign"), sole(place / "out"):
+        with pytest.raises(ArgumentError, match="is in use by another campaign"), sole(place / "out"):
             pytest.fail("two had the folder")
         with sole(place / "other"):
             pass

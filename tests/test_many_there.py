@@ -96,5 +96,5 @@ def test_what_is_there_is_measured_by_the_plan_that_it_was_made_by(runs, out, mo
     refused = verification.Measured(error_db=-30.0, n_directions=7, peaks=None)
     monkeypatch.setattr(verification, "measure", lambda *_, **__: refused)
     found, _ = run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=narrow, verify=True))
-    assert "image of sensor eRTIS-7 errs by -30.0 dB" in found["a.h5"].error
+    assert "image of sensor eRTIS-7 has an error of -30.0 dB, but the limit is -35 dB" in found["a.h5"].error
     assert state(out / "a.energy.h5") == before

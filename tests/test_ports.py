@@ -66,7 +66,7 @@ def test_an_emulated_device_by_all_its_names(folder, tmp_path):
         )
         device.unplug()
         assert find_ports() == [right]
-        with pytest.raises(SonarError, match=re.escape(f"serial port '{link}'; give one")):
+        with pytest.raises(SonarError, match=re.escape(f"serial port '{link}' does not exist")):
             find_again(left)
         device.replug()
         assert find_again(left).path == device.port
@@ -81,7 +81,7 @@ def test_what_a_killed_emulator_left_leads_nowhere(folder):
         (folder / ".left.lock").touch()
         assert find_ports() == []
         for name in ("left", str(folder / "left")):
-            with pytest.raises(SonarError, match="there is no serial port"):
+            with pytest.raises(SonarError, match="serial port .* does not exist"):
                 resolve(name)
 
 
@@ -126,7 +126,7 @@ def test_a_port_that_is_not_there(monkeypatch):
         resolve("SN7")
     assert caught.value.errno == errno.ENOENT
     plug_in(monkeypatch, ttyACM0="SN8")
-    with pytest.raises(SonarError, match=r"no serial port '/dev/ttyACM7'; give one .* are: /dev/ttyACM0 \(SN8\)$"):
+    with pytest.raises(SonarError, match=r"serial port '/dev/ttyACM7' does not exist; choose one of /dev/ttyACM0 \(SN8\)"):
         resolve("/dev/ttyACM7")
 
 

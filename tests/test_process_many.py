@@ -106,10 +106,10 @@ def test_what_errs_too_much_is_not_written(runs, monkeypatch):
     [
         (["runs/a.h5", "runs/b.h5"], 2, "several recordings need an output folder; give one with -o"),
         (["runs"], 2, "several recordings need a folder"),
-        (["runs/a.h5", "--workers", "2"], 2, "--workers is for several recordings; give more, a folder or a pattern"),
-        (["runs/a.h5", "--scheduler", "tcp://x:1"], 2, "--scheduler is for several recordings"),
+        (["runs/a.h5", "--workers", "2"], 2, "--workers applies to several recordings; give more, a folder or a pattern"),
+        (["runs/a.h5", "--scheduler", "tcp://x:1"], 2, "--scheduler applies to several recordings"),
         (["none/*.h5", "-o", "out"], 1, "no file is named like none/*.h5; give another pattern"),
-        (["runs", "-o", "runs/a.h5"], 1, "output runs/a.h5 is a file, and several recordings need a folder"),
+        (["runs", "-o", "runs/a.h5"], 1, "output runs/a.h5 is a file, but several recordings need a folder"),
         (["runs", "-o", "out", "--workers", "2", "--scheduler", "tcp://x:1"], 1, "give one of both"),
         (["runs", "-o", "out", "--directions", "90", "--azimuth", "-9:9"], 2, "directions 90 have fixed limits"),
         (["runs", "-o", "out", "--method", "paper", "--explain"], 2, "--explain needs --method fast"),

@@ -196,7 +196,7 @@ def test_a_capture_that_fails_and_cannot_be_sealed(tmp_path, capsys):
     (tmp_path / "rec.h5").write_text("mine")
     reported = (
         f"{tmp_path}/rec.h5 exists with other content than {path}; move it, or give --force; "
-        f"the measurements are safe in {path}, recover them with 'ertis recover {path}'"
+        f"the measurements are safe in {path}; recover them with 'ertis recover {path}'"
     )
     with pytest.raises(SonarError, match="left: it was unplugged"):
         _seal(path, LOST, overwrite=False)

@@ -254,7 +254,7 @@ def test_a_process_of_its_own(tmp_path):
     assert (done.returncode, done.stdout) == (1, "")
     assert (
         done.stderr
-        == f"{tmp_path / 'none.journal'}: No such file or directory; give a journal that 'ertis capture' left\n"
+        == f"{tmp_path / 'none.journal'}: No such file or directory; give a journal left by 'ertis capture'\n"
     )
 
 
@@ -330,7 +330,7 @@ def test_gaps_where_numbers_start_again():
     ("sensor", "reason", "message"),
     [
         ("left", "x" * 65, "reason of a gap is .*; give a line of 1 to 64 bytes"),
-        ("right", "x", "a gap is given for sensor 'right', of which no measurement came"),
+        ("right", "x", "a gap is given for sensor 'right', which has no measurement"),
     ],
 )
 def test_gaps_that_no_recording_can_hold(tmp_path, sensor, reason, message):
@@ -341,7 +341,7 @@ def test_gaps_that_no_recording_can_hold(tmp_path, sensor, reason, message):
 
 def test_firmware_of_a_sensor_of_which_nothing_came(tmp_path):
     with (
-        pytest.raises(ArgumentError, match="firmware is given for sensor 'right', of which no measurement came"),
+        pytest.raises(ArgumentError, match="firmware is given for sensor 'right', which has no measurement"),
         RecordingWriter(tmp_path / "rec.h5", firmware={"right": "1"}) as writer,
     ):
         writer.write(entries(1)[0].measurement)

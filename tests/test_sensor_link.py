@@ -133,7 +133,7 @@ def test_another_version_is_told():
     with StandIn() as central, Node(central.address) as node:
         central.version = 9
         node.append(entries(1))
-        assert "a header has version 9 of the protocol, this node speaks 1" in node.notes.get(timeout=SOON_S)
+        assert "a header has protocol version 9, but this node uses 1" in node.notes.get(timeout=SOON_S)
         central.version = messages.VERSION
         assert node.flush(SOON_S)
 
@@ -152,7 +152,7 @@ def test_a_fault_holds_measurements_back():
         assert central.seen == {10, 11}  # to see whether it stores again, one is enough
         central.state = "storage"
         assert node.flush(SOON_S)
-        assert node.notes.get(timeout=SOON_S) == "the central node stores again"
+        assert node.notes.get(timeout=SOON_S) == "the central node can store again"
         assert node.central == "storage"
     assert has_all(central, given)
 
@@ -168,7 +168,7 @@ def test_silence_is_answered_by_a_new_connection():
         assert node.central == "away"
         node.append(given[5:])
         central.silent = False
-        assert "is there" in node.notes.get(timeout=SOON_S)
+        assert "connected to the central node" in node.notes.get(timeout=SOON_S)
         assert node.flush(SOON_S)
         assert node.reconnects == 1
     assert has_all(central, given)
@@ -221,7 +221,7 @@ def test_a_failing_listener_stops_nothing(caplog):
         assert node.counts["left"].stored == 6
     assert has_all(central, given)
     reported = [record.ertis_fields["text"] for record in caplog.records if record.name == "ertis.network.sensor_node"]
-    assert sorted(reported) == [f"{name} failed: OSError: the pipe is closed" for name in ("on_note", "on_acked")]
+    assert sorted(reported) == [f"{name} failed: OSError: the pipe is closed" for name in ("on_acked", "on_note")]
 
 
 def test_a_link_that_fails_is_made_again(monkeypatch):
@@ -238,5 +238,5 @@ def test_a_link_that_fails_is_made_again(monkeypatch):
     with StandIn() as central, Node(central.address) as node:
         node.append(given)
         assert node.flush(SOON_S)
-        assert "has failed (MemoryError: no room); it is made again" in node.notes.get(timeout=SOON_S)
+        assert "has failed (MemoryError: no room); reconnecting" in node.notes.get(timeout=SOON_S)
     assert has_all(central, given)

@@ -237,7 +237,7 @@ BAD = {
     "address": (lambda _: SensorNode("here"), "address 'here' cannot be used; give tcp://HOST:PORT"),
     "no keys": (
         lambda _: SensorNode("tcp://10.0.0.1:5601"),
-        "can be reached from other machines, and there are no keys",
+        r"address tcp://10\.0\.0\.1:5601 can be reached from other machines, but there are no keys",
     ),
     "ring": (
         lambda _: SensorNode("tcp://127.0.0.1:1", ring_bytes=0),
@@ -245,15 +245,15 @@ BAD = {
     ),
     "limit without spool": (
         lambda _: SensorNode("tcp://127.0.0.1:1", spool_bytes=1),
-        "spool_bytes is given without a spool; give its folder, too",
+        "spool_bytes is given without a spool; give its folder with spool",
     ),
     "unknown sensor": (
         lambda node: node.append(entries(1, sensor="right")),
-        "sensor 'right' is not known to this sensor node; add it first",
+        "sensor 'right' is not registered at this sensor node; add it first",
     ),
     "gap of it": (
         lambda node: node.note_gap("right", 0, 1, "x", session_id=1),
-        "sensor 'right' is not known to this sensor node; add it first",
+        "sensor 'right' is not registered at this sensor node; add it first",
     ),
     "gap backwards": (
         lambda node: node.note_gap("left", 2, 1, "x", session_id=1),
@@ -275,19 +275,19 @@ BAD = {
         lambda node: node.note_gap("left", 1, 2, "x", session_id=-1),
         "session_id is -1; give a whole number from 0",
     ),
-    "name": (lambda node: node.add_sensor("a" * 65, TINY), "sensor name 'a{65}' has 65 characters; give 64 at most"),
+    "name": (lambda node: node.add_sensor("a" * 65, TINY), "sensor name 'a{65}' has 65 characters; the limit is 64"),
     "longer than the memory": (
         lambda node: node.add_sensor("b", TINY.replace(recording=Recording(n_samples=200_000))),
-        "a measurement of sensor b has 200000 bytes, and the memory has room for 100000; give ring_bytes",
+        r"a measurement of sensor b has 200000 bytes, but the memory has room for 100000; give a larger ring_bytes \(--ring\)",
     ),
     "settings": (
         lambda node: node.append(entries(1, settings=TINY.replace(recording=Recording(n_samples=4097)))),
         "a measurement has other recording settings than sensor left",
     ),
-    "again": (lambda node: node.append(entries(1)), "measurement 10 of sensor left comes after 12; give them in order"),
+    "again": (lambda node: node.append(entries(1)), "measurement 10 of sensor left follows 12"),
     "twice at once": (
         lambda node: node.append([*entries(1, first=20), *entries(1, first=20)]),
-        "measurement 20 of sensor left comes after 20; give them in order",
+        "measurement 20 of sensor left follows 20",
     ),
 }
 

@@ -210,7 +210,7 @@ def test_with_keys_each_node_gets_what_it_is_listed_for(tmp_path):
         while not notes:
             another.receive(0.1)
         assert another.counts.received == 0
-    assert any("listed as sensor" in note for note in notes)
+    assert any("front has the role sensor" in note for note in notes)
 
 
 @pytest.mark.parametrize(

@@ -400,7 +400,7 @@ def test_energyscapes_that_cannot_be_written(tmp_path, other, message):
     ("name", "message"),
     [
         ("there.h5", "there.h5 exists; give another name, or ask to overwrite it"),
-        ("nowhere/rec.h5", "there is no folder"),
+        ("nowhere/rec.h5", "does not exist"),
         ("folder", "folder is a folder; give the name of a file"),
     ],
 )

@@ -72,7 +72,7 @@ def test_the_other_kind(path, tmp_path):
 @pytest.mark.parametrize("kept", [0.0001, 0.01, 0.3, 0.9, 0.9999])
 def test_cut_short(path, kept):
     os.truncate(path, int(kept * path.stat().st_size))
-    with pytest.raises(DataError, match=r"is cut short or damaged, it has \d+ of \d+ bytes|is not an HDF5 file"):
+    with pytest.raises(DataError, match=r"is cut short or damaged: it has \d+ of \d+ bytes|is not an HDF5 file"):
         open_recording(path)
 
 
@@ -121,7 +121,7 @@ def test_a_file_that_a_killed_program_wrote_is_not_called_damaged(path):
 def test_newer_version(path):
     with h5py.File(path, "r+") as file:
         file.attrs["ertis_format_version"] = 2
-    with pytest.raises(FormatVersionError, match="has format version 2, but this package reads up to 1; update"):
+    with pytest.raises(FormatVersionError, match="has format version 2, but this package reads up to 2; update"):
         open_recording(path)
 
 

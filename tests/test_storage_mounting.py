@@ -95,7 +95,7 @@ def test_what_is_given_counts_more_than_the_recording(recorded, tmp_path):
     [
         ({"left": ((0.0, 0.0), TURNED)}, "translation_m of sensor left"),
         ({"left": ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 2.0))}, "rotation_xyzw of sensor left has length 2"),
-        ({"back": PLACES["left"]}, "mounting is given for sensor 'back', of which no measurement came"),
+        ({"back": PLACES["left"]}, "mounting is given for sensor 'back', which has no measurement"),
     ],
 )
 def test_mountings_that_cannot_be(tmp_path, given, reported):

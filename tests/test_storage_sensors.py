@@ -133,7 +133,7 @@ def test_mounting_is_kept(tmp_path):
         ({"settings": SMALL}, "settings are given for one sensor, but measurements came of right and left; give none"),
         (
             {"mounting": {"a": ((0, 0, 0), TURNED)}},
-            "mounting is given for sensor 'a', of which no measurement came",
+            "mounting is given for sensor 'a', which has no measurement",
         ),
         ({"mounting": {"left": ((0, 0), TURNED)}}, r"translation_m of sensor left has shape \(2,\); give shape \(3,\)"),
         ({"mounting": {"left": ((0, 0, np.inf), TURNED)}}, r"translation_m of sensor left holds inf at \[2\]; give"),

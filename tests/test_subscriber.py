@@ -166,7 +166,7 @@ def test_receive_gives_up_after_its_time(publisher):
     ("arguments", "match"),
     [
         ({"address": "127.0.0.1:5602"}, "address '127.0.0.1:5602' cannot be used"),
-        ({"address": "tcp://10.0.0.1:5602"}, "can be reached from other machines, and there are no keys"),
+        ({"address": "tcp://10.0.0.1:5602"}, "can be reached from other machines, but there are no keys"),
         ({"products": ["pictures"]}, "product 'pictures' is unknown"),
         ({"products": []}, "products are none; give some of energyscape"),
         ({"sensors": []}, "sensors are 0; give 1 to 32"),

@@ -93,7 +93,8 @@ class Tally:
         self._was_read = True
         self.damage = blocks.pop(0, {}).get("damage", "")
         for place, block in blocks.items():
-            mark = Mark(**block)
+            # Tallies written before version 2 of the formats name the session "epoch".
+            mark = Mark(**{"session_id" if key == "epoch" else key: value for key, value in block.items()})
             self._places[mark.sensor, mark.session_id] = place
             self.marks[mark.sensor, mark.session_id] = mark
 

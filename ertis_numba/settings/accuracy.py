@@ -47,7 +47,7 @@ class Accuracy(TomlTable, frozen=True, kw_only=True):
     stopband_attenuation_db : float, optional, default None
         Stopband attenuation of the decimation filter in dB, 40 to 140: attenuation of sound that would alias into the
         call's band.
-    zones : int, optional, default None
+    focal_zones : int, optional, default None
         Number of focal zones for spherical wavefronts, from 1. Ranges within a focal zone share their delays.
     """
 

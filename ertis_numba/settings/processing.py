@@ -57,7 +57,7 @@ class Processing(TomlTable, frozen=True, kw_only=True):
         array, ``cosine``, ``hann``, ``hamming``, ``blackman``, ``taylor:DB`` (20 to 80 dB, 30 by default) or
         ``kaiser:BETA`` (0 to 20, 6 by default); or one number per channel, not below 0. For delay_and_sum only; see
         ``docs/explanation/beamformers.md``.
-    loading : float, default 1
+    diagonal_loading : float, default 1
         Diagonal loading of ``capon`` relative to the mean power of a microphone, 1e-6 to 1e6. Larger values approach
         delay-and-sum.
     """
