@@ -63,7 +63,7 @@ def check_target(path: Path, *, overwrite: bool, sources: Iterable[Path] = ()) -
     if path.is_symlink() or (path.exists() and not path.is_file()):
         raise ArgumentError(f"output {path} is a link or a device; give the name of a file")
     if not path.parent.is_dir():
-        raise ArgumentError(f"output {path}: there is no folder {path.parent}; make it or give another")
+        raise ArgumentError(f"output {path}: folder {path.parent} does not exist; create it or give another")
     if path.exists() and any(source.exists() and source.samefile(path) for source in sources):
         raise ArgumentError(f"output {path} is the input itself; give another name")
     if path.exists() and not overwrite:

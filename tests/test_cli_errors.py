@@ -69,7 +69,7 @@ CASES = {
     "cut short": ("process cut.h5 -o out.h5", 1, "cut.h5 is cut short or damaged: it has"),
     "newer": ("process newer.h5 -o out.h5", 1, "newer.h5 has format version 9, but this package reads up to 2; update"),
     "damaged words": ("process damaged.h5 -o out.h5", 1, "damaged.h5: measurement 1 has CRC-32"),
-    "NaN in calibration": ("process nan.h5 -o out.h5", 1, "nan.h5: calibration_gain of channel 3 is nan, the settings"),
+    "NaN in calibration": ("process nan.h5 -o out.h5", 1, "nan.h5: calibration_gain of channel 3 is nan, but the settings"),
     "info of nothing": ("info folder", 1, "folder is a folder; give a recording or an energyscape file"),
     # processing
     "no directions": ("process rec.h5 -o out.h5 --directions 2d:0", 1, "count of directions '2d:0' is 0; give a whole"),
@@ -136,7 +136,7 @@ CASES = {
     "picture format": ("plot img.h5 -o out.bmp", 1, "picture format '.bmp' is unknown; known are .pdf, .png, .svg"),
     "dynamic range": ("plot img.h5 -o out.png --dynamic-range -5", 1, "--dynamic-range is -5; give a number above 0"),
     # sensors and truth
-    "which sensor": ("plot two.h5 -o out.png", 1, "two.h5 holds 2 sensors; choose one of left, right (--sensor)"),
+    "which sensor": ("plot two.h5 -o out.png", 1, "two.h5 contains 2 sensors; choose one of left, right (--sensor)"),
     "no such sensor to process": ("process rec.h5 -o out.h5 --sensor x", 1, "has no sensor 'x'; choose one of eRTIS-7"),
     "no such sensor to plot": ("plot two.h5 -o out.png --sensor x", 1, "no sensor 'x'; choose one of left, right"),
     "no such sensor to list": ("peaks two.h5 --sensor x", 1, "two.h5 has no sensor 'x'; choose one of left, right"),

@@ -161,7 +161,7 @@ def test_exports_and_pictures_have_no_disabled_microphone(recording, tmp_path):
 def test_advice_on_faulty_microphones_can_be_followed(recording, tmp_path):
     first = tmp_path / "first.h5"
     (reported,) = run("process", recording, "-o", first, "--quiet").stderr.splitlines()
-    advice = reported.partition("leave them out by ")[2].partition(",  or")[0].partition(", or see")[0]
+    advice = reported.partition("exclude them with ")[2].partition(",  or")[0].partition(", or see")[0]
     assert advice == "--without 3,8,11,12,21,26"
     second = tmp_path / "second.h5"
     assert run("process", recording, "-o", second, "--quiet", "--strict", *advice.split()).stderr == ""

@@ -158,7 +158,7 @@ def test_keys_that_others_can_read(doctor, tmp_path):
     assert doctor()["keys"][0][0] == "good"
     secret.chmod(0o644)
     state, text, remedy = doctor()["keys"][0]
-    assert (state, "others may use it" in text) == ("bad", True)
+    assert (state, "other users may read it" in text) == ("bad", True)
     assert "chmod 600" in remedy
 
 

@@ -95,7 +95,7 @@ def test_the_command_unplugs_its_devices(emulate, recording, tmp_path):
     process = emulate(recording, "--sensor", "left", "--link", link, "--unplug", "0:0.05", "--json")
     reported = json.loads(process.stdout.readline())
     assert (reported["sensor"], reported["link"], reported["port"][:5]) == ("left", str(link), "/dev/")
-    assert process.stderr.readline().startswith("left is back: /dev/")
+    assert process.stderr.readline().startswith("left reconnected: /dev/")
     with serial.Serial(str(link), timeout=TIMEOUT_S) as port:
         assert ask(port, b"!Y,0,0,0\n") == 0x010000
     second = emulate(recording, "--sensor", "left", "--link", link)
@@ -155,7 +155,7 @@ def test_a_system_without_pseudo_terminals(recording, tmp_path):
         check=False,
         env=ENVIRONMENT | {"ERTIS_EMULATED_DIR": str(tmp_path / "links")},
     )
-    assert done.stdout == "Emulator Setup Sonar\n"
+    assert done.stdout == "Emulator Setup SonarDriver\n"
     assert done.stderr == ("ertis: error: this system has no pseudo terminals; emulate sensors on Linux or macOS\n")
     assert done.returncode == 1
     assert not (tmp_path / "links").exists()
@@ -212,7 +212,7 @@ def test_a_length_that_no_device_has_is_refused(tmp_path, monkeypatch):
     monkeypatch.setenv("ERTIS_EMULATED_DIR", str(tmp_path))
     done = CliRunner().invoke(cli, ["emulate", str(write_recording(tmp_path / "rec.h5", noise()))])
     assert (done.exit_code, done.stdout) == (1, "")
-    assert "recording.n_samples is 40960; a sensor measures multiples of 32768 up to 16777216" in done.stderr
+    assert "recording.n_samples is 40960, but a sensor measures multiples of 32768 up to 16777216" in done.stderr
 
 
 def captured(port, settings):

@@ -121,7 +121,7 @@ def test_other_words_are_refused(words, message):
 def test_a_link_belongs_to_one_device(tmp_path):
     link = tmp_path / "front"
     with Emulator(WORDS, link=link) as device:
-        with pytest.raises(ArgumentError, match="front belongs to an emulated device that runs; end that one"):
+        with pytest.raises(ArgumentError, match="front belongs to a running emulated device; end that one"):
             Emulator(WORDS, link=link)
         assert link.readlink() == Path(device.port)
     link.symlink_to("/dev/pts/0")  # as one that was killed leaves it

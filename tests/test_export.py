@@ -132,7 +132,7 @@ CASES = {
     "no places": ("img.h5 -o a.npz -m 1:x", 2, "'1:x' is not a measurement; give one number, or two as in 2:5"),
     "unknown mounting": ("both.energy.h5 -o a.ply", 1, "choose one (--sensor), or give their --mounting"),
     "several sensors": ("both.h5 -o a.npz", 1, "sensors left and right cannot share the axes of one npz"),
-    "several signals": ("rec.h5 -o a.h5", 1, "more than one measurement came; give one (--measurement)"),
+    "several signals": ("rec.h5 -o a.h5", 1, "more than one measurement was given; give one (--measurement)"),
     "no signals": ("img.h5 -o a.h5 -m 0", 1, "img.h5 is an energyscape file, wanted a recording; give"),
     "topics of a cloud": (
         "img.h5 -o a.ply --topic points",
@@ -236,7 +236,7 @@ def test_errors_of_the_disk_name_the_file(tmp_path, monkeypatch):
 
 
 def test_measurements_are_no_images(tmp_path):
-    with pytest.raises(ArgumentError, match="a measurement is given, wanted energyscapes; process it first"):
+    with pytest.raises(ArgumentError, match="a measurement is given, but energyscapes are needed; process it first"):
         export(tmp_path / "a.ply", noise())
     with pytest.raises(ArgumentError, match="format 'las' is unknown"):
         export(tmp_path / "a.ply", [image()], file_format="las")

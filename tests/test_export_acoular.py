@@ -118,7 +118,7 @@ def test_what_is_in_the_files(tmp_path):
 
 def test_what_is_refused(tmp_path, monkeypatch):
     for given, message in (
-        (noise(), "holds signals of one measurement, and more than one measurement came; give one"),
+        (noise(), "contains signals of one measurement, but more than one measurement was given; give one"),
         ([], "and no measurement came"),
         ([image()], "and an energyscape came"),
     ):

@@ -274,7 +274,7 @@ def test_what_is_refused(tmp_path, monkeypatch):
     for items, options, message in (
         ([], {}, "no energyscape is given"),
         ([given], {"topics": ["cloud"]}, "topic 'cloud' is unknown; known are points, image, sonar_image"),
-        ([given.replace(stamp=Stamp(timestamp_ns=2**62))], {}, "wanted one from 1970 to 2038"),
+        ([given.replace(stamp=Stamp(timestamp_ns=2**62))], {}, "outside 1970 to 2038"),
         (
             [given.replace(stamp=Stamp(sensor="a b"))],
             {},

@@ -91,7 +91,7 @@ def test_numbers_rise_within_an_epoch(tmp_path):
         journal.append(entries(1, first=0, session_id=9))
         journal.append(entries(1, first=13))
     with Journal.open(journal.path) as journal:
-        with pytest.raises(ArgumentError, match="measurement 13 of sensor left comes after 13"):
+        with pytest.raises(ArgumentError, match="measurement 13 of sensor left follows 13"):
             journal.append(entries(1, first=13))
         assert [key.sequence for key in journal.index()] == [10, 11, 12, 0, 13]
 

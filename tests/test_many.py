@@ -97,7 +97,7 @@ def test_what_is_there_is_left_alone(runs, out, monkeypatch):
     before = states(out)
     (out / "b.energy.h5").unlink()
     found, pool = run_here(monkeypatch, [runs], out, CampaignOptions(settings=narrow, overwrite=True))
-    assert outcomes(found) == {"a.h5": "there", "b.h5": "made", "c.h5": "there", "d.h5": "there"}
+    assert outcomes(found) == {"a.h5": "kept", "b.h5": "made", "c.h5": "kept", "d.h5": "kept"}
     assert [order.about["path"] for order in pool.given if order.do == "make"] == [str(runs / "b.h5")]
     after = states(out)
     assert {name: after[name] for name in after if name != "b.energy.h5"} == {
@@ -127,7 +127,7 @@ def test_what_was_made_otherwise_is_told_or_replaced(runs, out, monkeypatch, wan
     found, _ = run_here(monkeypatch, [runs / "a.h5", runs / "b.h5"], out, replaced)
     assert set(outcomes(found).values()) == {"made"}
     found, _ = run_here(monkeypatch, [runs / "a.h5", runs / "b.h5"], out, wanted)
-    assert set(outcomes(found).values()) == {"there"}
+    assert set(outcomes(found).values()) == {"kept"}
 
 
 def test_another_recording_of_the_same_name(runs, out, monkeypatch):
@@ -175,7 +175,7 @@ def test_a_grid_whose_file_has_changed(runs, out, monkeypatch, tmp_path):
     grid.write_text("-10,0\n10,0\n")
     run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=by_file))
     found, _ = run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=by_file))
-    assert outcomes(found) == {"a.h5": "there"}
+    assert outcomes(found) == {"a.h5": "kept"}
     grid.write_text("-10,0\n11,0\n")
     found, _ = run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=by_file))
     assert "other settings (grid of sensor eRTIS-7)" in found["a.h5"].error
@@ -208,8 +208,8 @@ def test_settings_that_no_plan_can_keep_are_told_of_each(runs, out, monkeypatch)
 def test_energyscape_files_are_passed_over_unless_named(runs, out, monkeypatch):
     run_here(monkeypatch, [runs / "a.h5"], runs, CampaignOptions(settings=narrow))  # beside the recordings
     found, _ = run_here(monkeypatch, [runs], runs, CampaignOptions(settings=narrow))
-    assert found["a.energy.h5"].outcome == "passed over"
-    assert outcomes(found)["a.h5"] == "there"
+    assert found["a.energy.h5"].outcome == "skipped"
+    assert outcomes(found)["a.h5"] == "kept"
     found, _ = run_here(monkeypatch, [runs / "a.energy.h5"], out)
     assert "a.energy.h5 is an energyscape file, wanted a recording" in found["a.energy.h5"].error
 

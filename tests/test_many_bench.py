@@ -39,7 +39,7 @@ def test_all_pools_are_timed_and_compared(tmp_path, monkeypatch):
 
 def test_more_cores_have_more_pools(monkeypatch):
     monkeypatch.setattr(many, "_cores", lambda: 4)
-    crews = many._pools  # noqa: SLF001
+    crews = many._crews  # noqa: SLF001
     assert [tuple(pool.values()) for pool in crews("tcp://x:1").values()] == [
         (1, 1),
         (1, 4),

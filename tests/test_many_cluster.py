@@ -67,7 +67,7 @@ def test_files_are_those_of_this_process(scheduler, runs, tmp_path, monkeypatch)
     here, there = ({item.name: item.read_bytes() for item in (tmp_path / name).iterdir()} for name in ("here", "out"))
     assert [name for name in here if here[name] != there[name]] == []
     again = ended(Campaign(find(["runs"]), "out", WANTED, scheduler=scheduler).run())
-    assert set(outcomes(again).values()) == {"there", "failed"}
+    assert set(outcomes(again).values()) == {"kept", "failed"}
 
 
 def test_workers_of_a_cluster_name_recordings_of_another_call(scheduler, tmp_path):

@@ -93,7 +93,7 @@ def test_a_worker_that_dies_takes_one_recording_with_it(long_runs, tmp_path, cre
     assert f"{long_runs / 'b.h5'}: its worker process was ended by SIGKILL" in found["b.h5"].error
     assert names_in(out) == ["a.energy.h5", "c.energy.h5", "d.energy.h5"]
     again = ended(Campaign(find([long_runs]), out, CampaignOptions(settings=narrow), workers=1).run())
-    assert outcomes(again) == {"a.h5": "there", "b.h5": "made", "c.h5": "there", "d.h5": "there"}
+    assert outcomes(again) == {"a.h5": "kept", "b.h5": "made", "c.h5": "kept", "d.h5": "kept"}
 
 
 def test_to_close_it_ends_all_work_at_once(long_runs, tmp_path, crews):
@@ -213,8 +213,8 @@ def test_a_kill_leaves_no_half_file_and_the_next_run_completes_it(long_runs, tmp
         reported = [json.loads(line) for line in process.stdout]
         assert process.wait(PATIENCE_S) == 0
     assert contents(out) == wanted
-    assert reported[-1]["made"] + reported[-1]["there"] == 4
-    assert reported[-1]["there"] == len(left) - ("b.energy.h5" in left)
+    assert reported[-1]["made"] + reported[-1]["kept"] == 4
+    assert reported[-1]["kept"] == len(left) - ("b.energy.h5" in left)
 
 
 def test_ctrl_c_ends_all_at_once(long_runs, tmp_path):

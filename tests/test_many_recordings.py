@@ -62,7 +62,7 @@ def test_a_file_that_is_not_there_is_left_to_whoever_opens_it():
 
 @pytest.mark.parametrize(
     ("given", "stated"),
-    [("runs/*.hdf", "no file is named like runs/"), ("empty", r"folder empty has no \*\.h5 in it")],
+    [("runs/*.hdf", "no file matches runs/"), ("empty", r"folder empty contains no \*\.h5")],
 )
 def test_nothing_meant(given, stated):
     Path("empty").mkdir()
@@ -90,7 +90,7 @@ def test_refused_before_anything_is_made(place, given, folder, stated):
 
 def test_no_recording_is_replaced():
     Path("runs/a.energy.h5").touch()
-    with pytest.raises(ArgumentError, match=r"would become runs/a\.energy\.h5, which is to be processed itself"):
+    with pytest.raises(ArgumentError, match=r"would become runs/a\.energy\.h5, which is itself to be processed"):
         outputs([Source(Path("runs/a.h5")), Source(Path("runs/a.energy.h5"))], Path("runs"))
 
 

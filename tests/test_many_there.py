@@ -78,7 +78,7 @@ def test_strict_holds_for_what_is_there(tmp_path, out, monkeypatch):
     found, _ = run_here(monkeypatch, [tmp_path / "worn.h5"], out, CampaignOptions(settings=narrow, strict=True))
     assert "stuck at 0: channel 0" in found["worn.h5"].error
     found, _ = run_here(monkeypatch, [tmp_path / "worn.h5"], out, CampaignOptions(settings=narrow))
-    assert outcomes(found) == {"worn.h5": "there"}
+    assert outcomes(found) == {"worn.h5": "kept"}
     assert state(out / "worn.energy.h5") == before
 
 
@@ -88,7 +88,7 @@ def test_what_is_there_is_measured_by_the_plan_that_it_was_made_by(runs, out, mo
     found, pool = run_here(
         monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=narrow, explain=True, verify=True)
     )
-    assert outcomes(found) == {"a.h5": "there"}
+    assert outcomes(found) == {"a.h5": "kept"}
     assert [order.do for order in pool.given] == ["look", "plan", "check"]
     (sensor,) = found["a.h5"].made["sensors"]
     assert sensor["plan"]["accuracy"]["oversampling"] == 48

@@ -53,7 +53,7 @@ def test_each_is_told_as_it_ends_and_all_at_the_end(runs, tmp_path):
     (failed,) = [one for one in each if one["outcome"] == "failed"]
     assert failed["error"].startswith("runs/broken.h5 is not an HDF5 file")
     assert total.pop("seconds") > 0
-    assert total == {"recordings": 3, "made": 2, "there": 0, "passed_over": 0, "failed": 1, "measurements": 6}
+    assert total == {"recordings": 3, "made": 2, "kept": 0, "skipped": 0, "failed": 1, "measurements": 6}
     lines = done.stderr.splitlines()
     assert any(line.startswith("out/a.energy.h5: 3 measurements, 9 directions × ") for line in lines)
     assert any(line.startswith("ertis: failed: runs/broken.h5 is not an HDF5 file") for line in lines)
@@ -68,8 +68,8 @@ def test_each_is_told_as_it_ends_and_all_at_the_end(runs, tmp_path):
     assert [line.partition(" is ")[0] for line in done.stderr.splitlines()[:-1]] == ["ertis: failed: runs/broken.h5"]
     (runs / "broken.h5").unlink()
     done = run("runs", "-o", "out", *FAST)
-    assert "out/a.energy.h5: made before" in done.stderr.splitlines()
-    assert "2 recordings: 2 there; 0 measurements in " in done.stderr
+    assert "out/a.energy.h5: exists already, kept" in done.stderr.splitlines()
+    assert "2 recordings: 2 kept; 0 measurements in " in done.stderr
 
 
 def test_plans_are_told_of_each_and_measured(runs, monkeypatch):
@@ -83,10 +83,10 @@ def test_plans_are_told_of_each_and_measured(runs, monkeypatch):
         assert "lines" not in sensor
     monkeypatch.setattr(Campaign, "_pool", lambda _: Here())
     done = run("runs", "-o", "more", *FAST, "--explain")
-    assert done.stderr.count("plan of eRTIS-7, for an error of -35 dB at the most:") == 2
+    assert done.stderr.count("plan of eRTIS-7 for an error budget of -35 dB:") == 2
     again = run("runs", "-o", "more", *FAST, "--explain")
-    assert again.stderr.count("plan of eRTIS-7, for an error of -35 dB at the most:") == 2
-    assert again.stderr.count(": made before\n") == 2
+    assert again.stderr.count("plan of eRTIS-7 for an error budget of -35 dB:") == 2
+    assert again.stderr.count(": exists already, kept\n") == 2
 
 
 @pytest.mark.usefixtures("here")
@@ -96,7 +96,7 @@ def test_what_errs_too_much_is_not_written(runs, monkeypatch):
     done = run("runs", "-o", "out", *FAST, "--verify", code=1)
     for name in "ab":
         assert (
-            f"ertis: failed: runs/{name}.h5: image of sensor eRTIS-7 errs by -30.0 dB, allowed are -35" in done.stderr
+            f"ertis: failed: runs/{name}.h5: image of sensor eRTIS-7 has an error of -30.0 dB, but the limit is -35 dB" in done.stderr
         )
     assert names_in(runs.parent / "out") == []
 
@@ -105,12 +105,12 @@ def test_what_errs_too_much_is_not_written(runs, monkeypatch):
     ("arguments", "code", "stated"),
     [
         (["runs/a.h5", "runs/b.h5"], 2, "several recordings need an output folder; give one with -o"),
-        (["runs"], 2, "several recordings need a folder"),
+        (["runs"], 2, "several recordings need an output folder"),
         (["runs/a.h5", "--workers", "2"], 2, "--workers applies to several recordings; give more, a folder or a pattern"),
         (["runs/a.h5", "--scheduler", "tcp://x:1"], 2, "--scheduler applies to several recordings"),
-        (["none/*.h5", "-o", "out"], 1, "no file is named like none/*.h5; give another pattern"),
+        (["none/*.h5", "-o", "out"], 1, "no file matches none/*.h5; give another pattern"),
         (["runs", "-o", "runs/a.h5"], 1, "output runs/a.h5 is a file, but several recordings need a folder"),
-        (["runs", "-o", "out", "--workers", "2", "--scheduler", "tcp://x:1"], 1, "give one of both"),
+        (["runs", "-o", "out", "--workers", "2", "--scheduler", "tcp://x:1"], 1, "give one of them"),
         (["runs", "-o", "out", "--directions", "90", "--azimuth", "-9:9"], 2, "directions 90 have fixed limits"),
         (["runs", "-o", "out", "--method", "paper", "--explain"], 2, "--explain needs --method fast"),
     ],
@@ -173,7 +173,7 @@ def test_a_table_of_very_many_has_those_that_failed(monkeypatch, capsys):
     report = vars(_process_many)["_Report"](paths, quiet=False, as_json=False)
     shown = vars(_process_many)["_Hidden"]()
     for path in paths:
-        outcome = "there" if path == paths[1] else "failed"
+        outcome = "kept" if path == paths[1] else "failed"
         report.follow(RecordingEnded(path, Path("out"), outcome, error="torn" if outcome == "failed" else ""), shown)
     with pytest.raises(click.ClickException, match="4 of 5 recordings failed"):
         report.close()

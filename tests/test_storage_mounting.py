@@ -150,7 +150,7 @@ def test_several_sensors_without_a_mounting_are_not_laid_over_one_another(tmp_pa
     command = ["export", str(path), "-o", str(tmp_path / "a.ply"), "--top", "3"]
     done = CliRunner().invoke(cli, command)
     assert done.exit_code == 1
-    assert "where sensors left, right are on their platform is not known" in done.stderr
+    assert "the mountings of sensors left, right on their platform are unknown" in done.stderr
     (tmp_path / "where.toml").write_text('[[sensors]]\nname = "left"\n[[sensors]]\nname = "right"\nyaw_deg = 90.0\n')
     given = write_recording(tmp_path / "given.h5", both, mounting=PLACES)
     for file in (tmp_path / "where.toml", given):

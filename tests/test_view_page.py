@@ -122,7 +122,7 @@ def test_what_cannot_be_saved_or_chosen_is_told_and_the_view_goes_on(tmp_path):
         assert view.choices == Choices()
     ((title, body),) = client.notices
     assert title == "Nothing is saved"
-    assert "wanted one from 1970 to 2038" in body
+    assert "outside 1970 to 2038" in body
     ((name, content),) = client.files
     assert (name, content[:4]) == ("img.png", b"\x89PNG")
 

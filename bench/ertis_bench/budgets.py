@@ -84,7 +84,7 @@ def tried(seed: int) -> dict[str, Any] | None:
         write_recording(recording, [measurement])
         done = captures.ertis("process", str(recording), "-o", str(target), "--device", "cpu", "--quiet")
         if done.returncode:
-            if "max_error_db" in done.stderr and "the best" in done.stderr:
+            if "max_error_db" in done.stderr and "smallest error" in done.stderr:
                 return None
             raise ArgumentError(f"seed {seed}: ertis process ended with {done.returncode}: {done.stderr}")
         with open_energyscapes(target) as images:

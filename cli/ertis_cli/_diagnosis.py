@@ -28,6 +28,7 @@ _EXTRAS: Final = {
     "metrics": ("prometheus_client",),
     "ros": ("mcap", "mcap_ros2"),
     "view": ("viser", "websockets"),
+    "xarray": ("xarray",),
 }
 """Modules of each extra. The modules for a GPU are checked with the GPU."""
 

@@ -124,7 +124,7 @@ class _Report:
         self._count, self._quiet, self._as_json = len(recordings), quiet, as_json
         self._rows: dict[Path, tuple[str, ...]] = dict.fromkeys(recordings[:_MAX_ROWS], ())
         self._begun_s = time.monotonic()
-        self._totals = dict.fromkeys(("made", "there", "passed over", "failed"), 0)
+        self._totals = dict.fromkeys(("made", "kept", "skipped", "failed"), 0)
         self._measurements = 0
         self._wavefronts: list[tuple[float, float]] = []  # error in dB and its range in metres, of each recording
         self._failed: list[str] = []
@@ -205,10 +205,10 @@ def _lines(event: "RecordingEnded", *, reported: bool) -> Iterator[str]:
         case "made":
             yield from _plan_lines(event, reported=reported)
             yield from summary(event.output, event.made["sensors"], event.made["device"])
-        case "there":
+        case "kept":
             yield from _plan_lines(event, reported=reported)
             yield f"{event.output}: exists already, kept"
-        case "passed over":
+        case "skipped":
             yield f"{event.recording}: an energyscape file, not a recording; skipped"
 
 

@@ -33,7 +33,7 @@ class _Case:
     target: Path
     measurements: int = 0
     wanted: dict[str, Settings] = field(default_factory=dict)
-    is_there: bool = False
+    is_kept: bool = False
 
     def ended(self, outcome: Outcome, **more: Any) -> RecordingEnded:
         return RecordingEnded(self.found.path, self.target, outcome, **more)
@@ -143,7 +143,7 @@ class Campaign:
         """Return the next order; recordings that are nearest to their end come first."""
         if self._ready:
             case = self._ready.popleft()
-            return self._order("check" if case.is_there else "make", self._pending_output(case, pool.size)), case
+            return self._order("check" if case.is_kept else "make", self._pending_output(case, pool.size)), case
         if (planned := self._to_plan(pool.size)) is not None:
             return planned
         in_hand = len(self._given) + len(self._unplanned)
@@ -214,11 +214,11 @@ class Campaign:
         elif order.do == "look":
             yield from self._looked(case, news.result)
         else:
-            yield case.ended("there" if case.is_there else "made", made=news.result)
+            yield case.ended("kept" if case.is_kept else "made", made=news.result)
 
     def _looked(self, case: _Case, reported: dict[str, Any]) -> Iterator[Event]:
-        if reported.get("passed_over"):
-            yield case.ended("passed over")
+        if reported.get("skipped"):
+            yield case.ended("skipped")
             return
         try:
             for name, text in reported["sensors"].items():
@@ -241,9 +241,9 @@ class Campaign:
     def _found_there(self, case: _Case, sensors: dict[str, Any]) -> Iterator[Event]:
         """Report an existing output, or examine its processing first if the options request that."""
         if not self._options.is_thorough:
-            yield case.ended("there")
+            yield case.ended("kept")
             return
-        case.is_there = True
+        case.is_kept = True
         case.wanted = {name: Settings.from_toml(held["settings"], "settings") for name, held in sensors.items()}
         yield from self._forward(case)
 
@@ -265,7 +265,7 @@ class Campaign:
             self._unplanned.append(case)
         else:
             self._ready.append(case)
-            if not case.is_there:
+            if not case.is_kept:
                 yield Begun(case.found.path, case.measurements)
 
 

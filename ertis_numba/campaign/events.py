@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 __all__ = ["Advanced", "Begun", "Event", "Outcome", "RecordingEnded"]
 
-Outcome = Literal["made", "there", "passed over", "failed"]
+Outcome = Literal["made", "kept", "skipped", "failed"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,8 +33,8 @@ class RecordingEnded:
     ----------
     recording, output : Path
         Recording, and its energyscape file.
-    outcome : {"made", "there", "passed over", "failed"}
-        ``there`` means that the output exists, made with the same settings and versions. ``passed over`` means an
+    outcome : {"made", "kept", "skipped", "failed"}
+        ``kept`` means that the output exists, made with the same settings and versions. ``skipped`` means an
         energyscape file that was not given by name.
     error : str
         Reason of a failure in one line; empty otherwise.

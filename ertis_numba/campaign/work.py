@@ -64,7 +64,7 @@ def _look(about: Mapping[str, Any], _: ReportProgress) -> dict[str, Any]:
     """Return sensors, settings and number of measurements of a recording, and a description of its existing output."""
     path = Path(about["path"])
     if not about["named"] and file_kind(path) == "energyscape":
-        return {"passed_over": True}
+        return {"skipped": True}
     names = sensor_names(path) if about["sensor"] is None else (about["sensor"],)
     with ExitStack() as stack:
         recordings = [stack.enter_context(open_recording(path, sensor=name)) for name in names]

@@ -143,12 +143,12 @@ def _range_axis(settings: Settings, n_samples: int) -> tuple[NDArray[np.float64]
     if stop > n_outputs:
         raise ArgumentError(
             f"processing.range_m ends at {last_m:g} m, but the record of {settings.recording.duration_s * 1e3:.4g} ms "
-            f"covers {step_m * (n_outputs - 1):.4g} m. Shorten processing.range_m or use a longer preset"
+            f"covers {step_m * (n_outputs - 1):.4g} m; shorten processing.range_m or use a longer preset"
         )
     if first >= stop:
         raise ArgumentError(
-            f"processing.range_m, {first_m:g} to {last_m:g} m, contains no multiple of the range step, {step_m:.4g} m. "
-            "Extend processing.range_m"
+            f"processing.range_m, {first_m:g} to {last_m:g} m, contains no multiple of the range step, {step_m:.4g} m; "
+            "extend processing.range_m"
         )
     return np.arange(first, stop, dtype=np.float64) * step_m, slice(first, stop)
 

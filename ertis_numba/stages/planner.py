@@ -172,8 +172,8 @@ class Planner:
             measured = self._max_bytes is None and limit > _USUAL_BYTES
             has = "this machine has available" if measured else "the limit is"
             raise ArgumentError(
-                f"no plan fits into memory: the smallest needs {min(sizes) / 1e6:.0f} MB, {has} {limit / 1e6:.0f} MB. "
-                "Shorten processing.range_m or start it at a larger range, give fewer directions or microphones, or "
+                f"no plan fits into memory: the smallest needs {min(sizes) / 1e6:.0f} MB, {has} {limit / 1e6:.0f} MB; "
+                "shorten processing.range_m or start it at a larger range, give fewer directions or microphones, or "
                 "give a lower accuracy.oversampling or accuracy.focal_zones"
             )
         if within:

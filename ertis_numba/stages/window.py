@@ -72,7 +72,7 @@ def time_window(settings: Settings, *, largest_delay_s: float, n_taps: int, ring
     if last_m > record_m:
         raise ArgumentError(
             f"processing.range_m ends at {last_m:g} m, but the record of "
-            f"{settings.recording.duration_s * 1e3:.4g} ms covers {record_m:.4g} m. Shorten processing.range_m or "
+            f"{settings.recording.duration_s * 1e3:.4g} ms covers {record_m:.4g} m; shorten processing.range_m or "
             "use a longer preset"
         )
     output_rate_hz = settings.output_rate_hz

@@ -42,7 +42,7 @@ def read_mounting(group: h5py.Group, path: Path) -> _Found:
     if status == _UNKNOWN or not (status or {"translation_m", "rotation_xyzw"} & stated.keys()):
         return None, None
     if status not in {"", _GIVEN}:
-        raise DamagedError(f"{path}: attribute mounting is {status[:80]!r}, wanted {_GIVEN!r} or {_UNKNOWN!r}")
+        raise DamagedError(f"{path}: attribute mounting is {status[:80]!r}, wanted {_GIVEN!r} or {_UNKNOWN!r}; copy it again")
     sensor = group.name.rpartition("/")[2]
     try:
         place = mounting(sensor, stated["translation_m"], stated["rotation_xyzw"])

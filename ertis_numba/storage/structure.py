@@ -60,7 +60,7 @@ def child(group: h5py.Group, name: str, kind: type[Any]) -> Any:
     found = group[name]
     if not isinstance(found, kind):
         raise DamagedError(
-            f"{_path(group, name)} is a {type(found).__name__.lower()}, wanted a {kind.__name__.lower()}"
+            f"{_path(group, name)} is a {type(found).__name__.lower()}, wanted a {kind.__name__.lower()}; copy it again"
         )
     if h5py.h5o.get_info(found.id).rc != 1:
         raise ForeignDataError(f"{_path(group, name)} has several names in the file; copy the data to each place")

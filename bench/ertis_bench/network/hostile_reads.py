@@ -143,7 +143,7 @@ def _summary(chosen: list[HostileFile], reads: list[dict[str, Any]]) -> dict[str
         "files": len(chosen),
         "reads": len(reads),
         "taken": [read["name"] for read in reads if read["code"] == 0],
-        "failed": [f"{read['name']}: {read['stated']}" for read in reads if read["said"].startswith("Traceback")],
+        "failed": [f"{read['name']}: {read['said']}" for read in reads if read["said"].startswith("Traceback")],
         "crashes": [f"{read['name']}: {read['code']}" for read in reads if read["code"] < 0],
         "slowest, s": round(slowest["took_s"], 3),
         "slowest": slowest["name"],
