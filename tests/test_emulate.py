@@ -100,7 +100,7 @@ def test_the_command_unplugs_its_devices(emulate, recording, tmp_path):
         assert ask(port, b"!Y,0,0,0\n") == 0x010000
     second = emulate(recording, "--sensor", "left", "--link", link)
     assert second.communicate(timeout=TIMEOUT_S)[1] == (
-        f"ertis: error: link {link} belongs to an emulated device that runs; end that one, or give another name\n"
+        f"ertis: error: link {link} belongs to a running emulated device; end that one, or give another name\n"
     )
     assert second.returncode == 1
     code, out, errors = ended(process, signal.SIGINT)

@@ -129,7 +129,7 @@ def test_a_link_belongs_to_one_device(tmp_path):
     with Emulator(WORDS, link=link) as device:
         assert link.readlink() == Path(device.port)
     link.write_text("precious")
-    with pytest.raises(ArgumentError, match="front exists and leads to no port; give another name"):
+    with pytest.raises(ArgumentError, match="front exists but is not a link to a port; give another name"):
         HeldLink(link)
     assert link.read_text() == "precious"
 

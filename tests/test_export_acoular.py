@@ -119,13 +119,13 @@ def test_what_is_in_the_files(tmp_path):
 def test_what_is_refused(tmp_path, monkeypatch):
     for given, message in (
         (noise(), "contains signals of one measurement, but more than one measurement was given; give one"),
-        ([], "and no measurement came"),
-        ([image()], "and an energyscape came"),
+        ([], "but no measurement was given"),
+        ([image()], "but an energyscape was given"),
     ):
         with pytest.raises(ArgumentError, match=message):
             export(tmp_path / "a.h5", given)
     for overwrite in (False, True):
-        with pytest.raises(ArgumentError, match=r"b.xml is where the array would be written, beside the sig"):
+        with pytest.raises(ArgumentError, match=r"b.xml is also the name of the array's file; give"):
             export(tmp_path / "b.xml", noise(count=1), file_format="acoular", overwrite=overwrite)
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "a.xml").write_text("mine")

@@ -149,7 +149,7 @@ BAD = {
     ),
     "sensor twice": (
         lambda journal: journal.add_sensor("left", TINY),
-        "give each sensor its own name",
+        r"sensor 'left' is in .* already; give each sensor its own name",
     ),
     "name": (lambda journal: journal.add_sensor("a/b", TINY), "sensor name 'a/b' cannot name a group in a file"),
     "mounting": (

@@ -89,7 +89,7 @@ def test_a_plan_that_is_none_is_refused(runs, out, monkeypatch):
         return settings.replace(processing=settings.processing.replace(method="paper"))
 
     found, _ = run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=on_paper, explain=True))
-    assert "a plan is asked for, and method 'paper' has none; give 'fast'" in found["a.h5"].error
+    assert "needs a plan, but method 'paper' has none; give 'fast'" in found["a.h5"].error
 
 
 def test_what_is_there_is_left_alone(runs, out, monkeypatch):
@@ -111,7 +111,7 @@ def test_what_is_there_is_left_alone(runs, out, monkeypatch):
         (CampaignOptions(settings=other), r"was made with other settings \(processing\.range_m of sensor eRTIS-7\)"),
         (CampaignOptions(settings=exact), r"was made with other settings \(accuracy\.oversampling of sensor eRTIS-7\)"),
         (CampaignOptions(settings=warm), r"was made with other settings \(air\.temperature_c of sensor eRTIS-7\)"),
-        (CampaignOptions(settings=narrow, dtype="float16"), "holds float32, wanted float16"),
+        (CampaignOptions(settings=narrow, dtype="float16"), "contains float32, not float16"),
     ],
 )
 def test_what_was_made_otherwise_is_told_or_replaced(runs, out, monkeypatch, wanted, stated):
@@ -134,7 +134,7 @@ def test_another_recording_of_the_same_name(runs, out, monkeypatch):
     run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=narrow))
     write_recording(runs / "a.h5", noise(count=3, seed=9), overwrite=True)
     found, _ = run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=narrow))
-    assert "exists and was made of another recording" in found["a.h5"].error
+    assert "exists and was made from another recording" in found["a.h5"].error
 
 
 def test_the_same_measurements_in_another_file(runs, out, monkeypatch):
@@ -142,7 +142,7 @@ def test_the_same_measurements_in_another_file(runs, out, monkeypatch):
     with h5py.File(runs / "a.h5", "r+") as file:
         file.attrs["remark"] = "written to"
     found, _ = run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=narrow))
-    assert "exists and was made of another file of the same recording" in found["a.h5"].error
+    assert "exists and was made from another file of the same recording" in found["a.h5"].error
 
 
 def test_another_version(runs, out, monkeypatch):
@@ -161,7 +161,7 @@ def test_what_is_no_energyscape_file_is_not_touched(runs, out, monkeypatch, cont
     content = (runs / "b.h5").read_bytes() if recording else content
     (out / "a.energy.h5").write_bytes(content)
     found, _ = run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(overwrite=recording))
-    stated = "is a recording; give another folder" if recording else "is no energyscape file that can be read"
+    stated = "is a recording; give another folder" if recording else "is not a readable energyscape file"
     assert f"exists and {stated}" in found["a.h5"].error
     assert (out / "a.energy.h5").read_bytes() == content
 

@@ -44,10 +44,10 @@ print("rich" in sys.modules, file=sys.stderr)
 NOTES = [f"note {item}: {'long ' * 30}".rstrip() for item in range(3)]
 RESULTS = [f"result {item}: {'long ' * 30}".rstrip() for item in range(3)]
 TABLE = """
-from ertis_cli._tables import Table
+from ertis_cli._tables import TextTable
 columns = {"port": "left", "state": "left", "rate_hz": "right", "count": "right"}
 rows = [("/dev/serial/by-id/usb-of-a-long-name", "in use", "12.345", "7"), ("[b]", "failed", "-1.0", "123456")]
-Table(columns, rows, {"failed": "red"}).print()
+TextTable(columns, rows, {"failed": "red"}).print()
 import sys
 print("rich" in sys.modules)
 """

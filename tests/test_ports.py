@@ -122,7 +122,7 @@ def test_several_ports_of_one_serial_number(monkeypatch):
 
 
 def test_a_port_that_is_not_there(monkeypatch):
-    with pytest.raises(SonarError, match="serial port 'SN7' does not exist") as caught:
+    with pytest.raises(SonarError, match=r"serial port 'SN7' does not exist; no port exists: .* 'ertis emulate'") as caught:
         resolve("SN7")
     assert caught.value.errno == errno.ENOENT
     plug_in(monkeypatch, ttyACM0="SN8")

@@ -100,7 +100,7 @@ def test_apart_and_interrupted(tmp_path, instead, late):
 
     with pytest.raises(KeyboardInterrupt) as error:
         seal_apart(path, progress=interrupt)
-    safe = f"the measurements are safe in {path}; recover them with 'ertis recover {path}'"
+    safe = f"the measurements are safe in {path}; seal them with 'ertis recover {path}'"
     assert str(error.value) == (f"the measurements are in {tmp_path / 'rec.h5'}" if late else safe)
     assert (path.exists(), (tmp_path / "rec.h5").exists()) == (not late, late)
     assert seal(path).measurements == 3
@@ -171,7 +171,7 @@ def test_recover_is_interrupted(tmp_path, monkeypatch):
     path = crashed(tmp_path)
     monkeypatch.setattr(sealer.subprocess, "Popen", interrupted)
     done = run("recover", path, code=130)
-    assert done.stderr.splitlines()[0] == f"the measurements are safe in {path}; recover them with 'ertis recover {path}'"
+    assert done.stderr.splitlines()[0] == f"the measurements are safe in {path}; seal them with 'ertis recover {path}'"
     monkeypatch.undo()
     assert run("recover", path).stderr == f"{tmp_path}/rec.h5: 3 measurements, 0 missing\n"
 
@@ -196,7 +196,7 @@ def test_a_capture_that_fails_and_cannot_be_sealed(tmp_path, capsys):
     (tmp_path / "rec.h5").write_text("mine")
     reported = (
         f"{tmp_path}/rec.h5 exists with other content than {path}; move it, or give --force; "
-        f"the measurements are safe in {path}; recover them with 'ertis recover {path}'"
+        f"the measurements are safe in {path}; seal them with 'ertis recover {path}'"
     )
     with pytest.raises(SonarError, match="left: it was unplugged"):
         _seal(path, LOST, overwrite=False)
@@ -223,4 +223,4 @@ def test_a_capture_whose_sealing_is_interrupted(tmp_path, monkeypatch, capsys, f
     monkeypatch.setattr(sealer.subprocess, "Popen", interrupted)
     with pytest.raises(KeyboardInterrupt if failure is None else SonarError):
         _seal(path, failure, overwrite=False)
-    assert capsys.readouterr().err == f"the measurements are safe in {path}; recover them with 'ertis recover {path}'\n"
+    assert capsys.readouterr().err == f"the measurements are safe in {path}; seal them with 'ertis recover {path}'\n"

@@ -283,7 +283,7 @@ def test_a_call_that_did_not_arrive(device):
     wanted, held = f"{call_hash(setup.codes):#06x}", f"{call_hash(setup.codes) ^ 1:#06x}"
     with (
         SonarDriver.open("left") as sonar,
-        pytest.raises(SonarError, match=f"sent a call with hash {wanted} and holds one with {held}; plug"),
+        pytest.raises(SonarError, match=f"sent a call with hash {wanted} but has one with {held}; unplug"),
     ):
         sonar.configure(setup)
 

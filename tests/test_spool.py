@@ -95,7 +95,7 @@ def test_a_run_goes_on_after_a_restart(tmp_path):
     given = entries(10)
     kept(tmp_path, given[:5])
     with Node(NOBODY, spool=tmp_path) as node:
-        with pytest.raises(ArgumentError, match="measurement 14 of sensor left comes after 14"):
+        with pytest.raises(ArgumentError, match="measurement 14 of sensor left follows 14"):
             node.append(given[4:])
         node.append(given[5:])
         assert len(journals(tmp_path)) == 1
@@ -219,9 +219,9 @@ def test_journals_that_cannot_be_sent_stay(tmp_path):
     assert [path.name for path in journals(tmp_path)] == [
         "b_short.h5.journal", "c_far.h5.journal", "used.h5.journal", "z_copy.h5.journal"
     ]  # fmt: skip
-    assert "what is in b_short.h5.journal is not sent" in notes[0]
-    assert f"what is in c_far.h5.journal is not sent: sequence number {2**48 + 1} is above {2**48}" in notes[1]
-    assert "holds runs that another journal holds, too; move it elsewhere" in notes[2]
+    assert "measurements in b_short.h5.journal are not sent" in notes[0]
+    assert f"measurements in c_far.h5.journal are not sent: sequence number {2**48 + 1} is above {2**48}" in notes[1]
+    assert "has sessions that another journal has, too; move it elsewhere" in notes[2]
 
 
 def test_a_journal_of_a_capture_is_sent_too(tmp_path):
@@ -234,7 +234,7 @@ def test_a_journal_of_a_capture_is_sent_too(tmp_path):
 
 def test_no_folder(tmp_path):
     (tmp_path / "file").touch()
-    with pytest.raises(NetworkError, match="give a folder for the spool"), Node(NOBODY, spool=tmp_path / "file"):
+    with pytest.raises(NetworkError, match=r"give a writable spool folder \(--spool\)"), Node(NOBODY, spool=tmp_path / "file"):
         pass
 
 

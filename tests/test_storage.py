@@ -249,7 +249,7 @@ def test_what_reads_back_differently_is_refused(tmp_path):
 
     with pytest.raises(DataError, match=r"measurement 0 has CRC-32 .* the file is damaged"):
         write_and_fail(tmp_path / "rec.h5", None, before=flip_on_disk)
-    with pytest.raises(DataError, match="reads back differently than it was written; check the disk"):
+    with pytest.raises(DataError, match="reads back with other content than written; check the disk"):
         write_and_fail(tmp_path / "rec.h5", None, before=drop_a_row)
     assert not list(tmp_path.iterdir())
 
@@ -360,7 +360,7 @@ PCM_OF = {
 )
 def test_words_of_another_type_are_not_converted_in_silence(tmp_path, settings, dtype):
     words = sample_format(settings)
-    message = rf"measurement 0 holds {dtype} words, its settings want {words.dtype.name}; convert them, or give"
+    message = rf"measurement 0 contains {dtype} samples, but its settings give {words.dtype.name}; convert them, or give"
     with pytest.raises(ArgumentError, match=message):
         write_recording(tmp_path / "rec.h5", [Measurement(np.zeros(words.shape, dtype), settings)])
 
@@ -431,5 +431,5 @@ def test_unknown_dtype(tmp_path):
 def test_image_too_large_for_one_piece_is_refused(tmp_path):
     with h5py.File(tmp_path / "large.h5", "w") as file:
         sizes = {"direction": 1_000_000, "range": 1_178}
-        with pytest.raises(ArgumentError, match="energy of 1000000 directions × 1178 ranges exceeds the 4 GiB"):
+        with pytest.raises(ArgumentError, match="amplitude of 1000000 directions × 1178 ranges exceeds the 4 GiB limit of HDF5 for one chunk"):
             lay_out(file, ENERGYSCAPE, sizes=sizes, dtypes={"amplitude": "<f4"})

@@ -30,8 +30,8 @@ REFUSED = {
     "names: the same rows under 201 names": r"has several names in the file",
     "names: sensor '..'": r"sensor name '..' cannot name a group in a file",
     "settings: text of 262,145 bytes": r"settings holds \|S262145, wanted text of up to 262144 bytes",
-    "settings: directions: '/etc/passwd.csv/'": r"processing.directions is '/etc/passwd.csv/', a file",
-    "settings: layout: '/etc/passwd.toml'": r"array.layout is '/etc/passwd.toml', a file",
+    "settings: directions: '/etc/passwd.csv/'": r"processing.directions is '/etc/passwd.csv/', the name of a file",
+    "settings: layout: '/etc/passwd.toml'": r"array.layout is '/etc/passwd.toml', the name of a file",
 }
 
 

@@ -147,7 +147,7 @@ def test_energyscape_of_another_recording(path, tmp_path):
 def test_truth_of_another_length(tmp_path):
     with pytest.raises(
         ArgumentError,
-        match="the truth of sensor eRTIS-7 is about 2 measurements, the file holds 3; give the reflectors",
+        match="the truth of sensor eRTIS-7 has 2 measurements, but the file has 3; give the reflectors of each",
     ):
         write_recording(tmp_path / "rec.h5", noise(), truth={SENSOR: truth(ROWS[:2])})
     assert not list(tmp_path.iterdir())

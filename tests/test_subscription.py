@@ -93,12 +93,12 @@ def test_no_images_are_no_silence_where_the_publisher_answers(publisher):
     [
         (lambda p: p.raw(b"\x00" * 40), "header begins with"),
         (lambda p: p.raw(messages.encode(messages.Ping())), "message is 'ping'"),
-        (lambda p: p.publish(image(), shape=(31, 17)), r"image has shape \(31, 17\), its axes"),
+        (lambda p: p.publish(image(), shape=(31, 17)), r"image has shape \(31, 17\), but its axes"),
         (lambda p: p.publish(image(), dtype="float16"), "31000 bytes arrived for float16"),
-        (lambda p: p.publish(image(), description=9), "refers to description 9, which has not come"),
+        (lambda p: p.publish(image(), description=9), "refers to description 9, which has not arrived"),
         (lambda p: p.publish(cloud(), n_points=2**60), "16 bytes arrived for float32 of shape"),
-        (lambda p: p.publish(measurement(), crc32=1), "has does not match than its header"),
-        (lambda p: p.tell_all(messages.Report(), b"\xff"), "status cannot be read"),
+        (lambda p: p.publish(measurement(), crc32=1), "does not match the CRC-32 in its header"),
+        (lambda p: p.tell_all(messages.Report(), b"\xff"), "status cannot be decoded"),
         (lambda p: p.tell_all(messages.Description(number=0, sensor="front")), "has 0 payloads; send settings and 3"),
         (
             lambda p: p.tell_all(messages.Description(number=0, sensor="front"), b"[", b"", b"", b""),
@@ -184,7 +184,7 @@ def test_with_keys(keys):
     ("who", "match"),
     [
         ("unknown", "the central node does not know this key"),
-        ("none", "wants a key.* give --key and --server-key"),
+        ("none", "requires a key; give --key and --server-key"),
         ("wrong server", "server-key"),
     ],
 )

@@ -138,8 +138,8 @@ def test_restarted_process_runs_for_the_rest_of_the_duration():
 
 def test_nodes_of_a_demo_end_if_it_is_killed(tmp_path):
     program = (
-        "import pathlib, sys, time; from ertis_cli.demo import _Run\n"
-        f"run = _Run({ENVIRONMENT!r}, quiet=True)\n"
+        "import pathlib, sys, time; from ertis_cli.demo import _DemoRun\n"
+        f"run = _DemoRun({ENVIRONMENT!r}, quiet=True)\n"
         "output = pathlib.Path('started.jsonl')\n"
         "with run.node('record', '--listen', 'tcp://127.0.0.1:0', '-o', 'out', '--json', output=output) as node:\n"
         "    print(node['pid'], flush=True)\n"

@@ -155,7 +155,7 @@ def test_files_from_before_epochs_were_numbers_of_runs():
     path = Path(__file__).parent / "recordings" / "before_epochs.h5"
     with h5py.File(path) as file:
         (group,) = file["sensors"].values()
-        assert (group["session_id"].dtype.str, "gap_session_id" in group) == ("<i4", False)
+        assert (group["epoch"].dtype.str, "gap_epoch" in group) == ("<i4", False)
     assert all(report.whole for report in verify(path))
 
 
@@ -214,5 +214,5 @@ def test_several_files_and_such_that_cannot_be_read(tmp_path, recording):
 def test_a_recording_without_a_sensor(recording):
     with h5py.File(recording, "r+") as file:
         del file["sensors/left"]
-    with pytest.raises(DataError, match=r"rec.h5 holds no sensor; copy it again"):
+    with pytest.raises(DataError, match="rec.h5 contains no sensor; copy it again"):
         verify(recording)

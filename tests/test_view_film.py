@@ -27,18 +27,18 @@ from tests.views import PATIENCE_S, acked_through, spot, stamped, wait_for
 def test_a_film_shows_all_sensors_of_a_moment_together(tmp_path):
     path = write_energyscapes(tmp_path / "img.h5", stamped(3, sensors=("front", "left")))
     with Playback(path) as playback:
-        assert [moment.time_s for moment in playback.moments] == pytest.approx([0, 0.05, 0.1])
-        assert playback.moments[1].measurements == (("front", 1), ("left", 1))
+        assert [moment.time_s for moment in playback.time_steps] == pytest.approx([0, 0.05, 0.1])
+        assert playback.time_steps[1].measurements == (("front", 1), ("left", 1))
         assert [each.image.stamp.sensor for each in playback.at(2)] == ["front", "left"]
     with Playback(path, sensors=["left"]) as playback:
-        assert playback.moments[2].measurements == (("left", 2),)
+        assert playback.time_steps[2].measurements == (("left", 2),)
 
 
 def test_a_film_of_one_sensor_takes_its_name(tmp_path):
     path = write_energyscapes(tmp_path / "img.h5", stamped(2, sensors=("front", "left")))
     for named in ("left", ["left"]):
         with Playback(path, sensors=named) as playback:
-            assert [moment.measurements for moment in playback.moments] == [(("left", 0),), (("left", 1),)]
+            assert [moment.measurements for moment in playback.time_steps] == [(("left", 0),), (("left", 1),)]
 
 
 def test_a_film_plays_pauses_and_steps(tmp_path):
@@ -64,7 +64,7 @@ def test_a_film_plays_pauses_and_steps(tmp_path):
 def test_a_film_without_times_has_its_own(tmp_path):
     path = write_energyscapes(tmp_path / "img.h5", [each.replace(stamp=Stamp()) for each in stamped(3)])
     with Playback(path) as playback:
-        assert [moment.time_s for moment in playback.moments] == pytest.approx([0, 0.1, 0.2])
+        assert [moment.time_s for moment in playback.time_steps] == pytest.approx([0, 0.1, 0.2])
 
 
 def test_recordings_are_processed_with_their_own_settings_and_air(tmp_path):

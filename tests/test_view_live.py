@@ -175,7 +175,7 @@ def test_sensors_that_there_are_not_are_told(monkeypatch):
             wait_for(lambda: notes.extend(live.notes()) or notes)
             monkeypatch.setattr(_live, "_SOON_S", 0.0)
             wait_for(lambda: notes.extend(live.notes()) or len(notes) > 1)
-        assert notes == ["connected", "no sensor 'nope' yet; there are front, left"]
+        assert notes == ["connected", "no sensor 'nope' yet; choose one of front, left"]
         assert live.received == 0
 
 

@@ -47,8 +47,8 @@ def test_a_clock_that_is_set_halfway_plays_on():
     assert [dict(moment.measurements)["a"] for moment in found] == list(range(8))
     (note,) = notes
     assert note == (
-        "sensor 'a': 3 of 8 measurements have no time, as its clock was not set; they are shown as far apart as is "
-        "usual"
+        "sensor 'a': 3 of 8 measurements have no timestamp, because the clock was not set; they are shown at the "
+        "typical interval"
     )
 
 
@@ -103,5 +103,5 @@ def test_a_film_says_what_its_times_are(tmp_path):
     with Playback(write_energyscapes(tmp_path / "img.h5", images)) as playback:
         assert times_s(playback.time_steps) == pytest.approx([0, 0.1])
         (note,) = playback.notes()
-        assert note.startswith("sensor 'front': 1 of 2 measurements have no time")
+        assert note.startswith("sensor 'front': 1 of 2 measurements have no timestamp")
         assert playback.notes() == []

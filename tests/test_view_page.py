@@ -28,9 +28,9 @@ def test_a_port_that_is_taken_is_refused(tmp_path):
     with socket.socket() as other, Playback(path) as playback:
         other.bind(("127.0.0.1", 0))
         other.listen()
-        with pytest.raises(NetworkError, match=r"nothing can be served at 127.0.0.1:\d+ .*; give another host or port"):
+        with pytest.raises(NetworkError, match=r"cannot serve the page at 127\.0\.0\.1:\d+ .*; give another host or port"):
             Viewer(playback, port=other.getsockname()[1])
-    with Playback(path) as playback, pytest.raises(NetworkError, match=r"nothing can be served at 203\.0\.113\.1"):
+    with Playback(path) as playback, pytest.raises(NetworkError, match=r"cannot serve the page at 203\.0\.113\.1"):
         Viewer(playback, host="203.0.113.1", port=0)
 
 
@@ -218,7 +218,7 @@ def test_a_recording_ends_when_it_is_full(tmp_path, monkeypatch):
         view.record(tmp_path / "page.html")
         assert 2 < view.recorded < 29
         assert view.shown == view.recorded
-    assert notes == [f"{tmp_path / 'page.html'} is full at 0.02 MB: what came until now is written"]
+    assert notes == [f"{tmp_path / 'page.html'} is full at 0.02 MB: the view up to now is written"]
     assert 15_000 < len(embedded((tmp_path / "page.html").read_text())) < 25_000
 
 
@@ -268,7 +268,7 @@ def test_a_view_goes_on_when_its_recordings_are_full(tmp_path, monkeypatch):
         source.notes = send
         view.run(duration_s=PATIENCE_S, html=page)
         assert 0 < view.recorded < view.shown
-    assert notes == [f"{page} is full at 0.02 MB: what came until now is written"]
+    assert notes == [f"{page} is full at 0.02 MB: the view up to now is written"]
     assert [title for title, _ in client.notices] == ["The HTML recording is full"]
     assert [name for name, _ in client.files] == ["live.html"]
 

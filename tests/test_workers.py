@@ -113,10 +113,10 @@ def test_a_sensor_whose_measurements_fail_pauses_and_the_others_go_on(monkeypatc
         counts = loop.processing.counts("bad")
         assert counts.dropped == {"failed twice": 3}
         loop.offer("bad")
-        assert counts.dropped["too many of its sensor have failed"] == 1
+        assert counts.dropped["sensor suspended after repeated failures"] == 1
         reported = loop.processing.drain_dropped()
         assert reported == [("bad", 7, number, "failed twice") for number in range(3)] + [
-            ("bad", 7, 3, "too many of its sensor have failed")
+            ("bad", 7, 3, "sensor suspended after repeated failures")
         ]
         assert loop.processing.drain_dropped() == []
         loop.offer("good")
@@ -137,7 +137,7 @@ def test_a_quarantine_has_an_end(tmp_path):
     (path,) = tmp_path.glob("quarantine_*.h5.journal")
     with Journal.open(path) as journal:
         assert len(list(journal.entries())) == 100
-    assert sum("100 are kept already" in fields["text"] for event, fields in log.lines if event == "not_kept") == 10
+    assert sum("100 measurements are kept already" in fields["text"] for event, fields in log.lines if event == "not_kept") == 10
 
 
 def test_a_quarantine_ends_though_its_disk_does_not_answer(tmp_path, monkeypatch):
@@ -165,7 +165,7 @@ def test_a_kind_that_is_forgotten_while_a_worker_gets_ready_for_it_is_forgotten_
         runner.prepare(kind)
         runner.forget(kind)
         loop.until(lambda: loop.workers("idle"))
-        assert [type(note).__name__ for note in sent] == ["Prepare", "Forget"]
+        assert [type(note).__name__ for note in sent] == ["Prepare", "Release"]
         assert 99 not in worker.kinds
 
 
@@ -213,7 +213,7 @@ class TestSensors:
         assert sensors.kind_of(data()) is None
         assert kinds == []
         ((event, fields),) = log.lines
-        assert (event, "256 MB at most" in fields["text"]) == ("unusable", True)
+        assert (event, "the limit is 256 MB" in fields["text"]) == ("unusable", True)
         sensors.register(hello("good"), SHORT.replace(processing=SHORT.processing.replace(directions="3000")))
         assert len(kinds) == 1
 
@@ -310,7 +310,7 @@ def test_nothing_is_left_when_the_central_node_is_killed():
 
 
 def test_what_is_asked_for_is_checked(tmp_path):
-    with pytest.raises(ArgumentError, match=r"quarantine .* is no folder"):
+    with pytest.raises(ArgumentError, match=r"quarantine folder .* does not exist"):
         ProcessingOptions(publish=ANY, quarantine=tmp_path / "missing")
     with pytest.raises(ArgumentError, match="dtype 'float64' is unknown"):
         ProcessingOptions(dtype="float64")
