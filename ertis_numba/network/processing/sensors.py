@@ -219,7 +219,7 @@ def _require_size(settings: Settings) -> None:
     if n_bytes > _MAX_BYTES:
         raise ArgumentError(
             f"images of {grid} over {processing.range_m[0]:g} to {processing.range_m[1]:g} m have "
-            f"{n_bytes / 1e6:.0f} MB; the limit is {_MAX_BYTES // 1_000_000} MB, give fewer directions or ranges"
+            f"{n_bytes / 1e6:.0f} MB, but the limit is {_MAX_BYTES // 1_000_000} MB; give fewer directions or ranges"
         )
 
 
