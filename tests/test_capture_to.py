@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
-from ertis_numba.capture import Session
+from ertis_numba.capture import CaptureSession
 from ertis_numba.devices.emulator import Emulator
 from ertis_numba.devices.setup import Setup
 from ertis_numba.devices.sonar import SonarDriver
@@ -343,7 +343,7 @@ def test_a_session_counts_what_its_sink_has_no_room_for(tmp_path, sensors):
     ):
         sonar.configure(Setup.of(SETTINGS))
         reported = []
-        session = Session({"one": sonar}, SETTINGS, trigger="command", rate_hz=50.0, n=5, on_stored=reported.extend)
+        session = CaptureSession({"one": sonar}, SETTINGS, trigger="command", rate_hz=50.0, n=5, on_stored=reported.extend)
         session.run(node)
         counts = session.counts["one"]
         assert (counts.stored, dict(counts.missing)) == (2, {"there was no room for it": 3})

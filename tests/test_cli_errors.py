@@ -14,7 +14,7 @@ from ertis_cli import options
 from ertis_cli.main import cli
 
 from ertis_numba.frames import Stamp
-from ertis_numba.storage import Truth, write_energyscapes, write_recording
+from ertis_numba.storage import GroundTruth, write_energyscapes, write_recording
 from tests.files import image, noise
 
 N_BYTES = 4 * 65_536
@@ -182,7 +182,7 @@ def folder(tmp_path_factory):
     (folder / "long.toml").write_text("[recording]\nn_samples = 163840\n")
     write_recording(folder / "rec.h5", noise())
     write_energyscapes(folder / "img.h5", [image()])
-    truth = Truth(scene="", seed=1, reflectors=((),))
+    truth = GroundTruth(scene="", seed=1, reflectors=((),))
     write_energyscapes(folder / "truth.h5", [image()], truth={"sensor": truth})
     write_energyscapes(folder / "two.h5", [image().replace(stamp=Stamp(sensor=name)) for name in ("left", "right")])
     for name in ("cut", "newer", "damaged", "nan"):

@@ -17,7 +17,7 @@ import ertis_numba as ertis
 from ertis_numba.analysis.finder import PointFinder
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement, Stamp
-from ertis_numba.interop import FORMATS, TOPICS, export, files_of, format_of
+from ertis_numba.interop import FORMATS, TOPICS, export, output_files, choose_format
 from ertis_numba.settings import Air
 from ertis_numba.storage import write_energyscapes, write_recording
 from tests.files import SMALL, image, noise
@@ -105,8 +105,8 @@ def test_the_format_is_that_of_the_ending_or_the_one_given(files, tmp_path):
     assert "\nDATA ascii\n" in (tmp_path / "cloud.txt").read_text()
     run(files / "rec.h5", "-o", tmp_path / "signals.h5", "-m", 1)
     assert {path.name for path in tmp_path.iterdir()} == {"CLOUD.PLY", "cloud.txt", "signals.h5", "signals.xml"}
-    assert [format_of("x.h5"), format_of("x.csv"), format_of("x.csv", "npz")] == ["acoular", "csv", "npz"]
-    assert [path.name for path in files_of("x.h5", "acoular")] == ["x.h5", "x.xml"]
+    assert [choose_format("x.h5"), choose_format("x.csv"), choose_format("x.csv", "npz")] == ["acoular", "csv", "npz"]
+    assert [path.name for path in output_files("x.h5", "acoular")] == ["x.h5", "x.xml"]
 
 
 def test_air_that_changes(tmp_path):
@@ -185,7 +185,7 @@ def test_options_are_those_of_the_format(tmp_path, kind, option):
 
 @pytest.mark.parametrize("kind", FORMATS)
 def test_what_breaks_off_leaves_the_older_file(tmp_path, kind):
-    target, *others = files_of(tmp_path / f"a{FORMATS[kind].ending}", kind)
+    target, *others = output_files(tmp_path / f"a{FORMATS[kind].ending}", kind)
     for path in (target, *others):
         path.write_text("mine")
 
@@ -213,7 +213,7 @@ def test_a_full_disk_is_told(tmp_path, kind):
     part = Full(tmp_path / "a.part")
     find = PointFinder(top=256, min_level_db=-60.0)
     images = [image(seed=seed) for seed in range(30)]
-    table = _points.PointTable.of(images, find, {})
+    table = _points.PointTable.from_images(images, find, {})
     write = {
         "mcap": lambda: _mcap.write_mcap(part, images, find, {}, topics=TOPICS),
         "npz": lambda: _npz.write_npz(Path("/dev/full"), images, None),

@@ -167,7 +167,7 @@ def test_pictures(bag):
 
 
 def _pixels(given):
-    from ertis_numba.interop._picture import Picture  # noqa: PLC0415  as the file has it
+    from ertis_numba.interop._grey_image import Picture  # noqa: PLC0415  as the file has it
 
     return Picture(given)(given.amplitude)
 

@@ -133,7 +133,7 @@ def test_journal_is_sealed_to_the_same(tmp_path, measurement):
     path = tmp_path / "run.h5.journal"
     with Journal.create(path, target=tmp_path / "run.h5") as journal:
         journal.add_sensor("sensor", measurement.settings)
-        journal.append([ertis.Entry(measurement, 0)])
+        journal.append([ertis.JournalEntry(measurement, 0)])
     sealed = seal(path)
     with open_recording(sealed.recording) as recording:
         assert np.array_equal(recording[0].data, measurement.data)
@@ -146,7 +146,7 @@ def test_a_journal_that_holds_no_number_is_sealed_all_the_same(tmp_path):
     path = tmp_path / "run.h5.journal"
     with Journal.create(path, target=tmp_path / "run.h5") as journal:
         journal.add_sensor("sensor", settings)
-        journal.append([ertis.Entry(ertis.Measurement(words, settings), 0)])
+        journal.append([ertis.JournalEntry(ertis.Measurement(words, settings), 0)])
     with open_recording(seal(path).recording) as recording:
         assert np.array_equal(recording[0].data, words, equal_nan=True)
 

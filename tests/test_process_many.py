@@ -13,7 +13,7 @@ from ertis_cli import _process_many
 from ertis_cli.main import cli
 
 from ertis_numba import verification
-from ertis_numba.campaign import Advanced, Begun, Campaign, CampaignOptions, RecordingEnded
+from ertis_numba.campaign import RecordingProgress, RecordingStarted, Campaign, CampaignOptions, RecordingEnded
 from tests.campaigns import Here, names_in, write_recordings
 
 FAST = ["--range", "0.5:0.8", "--directions", "2d:9", "--workers", "1"]
@@ -157,10 +157,10 @@ def test_there_is_a_bar_for_each_recording_under_way(monkeypatch):
         return [(task.description, task.completed, task.total) for task in bars.progress.tasks]
 
     paths = [Path(f"runs/{name}.h5") for name in "ab"]
-    bars.follow(Advanced(paths[0], 3))  # of one that it has never heard of
+    bars.follow(RecordingProgress(paths[0], 3))  # of one that it has never heard of
     for path in paths:
-        bars.follow(Begun(path, 7))
-    bars.follow(Advanced(paths[1], 4))
+        bars.follow(RecordingStarted(path, 7))
+    bars.follow(RecordingProgress(paths[1], 4))
     assert drawn() == [("recordings", 0, 3), ("a.h5", 0, 7), ("b.h5", 4, 7)]
     bars.follow(RecordingEnded(paths[1], Path("out/b.energy.h5"), "failed"))
     assert drawn() == [("recordings", 1, 3), ("a.h5", 0, 7)]

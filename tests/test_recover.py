@@ -10,7 +10,8 @@ from ertis_cli.capture import _seal
 from ertis_cli.main import cli
 
 from ertis_numba.errors import DataError, JournalInUseError, SonarError
-from ertis_numba.journal import seal_apart, sealer
+from ertis_numba.journal import seal_apart
+from ertis_numba.journal import sealing_client
 from ertis_numba.storage.sealing import seal
 from ertis_numba.storage.verify import verify
 from tests.journals import crashed, create, entries
@@ -62,7 +63,7 @@ def instead(tmp_path, monkeypatch):
         script = tmp_path / "python"
         script.write_text(f"#!/bin/sh\n{line}\n")
         script.chmod(0o755)
-        monkeypatch.setattr(sealer.sys, "executable", str(script))
+        monkeypatch.setattr(sealing_client.sys, "executable", str(script))
 
     return replace_python
 
@@ -124,7 +125,7 @@ def test_recover_a_folder(tmp_path):
     ]
     assert done.stdout == ""
     assert sorted(path.name for path in tmp_path.iterdir()) == ["b.h5", "rec.h5", "sub", "used.h5.journal"]
-    assert verify(tmp_path / "rec.h5")[0].whole
+    assert verify(tmp_path / "rec.h5")[0].is_intact
 
 
 def test_recover_what_cannot_be_sealed(tmp_path):
@@ -138,7 +139,7 @@ def test_recover_what_cannot_be_sealed(tmp_path):
     reported = json.loads(done.stdout)["journals"]
     assert [(report.get("measurements"), "error" in report) for report in reported] == [(3, False), (None, True)]
     assert run("recover", path, "--force", "--quiet").stderr == ""
-    assert verify(tmp_path / "rec.h5")[0].whole
+    assert verify(tmp_path / "rec.h5")[0].is_intact
 
 
 def test_recover_damaged_measurements(tmp_path):
@@ -169,7 +170,7 @@ def interrupted(*_, **__):
 
 def test_recover_is_interrupted(tmp_path, monkeypatch):
     path = crashed(tmp_path)
-    monkeypatch.setattr(sealer.subprocess, "Popen", interrupted)
+    monkeypatch.setattr(sealing_client.subprocess, "Popen", interrupted)
     done = run("recover", path, code=130)
     assert done.stderr.splitlines()[0] == f"the measurements are safe in {path}; recover them with 'ertis recover {path}'"
     monkeypatch.undo()
@@ -206,7 +207,7 @@ def test_a_capture_that_fails_and_cannot_be_sealed(tmp_path, capsys):
     assert str(error.value) == reported
     assert capsys.readouterr().err == ""
     _seal(path, None, overwrite=True)
-    assert verify(tmp_path / "rec.h5")[0].whole
+    assert verify(tmp_path / "rec.h5")[0].is_intact
 
 
 def test_a_capture_of_nothing(tmp_path):
@@ -220,7 +221,7 @@ def test_a_capture_of_nothing(tmp_path):
 @pytest.mark.parametrize("failure", [None, LOST])
 def test_a_capture_whose_sealing_is_interrupted(tmp_path, monkeypatch, capsys, failure):
     path = crashed(tmp_path)
-    monkeypatch.setattr(sealer.subprocess, "Popen", interrupted)
+    monkeypatch.setattr(sealing_client.subprocess, "Popen", interrupted)
     with pytest.raises(KeyboardInterrupt if failure is None else SonarError):
         _seal(path, failure, overwrite=False)
     assert capsys.readouterr().err == f"the measurements are safe in {path}; recover them with 'ertis recover {path}'\n"

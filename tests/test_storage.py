@@ -23,7 +23,7 @@ from ertis_numba.storage import (
     write_energyscapes,
     write_recording,
 )
-from ertis_numba.storage.schema import ENERGYSCAPE, RECORDING, lay_out
+from ertis_numba.storage.schema import ENERGYSCAPE, RECORDING, create_variables
 from tests.files import SMALL, image, line, noise
 
 
@@ -432,4 +432,4 @@ def test_image_too_large_for_one_piece_is_refused(tmp_path):
     with h5py.File(tmp_path / "large.h5", "w") as file:
         sizes = {"direction": 1_000_000, "range": 1_178}
         with pytest.raises(ArgumentError, match="energy of 1000000 directions × 1178 ranges exceeds the 4 GiB"):
-            lay_out(file, ENERGYSCAPE, sizes=sizes, dtypes={"amplitude": "<f4"})
+            create_variables(file, ENERGYSCAPE, sizes=sizes, dtypes={"amplitude": "<f4"})

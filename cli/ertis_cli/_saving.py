@@ -91,7 +91,7 @@ def _recording(target: Path, *, overwrite: bool) -> Iterator[Write]:
     """Yield a function that appends measurements to a journal; the journal is then sealed into a recording."""
     from ertis_numba.atomic_files import check_target
     from ertis_numba.errors import DataError
-    from ertis_numba.journal import SUFFIX, Entry, Journal, seal_apart
+    from ertis_numba.journal import SUFFIX, JournalEntry, Journal, seal_apart
 
     check_target(target, overwrite=overwrite)
     path = target.with_name(f"{target.name}{SUFFIX}")
@@ -111,7 +111,7 @@ def _recording(target: Path, *, overwrite: bool) -> Iterator[Write]:
                     rotation_xyzw=arrival.rotation_xyzw,
                 )
                 known.add(sensor)
-            journal.append([Entry(measurement, arrival.arrived_ns)])
+            journal.append([JournalEntry(measurement, arrival.arrived_ns)])
 
         try:
             yield write

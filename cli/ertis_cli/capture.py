@@ -20,7 +20,7 @@ from ertis_cli._watch import Watch, report
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from ertis_numba.capture import Session
+    from ertis_numba.capture import CaptureSession
     from ertis_numba.devices.bits import BitCheck
     from ertis_numba.devices.setup import Setup
     from ertis_numba.devices.sonar import SonarDriver
@@ -187,7 +187,7 @@ def capture(
         raise click.UsageError("--spool-size is given without --spool; add --spool with its folder")
     _network.require_duration(duration)
     from ertis_numba.atomic_files import check_target
-    from ertis_numba.capture import Session
+    from ertis_numba.capture import CaptureSession
 
     if target is not None:
         check_target(target, overwrite=force)
@@ -205,7 +205,7 @@ def capture(
         target = target or Path(_default_name(list(sonars)))
         if send is None:
             check_target(target, overwrite=force)
-        session = Session(
+        session = CaptureSession(
             sonars,
             settings,
             trigger=trigger,
@@ -237,7 +237,7 @@ def capture(
 
 
 def _record(
-    session: "Session",
+    session: "CaptureSession",
     watch: Watch,
     checks: "dict[str, BitCheck]",
     target: Path,

@@ -5,21 +5,21 @@ recording. Workers are independent processes: a crash affects only the recording
 """
 
 from ertis_numba.campaign.campaign import Campaign
-from ertis_numba.campaign.events import Advanced, Begun, Event, RecordingEnded
-from ertis_numba.campaign.making import Making, making
-from ertis_numba.campaign.orders import CampaignOptions
-from ertis_numba.campaign.recordings import Source, find, outputs
+from ertis_numba.campaign.events import RecordingProgress, RecordingStarted, Event, RecordingEnded
+from ertis_numba.campaign.recording_job import Making, making
+from ertis_numba.campaign.tasks import CampaignOptions
+from ertis_numba.campaign.recordings import RecordingFile, find_recordings, output_paths
 
 __all__ = [
-    "Advanced",
-    "Begun",
+    "RecordingProgress",
+    "RecordingStarted",
     "Campaign",
     "CampaignOptions",
     "Event",
     "Making",
     "RecordingEnded",
-    "Source",
-    "find",
+    "RecordingFile",
+    "find_recordings",
     "making",
-    "outputs",
+    "output_paths",
 ]

@@ -15,7 +15,7 @@ from ertis_numba.storage.recording import (
     open_recording,
     write_recording,
 )
-from ertis_numba.storage.truth import Truth, TruthLog
+from ertis_numba.storage.truth import GroundTruth, GroundTruthLog
 
 __all__ = [
     "EnergyscapeReader",
@@ -23,8 +23,8 @@ __all__ = [
     "RecordingGap",
     "RecordingReader",
     "RecordingWriter",
-    "Truth",
-    "TruthLog",
+    "GroundTruth",
+    "GroundTruthLog",
     "atomic_write",
     "check_target",
     "file_kind",

@@ -24,18 +24,18 @@ from ertis_numba.storage.schema import (
     content_sha256,
     content_uuid,
     date_created,
-    describe,
+    set_attributes,
     sensor_path,
     software_versions,
 )
-from ertis_numba.storage.truth import Truth, TruthLog, write_truth
+from ertis_numba.storage.truth import GroundTruth, GroundTruthLog, write_truth
 
-__all__ = ["Writer"]
+__all__ = ["FileWriter"]
 
 Item = TypeVar("Item", Measurement, Energyscape)
 
 
-class Writer(ABC, Generic[Item]):
+class FileWriter(ABC, Generic[Item]):
     """Writer of rows; the file appears when the ``with`` block ends without an error.
 
     Rows of several sensors may come in any order; each sensor has its own group.
@@ -53,7 +53,7 @@ class Writer(ABC, Generic[Item]):
         *,
         overwrite: bool,
         attributes: Mapping[str, str],
-        truth: Mapping[str, Truth | TruthLog] | None,
+        truth: Mapping[str, GroundTruth | GroundTruthLog] | None,
     ) -> None:
         self.path = Path(path)
         self._overwrite = overwrite
@@ -79,7 +79,7 @@ class Writer(ABC, Generic[Item]):
     def _complete(self, group: h5py.Group, rows: RowWriter) -> None:
         """Write the parts that are known only at the end."""
 
-    def _truth_of(self, sensor: str, group: h5py.Group) -> Truth | TruthLog | None:  # noqa: ARG002  for subclasses
+    def _truth_of(self, sensor: str, group: h5py.Group) -> GroundTruth | GroundTruthLog | None:  # noqa: ARG002  for subclasses
         """Return the ground truth of a sensor, if known."""
         return self._truth.get(sensor)
 
@@ -143,7 +143,7 @@ class Writer(ABC, Generic[Item]):
             raise ArgumentError(f"{self.path} would contain no measurement; give at least one")
         self._require_sensors("truth", self._truth)
         contents = {sensor: self._finish_sensor(file, sensor) for sensor in self._rows}
-        describe(
+        set_attributes(
             file,
             {
                 "Conventions": CONVENTIONS,
@@ -165,7 +165,7 @@ class Writer(ABC, Generic[Item]):
         if truth is not None:
             write_truth(group, truth, len(rows))
         content = content_sha256(group, self._table)
-        describe(group, {"content_sha256": content})
+        set_attributes(group, {"content_sha256": content})
         return content
 
     def _require_sensors(self, name: str, given: Iterable[str]) -> None:

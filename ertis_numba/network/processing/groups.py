@@ -5,7 +5,7 @@ from collections import Counter, deque
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
-from ertis_numba.capture.sync_counts import SyncCounts
+from ertis_numba.capture.sync_counts import PulseAligner
 from ertis_numba.network.messages import Data, Group
 
 __all__ = ["Groups"]
@@ -62,7 +62,7 @@ class Groups:
 
     def __init__(self) -> None:
         slots = [str(number) for number in range(_RUNS)]
-        self._pulses: SyncCounts[tuple[Data, int]] = SyncCounts(slots, shortest_s=_SHORTEST_S)
+        self._pulses: PulseAligner[tuple[Data, int]] = PulseAligner(slots, shortest_s=_SHORTEST_S)
         self._free = slots
         self._runs: dict[int, _SessionClock] = {}
         self._seen_ns: dict[str, int] = {}

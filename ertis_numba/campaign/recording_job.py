@@ -11,8 +11,8 @@ from typing import Any
 
 from ertis_numba import kernels
 from ertis_numba.analysis.call_match import CallMatch, first_call_match
-from ertis_numba.campaign.orders import CampaignOptions
-from ertis_numba.campaign.sensor_run import SensorRun, faults_of
+from ertis_numba.campaign.tasks import CampaignOptions
+from ertis_numba.campaign.sensor_processing import SensorRun, faults_of
 from ertis_numba.errors import DataError
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.prediction import planner_of, predict

@@ -8,8 +8,8 @@ from contextlib import ExitStack
 from typing import Any, Final
 
 from ertis_numba import cluster
-from ertis_numba.campaign.orders import News, WorkOrder
-from ertis_numba.campaign.work import follow
+from ertis_numba.campaign.tasks import News, WorkOrder
+from ertis_numba.campaign.work import run_task
 from ertis_numba.errors import NetworkError
 from ertis_numba.storage.schema import software_versions
 
@@ -140,7 +140,7 @@ class _UnwantedError(Exception):
 
 
 def follow_there(do: str, about: dict[str, Any], topic: str, number: int) -> dict[str, Any]:
-    """Run an order on a worker of the cluster, as `work.follow` does; ``topic`` receives its progress."""
+    """Run an order on a worker of the cluster, as `work.run_task` does; ``topic`` receives its progress."""
     here = cluster.current_worker()
     for name, wanted in about["versions"].items():
         came = software_versions()[name]
@@ -159,4 +159,4 @@ def follow_there(do: str, about: dict[str, Any], topic: str, number: int) -> dic
             reported_s = time.monotonic()
             here.log_event(topic, {"number": number, "done": done})
 
-    return follow(do, {**about, "at_most": here.state.nthreads}, notify)
+    return run_task(do, {**about, "at_most": here.state.nthreads}, notify)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from ertis_numba.analysis.health import health
 from ertis_numba.analysis.health.kinds import DISABLE
-from ertis_numba.campaign.orders import MAX_BYTES
+from ertis_numba.campaign.tasks import MAX_BYTES
 from ertis_numba.errors import DataError
 from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.pipeline import Pipeline
