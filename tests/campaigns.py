@@ -3,7 +3,7 @@
 from collections import deque
 
 from ertis_numba.campaign import Campaign, RecordingEnded, find_recordings
-from ertis_numba.campaign.tasks import News
+from ertis_numba.campaign.tasks import TaskUpdate
 from ertis_numba.campaign.work import run_task
 from ertis_numba.settings import Air
 from ertis_numba.storage import write_recording
@@ -42,8 +42,8 @@ class Here:
     def wait(self, _):
         order = self.orders.popleft()
         advanced = []
-        result = run_task(order.do, order.about, lambda done: advanced.append(News(order.number, done)))
-        return [*advanced, News(order.number, result=result)]
+        result = run_task(order.do, order.about, lambda done: advanced.append(TaskUpdate(order.number, done)))
+        return [*advanced, TaskUpdate(order.number, result=result)]
 
     def close(self):
         self.orders.clear()

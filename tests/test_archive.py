@@ -9,7 +9,7 @@ from datetime import datetime
 import pytest
 
 from ertis_numba.errors import ArgumentError, DataError, DiskFullError, JournalInUseError
-from ertis_numba.journal import SUFFIX, Journal, JournalGap, JournalSensor, seal_apart
+from ertis_numba.journal import SUFFIX, Journal, JournalGap, JournalSensor, seal_in_subprocess
 from ertis_numba.network.central_node import Archive, _volumes
 from ertis_numba.network.central_node._received_items import (
     Forgotten,
@@ -460,7 +460,7 @@ def test_a_journal_that_cannot_be_sealed_is_tried_again(tmp_path, monkeypatch):
 
 def test_a_journal_that_somebody_else_recovers_is_done(tmp_path, monkeypatch):
     def seals(journal, **options):
-        seal_apart(journal, **options)
+        seal_in_subprocess(journal, **options)
         raise JournalInUseError("somebody else has it")
 
     with Opened(tmp_path) as opened:
@@ -480,7 +480,7 @@ def test_sealing_rests_long_until_the_room_gets_scarce(tmp_path, monkeypatch, sh
 
     def seals(journal, **options):
         asked.append(options["rests"])
-        return seal_apart(journal, **options)
+        return seal_in_subprocess(journal, **options)
 
     with Opened(tmp_path) as opened:
         opened.give(item_of(from_zero(1)[0]))

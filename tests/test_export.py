@@ -173,7 +173,7 @@ GIVEN = {"mounting": MOUNTED, "topics": TOPICS, "top": 5, "min_level_db": -9.0, 
 @pytest.mark.parametrize("kind", FORMATS)
 def test_options_are_those_of_the_format(tmp_path, kind, option):
     """Taken where the format has them, and refused elsewhere rather than passed over."""
-    target = tmp_path / f"a{FORMATS[kind].ending}"
+    target = tmp_path / f"a{FORMATS[kind].suffix}"
     items = [noise(count=1)[0]] if kind == "acoular" else [image()]
     if option in FORMATS[kind].options:
         export(target, items, **{option: GIVEN[option]})
@@ -185,7 +185,7 @@ def test_options_are_those_of_the_format(tmp_path, kind, option):
 
 @pytest.mark.parametrize("kind", FORMATS)
 def test_what_breaks_off_leaves_the_older_file(tmp_path, kind):
-    target, *others = output_files(tmp_path / f"a{FORMATS[kind].ending}", kind)
+    target, *others = output_files(tmp_path / f"a{FORMATS[kind].suffix}", kind)
     for path in (target, *others):
         path.write_text("mine")
 
@@ -253,7 +253,7 @@ def test_the_page_names_what_the_formats_hold():
     for line in table:
         name, ending, held, _ = (cell.strip() for cell in line.strip("|").split("|"))
         reported[name.strip("`")] = (ending.strip("`"), tuple(re.findall(r"`(\w+)`", held)))
-    assert reported == {name: (each.ending, each.holds) for name, each in FORMATS.items()}
+    assert reported == {name: (each.suffix, each.fields) for name, each in FORMATS.items()}
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from ertis_numba.errors import DamagedError, DataError
-from ertis_numba.journal import Journal, seal_apart
+from ertis_numba.journal import Journal, seal_in_subprocess
 from ertis_numba.journal._limit import read_limit
 from ertis_numba.storage import open_recording
 from tests.journals import EPOCH, crashed, create, entries, same
@@ -60,7 +60,7 @@ def test_open_deletes_gaps_and_runs_that_were_never_acknowledged(tmp_path):
 def test_recording_of_a_limited_journal_holds_acknowledged_measurements(tmp_path):
     path = crashed(tmp_path, entries(4))
     Journal.abandon(path, {("left", EPOCH): 11})
-    sealed = seal_apart(path)
+    sealed = seal_in_subprocess(path)
     assert sealed.measurements == 2
     with open_recording(sealed.recording, sensor="left") as recording:
         assert [measurement.stamp.sequence for measurement in recording] == [10, 11]

@@ -15,7 +15,7 @@ from ertis_cli.main import cli
 from ertis_numba import cluster
 from ertis_numba.campaign import RecordingProgress, RecordingStarted, Campaign, CampaignOptions, find_recordings
 from ertis_numba.campaign import dask_workers
-from ertis_numba.campaign.tasks import WorkOrder
+from ertis_numba.campaign.tasks import Task
 from ertis_numba.errors import NetworkError
 from ertis_numba.storage import open_energyscapes, write_recording
 from tests.campaigns import ended, names_in, outcomes, run_here, write_recordings
@@ -132,7 +132,7 @@ def test_other_versions_are_told(monkeypatch):
         address = "tcp://far:1"
 
     monkeypatch.setattr(cluster, "current_worker", Elsewhere)
-    reported = dask_workers.follow_there("look", {"versions": {"numpy": "0.1"}}, "topic", 1)
+    reported = dask_workers.run_on_dask_worker("look", {"versions": {"numpy": "0.1"}}, "topic", 1)
     assert "worker tcp://far:1 has numpy " in reported["error"]
     assert "not 0.1; install the same version everywhere" in reported["error"]
 
@@ -169,9 +169,9 @@ def test_a_worker_that_is_lost_makes_no_room(monkeypatch):
     monkeypatch.setattr(cluster, "connect", lambda *_, **__: Dwindling())
     monkeypatch.setattr(cluster, "require_workers", lambda *_, **__: None)
     monkeypatch.setattr(dask_workers, "_LOOK_S", 0.0)
-    pool = dask_workers.Members("tcp://far:1")
+    pool = dask_workers.DaskWorkerPool("tcp://far:1")
     for number in range(pool.free):
-        pool.give(WorkOrder(number, "look", {}))
+        pool.give(Task(number, "look", {}))
     assert (pool.size, pool.free) == (3, 0)
     pool.wait(0.0)
     assert (pool.size, pool.free) == (2, 0)
@@ -181,7 +181,7 @@ def test_dask_is_silent_while_a_campaign_runs(monkeypatch):
     monkeypatch.setattr(cluster, "connect", lambda *_, **__: Dwindling())
     monkeypatch.setattr(cluster, "require_workers", lambda *_, **__: None)
     loggers = [logging.getLogger(name) for name in ("distributed", "distributed.client", "distributed.core")]
-    pool = dask_workers.Members("tcp://far:1")
+    pool = dask_workers.DaskWorkerPool("tcp://far:1")
     assert not any(logger.isEnabledFor(logging.CRITICAL) for logger in loggers)
     pool.close()
     assert all(logger.isEnabledFor(logging.CRITICAL) for logger in loggers)

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from ertis_numba.campaign import RecordingProgress, Campaign, CampaignOptions, find_recordings, processes
-from ertis_numba.campaign.tasks import WorkOrder
+from ertis_numba.campaign.tasks import Task
 from ertis_numba.campaign.processes import ProcessPool
 from ertis_numba.errors import DeviceError
 from ertis_numba.storage import open_energyscapes, write_recording
@@ -114,7 +114,7 @@ def test_a_worker_that_dies_of_nothing_is_replaced():
         (pid,) = pool.current_paths
         os.kill(pid, signal.SIGKILL)
         assert gone(pid)
-        pool.give(WorkOrder(7, "look", {"path": "none.h5", "named": True, "sensor": None}))
+        pool.give(Task(7, "look", {"path": "none.h5", "named": True, "sensor": None}))
         news = []
         while not (news and news[-1].result):
             news += pool.wait(PATIENCE_S)
@@ -142,7 +142,7 @@ def test_fewer_are_wanted_while_all_are_busy(size):
 
         def feed():
             while pool.free > 0 and (number := next(numbers, None)) is not None:
-                pool.give(WorkOrder(number, "look", {"path": "none.h5", "named": True, "sensor": None}))
+                pool.give(Task(number, "look", {"path": "none.h5", "named": True, "sensor": None}))
                 in_hand.add(number)
             return len(in_hand)
 

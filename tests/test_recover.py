@@ -10,7 +10,7 @@ from ertis_cli.capture import _seal
 from ertis_cli.main import cli
 
 from ertis_numba.errors import DataError, JournalInUseError, SonarError
-from ertis_numba.journal import seal_apart
+from ertis_numba.journal import seal_in_subprocess
 from ertis_numba.journal import sealing_client
 from ertis_numba.storage.sealing import seal
 from ertis_numba.storage.verify import verify
@@ -29,7 +29,7 @@ def test_apart(tmp_path):
         path = journal.path
     shutil.copy(path, tmp_path / "kept")
     reported = []
-    sealed = seal_apart(path, progress=lambda *numbers: reported.append(numbers))
+    sealed = seal_in_subprocess(path, progress=lambda *numbers: reported.append(numbers))
     assert reported == [(number + 1, 5) for number in range(5)]
     assert not path.exists()
     shutil.copy(tmp_path / "kept", path)
@@ -39,7 +39,7 @@ def test_apart(tmp_path):
 
 def test_apart_nothing_was_measured(tmp_path):
     create(tmp_path, []).close()
-    sealed = seal_apart(tmp_path / "rec.h5.journal")
+    sealed = seal_in_subprocess(tmp_path / "rec.h5.journal")
     assert (sealed.recording, sealed.remark) == (None, f"{tmp_path}/rec.h5.journal: no measurement was captured")
 
 
@@ -48,11 +48,11 @@ def test_apart_refused(tmp_path):
         create(tmp_path) as journal,
         pytest.raises(JournalInUseError, match=r"rec.h5.journal is in use by another process"),
     ):
-        seal_apart(journal.path)
+        seal_in_subprocess(journal.path)
     (tmp_path / "rec.h5").write_text("mine")
     with pytest.raises(DataError, match="exists with other content"):
-        seal_apart(journal.path)
-    assert seal_apart(journal.path, overwrite=True).measurements == 3
+        seal_in_subprocess(journal.path)
+    assert seal_in_subprocess(journal.path, overwrite=True).measurements == 3
 
 
 @pytest.fixture
@@ -84,7 +84,7 @@ def instead(tmp_path, monkeypatch):
 def test_apart_and_lost(tmp_path, instead, line, reason):
     instead(line)
     with pytest.raises(DataError, match=f"rec.h5.journal: the process that seals it {reason}"):
-        seal_apart(crashed(tmp_path))
+        seal_in_subprocess(crashed(tmp_path))
 
 
 @pytest.mark.parametrize("late", [False, True])
@@ -100,7 +100,7 @@ def test_apart_and_interrupted(tmp_path, instead, late):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt) as error:
-        seal_apart(path, progress=interrupt)
+        seal_in_subprocess(path, progress=interrupt)
     safe = f"the measurements are safe in {path}; recover them with 'ertis recover {path}'"
     assert str(error.value) == (f"the measurements are in {tmp_path / 'rec.h5'}" if late else safe)
     assert (path.exists(), (tmp_path / "rec.h5").exists()) == (not late, late)

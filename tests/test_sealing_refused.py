@@ -7,7 +7,7 @@ import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
-from ertis_numba.journal import Journal, seal_apart
+from ertis_numba.journal import Journal, seal_in_subprocess
 from ertis_numba.network.central_node._received_items import SealedOne, SealingFailed
 from ertis_numba.settings import Call, call
 from ertis_numba.storage import open_recording, sealing, sensor_names
@@ -100,7 +100,7 @@ def test_verify_reports_a_sensor_of_a_journal_that_cannot_be_used(left):
 
 
 def test_seal_apart_returns_what_was_refused(left):
-    sealed = seal_apart(left)
+    sealed = seal_in_subprocess(left)
     assert (sealed.measurements, list(sealed.refused), sealed.set_aside.exists()) == (3, ["bad"], True)
 
 

@@ -62,7 +62,7 @@ def test_a_sensor_that_was_away_is_aligned_again(seed, n_sensors):
         if sensor == last and pulse >= 20 + seed and seed:
             if restarted is None:
                 restarted = counter - 7
-                found += counts.forget(last)
+                found += counts.reset(last)
             counter -= restarted  # noqa: PLW2901
         found += counts.add(sensor, (sensor, pulse), counter, now_ns)
     found += counts.release(now_ns, at_once=True)
@@ -88,8 +88,8 @@ def test_what_is_held_of_a_sensor_is_told_before_it_begins_anew():
     found = [each for number in range(4) for each in counts.add("a", ("a", number), number, number * 100_000_000)]
     found += counts.add("b", ("b", 2), 100, 205_000_000)
     assert not [item for (item, _), _ in found if item == "b"]  # too few to decide
-    assert counts.forget("b") == [(("b", 2), 2)]
-    assert counts.forget("b") == []
+    assert counts.reset("b") == [(("b", 2), 2)]
+    assert counts.reset("b") == []
     found += [each for number in range(4, 8) for each in counts.add("a", ("a", number), number, number * 100_000_000)]
     found += [each for number in (4, 5, 6) for each in counts.add("b", ("b", number), number - 4, number * 100_000_000)]
     assert all(pulse == number for (_, pulse), number in found)

@@ -91,7 +91,7 @@ def _recording(target: Path, *, overwrite: bool) -> Iterator[Write]:
     """Yield a function that appends measurements to a journal; the journal is then sealed into a recording."""
     from ertis_numba.atomic_files import check_target
     from ertis_numba.errors import DataError
-    from ertis_numba.journal import SUFFIX, JournalEntry, Journal, seal_apart
+    from ertis_numba.journal import SUFFIX, JournalEntry, Journal, seal_in_subprocess
 
     check_target(target, overwrite=overwrite)
     path = target.with_name(f"{target.name}{SUFFIX}")
@@ -128,6 +128,6 @@ def _recording(target: Path, *, overwrite: bool) -> Iterator[Write]:
             raise DataError(
                 f"{target} is not written, because no measurement was received; run the command for a longer time"
             )
-    sealed = seal_apart(path, overwrite=overwrite)
+    sealed = seal_in_subprocess(path, overwrite=overwrite)
     if sealed.recording is None:
         raise DataError(sealed.remark)

@@ -268,10 +268,10 @@ def _record(
 def _seal(path: Path, failure: Exception | None, *, overwrite: bool) -> None:
     """Seal the journal into a recording, then raise the error that ended the capture, if any."""
     from ertis_numba.errors import DataError
-    from ertis_numba.journal import seal_apart
+    from ertis_numba.journal import seal_in_subprocess
 
     try:
-        sealed = seal_apart(path, overwrite=overwrite)
+        sealed = seal_in_subprocess(path, overwrite=overwrite)
     except (OSError, ValueError) as error:
         reported = f"{error}; the measurements are safe in {path}; seal them with 'ertis recover {path}'"
         if failure is None:

@@ -6,7 +6,7 @@ recording. Workers are independent processes: a crash affects only the recording
 
 from ertis_numba.campaign.campaign import Campaign
 from ertis_numba.campaign.events import RecordingProgress, RecordingStarted, Event, RecordingEnded
-from ertis_numba.campaign.recording_job import Making, making
+from ertis_numba.campaign.recording_job import RecordingJob, prepare_recording
 from ertis_numba.campaign.tasks import CampaignOptions
 from ertis_numba.campaign.recordings import RecordingFile, find_recordings, output_paths
 
@@ -16,10 +16,10 @@ __all__ = [
     "Campaign",
     "CampaignOptions",
     "Event",
-    "Making",
+    "RecordingJob",
     "RecordingEnded",
     "RecordingFile",
     "find_recordings",
-    "making",
+    "prepare_recording",
     "output_paths",
 ]

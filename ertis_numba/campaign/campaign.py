@@ -11,7 +11,7 @@ from ertis_numba import checks
 from ertis_numba.campaign.events import RecordingProgress, RecordingStarted, Event, Outcome, RecordingEnded
 from ertis_numba.campaign.existing_output import difference
 from ertis_numba.campaign.folder import clear_parts, exclusive_folder
-from ertis_numba.campaign.tasks import HOW, MAX_BYTES, CampaignOptions, Do, News, WorkerPool, WorkOrder
+from ertis_numba.campaign.tasks import TASK_OPTIONS, MAX_WAITING_BYTES, CampaignOptions, TaskAction, TaskUpdate, WorkerPool, Task
 from ertis_numba.campaign.plans import Plans
 from ertis_numba.campaign.recordings import RecordingFile, output_paths
 from ertis_numba.cpu_cores import usable_cores
@@ -91,7 +91,7 @@ class Campaign:
         self._plans = Plans()
         self._unplanned: deque[_RecordingState] = deque()
         self._ready: deque[_RecordingState] = deque()
-        self._submitted: dict[int, tuple[WorkOrder, _RecordingState]] = {}
+        self._submitted: dict[int, tuple[Task, _RecordingState]] = {}
         self._n_orders = 0
 
     @property
@@ -125,9 +125,9 @@ class Campaign:
 
     def _pool(self) -> WorkerPool:
         if self._scheduler is not None:
-            from ertis_numba.campaign.dask_workers import Members  # noqa: PLC0415  it loads dask
+            from ertis_numba.campaign.dask_workers import DaskWorkerPool  # noqa: PLC0415  it loads dask
 
-            return Members(self._scheduler)
+            return DaskWorkerPool(self._scheduler)
         from ertis_numba.campaign.processes import ProcessPool  # noqa: PLC0415
 
         return ProcessPool(self.workers)
@@ -136,10 +136,10 @@ class Campaign:
         """Give orders to free workers; return True if any order is in progress."""
         while pool.free > 0 and (pair := self._next(pool)) is not None:
             self._submitted[pair[0].number] = pair
-            pool.give(pair[0])
+            pool.submit(pair[0])
         return bool(self._submitted)
 
-    def _next(self, pool: WorkerPool) -> tuple[WorkOrder, _RecordingState] | None:
+    def _next(self, pool: WorkerPool) -> tuple[Task, _RecordingState] | None:
         """Return the next order; recordings that are nearest to their end come first."""
         if self._ready:
             case = self._ready.popleft()
@@ -152,7 +152,7 @@ class Campaign:
             return self._order("look", self._paths(case) | {"sensor": self._options.sensor}), case
         return None
 
-    def _to_plan(self, n_workers: int) -> tuple[WorkOrder, _RecordingState] | None:
+    def _to_plan(self, n_workers: int) -> tuple[Task, _RecordingState] | None:
         """Return a planning order, unless all planning has to wait."""
         for case in self._unplanned:
             settings = next(each for each in case.wanted.values() if self._plans.get(each) is None)
@@ -162,9 +162,9 @@ class Campaign:
                 return self._order("plan", about), case
         return None
 
-    def _order(self, do: Do, about: dict[str, Any]) -> WorkOrder:
+    def _order(self, do: TaskAction, about: dict[str, Any]) -> Task:
         self._n_orders += 1
-        return WorkOrder(self._n_orders, do, about)
+        return Task(self._n_orders, do, about)
 
     def _paths(self, case: _RecordingState) -> dict[str, Any]:
         far = self._scheduler is not None  # Its workers may have another current folder.
@@ -186,14 +186,14 @@ class Campaign:
         return {
             **self._paths(case),
             **self._shares(n_workers),
-            **{name: getattr(options, name) for name in HOW},
+            **{name: getattr(options, name) for name in TASK_OPTIONS},
             "sensors": planned,
-            "max_bytes": MAX_BYTES / n_workers,
+            "max_bytes": MAX_WAITING_BYTES / n_workers,
             # Dask repeats the order of a lost worker, even if only the message about its result was missing.
             "overwrite": options.overwrite or self._scheduler is not None,
         }
 
-    def _handle_update(self, pool: WorkerPool, news: News) -> Iterator[Event]:
+    def _handle_update(self, pool: WorkerPool, news: TaskUpdate) -> Iterator[Event]:
         if news.number not in self._submitted:
             return
         order, case = self._submitted[news.number]
@@ -202,16 +202,16 @@ class Campaign:
                 yield RecordingProgress(case.found.path, news.done)
             return
         del self._submitted[news.number]
-        if order.do == "plan":
-            self._plans.finish(Settings.from_toml(order.about["settings"], "settings"), news.result)
+        if order.action == "plan":
+            self._plans.finish(Settings.from_toml(order.arguments["settings"], "settings"), news.result)
             if "by_chance" not in news.result:
                 yield from self._planned(pool, case, news.result)
                 return
         if "error" in news.result:
-            if order.do == "make" and "by_chance" in news.result:
+            if order.action == "make" and "by_chance" in news.result:
                 clear_parts(self.folder, {case.target.name})  # A killed worker may have left them.
             yield case.ended("failed", error=news.result["error"])
-        elif order.do == "look":
+        elif order.action == "look":
             yield from self._handle_inspection(case, news.result)
         else:
             yield case.ended("kept" if case.is_kept else "made", made=news.result)
@@ -240,7 +240,7 @@ class Campaign:
 
     def _handle_existing(self, case: _RecordingState, sensors: dict[str, Any]) -> Iterator[Event]:
         """Report an existing output, or examine its processing first if the options request that."""
-        if not self._options.is_thorough:
+        if not self._options.examines_existing:
             yield case.ended("kept")
             return
         case.is_kept = True

@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import IO, Any, Final
 
-from ertis_numba.campaign.tasks import News, WorkOrder
+from ertis_numba.campaign.tasks import TaskUpdate, Task
 from ertis_numba.errors import DeviceError
 
 __all__ = ["ProcessPool"]
@@ -26,7 +26,7 @@ class _WorkerProcess:
     """A process, and its current order."""
 
     process: "subprocess.Popen[str]"
-    order: WorkOrder | None = None
+    order: Task | None = None
     begun: bool = False
     ready: bool = False
     stated: deque[str] = field(default_factory=lambda: deque(maxlen=_MAX_STDERR_LINES))
@@ -82,17 +82,17 @@ class ProcessPool:
         for worker in [worker for worker in self._workers if worker.order is None][self._size :]:
             self._end(worker)
 
-    def give(self, order: WorkOrder) -> None:
+    def give(self, order: Task) -> None:
         """Run an order; never blocks."""
         worker = next((worker for worker in self._workers if worker.order is None), None) or self._start()
         worker.order, worker.begun = order, False
         stdin = worker.process.stdin
         if stdin is not None:
             with suppress(OSError):  # The process has ended, which `wait` detects.
-                stdin.write(json.dumps({"number": order.number, "do": order.do, "about": order.about}) + "\n")
+                stdin.write(json.dumps({"number": order.number, "do": order.action, "about": order.arguments}) + "\n")
                 stdin.flush()
 
-    def wait(self, timeout_s: float) -> list[News]:
+    def wait(self, timeout_s: float) -> list[TaskUpdate]:
         """Return messages of workers, or an empty list after a timeout."""
         try:
             reported = [self._reported.get(timeout=timeout_s)]
@@ -139,7 +139,7 @@ class ProcessPool:
     def _keep_stderr(worker: _WorkerProcess, stream: IO[str]) -> None:
         worker.stated.extend(line.strip() for line in stream if line.strip())
 
-    def _handle_line(self, worker: _WorkerProcess, line: str | None) -> News | None:
+    def _handle_line(self, worker: _WorkerProcess, line: str | None) -> TaskUpdate | None:
         if line is None:
             return self._died(worker)
         try:
@@ -150,14 +150,14 @@ class ProcessPool:
             worker.ready, self._n_failed_starts = True, 0
             return None
         worker.begun = True
-        news = News(reported["number"], reported.get("done", 0), reported.get("result"))
+        news = TaskUpdate(reported["number"], reported.get("done", 0), reported.get("result"))
         if news.result is not None:
             worker.order = None
             if len(self._workers) > self._size:
                 self._end(worker)
         return news
 
-    def _died(self, worker: _WorkerProcess) -> News | None:
+    def _died(self, worker: _WorkerProcess) -> TaskUpdate | None:
         if worker not in self._workers:
             return None
         order = worker.order
@@ -173,7 +173,7 @@ class ProcessPool:
         if order is None:
             return None
         text = f"{_path(order)}: its worker process {how}; if memory runs out, give fewer --workers"
-        return News(order.number, result={"error": text, "by_chance": True})
+        return TaskUpdate(order.number, result={"error": text, "by_chance": True})
 
     def _end(self, worker: _WorkerProcess) -> None:
         """Kill a process, and close its streams."""
@@ -188,8 +188,8 @@ class ProcessPool:
                     stream.close()
 
 
-def _path(order: WorkOrder | None) -> str:
-    return "" if order is None else str(order.about.get("path", ""))
+def _path(order: Task | None) -> str:
+    return "" if order is None else str(order.arguments.get("path", ""))
 
 
 def _how_it_ended(worker: _WorkerProcess) -> str:

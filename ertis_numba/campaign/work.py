@@ -15,8 +15,8 @@ from ertis_numba import kernels
 from ertis_numba.atomic_files import remedy
 from ertis_numba.campaign.existing_output import inspect_output
 from ertis_numba.campaign.folder import final_name
-from ertis_numba.campaign.recording_job import checked, making
-from ertis_numba.campaign.tasks import HOW, CampaignOptions
+from ertis_numba.campaign.recording_job import check_recording, prepare_recording
+from ertis_numba.campaign.tasks import TASK_OPTIONS, CampaignOptions
 from ertis_numba.errors import ErtisError
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Settings
@@ -96,7 +96,7 @@ def _make(about: Mapping[str, Any], notify: ReportProgress) -> dict[str, Any]:
     """Write the energyscape file of a recording."""
     options, how = _processing_arguments(about)
     warnings: list[str] = []
-    with making(
+    with prepare_recording(
         Path(about["path"]),
         Path(about["target"]),
         options,
@@ -115,14 +115,14 @@ def _check(about: Mapping[str, Any], _: ReportProgress) -> dict[str, Any]:
     """Return the warnings and results that processing would give, for a recording with an existing output."""
     options, how = _processing_arguments(about)
     warnings: list[str] = []
-    return {**checked(Path(about["path"]), options, warn=warnings.append, **how), "warnings": warnings}
+    return {**check_recording(Path(about["path"]), options, warn=warnings.append, **how), "warnings": warnings}
 
 
 def _processing_arguments(about: Mapping[str, Any]) -> tuple[CampaignOptions, dict[str, Any]]:
     """Return the options, the settings of each sensor and the source of pipelines."""
     settings = {name: Settings.from_toml(text, f"settings of {name}") for name, text in about["sensors"].items()}
     threads = _threads(about, next(iter(settings.values())))
-    options = CampaignOptions(**{name: about[name] for name in HOW}, threads=threads)
+    options = CampaignOptions(**{name: about[name] for name in TASK_OPTIONS}, threads=threads)
     pipelines = functools.partial(_pipelines, device=about["device"], threads=threads)
     return options, {"settings": settings, "pipelines": pipelines}
 

@@ -182,7 +182,7 @@ class CaptureSession:
         self._record_ns = round(1e9 * settings.recording.duration_s)
         self._stop = threading.Event()
         self._errors: dict[str, Exception] = {}
-        self._tracks = {sensor: _SequenceState() for sensor in sonars}
+        self._sequence_states = {sensor: _SequenceState() for sensor in sonars}
         self._pulses: PulseAligner[BlockArrived] = PulseAligner(list(sonars), shortest_s=settings.recording.duration_s)
         self._waiting: list[JournalEntry] = []  # Entries to store together.
         self._groups: dict[int, int] = {}
@@ -210,7 +210,7 @@ class CaptureSession:
         readers: list[SensorReader] = []
         try:
             self._begin(sink, readers, events)
-            self._take(sink, readers, events)
+            self._process_events(sink, readers, events)
         finally:
             for reader in readers:
                 reader.abandon()
@@ -246,7 +246,7 @@ class CaptureSession:
         for reader in readers:
             reader.start()
 
-    def _take(self, sink: MeasurementSink, readers: list[SensorReader], events: "queue.Queue[Event]") -> None:
+    def _process_events(self, sink: MeasurementSink, readers: list[SensorReader], events: "queue.Queue[Event]") -> None:
         end_s = None if self._duration_s is None else time.monotonic() + self._duration_s
         while len(self._ended) < len(readers):
             if self._stop.is_set() or self._done() or (end_s is not None and time.monotonic() >= end_s):
@@ -262,7 +262,7 @@ class CaptureSession:
         """Return True if every remaining sensor has delivered the last pulse, or a later one."""
         if self._n is None or not self._synced:
             return False
-        return all(self._tracks[sensor].passed for sensor in self._sonars if sensor not in self._ended)
+        return all(self._sequence_states[sensor].passed for sensor in self._sonars if sensor not in self._ended)
 
     def _handle(self, sink: MeasurementSink, events: Iterable[Event]) -> None:
         ready: list[tuple[BlockArrived, int]] = []
@@ -277,16 +277,16 @@ class CaptureSession:
                     self._note_tick(event.sensor, event.tick)
                     self._store(sink, ready)
                     ready = []
-                    self._miss_until(sink, event.sensor, event.count + 1, event.reason)
+                    self._record_gap_before(sink, event.sensor, event.count + 1, event.reason)
                     self._on_note(event.sensor, event.text)
                 case SensorMessage(sensor, text):
                     self._on_note(sensor, text)
                 case CounterRestarted(sensor):
-                    ready += self._begin_anew(sensor, "the sensor restarted")
+                    ready += self._realign(sensor, "the sensor restarted")
                     self._on_note(sensor, "has restarted its counter")
                 case SensorReconnected(sensor, away_s):
                     self.counts[sensor].unplugged += 1
-                    ready += self._begin_anew(sensor, "the sensor was unplugged")
+                    ready += self._realign(sensor, "the sensor was unplugged")
                     self._on_back(sensor, away_s)
                 case SensorEnded(sensor, error):
                     self._ended.add(sensor)
@@ -297,14 +297,14 @@ class CaptureSession:
         self._store(sink, ready)
 
     def _note_tick(self, sensor: str, tick: int) -> None:
-        track = self._tracks[sensor]
+        track = self._sequence_states[sensor]
         self.counts[sensor].skipped += tick - track.tick - 1
         track.tick = tick
 
-    def _begin_anew(self, sensor: str, why: str) -> list[tuple[BlockArrived, int]]:
+    def _realign(self, sensor: str, why: str) -> list[tuple[BlockArrived, int]]:
         """Align the counter of a sensor with the others again, and return its held blocks."""
-        self._tracks[sensor].why = why
-        return self._pulses.forget(sensor)
+        self._sequence_states[sensor].why = why
+        return self._pulses.reset(sensor)
 
     def _store(self, sink: MeasurementSink, ready: list[tuple[BlockArrived, int]]) -> None:
         """Store measurements durably, then report them."""
@@ -334,7 +334,7 @@ class CaptureSession:
 
     def _entry(self, sink: MeasurementSink, event: BlockArrived, number: int) -> JournalEntry | None:
         """Return the entry of a block, None beyond the last pulse; store the gap before it."""
-        track, block = self._tracks[event.sensor], event.block
+        track, block = self._sequence_states[event.sensor], event.block
         sequence = event.count
         if self._synced:
             if track.first_pulse is None:
@@ -342,7 +342,7 @@ class CaptureSession:
             sequence = number - track.first_pulse
             end = sequence + 1 if self._n is None else self._n - track.first_pulse
             track.passed = self._n is not None and sequence >= end - 1
-            self._miss_until(sink, event.sensor, min(sequence, end), track.why or gap_reason(event))
+            self._record_gap_before(sink, event.sensor, min(sequence, end), track.why or gap_reason(event))
             if sequence >= end:
                 return None
         if track.sequence is not None:
@@ -359,9 +359,9 @@ class CaptureSession:
         measurement = Measurement(block.data, self._settings, stamp)
         return JournalEntry(measurement=measurement, monotonic_ns=block.arrived.monotonic_ns)
 
-    def _miss_until(self, sink: MeasurementSink, sensor: str, stop: int, why: str) -> None:
+    def _record_gap_before(self, sink: MeasurementSink, sensor: str, stop: int, why: str) -> None:
         """Store a gap for the missing numbers below ``stop``."""
-        track = self._tracks[sensor]
+        track = self._sequence_states[sensor]
         first = 0 if track.sequence is None else track.sequence + 1
         if first < stop:
             self._append(sink)  # Earlier measurements come before the gap.

@@ -59,12 +59,12 @@ class PulseAligner(Generic[Item]):
         self._intervals_ns: deque[float] = deque(maxlen=_MAX_PULSES)
         self.realigned = 0
 
-    def forget(self, sensor: str) -> list[tuple[Item, int]]:
+    def reset(self, sensor: str) -> list[tuple[Item, int]]:
         """Align a sensor again, after it has missed pulses or restarted its counter; return its held blocks."""
         state = self._sensors[sensor]
         found: list[tuple[Item, int]] = []
-        if state.held and self._decided(sensor, state, state.held[-1].arrived_ns, at_once=True):
-            found = self._released(state)
+        if state.held and self._is_offset_known(sensor, state, state.held[-1].arrived_ns, at_once=True):
+            found = self._release_held(state)
         state.offset = None
         return found
 
@@ -97,13 +97,13 @@ class PulseAligner(Generic[Item]):
         while progress:  # A block of one sensor may resolve that of another.
             progress = False
             for name, state in self._sensors.items():
-                if not state.held or not self._decided(name, state, now_ns, at_once=at_once):
+                if not state.held or not self._is_offset_known(name, state, now_ns, at_once=at_once):
                     continue
                 progress = True
-                found += self._released(state)
+                found += self._release_held(state)
         return found
 
-    def _released(self, state: _SensorPulses[Item]) -> list[tuple[Item, int]]:
+    def _release_held(self, state: _SensorPulses[Item]) -> list[tuple[Item, int]]:
         found = []
         for each in state.held:
             number = each.counter + (state.offset or 0)
@@ -117,7 +117,7 @@ class PulseAligner(Generic[Item]):
         """Interval between pulses; the minimum while it is unknown."""
         return statistics.median(self._intervals_ns) if self._intervals_ns else float(self._shortest_ns)
 
-    def _decided(self, name: str, state: _SensorPulses[Item], now_ns: int, *, at_once: bool) -> bool:
+    def _is_offset_known(self, name: str, state: _SensorPulses[Item], now_ns: int, *, at_once: bool) -> bool:
         """Determine the offset of a sensor with held blocks; return True if it is now known."""
         waited = at_once or now_ns - state.held[0].arrived_ns > _MAX_WAIT_S * 1e9
         if not self._pulses:
@@ -134,7 +134,7 @@ class PulseAligner(Generic[Item]):
             return False
         if not self._intervals_ns and not waited:
             return False  # The tolerance is not known yet.
-        voted = self._voted(state.held, waited=waited)
+        voted = self._majority_offset(state.held, waited=waited)
         if voted is not None:
             self.realigned += state.offset not in {None, voted}
             state.offset = voted
@@ -145,7 +145,7 @@ class PulseAligner(Generic[Item]):
         """Return True if there is no other sensor to compare with."""
         return len(self._sensors) == 1
 
-    def _voted(self, held: list[_HeldBlock[Item]], *, waited: bool) -> int | None:
+    def _majority_offset(self, held: list[_HeldBlock[Item]], *, waited: bool) -> int | None:
         """Return the offset that most times of arrival support, None while there is no majority."""
         votes = Counter(
             number - each.counter

@@ -38,32 +38,32 @@ class ExportFormat:
         Options of `export` that apply to this format, but not to all formats. None by default.
     """
 
-    ending: str
-    holds: tuple[str, ...]
+    suffix: str
+    fields: tuple[str, ...]
     options: tuple[str, ...] = ()
 
 
 FORMATS: Final = {
-    "mcap": ExportFormat(ending=".mcap", holds=(*TOPICS, "tf_static"), options=(*_POINT_OPTIONS, "topics")),
-    "ply": ExportFormat(ending=".ply", holds=_POINTS, options=(*_POINT_OPTIONS, "text")),
-    "pcd": ExportFormat(ending=".pcd", holds=_POINTS, options=(*_POINT_OPTIONS, "text")),
+    "mcap": ExportFormat(suffix=".mcap", fields=(*TOPICS, "tf_static"), options=(*_POINT_OPTIONS, "topics")),
+    "ply": ExportFormat(suffix=".ply", fields=_POINTS, options=(*_POINT_OPTIONS, "text")),
+    "pcd": ExportFormat(suffix=".pcd", fields=_POINTS, options=(*_POINT_OPTIONS, "text")),
     "csv": ExportFormat(
-        ending=".csv",
-        holds=(
+        suffix=".csv",
+        fields=(
             *("sensor", "session_id", "sequence", "sync_count", "timestamp_ns"),
             *("x_m", "y_m", "z_m", "amplitude", "uncertainty_range_m", "uncertainty_across_m"),
         ),
         options=_POINT_OPTIONS,
     ),
     "npz": ExportFormat(
-        ending=".npz",
-        holds=(
+        suffix=".npz",
+        fields=(
             *("amplitude", "azimuth_rad", "elevation_rad", "range_m"),
             *("session_id", "sequence", "sync_count", "timestamp_ns", "timestamp_uncertainty_ns"),
             *("sensor", "settings"),
         ),
     ),
-    "acoular": ExportFormat(ending=".h5", holds=("time_data", "metadata")),
+    "acoular": ExportFormat(suffix=".h5", fields=("time_data", "metadata")),
 }
 """Formats by name; the how-to guide on exports states the content of each."""
 
@@ -77,7 +77,7 @@ def choose_format(path: str | Path, name: str | None = None) -> str:
         The name or suffix is unknown.
     """
     if name is None:
-        endings = {each.ending: known for known, each in FORMATS.items()}
+        endings = {each.suffix: known for known, each in FORMATS.items()}
         checks.choice("ending of the export", Path(path).suffix.lower(), endings)
         return endings[Path(path).suffix.lower()]
     checks.choice("format", name, FORMATS)

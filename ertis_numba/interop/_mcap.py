@@ -21,7 +21,7 @@ from ertis_numba.frames import Energyscape, Stamp
 from ertis_numba.geometry import self_contained, unit_vectors
 from ertis_numba.interop._messages import encoder, schema
 from ertis_numba.interop._mountings import PLATFORM, Mountings
-from ertis_numba.interop._grey_image import Picture
+from ertis_numba.interop._grey_image import GreyImage
 from ertis_numba.interop._points import FindPoints, ros_time
 
 __all__ = ["TOPICS", "write_mcap"]
@@ -87,7 +87,7 @@ class _McapWriter:
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
         self._names: dict[str, str] = {}
-        self._pictures: dict[str, tuple[Energyscape, Picture]] = {}
+        self._pictures: dict[str, tuple[Energyscape, GreyImage]] = {}
 
     def write(self, images: Iterable[Energyscape]) -> None:
         """Write all messages; the transforms come last, because only then are all sensors known."""
@@ -97,14 +97,14 @@ class _McapWriter:
             if earliest is None or stamp.timestamp_ns < earliest.timestamp_ns:
                 earliest = stamp
             if sensor not in self._names:
-                self._greet(image)
+                self._register_sensor(image)
             for topic in self._topics:
                 message = getattr(self, f"_{topic}")(image)
                 self._add(f"/{self._names[sensor]}/{topic}", TOPICS[topic], message, stamp)
         if earliest is not None:
             self._add(_STATIC, _STATIC_TYPE, self._transforms(earliest), earliest)
 
-    def _greet(self, image: Energyscape) -> None:
+    def _register_sensor(self, image: Energyscape) -> None:
         """Choose a name for the topics of a sensor, and keep its settings."""
         sensor = checks.sensor_name(image.stamp.sensor)
         name = _INVALID_TOPIC_CHARACTERS.sub("_", sensor).strip("_")
@@ -157,7 +157,7 @@ class _McapWriter:
         sensor = image.stamp.sensor
         known = self._pictures.get(sensor)
         if known is None or not same_directions(known[0], image):
-            known = self._pictures[sensor] = image, Picture(image)
+            known = self._pictures[sensor] = image, GreyImage(image)
         pixels = known[1](image.amplitude)
         height, width = pixels.shape
         return {

@@ -5,7 +5,7 @@ from ertis_numba.journal._records import JournalEntry, JournalGap, JournalKey, J
 from ertis_numba.journal._recovery import LOST
 from ertis_numba.journal._tables import TABLES, VERSION, Column
 from ertis_numba.journal._tally import TALLY
-from ertis_numba.journal.sealing_client import Sealed, seal_apart
+from ertis_numba.journal.sealing_client import SealingResult, seal_in_subprocess
 
 __all__ = [
     "LOST",
@@ -19,7 +19,7 @@ __all__ = [
     "JournalGap",
     "JournalKey",
     "JournalSensor",
-    "Sealed",
+    "SealingResult",
     "require_same_settings",
-    "seal_apart",
+    "seal_in_subprocess",
 ]

@@ -43,7 +43,7 @@ class ReadableJournal:
     def __init__(self, path: Path, database: Database) -> None:
         self.path = path
         self._database = database
-        self._turn = threading.RLock()
+        self._lock = threading.RLock()
         self._sensors: dict[str, JournalSensor] = {}
         self._ids: dict[str, int] = {}
         # Name, reason and number of measurements, by sensor number.
@@ -115,7 +115,7 @@ class ReadableJournal:
     @property
     def gaps(self) -> tuple[JournalGap, ...]:
         """Noted gaps, in order."""
-        with self._turn:
+        with self._lock:
             rows = self._database.execute(select_statement("gaps", "ORDER BY id"))
         names = {number: name for name, number in self._ids.items()}
         made = (verified_values(self.path, "a gap", row) for row in rows)
@@ -128,7 +128,7 @@ class ReadableJournal:
     def index(self, sensor: str | None = None) -> list[JournalKey]:
         """Return the keys of measurements of one sensor or of all, in order of arrival, without reading them."""
         number = None if sensor is None else self._ids[self._sensor(sensor).name]
-        with self._turn:
+        with self._lock:
             rows = self._database.execute(
                 "SELECT id, sensor, epoch, sequence FROM measurements INDEXED BY key WHERE sensor = ifnull(?, sensor)",
                 (number,),
@@ -140,7 +140,7 @@ class ReadableJournal:
 
     def newest(self, n_max: int) -> list[tuple[str, int, int, int]]:
         """Return sensor, session_id, number and CRC-32 of the newest measurements, without reading their data."""
-        with self._turn:
+        with self._lock:
             rows = self._database.execute(
                 "SELECT sensor, epoch, sequence, crc32 FROM measurements ORDER BY id DESC LIMIT ?", (n_max,)
             )
@@ -155,7 +155,7 @@ class ReadableJournal:
         DamagedError
             There is no measurement with this number.
         """
-        with self._turn:
+        with self._lock:
             rows = self._database.execute(
                 "SELECT id FROM measurements INDEXED BY key WHERE sensor = ? AND epoch = ? AND sequence = ?",
                 (self._ids[self._sensor(sensor).name], session_id, sequence),
@@ -176,7 +176,7 @@ class ReadableJournal:
         DataError
             The measurement cannot be read.
         """
-        with self._turn:
+        with self._lock:
             rows = self._database.execute(_SELECTION, (key.place,))
         if len(rows) != 1 or tuple(rows[0][1:4]) != (self._ids[key.sensor], key.session_id, key.sequence):
             raise DamagedError(
@@ -219,5 +219,5 @@ class ReadableJournal:
 
     def close(self) -> None:
         """Close the journal; closing twice is harmless."""
-        with self._turn:
+        with self._lock:
             self._database.close()

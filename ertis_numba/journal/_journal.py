@@ -202,7 +202,7 @@ class Journal(WritableJournal):
             The journal cannot be written.
         """
         identity = row_crc32(header)
-        with self._turn:
+        with self._lock:
             if identity != self._identity:
                 with self._database.transaction():
                     self._database.execute("DELETE FROM journal")
@@ -218,12 +218,12 @@ class Journal(WritableJournal):
         DataError
             The disk fails. The stored measurements are safe.
         """
-        with self._turn:
+        with self._lock:
             self._database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
 
     def remove(self) -> None:
         """Close the journal and remove it: its content is in a recording, or it is empty."""
-        with self._turn:
+        with self._lock:
             try:
                 with suppress(DataError):
                     self._prepare_rename()
@@ -247,7 +247,7 @@ class Journal(WritableJournal):
         DataError
             The disk is full or fails. The journal keeps its name.
         """
-        with self._turn:
+        with self._lock:
             try:
                 self._prepare_rename()
                 aside = unused_path(self.path, end)
@@ -260,7 +260,7 @@ class Journal(WritableJournal):
 
     def close(self) -> None:
         """Close the journal; closing twice is harmless."""
-        with self._turn:
+        with self._lock:
             is_ours = self._database.has_file
             super().close()
             # Without a log, the main file detects its own damage.

@@ -75,31 +75,31 @@ def recover_rows(journal: "Journal", database: Database, log: WriteAheadLog | No
             kept = keep_damaged_log(journal.path, log.content)
         with suppress(DataError, OSError):
             found = _read_copy(journal, database, log)
-    unrecorded = [] if found is None else _add(journal, found)
+    unrecorded = [] if found is None else _store_recovered(journal, found)
     if n_commits and found is None and not missing:
         unrecorded.append(f"{n_commits} commits of unknown content")
     if found is not None:
-        unrecorded += _note(journal, found.lost)
+        unrecorded += _record_lost(journal, found.lost)
     is_complete = found is not None and found.is_complete
     # If all rows were recovered, the numbers between them were skipped by the sensor and are not lost.
-    unrecorded += _note(journal, _missing(journal) if is_complete else missing)
+    unrecorded += _record_lost(journal, _missing(journal) if is_complete else missing)
     if kept and not (unrecorded or missing or found is None or found.entries or found.gaps or found.lost):
         kept.unlink(missing_ok=True)  # The log contains only rows that were deleted afterwards.
     return "; ".join(unrecorded)
 
 
-def _note(journal: "Journal", gaps: Iterable[JournalGap]) -> list[str]:
+def _record_lost(journal: "Journal", gaps: Iterable[JournalGap]) -> list[str]:
     """Note lost numbers as gaps, and return the losses of sensors that the journal does not contain."""
     unrecorded = []
     for gap in list(gaps):
         if gap.sensor in journal.sensors:
-            journal.note_gaps(list(_holes(journal, gap)))
+            journal.note_gaps(list(_missing_parts(journal, gap)))
         else:
             unrecorded.append(f"up to {gap.last - gap.first + 1} numbers of sensor {gap.sensor}")
     return unrecorded
 
 
-def _held(journal: "Journal") -> Iterator[tuple[tuple[str, int], int, int]]:
+def _stored_ranges(journal: "Journal") -> Iterator[tuple[tuple[str, int], int, int]]:
     """Yield the numbers of measurements and gaps in a journal: session, first and last number."""
     for key in journal.index():
         yield (key.sensor, key.session_id), key.sequence, key.sequence
@@ -112,7 +112,7 @@ def _missing(journal: "Journal") -> Iterator[JournalGap]:
     if not journal.tally.ranges:
         return
     highest: dict[tuple[str, int], int] = {}
-    for run, _, last in _held(journal):
+    for run, _, last in _stored_ranges(journal):
         highest[run] = max(last, highest.get(run, -1))
     for run, mark in journal.tally.ranges.items():
         before = max(highest.get(run, -1), mark.first - 1, mark.discarded)
@@ -120,10 +120,10 @@ def _missing(journal: "Journal") -> Iterator[JournalGap]:
             yield JournalGap(mark.sensor, before + 1, mark.last, LOST, mark.session_id)
 
 
-def _holes(journal: "Journal", gap: JournalGap) -> Iterator[JournalGap]:
+def _missing_parts(journal: "Journal", gap: JournalGap) -> Iterator[JournalGap]:
     """Yield the parts of a gap without numbers that the journal contains."""
     begin = gap.first
-    held = sorted((first, last) for run, first, last in _held(journal) if run == (gap.sensor, gap.session_id))
+    held = sorted((first, last) for run, first, last in _stored_ranges(journal) if run == (gap.sensor, gap.session_id))
     for first, last in [*held, (gap.last + 1, gap.last + 1)]:
         if begin < first <= gap.last + 1:
             yield JournalGap(gap.sensor, begin, first - 1, gap.reason, gap.session_id)
@@ -192,7 +192,7 @@ def _is_unbroken(rows: Sequence[tuple[Any, ...]], end: int) -> bool:
     return [row[0] for row in rows] == list(range(end + 1, end + 1 + len(rows)))
 
 
-def _add(journal: "Journal", found: _RecoveredRows) -> list[str]:
+def _store_recovered(journal: "Journal", found: _RecoveredRows) -> list[str]:
     """Store the recovered rows, and return the losses that no gap can cover."""
     if found.header:
         journal.restore_header(found.header)

@@ -69,7 +69,7 @@ class WritableJournal(ReadableJournal):
         made = JournalSensor.from_settings(
             name, settings, firmware=firmware, translation_m=translation_m, rotation_xyzw=rotation_xyzw
         )
-        with self._turn:
+        with self._lock:
             if name in self._sensors:
                 raise ArgumentError(f"sensor {name!r} is in {self.path} already; give each sensor its own name")
             with self._database.transaction():
@@ -96,12 +96,12 @@ class WritableJournal(ReadableJournal):
         JournalInUseError
             Another process has removed or replaced the journal.
         """
-        with self._turn:
+        with self._lock:
             last = dict(self._last)
             rows = [self._row(entry, last) for entry in entries]
             sizes_bytes = [row[-1].nbytes for row in rows]
-            seals_bytes = self._seals_bytes(sum(sizes_bytes), len(rows))
-            _free_space.require(self.path, self.target, sizes_bytes=sizes_bytes, seals_bytes=seals_bytes)
+            seals_bytes = self._recording_bytes(sum(sizes_bytes), len(rows))
+            _free_space.require_free_space(self.path, self.target, sizes_bytes=sizes_bytes, seals_bytes=seals_bytes)
             self._database.require_file()
             if sum(sizes_bytes) > LOG_BYTES:
                 with suppress(DataError):
@@ -158,7 +158,7 @@ class WritableJournal(ReadableJournal):
         DataError
             The journal is not writable.
         """
-        with self._turn:
+        with self._lock:
             rows = [
                 (self._ids[self._sensor(gap.sensor).name], gap.session_id, gap.first, gap.last, gap.reason)
                 for gap in gaps
@@ -198,7 +198,7 @@ class WritableJournal(ReadableJournal):
         """
         known = self._sensor(sensor)
         which = self._ids[known.name], session_id, up_to
-        with self._turn:
+        with self._lock:
             # Deleted measurements need not be erased. Some builds of SQLite overwrite them, as slowly as they store.
             self._database.execute("PRAGMA secure_delete = OFF")
             self._database.require_file()
@@ -222,7 +222,7 @@ class WritableJournal(ReadableJournal):
     def _insert(self, table: str, values: tuple[Any, ...]) -> None:
         self._database.execute(insert_statement(table), (*values, row_crc32(values)))
 
-    def room(self) -> int:
+    def appendable_bytes(self) -> int:
         """Return the approximate number of bytes of samples that can be appended while sealing stays possible.
 
         Raises
@@ -230,10 +230,10 @@ class WritableJournal(ReadableJournal):
         DataError
             The folder of the recording does not exist.
         """
-        with self._turn:
-            return _free_space.left(self.path, self.target, seals_bytes=self._seals_bytes())
+        with self._lock:
+            return _free_space.appendable_bytes(self.path, self.target, seals_bytes=self._recording_bytes())
 
-    def _seals_bytes(self, more_bytes: int = 0, n_more: int = 0) -> int:
+    def _recording_bytes(self, more_bytes: int = 0, n_more: int = 0) -> int:
         """Return the approximate size of the recording with additional measurements."""
         return _free_space.recording_bytes(
             self._held_bytes + more_bytes, n_rows=len(self) + n_more, n_sensors=len(self._sensors)

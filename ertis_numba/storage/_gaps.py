@@ -30,7 +30,7 @@ class SensorSequences:
     def __init__(self) -> None:
         self._numbers: dict[int, SequenceNumbers] = {}
 
-    def holds(self, number: int, session_id: int) -> bool:
+    def contains(self, number: int, session_id: int) -> bool:
         """Return True if a number of a session has arrived."""
         return session_id in self._numbers and number in self._numbers[session_id]
 

@@ -81,7 +81,7 @@ class RowWriter:
             self.flush()
 
     def _require_new(self, sequence: int, session_id: int) -> None:
-        if self._numbered and self.runs.holds(sequence, session_id):
+        if self._numbered and self.runs.contains(sequence, session_id):
             raise ArgumentError(
                 f"measurement {self._n_rows} has sequence {sequence} of session {session_id}, like an earlier "
                 "one; give each measurement of a sensor its own number (Stamp.sequence)"

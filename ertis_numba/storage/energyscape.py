@@ -179,7 +179,7 @@ class EnergyscapeWriter(FileWriter[Energyscape]):
         self._require_sensors("mounting", self._given)
 
     def _truth_of(self, sensor: str, group: h5py.Group) -> GroundTruth | GroundTruthLog | None:
-        given = super()._truth_of(sensor, group)
+        given = super()._sensor_truth(sensor, group)
         if given is not None or sensor not in self._recorded:
             return given
         truth, recorded = self._recorded[sensor]

@@ -22,7 +22,7 @@ from ertis_numba.errors import DataError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import mounting as mounted
 from ertis_numba.geometry import storable
-from ertis_numba.journal import LOST, SUFFIX, Journal, JournalSensor, Sealed
+from ertis_numba.journal import LOST, SUFFIX, Journal, JournalSensor, SealingResult
 from ertis_numba.storage._journal_rows import JournalRows
 from ertis_numba.storage._reader import sensor_names
 from ertis_numba.storage.recording import (
@@ -47,7 +47,7 @@ PART_TOKEN = "sealing"  # noqa: S105
 Progress = Callable[[int, int], None]
 
 
-def seal(path: str | Path, *, overwrite: bool = False, progress: Progress = lambda _done, _of: None) -> Sealed:
+def seal(path: str | Path, *, overwrite: bool = False, progress: Progress = lambda _done, _of: None) -> SealingResult:
     """Make the recording of a journal, verify and sync it, and then remove the journal.
 
     Measurements damaged in the journal become gaps of the recording, and the journal is kept under another name. The
@@ -90,11 +90,11 @@ def seal(path: str | Path, *, overwrite: bool = False, progress: Progress = lamb
         refused = _remove_refused(journal, rows)
         if refused and not any(map(len, rows.values())):
             damage = _damage(journal, rows)  # The damage is recorded in the tally, which is removed with the journal.
-            return Sealed(path, None, set_aside=journal.set_aside(REFUSED_SUFFIX), damage=damage, refused=refused)
+            return SealingResult(path, None, set_aside=journal.set_aside(REFUSED_SUFFIX), damage=damage, refused=refused)
         if not len(journal):
             _require_nothing_lost(journal)
             journal.remove()
-            return Sealed(path, None)
+            return SealingResult(path, None)
         if target.is_file() and _is_complete_recording(target, journal, rows):
             for place in (target, target.parent):  # The writer may have been killed before it did this.
                 fsync(place)
@@ -273,7 +273,7 @@ def _summary(
     damaged: int = 0,
     set_aside: Path | None = None,
     refused: dict[str, str] | None = None,
-) -> Sealed:
+) -> SealingResult:
     """Return the result of sealing."""
     n_measurements = n_missing = n_lost = 0
     damage = ""
@@ -283,7 +283,7 @@ def _summary(
             n_missing += sum(gap.last - gap.first + 1 for gap in reader.gaps)
             n_lost += sum(gap.last - gap.first + 1 for gap in reader.gaps if gap.reason == LOST)
             damage = str(reader.attributes.get(JOURNAL_DAMAGE, ""))
-    return Sealed(path, recording, n_measurements, n_missing, damaged, set_aside, n_lost, damage, refused or {})
+    return SealingResult(path, recording, n_measurements, n_missing, damaged, set_aside, n_lost, damage, refused or {})
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from typing import TextIO
 
 from ertis_numba.atomic_files import temporary_path
 from ertis_numba.errors import ErtisError, JournalInUseError
-from ertis_numba.journal import SUFFIX, Sealed
+from ertis_numba.journal import SUFFIX, SealingResult
 from ertis_numba.storage._gradual_sync import GradualSync, gradual_unlink
 from ertis_numba.storage.sealing import PART_TOKEN, seal
 
@@ -32,7 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Seal a journal and return an exit code: 0 done, `FAILED`, `NO_MEASUREMENTS`, `IN_USE` or `INTERRUPTED`.
 
     The path of the recording goes to stdout, and errors go to stderr in one line. With ``--json``, stdout has one
-    object per line: progress (``done``, ``of``), and at the end the fields of `Sealed`, or ``error`` and ``in_use``.
+    object per line: progress (``done``, ``of``), and at the end the fields of `SealingResult`, or ``error`` and ``in_use``.
     """
     parser = argparse.ArgumentParser(
         "python -m ertis_numba.storage.sealing_process", description=(__doc__ or "").partition("\n")[0]
@@ -76,7 +76,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return _exit_code(sealed)
 
 
-def _exit_code(sealed: Sealed) -> int:
+def _exit_code(sealed: SealingResult) -> int:
     if sealed.refused:
         return FAILED
     return NO_MEASUREMENTS if sealed.recording is None else 0

@@ -91,7 +91,7 @@ class GroundTruthLog:
         self._waiting: list[NDArray[Any]] = []
         self._block_sizes: list[int] = []
         self._folder = folder or Path(tempfile.gettempdir())
-        with self._naming_folder():
+        with self._errors_with_folder():
             self._file = tempfile.TemporaryFile(dir=folder, prefix="ertis-truth-")  # noqa: SIM115  closed on exit
 
     def __enter__(self) -> Self:
@@ -145,14 +145,14 @@ class GroundTruthLog:
     def _flush(self) -> None:
         if self._waiting:
             records = np.concatenate(self._waiting)
-            with self._naming_folder():
+            with self._errors_with_folder():
                 self._file.write(records.tobytes())
                 self._file.flush()
             self._block_sizes.append(records.nbytes)
             self._waiting.clear()
 
     @contextmanager
-    def _naming_folder(self) -> Iterator[None]:
+    def _errors_with_folder(self) -> Iterator[None]:
         try:
             yield
         except OSError as error:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Final, NamedTuple, TypeAlias
 
-from ertis_numba.journal import JournalEntry, JournalGap, JournalSensor, Sealed
+from ertis_numba.journal import JournalEntry, JournalGap, JournalSensor, SealingResult
 
 __all__ = [
     "Event",
@@ -110,7 +110,7 @@ class Resumed:
 class SealedOne:
     """A journal has become a recording."""
 
-    sealed: Sealed
+    sealed: SealingResult
 
 
 @dataclass(slots=True)
