@@ -35,7 +35,7 @@ class Here:
     def limit(self, size):
         self.size = min(self.size, size)
 
-    def give(self, order):
+    def submit(self, order):
         self.orders.append(order)
         self.given.append(order)
 

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 
 import zmq
 
-from ertis_numba.journal import SUFFIX, JournalEntry, Journal
+from ertis_numba.journal import SUFFIX, Journal, JournalEntry
 from ertis_numba.network import messages, sockets
 from ertis_numba.network.central_node import Archive, CentralNode
 from ertis_numba.storage import open_recording, sensor_names

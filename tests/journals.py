@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ertis_numba.journal import SUFFIX, JournalEntry, Journal
+from ertis_numba.journal import SUFFIX, Journal, JournalEntry
 from ertis_numba.journal._tables import insert_statement
 from ertis_numba.settings import Air, Recording
 from tests.files import line, noise

@@ -120,7 +120,8 @@ def test_what_does_not_follow_is_sent_back(tmp_path):
 def test_an_item_that_no_journal_can_hold_harms_no_other(tmp_path):
     others = from_zero(2, sensor="right")
     bad = item_of(
-        from_zero(1)[0], JournalSensor.from_settings("left", TINY.replace(recording=TINY.recording.replace(n_samples=8192)))
+        from_zero(1)[0],
+        JournalSensor.from_settings("left", TINY.replace(recording=TINY.recording.replace(n_samples=8192))),
     )
     with Opened(tmp_path) as opened:
         right = JournalSensor.from_settings("right", TINY)

@@ -322,7 +322,9 @@ def test_a_silent_sensor_ends_the_capture_and_the_others_are_kept(captures):
     capture = captures(names=("one", "two"), n=12, rate_hz=20.0)
     capture.emulators[1].unplug()
     with pytest.raises(SonarError, match="two: "):
-        CaptureSession(capture.sonars, SETTINGS, trigger="command", rate_hz=20.0, n=12, patience_s=0.4).run(capture.journal)
+        CaptureSession(capture.sonars, SETTINGS, trigger="command", rate_hz=20.0, n=12, patience_s=0.4).run(
+            capture.journal
+        )
     with capture.recording("one") as recording:
         assert len(recording) == 12
 

@@ -69,7 +69,11 @@ CASES = {
     "cut short": ("process cut.h5 -o out.h5", 1, "cut.h5 is cut short or damaged: it has"),
     "newer": ("process newer.h5 -o out.h5", 1, "newer.h5 has format version 9, but this package reads up to 2; update"),
     "damaged words": ("process damaged.h5 -o out.h5", 1, "damaged.h5: measurement 1 has CRC-32"),
-    "NaN in calibration": ("process nan.h5 -o out.h5", 1, "nan.h5: calibration_gain of channel 3 is nan, but the settings"),
+    "NaN in calibration": (
+        "process nan.h5 -o out.h5",
+        1,
+        "nan.h5: calibration_gain of channel 3 is nan, but the settings",
+    ),
     "info of nothing": ("info folder", 1, "folder is a folder; give a recording or an energyscape file"),
     # processing
     "no directions": ("process rec.h5 -o out.h5 --directions 2d:0", 1, "count of directions '2d:0' is 0; give a whole"),

@@ -17,7 +17,7 @@ import ertis_numba as ertis
 from ertis_numba.analysis.finder import PointFinder
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement, Stamp
-from ertis_numba.interop import FORMATS, TOPICS, export, output_files, choose_format
+from ertis_numba.interop import FORMATS, TOPICS, choose_format, export, output_files
 from ertis_numba.settings import Air
 from ertis_numba.storage import write_energyscapes, write_recording
 from tests.files import SMALL, image, noise
@@ -149,7 +149,11 @@ CASES = {
     "no points": ("img.h5 -o a.csv --top 0", 1, "top is 0; give a whole number of at least 1"),
     "over the input": ("rec.h5 -o rec.h5 --force -m 0", 1, "output rec.h5 is the input itself; give another name"),
     "exists": ("img.h5 -o both.h5 --format csv", 1, "output both.h5 exists; give another name, or ask to overwrite"),
-    "no folder": ("img.h5 -o none/a.csv", 1, "output none/a.csv: folder none does not exist; create it or give another"),
+    "no folder": (
+        "img.h5 -o none/a.csv",
+        1,
+        "output none/a.csv: folder none does not exist; create it or give another",
+    ),
 }
 
 

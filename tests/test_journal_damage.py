@@ -271,7 +271,9 @@ def test_a_copy_without_its_log(tmp_path):
 def test_a_journal_that_was_removed_takes_no_more(tmp_path):
     with create(tmp_path, entries(2)) as journal:
         journal.path.unlink()
-        with pytest.raises(JournalInUseError, match="was removed or replaced by another process; check the folder again"):
+        with pytest.raises(
+            JournalInUseError, match="was removed or replaced by another process; check the folder again"
+        ):
             journal.append(entries(1, first=20))
 
 

@@ -12,7 +12,15 @@ import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
-from ertis_numba.campaign import Campaign, CampaignOptions, RecordingFile, campaign, existing_output, find_recordings, work
+from ertis_numba.campaign import (
+    Campaign,
+    CampaignOptions,
+    RecordingFile,
+    campaign,
+    existing_output,
+    find_recordings,
+    work,
+)
 from ertis_numba.settings import Air
 from ertis_numba.storage import open_energyscapes, write_recording
 from tests.campaigns import Here, ended, names_in, outcomes, run_here, write_recordings
@@ -332,8 +340,8 @@ class Watched(Here):
             self.in_hand.clear()
         self.limited_at.append(len(self.orders))
 
-    def give(self, order):
-        super().give(order)
+    def submit(self, order):
+        super().submit(order)
         self.in_hand.append(len(self.orders))
 
 
@@ -348,7 +356,9 @@ def test_a_gpu_serves_one_at_a_time(tmp_path, out, monkeypatch, workers, largest
     write_recordings(tmp_path / "many", "abcdefghi", count=1)
     monkeypatch.setattr("tests.campaigns.follow", on_a_gpu)
     monkeypatch.setattr(Campaign, "_pool", lambda _: pool)
-    found = ended(Campaign(find_recordings([tmp_path / "many"]), out, CampaignOptions(settings=narrow), workers=workers).run())
+    found = ended(
+        Campaign(find_recordings([tmp_path / "many"]), out, CampaignOptions(settings=narrow), workers=workers).run()
+    )
     assert set(outcomes(found).values()) == {"made"}
     assert max(pool.in_hand) == largest
     assert pool.size == largest

@@ -13,8 +13,14 @@ from distributed import Client, LocalCluster
 from ertis_cli.main import cli
 
 from ertis_numba import cluster
-from ertis_numba.campaign import RecordingProgress, RecordingStarted, Campaign, CampaignOptions, find_recordings
-from ertis_numba.campaign import dask_workers
+from ertis_numba.campaign import (
+    Campaign,
+    CampaignOptions,
+    RecordingProgress,
+    RecordingStarted,
+    dask_workers,
+    find_recordings,
+)
 from ertis_numba.campaign.tasks import Task
 from ertis_numba.errors import NetworkError
 from ertis_numba.storage import open_energyscapes, write_recording
@@ -171,7 +177,7 @@ def test_a_worker_that_is_lost_makes_no_room(monkeypatch):
     monkeypatch.setattr(dask_workers, "_LOOK_S", 0.0)
     pool = dask_workers.DaskWorkerPool("tcp://far:1")
     for number in range(pool.free):
-        pool.give(Task(number, "look", {}))
+        pool.submit(Task(number, "look", {}))
     assert (pool.size, pool.free) == (3, 0)
     pool.wait(0.0)
     assert (pool.size, pool.free) == (2, 0)

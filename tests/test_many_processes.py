@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from ertis_numba.campaign import RecordingProgress, Campaign, CampaignOptions, find_recordings, processes
-from ertis_numba.campaign.tasks import Task
+from ertis_numba.campaign import Campaign, CampaignOptions, RecordingProgress, find_recordings, processes
 from ertis_numba.campaign.processes import ProcessPool
+from ertis_numba.campaign.tasks import Task
 from ertis_numba.errors import DeviceError
 from ertis_numba.storage import open_energyscapes, write_recording
 from tests.campaigns import ended, names_in, outcomes, run_here, write_recordings
@@ -98,7 +98,9 @@ def test_a_worker_that_dies_takes_one_recording_with_it(long_runs, tmp_path, cre
 
 def test_to_close_it_ends_all_work_at_once(long_runs, tmp_path, crews):
     """However far it is: processes that stand still would never be done with theirs."""
-    events = Campaign(find_recordings([long_runs]), tmp_path / "out", CampaignOptions(settings=narrow, batch=1), workers=2).run()
+    events = Campaign(
+        find_recordings([long_runs]), tmp_path / "out", CampaignOptions(settings=narrow, batch=1), workers=2
+    ).run()
     next(event for event in events if isinstance(event, RecordingProgress))
     pids = list(crews[0].doing)
     for pid in pids:
@@ -114,7 +116,7 @@ def test_a_worker_that_dies_of_nothing_is_replaced():
         (pid,) = pool.current_paths
         os.kill(pid, signal.SIGKILL)
         assert gone(pid)
-        pool.give(Task(7, "look", {"path": "none.h5", "named": True, "sensor": None}))
+        pool.submit(Task(7, "look", {"path": "none.h5", "named": True, "sensor": None}))
         news = []
         while not (news and news[-1].result):
             news += pool.wait(PATIENCE_S)
@@ -142,7 +144,7 @@ def test_fewer_are_wanted_while_all_are_busy(size):
 
         def feed():
             while pool.free > 0 and (number := next(numbers, None)) is not None:
-                pool.give(Task(number, "look", {"path": "none.h5", "named": True, "sensor": None}))
+                pool.submit(Task(number, "look", {"path": "none.h5", "named": True, "sensor": None}))
                 in_hand.add(number)
             return len(in_hand)
 
@@ -164,7 +166,10 @@ def test_fewer_are_wanted_while_all_are_busy(size):
 
 def test_processes_that_cannot_begin_are_told(runs, tmp_path, monkeypatch):
     monkeypatch.setattr(processes, "_MODULE", "ertis_numba.no_such_module")
-    with pytest.raises(DeviceError, match=r"worker processes end at once: the last one ended with 1, printing '/work/main/\.venv/bin/python"):
+    with pytest.raises(
+        DeviceError,
+        match=r"worker processes end at once: the last one ended with 1, printing '/work/main/\.venv/bin/python",
+    ):
         list(Campaign(find_recordings([runs]), tmp_path / "out", workers=1).run())
 
 

@@ -71,7 +71,9 @@ def test_nothing_meant(given, stated):
 
 
 def test_each_has_its_own_output():
-    assert output_paths(find_recordings(["runs/**/*.h5"]), Path("out")) == [Path(f"out/{name}.energy.h5") for name in "abc"]
+    assert output_paths(find_recordings(["runs/**/*.h5"]), Path("out")) == [
+        Path(f"out/{name}.energy.h5") for name in "abc"
+    ]
 
 
 @pytest.mark.parametrize(

@@ -125,7 +125,10 @@ def test_recording_whose_settings_say_something_else_is_refused(tmp_path, measur
         text = group["settings"][()].decode().replace('"int16"', '"float32"')
         del group["settings"]
         group.create_dataset("settings", data=np.bytes_(text.encode()))
-    with pytest.raises(DataError, match=r"pcm contains int16, but the settings in the file give float32 \(recording\.encoding 'float32'\); change the settings with it"):
+    with pytest.raises(
+        DataError,
+        match=r"pcm contains int16, but the settings in the file give float32 \(recording\.encoding 'float32'\); change the settings with it",
+    ):
         open_recording(path)
 
 

@@ -119,7 +119,9 @@ def test_process_chooses_plans_by_the_costs_asked_for(recording, tmp_path, more)
                 settings=lambda recorded: recorded.replace(processing=MANY.processing), device="cpu", plan=plan
             )
             folder = tmp_path / plan
-            campaign = Campaign(list(find_recordings([tmp_path / "rec.h5", tmp_path / "other.h5"])), folder, options, workers=1)
+            campaign = Campaign(
+                list(find_recordings([tmp_path / "rec.h5", tmp_path / "other.h5"])), folder, options, workers=1
+            )
             assert all(getattr(event, "outcome", "made") == "made" for event in campaign.run())
             with open_energyscapes(folder / "rec.energy.h5") as images:
                 found.append(images.settings.accuracy)

@@ -126,7 +126,9 @@ def test_a_port_that_is_not_there(monkeypatch):
         resolve("SN7")
     assert caught.value.errno == errno.ENOENT
     plug_in(monkeypatch, ttyACM0="SN8")
-    with pytest.raises(SonarError, match=r"serial port '/dev/ttyACM7' does not exist; choose one of /dev/ttyACM0 \(SN8\)"):
+    with pytest.raises(
+        SonarError, match=r"serial port '/dev/ttyACM7' does not exist; choose one of /dev/ttyACM0 \(SN8\)"
+    ):
         resolve("/dev/ttyACM7")
 
 

@@ -10,8 +10,7 @@ from ertis_cli.capture import _seal
 from ertis_cli.main import cli
 
 from ertis_numba.errors import DataError, JournalInUseError, SonarError
-from ertis_numba.journal import seal_in_subprocess
-from ertis_numba.journal import sealing_client
+from ertis_numba.journal import seal_in_subprocess, sealing_client
 from ertis_numba.storage.sealing import seal
 from ertis_numba.storage.verify import verify
 from tests.journals import crashed, create, entries
@@ -172,7 +171,9 @@ def test_recover_is_interrupted(tmp_path, monkeypatch):
     path = crashed(tmp_path)
     monkeypatch.setattr(sealing_client.subprocess, "Popen", interrupted)
     done = run("recover", path, code=130)
-    assert done.stderr.splitlines()[0] == f"the measurements are safe in {path}; recover them with 'ertis recover {path}'"
+    assert (
+        done.stderr.splitlines()[0] == f"the measurements are safe in {path}; recover them with 'ertis recover {path}'"
+    )
     monkeypatch.undo()
     assert run("recover", path).stderr == f"{tmp_path}/rec.h5: 3 measurements, 0 missing\n"
 

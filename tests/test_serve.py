@@ -80,7 +80,9 @@ class Sensors:
             Stamp(sensor=name, sequence=number, sync_count=number, session_id=11, timestamp_ns=now_ns)
             for name in self.names
         ]
-        self.node.append([JournalEntry(Measurement(MEASUREMENT.data, SHORT, stamp), time.monotonic_ns()) for stamp in stamps])
+        self.node.append(
+            [JournalEntry(Measurement(MEASUREMENT.data, SHORT, stamp), time.monotonic_ns()) for stamp in stamps]
+        )
 
 
 def received(subscriber, kind):

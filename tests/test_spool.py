@@ -10,7 +10,7 @@ from dataclasses import replace
 import pytest
 
 from ertis_numba.errors import ArgumentError, DataError, NetworkError
-from ertis_numba.journal import LOST, JournalEntry, Journal
+from ertis_numba.journal import LOST, Journal, JournalEntry
 from ertis_numba.journal._database import PAGE_BYTES
 from ertis_numba.network.sensor_node import _disk as disk
 from ertis_numba.network.sensor_node import _runs as runs

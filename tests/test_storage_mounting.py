@@ -11,7 +11,7 @@ from ertis_cli.main import cli
 
 from ertis_numba.errors import ArgumentError, DamagedError
 from ertis_numba.frames import PointCloud
-from ertis_numba.journal import JournalEntry, Journal
+from ertis_numba.journal import Journal, JournalEntry
 from ertis_numba.network.messages import Hello, decode, encode
 from ertis_numba.storage import open_energyscapes, open_recording, write_energyscapes, write_recording
 from ertis_numba.storage.sealing import seal

@@ -154,9 +154,7 @@ def test_truth_of_another_length(tmp_path):
 
 
 def test_truth_of_a_sensor_that_is_not_there(tmp_path):
-    with pytest.raises(
-        ArgumentError, match=r"truth is given for sensor 'left', which has no measurement; .* eRTIS-7"
-    ):
+    with pytest.raises(ArgumentError, match=r"truth is given for sensor 'left', which has no measurement; .* eRTIS-7"):
         write_recording(tmp_path / "rec.h5", noise(), truth={"left": truth()})
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from ertis_numba.errors import ArgumentError
-from ertis_numba.journal import JournalEntry, Journal
+from ertis_numba.journal import Journal, JournalEntry
 from ertis_numba.network.processing import ProcessingOptions
 from ertis_numba.network.processing.choice import Choice, Mode
 from ertis_numba.network.processing.dead_letter_queue import DeadLetterQueue

@@ -24,7 +24,7 @@ import numpy as np
 
 from ertis_numba.errors import ErtisError
 from ertis_numba.frames import Measurement, Stamp
-from ertis_numba.journal import SUFFIX, JournalEntry, Journal, JournalGap, JournalSensor
+from ertis_numba.journal import SUFFIX, Journal, JournalEntry, JournalGap, JournalSensor
 from ertis_numba.journal._tables import insert_statement
 from ertis_numba.network.allow_list import AllowList, Permission
 from ertis_numba.network.central_node._ledger import Ledger

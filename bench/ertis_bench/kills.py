@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 import ertis_numba
 from ertis_numba.frames import Measurement, Stamp
-from ertis_numba.journal import JournalEntry, Journal
+from ertis_numba.journal import Journal, JournalEntry
 from ertis_numba.settings import Recording, Settings
 
 __all__ = ["appending", "sealing"]

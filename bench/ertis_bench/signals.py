@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from ertis_bench import captures
-from ertis_numba.journal import SUFFIX, JournalEntry, Journal
+from ertis_numba.journal import SUFFIX, Journal, JournalEntry
 from ertis_numba.storage import open_recording
 
 __all__ = ["COMMANDS", "MAX_END_S", "send"]

@@ -91,7 +91,7 @@ def _recording(target: Path, *, overwrite: bool) -> Iterator[Write]:
     """Yield a function that appends measurements to a journal; the journal is then sealed into a recording."""
     from ertis_numba.atomic_files import check_target
     from ertis_numba.errors import DataError
-    from ertis_numba.journal import SUFFIX, JournalEntry, Journal, seal_in_subprocess
+    from ertis_numba.journal import SUFFIX, Journal, JournalEntry, seal_in_subprocess
 
     check_target(target, overwrite=overwrite)
     path = target.with_name(f"{target.name}{SUFFIX}")

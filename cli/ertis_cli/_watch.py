@@ -40,7 +40,9 @@ class Watch:
         self._session: CaptureSession | None = None
         self._checks: dict[str, BitCheck] = {}
 
-    def run(self, session: "CaptureSession", sink: "MeasurementSink", checks: "dict[str, BitCheck]", *, where: str) -> Exception | None:
+    def run(
+        self, session: "CaptureSession", sink: "MeasurementSink", checks: "dict[str, BitCheck]", *, where: str
+    ) -> Exception | None:
         """Run a session; return the error that ended it early, or None.
 
         ``where`` is printed on an interruption, and states where the measurements are.

@@ -5,21 +5,21 @@ recording. Workers are independent processes: a crash affects only the recording
 """
 
 from ertis_numba.campaign.campaign import Campaign
-from ertis_numba.campaign.events import RecordingProgress, RecordingStarted, Event, RecordingEnded
+from ertis_numba.campaign.events import Event, RecordingEnded, RecordingProgress, RecordingStarted
 from ertis_numba.campaign.recording_job import RecordingJob, prepare_recording
-from ertis_numba.campaign.tasks import CampaignOptions
 from ertis_numba.campaign.recordings import RecordingFile, find_recordings, output_paths
+from ertis_numba.campaign.tasks import CampaignOptions
 
 __all__ = [
-    "RecordingProgress",
-    "RecordingStarted",
     "Campaign",
     "CampaignOptions",
     "Event",
-    "RecordingJob",
     "RecordingEnded",
     "RecordingFile",
+    "RecordingJob",
+    "RecordingProgress",
+    "RecordingStarted",
     "find_recordings",
-    "prepare_recording",
     "output_paths",
+    "prepare_recording",
 ]

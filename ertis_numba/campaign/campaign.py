@@ -8,12 +8,20 @@ from pathlib import Path
 from typing import Any, Final
 
 from ertis_numba import checks
-from ertis_numba.campaign.events import RecordingProgress, RecordingStarted, Event, Outcome, RecordingEnded
+from ertis_numba.campaign.events import Event, Outcome, RecordingEnded, RecordingProgress, RecordingStarted
 from ertis_numba.campaign.existing_output import difference
 from ertis_numba.campaign.folder import clear_parts, exclusive_folder
-from ertis_numba.campaign.tasks import TASK_OPTIONS, MAX_WAITING_BYTES, CampaignOptions, TaskAction, TaskUpdate, WorkerPool, Task
 from ertis_numba.campaign.plans import Plans
 from ertis_numba.campaign.recordings import RecordingFile, output_paths
+from ertis_numba.campaign.tasks import (
+    MAX_WAITING_BYTES,
+    TASK_OPTIONS,
+    CampaignOptions,
+    Task,
+    TaskAction,
+    TaskUpdate,
+    WorkerPool,
+)
 from ertis_numba.cpu_cores import usable_cores
 from ertis_numba.errors import ArgumentError, ErtisError
 from ertis_numba.geometry import self_contained

@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from typing import Any, Final
 
 from ertis_numba import cluster
-from ertis_numba.campaign.tasks import TaskUpdate, Task
+from ertis_numba.campaign.tasks import Task, TaskUpdate
 from ertis_numba.campaign.work import run_task
 from ertis_numba.errors import NetworkError
 from ertis_numba.storage.schema import software_versions
@@ -69,7 +69,7 @@ class DaskWorkerPool:
     def limit(self, size: int) -> None:
         """Do nothing: each worker of a cluster has its own device."""
 
-    def give(self, order: Task) -> None:
+    def submit(self, order: Task) -> None:
         """Run an order; never blocks."""
         future = self._client.submit(
             run_on_dask_worker,
@@ -129,7 +129,9 @@ def _news(number: int, future: cluster.Future) -> TaskUpdate:
     try:
         return TaskUpdate(number, result=future.result(timeout=_CONNECT_S))
     except CancelledError:
-        return TaskUpdate(number, result={"error": "the cluster has cancelled the order; process again", "by_chance": True})
+        return TaskUpdate(
+            number, result={"error": "the cluster has cancelled the order; process again", "by_chance": True}
+        )
     except Exception as error:  # noqa: BLE001  the campaign reports any error
         text = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
         return TaskUpdate(number, result={"error": text, "by_chance": True})

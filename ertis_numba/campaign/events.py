@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-__all__ = ["RecordingProgress", "RecordingStarted", "Event", "Outcome", "RecordingEnded"]
+__all__ = ["Event", "Outcome", "RecordingEnded", "RecordingProgress", "RecordingStarted"]
 
 Outcome = Literal["made", "kept", "skipped", "failed"]
 

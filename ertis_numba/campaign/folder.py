@@ -9,7 +9,7 @@ from pathlib import Path
 
 from ertis_numba.errors import ArgumentError
 
-__all__ = ["clear_parts", "final_name", "exclusive_folder"]
+__all__ = ["clear_parts", "exclusive_folder", "final_name"]
 
 _PART = re.compile(r"(.+)\.[0-9a-f]{8}\.part")  # Names of `ertis_numba.atomic_files.atomic_write`.
 

@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import IO, Any, Final
 
-from ertis_numba.campaign.tasks import TaskUpdate, Task
+from ertis_numba.campaign.tasks import Task, TaskUpdate
 from ertis_numba.errors import DeviceError
 
 __all__ = ["ProcessPool"]
@@ -82,7 +82,7 @@ class ProcessPool:
         for worker in [worker for worker in self._workers if worker.order is None][self._size :]:
             self._end(worker)
 
-    def give(self, order: Task) -> None:
+    def submit(self, order: Task) -> None:
         """Run an order; never blocks."""
         worker = next((worker for worker in self._workers if worker.order is None), None) or self._start()
         worker.order, worker.begun = order, False
@@ -168,7 +168,7 @@ class ProcessPool:
         if self._n_failed_starts >= _MAX_FAILED_STARTS:
             raise DeviceError(f"worker processes end at once: the last one {how}; try 'ertis process' on one file")
         if order is not None and not worker.begun:
-            self.give(order)
+            self.submit(order)
             return None
         if order is None:
             return None

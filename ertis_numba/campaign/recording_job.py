@@ -11,8 +11,8 @@ from typing import Any
 
 from ertis_numba import kernels
 from ertis_numba.analysis.call_match import CallMatch, first_call_match
-from ertis_numba.campaign.tasks import CampaignOptions
 from ertis_numba.campaign.sensor_processing import SensorProcessing, describe_faults
+from ertis_numba.campaign.tasks import CampaignOptions
 from ertis_numba.errors import DataError
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.prediction import planner_of, predict
@@ -167,7 +167,9 @@ def check_recording(
     with ExitStack() as stack:
         recordings = [stack.enter_context(open_recording(path, sensor=name)) for name in settings]
         checks = _begin_checks(stack, recordings, list(settings.values()))
-        runs = [SensorProcessing(pipeline, batch=1) for pipeline in stack.enter_context(pipelines(list(settings.values())))]
+        runs = [
+            SensorProcessing(pipeline, batch=1) for pipeline in stack.enter_context(pipelines(list(settings.values())))
+        ]
         for run, recording, check in zip(runs, recordings, checks, strict=True):
             _check_sensor(run, recording, check.result(), options, warn, lambda *_: None)
         rows = [{"sensor": recording.sensor, **run.reported} for recording, run in zip(recordings, runs, strict=True)]

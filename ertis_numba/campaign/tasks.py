@@ -9,7 +9,7 @@ from ertis_numba.settings import Settings
 from ertis_numba.stages.costs import PLAN_COSTS, PlanCosts
 from ertis_numba.storage.recording import Mounting
 
-__all__ = ["TASK_OPTIONS", "MAX_WAITING_BYTES", "CampaignOptions", "TaskAction", "TaskUpdate", "Task", "WorkerPool"]
+__all__ = ["MAX_WAITING_BYTES", "TASK_OPTIONS", "CampaignOptions", "Task", "TaskAction", "TaskUpdate", "WorkerPool"]
 
 MAX_WAITING_BYTES: Final = 256e6
 """Limit on images that wait to be written, of all workers together."""

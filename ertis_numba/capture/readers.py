@@ -12,13 +12,13 @@ from ertis_numba.errors import SonarDisconnectedError, SonarError
 
 __all__ = [
     "BlockArrived",
+    "CounterRestarted",
     "Event",
     "MeasurementFailed",
-    "SensorMessage",
-    "CounterRestarted",
-    "SensorReconnected",
     "SensorEnded",
+    "SensorMessage",
     "SensorReader",
+    "SensorReconnected",
     "TriggerClock",
 ]
 

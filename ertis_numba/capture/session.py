@@ -13,13 +13,13 @@ from ertis_numba import checks
 from ertis_numba.capture.gap_reasons import gap_reason
 from ertis_numba.capture.readers import (
     BlockArrived,
+    CounterRestarted,
     Event,
     MeasurementFailed,
-    SensorMessage,
-    CounterRestarted,
-    SensorReconnected,
     SensorEnded,
+    SensorMessage,
     SensorReader,
+    SensorReconnected,
     TriggerClock,
 )
 from ertis_numba.capture.sync_counts import PulseAligner

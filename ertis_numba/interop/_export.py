@@ -13,7 +13,7 @@ from ertis_numba.errors import ArgumentError, DataError, ErtisError
 from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.interop._mountings import Mountings, validated
 
-__all__ = ["FORMATS", "TOPICS", "ExportFormat", "export", "output_files", "choose_format"]
+__all__ = ["FORMATS", "TOPICS", "ExportFormat", "choose_format", "export", "output_files"]
 
 TOPICS: Final = ("points", "image", "sonar_image")
 """Products of a sensor in MCAP."""

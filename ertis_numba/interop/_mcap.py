@@ -19,9 +19,9 @@ from ertis_numba.errors import ArgumentError
 from ertis_numba.extras import extra
 from ertis_numba.frames import Energyscape, Stamp
 from ertis_numba.geometry import self_contained, unit_vectors
+from ertis_numba.interop._grey_image import GreyImage
 from ertis_numba.interop._messages import encoder, schema
 from ertis_numba.interop._mountings import PLATFORM, Mountings
-from ertis_numba.interop._grey_image import GreyImage
 from ertis_numba.interop._points import FindPoints, ros_time
 
 __all__ = ["TOPICS", "write_mcap"]

@@ -10,7 +10,7 @@ from ertis_numba.errors import DataError
 from ertis_numba.journal._limit import LIMIT
 from ertis_numba.journal._tally import TALLY
 
-__all__ = ["LOGS", "companion", "disk_errors", "unused_path", "keep_damaged_log", "rename_orphans", "unlink_all"]
+__all__ = ["LOGS", "companion", "disk_errors", "keep_damaged_log", "rename_orphans", "unlink_all", "unused_path"]
 
 LOGS: Final = ("-wal", "-journal")  # A killed process may leave these files with data.
 _COMPANIONS: Final = ("-shm", TALLY, LIMIT)  # Files without use once the journal is removed.

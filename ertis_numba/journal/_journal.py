@@ -11,7 +11,7 @@ from ertis_numba.atomic_files import fsync
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.journal._contents import SUFFIX
 from ertis_numba.journal._database import Database
-from ertis_numba.journal._files import LOGS, companion, disk_errors, unused_path, rename_orphans, unlink_all
+from ertis_numba.journal._files import LOGS, companion, disk_errors, rename_orphans, unlink_all, unused_path
 from ertis_numba.journal._limit import LIMIT, read_limit, write_limit
 from ertis_numba.journal._log import read_log
 from ertis_numba.journal._log_choice import choose_log

@@ -17,7 +17,7 @@ from ertis_numba.journal._tables import row_crc32
 from ertis_numba.sample_format import sample_format
 from ertis_numba.settings import Air, Settings
 
-__all__ = ["JournalEntry", "JournalGap", "JournalKey", "JournalSensor", "verified_values", "require_same_settings"]
+__all__ = ["JournalEntry", "JournalGap", "JournalKey", "JournalSensor", "require_same_settings", "verified_values"]
 
 _INT64 = (-(2**63), 2**63 - 1)
 _UNKNOWN = 7 * (0.0,)  # Unknown mounting: translation, and a rotation that no mounting has.

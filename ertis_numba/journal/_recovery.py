@@ -159,7 +159,9 @@ def _read(journal: "Journal", database: Database, repaired: Database) -> _Recove
     with suppress(DamagedError, ValueError):
         (row,) = repaired.execute(select_statement("journal"))
         found.header = verified_values(journal.path, "the journal", row)
-    sensors = {row[0]: JournalSensor.from_row(journal.path, row) for row in repaired.execute(select_statement("sensors"))}
+    sensors = {
+        row[0]: JournalSensor.from_row(journal.path, row) for row in repaired.execute(select_statement("sensors"))
+    }
     found.sensors = [sensors[number] for number in sorted(sensors) if sensors[number].name not in journal.sensors]
     ends = [database.execute(f"SELECT ifnull(max(id), 0) FROM {table}")[0][0] for table in ("measurements", "gaps")]  # noqa: S608
     rows = repaired.execute("SELECT id FROM measurements NOT INDEXED WHERE id > ? ORDER BY id", ends[:1])

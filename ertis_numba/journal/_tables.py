@@ -12,8 +12,8 @@ __all__ = [
     "TABLES",
     "VERSION",
     "Column",
-    "insert_statement",
     "create_statements",
+    "insert_statement",
     "row_crc32",
     "select_statement",
 ]

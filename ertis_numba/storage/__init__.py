@@ -20,11 +20,11 @@ from ertis_numba.storage.truth import GroundTruth, GroundTruthLog
 __all__ = [
     "EnergyscapeReader",
     "EnergyscapeWriter",
+    "GroundTruth",
+    "GroundTruthLog",
     "RecordingGap",
     "RecordingReader",
     "RecordingWriter",
-    "GroundTruth",
-    "GroundTruthLog",
     "atomic_write",
     "check_target",
     "file_kind",

@@ -4,7 +4,7 @@ import bisect
 from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
-__all__ = ["UNKNOWN", "MissingNumbers", "SequenceNumbers", "SensorSequences"]
+__all__ = ["UNKNOWN", "MissingNumbers", "SensorSequences", "SequenceNumbers"]
 
 Range = tuple[int, int]
 ReasonedRange = tuple[int, int, str]
@@ -74,7 +74,9 @@ class SequenceNumbers:
         self._late: set[int] = set()  # Numbers that did not rise.
 
     def __contains__(self, number: int) -> bool:
-        return number in self._late or (number <= self._highest and not any(_intersection((number, number), self._skipped)))
+        return number in self._late or (
+            number <= self._highest and not any(_intersection((number, number), self._skipped))
+        )
 
     def add(self, number: int) -> None:
         """Add the next number."""

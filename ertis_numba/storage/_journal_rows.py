@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from ertis_numba.errors import DamagedError
-from ertis_numba.journal import JournalEntry, Journal
+from ertis_numba.journal import Journal, JournalEntry
 from ertis_numba.storage._gaps import MissingNumbers, SensorSequences
 
 __all__ = ["DamagedMeasurement", "JournalRows"]
@@ -38,7 +38,9 @@ class JournalRows:
         self._journal = journal
         self.keys = journal.index(sensor)
         self._noted = [
-            MissingNumbers(gap.first, gap.last, gap.reason, gap.session_id) for gap in journal.gaps if gap.sensor == sensor
+            MissingNumbers(gap.first, gap.last, gap.reason, gap.session_id)
+            for gap in journal.gaps
+            if gap.sensor == sensor
         ]
         self._numbers = SensorSequences()
         self.damaged: list[DamagedMeasurement] = []
@@ -62,6 +64,7 @@ class JournalRows:
     def missing(self) -> list[MissingNumbers]:
         """Missing numbers in order, damaged ones included."""
         lost = [
-            MissingNumbers(item.sequence, item.sequence, _DAMAGED, self.keys[item.index].session_id) for item in self.damaged
+            MissingNumbers(item.sequence, item.sequence, _DAMAGED, self.keys[item.index].session_id)
+            for item in self.damaged
         ]
         return self._numbers.missing([*lost, *self._noted])

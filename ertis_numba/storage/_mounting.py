@@ -12,7 +12,7 @@ from ertis_numba.errors import ArgumentError, DamagedError
 from ertis_numba.geometry import mounting
 from ertis_numba.storage.schema import set_attributes, to_python
 
-__all__ = ["write_mounting", "read_mounting"]
+__all__ = ["read_mounting", "write_mounting"]
 
 _GIVEN: Final = "given"
 _UNKNOWN: Final = "unknown"
@@ -42,7 +42,9 @@ def read_mounting(group: h5py.Group, path: Path) -> _Found:
     if status == _UNKNOWN or not (status or {"translation_m", "rotation_xyzw"} & stated.keys()):
         return None, None
     if status not in {"", _GIVEN}:
-        raise DamagedError(f"{path}: attribute mounting is {status[:80]!r}, wanted {_GIVEN!r} or {_UNKNOWN!r}; copy it again")
+        raise DamagedError(
+            f"{path}: attribute mounting is {status[:80]!r}, wanted {_GIVEN!r} or {_UNKNOWN!r}; copy it again"
+        )
     sensor = group.name.rpartition("/")[2]
     try:
         place = mounting(sensor, stated["translation_m"], stated["rotation_xyzw"])

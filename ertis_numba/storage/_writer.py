@@ -24,8 +24,8 @@ from ertis_numba.storage.schema import (
     content_sha256,
     content_uuid,
     date_created,
-    set_attributes,
     sensor_path,
+    set_attributes,
     software_versions,
 )
 from ertis_numba.storage.truth import GroundTruth, GroundTruthLog, write_truth

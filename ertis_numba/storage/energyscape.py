@@ -18,12 +18,12 @@ from ertis_numba.errors import ArgumentError, DamagedError
 from ertis_numba.frames import Energyscape
 from ertis_numba.geometry import mounting as mounted
 from ertis_numba.geometry import self_contained
-from ertis_numba.storage._mounting import write_mounting, read_mounting
+from ertis_numba.storage._mounting import read_mounting, write_mounting
 from ertis_numba.storage._reader import FileReader
 from ertis_numba.storage._rows import RowReader
 from ertis_numba.storage._writer import FileWriter
 from ertis_numba.storage.recording import Mounting, RecordingReader
-from ertis_numba.storage.schema import ENERGYSCAPE, Variable, set_attributes, create_variables, to_python
+from ertis_numba.storage.schema import ENERGYSCAPE, Variable, create_variables, set_attributes, to_python
 from ertis_numba.storage.truth import GroundTruth, GroundTruthLog
 
 __all__ = ["EnergyscapeReader", "EnergyscapeWriter", "open_energyscapes", "write_energyscapes"]

@@ -18,11 +18,18 @@ from ertis_numba.geometry import mounting as mounted
 from ertis_numba.sample_format import SampleFormat, sample_format
 from ertis_numba.settings import Air, Settings
 from ertis_numba.storage._gaps import MissingNumbers
-from ertis_numba.storage._mounting import write_mounting, read_mounting
+from ertis_numba.storage._mounting import read_mounting, write_mounting
 from ertis_numba.storage._reader import FileReader
 from ertis_numba.storage._rows import RowWriter
 from ertis_numba.storage._writer import FileWriter
-from ertis_numba.storage.schema import RECORDING, RECORDING_OF_PCM, Variable, set_attributes, create_variables, to_python
+from ertis_numba.storage.schema import (
+    RECORDING,
+    RECORDING_OF_PCM,
+    Variable,
+    create_variables,
+    set_attributes,
+    to_python,
+)
 from ertis_numba.storage.truth import GroundTruth, GroundTruthLog
 from ertis_numba.waveform import call_samples
 
@@ -193,7 +200,9 @@ class RecordingWriter(FileWriter[Measurement]):
                 group[name][:] = column
 
 
-def create_sensor_variables(group: h5py.Group, settings: Settings, *, firmware: str, mounting: Mapping[str, Any]) -> None:
+def create_sensor_variables(
+    group: h5py.Group, settings: Settings, *, firmware: str, mounting: Mapping[str, Any]
+) -> None:
     """Create all variables of a sensor, without rows.
 
     Parameters

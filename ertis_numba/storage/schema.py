@@ -34,13 +34,13 @@ __all__ = [
     "Variable",
     "content_sha256",
     "content_uuid",
-    "date_created",
-    "set_attributes",
     "create_variables",
-    "to_python",
+    "date_created",
     "sensor_path",
+    "set_attributes",
     "software_versions",
     "text_type",
+    "to_python",
 ]
 
 CONVENTIONS: Final = "CF-1.11 ertis-1.0"
@@ -228,7 +228,9 @@ def create_variables(
         else:
             dtype = (dtypes or {}).get(variable.name, variable.dtype)
             dataset = _dataset(group, variable.name, dims, sizes, dtype)
-        set_attributes(dataset, {"long_name": variable.description} | ({"units": variable.units} if variable.units else {}))
+        set_attributes(
+            dataset, {"long_name": variable.description} | ({"units": variable.units} if variable.units else {})
+        )
         if dims == (variable.name,):
             dataset.make_scale(variable.name)
             scales[variable.name] = dataset

@@ -34,7 +34,7 @@ from ertis_numba.storage.recording import (
 )
 from ertis_numba.storage.schema import sensor_path
 
-__all__ = ["REFUSED_SUFFIX", "PART_TOKEN", "seal"]
+__all__ = ["PART_TOKEN", "REFUSED_SUFFIX", "seal"]
 
 REFUSED_SUFFIX = "refused"
 """Suffix of a journal that is kept because a recording cannot contain one of its sensors."""
@@ -90,7 +90,9 @@ def seal(path: str | Path, *, overwrite: bool = False, progress: Progress = lamb
         refused = _remove_refused(journal, rows)
         if refused and not any(map(len, rows.values())):
             damage = _damage(journal, rows)  # The damage is recorded in the tally, which is removed with the journal.
-            return SealingResult(path, None, set_aside=journal.set_aside(REFUSED_SUFFIX), damage=damage, refused=refused)
+            return SealingResult(
+                path, None, set_aside=journal.set_aside(REFUSED_SUFFIX), damage=damage, refused=refused
+            )
         if not len(journal):
             _require_nothing_lost(journal)
             journal.remove()

@@ -15,7 +15,7 @@ from ertis_numba import checks
 from ertis_numba.atomic_files import remedy
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Reflector
-from ertis_numba.storage.schema import TRUTH, set_attributes, create_variables, to_python, text_type
+from ertis_numba.storage.schema import TRUTH, create_variables, set_attributes, text_type, to_python
 
 __all__ = ["GroundTruth", "GroundTruthLog", "read_truth", "write_truth"]
 

@@ -60,7 +60,9 @@ def points_ply(points: list[tuple[Energyscape, PointCloud, Pose | None]]) -> byt
         {image.stamp.sensor: (pose.translation_m, pose.rotation_xyzw) for image, _, pose in points if pose}
     )
     found = {image.stamp.sensor: cloud for image, cloud, _ in points}  # Only drawn points are saved.
-    table = PointTable.from_images([image for image, _, _ in points], lambda image: found[image.stamp.sensor], mountings)
+    table = PointTable.from_images(
+        [image for image, _, _ in points], lambda image: found[image.stamp.sensor], mountings
+    )
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "points.ply"
         write_ply(path, table, text=False)

@@ -14,7 +14,7 @@ import numpy as np
 from ertis_bench.network.diary import Row
 from ertis_numba.errors import DataError
 from ertis_numba.frames import Measurement, Stamp
-from ertis_numba.journal import SUFFIX, JournalEntry, Journal
+from ertis_numba.journal import SUFFIX, Journal, JournalEntry
 from ertis_numba.settings import Recording, Settings
 
 _SETTINGS = Settings(recording=Recording(n_samples=32_768))

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from ertis_numba.errors import ArgumentError, DataError, DiskFullError
-from ertis_numba.journal import SUFFIX, JournalEntry, Journal
+from ertis_numba.journal import SUFFIX, Journal, JournalEntry
 from ertis_numba.network.central_node._checksums import Checksums
 from ertis_numba.network.central_node._ledger import Ledger, read_acked_through
 from ertis_numba.network.central_node._received_items import (

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Self
 
 from ertis_numba.errors import DamagedError
-from ertis_numba.journal import SUFFIX, JournalEntry, Journal, JournalGap, JournalSensor
+from ertis_numba.journal import SUFFIX, Journal, JournalEntry, JournalGap, JournalSensor
 from ertis_numba.network.central_node._received_items import ReceivedItem, SensorSession
 
 __all__ = ["Volume", "journal_name", "runs_of", "same"]

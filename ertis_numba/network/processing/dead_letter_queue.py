@@ -10,7 +10,7 @@ from typing import Final
 
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Measurement
-from ertis_numba.journal import SUFFIX, JournalEntry, Journal
+from ertis_numba.journal import SUFFIX, Journal, JournalEntry
 from ertis_numba.network.log import EventLog
 from ertis_numba.network.processing.runner import Job, bytes_of
 from ertis_numba.sample_format import sample_format

@@ -12,7 +12,7 @@ from typing import Final, Literal
 from ertis_numba import checks
 from ertis_numba.atomic_files import make_folder
 from ertis_numba.errors import DamagedError, DataError, JournalInUseError, NetworkError
-from ertis_numba.journal import LOST, SUFFIX, JournalEntry, Journal, JournalGap
+from ertis_numba.journal import LOST, SUFFIX, Journal, JournalEntry, JournalGap
 from ertis_numba.network.messages import MAX_SEQUENCE
 from ertis_numba.network.sensor_node._runs import OutgoingSession, UnackedItem
 from ertis_numba.network.sensor_node._spool import SensorCounts, Spool

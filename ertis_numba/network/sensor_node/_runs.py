@@ -7,7 +7,7 @@ from itertools import islice
 from typing import Final, Literal
 
 from ertis_numba.errors import ArgumentError
-from ertis_numba.journal import JournalEntry, Journal, JournalSensor
+from ertis_numba.journal import Journal, JournalEntry, JournalSensor
 
 __all__ = ["MEMORY_FULL", "NEVER_GIVEN", "OutgoingSession", "UnackedItem"]
 
