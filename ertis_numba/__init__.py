@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from ertis_numba.frames import Energyscape, Measurement, MicrophoneSignals, Peak, PointCloud, Reflector, Stamp
     from ertis_numba.geometry import load_layout
     from ertis_numba.interop import export, open_pcm, open_raw, open_rtis_folder
-    from ertis_numba.journal import Entry
+    from ertis_numba.journal import JournalEntry
     from ertis_numba.network.allow_list import AllowList, Permission
     from ertis_numba.network.keys import ClientKeys, KeyPair, ServerKeys
     from ertis_numba.network.sensor_node import SensorNode
@@ -78,11 +78,11 @@ __all__ = [
     "DiskFullError",
     "Emulator",
     "Energyscape",
-    "Entry",
     "ErrorBudgetWarning",
     "ErtisError",
     "ForeignDataError",
     "FormatVersionError",
+    "JournalEntry",
     "JournalInUseError",
     "KeyPair",
     "Measurement",

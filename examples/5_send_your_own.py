@@ -21,7 +21,7 @@ def main(address: str, path: str) -> None:
         for number, found in enumerate(recording):
             stamp = ertis.Stamp(sensor="mine", session_id=session_id, sequence=number, timestamp_ns=time.time_ns())
             made = ertis.Measurement(found.data, found.settings, stamp)
-            node.append([ertis.Entry(made, time.monotonic_ns())])
+            node.append([ertis.JournalEntry(made, time.monotonic_ns())])
         if not node.flush(timeout_s=10):
             sys.exit(f"{address} has not acknowledged {node.unacked} measurements; start 'ertis record' there")
         print(f"{node.counts['mine'].stored} stored")

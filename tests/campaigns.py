@@ -2,9 +2,9 @@
 
 from collections import deque
 
-from ertis_numba.campaign import Campaign, RecordingEnded, find
-from ertis_numba.campaign.orders import News
-from ertis_numba.campaign.work import follow
+from ertis_numba.campaign import Campaign, RecordingEnded, find_recordings
+from ertis_numba.campaign.tasks import TaskUpdate
+from ertis_numba.campaign.work import run_task
 from ertis_numba.settings import Air
 from ertis_numba.storage import write_recording
 from tests.files import SMALL, noise
@@ -35,15 +35,15 @@ class Here:
     def limit(self, size):
         self.size = min(self.size, size)
 
-    def give(self, order):
+    def submit(self, order):
         self.orders.append(order)
         self.given.append(order)
 
     def wait(self, _):
         order = self.orders.popleft()
         advanced = []
-        result = follow(order.do, order.about, lambda done: advanced.append(News(order.number, done)))
-        return [*advanced, News(order.number, result=result)]
+        result = run_task(order.do, order.about, lambda done: advanced.append(TaskUpdate(order.number, done)))
+        return [*advanced, TaskUpdate(order.number, result=result)]
 
     def close(self):
         self.orders.clear()
@@ -54,7 +54,7 @@ def run_here(monkeypatch, paths, folder, wanted=None, size=2):
     pool = Here(size)
     with monkeypatch.context() as patch:
         patch.setattr(Campaign, "_pool", lambda _: pool)
-        return ended(Campaign(find(paths), folder, wanted).run()), pool
+        return ended(Campaign(find_recordings(paths), folder, wanted).run()), pool
 
 
 def ended(events):

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 
 import zmq
 
-from ertis_numba.journal import SUFFIX, Entry, Journal
+from ertis_numba.journal import SUFFIX, Journal, JournalEntry
 from ertis_numba.network import messages, sockets
 from ertis_numba.network.central_node import Archive, CentralNode
 from ertis_numba.storage import open_recording, sensor_names
@@ -106,7 +106,7 @@ def stored(folder):
     for path in sorted(folder.glob("*.h5")):
         for name in sensor_names(path):
             with open_recording(path, sensor=name) as reader:
-                found += wanted(Entry(measurement, 0) for measurement in reader)
+                found += wanted(JournalEntry(measurement, 0) for measurement in reader)
                 missing += [(name, gap.session_id, gap.first, gap.last, gap.reason) for gap in reader.gaps]
     return found, missing
 

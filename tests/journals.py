@@ -9,8 +9,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ertis_numba.journal import SUFFIX, Entry, Journal
-from ertis_numba.journal._tables import insertion
+from ertis_numba.journal import SUFFIX, Journal, JournalEntry
+from ertis_numba.journal._tables import insert_statement
 from ertis_numba.settings import Air, Recording
 from tests.files import line, noise
 
@@ -24,7 +24,7 @@ def entries(count=3, *, sensor="left", first=10, settings=TINY, session_id=EPOCH
     made = []
     for number, measurement in enumerate(noise(settings, count, seed)):
         stamp = replace(measurement.stamp, sensor=sensor, sequence=first + number, session_id=session_id)
-        made.append(Entry(replace(measurement, stamp=stamp), monotonic_ns=1_000 + number))
+        made.append(JournalEntry(replace(measurement, stamp=stamp), monotonic_ns=1_000 + number))
     return made
 
 
@@ -57,14 +57,14 @@ def crashed(folder, given=None, *, moment="log", **options):
     with create(folder / "running", given, **options) as journal:
         execute = journal._database.execute  # noqa: SLF001  nobody else can ask
         if moment != "log":
-            journal._database.write_once()  # noqa: SLF001  without 4 MB to commit
+            journal._database.use_rollback_journal()  # noqa: SLF001  without 4 MB to commit
         if moment == "commit":
             execute("PRAGMA cache_size = 1")  # what does not fit is written before the commit
             execute("BEGIN")
             execute("UPDATE measurements SET crc32 = 0")
             execute("INSERT INTO gaps SELECT NULL, 1, 1, 1, 1, 'x', 0 FROM measurements, sensors")
             for number in range(60):
-                execute(insertion("measurements"), (1, EPOCH, 100 + number, *[0] * 9, bytes(4096)))
+                execute(insert_statement("measurements"), (1, EPOCH, 100 + number, *[0] * 9, bytes(4096)))
         for path in (folder / "running").iterdir():
             shutil.copy(path, folder)
     shutil.rmtree(folder / "running")

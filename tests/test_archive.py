@@ -9,7 +9,7 @@ from datetime import datetime
 import pytest
 
 from ertis_numba.errors import ArgumentError, DataError, DiskFullError, JournalInUseError
-from ertis_numba.journal import SUFFIX, Journal, JournalGap, JournalSensor, seal_apart
+from ertis_numba.journal import SUFFIX, Journal, JournalGap, JournalSensor, seal_in_subprocess
 from ertis_numba.network.central_node import Archive, _volumes
 from ertis_numba.network.central_node._received_items import (
     Forgotten,
@@ -28,7 +28,7 @@ from ertis_numba.storage import open_recording, sensor_names
 from tests.central import stored, wanted
 from tests.journals import EPOCH, TINY, create, entries
 
-SOURCE, RIGHT = JournalSensor.of("left", TINY), JournalSensor.of("right", TINY)
+SOURCE, RIGHT = JournalSensor.from_settings("left", TINY), JournalSensor.from_settings("right", TINY)
 RUN = SensorSession("left", EPOCH)
 WAIT_S = 20.0
 
@@ -120,10 +120,11 @@ def test_what_does_not_follow_is_sent_back(tmp_path):
 def test_an_item_that_no_journal_can_hold_harms_no_other(tmp_path):
     others = from_zero(2, sensor="right")
     bad = item_of(
-        from_zero(1)[0], JournalSensor.of("left", TINY.replace(recording=TINY.recording.replace(n_samples=8192)))
+        from_zero(1)[0],
+        JournalSensor.from_settings("left", TINY.replace(recording=TINY.recording.replace(n_samples=8192))),
     )
     with Opened(tmp_path) as opened:
-        right = JournalSensor.of("right", TINY)
+        right = JournalSensor.from_settings("right", TINY)
         opened.give(item_of(others[0], right), bad, item_of(others[1], right))
         opened.until_stored(1)
     assert [event.reason for event in opened.events if isinstance(event, Forgotten)] != [""]
@@ -135,7 +136,7 @@ def test_what_follows_an_item_that_no_journal_can_hold_is_sent_back(tmp_path):
     given[1:2] = from_zero(1, 1, settings=TINY.replace(recording=TINY.recording.replace(n_samples=8192)))
     others = from_zero(2, sensor="right")
     with Opened(tmp_path) as opened:
-        right = JournalSensor.of("right", TINY)
+        right = JournalSensor.from_settings("right", TINY)
         opened.archive._store(  # noqa: SLF001  all of them in one batch
             opened.archive._journal_store,  # noqa: SLF001
             [*map(item_of, given), *(item_of(other, right) for other in others)],
@@ -181,7 +182,7 @@ def test_gaps_share_a_transaction(tmp_path, monkeypatch):
 
 
 def test_two_places_of_a_sensor_are_two_recordings_even_in_a_batch(tmp_path):
-    moved = JournalSensor.of("left", TINY, translation_m=(1.0, 0.0, 0.0))
+    moved = JournalSensor.from_settings("left", TINY, translation_m=(1.0, 0.0, 0.0))
     first, second = from_zero(2)
     with Opened(tmp_path) as opened:
         opened.archive._store(opened.archive._journal_store, [item_of(first), item_of(second, moved)])  # noqa: SLF001
@@ -460,7 +461,7 @@ def test_a_journal_that_cannot_be_sealed_is_tried_again(tmp_path, monkeypatch):
 
 def test_a_journal_that_somebody_else_recovers_is_done(tmp_path, monkeypatch):
     def seals(journal, **options):
-        seal_apart(journal, **options)
+        seal_in_subprocess(journal, **options)
         raise JournalInUseError("somebody else has it")
 
     with Opened(tmp_path) as opened:
@@ -480,7 +481,7 @@ def test_sealing_rests_long_until_the_room_gets_scarce(tmp_path, monkeypatch, sh
 
     def seals(journal, **options):
         asked.append(options["rests"])
-        return seal_apart(journal, **options)
+        return seal_in_subprocess(journal, **options)
 
     with Opened(tmp_path) as opened:
         opened.give(item_of(from_zero(1)[0]))

@@ -267,7 +267,10 @@ def test_accuracy_says_what_it_leaves_out(monkeypatch):
     monkeypatch.setattr(plans, "PLANS", FEW[:1])
     done = bench_accuracy()
     assert "real measurement: left out, as the package rtisdev, which has it, is not installed" in done.stderr
-    assert "reflectors without a peak from `find_peaks` within 5° and 2 cm. Not installed here: real measurement." in done.stdout
+    assert (
+        "reflectors without a peak from `find_peaks` within 5° and 2 cm. Not installed here: real measurement."
+        in done.stdout
+    )
     assert "| synthetic (data/synthetic/reflectors.h5) |" in done.stdout
     assert "| real" not in done.stdout
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ertis_numba.capture import Session
+from ertis_numba.capture import CaptureSession
 from ertis_numba.capture.gap_reasons import DROPPED, NOT_TRIGGERED
 from ertis_numba.devices.emulator import Emulator, Quirks, SyncChain
 from ertis_numba.devices.emulator.faults import BlockFault, Faults, Spoilt
@@ -77,7 +77,7 @@ class Capture:
         self.notes, self.stored = [], []
         self.many = threading.Event()
         self._wanted = 0
-        self.session = Session(
+        self.session = CaptureSession(
             sonars,
             SETTINGS,
             trigger=trigger,
@@ -322,7 +322,9 @@ def test_a_silent_sensor_ends_the_capture_and_the_others_are_kept(captures):
     capture = captures(names=("one", "two"), n=12, rate_hz=20.0)
     capture.emulators[1].unplug()
     with pytest.raises(SonarError, match="two: "):
-        Session(capture.sonars, SETTINGS, trigger="command", rate_hz=20.0, n=12, patience_s=0.4).run(capture.journal)
+        CaptureSession(capture.sonars, SETTINGS, trigger="command", rate_hz=20.0, n=12, patience_s=0.4).run(
+            capture.journal
+        )
     with capture.recording("one") as recording:
         assert len(recording) == 12
 
@@ -340,12 +342,12 @@ def test_a_silent_sensor_ends_the_capture_and_the_others_are_kept(captures):
 def test_refused(captures, options, message):
     capture = captures()
     with pytest.raises(ArgumentError, match=message):
-        Session(capture.sonars, SETTINGS, **{"trigger": "command", **options})
+        CaptureSession(capture.sonars, SETTINGS, **{"trigger": "command", **options})
 
 
 def test_without_a_sensor():
     with pytest.raises(ArgumentError, match="sonars is empty; give at least one sensor"):
-        Session({}, SETTINGS, trigger="command")
+        CaptureSession({}, SETTINGS, trigger="command")
 
 
 # The command, as users run it.

@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
-from ertis_numba.capture import Session
+from ertis_numba.capture import CaptureSession
 from ertis_numba.devices.emulator import Emulator
 from ertis_numba.devices.setup import Setup
 from ertis_numba.devices.sonar import SonarDriver
@@ -302,10 +302,22 @@ def test_nodes_that_send_one_sensor_are_told(tmp_path):
         (["--to", "tcp://127.0.0.1:9", "--spool-size", "1"], "--spool-size is given without --spool; add --spool", 2),
         (["--to", "here"], "address 'here' cannot be used; give tcp://HOST:PORT", 1),
         (["--to", "tcp://10.1.1.1:5601"], "can be reached from other machines, but there are no keys", 1),
-        (["--to", "tcp://127.0.0.1:9", "--spool", "settings.toml"], "settings.toml: File exists; give a writable spool folder", 1),
-        (["--to", "tcp://127.0.0.1:9", "--spool", "/proc"], "/proc: No such file or directory; give a writable spool folder", 1),
+        (
+            ["--to", "tcp://127.0.0.1:9", "--spool", "settings.toml"],
+            "settings.toml: File exists; give a writable spool folder",
+            1,
+        ),
+        (
+            ["--to", "tcp://127.0.0.1:9", "--spool", "/proc"],
+            "/proc: No such file or directory; give a writable spool folder",
+            1,
+        ),
         (["--to", "tcp://127.0.0.1:9", "--ring", "0.1"], "--ring is 0.1 MB, but one measurement has 0.131 MB; give", 1),
-        (["--to", "tcp://127.0.0.1:9", "--spool", "s", "--spool-size", "1e-9"], "--spool-size is 1e-09 MB, but one measurement has 0.131 MB", 1),
+        (
+            ["--to", "tcp://127.0.0.1:9", "--spool", "s", "--spool-size", "1e-9"],
+            "--spool-size is 1e-09 MB, but one measurement has 0.131 MB",
+            1,
+        ),
         (["--mounting", "none.toml"], "none.toml", 1),
         (["--mounting", "empty.toml"], "does not contain sensor 'one'; add it, or choose one of sensor with --name", 1),
     ],
@@ -343,7 +355,9 @@ def test_a_session_counts_what_its_sink_has_no_room_for(tmp_path, sensors):
     ):
         sonar.configure(Setup.of(SETTINGS))
         reported = []
-        session = Session({"one": sonar}, SETTINGS, trigger="command", rate_hz=50.0, n=5, on_stored=reported.extend)
+        session = CaptureSession(
+            {"one": sonar}, SETTINGS, trigger="command", rate_hz=50.0, n=5, on_stored=reported.extend
+        )
         session.run(node)
         counts = session.counts["one"]
         assert (counts.stored, dict(counts.missing)) == (2, {"there was no room for it": 3})

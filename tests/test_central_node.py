@@ -274,7 +274,10 @@ def test_a_message_that_fails_harms_nobody(tmp_path, monkeypatch):
         with monkeypatch.context() as patch:
             patch.setattr("ertis_numba.network.central_node._intake.Intake.ping", lambda *_: 1 / 0)
             node.send(Ping())
-            assert "the central node has an internal error (ZeroDivisionError: division by zero)" in node.hear(Refused).reason
+            assert (
+                "the central node has an internal error (ZeroDivisionError: division by zero)"
+                in node.hear(Refused).reason
+            )
             node.send(Ping())
             node.hear(Refused)
             node.measure(*given)
@@ -294,7 +297,10 @@ def test_a_message_that_cannot_be_read_for_a_mistake_is_answered(step, tmp_path,
             refused = [node.hear(Refused) for _ in given]
         node.measure(*given)  # the sender has kept them
         node.hear_settled(11)
-    assert all("the central node has an internal error (ZeroDivisionError: division by zero)" in each.reason for each in refused)
+    assert all(
+        "the central node has an internal error (ZeroDivisionError: division by zero)" in each.reason
+        for each in refused
+    )
     assert {each.sensor for each in refused} == ({"left"} if step == "require_role" else {""})
     assert central.latest.refused["internal"] == 2
     assert [event["event"] for event in central.events].count("internal") == 1

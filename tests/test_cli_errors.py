@@ -14,7 +14,7 @@ from ertis_cli import options
 from ertis_cli.main import cli
 
 from ertis_numba.frames import Stamp
-from ertis_numba.storage import Truth, write_energyscapes, write_recording
+from ertis_numba.storage import GroundTruth, write_energyscapes, write_recording
 from tests.files import image, noise
 
 N_BYTES = 4 * 65_536
@@ -69,7 +69,11 @@ CASES = {
     "cut short": ("process cut.h5 -o out.h5", 1, "cut.h5 is cut short or damaged: it has"),
     "newer": ("process newer.h5 -o out.h5", 1, "newer.h5 has format version 9, but this package reads up to 2; update"),
     "damaged words": ("process damaged.h5 -o out.h5", 1, "damaged.h5: measurement 1 has CRC-32"),
-    "NaN in calibration": ("process nan.h5 -o out.h5", 1, "nan.h5: calibration_gain of channel 3 is nan, but the settings"),
+    "NaN in calibration": (
+        "process nan.h5 -o out.h5",
+        1,
+        "nan.h5: calibration_gain of channel 3 is nan, but the settings",
+    ),
     "info of nothing": ("info folder", 1, "folder is a folder; give a recording or an energyscape file"),
     # processing
     "no directions": ("process rec.h5 -o out.h5 --directions 2d:0", 1, "count of directions '2d:0' is 0; give a whole"),
@@ -182,7 +186,7 @@ def folder(tmp_path_factory):
     (folder / "long.toml").write_text("[recording]\nn_samples = 163840\n")
     write_recording(folder / "rec.h5", noise())
     write_energyscapes(folder / "img.h5", [image()])
-    truth = Truth(scene="", seed=1, reflectors=((),))
+    truth = GroundTruth(scene="", seed=1, reflectors=((),))
     write_energyscapes(folder / "truth.h5", [image()], truth={"sensor": truth})
     write_energyscapes(folder / "two.h5", [image().replace(stamp=Stamp(sensor=name)) for name in ("left", "right")])
     for name in ("cut", "newer", "damaged", "nan"):

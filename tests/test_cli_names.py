@@ -4,7 +4,7 @@ import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
-from ertis_numba.storage import Truth, write_energyscapes, write_recording
+from ertis_numba.storage import GroundTruth, write_energyscapes, write_recording
 from tests.files import image, noise
 
 CASES = {
@@ -35,7 +35,7 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("names")
     write_recording(folder / "r.h5", noise())
     write_energyscapes(folder / "i.h5", [image()])
-    truth = Truth(scene="", seed=1, reflectors=((),))
+    truth = GroundTruth(scene="", seed=1, reflectors=((),))
     write_energyscapes(folder / "t.h5", [image()], truth={"sensor": truth})
     return folder
 

@@ -9,7 +9,7 @@ from click.testing import CliRunner
 from ertis_cli.main import cli
 
 from ertis_numba.frames import Stamp
-from ertis_numba.storage import Truth, open_energyscapes, sensor_names, write_energyscapes, write_recording
+from ertis_numba.storage import GroundTruth, open_energyscapes, sensor_names, write_energyscapes, write_recording
 from tests.files import line, noise
 from tests.test_compare import LEFT, MIDDLE, RIGHT, ideal, true
 
@@ -35,7 +35,7 @@ def recording(tmp_path):
         for name, settings, count in (("right", line(8, 8), 2), ("left", line(16, 16), 1))
         for m in noise(settings, count)
     ]
-    truth = {"right": Truth(scene='name = "two"\n', seed=7, reflectors=((MIDDLE,), (MIDDLE, LEFT)))}
+    truth = {"right": GroundTruth(scene='name = "two"\n', seed=7, reflectors=((MIDDLE,), (MIDDLE, LEFT)))}
     mounting = {"left": ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))}
     return write_recording(tmp_path / "rec.h5", given, truth=truth, mounting=mounting)
 
@@ -48,7 +48,7 @@ def images(tmp_path_factory):
     return write_energyscapes(
         tmp_path_factory.mktemp("images") / "img.h5",
         [image.replace(stamp=Stamp(sensor=name)) for name, given in shown.items() for image in given],
-        truth={name: Truth(scene="", seed=1, reflectors=rows) for name, rows in reported.items()},
+        truth={name: GroundTruth(scene="", seed=1, reflectors=rows) for name, rows in reported.items()},
     )
 
 
@@ -196,7 +196,7 @@ def test_compare_where_nothing_is_found(tmp_path):
     path = write_energyscapes(
         tmp_path / "img.h5",
         [ideal()],
-        truth={"sensor": Truth(scene="", seed=1, reflectors=((true(0, 1.0),),))},
+        truth={"sensor": GroundTruth(scene="", seed=1, reflectors=((true(0, 1.0),),))},
     )
     held = report("compare", path)
     assert [held[name] for name in ERRORS] == [None, None, None, None, 1, 0]

@@ -68,7 +68,8 @@ def test_whatever_comes_is_a_command_or_refused(line):
 )
 def test_what_is_no_command_is_refused(line):
     with pytest.raises(
-        DataError, match="is not a command; a command is '!X,i,j,k' with X one of YGFDECLIHJKBA and whole numbers from 0 to 4294967295"
+        DataError,
+        match="is not a command; a command is '!X,i,j,k' with X one of YGFDECLIHJKBA and whole numbers from 0 to",
     ) as caught:
         Command.decode(line)
     assert "\n" not in str(caught.value)
@@ -246,9 +247,15 @@ REFUSED = [
     (_call(sample_rate_hz=450_000.5), "call.sample_rate_hz is 450000.5; give a whole number from 160000 to 2000000"),
     (_call(sample_rate_hz=159_999.0), "call.sample_rate_hz is 159999; give a whole number from 160000 to 2000000"),
     (_call(sample_rate_hz=2e6 + 1), "call.sample_rate_hz is 2000001; give a whole number from 160000 to 2000000"),
-    (_call(duration_s=1e-4), "call has 46 samples, but a sensor plays 64 to 65535; give a call.duration_s from 0.00014 to"),
+    (
+        _call(duration_s=1e-4),
+        "call has 46 samples, but a sensor plays 64 to 65535; give a call.duration_s from 0.00014 to",
+    ),
     (_call(duration_s=0.15), "call has 67501 samples, but a sensor plays 64 to 65535; .* to 0.146"),
-    ({"array": Array(layout="wide", positions_m=WIDE)}, "array has 33 channels, but a sensor has 32; give at most 32 positions"),
+    (
+        {"array": Array(layout="wide", positions_m=WIDE)},
+        "array has 33 channels, but a sensor has 32; give at most 32 positions",
+    ),
     ({"array": Array(layout="line", positions_m=LINE_8, word_bits=8)}, "array.word_bits is 8, but .* have 32; give 32"),
 ]
 
@@ -285,7 +292,10 @@ CODES = call_codes(Call())
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"n_samples": 100_000}, r"recording\.n_samples is 100000, but a sensor measures multiples of 32768 up to 16777216"),
+        (
+            {"n_samples": 100_000},
+            r"recording\.n_samples is 100000, but a sensor measures multiples of 32768 up to 16777216",
+        ),
         ({"n_samples": 0}, "n_samples is 0; give a whole number of at least 1"),
         ({"n_samples": 32_768.0}, "n_samples is 32768.0; give a whole number"),
         ({"pdm_rate_hz": 4e6}, "sample_rate_hz is 4000000, but a sensor's clocks are 4500000 and 1125000"),

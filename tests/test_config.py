@@ -169,9 +169,17 @@ def test_what_does_not_fit_is_refused_where_it_was_typed_only(images, tmp_path):
     raw = tmp_path / "a.bin"
     raw.write_bytes(bytes(4 * 65_536))
     for given, typed, message in (
-        (("process", REFLECTORS, "-o", "p.h5", "--directions", "2d:5"), ("--workers", 2), "applies to several recordings"),
+        (
+            ("process", REFLECTORS, "-o", "p.h5", "--directions", "2d:5"),
+            ("--workers", 2),
+            "applies to several recordings",
+        ),
         (("export", folder / "img.h5", "-o", "a.npz"), ("--top", 5), "option --top is given, but format 'npz'"),
-        (("export", folder / "img.h5", "-o", "a.csv"), ("--topic", "points"), "option --topic is given, but format 'csv'"),
+        (
+            ("export", folder / "img.h5", "-o", "a.csv"),
+            ("--topic", "points"),
+            "option --topic is given, but format 'csv'",
+        ),
         (("import", raw, "--layout", "eRTIS_v3D1", "--preset", "short_25_50"), ("--skip", 1), "is for PCM (.wav, .h5)"),
     ):
         done = ertis(*given, *typed, folder=tmp_path)

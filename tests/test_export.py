@@ -17,7 +17,7 @@ import ertis_numba as ertis
 from ertis_numba.analysis.finder import PointFinder
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement, Stamp
-from ertis_numba.interop import FORMATS, TOPICS, export, files_of, format_of
+from ertis_numba.interop import FORMATS, TOPICS, choose_format, export, output_files
 from ertis_numba.settings import Air
 from ertis_numba.storage import write_energyscapes, write_recording
 from tests.files import SMALL, image, noise
@@ -105,8 +105,8 @@ def test_the_format_is_that_of_the_ending_or_the_one_given(files, tmp_path):
     assert "\nDATA ascii\n" in (tmp_path / "cloud.txt").read_text()
     run(files / "rec.h5", "-o", tmp_path / "signals.h5", "-m", 1)
     assert {path.name for path in tmp_path.iterdir()} == {"CLOUD.PLY", "cloud.txt", "signals.h5", "signals.xml"}
-    assert [format_of("x.h5"), format_of("x.csv"), format_of("x.csv", "npz")] == ["acoular", "csv", "npz"]
-    assert [path.name for path in files_of("x.h5", "acoular")] == ["x.h5", "x.xml"]
+    assert [choose_format("x.h5"), choose_format("x.csv"), choose_format("x.csv", "npz")] == ["acoular", "csv", "npz"]
+    assert [path.name for path in output_files("x.h5", "acoular")] == ["x.h5", "x.xml"]
 
 
 def test_air_that_changes(tmp_path):
@@ -149,7 +149,11 @@ CASES = {
     "no points": ("img.h5 -o a.csv --top 0", 1, "top is 0; give a whole number of at least 1"),
     "over the input": ("rec.h5 -o rec.h5 --force -m 0", 1, "output rec.h5 is the input itself; give another name"),
     "exists": ("img.h5 -o both.h5 --format csv", 1, "output both.h5 exists; give another name, or ask to overwrite"),
-    "no folder": ("img.h5 -o none/a.csv", 1, "output none/a.csv: folder none does not exist; create it or give another"),
+    "no folder": (
+        "img.h5 -o none/a.csv",
+        1,
+        "output none/a.csv: folder none does not exist; create it or give another",
+    ),
 }
 
 
@@ -173,7 +177,7 @@ GIVEN = {"mounting": MOUNTED, "topics": TOPICS, "top": 5, "min_level_db": -9.0, 
 @pytest.mark.parametrize("kind", FORMATS)
 def test_options_are_those_of_the_format(tmp_path, kind, option):
     """Taken where the format has them, and refused elsewhere rather than passed over."""
-    target = tmp_path / f"a{FORMATS[kind].ending}"
+    target = tmp_path / f"a{FORMATS[kind].suffix}"
     items = [noise(count=1)[0]] if kind == "acoular" else [image()]
     if option in FORMATS[kind].options:
         export(target, items, **{option: GIVEN[option]})
@@ -185,7 +189,7 @@ def test_options_are_those_of_the_format(tmp_path, kind, option):
 
 @pytest.mark.parametrize("kind", FORMATS)
 def test_what_breaks_off_leaves_the_older_file(tmp_path, kind):
-    target, *others = files_of(tmp_path / f"a{FORMATS[kind].ending}", kind)
+    target, *others = output_files(tmp_path / f"a{FORMATS[kind].suffix}", kind)
     for path in (target, *others):
         path.write_text("mine")
 
@@ -213,7 +217,7 @@ def test_a_full_disk_is_told(tmp_path, kind):
     part = Full(tmp_path / "a.part")
     find = PointFinder(top=256, min_level_db=-60.0)
     images = [image(seed=seed) for seed in range(30)]
-    table = _points.PointTable.of(images, find, {})
+    table = _points.PointTable.from_images(images, find, {})
     write = {
         "mcap": lambda: _mcap.write_mcap(part, images, find, {}, topics=TOPICS),
         "npz": lambda: _npz.write_npz(Path("/dev/full"), images, None),
@@ -253,7 +257,7 @@ def test_the_page_names_what_the_formats_hold():
     for line in table:
         name, ending, held, _ = (cell.strip() for cell in line.strip("|").split("|"))
         reported[name.strip("`")] = (ending.strip("`"), tuple(re.findall(r"`(\w+)`", held)))
-    assert reported == {name: (each.ending, each.holds) for name, each in FORMATS.items()}
+    assert reported == {name: (each.suffix, each.fields) for name, each in FORMATS.items()}
 
 
 @pytest.fixture

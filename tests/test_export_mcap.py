@@ -167,9 +167,9 @@ def test_pictures(bag):
 
 
 def _pixels(given):
-    from ertis_numba.interop._picture import Picture  # noqa: PLC0415  as the file has it
+    from ertis_numba.interop._grey_image import GreyImage  # noqa: PLC0415  as the file has it
 
-    return Picture(given)(given.amplitude)
+    return GreyImage(given)(given.amplitude)
 
 
 @pytest.mark.parametrize("direction", [0, 17, 33, 59])

@@ -31,7 +31,7 @@ def test_all_comes_back(tmp_path, given):
     wanted = images()
     (path,) = export(tmp_path / "a.npz", given)
     with np.load(path, allow_pickle=False) as data:
-        assert tuple(data) == FORMATS["npz"].holds
+        assert tuple(data) == FORMATS["npz"].fields
         assert data["amplitude"].dtype == np.float32
         assert np.array_equal(data["amplitude"], [each.amplitude for each in wanted])
         for name in ("azimuth_rad", "elevation_rad", "range_m"):

@@ -67,7 +67,7 @@ def test_clouds_come_back_bit_by_bit(tmp_path, kind, read, text):
         tmp_path / f"a.{kind}", given, text=text, mounting=dict.fromkeys(("left", "right"), TURNED), **FINDING
     )
     points, comments = read(path)
-    assert points.dtype.names == FORMATS[kind].holds
+    assert points.dtype.names == FORMATS[kind].fields
     assert {"frame base_link", "sensor 0 left", "sensor 1 right"} <= set(comments)
     clouds = expected(given, translation_m=TURNED[0], rotation_xyzw=TURNED[1])
     assert len(points) == sum(map(len, clouds)) > 60
@@ -90,7 +90,7 @@ def test_csv_comes_back(tmp_path):
     (path,) = export(tmp_path / "a.csv", given, **FINDING)
     with path.open(newline="") as file:
         head, *rows = csv.reader(file)
-    assert tuple(head) == FORMATS["csv"].holds
+    assert tuple(head) == FORMATS["csv"].fields
     clouds = expected(given)
     columns = dict(zip(head, zip(*rows, strict=True), strict=True))
     assert set(columns["sensor"]) == {'left, and"right'}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ertis_numba.capture.gap_reasons import DAMAGED, DISK_BUSY, DROPPED, NOT_TRIGGERED, gap_reason
-from ertis_numba.capture.readers import Arrived
+from ertis_numba.capture.readers import BlockArrived
 from ertis_numba.devices.blocks import Block, Instant
 
 
@@ -20,4 +20,4 @@ from ertis_numba.devices.blocks import Block, Instant
 )
 def test_gap_reason_names_the_place_of_the_loss(what, reason):
     block = Block(5, np.zeros(8, np.uint32), Instant(0, 0, 0))
-    assert gap_reason(Arrived("one", block, 5, None, **what)) == reason
+    assert gap_reason(BlockArrived("one", block, 5, None, **what)) == reason

@@ -35,7 +35,9 @@ def test_a_listed_key_is_let_in_as_what_it_is_listed(door, pair, sends, receives
 
 def test_an_unknown_key_is_refused_counted_and_told(door):
     client = door.knock(STRANGER)
-    assert door.reported(client).startswith("the central node does not know this key; add it there with 'ertis keys allow'")
+    assert door.reported(client).startswith(
+        "the central node does not know this key; add it there with 'ertis keys allow'"
+    )
     assert door.monitors[client].final
     assert door.admits(STRANGER) is None
     assert (door.came, +door.gate.refused) == ([], {"unknown key": 2})

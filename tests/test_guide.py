@@ -15,7 +15,7 @@ from scipy.io import wavfile
 
 import ertis_numba
 from ertis_numba import kernels
-from ertis_numba.storage import Truth, open_recording
+from ertis_numba.storage import GroundTruth, open_recording
 from tests.files import noise
 from tests.pages import DOCS, GUIDE, ROOT, commands_in, environment, in_background, page, python_in, run, run_here
 from tests.publishing import Publisher, cloud
@@ -255,7 +255,7 @@ def test_readers_have_what_the_page_says():
     assert len(names) == 6
     with open_recording(ROOT / "data" / "synthetic" / "reflectors.h5") as recording:
         assert all(hasattr(recording, name) for name in names)
-        assert isinstance(recording.truth, Truth)
+        assert isinstance(recording.truth, GroundTruth)
 
 
 def test_every_page_is_in_the_guide():

@@ -153,13 +153,25 @@ def test_one_file_of_many_measurements(tmp_path):
     ("made", "message"),
     [
         ({"names": ()}, r"run.1 is a folder; give a file of raw words, or a folder with .bin files of RTIS Dev"),
-        ({"names": ("a_1.bin", "b_2.bin")}, "the order of its 2 .bin files is unknown, because their names are not like NAME<num"),
-        ({"names": ("a.bin", "a1.bin")}, r"the order of its 2 \.bin files is unknown, because their names are not like NAME<number>\.bin"),
-        ({"names": ("a1.bin", "a01.bin")}, r"the order of its 2 \.bin files is unknown, because their names are not like NAME<number>\.bin"),
+        (
+            {"names": ("a_1.bin", "b_2.bin")},
+            "the order of its 2 .bin files is unknown, because their names are not like NAME<num",
+        ),
+        (
+            {"names": ("a.bin", "a1.bin")},
+            r"the order of its 2 \.bin files is unknown, because their names are not like NAME<number>\.bin",
+        ),
+        (
+            {"names": ("a1.bin", "a01.bin")},
+            r"the order of its 2 \.bin files is unknown, because their names are not like NAME<number>\.bin",
+        ),
         ({"recording": None}, "run.1 contains no recording settings of RTIS Dev .*; give --preset"),
         ({"processing": None}, r"does not name its array \(microphoneLayout\); give --layout"),
         ({"recording": SHORT | {"callEmissions": 2}}, "callEmissions is 2, but an image shows only 1 emission"),
-        ({"recording": {"callCustom": "bat.csv"}}, "callCustom is the file 'bat.csv', which a recording cannot contain"),
+        (
+            {"recording": {"callCustom": "bat.csv"}},
+            "callCustom is the file 'bat.csv', which a recording cannot contain",
+        ),
         ({"processing": PLANAR | {"rangesCustom": "r.csv"}}, "rangesCustom is the file 'r.csv', .*give --range when"),
         ({"processing": PLANAR | {"directionsCustom": "d.csv"}}, "directionsCustom is the file"),
         ({"processing": PLANAR | {"elevation2DAngle": 20}}, "elevation2DAngle is 20, but only 0 is supported"),
@@ -210,7 +222,9 @@ def test_json_that_is_refused_or_of_others(tmp_path):
 def test_numbers_that_overlap(tmp_path):
     folder = folder_of(tmp_path)
     (folder / "m_0.bin").write_bytes(words(0, 2).tobytes())
-    with pytest.raises(DataError, match=r"m_0.bin contains 2 measurements, but the next file is number 1; give the files"):
+    with pytest.raises(
+        DataError, match=r"m_0.bin contains 2 measurements, but the next file is number 1; give the files"
+    ):
         open_rtis_folder(folder)
 
 

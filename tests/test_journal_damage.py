@@ -38,7 +38,8 @@ DAMAGED = {
     "fewer words": ("UPDATE measurements SET words = x'00' WHERE id = 2", "measurement 11 of sensor left has CRC-32"),
     "time": (
         "UPDATE measurements SET timestamp_ns = 7 WHERE id = 2",
-        "the record of measurement 11 of sensor left has CRC-32 1844115737, but should have 32022344: the journal is damaged",
+        "the record of measurement 11 of sensor left has CRC-32 1844115737, but should have 32022344: "
+        "the journal is damaged",
     ),
     "type of the words": (
         "UPDATE measurements SET words = 'text' WHERE id = 2",
@@ -271,7 +272,9 @@ def test_a_copy_without_its_log(tmp_path):
 def test_a_journal_that_was_removed_takes_no_more(tmp_path):
     with create(tmp_path, entries(2)) as journal:
         journal.path.unlink()
-        with pytest.raises(JournalInUseError, match="was removed or replaced by another process; check the folder again"):
+        with pytest.raises(
+            JournalInUseError, match="was removed or replaced by another process; check the folder again"
+        ):
             journal.append(entries(1, first=20))
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from ertis_numba.errors import DamagedError, DataError
-from ertis_numba.journal import Journal, seal_apart
-from ertis_numba.journal._limit import limit_of
+from ertis_numba.journal import Journal, seal_in_subprocess
+from ertis_numba.journal._limit import read_limit
 from ertis_numba.storage import open_recording
 from tests.journals import EPOCH, crashed, create, entries, same
 
@@ -60,7 +60,7 @@ def test_open_deletes_gaps_and_runs_that_were_never_acknowledged(tmp_path):
 def test_recording_of_a_limited_journal_holds_acknowledged_measurements(tmp_path):
     path = crashed(tmp_path, entries(4))
     Journal.abandon(path, {("left", EPOCH): 11})
-    sealed = seal_apart(path)
+    sealed = seal_in_subprocess(path)
     assert sealed.measurements == 2
     with open_recording(sealed.recording, sensor="left") as recording:
         assert [measurement.stamp.sequence for measurement in recording] == [10, 11]
@@ -92,7 +92,7 @@ def test_one_flipped_bit_in_a_limit_is_refused_or_harmless(tmp_path):
         spoilt[place // 8] ^= 1 << place % 8
         limit.write_bytes(spoilt)
         try:
-            assert limit_of(path) == {("left", EPOCH): 11}
+            assert read_limit(path) == {("left", EPOCH): 11}
         except DamagedError:
             continue
 
@@ -136,7 +136,7 @@ def test_append_fails_where_the_name_of_the_log_is_not_durable(tmp_path, monkeyp
 
 def test_append_fails_if_the_old_log_may_reappear(tmp_path, monkeypatch):
     with create(tmp_path) as journal:
-        journal._database.write_once()  # noqa: SLF001  without 4 MB to commit
+        journal._database.use_rollback_journal()  # noqa: SLF001  without 4 MB to commit
         failing_sync(monkeypatch, folders=True)
         more = entries(1, first=20)
         with pytest.raises(DataError, match="Input/output error"):

@@ -159,7 +159,7 @@ def test_log_that_was_cut_short_is_noticed(tmp_path, cut):
             ("left", 10 + len(numbers), 9 + COUNT, LOST)
         ]
         assert seal(path).lost == COUNT - len(numbers)
-        assert not verify(tmp_path / "rec.h5")[0].whole
+        assert not verify(tmp_path / "rec.h5")[0].is_intact
         return
     for _ in range(2):
         with pytest.raises(DataError, match=r"has lost all its measurements.*12 numbers of sensor left"):

@@ -124,7 +124,7 @@ def test_killed_while_it_discards(tmp_path, how):
 def test_removing_waits_for_its_turn(tmp_path, act):
     with create(tmp_path) as journal:
         thread = threading.Thread(target=act, args=(journal,))
-        with journal._turn:  # noqa: SLF001  as while another thread appends
+        with journal._lock:  # noqa: SLF001  as while another thread appends
             thread.start()
             thread.join(0.05)
             assert thread.is_alive()

@@ -18,14 +18,12 @@ def test_a_nearly_full_disk_is_left_enough_to_seal(tmp_path, monkeypatch):
     with create(tmp_path) as journal:
         with monkeypatch.context() as patch:
             patch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=9_400_000))
-            with pytest.raises(
-                DataError, match=r"has 9.4 MB free, but 9.\d MB are needed to seal rec.h5.journal"
-            ):
+            with pytest.raises(DataError, match=r"has 9.4 MB free, but 9.\d MB are needed to seal rec.h5.journal"):
                 journal.append(entries(1, first=20))
-            assert journal.room() == 0
+            assert journal.appendable_bytes() == 0
         assert len(journal) == len(journal.index()) == 3
         journal.append(entries(1, first=20))  # once there is room
-        assert usage.free / 4 < journal.room() < usage.free / 2
+        assert usage.free / 4 < journal.appendable_bytes() < usage.free / 2
 
 
 APPEND = """

@@ -7,7 +7,7 @@ import zlib
 import pytest
 
 from ertis_numba.errors import DataError, FormatVersionError, JournalInUseError
-from ertis_numba.journal import JournalGap, seal_apart
+from ertis_numba.journal import JournalGap, seal_in_subprocess
 from ertis_numba.network.central_node._ledger import Ledger, Lock, read_acked_through
 from ertis_numba.network.central_node._received_items import SensorSession
 from tests.journals import EPOCH, create, entries
@@ -122,7 +122,7 @@ def test_a_folder_is_for_one(tmp_path):
 def test_recordings_are_looked_at(tmp_path):
     with create(tmp_path, [*entries(3), *entries(2, session_id=9), *entries(1, sensor="right")]) as journal:
         journal.note_gap("left", 20, 29, "lost", session_id=EPOCH)
-    seal_apart(journal.path)
+    seal_in_subprocess(journal.path)
     assert read_acked_through([tmp_path / "rec.h5"]) == {
         SensorSession("left", EPOCH): 29,
         SensorSession("left", 9): 11,

@@ -193,8 +193,8 @@ def test_the_address_of_sensors_is_told_from_that_of_images(tmp_path):
         done = listen(central.address)
     assert done.exit_code == 1
     assert done.stderr.splitlines()[-1].endswith(
-        f"{central.address}: this address is for sensor nodes; applications use the address that 'ertis serve' prints as "
-        "publish"
+        f"{central.address}: this address is for sensor nodes; applications use the address that "
+        "'ertis serve' prints as publish"
     )
 
 

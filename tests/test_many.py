@@ -12,7 +12,15 @@ import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
-from ertis_numba.campaign import Campaign, CampaignOptions, Source, campaign, existing_output, find, work
+from ertis_numba.campaign import (
+    Campaign,
+    CampaignOptions,
+    RecordingFile,
+    campaign,
+    existing_output,
+    find_recordings,
+    work,
+)
 from ertis_numba.settings import Air
 from ertis_numba.storage import open_energyscapes, write_recording
 from tests.campaigns import Here, ended, names_in, outcomes, run_here, write_recordings
@@ -237,7 +245,7 @@ def test_faulty_microphones_are_told_or_refused(tmp_path, out, monkeypatch):
 
 def test_neither_memory_nor_orders_grow_with_the_number_of_recordings(tmp_path, out, monkeypatch):
     most_kept, most_in_hand = [], []
-    follow = work.follow
+    follow = work.run_task
 
     def watched(*arguments):
         result = follow(*arguments)
@@ -263,7 +271,7 @@ def test_a_plan_that_fails_by_chance_is_tried_again(runs, out, monkeypatch):
     chances = [{"error": "no memory", "by_chance": True}]
 
     def short_of_memory(do, *arguments):
-        return chances.pop() if do == "plan" and chances else work.follow(do, *arguments)
+        return chances.pop() if do == "plan" and chances else work.run_task(do, *arguments)
 
     monkeypatch.setattr("tests.campaigns.follow", short_of_memory)
     found, _ = run_here(
@@ -279,7 +287,7 @@ def test_errors_that_may_pass_are_told_as_such(runs, monkeypatch, error):
         raise error
 
     monkeypatch.setattr(work, "sensor_names", fails)
-    reported = work.follow("look", {"path": str(runs / "a.h5"), "named": True, "sensor": None})
+    reported = work.run_task("look", {"path": str(runs / "a.h5"), "named": True, "sensor": None})
     assert reported == {"error": str(error) or "MemoryError", "by_chance": True}
 
 
@@ -289,7 +297,7 @@ def test_a_folder_is_searched_only_for_what_a_worker_that_died_may_have_left(run
     def died_of_c(do, about, *more):
         if do == "make" and about["path"].endswith("c.h5"):
             return {"error": "ended by SIGKILL", "by_chance": True}
-        return work.follow(do, about, *more)
+        return work.run_task(do, about, *more)
 
     monkeypatch.setattr("tests.campaigns.follow", died_of_c)
     monkeypatch.setattr(campaign, "clear_parts", lambda _, names: searched.append(set(names)))
@@ -332,8 +340,8 @@ class Watched(Here):
             self.in_hand.clear()
         self.limited_at.append(len(self.orders))
 
-    def give(self, order):
-        super().give(order)
+    def submit(self, order):
+        super().submit(order)
         self.in_hand.append(len(self.orders))
 
 
@@ -342,13 +350,15 @@ def test_a_gpu_serves_one_at_a_time(tmp_path, out, monkeypatch, workers, largest
     """However many orders are in hand when it is known to be a GPU: no more come until there are fewer."""
 
     def on_a_gpu(*arguments):
-        return {name: "cuda" if name == "device" else value for name, value in work.follow(*arguments).items()}
+        return {name: "cuda" if name == "device" else value for name, value in work.run_task(*arguments).items()}
 
     pool = Watched(3)
     write_recordings(tmp_path / "many", "abcdefghi", count=1)
     monkeypatch.setattr("tests.campaigns.follow", on_a_gpu)
     monkeypatch.setattr(Campaign, "_pool", lambda _: pool)
-    found = ended(Campaign(find([tmp_path / "many"]), out, CampaignOptions(settings=narrow), workers=workers).run())
+    found = ended(
+        Campaign(find_recordings([tmp_path / "many"]), out, CampaignOptions(settings=narrow), workers=workers).run()
+    )
     assert set(outcomes(found).values()) == {"made"}
     assert max(pool.in_hand) == largest
     assert pool.size == largest
@@ -370,7 +380,7 @@ def test_a_gpu_serves_one_at_a_time(tmp_path, out, monkeypatch, workers, largest
 )
 def test_how_many_workers_share_the_cores(monkeypatch, tmp_path, wanted, workers, count, found):
     monkeypatch.setattr(campaign, "usable_cores", lambda: 4)
-    recordings = [Source(Path(f"{number}.h5")) for number in range(count)]
+    recordings = [RecordingFile(Path(f"{number}.h5")) for number in range(count)]
     assert Campaign(recordings, tmp_path / "out", wanted, workers=workers).workers == found
 
 
@@ -389,7 +399,7 @@ def test_a_folder_that_cannot_be_written_is_told_with_the_remedy(monkeypatch, tm
         raise OSError(errno.EROFS, "Read-only file system", str(tmp_path / "a.energy.h5.0123abcd.part"))
 
     monkeypatch.setitem(vars(work)["_ORDERS"], "make", refused)
-    reported = work.follow("make", {})
+    reported = work.run_task("make", {})
     assert (
         reported["error"]
         == f"{tmp_path / 'a.energy.h5'}: Read-only file system; check the permissions of the file and its "

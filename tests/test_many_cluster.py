@@ -13,8 +13,15 @@ from distributed import Client, LocalCluster
 from ertis_cli.main import cli
 
 from ertis_numba import cluster
-from ertis_numba.campaign import Advanced, Begun, Campaign, CampaignOptions, find, members
-from ertis_numba.campaign.orders import WorkOrder
+from ertis_numba.campaign import (
+    Campaign,
+    CampaignOptions,
+    RecordingProgress,
+    RecordingStarted,
+    dask_workers,
+    find_recordings,
+)
+from ertis_numba.campaign.tasks import Task
 from ertis_numba.errors import NetworkError
 from ertis_numba.storage import open_energyscapes, write_recording
 from tests.campaigns import ended, names_in, outcomes, run_here, write_recordings
@@ -59,14 +66,14 @@ def test_files_are_those_of_this_process(scheduler, runs, tmp_path, monkeypatch)
     run_here(monkeypatch, [runs], tmp_path / "here", WANTED)
     (runs / "broken.h5").write_bytes(b"broken")
     monkeypatch.chdir(tmp_path)  # workers are elsewhere
-    events = list(Campaign(find(["runs"]), "out", WANTED, scheduler=scheduler).run())
+    events = list(Campaign(find_recordings(["runs"]), "out", WANTED, scheduler=scheduler).run())
     found = ended(events)
     assert outcomes(found) == {**dict.fromkeys(["a.h5", "b.h5", "c.h5", "d.h5"], "made"), "broken.h5": "failed"}
     assert "broken.h5 is not an HDF5 file" in found["broken.h5"].error
     assert names_in(tmp_path / "out") == names_in(tmp_path / "here")
     here, there = ({item.name: item.read_bytes() for item in (tmp_path / name).iterdir()} for name in ("here", "out"))
     assert [name for name in here if here[name] != there[name]] == []
-    again = ended(Campaign(find(["runs"]), "out", WANTED, scheduler=scheduler).run())
+    again = ended(Campaign(find_recordings(["runs"]), "out", WANTED, scheduler=scheduler).run())
     assert set(outcomes(again).values()) == {"kept", "failed"}
 
 
@@ -74,7 +81,7 @@ def test_workers_of_a_cluster_name_recordings_of_another_call(scheduler, tmp_pat
     (tmp_path / "runs").mkdir()
     for name, call in {"same": CALL, "other": REVERSED}.items():
         write_recording(tmp_path / "runs" / f"{name}.h5", [heard(call)])
-    found = ended(list(Campaign(find([tmp_path / "runs"]), tmp_path / "out", scheduler=scheduler).run()))
+    found = ended(list(Campaign(find_recordings([tmp_path / "runs"]), tmp_path / "out", scheduler=scheduler).run()))
     (warning,) = found["other.h5"].made["warnings"]
     assert not found["same.h5"].made["warnings"]
     with open_energyscapes(tmp_path / "out" / "other.energy.h5") as images:
@@ -83,17 +90,17 @@ def test_workers_of_a_cluster_name_recordings_of_another_call(scheduler, tmp_pat
 
 
 def test_progress_is_told_and_to_close_it_ends_the_work(scheduler, runs, tmp_path, monkeypatch):
-    monkeypatch.setattr(members, "_REPORT_INTERVAL_S", 0.0)
+    monkeypatch.setattr(dask_workers, "_REPORT_INTERVAL_S", 0.0)
     out = tmp_path / "out"
-    events = Campaign(find([runs / "b.h5"]), out, WANTED, scheduler=scheduler).run()
+    events = Campaign(find_recordings([runs / "b.h5"]), out, WANTED, scheduler=scheduler).run()
     kinds = []
     for event in events:
         kinds.append(type(event))
-        if isinstance(event, Advanced):
+        if isinstance(event, RecordingProgress):
             break
     events.close()
-    assert kinds[0] is Begun
-    assert kinds[-1] is Advanced
+    assert kinds[0] is RecordingStarted
+    assert kinds[-1] is RecordingProgress
     with Client(scheduler, set_as_default=False) as client:
         end_s = time.monotonic() + PATIENCE_S
         while any(client.call_stack().values()) and time.monotonic() < end_s:
@@ -106,8 +113,8 @@ def test_workers_that_are_killed_lose_nothing(scheduler, runs, tmp_path):
     found = {}
     with Client(scheduler, set_as_default=False) as client:
         pids = client.run(os.getpid)
-        for event in Campaign(find([runs]), out, WANTED, scheduler=scheduler).run():
-            if isinstance(event, Begun) and event.measurements == LONG:
+        for event in Campaign(find_recordings([runs]), out, WANTED, scheduler=scheduler).run():
+            if isinstance(event, RecordingStarted) and event.measurements == LONG:
                 for pid in pids.values():
                     os.kill(pid, signal.SIGKILL)
             found |= ended([event])
@@ -131,7 +138,7 @@ def test_other_versions_are_told(monkeypatch):
         address = "tcp://far:1"
 
     monkeypatch.setattr(cluster, "current_worker", Elsewhere)
-    reported = members.follow_there("look", {"versions": {"numpy": "0.1"}}, "topic", 1)
+    reported = dask_workers.run_on_dask_worker("look", {"versions": {"numpy": "0.1"}}, "topic", 1)
     assert "worker tcp://far:1 has numpy " in reported["error"]
     assert "not 0.1; install the same version everywhere" in reported["error"]
 
@@ -167,10 +174,10 @@ class Dwindling:
 def test_a_worker_that_is_lost_makes_no_room(monkeypatch):
     monkeypatch.setattr(cluster, "connect", lambda *_, **__: Dwindling())
     monkeypatch.setattr(cluster, "require_workers", lambda *_, **__: None)
-    monkeypatch.setattr(members, "_LOOK_S", 0.0)
-    pool = members.Members("tcp://far:1")
+    monkeypatch.setattr(dask_workers, "_LOOK_S", 0.0)
+    pool = dask_workers.DaskWorkerPool("tcp://far:1")
     for number in range(pool.free):
-        pool.give(WorkOrder(number, "look", {}))
+        pool.submit(Task(number, "look", {}))
     assert (pool.size, pool.free) == (3, 0)
     pool.wait(0.0)
     assert (pool.size, pool.free) == (2, 0)
@@ -180,32 +187,32 @@ def test_dask_is_silent_while_a_campaign_runs(monkeypatch):
     monkeypatch.setattr(cluster, "connect", lambda *_, **__: Dwindling())
     monkeypatch.setattr(cluster, "require_workers", lambda *_, **__: None)
     loggers = [logging.getLogger(name) for name in ("distributed", "distributed.client", "distributed.core")]
-    pool = members.Members("tcp://far:1")
+    pool = dask_workers.DaskWorkerPool("tcp://far:1")
     assert not any(logger.isEnabledFor(logging.CRITICAL) for logger in loggers)
     pool.close()
     assert all(logger.isEnabledFor(logging.CRITICAL) for logger in loggers)
 
 
 def test_no_scheduler(monkeypatch, runs, tmp_path):
-    monkeypatch.setattr(members, "_CONNECT_S", 0.5)
+    monkeypatch.setattr(dask_workers, "_CONNECT_S", 0.5)
     with pytest.raises(NetworkError, match=r"no dask scheduler answers at tcp://127\.0\.0\.1:9"):
-        list(Campaign(find([runs]), tmp_path / "out", scheduler="tcp://127.0.0.1:9").run())
+        list(Campaign(find_recordings([runs]), tmp_path / "out", scheduler="tcp://127.0.0.1:9").run())
 
 
 def test_no_workers(monkeypatch, runs, tmp_path):
-    monkeypatch.setattr(members, "_CONNECT_S", 1.0)
+    monkeypatch.setattr(dask_workers, "_CONNECT_S", 1.0)
     with (
         LocalCluster(n_workers=0, dashboard_address=":0", silence_logs=50) as local,
         pytest.raises(NetworkError, match=r"has no workers; start some with 'dask worker tcp://"),
     ):
-        list(Campaign(find([runs]), tmp_path / "out", scheduler=local.scheduler_address).run())
+        list(Campaign(find_recordings([runs]), tmp_path / "out", scheduler=local.scheduler_address).run())
 
 
 def test_a_scheduler_that_goes_is_told(runs, tmp_path):
     for name in "efgh":  # more than can be done before it is gone
         shutil.copy(runs / "b.h5", runs / f"{name}.h5")
     local = LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0", silence_logs=50)
-    events = Campaign(find([runs]), tmp_path / "out", WANTED, scheduler=local.scheduler_address).run()
+    events = Campaign(find_recordings([runs]), tmp_path / "out", WANTED, scheduler=local.scheduler_address).run()
     next(events)
     local.close()
     with pytest.raises(NetworkError, match=r"is gone; finished output stays"):

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from ertis_numba.campaign import Advanced, Campaign, CampaignOptions, find, processes
-from ertis_numba.campaign.orders import WorkOrder
+from ertis_numba.campaign import Campaign, CampaignOptions, RecordingProgress, find_recordings, processes
 from ertis_numba.campaign.processes import ProcessPool
+from ertis_numba.campaign.tasks import Task
 from ertis_numba.errors import DeviceError
 from ertis_numba.storage import open_energyscapes, write_recording
 from tests.campaigns import ended, names_in, outcomes, run_here, write_recordings
@@ -73,16 +73,16 @@ def gone(pid):
 def test_bits_do_not_depend_on_the_workers(runs, tmp_path, monkeypatch):
     wanted = CampaignOptions(settings=narrow, batch=2)
     run_here(monkeypatch, [runs], tmp_path / "here", wanted)
-    found = ended(Campaign(find([runs]), tmp_path / "out", wanted, workers=2).run())
+    found = ended(Campaign(find_recordings([runs]), tmp_path / "out", wanted, workers=2).run())
     assert outcomes(found) == dict.fromkeys(["a.h5", "b.h5", "c.h5", "d.h5"], "made")
     assert contents(tmp_path / "out") == contents(tmp_path / "here")
 
 
 def test_a_worker_that_dies_takes_one_recording_with_it(long_runs, tmp_path, crews):
     out, killed, found = tmp_path / "out", [], {}
-    campaign = Campaign(find([long_runs]), out, CampaignOptions(settings=narrow, batch=1), workers=2)
+    campaign = Campaign(find_recordings([long_runs]), out, CampaignOptions(settings=narrow, batch=1), workers=2)
     for event in campaign.run():
-        if isinstance(event, Advanced) and event.recording.name == "b.h5" and not killed:
+        if isinstance(event, RecordingProgress) and event.recording.name == "b.h5" and not killed:
             (pool,) = crews
             (pid,) = [pid for pid, path in pool.doing.items() if path.endswith("b.h5")]
             os.kill(pid, signal.SIGKILL)
@@ -92,14 +92,16 @@ def test_a_worker_that_dies_takes_one_recording_with_it(long_runs, tmp_path, cre
     assert outcomes(found) == {"a.h5": "made", "b.h5": "failed", "c.h5": "made", "d.h5": "made"}
     assert f"{long_runs / 'b.h5'}: its worker process was ended by SIGKILL" in found["b.h5"].error
     assert names_in(out) == ["a.energy.h5", "c.energy.h5", "d.energy.h5"]
-    again = ended(Campaign(find([long_runs]), out, CampaignOptions(settings=narrow), workers=1).run())
+    again = ended(Campaign(find_recordings([long_runs]), out, CampaignOptions(settings=narrow), workers=1).run())
     assert outcomes(again) == {"a.h5": "kept", "b.h5": "made", "c.h5": "kept", "d.h5": "kept"}
 
 
 def test_to_close_it_ends_all_work_at_once(long_runs, tmp_path, crews):
     """However far it is: processes that stand still would never be done with theirs."""
-    events = Campaign(find([long_runs]), tmp_path / "out", CampaignOptions(settings=narrow, batch=1), workers=2).run()
-    next(event for event in events if isinstance(event, Advanced))
+    events = Campaign(
+        find_recordings([long_runs]), tmp_path / "out", CampaignOptions(settings=narrow, batch=1), workers=2
+    ).run()
+    next(event for event in events if isinstance(event, RecordingProgress))
     pids = list(crews[0].doing)
     for pid in pids:
         os.kill(pid, signal.SIGSTOP)
@@ -111,10 +113,10 @@ def test_to_close_it_ends_all_work_at_once(long_runs, tmp_path, crews):
 def test_a_worker_that_dies_of_nothing_is_replaced():
     pool = ProcessPool(1)
     try:
-        (pid,) = pool.doing
+        (pid,) = pool.current_paths
         os.kill(pid, signal.SIGKILL)
         assert gone(pid)
-        pool.give(WorkOrder(7, "look", {"path": "none.h5", "named": True, "sensor": None}))
+        pool.submit(Task(7, "look", {"path": "none.h5", "named": True, "sensor": None}))
         news = []
         while not (news and news[-1].result):
             news += pool.wait(PATIENCE_S)
@@ -126,9 +128,9 @@ def test_a_worker_that_dies_of_nothing_is_replaced():
 def test_fewer_are_wanted_after_all():
     pool = ProcessPool(3)
     try:
-        pids = list(pool.doing)
+        pids = list(pool.current_paths)
         pool.limit(1)
-        assert (pool.size, pool.free, list(pool.doing)) == (1, 1, pids[:1])
+        assert (pool.size, pool.free, list(pool.current_paths)) == (1, 1, pids[:1])
         assert all(gone(pid) for pid in pids[1:])
     finally:
         pool.close()
@@ -142,7 +144,7 @@ def test_fewer_are_wanted_while_all_are_busy(size):
 
         def feed():
             while pool.free > 0 and (number := next(numbers, None)) is not None:
-                pool.give(WorkOrder(number, "look", {"path": "none.h5", "named": True, "sensor": None}))
+                pool.submit(Task(number, "look", {"path": "none.h5", "named": True, "sensor": None}))
                 in_hand.add(number)
             return len(in_hand)
 
@@ -150,22 +152,25 @@ def test_fewer_are_wanted_while_all_are_busy(size):
         pool.limit(size)
         assert pool.free == 0
         while feed():
-            seen.append((len(in_hand), len(pool.doing)))
+            seen.append((len(in_hand), len(pool.current_paths)))
             in_hand -= {news.number for news in pool.wait(PATIENCE_S) if news.result is not None}
         assert next(numbers, None) is None
         assert seen == sorted(seen, reverse=True)
         assert seen[0] == (3, 3)
         assert (size, size) in seen
         assert max(processes for given, processes in seen if given <= size) == size
-        assert len(pool.doing) == size
+        assert len(pool.current_paths) == size
     finally:
         pool.close()
 
 
 def test_processes_that_cannot_begin_are_told(runs, tmp_path, monkeypatch):
     monkeypatch.setattr(processes, "_MODULE", "ertis_numba.no_such_module")
-    with pytest.raises(DeviceError, match=r"worker processes end at once: the last one ended with 1, printing '/work/main/\.venv/bin/python"):
-        list(Campaign(find([runs]), tmp_path / "out", workers=1).run())
+    with pytest.raises(
+        DeviceError,
+        match=r"worker processes end at once: the last one ended with 1, printing '/work/main/\.venv/bin/python",
+    ):
+        list(Campaign(find_recordings([runs]), tmp_path / "out", workers=1).run())
 
 
 def command(runs, out, *more):

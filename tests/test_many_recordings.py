@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from ertis_numba.campaign import Campaign, Source, find, outputs
-from ertis_numba.campaign.folder import clear_parts, sole
+from ertis_numba.campaign import Campaign, RecordingFile, find_recordings, output_paths
+from ertis_numba.campaign.folder import clear_parts, exclusive_folder
 from ertis_numba.errors import ArgumentError, DataError
 from tests.campaigns import names_in
 
@@ -21,7 +21,7 @@ def place(tmp_path, monkeypatch):
 
 
 def names(*given):
-    return [str(found.path) for found in find(given)]
+    return [str(found.path) for found in find_recordings(given)]
 
 
 def test_files_folders_and_patterns():
@@ -40,7 +40,7 @@ def test_a_file_that_is_named_twice_is_processed_once():
 def test_a_file_counts_rather_than_a_link_to_it():
     Path("runs/0.h5").symlink_to("b.h5")
     assert names("runs") == ["runs/b.h5", "runs/a.h5"]
-    assert find(["runs/0.h5", "runs"])[0] == Source(Path("runs/b.h5"), named=True)
+    assert find_recordings(["runs/0.h5", "runs"])[0] == RecordingFile(Path("runs/b.h5"), named=True)
     assert names("runs/0.h5") == ["runs/0.h5"]
 
 
@@ -49,11 +49,11 @@ def test_a_link_to_nothing_is_left_to_whoever_opens_it(given):
     Path("runs/lost.h5").symlink_to("gone.h5")
     Path("runs/round.h5").symlink_to("round.h5")
     assert names(given) == ["runs/a.h5", "runs/b.h5", "runs/lost.h5", "runs/round.h5"]
-    assert len(outputs(find([given]), Path("out"))) == 4
+    assert len(output_paths(find_recordings([given]), Path("out"))) == 4
 
 
 def test_only_what_is_named_is_meant_for_sure():
-    assert [found.named for found in find(["runs/b.h5", "runs"])] == [True, False]
+    assert [found.named for found in find_recordings(["runs/b.h5", "runs"])] == [True, False]
 
 
 def test_a_file_that_is_not_there_is_left_to_whoever_opens_it():
@@ -67,11 +67,13 @@ def test_a_file_that_is_not_there_is_left_to_whoever_opens_it():
 def test_nothing_meant(given, stated):
     Path("empty").mkdir()
     with pytest.raises(DataError, match=stated):
-        find([given])
+        find_recordings([given])
 
 
 def test_each_has_its_own_output():
-    assert outputs(find(["runs/**/*.h5"]), Path("out")) == [Path(f"out/{name}.energy.h5") for name in "abc"]
+    assert output_paths(find_recordings(["runs/**/*.h5"]), Path("out")) == [
+        Path(f"out/{name}.energy.h5") for name in "abc"
+    ]
 
 
 @pytest.mark.parametrize(
@@ -84,31 +86,31 @@ def test_each_has_its_own_output():
 )
 def test_refused_before_anything_is_made(place, given, folder, stated):
     with pytest.raises(ArgumentError, match=stated):
-        Campaign(find(given), folder)
+        Campaign(find_recordings(given), folder)
     assert names_in(place) == ["more", "odd[1].h5", "runs"]
 
 
 def test_no_recording_is_replaced():
     Path("runs/a.energy.h5").touch()
     with pytest.raises(ArgumentError, match=r"would become runs/a\.energy\.h5, which is itself to be processed"):
-        outputs([Source(Path("runs/a.h5")), Source(Path("runs/a.energy.h5"))], Path("runs"))
+        output_paths([RecordingFile(Path("runs/a.h5")), RecordingFile(Path("runs/a.energy.h5"))], Path("runs"))
 
 
 def test_workers_and_a_scheduler():
     with pytest.raises(ArgumentError, match="workers and scheduler exclude each other"):
-        Campaign(find(["runs"]), "out", workers=2, scheduler="tcp://127.0.0.1:9")
+        Campaign(find_recordings(["runs"]), "out", workers=2, scheduler="tcp://127.0.0.1:9")
     with pytest.raises(ArgumentError, match="workers is 0; give a whole number of at least 1"):
-        Campaign(find(["runs"]), "out", workers=0)
+        Campaign(find_recordings(["runs"]), "out", workers=0)
 
 
 def test_one_campaign_at_a_time(place):
-    with sole(place / "out"):
-        with pytest.raises(ArgumentError, match="is in use by another campaign"), sole(place / "out"):
+    with exclusive_folder(place / "out"):
+        with pytest.raises(ArgumentError, match="is in use by another campaign"), exclusive_folder(place / "out"):
             pytest.fail("two had the folder")
-        with sole(place / "other"):
+        with exclusive_folder(place / "other"):
             pass
     with contextlib.ExitStack() as stack:
-        stack.enter_context(sole(place / "out"))
+        stack.enter_context(exclusive_folder(place / "out"))
     assert names_in(place / "out") == []
 
 

@@ -345,8 +345,6 @@ def test_parts_and_their_texts_agree():
 def test_a_node_that_does_not_start_is_told(tmp_path):
     with (
         central("record", tmp_path, "-o", str(tmp_path / "file"), listen="tcp://nowhere") as node,
-        pytest.raises(
-            DataError, match='no event \'listening\' came of central; it ended with 1, saying "ertis: error'
-        ),
+        pytest.raises(DataError, match="no event 'listening' came of central; it ended with 1, saying \"ertis: error"),
     ):
         node.wait_for("listening")

@@ -125,7 +125,10 @@ def test_recording_whose_settings_say_something_else_is_refused(tmp_path, measur
         text = group["settings"][()].decode().replace('"int16"', '"float32"')
         del group["settings"]
         group.create_dataset("settings", data=np.bytes_(text.encode()))
-    with pytest.raises(DataError, match=r"pcm contains int16, but the settings in the file give float32 \(recording\.encoding 'float32'\); change the settings with it"):
+    with pytest.raises(
+        DataError,
+        match=r"pcm contains int16, but the settings in the file give float32 \(recording\.encoding 'float32'\)",
+    ):
         open_recording(path)
 
 
@@ -133,7 +136,7 @@ def test_journal_is_sealed_to_the_same(tmp_path, measurement):
     path = tmp_path / "run.h5.journal"
     with Journal.create(path, target=tmp_path / "run.h5") as journal:
         journal.add_sensor("sensor", measurement.settings)
-        journal.append([ertis.Entry(measurement, 0)])
+        journal.append([ertis.JournalEntry(measurement, 0)])
     sealed = seal(path)
     with open_recording(sealed.recording) as recording:
         assert np.array_equal(recording[0].data, measurement.data)
@@ -146,7 +149,7 @@ def test_a_journal_that_holds_no_number_is_sealed_all_the_same(tmp_path):
     path = tmp_path / "run.h5.journal"
     with Journal.create(path, target=tmp_path / "run.h5") as journal:
         journal.add_sensor("sensor", settings)
-        journal.append([ertis.Entry(ertis.Measurement(words, settings), 0)])
+        journal.append([ertis.JournalEntry(ertis.Measurement(words, settings), 0)])
     with open_recording(seal(path).recording) as recording:
         assert np.array_equal(recording[0].data, words, equal_nan=True)
 

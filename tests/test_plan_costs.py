@@ -11,7 +11,7 @@ from ertis_bench import costs as bench_costs
 from ertis_cli.main import cli
 
 from ertis_numba import kernels
-from ertis_numba.campaign import Campaign, CampaignOptions, find
+from ertis_numba.campaign import Campaign, CampaignOptions, find_recordings
 from ertis_numba.errors import ArgumentError
 from ertis_numba.network.processing import ProcessingOptions as ServeOptions
 from ertis_numba.pipeline import Pipeline
@@ -119,7 +119,9 @@ def test_process_chooses_plans_by_the_costs_asked_for(recording, tmp_path, more)
                 settings=lambda recorded: recorded.replace(processing=MANY.processing), device="cpu", plan=plan
             )
             folder = tmp_path / plan
-            campaign = Campaign(list(find([tmp_path / "rec.h5", tmp_path / "other.h5"])), folder, options, workers=1)
+            campaign = Campaign(
+                list(find_recordings([tmp_path / "rec.h5", tmp_path / "other.h5"])), folder, options, workers=1
+            )
             assert all(getattr(event, "outcome", "made") == "made" for event in campaign.run())
             with open_energyscapes(folder / "rec.energy.h5") as images:
                 found.append(images.settings.accuracy)

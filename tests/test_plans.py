@@ -143,7 +143,9 @@ def test_writes_nothing_that_errs_too_much(recording, tmp_path, monkeypatch):
 
 def test_refuses_a_budget_that_no_plan_keeps(recording, tmp_path):
     done = run(recording, "-o", tmp_path / "a.h5", "--max-error", -150, code=1)
-    assert done.stderr.splitlines()[-1].startswith("ertis: error: accuracy.max_error_db is -150, but the smallest error")
+    assert done.stderr.splitlines()[-1].startswith(
+        "ertis: error: accuracy.max_error_db is -150, but the smallest error"
+    )
     assert [item.name for item in tmp_path.iterdir()] == ["rec.h5"]
 
 

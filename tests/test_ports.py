@@ -81,7 +81,7 @@ def test_what_a_killed_emulator_left_leads_nowhere(folder):
         (folder / ".left.lock").touch()
         assert find_ports() == []
         for name in ("left", str(folder / "left")):
-            with pytest.raises(SonarError, match="serial port .* does not exist"):
+            with pytest.raises(SonarError, match=r"serial port .* does not exist"):
                 resolve(name)
 
 
@@ -122,11 +122,15 @@ def test_several_ports_of_one_serial_number(monkeypatch):
 
 
 def test_a_port_that_is_not_there(monkeypatch):
-    with pytest.raises(SonarError, match=r"serial port 'SN7' does not exist; no port exists: .* 'ertis emulate'") as caught:
+    with pytest.raises(
+        SonarError, match=r"serial port 'SN7' does not exist; no port exists: .* 'ertis emulate'"
+    ) as caught:
         resolve("SN7")
     assert caught.value.errno == errno.ENOENT
     plug_in(monkeypatch, ttyACM0="SN8")
-    with pytest.raises(SonarError, match=r"serial port '/dev/ttyACM7' does not exist; choose one of /dev/ttyACM0 \(SN8\)"):
+    with pytest.raises(
+        SonarError, match=r"serial port '/dev/ttyACM7' does not exist; choose one of /dev/ttyACM0 \(SN8\)"
+    ):
         resolve("/dev/ttyACM7")
 
 

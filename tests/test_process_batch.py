@@ -6,7 +6,7 @@ import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
-from ertis_numba.campaign import sensor_run
+from ertis_numba.campaign import sensor_processing
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Air
 from ertis_numba.storage import open_energyscapes, write_recording
@@ -79,14 +79,14 @@ def test_batch_of_large_images_is_smaller(recording, tmp_path, sizes, monkeypatc
         image_bytes = images[0].amplitude.nbytes
     for room, wanted in ((2.5, [2, 2, 2, 1]), (0.5, [1] * 7)):
         sizes["sizes"].clear()
-        monkeypatch.setattr(sensor_run, "MAX_BYTES", room * image_bytes)
+        monkeypatch.setattr(sensor_processing, "MAX_BYTES", room * image_bytes)
         run(recording, "-o", tmp_path / "img.h5", *FAST, "--force")
         assert sizes["sizes"] == [1, *wanted]  # the first image is made once more, to predict its error
 
 
 def test_time_is_that_of_one_measurement(recording, tmp_path, monkeypatch):
     clock_s = iter(np.arange(0.0, 100.0, 0.7).tolist())  # of every batch, then
-    monkeypatch.setattr(sensor_run.time, "perf_counter", lambda: next(clock_s))
+    monkeypatch.setattr(sensor_processing.time, "perf_counter", lambda: next(clock_s))
     done = run(recording, "-o", tmp_path / "img.h5", *FAST)
     assert "7 measurements, 9 directions" in done.stderr
     assert "100.0 ms each (median)" in done.stderr

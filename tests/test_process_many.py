@@ -13,7 +13,7 @@ from ertis_cli import _process_many
 from ertis_cli.main import cli
 
 from ertis_numba import verification
-from ertis_numba.campaign import Advanced, Begun, Campaign, CampaignOptions, RecordingEnded
+from ertis_numba.campaign import Campaign, CampaignOptions, RecordingEnded, RecordingProgress, RecordingStarted
 from tests.campaigns import Here, names_in, write_recordings
 
 FAST = ["--range", "0.5:0.8", "--directions", "2d:9", "--workers", "1"]
@@ -96,7 +96,8 @@ def test_what_errs_too_much_is_not_written(runs, monkeypatch):
     done = run("runs", "-o", "out", *FAST, "--verify", code=1)
     for name in "ab":
         assert (
-            f"ertis: failed: runs/{name}.h5: image of sensor eRTIS-7 has an error of -30.0 dB, but the limit is -35 dB" in done.stderr
+            f"ertis: failed: runs/{name}.h5: image of sensor eRTIS-7 has an error of -30.0 dB, but the limit is -35 dB"
+            in done.stderr
         )
     assert names_in(runs.parent / "out") == []
 
@@ -106,7 +107,11 @@ def test_what_errs_too_much_is_not_written(runs, monkeypatch):
     [
         (["runs/a.h5", "runs/b.h5"], 2, "several recordings need an output folder; give one with -o"),
         (["runs"], 2, "several recordings need an output folder"),
-        (["runs/a.h5", "--workers", "2"], 2, "--workers applies to several recordings; give more, a folder or a pattern"),
+        (
+            ["runs/a.h5", "--workers", "2"],
+            2,
+            "--workers applies to several recordings; give more, a folder or a pattern",
+        ),
         (["runs/a.h5", "--scheduler", "tcp://x:1"], 2, "--scheduler applies to several recordings"),
         (["none/*.h5", "-o", "out"], 1, "no file matches none/*.h5; give another pattern"),
         (["runs", "-o", "runs/a.h5"], 1, "output runs/a.h5 is a file, but several recordings need a folder"),
@@ -157,10 +162,10 @@ def test_there_is_a_bar_for_each_recording_under_way(monkeypatch):
         return [(task.description, task.completed, task.total) for task in bars.progress.tasks]
 
     paths = [Path(f"runs/{name}.h5") for name in "ab"]
-    bars.follow(Advanced(paths[0], 3))  # of one that it has never heard of
+    bars.follow(RecordingProgress(paths[0], 3))  # of one that it has never heard of
     for path in paths:
-        bars.follow(Begun(path, 7))
-    bars.follow(Advanced(paths[1], 4))
+        bars.follow(RecordingStarted(path, 7))
+    bars.follow(RecordingProgress(paths[1], 4))
     assert drawn() == [("recordings", 0, 3), ("a.h5", 0, 7), ("b.h5", 4, 7)]
     bars.follow(RecordingEnded(paths[1], Path("out/b.energy.h5"), "failed"))
     assert drawn() == [("recordings", 1, 3), ("a.h5", 0, 7)]

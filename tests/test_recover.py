@@ -10,7 +10,7 @@ from ertis_cli.capture import _seal
 from ertis_cli.main import cli
 
 from ertis_numba.errors import DataError, JournalInUseError, SonarError
-from ertis_numba.journal import seal_apart, sealer
+from ertis_numba.journal import seal_in_subprocess, sealing_client
 from ertis_numba.storage.sealing import seal
 from ertis_numba.storage.verify import verify
 from tests.journals import crashed, create, entries
@@ -28,7 +28,7 @@ def test_apart(tmp_path):
         path = journal.path
     shutil.copy(path, tmp_path / "kept")
     reported = []
-    sealed = seal_apart(path, progress=lambda *numbers: reported.append(numbers))
+    sealed = seal_in_subprocess(path, progress=lambda *numbers: reported.append(numbers))
     assert reported == [(number + 1, 5) for number in range(5)]
     assert not path.exists()
     shutil.copy(tmp_path / "kept", path)
@@ -38,7 +38,7 @@ def test_apart(tmp_path):
 
 def test_apart_nothing_was_measured(tmp_path):
     create(tmp_path, []).close()
-    sealed = seal_apart(tmp_path / "rec.h5.journal")
+    sealed = seal_in_subprocess(tmp_path / "rec.h5.journal")
     assert (sealed.recording, sealed.remark) == (None, f"{tmp_path}/rec.h5.journal: no measurement was captured")
 
 
@@ -47,11 +47,11 @@ def test_apart_refused(tmp_path):
         create(tmp_path) as journal,
         pytest.raises(JournalInUseError, match=r"rec.h5.journal is in use by another process"),
     ):
-        seal_apart(journal.path)
+        seal_in_subprocess(journal.path)
     (tmp_path / "rec.h5").write_text("mine")
     with pytest.raises(DataError, match="exists with other content"):
-        seal_apart(journal.path)
-    assert seal_apart(journal.path, overwrite=True).measurements == 3
+        seal_in_subprocess(journal.path)
+    assert seal_in_subprocess(journal.path, overwrite=True).measurements == 3
 
 
 @pytest.fixture
@@ -62,7 +62,7 @@ def instead(tmp_path, monkeypatch):
         script = tmp_path / "python"
         script.write_text(f"#!/bin/sh\n{line}\n")
         script.chmod(0o755)
-        monkeypatch.setattr(sealer.sys, "executable", str(script))
+        monkeypatch.setattr(sealing_client.sys, "executable", str(script))
 
     return replace_python
 
@@ -83,7 +83,7 @@ def instead(tmp_path, monkeypatch):
 def test_apart_and_lost(tmp_path, instead, line, reason):
     instead(line)
     with pytest.raises(DataError, match=f"rec.h5.journal: the process that seals it {reason}"):
-        seal_apart(crashed(tmp_path))
+        seal_in_subprocess(crashed(tmp_path))
 
 
 @pytest.mark.parametrize("late", [False, True])
@@ -99,8 +99,8 @@ def test_apart_and_interrupted(tmp_path, instead, late):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt) as error:
-        seal_apart(path, progress=interrupt)
-    safe = f"the measurements are safe in {path}; seal them with 'ertis recover {path}'"
+        seal_in_subprocess(path, progress=interrupt)
+    safe = f"the measurements are safe in {path}; recover them with 'ertis recover {path}'"
     assert str(error.value) == (f"the measurements are in {tmp_path / 'rec.h5'}" if late else safe)
     assert (path.exists(), (tmp_path / "rec.h5").exists()) == (not late, late)
     assert seal(path).measurements == 3
@@ -124,7 +124,7 @@ def test_recover_a_folder(tmp_path):
     ]
     assert done.stdout == ""
     assert sorted(path.name for path in tmp_path.iterdir()) == ["b.h5", "rec.h5", "sub", "used.h5.journal"]
-    assert verify(tmp_path / "rec.h5")[0].whole
+    assert verify(tmp_path / "rec.h5")[0].is_intact
 
 
 def test_recover_what_cannot_be_sealed(tmp_path):
@@ -138,7 +138,7 @@ def test_recover_what_cannot_be_sealed(tmp_path):
     reported = json.loads(done.stdout)["journals"]
     assert [(report.get("measurements"), "error" in report) for report in reported] == [(3, False), (None, True)]
     assert run("recover", path, "--force", "--quiet").stderr == ""
-    assert verify(tmp_path / "rec.h5")[0].whole
+    assert verify(tmp_path / "rec.h5")[0].is_intact
 
 
 def test_recover_damaged_measurements(tmp_path):
@@ -169,9 +169,11 @@ def interrupted(*_, **__):
 
 def test_recover_is_interrupted(tmp_path, monkeypatch):
     path = crashed(tmp_path)
-    monkeypatch.setattr(sealer.subprocess, "Popen", interrupted)
+    monkeypatch.setattr(sealing_client.subprocess, "Popen", interrupted)
     done = run("recover", path, code=130)
-    assert done.stderr.splitlines()[0] == f"the measurements are safe in {path}; seal them with 'ertis recover {path}'"
+    assert (
+        done.stderr.splitlines()[0] == f"the measurements are safe in {path}; recover them with 'ertis recover {path}'"
+    )
     monkeypatch.undo()
     assert run("recover", path).stderr == f"{tmp_path}/rec.h5: 3 measurements, 0 missing\n"
 
@@ -196,7 +198,7 @@ def test_a_capture_that_fails_and_cannot_be_sealed(tmp_path, capsys):
     (tmp_path / "rec.h5").write_text("mine")
     reported = (
         f"{tmp_path}/rec.h5 exists with other content than {path}; move it, or give --force; "
-        f"the measurements are safe in {path}; seal them with 'ertis recover {path}'"
+        f"the measurements are safe in {path}; recover them with 'ertis recover {path}'"
     )
     with pytest.raises(SonarError, match="left: it was unplugged"):
         _seal(path, LOST, overwrite=False)
@@ -206,7 +208,7 @@ def test_a_capture_that_fails_and_cannot_be_sealed(tmp_path, capsys):
     assert str(error.value) == reported
     assert capsys.readouterr().err == ""
     _seal(path, None, overwrite=True)
-    assert verify(tmp_path / "rec.h5")[0].whole
+    assert verify(tmp_path / "rec.h5")[0].is_intact
 
 
 def test_a_capture_of_nothing(tmp_path):
@@ -220,7 +222,7 @@ def test_a_capture_of_nothing(tmp_path):
 @pytest.mark.parametrize("failure", [None, LOST])
 def test_a_capture_whose_sealing_is_interrupted(tmp_path, monkeypatch, capsys, failure):
     path = crashed(tmp_path)
-    monkeypatch.setattr(sealer.subprocess, "Popen", interrupted)
+    monkeypatch.setattr(sealing_client.subprocess, "Popen", interrupted)
     with pytest.raises(KeyboardInterrupt if failure is None else SonarError):
         _seal(path, failure, overwrite=False)
-    assert capsys.readouterr().err == f"the measurements are safe in {path}; seal them with 'ertis recover {path}'\n"
+    assert capsys.readouterr().err == f"the measurements are safe in {path}; recover them with 'ertis recover {path}'\n"

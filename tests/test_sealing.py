@@ -16,9 +16,9 @@ from ertis_numba import atomic_files
 from ertis_numba.errors import ArgumentError, DataError, JournalInUseError
 from ertis_numba.settings import Air
 from ertis_numba.storage import RecordingWriter, open_recording, sensor_names, write_recording
-from ertis_numba.storage._gaps import UNKNOWN, Numbers
+from ertis_numba.storage._gaps import UNKNOWN, SequenceNumbers
 from ertis_numba.storage.sealing import seal
-from ertis_numba.storage.sealing_process import IN_USE, NOTHING, main
+from ertis_numba.storage.sealing_process import IN_USE, NO_MEASUREMENTS, main
 from tests.journals import ENVIRONMENT, EPOCH, TINY, crashed, create, entries, python
 from tests.test_journal_damage import spoil
 
@@ -151,7 +151,7 @@ def test_nothing_was_measured(tmp_path, tables, capsys):
             journal.add_sensor("left", TINY)
     else:
         path.touch()
-    assert main([str(path)]) == NOTHING
+    assert main([str(path)]) == NO_MEASUREMENTS
     assert capsys.readouterr().err == f"{path}: no measurement was captured\n"
     assert not list(tmp_path.iterdir())
 
@@ -307,7 +307,7 @@ def test_gaps_are_those_of_a_naive_count():
         for _ in range(rng.integers(0, 6)):
             first = int(rng.integers(0, 45))
             noted.append((first, first + int(rng.integers(0, 12)), str(rng.choice(["a", "b"]))))
-        numbers = Numbers()
+        numbers = SequenceNumbers()
         for number in present:
             numbers.add(number)
         missing = numbers.missing(noted)
@@ -320,7 +320,7 @@ def test_gaps_are_those_of_a_naive_count():
 
 
 def test_gaps_where_numbers_start_again():
-    numbers = Numbers()
+    numbers = SequenceNumbers()
     for number in (5, 6, 0, 1, 4):
         numbers.add(number)
     assert numbers.missing([(6, 7, "footer")]) == [(2, 3, UNKNOWN), (6, 7, "footer")]

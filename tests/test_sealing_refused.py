@@ -7,7 +7,7 @@ import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
-from ertis_numba.journal import Journal, seal_apart
+from ertis_numba.journal import Journal, seal_in_subprocess
 from ertis_numba.network.central_node._received_items import SealedOne, SealingFailed
 from ertis_numba.settings import Call, call
 from ertis_numba.storage import open_recording, sealing, sensor_names
@@ -72,7 +72,7 @@ def test_seal_survives_any_error_in_laying_out_a_sensor(tmp_path, monkeypatch):
             raise ValueError("Maximum allowed size exceeded")
         return lay_out_sensor(group, settings, **more)
 
-    lay_out_sensor = sealing.lay_out_sensor
+    lay_out_sensor = sealing.create_sensor_variables
     monkeypatch.setattr(sealing, "lay_out_sensor", fails)
     create(tmp_path, [*entries(2), *entries(2, sensor="right")]).close()
     sealed = seal(tmp_path / "rec.h5.journal")
@@ -95,12 +95,12 @@ def test_recover_reports_a_sensor_that_cannot_be_sealed(tmp_path, left):
 
 def test_verify_reports_a_sensor_of_a_journal_that_cannot_be_used(left):
     bad = verify(left)[1]
-    assert (bad.sensor, bad.measurements, bad.whole) == ("bad", 2, False)
+    assert (bad.sensor, bad.measurements, bad.is_intact) == ("bad", 2, False)
     assert "call has 5000000 samples" in bad.fault
 
 
 def test_seal_apart_returns_what_was_refused(left):
-    sealed = seal_apart(left)
+    sealed = seal_in_subprocess(left)
     assert (sealed.measurements, list(sealed.refused), sealed.set_aside.exists()) == (3, ["bad"], True)
 
 

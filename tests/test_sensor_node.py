@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ertis_numba.errors import ArgumentError
-from ertis_numba.journal import Entry, JournalSensor
+from ertis_numba.journal import JournalEntry, JournalSensor
 from ertis_numba.network import messages
 from ertis_numba.network.sensor_node import SensorNode
 from ertis_numba.network.sensor_node import _runs as runs
@@ -123,7 +123,7 @@ def test_memory_is_flat_while_nobody_takes_anything():
         node.add_sensor("left", small)
         for number in range(0, 4000, 2):
             stamp = replace(blank.measurement.stamp, sequence=number)
-            node.append([Entry(replace(blank.measurement, stamp=stamp), 0)])
+            node.append([JournalEntry(replace(blank.measurement, stamp=stamp), 0)])
             node.note_gap("left", number + 1, number + 1, f"reason {number % 7}", session_id=EPOCH)
         run = node._spool.runs[KEY]  # noqa: SLF001  nobody else can tell
         assert len(run.items) < 300
@@ -196,7 +196,7 @@ def test_numbers_hold_whatever_happens():  # noqa: C901  it is a list of what ma
     """A run against an obvious model: random losses, evictions, acks late and beyond."""
     chance = random.Random(4)
     for _ in range(30):
-        run = runs.OutgoingSession(JournalSensor.of("left", TINY), EPOCH)
+        run = runs.OutgoingSession(JournalSensor.from_settings("left", TINY), EPOCH)
         taken, number, lost = -1, 0, set()
         for step in range(400):
             match chance.randrange(8):
@@ -278,7 +278,7 @@ BAD = {
     "name": (lambda node: node.add_sensor("a" * 65, TINY), "sensor name 'a{65}' has 65 characters; the limit is 64"),
     "longer than the memory": (
         lambda node: node.add_sensor("b", TINY.replace(recording=Recording(n_samples=200_000))),
-        r"a measurement of sensor b has 200000 bytes, but the memory has room for 100000; give a larger ring_bytes \(--ring\)",
+        r"a measurement of sensor b has 200000 bytes, but the memory has room for 100000; give a larger ring_bytes",
     ),
     "settings": (
         lambda node: node.append(entries(1, settings=TINY.replace(recording=Recording(n_samples=4097)))),

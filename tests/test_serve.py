@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from ertis_numba.frames import Energyscape, Measurement, Stamp
-from ertis_numba.journal import Entry
+from ertis_numba.journal import JournalEntry
 from ertis_numba.network.allow_list import AllowList, Permission
 from ertis_numba.network.keys import ClientKeys, KeyPair
 from ertis_numba.network.messages import Group
@@ -80,7 +80,9 @@ class Sensors:
             Stamp(sensor=name, sequence=number, sync_count=number, session_id=11, timestamp_ns=now_ns)
             for name in self.names
         ]
-        self.node.append([Entry(Measurement(MEASUREMENT.data, SHORT, stamp), time.monotonic_ns()) for stamp in stamps])
+        self.node.append(
+            [JournalEntry(Measurement(MEASUREMENT.data, SHORT, stamp), time.monotonic_ns()) for stamp in stamps]
+        )
 
 
 def received(subscriber, kind):
@@ -259,7 +261,7 @@ def test_numbers_of_pcm_go_all_the_way(tmp_path):
         with SensorNode(served.listen) as node:
             node.add_sensor("ring", given.settings)
             stamp = Stamp(sensor="ring", session_id=11, timestamp_ns=time.time_ns())
-            node.append([Entry(Measurement(given.data, given.settings, stamp), time.monotonic_ns())])
+            node.append([JournalEntry(Measurement(given.data, given.settings, stamp), time.monotonic_ns())])
             assert node.flush(timeout_s=TIMEOUT_S)
             image = received(subscriber, Energyscape)
         served.end()

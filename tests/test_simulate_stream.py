@@ -16,7 +16,7 @@ from ertis_numba.geometry import layouts, load_layout
 from ertis_numba.simulation import Box, Point, Scene, Tone
 from ertis_numba.simulation.engine import Engine
 from ertis_numba.simulation.plan import make_plan
-from ertis_numba.storage import TruthLog, open_recording, write_recording
+from ertis_numba.storage import GroundTruthLog, open_recording, write_recording
 from tests.files import noise
 from tests.scenes import SENSOR, scene_of
 
@@ -98,7 +98,7 @@ def test_truth_log_of_several_blocks_reads_back(tmp_path, monkeypatch):
         )
         for index in range(3)
     ]
-    with TruthLog("", 5, left_out=("doppler", "walls"), folder=tmp_path) as log:
+    with GroundTruthLog("", 5, left_out=("doppler", "walls"), folder=tmp_path) as log:
         for row in rows:
             log.append(row)
         path = write_recording(tmp_path / "rec.h5", noise(), truth={"eRTIS-7": log})
@@ -112,7 +112,7 @@ def test_truth_log_of_several_blocks_reads_back(tmp_path, monkeypatch):
 
 def test_truth_log_names_the_folder_that_cannot_be_written(tmp_path):
     with pytest.raises(DataError, match=r"gone: a temporary file cannot be written \(No such file or directory\); "):
-        TruthLog("", 5, folder=tmp_path / "gone")
+        GroundTruthLog("", 5, folder=tmp_path / "gone")
 
 
 def test_shipped_layout_is_read_once(monkeypatch):

@@ -149,7 +149,7 @@ def test_a_program_is_told_what_is_wrong_with_a_port(tmp_path, monkeypatch):
     with pytest.raises(SonarError) as caught:
         SonarDriver.open(str(tmp_path / "file.txt"))
     assert caught.value.errno == errno.EINVAL
-    with pytest.raises(SonarError, match="serial port .* does not exist") as caught:
+    with pytest.raises(SonarError, match=r"serial port .* does not exist") as caught:
         SonarDriver.open(str(tmp_path / "nothing"))
     assert caught.value.errno == errno.ENOENT
 
@@ -348,7 +348,9 @@ def test_what_lay_there_is_dropped(sonar, device):
 
 def test_a_measurement_that_comes_too_late(sonar, device):
     device.quirks = Quirks(bytes_per_s=200_000)
-    with pytest.raises(SonarError, match=r"no complete measurement within 0\.53 s; \d+ of 131084 bytes arrived: measure"):
+    with pytest.raises(
+        SonarError, match=r"no complete measurement within 0\.53 s; \d+ of 131084 bytes arrived: measure"
+    ):
         sonar.measure()
     device.quirks = Quirks()
     assert is_block(sonar.measure(), 1, WORDS[1])
@@ -513,7 +515,9 @@ def test_listening_for_another_length(device):
     registers.n_bytes, registers.armed = 4 * N_SAMPLES, 1
     with SonarDriver.open("left", passive=True) as sonar, SyncChain([device], 50.0):
         sonar.configure(Setup.of(SETTINGS.replace(recording=Recording(n_samples=2 * N_SAMPLES))))
-        with pytest.raises(SonarError, match=r"\d+ bytes arrived within .* no complete measurement of 65536 samples; give"):
+        with pytest.raises(
+            SonarError, match=r"\d+ bytes arrived within .* no complete measurement of 65536 samples; give"
+        ):
             list(sonar.listen(stop=lambda: False, timeout_s=0.1))
 
 

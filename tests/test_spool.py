@@ -10,7 +10,7 @@ from dataclasses import replace
 import pytest
 
 from ertis_numba.errors import ArgumentError, DataError, NetworkError
-from ertis_numba.journal import LOST, Entry, Journal
+from ertis_numba.journal import LOST, Journal, JournalEntry
 from ertis_numba.journal._database import PAGE_BYTES
 from ertis_numba.network.sensor_node import _disk as disk
 from ertis_numba.network.sensor_node import _runs as runs
@@ -234,7 +234,10 @@ def test_a_journal_of_a_capture_is_sent_too(tmp_path):
 
 def test_no_folder(tmp_path):
     (tmp_path / "file").touch()
-    with pytest.raises(NetworkError, match=r"give a writable spool folder \(--spool\)"), Node(NOBODY, spool=tmp_path / "file"):
+    with (
+        pytest.raises(NetworkError, match=r"give a writable spool folder \(--spool\)"),
+        Node(NOBODY, spool=tmp_path / "file"),
+    ):
         pass
 
 
@@ -293,7 +296,7 @@ def test_a_gap_that_only_memory_knew_is_one_all_the_same(tmp_path):
 def test_an_old_measurement_is_sent_as_it_was(tmp_path):
     (given,) = entries(1)
     stamp = replace(given.measurement.stamp, timestamp_ns=-5, timestamp_uncertainty_ns=2**32 - 1, sync_count=-(2**63))
-    given = Entry(replace(given.measurement, stamp=stamp), monotonic_ns=-1)
+    given = JournalEntry(replace(given.measurement, stamp=stamp), monotonic_ns=-1)
     kept(tmp_path, [given])
     with StandIn() as central, Node(central.address, (), spool=tmp_path) as node:
         assert node.flush(SOON_S)

@@ -15,7 +15,7 @@ from ertis_numba.errors import ArgumentError, DataError, FormatVersionError
 from ertis_numba.frames import Reflector
 from ertis_numba.settings import Recording
 from ertis_numba.storage import (
-    Truth,
+    GroundTruth,
     file_kind,
     open_energyscapes,
     open_recording,
@@ -100,9 +100,7 @@ def held_open(path, **more):
 def test_a_file_that_another_program_writes_is_not_called_damaged(path):
     with held_open(path) as holder:
         for read in (open_recording, file_kind):
-            with pytest.raises(
-                DataError, match=r"rec.h5 is open for writing in another program; close it there"
-            ):
+            with pytest.raises(DataError, match=r"rec.h5 is open for writing in another program; close it there"):
                 read(path)
         holder.stdin.close()
     with open_recording(path) as recording:
@@ -113,7 +111,8 @@ def test_a_file_that_a_killed_program_wrote_is_not_called_damaged(path):
     with held_open(path) as holder:
         holder.kill()
     with pytest.raises(
-        DataError, match=r"rec.h5 is open for writing in another program, or that program was killed; close it there, or copy the file"
+        DataError,
+        match=r"rec.h5 is open for writing in another program, or that program was killed; close it there",
     ):
         open_recording(path)
 
@@ -229,7 +228,7 @@ def test_one_damaged_bit_never_passes(tmp_path):
     """Wherever it is, reading gives what was written or a `DataError` of one line."""
     given = noise(line(8, 8).replace(recording=Recording(n_samples=512)), 2)
     wall = Reflector(name="wall", azimuth_deg=10.0, elevation_deg=20.0, range_m=1.5, level_db=0.0)
-    reported = Truth(scene="", seed=1, reflectors=((), (wall,)))
+    reported = GroundTruth(scene="", seed=1, reflectors=((), (wall,)))
     path = write_recording(tmp_path / "rec.h5", given, truth={"eRTIS-7": reported})
     with open_recording(path) as recording:
         reported = recording.truth

@@ -49,7 +49,7 @@ def test_a_recording_is_refused(tmp_path, spoiled, name):
 
 
 def test_template_of_hostile_files_is_sound(tmp_path):
-    assert [report.whole for report in verify(write_good(tmp_path / "good.h5"))] == [True]
+    assert [report.is_intact for report in verify(write_good(tmp_path / "good.h5"))] == [True]
 
 
 def test_a_recording_whose_variables_share_their_room_is_refused(tmp_path, monkeypatch):
@@ -73,7 +73,7 @@ def test_verify_does_not_read_what_other_objects_claim(tmp_path, spoil, reported
     with h5py.File(path, "r+", libver=("v110", "v110")) as file:
         spoil(file.create_group("extra"))
     (report,) = verify(path)
-    assert not report.whole
+    assert not report.is_intact
     assert reported in report.remark
 
 

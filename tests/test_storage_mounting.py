@@ -11,11 +11,11 @@ from ertis_cli.main import cli
 
 from ertis_numba.errors import ArgumentError, DamagedError
 from ertis_numba.frames import PointCloud
-from ertis_numba.journal import Entry, Journal
+from ertis_numba.journal import Journal, JournalEntry
 from ertis_numba.network.messages import Hello, decode, encode
 from ertis_numba.storage import open_energyscapes, open_recording, write_energyscapes, write_recording
 from ertis_numba.storage.sealing import seal
-from ertis_numba.storage.truth import Truth
+from ertis_numba.storage.truth import GroundTruth
 from tests.files import SMALL, image, noise
 from tests.test_storage_sensors import TURNED, of
 
@@ -171,7 +171,7 @@ def test_processing_keeps_that_a_mounting_is_unknown(tmp_path):
 
 @pytest.mark.parametrize("simulated", [False, True])
 def test_the_origin_of_older_recordings_is_unknown_unless_simulated(tmp_path, simulated):
-    truth = {"left": Truth(scene="", seed=1, reflectors=((),))} if simulated else None
+    truth = {"left": GroundTruth(scene="", seed=1, reflectors=((),))} if simulated else None
     path = older(write_recording(tmp_path / "rec.h5", of("left", noise(SMALL, 1)), truth=truth), **ORIGIN)
     with open_recording(path) as recording:
         assert (recording.translation_m is not None) == simulated
@@ -203,7 +203,7 @@ def test_a_mounting_of_another_kind_is_damage(tmp_path, value):
 def test_journals_keep_that_a_mounting_is_unknown(tmp_path):
     with Journal.create(tmp_path / "rec.h5.journal", target="rec.h5") as journal:
         journal.add_sensor("left", SMALL)
-        journal.append([Entry(each, 0) for each in of("left", noise(SMALL, 1))])
+        journal.append([JournalEntry(each, 0) for each in of("left", noise(SMALL, 1))])
     with Journal.open(tmp_path / "rec.h5.journal") as journal:
         assert (journal.sensors["left"].translation_m, journal.sensors["left"].rotation_xyzw) == (None, None)
     assert seal(tmp_path / "rec.h5.journal").recording == tmp_path / "rec.h5"

@@ -130,7 +130,10 @@ def test_mounting_is_kept(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"settings": SMALL}, "settings are given for one sensor, but there are measurements of right and left; give none"),
+        (
+            {"settings": SMALL},
+            "settings are given for one sensor, but there are measurements of right and left; give none",
+        ),
         (
             {"mounting": {"a": ((0, 0, 0), TURNED)}},
             "mounting is given for sensor 'a', which has no measurement",

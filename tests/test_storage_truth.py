@@ -9,7 +9,7 @@ import xarray
 
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Reflector
-from ertis_numba.storage import Truth, open_energyscapes, open_recording, write_energyscapes, write_recording
+from ertis_numba.storage import GroundTruth, open_energyscapes, open_recording, write_energyscapes, write_recording
 from ertis_numba.storage.schema import TRUTH
 from tests.files import image, noise
 
@@ -30,7 +30,7 @@ ROWS = (
 
 
 def truth(reflectors=ROWS):
-    return Truth(scene='name = "two"\n', seed=7, reflectors=reflectors)
+    return GroundTruth(scene='name = "two"\n', seed=7, reflectors=reflectors)
 
 
 def same(one, other):
@@ -154,9 +154,7 @@ def test_truth_of_another_length(tmp_path):
 
 
 def test_truth_of_a_sensor_that_is_not_there(tmp_path):
-    with pytest.raises(
-        ArgumentError, match=r"truth is given for sensor 'left', which has no measurement; .* eRTIS-7"
-    ):
+    with pytest.raises(ArgumentError, match=r"truth is given for sensor 'left', which has no measurement; .* eRTIS-7"):
         write_recording(tmp_path / "rec.h5", noise(), truth={"left": truth()})
 
 
@@ -173,4 +171,4 @@ def test_truth_of_a_sensor_that_is_not_there(tmp_path):
 )
 def test_truth_that_cannot_be_used(changes, message):
     with pytest.raises(ArgumentError, match=message):
-        Truth(**{"scene": "", "seed": 1, "reflectors": (), **changes})
+        GroundTruth(**{"scene": "", "seed": 1, "reflectors": (), **changes})

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ertis_numba.capture.sync_counts import SyncCounts
+from ertis_numba.capture.sync_counts import PulseAligner
 
 SHORTEST_S = 0.0364
 
@@ -28,7 +28,7 @@ def pulses_of(seed, *, n_sensors, rate_hz, n=60, lose=0.1, jitter_s=0.01, regula
 
 
 def numbered(events, sensors, counts=None):
-    counts = counts or SyncCounts(sensors, shortest_s=SHORTEST_S)
+    counts = counts or PulseAligner(sensors, shortest_s=SHORTEST_S)
     found, now_ns = [], 0
     for sensor, counter, now_ns, pulse in events:
         found += counts.add(sensor, (sensor, pulse), counter, now_ns)
@@ -53,7 +53,7 @@ def test_a_sensor_that_was_away_is_aligned_again(seed, n_sensors):
     sensors = [f"s{number}" for number in range(n_sensors)]
     events = list(pulses_of(seed, n_sensors=n_sensors, rate_hz=10.0, lose=0.0))
     last = sensors[-1]
-    counts = SyncCounts(sensors, shortest_s=SHORTEST_S)
+    counts = PulseAligner(sensors, shortest_s=SHORTEST_S)
     found, now_ns, restarted = [], 0, None
     for sensor, counter, arrived_ns, pulse in events:
         now_ns = arrived_ns
@@ -62,7 +62,7 @@ def test_a_sensor_that_was_away_is_aligned_again(seed, n_sensors):
         if sensor == last and pulse >= 20 + seed and seed:
             if restarted is None:
                 restarted = counter - 7
-                found += counts.forget(last)
+                found += counts.reset(last)
             counter -= restarted  # noqa: PLW2901
         found += counts.add(sensor, (sensor, pulse), counter, now_ns)
     found += counts.release(now_ns, at_once=True)
@@ -84,12 +84,12 @@ def test_a_counter_that_missed_a_pulse_unnoticed_is_compared_anew():
 
 
 def test_what_is_held_of_a_sensor_is_told_before_it_begins_anew():
-    counts = SyncCounts(["a", "b"], shortest_s=SHORTEST_S)
+    counts = PulseAligner(["a", "b"], shortest_s=SHORTEST_S)
     found = [each for number in range(4) for each in counts.add("a", ("a", number), number, number * 100_000_000)]
     found += counts.add("b", ("b", 2), 100, 205_000_000)
     assert not [item for (item, _), _ in found if item == "b"]  # too few to decide
-    assert counts.forget("b") == [(("b", 2), 2)]
-    assert counts.forget("b") == []
+    assert counts.reset("b") == [(("b", 2), 2)]
+    assert counts.reset("b") == []
     found += [each for number in range(4, 8) for each in counts.add("a", ("a", number), number, number * 100_000_000)]
     found += [each for number in (4, 5, 6) for each in counts.add("b", ("b", number), number - 4, number * 100_000_000)]
     assert all(pulse == number for (_, pulse), number in found)
@@ -97,7 +97,7 @@ def test_what_is_held_of_a_sensor_is_told_before_it_begins_anew():
 
 
 def test_nothing_waits_for_ever():
-    counts = SyncCounts(["a", "b"], shortest_s=SHORTEST_S)
+    counts = PulseAligner(["a", "b"], shortest_s=SHORTEST_S)
     assert counts.add("b", "early", 4, 1_000_000_000) == []  # the first sensor has said nothing yet
     assert counts.release(1_400_000_000) == []
     assert counts.release(1_600_000_000) == [("early", 0)]

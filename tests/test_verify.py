@@ -55,7 +55,7 @@ def flip(path, *rows, sensor="left"):
 def test_whole(tmp_path):
     path = write_recording(tmp_path / "rec.h5", measurements(1, 2, 3))
     (report,) = verify(path)
-    assert (report.sensor, report.measurements, report.whole) == ("left", 3, True)
+    assert (report.sensor, report.measurements, report.is_intact) == ("left", 3, True)
     assert run("verify", path).stdout == f"{path}  left: 3 measurements, whole\n"
     assert run("verify", path, "--quiet").stdout == ""
 
@@ -93,7 +93,7 @@ def unnumbered(monkeypatch):
 def test_disorder_is_told(tmp_path):
     path = write_recording(tmp_path / "rec.h5", measurements(1, 2, 4, 3, 4))
     (report,) = verify(path)
-    assert report.disordered == (3,)
+    assert report.out_of_order == (3,)
     assert "1 out of order (at 3)" in run("verify", path, code=3).stdout
 
 
@@ -107,10 +107,10 @@ def test_a_number_that_comes_twice_is_told(tmp_path):
 def test_numbers_that_start_again(tmp_path):
     with create(tmp_path, entries(2, first=8, session_id=1)) as journal:
         journal.append(entries(2, first=0, session_id=2))
-    assert verify(journal.path)[0].whole
+    assert verify(journal.path)[0].is_intact
     given = measurements(8, 9, 0, 1)
     given[2:] = [replace(m, stamp=replace(m.stamp, session_id=2**62)) for m in given[2:]]
-    assert verify(write_recording(tmp_path / "rec.h5", given))[0].whole
+    assert verify(write_recording(tmp_path / "rec.h5", given))[0].is_intact
 
 
 def test_gaps_of_two_runs(tmp_path):
@@ -138,14 +138,14 @@ def test_gaps_of_two_runs(tmp_path):
     assert (tmp_path / "rec.h5").stat().st_ino == before
     (report,) = verify(tmp_path / "rec.h5")
     assert [(gap.first, gap.last, gap.reason, gap.session_id) for gap in report.gaps] == wanted
-    assert (report.disordered, report.damaged) == ((), ())
+    assert (report.out_of_order, report.damaged) == ((), ())
 
 
 def test_a_sealed_recording_of_two_runs_is_whole(tmp_path):
     given = [*entries(2, first=8, session_id=2**63 - 1), *entries(3, first=0, session_id=1)]
     create(tmp_path, given).close()
     path = seal(tmp_path / "rec.h5.journal").recording
-    assert verify(path)[0].whole
+    assert verify(path)[0].is_intact
     with open_recording(path) as recording:
         assert recording.stamps() == [measurement.stamp for measurement in recording]
         assert recording.stamps() == [entry.measurement.stamp for entry in given]
@@ -156,7 +156,7 @@ def test_files_from_before_epochs_were_numbers_of_runs():
     with h5py.File(path) as file:
         (group,) = file["sensors"].values()
         assert (group["epoch"].dtype.str, "gap_epoch" in group) == ("<i4", False)
-    assert all(report.whole for report in verify(path))
+    assert all(report.is_intact for report in verify(path))
 
 
 def test_a_disk_that_fails_damages_no_recording(tmp_path, monkeypatch):
@@ -175,7 +175,7 @@ def test_one_sensor_of_two_cannot_be_read(tmp_path):
     with h5py.File(path, "r+") as file:
         file["sensors/right/sequence"][0] = 7
     left, right = verify(path)
-    assert (left.whole, right.whole) == (True, False)
+    assert (left.is_intact, right.is_intact) == (True, False)
     assert "the content of sensor right has SHA-256" in right.fault
     assert "right: " in run("verify", path, code=3).stdout
     with h5py.File(path, "r+") as file:
@@ -186,12 +186,12 @@ def test_one_sensor_of_two_cannot_be_read(tmp_path):
 
 def test_journals(tmp_path):
     path = crashed(tmp_path, [*entries(2), *entries(1, sensor="right")])
-    assert [report.whole for report in verify(path)] == [True, True]
+    assert [report.is_intact for report in verify(path)] == [True, True]
     with Journal.open(path) as journal:
         journal.note_gap("left", 12, 13, "footer", session_id=EPOCH)
     spoil(path, "UPDATE measurements SET words = x'00' WHERE id <= 2")
     left, right = verify(path)
-    assert right.whole
+    assert right.is_intact
     assert [(item.index, item.sequence) for item in left.damaged] == [(0, 10), (1, 11)]
     assert [(gap.first, gap.last, gap.reason) for gap in left.gaps] == [
         (10, 11, "damaged in the journal"),
@@ -214,5 +214,5 @@ def test_several_files_and_such_that_cannot_be_read(tmp_path, recording):
 def test_a_recording_without_a_sensor(recording):
     with h5py.File(recording, "r+") as file:
         del file["sensors/left"]
-    with pytest.raises(DataError, match="rec.h5 contains no sensor; copy it again"):
+    with pytest.raises(DataError, match=r"rec\.h5 contains no sensor; copy it again"):
         verify(recording)

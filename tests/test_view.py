@@ -360,5 +360,8 @@ def test_sensors_whose_places_nobody_knows_have_no_platform():
     for drawn in frame.sensors.values():
         assert (drawn.pose, drawn.shape, len(drawn.position_m), drawn.n_points) == (None, None, 0, 1)
         assert (drawn.picture == TABLE[255]).all(axis=2).any()
-    with pytest.raises(ArgumentError, match="the mountings of sensors front, left on their platform are unknown, but all points need one frame"):
+    with pytest.raises(
+        ArgumentError,
+        match="the mountings of sensors front, left on their platform are unknown, but all points need one frame",
+    ):
         points_ply(scene.latest(Choices()))

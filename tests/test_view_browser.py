@@ -23,7 +23,7 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from ertis_numba.frames import Measurement, Stamp
-from ertis_numba.journal import Entry
+from ertis_numba.journal import JournalEntry
 from ertis_numba.network.sensor_node import SensorNode
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Processing, Recording, Settings
@@ -294,7 +294,7 @@ def measuring(address):
         number = 0
         while not ended.wait(1 / RATE_HZ):
             stamp = Stamp(sensor="front", sequence=number, sync_count=number, session_id=3, timestamp_ns=time.time_ns())
-            node.append([Entry(Measurement(words, settings, stamp), time.monotonic_ns())])
+            node.append([JournalEntry(Measurement(words, settings, stamp), time.monotonic_ns())])
             number += 1
 
     with SensorNode(address) as node:

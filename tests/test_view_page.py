@@ -28,7 +28,9 @@ def test_a_port_that_is_taken_is_refused(tmp_path):
     with socket.socket() as other, Playback(path) as playback:
         other.bind(("127.0.0.1", 0))
         other.listen()
-        with pytest.raises(NetworkError, match=r"cannot serve the page at 127\.0\.0\.1:\d+ .*; give another host or port"):
+        with pytest.raises(
+            NetworkError, match=r"cannot serve the page at 127\.0\.0\.1:\d+ .*; give another host or port"
+        ):
             Viewer(playback, port=other.getsockname()[1])
     with Playback(path) as playback, pytest.raises(NetworkError, match=r"cannot serve the page at 203\.0\.113\.1"):
         Viewer(playback, host="203.0.113.1", port=0)

@@ -231,7 +231,9 @@ def test_filter_response_is_that_of_the_taps():
 @pytest.mark.parametrize("decimation", [10, 30])
 def test_decimation_that_leaves_too_little_is_refused(decimation):
     rate_hz = 4.5e6 / decimation
-    with pytest.raises(ArgumentError, match=f"decimation {decimation} gives a rate of {rate_hz:g} Hz, too low .*; give a smaller one"):
+    with pytest.raises(
+        ArgumentError, match=f"decimation {decimation} gives a rate of {rate_hz:g} Hz, too low .*; give a smaller one"
+    ):
         decimation_taps(sample_rate_hz=4.5e6, decimation=decimation, pass_hz=0.499 * rate_hz)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from ertis_numba.errors import ArgumentError
-from ertis_numba.journal import Entry, Journal
+from ertis_numba.journal import Journal, JournalEntry
 from ertis_numba.network.processing import ProcessingOptions
 from ertis_numba.network.processing.choice import Choice, Mode
 from ertis_numba.network.processing.dead_letter_queue import DeadLetterQueue
@@ -130,14 +130,17 @@ def test_a_quarantine_has_an_end(tmp_path):
     quarantine = DeadLetterQueue(tmp_path, log)
     for number in range(110):
         stamp = replace(MEASUREMENT.stamp, sequence=number)
-        quarantine.put(Entry(replace(MEASUREMENT, stamp=stamp), 0, zlib.crc32(MEASUREMENT.data.tobytes())))
+        quarantine.put(JournalEntry(replace(MEASUREMENT, stamp=stamp), 0, zlib.crc32(MEASUREMENT.data.tobytes())))
         while quarantine._waiting.qsize() > 8:  # noqa: SLF001
             os.sched_yield()
     quarantine.close()
     (path,) = tmp_path.glob("quarantine_*.h5.journal")
     with Journal.open(path) as journal:
         assert len(list(journal.entries())) == 100
-    assert sum("100 measurements are kept already" in fields["text"] for event, fields in log.lines if event == "not_kept") == 10
+    assert (
+        sum("100 measurements are kept already" in fields["text"] for event, fields in log.lines if event == "not_kept")
+        == 10
+    )
 
 
 def test_a_quarantine_ends_though_its_disk_does_not_answer(tmp_path, monkeypatch):
@@ -146,7 +149,7 @@ def test_a_quarantine_ends_though_its_disk_does_not_answer(tmp_path, monkeypatch
     monkeypatch.setattr(DeadLetterQueue, "_write", lambda *_: answers.wait(TIMEOUT_S))
     quarantine = DeadLetterQueue(tmp_path, Lines("processing"))
     for _ in range(20):  # more than may wait
-        quarantine.put(Entry(MEASUREMENT, 0, 0))
+        quarantine.put(JournalEntry(MEASUREMENT, 0, 0))
     quarantine.close()
     assert quarantine._thread.is_alive()  # noqa: SLF001
     answers.set()

@@ -95,7 +95,7 @@ def cloud():
 def test_point_clouds_become_the_rows_of_exported_files():
     found = cloud()
     rows = found.to_structured()
-    exported = PointTable.of([image()], lambda _: found, {}).rows
+    exported = PointTable.from_images([image()], lambda _: found, {}).rows
     assert set(rows.dtype.names) == set(exported.dtype.names) - {"sensor"}
     for name in rows.dtype.names:
         assert rows.dtype[name] == exported.dtype[name]

@@ -24,8 +24,8 @@ import numpy as np
 
 from ertis_numba.errors import ErtisError
 from ertis_numba.frames import Measurement, Stamp
-from ertis_numba.journal import SUFFIX, Entry, Journal, JournalGap, JournalSensor
-from ertis_numba.journal._tables import insertion
+from ertis_numba.journal import SUFFIX, Journal, JournalEntry, JournalGap, JournalSensor
+from ertis_numba.journal._tables import insert_statement
 from ertis_numba.network.allow_list import AllowList, Permission
 from ertis_numba.network.central_node._ledger import Ledger
 from ertis_numba.network.central_node._received_items import SensorSession
@@ -162,7 +162,7 @@ def _journal(state: str) -> Callable[[Path], Judge]:
             sealed = seal(work / f"rec.h5{SUFFIX}")
             if sealed.recording is None:
                 return None, False
-            reported = bool(sealed.remark) or not all(report.whole for report in verify(sealed.recording))
+            reported = bool(sealed.remark) or not all(report.is_intact for report in verify(sealed.recording))
             return _content(sealed.recording), reported
 
         return lambda work: _judged(lambda: read(work), wanted)
@@ -179,7 +179,7 @@ def _recording(folder: Path) -> Judge:
     wanted = _content(folder / "rec.h5")
 
     def read(work: Path) -> tuple[object, bool]:
-        reported = not all(report.whole for report in verify(work / "rec.h5"))
+        reported = not all(report.is_intact for report in verify(work / "rec.h5"))
         return (None if reported else _content(work / "rec.h5")), reported
 
     return lambda work: _judged(lambda: read(work), wanted)
@@ -280,17 +280,17 @@ def _attribute(file: h5py.File, value: Any, key: str) -> object:
 # Processes that are killed
 
 
-def _entries(count: int, first: int = 0) -> Iterator[Entry]:
+def _entries(count: int, first: int = 0) -> Iterator[JournalEntry]:
     for number in range(first, first + count):
         for sensor in _SENSORS:
             words = np.random.default_rng([number, _SENSORS.index(sensor)]).integers(
                 0, 2**32, _SETTINGS.recording.n_samples, dtype=np.uint32
             )
             stamp = Stamp(sensor=sensor, sequence=number, session_id=_SESSION_ID, timestamp_ns=1_000_000_007 * number)
-            yield Entry(Measurement(words, _SETTINGS, stamp), monotonic_ns=number)
+            yield JournalEntry(Measurement(words, _SETTINGS, stamp), monotonic_ns=number)
 
 
-def _emit_event(entries: list[Entry]) -> None:
+def _emit_event(entries: list[JournalEntry]) -> None:
     for entry in entries:
         stamp = entry.measurement.stamp
         sys.stdout.write(json.dumps([stamp.sensor, stamp.sequence, entry.crc32]) + "\n")
@@ -304,7 +304,7 @@ def _begin_another_commit(journal: Journal) -> None:
     execute("BEGIN")
     execute("UPDATE measurements SET crc32 = 0 WHERE id % 9 = 1")
     for number in range(60):
-        execute(insertion("measurements"), (1, _SESSION_ID, 10_000 + number, *[0] * 9, bytes(8192)))
+        execute(insert_statement("measurements"), (1, _SESSION_ID, 10_000 + number, *[0] * 9, bytes(8192)))
 
 
 def _live(state: str, folder: Path) -> None:
@@ -324,7 +324,7 @@ def _live(state: str, folder: Path) -> None:
         spool = DiskSpool(folder, 10**9, None, on_note=lambda _: None)
         spool.open()
         for sensor in _SENSORS:
-            spool.add_sensor(JournalSensor.of(sensor, _SETTINGS))
+            spool.add_sensor(JournalSensor.from_settings(sensor, _SETTINGS))
         entries = list(_entries(20))
         for entry in entries:
             spool.append([entry])

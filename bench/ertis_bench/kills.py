@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 import ertis_numba
 from ertis_numba.frames import Measurement, Stamp
-from ertis_numba.journal import Entry, Journal
+from ertis_numba.journal import Journal, JournalEntry
 from ertis_numba.settings import Recording, Settings
 
 __all__ = ["appending", "sealing"]
@@ -114,7 +114,7 @@ def _append(*, path: str, seed: int) -> None:
                 journal.add_sensor(sensor, _SETTINGS, firmware="1.2.3")
             stamp = Stamp(sensor=sensor, sequence=counts[sensor], session_id=_SESSION_ID)
             measurement = Measurement(_words(seed, sensor, counts[sensor]), _SETTINGS, stamp)
-            entries.append(Entry(measurement, monotonic_ns=counts[sensor]))
+            entries.append(JournalEntry(measurement, monotonic_ns=counts[sensor]))
             counts[sensor] += 1
         journal.append(entries)
         for entry in entries:
@@ -169,7 +169,7 @@ def _crash(folder: Path, seed: int) -> None:
                     sensor=sensor, sequence=sequence, sync_count=sequence, timestamp_ns=sequence, session_id=_SESSION_ID
                 )
                 words = _words(seed, sensor, sequence)
-                journal.append([Entry(Measurement(words, _SETTINGS, stamp), monotonic_ns=sequence)])
+                journal.append([JournalEntry(Measurement(words, _SETTINGS, stamp), monotonic_ns=sequence)])
         journal.note_gap("left", 4, 4, "footer", session_id=_SESSION_ID)
         journal.note_gap("absent", 0, 6, "it was silent", session_id=_SESSION_ID)
         shutil.copytree(made, folder)  # nothing is written now: to the files, it is as if this process was killed

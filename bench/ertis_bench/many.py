@@ -17,7 +17,7 @@ from ertis_bench import checks, machine, subject
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table as _table
 from ertis_numba import cluster
-from ertis_numba.campaign import Begun, Campaign, CampaignOptions, RecordingEnded, find
+from ertis_numba.campaign import Campaign, CampaignOptions, RecordingEnded, RecordingStarted, find_recordings
 from ertis_numba.errors import DataError
 from ertis_numba.frames import Measurement
 from ertis_numba.storage import open_energyscapes, open_recording, write_recording
@@ -136,8 +136,8 @@ def _differences(files: dict[str, bytes], wanted: dict[str, bytes]) -> Iterator[
 
 def _timed(folder: Path, target: Path, *, threads: int | None = None, **pool: Any) -> tuple[float, float]:
     begin_s = first_s = time.perf_counter()
-    for event in Campaign(find([folder]), target, CampaignOptions(threads=threads), **pool).run():
-        if isinstance(event, Begun) and first_s == begin_s:
+    for event in Campaign(find_recordings([folder]), target, CampaignOptions(threads=threads), **pool).run():
+        if isinstance(event, RecordingStarted) and first_s == begin_s:
             first_s = time.perf_counter()
         if isinstance(event, RecordingEnded) and event.outcome != "made":
             raise DataError(f"{event.recording} is {event.outcome} ({event.error}); it is not timed")

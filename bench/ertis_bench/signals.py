@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from ertis_bench import captures
-from ertis_numba.journal import SUFFIX, Entry, Journal
+from ertis_numba.journal import SUFFIX, Journal, JournalEntry
 from ertis_numba.storage import open_recording
 
 __all__ = ["COMMANDS", "MAX_END_S", "send"]
@@ -116,7 +116,7 @@ def _files(folder: Path, source: Path) -> dict[str, str]:
         made.mkdir()
         with Journal.create(made / f"rec.h5{SUFFIX}", target="rec.h5", source="signals") as journal:
             journal.add_sensor(measurement.stamp.sensor, measurement.settings)
-            journal.append([Entry(measurement, monotonic_ns=0)])
+            journal.append([JournalEntry(measurement, monotonic_ns=0)])
             shutil.copytree(made, crashed)  # as a killed process leaves it
     done = captures.ertis("process", str(source), "-o", str(images), "--quiet")
     done.check_returncode()

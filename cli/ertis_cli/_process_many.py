@@ -47,12 +47,12 @@ def process_many(
     as_json: bool,
 ) -> None:
     """Process recordings into a folder, and report the outcome of each."""
-    from ertis_numba.campaign import Campaign, find
+    from ertis_numba.campaign import Campaign, find_recordings
 
     context = click.get_current_context()
     if target is None:
         raise click.UsageError("several recordings need an output folder; give one with -o", context)
-    recordings = find(paths)
+    recordings = find_recordings(paths)
     campaign = Campaign(recordings, target, wanted, workers=workers, scheduler=scheduler)
     report = _Report([found.path for found in recordings], quiet=quiet, as_json=as_json)
     with closing(campaign.run()) as events, _shown(len(recordings), quiet=quiet) as shown:
@@ -93,12 +93,12 @@ class _Bars(_Hidden):
         self._tasks: dict[Path, TaskID] = {}
 
     def follow(self, event: "Event") -> None:
-        from ertis_numba.campaign import Advanced, Begun
+        from ertis_numba.campaign import RecordingProgress, RecordingStarted
 
         match event:
-            case Begun(recording, measurements):
+            case RecordingStarted(recording, measurements):
                 self._tasks[recording] = self.progress.add_task(recording.name, total=measurements)
-            case Advanced(recording, done):
+            case RecordingProgress(recording, done):
                 if recording in self._tasks:
                     self.progress.update(self._tasks[recording], completed=done)
             case _:

@@ -91,7 +91,7 @@ def _recording(target: Path, *, overwrite: bool) -> Iterator[Write]:
     """Yield a function that appends measurements to a journal; the journal is then sealed into a recording."""
     from ertis_numba.atomic_files import check_target
     from ertis_numba.errors import DataError
-    from ertis_numba.journal import SUFFIX, Entry, Journal, seal_apart
+    from ertis_numba.journal import SUFFIX, Journal, JournalEntry, seal_in_subprocess
 
     check_target(target, overwrite=overwrite)
     path = target.with_name(f"{target.name}{SUFFIX}")
@@ -111,14 +111,14 @@ def _recording(target: Path, *, overwrite: bool) -> Iterator[Write]:
                     rotation_xyzw=arrival.rotation_xyzw,
                 )
                 known.add(sensor)
-            journal.append([Entry(measurement, arrival.arrived_ns)])
+            journal.append([JournalEntry(measurement, arrival.arrived_ns)])
 
         try:
             yield write
         except BaseException:
             if len(journal):
                 click.echo(
-                    f"the received measurements are safe in {path}; seal them with 'ertis recover {path}'", err=True
+                    f"the received measurements are safe in {path}; recover them with 'ertis recover {path}'", err=True
                 )
             else:
                 journal.remove()
@@ -128,6 +128,6 @@ def _recording(target: Path, *, overwrite: bool) -> Iterator[Write]:
             raise DataError(
                 f"{target} is not written, because no measurement was received; run the command for a longer time"
             )
-    sealed = seal_apart(path, overwrite=overwrite)
+    sealed = seal_in_subprocess(path, overwrite=overwrite)
     if sealed.recording is None:
         raise DataError(sealed.remark)

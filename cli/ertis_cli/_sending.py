@@ -11,7 +11,7 @@ from ertis_cli import options
 from ertis_cli._watch import Watch
 
 if TYPE_CHECKING:
-    from ertis_numba.capture import Session
+    from ertis_numba.capture import CaptureSession
     from ertis_numba.devices.bits import BitCheck
     from ertis_numba.network.keys import ClientKeys
     from ertis_numba.network.sensor_node import Acknowledged, SensorNode
@@ -117,7 +117,7 @@ class Sending:
         )
         return self._node
 
-    def run(self, session: "Session", checks: "dict[str, BitCheck]", *, patience_s: float) -> Exception | None:
+    def run(self, session: "CaptureSession", checks: "dict[str, BitCheck]", *, patience_s: float) -> Exception | None:
         """Capture, wait for the acknowledgement of all measurements, and return the error, if any."""
         from ertis_numba.errors import NetworkError
 
@@ -182,7 +182,7 @@ def _require_room(option: str, size_mb: float, settings: "Settings") -> None:
     from ertis_numba.errors import ArgumentError
     from ertis_numba.journal import JournalSensor
 
-    min_mb = 1e-6 * JournalSensor.of("any", settings).n_bytes
+    min_mb = 1e-6 * JournalSensor.from_settings("any", settings).n_bytes
     if size_mb < min_mb:
         raise ArgumentError(
             f"{option} is {size_mb:g} MB, but one measurement has {min_mb:.3g} MB; give a larger size, or remove it"

@@ -12,10 +12,10 @@ import click
 from ertis_cli import options
 
 if TYPE_CHECKING:
-    from ertis_numba.capture import Session
-    from ertis_numba.capture.session import Sink
+    from ertis_numba.capture import CaptureSession
+    from ertis_numba.capture.session import MeasurementSink
     from ertis_numba.devices.bits import BitCheck
-    from ertis_numba.journal import Entry
+    from ertis_numba.journal import JournalEntry
 
 __all__ = ["Watch", "report"]
 
@@ -37,10 +37,12 @@ class Watch:
         self._line = sys.stderr.isatty() and not quiet
         self._next_s = 0.0
         self.took: dict[str, float] = {}
-        self._session: Session | None = None
+        self._session: CaptureSession | None = None
         self._checks: dict[str, BitCheck] = {}
 
-    def run(self, session: "Session", sink: "Sink", checks: "dict[str, BitCheck]", *, where: str) -> Exception | None:
+    def run(
+        self, session: "CaptureSession", sink: "MeasurementSink", checks: "dict[str, BitCheck]", *, where: str
+    ) -> Exception | None:
         """Run a session; return the error that ended it early, or None.
 
         ``where`` is printed on an interruption, and states where the measurements are.
@@ -60,7 +62,7 @@ class Watch:
                 click.echo("\r\x1b[K", err=True, nl=False)
         return None
 
-    def stored(self, entries: "list[Entry]") -> None:
+    def stored(self, entries: "list[JournalEntry]") -> None:
         """Report durable measurements."""
         if self._as_json:
             for entry in entries:
@@ -132,7 +134,7 @@ class Watch:
 
 def report(
     target: Path | str,
-    session: "Session",
+    session: "CaptureSession",
     took: dict[str, float],
     *,
     quiet: bool,

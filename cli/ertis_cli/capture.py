@@ -20,7 +20,7 @@ from ertis_cli._watch import Watch, report
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from ertis_numba.capture import Session
+    from ertis_numba.capture import CaptureSession
     from ertis_numba.devices.bits import BitCheck
     from ertis_numba.devices.setup import Setup
     from ertis_numba.devices.sonar import SonarDriver
@@ -187,7 +187,7 @@ def capture(
         raise click.UsageError("--spool-size is given without --spool; add --spool with its folder")
     _network.require_duration(duration)
     from ertis_numba.atomic_files import check_target
-    from ertis_numba.capture import Session
+    from ertis_numba.capture import CaptureSession
 
     if target is not None:
         check_target(target, overwrite=force)
@@ -205,7 +205,7 @@ def capture(
         target = target or Path(_default_name(list(sonars)))
         if send is None:
             check_target(target, overwrite=force)
-        session = Session(
+        session = CaptureSession(
             sonars,
             settings,
             trigger=trigger,
@@ -237,7 +237,7 @@ def capture(
 
 
 def _record(
-    session: "Session",
+    session: "CaptureSession",
     watch: Watch,
     checks: "dict[str, BitCheck]",
     target: Path,
@@ -255,7 +255,7 @@ def _record(
     )
     if journal.remark:
         click.echo(f"ertis: warning: {journal.remark}", err=True)
-    where = f"the measurements so far are safe in {path}; seal them with 'ertis recover {path}'"
+    where = f"the measurements so far are safe in {path}; recover them with 'ertis recover {path}'"
     failure = watch.run(session, journal, checks, where=where)
     if signals.came and not len(journal):
         journal.remove()
@@ -268,12 +268,12 @@ def _record(
 def _seal(path: Path, failure: Exception | None, *, overwrite: bool) -> None:
     """Seal the journal into a recording, then raise the error that ended the capture, if any."""
     from ertis_numba.errors import DataError
-    from ertis_numba.journal import seal_apart
+    from ertis_numba.journal import seal_in_subprocess
 
     try:
-        sealed = seal_apart(path, overwrite=overwrite)
+        sealed = seal_in_subprocess(path, overwrite=overwrite)
     except (OSError, ValueError) as error:
-        reported = f"{error}; the measurements are safe in {path}; seal them with 'ertis recover {path}'"
+        reported = f"{error}; the measurements are safe in {path}; recover them with 'ertis recover {path}'"
         if failure is None:
             raise DataError(reported) from error
         click.echo(f"ertis: error: {reported}", err=True)

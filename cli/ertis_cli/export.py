@@ -100,8 +100,8 @@ def export(
     from ertis_numba import interop
     from ertis_numba.storage import check_target, file_kind, open_energyscapes, open_recording
 
-    name = interop.format_of(target, file_format)
-    for file in interop.files_of(target, name):
+    name = interop.choose_format(target, file_format)
+    for file in interop.output_files(target, name):
         check_target(file, overwrite=force, sources=[path])
     with ExitStack() as stack:
         recorded = name == "acoular" or file_kind(path) == "recording"

@@ -235,7 +235,7 @@ def _note_mountings(path: Path, *, quiet: bool) -> None:
 
 def _process_one(path: Path, target: Path, wanted: "CampaignOptions", *, quiet: bool, as_json: bool) -> dict[str, Any]:
     """Process one recording in this process, and return the report."""
-    from ertis_numba.campaign import making
+    from ertis_numba.campaign import prepare_recording
 
     @contextmanager
     def pipelines(several: "Sequence[Settings]") -> "Iterator[list[Pipeline]]":
@@ -249,7 +249,7 @@ def _process_one(path: Path, target: Path, wanted: "CampaignOptions", *, quiet: 
         for line in () if as_json or quiet else _plans.said_of(sensor, reported):
             click.echo(line, err=True)
 
-    with making(
+    with prepare_recording(
         path,
         target,
         wanted,

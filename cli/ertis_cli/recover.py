@@ -62,7 +62,7 @@ def _found(place: Path) -> list[Path]:
 def _seal(journal: Path, *, force: bool, quiet: bool) -> dict[str, Any]:
     """Seal a journal and return a report of the result."""
     from ertis_numba.errors import DataError, JournalInUseError
-    from ertis_numba.journal import seal_apart
+    from ertis_numba.journal import seal_in_subprocess
 
     with options.progress(range(_STEPS), length=_STEPS, label=journal.name, quiet=quiet) as shown:
         steps = iter(shown)
@@ -74,7 +74,7 @@ def _seal(journal: Path, *, force: bool, quiet: bool) -> dict[str, Any]:
                 n_reported += 1
 
         try:
-            sealed = seal_apart(journal, overwrite=force, progress=progress)
+            sealed = seal_in_subprocess(journal, overwrite=force, progress=progress)
         except (DataError, OSError) as error:
             return {"journal": str(journal), "error": str(error), "in_use": isinstance(error, JournalInUseError)}
         except KeyboardInterrupt as interrupt:

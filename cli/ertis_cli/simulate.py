@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from ertis_numba.simulation import Scene
     from ertis_numba.simulation.plan import EffectPlan
     from ertis_numba.simulation.render import Simulator
-    from ertis_numba.storage import TruthLog
+    from ertis_numba.storage import GroundTruthLog
 
 __all__ = ["simulate"]
 
@@ -146,7 +146,7 @@ def _require_room(target: Path, scene: "Scene", names: "Sequence[str]", n_reflec
 
 
 def _measurements(
-    simulators: "Sequence[Simulator]", firsts: "dict[str, list[Reflector]]", logs: "dict[str, TruthLog]"
+    simulators: "Sequence[Simulator]", firsts: "dict[str, list[Reflector]]", logs: "dict[str, GroundTruthLog]"
 ) -> "Iterator[Measurement]":
     """Yield simultaneous measurements, one sensor after the other, and log their ground truth."""
     scene = simulators[0].scene
@@ -157,12 +157,12 @@ def _measurements(
             yield simulator.render(index)
 
 
-def _log(scene: "Scene", plan: "EffectPlan", folder: Path) -> "TruthLog":
-    from ertis_numba.storage import TruthLog
+def _log(scene: "Scene", plan: "EffectPlan", folder: Path) -> "GroundTruthLog":
+    from ertis_numba.storage import GroundTruthLog
 
     # Store the verdicts, so that the same data can be rendered even if an A/B render would decide otherwise.
     decided = scene.replace(effects={verdict.name: verdict.on for verdict in plan.verdicts})
-    return TruthLog(decided.to_toml(), scene.seed, left_out=plan.left_out, folder=folder)
+    return GroundTruthLog(decided.to_toml(), scene.seed, left_out=plan.left_out, folder=folder)
 
 
 def _mounting(simulator: "Simulator") -> Any:

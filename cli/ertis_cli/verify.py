@@ -41,9 +41,9 @@ def verify(ctx: click.Context, *, paths: tuple[Path, ...], quiet: bool, as_json:
             files.append({"file": str(path), "error": str(error)})
             code = _FAILED
             continue
-        whole = all(report.whole for report in reports)
+        whole = all(report.is_intact for report in reports)
         code = code or (0 if whole else _INCOMPLETE)
-        sensors = [{**asdict(report), "missing": report.missing, "whole": report.whole} for report in reports]
+        sensors = [{**asdict(report), "missing": report.missing, "whole": report.is_intact} for report in reports]
         files.append({"file": str(path), "whole": whole, "sensors": sensors})
         if not (quiet or as_json):
             for report in reports:
@@ -63,11 +63,11 @@ def _line(report: "SensorReport") -> str:
         reported.append(f"{report.missing} missing ({gaps})")
     if report.damaged:
         reported.append(f"{len(report.damaged)} damaged (at {_places(item.index for item in report.damaged)})")
-    if report.disordered:
-        reported.append(f"{len(report.disordered)} out of order (at {_places(report.disordered)})")
+    if report.out_of_order:
+        reported.append(f"{len(report.out_of_order)} out of order (at {_places(report.out_of_order)})")
     if report.remark:
         reported.append(report.remark)
-    return f"{report.sensor}: {', '.join(reported)}{', whole' if report.whole else ''}"
+    return f"{report.sensor}: {', '.join(reported)}{', whole' if report.is_intact else ''}"
 
 
 def _places(places: Iterable[int]) -> str:

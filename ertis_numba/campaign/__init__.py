@@ -5,21 +5,21 @@ recording. Workers are independent processes: a crash affects only the recording
 """
 
 from ertis_numba.campaign.campaign import Campaign
-from ertis_numba.campaign.events import Advanced, Begun, Event, RecordingEnded
-from ertis_numba.campaign.making import Making, making
-from ertis_numba.campaign.orders import CampaignOptions
-from ertis_numba.campaign.recordings import Source, find, outputs
+from ertis_numba.campaign.events import Event, RecordingEnded, RecordingProgress, RecordingStarted
+from ertis_numba.campaign.recording_job import RecordingJob, prepare_recording
+from ertis_numba.campaign.recordings import RecordingFile, find_recordings, output_paths
+from ertis_numba.campaign.tasks import CampaignOptions
 
 __all__ = [
-    "Advanced",
-    "Begun",
     "Campaign",
     "CampaignOptions",
     "Event",
-    "Making",
     "RecordingEnded",
-    "Source",
-    "find",
-    "making",
-    "outputs",
+    "RecordingFile",
+    "RecordingJob",
+    "RecordingProgress",
+    "RecordingStarted",
+    "find_recordings",
+    "output_paths",
+    "prepare_recording",
 ]

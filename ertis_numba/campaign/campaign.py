@@ -8,12 +8,20 @@ from pathlib import Path
 from typing import Any, Final
 
 from ertis_numba import checks
-from ertis_numba.campaign.events import Advanced, Begun, Event, Outcome, RecordingEnded
+from ertis_numba.campaign.events import Event, Outcome, RecordingEnded, RecordingProgress, RecordingStarted
 from ertis_numba.campaign.existing_output import difference
-from ertis_numba.campaign.folder import clear_parts, sole
-from ertis_numba.campaign.orders import HOW, MAX_BYTES, CampaignOptions, Do, News, WorkerPool, WorkOrder
+from ertis_numba.campaign.folder import clear_parts, exclusive_folder
 from ertis_numba.campaign.plans import Plans
-from ertis_numba.campaign.recordings import Source, outputs
+from ertis_numba.campaign.recordings import RecordingFile, output_paths
+from ertis_numba.campaign.tasks import (
+    MAX_WAITING_BYTES,
+    TASK_OPTIONS,
+    CampaignOptions,
+    Task,
+    TaskAction,
+    TaskUpdate,
+    WorkerPool,
+)
 from ertis_numba.cpu_cores import usable_cores
 from ertis_numba.errors import ArgumentError, ErtisError
 from ertis_numba.geometry import self_contained
@@ -22,14 +30,14 @@ from ertis_numba.settings import Accuracy, Settings
 __all__ = ["Campaign"]
 
 _WAIT_S: Final = 0.5
-_AHEAD: Final = 2  # Recordings inspected in advance, so that no worker waits.
+_N_INSPECTED_AHEAD: Final = 2  # Recordings inspected in advance, so that no worker waits.
 
 
 @dataclass(slots=True, eq=False)
-class _Case:
+class _RecordingState:
     """Recording in progress."""
 
-    found: Source
+    found: RecordingFile
     target: Path
     measurements: int = 0
     wanted: dict[str, Settings] = field(default_factory=dict)
@@ -69,7 +77,7 @@ class Campaign:
 
     def __init__(
         self,
-        recordings: Sequence[Source],
+        recordings: Sequence[RecordingFile],
         folder: str | Path,
         options: CampaignOptions | None = None,
         *,
@@ -84,14 +92,14 @@ class Campaign:
                     "them"
                 )
         self.folder, self._options = Path(folder), options or CampaignOptions()
-        targets = outputs(recordings, self.folder)
+        targets = output_paths(recordings, self.folder)
         self._names = {target.name for target in targets}
-        self._waiting = deque(_Case(*pair) for pair in zip(recordings, targets, strict=True))
+        self._waiting = deque(_RecordingState(*pair) for pair in zip(recordings, targets, strict=True))
         self._workers, self._scheduler = workers, scheduler
         self._plans = Plans()
-        self._unplanned: deque[_Case] = deque()
-        self._ready: deque[_Case] = deque()
-        self._given: dict[int, tuple[WorkOrder, _Case]] = {}
+        self._unplanned: deque[_RecordingState] = deque()
+        self._ready: deque[_RecordingState] = deque()
+        self._submitted: dict[int, tuple[Task, _RecordingState]] = {}
         self._n_orders = 0
 
     @property
@@ -113,60 +121,60 @@ class Campaign:
         NetworkError
             The scheduler does not answer, or the connection to it is lost.
         """
-        with sole(self.folder):
+        with exclusive_folder(self.folder):
             clear_parts(self.folder, self._names)
             try:
                 with closing(self._pool()) as pool:
-                    while self._feed(pool):
+                    while self._submit_tasks(pool):
                         for news in pool.wait(_WAIT_S):
-                            yield from self._heard(pool, news)
+                            yield from self._handle_update(pool, news)
             finally:
                 clear_parts(self.folder, self._names)
 
     def _pool(self) -> WorkerPool:
         if self._scheduler is not None:
-            from ertis_numba.campaign.members import Members  # noqa: PLC0415  it loads dask
+            from ertis_numba.campaign.dask_workers import DaskWorkerPool  # noqa: PLC0415  it loads dask
 
-            return Members(self._scheduler)
+            return DaskWorkerPool(self._scheduler)
         from ertis_numba.campaign.processes import ProcessPool  # noqa: PLC0415
 
         return ProcessPool(self.workers)
 
-    def _feed(self, pool: WorkerPool) -> bool:
+    def _submit_tasks(self, pool: WorkerPool) -> bool:
         """Give orders to free workers; return True if any order is in progress."""
         while pool.free > 0 and (pair := self._next(pool)) is not None:
-            self._given[pair[0].number] = pair
-            pool.give(pair[0])
-        return bool(self._given)
+            self._submitted[pair[0].number] = pair
+            pool.submit(pair[0])
+        return bool(self._submitted)
 
-    def _next(self, pool: WorkerPool) -> tuple[WorkOrder, _Case] | None:
+    def _next(self, pool: WorkerPool) -> tuple[Task, _RecordingState] | None:
         """Return the next order; recordings that are nearest to their end come first."""
         if self._ready:
             case = self._ready.popleft()
             return self._order("check" if case.is_kept else "make", self._pending_output(case, pool.size)), case
         if (planned := self._to_plan(pool.size)) is not None:
             return planned
-        in_hand = len(self._given) + len(self._unplanned)
-        if self._waiting and in_hand < pool.size + _AHEAD:
+        in_hand = len(self._submitted) + len(self._unplanned)
+        if self._waiting and in_hand < pool.size + _N_INSPECTED_AHEAD:
             case = self._waiting.popleft()
             return self._order("look", self._paths(case) | {"sensor": self._options.sensor}), case
         return None
 
-    def _to_plan(self, n_workers: int) -> tuple[WorkOrder, _Case] | None:
+    def _to_plan(self, n_workers: int) -> tuple[Task, _RecordingState] | None:
         """Return a planning order, unless all planning has to wait."""
         for case in self._unplanned:
-            settings = next(each for each in case.wanted.values() if self._plans.of(each) is None)
+            settings = next(each for each in case.wanted.values() if self._plans.get(each) is None)
             if (kind := self._plans.begin(settings)) is not None:
                 self._unplanned.remove(case)
                 about = {"settings": settings.to_toml(), "warm": kind == "new", **self._shares(n_workers)}
                 return self._order("plan", about), case
         return None
 
-    def _order(self, do: Do, about: dict[str, Any]) -> WorkOrder:
+    def _order(self, do: TaskAction, about: dict[str, Any]) -> Task:
         self._n_orders += 1
-        return WorkOrder(self._n_orders, do, about)
+        return Task(self._n_orders, do, about)
 
-    def _paths(self, case: _Case) -> dict[str, Any]:
+    def _paths(self, case: _RecordingState) -> dict[str, Any]:
         far = self._scheduler is not None  # Its workers may have another current folder.
         path, target = (each.absolute() if far else each for each in (case.found.path, case.target))
         return {"path": str(path), "target": str(target), "named": case.found.named, "dtype": self._options.dtype}
@@ -176,47 +184,47 @@ class Campaign:
         options = self._options
         return {"device": options.device, "plan": options.plan, "threads": options.threads, "share": share}
 
-    def _pending_output(self, case: _Case, n_workers: int) -> dict[str, Any]:
+    def _pending_output(self, case: _RecordingState, n_workers: int) -> dict[str, Any]:
         options = self._options
         planned = {}
         for name, settings in case.wanted.items():
-            plan = self._plans.of(settings)
+            plan = self._plans.get(settings)
             if isinstance(plan, Accuracy):
                 planned[name] = settings.replace(accuracy=plan).to_toml()
         return {
             **self._paths(case),
             **self._shares(n_workers),
-            **{name: getattr(options, name) for name in HOW},
+            **{name: getattr(options, name) for name in TASK_OPTIONS},
             "sensors": planned,
-            "max_bytes": MAX_BYTES / n_workers,
+            "max_bytes": MAX_WAITING_BYTES / n_workers,
             # Dask repeats the order of a lost worker, even if only the message about its result was missing.
             "overwrite": options.overwrite or self._scheduler is not None,
         }
 
-    def _heard(self, pool: WorkerPool, news: News) -> Iterator[Event]:
-        if news.number not in self._given:
+    def _handle_update(self, pool: WorkerPool, news: TaskUpdate) -> Iterator[Event]:
+        if news.number not in self._submitted:
             return
-        order, case = self._given[news.number]
+        order, case = self._submitted[news.number]
         if news.result is None:
             if news.done:
-                yield Advanced(case.found.path, news.done)
+                yield RecordingProgress(case.found.path, news.done)
             return
-        del self._given[news.number]
-        if order.do == "plan":
-            self._plans.end(Settings.from_toml(order.about["settings"], "settings"), news.result)
+        del self._submitted[news.number]
+        if order.action == "plan":
+            self._plans.finish(Settings.from_toml(order.arguments["settings"], "settings"), news.result)
             if "by_chance" not in news.result:
                 yield from self._planned(pool, case, news.result)
                 return
         if "error" in news.result:
-            if order.do == "make" and "by_chance" in news.result:
+            if order.action == "make" and "by_chance" in news.result:
                 clear_parts(self.folder, {case.target.name})  # A killed worker may have left them.
             yield case.ended("failed", error=news.result["error"])
-        elif order.do == "look":
-            yield from self._looked(case, news.result)
+        elif order.action == "look":
+            yield from self._handle_inspection(case, news.result)
         else:
             yield case.ended("kept" if case.is_kept else "made", made=news.result)
 
-    def _looked(self, case: _Case, reported: dict[str, Any]) -> Iterator[Event]:
+    def _handle_inspection(self, case: _RecordingState, reported: dict[str, Any]) -> Iterator[Event]:
         if reported.get("skipped"):
             yield case.ended("skipped")
             return
@@ -231,33 +239,33 @@ class Campaign:
             yield case.ended("failed", error=" ".join(str(error).split()))
             return
         if made is not None and not differs:
-            yield from self._found_there(case, made["sensors"])
+            yield from self._handle_existing(case, made["sensors"])
         elif made is not None and (made.get("recording") or not self._options.overwrite):
             remedy = "give another folder" + ("" if made.get("recording") else ", or ask to replace it (--force)")
             yield case.ended("failed", error=f"output {case.target} exists and {differs}; {remedy}")
         else:
-            yield from self._forward(case)
+            yield from self._advance(case)
 
-    def _found_there(self, case: _Case, sensors: dict[str, Any]) -> Iterator[Event]:
+    def _handle_existing(self, case: _RecordingState, sensors: dict[str, Any]) -> Iterator[Event]:
         """Report an existing output, or examine its processing first if the options request that."""
-        if not self._options.is_thorough:
+        if not self._options.examines_existing:
             yield case.ended("kept")
             return
         case.is_kept = True
         case.wanted = {name: Settings.from_toml(held["settings"], "settings") for name, held in sensors.items()}
-        yield from self._forward(case)
+        yield from self._advance(case)
 
-    def _planned(self, pool: WorkerPool, case: _Case, reported: dict[str, Any]) -> Iterator[Event]:
+    def _planned(self, pool: WorkerPool, case: _RecordingState, reported: dict[str, Any]) -> Iterator[Event]:
         if reported.get("device") == "cuda" and self._workers is None and self._scheduler is None:
             pool.limit(1)  # A GPU processes recordings faster one at a time.
         cases = [case, *self._unplanned]
         self._unplanned.clear()
         for each in cases:
-            yield from self._forward(each)
+            yield from self._advance(each)
 
-    def _forward(self, case: _Case) -> Iterator[Event]:
+    def _advance(self, case: _RecordingState) -> Iterator[Event]:
         """Queue a recording for processing if its plans are known, otherwise for planning."""
-        plans = [self._plans.of(settings) for settings in case.wanted.values()]
+        plans = [self._plans.get(settings) for settings in case.wanted.values()]
         failed = [plan for plan in plans if isinstance(plan, str)]
         if failed:
             yield case.ended("failed", error=f"{case.found.path}: {failed[0]}")
@@ -266,7 +274,7 @@ class Campaign:
         else:
             self._ready.append(case)
             if not case.is_kept:
-                yield Begun(case.found.path, case.measurements)
+                yield RecordingStarted(case.found.path, case.measurements)
 
 
 def _absolute(settings: Settings) -> Settings:

@@ -4,13 +4,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-__all__ = ["Advanced", "Begun", "Event", "Outcome", "RecordingEnded"]
+__all__ = ["Event", "Outcome", "RecordingEnded", "RecordingProgress", "RecordingStarted"]
 
 Outcome = Literal["made", "kept", "skipped", "failed"]
 
 
 @dataclass(frozen=True, slots=True)
-class Begun:
+class RecordingStarted:
     """Processing of a recording has begun."""
 
     recording: Path
@@ -18,7 +18,7 @@ class Begun:
 
 
 @dataclass(frozen=True, slots=True)
-class Advanced:
+class RecordingProgress:
     """Number of processed measurements of a recording."""
 
     recording: Path
@@ -49,4 +49,4 @@ class RecordingEnded:
     made: dict[str, Any] = field(default_factory=dict)
 
 
-Event = Begun | Advanced | RecordingEnded
+Event = RecordingStarted | RecordingProgress | RecordingEnded

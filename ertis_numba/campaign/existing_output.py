@@ -12,10 +12,10 @@ from ertis_numba.storage import EnergyscapeReader, RecordingReader, file_kind, s
 from ertis_numba.storage.recording import Mounting
 from ertis_numba.storage.schema import software_versions
 
-__all__ = ["difference", "look_at"]
+__all__ = ["difference", "inspect_output"]
 
-_OPEN = (None, "auto")  # Values that let the planner choose.
-_ODD = (OSError, RuntimeError, LookupError, AttributeError, TypeError, ValueError)  # Errors of h5py.
+_AUTOMATIC = (None, "auto")  # Values that let the planner choose.
+_UNREADABLE = (OSError, RuntimeError, LookupError, AttributeError, TypeError, ValueError)  # Errors of h5py.
 
 
 class _ExistingOutput(EnergyscapeReader):
@@ -48,7 +48,7 @@ def _digest(*parts: bytes) -> str:
     return hashlib.sha256(b"".join(parts)).hexdigest()
 
 
-def look_at(target: Path, recording: RecordingReader, dtype: str) -> dict[str, Any] | None:
+def inspect_output(target: Path, recording: RecordingReader, dtype: str) -> dict[str, Any] | None:
     """Return the description of an existing output of a recording: settings and axes of its sensors.
 
     Return None if the file does not exist. ``differs`` is the reason why the file is not this output, or that it is
@@ -60,7 +60,7 @@ def look_at(target: Path, recording: RecordingReader, dtype: str) -> dict[str, A
         found, made_of = _read(target, recording, dtype)
     except DamagedError:
         return {"differs": "is damaged"}
-    except (ErtisError, *_ODD):
+    except (ErtisError, *_UNREADABLE):
         return {"differs": "is not a readable energyscape file"}
     if not found["differs"] and made_of != recording.sha256():  # Hashing reads the whole file, so it comes last.
         return {"differs": "was made from another file of the same recording"}
@@ -141,4 +141,4 @@ def _changed(made: Settings, wanted: Settings) -> str:
 
 def _reopened(made: Accuracy, wanted: Accuracy) -> Accuracy:
     asked = {name: getattr(wanted, name) for name in Accuracy.__struct_fields__}
-    return made.replace(**{name: value for name, value in asked.items() if value in _OPEN})
+    return made.replace(**{name: value for name, value in asked.items() if value in _AUTOMATIC})

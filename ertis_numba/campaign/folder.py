@@ -9,13 +9,13 @@ from pathlib import Path
 
 from ertis_numba.errors import ArgumentError
 
-__all__ = ["clear_parts", "final_name", "sole"]
+__all__ = ["clear_parts", "exclusive_folder", "final_name"]
 
 _PART = re.compile(r"(.+)\.[0-9a-f]{8}\.part")  # Names of `ertis_numba.atomic_files.atomic_write`.
 
 
 @contextmanager
-def sole(folder: Path) -> Iterator[None]:
+def exclusive_folder(folder: Path) -> Iterator[None]:
     """Create a folder unless it exists, and lock it for this campaign until the block ends.
 
     The system releases the lock when the process ends, even after a crash.

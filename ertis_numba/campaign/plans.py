@@ -19,9 +19,9 @@ class Plans:
     def __init__(self) -> None:
         self._found: dict[bytes, Accuracy | str] = {}
         self._kinds: set[bytes] = set()  # Kinds of settings whose kernels are compiled.
-        self._under_way: dict[bytes, bool] = {}  # True for settings of a new kind.
+        self._in_progress: dict[bytes, bool] = {}  # True for settings of a new kind.
 
-    def of(self, settings: Settings) -> Accuracy | str | None:
+    def get(self, settings: Settings) -> Accuracy | str | None:
         """Return the plan for settings, or an error text, or None while it is not known."""
         return self._found.get(_key(settings))
 
@@ -32,15 +32,15 @@ class Plans:
         compile the same kernels could corrupt the cache.
         """
         key, new = _key(settings), _kind(settings) not in self._kinds
-        if key in self._under_way or (new and any(self._under_way.values())):
+        if key in self._in_progress or (new and any(self._in_progress.values())):
             return None
-        self._under_way[key] = new
+        self._in_progress[key] = new
         return "new" if new else "known"
 
-    def end(self, settings: Settings, reported: Mapping[str, Any]) -> None:
+    def finish(self, settings: Settings, reported: Mapping[str, Any]) -> None:
         """Store the result; after a temporary error, the next request plans again."""
         key = _key(settings)
-        self._under_way.pop(key)
+        self._in_progress.pop(key)
         if "by_chance" in reported:
             return
         if "error" in reported:

@@ -11,14 +11,14 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import IO, Any, Final
 
-from ertis_numba.campaign.orders import News, WorkOrder
+from ertis_numba.campaign.tasks import Task, TaskUpdate
 from ertis_numba.errors import DeviceError
 
 __all__ = ["ProcessPool"]
 
 _MODULE: Final = "ertis_numba.campaign.worker_process"
-_MAX_STILLBORN: Final = 3  # Limit on successive processes that end before they are ready.
-_LAST_WORDS: Final = 20  # Number of kept lines of stderr.
+_MAX_FAILED_STARTS: Final = 3  # Limit on successive processes that end before they are ready.
+_MAX_STDERR_LINES: Final = 20  # Number of kept lines of stderr.
 
 
 @dataclass(slots=True, eq=False)
@@ -26,10 +26,10 @@ class _WorkerProcess:
     """A process, and its current order."""
 
     process: "subprocess.Popen[str]"
-    order: WorkOrder | None = None
+    order: Task | None = None
     begun: bool = False
     ready: bool = False
-    stated: deque[str] = field(default_factory=lambda: deque(maxlen=_LAST_WORDS))
+    stated: deque[str] = field(default_factory=lambda: deque(maxlen=_MAX_STDERR_LINES))
     threads: list[threading.Thread] = field(default_factory=list)
 
 
@@ -53,7 +53,7 @@ class ProcessPool:
         self._size = size
         self._reported: queue.SimpleQueue[tuple[_WorkerProcess, str | None]] = queue.SimpleQueue()
         self._workers: list[_WorkerProcess] = []
-        self._stillborn = 0
+        self._n_failed_starts = 0
         try:
             for _ in range(size):
                 self._start()
@@ -72,7 +72,7 @@ class ProcessPool:
         return max(0, self._size - sum(worker.order is not None for worker in self._workers))
 
     @property
-    def doing(self) -> dict[int, str]:
+    def current_paths(self) -> dict[int, str]:
         """Recording in progress of each process, by process identifier; empty for an idle one."""
         return {worker.process.pid: _path(worker.order) for worker in self._workers}
 
@@ -82,17 +82,17 @@ class ProcessPool:
         for worker in [worker for worker in self._workers if worker.order is None][self._size :]:
             self._end(worker)
 
-    def give(self, order: WorkOrder) -> None:
+    def submit(self, order: Task) -> None:
         """Run an order; never blocks."""
         worker = next((worker for worker in self._workers if worker.order is None), None) or self._start()
         worker.order, worker.begun = order, False
         stdin = worker.process.stdin
         if stdin is not None:
             with suppress(OSError):  # The process has ended, which `wait` detects.
-                stdin.write(json.dumps({"number": order.number, "do": order.do, "about": order.about}) + "\n")
+                stdin.write(json.dumps({"number": order.number, "do": order.action, "about": order.arguments}) + "\n")
                 stdin.flush()
 
-    def wait(self, timeout_s: float) -> list[News]:
+    def wait(self, timeout_s: float) -> list[TaskUpdate]:
         """Return messages of workers, or an empty list after a timeout."""
         try:
             reported = [self._reported.get(timeout=timeout_s)]
@@ -100,7 +100,7 @@ class ProcessPool:
             return []
         while not self._reported.empty():
             reported.append(self._reported.get())
-        return [news for worker, line in reported if (news := self._heard(worker, line)) is not None]
+        return [news for worker, line in reported if (news := self._handle_line(worker, line)) is not None]
 
     def close(self) -> None:
         """Kill all processes."""
@@ -123,7 +123,7 @@ class ProcessPool:
             creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),  # Windows has no sessions.
         )
         worker = _WorkerProcess(process)
-        for work, stream in ((self._listen, process.stdout), (self._overhear, process.stderr)):
+        for work, stream in ((self._listen, process.stdout), (self._keep_stderr, process.stderr)):
             thread = threading.Thread(target=work, args=(worker, stream), daemon=True)
             thread.start()
             worker.threads.append(thread)
@@ -136,10 +136,10 @@ class ProcessPool:
         self._reported.put((worker, None))
 
     @staticmethod
-    def _overhear(worker: _WorkerProcess, stream: IO[str]) -> None:
+    def _keep_stderr(worker: _WorkerProcess, stream: IO[str]) -> None:
         worker.stated.extend(line.strip() for line in stream if line.strip())
 
-    def _heard(self, worker: _WorkerProcess, line: str | None) -> News | None:
+    def _handle_line(self, worker: _WorkerProcess, line: str | None) -> TaskUpdate | None:
         if line is None:
             return self._died(worker)
         try:
@@ -147,33 +147,33 @@ class ProcessPool:
         except ValueError:  # A killed process may have printed half a line.
             return None
         if "number" not in reported:
-            worker.ready, self._stillborn = True, 0
+            worker.ready, self._n_failed_starts = True, 0
             return None
         worker.begun = True
-        news = News(reported["number"], reported.get("done", 0), reported.get("result"))
+        news = TaskUpdate(reported["number"], reported.get("done", 0), reported.get("result"))
         if news.result is not None:
             worker.order = None
             if len(self._workers) > self._size:
                 self._end(worker)
         return news
 
-    def _died(self, worker: _WorkerProcess) -> News | None:
+    def _died(self, worker: _WorkerProcess) -> TaskUpdate | None:
         if worker not in self._workers:
             return None
         order = worker.order
         self._end(worker)
         how = _how_it_ended(worker)
         if not worker.ready:
-            self._stillborn += 1
-        if self._stillborn >= _MAX_STILLBORN:
+            self._n_failed_starts += 1
+        if self._n_failed_starts >= _MAX_FAILED_STARTS:
             raise DeviceError(f"worker processes end at once: the last one {how}; try 'ertis process' on one file")
         if order is not None and not worker.begun:
-            self.give(order)
+            self.submit(order)
             return None
         if order is None:
             return None
         text = f"{_path(order)}: its worker process {how}; if memory runs out, give fewer --workers"
-        return News(order.number, result={"error": text, "by_chance": True})
+        return TaskUpdate(order.number, result={"error": text, "by_chance": True})
 
     def _end(self, worker: _WorkerProcess) -> None:
         """Kill a process, and close its streams."""
@@ -188,8 +188,8 @@ class ProcessPool:
                     stream.close()
 
 
-def _path(order: WorkOrder | None) -> str:
-    return "" if order is None else str(order.about.get("path", ""))
+def _path(order: Task | None) -> str:
+    return "" if order is None else str(order.arguments.get("path", ""))
 
 
 def _how_it_ended(worker: _WorkerProcess) -> str:

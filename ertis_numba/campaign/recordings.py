@@ -8,14 +8,14 @@ from pathlib import Path
 
 from ertis_numba.errors import ArgumentError, DataError
 
-__all__ = ["SUFFIX", "Source", "find", "outputs"]
+__all__ = ["SUFFIX", "RecordingFile", "find_recordings", "output_paths"]
 
 SUFFIX = ".energy.h5"
 """Suffix of a recording's energyscape file."""
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
+class RecordingFile:
     """File to process.
 
     Attributes
@@ -30,7 +30,7 @@ class Source:
     named: bool = True
 
 
-def find(given: Iterable[str | Path]) -> list[Source]:
+def find_recordings(given: Iterable[str | Path]) -> list[RecordingFile]:
     """Return the files to process, each once, in the given order.
 
     A file is preferred to links to it, whose target may change. Broken links are returned as well: opening them reports
@@ -46,40 +46,40 @@ def find(given: Iterable[str | Path]) -> list[Source]:
     DataError
         A folder contains no ``*.h5``, or no file matches a pattern.
     """
-    found: dict[str, Source] = {}
+    found: dict[str, RecordingFile] = {}
     for each in given:
-        for one in _meant(str(each)):
+        for one in _expand(str(each)):
             real = os.path.realpath(one.path)  # resolve() refuses circular links.
             known = found.setdefault(real, one)
-            found[real] = Source(
+            found[real] = RecordingFile(
                 one.path if known.path.is_symlink() and not one.path.is_symlink() else known.path,
                 named=known.named or one.named,
             )
     return list(found.values())
 
 
-def _meant(text: str) -> Sequence[Source]:
+def _expand(text: str) -> Sequence[RecordingFile]:
     path = Path(text)
     if path.is_dir():
-        paths = sorted(each for each in path.glob("*.h5") if _may_be_meant(each))
+        paths = sorted(each for each in path.glob("*.h5") if _is_candidate(each))
         if not paths:
             raise DataError(f"folder {path} contains no *.h5; give a folder with recordings, or a pattern")
     elif path.exists() or not glob.has_magic(text):
-        return [Source(path)]
+        return [RecordingFile(path)]
     else:
         every = map(Path, glob.glob(text, recursive=True))  # noqa: PTH207
-        paths = sorted(each for each in every if _may_be_meant(each))
+        paths = sorted(each for each in every if _is_candidate(each))
         if not paths:
             raise DataError(f"no file matches {text}; give another pattern")
-    return [Source(each, named=False) for each in paths]
+    return [RecordingFile(each, named=False) for each in paths]
 
 
-def _may_be_meant(path: Path) -> bool:
+def _is_candidate(path: Path) -> bool:
     """Return True for a file, or a broken link to one."""
     return path.is_file() or not path.exists()
 
 
-def outputs(recordings: Sequence[Source], folder: Path) -> list[Path]:
+def output_paths(recordings: Sequence[RecordingFile], folder: Path) -> list[Path]:
     """Return the output file in ``folder`` for each recording.
 
     Raises

@@ -13,10 +13,10 @@ from typing import Any, Final
 
 from ertis_numba import kernels
 from ertis_numba.atomic_files import remedy
-from ertis_numba.campaign.existing_output import look_at
+from ertis_numba.campaign.existing_output import inspect_output
 from ertis_numba.campaign.folder import final_name
-from ertis_numba.campaign.making import checked, making
-from ertis_numba.campaign.orders import HOW, CampaignOptions
+from ertis_numba.campaign.recording_job import check_recording, prepare_recording
+from ertis_numba.campaign.tasks import TASK_OPTIONS, CampaignOptions
 from ertis_numba.errors import ErtisError
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Settings
@@ -24,16 +24,16 @@ from ertis_numba.stages import planner
 from ertis_numba.stages.costs import PlanCosts
 from ertis_numba.storage import file_kind, open_recording, sensor_names
 
-__all__ = ["follow"]
+__all__ = ["run_task"]
 
 ReportProgress = Callable[[int], None]
 _Key = tuple[str, str, int | None]
 
-_turn = threading.Lock()
-_kept: dict[_Key, Pipeline] = {}  # Pipelines that are not in use.
+_idle_lock = threading.Lock()
+_idle_pipelines: dict[_Key, Pipeline] = {}  # Pipelines that are not in use.
 
 
-def follow(do: str, about: Mapping[str, Any], notify: ReportProgress = lambda _: None) -> dict[str, Any]:
+def run_task(do: str, about: Mapping[str, Any], notify: ReportProgress = lambda _: None) -> dict[str, Any]:
     """Run an order, and return its result; expected errors are returned as ``error``.
 
     Parameters
@@ -46,21 +46,21 @@ def follow(do: str, about: Mapping[str, Any], notify: ReportProgress = lambda _:
         Called with the number of processed measurements. An exception that it raises ends the work.
     """
     try:
-        return _ORDERS[do](about, notify)
+        return _ACTIONS[do](about, notify)
     except ErtisError as error:
         return {"error": " ".join(str(error).split())}
     except (OSError, MemoryError) as error:  # These errors may be temporary.
-        return {"error": _in_a_line(error), "by_chance": True}
+        return {"error": _one_line(error), "by_chance": True}
 
 
-def _in_a_line(error: OSError | MemoryError) -> str:
+def _one_line(error: OSError | MemoryError) -> str:
     """Return an error of the system in one line, with the final name of the file and a remedy."""
     if isinstance(error, OSError) and error.strerror and error.filename is not None:
         return f"{final_name(os.fsdecode(error.filename))}: {error.strerror}; {remedy(error)}"
     return " ".join(str(error).split()) or type(error).__name__
 
 
-def _look(about: Mapping[str, Any], _: ReportProgress) -> dict[str, Any]:
+def _inspect(about: Mapping[str, Any], _: ReportProgress) -> dict[str, Any]:
     """Return sensors, settings and number of measurements of a recording, and a description of its existing output."""
     path = Path(about["path"])
     if not about["named"] and file_kind(path) == "energyscape":
@@ -71,7 +71,7 @@ def _look(about: Mapping[str, Any], _: ReportProgress) -> dict[str, Any]:
         return {
             "sensors": {recording.sensor: recording.settings.to_toml() for recording in recordings},
             "measurements": sum(map(len, recordings)),
-            "made": look_at(Path(about["target"]), recordings[0], about["dtype"]),
+            "made": inspect_output(Path(about["target"]), recordings[0], about["dtype"]),
         }
 
 
@@ -85,18 +85,18 @@ def _plan(about: Mapping[str, Any], _: ReportProgress) -> dict[str, Any]:
         return {"settings": planned.to_toml(), "device": loaded.device}
     with _pipelines([settings], about["device"], threads, about["plan"]) as (pipeline,):
         planned, device = pipeline.settings, pipeline.device
-    with _turn:
-        made = _kept.pop((settings.to_toml(), about["device"], threads), None)
+    with _idle_lock:
+        made = _idle_pipelines.pop((settings.to_toml(), about["device"], threads), None)
     if made is not None:  # Later orders have the settings with the plan.
-        _keep({(planned.to_toml(), about["device"], threads): made})
+        _store_idle({(planned.to_toml(), about["device"], threads): made})
     return {"settings": planned.to_toml(), "device": device}
 
 
 def _make(about: Mapping[str, Any], notify: ReportProgress) -> dict[str, Any]:
     """Write the energyscape file of a recording."""
-    options, how = _how(about)
+    options, how = _processing_arguments(about)
     warnings: list[str] = []
-    with making(
+    with prepare_recording(
         Path(about["path"]),
         Path(about["target"]),
         options,
@@ -113,16 +113,16 @@ def _make(about: Mapping[str, Any], notify: ReportProgress) -> dict[str, Any]:
 
 def _check(about: Mapping[str, Any], _: ReportProgress) -> dict[str, Any]:
     """Return the warnings and results that processing would give, for a recording with an existing output."""
-    options, how = _how(about)
+    options, how = _processing_arguments(about)
     warnings: list[str] = []
-    return {**checked(Path(about["path"]), options, warn=warnings.append, **how), "warnings": warnings}
+    return {**check_recording(Path(about["path"]), options, warn=warnings.append, **how), "warnings": warnings}
 
 
-def _how(about: Mapping[str, Any]) -> tuple[CampaignOptions, dict[str, Any]]:
+def _processing_arguments(about: Mapping[str, Any]) -> tuple[CampaignOptions, dict[str, Any]]:
     """Return the options, the settings of each sensor and the source of pipelines."""
     settings = {name: Settings.from_toml(text, f"settings of {name}") for name, text in about["sensors"].items()}
     threads = _threads(about, next(iter(settings.values())))
-    options = CampaignOptions(**{name: about[name] for name in HOW}, threads=threads)
+    options = CampaignOptions(**{name: about[name] for name in TASK_OPTIONS}, threads=threads)
     pipelines = functools.partial(_pipelines, device=about["device"], threads=threads)
     return options, {"settings": settings, "pipelines": pipelines}
 
@@ -145,10 +145,10 @@ def _pipelines(
     grow with the number of recordings.
     """
     keys: list[_Key] = [(each.to_toml(), device, threads) for each in settings]
-    with _turn:
-        found = {key: _kept.pop(key) for key in keys if key in _kept}
-        spare = list(_kept.values())
-        _kept.clear()
+    with _idle_lock:
+        found = {key: _idle_pipelines.pop(key) for key in keys if key in _idle_pipelines}
+        spare = list(_idle_pipelines.values())
+        _idle_pipelines.clear()
     for each in spare:  # Close them first: memory may not suffice for both.
         each.close()
     try:
@@ -157,20 +157,20 @@ def _pipelines(
                 found[key] = Pipeline(given, device=device, threads=threads, predict=False, plan=plan)
         yield [found[key] for key in keys]
     finally:
-        _keep(found)
+        _store_idle(found)
 
 
-def _keep(pipelines: Mapping[_Key, Pipeline]) -> None:
+def _store_idle(pipelines: Mapping[_Key, Pipeline]) -> None:
     """Keep pipelines for later requests, replacing those of the same settings."""
-    with _turn:
-        spare = [_kept.pop(key) for key in pipelines if key in _kept]
-        _kept.update(pipelines)
+    with _idle_lock:
+        spare = [_idle_pipelines.pop(key) for key in pipelines if key in _idle_pipelines]
+        _idle_pipelines.update(pipelines)
     for each in spare:
         each.close()
 
 
-_ORDERS: Final[dict[str, Callable[[Mapping[str, Any], ReportProgress], dict[str, Any]]]] = {
-    "look": _look,
+_ACTIONS: Final[dict[str, Callable[[Mapping[str, Any], ReportProgress], dict[str, Any]]]] = {
+    "look": _inspect,
     "plan": _plan,
     "make": _make,
     "check": _check,

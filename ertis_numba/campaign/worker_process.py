@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import IO, Any, Final
 
 from ertis_numba.campaign.folder import clear_parts
-from ertis_numba.campaign.work import follow
+from ertis_numba.campaign.work import run_task
 
 __all__ = ["main"]
 
@@ -41,7 +41,7 @@ class _Process:
             if order["do"] == "make":
                 self._target = Path(about["target"])
             try:
-                result = follow(order["do"], about, functools.partial(self._advance, number))
+                result = run_task(order["do"], about, functools.partial(self._advance, number))
             except Exception as error:  # noqa: BLE001  an error in one recording must not affect others
                 text = f"{about.get('path', '')}: {type(error).__name__}: {' '.join(str(error).split())}"
                 result = {"error": text, "by_chance": True}

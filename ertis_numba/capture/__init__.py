@@ -1,5 +1,5 @@
 """Capture of measurements from sensors into a journal."""
 
-from ertis_numba.capture.session import CaptureCounts, Session
+from ertis_numba.capture.session import CaptureCounts, CaptureSession
 
-__all__ = ["CaptureCounts", "Session"]
+__all__ = ["CaptureCounts", "CaptureSession"]

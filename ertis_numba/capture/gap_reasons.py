@@ -2,7 +2,7 @@
 
 from typing import Final
 
-from ertis_numba.capture.readers import Arrived
+from ertis_numba.capture.readers import BlockArrived
 
 __all__ = ["DAMAGED", "DISK_BUSY", "DROPPED", "NOT_TRIGGERED", "gap_reason"]
 
@@ -15,7 +15,7 @@ NOT_TRIGGERED: Final = "the sensor was not triggered"
 _MIN_BUSY_S = 0.05
 
 
-def gap_reason(event: Arrived) -> str:
+def gap_reason(event: BlockArrived) -> str:
     """Return the reason of the gap before a measurement.
 
     A sensor counts each measurement that it makes, including those that it drops because its buffer is full. If other

@@ -11,20 +11,20 @@ from ertis_numba.devices.sonar import SonarDriver
 from ertis_numba.errors import SonarDisconnectedError, SonarError
 
 __all__ = [
-    "Arrived",
+    "BlockArrived",
+    "CounterRestarted",
     "Event",
     "MeasurementFailed",
-    "Note",
-    "Restarted",
-    "Returned",
     "SensorEnded",
+    "SensorMessage",
     "SensorReader",
+    "SensorReconnected",
     "TriggerClock",
 ]
 
 
 @dataclass(frozen=True, slots=True)
-class Arrived:
+class BlockArrived:
     """A received measurement.
 
     Attributes
@@ -70,7 +70,7 @@ class MeasurementFailed:
 
 
 @dataclass(frozen=True, slots=True)
-class Note:
+class SensorMessage:
     """Message about a sensor, for users."""
 
     sensor: str
@@ -78,14 +78,14 @@ class Note:
 
 
 @dataclass(frozen=True, slots=True)
-class Restarted:
+class CounterRestarted:
     """A sensor's counter has restarted, for example after an unnoticed power cut."""
 
     sensor: str
 
 
 @dataclass(frozen=True, slots=True)
-class Returned:
+class SensorReconnected:
     """A sensor is connected again, after it was unplugged."""
 
     sensor: str
@@ -100,7 +100,7 @@ class SensorEnded:
     error: Exception | None
 
 
-Event = Arrived | MeasurementFailed | Note | Restarted | Returned | SensorEnded
+Event = BlockArrived | MeasurementFailed | SensorMessage | CounterRestarted | SensorReconnected | SensorEnded
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -176,7 +176,7 @@ class SensorReader(threading.Thread):
             if self._pace is None:
                 self._listen()
             else:
-                self._command(self._pace)
+                self._trigger_by_command(self._pace)
         except Exception as failure:  # noqa: BLE001  the session reports any error
             error = failure
         self._put(SensorEnded(self._sensor, error))
@@ -185,10 +185,10 @@ class SensorReader(threading.Thread):
         while not self._stop_asked.is_set():
             try:
                 for block in self._sonar.listen(stop=self._may_stop, timeout_s=self._patience_s):
-                    skipped = self._count_on(block)
+                    skipped = self._advance_count(block)
                     waited_s, self._waited_s = self._waited_s, 0.0
                     self._put(
-                        Arrived(
+                        BlockArrived(
                             self._sensor,
                             block,
                             self._count,
@@ -199,8 +199,8 @@ class SensorReader(threading.Thread):
                         )
                     )
             except SonarDisconnectedError as error:
-                self._put(Note(self._sensor, str(error)))
-                self._come_back()
+                self._put(SensorMessage(self._sensor, str(error)))
+                self._reconnect()
             else:
                 return
 
@@ -208,7 +208,7 @@ class SensorReader(threading.Thread):
         """Return True if listening may stop; a measurement in progress is received first, unless it is overdue."""
         return self._abandoned.is_set() or (self._stop_asked.is_set() and not self._sonar.receiver.missing)
 
-    def _command(self, pace: TriggerClock) -> None:
+    def _trigger_by_command(self, pace: TriggerClock) -> None:
         tick = taken = 0
         latest_s = time.monotonic()
         while pace.n is None or taken < pace.n:
@@ -219,7 +219,7 @@ class SensorReader(threading.Thread):
                 block = self._sonar.measure()
             except SonarDisconnectedError as error:
                 self._put(MeasurementFailed(self._sensor, self._count, tick, "the sensor was unplugged", str(error)))
-                self._come_back()
+                self._reconnect()
                 latest_s = time.monotonic()
             except SonarError as error:
                 self._put(MeasurementFailed(self._sensor, self._count, tick, "it did not arrive in time", str(error)))
@@ -227,18 +227,18 @@ class SensorReader(threading.Thread):
                     raise
             else:
                 latest_s, taken = time.monotonic(), taken + 1
-                self._put(Arrived(self._sensor, block, self._count, tick))
+                self._put(BlockArrived(self._sensor, block, self._count, tick))
             self._count += 1
             late = math.ceil((time.monotonic() - pace.start_s) * pace.rate_hz - 1e-3)
             tick = max(tick + 1, late)
 
-    def _count_on(self, block: Block) -> int:
+    def _advance_count(self, block: Block) -> int:
         """Update the count from the sensor's own counter, and return the number of skipped measurements."""
         step = 1
         if self._counter is not None:
             step = (block.counter - self._counter) % COUNTERS
             if step >= COUNTERS // 2:
-                self._put(Restarted(self._sensor))
+                self._put(CounterRestarted(self._sensor))
                 step = 1
             self._count += step
         self._counter = block.counter
@@ -248,11 +248,11 @@ class SensorReader(threading.Thread):
         before, self._rejected = self._rejected, sum(self._sonar.receiver.rejected_blocks.values())
         return self._rejected > before
 
-    def _come_back(self) -> None:
+    def _reconnect(self) -> None:
         gone_s = time.monotonic()
         self._sonar.reconnect(within_s=self._patience_s, stop=self._stop_asked.is_set)
         if not self._stop_asked.is_set():
-            self._put(Returned(self._sensor, time.monotonic() - gone_s))
+            self._put(SensorReconnected(self._sensor, time.monotonic() - gone_s))
 
     def _put(self, event: Event) -> None:
         begin_s = time.monotonic()

@@ -12,32 +12,32 @@ from typing import Protocol
 from ertis_numba import checks
 from ertis_numba.capture.gap_reasons import gap_reason
 from ertis_numba.capture.readers import (
-    Arrived,
+    BlockArrived,
+    CounterRestarted,
     Event,
     MeasurementFailed,
-    Note,
-    Restarted,
-    Returned,
     SensorEnded,
+    SensorMessage,
     SensorReader,
+    SensorReconnected,
     TriggerClock,
 )
-from ertis_numba.capture.sync_counts import SyncCounts
+from ertis_numba.capture.sync_counts import PulseAligner
 from ertis_numba.devices.sonar import SonarDriver
 from ertis_numba.errors import ArgumentError, SonarError
 from ertis_numba.frames import Measurement, Stamp
-from ertis_numba.journal import Entry
+from ertis_numba.journal import JournalEntry
 from ertis_numba.settings import Settings
 
-__all__ = ["CaptureCounts", "Session", "Sink"]
+__all__ = ["CaptureCounts", "CaptureSession", "MeasurementSink"]
 
 _WAITING_BYTES = 40_000_000  # Limit on blocks that wait for the disk; sensors wait beyond it.
 _RECENT_S = 3.0  # Interval of the reported rate.
-_NO_ROOM = "there was no room for it"
-_GROUPS = 16  # Limit on open groups: sensors deliver simultaneous measurements at different times.
+_DISK_FULL = "there was no room for it"
+_MAX_OPEN_GROUPS = 16  # Limit on open groups: sensors deliver simultaneous measurements at different times.
 
 
-class Sink(Protocol):
+class MeasurementSink(Protocol):
     """Destination of measurements: a `Journal`, or a buffer that keeps them until another node has stored them."""
 
     def add_sensor(
@@ -51,7 +51,7 @@ class Sink(Protocol):
     ) -> None:
         """Register a sensor before its first measurement."""
 
-    def append(self, entries: Sequence[Entry]) -> Sequence[Entry] | None:
+    def append(self, entries: Sequence[JournalEntry]) -> Sequence[JournalEntry] | None:
         """Store measurements; None means that all of them are stored, otherwise return the stored ones."""
 
     def note_gap(self, sensor: str, first: int, last: int, reason: str, *, session_id: int) -> None:
@@ -95,7 +95,7 @@ class CaptureCounts:
 
 
 @dataclass(slots=True)
-class _Track:
+class _SequenceState:
     """Sequence numbers of one sensor."""
 
     sequence: int | None = None  # Number of the latest measurement, stored or missing.
@@ -105,7 +105,7 @@ class _Track:
     passed: bool = False  # True once a pulse beyond the last requested one has arrived.
 
 
-class Session:
+class CaptureSession:
     """Capture session: receives measurements from sensors, stores them durably, and reports them.
 
     Sequence numbers are those of the commands to a sensor, or of the SYNC pulses since its first one. They start at 0,
@@ -161,7 +161,7 @@ class Session:
         patience_s: float = 30.0,
         mounting: Mapping[str, tuple[Sequence[float], Sequence[float]]] | None = None,
         session_id: int | None = None,
-        on_stored: Callable[[list[Entry]], None] = lambda _: None,
+        on_stored: Callable[[list[JournalEntry]], None] = lambda _: None,
         on_note: Callable[[str, str], None] = lambda _sensor, _text: None,
         on_back: Callable[[str, float], None] = lambda _sensor, _away_s: None,
         on_tick: Callable[[], None] = lambda: None,
@@ -182,9 +182,9 @@ class Session:
         self._record_ns = round(1e9 * settings.recording.duration_s)
         self._stop = threading.Event()
         self._errors: dict[str, Exception] = {}
-        self._tracks = {sensor: _Track() for sensor in sonars}
-        self._pulses: SyncCounts[Arrived] = SyncCounts(list(sonars), shortest_s=settings.recording.duration_s)
-        self._waiting: list[Entry] = []  # Entries to store together.
+        self._sequence_states = {sensor: _SequenceState() for sensor in sonars}
+        self._pulses: PulseAligner[BlockArrived] = PulseAligner(list(sonars), shortest_s=settings.recording.duration_s)
+        self._waiting: list[JournalEntry] = []  # Entries to store together.
         self._groups: dict[int, int] = {}
         self._closed = -(2**63)  # Latest closed group.
         self._ended: set[str] = set()
@@ -195,7 +195,7 @@ class Session:
         """End after the current measurement; a signal handler or another thread may call this."""
         self._stop.set()
 
-    def run(self, sink: Sink) -> None:
+    def run(self, sink: MeasurementSink) -> None:
         """Capture until the session ends.
 
         Raises
@@ -210,7 +210,7 @@ class Session:
         readers: list[SensorReader] = []
         try:
             self._begin(sink, readers, events)
-            self._take(sink, readers, events)
+            self._process_events(sink, readers, events)
         finally:
             for reader in readers:
                 reader.abandon()
@@ -226,7 +226,7 @@ class Session:
         if self._errors:
             raise SonarError("; ".join(f"{sensor}: {error}" for sensor, error in self._errors.items()))
 
-    def _begin(self, sink: Sink, readers: list[SensorReader], events: "queue.Queue[Event]") -> None:
+    def _begin(self, sink: MeasurementSink, readers: list[SensorReader], events: "queue.Queue[Event]") -> None:
         for sensor, sonar in self._sonars.items():
             translation_m, rotation_xyzw = self._mounting.get(sensor, (None, None))
             sink.add_sensor(
@@ -246,13 +246,13 @@ class Session:
         for reader in readers:
             reader.start()
 
-    def _take(self, sink: Sink, readers: list[SensorReader], events: "queue.Queue[Event]") -> None:
+    def _process_events(self, sink: MeasurementSink, readers: list[SensorReader], events: "queue.Queue[Event]") -> None:
         end_s = None if self._duration_s is None else time.monotonic() + self._duration_s
         while len(self._ended) < len(readers):
             if self._stop.is_set() or self._done() or (end_s is not None and time.monotonic() >= end_s):
                 for reader in readers:
                     reader.stop()
-            self._handle(sink, _all_of(events))
+            self._handle(sink, _drain(events))
             self._on_tick()
         self._store(sink, self._pulses.release(time.monotonic_ns(), at_once=True))
         for sync_count in sorted(self._groups):
@@ -262,31 +262,31 @@ class Session:
         """Return True if every remaining sensor has delivered the last pulse, or a later one."""
         if self._n is None or not self._synced:
             return False
-        return all(self._tracks[sensor].passed for sensor in self._sonars if sensor not in self._ended)
+        return all(self._sequence_states[sensor].passed for sensor in self._sonars if sensor not in self._ended)
 
-    def _handle(self, sink: Sink, events: Iterable[Event]) -> None:
-        ready: list[tuple[Arrived, int]] = []
+    def _handle(self, sink: MeasurementSink, events: Iterable[Event]) -> None:
+        ready: list[tuple[BlockArrived, int]] = []
         for event in events:
             match event:
-                case Arrived(tick=None):
+                case BlockArrived(tick=None):
                     ready += self._pulses.add(event.sensor, event, event.count, event.block.arrived.monotonic_ns)
-                case Arrived(tick=int(tick)):
+                case BlockArrived(tick=int(tick)):
                     self._note_tick(event.sensor, tick)
                     ready.append((event, tick))
                 case MeasurementFailed():
                     self._note_tick(event.sensor, event.tick)
                     self._store(sink, ready)
                     ready = []
-                    self._miss_until(sink, event.sensor, event.count + 1, event.reason)
+                    self._record_gap_before(sink, event.sensor, event.count + 1, event.reason)
                     self._on_note(event.sensor, event.text)
-                case Note(sensor, text):
+                case SensorMessage(sensor, text):
                     self._on_note(sensor, text)
-                case Restarted(sensor):
-                    ready += self._begin_anew(sensor, "the sensor restarted")
+                case CounterRestarted(sensor):
+                    ready += self._realign(sensor, "the sensor restarted")
                     self._on_note(sensor, "has restarted its counter")
-                case Returned(sensor, away_s):
+                case SensorReconnected(sensor, away_s):
                     self.counts[sensor].unplugged += 1
-                    ready += self._begin_anew(sensor, "the sensor was unplugged")
+                    ready += self._realign(sensor, "the sensor was unplugged")
                     self._on_back(sensor, away_s)
                 case SensorEnded(sensor, error):
                     self._ended.add(sensor)
@@ -297,16 +297,16 @@ class Session:
         self._store(sink, ready)
 
     def _note_tick(self, sensor: str, tick: int) -> None:
-        track = self._tracks[sensor]
+        track = self._sequence_states[sensor]
         self.counts[sensor].skipped += tick - track.tick - 1
         track.tick = tick
 
-    def _begin_anew(self, sensor: str, why: str) -> list[tuple[Arrived, int]]:
+    def _realign(self, sensor: str, why: str) -> list[tuple[BlockArrived, int]]:
         """Align the counter of a sensor with the others again, and return its held blocks."""
-        self._tracks[sensor].why = why
-        return self._pulses.forget(sensor)
+        self._sequence_states[sensor].why = why
+        return self._pulses.reset(sensor)
 
-    def _store(self, sink: Sink, ready: list[tuple[Arrived, int]]) -> None:
+    def _store(self, sink: MeasurementSink, ready: list[tuple[BlockArrived, int]]) -> None:
         """Store measurements durably, then report them."""
         for event, number in ready:
             entry = self._entry(sink, event, number)
@@ -314,7 +314,7 @@ class Session:
                 self._waiting.append(entry)
         self._append(sink)
 
-    def _append(self, sink: Sink) -> None:
+    def _append(self, sink: MeasurementSink) -> None:
         """Store waiting entries durably."""
         entries, self._waiting = self._waiting, []
         if not entries:
@@ -322,7 +322,7 @@ class Session:
         stored = sink.append(entries)
         if stored is not None:
             for sensor in (entry.measurement.stamp.sensor for entry in entries if entry not in stored):
-                self.counts[sensor].missing[_NO_ROOM] += 1
+                self.counts[sensor].missing[_DISK_FULL] += 1
             entries = list(stored)
         for entry in entries:
             stamp = entry.measurement.stamp
@@ -332,9 +332,9 @@ class Session:
             self._group(stamp.sync_count)
         self._on_stored(entries)
 
-    def _entry(self, sink: Sink, event: Arrived, number: int) -> Entry | None:
+    def _entry(self, sink: MeasurementSink, event: BlockArrived, number: int) -> JournalEntry | None:
         """Return the entry of a block, None beyond the last pulse; store the gap before it."""
-        track, block = self._tracks[event.sensor], event.block
+        track, block = self._sequence_states[event.sensor], event.block
         sequence = event.count
         if self._synced:
             if track.first_pulse is None:
@@ -342,7 +342,7 @@ class Session:
             sequence = number - track.first_pulse
             end = sequence + 1 if self._n is None else self._n - track.first_pulse
             track.passed = self._n is not None and sequence >= end - 1
-            self._miss_until(sink, event.sensor, min(sequence, end), track.why or gap_reason(event))
+            self._record_gap_before(sink, event.sensor, min(sequence, end), track.why or gap_reason(event))
             if sequence >= end:
                 return None
         if track.sequence is not None:
@@ -357,11 +357,11 @@ class Session:
             timestamp_uncertainty_ns=min(block.arrived.uncertainty_ns, 2**32 - 1),
         )
         measurement = Measurement(block.data, self._settings, stamp)
-        return Entry(measurement=measurement, monotonic_ns=block.arrived.monotonic_ns)
+        return JournalEntry(measurement=measurement, monotonic_ns=block.arrived.monotonic_ns)
 
-    def _miss_until(self, sink: Sink, sensor: str, stop: int, why: str) -> None:
+    def _record_gap_before(self, sink: MeasurementSink, sensor: str, stop: int, why: str) -> None:
         """Store a gap for the missing numbers below ``stop``."""
-        track = self._tracks[sensor]
+        track = self._sequence_states[sensor]
         first = 0 if track.sequence is None else track.sequence + 1
         if first < stop:
             self._append(sink)  # Earlier measurements come before the gap.
@@ -373,7 +373,7 @@ class Session:
         if sync_count <= self._closed:
             return  # It was counted when it was closed.
         self._groups[sync_count] = self._groups.get(sync_count, 0) + 1
-        while len(self._groups) > _GROUPS:
+        while len(self._groups) > _MAX_OPEN_GROUPS:
             self._close_group(min(self._groups))
 
     def _close_group(self, sync_count: int) -> None:
@@ -384,7 +384,7 @@ class Session:
             self.incomplete += 1
 
 
-def _all_of(events: "queue.Queue[Event]") -> list[Event]:
+def _drain(events: "queue.Queue[Event]") -> list[Event]:
     """Wait up to 0.1 s for an event, and return all events that have arrived."""
     found: list[Event] = []
     try:

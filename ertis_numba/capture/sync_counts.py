@@ -5,20 +5,20 @@ from collections import Counter, deque
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
-__all__ = ["SyncCounts"]
+__all__ = ["PulseAligner"]
 
 Item = TypeVar("Item")
 
-_NEAR = 0.4  # Relative to the interval between pulses: closer blocks belong to the same pulse.
-_PULSES = 64  # Number of kept pulses, which span some seconds.
-_VOTES = 3  # Number of blocks that decide an offset; a busy host or sensor may delay one.
-_HELD_S = 0.5  # Limit on the time that blocks wait for this decision.
-_DOUBTS = 5  # Number of successive blocks that must contradict an offset before it changes.
-_DOUBTED_S = 5.0  # Limit on the time that these blocks wait.
+_PULSE_TOLERANCE = 0.4  # Relative to the interval between pulses: closer blocks belong to the same pulse.
+_MAX_PULSES = 64  # Number of kept pulses, which span some seconds.
+_MIN_VOTES = 3  # Number of blocks that decide an offset; a busy host or sensor may delay one.
+_MAX_WAIT_S = 0.5  # Limit on the time that blocks wait for this decision.
+_MIN_DISAGREEMENTS = 5  # Number of successive blocks that must contradict an offset before it changes.
+_MAX_DISAGREEMENT_S = 5.0  # Limit on the time that these blocks wait.
 
 
 @dataclass(slots=True)
-class _Held(Generic[Item]):
+class _HeldBlock(Generic[Item]):
     item: Item
     counter: int
     arrived_ns: int
@@ -27,10 +27,10 @@ class _Held(Generic[Item]):
 @dataclass(slots=True)
 class _SensorPulses(Generic[Item]):
     offset: int | None = None  # Offset from the sensor's own counter to the pulse number.
-    held: list[_Held[Item]] = field(default_factory=list)
+    held: list[_HeldBlock[Item]] = field(default_factory=list)
 
 
-class SyncCounts(Generic[Item]):
+class PulseAligner(Generic[Item]):
     """Assignment of pulse numbers to the blocks of several sensors.
 
     Each sensor counts its own triggers. The counters differ by an offset, because sensors are armed one after the other
@@ -56,15 +56,15 @@ class SyncCounts(Generic[Item]):
         self._first = sensors[0]
         self._shortest_ns = round(shortest_s * 1e9)
         self._pulses: dict[int, int] = {}  # Time of the first block, by pulse number.
-        self._intervals_ns: deque[float] = deque(maxlen=_PULSES)
+        self._intervals_ns: deque[float] = deque(maxlen=_MAX_PULSES)
         self.realigned = 0
 
-    def forget(self, sensor: str) -> list[tuple[Item, int]]:
+    def reset(self, sensor: str) -> list[tuple[Item, int]]:
         """Align a sensor again, after it has missed pulses or restarted its counter; return its held blocks."""
         state = self._sensors[sensor]
         found: list[tuple[Item, int]] = []
-        if state.held and self._decided(sensor, state, state.held[-1].arrived_ns, at_once=True):
-            found = self._released(state)
+        if state.held and self._is_offset_known(sensor, state, state.held[-1].arrived_ns, at_once=True):
+            found = self._release_held(state)
         state.offset = None
         return found
 
@@ -87,7 +87,7 @@ class SyncCounts(Generic[Item]):
         list of tuple of object and int
             Released blocks with the number of their pulse.
         """
-        self._sensors[sensor].held.append(_Held(item, counter, arrived_ns))
+        self._sensors[sensor].held.append(_HeldBlock(item, counter, arrived_ns))
         return self.release(arrived_ns)
 
     def release(self, now_ns: int, *, at_once: bool = False) -> list[tuple[Item, int]]:
@@ -97,13 +97,13 @@ class SyncCounts(Generic[Item]):
         while progress:  # A block of one sensor may resolve that of another.
             progress = False
             for name, state in self._sensors.items():
-                if not state.held or not self._decided(name, state, now_ns, at_once=at_once):
+                if not state.held or not self._is_offset_known(name, state, now_ns, at_once=at_once):
                     continue
                 progress = True
-                found += self._released(state)
+                found += self._release_held(state)
         return found
 
-    def _released(self, state: _SensorPulses[Item]) -> list[tuple[Item, int]]:
+    def _release_held(self, state: _SensorPulses[Item]) -> list[tuple[Item, int]]:
         found = []
         for each in state.held:
             number = each.counter + (state.offset or 0)
@@ -117,24 +117,24 @@ class SyncCounts(Generic[Item]):
         """Interval between pulses; the minimum while it is unknown."""
         return statistics.median(self._intervals_ns) if self._intervals_ns else float(self._shortest_ns)
 
-    def _decided(self, name: str, state: _SensorPulses[Item], now_ns: int, *, at_once: bool) -> bool:
+    def _is_offset_known(self, name: str, state: _SensorPulses[Item], now_ns: int, *, at_once: bool) -> bool:
         """Determine the offset of a sensor with held blocks; return True if it is now known."""
-        waited = at_once or now_ns - state.held[0].arrived_ns > _HELD_S * 1e9
+        waited = at_once or now_ns - state.held[0].arrived_ns > _MAX_WAIT_S * 1e9
         if not self._pulses:
             if name == self._first or waited:
                 state.offset = -state.held[0].counter  # The first pulse is number 0.
             return state.offset is not None
         if state.offset is not None:
             doubted_s = (now_ns - state.held[0].arrived_ns) / 1e9
-            if self._agrees(state.held[-1], state.offset) or at_once or doubted_s > _DOUBTED_S:
+            if self._agrees(state.held[-1], state.offset) or at_once or doubted_s > _MAX_DISAGREEMENT_S:
                 return True
-            if len(state.held) < _DOUBTS:
+            if len(state.held) < _MIN_DISAGREEMENTS:
                 return False
-        elif len(state.held) < _VOTES and not waited and not self._is_alone:
+        elif len(state.held) < _MIN_VOTES and not waited and not self._is_alone:
             return False
         if not self._intervals_ns and not waited:
             return False  # The tolerance is not known yet.
-        voted = self._voted(state.held, waited=waited)
+        voted = self._majority_offset(state.held, waited=waited)
         if voted is not None:
             self.realigned += state.offset not in {None, voted}
             state.offset = voted
@@ -145,7 +145,7 @@ class SyncCounts(Generic[Item]):
         """Return True if there is no other sensor to compare with."""
         return len(self._sensors) == 1
 
-    def _voted(self, held: list[_Held[Item]], *, waited: bool) -> int | None:
+    def _majority_offset(self, held: list[_HeldBlock[Item]], *, waited: bool) -> int | None:
         """Return the offset that most times of arrival support, None while there is no majority."""
         votes = Counter(
             number - each.counter
@@ -161,7 +161,7 @@ class SyncCounts(Generic[Item]):
         """Return the pulse number that a time of arrival indicates, None while it is unknown."""
         number = min(self._pulses, key=lambda each: abs(self._pulses[each] - arrived_ns))
         away_ns = arrived_ns - self._pulses[number]
-        if abs(away_ns) <= _NEAR * self.interval_ns:
+        if abs(away_ns) <= _PULSE_TOLERANCE * self.interval_ns:
             return number
         earlier = [each for each, time_ns in self._pulses.items() if time_ns <= arrived_ns]
         later = [each for each, time_ns in self._pulses.items() if time_ns > arrived_ns]
@@ -177,7 +177,7 @@ class SyncCounts(Generic[Item]):
             return first if share < 1 / 2 else last
         return min(max(first + round(share * (last - first)), first + 1), last - 1)
 
-    def _agrees(self, held: _Held[Item], offset: int) -> bool:
+    def _agrees(self, held: _HeldBlock[Item], offset: int) -> bool:
         """Return True unless another block of the same pulse contradicts an offset by its time."""
         known_ns = self._pulses.get(held.counter + offset)
         return known_ns is None or abs(held.arrived_ns - known_ns) <= self.interval_ns / 2
@@ -190,5 +190,5 @@ class SyncCounts(Generic[Item]):
         if before_ns is not None and arrived_ns > before_ns:
             self._intervals_ns.append(arrived_ns - before_ns)
         self._pulses[number] = arrived_ns
-        while len(self._pulses) > _PULSES:
+        while len(self._pulses) > _MAX_PULSES:
             del self._pulses[min(self._pulses)]

@@ -190,4 +190,6 @@ def _check_codes(codes: NDArray[np.uint16], rate_hz: int) -> None:
             f"from {(fewest - 1) / rate_hz:.3g} to {(largest - 1) / rate_hz:.3g}"
         )
     if codes.max() > DAC_CODE_MAX:
-        raise ArgumentError(f"codes reach {codes.max()}, but a sensor's converter accepts 0 to {DAC_CODE_MAX}; give smaller ones")
+        raise ArgumentError(
+            f"codes reach {codes.max()}, but a sensor's converter accepts 0 to {DAC_CODE_MAX}; give smaller ones"
+        )

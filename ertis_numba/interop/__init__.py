@@ -1,6 +1,6 @@
 """Readers and writers of foreign formats."""
 
-from ertis_numba.interop._export import FORMATS, TOPICS, export, files_of, format_of
+from ertis_numba.interop._export import FORMATS, TOPICS, choose_format, export, output_files
 from ertis_numba.interop.pcm import PcmReader, open_pcm
 from ertis_numba.interop.rtis import RawReader, open_raw
 from ertis_numba.interop.rtis_folder import open_rtis_folder
@@ -10,10 +10,10 @@ __all__ = [
     "TOPICS",
     "PcmReader",
     "RawReader",
+    "choose_format",
     "export",
-    "files_of",
-    "format_of",
     "open_pcm",
     "open_raw",
     "open_rtis_folder",
+    "output_files",
 ]

@@ -19,7 +19,7 @@ from ertis_numba.frames import Measurement
 from ertis_numba.geometry import Layout, microphones, received_settings, self_contained
 from ertis_numba.settings import Array, Recording, Settings
 from ertis_numba.stages.signals import signals_of
-from ertis_numba.storage.structure import child, require_attributes, stored_bytes
+from ertis_numba.storage.structure import local_member, require_attributes, stored_bytes
 
 __all__ = ["read_acoular", "write_acoular"]
 
@@ -57,14 +57,14 @@ def read_acoular(path: Path) -> tuple[float, NDArray[Any], Settings | None]:
     """
     try:
         with h5py.File(path, "r") as file:
-            data = child(file, "time_data", h5py.Dataset)
+            data = local_member(file, "time_data", h5py.Dataset)
             require_attributes(data)
             stored_bytes(data, may_be_filtered=True)
             numbers = np.asarray(data[()])
             rates_hz = np.asarray(data.attrs["sample_freq"], dtype=np.float64)
             reported = None
             if "metadata" in file:
-                reported = child(file, "metadata", h5py.Group).attrs.get("settings")
+                reported = local_member(file, "metadata", h5py.Group).attrs.get("settings")
     except (DamagedError, ForeignDataError) as error:
         raise DataError(f"{path}: {error}") from error
     except (OSError, KeyError, TypeError, ValueError, RuntimeError) as error:

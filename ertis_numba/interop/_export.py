@@ -11,9 +11,9 @@ from ertis_numba import checks
 from ertis_numba.atomic_files import atomic_write, check_target, remedy
 from ertis_numba.errors import ArgumentError, DataError, ErtisError
 from ertis_numba.frames import Energyscape, Measurement
-from ertis_numba.interop._mountings import Mountings, checked
+from ertis_numba.interop._mountings import Mountings, validated
 
-__all__ = ["FORMATS", "TOPICS", "Format", "export", "files_of", "format_of"]
+__all__ = ["FORMATS", "TOPICS", "ExportFormat", "choose_format", "export", "output_files"]
 
 TOPICS: Final = ("points", "image", "sonar_image")
 """Products of a sensor in MCAP."""
@@ -21,11 +21,11 @@ _POINTS = (
     *("x", "y", "z", "intensity", "uncertainty_range", "uncertainty_across"),
     *("sensor", "sequence", "sec", "nanosec"),
 )
-_FINDING = ("mounting", "top", "min_level_db")
+_POINT_OPTIONS = ("mounting", "top", "min_level_db")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Format:
+class ExportFormat:
     """Export format.
 
     Attributes
@@ -38,37 +38,37 @@ class Format:
         Options of `export` that apply to this format, but not to all formats. None by default.
     """
 
-    ending: str
-    holds: tuple[str, ...]
+    suffix: str
+    fields: tuple[str, ...]
     options: tuple[str, ...] = ()
 
 
 FORMATS: Final = {
-    "mcap": Format(ending=".mcap", holds=(*TOPICS, "tf_static"), options=(*_FINDING, "topics")),
-    "ply": Format(ending=".ply", holds=_POINTS, options=(*_FINDING, "text")),
-    "pcd": Format(ending=".pcd", holds=_POINTS, options=(*_FINDING, "text")),
-    "csv": Format(
-        ending=".csv",
-        holds=(
+    "mcap": ExportFormat(suffix=".mcap", fields=(*TOPICS, "tf_static"), options=(*_POINT_OPTIONS, "topics")),
+    "ply": ExportFormat(suffix=".ply", fields=_POINTS, options=(*_POINT_OPTIONS, "text")),
+    "pcd": ExportFormat(suffix=".pcd", fields=_POINTS, options=(*_POINT_OPTIONS, "text")),
+    "csv": ExportFormat(
+        suffix=".csv",
+        fields=(
             *("sensor", "session_id", "sequence", "sync_count", "timestamp_ns"),
             *("x_m", "y_m", "z_m", "amplitude", "uncertainty_range_m", "uncertainty_across_m"),
         ),
-        options=_FINDING,
+        options=_POINT_OPTIONS,
     ),
-    "npz": Format(
-        ending=".npz",
-        holds=(
+    "npz": ExportFormat(
+        suffix=".npz",
+        fields=(
             *("amplitude", "azimuth_rad", "elevation_rad", "range_m"),
             *("session_id", "sequence", "sync_count", "timestamp_ns", "timestamp_uncertainty_ns"),
             *("sensor", "settings"),
         ),
     ),
-    "acoular": Format(ending=".h5", holds=("time_data", "metadata")),
+    "acoular": ExportFormat(suffix=".h5", fields=("time_data", "metadata")),
 }
 """Formats by name; the how-to guide on exports states the content of each."""
 
 
-def format_of(path: str | Path, name: str | None = None) -> str:
+def choose_format(path: str | Path, name: str | None = None) -> str:
     """Return the name of the format to write: the given name, or that of the file's suffix.
 
     Raises
@@ -77,14 +77,14 @@ def format_of(path: str | Path, name: str | None = None) -> str:
         The name or suffix is unknown.
     """
     if name is None:
-        endings = {each.ending: known for known, each in FORMATS.items()}
+        endings = {each.suffix: known for known, each in FORMATS.items()}
         checks.choice("ending of the export", Path(path).suffix.lower(), endings)
         return endings[Path(path).suffix.lower()]
     checks.choice("format", name, FORMATS)
     return name
 
 
-def files_of(path: str | Path, name: str) -> tuple[Path, ...]:
+def output_files(path: str | Path, name: str) -> tuple[Path, ...]:
     """Return the files of an export: for ``acoular`` also that of the array, with the suffix ``.xml``.
 
     Raises
@@ -163,13 +163,13 @@ def export(
     """
     if not isinstance(items, Iterable):
         raise ArgumentError(f"items is of type {type(items).__name__}; give a list of Energyscape")
-    name = format_of(path, file_format)
+    name = choose_format(path, file_format)
     finding = {"top": top, "min_level_db": min_level_db}
     _require_options(name, {"mounting": mounting, "topics": topics, "text": text or None, **finding})
     chosen = TOPICS if topics is None else topics
     for topic in chosen:
         checks.choice("topic", topic, TOPICS)
-    paths = files_of(path, name)
+    paths = output_files(path, name)
     for each in paths:
         check_target(each, overwrite=overwrite)
     try:
@@ -180,7 +180,7 @@ def export(
             elif name == "npz":
                 _write_npz(parts[0], items)
             else:
-                _write_points(name, parts[0], _energyscapes(items), checked(mounting), chosen, finding, text=text)
+                _write_points(name, parts[0], _energyscapes(items), validated(mounting), chosen, finding, text=text)
     except OSError as error:
         if isinstance(error, ErtisError):  # Errors of the images' source pass unchanged.
             raise
@@ -239,7 +239,7 @@ def _write_points(
     if name == "mcap":
         _mcap.write_mcap(path, images, find, mountings, topics=topics)
         return
-    table = PointTable.of(images, find, mountings)
+    table = PointTable.from_images(images, find, mountings)
     if name == "csv":
         _point_files.write_csv(path, table)
     elif name == "ply":

@@ -19,10 +19,10 @@ from ertis_numba.errors import ArgumentError
 from ertis_numba.extras import extra
 from ertis_numba.frames import Energyscape, Stamp
 from ertis_numba.geometry import self_contained, unit_vectors
+from ertis_numba.interop._grey_image import GreyImage
 from ertis_numba.interop._messages import encoder, schema
 from ertis_numba.interop._mountings import PLATFORM, Mountings
-from ertis_numba.interop._picture import Picture
-from ertis_numba.interop._points import Find, ros_time
+from ertis_numba.interop._points import FindPoints, ros_time
 
 __all__ = ["TOPICS", "write_mcap"]
 
@@ -34,8 +34,8 @@ TOPICS: Final = {
 """Topics of a sensor, and their messages."""
 _STATIC, _STATIC_TYPE = "/tf_static", "tf2_msgs/msg/TFMessage"
 _SONAR_SUFFIX = "_sonar"
-_HALF = math.sqrt(0.5)
-_SONAR_TURN = (_HALF, 0.0, _HALF, 0.0)
+_SQRT_HALF = math.sqrt(0.5)
+_SONAR_TURN = (_SQRT_HALF, 0.0, _SQRT_HALF, 0.0)
 """Frame of marine_acoustic_msgs relative to that of the sensor: z forward, x up, y right.
 
 The rotation is 180° about the bisector of the x and z axes.
@@ -54,11 +54,11 @@ _PROFILE = """- history: 1
 """
 _FOREVER = "{sec: 9223372036, nsec: 854775807}"
 _TRANSIENT_LOCAL, _VOLATILE = 1, 2  # Constants of rmw_qos_durability_policy_t.
-_NAMED = re.compile(r"[^A-Za-z0-9]+")
+_INVALID_TOPIC_CHARACTERS = re.compile(r"[^A-Za-z0-9]+")
 
 
 def write_mcap(
-    path: Path, images: Iterable[Energyscape], find: Find, mountings: Mountings, *, topics: Collection[str]
+    path: Path, images: Iterable[Energyscape], find: FindPoints, mountings: Mountings, *, topics: Collection[str]
 ) -> None:
     """Write the messages of images as they arrive.
 
@@ -74,20 +74,20 @@ def write_mcap(
     with path.open("wb") as file:
         writer: Any = Writer(file)  # The annotations of mcap are partial.
         writer.start(profile="ros2", library="ertis-numba")
-        _Bag(writer, find, mountings, topics).write(images)
+        _McapWriter(writer, find, mountings, topics).write(images)
         writer.finish()
 
 
-class _Bag:
+class _McapWriter:
     """MCAP file in progress: its topics and sensors."""
 
-    def __init__(self, writer: Any, find: Find, mountings: Mountings, topics: Collection[str]) -> None:
+    def __init__(self, writer: Any, find: FindPoints, mountings: Mountings, topics: Collection[str]) -> None:
         self._writer, self._find, self._mountings = writer, find, mountings
         self._topics = [topic for topic in TOPICS if topic in topics]
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
         self._names: dict[str, str] = {}
-        self._pictures: dict[str, tuple[Energyscape, Picture]] = {}
+        self._pictures: dict[str, tuple[Energyscape, GreyImage]] = {}
 
     def write(self, images: Iterable[Energyscape]) -> None:
         """Write all messages; the transforms come last, because only then are all sensors known."""
@@ -97,17 +97,17 @@ class _Bag:
             if earliest is None or stamp.timestamp_ns < earliest.timestamp_ns:
                 earliest = stamp
             if sensor not in self._names:
-                self._greet(image)
+                self._register_sensor(image)
             for topic in self._topics:
                 message = getattr(self, f"_{topic}")(image)
                 self._add(f"/{self._names[sensor]}/{topic}", TOPICS[topic], message, stamp)
         if earliest is not None:
             self._add(_STATIC, _STATIC_TYPE, self._transforms(earliest), earliest)
 
-    def _greet(self, image: Energyscape) -> None:
+    def _register_sensor(self, image: Energyscape) -> None:
         """Choose a name for the topics of a sensor, and keep its settings."""
         sensor = checks.sensor_name(image.stamp.sensor)
-        name = _NAMED.sub("_", sensor).strip("_")
+        name = _INVALID_TOPIC_CHARACTERS.sub("_", sensor).strip("_")
         name = f"sensor_{name}" if not name[:1].isalpha() else name
         for other, taken in self._names.items():
             if taken == name:
@@ -157,7 +157,7 @@ class _Bag:
         sensor = image.stamp.sensor
         known = self._pictures.get(sensor)
         if known is None or not same_directions(known[0], image):
-            known = self._pictures[sensor] = image, Picture(image)
+            known = self._pictures[sensor] = image, GreyImage(image)
         pixels = known[1](image.amplitude)
         height, width = pixels.shape
         return {

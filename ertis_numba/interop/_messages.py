@@ -113,13 +113,13 @@ _RULE = "=" * 80
 
 def schema(name: str) -> str:
     """Return the definition of a message with all nested ones, as MCAP requires (``ros2msg`` in its registry)."""
-    first, *others = _with_needed(name)
+    first, *others = _with_dependencies(name)
     parts = [DEFINITIONS[first].lstrip()]
     parts += [f"MSG: {other.replace('/msg/', '/')}{DEFINITIONS[other]}" for other in others]
     return f"{_RULE}\n".join(parts)
 
 
-def _with_needed(name: str) -> list[str]:
+def _with_dependencies(name: str) -> list[str]:
     """Return a message with its nested ones, each once."""
     found = [name]
     for each in found:  # The list grows meanwhile.

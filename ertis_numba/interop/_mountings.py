@@ -5,7 +5,7 @@ from typing import Final, TypeAlias
 
 from ertis_numba.geometry import mounting
 
-__all__ = ["PLATFORM", "Mounting", "Mountings", "checked"]
+__all__ = ["PLATFORM", "Mounting", "Mountings", "validated"]
 
 Mounting: TypeAlias = tuple[tuple[float, float, float], tuple[float, float, float, float]]
 """Position x, y, z in m, and the unit quaternion x, y, z, w that rotates the sensor frame into that of the platform."""
@@ -15,7 +15,7 @@ PLATFORM: Final = "base_link"
 """Name of the platform's frame in REP 105."""
 
 
-def checked(given: Mapping[str, tuple[Sequence[float], Sequence[float]]] | None) -> Mountings:
+def validated(given: Mapping[str, tuple[Sequence[float], Sequence[float]]] | None) -> Mountings:
     """Return mountings as tuples of floats.
 
     Raises

@@ -11,9 +11,9 @@ from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Energyscape, PointCloud, Stamp
 from ertis_numba.interop._mountings import PLATFORM, Mountings
 
-__all__ = ["Find", "PointTable", "ros_time"]
+__all__ = ["FindPoints", "PointTable", "ros_time"]
 
-Find: TypeAlias = Callable[[Energyscape], PointCloud]
+FindPoints: TypeAlias = Callable[[Energyscape], PointCloud]
 """Function that returns the points of an image, in the sensor frame."""
 
 _POINT: Final = np.dtype(
@@ -46,7 +46,7 @@ class PointTable:
     frame: str
 
     @classmethod
-    def of(cls, images: Iterable[Energyscape], find: Find, mountings: Mountings) -> "PointTable":
+    def from_images(cls, images: Iterable[Energyscape], find: FindPoints, mountings: Mountings) -> "PointTable":
         """Collect the points of images.
 
         Raises

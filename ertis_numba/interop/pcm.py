@@ -21,8 +21,8 @@ __all__ = ["PcmReader", "open_pcm"]
 
 _ACOULAR = {".h5", ".hdf5", ".hdf"}
 _MIDDLE_OF_BYTES = 128
-_LONGEST_S = 1e9
-_LARGEST = float(np.finfo(np.float32).max)
+_MAX_DURATION_S = 1e9
+_MAX_FLOAT32 = float(np.finfo(np.float32).max)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,20 +71,20 @@ class PcmReader:
     ) -> None:
         if not paths:
             raise ArgumentError("no PCM file is given; give at least one")
-        self._files = [_look(path) for path in paths]
+        self._files = [_inspect(path) for path in paths]
         first = self._files[0]
         self._require_alike()
-        known = _known(settings, first)
+        known = _require_settings(settings, first)
         _require_channels(first, known)
-        self._skipped = round(checks.between("skip_s", skip_s, 0.0, _LONGEST_S) * first.rate_hz)
+        self._skipped = round(checks.between("skip_s", skip_s, 0.0, _MAX_DURATION_S) * first.rate_hz)
         shortest = min(file.n_samples for file in self._files) - self._skipped
         # An interval between emissions may contain a fraction of a sample, which must not accumulate.
         self._period = float(shortest)
         if length_s is not None:
             checks.positive("length_s", length_s)
-            self._period = checks.between("length_s", length_s, 0.0, _LONGEST_S) * first.rate_hz
+            self._period = checks.between("length_s", length_s, 0.0, _MAX_DURATION_S) * first.rate_hz
         self._n_samples = math.floor(self._period * (1 + 1e-12))
-        self._counts = [1 if length_s is None else self._whole(file) for file in self._files]
+        self._counts = [1 if length_s is None else self._count(file) for file in self._files]
         self._require_measurements(first)
         ends = [self._start(count - 1) + self._n_samples for count in self._counts]
         left = sum(file.n_samples - end for file, end in zip(self._files, ends, strict=True))
@@ -110,7 +110,7 @@ class PcmReader:
                     sync_count=sequence,
                     timestamp_ns=self._start_ns + round(sequence * period_ns),
                 )
-                words = _words(file, numbers, slice(start, start + self._n_samples), self._enabled)
+                words = _samples(file, numbers, slice(start, start + self._n_samples), self._enabled)
                 yield Measurement(words, self.settings, stamp)
                 sequence += 1
 
@@ -118,7 +118,7 @@ class PcmReader:
         """Return the first sample of a measurement in its file."""
         return self._skipped + round(number * self._period)
 
-    def _whole(self, file: _PcmFile) -> int:
+    def _count(self, file: _PcmFile) -> int:
         """Return the number of measurements in a file."""
         if self._n_samples < 1:
             return 0
@@ -147,8 +147,8 @@ class PcmReader:
             ):
                 if came != wanted:
                     raise DataError(
-                        f"{file.path} has {_plain(came)} {name}, but {first.path.name} has {_plain(wanted)}; "
-                        "import each file separately"
+                        f"{file.path} has {_format_value(came)} {name}, but {first.path.name} has "
+                        f"{_format_value(wanted)}; import each file separately"
                     )
 
 
@@ -218,7 +218,7 @@ def open_pcm(
     )
 
 
-def _known(settings: Settings | None, first: _PcmFile) -> Settings:
+def _require_settings(settings: Settings | None, first: _PcmFile) -> Settings:
     known = settings or first.settings
     if known is None:
         raise ArgumentError(f"{first.path} contains no array and call; give settings")
@@ -254,7 +254,7 @@ def _fitted(settings: Settings, recording: Recording, first: _PcmFile) -> Settin
     return settings.replace(recording=recording, processing=fit_ranges(settings.processing, recording, call))
 
 
-def _look(path: Path) -> _PcmFile:
+def _inspect(path: Path) -> _PcmFile:
     rate_hz, numbers, settings = _read(path)
     try:
         Recording(sample_rate_hz=rate_hz)
@@ -276,7 +276,7 @@ def _read(path: Path) -> tuple[float, NDArray[Any], Settings | None]:
     return *read_wav(path), None
 
 
-def _words(file: _PcmFile, numbers: NDArray[Any], samples: slice, enabled: NDArray[np.bool_]) -> NDArray[Any]:
+def _samples(file: _PcmFile, numbers: NDArray[Any], samples: slice, enabled: NDArray[np.bool_]) -> NDArray[Any]:
     """Return samples in the type of a recording; non-finite samples of disabled channels become 0."""
     numbers = numbers[samples]
     if numbers.dtype.itemsize == 1:  # 8-bit WAV samples are unsigned.
@@ -295,10 +295,10 @@ def _words(file: _PcmFile, numbers: NDArray[Any], samples: slice, enabled: NDArr
         came = numbers[sample, channel]
         raise DataError(
             f"{file.path} contains {came:g} at sample {samples.start + sample} of channel {channel}; "
-            + (f"give numbers up to {_LARGEST:.4g}" if np.isfinite(came) else "give finite numbers")
+            + (f"give numbers up to {_MAX_FLOAT32:.4g}" if np.isfinite(came) else "give finite numbers")
         )
     return words
 
 
-def _plain(value: object) -> object:
+def _format_value(value: object) -> object:
     return f"{value:g}" if isinstance(value, float) else value

@@ -97,7 +97,7 @@ class RawReader:
         return f"{self._format.n_bytes // self._format.dtype.itemsize} words of {self._format.dtype.itemsize} bytes"
 
 
-_OTHERWISE = "copy it again if it is cut short, or give the number of words of a measurement (recording.n_samples)"
+_LENGTH_REMEDY = "copy it again if it is cut short, or give the number of words of a measurement (recording.n_samples)"
 
 
 def _remedy(n_bytes: int, words: SampleFormat) -> str:
@@ -105,7 +105,7 @@ def _remedy(n_bytes: int, words: SampleFormat) -> str:
     tick_bytes = words.n_bytes // words.shape[0]
     lengths = {name.partition("_")[0]: Settings.from_preset(name).recording.n_samples for name in PRESETS}
     fitting = [f"{length}_…" for length, n_samples in lengths.items() if n_bytes % (tick_bytes * n_samples) == 0]
-    return f"its length fits the presets {', '.join(fitting)}" if fitting else _OTHERWISE
+    return f"its length fits the presets {', '.join(fitting)}" if fitting else _LENGTH_REMEDY
 
 
 def open_raw(paths: Sequence[str | Path] | str | Path, settings: Settings, *, sensor: str = "sensor") -> RawReader:

@@ -34,17 +34,17 @@ _PROCESSING = (
     "elevationLowLimit",
     "elevationHighLimit",
 )
-_DUMPED = {"dacSampleFrequency": "callSampleFrequency", "nDirections": "directions"}
+_KEYS_OF_DICT = {"dacSampleFrequency": "callSampleFrequency", "nDirections": "directions"}
 """Names in settings files, by the name in ``dict(RTISSettings)``, which users also write to JSON."""
 _AZIMUTHS, _ELEVATIONS = "directionsAzimuth", "directionsElevation"  # Radians, in dict(RTISSettings).
-_NOT_HELD = {
+_UNSUPPORTED_KEYS = {
     "callCustom": "give --preset to process it as a sweep",
     "directionsCustom": "remove it, and give --directions when processing",
     "delayMatrixCustom": "remove it",
     "rangesCustom": "remove it, and give --range when processing",
 }
 """Keys that name other files, with the remedy."""
-_KNOWN = {*_RECORDING, *_PROCESSING, *_DUMPED, *_NOT_HELD, "elevation2DAngle", _AZIMUTHS, _ELEVATIONS}
+_KNOWN = {*_RECORDING, *_PROCESSING, *_KEYS_OF_DICT, *_UNSUPPORTED_KEYS, "elevation2DAngle", _AZIMUTHS, _ELEVATIONS}
 
 
 def open_rtis_folder(
@@ -111,10 +111,10 @@ def open_rtis_folder(
     if preset is not None:
         settings = Settings.from_preset(preset)
     elif reported.keys() & {*_RECORDING, "callCustom"}:
-        settings = _recorded(folder, reported)
+        settings = _recording_settings(folder, reported)
     else:
         raise DataError(f"{folder} contains no recording settings of RTIS Dev (.json); give --preset")
-    processing = _processed(folder, reported, settings.processing)
+    processing = _processing_settings(folder, reported, settings.processing)
     settings = settings.replace(array=Array(layout=layout), air=air or Air(), processing=processing)
     return RawReader(paths, settings, sensor=sensor, first=first)
 
@@ -151,7 +151,7 @@ def _settings_in(folder: Path) -> dict[str, Any]:
         except (OSError, ValueError) as error:
             raise DataError(f"{path}: {error}; give readable JSON, or remove the file") from error
         for key in _KNOWN & content.keys() if isinstance(content, dict) else ():
-            name = _DUMPED.get(key, key)
+            name = _KEYS_OF_DICT.get(key, key)
             if name in reported and reported[name] != content[key]:
                 raise DataError(
                     f"{path}: {key} is {content[key]!r}, but {reported[name]!r} in {sources[name].name}; keep one"
@@ -160,9 +160,9 @@ def _settings_in(folder: Path) -> dict[str, Any]:
     return reported
 
 
-def _recorded(folder: Path, reported: dict[str, Any]) -> Settings:
+def _recording_settings(folder: Path, reported: dict[str, Any]) -> Settings:
     """Return call and length of a measurement."""
-    _refuse(folder, reported, "callCustom")
+    _refuse_external(folder, reported, "callCustom")
     number = {
         name: checks.finite(f"{folder}: {name}", reported.get(name, standard)) for name, standard in _RECORDING.items()
     }
@@ -182,9 +182,9 @@ def _recorded(folder: Path, reported: dict[str, Any]) -> Settings:
     return Settings(call=call, recording=recording, processing=fit_ranges(Processing(), recording, call))
 
 
-def _processed(folder: Path, reported: dict[str, Any], standard: Processing) -> Processing:
+def _processing_settings(folder: Path, reported: dict[str, Any], standard: Processing) -> Processing:
     """Return ranges and directions."""
-    _refuse(folder, reported, "directionsCustom", "delayMatrixCustom", "rangesCustom")
+    _refuse_external(folder, reported, "directionsCustom", "delayMatrixCustom", "rangesCustom")
 
     def number(name: str, otherwise: float) -> float:
         return checks.finite(f"{folder}: {name}", reported.get(name, otherwise))
@@ -224,10 +224,11 @@ def _angles_rad(folder: Path, reported: dict[str, Any], name: str) -> list[float
     return [checks.finite(f"{folder}: {name}", angle_rad) for angle_rad in angles]
 
 
-def _refuse(folder: Path, reported: dict[str, Any], *names: str) -> None:
+def _refuse_external(folder: Path, reported: dict[str, Any], *names: str) -> None:
     """Refuse settings that are stored in other files."""
     for name in names:
         if name in reported:
             raise DataError(
-                f"{folder}: {name} is the file {reported[name]!r}, which a recording cannot contain; {_NOT_HELD[name]}"
+                f"{folder}: {name} is the file {reported[name]!r}, which a recording cannot contain; "
+                f"{_UNSUPPORTED_KEYS[name]}"
             )

@@ -1,11 +1,11 @@
 """Journals, which store measurements durably before any other use; the only package that imports sqlite3."""
 
 from ertis_numba.journal._journal import SUFFIX, Journal
-from ertis_numba.journal._records import Entry, JournalGap, JournalKey, JournalSensor, require_same
-from ertis_numba.journal._rescue import LOST
+from ertis_numba.journal._records import JournalEntry, JournalGap, JournalKey, JournalSensor, require_same_settings
+from ertis_numba.journal._recovery import LOST
 from ertis_numba.journal._tables import TABLES, VERSION, Column
 from ertis_numba.journal._tally import TALLY
-from ertis_numba.journal.sealer import Sealed, seal_apart
+from ertis_numba.journal.sealing_client import SealingResult, seal_in_subprocess
 
 __all__ = [
     "LOST",
@@ -14,12 +14,12 @@ __all__ = [
     "TALLY",
     "VERSION",
     "Column",
-    "Entry",
     "Journal",
+    "JournalEntry",
     "JournalGap",
     "JournalKey",
     "JournalSensor",
-    "Sealed",
-    "require_same",
-    "seal_apart",
+    "SealingResult",
+    "require_same_settings",
+    "seal_in_subprocess",
 ]

@@ -10,18 +10,18 @@ from typing import Final, Self
 
 from ertis_numba.errors import ArgumentError, DamagedError, DataError
 from ertis_numba.journal._database import Database
-from ertis_numba.journal._records import Entry, JournalGap, JournalKey, JournalSensor, checked
-from ertis_numba.journal._tables import COMPLETE_VERSION, selection
+from ertis_numba.journal._records import JournalEntry, JournalGap, JournalKey, JournalSensor, verified_values
+from ertis_numba.journal._tables import COMPLETE_VERSION, select_statement
 
-__all__ = ["SUFFIX", "Contents"]
+__all__ = ["SUFFIX", "ReadableJournal"]
 
 SUFFIX: Final = ".journal"
 """Suffix of a journal, after the name of its recording."""
 
-_SELECTION: Final = selection("measurements", "WHERE id = ?")
+_SELECTION: Final = select_statement("measurements", "WHERE id = ?")
 
 
-def _own_name(journal: str, target: str) -> str:
+def _recording_name(journal: str, target: str) -> str:
     """Return the name of the recording to be made from a journal, in the folder of the journal.
 
     A journal may come from an untrusted source. The path that it stores is used only if the journal's own name lacks
@@ -33,7 +33,7 @@ def _own_name(journal: str, target: str) -> str:
     return f"{journal}.h5" if name in {"", ".", "..", journal} else name
 
 
-class Contents:
+class ReadableJournal:
     """An open journal for reading."""
 
     path: Path
@@ -43,7 +43,7 @@ class Contents:
     def __init__(self, path: Path, database: Database) -> None:
         self.path = path
         self._database = database
-        self._turn = threading.RLock()
+        self._lock = threading.RLock()
         self._sensors: dict[str, JournalSensor] = {}
         self._ids: dict[str, int] = {}
         # Name, reason and number of measurements, by sensor number.
@@ -53,13 +53,13 @@ class Contents:
         self._identity = 0
 
     def _load(self) -> None:
-        rows = self._database.execute(selection("journal"))
+        rows = self._database.execute(select_statement("journal"))
         if len(rows) != 1:
             raise DamagedError(f"{self.path} is damaged: it has no header; copy it again if you can")
-        target, self.source, _ = checked(self.path, "the journal", rows[0])
-        self.target = self.path.parent / _own_name(self.path.name, os.fsdecode(target))
+        target, self.source, _ = verified_values(self.path, "the journal", rows[0])
+        self.target = self.path.parent / _recording_name(self.path.name, os.fsdecode(target))
         self._identity = rows[0][-1]
-        for row in self._database.execute(selection("sensors", "ORDER BY id")):
+        for row in self._database.execute(select_statement("sensors", "ORDER BY id")):
             try:
                 self._register(row[0], JournalSensor.from_row(self.path, row))
             except DamagedError:
@@ -115,10 +115,10 @@ class Contents:
     @property
     def gaps(self) -> tuple[JournalGap, ...]:
         """Noted gaps, in order."""
-        with self._turn:
-            rows = self._database.execute(selection("gaps", "ORDER BY id"))
+        with self._lock:
+            rows = self._database.execute(select_statement("gaps", "ORDER BY id"))
         names = {number: name for name, number in self._ids.items()}
-        made = (checked(self.path, "a gap", row) for row in rows)
+        made = (verified_values(self.path, "a gap", row) for row in rows)
         return tuple(
             JournalGap(names[number], first, last, why, session_id)
             for number, session_id, first, last, why in made
@@ -128,7 +128,7 @@ class Contents:
     def index(self, sensor: str | None = None) -> list[JournalKey]:
         """Return the keys of measurements of one sensor or of all, in order of arrival, without reading them."""
         number = None if sensor is None else self._ids[self._sensor(sensor).name]
-        with self._turn:
+        with self._lock:
             rows = self._database.execute(
                 "SELECT id, sensor, epoch, sequence FROM measurements INDEXED BY key WHERE sensor = ifnull(?, sensor)",
                 (number,),
@@ -140,7 +140,7 @@ class Contents:
 
     def newest(self, n_max: int) -> list[tuple[str, int, int, int]]:
         """Return sensor, session_id, number and CRC-32 of the newest measurements, without reading their data."""
-        with self._turn:
+        with self._lock:
             rows = self._database.execute(
                 "SELECT sensor, epoch, sequence, crc32 FROM measurements ORDER BY id DESC LIMIT ?", (n_max,)
             )
@@ -155,7 +155,7 @@ class Contents:
         DamagedError
             There is no measurement with this number.
         """
-        with self._turn:
+        with self._lock:
             rows = self._database.execute(
                 "SELECT id FROM measurements INDEXED BY key WHERE sensor = ? AND epoch = ? AND sequence = ?",
                 (self._ids[self._sensor(sensor).name], session_id, sequence),
@@ -166,7 +166,7 @@ class Contents:
             )
         return JournalKey(rows[0][0], sensor, session_id, sequence)
 
-    def entry(self, key: JournalKey) -> Entry:
+    def entry(self, key: JournalKey) -> JournalEntry:
         """Return a measurement with read-only data.
 
         Raises
@@ -176,7 +176,7 @@ class Contents:
         DataError
             The measurement cannot be read.
         """
-        with self._turn:
+        with self._lock:
             rows = self._database.execute(_SELECTION, (key.place,))
         if len(rows) != 1 or tuple(rows[0][1:4]) != (self._ids[key.sensor], key.session_id, key.sequence):
             raise DamagedError(
@@ -185,7 +185,7 @@ class Contents:
             )
         return self._sensors[key.sensor].entry(self.path, rows[0])
 
-    def entries(self, sensor: str | None = None) -> Iterator[Entry]:
+    def entries(self, sensor: str | None = None) -> Iterator[JournalEntry]:
         """Yield the measurements of one sensor or of all, in order of arrival, each read when it is requested.
 
         Raises
@@ -219,5 +219,5 @@ class Contents:
 
     def close(self) -> None:
         """Close the journal; closing twice is harmless."""
-        with self._turn:
+        with self._lock:
             self._database.close()

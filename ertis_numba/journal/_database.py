@@ -11,8 +11,8 @@ from urllib.parse import quote
 
 from ertis_numba.atomic_files import fsync
 from ertis_numba.errors import DamagedError, DataError, FormatVersionError, JournalInUseError
-from ertis_numba.journal._files import beside
-from ertis_numba.journal._tables import APPLICATION_ID, TABLES, VERSION, layout
+from ertis_numba.journal._files import companion
+from ertis_numba.journal._tables import APPLICATION_ID, TABLES, VERSION, create_statements
 
 __all__ = ["LOG_BYTES", "PAGE_BYTES", "Database"]
 
@@ -33,7 +33,7 @@ _SETUP: Final = (
     f"PRAGMA cache_size = -{_CACHE_KIB}",
 )
 
-_REPORTED: Final = {
+_MESSAGES: Final = {
     sqlite3.SQLITE_FULL: "has no room on its disk; free some space: what was committed before is safe",
     sqlite3.SQLITE_IOERR: "cannot be written or read ({}); check the disk: what was committed before is safe",
     sqlite3.SQLITE_READONLY: "cannot be written ({}); allow writing to the file and to its folder",
@@ -64,15 +64,15 @@ class Database:
 
     def __init__(self, path: Path, *, empty: bool) -> None:
         self._path = path
-        self._writes_once = False  # An existing file may already use a rollback journal.
-        self._is_log_named = False  # True once the folder durably contains the name of the log.
+        self._uses_rollback_journal = False  # An existing file may already use a rollback journal.
+        self._is_log_durable = False  # True once the folder durably contains the name of the log.
         self._is_folder_synced = True
-        self._ends: dict[str, int] = {}  # Highest row numbers before a commit whose result is unknown.
-        with self._reported():
+        self._uncommitted_max_ids: dict[str, int] = {}  # Highest row numbers before a commit whose result is unknown.
+        with self._translate_errors():
             self._file = before = path.stat()
             if not before.st_size and not empty:  # Locking would turn it into a database.
                 raise DataError(f"{path} is empty; give a journal left by 'ertis capture'")
-            for log, least_bytes in _smallest(path):  # SQLite would discard the log, or pad with zeros.
+            for log, least_bytes in _min_sizes(path):  # SQLite would discard the log, or pad with zeros.
                 if before.st_size < least_bytes:
                     raise DamagedError(
                         f"{path} has {before.st_size} bytes, but its log {log.name} needs at least {least_bytes}: "
@@ -82,21 +82,21 @@ class Database:
             # Callers ensure that only one thread uses a journal at a time.
             self._connection = sqlite3.connect(uri, uri=True, timeout=0, isolation_level=None, check_same_thread=False)
         try:
-            with self._reported():
-                self.is_new = self._take(before, empty=empty)
+            with self._translate_errors():
+                self.is_new = self._lock_and_check(before, empty=empty)
         except BaseException:
             self._connection.close()
-            self._require_there(before)  # A missing file would explain the error.
+            self._require_same_file(before)  # A missing file would explain the error.
             raise
 
-    def _take(self, before: os.stat_result, *, empty: bool) -> bool:
+    def _lock_and_check(self, before: os.stat_result, *, empty: bool) -> bool:
         """Lock the file, and check its format before anything in it changes; return True for a new journal."""
         self.execute(f"PRAGMA page_size = {PAGE_BYTES}")
         self.execute("PRAGMA locking_mode = EXCLUSIVE")
         self.execute("BEGIN EXCLUSIVE")
         self.execute("COMMIT")
-        self._require_there(before)
-        self._bring_logs_to_disk()
+        self._require_same_file(before)
+        self._sync_logs()
         ((application,),), ((version,),), ((n_tables,),) = map(
             self.execute, ("PRAGMA application_id", "PRAGMA user_version", "SELECT count(*) FROM sqlite_schema")
         )
@@ -113,13 +113,13 @@ class Database:
             self.execute("PRAGMA journal_mode = WAL")
         return is_new
 
-    def _bring_logs_to_disk(self) -> None:
+    def _sync_logs(self) -> None:
         """Rewrite the logs of an earlier process in place, and sync them.
 
         That process may have ended before its sync, or its sync may have failed. The system then marks the failed pages
         as written and never writes them, although readers see their content. Rewriting makes the pages dirty again.
         """
-        for log in (beside(self._path, "-wal"), beside(self._path, "-journal")):
+        for log in (companion(self._path, "-wal"), companion(self._path, "-journal")):
             if log.exists() and log.stat().st_size:
                 with log.open("r+b", buffering=0) as file:
                     while chunk := file.read(_CHUNK_BYTES):
@@ -141,7 +141,7 @@ class Database:
             ) from error
         self._is_folder_synced = True
 
-    def write_once(self) -> None:
+    def use_rollback_journal(self) -> None:
         """Switch to a rollback journal permanently, so that commits write to the main file at once.
 
         Until then, a commit writes to the log with one sync, and a full log is moved to the main file. If each commit
@@ -153,13 +153,13 @@ class Database:
         DataError
             The disk is full or fails. Nothing has changed.
         """
-        if not self._writes_once:
-            self._roll_back_by("DELETE")
-            self._writes_once = True
+        if not self._uses_rollback_journal:
+            self._set_rollback_mode("DELETE")
+            self._uses_rollback_journal = True
             # The old log must not reappear, and the new one must stay.
-            self._is_folder_synced = self._is_log_named = False
+            self._is_folder_synced = self._is_log_durable = False
 
-    def _roll_back_by(self, mode: str) -> None:
+    def _set_rollback_mode(self, mode: str) -> None:
         """Switch to a rollback journal.
 
         A commit invalidates its header instead of removing it, because no other process can open the file. With
@@ -168,7 +168,7 @@ class Database:
         if self.execute(f"PRAGMA journal_mode = {mode}") != [(mode.lower(),)]:
             raise DataError(f"{self._path} cannot switch from its log; close it, and try again")
 
-    def require_name(self) -> None:
+    def require_file(self) -> None:
         """Refuse to continue if the path no longer leads to the open file, because new data would be lost.
 
         Raises
@@ -176,18 +176,18 @@ class Database:
         JournalInUseError
             The file was removed or replaced.
         """
-        self._require_there(self._file)
+        self._require_same_file(self._file)
 
     @property
-    def has_name(self) -> bool:
+    def has_file(self) -> bool:
         """Return True if the path still leads to the open file."""
         try:
-            self._require_there(self._file)
+            self._require_same_file(self._file)
         except (JournalInUseError, OSError):
             return False
         return True
 
-    def _require_there(self, before: os.stat_result) -> None:
+    def _require_same_file(self, before: os.stat_result) -> None:
         """Refuse a removed or replaced file: the process that had locked it may have sealed it."""
         now = self._path.stat() if self._path.exists() else None
         if now is None or (now.st_dev, now.st_ino) != (before.st_dev, before.st_ino):
@@ -205,25 +205,25 @@ class Database:
         DataError
             The disk is full, fails or is not writable, or the file is closed.
         """
-        with self._reported():
+        with self._translate_errors():
             return self._connection.execute(statement, values).fetchall()
 
     @contextmanager
     def transaction(self) -> Iterator[None]:
         """Make the changes of the block durable at its end, all or none; an error adds no row."""
         self._sync_folder()
-        self._withdraw()
-        with self._all_or_nothing():
-            self._ends = self._find_ends()
+        self._delete_uncommitted()
+        with self._atomic():
+            self._uncommitted_max_ids = self._max_ids()
             yield
-        if not self._is_log_named:  # The first commit has created the log.
+        if not self._is_log_durable:  # The first commit has created the log.
             self._is_folder_synced = False
             self._sync_folder()
-            self._is_log_named = True
-        self._ends = {}
+            self._is_log_durable = True
+        self._uncommitted_max_ids = {}
 
     @contextmanager
-    def _all_or_nothing(self) -> Iterator[None]:
+    def _atomic(self) -> Iterator[None]:
         self.execute("BEGIN IMMEDIATE")
         try:
             yield
@@ -233,31 +233,31 @@ class Database:
                 if self._connection.in_transaction:
                     self._connection.execute("ROLLBACK")
             with suppress(DataError):  # The next transaction tries it again.
-                self._withdraw()
+                self._delete_uncommitted()
             raise
 
-    def _find_ends(self) -> dict[str, int]:
+    def _max_ids(self) -> dict[str, int]:
         """Return the highest row number of each table."""
         names = {name for (name,) in self.execute("SELECT name FROM sqlite_schema WHERE type = 'table'")}
         tables = [table for table in TABLES if table in names]
         ends = (self.execute(f"SELECT ifnull(max(id), 0) FROM {table}")[0][0] for table in tables)  # noqa: S608  our own
         return dict(zip(tables, ends, strict=True))
 
-    def _withdraw(self) -> None:
+    def _delete_uncommitted(self) -> None:
         """Delete the rows of a failed commit, whose last step may fail after all rows were written."""
-        if ends := self._ends:
-            self._ends = {}
+        if ends := self._uncommitted_max_ids:
+            self._uncommitted_max_ids = {}
             try:
-                with self._all_or_nothing():
+                with self._atomic():
                     for table, last in ends.items():
                         self.execute(f"DELETE FROM {table} WHERE id > ?", (last,))  # noqa: S608  our own
             except BaseException:
-                self._ends = ends
+                self._uncommitted_max_ids = ends
                 raise
 
-    def lay_out(self) -> None:
+    def create_tables(self) -> None:
         """Create the tables, within a transaction."""
-        for statement in layout():
+        for statement in create_statements():
             self.execute(statement)
 
     def copy_to(self, path: Path) -> None:
@@ -270,14 +270,14 @@ class Database:
         DataError
             The disk is full or fails.
         """
-        with self._reported():
+        with self._translate_errors():
             copy = sqlite3.connect(path, isolation_level=None)
             try:
                 self._connection.backup(copy)
             finally:
                 copy.close()
 
-    def leave_log(self) -> None:
+    def checkpoint_and_remove_log(self) -> None:
         """Move everything to the main file and remove the log, so that closing touches no file by name.
 
         Only `close` may follow, because an interrupted commit could no longer be rolled back.
@@ -289,15 +289,15 @@ class Database:
         """
         for statement in ("BEGIN IMMEDIATE", "COMMIT"):  # They roll back a commit that a disk error has interrupted.
             self.execute(statement)
-        self._roll_back_by("PERSIST")
-        beside(self._path, "-journal").unlink(missing_ok=True)
+        self._set_rollback_mode("PERSIST")
+        companion(self._path, "-journal").unlink(missing_ok=True)
 
     def close(self) -> None:
         """Close the file; closing twice is harmless."""
         self._connection.close()
 
     @contextmanager
-    def _reported(self) -> Iterator[None]:
+    def _translate_errors(self) -> Iterator[None]:
         """Raise errors of SQLite as errors of this package, in one line with the name of the file."""
         try:
             yield
@@ -314,21 +314,21 @@ class Database:
                 raise JournalInUseError(
                     f"{self._path} is in use by another process, a capture or its sealing; wait until that has ended"
                 ) from error
-            reported = _REPORTED.get(code, "cannot be used ({}); check the disk")
+            reported = _MESSAGES.get(code, "cannot be used ({}); check the disk")
             kind = DamagedError if code == sqlite3.SQLITE_CORRUPT else DataError
-            raise kind(f"{self._path} {reported.format(_line(error))}") from error
+            raise kind(f"{self._path} {reported.format(_one_line(error))}") from error
         except UnicodeError as error:  # Damaged text raises this error.
-            raise DamagedError(f"{self._path} {_REPORTED[sqlite3.SQLITE_CORRUPT].format(_line(error))}") from error
+            raise DamagedError(f"{self._path} {_MESSAGES[sqlite3.SQLITE_CORRUPT].format(_one_line(error))}") from error
         except OSError as error:
             raise DataError(f"{self._path}: {error.strerror}; give a journal left by 'ertis capture'") from error
 
 
-def _smallest(path: Path) -> Iterator[tuple[Path, int]]:
+def _min_sizes(path: Path) -> Iterator[tuple[Path, int]]:
     """Yield the logs beside a file, and the minimum length of the file for each."""
-    log = beside(path, "-wal")
+    log = companion(path, "-wal")
     if log.exists() and log.stat().st_size:
         yield log, PAGE_BYTES
-    log = beside(path, "-journal")
+    log = companion(path, "-journal")
     if log.exists():
         with log.open("rb") as file:
             header = file.read(_HEADER.size)
@@ -337,5 +337,5 @@ def _smallest(path: Path) -> Iterator[tuple[Path, int]]:
             yield log, n_pages * page_bytes
 
 
-def _line(error: Exception) -> str:
+def _one_line(error: Exception) -> str:
     return " ".join(str(error).split())

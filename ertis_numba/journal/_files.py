@@ -10,23 +10,23 @@ from ertis_numba.errors import DataError
 from ertis_numba.journal._limit import LIMIT
 from ertis_numba.journal._tally import TALLY
 
-__all__ = ["LOGS", "beside", "disk_errors", "free_name", "keep_damaged_log", "rename_orphans", "unlink_all"]
+__all__ = ["LOGS", "companion", "disk_errors", "keep_damaged_log", "rename_orphans", "unlink_all", "unused_path"]
 
 LOGS: Final = ("-wal", "-journal")  # A killed process may leave these files with data.
-_NOTES: Final = ("-shm", TALLY, LIMIT)  # Files without use once the journal is removed.
+_COMPANIONS: Final = ("-shm", TALLY, LIMIT)  # Files without use once the journal is removed.
 
 
-def beside(path: Path, end: str) -> Path:
+def companion(path: Path, end: str) -> Path:
     """Return the path of a file beside a journal."""
     return path.with_name(f"{path.name}{end}")
 
 
-def free_name(path: Path, end: str) -> Path:
+def unused_path(path: Path, end: str) -> Path:
     """Return the first of ``NAME.END``, ``NAME.2.END``, ``NAME.3.END``… that does not exist."""
-    number, free = 1, beside(path, f".{end}")
+    number, free = 1, companion(path, f".{end}")
     while free.exists():
         number += 1
-        free = beside(path, f".{number}.{end}")
+        free = companion(path, f".{number}.{end}")
     return free
 
 
@@ -47,11 +47,11 @@ def keep_damaged_log(path: Path, content: bytes) -> Path | None:
     OSError
         The disk is full or fails.
     """
-    log = beside(path, "-wal")
+    log = companion(path, "-wal")
     for kept in log.parent.iterdir():
         if kept.name.startswith(f"{log.name}.") and kept.suffix == ".damaged" and _holds(kept, content):
             return None
-    made = free_name(log, "damaged")
+    made = unused_path(log, "damaged")
     try:
         with made.open("xb") as file:
             file.write(content)
@@ -69,19 +69,19 @@ def _holds(path: Path, content: bytes) -> bool:
 
 def unlink_all(path: Path) -> None:
     """Remove a closed journal and the files beside it."""
-    for end in ("", *LOGS, *_NOTES):
-        beside(path, end).unlink(missing_ok=True)
+    for end in ("", *LOGS, *_COMPANIONS):
+        companion(path, end).unlink(missing_ok=True)
 
 
 def rename_orphans(path: Path) -> str:
     """Rename logs of an earlier journal with this name, and return a line about them."""
-    for end in _NOTES:
-        beside(path, end).unlink(missing_ok=True)
+    for end in _COMPANIONS:
+        companion(path, end).unlink(missing_ok=True)
     moved = []
-    for log in (beside(path, end) for end in LOGS):
+    for log in (companion(path, end) for end in LOGS):
         if log.exists():
             number = 1
-            while (aside := beside(log, f".{number}.orphaned")).exists():
+            while (aside := companion(log, f".{number}.orphaned")).exists():
                 number += 1
             log.rename(aside)
             moved.append(f"{log.name} had no journal and is kept as {aside.name}")

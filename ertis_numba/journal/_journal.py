@@ -11,18 +11,18 @@ from ertis_numba.atomic_files import fsync
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.journal._contents import SUFFIX
 from ertis_numba.journal._database import Database
-from ertis_numba.journal._files import LOGS, beside, disk_errors, free_name, rename_orphans, unlink_all
-from ertis_numba.journal._limit import LIMIT, limit_of, note_limit
+from ertis_numba.journal._files import LOGS, companion, disk_errors, rename_orphans, unlink_all, unused_path
+from ertis_numba.journal._limit import LIMIT, read_limit, write_limit
 from ertis_numba.journal._log import read_log
 from ertis_numba.journal._log_choice import choose_log
-from ertis_numba.journal._rescue import rescue
-from ertis_numba.journal._rows import Rows
+from ertis_numba.journal._recovery import recover_rows
+from ertis_numba.journal._rows import WritableJournal
 from ertis_numba.journal._tables import VERSION, row_crc32
 
 __all__ = ["SUFFIX", "Journal"]
 
 
-class Journal(Rows):
+class Journal(WritableJournal):
     """Durable measurements until they are sealed into a recording.
 
     Create it with `create` or `open`, and close it after use, or use it in a ``with`` statement. No other process can
@@ -109,7 +109,7 @@ class Journal(Rows):
         """
         path = Path(path)
         log = read_log(path)
-        if log is not None and log.is_cut:
+        if log is not None and log.is_truncated:
             choose_log(path, log)
         # A process that is killed just after it created the file leaves it empty or without tables.
         opened = cls(path, Database(path, empty=path.name.endswith(SUFFIX)))
@@ -120,15 +120,15 @@ class Journal(Rows):
             else:
                 opened._load()
             opened.tally.read(opened._identity, any_journal=is_new)
-            acked = limit_of(path)
+            acked = read_limit(path)
             if acked is not None:
                 with disk_errors(path):
                     opened.tally.limit(acked)  # Rows above the limit are not a loss.
-            damage = rescue(opened, opened._database, log)
+            damage = recover_rows(opened, opened._database, log)
             if damage:
                 opened.tally.note_damage(damage)
             if acked is not None:
-                opened._obey_limit(acked)  # This includes rescued rows.
+                opened._apply_limit(acked)  # This includes rescued rows.
         except BaseException:
             opened.close()
             raise
@@ -156,12 +156,12 @@ class Journal(Rows):
         """
         path = Path(path)
         if acked:
-            note_limit(path, acked)
+            write_limit(path, acked)
             return
         unlink_all(path)
         fsync(path.parent)
 
-    def _obey_limit(self, acked: Mapping[tuple[str, int], int]) -> None:
+    def _apply_limit(self, acked: Mapping[tuple[str, int], int]) -> None:
         """Delete rows above the limit."""
         runs = {(key.sensor, key.session_id) for key in self.index()} | {
             (gap.sensor, gap.session_id) for gap in self.gaps
@@ -178,17 +178,17 @@ class Journal(Rows):
         self._n_entries = self._held_bytes = 0
         self._load()
         with disk_errors(self.path):
-            beside(self.path, LIMIT).unlink(missing_ok=True)
+            companion(self.path, LIMIT).unlink(missing_ok=True)
 
     def _begin(self, target: Path, source: str) -> None:
         now = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
         with self._database.transaction():
-            self._database.lay_out()
+            self._database.create_tables()
             self._insert("journal", (os.fsencode(target), source, now))
         self._load()
         self.tally.begin(self._identity)
 
-    def adopt(self, header: Sequence[Any]) -> None:
+    def restore_header(self, header: Sequence[Any]) -> None:
         """Restore the header of the journal from before its log was damaged.
 
         Parameters
@@ -202,7 +202,7 @@ class Journal(Rows):
             The journal cannot be written.
         """
         identity = row_crc32(header)
-        with self._turn:
+        with self._lock:
             if identity != self._identity:
                 with self._database.transaction():
                     self._database.execute("DELETE FROM journal")
@@ -218,15 +218,15 @@ class Journal(Rows):
         DataError
             The disk fails. The stored measurements are safe.
         """
-        with self._turn:
+        with self._lock:
             self._database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
 
     def remove(self) -> None:
         """Close the journal and remove it: its content is in a recording, or it is empty."""
-        with self._turn:
+        with self._lock:
             try:
                 with suppress(DataError):
-                    self._release()
+                    self._prepare_rename()
                 self.tally.close()
                 # If the disk was too full to merge the log, it stays, and has no meaning without the journal.
                 unlink_all(self.path)
@@ -247,10 +247,10 @@ class Journal(Rows):
         DataError
             The disk is full or fails. The journal keeps its name.
         """
-        with self._turn:
+        with self._lock:
             try:
-                self._release()
-                aside = free_name(self.path, end)
+                self._prepare_rename()
+                aside = unused_path(self.path, end)
                 self.tally.remove()
                 self.path.rename(aside)
             finally:
@@ -260,18 +260,18 @@ class Journal(Rows):
 
     def close(self) -> None:
         """Close the journal; closing twice is harmless."""
-        with self._turn:
-            is_ours = self._database.has_name
+        with self._lock:
+            is_ours = self._database.has_file
             super().close()
             # Without a log, the main file detects its own damage.
-            if is_ours and not self.damage and not any(beside(self.path, end).exists() for end in LOGS):
+            if is_ours and not self.damage and not any(companion(self.path, end).exists() for end in LOGS):
                 with suppress(OSError):
                     self.tally.remove()
             self.tally.close()
 
-    def _release(self) -> None:
+    def _prepare_rename(self) -> None:
         """Prepare the file for renaming; it stays locked on systems that allow renaming an open file."""
         if os.name == "nt":
             self.close()
         else:
-            self._database.leave_log()
+            self._database.checkpoint_and_remove_log()

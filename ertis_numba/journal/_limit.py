@@ -13,13 +13,13 @@ from typing import Final
 from ertis_numba.atomic_files import atomic_write
 from ertis_numba.errors import DamagedError, DataError
 
-__all__ = ["LIMIT", "limit_of", "note_limit"]
+__all__ = ["LIMIT", "read_limit", "write_limit"]
 
 LIMIT: Final = "-limit"
 """Suffix of the file, after the name of the journal."""
 
 
-def note_limit(path: Path, acked: Mapping[tuple[str, int], int]) -> None:
+def write_limit(path: Path, acked: Mapping[tuple[str, int], int]) -> None:
     """Write the limit of a journal durably.
 
     Parameters
@@ -36,11 +36,11 @@ def note_limit(path: Path, acked: Mapping[tuple[str, int], int]) -> None:
     """
     runs: list[list[str | int]] = [[sensor, session_id, last] for (sensor, session_id), last in acked.items()]
     text = json.dumps({"runs": runs, "crc32": _check(runs)})
-    with atomic_write(_beside(path), overwrite=True, token="new") as part:  # noqa: S106  the folder has one writer
+    with atomic_write(_limit_path(path), overwrite=True, token="new") as part:  # noqa: S106  the folder has one writer
         part.write_text(text, "utf-8")
 
 
-def limit_of(path: Path) -> dict[tuple[str, int], int] | None:
+def read_limit(path: Path) -> dict[tuple[str, int], int] | None:
     """Return the limit of a journal; None if it has none.
 
     Raises
@@ -50,7 +50,7 @@ def limit_of(path: Path) -> dict[tuple[str, int], int] | None:
     DataError
         The file cannot be read.
     """
-    place = _beside(path)
+    place = _limit_path(path)
     try:
         content = json.loads(place.read_bytes())
         runs = content["runs"]
@@ -74,5 +74,5 @@ def _check(runs: list[list[str | int]]) -> int:
     return zlib.crc32(json.dumps(runs).encode())
 
 
-def _beside(path: Path) -> Path:
+def _limit_path(path: Path) -> Path:
     return path.with_name(f"{path.name}{LIMIT}")

@@ -48,7 +48,7 @@ class WriteAheadLog:
     n_lost_commits: int
 
     @property
-    def is_cut(self) -> bool:
+    def is_truncated(self) -> bool:
         """True if frames of this generation follow those that SQLite reads: damaged ones, or a torn end."""
         _, page_bytes = _format(self.content)
         place = _HEADER_BYTES + self.n_read * (_FRAME.size + page_bytes)

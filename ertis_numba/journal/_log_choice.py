@@ -15,7 +15,7 @@ from typing import Final
 
 from ertis_numba.atomic_files import fsync
 from ertis_numba.errors import DamagedError, DataError
-from ertis_numba.journal._files import beside, keep_damaged_log
+from ertis_numba.journal._files import companion, keep_damaged_log
 from ertis_numba.journal._log import WriteAheadLog
 
 try:
@@ -49,24 +49,24 @@ def choose_log(path: Path, log: WriteAheadLog) -> None:
     DataError
         The disk is full or fails. Nothing has changed.
     """
-    with _unused(path) as is_unused:
+    with _locked(path) as is_unused:
         if not is_unused:
             return
         try:
-            chosen = _sound(path, log)
+            chosen = _usable_content(path, log)
             if chosen is not log.content:
-                _install(path, log.content, chosen)
+                _replace_log(path, log.content, chosen)
         except OSError as error:
             raise DataError(f"{path}: {error.strerror}; free space for a copy, because its log is damaged") from error
 
 
-def _sound(path: Path, log: WriteAheadLog) -> bytes:
+def _usable_content(path: Path, log: WriteAheadLog) -> bytes:
     """Return the first content of the log with which a copy of the journal is intact."""
     with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
         copy = Path(folder) / path.name
         for content in (log.content, log.repaired, b""):
             shutil.copyfile(path, copy)
-            beside(copy, "-wal").write_bytes(content)
+            companion(copy, "-wal").write_bytes(content)
             with suppress(sqlite3.Error), closing(sqlite3.connect(copy)) as connection:
                 if connection.execute("PRAGMA quick_check(1)").fetchall() == [("ok",)]:
                     return content
@@ -75,20 +75,20 @@ def _sound(path: Path, log: WriteAheadLog) -> bytes:
     raise DamagedError(f"{path} and its log are damaged; copy both again if you can")
 
 
-def _install(path: Path, damaged: bytes, chosen: bytes) -> None:
+def _replace_log(path: Path, damaged: bytes, chosen: bytes) -> None:
     keep_damaged_log(path, damaged)
-    made = beside(path, "-wal.new")
+    made = companion(path, "-wal.new")
     with made.open("wb") as file:
         file.write(chosen)
         file.flush()
         os.fsync(file.fileno())
-    made.replace(beside(path, "-wal"))
-    beside(path, "-shm").unlink(missing_ok=True)
+    made.replace(companion(path, "-wal"))
+    companion(path, "-shm").unlink(missing_ok=True)
     fsync(path.parent)
 
 
 @contextmanager
-def _unused(path: Path) -> Iterator[bool]:
+def _locked(path: Path) -> Iterator[bool]:
     """Lock the journal during the block; yield False if another process has it open."""
     with path.open("r+b") as file:
         if fcntl is not None:

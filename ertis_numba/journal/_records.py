@@ -17,7 +17,7 @@ from ertis_numba.journal._tables import row_crc32
 from ertis_numba.sample_format import sample_format
 from ertis_numba.settings import Air, Settings
 
-__all__ = ["Entry", "JournalGap", "JournalKey", "JournalSensor", "checked", "require_same"]
+__all__ = ["JournalEntry", "JournalGap", "JournalKey", "JournalSensor", "require_same_settings", "verified_values"]
 
 _INT64 = (-(2**63), 2**63 - 1)
 _UNKNOWN = 7 * (0.0,)  # Unknown mounting: translation, and a rotation that no mounting has.
@@ -25,7 +25,7 @@ _MAX_BYTES = 999_000_000  # Limit on one measurement: the limit of SQLite, with 
 
 
 @dataclass(slots=True, eq=False)
-class Entry:
+class JournalEntry:
     """A measurement in a journal.
 
     Attributes
@@ -98,7 +98,7 @@ class JournalSensor:
     dtype: np.dtype[Any]
 
     @classmethod
-    def of(
+    def from_settings(
         cls,
         name: str,
         settings: Settings,
@@ -140,19 +140,19 @@ class JournalSensor:
     @classmethod
     def from_row(cls, path: Path, row: Sequence[Any]) -> Self:
         """Return the sensor of a row."""
-        name, text, firmware, *place = checked(path, "a sensor", row)
+        name, text, firmware, *place = verified_values(path, "a sensor", row)
         try:
             settings = received_settings(text, f"{path}: settings of sensor {name}")
         except SettingsError as error:
             raise DataError(str(error)) from error
         if tuple(place) == _UNKNOWN:
-            return cls.of(name, settings, firmware=firmware)
-        return cls.of(name, settings, firmware=firmware, translation_m=place[:3], rotation_xyzw=place[3:])
+            return cls.from_settings(name, settings, firmware=firmware)
+        return cls.from_settings(name, settings, firmware=firmware, translation_m=place[:3], rotation_xyzw=place[3:])
 
-    def entry_row(self, entry: Entry, sensor_id: int) -> tuple[Any, ...]:
+    def entry_row(self, entry: JournalEntry, sensor_id: int) -> tuple[Any, ...]:
         """Return the row of a measurement; refuse data that does not match this sensor."""
         stamp, air = entry.measurement.stamp, entry.measurement.settings.air
-        words = self._words(entry.measurement.data)
+        words = self._sample_data(entry.measurement.data)
         if entry.crc32 is None:
             entry.crc32 = zlib.crc32(words.data)
         values = (
@@ -170,13 +170,13 @@ class JournalSensor:
         )
         return (*values, row_crc32(values), words)
 
-    def _words(self, words: NDArray[np.unsignedinteger[Any]]) -> NDArray[np.unsignedinteger[Any]]:
+    def _sample_data(self, words: NDArray[np.unsignedinteger[Any]]) -> NDArray[np.unsignedinteger[Any]]:
         checks.shape(f"a measurement of sensor {self.name}", words.shape, self.shape)
         if words.dtype.newbyteorder("<") != self.dtype:
             raise ArgumentError(f"a measurement of sensor {self.name} contains {words.dtype}; give {self.dtype.name}")
         return np.ascontiguousarray(words, dtype=self.dtype)
 
-    def entry(self, path: Path, row: Sequence[Any]) -> Entry:
+    def entry(self, path: Path, row: Sequence[Any]) -> JournalEntry:
         """Return the measurement of a row.
 
         Raises
@@ -186,7 +186,7 @@ class JournalSensor:
         """
         *values, words = row
         what = f"measurement {row[3]} of sensor {self.name}"
-        _, session_id, sequence, sync_count, time_ns, uncertainty_ns, monotonic_ns, *air, crc32 = checked(
+        _, session_id, sequence, sync_count, time_ns, uncertainty_ns, monotonic_ns, *air, crc32 = verified_values(
             path, what, values
         )
         if not isinstance(words, bytes):  # The recorded type is damaged.
@@ -209,10 +209,10 @@ class JournalSensor:
             session_id=session_id,
         )
         array = np.frombuffer(words, dtype=self.dtype).reshape(self.shape)
-        return Entry(Measurement(array, settings, stamp), monotonic_ns, crc32)
+        return JournalEntry(Measurement(array, settings, stamp), monotonic_ns, crc32)
 
 
-def checked(path: Path, what: str, row: Sequence[Any]) -> list[Any]:
+def verified_values(path: Path, what: str, row: Sequence[Any]) -> list[Any]:
     """Check the CRC-32 of a row, and return its values without number and CRC-32."""
     _, *values, wanted = row
     got = row_crc32(values)
@@ -224,7 +224,7 @@ def checked(path: Path, what: str, row: Sequence[Any]) -> list[Any]:
     return values
 
 
-def require_same(sensor: JournalSensor, settings: Settings) -> None:
+def require_same_settings(sensor: JournalSensor, settings: Settings) -> None:
     """Refuse settings that differ from those of the sensor in more than the air."""
     came = self_contained(settings)
     for name in ("array", "call", "recording"):

@@ -6,21 +6,21 @@ from pathlib import Path
 from typing import Any, Final
 
 from ertis_numba.errors import ArgumentError, DataError
-from ertis_numba.journal import _room
-from ertis_numba.journal._contents import Contents
+from ertis_numba.journal import _free_space
+from ertis_numba.journal._contents import ReadableJournal
 from ertis_numba.journal._database import LOG_BYTES, Database
 from ertis_numba.journal._files import disk_errors
-from ertis_numba.journal._records import Entry, JournalGap, JournalSensor, require_same
-from ertis_numba.journal._tables import VERSION, insertion, row_crc32
+from ertis_numba.journal._records import JournalEntry, JournalGap, JournalSensor, require_same_settings
+from ertis_numba.journal._tables import VERSION, insert_statement, row_crc32
 from ertis_numba.journal._tally import Tally
 from ertis_numba.settings import Settings
 
-__all__ = ["Rows"]
+__all__ = ["WritableJournal"]
 
-_INSERTION: Final = insertion("measurements")
+_INSERTION: Final = insert_statement("measurements")
 
 
-class Rows(Contents):
+class WritableJournal(ReadableJournal):
     """An open journal for changes.
 
     Attributes
@@ -66,17 +66,17 @@ class Rows(Contents):
         DataError
             The journal is not writable.
         """
-        made = JournalSensor.of(
+        made = JournalSensor.from_settings(
             name, settings, firmware=firmware, translation_m=translation_m, rotation_xyzw=rotation_xyzw
         )
-        with self._turn:
+        with self._lock:
             if name in self._sensors:
                 raise ArgumentError(f"sensor {name!r} is in {self.path} already; give each sensor its own name")
             with self._database.transaction():
                 self._insert("sensors", made.row())
             self._register(len(self._ids) + len(self._unusable) + 1, made)
 
-    def append(self, entries: Sequence[Entry]) -> None:
+    def append(self, entries: Sequence[JournalEntry]) -> None:
         """Store measurements durably, all or none.
 
         Parameters
@@ -96,16 +96,16 @@ class Rows(Contents):
         JournalInUseError
             Another process has removed or replaced the journal.
         """
-        with self._turn:
+        with self._lock:
             last = dict(self._last)
             rows = [self._row(entry, last) for entry in entries]
             sizes_bytes = [row[-1].nbytes for row in rows]
-            seals_bytes = self._seals_bytes(sum(sizes_bytes), len(rows))
-            _room.require(self.path, self.target, sizes_bytes=sizes_bytes, seals_bytes=seals_bytes)
-            self._database.require_name()
+            seals_bytes = self._recording_bytes(sum(sizes_bytes), len(rows))
+            _free_space.require_free_space(self.path, self.target, sizes_bytes=sizes_bytes, seals_bytes=seals_bytes)
+            self._database.require_file()
             if sum(sizes_bytes) > LOG_BYTES:
                 with suppress(DataError):
-                    self._database.write_once()
+                    self._database.use_rollback_journal()
             with self._database.transaction():
                 for row in rows:
                     self._database.execute(_INSERTION, row)
@@ -116,14 +116,14 @@ class Rows(Contents):
             for stamp in (entry.measurement.stamp for entry in entries):
                 first.setdefault((stamp.sensor, stamp.session_id), stamp.sequence)
             for run, number in first.items():
-                self.tally.grow(*run, number, last[run])
+                self.tally.record(*run, number, last[run])
 
-    def _row(self, entry: Entry, last: dict[tuple[str, int], int]) -> tuple[Any, ...]:
+    def _row(self, entry: JournalEntry, last: dict[tuple[str, int], int]) -> tuple[Any, ...]:
         """Return the row of a measurement, whose number must be above the one in ``last``."""
         stamp, settings = entry.measurement.stamp, entry.measurement.settings
         sensor = self._sensor(stamp.sensor)
         if settings is not self._accepted.get(sensor.name):
-            require_same(sensor, settings)
+            require_same_settings(sensor, settings)
             self._accepted[sensor.name] = settings
         row = sensor.entry_row(entry, self._ids[sensor.name])
         key = (sensor.name, stamp.session_id)
@@ -158,7 +158,7 @@ class Rows(Contents):
         DataError
             The journal is not writable.
         """
-        with self._turn:
+        with self._lock:
             rows = [
                 (self._ids[self._sensor(gap.sensor).name], gap.session_id, gap.first, gap.last, gap.reason)
                 for gap in gaps
@@ -167,7 +167,7 @@ class Rows(Contents):
                 for row in rows:
                     self._insert("gaps", row)
             for gap in gaps:
-                self.tally.grow(gap.sensor, gap.session_id, gap.first, gap.last)
+                self.tally.record(gap.sensor, gap.session_id, gap.first, gap.last)
 
     def discard(self, sensor: str, session_id: int, up_to: int) -> int:
         """Delete measurements of a sensor's session that another node has stored, and gaps; durably, all or none.
@@ -198,10 +198,10 @@ class Rows(Contents):
         """
         known = self._sensor(sensor)
         which = self._ids[known.name], session_id, up_to
-        with self._turn:
+        with self._lock:
             # Deleted measurements need not be erased. Some builds of SQLite overwrite them, as slowly as they store.
             self._database.execute("PRAGMA secure_delete = OFF")
-            self._database.require_name()
+            self._database.require_file()
             with disk_errors(self.tally.path):
                 self.tally.discard(sensor, session_id, up_to)
             with self._database.transaction():
@@ -220,9 +220,9 @@ class Rows(Contents):
         return int(n_deleted)
 
     def _insert(self, table: str, values: tuple[Any, ...]) -> None:
-        self._database.execute(insertion(table), (*values, row_crc32(values)))
+        self._database.execute(insert_statement(table), (*values, row_crc32(values)))
 
-    def room(self) -> int:
+    def appendable_bytes(self) -> int:
         """Return the approximate number of bytes of samples that can be appended while sealing stays possible.
 
         Raises
@@ -230,11 +230,11 @@ class Rows(Contents):
         DataError
             The folder of the recording does not exist.
         """
-        with self._turn:
-            return _room.left(self.path, self.target, seals_bytes=self._seals_bytes())
+        with self._lock:
+            return _free_space.appendable_bytes(self.path, self.target, seals_bytes=self._recording_bytes())
 
-    def _seals_bytes(self, more_bytes: int = 0, n_more: int = 0) -> int:
+    def _recording_bytes(self, more_bytes: int = 0, n_more: int = 0) -> int:
         """Return the approximate size of the recording with additional measurements."""
-        return _room.recording_bytes(
+        return _free_space.recording_bytes(
             self._held_bytes + more_bytes, n_rows=len(self) + n_more, n_sensors=len(self._sensors)
         )

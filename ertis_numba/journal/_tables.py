@@ -12,10 +12,10 @@ __all__ = [
     "TABLES",
     "VERSION",
     "Column",
-    "insertion",
-    "layout",
+    "create_statements",
+    "insert_statement",
     "row_crc32",
-    "selection",
+    "select_statement",
 ]
 
 APPLICATION_ID: Final = 0x6552544A
@@ -46,7 +46,7 @@ class Column:
 
     name: str
     kind: str
-    about: str
+    description: str
     units: str = ""
 
 
@@ -109,7 +109,7 @@ TABLES: Final[Mapping[str, tuple[Column, ...]]] = {
 }
 
 
-def layout() -> Iterable[str]:
+def create_statements() -> Iterable[str]:
     """Yield the statements that create the tables, and the index of keys."""
     for table, columns in TABLES.items():
         kinds = ", ".join(
@@ -121,13 +121,13 @@ def layout() -> Iterable[str]:
     yield f"PRAGMA user_version = {COMPLETE_VERSION}"
 
 
-def insertion(table: str) -> str:
+def insert_statement(table: str) -> str:
     """Return the statement that adds a row, given all its columns but ``id``."""
     names = [column.name for column in TABLES[table] if column is not _ID]
     return f"INSERT INTO {table} ({', '.join(names)}) VALUES ({', '.join('?' * len(names))})"  # noqa: S608  our own
 
 
-def selection(table: str, where: str = "") -> str:
+def select_statement(table: str, where: str = "") -> str:
     """Return the statement that reads rows with all their columns."""
     return f"SELECT {', '.join(column.name for column in TABLES[table])} FROM {table} {where}"  # noqa: S608  our own
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Final
 
-__all__ = ["TALLY", "Mark", "Tally"]
+__all__ = ["TALLY", "SequenceRange", "Tally"]
 
 TALLY: Final = "-tally"
 """Suffix of the file, after the name of the journal."""
@@ -23,7 +23,7 @@ _BLOCK_BYTES: Final = 512  # Size of a sector, which a disk writes as a whole.
 
 
 @dataclass(slots=True)
-class Mark:
+class SequenceRange:
     """Numbers of one session of a sensor.
 
     Attributes
@@ -45,7 +45,7 @@ class Mark:
     discarded: int = -1
 
 
-_FIELDS: Final = tuple(field.name for field in fields(Mark))
+_FIELDS: Final = tuple(field.name for field in fields(SequenceRange))
 
 
 class Tally:
@@ -70,7 +70,7 @@ class Tally:
         self._identity = 0
         self._was_read = False
         self._places: dict[tuple[str, int], int] = {}
-        self.marks: dict[tuple[str, int], Mark] = {}
+        self.ranges: dict[tuple[str, int], SequenceRange] = {}
         self.damage = ""
 
     def begin(self, identity: int) -> None:
@@ -94,13 +94,13 @@ class Tally:
         self.damage = blocks.pop(0, {}).get("damage", "")
         for place, block in blocks.items():
             # Tallies written before version 2 of the formats name the session "epoch".
-            mark = Mark(**{"session_id" if key == "epoch" else key: value for key, value in block.items()})
+            mark = SequenceRange(**{"session_id" if key == "epoch" else key: value for key, value in block.items()})
             self._places[mark.sensor, mark.session_id] = place
-            self.marks[mark.sensor, mark.session_id] = mark
+            self.ranges[mark.sensor, mark.session_id] = mark
 
-    def grow(self, sensor: str, session_id: int, first: int, last: int) -> None:
+    def record(self, sensor: str, session_id: int, first: int, last: int) -> None:
         """Register stored numbers; errors are ignored, so that the loss of these numbers could go unnoticed."""
-        mark = self.marks.setdefault((sensor, session_id), Mark(sensor, session_id, first, last))
+        mark = self.ranges.setdefault((sensor, session_id), SequenceRange(sensor, session_id, first, last))
         mark.last = max(mark.last, last)
         with suppress(OSError):
             self._put(mark)
@@ -119,7 +119,7 @@ class Tally:
         OSError
             The file cannot be written.
         """
-        mark = self.marks.get((sensor, session_id))
+        mark = self.ranges.get((sensor, session_id))
         if mark is not None and up_to > mark.discarded:
             mark.discarded = up_to
             self._put(mark)
@@ -138,13 +138,13 @@ class Tally:
         OSError
             The file cannot be written.
         """
-        for run, mark in self.marks.items():
+        for run, mark in self.ranges.items():
             last = max(acked.get(run, -1), mark.first - 1)
             if mark.last > last:
                 mark.last = last
                 self._put(mark)
 
-    def _put(self, mark: Mark) -> None:
+    def _put(self, mark: SequenceRange) -> None:
         place = self._places.setdefault((mark.sensor, mark.session_id), max(self._places.values(), default=0) + 1)
         if self._descriptor < 0:
             self._begin()

@@ -15,16 +15,16 @@ from ertis_numba.storage.recording import (
     open_recording,
     write_recording,
 )
-from ertis_numba.storage.truth import Truth, TruthLog
+from ertis_numba.storage.truth import GroundTruth, GroundTruthLog
 
 __all__ = [
     "EnergyscapeReader",
     "EnergyscapeWriter",
+    "GroundTruth",
+    "GroundTruthLog",
     "RecordingGap",
     "RecordingReader",
     "RecordingWriter",
-    "Truth",
-    "TruthLog",
     "atomic_write",
     "check_target",
     "file_kind",

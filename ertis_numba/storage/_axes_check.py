@@ -9,7 +9,7 @@ from ertis_numba.errors import DamagedError, ForeignDataError
 from ertis_numba.storage.schema import RECORDING, RECORDING_OF_PCM
 from ertis_numba.storage.structure import require_attributes, stored_bytes
 
-__all__ = ["fault_of"]
+__all__ = ["find_damage"]
 
 _MAX_BYTES: Final = 16 * 2**20  # Limit for a dataset that no table names.
 _DIMS: Final = {variable.name: variable.dims for variable in (*RECORDING, *RECORDING_OF_PCM)}
@@ -17,7 +17,7 @@ _DIMS: Final = {variable.name: variable.dims for variable in (*RECORDING, *RECOR
 _UNREADABLE: Final = (OSError, RuntimeError, LookupError, AttributeError, TypeError, ValueError)
 
 
-def fault_of(path: Path) -> str:
+def find_damage(path: Path) -> str:
     """Return the first damaged object of a file and its damage, as one line; empty if there is none.
 
     Raises
@@ -36,7 +36,7 @@ def fault_of(path: Path) -> str:
             names: list[str] = []
             file.visit(names.append)
             for place in ("/", *names):
-                if wrong := _fault(file, file[place]):
+                if wrong := _damage_of(file, file[place]):
                     return f"{place}: {wrong}"
     except ForeignDataError:
         raise
@@ -48,7 +48,7 @@ def fault_of(path: Path) -> str:
     return ""
 
 
-def _fault(file: h5py.File, item: h5py.Group | h5py.Dataset) -> str:
+def _damage_of(file: h5py.File, item: h5py.Group | h5py.Dataset) -> str:
     require_attributes(item)
     for name in item.attrs:
         value = item.attrs[name]
@@ -59,22 +59,22 @@ def _fault(file: h5py.File, item: h5py.Group | h5py.Dataset) -> str:
     if not isinstance(item, h5py.Dataset):
         return ""
     name = item.name.rpartition("/")[2]
-    if name not in _DIMS and item.shape is not None and not _only_counts(item):
+    if name not in _DIMS and item.shape is not None and not _is_empty_scale(item):
         stored_bytes(item, may_be_filtered=True)
         if item.nbytes <= _MAX_BYTES:
             item[()]
     if "/truth/" in item.name or item.is_scale:
         return ""
-    return _wrong_axes(item, _DIMS.get(name, ()))
+    return _axes_mismatch(item, _DIMS.get(name, ()))
 
 
-def _only_counts(item: h5py.Dataset) -> bool:
+def _is_empty_scale(item: h5py.Dataset) -> bool:
     """Return True if a dataset is an axis without values, which stores nothing."""
     is_here = not (item.is_virtual or item.external)
     return bool(item.is_scale and is_here and not item.id.get_storage_size())
 
 
-def _wrong_axes(item: h5py.Dataset, wanted: tuple[str, ...]) -> str:
+def _axes_mismatch(item: h5py.Dataset, wanted: tuple[str, ...]) -> str:
     found: list[Any] = [scale.name.rpartition("/")[2] for axis in item.dims for scale in axis.values()]
     dims = [dim for dim in wanted if dim in item.parent][: item.ndim]
     return "" if found == dims or not found or not dims else f"has axes {', '.join(found)}, wanted {', '.join(dims)}"

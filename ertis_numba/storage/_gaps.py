@@ -4,10 +4,10 @@ import bisect
 from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
-__all__ = ["UNKNOWN", "Missing", "Numbers", "Runs"]
+__all__ = ["UNKNOWN", "MissingNumbers", "SensorSequences", "SequenceNumbers"]
 
 Range = tuple[int, int]
-Hole = tuple[int, int, str]
+ReasonedRange = tuple[int, int, str]
 
 UNKNOWN = "not among the measurements given"
 """Reason of a gap without a noted reason."""
@@ -15,7 +15,7 @@ UNKNOWN = "not among the measurements given"
 _END = 2**63  # Above all sequence numbers.
 
 
-class Missing(NamedTuple):
+class MissingNumbers(NamedTuple):
     """Missing sequence numbers of a sensor's session, ``first`` and ``last`` included, with the reason."""
 
     first: int
@@ -24,21 +24,21 @@ class Missing(NamedTuple):
     session_id: int = 0
 
 
-class Runs:
+class SensorSequences:
     """Sequence numbers of a sensor's sessions, and the missing ones."""
 
     def __init__(self) -> None:
-        self._numbers: dict[int, Numbers] = {}
+        self._numbers: dict[int, SequenceNumbers] = {}
 
-    def holds(self, number: int, session_id: int) -> bool:
+    def contains(self, number: int, session_id: int) -> bool:
         """Return True if a number of a session has arrived."""
         return session_id in self._numbers and number in self._numbers[session_id]
 
     def add(self, number: int, session_id: int) -> None:
         """Add the next number of a session."""
-        self._numbers.setdefault(session_id, Numbers()).add(number)
+        self._numbers.setdefault(session_id, SequenceNumbers()).add(number)
 
-    def missing(self, noted: Iterable[Missing]) -> list[Missing]:
+    def missing(self, noted: Iterable[MissingNumbers]) -> list[MissingNumbers]:
         """Return the missing numbers of all sessions: in order of arrival, then sessions of which only gaps are known.
 
         Parameters
@@ -46,17 +46,17 @@ class Runs:
         noted : iterable of Missing
             Noted gaps.
         """
-        known: dict[int, list[Hole]] = {}
+        known: dict[int, list[ReasonedRange]] = {}
         for first, last, reason, session_id in noted:
             known.setdefault(session_id, []).append((first, last, reason))
         return [
-            Missing(*hole, session_id)
+            MissingNumbers(*hole, session_id)
             for session_id in (*self._numbers, *sorted(known.keys() - self._numbers.keys()))
-            for hole in self._numbers.get(session_id, Numbers()).missing(known.get(session_id, ()))
+            for hole in self._numbers.get(session_id, SequenceNumbers()).missing(known.get(session_id, ()))
         ]
 
 
-class Numbers:
+class SequenceNumbers:
     """Sequence numbers of one session of a sensor, in order of arrival, and the missing ones.
 
     Attributes
@@ -74,7 +74,9 @@ class Numbers:
         self._late: set[int] = set()  # Numbers that did not rise.
 
     def __contains__(self, number: int) -> bool:
-        return number in self._late or (number <= self._highest and not any(_shared((number, number), self._skipped)))
+        return number in self._late or (
+            number <= self._highest and not any(_intersection((number, number), self._skipped))
+        )
 
     def add(self, number: int) -> None:
         """Add the next number."""
@@ -90,7 +92,7 @@ class Numbers:
             self._highest = number
         self._last = number
 
-    def missing(self, noted: Iterable[Hole]) -> list[Hole]:
+    def missing(self, noted: Iterable[ReasonedRange]) -> list[ReasonedRange]:
         """Return the missing numbers in order: first, last and reason; neighbours with one reason are merged.
 
         If the numbers rise, the missing part of a noted gap is outside of their interval or in a jump. Otherwise, as in
@@ -104,13 +106,13 @@ class Numbers:
         known = list(_disjoint(noted))
         if self._first is not None and not self._late:
             absent = [(-_END, self._first - 1), *self.jumps, (self._last + 1, _END)]
-            known = [(first, last, item[2]) for item in known for first, last in _shared(item[:2], absent)]
+            known = [(first, last, item[2]) for item in known for first, last in _intersection(item[:2], absent)]
         holes = [item[:2] for item in known]
-        unknown = [(first, last, UNKNOWN) for jump in self.jumps for first, last in _less(jump, holes)]
-        return list(_joined(sorted(known + unknown)))
+        unknown = [(first, last, UNKNOWN) for jump in self.jumps for first, last in _difference(jump, holes)]
+        return list(_merged(sorted(known + unknown)))
 
 
-def _disjoint(noted: Iterable[Hole]) -> Iterator[Hole]:
+def _disjoint(noted: Iterable[ReasonedRange]) -> Iterator[ReasonedRange]:
     end = -_END
     for first, last, reason in sorted(noted, key=lambda item: item[0]):
         if last > end:
@@ -118,7 +120,7 @@ def _disjoint(noted: Iterable[Hole]) -> Iterator[Hole]:
             end = last
 
 
-def _shared(given: Range, others: Sequence[Range]) -> Iterator[Range]:
+def _intersection(given: Range, others: Sequence[Range]) -> Iterator[Range]:
     """Yield the intersection of a range with other ranges, which are in order and do not overlap."""
     for index in range(bisect.bisect_left(others, given[0], key=lambda other: other[1]), len(others)):
         first, last = others[index]
@@ -127,10 +129,10 @@ def _shared(given: Range, others: Sequence[Range]) -> Iterator[Range]:
         yield max(first, given[0]), min(last, given[1])
 
 
-def _less(given: Range, others: Sequence[Range]) -> Iterator[Range]:
+def _difference(given: Range, others: Sequence[Range]) -> Iterator[Range]:
     """Yield the difference between a range and other ranges, which are in order and do not overlap."""
     begin, end = given
-    for first, last in _shared(given, others):
+    for first, last in _intersection(given, others):
         if first > begin:
             yield begin, first - 1
         begin = last + 1
@@ -138,8 +140,8 @@ def _less(given: Range, others: Sequence[Range]) -> Iterator[Range]:
         yield begin, end
 
 
-def _joined(missing: Iterable[Hole]) -> Iterator[Hole]:
-    held: Hole | None = None
+def _merged(missing: Iterable[ReasonedRange]) -> Iterator[ReasonedRange]:
+    held: ReasonedRange | None = None
     for item in missing:
         if held is not None and held[2] == item[2] and held[1] + 1 == item[0]:
             held = (held[0], item[1], item[2])

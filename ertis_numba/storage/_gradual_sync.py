@@ -7,12 +7,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-__all__ = ["GradualSync", "shrinking"]
+__all__ = ["GradualSync", "gradual_unlink"]
 
 _NICE: Final = 19  # The lowest priority.
 _STEP_BYTES: Final = 4_000_000
 _SHRINK_BYTES: Final = 32_000_000
-_MAX_REST_S: Final = 0.5
+_MAX_PAUSE_S: Final = 0.5
 
 
 class GradualSync:
@@ -46,7 +46,7 @@ class GradualSync:
         begun_s = time.monotonic()
         _sync_data(self._path)
         self._done_bytes = n_bytes
-        time.sleep(min(self._rests * (time.monotonic() - begun_s), _MAX_REST_S))
+        time.sleep(min(self._rests * (time.monotonic() - begun_s), _MAX_PAUSE_S))
 
 
 def _sync_data(path: Path) -> None:
@@ -58,7 +58,7 @@ def _sync_data(path: Path) -> None:
 
 
 @contextmanager
-def shrinking(path: Path, rests: float) -> Iterator[None]:
+def gradual_unlink(path: Path, rests: float) -> Iterator[None]:
     """Truncate a file in steps if the block removes it, because freeing gigabytes at once blocks the disk."""
     if os.name != "posix" or not path.exists():
         yield
@@ -71,6 +71,6 @@ def shrinking(path: Path, rests: float) -> Iterator[None]:
             os.ftruncate(descriptor, max(0, left - _SHRINK_BYTES))
             begun_s = time.monotonic()
             os.fsync(descriptor)
-            time.sleep(min(rests * (time.monotonic() - begun_s), _MAX_REST_S))
+            time.sleep(min(rests * (time.monotonic() - begun_s), _MAX_PAUSE_S))
     finally:
         os.close(descriptor)

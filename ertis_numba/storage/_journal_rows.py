@@ -4,16 +4,16 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from ertis_numba.errors import DamagedError
-from ertis_numba.journal import Entry, Journal
-from ertis_numba.storage._gaps import Missing, Runs
+from ertis_numba.journal import Journal, JournalEntry
+from ertis_numba.storage._gaps import MissingNumbers, SensorSequences
 
-__all__ = ["Damage", "JournalRows"]
+__all__ = ["DamagedMeasurement", "JournalRows"]
 
 _DAMAGED = "damaged in the journal"
 
 
 @dataclass(frozen=True, slots=True)
-class Damage:
+class DamagedMeasurement:
     """Unreadable measurement: its index among those of its sensor, its number, and the damage."""
 
     index: int
@@ -38,30 +38,33 @@ class JournalRows:
         self._journal = journal
         self.keys = journal.index(sensor)
         self._noted = [
-            Missing(gap.first, gap.last, gap.reason, gap.session_id) for gap in journal.gaps if gap.sensor == sensor
+            MissingNumbers(gap.first, gap.last, gap.reason, gap.session_id)
+            for gap in journal.gaps
+            if gap.sensor == sensor
         ]
-        self._numbers = Runs()
-        self.damaged: list[Damage] = []
+        self._numbers = SensorSequences()
+        self.damaged: list[DamagedMeasurement] = []
 
     def __len__(self) -> int:
         """Return the number of measurements, damaged ones included."""
         return len(self.keys)
 
-    def __iter__(self) -> Iterator[Entry]:
-        self._numbers, self.damaged = Runs(), []
+    def __iter__(self) -> Iterator[JournalEntry]:
+        self._numbers, self.damaged = SensorSequences(), []
         for index, key in enumerate(self.keys):
             try:
                 entry = self._journal.entry(key)
             except DamagedError as error:  # Other errors may be temporary, so they are raised.
-                self.damaged.append(Damage(index, key.sequence, str(error)))
+                self.damaged.append(DamagedMeasurement(index, key.sequence, str(error)))
                 continue
             self._numbers.add(key.sequence, key.session_id)
             yield entry
 
     @property
-    def missing(self) -> list[Missing]:
+    def missing(self) -> list[MissingNumbers]:
         """Missing numbers in order, damaged ones included."""
         lost = [
-            Missing(item.sequence, item.sequence, _DAMAGED, self.keys[item.index].session_id) for item in self.damaged
+            MissingNumbers(item.sequence, item.sequence, _DAMAGED, self.keys[item.index].session_id)
+            for item in self.damaged
         ]
         return self._numbers.missing([*lost, *self._noted])

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from ertis_numba.errors import ArgumentError, DamagedError
 from ertis_numba.geometry import mounting
-from ertis_numba.storage.schema import describe, plain
+from ertis_numba.storage.schema import set_attributes, to_python
 
-__all__ = ["describe_mounting", "read_mounting"]
+__all__ = ["read_mounting", "write_mounting"]
 
 _GIVEN: Final = "given"
 _UNKNOWN: Final = "unknown"
@@ -21,9 +21,9 @@ _ORIGIN: Final = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 _Found: TypeAlias = tuple[NDArray[np.float64], NDArray[np.float64]] | tuple[None, None]
 
 
-def describe_mounting(group: h5py.Group, place: Mapping[str, NDArray[np.float64]]) -> None:
+def write_mounting(group: h5py.Group, place: Mapping[str, NDArray[np.float64]]) -> None:
     """Store a mounting, in the form of `ertis_numba.geometry.mounting`, or the fact that it is unknown."""
-    describe(group, {"mounting": _GIVEN if place else _UNKNOWN, **place})
+    set_attributes(group, {"mounting": _GIVEN if place else _UNKNOWN, **place})
 
 
 def read_mounting(group: h5py.Group, path: Path) -> _Found:
@@ -38,11 +38,13 @@ def read_mounting(group: h5py.Group, path: Path) -> _Found:
         The attributes are not a valid mounting.
     """
     stated = group.attrs
-    status = str(plain(stated["mounting"])) if "mounting" in stated else ""
+    status = str(to_python(stated["mounting"])) if "mounting" in stated else ""
     if status == _UNKNOWN or not (status or {"translation_m", "rotation_xyzw"} & stated.keys()):
         return None, None
     if status not in {"", _GIVEN}:
-        raise DamagedError(f"{path}: attribute mounting is {status[:80]!r}, wanted {_GIVEN!r} or {_UNKNOWN!r}; copy it again")
+        raise DamagedError(
+            f"{path}: attribute mounting is {status[:80]!r}, wanted {_GIVEN!r} or {_UNKNOWN!r}; copy it again"
+        )
     sensor = group.name.rpartition("/")[2]
     try:
         place = mounting(sensor, stated["translation_m"], stated["rotation_xyzw"])

@@ -17,9 +17,9 @@ from ertis_numba.errors import ArgumentError, DamagedError, DataError, FormatVer
 from ertis_numba.frames import Stamp
 from ertis_numba.geometry import received_settings
 from ertis_numba.storage._rows import RowReader
-from ertis_numba.storage.schema import FORMAT_VERSION, SensorGroup, Variable, content_sha256, plain
-from ertis_numba.storage.structure import child, require_attributes, require_variables, sensors_of
-from ertis_numba.storage.truth import Truth, read_truth
+from ertis_numba.storage.schema import FORMAT_VERSION, SensorGroup, Variable, content_sha256, to_python
+from ertis_numba.storage.structure import local_member, require_attributes, require_variables, sensors_of
+from ertis_numba.storage.truth import GroundTruth, read_truth
 
 __all__ = ["FileReader", "file_kind", "sensor_names"]
 
@@ -28,12 +28,12 @@ Item = TypeVar("Item")
 _UNREADABLE = (OSError, RuntimeError, LookupError, AttributeError, TypeError, ValueError)
 _SYSTEM_ERROR = re.compile(r"errno = (\d+), error message = '(.*?)'")  # Part of HDF5's own message.
 # Other errors may result from damaged addresses.
-_PASSING = (errno.EIO, errno.ENXIO, errno.ENODEV, errno.ENOMEM, errno.ETIMEDOUT)
-_LEFT_OPEN = "already open for write"  # HDF5 marks a file as open, and a killed program leaves the mark.
-_OMITTED = {"word"}  # The axis is left out if its length is one.
+_TRANSIENT_ERRNOS = (errno.EIO, errno.ENXIO, errno.ENODEV, errno.ENOMEM, errno.ETIMEDOUT)
+_OPEN_FOR_WRITE = "already open for write"  # HDF5 marks a file as open, and a killed program leaves the mark.
+_OPTIONAL_DIMS = {"word"}  # The axis is left out if its length is one.
 _MAX_NAMES = 64  # Limit on sensors in an error.
 _STORED_END = re.compile(r"stored_eof = (\d+)")
-_A = {"recording": "a recording", "energyscape": "an energyscape file"}
+_KIND_NAMES = {"recording": "a recording", "energyscape": "an energyscape file"}
 
 
 def file_kind(path: str | Path) -> str:
@@ -93,24 +93,24 @@ class FileReader(Sequence[Item]):
             with self._reading():
                 self._require_kind()
                 self.sensors: tuple[str, ...] = sensors_of(self._file)
-                self.sensor = self._choose(sensor)
-                self._group = SensorGroup(child(self._file["sensors"], self.sensor, h5py.Group))
-                self._look()
+                self.sensor = self._select_sensor(sensor)
+                self._group = SensorGroup(local_member(self._file["sensors"], self.sensor, h5py.Group))
+                self._select_table()
                 self._require_variables()
                 self._rows = RowReader(self._group, self._data)
-                self.attributes = {name: plain(value) for name, value in self._file.attrs.items()}
+                self.attributes = {name: to_python(value) for name, value in self._file.attrs.items()}
                 self.settings = received_settings(
                     self._group["settings"][()], f"{self.path}: settings", are_applied=self._kind == "energyscape"
                 )
                 self._require_shapes()
                 self._load()
                 self._require_content()
-                self.truth: Truth | None = read_truth(self._group)
+                self.truth: GroundTruth | None = read_truth(self._group)
         except BaseException:
             self._file.close()
             raise
 
-    def _look(self) -> None:
+    def _select_table(self) -> None:
         """Choose the table of variables, if the kind of file has several."""
 
     @abstractmethod
@@ -177,12 +177,12 @@ class FileReader(Sequence[Item]):
         return _reading(self._file, self.path)
 
     def _require_kind(self) -> None:
-        kind = _kind(self._file, self.path, _A[self._kind])
+        kind = _kind(self._file, self.path, _KIND_NAMES[self._kind])
         if kind != self._kind:
             remedy = "process it first" if kind == "recording" else "give the recording it was made from"
-            raise DataError(f"{self.path} is {_A[kind]}, wanted {_A[self._kind]}; {remedy}")
+            raise DataError(f"{self.path} is {_KIND_NAMES[kind]}, wanted {_KIND_NAMES[self._kind]}; {remedy}")
 
-    def _choose(self, sensor: str | None) -> str:
+    def _select_sensor(self, sensor: str | None) -> str:
         names = ", ".join(self.sensors[:_MAX_NAMES]) + ", …" * (len(self.sensors) > _MAX_NAMES)
         if sensor is None and len(self.sensors) != 1:
             raise ArgumentError(f"{self.path} contains {len(self.sensors)} sensors; choose one of {names} (--sensor)")
@@ -203,7 +203,7 @@ class FileReader(Sequence[Item]):
         for variable in self._table:
             if variable.optional and variable.name not in self._group:
                 continue
-            if not sizes.keys() >= set(variable.dims) - _OMITTED:  # Its length is free.
+            if not sizes.keys() >= set(variable.dims) - _OPTIONAL_DIMS:  # Its length is free.
                 continue
             wanted = tuple(sizes[dim] for dim in variable.dims if dim in sizes)
             shape = self._group[variable.name].shape
@@ -211,7 +211,7 @@ class FileReader(Sequence[Item]):
                 raise DamagedError(f"{self.path}: {variable.name} has shape {shape}, wanted {wanted}; copy it again")
 
     def _require_content(self) -> None:
-        wanted = plain(self._group.attrs["content_sha256"])
+        wanted = to_python(self._group.attrs["content_sha256"])
         got = content_sha256(self._group, self._table)
         if got != wanted:
             raise DamagedError(
@@ -236,7 +236,7 @@ def _reading(file: h5py.File, path: Path) -> Iterator[None]:
         if not file:
             raise DataError(f"{path} is closed; open it again") from error
         reported = _SYSTEM_ERROR.search(str(error))
-        if reported and int(reported[1]) in _PASSING:
+        if reported and int(reported[1]) in _TRANSIENT_ERRNOS:
             raise DataError(f"{path} cannot be read ({reported[2]}); check the disk") from error
         raise DamagedError(f"{path} is damaged or cut short ({_reason(error)}); copy it again") from error
 
@@ -260,7 +260,7 @@ def _open(path: Path) -> h5py.File:
     except BlockingIOError as error:
         raise DataError(f"{path} is open for writing in another program; close it there first") from error
     except OSError as error:
-        if _LEFT_OPEN in str(error):
+        if _OPEN_FOR_WRITE in str(error):
             raise DataError(
                 f"{path} is open for writing in another program, or that program was killed; close it there, or "
                 "copy the file"
@@ -273,9 +273,9 @@ def _open(path: Path) -> h5py.File:
 def _kind(file: h5py.File, path: Path, wanted: str) -> str:
     with _reading(file, path):
         require_attributes(file)
-    kind = plain(file.attrs.get("ertis_format", ""))
-    version = plain(file.attrs.get("ertis_format_version", 0))
-    if not isinstance(kind, str) or kind not in _A or not isinstance(version, int):
+    kind = to_python(file.attrs.get("ertis_format", ""))
+    version = to_python(file.attrs.get("ertis_format_version", 0))
+    if not isinstance(kind, str) or kind not in _KIND_NAMES or not isinstance(version, int):
         raise DataError(f"{path} is HDF5, but not of this package; give {wanted}")
     if version > FORMAT_VERSION:
         raise FormatVersionError(

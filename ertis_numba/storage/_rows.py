@@ -12,7 +12,7 @@ from ertis_numba import checks
 from ertis_numba.atomic_files import require_free_space
 from ertis_numba.errors import ArgumentError, DamagedError
 from ertis_numba.frames import Stamp
-from ertis_numba.storage._gaps import Runs
+from ertis_numba.storage._gaps import SensorSequences
 from ertis_numba.storage.schema import CHUNK_ROWS
 
 __all__ = ["RowReader", "RowWriter"]
@@ -56,7 +56,7 @@ class RowWriter:
         self._columns: dict[str, list[float]] = {}
         self._n_stored = 0
         self._n_rows = 0
-        self.runs = Runs()
+        self.runs = SensorSequences()
         self.check = 0
         """CRC-32 over all rows, for the comparison with the written file."""
 
@@ -81,7 +81,7 @@ class RowWriter:
             self.flush()
 
     def _require_new(self, sequence: int, session_id: int) -> None:
-        if self._numbered and self.runs.holds(sequence, session_id):
+        if self._numbered and self.runs.contains(sequence, session_id):
             raise ArgumentError(
                 f"measurement {self._n_rows} has sequence {sequence} of session {session_id}, like an earlier "
                 "one; give each measurement of a sensor its own number (Stamp.sequence)"

@@ -24,18 +24,18 @@ from ertis_numba.storage.schema import (
     content_sha256,
     content_uuid,
     date_created,
-    describe,
     sensor_path,
+    set_attributes,
     software_versions,
 )
-from ertis_numba.storage.truth import Truth, TruthLog, write_truth
+from ertis_numba.storage.truth import GroundTruth, GroundTruthLog, write_truth
 
-__all__ = ["Writer"]
+__all__ = ["FileWriter"]
 
 Item = TypeVar("Item", Measurement, Energyscape)
 
 
-class Writer(ABC, Generic[Item]):
+class FileWriter(ABC, Generic[Item]):
     """Writer of rows; the file appears when the ``with`` block ends without an error.
 
     Rows of several sensors may come in any order; each sensor has its own group.
@@ -53,7 +53,7 @@ class Writer(ABC, Generic[Item]):
         *,
         overwrite: bool,
         attributes: Mapping[str, str],
-        truth: Mapping[str, Truth | TruthLog] | None,
+        truth: Mapping[str, GroundTruth | GroundTruthLog] | None,
     ) -> None:
         self.path = Path(path)
         self._overwrite = overwrite
@@ -79,7 +79,7 @@ class Writer(ABC, Generic[Item]):
     def _complete(self, group: h5py.Group, rows: RowWriter) -> None:
         """Write the parts that are known only at the end."""
 
-    def _truth_of(self, sensor: str, group: h5py.Group) -> Truth | TruthLog | None:  # noqa: ARG002  for subclasses
+    def _sensor_truth(self, sensor: str, group: h5py.Group) -> GroundTruth | GroundTruthLog | None:  # noqa: ARG002  for subclasses
         """Return the ground truth of a sensor, if known."""
         return self._truth.get(sensor)
 
@@ -102,7 +102,7 @@ class Writer(ABC, Generic[Item]):
         """
         if self._file is None:
             raise ArgumentError(f"{self.path} is not open for writing; use the writer in a with statement")
-        with self._naming_file():
+        with self._errors_with_path():
             sensor = item.stamp.sensor
             if sensor not in self._rows:
                 group = self._file.create_group(sensor_path(sensor), track_order=True)
@@ -121,15 +121,15 @@ class Writer(ABC, Generic[Item]):
     def _open_part(self) -> Iterator[h5py.File]:
         """Yield the part file; complete, close and compare it when the block ends without an error."""
         require_free_space(self.path.parent, 0)
-        with self._naming_file():
+        with self._errors_with_path():
             # The newer layout has a checksum in every table, which reveals damage.
             file = h5py.File(self._part, "w", track_order=True, libver=("v110", "v110"))
         try:
             yield file
-            with self._naming_file():
+            with self._errors_with_path():
                 self._finish(file)
                 file.close()
-                self._compare()
+                self._verify_part()
         except BaseException:
             # Closing writes buffered data. If that fails, HDF5 crashes the process (h5py issue 914). Emptying the file
             # first frees the necessary space on a full disk.
@@ -143,7 +143,7 @@ class Writer(ABC, Generic[Item]):
             raise ArgumentError(f"{self.path} would contain no measurement; give at least one")
         self._require_sensors("truth", self._truth)
         contents = {sensor: self._finish_sensor(file, sensor) for sensor in self._rows}
-        describe(
+        set_attributes(
             file,
             {
                 "Conventions": CONVENTIONS,
@@ -161,11 +161,11 @@ class Writer(ABC, Generic[Item]):
         rows, group = self._rows[sensor], file[sensor_path(sensor)]
         rows.flush()
         self._complete(group, rows)
-        truth = self._truth_of(sensor, group)
+        truth = self._sensor_truth(sensor, group)
         if truth is not None:
             write_truth(group, truth, len(rows))
         content = content_sha256(group, self._table)
-        describe(group, {"content_sha256": content})
+        set_attributes(group, {"content_sha256": content})
         return content
 
     def _require_sensors(self, name: str, given: Iterable[str]) -> None:
@@ -177,7 +177,7 @@ class Writer(ABC, Generic[Item]):
                     f"{', '.join(self._rows)}"
                 )
 
-    def _compare(self) -> None:
+    def _verify_part(self) -> None:
         """Read all rows back from the closed file, and compare them with the given ones."""
         with h5py.File(self._part, "r") as file:
             for sensor, written in self._rows.items():
@@ -190,7 +190,7 @@ class Writer(ABC, Generic[Item]):
                     raise DataError(f"{self.path} reads back with other content than written; check the disk")
 
     @contextmanager
-    def _naming_file(self) -> Iterator[None]:
+    def _errors_with_path(self) -> Iterator[None]:
         try:
             yield
         except (OSError, RuntimeError) as error:  # h5py raises both when the disk fails.

@@ -18,20 +18,20 @@ from ertis_numba.errors import ArgumentError, DamagedError
 from ertis_numba.frames import Energyscape
 from ertis_numba.geometry import mounting as mounted
 from ertis_numba.geometry import self_contained
-from ertis_numba.storage._mounting import describe_mounting, read_mounting
+from ertis_numba.storage._mounting import read_mounting, write_mounting
 from ertis_numba.storage._reader import FileReader
 from ertis_numba.storage._rows import RowReader
-from ertis_numba.storage._writer import Writer
+from ertis_numba.storage._writer import FileWriter
 from ertis_numba.storage.recording import Mounting, RecordingReader
-from ertis_numba.storage.schema import ENERGYSCAPE, Variable, describe, lay_out, plain
-from ertis_numba.storage.truth import Truth, TruthLog
+from ertis_numba.storage.schema import ENERGYSCAPE, Variable, create_variables, set_attributes, to_python
+from ertis_numba.storage.truth import GroundTruth, GroundTruthLog
 
 __all__ = ["EnergyscapeReader", "EnergyscapeWriter", "open_energyscapes", "write_energyscapes"]
 
 _AXES = {"azimuth": "azimuth_rad", "elevation": "elevation_rad", "range": "range_m"}
 
 
-class EnergyscapeWriter(Writer[Energyscape]):
+class EnergyscapeWriter(FileWriter[Energyscape]):
     """Writer of an energyscape file, one image at a time; use it in a ``with`` statement.
 
     Energyscapes of several sensors may come in any order.
@@ -65,7 +65,7 @@ class EnergyscapeWriter(Writer[Energyscape]):
         path: str | Path,
         *,
         recording: RecordingReader | Sequence[RecordingReader] | None = None,
-        truth: Mapping[str, Truth] | None = None,
+        truth: Mapping[str, GroundTruth] | None = None,
         mounting: Mapping[str, Mounting] | None = None,
         dtype: Literal["float32", "float16"] = "float32",
         overwrite: bool = False,
@@ -73,7 +73,7 @@ class EnergyscapeWriter(Writer[Energyscape]):
         checks.choice("dtype", dtype, ("float32", "float16"))
         readers = [recording] if isinstance(recording, RecordingReader) else [*(recording or ())]
         check_target(Path(path), overwrite=overwrite, sources=[reader.path for reader in readers])
-        super().__init__(path, overwrite=overwrite, attributes=_origin(readers), truth=truth)
+        super().__init__(path, overwrite=overwrite, attributes=_provenance(readers), truth=truth)
         self._dtype = np.dtype(dtype).newbyteorder("<").str
         self._first: dict[str, Energyscape] = {}
         self._predicted: dict[str, dict[str, float | str]] = {}
@@ -145,22 +145,22 @@ class EnergyscapeWriter(Writer[Energyscape]):
     def _begin(self, group: h5py.Group, first: Energyscape) -> None:
         self._first[first.stamp.sensor] = first
         n_directions, n_ranges = len(first.azimuth_rad), len(first.range_m)
-        lay_out(
+        create_variables(
             group,
             ENERGYSCAPE,
             sizes={"direction": n_directions, "range": n_ranges},
             dtypes={"amplitude": self._dtype},
             texts={"settings": self_contained(first.settings).to_toml()},
         )
-        describe_mounting(group, self._mounting.get(first.stamp.sensor, {}))
-        describe(group, self._predicted.get(first.stamp.sensor, {}))
+        write_mounting(group, self._mounting.get(first.stamp.sensor, {}))
+        set_attributes(group, self._predicted.get(first.stamp.sensor, {}))
         if first.stamp.sensor in self._call_warnings:
-            describe(group, {"call_warning": self._call_warnings[first.stamp.sensor]})
+            set_attributes(group, {"call_warning": self._call_warnings[first.stamp.sensor]})
         if first.stamp.sensor in self._wavefront_errors_db:
-            describe(group, {"wavefront_error_db": self._wavefront_errors_db[first.stamp.sensor]})
+            set_attributes(group, {"wavefront_error_db": self._wavefront_errors_db[first.stamp.sensor]})
         for name, field in _AXES.items():
             group[name][:] = getattr(first, field)
-        describe(group["amplitude"], {"coordinates": "azimuth elevation"})
+        set_attributes(group["amplitude"], {"coordinates": "azimuth elevation"})
 
     def _row(self, item: Energyscape) -> tuple[NDArray[Any], dict[str, float]]:
         first = self._first[item.stamp.sensor]
@@ -178,8 +178,8 @@ class EnergyscapeWriter(Writer[Energyscape]):
         super()._finish(file)
         self._require_sensors("mounting", self._given)
 
-    def _truth_of(self, sensor: str, group: h5py.Group) -> Truth | TruthLog | None:
-        given = super()._truth_of(sensor, group)
+    def _truth_of(self, sensor: str, group: h5py.Group) -> GroundTruth | GroundTruthLog | None:
+        given = super()._sensor_truth(sensor, group)
         if given is not None or sensor not in self._recorded:
             return given
         truth, recorded = self._recorded[sensor]
@@ -198,7 +198,7 @@ class EnergyscapeWriter(Writer[Energyscape]):
         return replace(truth, reflectors=tuple(truth.reflectors[places[stamp]] for stamp in written))
 
 
-def _origin(readers: Sequence[RecordingReader]) -> dict[str, str]:
+def _provenance(readers: Sequence[RecordingReader]) -> dict[str, str]:
     """Return the attributes of the file that describe its recording."""
     if not readers:
         return {"source": "", "history": ""}
@@ -269,7 +269,7 @@ class EnergyscapeReader(FileReader[Energyscape], DegreesFromRadians):
             for name in ("predicted_error_db", "max_error_db", "wavefront_error_db")
         )
         self.budget_applies_to, self.error_warning, self.call_warning = (
-            str(plain(stated.get(name, ""))) for name in ("budget_applies_to", "error_warning", "call_warning")
+            str(to_python(stated.get(name, ""))) for name in ("budget_applies_to", "error_warning", "call_warning")
         )
         self.translation_m, self.rotation_xyzw = read_mounting(self._group, self.path)
 
@@ -335,7 +335,7 @@ def write_energyscapes(
     images: Iterable[Energyscape],
     *,
     recording: RecordingReader | Sequence[RecordingReader] | None = None,
-    truth: Mapping[str, Truth] | None = None,
+    truth: Mapping[str, GroundTruth] | None = None,
     mounting: Mapping[str, Mounting] | None = None,
     dtype: Literal["float32", "float16"] = "float32",
     overwrite: bool = False,

@@ -17,13 +17,20 @@ from ertis_numba.geometry import Layout, microphones, self_contained, storable
 from ertis_numba.geometry import mounting as mounted
 from ertis_numba.sample_format import SampleFormat, sample_format
 from ertis_numba.settings import Air, Settings
-from ertis_numba.storage._gaps import Missing
-from ertis_numba.storage._mounting import describe_mounting, read_mounting
+from ertis_numba.storage._gaps import MissingNumbers
+from ertis_numba.storage._mounting import read_mounting, write_mounting
 from ertis_numba.storage._reader import FileReader
 from ertis_numba.storage._rows import RowWriter
-from ertis_numba.storage._writer import Writer
-from ertis_numba.storage.schema import RECORDING, RECORDING_OF_PCM, Variable, describe, lay_out, plain
-from ertis_numba.storage.truth import Truth, TruthLog
+from ertis_numba.storage._writer import FileWriter
+from ertis_numba.storage.schema import (
+    RECORDING,
+    RECORDING_OF_PCM,
+    Variable,
+    create_variables,
+    set_attributes,
+    to_python,
+)
+from ertis_numba.storage.truth import GroundTruth, GroundTruthLog
 from ertis_numba.waveform import call_samples
 
 __all__ = [
@@ -31,7 +38,7 @@ __all__ = [
     "RecordingGap",
     "RecordingReader",
     "RecordingWriter",
-    "lay_out_sensor",
+    "create_sensor_variables",
     "open_recording",
     "write_recording",
 ]
@@ -55,7 +62,7 @@ class RecordingGap:
     session_id: int = 0
 
 
-class RecordingWriter(Writer[Measurement]):
+class RecordingWriter(FileWriter[Measurement]):
     """Writer of a recording, one measurement at a time; use it in a ``with`` statement.
 
     Measurements of several sensors may come in any order.
@@ -92,7 +99,7 @@ class RecordingWriter(Writer[Measurement]):
         settings: Settings | None = None,
         overwrite: bool = False,
         source: str = "",
-        truth: Mapping[str, Truth | TruthLog] | None = None,
+        truth: Mapping[str, GroundTruth | GroundTruthLog] | None = None,
         mounting: Mapping[str, Mounting] | None = None,
         firmware: Mapping[str, str] | None = None,
     ) -> None:
@@ -103,7 +110,7 @@ class RecordingWriter(Writer[Measurement]):
         self._formats: dict[str, SampleFormat] = {}
         self._mounting = {sensor: mounted(sensor, *given) for sensor, given in (mounting or {}).items()}
         self._firmware = firmware or {}
-        self._noted: dict[str, list[Missing]] = {}
+        self._noted: dict[str, list[MissingNumbers]] = {}
 
     def note_gap(self, sensor: str, first: int, last: int, reason: str, session_id: int = 0) -> None:
         """Store why sequence numbers are missing, ``first`` and ``last`` included; in any order, at any time.
@@ -119,7 +126,7 @@ class RecordingWriter(Writer[Measurement]):
         """
         checks.sequence_gap(first, last, reason)
         self._noted.setdefault(sensor, []).append(
-            Missing(first, last, reason, checks.integer("session_id", session_id, 0))
+            MissingNumbers(first, last, reason, checks.integer("session_id", session_id, 0))
         )
 
     def _begin(self, group: h5py.Group, first: Measurement) -> None:
@@ -132,7 +139,7 @@ class RecordingWriter(Writer[Measurement]):
         given = self._given or first.settings
         settings = self._settings[sensor] = storable(given)
         self._formats[sensor] = sample_format(settings)
-        lay_out_sensor(
+        create_sensor_variables(
             group,
             settings,
             firmware=self._firmware.get(sensor, ""),
@@ -141,7 +148,7 @@ class RecordingWriter(Writer[Measurement]):
 
     def _row(self, item: Measurement) -> tuple[NDArray[Any], dict[str, float]]:
         self._require_same(item.stamp.sensor, item.settings)
-        self._require_words(item)
+        self._require_samples(item)
         air = item.settings.air
         return item.data, {name: getattr(air, field) for name, field in _AIR.items()}
 
@@ -157,7 +164,7 @@ class RecordingWriter(Writer[Measurement]):
                 )
         self._checked[sensor] = settings
 
-    def _require_words(self, item: Measurement) -> None:
+    def _require_samples(self, item: Measurement) -> None:
         """Refuse samples of another type, and samples that no pipeline accepts."""
         name, wanted = f"measurement {len(self._rows[item.stamp.sensor])}", self._formats[item.stamp.sensor].dtype
         if not np.can_cast(item.data.dtype, wanted, "equiv"):  # This allows another byte order.
@@ -193,7 +200,9 @@ class RecordingWriter(Writer[Measurement]):
                 group[name][:] = column
 
 
-def lay_out_sensor(group: h5py.Group, settings: Settings, *, firmware: str, mounting: Mapping[str, Any]) -> None:
+def create_sensor_variables(
+    group: h5py.Group, settings: Settings, *, firmware: str, mounting: Mapping[str, Any]
+) -> None:
     """Create all variables of a sensor, without rows.
 
     Parameters
@@ -214,21 +223,21 @@ def lay_out_sensor(group: h5py.Group, settings: Settings, *, firmware: str, moun
     """
     layout, words, samples = microphones(settings.array), sample_format(settings), call_samples(settings.call)
     data, table = _data_and_table(pdm=settings.recording.is_pdm)
-    lay_out(
+    create_variables(
         group,
         table,
         sizes={**_sizes(settings), "call_sample": len(samples)},
         dtypes={data: words.dtype},
         texts={"settings": settings.to_toml()},
     )
-    describe(group, _identity(group.name.rpartition("/")[2], settings, firmware))
-    describe_mounting(group, mounting)
+    set_attributes(group, _identity(group.name.rpartition("/")[2], settings, firmware))
+    write_mounting(group, mounting)
     bits = {"bit_order": "lsb_first"} if settings.recording.is_pdm else {}
-    describe(group[data], {"sample_rate_hz": settings.recording.sample_rate_hz, **bits})
-    describe(group["call"], {"sample_rate_hz": settings.call.sample_rate_hz})
+    set_attributes(group[data], {"sample_rate_hz": settings.recording.sample_rate_hz, **bits})
+    set_attributes(group["call"], {"sample_rate_hz": settings.call.sample_rate_hz})
     group["microphone"][:] = np.arange(len(layout.enabled))
     group["call"][:] = samples
-    for name, values in _copies(layout).items():
+    for name, values in _layout_arrays(layout).items():
         group[name][:] = values
 
 
@@ -244,7 +253,7 @@ def _sizes(settings: Settings) -> dict[str, int]:
     return {"sample": settings.recording.n_samples, "microphone": len(layout.enabled), "axis": 3, **several}
 
 
-def _copies(layout: Layout) -> dict[str, NDArray[Any]]:
+def _layout_arrays(layout: Layout) -> dict[str, NDArray[Any]]:
     """Return the arrays that repeat the settings for programs without a TOML parser."""
     return {
         "microphone_position": layout.positions_m,
@@ -294,7 +303,7 @@ class RecordingReader(FileReader[Measurement]):
             RecordingGap(first, last, reason.decode(), session_id)
             for (first, last, reason), session_id in zip(zip(*columns, strict=True), session_ids, strict=False)
         )
-        self.firmware = str(plain(self._group.attrs["firmware"]))
+        self.firmware = str(to_python(self._group.attrs["firmware"]))
         self.translation_m, self.rotation_xyzw = read_mounting(self._group, self.path)
 
     def _item(self, index: int) -> Measurement:
@@ -313,7 +322,7 @@ class RecordingReader(FileReader[Measurement]):
                 f"{self.path}: {self._data} contains {came}, but the settings in the file give {words.dtype} "
                 f"(recording.encoding {self.settings.recording.encoding!r}); change the settings with it"
             )
-        for name, wanted in _copies(microphones(self.settings.array)).items():
+        for name, wanted in _layout_arrays(microphones(self.settings.array)).items():
             values = self._group[name][:]
             wrong = np.argwhere(values != wanted)  # This includes NaN.
             if wrong.size:
@@ -364,7 +373,7 @@ def write_recording(
     settings: Settings | None = None,
     overwrite: bool = False,
     source: str = "",
-    truth: Mapping[str, Truth | TruthLog] | None = None,
+    truth: Mapping[str, GroundTruth | GroundTruthLog] | None = None,
     mounting: Mapping[str, Mounting] | None = None,
 ) -> Path:
     """Write a recording.

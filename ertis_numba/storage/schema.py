@@ -34,13 +34,13 @@ __all__ = [
     "Variable",
     "content_sha256",
     "content_uuid",
+    "create_variables",
     "date_created",
-    "describe",
-    "lay_out",
-    "plain",
     "sensor_path",
+    "set_attributes",
     "software_versions",
     "text_type",
+    "to_python",
 ]
 
 CONVENTIONS: Final = "CF-1.11 ertis-1.0"
@@ -76,7 +76,7 @@ class Variable:
     name: str
     dims: tuple[str, ...]
     dtype: str
-    about: str
+    description: str
     units: str = ""
     optional: bool = False
 
@@ -194,7 +194,7 @@ class SensorGroup(h5py.Group):  # type: ignore[misc]  # h5py has no annotations
         return super().get(self.stored_name(name), *args, **options)
 
 
-def lay_out(
+def create_variables(
     group: h5py.Group,
     table: Iterable[Variable],
     *,
@@ -228,7 +228,9 @@ def lay_out(
         else:
             dtype = (dtypes or {}).get(variable.name, variable.dtype)
             dataset = _dataset(group, variable.name, dims, sizes, dtype)
-        describe(dataset, {"long_name": variable.about} | ({"units": variable.units} if variable.units else {}))
+        set_attributes(
+            dataset, {"long_name": variable.description} | ({"units": variable.units} if variable.units else {})
+        )
         if dims == (variable.name,):
             dataset.make_scale(variable.name)
             scales[variable.name] = dataset
@@ -266,7 +268,7 @@ def _scale_without_values(group: h5py.Group, dim: str, size: int) -> h5py.Datase
     return scale
 
 
-def describe(owner: h5py.File | h5py.Group | h5py.Dataset, attributes: Mapping[str, Any]) -> None:
+def set_attributes(owner: h5py.File | h5py.Group | h5py.Dataset, attributes: Mapping[str, Any]) -> None:
     """Set attributes.
 
     Texts have a fixed length, as everywhere in these files. HDF5 stores texts of variable length in a heap without
@@ -280,7 +282,7 @@ def describe(owner: h5py.File | h5py.Group | h5py.Dataset, attributes: Mapping[s
             owner.attrs[name] = value
 
 
-def plain(value: object) -> object:
+def to_python(value: object) -> object:
     """Return the value of an attribute as a Python object."""
     if isinstance(value, bytes):
         return value.decode(errors="replace")

@@ -22,32 +22,32 @@ from ertis_numba.errors import DataError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import mounting as mounted
 from ertis_numba.geometry import storable
-from ertis_numba.journal import LOST, SUFFIX, Journal, JournalSensor, Sealed
+from ertis_numba.journal import LOST, SUFFIX, Journal, JournalSensor, SealingResult
 from ertis_numba.storage._journal_rows import JournalRows
 from ertis_numba.storage._reader import sensor_names
 from ertis_numba.storage.recording import (
     JOURNAL_DAMAGE,
     RecordingReader,
     RecordingWriter,
-    lay_out_sensor,
+    create_sensor_variables,
     open_recording,
 )
 from ertis_numba.storage.schema import sensor_path
 
-__all__ = ["REFUSED", "TOKEN", "seal"]
+__all__ = ["PART_TOKEN", "REFUSED_SUFFIX", "seal"]
 
-REFUSED = "refused"
+REFUSED_SUFFIX = "refused"
 """Suffix of a journal that is kept because a recording cannot contain one of its sensors."""
 
 MAX_HISTORY = 16_000  # Characters; an attribute of HDF5 is limited to 65,536 bytes.
 
-TOKEN = "sealing"  # noqa: S105
+PART_TOKEN = "sealing"  # noqa: S105
 """Token in the name of the temporary file. It is fixed, because only the process with the journal writes the file."""
 
 Progress = Callable[[int, int], None]
 
 
-def seal(path: str | Path, *, overwrite: bool = False, progress: Progress = lambda _done, _of: None) -> Sealed:
+def seal(path: str | Path, *, overwrite: bool = False, progress: Progress = lambda _done, _of: None) -> SealingResult:
     """Make the recording of a journal, verify and sync it, and then remove the journal.
 
     Measurements damaged in the journal become gaps of the recording, and the journal is kept under another name. The
@@ -81,21 +81,23 @@ def seal(path: str | Path, *, overwrite: bool = False, progress: Progress = lamb
     path = Path(path)
     before = path.with_name(path.name.removesuffix(SUFFIX))
     # An earlier process may have been killed just after it had removed the journal.
-    if not path.exists() and before != path and _made_of(path, before):
-        return _reported(path, before)
+    if not path.exists() and before != path and _is_sealed_from(path, before):
+        return _summary(path, before)
     with Journal.open(path) as journal:
         target = journal.target
-        temporary_path(target, TOKEN).unlink(missing_ok=True)
+        temporary_path(target, PART_TOKEN).unlink(missing_ok=True)
         rows = {name: JournalRows(journal, name) for name in journal.sensors}
-        refused = _refused(journal, rows)
+        refused = _remove_refused(journal, rows)
         if refused and not any(map(len, rows.values())):
             damage = _damage(journal, rows)  # The damage is recorded in the tally, which is removed with the journal.
-            return Sealed(path, None, set_aside=journal.set_aside(REFUSED), damage=damage, refused=refused)
+            return SealingResult(
+                path, None, set_aside=journal.set_aside(REFUSED_SUFFIX), damage=damage, refused=refused
+            )
         if not len(journal):
             _require_nothing_lost(journal)
             journal.remove()
-            return Sealed(path, None)
-        if target.is_file() and _holds(target, journal, rows):
+            return SealingResult(path, None)
+        if target.is_file() and _is_complete_recording(target, journal, rows):
             for place in (target, target.parent):  # The writer may have been killed before it did this.
                 fsync(place)
         elif target.is_file() and not overwrite:
@@ -104,10 +106,10 @@ def seal(path: str | Path, *, overwrite: bool = False, progress: Progress = lamb
             _write(journal, rows, refused, overwrite=overwrite, progress=progress)
         n_damaged = sum(len(held.damaged) for held in rows.values())
         if n_damaged or refused:
-            aside = journal.set_aside("damaged" if n_damaged else REFUSED)
-            return _reported(path, target, damaged=n_damaged, set_aside=aside, refused=refused)
+            aside = journal.set_aside("damaged" if n_damaged else REFUSED_SUFFIX)
+            return _summary(path, target, damaged=n_damaged, set_aside=aside, refused=refused)
         journal.remove()
-    return _reported(path, target)
+    return _summary(path, target)
 
 
 def _require_nothing_lost(journal: Journal) -> None:
@@ -133,23 +135,23 @@ def _damage(journal: Journal, rows: dict[str, JournalRows]) -> str:
     return "; ".join([*([journal.damage] if journal.damage else []), *absent])
 
 
-def _refused(journal: Journal, rows: dict[str, JournalRows]) -> dict[str, str]:
+def _remove_refused(journal: Journal, rows: dict[str, JournalRows]) -> dict[str, str]:
     """Return the reasons why a recording cannot contain some sensors, and remove these sensors from the rows."""
     refused = {name: reason for name, (reason, count) in journal.unusable.items() if count}
     for name, held in list(rows.items()):
         first = next(iter(held), None)
-        reason = "" if first is None else _refusal(journal.sensors[name], first.measurement)
+        reason = "" if first is None else _refusal_reason(journal.sensors[name], first.measurement)
         if reason:
             refused[name] = reason
             del rows[name]
     return refused
 
 
-def _refusal(sensor: JournalSensor, first: Measurement) -> str:
+def _refusal_reason(sensor: JournalSensor, first: Measurement) -> str:
     """Return the reason why a recording cannot contain a sensor, from a trial in memory; empty if it can."""
     try:
         with h5py.File("trial", "w", driver="core", backing_store=False, libver=("v110", "v110")) as trial:
-            lay_out_sensor(
+            create_sensor_variables(
                 trial.create_group(sensor_path(sensor.name), track_order=True),
                 storable(first.settings),
                 firmware=sensor.firmware,
@@ -162,27 +164,27 @@ def _refusal(sensor: JournalSensor, first: Measurement) -> str:
     return ""
 
 
-def _origin(path: Path) -> str:
+def _history_of(path: Path) -> str:
     """Return the first part of a recording's history, which names its journal."""
     return f"sealed from {path.name.encode(errors='backslashreplace').decode()}"  # The name may not be valid text.
 
 
-def _made_of(path: Path, recording: Path) -> bool:
+def _is_sealed_from(path: Path, recording: Path) -> bool:
     """Return True if a file is the recording of a removed journal with this name."""
     try:
         with open_recording(recording, sensor=sensor_names(recording)[0]) as reader:
             history = str(reader.attributes.get("history", ""))
     except (DataError, IndexError):
         return False
-    return f"{history}; ".startswith(f"{_origin(path)}; ")
+    return f"{history}; ".startswith(f"{_history_of(path)}; ")
 
 
-class _Sealer(RecordingWriter):
-    _part_token: ClassVar[str | None] = TOKEN
+class _SealingWriter(RecordingWriter):
+    _part_token: ClassVar[str | None] = PART_TOKEN
     # The journal's index keeps numbers unique, and damage must not prevent sealing the rest.
     _numbered: ClassVar[bool] = False
 
-    def say(self, history: str) -> None:
+    def set_history(self, history: str) -> None:
         """Set the history of the recording."""
         self._attributes["history"] = history
 
@@ -201,7 +203,7 @@ def _write(
     journal: Journal, rows: dict[str, JournalRows], refused: dict[str, str], *, overwrite: bool, progress: Progress
 ) -> None:
     sensors = [journal.sensors[name] for name in rows]
-    with _Sealer(
+    with _SealingWriter(
         journal.target,
         overwrite=overwrite,
         source=journal.source,
@@ -225,10 +227,10 @@ def _write(
         if damage := _damage(journal, rows):
             writer.report_damage(damage)
         kept = (f"sensor {name} was set aside: {reason}" for name, reason in refused.items())
-        writer.say("; ".join([_origin(journal.path), *_absent(rows), *kept])[:MAX_HISTORY])
+        writer.set_history("; ".join([_history_of(journal.path), *_history_of_lost_sensors(rows), *kept])[:MAX_HISTORY])
 
 
-def _absent(rows: dict[str, JournalRows]) -> Iterator[str]:
+def _history_of_lost_sensors(rows: dict[str, JournalRows]) -> Iterator[str]:
     """Yield parts of the history on sensors without readable measurements, which a recording cannot contain."""
     for name, held in rows.items():
         if len(held) == len(held.damaged):
@@ -236,7 +238,7 @@ def _absent(rows: dict[str, JournalRows]) -> Iterator[str]:
             yield from (f"{first} to {last}: {reason}" for first, last, reason, _ in held.missing)
 
 
-def _holds(target: Path, journal: Journal, rows: dict[str, JournalRows]) -> bool:
+def _is_complete_recording(target: Path, journal: Journal, rows: dict[str, JournalRows]) -> bool:
     """Return True if a file is the complete, undamaged recording of a journal."""
     try:
         names = sensor_names(target)
@@ -266,14 +268,14 @@ def _equal(one: Measurement, other: Measurement) -> bool:
     return (one.stamp, one.settings) == (other.stamp, other.settings) and np.array_equal(one.data, other.data)
 
 
-def _reported(
+def _summary(
     path: Path,
     recording: Path,
     *,
     damaged: int = 0,
     set_aside: Path | None = None,
     refused: dict[str, str] | None = None,
-) -> Sealed:
+) -> SealingResult:
     """Return the result of sealing."""
     n_measurements = n_missing = n_lost = 0
     damage = ""
@@ -283,7 +285,7 @@ def _reported(
             n_missing += sum(gap.last - gap.first + 1 for gap in reader.gaps)
             n_lost += sum(gap.last - gap.first + 1 for gap in reader.gaps if gap.reason == LOST)
             damage = str(reader.attributes.get(JOURNAL_DAMAGE, ""))
-    return Sealed(path, recording, n_measurements, n_missing, damaged, set_aside, n_lost, damage, refused or {})
+    return SealingResult(path, recording, n_measurements, n_missing, damaged, set_aside, n_lost, damage, refused or {})
 
 
 if __name__ == "__main__":

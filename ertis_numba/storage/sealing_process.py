@@ -11,15 +11,15 @@ from typing import TextIO
 
 from ertis_numba.atomic_files import temporary_path
 from ertis_numba.errors import ErtisError, JournalInUseError
-from ertis_numba.journal import SUFFIX, Sealed
-from ertis_numba.storage._gradual_sync import GradualSync, shrinking
-from ertis_numba.storage.sealing import TOKEN, seal
+from ertis_numba.journal import SUFFIX, SealingResult
+from ertis_numba.storage._gradual_sync import GradualSync, gradual_unlink
+from ertis_numba.storage.sealing import PART_TOKEN, seal
 
-__all__ = ["FAILED", "INTERRUPTED", "IN_USE", "NOTHING", "main"]
+__all__ = ["FAILED", "INTERRUPTED", "IN_USE", "NO_MEASUREMENTS", "main"]
 
 FAILED, INTERRUPTED = 1, 130
 
-NOTHING = 66
+NO_MEASUREMENTS = 66
 """Exit code for a journal without measurements: EX_NOINPUT of sysexits.h. The journal is removed."""
 
 IN_USE = 75
@@ -29,10 +29,11 @@ _STEPS = 100  # Number of progress reports.
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Seal a journal and return an exit code: 0 done, `FAILED`, `NOTHING`, `IN_USE` or `INTERRUPTED`.
+    """Seal a journal and return an exit code: 0 done, `FAILED`, `NO_MEASUREMENTS`, `IN_USE` or `INTERRUPTED`.
 
     The path of the recording goes to stdout, and errors go to stderr in one line. With ``--json``, stdout has one
-    object per line: progress (``done``, ``of``), and at the end the fields of `Sealed`, or ``error`` and ``in_use``.
+    object per line: progress (``done``, ``of``), and at the end the fields of `SealingResult`, or ``error`` and
+    ``in_use``.
     """
     parser = argparse.ArgumentParser(
         "python -m ertis_numba.storage.sealing_process", description=(__doc__ or "").partition("\n")[0]
@@ -45,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--json", action="store_true", help="print progress and result as JSON lines")
     given = parser.parse_args(arguments)
     recording = given.journal.with_name(given.journal.name.removesuffix(SUFFIX))
-    pace = None if given.rests is None else GradualSync(temporary_path(recording, TOKEN), given.rests)
+    pace = None if given.rests is None else GradualSync(temporary_path(recording, PART_TOKEN), given.rests)
 
     def progress(done: int, of: int) -> None:
         if pace is not None:
@@ -54,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             _report_progress(done, of)
 
     try:
-        with nullcontext() if given.rests is None else shrinking(given.journal, given.rests):
+        with nullcontext() if given.rests is None else gradual_unlink(given.journal, given.rests):
             sealed = seal(given.journal, overwrite=given.force, progress=progress)
     except KeyboardInterrupt:
         return INTERRUPTED
@@ -64,22 +65,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if given.json:
             _emit_event({"error": line, "in_use": in_use})
         else:
-            _say(line, sys.stderr)
+            _write_line(line, sys.stderr)
         return IN_USE if in_use else FAILED
     if given.json:
         _emit_event({name: str(value) if isinstance(value, Path) else value for name, value in asdict(sealed).items()})
     else:
         if sealed.recording is not None:
-            _say(str(sealed.recording), sys.stdout)
+            _write_line(str(sealed.recording), sys.stdout)
         if sealed.remark:
-            _say(sealed.remark, sys.stderr)
-    return _code_of(sealed)
+            _write_line(sealed.remark, sys.stderr)
+    return _exit_code(sealed)
 
 
-def _code_of(sealed: Sealed) -> int:
+def _exit_code(sealed: SealingResult) -> int:
     if sealed.refused:
         return FAILED
-    return NOTHING if sealed.recording is None else 0
+    return NO_MEASUREMENTS if sealed.recording is None else 0
 
 
 def _report_progress(done: int, of: int) -> None:
@@ -88,10 +89,10 @@ def _report_progress(done: int, of: int) -> None:
 
 
 def _emit_event(report: dict[str, object]) -> None:
-    _say(json.dumps(report), sys.stdout)
+    _write_line(json.dumps(report), sys.stdout)
 
 
-def _say(text: str, stream: TextIO) -> None:
+def _write_line(text: str, stream: TextIO) -> None:
     with suppress(OSError):  # The reader may have been killed: the recording is made all the same.
         stream.write(text.encode(errors="backslashreplace").decode() + "\n")  # File names may not be valid text.
         stream.flush()

@@ -13,10 +13,10 @@ from ertis_numba.errors import DataError
 from ertis_numba.storage._reader import file_kind, sensor_names
 from ertis_numba.storage.recording import open_recording
 
-__all__ = ["main", "runs_of"]
+__all__ = ["main", "sessions_of"]
 
 
-def runs_of(path: Path) -> list[tuple[str, int, int]]:
+def sessions_of(path: Path) -> list[tuple[str, int, int]]:
     """Return the sessions in a recording: sensor, session_id, and the highest stored or missing number."""
     found: list[tuple[str, int, int]] = []
     for sensor in sensor_names(path):
@@ -42,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             run
             for path in parser.parse_args(arguments).recordings
             if file_kind(path) == "recording"
-            for run in runs_of(path)
+            for run in sessions_of(path)
         ]
     except (DataError, OSError) as error:
         sys.stderr.write(f"{' '.join(str(error).split())}\n")

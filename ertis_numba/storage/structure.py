@@ -17,7 +17,7 @@ from ertis_numba.errors import ArgumentError, DamagedError, ForeignDataError
 from ertis_numba.settings import Settings
 from ertis_numba.storage.schema import TRUTH, Variable
 
-__all__ = ["child", "require_attributes", "require_variables", "sensors_of", "stored_bytes"]
+__all__ = ["local_member", "require_attributes", "require_variables", "sensors_of", "stored_bytes"]
 
 MAX_SENSORS: Final = 1024  # Equal to the limit of a central node.
 MAX_MEMBERS: Final = 256  # Limit on the members of a group: variables, and the scales of their axes.
@@ -29,7 +29,7 @@ MAX_COMPRESSION: Final = 1032  # Limit of deflate.
 MAX_ROW_BYTES: Final = 2**32 - 1
 
 
-def child(group: h5py.Group, name: str, kind: type[Any]) -> Any:
+def local_member(group: h5py.Group, name: str, kind: type[Any]) -> Any:
     """Return a member of a group; refuse links, and members with several names.
 
     Parameters
@@ -75,7 +75,7 @@ def sensors_of(file: h5py.File) -> tuple[str, ...]:
     DamagedError
         There are too many sensors, or a name is not a valid name of a sensor.
     """
-    group = child(file, "sensors", h5py.Group)
+    group = local_member(file, "sensors", h5py.Group)
     if len(group) > MAX_SENSORS:
         raise DamagedError(f"{len(group)} sensors; the limit is {MAX_SENSORS}")
     try:
@@ -126,7 +126,7 @@ def require_variables(group: h5py.Group, table: Iterable[Variable]) -> None:
     require_attributes(group)
     room = group.file.id.get_filesize()
     for owner, variable in _members(group, table):
-        dataset = child(owner, variable.name, h5py.Dataset)
+        dataset = local_member(owner, variable.name, h5py.Dataset)
         _require_kind(dataset, variable)
         room -= stored_bytes(dataset)
         if room < 0:
@@ -141,7 +141,7 @@ def _members(group: h5py.Group, table: Iterable[Variable]) -> Iterator[tuple[h5p
         if variable.name in group:
             yield group, variable
     if "truth" in group:
-        truth = child(group, "truth", h5py.Group)
+        truth = local_member(group, "truth", h5py.Group)
         require_attributes(truth)
         for variable in TRUTH:
             if variable.name in truth:

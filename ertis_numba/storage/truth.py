@@ -15,9 +15,9 @@ from ertis_numba import checks
 from ertis_numba.atomic_files import remedy
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Reflector
-from ertis_numba.storage.schema import TRUTH, describe, lay_out, plain, text_type
+from ertis_numba.storage.schema import TRUTH, create_variables, set_attributes, text_type, to_python
 
-__all__ = ["Truth", "TruthLog", "read_truth", "write_truth"]
+__all__ = ["GroundTruth", "GroundTruthLog", "read_truth", "write_truth"]
 
 _FIELDS = {
     "azimuth": "azimuth_deg",
@@ -37,7 +37,7 @@ _RECORD = np.dtype(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Truth:
+class GroundTruth:
     """Ground truth of a simulated sensor.
 
     Attributes
@@ -63,7 +63,7 @@ class Truth:
             checks.finite_array(f"{_FIELDS[name]} of the true reflectors", values)
 
 
-class TruthLog:
+class GroundTruthLog:
     """Ground truth that grows with each measurement, in a temporary file; use it in a ``with`` statement.
 
     Parameters
@@ -91,7 +91,7 @@ class TruthLog:
         self._waiting: list[NDArray[Any]] = []
         self._block_sizes: list[int] = []
         self._folder = folder or Path(tempfile.gettempdir())
-        with self._naming_folder():
+        with self._errors_with_folder():
             self._file = tempfile.TemporaryFile(dir=folder, prefix="ertis-truth-")  # noqa: SIM115  closed on exit
 
     def __enter__(self) -> Self:
@@ -145,14 +145,14 @@ class TruthLog:
     def _flush(self) -> None:
         if self._waiting:
             records = np.concatenate(self._waiting)
-            with self._naming_folder():
+            with self._errors_with_folder():
                 self._file.write(records.tobytes())
                 self._file.flush()
             self._block_sizes.append(records.nbytes)
             self._waiting.clear()
 
     @contextmanager
-    def _naming_folder(self) -> Iterator[None]:
+    def _errors_with_folder(self) -> Iterator[None]:
         try:
             yield
         except OSError as error:
@@ -170,7 +170,7 @@ class TruthLog:
             yield slice(first, min(first + _BLOCK_ROWS, self._rows)), records
 
 
-def write_truth(group: h5py.Group, truth: Truth | TruthLog, n_measurements: int) -> None:
+def write_truth(group: h5py.Group, truth: GroundTruth | GroundTruthLog, n_measurements: int) -> None:
     """Write the ground truth of a sensor into its group.
 
     Raises
@@ -178,8 +178,8 @@ def write_truth(group: h5py.Group, truth: Truth | TruthLog, n_measurements: int)
     ArgumentError
         The truth has another number of measurements than the file.
     """
-    if isinstance(truth, Truth):
-        with TruthLog(truth.scene, truth.seed, left_out=truth.left_out) as log:
+    if isinstance(truth, GroundTruth):
+        with GroundTruthLog(truth.scene, truth.seed, left_out=truth.left_out) as log:
             for reflectors in truth.reflectors:
                 log.append(reflectors)
             write_truth(group, log, n_measurements)
@@ -196,8 +196,8 @@ def write_truth(group: h5py.Group, truth: Truth | TruthLog, n_measurements: int)
     sizes = {"measurement": n_measurements, "target": truth.n_targets, "axis": 3}
     made = group.create_group("truth", track_order=True)
     table = [variable for variable in TRUTH if not variable.optional or variable.name in texts]
-    lay_out(made, table, sizes=sizes, dtypes=kinds, texts={"scene": truth.scene})
-    describe(made, {"seed": truth.seed, "effects_left_out": " ".join(truth.left_out)})
+    create_variables(made, table, sizes=sizes, dtypes=kinds, texts={"scene": truth.scene})
+    set_attributes(made, {"seed": truth.seed, "effects_left_out": " ".join(truth.left_out)})
     if not truth.n_targets:  # There is no data to write.
         return
     columns = {field: np.array(column, dtype=kinds[field]) for field, column in texts.items()}
@@ -211,7 +211,7 @@ def write_truth(group: h5py.Group, truth: Truth | TruthLog, n_measurements: int)
             dataset[rows] = whole
 
 
-def read_truth(group: h5py.Group) -> Truth | None:
+def read_truth(group: h5py.Group) -> GroundTruth | None:
     """Return the ground truth from a sensor's group, if there is one."""
     if "truth" not in group:
         return None
@@ -235,8 +235,8 @@ def read_truth(group: h5py.Group) -> Truth | None:
                 for target in range(n_targets)
             )
         )
-    left_out = str(plain(group.attrs.get("effects_left_out", b"")))  # Unknown for older files.
-    return Truth(
+    left_out = str(to_python(group.attrs.get("effects_left_out", b"")))  # Unknown for older files.
+    return GroundTruth(
         scene=group["scene"][()].decode(),
         seed=int(group.attrs["seed"]),
         reflectors=tuple(rows),

@@ -6,12 +6,12 @@ from pathlib import Path
 
 from ertis_numba.errors import ArgumentError, DamagedError, DataError, ForeignDataError
 from ertis_numba.journal import Journal
-from ertis_numba.storage._axes_check import fault_of
-from ertis_numba.storage._journal_rows import Damage, JournalRows
+from ertis_numba.storage._axes_check import find_damage
+from ertis_numba.storage._journal_rows import DamagedMeasurement, JournalRows
 from ertis_numba.storage._reader import sensor_names
 from ertis_numba.storage.recording import JOURNAL_DAMAGE, RecordingGap, RecordingReader, open_recording
 
-__all__ = ["Damage", "SensorReport", "verify"]
+__all__ = ["DamagedMeasurement", "SensorReport", "verify"]
 
 _SQLITE = b"SQLite format 3\0"
 
@@ -41,8 +41,8 @@ class SensorReport:
     sensor: str
     measurements: int = 0
     gaps: tuple[RecordingGap, ...] = ()
-    damaged: tuple[Damage, ...] = ()
-    disordered: tuple[int, ...] = ()
+    damaged: tuple[DamagedMeasurement, ...] = ()
+    out_of_order: tuple[int, ...] = ()
     fault: str = ""
     remark: str = ""
 
@@ -52,9 +52,9 @@ class SensorReport:
         return sum(gap.last - gap.first + 1 for gap in self.gaps)
 
     @property
-    def whole(self) -> bool:
+    def is_intact(self) -> bool:
         """True if all measurements are present and intact."""
-        return not (self.gaps or self.damaged or self.disordered or self.fault or self.remark)
+        return not (self.gaps or self.damaged or self.out_of_order or self.fault or self.remark)
 
 
 def verify(path: str | Path) -> list[SensorReport]:
@@ -85,7 +85,7 @@ def verify(path: str | Path) -> list[SensorReport]:
             raise DataError(reports[0].fault)
         return reports
     names = sensor_names(path)
-    structure = fault_of(path)
+    structure = find_damage(path)
     reports = [_of_recording(path, name, structure) for name in names]
     if all(report.fault for report in reports):
         raise DataError(reports[0].fault if reports else f"{path} contains no sensor; copy it again")
@@ -107,20 +107,20 @@ def _of_recording(path: Path, sensor: str, structure: str) -> SensorReport:
         raise
     except (ArgumentError, DataError) as error:
         return SensorReport(sensor=sensor, fault=str(error))
-    damaged: list[Damage] = []
+    damaged: list[DamagedMeasurement] = []
     with recording:
         stamps = recording.stamps()
         for index, stamp in enumerate(stamps):
             try:
                 recording[index]
             except DamagedError as error:
-                damaged.append(Damage(index, stamp.sequence, str(error)))
+                damaged.append(DamagedMeasurement(index, stamp.sequence, str(error)))
         return SensorReport(
             sensor=sensor,
             measurements=len(recording),
             gaps=recording.gaps,
             damaged=tuple(damaged),
-            disordered=_disordered((stamp.session_id, stamp.sequence) for stamp in stamps),
+            out_of_order=_out_of_order((stamp.session_id, stamp.sequence) for stamp in stamps),
             remark="; ".join(filter(None, (_journal_damage(recording), structure))),
         )
 
@@ -130,7 +130,7 @@ def _journal_damage(recording: RecordingReader) -> str:
     return f"lost in a damaged journal: {damage}" if damage else ""
 
 
-def _disordered(numbers: Iterable[tuple[int, int]]) -> tuple[int, ...]:
+def _out_of_order(numbers: Iterable[tuple[int, int]]) -> tuple[int, ...]:
     """Return the indices of numbers that are not above the previous one of the session."""
     last: dict[int, int] = {}
     found = []
@@ -150,6 +150,6 @@ def _of_journal(journal: Journal, sensor: str) -> SensorReport:
         measurements=len(rows),
         gaps=tuple(RecordingGap(*item) for item in rows.missing),
         damaged=tuple(rows.damaged),
-        disordered=_disordered((key.session_id, key.sequence) for key in rows.keys),
+        out_of_order=_out_of_order((key.session_id, key.sequence) for key in rows.keys),
         remark=f"lost in a damaged journal: {journal.damage}" if journal.damage else "",
     )

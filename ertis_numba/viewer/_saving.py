@@ -8,7 +8,7 @@ from typing import Final
 from matplotlib.figure import Figure
 
 from ertis_numba.frames import Energyscape, PointCloud
-from ertis_numba.interop._mountings import checked
+from ertis_numba.interop._mountings import validated
 from ertis_numba.interop._point_files import write_ply
 from ertis_numba.interop._points import PointTable
 from ertis_numba.viewer._axes import PAGE
@@ -56,11 +56,13 @@ def points_ply(points: list[tuple[Energyscape, PointCloud, Pose | None]]) -> byt
     ArgumentError
         There are several sensors, and it is not known where each of them is.
     """
-    mountings = checked(
+    mountings = validated(
         {image.stamp.sensor: (pose.translation_m, pose.rotation_xyzw) for image, _, pose in points if pose}
     )
     found = {image.stamp.sensor: cloud for image, cloud, _ in points}  # Only drawn points are saved.
-    table = PointTable.of([image for image, _, _ in points], lambda image: found[image.stamp.sensor], mountings)
+    table = PointTable.from_images(
+        [image for image, _, _ in points], lambda image: found[image.stamp.sensor], mountings
+    )
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "points.ply"
         write_ply(path, table, text=False)

@@ -219,7 +219,9 @@ def test_a_sweep_too_narrow_for_the_paper_is_refused():
     """Its band pass rang for a minute, and 3 GB of it were computed."""
     call = Call(start_frequency_hz=40_000.5, stop_frequency_hz=40_000.0)
     Settings(call=call)
-    with pytest.raises(ArgumentError, match=r"call sweeps over 0\.5 Hz, too little for the band-pass filter .*; give 100 Hz"):
+    with pytest.raises(
+        ArgumentError, match=r"call sweeps over 0\.5 Hz, too little for the band-pass filter .*; give 100 Hz"
+    ):
         Settings(call=call, processing=Processing(method="paper"))
 
 

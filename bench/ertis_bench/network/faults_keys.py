@@ -18,7 +18,7 @@ from ertis_bench.network.sender import SMALL
 from ertis_bench.network.zmtp import ZmtpPeer
 from ertis_numba.errors import ErtisError
 from ertis_numba.frames import Measurement, Stamp
-from ertis_numba.journal import Entry
+from ertis_numba.journal import JournalEntry
 from ertis_numba.network.allow_list import AllowList, Permission
 from ertis_numba.network.keys import ClientKeys, KeyPair
 from ertis_numba.network.sensor_node import SensorNode
@@ -60,7 +60,7 @@ class _Try:
         )
         now_ns, key = time.monotonic_ns(), DiaryKey(self.sensor, self.session_id, self.sent)
         self.diary.offered(key, Row.of(measurement), now_ns)
-        self.node.append([Entry(measurement, monotonic_ns=now_ns)])
+        self.node.append([JournalEntry(measurement, monotonic_ns=now_ns)])
         self.diary.kept(key)
         self.sent += 1
 

@@ -24,7 +24,7 @@ from ertis_bench.network.diary import Diary, DiaryKey, Row
 from ertis_bench.network.processes import JsonLinesProcess
 from ertis_bench.network.trap import set_trap
 from ertis_numba.frames import Measurement, Stamp
-from ertis_numba.journal import Entry
+from ertis_numba.journal import JournalEntry
 from ertis_numba.network.keys import ClientKeys, KeyPair
 from ertis_numba.network.sensor_node import SensorNode
 from ertis_numba.settings import Processing, Recording, Settings
@@ -195,16 +195,16 @@ class _Sender:
             timestamp_uncertainty_ns=100_000,
         )
 
-    def _entry(self, stamp: Stamp, words: NDArray[np.uint32]) -> Entry:
+    def _entry(self, stamp: Stamp, words: NDArray[np.uint32]) -> JournalEntry:
         """Return a measurement, once it stands in the diary."""
         measurement = Measurement(words, self.settings, stamp)
         row, now_ns = Row.of(measurement), time.monotonic_ns()
-        entry = Entry(measurement, monotonic_ns=now_ns)
+        entry = JournalEntry(measurement, monotonic_ns=now_ns)
         self.diary.offered(_key(entry), row, now_ns)
         return entry
 
 
-def _key(entry: Entry) -> DiaryKey:
+def _key(entry: JournalEntry) -> DiaryKey:
     stamp = entry.measurement.stamp
     return DiaryKey(stamp.sensor, stamp.session_id, stamp.sequence)
 

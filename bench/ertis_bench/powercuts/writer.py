@@ -14,7 +14,7 @@ import numpy as np
 from ertis_bench.network.diary import Row
 from ertis_numba.errors import DataError
 from ertis_numba.frames import Measurement, Stamp
-from ertis_numba.journal import SUFFIX, Entry, Journal
+from ertis_numba.journal import SUFFIX, Journal, JournalEntry
 from ertis_numba.settings import Recording, Settings
 
 _SETTINGS = Settings(recording=Recording(n_samples=32_768))
@@ -37,14 +37,14 @@ def main(folder: Path, seed: int, n_commits: int) -> None:
             for _ in range(count):
                 words[:2] = sequence, seed & 0xFFFFFFFF
                 stamp = Stamp(sensor=_SENSOR, sequence=sequence, sync_count=sequence, session_id=_SESSION_ID)
-                entries.append(Entry(Measurement(words.copy(), _SETTINGS, stamp), monotonic_ns=sequence))
+                entries.append(JournalEntry(Measurement(words.copy(), _SETTINGS, stamp), monotonic_ns=sequence))
                 sequence += 1
             _append(journal, entries, rng)
             if rng.random() < 0.2:
                 _discard(journal, sequence - 2 * _SHORT)
 
 
-def _append(journal: Journal, entries: list[Entry], rng: random.Random) -> None:
+def _append(journal: Journal, entries: list[JournalEntry], rng: random.Random) -> None:
     """Append until it works, or let these measurements be lost, as a full spool does."""
     while True:
         try:

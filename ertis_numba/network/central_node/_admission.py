@@ -8,7 +8,7 @@ import numpy as np
 
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Measurement
-from ertis_numba.journal import Entry, JournalSensor
+from ertis_numba.journal import JournalEntry, JournalSensor
 from ertis_numba.network.central_node._received_items import SensorSession
 from ertis_numba.network.central_node._roles import Unwanted
 from ertis_numba.network.central_node._streams import PeerConnection, SensorTrack, Stream, source_of
@@ -77,7 +77,7 @@ def require_same(
                 )
 
 
-def entry_in(stream: Stream, data: Data, payload: Sequence[memoryview]) -> Entry:
+def entry_in(stream: Stream, data: Data, payload: Sequence[memoryview]) -> JournalEntry:
     """Return the measurement of a message, or refuse the message."""
     source = stream.source
     if len(payload) != 1 or len(payload[0]) != source.n_bytes:
@@ -94,4 +94,4 @@ def entry_in(stream: Stream, data: Data, payload: Sequence[memoryview]) -> Entry
     except ArgumentError as error:
         raise Unwanted("message", str(error), "message") from error
     words = np.frombuffer(payload[0], dtype=source.dtype).reshape(source.shape)
-    return Entry(Measurement(words, settings, data.stamp), data.monotonic_ns, data.crc32)
+    return JournalEntry(Measurement(words, settings, data.stamp), data.monotonic_ns, data.crc32)

@@ -14,7 +14,7 @@ from msgspec.structs import replace
 from ertis_numba import checks
 from ertis_numba.atomic_files import make_folder
 from ertis_numba.errors import ArgumentError, DataError
-from ertis_numba.journal import SUFFIX, Sealed
+from ertis_numba.journal import SUFFIX, SealingResult
 from ertis_numba.network.central_node._journal_store import JournalStore
 from ertis_numba.network.central_node._ledger import Ledger, Lock
 from ertis_numba.network.central_node._received_items import (
@@ -189,7 +189,7 @@ class Archive:
         if self._wakeup_socket is not None:
             self._wakeup_socket.wake()
 
-    def _sealed(self, sealed: Sealed) -> None:
+    def _sealed(self, sealed: SealingResult) -> None:
         self._emit_event(SealedOne(sealed))
 
     def _not_sealed(self, text: str) -> None:
@@ -281,7 +281,7 @@ class Archive:
             if volume is not None:
                 made.recording = volume.path.name.removesuffix(SUFFIX)
                 made.journal_bytes = volume.path.stat().st_size
-                made.room_bytes = volume.journal.room()
+                made.room_bytes = volume.journal.appendable_bytes()
         except (OSError, DataError, ArgumentError):  # Storing raises the specific error.
             pass
         self._snapshot = made

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, Final
 
-from ertis_numba.journal import Sealed
+from ertis_numba.journal import SealingResult
 from ertis_numba.network.central_node._received_items import ReceivedItem
 
 __all__ = ["Telling", "text_of"]
@@ -45,7 +45,7 @@ class Telling:
                 for item in items:
                     self._on_stored(item.run.sensor, item.run.session_id, item.first, getattr(item.what, "crc32", 0))
 
-    def sealed(self, sealed: Sealed) -> None:
+    def sealed(self, sealed: SealingResult) -> None:
         """Report a journal that has become a recording."""
         self.notify(
             "sealed",

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from typing import Final
 
 from ertis_numba.errors import ArgumentError
-from ertis_numba.journal import Entry, JournalSensor
+from ertis_numba.journal import JournalEntry, JournalSensor
 from ertis_numba.journal import JournalGap as NotedGap
 from ertis_numba.network.central_node._acks import Acks
 from ertis_numba.network.central_node._admission import entry_in, require_room, require_same, source_in
@@ -313,7 +313,7 @@ class Intake:
         for item in event.items:
             stream = self._done(item)
             track = self.tracks.setdefault(item.run.sensor, SensorTrack())
-            if isinstance(item.what, Entry):
+            if isinstance(item.what, JournalEntry):
                 track.stored += 1
                 self.acks.acked_through(item.arrived_s)
             else:
@@ -325,7 +325,7 @@ class Intake:
                 self.acks.owe(stream)
                 self._forget(stream)
         if self._on_stored is not None:
-            self._on_stored([item for item in event.items if isinstance(item.what, Entry)])
+            self._on_stored([item for item in event.items if isinstance(item.what, JournalEntry)])
 
     def twin(self, event: Twin) -> None:
         """Process a duplicate."""

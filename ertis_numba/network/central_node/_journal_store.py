@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from ertis_numba.errors import ArgumentError, DataError, DiskFullError
-from ertis_numba.journal import SUFFIX, Entry, Journal
+from ertis_numba.journal import SUFFIX, Journal, JournalEntry
 from ertis_numba.network.central_node._checksums import Checksums
 from ertis_numba.network.central_node._ledger import Ledger, read_acked_through
 from ertis_numba.network.central_node._received_items import (
@@ -159,7 +159,7 @@ class JournalStore:
             elif item.first != last + 1:
                 self._send_back(item)
             else:
-                if batch and isinstance(item.what, Entry) != isinstance(batch[-1].what, Entry):
+                if batch and isinstance(item.what, JournalEntry) != isinstance(batch[-1].what, JournalEntry):
                     flush()
                 self._fit(item, flush)
                 batch.append(item)
@@ -201,7 +201,7 @@ class JournalStore:
                     self._send_back(item)
             return
         self._report_stored(list(batch), 1e3 * (time.monotonic() - begun_s))
-        if isinstance(batch[0].what, Entry):
+        if isinstance(batch[0].what, JournalEntry):
             unrecorded = self._unrecorded.of(item.run.sensor for item in batch)
             if unrecorded:
                 self.volume.note_gaps(unrecorded)
@@ -211,13 +211,13 @@ class JournalStore:
         for item in items:
             self._grow(item.run, item.last)
             item.done = True
-            if isinstance(item.what, Entry):
+            if isinstance(item.what, JournalEntry):
                 self._checksums.add(item.run, item.first, item.what.crc32 or 0)
         self._emit_event(Stored(items, took_ms))
 
     def _store_twin(self, item: ReceivedItem) -> None:
         """Store a duplicate with other content as a conflict; discard equal ones."""
-        if not isinstance(item.what, Entry):
+        if not isinstance(item.what, JournalEntry):
             return
         key = (item.run, item.first, item.what.crc32 or 0)
         differs = key not in self._known_twins and self._differs(item, item.what)
@@ -236,7 +236,7 @@ class JournalStore:
         item.done = True
         self._emit_event(Twin(item, differs=differs))
 
-    def _differs(self, item: ReceivedItem, entry: Entry) -> bool:
+    def _differs(self, item: ReceivedItem, entry: JournalEntry) -> bool:
         """Return True if a number holds another measurement, or one that cannot be compared any more."""
         held = self._checksums.find(item.run, item.first)
         if held is None and self.volume is not None:

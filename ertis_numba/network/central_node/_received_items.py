@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Final, NamedTuple, TypeAlias
 
-from ertis_numba.journal import Entry, JournalGap, JournalSensor, Sealed
+from ertis_numba.journal import JournalEntry, JournalGap, JournalSensor, SealingResult
 
 __all__ = [
     "Event",
@@ -56,7 +56,7 @@ class ReceivedItem:
     run: SensorSession
     first: int
     last: int
-    what: Entry | JournalGap
+    what: JournalEntry | JournalGap
     source: JournalSensor
     arrived_s: float
     owner: bytes
@@ -67,7 +67,7 @@ class ReceivedItem:
     @property
     def n_bytes(self) -> int:
         """Approximate memory of the item."""
-        return _OVERHEAD + (self.what.measurement.data.nbytes if isinstance(self.what, Entry) else 0)
+        return _OVERHEAD + (self.what.measurement.data.nbytes if isinstance(self.what, JournalEntry) else 0)
 
 
 @dataclass(slots=True)
@@ -110,7 +110,7 @@ class Resumed:
 class SealedOne:
     """A journal has become a recording."""
 
-    sealed: Sealed
+    sealed: SealingResult
 
 
 @dataclass(slots=True)

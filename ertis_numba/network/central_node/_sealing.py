@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from ertis_numba.errors import JournalInUseError
-from ertis_numba.journal import SUFFIX, Sealed, seal_apart
+from ertis_numba.journal import SUFFIX, SealingResult, seal_in_subprocess
 
 __all__ = ["Sealing"]
 
@@ -48,7 +48,7 @@ class Sealing:
         Counts so far.
     """
 
-    def __init__(self, on_sealed: Callable[[Sealed], None], on_failed: Callable[[str], None]) -> None:
+    def __init__(self, on_sealed: Callable[[SealingResult], None], on_failed: Callable[[str], None]) -> None:
         self._on_sealed, self._on_failed = on_sealed, on_failed
         self._given: queue.SimpleQueue[Path | None] = queue.SimpleQueue()
         self._waiting: list[tuple[float, float, Path]] = []  # Due time, previous delay, journal.
@@ -96,7 +96,7 @@ class Sealing:
 
     def _seal(self, path: Path, waited_s: float) -> None:
         try:
-            sealed = seal_apart(path, rests=None if self._ends else self._rests(path.parent))
+            sealed = seal_in_subprocess(path, rests=None if self._ends else self._rests(path.parent))
         except Exception as error:  # noqa: BLE001  whatever it is, the journal is still there and ingest goes on
             if not path.exists() and path.with_name(path.name.removesuffix(SUFFIX)).exists():
                 self._left.discard(path)  # Another process has made the recording.

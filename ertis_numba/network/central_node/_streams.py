@@ -55,7 +55,7 @@ def _source(
     if not firmware.isprintable():
         raise ArgumentError(f"firmware of sensor {name} is {firmware!r}; give printable characters")
     settings = received_settings(text, f"settings of sensor {name}")
-    source = JournalSensor.of(
+    source = JournalSensor.from_settings(
         name, settings, firmware=firmware, translation_m=translation_m, rotation_xyzw=rotation_xyzw
     )
     if source.n_bytes > max_bytes:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Self
 
 from ertis_numba.errors import DamagedError
-from ertis_numba.journal import SUFFIX, Entry, Journal, JournalGap, JournalSensor
+from ertis_numba.journal import SUFFIX, Journal, JournalEntry, JournalGap, JournalSensor
 from ertis_numba.network.central_node._received_items import ReceivedItem, SensorSession
 
 __all__ = ["Volume", "journal_name", "runs_of", "same"]
@@ -100,7 +100,7 @@ class Volume:
         """
         for item in items:
             self._add(item.source)
-        entries = [item.what for item in items if isinstance(item.what, Entry)]
+        entries = [item.what for item in items if isinstance(item.what, JournalEntry)]
         if not entries:
             self.note_gaps([item.what for item in items if isinstance(item.what, JournalGap)])
             return
@@ -127,7 +127,7 @@ class Volume:
             )
         self.register(source)
 
-    def crc32_of(self, entry: Entry) -> int | None:
+    def crc32_of(self, entry: JournalEntry) -> int | None:
         """Return the CRC-32 of the stored measurement with this number; None if there is none."""
         stamp = entry.measurement.stamp
         if stamp.sensor not in self.journal.sensors:

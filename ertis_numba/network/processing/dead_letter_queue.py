@@ -10,7 +10,7 @@ from typing import Final
 
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Measurement
-from ertis_numba.journal import SUFFIX, Entry, Journal
+from ertis_numba.journal import SUFFIX, Journal, JournalEntry
 from ertis_numba.network.log import EventLog
 from ertis_numba.network.processing.runner import Job, bytes_of
 from ertis_numba.sample_format import sample_format
@@ -37,13 +37,13 @@ class DeadLetterQueue:
 
     def __init__(self, folder: Path, log: EventLog) -> None:
         self._folder, self._log = folder, log
-        self._waiting: queue.Queue[Entry | None] = queue.Queue(_WAITING)
+        self._waiting: queue.Queue[JournalEntry | None] = queue.Queue(_WAITING)
         self._thread = threading.Thread(target=self._run, name="quarantine", daemon=True)
         self._journal: Journal | None = None
         self._kept = 0
         self._thread.start()
 
-    def put(self, entry: Entry) -> None:
+    def put(self, entry: JournalEntry) -> None:
         """Queue a measurement, unless too many are kept or the disk is far behind."""
         if self._kept >= _MAX:
             self._lost(entry, f"{_MAX} measurements are kept already; analyse these first")
@@ -60,7 +60,7 @@ class DeadLetterQueue:
             self._waiting.put(None, timeout=_CLOSED_S)
         self._thread.join(_CLOSED_S)
 
-    def _lost(self, entry: Entry, why: str) -> None:
+    def _lost(self, entry: JournalEntry, why: str) -> None:
         stamp = entry.measurement.stamp
         self._log.error("not_kept", sensor=stamp.sensor, session_id=stamp.session_id, sequence=stamp.sequence, text=why)
 
@@ -73,7 +73,7 @@ class DeadLetterQueue:
         if self._journal is not None:
             self._journal.close()
 
-    def _write(self, entry: Entry) -> None:
+    def _write(self, entry: JournalEntry) -> None:
         measurement: Measurement = entry.measurement
         if self._journal is not None:
             try:
@@ -89,17 +89,17 @@ class DeadLetterQueue:
         self._log.warning("quarantine", text=f"recover the kept measurements with 'ertis recover {self._journal.path}'")
 
     @staticmethod
-    def _append(journal: Journal, measurement: Measurement, entry: Entry) -> None:
+    def _append(journal: Journal, measurement: Measurement, entry: JournalEntry) -> None:
         if measurement.stamp.sensor not in journal.sensors:
             journal.add_sensor(measurement.stamp.sensor, measurement.settings)
         journal.append([entry])
 
 
-def entry_of(job: Job, settings: Settings) -> Entry | None:
+def entry_of(job: Job, settings: Settings) -> JournalEntry | None:
     """Return the measurement of a job with the settings of its sensor; None if its data does not match them."""
     data, content = job.data, bytes_of(job.words)
     words = sample_format(settings)
     if len(content) != words.n_bytes:
         return None
     measurement = Measurement(words.from_bytes(content).copy(), settings.replace(air=data.air), data.stamp)
-    return Entry(measurement, data.monotonic_ns, zlib.crc32(content))
+    return JournalEntry(measurement, data.monotonic_ns, zlib.crc32(content))

@@ -5,7 +5,7 @@ from collections import Counter, deque
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
-from ertis_numba.capture.sync_counts import SyncCounts
+from ertis_numba.capture.sync_counts import PulseAligner
 from ertis_numba.network.messages import Data, Group
 
 __all__ = ["Groups"]
@@ -62,7 +62,7 @@ class Groups:
 
     def __init__(self) -> None:
         slots = [str(number) for number in range(_RUNS)]
-        self._pulses: SyncCounts[tuple[Data, int]] = SyncCounts(slots, shortest_s=_SHORTEST_S)
+        self._pulses: PulseAligner[tuple[Data, int]] = PulseAligner(slots, shortest_s=_SHORTEST_S)
         self._free = slots
         self._runs: dict[int, _SessionClock] = {}
         self._seen_ns: dict[str, int] = {}
@@ -98,7 +98,7 @@ class Groups:
         if not self._free:
             oldest = min(self._runs, key=lambda session_id: self._runs[session_id].used_ns)
             slot = self._runs.pop(oldest).slot
-            self._place(self._pulses.forget(slot))
+            self._place(self._pulses.reset(slot))
             self._free.append(slot)
         return self._begun(self._free.pop(0), data, arrived_ns, data.timestamp_ns)
 
@@ -131,7 +131,7 @@ class Groups:
         is_far = abs(data.sync_count - run.count - expected) > _FAR
         if not is_far and at_ns == data.monotonic_ns + run.ahead_ns and at_ns - now_ns <= _FUTURE_S * 1e9:
             return run
-        self._place(self._pulses.forget(run.slot))
+        self._place(self._pulses.reset(run.slot))
         return self._begun(run.slot, data, arrived_ns, at_ns)
 
     def _place(self, found: list[tuple[tuple[Data, int], int]]) -> None:

@@ -12,7 +12,7 @@ from typing import Final, Literal
 from ertis_numba import checks
 from ertis_numba.atomic_files import make_folder
 from ertis_numba.errors import DamagedError, DataError, JournalInUseError, NetworkError
-from ertis_numba.journal import LOST, SUFFIX, Entry, Journal, JournalGap
+from ertis_numba.journal import LOST, SUFFIX, Journal, JournalEntry, JournalGap
 from ertis_numba.network.messages import MAX_SEQUENCE
 from ertis_numba.network.sensor_node._runs import OutgoingSession, UnackedItem
 from ertis_numba.network.sensor_node._spool import SensorCounts, Spool
@@ -117,15 +117,15 @@ class DiskSpool(Spool):
                     self._count_kept(run, run.sensor.n_bytes)
         self._found.append(journal)
 
-    def append(self, entries: Sequence[Entry]) -> list[Entry]:
+    def append(self, entries: Sequence[JournalEntry]) -> list[JournalEntry]:
         """Store measurements durably, and return the stored ones; the others become gaps."""
-        kept: list[Entry] = []
+        kept: list[JournalEntry] = []
         with self._writing:
             with self.turn:
                 self.check(entries)
                 free_bytes = self._free_bytes()
-            taken: list[Entry] = []
-            refused: list[Entry] = []
+            taken: list[JournalEntry] = []
+            refused: list[JournalEntry] = []
             for entry in entries:
                 free_bytes -= entry.measurement.data.nbytes
                 (taken if free_bytes >= 0 else refused).append(entry)
@@ -175,7 +175,7 @@ class DiskSpool(Spool):
         name = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{session_id:016x}.h5"
         return Journal.create(self._folder / f"{name}{SUFFIX}", target=name, source="spool of a sensor node")
 
-    def _add(self, journal: Journal, entries: Iterable[Entry]) -> None:
+    def _add(self, journal: Journal, entries: Iterable[JournalEntry]) -> None:
         """Add stored measurements to the items to send."""
         for entry in entries:
             stamp, n_bytes = entry.measurement.stamp, entry.measurement.data.nbytes
@@ -189,7 +189,7 @@ class DiskSpool(Spool):
                     run.add_measurement(stamp.sequence, n_bytes, entry=None)
                     self._count_kept(run, n_bytes)
 
-    def _refuse(self, entry: Entry) -> None:
+    def _refuse(self, entry: JournalEntry) -> None:
         """Replace a measurement without room by a gap."""
         stamp = entry.measurement.stamp
         key = stamp.sensor, stamp.session_id
@@ -229,7 +229,7 @@ class DiskSpool(Spool):
                 with self.turn:
                     self._run(sensor, session_id).journal = journal
 
-    def entry(self, item: UnackedItem, run: OutgoingSession) -> Entry | None:
+    def entry(self, item: UnackedItem, run: OutgoingSession) -> JournalEntry | None:
         """Return the measurement of an item, read if it is not in memory; None if it is a gap."""
         entry = item.entry
         if entry is not None or item.reason or run.journal is None:
@@ -326,5 +326,5 @@ class DiskSpool(Spool):
         yield from dict.fromkeys([*self._found, *self._journals.values()])
 
 
-def _session_id(entry: Entry) -> int:
+def _session_id(entry: JournalEntry) -> int:
     return entry.measurement.stamp.session_id

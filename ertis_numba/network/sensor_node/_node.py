@@ -7,7 +7,7 @@ from typing import Generic, Self, TypeVar
 
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError
-from ertis_numba.journal import Entry, JournalSensor
+from ertis_numba.journal import JournalEntry, JournalSensor
 from ertis_numba.network import addresses
 from ertis_numba.network.keys import ClientKeys
 from ertis_numba.network.log import logger
@@ -141,12 +141,12 @@ class SensorNode:
         ArgumentError
             A recording cannot contain this sensor, or a measurement exceeds the memory.
         """
-        made = JournalSensor.of(
+        made = JournalSensor.from_settings(
             name, settings, firmware=firmware, translation_m=translation_m, rotation_xyzw=rotation_xyzw
         )
         self._spool.add_sensor(made)
 
-    def append(self, entries: Sequence[Entry]) -> list[Entry]:
+    def append(self, entries: Sequence[JournalEntry]) -> list[JournalEntry]:
         """Keep measurements until the central node has acknowledged them; with a spool, they are on disk on return.
 
         Parameters

@@ -7,7 +7,7 @@ from itertools import islice
 from typing import Final, Literal
 
 from ertis_numba.errors import ArgumentError
-from ertis_numba.journal import Entry, Journal, JournalSensor
+from ertis_numba.journal import Journal, JournalEntry, JournalSensor
 
 __all__ = ["MEMORY_FULL", "NEVER_GIVEN", "OutgoingSession", "UnackedItem"]
 
@@ -39,7 +39,7 @@ class UnackedItem:
     last: int
     reason: str = ""
     n_bytes: int = 0
-    entry: Entry | None = None
+    entry: JournalEntry | None = None
 
 
 @dataclass(slots=True, eq=False)
@@ -91,7 +91,7 @@ class OutgoingSession:
         """Sensor and session."""
         return self.sensor.name, self.session_id
 
-    def add_measurement(self, number: int, n_bytes: int, *, entry: Entry | None) -> UnackedItem:
+    def add_measurement(self, number: int, n_bytes: int, *, entry: JournalEntry | None) -> UnackedItem:
         """Add a measurement at the end; missing numbers before it become a gap."""
         self.require_above(number)
         self._fill(number)

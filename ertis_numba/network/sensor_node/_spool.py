@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Stamp
-from ertis_numba.journal import Entry, JournalSensor, require_same
+from ertis_numba.journal import JournalEntry, JournalSensor, require_same_settings
 from ertis_numba.network.messages import MAX_SEQUENCE
 from ertis_numba.network.sensor_node._runs import OutgoingSession, UnackedItem
 
@@ -111,7 +111,7 @@ class Spool:
             self._accepted.pop(sensor.name, None)
             self.counts.setdefault(sensor.name, SensorCounts())
 
-    def append(self, entries: Sequence[Entry]) -> list[Entry]:
+    def append(self, entries: Sequence[JournalEntry]) -> list[JournalEntry]:
         """Keep measurements, and return the kept ones; their CRC-32 is filled in if it is None."""
         with self.turn:
             self.check(entries)
@@ -122,14 +122,14 @@ class Spool:
             self._tidy()
         return list(entries)
 
-    def check(self, entries: Iterable[Entry]) -> None:
+    def check(self, entries: Iterable[JournalEntry]) -> None:
         """Refuse measurements that do not match their sensors, or whose numbers do not rise."""
         last: dict[tuple[str, int], int] = {}
         for entry in entries:
             settings = entry.measurement.settings
             sensor = self._known(entry.measurement.stamp.sensor)
             if settings is not self._accepted.get(sensor.name):
-                require_same(sensor, settings)
+                require_same_settings(sensor, settings)
                 self._accepted[sensor.name] = settings
             # The encoder requires contiguous little-endian data and Python integers.
             _, session_id, number, sync_count, time_ns, uncertainty_ns, *rest, crc32, _, words = sensor.entry_row(
@@ -170,7 +170,7 @@ class Spool:
             self.runs[key] = OutgoingSession(self._known(sensor), session_id)
         return self.runs[key]
 
-    def _keep(self, run: OutgoingSession, entry: Entry) -> UnackedItem:
+    def _keep(self, run: OutgoingSession, entry: JournalEntry) -> UnackedItem:
         """Add a measurement in memory to its session, and count it."""
         n_bytes = entry.measurement.data.nbytes
         item = run.add_measurement(entry.measurement.stamp.sequence, n_bytes, entry=entry)
@@ -210,7 +210,7 @@ class Spool:
             self._run(sensor, session_id).add_gap(first, last, reason)
             self.counts[sensor].missing[reason] += last - first + 1
 
-    def entry(self, item: UnackedItem, run: OutgoingSession) -> Entry | None:  # noqa: ARG002  another spool has to ask the run
+    def entry(self, item: UnackedItem, run: OutgoingSession) -> JournalEntry | None:  # noqa: ARG002  another spool has to ask the run
         """Return the measurement of an item; None if it has become a gap."""
         return item.entry
 

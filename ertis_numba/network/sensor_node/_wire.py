@@ -4,7 +4,7 @@ import zlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, TypeAlias, cast
 
-from ertis_numba.journal import Entry
+from ertis_numba.journal import JournalEntry
 from ertis_numba.network import messages
 from ertis_numba.network.sensor_node._runs import OutgoingSession, UnackedItem
 
@@ -56,7 +56,7 @@ def greeting(run: OutgoingSession) -> Frames:
     return [messages.encode(hello), settings]
 
 
-def frames_of(run: OutgoingSession, item: UnackedItem, entry: Entry | None) -> tuple[Frames, int]:
+def frames_of(run: OutgoingSession, item: UnackedItem, entry: JournalEntry | None) -> tuple[Frames, int]:
     """Return the frames of an item, and its last number at that time."""
     if entry is None:
         first, last = item.first, item.last

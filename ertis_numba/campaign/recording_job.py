@@ -11,8 +11,8 @@ from typing import Any
 
 from ertis_numba import kernels
 from ertis_numba.analysis.call_match import CallMatch, first_call_match
-from ertis_numba.campaign.orders import CampaignOptions
-from ertis_numba.campaign.sensor_run import SensorRun, faults_of
+from ertis_numba.campaign.sensor_processing import SensorProcessing, describe_faults
+from ertis_numba.campaign.tasks import CampaignOptions
 from ertis_numba.errors import DataError
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.prediction import planner_of, predict
@@ -21,18 +21,18 @@ from ertis_numba.stages.planner import Planner
 from ertis_numba.stages.wavefronts import plane_wave_error_db
 from ertis_numba.storage import EnergyscapeWriter, RecordingReader, open_recording
 
-__all__ = ["Making", "checked", "making"]
+__all__ = ["RecordingJob", "check_recording", "prepare_recording"]
 
 _Pipelines = Callable[[Sequence[Settings]], AbstractContextManager[Sequence[Pipeline]]]
 _Show = Callable[[str, dict[str, Any]], None]
 _Checks = tuple[str, CallMatch | None]
 
 
-class Making:
+class RecordingJob:
     """A recording that is ready to be processed; nothing is written yet."""
 
     def __init__(
-        self, recordings: Sequence[RecordingReader], runs: Sequence[SensorRun], writer: EnergyscapeWriter
+        self, recordings: Sequence[RecordingReader], runs: Sequence[SensorProcessing], writer: EnergyscapeWriter
     ) -> None:
         self._recordings, self._runs, self._writer = recordings, runs, writer
         self.measurements = sum(map(len, recordings))
@@ -65,7 +65,7 @@ class Making:
 
 
 @contextmanager
-def making(
+def prepare_recording(
     path: Path,
     target: Path,
     options: CampaignOptions,
@@ -76,7 +76,7 @@ def making(
     max_bytes: float | None = None,
     warn: Callable[[str], None] = lambda _: None,
     show: _Show = lambda *_: None,
-) -> Iterator[Making]:
+) -> Iterator[RecordingJob]:
     """Open a recording and check every sensor, so that errors are reported before any processing.
 
     Parameters
@@ -92,7 +92,7 @@ def making(
     pipelines : callable
         Function that takes a sequence of settings, and returns a context manager with one pipeline for each.
     max_bytes : float, optional
-        Limit on images that wait to be written, in bytes. See `SensorRun`.
+        Limit on images that wait to be written, in bytes. See `SensorProcessing`.
     warn : callable
         Called with a line for each sensor that has faulty microphones, whose echoes do not match the call, or whose
         images may exceed the error budget.
@@ -124,19 +124,19 @@ def making(
         )
         checks = _begin_checks(stack, recordings, chosen)
         runs = [
-            SensorRun(pipeline, batch=options.batch, max_bytes=max_bytes)
+            SensorProcessing(pipeline, batch=options.batch, max_bytes=max_bytes)
             for pipeline in stack.enter_context(pipelines(chosen))
         ]
         for run, recording, check in zip(runs, recordings, checks, strict=True):
-            _look_over(run, recording, check.result(), options, warn, show)
+            _check_sensor(run, recording, check.result(), options, warn, show)
             if run.prediction is not None:
                 writer.note_error(recording.sensor, **run.prediction.as_dict())
             writer.note_call(recording.sensor, run.call_warning)
             writer.note_wavefront(recording.sensor, run.reported.get("wavefront_error_db"))
-        yield Making(recordings, runs, writer)
+        yield RecordingJob(recordings, runs, writer)
 
 
-def checked(
+def check_recording(
     path: Path,
     options: CampaignOptions,
     *,
@@ -144,7 +144,7 @@ def checked(
     pipelines: _Pipelines,
     warn: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
-    """Check every sensor of a recording as `making` does, and return the results about plans; write nothing.
+    """Check every sensor of a recording as `prepare_recording` does, and return the results about plans; write nothing.
 
     Parameters
     ----------
@@ -155,21 +155,23 @@ def checked(
     settings : mapping of str to Settings
         Settings with which its energyscapes were made, by sensor.
     pipelines, warn : callable
-        As for `making`.
+        As for `prepare_recording`.
 
     Raises
     ------
     DataError
-        As for `making`.
+        As for `prepare_recording`.
     ErtisError
         The recording is invalid.
     """
     with ExitStack() as stack:
         recordings = [stack.enter_context(open_recording(path, sensor=name)) for name in settings]
         checks = _begin_checks(stack, recordings, list(settings.values()))
-        runs = [SensorRun(pipeline, batch=1) for pipeline in stack.enter_context(pipelines(list(settings.values())))]
+        runs = [
+            SensorProcessing(pipeline, batch=1) for pipeline in stack.enter_context(pipelines(list(settings.values())))
+        ]
         for run, recording, check in zip(runs, recordings, checks, strict=True):
-            _look_over(run, recording, check.result(), options, warn, lambda *_: None)
+            _check_sensor(run, recording, check.result(), options, warn, lambda *_: None)
         rows = [{"sensor": recording.sensor, **run.reported} for recording, run in zip(recordings, runs, strict=True)]
         return {**(runs[0].reported if len(runs) == 1 else {}), "sensors": rows}
 
@@ -199,21 +201,21 @@ def _begin_checks(
 def _check(recording: RecordingReader, settings: Settings) -> _Checks:
     """Return the faults of a sensor's microphones, empty if there are none, and the match of its call."""
     first = recording[0]
-    faults = faults_of(f"{recording.path}: sensor {recording.sensor}", replace(first, settings=settings))
+    faults = describe_faults(f"{recording.path}: sensor {recording.sensor}", replace(first, settings=settings))
     others = (recording[index] for index in range(1, len(recording)))
     heard = (replace(each, settings=settings) for each in itertools.chain([first], others))
     return faults, first_call_match(heard)
 
 
-def _look_over(
-    run: SensorRun,
+def _check_sensor(
+    run: SensorProcessing,
     recording: RecordingReader,
     checks: _Checks,
     options: CampaignOptions,
     warn: Callable[[str], None],
     show: _Show,
 ) -> None:
-    first = run.known(recording[0])
+    first = run.with_pipeline_settings(recording[0])
     faults, match = checks
     if faults and options.strict:
         raise DataError(faults)

@@ -9,9 +9,9 @@ from ertis_numba.settings import Settings
 from ertis_numba.stages.costs import PLAN_COSTS, PlanCosts
 from ertis_numba.storage.recording import Mounting
 
-__all__ = ["HOW", "MAX_BYTES", "CampaignOptions", "Do", "News", "WorkOrder", "WorkerPool"]
+__all__ = ["MAX_WAITING_BYTES", "TASK_OPTIONS", "CampaignOptions", "Task", "TaskAction", "TaskUpdate", "WorkerPool"]
 
-MAX_BYTES: Final = 256e6
+MAX_WAITING_BYTES: Final = 256e6
 """Limit on images that wait to be written, of all workers together."""
 
 
@@ -69,20 +69,20 @@ class CampaignOptions:
         checks.integer("batch", self.batch, 1)
 
     @property
-    def is_thorough(self) -> bool:
+    def examines_existing(self) -> bool:
         """True if an existing output has to be examined as well."""
         return self.strict or self.explain or self.verify
 
 
-HOW: Final = ("dtype", "batch", "strict", "overwrite", "mounting", "explain", "verify")
+TASK_OPTIONS: Final = ("dtype", "batch", "strict", "overwrite", "mounting", "explain", "verify")
 """Fields of `CampaignOptions` that an order contains unchanged."""
 
 
-Do = Literal["look", "plan", "make", "check"]
+TaskAction = Literal["look", "plan", "make", "check"]
 
 
 @dataclass(frozen=True, slots=True)
-class WorkOrder:
+class Task:
     """Order to a worker.
 
     Attributes
@@ -96,12 +96,12 @@ class WorkOrder:
     """
 
     number: int
-    do: Do
-    about: dict[str, Any]
+    action: TaskAction
+    arguments: dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
-class News:
+class TaskUpdate:
     """Message of a worker about an order.
 
     Attributes
@@ -134,10 +134,10 @@ class WorkerPool(Protocol):
     def limit(self, size: int) -> None:
         """Reduce the number of orders in progress at once; running orders finish."""
 
-    def give(self, order: WorkOrder) -> None:
+    def submit(self, order: Task) -> None:
         """Run an order; never blocks."""
 
-    def wait(self, timeout_s: float) -> list[News]:
+    def wait(self, timeout_s: float) -> list[TaskUpdate]:
         """Return messages of workers, or an empty list after a timeout."""
 
     def close(self) -> None:

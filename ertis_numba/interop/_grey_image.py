@@ -10,14 +10,14 @@ from ertis_numba.analysis.levels import below_strongest_db
 from ertis_numba.frames import Energyscape
 from ertis_numba.geometry import FAR, spacing_rad, unit_vectors, unrolled_rad
 
-__all__ = ["DYNAMIC_RANGE_DB", "Picture"]
+__all__ = ["DYNAMIC_RANGE_DB", "GreyImage"]
 
 DYNAMIC_RANGE_DB = 40.0
 """Level relative to the strongest at which a pixel is black."""
 _MAX_PIXELS = 1000  # Limit along each side of a map.
 
 
-class Picture:
+class GreyImage:
     """Converter of images with the same directions to pictures.
 
     A planar image becomes a picture of azimuth, from the left, and of range, from below. An image with elevations

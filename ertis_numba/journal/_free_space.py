@@ -9,12 +9,12 @@ from ertis_numba.atomic_files import RESERVED_BYTES
 from ertis_numba.errors import DataError, DiskFullError
 from ertis_numba.journal._database import LOG_BYTES, PAGE_BYTES
 
-__all__ = ["left", "recording_bytes", "require"]
+__all__ = ["appendable_bytes", "recording_bytes", "require_free_space"]
 
 _SPARE_BYTES: Final = RESERVED_BYTES + 1_000_000  # Slightly more than sealing keeps free while it writes.
 _SENSOR_BYTES: Final = 150_000  # Tables of a recording: 90 kB were measured, and settings may be longer.
 _ROW_BYTES: Final = 150  # Bytes per row in these tables.
-_KEPT_PAGES: Final = 6  # Pages that a commit changes, in addition to one for each measurement.
+_COMMIT_PAGES: Final = 6  # Pages that a commit changes, in addition to one for each measurement.
 
 
 def recording_bytes(words_bytes: int, *, n_rows: int, n_sensors: int) -> int:
@@ -22,7 +22,7 @@ def recording_bytes(words_bytes: int, *, n_rows: int, n_sensors: int) -> int:
     return words_bytes + n_rows * _ROW_BYTES + n_sensors * _SENSOR_BYTES
 
 
-def require(path: Path, target: Path, *, sizes_bytes: Sequence[int], seals_bytes: int) -> None:
+def require_free_space(path: Path, target: Path, *, sizes_bytes: Sequence[int], seals_bytes: int) -> None:
     """Refuse measurements after which a journal could not be sealed any more.
 
     The disk of ``target`` needs space for the recording of the whole journal, and a reserve. The disk of the journal
@@ -48,8 +48,8 @@ def require(path: Path, target: Path, *, sizes_bytes: Sequence[int], seals_bytes
     if log.exists():
         journal_bytes = log.stat().st_size + 2 * grows_bytes
     else:
-        journal_bytes = grows_bytes + (_KEPT_PAGES + len(sizes_bytes)) * PAGE_BYTES
-    for folder, wanted_bytes in _wanted(path, target, journal_bytes, seals_bytes).items():
+        journal_bytes = grows_bytes + (_COMMIT_PAGES + len(sizes_bytes)) * PAGE_BYTES
+    for folder, wanted_bytes in _required_bytes(path, target, journal_bytes, seals_bytes).items():
         free_bytes = shutil.disk_usage(folder).free
         if free_bytes < wanted_bytes:
             raise DiskFullError(
@@ -58,14 +58,14 @@ def require(path: Path, target: Path, *, sizes_bytes: Sequence[int], seals_bytes
             )
 
 
-def left(path: Path, target: Path, *, seals_bytes: int) -> int:
+def appendable_bytes(path: Path, target: Path, *, seals_bytes: int) -> int:
     """Return the remaining capacity of a journal in bytes, given the current size of its recording."""
-    wanted = _wanted(path, target, LOG_BYTES, seals_bytes)
+    wanted = _required_bytes(path, target, LOG_BYTES, seals_bytes)
     rooms = [shutil.disk_usage(folder).free - wanted_bytes for folder, wanted_bytes in wanted.items()]
     return max(0, min(rooms) // (3 - len(rooms)))  # On one disk, each byte needs space twice.
 
 
-def _wanted(path: Path, target: Path, journal_bytes: int, seals_bytes: int) -> dict[Path, int]:
+def _required_bytes(path: Path, target: Path, journal_bytes: int, seals_bytes: int) -> dict[Path, int]:
     """Return the space needed in each folder, or in one of them for both if they are on the same disk."""
     folders = path.absolute().parent, target.absolute().parent
     target_bytes = seals_bytes + _SPARE_BYTES

@@ -12,13 +12,13 @@ from ertis_numba.errors import ArgumentError, DamagedError, DataError
 from ertis_numba.journal._database import Database
 from ertis_numba.journal._files import keep_damaged_log
 from ertis_numba.journal._log import WriteAheadLog
-from ertis_numba.journal._records import Entry, JournalGap, JournalSensor, checked
-from ertis_numba.journal._tables import selection
+from ertis_numba.journal._records import JournalEntry, JournalGap, JournalSensor, verified_values
+from ertis_numba.journal._tables import select_statement
 
 if TYPE_CHECKING:
     from ertis_numba.journal._journal import Journal
 
-__all__ = ["LOST", "rescue"]
+__all__ = ["LOST", "recover_rows"]
 
 LOST: Final = "lost in a damaged journal"
 """Reason of a gap for numbers that the journal had noted before its log was damaged.
@@ -29,7 +29,7 @@ skipped by the sensor.
 
 
 @dataclass(slots=True)
-class _Found:
+class _RecoveredRows:
     """Rows of a repaired copy that the journal lacks.
 
     ``lost`` contains measurements with intact record and damaged samples. ``n_unreadable`` counts all other damaged
@@ -38,14 +38,14 @@ class _Found:
 
     header: list[Any] = field(default_factory=list)
     sensors: list[JournalSensor] = field(default_factory=list)
-    entries: list[Entry] = field(default_factory=list)
+    entries: list[JournalEntry] = field(default_factory=list)
     gaps: list[JournalGap] = field(default_factory=list)
     lost: list[JournalGap] = field(default_factory=list)
     n_unreadable: int = 0
     is_complete: bool = False
 
 
-def rescue(journal: "Journal", database: Database, log: WriteAheadLog | None) -> str:
+def recover_rows(journal: "Journal", database: Database, log: WriteAheadLog | None) -> str:
     """Recover rows of a damaged log that SQLite does not read, and note lost numbers as gaps.
 
     Parameters
@@ -75,31 +75,31 @@ def rescue(journal: "Journal", database: Database, log: WriteAheadLog | None) ->
             kept = keep_damaged_log(journal.path, log.content)
         with suppress(DataError, OSError):
             found = _read_copy(journal, database, log)
-    unrecorded = [] if found is None else _add(journal, found)
+    unrecorded = [] if found is None else _store_recovered(journal, found)
     if n_commits and found is None and not missing:
         unrecorded.append(f"{n_commits} commits of unknown content")
     if found is not None:
-        unrecorded += _note(journal, found.lost)
+        unrecorded += _record_lost(journal, found.lost)
     is_complete = found is not None and found.is_complete
     # If all rows were recovered, the numbers between them were skipped by the sensor and are not lost.
-    unrecorded += _note(journal, _missing(journal) if is_complete else missing)
+    unrecorded += _record_lost(journal, _missing(journal) if is_complete else missing)
     if kept and not (unrecorded or missing or found is None or found.entries or found.gaps or found.lost):
         kept.unlink(missing_ok=True)  # The log contains only rows that were deleted afterwards.
     return "; ".join(unrecorded)
 
 
-def _note(journal: "Journal", gaps: Iterable[JournalGap]) -> list[str]:
+def _record_lost(journal: "Journal", gaps: Iterable[JournalGap]) -> list[str]:
     """Note lost numbers as gaps, and return the losses of sensors that the journal does not contain."""
     unrecorded = []
     for gap in list(gaps):
         if gap.sensor in journal.sensors:
-            journal.note_gaps(list(_holes(journal, gap)))
+            journal.note_gaps(list(_missing_parts(journal, gap)))
         else:
             unrecorded.append(f"up to {gap.last - gap.first + 1} numbers of sensor {gap.sensor}")
     return unrecorded
 
 
-def _held(journal: "Journal") -> Iterator[tuple[tuple[str, int], int, int]]:
+def _stored_ranges(journal: "Journal") -> Iterator[tuple[tuple[str, int], int, int]]:
     """Yield the numbers of measurements and gaps in a journal: session, first and last number."""
     for key in journal.index():
         yield (key.sensor, key.session_id), key.sequence, key.sequence
@@ -109,28 +109,28 @@ def _held(journal: "Journal") -> Iterator[tuple[tuple[str, int], int, int]]:
 
 def _missing(journal: "Journal") -> Iterator[JournalGap]:
     """Yield the numbers that the tally lists and the journal lacks."""
-    if not journal.tally.marks:
+    if not journal.tally.ranges:
         return
     highest: dict[tuple[str, int], int] = {}
-    for run, _, last in _held(journal):
+    for run, _, last in _stored_ranges(journal):
         highest[run] = max(last, highest.get(run, -1))
-    for run, mark in journal.tally.marks.items():
+    for run, mark in journal.tally.ranges.items():
         before = max(highest.get(run, -1), mark.first - 1, mark.discarded)
         if mark.last > before:
             yield JournalGap(mark.sensor, before + 1, mark.last, LOST, mark.session_id)
 
 
-def _holes(journal: "Journal", gap: JournalGap) -> Iterator[JournalGap]:
+def _missing_parts(journal: "Journal", gap: JournalGap) -> Iterator[JournalGap]:
     """Yield the parts of a gap without numbers that the journal contains."""
     begin = gap.first
-    held = sorted((first, last) for run, first, last in _held(journal) if run == (gap.sensor, gap.session_id))
+    held = sorted((first, last) for run, first, last in _stored_ranges(journal) if run == (gap.sensor, gap.session_id))
     for first, last in [*held, (gap.last + 1, gap.last + 1)]:
         if begin < first <= gap.last + 1:
             yield JournalGap(gap.sensor, begin, first - 1, gap.reason, gap.session_id)
         begin = max(begin, last + 1)
 
 
-def _read_copy(journal: "Journal", database: Database, log: WriteAheadLog) -> _Found:
+def _read_copy(journal: "Journal", database: Database, log: WriteAheadLog) -> _RecoveredRows:
     """Read the rows that the journal lacks from a copy of it with the repaired log.
 
     Each row has its own checksum, so a wrong repair cannot give wrong rows.
@@ -154,30 +154,32 @@ def _read_copy(journal: "Journal", database: Database, log: WriteAheadLog) -> _F
             repaired.close()
 
 
-def _read(journal: "Journal", database: Database, repaired: Database) -> _Found:
-    found = _Found()
+def _read(journal: "Journal", database: Database, repaired: Database) -> _RecoveredRows:
+    found = _RecoveredRows()
     with suppress(DamagedError, ValueError):
-        (row,) = repaired.execute(selection("journal"))
-        found.header = checked(journal.path, "the journal", row)
-    sensors = {row[0]: JournalSensor.from_row(journal.path, row) for row in repaired.execute(selection("sensors"))}
+        (row,) = repaired.execute(select_statement("journal"))
+        found.header = verified_values(journal.path, "the journal", row)
+    sensors = {
+        row[0]: JournalSensor.from_row(journal.path, row) for row in repaired.execute(select_statement("sensors"))
+    }
     found.sensors = [sensors[number] for number in sorted(sensors) if sensors[number].name not in journal.sensors]
     ends = [database.execute(f"SELECT ifnull(max(id), 0) FROM {table}")[0][0] for table in ("measurements", "gaps")]  # noqa: S608
     rows = repaired.execute("SELECT id FROM measurements NOT INDEXED WHERE id > ? ORDER BY id", ends[:1])
     for (number,) in rows:
         record: list[int] = []
         try:
-            (row,) = repaired.execute(selection("measurements", "WHERE id = ?"), (number,))
-            record = checked(journal.path, "a measurement", row[:-1])
+            (row,) = repaired.execute(select_statement("measurements", "WHERE id = ?"), (number,))
+            record = verified_values(journal.path, "a measurement", row[:-1])
             found.entries.append(sensors[record[0]].entry(journal.path, row))
         except (DamagedError, KeyError, ValueError):
             if record and record[0] in sensors:
                 found.lost.append(JournalGap(sensors[record[0]].name, record[2], record[2], LOST, record[1]))
             else:
                 found.n_unreadable += 1
-    gaps = repaired.execute(selection("gaps", "WHERE id > ? ORDER BY id"), ends[1:])
+    gaps = repaired.execute(select_statement("gaps", "WHERE id > ? ORDER BY id"), ends[1:])
     for row in gaps:
         with suppress(DamagedError, KeyError):
-            number, session_id, first, last, reason = checked(journal.path, "a gap", row)
+            number, session_id, first, last, reason = verified_values(journal.path, "a gap", row)
             found.gaps.append(JournalGap(sensors[number].name, first, last, reason, session_id))
     found.is_complete = (
         not found.n_unreadable
@@ -192,10 +194,10 @@ def _is_unbroken(rows: Sequence[tuple[Any, ...]], end: int) -> bool:
     return [row[0] for row in rows] == list(range(end + 1, end + 1 + len(rows)))
 
 
-def _add(journal: "Journal", found: _Found) -> list[str]:
+def _store_recovered(journal: "Journal", found: _RecoveredRows) -> list[str]:
     """Store the recovered rows, and return the losses that no gap can cover."""
     if found.header:
-        journal.adopt(found.header)
+        journal.restore_header(found.header)
     for sensor in found.sensors:
         with suppress(ArgumentError):
             journal.add_sensor(

@@ -14,13 +14,13 @@ from typing import IO, Any
 
 from ertis_numba.errors import DataError, JournalInUseError
 
-__all__ = ["Sealed", "seal_apart"]
+__all__ = ["SealingResult", "seal_in_subprocess"]
 
 Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, slots=True)
-class Sealed:
+class SealingResult:
     """Result of sealing a journal.
 
     Attributes
@@ -76,13 +76,13 @@ class Sealed:
         return "; ".join(reported)
 
 
-def seal_apart(
+def seal_in_subprocess(
     journal: Path,
     *,
     overwrite: bool = False,
     rests: float | None = None,
     progress: Progress = lambda _done, _of: None,
-) -> Sealed:
+) -> SealingResult:
     """Make the recording of a journal in a separate process; see `ertis_numba.storage.sealing.seal`.
 
     Ctrl-C in a terminal does not reach that process. However it ends, the measurements are in the journal or in the
@@ -122,9 +122,9 @@ def seal_apart(
         chosen = [*(["--force"] if overwrite else []), *([] if rests is None else [f"--rests={rests}"])]
         reason = _run([*command, *chosen, "--", str(journal)], reported, progress)
     except KeyboardInterrupt as error:
-        raise KeyboardInterrupt(_where(journal, reported)) from error
+        raise KeyboardInterrupt(_interrupt_message(journal, reported)) from error
     if "recording" in reported:
-        return _sealed(reported)
+        return _parse_result(reported)
     if reported.get("in_use"):
         raise JournalInUseError(reported["error"])
     raise DataError(reported.get("error") or f"{journal}: the process that seals it {reason}; seal it again")
@@ -144,25 +144,25 @@ def _run(command: list[str], reported: dict[str, Any], progress: Progress) -> st
         creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
     ) as process:
         stated: deque[str] = deque(maxlen=1)
-        listener = Thread(target=_listen, args=(process.stderr, stated), daemon=True)
+        listener = Thread(target=_keep_last_line, args=(process.stderr, stated), daemon=True)
         listener.start()
         try:
-            _take(process.stdout, reported, progress)
+            _forward_progress(process.stdout, reported, progress)
         except BaseException:
-            _end(process)
-            _take(process.stdout, reported, lambda _done, _of: None)
+            _interrupt(process)
+            _forward_progress(process.stdout, reported, lambda _done, _of: None)
             raise
         process.wait()
         listener.join()
     return f"ended with {process.returncode}, " + (f"printing {stated[0]!r}" if stated else "printing nothing")
 
 
-def _listen(stream: IO[str] | None, stated: deque[str]) -> None:
+def _keep_last_line(stream: IO[str] | None, stated: deque[str]) -> None:
     """Keep the last line of stderr, which is the error in a traceback."""
     stated.extend(line.strip() for line in stream or () if line.strip())
 
 
-def _take(stream: IO[str] | None, reported: dict[str, Any], progress: Progress) -> None:
+def _forward_progress(stream: IO[str] | None, reported: dict[str, Any], progress: Progress) -> None:
     """Forward progress until the process ends its output."""
     for line in stream or ():
         try:
@@ -175,7 +175,7 @@ def _take(stream: IO[str] | None, reported: dict[str, Any], progress: Progress) 
             reported.update(report)
 
 
-def _end(process: "subprocess.Popen[str]") -> None:
+def _interrupt(process: "subprocess.Popen[str]") -> None:
     """Interrupt a process, so that it ends cleanly if the system allows that."""
     if os.name == "posix":
         process.send_signal(signal.SIGINT)
@@ -183,14 +183,14 @@ def _end(process: "subprocess.Popen[str]") -> None:
         process.terminate()
 
 
-def _sealed(reported: dict[str, Any]) -> Sealed:
+def _parse_result(reported: dict[str, Any]) -> SealingResult:
     paths = {name: Path(reported[name]) for name in ("journal", "recording", "set_aside") if reported[name] is not None}
-    return Sealed(**reported | paths)
+    return SealingResult(**reported | paths)
 
 
-def _where(journal: Path, reported: dict[str, Any]) -> str:
+def _interrupt_message(journal: Path, reported: dict[str, Any]) -> str:
     """Return a line on where the measurements are after an interrupt; sealing may have ended before it."""
     if "recording" not in reported:
         return f"the measurements are safe in {journal}; recover them with 'ertis recover {journal}'"
-    sealed = _sealed(reported)
+    sealed = _parse_result(reported)
     return sealed.remark or f"the measurements are in {sealed.recording}"

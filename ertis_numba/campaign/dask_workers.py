@@ -8,19 +8,19 @@ from contextlib import ExitStack
 from typing import Any, Final
 
 from ertis_numba import cluster
-from ertis_numba.campaign.orders import News, WorkOrder
-from ertis_numba.campaign.work import follow
+from ertis_numba.campaign.tasks import Task, TaskUpdate
+from ertis_numba.campaign.work import run_task
 from ertis_numba.errors import NetworkError
 from ertis_numba.storage.schema import software_versions
 
-__all__ = ["Members", "follow_there"]
+__all__ = ["DaskWorkerPool", "run_on_dask_worker"]
 
 _CONNECT_S: Final = 10.0
 _LOOK_S: Final = 1.0
 _REPORT_INTERVAL_S: Final = 0.5
 
 
-class Members:
+class DaskWorkerPool:
     """`WorkerPool` of the workers of a dask scheduler, with at most one recording in progress per worker.
 
     The workers need the same versions of this package and its dependencies, and access to the files under the same
@@ -43,7 +43,7 @@ class Members:
     def __init__(self, address: str) -> None:
         self._address = address
         self._topic = f"ertis-{secrets.token_hex(4)}"
-        self._reported: queue.SimpleQueue[News] = queue.SimpleQueue()
+        self._reported: queue.SimpleQueue[TaskUpdate] = queue.SimpleQueue()
         self._futures: dict[int, cluster.Future] = {}
         with ExitStack() as stack:
             self._client = cluster.connect(address, timeout_s=_CONNECT_S)
@@ -69,12 +69,12 @@ class Members:
     def limit(self, size: int) -> None:
         """Do nothing: each worker of a cluster has its own device."""
 
-    def give(self, order: WorkOrder) -> None:
+    def submit(self, order: Task) -> None:
         """Run an order; never blocks."""
         future = self._client.submit(
-            follow_there,
-            order.do,
-            {**order.about, "versions": software_versions()},
+            run_on_dask_worker,
+            order.action,
+            {**order.arguments, "versions": software_versions()},
             self._topic,
             order.number,
             key=f"{self._topic}-{order.number}",
@@ -83,14 +83,14 @@ class Members:
         self._futures[order.number] = future
         future.add_done_callback(lambda done, number=order.number: self._reported.put(_news(number, done)))
 
-    def wait(self, timeout_s: float) -> list[News]:
+    def wait(self, timeout_s: float) -> list[TaskUpdate]:
         """Return messages of workers, or an empty list after a timeout."""
         if self._client.status != "running":
             raise NetworkError(
                 f"the dask scheduler at {self._address} is gone; finished output stays. Give another scheduler "
                 "to continue"
             )
-        self._look()
+        self._update_size()
         try:
             news = [self._reported.get(timeout=timeout_s)]
         except queue.Empty:
@@ -111,9 +111,9 @@ class Members:
     def _advance(self, event: tuple[Any, dict[str, Any]]) -> None:
         """Process a message of a task; runs in the thread of the client."""
         _, reported = event
-        self._reported.put(News(reported["number"], reported["done"]))
+        self._reported.put(TaskUpdate(reported["number"], reported["done"]))
 
-    def _look(self) -> None:
+    def _update_size(self) -> None:
         """Count the workers again from time to time."""
         if time.monotonic() < self._looked_s + _LOOK_S:
             return
@@ -124,23 +124,25 @@ class Members:
             return
 
 
-def _news(number: int, future: cluster.Future) -> News:
+def _news(number: int, future: cluster.Future) -> TaskUpdate:
     """Return the result of a task; runs in the thread of the client."""
     try:
-        return News(number, result=future.result(timeout=_CONNECT_S))
+        return TaskUpdate(number, result=future.result(timeout=_CONNECT_S))
     except CancelledError:
-        return News(number, result={"error": "the cluster has cancelled the order; process again", "by_chance": True})
+        return TaskUpdate(
+            number, result={"error": "the cluster has cancelled the order; process again", "by_chance": True}
+        )
     except Exception as error:  # noqa: BLE001  the campaign reports any error
         text = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
-        return News(number, result={"error": text, "by_chance": True})
+        return TaskUpdate(number, result={"error": text, "by_chance": True})
 
 
-class _UnwantedError(Exception):
+class _TaskCancelledError(Exception):
     """The order was cancelled."""
 
 
-def follow_there(do: str, about: dict[str, Any], topic: str, number: int) -> dict[str, Any]:
-    """Run an order on a worker of the cluster, as `work.follow` does; ``topic`` receives its progress."""
+def run_on_dask_worker(do: str, about: dict[str, Any], topic: str, number: int) -> dict[str, Any]:
+    """Run an order on a worker of the cluster, as `work.run_task` does; ``topic`` receives its progress."""
     here = cluster.current_worker()
     for name, wanted in about["versions"].items():
         came = software_versions()[name]
@@ -154,9 +156,9 @@ def follow_there(do: str, about: dict[str, Any], topic: str, number: int) -> dic
         nonlocal reported_s
         task = here.state.tasks.get(f"{topic}-{number}")
         if task is None or task.state == "cancelled":
-            raise _UnwantedError
+            raise _TaskCancelledError
         if time.monotonic() > reported_s + _REPORT_INTERVAL_S:
             reported_s = time.monotonic()
             here.log_event(topic, {"number": number, "done": done})
 
-    return follow(do, {**about, "at_most": here.state.nthreads}, notify)
+    return run_task(do, {**about, "at_most": here.state.nthreads}, notify)

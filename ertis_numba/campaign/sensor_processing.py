@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from ertis_numba.analysis.health import health
 from ertis_numba.analysis.health.kinds import DISABLE
-from ertis_numba.campaign.orders import MAX_BYTES
+from ertis_numba.campaign.tasks import MAX_WAITING_BYTES
 from ertis_numba.errors import DataError
 from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.pipeline import Pipeline
@@ -19,10 +19,10 @@ from ertis_numba.storage import EnergyscapeWriter, RecordingReader
 if TYPE_CHECKING:
     from ertis_numba.prediction import Prediction
 
-__all__ = ["SensorRun", "faults_of"]
+__all__ = ["SensorProcessing", "describe_faults"]
 
 
-def faults_of(name: str, measurement: Measurement) -> str:
+def describe_faults(name: str, measurement: Measurement) -> str:
     """Return the faults of the microphones with the remedy, in one line; empty if there are none."""
     report = health(measurement)
     if not report.faults:
@@ -40,7 +40,7 @@ def faults_of(name: str, measurement: Measurement) -> str:
     return f"{name} has faulty microphones ({report.verdict()}); {remedy}, or see 'ertis info --health'"
 
 
-class SensorRun:
+class SensorProcessing:
     """Pipeline of one sensor, its predictions, and the time of each measurement.
 
     Parameters
@@ -50,7 +50,7 @@ class SensorRun:
     batch : int
         Number of measurements per batch; fewer if the images exceed ``max_bytes``.
     max_bytes : float, optional
-        Limit on images that wait to be written, in bytes; `MAX_BYTES` by default.
+        Limit on images that wait to be written, in bytes; `MAX_WAITING_BYTES` by default.
 
     Attributes
     ----------
@@ -73,9 +73,9 @@ class SensorRun:
         self.prediction: Prediction | None = None
         self.call_warning = ""
         image_bytes = 4 * len(pipeline.grid) * len(pipeline.range_m)
-        self._size = max(1, min(batch, int((max_bytes or MAX_BYTES) / image_bytes)))
+        self._size = max(1, min(batch, int((max_bytes or MAX_WAITING_BYTES) / image_bytes)))
 
-    def known(self, measurement: Measurement) -> Measurement:
+    def with_pipeline_settings(self, measurement: Measurement) -> Measurement:
         """Return a measurement with the settings of the pipeline, which may correct its array, call or air."""
         return replace(measurement, settings=self.pipeline.settings)
 
@@ -94,7 +94,7 @@ class SensorRun:
             if as_recorded:
                 for measurement in group:
                     _require_same_air(measurement, settings)
-            images = self._processed([self.known(measurement) for measurement in group])
+            images = self._processed([self.with_pipeline_settings(measurement) for measurement in group])
             images.reverse()
             while images:  # Written images are released: on a GPU, the next batch needs their memory.
                 writer.write(images.pop())
