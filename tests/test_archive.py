@@ -467,7 +467,7 @@ def test_a_journal_that_somebody_else_recovers_is_done(tmp_path, monkeypatch):
     with Opened(tmp_path) as opened:
         opened.give(item_of(from_zero(1)[0]))
         opened.until_stored(0)
-    monkeypatch.setattr("ertis_numba.network.central_node._sealing.seal_apart", seals)
+    monkeypatch.setattr("ertis_numba.network.central_node._sealing.seal_in_subprocess", seals)
     with Opened(tmp_path, seal=True) as opened:
         pass
     assert not [event for event in opened.events if isinstance(event, SealingFailed)]
@@ -488,7 +488,7 @@ def test_sealing_rests_long_until_the_room_gets_scarce(tmp_path, monkeypatch, sh
         opened.until_stored(0)
     (path,) = tmp_path.glob(f"*{SUFFIX}")
     usage = shutil.disk_usage(tmp_path)._replace(free=int(4 * path.stat().st_size / share))
-    monkeypatch.setattr("ertis_numba.network.central_node._sealing.seal_apart", seals)
+    monkeypatch.setattr("ertis_numba.network.central_node._sealing.seal_in_subprocess", seals)
     monkeypatch.setattr("ertis_numba.network.central_node._sealing.shutil.disk_usage", lambda _: usage)
     with Opened(tmp_path, seal=True) as opened:
         opened.until(SealedOne)

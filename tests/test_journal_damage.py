@@ -38,8 +38,10 @@ DAMAGED = {
     "fewer words": ("UPDATE measurements SET words = x'00' WHERE id = 2", "measurement 11 of sensor left has CRC-32"),
     "time": (
         "UPDATE measurements SET timestamp_ns = 7 WHERE id = 2",
-        "the record of measurement 11 of sensor left has CRC-32 1844115737, but should have 32022344: "
-        "the journal is damaged",
+        (
+            "the record of measurement 11 of sensor left has CRC-32 1844115737, but should have 32022344: "
+            "the journal is damaged"
+        ),
     ),
     "type of the words": (
         "UPDATE measurements SET words = 'text' WHERE id = 2",

@@ -30,13 +30,13 @@ APPEND = """
 import sys
 from pathlib import Path
 from ertis_numba.errors import DataError
-from ertis_numba.journal import Journal, _room
+from ertis_numba.journal import Journal, _free_space
 from ertis_numba.settings import Recording, Settings
 from tests.journals import create, entries, same
 settings = Settings(recording=Recording(n_samples=32_768))
 given = entries(200, settings=settings)
 if "unguarded" in sys.argv:
-    _room.require = lambda *_, **__: None
+    _free_space.require_free_space = lambda *_, **__: None
 journal = create(Path(sys.argv[1]), [])
 journal.add_sensor("left", settings)
 ballast = Path(sys.argv[1], "ballast")

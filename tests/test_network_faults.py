@@ -44,7 +44,7 @@ import sys, zlib
 
 if "record" in sys.argv:
     from dataclasses import replace
-    from ertis_numba.journal import Entry, Journal
+    from ertis_numba.journal import Journal, JournalEntry
 
     append = Journal.append
 
@@ -58,7 +58,7 @@ if "record" in sys.argv:
                 words = entry.measurement.data.copy()
                 words[1000] ^= 1
                 measurement = replace(entry.measurement, data=words)
-                entry = Entry(measurement, entry.monotonic_ns, zlib.crc32(words.data))
+                entry = JournalEntry(measurement, entry.monotonic_ns, zlib.crc32(words.data))
             kept.append(entry)
         append(self, kept)
 
