@@ -156,7 +156,7 @@ _HOMES = {
     "frames": ("Energyscape", "Measurement", "MicrophoneSignals", "Peak", "PointCloud", "Reflector", "Stamp"),
     "geometry": ("load_layout",),
     "interop": ("export", "open_pcm", "open_raw", "open_rtis_folder"),
-    "journal": ("Entry",),
+    "journal": ("JournalEntry",),
     "network.allow_list": ("AllowList", "Permission"),
     "network.keys": ("ClientKeys", "KeyPair", "ServerKeys"),
     "network.sensor_node": ("SensorNode",),

@@ -18,7 +18,7 @@ WITHOUT_EXAMPLE = {
     # `Pipeline.signals` returns it and has an example.
     "MicrophoneSignals",
     # They need keys or a network; pages of the guide have examples, which tests run.
-    *("AllowList", "ClientKeys", "Entry", "KeyPair", "Permission", "ServerKeys"),
+    *("AllowList", "ClientKeys", "JournalEntry", "KeyPair", "Permission", "ServerKeys"),
 }
 """Public names whose docstring has no example, each with its reason."""
 

@@ -58,8 +58,8 @@ RUN_BY = {
     ("ros", "$"): ["test_guide::test_commands_on_ros"],
     ("simulation", "$"): ["test_readme::test_page_on_simulation"],
     ("simulation", "python"): ["test_readme::test_page_on_simulation"],
-    ("view", "$"): ["test_view_command::test_the_page_on_the_view"],
-    ("view", "python"): ["test_view_command::test_the_page_on_the_view"],
+    ("view", "$"): ["test_view_command::test_commands_of_the_page_on_the_view_run"],
+    ("view", "python"): ["test_view_command::test_commands_of_the_page_on_the_view_run"],
 }
 """Which tests run what a page has to be run: lines that begin with a prompt, or blocks of Python."""
 

@@ -38,7 +38,7 @@ def places_of(sensor):
 # ---- other sensors ---------------------------------------------------------------------------------
 
 
-def test_a_foreign_call_goes_over_the_target_on_an_ellipse():
+def test_foreign_call_travels_over_the_target():
     """From emitter j to the target to microphone i, and straight from j to i."""
     point_m = np.array([1.0, 0.5, -0.2])
     left = SENSOR.replace(name="left", position_m=(0.0, 0.5, 0.0), yaw_deg=-20)
@@ -59,7 +59,7 @@ def test_a_foreign_call_goes_over_the_target_on_an_ellipse():
         assert_allclose(direct.amplitude[..., 0], [level / straight_m])
 
 
-def test_two_facing_sensors_hear_each_other():
+def test_facing_sensors_receive_each_others_calls():
     """1 m apart: the sound takes 1 m / c, and half of it would be the range of an image."""
     near = EAR.replace(name="near", emitter=Emitter(diameter_m=0.02, level_db=-20))
     far = near.replace(name="far", position_m=(1.0, 0.0, 0.0), yaw_deg=180)
@@ -81,7 +81,7 @@ def test_calls_of_other_sensors_keep_their_form():
     assert error_db(heard(scene, "cross_emission"), written_out(up, direct.delay_s, 1.0, 40_000)) < -75
 
 
-def test_silent_sensors_are_not_heard():
+def test_silent_sensors_emit_no_call():
     scene = Scene(
         sensors=(LISTENS, LISTENS.replace(name="other", position_m=(1.0, 0.0, 0.0))), points=(Point(range_m=1),)
     )
@@ -105,7 +105,7 @@ def test_each_sensor_of_the_chain_starts_400_ns_later(place, wanted_ns):
     assert stamps == [50_000_000, 50_000_400, 50_000_800]
 
 
-def test_the_chain_shows_in_signals():
+def test_delays_of_the_chain_appear_in_signals():
     sensors = LISTENS, EAR.replace(name="other", position_m=(0.5, 0.0, 0.0))
     signals = heard(Scene(sensors=sensors), "cross_emission", "sync_delay")
     delay_s = np.linalg.norm(places_of(LISTENS) - (0.5, 0, 0), axis=1) / SPEED_M_S + 400e-9
@@ -129,7 +129,7 @@ def test_tones_have_frequency_level_and_phase(frequency_hz, index):
     assert_allclose(signals, wanted, atol=1e-9)
 
 
-def test_tones_add_up_and_move_from_measurement_to_measurement():
+def test_tones_add_up_and_continue_between_measurements():
     still = Tone(position_m=(0.6, -0.8, 0.3), frequency_hz=40e3)
     moving = Tone(position_m=(1.0, 0.0, 0.0), velocity_m_s=(0.0, 2.0, 0.0), frequency_hz=30e3)
     both = heard(scene_of(sensor=LISTENS, tones=(still, moving), rate_hz=4.0), "interference", index=1)
@@ -140,7 +140,7 @@ def test_tones_add_up_and_move_from_measurement_to_measurement():
     assert_allclose(both, alone[0] + alone[1], atol=1e-12)
 
 
-def test_sensitivities_of_the_microphones_count_for_tones():
+def test_microphone_sensitivities_scale_tones():
     array = SENSOR.array.replace(gain=(1.0, 2.0, 0.5))
     tone = Tone(position_m=(0.6, -0.8, 0.3), frequency_hz=40e3)
     plain, calibrated = (
@@ -177,7 +177,7 @@ def test_noise_has_level_and_band(band_hz):
     assert_allclose(quarters / quarters.mean(), 1, atol=4 * math.sqrt(8 / independent))
 
 
-def test_noise_reaches_microphones_one_after_the_other():
+def test_noise_of_a_source_is_delayed_between_microphones():
     """The peak of the correlation lies where the ways differ."""
     sensor = LISTENS.replace(array=line_array(2, 0.1))
     noise = Noise(position_m=(1.0, 0.7, 0.0), level_db=0)
@@ -197,7 +197,7 @@ def test_noise_reaches_microphones_one_after_the_other():
     assert np.corrcoef(aligned, first)[0, 1] > 0.98  # frames turn about their ends
 
 
-def test_noise_goes_on_from_block_to_block():
+def test_noise_continues_between_blocks():
     """Its level is the same everywhere, and it does not repeat."""
     [signal] = heard(noisy(Noise(position_m=(1.0, 0.0, 0.0), level_db=0), sensor=EAR), "interference")
     parts = signal[: 30 * 8192].reshape(30, 8192)
@@ -222,7 +222,7 @@ def test_noise_depends_on_seed_and_index_and_source_and_sensor():
         assert abs(np.corrcoef(other[0], first)[0, 1]) < 0.2
 
 
-def test_noise_is_the_same_in_any_blocks(monkeypatch):
+def test_noise_does_not_depend_on_the_block_length(monkeypatch):
     scene = noisy(Noise(position_m=(1.0, 0.0, 0.0)), ambient=Ambient(level_dbfs=-60))
     whole = heard(scene, "interference", "ambient_noise")
     monkeypatch.setattr("ertis_numba.simulation.synthesis.BLOCK", 10_007)
@@ -261,7 +261,7 @@ SONAR = Sonar(position_m=(0.5, 0.0, 0.2), level_db=-6, period_s=0.003, offset_s=
 
 
 @pytest.mark.parametrize("index", [0, 1, 7])
-def test_calls_of_other_sonars_come_with_their_period(index):
+def test_calls_of_other_sonars_repeat_with_their_period(index):
     scene = scene_of(sensor=LISTENS, sonars=(SONAR,), rate_hz=100.0)
     way_m = np.linalg.norm(places_of(LISTENS) - SONAR.position_m, axis=1)
     begin_s = index / 100.0
@@ -275,14 +275,14 @@ def test_calls_of_other_sonars_come_with_their_period(index):
     assert error_db(heard(scene, "interference", index=index), wanted) < -75
 
 
-def test_no_call_comes_before_the_first():
+def test_other_sonars_are_silent_before_their_first_call():
     late = SONAR.replace(offset_s=0.1)
     assert not ways(scene_of(sensor=LISTENS, sonars=(late,)), "interference")
     delay_s, _ = sorted_ways(scene_of(sensor=LISTENS, sonars=(late,)), "interference", index=2)
     assert delay_s[0] >= 0.5 / SPEED_M_S
 
 
-def test_sources_are_not_heard_where_the_effect_is_off():
+def test_disabled_effect_removes_all_sources():
     scene = scene_of(
         sensor=LISTENS,
         sonars=(SONAR,),
@@ -293,7 +293,7 @@ def test_sources_are_not_heard_where_the_effect_is_off():
     assert not heard(scene).any()
 
 
-def test_parts_of_a_large_array_hear_parts_of_one_ambient_noise():
+def test_sub_arrays_record_one_common_ambient_noise():
     """Channels are rendered 128 at a time; those of different parts are as independent as their distance makes them."""
     sensor = LISTENS.replace(array=line_array(256, 0.01), recording=Recording(n_samples=50_000))
     scene = scene_of(sensor=sensor, ambient=Ambient(level_dbfs=-30))

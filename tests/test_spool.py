@@ -59,7 +59,7 @@ def test_measurements_are_durable_before_they_are_sent(tmp_path):
     assert open_recording(sealed.recording).firmware == "1.2.3"
 
 
-def test_what_the_central_node_has_leaves_the_disk(tmp_path):
+def test_acknowledged_measurements_leave_the_disk(tmp_path):
     given = entries(30)
     with StandIn() as central, Node(central.address, spool=tmp_path) as node:
         node.append(given[:29])
@@ -74,7 +74,7 @@ def test_what_the_central_node_has_leaves_the_disk(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_earlier_runs_are_sent_first(tmp_path):
+def test_earlier_sessions_are_sent_first(tmp_path):
     old, older, new = entries(5, session_id=2), entries(5, session_id=1), entries(5, session_id=3)
     kept(tmp_path, older)
     journals(tmp_path)[0].rename(tmp_path / "20200101T000000Z-1.h5.journal")
@@ -91,7 +91,7 @@ def test_earlier_runs_are_sent_first(tmp_path):
     assert notes == []
 
 
-def test_a_run_goes_on_after_a_restart(tmp_path):
+def test_session_continues_after_a_restart(tmp_path):
     given = entries(10)
     kept(tmp_path, given[:5])
     with Node(NOBODY, spool=tmp_path) as node:
@@ -106,7 +106,7 @@ def test_a_run_goes_on_after_a_restart(tmp_path):
 
 
 @IMPATIENT
-def test_acks_that_were_lost_with_the_node(tmp_path):
+def test_stored_measurements_with_lost_acks_are_not_sent_again(tmp_path):
     """What the central node has is not sent again, and leaves the disk."""
     given = entries(8)
     kept(tmp_path / "a", given)
@@ -120,7 +120,7 @@ def test_acks_that_were_lost_with_the_node(tmp_path):
     assert not journals(tmp_path / "b")
 
 
-def test_memory_has_a_bound_that_the_disk_has_not(tmp_path):
+def test_memory_is_bounded_while_the_disk_keeps_everything(tmp_path):
     given = entries(20)
     with StandIn() as central:
         address = central.address
@@ -133,7 +133,7 @@ def test_memory_has_a_bound_that_the_disk_has_not(tmp_path):
     assert has_all(central, given)
 
 
-def test_a_full_spool_refuses_the_new_ones(tmp_path):
+def test_full_spool_refuses_new_measurements(tmp_path):
     given = entries(200)
     with StandIn() as central:
         address = central.address
@@ -154,7 +154,7 @@ def test_a_full_spool_refuses_the_new_ones(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["the disk is full", "the disk fails"])
-def test_a_disk_that_takes_nothing_for_a_while(tmp_path, monkeypatch, text):
+def test_spool_survives_a_disk_that_is_full_for_a_while(tmp_path, monkeypatch, text):
     given = entries(9)
     append, note_gap = Journal.append, Journal.note_gap
 
@@ -179,7 +179,7 @@ def test_a_disk_that_takes_nothing_for_a_while(tmp_path, monkeypatch, text):
     assert not journals(tmp_path)
 
 
-def test_what_is_damaged_in_the_spool_is_a_gap(tmp_path):
+def test_damaged_measurements_of_the_spool_become_gaps(tmp_path):
     given = entries(20, first=0)
     kept(tmp_path, given)
     (path,) = journals(tmp_path)
@@ -195,7 +195,7 @@ def test_what_is_damaged_in_the_spool_is_a_gap(tmp_path):
     assert (counts.accepted, counts.stored, counts.damaged, counts.unacked) == (20, 18, 2, 0)
 
 
-def test_journals_that_cannot_be_sent_stay(tmp_path):
+def test_unsendable_journals_stay_in_the_spool(tmp_path):
     """One that another process has, one that is cut short, one with numbers that cannot be sent, one twice.
 
     And an empty one, which goes.
@@ -224,7 +224,7 @@ def test_journals_that_cannot_be_sent_stay(tmp_path):
     assert "has sessions that another journal has, too; move it elsewhere" in notes[2]
 
 
-def test_a_journal_of_a_capture_is_sent_too(tmp_path):
+def test_journal_of_a_capture_in_the_spool_is_sent(tmp_path):
     given = entries(4)
     create(tmp_path, given).close()
     with StandIn() as central, Node(central.address, (), spool=tmp_path) as node:
@@ -232,7 +232,7 @@ def test_a_journal_of_a_capture_is_sent_too(tmp_path):
     assert has_all(central, given)
 
 
-def test_no_folder(tmp_path):
+def test_missing_spool_folder_is_refused(tmp_path):
     (tmp_path / "file").touch()
     with (
         pytest.raises(NetworkError, match=r"give a writable spool folder \(--spool\)"),
@@ -258,7 +258,7 @@ with SensorNode(address, spool=folder) as node:
 
 
 @IMPATIENT
-def test_killed_nodes_and_a_central_node_that_dies_lose_nothing(tmp_path):
+def test_killed_sensor_and_central_nodes_lose_nothing(tmp_path):
     """Everything that a node said it had kept arrives once."""
     accepted = {}
     with StandIn() as central:
@@ -285,7 +285,7 @@ def test_killed_nodes_and_a_central_node_that_dies_lose_nothing(tmp_path):
     assert not journals(tmp_path)
 
 
-def test_a_gap_that_only_memory_knew_is_one_all_the_same(tmp_path):
+def test_gap_kept_only_in_memory_is_reported_after_a_restart(tmp_path):
     """The node was killed before its journal was told why."""
     kept(tmp_path, [*entries(2, first=0), *entries(2, first=5)])
     with StandIn() as central, Node(central.address, (), spool=tmp_path) as node:
@@ -293,7 +293,7 @@ def test_a_gap_that_only_memory_knew_is_one_all_the_same(tmp_path):
     assert central.gaps[KEY] == [(2, 4, runs.NEVER_GIVEN)]
 
 
-def test_an_old_measurement_is_sent_as_it_was(tmp_path):
+def test_old_measurement_is_sent_unchanged(tmp_path):
     (given,) = entries(1)
     stamp = replace(given.measurement.stamp, timestamp_ns=-5, timestamp_uncertainty_ns=2**32 - 1, sync_count=-(2**63))
     given = JournalEntry(replace(given.measurement, stamp=stamp), monotonic_ns=-1)

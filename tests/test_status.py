@@ -109,7 +109,7 @@ def keys(tmp_path):
     return ServerKeys(CENTRAL, tmp_path / "allow.toml")
 
 
-def test_a_central_node_says_how_it_is_again_and_again():
+def test_status_client_receives_repeated_statuses():
     with central_node() as address, Asking(address) as node:
         first, second = node.ask(PATIENCE_S), node.ask(PATIENCE_S)
     assert first.address == second.address == address
@@ -117,7 +117,7 @@ def test_a_central_node_says_how_it_is_again_and_again():
     assert second.uptime_s >= first.uptime_s > 0
 
 
-def test_an_application_may_ask_and_a_sensor_may_not(keys):
+def test_application_may_request_the_status_and_sensor_node_may_not(keys):
     with central_node(keys) as address:
         with Asking(address, keys=ClientKeys(VIEWER, CENTRAL.public)) as node:
             status = node.ask(PATIENCE_S)
@@ -130,7 +130,7 @@ def test_an_application_may_ask_and_a_sensor_may_not(keys):
     assert not any(status.refused.values())
 
 
-def test_who_is_not_let_in_is_told_why_at_once(keys):
+def test_refused_status_client_gets_the_reason_at_once(keys):
     with central_node(keys) as address:
         with (
             Asking(address, keys=ClientKeys(KeyPair.new("x"), CENTRAL.public)) as node,
@@ -146,19 +146,19 @@ def test_who_is_not_let_in_is_told_why_at_once(keys):
             node.ask(PATIENCE_S)
 
 
-def test_where_nobody_answers_the_remedy_is_told():
+def test_missing_central_node_is_reported_with_the_remedy():
     with Asking("tcp://127.0.0.1:1") as node, pytest.raises(NetworkError, match=r"within 0\.1 s; start"):
         node.ask(0.1)
     with pytest.raises(NetworkError, match="use it in a with statement"):
         node.ask(0.1)
 
 
-def test_another_machine_is_not_asked_without_keys():
+def test_status_of_another_machine_needs_keys():
     with pytest.raises(ArgumentError, match="there are no keys"):
         Asking("tcp://192.0.2.1:5601")
 
 
-def test_the_command_prints_a_table_once_where_nobody_watches():
+def test_command_prints_one_table_without_a_terminal():
     with central_node() as address:
         result = CliRunner().invoke(cli, ["status", address], catch_exceptions=False)
     assert result.exit_code == 0
@@ -166,7 +166,7 @@ def test_the_command_prints_a_table_once_where_nobody_watches():
     assert "storage" in result.stdout
 
 
-def test_the_command_prints_one_json_object(keys, tmp_path):
+def test_command_prints_one_json_object(keys, tmp_path):
     secret, _ = VIEWER.save(tmp_path / "keys")
     with central_node(keys) as address:
         result = CliRunner().invoke(
@@ -181,7 +181,7 @@ def test_the_command_prints_one_json_object(keys, tmp_path):
     assert (reported.address, reported.state, reported.keys) == (address, "storage", True)
 
 
-def test_a_command_that_gets_no_answer_fails_in_a_line():
+def test_command_without_an_answer_fails_with_one_line():
     result = CliRunner().invoke(cli, ["status", "tcp://127.0.0.1:1", "--patience", "0.1"])
     assert result.exit_code == 1
     assert len(result.stderr.splitlines()) == 1
@@ -213,7 +213,7 @@ class _Asked:
 
 
 @pytest.mark.parametrize("as_json", [False, True])
-def test_a_central_node_that_goes_away_is_waited_for(monkeypatch, as_json):
+def test_command_waits_for_a_central_node_that_disappears(monkeypatch, as_json):
     monkeypatch.setattr("ertis_numba.network.status_client.Asking", lambda *_, **__: _Asked())
     monkeypatch.setattr("ertis_cli.status._REFRESH_S", 0.0)
     result = CliRunner().invoke(cli, ["status", BUSY.address, "--watch", *(["--json"] if as_json else [])])
@@ -234,7 +234,7 @@ def _printed(status):
     return stream.getvalue()
 
 
-def test_a_table_says_all_that_somebody_should_look_at():
+def test_table_shows_everything_that_needs_attention():
     text = _printed(BUSY)
     for part in (
         "up 1:02:03",
@@ -265,7 +265,7 @@ def test_a_table_says_all_that_somebody_should_look_at():
         ("a.h5", "", "a.h5 is being written, 0 MB in its journal"),
     ],
 )
-def test_what_is_written_is_told_as_it_is(recording, fault, reported):
+def test_archive_state_is_reported(recording, fault, reported):
     archive = msgspec.structs.replace(BUSY.archive, recording=recording)
     text = _printed(msgspec.structs.replace(BUSY, archive=archive, fault=fault))
     assert f"archive /data: {reported}, 0 sealed, 0 to seal" in text

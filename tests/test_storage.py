@@ -32,7 +32,7 @@ from tests.files import SMALL, image, line, noise
     [SMALL, line(1, 8), line(8, 8), line(16, 16), line(64, 64), line(33, 32), line(70, 16)],
     ids=["32", "1 of 8", "8", "16", "64", "33 in 2 words", "70 in 5 words"],
 )
-def test_recording_comes_back(tmp_path, settings):
+def test_recording_is_read_back_unchanged(tmp_path, settings):
     given = noise(settings)
     path = write_recording(tmp_path / "rec.h5", given, source="noise")
     with open_recording(path) as recording:
@@ -61,7 +61,7 @@ def test_readers_are_sequences(tmp_path):
         assert [np.array_equal(each.amplitude, image().amplitude) for each in images[1:]] == [True, True]
 
 
-def test_recording_depends_on_no_other_file(tmp_path):
+def test_recording_needs_no_other_file(tmp_path):
     layout = tmp_path / "mine.csv"
     layout.write_text("0, 0\n4, 0\n8, 1\n")
     settings = SMALL.replace(array=Array(layout=str(layout)))
@@ -77,7 +77,7 @@ def test_recording_depends_on_no_other_file(tmp_path):
     assert again.name == "again.h5"
 
 
-def test_gaps_epochs_and_air(tmp_path):
+def test_gaps_sessions_and_air_are_kept(tmp_path):
     warm = SMALL.replace(air=Air(temperature_c=31.25, humidity_percent=80.0))
     words = noise(count=1)[0].data
     runs = [(3, 7), (4, 7), (9, 7), (1, 2**40), (3, 2**40), (4, 0)]
@@ -96,7 +96,7 @@ def test_gaps_epochs_and_air(tmp_path):
         assert file["sensors/sensor/gap_session_id"][:].tolist() == [7, 2**40]
 
 
-def test_columns_pass_the_end_of_a_chunk(tmp_path):
+def test_columns_continue_beyond_a_chunk(tmp_path):
     short = line(8, 8).replace(recording=Recording(n_samples=16))
     words = np.zeros(16, np.uint8)
     write_recording(tmp_path / "rec.h5", (Measurement(words, short, Stamp(sequence=i)) for i in range(1100)))
@@ -133,13 +133,13 @@ def test_xarray_shows_named_axes(tmp_path):
         assert set(data.variables) == {variable.name for variable in ENERGYSCAPE}
 
 
-def test_several_words_have_an_axis_of_their_own(tmp_path):
+def test_words_of_wide_arrays_have_their_own_axis(tmp_path):
     write_recording(tmp_path / "rec.h5", noise(line(33, 32)))
     with xarray.open_dataset(tmp_path / "rec.h5", group="/sensors/eRTIS-7", engine="netcdf4") as data:
         assert data["pdm"].dims == ("time", "sample", "word")
 
 
-def test_energyscapes_come_back(tmp_path):
+def test_energyscapes_are_read_back_unchanged(tmp_path):
     given = image()
     write_energyscapes(tmp_path / "img.h5", [given, given.replace(amplitude=given.amplitude * 2)])
     with open_energyscapes(tmp_path / "img.h5") as images:
@@ -159,7 +159,7 @@ def test_half_precision_keeps_three_digits(tmp_path):
         np.testing.assert_allclose(images[0].amplitude, given.amplitude, rtol=2**-11, atol=2**-25)
 
 
-def test_result_names_its_recording(tmp_path):
+def test_energyscape_file_names_its_recording(tmp_path):
     write_recording(tmp_path / "rec.h5", noise())
     with open_recording(tmp_path / "rec.h5") as recording:
         write_energyscapes(tmp_path / "img.h5", [image()], recording=recording)
@@ -225,13 +225,13 @@ def write_and_fail(path, error, *, before=None):
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, ZeroDivisionError, GeneratorExit])
-def test_an_exception_leaves_nothing(tmp_path, error):
+def test_exception_while_writing_leaves_no_file(tmp_path, error):
     with pytest.raises(error):
         write_and_fail(tmp_path / "rec.h5", error)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_failure_leaves_the_older_file(tmp_path):
+def test_failed_replacement_keeps_the_older_file(tmp_path):
     path = write_recording(tmp_path / "rec.h5", noise())
     before = path.read_bytes()
     with pytest.raises(KeyboardInterrupt):
@@ -240,7 +240,7 @@ def test_a_failure_leaves_the_older_file(tmp_path):
     assert [item.name for item in tmp_path.iterdir()] == ["rec.h5"]
 
 
-def test_what_reads_back_differently_is_refused(tmp_path):
+def test_file_that_reads_back_differently_is_refused(tmp_path):
     def flip_on_disk(writer):
         writer._file["sensors/eRTIS-7/pdm"][0, 5] ^= 1  # noqa: SLF001  a fault between memory and disk
 
@@ -254,7 +254,7 @@ def test_what_reads_back_differently_is_refused(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_file_that_appears_meanwhile_is_not_replaced(tmp_path):
+def test_file_created_meanwhile_is_not_replaced(tmp_path):
     with pytest.raises(ArgumentError, match="exists"):
         write_and_fail(tmp_path / "rec.h5", None, before=lambda writer: writer.path.write_text("mine"))
     assert [(item.name, item.read_text()) for item in tmp_path.iterdir()] == [("rec.h5", "mine")]
@@ -283,7 +283,7 @@ def spoilt(**settings):
         (noise(SMALL.replace(processing=Processing(directions="grid.csv"))), "is the file grid.csv"),
     ],
 )
-def test_measurements_that_cannot_be_written(tmp_path, measurements, message):
+def test_unstorable_measurements_are_refused(tmp_path, measurements, message):
     with pytest.raises(ArgumentError, match=message):
         write_recording(tmp_path / "rec.h5", measurements)
     assert not list(tmp_path.iterdir())
@@ -304,7 +304,7 @@ def test_measurements_that_cannot_be_written(tmp_path, measurements, message):
     ],
     ids=["sequence", "negative sequence", "half a sequence", "time", "pulse", "session_id"],
 )
-def test_stamps_that_no_file_can_hold(tmp_path, stamp, message):
+def test_stamps_beyond_the_file_format_are_refused(tmp_path, stamp, message):
     with pytest.raises(ArgumentError, match=message):
         write_recording(tmp_path / "rec.h5", [Measurement(noise()[0].data, SMALL, stamp)])
     with pytest.raises(ArgumentError, match=message):
@@ -322,7 +322,7 @@ def numbered(*numbers, session_id=0):
     [((0, 0), 1), ((3, 4, 3), 2), ((7, 2, 5, 2), 3), ((7, 2, 5, 7), 3), ((9, 4, 4), 2)],
     ids=["at once", "rising", "falling", "highest", "late"],
 )
-def test_a_number_comes_once_in_a_run(tmp_path, numbers, place):
+def test_sequence_numbers_are_unique_within_a_session(tmp_path, numbers, place):
     message = rf"measurement {place} has sequence {numbers[place]} of session 0, like an earlier one; give each"
     with pytest.raises(ArgumentError, match=message):
         write_recording(tmp_path / "rec.h5", numbered(*numbers))
@@ -331,7 +331,7 @@ def test_a_number_comes_once_in_a_run(tmp_path, numbers, place):
     write_recording(tmp_path / "rec.h5", given)
 
 
-def test_numbers_that_have_not_come_may_come_late(tmp_path):
+def test_missing_sequence_numbers_may_arrive_late(tmp_path):
     order = np.random.default_rng(1).permutation(50).tolist()
     path = write_recording(tmp_path / "rec.h5", numbered(*order))
     with open_recording(path) as recording:
@@ -358,7 +358,7 @@ PCM_OF = {
     ],
     ids=lambda given: given if isinstance(given, str) else given.recording.encoding,
 )
-def test_words_of_another_type_are_not_converted_in_silence(tmp_path, settings, dtype):
+def test_samples_of_another_type_are_refused(tmp_path, settings, dtype):
     words = sample_format(settings)
     message = (
         rf"measurement 0 contains {dtype} samples, but its settings give {words.dtype.name}; convert them, or give"
@@ -368,7 +368,7 @@ def test_words_of_another_type_are_not_converted_in_silence(tmp_path, settings, 
 
 
 @pytest.mark.parametrize("settings", [SMALL, *PCM_OF.values()], ids=["pdm", *PCM_OF])
-def test_words_of_another_byte_order_are_the_same_words(tmp_path, settings):
+def test_samples_of_another_byte_order_are_stored_equal(tmp_path, settings):
     given = np.ones(sample_format(settings).shape, sample_format(settings).dtype.newbyteorder(">"))
     write_recording(tmp_path / "rec.h5", [Measurement(given, settings)])
     with open_recording(tmp_path / "rec.h5") as recording:
@@ -376,7 +376,7 @@ def test_words_of_another_byte_order_are_the_same_words(tmp_path, settings):
 
 
 @pytest.mark.parametrize("number", [np.nan, -np.inf], ids=str)
-def test_what_is_no_number_is_not_recorded(tmp_path, number):
+def test_nan_and_infinity_are_not_recorded(tmp_path, number):
     settings = PCM_OF["float32"]
     words = np.zeros(sample_format(settings).shape, np.float32)
     words[7, 2] = number
@@ -392,7 +392,7 @@ def test_what_is_no_number_is_not_recorded(tmp_path, number):
         (image(settings=Settings()), "settings of an energyscape differ from those of the first"),
     ],
 )
-def test_energyscapes_that_cannot_be_written(tmp_path, other, message):
+def test_unstorable_energyscapes_are_refused(tmp_path, other, message):
     with pytest.raises(ArgumentError, match=message):
         write_energyscapes(tmp_path / "img.h5", [image(), other])
     assert not list(tmp_path.iterdir())
@@ -406,7 +406,7 @@ def test_energyscapes_that_cannot_be_written(tmp_path, other, message):
         ("folder", "folder is a folder; give the name of a file"),
     ],
 )
-def test_places_that_cannot_be_written(tmp_path, name, message):
+def test_unwritable_paths_are_refused(tmp_path, name, message):
     (tmp_path / "folder").mkdir()
     (tmp_path / "there.h5").write_text("mine")
     with pytest.raises(ArgumentError, match=message):
@@ -414,23 +414,23 @@ def test_places_that_cannot_be_written(tmp_path, name, message):
     assert (tmp_path / "there.h5").read_text() == "mine"
 
 
-def test_writer_is_used_in_a_with_statement(tmp_path):
+def test_writer_needs_a_with_statement(tmp_path):
     with pytest.raises(ArgumentError, match="is not open for writing; use the writer in a with statement"):
         RecordingWriter(tmp_path / "rec.h5").write(noise()[0])
 
 
-def test_result_does_not_replace_its_recording(tmp_path):
+def test_energyscape_file_does_not_replace_its_recording(tmp_path):
     path = write_recording(tmp_path / "rec.h5", noise())
     with open_recording(path) as recording, pytest.raises(ArgumentError, match="is the input itself"):
         EnergyscapeWriter(path, recording=recording, overwrite=True)
 
 
-def test_unknown_dtype(tmp_path):
+def test_unknown_dtype_is_refused(tmp_path):
     with pytest.raises(ArgumentError, match="dtype 'float64' is unknown"):
         EnergyscapeWriter(tmp_path / "img.h5", dtype="float64")
 
 
-def test_image_too_large_for_one_piece_is_refused(tmp_path):
+def test_image_above_the_chunk_limit_is_refused(tmp_path):
     with h5py.File(tmp_path / "large.h5", "w") as file:
         sizes = {"direction": 1_000_000, "range": 1_178}
         with pytest.raises(ArgumentError, match="amplitude of 1000000 directions × 1178 ranges exceeds the 4 GiB"):

@@ -40,7 +40,7 @@ def path(tmp_path):
         (b"abc" * 1000, "is not an HDF5 file; give a recording"),
     ],
 )
-def test_not_a_recording(tmp_path, content, message):
+def test_text_file_is_not_a_recording(tmp_path, content, message):
     path = tmp_path / "file.h5"
     if content is not None:
         path.write_bytes(content)
@@ -48,12 +48,12 @@ def test_not_a_recording(tmp_path, content, message):
         open_recording(path)
 
 
-def test_a_folder(tmp_path):
+def test_folder_is_not_a_recording(tmp_path):
     with pytest.raises(DataError, match="is a folder; give"):
         open_recording(tmp_path)
 
 
-def test_hdf5_of_somebody_else(tmp_path):
+def test_foreign_hdf5_file_is_refused(tmp_path):
     with h5py.File(tmp_path / "other.h5", "w") as file:
         file["x"] = 1
     for read in (open_recording, open_energyscapes, file_kind):
@@ -61,7 +61,7 @@ def test_hdf5_of_somebody_else(tmp_path):
             read(tmp_path / "other.h5")
 
 
-def test_the_other_kind(path, tmp_path):
+def test_energyscape_file_is_not_a_recording(path, tmp_path):
     write_energyscapes(tmp_path / "img.h5", [image()])
     with pytest.raises(DataError, match=r"rec.h5 is a recording, wanted an energyscape file; process it first"):
         open_energyscapes(path)
@@ -70,7 +70,7 @@ def test_the_other_kind(path, tmp_path):
 
 
 @pytest.mark.parametrize("kept", [0.0001, 0.01, 0.3, 0.9, 0.9999])
-def test_cut_short(path, kept):
+def test_truncated_file_is_reported(path, kept):
     os.truncate(path, int(kept * path.stat().st_size))
     with pytest.raises(DataError, match=r"is cut short or damaged: it has \d+ of \d+ bytes|is not an HDF5 file"):
         open_recording(path)
@@ -97,7 +97,7 @@ def held_open(path, **more):
     return holder
 
 
-def test_a_file_that_another_program_writes_is_not_called_damaged(path):
+def test_file_open_for_writing_is_not_reported_as_damaged(path):
     with held_open(path) as holder:
         for read in (open_recording, file_kind):
             with pytest.raises(DataError, match=r"rec.h5 is open for writing in another program; close it there"):
@@ -107,7 +107,7 @@ def test_a_file_that_another_program_writes_is_not_called_damaged(path):
         assert len(recording) == 3
 
 
-def test_a_file_that_a_killed_program_wrote_is_not_called_damaged(path):
+def test_file_of_a_killed_writer_is_not_reported_as_damaged(path):
     with held_open(path) as holder:
         holder.kill()
     with pytest.raises(
@@ -117,14 +117,14 @@ def test_a_file_that_a_killed_program_wrote_is_not_called_damaged(path):
         open_recording(path)
 
 
-def test_newer_version(path):
+def test_newer_format_version_is_refused(path):
     with h5py.File(path, "r+") as file:
         file.attrs["ertis_format_version"] = 3
     with pytest.raises(FormatVersionError, match="has format version 3, but this package reads up to 2; update"):
         open_recording(path)
 
 
-def test_one_flipped_bit_in_the_words(path):
+def test_flipped_bit_in_the_samples_is_found(path):
     with h5py.File(path, "r+") as file:
         file[f"{GROUP}/pdm"][1, 777] ^= 1 << 9
     with open_recording(path) as recording:
@@ -133,7 +133,7 @@ def test_one_flipped_bit_in_the_words(path):
             recording[1]
 
 
-def test_arrays_that_contradict_the_settings(path):
+def test_array_variables_that_contradict_the_settings_are_damage(path):
     for name, place, message in [
         ("calibration_gain", (3,), "calibration_gain of channel 3 is nan, but the settings in the file give 1"),
         ("calibration_delay", (0,), "calibration_delay of channel 0 is nan"),
@@ -149,7 +149,7 @@ def test_arrays_that_contradict_the_settings(path):
     open_recording(path).close()
 
 
-def test_settings_that_cannot_be_used(path):
+def test_unusable_settings_are_damage(path):
     with h5py.File(path, "r+") as file:
         text = file[f"{GROUP}/settings"]
         text[()] = text[()].replace(b"duration_s = 0.0025", b"duration_s = nan")
@@ -157,21 +157,21 @@ def test_settings_that_cannot_be_used(path):
         open_recording(path)
 
 
-def test_missing_variable(path):
+def test_missing_variable_is_damage(path):
     with h5py.File(path, "r+") as file:
         del file[f"{GROUP}/crc32"]
     with pytest.raises(DataError, match="has no 'crc32' for sensor eRTIS-7; copy it again"):
         open_recording(path)
 
 
-def test_variables_of_other_lengths(path):
+def test_variables_of_unequal_lengths_are_damage(path):
     with h5py.File(path, "r+") as file:
         file[f"{GROUP}/sequence"].resize((2,))
     with pytest.raises(DataError, match=r"sequence has shape \(2,\), wanted \(3,\); copy it again"):
         open_recording(path)
 
 
-def test_no_such_measurement(path):
+def test_unknown_measurement_is_refused(path):
     with open_recording(path) as recording:
         with pytest.raises(IndexError, match="has no measurement 3; it has 3, counted from 0"):
             recording[3]
@@ -179,7 +179,7 @@ def test_no_such_measurement(path):
             recording[-4]
 
 
-def test_closed(path):
+def test_closed_file_is_refused(path):
     recording = open_recording(path)
     recording.close()
     recording.close()
@@ -213,7 +213,7 @@ def test_scalar_words_are_refused(tmp_path):
         open_recording(path)
 
 
-def test_several_sensors(path):
+def test_sensor_of_several_must_be_chosen(path):
     with h5py.File(path, "r+") as file:
         file.copy(GROUP, file["sensors"], name="other")
     with pytest.raises(ArgumentError, match=r"choose one of eRTIS-7, other \(--sensor\)"):
@@ -224,7 +224,7 @@ def test_several_sensors(path):
         assert recording[0].stamp.sensor == "other"
 
 
-def test_one_damaged_bit_never_passes(tmp_path):
+def test_any_damaged_bit_is_found(tmp_path):
     """Wherever it is, reading gives what was written or a `DataError` of one line."""
     given = noise(line(8, 8).replace(recording=Recording(n_samples=512)), 2)
     wall = Reflector(name="wall", azimuth_deg=10.0, elevation_deg=20.0, range_m=1.5, level_db=0.0)
@@ -251,7 +251,7 @@ def test_one_damaged_bit_never_passes(tmp_path):
     assert not any("\n" in refusal for refusal in refusals)
 
 
-def test_settings_that_were_changed(path):
+def test_changed_settings_are_found(path):
     with h5py.File(path, "r+") as file:
         text = file[f"{GROUP}/settings"]
         text[()] = text[()].replace(b"temperature_c = 20.0", b"temperature_c = 25.0")
@@ -259,7 +259,7 @@ def test_settings_that_were_changed(path):
         open_recording(path)
 
 
-def test_no_room(tmp_path, monkeypatch):
+def test_full_disk_leaves_no_file(tmp_path, monkeypatch):
     free = shutil.disk_usage(tmp_path).free
     monkeypatch.setattr(atomic_files, "RESERVED_BYTES", 2 * free)
     with pytest.raises(
@@ -284,7 +284,7 @@ except DataError as error:
 """
 
 
-def test_disk_fails_in_the_middle(tmp_path):
+def test_disk_error_while_writing_leaves_no_file(tmp_path):
     """The limit on the size of a file stands for a full disk: writing fails in the same way."""
     done = subprocess.run(
         [sys.executable, "-c", WRITE_UNDER_A_LIMIT, tmp_path / "rec.h5"],

@@ -41,7 +41,7 @@ def spoiled():
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_a_recording_is_refused(tmp_path, spoiled, name):
+def test_hostile_recording_is_refused(tmp_path, spoiled, name):
     path = tmp_path / "bad.h5"
     spoiled[name].make(write_good(tmp_path / "good.h5"), path)
     with pytest.raises(DataError, match=rf"{re.escape(str(path))}.*{REFUSED[name]}"):
@@ -52,7 +52,7 @@ def test_template_of_hostile_files_is_sound(tmp_path):
     assert [report.is_intact for report in verify(write_good(tmp_path / "good.h5"))] == [True]
 
 
-def test_a_recording_whose_variables_share_their_room_is_refused(tmp_path, monkeypatch):
+def test_recording_with_overlapping_variables_is_refused(tmp_path, monkeypatch):
     """As chunks may that all lie at one place, of which a small file can name millions."""
     path = write_good(tmp_path / "good.h5")
     monkeypatch.setattr(structure, "stored_bytes", lambda _: 1_000_000)
@@ -68,7 +68,7 @@ def test_a_recording_whose_variables_share_their_room_is_refused(tmp_path, monke
     ],
     ids=["unallocated", "attributes"],
 )
-def test_verify_does_not_read_what_other_objects_claim(tmp_path, spoil, reported):
+def test_verify_ignores_other_objects(tmp_path, spoil, reported):
     path = write_good(tmp_path / "good.h5")
     with h5py.File(path, "r+", libver=("v110", "v110")) as file:
         spoil(file.create_group("extra"))
@@ -77,7 +77,7 @@ def test_verify_does_not_read_what_other_objects_claim(tmp_path, spoil, reported
     assert reported in report.remark
 
 
-def test_verify_refuses_other_objects_in_other_files(tmp_path):
+def test_verify_refuses_objects_in_other_files(tmp_path):
     (tmp_path / "other.raw").write_bytes(bytes(8))
     path = write_good(tmp_path / "good.h5")
     with h5py.File(path, "r+", libver=("v110", "v110")) as file:

@@ -44,7 +44,7 @@ def recorded(tmp_path):
 
 
 @pytest.mark.parametrize("many", [False, True])
-def test_processing_keeps_where_sensors_are(recorded, tmp_path, many):
+def test_processing_keeps_mountings(recorded, tmp_path, many):
     made = tmp_path / "img.h5"
     if many:  # a folder is worked on by other code
         run("process", recorded.parent, "-o", tmp_path / "out", "--quiet", "--device", "cpu")
@@ -57,7 +57,7 @@ def test_processing_keeps_where_sensors_are(recorded, tmp_path, many):
         np.testing.assert_array_equal(kept[1], rotation_xyzw)
 
 
-def test_an_export_of_images_is_that_of_their_recording(recorded, tmp_path):
+def test_export_of_images_equals_export_of_their_recording(recorded, tmp_path):
     run("process", recorded, "-o", tmp_path / "img.h5", "--quiet")
     for name, source in (("a", recorded), ("b", tmp_path / "img.h5")):
         run("export", source, "-o", tmp_path / f"{name}.csv", "--top", 5)
@@ -69,7 +69,7 @@ def test_an_export_of_images_is_that_of_their_recording(recorded, tmp_path):
     assert "frame base_link" in plyfile.PlyData.read(tmp_path / "c.ply").comments
 
 
-def test_what_nobody_said_is_not_in_the_file(tmp_path):
+def test_unknown_mounting_is_not_stored(tmp_path):
     path = write_energyscapes(tmp_path / "img.h5", images("left"))
     assert place_of(path, "left") == (None, None)
     with h5py.File(path) as file:
@@ -79,7 +79,7 @@ def test_what_nobody_said_is_not_in_the_file(tmp_path):
     assert "frame left" in plyfile.PlyData.read(tmp_path / "a.ply").comments
 
 
-def test_what_is_given_counts_more_than_the_recording(recorded, tmp_path):
+def test_given_mounting_overrides_the_recording(recorded, tmp_path):
     given = {"left": ((5.0, 6.0, 7.0), (0.0, 0.0, 1.0, 0.0))}
     with open_recording(recorded, sensor="left") as left, open_recording(recorded, sensor="right") as right:
         path = write_energyscapes(
@@ -98,7 +98,7 @@ def test_what_is_given_counts_more_than_the_recording(recorded, tmp_path):
         ({"back": PLACES["left"]}, "mounting is given for sensor 'back', which has no measurement"),
     ],
 )
-def test_mountings_that_cannot_be(tmp_path, given, reported):
+def test_impossible_mountings_are_refused(tmp_path, given, reported):
     with pytest.raises(ArgumentError, match=reported):
         write_energyscapes(tmp_path / "img.h5", images("left"), mounting=given)
     assert not [*tmp_path.iterdir()]
@@ -144,7 +144,7 @@ def test_recordings_without_a_mounting_are_exported_in_the_sensors_own_frame(tmp
     assert '"mounting": "unknown"' in info.stdout
 
 
-def test_several_sensors_without_a_mounting_are_not_laid_over_one_another(tmp_path):
+def test_sensors_without_mounting_are_not_combined(tmp_path):
     both = [*of("left", noise(SMALL, 1)), *of("right", noise(SMALL, 1, seed=2))]
     path = write_recording(tmp_path / "rec.h5", both)
     command = ["export", str(path), "-o", str(tmp_path / "a.ply"), "--top", "3"]
@@ -218,7 +218,7 @@ def test_point_clouds_of_an_unknown_mounting_have_no_place_on_a_platform():
 
 
 @pytest.mark.parametrize("place", [None, (1.0, 2.0, 3.0)])
-def test_mountings_travel_over_the_wire(place):
+def test_mountings_are_sent_over_the_network(place):
     rotation = None if place is None else (0.0, 0.0, 0.0, 1.0)
     hello = Hello(
         sensor="a", session_id=1, next_sequence=0, settings_crc32=0, translation_m=place, rotation_xyzw=rotation
@@ -227,7 +227,7 @@ def test_mountings_travel_over_the_wire(place):
     assert Hello(sensor="a", session_id=1, next_sequence=0, settings_crc32=0).translation_m is None
 
 
-def test_processing_refuses_to_write_a_picture(tmp_path):
+def test_processing_refuses_a_picture_as_output(tmp_path):
     path = write_recording(tmp_path / "rec.h5", of("left", noise(SMALL, 1)))
     done = CliRunner().invoke(cli, ["process", str(path), "-o", str(tmp_path / "x.png")])
     assert done.exit_code == 2
@@ -236,7 +236,7 @@ def test_processing_refuses_to_write_a_picture(tmp_path):
     assert not (tmp_path / "x.png").exists()
 
 
-def test_process_takes_mountings_that_the_recording_lacks(tmp_path):
+def test_process_accepts_missing_mountings(tmp_path):
     both = [*of("left", noise(SMALL, 1)), *of("right", noise(SMALL, 1, seed=2))]
     given = write_recording(tmp_path / "given.h5", both, mounting=PLACES)
     unknown = write_recording(tmp_path / "rec.h5", both)
@@ -251,7 +251,7 @@ def test_process_takes_mountings_that_the_recording_lacks(tmp_path):
     assert "contains no mounting of a sensor" in bare.stderr
 
 
-def test_process_makes_images_anew_for_another_mounting(tmp_path):
+def test_process_repeats_images_for_another_mounting(tmp_path):
     moved = {"left": ((0.2, 0.3, -0.2), TURNED), "right": PLACES["right"]}
     both = [*of("left", noise(SMALL, 1)), *of("right", noise(SMALL, 1, seed=2))]
     unknown = write_recording(tmp_path / "rec.h5", both)

@@ -33,7 +33,7 @@ def two(settings=SMALL):
     return [right[0], left[0], left[1], right[1], right[2]]
 
 
-def test_sensors_come_back(tmp_path):
+def test_sensors_are_read_back_unchanged(tmp_path):
     path = write_recording(tmp_path / "rec.h5", two())
     assert sensor_names(path) == ("right", "left")  # as they came
     for name, wanted in (("right", SMALL), ("left", line(8, 8))):
@@ -49,7 +49,7 @@ def test_sensors_come_back(tmp_path):
         assert data["pdm"].shape == (2, 40_960)
 
 
-def test_energyscapes_of_several_sensors_come_back(tmp_path):
+def test_energyscapes_of_several_sensors_are_read_back(tmp_path):
     path = write_recording(tmp_path / "rec.h5", two())
     with open_recording(path, sensor="right") as right, open_recording(path, sensor="left") as left:
         pipelines = {"right": Pipeline(right.settings), "left": Pipeline(left.settings)}
@@ -66,7 +66,7 @@ def test_energyscapes_of_several_sensors_come_back(tmp_path):
             ] * len(given)
 
 
-def test_each_sensor_has_gaps_and_epochs_of_its_own(tmp_path):
+def test_each_sensor_has_its_own_gaps_and_sessions(tmp_path):
     given = two()
     given[2] = replace(given[2], stamp=replace(given[2].stamp, sequence=20, session_id=3))
     given.append(replace(given[2], stamp=replace(given[2].stamp, sequence=22)))
@@ -85,7 +85,7 @@ def uuid_of(path, sensor):
         return recording.uuid
 
 
-def test_identity_is_that_of_all_content(tmp_path):
+def test_identity_covers_all_sensors(tmp_path):
     given = two()
     first = write_recording(tmp_path / "a.h5", given)
     sorted_by_name = write_recording(tmp_path / "b.h5", sorted(given, key=lambda m: m.stamp.sensor))
@@ -102,7 +102,7 @@ def write_and_spoil(path):
         writer._file["sensors/right/pdm"][0, 5] ^= 1  # noqa: SLF001  a fault between memory and disk
 
 
-def test_every_sensor_is_read_back(tmp_path):
+def test_written_sensors_are_all_verified(tmp_path):
     with pytest.raises(DataError, match="measurement 0 has CRC-32"):
         write_and_spoil(tmp_path / "rec.h5")
     assert not list(tmp_path.iterdir())
@@ -144,20 +144,20 @@ def test_mounting_is_kept(tmp_path):
         ({"mounting": {"left": ((0, 0, 0), (0, 0, 1, 1))}}, "rotation_xyzw of sensor left has length 1.41421; give a"),
     ],
 )
-def test_options_that_do_not_fit(tmp_path, options, message):
+def test_options_for_other_sensors_are_refused(tmp_path, options, message):
     with pytest.raises(ArgumentError, match=message):
         write_recording(tmp_path / "rec.h5", two(), **options)
     assert not list(tmp_path.iterdir())
 
 
-def test_settings_of_one_sensor_do_not_count_for_another(tmp_path):
+def test_other_array_settings_within_a_sensor_are_refused(tmp_path):
     given = two()
     given[3] = replace(given[3], settings=SMALL.replace(array=Array(layout="eRTIS_v2")))
     with pytest.raises(ArgumentError, match="other array settings"):
         write_recording(tmp_path / "rec.h5", given)
 
 
-def test_readers_of_different_recordings(tmp_path):
+def test_readers_of_different_recordings_are_not_mixed(tmp_path):
     for seed in (1, 2):
         write_recording(tmp_path / f"{seed}.h5", noise(seed=seed))
     with (
@@ -168,7 +168,7 @@ def test_readers_of_different_recordings(tmp_path):
         write_energyscapes(tmp_path / "img.h5", [image()], recording=[first, second])
 
 
-def test_names_in_a_damaged_file(tmp_path):
+def test_damaged_sensor_names_are_reported(tmp_path):
     path = write_recording(tmp_path / "rec.h5", noise())
     with h5py.File(path, "r+") as file:
         del file["sensors"]

@@ -56,13 +56,13 @@ def test_truth_is_kept(path):
         same(recording.truth.reflectors, ROWS)
 
 
-def test_no_truth(tmp_path):
+def test_recording_without_truth_has_none(tmp_path):
     write_recording(tmp_path / "rec.h5", noise())
     with open_recording(tmp_path / "rec.h5") as recording:
         assert recording.truth is None
 
 
-def test_measurements_without_reflectors(tmp_path):
+def test_measurements_without_reflectors_have_empty_truth(tmp_path):
     write_recording(tmp_path / "rec.h5", noise(), truth={SENSOR: truth(((), (), ()))})
     with open_recording(tmp_path / "rec.h5") as recording:
         assert recording.truth.reflectors == ((), (), ())
@@ -101,7 +101,7 @@ def test_missing_truth_is_refused(path):
         open_recording(path)
 
 
-def test_half_a_truth_is_refused(path):
+def test_partial_truth_is_refused(path):
     with h5py.File(path, "r+") as file:
         del file[f"{GROUP}/level"]
     with pytest.raises(DataError, match=r"rec.h5 is damaged or cut short"):
@@ -124,7 +124,7 @@ def test_each_energyscape_keeps_the_truth_of_its_measurement(path, tmp_path):
         same(images.truth.reflectors, (ROWS[2], ROWS[0]))
 
 
-def test_truth_of_energyscapes_may_be_given(path, tmp_path):
+def test_energyscapes_accept_a_given_truth(path, tmp_path):
     with open_recording(path) as recording:
         made = images_of(recording)
         given = {SENSOR: truth((ROWS[1], ROWS[1], ROWS[2]))}
@@ -133,7 +133,7 @@ def test_truth_of_energyscapes_may_be_given(path, tmp_path):
         same(images.truth.reflectors, (ROWS[1], ROWS[1], ROWS[2]))
 
 
-def test_energyscape_of_another_recording(path, tmp_path):
+def test_truth_of_another_recording_is_refused(path, tmp_path):
     with open_recording(path) as recording:
         made = images_of(recording)
         strange = made[1].replace(stamp=replace(made[1].stamp, sequence=99))
@@ -144,7 +144,7 @@ def test_energyscape_of_another_recording(path, tmp_path):
     assert [item.name for item in tmp_path.iterdir()] == ["rec.h5"]
 
 
-def test_truth_of_another_length(tmp_path):
+def test_truth_of_another_length_is_refused(tmp_path):
     with pytest.raises(
         ArgumentError,
         match="the truth of sensor eRTIS-7 has 2 measurements, but the file has 3; give the reflectors of each",
@@ -153,7 +153,7 @@ def test_truth_of_another_length(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_truth_of_a_sensor_that_is_not_there(tmp_path):
+def test_truth_of_an_absent_sensor_is_refused(tmp_path):
     with pytest.raises(ArgumentError, match=r"truth is given for sensor 'left', which has no measurement; .* eRTIS-7"):
         write_recording(tmp_path / "rec.h5", noise(), truth={"left": truth()})
 
@@ -169,6 +169,6 @@ def test_truth_of_a_sensor_that_is_not_there(tmp_path):
         ),
     ],
 )
-def test_truth_that_cannot_be_used(changes, message):
+def test_invalid_truth_is_refused(changes, message):
     with pytest.raises(ArgumentError, match=message):
         GroundTruth(**{"scene": "", "seed": 1, "reflectors": (), **changes})

@@ -33,7 +33,7 @@ def publisher():
         yield made
 
 
-def test_each_product_comes_as_it_was_sent(publisher):
+def test_each_product_arrives_unchanged(publisher):
     sent = [
         image(3, reflectors=[(10, 1, 0.5)]),
         cloud(4),
@@ -66,7 +66,7 @@ def test_each_product_comes_as_it_was_sent(publisher):
         assert (subscriber.counts.received, subscriber.counts.missed, subscriber.counts.reconnects) == (5, 0, 0)
 
 
-def test_what_came_with_a_product(publisher):
+def test_product_carries_its_metadata(publisher):
     with Subscriber(publisher.address) as subscriber:
         subscribed(publisher)
         assert subscriber.latest is None
@@ -83,7 +83,7 @@ def test_what_came_with_a_product(publisher):
         assert subscriber.latest.age_s is None
 
 
-def test_images_of_half_precision_come_as_float32(publisher):
+def test_half_precision_images_arrive_as_float32(publisher):
     half = image(reflectors=[(0, 1, 1.0)])
     half = half.replace(amplitude=half.amplitude.astype(np.float16))
     with Subscriber(publisher.address) as subscriber:
@@ -94,14 +94,14 @@ def test_images_of_half_precision_come_as_float32(publisher):
     np.testing.assert_array_equal(came.amplitude, half.amplitude.astype(np.float32))
 
 
-def test_the_air_of_a_raw_measurement_is_its_own(publisher):
+def test_raw_measurement_keeps_its_own_air(publisher):
     with Subscriber(publisher.address, products=["raw"]) as subscriber:
         subscribed(publisher)
         publisher.publish(measurement(temperature_c=31.5))
         assert got(publisher, subscriber).settings.air.temperature_c == 31.5
 
 
-def test_asks_for_some_sensors_and_products_only(publisher):
+def test_subscriber_requests_selected_sensors_and_products(publisher):
     with Subscriber(publisher.address, sensors=["left", "left"], products=["points"]) as subscriber:
         subscribed(publisher)
         (peer,) = publisher.peers.values()
@@ -113,7 +113,7 @@ def test_asks_for_some_sensors_and_products_only(publisher):
         assert got(publisher, subscriber).stamp.sequence == 3
 
 
-def test_what_a_slow_application_has_no_credit_for_is_dropped_and_counted(publisher):
+def test_products_beyond_the_credit_are_dropped_and_counted(publisher):
     with Subscriber(publisher.address, credit=2) as subscriber:
         subscribed(publisher)
         for sequence in range(10):
@@ -126,7 +126,7 @@ def test_what_a_slow_application_has_no_credit_for_is_dropped_and_counted(publis
         assert (counts.received, counts.dropped, counts.missed) == (3, 8, 8)
 
 
-def test_what_was_not_taken_is_not_consumed_though_it_has_come(publisher):
+def test_unread_products_are_not_reported_as_consumed(publisher):
     with Subscriber(publisher.address, credit=2) as subscriber:
         subscribed(publisher)
         publisher.publish(image(0))
@@ -137,7 +137,7 @@ def test_what_was_not_taken_is_not_consumed_though_it_has_come(publisher):
         consumed(publisher, 1)
 
 
-def test_a_loop_ends_when_another_thread_closes(publisher):
+def test_loop_ends_when_another_thread_closes_the_subscriber(publisher):
     came = []
     with Subscriber(publisher.address) as subscriber:
         subscribed(publisher)
@@ -156,7 +156,7 @@ def test_a_loop_ends_when_another_thread_closes(publisher):
     assert "ertis-subscriber" not in {thread.name for thread in threading.enumerate()}
 
 
-def test_receive_gives_up_after_its_time(publisher):
+def test_receive_returns_after_its_timeout(publisher):
     with Subscriber(publisher.address) as subscriber:
         assert subscriber.receive(0) is None
         assert subscriber.receive(0.01) is None
@@ -174,6 +174,6 @@ def test_receive_gives_up_after_its_time(publisher):
         ({"credit": 65}, "credit is 65; give a whole number from 1 to 64"),
     ],
 )
-def test_refuses(arguments, match):
+def test_invalid_arguments_are_refused(arguments, match):
     with pytest.raises(ArgumentError, match=match):
         Subscriber(**{"address": "tcp://127.0.0.1:1"} | arguments)

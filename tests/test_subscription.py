@@ -46,7 +46,7 @@ def hasty(monkeypatch):
         monkeypatch.setattr(_subscription, name, time_s)
 
 
-def test_a_publisher_that_comes_back_is_found_and_numbers_begin_anew(publisher):
+def test_restarted_publisher_is_found_and_numbers_restart(publisher):
     notes = []
     with Subscriber(publisher.address, on_note=notes.append) as subscriber:
         subscribed(publisher)
@@ -81,7 +81,7 @@ def test_silence_ends_a_connection():
 
 
 @pytest.mark.usefixtures("hasty")
-def test_no_images_are_no_silence_where_the_publisher_answers(publisher):
+def test_answering_publisher_without_images_is_not_silent(publisher):
     with Subscriber(publisher.address) as subscriber:
         publisher.pump(lambda: sum(isinstance(message, messages.Ping) for message in publisher.heard) == 15)
         assert len(publisher.peers) == 1
@@ -110,7 +110,7 @@ def test_no_images_are_no_silence_where_the_publisher_answers(publisher):
         ),
     ],
 )
-def test_what_is_damaged_ends_the_connection_and_not_the_application(publisher, spoil, match):
+def test_damaged_messages_end_the_connection_only(publisher, spoil, match):
     notes = []
     with Subscriber(publisher.address, products=ALL, on_note=notes.append) as subscriber:
         publisher.pump(lambda: subscriber.connected)
@@ -123,7 +123,7 @@ def test_what_is_damaged_ends_the_connection_and_not_the_application(publisher, 
     assert any(re.search(match, note) for note in notes), notes
 
 
-def test_waits_for_a_publisher_that_is_not_there_yet():
+def test_subscriber_waits_for_a_publisher():
     with Publisher() as gone:
         address = gone.address
     with Subscriber(address) as subscriber:
@@ -135,7 +135,7 @@ def test_waits_for_a_publisher_that_is_not_there_yet():
 
 
 @pytest.mark.usefixtures("hasty")
-def test_refused_from_the_start_raises(publisher):
+def test_first_refusal_raises(publisher):
     def refuse():
         publisher.tell_all(messages.Refused(code="role", reason="key 'x' is of a sensor; give one of an application"))
         publisher.peers.clear()
@@ -173,7 +173,7 @@ def keys(tmp_path_factory):
     }
 
 
-def test_with_keys(keys):
+def test_subscriber_with_keys_receives_products(keys):
     with Publisher(keys=keys["server"]) as publisher, Subscriber(publisher.address, keys=keys["known"]) as subscriber:
         subscribed(publisher)
         publisher.publish(image(2))
@@ -189,7 +189,7 @@ def test_with_keys(keys):
     ],
 )
 @pytest.mark.usefixtures("hasty")
-def test_who_is_not_let_in_is_told_so(keys, who, match):
+def test_refused_subscriber_gets_the_reason(keys, who, match):
     with Publisher(keys=keys["server"]) as publisher, publisher.playing([image()]):
         with Subscriber(publisher.address, keys=keys[who]) as subscriber, pytest.raises(RefusedError, match=match):
             subscriber.receive(WAIT_S)
@@ -229,7 +229,7 @@ def turned(processing, until):
         processing.tick(time.monotonic())
 
 
-def test_images_of_a_real_publisher_which_dies_and_comes_back(keys):
+def test_images_continue_after_a_publisher_restart(keys):
     processing = ImageProcessing(
         ProcessingOptions(publish="tcp://127.0.0.1:0", keys=keys["server"], device="cpu", workers=1)
     )

@@ -66,7 +66,7 @@ def test_serve_restarts_with_both_of_its_addresses():
         assert served.end()["restarts"] == 1
 
 
-def test_the_node_ends_with_its_supervisor(tmp_path):
+def test_node_ends_with_its_supervisor(tmp_path):
     with Recording(tmp_path) as central:
         child = central.started["pid"]
         central.process.kill()
@@ -74,7 +74,7 @@ def test_the_node_ends_with_its_supervisor(tmp_path):
         until(lambda: is_gone(child))
 
 
-def test_a_duration_goes_on_after_a_restart_and_all_lines_are_one_stream(tmp_path):
+def test_duration_and_output_continue_after_a_restart(tmp_path):
     begun_s = time.monotonic()
     with Recording(tmp_path, "--duration", "2") as central:
         os.kill(central.started["pid"], signal.SIGABRT)
@@ -84,7 +84,7 @@ def test_a_duration_goes_on_after_a_restart_and_all_lines_are_one_stream(tmp_pat
     assert time.monotonic() - begun_s >= 2.0
 
 
-def test_a_node_that_is_ended_before_it_listens_is_not_started_again(tmp_path):
+def test_node_ended_before_listening_is_not_restarted(tmp_path):
     environment = environment_with(tmp_path, "os.abort()")
     command = [sys.executable, "-m", "ertis_cli", "record", "--listen", "tcp://127.0.0.1:0", "-o", str(tmp_path / "a")]
     done = subprocess.run([*command, "--json"], capture_output=True, text=True, check=False, env=environment)
@@ -114,7 +114,7 @@ def test_supervisor_fails_after_ten_restarts_in_vain_and_keeps_measurements(end,
     assert stored(tmp_path / "a")[0] == wanted(given)
 
 
-def test_a_node_that_is_killed_while_it_stops_fails(tmp_path):
+def test_node_killed_while_stopping_fails(tmp_path):
     with Recording(tmp_path) as central:
         child = central.started["pid"]
         os.kill(child, signal.SIGSTOP)
@@ -136,7 +136,7 @@ def test_restarted_process_runs_for_the_rest_of_the_duration():
     assert Life(elapsed_s=40.0).remaining_s(10.0) > 0.0
 
 
-def test_nodes_of_a_demo_end_if_it_is_killed(tmp_path):
+def test_nodes_end_with_a_killed_demo(tmp_path):
     program = (
         "import pathlib, sys, time; from ertis_cli.demo import _DemoRun\n"
         f"run = _DemoRun({ENVIRONMENT!r}, quiet=True)\n"

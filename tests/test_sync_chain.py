@@ -37,7 +37,7 @@ def test_pulses_are_steady_and_pass_from_device_to_device():
     assert np.median(periods) == 1
 
 
-def test_pulses_that_are_missed_are_left_out():
+def test_missed_pulses_are_skipped():
     class Slow(Listener):
         """Holds the chain up at its first pulse, for some periods."""
 
@@ -54,7 +54,7 @@ def test_pulses_that_are_missed_are_left_out():
     assert (second_ns - first_ns) % 1e8 == 0
 
 
-def test_pulses_are_numbered_from_the_first_that_counts():
+def test_pulse_numbers_start_at_the_first_pulse():
     device = Listener(takes=False)
     with SyncChain([device], 500.0) as chain:
         assert [device.came.get(timeout=TIMEOUT_S)[0] for _ in range(3)] == [0, 0, 0]
@@ -65,12 +65,12 @@ def test_pulses_are_numbered_from_the_first_that_counts():
     assert set(np.diff(pulses)) == {0, 1} or set(np.diff(pulses)) == {1}
 
 
-def test_a_rate_that_is_none_is_refused():
+def test_invalid_pulse_rate_is_refused():
     with pytest.raises(ArgumentError, match=r"rate_hz is 0; give a number from 0\.001 to 1000"):
         SyncChain([], 0.0)
 
 
-def test_four_devices_on_a_chain_hear_the_same_moments():
+def test_four_devices_on_a_chain_measure_at_the_same_time():
     begun = [threading.Event() for _ in range(5)]
     begun[0].set()
 

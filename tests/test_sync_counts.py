@@ -38,7 +38,7 @@ def numbered(events, sensors, counts=None):
 @pytest.mark.parametrize("seed", range(30))
 @pytest.mark.parametrize("n_sensors", [1, 2, 4])
 @pytest.mark.parametrize("regular", [True, False])
-def test_all_get_the_number_of_their_pulse(seed, n_sensors, regular):
+def test_measurements_get_the_number_of_their_pulse(seed, n_sensors, regular):
     sensors = [f"s{number}" for number in range(n_sensors)]
     events = list(pulses_of(seed, n_sensors=n_sensors, rate_hz=[5.0, 10.0, 20.0][seed % 3], regular=regular))
     found, counts = numbered(events, sensors)
@@ -49,7 +49,7 @@ def test_all_get_the_number_of_their_pulse(seed, n_sensors, regular):
 
 @pytest.mark.parametrize("seed", range(20))
 @pytest.mark.parametrize("n_sensors", [1, 3])
-def test_a_sensor_that_was_away_is_aligned_again(seed, n_sensors):
+def test_returning_sensor_is_aligned_again(seed, n_sensors):
     sensors = [f"s{number}" for number in range(n_sensors)]
     events = list(pulses_of(seed, n_sensors=n_sensors, rate_hz=10.0, lose=0.0))
     last = sensors[-1]
@@ -70,7 +70,7 @@ def test_a_sensor_that_was_away_is_aligned_again(seed, n_sensors):
     assert counts.realigned == 0
 
 
-def test_a_counter_that_missed_a_pulse_unnoticed_is_compared_anew():
+def test_unnoticed_missed_pulse_is_corrected():
     """As where a sensor ignores a pulse that comes while it still measures, and does not count it."""
     events = [
         (sensor, counter - (sensor == "s1" and counter >= 30), now_ns, pulse)
@@ -83,7 +83,7 @@ def test_a_counter_that_missed_a_pulse_unnoticed_is_compared_anew():
     assert all(number == pulse for (sensor, pulse), number in found if pulse >= 35)
 
 
-def test_what_is_held_of_a_sensor_is_told_before_it_begins_anew():
+def test_held_measurements_are_released_before_a_restart():
     counts = PulseAligner(["a", "b"], shortest_s=SHORTEST_S)
     found = [each for number in range(4) for each in counts.add("a", ("a", number), number, number * 100_000_000)]
     found += counts.add("b", ("b", 2), 100, 205_000_000)
@@ -96,7 +96,7 @@ def test_what_is_held_of_a_sensor_is_told_before_it_begins_anew():
     assert len(found) == 11
 
 
-def test_nothing_waits_for_ever():
+def test_held_measurements_are_released_after_a_timeout():
     counts = PulseAligner(["a", "b"], shortest_s=SHORTEST_S)
     assert counts.add("b", "early", 4, 1_000_000_000) == []  # the first sensor has said nothing yet
     assert counts.release(1_400_000_000) == []
@@ -104,7 +104,7 @@ def test_nothing_waits_for_ever():
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_blocks_that_come_late_change_nothing(seed):
+def test_late_blocks_change_nothing(seed):
     """On a busy host a block may come when the next pulse has passed; what counts is what most of them say."""
     random = np.random.default_rng(seed)
     late = [

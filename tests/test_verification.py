@@ -147,7 +147,7 @@ def test_silence_gives_amplitudes_of_zero(beamformer):
 
 
 @pytest.mark.parametrize(("wavefront", "n_sampled"), [("plane", 80), ("spherical", 8)])
-def test_sampled_places_stand_for_all(monkeypatch, wavefront, n_sampled):
+def test_sampled_places_represent_all(monkeypatch, wavefront, n_sampled):
     """A few of many places measure the error of all, as bright ones are drawn more often."""
     with open_recording(REFLECTORS) as recording:
         measurement = recording[0]
@@ -165,7 +165,7 @@ def test_sampled_places_stand_for_all(monkeypatch, wavefront, n_sampled):
     assert some.error_db == pytest.approx(whole.error_db, abs=0.5)
 
 
-def test_sample_weights_add_up_to_all():
+def test_sample_weights_add_up_to_the_total():
     power = np.random.default_rng(1).uniform(0, 1, 50) ** 4
     chosen, weights = _measured.sampled(power, 500)
     assert chosen.tolist() == list(range(50))
@@ -192,7 +192,7 @@ def test_bench_verification_reports_every_kind_of_setting(tmp_path):
     assert "\n| all | 2 | 2 | 0 |" in target.read_text("utf-8")
 
 
-def test_bench_verification_names_what_is_wrong(monkeypatch):
+def test_bench_verification_names_the_error(monkeypatch):
     monkeypatch.setattr(verification, "measure", lambda *_: verification.Measured(-90.0, 1, None))
     stated = []
     (row,) = campaign.run(count=1, seed=1, say=stated.append)["rows"]
@@ -200,7 +200,7 @@ def test_bench_verification_names_what_is_wrong(monkeypatch):
     assert stated == [f"seed 1: verified -90.00 dB, true {row['true_db']:.2f} dB"]
 
 
-def test_random_settings_are_of_every_kind():
+def test_random_settings_cover_every_kind():
     drawn = [random_settings(np.random.default_rng(seed), Limits()) for seed in range(60)]
     assert {settings.processing.beamformer for settings in drawn} == {
         "delay_and_sum",
@@ -214,6 +214,6 @@ def test_random_settings_are_of_every_kind():
     assert random_measurement(7).data.tobytes() == random_measurement(7).data.tobytes()
 
 
-def test_random_settings_refuse_limits_that_nothing_meets():
+def test_random_settings_refuse_impossible_limits():
     with pytest.raises(ArgumentError, match=r"100 draws gave no valid settings, the last one because: .*; give wider"):
         random_settings(np.random.default_rng(1), Limits(max_samples=0))

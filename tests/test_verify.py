@@ -52,7 +52,7 @@ def flip(path, *rows, sensor="left"):
             file[f"sensors/{sensor}/pdm"][row, 5] ^= 1
 
 
-def test_whole(tmp_path):
+def test_intact_recording_is_reported_as_intact(tmp_path):
     path = write_recording(tmp_path / "rec.h5", measurements(1, 2, 3))
     (report,) = verify(path)
     assert (report.sensor, report.measurements, report.is_intact) == ("left", 3, True)
@@ -60,7 +60,7 @@ def test_whole(tmp_path):
     assert run("verify", path, "--quiet").stdout == ""
 
 
-def test_gaps_and_all_damaged_measurements_are_told(recording):
+def test_gaps_and_damaged_measurements_are_reported(recording):
     flip(recording, 0, 2, 3, 4)
     (report,) = verify(recording)
     assert [(gap.first, gap.last, gap.reason) for gap in report.gaps] == [
@@ -90,7 +90,7 @@ def unnumbered(monkeypatch):
 
 
 @pytest.mark.usefixtures("unnumbered")
-def test_disorder_is_told(tmp_path):
+def test_falling_numbers_are_reported(tmp_path):
     path = write_recording(tmp_path / "rec.h5", measurements(1, 2, 4, 3, 4))
     (report,) = verify(path)
     assert report.out_of_order == (3,)
@@ -98,13 +98,13 @@ def test_disorder_is_told(tmp_path):
 
 
 @pytest.mark.usefixtures("unnumbered")
-def test_a_number_that_comes_twice_is_told(tmp_path):
+def test_repeated_numbers_are_reported(tmp_path):
     write_recording(tmp_path / "rec.h5", measurements(1, 2, 2, 3))
     done = run("verify", tmp_path / "rec.h5", code=3)
     assert "whole" not in done.stdout
 
 
-def test_numbers_that_start_again(tmp_path):
+def test_numbers_may_restart_in_a_new_session(tmp_path):
     with create(tmp_path, entries(2, first=8, session_id=1)) as journal:
         journal.append(entries(2, first=0, session_id=2))
     assert verify(journal.path)[0].is_intact
@@ -113,7 +113,7 @@ def test_numbers_that_start_again(tmp_path):
     assert verify(write_recording(tmp_path / "rec.h5", given))[0].is_intact
 
 
-def test_gaps_of_two_runs(tmp_path):
+def test_gaps_of_two_sessions_are_reported(tmp_path):
     """Each run has its own numbers, also where both have given the same ones."""
     with create(tmp_path, [*entries(1, first=0, session_id=9), *entries(1, first=3, session_id=9)]) as journal:
         journal.append([*entries(2, first=0, session_id=4), *entries(1, first=3, session_id=4)])
@@ -141,7 +141,7 @@ def test_gaps_of_two_runs(tmp_path):
     assert (report.out_of_order, report.damaged) == ((), ())
 
 
-def test_a_sealed_recording_of_two_runs_is_whole(tmp_path):
+def test_sealed_recording_of_two_sessions_is_intact(tmp_path):
     given = [*entries(2, first=8, session_id=2**63 - 1), *entries(3, first=0, session_id=1)]
     create(tmp_path, given).close()
     path = seal(tmp_path / "rec.h5.journal").recording
@@ -151,7 +151,7 @@ def test_a_sealed_recording_of_two_runs_is_whole(tmp_path):
         assert recording.stamps() == [entry.measurement.stamp for entry in given]
 
 
-def test_files_from_before_epochs_were_numbers_of_runs():
+def test_recordings_without_session_identifiers_are_verified():
     path = Path(__file__).parent / "recordings" / "before_epochs.h5"
     with h5py.File(path) as file:
         (group,) = file["sensors"].values()
@@ -159,7 +159,7 @@ def test_files_from_before_epochs_were_numbers_of_runs():
     assert all(report.is_intact for report in verify(path))
 
 
-def test_a_disk_that_fails_damages_no_recording(tmp_path, monkeypatch):
+def test_disk_error_is_not_reported_as_damage(tmp_path, monkeypatch):
     path = write_recording(tmp_path / "rec.h5", measurements(1, 2))
 
     def fail(*_):
@@ -170,7 +170,7 @@ def test_a_disk_that_fails_damages_no_recording(tmp_path, monkeypatch):
         verify(path)
 
 
-def test_one_sensor_of_two_cannot_be_read(tmp_path):
+def test_unreadable_sensor_leaves_the_other_verified(tmp_path):
     path = write_recording(tmp_path / "rec.h5", [*measurements(1, 2), *measurements(1, sensor="right")])
     with h5py.File(path, "r+") as file:
         file["sensors/right/sequence"][0] = 7
@@ -184,7 +184,7 @@ def test_one_sensor_of_two_cannot_be_read(tmp_path):
         verify(path)
 
 
-def test_journals(tmp_path):
+def test_journals_are_verified(tmp_path):
     path = crashed(tmp_path, [*entries(2), *entries(1, sensor="right")])
     assert [report.is_intact for report in verify(path)] == [True, True]
     with Journal.open(path) as journal:
@@ -199,7 +199,7 @@ def test_journals(tmp_path):
     ]
 
 
-def test_several_files_and_such_that_cannot_be_read(tmp_path, recording):
+def test_several_and_unreadable_files_are_reported(tmp_path, recording):
     images = write_energyscapes(tmp_path / "img.h5", [image()])
     with create(tmp_path, name="used.h5") as journal:
         done = run("verify", tmp_path / "none", images, journal.path, recording, code=1)
@@ -211,7 +211,7 @@ def test_several_files_and_such_that_cannot_be_read(tmp_path, recording):
     assert ["error" in file for file in reported] == [True, False]
 
 
-def test_a_recording_without_a_sensor(recording):
+def test_recording_without_a_sensor_is_refused(recording):
     with h5py.File(recording, "r+") as file:
         del file["sensors/left"]
     with pytest.raises(DataError, match=r"rec\.h5 contains no sensor; copy it again"):

@@ -45,7 +45,7 @@ IMAGES = {
 
 
 @pytest.mark.parametrize("name", IMAGES)
-def test_pictures_of_all_kinds_of_axes(name):
+def test_every_kind_of_axes_is_drawn(name):
     polar = Polar(IMAGES[name])
     picture = polar.picture(polar.levels(IMAGES[name].amplitude), TABLE)
     assert picture.shape == (*polar.shape, 3)
@@ -56,7 +56,7 @@ def test_pictures_of_all_kinds_of_axes(name):
 
 @pytest.mark.parametrize("place", [(7.0, 2.2), (-38.0, 1.15), (61.5, 3.333), (-80.0, 4.7)])
 @pytest.mark.parametrize("window_m", [None, (1.0, 4.8)])
-def test_a_reflector_is_drawn_where_it_is(place, window_m):
+def test_reflector_is_drawn_at_its_position(place, window_m):
     made = cropped(spot(*place), window_m)
     polar = Polar(made)
     x, y = brightest(polar.picture(polar.levels(made.amplitude), TABLE)[:-66])
@@ -66,7 +66,7 @@ def test_a_reflector_is_drawn_where_it_is(place, window_m):
     assert polar.pixel_of(azimuth_deg, range_m) == pytest.approx((x, y))
 
 
-def test_rings_and_rays_are_where_they_say():
+def test_rings_and_rays_match_their_labels():
     polar = Polar(image())
     lit = (polar.picture(np.zeros((37, 400), np.uint8), TABLE) != TABLE[0]).any(axis=2)
 
@@ -82,7 +82,7 @@ def test_rings_and_rays_are_where_they_say():
 
 @pytest.mark.parametrize("half_deg", [5, 45, 60, 90, 135, 180])
 @pytest.mark.parametrize("range_m", [(0.0, 0.3), (0.5, 5.0), (2.0, 2.5), (3.0, 3.004), (4.9995, 5.0), (12.0, 12.0006)])
-def test_no_names_overlap(half_deg, range_m, monkeypatch):
+def test_labels_do_not_overlap(half_deg, range_m, monkeypatch):
     drawn = []
     monkeypatch.setattr(_axes, "_ink", drawn.append)
     fan_rad = np.radians([-half_deg, 0, half_deg])
@@ -96,7 +96,7 @@ def test_no_names_overlap(half_deg, range_m, monkeypatch):
     assert all(box.x0 >= 0 and box.x1 <= place.width_px for box in boxes)
 
 
-def test_levels_are_those_below_the_strongest():
+def test_levels_are_relative_to_the_strongest():
     made = spot(0, 2.0)
     levels = Polar(made, dynamic_range_db=40).levels(made.amplitude)
     half = made.replace(amplitude=np.where(made.amplitude == made.amplitude.max(), made.amplitude, made.amplitude / 10))
@@ -106,7 +106,7 @@ def test_levels_are_those_below_the_strongest():
     np.testing.assert_allclose(levels[seen].astype(int) - there[seen], 255 * 20 / 40, atol=1)
 
 
-def test_a_window_outside_of_the_image_shows_its_end():
+def test_window_outside_the_image_shows_its_end():
     assert len(cropped(image(), (7.0, 9.0)).range_m) == 1
     assert cropped(image(), (0.0, 9.0)).range_m is image().range_m or len(cropped(image(), (0.0, 9.0)).range_m) == 400
 
@@ -132,7 +132,7 @@ def test_points_follow_threshold_and_window():
     assert len(points(threshold_db=-60)) > 2
 
 
-def test_points_stay_and_fade():
+def test_points_persist_and_fade():
     scene = ViewedScene()
     for number in range(4):
         scene.take(taken(spot(10 * number, 2.0), time_s=0.1 * number))
@@ -146,7 +146,7 @@ def test_points_stay_and_fade():
     assert len(scene.draw(Choices(decay_s=10)).sensors["front"].position_m) == 2
 
 
-def test_what_two_sensors_see_becomes_one_image():
+def test_images_of_two_sensors_are_combined():
     scene = ViewedScene()
     left = Pose((0.0, 1.0, 0.3))
     right = Pose((0.0, -1.0, 0.3), (0.0, 0.0, math.sin(math.radians(15)), math.cos(math.radians(15))))
@@ -169,7 +169,7 @@ def test_what_two_sensors_see_becomes_one_image():
 
 
 @pytest.mark.parametrize("threshold_db", [-20.0, -3.0])
-def test_an_image_with_elevations_is_a_dome_of_echoes(threshold_db):
+def test_image_with_elevations_is_drawn_as_a_dome(threshold_db):
     scene = ViewedScene()
     speckle = solid()
     made = speckle.replace(amplitude=speckle.amplitude + np.float32(0.1))
@@ -187,13 +187,13 @@ def test_an_image_with_elevations_is_a_dome_of_echoes(threshold_db):
     np.testing.assert_array_equal(drawn.shape.colours[strongest], colour_table("viridis")[255])
 
 
-def test_maps_of_colours_rise_in_brightness():
+def test_colour_maps_rise_in_brightness():
     for name in COLOURS:
         luminance = colour_table(name) @ [0.2126, 0.7152, 0.0722]
         assert np.diff(luminance[::8]).min() > 0, name
 
 
-def test_files_hold_what_is_drawn():
+def test_saved_files_contain_the_drawn_view():
     scene = ViewedScene()
     choices = Choices(threshold_db=-30, range_m=(0.8, 4.0))
     scene.take(taken(spot(-40, 1.5, timestamp_ns=1_700_000_000_123_000_000), TURNED))
@@ -209,7 +209,7 @@ def test_files_hold_what_is_drawn():
     np.testing.assert_allclose(stored, drawn, atol=1e-5)
 
 
-def test_the_points_that_are_saved_are_those_that_are_drawn():
+def test_saved_points_are_the_drawn_points():
     """Also where the strongest of the image lies beyond the window, and between directions."""
     rng = np.random.default_rng(5)
     noisy = image(np.linspace(-90, 90, 91))
@@ -267,12 +267,12 @@ def test_nothing_is_drawn_beyond_the_image():
         ({"colours": "jet"}, "colours 'jet' is unknown"),
     ],
 )
-def test_choices_that_cannot_be(changes, reported):
+def test_invalid_choices_are_refused(changes, reported):
     with pytest.raises(ArgumentError, match=reported):
         Choices(**changes)
 
 
-def test_pictures_that_cannot_be():
+def test_invalid_picture_sizes_are_refused():
     with pytest.raises(ArgumentError, match="width_px is 50; give at least"):
         Polar(image(), width_px=50)
     with pytest.raises(ArgumentError, match="the image ends at range 0"):
@@ -284,7 +284,7 @@ def seen(frame, name):
     return len(drawn.position_m), drawn.overdue
 
 
-def test_points_fade_with_time_and_not_with_images():
+def test_points_fade_with_time_instead_of_images():
     scene = ViewedScene()
     scene.take(taken(spot(0, 2.0), time_s=10.0))
     bright = scene.draw(Choices(decay_s=0.5), 10.0)
@@ -298,7 +298,7 @@ def test_points_fade_with_time_and_not_with_images():
 
 
 @pytest.mark.parametrize(("interval_s", "due_s"), [(None, 10.0), (0.05, 1.0), (2.0, 6.0)])
-def test_who_is_silent_is_overdue_by_what_is_usual_of_it(interval_s, due_s):
+def test_silent_sensor_is_overdue_after_its_typical_interval(interval_s, due_s):
     scene = ViewedScene()
     scene.take(taken(spot(0, 2.0), time_s=10.0, interval_s=interval_s))
     timely = scene.draw(Choices(), 10.0 + due_s - 0.01)
@@ -312,7 +312,7 @@ def test_who_is_silent_is_overdue_by_what_is_usual_of_it(interval_s, due_s):
     assert 2 * after.colours.astype(int).max() < before.colours.max()
 
 
-def test_who_is_overdue_is_no_part_of_what_is_fused():
+def test_overdue_sensor_is_excluded_from_the_combined_image():
     scene = ViewedScene()
     places = {"front": Pose((0.3, 0.0, 0.0)), "left": Pose((0.0, 0.3, 0.0)), "right": Pose((0.0, -0.3, 0.0))}
     for name, pose in places.items():
@@ -332,7 +332,7 @@ def test_who_is_overdue_is_no_part_of_what_is_fused():
     assert scene.draw(Choices()).fused is not None
 
 
-def test_what_stays_the_same_is_not_drawn_again():
+def test_unchanged_view_is_not_drawn_again():
     scene = ViewedScene()
     for name in ("front", "left"):
         scene.take(taken(spot(0, 2.0, sensor=name)))
@@ -346,7 +346,7 @@ def test_what_stays_the_same_is_not_drawn_again():
     assert not np.array_equal(other.sensors["left"].picture, first.sensors["left"].picture)
 
 
-def test_sensors_whose_places_nobody_knows_have_no_platform():
+def test_sensors_with_unknown_mounting_have_no_platform_view():
     scene = ViewedScene()
     scene.take(ReceivedImage(spot(-40, 1.5), None, 0.0))
     alone = scene.draw(Choices()).sensors["front"]

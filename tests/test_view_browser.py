@@ -181,7 +181,7 @@ def eventually(holds):
         assert time.monotonic() < end_s, "it never was"
 
 
-def test_the_reflectors_drawn_are_where_the_scene_put_them(playback):
+def test_drawn_reflectors_match_the_scene(playback):
     polar = Polar(playback.image)
     places = [(*polar.place_of(x, y), level) for x, y, level in spots(playback)]
     assert len(places) == len(reflectors())
@@ -203,7 +203,7 @@ def test_a_higher_threshold_leaves_fewer_points(playback):
     assert int(playback.reported("points")) == sum(each["level_db"] > -1 for each in reflectors())
 
 
-def test_the_window_of_ranges_moves_the_axes(playback):
+def test_range_window_moves_the_axes(playback):
     slider = playback.control(re.compile("^Range"))
     thumb = slider.locator(".multi-slider-thumb").last
     box, track = thumb.bounding_box(), slider.locator(".multi-slider-track").bounding_box()
@@ -227,7 +227,7 @@ def test_the_window_of_ranges_moves_the_axes(playback):
     eventually(moved)
 
 
-def test_the_time_line_chooses_what_is_shown(playback):
+def test_time_line_selects_the_shown_image(playback):
     playback.slide("Measurement", 1)
     playback.wait_until("sequence", "text === '1'")
     playback.press("back")
@@ -239,14 +239,14 @@ def test_the_time_line_chooses_what_is_shown(playback):
     assert playback.reported("captured") == "2001-09-09 01:46:40.200 UTC"
 
 
-def test_colours_are_of_the_map_that_was_chosen(playback):
+def test_chosen_colour_map_is_used(playback):
     playback.control("Colours").locator("input:not([type=hidden])").first.click()
     playback.page.get_by_role("option", name="viridis").click()
     wanted = colour_table("viridis")[255].astype(int)
     eventually(lambda: np.abs(playback.picture()[0] - wanted).sum(axis=2).min() < 40)
 
 
-def test_what_is_saved_can_be_read(playback, browser, tmp_path):
+def test_saved_page_can_be_opened(playback, browser, tmp_path):
     picture, name = playback.saved("Picture (PNG)")
     assert name == "img.png"
     image = np.asarray(Image.open(io.BytesIO(picture)).convert("RGB"))
@@ -325,7 +325,7 @@ LAG = """() => new Promise(resolve => {
 
 
 @pytest.mark.alone
-def test_a_live_view_counts_on_and_lags_less_than_a_second(browser):
+def test_live_view_lags_less_than_a_second(browser):
     with ExitStack() as stack:
         served = stack.enter_context(serving(*LOOPBACK, "--workers", "1", "--device", "cpu"))
         stack.enter_context(measuring(served.listen))
@@ -356,7 +356,7 @@ def test_a_live_view_counts_on_and_lags_less_than_a_second(browser):
         live.close()
 
 
-def test_each_browser_has_a_recording_of_its_own(playback, browser):
+def test_each_browser_has_its_own_recording(playback, browser):
     other = Page(browser, playback.page.url)
     begin, end = (
         other.page.get_by_role("button", name=f"{word} HTML recording", exact=True) for word in ("Begin", "End")

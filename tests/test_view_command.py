@@ -61,7 +61,7 @@ BIND = socket.socket.bind
         ),
     ],
 )
-def test_what_cannot_be_viewed_is_refused_in_a_line(tmp_path, arguments, reported):
+def test_unviewable_input_is_refused_in_one_line(tmp_path, arguments, reported):
     path = write_energyscapes(tmp_path / "img.h5", stamped(1))
     (tmp_path / "other.html").touch()
     named = {"IMG": path, "OTHER": tmp_path / "other.html", "p.html": tmp_path / "p.html", "p.png": tmp_path / "p.png"}
@@ -72,7 +72,7 @@ def test_what_cannot_be_viewed_is_refused_in_a_line(tmp_path, arguments, reporte
     assert {each: each.read_bytes() for each in tmp_path.iterdir()} == before
 
 
-def test_defaults_of_a_settings_file_are_for_those_who_have_use_for_them(tmp_path, monkeypatch):
+def test_config_defaults_apply_to_their_commands_only(tmp_path, monkeypatch):
     path = write_energyscapes(tmp_path / "img.h5", stamped(1))
     config = tmp_path / "config.toml"
     config.write_text('[view]\nhost = "0.0.0.0"\nloop = true\n')
@@ -85,7 +85,7 @@ def test_defaults_of_a_settings_file_are_for_those_who_have_use_for_them(tmp_pat
     assert {host for host, *_ in listened} == {"127.0.0.1"}
 
 
-def test_a_recording_as_a_page_of_its_own(tmp_path):
+def test_recording_is_saved_as_a_page(tmp_path):
     path = write_energyscapes(tmp_path / "img.h5", stamped(3))
     page = tmp_path / "page.html"
     done = CliRunner().invoke(cli, ["view", str(path), "--save-html", str(page), "--json"])
@@ -97,7 +97,7 @@ def test_a_recording_as_a_page_of_its_own(tmp_path):
     assert len(text) > 500_000
 
 
-def test_a_live_view_as_a_page_of_its_own(tmp_path):
+def test_live_view_is_saved_as_a_page(tmp_path):
     page = tmp_path / "page.html"
     with Publisher() as publisher, publisher.playing([published(number) for number in range(3)]):
         command = f"view {publisher.address} --save-html {page} --duration 1.5 --port 0 --no-open --json"
@@ -111,7 +111,7 @@ def test_a_live_view_as_a_page_of_its_own(tmp_path):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_page_that_is_interrupted_is_not_written(tmp_path, monkeypatch, number):
+def test_interrupted_page_is_not_written(tmp_path, monkeypatch, number):
     path = write_energyscapes(tmp_path / "img.h5", stamped(3))
     page = tmp_path / "page.html"
     draw = ViewedScene.draw
@@ -127,7 +127,7 @@ def test_a_page_that_is_interrupted_is_not_written(tmp_path, monkeypatch, number
     assert [each.name for each in tmp_path.iterdir()] == ["img.h5"]
 
 
-def test_who_interrupts_the_compiler_is_told_that_it_ends_first(tmp_path, monkeypatch):
+def test_interrupt_during_compilation_is_reported(tmp_path, monkeypatch):
     path = write_energyscapes(tmp_path / "img.h5", stamped(3))
     ended = []
     monkeypatch.setattr(os, "_exit", ended.append)
@@ -147,7 +147,7 @@ def test_who_interrupts_the_compiler_is_told_that_it_ends_first(tmp_path, monkey
     assert [each.name for each in tmp_path.iterdir()] == ["img.h5"]
 
 
-def test_a_live_view_without_images_is_no_success(tmp_path):
+def test_live_view_without_images_fails(tmp_path):
     page = tmp_path / "page.html"
     with Publisher() as publisher, publisher.playing([]):
         command = f"view {publisher.address} --save-html {page} --duration 0.5 --port 0 --no-open"
@@ -159,7 +159,7 @@ def test_a_live_view_without_images_is_no_success(tmp_path):
     assert not page.exists()
 
 
-def test_the_page_on_the_view(tmp_path):
+def test_commands_of_the_page_on_the_view_run(tmp_path):
     write_energyscapes(tmp_path / "IMG.h5", stamped(3))
     text = path_of("view").read_text("utf-8")
     commands = [command for command in commands_in(text) if command.startswith("view ")]
@@ -179,7 +179,7 @@ def test_the_page_on_the_view(tmp_path):
     assert done.stdout.startswith("http://127.0.0.1:")
 
 
-def test_the_limit_of_recordings_is_the_one_that_is_told():
+def test_recording_limit_matches_its_documentation():
     reported = f"at most {MAX_BYTES / 1e6:g} MB"
     assert reported in " ".join(CliRunner().invoke(cli, ["view", "--help"]).stdout.split())
     assert reported in " ".join(path_of("view").read_text("utf-8").split())
@@ -198,7 +198,7 @@ class InTerminal(webbrowser.GenericBrowser):
         assert self.ended.wait(PATIENCE_S)
 
 
-def test_a_browser_does_not_keep_the_view_from_beginning(tmp_path, monkeypatch):
+def test_slow_browser_does_not_delay_the_view(tmp_path, monkeypatch):
     path = write_energyscapes(tmp_path / "img.h5", stamped(1))
     browser = InTerminal()
     monkeypatch.setattr(webbrowser, "get", lambda: browser)
@@ -221,7 +221,7 @@ def test_a_browser_does_not_keep_the_view_from_beginning(tmp_path, monkeypatch):
     ],
     ids=["xdg-open", "chromium", "other", "w3m", "elinks"],
 )
-def test_a_browser_that_takes_the_terminal_is_opened_for_who_asks(monkeypatch, browser, is_opened):
+def test_terminal_browser_is_opened_only_with_open(monkeypatch, browser, is_opened):
     opened = []
     monkeypatch.setattr(webbrowser, "get", lambda: browser)
     monkeypatch.setattr(browser, "open", opened.append)
@@ -231,7 +231,7 @@ def test_a_browser_that_takes_the_terminal_is_opened_for_who_asks(monkeypatch, b
     assert opened == ["page"] * (is_opened + 1)
 
 
-def test_where_there_is_no_browser_none_is_opened(monkeypatch):
+def test_missing_browser_is_not_opened(monkeypatch):
     def get():
         raise webbrowser.Error("could not locate runnable browser")
 

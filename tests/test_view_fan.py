@@ -11,7 +11,7 @@ from tests.views import TABLE, brightest
 
 
 @pytest.mark.parametrize("first_deg", [-180.0, -178.0, -77.0, 0.0])
-def test_a_grid_all_around_has_no_gap(first_deg):
+def test_full_circle_grid_has_no_gap(first_deg):
     made = image(first_deg + np.arange(0.0, 360.0, 2.0))
     level = np.ones_like(made.amplitude)
     level[0] = 1e-4  # between the last and this one is half of what is between them, in dB
@@ -53,11 +53,11 @@ def looking(azimuth_deg):
         ([-30, -25, -20, *np.arange(-20, 20, 0.5), 20, 25, 30], set(range(-30, 31))),
     ],
 )
-def test_a_picture_shows_where_somebody_looked(azimuth_deg, seen_deg):
+def test_picture_shows_the_imaged_sector(azimuth_deg, seen_deg):
     assert looking(np.asarray(azimuth_deg, float)) == seen_deg
 
 
-def test_a_reflector_behind_is_drawn_where_it_is():
+def test_reflector_behind_is_drawn_at_its_position():
     made = image(np.arange(100.0, 261.0, 2.0))
     across, along = (np.degrees(made.azimuth_rad) - 230) / 4, (made.range_m - 3.0) / 0.03
     amplitude = np.exp(-0.5 * (across[:, None] ** 2 + along**2)).astype(np.float32)
@@ -71,7 +71,7 @@ def test_a_reflector_behind_is_drawn_where_it_is():
     ("fan_deg", "rays"),
     [((100, 260), "−150° −120° +120° +150° +180°"), ((-180, 180), "−150° −120° −90° −60° −30° 0° +30° +60°")],
 )
-def test_rays_behind_have_their_names(fan_deg, rays, monkeypatch):
+def test_rays_behind_are_labelled(fan_deg, rays, monkeypatch):
     drawn = []
     monkeypatch.setattr(_axes, "_ink", drawn.append)
     fan_rad = np.radians(fan_deg)

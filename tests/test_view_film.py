@@ -24,7 +24,7 @@ from tests.test_view import TURNED
 from tests.views import PATIENCE_S, acked_through, spot, stamped, wait_for
 
 
-def test_a_film_shows_all_sensors_of_a_moment_together(tmp_path):
+def test_time_step_shows_all_sensors_together(tmp_path):
     path = write_energyscapes(tmp_path / "img.h5", stamped(3, sensors=("front", "left")))
     with Playback(path) as playback:
         assert [moment.time_s for moment in playback.time_steps] == pytest.approx([0, 0.05, 0.1])
@@ -34,14 +34,14 @@ def test_a_film_shows_all_sensors_of_a_moment_together(tmp_path):
         assert playback.time_steps[2].measurements == (("left", 2),)
 
 
-def test_a_film_of_one_sensor_takes_its_name(tmp_path):
+def test_playback_selects_one_sensor_by_name(tmp_path):
     path = write_energyscapes(tmp_path / "img.h5", stamped(2, sensors=("front", "left")))
     for named in ("left", ["left"]):
         with Playback(path, sensors=named) as playback:
             assert [moment.measurements for moment in playback.time_steps] == [(("left", 0),), (("left", 1),)]
 
 
-def test_a_film_plays_pauses_and_steps(tmp_path):
+def test_playback_plays_pauses_and_steps(tmp_path):
     path = write_energyscapes(tmp_path / "img.h5", stamped(4))
     with Playback(path) as playback:
         playback.play(playing=False)
@@ -61,7 +61,7 @@ def test_a_film_plays_pauses_and_steps(tmp_path):
         assert wait_for(lambda: playback.take() and playback.shown == 3)
 
 
-def test_a_film_without_times_has_its_own(tmp_path):
+def test_playback_without_timestamps_uses_an_interval(tmp_path):
     path = write_energyscapes(tmp_path / "img.h5", [each.replace(stamp=Stamp()) for each in stamped(3)])
     with Playback(path) as playback:
         assert [moment.time_s for moment in playback.time_steps] == pytest.approx([0, 0.1, 0.2])
@@ -82,7 +82,7 @@ def test_recordings_are_processed_with_their_own_settings_and_air(tmp_path):
             assert shown.pose.translation_m == TURNED.translation_m
 
 
-def test_a_device_that_is_not_there_is_told_before_anything_is_shown(tmp_path, monkeypatch):
+def test_missing_device_is_reported_before_the_first_image(tmp_path, monkeypatch):
     path = write_recording(tmp_path / "rec.h5", noise(SMALL, 1))
 
     def load(device):
@@ -115,7 +115,7 @@ def come(playback):
     return sequences(wait_for(playback.take))
 
 
-def test_after_a_seek_nothing_of_another_time_is_shown(tmp_path):
+def test_seek_discards_images_of_other_times(tmp_path):
     path = write_energyscapes(tmp_path / "img.h5", alternating(6))
     with Playback(path) as playback, Viewer(playback, port=0) as view:
         playback.play(playing=False)
@@ -132,7 +132,7 @@ def test_after_a_seek_nothing_of_another_time_is_shown(tmp_path):
         assert view._frame.fused is None  # noqa: SLF001
 
 
-def test_a_film_that_begins_anew_forgets_its_end(tmp_path):
+def test_restarted_playback_forgets_its_end(tmp_path):
     path = write_energyscapes(tmp_path / "img.h5", alternating(2, step_s=0.03))
     with Playback(path, loop=True) as playback:
         assert come(playback) == {"a": 0}
@@ -143,7 +143,7 @@ def test_a_film_that_begins_anew_forgets_its_end(tmp_path):
         assert sequences(taken)["a"] == 0
 
 
-def test_a_film_shows_the_last_of_each_sensor_though_moments_are_skipped(tmp_path):
+def test_skipped_time_steps_keep_the_latest_of_each_sensor(tmp_path):
     path = write_energyscapes(tmp_path / "img.h5", alternating(6))
     with Playback(path) as playback:
         playback._advance = lambda _: None  # noqa: SLF001  as if no time passed
@@ -156,7 +156,7 @@ def test_a_film_shows_the_last_of_each_sensor_though_moments_are_skipped(tmp_pat
         assert playback.skipped == 4
 
 
-def test_what_nobody_took_in_time_is_skipped(tmp_path):
+def test_late_images_are_skipped(tmp_path):
     path = write_energyscapes(tmp_path / "img.h5", stamped(4))
     with Playback(path) as playback:
         playback._advance = lambda _: None  # noqa: SLF001  as if no time passed
@@ -168,7 +168,7 @@ def test_what_nobody_took_in_time_is_skipped(tmp_path):
         assert playback.skipped == 2
 
 
-def test_who_goes_elsewhere_skips_nothing(tmp_path):
+def test_seek_counts_no_skipped_images(tmp_path):
     path = write_energyscapes(tmp_path / "img.h5", stamped(10, step_s=100.0))
     with Playback(path) as playback:
         come(playback)
@@ -183,7 +183,7 @@ def test_who_goes_elsewhere_skips_nothing(tmp_path):
         assert (playback.skipped, playback.received) == (0, 4)
 
 
-def test_the_clock_of_a_film_stands_still_when_it_does(tmp_path):
+def test_paused_playback_stops_its_clock(tmp_path):
     path = write_energyscapes(tmp_path / "img.h5", stamped(3, step_s=100.0))
     with Playback(path) as playback:
         assert playback.clock_s == 0
@@ -199,7 +199,7 @@ def test_the_clock_of_a_film_stands_still_when_it_does(tmp_path):
         assert playback.clock_s == pytest.approx(200)
 
 
-def test_the_usual_interval_is_that_of_each_sensor(tmp_path):
+def test_typical_interval_is_computed_per_sensor(tmp_path):
     rare = [spot(0, 1.0, sensor="rare", timestamp_ns=round(1e18 + s * 1e9)) for s in (0, 4, 8)]
     path = write_energyscapes(tmp_path / "img.h5", stamped(9, step_s=1.0) + rare)
     with Playback(path) as playback:
@@ -207,7 +207,7 @@ def test_the_usual_interval_is_that_of_each_sensor(tmp_path):
         assert playback.at(8)[0].time_s == 8.0
 
 
-def test_a_recorded_film_fades_where_nothing_comes(tmp_path):
+def test_recorded_view_fades_without_new_images(tmp_path):
     path = write_energyscapes(tmp_path / "img.h5", stamped(2, step_s=2.0))
     drawn = []
     with Playback(path) as playback, Viewer(playback, port=0, choices=Choices(decay_s=0.5)) as view:
@@ -224,7 +224,7 @@ def test_a_recorded_film_fades_where_nothing_comes(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["recording", "energyscape"])
-def test_files_know_where_their_sensors_are(tmp_path, kind):
+def test_files_contain_mountings(tmp_path, kind):
     given = noise(SMALL, 1)[0]
     several = [replace(given, stamp=replace(given.stamp, sensor=name)) for name in "ab"]
     places = {"a": TURNED, "b": replace(TURNED, translation_m=(0.0, -1.0, 0.5))}
@@ -242,7 +242,7 @@ def test_files_know_where_their_sensors_are(tmp_path, kind):
         assert scene.draw(Choices()).fused is not None
 
 
-def test_a_saved_page_has_a_title_and_the_picture_of_each_sensor(tmp_path):
+def test_saved_page_has_a_title_and_a_picture_per_sensor(tmp_path):
     path = write_energyscapes(tmp_path / "a <b>.h5", stamped(1, sensors=("front", "left")))
     with Playback(path) as playback, Viewer(playback, port=0) as view:
         view.record(tmp_path / "page.html")
@@ -265,7 +265,7 @@ def test_a_given_mounting_places_sensors_whose_own_is_unknown(tmp_path):
         assert scene.draw(Choices()).fused is not None
 
 
-def test_files_that_do_not_know_it_fuse_nothing(tmp_path):
+def test_files_without_mountings_are_not_combined(tmp_path):
     path = write_energyscapes(tmp_path / "img.h5", stamped(1, sensors=("front", "left")))
     with Playback(path) as playback, Viewer(playback, port=0) as view:
         wait_for(lambda: view.run(duration_s=0.02) or view.shown)
@@ -274,7 +274,7 @@ def test_files_that_do_not_know_it_fuse_nothing(tmp_path):
         assert acked_through(view)["unplaced"] == "front, left: not on the platform"
 
 
-def test_who_ends_waits_for_the_compiler(tmp_path, monkeypatch):
+def test_closing_waits_for_the_compiler(tmp_path, monkeypatch):
     """An interpreter that ends while a thread is in it crashes."""
     path = write_energyscapes(tmp_path / "img.h5", stamped(1))
     at_exit, compiling, compiled = [], threading.Event(), threading.Event()
@@ -296,7 +296,7 @@ def test_who_ends_waits_for_the_compiler(tmp_path, monkeypatch):
         monkeypatch.undo()
 
 
-def test_a_film_begins_when_somebody_sees_it(tmp_path):
+def test_playback_starts_with_the_first_browser(tmp_path):
     path = write_energyscapes(tmp_path / "img.h5", stamped(4, step_s=0.01))
     with Playback(path) as playback, Viewer(playback, port=0) as view:
         wait_for(lambda: view.run(duration_s=0.02) or view.shown)

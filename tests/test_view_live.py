@@ -15,7 +15,7 @@ from tests.publishing import image as published
 from tests.views import TABLE, Source, acked_through, spot, taken, wait_for
 
 
-def test_the_latest_of_each_sensor_is_shown_and_others_are_counted():
+def test_latest_of_each_sensor_is_shown_and_the_rest_counted():
     sent = [published(number, sensor=name) for number in range(5) for name in ("front", "left")]
     with Publisher() as publisher, publisher.playing(sent), Live(publisher.address) as live:
         wait_for(lambda: live.skipped == len(sent) - 2)  # all have come
@@ -33,7 +33,7 @@ def view_of(source, **choices):
     return Viewer(source, port=0, choices=Choices(**choices))
 
 
-def test_images_whose_clock_was_not_set_have_no_age_by_it():
+def test_unset_clock_gives_no_age():
     """Those of others beside them have."""
     unset, timed = (taken(spot(0, 2.0, timestamp_ns=at_ns)) for at_ns in (50_000_000, 1_700_000_000 * 10**9))
     with Live("tcp://127.0.0.1:1") as live:
@@ -42,7 +42,7 @@ def test_images_whose_clock_was_not_set_have_no_age_by_it():
         assert live.latency_s([unset, timed]) == pytest.approx(time.time() - 1_700_000_000, abs=5)
 
 
-def test_what_fades_is_drawn_again_though_nothing_comes():
+def test_fading_points_are_redrawn_without_new_images():
     source = Source()
     source.waiting = [taken(spot(0, 2.0), time_s=100.0)]
     with view_of(source, decay_s=0.5) as view:
@@ -56,7 +56,7 @@ def test_what_fades_is_drawn_again_though_nothing_comes():
         assert view.shown == 1
 
 
-def test_a_sensor_that_is_silent_is_seen_to_be():
+def test_silent_sensor_is_marked():
     source = Source()
     poses = {"a": Pose((0.0, 0.3, 0.0)), "b": Pose((0.0, -0.3, 0.0))}
     source.waiting = [taken(spot(0, 2.0, sensor=name), pose, 100.0, 0.1) for name, pose in poses.items()]
@@ -78,7 +78,7 @@ def test_a_sensor_that_is_silent_is_seen_to_be():
         assert acked_through(view)["age"] == "a 2.2 s (overdue), b 0.0 s"
 
 
-def test_what_a_paused_view_does_not_show_is_counted():
+def test_images_during_a_pause_are_counted():
     source = Source()
 
     def send(number):
@@ -110,7 +110,7 @@ def test_what_a_paused_view_does_not_show_is_counted():
         assert source.received == view.shown + 24
 
 
-def test_the_usual_interval_of_a_sensor_is_that_of_its_arrivals():
+def test_typical_interval_is_measured_from_arrivals():
     sent = [published(number) for number in range(5)]
     with Publisher() as publisher, publisher.playing(sent), Live(publisher.address) as live:
         wait_for(lambda: live.received == len(sent))
@@ -119,7 +119,7 @@ def test_the_usual_interval_of_a_sensor_is_that_of_its_arrivals():
         assert shown.time_s <= live.clock_s
 
 
-def test_measurements_have_the_names_of_their_sensors_in_the_order_of_the_pictures():
+def test_measurements_are_listed_in_the_order_of_the_pictures():
     source = Source()
     with view_of(source) as view:
         for number, name in enumerate(("right", "front", "left")):  # as they come
@@ -130,7 +130,7 @@ def test_measurements_have_the_names_of_their_sensors_in_the_order_of_the_pictur
         assert sorted(shown, key=lambda name: shown[name].order) == ["front", "left", "right"]
 
 
-def test_the_state_says_whether_sensors_send():
+def test_state_shows_sending_sensors():
     source = Source()
     source.latency_s = lambda _: 0.025
     with view_of(source) as view:
@@ -153,7 +153,7 @@ def notes_of(live):
     return wait_for(live.notes)
 
 
-def test_that_nobody_answers_is_told_once(monkeypatch):
+def test_missing_publisher_is_reported_once(monkeypatch):
     monkeypatch.setattr(_live, "_SOON_S", 0.2)
     with Publisher() as publisher:
         address = publisher.address
@@ -166,7 +166,7 @@ def test_that_nobody_answers_is_told_once(monkeypatch):
             assert notes_of(live) == ["connected"]
 
 
-def test_sensors_that_there_are_not_are_told(monkeypatch):
+def test_unknown_sensors_are_reported(monkeypatch):
     reported = status(sensors={name: SensorStatus() for name in ("left", "front")})
     notes = []
     statuses = itertools.takewhile(lambda _: len(notes) < 2, itertools.repeat(reported, 20_000))
@@ -179,7 +179,7 @@ def test_sensors_that_there_are_not_are_told(monkeypatch):
         assert live.received == 0
 
 
-def test_a_refusal_is_told_once():
+def test_refusal_is_reported_once():
     """As an error, where this looks for applications at the port of sensors."""
     with Publisher(answers=False) as publisher, Live(publisher.address) as live:
         notes, failed = [], []
@@ -209,7 +209,7 @@ def come(view, source, number, *names, clock_s, moment=None):
     return acked_through(view, within_s=0.1)
 
 
-def test_a_step_shows_all_sensors_that_send():
+def test_step_shows_all_sending_sensors():
     source = Source()
     with view_of(source) as view:
         come(view, source, 0, "a", "b", "dead", clock_s=100.0)
@@ -226,7 +226,7 @@ def test_a_step_shows_all_sensors_that_send():
         assert acked_through(view)["sequence"] == "a 22, b 22, dead 0"
 
 
-def test_a_step_does_not_wait_for_a_sensor_that_measures_rarely():
+def test_step_does_not_wait_for_a_slow_sensor():
     source = Source()
     rare = [taken(spot(0, 2.0, sensor="rare", sequence=n), time_s=90.0 + 10 * n, interval_s=10.0) for n in range(3)]
     with view_of(source) as view:

@@ -36,12 +36,12 @@ def times_s(found):
         (2**63 - 1, "2262-04-11T23:47:16.854775807Z", "2262-04-11 23:47:16.854 UTC"),
     ],
 )
-def test_a_time_is_told_where_the_clock_was_set(at_ns, iso, utc):
+def test_time_is_shown_if_the_clock_was_set(at_ns, iso, utc):
     stamp = Stamp(timestamp_ns=at_ns)
     assert (stamp.is_timed, stamp.iso, stamp.utc) == (iso is not None, iso, utc)
 
 
-def test_a_clock_that_is_set_halfway_plays_on():
+def test_clock_set_halfway_keeps_the_order():
     found, notes = time_steps(a=steps(BOOT_NS, 3) + steps(NOW_NS, 5))
     assert times_s(found) == pytest.approx([number / 10 for number in range(8)])
     assert [dict(moment.measurements)["a"] for moment in found] == list(range(8))
@@ -52,20 +52,20 @@ def test_a_clock_that_is_set_halfway_plays_on():
     )
 
 
-def test_a_clock_that_is_lost_halfway_plays_on():
+def test_clock_lost_halfway_keeps_the_order():
     found, _ = time_steps(a=steps(NOW_NS, 3) + steps(BOOT_NS, 2) + steps(NOW_NS + 10**9, 2))
     assert times_s(found) == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4, 1.0, 1.1])
 
 
 @pytest.mark.parametrize("unset_ns", [[0] * 5, steps(BOOT_NS, 5)])
-def test_a_sensor_without_times_begins_with_those_that_have_some(unset_ns):
+def test_sensor_without_timestamps_starts_with_the_others(unset_ns):
     found, notes = time_steps(timed=steps(NOW_NS, 5), untimed=unset_ns)
     assert times_s(found) == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
     assert found[3].measurements == (("timed", 3), ("untimed", 3))
     assert [note[:34] for note in notes] == ["sensor 'untimed': 5 of 5 measureme"]
 
 
-def test_simulated_times_and_none_are_as_they_were():
+def test_simulated_and_missing_timestamps_are_kept():
     assert time_steps(a=steps(0, 3, 0.25), b=steps(0, 3, 0.25))[1] == []
     assert times_s(time_steps(a=steps(0, 3, 0.25))[0]) == [0.0, 0.25, 0.5]
     found, notes = time_steps(a=[0, 0, 0], b=[0, 0])
@@ -91,14 +91,14 @@ def test_simulated_times_and_none_are_as_they_were():
         ),
     ],
 )
-def test_long_pauses_are_short(times_ns, wanted_s, reported):
+def test_long_pauses_are_shortened(times_ns, wanted_s, reported):
     found, notes = time_steps(a=times_ns)
     assert times_s(found) == pytest.approx(wanted_s)
     assert len(notes) == (reported is not None)
     assert not notes or notes[0].startswith(reported)
 
 
-def test_a_film_says_what_its_times_are(tmp_path):
+def test_playback_reports_replaced_timestamps(tmp_path):
     images = [spot(0, 1.0, sequence=number, timestamp_ns=at_ns) for number, at_ns in enumerate((BOOT_NS, NOW_NS))]
     with Playback(write_energyscapes(tmp_path / "img.h5", images)) as playback:
         assert times_s(playback.time_steps) == pytest.approx([0, 0.1])

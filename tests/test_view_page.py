@@ -23,7 +23,7 @@ from ertis_numba.viewer._page import ControlRequest
 from tests.views import PATIENCE_S, Client, Source, spot, stamped, taken, wait_for
 
 
-def test_a_port_that_is_taken_is_refused(tmp_path):
+def test_occupied_port_is_refused(tmp_path):
     path = write_energyscapes(tmp_path / "img.h5", stamped(1))
     with socket.socket() as other, Playback(path) as playback:
         other.bind(("127.0.0.1", 0))
@@ -108,7 +108,7 @@ def test_other_addresses_of_this_machine_are_loopback():
     assert not any(is_loopback(host) for host in ("0.0.0.0", "::", "192.168.1.2", "example.org", "127.example.org"))
 
 
-def test_what_cannot_be_saved_or_chosen_is_told_and_the_view_goes_on(tmp_path):
+def test_failed_saving_is_reported_and_the_view_continues(tmp_path):
     path = write_energyscapes(tmp_path / "img.h5", [spot(0, 2.0, timestamp_ns=3 * 10**18)])
     client = Client()
     with Playback(path) as playback, Viewer(playback, port=0) as view:
@@ -147,7 +147,7 @@ def moving(count):
     return [spot(2 * number, 2.0, sequence=number, timestamp_ns=round(1e18 + number * 5e7)) for number in range(count)]
 
 
-def test_a_browser_does_not_end_the_recording_of_another(tmp_path):
+def test_browser_does_not_end_the_recording_of_another(tmp_path):
     path = write_energyscapes(tmp_path / "img.h5", stamped(3, step_s=0.01))
     one, other = Client(1), Client(2)
     with Playback(path) as playback, Viewer(playback, port=0) as view:
@@ -173,7 +173,7 @@ def test_a_browser_does_not_end_the_recording_of_another(tmp_path):
     assert len(other.files) == 1
 
 
-def test_a_recording_lasts_as_long_as_somebody_recorded(tmp_path, monkeypatch):
+def test_saved_recording_lasts_from_its_start_to_its_end(tmp_path, monkeypatch):
     """Not since what it begins with was drawn, and until its end though nothing more comes."""
     source, client = Source(), Client()
     clock = SimpleNamespace(now_s=1000.0, monotonic=lambda: clock.now_s)
@@ -202,7 +202,7 @@ def test_a_recording_lasts_as_long_as_somebody_recorded(tmp_path, monkeypatch):
     assert times_s((tmp_path / "ours.html").read_text()) == ({0.0, 7.0, 609.0, 616.0}, 621.0)
 
 
-def test_a_recording_is_made_by_who_began_it_though_a_browser_records(tmp_path):
+def test_browser_recording_does_not_end_that_of_run(tmp_path):
     source, client = Source(), Client()
     source.waiting = [taken(spot(0, 2.0), time_s=source.clock_s)]
     with Viewer(source, port=0) as view:
@@ -212,7 +212,7 @@ def test_a_recording_is_made_by_who_began_it_though_a_browser_records(tmp_path):
     assert (tmp_path / "live.html").stat().st_size > 500_000
 
 
-def test_a_recording_ends_when_it_is_full(tmp_path, monkeypatch):
+def test_recording_ends_at_its_size_limit(tmp_path, monkeypatch):
     monkeypatch.setattr(recordings, "MAX_BYTES", 20_000)
     path = write_energyscapes(tmp_path / "img.h5", moving(30))
     notes = []
@@ -224,7 +224,7 @@ def test_a_recording_ends_when_it_is_full(tmp_path, monkeypatch):
     assert 15_000 < len(embedded((tmp_path / "page.html").read_text())) < 25_000
 
 
-def test_a_film_that_is_stopped_leaves_no_page(tmp_path):
+def test_stopped_playback_leaves_no_page(tmp_path):
     path = write_energyscapes(tmp_path / "img.h5", moving(5))
     page = tmp_path / "page.html"
     with Playback(path) as playback, Viewer(playback, port=0) as view:
@@ -243,14 +243,14 @@ def test_a_film_that_is_stopped_leaves_no_page(tmp_path):
     assert [each.name for each in tmp_path.iterdir()] == ["img.h5"]
 
 
-def test_a_live_view_without_images_leaves_no_page(tmp_path):
+def test_live_view_without_images_leaves_no_page(tmp_path):
     with Viewer(Source(), port=0) as view:
         view.run(duration_s=0.1, html=tmp_path / "page.html")
         assert view.recorded is None
     assert [*tmp_path.iterdir()] == []
 
 
-def test_a_view_goes_on_when_its_recordings_are_full(tmp_path, monkeypatch):
+def test_view_continues_after_a_full_recording(tmp_path, monkeypatch):
     monkeypatch.setattr(recordings, "MAX_BYTES", 20_000)
     source, client, notes = Source(), Client(), []
     page = tmp_path / "live.html"
@@ -275,7 +275,7 @@ def test_a_view_goes_on_when_its_recordings_are_full(tmp_path, monkeypatch):
     assert [name for name, _ in client.files] == ["live.html"]
 
 
-def test_what_is_recorded_is_counted_as_it_takes_room(tmp_path):
+def test_recorded_bytes_are_counted(tmp_path):
     path = write_energyscapes(tmp_path / "img.h5", moving(8))
     counted = []
     with Playback(path) as playback, Viewer(playback, port=0) as view:
@@ -288,7 +288,7 @@ def test_what_is_recorded_is_counted_as_it_takes_room(tmp_path):
 
 
 @pytest.mark.parametrize("record", [True, False])
-def test_a_film_is_not_recorded_over_itself(tmp_path, record):
+def test_playback_is_not_recorded_over_itself(tmp_path, record):
     path = write_energyscapes(tmp_path / "img.h5", stamped(1))
     before = path.read_bytes()
     with (
@@ -300,7 +300,7 @@ def test_a_film_is_not_recorded_over_itself(tmp_path, record):
     assert path.read_bytes() == before
 
 
-def test_a_recording_that_cannot_be_written_is_told(tmp_path):
+def test_unwritable_recording_is_reported(tmp_path):
     path = write_energyscapes(tmp_path / "img.h5", stamped(1))
     with Playback(path) as playback, Viewer(playback, port=0) as view:
         view._page.show = lambda *_: (tmp_path / "page.html").touch()  # noqa: SLF001  somebody was faster
@@ -321,7 +321,7 @@ def controls(view):
         ((10.0, 20.0), (10.0, 20.0), 20.0, "Range 10–20 m"),
     ],
 )
-def test_the_slider_of_ranges_shows_the_window(window_m, shown_m, top_m, reported):
+def test_range_slider_shows_the_window(window_m, shown_m, top_m, reported):
     source = Source()
     source.waiting = [taken(spot(0, 2.0), time_s=100.0)]
     with Viewer(source, port=0, choices=Choices(range_m=window_m)) as view:
@@ -333,7 +333,7 @@ def test_the_slider_of_ranges_shows_the_window(window_m, shown_m, top_m, reporte
         assert slider.label == "Range 1–2 m"
 
 
-def test_numbers_that_cannot_be_are_put_back(monkeypatch):
+def test_invalid_numbers_are_reset(monkeypatch):
     source = Source()
     with Viewer(source, port=0, choices=Choices(threshold_db=-15.0)) as view:
         box = controls(view)["threshold_db"]

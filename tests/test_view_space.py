@@ -34,7 +34,7 @@ def joined(*groups, **choices):
         return ground(view)
 
 
-def test_the_camera_does_not_depend_on_who_comes_first():
+def test_camera_does_not_depend_on_the_order_of_sensors():
     wanted = joined(list(PLACES))
     assert wanted == joined(["left"], ["front"], ["right"]) == joined(["right"], ["left", "front"])
     assert wanted != joined(["left"])
@@ -43,7 +43,7 @@ def test_the_camera_does_not_depend_on_who_comes_first():
 
 
 @pytest.mark.parametrize("names", [["front"], list(PLACES)])
-def test_a_window_that_is_widened_is_seen(names):
+def test_widened_window_moves_the_camera(names):
     source = Source()
     with Viewer(source, port=0, choices=Choices(range_m=(0.6, 1.0))) as view:
         source.waiting = [of(name) for name in names]
@@ -59,7 +59,7 @@ def test_a_window_that_is_widened_is_seen(names):
         assert ground(view) == joined(names)  # who looks closer goes there
 
 
-def test_a_camera_that_somebody_has_moved_stays():
+def test_moved_camera_stays():
     source = Source()
 
     def client():
@@ -81,7 +81,7 @@ def test_a_camera_that_somebody_has_moved_stays():
         assert other.camera.position == (9.0, 9.0, 9.0)
 
 
-def test_points_that_fade_become_small():
+def test_fading_points_become_small():
     source = Source()
     source.waiting = [taken(spot(0, 2.0), time_s=100.0)]
     with Viewer(source, port=0, choices=Choices(decay_s=1.0)) as view:
@@ -96,7 +96,7 @@ def test_points_that_fade_become_small():
     assert sizes == pytest.approx([0.06, 0.045, 0.03, 0.018])
 
 
-def test_who_is_overdue_hides_nothing_of_what_others_see():
+def test_overdue_sensor_hides_no_other_points():
     source = Source()
     with Viewer(source, port=0) as view:
         source.waiting = [of("left")]
@@ -132,5 +132,5 @@ def test_the_ground_suits_the_range(scale, distances):
         assert node._frame.axes_length == pytest.approx(0.12 * scale)  # noqa: SLF001
 
 
-def test_round_steps():
+def test_grid_steps_are_round():
     assert [round_step(length, 7) for length in (7, 7.01, 0.7, 14, 35, 36)] == pytest.approx([1, 2, 0.1, 2, 5, 10])

@@ -67,7 +67,7 @@ def test_every_microphone_has_its_own_image():
 
 
 @pytest.mark.parametrize("facing_deg", [(180.0, 0.0), (0.0, 0.0), (160.0, 0.0), (-150.0, 20.0), (30.0, -45.0)])
-def test_the_image_lies_as_far_behind_an_oblique_wall(facing_deg):
+def test_mirror_source_lies_behind_an_oblique_wall(facing_deg):
     normal = unit_vectors(*np.radians(facing_deg))
     scene = scene_of(sensor=EAR, walls=(Wall(position_m=(1.2, 0.3, -0.4), facing_deg=facing_deg),))
     [reflector] = seen(scene, "walls")
@@ -78,7 +78,7 @@ def test_the_image_lies_as_far_behind_an_oblique_wall(facing_deg):
     assert_allclose(found, foot_m, atol=1e-9)
 
 
-def test_second_images_between_two_walls():
+def test_second_order_images_between_two_walls():
     """Between parallel walls at 1.5 m and -1 m: there and back over both is 5 m, whichever comes first."""
     back = Wall(position_m=(-1.0, 0.0, 0.0), facing_deg=(0.0, 0.0))
     scene = scene_of(sensor=EAR, walls=(FRONT, back))
@@ -90,7 +90,7 @@ def test_second_images_between_two_walls():
     assert_allclose(sorted_ways(third, "walls")[0] * SPEED_M_S, [2.0, 3.0, 5.0, 5.0, 7.0, 8.0], atol=1e-9)
 
 
-def test_the_image_in_a_corner_is_there_once():
+def test_corner_image_occurs_once():
     """Emitter and microphone apart: of the two orders of the walls, one is possible."""
     scene = listener_and_emitter((0.0, 0.0, 0.0), (0.3, -0.5, 0.1), walls=(FRONT, SIDE))
     delay_s, amplitude = sorted_ways(scene, "walls", "spreading", "cross_emission")
@@ -121,7 +121,7 @@ def test_a_room_has_all_its_second_images_for_a_sensor_that_hears_itself():
     assert len(seen(scene_of(sensor=EAR, boxes=(box,)), "walls", "occlusion")) == 6 + 6 + 12
 
 
-def test_reflections_are_counted():
+def test_number_of_reflections_is_limited():
     point = Point(position_m=(0.8, 0.2, 0.1))
     counts = [
         len(sorted_ways(scene_of(point, sensor=EAR, walls=(FRONT,), max_reflections=largest), "walls")[0])
@@ -136,7 +136,7 @@ def test_reflections_are_counted():
 
 @pytest.mark.parametrize(("aside_m", "there"), [(0.0, True), (0.49, True), (0.51, False), (2.0, False)])
 @pytest.mark.parametrize("axis", [1, 2])
-def test_a_wall_mirrors_where_it_is(aside_m, there, axis):
+def test_wall_reflects_only_within_its_extent(aside_m, there, axis):
     """The mirror point of the sensor itself lies straight ahead; the wall is 1 m wide and high."""
     place_m = [1.5, 0.0, 0.0]
     place_m[axis] = aside_m
@@ -154,7 +154,7 @@ def test_width_lies_level_and_height_upright():
     assert seen(scene_of(sensor=EAR, walls=(floor.replace(size_m=(2.0, 0.2), facing_deg=(90.0, 90.0)),)), "walls")
 
 
-def test_a_wall_is_no_mirror_for_what_lies_on_both_its_sides():
+def test_wall_between_sensor_and_emitter_reflects_nothing():
     scene = listener_and_emitter((0.0, 0.0, 0.0), (2.5, 0.2, 0.0), walls=(FRONT,))
     assert len(sorted_ways(scene, "walls", "cross_emission")[0]) == 1  # straight, for want of occlusion
 
@@ -184,7 +184,7 @@ def test_patterns_are_mirrored(end):
 
 
 @pytest.mark.parametrize("end", ["emitter", "microphone"])
-def test_patterns_count_at_each_end_of_a_way_over_wall_and_point(end):
+def test_patterns_apply_at_both_ends_of_a_reflected_path(end):
     """Of the two ways with one reflection, the emitter sends one to the wall and the other to the point."""
     sensor = EAR.replace(
         yaw_deg=20, emitter=Emitter(diameter_m=0.02), electronics=Electronics(microphone_diameter_m=0.02)
@@ -206,7 +206,7 @@ def test_patterns_count_at_each_end_of_a_way_over_wall_and_point(end):
     assert_allclose(by_wall, (of_image, of_point), rtol=1e-9)
 
 
-def test_signals_hold_all_images():
+def test_signals_contain_all_images():
     """Rendered, against calls written out at the places of the images."""
     floor = Wall(position_m=(0.0, 0.0, -0.4), facing_deg=(0.0, 90.0), reflection_db=-2)
     sphere = Sphere(position_m=(0.85, 0.1, 0.0), radius_m=0.3)  # so large that it is a mirror at all frequencies

@@ -75,7 +75,7 @@ def test_instantaneous_frequency_is_hyperbolic(call):
 
 
 @CALLS
-def test_phase_is_the_closed_form(call):
+def test_phase_matches_its_closed_form(call):
     time_s = np.linspace(0, call.duration_s, 999)
     f0, f1, duration_s = call.start_frequency_hz, call.stop_frequency_hz, call.duration_s
     slope = (1 / f1 - 1 / f0) / duration_s
@@ -119,7 +119,7 @@ def test_matched_filter_turns_the_call_into_one_peak(call):
 
 @settings(max_examples=60, deadline=None)
 @given(calls, st.integers(2500, 9000))
-def test_matched_filter_of_any_call(call, n_fft):
+def test_matched_filter_peaks_for_any_call(call, n_fft):
     low_hz, high_hz = matched_band_hz(settings_of(call))
     matched = matched_filter_spectrum(settings_of(call), n_fft=n_fft)
     frequency_hz = (matched.first_bin + np.arange(len(matched.values))) * RATE_HZ / n_fft
@@ -132,7 +132,7 @@ def test_matched_filter_of_any_call(call, n_fft):
 
 
 @CALLS
-def test_matched_filter_has_ended_after_its_guard(call):
+def test_matched_filter_ends_within_its_guard(call):
     """An impulse rings for the call's length backwards and a guard on either side, down to −50 dB."""
     n_fft, at = 16_384, 8192
     impulse = np.zeros(n_fft)
@@ -144,7 +144,7 @@ def test_matched_filter_has_ended_after_its_guard(call):
     assert 20 * np.log10(outside.max() / ringing.max()) < -50
 
 
-def test_matched_filter_scales_with_the_echo_and_nothing_else():
+def test_matched_filter_scales_with_the_echo_only():
     samples = call_samples(LOW, rate_hz=RATE_HZ)
     late = np.zeros(8192)
     late[3000 : 3000 + len(samples)] = -0.25 * samples
@@ -194,7 +194,7 @@ def test_band_edges_change_an_echo_as_documented(call, band_edges_hz, difference
 
 @settings(max_examples=60, deadline=None)
 @given(decimation=st.integers(1, 40), share=st.floats(0.05, 0.97), sample_rate_hz=st.floats(1e5, 1e7))
-def test_decimation_filter_keeps_its_promises(decimation, share, sample_rate_hz):
+def test_decimation_filter_meets_its_specification(decimation, share, sample_rate_hz):
     rate_hz = sample_rate_hz / decimation
     pass_hz = share * rate_hz / 2
     taps = decimation_taps(sample_rate_hz=sample_rate_hz, decimation=decimation, pass_hz=pass_hz)
@@ -210,7 +210,7 @@ def test_decimation_filter_keeps_its_promises(decimation, share, sample_rate_hz)
         assert gain_db < -59.4
 
 
-def test_decimation_filter_of_the_default_measurement():
+def test_default_decimation_filter_has_61_taps_and_60_db():
     made = Settings()
     taps = decimation_taps(
         sample_rate_hz=made.recording.sample_rate_hz, decimation=10, pass_hz=matched_band_hz(made)[1]
@@ -220,7 +220,7 @@ def test_decimation_filter_of_the_default_measurement():
     assert 20 * np.log10(np.abs(folding).max()) < -60
 
 
-def test_filter_response_is_that_of_the_taps():
+def test_filter_response_matches_the_taps():
     taps = decimation_taps(sample_rate_hz=4.5e6, decimation=10, pass_hz=85e3)
     frequency = np.linspace(0, 0.5, 64)
     half = (len(taps) - 1) / 2
@@ -229,7 +229,7 @@ def test_filter_response_is_that_of_the_taps():
 
 
 @pytest.mark.parametrize("decimation", [10, 30])
-def test_decimation_that_leaves_too_little_is_refused(decimation):
+def test_decimation_below_the_signal_bandwidth_is_refused(decimation):
     rate_hz = 4.5e6 / decimation
     with pytest.raises(
         ArgumentError, match=f"decimation {decimation} gives a rate of {rate_hz:g} Hz, too low .*; give a smaller one"
@@ -239,7 +239,7 @@ def test_decimation_that_leaves_too_little_is_refused(decimation):
 
 @settings(max_examples=60, deadline=None)
 @given(decimation=st.integers(1, 100), share=st.floats(0.05, 0.5))
-def test_whole_taps_change_the_filter_little_or_are_refused(decimation, share):
+def test_integer_taps_change_the_filter_little_or_are_refused(decimation, share):
     taps = decimation_taps(sample_rate_hz=4.5e6, decimation=decimation, pass_hz=share * 4.5e6 / decimation / 2)
     whole = integer_taps(taps)
     assert whole.dtype == np.int16
@@ -248,7 +248,7 @@ def test_whole_taps_change_the_filter_little_or_are_refused(decimation, share):
     assert 20 * np.log10(np.abs(change).max() + 1e-12) < -49
 
 
-def test_taps_too_many_for_16_bits_are_refused():
+def test_tap_sums_beyond_16_bits_are_refused():
     taps = decimation_taps(sample_rate_hz=4.5e6, decimation=500, pass_hz=0.8 * 4500)
     with pytest.raises(ArgumentError, match=r"decimation filter of \d+ taps is too long for 16 bits .* smaller"):
         integer_taps(taps)
@@ -258,7 +258,7 @@ def test_taps_too_many_for_16_bits_are_refused():
 
 @pytest.mark.parametrize("modulation", ["hyperbolic", "linear"])
 @pytest.mark.parametrize(("start_hz", "stop_hz"), [(50e3, 25e3), (20e3, 80e3)])
-def test_frequency_goes_as_the_modulation_says(modulation, start_hz, stop_hz):
+def test_instantaneous_frequency_follows_the_modulation(modulation, start_hz, stop_hz):
     """The instantaneous frequency of the samples, by a quarter of them, against the definition."""
     call = Call(start_frequency_hz=start_hz, stop_frequency_hz=stop_hz, modulation=modulation, ramp_fraction=0.0)
     rate_hz = 10e6

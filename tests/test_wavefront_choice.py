@@ -32,7 +32,7 @@ def test_auto_chooses_wavefronts_by_the_first_range(changes, expected):
     assert complete(settings, CPU, threads=1).processing.wavefront == expected
 
 
-def test_predicted_wavefront_error_is_that_of_the_exact_images():
+def test_predicted_wavefront_error_matches_exact_images():
     """Echoes of random directions are not planned for: the prediction is an upper bound within 10 dB."""
     near = with_processing(range_m=(0.9, 1.2), directions="2d:31")
     measurement = heard(CALL, noise=0.3)

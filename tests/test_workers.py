@@ -45,7 +45,7 @@ def is_gone(pid):
         return True
 
 
-def test_a_measurement_whose_worker_is_killed_is_processed_by_the_next():
+def test_measurement_of_a_killed_worker_is_retried():
     with driven() as loop:
         loop.processing.register(hello(), SHORT)
         pid = stop_and_offer(loop)
@@ -59,7 +59,7 @@ def test_a_measurement_whose_worker_is_killed_is_processed_by_the_next():
     assert (about["sensor"], about["session_id"], about["sequence"]) == ("front", 7, 0)
 
 
-def test_a_worker_that_is_killed_while_idle_takes_nothing_with_it():
+def test_idle_worker_killed_loses_nothing():
     with driven() as loop:
         loop.processing.register(hello(), SHORT)
         for _ in range(3):
@@ -73,7 +73,7 @@ def test_a_worker_that_is_killed_while_idle_takes_nothing_with_it():
     assert (counts.received, counts.published) == (3, 3)
 
 
-def test_a_measurement_that_two_workers_hang_over_is_kept_in_quarantine(tmp_path):
+def test_measurement_that_hangs_two_workers_is_quarantined(tmp_path):
     with driven(deadline_s=0.2, workers=2, quarantine=tmp_path) as loop:
         loop.processing.register(hello(), SHORT)
         loop.until(lambda: len(loop.workers("idle")) == 2)
@@ -94,7 +94,7 @@ def test_a_measurement_that_two_workers_hang_over_is_kept_in_quarantine(tmp_path
     assert entry.measurement.stamp.sequence == 0
 
 
-def test_a_sensor_whose_measurements_fail_pauses_and_the_others_go_on(monkeypatch):
+def test_failing_sensor_is_suspended_and_others_continue(monkeypatch):
     monkeypatch.setattr("ertis_numba.network.processing.circuit_breaker._PAUSE_S", 0.5)
     with driven() as loop:
         for sensor in ("bad", "good"):
@@ -125,7 +125,7 @@ def test_a_sensor_whose_measurements_fail_pauses_and_the_others_go_on(monkeypatc
         loop.until(lambda: loop.offer("bad") or counts.published)  # after its pause
 
 
-def test_a_quarantine_has_an_end(tmp_path):
+def test_quarantine_is_bounded(tmp_path):
     log = Lines("processing")
     quarantine = DeadLetterQueue(tmp_path, log)
     for number in range(110):
@@ -143,7 +143,7 @@ def test_a_quarantine_has_an_end(tmp_path):
     )
 
 
-def test_a_quarantine_ends_though_its_disk_does_not_answer(tmp_path, monkeypatch):
+def test_quarantine_closes_without_its_disk(tmp_path, monkeypatch):
     monkeypatch.setattr("ertis_numba.network.processing.dead_letter_queue._CLOSED_S", 0.05)
     answers = threading.Event()
     monkeypatch.setattr(DeadLetterQueue, "_write", lambda *_: answers.wait(TIMEOUT_S))
@@ -155,7 +155,7 @@ def test_a_quarantine_ends_though_its_disk_does_not_answer(tmp_path, monkeypatch
     answers.set()
 
 
-def test_a_kind_that_is_forgotten_while_a_worker_gets_ready_for_it_is_forgotten_there():
+def test_released_kind_is_released_in_a_preparing_worker():
     with driven() as loop:
         loop.processing.register(hello(), SHORT)
         loop.until(lambda: loop.workers("idle"))
@@ -172,7 +172,7 @@ def test_a_kind_that_is_forgotten_while_a_worker_gets_ready_for_it_is_forgotten_
         assert 99 not in worker.kinds
 
 
-def test_a_worker_that_does_not_die_at_once_holds_nobody_up(monkeypatch):
+def test_slowly_dying_worker_delays_nothing(monkeypatch):
     with driven() as loop:
         loop.processing.register(hello(), SHORT)
         loop.until(lambda: loop.workers("idle"))
@@ -196,7 +196,7 @@ class TestSensors:
         made = Sensors(ProcessingOptions(publish=ANY, **options), log, describe=notify, prepare=kinds.append)
         return made, kinds, log
 
-    def test_air_that_changes_slowly_makes_no_pipeline_of_each_measurement(self):
+    def test_slow_changes_of_air_keep_the_pipeline(self):
         sensors, kinds, _ = self.sensors()
         sensors.register(hello(), SHORT)
         first = SHORT.air.temperature_c
@@ -209,7 +209,7 @@ class TestSensors:
         assert len(kinds) <= 5
         assert sensors.kind_of(data(humidity_percent=float("nan"))) is None
 
-    def test_images_that_are_too_large_are_refused_before_anything_is_made(self):
+    def test_oversized_images_are_refused_in_advance(self):
         sensors, kinds, log = self.sensors()
         wide = SHORT.processing.replace(directions="3d:1000000", range_m=(0.4, 1.4))
         sensors.register(hello(), SHORT.replace(processing=wide))
@@ -220,7 +220,7 @@ class TestSensors:
         sensors.register(hello("good"), SHORT.replace(processing=SHORT.processing.replace(directions="3000")))
         assert len(kinds) == 1
 
-    def test_a_pipeline_that_could_not_be_made_is_tried_again_after_a_while(self, monkeypatch):
+    def test_failed_pipeline_is_retried_later(self, monkeypatch):
         sensors, kinds, _ = self.sensors()
         now_s = time.monotonic()
         sensors.register(hello(), SHORT)
@@ -240,7 +240,7 @@ class TestSensors:
         assert kinds == [kind] * 4
 
 
-def test_a_measurement_of_the_wrong_size_is_dropped_and_the_worker_lives():
+def test_measurement_of_the_wrong_size_is_dropped():
     with driven() as loop:
         loop.processing.register(hello(), SHORT)
         loop.offer(words=MEASUREMENT.data[:-1])
@@ -251,7 +251,7 @@ def test_a_measurement_of_the_wrong_size_is_dropped_and_the_worker_lives():
     assert (status.respawned, status.retried) == (0, 0)
 
 
-def test_a_worker_that_raises_is_asked_twice_and_lives():
+def test_failing_measurement_is_tried_twice():
     with driven() as loop:
         loop.processing.register(hello(), SHORT)
         loop.until(lambda: loop.workers("idle"))
@@ -265,7 +265,7 @@ def test_a_worker_that_raises_is_asked_twice_and_lives():
     assert [fields["text"] for event, fields in loop.lines if event == "failed_twice"] == ["KeyError: 1"]
 
 
-def test_settings_that_no_pipeline_can_use_are_dropped_by_reason_and_other_sensors_go_on():
+def test_unusable_settings_drop_only_their_sensor():
     unusable = SHORT.replace(processing=SHORT.processing.replace(range_m=(9.0, 9.5)))  # beyond the record
     with driven() as loop:
         loop.processing.register(hello("bad", unusable), unusable)
@@ -294,7 +294,7 @@ with driven(workers=2) as loop:
 """
 
 
-def test_nothing_is_left_when_the_central_node_is_killed():
+def test_killed_central_node_leaves_no_process():
     program = PARENT.format(path=[str(Path.cwd())])
     with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as parent:
         pids = [int(pid) for pid in parent.stdout.readline().split()]
@@ -312,7 +312,7 @@ def test_nothing_is_left_when_the_central_node_is_killed():
     assert not any("/dev/shm" in text for text in maps)
 
 
-def test_what_is_asked_for_is_checked(tmp_path):
+def test_processing_options_are_checked(tmp_path):
     with pytest.raises(ArgumentError, match=r"quarantine folder .* does not exist"):
         ProcessingOptions(publish=ANY, quarantine=tmp_path / "missing")
     with pytest.raises(ArgumentError, match="dtype 'float64' is unknown"):
@@ -322,14 +322,14 @@ def test_what_is_asked_for_is_checked(tmp_path):
 
 
 class TestChoice:
-    def test_all_cores_for_each_while_there_is_time(self):
+    def test_idle_machine_uses_all_cores_per_measurement(self):
         choice = Choice(2, 2)
         choice.seed(0.010, 0.016)
         assert not choice.look(0.0, 50.0)
         assert choice.mode == Mode(1, 2)
         assert "50%" in choice.why
 
-    def test_several_at_once_where_that_gets_more_done(self):
+    def test_loaded_machine_processes_several_at_once(self):
         choice = Choice(2, 2)
         choice.seed(0.010, 0.016)
         assert choice.look(0.0, 90.0)
@@ -338,20 +338,20 @@ class TestChoice:
         assert choice.look(4.0, 10.0)
         assert choice.mode == Mode(1, 2)
 
-    def test_all_cores_for_each_where_several_at_once_get_less_done(self):
+    def test_all_cores_per_measurement_if_parallel_jobs_are_slower(self):
         choice = Choice(2, 2)
         choice.seed(0.010, 0.030)
         assert not choice.look(0.0, 200.0)
         assert choice.mode == Mode(1, 2)
 
-    def test_times_of_jobs_count_more_than_those_before(self):
+    def test_recent_job_times_weigh_more(self):
         choice = Choice(2, 2)
         choice.seed(0.010, 0.016)
         for _ in range(8):
             choice.took(Mode(1, 2), 0.020)
         assert choice.look(0.0, 45.0)
 
-    def test_one_worker_has_no_choice(self):
+    def test_single_worker_uses_all_cores(self):
         choice = Choice(1, 4)
         choice.seed(0.010, 0.010)
         assert not choice.look(0.0, 1000.0)

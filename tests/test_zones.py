@@ -40,7 +40,7 @@ def test_zones_hold_every_range_once(first_m, step_m, n_ranges, count):
         assert nearest_m * (1 - 1e-9) <= distance_m <= max(range_m[stop - 1], 1e-3) * (1 + 1e-9)
 
 
-def test_curvature_changes_alike_over_all_zones():
+def test_curvature_changes_equally_over_all_zones():
     range_m = np.arange(0.1, 5.0, 0.0001)
     zones = zone_edges(range_m, 20)
     assert len(zones) == 20
@@ -75,7 +75,7 @@ def test_near_ranges_are_within_the_budget(budget_db, precision):
     assert error_db(settings, image.amplitude, spherical=True) < budget_db
 
 
-def test_interpolated_beams_are_within_the_budget_as_well():
+def test_interpolated_beams_are_within_the_budget():
     settings = tuned(NEAR, beam_taps=4, max_error_db=-40.0).replace(array=LINE)
     settings = settings.replace(processing=NEAR.processing.replace(directions="2d:31"))
     pipeline, measurement = Pipeline(settings), noise(settings)
@@ -84,7 +84,7 @@ def test_interpolated_beams_are_within_the_budget_as_well():
     assert error_db(settings, image.amplitude, spherical=True) < -40
 
 
-def test_plane_waves_are_not():
+def test_plane_waves_exceed_the_budget_at_near_ranges():
     """They are what they should be themselves, and wrong of points at such ranges."""
     settings = NEAR.replace(processing=NEAR.processing.replace(wavefront="plane"))
     pipeline, measurement = Pipeline(settings), noise(settings)
@@ -93,7 +93,7 @@ def test_plane_waves_are_not():
     assert error_db(settings, image, spherical=True) > -20
 
 
-def test_a_near_echo_is_as_bright_as_a_far_one():
+def test_near_echo_is_as_bright_as_a_far_one():
     """Of a point at 15 cm, which plane waves lose a part of."""
     words = echo_words(NEAR, azimuth_deg=20.0, range_m=0.15, level=0.1, spherical=True)
     brightest = {}
@@ -111,7 +111,7 @@ def test_a_near_echo_is_as_bright_as_a_far_one():
     assert brightest["plane"] < 0.9 * brightest["spherical"]
 
 
-def test_the_planner_takes_no_more_zones_than_it_needs():
+def test_planner_uses_the_fewest_zones():
     """More for less error, few for far ranges, one where waves are plane."""
     counts = {}
     for name, range_m, budget_db in (

@@ -81,7 +81,7 @@ class WritableJournal(ReadableJournal):
 
         Parameters
         ----------
-        entries : sequence of Entry
+        entries : sequence of JournalEntry
             Measurements of any sensors in any order. The sequence numbers of a sensor rise within a session. ``crc32``
             is filled in if it is None.
 

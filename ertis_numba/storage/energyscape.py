@@ -178,7 +178,7 @@ class EnergyscapeWriter(FileWriter[Energyscape]):
         super()._finish(file)
         self._require_sensors("mounting", self._given)
 
-    def _truth_of(self, sensor: str, group: h5py.Group) -> GroundTruth | GroundTruthLog | None:
+    def _sensor_truth(self, sensor: str, group: h5py.Group) -> GroundTruth | GroundTruthLog | None:
         given = super()._sensor_truth(sensor, group)
         if given is not None or sensor not in self._recorded:
             return given

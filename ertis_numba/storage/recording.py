@@ -290,7 +290,7 @@ class RecordingReader(FileReader[Measurement]):
     translation_m: NDArray[np.float64] | None
     rotation_xyzw: NDArray[np.float64] | None
 
-    def _look(self) -> None:
+    def _select_table(self) -> None:
         self._data, self._table = _data_and_table(pdm="pcm" not in self._group)
 
     def _load(self) -> None:

@@ -192,7 +192,7 @@ class _SealingWriter(RecordingWriter):
         """Store a description of losses that no gap covers."""
         self._attributes[JOURNAL_DAMAGE] = damage
 
-    def _require_words(self, item: Measurement) -> None:
+    def _require_samples(self, item: Measurement) -> None:
         """Accept all samples: the journal has checked their type; non-finite numbers must not prevent sealing."""
 
     def _require_sensors(self, name: str, given: Iterable[str]) -> None:

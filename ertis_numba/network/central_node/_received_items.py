@@ -38,7 +38,7 @@ class ReceivedItem:
     run : SensorSession
     first, last : int
         Numbers acknowledged once it is stored.
-    what : Entry or JournalGap
+    what : JournalEntry or JournalGap
     source : JournalSensor
         Sensor for the journal.
     arrived_s : float

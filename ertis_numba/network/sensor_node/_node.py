@@ -151,13 +151,13 @@ class SensorNode:
 
         Parameters
         ----------
-        entries : sequence of Entry
+        entries : sequence of JournalEntry
             Measurements of any sensors in any order, whose data must not change any more. The sequence numbers of a
             sensor rise within a session. ``crc32`` is filled in if it is None.
 
         Returns
         -------
-        list of Entry
+        list of JournalEntry
             Kept measurements; the others have become gaps, because the spool is full.
 
         Raises

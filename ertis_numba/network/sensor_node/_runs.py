@@ -31,7 +31,7 @@ class UnackedItem:
         Reason of a gap; empty for a measurement.
     n_bytes : int
         Size of its data.
-    entry : Entry or None
+    entry : JournalEntry or None
         The measurement, if it is in memory.
     """
 
