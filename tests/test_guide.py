@@ -25,7 +25,7 @@ RUN_BY = {
     ("applications", "$"): ["test_applications_page::test_commands"],
     ("applications", "python"): ["test_applications_page::test_loop"],
     ("beamformers", "$"): ["test_guide::test_commands_of_a_page"],
-    ("command-line", "$"): ["test_config::test_the_page_says_how", "test_config::test_completion_for_each_shell"],
+    ("command-line", "$"): ["test_config::test_command_line_page_example_works", "test_config::test_completion_prints_a_script_for_each_shell"],
     ("concepts", "python"): ["test_guide::test_python_on_concepts"],
     ("cuda", "$"): ["test_guide::test_commands_on_cuda"],
     ("cuda", "python"): ["test_guide::test_python_on_cuda"],
