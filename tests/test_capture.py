@@ -42,7 +42,7 @@ def words():
     return [np.ascontiguousarray(whole[start : start + SHORT]) for start in range(0, 4 * SHORT, SHORT)]
 
 
-class Dropping(Faults):
+class DropFaults(Faults):
     """Faults that drop the measurements with some numbers."""
 
     def __init__(self, counters):
@@ -63,7 +63,7 @@ class Capture:
         self.emulators = [
             stack.enter_context(
                 Emulator(
-                    words, name=name, link=folder / name, log=self.log, faults=Dropping((dropped or {}).get(name, ()))
+                    words, name=name, link=folder / name, log=self.log, faults=DropFaults((dropped or {}).get(name, ()))
                 )
             )
             for name in names
@@ -125,7 +125,7 @@ def test_capture_stores_the_samples_that_were_sent(captures, words):
         times_ns = np.array([stamp.timestamp_ns for stamp in recording.stamps()])
         sent_ns = [json.loads(entry)["time_ns"] for entry in capture.log.getvalue().splitlines()]
         late_ms = (times_ns + 1e9 * SETTINGS.recording.duration_s - sent_ns) / 1e6
-        assert np.median(late_ms) == pytest.approx(0, abs=6)  # stamped when sent, once the recording time is added
+        assert np.median(late_ms) == pytest.approx(0, abs=6)  # the stamp plus the recording time is the sending time
         assert np.median(np.diff(times_ns)) / 1e6 == pytest.approx(50, abs=20)  # wide enough for a busy machine
         assert all(0 < stamp.timestamp_uncertainty_ns < 1e8 for stamp in recording.stamps())
         assert recording.settings.recording == SETTINGS.recording
@@ -186,7 +186,7 @@ def test_sync_capture_ends_when_last_measurement_is_lost(captures):
     assert capture.session.counts["one"].lost == 2
 
 
-class Deaf:
+class PulseIgnorer:
     """An emulated sensor that ignores the SYNC pulses with some numbers."""
 
     def __init__(self, emulator, pulses):
@@ -199,14 +199,14 @@ class Deaf:
 def test_gap_reasons_distinguish_dropped_measurements_from_missed_pulses(captures):
     capture = captures(trigger="sync", names=("one", "two"), n=10, dropped={"two": (4,)})
     one, two = capture.emulators
-    with SyncChain([one, Deaf(two, {6})], rate_hz=10.0):
+    with SyncChain([one, PulseIgnorer(two, {6})], rate_hz=10.0):
         capture.session.run(capture.journal)
     with capture.recording("two") as recording:
         reasons = {gap.reason for gap in recording.gaps}
     assert reasons == {DROPPED, NOT_TRIGGERED}
 
 
-class Ordered:
+class OrderRecorder:
     """A sink that forwards all calls to a journal and records the order of the numbers."""
 
     def __init__(self, journal):
@@ -230,7 +230,7 @@ class Ordered:
 def test_capture_passes_gaps_and_measurements_in_order(captures):
     """The pulses of the second sensor are known only from its third block, so gaps and measurements come together."""
     capture = captures(trigger="sync", names=("one", "two"), n=8, dropped={"two": (1,)})
-    sink = Ordered(capture.journal)
+    sink = OrderRecorder(capture.journal)
     with SyncChain(capture.emulators, rate_hz=20.0):
         capture.session.run(sink)
     assert capture.session.counts["two"].lost >= 1

@@ -78,7 +78,7 @@ def run(tmp_path, *arguments, **options):
     return process.returncode, [json.loads(line) for line in out.splitlines()], err
 
 
-def checks(central):
+def held_crc32(central):
     """CRC-32 of each measurement that a central node holds, by sensor, session and number."""
     return {
         (*key, number): message.crc32 for key, held in central.held.items() for number, (message, _) in held.items()
@@ -106,14 +106,14 @@ def test_capture_to_delivers_measurements_of_two_sensors(tmp_path, words):
         )
         hellos = {hello.sensor: hello for hello, _ in central.hellos.queue}
     assert code == 0, err
-    assert kept(events) == checks(central)
+    assert kept(events) == held_crc32(central)
     times = {(name, session_id, number): message.timestamp_ns for (name, session_id), held in central.held.items()
              for number, (message, _) in held.items()}  # fmt: skip
     assert times == kept(events, "timestamp_ns")
     assert all(each["uncertainty_ns"] > 0 for each in events if each["event"] == "kept")
     (session_id,) = {session_id for _, session_id, _ in kept(events)}
     given = {"one": words, "two": words[::-1]}
-    assert checks(central) == {
+    assert held_crc32(central) == {
         (name, session_id, number): zlib.crc32(each.tobytes())
         for name, several in given.items()
         for number, each in enumerate(several)
@@ -165,8 +165,8 @@ def test_capture_to_sends_spooled_measurements_next_time(tmp_path):
     with StandIn() as central:
         code, second, err = run(tmp_path, "--to", central.address, "--spool", "spool", "-n", 2)
     assert code == 0, err
-    assert kept(first) | kept(second) == checks(central)
-    assert len(checks(central)) == 5
+    assert kept(first) | kept(second) == held_crc32(central)
+    assert len(held_crc32(central)) == 5
     assert not list((tmp_path / "spool").iterdir())
 
 
@@ -216,8 +216,8 @@ def test_capture_to_loses_nothing_on_sigterm_or_sigkill(tmp_path, kill):
             code, more, err = run(tmp_path, "--to", central.address, "--spool", "spool", "-n", 1)
             assert code == 0, err
             events += more
-    assert kept(events).items() <= checks(central).items()
-    assert len(checks(central)) <= len(kept(events)) + kill
+    assert kept(events).items() <= held_crc32(central).items()
+    assert len(held_crc32(central)) <= len(kept(events)) + kill
     assert not list((tmp_path / "spool").iterdir())
 
 

@@ -140,7 +140,7 @@ def test_changed_air_stays_in_one_recording(tmp_path):
     assert stored(tmp_path)[0] == wanted(given)
 
 
-WRONG = {
+INVALID_MEASUREMENTS = {
     "before its hello": ({"session_id": 6}, "hello", "send hello first"),
     "too short": ({"words": b"1234"}, "message", "a measurement has 4 bytes, but its settings give 4096"),
     "of do not match": ({"crc32": 1}, "message", "does not match"),
@@ -148,9 +148,9 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("what", WRONG)
+@pytest.mark.parametrize("what", INVALID_MEASUREMENTS)
 def test_invalid_measurement_is_refused_with_its_reason(what, tmp_path):
-    changes, code, reason = WRONG[what]
+    changes, code, reason = INVALID_MEASUREMENTS[what]
     given = entries(2)
     with running(tmp_path) as central, Node(central.address) as node:
         node.hello()
@@ -164,7 +164,7 @@ def test_invalid_measurement_is_refused_with_its_reason(what, tmp_path):
     assert stored(tmp_path)[0] == wanted(given)
 
 
-HELLOS = {
+INVALID_HELLOS = {
     "settings of do not match": ({"settings_crc32": 1}, "do not match"),
     "no settings": ({"settings": b"["}, "settings of sensor left"),
     "no text": ({"settings": b"\xff"}, "not text"),
@@ -178,9 +178,9 @@ HELLOS = {
 }
 
 
-@pytest.mark.parametrize("what", HELLOS)
+@pytest.mark.parametrize("what", INVALID_HELLOS)
 def test_hello_with_invalid_settings_is_refused(what, tmp_path):
-    changes, reason = HELLOS[what]
+    changes, reason = INVALID_HELLOS[what]
     with running(tmp_path) as central, Node(central.address) as node:
         refused = node.hello(**changes)
         assert isinstance(refused, Refused)

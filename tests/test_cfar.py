@@ -146,7 +146,7 @@ def test_false_alarm_rate_in_images_of_one_bit_noise(false_alarm):
     assert np.mean(shares) == pytest.approx(false_alarm, abs=3 * deviation + 0.1 * false_alarm)
 
 
-def places_of(place, count, *, step=2, guard=11):
+def reference_indices(place, count, *, step=2, guard=11):
     """Indices of the reference bins of a range: the nearest ones, half on each side if both sides have room."""
     before = [place - guard - step * n for n in range(1, 200) if place - guard - step * n >= 0]
     behind = [place + guard + step * n for n in range(1, 200) if place + guard + step * n < count]
@@ -160,7 +160,7 @@ def test_reference_bins_are_the_nearest_beyond_the_guard():
     count = image.amplitude.shape[1]
     places = _reference(image, N)
     for place in range(count):
-        assert places[:, place].tolist() == places_of(place, count), place
+        assert places[:, place].tolist() == reference_indices(place, count), place
         assert (places[:, place] == count - 1 - places[::-1, count - 1 - place]).all(), place  # mirrored
     assert places[:, 0].min() == 13
 
@@ -174,7 +174,7 @@ def test_cfar_equals_a_bin_by_bin_reference(method):
     alpha, count = threshold_factor(method, N, 1e-2), image.amplitude.shape[1]
     above = np.zeros(image.amplitude.shape)
     for direction, place in np.ndindex(above.shape):
-        power = image.amplitude[direction, places_of(place, count)].astype(float) ** 2
+        power = image.amplitude[direction, reference_indices(place, count)].astype(float) ** 2
         reported = {
             "ordered_statistic": np.sort(power)[23],
             "cell_averaging": power.mean(),

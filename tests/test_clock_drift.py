@@ -19,7 +19,7 @@ def test_own_echoes_shift_by_drift_times_delay():
     assert ways(scene, "clock_drift")[0].stretch is None  # the call and the record share one clock
 
 
-def of_two(listener_ppm, emitter_ppm, **more):
+def scene_of_two(listener_ppm, emitter_ppm, **more):
     """A scene with a sensor that receives the call of another sensor 0.5 m away."""
     receiver = EAR.replace(electronics=Electronics(clock_drift_ppm=listener_ppm), emitter=Emitter(silent=True))
     transmitter = EAR.replace(
@@ -30,10 +30,8 @@ def of_two(listener_ppm, emitter_ppm, **more):
 
 @pytest.mark.parametrize(("listener_ppm", "emitter_ppm"), [(50, 0), (0, 50), (-30, 40), (80, 80)])
 @pytest.mark.parametrize(("sync_every", "index", "since_s"), [(1, 3, 0.0), (10, 0, 0.0), (10, 3, 0.15), (2, 3, 0.05)])
-def test_other_calls_shift_by_drift_times_time_since_sync(
-    listener_ppm, emitter_ppm, sync_every, index, since_s
-):
-    scene = of_two(listener_ppm, emitter_ppm, count=20, sync_every=sync_every)
+def test_other_calls_shift_by_drift_times_time_since_sync(listener_ppm, emitter_ppm, sync_every, index, since_s):
+    scene = scene_of_two(listener_ppm, emitter_ppm, count=20, sync_every=sync_every)
     listener, emitter = 1e-6 * listener_ppm, 1e-6 * emitter_ppm
     [found] = ways(scene, "cross_emission", "clock_drift", index=index)
     way_s = 0.5 / SPEED_M_S
@@ -48,14 +46,14 @@ def test_other_calls_shift_by_drift_times_time_since_sync(
 
 
 def test_other_calls_are_stretched_by_the_drift_ratio():
-    scene = of_two(500.0, -500.0)
+    scene = scene_of_two(500.0, -500.0)
     [found] = ways(scene, "cross_emission", "clock_drift")
     signals = heard(scene, "cross_emission", "clock_drift")
     assert error_db(signals, written_out(EAR.call, found.delay_s, 1.0, 40_000, stretch=1.0005 / 0.9995)) < -60
 
 
 def test_other_calls_that_end_before_the_record_are_omitted():
-    scene = of_two(-500.0, 500.0, count=1000, sync_every=1000)
+    scene = scene_of_two(-500.0, 500.0, count=1000, sync_every=1000)
     assert heard(scene, "cross_emission", "clock_drift", index=0).any()
     assert not heard(scene, "cross_emission", "clock_drift", index=900).any()
 

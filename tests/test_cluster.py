@@ -54,7 +54,7 @@ def events_of(runner, count=1):
     return found
 
 
-def give(runner, job):
+def submit_when_possible(runner, job):
     """Submit a job as soon as a worker can accept it."""
     end_s = time.monotonic() + LONG_S
     while not runner.takes(job.kind) and time.monotonic() < end_s:
@@ -176,13 +176,13 @@ def test_cluster_abandons_jobs_after_their_deadline(scheduler, measurement):
     kind = kind_of(measurement)
     runner.prepare(kind)
     events_of(runner)
-    give(runner, job_of(measurement, 0, kind))
+    submit_when_possible(runner, job_of(measurement, 0, kind))
     (event,) = events_of(runner)
     assert isinstance(event, Lost)
     assert event.again
     assert "deadline" in event.text
     assert any("gets no more jobs: it missed the deadline" in text for text in stated)
-    give(runner, job_of(measurement, 1, kind))  # the worker is reachable again, or another accepts the job
+    submit_when_possible(runner, job_of(measurement, 1, kind))  # the worker is reachable again, or another accepts
     runner.close()
 
 

@@ -196,7 +196,7 @@ def test_compare_accepts_small_images(n_ranges):
     assert counts(compare(small, [MIDDLE]))[:2] == (0, 0)
 
 
-def test_errors_of_averages_over_several_images():
+def test_errors_of_combines_several_images():
     first, second = compare(ideal(MIDDLE), [MIDDLE]), compare(ideal(MIDDLE), [RIGHT])
     errors = errors_of([first, second])
     assert (errors.measurements, errors.matched, errors.missed, errors.false) == (2, 1, 1, 1)

@@ -189,7 +189,7 @@ def test_inapplicable_option_is_refused_only_if_typed(images, tmp_path):
         assert done.returncode == 0, done.stderr
 
 
-def test_command_line_page_example_works(tmp_path):
+def test_command_line_page_runs(tmp_path):
     """The test runs the file and the commands of the page verbatim."""
     page = path_of("command-line").read_text("utf-8")
     (tmp_path / "ertis.toml").write_text(page.split("```toml\n")[1].split("```")[0])
@@ -242,7 +242,7 @@ def test_bash_completes_commands_options_and_values(tmp_path, line, wanted):
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_completion_prints_a_script_for_each_shell(tmp_path, shell):
+def test_completion_for_each_shell(tmp_path, shell):
     done = ertis("completion", shell, folder=tmp_path)
     assert done.returncode == 0
     assert "_ERTIS_COMPLETE" in done.stdout

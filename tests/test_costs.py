@@ -16,7 +16,7 @@ CPU = kernels.load("cpu")
 
 @pytest.fixture
 def measured(monkeypatch, tmp_path):
-    """A folder of its own, nothing known, and a list that tells how often costs were measured."""
+    """An empty cache folder, no costs in memory, and a list of the measurements made."""
     found = costs.measured_costs(CPU, 1)
     times = []
 

@@ -10,10 +10,10 @@ SHORTEST_S = 0.04
 REGULAR = [0.05 * index for index in range(40)]
 IRREGULAR = np.cumsum(0.041 + np.random.default_rng(5).exponential(0.1, 40)).tolist()
 FIRST = 2**32 - 17  # the counter wraps around
-ANEW = 10**9
+RESET = 10**9
 
 
-def heard(stream, **changes):
+def receive_all(stream, **changes):
     """Return the numbers accepted from (time, bytes) pairs, including those of finish(), and the receiver."""
     receiver = BlockReceiver(N_SAMPLES, **{"expected": FIRST, "shortest_s": SHORTEST_S} | changes)
     found = [block for time_s, data in stream for block in receiver.feed(data, at(time_s))]
@@ -46,7 +46,7 @@ def test_receiver_rejects_counter_with_a_flipped_bit(times_s, bit):
     damaged = bytearray(stream[20][1])
     damaged[4 + bit // 8] ^= 1 << bit % 8
     stream[20] = (stream[20][0], bytes(damaged))
-    found, receiver = heard(stream)
+    found, receiver = receive_all(stream)
     assert found == [index for index in range(40) if index != 20]
     assert receiver.rejected_blocks == {"counter": 1}
     assert receiver.lost == 1
@@ -59,7 +59,7 @@ def test_receiver_loses_only_the_block_with_a_damaged_frame(times_s, place):
     damaged = bytearray(stream[20][1])
     damaged[place] ^= 0x5A
     stream[20] = (stream[20][0], bytes(damaged))
-    found, receiver = heard(stream)
+    found, receiver = receive_all(stream)
     assert found == [index for index in range(40) if index != 20]
     assert receiver.rejected == {"no header" if place < 4 else "footer": N_BYTES}
     assert receiver.lost == 1
@@ -73,7 +73,7 @@ def test_receiver_accepts_blocks_after_missing_ones(times_s, n_missing, first):
         n_missing = 3
     stream = stream_of(times_s)
     del stream[first : first + n_missing]
-    found, receiver = heard(stream)
+    found, receiver = receive_all(stream)
     assert found == [index for index in range(40) if not first <= index < first + n_missing]
     assert not receiver.rejected
     assert receiver.lost in ({n_missing} if first else {n_missing - 1, n_missing})
@@ -108,16 +108,16 @@ def test_receiver_holds_uncertain_number_until_confirmed():
 
 
 def test_receiver_follows_a_counter_reset():
-    stream = stream_of(REGULAR)[:20] + [(time_s, block_of(ANEW + index)) for index, time_s in enumerate(REGULAR[20:])]
-    found, receiver = heard(stream)
-    assert found == [*range(20), *range(ANEW + 17, ANEW + 17 + 20)]
+    stream = stream_of(REGULAR)[:20] + [(time_s, block_of(RESET + index)) for index, time_s in enumerate(REGULAR[20:])]
+    found, receiver = receive_all(stream)
+    assert found == [*range(20), *range(RESET + 17, RESET + 17 + 20)]
     assert receiver.lost == 0
 
 
 def test_receiver_recovers_from_a_wrong_first_number():
     stream = stream_of(REGULAR)
     stream[0] = (0.0, block_of(FIRST + 2**20))
-    found, _ = heard(stream, expected=None)
+    found, _ = receive_all(stream, expected=None)
     assert found == [2**20, *range(1, 40)]
 
 
@@ -131,15 +131,15 @@ SPARSE = np.cumsum(0.2 + np.random.default_rng(6).exponential(0.2, 40)).tolist()
 
 
 def test_receiver_accepts_blocks_between_stray_bytes():
-    found, receiver = heard(with_strays(stream_of(SPARSE)))
+    found, receiver = receive_all(with_strays(stream_of(SPARSE)))
     assert found == list(range(40))
     assert receiver.lost == 0
 
 
 def test_receiver_follows_counter_reset_between_stray_bytes():
-    stream = stream_of(SPARSE)[:5] + [(time_s, block_of(ANEW + index)) for index, time_s in enumerate(SPARSE[5:])]
-    found, receiver = heard(with_strays(stream))
-    assert found == [*range(4), *range(ANEW + 17, ANEW + 17 + 35)]  # the last block before the reset stays uncertain
+    stream = stream_of(SPARSE)[:5] + [(time_s, block_of(RESET + index)) for index, time_s in enumerate(SPARSE[5:])]
+    found, receiver = receive_all(with_strays(stream))
+    assert found == [*range(4), *range(RESET + 17, RESET + 17 + 35)]  # the last block before the reset stays uncertain
     assert receiver.lost == 0
 
 
@@ -157,13 +157,13 @@ def test_receiver_accepts_numbers_in_steps_of_two(times_s):
     """The sensor counts all pulses but measures on every second one from some moment on."""
     stream = stream_of(times_s)[:10]
     stream += [(time_s, block_of(FIRST + 10 + 2 * index)) for index, time_s in enumerate(times_s[10:])]
-    found, receiver = heard(stream)
+    found, receiver = receive_all(stream)
     assert found == [*range(10), *range(10, 70, 2)]
     assert receiver.lost == 29
     assert not receiver.rejected
 
 
-def test_receiver_accepts_two_consistent_blocks_around_a_damaged_one():
+def test_receiver_accepts_consistent_blocks_around_a_damaged_one():
     receiver = BlockReceiver(N_SAMPLES, expected=FIRST, shortest_s=SHORTEST_S)
     for index, (time_s, data) in enumerate(stream_of(IRREGULAR)[:24]):
         if index != 20:
@@ -175,7 +175,7 @@ def test_receiver_keeps_a_true_number_among_wrong_ones():
     stream = stream_of(IRREGULAR)
     for index, wrong in ((22, 2**20), (23, 2**21), (24, 2**29)):
         stream[index] = (stream[index][0], block_of(FIRST + index + wrong))
-    found, receiver = heard(stream[:20] + stream[21:])
+    found, receiver = receive_all(stream[:20] + stream[21:])
     assert found == [index for index in range(40) if index not in {20, 22, 23, 24}]
     assert receiver.rejected_blocks == {"counter": 3}
 
@@ -187,15 +187,15 @@ def test_receiver_rejects_reused_number_of_a_damaged_block(times_s):
     stream[20] = (stream[20][0], stream[20][1][:-9])
     stream[21] = (stream[21][0], block_of(FIRST + 20, np.zeros(N_SAMPLES)))
     expected = [index for index in range(40) if index not in {20, 21}]
-    assert heard(stream)[0] == expected
-    assert heard(stream[:22] + stream[23:])[0] == [index for index in expected if index != 22]
+    assert receive_all(stream)[0] == expected
+    assert receive_all(stream[:22] + stream[23:])[0] == [index for index in expected if index != 22]
 
 
 def test_finish_rejects_reused_number_of_a_damaged_block():
     stream = stream_of(REGULAR)
     stream[20] = (stream[20][0], stream[20][1][:-9])
     stream[21] = (stream[21][0], block_of(FIRST + 20))
-    assert heard(stream[:22])[0] == list(range(20))
+    assert receive_all(stream[:22])[0] == list(range(20))
 
 
 def test_receiver_does_not_count_late_bytes_as_a_trigger():
@@ -211,21 +211,21 @@ def test_receiver_does_not_count_late_bytes_as_a_trigger():
 def test_finish_counts_blocks_of_one_burst_by_their_bytes():
     """After a pause of the program, a dozen damaged blocks and a whole one arrive together."""
     waiting = b"".join(block_of(FIRST + index)[:-1] for index in range(1, 13))
-    assert heard([(0, block_of(FIRST)), (0, waiting + block_of(FIRST + 13))])[0] == [0, 13]
+    assert receive_all([(0, block_of(FIRST)), (0, waiting + block_of(FIRST + 13))])[0] == [0, 13]
 
 
 def test_receiver_rejects_repeated_blocks():
     stream = stream_of(REGULAR)
-    found, receiver = heard([(time_s, 2 * data) for time_s, data in stream])
+    found, receiver = receive_all([(time_s, 2 * data) for time_s, data in stream])
     assert found == list(range(40))
     assert receiver.rejected_blocks == {"counter": 40}
 
 
 def test_finish_accepts_only_plausible_numbers():
     stream = stream_of(IRREGULAR)
-    assert heard([*stream[:20], stream[21]])[0] == [*range(20), 21]
-    assert heard([*stream[:20], stream[30]])[0] == list(range(20))
-    found, receiver = heard([*stream[:20], (stream[20][0], block_of(FIRST + 120))])
+    assert receive_all([*stream[:20], stream[21]])[0] == [*range(20), 21]
+    assert receive_all([*stream[:20], stream[30]])[0] == list(range(20))
+    found, receiver = receive_all([*stream[:20], (stream[20][0], block_of(FIRST + 120))])
     assert found == list(range(20))
     assert receiver.rejected == {"counter": N_BYTES}
 
@@ -233,7 +233,7 @@ def test_finish_accepts_only_plausible_numbers():
 def test_finish_accepts_the_next_number_after_stray_bytes():
     stream = stream_of(IRREGULAR)[:20]
     stray = [(stream[19][0] - 0.04, b"s"), (stream[19][0] - 0.005, b"s")]
-    assert heard([*stream[:19], *stray, stream[19]])[0] == list(range(20))
+    assert receive_all([*stream[:19], *stray, stream[19]])[0] == list(range(20))
 
 
 @pytest.mark.parametrize(("first", "taken"), [(-1, False), (0, True), (1, True), (2, False), (2**31, False)])
@@ -296,7 +296,7 @@ def test_receiver_rejects_block_with_implausible_samples():
 
     stream = stream_of(REGULAR)
     stream[20] = (stream[20][0], block_of(FIRST + 20, [0] * N_SAMPLES))
-    found, receiver = heard(stream, bits=reason)
+    found, receiver = receive_all(stream, bits=reason)
     assert found == [index for index in range(40) if index != 20]
     assert receiver.rejected == {"too quiet": N_BYTES}
     assert receiver.rejected_blocks == {"too quiet": 1}

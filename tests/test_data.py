@@ -115,7 +115,7 @@ CALLED_FOR = {
 SCENES = sorted(CALLED_FOR)
 
 
-def told_of(name):
+def page_text_of(name):
     """Return the text of the page about a scene, between its markers."""
     return PAGE.partition(f"<!-- scene {name} -->")[2].partition(f"<!-- /scene {name} -->")[0]
 
@@ -141,7 +141,7 @@ def test_gallery_update_rejects_page_without_markers():
 
 
 @functools.cache
-def begun(name):
+def scene_and_plan(name):
     """Return the scene and the plan of its first measurement; later measurements may need more effects."""
     scene = load_scene(FOLDER / "scenes" / f"{name}.toml")
     return scene, make_plan(scene.replace(count=1))
@@ -149,17 +149,17 @@ def begun(name):
 
 @pytest.mark.parametrize("name", SCENES)
 def test_gallery_page_lists_active_effects_of_each_scene(name):
-    reported = dict(re.findall(r"^\| `(\w+)` \| (on|off) \|", told_of(name), re.MULTILINE))
+    reported = dict(re.findall(r"^\| `(\w+)` \| (on|off) \|", page_text_of(name), re.MULTILINE))
     on = {effect for effect, state in reported.items() if state == "on"}
     assert CALLED_FOR[name] <= on
-    scene, plan = begun(name)
+    scene, plan = scene_and_plan(name)
     assert not scene.effects
     assert plan.active <= on
 
 
 @pytest.mark.parametrize("name", SCENES)
 def test_image_of_gallery_scene_shows_most_reflectors(name):
-    scene, plan = begun(name)
+    scene, plan = scene_and_plan(name)
     for sensor in scene.sensors:
         simulator = Simulator(scene, sensor=sensor.name, plan=plan)
         assert 1e-3 < np.abs(simulator.signals()).max() < 0.5  # higher levels overload the modulators
