@@ -136,7 +136,7 @@ def test_false_alarm_rate_beside_a_strong_reflector(method, false_alarm):
 
 @pytest.mark.parametrize("false_alarm", [1e-2, 1e-3])
 def test_false_alarm_rate_in_images_of_one_bit_noise(false_alarm):
-    """Images of microphones without a signal, whose ranges lie closer than the resolution."""
+    """Images of microphones without a signal. Their ranges lie closer than the resolution."""
     settings = Settings(
         recording=Recording(n_samples=65_536), processing=Processing(directions="2d:9", range_m=(0.3, 2.0))
     )

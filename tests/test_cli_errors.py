@@ -20,7 +20,7 @@ from tests.files import image, noise
 N_BYTES = 4 * 65_536
 RAW = "import {} -o out.h5 --layout eRTIS_v3D1 --preset short_25_50"
 CASES = {
-    # raw words
+    # raw samples
     "missing raw file": (RAW.format("none.bin"), 1, "none.bin: No such file or directory"),
     "empty raw file": (RAW.format("empty.bin"), 1, "empty.bin is empty, wanted a multiple of 262144"),
     "odd raw file": (RAW.format("odd.bin"), 1, "odd.bin has 262143 bytes, which is not a multiple of a word"),
@@ -128,7 +128,7 @@ CASES = {
     "output is a folder": ("process rec.h5 -o folder --force", 1, "output folder is a folder; give the name of a file"),
     "no such folder": ("process rec.h5 -o none/out.h5", 1, "output none/out.h5: folder none does not exist; create it"),
     "output is the input": ("process rec.h5 -o rec.h5 --force", 1, "output rec.h5 is the input itself; give"),
-    # looking
+    # views of files
     "no such measurement": ("plot img.h5 -o out.png -m 7", 1, "--measurement is 7; give a whole number from 0 to 0"),
     "negative measurement": ("peaks img.h5 -m -1", 1, "--measurement is -1; give a whole number from 0 to 0"),
     "no peaks": ("peaks img.h5 --top 0", 1, "--top is 0; give a whole number of at least 1"),
@@ -139,7 +139,7 @@ CASES = {
     "a folder": ("plot folder", 1, "folder is a folder; give a recording or an energyscape file"),
     "picture format": ("plot img.h5 -o out.bmp", 1, "picture format '.bmp' is unknown; known are .pdf, .png, .svg"),
     "dynamic range": ("plot img.h5 -o out.png --dynamic-range -5", 1, "--dynamic-range is -5; give a number above 0"),
-    # sensors and truth
+    # sensors and ground truth
     "which sensor": ("plot two.h5 -o out.png", 1, "two.h5 contains 2 sensors; choose one of left, right (--sensor)"),
     "no such sensor to process": ("process rec.h5 -o out.h5 --sensor x", 1, "has no sensor 'x'; choose one of eRTIS-7"),
     "no such sensor to plot": ("plot two.h5 -o out.png --sensor x", 1, "no sensor 'x'; choose one of left, right"),

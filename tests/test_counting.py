@@ -1,4 +1,4 @@
-"""Block numbers that a receiver accepts: all that were sent, and no others."""
+"""Block numbers accepted by a receiver: all numbers that were sent, and no others."""
 
 import numpy as np
 import pytest
