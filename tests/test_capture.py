@@ -1,4 +1,4 @@
-"""Captures from emulated sensors on real pseudo terminals: what is stored is what was sent, whatever happens."""
+"""Captures from emulated sensors on real pseudo terminals: stored samples equal sent samples under every fault."""
 
 import contextlib
 import io
@@ -29,7 +29,7 @@ from ertis_numba.storage.sealing import seal
 
 ROOT = Path(__file__).parents[1]
 ERTIS = (sys.executable, "-m", "ertis_cli")
-SHORT = 32_768  # the shortest measurement that a sensor can
+SHORT = 32_768  # the shortest measurement of a sensor
 SETTINGS = Settings(recording=Recording(n_samples=SHORT)).replace(
     processing=Settings().processing.replace(range_m=(0.1, 0.5))
 )
@@ -37,13 +37,13 @@ SETTINGS = Settings(recording=Recording(n_samples=SHORT)).replace(
 
 @pytest.fixture(scope="module")
 def words():
-    """Four measurements, different parts of a simulated one."""
+    """Four measurements cut from one simulated measurement."""
     whole = open_recording(ROOT / "data" / "synthetic" / "reflectors.h5")[0].data
     return [np.ascontiguousarray(whole[start : start + SHORT]) for start in range(0, 4 * SHORT, SHORT)]
 
 
-class Dropping(Faults):
-    """Loses the measurements with some numbers."""
+class DropFaults(Faults):
+    """Faults that drop the measurements with some numbers."""
 
     def __init__(self, counters):
         super().__init__()
@@ -56,14 +56,14 @@ class Dropping(Faults):
 
 
 class Capture:
-    """Emulated sensors, the driver, a journal, and what became of it."""
+    """Emulated sensors, their drivers, a journal, and a record of all callbacks."""
 
     def __init__(self, stack, folder, words, *, trigger="command", names=("one",), dropped=None, **options):
         self.log = io.StringIO()
         self.emulators = [
             stack.enter_context(
                 Emulator(
-                    words, name=name, link=folder / name, log=self.log, faults=Dropping((dropped or {}).get(name, ()))
+                    words, name=name, link=folder / name, log=self.log, faults=DropFaults((dropped or {}).get(name, ()))
                 )
             )
             for name in names
@@ -113,7 +113,7 @@ def captures(tmp_path, words):
 
 
 @pytest.mark.alone
-def test_what_is_stored_is_what_was_sent(captures, words):
+def test_capture_stores_the_samples_that_were_sent(captures, words):
     capture = captures(n=6, rate_hz=20.0)
     capture.session.run(capture.journal)
     with capture.recording() as recording:
@@ -121,12 +121,12 @@ def test_what_is_stored_is_what_was_sent(captures, words):
         for number, measurement in enumerate(recording):
             np.testing.assert_array_equal(measurement.data, words[number % 4])
             assert measurement.stamp.sequence == number
-            assert measurement.stamp.sync_count >= number  # ticks that a busy machine has missed are left out
+            assert measurement.stamp.sync_count >= number  # ticks that a busy machine misses are skipped
         times_ns = np.array([stamp.timestamp_ns for stamp in recording.stamps()])
         sent_ns = [json.loads(entry)["time_ns"] for entry in capture.log.getvalue().splitlines()]
         late_ms = (times_ns + 1e9 * SETTINGS.recording.duration_s - sent_ns) / 1e6
-        assert np.median(late_ms) == pytest.approx(0, abs=6)  # read as soon as it is sent, when all is recorded
-        assert np.median(np.diff(times_ns)) / 1e6 == pytest.approx(50, abs=20)  # on a busy machine, too
+        assert np.median(late_ms) == pytest.approx(0, abs=6)  # the stamp plus the recording time is the sending time
+        assert np.median(np.diff(times_ns)) / 1e6 == pytest.approx(50, abs=20)  # wide enough for a busy machine
         assert all(0 < stamp.timestamp_uncertainty_ns < 1e8 for stamp in recording.stamps())
         assert recording.settings.recording == SETTINGS.recording
         assert not recording.gaps
@@ -135,13 +135,13 @@ def test_what_is_stored_is_what_was_sent(captures, words):
 
 
 @pytest.mark.alone
-def test_groups_of_a_sync_chain(captures, words):
-    """Sensors are armed while pulses come, so their own counters differ."""
+def test_sync_capture_groups_measurements_of_one_pulse(captures, words):
+    """Each sensor is armed while pulses already arrive, so the counters of the sensors differ."""
     names = ("a", "b", "c")
     capture = captures(trigger="sync", names=names, n=8)
     with SyncChain(capture.emulators, rate_hz=20.0):
         capture.session.run(capture.journal)
-    # The first pulse may come while sensors are armed, and a busy emulator ignores pulses while it still measures.
+    # Pulses may arrive before all sensors are armed, and an emulator ignores pulses while it measures.
     assert capture.session.complete >= 4
     assert capture.session.complete + capture.session.incomplete <= 8
     rows = {}
@@ -154,8 +154,8 @@ def test_groups_of_a_sync_chain(captures, words):
     assert all(len(indices) == 1 for indices in rows.values())
 
 
-def test_measurements_that_are_missing_are_gaps(captures):
-    """Also at the beginning and at the end, and by their reason."""
+def test_capture_records_dropped_measurements_as_gaps(captures):
+    """Gaps at the beginning and at the end are recorded with their reason, too."""
     capture = captures(rate_hz=20.0, n=4, dropped={"one": (0, 2, 3, 6)})
     capture.session.run(capture.journal)
     with capture.recording() as recording:
@@ -168,7 +168,7 @@ def test_measurements_that_are_missing_are_gaps(captures):
     ] * 4
 
 
-def test_commands_that_come_too_early_are_left_out_and_counted(captures):
+def test_capture_counts_commands_skipped_at_too_high_a_rate(captures):
     capture = captures(rate_hz=400.0, n=4)
     capture.session.run(capture.journal)
     counts = capture.session.counts["one"]
@@ -176,7 +176,7 @@ def test_commands_that_come_too_early_are_left_out_and_counted(captures):
     assert counts.skipped == capture.stored[-1].sync_count - 3 > 3
 
 
-def test_a_capture_by_pulses_ends_though_the_last_is_lost(captures):
+def test_sync_capture_ends_when_last_measurement_is_lost(captures):
     capture = captures(trigger="sync", n=6, dropped={"one": (2, 5)})
     with SyncChain(capture.emulators, rate_hz=20.0):
         capture.session.run(capture.journal)
@@ -186,8 +186,8 @@ def test_a_capture_by_pulses_ends_though_the_last_is_lost(captures):
     assert capture.session.counts["one"].lost == 2
 
 
-class Deaf:
-    """An emulated sensor that the SYNC pulses with some numbers do not trigger."""
+class PulseIgnorer:
+    """An emulated sensor that ignores the SYNC pulses with some numbers."""
 
     def __init__(self, emulator, pulses):
         self._emulator, self._pulses = emulator, pulses
@@ -199,15 +199,15 @@ class Deaf:
 def test_gap_reasons_distinguish_dropped_measurements_from_missed_pulses(captures):
     capture = captures(trigger="sync", names=("one", "two"), n=10, dropped={"two": (4,)})
     one, two = capture.emulators
-    with SyncChain([one, Deaf(two, {6})], rate_hz=10.0):
+    with SyncChain([one, PulseIgnorer(two, {6})], rate_hz=10.0):
         capture.session.run(capture.journal)
     with capture.recording("two") as recording:
         reasons = {gap.reason for gap in recording.gaps}
     assert reasons == {DROPPED, NOT_TRIGGERED}
 
 
-class Ordered:
-    """A sink that passes on what comes in order, and what the order was."""
+class OrderRecorder:
+    """A sink that forwards all calls to a journal and records the order of the numbers."""
 
     def __init__(self, journal):
         self._journal = journal
@@ -227,10 +227,10 @@ class Ordered:
         self._journal.note_gap(sensor, first, last, reason, session_id=session_id)
 
 
-def test_gaps_and_measurements_come_in_order(captures):
-    """Also where they come together: which pulses the second sensor heard is known from its third block only."""
+def test_capture_passes_gaps_and_measurements_in_order(captures):
+    """The pulses of the second sensor are known only from its third block, so gaps and measurements come together."""
     capture = captures(trigger="sync", names=("one", "two"), n=8, dropped={"two": (1,)})
-    sink = Ordered(capture.journal)
+    sink = OrderRecorder(capture.journal)
     with SyncChain(capture.emulators, rate_hz=20.0):
         capture.session.run(sink)
     assert capture.session.counts["two"].lost >= 1
@@ -238,20 +238,20 @@ def test_gaps_and_measurements_come_in_order(captures):
     assert len(sink.numbers["two"]) >= 4
 
 
-@pytest.mark.alone  # on a busy machine the other misses a pulse more
-def test_a_sensor_may_hear_pulses_before_the_first_one_does(captures):
+@pytest.mark.alone  # on a busy machine the other sensor misses more pulses
+def test_sync_capture_accepts_pulses_before_the_first_sensors(captures):
     capture = captures(trigger="sync", names=("one", "two"), n=8, dropped={"one": range(4)})
     with SyncChain(capture.emulators, rate_hz=20.0):
         capture.session.run(capture.journal)
     with capture.recording("two") as recording:
         assert recording.stamps()[0].sequence == 0
-        assert -5 < recording.stamps()[0].sync_count < 0  # it is armed after the other
+        assert -5 < recording.stamps()[0].sync_count < 0  # it is armed after the other sensor
     assert capture.session.complete >= 4
 
 
 @pytest.mark.alone
 @pytest.mark.parametrize("trigger", ["command", "sync"])
-def test_an_unplugged_sensor_comes_back(captures, words, trigger):
+def test_capture_resumes_when_unplugged_sensor_returns(captures, words, trigger):
     capture = captures(trigger=trigger, rate_hz=20.0)
     runner = threading.Thread(target=capture.session.run, args=(capture.journal,))
     with ExitStack() as stack:
@@ -280,8 +280,8 @@ def test_an_unplugged_sensor_comes_back(captures, words, trigger):
 
 
 @pytest.mark.alone
-def test_a_counter_that_begins_anew_is_counted_on(captures):
-    """As after a power cut that nobody has noticed."""
+def test_capture_continues_numbers_after_counter_reset(captures):
+    """A power cut that the computer does not notice resets the counter of a sensor."""
     capture = captures(trigger="sync")
     runner = threading.Thread(target=capture.session.run, args=(capture.journal,))
     with SyncChain(capture.emulators, rate_hz=20.0):
@@ -298,7 +298,7 @@ def test_a_counter_that_begins_anew_is_counted_on(captures):
         assert sum(gap.last - gap.first + 1 for gap in recording.gaps) == sequences[-1] + 1 - len(sequences) < 5
 
 
-def test_a_sensor_that_stays_away_ends_the_capture(captures):
+def test_capture_fails_when_unplugged_sensor_stays_away(captures):
     capture = captures(rate_hz=20.0, patience_s=0.5)
     runner_error = []
 
@@ -315,10 +315,10 @@ def test_a_sensor_that_stays_away_ends_the_capture(captures):
     runner.join(10)
     assert str(runner_error[0]).startswith("one: ")
     with capture.recording() as recording:
-        assert len(recording) >= 3  # what was stored stays
+        assert len(recording) >= 3  # stored measurements are kept
 
 
-def test_a_silent_sensor_ends_the_capture_and_the_others_are_kept(captures):
+def test_capture_keeps_other_sensors_when_one_is_silent(captures):
     capture = captures(names=("one", "two"), n=12, rate_hz=20.0)
     capture.emulators[1].unplug()
     with pytest.raises(SonarError, match="two: "):
@@ -339,23 +339,23 @@ def test_a_silent_sensor_ends_the_capture_and_the_others_are_kept(captures):
         ({"patience_s": -1.0}, "patience is -1; give a number above 0"),
     ],
 )
-def test_refused(captures, options, message):
+def test_capture_session_rejects_invalid_options(captures, options, message):
     capture = captures()
     with pytest.raises(ArgumentError, match=message):
         CaptureSession(capture.sonars, SETTINGS, **{"trigger": "command", **options})
 
 
-def test_without_a_sensor():
+def test_capture_session_rejects_empty_sonars():
     with pytest.raises(ArgumentError, match="sonars is empty; give at least one sensor"):
         CaptureSession({}, SETTINGS, trigger="command")
 
 
-# The command, as users run it.
+# The tests below run the command as users do.
 
 
 @pytest.fixture
 def sensor(tmp_path, words):
-    """The link to an emulated sensor."""
+    """An emulated sensor, linked as eRTIS-7."""
     with Emulator(words, name="eRTIS-7", link=tmp_path / "eRTIS-7") as emulator:
         yield emulator
 
@@ -378,13 +378,13 @@ def run(tmp_path, *arguments):
 
 
 def has_open(process, path):
-    """Whether a process has a file open."""
-    with contextlib.suppress(OSError):  # it may close one just now
+    """Return True if a process has a file open."""
+    with contextlib.suppress(OSError):  # the process may close a file at this moment
         return any(os.path.realpath(each) == path for each in Path(f"/proc/{process.pid}/fd").iterdir())
     return False
 
 
-def test_the_command(tmp_path, sensor, words):
+def test_capture_command_reports_and_writes_a_recording(tmp_path, sensor, words):
     code, lines, err = run(tmp_path, "--port", str(sensor.link), "-n", "3", "--rate", "20", "--json")
     assert code == 0, err
     *stored, final = lines
@@ -401,7 +401,7 @@ def test_the_command(tmp_path, sensor, words):
     ("number", "arguments", "code"),
     [(signal.SIGINT, (), 0), (signal.SIGTERM, (), 0), (signal.SIGINT, ("-n", "1000"), 130)],
 )
-def test_a_signal_ends_it_with_a_complete_file(tmp_path, sensor, number, arguments, code):
+def test_capture_command_completes_its_file_on_signal(tmp_path, sensor, number, arguments, code):
     process = start(
         tmp_path, "--port", str(sensor.link), "--rate", "20", "--json", "-o", "rec.h5", "--quiet", *arguments
     )
@@ -416,8 +416,8 @@ def test_a_signal_ends_it_with_a_complete_file(tmp_path, sensor, number, argumen
 
 
 @pytest.mark.parametrize("after_s", [0.01, 0.2, 0.4])
-def test_a_signal_while_it_starts_ends_it_and_leaves_nothing(tmp_path, sensor, after_s):
-    """Libraries that are being loaded must not swallow it, nor break over it."""
+def test_capture_command_leaves_no_file_when_stopped_at_start(tmp_path, sensor, after_s):
+    """Libraries that are being loaded must neither swallow the signal nor fail because of it."""
     process = start(tmp_path, "--port", str(sensor.link), "-o", "rec.h5")
     while not has_open(process, sensor.port):
         assert process.poll() is None
@@ -425,12 +425,12 @@ def test_a_signal_while_it_starts_ends_it_and_leaves_nothing(tmp_path, sensor, a
         process.wait(after_s)
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=30)
-    assert process.returncode in {0, 130}, err  # 0 where it had begun to measure
+    assert process.returncode in {0, 130}, err  # 0 if the measurement had begun
     assert "Traceback" not in err
     assert process.returncode == 0 or not list(tmp_path.glob("rec.h5*"))
 
 
-def test_what_takes_measurements_in_never_loads_hdf5(tmp_path, sensor):
+def test_capture_command_does_not_load_hdf5(tmp_path, sensor):
     arguments = ["capture", "--port", str(sensor.link), "-n", "2", "-o", "rec.h5", "--quiet", "--settings"]
     code = (
         "import sys; from ertis_cli.main import cli\n"
@@ -446,7 +446,7 @@ def test_what_takes_measurements_in_never_loads_hdf5(tmp_path, sensor):
     assert done.stdout == "False True\n", done.stderr
 
 
-def test_commands_are_printed_and_nothing_is_opened(tmp_path):
+def test_capture_dry_run_prints_commands_and_opens_no_port(tmp_path):
     done = subprocess.run(
         [*ERTIS, "capture", "--port", "none", "--dry-run", "--trigger", "sync", "--pin", "2"],
         cwd=tmp_path,
@@ -472,7 +472,7 @@ def test_commands_are_printed_and_nothing_is_opened(tmp_path):
         ([], "Missing option '--port'", 2),
     ],
 )
-def test_errors_are_one_line(tmp_path, sensor, arguments, message, code):
+def test_capture_command_reports_errors_in_one_line(tmp_path, sensor, arguments, message, code):
     found, lines, err = run(tmp_path, *(each.replace("{link}", str(sensor.link)) for each in arguments))
     assert (found, lines) == (code, [])
     assert message in err
@@ -480,7 +480,7 @@ def test_errors_are_one_line(tmp_path, sensor, arguments, message, code):
     assert not list(tmp_path.glob("*.h5*"))
 
 
-def test_a_journal_that_was_left_is_not_overwritten(tmp_path, sensor):
+def test_capture_command_does_not_overwrite_a_leftover_journal(tmp_path, sensor):
     left = tmp_path / "rec.h5.journal"
     left.write_bytes(b"anything")
     code, _, err = run(tmp_path, "--port", str(sensor.link), "-n", "1", "-o", "rec.h5", "--force")
@@ -489,7 +489,7 @@ def test_a_journal_that_was_left_is_not_overwritten(tmp_path, sensor):
     assert left.read_bytes() == b"anything"
 
 
-def test_a_dead_sensor_is_told(tmp_path, sensor):
+def test_capture_command_reports_a_silent_sensor_in_one_line(tmp_path, sensor):
     sensor.quirks = Quirks(silent=True)
     code, _, err = run(tmp_path, "--port", str(sensor.link), "-n", "1")
     assert code == 1

@@ -1,4 +1,4 @@
-"""``ertis capture --to``: what sensors measure reaches a central node, or the command says that it does not."""
+"""``ertis capture --to``: measurements reach a central node, or the command reports an error."""
 
 import contextlib
 import json
@@ -48,7 +48,7 @@ TURNED = ((0.0, -0.5, 0.4), (0.0, 0.0, -(0.5**0.5), 0.5**0.5))
 
 @pytest.fixture(scope="module")
 def words():
-    """Four measurements, different parts of a simulated one."""
+    """Four measurements cut from one simulated measurement."""
     whole = open_recording("data/synthetic/reflectors.h5")[0].data
     return [np.ascontiguousarray(whole[start : start + N_SAMPLES]) for start in range(0, 4 * N_SAMPLES, N_SAMPLES)]
 
@@ -78,8 +78,8 @@ def run(tmp_path, *arguments, **options):
     return process.returncode, [json.loads(line) for line in out.splitlines()], err
 
 
-def checks(central):
-    """CRC-32 of what a central node holds, by sensor, epoch and number."""
+def held_crc32(central):
+    """CRC-32 of each measurement that a central node holds, by sensor, session and number."""
     return {
         (*key, number): message.crc32 for key, held in central.held.items() for number, (message, _) in held.items()
     }
@@ -90,7 +90,7 @@ def kept(events, name="crc32"):
 
 
 @pytest.mark.usefixtures("sensors")
-def test_measurements_of_two_sensors_reach_the_central_node(tmp_path, words):
+def test_capture_to_delivers_measurements_of_two_sensors(tmp_path, words):
     with StandIn() as central:
         code, events, err = run(
             tmp_path,
@@ -106,14 +106,14 @@ def test_measurements_of_two_sensors_reach_the_central_node(tmp_path, words):
         )
         hellos = {hello.sensor: hello for hello, _ in central.hellos.queue}
     assert code == 0, err
-    assert kept(events) == checks(central)
+    assert kept(events) == held_crc32(central)
     times = {(name, session_id, number): message.timestamp_ns for (name, session_id), held in central.held.items()
              for number, (message, _) in held.items()}  # fmt: skip
     assert times == kept(events, "timestamp_ns")
     assert all(each["uncertainty_ns"] > 0 for each in events if each["event"] == "kept")
     (session_id,) = {session_id for _, session_id, _ in kept(events)}
     given = {"one": words, "two": words[::-1]}
-    assert checks(central) == {
+    assert held_crc32(central) == {
         (name, session_id, number): zlib.crc32(each.tobytes())
         for name, several in given.items()
         for number, each in enumerate(several)
@@ -138,7 +138,7 @@ def test_measurements_of_two_sensors_reach_the_central_node(tmp_path, words):
 
 
 @pytest.mark.usefixtures("sensors")
-def test_a_recording_says_where_sensors_are(tmp_path):
+def test_capture_output_stores_sensor_mounting(tmp_path):
     code, events, err = run(tmp_path, "-o", "rec.h5", "-n", 1, "--mounting", "mounting.toml", ports=("two", "one"))
     assert code == 0, err
     assert {each["event"] for each in events} == {"stored", "captured"}
@@ -149,7 +149,7 @@ def test_a_recording_says_where_sensors_are(tmp_path):
 
 
 @pytest.mark.usefixtures("sensors")
-def test_what_never_arrives_is_an_error(tmp_path):
+def test_capture_to_fails_when_nothing_is_acknowledged(tmp_path):
     code, events, err = run(tmp_path, "--to", "tcp://127.0.0.1:9", "-n", 3, "--patience", "0.1")
     assert code == 1
     message = "3 measurements not acknowledged by the central node at tcp://127.0.0.1:9"
@@ -158,15 +158,15 @@ def test_what_never_arrives_is_an_error(tmp_path):
 
 
 @pytest.mark.usefixtures("sensors")
-def test_a_spool_keeps_what_did_not_arrive_for_the_next_capture(tmp_path):
+def test_capture_to_sends_spooled_measurements_next_time(tmp_path):
     code, first, err = run(tmp_path, "--to", "tcp://127.0.0.1:9", "--spool", "spool", "-n", 3, "--patience", "0.1")
     assert code == 0, err
     assert "3 measurements unacknowledged in spool; the next capture with --spool sends them" in err
     with StandIn() as central:
         code, second, err = run(tmp_path, "--to", central.address, "--spool", "spool", "-n", 2)
     assert code == 0, err
-    assert kept(first) | kept(second) == checks(central)
-    assert len(checks(central)) == 5
+    assert kept(first) | kept(second) == held_crc32(central)
+    assert len(held_crc32(central)) == 5
     assert not list((tmp_path / "spool").iterdir())
 
 
@@ -178,7 +178,7 @@ def test_a_spool_keeps_what_did_not_arrive_for_the_next_capture(tmp_path):
         (["--spool", "spool", "--spool-size"], "refused", "give the spool more (--spool-size)"),
     ],
 )
-def test_no_more_is_kept_than_there_is_room_for(tmp_path, words, given, lost, remedy):
+def test_capture_to_limits_size_of_ring_and_spool(tmp_path, words, given, lost, remedy):
     size_mb = 2.5 * words[0].nbytes / 1e6
     code, events, err = run(tmp_path, "--to", "tcp://127.0.0.1:9", *given, size_mb, "-n", 3, "--patience", "0.1")
     assert code == 1
@@ -187,7 +187,7 @@ def test_no_more_is_kept_than_there_is_room_for(tmp_path, words, given, lost, re
 
 
 @pytest.mark.usefixtures("sensors")
-def test_what_the_central_node_drops_is_told(tmp_path):
+def test_capture_to_reports_drops_of_the_central_node(tmp_path):
     with StandIn(acks="accepted") as central:
         central.dropped = ((0, "superseded"), (2, "failed twice"))
         code, events, err = run(tmp_path, "--to", central.address, "-n", 3)
@@ -200,8 +200,8 @@ def test_what_the_central_node_drops_is_told(tmp_path):
 
 @pytest.mark.usefixtures("sensors")
 @pytest.mark.parametrize("kill", [False, True])
-def test_what_ends_a_capture_loses_nothing(tmp_path, kill):
-    """A signal once: everything is sent first. SIGKILL: the spool has what was told of."""
+def test_capture_to_loses_nothing_on_sigterm_or_sigkill(tmp_path, kill):
+    """SIGTERM sends all measurements first. After SIGKILL the spool holds every reported measurement."""
     with StandIn() as central:
         events = []
         central.silent = kill
@@ -216,19 +216,19 @@ def test_what_ends_a_capture_loses_nothing(tmp_path, kill):
             code, more, err = run(tmp_path, "--to", central.address, "--spool", "spool", "-n", 1)
             assert code == 0, err
             events += more
-    assert kept(events).items() <= checks(central).items()
-    assert len(checks(central)) <= len(kept(events)) + kill
+    assert kept(events).items() <= held_crc32(central).items()
+    assert len(held_crc32(central)) <= len(kept(events)) + kill
     assert not list((tmp_path / "spool").iterdir())
 
 
 @pytest.mark.usefixtures("sensors")
-def test_a_second_signal_ends_it_at_once(tmp_path):
+def test_capture_to_stops_at_once_on_second_signal(tmp_path):
     with start(tmp_path, "--to", "tcp://127.0.0.1:9", "-n", 2, "--patience", 3600) as process:
         has_all = is_waiting = False
         for line in process.stdout:
             event = json.loads(line)
             has_all |= event.get("sequence") == 1
-            is_waiting |= "does not answer" in event.get("text", "")  # of the central node
+            is_waiting |= "does not answer" in event.get("text", "")  # the note about the central node
             if has_all and is_waiting:
                 break
         process.send_signal(signal.SIGINT)
@@ -241,7 +241,7 @@ def test_a_second_signal_ends_it_at_once(tmp_path):
 
 
 @pytest.mark.usefixtures("sensors")
-def test_keys(tmp_path):
+def test_capture_to_requires_allowed_keys(tmp_path):
     mine, theirs = KeyPair.new("node"), KeyPair.new("central")
     secret, _ = mine.save(tmp_path / "keys")
     allow = tmp_path / "allow.toml"
@@ -263,7 +263,7 @@ def test_keys(tmp_path):
 
 
 @pytest.mark.usefixtures("sensors")
-def test_the_address_of_images_is_told_from_that_of_sensors(tmp_path):
+def test_capture_to_image_address_suggests_the_other_address(tmp_path):
     publisher = Publisher(ProcessingOptions(publish="tcp://127.0.0.1:0"), logger("test"))
     publisher.start()
     try:
@@ -276,7 +276,7 @@ def test_the_address_of_images_is_told_from_that_of_sensors(tmp_path):
     assert err.splitlines()[-1].endswith(f"not acknowledged by the central node at {publisher.address}: {remedy}")
 
 
-def test_nodes_that_send_one_sensor_are_told(tmp_path):
+def test_sensor_nodes_are_warned_of_a_shared_sensor_name(tmp_path):
     notes = [queue.Queue(), queue.Queue()]
     with running(tmp_path) as central, contextlib.ExitStack() as stack:
         for session_id, reported in enumerate(notes):
@@ -322,7 +322,7 @@ def test_nodes_that_send_one_sensor_are_told(tmp_path):
         (["--mounting", "empty.toml"], "does not contain sensor 'one'; add it, or choose one of sensor with --name", 1),
     ],
 )
-def test_errors_are_one_line(tmp_path, arguments, message, code):
+def test_capture_to_reports_errors_in_one_line(tmp_path, arguments, message, code):
     (tmp_path / "empty.toml").touch()
     came, events, err = run(tmp_path, *arguments)
     assert (came, events) == (code, [])
@@ -339,7 +339,7 @@ def test_errors_are_one_line(tmp_path, arguments, message, code):
         (["--to", "tcp://127.0.0.1:9", "--spool", "new/spool"], "ertis: error: serial port 'none' does not exist"),
     ],
 )
-def test_what_is_refused_was_not_begun(tmp_path, monkeypatch, arguments, message):
+def test_rejected_capture_creates_no_file(tmp_path, monkeypatch, arguments, message):
     monkeypatch.chdir(tmp_path)
     done = CliRunner().invoke(cli, ["capture", "--port", "none", *arguments])
     assert done.exit_code == 1
@@ -347,7 +347,7 @@ def test_what_is_refused_was_not_begun(tmp_path, monkeypatch, arguments, message
     assert not list(tmp_path.iterdir())
 
 
-def test_a_session_counts_what_its_sink_has_no_room_for(tmp_path, sensors):
+def test_capture_session_counts_measurements_a_full_spool_rejects(tmp_path, sensors):
     del sensors
     with (
         SonarDriver.open(str(tmp_path / "one")) as sonar,
@@ -366,7 +366,7 @@ def test_a_session_counts_what_its_sink_has_no_room_for(tmp_path, sensors):
 
 
 @pytest.mark.usefixtures("sensors")
-def test_a_central_node_records_it(tmp_path):
+def test_capture_to_is_recorded_by_the_record_command(tmp_path):
     command = [*ERTIS, "record", "--listen", "tcp://127.0.0.1:*", "-o", "recordings", "--json"]
     with subprocess.Popen(
         command, cwd=tmp_path, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

@@ -1,4 +1,4 @@
-"""A central node and what makes images, whatever that does."""
+"""A central node with image processing: the node keeps working when processing fails."""
 
 import os
 import threading
@@ -18,7 +18,7 @@ from tests.sending import SOON_S, until
 
 
 class Images:
-    """Stands for what makes images."""
+    """A stand-in for image processing."""
 
     refused: ClassVar = {}
 
@@ -72,7 +72,7 @@ def test_processing_gets_each_measurement_once(archive, tmp_path):
     assert (sensor.received, sensor.repeated, sensor.published, sensor.dropped) == (3, 1, 2, {"late": 1})
 
 
-def test_without_an_archive_a_run_is_remembered():
+def test_session_survives_reconnect_without_archive():
     with running(processing=Images()) as central:
         with Node(central.address) as node:
             node.hello()
@@ -91,7 +91,7 @@ FAILING = ("register", "offer", "fds", "ready", "tick", "counts", "status", "pub
 
 
 @pytest.mark.parametrize("what", [*FAILING, "all"])
-def test_ingest_goes_on_whatever_processing_does(what, tmp_path, monkeypatch):
+def test_ingest_continues_when_processing_fails(what, tmp_path, monkeypatch):
     def fails(*_):
         raise MemoryError("no more")
 
@@ -106,7 +106,7 @@ def test_ingest_goes_on_whatever_processing_does(what, tmp_path, monkeypatch):
         node.hello()
         node.measure(*given)
         node.hear_settled(11)
-        for _ in range(3):  # longer than a tick
+        for _ in range(3):  # longer than one tick
             node.socket.poll(100)
     for end in reads:
         os.close(end)
@@ -114,12 +114,12 @@ def test_ingest_goes_on_whatever_processing_does(what, tmp_path, monkeypatch):
     assert central.latest.refused["internal"] >= 1
     reported = [event["text"] for event in central.events if event["event"] == "internal"]
     assert set(reported) == {"MemoryError: no more"}
-    assert len(reported) <= 2  # once a second
-    with running(tmp_path):  # the folder is free again
+    assert len(reported) <= 2  # at most one report per second
+    with running(tmp_path):  # the folder is no longer in use
         pass
 
 
-def test_what_processing_drops_is_told_to_its_node(monkeypatch):
+def test_drops_of_processing_are_reported_to_the_sensor_node(monkeypatch):
     drops = [[("left", EPOCH, 10, "superseded")]]
     monkeypatch.setattr(Images, "drain_dropped", lambda _: drops.pop() if drops else [])
     with running(processing=Images()) as central, Node(central.address) as node:
@@ -134,7 +134,7 @@ def test_what_processing_drops_is_told_to_its_node(monkeypatch):
 
 
 class Loading(Images):
-    """Images whose processes never become ready."""
+    """Image processing whose worker processes never become ready."""
 
     def __init__(self):
         self.waits, self.closed = threading.Event(), False
@@ -147,7 +147,7 @@ class Loading(Images):
         self.closed = True
 
 
-def test_stop_ends_the_wait_for_processes_that_are_loading(tmp_path):
+def test_stop_ends_the_wait_for_loading_workers(tmp_path):
     images, events = Loading(), []
     central = CentralNode("tcp://127.0.0.1:0", archive=Archive(tmp_path), processing=images, on_event=events.append)
 

@@ -1,4 +1,4 @@
-"""Who a central node hears: whose key is listed, as long as it is, for what it is listed."""
+"""Keys of a central node: a key is accepted only while it is listed, and only for its role and serials."""
 
 import select
 
@@ -24,7 +24,7 @@ def permission(pair, role="sensor", serials=("left",)):
     return Permission(name=pair.name, public=pair.public, role=role, serials=serials if role == "sensor" else ())
 
 
-def test_a_key_speaks_for_its_serials_and_role_only(tmp_path):
+def test_key_is_limited_to_its_serials_and_role(tmp_path):
     pairs = [KeyPair.new(name) for name in ("node", "screen")]
     given = keys(tmp_path, permission(pairs[0]), permission(pairs[1], "application"))
     with running(tmp_path / "a", keys=given) as central:
@@ -45,7 +45,7 @@ def test_a_key_speaks_for_its_serials_and_role_only(tmp_path):
     assert central.latest.refused["role"] == 2
 
 
-def test_a_key_that_is_removed_is_not_heard_any_more(tmp_path):
+def test_removed_key_is_refused(tmp_path):
     pair = KeyPair.new("node")
     given = keys(tmp_path, permission(pair))
     known = ClientKeys(pair, given.pair.public)
@@ -62,7 +62,7 @@ def test_a_key_that_is_removed_is_not_heard_any_more(tmp_path):
     assert len(stored(tmp_path / "a")[0]) == 1
 
 
-def test_others_cannot_reach_it_without_keys(tmp_path):
+def test_central_node_without_keys_rejects_a_public_address(tmp_path):
     with (
         pytest.raises(ArgumentError, match="there are no keys"),
         CentralNode("tcp://0.0.0.0:0", archive=Archive(tmp_path)),
@@ -70,7 +70,7 @@ def test_others_cannot_reach_it_without_keys(tmp_path):
         pass
 
 
-def test_a_list_of_keys_that_cannot_be_used_is_told(tmp_path):
+def test_invalid_allow_list_is_reported_until_repaired(tmp_path):
     pair = KeyPair.new("node")
     given = keys(tmp_path, permission(pair))
     listed = given.allow.read_bytes()

@@ -1,4 +1,4 @@
-"""The central node takes measurements in once and in order, and answers whatever comes."""
+"""The central node stores measurements once and in order, and answers every message."""
 
 import random
 
@@ -17,7 +17,7 @@ from tests.files import line
 from tests.journals import EPOCH, TINY, entries
 
 
-def test_what_is_acked_is_in_the_recording(tmp_path):
+def test_acknowledged_measurements_are_in_the_recording(tmp_path):
     given = entries(5)
     with running(archive=Archive(tmp_path / "a")) as central, Node(central.address) as node:
         welcome = node.hello(first=10)
@@ -28,7 +28,7 @@ def test_what_is_acked_is_in_the_recording(tmp_path):
     assert [event["event"] for event in central.events] == ["listening", "joined", "sealed"]
 
 
-def test_a_number_is_stored_once_and_acked_again(tmp_path):
+def test_duplicate_measurement_is_acknowledged_but_stored_once(tmp_path):
     given = entries(3)
     with running(tmp_path) as central, Node(central.address) as node:
         node.hello()
@@ -42,7 +42,7 @@ def test_a_number_is_stored_once_and_acked_again(tmp_path):
     assert (central.latest.sensors["left"].received, central.latest.sensors["left"].repeated) == (3, 2)
 
 
-def test_nothing_beyond_a_hole_is_taken(tmp_path):
+def test_measurements_after_missing_numbers_are_discarded(tmp_path):
     given = entries(4)
     with running(tmp_path) as central, Node(central.address) as node:
         node.hello()
@@ -55,7 +55,7 @@ def test_nothing_beyond_a_hole_is_taken(tmp_path):
     assert stored(tmp_path)[0] == wanted(given)
 
 
-def test_gaps_settle_in_order(tmp_path):
+def test_gaps_are_acknowledged_in_order(tmp_path):
     given = entries(6)
     with running(tmp_path) as central, Node(central.address) as node:
         node.hello()
@@ -71,7 +71,7 @@ def test_gaps_settle_in_order(tmp_path):
     assert central.latest.sensors["left"].missing == {"never reached the central node": 10, "the ring was full": 2}
 
 
-def test_a_node_that_comes_back_goes_on_where_it_was(tmp_path):
+def test_reconnected_sensor_node_continues_its_session(tmp_path):
     given = entries(6)
     with running(tmp_path) as central:
         with Node(central.address) as node:
@@ -85,7 +85,7 @@ def test_a_node_that_comes_back_goes_on_where_it_was(tmp_path):
     assert stored(tmp_path)[0] == wanted(given)
 
 
-def test_the_next_run_of_the_central_node_knows_what_is_stored(tmp_path):
+def test_restarted_central_node_continues_stored_sessions(tmp_path):
     given = entries(6)
     for first, last in ((0, 3), (2, 6)):
         with running(tmp_path) as central, Node(central.address) as node:
@@ -97,7 +97,7 @@ def test_the_next_run_of_the_central_node_knows_what_is_stored(tmp_path):
     assert [each[2:4] for each in missing] == [(0, 9)]
 
 
-def test_another_measurement_of_a_number_is_kept_too(tmp_path):
+def test_conflicting_measurement_of_one_number_is_stored_aside(tmp_path):
     given, others = entries(3), entries(3, seed=2)
     with running(tmp_path) as central, Node(central.address) as node:
         node.hello()
@@ -109,12 +109,12 @@ def test_another_measurement_of_a_number_is_kept_too(tmp_path):
     twins = sorted(tmp_path.glob("*_conflicts.h5.journal"))
     found = stored(tmp_path)[0]
     assert sorted(found) == sorted(wanted([*given, *others[:2]]))
-    assert len(twins) == 2  # numbers of one recording rise
+    assert len(twins) == 2  # numbers within one recording must increase
     sensor = central.latest.sensors["left"]
     assert (sensor.stored, sensor.conflicts, sensor.repeated) == (3, 2, 3)
 
 
-def test_other_settings_begin_another_recording(tmp_path):
+def test_changed_settings_start_a_new_recording(tmp_path):
     given, others = entries(2), entries(2, first=12, settings=TINY.replace(call=TINY.call.replace(duration_s=2e-3)))
     with running(tmp_path) as central, Node(central.address) as node:
         node.hello()
@@ -130,7 +130,7 @@ def test_other_settings_begin_another_recording(tmp_path):
     assert len(stored(tmp_path)[0]) == 5
 
 
-def test_air_may_change(tmp_path):
+def test_changed_air_stays_in_one_recording(tmp_path):
     settings = TINY.replace(air=Air(temperature_c=5.0))
     given = [entries(1)[0], *entries(1, first=11, settings=settings)]
     with running(tmp_path) as central, Node(central.address) as node:
@@ -140,7 +140,7 @@ def test_air_may_change(tmp_path):
     assert stored(tmp_path)[0] == wanted(given)
 
 
-WRONG = {
+INVALID_MEASUREMENTS = {
     "before its hello": ({"session_id": 6}, "hello", "send hello first"),
     "too short": ({"words": b"1234"}, "message", "a measurement has 4 bytes, but its settings give 4096"),
     "of do not match": ({"crc32": 1}, "message", "does not match"),
@@ -148,9 +148,9 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("what", WRONG)
-def test_a_measurement_that_is_wrong_is_refused(what, tmp_path):
-    changes, code, reason = WRONG[what]
+@pytest.mark.parametrize("what", INVALID_MEASUREMENTS)
+def test_invalid_measurement_is_refused_with_its_reason(what, tmp_path):
+    changes, code, reason = INVALID_MEASUREMENTS[what]
     given = entries(2)
     with running(tmp_path) as central, Node(central.address) as node:
         node.hello()
@@ -164,7 +164,7 @@ def test_a_measurement_that_is_wrong_is_refused(what, tmp_path):
     assert stored(tmp_path)[0] == wanted(given)
 
 
-HELLOS = {
+INVALID_HELLOS = {
     "settings of do not match": ({"settings_crc32": 1}, "do not match"),
     "no settings": ({"settings": b"["}, "settings of sensor left"),
     "no text": ({"settings": b"\xff"}, "not text"),
@@ -178,9 +178,9 @@ HELLOS = {
 }
 
 
-@pytest.mark.parametrize("what", HELLOS)
-def test_settings_that_cannot_be_used_are_refused(what, tmp_path):
-    changes, reason = HELLOS[what]
+@pytest.mark.parametrize("what", INVALID_HELLOS)
+def test_hello_with_invalid_settings_is_refused(what, tmp_path):
+    changes, reason = INVALID_HELLOS[what]
     with running(tmp_path) as central, Node(central.address) as node:
         refused = node.hello(**changes)
         assert isinstance(refused, Refused)
@@ -189,7 +189,7 @@ def test_settings_that_cannot_be_used_are_refused(what, tmp_path):
         assert isinstance(node.hello(), Welcome)
 
 
-def test_garbage_is_counted_and_harms_nobody(tmp_path):
+def test_malformed_messages_are_counted_and_other_peers_served(tmp_path):
     generator = random.Random(1)
     given = entries(3)
     known = [messages.encode(Ping()), *(messages.encode(data_of(entry)[0]) for entry in given)]
@@ -204,8 +204,8 @@ def test_garbage_is_counted_and_harms_nobody(tmp_path):
         node.measure(*given)
         node.hear_settled(12)
         reported = ""
-        while "has protocol version 2, " not in reported:  # one bit makes no 2 of a 1
-            if not stranger.socket.poll(500):  # who does not read misses answers
+        while "has protocol version 2, " not in reported:  # flipping one bit never turns version 1 into 2
+            if not stranger.socket.poll(500):  # a peer that does not read its socket loses answers
                 stranger.socket.send_multipart([b"eRTN\x02more"])
             reported = stranger.hear(Refused).reason
     assert stored(tmp_path)[0] == wanted(given)
@@ -215,14 +215,14 @@ def test_garbage_is_counted_and_harms_nobody(tmp_path):
     assert 200 < sum(refused.values()) < 310
 
 
-def test_a_gap_that_no_file_can_hold_is_refused(tmp_path):
+def test_gap_with_line_feed_in_reason_is_refused(tmp_path):
     with running(tmp_path) as central, Node(central.address) as node:
         node.hello(first=0)
         node.send(Gap(sensor="left", session_id=EPOCH, first=0, last=3, reason="two\nlines"))
         assert node.hear(Refused).code == "message"
 
 
-def test_status_is_told_to_who_asks(tmp_path):
+def test_status_request_is_answered(tmp_path):
     with running(tmp_path) as central, Node(central.address) as node:
         node.hello()
         node.measure(*entries(2))
@@ -238,7 +238,7 @@ def test_status_is_told_to_who_asks(tmp_path):
     assert status.archive.ack.max_ms > 0
 
 
-def test_nodes_that_are_silent_are_forgotten(tmp_path, monkeypatch):
+def test_silent_sensor_node_must_send_hello_again(tmp_path, monkeypatch):
     with running(tmp_path) as central, Node(central.address) as node:
         node.hello()
         node.measure(*entries(1))
@@ -252,22 +252,22 @@ def test_nodes_that_are_silent_are_forgotten(tmp_path, monkeypatch):
         assert node.hello(first=11).acked_through == 10
 
 
-def test_a_central_node_needs_something_to_do():
+def test_central_node_requires_archive_or_processing():
     with pytest.raises(ArgumentError, match="neither archive nor processing"):
         CentralNode("tcp://127.0.0.1:0")
 
 
-def test_it_is_run_in_a_with_statement(tmp_path):
+def test_central_node_run_requires_with_statement(tmp_path):
     with pytest.raises(ArgumentError, match="not open"):
         CentralNode("tcp://127.0.0.1:0", archive=Archive(tmp_path)).run()
 
 
-def test_a_folder_belongs_to_one_central_node(tmp_path):
+def test_archive_folder_is_locked_by_one_central_node(tmp_path):
     with running(tmp_path), pytest.raises(JournalInUseError, match="in use by another central node"), running(tmp_path):
         pass
 
 
-def test_a_message_that_fails_harms_nobody(tmp_path, monkeypatch):
+def test_internal_error_of_one_message_does_not_stop_the_node(tmp_path, monkeypatch):
     given = entries(2)
     with running(tmp_path) as central, Node(central.address) as node:
         node.hello()
@@ -287,7 +287,7 @@ def test_a_message_that_fails_harms_nobody(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("step", ["read", "require_role", "ServerSocket.who"])
-def test_a_message_that_cannot_be_read_for_a_mistake_is_answered(step, tmp_path, monkeypatch):
+def test_internal_error_while_reading_a_message_is_answered(step, tmp_path, monkeypatch):
     given = entries(2)
     with running(tmp_path) as central, Node(central.address) as node:
         node.hello()
@@ -295,7 +295,7 @@ def test_a_message_that_cannot_be_read_for_a_mistake_is_answered(step, tmp_path,
             patch.setattr(f"ertis_numba.network.central_node._node.{step}", lambda *_: 1 / 0)
             node.measure(*given)
             refused = [node.hear(Refused) for _ in given]
-        node.measure(*given)  # the sender has kept them
+        node.measure(*given)  # the sender keeps unacknowledged measurements
         node.hear_settled(11)
     assert all(
         "the central node has an internal error (ZeroDivisionError: division by zero)" in each.reason
@@ -306,7 +306,7 @@ def test_a_message_that_cannot_be_read_for_a_mistake_is_answered(step, tmp_path,
     assert [event["event"] for event in central.events].count("internal") == 1
 
 
-def test_a_fault_that_names_a_path_without_utf8_is_sent(tmp_path, monkeypatch):
+def test_fault_text_with_non_utf8_path_is_sent(tmp_path, monkeypatch):
     with running(tmp_path) as central, Node(central.address) as node:
         monkeypatch.setattr(Archive, "stuck", "cannot write /disk/\udcff")
         node.send(Ping())
@@ -315,7 +315,7 @@ def test_a_fault_that_names_a_path_without_utf8_is_sent(tmp_path, monkeypatch):
         node.hear(Report)
 
 
-def test_a_status_is_made_once_for_all_who_ask_at_once(tmp_path, monkeypatch):
+def test_status_is_computed_once_for_simultaneous_requests(tmp_path, monkeypatch):
     made, status = [], Condition.status
     with running(tmp_path) as central, Node(central.address) as node:
         monkeypatch.setattr(Condition, "status", lambda condition: made.append(1) or status(condition))
@@ -325,7 +325,7 @@ def test_a_status_is_made_once_for_all_who_ask_at_once(tmp_path, monkeypatch):
     assert len(made) < 15
 
 
-def test_a_disk_that_does_not_answer_is_told(tmp_path, monkeypatch):
+def test_stuck_disk_is_reported_as_fault(tmp_path, monkeypatch):
     why = ["the disk does not answer"]
     with running(tmp_path) as central, Node(central.address) as node:
         monkeypatch.setattr(Archive, "stuck", property(lambda _: why[0]))
@@ -340,7 +340,7 @@ def test_a_disk_that_does_not_answer_is_told(tmp_path, monkeypatch):
     assert [event["text"] for event in central.events if event["event"] == "fault"] == ["the disk does not answer"]
 
 
-def test_nodes_hear_that_it_ends(tmp_path):
+def test_sensor_nodes_are_notified_of_shutdown(tmp_path):
     with running(tmp_path) as central, Node(central.address) as node:
         node.hello()
         central.stop()

@@ -1,4 +1,4 @@
-"""False alarms are as many as were asked for, and reflectors are found beside clutter and beside each other."""
+"""CFAR detection: the false-alarm rate is the requested one, and reflectors beside clutter or each other are found."""
 
 import functools
 import math
@@ -19,45 +19,45 @@ from tests.test_detect import image_of
 
 N = 32
 SETTINGS = Settings()
-MIDDLE = 18  # of ranges so far apart that each is a resolution and the guard one: 16 + 1 + 1 + 1 + 16 and some
+MIDDLE = 18  # ranges lie one resolution apart and the guard is one bin, so 16 + 1 + 1 + 1 + 16 bins suffice
 SPACING_M = 0.05
 
 
 def rayleigh(n_rows, scale=1.0, *, seed=1, n_ranges=37):
-    """Noise in so many directions: only one bin of each is looked at, so that all that is counted is independent."""
+    """Noise in many directions. Tests count one bin of each direction, so that the counts are independent."""
     values = np.random.default_rng(seed).rayleigh(size=(n_rows, n_ranges)) * scale
     angles = np.linspace(-1.0, 1.0, n_rows)
     return Energyscape(values.astype(np.float32), angles, np.zeros(n_rows), SPACING_M * np.arange(n_ranges), SETTINGS)
 
 
 def interval(count, total, confidence=0.999):
-    """Probabilities that so many of so many do not speak against (Clopper and Pearson, 1934)."""
+    """Confidence interval of a probability after some successes in some trials (Clopper and Pearson, 1934)."""
     tail = (1 - confidence) / 2
     low = scipy.special.betaincinv(count, total - count + 1, tail) if count else 0.0
     return low, scipy.special.betaincinv(count + 1, total - count, 1 - tail)
 
 
 def assert_share(found, wanted):
-    """Assert that a share of true values is that of a probability."""
+    """Assert that the share of true values agrees with a probability."""
     low, high = interval(int(np.count_nonzero(found)), found.size)
     assert low <= wanted <= high, (np.mean(found), wanted)
 
 
 def exact(method, scales, false_alarm):
-    """Probability that a bin of scale 1 stands out of bins of others: (reference,), the first half before it.
+    """Probability that a bin of scale 1 is detected among reference bins of other scales, the first half before it.
 
-    For the k-th lowest and for the greater half by counting over which half or which bins are lower.
+    For the k-th lowest and for the greater half, by counting the bins below a threshold.
     """
     alpha = threshold_factor(method, N, false_alarm)
     power = np.asarray(scales, dtype=float) ** 2
-    if method == "cell_averaging":  # the transform of a sum of exponential variables
+    if method == "cell_averaging":  # the Laplace transform of a sum of exponential variables
         return float(np.prod(1 / (1 + alpha * power / N)))
     if method == "greatest_of":  # ∫ exp(−α max(a, b)) over both halves, as sums of equal exponentials each
         grid = np.linspace(0, 40, 40_001)
         halves = [scipy.special.gammainc(N // 2, grid * (N // 2) / part[0]) for part in (power[:16], power[16:])]
         cumulated = halves[0] * halves[1]
         return float(np.sum(np.exp(-alpha * (grid[1:] + grid[:-1]) / 2) * np.diff(cumulated)))
-    # The k-th lowest is below x when k or more bins are; the count of two groups is two binomial ones.
+    # The k-th lowest bin is below x if k or more bins are; their count is the sum of two binomial counts.
     grid = np.linspace(0, 40, 8001)
     groups = [(np.count_nonzero(power == value), 1 - np.exp(-grid / value)) for value in np.unique(power)]
     counts = np.ones((len(grid), 1))
@@ -70,8 +70,8 @@ def exact(method, scales, false_alarm):
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("false_alarm", [1e-2, 1e-3, 1e-4])
-def test_factor_gives_the_probability(method, false_alarm):
-    """By another way than the formula it is solved from."""
+def test_threshold_factor_gives_the_false_alarm_probability(method, false_alarm):
+    """The probability is computed independently of the formula that the factor is solved from."""
     assert exact(method, np.ones(N), false_alarm) == pytest.approx(false_alarm, rel=0.01)
 
 
@@ -86,8 +86,8 @@ def noise_alone(false_alarm):
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("false_alarm", [1e-2, 1e-3, 1e-4])
-def test_false_alarms_in_noise(method, false_alarm):
-    """In the middle and at both ends, whatever the level is."""
+def test_false_alarm_rate_in_noise(method, false_alarm):
+    """The rate holds in the middle and at both ends, at every noise level."""
     given = noise_alone(false_alarm)
     found = cfar(given, false_alarm=false_alarm, method=method)
     for place in (0, MIDDLE, -1):
@@ -102,13 +102,13 @@ def test_false_alarms_in_noise(method, false_alarm):
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("false_alarm", [1e-2, 1e-3, 1e-4])
-def test_false_alarms_beside_a_clutter_edge(method, false_alarm):
-    """20 dB between one side and the other: what it is right at the edge is what theory says."""
-    step = np.where(np.arange(37) < MIDDLE, 0.1, 1.0)  # the bin in the middle is the first of the louder side
+def test_false_alarm_rate_beside_a_clutter_edge(method, false_alarm):
+    """With a step of 20 dB, the rate at the edge is the theoretical one."""
+    step = np.where(np.arange(37) < MIDDLE, 0.1, 1.0)  # the middle bin is the first of the louder side
     found = cfar(rayleigh(ROWS[false_alarm], step, seed=3), false_alarm=false_alarm, method=method)
     wanted = exact(method, np.where(np.arange(N) < N // 2, 0.1, 1.0), false_alarm)
     assert_share(found[:, MIDDLE], wanted)
-    # On the quieter side there are fewer than asked for.
+    # The quieter side has fewer false alarms than requested.
     assert interval(int(np.count_nonzero(found[:, MIDDLE - 1])), len(found))[0] <= false_alarm
     if method == "greatest_of":
         assert wanted < 6 * false_alarm
@@ -118,8 +118,8 @@ def test_false_alarms_beside_a_clutter_edge(method, false_alarm):
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("false_alarm", [1e-2, 1e-3, 1e-4])
-def test_false_alarms_beside_a_strong_reflector(method, false_alarm):
-    """40 dB above the noise: the ordered statistic loses some, the means are blind."""
+def test_false_alarm_rate_beside_a_strong_reflector(method, false_alarm):
+    """With a reflector 40 dB above the noise, only the ordered statistic keeps some sensitivity."""
     scale = np.ones(37)
     scale[MIDDLE + 5 : MIDDLE + 8] = 100.0
     found = cfar(rayleigh(ROWS[false_alarm], scale, seed=4), false_alarm=false_alarm, method=method)[:, MIDDLE]
@@ -135,8 +135,8 @@ def test_false_alarms_beside_a_strong_reflector(method, false_alarm):
 
 
 @pytest.mark.parametrize("false_alarm", [1e-2, 1e-3])
-def test_false_alarms_of_real_bits(false_alarm):
-    """Images of microphones that hear nothing, whose ranges lie closer than the resolution."""
+def test_false_alarm_rate_in_images_of_one_bit_noise(false_alarm):
+    """Images of microphones without a signal. Their ranges lie closer than the resolution."""
     settings = Settings(
         recording=Recording(n_samples=65_536), processing=Processing(directions="2d:9", range_m=(0.3, 2.0))
     )
@@ -146,35 +146,35 @@ def test_false_alarms_of_real_bits(false_alarm):
     assert np.mean(shares) == pytest.approx(false_alarm, abs=3 * deviation + 0.1 * false_alarm)
 
 
-def places_of(place, count, *, step=2, guard=11):
-    """Where the reference bins of a range are: as near as can be, half on each side where there is room."""
+def reference_indices(place, count, *, step=2, guard=11):
+    """Indices of the reference bins of a range: the nearest ones, half on each side if both sides have room."""
     before = [place - guard - step * n for n in range(1, 200) if place - guard - step * n >= 0]
     behind = [place + guard + step * n for n in range(1, 200) if place + guard + step * n < count]
     n_behind = min(len(behind), N - min(len(before), N // 2))
     return sorted(before[: N - n_behind] + behind[:n_behind])
 
 
-def test_reference_bins_are_as_near_as_can_be():
-    """At the usual spacing of ranges: every other bin, ten bins aside, and at both ends the same."""
+def test_reference_bins_are_the_nearest_beyond_the_guard():
+    """At the default range spacing: every other bin, beyond ten guard bins, and symmetric at both ends."""
     image = image_of([], directions="2d:2", range_m=(0.8, 1.7))
     count = image.amplitude.shape[1]
     places = _reference(image, N)
     for place in range(count):
-        assert places[:, place].tolist() == places_of(place, count), place
-        assert (places[:, place] == count - 1 - places[::-1, count - 1 - place]).all(), place  # halves, too
+        assert places[:, place].tolist() == reference_indices(place, count), place
+        assert (places[:, place] == count - 1 - places[::-1, count - 1 - place]).all(), place  # mirrored
     assert places[:, 0].min() == 13
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_is_the_reference(method):
-    """The same, bin by bin; where it is a matter of the last digit, either is right."""
+def test_cfar_equals_a_bin_by_bin_reference(method):
+    """Bins within rounding of the threshold may differ."""
     image = image_of([(12.0, 0.0, 1.3, 0.3)], directions="2d:5", range_m=(0.8, 1.7))
     values = np.random.default_rng(1).rayleigh(size=image.amplitude.shape) * 0.1
     image = image.replace(amplitude=(image.amplitude + values).astype(np.float32))
     alpha, count = threshold_factor(method, N, 1e-2), image.amplitude.shape[1]
     above = np.zeros(image.amplitude.shape)
     for direction, place in np.ndindex(above.shape):
-        power = image.amplitude[direction, places_of(place, count)].astype(float) ** 2
+        power = image.amplitude[direction, reference_indices(place, count)].astype(float) ** 2
         reported = {
             "ordered_statistic": np.sort(power)[23],
             "cell_averaging": power.mean(),
@@ -187,8 +187,8 @@ def test_is_the_reference(method):
     np.testing.assert_array_equal(cfar(image, false_alarm=1e-2, method=method)[sure], above[sure] > 1)
 
 
-def test_weak_reflector_beside_a_strong_one():
-    """26 dB weaker and 20 cm behind: the mean is blinded, the ordered statistic is not."""
+def test_only_ordered_statistic_finds_weak_beside_strong_reflector():
+    """The second reflector is 26 dB weaker and 20 cm farther away; it hides from methods that average."""
     image = image_of([(0.0, 0.0, 1.2, 1.0), (0.0, 0.0, 1.4, 0.05)], directions="2d:3", range_m=(0.9, 1.65))
     values = np.random.default_rng(1).rayleigh(size=image.amplitude.shape) * 0.002
     image = image.replace(amplitude=(image.amplitude + values).astype(np.float32))
@@ -197,7 +197,7 @@ def test_weak_reflector_beside_a_strong_one():
     assert found == {"ordered_statistic": True, "cell_averaging": False, "greatest_of": False}
 
 
-def test_cleaning_keeps_the_strongest_of_each_range():
+def test_clean_keeps_the_strongest_directions_of_each_range():
     image = image_of([], directions="2d:4", range_m=(0.9, 1.0))
     amplitude = np.zeros(image.amplitude.shape, np.float32)
     amplitude[:, 3] = [1.0, 0.55, 0.45, 0.1]
@@ -205,26 +205,26 @@ def test_cleaning_keeps_the_strongest_of_each_range():
     given = image.replace(amplitude=amplitude)
     kept = clean(given, within_db=6.0).amplitude
     np.testing.assert_array_equal(kept[:, 3], np.float32([1.0, 0.55, 0, 0]))
-    np.testing.assert_array_equal(kept[:, 5], np.float32([0, 0, 0.02, 0]))  # the half is a little above −6 dB
+    np.testing.assert_array_equal(kept[:, 5], np.float32([0, 0, 0.02, 0]))  # one half is slightly above −6 dB
     assert not kept[:, [0, 1, 2, 4]].any()
     kept = clean(
         given, within_db=6.0, above_mean_db=6.0
-    ).amplitude  # the mean of the first is 0.525, of the other 0.0075
+    ).amplitude  # means: 0.525 at the first range, 0.0075 at the other
     assert not kept[:, 3].any()
     np.testing.assert_array_equal(kept[:, 5], np.float32([0, 0, 0.02, 0]))
     assert given.amplitude is amplitude
 
 
-def test_cleaning_takes_side_lobes_away():
+def test_clean_removes_side_lobes():
     image = image_of([(12.0, 0.0, 1.2, 1.0), (-40.0, 0.0, 1.4, 0.02)], directions="2d:181", range_m=(0.9, 1.6))
     kept = clean(image, within_db=10.0)
     lobes = np.flatnonzero(kept.amplitude[:, np.argmin(np.abs(image.range_m - 1.2))])
     assert np.ptp(np.degrees(image.azimuth_rad[lobes])) < 20
-    assert kept.amplitude[50, np.argmin(np.abs(image.range_m - 1.4))] > 0  # 34 dB weaker, but alone at its range
+    assert kept.amplitude[50, np.argmin(np.abs(image.range_m - 1.4))] > 0  # 34 dB weaker but alone at its range
 
 
-def test_peaks_are_found_however_weak():
-    """46 dB below the strongest, and 14 dB above the noise."""
+def test_cfar_peaks_finds_weak_reflectors():
+    """The weaker reflector is 46 dB below the strongest and 14 dB above the noise."""
     reflectors = [(12.3, 0, 1.1, 1.0), (-33.3, 0, 1.45, 0.005)]
     image = image_of(reflectors, directions="2d:91", range_m=(0.9, 1.65))
     rng = np.random.default_rng(1)
@@ -234,13 +234,13 @@ def test_peaks_are_found_however_weak():
     assert len(find_peaks(image)) == 1
     assert [peak.azimuth_deg for peak in peaks[:2]] == pytest.approx([12.3, -33.3], abs=3)
     assert peaks[1].level_db == pytest.approx(-46, abs=2)
-    assert len(peaks) < 2 + 8  # of 18,000 bins
+    assert len(peaks) < 2 + 8  # out of 18,000 bins
     assert len(cfar_peaks(image, top=1)) == 1
     assert len(cfar_peaks(image, min_level_db=-20)) == 1
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_silence_stands_out_of_nothing(method):
+def test_cfar_detects_nothing_in_silence(method):
     image = rayleigh(3)
     silent = image.replace(amplitude=np.zeros_like(image.amplitude))
     assert not cfar(silent, method=method).any()
@@ -262,7 +262,7 @@ def test_silence_stands_out_of_nothing(method):
         ),
     ],
 )
-def test_refuses(arguments, match):
+def test_cfar_rejects_invalid_arguments(arguments, match):
     with pytest.raises(ArgumentError, match=match):
         cfar(rayleigh(2), **arguments)
 
@@ -274,18 +274,18 @@ def test_refuses(arguments, match):
         ({"above_mean_db": -1.0}, "above_mean_db"),
     ],
 )
-def test_cleaning_refuses(arguments, match):
+def test_clean_rejects_invalid_arguments(arguments, match):
     with pytest.raises(ArgumentError, match=match):
         clean(rayleigh(2), **arguments)
 
 
-def test_bins_that_may_be_peaks_have_the_shape_of_the_image():
+def test_find_peaks_rejects_mask_of_wrong_shape():
     with pytest.raises(ArgumentError, match=r"where has shape \(2, 2\); give shape"):
         find_peaks(rayleigh(4), where=np.ones((2, 2), dtype=bool))
 
 
-def test_page_tells_what_theory_says():
-    """The table of false alarms beside a step of 20 dB."""
+def test_plots_page_lists_theoretical_false_alarm_rates():
+    """The page has a table of false alarms beside a step of 20 dB."""
     page = path_of("plots").read_text("utf-8")
     step = np.where(np.arange(N) < N // 2, 0.1, 1.0)
     for false_alarm in ("1e-2", "1e-3", "1e-4"):

@@ -1,4 +1,4 @@
-"""Argument errors name what came, what was wanted and the remedy, in one line."""
+"""Argument errors state the value, the accepted values and the remedy in one line."""
 
 import math
 
@@ -35,14 +35,14 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("check", "arguments", "message"), REFUSED)
-def test_refused(check, arguments, message):
+def test_check_rejects_invalid_value_in_one_line(check, arguments, message):
     with pytest.raises(ArgumentError) as caught:
         check(*arguments)
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-def test_what_fits_is_returned():
+def test_checks_return_valid_values():
     assert checks.finite("x", 2) == 2.0
     assert isinstance(checks.finite("x", np.float32(2)), float)
     assert checks.positive("x", 1e-300) == 1e-300
@@ -55,7 +55,7 @@ def test_what_fits_is_returned():
     checks.shape("x", (2, 3), (2, 3))
 
 
-def test_each_error_is_also_what_a_caller_would_catch():
+def test_errors_derive_from_standard_exceptions():
     assert issubclass(errors.ArgumentError, ValueError)
     assert issubclass(errors.SettingsError, errors.ArgumentError)
     assert issubclass(errors.FormatVersionError, errors.DataError)

@@ -1,4 +1,4 @@
-"""The commands do what they say, on stdout, on stderr and with their exit codes."""
+"""Commands: results on stdout, messages on stderr, and exit codes."""
 
 import ast
 import json
@@ -58,13 +58,13 @@ def images(tmp_path):
     return write_energyscapes(tmp_path / "img.h5", [image(), image(seed=2)])
 
 
-def test_from_raw_words_to_a_picture(tmp_path, raw):
+def test_import_process_peaks_and_plot_raw_samples(tmp_path, raw):
     rec, img, picture = (tmp_path / name for name in ("rec.h5", "img.h5", "picture.png"))
     assert report("import", raw, "-o", rec, *LAYOUT, "--temperature", 12.5, "--humidity", 80)["measurements"] == 2
     made = report("process", rec, "-o", img, *FAST)
     assert (made["measurements"], made["directions"], made["device"]) == (2, 9, "cpu")
     assert made["median_ms"] > 0
-    assert report("peaks", img, "--top", 2)["peaks"] == []  # the words are noise
+    assert report("peaks", img, "--top", 2)["peaks"] == []  # the samples are noise
     found = report("peaks", img, "--top", 2, "--all")["peaks"]
     assert [peak["measurement"] for peak in found] == [0, 0, 1, 1]
     places = {"azimuth_deg", "elevation_deg", "range_m"}
@@ -80,7 +80,7 @@ def test_from_raw_words_to_a_picture(tmp_path, raw):
     assert sorted(item.name for item in tmp_path.iterdir()) == ["img.h5", "picture.png", "raw.bin", "rec.h5"]
 
 
-def test_default_outputs_stand_beside_the_input(tmp_path, raw):
+def test_default_outputs_are_beside_the_input(tmp_path, raw):
     run("import", raw, *LAYOUT)
     run("process", tmp_path / "raw.h5", *FAST)
     run("plot", tmp_path / "raw.energy.h5")
@@ -88,14 +88,14 @@ def test_default_outputs_stand_beside_the_input(tmp_path, raw):
     assert names == ["raw.bin", "raw.energy.h5", "raw.energy.png", "raw.h5"]
 
 
-def test_several_raw_files(tmp_path, raw):
+def test_import_appends_several_raw_files(tmp_path, raw):
     run("import", raw, raw, "-o", tmp_path / "rec.h5", *LAYOUT, "--sensor", "left")
     with open_recording(tmp_path / "rec.h5") as back:
         assert [m.stamp.sequence for m in back] == [0, 1, 2, 3]
         assert back.sensor == "left"
 
 
-def test_json_is_one_object_and_all_of_stdout(recording, images, tmp_path):
+def test_json_output_is_one_object_on_stdout(recording, images, tmp_path):
     for arguments in (
         ["process", recording, "-o", tmp_path / "p.h5", *FAST],
         ["info", recording],
@@ -108,7 +108,7 @@ def test_json_is_one_object_and_all_of_stdout(recording, images, tmp_path):
         assert isinstance(json.loads(done.stdout), dict)
 
 
-def test_words_for_people_go_to_stderr_and_can_be_silenced(recording, tmp_path):
+def test_messages_go_to_stderr_unless_quiet(recording, tmp_path):
     done = run("process", recording, "-o", tmp_path / "a.h5", *FAST)
     assert done.stdout == ""
     assert "3 measurements, 9 directions" in done.stderr
@@ -116,7 +116,7 @@ def test_words_for_people_go_to_stderr_and_can_be_silenced(recording, tmp_path):
     assert (done.stdout, done.stderr) == ("", "")
 
 
-def test_info(recording, images):
+def test_info_reports_recordings_and_energyscapes(recording, images):
     held = report("info", recording)
     assert (held["kind"], held["measurements"], held["samples"], held["microphones"]) == ("recording", 3, 40_960, 32)
     assert held["first"] == "2023-11-14T22:13:20.123456789Z"
@@ -126,13 +126,13 @@ def test_info(recording, images):
     assert ["directions", "37"] in [line.split() for line in run("info", images).stdout.splitlines()]
 
 
-def test_info_of_unknown_times(tmp_path):
+def test_info_reports_unknown_times_as_null(tmp_path):
     write_recording(tmp_path / "rec.h5", [Measurement(noise()[0].data, SMALL)])
     reported = report("info", tmp_path / "rec.h5")
     assert (reported["first"], reported["last"]) == (None, None)
 
 
-def test_peaks_table(images):
+def test_peaks_prints_a_table(images):
     lines = run("peaks", images, "-m", 1, "--top", 1).stdout.splitlines()
     places = ["azimuth_deg", "elevation_deg", "range_m"]
     assert lines[0].split() == ["sensor", "measurement", *places, "level_db", "level_dbfs"]
@@ -140,7 +140,7 @@ def test_peaks_table(images):
     assert len(lines) == 2
 
 
-def test_threads_and_methods_and_types(recording, tmp_path):
+def test_process_accepts_threads_device_method_and_dtype(recording, tmp_path):
     amplitudes = {}
     for name, extra in {
         "one": ["--threads", 1],
@@ -158,13 +158,13 @@ def test_threads_and_methods_and_types(recording, tmp_path):
     assert not np.array_equal(amplitudes["paper"], amplitudes["one"])
 
 
-def test_limits_of_a_grid(recording, tmp_path):
+def test_process_limits_azimuth_of_a_grid(recording, tmp_path):
     run("process", recording, "-o", tmp_path / "img.h5", "--directions", "2d:3", "--azimuth", "-40:20", *FAST[:2])
     with open_energyscapes(tmp_path / "img.h5") as back:
         np.testing.assert_allclose(np.degrees(back.azimuth_rad), [-40, -10, 20])
 
 
-def test_settings_file_changes_what_it_holds(recording, tmp_path):
+def test_settings_file_changes_only_its_keys(recording, tmp_path):
     (tmp_path / "some.toml").write_text('[air]\ntemperature_c = 0.0\n[processing]\ndirections = "2d:5"\n')
     run("process", recording, "-o", tmp_path / "img.h5", "--settings", tmp_path / "some.toml", *FAST[:2])
     with open_energyscapes(tmp_path / "img.h5") as back:
@@ -174,7 +174,7 @@ def test_settings_file_changes_what_it_holds(recording, tmp_path):
         assert len(back.azimuth_rad) == 5
 
 
-def test_files_that_a_settings_file_names_are_beside_it(recording, tmp_path, monkeypatch):
+def test_paths_in_settings_file_are_relative_to_that_file(recording, tmp_path, monkeypatch):
     folder = tmp_path / "mine"
     folder.mkdir()
     (folder / "some.toml").write_text('[array]\nlayout = "line.csv"\n[processing]\ndirections = "two.csv"\n')
@@ -204,7 +204,7 @@ def test_settings_file_replaces_an_array_as_a_whole(recording, tmp_path):
     assert not np.allclose(amplitudes[0], amplitudes[1])
 
 
-def test_changing_air_is_refused_unless_one_is_given(tmp_path):
+def test_process_refuses_changing_air_without_settings(tmp_path):
     warm = SMALL.replace(air=Air(temperature_c=30.0))
     words = noise()[0].data
     write_recording(tmp_path / "rec.h5", [Measurement(words, SMALL), Measurement(words, warm, Stamp(sequence=1))])
@@ -216,12 +216,12 @@ def test_changing_air_is_refused_unless_one_is_given(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["png", "svg", "pdf"])
-def test_plot_of_a_recording(recording, tmp_path, kind):
+def test_plot_writes_each_picture_format(recording, tmp_path, kind):
     run("plot", recording, "-o", tmp_path / f"a.{kind}", "--theme", "light", "--dynamic-range", 30, "--peaks", 0)
     assert (tmp_path / f"a.{kind}").stat().st_size > 10_000
 
 
-def test_force_overwrites(images, tmp_path):
+def test_plot_overwrites_only_with_force(images, tmp_path):
     (tmp_path / "a.png").write_text("mine")
     assert "exists" in run("plot", images, "-o", tmp_path / "a.png", code=1).stderr
     assert (tmp_path / "a.png").read_text() == "mine"
@@ -229,7 +229,7 @@ def test_force_overwrites(images, tmp_path):
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_every_command_is_documented():
+def test_every_command_and_option_has_help():
     context = click.Context(cli)
     for name, (_, about) in COMMANDS.items():
         command = cli.get_command(context, name)
@@ -241,21 +241,21 @@ def test_every_command_is_documented():
             assert all(option.help for option in member.params if isinstance(option, click.Option)), member.name
 
 
-def test_help_names_all_commands():
+def test_help_lists_all_commands():
     text = run("--help").stdout
     for name, (_, about) in COMMANDS.items():
         assert name in text
         assert about in text
 
 
-def test_no_command_shows_the_help():
+def test_ertis_without_command_prints_usage():
     done = run(code=2)
     assert done.stdout == ""
     assert done.stderr.startswith("Usage: ertis [OPTIONS] COMMAND")
 
 
-def test_a_reader_that_stops(images):
-    """As ``ertis peaks | head -1``: whoever reads no further is no error to tell."""
+def test_closed_stdout_is_not_an_error(images):
+    """In ``ertis peaks | head -1``, the reader closes the pipe early."""
     process = subprocess.Popen(
         [*MODULE, "peaks", images], env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
@@ -265,7 +265,7 @@ def test_a_reader_that_stops(images):
     process.stderr.close()
 
 
-def test_help_names_all_presets():
+def test_import_help_lists_all_presets():
     text = run("import", "--help").stdout
     for preset in PRESETS:
         length, _, band = preset.partition("_")
@@ -273,8 +273,8 @@ def test_help_names_all_presets():
         assert band in text
 
 
-def test_commands_load_their_libraries_inside():
-    """Only click and the standard library may load with a command, so that help comes at once."""
+def test_command_modules_import_libraries_lazily():
+    """Modules of commands import only click and the standard library, so that help appears at once."""
     allowed = {*sys.stdlib_module_names, "click", "ertis_cli"}
     for path in Path(options.__file__).parent.glob("*.py"):
         for node in ast.parse(path.read_text()).body:
@@ -283,7 +283,7 @@ def test_commands_load_their_libraries_inside():
             assert {name.partition(".")[0] for name in names} <= allowed, path
 
 
-def test_help_loads_nothing_heavy():
+def test_help_loads_no_heavy_library():
     code = "import sys; from ertis_cli.main import cli; cli.main(['--help'])"
     done = subprocess.run(
         [sys.executable, "-X", "importtime", "-c", code], env=ENVIRONMENT, capture_output=True, text=True, check=True
@@ -293,18 +293,18 @@ def test_help_loads_nothing_heavy():
     assert not loaded & {"numba", "numpy", "scipy", "h5py", "matplotlib", "msgspec"}
 
 
-def test_import_of_the_package_loads_nothing_heavy():
+def test_package_import_loads_no_heavy_library():
     code = "import sys, ertis_numba; ertis_numba.ErtisError, ertis_numba.__version__; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True, check=True)
     assert not {"numba", "numpy", "scipy", "h5py", "matplotlib", "msgspec"} & set(done.stdout.split())
 
 
-def test_version():
+def test_version_option_prints_the_version():
     done = subprocess.run([*MODULE, "--version"], env=ENVIRONMENT, capture_output=True, text=True, check=True)
     assert done.stdout.startswith("ertis ")
 
 
-def test_failure_in_a_process_of_its_own(images):
+def test_error_of_a_command_is_one_line_on_stderr(images):
     done = subprocess.run([*MODULE, "process", images], env=ENVIRONMENT, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr.startswith("ertis: error: ")
@@ -312,7 +312,7 @@ def test_failure_in_a_process_of_its_own(images):
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
-def test_ended_from_outside(tmp_path, number, code):
+def test_signal_ends_import_and_removes_partial_file(tmp_path, number, code):
     with (tmp_path / "long.bin").open("wb") as file:
         file.truncate(4 * 65_536 * 8000)  # a sparse file, 2 GB of silence
     command = [*MODULE, "import", tmp_path / "long.bin", "-o", tmp_path / "rec.h5", *LAYOUT]
@@ -329,8 +329,8 @@ def test_ended_from_outside(tmp_path, number, code):
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_in_a_callback_is_obeyed(number, code):
-    """Python itself prints what is raised in the callback of a weak reference, and goes on."""
+def test_signal_in_a_weakref_callback_ends_the_process(number, code):
+    """Python prints and then ignores an exception raised in the callback of a weak reference."""
     program = (
         "import signal, sys, weakref; from ertis_cli import _signals; _signals.obey_signals()\n"
         "class Dropped: pass\n"
@@ -367,7 +367,7 @@ WHILE_IMPORTING = (
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 @pytest.mark.parametrize("program", [SWALLOWED, WHILE_IMPORTING], ids=["swallowed by a library", "while importing"])
-def test_a_signal_that_becomes_another_error_is_no_traceback(program, number, code):
+def test_signal_hidden_by_another_error_prints_no_traceback(program, number, code):
     command = [sys.executable, "-c", program.format(number.value)]
     done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (code, ""), done.stderr
@@ -375,7 +375,7 @@ def test_a_signal_that_becomes_another_error_is_no_traceback(program, number, co
 
 
 @pytest.mark.parametrize("command", ["import", "simulate"])
-def test_input_is_never_overwritten(tmp_path, command):
+def test_command_never_overwrites_its_input(tmp_path, command):
     path = tmp_path / "input.toml"
     path.write_bytes(b"\xaa" * 4 * 65_536 if command == "import" else b"seed = 1\n")
     before = path.read_bytes()
@@ -387,14 +387,14 @@ def test_input_is_never_overwritten(tmp_path, command):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="file names are text elsewhere")
-def test_file_name_that_is_no_text(tmp_path):
+def test_import_accepts_file_name_that_is_not_utf8(tmp_path):
     raw = os.fsencode(tmp_path) + b"/b\xff.bin"
     Path(os.fsdecode(raw)).write_bytes(b"\xaa" * 4 * 65_536)
     command = [*MODULE, "import", raw, "-o", tmp_path / "rec.h5", *LAYOUT]
     subprocess.run(command, env=ENVIRONMENT, capture_output=True, check=True)
 
 
-def test_slow_work_is_explained(capsys):
+def test_slow_work_prints_a_note(capsys):
     with options.note_when_slow("still working", after_s=0.0, quiet=False) as note:
         note.join()
     assert capsys.readouterr().err == "still working\n"
@@ -406,8 +406,8 @@ def test_slow_work_is_explained(capsys):
 @pytest.mark.parametrize(
     "command", ["process {} -o out.h5 --range 0.5:1 --directions 2d:3", "simulate scene.toml -o out.h5"]
 )
-def test_a_slow_start_is_not_said_to_compile_what_is_compiled(tmp_path, monkeypatch, command):
-    """That it took a second is all that is known."""
+def test_slow_start_note_does_not_mention_compiling(tmp_path, monkeypatch, command):
+    """A slow start alone is no evidence of compilation."""
     reported = []
 
     @contextmanager
@@ -423,7 +423,7 @@ def test_a_slow_start_is_not_said_to_compile_what_is_compiled(tmp_path, monkeypa
     assert reported[0] == "preparing ..."
 
 
-def test_compiling_is_said_where_kernels_are_compiled(capsys):
+def test_note_mentions_compiling_only_while_kernels_compile(capsys):
     import numba  # noqa: PLC0415
 
     kernels.load("cpu")
@@ -433,12 +433,12 @@ def test_compiling_is_said_where_kernels_are_compiled(capsys):
         assert capsys.readouterr().err == (f"{options.COMPILING}\n" if compiles else "")
 
 
-def test_compiling_is_not_said_of_a_warm_run(recording, tmp_path):
+def test_warm_process_does_not_mention_compiling(recording, tmp_path):
     done = run("process", recording, "-o", tmp_path / "a.h5", *FAST)
     assert "compiles" not in done.stderr
 
 
-def test_info_tells_air_and_times_to_people(recording):
+def test_info_prints_air_and_times_with_units(recording):
     lines = run("info", recording).stdout.splitlines()
     reported = dict(re.split("  +", line, maxsplit=1) for line in lines)
     assert (reported["temperature"], reported["humidity"]) == ("20.0 °C", "50.0 %")
@@ -448,7 +448,7 @@ def test_info_tells_air_and_times_to_people(recording):
     assert held["sound_speed_m_s"] == 343.87
 
 
-def test_one_microphone_tells_no_directions(tmp_path):
+def test_peaks_notes_that_one_microphone_has_no_directions(tmp_path):
     alone = SMALL.replace(array=SMALL.array.replace(layout="one", positions_m=((0.0, 0.0, 0.0),)))
     for settings, count in ((SMALL, 0), (alone, 1)):
         path = write_energyscapes(tmp_path / f"{count}.h5", [image(settings=settings)])

@@ -1,4 +1,4 @@
-"""Bad input ends in one line that says what came, what was wanted and what to do: nothing else."""
+"""Invalid input ends in one line with the value, the accepted values and the remedy, and writes no file."""
 
 import os
 import shutil
@@ -20,7 +20,7 @@ from tests.files import image, noise
 N_BYTES = 4 * 65_536
 RAW = "import {} -o out.h5 --layout eRTIS_v3D1 --preset short_25_50"
 CASES = {
-    # raw words
+    # raw samples
     "missing raw file": (RAW.format("none.bin"), 1, "none.bin: No such file or directory"),
     "empty raw file": (RAW.format("empty.bin"), 1, "empty.bin is empty, wanted a multiple of 262144"),
     "odd raw file": (RAW.format("odd.bin"), 1, "odd.bin has 262143 bytes, which is not a multiple of a word"),
@@ -128,7 +128,7 @@ CASES = {
     "output is a folder": ("process rec.h5 -o folder --force", 1, "output folder is a folder; give the name of a file"),
     "no such folder": ("process rec.h5 -o none/out.h5", 1, "output none/out.h5: folder none does not exist; create it"),
     "output is the input": ("process rec.h5 -o rec.h5 --force", 1, "output rec.h5 is the input itself; give"),
-    # looking
+    # views of files
     "no such measurement": ("plot img.h5 -o out.png -m 7", 1, "--measurement is 7; give a whole number from 0 to 0"),
     "negative measurement": ("peaks img.h5 -m -1", 1, "--measurement is -1; give a whole number from 0 to 0"),
     "no peaks": ("peaks img.h5 --top 0", 1, "--top is 0; give a whole number of at least 1"),
@@ -139,7 +139,7 @@ CASES = {
     "a folder": ("plot folder", 1, "folder is a folder; give a recording or an energyscape file"),
     "picture format": ("plot img.h5 -o out.bmp", 1, "picture format '.bmp' is unknown; known are .pdf, .png, .svg"),
     "dynamic range": ("plot img.h5 -o out.png --dynamic-range -5", 1, "--dynamic-range is -5; give a number above 0"),
-    # sensors and truth
+    # sensors and ground truth
     "which sensor": ("plot two.h5 -o out.png", 1, "two.h5 contains 2 sensors; choose one of left, right (--sensor)"),
     "no such sensor to process": ("process rec.h5 -o out.h5 --sensor x", 1, "has no sensor 'x'; choose one of eRTIS-7"),
     "no such sensor to plot": ("plot two.h5 -o out.png --sensor x", 1, "no sensor 'x'; choose one of left, right"),
@@ -174,7 +174,7 @@ CASES = {
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """All the files that the cases name, good and bad."""
+    """A folder with all files that the cases name, valid and invalid."""
     folder = tmp_path_factory.mktemp("files")
     (folder / "folder").mkdir()
     for name, n_bytes in {"good": N_BYTES, "empty": 0, "odd": N_BYTES - 1, "cut": N_BYTES - 4}.items():
@@ -204,21 +204,21 @@ def folder(tmp_path_factory):
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_one_line_and_nothing_left(folder, monkeypatch, name):
+def test_invalid_command_prints_one_line_and_writes_nothing(folder, monkeypatch, name):
     command, code, message = CASES[name]
     monkeypatch.chdir(folder)
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
     done = CliRunner().invoke(cli, command.split())
     assert done.exit_code == code, done.output
     assert done.stdout == ""
-    stated = done.stderr.removeprefix(f"{options.PREPARING}\n")  # as a slow machine is told
+    stated = done.stderr.removeprefix(f"{options.PREPARING}\n")  # a slow machine prints this note first
     assert stated.startswith("ertis: error: ")
     assert stated.count("\n") == 1
     assert message in stated
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
 
 
-def test_a_folder_that_cannot_be_written(tmp_path, folder):
+def test_process_reports_a_read_only_folder(tmp_path, folder):
     if os.geteuid() == 0:
         pytest.skip("root may write everywhere")
     tmp_path.chmod(0o555)
@@ -250,9 +250,9 @@ def test_a_folder_that_cannot_be_written(tmp_path, folder):
         ("export img.h5 -o /sys/a.csv", "/sys/a.csv cannot be written (Permission denied); check the permissions"),
     ],
 )
-def test_the_remedy_fits_the_cause(folder, monkeypatch, command, message):
+def test_unwritable_output_suggests_a_fitting_remedy(folder, monkeypatch, command, message):
     monkeypatch.chdir(folder)
-    monkeypatch.setattr("ertis_numba.storage._writer.require_free_space", lambda *_: None)  # there is none in /sys
+    monkeypatch.setattr("ertis_numba.storage._writer.require_free_space", lambda *_: None)  # /sys has no free space
     done = CliRunner().invoke(cli, command.split())
     assert done.exit_code == 1
     assert done.stderr.startswith(f"ertis: error: {message}"), done.stderr
@@ -262,7 +262,7 @@ def test_the_remedy_fits_the_cause(folder, monkeypatch, command, message):
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="only Linux has a device that is always full")
 @pytest.mark.parametrize("more", [[], ["--json"]])
-def test_a_full_disk_behind_stdout_is_told_in_a_line(folder, more):
+def test_full_disk_behind_stdout_is_reported_in_one_line(folder, more):
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(
             [sys.executable, "-m", "ertis_cli", "info", folder / "rec.h5", *more],
@@ -278,7 +278,7 @@ def test_a_full_disk_behind_stdout_is_told_in_a_line(folder, more):
     )
 
 
-def test_mistakes_of_the_program_keep_their_traceback(monkeypatch):
+def test_program_errors_keep_their_traceback(monkeypatch):
     monkeypatch.setattr("ertis_cli.info.options.print_json", None)
     monkeypatch.setattr("ertis_numba.storage.file_kind", None)
     done = CliRunner().invoke(cli, ["info", "x"])

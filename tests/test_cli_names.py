@@ -1,4 +1,4 @@
-"""What is refused is called as it was typed: options by their names, also where a library refuses the value."""
+"""Error messages name options as typed, even if the library rejects the value."""
 
 import pytest
 from click.testing import CliRunner
@@ -26,7 +26,7 @@ CASES = {
         "Invalid value for '--steer': '100:0' is not a direction; give azimuth and elevation, each from -90"
     ),
     "process r.h5 -o a.h5 --threads 0": "--threads is 0; give a whole number from 1",
-    "plot r.h5 -o a.png -m 5": "--measurement is 5; give",  # as always
+    "plot r.h5 -o a.png -m 5": "--measurement is 5; give",  # unchanged name
 }
 
 
@@ -41,28 +41,28 @@ def folder(tmp_path_factory):
 
 
 @pytest.mark.parametrize("line", CASES)
-def test_an_option_is_called_by_its_name(folder, monkeypatch, line):
+def test_errors_name_the_option_as_typed(folder, monkeypatch, line):
     monkeypatch.chdir(folder)
     done = CliRunner().invoke(cli, line.split())
     assert done.exit_code in {1, 2}
     assert done.stderr.startswith(f"ertis: error: {CASES[line]}"), done.stderr
 
 
-def test_names_that_were_not_given_stay(folder, monkeypatch):
-    """A settings file has keys, which are no options."""
+def test_errors_keep_keys_of_settings_files(folder, monkeypatch):
+    """Keys of a settings file are not options, so messages keep them."""
     monkeypatch.chdir(folder)
     (folder / "s.toml").write_text("[air]\ntemperature_c = nan\n")
     done = CliRunner().invoke(cli, ["process", "r.h5", "-o", "a.h5", "--settings", "s.toml"])
     assert "air.temperature_c is nan; give a finite number" in done.stderr
 
 
-def test_a_variable_has_the_name_of_the_option(folder, monkeypatch):
+def test_errors_of_environment_variables_name_the_option(folder, monkeypatch):
     monkeypatch.chdir(folder)
     done = CliRunner().invoke(cli, ["peaks", "i.h5"], env={"ERTIS_PEAKS_TOP": "0"})
     assert done.stderr.startswith("ertis: error: --top is 0; give a whole number of at least 1")
 
 
-def test_one_number_is_no_direction(folder, monkeypatch):
+def test_plot_steer_rejects_a_single_number(folder, monkeypatch):
     monkeypatch.chdir(folder)
     done = CliRunner().invoke(cli, ["plot", "eRTIS_v2", "-o", "a.png", "--kind", "array", "--steer", "30"])
     assert done.exit_code == 2

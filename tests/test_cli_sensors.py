@@ -1,4 +1,4 @@
-"""The commands on files of several sensors, and against the truth."""
+"""Commands on files with several sensors and with ground truth."""
 
 import json
 from dataclasses import replace
@@ -29,7 +29,7 @@ def report(*arguments):
 
 @pytest.fixture
 def recording(tmp_path):
-    """A recording of two sensors, whose arrays differ, with a truth about one of them."""
+    """A recording of two sensors with different arrays and a ground truth of one sensor."""
     given = [
         replace(m, stamp=replace(m.stamp, sensor=name))
         for name, settings, count in (("right", line(8, 8), 2), ("left", line(16, 16), 1))
@@ -42,7 +42,7 @@ def recording(tmp_path):
 
 @pytest.fixture(scope="module")
 def images(tmp_path_factory):
-    """Images of two sensors: the first finds all, the second misses one and has one too many."""
+    """Images of two sensors: the first has all reflectors, the second a missed reflector and a ghost."""
     shown = {"front": [ideal(LEFT, MIDDLE), ideal(RIGHT)], "rear": [ideal(LEFT, MIDDLE)]}
     reported = {"front": ((MIDDLE, LEFT), (RIGHT,)), "rear": ((MIDDLE, RIGHT),)}
     return write_energyscapes(
@@ -52,7 +52,7 @@ def images(tmp_path_factory):
     )
 
 
-def test_process_takes_all_sensors(recording, tmp_path):
+def test_process_includes_all_sensors(recording, tmp_path):
     made = report("process", recording, "-o", tmp_path / "img.h5", *FAST)
     assert (made["measurements"], made["device"]) == (3, "cpu")
     assert [(row["sensor"], row["measurements"], row["directions"]) for row in made["sensors"]] == [
@@ -73,7 +73,7 @@ def test_process_takes_all_sensors(recording, tmp_path):
         assert len(left.settings.array.positions_m) == 16
 
 
-def test_process_takes_one_sensor(recording, tmp_path):
+def test_process_selects_one_sensor(recording, tmp_path):
     run("process", recording, "-o", tmp_path / "both.h5", *FAST)
     made = report("process", recording, "-o", tmp_path / "one.h5", "--sensor", "left", *FAST)
     assert (made["measurements"], made["directions"], made["sensors"][0]["sensor"]) == (1, 9, "left")
@@ -82,14 +82,14 @@ def test_process_takes_one_sensor(recording, tmp_path):
         assert np.array_equal(both[0].amplitude, one[0].amplitude)
 
 
-def test_process_says_a_line_for_each_sensor(recording, tmp_path):
+def test_process_prints_a_line_for_each_sensor(recording, tmp_path):
     lines = run("process", recording, "-o", tmp_path / "img.h5", *FAST).stderr.splitlines()
     reported = [text for text in lines if "img.h5" in text]
     assert "2 measurements of right, 9 directions" in reported[0]
     assert "1 measurement of left, 9 directions" in reported[1]
 
 
-def test_process_refuses_before_it_writes(recording, tmp_path):
+def test_process_rejects_invalid_range_without_writing(recording, tmp_path):
     done = run("process", recording, "-o", tmp_path / "img.h5", "--range", "1:50", code=1)
     assert "processing.range_m ends at 50 m" in done.stderr
     assert [item.name for item in tmp_path.iterdir()] == ["rec.h5"]
@@ -108,20 +108,20 @@ def test_info_has_a_section_for_each_sensor(recording, images):
     assert [row["measurements"] for row in report("info", images)["sensors"]] == [2, 1]
 
 
-def test_info_of_one_sensor_is_flat_as_well(tmp_path):
+def test_info_of_one_sensor_is_flat_too(tmp_path):
     held = report("info", write_recording(tmp_path / "rec.h5", noise()))
     assert held["measurements"] == 3
     assert held.items() >= held["sensors"][0].items()
 
 
-def test_plot_of_one_of_several(images, recording, tmp_path):
+def test_plot_selects_sensor_and_measurement(images, recording, tmp_path):
     made = report("plot", images, "-o", tmp_path / "a.png", "--sensor", "front", "-m", 1)
     assert (made["sensor"], made["measurement"]) == ("front", 1)
     run("plot", recording, "-o", tmp_path / "b.png", "--sensor", "left")
     assert (tmp_path / "b.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_peaks_of_all_sensors_or_one(images):
+def test_peaks_lists_all_sensors_or_a_selected_one(images):
     found = report("peaks", images)["peaks"]
     assert [(peak["sensor"], peak["measurement"]) for peak in found] == [
         ("front", 0),
@@ -135,7 +135,7 @@ def test_peaks_of_all_sensors_or_one(images):
     assert [line.split()[0] for line in lines] == ["sensor", "front", "front", "rear", "rear"]
 
 
-def test_peaks_beside_the_truth(images):
+def test_peaks_truth_reports_errors_and_missed_reflectors(images):
     held = report("peaks", images, "--truth")
     assert [peak["truth"]["name"] if peak["truth"] else None for peak in held["peaks"]] == ["points[0]"] * 4 + [None]
     assert [peak["false"] for peak in held["peaks"]] == [False] * 4 + [True]
@@ -154,7 +154,7 @@ def test_peaks_beside_the_truth(images):
     assert report("peaks", images, "--truth", "-m", 0, "--sensor", "front")["missed"] == []
 
 
-def test_table_beside_the_truth(images):
+def test_peaks_truth_table_has_error_columns(images):
     head, *lines = run("peaks", images, "--truth", "--sensor", "rear").stdout.splitlines()
     assert head.split()[-4:] == ["angle_error_deg", "range_error_m", "level_error_db", "reflector"]
     cells = [line.split() for line in lines]
@@ -162,10 +162,10 @@ def test_table_beside_the_truth(images):
     assert cells[0][-1] == "points[0]"
     assert cells[1][2:] == ["+55.50", "+0.00", "1.450", "-4.0", "missed", "-", "-", "points[0]"]
     assert cells[2][6:] == ["false", "-", "-", "-"]
-    assert len({len(line.rsplit(None, 1)[0].rstrip()) for line in lines[1:]}) == 1  # columns stand below each other
+    assert len({len(line.rsplit(None, 1)[0].rstrip()) for line in lines[1:]}) == 1  # columns are aligned
 
 
-def test_compare_all_sensors(images):
+def test_compare_reports_all_sensors(images):
     held = report("compare", images)
     assert [(row["sensor"], row["measurements"], row["matched"]) for row in held["sensors"]] == [
         ("front", 2, 3),
@@ -179,12 +179,12 @@ def test_compare_all_sensors(images):
         assert abs(row["range_bias_m"]) <= row["range_rms_m"] < 1e-3
 
 
-def test_compare_one_sensor_and_level(images):
+def test_compare_selects_sensor_and_min_level(images):
     held = report("compare", images, "--sensor", "rear", "--min-level", -3)
     assert (len(held["sensors"]), held["matched"], held["missed"], held["false"]) == (1, 1, 0, 0)
 
 
-def test_compare_table(images):
+def test_compare_prints_an_aligned_table(images):
     head, *lines = run("compare", images).stdout.splitlines()
     assert head.split()[0] == "sensor"
     assert set(ERRORS) <= set(head.split())
@@ -192,7 +192,7 @@ def test_compare_table(images):
     assert len({len(line) for line in (head, *lines)}) == 1
 
 
-def test_compare_where_nothing_is_found(tmp_path):
+def test_compare_without_matches_has_no_errors(tmp_path):
     path = write_energyscapes(
         tmp_path / "img.h5",
         [ideal()],

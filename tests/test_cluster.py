@@ -1,4 +1,4 @@
-"""Jobs on a real dask cluster of this machine, through the interface that local workers have, too."""
+"""Jobs on a real dask cluster on this machine, through the interface that local workers share."""
 
 import gc
 import os
@@ -54,8 +54,8 @@ def events_of(runner, count=1):
     return found
 
 
-def give(runner, job):
-    """As soon as a worker takes it."""
+def submit_when_possible(runner, job):
+    """Submit a job as soon as a worker can accept it."""
     end_s = time.monotonic() + LONG_S
     while not runner.takes(job.kind) and time.monotonic() < end_s:
         assert not runner.tick(time.monotonic(), 10.0)
@@ -64,7 +64,7 @@ def give(runner, job):
 
 
 def get_all_ready(runner, n_workers, kind):
-    """Wait until a kind is ready on some workers, as one is enough for jobs to be taken."""
+    """Wait until a kind is ready on some workers, because a cluster accepts jobs as soon as one worker is ready."""
     end_s = time.monotonic() + LONG_S
     members = runner._members  # noqa: SLF001
     while sum(kind.number in each.ready for each in members.values()) < n_workers:
@@ -85,7 +85,7 @@ def job_of(measurement, number, kind, *, points=False):
     return Job(number, data, measurement.data, kind, 0, points=points)
 
 
-def test_images_are_those_of_a_pipeline_here(cluster, measurement):
+def test_cluster_images_equal_those_of_a_local_pipeline(cluster, measurement):
     kind = kind_of(measurement)
     cluster.prepare(kind)
     assert not cluster.takes(kind)
@@ -107,7 +107,7 @@ def test_images_are_those_of_a_pipeline_here(cluster, measurement):
     assert "2 workers" in cluster.choice
 
 
-def test_it_takes_no_more_than_it_has_threads(cluster, measurement):
+def test_cluster_accepts_one_job_per_thread(cluster, measurement):
     kind = kind_of(measurement)
     cluster.prepare(kind)
     events_of(cluster)
@@ -123,7 +123,7 @@ def test_it_takes_no_more_than_it_has_threads(cluster, measurement):
     assert cluster.takes(kind)
 
 
-def test_settings_that_no_pipeline_can_use_are_told(cluster, measurement):
+def test_cluster_reports_settings_a_pipeline_rejects(cluster, measurement):
     processing = measurement.settings.processing.replace(directions="no/such/grid.csv")
     cluster.prepare(kind_of(measurement, 1, measurement.settings.replace(processing=processing)))
     (event, *_) = events_of(cluster)
@@ -131,7 +131,7 @@ def test_settings_that_no_pipeline_can_use_are_told(cluster, measurement):
     assert "grid.csv" in event.text
 
 
-def test_words_that_do_not_fit_are_told(cluster, measurement):
+def test_cluster_reports_samples_of_wrong_length(cluster, measurement):
     kind = kind_of(measurement)
     cluster.prepare(kind)
     events_of(cluster)
@@ -142,12 +142,12 @@ def test_words_that_do_not_fit_are_told(cluster, measurement):
     assert "bytes" in event.text
 
 
-def test_a_worker_that_is_killed_loses_nothing(cluster, measurement):
+def test_cluster_recovers_jobs_of_a_killed_worker(cluster, measurement):
     kind = kind_of(measurement)
     cluster.prepare(kind)
     events_of(cluster)
     get_all_ready(cluster, 2, kind)
-    for number in range(2):  # both have one
+    for number in range(2):  # one job for each worker
         cluster.submit(job_of(measurement, number, kind))
     victim = cluster.status()[0].pid
     os.kill(victim, signal.SIGKILL)
@@ -158,7 +158,7 @@ def test_a_worker_that_is_killed_loses_nothing(cluster, measurement):
         while waiting and cluster.takes(kind):
             cluster.submit(waiting.pop(0))
         for event in cluster.tick(time.monotonic(), 10.0):
-            if isinstance(event, Lost):  # as by a worker of this machine: whoever asked for it tries again
+            if isinstance(event, Lost):  # as with a local worker, the caller retries
                 assert event.again
                 waiting.insert(0, event.job)
             else:
@@ -167,26 +167,26 @@ def test_a_worker_that_is_killed_loses_nothing(cluster, measurement):
         time.sleep(0.01)
     assert victim not in {worker.pid for worker in cluster.status()}
     assert cluster.respawned == 1
-    get_all_ready(cluster, 2, kind)  # dask has started another, which is used from now on
+    get_all_ready(cluster, 2, kind)  # dask has started a new worker, which the cluster uses
 
 
-def test_what_is_not_done_in_time_is_given_up(scheduler, measurement):
+def test_cluster_abandons_jobs_after_their_deadline(scheduler, measurement):
     stated = []
     runner = Cluster(ProcessingOptions(cluster=scheduler, deadline_s=1e-6), stated.append)
     kind = kind_of(measurement)
     runner.prepare(kind)
     events_of(runner)
-    give(runner, job_of(measurement, 0, kind))
+    submit_when_possible(runner, job_of(measurement, 0, kind))
     (event,) = events_of(runner)
     assert isinstance(event, Lost)
     assert event.again
     assert "deadline" in event.text
     assert any("gets no more jobs: it missed the deadline" in text for text in stated)
-    give(runner, job_of(measurement, 1, kind))  # it is reached again, or another takes it
+    submit_when_possible(runner, job_of(measurement, 1, kind))  # the worker is reachable again, or another accepts
     runner.close()
 
 
-def test_what_a_worker_raises_is_told_and_costs_no_worker(cluster, measurement, monkeypatch):
+def test_cluster_worker_survives_an_exception_in_a_job(cluster, measurement, monkeypatch):
     kind = kind_of(measurement)
     cluster.prepare(kind)
     events_of(cluster)
@@ -199,7 +199,7 @@ def test_what_a_worker_raises_is_told_and_costs_no_worker(cluster, measurement, 
     assert cluster.respawned == 0
 
 
-def test_a_kind_that_is_forgotten_can_be_prepared_again(cluster, measurement):
+def test_forgotten_job_kind_can_be_prepared_again(cluster, measurement):
     kind = kind_of(measurement)
     cluster.prepare(kind)
     cluster.forget(kind)
@@ -209,22 +209,22 @@ def test_a_kind_that_is_forgotten_can_be_prepared_again(cluster, measurement):
     assert not cluster.takes(kind)
 
 
-def test_a_scheduler_that_is_not_there_is_told_in_a_line(monkeypatch):
+def test_cluster_reports_a_missing_scheduler(monkeypatch):
     monkeypatch.setattr("ertis_numba.network.processing.cluster._CONNECT_S", 0.5)
     with pytest.raises(ertis.NetworkError, match=r"no dask scheduler answers at tcp://127\.0\.0\.1:9"):
         Cluster(ProcessingOptions(cluster="tcp://127.0.0.1:9"), lambda _: None)
 
 
 @pytest.mark.parametrize("address", ["foo", "http://127.0.0.1:9", "silent"])
-def test_what_is_no_scheduler_is_told_and_nothing_goes_on(address):
-    """A client that is not closed would wait for an answer until the process ends, and print that none came."""
+def test_connect_rejects_other_servers_and_closes_its_client(address):
+    """An unclosed client would wait for an answer until the process ends, and then print an error."""
 
     def unclosed():
         clients = {each for each in gc.get_objects() if issubclass(type(each), Client)}
         return {client for client in clients if client.status != "closed"}
 
     before = unclosed()
-    with socket.create_server(("127.0.0.1", 0)) as silent:  # takes calls, and says nothing
+    with socket.create_server(("127.0.0.1", 0)) as silent:  # accepts connections and never answers
         name = address.replace("silent", "tcp://{}:{}".format(*silent.getsockname()))
         with pytest.raises(ertis.NetworkError, match=f"no dask scheduler answers at {name} "):
             connect(name, timeout_s=0.1)

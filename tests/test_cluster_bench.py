@@ -1,4 +1,4 @@
-"""``ertis bench network --only cluster`` runs, in its short form, and says what its table needs."""
+"""``ertis bench network --only cluster``, with a short measurement, fills its table."""
 
 import json
 
@@ -11,7 +11,7 @@ processing = figures.processing
 
 
 def only_on_the_cluster(folder, duration_s, seed, *, rate_hz, scheduler, **options):
-    """Make images on the cluster at the lower rate; of all else, which takes long, other tests know."""
+    """Measure the cluster at the lower rate only. Other tests cover the remaining cases, which are slow."""
     if scheduler is not None and rate_hz == 10.0:
         return processing(folder, duration_s, seed, rate_hz=rate_hz, scheduler=scheduler, **options)
     published = round(duration_s * (rate_hz if scheduler is None else rate_hz / 2))
@@ -24,7 +24,7 @@ def _short(monkeypatch):
     monkeypatch.setattr(figures, "processing", only_on_the_cluster)
 
 
-def test_images_of_a_cluster_are_measured_and_written(tmp_path):
+def test_cluster_bench_measures_and_updates_the_page(tmp_path):
     target = tmp_path / "page.md"
     target.write_text(
         "<!-- ertis bench network --only cluster -->\nold\n<!-- /ertis bench network --only cluster -->\n", "utf-8"

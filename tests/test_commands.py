@@ -1,4 +1,4 @@
-"""Commands, answers and blocks as bytes, and what a sensor is told for which settings."""
+"""Commands, answers and blocks as bytes, and the commands that settings produce."""
 
 import dataclasses
 import math
@@ -22,7 +22,7 @@ WIDE = tuple((0.0, 0.001 * channel, 0.0) for channel in range(33))
 
 
 @given(st.sampled_from(commands.CODES), NUMBERS, NUMBERS, NUMBERS)
-def test_a_command_is_read_as_it_was_written(code, first, second, third):
+def test_command_encoding_round_trips(code, first, second, third):
     command = Command(code, first, second, third)
     line = command.encode()
     assert Command.decode(line) == Command.decode(line.removesuffix(b"\n")) == command
@@ -31,13 +31,13 @@ def test_a_command_is_read_as_it_was_written(code, first, second, third):
     assert len(command.about.splitlines()) == 1
 
 
-def test_a_command_as_it_stands_on_the_wire():
+def test_command_bytes_are_fixed():
     assert Command("G", 655_360).encode() == b"!G,655360,0,0\n"
     assert Command("C", 17, 4095).encode() == b"!C,17,4095,0\n"
 
 
 @given(st.binary(max_size=30))
-def test_whatever_comes_is_a_command_or_refused(line):
+def test_command_decode_of_any_bytes_succeeds_or_raises(line):
     try:
         command = Command.decode(line)
     except DataError:
@@ -66,7 +66,7 @@ def test_whatever_comes_is_a_command_or_refused(line):
         b"!G,\xd9\xa1,0,0\n",
     ],
 )
-def test_what_is_no_command_is_refused(line):
+def test_command_decode_rejects_invalid_lines(line):
     with pytest.raises(
         DataError,
         match="is not a command; a command is '!X,i,j,k' with X one of YGFDECLIHJKBA and whole numbers from 0 to",
@@ -75,7 +75,7 @@ def test_what_is_no_command_is_refused(line):
     assert "\n" not in str(caught.value)
 
 
-def test_of_a_long_line_the_beginning_is_told():
+def test_command_decode_error_truncates_long_lines():
     with pytest.raises(DataError, match=r"^b'A{40}' is not a command"):
         Command.decode(b"A" * 10_000)
 
@@ -89,12 +89,12 @@ def test_of_a_long_line_the_beginning_is_told():
         (("C", 0, 0, 1.0), "third number of command C is 1.0; give a whole number"),
     ],
 )
-def test_what_cannot_be_commanded(arguments, message):
+def test_command_rejects_unknown_letter_and_invalid_numbers(arguments, message):
     with pytest.raises(ArgumentError, match=message):
         Command(*arguments)
 
 
-def test_commands_in_words():
+def test_command_about_describes_each_command():
     reported = [Command(code, 1, 2).about for code in commands.CODES]
     assert reported == [
         "firmware version?",
@@ -121,32 +121,32 @@ def test_commands_in_words():
     assert Command("F", 2).about == "PDM clock: mode 2"
 
 
-def test_all_but_a_measurement_are_answered():
+def test_every_command_but_measure_has_an_answer():
     assert [code for code in commands.CODES if not Command(code).answers] == ["A"]
 
 
 @given(NUMBERS)
-def test_an_answer_is_read_as_it_was_written(value):
+def test_answer_encoding_round_trips(value):
     assert commands.decode_answer(commands.encode_answer(value)) == value
 
 
-def test_an_answer_as_it_stands_on_the_wire():
+def test_answer_bytes_are_fixed():
     assert commands.encode_answer(0x01020304) == b"\x04\x03\x02\x01"
     assert commands.firmware_version(0xFF_02_10_00) == "2.16.0"
 
 
 @pytest.mark.parametrize("data", [b"", b"abc", b"abcde"])
-def test_an_answer_of_another_length_is_refused(data):
+def test_answer_of_wrong_length_is_refused(data):
     with pytest.raises(DataError, match=f"answer has {len(data)} bytes; an answer has 4: ask again"):
         commands.decode_answer(data)
 
 
-def test_an_answer_that_does_not_fit_is_refused():
+def test_answer_above_32_bits_is_refused():
     with pytest.raises(ArgumentError, match="answer is 4294967296; give a whole number from 0 to 4294967295"):
         commands.encode_answer(2**32)
 
 
-def test_a_block_as_it_stands_on_the_wire():
+def test_block_bytes_are_fixed():
     words = np.array([1, 0xA0B0C0D0], dtype=np.uint32)
     expected = struct.pack("<IIIII", 0x51534E12, 7, 1, 0xA0B0C0D0, 0x2F418672)
     assert blocks.encode_block(7, words) == expected
@@ -163,13 +163,13 @@ def test_a_block_as_it_stands_on_the_wire():
         (0, np.zeros((1, 2), np.uint32), r"words are uint32 of shape \(1, 2\); give \(sample,\) uint32"),
     ],
 )
-def test_what_is_no_block_is_refused(counter, words, message):
+def test_encode_block_rejects_invalid_counter_and_samples(counter, words, message):
     with pytest.raises(ArgumentError, match=message):
         blocks.encode_block(counter, words)
 
 
-def test_the_codes_of_a_call():
-    """Against the phase as the makers write it, sample by sample."""
+def test_call_codes_follow_the_documented_phase():
+    """The reference is the phase formula of the manufacturer, evaluated sample by sample."""
     call = Call()
     codes = call_codes(call)
     assert (len(codes), codes.dtype) == (1126, np.uint16)  # t = 0 … T inclusive
@@ -185,12 +185,12 @@ def test_the_codes_of_a_call():
     assert 4085 < codes.max() <= 4095
 
 
-def test_the_hash_of_a_call_is_the_xor_of_its_codes():
+def test_call_hash_is_the_xor_of_its_codes():
     assert call_hash(np.array([0b0101, 0b0011, 0b1000], np.uint16)) == 0b1110
     assert call_hash(np.array([], np.uint16)) == 0
 
 
-def test_what_a_sensor_is_told_by_default():
+def test_setup_of_default_settings_gives_expected_commands():
     setup = Setup.of(Settings())
     assert [command.encode() for command in setup.before_call()] == [
         b"!J,0,1,0\n",
@@ -206,7 +206,7 @@ def test_what_a_sensor_is_told_by_default():
     assert setup.n_bytes == 655_360
 
 
-def test_what_a_passive_sensor_is_told():
+def test_setup_of_a_passive_sensor_gives_expected_commands():
     settings = Settings().replace(recording=Recording(n_samples=32_768, sample_rate_hz=1_125_000.0), call=_slow())
     setup = Setup.of(settings, active=False, pin=2, emissions=3)
     assert b"".join(command.encode() for command in setup.before_call()[:3]) == b"!J,0,2,0\n!G,131072,0,0\n!F,1,0,0\n"
@@ -219,11 +219,11 @@ def _slow():
 
 
 @pytest.mark.parametrize("preset", ["short_20_80", "default_25_50", "long_20_80"])
-def test_presets_suit_a_sensor(preset):
+def test_setup_accepts_presets(preset):
     assert Setup.of(Settings.from_preset(preset)).n_samples % commands.LENGTH_STEP == 0
 
 
-def test_the_longest_measurement_suits_a_sensor():
+def test_setup_accepts_the_longest_measurement():
     setup = Setup.of(Settings(recording=Recording(n_samples=commands.MAX_WORDS)))
     assert setup.before_call()[1] == Command("G", 2**26)
 
@@ -261,7 +261,7 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("changes", "message"), REFUSED)
-def test_what_no_sensor_can_do_is_refused(changes, message):
+def test_setup_rejects_settings_beyond_the_hardware(changes, message):
     settings = Settings().replace(**changes)
     with pytest.raises(ArgumentError, match=message) as caught:
         Setup.of(settings)
@@ -269,7 +269,7 @@ def test_what_no_sensor_can_do_is_refused(changes, message):
 
 
 @pytest.mark.parametrize("n_samples", [64, 65_535])
-def test_the_shortest_and_the_longest_call_suit_a_sensor(n_samples):
+def test_setup_accepts_the_shortest_and_longest_call(n_samples):
     setup = Setup.of(Settings().replace(**_call(duration_s=(n_samples - 1) / 450_000)))
     assert setup.before_call()[-1] == Command("E", n_samples)
 
@@ -281,7 +281,7 @@ def test_the_shortest_and_the_longest_call_suit_a_sensor(n_samples):
         ({"emissions": 0}, "emissions is 0; give a whole number from 1 to"),
     ],
 )
-def test_how_no_sensor_measures_is_refused(changes, message):
+def test_setup_of_settings_rejects_invalid_options(changes, message):
     with pytest.raises(ArgumentError, match=message):
         Setup.of(Settings(), **changes)
 
@@ -312,7 +312,7 @@ CODES = call_codes(Call())
         ),
     ],
 )
-def test_a_setup_without_settings_is_checked_as_well(changes, message):
+def test_setup_constructor_rejects_invalid_arguments(changes, message):
     right = {"n_samples": 32_768, "pdm_rate_hz": 4.5e6, "codes": CODES, "dac_rate_hz": 450_000}
     with pytest.raises(ArgumentError, match=message) as caught:
         Setup(**right | changes)
@@ -320,11 +320,11 @@ def test_a_setup_without_settings_is_checked_as_well(changes, message):
     assert Setup(**right).before_call() == Setup.of(Settings(recording=Recording(n_samples=32_768))).before_call()
 
 
-def test_fewer_channels_than_bits_are_no_harm():
+def test_setup_accepts_fewer_channels_than_bits():
     setup = Setup.of(Settings().replace(array=Array(layout="line", positions_m=LINE_8)))
     assert setup.n_samples == Recording().n_samples
 
 
-def test_a_setup_cannot_be_changed():
+def test_setup_is_immutable():
     with pytest.raises(dataclasses.FrozenInstanceError):
         Setup.of(Settings()).pin = 2

@@ -1,4 +1,4 @@
-"""Errors against a known truth, in images whose content is known by formula."""
+"""Comparison with a known ground truth, on images computed from closed forms."""
 
 import math
 from dataclasses import replace
@@ -24,7 +24,7 @@ def true(azimuth_deg, range_m, level_db=0.0, *, elevation_deg=0.0, name="points[
 
 
 def ideal(*reflectors, **options):
-    """The image of reflectors as they are said to be."""
+    """Return an image that shows reflectors exactly as specified."""
     return image_of(
         [(r.azimuth_deg, r.elevation_deg, r.range_m, 10 ** (r.level_db / 20)) for r in reflectors], **options
     )
@@ -37,7 +37,7 @@ def counts(comparison):
 LEFT, MIDDLE, RIGHT = true(-40, 0.95, -6.0), true(3.3, 1.3), true(55.5, 1.45, -4.0)
 
 
-def test_reflectors_that_are_where_they_should_be():
+def test_compare_matches_reflectors_at_true_positions():
     comparison = compare(ideal(LEFT, MIDDLE, RIGHT), [MIDDLE, RIGHT, LEFT])
     assert counts(comparison) == (3, 0, 0, 0)
     assert [match.reflector for match in comparison.matched] == [MIDDLE, RIGHT, LEFT]
@@ -48,8 +48,8 @@ def test_reflectors_that_are_where_they_should_be():
     assert errors.level_rms_db < 0.5
 
 
-def test_known_errors_are_measured():
-    """The truth is displaced by a known step from what the image shows."""
+def test_compare_measures_known_displacements():
+    """The ground truth is displaced from the image by a known step."""
     reported = [true(r.azimuth_deg + 2, r.range_m - 0.05, r.level_db) for r in (LEFT, MIDDLE, RIGHT)]
     exact = errors_of([compare(ideal(LEFT, MIDDLE, RIGHT), [MIDDLE, RIGHT, LEFT])])
     errors = errors_of([compare(ideal(LEFT, MIDDLE, RIGHT), reported)])
@@ -59,15 +59,15 @@ def test_known_errors_are_measured():
     assert errors.range_rms_m == pytest.approx(0.05, abs=1e-3)
 
 
-def test_levels_are_below_the_strongest_found():
+def test_compare_levels_are_relative_to_the_strongest_match():
     reported = [true(3.3, 1.3, -3.0), true(55.5, 1.45, -9.0), true(20, 1.1, 0.0, name="not there")]
     comparison = compare(ideal(MIDDLE, RIGHT), reported)
     assert [reflector.name for reflector in comparison.missed] == ["not there"]
-    # The image shows the second 4 dB below the first, the truth says 6.
+    # The second reflector is 4 dB below the first in the image, and 6 dB in the ground truth.
     assert [match.level_db for match in comparison.matched] == pytest.approx([0.0, 2.0], abs=0.3)
 
 
-def test_what_is_not_there_is_missed_and_what_should_not_be_is_false():
+def test_compare_lists_missed_reflectors_and_ghosts():
     comparison = compare(ideal(LEFT, MIDDLE), [MIDDLE, RIGHT])
     assert comparison.missed == (RIGHT,)
     assert [peak.azimuth_deg for peak in comparison.false] == pytest.approx([-40], abs=1)
@@ -83,18 +83,18 @@ def test_what_is_not_there_is_missed_and_what_should_not_be_is_false():
         (true(3.3 + 20, 1.3), False),
     ],
 )
-def test_gate(reported, found):
+def test_compare_matches_only_within_the_gate(reported, found):
     assert counts(compare(ideal(MIDDLE), [reported])) == ((1, 0, 0, 0) if found else (0, 1, 1, 0))
 
 
-def test_two_at_the_same_place_are_one_found_and_one_missed():
+def test_compare_matches_one_of_two_coincident_reflectors():
     twin = true(3.3, 1.3, -1.0, name="twin")
     comparison = compare(ideal(MIDDLE), [MIDDLE, twin])
     assert counts(comparison) == (1, 1, 0, 0)
 
 
-def test_as_many_as_possible_are_assigned():
-    """The nearest peak of the one in between is the only one of its neighbour."""
+def test_compare_matches_as_many_reflectors_as_possible():
+    """The peak nearest to the first reflector is the only peak within the gate of the second."""
     image = ideal(true(0, 1.10), true(0, 1.20))
     comparison = compare(image, [true(0, 1.16, name="between"), true(0, 1.24, name="behind")])
     assert counts(comparison) == (2, 0, 0, 0)
@@ -112,19 +112,19 @@ def test_as_many_as_possible_are_assigned():
     ],
     ids=["far", "near", "weak", "above", "behind"],
 )
-def test_what_the_image_cannot_show_is_not_missed(hidden):
+def test_compare_ignores_reflectors_outside_the_image(hidden):
     assert counts(compare(ideal(MIDDLE), [hidden, MIDDLE])) == (1, 0, 0, 0)
 
 
-def test_plane_array_shows_what_is_behind_it_in_front():
+def test_compare_explains_front_peak_of_a_reflector_behind():
     behind = true(180 - 3.3, 1.3)
     comparison = compare(ideal(MIDDLE, LEFT), [behind, LEFT])
     assert counts(comparison) == (1, 0, 0, 1)
     assert comparison.explained[0].azimuth_deg == pytest.approx(3.3, abs=0.5)
 
 
-def test_mirror_image_of_a_reflector_that_counts():
-    """In a grid that goes around, a plane array shows one reflector twice."""
+def test_compare_accepts_mirror_image_of_a_planar_array():
+    """In a grid around the sensor, a planar array shows one reflector twice."""
     image = ideal(MIDDLE, directions="3d:2000")
     around = image.replace(
         azimuth_rad=np.concatenate([image.azimuth_rad, np.pi - image.azimuth_rad]),
@@ -134,7 +134,7 @@ def test_mirror_image_of_a_reflector_that_counts():
     assert counts(compare(around, [MIDDLE]))[:3] == (1, 0, 0)
 
 
-def test_side_lobes_of_what_is_out_of_the_plane_are_explained():
+def test_compare_explains_side_lobes_of_elevated_reflectors():
     above = true(20, 1.0, elevation_deg=40.0)
     comparison = compare(ideal(above, MIDDLE), [above, MIDDLE])
     assert counts(comparison)[:3] == (1, 0, 0)
@@ -142,24 +142,24 @@ def test_side_lobes_of_what_is_out_of_the_plane_are_explained():
     assert counts(compare(ideal(above, MIDDLE), [MIDDLE]))[2]
 
 
-def test_weak_ones_explain_peaks_and_are_not_missed():
+def test_compare_weak_reflectors_explain_peaks_without_misses():
     weak = true(-40, 0.95, -10.3)
-    shown = true(-40, 0.95, -9.7)  # by chance a little stronger in the image
+    shown = true(-40, 0.95, -9.7)  # slightly stronger in the image, by chance
     assert counts(compare(ideal(MIDDLE, shown), [MIDDLE, weak], min_level_db=-10)) == (1, 0, 0, 1)
 
 
-def test_strong_one_that_is_shown_weaker_is_found():
+def test_compare_matches_strong_reflector_with_weaker_peak():
     shown = true(-40, 0.95, -11)
     assert counts(compare(ideal(MIDDLE, shown), [MIDDLE, true(-40, 0.95, -9)], min_level_db=-10)) == (1 + 1, 0, 0, 0)
 
 
-def test_level_counts_from_the_strongest_that_counts():
-    """What is behind the image does not make the others too weak."""
+def test_compare_min_level_ignores_reflectors_outside_the_image():
+    """A strong reflector beyond the image must not push the others below the level limit."""
     reported = [true(0, 9.0, 0.0), true(3.3, 1.3, -35.0), true(55.5, 1.45, -39.0)]
     assert counts(compare(ideal(MIDDLE, RIGHT), reported)) == (2, 0, 0, 0)
 
 
-def test_solid_angle():
+def test_compare_measures_angles_in_3d_images():
     given = [true(-21.7, 1.0, elevation_deg=13.2), true(30.1, 1.3, -6.0, elevation_deg=-41.0)]
     comparison = compare(ideal(*given, directions="3000", range_m=(0.9, 1.4)), given, min_level_db=-12)
     assert counts(comparison) == (2, 0, 0, 0)
@@ -169,12 +169,12 @@ def test_solid_angle():
     assert match.angle_deg == pytest.approx(3, abs=0.5)
 
 
-def test_planar_image_is_about_azimuth_only():
+def test_compare_of_planar_image_ignores_elevation():
     comparison = compare(ideal(MIDDLE), [true(3.3, 1.3, elevation_deg=4.0)])
     assert comparison.matched[0].angle_deg < 0.2
 
 
-def test_one_microphone_shows_no_direction():
+def test_compare_of_one_microphone_ignores_direction():
     image = ideal(MIDDLE)
     one = image.settings.replace(array=Array(layout="one", positions_m=((0.0, 0.0, 0.0),)))
     comparison = compare(image.replace(settings=one), [true(-90, 1.3)])
@@ -182,21 +182,21 @@ def test_one_microphone_shows_no_direction():
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.002])
-def test_nothing_to_find(noise):
+def test_compare_of_empty_images_and_empty_truth(noise):
     comparison = compare(image_of([], noise=noise, range_m=(0.8, 3.2)), [])
     assert counts(comparison)[:2] == (0, 0)
-    assert len(comparison.false) == (100 if noise else 0)  # noise alone is not listed without end
+    assert len(comparison.false) == (100 if noise else 0)  # the list of ghosts in noise is limited
     assert counts(compare(image_of([]), [MIDDLE])) == (0, 1, 0, 0)
 
 
 @pytest.mark.parametrize("n_ranges", [1, 2, 3])
-def test_small_images(n_ranges):
+def test_compare_accepts_small_images(n_ranges):
     image = ideal(MIDDLE)
     small = image.replace(amplitude=image.amplitude[:, :n_ranges].copy(), range_m=image.range_m[:n_ranges])
     assert counts(compare(small, [MIDDLE]))[:2] == (0, 0)
 
 
-def test_errors_over_several_images():
+def test_errors_of_combines_several_images():
     first, second = compare(ideal(MIDDLE), [MIDDLE]), compare(ideal(MIDDLE), [RIGHT])
     errors = errors_of([first, second])
     assert (errors.measurements, errors.matched, errors.missed, errors.false) == (2, 1, 1, 1)
@@ -213,25 +213,25 @@ def test_errors_over_several_images():
     assert errors.level_rms_db == pytest.approx(math.sqrt(2.5))
 
 
-def test_errors_of_nothing_are_none():
+def test_errors_of_no_match_are_none():
     errors = errors_of([compare(ideal(MIDDLE), [RIGHT])])
     assert {errors.angle_rms_deg, errors.range_bias_m, errors.range_rms_m, errors.level_rms_db} == {None}
 
 
-def test_refuses():
+def test_compare_rejects_invalid_min_level():
     with pytest.raises(ArgumentError, match="min_level_db is 3; give a number from -1000 to 0"):
         compare(ideal(MIDDLE), [], min_level_db=3.0)
 
 
-def test_echoes_of_other_sensors_calls_are_explained_and_not_missed():
-    """A peak at half of the way of another call is not false; another call that is not seen is not missed."""
+def test_compare_explains_echoes_of_calls_of_other_sensors():
+    """A peak at half the path of the other call is no ghost, and an unseen echo of that call is no miss."""
     other = replace(RIGHT, name="east: points[0]", emitter="east")
     unseen = replace(true(20, 1.1), name="east: points[1]", emitter="east")
     assert counts(compare(ideal(LEFT, MIDDLE, RIGHT), [LEFT, MIDDLE, other, unseen])) == (2, 0, 0, 1)
 
 
-def test_echoes_of_several_sensors_are_explained_by_who_emitted():
-    """Two sensors, each with the echoes of both calls in its image."""
+def test_compare_explains_cross_echoes_of_two_simulated_sensors():
+    """Each of the two sensors has the echoes of both calls in its image."""
     scene = Scene.from_toml(FACING)
     for name in ("west", "east"):
         simulator = Simulator(

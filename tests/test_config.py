@@ -1,4 +1,4 @@
-"""Options that are not given come from variables, then from a file, then from their defaults."""
+"""Precedence of options: command line, environment variables, configuration file, defaults."""
 
 import json
 import os
@@ -31,7 +31,7 @@ def ertis(*arguments, folder, **variables):
 
 @pytest.fixture(scope="module")
 def images(tmp_path_factory):
-    """An energyscape file of few directions, in a folder with a configuration."""
+    """An energyscape file with few directions, in a folder with a configuration file."""
     folder = tmp_path_factory.mktemp("config")
     (folder / "ertis.toml").write_text('[process]\ndirections = "2d:31"\nrange = "0.5:4"\nquiet = true\n')
     done = ertis("--config", "ertis.toml", "process", REFLECTORS, "-o", "img.h5", "--json", folder=folder)
@@ -39,11 +39,11 @@ def images(tmp_path_factory):
     return folder, json.loads(done.stdout)
 
 
-def test_a_file_gives_what_is_not_given(images):
+def test_config_file_sets_options(images):
     assert images[1]["directions"] == 31
 
 
-def test_what_comes_first(images):
+def test_options_override_variables_and_variables_override_files(images):
     folder, _ = images
     (folder / "peaks.toml").write_text("[peaks]\ntop = 1\n")
 
@@ -61,10 +61,10 @@ def test_what_comes_first(images):
     assert number(*given, ERTIS_PEAKS_TOP="2") == 3
 
 
-def test_some_variables_are_of_all_commands(images):
+def test_shared_variable_applies_to_commands_with_that_option(images):
     folder, _ = images
     done = ertis("info", "img.h5", folder=folder, ERTIS_THREADS="x")
-    assert done.returncode == 0  # which has no such option
+    assert done.returncode == 0  # info has no option --threads
     done = ertis("process", REFLECTORS, "-o", "b.h5", folder=folder, ERTIS_THREADS="x")
     assert done.returncode == 2
     assert "'x' is not a valid integer (from the variable ERTIS_THREADS); see 'ertis process --help'" in done.stderr
@@ -80,11 +80,11 @@ def test_some_variables_are_of_all_commands(images):
         ("ERTIS_THREAD", "did you mean 'ERTIS_THREADS'?"),
         ("ERTIS_CACHEDIR", "did you mean 'ERTIS_CACHE_DIR'?"),
         ("ERTIS_KEYS_NEW_DIRR", "did you mean 'ERTIS_KEYS_NEW_DIR'?"),
-        ("ERTIS_PORT_5601_TCP", "unset it if no other program needs it"),  # which may be somebody else's
+        ("ERTIS_PORT_5601_TCP", "unset it if no other program needs it"),  # possibly a variable of another program
     ],
 )
-def test_a_variable_of_nothing_is_warned_of(images, name, meant):
-    """In a line, and no more: others may name theirs so, too."""
+def test_unknown_ertis_variable_causes_one_warning(images, name, meant):
+    """The command continues, because other programs may use such a name."""
     folder, _ = images
     done = ertis("info", "img.h5", "--json", folder=folder, **{name: "3"})
     assert done.returncode == 0
@@ -92,7 +92,7 @@ def test_a_variable_of_nothing_is_warned_of(images, name, meant):
     assert done.stderr == f"ertis: warning: no command reads the variable {name}; {meant}\n"
 
 
-def test_variables_that_are_no_options_are_known(images):
+def test_variables_that_are_not_options_cause_no_warning(images):
     folder, _ = images
     path = str(folder)
     of_folders = dict.fromkeys(("ERTIS_CACHE_DIR", "ERTIS_EMULATED_DIR", "ERTIS_KEYS_DIR"), path)
@@ -113,7 +113,7 @@ def test_variables_that_are_no_options_are_known(images):
         ("xyz", "No such command 'xyz' (choose one of bench, capture, compare, "),
     ],
 )
-def test_a_command_that_is_not_known(tmp_path, line, message):
+def test_unknown_command_suggests_known_ones(tmp_path, line, message):
     done = ertis(*line.split(), folder=tmp_path)
     assert done.returncode == 2
     assert done.stderr.startswith(f"ertis: error: {message}")
@@ -132,7 +132,7 @@ def test_a_command_that_is_not_known(tmp_path, line, message):
     ],
     ids=["command", "option", "of a group", "no table", "value", "no TOML"],
 )
-def test_what_cannot_be_used_is_refused_in_a_line(tmp_path, text, message):
+def test_invalid_config_file_is_refused_in_one_line(tmp_path, text, message):
     (tmp_path / "ertis.toml").write_text(text)
     done = ertis("--config", "ertis.toml", "process", REFLECTORS, "-o", "a.h5", folder=tmp_path)
     assert done.returncode in {1, 2}
@@ -141,7 +141,7 @@ def test_what_cannot_be_used_is_refused_in_a_line(tmp_path, text, message):
     assert list(tmp_path.iterdir()) == [tmp_path / "ertis.toml"]
 
 
-def test_a_file_that_is_not_there(tmp_path):
+def test_missing_config_file_is_reported(tmp_path):
     done = ertis("--config", "none.toml", "info", REFLECTORS, folder=tmp_path)
     assert (done.returncode, done.stderr) == (
         1,
@@ -149,8 +149,8 @@ def test_a_file_that_is_not_there(tmp_path):
     )
 
 
-def test_help_and_completion_do_without_it(tmp_path):
-    """Every new shell asks for the one, whoever is at a loss for the other."""
+def test_help_and_completion_work_without_config_file(tmp_path):
+    """Every new shell requests completions, and users need help most when something is broken."""
     for line in ("--help", "completion bash"):
         done = ertis(*line.split(), folder=tmp_path, ERTIS_CONFIG="none.toml")
         assert done.returncode == 0, line
@@ -162,7 +162,7 @@ def test_help_and_completion_do_without_it(tmp_path):
         assert warned == (line != "--help")
 
 
-def test_what_does_not_fit_is_refused_where_it_was_typed_only(images, tmp_path):
+def test_inapplicable_option_is_refused_only_if_typed(images, tmp_path):
     folder, _ = images
     text = "[process]\nworkers = 2\n[export]\ntop = 5\ntopic = ['points']\n[import]\nskip = 0.1\n"
     (tmp_path / "mine.toml").write_text(text)
@@ -189,8 +189,8 @@ def test_what_does_not_fit_is_refused_where_it_was_typed_only(images, tmp_path):
         assert done.returncode == 0, done.stderr
 
 
-def test_the_page_says_how(tmp_path):
-    """Its file and its commands, word by word."""
+def test_command_line_page_runs(tmp_path):
+    """The test runs the file and the commands of the page verbatim."""
     page = path_of("command-line").read_text("utf-8")
     (tmp_path / "ertis.toml").write_text(page.split("```toml\n")[1].split("```")[0])
     (tmp_path / "reflectors.h5").symlink_to(ROOT / "data" / "synthetic" / "reflectors.h5")
@@ -214,8 +214,8 @@ def test_the_page_says_how(tmp_path):
         ("ertis capture --layout uRT", "uRTIS_v1"),
     ],
 )
-def test_a_shell_completes(tmp_path, line, wanted):
-    """In a real one."""
+def test_bash_completes_commands_options_and_values(tmp_path, line, wanted):
+    """A real bash evaluates the completion script."""
     words = " ".join(f"'{word}'" for word in line.split())
     command = tmp_path / "ertis"
     command.write_text(f"#!/bin/sh\nexec '{sys.executable}' -m ertis_cli \"$@\"\n")
@@ -249,12 +249,12 @@ def test_completion_for_each_shell(tmp_path, shell):
 
 
 @pytest.mark.skipif(shutil.which("zsh") is None, reason="zsh is not installed")
-def test_zsh_completes_after_what_the_page_names(tmp_path):
+def test_zsh_completion_works_after_lines_of_the_page(tmp_path):
     (before,) = re.findall(r"in ~/.zshrc, after: (.*)", path_of("command-line").read_text("utf-8"))
     printed = tmp_path / "printed"
     printed.write_text(ertis("completion", "zsh", folder=tmp_path).stdout)
     done = subprocess.run(
-        # -u: whoever owns the folders of zsh here, ask nothing.
+        # -u suppresses questions about the owner of the zsh folders.
         ["zsh", "-f", "-c", f'{before} -u; eval "$(<{printed})"; print ${{_comps[ertis]}}'],
         cwd=tmp_path,
         env=os.environ | {"HOME": str(tmp_path)},

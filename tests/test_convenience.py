@@ -18,7 +18,7 @@ SETTINGS = EIGHT.settings()
 
 
 def image(*points, noise_dbfs=-60.0, seed=0):
-    """An image of points, with white noise in every microphone."""
+    """An image of points with white noise in every beam."""
     scene = scene_of(*points, sensor=EIGHT)
     measurement = Simulator(scene, plan=only("spreading")).render()
     made = ertis.Pipeline(SETTINGS, predict=False).process(measurement)
@@ -27,14 +27,14 @@ def image(*points, noise_dbfs=-60.0, seed=0):
     return made.replace(amplitude=np.hypot(made.amplitude + noise[0], noise[1]).astype(np.float32))
 
 
-def test_images_are_arrays():
+def test_energyscape_converts_to_an_array():
     shown = image(Point(range_m=0.5))
     assert np.array_equal(np.asarray(shown), shown.amplitude)
     assert np.asarray(shown, dtype=np.float64).dtype == np.float64
     assert np.max(shown) == shown.amplitude.max()
 
 
-def test_pipelines_take_the_path_of_settings(tmp_path):
+def test_pipeline_accepts_a_settings_path(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text(SETTINGS.to_toml(), "utf-8")
     assert ertis.Pipeline(path).settings == ertis.Pipeline(SETTINGS).settings == ertis.Pipeline(str(path)).settings
@@ -56,13 +56,13 @@ def test_pipelines_take_the_path_of_settings(tmp_path):
         ),
     ],
 )
-def test_arguments_of_the_wrong_kind_are_refused_in_a_line(call, message):
+def test_wrong_argument_types_are_refused_in_one_line(call, message):
     with pytest.raises(ertis.ErtisError, match=message) as caught:
         call(image(Point(range_m=0.5)))
     assert "\n" not in str(caught.value)
 
 
-def test_noise_gives_no_reflectors_and_echoes_stay():
+def test_find_peaks_with_false_alarm_rejects_noise_only():
     for seed in range(20):
         assert ertis.find_peaks(image(seed=seed), false_alarm=1e-3) == []
         assert len(ertis.find_peaks(image(seed=seed))) > 3
@@ -73,7 +73,7 @@ def test_noise_gives_no_reflectors_and_echoes_stay():
     assert peaks[1].level_dbfs - peaks[0].level_dbfs == pytest.approx(peaks[1].level_db)
 
 
-def test_noise_of_an_image_is_its_root_mean_square():
+def test_noise_of_image_is_its_root_mean_square():
     shown = image(noise_dbfs=-40.0)
     assert 20 * np.log10(noise_of(shown)) == pytest.approx(-40, abs=0.3)
     n_bins = shown.amplitude.size
@@ -81,7 +81,7 @@ def test_noise_of_an_image_is_its_root_mean_square():
     assert exceeded < 1e-3
 
 
-def test_peaks_lists_absolute_levels_and_says_if_nothing_is_found(tmp_path):
+def test_peaks_command_lists_dbfs_levels_or_nothing_found(tmp_path):
     found, silent = tmp_path / "found.h5", tmp_path / "silent.h5"
     ertis.write_energyscapes(found, [image(Point(range_m=0.5))])
     ertis.write_energyscapes(silent, [image()])

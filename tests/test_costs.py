@@ -1,4 +1,4 @@
-"""What stages take on this machine: measured once, kept, and measured again where the file is of no use."""
+"""Measured costs of the processing steps: measured once, cached, and measured again if the cache file is invalid."""
 
 import json
 import logging
@@ -16,7 +16,7 @@ CPU = kernels.load("cpu")
 
 @pytest.fixture
 def measured(monkeypatch, tmp_path):
-    """A folder of its own, nothing known, and a list that tells how often costs were measured."""
+    """An empty cache folder, no costs in memory, and a list of the measurements made."""
     found = costs.measured_costs(CPU, 1)
     times = []
 
@@ -31,7 +31,7 @@ def measured(monkeypatch, tmp_path):
 
 
 def forget():
-    costs._KNOWN.clear()  # noqa: SLF001 - as in a process of its own
+    costs._KNOWN.clear()  # noqa: SLF001 - as in a new process
 
 
 @pytest.mark.parametrize("device", kernels.usable())
@@ -42,13 +42,13 @@ def test_measured_costs_are_times(device):
     assert found["demodulate_16"] < 1e-4
 
 
-def test_costs_are_kept(measured, caplog):
+def test_measured_costs_are_cached(measured, caplog):
     with caplog.at_level(logging.INFO, logger="ertis_numba"):
         first = costs.measured_costs(CPU, 1)
     assert "measuring the costs of the kernels of device 'cpu'; they are stored in" in caplog.text
     path = costs.cache_file("cpu", 1)
     assert json.loads(path.read_text("utf-8")) == first.seconds
-    assert list(path.parent.iterdir()) == [path]  # nothing half written is left
+    assert list(path.parent.iterdir()) == [path]  # no partial file is left
     assert costs.measured_costs(CPU, 1) is first
     forget()
     assert costs.measured_costs(CPU, 1) == first
@@ -56,8 +56,8 @@ def test_costs_are_kept(measured, caplog):
 
 
 @pytest.mark.usefixtures("measured")
-def test_processes_that_measure_at_once_agree(monkeypatch):
-    """Whoever is first decides for all: by other costs, a plan and its bits may be others."""
+def test_concurrent_processes_use_the_first_stored_costs(monkeypatch):
+    """Different costs could lead to different plans, and so to different images."""
     found = costs.measure(CPU, 1)
     path = costs.cache_file("cpu", 1)
     theirs = {name: value / 2 for name, value in found.seconds.items()}
@@ -72,7 +72,7 @@ def test_processes_that_measure_at_once_agree(monkeypatch):
     assert list(path.parent.iterdir()) == [path]
 
 
-def test_a_disk_without_links_keeps_costs_as_well(measured, monkeypatch):
+def test_costs_are_cached_on_disks_without_hard_links(measured, monkeypatch):
     def refused(*_):
         raise PermissionError("no links here")
 
@@ -84,7 +84,7 @@ def test_a_disk_without_links_keeps_costs_as_well(measured, monkeypatch):
     assert measured == [("cpu", 1)]
 
 
-def test_devices_and_threads_have_costs_of_their_own(measured):
+def test_costs_are_cached_per_device_and_thread_count(measured):
     costs.measured_costs(CPU, 1)
     costs.measured_costs(CPU, 2)
     costs.measured_costs(kernels.load("numpy"), 1)
@@ -108,7 +108,7 @@ def test_devices_and_threads_have_costs_of_their_own(measured):
         lambda _: b"\xff\xfe\x00",
     ],
 )
-def test_spoilt_files_are_measured_again(measured, spoil):
+def test_invalid_cost_file_is_measured_again(measured, spoil):
     found = costs.measured_costs(CPU, 1)
     path = costs.cache_file("cpu", 1)
     spoilt = spoil(path.read_text("utf-8"))
@@ -119,7 +119,7 @@ def test_spoilt_files_are_measured_again(measured, spoil):
     assert json.loads(path.read_text("utf-8")) == found.seconds
 
 
-def test_a_folder_that_cannot_be_written_does_no_harm(measured, monkeypatch, tmp_path, caplog):
+def test_costs_work_without_a_writable_cache_folder(measured, monkeypatch, tmp_path, caplog):
     (tmp_path / "file").write_text("no folder", "utf-8")
     monkeypatch.setenv("ERTIS_CACHE_DIR", str(tmp_path / "file" / "below"))
     with caplog.at_level(logging.INFO, logger="ertis_numba"):
@@ -130,13 +130,13 @@ def test_a_folder_that_cannot_be_written_does_no_harm(measured, monkeypatch, tmp
 
 
 @pytest.mark.usefixtures("measured")
-def test_a_folder_in_the_way_of_the_file_does_no_harm():
+def test_costs_work_when_a_folder_blocks_the_cache_file():
     costs.cache_file("cpu", 1).mkdir(parents=True)
     assert costs.measured_costs(CPU, 1).seconds
     assert list(costs.cache_file("cpu", 1).parent.iterdir()) == [costs.cache_file("cpu", 1)]
 
 
-def test_more_work_takes_longer():
+def test_predicted_time_grows_with_work():
     found = costs.measured_costs(CPU, 1)
     work = {
         "n_mics": 32, "n_words": 1, "n_samples": 5000, "n_taps": 101, "tap_bits": 16, "n_fft": 6000, "n_bins": 800,

@@ -1,4 +1,4 @@
-"""The shipped recordings, made again and looked at; the scenes of the gallery, and what its page says of them."""
+"""The shipped recordings, rebuilt and processed; the scenes of the gallery and the text of its page."""
 
 import dataclasses
 import functools
@@ -29,12 +29,12 @@ FOLDER = ROOT / "data" / "synthetic"
 NAMES = ("line", "reflectors", "reflectors_3d")
 
 
-def test_all_scenes_are_built_and_small():
+def test_shipped_data_has_all_scenes_and_is_small():
     assert {path.stem for path in FOLDER.glob("*.toml")} == set(NAMES)
     assert sum(path.stat().st_size for path in FOLDER.iterdir() if path.is_file()) < 3e6
 
 
-def test_sums():
+def test_shipped_files_match_sha256sums():
     lines = (FOLDER / "SHA256SUMS").read_text().splitlines()
     sums = {name: digest for digest, name in (line.split("  ") for line in lines)}
     assert set(sums) == {f"{name}.{kind}" for name in NAMES for kind in ("h5", "json", "toml")}
@@ -43,7 +43,7 @@ def test_sums():
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_recording_is_its_scene(name):
+def test_shipped_recording_equals_its_simulated_scene(name):
     scene = load_scene(FOLDER / f"{name}.toml")
     report = json.loads((FOLDER / f"{name}.json").read_text())
     with open_recording(FOLDER / f"{name}.h5") as recording:
@@ -71,8 +71,8 @@ def test_recording_is_its_scene(name):
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("method", ["fast", "paper"])
-def test_recording_shows_its_reflectors(name, method):
-    """Places and levels below the strongest; the paper's far field and integer delays cost a little."""
+def test_image_of_shipped_recording_shows_its_reflectors(name, method):
+    """Positions and relative levels agree; the far field and integer delays of the paper cost some accuracy."""
     with open_recording(FOLDER / f"{name}.h5") as recording:
         settings = recording.settings.replace(processing=recording.settings.processing.replace(method=method))
         image = Pipeline(settings).process(recording[0])
@@ -86,12 +86,12 @@ def test_recording_shows_its_reflectors(name, method):
         assert abs(near.range_m - wanted["range_m"]) < range_m
         assert abs(near.level_db - wanted["level_db"]) < level_db
     if method == "fast":
-        assert len(find_peaks(image)) == len(expected)  # one entry per reflector, none for a side lobe
+        assert len(find_peaks(image)) == len(expected)  # one peak per reflector, none for a side lobe
     strongest = sorted(peak.range_m for peak in found[: len(expected)])
     assert_allclose(strongest, sorted(wanted["range_m"] for wanted in expected), atol=range_m)
 
 
-def test_make_data_makes_the_same_words(tmp_path):
+def test_data_build_is_reproducible(tmp_path):
     paths = os.pathsep.join(str(ROOT / folder) for folder in (".", "cli"))
     subprocess.run(
         [sys.executable, str(FOLDER / "build.py"), str(tmp_path)], env=os.environ | {"PYTHONPATH": paths}, check=True
@@ -115,8 +115,8 @@ CALLED_FOR = {
 SCENES = sorted(CALLED_FOR)
 
 
-def told_of(name):
-    """What the page says of a scene, between its markers."""
+def page_text_of(name):
+    """Return the text of the page about a scene, between its markers."""
     return PAGE.partition(f"<!-- scene {name} -->")[2].partition(f"<!-- /scene {name} -->")[0]
 
 
@@ -129,7 +129,7 @@ def test_gallery_shows_all_scenes():
     assert max(path.stat().st_size for path in folder.iterdir()) <= 150_000
 
 
-def test_page_without_markers_is_refused():
+def test_gallery_update_rejects_page_without_markers():
     spec = importlib.util.spec_from_file_location("gallery", FOLDER / "gallery.py")
     gallery = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(gallery)
@@ -141,28 +141,28 @@ def test_page_without_markers_is_refused():
 
 
 @functools.cache
-def begun(name):
-    """The scene, and what its first measurement calls for; later ones may call for more."""
+def scene_and_plan(name):
+    """Return the scene and the plan of its first measurement; later measurements may need more effects."""
     scene = load_scene(FOLDER / "scenes" / f"{name}.toml")
     return scene, make_plan(scene.replace(count=1))
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_gallery_tells_which_effects_a_scene_calls_for(name):
-    reported = dict(re.findall(r"^\| `(\w+)` \| (on|off) \|", told_of(name), re.MULTILINE))
+def test_gallery_page_lists_active_effects_of_each_scene(name):
+    reported = dict(re.findall(r"^\| `(\w+)` \| (on|off) \|", page_text_of(name), re.MULTILINE))
     on = {effect for effect, state in reported.items() if state == "on"}
     assert CALLED_FOR[name] <= on
-    scene, plan = begun(name)
+    scene, plan = scene_and_plan(name)
     assert not scene.effects
     assert plan.active <= on
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_gallery_scene_gives_sensible_images(name):
-    scene, plan = begun(name)
+def test_image_of_gallery_scene_shows_most_reflectors(name):
+    scene, plan = scene_and_plan(name)
     for sensor in scene.sensors:
         simulator = Simulator(scene, sensor=sensor.name, plan=plan)
-        assert 1e-3 < np.abs(simulator.signals()).max() < 0.5  # more overloads the modulators
+        assert 1e-3 < np.abs(simulator.signals()).max() < 0.5  # higher levels overload the modulators
         settings = sensor.settings().replace(processing=sensor.processing.replace(directions="2d:31"))
         image = Pipeline(settings).process(dataclasses.replace(simulator.render(), settings=settings))
         assert np.isfinite(image.amplitude).all()

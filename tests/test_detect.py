@@ -1,4 +1,4 @@
-"""Reflectors found in images whose content is known by formula."""
+"""Peak detection in images computed from closed forms."""
 
 import numpy as np
 import pytest
@@ -14,9 +14,9 @@ from ertis_numba.waveform import matched_filter_spectrum
 
 
 def image_of(reflectors, *, directions="2d:181", range_m=(0.8, 1.6), noise=0.0, errors_m=0.0):
-    """The image of ideal far reflectors: (azimuth, elevation in degrees, range in m, amplitude).
+    """Return the image of ideal far reflectors: (azimuth, elevation in degrees, range in m, amplitude).
 
-    Microphones are off their places by ``errors_m``, a standard deviation.
+    Microphone positions have errors with standard deviation ``errors_m``.
     """
     settings = Settings(processing=Processing(directions=directions, range_m=range_m))
     grid = direction_grid(settings.processing)
@@ -39,7 +39,7 @@ def image_of(reflectors, *, directions="2d:181", range_m=(0.8, 1.6), noise=0.0, 
     return Energyscape(amplitude.astype(np.float32), grid.azimuth_rad, grid.elevation_rad, ranges_m, settings)
 
 
-def test_one_entry_for_one_reflector():
+def test_find_peaks_lists_one_reflector_once():
     (peak,) = find_peaks(image_of([(12.34, 0, 1.2345, 1.0)]))
     assert peak.azimuth_deg == pytest.approx(12.34, abs=0.05)
     assert peak.elevation_deg == pytest.approx(0, abs=1e-6)
@@ -47,7 +47,7 @@ def test_one_entry_for_one_reflector():
     assert peak.level_db == 0
 
 
-def test_every_reflector_strongest_first():
+def test_find_peaks_sorts_reflectors_by_level():
     reflectors = [(-40, 0, 0.95, 0.5), (3.3, 0, 1.3, 1.0), (55.5, 0, 1.45, 0.6), (3.3, 0, 1.1, 0.25)]
     peaks = find_peaks(image_of(reflectors, noise=0.002), min_level_db=-20)
     expected = sorted(reflectors, key=lambda reflector: -reflector[3])
@@ -58,7 +58,7 @@ def test_every_reflector_strongest_first():
         assert peak.level_db == pytest.approx(20 * np.log10(amplitude), abs=0.7)
 
 
-def test_solid_angle_is_interpolated_in_both_angles():
+def test_find_peaks_interpolates_azimuth_and_elevation():
     reflectors = [(-21.7, 13.2, 1.0, 1.0), (30.1, -41.0, 1.3, 0.5)]
     peaks = find_peaks(image_of(reflectors, directions="3000", range_m=(0.9, 1.4)), min_level_db=-12)
     assert len(peaks) == 2
@@ -68,15 +68,15 @@ def test_solid_angle_is_interpolated_in_both_angles():
         assert peak.range_m == pytest.approx(range_m, abs=1e-3)
 
 
-def test_two_reflectors_a_beam_width_and_a_half_apart_are_two():
+def test_find_peaks_separates_reflectors_1_5_beam_widths_apart():
     peaks = find_peaks(image_of([(0, 0, 1.2, 1.0), (12, 0, 1.2, 0.9)]), min_level_db=-6)
-    # Each pulls at the other's main lobe with its first side lobe.
+    # The first side lobe of each reflector shifts the main lobe of the other.
     assert [peak.azimuth_deg for peak in peaks] == pytest.approx([0, 12], abs=1.5)
 
 
 @pytest.mark.parametrize("errors_m", [0.0, 5e-4, 8e-4])
-def test_side_lobes_of_an_imperfect_array_are_no_reflectors(errors_m):
-    """Microphones half a millimetre off their places raise side lobes above their prediction."""
+def test_find_peaks_ignores_side_lobes_of_an_imperfect_array(errors_m):
+    """Position errors of half a millimetre raise side lobes above their prediction."""
     strong, other = (12.0, 20.0, 1.2, 1.0), (-35.0, -10.0, 1.21, 0.5)
     image = image_of([strong], directions="3d:1500", range_m=(1.05, 1.35), noise=1e-4, errors_m=errors_m)
     assert len(find_peaks(image, min_level_db=-20)) == 1
@@ -84,20 +84,20 @@ def test_side_lobes_of_an_imperfect_array_are_no_reflectors(errors_m):
     assert [peak.azimuth_deg for peak in find_peaks(both, min_level_db=-20)] == pytest.approx([12.0, -35.0], abs=1.5)
 
 
-def test_weak_side_lobes_of_other_beamformers_raise_no_limit():
+def test_find_peaks_keeps_weak_reflectors_of_coherence_factor():
     linear = image_of([(0.0, 0.0, 1.2, 1.0), (40.0, 0.0, 1.2, 0.6)], range_m=(1.05, 1.35))
     settings = linear.settings.replace(processing=linear.settings.processing.replace(beamformer="coherence_factor"))
     image = linear.replace(amplitude=linear.amplitude**2, settings=settings)
     assert [round(peak.azimuth_deg) for peak in find_peaks(image, min_level_db=-12)] == [0, 40]
 
 
-def test_rounding_errors_of_one_bit_microphones_are_no_reflectors():
+def test_find_peaks_with_false_alarm_ignores_rounding_errors():
     image = image_of([(10.0, 0.0, 1.2, 1e-9)])
     assert len(find_peaks(image)) == 1
     assert find_peaks(image, false_alarm=1e-3) == []
 
 
-def test_an_image_without_side_lobes_is_dark_but_for_main_lobes():
+def test_without_side_lobes_keeps_only_main_lobes():
     image = image_of([(12.0, 20.0, 1.2, 1.0)], directions="3d:1500", range_m=(1.05, 1.35), noise=1e-4)
     dark = without_side_lobes(image)
     bright = dark.amplitude.max(axis=1) > 0.02
@@ -109,13 +109,13 @@ def test_an_image_without_side_lobes_is_dark_but_for_main_lobes():
 
 
 @pytest.mark.parametrize(("directions", "azimuth_deg"), [("2d:91", 97.0), ("1850", 50.0)])
-def test_no_reflector_is_put_outside_the_grid(directions, azimuth_deg):
+def test_find_peaks_stays_inside_the_grid(directions, azimuth_deg):
     image = image_of([(azimuth_deg, 0, 1.2, 1.0)], directions=directions, range_m=(1.1, 1.3))
     edge_deg = np.degrees(image.azimuth_rad).max()
     assert all(peak.azimuth_deg <= edge_deg + 1e-9 for peak in find_peaks(image))
 
 
-def test_top_and_level_limit_the_list():
+def test_find_peaks_limits_by_top_and_min_level():
     image = image_of([(-40, 0, 0.95, 0.5), (3, 0, 1.3, 1.0), (50, 0, 1.1, 0.2)])
     assert len(find_peaks(image, top=2)) == 2
     assert len(find_peaks(image, min_level_db=-10)) == 2
@@ -123,7 +123,7 @@ def test_top_and_level_limit_the_list():
 
 
 @pytest.mark.parametrize("shape", [(181, 210), (1, 1), (1, 5), (2, 2), (3, 1)])
-def test_silence_and_small_images_are_fine(shape):
+def test_find_peaks_accepts_silence_and_small_images(shape):
     image = image_of([])
     small = image.replace(
         amplitude=np.zeros(shape, np.float32),
@@ -143,6 +143,6 @@ def test_silence_and_small_images_are_fine(shape):
     ("arguments", "match"),
     [({"top": 0}, "top is 0; give a whole number of at least 1"), ({"min_level_db": 3.0}, "min_level_db is 3")],
 )
-def test_refuses(arguments, match):
+def test_find_peaks_rejects_invalid_arguments(arguments, match):
     with pytest.raises(ArgumentError, match=match):
         find_peaks(image_of([]), **arguments)

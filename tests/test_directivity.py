@@ -1,4 +1,4 @@
-"""Patterns of emitters, microphones, arrays and discs in rendered signals, against closed forms."""
+"""Directivity of emitters, microphones, arrays and discs in rendered signals, compared with closed forms."""
 
 import math
 
@@ -30,7 +30,7 @@ from tests.scenes import (
 # ---- pistons ---------------------------------------------------------------------------------------
 
 
-def test_piston_pattern():
+def test_piston_has_known_zeros_and_side_lobe():
     argument = np.linspace(3.9, 7.0, 10_000)
     side_lobe = np.abs(piston(argument)).max()
     assert piston(np.array([1.6163]))[0] ** 2 == pytest.approx(0.5, abs=1e-4)
@@ -46,7 +46,7 @@ def pattern_at(azimuth_deg, diameter_m, frequency_hz):
 
 @pytest.mark.parametrize("end", ["emitter", "microphone"])
 @pytest.mark.parametrize(("azimuth_deg", "diameter_m"), [(0, 0.02), (20, 0.02), (50, 0.02), (-85, 0.01), (35, 0.05)])
-def test_a_piston_filters_an_echo_off_its_axis(end, azimuth_deg, diameter_m):
+def test_piston_directivity_filters_off_axis_echoes(end, azimuth_deg, diameter_m):
     emitter = Emitter(diameter_m=diameter_m if end == "emitter" else 0.0)
     electronics = Electronics(microphone_diameter_m=diameter_m if end == "microphone" else 0.0)
     scene = scene_of(
@@ -56,7 +56,7 @@ def test_a_piston_filters_an_echo_off_its_axis(end, azimuth_deg, diameter_m):
     assert_allclose(found, pattern_at(azimuth_deg, diameter_m, BAND_HZ), atol=0.005)
 
 
-def test_patterns_of_emitter_and_microphone_multiply():
+def test_emitter_and_microphone_patterns_multiply():
     sensor = EAR.replace(emitter=Emitter(diameter_m=0.02), electronics=Electronics(microphone_diameter_m=0.01))
     scene = scene_of(Point(azimuth_deg=30, elevation_deg=20, range_m=0.5), sensor=sensor)
     found = filtered(heard(scene), heard(scene, "emitter_directivity", "microphone_directivity"))
@@ -64,8 +64,8 @@ def test_patterns_of_emitter_and_microphone_multiply():
     assert_allclose(found, pattern_at(off_deg, 0.02, BAND_HZ) * pattern_at(off_deg, 0.01, BAND_HZ), atol=0.005)
 
 
-def test_emitter_and_microphone_may_change_places():
-    """Reciprocity: what a piston sends to a point and a port hears, a port would send and a piston hear."""
+def test_emitter_and_microphone_directivity_are_reciprocal():
+    """By reciprocity, a piston emitter with a point microphone equals a point emitter with a piston microphone."""
     point = Point(azimuth_deg=40, range_m=0.5)
     sends = scene_of(point, sensor=EAR.replace(emitter=Emitter(diameter_m=0.02)))
     hears = scene_of(point, sensor=EAR.replace(electronics=Electronics(microphone_diameter_m=0.02)))
@@ -73,14 +73,14 @@ def test_emitter_and_microphone_may_change_places():
 
 
 @pytest.mark.parametrize("end", ["emitter", "microphone"])
-def test_nothing_goes_behind_a_piston(end):
+def test_piston_emits_and_receives_nothing_behind(end):
     sensor = EAR.replace(emitter=Emitter(diameter_m=0.01), electronics=Electronics(microphone_diameter_m=0.01))
     behind = scene_of(Point(azimuth_deg=120, range_m=0.5), sensor=sensor)
     assert heard(behind).any()
     assert not heard(behind, f"{end}_directivity").any()
 
 
-def test_a_turned_sensor_turns_its_axis():
+def test_piston_axis_turns_with_the_sensor():
     sensor = EAR.replace(emitter=Emitter(diameter_m=0.03), electronics=Electronics(microphone_diameter_m=0.03))
     scene = scene_of(
         Point(azimuth_deg=-70, elevation_deg=40, range_m=0.5), sensor=sensor.replace(yaw_deg=-70, pitch_deg=40)
@@ -89,11 +89,11 @@ def test_a_turned_sensor_turns_its_axis():
     assert_allclose(both, heard(scene), atol=1e-12)
 
 
-def test_a_wall_ahead_lies_on_the_axis_for_a_large_array():
+def test_wall_echo_straight_ahead_is_on_the_piston_axis():
     sensor = SENSOR.replace(array=line_array(75, 0.002), emitter=Emitter(diameter_m=0.02))
     scene = scene_of(sensor=sensor, walls=(Wall(position_m=(0.25, 0.0, 0.0), facing_deg=(180.0, 0.0)),))
     [plain], [patterned] = ways(scene, "walls"), ways(scene, "walls", "emitter_directivity", frequency_hz=(80e3,))
-    assert patterned.amplitude[0, 37, 0] == pytest.approx(plain.amplitude[0, 37, 0])  # the microphone in the middle
+    assert patterned.amplitude[0, 37, 0] == pytest.approx(plain.amplitude[0, 37, 0])  # the middle microphone
 
 
 # ---- arrays ----------------------------------------------------------------------------------------
@@ -101,9 +101,9 @@ def test_a_wall_ahead_lies_on_the_axis_for_a_large_array():
 
 @pytest.mark.parametrize("n_mics", [8, 16])
 @pytest.mark.parametrize("azimuth_deg", [0.0, 25.0])
-def test_a_line_array_has_its_pattern(n_mics, azimuth_deg):
-    """``sin(N ψ / 2) / (N sin(ψ / 2))`` with ``ψ = k d (sin θ - sin θ₀)``, through bits and pipeline."""
-    spacing_m, range_m = 0.004, 3.0  # far enough that the wave is flat over the array
+def test_line_array_image_follows_the_array_pattern(n_mics, azimuth_deg):
+    """``sin(N ψ / 2) / (N sin(ψ / 2))`` with ``ψ = k d (sin θ - sin θ₀)``, through one-bit samples and pipeline."""
+    spacing_m, range_m = 0.004, 3.0  # so far that the wave is planar over the array
     sensor = SENSOR.replace(
         array=line_array(n_mics, spacing_m),
         call=NARROW,
@@ -125,8 +125,8 @@ def test_a_line_array_has_its_pattern(n_mics, azimuth_deg):
         assert np.ptp(above) == pytest.approx(width_deg, abs=0.5)
 
 
-def test_first_side_lobe_of_a_line_array():
-    """-13.26 dB for many microphones; -13.15 dB for 16 of them."""
+def test_line_array_first_side_lobe_has_known_level():
+    """The level is −13.26 dB for many microphones and −13.15 dB for 16."""
     sensor = SENSOR.replace(
         array=line_array(16, 0.004),
         call=NARROW,
@@ -141,12 +141,12 @@ def test_first_side_lobe_of_a_line_array():
     assert 20 * np.log10(lobes[1] / lobes[0]) == pytest.approx(-13.15, abs=0.2)
 
 
-# ---- targets that face somewhere -------------------------------------------------------------------
+# ---- targets with an orientation -------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("turned_deg", [0, 5, 15, 30, 60])
-def test_a_disc_mirrors_like_a_piston(turned_deg):
-    """Both legs lie on one line, so that the phase over the disc runs twice: v = π d f · 2 sin θ / c."""
+def test_disc_reflects_with_a_piston_pattern(turned_deg):
+    """Both paths lie on one line, so the phase across the disc doubles: v = π d f · 2 sin θ / c."""
     disc = Point(range_m=1.0, diameter_m=0.02, facing_deg=(180 - turned_deg, 0))
     scene = scene_of(disc, sensor=EAR)
     found = filtered(heard(scene), heard(scene, "target_size"))
@@ -154,8 +154,8 @@ def test_a_disc_mirrors_like_a_piston(turned_deg):
     assert_allclose(found, np.abs(piston(argument)), atol=0.005)
 
 
-def test_a_disc_sends_most_where_a_mirror_would():
-    """Emitter and ear look at it from both sides of its normal."""
+def test_disc_reflects_most_in_the_mirror_direction():
+    """Transmitter and receiver are on opposite sides of the normal of the disc."""
     receiver = EAR.replace(emitter=Emitter(silent=True))
     transmitter = EAR.replace(name="mouth", position_m=(0.0, 0.5, 0.0))
 
@@ -169,13 +169,13 @@ def test_a_disc_sends_most_where_a_mirror_would():
     assert levels[170] == pytest.approx(levels[-170])
 
 
-def test_a_disc_sends_nothing_from_its_back():
+def test_disc_reflects_nothing_from_its_back():
     scene = scene_of(Point(range_m=0.5, diameter_m=0.02, facing_deg=(0, 0)), sensor=EAR)
     assert heard(scene).any()
     assert not heard(scene, "target_size").any()
 
 
-def test_a_disc_faces_the_origin_where_nothing_is_said():
+def test_disc_faces_the_origin_by_default():
     disc = Point(azimuth_deg=40, elevation_deg=20, range_m=0.5, diameter_m=0.1)
     facing, turned = (disc.replace(facing_deg=facing_deg) for facing_deg in ((-140.0, -20.0), (-130.0, -20.0)))
     found, wanted, other = (heard(scene_of(each, sensor=EAR), "target_size") for each in (disc, facing, turned))

@@ -1,4 +1,4 @@
-"""Microphones that ``array.disabled`` leaves out: no path uses them, and the origin of images stays."""
+"""Microphones in ``array.disabled``: no step uses them, and the origin of images does not move."""
 
 import dataclasses
 import json
@@ -49,14 +49,14 @@ def without(settings, *channels):
 
 
 @pytest.mark.parametrize("array", [Array(), line(8, 8).array], ids=["named", "written out"])
-def test_positions_stay_when_a_microphone_is_disabled(array):
+def test_disabled_microphones_do_not_move_the_array(array):
     """A faulty microphone does not move the sensor."""
     whole, fewer = microphones(array), microphones(array.replace(disabled=(1, 5)))
     assert_array_equal(fewer.positions_m, whole.positions_m)
     assert set(np.flatnonzero(whole.enabled)) - set(np.flatnonzero(fewer.enabled)) == {1, 5}
 
 
-def test_disabled_microphones_survive_what_stores_and_sends_settings():
+def test_disabled_microphones_survive_settings_round_trips():
     settings = without(Settings(), 5, 12)
     written = self_contained(settings)
     for read in (written, Settings.from_toml(written.to_toml()), received_settings(written.to_toml(), "a sensor")):
@@ -66,7 +66,7 @@ def test_disabled_microphones_survive_what_stores_and_sends_settings():
         assert_array_equal(layout.positions_m, load_layout("eRTIS_v3D1").positions_m)
 
 
-def test_settings_without_disabled_microphones_are_written_as_before():
+def test_settings_omit_empty_disabled_list():
     assert "disabled" not in Settings().to_toml()
 
 
@@ -78,19 +78,19 @@ def test_settings_without_disabled_microphones_are_written_as_before():
         (tuple(range(32)), "array.disabled disables all 32 microphones; name fewer channels"),
     ],
 )
-def test_disabled_channels_that_cannot_be_are_refused(disabled, message):
+def test_invalid_disabled_channels_are_refused(disabled, message):
     with pytest.raises(ArgumentError, match=message):
         microphones(Array(disabled=disabled))
 
 
-def test_settings_file_that_only_disables_keeps_the_array(tmp_path):
+def test_settings_file_with_only_disabled_keeps_the_array(tmp_path):
     (tmp_path / "s.toml").write_text("[array]\ndisabled = [2]\n")
     known = line(8, 8)
     changed = known.updated_from_file(tmp_path / "s.toml")
     assert changed.array == known.array.replace(disabled=(2,))
 
 
-# ---- what is made of it --------------------------------------------------------------------------------
+# ---- images, exports and figures -----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -105,8 +105,8 @@ def test_settings_file_that_only_disables_keeps_the_array(tmp_path):
     ],
     ids=lambda changes: "-".join(changes.values()) or "fast",
 )
-def test_disabled_microphones_change_no_image(processing):
-    """Whatever they hear."""
+def test_samples_of_disabled_microphones_do_not_change_images(processing):
+    """Images are equal for any samples of the disabled microphones."""
     settings = without(SMALL.replace(processing=SMALL.processing.replace(**processing)), 4, 9)
     (measurement,) = noise(settings, count=1)
     other = dataclasses.replace(measurement, data=measurement.data ^ np.uint32(1 << 4 | 1 << 9))
@@ -114,14 +114,14 @@ def test_disabled_microphones_change_no_image(processing):
         assert_array_equal(pipeline.process(measurement).amplitude, pipeline.process(other).amplitude)
 
 
-def test_image_without_microphones_keeps_its_error_budget():
+def test_image_with_disabled_microphones_meets_its_error_budget():
     settings = without(SMALL, 4, 9)
     (measurement,) = noise(settings, count=1)
     with Pipeline(settings) as pipeline:
         assert measure(pipeline.process(measurement), measurement).error_db < settings.accuracy.max_error_db
 
 
-def test_reflectors_stay_where_they_are_without_a_microphone():
+def test_disabled_microphones_do_not_move_reflectors():
     scene = load_scene(ROOT / "data" / "synthetic" / "reflectors.toml")
     with open_recording(ROOT / "data" / "synthetic" / "reflectors.h5") as recording:
         measurement = recording[0]
@@ -133,7 +133,7 @@ def test_reflectors_stay_where_they_are_without_a_microphone():
         assert abs(match.range_m) < 0.001
 
 
-def test_health_looks_at_no_disabled_microphone(recording):
+def test_health_ignores_disabled_microphones(recording):
     with open_recording(recording) as given:
         measurement = given[0]
     report = health(dataclasses.replace(measurement, settings=without(measurement.settings, *FAULTY)))
@@ -141,7 +141,7 @@ def test_health_looks_at_no_disabled_microphone(recording):
     assert not report.faults
 
 
-def test_exports_and_pictures_have_no_disabled_microphone(recording, tmp_path):
+def test_exports_and_figures_omit_disabled_microphones(recording, tmp_path):
     with open_recording(recording) as given:
         measurement = dataclasses.replace(given[0], settings=without(given[0].settings, *FAULTY))
     export(tmp_path / "signals.h5", [measurement])
@@ -158,7 +158,7 @@ def test_exports_and_pictures_have_no_disabled_microphone(recording, tmp_path):
 # ---- the command line ----------------------------------------------------------------------------------
 
 
-def test_advice_on_faulty_microphones_can_be_followed(recording, tmp_path):
+def test_process_advice_on_faulty_microphones_works(recording, tmp_path):
     first = tmp_path / "first.h5"
     (reported,) = run("process", recording, "-o", first, "--quiet").stderr.splitlines()
     advice = reported.partition("exclude them with ")[2].partition(",  or")[0].partition(", or see")[0]
@@ -183,12 +183,12 @@ def test_advice_on_faulty_microphones_can_be_followed(recording, tmp_path):
         ("40", "array.disabled is 40; give a whole number from 0 to 31"),
     ],
 )
-def test_channels_that_are_not_there_are_refused(recording, tmp_path, channels, message):
+def test_process_without_rejects_invalid_channels(recording, tmp_path, channels, message):
     done = run("process", recording, "-o", tmp_path / "a.h5", "--without", channels, code=2 if channels == "x" else 1)
     assert message in done.stderr
 
 
-def test_layout_prints_what_a_settings_file_can_name(tmp_path):
+def test_layout_command_prints_a_loadable_layout(tmp_path):
     listed = json.loads(run("layout", "--json").stdout)["layouts"]
     assert {"name": "eRTIS_v3D1", "microphones": 32, "word_bits": 32} in listed
     assert "eRTIS_v3D1" in run("layout").stdout

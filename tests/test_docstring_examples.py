@@ -1,4 +1,4 @@
-"""Examples in docstrings of public names run, and public functions state parameters, results and errors."""
+"""Docstrings of public names: their examples run, and functions document parameters, results and errors."""
 
 import doctest
 import inspect
@@ -17,7 +17,7 @@ WITHOUT_EXAMPLE = {
     *(name for name in ertis.__all__ if name.endswith(("Error", "Warning"))),
     # `Pipeline.signals` returns it and has an example.
     "MicrophoneSignals",
-    # They need keys or a network; pages of the guide have examples, which tests run.
+    # They need keys or a network. Tests run the examples on the pages of the guide instead.
     *("AllowList", "ClientKeys", "JournalEntry", "KeyPair", "Permission", "ServerKeys"),
 }
 """Public names whose docstring has no example, each with its reason."""
@@ -57,7 +57,7 @@ DOCUMENTED = [
 
 @pytest.fixture
 def place(tmp_path, monkeypatch):
-    """A folder with what ``ertis example reflectors`` copies."""
+    """A folder with the files of ``ertis example reflectors``."""
     shutil.copy(ROOT / "data" / "synthetic" / "reflectors.h5", tmp_path)
     monkeypatch.chdir(tmp_path)
     mpl.use("Agg")
@@ -65,7 +65,7 @@ def place(tmp_path, monkeypatch):
 
 
 def public():
-    """Public objects with the examples in their docstrings and in those of their methods."""
+    """Yield public objects whose docstrings, or those of their methods, have examples."""
     finder = doctest.DocTestFinder(exclude_empty=True)
     for name in ertis.__all__:
         for test in finder.find(getattr(ertis, name), name, globs={}):
@@ -75,7 +75,7 @@ def public():
 
 @pytest.mark.usefixtures("place")
 @pytest.mark.parametrize("example", list(public()))
-def test_examples_run(example):
+def test_docstring_examples_run(example):
     runner = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE)
     shown = []
     runner.run(example, out=shown.append)

@@ -1,4 +1,4 @@
-"""What 'ertis doctor' finds, and what it says to do."""
+"""Findings of 'ertis doctor' and their remedies."""
 
 import json
 import os
@@ -23,7 +23,7 @@ permission = vars(_diagnosis)["_permission"]
 
 @pytest.fixture
 def doctor(tmp_path, monkeypatch):
-    """Run it in a folder of its own, with what is found by its name."""
+    """Run 'ertis doctor' in an empty folder and return its findings by name."""
     monkeypatch.setenv("ERTIS_KEYS_DIR", str(tmp_path / "keys"))
     monkeypatch.setenv("ERTIS_EMULATED_DIR", str(tmp_path / "emulated"))
 
@@ -40,7 +40,7 @@ def doctor(tmp_path, monkeypatch):
     return run
 
 
-def test_what_works(doctor):
+def test_doctor_reports_a_working_installation(doctor):
     found = doctor()
     for what in ("ertis", "libraries", "processing"):
         assert {state for state, _, _ in found[what]} == {"good"}
@@ -50,13 +50,13 @@ def test_what_works(doctor):
     assert all(remedy for each in found.values() for state, _, remedy in each if state != "good")
 
 
-def test_threads_that_take_turns(doctor, monkeypatch):
+def test_doctor_notes_the_workqueue_threading_layer(doctor, monkeypatch):
     monkeypatch.setattr(_diagnosis, "_threading_layer", lambda: "workqueue")
     assert doctor()["threads"][0][0] == "note"
     assert "tbb" in doctor()["threads"][0][2]
 
 
-def test_a_slow_disk(doctor, monkeypatch):
+def test_doctor_reports_a_slow_disk(doctor, monkeypatch):
     monkeypatch.setattr(_diagnosis, "_commits_s", lambda _: [1.0] * 3)
     assert doctor()["disk"] == [
         ("bad", "5 MB/s durably, slowest 5 MB in 1000 ms: less than one sensor at 20 Hz",
@@ -64,7 +64,7 @@ def test_a_slow_disk(doctor, monkeypatch):
     ]  # fmt: skip
 
 
-def test_a_disk_that_cannot_be_written(doctor, monkeypatch):
+def test_doctor_reports_a_read_only_disk(doctor, monkeypatch):
     def fails(_):
         raise OSError(30, "Read-only file system")
 
@@ -72,7 +72,7 @@ def test_a_disk_that_cannot_be_written(doctor, monkeypatch):
     assert doctor()["disk"][0][0] == "bad"
 
 
-def test_a_port_that_may_not_be_opened(doctor, monkeypatch, tmp_path):
+def test_doctor_reports_a_port_without_permission(doctor, monkeypatch, tmp_path):
     path = tmp_path / "ttyACM0"
     path.touch()
     port = Port(path=str(path), link="", serial_number="123", description="eRTIS", emulated=True)
@@ -90,14 +90,14 @@ def test_a_port_that_may_not_be_opened(doctor, monkeypatch, tmp_path):
     ("group_id", "mode", "remedy"),
     [
         (20, 0o660, "run 'sudo usermod -aG serial $USER' and log in again"),
-        (0, 0o660, "udev"),  # to join the group of root is to be root
-        (20, 0o640, "udev"),  # whose members may not write
+        (0, 0o660, "udev"),  # joining the root group would grant root access
+        (20, 0o640, "udev"),  # the group may not write
         (20, 0o600, "udev"),
-        (77, 0o660, "udev"),  # which has no name
-        (os.getgid() or 21, 0o660, "udev"),  # of which one is a member, and may not all the same
+        (77, 0o660, "udev"),  # the group has no name
+        (os.getgid() or 21, 0o660, "udev"),  # a group of the user, which still has no access
     ],
 )
-def test_what_would_permit_to_open_a_port(monkeypatch, group_id, mode, remedy):
+def test_doctor_port_remedy_suits_group_and_mode(monkeypatch, group_id, mode, remedy):
     import grp  # noqa: PLC0415  not on every system
 
     def named(number):
@@ -114,14 +114,14 @@ def test_what_would_permit_to_open_a_port(monkeypatch, group_id, mode, remedy):
     assert re.search(r"""write 'KERNEL=="ttyACM\*", .*' to /etc/udev/rules.d/\S+\.rules""", reported)
 
 
-def test_all_extras_are_looked_at(doctor):
-    """Those that users have, by a module of each package that they bring."""
+def test_doctor_checks_all_extras(doctor):
+    """Each extra for users is checked by one module of every package in it."""
     parser = ConfigParser()
     parser.read(Path(__file__).parents[1] / "setup.cfg")
     brought = {
         extra: {re.split(r"[\[<>=]", line)[0] for line in lines.split("\n") if line}
         for extra, lines in parser["options.extras_require"].items()
-        if extra not in {"cu12", "cu13", "test", "docs", "check"}  # a GPU is looked at, and the others are for authors
+        if extra not in {"cu12", "cu13", "test", "docs", "check"}  # GPUs have their own check; others are not for users
     }
     packages = packages_distributions()
     looked_at = {
@@ -132,7 +132,7 @@ def test_all_extras_are_looked_at(doctor):
     assert {f"extra {extra}" for extra in brought} <= set(doctor())
 
 
-def test_an_extra_that_is_not_there_in_full(doctor, monkeypatch):
+def test_doctor_notes_an_incomplete_extra(doctor, monkeypatch):
     there = _diagnosis.importlib.util.find_spec
     monkeypatch.setattr(
         _diagnosis.importlib.util, "find_spec", lambda name: None if name == "websockets" else there(name)
@@ -140,7 +140,7 @@ def test_an_extra_that_is_not_there_in_full(doctor, monkeypatch):
     assert doctor()["extra view"] == [("note", "not installed", "optional: pip install 'ertis-numba[view]'")]
 
 
-def test_a_gpu_that_cannot_be_used(doctor, monkeypatch):
+def test_doctor_reports_an_unusable_gpu(doctor, monkeypatch):
     def fails(device):
         if device == "cuda":
             raise DeviceError("no driver; install one")
@@ -153,7 +153,7 @@ def test_a_gpu_that_cannot_be_used(doctor, monkeypatch):
     assert (state in {"note", "bad"}, text, remedy) == (True, "no driver", "install one")
 
 
-def test_keys_that_others_can_read(doctor, tmp_path):
+def test_doctor_reports_keys_readable_by_other_users(doctor, tmp_path):
     secret, _ = KeyPair.new("mine").save(tmp_path / "keys")
     assert doctor()["keys"][0][0] == "good"
     secret.chmod(0o644)
@@ -162,7 +162,7 @@ def test_keys_that_others_can_read(doctor, tmp_path):
     assert "chmod 600" in remedy
 
 
-def test_what_is_broken_hides_nothing_else(doctor, monkeypatch):
+def test_doctor_continues_after_a_failing_check(doctor, monkeypatch):
     def breaks(_):
         raise RuntimeError("of all things")
         yield
@@ -173,7 +173,7 @@ def test_what_is_broken_hides_nothing_else(doctor, monkeypatch):
     assert "disk" in found
 
 
-def test_for_people(tmp_path):
+def test_doctor_prints_a_table_and_rejects_missing_folder(tmp_path):
     done = CliRunner().invoke(cli, ["doctor", "--folder", str(tmp_path)])
     lines = done.stdout.splitlines()
     assert lines[0].split() == ["what", "found", "what", "to", "do"]

@@ -1,4 +1,4 @@
-"""Where reflectors are seen that an emitter beside the array has made ring, as docs/how-to/own-array.md says."""
+"""Apparent range of reflectors when the emitter is beside the array, as stated in docs/how-to/own-array.md."""
 
 import math
 
@@ -15,7 +15,7 @@ SHORT = {"processing": Processing(directions="2d:181", range_m=(0.3, 1.7)), "rec
 
 @pytest.mark.parametrize("emitter_m", [(0.0, 0.0, -0.06), (0.0, 0.06, 0.0), (-0.02, -0.05, 0.04)])
 @pytest.mark.parametrize(("azimuth_deg", "range_m"), [(0, 0.6), (50, 0.6), (-70, 1.5)])
-def test_ranges_are_longer_by_what_the_page_says(emitter_m, azimuth_deg, range_m):
+def test_emitter_beside_array_shifts_ranges_as_documented(emitter_m, azimuth_deg, range_m):
     angle = math.radians(azimuth_deg)
     toward = np.array([math.cos(angle), math.sin(angle), 0.0])
     array = Sensor(name="array", emitter=Emitter(silent=True), **SHORT)

@@ -1,4 +1,4 @@
-"""Emitters beside their array and transducers that ring, against geometry and closed forms."""
+"""Emitters beside their array and resonant transducers, compared with geometry and closed forms."""
 
 import math
 
@@ -37,13 +37,13 @@ BESIDE = SENSOR.replace(emitter=Emitter(position_m=OFFSET_M, direct_sound_db=-30
 
 
 def test_emitter_offset_makes_paths_bistatic():
-    """In a turned sensor: from the emitter's place to the target, and from there to each microphone."""
+    """The sensor is rotated: paths run from the emitter to the target, and from there to each microphone."""
     sensor = BESIDE.replace(position_m=(0.2, 0.1, -0.1), yaw_deg=70.0, pitch_deg=20.0, roll_deg=-30.0)
     target_m = np.array([0.5, 0.6, 0.2])
     scene = scene_of(Point(position_m=(0.5, 0.6, 0.2), strength_db=0.0), sensor=sensor)
-    mouth_m = np.array([0.2, 0.1, -0.1]) + sensor.rotation() @ np.array(OFFSET_M)
+    transmitter_m = np.array([0.2, 0.1, -0.1]) + sensor.rotation() @ np.array(OFFSET_M)
     mics_m = np.array([0.2, 0.1, -0.1]) + microphones(sensor.array).positions_m @ sensor.rotation().T
-    first_m, second_m = np.linalg.norm(target_m - mouth_m), np.linalg.norm(target_m - mics_m, axis=1)
+    first_m, second_m = np.linalg.norm(target_m - transmitter_m), np.linalg.norm(target_m - mics_m, axis=1)
     [echo] = ways(scene, "spreading", "emitter_offset")
     assert_allclose(echo.delay_s, [(first_m + second_m) / SPEED_M_S], atol=2e-12)
     assert_allclose(echo.amplitude[..., 0], [1 / (first_m * second_m)])
@@ -57,8 +57,8 @@ def test_emitter_offset_moves_the_direct_sound():
     assert_allclose(direct.delay_s, [way_m / SPEED_M_S], atol=1e-12)
 
 
-def test_emitter_offset_moves_images_in_walls():
-    """The way over a wall to the side is that from the emitter's mirror image."""
+def test_emitter_offset_moves_the_mirror_image_in_a_wall():
+    """The path over a wall at the side starts at the mirror image of the emitter."""
     wall = Wall(position_m=(0.0, 0.4, 0.0), facing_deg=(90.0, 0.0))
     scene = scene_of(sensor=EAR.replace(emitter=Emitter(position_m=OFFSET_M)), walls=(wall,))
     delay_s, _ = sorted_ways(scene, "walls", "emitter_offset")
@@ -67,7 +67,7 @@ def test_emitter_offset_moves_images_in_walls():
 
 
 def test_truth_accounts_for_the_emitter_position():
-    """Image, truth and comparison agree on half of the bistatic way."""
+    """Image, ground truth and comparison use half of the bistatic path as range."""
     sensor = SENSOR.replace(
         array=SENSOR.array.replace(layout="eRTIS_v3D1", positions_m=None, word_bits=32),
         emitter=Emitter(position_m=(0.0, 0.1, 0.0)),
@@ -87,7 +87,7 @@ def test_truth_accounts_for_the_emitter_position():
     assert centred.range_m < -0.04
 
 
-# ---- a transducer that rings -----------------------------------------------------------------------
+# ---- a resonant transducer -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("resonance_hz", "quality_factor"), [(40e3, 3.0), (40e3, 20.0), (30e3, 8.0), (60e3, 5.0)])
@@ -101,7 +101,7 @@ def test_transducer_filters_as_a_resonant_circuit(resonance_hz, quality_factor):
 
 @pytest.mark.parametrize("quality_factor", [10.0, 30.0, 100.0])
 def test_transducer_rings_at_its_resonance_and_decays_exponentially(quality_factor):
-    """After the call: ``exp(-π f₀ t / Q)`` at f₀."""
+    """After the call, the amplitude follows ``exp(-π f₀ t / Q)`` at f₀."""
     emitter = Emitter(resonance_hz=40e3, quality_factor=quality_factor)
     scene = scene_of(Point(range_m=0.3, strength_db=0.0), sensor=EAR.replace(emitter=emitter))
     [signal] = heard(scene, "emitter_response")
@@ -117,7 +117,7 @@ def test_transducer_rings_at_its_resonance_and_decays_exponentially(quality_fact
     assert decay_s == pytest.approx(quality_factor / (math.pi * 40e3), rel=0.02)
 
 
-def test_ringing_goes_on_in_the_next_block(monkeypatch):
+def test_ringing_continues_across_synthesis_blocks(monkeypatch):
     emitter = Emitter(resonance_hz=40e3, quality_factor=60.0, direct_sound_db=-30.0)
     scene = scene_of(Point(range_m=0.7), sensor=EAR.replace(emitter=emitter))
     names = ("emitter_response", "direct_sound")
@@ -126,8 +126,8 @@ def test_ringing_goes_on_in_the_next_block(monkeypatch):
     assert error_db(heard(scene, *names), whole) < -100
 
 
-def test_ringing_follows_motion():
-    """A target that flies away: the ringing is stretched with its call."""
+def test_ringing_of_moving_target_is_doppler_shifted():
+    """The echo of a receding target stretches the ringing together with the call."""
     emitter = Emitter(resonance_hz=40e3, quality_factor=10.0)
     scene = scene_of(
         Point(position_m=(0.4, 0.0, 0.0), velocity_m_s=(20.0, 0.0, 0.0)), sensor=EAR.replace(emitter=emitter)
@@ -149,7 +149,7 @@ def test_ringing_follows_motion():
         ("clock_drift", SENSOR.replace(electronics=Electronics(clock_drift_ppm=1000.0))),
     ],
 )
-def test_effects_are_off_by_default_and_on_where_they_matter(name, sensor):
+def test_plan_enables_effects_only_where_relevant(name, sensor):
     point = Point(azimuth_deg=30, range_m=0.7, strength_db=-15)
     assert name not in make_plan(scene_of(point)).active
     assert name in make_plan(scene_of(point, sensor=sensor)).active

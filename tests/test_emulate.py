@@ -1,4 +1,4 @@
-"""``ertis emulate``, as a process of its own: what it prints, what its devices measure, and what it leaves."""
+"""``ertis emulate`` as a separate process: output, measurements of its devices, and cleanup."""
 
 import json
 import os
@@ -33,7 +33,7 @@ ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)
 
 @pytest.fixture
 def recording(tmp_path):
-    """Two sensors, with two measurements and with one."""
+    """A recording of two sensors, with two measurements and with one."""
     settings = Settings(recording=Recording(n_samples=N_SAMPLES), processing=Processing(range_m=(0.3, 0.5)))
     given = [("left", WORDS[0]), ("right", WORDS[1]), ("left", WORDS[2])]
     return write_recording(
@@ -44,7 +44,7 @@ def recording(tmp_path):
 
 @pytest.fixture
 def emulate(tmp_path):
-    """Start the command as a process of its own; what still runs is ended."""
+    """Start the command as a separate process and kill it after the test."""
     with ExitStack() as stack:
 
         def start(*arguments):
@@ -69,7 +69,7 @@ def ended(process, number):
     return process.returncode, out, errors
 
 
-def test_the_command_replays_a_recording(emulate, recording, tmp_path):
+def test_emulate_replays_a_recording(emulate, recording, tmp_path):
     log = tmp_path / "log"
     process = emulate(recording, "--sync-rate", 50, "--log", log, "--fault", "short_reads=1", "--quiet")
     paths = [process.stdout.readline().rstrip() for _ in range(2)]
@@ -90,7 +90,7 @@ def test_the_command_replays_a_recording(emulate, recording, tmp_path):
     assert [entry["name"] for entry in entries] == 3 * ["left"] + 5 * ["right"]
 
 
-def test_the_command_unplugs_its_devices(emulate, recording, tmp_path):
+def test_emulate_unplugs_and_reconnects_its_devices(emulate, recording, tmp_path):
     link = tmp_path / "mine"
     process = emulate(recording, "--sensor", "left", "--link", link, "--unplug", "0:0.05", "--json")
     reported = json.loads(process.stdout.readline())
@@ -110,8 +110,8 @@ def test_the_command_unplugs_its_devices(emulate, recording, tmp_path):
 
 
 @pytest.mark.parametrize(("number", "code"), [("SIGINT", 130), ("SIGTERM", 143)])
-def test_a_script_ends_what_it_has_in_the_background(emulate, recording, tmp_path, number, code):
-    """Whose background jobs a shell has ignore SIGINT."""
+def test_emulate_in_background_obeys_signals(emulate, recording, tmp_path, number, code):
+    """A shell starts background jobs with SIGINT ignored."""
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         process = emulate(recording, "--sensor", "left")
@@ -122,7 +122,7 @@ def test_a_script_ends_what_it_has_in_the_background(emulate, recording, tmp_pat
     assert not (tmp_path / "links" / "left").is_symlink()
 
 
-def test_a_killed_emulator_leaves_a_link_that_the_next_replaces(emulate, recording, tmp_path):
+def test_emulate_replaces_the_link_of_a_killed_emulator(emulate, recording, tmp_path):
     link = tmp_path / "links" / "left"
     process = emulate(recording, "--sensor", "left")
     process.stdout.readline()
@@ -133,7 +133,7 @@ def test_a_killed_emulator_leaves_a_link_that_the_next_replaces(emulate, recordi
     assert ended(process, signal.SIGTERM)[0] == 143
 
 
-ELSEWHERE = """
+WITHOUT_PSEUDO_TERMINALS = """
 import sys
 import serial  # which has a module of its own for Windows
 
@@ -147,9 +147,9 @@ main()
 """
 
 
-def test_a_system_without_pseudo_terminals(recording, tmp_path):
+def test_emulate_reports_a_system_without_pseudo_terminals(recording, tmp_path):
     done = subprocess.run(
-        [sys.executable, "-c", ELSEWHERE, "emulate", str(recording)],
+        [sys.executable, "-c", WITHOUT_PSEUDO_TERMINALS, "emulate", str(recording)],
         capture_output=True,
         text=True,
         check=False,
@@ -174,7 +174,7 @@ range_m = 0.4
 """
 
 
-def test_the_command_renders_a_scene(emulate, tmp_path):
+def test_emulate_renders_a_scene(emulate, tmp_path):
     (tmp_path / "scene.toml").write_text(SCENE)
     process = emulate(tmp_path / "scene.toml", "--seed", 4, "--quiet")
     scene = Scene.from_toml(SCENE).replace(seed=4)
@@ -184,7 +184,7 @@ def test_the_command_renders_a_scene(emulate, tmp_path):
         ask(port, b"!G,131072,0,0\n")
         for counter, active in enumerate((1, 1, 0, 1)):
             port.write(b"!A,%d,0,0\n" % active)
-            heard = scene if active else silent  # with all effects: determining the relevant ones takes longer
+            heard = scene if active else silent  # all effects are on, as selecting the relevant ones is slow
             words = Engine(heard, heard.sensors[0], frozenset(EFFECTS)).render(counter % 2).data
             assert is_block(block(port), counter, words)
     assert ended(process, signal.SIGTERM) == (143, "", "")
@@ -202,13 +202,13 @@ def test_the_command_renders_a_scene(emulate, tmp_path):
         (["--unplug", "3"], 2, "'3' is not an interval"),
     ],
 )
-def test_the_command_refuses_what_it_cannot_do(recording, options, code, message):
+def test_emulate_rejects_invalid_options(recording, options, code, message):
     done = CliRunner().invoke(cli, ["emulate", str(recording), *options])
     assert (done.exit_code, done.stdout) == (code, "")
     assert message in done.stderr
 
 
-def test_a_length_that_no_device_has_is_refused(tmp_path, monkeypatch):
+def test_emulate_rejects_unsupported_measurement_length(tmp_path, monkeypatch):
     monkeypatch.setenv("ERTIS_EMULATED_DIR", str(tmp_path))
     done = CliRunner().invoke(cli, ["emulate", str(write_recording(tmp_path / "rec.h5", noise()))])
     assert (done.exit_code, done.stdout) == (1, "")
@@ -222,7 +222,7 @@ def captured(port, settings):
         return sonar.measure().data
 
 
-def test_a_scene_is_rendered_for_the_call_that_a_sensor_receives(emulate, tmp_path):
+def test_emulate_renders_a_scene_for_the_configured_call(emulate, tmp_path):
     (tmp_path / "scene.toml").write_text(SCENE)
     process = emulate(tmp_path / "scene.toml", "--quiet")
     settings = Settings.from_preset("short_20_80")
@@ -241,7 +241,7 @@ def test_a_scene_is_rendered_for_the_call_that_a_sensor_receives(emulate, tmp_pa
         ("recording", "left was recorded with a call of 50 to 25 kHz in 2.5 ms and 32768 samples at 4.5 MHz"),
     ],
 )
-def test_a_call_without_measurements_is_refused(emulate, recording, tmp_path, source, reported):
+def test_emulate_rejects_a_call_without_measurements(emulate, recording, tmp_path, source, reported):
     (tmp_path / "scene.toml").write_text(SCENE)
     process = emulate(*([tmp_path / "scene.toml"] if source == "scene" else [recording, "--sensor", "left"]), "--quiet")
     port = process.stdout.readline().rstrip()
@@ -249,7 +249,7 @@ def test_a_call_without_measurements_is_refused(emulate, recording, tmp_path, so
         call=Call(start_frequency_hz=25e3, stop_frequency_hz=50e3), recording=Recording(n_samples=N_SAMPLES)
     )
     settings = settings.replace(processing=Processing(range_m=(0.3, 0.5)))
-    for _ in range(2):  # the device still holds the call at the second attempt
+    for _ in range(2):  # the device keeps the call for the second attempt
         with pytest.raises(SonarError, match="'ertis emulate' prints the reason"):
             captured(port, settings)
         assert process.stderr.readline().startswith(f"ertis: warning: {reported}")
@@ -258,7 +258,7 @@ def test_a_call_without_measurements_is_refused(emulate, recording, tmp_path, so
     assert ended(process, signal.SIGTERM) == (143, "", "")
 
 
-def test_a_point_on_a_sensor_is_reported(emulate, tmp_path):
+def test_emulate_reports_a_point_on_a_sensor(emulate, tmp_path):
     (tmp_path / "scene.toml").write_text(SCENE + "[[points]]\nposition_m = [0.0, 0.0, 0.0]\n")
     process = emulate(tmp_path / "scene.toml")
     process.stdout.readline()
@@ -268,8 +268,8 @@ def test_a_point_on_a_sensor_is_reported(emulate, tmp_path):
     assert not any("rehears" in line or "Traceback" in line for line in errors.splitlines())
 
 
-def test_pulses_wait_until_a_scene_is_rendered(emulate, tmp_path):
-    """With a SYNC line, the port exists before anything is rendered, and every pulse has its measurement."""
+def test_emulate_renders_a_scene_before_answering_pulses(emulate, tmp_path):
+    """With a SYNC line, the port exists before rendering starts, and every pulse gets its measurement."""
     (tmp_path / "scene.toml").write_text(SCENE)
     process = emulate(tmp_path / "scene.toml", "--sync-rate", 5)
     with SonarDriver.open(process.stdout.readline().rstrip()) as sonar:
@@ -304,14 +304,14 @@ def test_capture_waits_for_a_port(emulate, recording, tmp_path, monkeypatch):
 
 
 class Unrenderable(list):
-    """Measurements of a scene that cannot be rendered at this time."""
+    """Measurements of a scene that cannot be rendered."""
 
     def __getitem__(self, _):
         raise ArgumentError("spheres[0] is 0 m from emitter of sensor")
 
 
-def test_a_pulse_survives_measurements_that_cannot_be_rendered():
-    """The device renders them again, and reports the error."""
+def test_pulse_preparation_survives_a_rendering_error():
+    """The device renders the measurement again later and then reports the error."""
     registers = SimpleNamespace(armed=True, active=True, amplifier=True, n_codes=0)
     device = SimpleNamespace(name="sensor", error=None, registers=registers)
     _get_ready([device], {"sensor": (Unrenderable([0]), None, None)}, 3)

@@ -1,4 +1,4 @@
-"""Emulated devices on real pseudo terminals, through pyserial: they answer, measure, and fail as they are told."""
+"""Emulated devices on real pseudo terminals, through pyserial: answers, measurements and configured quirks."""
 
 import select
 import threading
@@ -31,7 +31,7 @@ def port(device):
 
 @pytest.fixture
 def armed():
-    """A device that pulses trigger, with a log, and its port."""
+    """An armed device with its port and a log."""
     log = Log()
     with Emulator(WORDS, log=log) as device, opened(device) as port:
         for line in (b"!G,%d,0,0\n" % (4 * N_SAMPLES), b"!H,1,0,0\n", b"!J,1,1,0\n"):
@@ -39,7 +39,7 @@ def armed():
         yield device, port, log
 
 
-def test_it_remembers_what_it_is_told(device, port):
+def test_emulator_stores_configured_registers(device, port):
     assert ask(port, b"!Y,0,0,0\n") == 0x010000
     reported = device.registers
     assert (reported.amplifier, reported.armed, reported.counter) == (1, 0, 0)
@@ -55,7 +55,7 @@ def test_it_remembers_what_it_is_told(device, port):
     assert device.refused == 0
 
 
-def test_its_hash_is_that_of_the_call(port):
+def test_emulator_hash_equals_the_call_hash(port):
     codes = call_codes(Call(duration_s=2e-4))
     assert ask(port, b"!E,%d,0,0\n" % len(codes)) == 1
     for index, code in enumerate(codes):
@@ -85,14 +85,14 @@ def test_its_hash_is_that_of_the_call(port):
         b"x" * 300,
     ],
 )
-def test_what_is_no_command_is_answered_by_0_and_counted(device, port, line):
+def test_emulator_answers_0_to_invalid_commands_and_counts_them(device, port, line):
     before = {name: value for name, value in vars(device.registers).items() if name != "codes"}
     assert ask(port, line) == 0
     assert device.refused == 1
     assert {name: value for name, value in vars(device.registers).items() if name != "codes"} == before
 
 
-def test_measurements_are_numbered_and_have_the_words_of_their_number(port):
+def test_emulator_numbers_blocks_and_cycles_measurements(port):
     for counter in range(4):
         port.write(b"!A,1,0,0\n")
         assert is_block(block(port), counter, WORDS[counter % 3])
@@ -106,7 +106,7 @@ def test_measurements_are_numbered_and_have_the_words_of_their_number(port):
     ("lines", "given"),
     [((b"!A,0,0,0\n",), PASSIVE), ((b"!K,0,0,0\n", b"!A,1,0,0\n"), PASSIVE), ((b"!A,1,0,0\n",), WORDS)],
 )
-def test_without_emission_the_passive_words_are_heard(port, lines, given):
+def test_emulator_sends_passive_samples_without_emission(port, lines, given):
     for line in lines[:-1]:
         ask(port, line)
     for counter in range(3):
@@ -114,7 +114,7 @@ def test_without_emission_the_passive_words_are_heard(port, lines, given):
         assert is_block(block(port), counter, given[counter % len(given)])
 
 
-def test_words_are_cut_or_go_on_from_the_beginning():
+def test_emulator_truncates_or_repeats_samples_to_length():
     with Emulator([np.concatenate([WORDS[0], WORDS[1]])]) as device, opened(device) as port:
         for n_samples in (N_SAMPLES, 3 * N_SAMPLES):
             ask(port, b"!G,%d,0,0\n" % (4 * n_samples))
@@ -124,7 +124,7 @@ def test_words_are_cut_or_go_on_from_the_beginning():
 
 
 @pytest.mark.parametrize(("clock", "rate_hz"), [(0, 4.5e6), (1, 1.125e6)])
-def test_the_first_byte_comes_when_the_measurement_is_complete(port, clock, rate_hz):
+def test_emulator_sends_first_byte_after_measurement_duration(port, clock, rate_hz):
     ask(port, b"!F,%d,0,0\n" % clock)
     late_s = []
     for _ in range(5):
@@ -137,27 +137,27 @@ def test_the_first_byte_comes_when_the_measurement_is_complete(port, clock, rate
     assert min(late_s) < 5e-3
 
 
-def test_a_line_without_end_is_taken_when_it_is_left_or_the_next_begins(device, port):
+def test_emulator_accepts_lines_without_line_feed(device, port):
     port.write(b"!A,1,0,0")
     assert block(port)[0] == 0
     port.write(b"!K,0,0,0!H,1,0,0!Y,0,0,0\n")
     assert port.read(12) == b"\x01\0\0\0\x01\0\0\0\0\0\x01\0"
-    assert ask(port, b"!J,1,2,0,0\n") == 1  # the authors' code for Linux
+    assert ask(port, b"!J,1,2,0,0\n") == 1  # as the Linux code of the manufacturer sends it
     assert (device.registers.amplifier, device.registers.active, device.registers.pin) == (0, 1, 2)
     assert device.refused == 0
 
 
-def test_a_line_that_is_no_command_yet_waits_for_the_rest(device, port):
+def test_emulator_waits_for_the_rest_of_a_partial_line(device, port):
     port.write(b"!Y,0,")
     assert not select.select([port.fd], [], [], 0.06)[0]
     assert ask(port, b"0,0\n") == 0x010000
     assert device.refused == 0
 
 
-def test_pulses_count_while_the_trigger_is_on(armed):
+def test_emulator_accepts_pulses_only_while_armed(armed):
     device, port, log = armed
     assert device.trigger()
-    assert not device.trigger()  # it records
+    assert not device.trigger()  # it is recording
     assert is_block(block(port), 0, WORDS[0])
     assert device.trigger(5)
     assert is_block(block(port), 1, WORDS[2])
@@ -167,18 +167,18 @@ def test_pulses_count_while_the_trigger_is_on(armed):
     assert [(entry["index"], entry["counter"], entry["active"]) for entry in entries] == [(0, 0, True), (2, 1, True)]
 
 
-def test_it_records_while_it_sends(armed):
+def test_emulator_records_while_sending(armed):
     device, port, log = armed
-    device.quirks = Quirks(bytes_per_s=2e6)  # 66 ms for one, which is recorded in 7
+    device.quirks = Quirks(bytes_per_s=2e6)  # sending takes 66 ms, and recording takes 7 ms
     assert device.trigger()
     log.lines(1)
     assert device.trigger()
-    log.lines(1)  # the second is complete
+    log.lines(1)  # the second measurement is complete
     assert is_block(block(port), 0, WORDS[0])
     assert is_block(block(port), 1, WORDS[1])
 
 
-def test_what_nobody_reads_is_dropped_as_a_whole(armed):
+def test_emulator_drops_unread_measurements_whole(armed):
     device, port, log = armed
     for _ in range(5):
         assert device.trigger()
@@ -189,7 +189,7 @@ def test_what_nobody_reads_is_dropped_as_a_whole(armed):
     assert is_block(block(port), 5, WORDS[2])
 
 
-def test_the_log_tells_what_was_sent_and_what_was_not(armed):
+def test_emulator_logs_sent_dropped_and_unplugged_measurements(armed):
     device, _, log = armed
     entries = []
     for _ in range(3):
@@ -203,7 +203,7 @@ def test_the_log_tells_what_was_sent_and_what_was_not(armed):
     assert [(entry["counter"], entry["fault"]) for entry in log.lines(2)] == [(0, "unplugged"), (1, "unplugged")]
 
 
-def test_a_measurement_that_was_sent_but_not_read_is_logged_as_lost(armed):
+def test_emulator_logs_partially_read_measurement_as_unplugged(armed):
     device, port, log = armed
     device.trigger()
     assert log.lines(1)[0]["fault"] == ""
@@ -224,7 +224,7 @@ def test_a_measurement_that_was_sent_but_not_read_is_logged_as_lost(armed):
     }
 
 
-def test_commands_are_obeyed_while_nobody_reads_measurements(armed):
+def test_emulator_obeys_commands_while_measurements_are_unread(armed):
     device, port, log = armed
     for _ in range(3):
         device.trigger()
@@ -232,11 +232,11 @@ def test_commands_are_obeyed_while_nobody_reads_measurements(armed):
     port.write(b"!I,9,0,0\n")
     assert block(port)[0] == 0
     assert block(port)[0] == 1
-    assert port.read(4) == b"\x01\0\0\0"  # in the order in which they came about
+    assert port.read(4) == b"\x01\0\0\0"  # answers and blocks keep their order
     assert device.registers.emissions == 9
 
 
-def test_commands_wait_while_nobody_reads_the_answers(device, port):
+def test_emulator_pauses_commands_while_answers_are_unread(device, port):
     writer = threading.Thread(target=port.write, args=(b"!Y,0,0,0\n" * 60_000,))
     writer.start()
     writer.join(0.2)
@@ -247,7 +247,7 @@ def test_commands_wait_while_nobody_reads_the_answers(device, port):
     assert not writer.is_alive()
 
 
-def test_a_host_may_open_the_port_for_every_command(device):
+def test_emulator_port_can_be_reopened_for_every_command(device):
     for line, answer in ((b"!Y,0,0,0\n", 0x010000), (b"!G,131072,0,0\n", 1), (b"!B,3,0,0\n", 1)):
         with opened(device) as port:
             port.reset_input_buffer()
@@ -257,7 +257,7 @@ def test_a_host_may_open_the_port_for_every_command(device):
         assert is_block(block(port), 3, WORDS[0])
 
 
-def test_a_device_may_be_silent_slow_or_wrong(device, port):
+def test_emulator_quirks_make_it_silent_slow_or_wrong(device, port):
     device.quirks = Quirks(wrong_hash=True)
     assert ask(port, b"!L,0,0,0\n") == 1
     device.quirks = Quirks(answer_delay_s=0.05)
@@ -272,10 +272,10 @@ def test_a_device_may_be_silent_slow_or_wrong(device, port):
     began_s = time.monotonic()
     port.write(b"!A,1,0,0\n")
     assert is_block(block(port), 1, WORDS[1])
-    assert 0.1 < time.monotonic() - began_s - N_SAMPLES / 4.5e6 < 1.0  # of 0.131
+    assert 0.1 < time.monotonic() - began_s - N_SAMPLES / 4.5e6 < 1.0  # 0.131 MB at 1 MB/s
 
 
-def test_closing_does_not_wait_for_a_reader(armed):
+def test_emulator_close_does_not_wait_for_a_reader(armed):
     device, _, log = armed
     device.trigger()
     log.lines(1)

@@ -1,4 +1,4 @@
-"""Emulated devices go wrong as they are told: spoilt bytes, unplugged, silent; and their links are their own."""
+"""Configured faults of emulated devices: damaged bytes, unplugging and silence; and exclusive links."""
 
 import fcntl
 import os
@@ -20,7 +20,7 @@ from ertis_numba.errors import ArgumentError
 from tests.emulated import N_SAMPLES, TIMEOUT_S, WORDS, Log, Numbered, ask, opened
 
 
-def test_faults_spoil_what_is_sent_and_are_logged():
+def test_emulator_faults_damage_blocks_and_are_logged():
     log = Log()
     faults = Faults(3, {"flip": 0.5, "short_reads": True})
     with Emulator(WORDS, log=log, faults=faults) as device, opened(device) as port:
@@ -37,7 +37,7 @@ def test_faults_spoil_what_is_sent_and_are_logged():
     assert [entry["crc32"] for entry in entries] == 2 * [zlib.crc32(words.tobytes()) for words in WORDS]
 
 
-def test_it_is_unplugged_and_comes_back_as_after_power_up(tmp_path):
+def test_replugged_emulator_has_registers_of_power_up(tmp_path):
     link = tmp_path / "deep" / "front"
     with Emulator(WORDS, link=link) as device:
         assert link.readlink() == Path(device.port)
@@ -46,13 +46,13 @@ def test_it_is_unplugged_and_comes_back_as_after_power_up(tmp_path):
             assert ask(port, b"!I,9,0,0\n") == 1
             ask(port, b"junk\n")
             device.unplug()
-            with pytest.raises((serial.SerialException, OSError)):  # whichever pyserial makes of a hang-up
+            with pytest.raises((serial.SerialException, OSError)):  # pyserial raises either on a hang-up
                 ask(port, b"!Y,0,0,0\n")
             assert not link.is_symlink()
             assert not device.trigger()
             before = device.port
             device.replug()
-            assert device.port != before  # which the host has open still
+            assert device.port != before  # the host still has the old port open
         assert link.readlink() == Path(device.port)
         with serial.Serial(str(link), timeout=TIMEOUT_S) as port:
             assert ask(port, b"!Y,0,0,0\n") == 0x010000
@@ -61,7 +61,7 @@ def test_it_is_unplugged_and_comes_back_as_after_power_up(tmp_path):
     assert not list(link.parent.iterdir())
 
 
-def test_a_fault_unplugs_it_for_a_while():
+def test_unplug_fault_reconnects_the_emulator_after_a_time():
     back = queue.Queue()
     log = Log()
     faults, quirks = Faults(1, {"unplug": 1.0}), Quirks(away_s=0.05)
@@ -78,7 +78,7 @@ def test_a_fault_unplugs_it_for_a_while():
             assert ask(port, b"!Y,0,0,0\n") == 0x010000
 
 
-def test_it_comes_back_after_a_time():
+def test_unplug_for_some_seconds_reconnects_the_emulator():
     back = queue.Queue()
     with Emulator(WORDS, on_port=back.put) as device:
         began_s = time.monotonic()
@@ -87,7 +87,7 @@ def test_it_comes_back_after_a_time():
         assert time.monotonic() - began_s >= 0.03
 
 
-def test_words_that_cannot_be_read_end_the_device():
+def test_unreadable_samples_stop_the_emulator():
     class Broken(Numbered):
         def __getitem__(self, index):
             if index:
@@ -99,7 +99,7 @@ def test_words_that_cannot_be_read_end_the_device():
         port.write(b"!A,1,0,0\n")
         with pytest.raises((serial.SerialException, OSError)):
             port.read(1)
-        device.replug()  # in vain
+        device.replug()  # has no effect
         assert str(device.error) == "disk is gone"
 
 
@@ -111,20 +111,20 @@ def test_words_that_cannot_be_read_end_the_device():
         ([np.zeros((4, 2), np.uint32)], "measurements to emulate are 2-dimensional uint32"),
     ],
 )
-def test_other_words_are_refused(words, message):
+def test_emulator_rejects_invalid_samples(words, message):
     with pytest.raises(ArgumentError, match=message):
         Emulator(words)
     with pytest.raises(ArgumentError, match=message):
         Emulator(WORDS, passive=words)
 
 
-def test_a_link_belongs_to_one_device(tmp_path):
+def test_emulator_link_is_exclusive_to_one_device(tmp_path):
     link = tmp_path / "front"
     with Emulator(WORDS, link=link) as device:
         with pytest.raises(ArgumentError, match="front belongs to a running emulated device; end that one"):
             Emulator(WORDS, link=link)
         assert link.readlink() == Path(device.port)
-    link.symlink_to("/dev/pts/0")  # as one that was killed leaves it
+    link.symlink_to("/dev/pts/0")  # a killed emulator leaves such a link
     (tmp_path / ".front.lock").touch()
     with Emulator(WORDS, link=link) as device:
         assert link.readlink() == Path(device.port)
@@ -134,8 +134,8 @@ def test_a_link_belongs_to_one_device(tmp_path):
     assert link.read_text() == "precious"
 
 
-def test_a_link_that_somebody_looks_at_can_be_taken(tmp_path):
-    """Whether it is held shows a lock, which whoever looks holds for an instant."""
+def test_held_link_waits_for_a_short_shared_lock(tmp_path):
+    """A process that checks a link holds a shared lock for an instant."""
     looker = os.open(tmp_path / ".front.lock", os.O_CREAT | os.O_RDONLY)
     fcntl.flock(looker, fcntl.LOCK_SH)
     timer = threading.Timer(0.02, os.close, [looker])
@@ -144,7 +144,7 @@ def test_a_link_that_somebody_looks_at_can_be_taken(tmp_path):
     timer.join()
 
 
-def test_the_folder_of_links_can_be_chosen(monkeypatch, tmp_path):
+def test_emulated_folder_follows_the_environment_variable(monkeypatch, tmp_path):
     monkeypatch.setenv("ERTIS_EMULATED_DIR", str(tmp_path))
     assert emulated_folder() == tmp_path
     monkeypatch.delenv("ERTIS_EMULATED_DIR")

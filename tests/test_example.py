@@ -32,7 +32,7 @@ def test_example_lists_every_file_with_a_sentence():
     assert "corridor.toml" in run("example").stdout
 
 
-def test_every_example_is_a_file_of_the_source():
+def test_every_example_equals_its_source_file():
     sources = {path.name: path for path in (*(ROOT / "examples").iterdir(), *(ROOT / "data").rglob("*"))}
     for name, item in _examples.examples().items():
         assert item.read_bytes() == sources[name].read_bytes()
@@ -46,7 +46,7 @@ def test_example_copies_a_scene_and_its_recording():
     assert {path.name for path in Path().iterdir()} == {"reflectors.h5", "reflectors.toml", "platform.toml"}
 
 
-def test_every_scene_can_be_loaded_where_it_is_copied_to():
+def test_every_copied_scene_can_be_loaded():
     scenes = [name for name in _examples.examples() if PurePath(name).suffix == ".toml"]
     scenes = [
         name for name in scenes if name not in {"every_settings_key.toml", "every_layout_key.toml", "own_waveform.toml"}
@@ -56,7 +56,7 @@ def test_every_scene_can_be_loaded_where_it_is_copied_to():
         assert load_scene(name).sensors
 
 
-def test_example_overwrites_only_by_force():
+def test_example_overwrites_only_with_force():
     Path("line.toml").write_text("mine")
     assert (
         "line.toml exists; give another name, or ask to overwrite it (--force)" in run("example", "line", code=1).stderr
@@ -64,7 +64,7 @@ def test_example_overwrites_only_by_force():
     assert Path("line.toml").read_text() == "mine"
     assert not Path("line.h5").exists()
     run("example", "line", "--force")
-    again = json.loads(run("example", "line", "--json").stdout)  # a copy is not in the way
+    again = json.loads(run("example", "line", "--json").stdout)  # an identical copy is no conflict
     assert again == {"files": ["line.h5", "line.toml"], "copied": []}
 
 
@@ -72,7 +72,7 @@ def test_example_suggests_a_name():
     assert "example 'coridor' does not exist; did you mean 'corridor'?" in run("example", "coridor", code=1).stderr
 
 
-def test_demo_keeps_files_of_an_earlier_one():
+def test_demo_keeps_files_of_an_earlier_demo():
     folder = Path("demo")
     folder.mkdir()
     (folder / "image.png").write_text("mine")
@@ -81,8 +81,8 @@ def test_demo_keeps_files_of_an_earlier_one():
     assert (folder / "image.png").read_text() == "mine"
 
 
-def test_demo_makes_a_picture_of_what_four_sensors_send(tmp_path, monkeypatch):
-    """With one measurement of each sensor to render, where the shipped scene has thirty."""
+def test_demo_writes_recording_and_picture_of_four_sensors(tmp_path, monkeypatch):
+    """Each sensor renders one measurement instead of the thirty of the shipped scene."""
     scene = tmp_path / "small.toml"
     scene.write_text(_examples.examples()["platform.toml"].read_text("utf-8").replace("count = 30", "count = 1"))
     monkeypatch.setattr(_examples, "named", lambda name: {name: scene})

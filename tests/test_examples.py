@@ -1,4 +1,4 @@
-"""The examples that listen to a central node do what they say."""
+"""Example programs that receive data from a central node or send data to it."""
 
 import contextlib
 import csv
@@ -51,7 +51,7 @@ def log_points():
 
 @contextlib.contextmanager
 def running(monkeypatch, main, *arguments):
-    """Run an example's main in a thread until the block ends; yield the lines that it has printed."""
+    """Run the main function of an example in a thread until the block ends; yield a function returning its output."""
     subscribers, printed = [], io.StringIO()
 
     class Kept(Subscriber):
@@ -71,10 +71,10 @@ def running(monkeypatch, main, *arguments):
         thread.join(WAIT_S)
 
 
-# Safety stop: bands at 0.8 m and 1.6 m, left at a quarter more, after three images.
+# Safety stop: limits at 0.8 m and 1.6 m, released a quarter farther away and after three images.
 
 
-def test_stops_at_once_and_goes_on_late(safety_stop):
+def test_safety_stop_stops_at_once_and_resumes_late(safety_stop):
     way, speeds = safety_stop.Way(), []
     far, near = 5.0, 0.5
     for now_s, nearest_m in enumerate([far, far, far, far, far, far, near, far, far, far, near]):
@@ -83,10 +83,10 @@ def test_stops_at_once_and_goes_on_late(safety_stop):
     assert speeds == ["stop"] * 2 + ["slow"] * 3 + ["go", "stop", "stop", "stop", "slow", "stop"]
 
 
-def test_between_both_thresholds_of_a_band_nothing_changes(safety_stop):
+def test_safety_stop_has_hysteresis(safety_stop):
     way = safety_stop.Way()
     for now_s in range(20):
-        way.see(0.9, now_s)  # farther than what stops, nearer than what lets go
+        way.see(0.9, now_s)  # beyond the stop limit, within the release limit
     assert way.speed == 0
     for now_s in range(3):
         way.see(1.1, now_s)
@@ -98,14 +98,14 @@ def test_between_both_thresholds_of_a_band_nothing_changes(safety_stop):
     assert way.speed == 0
 
 
-def test_a_gap_in_the_echoes_does_not_let_go(safety_stop):
+def test_safety_stop_holds_through_missing_echoes(safety_stop):
     way = safety_stop.Way()
     for now_s in range(30):
         way.see(0.5 if now_s % 3 == 0 else 5.0, now_s)
     assert way.speed == 0
 
 
-def test_silence_stops(safety_stop):
+def test_safety_stop_stops_without_images(safety_stop):
     way = safety_stop.Way()
     for number in range(6):
         way.see(9.0, 0.1 * number)
@@ -115,13 +115,13 @@ def test_silence_stops(safety_stop):
     assert way.speed == 0
 
 
-def test_what_is_beside_or_behind_is_not_in_the_way(safety_stop):
+def test_safety_stop_ignores_points_beside_and_behind(safety_stop):
     points = [[2.0, 0.3, 0.1], [0.4, 0.5, 0.0], [0.3, -0.41, 0.0], [-0.2, 0.0, 0.0]]
     assert safety_stop.nearest_in_way_m(cloud(position_m=points)) == 2.0
     assert safety_stop.nearest_in_way_m(cloud(position_m=[])) == np.inf
 
 
-def test_says_when_it_changes_its_mind(safety_stop, monkeypatch):
+def test_safety_stop_prints_every_change_of_speed(safety_stop, monkeypatch):
     def now(sequence, x_m, late_s=0.0):
         made = cloud(sequence, position_m=[[x_m, 0, 0]])
         stamp = image(sequence, timestamp_ns=time.time_ns() - round(1e9 * late_s)).stamp
@@ -139,9 +139,9 @@ def test_says_when_it_changes_its_mind(safety_stop, monkeypatch):
     numbers = iter(range(100))
     with Publisher() as publisher, running(monkeypatch, safety_stop.main, publisher.address, "front") as printed:
         publisher.pump(lambda: len(publisher.peers) == 1)
-        until(["stop"])  # nothing was seen yet
+        until(["stop"])  # no image arrived yet
         see(4.0, late_s=2.0)  # too old
-        see(4.0, late_s=-2.0)  # not yet
+        see(4.0, late_s=-2.0)  # stamped in the future
         see(4.0)
         until(["stop", "slow"])
         see(4.0)
@@ -150,13 +150,13 @@ def test_says_when_it_changes_its_mind(safety_stop, monkeypatch):
         until(["stop", "slow", "go", "stop"])
         see(1.3)
         until(["stop", "slow", "go", "stop", "slow"])
-        until(["stop", "slow", "go", "stop", "slow", "stop"])  # silence
+        until(["stop", "slow", "go", "stop", "slow", "stop"])  # no more images
 
 
-# Acoustic flow
+# Acoustic flow.
 
 
-def test_flow_of_echoes_that_move_in_range(acoustic_flow):
+def test_flow_measures_radial_speed_of_echoes(acoustic_flow):
     before = image(0, reflectors=[(-36, 1.2, 1.0), (36, 2.0, 0.5)])
     now = image(1, reflectors=[(-36, 1.15, 1.0), (36, 2.013, 0.5)])  # 0.1 s later
     directions, speeds_m_s = acoustic_flow.flow(before, now)
@@ -166,14 +166,14 @@ def test_flow_of_echoes_that_move_in_range(acoustic_flow):
     np.testing.assert_allclose(speeds_m_s[azimuth_deg > 0], 0.13, atol=0.02)
 
 
-def test_no_flow_where_there_is_no_echo_or_another(acoustic_flow):
+def test_flow_is_empty_without_matching_echoes(acoustic_flow):
     directions, _ = acoustic_flow.flow(image(0, reflectors=[(0, 1.2, 1.0)]), image(1, reflectors=[(0, 2.2, 1.0)]))
-    assert not len(directions)  # faster than anything it looks for
+    assert not len(directions)  # faster than the search range
     directions, _ = acoustic_flow.flow(image(0), image(1))
     assert not len(directions)
 
 
-def test_flow_of_a_simulated_person_is_the_truth(acoustic_flow):
+def test_flow_of_simulated_person_equals_the_true_speed(acoustic_flow):
     scene = Scene.from_toml(
         """
         seed = 5
@@ -197,7 +197,7 @@ def test_flow_of_a_simulated_person_is_the_truth(acoustic_flow):
     assert speeds_m_s[nearest] == pytest.approx(np.array([-0.8, -0.2]) @ towards, abs=0.02)
 
 
-def test_flow_is_told_of_images_that_follow(acoustic_flow, monkeypatch):
+def test_flow_example_prints_speeds_of_consecutive_images(acoustic_flow, monkeypatch):
     items = [image(k, reflectors=[(12, 2 - 0.05 * k, 1.0)]) for k in range(3)]
     with (
         Publisher() as publisher,
@@ -212,7 +212,7 @@ def test_flow_is_told_of_images_that_follow(acoustic_flow, monkeypatch):
         assert printed()[1].startswith("#2: -0.5")
 
 
-# Log of points
+# Log of points.
 
 
 def logged(log_points, path, capsys):
@@ -223,21 +223,21 @@ def logged(log_points, path, capsys):
     return items
 
 
-def test_log_as_csv_in_the_frame_of_the_platform(log_points, tmp_path, capsys):
+def test_point_log_csv_is_in_the_platform_frame(log_points, tmp_path, capsys):
     path = tmp_path / "points.csv"
     items = logged(log_points, path, capsys)
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [(row["sensor"], row["sequence"]) for row in rows] == [("front", "1"), ("front", "1"), ("left", "3")]
     assert rows[0]["timestamp_ns"] == str(items[0].stamp.timestamp_ns)
-    # Turned by half a turn about z, then moved by 1, 2, 3.
+    # The points are rotated by half a turn about z and then moved by (1, 2, 3).
     places = [[float(row[axis]) for axis in ("x_m", "y_m", "z_m")] for row in rows]
     np.testing.assert_allclose(places, [[0, 2, 3], [1, 0, 3], [0, 2, 3]], atol=1e-6)
     assert [float(row["amplitude"]) for row in rows] == [1.0, 0.5, 1.0]
     assert [each.name for each in tmp_path.iterdir()] == ["points.csv"]
 
 
-def test_log_as_npz(log_points, tmp_path, capsys):
+def test_point_log_npz_has_all_columns(log_points, tmp_path, capsys):
     path = tmp_path / "points.npz"
     logged(log_points, path, capsys)
     with np.load(path) as table:
@@ -247,15 +247,15 @@ def test_log_as_npz(log_points, tmp_path, capsys):
         np.testing.assert_allclose(table["x_m"], [0, 1, 0], atol=1e-6)
 
 
-def test_an_empty_log_is_a_table_without_rows(log_points, tmp_path):
+def test_empty_point_log_is_a_table_without_rows(log_points, tmp_path):
     log_points.Log().save(tmp_path / "none.csv")
     assert (tmp_path / "none.csv").read_text() == ",".join(log_points.COLUMNS) + "\n"
 
 
-# What one's own program has measured
+# Measurements of a user's own program.
 
 
-def test_what_is_sent_by_ones_own_program_is_stored(tmp_path, capsys):
+def test_send_your_own_example_stores_measurements(tmp_path, capsys):
     given = noise()
     write_recording(tmp_path / "given.h5", given)
     with StandIn() as central:

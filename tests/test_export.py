@@ -1,4 +1,4 @@
-"""``ertis export`` chooses, writes whole files or none, and the page on it says what is so."""
+"""``ertis export``: selection, formats, complete files or none, and the page about it."""
 
 import csv
 import json
@@ -36,7 +36,7 @@ def run(*arguments, code=0):
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    """A recording of two sensors, one of one, and their energyscapes."""
+    """Recordings of two sensors and of one sensor, and energyscape files."""
     folder = tmp_path_factory.mktemp("files")
     both = [
         Measurement(given.data, SMALL, Stamp(sensor=sensor, sequence=number))
@@ -57,7 +57,7 @@ def rows(path):
         return list(csv.DictReader(file))
 
 
-def test_a_recording_is_processed_with_its_own_settings(files, tmp_path):
+def test_export_processes_a_recording_with_its_settings(files, tmp_path):
     run(files / "rec.h5", "-o", tmp_path / "a.npz")
     with ertis.open_recording(files / "rec.h5") as recording, np.load(tmp_path / "a.npz") as data:
         pipeline = ertis.Pipeline(recording.settings)
@@ -66,26 +66,26 @@ def test_a_recording_is_processed_with_its_own_settings(files, tmp_path):
 
 
 @pytest.mark.parametrize(("places", "chosen"), [("2", [2]), ("1:2", [1, 2]), ("0:0", [0]), (None, [0, 1, 2, 3])])
-def test_measurements_are_chosen(files, tmp_path, places, chosen):
+def test_export_selects_measurements(files, tmp_path, places, chosen):
     run(files / "img.h5", "-o", tmp_path / "a.npz", *(() if places is None else ("--measurement", places)))
     with np.load(tmp_path / "a.npz") as data:
         assert np.array_equal(data["amplitude"], [image(seed=seed).amplitude for seed in chosen])
 
 
-def test_all_sensors_are_in_the_frame_of_their_platform(files, tmp_path):
+def test_export_writes_points_in_the_platform_frame(files, tmp_path):
     run(files / "both.h5", "-o", tmp_path / "a.csv", "--top", 3)
     run(files / "both.energy.h5", "-o", tmp_path / "b.csv", "--sensor", "right", "--top", 3)
     both, right = rows(tmp_path / "a.csv"), rows(tmp_path / "b.csv")
     assert {row["sensor"] for row in both} == {"left", "right"}
     turned = [row for row in both if row["sensor"] == "right"]
     assert len(turned) == len(right) == 9
-    for there, here in zip(turned, right, strict=True):  # half a turn about z, and a metre back
+    for there, here in zip(turned, right, strict=True):  # half a turn about z, and one metre back
         assert float(there["x_m"]) == pytest.approx(-1 - float(here["x_m"]), abs=1e-6)
         assert float(there["y_m"]) == pytest.approx(-float(here["y_m"]), abs=1e-6)
         assert there["amplitude"] == here["amplitude"]
 
 
-def test_json_and_words(files, tmp_path):
+def test_export_reports_json_and_a_summary(files, tmp_path):
     done = run(files / "both.h5", "-o", tmp_path / "a.csv", "--json")
     assert json.loads(done.stdout) == {
         "output": str(tmp_path / "a.csv"),
@@ -98,7 +98,7 @@ def test_json_and_words(files, tmp_path):
     assert run(files / "rec.h5", "-o", tmp_path / "b.csv", "--quiet").stderr == ""
 
 
-def test_the_format_is_that_of_the_ending_or_the_one_given(files, tmp_path):
+def test_export_format_follows_suffix_or_option(files, tmp_path):
     run(files / "img.h5", "-o", tmp_path / "CLOUD.PLY")
     assert (tmp_path / "CLOUD.PLY").read_bytes().startswith(b"ply\nformat binary_little_endian 1.0\n")
     run(files / "img.h5", "-o", tmp_path / "cloud.txt", "--format", "pcd", "--ascii")
@@ -109,8 +109,8 @@ def test_the_format_is_that_of_the_ending_or_the_one_given(files, tmp_path):
     assert [path.name for path in output_files("x.h5", "acoular")] == ["x.h5", "x.xml"]
 
 
-def test_air_that_changes(tmp_path):
-    """Each image is made in the air of its measurement; one NPZ has one axis of ranges only."""
+def test_export_accepts_changing_air_except_in_npz(tmp_path):
+    """Each image uses the air of its measurement, but an NPZ file has only one range axis."""
     words = noise(count=1)[0].data
     warm = SMALL.replace(air=Air(temperature_c=35.0))
     given = [Measurement(words, settings, Stamp(sequence=n)) for n, settings in enumerate((SMALL, warm, warm))]
@@ -158,11 +158,11 @@ CASES = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_one_line_and_nothing_left(files, monkeypatch, name):
+def test_invalid_export_prints_one_line_and_writes_nothing(files, monkeypatch, name):
     arguments, code, message = CASES[name]
     monkeypatch.chdir(files)
     before = {path: path.stat().st_mtime_ns for path in files.iterdir()}
-    done = run(*arguments.split(), "--quiet", code=code)  # a slow machine would be told that it prepares
+    done = run(*arguments.split(), "--quiet", code=code)  # a slow machine would print a note about preparation
     assert done.stdout == ""
     assert done.stderr.startswith("ertis: error: ")
     assert done.stderr.count("\n") == 1
@@ -175,8 +175,8 @@ GIVEN = {"mounting": MOUNTED, "topics": TOPICS, "top": 5, "min_level_db": -9.0, 
 
 @pytest.mark.parametrize("option", GIVEN)
 @pytest.mark.parametrize("kind", FORMATS)
-def test_options_are_those_of_the_format(tmp_path, kind, option):
-    """Taken where the format has them, and refused elsewhere rather than passed over."""
+def test_export_accepts_only_options_of_the_format(tmp_path, kind, option):
+    """Options that a format lacks are rejected rather than ignored."""
     target = tmp_path / f"a{FORMATS[kind].suffix}"
     items = [noise(count=1)[0]] if kind == "acoular" else [image()]
     if option in FORMATS[kind].options:
@@ -188,7 +188,7 @@ def test_options_are_those_of_the_format(tmp_path, kind, option):
 
 
 @pytest.mark.parametrize("kind", FORMATS)
-def test_what_breaks_off_leaves_the_older_file(tmp_path, kind):
+def test_failed_export_keeps_the_existing_file(tmp_path, kind):
     target, *others = output_files(tmp_path / f"a{FORMATS[kind].suffix}", kind)
     for path in (target, *others):
         path.write_text("mine")
@@ -204,7 +204,7 @@ def test_what_breaks_off_leaves_the_older_file(tmp_path, kind):
 
 
 @pytest.mark.parametrize("kind", [kind for kind in FORMATS if kind != "acoular"])
-def test_a_full_disk_is_told(tmp_path, kind):
+def test_export_writers_raise_on_a_full_disk(tmp_path, kind):
     if not Path("/dev/full").exists():
         pytest.skip("no /dev/full on this system")
 
@@ -212,7 +212,7 @@ def test_a_full_disk_is_told(tmp_path, kind):
         def open(self, *arguments, **options):
             return Path("/dev/full").open(*arguments, **options)
 
-    from ertis_numba.interop import _mcap, _npz, _point_files, _points  # noqa: PLC0415  what the format needs
+    from ertis_numba.interop import _mcap, _npz, _point_files, _points  # noqa: PLC0415  loads optional libraries
 
     part = Full(tmp_path / "a.part")
     find = PointFinder(top=256, min_level_db=-60.0)
@@ -229,7 +229,7 @@ def test_a_full_disk_is_told(tmp_path, kind):
         write()
 
 
-def test_errors_of_the_disk_name_the_file(tmp_path, monkeypatch):
+def test_export_disk_errors_name_the_file(tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
@@ -239,19 +239,19 @@ def test_errors_of_the_disk_name_the_file(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_measurements_are_no_images(tmp_path):
+def test_export_rejects_measurements_and_unknown_formats(tmp_path):
     with pytest.raises(ArgumentError, match="a measurement is given, but energyscapes are needed; process it first"):
         export(tmp_path / "a.ply", noise())
     with pytest.raises(ArgumentError, match="format 'las' is unknown"):
         export(tmp_path / "a.ply", [image()], file_format="las")
 
 
-def test_the_command_knows_the_formats():
+def test_export_command_lists_formats_and_topics_of_the_library():
     assert tuple(FORMATS) == command.FORMATS
     assert command.TOPICS == TOPICS
 
 
-def test_the_page_names_what_the_formats_hold():
+def test_export_page_lists_fields_of_each_format():
     table = PAGE[PAGE.index("| format |") :].split("\n\n", 1)[0].splitlines()[2:]
     reported = {}
     for line in table:
@@ -262,7 +262,7 @@ def test_the_page_names_what_the_formats_hold():
 
 @pytest.fixture
 def place(tmp_path, monkeypatch):
-    """A folder with what the page names."""
+    """A folder with the files that the page names."""
     (tmp_path / "data").symlink_to(ROOT / "data")
     (tmp_path / "FOLDER").mkdir()
     for number in (3, 4):
@@ -274,7 +274,7 @@ def place(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_page(place):
+def test_export_page_commands_and_code_run(place):
     for words in re.findall(r"^\$ ertis (.*)$", PAGE, re.MULTILINE):
         done = CliRunner().invoke(cli, words.split())
         assert done.exit_code == 0, (words, done.stderr, done.exception)
