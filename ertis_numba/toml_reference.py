@@ -71,7 +71,7 @@ class TableReference:
     header : str
         Header of the table as in a file, such as ``[array]`` or ``[[points]]``; empty for keys before any table.
     about : str
-    keys : tuple of Key
+    keys : tuple of KeyReference
     """
 
     header: str

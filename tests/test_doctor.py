@@ -32,7 +32,7 @@ def doctor(tmp_path, monkeypatch):
         report = json.loads(done.stdout)
         found = {}
         for each in report["findings"]:
-            found.setdefault(each["what"], []).append((each["state"], each["text"], each["remedy"]))
+            found.setdefault(each["check"], []).append((each["state"], each["text"], each["remedy"]))
         assert report["problems"] == sum(each["state"] == "bad" for each in report["findings"])
         assert done.exit_code == (report["problems"] > 0)
         return found
@@ -42,8 +42,8 @@ def doctor(tmp_path, monkeypatch):
 
 def test_doctor_reports_a_working_installation(doctor):
     found = doctor()
-    for what in ("ertis", "libraries", "processing"):
-        assert {state for state, _, _ in found[what]} == {"good"}
+    for check in ("ertis", "libraries", "processing"):
+        assert {state for state, _, _ in found[check]} == {"good"}
     assert "numba" in found["libraries"][0][1]
     assert "an image of 90 directions takes" in found["processing"][0][1]
     assert "MB/s durably" in found["disk"][0][1]
@@ -176,7 +176,7 @@ def test_doctor_continues_after_a_failing_check(doctor, monkeypatch):
 def test_doctor_prints_a_table_and_rejects_missing_folder(tmp_path):
     done = CliRunner().invoke(cli, ["doctor", "--folder", str(tmp_path)])
     lines = done.stdout.splitlines()
-    assert lines[0].split() == ["what", "found", "what", "to", "do"]
+    assert lines[0].split() == ["check", "found", "remedy"]
     assert any(line.startswith("ok") for line in lines)
     refused = CliRunner().invoke(cli, ["doctor", "--folder", str(tmp_path / "none")])
     assert refused.exit_code == 1

@@ -169,3 +169,44 @@ def sentences_of(text):
     kept = [each for each in paragraphs if not re.match(r"\s*(\||#|:::|!\[)", each)]
     joined = [" ".join(re.sub(r"\]\([^)]*\)", "]", each).split()) for each in kept]
     return [sentence for each in joined for sentence in re.split(r"(?<=[.!?:;])\s+", each) if sentence]
+
+
+def test_docstrings_name_existing_parameters_and_attributes():
+    bad = []
+    for path, tree in modules().items():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ClassDef | ast.FunctionDef) and (text := ast.get_docstring(node)):
+                known = names_within(node)
+                for section in ("Parameters", "Attributes"):
+                    bad += [(path, node.name, name) for name in entries(text, section) if name not in known]
+    assert bad == []
+
+
+def entries(text, section):
+    """Return the names that a numpydoc section describes."""
+    found = re.search(rf"(?ms)^{section}\n-+\n(.*?)(?=^\S[^\n]*\n-+\n|\Z)", text)
+    lines = found[1].splitlines() if found else []
+    heads = [line.split(" : ")[0] for line in lines if line and not line.startswith(" ")]
+    return [name.strip(" *") for head in heads for name in head.split(",")]
+
+
+def names_within(node):
+    """Return parameters of a function; fields, attributes, methods and parameters of methods of a class."""
+    if isinstance(node, ast.FunctionDef):
+        return {arg.arg for arg in ast.walk(node.args) if isinstance(arg, ast.arg)}
+    found = {each.name for each in node.body if isinstance(each, ast.FunctionDef)}
+    found |= {each.target.id for each in node.body if isinstance(each, ast.AnnAssign)}
+    for each in ast.walk(node):
+        if isinstance(each, ast.FunctionDef) and each.name in ("__init__", "__call__"):
+            found |= names_within(each)
+        if isinstance(each, ast.Attribute) and isinstance(each.value, ast.Name) and each.value.id == "self":
+            found.add(each.attr)
+    for base in node.bases:
+        name = getattr(base, "value", base)  # The class itself, if it is generic.
+        found |= names_within(classes()[name.id]) if getattr(name, "id", None) in classes() else set()
+    return found
+
+
+@cache
+def classes():
+    return {node.name: node for tree in modules().values() for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}

@@ -48,7 +48,7 @@ class InstallationFinding:
 
     Attributes
     ----------
-    what : str
+    check : str
         Part that was checked.
     state : {"good", "note", "bad"}
         ``bad`` if something does not work.
@@ -58,7 +58,7 @@ class InstallationFinding:
         Action that fixes the problem; empty by default.
     """
 
-    what: str
+    check: str
     state: State
     text: str
     remedy: str = ""

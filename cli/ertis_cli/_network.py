@@ -109,11 +109,11 @@ def require_duration(given: float | None) -> None:
         checks.positive("--duration", given)
 
 
-def _file(given: str, what: str) -> str:
+def _file(given: str, kind: str) -> str:
     """Return the file of a key that was given by name; return any other text unchanged."""
     from ertis_numba.network.keys import default_folder
 
-    named = default_folder() / f"{given}.{what}.toml"
+    named = default_folder() / f"{given}.{kind}.toml"
     if Path(given).name == given and not Path(given).is_file() and named.is_file():
         return str(named)
     return given

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 __all__ = ["devices"]
 
 _COLUMNS: dict[str, _tables.Side] = dict.fromkeys(
-    ("port", "serial number", "state", "firmware", "call", "what"), "left"
+    ("port", "serial number", "state", "firmware", "call", "description"), "left"
 )
 
 

@@ -11,7 +11,7 @@ __all__ = ["doctor"]
 
 _MARKS = {"good": "ok", "note": "note", "bad": "BAD"}
 _STYLES = {"ok": "green", "note": "yellow", "BAD": "red"}
-_COLUMNS: dict[str, _tables.Side] = dict.fromkeys(("", "what", "found", "what to do"), "left")
+_COLUMNS: dict[str, _tables.Side] = dict.fromkeys(("", "check", "found", "remedy"), "left")
 
 
 @click.command()
@@ -47,7 +47,7 @@ def doctor(ctx: click.Context, *, folder: Path, as_json: bool) -> None:
     if as_json:
         options.print_json({"problems": n_bad, "findings": [asdict(each) for each in found]})
     else:
-        rows = [(_MARKS[each.state], each.what, each.text, each.remedy) for each in found]
+        rows = [(_MARKS[each.state], each.check, each.text, each.remedy) for each in found]
         _tables.TextTable(_COLUMNS, rows, _STYLES).print()
     if n_bad:
         ctx.exit(1)

@@ -122,9 +122,9 @@ COMPILING = "a first run compiles kernels, which takes longer ..."
 _FILE = click.Path(path_type=Path)
 
 
-def as_json_of(what: str) -> Decorator:
+def as_json_of(objects: str) -> Decorator:
     """Return the option that prints JSON instead of text; its help states the objects that are printed."""
-    return click.option("--json", "as_json", is_flag=True, help=f"Print JSON on stdout: {what}.")
+    return click.option("--json", "as_json", is_flag=True, help=f"Print JSON on stdout: {objects}.")
 
 
 as_json: Decorator = as_json_of("one object, or one per line if there are several")

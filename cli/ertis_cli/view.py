@@ -45,7 +45,7 @@ _ONLY = {
 
 
 @click.command()
-@click.argument("what", metavar="ADDRESS|REC.h5|IMG.h5")
+@click.argument("location", metavar="ADDRESS|REC.h5|IMG.h5")
 @click.option(
     "--sensor",
     "sensors",
@@ -107,7 +107,7 @@ _ONLY = {
 @options.as_json
 def view(
     *,
-    what: str,
+    location: str,
     sensors: tuple[str, ...],
     host: str,
     port: int,
@@ -134,14 +134,14 @@ def view(
     playback, and is shown at its original speed. The page shows range versus azimuth for each sensor, and all sensors
     on their platform in three dimensions. The command needs the extra 'view'; the page loads nothing from other hosts.
     """
-    live = _is_address(what)
+    live = _is_address(location)
     _require_use(_LIVE if live else _PLAYBACK if html is None else _PAGE)
     _network.require_duration(duration)
     if html is not None:
         from ertis_numba import checks
         from ertis_numba.storage import check_target
 
-        check_target(html, overwrite=force, sources=[] if live else [Path(what)])
+        check_target(html, overwrite=force, sources=[] if live else [Path(location)])
         checks.choice("page format", html.suffix.lower(), _PAGES)
     from ertis_numba.viewer import Choices, Viewer
 
@@ -152,7 +152,7 @@ def view(
     with (
         stopped_by_signals() as signals,
         _source(
-            what, sensors, live=live, keys=(key, server_key), device=device, loop=loop, mounting=mounting
+            location, sensors, live=live, keys=(key, server_key), device=device, loop=loop, mounting=mounting
         ) as source,
         nullcontext() if live else _ended(source, signals, quiet=quiet),
         Viewer(
@@ -171,7 +171,7 @@ def view(
             if shown.recorded is None:
                 signals.end()
         else:
-            _emit_event(what, shown, quiet=quiet, as_json=as_json)
+            _emit_event(location, shown, quiet=quiet, as_json=as_json)
             if sys.stderr.isatty() if opened is None else opened:
                 # Some browsers return when they are closed, and others only after seconds.
                 asked = {"asked": bool(opened)}
@@ -179,15 +179,17 @@ def view(
             shown.run(duration_s=math.inf if duration is None else duration, html=html, overwrite=force)
     gc.freeze()  # skips a garbage collection of 0.2 s at exit
     if html is not None:
-        _report_recorded(what, html, shown.recorded, quiet=quiet, as_json=as_json)
+        _report_recorded(location, html, shown.recorded, quiet=quiet, as_json=as_json)
 
 
-def _is_address(what: str) -> bool:
+def _is_address(location: str) -> bool:
     """Return True for an address, and False for a file."""
-    live = "://" in what
-    host_port = None if live or Path(what).exists() else _HOST_PORT.fullmatch(what)
+    live = "://" in location
+    host_port = None if live or Path(location).exists() else _HOST_PORT.fullmatch(location)
     if host_port:
-        raise click.UsageError(f"{what!r} is not a file; for the address of a central node, give tcp://{host_port[2]}")
+        raise click.UsageError(
+            f"{location!r} is not a file; for the address of a central node, give tcp://{host_port[2]}"
+        )
     return live
 
 
@@ -203,7 +205,7 @@ def _require_use(kind: str) -> None:
 
 
 def _source(
-    what: str,
+    location: str,
     sensors: tuple[str, ...],
     *,
     live: bool,
@@ -216,12 +218,12 @@ def _source(
         from ertis_numba.viewer import Live
 
         given = _mountings.mountings(mounting, sensors or None)
-        return Live(what, sensors=sensors or None, keys=_network.client_keys(*keys), mounting=given)
+        return Live(location, sensors=sensors or None, keys=_network.client_keys(*keys), mounting=given)
     from ertis_numba.storage import sensor_names
     from ertis_numba.viewer import Playback
 
-    given = None if mounting is None else _mountings.mountings(mounting, sensors or sensor_names(what))
-    return Playback(what, sensors=sensors or None, device=device, loop=loop, mounting=given)
+    given = None if mounting is None else _mountings.mountings(mounting, sensors or sensor_names(location))
+    return Playback(location, sensors=sensors or None, device=device, loop=loop, mounting=given)
 
 
 @contextmanager
@@ -281,23 +283,23 @@ def _has_window(browser: webbrowser.BaseBrowser) -> bool:
     return getattr(browser, "background", True)
 
 
-def _emit_event(what: str, shown: "Viewer", *, quiet: bool, as_json: bool) -> None:
+def _emit_event(location: str, shown: "Viewer", *, quiet: bool, as_json: bool) -> None:
     """Report the address of the page, and the need for its token."""
     if as_json:
-        options.print_json({"event": "viewing", "source": what, "url": shown.url})
-    options.say(f"{what} at {shown.url}; Ctrl-C ends", quiet=quiet)
+        options.print_json({"event": "viewing", "source": location, "url": shown.url})
+    options.say(f"{location} at {shown.url}; Ctrl-C ends", quiet=quiet)
     if not shown.is_local:
         options.say(
             "other machines need the token in this address; anyone who has it can control this view", quiet=quiet
         )
 
 
-def _report_recorded(what: str, html: Path, n_frames: int | None, *, quiet: bool, as_json: bool) -> None:
+def _report_recorded(location: str, html: Path, n_frames: int | None, *, quiet: bool, as_json: bool) -> None:
     """Report the written page; raise an error if no image was recorded."""
     if n_frames is None:
         raise click.ClickException(
-            f"{html} is not written, because no image of {what} was shown; check that sensors send measurements"
+            f"{html} is not written, because no image of {location} was shown; check that sensors send measurements"
         )
-    options.say(f"{html}: {options.counted(n_frames, 'frame')} of {what}", quiet=quiet)
+    options.say(f"{html}: {options.counted(n_frames, 'frame')} of {location}", quiet=quiet)
     if as_json:
-        options.print_json({"event": "recorded", "source": what, "output": str(html), "frames": n_frames})
+        options.print_json({"event": "recorded", "source": location, "output": str(html), "frames": n_frames})

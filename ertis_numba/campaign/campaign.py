@@ -56,7 +56,7 @@ class Campaign:
 
     Parameters
     ----------
-    recordings : sequence of Source
+    recordings : sequence of RecordingFile
         Recordings to process, as `find` returns them.
     folder : str or Path
         Output folder. It is created if it does not exist.
@@ -100,7 +100,7 @@ class Campaign:
         self._unplanned: deque[_RecordingState] = deque()
         self._ready: deque[_RecordingState] = deque()
         self._submitted: dict[int, tuple[Task, _RecordingState]] = {}
-        self._n_orders = 0
+        self._n_tasks = 0
 
     @property
     def workers(self) -> int:
@@ -141,38 +141,38 @@ class Campaign:
         return ProcessPool(self.workers)
 
     def _submit_tasks(self, pool: WorkerPool) -> bool:
-        """Give orders to free workers; return True if any order is in progress."""
+        """Give tasks to free workers; return True if any task is in progress."""
         while pool.free > 0 and (pair := self._next(pool)) is not None:
             self._submitted[pair[0].number] = pair
             pool.submit(pair[0])
         return bool(self._submitted)
 
     def _next(self, pool: WorkerPool) -> tuple[Task, _RecordingState] | None:
-        """Return the next order; recordings that are nearest to their end come first."""
+        """Return the next task; recordings that are nearest to their end come first."""
         if self._ready:
             case = self._ready.popleft()
-            return self._order("check" if case.is_kept else "make", self._pending_output(case, pool.size)), case
+            return self._new_task("check" if case.is_kept else "make", self._pending_output(case, pool.size)), case
         if (planned := self._to_plan(pool.size)) is not None:
             return planned
         in_hand = len(self._submitted) + len(self._unplanned)
         if self._waiting and in_hand < pool.size + _N_INSPECTED_AHEAD:
             case = self._waiting.popleft()
-            return self._order("look", self._paths(case) | {"sensor": self._options.sensor}), case
+            return self._new_task("look", self._paths(case) | {"sensor": self._options.sensor}), case
         return None
 
     def _to_plan(self, n_workers: int) -> tuple[Task, _RecordingState] | None:
-        """Return a planning order, unless all planning has to wait."""
+        """Return a planning task, unless all planning has to wait."""
         for case in self._unplanned:
             settings = next(each for each in case.wanted.values() if self._plans.get(each) is None)
             if (kind := self._plans.begin(settings)) is not None:
                 self._unplanned.remove(case)
-                about = {"settings": settings.to_toml(), "warm": kind == "new", **self._shares(n_workers)}
-                return self._order("plan", about), case
+                arguments = {"settings": settings.to_toml(), "warm": kind == "new", **self._shares(n_workers)}
+                return self._new_task("plan", arguments), case
         return None
 
-    def _order(self, do: TaskAction, about: dict[str, Any]) -> Task:
-        self._n_orders += 1
-        return Task(self._n_orders, do, about)
+    def _new_task(self, action: TaskAction, arguments: dict[str, Any]) -> Task:
+        self._n_tasks += 1
+        return Task(self._n_tasks, action, arguments)
 
     def _paths(self, case: _RecordingState) -> dict[str, Any]:
         far = self._scheduler is not None  # Its workers may have another current folder.
@@ -197,29 +197,29 @@ class Campaign:
             **{name: getattr(options, name) for name in TASK_OPTIONS},
             "sensors": planned,
             "max_bytes": MAX_WAITING_BYTES / n_workers,
-            # Dask repeats the order of a lost worker, even if only the message about its result was missing.
+            # Dask repeats the task of a lost worker, even if only the message about its result was missing.
             "overwrite": options.overwrite or self._scheduler is not None,
         }
 
     def _handle_update(self, pool: WorkerPool, news: TaskUpdate) -> Iterator[Event]:
         if news.number not in self._submitted:
             return
-        order, case = self._submitted[news.number]
+        task, case = self._submitted[news.number]
         if news.result is None:
             if news.done:
                 yield RecordingProgress(case.found.path, news.done)
             return
         del self._submitted[news.number]
-        if order.action == "plan":
-            self._plans.finish(Settings.from_toml(order.arguments["settings"], "settings"), news.result)
+        if task.action == "plan":
+            self._plans.finish(Settings.from_toml(task.arguments["settings"], "settings"), news.result)
             if "by_chance" not in news.result:
                 yield from self._planned(pool, case, news.result)
                 return
         if "error" in news.result:
-            if order.action == "make" and "by_chance" in news.result:
+            if task.action == "make" and "by_chance" in news.result:
                 clear_parts(self.folder, {case.target.name})  # A killed worker may have left them.
             yield case.ended("failed", error=news.result["error"])
-        elif order.action == "look":
+        elif task.action == "look":
             yield from self._handle_inspection(case, news.result)
         else:
             yield case.ended("kept" if case.is_kept else "made", made=news.result)

@@ -24,7 +24,7 @@ class DaskWorkerPool:
     """`WorkerPool` of the workers of a dask scheduler, with at most one recording in progress per worker.
 
     The workers need the same versions of this package and its dependencies, and access to the files under the same
-    paths. Dask repeats the order of a lost worker on another worker, a few times. Every program that reaches a
+    paths. Dask repeats the task of a lost worker on another worker, a few times. Every program that reaches a
     scheduler can run code on its workers: keep it in a trusted network, or use TLS with dask.
 
     Parameters
@@ -58,30 +58,30 @@ class DaskWorkerPool:
 
     @property
     def size(self) -> int:
-        """Number of orders in progress at once."""
+        """Number of tasks in progress at once."""
         return self._size
 
     @property
     def free(self) -> int:
-        """Number of orders that can be given now."""
+        """Number of tasks that can be given now."""
         return max(0, self._size - len(self._futures))  # Workers may have been lost.
 
     def limit(self, size: int) -> None:
         """Do nothing: each worker of a cluster has its own device."""
 
-    def submit(self, order: Task) -> None:
-        """Run an order; never blocks."""
+    def submit(self, task: Task) -> None:
+        """Run a task; never blocks."""
         future = self._client.submit(
             run_on_dask_worker,
-            order.action,
-            {**order.arguments, "versions": software_versions()},
+            task.action,
+            {**task.arguments, "versions": software_versions()},
             self._topic,
-            order.number,
-            key=f"{self._topic}-{order.number}",
+            task.number,
+            key=f"{self._topic}-{task.number}",
             pure=False,
         )
-        self._futures[order.number] = future
-        future.add_done_callback(lambda done, number=order.number: self._reported.put(_news(number, done)))
+        self._futures[task.number] = future
+        future.add_done_callback(lambda done, number=task.number: self._reported.put(_news(number, done)))
 
     def wait(self, timeout_s: float) -> list[TaskUpdate]:
         """Return messages of workers, or an empty list after a timeout."""
@@ -103,7 +103,7 @@ class DaskWorkerPool:
         return news
 
     def close(self) -> None:
-        """Cancel all orders: dask cannot end a thread, but a cancelled order stops at its next progress report."""
+        """Cancel all tasks: dask cannot end a thread, but a cancelled task stops at its next progress report."""
         with self._stack:
             if self._client.status == "running":
                 self._client.cancel(list(self._futures.values()), force=True)
@@ -130,7 +130,7 @@ def _news(number: int, future: cluster.Future) -> TaskUpdate:
         return TaskUpdate(number, result=future.result(timeout=_CONNECT_S))
     except CancelledError:
         return TaskUpdate(
-            number, result={"error": "the cluster has cancelled the order; process again", "by_chance": True}
+            number, result={"error": "the cluster has cancelled the task; process again", "by_chance": True}
         )
     except Exception as error:  # noqa: BLE001  the campaign reports any error
         text = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
@@ -138,13 +138,13 @@ def _news(number: int, future: cluster.Future) -> TaskUpdate:
 
 
 class _TaskCancelledError(Exception):
-    """The order was cancelled."""
+    """The task was cancelled."""
 
 
-def run_on_dask_worker(do: str, about: dict[str, Any], topic: str, number: int) -> dict[str, Any]:
-    """Run an order on a worker of the cluster, as `work.run_task` does; ``topic`` receives its progress."""
+def run_on_dask_worker(action: str, arguments: dict[str, Any], topic: str, number: int) -> dict[str, Any]:
+    """Run a task on a worker of the cluster, as `work.run_task` does; ``topic`` receives its progress."""
     here = cluster.current_worker()
-    for name, wanted in about["versions"].items():
+    for name, wanted in arguments["versions"].items():
         came = software_versions()[name]
         if came != wanted:
             return {
@@ -161,4 +161,4 @@ def run_on_dask_worker(do: str, about: dict[str, Any], topic: str, number: int) 
             reported_s = time.monotonic()
             here.log_event(topic, {"number": number, "done": done})
 
-    return run_task(do, {**about, "at_most": here.state.nthreads}, notify)
+    return run_task(action, {**arguments, "at_most": here.state.nthreads}, notify)

@@ -1,4 +1,4 @@
-"""Worker processes on this machine: start, orders, restart after death."""
+"""Worker processes on this machine: start, tasks, restart after death."""
 
 import json
 import queue
@@ -23,10 +23,10 @@ _MAX_STDERR_LINES: Final = 20  # Number of kept lines of stderr.
 
 @dataclass(slots=True, eq=False)
 class _WorkerProcess:
-    """A process, and its current order."""
+    """A process, and its current task."""
 
     process: "subprocess.Popen[str]"
-    order: Task | None = None
+    task: Task | None = None
     begun: bool = False
     ready: bool = False
     stated: deque[str] = field(default_factory=lambda: deque(maxlen=_MAX_STDERR_LINES))
@@ -63,33 +63,34 @@ class ProcessPool:
 
     @property
     def size(self) -> int:
-        """Number of orders in progress at once."""
+        """Number of tasks in progress at once."""
         return self._size
 
     @property
     def free(self) -> int:
-        """Number of orders that can be given now."""
-        return max(0, self._size - sum(worker.order is not None for worker in self._workers))
+        """Number of tasks that can be given now."""
+        return max(0, self._size - sum(worker.task is not None for worker in self._workers))
 
     @property
     def current_paths(self) -> dict[int, str]:
         """Recording in progress of each process, by process identifier; empty for an idle one."""
-        return {worker.process.pid: _path(worker.order) for worker in self._workers}
+        return {worker.process.pid: _path(worker.task) for worker in self._workers}
 
     def limit(self, size: int) -> None:
-        """Reduce the number of processes; a busy one ends after its order, if there are too many."""
+        """Reduce the number of processes; a busy one ends after its task, if there are too many."""
         self._size = min(self._size, size)
-        for worker in [worker for worker in self._workers if worker.order is None][self._size :]:
+        for worker in [worker for worker in self._workers if worker.task is None][self._size :]:
             self._end(worker)
 
-    def submit(self, order: Task) -> None:
-        """Run an order; never blocks."""
-        worker = next((worker for worker in self._workers if worker.order is None), None) or self._start()
-        worker.order, worker.begun = order, False
+    def submit(self, task: Task) -> None:
+        """Run a task; never blocks."""
+        worker = next((worker for worker in self._workers if worker.task is None), None) or self._start()
+        worker.task, worker.begun = task, False
         stdin = worker.process.stdin
         if stdin is not None:
             with suppress(OSError):  # The process has ended, which `wait` detects.
-                stdin.write(json.dumps({"number": order.number, "do": order.action, "about": order.arguments}) + "\n")
+                message = {"number": task.number, "action": task.action, "arguments": task.arguments}
+                stdin.write(json.dumps(message) + "\n")
                 stdin.flush()
 
     def wait(self, timeout_s: float) -> list[TaskUpdate]:
@@ -152,7 +153,7 @@ class ProcessPool:
         worker.begun = True
         news = TaskUpdate(reported["number"], reported.get("done", 0), reported.get("result"))
         if news.result is not None:
-            worker.order = None
+            worker.task = None
             if len(self._workers) > self._size:
                 self._end(worker)
         return news
@@ -160,20 +161,20 @@ class ProcessPool:
     def _died(self, worker: _WorkerProcess) -> TaskUpdate | None:
         if worker not in self._workers:
             return None
-        order = worker.order
+        task = worker.task
         self._end(worker)
         how = _how_it_ended(worker)
         if not worker.ready:
             self._n_failed_starts += 1
         if self._n_failed_starts >= _MAX_FAILED_STARTS:
             raise DeviceError(f"worker processes end at once: the last one {how}; try 'ertis process' on one file")
-        if order is not None and not worker.begun:
-            self.submit(order)
+        if task is not None and not worker.begun:
+            self.submit(task)
             return None
-        if order is None:
+        if task is None:
             return None
-        text = f"{_path(order)}: its worker process {how}; if memory runs out, give fewer --workers"
-        return TaskUpdate(order.number, result={"error": text, "by_chance": True})
+        text = f"{_path(task)}: its worker process {how}; if memory runs out, give fewer --workers"
+        return TaskUpdate(task.number, result={"error": text, "by_chance": True})
 
     def _end(self, worker: _WorkerProcess) -> None:
         """Kill a process, and close its streams."""
@@ -188,8 +189,8 @@ class ProcessPool:
                     stream.close()
 
 
-def _path(order: Task | None) -> str:
-    return "" if order is None else str(order.arguments.get("path", ""))
+def _path(task: Task | None) -> str:
+    return "" if task is None else str(task.arguments.get("path", ""))
 
 
 def _how_it_ended(worker: _WorkerProcess) -> str:

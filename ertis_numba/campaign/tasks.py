@@ -1,4 +1,4 @@
-"""Options of a campaign, and orders to workers, which JSON can represent."""
+"""Options of a campaign, and tasks to workers, which JSON can represent."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -75,7 +75,7 @@ class CampaignOptions:
 
 
 TASK_OPTIONS: Final = ("dtype", "batch", "strict", "overwrite", "mounting", "explain", "verify")
-"""Fields of `CampaignOptions` that an order contains unchanged."""
+"""Fields of `CampaignOptions` that a task contains unchanged."""
 
 
 TaskAction = Literal["look", "plan", "make", "check"]
@@ -83,15 +83,15 @@ TaskAction = Literal["look", "plan", "make", "check"]
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """Order to a worker.
+    """Task of a worker.
 
     Attributes
     ----------
     number : int
-        Identifier of the order.
-    do : {"look", "plan", "make", "check"}
+        Identifier of the task.
+    action : {"look", "plan", "make", "check"}
         Action.
-    about : dict
+    arguments : dict
         Arguments of the action, see `ertis_numba.campaign.work`.
     """
 
@@ -102,16 +102,16 @@ class Task:
 
 @dataclass(frozen=True, slots=True)
 class TaskUpdate:
-    """Message of a worker about an order.
+    """Message of a worker about a task.
 
     Attributes
     ----------
     number : int
-        Identifier of the order.
+        Identifier of the task.
     done : int
         Number of processed measurements, in a progress report.
     result : dict or None
-        Result at the end of an order. ``error`` is the reason of a failure, and ``by_chance`` marks a failure that may
+        Result at the end of a task. ``error`` is the reason of a failure, and ``by_chance`` marks a failure that may
         be temporary.
     """
 
@@ -121,24 +121,24 @@ class TaskUpdate:
 
 
 class WorkerPool(Protocol):
-    """Workers that run orders."""
+    """Workers that run tasks."""
 
     @property
     def size(self) -> int:
-        """Number of orders in progress at once."""
+        """Number of tasks in progress at once."""
 
     @property
     def free(self) -> int:
-        """Number of orders that can be given now; zero if more are in progress than allowed."""
+        """Number of tasks that can be given now; zero if more are in progress than allowed."""
 
     def limit(self, size: int) -> None:
-        """Reduce the number of orders in progress at once; running orders finish."""
+        """Reduce the number of tasks in progress at once; running tasks finish."""
 
-    def submit(self, order: Task) -> None:
-        """Run an order; never blocks."""
+    def submit(self, task: Task) -> None:
+        """Run a task; never blocks."""
 
     def wait(self, timeout_s: float) -> list[TaskUpdate]:
         """Return messages of workers, or an empty list after a timeout."""
 
     def close(self) -> None:
-        """Cancel all orders."""
+        """Cancel all tasks."""

@@ -33,20 +33,20 @@ _idle_lock = threading.Lock()
 _idle_pipelines: dict[_Key, Pipeline] = {}  # Pipelines that are not in use.
 
 
-def run_task(do: str, about: Mapping[str, Any], notify: ReportProgress = lambda _: None) -> dict[str, Any]:
-    """Run an order, and return its result; expected errors are returned as ``error``.
+def run_task(action: str, arguments: Mapping[str, Any], notify: ReportProgress = lambda _: None) -> dict[str, Any]:
+    """Run a task, and return its result; expected errors are returned as ``error``.
 
     Parameters
     ----------
-    do : {"look", "plan", "make", "check"}
+    action : {"look", "plan", "make", "check"}
         Action.
-    about : mapping
+    arguments : mapping
         Arguments of the action.
     notify : callable
         Called with the number of processed measurements. An exception that it raises ends the work.
     """
     try:
-        return _ACTIONS[do](about, notify)
+        return _ACTIONS[action](arguments, notify)
     except ErtisError as error:
         return {"error": " ".join(str(error).split())}
     except (OSError, MemoryError) as error:  # These errors may be temporary.
@@ -60,48 +60,48 @@ def _one_line(error: OSError | MemoryError) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
-def _inspect(about: Mapping[str, Any], _: ReportProgress) -> dict[str, Any]:
+def _inspect(arguments: Mapping[str, Any], _: ReportProgress) -> dict[str, Any]:
     """Return sensors, settings and number of measurements of a recording, and a description of its existing output."""
-    path = Path(about["path"])
-    if not about["named"] and file_kind(path) == "energyscape":
+    path = Path(arguments["path"])
+    if not arguments["named"] and file_kind(path) == "energyscape":
         return {"skipped": True}
-    names = sensor_names(path) if about["sensor"] is None else (about["sensor"],)
+    names = sensor_names(path) if arguments["sensor"] is None else (arguments["sensor"],)
     with ExitStack() as stack:
         recordings = [stack.enter_context(open_recording(path, sensor=name)) for name in names]
         return {
             "sensors": {recording.sensor: recording.settings.to_toml() for recording in recordings},
             "measurements": sum(map(len, recordings)),
-            "made": inspect_output(Path(about["target"]), recordings[0], about["dtype"]),
+            "made": inspect_output(Path(arguments["target"]), recordings[0], arguments["dtype"]),
         }
 
 
-def _plan(about: Mapping[str, Any], _: ReportProgress) -> dict[str, Any]:
+def _plan(arguments: Mapping[str, Any], _: ReportProgress) -> dict[str, Any]:
     """Complete open settings; ``warm`` also compiles the kernels for later use."""
-    settings = Settings.from_toml(about["settings"], "settings")
-    threads = _threads(about, settings)
-    if not about["warm"]:
-        loaded = kernels.load(about["device"])
-        planned = planner.complete(settings, loaded, threads=loaded.max_threads, plan=about["plan"])
+    settings = Settings.from_toml(arguments["settings"], "settings")
+    threads = _threads(arguments, settings)
+    if not arguments["warm"]:
+        loaded = kernels.load(arguments["device"])
+        planned = planner.complete(settings, loaded, threads=loaded.max_threads, plan=arguments["plan"])
         return {"settings": planned.to_toml(), "device": loaded.device}
-    with _pipelines([settings], about["device"], threads, about["plan"]) as (pipeline,):
+    with _pipelines([settings], arguments["device"], threads, arguments["plan"]) as (pipeline,):
         planned, device = pipeline.settings, pipeline.device
     with _idle_lock:
-        made = _idle_pipelines.pop((settings.to_toml(), about["device"], threads), None)
-    if made is not None:  # Later orders have the settings with the plan.
-        _store_idle({(planned.to_toml(), about["device"], threads): made})
+        made = _idle_pipelines.pop((settings.to_toml(), arguments["device"], threads), None)
+    if made is not None:  # Later tasks have the settings with the plan.
+        _store_idle({(planned.to_toml(), arguments["device"], threads): made})
     return {"settings": planned.to_toml(), "device": device}
 
 
-def _make(about: Mapping[str, Any], notify: ReportProgress) -> dict[str, Any]:
+def _make(arguments: Mapping[str, Any], notify: ReportProgress) -> dict[str, Any]:
     """Write the energyscape file of a recording."""
-    options, how = _processing_arguments(about)
+    options, how = _processing_arguments(arguments)
     warnings: list[str] = []
     with prepare_recording(
-        Path(about["path"]),
-        Path(about["target"]),
+        Path(arguments["path"]),
+        Path(arguments["target"]),
         options,
         sensors=list(how["settings"]),
-        max_bytes=about["max_bytes"],
+        max_bytes=arguments["max_bytes"],
         warn=warnings.append,
         **how,
     ) as work:
@@ -111,28 +111,28 @@ def _make(about: Mapping[str, Any], notify: ReportProgress) -> dict[str, Any]:
         return {**work.report(), "warnings": warnings}
 
 
-def _check(about: Mapping[str, Any], _: ReportProgress) -> dict[str, Any]:
+def _check(arguments: Mapping[str, Any], _: ReportProgress) -> dict[str, Any]:
     """Return the warnings and results that processing would give, for a recording with an existing output."""
-    options, how = _processing_arguments(about)
+    options, how = _processing_arguments(arguments)
     warnings: list[str] = []
-    return {**check_recording(Path(about["path"]), options, warn=warnings.append, **how), "warnings": warnings}
+    return {**check_recording(Path(arguments["path"]), options, warn=warnings.append, **how), "warnings": warnings}
 
 
-def _processing_arguments(about: Mapping[str, Any]) -> tuple[CampaignOptions, dict[str, Any]]:
+def _processing_arguments(arguments: Mapping[str, Any]) -> tuple[CampaignOptions, dict[str, Any]]:
     """Return the options, the settings of each sensor and the source of pipelines."""
-    settings = {name: Settings.from_toml(text, f"settings of {name}") for name, text in about["sensors"].items()}
-    threads = _threads(about, next(iter(settings.values())))
-    options = CampaignOptions(**{name: about[name] for name in TASK_OPTIONS}, threads=threads)
-    pipelines = functools.partial(_pipelines, device=about["device"], threads=threads)
+    settings = {name: Settings.from_toml(text, f"settings of {name}") for name, text in arguments["sensors"].items()}
+    threads = _threads(arguments, next(iter(settings.values())))
+    options = CampaignOptions(**{name: arguments[name] for name in TASK_OPTIONS}, threads=threads)
+    pipelines = functools.partial(_pipelines, device=arguments["device"], threads=threads)
     return options, {"settings": settings, "pipelines": pipelines}
 
 
-def _threads(about: Mapping[str, Any], settings: Settings) -> int | None:
+def _threads(arguments: Mapping[str, Any], settings: Settings) -> int | None:
     """Return the number of threads per measurement, if workers share the cores of a machine."""
-    if about["threads"] is not None or settings.processing.method == "paper":
-        return None if about["threads"] is None else int(about["threads"])
-    largest = kernels.load(about["device"]).max_threads
-    return max(1, min(largest // int(about["share"]), int(about.get("at_most", largest))))
+    if arguments["threads"] is not None or settings.processing.method == "paper":
+        return None if arguments["threads"] is None else int(arguments["threads"])
+    largest = kernels.load(arguments["device"]).max_threads
+    return max(1, min(largest // int(arguments["share"]), int(arguments.get("at_most", largest))))
 
 
 @contextmanager

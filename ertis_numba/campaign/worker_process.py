@@ -1,4 +1,4 @@
-"""Worker process that runs orders from JSON lines: ``python -m ertis_numba.campaign.worker_process``.
+"""Worker process that runs tasks from JSON lines: ``python -m ertis_numba.campaign.worker_process``.
 
 The process ends as soon as its input is closed.
 """
@@ -26,7 +26,7 @@ _REPORT_INTERVAL_S: Final = 0.1
 class _Process:
     def __init__(self, out: IO[str]) -> None:
         self._out = out
-        self._orders: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+        self._tasks: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
         self._target: Path | None = None
         self._reported_s = 0.0
 
@@ -35,15 +35,15 @@ class _Process:
         self._out.write("{}\n")
         self._out.flush()
         while True:
-            order = self._orders.get()
-            number, about = order["number"], order["about"]
-            self._emit_event(number)  # From now on, the order counts as the cause if this process ends.
-            if order["do"] == "make":
-                self._target = Path(about["target"])
+            task = self._tasks.get()
+            number, arguments = task["number"], task["arguments"]
+            self._emit_event(number)  # From now on, the task counts as the cause if this process ends.
+            if task["action"] == "make":
+                self._target = Path(arguments["target"])
             try:
-                result = run_task(order["do"], about, functools.partial(self._advance, number))
+                result = run_task(task["action"], arguments, functools.partial(self._advance, number))
             except Exception as error:  # noqa: BLE001  an error in one recording must not affect others
-                text = f"{about.get('path', '')}: {type(error).__name__}: {' '.join(str(error).split())}"
+                text = f"{arguments.get('path', '')}: {type(error).__name__}: {' '.join(str(error).split())}"
                 result = {"error": text, "by_chance": True}
             self._target = None
             self._emit_event(number, result=result)
@@ -53,13 +53,13 @@ class _Process:
             self._reported_s = time.monotonic()
             self._emit_event(number, done=done)
 
-    def _emit_event(self, number: int, **what: Any) -> None:
-        self._out.write(json.dumps({"number": number, **what}) + "\n")
+    def _emit_event(self, number: int, **fields: Any) -> None:
+        self._out.write(json.dumps({"number": number, **fields}) + "\n")
         self._out.flush()
 
     def _listen(self) -> None:
         for line in sys.stdin:
-            self._orders.put(json.loads(line))
+            self._tasks.put(json.loads(line))
         # The parent process has ended. Remove the half-written file, which no other process can use.
         if (target := self._target) is not None:
             with suppress(OSError):
@@ -68,7 +68,7 @@ class _Process:
 
 
 def main() -> None:
-    """Run orders from stdin, and print their results on stdout."""
+    """Run tasks from stdin, and print their results on stdout."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # The parent process decides when to end.
     out = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # Other output must not mix with the messages.

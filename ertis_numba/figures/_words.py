@@ -70,10 +70,10 @@ def _if_faint(values: NDArray[np.floating]) -> tuple[str, ...]:
     return (f"the strongest is {minus(f'{level_db:.0f}')} dB of full scale",) if level_db < _FAINT_DB else ()
 
 
-def of_measurement(what: str, settings: Settings, stamp: Stamp, *parts: str, values: NDArray[np.floating]) -> Heading:
+def of_measurement(title: str, settings: Settings, stamp: Stamp, *parts: str, values: NDArray[np.floating]) -> Heading:
     """Return the words above ``values`` that were recorded."""
     return Heading(
-        (what, stamp.sensor, f"measurement {stamp.sequence}", *_if_faint(values)),
+        (title, stamp.sensor, f"measurement {stamp.sequence}", *_if_faint(values)),
         (
             *_of_sensor(settings),
             *parts,
@@ -112,9 +112,9 @@ def _of_sensor(settings: Settings) -> tuple[str, str]:
     )
 
 
-def highest_over(what: str, *, hidden: bool) -> str:
+def highest_over(axes: str, *, hidden: bool) -> str:
     """Return the caption of a panel that shows maxima, and whether side lobes are ``hidden``."""
-    return f"strongest over {what}" + (", side lobes hidden" if hidden else "")
+    return f"strongest over {axes}" + (", side lobes hidden" if hidden else "")
 
 
 def number(value: float, digits: int = 3) -> str:

@@ -23,7 +23,7 @@ class Measurement:
 
     Attributes
     ----------
-    words : (sample,) or (sample, word) uint8 to uint64; (sample, channel) int16 or float32
+    data : (sample,) or (sample, word) uint8 to uint64; (sample, channel) int16 or float32
         PDM: one word per clock tick, in which bit m, least significant first, is channel m. An array with more
         channels than a word has bits needs several words per sample. PCM: one number per channel, if
         ``settings.recording.encoding`` is ``int16`` or ``float32``.
@@ -52,7 +52,7 @@ class Measurement:
     stamp: Stamp = Stamp()
 
     def __post_init__(self) -> None:
-        checks.instance("words", self.data, np.ndarray, "a recording holds, or numpy.asarray makes")
+        checks.instance("data", self.data, np.ndarray, "a recording holds, or numpy.asarray makes")
         checks.instance("settings", self.settings, Settings, "a recording holds, or Settings.from_preset returns")
 
     def to_xarray(self) -> "xarray.DataArray":

@@ -26,7 +26,7 @@ class Stamp:
     timestamp_uncertainty_ns : int, default 0
         Uncertainty of the time in nanoseconds.
     session_id : int, default 0
-        Number of the sensor's session. The triple (sensor, epoch, sequence) is unique.
+        Number of the sensor's session. The triple (sensor, session_id, sequence) is unique.
 
     Examples
     --------

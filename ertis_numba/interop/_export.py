@@ -30,9 +30,9 @@ class ExportFormat:
 
     Attributes
     ----------
-    ending : str
+    suffix : str
         Suffix of the file.
-    holds : tuple of str
+    fields : tuple of str
         Names of the fields in the file.
     options : tuple of str
         Options of `export` that apply to this format, but not to all formats. None by default.

@@ -185,16 +185,16 @@ class JournalSensor:
             The row is damaged.
         """
         *values, words = row
-        what = f"measurement {row[3]} of sensor {self.name}"
+        record = f"measurement {row[3]} of sensor {self.name}"
         _, session_id, sequence, sync_count, time_ns, uncertainty_ns, monotonic_ns, *air, crc32 = verified_values(
-            path, what, values
+            path, record, values
         )
         if not isinstance(words, bytes):  # The recorded type is damaged.
             words = b""
         got = zlib.crc32(words)
         if got != crc32 or len(words) != self.n_bytes:
             raise DamagedError(
-                f"{path}: {what} has CRC-32 {got:08x}, but its record states {crc32:08x}: the journal is "
+                f"{path}: {record} has CRC-32 {got:08x}, but its record states {crc32:08x}: the journal is "
                 "damaged; copy it again if you can"
             )
         settings = self.settings
@@ -212,13 +212,13 @@ class JournalSensor:
         return JournalEntry(Measurement(array, settings, stamp), monotonic_ns, crc32)
 
 
-def verified_values(path: Path, what: str, row: Sequence[Any]) -> list[Any]:
+def verified_values(path: Path, name: str, row: Sequence[Any]) -> list[Any]:
     """Check the CRC-32 of a row, and return its values without number and CRC-32."""
     _, *values, wanted = row
     got = row_crc32(values)
     if got != wanted:
         raise DamagedError(
-            f"{path}: the record of {what} has CRC-32 {got}, but should have {wanted!r}: the journal is damaged; "
+            f"{path}: the record of {name} has CRC-32 {got}, but should have {wanted!r}: the journal is damaged; "
             "copy it again if you can"
         )
     return values

@@ -38,7 +38,7 @@ class Column:
         Name of the column.
     kind : str
         Type in the notation of SQLite.
-    about : str
+    description : str
         Description.
     units : str
         Unit in the notation of UDUNITS; empty, the default, for numbers without a unit.

@@ -58,7 +58,7 @@ class Tally:
 
     Attributes
     ----------
-    marks : dict of (sensor, session_id) to Mark
+    ranges : dict of (sensor, session_id) to SequenceRange
         Numbers of each session.
     damage : str
         Known losses that no gap of the journal covers; empty if there are none.

@@ -66,10 +66,10 @@ def require_own(path: Path, about: str = "is an allow list of keys") -> None:
     for where in (*links, *folders, file):
         status = where.lstat()
         given = path.absolute()
-        what = "it" if where in (file, given) else "its folder" if where == given.parent else str(where)
+        part = "it" if where in (file, given) else "its folder" if where == given.parent else str(where)
         if status.st_uid not in (0, os.geteuid()):
             raise SettingsError(
-                f"{path} {about}, but other users may change {what} (owned by user {status.st_uid}); run 'chown "
+                f"{path} {about}, but other users may change {part} (owned by user {status.st_uid}); run 'chown "
                 f"{os.geteuid()} {where}', and review the file"
             )
         mode = stat.S_IMODE(status.st_mode)
@@ -77,7 +77,7 @@ def require_own(path: Path, about: str = "is an allow list of keys") -> None:
         is_kept = where in links or (where in folders and mode & stat.S_ISVTX)
         if mode & _OTHERS_WRITE and not is_kept:
             raise SettingsError(
-                f"{path} {about}, but other users may change {what} (mode {mode:04o}); run 'chmod go-w {where}', "
+                f"{path} {about}, but other users may change {part} (mode {mode:04o}); run 'chmod go-w {where}', "
                 "and review the file"
             )
 

@@ -90,7 +90,7 @@ class Planner:
         Values that their accuracy fixes are kept.
     kernels : KernelSet
     threads : int
-    signal_model : Texture, optional
+    signal_model : SignalModel, optional
         Signal model of a measurement; a safe one for any sound by default.
     max_bytes : int, optional
         Limit on the memory of a plan's signals and delays.

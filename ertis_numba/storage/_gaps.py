@@ -43,7 +43,7 @@ class SensorSequences:
 
         Parameters
         ----------
-        noted : iterable of Missing
+        noted : iterable of MissingNumbers
             Noted gaps.
         """
         known: dict[int, list[ReasonedRange]] = {}

@@ -30,7 +30,7 @@ class JournalRows:
     ----------
     keys : list of JournalKey
         Keys of all measurements, damaged ones included.
-    damaged : list of Damage
+    damaged : list of DamagedMeasurement
         Damaged measurements.
     """
 

@@ -76,7 +76,7 @@ class FileReader(Sequence[Item]):
         All sensors in the file, in its order.
     settings : Settings
         Settings of the sensor, independent of other files.
-    truth : Truth or None
+    truth : GroundTruth or None
         Ground truth of simulated measurements; None if unknown.
     attributes : dict
         Attributes of the file: uuid, source, date_created and others.

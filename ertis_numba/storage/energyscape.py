@@ -43,7 +43,7 @@ class EnergyscapeWriter(FileWriter[Energyscape]):
     recording : RecordingReader or sequence of RecordingReader, optional
         Recording of the images: one reader, or one for each sensor of the same recording. The file stores its UUID and
         SHA-256, and the ground truth of the measurements.
-    truth : mapping of str to Truth, optional
+    truth : mapping of str to GroundTruth, optional
         Ground truth by name of the sensor, instead of that of the recording.
     mounting : mapping of str to (translation_m, rotation_xyzw), optional
         Mounting by name of the sensor, as for `RecordingWriter`, instead of that of the recording. By default, the file

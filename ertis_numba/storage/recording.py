@@ -78,7 +78,7 @@ class RecordingWriter(FileWriter[Measurement]):
         Replace an existing file.
     source : str
         Origin of the measurements.
-    truth : mapping of str to Truth or TruthLog, optional
+    truth : mapping of str to GroundTruth or GroundTruthLog, optional
         Ground truth of each simulated sensor, by name. A log may grow while measurements are written.
     mounting : mapping of str to (translation_m, rotation_xyzw), optional
         Mounting of each sensor on its platform, by name: x, y, z in metres, and the unit quaternion x, y, z, w that

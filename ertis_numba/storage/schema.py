@@ -65,7 +65,7 @@ class Variable:
         Axes. A variable with the name of its only axis is the coordinate of that axis.
     dtype : str
         NumPy type, ``str`` for text, or empty if the settings determine it.
-    about : str
+    description : str
         Description, stored as the attribute ``long_name``.
     units : str
         Unit in the notation of UDUNITS; empty, the default, for numbers without a unit.

@@ -28,9 +28,9 @@ class SensorReport:
         Number of measurements, damaged ones included.
     gaps : tuple of RecordingGap
         Missing sequence numbers with their reasons.
-    damaged : tuple of Damage
+    damaged : tuple of DamagedMeasurement
         Damaged measurements.
-    disordered : tuple of int
+    out_of_order : tuple of int
         Indices of measurements whose sequence number is not above the previous one of the session.
     fault : str
         Reason why nothing of this sensor can be read; otherwise empty.

@@ -29,19 +29,19 @@ class Sent:
 
     Attributes
     ----------
-    offered : dict of Key to Row
+    offered : dict of DiaryKey to Row
         All that may be there.
-    arrived_ns : dict of Key to int
+    arrived_ns : dict of DiaryKey to int
         When all of it was there, at the sender.
-    kept : set of Key
+    kept : set of DiaryKey
         What was accepted.
     acked_through : dict of (sensor, epoch) to int
         The highest number that was acked, and all before it.
-    acked_ns : dict of Key to int
+    acked_ns : dict of DiaryKey to int
         When the first ack that covers it came.
     statuses : Counter of str
         Acks by what they mean.
-    dropped : dict of Key to str
+    dropped : dict of DiaryKey to str
     """
 
     offered: dict[DiaryKey, Row] = field(default_factory=dict)
@@ -98,7 +98,7 @@ class Archived:
 
     Attributes
     ----------
-    rows : dict of Key to list of Row
+    rows : dict of DiaryKey to list of Row
         More than one where something was stored twice.
     gaps : dict of (sensor, epoch) to list of Gap
     recordings, broken, left_over : list of str
@@ -156,7 +156,7 @@ def compare(sent: Sent, archived: Archived, promised: AbstractSet[DiaryKey]) -> 
     ----------
     sent : Sent
     archived : Archived
-    promised : set of Key
+    promised : set of DiaryKey
         What has to be there, such as all that was acked.
 
     Returns

@@ -67,7 +67,7 @@ class Received:
 
     Attributes
     ----------
-    times_ms : dict of Key to float
+    times_ms : dict of DiaryKey to float
         From the arrival of each measurement at the sensor node to its image in the receiver's hands.
     twice, disordered, wrong : int
         Images that came again; whose number does not rise; that are not what they should be.

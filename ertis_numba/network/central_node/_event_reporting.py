@@ -43,7 +43,7 @@ class Telling:
         if self._on_stored is not None:
             with suppress(OSError):  # The listener may be gone.
                 for item in items:
-                    self._on_stored(item.run.sensor, item.run.session_id, item.first, getattr(item.what, "crc32", 0))
+                    self._on_stored(item.run.sensor, item.run.session_id, item.first, getattr(item.content, "crc32", 0))
 
     def sealed(self, sealed: SealingResult) -> None:
         """Report a journal that has become a recording."""

@@ -313,11 +313,11 @@ class Intake:
         for item in event.items:
             stream = self._done(item)
             track = self.tracks.setdefault(item.run.sensor, SensorTrack())
-            if isinstance(item.what, JournalEntry):
+            if isinstance(item.content, JournalEntry):
                 track.stored += 1
                 self.acks.acked_through(item.arrived_s)
             else:
-                track.miss(item.what.reason, item.last - item.first + 1)
+                track.miss(item.content.reason, item.last - item.first + 1)
             if stream is not None:
                 stream.acked_through = max(stream.acked_through, item.last)
                 stream.taken = max(stream.taken, stream.acked_through)
@@ -325,7 +325,7 @@ class Intake:
                 self.acks.owe(stream)
                 self._forget(stream)
         if self._on_stored is not None:
-            self._on_stored([item for item in event.items if isinstance(item.what, JournalEntry)])
+            self._on_stored([item for item in event.items if isinstance(item.content, JournalEntry)])
 
     def twin(self, event: Twin) -> None:
         """Process a duplicate."""

@@ -159,7 +159,7 @@ class JournalStore:
             elif item.first != last + 1:
                 self._send_back(item)
             else:
-                if batch and isinstance(item.what, JournalEntry) != isinstance(batch[-1].what, JournalEntry):
+                if batch and isinstance(item.content, JournalEntry) != isinstance(batch[-1].content, JournalEntry):
                     flush()
                 self._fit(item, flush)
                 batch.append(item)
@@ -201,7 +201,7 @@ class JournalStore:
                     self._send_back(item)
             return
         self._report_stored(list(batch), 1e3 * (time.monotonic() - begun_s))
-        if isinstance(batch[0].what, JournalEntry):
+        if isinstance(batch[0].content, JournalEntry):
             unrecorded = self._unrecorded.of(item.run.sensor for item in batch)
             if unrecorded:
                 self.volume.note_gaps(unrecorded)
@@ -211,16 +211,16 @@ class JournalStore:
         for item in items:
             self._grow(item.run, item.last)
             item.done = True
-            if isinstance(item.what, JournalEntry):
-                self._checksums.add(item.run, item.first, item.what.crc32 or 0)
+            if isinstance(item.content, JournalEntry):
+                self._checksums.add(item.run, item.first, item.content.crc32 or 0)
         self._emit_event(Stored(items, took_ms))
 
     def _store_twin(self, item: ReceivedItem) -> None:
         """Store a duplicate with other content as a conflict; discard equal ones."""
-        if not isinstance(item.what, JournalEntry):
+        if not isinstance(item.content, JournalEntry):
             return
-        key = (item.run, item.first, item.what.crc32 or 0)
-        differs = key not in self._known_twins and self._differs(item, item.what)
+        key = (item.run, item.first, item.content.crc32 or 0)
+        differs = key not in self._known_twins and self._differs(item, item.content)
         if differs:
             if self._twins is not None and not self._twins.fits(item):
                 self._retire_volume(self._twins)

@@ -182,9 +182,9 @@ class Ledger:
             case _Tail(sensor, session_id, numbers):
                 self.tails[SensorSession(sensor, session_id)] = dict(numbers)
 
-    def _note_damage(self, what: str) -> None:
+    def _note_damage(self, damage: str) -> None:
         self.damage = (
-            f"{self._path} is damaged: {what}. Its content is read again from the recordings and journals beside it; "
+            f"{self._path} is damaged: {damage}. Its content is read again from the recordings and journals beside it; "
             "measurements in recordings that were moved elsewhere may be stored a second time"
         )
 

@@ -38,7 +38,7 @@ class ReceivedItem:
     run : SensorSession
     first, last : int
         Numbers acknowledged once it is stored.
-    what : JournalEntry or JournalGap
+    content : JournalEntry or JournalGap
     source : JournalSensor
         Sensor for the journal.
     arrived_s : float
@@ -56,7 +56,7 @@ class ReceivedItem:
     run: SensorSession
     first: int
     last: int
-    what: JournalEntry | JournalGap
+    content: JournalEntry | JournalGap
     source: JournalSensor
     arrived_s: float
     owner: bytes
@@ -67,7 +67,7 @@ class ReceivedItem:
     @property
     def n_bytes(self) -> int:
         """Approximate memory of the item."""
-        return _OVERHEAD + (self.what.measurement.data.nbytes if isinstance(self.what, JournalEntry) else 0)
+        return _OVERHEAD + (self.content.measurement.data.nbytes if isinstance(self.content, JournalEntry) else 0)
 
 
 @dataclass(slots=True)

@@ -100,9 +100,9 @@ class Volume:
         """
         for item in items:
             self._add(item.source)
-        entries = [item.what for item in items if isinstance(item.what, JournalEntry)]
+        entries = [item.content for item in items if isinstance(item.content, JournalEntry)]
         if not entries:
-            self.note_gaps([item.what for item in items if isinstance(item.what, JournalGap)])
+            self.note_gaps([item.content for item in items if isinstance(item.content, JournalGap)])
             return
         self.journal.append(entries)
         for item in items:
