@@ -89,12 +89,12 @@ class _LaunchStopwatch(Stopwatch):
         self._begin_s = self._end_s = 0.0
 
     def start(self) -> None:
-        """See `Stopwatch.start`."""
+        """Remove all marks, and start the measurement."""
         self._begin_s = time.perf_counter()
         super().start()
 
     def mark(self, name: str) -> None:
-        """See `Stopwatch.mark`."""
+        """Mark the end of the part ``name``, which began at the previous mark."""
         super().mark(name)
         self._end_s = time.perf_counter()
 

@@ -59,12 +59,12 @@ class CufftTransforms:
             ) from error
 
     def forward(self, *, threads: int) -> NDArray[np.complex64]:  # noqa: ARG002
-        """See `Transforms.forward`."""
+        """Return the one-sided spectra of the real signals: (mic, n // 2 + 1) complex64."""
         with self._stream:
             self._forward.fft(self._real, self._bins, cufft.CUFFT_FORWARD)
         return self._spectra
 
     def inverse(self, *, threads: int) -> None:  # noqa: ARG002
-        """See `Transforms.inverse`."""
+        """Transform the spectra in the array of analytic signals, (mic, phase, n), to signals in place."""
         with self._stream:
             self._inverse.fft(self._both, self._both, cufft.CUFFT_INVERSE)

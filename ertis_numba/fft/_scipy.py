@@ -19,11 +19,11 @@ class ScipyTransforms:
         self._signals, self._analytic = np.asarray(signals), np.asarray(analytic)
 
     def forward(self, *, threads: int) -> NDArray[np.complex64]:
-        """See `Transforms.forward`."""
+        """Return the one-sided spectra of the real signals: (mic, n // 2 + 1) complex64."""
         return cast("NDArray[np.complex64]", scipy.fft.rfft(self._signals, workers=threads))
 
     def inverse(self, *, threads: int) -> None:
-        """See `Transforms.inverse`."""
+        """Transform the spectra in the array of analytic signals, (mic, phase, n), to signals in place."""
         spectra = self._analytic
         result = scipy.fft.ifft(spectra, norm="forward", overwrite_x=True, workers=threads)
         if result is not spectra and not np.shares_memory(result, spectra):

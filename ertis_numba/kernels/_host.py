@@ -21,28 +21,28 @@ class _HostLane:
     stream = None
 
     def entered(self) -> AbstractContextManager[None]:
-        """See `Lane.entered`."""
+        """Run the enclosed kernels of this Python thread on this lane."""
         return contextlib.nullcontext()
 
     def send(self, array: Array) -> Array:
-        """See `Lane.send`."""
+        """Start to copy an array of the host to the device, and return the copy."""
         return array
 
     def target(self, out: Array) -> Array:
-        """See `Lane.target`."""
+        """Return the array of the device that `fetch` copies to ``out``."""
         return out
 
     def run(self, steps: Callable[[], None]) -> None:
-        """See `Lane.run`."""
+        """Start ``steps``, which must use the same arrays at each call; a lane may record and replay them."""
         steps()
 
     def fetch(self, array: Array, out: Array) -> None:
-        """See `Lane.fetch`."""
+        """Start to copy an array of the device, such as the result of `target`, to ``out``."""
         if array is not out:
             out[...] = array
 
     def wait(self) -> None:
-        """See `Lane.wait`."""
+        """Block until all operations on this lane are complete."""
 
 
 class HostMemory:
@@ -56,21 +56,21 @@ class HostMemory:
         self._images = ImagePool(lambda shape: np.empty(shape, np.float32))
 
     def table(self, array: Array) -> Array:
-        """See `Memory.table`."""
+        """Return ``array`` on the device. Callers must not modify it afterwards."""
         return array
 
     def zeros(self, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-        """See `Memory.zeros`."""
+        """Return a new array of zeros on the device."""
         return np.zeros(shape, dtype)
 
     def image(self, shape: tuple[int, int]) -> NDArray[np.float32]:
-        """See `Memory.image`."""
+        """Return an unused, uninitialised array of the host to which `Lane.fetch` is fast."""
         return self._images.take(shape)
 
     def lane(self) -> _HostLane:
-        """See `Memory.lane`."""
+        """Return a new lane."""
         return _HostLane()
 
     def close(self) -> None:
-        """See `Memory.close`."""
+        """Free all unreferenced memory immediately."""
         self._images.close()

@@ -23,13 +23,13 @@ _NOISE_UNIT = 1 / math.sqrt((2.0**24 - 1) / 3)  # 1 / RMS of a sum of four integ
 
 @contextlib.contextmanager
 def threads(count: int) -> Iterator[None]:
-    """See `Threads`."""
+    """Run the enclosed kernels of this Python thread on ``count`` threads."""
     checks.integer("threads", count, 1, 1)
     yield
 
 
 def unpack_bits(words: Words, channels: Index, out: Real) -> None:
-    """See `UnpackBits`."""
+    """Convert the bits of PDM words to signals of +1 and −1."""
     octets = words.view(np.uint8).reshape(len(words), words.shape[1] * words.itemsize)
     out[:] = np.unpackbits(octets, axis=1, bitorder="little")[:, channels].T
     out *= np.float32(2)
@@ -37,7 +37,7 @@ def unpack_bits(words: Words, channels: Index, out: Real) -> None:
 
 
 def unpack_pcm(words: Pcm, channels: Index, scale: np.float32, silence: np.float32, first: int, out: Real) -> None:
-    """See `UnpackPcm`."""
+    """Convert PCM samples to signals: ``out[mic, n] = scale · words[first + n, channels[mic]]``, 0 elsewhere."""
     start, stop = max(first, 0), min(first + out.shape[1], len(words))
     out[:] = 0
     if start < stop:
@@ -47,12 +47,12 @@ def unpack_pcm(words: Pcm, channels: Index, scale: np.float32, silence: np.float
 
 
 def decimate(signals: Real, taps: Real, factor: int, out: Real) -> None:
-    """See `Decimate`."""
+    """Filter signals and keep every ``factor``-th sample."""
     out[:] = _filtered(signals, taps, factor, 1 - len(taps), out.shape[1])
 
 
 def remove_group_delay(signals: Real, delay: int, out: Real) -> None:
-    """See `RemoveGroupDelay`."""
+    """Advance signals in time: ``out[mic, n] = signals[mic, n + delay]``, 0 beyond the end."""
     moved = signals[:, delay : delay + out.shape[1]]
     out[:, : moved.shape[1]] = moved
     out[:, moved.shape[1] :] = 0
@@ -68,7 +68,7 @@ def demodulate_words(
     n_outputs: int,
     out: Real,
 ) -> None:
-    """See `DemodulateWords`."""
+    """Unpack, decimate and remove the group delay in one pass over the words."""
     half = len(taps) // 2
     start = max(first * factor - half, 0)
     stop = min((first + n_outputs - 1) * factor + half + 1, len(words))
@@ -105,12 +105,12 @@ def _filtered(
 
 
 def multiply_spectra(spectra: Complex, response: Complex, out: Complex) -> None:
-    """See `MultiplySpectra`."""
+    """Multiply the spectrum of each microphone by a filter: ``out[mic, bin] = spectra · response``."""
     np.multiply(spectra, response, out=out)
 
 
 def multiply_and_fold(spectra: Complex, responses: Complex, first_bin: int, out: Complex) -> None:
-    """See `MultiplyAndFold`."""
+    """Multiply spectra by one filter per phase and fold each product to the length of ``out``."""
     n_bins, n_out = responses.shape[2], out.shape[2]
     out[:] = 0
     done = 0
@@ -123,7 +123,7 @@ def multiply_and_fold(spectra: Complex, responses: Complex, first_bin: int, out:
 
 
 def delay_and_sum(signals: Complex, offsets: Index, weights: Complex, out: Complex) -> None:
-    """See `DelayAndSum`."""
+    """Sum the delayed and weighted signals of all microphones for every direction and range."""
     flat = signals.reshape(-1)
     n_ranges = out.shape[1]
     for direction in range(len(out)):
@@ -133,14 +133,14 @@ def delay_and_sum(signals: Complex, offsets: Index, weights: Complex, out: Compl
 
 
 def envelope(beams: Complex, out: Real) -> None:
-    """See `Envelope`."""
+    """Compute the magnitude of analytic beams."""
     np.abs(beams, out=out)
 
 
 def delay_and_sum_envelope(
     signals: Complex, offsets: Index, weights: Complex, first: int, stop: int, out: Real
 ) -> None:
-    """See `DelayAndSumEnvelope`."""
+    """`DelayAndSum` and `Envelope` in one pass over some ranges, without writing beams to memory."""
     beams: NDArray[Any] = np.empty((len(out), stop - first), dtype=np.complex64)
     delay_and_sum(signals, offsets + np.int32(first), weights, beams)
     envelope(beams, out[:, first:stop])
@@ -158,7 +158,7 @@ def interpolated_beams_envelope(
     n_blocks: int,  # noqa: ARG001
     out: Real,
 ) -> None:
-    """See `InterpolatedBeamsEnvelope`."""
+    """Compute beams on a coarse beam grid, interpolate the beams of all directions, and take their envelopes."""
     nodes: NDArray[Any] = np.empty((len(offsets), stop - first), dtype=np.complex64)
     delay_and_sum(signals, offsets + np.int32(first), weights, nodes)
     # The weights are real, so a matrix product of floats takes half of the operations.
@@ -169,7 +169,7 @@ def interpolated_beams_envelope(
 
 
 def quantise_tiles(signals: Complex, starts: Index, limit: np.float32, tiles: Short, scales: Real) -> None:
-    """See `QuantiseTiles`."""
+    """Split analytic signals into tiles of ranges, and store each in 16 bits with its own scale."""
     tiles[:] = 0
     for tile, start in enumerate(starts):
         part = np.ascontiguousarray(signals[:, :, start : start + tiles.shape[3]])
@@ -190,7 +190,7 @@ def delay_and_sum_envelope_int16(
     weight_scale: np.float32,
     out: Real,
 ) -> None:
-    """See `DelayAndSumEnvelopeInt16`."""
+    """`DelayAndSumEnvelope` on the tiles of `QuantiseTiles`, with integer sums."""
     for tile, start in enumerate(starts):
         n_ranges = min(_TILE_RANGES, stop - start)
         for direction in range(len(offsets)):
@@ -212,7 +212,7 @@ def interpolated_beams_envelope_int16(
     n_blocks: int,  # noqa: ARG001
     out: Real,
 ) -> None:
-    """See `InterpolatedBeamsEnvelopeInt16`."""
+    """`InterpolatedBeamsEnvelope` on the tiles of `QuantiseTiles`, with integer sums."""
     for tile, start in enumerate(starts):
         n_ranges = min(_TILE_RANGES, stop - start)
         nodes = np.stack([_whole_beam(tiles[tile], *row) for row in zip(offsets, weights, strict=True)])
@@ -245,7 +245,7 @@ def _delayed(
 
 
 def combine_coherence(signals: Complex, offsets: Index, weights: Complex, out: Real) -> None:
-    """See `CombineCoherence`."""
+    """Delay-and-sum times the coherence factor of Mallart and Fink (1994), which measures agreement of microphones."""
     for direction, y in _delayed(signals, offsets, weights, out.shape[1]):
         beams = np.abs(y.sum(axis=0))
         total = len(y) * (y.real**2 + y.imag**2).sum(axis=0)
@@ -253,7 +253,7 @@ def combine_coherence(signals: Complex, offsets: Index, weights: Complex, out: R
 
 
 def combine_dmas(signals: Complex, offsets: Index, weights: Complex, order: int, out: Real) -> None:
-    """See `CombineDmas`."""
+    """Delay-multiply-and-sum: sum the products of the roots of all combinations of ``order`` microphones."""
     level = np.abs(signals.astype(np.complex128))
     roots = signals * np.power(level, 1 / order - 1, out=np.zeros_like(level), where=level != 0)
     for direction, z in _delayed(roots, offsets, weights, out.shape[1]):
@@ -291,7 +291,7 @@ def add_paths(
     nodes_per_bin: float,
     out: NDArray[np.complex128],
 ) -> None:
-    """See `AddPaths`."""
+    """Add delayed and filtered copies of a call to the spectrum of each microphone."""
     bins = first_bin + np.arange(out.shape[1])
     nodes = np.arange(amplitude.shape[2])
     for path in range(len(turns)):

@@ -8,7 +8,7 @@ __all__ = ["CombineCapon", "CombineCoherence", "CombineDmas"]
 
 
 class CombineCoherence(Protocol):
-    """Delay-and-sum times the coherence factor of Mallart and Fink (1994), a measure of agreement of the microphones.
+    """Delay-and-sum times the coherence factor of Mallart and Fink (1994), which measures agreement of microphones.
 
     With ``y = weights[direction, mic] · signals.flat[offsets[direction, mic] + range]``,
     ``out[direction, range] = |Σ y| · |Σ y|² / (M Σ |y|²)`` over the M microphones, and 0 if all are silent.

@@ -61,7 +61,7 @@ def _layer_is_reentrant() -> bool:
 
 @contextlib.contextmanager
 def threads(count: int) -> Iterator[None]:
-    """See `Threads`.
+    """Run the enclosed kernels of this Python thread on ``count`` threads.
 
     Without OpenMP and TBB, Numba falls back to its workqueue layer. That layer aborts the process if two threads use it
     concurrently. With it, and until the layer is known, one thread runs at a time.

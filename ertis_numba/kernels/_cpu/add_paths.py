@@ -18,7 +18,7 @@ _LANES = 8
 
 @njit(parallel=True, nogil=True, cache=True)
 def add_paths(call, turns, amplitude, first_bin, nodes_per_bin, out):
-    """See `AddPaths`."""
+    """Add delayed and filtered copies of a call to the spectrum of each microphone."""
     n_bins = out.shape[1]
     n_nodes = amplitude.shape[2]
     for mic in prange(out.shape[0]):

@@ -101,7 +101,7 @@ def _solve(beams, first, count, column, t, fit):
 
 @njit(parallel=True, nogil=True, cache=True, error_model="numpy")
 def combine_capon(signals, offsets, weights, n_snapshots, loading, out):
-    """See `CombineCapon`."""
+    """Combine the microphones with the Capon (minimum-variance distortionless response) weights."""
     flat = signals.reshape(-1)
     n_directions, n_mics = offsets.shape
     n_ranges = out.shape[1]

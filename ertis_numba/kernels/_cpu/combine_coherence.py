@@ -13,7 +13,7 @@ _TILE = 256  # ranges whose sums stay in the L1 cache during the loop over micro
 
 @njit(parallel=True, nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
 def combine_coherence(signals, offsets, weights, out):
-    """See `CombineCoherence`."""
+    """Delay-and-sum times the coherence factor of Mallart and Fink (1994), which measures agreement of microphones."""
     flat = signals.reshape(-1)
     n_directions, n_mics = offsets.shape
     n_ranges = out.shape[1]

@@ -53,7 +53,7 @@ def _add_products(z, x, total, count):
 
 @njit(parallel=True, nogil=True, cache=True)
 def combine_dmas(signals, offsets, weights, order, out):
-    """See `CombineDmas`."""
+    """Delay-multiply-and-sum: sum the products of the roots of all combinations of ``order`` microphones."""
     flat = signals.reshape(-1)
     roots = np.empty((2, len(flat)), np.float32)
     _take_roots(flat, order, roots)

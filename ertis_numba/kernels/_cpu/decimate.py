@@ -8,7 +8,7 @@ __all__ = ["decimate"]
 
 @njit(parallel=True, nogil=True, cache=True, fastmath={"reassoc", "contract", "nsz"})
 def decimate(signals, taps, factor, out):
-    """See `Decimate`."""
+    """Filter signals and keep every ``factor``-th sample."""
     n_mics, n_samples = signals.shape
     n_taps = taps.size
     for mic in prange(n_mics):

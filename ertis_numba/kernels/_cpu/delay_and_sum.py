@@ -8,7 +8,7 @@ __all__ = ["delay_and_sum"]
 
 @njit(parallel=True, nogil=True, cache=True, fastmath={"contract", "nsz"})
 def delay_and_sum(signals, offsets, weights, out):
-    """See `DelayAndSum`."""
+    """Sum the delayed and weighted signals of all microphones for every direction and range."""
     flat = signals.reshape(-1)
     n_directions, n_mics = offsets.shape
     n_ranges = out.shape[1]

@@ -50,7 +50,7 @@ def _beam_short(signals, offsets, weights, direction, first, stop, out):
 
 @njit(parallel=True, nogil=True, cache=True)
 def delay_and_sum_envelope(signals, offsets, weights, first, stop, out):
-    """See `DelayAndSumEnvelope`."""
+    """`DelayAndSum` and `Envelope` in one pass over some ranges, without writing beams to memory."""
     n_directions = out.shape[0]
     n_tiles = (stop - first + TILE - 1) // TILE
     # Small images get smaller blocks, so that every thread gets some.

@@ -34,7 +34,7 @@ def _beam_tile(typing_context, tiles, tile, offsets, weights, direction, scale, 
 
 @njit(parallel=True, nogil=True, cache=True)
 def delay_and_sum_envelope_int16(tiles, scales, starts, stop, offsets, weights, weight_scale, out):
-    """See `DelayAndSumEnvelopeInt16`."""
+    """`DelayAndSumEnvelope` on the tiles of `QuantiseTiles`, with integer sums."""
     n_directions, n_ranges = out.shape
     block = min(_BLOCK, max(1, n_directions // 4))
     n_blocks = (n_directions + block - 1) // block

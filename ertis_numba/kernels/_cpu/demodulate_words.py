@@ -97,7 +97,7 @@ def _filter_at_edge(words, channels, taps, scale, factor, first, begin, end, out
 
 @njit(parallel=True, nogil=True, cache=True)
 def demodulate_words(words, channels, taps, scale, factor, first, n_outputs, out):
-    """See `DemodulateWords`."""
+    """Unpack, decimate and remove the group delay in one pass over the words."""
     n_samples, n_words = words.shape
     tap_total = np.int32(0)
     for tap in range(taps.size):

@@ -10,7 +10,7 @@ __all__ = ["envelope"]
 
 @njit(parallel=True, nogil=True, cache=True, fastmath={"contract"})
 def envelope(beams, out):
-    """See `Envelope`."""
+    """Compute the magnitude of analytic beams."""
     n_directions, n_ranges = beams.shape
     for direction in prange(n_directions):
         for r in range(n_ranges):

@@ -63,7 +63,7 @@ def _interpolate_tile(typing_context, rows, skipped, places, weights, direction,
 
 @njit(parallel=True, nogil=True, cache=True)
 def interpolated_beams_envelope(signals, offsets, weights, places, tap_weights, rows, first, stop, n_blocks, out):
-    """See `InterpolatedBeamsEnvelope`."""
+    """Compute beams on a coarse beam grid, interpolate the beams of all directions, and take their envelopes."""
     n_directions, n_ranges = out.shape
     n_tiles = (stop - first + TILE - 1) // TILE
     block = (n_directions + n_blocks - 1) // n_blocks

@@ -133,7 +133,7 @@ def _node_pairs(tiles, tile, offsets, weights, first, last):
 def interpolated_beams_envelope_int16(
     tiles, scales, starts, stop, offsets, weights, places, tap_weights, rows, weight_scale, n_blocks, out
 ):
-    """See `InterpolatedBeamsEnvelopeInt16`."""
+    """`InterpolatedBeamsEnvelope` on the tiles of `QuantiseTiles`, with integer sums."""
     n_directions, n_ranges = out.shape
     n_tiles = tiles.shape[0]
     block = (n_directions + n_blocks - 1) // n_blocks

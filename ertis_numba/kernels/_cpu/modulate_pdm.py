@@ -144,7 +144,7 @@ def _used_octets(mics, out):
 
 @njit(parallel=True, nogil=True, cache=True)
 def modulate_pdm(signals, mics, keys, noise_rms, states, loop, first, out):
-    """See `ModulatePdm`."""
+    """Modulate a block of signals with a loop of up to four integrators, and pack the bits into PDM words."""
     used = _used_octets(mics, out)
     for group in prange((len(used) + _OCTETS - 1) // _OCTETS):
         octets = np.empty(_OCTETS, np.int64)

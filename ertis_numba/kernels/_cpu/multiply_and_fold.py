@@ -8,7 +8,7 @@ __all__ = ["multiply_and_fold"]
 
 @njit(parallel=True, nogil=True, cache=True, fastmath={"contract", "nsz"})
 def multiply_and_fold(spectra, responses, first_bin, out):
-    """See `MultiplyAndFold`."""
+    """Multiply spectra by one filter per phase and fold each product to the length of ``out``."""
     n_mics, n_phases, n_out = out.shape
     n_bins = responses.shape[2]
     for mic in prange(n_mics):

@@ -10,7 +10,7 @@ _ZERO = np.float32(0)  # adding it determines which product is fused
 
 @njit(parallel=True, nogil=True, cache=True, fastmath={"contract"})
 def multiply_spectra(spectra, response, out):
-    """See `MultiplySpectra`."""
+    """Multiply the spectrum of each microphone by a filter: ``out[mic, bin] = spectra · response``."""
     n_mics, n_bins = spectra.shape
     for mic in prange(n_mics):
         for b in range(n_bins):

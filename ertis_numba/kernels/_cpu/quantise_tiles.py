@@ -39,7 +39,7 @@ def _round(source, factor, target):
 
 @njit(parallel=True, nogil=True, cache=True)
 def quantise_tiles(signals, starts, limit, tiles, scales):
-    """See `QuantiseTiles`."""
+    """Split analytic signals into tiles of ranges, and store each in 16 bits with its own scale."""
     n_tiles, n_mics, n_phases, width, _ = tiles.shape
     parts, targets = signals.view(np.float32), tiles.reshape(n_tiles, n_mics, n_phases, 2 * width)
     for tile in prange(n_tiles):

@@ -8,7 +8,7 @@ __all__ = ["remove_group_delay"]
 
 @njit(parallel=True, nogil=True, cache=True)
 def remove_group_delay(signals, delay, out):
-    """See `RemoveGroupDelay`."""
+    """Advance signals in time: ``out[mic, n] = signals[mic, n + delay]``, 0 beyond the end."""
     n_mics, n_samples = signals.shape
     for mic in prange(n_mics):
         for n in range(out.shape[1]):

@@ -8,7 +8,7 @@ __all__ = ["unpack_bits"]
 
 @njit(parallel=True, nogil=True, cache=True)
 def unpack_bits(words, channels, out):
-    """See `UnpackBits`."""
+    """Convert the bits of PDM words to signals of +1 and −1."""
     word_bits = words.itemsize * 8
     for mic in prange(channels.size):
         word = channels[mic] // word_bits

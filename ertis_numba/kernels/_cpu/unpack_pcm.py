@@ -10,7 +10,7 @@ _BLOCK = 512  # samples that stay in the cache during the loop over microphones
 
 @njit(parallel=True, nogil=True, cache=True)
 def unpack_pcm(words, channels, scale, silence, first, out):
-    """See `UnpackPcm`."""
+    """Convert PCM samples to signals: ``out[mic, n] = scale · words[first + n, channels[mic]]``, 0 elsewhere."""
     n_samples = out.shape[1]
     for block in prange((n_samples + _BLOCK - 1) // _BLOCK):
         for mic in range(channels.size):

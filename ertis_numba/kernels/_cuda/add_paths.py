@@ -34,6 +34,6 @@ def _add(call, turns, amplitude, first_bin, nodes_per_bin, out):
 
 
 def add_paths(call, turns, amplitude, first_bin, nodes_per_bin, out):
-    """See `AddPaths`."""
+    """Add delayed and filtered copies of a call to the spectrum of each microphone."""
     grid = -(-out.shape[1] // _BLOCK), out.shape[0]
     launch(_add, grid, (_BLOCK,), call, turns, amplitude, first_bin, nodes_per_bin, out)

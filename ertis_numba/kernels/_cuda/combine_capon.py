@@ -113,7 +113,7 @@ def _combine(beams, lags, loading, n_mics, column, t, first, n_directions, out):
 
 
 def combine_capon(signals, offsets, weights, n_snapshots, loading, out):
-    """See `CombineCapon`."""
+    """Combine the microphones with the Capon (minimum-variance distortionless response) weights."""
     (n_directions, n_mics), n_ranges = offsets.shape, out.shape[1]
     n_snapshots = min(n_snapshots, n_ranges)
     of_direction, of_thread = 16 * n_ranges * (n_snapshots + 1), 16 * n_snapshots * (n_snapshots + 1)

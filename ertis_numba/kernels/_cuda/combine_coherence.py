@@ -56,6 +56,6 @@ def _combine(signals, offsets, weights, n_mics, out):
 
 
 def combine_coherence(signals, offsets, weights, out):
-    """See `CombineCoherence`."""
+    """Delay-and-sum times the coherence factor of Mallart and Fink (1994), which measures agreement of microphones."""
     tables = offsets.reshape(-1), complexes(weights), offsets.shape[1]
     launch(_combine, beam_grid(*out.shape), BLOCK, complexes(signals), *tables, out)

@@ -63,7 +63,7 @@ def _kernel_of(order):
 
 
 def combine_dmas(signals, offsets, weights, order, out):
-    """See `CombineDmas`."""
+    """Delay-multiply-and-sum: sum the products of the roots of all combinations of ``order`` microphones."""
     samples = complexes(signals)
     roots = workspace("roots", samples.shape, np.uint64)
     launch(_take_roots, (-(-samples.size // _BLOCK),), (_BLOCK,), samples, order, roots)

@@ -26,5 +26,5 @@ def _filter(signals, taps, factor, out):
 
 
 def decimate(signals, taps, factor, out):
-    """See `Decimate`."""
+    """Filter signals and keep every ``factor``-th sample."""
     launch(_filter, (-(-out.shape[1] // _BLOCK), out.shape[0]), (_BLOCK,), signals, taps, factor, out)

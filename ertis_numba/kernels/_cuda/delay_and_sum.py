@@ -26,5 +26,5 @@ def beams_from(signals, offsets, weights, first, n_ranges, out):
 
 
 def delay_and_sum(signals, offsets, weights, out):
-    """See `DelayAndSum`."""
+    """Sum the delayed and weighted signals of all microphones for every direction and range."""
     beams_from(signals, offsets, weights, 0, out.shape[1], out.view(np.uint64))

@@ -15,6 +15,6 @@ def _fill(signals, offsets, weights, n_terms, first, stop, out):
 
 
 def delay_and_sum_envelope(signals, offsets, weights, first, stop, out):
-    """See `DelayAndSumEnvelope`."""
+    """`DelayAndSum` and `Envelope` in one pass over some ranges, without writing beams to memory."""
     grid, tables = beam_grid(out.shape[0], stop - first), (offsets.reshape(-1), complexes(weights))
     launch(_fill, grid, BLOCK, complexes(signals), *tables, offsets.shape[1], first, stop, out)

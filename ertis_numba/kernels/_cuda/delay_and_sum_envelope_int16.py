@@ -68,7 +68,7 @@ def _fill(samples, per_tile, scales, starts, stop, offsets, weights, n_terms, we
 
 
 def delay_and_sum_envelope_int16(tiles, scales, starts, stop, offsets, weights, weight_scale, out):
-    """See `DelayAndSumEnvelopeInt16`."""
+    """`DelayAndSumEnvelope` on the tiles of `QuantiseTiles`, with integer sums."""
     n_directions, n_terms = offsets.shape
     n_tiles = tiles.shape[0]
     samples = indexed(tiles.reshape(-1).view(np.uint32))

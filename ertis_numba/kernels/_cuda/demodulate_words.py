@@ -43,7 +43,7 @@ def _sum_taps(octets, n_samples, n_octets, channels, taps, scale, factor, first,
 
 
 def demodulate_words(words, channels, taps, scale, factor, first, n_outputs, out):
-    """See `DemodulateWords`."""
+    """Unpack, decimate and remove the group delay in one pass over the words."""
     octets = words.view(np.uint8)
     n_mics = min(_MICS, 1 << (out.shape[0] - 1).bit_length())
     block = n_mics, _THREADS // n_mics

@@ -20,5 +20,5 @@ def _take(beams, out):
 
 
 def envelope(beams, out):
-    """See `Envelope`."""
+    """Compute the magnitude of analytic beams."""
     launch(_take, (-(-out.size // _BLOCK),), (_BLOCK,), complexes(beams), out.reshape(-1))

@@ -63,7 +63,7 @@ def _interpolate(nodes, width, places, n_pairs, tap_weights, rows, first, stop, 
 
 
 def interpolated_beams_envelope(signals, offsets, weights, places, tap_weights, rows, first, stop, n_blocks, out):
-    """See `InterpolatedBeamsEnvelope`."""
+    """Compute beams on a coarse beam grid, interpolate the beams of all directions, and take their envelopes."""
     grid = beam_grid(places.shape[0], stop - first)
     width = grid[1] * TILE
     nodes = workspace(f"nodes from range {first} on", (offsets.shape[0], width), np.uint64)

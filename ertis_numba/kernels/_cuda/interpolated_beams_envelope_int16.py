@@ -65,7 +65,7 @@ def _interpolate(nodes, n_nodes, scales, starts, stop, places, n_pairs, tap_weig
 def interpolated_beams_envelope_int16(
     tiles, scales, starts, stop, offsets, weights, places, tap_weights, rows, weight_scale, n_blocks, out
 ):
-    """See `InterpolatedBeamsEnvelopeInt16`."""
+    """`InterpolatedBeamsEnvelope` on the tiles of `QuantiseTiles`, with integer sums."""
     n_nodes, n_terms = offsets.shape
     n_directions, n_pairs = places.shape
     n_tiles = tiles.shape[0]

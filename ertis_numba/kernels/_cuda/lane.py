@@ -58,7 +58,7 @@ class Lane:
 
     @contextlib.contextmanager
     def entered(self) -> Iterator[None]:
-        """See `kernels.Lane.entered`."""
+        """Run the enclosed kernels of this Python thread on this lane."""
         before = getattr(_HERE, "lane", None)
         _HERE.lane = self
         try:
@@ -67,7 +67,7 @@ class Lane:
             _HERE.lane = before
 
     def send(self, array: NDArray[Any]) -> Any:
-        """See `kernels.Lane.send`."""
+        """Start to copy an array of the host to the device, and return the copy."""
         kind = (array.shape, array.dtype.str)
         if kind not in self._staged:
             # Only copies from pinned memory run concurrently with the kernels of other lanes.
@@ -78,24 +78,24 @@ class Lane:
         return here
 
     def target(self, out: NDArray[np.float32]) -> Any:
-        """See `kernels.Lane.target`."""
+        """Return the array of the device that `fetch` copies to ``out``."""
         if out.shape not in self._targets:
             self._targets[out.shape] = self._allocate(out.shape, out.dtype)
         return self._targets[out.shape]
 
     def run(self, steps: Callable[[], None]) -> None:
-        """See `kernels.Lane.run`."""
+        """Start ``steps``, which must use the same arrays at each call; a lane may record and replay them."""
         if self._graph is None:
             steps()
         else:
             self._graph.run(steps)
 
     def fetch(self, array: Any, out: NDArray[Any]) -> None:
-        """See `kernels.Lane.fetch`."""
+        """Start to copy an array of the device, such as the result of `target`, to ``out``."""
         array.copy_to_host(out, stream=self.stream)
 
     def wait(self) -> None:
-        """See `kernels.Lane.wait`."""
+        """Block until all operations on this lane are complete."""
         if self.stream:
             self.stream.synchronize()
         else:

@@ -29,24 +29,24 @@ class CudaMemory:
         self._images = ImagePool(lambda shape: self._pinned(shape, np.float32))
 
     def table(self, array: Array) -> Array:
-        """See `Memory.table`."""
+        """Return ``array`` on the device. Callers must not modify it afterwards."""
         made: Array = self._made(array.nbytes, lambda: cuda.to_device(np.ascontiguousarray(array)))
         return made
 
     def zeros(self, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-        """See `Memory.zeros`."""
+        """Return a new array of zeros on the device."""
         return self.table(np.zeros(shape, dtype))
 
     def image(self, shape: tuple[int, int]) -> NDArray[np.float32]:
-        """See `Memory.image`."""
+        """Return an unused, uninitialised array of the host to which `Lane.fetch` is fast."""
         return self._images.take(shape)
 
     def lane(self) -> Lane:
-        """See `Memory.lane`."""
+        """Return a new lane."""
         return Lane(cuda.stream(), self._array, self._pinned, graphs=self._graphs)
 
     def close(self) -> None:
-        """See `Memory.close`."""
+        """Free all unreferenced memory immediately."""
         self._images.close()
         if not SIMULATED:
             cuda.current_context().deallocations.clear()  # otherwise Numba defers them

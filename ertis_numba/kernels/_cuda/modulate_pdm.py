@@ -79,7 +79,7 @@ def _pack(above, mics, out):
 
 
 def modulate_pdm(signals, mics, keys, noise_rms, states, loop, first, out):
-    """See `ModulatePdm`."""
+    """Modulate a block of signals with a loop of up to four integrators, and pack the bits into PDM words."""
     n_samples, n_octets = out.shape
     n_mics = keys.shape[0]
     above = workspace("bits of modulators", (n_samples, n_mics), np.uint8)

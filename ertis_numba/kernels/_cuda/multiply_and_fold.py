@@ -37,7 +37,7 @@ def _fold(spectra, responses, first_bin, ahead, out):
 
 
 def multiply_and_fold(spectra, responses, first_bin, out):
-    """See `MultiplyAndFold`."""
+    """Multiply spectra by one filter per phase and fold each product to the length of ``out``."""
     n_mics, n_phases, n_out = out.shape
     grid, numbers = (-(-n_out // _BLOCK), n_phases, n_mics), (spectra.view(np.uint64), responses.view(np.uint64))
     launch(_fold, grid, (_BLOCK,), *numbers, first_bin, -first_bin % n_out, out.view(np.uint64))

@@ -21,6 +21,6 @@ def _multiply(spectra, response, out):
 
 
 def multiply_spectra(spectra, response, out):
-    """See `MultiplySpectra`."""
+    """Multiply the spectrum of each microphone by a filter: ``out[mic, bin] = spectra · response``."""
     numbers = spectra.view(np.uint64), response.view(np.uint64), out.view(np.uint64)
     launch(_multiply, (-(-out.shape[1] // _BLOCK), out.shape[0]), (_BLOCK,), *numbers)

@@ -69,7 +69,7 @@ def _round(signals, starts, limit, bits, tiles, scales):
 
 
 def quantise_tiles(signals, starts, limit, tiles, scales):
-    """See `QuantiseTiles`."""
+    """Split analytic signals into tiles of ranges, and store each in 16 bits with its own scale."""
     n_tiles, n_mics, n_phases, width, _ = tiles.shape
     n_rows = n_mics * n_phases
     samples = signals.view(np.uint64).reshape(n_rows, signals.shape[2])

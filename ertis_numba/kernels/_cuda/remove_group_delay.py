@@ -19,5 +19,5 @@ def _move(signals, delay, out):
 
 
 def remove_group_delay(signals, delay, out):
-    """See `RemoveGroupDelay`."""
+    """Advance signals in time: ``out[mic, n] = signals[mic, n + delay]``, 0 beyond the end."""
     launch(_move, (-(-out.shape[1] // _BLOCK), out.shape[0]), (_BLOCK,), signals, delay, out)

@@ -23,5 +23,5 @@ def _unpack(octets, channels, out):
 
 
 def unpack_bits(words, channels, out):
-    """See `UnpackBits`."""
+    """Convert the bits of PDM words to signals of +1 and −1."""
     launch(_unpack, (-(-out.shape[1] // _BLOCK),), (_BLOCK,), words.view(np.uint8), channels, out)

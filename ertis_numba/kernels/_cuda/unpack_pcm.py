@@ -25,5 +25,5 @@ def _unpack(words, channels, scale, silence, first, out):
 
 
 def unpack_pcm(words, channels, scale, silence, first, out):
-    """See `UnpackPcm`."""
+    """Convert PCM samples to signals: ``out[mic, n] = scale · words[first + n, channels[mic]]``, 0 elsewhere."""
     launch(_unpack, (-(-out.shape[1] // _BLOCK),), (_BLOCK,), words, channels, scale, silence, first, out)

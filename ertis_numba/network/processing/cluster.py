@@ -111,7 +111,7 @@ class Cluster:
         return f"up to {threads} at a time on {workers} workers of the cluster at {self._address}"
 
     def prepare(self, kind: JobKind) -> None:
-        """See `Runner`."""
+        """Prepare for jobs of a kind; `KindReady` or `KindFailed` follows."""
         self.forget(kind)
         self._kinds[kind.number] = kind
         self._ask_to_prepare()
@@ -126,7 +126,7 @@ class Cluster:
                     self._ask(member, call, self._options.prepare_s, "prepared", kind, member)
 
     def forget(self, kind: JobKind) -> None:
-        """See `Runner`."""
+        """Release a kind, because no more jobs of it will come."""
         self._prepared.pop(kind.number, None)
         self._kinds.pop(kind.number, None)
         for member in self._members.values():
@@ -134,7 +134,7 @@ class Cluster:
             member.ready.discard(kind.number)
 
     def takes(self, kind: JobKind) -> bool:
-        """See `Runner`."""
+        """Return True if a job of a kind can run now."""
         return kind.number in self._prepared and self._idle(kind) is not None
 
     def _idle(self, kind: JobKind) -> _Member | None:
@@ -143,7 +143,7 @@ class Cluster:
         return min(able, key=lambda member: member.busy / member.threads, default=None)
 
     def submit(self, job: Job) -> None:
-        """See `Runner`."""
+        """Run a job that `takes` accepts; `FinishedJob` or `Lost` follows."""
         if (member := self._idle(job.kind)) is None:
             raise AssertionError("a job was submitted that no worker can accept; call takes() first")
         attempt = _Attempt(job, self._slot_for(job), member)
@@ -203,30 +203,30 @@ class Cluster:
         return slot
 
     def release(self, slot: Slot) -> None:
-        """See `Runner`."""
+        """Release the slot of a finished job."""
         self._free.append(slot)
 
     def fds(self) -> Iterable[int]:
-        """See `Runner`."""
+        """Return the descriptors to poll now."""
         return [self._wakeup_socket.fileno()]
 
     def ready(self, fd: int) -> Sequence[Event]:
-        """See `Runner`."""
+        """Return new events, after a descriptor became readable."""
         if fd == self._wakeup_socket.fileno():
             self._wakeup_socket.clear()
         return self._heard()
 
     def tick(self, now_s: float, rate_hz: float) -> Sequence[Event]:  # noqa: ARG002  time is the client's matter
-        """See `Runner`."""
+        """Return new events; call it ten times a second with the rate of arriving measurements."""
         return self._heard()
 
     def status(self) -> list[WorkerStatus]:
-        """See `Runner`."""
+        """Return the status of the workers."""
         members = self._members.values()
         return [WorkerStatus(pid=each.pid, state="busy" if each.busy else "idle", done=each.done) for each in members]
 
     def close(self) -> None:
-        """See `Runner`."""
+        """Close everything."""
         self._closing.set()
         self._client.close(timeout=2)
         self._looker.join(_CONNECT_S)

@@ -82,14 +82,14 @@ class LocalWorkerPool:
         return self._chosen.why
 
     def prepare(self, kind: JobKind) -> None:
-        """See `Runner`."""
+        """Prepare for jobs of a kind; `KindReady` or `KindFailed` follows."""
         self._kinds[kind.number] = kind
         self._tries.pop(kind.number, None)
         for worker in self._workers:
             self._next_kind(worker)
 
     def forget(self, kind: JobKind) -> None:
-        """See `Runner`."""
+        """Release a kind, because no more jobs of it will come."""
         self._kinds.pop(kind.number, None)
         self._prepared.pop(kind.number, None)
         self._tries.pop(kind.number, None)
@@ -99,7 +99,7 @@ class LocalWorkerPool:
                 worker.child.pipe.send(Release(kind=kind.number))
 
     def takes(self, kind: JobKind) -> bool:
-        """See `Runner`."""
+        """Return True if a job of a kind can run now."""
         busy = sum(worker.job is not None for worker in self._workers)
         return busy < self._chosen.mode.at_once and self._idle(kind) is not None
 
@@ -110,7 +110,7 @@ class LocalWorkerPool:
         return None
 
     def submit(self, job: Job) -> None:
-        """See `Runner`."""
+        """Run a job that `takes` accepts; `FinishedJob` or `Lost` follows."""
         worker = self._idle(job.kind)
         if worker is None or worker.child is None:
             raise AssertionError("a job was submitted that no worker can accept; call takes() first")
@@ -131,25 +131,25 @@ class LocalWorkerPool:
         )
 
     def release(self, slot: Slot) -> None:
-        """See `Runner`."""
+        """Release the slot of a finished job."""
         worker = self._workers[slot.number // SLOTS]
         if slot in worker.slots:
             worker.free.append(slot)
 
     def fds(self) -> Iterable[int]:
-        """See `Runner`."""
+        """Return the descriptors to poll now."""
         children = (worker.child for worker in self._workers)
         return [child.pipe.fileno() for child in children if child is not None and not child.pipe.closed]
 
     def ready(self, fd: int) -> Sequence[Event]:
-        """See `Runner`."""
+        """Return new events, after a descriptor became readable."""
         for worker in self._workers:
             if worker.child is not None and worker.child.pipe.fileno() == fd:
                 return self._heard(worker)
         return []
 
     def tick(self, now_s: float, rate_hz: float) -> Sequence[Event]:
-        """See `Runner`."""
+        """Return new events; call it ten times a second with the rate of arriving measurements."""
         found: list[Event] = []
         for worker in self._workers[: self._started]:
             if worker.child is None:
@@ -170,7 +170,7 @@ class LocalWorkerPool:
         return found
 
     def status(self) -> list[WorkerStatus]:
-        """See `Runner`."""
+        """Return the status of the workers."""
         return [
             WorkerStatus(pid=worker.child.pid, state=worker.state, done=worker.done)
             for worker in self._workers
@@ -178,7 +178,7 @@ class LocalWorkerPool:
         ]
 
     def close(self) -> None:
-        """See `Runner`."""
+        """Close everything."""
         for worker in self._workers:
             if worker.child is not None:
                 worker.child.kill()  # Left alone, it would end after its imports, without cleaning up either.
