@@ -22,8 +22,8 @@ from tests.publishing import Publisher, cloud
 
 RUN_BY = {
     ("accuracy", "$"): ["test_guide::test_commands_of_a_page"],
-    ("applications", "$"): ["test_applications_page::test_commands"],
-    ("applications", "python"): ["test_applications_page::test_loop"],
+    ("applications", "$"): ["test_applications_page::test_application_commands_of_the_page_run"],
+    ("applications", "python"): ["test_applications_page::test_application_loop_of_the_page_runs"],
     ("beamformers", "$"): ["test_guide::test_commands_of_a_page"],
     ("command-line", "$"): ["test_config::test_command_line_page_runs", "test_config::test_completion_for_each_shell"],
     ("concepts", "python"): ["test_guide::test_python_on_concepts"],
