@@ -38,14 +38,17 @@ RUN_BY = {
     ("gpu", "$"): ["test_guide::test_commands_of_the_gpu_page_run"],
     ("health", "$"): ["test_health_commands::test_health_page_shows_the_printed_output"],
     ("many", "$"): [
-        "test_many_docs::test_commands_in_their_order",
-        "test_many_cluster::test_the_line_of_the_page_runs",
+        "test_many_docs::test_commands_of_the_page_run_in_order",
+        "test_many_cluster::test_cluster_command_of_the_page_runs",
     ],
-    ("many", "python"): ["test_many_docs::test_python_lines"],
-    ("network", "$"): ["test_network_page::test_one_machine", "test_network_page::test_several_machines"],
+    ("many", "python"): ["test_many_docs::test_code_of_the_page_runs"],
+    ("network", "$"): [
+        "test_network_page::test_network_page_on_one_machine_runs",
+        "test_network_page::test_network_page_on_several_machines_runs",
+    ],
     ("network", "python"): ["test_guide::test_code_of_the_network_page_runs"],
     ("numpy", "python"): [
-        "test_numpy_page::test_examples_run",
+        "test_numpy_page::test_page_examples_run",
         "test_numpy_page::test_own_beamformer_finds_the_reflectors",
     ],
     ("own-array", "$"): ["test_guide::test_own_array_page_runs_page_runs"],
