@@ -1,4 +1,4 @@
-"""Small recordings, and a crew in this process, that the tests of campaigns share."""
+"""Small recordings, and a worker pool in this process, for the tests of campaigns."""
 
 from collections import deque
 
@@ -22,36 +22,36 @@ def write_recordings(folder, names=NAMES, count=3, **more):
     return found
 
 
-class Here:
-    """A crew that follows orders in this process, when it is asked for news."""
+class InlinePool:
+    """Worker pool that runs tasks in this process when its events are read."""
 
     def __init__(self, size=2):
-        self.size, self.orders, self.given, self.largest = size, deque(), [], 0
+        self.size, self.tasks, self.given, self.largest = size, deque(), [], 0
 
     @property
     def free(self):
-        return max(0, self.size - len(self.orders))
+        return max(0, self.size - len(self.tasks))
 
     def limit(self, size):
         self.size = min(self.size, size)
 
-    def submit(self, order):
-        self.orders.append(order)
-        self.given.append(order)
+    def submit(self, task):
+        self.tasks.append(task)
+        self.given.append(task)
 
     def wait(self, _):
-        order = self.orders.popleft()
+        task = self.tasks.popleft()
         advanced = []
-        result = run_task(order.do, order.about, lambda done: advanced.append(TaskUpdate(order.number, done)))
-        return [*advanced, TaskUpdate(order.number, result=result)]
+        result = run_task(task.action, task.arguments, lambda done: advanced.append(TaskUpdate(task.number, done)))
+        return [*advanced, TaskUpdate(task.number, result=result)]
 
     def close(self):
-        self.orders.clear()
+        self.tasks.clear()
 
 
 def run_here(monkeypatch, paths, folder, wanted=None, size=2):
-    """Process in this process; return what became of each recording, by its name, and the crew."""
-    pool = Here(size)
+    """Process in this process; return what became of each recording, by its name, and the pool."""
+    pool = InlinePool(size)
     with monkeypatch.context() as patch:
         patch.setattr(Campaign, "_pool", lambda _: pool)
         return ended(Campaign(find_recordings(paths), folder, wanted).run()), pool

@@ -189,7 +189,7 @@ def test_temporary_read_error_is_not_damage(tmp_path, monkeypatch):
             return execute(self, statement, values)
         error = sqlite3.OperationalError("disk I/O error")
         error.sqlite_errorcode = sqlite3.SQLITE_IOERR_READ
-        with self._reported():
+        with self._translate_errors():
             raise error
 
     with monkeypatch.context() as patch:

@@ -82,7 +82,7 @@ from ertis_numba.journal import Journal
 from tests.journals import EPOCH, entries
 with Journal.open(Path(sys.argv[1])) as journal:
     if sys.argv[3] == "once":
-        journal._database.write_once()
+        journal._database.use_rollback_journal()
     for number in range(int(sys.argv[2]), 10**9):
         for sensor in ("left", "right"):
             journal.append(entries(1, sensor=sensor, first=number))

@@ -148,7 +148,7 @@ with (folder / "ballast").open("wb", buffering=0) as file:
             pass
     except OSError:
         pass
-for act in (lambda journal: journal._database.write_once(), Journal.set_aside):
+for act in (lambda journal: journal._database.use_rollback_journal(), Journal.set_aside):
     with Journal.open(path) as journal:
         assert all(same(*pair) for pair in zip(journal.entries(), given, strict=True))
         try:
@@ -164,7 +164,7 @@ for act in (lambda journal: journal._database.write_once(), Journal.set_aside):
 if "freed" in sys.argv:
     (folder / "ballast").unlink()
     with Journal.open(path) as journal:
-        journal._database.write_once()
+        journal._database.use_rollback_journal()
         assert not log.exists()
         assert all(same(*pair) for pair in zip(journal.entries(), given, strict=True))
 else:

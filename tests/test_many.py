@@ -23,7 +23,7 @@ from ertis_numba.campaign import (
 )
 from ertis_numba.settings import Air
 from ertis_numba.storage import open_energyscapes, write_recording
-from tests.campaigns import Here, ended, names_in, outcomes, run_here, write_recordings
+from tests.campaigns import InlinePool, ended, names_in, outcomes, run_here, write_recordings
 from tests.files import SMALL, line, noise
 
 RANGE_M = (0.5, 0.8)
@@ -65,7 +65,7 @@ def states(folder):
 def test_files_equal_those_of_single_recordings(runs, out, monkeypatch):
     found, pool = run_here(monkeypatch, [runs], out, CampaignOptions(settings=narrow))
     assert outcomes(found) == dict.fromkeys(["a.h5", "b.h5", "c.h5", "d.h5"], "made")
-    assert [order.about["warm"] for order in pool.given if order.do == "plan"] == [True, False]  # one for each air
+    assert [task.arguments["warm"] for task in pool.given if task.action == "plan"] == [True, False]  # one for each air
     assert found["a.h5"].made["measurements"] == 3
     for name in "abcd":
         single = out / "single.h5"
@@ -106,7 +106,7 @@ def test_existing_output_is_kept(runs, out, monkeypatch):
     (out / "b.energy.h5").unlink()
     found, pool = run_here(monkeypatch, [runs], out, CampaignOptions(settings=narrow, overwrite=True))
     assert outcomes(found) == {"a.h5": "kept", "b.h5": "made", "c.h5": "kept", "d.h5": "kept"}
-    assert [order.about["path"] for order in pool.given if order.do == "make"] == [str(runs / "b.h5")]
+    assert [task.arguments["path"] for task in pool.given if task.action == "make"] == [str(runs / "b.h5")]
     after = states(out)
     assert {name: after[name] for name in after if name != "b.energy.h5"} == {
         name: before[name] for name in before if name != "b.energy.h5"
@@ -209,7 +209,7 @@ def test_unreachable_budget_is_reported_per_recording(runs, out, monkeypatch):
     assert set(outcomes(found).values()) == {"failed"}
     for name, event in found.items():
         assert event.error.startswith(f"{runs / name}: accuracy.max_error_db is -199, but the smallest error")
-    assert [order.do for order in pool.given].count("plan") == 2  # each tried once
+    assert [task.action for task in pool.given].count("plan") == 2  # each tried once
     assert names_in(out) == []
 
 
@@ -249,10 +249,10 @@ def test_memory_and_tasks_are_independent_of_the_number_of_recordings(tmp_path, 
 
     def watched(*arguments):
         result = follow(*arguments)
-        most_kept.append(len(vars(work)["_kept"]))
+        most_kept.append(len(vars(work)["_idle_pipelines"]))
         return result
 
-    monkeypatch.setattr("tests.campaigns.follow", watched)
+    monkeypatch.setattr("tests.campaigns.run_task", watched)
     for number in range(12):  # each has air of its own, and so a pipeline of its own
         settings = SMALL.replace(air=Air(temperature_c=float(number)))
         write_recording(tmp_path / f"{number:02}.h5", noise(settings, count=1, seed=number))
@@ -260,9 +260,9 @@ def test_memory_and_tasks_are_independent_of_the_number_of_recordings(tmp_path, 
     assert set(outcomes(found).values()) == {"made"}
     assert max(most_kept) == 1
     place = {"look": 0, "make": 0}
-    for order in pool.given:
-        if order.do in place:
-            place[order.do] += 1
+    for task in pool.given:
+        if task.action in place:
+            place[task.action] += 1
             most_in_hand.append(place["look"] - place["make"])
     assert max(most_in_hand) <= pool.size + 3
 
@@ -273,7 +273,7 @@ def test_temporary_planning_failure_is_repeated(runs, out, monkeypatch):
     def short_of_memory(do, *arguments):
         return chances.pop() if do == "plan" and chances else work.run_task(do, *arguments)
 
-    monkeypatch.setattr("tests.campaigns.follow", short_of_memory)
+    monkeypatch.setattr("tests.campaigns.run_task", short_of_memory)
     found, _ = run_here(
         monkeypatch, [runs / "a.h5", runs / "c.h5"], out, CampaignOptions(settings=narrow)
     )  # in the same air
@@ -299,7 +299,7 @@ def test_leftovers_are_searched_only_after_a_worker_died(runs, out, monkeypatch)
             return {"error": "ended by SIGKILL", "by_chance": True}
         return work.run_task(do, about, *more)
 
-    monkeypatch.setattr("tests.campaigns.follow", died_of_c)
+    monkeypatch.setattr("tests.campaigns.run_task", died_of_c)
     monkeypatch.setattr(campaign, "clear_parts", lambda _, names: searched.append(set(names)))
     (runs / "b.h5").write_bytes(b"no recording")
     found, _ = run_here(monkeypatch, [runs], out, CampaignOptions(settings=narrow))
@@ -319,7 +319,7 @@ def test_duplicate_pipeline_of_another_thread_is_closed(monkeypatch):
             self.closed += 1
 
     monkeypatch.setattr(work, "Pipeline", Counted)
-    monkeypatch.setattr(work, "_kept", {})
+    monkeypatch.setattr(work, "_idle_pipelines", {})
     borrow = vars(work)["_pipelines"]
     with borrow([SMALL], "cpu", 1) as (first,), borrow([SMALL], "cpu", 1) as (second,):
         assert first is not second
@@ -327,8 +327,8 @@ def test_duplicate_pipeline_of_another_thread_is_closed(monkeypatch):
         assert [each.closed for each in existing_output] == [again is not each for each in existing_output]
 
 
-class Watched(Here):
-    """A crew that notes how many orders it has in hand whenever it gets one, and what it had when it was limited."""
+class Watched(InlinePool):
+    """Worker pool that notes how many tasks it has in hand whenever it gets one, and what it had when it was limited."""
 
     def __init__(self, size):
         super().__init__(size)
@@ -338,23 +338,23 @@ class Watched(Here):
         super().limit(size)
         if not self.limited_at:
             self.in_hand.clear()
-        self.limited_at.append(len(self.orders))
+        self.limited_at.append(len(self.tasks))
 
-    def submit(self, order):
-        super().submit(order)
-        self.in_hand.append(len(self.orders))
+    def submit(self, task):
+        super().submit(task)
+        self.in_hand.append(len(self.tasks))
 
 
 @pytest.mark.parametrize(("workers", "largest"), [(None, 1), (3, 3)])
 def test_gpu_runs_one_task_at_a_time(tmp_path, out, monkeypatch, workers, largest):
-    """However many orders are in hand when it is known to be a GPU: no more come until there are fewer."""
+    """However many tasks are in hand when it is known to be a GPU: no more come until there are fewer."""
 
     def on_a_gpu(*arguments):
         return {name: "cuda" if name == "device" else value for name, value in work.run_task(*arguments).items()}
 
     pool = Watched(3)
     write_recordings(tmp_path / "many", "abcdefghi", count=1)
-    monkeypatch.setattr("tests.campaigns.follow", on_a_gpu)
+    monkeypatch.setattr("tests.campaigns.run_task", on_a_gpu)
     monkeypatch.setattr(Campaign, "_pool", lambda _: pool)
     found = ended(
         Campaign(find_recordings([tmp_path / "many"]), out, CampaignOptions(settings=narrow), workers=workers).run()
@@ -398,7 +398,7 @@ def test_unwritable_folder_is_reported_with_a_remedy(monkeypatch, tmp_path):
     def refused(*_):
         raise OSError(errno.EROFS, "Read-only file system", str(tmp_path / "a.energy.h5.0123abcd.part"))
 
-    monkeypatch.setitem(vars(work)["_ORDERS"], "make", refused)
+    monkeypatch.setitem(vars(work)["_ACTIONS"], "make", refused)
     reported = work.run_task("make", {})
     assert (
         reported["error"]

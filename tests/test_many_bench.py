@@ -9,7 +9,7 @@ from ertis_cli.main import cli
 
 from ertis_numba.campaign import Campaign
 from ertis_numba.errors import DataError
-from tests.campaigns import Here
+from tests.campaigns import InlinePool
 
 
 @pytest.fixture(autouse=True)
@@ -20,7 +20,7 @@ def _small(monkeypatch):
 
 def test_all_pools_are_timed_and_compared(tmp_path, monkeypatch):
     pool = Campaign._pool  # noqa: SLF001
-    chosen = lambda campaign: pool(campaign) if vars(campaign)["_scheduler"] else Here()  # noqa: E731
+    chosen = lambda campaign: pool(campaign) if vars(campaign)["_scheduler"] else InlinePool()  # noqa: E731
     monkeypatch.setattr(Campaign, "_pool", chosen)  # of processes, which take long to start, other tests know
     target = tmp_path / "page.md"
     target.write_text("<!-- ertis bench many -->\nold\n<!-- /ertis bench many -->\n", "utf-8")

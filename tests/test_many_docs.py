@@ -13,7 +13,7 @@ from click.testing import CliRunner
 from ertis_cli.main import cli
 
 from ertis_numba.campaign import Campaign
-from tests.campaigns import Here
+from tests.campaigns import InlinePool
 from tests.pages import page
 
 ROOT = Path(__file__).parents[1]
@@ -33,7 +33,7 @@ def place(tmp_path_factory):
 @pytest.fixture(autouse=True)
 def _there(place, monkeypatch):
     monkeypatch.chdir(place)
-    monkeypatch.setattr(Campaign, "_pool", lambda _: Here())  # which takes less to start
+    monkeypatch.setattr(Campaign, "_pool", lambda _: InlinePool())  # which takes less to start
 
 
 def run(command, code=0):

@@ -41,7 +41,7 @@ def long_runs(runs):
 
 
 @pytest.fixture
-def crews(monkeypatch):
+def pools(monkeypatch):
     """All that are started."""
     made, begin = [], ProcessPool.__init__
 
@@ -78,13 +78,13 @@ def test_bits_are_independent_of_the_workers(runs, tmp_path, monkeypatch):
     assert contents(tmp_path / "out") == contents(tmp_path / "here")
 
 
-def test_dying_worker_fails_one_recording(long_runs, tmp_path, crews):
+def test_dying_worker_fails_one_recording(long_runs, tmp_path, pools):
     out, killed, found = tmp_path / "out", [], {}
     campaign = Campaign(find_recordings([long_runs]), out, CampaignOptions(settings=narrow, batch=1), workers=2)
     for event in campaign.run():
         if isinstance(event, RecordingProgress) and event.recording.name == "b.h5" and not killed:
-            (pool,) = crews
-            (pid,) = [pid for pid, path in pool.doing.items() if path.endswith("b.h5")]
+            (pool,) = pools
+            (pid,) = [pid for pid, path in pool.current_paths.items() if path.endswith("b.h5")]
             os.kill(pid, signal.SIGKILL)
             killed.append(pid)
         found |= ended([event])
@@ -96,13 +96,13 @@ def test_dying_worker_fails_one_recording(long_runs, tmp_path, crews):
     assert outcomes(again) == {"a.h5": "kept", "b.h5": "made", "c.h5": "kept", "d.h5": "kept"}
 
 
-def test_close_ends_all_work_at_once(long_runs, tmp_path, crews):
+def test_close_ends_all_work_at_once(long_runs, tmp_path, pools):
     """However far it is: processes that stand still would never be done with theirs."""
     events = Campaign(
         find_recordings([long_runs]), tmp_path / "out", CampaignOptions(settings=narrow, batch=1), workers=2
     ).run()
     next(event for event in events if isinstance(event, RecordingProgress))
-    pids = list(crews[0].doing)
+    pids = list(pools[0].current_paths)
     for pid in pids:
         os.kill(pid, signal.SIGSTOP)
     events.close()
@@ -138,7 +138,7 @@ def test_number_of_workers_can_be_reduced():
 
 @pytest.mark.parametrize("size", [1, 2])
 def test_number_of_busy_workers_can_be_reduced(size):
-    """Never more orders in hand than there were, and soon no more than are wanted, by as many processes."""
+    """Never more tasks in hand than there were, and soon no more than are wanted, by as many processes."""
     pool, numbers, in_hand, seen = ProcessPool(3), iter(range(12)), set(), []
     try:
 

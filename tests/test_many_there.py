@@ -89,7 +89,7 @@ def test_existing_output_is_verified_with_its_own_plan(runs, out, monkeypatch):
         monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=narrow, explain=True, verify=True)
     )
     assert outcomes(found) == {"a.h5": "kept"}
-    assert [order.do for order in pool.given] == ["look", "plan", "check"]
+    assert [task.action for task in pool.given] == ["look", "plan", "check"]
     (sensor,) = found["a.h5"].made["sensors"]
     assert sensor["plan"]["accuracy"]["oversampling"] == 48
     assert sensor["verified"]["error_db"] <= -35.0

@@ -88,7 +88,7 @@ def test_envelope_has_no_carrier_ripple():
     ("processing", "n_samples", "match"),
     [
         (Processing(range_m=(0.5, 5.0)), 40_960, "range_m ends at 5 m, but the record of 9.102 ms covers 1.563 m"),
-        (Processing(range_m=(0.701, 0.702)), 40_960, "0.701 to 0.702 m, contains no multiple of .*0.003821 m. Extend"),
+        (Processing(range_m=(0.701, 0.702)), 40_960, "0.701 to 0.702 m, contains no multiple of .*0.003821 m; extend"),
         (Processing(range_m=(0.0, 0.1)), 9, "range_m ends at 0.1 m, but the record of 0.002 ms covers 0 m"),
     ],
 )

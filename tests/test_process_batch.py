@@ -79,7 +79,7 @@ def test_batch_of_large_images_is_smaller(recording, tmp_path, sizes, monkeypatc
         image_bytes = images[0].amplitude.nbytes
     for room, wanted in ((2.5, [2, 2, 2, 1]), (0.5, [1] * 7)):
         sizes["sizes"].clear()
-        monkeypatch.setattr(sensor_processing, "MAX_BYTES", room * image_bytes)
+        monkeypatch.setattr(sensor_processing, "MAX_WAITING_BYTES", room * image_bytes)
         run(recording, "-o", tmp_path / "img.h5", *FAST, "--force")
         assert sizes["sizes"] == [1, *wanted]  # the first image is made once more, to predict its error
 

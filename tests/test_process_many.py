@@ -14,7 +14,7 @@ from ertis_cli.main import cli
 
 from ertis_numba import verification
 from ertis_numba.campaign import Campaign, CampaignOptions, RecordingEnded, RecordingProgress, RecordingStarted
-from tests.campaigns import Here, names_in, write_recordings
+from tests.campaigns import InlinePool, names_in, write_recordings
 
 FAST = ["--range", "0.5:0.8", "--directions", "2d:9", "--workers", "1"]
 
@@ -36,7 +36,7 @@ def run(*arguments, code=0):
 @pytest.fixture
 def here(monkeypatch):
     """No processes, which takes less to start."""
-    monkeypatch.setattr(Campaign, "_pool", lambda _: Here())
+    monkeypatch.setattr(Campaign, "_pool", lambda _: InlinePool())
 
 
 @pytest.mark.usefixtures("here")
@@ -81,7 +81,7 @@ def test_process_reports_plans_and_verifies_each_recording(runs, monkeypatch):
         assert sensor["verified"]["error_db"] <= sensor["verified"]["max_error_db"]
         assert sensor["plan"]["safe_db"] <= -35.0
         assert "lines" not in sensor
-    monkeypatch.setattr(Campaign, "_pool", lambda _: Here())
+    monkeypatch.setattr(Campaign, "_pool", lambda _: InlinePool())
     done = run("runs", "-o", "more", *FAST, "--explain")
     assert done.stderr.count("plan of eRTIS-7 for an error budget of -35 dB:") == 2
     again = run("runs", "-o", "more", *FAST, "--explain")

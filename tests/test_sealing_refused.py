@@ -70,10 +70,10 @@ def test_seal_survives_any_error_in_laying_out_a_sensor(tmp_path, monkeypatch):
     def fails(group, settings, **more):
         if group.name == "/sensors/right" and group.file.driver == "core":
             raise ValueError("Maximum allowed size exceeded")
-        return lay_out_sensor(group, settings, **more)
+        return create_sensor_variables(group, settings, **more)
 
-    lay_out_sensor = sealing.create_sensor_variables
-    monkeypatch.setattr(sealing, "lay_out_sensor", fails)
+    create_sensor_variables = sealing.create_sensor_variables
+    monkeypatch.setattr(sealing, "create_sensor_variables", fails)
     create(tmp_path, [*entries(2), *entries(2, sensor="right")]).close()
     sealed = seal(tmp_path / "rec.h5.journal")
     assert sealed.refused == {"right": "Maximum allowed size exceeded"}
