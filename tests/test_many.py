@@ -328,7 +328,7 @@ def test_duplicate_pipeline_of_another_thread_is_closed(monkeypatch):
 
 
 class Watched(InlinePool):
-    """Worker pool that notes how many tasks it has in hand whenever it gets one, and what it had when it was limited."""
+    """Worker pool that notes its number of tasks whenever it gets one, and when it is limited."""
 
     def __init__(self, size):
         super().__init__(size)
