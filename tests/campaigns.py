@@ -1,4 +1,4 @@
-"""Small recordings, and a crew in this process, that the tests of campaigns share."""
+"""Small recordings and an in-process worker pool, shared by the tests of campaigns."""
 
 from collections import deque
 
@@ -13,7 +13,7 @@ NAMES = ("a", "b", "c", "d")
 
 
 def write_recordings(folder, names=NAMES, count=3, **more):
-    """Write recordings that all differ, in two kinds of air."""
+    """Write recordings with different samples, in air of two temperatures."""
     folder.mkdir(exist_ok=True)
     found = []
     for number, name in enumerate(names):
@@ -23,7 +23,7 @@ def write_recordings(folder, names=NAMES, count=3, **more):
 
 
 class Here:
-    """A crew that follows orders in this process, when it is asked for news."""
+    """A worker pool that runs each task in this process when `wait` is called."""
 
     def __init__(self, size=2):
         self.size, self.orders, self.given, self.largest = size, deque(), [], 0
@@ -50,7 +50,7 @@ class Here:
 
 
 def run_here(monkeypatch, paths, folder, wanted=None, size=2):
-    """Process in this process; return what became of each recording, by its name, and the crew."""
+    """Run a campaign in this process; return the last event of each recording by file name, and the pool."""
     pool = Here(size)
     with monkeypatch.context() as patch:
         patch.setattr(Campaign, "_pool", lambda _: pool)
@@ -58,15 +58,15 @@ def run_here(monkeypatch, paths, folder, wanted=None, size=2):
 
 
 def ended(events):
-    """What became of each recording, by the name of its file."""
+    """Collect the last event of each recording by file name."""
     return {event.recording.name: event for event in events if isinstance(event, RecordingEnded)}
 
 
 def outcomes(found):
-    """The bare outcomes."""
+    """Reduce events to their outcomes."""
     return {name: event.outcome for name, event in found.items()}
 
 
 def names_in(folder):
-    """The names of all files in a folder."""
+    """List the names of all files in a folder, sorted."""
     return sorted(item.name for item in folder.iterdir())
