@@ -13,7 +13,7 @@ NAMES = ("a", "b", "c", "d")
 
 
 def write_recordings(folder, names=NAMES, count=3, **more):
-    """Write recordings that all differ, in two kinds of air."""
+    """Write recordings with different samples, in air of two temperatures."""
     folder.mkdir(exist_ok=True)
     found = []
     for number, name in enumerate(names):
@@ -50,7 +50,7 @@ class InlinePool:
 
 
 def run_here(monkeypatch, paths, folder, wanted=None, size=2):
-    """Process in this process; return what became of each recording, by its name, and the pool."""
+    """Run a campaign in this process; return the last event of each recording by file name, and the pool."""
     pool = InlinePool(size)
     with monkeypatch.context() as patch:
         patch.setattr(Campaign, "_pool", lambda _: pool)
@@ -58,15 +58,15 @@ def run_here(monkeypatch, paths, folder, wanted=None, size=2):
 
 
 def ended(events):
-    """What became of each recording, by the name of its file."""
+    """Collect the last event of each recording by file name."""
     return {event.recording.name: event for event in events if isinstance(event, RecordingEnded)}
 
 
 def outcomes(found):
-    """The bare outcomes."""
+    """Reduce events to their outcomes."""
     return {name: event.outcome for name, event in found.items()}
 
 
 def names_in(folder):
-    """The names of all files in a folder."""
+    """List the names of all files in a folder, sorted."""
     return sorted(item.name for item in folder.iterdir())

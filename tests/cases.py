@@ -1,4 +1,4 @@
-"""One table of settings that every chain and every device is tested on, and words to test them with."""
+"""Settings that every chain and every device is tested on, and data to test them with."""
 
 import numpy as np
 
@@ -65,11 +65,11 @@ CASES = {
     "fine ranges": SHORT.replace(processing=SHORT.processing.replace(range_decimation=30)),
     "every sample": SHORT.replace(processing=SHORT.processing.replace(range_decimation=10, range_m=(0.6, 0.62))),
 }
-"""Settings by name. Records are short, so that the float64 referees are quick."""
+"""Settings by name. Records are short to keep the float64 reference implementations fast."""
 
 
 def noise(settings: Settings, seed: int = 1) -> Measurement:
-    """White noise: it tells at all ranges and directions at once what echoes would."""
+    """White noise, which exercises all ranges and directions at once."""
     words, random = sample_format(settings), np.random.default_rng(seed)
     if settings.recording.is_pdm:
         numbers = random.integers(0, 2**settings.array.word_bits, words.shape, dtype=words.dtype)
@@ -79,9 +79,9 @@ def noise(settings: Settings, seed: int = 1) -> Measurement:
 
 
 def words_of(signals, seed: int = 1):
-    """Words whose bits are 1 with probability (1 + signal) / 2: (sample,) uint32.
+    """Convert signals to words whose bits are 1 with probability (1 + signal) / 2: (sample,) uint32.
 
-    The simplest one-bit converter: its mean is the signal, whatever the signal is, and its error is white.
+    This is the simplest one-bit converter. Its mean equals the signal, and its error is white.
 
     Parameters
     ----------

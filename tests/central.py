@@ -1,4 +1,4 @@
-"""A sensor node of a few lines, and a central node in a thread, for the tests of the central node."""
+"""A minimal sensor node and a central node in a thread, for the tests of the central node."""
 
 import threading
 import zlib
@@ -16,7 +16,7 @@ WAIT_MS = 10_000
 
 
 class Node:
-    """Speaks the protocol word by word."""
+    """A sensor node that sends one protocol message per call."""
 
     def __init__(self, address, keys=None):
         self._context = zmq.Context()
@@ -32,7 +32,7 @@ class Node:
         self.socket.send_multipart([messages.encode(message), *payload])
 
     def hear(self, kind=None):
-        """The next message, or the next of a kind."""
+        """Return the next message, or the next one of a kind."""
         while True:
             assert self.socket.poll(WAIT_MS), f"no {kind} came"
             message = messages.decode(self.socket.recv_multipart()[0])
@@ -40,7 +40,7 @@ class Node:
                 return message
 
     def hear_settled(self, acked_through):
-        """Acks until one says that a number is settled."""
+        """Read acks until one acknowledges a number; return that ack."""
         while True:
             ack = self.hear(messages.Ack)
             if ack.acked_through >= acked_through:
@@ -61,7 +61,7 @@ class Node:
 
 
 def data_of(entry, **changes):
-    """The message of an entry."""
+    """Build the Data message of a journal entry."""
     stamp, air = entry.measurement.stamp, entry.measurement.settings.air
     words = changes.pop("words", entry.measurement.data.tobytes())
     fields = {
@@ -82,7 +82,7 @@ def data_of(entry, **changes):
 
 @contextmanager
 def running(folder=None, **options):
-    """A central node that runs; its archive is in ``folder``."""
+    """Run a central node in a thread, with its archive in ``folder``."""
     events = []
     archive = options.pop("archive", None) or (None if folder is None else Archive(folder, seal=False))
     with CentralNode("tcp://127.0.0.1:0", archive=archive, on_event=events.append, **options) as central:
@@ -97,7 +97,7 @@ def running(folder=None, **options):
 
 
 def stored(folder):
-    """What recordings and journals hold: (sensor, epoch, sequence) and words, in order, and what is missing."""
+    """Read all recordings and journals: (sensor, session, sequence) and data in order, and the gaps."""
     found, missing = [], []
     for path in sorted(folder.glob(f"*.h5{SUFFIX}")):
         with Journal.open(path) as journal:
@@ -112,7 +112,7 @@ def stored(folder):
 
 
 def wanted(entries):
-    """What `stored` returns of entries."""
+    """The part of the result of `stored` that belongs to entries."""
     return [
         ((stamp.sensor, stamp.session_id, stamp.sequence), entry.measurement.data.tobytes())
         for entry in entries

@@ -1,4 +1,4 @@
-"""What all tests run under."""
+"""Fixtures that apply to all tests."""
 
 import logging
 import os
@@ -10,10 +10,11 @@ import threadpoolctl
 
 @pytest.fixture(scope="session", autouse=True)
 def _one_blas_thread():
-    """Keep the referees' products to one thread: they are small, and threads of BLAS spin while they wait.
+    """Limit BLAS to one thread in this process.
 
-    That cost a third of the suite's processor time and saved nothing. Commands that tests start as processes of their
-    own have the threads that everybody has.
+    The matrix products of the reference implementations are small, and BLAS threads spin while they wait. More
+    threads took a third of the suite's processor time and saved nothing. Commands that tests start in their own
+    processes keep the default number of threads.
     """
     with threadpoolctl.threadpool_limits(1, user_api="blas"):
         yield
@@ -21,11 +22,11 @@ def _one_blas_thread():
 
 @pytest.fixture(scope="session", autouse=True)
 def _garbage_in_new_arrays_of_the_gpu():
-    """Let new arrays hold what nobody would overlook: on a GPU they hold what was there before, in the simulator 0."""
+    """Fill new device arrays with garbage: a GPU leaves old memory in them, but the simulator fills them with 0."""
     if os.environ.get("NUMBA_ENABLE_CUDASIM") != "1":
         yield
         return
-    from numba import cuda  # noqa: PLC0415 - other processes do not load it
+    from numba import cuda  # noqa: PLC0415 - only the simulator's process needs this slow import
 
     make = cuda.device_array
 
@@ -41,7 +42,7 @@ def _garbage_in_new_arrays_of_the_gpu():
 
 @pytest.fixture(autouse=True)
 def _log_as_before():
-    """Leave the log as it was: commands that a test runs in this process show it their own way from then on."""
+    """Restore the log's handlers, because commands that a test runs in this process replace them."""
     log = logging.getLogger("ertis.network")
     before = log.handlers[:], log.level, log.propagate
     yield

@@ -1,4 +1,4 @@
-"""A server, its gate, and clients that knock."""
+"""A server socket with its ZAP authenticator, and clients that connect to it."""
 
 import random
 import time
@@ -21,12 +21,12 @@ LISTED = AllowList(
     )
 )
 LOOPBACK = "tcp://127.0.0.1:*"
-PATIENCE_S = 10.0  # of what is to happen
-MOMENT_S = 0.4  # of what is not to happen: a handshake takes a hundredth of it
+PATIENCE_S = 10.0  # timeout for events that must happen
+MOMENT_S = 0.4  # wait for events that must not happen; a handshake takes a hundredth of this
 
 
 class Door:
-    """A server and its gate in one loop, as a central node has them, and clients that knock."""
+    """A server socket and its ZAP authenticator in one loop, as in a central node, and clients that connect."""
 
     def __init__(self, folder, *, with_keys=True, gate=ZapAuthenticator, server_gate=True, max_bytes=sockets.MAX_BYTES):
         self.list = folder / "allow.toml"
@@ -38,7 +38,7 @@ class Door:
         self.gate.watch(self.server)
         self.address = sockets.bound(self.server)
         self.port = int(self.address.rpartition(":")[2])
-        self.changed = 0  # so often the list did
+        self.changed = 0  # number of reloads of the allow list
         self.came, self._clients, self._unsaid, self.monitors = [], [], [], {}
 
     def __enter__(self):
@@ -51,11 +51,11 @@ class Door:
         for client in self._clients:
             client.close(linger=0)
         self.server.close(linger=0)
-        self.context.destroy(linger=0)  # also what a test that failed has left open
+        self.context.destroy(linger=0)  # also closes sockets that a failed test left open
         self.outside.destroy(linger=0)
 
     def turn(self):
-        """Once around the loop."""
+        """Run one turn of the loop."""
         poller = zmq.Poller()
         for each in (self.server, self.gate.socket):
             if each is not None:
@@ -72,19 +72,19 @@ class Door:
         self.changed += self.gate.tick()
 
     def until(self, condition, patience_s=PATIENCE_S):
-        """Serve until something is so; whether it became so."""
+        """Serve until a condition holds or the time is over; return True if it holds."""
         end_s = time.monotonic() + patience_s
         while not (so := condition()) and time.monotonic() < end_s:
             self.turn()
         return bool(so)
 
     def knock(self, pair, *, server=CENTRAL.public, options=(), text=b"hello"):
-        """Connect, and send when connected."""
+        """Connect a client and queue a text that it sends once connected."""
         keys = ClientKeys(pair, server) if pair else None
         client = sockets.client(self.outside, self.address, keys=keys)
         for option, value in options:
             client.setsockopt(option, value)
-        if options:  # they count for the next connection
+        if options:  # options apply to the next connection only
             client.disconnect(self.address)
             client.connect(self.address)
         self.monitors[client] = sockets.Monitor(client)
@@ -93,17 +93,17 @@ class Door:
         return client
 
     def say(self, client, text):
-        """Send something as soon as a client is connected."""
+        """Queue a text that a client sends as soon as it is connected."""
         self._unsaid.append((client, text))
 
     def reported(self, client):
-        """Wait until a client is told why it is not let in."""
+        """Wait until the monitor of a client reports a refused connection; return the reason."""
         lines = []
         assert self.until(lambda: lines.extend(self.monitors[client].read()) or lines)
         return lines[0]
 
     def admits(self, pair, **options):
-        """Whether a key is let in within a moment, and as what."""
+        """Identity of the client if its message arrives within ``MOMENT_S``, otherwise None."""
         text = random.randbytes(8)
         self.knock(pair, text=text, **options)
         self.until(lambda: any(came == text for came, _ in self.came), MOMENT_S)

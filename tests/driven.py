@@ -1,4 +1,4 @@
-"""Processing as a central node drives it, for tests: a small loop, measurements, and an application."""
+"""Image processing driven as in a central node: a small event loop, measurements and an application."""
 
 import select
 import time
@@ -40,7 +40,7 @@ def data(sensor="front", sequence=0, *, session_id=7, settings=SHORT, **changes)
 
 
 class Loop:
-    """Drives a `ImageProcessing`, and looks at its counts after every step."""
+    """An event loop that drives an `ImageProcessing` and checks its counts after every step."""
 
     def __init__(self, processing):
         self.processing = processing
@@ -107,20 +107,20 @@ def driven(**options):
 
 
 class Lines(EventLog):
-    """A log that is remembered: events and their fields."""
+    """An event log that keeps its events and their fields in a list."""
 
     def __init__(self, name):
         super().__init__(name)
         self.lines = []
 
-    def _log(self, level, event, fields):  # noqa: ARG002  as it is called
+    def _log(self, level, event, fields):  # noqa: ARG002  the signature of the base class
         self.lines.append((event, fields))
 
 
 class Application:
-    """A DEALER that subscribes as it is told to, message by message."""
+    """An application that subscribes with one message per call."""
 
-    running = set()  # noqa: RUF012  of all of them
+    running = set()  # noqa: RUF012  shared by all instances
 
     def __init__(self, address, keys=None):
         self._context = zmq.Context()
@@ -138,15 +138,15 @@ class Application:
         self._reported_names = message if isinstance(message, Subscribe) else None
         self._said_s = time.monotonic()
         try:
-            # To wait here for a publisher would hold up the loop that starts it.
+            # Waiting here for a publisher would block the loop that starts it.
             self.socket.send(encode(message), zmq.NOBLOCK)
         except zmq.Again:
             if self._reported_names is None:
                 raise
-            self._said_s = 0.0  # it is said again with the next step
+            self._said_s = 0.0  # `keep` repeats it with the next step
 
     def keep(self):
-        """Say again what was said last, as a subscriber does, which is forgotten otherwise."""
+        """Repeat the last subscription as a subscriber does, because it expires otherwise."""
         if self._reported_names is not None and time.monotonic() - self._said_s > 0.5:
             self.send(self._reported_names)
 

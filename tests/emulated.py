@@ -1,4 +1,4 @@
-"""What tests say to emulated devices, and what they take from them."""
+"""Commands to emulated devices, and parsers of their replies."""
 
 import json
 import queue
@@ -14,7 +14,7 @@ TIMEOUT_S = 20.0
 
 
 class Log(queue.Queue):
-    """A log whose lines can be waited for."""
+    """A log with a method that waits for lines."""
 
     def write(self, text):
         self.put(json.loads(text))
@@ -27,7 +27,7 @@ class Log(queue.Queue):
 
 
 class Numbered:
-    """Measurements whose words tell their number."""
+    """Measurements whose samples all equal their number."""
 
     def __len__(self):
         return 1_000_000

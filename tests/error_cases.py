@@ -1,4 +1,4 @@
-"""Scenes and plans that the error model is tested on, and images as good as exact."""
+"""Scenes and plans for the tests of the error model, and nearly exact images."""
 
 import functools
 
@@ -25,7 +25,7 @@ BEST = Accuracy(
     stopband_attenuation_db=140.0,
     focal_zones=1,
 )
-"""Stands for the exact image, from which it differs by -115 dB or less."""
+"""The plan of the reference image, which differs from the exact image by -115 dB or less."""
 
 
 def _plan(**changes):
@@ -33,7 +33,7 @@ def _plan(**changes):
 
 
 PLANS = {
-    # One part at a time, and then what a planner would choose.
+    # Each part of the error alone, then plans as a planner chooses them.
     **{
         f"delays {oversampling} {taps}": _plan(oversampling=oversampling, delay_taps=taps)
         for oversampling, taps in [(1, 2), (4, 1), (16, 1), (2, 2), (6, 2), (3, 3), (1, 4), (2, 4), (4, 4), (2, 6)]
@@ -64,12 +64,12 @@ def tuned_for(settings, plan):
 
 
 def kernels_for(plan):
-    """The processor's kernels, or NumPy's for 16 bits on a processor that has no dot product of them."""
+    """Kernels of the CPU, or those of NumPy for 16 bits if the processor has no 16-bit dot product."""
     return CPU if plan.precision != "int16" or CPU.tile_ranges else kernels.load("numpy")
 
 
 def image_of(measurement, settings):
-    """The image by a complete plan: (direction, range) float32."""
+    """Compute an image with a complete plan: (direction, range) float32."""
     chain = FastChain(settings, kernels_for(settings.accuracy), threads=1)
     image = np.empty((len(chain.grid), len(chain.range_m)), dtype=np.float32)
     chain.process(measurement.data.reshape(len(measurement.data), -1), image)
@@ -77,7 +77,7 @@ def image_of(measurement, settings):
 
 
 class Rated:
-    """A measurement, and what plans are predicted and measured to err by in its image."""
+    """A measurement with the predicted and the measured error of plans in its image."""
 
     def __init__(self, measurement, settings):
         self.measurement, self.settings = measurement, settings
@@ -85,7 +85,7 @@ class Rated:
         self._best = image_of(measurement, tuned_for(settings, BEST))
 
     def predicted(self, plan):
-        """What the planner expects, knowing what is heard."""
+        """Predict the error of a plan with the signal model of the measurement."""
         settings = tuned_for(self.settings, plan)
         return Planner(settings, kernels_for(plan), threads=1, signal_model=self.signal_model).chosen(plan)
 
@@ -95,7 +95,7 @@ class Rated:
 
 
 def random_measurement(seed):
-    """Some echoes in noise or none, within view or out of it, as some of eRTIS' microphones hear them."""
+    """Render echoes inside or outside the field of view, some with noise, for a random part of the eRTIS array."""
     random = np.random.default_rng(seed)
     layout = microphones(Array())
     heard = np.zeros(32, dtype=bool)

@@ -1,4 +1,4 @@
-"""Small files that the tests of storage, figures and command line share."""
+"""Small measurements and images, shared by the tests of storage, figures and command line."""
 
 import numpy as np
 
@@ -9,13 +9,13 @@ SMALL = Settings(recording=Recording(n_samples=40_960), processing=Processing(di
 
 
 def line(n_channels, word_bits):
-    """Settings of a line array."""
+    """Settings with a line array."""
     positions_m = tuple((0.0, 0.004 * channel, 0.0) for channel in range(n_channels))
     return SMALL.replace(array=Array(layout="line", positions_m=positions_m, word_bits=word_bits))
 
 
 def noise(settings=SMALL, count=3, seed=1):
-    """Measurements of noise whose stamps all differ."""
+    """Measurements of noise with different stamps."""
     array = settings.array
     n_words = -(-len(array.positions_m or range(32)) // array.word_bits)
     shape = (settings.recording.n_samples, n_words)[: 1 + (n_words > 1)]
@@ -37,7 +37,7 @@ def noise(settings=SMALL, count=3, seed=1):
 
 
 def image(azimuth_deg=None, elevation_deg=None, *, range_m=None, seed=1, settings=SMALL):
-    """An energyscape of speckle with one bright place."""
+    """An energyscape of speckle with one bright point."""
     azimuth_deg = np.linspace(-90, 90, 37) if azimuth_deg is None else np.asarray(azimuth_deg, dtype=float)
     elevation_deg = np.zeros_like(azimuth_deg) if elevation_deg is None else np.asarray(elevation_deg, dtype=float)
     range_m = np.linspace(0.5, 5.0, 400) if range_m is None else np.asarray(range_m, dtype=float)

@@ -1,4 +1,4 @@
-"""Recordings of few microphones, healthy and faulty, for the tests of health."""
+"""Recordings with healthy and faulty microphones, for the tests of array health."""
 
 import dataclasses
 import functools
@@ -27,7 +27,7 @@ ECHOES = (Point(range_m=0.5, strength_db=-20), Point(azimuth_deg=40, range_m=0.9
 
 
 def rendered(sensor=EIGHT, *points, **more):
-    """A measurement in which every effect acts."""
+    """Render a measurement with every effect on."""
     return Simulator(scene_of(*(points or ECHOES), sensor=sensor, **more), plan=only(*EFFECTS)).render()
 
 
@@ -42,7 +42,7 @@ def real():
 
 
 def with_bits(measurement, channel, bits):
-    """The measurement with other bits, (sample,) of 0 and 1, in one channel of 8-bit or 32-bit words."""
+    """Replace the bits of one channel, (sample,) of 0 and 1, in words of 8 or 32 bits."""
     words = measurement.data & ~words_bit(measurement, channel)
     return dataclasses.replace(measurement, data=words | (np.asarray(bits).astype(words.dtype) << channel))
 
@@ -52,7 +52,7 @@ def words_bit(measurement, channel):
 
 
 def modulated(signal, channel=0):
-    """The usual measurement with one channel that hears a signal of its own, by a first-order modulator."""
+    """The healthy measurement with another signal in one channel, converted by a first-order modulator."""
     total = np.floor(np.cumsum((1 + np.clip(signal, -1, 1)) / 2 + np.zeros(65_536)))
     return with_bits(sound(), channel, np.diff(total, prepend=0.0) > 0)
 
@@ -62,7 +62,7 @@ NOISE = 0.01 * np.random.default_rng(5).standard_normal(65_536)
 
 BY_HAND = {
     "stuck at 0": lambda: with_bits(sound(), 3, np.zeros(65_536)),
-    "stuck at 1": lambda: with_bits(sound(), 3, np.arange(65_536) % 10_000 > 0),  # with a glitch now and then
+    "stuck at 1": lambda: with_bits(sound(), 3, np.arange(65_536) % 10_000 > 0),  # with an occasional glitch
     "stuck in a pattern": lambda: with_bits(sound(), 3, np.arange(65_536) % 2),
     "offset": lambda: modulated(0.08 + NOISE + 0.05 * np.sin(2.5e5 * TIME_S), 3),
     "saturated": lambda: modulated(1.5 * np.sin(2.5e5 * TIME_S) * (TIME_S < 2.5e-3) + NOISE, 3),

@@ -1,4 +1,4 @@
-"""Journals that the tests of storing and sealing share."""
+"""Journals shared by the tests of storing and sealing."""
 
 import os
 import shutil
@@ -20,7 +20,7 @@ EPOCH = 5
 
 
 def entries(count=3, *, sensor="left", first=10, settings=TINY, session_id=EPOCH, seed=1):
-    """Measurements of noise whose stamps all differ, as they would arrive."""
+    """Journal entries of noise with different stamps, in order of arrival."""
     made = []
     for number, measurement in enumerate(noise(settings, count, seed)):
         stamp = replace(measurement.stamp, sensor=sensor, sequence=first + number, session_id=session_id)
@@ -29,7 +29,7 @@ def entries(count=3, *, sensor="left", first=10, settings=TINY, session_id=EPOCH
 
 
 def both():
-    """Measurements of two sensors in turn, the first one in changing air."""
+    """Alternating measurements of two sensors; the air of the first one changes."""
     left, right = entries(), entries(2, sensor="right", first=0, seed=2)
     warm = TINY.replace(air=Air(temperature_c=31.5, humidity_percent=12.0, pressure_pa=99_000.0))
     left[1] = replace(left[1], measurement=replace(left[1].measurement, settings=warm))
@@ -37,7 +37,7 @@ def both():
 
 
 def create(folder, given=None, *, name="rec.h5", target=None, settings=TINY):
-    """An open journal of ``rec.h5`` with measurements, each in a commit of its own."""
+    """Create a journal of ``rec.h5`` and append measurements, each in its own commit; return the open journal."""
     journal = Journal.create(folder / f"{name}{SUFFIX}", target=name if target is None else target, source="test")
     for entry in entries() if given is None else given:
         sensor = entry.measurement.stamp.sensor
@@ -48,18 +48,18 @@ def create(folder, given=None, *, name="rec.h5", target=None, settings=TINY):
 
 
 def crashed(folder, given=None, *, moment="log", **options):
-    """The path of a journal as a process leaves it that is killed.
+    """Create a journal in the state that a killed process leaves; return its path.
 
-    With a ``log`` that is not yet in the main file; or, where commits do without, ``between`` two, or in mid
-    ``commit``.
+    The process ends with a write-ahead ``log`` not yet in the main file. In rollback mode it ends ``between`` two
+    commits, or in the middle of a ``commit``.
     """
     (folder / "running").mkdir()
     with create(folder / "running", given, **options) as journal:
-        execute = journal._database.execute  # noqa: SLF001  nobody else can ask
+        execute = journal._database.execute  # noqa: SLF001  no public access
         if moment != "log":
-            journal._database.use_rollback_journal()  # noqa: SLF001  without 4 MB to commit
+            journal._database.use_rollback_journal()  # noqa: SLF001  otherwise 4 MB would be needed
         if moment == "commit":
-            execute("PRAGMA cache_size = 1")  # what does not fit is written before the commit
+            execute("PRAGMA cache_size = 1")  # SQLite writes pages beyond the cache before the commit
             execute("BEGIN")
             execute("UPDATE measurements SET crc32 = 0")
             execute("INSERT INTO gaps SELECT NULL, 1, 1, 1, 1, 'x', 0 FROM measurements, sensors")
@@ -72,7 +72,7 @@ def crashed(folder, given=None, *, moment="log", **options):
 
 
 def same(came, wanted):
-    """Whether an entry that was read is another one to the last bit, and has its CRC-32."""
+    """Compare an entry that was read with the original, bit by bit; check its CRC-32."""
     words = [np.ascontiguousarray(entry.measurement.data) for entry in (came, wanted)]
     return (
         (came.monotonic_ns, came.measurement.stamp) == (wanted.monotonic_ns, wanted.measurement.stamp)
@@ -84,6 +84,6 @@ def same(came, wanted):
 
 
 def python(code, *arguments, **options):
-    """Run Python in a process of its own."""
+    """Run Python code in a new process."""
     command = [sys.executable, "-c", code, *map(str, arguments)]
     return subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, check=False, **options)

@@ -1,4 +1,4 @@
-"""Kernels of any device called with arrays of NumPy, so that one table of cases serves all of them."""
+"""Kernels of any device, called with NumPy arrays, to share one table of test cases."""
 
 import functools
 
@@ -10,7 +10,7 @@ __all__ = ["KERNELS", "SIMULATED", "on_device", "sized"]
 
 
 class _OnDevice:
-    """A kernel set whose kernels take arrays of the host; all else is the kernel set's."""
+    """A kernel set whose kernels accept host arrays; other attributes are passed through."""
 
     def __init__(self, kernel_set):
         self._kernel_set = kernel_set
@@ -22,7 +22,7 @@ class _OnDevice:
         return functools.partial(self._run, found) if is_kernel else found
 
     def _run(self, kernel, *arguments):
-        """Copy arrays to the device, run, and copy back what may have been written."""
+        """Copy arrays to the device, run the kernel, and copy writable arrays back."""
         lane = self._memory.lane()
         here = [self._memory.table(each) if isinstance(each, np.ndarray) else each for each in arguments]
         with lane.entered():
@@ -34,7 +34,7 @@ class _OnDevice:
 
 
 def on_device(kernel_set):
-    """Return a kernel set whose kernels take arrays of NumPy."""
+    """Return a kernel set whose kernels accept NumPy arrays."""
     return _OnDevice(kernel_set) if kernel_set.device == "cuda" else kernel_set
 
 
@@ -43,5 +43,5 @@ SIMULATED = any(kernel_set.simulated for kernel_set in KERNELS.values())
 
 
 def sized(small, large):
-    """Return small and large cases, but in the simulator, which takes 0.2 ms per thread of the GPU, the small ones."""
+    """Return small and large cases, or only small ones in the simulator, which takes 0.2 ms per GPU thread."""
     return list(small) if SIMULATED else [*small, *large]

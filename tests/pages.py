@@ -1,4 +1,4 @@
-"""Running what pages say."""
+"""Tools that run the commands and code of documentation pages."""
 
 import contextlib
 import os
@@ -29,11 +29,11 @@ __all__ = [
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 GUIDE = sorted(path for path in DOCS.rglob("*.md") if path.parent.name not in {"decisions", "upstream"})
-"""Pages of the guide, in all of its folders; their names are unique."""
+"""Paths of all pages of the guide; page names are unique across its folders."""
 
 
 def path_of(name):
-    """Return the path of a page of the guide, whose folder the name leaves out."""
+    """Return the path of a page of the guide, given its name without the folder."""
     (path,) = (each for each in GUIDE if each.stem == name)
     return path
 
@@ -53,7 +53,7 @@ def run(place, *command):
 
 @contextlib.contextmanager
 def in_background(place, command):
-    """Run a command that ends with ``&`` until the block ends; it has told its ports when the block begins."""
+    """Run a command that ends with ``&`` until the block ends; wait for its port names first."""
     words = [sys.executable, "-m", "ertis_cli.main", *command.removesuffix("&").split()]
     with subprocess.Popen(words, cwd=place, env=environment(place), stdout=subprocess.PIPE, text=True) as process:
         try:
@@ -65,7 +65,7 @@ def in_background(place, command):
 
 
 def run_here(place, command):
-    """Run a command in this process, which takes less to start."""
+    """Run a command in this process, which is faster than starting one."""
     with contextlib.chdir(place):
         done = CliRunner().invoke(cli, shlex.split(command))
     assert done.exit_code == 0, (command, done.stderr, done.exception)

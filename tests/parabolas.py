@@ -1,4 +1,4 @@
-"""Maxima between bins, one at a time: parabolas, and what they err by for a reflector where they put it."""
+"""Reference implementation of peak interpolation: parabolas, corrected by their error for a point reflector."""
 
 import functools
 import math
@@ -53,7 +53,7 @@ def amplitude(settings, direction_offset, range_offset_m):
 
 @functools.cache
 def waves_of(settings):
-    """Wave numbers and power of the call, and where microphones are."""
+    """Wave numbers, normalised power spectrum of the call, and microphone positions."""
     n_fft = 2048
     matched = matched_filter_spectrum(settings, n_fft=n_fft)
     frequency_hz = (matched.first_bin + np.arange(len(matched.values))) * settings.signal_rate_hz / n_fft
@@ -72,7 +72,7 @@ def parabolas(logs, offsets):
 
 
 def quadric_top(offsets, rises):
-    """Top of a quadric through samples around 0: its place and its rise."""
+    """Offset and rise of the maximum of a quadric through samples around 0."""
     none = np.zeros(3), 0.0
     reach = np.max(np.linalg.norm(offsets, axis=1))
     if len(offsets) < 3 or np.linalg.norm(offsets.mean(axis=0)) > 0.25 * reach:

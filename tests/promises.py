@@ -1,7 +1,7 @@
-"""Times that are promised, on machines as quick as those they were promised for, and on slower ones.
+"""Documented time limits, scaled for slower machines.
 
-They were promised for one that imports what all commands need in some 0.4 s, which is an estimate: on that machine
-nobody measured it. Where that takes longer, so may all else.
+The limits apply to a machine that imports the libraries of all commands in 0.4 s. That time is an estimate, not a
+measurement. A machine with slower imports may take proportionally longer.
 """
 
 import functools
@@ -16,7 +16,7 @@ IMPORTS_S = 0.4
 
 
 def best_s(once, *, times, promised_s):
-    """Seconds of the quickest of some runs, on a machine as quick as promised; none follows one that was."""
+    """Seconds of the fastest run, scaled to the assumed machine; stop after the first run within the limit."""
     best = np.inf
     for _ in range(times):
         start = time.perf_counter()
@@ -29,7 +29,7 @@ def best_s(once, *, times, promised_s):
 
 @functools.cache
 def slowness():
-    """How many times longer than promised this machine takes for what it has to do anyway; 1 at least."""
+    """Import time on this machine relative to the assumed one, at least 1."""
     taken_s = []
     for _ in range(5):
         start = time.perf_counter()

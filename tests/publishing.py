@@ -1,4 +1,4 @@
-"""A publisher that does what a test tells it: the protocol of applications, without what makes images."""
+"""A publisher for tests: the protocol of applications without image processing."""
 
 import contextlib
 import threading
@@ -21,11 +21,11 @@ SETTINGS = Settings(processing=Processing(directions="2d:31", range_m=(0.5, 3.0)
 RANGE_M = np.arange(0.5, 3.0, 0.01)
 ALL = ("energyscape", "points", "raw", "group", "status")
 PATIENCE_S = 20.0
-PART = 5_000  # bytes of a frame: images come in several
+PART = 5_000  # bytes per frame: images take several frames
 
 
 def image(sequence=0, *, sensor="front", reflectors=(), sync_count=None, **stamp):
-    """An image with reflectors: (azimuth in degrees, range in m, amplitude)."""
+    """An image with reflectors, each given by azimuth in degrees, range in m and amplitude."""
     grid = direction_grid(SETTINGS.processing)
     amplitude = np.full((len(grid), len(RANGE_M)), 1e-4, np.float32)
     for azimuth_deg, range_m, peak in reflectors:
@@ -65,7 +65,7 @@ def status(**fields):
 
 @dataclass
 class Peer:
-    """A subscriber, as the publisher knows it."""
+    """State of a subscriber in the publisher."""
 
     wanted: messages.Subscribe
     before: int = 0
@@ -80,7 +80,7 @@ class Peer:
 
 
 class Publisher:
-    """Serves while `pump` runs, or in a thread of its own by `playing`."""
+    """A publisher that serves while `pump` runs, or in its own thread within `playing`."""
 
     translation_m = (1.0, 2.0, 3.0)
     rotation_xyzw = (0.0, 0.0, 1.0, 0.0)
@@ -103,7 +103,7 @@ class Publisher:
         self._context.destroy(linger=0)
 
     def pump(self, until, *, within_s=PATIENCE_S):
-        """Serve until something is so; fail if it is not in time."""
+        """Serve until a condition holds; fail after ``within_s``."""
         end_s = time.monotonic() + within_s
         while not until():
             assert time.monotonic() < end_s, "it did not come to that"
@@ -129,7 +129,7 @@ class Publisher:
                 self.notify(peer, messages.Pong(state="processing"))
 
     def notify(self, peer, message, *payload):
-        with contextlib.suppress(zmq.ZMQError):  # who has left
+        with contextlib.suppress(zmq.ZMQError):  # the peer has left
             self._socket.send_multipart([peer, messages.encode(message), *payload])
 
     def tell_all(self, message, *payload):
@@ -141,7 +141,7 @@ class Publisher:
             self._socket.send_multipart([peer, *frames])
 
     def publish(self, item, **changes):
-        """Send an item to whoever wants it and has credit; drop it otherwise. ``changes`` spoil its header."""
+        """Send an item to subscribers with credit, or count it as dropped; ``changes`` alter its header."""
         for key, peer in self.peers.items():
             sensor = item.stamp.sensor if hasattr(item, "stamp") else None
             if kind_of(item) not in peer.wanted.products or (
@@ -202,7 +202,7 @@ class Publisher:
 
     @contextlib.contextmanager
     def playing(self, items):
-        """Publish items, each when everybody can take it, from when there is a subscriber until the block ends."""
+        """Publish items from the first subscription on, each once all subscribers have credit, until the block ends."""
         ended = threading.Event()
         failed = []
 
@@ -213,7 +213,7 @@ class Publisher:
                     self.pump(lambda: ended.is_set() or all(peer.has_room for peer in self.peers.values()))
                     self.publish(item)
                 self.pump(ended.is_set, within_s=3 * PATIENCE_S)
-            except Exception as error:  # noqa: BLE001  the test's thread is to know
+            except Exception as error:  # noqa: BLE001  reported in the test's thread
                 failed.append(error)
 
         thread = threading.Thread(target=play)
@@ -236,7 +236,7 @@ def subscribed(publisher, count=1):
 
 
 def got(publisher, subscriber):
-    """Return what the subscriber receives next while the publisher serves."""
+    """Serve until the subscriber receives an item; return it."""
     items = []
 
     def came():

@@ -1,8 +1,8 @@
-"""The referees: slow, obvious, float64, and independent of kernels and stages.
+"""Reference implementations: slow, simple, in float64, and independent of kernels and stages.
 
-`exact` is the image that the fast chain approximates. It never decimates: the spectrum of the bits themselves is
-matched, delayed by exact phase shifts and evaluated at the asked ranges. `paper` is the image of the paper's
-algorithm. The plain functions below them say what each kernel should do.
+`exact` computes the image that the fast chain approximates, without decimation. It applies the matched filter to the
+spectrum of the bits, delays it by exact phase shifts, and evaluates it at the given ranges. `paper` computes the image
+of the paper's algorithm. The other functions are the references of single kernels.
 """
 
 import functools
@@ -21,12 +21,12 @@ from ertis_numba.waveform import call_at
 
 
 def error_db(image, exact) -> float:
-    """Difference of two images in dB of the exact one's norm."""
+    """Norm of the difference relative to the norm of the exact image, in dB."""
     return float(20 * np.log10(np.linalg.norm(image - exact) / np.linalg.norm(exact)))
 
 
 def exact(words, settings: Settings, directions, range_m, *, spherical=False, delay_rate_hz=None):
-    """The exact image: (direction, range) float64.
+    """Compute the exact image: (direction, range) float64.
 
     Parameters
     ----------
@@ -34,19 +34,19 @@ def exact(words, settings: Settings, directions, range_m, *, spherical=False, de
     directions : (direction, axis) unit vectors
     range_m : (range,)
     spherical : bool
-        Delays of points at their ranges instead of plane waves.
+        Use the delays of points at their ranges instead of those of plane waves.
     delay_rate_hz : float
-        Round the delays of plane waves to whole samples of this rate.
+        Round the delays of plane waves to integer samples at this rate.
     """
     given = [np.ascontiguousarray(values) for values in (words, directions, range_m)]
-    # Devices and plans share the exact image of their words: plans are about how it is approximated.
+    # The cache ignores device and plan, which only change the approximation of the exact image.
     sensor = settings.array, settings.call, settings.recording, settings.air
     given.append(array_weights(settings))
     return _exact(*map(_Same, given), *sensor, spherical, delay_rate_hz)
 
 
 class _Same:
-    """An array that equals others of the same bytes."""
+    """A hashable array that equals arrays of the same bytes, for use as a cache key."""
 
     def __init__(self, values):
         self.values = values
@@ -80,9 +80,9 @@ def _exact(words, directions, range_m, weights, array, call, recording, air, sph
 
 
 def paper(words, settings: Settings, directions):
-    """The image of the paper's algorithm, and its range axis: (direction, range), (range,) float64.
+    """Compute the image of the paper's algorithm and its range axis: (direction, range), (range,) float64.
 
-    Filters, correlation and low pass in the time domain, one microphone and one direction at a time.
+    All filters and correlations work in the time domain, on one microphone and one direction at a time.
     """
     layout = microphones(settings.array)
     rate_hz, speed_m_s = settings.signal_rate_hz, sound_speed_m_s(settings.air)
@@ -118,7 +118,7 @@ def paper(words, settings: Settings, directions):
 
 
 def _paper_filters(signal, settings):
-    """Demodulate: Butterworth low pass, every decimation-th sample, Butterworth band pass."""
+    """Apply a Butterworth low pass, decimate, and apply a Butterworth band pass."""
     rate_hz, call = settings.signal_rate_hz, settings.call
     low_pass_hz = max(100e3 / 450e3 * rate_hz, call.high_frequency_hz)
     low_pass = scipy.signal.butter(6, low_pass_hz, fs=settings.recording.sample_rate_hz, output="sos")
@@ -129,7 +129,7 @@ def _paper_filters(signal, settings):
 
 
 def _paper_low_pass(settings):
-    """The envelope's low pass, Butterworth as well, and by how many samples it is late."""
+    """Design the Butterworth low pass of the envelope; return its sections and its delay in samples."""
     cutoff_hz = min(settings.output_rate_hz / 2, settings.call.low_frequency_hz)
     sections = scipy.signal.butter(6, cutoff_hz, fs=settings.signal_rate_hz, output="sos")
     impulse = scipy.signal.sosfilt(sections, np.eye(1, 100_000)[0])
@@ -137,13 +137,13 @@ def _paper_low_pass(settings):
 
 
 def decimate(signals, taps, factor):
-    """Every factor-th sample of the filtered signals, late by the filter's group delay."""
+    """Filter and decimate signals; the result is late by the filter's group delay."""
     filtered = [np.convolve(signal.astype(float), taps.astype(float))[: len(signal)] for signal in signals]
     return np.stack(filtered)[:, ::factor]
 
 
 def delay_and_sum(signals, offsets, weights, n_ranges):
-    """The complex beams: (direction, range) complex128."""
+    """Compute the complex beams: (direction, range) complex128."""
     flat = signals.reshape(-1).astype(complex)
     beams = np.zeros((len(offsets), n_ranges), dtype=complex)
     for direction, (starts, factors) in enumerate(zip(offsets, weights.astype(complex), strict=True)):
@@ -153,35 +153,35 @@ def delay_and_sum(signals, offsets, weights, n_ranges):
 
 
 def delayed(signals, offsets, weights, n_ranges):
-    """The weighted samples that a direction's beams are made of: (direction, mic, range) complex128."""
+    """Select and weight the samples of each beam: (direction, mic, range) complex128."""
     flat = signals.reshape(-1).astype(complex)
     return flat[offsets[:, :, None] + np.arange(n_ranges)] * weights.astype(complex)[:, :, None]
 
 
 def coherence_factor(signals, offsets, weights, n_ranges):
-    """Delay-and-sum times the coherent by the total power: (direction, range) float64; no silence, please."""
+    """Delay-and-sum times coherent / total power: (direction, range) float64; signals must not be 0."""
     return np.stack([referee.coherence_factor(y) for y in delayed(signals, offsets, weights, n_ranges)])
 
 
 def dmas(signals, offsets, weights, order, n_ranges):
-    """The products of all choices of microphones, written out: (direction, range) float64; no silence, please."""
+    """Sum of products over all combinations of microphones: (direction, range) float64; signals must not be 0."""
     z = delayed(signals / np.abs(signals).astype(float) ** (1 - 1 / order), offsets, weights, n_ranges)
     return np.stack([math.comb(len(rows), order) * referee.dmas(rows, order) for rows in z])
 
 
 def capon(signals, offsets, weights, n_snapshots, loading, n_ranges):
-    """The weights of least variance from the whole covariance: (direction, range) float64; no silence, please."""
+    """Capon beams from the full covariance matrix: (direction, range) float64; signals must not be 0."""
     return np.stack([referee.capon(y, n_snapshots, loading) for y in delayed(signals, offsets, weights, n_ranges)])
 
 
 def interpolated_beams(signals, offsets, weights, places, tap_weights, rows, n_ranges):
-    """Beams of nodes, and of pairs of them those of all directions: (direction, range) complex128."""
+    """Beams of the beam grid, interpolated to all directions: (direction, range) complex128."""
     nodes = delay_and_sum(signals, offsets, weights, n_ranges)
     return _of_pairs(nodes, places, tap_weights, rows)
 
 
 def interpolated_whole_beams(tile, offsets, weights, places, tap_weights, rows, n_ranges):
-    """The same from one tile of whole numbers, whose nodes keep their upper 16 bits: (direction, range) complex128.
+    """Interpolated beams from an integer tile; grid beams keep their upper 16 bits: (direction, range) complex128.
 
     Parameters
     ----------
@@ -198,7 +198,7 @@ def interpolated_whole_beams(tile, offsets, weights, places, tap_weights, rows, 
 
 
 def _of_pairs(nodes, places, tap_weights, rows):
-    """Sums of pairs of neighbours, each put into its row: (direction, range) complex128."""
+    """Interpolate beams between neighbouring grid points, each into its row: (direction, range) complex128."""
     beams = np.zeros((len(rows), nodes.shape[1]), dtype=complex)
     for pair, k in np.ndindex(tap_weights.shape[1:]):
         beams[rows] += tap_weights[:, pair, k, None].astype(float) * nodes[places[:, pair] + k]

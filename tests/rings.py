@@ -1,4 +1,4 @@
-"""A ring of microphones that give PCM, and what it hears of two points."""
+"""A ring of PCM microphones, and its simulated measurement of two points."""
 
 import numpy as np
 
@@ -24,7 +24,7 @@ POINTS = (
 
 
 def sensor_of(settings, **more):
-    """A scene's sensor with such settings."""
+    """A sensor of a scene with the given settings."""
     fields = {name: getattr(settings, name) for name in settings.__struct_fields__}
     return Sensor(**fields, **more)
 

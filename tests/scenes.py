@@ -1,4 +1,4 @@
-"""Small scenes, and what the tests of the simulator measure in them."""
+"""Small scenes and measurement functions for the tests of the simulator."""
 
 import numpy as np
 
@@ -24,7 +24,7 @@ SPEED_M_S = sound_speed_m_s(SENSOR.air)
 
 
 def only(*names):
-    """A plan of some effects and of those that cannot be left out, whatever the scene calls for."""
+    """A plan with the given effects and the indispensable ones, whatever the scene needs."""
     return EffectPlan(
         tuple(
             Verdict(name=name, on=name in names or name in INDISPENSABLE, reason="a test asks for it", estimate_db=None)
@@ -34,7 +34,7 @@ def only(*names):
 
 
 def line_array(n_mics, spacing_m):
-    """Microphones along y, about the origin."""
+    """A line of microphones along y, centred on the origin."""
     places_m = spacing_m * (np.arange(n_mics) - (n_mics - 1) / 2)
     return Array(layout="line", positions_m=tuple((0.0, float(y), 0.0) for y in places_m), word_bits=64)
 
@@ -45,13 +45,13 @@ def heard(scene, *names, index=0, sensor=None):
 
 
 def ways(scene, *names, index=0, sensor=None, frequency_hz=(40_000.0,)):
-    """What arrives of calls with some effects."""
+    """Arrivals of the calls with the given effects."""
     shot = snapshot(scene, scene.sensor(sensor), index / scene.rate_hz)
     return arrivals(shot, {*names, *INDISPENSABLE}, np.asarray(frequency_hz, dtype=np.float64), CostStopwatch())
 
 
 def sorted_ways(scene, *names, **options):
-    """Delay and amplitude of all that the first microphone hears, in the order of time: both (path,) float64."""
+    """Delay and amplitude of all arrivals at the first microphone, sorted by delay: both (path,) float64."""
     found = ways(scene, *names, **options)
     delay_s = np.concatenate([np.zeros(0), *(entry.delay_s[:, 0] for entry in found)])
     amplitude = np.concatenate([np.zeros(0), *(entry.amplitude[:, 0, 0] for entry in found)])
@@ -60,12 +60,12 @@ def sorted_ways(scene, *names, **options):
 
 
 def seen(scene, *names, index=0, sensor=None):
-    """The truth with some effects, strongest first."""
+    """Reflectors of the ground truth with the given effects, strongest first."""
     return Simulator(scene, sensor=sensor, plan=only(*names)).reflectors(index)
 
 
 def written_out(call, delay_s, amplitude, n_samples, stretch=1.0):
-    """The obvious renderer: copies of the call, evaluated at the times of the samples: (mic, sample) float64.
+    """Render by summing copies of the call, evaluated at the sample times: (mic, sample) float64.
 
     Parameters
     ----------
@@ -79,36 +79,36 @@ def written_out(call, delay_s, amplitude, n_samples, stretch=1.0):
 
 
 def error_db(found, wanted):
-    """Power of the difference beside that of what is wanted."""
+    """Power of the difference relative to the power of ``wanted``, in dB."""
     return 10 * np.log10(np.sum((found - wanted) ** 2) / np.sum(wanted**2) + 1e-30)
 
 
 def spectrum_at(signal, frequency_hz):
-    """The spectrum of a signal at any frequencies: (frequency,) complex128."""
+    """Spectrum of a signal at arbitrary frequencies: (frequency,) complex128."""
     time_s = np.arange(len(signal)) / RATE_HZ
     return np.exp(-2j * np.pi * np.outer(frequency_hz, time_s)) @ signal
 
 
 def filtered(before, after):
-    """Amplitude that an effect leaves of each of ``BAND_HZ`` in the first microphone's signal."""
+    """Gain of an effect at each frequency of ``BAND_HZ`` in the first microphone's signal."""
     return np.abs(spectrum_at(after[0], BAND_HZ) / spectrum_at(before[0], BAND_HZ))
 
 
 def bits_of(measurement):
-    """The bits of every channel as (channel, sample) of +1 and −1."""
+    """Unpack the bits of every channel: (channel, sample) of +1 and −1."""
     words = measurement.data.reshape(len(measurement.data), -1)
     octets = words.astype(words.dtype.newbyteorder("<")).view(np.uint8)
     return 2.0 * np.unpackbits(octets, axis=1, bitorder="little").T - 1.0
 
 
 def arrival_s(signal, call, near_s):
-    """Find the call in a signal: the peak of the correlation with itself, to a small part of a sample."""
+    """Arrival time of the call in a signal, from the correlation peak, to a small fraction of a sample."""
     n = 2 * len(signal)
     frequency_hz = np.fft.rfftfreq(n, 1 / RATE_HZ)
     inside = (frequency_hz > call.low_frequency_hz) & (frequency_hz < call.high_frequency_hz)
     replica = np.fft.rfft(call_at(call, np.arange(len(signal)) / RATE_HZ), n)
     product = np.where(inside, np.fft.rfft(signal, n) * np.conj(replica), 0)
-    for _ in range(4):  # Newton's steps to the maximum of the exact correlation
+    for _ in range(4):  # Newton steps to the maximum of the exact correlation
         turn = 2j * np.pi * frequency_hz
         turned = product * np.exp(turn * near_s)
         near_s -= np.sum(turned * turn).real / np.sum(turned * turn**2).real
@@ -116,16 +116,16 @@ def arrival_s(signal, call, near_s):
 
 
 def scene_of(*points, sensor=SENSOR, **more):
-    """A scene of one sensor and some points."""
+    """A scene with one sensor and the given points."""
     return Scene(seed=7, sensors=(sensor,), points=points, **more)
 
 
 def listener_and_emitter(receiver_m, mouth_m, **more):
-    """A scene whose first sensor hears the second only."""
+    """A scene with a silent receiver and a second sensor that transmits."""
     receiver = EAR.replace(position_m=vector(receiver_m), emitter=Emitter(silent=True))
     return Scene(sensors=(receiver, EAR.replace(name="mouth", position_m=vector(mouth_m))), **more)
 
 
 def vector(values):
-    """Plain numbers, as scenes hold them."""
+    """Convert values to a tuple of Python floats, as scenes require."""
     return tuple(float(value) for value in values)

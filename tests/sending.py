@@ -1,4 +1,4 @@
-"""A sensor node whose notes and acks can be waited for, and what a stand-in of a central node got of it."""
+"""A sensor node that queues its notes and acks, and checks of the messages that a stand-in received."""
 
 import queue
 import threading
@@ -18,7 +18,7 @@ SOON_S = 20.0
 
 @pytest.fixture
 def impatient(monkeypatch):
-    """What takes seconds takes fractions of one."""
+    """Shorten all timeouts to fractions of a second."""
     for module, name, value in (
         (link, "_PING_S", 0.05),
         (link, "_DEAD_S", 0.5),
@@ -35,7 +35,7 @@ IMPATIENT = pytest.mark.usefixtures("impatient")
 
 
 class Node(SensorNode):
-    """A sensor node of one sensor, whose notes and acks can be waited for."""
+    """A sensor node of one sensor that puts notes and acks into queues."""
 
     def __init__(self, address, sensors=("left",), **options):
         self.notes, self.acks = queue.Queue(), queue.Queue()
@@ -45,7 +45,7 @@ class Node(SensorNode):
 
 
 def until(condition):
-    """Wait until something is so."""
+    """Wait until a condition holds."""
     end_s = time.monotonic() + SOON_S
     while not condition():
         assert time.monotonic() < end_s
@@ -53,7 +53,7 @@ def until(condition):
 
 
 def same(held, wanted):
-    """Whether a central node has what was given, with everything that belongs to it."""
+    """Compare a measurement held by the central node with the original, including all fields."""
     message, words = held
     entry, stamp, air = wanted, wanted.measurement.stamp, wanted.measurement.settings.air
     return words == entry.measurement.data.tobytes() and message == messages.Data(

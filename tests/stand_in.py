@@ -1,4 +1,4 @@
-"""A small central node for tests of sensor nodes, which loses and reorders what it says, and dies."""
+"""A small central node for tests of sensor nodes, which can lose and reorder its acks, and stop."""
 
 import queue
 import random
@@ -15,27 +15,27 @@ TURN_MS = 20
 
 
 class StandIn:
-    """Takes what sensor nodes send, as the wire format wants it: the next number, or a gap that begins there.
+    """A central node that accepts the next sequence number, or a gap that begins there, as the wire format requires.
 
     Attributes
     ----------
-    held : dict of (sensor, epoch) to dict
-        Header and words of each measurement by its number.
-    gaps : dict of (sensor, epoch) to list
-        First, last and reason.
+    held : dict of (sensor, session) to dict
+        Header and samples of each measurement by its sequence number.
+    gaps : dict of (sensor, session) to list
+        First number, last number and reason of each gap.
     wrong : list of str
-        What no sensor node should do.
+        Violations of the protocol by sensor nodes.
     """
 
     def __init__(self, *, seed=0, acks="stored", window=16, keys=None, max_bytes=sockets.MAX_BYTES):
         self.random = random.Random(seed)
         self.held, self.gaps, self.acked_through, self.wrong = {}, {}, {}, []
         self.acks, self.window, self.state, self.text = acks, window, "storage", ""
-        self.dropped = ()  # told with the next ack
+        self.dropped = ()  # reported with the next ack
         self.max_runs, self.forget_peers = 1000, threading.Event()
         self.silent, self.version = False, messages.VERSION
-        self.ignored = 0.0  # share of measurements
-        self.lost = self.repeated = self.late = 0.0  # shares of acks
+        self.ignored = 0.0  # share of measurements that are ignored
+        self.lost = self.repeated = self.late = 0.0  # shares of acks that are lost, repeated or delayed
         self.refusal = lambda _message: None
         self.hellos, self.seen = queue.Queue(), set()
         self.taken = self.resent = self.connections = 0
@@ -52,14 +52,14 @@ class StandIn:
         self.stop()
 
     def start(self):
-        """Listen; at the same port as before."""
+        """Start to listen, after a restart at the same port."""
         self._end, ready = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._serve, args=(ready,))
         self._thread.start()
         assert ready.wait(10)
 
     def stop(self, *, forget=False):
-        """Die, without a word; what is held stays, but for its memory."""
+        """Stop without any message; stored data stays, and ``forget`` clears the acknowledged numbers."""
         if self._thread is not None:
             self._end.set()
             self._thread.join()

@@ -1,4 +1,4 @@
-"""Commands in a pseudo terminal, and what somebody sees there."""
+"""Commands in a pseudo terminal, and the text visible on its screen."""
 
 import fcntl
 import os
@@ -15,12 +15,12 @@ from tests.pages import environment
 __all__ = ["Terminal", "seen"]
 
 PATIENCE_S = 60.0
-# What Ctrl-C is to reach has the terminal as its own.
+# Ctrl-C only reaches processes whose controlling terminal this is.
 BEGIN = "import fcntl, termios; fcntl.ioctl(2, termios.TIOCSCTTY, 0)\n"
 
 
 class Terminal:
-    """Python code whose stderr is a terminal; its stdin is a pipe, and its stdout is the same terminal or a pipe."""
+    """Python code in a process: stderr is a terminal, stdin a pipe, and stdout the same terminal or a pipe."""
 
     def __init__(self, code, place, *arguments, columns=100, piped=False, **variables):
         self._columns, self._read_so_far = columns, b""
@@ -48,14 +48,14 @@ class Terminal:
         os.close(self._end)
 
     def until(self, pattern):
-        """Read until this is shown."""
+        """Read until the output matches a pattern."""
         end_s = time.monotonic() + PATIENCE_S
         while not re.search(pattern, self.shown):
             assert self._read(), self.shown
             assert time.monotonic() < end_s, self.shown
 
     def go_on(self):
-        """Let code that waits for a line read one."""
+        """Send a line to the code's stdin."""
         self._process.stdin.write("\n")
         self._process.stdin.flush()
 
@@ -66,7 +66,7 @@ class Terminal:
         self._process.terminate()
 
     def finish(self):
-        """Wait for its end; return the exit code, and stdout if that is a pipe."""
+        """Wait for the process to end; return the exit code, and stdout if that is a pipe."""
         while self._read():
             pass
         reported, _ = self._process.communicate(timeout=PATIENCE_S)
@@ -81,7 +81,7 @@ class Terminal:
         return seen(self.shown, self._columns)
 
     def _read(self):
-        with suppress(OSError):  # which is how a terminal ends
+        with suppress(OSError):  # raised when the terminal is closed
             octets = os.read(self._end, 65_536)
             self._read_so_far += octets
             return bool(octets)
@@ -89,7 +89,7 @@ class Terminal:
 
 
 def seen(shown, columns):
-    """Return the lines down to the last that is on the screen after all that was written to it, colours apart."""
+    """Return the lines of the screen after all output, without colours and trailing empty lines."""
     lines, row, column = [""], 0, 0
     for match in re.finditer(r"\x1b\[([?\d;]*)([A-Za-z])|.", shown, re.DOTALL):
         character, (number, order) = match[0], match.groups()

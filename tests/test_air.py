@@ -1,4 +1,4 @@
-"""The speed of sound and absorption against tabulated values."""
+"""Speed of sound and absorption compared with tabulated values."""
 
 import math
 
@@ -25,7 +25,7 @@ def test_speed_of_sound_in_dry_air_matches_tables(temperature_c, speed_m_s):
 
 
 def speed_by_cramer_m_s(temperature_c, humidity_percent, pressure_pa=101_325.0, carbon_dioxide=314e-6):
-    """Return the fit of O. Cramer, JASA 93 (1993), to real gases at 0 to 30 °C: an independent route."""
+    """Return O. Cramer's fit to real gases at 0 to 30 °C, JASA 93 (1993), which is independent of our equations."""
     t, p, xc, kelvin = temperature_c, pressure_pa, carbon_dioxide, temperature_c + 273.15
     enhancement = 1.00062 + 3.14e-8 * p + 5.6e-7 * t**2
     saturation_pa = math.exp(1.2811805e-5 * kelvin**2 - 1.9509874e-2 * kelvin + 34.04926034 - 6.3536311e3 / kelvin)
@@ -51,24 +51,24 @@ def test_speed_of_sound_in_humid_air_matches_tables(temperature_c, humidity_perc
     assert sound_speed_m_s(air) == pytest.approx(speed_by_cramer_m_s(temperature_c, humidity_percent), rel=5e-4)
 
 
-def test_humidity_adds_at_most_0_4_percent_at_room_temperature():
+def test_humidity_raises_speed_of_sound_by_at_most_0_45_percent():
     dry, humid = (sound_speed_m_s(Air(humidity_percent=percent)) for percent in (0, 100))
     assert 0.003 < humid / dry - 1 < 0.0045
 
 
-def test_pressure_is_irrelevant_in_dry_air():
+def test_speed_of_sound_in_dry_air_ignores_pressure():
     thin, thick = (sound_speed_m_s(Air(humidity_percent=0, pressure_pa=pa)) for pa in (20_000, 200_000))
     assert thin == thick
 
 
 @given(airs)
 def test_speed_of_sound_is_plausible_for_any_air(air):
-    steam = math.sqrt(1.33 * 461.5 * 333.15)  # the fastest there is: water vapour at 60 °C
+    steam = math.sqrt(1.33 * 461.5 * 333.15)  # the upper limit: water vapour at 60 °C
     assert 300 < sound_speed_m_s(air) <= steam + 1
 
 
 @given(airs, st.floats(1, 20))
-def test_warmer_air_is_faster(air, warmer_c):
+def test_speed_of_sound_rises_with_temperature(air, warmer_c):
     warm = air.replace(temperature_c=min(air.temperature_c + warmer_c, 60.0), humidity_percent=0.0)
     assert sound_speed_m_s(warm) >= sound_speed_m_s(air.replace(humidity_percent=0.0))
 
@@ -91,26 +91,26 @@ TABLE_HZ = (20e3, 25e3, 30e3, 40e3, 50e3, 60e3, 80e3, 100e3)
     ],
 )
 def test_absorption_matches_iso_9613(temperature_c, humidity_percent, wanted_db_m):
-    """At 101.325 kPa, to all the digits of the table."""
+    """At 101.325 kPa all digits of the table match."""
     air = Air(temperature_c=temperature_c, humidity_percent=humidity_percent)
     assert_allclose(absorption_db_m(air, np.array(TABLE_HZ)), wanted_db_m, atol=6e-4)
 
 
 def test_absorption_matches_iso_9613_table_1():
-    """ISO 9613-1, table 1: 10 °C, 10 %."""
+    """Values of ISO 9613-1, table 1, for 10 °C and 10 %."""
     air = Air(temperature_c=10, humidity_percent=10)
     assert_allclose(1000 * absorption_db_m(air, np.array([100.0, 1000.0])), [0.585, 21.6], rtol=0.005)
 
 
 def test_absorption_agrees_with_measurements():
-    """B. D. Lawrence, J. A. Simmons, JASA 71, 1982: 0.7 dB/m at 30 kHz and 8 dB/m at 200 kHz."""
+    """Measurements by B. D. Lawrence and J. A. Simmons, JASA 71, 1982: 0.7 dB/m at 30 kHz and 8 dB/m at 200 kHz."""
     measured_db_m = np.array([0.7, 8.0])
     assert_allclose(absorption_db_m(Air(temperature_c=25), np.array([30e3, 200e3])), [0.91, 9.24], rtol=0.005)
     assert_allclose(absorption_db_m(Air(temperature_c=25), np.array([30e3, 200e3])), measured_db_m, rtol=0.35)
 
 
 def test_dry_air_has_classical_absorption_at_ultrasound():
-    """Without vapour oxygen relaxes at 24 Hz, and what is left in ultrasound is classical: it grows as f²."""
+    """Without vapour oxygen relaxes at 24 Hz, which leaves classical absorption in ultrasound; it grows as f²."""
     dry = absorption_db_m(Air(humidity_percent=0), np.array([40e3, 80e3]))
     assert dry[1] / dry[0] == pytest.approx(4, rel=0.01)
     assert dry[0] < absorption_db_m(Air(humidity_percent=50), np.array([40e3]))[0]

@@ -1,4 +1,4 @@
-"""Commands and code of docs/how-to/applications.md; the emulated sensor replays two measurements only."""
+"""Commands and code of docs/how-to/applications.md, with an emulated sensor that replays two measurements."""
 
 import re
 import subprocess
@@ -25,7 +25,7 @@ def test_application_loop_of_the_page_runs(tmp_path):
 
 
 def test_application_commands_of_the_page_run(place, ports, platform):
-    """Nothing is near: the vehicle may go."""
+    """Nothing is near, so the vehicle may go."""
     lines = re.findall(r"^\$ (.*)$", PAGE, re.MULTILINE)
     assert [line.split()[1] for line in lines] == ["example", "emulate", "serve", "capture", "2_safety_stop.py"]
     *commands, example = lines
@@ -36,5 +36,5 @@ def test_application_commands_of_the_page_run(place, ports, platform):
         with subprocess.Popen(words, cwd=place, env=environment(place), stdout=subprocess.PIPE, text=True) as process:
             spoken = iter(process.stdout.readline, "")
             assert next(spoken) == "stop\n"  # until there is an image
-            assert "go\n" in spoken  # reads up to it
+            assert "go\n" in spoken  # reads lines until it appears
             process.terminate()

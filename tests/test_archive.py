@@ -1,4 +1,4 @@
-"""What an archive tells to be stored is durable and there once, whatever becomes of its disk."""
+"""Durability of the archive: each acknowledged item is stored exactly once, even if the disk fails."""
 
 import select
 import shutil
@@ -54,7 +54,7 @@ def gap_of(first, last, reason="lost", sensor="left"):
 
 
 class Opened:
-    """An archive that is open, and what it has told."""
+    """An open archive and its events."""
 
     def __init__(self, folder, **options):
         self.archive = Archive(folder, **{"seal": False} | options)
@@ -73,7 +73,7 @@ class Opened:
             self.archive.offer(item)
 
     def until(self, kind, test=lambda _: True):
-        """Wait for an event, also one that has been."""
+        """Wait for an event of a kind, including earlier events."""
         end_s = time.monotonic() + WAIT_S
         seen = 0
         while True:
@@ -89,8 +89,8 @@ class Opened:
         self.until(Stored, lambda event: event.items[-1].last >= number)
 
 
-def reported(opened):
-    """Numbers that were told to be stored, in that order."""
+def stored_numbers(opened):
+    """Sequence numbers stored_numbers as stored, in order of the reports."""
     return [item.last for event in opened.events if isinstance(event, Stored) for item in event.items]
 
 
@@ -104,7 +104,7 @@ def test_archive_stores_in_order_and_reports_each_item_once(tmp_path):
         opened.give(*map(item_of, given), gap_of(40, 44), *map(item_of, from_zero(2, 45)))
         opened.until_stored(46)
         assert opened.archive.acked_through(RUN) == 46
-    assert reported(opened) == [*range(40), 44, 45, 46]
+    assert stored_numbers(opened) == [*range(40), 44, 45, 46]
     assert stored(tmp_path) == (wanted([*given, *from_zero(2, 45)]), [("left", EPOCH, 40, 44, "lost")])
 
 
@@ -117,7 +117,7 @@ def test_archive_returns_items_out_of_order(tmp_path):
     assert stored(tmp_path)[0] == wanted(given[:2])
 
 
-def test_unstorable_item_does_not_affect_others(tmp_path):
+def test_archive_stores_other_sensors_beside_an_invalid_item(tmp_path):
     others = from_zero(2, sensor="right")
     bad = item_of(
         from_zero(1)[0],
@@ -131,7 +131,7 @@ def test_unstorable_item_does_not_affect_others(tmp_path):
     assert stored(tmp_path)[0] == wanted(others)
 
 
-def test_items_after_an_unstorable_one_are_returned(tmp_path):
+def test_archive_returns_items_after_an_invalid_one(tmp_path):
     given = from_zero(3)
     given[1:2] = from_zero(1, 1, settings=TINY.replace(recording=TINY.recording.replace(n_samples=8192)))
     others = from_zero(2, sensor="right")
@@ -147,7 +147,7 @@ def test_items_after_an_unstorable_one_are_returned(tmp_path):
     assert stored(tmp_path)[0] == wanted([given[0], *others])
 
 
-def test_repeated_number_is_found_without_a_full_search(tmp_path, monkeypatch):
+def test_archive_finds_repeated_number_without_full_search(tmp_path, monkeypatch):
     given, (other,) = from_zero(3), from_zero(1, 1, seed=2)
     again = [item_of(from_zero(3)[1]), item_of(other), item_of(from_zero(1, 9)[0])]
     for item in again:
@@ -166,7 +166,7 @@ def test_repeated_number_is_found_without_a_full_search(tmp_path, monkeypatch):
     assert [event.differs for event in opened.events if isinstance(event, Twin)] == [False, False, True]
 
 
-def test_gaps_share_one_transaction(tmp_path, monkeypatch):
+def test_archive_writes_consecutive_gaps_in_one_transaction(tmp_path, monkeypatch):
     notes, commits = Journal.note_gaps, []
     monkeypatch.setattr(Journal, "note_gaps", lambda journal, gaps: (commits.append(len(gaps)), notes(journal, gaps)))
     with Opened(tmp_path) as opened:
@@ -189,7 +189,7 @@ def test_two_mountings_of_a_sensor_become_two_recordings(tmp_path):
     assert len(list(tmp_path.glob(f"*{SUFFIX}"))) == 2
 
 
-def test_ended_archive_thread_is_detected(tmp_path, monkeypatch):
+def test_archive_reports_an_ended_storage_thread(tmp_path, monkeypatch):
     with Opened(tmp_path) as opened:
         assert opened.archive.stuck == ""
         monkeypatch.setattr(Archive, "_store", lambda *_: False)
@@ -198,7 +198,7 @@ def test_ended_archive_thread_is_detected(tmp_path, monkeypatch):
         assert "the storage thread has ended because of an internal error" in opened.archive.stuck
 
 
-def test_full_recordings_are_sealed_during_storage(tmp_path):
+def test_archive_seals_full_recordings_while_storing(tmp_path):
     given = from_zero(600)
     with Opened(tmp_path, seal=True, rotate_bytes=1e6) as opened:
         for begin in range(0, 600, 100):
@@ -211,7 +211,7 @@ def test_full_recordings_are_sealed_during_storage(tmp_path):
     assert sorted(stored(tmp_path)[0]) == sorted(wanted(given))
 
 
-def test_recording_is_full_after_its_time_limit(tmp_path, monkeypatch):
+def test_archive_rotates_recording_after_its_time_limit(tmp_path, monkeypatch):
     with Opened(tmp_path) as opened:
         opened.give(item_of(from_zero(1)[0]))
         opened.until_stored(0)
@@ -224,8 +224,8 @@ def test_recording_is_full_after_its_time_limit(tmp_path, monkeypatch):
     assert len(list(tmp_path.glob(f"*{SUFFIX}"))) == 2
 
 
-def failing(monkeypatch, *, times, before=True, error=None):
-    """Have commits fail: before anything is written, or after it was."""
+def make_commits_fail(monkeypatch, *, times, before=True, error=None):
+    """Make commits fail before or after the journal writes the data."""
     append, left = Journal.append, [times]
 
     def fails(journal, given):
@@ -242,20 +242,20 @@ def failing(monkeypatch, *, times, before=True, error=None):
 
 @pytest.mark.parametrize("before", [True, False])
 @pytest.mark.parametrize("times", [1, 4])
-def test_failed_commit_is_repeated_once(before, times, tmp_path, monkeypatch):
-    failing(monkeypatch, times=times, before=before)
+def test_archive_retries_failed_commit_without_duplicates(before, times, tmp_path, monkeypatch):
+    make_commits_fail(monkeypatch, times=times, before=before)
     given = from_zero(3)
     with Opened(tmp_path) as opened:
         opened.give(*map(item_of, given))
         opened.until_stored(2)
         opened.until(Resumed)
     assert [type(event) for event in opened.events if not isinstance(event, Stored)][:2] == [StorageFault, Resumed]
-    assert sorted(reported(opened)) == [0, 1, 2]
+    assert sorted(stored_numbers(opened)) == [0, 1, 2]
     assert sorted(stored(tmp_path)[0]) == sorted(wanted(given))
 
 
-def test_any_error_is_a_temporary_fault(tmp_path, monkeypatch):
-    failing(monkeypatch, times=3, error=OSError(5, "Input/output error"))
+def test_archive_retries_after_an_input_output_error(tmp_path, monkeypatch):
+    make_commits_fail(monkeypatch, times=3, error=OSError(5, "Input/output error"))
     with Opened(tmp_path) as opened:
         opened.give(*map(item_of, from_zero(2)))
         opened.until_stored(1)
@@ -263,7 +263,7 @@ def test_any_error_is_a_temporary_fault(tmp_path, monkeypatch):
     assert faults == ["[Errno 5] Input/output error"]
 
 
-def test_removed_journal_is_replaced_by_a_new_one(tmp_path, monkeypatch):
+def test_archive_replaces_a_removed_journal(tmp_path, monkeypatch):
     monkeypatch.setattr("ertis_numba.network.central_node._archive._AGAIN_S", 0.01)
     with Opened(tmp_path) as opened:
         opened.give(item_of(from_zero(1)[0]))
@@ -277,12 +277,12 @@ def test_removed_journal_is_replaced_by_a_new_one(tmp_path, monkeypatch):
 
 
 def test_rows_of_a_failed_journal_are_stored_in_a_new_one(tmp_path, monkeypatch):
-    """After a failed sync a journal shows what never reaches the disk."""
+    """After a failed sync a journal can show rows that never reach the disk."""
     given = from_zero(3)
     with Opened(tmp_path) as opened:
         opened.give(item_of(given[0]))
         opened.until_stored(0)
-        failing(monkeypatch, times=1, before=False)
+        make_commits_fail(monkeypatch, times=1, before=False)
         opened.give(item_of(given[1]))
         opened.until_stored(1)
         opened.give(item_of(given[2]))
@@ -292,12 +292,12 @@ def test_rows_of_a_failed_journal_are_stored_in_a_new_one(tmp_path, monkeypatch)
             assert [key.sequence for key in failed.index()] == [0]
     with Journal.open(paths[1]) as follower:
         assert [key.sequence for key in follower.index()] == [1, 2]
-    assert reported(opened) == [0, 1, 2]
+    assert stored_numbers(opened) == [0, 1, 2]
     assert sorted(stored(tmp_path)[0]) == sorted(wanted(given))
 
 
 def test_journal_that_fails_before_any_acknowledgement_is_removed(tmp_path, monkeypatch):
-    failing(monkeypatch, times=3, before=False)
+    make_commits_fail(monkeypatch, times=3, before=False)
     with Opened(tmp_path) as opened:
         opened.give(item_of(from_zero(1)[0]))
         opened.until_stored(0)
@@ -305,12 +305,12 @@ def test_journal_that_fails_before_any_acknowledgement_is_removed(tmp_path, monk
     assert stored(tmp_path)[0] == wanted(from_zero(1))
 
 
-def test_full_disk_keeps_its_journal(tmp_path, monkeypatch):
+def test_archive_keeps_its_journal_when_disk_is_full(tmp_path, monkeypatch):
     given = from_zero(2)
     with Opened(tmp_path) as opened:
         opened.give(item_of(given[0]))
         opened.until_stored(0)
-        failing(monkeypatch, times=3, error=DiskFullError("the disk is full"))
+        make_commits_fail(monkeypatch, times=3, error=DiskFullError("the disk is full"))
         opened.give(item_of(given[1]))
         opened.until_stored(1)
     assert len(list(tmp_path.glob(f"*{SUFFIX}"))) == 1
@@ -318,12 +318,12 @@ def test_full_disk_keeps_its_journal(tmp_path, monkeypatch):
 
 
 def test_archive_stops_although_the_disk_fails(tmp_path, monkeypatch):
-    failing(monkeypatch, times=10**9)
+    make_commits_fail(monkeypatch, times=10**9)
     with Opened(tmp_path) as opened:
         opened.give(item_of(from_zero(1)[0]))
         opened.until(StorageFault)
     monkeypatch.undo()
-    assert reported(opened) == []
+    assert stored_numbers(opened) == []
     with Opened(tmp_path) as opened:
         assert opened.archive.acked_through(RUN) == -1
 
@@ -333,12 +333,12 @@ def test_measurements_before_a_fault_are_sealed_at_the_end(tmp_path, monkeypatch
     with Opened(tmp_path, seal=True) as opened:
         opened.give(first)
         opened.until_stored(0)
-        failing(monkeypatch, times=10**9)
+        make_commits_fail(monkeypatch, times=10**9)
         opened.give(second)
         opened.until(StorageFault)
     assert [type(event) for event in opened.events if isinstance(event, Resumed | SealedOne)] == [SealedOne]
     assert not list(tmp_path.glob("*.journal"))
-    assert reported(opened) == [0]
+    assert stored_numbers(opened) == [0]
 
 
 def test_journals_left_by_a_crash_are_registered_and_sealed(tmp_path):
@@ -357,7 +357,7 @@ def test_journals_left_by_a_crash_are_registered_and_sealed(tmp_path):
 
 
 def gaps_in(folder):
-    """What recordings say to be missing: first, last and reason."""
+    """Gaps in all recordings of a folder: sensor, first number, last number and reason."""
     found = set()
     for path in sorted(folder.glob("*.h5")):
         for sensor in sensor_names(path):
@@ -368,21 +368,21 @@ def gaps_in(folder):
 
 @pytest.mark.parametrize("how", ["ends", "killed"])
 def test_gap_before_any_measurement_is_in_the_next_recording(tmp_path, how):
-    """Although the journal that had it was sealed to nothing, as nothing had been measured."""
+    """The gap's journal contains no measurement, so sealing it creates no recording."""
     with Opened(tmp_path, seal=how == "ends") as opened:
         opened.give(gap_of(0, 4, "ring overflow"))
         opened.until_stored(4)
         if how == "killed":
             for path in tmp_path.iterdir():
                 shutil.copy(path, tmp_path / f"{path.name}.left")
-    for path in tmp_path.glob("*.left"):  # as it was before the ledger said that the journal is complete
+    for path in tmp_path.glob("*.left"):  # the state before the ledger marked the journal as complete
         path.replace(path.with_suffix(""))
     with Opened(tmp_path, seal=True) as opened:
         opened.give(*map(item_of, from_zero(2, 5)))
         opened.until_stored(6)
     assert not list(tmp_path.glob(f"*{SUFFIX}"))
     assert gaps_in(tmp_path) == {("left", 0, 4, "ring overflow")}
-    with Opened(tmp_path, seal=True) as opened:  # and once told, not again
+    with Opened(tmp_path, seal=True) as opened:  # a stored_numbers gap is not repeated
         opened.give(*map(item_of, from_zero(1, 7)))
         opened.until_stored(7)
     recordings = sorted(tmp_path.glob("*.h5"))
@@ -401,7 +401,7 @@ def test_journal_names_within_one_second_keep_their_order(tmp_path, monkeypatch)
     stem = "runs_20260102T030405Z"
     assert journal_name(tmp_path, "runs") == f"{stem}.h5{SUFFIX}"
     assert journal_name(tmp_path, "runs", taken=[f"{stem}.h5{SUFFIX}"]) == f"{stem}_002.h5{SUFFIX}"
-    (tmp_path / f"{stem}_002.h5").touch()  # what was before it has become no recording
+    (tmp_path / f"{stem}_002.h5").touch()  # the first journal was sealed without a recording
     assert journal_name(tmp_path, "runs") == f"{stem}_003.h5{SUFFIX}"
     assert journal_name(tmp_path, "runs", end="_conflicts") == f"{stem}_conflicts.h5{SUFFIX}"
     (tmp_path / f"{stem}_003.h5{SUFFIX}").touch()
@@ -409,7 +409,7 @@ def test_journal_names_within_one_second_keep_their_order(tmp_path, monkeypatch)
     assert journal_name(tmp_path, "run") == f"run_20260102T030405Z.h5{SUFFIX}"
 
 
-def test_gap_of_a_sensor_beside_another_is_reported_later(tmp_path):
+def test_gap_of_sensor_without_data_is_in_its_next_recording(tmp_path):
     with Opened(tmp_path, seal=True) as opened:
         right = ReceivedItem(
             SensorSession("right", EPOCH), 0, 4, JournalGap("right", 0, 4, "ring overflow", EPOCH), RIGHT, 0.0, b""
@@ -426,7 +426,7 @@ def test_gap_of_a_sensor_beside_another_is_reported_later(tmp_path):
     assert ("right", 0, 4, "ring overflow") in gaps_in(tmp_path)
 
 
-def test_folder_without_a_ledger_is_read(tmp_path):
+def test_archive_reads_a_folder_without_ledger(tmp_path):
     with Opened(tmp_path, seal=True) as opened:
         opened.give(*map(item_of, from_zero(3)))
         opened.until_stored(2)
@@ -436,14 +436,14 @@ def test_folder_without_a_ledger_is_read(tmp_path):
         assert opened.archive.acked_through(RUN) == 4
 
 
-def test_locked_journal_is_not_assumed_readable(tmp_path):
+def test_archive_refuses_to_open_with_a_locked_journal(tmp_path):
     with create(tmp_path, from_zero(2)), pytest.raises(JournalInUseError, match="in use by another process"):
         Archive(tmp_path).open()
-    with Opened(tmp_path) as opened:  # and the folder is free again
+    with Opened(tmp_path) as opened:  # the failed open has released the folder
         assert opened.archive.acked_through(RUN) == 1
 
 
-def test_failed_sealing_is_repeated(tmp_path, monkeypatch):
+def test_archive_retries_failed_sealing(tmp_path, monkeypatch):
     monkeypatch.setattr("ertis_numba.network.central_node._sealing._AGAIN_S", 0.05)
     with Opened(tmp_path) as opened:
         opened.give(item_of(from_zero(1)[0]))
@@ -476,7 +476,7 @@ def test_journal_recovered_by_another_process_counts_as_sealed(tmp_path, monkeyp
 
 
 @pytest.mark.parametrize(("share", "rests"), [(0.5, 4.0), (2.0, 0.5)], ids=["room", "scarce"])
-def test_sealing_retries_are_rare_until_free_space_is_scarce(tmp_path, monkeypatch, share, rests):
+def test_sealing_rests_less_when_free_space_is_scarce(tmp_path, monkeypatch, share, rests):
     asked = []
 
     def seals(journal, **options):

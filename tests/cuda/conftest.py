@@ -1,4 +1,4 @@
-"""These tests run where there is a GPU, and everywhere else in a process of Numba's simulator."""
+"""Tests of the CUDA kernels, on a GPU or in a process that uses Numba's simulator."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""An array and a scene so small that the simulator bears them, and the plans that they are processed by."""
+"""Settings small enough for the slow CUDA simulator, and the processing plans to test with them."""
 
 from ertis_numba.settings import Accuracy, Array, Call, Processing, Recording, Settings
 
@@ -20,8 +20,8 @@ DIRECT = Accuracy(
 )
 NODES = DIRECT.replace(beam_taps=2, beam_density=3.0)
 PLANS = {
-    # Settings, and how far apart the images of processor and GPU may be: single precision differs by the order of sums,
-    # 16 bits by numbers that are rounded the other way.
+    # Settings, and the largest difference in dB between the images of CPU and GPU. In single precision the order of
+    # sums differs; with 16 bits some numbers round the other way.
     "float32": (TINY.replace(accuracy=DIRECT), -120),
     "float32, nodes": (TINY.replace(accuracy=NODES), -120),
     "int16": (TINY.replace(accuracy=DIRECT.replace(precision="int16")), -100),

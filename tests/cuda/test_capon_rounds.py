@@ -1,4 +1,4 @@
-"""Images that take Capon's beamformer more than one round, which otherwise only large ones do."""
+"""Capon images computed in several rounds, which otherwise only large images need."""
 
 import importlib
 
@@ -17,7 +17,7 @@ def test_capon_rounds_cover_all_directions_and_ranges(monkeypatch):
     offsets = np.arange(N_MICS) * (N_RANGES + 9) + random.integers(0, 10, (N_DIRECTIONS, N_MICS))
     offsets = offsets.astype(np.int32)
     weights = np.ones((N_DIRECTIONS, N_MICS), dtype=np.complex64)
-    monkeypatch.setattr(MODULE, "_MAX_BYTES", 2 * 16 * N_RANGES * (N_SNAPSHOTS + 1))  # two directions; 20 windows
+    monkeypatch.setattr(MODULE, "_MAX_BYTES", 2 * 16 * N_RANGES * (N_SNAPSHOTS + 1))  # two directions or 20 windows
     launched = []
     launch = MODULE.launch
     monkeypatch.setattr(MODULE, "launch", lambda *given: launched.append(given[1]) or launch(*given))

@@ -1,4 +1,4 @@
-"""The whole chain on the GPU, or on the simulator, against the processor's."""
+"""The whole chain on the GPU or in the simulator, compared with the chain on the CPU."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ from tests.cuda.plans import PLANS, TINY
 
 @pytest.fixture(scope="module", params=PLANS)
 def pair(request):
-    """Pipelines of one plan on both devices, and how far apart their images may be."""
+    """Pipelines of one plan on CPU and GPU, and the largest difference of their images in dB."""
     settings, bound_db = PLANS[request.param]
     if settings.accuracy.precision == "int16" and not kernels.load("cpu").tile_ranges:
         pytest.skip("this processor has no 16-bit dot product (AVX-512 VNNI or AVX-VNNI)")
@@ -68,7 +68,7 @@ def test_gpu_signals_equal_cpu_signals():
     assert found["cuda"][3] == found["cpu"][3]
 
 
-def test_image_may_stay_on_the_device():
+def test_image_can_stay_on_the_gpu():
     settings = PLANS["float32"][0]
     chain = FastChain(settings, kernels.load("cuda"), threads=1)
     words = noise(settings).data.reshape(-1, 1)
@@ -78,8 +78,8 @@ def test_image_may_stay_on_the_device():
     assert image.any()
 
 
-def test_plan_is_chosen_for_the_gpu():
-    """Without a GPU by nominal costs; what is chosen keeps its budget all the same."""
+def test_plan_chosen_for_the_gpu_keeps_its_error_budget():
+    """The simulator chooses by nominal costs, and the chosen plan still keeps its error budget."""
     with Pipeline(TINY.replace(accuracy=TINY.accuracy.replace(max_error_db=-50.0)), device="cuda") as pipeline:
         image = pipeline.process(noise(pipeline.settings)).amplitude
     exact = Pipeline(pipeline.settings.replace(accuracy=TINY.accuracy.replace(max_error_db=-100.0)), device="cpu")

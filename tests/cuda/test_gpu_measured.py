@@ -1,4 +1,4 @@
-"""What only a GPU can tell is measured by code that the simulator runs too; times it has none."""
+"""GPU benchmarks. The simulator runs the same code but reports no times."""
 
 import dataclasses
 
@@ -41,9 +41,9 @@ def _quick(monkeypatch):
     monkeypatch.setattr(timing, "_WARM_UP_S", 0.0)
 
 
-def test_gpu_ceiling_kernels_compute():
+def test_gpu_ceiling_kernels_compute_correct_values():
     sums = cuda.to_device(np.zeros(4, np.float32))
-    ceilings.multiply_add(3, sums)  # each of eight sums tends to 1 / (1 - 1/2)
+    ceilings.multiply_add(3, sums)  # each of the eight sums converges to 1 / (1 - 1/2)
     assert sums.copy_to_host() == pytest.approx(16)
     samples = np.arange(2048 + 256, dtype=np.uint64) ** np.uint64(3)
     found = cuda.to_device(np.zeros(4, np.uint64))
@@ -59,14 +59,14 @@ def test_gpu_ceiling_kernels_compute():
 def test_stopwatch_adds_parts_of_the_same_name():
     watch, lane = Stopwatch(), kernels.load("cuda").memory().lane()
     with lane.entered():
-        for _ in range(2):  # the second time from the start again
+        for _ in range(2):  # `start` resets the stopwatch in the second pass
             watch.start()
             for name in ("one", "two", "one"):
                 watch.mark(name)
     assert list(watch.read_ms()) == ["one", "two"]
 
 
-def test_paper_and_ceilings_report_rows():
+def test_gpu_benchmark_reports_paper_and_ceiling_rows():
     (row,) = list(gpu_parts.paper(SCALE))[:1]
     assert row["plan"] == "float32, 2 samples of 2 per range, 40 dB"
     assert row["off_cpu_db"] <= -100
@@ -94,7 +94,7 @@ def test_rival_images_are_compared_before_timing(monkeypatch):
     assert missing == {"library": "Missing", "directions": "2d:2", "status": "not installed"}
 
 
-def test_wrong_image_is_not_timed(monkeypatch):
+def test_gpu_benchmark_refuses_to_time_a_wrong_image(monkeypatch):
     process = Pipeline.process
 
     def louder(self, measurement, out=None):

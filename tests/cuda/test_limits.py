@@ -1,4 +1,4 @@
-"""What a GPU cannot do is refused in one line, before the driver does it in its own."""
+"""Limits of a GPU, each reported in one line before the driver fails with an error of its own."""
 
 import types
 

@@ -1,4 +1,4 @@
-"""What a pipeline keeps on the GPU: made once, given back at once, and missed with a remedy."""
+"""GPU memory of a pipeline: allocated once, freed by `close`, and reported with a remedy if it is too small."""
 
 import gc
 import threading
@@ -22,7 +22,7 @@ MAKERS = ("to_device", "device_array", "pinned_array")
 
 @pytest.fixture
 def made(monkeypatch):
-    """Weak references to all arrays that are made from now on."""
+    """Weak references to all device and pinned arrays created during the test."""
     found = []
     for name in MAKERS:
         make = getattr(cuda, name)
@@ -56,7 +56,7 @@ def test_close_frees_gpu_memory_without_garbage_collection(made):
         alive = [array for array in (reference() for reference in made) if array is not None]
     finally:
         gc.enable()
-    assert len(alive) == 1  # the memory of the image that is still looked at
+    assert len(alive) == 1  # the memory of the image that the test still holds
     assert (image.amplitude == before).all()
 
 
@@ -103,7 +103,7 @@ def test_unpinnable_memory_is_reported(monkeypatch, use):
 
 
 def test_failed_allocation_is_freed_when_its_error_is_caught(monkeypatch, made):
-    """So that a smaller pipeline can be made there."""
+    """A caller can then create a smaller pipeline in the exception handler."""
     left = [6]
 
     def full(array, *_, make=cuda.to_device):
@@ -122,15 +122,15 @@ def test_failed_allocation_is_freed_when_its_error_is_caught(monkeypatch, made):
 
 
 def test_close_waits_for_running_measurements():
-    """And refuses what comes later; the image of the measurement that was under way is whole."""
+    """The running measurement yields a complete image, and later measurements are refused."""
     pipeline = Pipeline(SETTINGS, device="cuda")
     expected = pipeline.process(noise(SETTINGS)).amplitude.copy()
-    chain, begun, images = pipeline._chain, threading.Event(), []  # noqa: SLF001 - to hold it at the worst moment
+    chain, begun, images = pipeline._chain, threading.Event(), []  # noqa: SLF001 - to close during processing
     finish = chain._finish  # noqa: SLF001
 
     def slow(buffers):
         begun.set()
-        closing.join(0.2)  # which does not come back before this is done
+        closing.join(0.2)  # `close` must not return before this measurement is finished
         assert closing.is_alive()
         finish(buffers)
 

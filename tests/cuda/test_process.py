@@ -1,4 +1,4 @@
-"""``ertis process --device cuda`` does what ``--device cpu`` does."""
+"""``ertis process --device cuda`` compared with ``--device cpu``."""
 
 import json
 
@@ -21,7 +21,7 @@ TINIER = TINY.replace(processing=TINY.processing.replace(directions="2d:3", rang
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """Process one recording with a plan and without, on both devices: reports and energies."""
+    """Reports and amplitudes of recordings processed with and without an explicit plan, on both devices."""
     folder, found = tmp_path_factory.mktemp("process"), {}
     free = Accuracy(max_error_db=BUDGET_DB)
     for plan, accuracy in {"explicit": DIRECT, "chosen": free, "exact": Accuracy(max_error_db=-100.0)}.items():
@@ -50,20 +50,20 @@ def test_cuda_process_reports_device_and_all_measurements(made):
 
 
 def test_cpu_and_cuda_images_differ_by_rounding_only(made):
-    """Single precision, of which the two devices add up the terms in another order: -100 dB at most."""
+    """The devices add single-precision terms in different orders: -100 dB at most."""
     for cpu, cuda in zip(made["explicit", "cpu"][1], made["explicit", "cuda"][1], strict=True):
         assert reference.error_db(cpu, cuda) < -100
 
 
 @pytest.mark.parametrize("device", ["cpu", "cuda"])
-def test_cuda_plan_keeps_its_budget(made, device):
+def test_cuda_plan_keeps_its_error_budget(made, device):
     for exact, image in zip(made["exact", "cpu"][1], made["chosen", device][1], strict=True):
         assert reference.error_db(exact, image) < BUDGET_DB
 
 
 def test_images_of_cpu_and_cuda_plans_differ_by_their_errors_at_most(made):
     for cpu, cuda in zip(made["chosen", "cpu"][1], made["chosen", "cuda"][1], strict=True):
-        assert reference.error_db(cpu, cuda) < BUDGET_DB + 6.1  # each as far off, on opposite sides
+        assert reference.error_db(cpu, cuda) < BUDGET_DB + 6.1  # both errors at their limit, with opposite signs
 
 
 def test_cuda_file_is_independent_of_the_batch_size(made, tmp_path):

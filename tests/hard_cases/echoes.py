@@ -1,4 +1,4 @@
-"""Words of one echo, for the cases that spoil them."""
+"""Samples of one echo, which the hard cases then corrupt."""
 
 import math
 
@@ -11,9 +11,9 @@ from tests.cases import words_of
 
 
 def echo_signals(settings, *, azimuth_deg, range_m, level, spherical=False):
-    """One echo of the call as each microphone receives it: (mic, sample) float64.
+    """One echo of the call at each microphone: (mic, sample) float64.
 
-    A plane wave, or the wave of a point that the call reached from the array's centre.
+    The wave is plane, or spherical from a point that the call reached from the array's centre.
     """
     speed_m_s = sound_speed_m_s(settings.air)
     positions_m = microphones(settings.array).enabled_positions_m
@@ -27,5 +27,5 @@ def echo_signals(settings, *, azimuth_deg, range_m, level, spherical=False):
 
 
 def echo_words(settings, **echo):
-    """The same through the simplest converter: (sample,) uint32."""
+    """One echo of the call, converted to bits by `words_of`: (sample,) uint32."""
     return words_of(echo_signals(settings, **echo))

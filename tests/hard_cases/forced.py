@@ -1,4 +1,4 @@
-"""Scenes with every effect on, and their images, on the way to which everything is checked."""
+"""Scenes with every effect on, and their images; all intermediate results are checked."""
 
 import numpy as np
 
@@ -27,21 +27,21 @@ FULL = EIGHT.replace(emitter=Emitter(diameter_m=0.02, direct_sound_db=-40), elec
 
 
 def forced(scene):
-    """The scene with every effect on."""
+    """Switch every effect of a scene on."""
     return scene.replace(effects=dict.fromkeys(EFFECTS, True))
 
 
 def image_of(scene, index=0):
-    """The image of a scene as it would be recorded, with every effect on; all on the way is checked."""
-    plan = only(*EFFECTS) if scene.boxes else make_plan(forced(scene))  # to ask about many walls takes long
+    """Render a scene with every effect on, check all intermediate results, and return its image."""
+    plan = only(*EFFECTS) if scene.boxes else make_plan(forced(scene))  # planning takes long with many walls
     simulator = Simulator(forced(scene), plan=plan)
     signals, measurement = simulator.signals(index), simulator.render(index)
     assert np.all(np.isfinite(signals))
     for reflector in simulator.reflectors(index):
         numbers = (reflector.azimuth_deg, reflector.elevation_deg, reflector.range_m, reflector.level_db)
         assert np.all(np.isfinite((*numbers, *reflector.velocity_m_s)))
-        assert reflector.level_db <= 0 or reflector.emitter  # sound of others may be louder than the strongest echo
+        assert reflector.level_db <= 0 or reflector.emitter  # other sensors may be louder than the strongest echo
         assert reflector.range_m >= 0
-    image = Pipeline(simulator.sensor.settings(), predict=False).process(measurement)  # some are silent
+    image = Pipeline(simulator.sensor.settings(), predict=False).process(measurement)  # some scenes are silent
     assert np.all(np.isfinite(image.amplitude))
     return image

@@ -1,8 +1,9 @@
-"""Butterworth order 6 at 100 kHz / 4.5 MHz: one polynomial in float32 against second-order sections.
+"""Butterworth low pass of order 6 at 100 kHz / 4.5 MHz: one polynomial or second-order sections in float32.
 
-Six poles crowd around z = 1, and the coefficients of their polynomial cannot tell them apart in 24 bits. Measured
-against 50 digits: the polynomial moves a pole by 1.9e-3 and the impulse response by -23 dB, sections by 2.4e-7 and
--119 dB. At 50 kHz, and in the band pass of 25 to 50 kHz, a pole of the polynomial leaves the unit circle.
+Six poles lie close to z = 1, and 24 bits of a polynomial's coefficients cannot separate them. Compared with 50 digits,
+the polynomial moves a pole by 1.9e-3 and changes the impulse response by -23 dB. Sections move it by 2.4e-7 and change
+the response by -119 dB. At 50 kHz, and in the band pass of 25 to 50 kHz, a pole of the polynomial leaves the unit
+circle.
 """
 
 import mpmath
@@ -20,7 +21,7 @@ N_SAMPLES = 1500  # the slowest pole has decayed by 470 dB
 
 
 def true_poles():
-    """Poles of the low pass by Butterworth's circle and the bilinear transform, to 50 digits."""
+    """Poles of the low pass from Butterworth's circle and the bilinear transform, to 50 digits."""
     with mpmath.workdps(50):
         warped = mpmath.tan(mpmath.pi * mpmath.mpf(CUTOFF_HZ) / RATE_HZ)
         analogue = [warped * mpmath.expjpi(mpmath.mpf(2 * k + ORDER + 1) / (2 * ORDER)) for k in range(ORDER)]
@@ -28,7 +29,7 @@ def true_poles():
 
 
 def true_impulse_response():
-    """The recursion itself in 50 digits: (sample,) float64."""
+    """Impulse response from the recursion in 50 digits: (sample,) float64."""
     with mpmath.workdps(50):
         denominator = [mpmath.mpf(1)]
         for pole in true_poles():
@@ -45,14 +46,14 @@ def true_impulse_response():
 
 
 def roots(coefficients):
-    """Roots of what float32 makes of a polynomial, exactly."""
+    """Exact roots of a polynomial whose coefficients are rounded to float32."""
     with mpmath.workdps(50):
         exact = [mpmath.mpf(float(value)) for value in np.asarray(coefficients, dtype=np.float32)]
         return mpmath.polyroots(exact[::-1], maxsteps=2000, extraprec=400, asc=True)
 
 
-def farthest(found, wanted):
-    """How far the worst pole has moved."""
+def largest_pole_error(found, wanted):
+    """Largest distance of a wanted pole from the nearest one found."""
     return float(max(min(abs(pole - other) for other in found) for pole in wanted))
 
 
@@ -61,12 +62,12 @@ def test_polynomial_poles_move_10_000_times_as_far_as_section_poles():
     sections = scipy.signal.butter(ORDER, CUTOFF_HZ, fs=RATE_HZ, output="sos")
     wanted = true_poles()
     assert float(max(map(abs, wanted))) == pytest.approx(0.964605, abs=1e-6)
-    assert farthest(roots(denominator), wanted) > 1e-3  # 1.9e-3
-    assert farthest([pole for section in sections for pole in roots(section[3:])], wanted) < 1e-6  # 2.4e-7
+    assert largest_pole_error(roots(denominator), wanted) > 1e-3  # 1.9e-3
+    assert largest_pole_error([pole for section in sections for pole in roots(section[3:])], wanted) < 1e-6  # 2.4e-7
 
 
 def test_sections_have_an_impulse_response_error_below_115_db():
-    """-119 dB; the polynomial gives -23 dB in float32, and -196 dB in float64."""
+    """Sections give -119 dB; the polynomial gives -23 dB in float32 and -196 dB in float64."""
     wanted = true_impulse_response()
     impulse = np.eye(1, N_SAMPLES)[0]
     polynomial = scipy.signal.butter(ORDER, CUTOFF_HZ, fs=RATE_HZ)
@@ -87,7 +88,7 @@ def test_sections_have_an_impulse_response_error_below_115_db():
     ],
 )
 def test_polynomial_form_is_unstable(band_hz, kind, rate_hz, largest):
-    """Radii of 1.02 at half the cutoff and of 1.03 for the paper's band pass; sections stay within."""
+    """Poles reach radius 1.02 at half the cutoff and 1.03 in the paper's band pass; those of sections stay below 1."""
     _, denominator = scipy.signal.butter(ORDER, band_hz, kind, fs=rate_hz)
     sections = scipy.signal.butter(ORDER, band_hz, kind, fs=rate_hz, output="sos")
     assert float(max(map(abs, roots(denominator)))) > largest - 1e-3
@@ -96,7 +97,7 @@ def test_polynomial_form_is_unstable(band_hz, kind, rate_hz, largest):
 
 @pytest.mark.filterwarnings("ignore:.*encountered:RuntimeWarning")
 def test_paper_image_needs_second_order_sections(monkeypatch):
-    """Within -100 dB of the float64 image as it is; with the same filters as polynomials it is lost."""
+    """Sections keep the image within -100 dB of the float64 image; the same filters as polynomials destroy it."""
     settings = SHORT.replace(processing=SHORT.processing.replace(method="paper"))
     pipeline, measurement = Pipeline(settings), noise(SHORT)
     directions = unit_vectors(pipeline.grid.azimuth_rad, pipeline.grid.elevation_rad)
@@ -107,4 +108,4 @@ def test_paper_image_needs_second_order_sections(monkeypatch):
         return scipy.signal.lfilter(*(part.astype(signals.dtype) for part in scipy.signal.sos2tf(sections)), signals)
 
     monkeypatch.setattr(scipy.signal, "sosfilt", as_polynomial)
-    assert not pipeline.process(measurement).amplitude.max() < 1e6  # 4e9, or no number at all
+    assert not pipeline.process(measurement).amplitude.max() < 1e6  # 4e9 or NaN

@@ -1,4 +1,4 @@
-"""Records of 16,777,216 words: nothing drifts over 640 m, and memory holds the words and nothing else of their size."""
+"""Records of 16,777,216 samples: no drift over 640 m, and no buffers of that size except the samples themselves."""
 
 import re
 import subprocess
@@ -24,13 +24,13 @@ LONG = Settings(
     array=PAIR, recording=Recording(n_samples=N_SAMPLES), processing=Processing(directions="2d:5", range_m=(0.4, 0.9))
 )
 RATE_HZ = LONG.recording.sample_rate_hz
-LATER = (N_SAMPLES - N_NOISE - 2000) // 100 * 100  # a multiple of range_decimation: ranges shift by whole steps
+LATER = (N_SAMPLES - N_NOISE - 2000) // 100 * 100  # a multiple of range_decimation, to shift ranges by whole steps
 
 
 def shifted_image(first, precision, shift=0):
-    """The image of noise that begins at sample ``first + shift``, its range window shifted with it.
+    """The image of noise that begins at sample ``first + shift``, with the range window shifted alike.
 
-    What surrounds the noise is an idle pattern with a period of two samples, the same before and after.
+    An idle pattern with a period of two samples surrounds the noise.
     """
     farther_m = shift * sound_speed_m_s(LONG.air) / (2 * RATE_HZ)
     near_m, far_m = LONG.processing.range_m
@@ -46,16 +46,16 @@ def shifted_image(first, precision, shift=0):
 
 @pytest.mark.parametrize("precision", ["float32", "auto"])
 def test_end_of_a_long_record_is_imaged_like_its_start(precision):
-    """At 640 m the image is that of the same bits at 0.4 m, to the last bit where both windows fall alike."""
+    """The image at 640 m equals that of the same bits at 0.4 m, bit for bit where both windows align."""
     near, far = shifted_image(1000, precision), shifted_image(1000, precision, LATER)
-    n_ranges = min(near.shape[1], far.shape[1])  # the last range may fall on either side of the window's edge
+    n_ranges = min(near.shape[1], far.shape[1])  # rounding may exclude the last range from one window
     assert n_ranges >= 130
     change = np.linalg.norm(far[:, :n_ranges] - near[:, :n_ranges])
-    assert change < 1e-5 * np.linalg.norm(near)  # it may well be 0
+    assert change < 1e-5 * np.linalg.norm(near)  # the change may be 0
 
 
-def test_times_in_float32_drift():
-    """The naive form: past 2²⁴ an index has no neighbour, and after 3.7 s the call is off by -36 dB."""
+def test_times_in_float32_drift_in_long_records():
+    """Float32 cannot represent every index beyond 2²⁴: after 3.7 s the error of the call is -36 dB."""
     assert np.float32(N_SAMPLES + 1) == np.float32(N_SAMPLES)
     index = LATER + np.arange(12_000)
     wanted = call_at(LONG.call, (index - LATER) / RATE_HZ)
@@ -76,20 +76,20 @@ print(open("/proc/self/status").read())
 
 
 def peak_bytes(path, n_samples):
-    """How large a process ever was that streamed four records of so many words from a file."""
+    """Peak memory of a process that streams four records of ``n_samples`` from a file."""
     settings = LONG.replace(recording=Recording(n_samples=n_samples))
     words = np.zeros(n_samples, dtype=np.uint8)
     words[1::2] = 0xFF
     write_recording(path, (Measurement(words, settings, Stamp(sequence=number)) for number in range(4)))
     done = subprocess.run([sys.executable, "-c", STREAM, path], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    # Not getrusage: what it says begins with the size of the process that started this one.
+    # Not getrusage: its maximum includes the size of the process that started this one.
     (peak_kb,) = re.findall(r"VmHWM:\s+(\d+) kB", done.stdout)
     return 1024 * int(peak_kb)
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="only Linux says how large a process ever was")
 def test_memory_grows_only_by_the_samples(tmp_path):
-    """Two records of 16 MiB at a time, the last and the next, of a file of 64 MiB; signals would take 128 MiB."""
+    """Memory holds two records of 16 MiB of a file of 64 MiB; signals would take 128 MiB."""
     grown = peak_bytes(tmp_path / "long.h5", N_SAMPLES) - peak_bytes(tmp_path / "short.h5", 2**17)
     assert grown < 2.5 * N_SAMPLES

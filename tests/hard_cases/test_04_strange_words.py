@@ -1,4 +1,4 @@
-"""Words without sound, faulty bits, offsets, idle tones: finite, and no worse than the missing share of the array."""
+"""Records without sound, faulty bits, offsets and idle tones: finite images that lose only a faulty channel's share."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ FAULTS = {
 
 
 def pulses(rate_hz):
-    """What a modulator makes of an offset near its limit, a pulse per period: (sample,) uint32 of 0 and 1."""
+    """Output of a modulator for an offset near its limit, one pulse per period: (sample,) uint32 of 0 and 1."""
     phase = np.arange(N_SAMPLES + 1) * (rate_hz / SETTINGS.recording.sample_rate_hz)
     return np.diff(np.floor(phase)).astype(np.uint32)
 
@@ -46,7 +46,7 @@ def level_db(image):
 
 
 def require_echo(image, changed_db, abs_db):
-    """The echo is at its place, and its level is off by what is expected."""
+    """Require the echo at its position, with the expected change of its level."""
     [peak] = find_peaks(image, top=1)
     assert peak.azimuth_deg == pytest.approx(20, abs=0.1)
     assert peak.range_m == pytest.approx(0.7, abs=3e-4)
@@ -56,14 +56,14 @@ def require_echo(image, changed_db, abs_db):
 @pytest.mark.parametrize(("method", "largest_db"), [("fast", -130), ("paper", -180)])
 @pytest.mark.parametrize("name", SILENT)
 def test_record_without_sound_gives_an_empty_image(name, method, largest_db):
-    """-146 dB of full scale at the most where the record is whole: offset and clock lie far out of the band."""
+    """Complete records give -146 dBFS at most, because offset and clock lie far out of the band."""
     settings = SETTINGS.replace(processing=SETTINGS.processing.replace(method=method))
     assert level_db(image_of(SILENT[name], settings)) < largest_db
 
 
 @pytest.mark.parametrize(("name", "largest_db"), [("all zero", -70), ("all one", -70), ("alternating", -100)])
 def test_constant_record_shows_only_its_initial_step(name, largest_db):
-    """A constant begins at sample 0, a step of full scale: -79 dB there, -124 dB beyond 0.5 m."""
+    """A constant starts with a full-scale step at sample 0: -79 dB there, -124 dB beyond 0.5 m."""
     image = image_of(SILENT[name], SETTINGS.replace(processing=SETTINGS.processing.replace(range_m=(0.0, 1.0))))
     assert level_db(image) < largest_db
     assert 20 * np.log10(image.amplitude[:, image.range_m > 0.5].max()) < -110
@@ -71,26 +71,26 @@ def test_constant_record_shows_only_its_initial_step(name, largest_db):
 
 @pytest.mark.parametrize("fault", FAULTS.values(), ids=FAULTS)
 def test_missing_channel_lowers_the_level_by_its_share(fault):
-    """One of 32: -0.28 dB."""
+    """One of 32 channels is -0.28 dB."""
     require_echo(image_of(fault(echo_words(SETTINGS, **ECHO))), 20 * np.log10(31 / 32), 0.02)
 
 
 @pytest.mark.parametrize(("offset", "abs_db"), [(-0.01, 0.02), (0.1, 0.05), (0.3, 0.1)])
 def test_offset_leaves_the_level_unchanged(offset, abs_db):
-    """An offset of 0.3 of full scale changes the level by 0.05 dB, which is the bits' own noise."""
+    """An offset of 0.3 of full scale changes the level by 0.05 dB, the noise of the bits themselves."""
     require_echo(image_of(words_of(echo_signals(SETTINGS, **ECHO) + offset)), 0, abs_db)
 
 
 @pytest.mark.parametrize("rate_hz", [30_000.0, 40_000.0, 45_000.0])
 def test_idle_tone_of_one_channel_keeps_the_echo(rate_hz):
-    """A tone of -29 dB in the middle of the band, in place of the microphone's signal."""
+    """A tone of -29 dB in the middle of the band replaces the microphone's signal."""
     words = (echo_words(SETTINGS, **ECHO) & ~CHANNEL) | (pulses(rate_hz) * CHANNEL)
     require_echo(image_of(words), 20 * np.log10(31 / 32), 0.05)
 
 
 @pytest.mark.parametrize("rate_hz", [30_000.0, 40_000.0, 45_000.0])
 def test_idle_tone_of_all_channels_has_the_gain_of_the_filter(rate_hz):
-    """Compression spreads a tone over the length of the call: within 0.3 dB of the filter's gain there."""
+    """Compression spreads a tone over the length of the call, within 0.3 dB of the filter's gain."""
     image = image_of(pulses(rate_hz) * ALL)
     n_fft, signal_rate_hz = 2**14, SETTINGS.signal_rate_hz
     matched = matched_filter_spectrum(SETTINGS, n_fft=n_fft)

@@ -1,4 +1,4 @@
-"""Reflectors 5 to 30 cm away, ranges from 0 on, and delays of points at and in the array."""
+"""Reflectors at 5 to 30 cm, ranges from 0 on, and delays of points at and inside the array."""
 
 import mpmath
 import numpy as np
@@ -26,10 +26,10 @@ SPEED_M_S = 343.0
 
 @pytest.mark.parametrize(("range_m", "plane_db"), [(0.05, -9.0), (0.1, -3.2), (0.2, -0.8), (0.3, -0.4)])
 def test_spherical_wavefronts_keep_the_level_of_near_echoes(range_m, plane_db):
-    """Focused on plane waves, the echo of a point is weaker by 0.4 dB at 30 cm and by 9 dB at 5 cm.
+    """Plane-wave focusing weakens the echo of a point by 0.4 dB at 30 cm and by 9 dB at 5 cm.
 
-    At 5 cm the array of 7 cm is no longer small, and the image's peak stands 11° off; from 10 cm on it is within
-    1°, and everywhere within 1 mm of its range. Delays to the point itself keep the level within 0.1 dB.
+    At 5 cm the array of 7 cm is no longer small, and the image's peak is 11° off. From 10 cm on the peak is within
+    1°, and at all ranges within 1 mm. Delays to the point itself keep the level within 0.1 dB.
     """
     words = echo_words(NEAR, azimuth_deg=20.0, range_m=range_m, level=0.5, spherical=True)
     image = Pipeline(NEAR, predict=False).process(Measurement(words, NEAR))
@@ -45,8 +45,8 @@ def test_spherical_wavefronts_keep_the_level_of_near_echoes(range_m, plane_db):
     assert reference.error_db(image.amplitude, reference.exact(words, NEAR, everywhere, image.range_m)) < -45
 
 
-def test_range_0_is_in_the_image():
-    """Also where the record begins: an echo of sample 0 on lies at range 0."""
+def test_image_includes_an_echo_at_range_0():
+    """An echo that begins at sample 0 lies at range 0, where the record begins."""
     words = echo_words(NEAR, azimuth_deg=0.0, range_m=0.0, level=0.5)
     image = Pipeline(NEAR, predict=False).process(Measurement(words, NEAR))
     assert image.range_m[0] == 0
@@ -57,9 +57,9 @@ def test_range_0_is_in_the_image():
     ("range_m", "bound_s"), [(0.0, 1e-19), (1e-9, 1e-19), (0.05, 1e-18), (1.0, 1e-17), (640.0, 2e-15), (1e4, 3e-14)]
 )
 def test_delays_of_points_are_exact_to_the_last_digit(range_m, bound_s):
-    """Against 50 digits: at 10 km, ``‖r u − p‖ − r`` cancels 11 of 16 digits and leaves 7e-15 s; float32 leaves 4e-6 s.
+    """At 10 km ``‖r u − p‖ − r`` loses 11 of 16 digits: the error is 7e-15 s in float64 and 4e-6 s in float32.
 
-    A period of 50 kHz is 2e-5 s long, and a phase of the image 2e-6 s or less.
+    The reference has 50 digits. A period of 50 kHz is 2e-5 s long, and a phase of the image 2e-6 s or less.
     """
     random = np.random.default_rng(1)
     directions = unit_vectors(random.uniform(-1.5, 1.5, 20), random.uniform(-1.5, 1.5, 20))
@@ -73,7 +73,7 @@ def test_delays_of_points_are_exact_to_the_last_digit(range_m, bound_s):
 
 
 def test_delays_in_float32_err_by_a_fifth_of_a_period_at_10_km():
-    """The naive form: 4e-6 s at 10 km, 3e-7 s at 640 m."""
+    """Float32 delays are off by 4e-6 s at 10 km and by 3e-7 s at 640 m."""
     toward = unit_vectors(np.linspace(-1.5, 1.5, 20), np.zeros(20))
     for range_m, error_s in ((640.0, 1e-7), (1e4, 2e-6)):
         points_m = np.float32(range_m) * toward.astype(np.float32)[:, None] - PLACES_M.astype(np.float32)
@@ -83,7 +83,7 @@ def test_delays_in_float32_err_by_a_fifth_of_a_period_at_10_km():
 
 
 def test_microphone_at_the_focus_has_a_finite_delay():
-    """It hears the echo sooner by the whole range, and no distance of 0 is divided by."""
+    """The microphone receives the echo earlier by the whole range, without a division by zero distance."""
     place_m = PLACES_M[5]
     range_m = float(np.linalg.norm(place_m))
     delays_s = spherical_delays(PLACES_M, place_m[None] / range_m, range_m=range_m, sound_speed_m_s=SPEED_M_S)
@@ -93,7 +93,7 @@ def test_microphone_at_the_focus_has_a_finite_delay():
 
 
 def test_delays_of_a_point_at_the_centre_are_distances():
-    """At range 0 the direction no longer matters, where plane waves still differ."""
+    """The direction is irrelevant at range 0, although delays of plane waves still depend on it."""
     toward = unit_vectors(np.array([-1.0, 0.3, 1.2]), np.array([0.0, 0.5, -1.0]))
     delays_s = spherical_delays(PLACES_M, toward, range_m=0.0, sound_speed_m_s=SPEED_M_S)
     assert delays_s == pytest.approx(np.tile(np.linalg.norm(PLACES_M, axis=1) / SPEED_M_S, (3, 1)), rel=1e-14)
@@ -105,7 +105,7 @@ def test_delays_of_a_point_at_the_centre_are_distances():
 
 @pytest.mark.parametrize("range_m", [0.05, 0.1])
 def test_target_within_the_length_of_the_call_is_found(range_m):
-    """Its echo comes before the call is over."""
+    """The echo of such a target arrives before the call ends."""
     scene = scene_of(Point(azimuth_deg=20, range_m=range_m, strength_db=-60), sensor=EIGHT)
     [peak] = find_peaks(image_of(scene), top=1)
     assert peak.range_m == pytest.approx(range_m, abs=0.005)

@@ -30,14 +30,14 @@ def with_processing(settings=SHORT, **changes):
 
 
 def with_grid(tmp_path, rows_deg):
-    """Settings whose directions are those of a file, azimuth and elevation."""
+    """Settings with directions from a file of azimuth and elevation."""
     path = tmp_path / "grid.csv"
     path.write_text("\n".join(f"{azimuth}, {elevation}" for azimuth, elevation in rows_deg))
     return with_processing(directions=str(path))
 
 
 def require_same(amplitude, other):
-    """Refuse what differs by more than rounding: -120 dB of the largest value."""
+    """Require equality within rounding: -120 dB of the largest value."""
     assert_allclose(amplitude, np.broadcast_to(other, amplitude.shape), rtol=0, atol=1e-6 * amplitude.max())
 
 
@@ -52,7 +52,7 @@ def require_exact(settings, measurement):
 
 @pytest.mark.parametrize("azimuth_deg", [-90.0, 90.0])
 def test_echo_in_the_plane_of_the_array_is_found(azimuth_deg):
-    """Within 5° where the beam is broadest, at its level; the other end of the axis is at least 20 dB below."""
+    """The peak is within 5° where the beam is broadest; the other end of the axis is at least 20 dB below it."""
     settings = with_processing(directions="2d:181")
     image = Pipeline(settings).process(
         Measurement(echo_words(settings, azimuth_deg=azimuth_deg, range_m=0.7, level=0.5), settings)
@@ -65,8 +65,8 @@ def test_echo_in_the_plane_of_the_array_is_found(azimuth_deg):
     assert other < near / 10
 
 
-def test_planar_array_has_equal_images_of_front_and_back():
-    """Azimuths α and 180° − α have the same delays: rounding apart, the same image."""
+def test_planar_array_images_front_and_back_equally():
+    """Azimuths α and 180° − α have the same delays, hence the same image except for rounding."""
     amplitude = require_exact(with_processing(directions="2d:9", azimuth_limits_deg=(-180.0, 180.0)), noise(SHORT))
     require_same(amplitude[[5, 8, 0]], amplitude[[7, 4, 4]])  # 45° and 135°, 180° and 0°
     assert reference.error_db(amplitude[5], amplitude[6]) > -10
@@ -80,7 +80,7 @@ def test_azimuth_is_irrelevant_at_the_poles(tmp_path, pole_deg):
 
 
 def test_echo_from_the_pole_is_found_once(tmp_path):
-    """Though six entries of the grid are one direction."""
+    """Six entries of the grid are the same direction."""
     rows = [(azimuth, 90) for azimuth in range(0, 360, 60)]
     rows += [(azimuth, elevation) for elevation in (70, 75, 80, 85) for azimuth in range(-180, 180, 10)]
     settings = with_grid(tmp_path, rows)
@@ -98,7 +98,7 @@ def test_echo_from_the_pole_is_found_once(tmp_path):
 @pytest.mark.parametrize("array", [SHORT.array, ONE], ids=["32 microphones", "one microphone"])
 @pytest.mark.parametrize("range_m", [(0.7, 0.7), (0.0, 0.0)])
 def test_image_of_one_direction_and_one_range_is_exact(array, range_m):
-    """An image of one number, and it is the exact one."""
+    """The image consists of one number, which equals that of the exact image."""
     settings = tuned(
         with_processing(SHORT.replace(array=array), directions="2d:1", range_m=range_m), max_error_db=-60.0
     )
@@ -106,12 +106,12 @@ def test_image_of_one_direction_and_one_range_is_exact(array, range_m):
 
 
 def test_coincident_microphones_act_as_one():
-    """With equal bits the image is that of one microphone, and the same in all directions."""
+    """With equal bits the image equals that of one microphone and is the same in all directions."""
     pair, single = SHORT.replace(array=TWO_IN_ONE_PLACE), SHORT.replace(array=ONE)
     bits = np.random.default_rng(1).integers(0, 2, SHORT.recording.n_samples, dtype=np.uint8)
     both = require_exact(pair, Measurement(3 * bits, pair))
     alone = Pipeline(single).process(Measurement(bits, single)).amplitude
-    assert_allclose(both, np.broadcast_to(alone, both.shape), rtol=0, atol=1e-2 * alone.max())  # two exact images
+    assert_allclose(both, np.broadcast_to(alone, both.shape), rtol=0, atol=1e-2 * alone.max())  # two approximations
     require_same(both, both[0])
 
 

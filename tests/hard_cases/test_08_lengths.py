@@ -1,4 +1,4 @@
-"""Records of any length against the exact image: prime, odd, no multiple of anything, shorter than call or filters."""
+"""Records of awkward lengths compared with the exact image: prime, odd, or shorter than the call or the filters."""
 
 import numpy as np
 import pytest
@@ -42,7 +42,7 @@ LENGTHS = {
 
 
 def of_length(n_samples, settings=LINE):
-    """Settings whose image ends where the record does."""
+    """Settings whose image ends with the record."""
     end_m = sound_speed_m_s(settings.air) * n_samples / settings.recording.sample_rate_hz / 2
     return settings.replace(
         recording=Recording(n_samples=n_samples),
@@ -52,8 +52,8 @@ def of_length(n_samples, settings=LINE):
 
 @pytest.mark.parametrize("precision", ["float32", "auto"])
 @pytest.mark.parametrize("n_samples", LENGTHS.values(), ids=LENGTHS)
-def test_image_of_any_length_is_the_exact_one(n_samples, precision):
-    """Within a budget of -60 dB of noise, those have -45 dB that hold no more than one end of the call's band."""
+def test_image_of_any_record_length_is_exact(n_samples, precision):
+    """The error budget is -60 dB; records that contain only one end of the call's band reach -45 dB."""
     settings = tuned(of_length(n_samples), precision=precision, max_error_db=-60.0)
     pipeline, measurement = Pipeline(settings, predict=False), noise(settings)
     amplitude = pipeline.process(measurement).amplitude
@@ -64,7 +64,7 @@ def test_image_of_any_length_is_the_exact_one(n_samples, precision):
 
 @pytest.mark.parametrize("n_samples", [1009, 12_347, 32_769])
 def test_truncation_to_whole_blocks_loses_the_end(n_samples):
-    """The naive form: without the samples past the last multiple of 32 the image is off by -15 to -52 dB."""
+    """Without the samples after the last multiple of 32 the image is off by -15 to -52 dB."""
     settings = of_length(n_samples)
     words = noise(settings).data
     directions, range_m = np.eye(3)[:1], np.linspace(0, settings.processing.range_m[1], 50)

@@ -1,4 +1,4 @@
-"""NaN and infinities are refused by name wherever a number can be given; the ends of what is allowed work."""
+"""NaN and infinities, refused by name in every numeric option, and values at the limits, which are accepted."""
 
 import math
 
@@ -33,7 +33,7 @@ def is_number(value):
 
 
 def spoiled(value, bad):
-    """All copies of a value, a number or nested tuples of numbers, with one number replaced."""
+    """Yield copies of a number or of nested tuples of numbers, each with one number replaced."""
     if is_number(value):
         yield bad
     elif isinstance(value, tuple):
@@ -71,7 +71,7 @@ def test_settings_refuse_nan_and_infinity(section, field, bad):
 @pytest.mark.parametrize("bad", ["nan", "inf", "-inf"])
 @pytest.mark.parametrize(("section", "field"), PLACES)
 def test_settings_files_refuse_nan_and_infinity(section, field, bad):
-    """In TOML, where NaN and infinities can be written."""
+    """TOML has literals for NaN and infinities."""
     if isinstance(getattr(getattr(FULL, section), field), tuple):
         given = str(next(spoiled(getattr(getattr(FULL, section), field), math.nan)))
         given = given.replace("(", "[").replace(")", "]").replace("nan", bad)
@@ -100,12 +100,12 @@ def test_grids_refuse_nan_and_infinity(tmp_path, bad):
         direction_grid(Processing(directions=str(path)))
 
 
-# ---- the ends of what is allowed -------------------------------------------------------------------
+# ---- values at the limits --------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("temperature_c", "humidity_percent"), CORNERS)
 def test_extreme_temperatures_keep_the_range_of_the_echo(temperature_c, humidity_percent):
-    """Within 0.5 mm at 0.7 m; with 343 m/s for all air, at -40 °C it would lie 8 cm too far."""
+    """The range is within 0.5 mm at 0.7 m; a constant 343 m/s would put it 8 cm too far at -40 °C."""
     air = Air(temperature_c=temperature_c, humidity_percent=humidity_percent)
     settings = SHORT.replace(air=air, processing=SHORT.processing.replace(directions="2d:91"))
     words = echo_words(settings, azimuth_deg=-10.0, range_m=0.7, level=0.5)
@@ -118,8 +118,8 @@ def test_extreme_temperatures_keep_the_range_of_the_echo(temperature_c, humidity
 
 @pytest.mark.parametrize(("temperature_c", "humidity_percent"), CORNERS)
 @pytest.mark.parametrize("pressure_pa", [10_000.0, 101_325.0, 200_000.0])
-def test_speed_of_sound_is_exact_to_12_digits(temperature_c, humidity_percent, pressure_pa):
-    """The equations again in 50 digits. Dry air must not divide by its vapour, nor hot thin air hold too much of it."""
+def test_sound_speed_and_absorption_are_exact_to_12_digits(temperature_c, humidity_percent, pressure_pa):
+    """The reference has 50 digits. Dry air must not divide by its vapour, and hot thin air must limit its vapour."""
     air = Air(temperature_c=temperature_c, humidity_percent=humidity_percent, pressure_pa=pressure_pa)
     frequency_hz = np.array([1.0, 20e3, 50e3, 80e3, 200e3])
     with mpmath.workdps(50):
@@ -130,7 +130,7 @@ def test_speed_of_sound_is_exact_to_12_digits(temperature_c, humidity_percent, p
 
 
 def true_air(air, frequency_hz):
-    """Speed of sound of the ideal mixture, and ISO 9613-1's equations 3 to 5, in the precision of mpmath."""
+    """Speed of sound of the ideal mixture and absorption by ISO 9613-1, equations 3 to 5, in mpmath's precision."""
     number = mpmath.mpf
     kelvin, pressure = number("273.15") + number(air.temperature_c), number(air.pressure_pa) / 101_325
     saturation = number(10) ** (number("4.6151") - number("6.8346") * (number("273.16") / kelvin) ** number("1.261"))

@@ -1,4 +1,4 @@
-"""The same bits whatever the threads, the processor and the way through a file; devices agree within a stated bound."""
+"""Bit-identical results for any number of threads, processor and file round trip; devices agree within a bound."""
 
 import functools
 import hashlib
@@ -78,8 +78,8 @@ def digests(argument, code=CODE, **environment):
 
 
 @pytest.mark.parametrize("precision", ["float32", "auto"])
-def test_same_bits_for_one_and_two_threads(precision):
-    """Of directions and ranges that do not fill the last tile."""
+def test_one_and_two_threads_give_the_same_bits(precision):
+    """Directions and ranges do not fill the last tile."""
     settings = Settings.from_preset("short_25_50").replace(
         processing=Processing(directions="3d:301", range_m=(0.5, 1.5))
     )
@@ -101,13 +101,13 @@ def test_results_are_independent_of_the_number_of_threads(precision):
 
 
 def test_workqueue_threading_layer_gives_the_same_bits():
-    """Numba falls back to its workqueue where there is neither OpenMP nor TBB."""
+    """Numba falls back to its workqueue layer without OpenMP and TBB."""
     found = digests("float32", NUMBA_NUM_THREADS="4", NUMBA_THREADING_LAYER="workqueue")
     assert found == usual_digests("float32")
 
 
 def test_compiled_and_cached_kernels_give_the_same_bits(tmp_path):
-    """A kernel from the cache is optimised once more; where its sums leave a choice, it may be taken the other way."""
+    """Numba optimises a cached kernel once more, which could change the order of sums."""
     fresh, kept = (digests("", COMBINE, NUMBA_CACHE_DIR=str(tmp_path)) for _ in range(2))
     assert len(fresh) == 4
     assert fresh == kept
@@ -121,13 +121,13 @@ def test_numba_limits_are_reported_in_one_line():
 
 
 def test_processor_with_fewer_features_is_supported(tmp_path):
-    """Numba may be told to compile for an older processor; what that lacks is not used."""
+    """Numba can compile for an older processor, without the features that it lacks."""
     older = {"NUMBA_CPU_NAME": "generic", "NUMBA_CACHE_DIR": str(tmp_path), "NUMBA_NUM_THREADS": "4"}
     assert len(set(digests("auto", **older))) == 1
 
 
 def test_modulators_give_the_same_bits_on_every_processor(tmp_path):
-    """Without AVX, fused multiplication or an instruction that rounds; the states agree as well, to the last bit."""
+    """Bits and states agree without AVX, fused multiply-add or a rounding instruction."""
     older = {"NUMBA_CPU_NAME": "generic", "NUMBA_CACHE_DIR": str(tmp_path)}
     found = digests("cpu", MODULATE, NUMBA_NUM_THREADS="4")
     assert len(found) == 4
@@ -138,18 +138,18 @@ def test_modulators_give_the_same_bits_on_every_processor(tmp_path):
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize(("precision", "bound_db"), [("float32", -120), ("int16", -95)])
 def test_devices_agree_within_rounding(name, precision, bound_db):
-    """Numba and NumPy add up in other orders: -131 dB in float32 and -106 dB through 16 bits at the worst."""
+    """Numba and NumPy add in different orders: -131 dB in float32 and -106 dB with 16 bits in the worst case."""
     settings = tuned(CASES[name], precision=precision)
     if precision == "int16" and not all(kernels.load(device).tile_ranges for device in ("cpu", "numpy")):
         pytest.skip("this processor has no 16-bit dot product (AVX-512 VNNI or AVX-VNNI)")
     compiled = Pipeline(settings, device="cpu")
-    plain = Pipeline(compiled.settings, device="numpy")  # by the same plan
+    plain = Pipeline(compiled.settings, device="numpy")  # the same plan
     images = [pipeline.process(noise(settings)).amplitude for pipeline in (compiled, plain)]
     assert np.array_equal(*images) or reference.error_db(*images) < bound_db
 
 
 def test_replay_of_a_file_gives_the_same_hash(tmp_path):
-    """Live, from the recording, from a copy of the recording, and from the image's own file."""
+    """Images are computed live, from a recording and from its copy, and read from an image file."""
     measurements = [replace(noise(SHORT, seed), stamp=Stamp(sequence=seed)) for seed in range(3)]
 
     def digest(images):

@@ -1,4 +1,4 @@
-"""Arrays of 1 to 1024 microphones and words of 8 to 64 bits, against the exact image."""
+"""Arrays of 1 to 1024 microphones and words of 8 to 64 bits, compared with the exact image."""
 
 import tracemalloc
 
@@ -17,7 +17,7 @@ from tests.hard_cases.forced import EIGHT
 from tests.hard_cases.tuned import tuned
 from tests.scenes import line_array, only, scene_of
 
-# A fifth of the usual clock: the referee's spectra of 1024 microphones stay below 200 MB.
+# A fifth of the usual clock keeps the reference spectra of 1024 microphones below 200 MB.
 SLOW = SHORT.replace(
     recording=Recording(sample_rate_hz=900_000.0, n_samples=4_000),
     processing=SHORT.processing.replace(directions="2d:3", range_m=(0.1, 0.4), range_decimation=20),
@@ -25,7 +25,7 @@ SLOW = SHORT.replace(
 
 
 def spiral(n_mics, word_bits):
-    """Microphones on a sunflower of 10 cm, in no order that a row of bits would have."""
+    """Microphones on a sunflower spiral of 10 cm; no permutation of bits leaves the array unchanged."""
     number = np.arange(n_mics)
     radius_m, angle_rad = 0.05 * np.sqrt((number + 0.5) / n_mics), 2.399_963 * number
     places_m = np.stack([0.01 * np.cos(5.0 * number), radius_m * np.cos(angle_rad), radius_m * np.sin(angle_rad)], -1)
@@ -36,7 +36,7 @@ def spiral(n_mics, word_bits):
 @pytest.mark.parametrize("word_bits", [8, 16, 32, 64])
 @pytest.mark.parametrize("n_mics", [1, 2, 31, 33, 64])
 def test_image_of_any_array_size_is_exact(n_mics, word_bits, precision):
-    """-42 dB, or less: a bit in a wrong place would leave -15 dB of 33 microphones."""
+    """The error is below -42 dB; one misplaced bit of 33 microphones would cause -15 dB."""
     require_exact(spiral(n_mics, word_bits), precision)
 
 
@@ -61,7 +61,7 @@ def require_exact(array, precision):
 
 
 def test_pipeline_handles_1024_microphones():
-    """In memory for 128 of them at a time."""
+    """The simulator needs memory for 128 microphones at a time."""
     sensor = EIGHT.replace(array=line_array(1024, 1e-3), recording=Recording(n_samples=40_000))
     scene = scene_of(Point(range_m=0.5, azimuth_deg=30, strength_db=-20), sensor=sensor)
     simulator = Simulator(scene, plan=only("spreading", "absorption"))

@@ -1,6 +1,6 @@
-"""Any valid settings with any data: finite energies of 0 or more, or one line that says what cannot be had.
+"""Random settings and data: a finite, non-negative image or a one-line error.
 
-As many examples as take some seconds; more with the number in ``ERTIS_EXAMPLES``.
+The default number of examples takes some seconds; ``ERTIS_EXAMPLES`` sets another.
 """
 
 import os
@@ -19,24 +19,24 @@ from tests.hard_cases.tuned import tuned
 
 EXAMPLES = int(os.environ.get("ERTIS_EXAMPLES", "300"))
 MAX_SAMPLES = 500_000
-LOUDEST = 100.0  # of an image whose full scale is 1, before calibrated gains
+LOUDEST = 100.0  # limit of an image with a full scale of 1, before calibrated gains
 DATA = ("noise", "zeros", "ones", "alternating", "sparse", "stuck")
 
 
 def count_of(array):
-    """Channels of an array; the shipped layouts have 32."""
+    """Number of channels of an array; the built-in layouts have 32."""
     return 32 if array.positions_m is None else len(array.positions_m)
 
 
 def limits(low, high):
-    """Intervals, those of no width among them."""
+    """Intervals, including those of width 0."""
     edges = st.floats(low, high, allow_subnormal=False)
     return st.tuples(edges, edges).map(lambda pair: (min(pair), max(pair))) | edges.map(lambda edge: (edge, edge))
 
 
 @st.composite
 def arrays(draw):
-    """1 to 8 microphones, at times 9 to 70, or a shipped layout; some in one place, some without a microphone."""
+    """Arrays of 1 to 8, rarely 9 to 70 microphones, or a built-in layout; some coincide, and some are disabled."""
     if draw(st.integers(0, 9)) == 0:
         return Array(layout=draw(st.sampled_from(["eRTIS_v3D1", "uRTIS_v1"])))
     n_mics = draw(st.integers(1, 8) | st.sampled_from([9, 31, 33, 70]))
@@ -63,7 +63,7 @@ def _mixed(values, n_mics):
 
 @st.composite
 def calls(draw):
-    """Fields of sweeps of any direction, width and ramp, from one that hardly sweeps on."""
+    """Fields of sweeps of any direction, ramp and width, including very narrow ones."""
     sample_rate_hz = draw(st.floats(2e5, 1e6))
     low_hz = draw(st.floats(2e3, 4e4))
     high_hz = draw(st.floats(low_hz * 1.0001, min(9e4, sample_rate_hz * 0.499)))
@@ -104,7 +104,7 @@ COMBINING = {
 
 @st.composite
 def any_settings(draw):
-    """Settings that their constructors take, or None where they refuse; records of 4 ms at the most."""
+    """Valid settings with records of 4 ms at most, or None if the constructors refuse the values."""
     rate_hz = draw(st.sampled_from([450e3, 9e5, 1.125e6, 4.5e6]) | st.floats(2.5e5, 5e6))
     recording = Recording(
         sample_rate_hz=rate_hz, n_samples=draw(st.integers(1, 300) | st.integers(1, max(1, int(4e-3 * rate_hz))))
@@ -114,7 +114,7 @@ def any_settings(draw):
     reach_m = 340.0 * recording.duration_s / 2
     array = draw(arrays())
     tuning = draw(some_of(TUNING))
-    # All phases and microphones of the 10 ms that an image needs at the most: few, so that examples are quick.
+    # Limit the samples of all phases and microphones in the 10 ms that an image needs, to keep examples fast.
     finest = max(1, min(64, int(MAX_SAMPLES * step * divisor / (10e-3 * rate_hz * count_of(array)))))
     tuning["oversampling"] = min(finest, tuning.get("oversampling", finest))
     air = Air(
@@ -143,7 +143,7 @@ def any_settings(draw):
 
 
 def require_one_line(error):
-    """What is refused is named, with the remedy, in one line."""
+    """Require an error message of one line with a remedy."""
     message = str(error)
     assert message
     assert "\n" not in message
@@ -151,7 +151,7 @@ def require_one_line(error):
 
 
 def words_for(pipeline, kind, seed):
-    """Data of a kind in the shape that the settings ask for."""
+    """Data of the given kind in the shape that the settings require."""
     random = np.random.default_rng(seed)
     array = pipeline.settings.array
     n_words = -(-count_of(array) // array.word_bits)
@@ -174,7 +174,7 @@ def words_for(pipeline, kind, seed):
     max_examples=EXAMPLES,
     deadline=None,
     derandomize=True,
-    phases=[Phase.generate],  # to make a failing example smaller would take minutes
+    phases=[Phase.generate],  # shrinking a failing example takes minutes
     suppress_health_check=[HealthCheck.too_slow],
 )
 @given(
@@ -195,7 +195,7 @@ def test_any_settings_and_data_give_an_image_or_one_line(made, kind, seed, devic
     image = pipeline.process(Measurement(words_for(pipeline, kind, seed), made))
     assert image.amplitude.shape == (len(pipeline.grid), len(pipeline.range_m))
     assert np.isfinite(image.amplitude).all()
-    if made.processing.method == "fast":  # the paper's envelope is low-passed by a recursive filter, which undershoots
+    if made.processing.method == "fast":  # the paper's recursive low pass undershoots
         assert image.amplitude.min() >= 0
     if made.processing.beamformer == "delay_and_sum":
         assert image.amplitude.max() < LOUDEST / min(made.array.gain or (1.0,))
@@ -204,11 +204,11 @@ def test_any_settings_and_data_give_an_image_or_one_line(made, kind, seed, devic
         assert peak.level_db <= 0
 
 
-# ---- what the search has found ---------------------------------------------------------------------
+# ---- errors found by random search -----------------------------------------------------------------
 
 
 def test_call_shorter_than_a_period_is_refused():
-    """Sampled at the signals' rate it was all zeros, and the matched filter divided by its power."""
+    """Sampled at the signal rate such a call is all zeros, and the matched filter would divide by its power."""
     with pytest.raises(
         ArgumentError, match=r"call\.duration_s is 8e-05, less than a period of 2000 Hz; give 0\.0005 or"
     ):
@@ -216,7 +216,7 @@ def test_call_shorter_than_a_period_is_refused():
 
 
 def test_sweep_too_narrow_for_the_paper_is_refused():
-    """Its band pass rang for a minute, and 3 GB of it were computed."""
+    """The band pass of such a sweep rings for a minute, which takes 3 GB to compute."""
     call = Call(start_frequency_hz=40_000.5, stop_frequency_hz=40_000.0)
     Settings(call=call)
     with pytest.raises(
@@ -226,7 +226,7 @@ def test_sweep_too_narrow_for_the_paper_is_refused():
 
 
 def test_peaks_are_found_if_the_sample_rate_cuts_the_band_edge():
-    """The paper's method may have a rate at which the matched filter's band reaches past half of it."""
+    """With the paper's method, the matched filter's band can extend beyond half the signal rate."""
     processing = Processing(method="paper", directions="2d:31", range_decimation=160, decimation=80, range_m=(0.2, 0.5))
     call = Call(start_frequency_hz=25_000.0, stop_frequency_hz=10_000.0)
     made = Settings(call=call, recording=Recording(n_samples=20_000), processing=processing)

@@ -1,4 +1,4 @@
-"""Settings of other accuracy, and the chain that takes signals."""
+"""Settings with changed accuracy, and the chain that processes signals before modulation."""
 
 from ertis_numba import kernels
 from ertis_numba.pipeline import Pipeline
@@ -11,5 +11,5 @@ def tuned(settings, **changes):
 
 
 def chain_of(settings):
-    """A chain on one thread, which also takes what would be modulated."""
+    """A single-threaded chain, which can also process signals before modulation."""
     return FastChain(Pipeline(settings, threads=1).settings, kernels.load("cpu"), threads=1)

@@ -1,1 +1,1 @@
-"""Kernels of the GPU, compiled without one. Run by themselves: a process either compiles kernels or simulates them."""
+"""GPU kernels compiled without a GPU. They need their own process, because one cannot both compile and simulate."""

@@ -1,4 +1,4 @@
-"""What these tests need, and what there is to compile."""
+"""Fixtures that require the compilers and record all kernel launches."""
 
 import os
 
@@ -11,7 +11,7 @@ from tests.ptx import launches
 
 @pytest.fixture(scope="session", autouse=True)
 def _compilers():
-    """Where there are no compilers nothing is tested, except where all of it must be."""
+    """Skip all tests without compilers, but fail in continuous integration."""
     try:
         compiling.require_compilers()
     except DeviceError as error:
@@ -22,5 +22,5 @@ def _compilers():
 
 @pytest.fixture(scope="session")
 def launched():
-    """All launches, by name of the kernel in the contract."""
+    """Kernel launches by the name of the kernel in the contract."""
     return launches.by_contract()

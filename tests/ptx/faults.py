@@ -1,4 +1,4 @@
-"""What may be wrong with compiled kernels that no simulator shows."""
+"""Checks of compiled kernels for faults that the simulator cannot show."""
 
 import math
 import re
@@ -8,16 +8,16 @@ DOUBLE = {
     "add_paths": "delays of thousands of turns, to a millionth of one",
     "modulate_pdm": "bits that are those of the processor",
 }
-"""Kernels that compute in double precision, and why; a GPU for games does so at a 64th of its speed."""
+"""Kernels that need double precision, with the reason; consumer GPUs compute it at 1/64 of their speed."""
 
 LIBRARY_CALLS = {"add_paths": "sin and cos bring a function for angles beyond 10⁵ turns, and 40 bytes for it"}
-"""Kernels that may call a function, and why."""
+"""Kernels that may call a function, with the reason."""
 
-_REGISTERS, _REGISTERS_AT_A_TIME = 65_536, 8  # of a block at most, and of a thread
+_REGISTERS, _REGISTERS_AT_A_TIME = 65_536, 8  # limit per block, and allocation step per thread
 
 
 def faults(launch, code):
-    """Return what is wrong with a launch and its code, in words."""
+    """Return descriptions of all faults of a launch and its code."""
     found = []
     if ".f64" in code.ptx and launch.file not in DOUBLE:
         found.append("computes in double precision")
@@ -40,5 +40,5 @@ def faults(launch, code):
 
 
 def contracts(text):
-    """Whether PTX or machine code rounds products and sums of double precision once."""
+    """Return True if PTX or machine code contains a fused multiply-add in double precision."""
     return re.search(r"\bfma\.\S+\.f64|\bDFMA\b", text) is not None

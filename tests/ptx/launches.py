@@ -1,4 +1,4 @@
-"""Every kernel launched as the chain does it, or by itself where no chain does."""
+"""Launches of every kernel, by the processing chain or, if no chain uses it, directly."""
 
 import functools
 
@@ -18,7 +18,7 @@ PLANS = {
     "deep stop band": ({"stopband_attenuation_db": 100.0, "precision": "float32"}, {}),  # taps of 32 bits
     "int16": ({"precision": "int16", "beam_taps": 0, "delay_taps": 2}, {}),
     "int16, nodes": ({"precision": "int16", "beam_taps": 4}, {}),
-    "near": ({}, {"range_m": (0.3, 1.0)}),  # several zones
+    "near": ({}, {"range_m": (0.3, 1.0)}),  # several focal zones
     "coherence": ({}, {"beamformer": "coherence_factor"}),
     "capon": ({}, {"beamformer": "capon", "directions": "90"}),
     **{f"dmas {order}": ({}, {"beamformer": "dmas", "dmas_order": order}) for order in (2, 3, 5, 8)},
@@ -46,7 +46,7 @@ def _chain(accuracy, processing, kernels):
 
 
 def _each(kernels):
-    """Launch what no plan uses, and every type of words and taps."""
+    """Launch the kernels that no plan uses, and every type of words and taps."""
     channels = np.arange(8, dtype=np.int32)
     signals, spectra = np.zeros((8, 500), np.float32), np.zeros((8, 251), np.complex64)
     for word in (np.uint8, np.uint16, np.uint32, np.uint64):

@@ -1,4 +1,4 @@
-"""The checks of compiled kernels find what they look for, in kernels made for it."""
+"""Checks of compiled kernels, tested with deliberately faulty kernels."""
 
 import dataclasses
 import types
@@ -41,7 +41,7 @@ def calling(x, out):
 
 
 def spilling():
-    """A kernel with more sums than it may have registers."""
+    """A kernel with more sums than registers."""
     lines = ["def spilling(x, out):", "    t = cuda.threadIdx.x", *(f"    a{k} = x[t + {k}]" for k in range(SUMS))]
     lines += ["    for i in range(x.size):"]
     lines += [f"        a{k} = a{k} * x[i] + a{(k + 1) % SUMS}" for k in range(SUMS)]
@@ -97,7 +97,7 @@ def test_register_spills_are_detected():
     ],
 )
 def test_launches_beyond_bounds_are_detected(grid, block, fault):
-    one = dataclasses.replace(recorded(good), grid=grid, block=block)  # `launch` itself would refuse some
+    one = dataclasses.replace(recorded(good), grid=grid, block=block)  # `launch` itself refuses some of these
     assert faults(one, compiling.code_of(one, CC)) == [fault]
 
 
@@ -109,7 +109,7 @@ def test_excess_registers_and_shared_memory_are_detected():
     assert faults(one, dataclasses.replace(code, shared_bytes=49_153)) == ["shares 49153 bytes"]
 
 
-def test_contraction_is_detected():
+def test_fused_multiply_add_in_double_precision_is_detected():
     code = compiling.code_of(recorded(contracted, dtype=np.float64), CC)
     assert contracts(code.ptx)
     assert contracts(compiling.disassembled(code))
@@ -129,7 +129,7 @@ def test_shared_memory_is_reported():
     assert compiling.code_of(recorded(sharing), CC).shared_bytes == 1024
 
 
-def test_arguments_have_gpu_types():
+def test_recorded_launch_has_types_of_gpu_arrays():
     x = np.zeros(100, np.float32)
     x.flags.writeable = False
     (one,) = compiling.recorded(lambda _: launch(good, (1,), (32,), x, x))

@@ -1,4 +1,4 @@
-"""Every kernel compiles for every kind of GPU, with the types of the chain, into code that is as it should be."""
+"""Every kernel compiled for several GPU generations with the types of the chain, and checked for faults."""
 
 import pytest
 
@@ -6,7 +6,7 @@ from ertis_numba.kernels._cuda import compiling
 from ertis_numba.kernels._kernel_set import KERNEL_NAMES
 from tests.ptx import faults
 
-CCS = [(6, 0), (7, 5), (9, 0)]  # the oldest that CUDA 12 compiles for, the oldest of CUDA 13, and an H200
+CCS = [(6, 0), (7, 5), (9, 0)]  # oldest target of CUDA 12, oldest target of CUDA 13, and H200
 CONTRACTS = sorted(KERNEL_NAMES)
 
 
@@ -17,7 +17,7 @@ def test_every_kernel_contract_is_launched(launched):
 
 @pytest.mark.parametrize("cc", CCS, ids=lambda cc: f"sm_{cc[0]}{cc[1]}")
 @pytest.mark.parametrize("name", CONTRACTS)
-def test_compiles_without_faults(launched, name, cc):
+def test_kernel_compiles_without_faults(launched, name, cc):
     found = {(launch.name, *faults.faults(launch, compiling.code_of(launch, cc))) for launch in launched[name]}
     assert {one for one in found if len(one) > 1} == set()
 

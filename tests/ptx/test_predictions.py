@@ -1,4 +1,4 @@
-"""What docs/explanation/gpu.md says of the kernels is what the compiler makes of them."""
+"""Predicted GPU times, and docs/explanation/gpu.md compared with the compiled kernels."""
 
 import json
 import re
@@ -76,10 +76,10 @@ def test_gpu_documentation_matches_the_compiled_code(report):
     assert published.strip() == tables.ptx(report).strip(), "run: ertis bench ptx --update docs/explanation/gpu.md"
 
 
-def test_loops_contain_only_needed_instructions(report):
+def test_gpu_loops_contain_only_needed_instructions(report):
     loops = {loop["kernel"]: loop for loop in report["loops"]}
     sums = loops["delay_and_sum_envelope.fill"]
-    assert (sums["loads"], sums["multiply-adds"]) == (6, 16)  # offset, weight, four samples; four multiply-adds each
+    assert (sums["loads"], sums["multiply-adds"]) == (6, 16)  # offset, weight, 4 samples; 4 multiply-adds per sample
     assert sums["all"] <= 32
     assert loops["delay_and_sum.fill"]["all"] <= 34
     taps = loops["demodulate_words.sum_taps"]
@@ -89,7 +89,7 @@ def test_loops_contain_only_needed_instructions(report):
     assert (nodes["loads"], nodes["multiply-adds"]) == (10, 16)
 
 
-def test_default_plans_reach_the_goals(report):
+def test_default_gpu_plans_reach_the_time_goals(report):
     for plan in report["plans"]:
         parts_us = sum(plan["times_us"].values())
         assert plan["one_ms"] == pytest.approx(parts_us / 1e3, abs=1e-3)
@@ -101,8 +101,8 @@ def test_default_plans_reach_the_goals(report):
             assert plan["per_second"]["images left on the GPU"] >= ptx.GOALS["streamed_per_s"]
 
 
-def test_prediction_equals_a_calculation_by_hand(report):
-    """3000 direct beams: 57 blocks on the busiest multiprocessor, of four warps, 32 terms, 14 lines each."""
+def test_predicted_gpu_time_matches_calculation_by_hand(report):
+    """3000 direct beams: the busiest multiprocessor runs 57 blocks of four warps, with 32 terms of 14 lines each."""
     (row,) = [row for row in report["plans"][-1]["launches"] if row["kernel"] == "delay_and_sum_envelope.fill"]
     assert row["grid"] == [750, 10]
     assert row["parts_us"]["first cache"] == pytest.approx(57 * 4 * 32 * 14 / 1.98e3, abs=0.01)
@@ -110,7 +110,7 @@ def test_prediction_equals_a_calculation_by_hand(report):
     assert row["parts_us"]["memory"] == pytest.approx((signals + image + 3000 * 32 * 12) / 4.8e6, abs=0.01)
 
 
-def test_command_writes_the_table(report, monkeypatch, tmp_path):
+def test_bench_ptx_command_writes_its_table(report, monkeypatch, tmp_path):
     monkeypatch.setattr(ptx, "run", lambda **_: report)
     target = tmp_path / "a.md"
     target.write_text("<!-- ertis bench ptx -->\n<!-- /ertis bench ptx -->\n", "utf-8")
