@@ -1,4 +1,4 @@
-"""``plot(image, ax=…)`` draws into the axes of a user's own figure."""
+"""``plot(image, ax=…)`` draws into axes of the caller's figure."""
 
 import numpy as np
 import pytest
@@ -45,7 +45,7 @@ def test_image_with_elevations_is_drawn_as_a_map():
     solid = image(np.degrees(SOLID.azimuth_rad), np.degrees(SOLID.elevation_rad))
     ertis.plot(solid, ax=axes, dynamic_range_db=30, side_lobes=True)
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("azimuth (°)", "elevation (°)")
-    assert axes.get_xlim()[0] > axes.get_xlim()[1]  # positive azimuths, towards y, are on the left
+    assert axes.get_xlim()[0] > axes.get_xlim()[1]  # Positive azimuths, towards +y, are on the left.
     assert axes.images[-1].get_clim() == (-30, 0)
     assert len(drawn(axes).reshape(-1, 4))
 

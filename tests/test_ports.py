@@ -1,4 +1,4 @@
-"""Which serial ports are found, which one a name means, and what sensors say when they are asked."""
+"""Discovery of serial ports, lookup by name, and the survey of connected sensors."""
 
 import errno
 import json
@@ -26,7 +26,7 @@ WORDS = [np.zeros(32_768, dtype=np.uint32)]
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch):
-    """The folder of emulated devices, and a machine without others."""
+    """Folder of emulated devices on a machine without other devices."""
     monkeypatch.setenv("ERTIS_EMULATED_DIR", str(tmp_path / "emulated"))
     monkeypatch.setattr(ports, "_BY_ID", tmp_path / "by-id")
     monkeypatch.setattr(list_ports, "comports", list)
@@ -34,7 +34,7 @@ def folder(tmp_path, monkeypatch):
 
 
 def plug_in(monkeypatch, **serial_numbers):
-    """Let there be USB devices: name=serial number."""
+    """Emulate USB devices, given as name=serial number."""
 
     def info(name, serial_number):
         port = ListPortInfo(f"/dev/{name}")
@@ -74,7 +74,7 @@ def test_emulated_device_is_found_by_all_its_names(folder, tmp_path):
 
 
 def test_link_of_a_killed_emulator_is_not_followed(folder):
-    """Its number is soon that of somebody's shell."""
+    """The system soon gives the number of its pseudo terminal to another process, such as a shell."""
     with Emulator(WORDS) as device:
         folder.mkdir()
         (folder / "left").symlink_to(device.port)
@@ -136,7 +136,7 @@ def test_missing_port_is_refused(monkeypatch):
 
 @pytest.fixture
 def four(folder):
-    """Devices of which one is ready, one has a call, one is in use and one is silent."""
+    """Four devices: a new one, one with a call, one in use and a silent one."""
     with ExitStack() as stack:
         emulators = {
             name: stack.enter_context(Emulator(WORDS, link=folder / name)) for name in ("call", "mute", "new", "used")
@@ -209,7 +209,7 @@ def test_given_port_without_a_sensor_is_reported():
 
 def test_devices_command_without_devices(monkeypatch):
     assert survey([]) == []
-    plug_in(monkeypatch, ttyUSB0="FTDI")  # it is no CDC-ACM port, so that nothing is said to it
+    plug_in(monkeypatch, ttyUSB0="FTDI")  # The survey queries CDC-ACM ports only.
     done = listed()
     assert (done.stdout, done.stderr) == (
         "",

@@ -1,4 +1,4 @@
-"""Disks after a power cut: nothing that was acknowledged is lost, or stored twice; the short form of two benchmarks."""
+"""Simulated power cuts: acknowledged measurements are stored exactly once (the short form of two benchmarks)."""
 
 import random
 import shutil
@@ -20,7 +20,7 @@ NOTHING_WRONG = dict.fromkeys(("lost", "twice", "wrong", "failed", "left_over"),
 
 @pytest.mark.parametrize("name", N_STATES)
 def test_power_cuts_lose_and_duplicate_nothing(tmp_path, name):
-    """Half of the commands run with syncs that fail."""
+    """Syncs fail in half of the runs."""
     reason = powercuts.reason_not_to_try(tmp_path)
     if reason:
         pytest.skip(reason)
@@ -46,7 +46,7 @@ def test_power_cuts_without_a_compiler_are_reported_as_not_tried(tmp_path, monke
 
 
 class Happening:
-    """Records of one process on a disk."""
+    """Simulated disk with the recorded operations of one process."""
 
     def __init__(self, folder):
         self.folder, self.disk = folder, Disk(folder)
@@ -61,7 +61,7 @@ class Happening:
         self(ends, name, inode=inode, offset=is_folder)
 
     def states(self, target, count=60):
-        """Content by name of each of some disks after a power cut."""
+        """Return the contents by file name for several disks after a power cut."""
         found = []
         rng = random.Random(SEED)
         for number in range(count):

@@ -1,4 +1,4 @@
-"""``ertis process`` of several recordings: what it prints, and how it ends."""
+"""``ertis process`` with several recordings: its output and exit codes."""
 
 import io
 import json
@@ -35,7 +35,7 @@ def run(*arguments, code=0):
 
 @pytest.fixture
 def here(monkeypatch):
-    """No processes, which takes less to start."""
+    """Process recordings in the test's own process, because worker processes start slowly."""
     monkeypatch.setattr(Campaign, "_pool", lambda _: Here())
 
 
@@ -148,10 +148,10 @@ def test_progress_bars_appear_on_a_terminal(runs, monkeypatch, capsys):
         _process_many.process_many(
             ["runs"], "out", CampaignOptions(), workers=None, scheduler=None, quiet=False, as_json=True
         )
-    shown = re.sub(r"\x1b\[[\d;?]*\w", "", terminal.getvalue())  # less colours
+    shown = re.sub(r"\x1b\[[\d;?]*\w", "", terminal.getvalue())  # Remove colours.
     assert re.search(r"recordings ━+ \d/2", shown)
     assert "out/a.energy.h5: 3 measurements" in shown
-    assert len(capsys.readouterr().out.splitlines()) == 3  # and nothing of the bars
+    assert len(capsys.readouterr().out.splitlines()) == 3  # Progress bars go to stderr.
 
 
 def test_each_recording_in_progress_has_a_bar(monkeypatch):
@@ -162,7 +162,7 @@ def test_each_recording_in_progress_has_a_bar(monkeypatch):
         return [(task.description, task.completed, task.total) for task in bars.progress.tasks]
 
     paths = [Path(f"runs/{name}.h5") for name in "ab"]
-    bars.follow(RecordingProgress(paths[0], 3))  # of one that it has never heard of
+    bars.follow(RecordingProgress(paths[0], 3))  # Its start was not reported.
     for path in paths:
         bars.follow(RecordingStarted(path, 7))
     bars.follow(RecordingProgress(paths[1], 4))

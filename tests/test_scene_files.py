@@ -1,4 +1,4 @@
-"""Scenes as TOML, and what is refused."""
+"""Scene files in TOML, and the error messages for invalid ones."""
 
 import math
 import time
@@ -34,7 +34,7 @@ from ertis_numba.simulation.plan import make_plan
 from ertis_numba.simulation.snapshot import snapshot
 from tests.scenes import SENSOR
 
-# ---- there and back --------------------------------------------------------------------------------
+# ---- round trip ------------------------------------------------------------------------------------
 
 vectors = st.tuples(*(st.floats(-50, 50) for _ in range(3)))
 directions = st.tuples(st.floats(-180, 180), st.floats(-90, 90))
@@ -50,7 +50,7 @@ bands = st.tuples(st.floats(1e3, 4e4), st.floats(5e4, 1e5))
 
 
 def things(kind, where=places, **fields):
-    """A few things of a kind, anywhere."""
+    """Strategy for a few scene objects of one kind."""
     made = st.builds(lambda place, rest: kind(**place, **rest), where, st.fixed_dictionaries(fields))
     return st.lists(made, max_size=2).map(tuple)
 
@@ -126,7 +126,7 @@ def test_positions_from_direction_and_range():
 
 
 def test_scene_stores_the_layout_beside_its_file(tmp_path):
-    """A layout that it names is looked for beside it."""
+    """A relative layout path starts at the folder of the scene file."""
     (tmp_path / "line.csv").write_text("0, 0\n5, 0\n10, 0\n")
     (tmp_path / "scene.toml").write_text('[[sensors]]\narray.layout = "line.csv"\n[[points]]\nrange_m = 1\n')
     scene = load_scene(tmp_path / "scene.toml")
@@ -157,7 +157,7 @@ def test_faults_of_missing_channels_are_refused(tmp_path, channel):
         load_scene(path)
 
 
-# ---- what is refused -------------------------------------------------------------------------------
+# ---- invalid scenes --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -302,7 +302,7 @@ def test_unknown_sensors_and_fields_are_refused():
         Point(range_m=1.0).replace(range=1.0)
 
 
-# ---- how sensors are turned ------------------------------------------------------------------------
+# ---- orientation of sensors ------------------------------------------------------------------------
 
 
 @given(st.floats(-180, 180), st.floats(-90, 90), st.floats(-180, 180))
@@ -313,7 +313,7 @@ def test_rotation_and_quaternion_are_equivalent(yaw_deg, pitch_deg, roll_deg):
     assert np.linalg.det(rotation) == pytest.approx(1)
     assert_allclose(scipy.spatial.transform.Rotation.from_quat(sensor.quaternion()).as_matrix(), rotation, atol=1e-9)
     wanted_m = (math.cos(math.radians(pitch_deg)) * math.cos(math.radians(yaw_deg)), math.sin(math.radians(pitch_deg)))
-    assert_allclose(rotation[[0, 2], 0], wanted_m, atol=1e-12)  # nose to the left, then up
+    assert_allclose(rotation[[0, 2], 0], wanted_m, atol=1e-12)  # Yaw to the left, then pitch up.
 
 
 def test_error_in_a_long_scene_is_found_quickly():

@@ -1,4 +1,4 @@
-"""One changed number of nested settings needs one call."""
+"""Changes of nested settings by dotted path, such as ``processing.range_m``."""
 
 import re
 
