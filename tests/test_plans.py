@@ -161,12 +161,12 @@ def test_plan_options_need_the_fast_method(recording, arguments, reported):
     assert reported in run(recording, *arguments, code=2).stderr
 
 
-def test_verified_error_of_silence_is_zero():
+def test_verify_refuses_a_silent_exact_image():
     with pytest.raises(DataError, match="the exact image is silent"):
         verification.error_db(np.ones((2, 3), np.float32), np.zeros((2, 3), np.float32))
 
 
-def test_nan_counts_as_the_largest_error():
+def test_verified_error_of_nan_is_infinite():
     assert verification.error_db(np.full((1, 1), np.nan, np.float32), np.ones((1, 1), np.float32)) == np.inf
 
 

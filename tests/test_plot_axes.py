@@ -71,7 +71,7 @@ def test_peaks_are_marked_and_other_axes_stay_empty():
     figure.canvas.draw()
 
 
-def test_a_page_is_drawn_without_axes():
+def test_plot_without_axes_draws_a_page():
     assert isinstance(ertis.plot(image()), Figure)
     pages = [ertis.plot(image(), theme="light"), ertis.plot_page(image(), theme="light")]
     for page in pages:
@@ -94,7 +94,7 @@ def test_a_page_is_drawn_without_axes():
         (lambda: ertis.plot_page(3), "image is of type int; give Energyscape"),
     ],
 )
-def test_unusable_arguments_are_refused_in_one_line(call, message):
+def test_plot_refuses_unusable_arguments_in_one_line(call, message):
     with pytest.raises(ertis.ArgumentError, match=message) as caught:
         call()
     assert "\n" not in str(caught.value)

@@ -113,7 +113,7 @@ def test_point_extractor_agrees_with_find_peaks():
     np.testing.assert_allclose(cloud.position_m, expected, atol=1e-5)
 
 
-def test_top_and_level_limit_the_cloud():
+def test_point_cloud_is_limited_by_top_and_level():
     image = image_of([(-40, 0, 0.95, 0.5), (3, 0, 1.3, 1.0), (50, 0, 1.1, 0.2)])
     assert len(PointExtractor(image.settings, top=2)(image)) == 2
     assert len(PointExtractor(image.settings, min_level_db=-10.0)(image)) == 2
@@ -308,7 +308,7 @@ def test_point_finder_computes_tables_once_per_sensor(monkeypatch):
     assert len(made) == 2
 
 
-def test_known_positions_in_the_frame_of_rep_103():
+def test_point_positions_follow_the_axes_of_rep_103():
     """REP 103: x points forward, y left and z up; positive azimuth is to the left."""
     reflectors = [(0.0, 0.0, 1.0, 1.0), (60.0, 0.0, 1.1, 1.0), (0.0, 45.0, 1.2, 1.0)]
     image = image_of(reflectors, directions="3000", range_m=(0.9, 1.3))

@@ -135,7 +135,7 @@ def test_missing_port_is_refused(monkeypatch):
 
 
 @pytest.fixture
-def four(folder):
+def four_devices(folder):
     """Four devices: a new one, one with a call, one in use and a silent one."""
     with ExitStack() as stack:
         emulators = {
@@ -154,7 +154,7 @@ def listed(*arguments, code=0):
     return done
 
 
-@pytest.mark.usefixtures("four")
+@pytest.mark.usefixtures("four_devices")
 def test_ports_are_queried_in_parallel():
     before = time.monotonic()
     answers = {answer.port.serial_number: answer for answer in survey(find_ports())}
@@ -170,25 +170,25 @@ def test_ports_are_queried_in_parallel():
     assert "does not answer" in str(answers["mute"].error)
 
 
-def test_devices_command_prints_a_table(four):
+def test_devices_command_prints_a_table(four_devices):
     done = listed()
     assert [re.split("  +", line) for line in done.stdout.splitlines()] == [
         ["port", "serial number", "state", "firmware", "call", "what"],
-        [four["call"].port, "call", "ready", "1.0.0", "0x0523", "emulated eRTIS"],
-        [four["new"].port, "new", "ready", "1.0.0", "0x0000", "emulated eRTIS"],
-        [four["used"].port, "used", "in use", "-", "-", "emulated eRTIS"],
+        [four_devices["call"].port, "call", "ready", "1.0.0", "0x0523", "emulated eRTIS"],
+        [four_devices["new"].port, "new", "ready", "1.0.0", "0x0000", "emulated eRTIS"],
+        [four_devices["used"].port, "used", "in use", "-", "-", "emulated eRTIS"],
     ]
     assert done.stderr.count("\n") == 1
-    assert f"{four['mute'].port} does not answer" in done.stderr
+    assert f"{four_devices['mute'].port} does not answer" in done.stderr
 
 
-def test_devices_command_prints_json(four):
-    done = listed("--json", "--port", "call", "-p", four["used"].port)
+def test_devices_command_prints_json(four_devices):
+    done = listed("--json", "--port", "call", "-p", four_devices["used"].port)
     assert (done.stdout.count("\n"), done.stderr) == (1, "")
     ready, used = json.loads(done.stdout)["devices"]
     assert ready == {
-        "port": four["call"].port,
-        "link": str(four["call"].link),
+        "port": four_devices["call"].port,
+        "link": str(four_devices["call"].link),
         "serial_number": "call",
         "description": "emulated eRTIS",
         "emulated": True,
@@ -199,15 +199,15 @@ def test_devices_command_prints_json(four):
     assert (used["state"], used["call_hash"]) == ("in use", None)
 
 
-@pytest.mark.usefixtures("four")
-def test_given_port_without_a_sensor_is_reported():
+@pytest.mark.usefixtures("four_devices")
+def test_devices_command_reports_a_port_without_a_sensor():
     done = listed("-p", "mute", "-p", "new", code=1)
     assert [re.split("  +", line)[2] for line in done.stdout.splitlines()[1:]] == ["no answer", "ready"]
     assert "does not answer 'firmware version?'" in str(done.exception)
     assert "serial port 'moot' does not exist" in str(listed("-p", "moot", code=1).exception)
 
 
-def test_devices_command_without_devices(monkeypatch):
+def test_devices_command_prints_nothing_without_devices(monkeypatch):
     assert survey([]) == []
     plug_in(monkeypatch, ttyUSB0="FTDI")  # The survey queries CDC-ACM ports only.
     done = listed()

@@ -34,12 +34,12 @@ def run(*arguments, code=0):
 
 
 @pytest.fixture
-def here(monkeypatch):
+def in_test_process(monkeypatch):
     """Process recordings in the test's own process, because worker processes start slowly."""
     monkeypatch.setattr(Campaign, "_pool", lambda _: Here())
 
 
-@pytest.mark.usefixtures("here")
+@pytest.mark.usefixtures("in_test_process")
 def test_process_reports_each_recording_and_a_summary(runs, tmp_path):
     done = run("runs/*.h5", "-o", "out/", *FAST, "--json", code=1)
     *each, total = [json.loads(line) for line in done.stdout.splitlines()]
@@ -89,7 +89,7 @@ def test_process_reports_plans_and_verifies_each_recording(runs, monkeypatch):
     assert again.stderr.count(": exists already, kept\n") == 2
 
 
-@pytest.mark.usefixtures("here")
+@pytest.mark.usefixtures("in_test_process")
 def test_images_beyond_the_budget_are_not_written(runs, monkeypatch):
     measured = verification.Measured(error_db=-30.0, n_directions=7, peaks=None)
     monkeypatch.setattr(verification, "measure", lambda *_, **__: measured)
@@ -127,7 +127,7 @@ def test_process_refuses_invalid_usage(runs, arguments, code, stated):
     assert not (runs.parent / "out").exists() or names_in(runs.parent / "out") == []
 
 
-def test_folder_as_output_of_one_recording(runs, tmp_path):
+def test_process_accepts_a_folder_for_one_recording(runs, tmp_path):
     run(runs / "a.h5", "-o", "out/", *FAST)
     assert names_in(tmp_path / "out") == ["a.energy.h5"]
 
@@ -137,7 +137,7 @@ class Terminal(io.StringIO):
         return True
 
 
-@pytest.mark.usefixtures("here")
+@pytest.mark.usefixtures("in_test_process")
 def test_progress_bars_appear_on_a_terminal(runs, monkeypatch, capsys):
     terminal = Terminal()
     monkeypatch.setenv("TERM", "xterm")

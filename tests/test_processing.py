@@ -123,7 +123,7 @@ def test_two_workers_publish_in_order():
     assert sequences == sorted(sequences)
 
 
-def test_changed_settings_apply_and_waiting_measurements_are_counted():
+def test_changed_settings_count_waiting_measurements():
     with driven() as loop, Application(loop.processing.address) as application:
         application.subscribe("energyscape", credit=8)
         loop.until(lambda: application.read() or application.others)

@@ -22,7 +22,7 @@ WORDS = st.lists(TRICKY | st.integers(0, 2**32 - 1), min_size=N_SAMPLES, max_siz
 JUNK = st.lists(st.integers(0, 255) | st.sampled_from(list(WORD.pack(HEADER) + WORD.pack(FOOTER)))).map(bytes)
 
 
-def fed(data, cuts=()):
+def parse_in_pieces(data, cuts=()):
     """Feed a stream to a new parser in pieces one second apart; return the parser and its blocks."""
     parser = BlockParser(N_SAMPLES)
     edges = [0, *sorted(cut % (len(data) + 1) for cut in cuts), len(data)]
@@ -36,8 +36,8 @@ def fed(data, cuts=()):
 
 @given(st.lists(WORDS.map(lambda words: block_of(3, words)) | JUNK, max_size=6).map(b"".join), st.lists(st.integers(0)))
 def test_parser_is_independent_of_the_chunks_of_a_stream(data, cuts):
-    whole, found = fed(data)
-    pieces, found_again = fed(data, cuts)
+    whole, found = parse_in_pieces(data)
+    pieces, found_again = parse_in_pieces(data, cuts)
     assert reported(found_again) == reported(found)
     for name in ("rejected", "rejected_blocks", "pending"):
         assert getattr(pieces, name) == getattr(whole, name)
@@ -47,7 +47,7 @@ def test_parser_is_independent_of_the_chunks_of_a_stream(data, cuts):
 def test_faultless_stream_is_received_completely(sent, first):
     """Headers and footers among the samples lose no block while each block directly follows the previous one."""
     data = [block_of(first + 1000 * index, words) for index, words in enumerate(sent)]
-    parser, found = fed(b"".join(data))
+    parser, found = parse_in_pieces(b"".join(data))
     assert reported(found) == data
     assert not parser.rejected
 
@@ -57,7 +57,7 @@ def test_damage_loses_only_the_damaged_block(place, n_lost, added, seed):
     """Replace bytes of one block by other bytes, at any alignment."""
     before, victim, after, last = (block_of(10 * seed + index) for index in range(4))
     damaged = victim[:place] + added + victim[place + n_lost :]
-    _, found = fed(before + damaged + after + last)
+    _, found = parse_in_pieces(before + damaged + after + last)
     alone = reported(found)
     assert alone[:1] == [before]
     assert alone[-2:] == [after, last]
@@ -69,7 +69,7 @@ def test_consecutive_blocks_are_found_after_any_junk(data):
     """The junk contains whole headers, and these lose no block either."""
     junk = data.draw(st.lists(JUNK | st.just(WORD.pack(HEADER)), max_size=4).map(b"".join))
     sent = [block_of(index) for index in range(3)]
-    _, found = fed(junk + b"".join(sent))
+    _, found = parse_in_pieces(junk + b"".join(sent))
     assert reported(found)[-3:] == sent
 
 
@@ -77,7 +77,7 @@ def test_false_header_within_samples_loses_no_block():
     """After a damaged block, the parser cannot distinguish headers from samples and searches both."""
     damaged = block_of(1)[:-1]
     sent = [block_of(index, [HEADER, 7, HEADER, FOOTER, HEADER]) for index in (2, 3)]
-    parser, found = fed(damaged + b"".join(sent))
+    parser, found = parse_in_pieces(damaged + b"".join(sent))
     assert reported(found) == sent
     assert parser.rejected == {"footer": N_BYTES - 1}
     assert parser.rejected_blocks == {"footer": 1}
@@ -94,8 +94,8 @@ def test_two_damaged_blocks_are_not_joined_to_one(later_s, taken):
     assert parser.rejected_blocks == ({"cut short": 1, "footer": 1} if taken == [3] else {})
 
 
-def test_rejected_bytes_have_reasons():
-    parser, _ = fed(b"abc" + block_of(0)[:-1] + block_of(1) + b"de" + block_of(2)[:-2])
+def test_parser_counts_rejected_bytes_by_reason():
+    parser, _ = parse_in_pieces(b"abc" + block_of(0)[:-1] + block_of(1) + b"de" + block_of(2)[:-2])
     assert parser.rejected == {"no header": 5, "footer": N_BYTES - 1}
     assert parser.missing == 2
     parser.expire()
@@ -142,7 +142,7 @@ def test_arrival_time_after_a_search_is_that_of_the_first_byte():
     assert block.arrived == at(2)
 
 
-def test_samples_own_their_memory():
+def test_parsed_samples_own_their_memory():
     parser = BlockParser(N_SAMPLES)
     [block] = parser.feed(block_of(1), at(0))
     assert block.data.flags.owndata
@@ -176,7 +176,7 @@ def test_parsing_time_is_linear_in_the_number_of_chunks():
     assert time.process_time() - began < 2
 
 
-def lawful(report, n_samples=128):
+def assert_consistent(report, n_samples=128):
     """Assert that the parser detects all faults visible in the frame, and counts each byte once."""
     taken = report.delivered + report.altered + report.mixed + report.wrong_counter + report.twice
     assert report.fed == taken * (4 * n_samples + 12) + report.rejected.total() + report.pending
@@ -187,7 +187,7 @@ def lawful(report, n_samples=128):
 @pytest.mark.parametrize("deadline_s", [None, 0.01])
 def test_parser_survives_faults_in_half_of_all_blocks(triggers, deadline_s):
     report = wire_faults.send(3000, triggers=triggers, deadline_s=deadline_s)
-    lawful(report)
+    assert_consistent(report)
     assert 0.4 < report.spoilt / report.sent < 0.6
     assert report.untouched < report.delivered < report.sent
     assert report.delivered + report.altered + report.lost > 0.95 * report.sent  # Few stay uncounted.
@@ -198,12 +198,12 @@ def test_altered_samples_are_detected_by_the_bit_check_only():
     """The bit check of this test detects every change, because it compares samples with those of all blocks."""
     kinds = {"flip": 0.3, "swap": 0.3}
     report = wire_faults.send(1000, kinds=kinds)
-    lawful(report)
+    assert_consistent(report)
     assert report.altered > 100
     random = np.random.default_rng(1)
     sent = {zlib.crc32(random.integers(0, 2**32, 128, dtype=np.uint32).tobytes()) for _ in range(1000)}
     checked = wire_faults.send(1000, kinds=kinds, bits=lambda words: None if zlib.crc32(words) in sent else "bits")
-    lawful(checked)
+    assert_consistent(checked)
     assert (checked.altered, checked.rejected_blocks["bits"]) == (0, report.altered)
     assert checked.delivered == report.delivered
 
@@ -212,7 +212,7 @@ def test_blocks_may_come_from_a_recording():
     words = np.arange(1000, dtype=np.uint32)
     seen = []
     report = wire_faults.send(50, words=words, kinds={}, n_samples=64, bits=seen.append)
-    lawful(report, 64)
+    assert_consistent(report, 64)
     assert report.delivered == report.sent == len(seen) == 50
     assert all(np.array_equal(np.diff(each.astype(int)), np.ones(63)) for each in seen)
     assert len({int(each[0]) for each in seen}) > 25

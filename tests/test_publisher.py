@@ -35,7 +35,7 @@ def publish(loop, count):
         loop.settle()
 
 
-def test_latest_image_waits_for_credit_and_replaced_ones_are_counted():
+def test_latest_image_waits_for_credit():
     with serving() as (loop, application):
         subscribed(loop, application, "energyscape", credit=2)
         publish(loop, 7)

@@ -58,7 +58,7 @@ def exact_image(processed):
     return image.replace(amplitude=amplitude.astype(np.float32), settings=settings)
 
 
-def agreeing(found, wanted):
+def count_matches(found, wanted):
     """Count the wanted peaks found within 1.5°, 1 cm and 1 dB."""
     return sum(
         any(
@@ -78,9 +78,9 @@ def test_ten_strongest_reflectors_match_the_exact_image(processed, exact_image):
     assert len(found) == len(wanted) == 10
     assert [peak["level_db"] for peak in found] == sorted((peak["level_db"] for peak in found), reverse=True)
     if layout == "eRTIS_v3D1":
-        assert agreeing(found, wanted) == 10
+        assert count_matches(found, wanted) == 10
     else:
-        assert agreeing(found, wanted) <= 1
+        assert count_matches(found, wanted) <= 1
 
 
 def test_image_of_the_real_measurement_is_exact(processed, exact_image):

@@ -140,7 +140,7 @@ def test_refused_record_leaves_no_files(options, message, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_existing_folder_is_kept(tmp_path):
+def test_refused_record_keeps_an_existing_folder(tmp_path):
     result = CliRunner().invoke(cli, ["record", "-o", str(tmp_path), "--listen", "tcp://10.1.1.1:5601", "-q"])
     assert result.exit_code == 1
     assert tmp_path.is_dir()

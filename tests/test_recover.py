@@ -55,7 +55,7 @@ def test_sealing_process_reports_a_refusal(tmp_path):
 
 
 @pytest.fixture
-def instead(tmp_path, monkeypatch):
+def fake_python(tmp_path, monkeypatch):
     """Return a function that makes seal_in_subprocess run a shell line instead of Python; ``$0`` is the script."""
 
     def replace_python(line):
@@ -80,20 +80,20 @@ def instead(tmp_path, monkeypatch):
         ),
     ],
 )
-def test_sealing_process_that_dies_is_reported(tmp_path, instead, line, reason):
-    instead(line)
+def test_sealing_process_that_dies_is_reported(tmp_path, fake_python, line, reason):
+    fake_python(line)
     with pytest.raises(DataError, match=f"rec.h5.journal: the process that seals it {reason}"):
         seal_in_subprocess(crashed(tmp_path))
 
 
 @pytest.mark.parametrize("late", [False, True])
-def test_sealing_process_can_be_interrupted(tmp_path, instead, late):
+def test_sealing_process_can_be_interrupted(tmp_path, fake_python, late):
     path = crashed(tmp_path)
     steps = [{"done": 1, "of": 3}, {"journal": "it was not asked to end", "recording": "none", "set_aside": None}]
     reported, late_told = (json.dumps(json.dumps(step)) for step in steps)
     slow = tmp_path / "slow.py"
     slow.write_text(f"import time; print({reported}, flush=True); time.sleep(5); print({late_told})")
-    instead(f"trap '' INT; exec {sys.executable} \"$@\"" if late else f"exec {sys.executable} {slow}")
+    fake_python(f"trap '' INT; exec {sys.executable} \"$@\"" if late else f"exec {sys.executable} {slow}")
 
     def interrupt(*_):
         raise KeyboardInterrupt
@@ -149,7 +149,7 @@ def test_recover_reports_damaged_measurements(tmp_path):
     assert reported in run("recover", path, code=3).stderr
 
 
-def test_recover_without_journals(tmp_path):
+def test_recover_reports_a_folder_without_journals(tmp_path):
     assert run("recover", tmp_path).stderr == f"no journal in {tmp_path}\n"
     assert run("recover", tmp_path, "--quiet").stderr == ""
     assert json.loads(run("recover", tmp_path, "--json").stdout) == {"journals": []}

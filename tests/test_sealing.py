@@ -105,7 +105,7 @@ def test_missing_journal_is_refused(tmp_path):
             seal(tmp_path / f"{name}.journal")
 
 
-def with_gap(path, given, *, sensor="left", reason="footer"):
+def write_with_gap(path, given, *, sensor="left", reason="footer"):
     """Write a recording with a gap after its last measurement."""
     with RecordingWriter(path) as writer:
         for measurement in given:
@@ -125,7 +125,7 @@ OTHERS = {
         path, [*given[:-1], replace(given[-1], stamp=replace(given[-1].stamp, timestamp_ns=7))]
     ),
     "another place": lambda path, given: write_recording(path, given, mounting={"left": ((1, 0, 0), (0, 0, 0, 1))}),
-    "another gap": with_gap,
+    "another gap": write_with_gap,
 }
 
 
@@ -335,7 +335,7 @@ def test_gaps_are_counted_per_session():
 )
 def test_unstorable_gaps_are_refused(tmp_path, sensor, reason, message):
     with pytest.raises(ArgumentError, match=message):
-        with_gap(tmp_path / "rec.h5", [entries(1)[0].measurement], sensor=sensor, reason=reason)
+        write_with_gap(tmp_path / "rec.h5", [entries(1)[0].measurement], sensor=sensor, reason=reason)
     assert not list(tmp_path.iterdir())
 
 

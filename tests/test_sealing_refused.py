@@ -46,7 +46,7 @@ def test_seal_keeps_a_journal_in_which_one_sensor_cannot_be_sealed(tmp_path, lef
         assert (len(kept), kept.unusable["bad"][1]) == (3, 2)
 
 
-def test_seal_can_be_repeated_after_a_kill_before_the_journal_was_renamed(tmp_path, left, monkeypatch):
+def test_seal_can_be_repeated_after_a_kill(tmp_path, left, monkeypatch):
     monkeypatch.setattr(Journal, "set_aside", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         seal(left)

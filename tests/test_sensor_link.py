@@ -18,7 +18,7 @@ from tests.stand_in import StandIn
 __all__ = ["impatient"]  # A fixture, imported for use here.
 
 
-def test_forgetful_central_node_gets_a_hello_at_once(monkeypatch):
+def test_link_sends_hello_at_once_to_a_forgetful_central_node(monkeypatch):
     """The link does not wait until measurements in flight are acknowledged."""
     monkeypatch.setattr(runs, "_PATIENCE_S", 1000.0)
     given = entries(20)
@@ -88,7 +88,7 @@ def test_link_survives_restarts_of_the_central_node(forget):
 
 
 @IMPATIENT
-def test_refused_sensor_retries_while_others_continue():
+def test_refused_sensor_retries_while_other_sensors_continue():
     left, right = entries(5), entries(5, sensor="right")
     with StandIn() as central, Node(central.address, ("left", "right")) as node:
         asked = queue.Queue()
@@ -158,7 +158,7 @@ def test_fault_of_the_central_node_delays_measurements():
 
 
 @IMPATIENT
-def test_silence_causes_a_new_connection():
+def test_link_reconnects_to_a_silent_central_node():
     given = entries(10)
     with StandIn() as central, Node(central.address) as node:
         node.append(given[:5])
@@ -203,7 +203,7 @@ def test_link_authenticates_with_keys(tmp_path, listed, server, message):
 
 
 @IMPATIENT
-def test_failing_event_listener_stops_nothing(caplog):
+def test_link_survives_a_failing_event_listener(caplog):
     given = entries(6)
 
     def fail(_):

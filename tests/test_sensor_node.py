@@ -58,7 +58,7 @@ def test_gaps_arrive_in_order():
     assert central.gaps[KEY] == [(5, 5, "footer"), (6, 6, "unplugged"), (7, 7, runs.NEVER_GIVEN)]
 
 
-def test_several_sensors_and_sessions_arrive():
+def test_measurements_of_several_sensors_and_sessions_arrive():
     left, right, later = entries(20), entries(20, sensor="right", seed=2), entries(5, first=0, session_id=9, seed=3)
     with StandIn(window=2) as central, Node(central.address, ("left", "right")) as node:
         for pair in zip(left, right, strict=True):
@@ -148,7 +148,7 @@ def test_memory_is_constant_while_one_sensor_is_refused():
         assert len(node._spool._order) < 1010  # noqa: SLF001  no public interface shows it
 
 
-def test_session_acknowledged_beyond_its_end_does_not_block_later_ones():
+def test_session_acknowledged_beyond_its_end_blocks_no_other():
     """A power cut may lose the end of a spool whose measurements were acknowledged."""
     later = entries(3, first=0, session_id=EPOCH + 1)
     with StandIn() as central, Node(central.address) as node:
@@ -160,7 +160,7 @@ def test_session_acknowledged_beyond_its_end_does_not_block_later_ones():
     assert has_all(central, later, ("left", EPOCH + 1))
 
 
-def test_numbers_of_any_kind_are_sent():
+def test_sensor_node_accepts_numpy_numbers():
     given = entries(2, first=0)
     stamp = given[0].measurement.stamp
     numpy = replace(
@@ -192,7 +192,7 @@ def test_dropped_measurements_are_counted_once():
     assert reported == [central.dropped]
 
 
-def test_counts_match_a_model_for_random_events():  # noqa: C901  one branch per kind of event
+def test_sensor_node_counts_match_a_model_for_random_events():  # noqa: C901  one branch per kind of event
     """Compare the spool with a simple model under random losses, evictions, and late or excessive acks."""
     chance = random.Random(4)
     for _ in range(30):

@@ -93,7 +93,7 @@ class Fake:
                 self._answer(line, self.write)
 
 
-def obedient(line, write):
+def answer_correctly(line, write):
     if not line.startswith(b"!A"):
         write(encode_answer(call_hash(Setup.of(SETTINGS).codes) if line.startswith(b"!L") else 1))
 
@@ -109,7 +109,7 @@ def is_block(block, counter, words):
     return block.counter == counter and np.array_equal(block.data, words)
 
 
-def taken(sonar, count):
+def receive_blocks(sonar, count):
     return list(itertools.islice(sonar.listen(stop=lambda: False, timeout_s=TIMEOUT_S), count))
 
 
@@ -209,7 +209,7 @@ def test_device_of_another_kind_is_reported():
 
 def test_endlessly_sending_device_is_reported():
     ended = threading.Event()
-    with Fake(obedient) as device:
+    with Fake(answer_correctly) as device:
 
         def talk():
             while not ended.wait(0.01):
@@ -298,7 +298,7 @@ def test_device_that_falls_silent_is_reported(device):
 def test_missing_answers_name_their_command():
     def forgetful(line, write):
         if not line.startswith((b"!C,21,", b"!L")):
-            obedient(line, write)
+            answer_correctly(line, write)
         elif line.startswith(b"!L"):
             write(encode_answer(0))
 
@@ -365,7 +365,7 @@ def test_delayed_measurement_is_recognised_by_its_number(pause_s):
     asked = []
 
     def slow(line, write):
-        obedient(line, write)
+        answer_correctly(line, write)
         asked.extend([line] * line.startswith(b"!A"))
         if len(asked) == 2:
             asked.append(b"")
@@ -385,7 +385,7 @@ def test_lost_byte_loses_one_measurement():
     counters = itertools.count()
 
     def lossy(line, write):
-        obedient(line, write)
+        answer_correctly(line, write)
         if line.startswith(b"!A"):
             counter = next(counters)
             data = encode_block(counter, WORDS[counter])
@@ -404,7 +404,7 @@ def test_lost_command_does_not_shift_the_numbers():
     counters = []
 
     def deaf_once(line, write):
-        obedient(line, write)
+        answer_correctly(line, write)
         if line.startswith(b"!B"):
             counters.append(int(line.split(b",")[1]))
         elif line.startswith(b"!A") and len(counters) > 1:
@@ -437,7 +437,7 @@ def test_driver_receives_twenty_pulses_per_second(folder):
         sonar.configure(Setup.of(SETTINGS))
         sonar.arm()
         with SyncChain([device], 20.0):
-            blocks = taken(sonar, 20)
+            blocks = receive_blocks(sonar, 20)
         reported = log.lines(blocks[-1].counter + 1)
         sent = [(line["counter"], line["crc32"]) for line in reported if line["fault"] != "dropped"]
         assert [(block.counter, zlib.crc32(block.data)) for block in blocks] == sent
@@ -502,7 +502,7 @@ def test_listening_needs_no_sent_byte(device):
     with SonarDriver.open("left", passive=True) as sonar, SyncChain([device], 50.0):
         assert sonar.firmware == ""
         sonar.configure(Setup.of(SETTINGS))
-        counters = [block.counter for block in taken(sonar, 3)]
+        counters = [block.counter for block in receive_blocks(sonar, 3)]
         assert 40 <= counters[0] < counters[1] < counters[2]  # Some may be dropped on a busy machine.
         with pytest.raises(SonarError, match="is open as passive"):
             sonar.measure()
@@ -526,7 +526,7 @@ def test_pause_within_a_measurement_drops_it(monkeypatch):
     monkeypatch.setattr("ertis_numba.devices.sonar._MARGIN_S", 0.1)
 
     def stalling(line, write):
-        obedient(line, write)
+        answer_correctly(line, write)
         if line.startswith(b"!J,1"):
             write(encode_block(0, WORDS[0])[:1_000])
 
@@ -553,7 +553,7 @@ def test_operations_out_of_order_are_refused():
             sonar.measure()
         sonar.configure(Setup.of(SETTINGS))
         with pytest.raises(SonarError, match=r"is not armed; call arm\(\) first"):
-            taken(sonar, 1)
+            receive_blocks(sonar, 1)
         sonar.arm()
         with pytest.raises(SonarError, match="is armed, and SYNC pulses trigger it"):
             sonar.measure()
@@ -582,14 +582,14 @@ def test_unplugging_within_a_measurement_is_reported(sonar, device):
 
 def test_unplugging_while_listening_is_reported(armed, device):
     with SyncChain([device], 50.0):
-        blocks = taken(armed, 3)
+        blocks = receive_blocks(armed, 3)
         device.unplug()
         with pytest.raises(SonarDisconnectedError):
-            blocks += taken(armed, 100)
+            blocks += receive_blocks(armed, 100)
         device.replug()
         before = time.monotonic()
         assert armed.reconnect(within_s=TIMEOUT_S)
-        [back] = taken(armed, 1)
+        [back] = receive_blocks(armed, 1)
     assert time.monotonic() - before < 3
     # On a busy machine the driver may read too late, and the device drops some measurements.
     counters = [block.counter for block in blocks]
