@@ -1,4 +1,4 @@
-"""The command line tells plans, measures their errors, and writes nothing that errs too much."""
+"""Accuracy plans on the command line: ``--explain``, ``--verify``, and error budgets that are not met."""
 
 import dataclasses
 import json
@@ -29,7 +29,7 @@ def run(*arguments, code=0):
 def report(*arguments):
     done = run(*arguments, "--json")
     assert done.stdout.count("\n") == 1
-    assert "dB" not in done.stderr  # all of it is in the object
+    assert "dB" not in done.stderr  # The JSON object contains the whole report.
     return json.loads(done.stdout)
 
 
@@ -52,14 +52,14 @@ def test_explain_prints_the_plan_as_json(recording, tmp_path):
     plan = report(recording, "-o", tmp_path / "a.h5", "--explain", "--max-error", -30)["plan"]
     assert plan["accuracy"]["max_error_db"] == -30
     assert plan["safe_db"] <= -30
-    assert plan["predicted_db"] < plan["safe_db"]  # noise holds none of the surprises that the safe side reckons with
+    assert plan["predicted_db"] < plan["safe_db"]  # White noise is milder than the worst case.
     for total, key in (("safe_db", "safe_db"), ("predicted_db", "predicted_db")):
         parts = 10 * np.log10(sum(10 ** (part[key] / 10) for part in plan["parts"]))
         assert parts == pytest.approx(plan[total], abs=0.2)
     assert plan["time_ms"] == pytest.approx(sum(plan["stages_ms"].values()), abs=0.01)
     near, far = plan["plane_waves"]
     assert (near["range_m"], far["range_m"]) == (0.4, 0.9)
-    # The phase that plane waves are wrong by falls with range.
+    # The phase error of plane waves falls with range.
     assert near["error_db"] - far["error_db"] == pytest.approx(20 * np.log10(0.9 / 0.4), abs=0.1)
 
 
@@ -131,7 +131,7 @@ def test_plan_beyond_its_budget_is_refused(recording, tmp_path):
 
 
 def test_verify_writes_no_image_beyond_the_budget(recording, tmp_path, monkeypatch):
-    """Predictions for what was never heard err on the safe side, so a true error beyond them has to be made up."""
+    """Replace the measured error, because predictions are conservative and real recordings stay within them."""
     measured = verification.Measured(error_db=-30.0, n_directions=7, peaks=None)
     monkeypatch.setattr(verification, "measure", lambda *_, **__: measured)
     output = tmp_path / "a.h5"
@@ -161,12 +161,12 @@ def test_plan_options_need_the_fast_method(recording, arguments, reported):
     assert reported in run(recording, *arguments, code=2).stderr
 
 
-def test_verified_error_of_silence_is_zero():
+def test_verify_refuses_a_silent_exact_image():
     with pytest.raises(DataError, match="the exact image is silent"):
         verification.error_db(np.ones((2, 3), np.float32), np.zeros((2, 3), np.float32))
 
 
-def test_nan_counts_as_the_largest_error():
+def test_verified_error_of_nan_is_infinite():
     assert verification.error_db(np.full((1, 1), np.nan, np.float32), np.ones((1, 1), np.float32)) == np.inf
 
 
@@ -177,7 +177,7 @@ def test_verify_compares_each_peak_with_the_nearest(monkeypatch):
     found = [peak(0.5, 1.001, 0.0), peak(3.0, 1.0, -1.0), peak(40.0, 2.05, -3.0)]
     monkeypatch.setattr(_peaks, "find_peaks", lambda *_, **__: found)
     errors = verification.peak_errors(None, [peak(0.0, 1.0, 0.0), peak(40.0, 2.0, -2.0), peak(4.0, 1.0, -3.0)])
-    assert (errors.wanted, errors.lost) == (3, 1)  # five centimetres off is another reflector
+    assert (errors.wanted, errors.lost) == (3, 1)  # A peak 5 cm away belongs to another reflector.
     assert errors.level_db == pytest.approx(2.0)
     assert errors.range_mm == pytest.approx(1.0)
     assert errors.angle_deg == pytest.approx(1.0)

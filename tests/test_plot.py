@@ -1,4 +1,4 @@
-"""``ertis plot`` draws each kind from what it is made of, and ``docs/how-to/plots.md`` shows how."""
+"""``ertis plot`` draws each kind of plot from its source file, and the examples of ``docs/how-to/plots.md`` run."""
 
 import contextlib
 import json
@@ -111,7 +111,7 @@ def test_plot_refuses_invalid_input(files, tmp_path, command, code, match):
 
 
 def test_every_plot_option_names_its_kinds():
-    """Those of the table are there, and help names each kind."""
+    """The help text names the kinds of each option in the table, and every kind of plot."""
     names = {option.opts[0].removeprefix("--") for option in plot.params}
     assert set(_ONLY) <= names
     stated = " ".join(run("plot", "--help").stdout.split())

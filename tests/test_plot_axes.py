@@ -1,4 +1,4 @@
-"""``plot(image, ax=…)`` draws into the axes of a user's own figure."""
+"""``plot(image, ax=…)`` draws into axes of the caller's figure."""
 
 import numpy as np
 import pytest
@@ -45,7 +45,7 @@ def test_image_with_elevations_is_drawn_as_a_map():
     solid = image(np.degrees(SOLID.azimuth_rad), np.degrees(SOLID.elevation_rad))
     ertis.plot(solid, ax=axes, dynamic_range_db=30, side_lobes=True)
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("azimuth (°)", "elevation (°)")
-    assert axes.get_xlim()[0] > axes.get_xlim()[1]  # positive azimuths, towards y, are on the left
+    assert axes.get_xlim()[0] > axes.get_xlim()[1]  # Positive azimuths, towards +y, are on the left.
     assert axes.images[-1].get_clim() == (-30, 0)
     assert len(drawn(axes).reshape(-1, 4))
 
@@ -71,7 +71,7 @@ def test_peaks_are_marked_and_other_axes_stay_empty():
     figure.canvas.draw()
 
 
-def test_a_page_is_drawn_without_axes():
+def test_plot_without_axes_draws_a_page():
     assert isinstance(ertis.plot(image()), Figure)
     pages = [ertis.plot(image(), theme="light"), ertis.plot_page(image(), theme="light")]
     for page in pages:
@@ -94,7 +94,7 @@ def test_a_page_is_drawn_without_axes():
         (lambda: ertis.plot_page(3), "image is of type int; give Energyscape"),
     ],
 )
-def test_unusable_arguments_are_refused_in_one_line(call, message):
+def test_plot_refuses_unusable_arguments_in_one_line(call, message):
     with pytest.raises(ertis.ArgumentError, match=message) as caught:
         call()
     assert "\n" not in str(caught.value)

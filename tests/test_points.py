@@ -1,4 +1,4 @@
-"""Point clouds of images whose content is known by formula, and against an obvious reference."""
+"""Point clouds of images with known reflectors, and comparison with a straightforward reference."""
 
 import numpy as np
 import pytest
@@ -36,7 +36,7 @@ def position_m(azimuth_deg, elevation_deg, range_m):
 
 
 def reference(image, *, top, min_level_db):
-    """The same, bin by bin."""
+    """Extract the points of an image bin by bin."""
     energy, spacing_m = image.amplitude, image.range_m[1] - image.range_m[0]
     directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
     neighbours = neighbours_of(directions)
@@ -66,7 +66,7 @@ def test_point_extractor_equals_the_reference(directions, min_level_db):
     expected = reference(image, top=80, min_level_db=min_level_db)
     cloud = PointExtractor(image.settings, top=80, min_level_db=min_level_db)(image)
     assert len(expected) > 2
-    # Maxima of noise are no reflectors: where their correction is large, it is as wrong as the table of the pulse.
+    # Maxima of noise are not reflectors. The tabulated pulse does not fit them, so large corrections are less exact.
     np.testing.assert_allclose(cloud.position_m, expected[:, :3], atol=1e-4)
     np.testing.assert_allclose(cloud.amplitude, expected[:, 3], rtol=1e-4)
     assert cloud.position_m.dtype == cloud.amplitude.dtype == np.float32
@@ -79,7 +79,7 @@ def test_point_extractor_equals_the_reference(directions, min_level_db):
 def test_strongest_peaks_of_noise_are_found():
     image = noise("3d:800")
     cloud = PointExtractor(image.settings, top=10)(image)
-    assert np.count_nonzero(image.amplitude > image.amplitude.max() / 10) > 640  # of which only these are looked at
+    assert np.count_nonzero(image.amplitude > image.amplitude.max() / 10) > 640  # Only some are examined.
     expected = reference(image, top=10, min_level_db=-20.0)
     np.testing.assert_allclose(cloud.position_m, expected[:, :3], atol=1e-5)
     np.testing.assert_allclose(cloud.amplitude, expected[:, 3], rtol=1e-5)
@@ -113,7 +113,7 @@ def test_point_extractor_agrees_with_find_peaks():
     np.testing.assert_allclose(cloud.position_m, expected, atol=1e-5)
 
 
-def test_top_and_level_limit_the_cloud():
+def test_point_cloud_is_limited_by_top_and_level():
     image = image_of([(-40, 0, 0.95, 0.5), (3, 0, 1.3, 1.0), (50, 0, 1.1, 0.2)])
     assert len(PointExtractor(image.settings, top=2)(image)) == 2
     assert len(PointExtractor(image.settings, min_level_db=-10.0)(image)) == 2
@@ -130,7 +130,7 @@ def test_silence_and_short_images_have_no_points(n_ranges):
     assert cloud.uncertainty_m.shape == (0, 2)
     assert len(cloud) == 0
     ramp = np.broadcast_to(np.arange(1, n_ranges + 1, dtype=np.float32), (5, n_ranges)).copy()
-    assert len(extractor(short.replace(amplitude=ramp))) == 0  # highest at an end, of which nothing is known
+    assert len(extractor(short.replace(amplitude=ramp))) == 0  # A maximum at the end of the range axis is not a peak.
 
 
 def test_point_extractor_leaves_its_input_unchanged():
@@ -148,10 +148,10 @@ def test_platform_frame_rotates_then_translates():
         np.ones(2, np.float32),
         Settings(),
         translation_m=(10.0, 20.0, 30.0),
-        rotation_xyzw=(0.0, 0.0, half, half),  # a quarter turn to the left
+        rotation_xyzw=(0.0, 0.0, half, half),  # A quarter turn to the left.
     )
     np.testing.assert_allclose(cloud.on_platform_m(), [[10, 22, 30], [9, 20, 33]], atol=1e-5)
-    assert cloud.uncertainty_m is None  # as of what came over the network
+    assert cloud.uncertainty_m is None  # Images received over the network have none.
     np.testing.assert_array_equal(cloud.replace(rotation_xyzw=(0, 0, 0, 1)).on_platform_m()[0], [12, 20, 30])
 
 
@@ -173,7 +173,7 @@ def test_point_extractor_refuses_an_image_of_another_grid():
 
 @pytest.mark.parametrize("directions", ["2d:61", "3d:500"])
 def test_uncertainty_is_the_spread_of_noisy_measurements(directions):
-    """40 times the same echo with other noise, 30 dB below it: within a factor of 1.5, of which chance is 1.25."""
+    """40 measurements of one echo with noise 30 dB below it agree within a factor of 1.5; chance explains 1.25."""
     sensor = Sensor(
         recording=Recording(n_samples=40_960),
         processing=Processing(
@@ -202,7 +202,7 @@ def test_uncertainty_is_the_spread_of_noisy_measurements(directions):
     forward = middle / np.linalg.norm(middle)
     found_along_m = np.std(positions @ forward, ddof=1)
     sideways = positions - np.outer(positions @ forward, forward)
-    found_across_m = np.sqrt(np.linalg.eigvalsh(np.cov(sideways.T))[-1])  # in the direction in which it is greatest
+    found_across_m = np.sqrt(np.linalg.eigvalsh(np.cov(sideways.T))[-1])  # Along the axis with the largest spread.
     assert 1 / 1.5 < found_along_m / along_m < 1.5
     assert 1 / 1.5 < found_across_m / across_m < 1.5
     assert 2e-5 < along_m < 5e-4 < across_m < 1e-2
@@ -212,8 +212,8 @@ def test_uncertainty_depends_on_range_level_and_noise():
     image = image_of([(12.3, 0.0, 1.0, 1.0), (-33.3, 0.0, 1.2, 0.5)], range_m=(0.9, 1.4), noise=0.01)
     extractor = PointExtractor(image.settings, min_level_db=-8.0)
     first, second, *_ = extractor(image).uncertainty_m
-    assert second[0] == pytest.approx(2 * first[0], rel=0.05)  # half the level
-    # It goes with the distance as well, and the aperture is foreshortened.
+    assert second[0] == pytest.approx(2 * first[0], rel=0.05)  # The second reflector has half the amplitude.
+    # The uncertainty also grows with range and with the foreshortening of the aperture.
     ratio = 2 * 1.2 * np.cos(np.radians(12.3)) / np.cos(np.radians(33.3))
     assert second[1] == pytest.approx(ratio * first[1], rel=0.05)
     louder = image.replace(amplitude=np.where(image.amplitude < 0.1, 2 * image.amplitude, image.amplitude))
@@ -223,7 +223,7 @@ def test_uncertainty_depends_on_range_level_and_noise():
 
 @pytest.mark.parametrize(("method", "beamformer"), [("fast", "delay_and_sum"), ("paper", "delay_and_sum"), *OTHERS])
 def test_noise_is_estimated_by_the_median_for_delay_and_sum_only(method, beamformer):
-    """√ln 2 of the root mean square, as of a Rayleigh variable."""
+    """The median of Rayleigh-distributed amplitudes is √ln 2 times their root mean square."""
     settings = Settings(
         recording=Recording(n_samples=65_536),
         processing=Processing(directions="2d:9", range_m=(0.3, 2.0), method=method, beamformer=beamformer),
@@ -239,7 +239,7 @@ def test_noise_is_estimated_by_the_median_for_delay_and_sum_only(method, beamfor
 
 
 def test_uncertainty_is_nan_without_noise():
-    """As of an image that was cleaned: 0 would be as if nothing could be known better."""
+    """A cleaned image has no noise, and an uncertainty of 0 would claim exact positions."""
     image = image_of([(12.3, 0.0, 1.0, 1.0), (-33.3, 0.0, 1.2, 0.5)], range_m=(0.9, 1.4), noise=0.01)
     cloud = PointExtractor(image.settings)(clean(image))
     assert len(cloud) > 1
@@ -259,7 +259,7 @@ def test_uncertainty_is_infinite_along_unresolved_angles(positions_m, directions
     image = noise(directions)
     settings = image.settings.replace(array=Array(layout="few", positions_m=positions_m, word_bits=8))
     cloud = PointExtractor(settings)(image.replace(settings=settings))
-    uncertainty_m = cloud.uncertainty_m[cloud.position_m[:, 0] > 0.1]  # from the side an array has no width
+    uncertainty_m = cloud.uncertainty_m[cloud.position_m[:, 0] > 0.1]  # An array seen from the side has no aperture.
     assert len(uncertainty_m) > 2
     assert np.isfinite(uncertainty_m[:, 0]).all()
     assert np.isfinite(uncertainty_m[:, 1]).all() == is_finite
@@ -308,8 +308,8 @@ def test_point_finder_computes_tables_once_per_sensor(monkeypatch):
     assert len(made) == 2
 
 
-def test_known_positions_in_the_frame_of_rep_103():
-    """x is forward, y is left, z is up: azimuth turns to the left."""
+def test_point_positions_follow_the_axes_of_rep_103():
+    """REP 103: x points forward, y left and z up; positive azimuth is to the left."""
     reflectors = [(0.0, 0.0, 1.0, 1.0), (60.0, 0.0, 1.1, 1.0), (0.0, 45.0, 1.2, 1.0)]
     image = image_of(reflectors, directions="3000", range_m=(0.9, 1.3))
     found = PointExtractor(image.settings)(image).position_m

@@ -1,4 +1,4 @@
-"""Which serial ports are found, which one a name means, and what sensors say when they are asked."""
+"""Discovery of serial ports, lookup by name, and the survey of connected sensors."""
 
 import errno
 import json
@@ -26,7 +26,7 @@ WORDS = [np.zeros(32_768, dtype=np.uint32)]
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch):
-    """The folder of emulated devices, and a machine without others."""
+    """Folder of emulated devices on a machine without other devices."""
     monkeypatch.setenv("ERTIS_EMULATED_DIR", str(tmp_path / "emulated"))
     monkeypatch.setattr(ports, "_BY_ID", tmp_path / "by-id")
     monkeypatch.setattr(list_ports, "comports", list)
@@ -34,7 +34,7 @@ def folder(tmp_path, monkeypatch):
 
 
 def plug_in(monkeypatch, **serial_numbers):
-    """Let there be USB devices: name=serial number."""
+    """Emulate USB devices, given as name=serial number."""
 
     def info(name, serial_number):
         port = ListPortInfo(f"/dev/{name}")
@@ -74,7 +74,7 @@ def test_emulated_device_is_found_by_all_its_names(folder, tmp_path):
 
 
 def test_link_of_a_killed_emulator_is_not_followed(folder):
-    """Its number is soon that of somebody's shell."""
+    """The system soon gives the number of its pseudo terminal to another process, such as a shell."""
     with Emulator(WORDS) as device:
         folder.mkdir()
         (folder / "left").symlink_to(device.port)
@@ -135,8 +135,8 @@ def test_missing_port_is_refused(monkeypatch):
 
 
 @pytest.fixture
-def four(folder):
-    """Devices of which one is ready, one has a call, one is in use and one is silent."""
+def four_devices(folder):
+    """Four devices: a new one, one with a call, one in use and a silent one."""
     with ExitStack() as stack:
         emulators = {
             name: stack.enter_context(Emulator(WORDS, link=folder / name)) for name in ("call", "mute", "new", "used")
@@ -154,7 +154,7 @@ def listed(*arguments, code=0):
     return done
 
 
-@pytest.mark.usefixtures("four")
+@pytest.mark.usefixtures("four_devices")
 def test_ports_are_queried_in_parallel():
     before = time.monotonic()
     answers = {answer.port.serial_number: answer for answer in survey(find_ports())}
@@ -170,25 +170,25 @@ def test_ports_are_queried_in_parallel():
     assert "does not answer" in str(answers["mute"].error)
 
 
-def test_devices_command_prints_a_table(four):
+def test_devices_command_prints_a_table(four_devices):
     done = listed()
     assert [re.split("  +", line) for line in done.stdout.splitlines()] == [
         ["port", "serial number", "state", "firmware", "call", "what"],
-        [four["call"].port, "call", "ready", "1.0.0", "0x0523", "emulated eRTIS"],
-        [four["new"].port, "new", "ready", "1.0.0", "0x0000", "emulated eRTIS"],
-        [four["used"].port, "used", "in use", "-", "-", "emulated eRTIS"],
+        [four_devices["call"].port, "call", "ready", "1.0.0", "0x0523", "emulated eRTIS"],
+        [four_devices["new"].port, "new", "ready", "1.0.0", "0x0000", "emulated eRTIS"],
+        [four_devices["used"].port, "used", "in use", "-", "-", "emulated eRTIS"],
     ]
     assert done.stderr.count("\n") == 1
-    assert f"{four['mute'].port} does not answer" in done.stderr
+    assert f"{four_devices['mute'].port} does not answer" in done.stderr
 
 
-def test_devices_command_prints_json(four):
-    done = listed("--json", "--port", "call", "-p", four["used"].port)
+def test_devices_command_prints_json(four_devices):
+    done = listed("--json", "--port", "call", "-p", four_devices["used"].port)
     assert (done.stdout.count("\n"), done.stderr) == (1, "")
     ready, used = json.loads(done.stdout)["devices"]
     assert ready == {
-        "port": four["call"].port,
-        "link": str(four["call"].link),
+        "port": four_devices["call"].port,
+        "link": str(four_devices["call"].link),
         "serial_number": "call",
         "description": "emulated eRTIS",
         "emulated": True,
@@ -199,17 +199,17 @@ def test_devices_command_prints_json(four):
     assert (used["state"], used["call_hash"]) == ("in use", None)
 
 
-@pytest.mark.usefixtures("four")
-def test_given_port_without_a_sensor_is_reported():
+@pytest.mark.usefixtures("four_devices")
+def test_devices_command_reports_a_port_without_a_sensor():
     done = listed("-p", "mute", "-p", "new", code=1)
     assert [re.split("  +", line)[2] for line in done.stdout.splitlines()[1:]] == ["no answer", "ready"]
     assert "does not answer 'firmware version?'" in str(done.exception)
     assert "serial port 'moot' does not exist" in str(listed("-p", "moot", code=1).exception)
 
 
-def test_devices_command_without_devices(monkeypatch):
+def test_devices_command_prints_nothing_without_devices(monkeypatch):
     assert survey([]) == []
-    plug_in(monkeypatch, ttyUSB0="FTDI")  # it is no CDC-ACM port, so that nothing is said to it
+    plug_in(monkeypatch, ttyUSB0="FTDI")  # The survey queries CDC-ACM ports only.
     done = listed()
     assert (done.stdout, done.stderr) == (
         "",

@@ -1,4 +1,4 @@
-"""Disks after a power cut: nothing that was acknowledged is lost, or stored twice; the short form of two benchmarks."""
+"""Simulated power cuts: acknowledged measurements are stored exactly once (the short form of two benchmarks)."""
 
 import random
 import shutil
@@ -20,7 +20,7 @@ NOTHING_WRONG = dict.fromkeys(("lost", "twice", "wrong", "failed", "left_over"),
 
 @pytest.mark.parametrize("name", N_STATES)
 def test_power_cuts_lose_and_duplicate_nothing(tmp_path, name):
-    """Half of the commands run with syncs that fail."""
+    """Syncs fail in half of the runs."""
     reason = powercuts.reason_not_to_try(tmp_path)
     if reason:
         pytest.skip(reason)
@@ -45,8 +45,8 @@ def test_power_cuts_without_a_compiler_are_reported_as_not_tried(tmp_path, monke
     assert reported in reliability_tables.reliability(report)
 
 
-class Happening:
-    """Records of one process on a disk."""
+class RecordedDisk:
+    """Simulated disk with the recorded operations of one process."""
 
     def __init__(self, folder):
         self.folder, self.disk = folder, Disk(folder)
@@ -61,7 +61,7 @@ class Happening:
         self(ends, name, inode=inode, offset=is_folder)
 
     def states(self, target, count=60):
-        """Content by name of each of some disks after a power cut."""
+        """Return the contents by file name for several disks after a power cut."""
         found = []
         rng = random.Random(SEED)
         for number in range(count):
@@ -72,10 +72,10 @@ class Happening:
 
 
 @pytest.fixture
-def happens(tmp_path):
+def recorded_disk(tmp_path):
     folder = tmp_path / "disk"
     folder.mkdir()
-    return Happening(folder)
+    return RecordedDisk(folder)
 
 
 @pytest.fixture
@@ -85,46 +85,46 @@ def after(tmp_path):
     return folder
 
 
-def test_disk_keeps_what_was_synced(happens, after):
-    happens(DiskOperation.CREATE, "a")
-    happens(DiskOperation.WRITE, "a", b"x" * 5000)
-    happens.sync("a")
-    happens.sync("")
-    assert happens.states(after, 9) == 9 * [{"a": b"x" * 5000}]
+def test_disk_keeps_what_was_synced(recorded_disk, after):
+    recorded_disk(DiskOperation.CREATE, "a")
+    recorded_disk(DiskOperation.WRITE, "a", b"x" * 5000)
+    recorded_disk.sync("a")
+    recorded_disk.sync("")
+    assert recorded_disk.states(after, 9) == 9 * [{"a": b"x" * 5000}]
 
 
-def test_disk_loses_and_tears_what_was_not_synced(happens, after):
-    happens(DiskOperation.CREATE, "a")
-    happens.sync("")
-    happens(DiskOperation.WRITE, "a", b"x" * 4096)
-    contents = [state["a"] for state in happens.states(after)]
+def test_disk_loses_and_tears_what_was_not_synced(recorded_disk, after):
+    recorded_disk(DiskOperation.CREATE, "a")
+    recorded_disk.sync("")
+    recorded_disk(DiskOperation.WRITE, "a", b"x" * 4096)
+    contents = [state["a"] for state in recorded_disk.states(after)]
     assert {b"", b"x" * 4096} < set(contents)
     assert any(content[:512] == bytes(512) and b"x" in content for content in contents)
 
 
-def test_disk_never_holds_data_of_a_failed_sync(happens, after):
-    happens(DiskOperation.CREATE, "a")
-    happens(DiskOperation.WRITE, "a", b"x" * 512)
-    happens.sync("a", ends=DiskOperation.SYNC_FAIL)
-    happens.sync("a")
-    happens.sync("")
-    assert happens.states(after, 9) == 9 * [{"a": b""}]
-    happens(DiskOperation.WRITE, "a", b"y" * 512)
-    happens.sync("a")
-    assert {state["a"] for state in happens.states(after / "0")} == {b"y" * 512}
+def test_disk_never_holds_data_of_a_failed_sync(recorded_disk, after):
+    recorded_disk(DiskOperation.CREATE, "a")
+    recorded_disk(DiskOperation.WRITE, "a", b"x" * 512)
+    recorded_disk.sync("a", ends=DiskOperation.SYNC_FAIL)
+    recorded_disk.sync("a")
+    recorded_disk.sync("")
+    assert recorded_disk.states(after, 9) == 9 * [{"a": b""}]
+    recorded_disk(DiskOperation.WRITE, "a", b"y" * 512)
+    recorded_disk.sync("a")
+    assert {state["a"] for state in recorded_disk.states(after / "0")} == {b"y" * 512}
 
 
-def test_disk_may_lose_names_until_their_folder_is_synced(happens, after):
-    happens(DiskOperation.CREATE, "a")
-    happens(DiskOperation.WRITE, "a", b"x")
-    happens.sync("a")
-    happens(DiskOperation.RENAME, "a", str(happens.folder / "b").encode())
-    names = [set(state) for state in happens.states(after)]
+def test_disk_may_lose_names_until_their_folder_is_synced(recorded_disk, after):
+    recorded_disk(DiskOperation.CREATE, "a")
+    recorded_disk(DiskOperation.WRITE, "a", b"x")
+    recorded_disk.sync("a")
+    recorded_disk(DiskOperation.RENAME, "a", str(recorded_disk.folder / "b").encode())
+    names = [set(state) for state in recorded_disk.states(after)]
     assert set() in names
     assert {"a"} in names
     assert {"b"} in names
-    happens.sync("")
-    assert {frozenset(state) for state in happens.states(after / "0")} == {frozenset({"b"})}
+    recorded_disk.sync("")
+    assert {frozenset(state) for state in recorded_disk.states(after / "0")} == {frozenset({"b"})}
 
 
 def test_log_contains_the_operations_of_a_process(tmp_path):

@@ -1,4 +1,4 @@
-"""Measurements are processed in batches; nobody sees it but by the clock."""
+"""Batched processing: the batch size changes the processing time but not the images."""
 
 import h5py
 import numpy as np
@@ -23,7 +23,7 @@ def recording(tmp_path):
 
 @pytest.fixture
 def sizes(monkeypatch):
-    """How many measurements went to the pipeline each time, and how many pipelines were closed."""
+    """Record the number of measurements in each pipeline call, and count closed pipelines."""
     calls = {"sizes": [], "closed": 0}
     one, many, close = Pipeline.process, Pipeline.process_batch, Pipeline.close
 
@@ -52,7 +52,7 @@ def run(*arguments, code=0):
 
 
 def test_file_is_independent_of_the_batch_size(recording, tmp_path, monkeypatch):
-    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")  # what else would differ is when it was made
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")  # Otherwise the creation times differ.
     files = []
     for batch in (1, 3, COUNT, 100):
         target = tmp_path / "img.h5"
@@ -69,7 +69,7 @@ def test_file_is_independent_of_the_batch_size(recording, tmp_path, monkeypatch)
 )
 def test_batches_have_the_given_size(recording, tmp_path, sizes, arguments, wanted):
     run(recording, "-o", tmp_path / "img.h5", *FAST, *arguments)
-    predicted, *made = sizes.pop("sizes")  # the error of the first image is predicted before
+    predicted, *made = sizes.pop("sizes")  # The first image is also processed to predict its error.
     assert (predicted, made, sizes) == (1, wanted, {"closed": 1})
 
 
@@ -81,11 +81,11 @@ def test_batch_of_large_images_is_smaller(recording, tmp_path, sizes, monkeypatc
         sizes["sizes"].clear()
         monkeypatch.setattr(sensor_processing, "MAX_WAITING_BYTES", room * image_bytes)
         run(recording, "-o", tmp_path / "img.h5", *FAST, "--force")
-        assert sizes["sizes"] == [1, *wanted]  # the first image is made once more, to predict its error
+        assert sizes["sizes"] == [1, *wanted]  # The first image is processed twice to predict its error.
 
 
 def test_reported_time_is_per_measurement(recording, tmp_path, monkeypatch):
-    clock_s = iter(np.arange(0.0, 100.0, 0.7).tolist())  # of every batch, then
+    clock_s = iter(np.arange(0.0, 100.0, 0.7).tolist())  # Each batch takes 0.7 s.
     monkeypatch.setattr(sensor_processing.time, "perf_counter", lambda: next(clock_s))
     done = run(recording, "-o", tmp_path / "img.h5", *FAST)
     assert "7 measurements, 9 directions" in done.stderr

@@ -1,4 +1,4 @@
-"""``ertis process`` of several recordings: what it prints, and how it ends."""
+"""``ertis process`` with several recordings: its output and exit codes."""
 
 import io
 import json
@@ -39,7 +39,7 @@ def here(monkeypatch):
     monkeypatch.setattr(Campaign, "_pool", lambda _: InlinePool())
 
 
-@pytest.mark.usefixtures("here")
+@pytest.mark.usefixtures("in_test_process")
 def test_process_reports_each_recording_and_a_summary(runs, tmp_path):
     done = run("runs/*.h5", "-o", "out/", *FAST, "--json", code=1)
     *each, total = [json.loads(line) for line in done.stdout.splitlines()]
@@ -89,7 +89,7 @@ def test_process_reports_plans_and_verifies_each_recording(runs, monkeypatch):
     assert again.stderr.count(": exists already, kept\n") == 2
 
 
-@pytest.mark.usefixtures("here")
+@pytest.mark.usefixtures("in_test_process")
 def test_images_beyond_the_budget_are_not_written(runs, monkeypatch):
     measured = verification.Measured(error_db=-30.0, n_directions=7, peaks=None)
     monkeypatch.setattr(verification, "measure", lambda *_, **__: measured)
@@ -127,7 +127,7 @@ def test_process_refuses_invalid_usage(runs, arguments, code, stated):
     assert not (runs.parent / "out").exists() or names_in(runs.parent / "out") == []
 
 
-def test_folder_as_output_of_one_recording(runs, tmp_path):
+def test_process_accepts_a_folder_for_one_recording(runs, tmp_path):
     run(runs / "a.h5", "-o", "out/", *FAST)
     assert names_in(tmp_path / "out") == ["a.energy.h5"]
 
@@ -137,7 +137,7 @@ class Terminal(io.StringIO):
         return True
 
 
-@pytest.mark.usefixtures("here")
+@pytest.mark.usefixtures("in_test_process")
 def test_progress_bars_appear_on_a_terminal(runs, monkeypatch, capsys):
     terminal = Terminal()
     monkeypatch.setenv("TERM", "xterm")
@@ -148,10 +148,10 @@ def test_progress_bars_appear_on_a_terminal(runs, monkeypatch, capsys):
         _process_many.process_many(
             ["runs"], "out", CampaignOptions(), workers=None, scheduler=None, quiet=False, as_json=True
         )
-    shown = re.sub(r"\x1b\[[\d;?]*\w", "", terminal.getvalue())  # less colours
+    shown = re.sub(r"\x1b\[[\d;?]*\w", "", terminal.getvalue())  # Remove colours.
     assert re.search(r"recordings ━+ \d/2", shown)
     assert "out/a.energy.h5: 3 measurements" in shown
-    assert len(capsys.readouterr().out.splitlines()) == 3  # and nothing of the bars
+    assert len(capsys.readouterr().out.splitlines()) == 3  # Progress bars go to stderr.
 
 
 def test_each_recording_in_progress_has_a_bar(monkeypatch):
@@ -162,7 +162,7 @@ def test_each_recording_in_progress_has_a_bar(monkeypatch):
         return [(task.description, task.completed, task.total) for task in bars.progress.tasks]
 
     paths = [Path(f"runs/{name}.h5") for name in "ab"]
-    bars.follow(RecordingProgress(paths[0], 3))  # of one that it has never heard of
+    bars.follow(RecordingProgress(paths[0], 3))  # Its start was not reported.
     for path in paths:
         bars.follow(RecordingStarted(path, 7))
     bars.follow(RecordingProgress(paths[1], 4))

@@ -1,4 +1,4 @@
-"""Processing in a loop: every measurement is published, dropped for a reason, or on its way, at any moment."""
+"""Processing in an event loop: each measurement is published, in progress, or dropped with a reason."""
 
 import dataclasses
 import time
@@ -77,14 +77,14 @@ def test_overload_drops_the_oldest_and_counts_each():
     with driven() as loop:
         for sensor in ("a", "b"):
             loop.processing.register(hello(sensor), SHORT)
-        for _ in range(30):  # before any worker is ready
+        for _ in range(30):  # No worker is ready yet.
             loop.offer("a")
         assert loop.processing.counts("a").dropped == {"the workers were getting ready": 28}
         assert (loop.processing.counts("a").queue, loop.processing.counts("a").in_flight) == (2, 2)
         loop.until(lambda: loop.processing.counts("a").published == 2)
         offered = {"a": 30, "b": 0}
         while offered["a"] < 430 or min(loop.processing.counts(sensor).published for sensor in offered) <= 2:
-            for sensor in "aaaabaaaab":  # to each step, far more than one worker takes
+            for sensor in "aaaabaaaab":  # One worker cannot process as many per step.
                 loop.offer(sensor)
                 offered[sensor] += 1
             loop.step()
@@ -94,7 +94,7 @@ def test_overload_drops_the_oldest_and_counts_each():
             counts = loop.processing.counts(sensor)
             assert counts.received == received
             assert counts.published + counts.dropped.total() == received
-            assert counts.published > 2  # each has its turn
+            assert counts.published > 2  # Workers alternate between sensors.
             assert counts.dropped["superseded"] > 0
         assert sum(worker.done for worker in status.workers) == sum(
             loop.processing.counts(sensor).published for sensor in offered
@@ -109,7 +109,7 @@ def test_two_workers_publish_in_order():
         loop.until(lambda: application.read() or application.others)
         loop.processing.register(hello(), SHORT)
         loop.until(lambda: len(loop.workers("idle")) == 2)
-        chosen = loop.processing._runner._chosen  # noqa: SLF001  as under a load that takes longer to build up
+        chosen = loop.processing._runner._chosen  # noqa: SLF001  a sustained load also selects it
         chosen.mode = chosen.many
         for _ in range(40):
             loop.offer()
@@ -123,7 +123,7 @@ def test_two_workers_publish_in_order():
     assert sequences == sorted(sequences)
 
 
-def test_changed_settings_apply_and_waiting_measurements_are_counted():
+def test_changed_settings_count_waiting_measurements():
     with driven() as loop, Application(loop.processing.address) as application:
         application.subscribe("energyscape", credit=8)
         loop.until(lambda: application.read() or application.others)
@@ -136,7 +136,7 @@ def test_changed_settings_apply_and_waiting_measurements_are_counted():
         loop.offer()
         loop.settle()
         warmer = Air(temperature_c=35.0)
-        loop.offer(temperature_c=warmer.temperature_c)  # is of another kind by itself
+        loop.offer(temperature_c=warmer.temperature_c)  # Other air needs a pipeline of its own.
         loop.offer(temperature_c=float("nan"))
         loop.settle()
         counts = loop.processing.counts("front")

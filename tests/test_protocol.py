@@ -1,4 +1,4 @@
-"""Blocks out of bytes: whatever happens to a line, no block is lost but its own victims, and none is made up."""
+"""Parser of blocks in a byte stream: faults lose only the damaged blocks, and no false block is returned."""
 
 import itertools
 import struct
@@ -22,8 +22,8 @@ WORDS = st.lists(TRICKY | st.integers(0, 2**32 - 1), min_size=N_SAMPLES, max_siz
 JUNK = st.lists(st.integers(0, 255) | st.sampled_from(list(WORD.pack(HEADER) + WORD.pack(FOOTER)))).map(bytes)
 
 
-def fed(data, cuts=()):
-    """What a parser makes of a stream that is cut into pieces, each of which comes a second after the other."""
+def parse_in_pieces(data, cuts=()):
+    """Feed a stream to a new parser in pieces one second apart; return the parser and its blocks."""
     parser = BlockParser(N_SAMPLES)
     edges = [0, *sorted(cut % (len(data) + 1) for cut in cuts), len(data)]
     found = []
@@ -36,8 +36,8 @@ def fed(data, cuts=()):
 
 @given(st.lists(WORDS.map(lambda words: block_of(3, words)) | JUNK, max_size=6).map(b"".join), st.lists(st.integers(0)))
 def test_parser_is_independent_of_the_chunks_of_a_stream(data, cuts):
-    whole, found = fed(data)
-    pieces, found_again = fed(data, cuts)
+    whole, found = parse_in_pieces(data)
+    pieces, found_again = parse_in_pieces(data, cuts)
     assert reported(found_again) == reported(found)
     for name in ("rejected", "rejected_blocks", "pending"):
         assert getattr(pieces, name) == getattr(whole, name)
@@ -45,19 +45,19 @@ def test_parser_is_independent_of_the_chunks_of_a_stream(data, cuts):
 
 @given(st.lists(WORDS, min_size=1, max_size=5), st.integers(0, 2**32 - 1))
 def test_faultless_stream_is_received_completely(sent, first):
-    """False headers and footers in the words cost nothing as long as each block directly follows another."""
+    """Headers and footers among the samples lose no block while each block directly follows the previous one."""
     data = [block_of(first + 1000 * index, words) for index, words in enumerate(sent)]
-    parser, found = fed(b"".join(data))
+    parser, found = parse_in_pieces(b"".join(data))
     assert reported(found) == data
     assert not parser.rejected
 
 
 @given(st.integers(0, N_BYTES - 1), st.integers(1, N_BYTES), st.binary(max_size=2 * N_BYTES), st.integers(0))
 def test_damage_loses_only_the_damaged_block(place, n_lost, added, seed):
-    """Bytes are lost, and others come in their place, at any alignment."""
+    """Replace bytes of one block by other bytes, at any alignment."""
     before, victim, after, last = (block_of(10 * seed + index) for index in range(4))
     damaged = victim[:place] + added + victim[place + n_lost :]
-    _, found = fed(before + damaged + after + last)
+    _, found = parse_in_pieces(before + damaged + after + last)
     alone = reported(found)
     assert alone[:1] == [before]
     assert alone[-2:] == [after, last]
@@ -66,18 +66,18 @@ def test_damage_loses_only_the_damaged_block(place, n_lost, added, seed):
 
 @given(st.data())
 def test_consecutive_blocks_are_found_after_any_junk(data):
-    """Random bytes with whole headers among them: a header of junk costs no block either."""
+    """The junk contains whole headers, and these lose no block either."""
     junk = data.draw(st.lists(JUNK | st.just(WORD.pack(HEADER)), max_size=4).map(b"".join))
     sent = [block_of(index) for index in range(3)]
-    _, found = fed(junk + b"".join(sent))
+    _, found = parse_in_pieces(junk + b"".join(sent))
     assert reported(found)[-3:] == sent
 
 
 def test_false_header_within_samples_loses_no_block():
-    """Behind a damaged block, where nobody knows whether a header is one, words that hold headers are searched."""
+    """After a damaged block, the parser cannot distinguish headers from samples and searches both."""
     damaged = block_of(1)[:-1]
     sent = [block_of(index, [HEADER, 7, HEADER, FOOTER, HEADER]) for index in (2, 3)]
-    parser, found = fed(damaged + b"".join(sent))
+    parser, found = parse_in_pieces(damaged + b"".join(sent))
     assert reported(found) == sent
     assert parser.rejected == {"footer": N_BYTES - 1}
     assert parser.rejected_blocks == {"footer": 1}
@@ -85,7 +85,7 @@ def test_false_header_within_samples_loses_no_block():
 
 @pytest.mark.parametrize(("later_s", "taken"), [(0.05, [3]), (0.02, [1, 3])])
 def test_two_damaged_blocks_are_not_joined_to_one(later_s, taken):
-    """The header of the second tells if it came later; else it might as well be one of the first one's words."""
+    """A header that arrives after a pause starts a new block; without a pause it may be a sample of the first."""
     first, second, third = block_of(1), block_of(2), block_of(3)
     parser = BlockParser(N_SAMPLES, apart_s=0.03)
     assert parser.feed(first[:12], at(0)) == []
@@ -94,8 +94,8 @@ def test_two_damaged_blocks_are_not_joined_to_one(later_s, taken):
     assert parser.rejected_blocks == ({"cut short": 1, "footer": 1} if taken == [3] else {})
 
 
-def test_rejected_bytes_have_reasons():
-    parser, _ = fed(b"abc" + block_of(0)[:-1] + block_of(1) + b"de" + block_of(2)[:-2])
+def test_parser_counts_rejected_bytes_by_reason():
+    parser, _ = parse_in_pieces(b"abc" + block_of(0)[:-1] + block_of(1) + b"de" + block_of(2)[:-2])
     assert parser.rejected == {"no header": 5, "footer": N_BYTES - 1}
     assert parser.missing == 2
     parser.expire()
@@ -119,7 +119,7 @@ def test_partial_header_may_be_discarded():
     assert parser.missing == N_BYTES - 3
     parser.expire()
     assert parser.missing == 0
-    parser.expire()  # nothing has begun, nothing happens
+    parser.expire()  # No block has begun, so nothing expires.
     assert parser.rejected == {"no header": 4}
     assert not parser.rejected_blocks
 
@@ -142,7 +142,7 @@ def test_arrival_time_after_a_search_is_that_of_the_first_byte():
     assert block.arrived == at(2)
 
 
-def test_samples_own_their_memory():
+def test_parsed_samples_own_their_memory():
     parser = BlockParser(N_SAMPLES)
     [block] = parser.feed(block_of(1), at(0))
     assert block.data.flags.owndata
@@ -167,7 +167,7 @@ def test_parsing_a_block_takes_two_milliseconds_at_most():
 
 
 def test_parsing_time_is_linear_in_the_number_of_chunks():
-    """A block of 8 MB in pieces of 512 bytes: copied at each, that would be 70 GB."""
+    """Copying an 8 MB block at each of its 512-byte pieces would move 70 GB."""
     data = block_of(1, n_samples=2**21)
     parser = BlockParser(2**21)
     began = time.process_time()
@@ -176,8 +176,8 @@ def test_parsing_time_is_linear_in_the_number_of_chunks():
     assert time.process_time() - began < 2
 
 
-def lawful(report, n_samples=128):
-    """Of what the frame can tell, everything is told right, and each byte is counted once."""
+def assert_consistent(report, n_samples=128):
+    """Assert that the parser detects all faults visible in the frame, and counts each byte once."""
     taken = report.delivered + report.altered + report.mixed + report.wrong_counter + report.twice
     assert report.fed == taken * (4 * n_samples + 12) + report.rejected.total() + report.pending
     assert report.untouched_lost == report.mixed == report.wrong_counter == report.twice == 0
@@ -187,23 +187,23 @@ def lawful(report, n_samples=128):
 @pytest.mark.parametrize("deadline_s", [None, 0.01])
 def test_parser_survives_faults_in_half_of_all_blocks(triggers, deadline_s):
     report = wire_faults.send(3000, triggers=triggers, deadline_s=deadline_s)
-    lawful(report)
+    assert_consistent(report)
     assert 0.4 < report.spoilt / report.sent < 0.6
     assert report.untouched < report.delivered < report.sent
-    assert report.delivered + report.altered + report.lost > 0.95 * report.sent  # nearly all are accounted for
+    assert report.delivered + report.altered + report.lost > 0.95 * report.sent  # Few stay uncounted.
     assert set(report.rejected) == {"no header", "footer", "counter", "cut short"}
 
 
 def test_altered_samples_are_detected_by_the_bit_check_only():
-    """Here the bits tell everything, since they are compared with those of all blocks."""
+    """The bit check of this test detects every change, because it compares samples with those of all blocks."""
     kinds = {"flip": 0.3, "swap": 0.3}
     report = wire_faults.send(1000, kinds=kinds)
-    lawful(report)
+    assert_consistent(report)
     assert report.altered > 100
     random = np.random.default_rng(1)
     sent = {zlib.crc32(random.integers(0, 2**32, 128, dtype=np.uint32).tobytes()) for _ in range(1000)}
     checked = wire_faults.send(1000, kinds=kinds, bits=lambda words: None if zlib.crc32(words) in sent else "bits")
-    lawful(checked)
+    assert_consistent(checked)
     assert (checked.altered, checked.rejected_blocks["bits"]) == (0, report.altered)
     assert checked.delivered == report.delivered
 
@@ -212,7 +212,7 @@ def test_blocks_may_come_from_a_recording():
     words = np.arange(1000, dtype=np.uint32)
     seen = []
     report = wire_faults.send(50, words=words, kinds={}, n_samples=64, bits=seen.append)
-    lawful(report, 64)
+    assert_consistent(report, 64)
     assert report.delivered == report.sent == len(seen) == 50
     assert all(np.array_equal(np.diff(each.astype(int)), np.ones(63)) for each in seen)
     assert len({int(each[0]) for each in seen}) > 25

@@ -1,4 +1,4 @@
-"""What applications get of the publisher: credit, the latest, exact numbers, and nothing without a right to it."""
+"""Publisher and its applications: credit, latest images, exact counts and access rights."""
 
 import os
 import signal
@@ -17,7 +17,7 @@ from tests.driven import Application, driven, hello
 
 @contextmanager
 def serving(**options):
-    """Processing whose sensor is ready, and an application."""
+    """Run processing with a registered sensor and connect an application."""
     with driven(**options) as loop, Application(loop.processing.address) as application:
         loop.processing.register(hello(), SHORT)
         loop.until(lambda: loop.workers("idle"))
@@ -35,7 +35,7 @@ def publish(loop, count):
         loop.settle()
 
 
-def test_latest_image_waits_for_credit_and_replaced_ones_are_counted():
+def test_latest_image_waits_for_credit():
     with serving() as (loop, application):
         subscribed(loop, application, "energyscape", credit=2)
         publish(loop, 7)
@@ -49,7 +49,7 @@ def test_latest_image_waits_for_credit_and_replaced_ones_are_counted():
     images = [image for image, _ in application.got]
     assert [(image.sequence, image.number, image.dropped) for image in images] == [(0, 0, 0), (1, 1, 0), (6, 6, 4)]
     assert (status.sent, status.dropped, status.products) == (3, 4, ("energyscape",))
-    assert loop.processing.counts("front").published == 7  # a slow application drops nothing of others
+    assert loop.processing.counts("front").published == 7  # A slow application causes no drops for others.
 
 
 def test_each_product_of_each_sensor_waits_separately():
@@ -112,19 +112,19 @@ def test_restarted_publisher_keeps_its_address(tmp_path):
         publisher = loop.processing.status().publisher_pid
         os.kill(publisher, signal.SIGKILL)
         loop.until(lambda: loop.processing.status().publisher_pid not in {0, publisher})
-        elsewhere = loop.processing.address.replace("127.0.0.1", "127.0.0.2")  # of this machine, but another address
+        elsewhere = loop.processing.address.replace("127.0.0.1", "127.0.0.2")  # Another address of this machine.
         with Application(elsewhere, ClientKeys(viewer, central.public)):
             loop.until(lambda: loop.processing.refused.get("unknown key"))
 
 
-@pytest.mark.alone  # who is silent for seconds is forgotten, and a busy machine makes an application be silent
+@pytest.mark.alone  # An application delayed by a busy machine loses its subscription.
 def test_sensor_may_change_its_settings_often():
     with serving() as (loop, application):
         subscribed(loop, application, "energyscape", "raw", credit=64)
-        for number in range(300):  # each describes what products of it are about
+        for number in range(300):  # Each registration announces a new position.
             place = {"translation_m": (float(number), 0.0, 0.0)}
             loop.processing.register(hello("left", **place), SHORT)
-            application.keep()  # a busy machine takes longer for all of them than who is silent is waited for
+            application.keep()  # The loop may outlast the timeout for silent applications.
             if number % 100 == 0:
                 loop.processing.register(hello("front", **place), SHORT)
                 publish(loop, 1)
@@ -138,7 +138,7 @@ def test_sensor_may_change_its_settings_often():
 
 def test_slowly_ending_publisher_blocks_nothing(monkeypatch):
     with serving() as (loop, _):
-        publisher = loop.processing._publisher  # noqa: SLF001  to have it seem to end slowly
+        publisher = loop.processing._publisher  # noqa: SLF001  the test delays the end of its process
         child = publisher._child  # noqa: SLF001
         monkeypatch.setattr(type(child), "ended", property(lambda _: False))
         monkeypatch.setattr(child, "close", lambda *_: pytest.fail("it is waited for"))
@@ -154,7 +154,7 @@ def test_hanging_publisher_is_killed(monkeypatch):
     with serving() as (loop, _):
         os.kill(loop.processing.status().publisher_pid, signal.SIGSTOP)
         for _ in range(5):
-            loop.offer()  # more than there are slots
+            loop.offer()  # There are fewer slots.
         loop.until(lambda: loop.processing.status().publisher_respawned == 1)
         loop.settle()
         publish(loop, 1)
@@ -243,7 +243,7 @@ class TestKeys:
 
 
 class TestSubscribers:
-    """Routing ids, as a socket that sends nothing gives them."""
+    """Limits of connections, tested with routing ids and a socket that sends nothing."""
 
     class Frame:
         def __init__(self, content):
@@ -260,7 +260,7 @@ class TestSubscribers:
         subscribers = Subscribers(self.Socket(), with_keys=True)
         assert [self.hear(subscribers, number, "a") for number in range(20)] == [True] * 16 + [False] * 4
         assert self.hear(subscribers, 100, "b")
-        assert self.hear(subscribers, 3, "a")  # is there already
+        assert self.hear(subscribers, 3, "a")  # This connection already exists.
 
     def test_silent_connections_of_a_key_are_closed_for_new_ones(self):
         subscribers = Subscribers(self.Socket(), with_keys=True)

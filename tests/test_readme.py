@@ -1,4 +1,4 @@
-"""What the README and the pages on simulation and sensors say runs."""
+"""Commands and code in the README and in the pages on simulation and sensors run."""
 
 import contextlib
 import importlib.metadata
@@ -29,7 +29,7 @@ PAGES = ["README.md", *(str(path.relative_to(ROOT)) for path in sorted((ROOT / "
 
 @pytest.fixture
 def place(tmp_path, monkeypatch):
-    """A folder with the files that the README's commands name."""
+    """Folder with the files named in the README's commands."""
     monkeypatch.setenv("ERTIS_EMULATED_DIR", str(tmp_path / "emulated"))
     (tmp_path / "data").symlink_to(ROOT / "data")
     real = importlib.metadata.distribution("rtisdev").locate_file("rtisdev/simulate.bin")
@@ -57,7 +57,7 @@ def test_readme_describes_every_folder():
 
 
 def test_readme_commands_run(place):
-    """Each in a process of its own where it is shown first."""
+    """Run each command in its own process at its first occurrence."""
     started = set()
     with contextlib.ExitStack() as background:
         for command in commands_in(README.replace(NETWORK, "")):
@@ -65,7 +65,7 @@ def test_readme_commands_run(place):
             if name in ELSEWHERE:
                 continue
             if (place / "REC.h5").exists() and "REC.h5" in arguments and name in {"import", "simulate"}:
-                (place / "REC.h5").unlink()  # each of the two ways to a recording is shown
+                (place / "REC.h5").unlink()  # The README shows two ways to make a recording.
             if arguments and arguments[-1] == "&":
                 background.enter_context(in_background(place, command))
             elif name in started:
@@ -87,11 +87,11 @@ def test_commands_of_the_devices_page_run(place):
             else:
                 run_here(place, command)
     with open_recording(place / "BOTH.h5", sensor="east") as recording:
-        assert 10 <= len(recording) <= 20  # a busy emulator ignores pulses while it still measures
+        assert 10 <= len(recording) <= 20  # A busy emulator ignores pulses during a measurement.
 
 
 def test_readme_example_runs(place):
-    """The nearest of the strong reflectors of the recording that is emulated."""
+    """The example prints the nearest strong reflector of the emulated recording."""
     with in_background(place, "emulate data/synthetic/reflectors.h5 &"):
         reported = run(
             place, sys.executable, "-W", "error", str(ROOT / "examples" / "1_nearest_reflector.py"), "sensor"
@@ -103,7 +103,7 @@ def test_commands_of_the_simulation_page_run(place):
     (code,) = re.findall(r"```python\n(.*?)```", SIMULATION, re.DOTALL)
     reported = run(place, sys.executable, "-W", "error", "-c", code).stdout
     assert "absorption True" in reported
-    assert reported.endswith("() ()\n")  # nothing missed, nothing false
+    assert reported.endswith("() ()\n")  # No missed reflector and no ghost.
     for command in commands_in(SIMULATION):
         reported = run_here(place, command)
     assert "points[0]" in reported
@@ -125,7 +125,7 @@ def test_files_named_on_pages_exist(name):
     "name", ["README.md", "docs/tutorial/quickstart.md", "docs/how-to/network.md", "docs/how-to/applications.md"]
 )
 def test_emulator_blocks_can_be_pasted_unchanged(name):
-    """Commands that follow at once find no sensor, so they wait for it."""
+    """Pasted commands run before the emulator is ready, so each block waits for its sensor."""
     blocks = [block for block in (ROOT / name).read_text().split("```") if "$ ertis emulate" in block]
     assert blocks
     for block in blocks:

@@ -1,7 +1,7 @@
-"""One real measurement, through the command line, against the exact image.
+"""Compare the image of one real measurement, processed on the command line, with its exact image.
 
-The file comes with the package rtisdev, whose code is never imported: its wheel changes warning filters and
-brings top-level packages of its own.
+The file is part of the package rtisdev. The tests never import the package itself, because it changes warning
+filters and installs other top-level packages.
 """
 
 import functools
@@ -30,11 +30,11 @@ def run(*command):
 
 @pytest.fixture(scope="module", params=["eRTIS_v3D1", "eRTIS_v2"])
 def processed(request, tmp_path_factory):
-    """The layout, the file of its image and the image."""
+    """Process the measurement with one layout; return the layout, the image file and the image."""
     folder = tmp_path_factory.mktemp(request.param)
     recording, image = folder / "recording.h5", folder / "image.h5"
     run("import", RAW, "-o", recording, "--layout", request.param, "--preset", "default_25_50")
-    # One of the ten is a maximum by a hair, which errors of -35 dB may level.
+    # One of the ten peaks is barely a maximum, and errors of -35 dB may remove it.
     run("process", recording, "-o", image, "--directions", "2d:181", "--range", "0.8:5", "--max-error", "fine")
     with ertis.open_energyscapes(image) as images:
         return request.param, image, images[0]
@@ -42,14 +42,14 @@ def processed(request, tmp_path_factory):
 
 @functools.cache
 def exact_energy(azimuth_rad, elevation_rad, range_m):
-    """The image of the right layout on some axes, which both layouts have in common."""
+    """Compute the exact image of the correct layout; cached, because both layouts use the same axes."""
     words, settings = np.fromfile(RAW, dtype="<u4"), ertis.Settings.from_preset("default_25_50")
     return reference.exact(words, settings, unit_vectors(np.array(azimuth_rad), np.array(elevation_rad)), range_m)
 
 
 @pytest.fixture(scope="module")
 def exact_image(processed):
-    """The exact image of the right layout, on the axes of the processed one."""
+    """Exact image of the correct layout, on the axes of the processed image."""
     image = processed[2]
     amplitude = exact_energy(
         *(tuple(axis.tolist()) for axis in (image.azimuth_rad, image.elevation_rad, image.range_m))
@@ -58,8 +58,8 @@ def exact_image(processed):
     return image.replace(amplitude=amplitude.astype(np.float32), settings=settings)
 
 
-def agreeing(found, wanted):
-    """How many of the wanted peaks are found within 1.5°, 1 cm and 1 dB."""
+def count_matches(found, wanted):
+    """Count the wanted peaks found within 1.5°, 1 cm and 1 dB."""
     return sum(
         any(
             abs(peak["azimuth_deg"] - other.azimuth_deg) < 1.5
@@ -78,9 +78,9 @@ def test_ten_strongest_reflectors_match_the_exact_image(processed, exact_image):
     assert len(found) == len(wanted) == 10
     assert [peak["level_db"] for peak in found] == sorted((peak["level_db"] for peak in found), reverse=True)
     if layout == "eRTIS_v3D1":
-        assert agreeing(found, wanted) == 10
+        assert count_matches(found, wanted) == 10
     else:
-        assert agreeing(found, wanted) <= 1
+        assert count_matches(found, wanted) <= 1
 
 
 def test_image_of_the_real_measurement_is_exact(processed, exact_image):
@@ -90,6 +90,6 @@ def test_image_of_the_real_measurement_is_exact(processed, exact_image):
     if layout == "eRTIS_v3D1":
         assert error_db < -60
         assert abs(brightest_db) < 0.1
-    else:  # the same positions in another channel order smear everything
+    else:  # A wrong channel order smears the image.
         assert error_db > -3
         assert brightest_db < -10

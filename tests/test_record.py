@@ -1,4 +1,4 @@
-"""``ertis record``: whatever ends it, what it has told is there once."""
+"""``ertis record`` stores each acknowledged measurement exactly once, even if it is killed."""
 
 import contextlib
 import json
@@ -30,7 +30,7 @@ REPORTED = {
 
 
 class Recording:
-    """A process that records; its events are read one after the other."""
+    """Process of ``ertis record`` whose events are read one at a time."""
 
     def __init__(self, folder, *options, environment=ENVIRONMENT, stderr=None):
         command = [sys.executable, "-m", "ertis_cli", "record", "--listen", "tcp://127.0.0.1:0", "-o", str(folder)]
@@ -59,7 +59,7 @@ class Recording:
 def test_record_listens_soon_after_its_start(tmp_path):
     begun_s = time.monotonic()
     with Recording(tmp_path):
-        assert time.monotonic() - begun_s < 5.0  # 0.3 s where nothing else runs
+        assert time.monotonic() - begun_s < 5.0  # It takes 0.3 s on an idle machine.
 
 
 def test_killed_record_neither_loses_nor_repeats_acknowledged_data(tmp_path):
@@ -140,7 +140,7 @@ def test_refused_record_leaves_no_files(options, message, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_existing_folder_is_kept(tmp_path):
+def test_refused_record_keeps_an_existing_folder(tmp_path):
     result = CliRunner().invoke(cli, ["record", "-o", str(tmp_path), "--listen", "tcp://10.1.1.1:5601", "-q"])
     assert result.exit_code == 1
     assert tmp_path.is_dir()
@@ -205,7 +205,7 @@ def test_unread_events_do_not_block_record():
         assert 0 < lines.lost < 100_000
         os.set_blocking(reader, False)
         got = b""
-        while b"line 999\n" not in got:  # now somebody reads
+        while b"line 999\n" not in got:  # Read the events only now.
             with contextlib.suppress(BlockingIOError):
                 got += os.read(reader, 65_536)
         assert got.startswith(b"line 0\nline 1\n")

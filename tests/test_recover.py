@@ -1,4 +1,4 @@
-"""What a crash has left is sealed in a process of its own, and told; so is what a capture has taken."""
+"""``ertis recover`` and ``ertis capture`` seal journals in a separate process and report the result."""
 
 import json
 import shutil
@@ -55,8 +55,8 @@ def test_sealing_process_reports_a_refusal(tmp_path):
 
 
 @pytest.fixture
-def instead(tmp_path, monkeypatch):
-    """What makes seal_apart run a line of shell where it would run Python; ``$0`` is that line's own file."""
+def fake_python(tmp_path, monkeypatch):
+    """Return a function that makes seal_in_subprocess run a shell line instead of Python; ``$0`` is the script."""
 
     def replace_python(line):
         script = tmp_path / "python"
@@ -73,27 +73,27 @@ def instead(tmp_path, monkeypatch):
         ("kill -9 $$", "ended with -9, printing nothing; seal it again"),
         ('echo \'{"done": 1, "o\'; kill -9 $$', "ended with -9, printing nothing; seal it again"),
         ("echo Traceback >&2; echo; echo 'KeyError: 1' >&2; exit 1", "ended with 1, printing 'KeyError: 1'; seal it"),
-        ("seq 100000 >&2; exit 3", "ended with 3, printing '100000'; seal it again"),  # more than a pipe holds
+        ("seq 100000 >&2; exit 3", "ended with 3, printing '100000'; seal it again"),  # Exceeds the capacity of a pipe.
         (
             f"exec {sys.executable} -c 'import os, sys; sys.exit(str(os.getsid(0) == os.getpid()))'",
-            "ended with 1, printing 'True'; seal it again",  # Ctrl-C in a terminal goes to a session
+            "ended with 1, printing 'True'; seal it again",  # A session of its own shields it from Ctrl-C.
         ),
     ],
 )
-def test_sealing_process_that_dies_is_reported(tmp_path, instead, line, reason):
-    instead(line)
+def test_sealing_process_that_dies_is_reported(tmp_path, fake_python, line, reason):
+    fake_python(line)
     with pytest.raises(DataError, match=f"rec.h5.journal: the process that seals it {reason}"):
         seal_in_subprocess(crashed(tmp_path))
 
 
 @pytest.mark.parametrize("late", [False, True])
-def test_sealing_process_can_be_interrupted(tmp_path, instead, late):
+def test_sealing_process_can_be_interrupted(tmp_path, fake_python, late):
     path = crashed(tmp_path)
     steps = [{"done": 1, "of": 3}, {"journal": "it was not asked to end", "recording": "none", "set_aside": None}]
     reported, late_told = (json.dumps(json.dumps(step)) for step in steps)
     slow = tmp_path / "slow.py"
     slow.write_text(f"import time; print({reported}, flush=True); time.sleep(5); print({late_told})")
-    instead(f"trap '' INT; exec {sys.executable} \"$@\"" if late else f"exec {sys.executable} {slow}")
+    fake_python(f"trap '' INT; exec {sys.executable} \"$@\"" if late else f"exec {sys.executable} {slow}")
 
     def interrupt(*_):
         raise KeyboardInterrupt
@@ -106,7 +106,7 @@ def test_sealing_process_can_be_interrupted(tmp_path, instead, late):
     assert seal(path).measurements == 3
 
 
-# The command.
+# The command `ertis recover`.
 
 
 def test_recover_seals_a_folder(tmp_path):
@@ -149,7 +149,7 @@ def test_recover_reports_damaged_measurements(tmp_path):
     assert reported in run("recover", path, code=3).stderr
 
 
-def test_recover_without_journals(tmp_path):
+def test_recover_reports_a_folder_without_journals(tmp_path):
     assert run("recover", tmp_path).stderr == f"no journal in {tmp_path}\n"
     assert run("recover", tmp_path, "--quiet").stderr == ""
     assert json.loads(run("recover", tmp_path, "--json").stdout) == {"journals": []}
@@ -178,7 +178,7 @@ def test_recover_can_be_interrupted(tmp_path, monkeypatch):
     assert run("recover", path).stderr == f"{tmp_path}/rec.h5: 3 measurements, 0 missing\n"
 
 
-# The same at the end of a capture.
+# Sealing at the end of a capture.
 
 
 LOST = SonarError("left: it was unplugged; plug it in")
@@ -188,7 +188,7 @@ def test_capture_reports_damage(tmp_path, capsys):
     create(tmp_path).close()
     path = tmp_path / "rec.h5.journal"
     spoil(path, "UPDATE measurements SET words = x'00' WHERE id = 1")
-    _seal(path, LOST, overwrite=False)  # which is told by who calls it
+    _seal(path, LOST, overwrite=False)  # The command reports the damage.
     assert capsys.readouterr().err == f"1 measurement is damaged; the journal is kept as {path}.damaged\n"
     assert len(verify(tmp_path / "rec.h5")) == 1
 

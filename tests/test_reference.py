@@ -1,4 +1,4 @@
-"""The exact referee against physics: echoes made by formula, noise, beam widths, a real measurement."""
+"""Reference imaging against physics: synthetic echoes, noise gain, beam widths and a real measurement."""
 
 import importlib.metadata
 
@@ -12,7 +12,7 @@ from ertis_numba.waveform import call_at
 from tests import reference
 from tests.cases import SHORT, noise, words_of
 
-SPEED_M_S = 343.0  # physics.md's beam widths
+SPEED_M_S = 343.0  # The beam widths in physics.md use this speed.
 
 
 def directions_of(azimuth_deg):
@@ -21,7 +21,7 @@ def directions_of(azimuth_deg):
 
 
 def received(settings: Settings, path_m):
-    """Words of one echo of amplitude 0.9 that comes by paths of these lengths: (mic,)."""
+    """Return the samples of one echo of amplitude 0.9 for path lengths of shape (mic,)."""
     time_s = np.arange(settings.recording.n_samples) / settings.recording.sample_rate_hz
     arrival_s = np.asarray(path_m) / sound_speed_m_s(settings.air)
     return words_of(0.9 * call_at(settings.call, time_s - arrival_s[:, None]))
@@ -75,7 +75,7 @@ def test_gain_of_32_microphones_on_white_noise_is_15_db():
 
 
 def beam_width_deg(frequency_hz, weights=None):
-    """Half-power width of the array's azimuth cut, of the mean power over frequencies."""
+    """Return the half-power width of the azimuth cut, with power averaged over frequencies."""
     azimuth_deg = np.linspace(-15, 15, 3001)
     path_m = directions_of(azimuth_deg) @ microphones(Array(layout="eRTIS_v3D1")).enabled_positions_m.T
     wave_1_m = 2 * np.pi * np.asarray(frequency_hz) / SPEED_M_S
@@ -97,9 +97,9 @@ def test_image_beam_has_the_width_of_the_beam_pattern():
     words = received(SHORT, 2 * 0.7 - positions_m @ directions_of(0.0)[0])
     azimuth_deg = np.linspace(-6, 6, 121)
     image = reference.exact(words, SHORT, directions_of(azimuth_deg), 0.7 + np.arange(-60, 61) * 5e-4)
-    amplitude = np.sum(image**2, axis=1)  # over ranges, so over the band
+    amplitude = np.sum(image**2, axis=1)  # Summing over ranges also sums over the band.
     wide = azimuth_deg[amplitude > amplitude.max() / 2]
-    # A hyperbolic sweep spends 1 / f² of its time at f, and the matched filter weighs by that once more.
+    # A hyperbolic sweep has spectral power in proportion to 1 / f², and the matched filter weights by it again.
     frequency_hz = np.linspace(25e3, 50e3, 101)
     expected_deg = beam_width_deg(frequency_hz, weights=frequency_hz**-4.0)
     assert wide[-1] - wide[0] == pytest.approx(expected_deg, abs=0.3)

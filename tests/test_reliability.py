@@ -1,4 +1,4 @@
-"""What is lost when things go wrong: the short form of what `ertis bench reliability --long` tries for an hour."""
+"""Data loss under faults: the short form of the one-hour run of `ertis bench reliability --long`."""
 
 import pytest
 from ertis_bench import captures, reliability
@@ -13,7 +13,7 @@ SEED = 1
 
 @pytest.mark.alone
 def test_sustained_capture_loses_nothing(tmp_path):
-    """Once in three times: a machine that does something else for a tenth of a second is not what this is about."""
+    """One of three attempts must succeed, because a busy machine may pause the capture for a tenth of a second."""
     for attempt in range(3):
         folder = tmp_path / str(attempt)
         folder.mkdir()
@@ -31,7 +31,7 @@ def test_groups_of_a_sync_chain_are_complete(tmp_path):
     platform.write_text(captures.platform(4, n_measurements=3).to_toml())
     found = captures.chain(platform, tmp_path, n_groups=SHORT.n_groups, rate_hz=10.0)
     assert (found["mixed"], found["wrong"]) == (0, 0)
-    # The first pulse may come while sensors are armed, and a busy emulator ignores pulses while it still measures.
+    # The first pulse may arrive during arming, and a busy emulator ignores pulses during a measurement.
     assert SHORT.n_groups / 2 <= found["complete"] <= found["groups"] <= SHORT.n_groups + 2
 
 

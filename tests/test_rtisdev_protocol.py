@@ -1,15 +1,15 @@
-"""The authors' own driver, rtisdev 2.16.0, drives an emulated device, by its code for Windows and by that for Linux.
+"""The original driver, rtisdev 2.16.0, controls an emulated device with its code for Windows and for Linux.
 
-It is run in a process of its own, since importing it changes warning filters. For Linux it needs the closed module
-``rtisserial``, for which a small one on pyserial stands in here.
+The driver runs in a separate process, because importing it changes warning filters. Its Linux code needs the
+closed-source module ``rtisserial``; a small replacement based on pyserial stands in for it.
 
-What differs between its two ways:
+Differences between the two code paths:
 
-- ``A``: for Linux 1 is active; for Windows 0 is, so that an active measurement is asked for as a passive one. The
-  device believes the number, as its protocol says.
-- ``A`` has no end of the line for Windows. It does not wait for an answer either way.
-- ``J`` has four numbers for Linux, three for Windows.
-- For Windows the port is opened and closed for every command; for Linux it stays open.
+- ``A``: 1 means active on Linux, and 0 means active on Windows, so Windows requests an active measurement as a
+  passive one. The device follows the number, as the protocol specifies.
+- ``A`` has no line ending on Windows. Neither code path waits for an answer.
+- ``J`` has four numbers on Linux and three on Windows.
+- On Windows the driver opens and closes the port for every command; on Linux the port stays open.
 """
 
 import json
@@ -27,11 +27,11 @@ from ertis_numba.devices.emulator.registers import Registers
 from ertis_numba.devices.setup import call_codes, call_hash
 from ertis_numba.settings import Call
 
-pytestmark = pytest.mark.alone  # the driver waits for an answer for no longer than it was written to
+pytestmark = pytest.mark.alone  # The driver's timeouts are short.
 N_SAMPLES = 65_536
 WORDS = [np.random.default_rng(index).integers(0, 2**32, N_SAMPLES, dtype=np.uint32) for index in range(3)]
 PASSIVE = [words[::-1].copy() for words in WORDS]
-PULSES_HZ = 2.0  # the first is half a second after the driver has begun to listen
+PULSES_HZ = 2.0  # The first pulse comes 0.5 s after the driver starts listening.
 
 DRIVER = """
 import json, os, sys, types, zlib
@@ -108,7 +108,7 @@ class Driven:
 
 @pytest.fixture(scope="module")
 def driven():
-    """What each way reported, and what the device had been told."""
+    """Run both code paths; return the report of each driver and the registers of its device."""
     with ExitStack() as stack:
         devices = {way: stack.enter_context(Emulator(WORDS, passive=PASSIVE)) for way in ("windows", "linux")}
         drivers = {
@@ -155,10 +155,10 @@ class TestBothWays:
         assert reported.hash == driven[way].report["hash"] == call_hash(reported.codes[:601])
         error = np.abs(reported.codes[:601].astype(int) - call_codes(call))
         assert error[62:-62].max() <= 1
-        assert error.max() <= 0.02 * 2047  # its ramps are those of a Hann window of another length
+        assert error.max() <= 0.02 * 2047  # The driver's ramps use a Hann window of another length.
 
     def test_rtisdev_triggered_measurements_match_the_pulses(self, driven, way):
-        # 77 is the counter that was set; the chain numbers its pulses from 0.
+        # The driver sets the counter to 77; the sync chain numbers its pulses from 0.
         assert driven[way].report["triggered"] == [[77, crc(WORDS[0])], [78, crc(WORDS[1])]]
 
 

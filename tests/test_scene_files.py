@@ -1,4 +1,4 @@
-"""Scenes as TOML, and what is refused."""
+"""Scene files in TOML, and the error messages for invalid ones."""
 
 import math
 import time
@@ -34,7 +34,7 @@ from ertis_numba.simulation.plan import make_plan
 from ertis_numba.simulation.snapshot import snapshot
 from tests.scenes import SENSOR
 
-# ---- there and back --------------------------------------------------------------------------------
+# ---- round trip ------------------------------------------------------------------------------------
 
 vectors = st.tuples(*(st.floats(-50, 50) for _ in range(3)))
 directions = st.tuples(st.floats(-180, 180), st.floats(-90, 90))
@@ -49,8 +49,8 @@ fixed, places = st.one_of(steady, polar), st.one_of(steady, polar, way_points)
 bands = st.tuples(st.floats(1e3, 4e4), st.floats(5e4, 1e5))
 
 
-def things(kind, where=places, **fields):
-    """A few things of a kind, anywhere."""
+def objects_of(kind, where=places, **fields):
+    """Strategy for a few scene objects of one kind."""
     made = st.builds(lambda place, rest: kind(**place, **rest), where, st.fixed_dictionaries(fields))
     return st.lists(made, max_size=2).map(tuple)
 
@@ -93,14 +93,14 @@ scenes = st.builds(
     sensors=st.lists(sensors, min_size=1, max_size=3).map(
         lambda found: tuple(sensor.replace(name=f"s{number}") for number, sensor in enumerate(found))
     ),
-    points=things(Point, strength_db=st.floats(-300, 120))
-    | things(Point, diameter_m=st.floats(1e-3, 10), facing_deg=st.none() | directions),
-    spheres=things(Sphere, radius_m=st.floats(1e-3, 10)),
-    walls=things(Wall, facing_deg=directions, size_m=st.none() | st.tuples(st.floats(0.1, 9), st.floats(0.1, 9))),
-    boxes=things(Box, fixed, size_m=st.tuples(*(st.floats(0.1, 9) for _ in range(3)))),
-    tones=things(Tone, frequency_hz=st.floats(1, 1e6)),
-    noises=things(Noise, band_hz=bands),
-    sonars=things(Sonar, period_s=st.floats(0.01, 10)),
+    points=objects_of(Point, strength_db=st.floats(-300, 120))
+    | objects_of(Point, diameter_m=st.floats(1e-3, 10), facing_deg=st.none() | directions),
+    spheres=objects_of(Sphere, radius_m=st.floats(1e-3, 10)),
+    walls=objects_of(Wall, facing_deg=directions, size_m=st.none() | st.tuples(st.floats(0.1, 9), st.floats(0.1, 9))),
+    boxes=objects_of(Box, fixed, size_m=st.tuples(*(st.floats(0.1, 9) for _ in range(3)))),
+    tones=objects_of(Tone, frequency_hz=st.floats(1, 1e6)),
+    noises=objects_of(Noise, band_hz=bands),
+    sonars=objects_of(Sonar, period_s=st.floats(0.01, 10)),
     ambient=st.none() | st.builds(Ambient, level_dbfs=st.floats(-300, 0), band_hz=bands),
 )
 
@@ -116,7 +116,7 @@ def test_empty_scene_file_is_one_sensor_in_silence():
     assert Scene().sensor().settings() == Settings()
 
 
-def test_positions_from_direction_and_range():
+def test_positions_are_computed_from_direction_and_range():
     by_angles = Point(azimuth_deg=90, elevation_deg=30, range_m=2.0)
     assert_allclose(by_angles.position_at(0.0), (0.0, math.sqrt(3), 1.0), atol=1e-12)
     assert_allclose(Point(range_m=2.0).position_at(0.0), (2.0, 0.0, 0.0))
@@ -126,7 +126,7 @@ def test_positions_from_direction_and_range():
 
 
 def test_scene_stores_the_layout_beside_its_file(tmp_path):
-    """A layout that it names is looked for beside it."""
+    """A relative layout path starts at the folder of the scene file."""
     (tmp_path / "line.csv").write_text("0, 0\n5, 0\n10, 0\n")
     (tmp_path / "scene.toml").write_text('[[sensors]]\narray.layout = "line.csv"\n[[points]]\nrange_m = 1\n')
     scene = load_scene(tmp_path / "scene.toml")
@@ -157,7 +157,7 @@ def test_faults_of_missing_channels_are_refused(tmp_path, channel):
         load_scene(path)
 
 
-# ---- what is refused -------------------------------------------------------------------------------
+# ---- invalid scenes --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -302,7 +302,7 @@ def test_unknown_sensors_and_fields_are_refused():
         Point(range_m=1.0).replace(range=1.0)
 
 
-# ---- how sensors are turned ------------------------------------------------------------------------
+# ---- orientation of sensors ------------------------------------------------------------------------
 
 
 @given(st.floats(-180, 180), st.floats(-90, 90), st.floats(-180, 180))
@@ -313,7 +313,7 @@ def test_rotation_and_quaternion_are_equivalent(yaw_deg, pitch_deg, roll_deg):
     assert np.linalg.det(rotation) == pytest.approx(1)
     assert_allclose(scipy.spatial.transform.Rotation.from_quat(sensor.quaternion()).as_matrix(), rotation, atol=1e-9)
     wanted_m = (math.cos(math.radians(pitch_deg)) * math.cos(math.radians(yaw_deg)), math.sin(math.radians(pitch_deg)))
-    assert_allclose(rotation[[0, 2], 0], wanted_m, atol=1e-12)  # nose to the left, then up
+    assert_allclose(rotation[[0, 2], 0], wanted_m, atol=1e-12)  # Yaw to the left, then pitch up.
 
 
 def test_error_in_a_long_scene_is_found_quickly():
@@ -350,7 +350,7 @@ def test_targets_around_emitters_or_microphones_are_refused(text, refused):
         make_plan(Scene.from_toml(text))
 
 
-def test_clear_targets_and_silent_emitters_inside_spheres_are_accepted():
+def test_silent_emitters_inside_spheres_are_accepted():
     text = (
         "[[sensors]]\nemitter.silent = true\nemitter.position_m = [1, 0, 0]\n[[spheres]]\nrange_m = 1\nradius_m = 0.1"
     )

@@ -1,4 +1,4 @@
-"""A journal becomes the recording that it should, whatever was there before and whoever is killed meanwhile."""
+"""Sealing of journals into recordings, also after kills and next to existing files."""
 
 import itertools
 import json
@@ -26,7 +26,7 @@ TURNED = (0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5))
 
 
 def two_sensors(folder):
-    """A journal with measurements of two sensors in turn and gaps of all kinds; of a third sensor nothing came."""
+    """Write a journal with alternating measurements of two sensors, several gaps, and a third sensor without data."""
     left, right = entries(5), entries(2, sensor="right", first=0, seed=2)
     warm = TINY.replace(air=Air(temperature_c=31.5))
     left[1] = replace(left[1], measurement=replace(left[1].measurement, settings=warm))
@@ -85,10 +85,10 @@ def test_sealed_recording_is_not_written_again(tmp_path):
     shutil.copy(path, tmp_path / "kept")
     first = seal(path)
     before = (tmp_path / "rec.h5").stat()
-    assert seal(path) == first  # killed after the journal had gone
+    assert seal(path) == first  # As after a kill between removing the journal and returning.
     shutil.copy(tmp_path / "kept", path)
     (tmp_path / "rec.h5.sealing.part").touch()
-    (tmp_path / "rec.h5.12345678.part").touch()  # of somebody else
+    (tmp_path / "rec.h5.12345678.part").touch()  # A partial file of another process.
     assert seal(path) == first
     after = (tmp_path / "rec.h5").stat()
     assert (after.st_ino, after.st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
@@ -105,8 +105,8 @@ def test_missing_journal_is_refused(tmp_path):
             seal(tmp_path / f"{name}.journal")
 
 
-def with_gap(path, given, *, sensor="left", reason="footer"):
-    """A recording that says that something is missing at its end."""
+def write_with_gap(path, given, *, sensor="left", reason="footer"):
+    """Write a recording with a gap after its last measurement."""
     with RecordingWriter(path) as writer:
         for measurement in given:
             writer.write(measurement)
@@ -125,7 +125,7 @@ OTHERS = {
         path, [*given[:-1], replace(given[-1], stamp=replace(given[-1].stamp, timestamp_ns=7))]
     ),
     "another place": lambda path, given: write_recording(path, given, mounting={"left": ((1, 0, 0), (0, 0, 0, 1))}),
-    "another gap": with_gap,
+    "another gap": write_with_gap,
 }
 
 
@@ -169,7 +169,7 @@ def test_damaged_measurement_becomes_a_gap_and_the_journal_is_kept(tmp_path, cap
         assert [stamp.sequence for stamp in recording.stamps()] == [10, 12]
         assert [(gap.first, gap.last, gap.reason) for gap in recording.gaps] == [(11, 11, "damaged in the journal")]
     shutil.move(tmp_path / "kept", path)
-    assert seal(path).set_aside == tmp_path / "rec.h5.journal.2.damaged"  # killed in between: the same recording
+    assert seal(path).set_aside == tmp_path / "rec.h5.journal.2.damaged"  # As after a kill before that.
 
 
 def test_journal_of_damaged_measurements_is_kept(tmp_path):
@@ -177,7 +177,7 @@ def test_journal_of_damaged_measurements_is_kept(tmp_path):
     path = tmp_path / "rec.h5.journal"
     spoil(path, "UPDATE measurements SET words = zeroblob(4096) WHERE sensor = 1")
     shutil.copy(path, tmp_path / "kept")
-    for _ in range(2):  # written, then found to be there already
+    for _ in range(2):  # The second pass finds the recording already written.
         sealed = seal(path)
         assert (sealed.measurements, sealed.damaged) == (1, 2)
         assert sensor_names(tmp_path / "rec.h5") == ("right",)
@@ -289,7 +289,7 @@ def test_killed_sealing_processes_leave_no_broken_file(tmp_path):
 
 
 def naive_gaps(numbers, noted):
-    """What is missing, one number after the other."""
+    """Return gaps by checking every number in turn."""
     reasons = {}
     for first, last, reason in sorted(noted, key=lambda item: item[0]):
         for number in range(first, last + 1):
@@ -316,7 +316,7 @@ def test_gaps_equal_a_naive_count():
         assert sum(last - first + 1 for first, last, _ in missing) == len(reported)
         for before, after in itertools.pairwise(missing):
             assert before[1] < after[0]
-            assert before[1] + 1 < after[0] or before[2] != after[2]  # joined where they can be
+            assert before[1] + 1 < after[0] or before[2] != after[2]  # Adjacent gaps of one reason are merged.
 
 
 def test_gaps_are_counted_per_session():
@@ -335,7 +335,7 @@ def test_gaps_are_counted_per_session():
 )
 def test_unstorable_gaps_are_refused(tmp_path, sensor, reason, message):
     with pytest.raises(ArgumentError, match=message):
-        with_gap(tmp_path / "rec.h5", [entries(1)[0].measurement], sensor=sensor, reason=reason)
+        write_with_gap(tmp_path / "rec.h5", [entries(1)[0].measurement], sensor=sensor, reason=reason)
     assert not list(tmp_path.iterdir())
 
 

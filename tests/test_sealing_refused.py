@@ -1,4 +1,4 @@
-"""Sensors that no recording can hold: the others are sealed, and the journal is kept with the reason."""
+"""Sensors that a recording cannot store: the others are sealed, and the journal is kept with the reason."""
 
 import json
 
@@ -22,7 +22,7 @@ REASON = r"settings of sensor bad, call: call has 5000000 samples .*; the limit 
 
 @pytest.fixture
 def left(tmp_path, monkeypatch):
-    """A journal of a version that had no limit on the samples of a call."""
+    """Journal from a version without a limit on the samples of a call."""
     with monkeypatch.context() as before:
         before.setattr(call, "MAX_CALL_SAMPLES", 10**9)
         long = TINY.replace(call=Call(duration_s=1.0, sample_rate_hz=5e6))
@@ -42,11 +42,11 @@ def test_seal_keeps_a_journal_in_which_one_sensor_cannot_be_sealed(tmp_path, lef
     with open_recording(tmp_path / "rec.h5") as recording:
         assert (recording.sensor, len(recording)) == ("left", 3)
         assert "sensor bad was set aside: " in recording.attributes["history"]
-    with Journal.open(sealed.set_aside) as kept:  # with all that was in it
+    with Journal.open(sealed.set_aside) as kept:  # The kept journal is complete.
         assert (len(kept), kept.unusable["bad"][1]) == (3, 2)
 
 
-def test_seal_can_be_repeated_after_a_kill_before_the_journal_was_renamed(tmp_path, left, monkeypatch):
+def test_seal_can_be_repeated_after_a_kill(tmp_path, left, monkeypatch):
     monkeypatch.setattr(Journal, "set_aside", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         seal(left)

@@ -1,4 +1,4 @@
-"""A sensor node and a central node that refuses, fails, dies, is silent, or loses what it says."""
+"""Link of a sensor node to a central node that refuses, fails, dies, falls silent or loses messages."""
 
 import queue
 import threading
@@ -15,11 +15,11 @@ from tests.journals import EPOCH, TINY, entries
 from tests.sending import IMPATIENT, SOON_S, Node, has_all, impatient, until
 from tests.stand_in import StandIn
 
-__all__ = ["impatient"]  # a fixture
+__all__ = ["impatient"]  # A fixture, imported for use here.
 
 
-def test_forgetful_central_node_gets_a_hello_at_once(monkeypatch):
-    """Without waiting for what is under way to be settled."""
+def test_link_sends_hello_at_once_to_a_forgetful_central_node(monkeypatch):
+    """The link does not wait until measurements in flight are acknowledged."""
     monkeypatch.setattr(runs, "_PATIENCE_S", 1000.0)
     given = entries(20)
     with StandIn() as central, Node(central.address) as node:
@@ -68,7 +68,7 @@ def test_ack_of_unsent_numbers_is_ignored():
 @IMPATIENT
 @pytest.mark.parametrize("forget", [False, True])
 def test_link_survives_restarts_of_the_central_node(forget):
-    """Five times; with ``forget``, it acknowledges what it has in memory only, which is then gone."""
+    """Restart it five times; with ``forget``, it acknowledges measurements that it holds in memory only and loses."""
     given = entries(100)
     with StandIn(acks="accepted" if forget else "stored") as central, Node(central.address) as node:
         for number, entry in enumerate(given):
@@ -88,7 +88,7 @@ def test_link_survives_restarts_of_the_central_node(forget):
 
 
 @IMPATIENT
-def test_refused_sensor_retries_while_others_continue():
+def test_refused_sensor_retries_while_other_sensors_continue():
     left, right = entries(5), entries(5, sensor="right")
     with StandIn() as central, Node(central.address, ("left", "right")) as node:
         asked = queue.Queue()
@@ -149,7 +149,7 @@ def test_fault_of_the_central_node_delays_measurements():
         node.append(given[1:])
         assert not node.flush(0.2)
         assert node.notes.get(timeout=SOON_S) == "the central node cannot store: no room; measurements are kept"
-        assert central.seen == {10, 11}  # to see whether it stores again, one is enough
+        assert central.seen == {10, 11}  # One measurement suffices to test whether it stores again.
         central.state = "storage"
         assert node.flush(SOON_S)
         assert node.notes.get(timeout=SOON_S) == "the central node can store again"
@@ -158,7 +158,7 @@ def test_fault_of_the_central_node_delays_measurements():
 
 
 @IMPATIENT
-def test_silence_causes_a_new_connection():
+def test_link_reconnects_to_a_silent_central_node():
     given = entries(10)
     with StandIn() as central, Node(central.address) as node:
         node.append(given[:5])
@@ -203,7 +203,7 @@ def test_link_authenticates_with_keys(tmp_path, listed, server, message):
 
 
 @IMPATIENT
-def test_failing_event_listener_stops_nothing(caplog):
+def test_link_survives_a_failing_event_listener(caplog):
     given = entries(6)
 
     def fail(_):
@@ -214,7 +214,7 @@ def test_failing_event_listener_stops_nothing(caplog):
         node.append(given[:3])
         assert node.flush(SOON_S)
         central.silent = True
-        until(lambda: node.central == "away")  # which is told
+        until(lambda: node.central == "away")  # The node reports the missing central node.
         node.append(given[3:])
         central.silent = False
         assert node.flush(SOON_S)

@@ -1,4 +1,4 @@
-"""A sensor node over real sockets: what it was given arrives once and bit by bit, or is a gap with a reason."""
+"""Sensor node over real sockets: each measurement arrives once and unchanged, or becomes a gap with a reason."""
 
 import random
 from dataclasses import replace
@@ -16,7 +16,7 @@ from tests.journals import EPOCH, TINY, entries, python
 from tests.sending import IMPATIENT, KEY, SOON_S, Node, has_all, impatient, until
 from tests.stand_in import StandIn
 
-__all__ = ["impatient"]  # a fixture
+__all__ = ["impatient"]  # A fixture, imported for use here.
 
 
 def test_measurements_arrive_with_stamp_air_and_settings():
@@ -50,15 +50,15 @@ def test_gaps_arrive_in_order():
     with StandIn() as central, Node(central.address) as node:
         node.append(given[:2])
         node.note_gap("left", 5, 5, "footer", session_id=EPOCH)
-        node.note_gap("left", 4, 6, "unplugged", session_id=EPOCH)  # of which 6 is news
+        node.note_gap("left", 4, 6, "unplugged", session_id=EPOCH)  # Only 6 is new.
         node.append(given[5:])
-        node.note_gap("left", 0, 8, "late", session_id=EPOCH)  # which is none
+        node.note_gap("left", 0, 8, "late", session_id=EPOCH)  # No new number except 7, which was never given.
         assert node.flush(SOON_S)
     assert [*central.held[KEY]] == [3, 4, 8]
     assert central.gaps[KEY] == [(5, 5, "footer"), (6, 6, "unplugged"), (7, 7, runs.NEVER_GIVEN)]
 
 
-def test_several_sensors_and_sessions_arrive():
+def test_measurements_of_several_sensors_and_sessions_arrive():
     left, right, later = entries(20), entries(20, sensor="right", seed=2), entries(5, first=0, session_id=9, seed=3)
     with StandIn(window=2) as central, Node(central.address, ("left", "right")) as node:
         for pair in zip(left, right, strict=True):
@@ -114,7 +114,7 @@ def test_full_memory_drops_the_oldest():
 
 
 def test_memory_is_constant_without_a_central_node():
-    """Even if every other number is a gap of its own kind."""
+    """Every other number is a gap, and neighbouring gaps differ in their reason."""
     small = TINY.replace(recording=Recording(n_samples=64))
     (blank,) = entries(1, settings=small)
     with StandIn() as central:
@@ -125,7 +125,7 @@ def test_memory_is_constant_without_a_central_node():
             stamp = replace(blank.measurement.stamp, sequence=number)
             node.append([JournalEntry(replace(blank.measurement, stamp=stamp), 0)])
             node.note_gap("left", number + 1, number + 1, f"reason {number % 7}", session_id=EPOCH)
-        run = node._spool.runs[KEY]  # noqa: SLF001  nobody else can tell
+        run = node._spool.runs[KEY]  # noqa: SLF001  no public interface shows it
         assert len(run.items) < 300
         assert run.items[0].first == 0
         assert all(one.last + 1 == other.first for one, other in zip(run.items, list(run.items)[1:], strict=False))
@@ -145,22 +145,22 @@ def test_memory_is_constant_while_one_sensor_is_refused():
         until(lambda: central.acked_through.get(("right", EPOCH)) == 3009)
         until(lambda: node.unacked == 1)
         node.append(entries(1, first=11, settings=small))
-        assert len(node._spool._order) < 1010  # noqa: SLF001  nobody else can tell
+        assert len(node._spool._order) < 1010  # noqa: SLF001  no public interface shows it
 
 
-def test_session_acknowledged_beyond_its_end_does_not_block_later_ones():
-    """As when the end of a spool was lost with the power."""
+def test_session_acknowledged_beyond_its_end_blocks_no_other():
+    """A power cut may lose the end of a spool whose measurements were acknowledged."""
     later = entries(3, first=0, session_id=EPOCH + 1)
     with StandIn() as central, Node(central.address) as node:
         central.acked_through[KEY] = 15
-        node.append([*entries(3), *later])  # 10 to 12
+        node.append([*entries(3), *later])  # Numbers 10 to 12.
         assert node.flush(SOON_S)
         assert node.acks.get_nowait().acked_through == 12
     assert KEY not in central.held
     assert has_all(central, later, ("left", EPOCH + 1))
 
 
-def test_numbers_of_any_kind_are_sent():
+def test_sensor_node_accepts_numpy_numbers():
     given = entries(2, first=0)
     stamp = given[0].measurement.stamp
     numpy = replace(
@@ -192,8 +192,8 @@ def test_dropped_measurements_are_counted_once():
     assert reported == [central.dropped]
 
 
-def test_counts_match_a_model_for_random_events():  # noqa: C901  it is a list of what may
-    """A run against an obvious model: random losses, evictions, acks late and beyond."""
+def test_sensor_node_counts_match_a_model_for_random_events():  # noqa: C901  one branch per kind of event
+    """Compare the spool with a simple model under random losses, evictions, and late or excessive acks."""
     chance = random.Random(4)
     for _ in range(30):
         run = runs.OutgoingSession(JournalSensor.from_settings("left", TINY), EPOCH)

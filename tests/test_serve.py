@@ -1,4 +1,4 @@
-"""``ertis serve`` as its users have it: processes that are started, sent to, subscribed to, killed and ended."""
+"""``ertis serve`` as a process: it receives measurements, publishes images, and survives killed workers."""
 
 import itertools
 import json
@@ -33,7 +33,7 @@ LOOPBACK = ("--listen", "tcp://127.0.0.1:0", "--publish", "tcp://127.0.0.1:0")
 
 
 class Served:
-    """A process of ``ertis serve``, its events, and what it said when it had ended."""
+    """Process of ``ertis serve`` with its events and its final report."""
 
     def __init__(self, process):
         self.process = process
@@ -67,7 +67,7 @@ def serving(*options):
 
 
 class Sensors:
-    """Sensors of a node that measure together."""
+    """Sensors of one node that measure at the same time."""
 
     def __init__(self, node, *names):
         self.node, self.names, self.numbers = node, names, itertools.count()
@@ -96,7 +96,7 @@ def received(subscriber, kind):
 
 
 def local(address):
-    """What others reach, as this machine reaches it."""
+    """Return an address with the local host in place of all interfaces."""
     assert address.startswith("tcp://0.0.0.0:")
     return address.replace("0.0.0.0", "127.0.0.1")
 
@@ -251,7 +251,7 @@ def test_refused_serve_leaves_no_files(tmp_path):
 
 
 def test_serve_handles_pcm(tmp_path):
-    """Sent, stored and imaged like bits."""
+    """PCM measurements are sent, stored and imaged like one-bit ones."""
     given = noise(CASES["PCM, calibrated"])
     with (
         serving(*LOOPBACK, "--record", str(tmp_path)) as served,

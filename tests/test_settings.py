@@ -1,4 +1,4 @@
-"""Settings: what is kept in TOML, what is refused and with which words, and the recording presets."""
+"""Settings: TOML round trips, error messages for invalid values, and recording presets."""
 
 import dataclasses
 import math
@@ -273,7 +273,7 @@ def test_bad_arguments_are_refused(make, message):
 def test_fields_accept_the_forms_of_settings_files(made, wanted):
     assert made == wanted
     assert hash(made) == hash(wanted)
-    assert repr(made) == repr(wanted)  # 1 is equal to 1.0, and a number of NumPy to Python's
+    assert repr(made) == repr(wanted)  # Equality alone does not distinguish 1, 1.0 and NumPy numbers.
 
 
 def test_each_interpolation_has_its_number_of_taps():
@@ -430,7 +430,7 @@ def test_range_window_ends_where_the_whole_echo_fits():
     assert window_m(10**6) == (0.5, 5.0)
     assert window_m(22_500) == (0.5, 3.0)
     assert window_m(5_000) == (0.0, 0.3)
-    assert window_m(2_810) == (0.0, 0.046)  # less than a step of the window
+    assert window_m(2_810) == (0.0, 0.046)  # The window is shorter than one step.
     assert window_m(2_810, range_m=(0.2, 9.0)) == (0.2, 9.0)
     with pytest.raises(
         ArgumentError,

@@ -1,4 +1,4 @@
-"""One changed number of nested settings needs one call."""
+"""Changes of nested settings by dotted path, such as ``processing.range_m``."""
 
 import re
 
@@ -9,14 +9,14 @@ from ertis_numba.settings import Accuracy, Processing, Settings
 from ertis_numba.simulation import Scene
 
 
-def test_a_path_changes_one_nested_value():
+def test_path_changes_one_nested_value():
     changed = Settings().replace("processing.range_m", (0.5, 3))
     assert changed == Settings(processing=Processing(range_m=(0.5, 3.0)))
     assert Settings().replace("accuracy", Accuracy(max_error_db=-50)) == Settings(accuracy=Accuracy(max_error_db=-50))
     assert Processing().replace("dmas_order", 3) == Processing().replace(dmas_order=3)
 
 
-def test_several_paths_change_in_one_call_and_are_checked_together():
+def test_several_paths_are_changed_and_checked_together():
     changes = {"processing.decimation": 15, "processing.range_decimation": 150, "accuracy.max_error_db": -50}
     assert Settings().replace(**changes) == Settings(
         processing=Processing(decimation=15, range_decimation=150), accuracy=Accuracy(max_error_db=-50)
@@ -25,14 +25,14 @@ def test_several_paths_change_in_one_call_and_are_checked_together():
         Settings().replace("processing.decimation", 15)
 
 
-def test_paths_change_tables_that_are_given_beside_them():
+def test_paths_apply_to_tables_of_the_same_call():
     changed = Settings().replace("processing.dmas_order", 4, processing=Processing(directions="2d:9"))
     assert changed.processing == Processing(directions="2d:9", dmas_order=4)
     assert Settings().replace(processing=Processing(dmas_order=4)).processing.dmas_order == 4
     assert Settings().replace() == Settings()
 
 
-def test_values_may_be_none():
+def test_path_value_may_be_none():
     fixed = Settings().replace("accuracy.delay_taps", 2)
     assert fixed.replace("accuracy.delay_taps", None) == Settings()
 
@@ -50,7 +50,7 @@ def test_values_may_be_none():
         ("processing.range_m.first", "processing key 'range_m.first' is unknown: range_m is no table; give 'range_m'"),
     ],
 )
-def test_unknown_paths_are_refused_in_one_line_with_similar_ones(path, message):
+def test_unknown_path_is_refused_with_similar_paths(path, message):
     with pytest.raises(ArgumentError, match=re.escape(message)) as caught:
         Settings().replace(path, 1)
     assert "\n" not in str(caught.value)
@@ -64,6 +64,6 @@ def test_values_of_paths_are_checked():
         Settings().replace("processing.range_m", 3)
 
 
-def test_scenes_take_paths_too():
+def test_scene_replace_accepts_paths():
     changed = Scene().replace("seed", 3)
     assert changed == Scene(seed=3)

@@ -1,4 +1,4 @@
-"""Reference of the keys of TOML files: each key is there, described, and its example is accepted."""
+"""Reference of TOML keys: it lists and describes every key, and the examples are valid."""
 
 import json
 import re
@@ -24,7 +24,7 @@ READERS = {"settings": Settings.load, "scene": load_scene, "layout": load_layout
 
 
 def structures(kind):
-    """Yield the structures of a document."""
+    """Yield the settings structures of a document."""
     yield kind
     for field in msgspec.structs.fields(kind):
         for part in (field.type, *getattr(field.type, "__args__", ())):
@@ -59,7 +59,7 @@ def test_file_of_examples_is_accepted(document):
 
 @pytest.mark.parametrize("document", DOCUMENTS)
 def test_unchanged_template_gives_the_defaults(document):
-    """All of its lines are comments until somebody takes the marks away."""
+    """Every line of the template is a comment until a user removes the comment mark."""
     text = CliRunner().invoke(cli, ["settings", document]).stdout
     assert tomllib.loads(text) == {}
     for section in reference(document):

@@ -1,4 +1,4 @@
-"""Signals to commands: the short form of what `ertis bench reliability --long` tries."""
+"""Signals sent to commands: the short form of the run of `ertis bench reliability --long`."""
 
 import os
 import signal
@@ -62,7 +62,7 @@ def test_signal_is_not_repeated_during_cleanup():
 
 
 def run_command(module, number, program=""):
-    """Run the command line, which gets a signal when it imports a module."""
+    """Run the command line and send it a signal when it imports a module."""
     text = f"""
 import atexit, os, signal, sys, time
 
@@ -121,7 +121,7 @@ def test_interrupted_command_does_not_finalise_the_interpreter():
 
 
 def test_ctrl_c_in_code_run_by_exec_exits_with_code_130(tmp_path):
-    """Python by default ends itself by SIGINT, because code run by `exec` makes it treat the exception as unhandled."""
+    """Python would otherwise end by SIGINT, because it treats an interrupt in code run by `exec` as unhandled."""
     (tmp_path / "sitecustomize.py").write_text(
         """
 import signal, sys
@@ -142,7 +142,7 @@ sys.meta_path.insert(0, Finder())
 
 
 def test_signal_that_is_ignored_from_the_start_stays_ignored():
-    """As `nohup` has it."""
+    """`nohup` starts commands with SIGHUP ignored."""
     program = """
         signal.raise_signal(signal.SIGHUP)
         with _signals.stopped_by_signals() as asked:

@@ -1,4 +1,4 @@
-"""The command that renders scenes, from file to file."""
+"""``ertis simulate`` renders a scene file into a recording."""
 
 import json
 import re
@@ -51,7 +51,7 @@ def test_simulate_writes_the_rendered_samples(scene_file, tmp_path):
         truth = recording.truth
     decided = Scene.from_toml(truth.scene)
     assert decided.replace(effects={}) == simulator.scene
-    assert Simulator(decided).plan.active == simulator.plan.active  # the verdicts are in the recording
+    assert Simulator(decided).plan.active == simulator.plan.active  # The recording stores the effect decisions.
     assert truth.seed == 11
     assert [[reflector.name for reflector in row] for row in truth.reflectors] == [["points[0]"]] * 3
 

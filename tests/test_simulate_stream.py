@@ -1,4 +1,4 @@
-"""Long simulations: room on the disk, memory, and what is computed when."""
+"""Long simulations: required disk space, memory use and streamed ground truth."""
 
 import re
 import shutil
@@ -48,7 +48,7 @@ def test_simulation_without_free_space_is_refused_before_computing(path, monkeyp
 
 
 def test_ground_truth_is_part_of_the_required_space(path, monkeypatch):
-    usage = namedtuple("usage", "total used free")  # noqa: PYI024  as in shutil
+    usage = namedtuple("usage", "total used free")  # noqa: PYI024  shutil uses such a tuple
     words = 2 * 40_000
     free = 10**7 + words
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(10**9, 0, free))
@@ -119,7 +119,7 @@ def test_shipped_layout_is_read_once(monkeypatch):
     load_layout("eRTIS_v3D1")
     monkeypatch.setattr(layouts.resources, "files", lambda _: pytest.fail("the layout was read again"))
     layout = load_layout("eRTIS_v3D1")
-    layout.positions_m[:] = 0.0  # of one caller only
+    layout.positions_m[:] = 0.0  # Each caller has its own copy.
     assert load_layout("eRTIS_v3D1").positions_m.any()
 
 
@@ -144,12 +144,12 @@ def points(count):
         ),
     ],
 )
-def test_scene_that_would_exceed_the_memory_is_refused_with_its_number(scene, message):
+def test_scene_exceeding_the_memory_is_refused(scene, message):
     with pytest.raises(ArgumentError, match=message):
         make_plan(scene)
 
 
-def test_measurement_that_would_exceed_the_memory_is_refused_with_its_number(monkeypatch):
+def test_measurement_exceeding_the_memory_is_refused(monkeypatch):
     monkeypatch.setattr("ertis_numba.simulation.bounds.MAX_AMPLITUDES", 100)
     message = (
         r"scene has 1 sound paths to 3 microphones at \d+ frequencies, in total \d+ amplitudes; the limit is 100\."

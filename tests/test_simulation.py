@@ -1,4 +1,4 @@
-"""Rendered scenes against closed forms: arrival times, levels, bits, and what decides them."""
+"""Rendered scenes against closed-form solutions: arrival times, levels, bits and their seeds."""
 
 import hashlib
 import tracemalloc
@@ -72,7 +72,7 @@ def test_arrivals_include_the_calibration_of_the_layout():
 @given(azimuth_deg=st.floats(-180, 180), elevation_deg=st.floats(-90, 90), range_m=st.floats(1e-3, 1000))
 def test_arrivals_are_finite_everywhere(azimuth_deg, elevation_deg, range_m):
     point = Point(azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, range_m=range_m, strength_db=0)
-    delay_s, amplitude = sorted_ways(scene_of(point, sensor=EAR), "spreading")  # the microphone sits upon the emitter
+    delay_s, amplitude = sorted_ways(scene_of(point, sensor=EAR), "spreading")  # Mic at the emitter.
     assert np.all(np.isfinite(amplitude))
     assert np.all(amplitude <= 1e4)
     assert np.all(delay_s >= 0)
@@ -80,7 +80,7 @@ def test_arrivals_are_finite_everywhere(azimuth_deg, elevation_deg, range_m):
 
 @pytest.mark.parametrize("range_m", [0.3, 0.5123, 0.7])
 def test_calls_arrive_on_time(range_m):
-    """Within 1e-5 of a sample at 450 kHz, before the modulators."""
+    """Arrivals before the modulators are within 1e-5 of a sample at 450 kHz."""
     scene = scene_of(Point(azimuth_deg=40, range_m=range_m, strength_db=-20))
     [echo] = ways(scene)
     for mic, signal in enumerate(heard(scene)):
@@ -89,7 +89,7 @@ def test_calls_arrive_on_time(range_m):
 
 
 def test_bits_preserve_arrival_time_and_amplitude():
-    """Through 4th order bits with dither, an arrival moves by less than 0.002 of a sample at 450 kHz."""
+    """Modulation of 4th order with dither moves an arrival by less than 0.002 of a sample at 450 kHz."""
     scene = scene_of(Point(azimuth_deg=-40, range_m=0.6, strength_db=-15))
     simulator = Simulator(scene, plan=only("spreading"))
     [echo] = ways(scene, "spreading")
@@ -114,7 +114,7 @@ def test_rendered_signals_equal_the_time_domain_sum(name):
 
 
 def test_fractional_delay_conserves_energy():
-    """Parseval: whatever part of a sample a call is delayed by, the energy stays."""
+    """By Parseval's theorem, a delay by a fraction of a sample keeps the energy of a call."""
     step_m = SPEED_M_S / RATE_HZ / 2
     scenes = (scene_of(Point(range_m=0.5 + step_m * part), sensor=EAR) for part in (0.0, 0.1, 0.37, 0.5, 0.77, 123.4))
     amplitude = [np.sum(heard(scene) ** 2) for scene in scenes]
@@ -132,7 +132,7 @@ def test_signals_are_independent_of_the_block_length(monkeypatch, block):
 
 
 def test_echo_continues_in_the_next_block():
-    """The call spans the first edge between blocks."""
+    """The call spans the boundary of the first two blocks."""
     scene = scene_of(Point(range_m=1.1), sensor=EAR)
     [echo] = ways(scene)
     assert echo.delay_s[0, 0] * RATE_HZ < 32_768 < (echo.delay_s[0, 0] + SENSOR.call.duration_s) * RATE_HZ
@@ -154,7 +154,7 @@ def test_emitter_level_scales_the_echoes():
 
 
 def test_call_spectrum_is_far_below_half_the_pdm_rate():
-    """What justifies evaluating the call at the PDM rate: nothing of it is left where it would alias."""
+    """The call has no content that would alias, so it can be evaluated at the PDM rate."""
     fine = np.fft.rfft(call_at(CALLS["wide"][0], np.arange(400_000) / (8 * RATE_HZ)))
     frequency_hz = np.fft.rfftfreq(400_000, 1 / (8 * RATE_HZ))
     beyond = np.abs(fine[frequency_hz > RATE_HZ / 2]).max()
@@ -175,7 +175,7 @@ def test_seed_and_index_determine_every_bit():
 
 
 def test_simulated_words_equal_those_of_earlier_versions():
-    """A change of these bits changes every shipped recording: then rebuild data/synthetic, and say so."""
+    """Changed bits change every shipped recording; rebuild data/synthetic and note it in the changelog."""
     words = render(NOISY).data
     assert hashlib.sha256(words.tobytes()).hexdigest()[:16] == "6ef2f5669f9743ea"
 
@@ -215,7 +215,7 @@ def test_each_channel_is_in_its_bit(word_bits, n_channels):
 
 
 def test_large_array_is_rendered_in_equal_parts():
-    """Channels are rendered 128 at a time; none of them notices."""
+    """Channels are rendered 128 at a time, without an effect on their signals."""
     sensor = SENSOR.replace(array=line_array(300, 1e-3), recording=Recording(n_samples=12_000))
     scene = scene_of(Point(range_m=0.2, azimuth_deg=40, strength_db=-50), sensor=sensor)
     simulator = Simulator(scene, plan=only("spreading"))
@@ -244,7 +244,7 @@ def test_memory_is_independent_of_the_record_length():
     simulator.render()
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert peak < 15e6  # the words take 1.5 MB, the signals would take 36 MB
+    assert peak < 15e6  # The samples take 1.5 MB; the signals would take 36 MB.
 
 
 def test_invalid_measurement_index_is_refused():
@@ -263,7 +263,7 @@ def test_effect_plan_is_made_by_default():
     assert "spreading" in simulator.plan.active
 
 
-# ---- truth -----------------------------------------------------------------------------------------
+# ---- ground truth ----------------------------------------------------------------------------------
 
 
 def test_reflectors_are_sorted_by_level():
@@ -290,7 +290,7 @@ def test_reflectors_are_in_the_frame_of_a_rotated_sensor():
 
 
 def test_roll_is_clockwise_seen_from_behind():
-    """What lies to the right appears above when the sensor's top leans to the right."""
+    """A point to the right appears above when the top of the sensor leans to the right."""
     scene = scene_of(Point(position_m=(1.0, -1.0, 0.0)), sensor=SENSOR.replace(roll_deg=90))
     [point] = Simulator(scene, plan=only("spreading")).reflectors()
     assert_allclose((point.azimuth_deg, point.elevation_deg), (0, 45), atol=1e-9)

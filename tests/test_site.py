@@ -1,4 +1,4 @@
-"""What the site makes of the help texts, which are written for a terminal."""
+"""Help texts on the site: they are written for a terminal and rendered as pages."""
 
 import runpy
 from pathlib import Path
@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[1]
 
 
 def helps(command):
-    """The text of a command and of its options."""
+    """Yield the help texts of a command, its options and its subcommands."""
     yield command.help or ""
     yield from (option.help or "" for option in command.params if isinstance(option, click.Option))
     for each in command.commands.values() if isinstance(command, click.Group) else ():
@@ -20,7 +20,7 @@ def helps(command):
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_node_addresses_are_not_links(name):
-    """Nobody can follow them."""
+    """Readers cannot open `tcp://` addresses."""
     core = pytest.importorskip("docutils.core", reason="docutils comes with what makes the site")
     nodes = pytest.importorskip("docutils.nodes")
     take_literally = runpy.run_path(str(ROOT / "docs" / "conf.py"))["_take_literally"]

@@ -1,4 +1,4 @@
-"""Servers and strangers: addresses, garbage, and more connections than anybody needs."""
+"""Server sockets: addresses, garbage on the port, and floods of connections."""
 
 import random
 import resource
@@ -47,7 +47,7 @@ def test_wildcard_server_reports_a_connectable_address(tmp_path):
 
 
 def test_immediate_refusal_is_reported(tmp_path):
-    """Between connecting and watching, everything may have happened already."""
+    """The refusal may arrive after connecting but before the monitor starts."""
     with (
         Door(tmp_path) as door,
         zmq.Context() as context,
@@ -74,7 +74,6 @@ def test_server_accepts_more_connections_than_the_default_limit():
 
 
 def test_garbage_on_the_port_affects_no_client(door):
-    """Seed 3."""
     random_ = random.Random(3)
     robot = door.knock(ROBOT)
     assert door.until(lambda: door.came)

@@ -1,4 +1,4 @@
-"""The driver on real pseudo terminals: what it tells a device, what it takes from it, and what it says of trouble."""
+"""Serial driver on pseudo terminals: commands to the device, received measurements and error messages."""
 
 import errno
 import itertools
@@ -62,7 +62,7 @@ def armed(device):
 
 
 class Fake:
-    """A device that answers what a test wants: ``answer`` gets each line and a function that writes."""
+    """Fake device with scripted answers: ``answer`` receives each line and a function that writes."""
 
     def __init__(self, answer):
         self.master, self._slave = os.openpty()
@@ -93,13 +93,13 @@ class Fake:
                 self._answer(line, self.write)
 
 
-def obedient(line, write):
+def answer_correctly(line, write):
     if not line.startswith(b"!A"):
         write(encode_answer(call_hash(Setup.of(SETTINGS).codes) if line.startswith(b"!L") else 1))
 
 
 def wait_for_bytes(device):
-    """Wait until something lies there that the host could read, and let it lie."""
+    """Wait until the host can read bytes, and leave them unread."""
     port = os.open(device.port, os.O_RDONLY | os.O_NOCTTY)
     assert select.select([port], [], [], TIMEOUT_S)[0]
     os.close(port)
@@ -109,7 +109,7 @@ def is_block(block, counter, words):
     return block.counter == counter and np.array_equal(block.data, words)
 
 
-def taken(sonar, count):
+def receive_blocks(sonar, count):
     return list(itertools.islice(sonar.listen(stop=lambda: False, timeout_s=TIMEOUT_S), count))
 
 
@@ -120,7 +120,7 @@ def refusal(device, *, timeout_s=0.2):
     return caught.value
 
 
-# Opening
+# Opening.
 
 
 def test_driver_opens_a_device(device):
@@ -209,7 +209,7 @@ def test_device_of_another_kind_is_reported():
 
 def test_endlessly_sending_device_is_reported():
     ended = threading.Event()
-    with Fake(obedient) as device:
+    with Fake(answer_correctly) as device:
 
         def talk():
             while not ended.wait(0.01):
@@ -244,7 +244,7 @@ def test_partial_command_left_by_a_crashed_program_is_discarded(device):
     SonarDriver.open("left").close()
 
 
-# Setting up
+# Configuration.
 
 
 def test_driver_sends_the_whole_configuration(device, caplog):
@@ -298,7 +298,7 @@ def test_device_that_falls_silent_is_reported(device):
 def test_missing_answers_name_their_command():
     def forgetful(line, write):
         if not line.startswith((b"!C,21,", b"!L")):
-            obedient(line, write)
+            answer_correctly(line, write)
         elif line.startswith(b"!L"):
             write(encode_answer(0))
 
@@ -307,10 +307,10 @@ def test_missing_answers_name_their_command():
         SonarDriver.open(device.port, timeout_s=0.1) as sonar,
         pytest.raises(SonarError, match=r"does not answer 'sample 31 of the call: \d+' within 0\.1 s"),
     ):
-        sonar.configure(Setup.of(SETTINGS))  # nobody can tell which of sixteen is missing: the last
+        sonar.configure(Setup.of(SETTINGS))  # The missing answer of sixteen is unknown, so the last is named.
 
 
-# Measuring
+# Active measurements.
 
 
 def test_driver_measures_on_command(sonar):
@@ -356,21 +356,21 @@ def test_late_measurement_is_not_taken_for_the_next(sonar, device):
     assert is_block(sonar.measure(), 1, WORDS[1])
     assert is_block(sonar.measure(), 2, WORDS[2])
     n_answers, rest = divmod(sonar.dropped + sonar.receiver.rejected.total() - BLOCK_BYTES, 4)
-    assert (n_answers < 3, rest) == (True, 0)  # those to the counter's command, which was asked again
+    assert (n_answers < 3, rest) == (True, 0)  # Answers to the repeated counter command.
 
 
 @pytest.mark.parametrize("pause_s", [0.0, 0.02])
 def test_delayed_measurement_is_recognised_by_its_number(pause_s):
-    """It is wholly there, but its number tells."""
+    """The delayed measurement is complete, but its number is that of the previous command."""
     asked = []
 
     def slow(line, write):
-        obedient(line, write)
+        answer_correctly(line, write)
         asked.extend([line] * line.startswith(b"!A"))
         if len(asked) == 2:
             asked.append(b"")
             write(encode_block(0, WORDS[0]))
-            time.sleep(pause_s)  # it measures
+            time.sleep(pause_s)  # Time of the measurement.
             write(encode_block(1, WORDS[1]))
 
     with Fake(slow) as device, SonarDriver.open(device.port) as sonar:
@@ -385,7 +385,7 @@ def test_lost_byte_loses_one_measurement():
     counters = itertools.count()
 
     def lossy(line, write):
-        obedient(line, write)
+        answer_correctly(line, write)
         if line.startswith(b"!A"):
             counter = next(counters)
             data = encode_block(counter, WORDS[counter])
@@ -400,11 +400,11 @@ def test_lost_byte_loses_one_measurement():
 
 
 def test_lost_command_does_not_shift_the_numbers():
-    """Each measurement has one of its own, even if the device has not counted."""
+    """The driver sets a number for each measurement, even if the device missed the previous command."""
     counters = []
 
     def deaf_once(line, write):
-        obedient(line, write)
+        answer_correctly(line, write)
         if line.startswith(b"!B"):
             counters.append(int(line.split(b",")[1]))
         elif line.startswith(b"!A") and len(counters) > 1:
@@ -427,17 +427,17 @@ def test_implausible_bits_are_refused():
         assert is_block(sonar.measure(), 1, WORDS[1])
 
 
-# Listening
+# Passive measurements.
 
 
 def test_driver_receives_twenty_pulses_per_second(folder):
-    """All that the device sent is here; on a busy machine it drops what nobody reads in time, and says so."""
+    """The driver receives every measurement sent; on a busy machine the device drops and counts unread ones."""
     log = Log()
     with Emulator(WORDS, link=folder / "right", log=log) as device, SonarDriver.open("right") as sonar:
         sonar.configure(Setup.of(SETTINGS))
         sonar.arm()
         with SyncChain([device], 20.0):
-            blocks = taken(sonar, 20)
+            blocks = receive_blocks(sonar, 20)
         reported = log.lines(blocks[-1].counter + 1)
         sent = [(line["counter"], line["crc32"]) for line in reported if line["fault"] != "dropped"]
         assert [(block.counter, zlib.crc32(block.data)) for block in blocks] == sent
@@ -482,7 +482,7 @@ def test_close_ends_listening_and_disarms_the_trigger(armed, device):
     timer.join()
     with serial.Serial(device.port, timeout=TIMEOUT_S) as port:
         port.write(b"!L,0,0,0\n")
-        assert len(port.read(4)) == 4  # now it has heard what closing said
+        assert len(port.read(4)) == 4  # The device has processed the command sent by closing.
     assert device.registers.armed == 0
     with pytest.raises(SonarError, match="was closed; open it again"):
         armed.disarm()
@@ -496,14 +496,14 @@ def test_listening_without_pulses_ends(armed):
 
 
 def test_listening_needs_no_sent_byte(device):
-    """Somebody else has set the device up; the counter may stand anywhere."""
+    """Another program has configured the device, so its counter may have any value."""
     registers = device.registers
     registers.n_bytes, registers.armed, registers.counter = 4 * N_SAMPLES, 1, 40
     with SonarDriver.open("left", passive=True) as sonar, SyncChain([device], 50.0):
         assert sonar.firmware == ""
         sonar.configure(Setup.of(SETTINGS))
-        counters = [block.counter for block in taken(sonar, 3)]
-        assert 40 <= counters[0] < counters[1] < counters[2]  # a busy machine may drop some
+        counters = [block.counter for block in receive_blocks(sonar, 3)]
+        assert 40 <= counters[0] < counters[1] < counters[2]  # Some may be dropped on a busy machine.
         with pytest.raises(SonarError, match="is open as passive"):
             sonar.measure()
     assert registers.armed == 1
@@ -522,11 +522,11 @@ def test_listening_with_another_record_length_is_reported(device):
 
 
 def test_pause_within_a_measurement_drops_it(monkeypatch):
-    """What began is given up, and the next one is whole."""
+    """The driver discards the partial measurement and receives the next one completely."""
     monkeypatch.setattr("ertis_numba.devices.sonar._MARGIN_S", 0.1)
 
     def stalling(line, write):
-        obedient(line, write)
+        answer_correctly(line, write)
         if line.startswith(b"!J,1"):
             write(encode_block(0, WORDS[0])[:1_000])
 
@@ -553,13 +553,13 @@ def test_operations_out_of_order_are_refused():
             sonar.measure()
         sonar.configure(Setup.of(SETTINGS))
         with pytest.raises(SonarError, match=r"is not armed; call arm\(\) first"):
-            taken(sonar, 1)
+            receive_blocks(sonar, 1)
         sonar.arm()
         with pytest.raises(SonarError, match="is armed, and SYNC pulses trigger it"):
             sonar.measure()
 
 
-# Unplugged
+# Unplugged devices.
 
 
 def test_unplugging_within_a_measurement_is_reported(sonar, device):
@@ -576,22 +576,22 @@ def test_unplugging_within_a_measurement_is_reported(sonar, device):
     device.quirks = Quirks()
     device.replug()
     assert sonar.reconnect(within_s=TIMEOUT_S)
-    assert sonar.port == device.port != first  # that number is taken until the driver lets go of it
+    assert sonar.port == device.port != first  # The old number stays in use until the driver closes it.
     assert is_block(sonar.measure(), 2, WORDS[2])
 
 
 def test_unplugging_while_listening_is_reported(armed, device):
     with SyncChain([device], 50.0):
-        blocks = taken(armed, 3)
+        blocks = receive_blocks(armed, 3)
         device.unplug()
         with pytest.raises(SonarDisconnectedError):
-            blocks += taken(armed, 100)
+            blocks += receive_blocks(armed, 100)
         device.replug()
         before = time.monotonic()
         assert armed.reconnect(within_s=TIMEOUT_S)
-        [back] = taken(armed, 1)
+        [back] = receive_blocks(armed, 1)
     assert time.monotonic() - before < 3
-    # A busy machine may read too late for some, which the device then drops.
+    # On a busy machine the driver may read too late, and the device drops some measurements.
     counters = [block.counter for block in blocks]
     assert counters == sorted(set(counters))
     assert counters[-1] + 1 <= back.counter < counters[-1] + 20
@@ -609,7 +609,7 @@ def test_device_that_does_not_return_is_reported(sonar, device):
 
 
 def test_device_that_reads_nothing_is_reported(monkeypatch):
-    """Its side of the line is full, since it does not read."""
+    """The device does not read, so its input buffer is full."""
     monkeypatch.setattr("ertis_numba.devices.line._WRITE_S", 0.05)
     master, slave = os.openpty()
     tty.setraw(slave)
