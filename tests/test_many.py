@@ -1,4 +1,4 @@
-"""What becomes of many recordings: made, there already, or failed; and what is made is what one recording becomes."""
+"""Campaigns over many recordings: outcome of each, and output equal to that of single recordings."""
 
 import errno
 import json
@@ -47,7 +47,7 @@ def warm(settings):
 
 @pytest.fixture
 def runs(tmp_path, monkeypatch):
-    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")  # what else would differ is when it was made
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")  # otherwise the creation dates would differ
     monkeypatch.chdir(tmp_path)
     write_recordings(tmp_path / "runs")
     return tmp_path / "runs"
@@ -65,7 +65,7 @@ def states(folder):
 def test_files_equal_those_of_single_recordings(runs, out, monkeypatch):
     found, pool = run_here(monkeypatch, [runs], out, CampaignOptions(settings=narrow))
     assert outcomes(found) == dict.fromkeys(["a.h5", "b.h5", "c.h5", "d.h5"], "made")
-    assert [order.about["warm"] for order in pool.given if order.do == "plan"] == [True, False]  # one for each air
+    assert [order.about["warm"] for order in pool.given if order.do == "plan"] == [True, False]  # one per air
     assert found["a.h5"].made["measurements"] == 3
     for name in "abcd":
         single = out / "single.h5"
@@ -88,7 +88,7 @@ def test_single_recording_is_reported_like_many(runs, out, monkeypatch):
     for each in (single, single["sensors"][0], many, many["sensors"][0]):
         assert each.pop("median_ms") > 0
         for measured in ("plan", "verified"):
-            assert isinstance(each.pop(measured), dict)  # times in it differ
+            assert isinstance(each.pop(measured), dict)  # it contains measured times, which differ
     assert single == many
 
 
@@ -209,12 +209,12 @@ def test_unreachable_budget_is_reported_per_recording(runs, out, monkeypatch):
     assert set(outcomes(found).values()) == {"failed"}
     for name, event in found.items():
         assert event.error.startswith(f"{runs / name}: accuracy.max_error_db is -199, but the smallest error")
-    assert [order.do for order in pool.given].count("plan") == 2  # each tried once
+    assert [order.do for order in pool.given].count("plan") == 2  # each is planned once
     assert names_in(out) == []
 
 
 def test_energyscape_files_are_skipped_unless_named(runs, out, monkeypatch):
-    run_here(monkeypatch, [runs / "a.h5"], runs, CampaignOptions(settings=narrow))  # beside the recordings
+    run_here(monkeypatch, [runs / "a.h5"], runs, CampaignOptions(settings=narrow))  # output beside recordings
     found, _ = run_here(monkeypatch, [runs], runs, CampaignOptions(settings=narrow))
     assert found["a.energy.h5"].outcome == "skipped"
     assert outcomes(found)["a.h5"] == "kept"
@@ -253,7 +253,7 @@ def test_memory_and_tasks_are_independent_of_the_number_of_recordings(tmp_path, 
         return result
 
     monkeypatch.setattr("tests.campaigns.follow", watched)
-    for number in range(12):  # each has air of its own, and so a pipeline of its own
+    for number in range(12):  # each has its own air temperature and so its own pipeline
         settings = SMALL.replace(air=Air(temperature_c=float(number)))
         write_recording(tmp_path / f"{number:02}.h5", noise(settings, count=1, seed=number))
     found, pool = run_here(monkeypatch, [tmp_path], out, CampaignOptions(settings=narrow))
@@ -276,7 +276,7 @@ def test_temporary_planning_failure_is_repeated(runs, out, monkeypatch):
     monkeypatch.setattr("tests.campaigns.follow", short_of_memory)
     found, _ = run_here(
         monkeypatch, [runs / "a.h5", runs / "c.h5"], out, CampaignOptions(settings=narrow)
-    )  # in the same air
+    )  # at the same air temperature
     assert outcomes(found) == {"a.h5": "failed", "c.h5": "made"}
     assert found["a.h5"].error == "no memory"
 
@@ -304,7 +304,7 @@ def test_leftovers_are_searched_only_after_a_worker_died(runs, out, monkeypatch)
     (runs / "b.h5").write_bytes(b"no recording")
     found, _ = run_here(monkeypatch, [runs], out, CampaignOptions(settings=narrow))
     assert outcomes(found) == {"a.h5": "made", "b.h5": "failed", "c.h5": "failed", "d.h5": "made"}
-    assert searched[1:-1] == [{"c.energy.h5"}]  # between what is done before all and after it
+    assert searched[1:-1] == [{"c.energy.h5"}]  # between the searches before and after the campaign
 
 
 def test_duplicate_pipeline_of_another_thread_is_closed(monkeypatch):
@@ -328,7 +328,7 @@ def test_duplicate_pipeline_of_another_thread_is_closed(monkeypatch):
 
 
 class Watched(Here):
-    """A crew that notes how many orders it has in hand whenever it gets one, and what it had when it was limited."""
+    """Worker pool that records the number of its tasks at each submission and at each new limit."""
 
     def __init__(self, size):
         super().__init__(size)
@@ -347,7 +347,7 @@ class Watched(Here):
 
 @pytest.mark.parametrize(("workers", "largest"), [(None, 1), (3, 3)])
 def test_gpu_runs_one_task_at_a_time(tmp_path, out, monkeypatch, workers, largest):
-    """However many orders are in hand when it is known to be a GPU: no more come until there are fewer."""
+    """Once a worker reports a GPU, the campaign submits no task until fewer are in progress than the limit."""
 
     def on_a_gpu(*arguments):
         return {name: "cuda" if name == "device" else value for name, value in work.run_task(*arguments).items()}
@@ -363,7 +363,7 @@ def test_gpu_runs_one_task_at_a_time(tmp_path, out, monkeypatch, workers, larges
     assert max(pool.in_hand) == largest
     assert pool.size == largest
     if workers is None:
-        assert pool.limited_at[0] > 1  # so that there is something to wait for
+        assert pool.limited_at[0] > 1  # otherwise the limit would have no effect
 
 
 @pytest.mark.parametrize(

@@ -33,7 +33,7 @@ def place(tmp_path_factory):
 @pytest.fixture(autouse=True)
 def _there(place, monkeypatch):
     monkeypatch.chdir(place)
-    monkeypatch.setattr(Campaign, "_pool", lambda _: Here())  # which takes less to start
+    monkeypatch.setattr(Campaign, "_pool", lambda _: Here())  # starts faster than processes
 
 
 def run(command, code=0):
@@ -43,7 +43,7 @@ def run(command, code=0):
 
 
 def shape(text):
-    """A text without its figures, widths and order of lines."""
+    """Return a text without its numbers, column widths and order of lines."""
     return sorted(re.sub(r"[\d.]+|─+| +", " ", line).strip() for line in text.splitlines() if line.strip())
 
 

@@ -1,4 +1,4 @@
-"""Workers of this machine: they give the same bits, die by themselves, and end when nobody wants them any more."""
+"""Local worker processes: identical output, single failures, and their end with the campaign."""
 
 import json
 import os
@@ -19,7 +19,7 @@ from tests.campaigns import ended, names_in, outcomes, run_here, write_recording
 from tests.files import noise
 
 PATIENCE_S = 60.0
-LONG = 150  # measurements: a recording that is not done at once
+LONG = 150  # measurements; such a recording takes a while to process
 
 
 def narrow(settings):
@@ -42,7 +42,7 @@ def long_runs(runs):
 
 @pytest.fixture
 def crews(monkeypatch):
-    """All that are started."""
+    """Collect all process pools that a test starts."""
     made, begin = [], ProcessPool.__init__
 
     def kept(self, size):
@@ -58,7 +58,7 @@ def contents(folder):
 
 
 def gone(pid):
-    """Whether a process has ended, which may take a moment; one that nobody has waited for has."""
+    """Wait for a process to end, and return ``True`` once it has; zombies count as ended."""
     end_s = time.monotonic() + PATIENCE_S
     while time.monotonic() < end_s:
         try:
@@ -97,7 +97,7 @@ def test_dying_worker_fails_one_recording(long_runs, tmp_path, crews):
 
 
 def test_close_ends_all_work_at_once(long_runs, tmp_path, crews):
-    """However far it is: processes that stand still would never be done with theirs."""
+    """Close must not wait for the current tasks: stopped processes never complete theirs."""
     events = Campaign(
         find_recordings([long_runs]), tmp_path / "out", CampaignOptions(settings=narrow, batch=1), workers=2
     ).run()
@@ -138,7 +138,7 @@ def test_number_of_workers_can_be_reduced():
 
 @pytest.mark.parametrize("size", [1, 2])
 def test_number_of_busy_workers_can_be_reduced(size):
-    """Never more orders in hand than there were, and soon no more than are wanted, by as many processes."""
+    """The numbers of tasks in progress and of processes only fall, until both reach the new size."""
     pool, numbers, in_hand, seen = ProcessPool(3), iter(range(12)), set(), []
     try:
 
@@ -227,7 +227,7 @@ def test_ctrl_c_ends_all_workers(long_runs, tmp_path):
     with started(long_runs, out) as process:
         until_a_part_grows(out)
         workers = children_of(process.pid)
-        for pid in workers:  # which would never be done with what they have
+        for pid in workers:  # stopped workers never complete their tasks
             os.kill(pid, signal.SIGSTOP)
         process.send_signal(signal.SIGINT)
         _, stated = process.communicate(timeout=PATIENCE_S)
