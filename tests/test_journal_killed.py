@@ -1,4 +1,4 @@
-"""Journals of processes that still run, or were killed."""
+"""Journals of running and of killed processes."""
 
 import signal
 import subprocess
@@ -60,7 +60,7 @@ def test_killed_process_holds_no_lock(tmp_path):
 
 @pytest.mark.parametrize("moment", ["file", "file and log", "tables"])
 def test_kill_during_creation_leaves_a_usable_or_no_journal(tmp_path, moment):
-    """What there is then: an empty file; one that has become a database; one with tables and no sensor."""
+    """A kill can leave an empty file, a database without tables, or tables without a sensor."""
     path = tmp_path / "rec.h5.journal"
     if moment == "tables":
         create(tmp_path, []).close()

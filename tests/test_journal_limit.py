@@ -1,4 +1,4 @@
-"""Journals after a failed sync: their logs are written again, and what was not acknowledged is not believed."""
+"""Journals after a failed sync: opening rewrites the log and deletes unacknowledged rows."""
 
 import errno
 import json
@@ -20,7 +20,7 @@ def numbers(journal):
 
 
 def failing_sync(monkeypatch, *, folders):
-    """Have syncs by Python fail, of folders or of files."""
+    """Let the next ``os.fsync`` of a folder or of a file fail."""
     fsync, left = os.fsync, [1]
 
     def fails(descriptor):
@@ -99,7 +99,7 @@ def test_one_flipped_bit_in_a_limit_is_refused_or_harmless(tmp_path):
 
 @pytest.mark.parametrize("moment", ["log", "between"])
 def test_open_writes_the_log_again_and_syncs_it(tmp_path, monkeypatch, moment):
-    """The process before may have ended before its sync, or its sync may have failed."""
+    """The previous process may have ended before its sync, or its sync may have failed."""
     path = crashed(tmp_path, moment=moment)
     synced = set()
     fsync = os.fsync
@@ -122,7 +122,7 @@ def test_open_raises_if_the_log_cannot_be_synced(tmp_path, monkeypatch):
 
 
 def test_append_fails_if_the_folder_of_the_log_cannot_be_synced(tmp_path, monkeypatch):
-    """SQLite syncs the folder of a new log, and ignores an error of that."""
+    """SQLite syncs the folder of a new log but ignores an error of this sync."""
     with create(tmp_path) as journal:
         pass
     more = entries(1, first=20)
@@ -136,7 +136,7 @@ def test_append_fails_if_the_folder_of_the_log_cannot_be_synced(tmp_path, monkey
 
 def test_append_fails_if_the_old_log_may_reappear(tmp_path, monkeypatch):
     with create(tmp_path) as journal:
-        journal._database.use_rollback_journal()  # noqa: SLF001  without 4 MB to commit
+        journal._database.use_rollback_journal()  # noqa: SLF001  a commit of 4 MB would have the same effect
         failing_sync(monkeypatch, folders=True)
         more = entries(1, first=20)
         with pytest.raises(DataError, match="Input/output error"):

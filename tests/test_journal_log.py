@@ -1,4 +1,4 @@
-"""A damaged log of a journal takes no stored measurement away without a word."""
+"""Damaged logs of a journal: every lost measurement is reported."""
 
 import shutil
 
@@ -18,7 +18,7 @@ from tests.journals import EPOCH, TINY, crashed, create, entries, same
 
 FRAME_BYTES = PAGE_BYTES + 24
 COUNT = 12
-LARGE = TINY.replace(recording=Recording(n_samples=65_536))  # of more than a page, which nothing else shares
+LARGE = TINY.replace(recording=Recording(n_samples=65_536))  # rows larger than a page, so each row has pages of its own
 
 
 def log_of(path):
@@ -46,7 +46,7 @@ def stored(path):
 def test_flipped_bit_in_the_log_loses_one_measurement_at_most(tmp_path, place, counted):
     given = entries(COUNT)
     path = crashed(tmp_path, given)
-    if not counted:  # as after a power cut
+    if not counted:  # a power cut leaves no tally
         tally_of(path).unlink()
     flip(log_of(path), int(place * log_of(path).stat().st_size))
     with Journal.open(path) as journal:
@@ -110,7 +110,7 @@ def test_copy_of_a_damaged_log_replaces_no_earlier_copy(tmp_path):
         path = crashed(folder, entries(COUNT, seed=number))
         flip(log_of(path), log_of(path).stat().st_size // 2)
         copies.append(log_of(path).read_bytes())
-        for _ in range(2):  # the same damage is kept once
+        for _ in range(2):  # a second copy of the same damage must not be kept
             for item in folder.iterdir():
                 shutil.copy(item, tmp_path)
             Journal.open(tmp_path / path.name).close()
@@ -125,7 +125,7 @@ def test_copy_of_a_damaged_log_replaces_no_earlier_copy(tmp_path):
 
 
 def test_damaged_last_commit_is_detected_by_the_tally(tmp_path):
-    """After a power cut, it could not be told from one that was torn."""
+    """Without the tally, a damaged last commit looks like a torn one."""
     given = entries(COUNT, settings=LARGE)
     path = crashed(tmp_path, given, settings=LARGE)
     words = given[-1].measurement.data.tobytes()
@@ -178,7 +178,7 @@ def test_damaged_log_header_loses_nothing(tmp_path):
 
 
 def test_torn_end_of_a_log_is_not_damage(tmp_path):
-    """As a power cut leaves it: the last transaction was not synced, and nobody was told of it."""
+    """After a power cut, the last transaction may be torn; it was neither synced nor acknowledged."""
     path = crashed(tmp_path, entries(COUNT))
     tally_of(path).unlink()
     flip(log_of(path), log_of(path).stat().st_size - FRAME_BYTES - 3000)
@@ -189,12 +189,12 @@ def test_torn_end_of_a_log_is_not_damage(tmp_path):
 
 
 def test_remains_of_two_torn_ends_are_not_damage(tmp_path):
-    """Frames of a transaction that was torn earlier lie behind the end and carry the salts of the log."""
+    """Frames of an earlier torn transaction follow the end of the log and carry its salts."""
     path = crashed(tmp_path, entries(COUNT))
     tally_of(path).unlink()
     content = bytearray(log_of(path).read_bytes())
     end = 32 + (read_log(path).n_frames - 3) * FRAME_BYTES
-    content[end + 4 : end + 8] = (9).to_bytes(4, "big")  # a commit of one frame, torn, over one of three
+    content[end + 4 : end + 8] = (9).to_bytes(4, "big")  # a torn commit of one frame overwrites one of three
     content[end + 16] ^= 1
     log_of(path).write_bytes(content)
     log = read_log(path)
@@ -268,7 +268,7 @@ def test_damaged_tally_changes_nothing(tmp_path):
 
 @pytest.mark.parametrize("place", [0.1, 0.3, 0.5, 0.7, 0.9, 0.99])
 def test_flipped_bit_in_a_checkpointed_log_loses_nothing(tmp_path, place):
-    """SQLite would put the old pages before the damage over the new ones in the main file."""
+    """SQLite would overwrite new pages of the main file with the old pages before the damage."""
     killed = tmp_path / "killed"
     killed.mkdir()
     with create(tmp_path, entries(COUNT, settings=LARGE), settings=LARGE) as journal:
@@ -278,16 +278,16 @@ def test_flipped_bit_in_a_checkpointed_log_loses_nothing(tmp_path, place):
     path = killed / "rec.h5.journal"
     flip(log_of(path), int(place * log_of(path).stat().st_size))
     verify(path)
-    (report,) = verify(path)  # the first one has not ruined it
+    (report,) = verify(path)  # the first verification must not change the journal
     assert report.measurements + sum(gap.last - gap.first + 1 for gap in report.gaps) >= COUNT
     assert report.measurements - len(report.damaged) >= COUNT - 1
 
 
 @pytest.mark.parametrize("place", [0.2, 0.4, 0.6])
 def test_damaged_log_keeps_later_pages_of_the_main_file(tmp_path, place):
-    """The log begins after a checkpoint, so its first part lacks pages that only a later commit of it changes.
+    """The log begins after a checkpoint, so its first part lacks the pages that only later commits change.
 
-    Ten rows fill one page and begin the next; the last rows begin a third page, and change the root for it.
+    Ten rows fill one page and begin the next. The last rows begin a third page, which changes the root page.
     """
     given = entries(18)
     killed = tmp_path / "killed"

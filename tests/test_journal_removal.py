@@ -1,4 +1,4 @@
-"""What a journal lets go of: measurements that others hold, or all of it."""
+"""Removal of journals and of acknowledged measurements in them."""
 
 import subprocess
 import sys
@@ -16,11 +16,11 @@ from tests.journals import ENVIRONMENT, EPOCH, both, crashed, create, entries, s
 
 
 def version(path):
-    return int.from_bytes(path.read_bytes()[60:64], "big")  # as SQLite's file format says
+    return int.from_bytes(path.read_bytes()[60:64], "big")  # user version in the header of an SQLite file
 
 
 def test_acknowledged_measurements_can_be_discarded(tmp_path):
-    """Of each sensor by itself, whose rows lie between those of the others."""
+    """Discarding affects one sensor, although its rows lie between rows of other sensors."""
     given = both()
     with create(tmp_path, given) as journal:
         for last, run in ((9, EPOCH), (11, EPOCH), (50, EPOCH + 1)):
@@ -40,7 +40,7 @@ def test_acknowledged_measurements_can_be_discarded(tmp_path):
         assert len(journal) == 4
         assert [same(*pair) for pair in zip(journal.entries(), given[1:], strict=True)] == [True] * 4
         assert [(gap.last, gap.session_id) for gap in journal.gaps] == [(11, EPOCH), (50, EPOCH + 1)]
-        journal.discard("left", EPOCH, 11)  # 12 stays, and the 0 and 1 of the right one before and after it
+        journal.discard("left", EPOCH, 11)  # keeps 12, between 0 and 1 of the right sensor
         assert [key[1:] for key in journal.index()] == [("right", EPOCH, 0), ("left", EPOCH, 12), ("right", EPOCH, 1)]
         assert journal.discard("left", EPOCH, 99) + journal.discard("right", EPOCH, 99) == 3
         journal.append(entries(1, first=100))
@@ -64,7 +64,7 @@ def test_remaining_measurements_are_sealed(tmp_path):
 
 
 def test_discarded_space_is_reused(tmp_path):
-    """What is deleted is not overwritten, and the file does not grow."""
+    """New rows use the space of discarded rows, so the file does not grow."""
     settings = line(32, 32).replace(recording=Recording(n_samples=65_536))
     given = entries(60, settings=settings)
     with create(tmp_path, given[:10], settings=settings) as journal:
@@ -93,7 +93,7 @@ with Journal.open(Path(sys.argv[1])) as journal:
 
 @pytest.mark.parametrize("how", ["log", "once"])
 def test_kill_during_discard_keeps_other_measurements(tmp_path, how):
-    """What was appended and not discarded is there; what was discarded never comes back."""
+    """Appended measurements stay until they are discarded; discarded ones never reappear."""
     create(tmp_path, both()).close()
     path, last = tmp_path / "rec.h5.journal", {"left": 12, "right": 12}
     for _ in range(6):
@@ -124,7 +124,7 @@ def test_kill_during_discard_keeps_other_measurements(tmp_path, how):
 def test_remove_waits_for_the_lock(tmp_path, act):
     with create(tmp_path) as journal:
         thread = threading.Thread(target=act, args=(journal,))
-        with journal._lock:  # noqa: SLF001  as while another thread appends
+        with journal._lock:  # noqa: SLF001  an append of another thread holds this lock
             thread.start()
             thread.join(0.05)
             assert thread.is_alive()
@@ -153,7 +153,7 @@ def test_remove_deletes_all_files(tmp_path, aside, moment):
 
 @pytest.mark.parametrize("act", [Journal.remove, Journal.set_aside])
 def test_close_keeps_files_of_a_newer_journal(tmp_path, monkeypatch, act):
-    """Whoever makes one of the same name while this one is about to be closed has a log of that name."""
+    """A new journal of the same name has a log of the same name, which closing the old one must not delete."""
     with Journal.open(crashed(tmp_path, moment="between")) as journal, monkeypatch.context() as patch:
         journal.append(entries(1, first=20))
         log = tmp_path / "rec.h5.journal-journal"

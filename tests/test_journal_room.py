@@ -1,4 +1,4 @@
-"""Journals on disks that get full."""
+"""Journals on full, small and failing disks."""
 
 import resource
 import shutil
@@ -22,7 +22,7 @@ def test_journal_leaves_enough_space_to_seal(tmp_path, monkeypatch):
                 journal.append(entries(1, first=20))
             assert journal.appendable_bytes() == 0
         assert len(journal) == len(journal.index()) == 3
-        journal.append(entries(1, first=20))  # once there is room
+        journal.append(entries(1, first=20))  # enough space is free again
         assert usage.free / 4 < journal.appendable_bytes() < usage.free / 2
 
 
@@ -59,7 +59,7 @@ with Journal.open(journal.path) as journal:
 
 
 def test_failing_disk_is_reported(tmp_path):
-    """The limit on the size of a file stands for a disk that cannot be written."""
+    """A limit on the file size stands in for a disk that rejects writes."""
     done = subprocess.run(
         [sys.executable, "-c", APPEND, tmp_path, "unguarded"],
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (3_000_000, 3_000_000)),
@@ -76,7 +76,7 @@ def test_failing_disk_is_reported(tmp_path):
 
 @pytest.mark.parametrize("times", [1, 2])
 def test_commit_that_fails_at_its_sync_can_be_repeated(tmp_path, monkeypatch, times):
-    """As when the disk cannot say that the end of a commit has reached it: that can be tried again."""
+    """The sync at the end of a commit may fail although the rows are written; a retry must succeed."""
     more, right = entries(1, first=20), entries(1, sensor="right")
     with create(tmp_path) as journal:
         execute, left = Database.execute, [0]
@@ -113,7 +113,7 @@ exec "$@"
 
 
 def on_a_small_disk(folder, code, *arguments):
-    """Run Python that sees a disk of 20 MB at ``folder``; with namespaces, that needs no rights."""
+    """Run Python code with a disk of 20 MB at ``folder``; user namespaces make this possible without root."""
     unshare = ["unshare", "--user", "--map-root-user", "--mount", "sh", "-c", ON_A_SMALL_DISK, "sh", folder]
     command = [*unshare, sys.executable, "-c", code, folder, *arguments]
     done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, check=False)
@@ -177,7 +177,7 @@ else:
 @pytest.mark.skipif(shutil.which("unshare") is None, reason="only Linux has namespaces")
 @pytest.mark.parametrize("freed", [False, True])
 def test_full_disk_keeps_the_log(tmp_path, freed):
-    """It stays, and is read; only where there is room does it go."""
+    """The journal is read from its log until there is space to merge the log into the main file."""
     number, message = on_a_small_disk(tmp_path, LEFT, *["freed"] * freed)
     assert number == 100
     assert "rec.h5.journal has no room on its disk; free some space: what was committed before is safe" in message

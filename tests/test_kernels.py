@@ -1,4 +1,4 @@
-"""Every kernel of every device against its plain float64 referee, over one table of cases."""
+"""Every kernel of every device against its float64 reference, over one table of cases."""
 
 import inspect
 
@@ -34,7 +34,7 @@ CONTRACTS = {
     "add_paths": _contract.AddPaths,
     "modulate_pdm": _contract.ModulatePdm,
 }
-FLOAT32 = 1e-5  # relative to the largest number that goes in
+FLOAT32 = 1e-5  # relative to the largest input
 
 WORDS = {
     # dtype, samples, words per sample, channels
@@ -96,7 +96,7 @@ def real_noise(*shape, seed=1):
 
 
 def filled(*shape, dtype=np.float32):
-    """An output with garbage in it: a kernel must fill all of it."""
+    """Return an output array full of garbage, because a kernel must write every element."""
     return np.full(shape, 12_345, dtype=dtype)
 
 
@@ -186,7 +186,7 @@ def test_demodulate_words_equals_its_three_parts(kernel_set, name, factor, first
     inside = (places >= 0) & (places < filtered.shape[1])
     expected = np.zeros((len(channels), n_out))
     expected[:, :n_outputs][:, inside] = 0.25 * np.rint(filtered[:, places[inside]])
-    assert (out == expected.astype(np.float32)).all()  # sums of integers: not a bit less
+    assert (out == expected.astype(np.float32)).all()  # sums of integers must be exact
 
 
 @pytest.mark.parametrize("word", [0, 0xFFFF_FFFF])
@@ -272,7 +272,7 @@ def test_delay_and_sum_envelope_int16_equals_its_reference(kernel_set, n_ranges,
     random = np.random.default_rng(1)
     n_tiles = -(-n_ranges // tile_ranges)
     starts = np.arange(n_tiles, dtype=np.int32) * np.int32(tile_ranges)
-    # As large as the sums can bear: all microphones at full scale and in phase.
+    # All microphones at full scale and in phase give the largest possible sums.
     limit, largest = 2 ** int((31 - 0.5 - np.log2(n_mics)) / 2), 2 ** int((31 - 0.5 - np.log2(n_mics)) / 2)
     limit, largest = min(limit, 32_767), min(largest, 32_767)
     tiles = random.integers(-limit, limit, (n_tiles, n_mics, 2, tile_ranges + 4, 2), np.int16, endpoint=True)
@@ -294,11 +294,11 @@ def test_delay_and_sum_envelope_int16_equals_its_reference(kernel_set, n_ranges,
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_nan_and_infinity_affect_only_their_own_outputs(kernel_set, value):
-    """No kernel may be compiled with flags that let NaN and infinities be assumed away."""
+    """Fast-math flags, which assume that there are no NaN and infinities, must not be used for any kernel."""
     signals, offsets, weights, shape = beam_input("small prime" if SIMULATED else "prime")
     signals[3, :, 100] = value
     out = filled(*shape)
-    with np.errstate(invalid="ignore"):  # NumPy also says so
+    with np.errstate(invalid="ignore"):  # the NumPy reference warns about invalid values
         kernel_set.delay_and_sum_envelope(signals, offsets, weights, 0, shape[1], out)
     touched = offsets[:, 3] % signals.shape[2]
     for direction in range(shape[0]):
@@ -309,7 +309,7 @@ def test_nan_and_infinity_affect_only_their_own_outputs(kernel_set, value):
 
 @pytest.mark.parametrize("precision", ["float32", "int16"])
 def test_pipeline_gives_the_same_bits_every_time(precision):
-    """Also where the last tile of ranges is not full."""
+    """The last tile of ranges is only partly filled in this case."""
     if precision == "int16" and not KERNELS["cpu"].tile_ranges:
         pytest.skip("this processor has no 16-bit dot product (AVX-512 VNNI or AVX-VNNI)")
     settings = cases.SHORT.replace(
@@ -337,7 +337,7 @@ def test_kernels_are_independent_of_the_number_of_threads():
 
 
 def add_paths_plainly(call, turns, amplitude, first_bin, nodes_per_bin, out):
-    """The equation of `AddPaths`, bin by bin."""
+    """Evaluate the equation of `AddPaths` bin by bin."""
     n_nodes = amplitude.shape[2]
     for path, mic, k in np.ndindex(*turns.shape, out.shape[1]):
         place = min((first_bin + k) * nodes_per_bin, n_nodes - 1)

@@ -1,4 +1,4 @@
-"""Addresses, keys, the list of those that are let in, and the commands that make them."""
+"""Addresses, keys, allow lists, and the commands that create and change them."""
 
 import contextlib
 import json
@@ -215,11 +215,11 @@ def test_secret_key_is_refused_as_a_public_key(folder):
         public_key(secret)
 
 
-# The list
+# Allow lists
 
 
 def _flipped(path):
-    """Write each bit of a file the other way round, in turn."""
+    """Flip each bit of a file in turn."""
     whole = path.read_bytes()
     for bit in range(8 * len(whole)):
         damaged = bytearray(whole)
@@ -372,7 +372,7 @@ def test_each_role_has_its_permissions(role, sends, receives):
     assert permission.may_receive is receives
 
 
-# The commands
+# Commands
 
 
 def _run(*arguments):
@@ -444,8 +444,8 @@ def test_allow_list_without_a_server_key_is_refused(tmp_path):
         _network.server_keys(None, tmp_path / "allow.toml")
 
 
-def _as_somebody_elses(monkeypatch, path):
-    """Have a file belong to another user."""
+def _give_to_another_user(monkeypatch, path):
+    """Make a file belong to another user."""
     if os.geteuid() == 0:
         os.lchown(path, 12345, -1)
     else:
@@ -455,21 +455,21 @@ def _as_somebody_elses(monkeypatch, path):
 def test_allow_list_of_another_user_is_refused(tmp_path, monkeypatch):
     path = tmp_path / "allow.toml"
     AllowList().allow(_permission()).save(path)
-    _as_somebody_elses(monkeypatch, path)
+    _give_to_another_user(monkeypatch, path)
     with pytest.raises(SettingsError, match=r"other users may change .*\(owned by user \d+\); run 'chown"):
         AllowList.load(path)
 
 
 def test_secret_key_of_another_user_is_refused(tmp_path, monkeypatch):
     secret, _ = PAIR.save(tmp_path / "keys")
-    _as_somebody_elses(monkeypatch, secret)
+    _give_to_another_user(monkeypatch, secret)
     with pytest.raises(SettingsError, match=r"contains a secret, but other users may change .*\(owned by user \d+\)"):
         KeyPair.load(secret)
 
 
 @pytest.mark.parametrize("depth", [1, 2])
 def test_allow_list_linked_through_a_shared_folder_is_refused(tmp_path, depth):
-    """Also where the link leads on to one that leads back to a safe place: somebody may put another there."""
+    """Other users may replace a link in a shared folder, even one that leads back to a private folder."""
     (tmp_path / "open").mkdir()
     (tmp_path / "own").mkdir()
     AllowList().allow(_permission()).save(tmp_path / "open" / "allow.toml")
@@ -495,5 +495,5 @@ def test_allow_list_below_a_shared_folder_is_refused(tmp_path):
     (tmp_path / "a").chmod(0o777)
     with pytest.raises(SettingsError, match=rf"other users may change {tmp_path / 'a'} \(mode 0777\)"):
         AllowList.load(path)
-    (tmp_path / "a").chmod(0o1777)  # as /tmp is: nobody can take away what is another's
+    (tmp_path / "a").chmod(0o1777)  # the sticky bit, as in /tmp, keeps users from replacing files of others
     AllowList.load(path)

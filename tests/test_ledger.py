@@ -1,4 +1,4 @@
-"""The ledger keeps what a folder holds, and a process of its own reads it from recordings."""
+"""Ledger of a folder, and the process that examines recordings for it."""
 
 import json
 import re

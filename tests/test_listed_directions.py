@@ -1,4 +1,4 @@
-"""Directions as an array: processed, stored, read back, sent, and refused if they cannot be used."""
+"""Directions given as an array: processing, storage, messages, and refusal of unusable ones."""
 
 import math
 

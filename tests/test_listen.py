@@ -1,4 +1,4 @@
-"""``ertis listen`` against a publisher: what it prints, what it saves and how it ends."""
+"""Output, saved files and exit of ``ertis listen`` with a publisher."""
 
 import json
 import signal
@@ -26,7 +26,7 @@ def listen(*arguments):
 
 
 def heard(items, *arguments):
-    """Return what a command that ends by itself does."""
+    """Run ``ertis listen`` on published items until it ends by itself, and return its result."""
     with Publisher() as publisher, publisher.playing(items):
         return listen(publisher.address, *arguments)
 
@@ -164,7 +164,7 @@ def test_unanswered_address_is_reported_once(monkeypatch):
 
 
 def test_points_use_the_directions_of_each_image(capsys):
-    """Also where a part of what came before is kept."""
+    """The output keeps part of the previous image, but must not keep its directions."""
     heard, flat = MicrophoneTable(as_json=True, quiet=True), image(1, reflectors=[(0, 1.5, 1)])
     raised = replace(flat, elevation_rad=np.full_like(flat.elevation_rad, np.radians(20.0)))
     for item in (flat, raised):
@@ -236,7 +236,7 @@ def test_listen_refuses_invalid_usage(arguments, match):
 def test_silence_is_reported_once(monkeypatch, capsys, n_received, lines):
     monkeypatch.setattr("ertis_cli._heard._SILENT_S", 0.0)
     heard = MicrophoneTable(as_json=False, quiet=False)
-    heard.silent("tcp://here", ("energyscape",), 0)  # not connected yet, which is reported elsewhere
+    heard.silent("tcp://here", ("energyscape",), 0)  # not connected yet; another message reports this
     heard.subscribed("tcp://here", (), ("energyscape",))
     for _ in range(2):
         heard.silent("tcp://here", ("energyscape",), n_received)

@@ -1,4 +1,4 @@
-"""Verdicts where signals come near full scale, and those of a few scenes of everything."""
+"""Verdicts on effects for signals near full scale, and for a few varied scenes."""
 
 import json
 
@@ -27,7 +27,7 @@ PCM = {
 
 
 def beside_an_emitter(direct_sound_db, kind):
-    """Points of -26 dB before microphones that hear the emitter beside them."""
+    """Return a scene of points at -26 dB and an emitter beside the microphones."""
     sensor = Sensor(array=OCTET, emitter=Emitter(direct_sound_db=direct_sound_db), **kind)
     points = (
         Point(azimuth_deg=-20.0, range_m=0.3, strength_db=-26.0),
@@ -38,7 +38,7 @@ def beside_an_emitter(direct_sound_db, kind):
 
 @pytest.mark.parametrize("kind", [PDM, PCM], ids=["pdm", "pcm"])
 def test_direct_sound_that_overloads_converters_is_simulated(kind):
-    """It is over where the image begins to matter, but not what it does to the converters."""
+    """The direct sound ends before the image begins, but its overload of the converters lasts longer."""
     scene = beside_an_emitter(-20.0, kind)
     plan = make_plan(scene)
     assert "direct_sound" in plan.active
@@ -52,7 +52,7 @@ def test_direct_sound_far_below_full_scale_changes_no_image():
     scene = beside_an_emitter(-75.0, PDM)
     verdict = next(each for each in make_plan(scene).verdicts if each.name == "direct_sound")
     assert verdict.estimate_db < scene.tolerance_db
-    assert verdict.on  # because the scene asks for it
+    assert verdict.on  # the scene requests the effect
 
 
 @pytest.mark.parametrize("noise_dbfs", [None, -30.0])
@@ -68,7 +68,7 @@ def test_signals_stay_below_their_bound(noise_dbfs):
         assert loudest <= 1.05 * peak_bound(snapshot(scene, sensor, 0.0), names)
 
 
-def test_verdicts_of_a_few_scenes_hold():
+def test_verdicts_of_varied_scenes_are_right():
     report = verdicts.run(count=2, say=lambda _: None, first=6)
     assert report["scenes"] == 2
     assert report["verdicts"] > 8
@@ -96,7 +96,7 @@ def test_disc_too_near_for_its_model_is_noted():
     assert make_plan(scene_of(far)).notes == ()
 
 
-def test_loud_means_half_of_full_scale():
+def test_loud_threshold_is_half_of_full_scale():
     assert LOUD == 0.5
     point = Point(range_m=0.5, strength_db=0.0)
     scene = scene_of(point, sensor=SENSOR.replace(emitter=Emitter(level_db=-18.0)))
@@ -104,8 +104,8 @@ def test_loud_means_half_of_full_scale():
     assert bound == pytest.approx(10 ** (-18 / 20) / 0.25, rel=0.1)
 
 
-def test_sensor_without_an_image_leaves_the_others_to_ab_renders():
-    """A window beyond the end of the record gives no image; the other sensor's change is measured all the same."""
+def test_ab_render_measures_change_despite_a_sensor_without_image():
+    """A range window beyond the end of the record gives no image; the other sensor's change is still measured."""
     scene = beside_an_emitter(-75.0, PDM)
     [sensor] = scene.sensors
     beyond = Processing(directions="2d:31", range_m=(5.0, 6.0))
@@ -116,8 +116,8 @@ def test_sensor_without_an_image_leaves_the_others_to_ab_renders():
     assert ABRender(scene.replace(sensors=(blind,))).change_db(0, active, "spreading") is None
 
 
-def test_scenes_in_motion_keep_what_changes_half_of_the_tolerance(monkeypatch):
-    """Of their measurements a few are rendered, and other users may change by more."""
+def test_effect_at_half_of_the_tolerance_is_kept_in_moving_scenes(monkeypatch):
+    """A/B renders cover only a few measurements of a moving scene, and the other measurements may change more."""
     scene = beside_an_emitter(-75.0, PCM).replace(effects={"absorption": False}, count=9)
     moving = scene.replace(points=(*scene.points[1:], scene.points[0].replace(velocity_m_s=(0.5, 0.0, 0.0))))
     monkeypatch.setattr(ABRender, "change_db", lambda *_: 0.07)

@@ -1,4 +1,4 @@
-"""What becomes of many recordings: made, there already, or failed; and what is made is what one recording becomes."""
+"""Campaigns over many recordings: outcome of each, and output equal to that of single recordings."""
 
 import errno
 import json
@@ -47,7 +47,7 @@ def warm(settings):
 
 @pytest.fixture
 def runs(tmp_path, monkeypatch):
-    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")  # what else would differ is when it was made
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")  # otherwise the creation dates would differ
     monkeypatch.chdir(tmp_path)
     write_recordings(tmp_path / "runs")
     return tmp_path / "runs"
@@ -88,7 +88,7 @@ def test_single_recording_is_reported_like_many(runs, out, monkeypatch):
     for each in (single, single["sensors"][0], many, many["sensors"][0]):
         assert each.pop("median_ms") > 0
         for measured in ("plan", "verified"):
-            assert isinstance(each.pop(measured), dict)  # times in it differ
+            assert isinstance(each.pop(measured), dict)  # it contains measured times, which differ
     assert single == many
 
 
@@ -214,7 +214,7 @@ def test_unreachable_budget_is_reported_per_recording(runs, out, monkeypatch):
 
 
 def test_energyscape_files_are_skipped_unless_named(runs, out, monkeypatch):
-    run_here(monkeypatch, [runs / "a.h5"], runs, CampaignOptions(settings=narrow))  # beside the recordings
+    run_here(monkeypatch, [runs / "a.h5"], runs, CampaignOptions(settings=narrow))  # output beside recordings
     found, _ = run_here(monkeypatch, [runs], runs, CampaignOptions(settings=narrow))
     assert found["a.energy.h5"].outcome == "skipped"
     assert outcomes(found)["a.h5"] == "kept"
@@ -276,7 +276,7 @@ def test_temporary_planning_failure_is_repeated(runs, out, monkeypatch):
     monkeypatch.setattr("tests.campaigns.run_task", short_of_memory)
     found, _ = run_here(
         monkeypatch, [runs / "a.h5", runs / "c.h5"], out, CampaignOptions(settings=narrow)
-    )  # in the same air
+    )  # at the same air temperature
     assert outcomes(found) == {"a.h5": "failed", "c.h5": "made"}
     assert found["a.h5"].error == "no memory"
 
@@ -304,7 +304,7 @@ def test_leftovers_are_searched_only_after_a_worker_died(runs, out, monkeypatch)
     (runs / "b.h5").write_bytes(b"no recording")
     found, _ = run_here(monkeypatch, [runs], out, CampaignOptions(settings=narrow))
     assert outcomes(found) == {"a.h5": "made", "b.h5": "failed", "c.h5": "failed", "d.h5": "made"}
-    assert searched[1:-1] == [{"c.energy.h5"}]  # between what is done before all and after it
+    assert searched[1:-1] == [{"c.energy.h5"}]  # between the searches before and after the campaign
 
 
 def test_duplicate_pipeline_of_another_thread_is_closed(monkeypatch):
@@ -363,7 +363,7 @@ def test_gpu_runs_one_task_at_a_time(tmp_path, out, monkeypatch, workers, larges
     assert max(pool.in_hand) == largest
     assert pool.size == largest
     if workers is None:
-        assert pool.limited_at[0] > 1  # so that there is something to wait for
+        assert pool.limited_at[0] > 1  # otherwise the limit would have no effect
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""``ertis bench many`` measures what it says, and times nothing that differs."""
+"""``ertis bench many`` compares all pools, and refuses to time failed or differing output."""
 
 import json
 

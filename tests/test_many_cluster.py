@@ -1,4 +1,4 @@
-"""Many recordings on a real dask cluster of this machine: the same files."""
+"""Campaigns on a local dask cluster write the same files as without one."""
 
 import logging
 import os
@@ -65,7 +65,7 @@ def runs(tmp_path):
 def test_cluster_files_equal_local_files(scheduler, runs, tmp_path, monkeypatch):
     run_here(monkeypatch, [runs], tmp_path / "here", WANTED)
     (runs / "broken.h5").write_bytes(b"broken")
-    monkeypatch.chdir(tmp_path)  # workers are elsewhere
+    monkeypatch.chdir(tmp_path)  # the workers have another current folder
     events = list(Campaign(find_recordings(["runs"]), "out", WANTED, scheduler=scheduler).run())
     found = ended(events)
     assert outcomes(found) == {**dict.fromkeys(["a.h5", "b.h5", "c.h5", "d.h5"], "made"), "broken.h5": "failed"}
@@ -77,7 +77,7 @@ def test_cluster_files_equal_local_files(scheduler, runs, tmp_path, monkeypatch)
     assert set(outcomes(again).values()) == {"kept", "failed"}
 
 
-def test_workers_of_a_cluster_name_recordings_of_another_call(scheduler, tmp_path):
+def test_cluster_workers_report_recordings_with_another_call(scheduler, tmp_path):
     (tmp_path / "runs").mkdir()
     for name, call in {"same": CALL, "other": REVERSED}.items():
         write_recording(tmp_path / "runs" / f"{name}.h5", [heard(call)])
@@ -144,7 +144,7 @@ def test_other_versions_of_workers_are_reported(monkeypatch):
 
 
 class Dwindling:
-    """A client of a cluster that loses a worker whenever somebody counts them, and ends nothing."""
+    """Client of a cluster that loses a worker at each count and never completes a task."""
 
     status = "running"
 
@@ -209,7 +209,7 @@ def test_missing_workers_are_reported(monkeypatch, runs, tmp_path):
 
 
 def test_lost_scheduler_is_reported(runs, tmp_path):
-    for name in "efgh":  # more than can be done before it is gone
+    for name in "efgh":  # more than the cluster can process before it closes
         shutil.copy(runs / "b.h5", runs / f"{name}.h5")
     local = LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0", silence_logs=50)
     events = Campaign(find_recordings([runs]), tmp_path / "out", WANTED, scheduler=local.scheduler_address).run()

@@ -43,7 +43,7 @@ def run(command, code=0):
 
 
 def shape(text):
-    """A text without its figures, widths and order of lines."""
+    """Return a text without its numbers, column widths and order of lines."""
     return sorted(re.sub(r"[\d.]+|─+| +", " ", line).strip() for line in text.splitlines() if line.strip())
 
 

@@ -1,4 +1,4 @@
-"""Workers of this machine: they give the same bits, die by themselves, and end when nobody wants them any more."""
+"""Local worker processes: identical output, single failures, and their end with the campaign."""
 
 import json
 import os
@@ -19,7 +19,7 @@ from tests.campaigns import ended, names_in, outcomes, run_here, write_recording
 from tests.files import noise
 
 PATIENCE_S = 60.0
-LONG = 150  # measurements: a recording that is not done at once
+LONG = 150  # measurements; such a recording takes a while to process
 
 
 def narrow(settings):
@@ -58,7 +58,7 @@ def contents(folder):
 
 
 def gone(pid):
-    """Whether a process has ended, which may take a moment; one that nobody has waited for has."""
+    """Wait for a process to end, and return ``True`` once it has; zombies count as ended."""
     end_s = time.monotonic() + PATIENCE_S
     while time.monotonic() < end_s:
         try:
@@ -227,7 +227,7 @@ def test_ctrl_c_ends_all_workers(long_runs, tmp_path):
     with started(long_runs, out) as process:
         until_a_part_grows(out)
         workers = children_of(process.pid)
-        for pid in workers:  # which would never be done with what they have
+        for pid in workers:  # stopped workers never complete their tasks
             os.kill(pid, signal.SIGSTOP)
         process.send_signal(signal.SIGINT)
         _, stated = process.communicate(timeout=PATIENCE_S)

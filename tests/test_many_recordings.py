@@ -1,4 +1,4 @@
-"""Which recordings are meant by names, folders and patterns, and what is refused before anything is made."""
+"""Search for recordings by name, folder and pattern, and conflicts that are refused before processing."""
 
 import contextlib
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What is there already: damage is noticed, and what is asked of recordings holds for those that are made, too."""
+"""Existing output: detection of damage, and requirements that apply to it as to new output."""
 
 import h5py
 import numpy as np
@@ -21,7 +21,7 @@ def exact(settings):
 
 @pytest.fixture
 def runs(tmp_path, monkeypatch):
-    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")  # what else would differ is when it was made
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")  # otherwise the creation dates would differ
     write_recordings(tmp_path / "runs", names="a")
     return tmp_path / "runs"
 

@@ -1,4 +1,4 @@
-"""The wire format: whatever is encoded is decoded, and whatever else comes is refused in one line."""
+"""Wire format: encoded messages are decoded, and everything else is refused with a one-line error."""
 
 import random
 
@@ -180,7 +180,7 @@ def test_other_messagepack_is_refused(value):
 
 
 def test_malformed_headers_are_refused():
-    """Seed 11: bytes turned, cut, doubled, put in and taken out of good headers, and plain noise."""
+    """Headers have bytes flipped, truncated, inserted, removed or replaced, or are pure noise."""
     random_ = random.Random(11)
     good = [encode(message) for message in _one_of_each()]
     taken = refused = 0
@@ -190,7 +190,7 @@ def test_malformed_headers_are_refused():
             message = decode(header)
         except DataError as error:
             refused += len(str(error).splitlines())
-        else:  # a number that became another is a message still
+        else:  # a header with another number in it is still a message
             taken += 1
             assert decode(encode(message)) == message or "nan" in repr(message)
     assert taken + refused == 10_000
@@ -217,7 +217,7 @@ def _spoiled(random_, header):
 
 
 def _one_of_each():
-    """Each message of the table, with the least that its fields may be."""
+    """Return one message of each kind, with the smallest valid value of each field."""
     return [msgspec.convert({"kind": kind.__struct_config__.tag, **_smallest(kind)}, kind) for kind in KINDS]
 
 
