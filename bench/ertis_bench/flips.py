@@ -1,7 +1,7 @@
-"""Random damage to every kind of file: whatever is lost or changed has to be reported by whoever reads it.
+"""Random damage to every kind of file. Each reader must report all data that is lost or changed.
 
-``python -m ertis_bench.flips STATE FOLDER`` makes files of one kind, prints what it was told to be stored, and ends by
-SIGKILL. The oracle reads recordings by h5py and zlib alone.
+``python -m ertis_bench.flips STATE FOLDER`` makes files of one kind, prints the measurements that were reported as
+stored, and ends by SIGKILL. The reference reader uses only h5py and zlib.
 """
 
 import json
@@ -42,12 +42,12 @@ _BLOCK_BYTES: Final = 512
 _OTHER_AT_EACH_SEALING: Final = {"/@date_created", "/@history"}
 
 Judge = Callable[[Path], str]
-"""Return "harmless", "noticed", "silent" or "crashed" for a damaged copy of a state."""
+"""Function that returns "harmless", "noticed", "silent" or "crashed" for a damaged copy of a state."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Kind:
-    """Files of one kind: the state they belong to, their names, and the share of all tries."""
+    """Files of one kind: their state, their names, and their share of all trials."""
 
     state: str
     pattern: str
@@ -68,12 +68,14 @@ _KINDS: Final = {
 
 
 def flips(folder: Path, *, seed: int, count: int, only: str = "") -> dict[str, Any]:
-    """Damage files ``count`` times: a flipped bit, or one time in ten each, a zeroed block or a lost end.
+    """Damage files ``count`` times.
+
+    One trial in ten zeroes a block, one in ten truncates a file, and the others flip a bit.
 
     Returns
     -------
     dict
-        ``tried``, ``noticed``, ``harmless``, ``silent`` and ``crashed`` in all, and ``kinds`` with the same of each.
+        Totals ``tried``, ``noticed``, ``harmless``, ``silent`` and ``crashed``. ``kinds`` has the same counts per kind.
     """
     rng = random.Random(seed)  # noqa: S311  nothing is secret
     kinds: dict[str, dict[str, int]] = {}
@@ -104,7 +106,7 @@ _VERDICTS: Final = ("noticed", "harmless", "silent", "crashed")
 
 
 def _damage(path: Path, rng: random.Random) -> str:
-    """Damage a file, and return how."""
+    """Damage a file, and return a description of the damage."""
     content = bytearray(path.read_bytes())
     place = rng.randrange(len(content))
     how = rng.random()
@@ -119,7 +121,7 @@ def _damage(path: Path, rng: random.Random) -> str:
 
 
 def _judged(read: Callable[[], tuple[object, bool]], wanted: object) -> str:
-    """Classify the content that was read, with the errors that were reported."""
+    """Classify the content that was read, together with the errors that were reported."""
     try:
         found, reported = read()
     except ErtisError as error:
@@ -136,13 +138,13 @@ def _judged(read: Callable[[], tuple[object, bool]], wanted: object) -> str:
 
 
 def _made(state: str, folder: Path) -> list[list[Any]]:
-    """Have a process create a state and kill it; return the values that it reported."""
+    """Create a state in a process that is then killed, and return the values that it reported."""
     folder.mkdir()
     command = [sys.executable, "-m", "ertis_bench.flips", state, str(folder)]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)  # noqa: S603
     if done.returncode != -signal.SIGKILL:
-        raise RuntimeError(f"the process that makes {state} ended with {done.returncode}: {done.stderr[-500:]}")
+        raise RuntimeError(f"process that makes {state!r} ended with {done.returncode}: {done.stderr[-500:]}")
     return [json.loads(line) for line in done.stdout.splitlines()]
 
 
@@ -156,7 +158,7 @@ def _journal(state: str) -> Callable[[Path], Judge]:
         seal(whole / f"rec.h5{SUFFIX}")
         wanted = _content(whole / "rec.h5")
         if shown != _measured(whole / "rec.h5"):
-            raise RuntimeError(f"without damage, a journal ({state}) is not what was told")
+            raise RuntimeError(f"undamaged journal ({state}) differs from the reported measurements")
 
         def read(work: Path) -> tuple[object, bool]:
             sealed = seal(work / f"rec.h5{SUFFIX}")
@@ -201,7 +203,7 @@ def _spool(folder: Path) -> Judge:
                 else:
                     found.add((run.sensor.name, item.first, zlib.crc32(entry.measurement.data.tobytes())))
         spool.close()
-        # Discarded measurements may come back: the central node recognises them.
+        # Discarded measurements may come back, because the central node recognises them.
         return found >= shown, bool(notes) or is_gap
 
     return lambda work: _judged(lambda: read(work), wanted=True)
@@ -215,7 +217,7 @@ def _ledger(folder: Path) -> Judge:
     def read(work: Path) -> tuple[object, bool]:
         ledger = Ledger(work)
         if any(last > whole.acked_through.get(run, -1) for run, last in ledger.acked_through.items()):
-            return None, False  # measurements to come would be thrown away, whatever is reported
+            return None, False  # The spool would discard later measurements, whatever it reports.
         return (ledger.acked_through, ledger.open, ledger.unsealed, ledger.gaps), bool(ledger.damage)
 
     return lambda work: _judged(lambda: read(work), wanted)
@@ -242,11 +244,11 @@ _STATES: Final[dict[str, Callable[[Path], Judge]]] = {
 }
 
 
-# The oracle
+# Reference reader
 
 
 def _measured(path: Path) -> set[tuple[str, int, int]]:
-    """Return sensor, number and CRC-32 of the words of all measurements of a recording."""
+    """Return sensor, sequence number and CRC-32 of the words of all measurements in a recording."""
     with h5py.File(path) as file:
         return {
             (name, int(number), zlib.crc32(np.ascontiguousarray(words).tobytes()))
@@ -298,9 +300,9 @@ def _emit_event(entries: list[JournalEntry]) -> None:
 
 
 def _begin_another_commit(journal: Journal) -> None:
-    """Change pages that a rollback journal brings back."""
+    """Change pages that a rollback journal restores."""
     execute = journal._database.execute  # noqa: SLF001  nobody else can be killed in mid commit
-    execute("PRAGMA cache_size = 1")  # what does not fit is written before the commit
+    execute("PRAGMA cache_size = 1")  # Pages that exceed the cache are written before the commit.
     execute("BEGIN")
     execute("UPDATE measurements SET crc32 = 0 WHERE id % 9 = 1")
     for number in range(60):
