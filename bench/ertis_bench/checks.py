@@ -34,8 +34,8 @@ def require_exact(image: Energyscape, measurement: Measurement, *, max_error_db:
     error_db = 20 * math.log10(float(difference / np.linalg.norm(expected)))
     if not error_db <= max_error_db:
         raise DataError(
-            f"image of {len(image.amplitude)} directions has an error of {error_db:.1f} dB relative to the exact image; "
-            f"the limit is {max_error_db:g} dB. Its time is not reported, because the result is wrong"
+            f"image of {len(image.amplitude)} directions has an error of {error_db:.1f} dB relative to the exact "
+            f"image; the limit is {max_error_db:g} dB. Its time is not reported, because the result is wrong"
         )
     return error_db
 

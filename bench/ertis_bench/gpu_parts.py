@@ -228,8 +228,8 @@ def _checked(plain: Pipeline, recorded: Pipeline, measurement: Measurement) -> d
     wanted_db = _SAME_DB if plain.settings.accuracy.precision == "float32" else _SAME_16_DB
     if not difference_db <= wanted_db:
         raise DataError(
-            f"image of {len(image.amplitude)} directions on 'cuda' differs from that on 'cpu' by {difference_db:.1f} dB; "
-            f"the limit is {wanted_db:g} dB. Its time is not reported, because the result is wrong"
+            f"image of {len(image.amplitude)} directions on 'cuda' differs from that on 'cpu' by {difference_db:.1f} "
+            f"dB; the limit is {wanted_db:g} dB. Its time is not reported, because the result is wrong"
         )
     return {"error_db": round(error_db, 1), "off_cpu_db": round(difference_db, 1)}
 

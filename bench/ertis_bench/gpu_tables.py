@@ -1,4 +1,4 @@
-"""The report of `gpu` as Markdown."""
+"""Markdown report of `gpu`."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -16,7 +16,7 @@ _PAPER = f"the paper's {_PUBLISHED.removeprefix('GPU ')}"
 
 
 def gpu(report: dict[str, Any]) -> str:
-    """Return all that was measured on a GPU; that nothing was, where the report is empty."""
+    """Return all measurements on a GPU, or a note that there are none if the report is empty."""
     if not report:
         return f"{_times(_lines({}))}\n\n{_NO_RESULTS}"
     parts = [_stages(report), _rivals(report), _reached(report), _verdicts(report), _machine(report)]
@@ -24,7 +24,7 @@ def gpu(report: dict[str, Any]) -> str:
 
 
 def gpu_short(report: dict[str, Any]) -> str:
-    """Return the times of the paper's grids, launched and one at a time, in a stream, and the paper's."""
+    """Return the times of single measurements and streams for the paper's direction grids, with the paper's times."""
     if not report:
         return "No GPU has run the kernels yet: they are simulated and compiled, and nothing is measured."
     lines = _lines(report)
@@ -39,7 +39,7 @@ def _rows(report: dict[str, Any], part: str) -> list[dict[str, Any]]:
 
 
 def _lines(report: dict[str, Any]) -> dict[str, list[str]]:
-    """Return the times of a measurement by grid; a grid that was not measured says so."""
+    """Return the times per measurement by direction grid. Grids without a measurement are marked."""
     rows = {row["directions"]: row for row in _rows(report, "paper")}
     lines: dict[str, list[str]] = {
         _ONE_AT_A_TIME: [],
@@ -130,7 +130,7 @@ def _reached(report: dict[str, Any]) -> str:
 
 
 def _verdicts(report: dict[str, Any]) -> str:
-    """Return the result of each part, failures included."""
+    """Return the result of each part, including failures."""
     lines = []
     for name, part in report["parts"].items():
         reported = [part["status"]]

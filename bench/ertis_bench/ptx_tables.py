@@ -1,4 +1,4 @@
-"""The report of `ptx` as Markdown."""
+"""Markdown report of `ptx`."""
 
 from typing import Any
 

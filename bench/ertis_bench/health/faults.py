@@ -1,4 +1,4 @@
-"""Table of faults: how each is put into a healthy recording, and the scene in which a single recording shows it."""
+"""Table of faults, with the injection of each into a healthy recording, and the scene in which a recording shows it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -24,22 +24,22 @@ _Change = Callable[[NDArray[Any], np.random.Generator], NDArray[Any]]
 
 @dataclass(frozen=True, slots=True)
 class ArrayFault:
-    """A fault that can be put into a recording.
+    """Fault that can be injected into a recording.
 
     Attributes
     ----------
     inject : callable
-        Returns new words and the faulty channels; none where the whole record is faulty.
+        Returns new words and the faulty channels. The channels are empty if the whole record is faulty.
     names : tuple of str
-        Faults of the report that count as named.
+        Faults of the report that count as correct.
     scene : str
-        ``one echo`` or ``direct sound``; the scene that shows it best.
+        ``one echo`` or ``direct sound``, the scene that shows the fault best.
     observable : bool
-        A single recording of that scene shows it.
+        True if a single recording of that scene shows the fault.
     why : str
-        Reason, or the condition.
+        Condition, or the reason why the fault is not observable.
     encodings : tuple of bool
-        PDM or not.
+        True for PDM, False for PCM.
     """
 
     inject: Callable[[Base, np.random.Generator], _Injected]
@@ -63,7 +63,7 @@ def _column(base: Base, channel: int) -> NDArray[Any]:
 
 
 def _with(base: Base, columns: dict[int, NDArray[Any]], words: NDArray[Any] | None = None) -> NDArray[Any]:
-    """Return the words with other samples in some channels."""
+    """Return a copy of the words with other samples in some channels."""
     words = (base.measurement.data if words is None else words).copy()
     for channel, column in columns.items():
         if base.sensor.recording.is_pdm:
@@ -75,7 +75,7 @@ def _with(base: Base, columns: dict[int, NDArray[Any]], words: NDArray[Any] | No
 
 
 def _converted(base: Base, signal: NDArray[np.float64], rng: np.random.Generator) -> NDArray[Any]:
-    """Return the samples that one microphone makes of a signal."""
+    """Return the samples that one microphone produces for a signal."""
     electronics, recording = base.sensor.electronics, base.sensor.recording
     rms = 10 ** ((electronics.noise_dbfs or -300.0) / 20)
     if not recording.is_pdm:
@@ -92,7 +92,7 @@ def _converted(base: Base, signal: NDArray[np.float64], rng: np.random.Generator
 
 
 def _signal(change: Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]) -> _Injection:
-    """Return the injection that changes the signal of one channel, a function of signal and time."""
+    """Return an injection that changes the signal of one channel, by a function of signal and time."""
 
     def inject(base: Base, rng: np.random.Generator) -> _Injected:
         channel = int(rng.integers(len(base.signals)))
@@ -103,7 +103,7 @@ def _signal(change: Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray
 
 
 def _samples(change: _Change) -> _Injection:
-    """Return the injection that changes the samples of one channel."""
+    """Return an injection that changes the samples of one channel."""
 
     def inject(base: Base, rng: np.random.Generator) -> _Injected:
         channel = int(rng.integers(len(base.signals)))
@@ -113,7 +113,7 @@ def _samples(change: _Change) -> _Injection:
 
 
 def _ordered(source: NDArray[np.intp]) -> _Injection:
-    """Return the injection that gives each channel the samples of another."""
+    """Return an injection that permutes the channels."""
 
     def inject(base: Base, _: np.random.Generator) -> _Injected:
         columns = {to: _column(base, int(origin)) for to, origin in enumerate(source) if to != origin}
@@ -123,7 +123,7 @@ def _ordered(source: NDArray[np.intp]) -> _Injection:
 
 
 def _rows(change: _Change) -> _Injection:
-    """Return the injection that changes all words alike."""
+    """Return an injection that changes all words."""
 
     def inject(base: Base, rng: np.random.Generator) -> _Injected:
         return change(base.measurement.data, rng), ()
@@ -189,14 +189,18 @@ def _late(delay_s: float) -> _Injection:
 
 
 def _swapped(*, apart: bool) -> _Injection:
-    """Return the injection that swaps two microphones whose delays differ by more than microphones may, or by less."""
+    """Return an injection that swaps two microphones.
+
+    Their delays differ by more than the tolerance between microphones if ``apart``, otherwise by as little as possible.
+    """
 
     def inject(base: Base, rng: np.random.Generator) -> _Injected:
         delay_s = base.echo_s()
         one = int(rng.integers(len(delay_s)))
         differ_s = np.abs(delay_s - delay_s[one])
         fitting = np.flatnonzero(differ_s > _APART_S) if apart else np.argsort(differ_s)[1:2]
-        if not len(fitting):  # in the middle of the array: the one at its end is far from it
+        # A microphone in the middle of the array may have no partner. The farthest microphone replaces it.
+        if not len(fitting):
             fitting = np.argsort(differ_s)[-1:]
         other = int(rng.choice(fitting))
         return _with(base, {one: _column(base, other), other: _column(base, one)}), (one, other)
@@ -205,7 +209,7 @@ def _swapped(*, apart: bool) -> _Injection:
 
 
 def _of_layout(base: Base, rng: np.random.Generator) -> _Injected:
-    """Return the channels of an eRTIS_v2 in the order of an eRTIS_v3D1, or the other way round."""
+    """Return the channels of an eRTIS_v2 in the order of an eRTIS_v3D1, or vice versa."""
     names = ("eRTIS_v2", "eRTIS_v3D1")
     own = base.sensor.array.layout
     other = names[1 - names.index(own)]
@@ -315,4 +319,4 @@ FAULTS = {
         _crosstalk, ("late", "gain"), observable=False, why="a sound of two arrivals looks the same"
     ),
 }
-"""Every kind of fault by its name."""
+"""All kinds of faults by name."""

@@ -1,4 +1,4 @@
-"""Report of the campaign as Markdown."""
+"""Markdown report of the health checks' trials."""
 
 from typing import Any
 
