@@ -25,8 +25,8 @@ from ertis_numba.storage import open_energyscapes, open_recording, write_recordi
 __all__ = ["many", "run"]
 
 _MEASUREMENTS: Final = 20  # per recording
-# A fixed session keeps files byte-identical; otherwise they would depend on the time of their creation.
-_SESSION_ID: Final = "1700000000"
+# Fixed creation time of all files, without which their bytes would differ.
+_CREATED_S: Final = "1700000000"
 
 
 def run(*, count: int, rounds: int, say: Callable[[str], None]) -> dict[str, Any]:
@@ -46,7 +46,7 @@ def run(*, count: int, rounds: int, say: Callable[[str], None]) -> dict[str, Any
         A recording failed, an image is wrong, or files differ.
     """
     before = os.environ.get("SOURCE_DATE_EPOCH")
-    os.environ["SOURCE_DATE_EPOCH"] = _SESSION_ID
+    os.environ["SOURCE_DATE_EPOCH"] = _CREATED_S
     try:
         with tempfile.TemporaryDirectory(prefix="ertis-") as place, ExitStack() as stack:
             say(f"writing {count} recordings")

@@ -1,4 +1,7 @@
-"""Recordings that commands must refuse: links, foreign data, rows that are not there, odd types, endless settings."""
+"""Recordings that commands must refuse.
+
+They contain links, foreign data, missing rows, unexpected types and excessive settings.
+"""
 
 import shutil
 from collections.abc import Callable, Iterator
@@ -31,15 +34,15 @@ _ROWS: Final = 10**8
 
 @dataclass(frozen=True, slots=True)
 class HostileFile:
-    """A recording that is spoiled.
+    """Recording with a defect.
 
     Attributes
     ----------
     name : str
     spoil : callable
-        Called with the open file and its path, a copy of a good one.
+        Adds the defect. Called with the open file, which is a copy of a valid one, and its path.
     harmless_to : tuple of str
-        Commands that may take it, as they read none of it.
+        Commands that may accept the file, because they do not read the defect.
     """
 
     name: str
@@ -47,14 +50,14 @@ class HostileFile:
     harmless_to: tuple[str, ...] = ()
 
     def make(self, good: Path, path: Path) -> None:
-        """Write it."""
+        """Write the file."""
         shutil.copy(good, path)
         with h5py.File(path, "r+", libver=("v110", "v110")) as file:
             self.spoil(file, path)
 
 
 def write_good(path: Path) -> Path:
-    """Write a recording of three measurements that nothing is wrong with."""
+    """Write a valid recording of three measurements."""
     rng = np.random.default_rng(1)
     words = rng.integers(0, 2**32, (3, 32_768), dtype=np.uint32)
     stamps = [
@@ -64,7 +67,7 @@ def write_good(path: Path) -> Path:
 
 
 def hostile_files() -> Iterator[HostileFile]:
-    """Yield all of them, those of one kind one after the other."""
+    """Yield all hostile files, grouped by kind."""
     for name in _READ:
         yield from _links(name)
         yield from _elsewhere(name)
@@ -76,7 +79,7 @@ def hostile_files() -> Iterator[HostileFile]:
     yield from _attributes()
     yield from _names()
     for name, text in hostile_texts():
-        if text.strip(b"\0"):  # HDF5 fills texts up with zeros
+        if text.strip(b"\0"):  # HDF5 pads strings with zeros.
             yield HostileFile(f"settings: {name}", _settings(text))
 
 
@@ -93,7 +96,7 @@ def _replace(file: h5py.File, name: str, data: Any, **options: Any) -> h5py.Data
 
 
 def _move(file: h5py.File, name: str, put: Callable[[str], Any]) -> None:
-    """Move a variable out of the way, and put something in its place."""
+    """Rename a variable, and put another object in its place."""
     file.move(f"{_GROUP}/{name}", "moved")
     file[f"{_GROUP}/{name}"] = put("/moved")
 
@@ -295,7 +298,7 @@ def _names() -> Iterator[HostileFile]:
         return lambda file, _: file.move(_GROUP, f"sensors/{name}")
 
     def shared(file: h5py.File, _: Path) -> None:
-        """Hold the same rows under many names, each of which takes as long to read."""
+        """Store the same rows under many names. Each name takes the full time to read."""
         for number in range(200):
             made = file.create_group(f"sensors/s{number}")
             for name, dataset in file[_GROUP].items():

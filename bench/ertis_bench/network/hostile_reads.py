@@ -1,7 +1,6 @@
 """Commands that read hostile files, each in a forked process: ``python -m ertis_bench.network.hostile_reads FOLDER``.
 
-A process that has loaded all that commands need is forked for each of them, so that time and memory are those of the
-command alone.
+The parent has imported all modules. Time and memory of each fork are therefore those of the command alone.
 """
 
 import argparse
@@ -36,7 +35,7 @@ class _Read(NamedTuple):
 
 
 def main() -> None:
-    """Try the files and print the results as JSON."""
+    """Try the files, and print the results as JSON."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--count", type=int)
@@ -56,11 +55,14 @@ def main() -> None:
 
 
 def _warm(good: Path, folder: Path) -> None:
-    """Check that the good file is accepted; lazily loaded modules stay out of the parent."""
+    """Check that the commands accept the valid file.
+
+    The check runs in forks, so that lazily imported modules stay out of the parent.
+    """
     for command in ("verify", "info"):
         read = _read(command, good, folder)
         if read.code:
-            raise SystemExit(f"ertis {command} of the file that is sound ended with {read.code}: {read.stated}")
+            raise SystemExit(f"ertis {command} of the valid file ended with {read.code}: {read.stated}")
 
 
 def _reads(each: HostileFile, good: Path, folder: Path, floor: dict[str, _Read]) -> list[dict[str, Any]]:
@@ -86,7 +88,7 @@ def _reads(each: HostileFile, good: Path, folder: Path, floor: dict[str, _Read])
 
 
 def _read(command: str, path: Path, folder: Path) -> _Read:
-    """Run a command on a file in a process of its own."""
+    """Run a command on a file in a forked process."""
     stated, out = folder / "said.txt", folder / "image.h5"
     out.unlink(missing_ok=True)
     arguments = ["ertis", command, str(path), *(["-o", str(out), "--quiet"] if command == "process" else [])]
@@ -109,7 +111,7 @@ def _read(command: str, path: Path, folder: Path) -> _Read:
 
 
 def _become(arguments: list[str], stated: Path) -> None:
-    """Run a command in this process, and end it."""
+    """Run a command in this process, and exit."""
     code = 70
     try:
         signal.signal(signal.SIGALRM, signal.SIG_DFL)

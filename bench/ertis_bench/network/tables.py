@@ -1,4 +1,4 @@
-"""The reports of `faults` and `figures` as Markdown."""
+"""Markdown reports of `faults` and `figures`."""
 
 from collections.abc import Mapping
 from typing import Any, Final
@@ -160,7 +160,10 @@ def network_faults(report: dict[str, Any]) -> str:
 
 
 def row(name: str, found: Mapping[str, Any] | None) -> tuple[str, str, str]:
-    """Return trials, limits and results of one part; None if it could not be tried."""
+    """Return the trials, limits and results of one part.
+
+    ``found`` is None if the part could not be tried.
+    """
     tried, wanted, became = ROWS[name]
     if found is None:
         return tried.partition(",")[0].partition("{")[0].rstrip(), wanted, _NOT_HERE
