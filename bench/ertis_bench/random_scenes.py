@@ -1,4 +1,4 @@
-"""Random scenes of some of everything, from far too weak to matter to strong."""
+"""Random scenes with many kinds of objects and effects, from negligible to strong."""
 
 import math
 from typing import Any
@@ -21,7 +21,7 @@ OCTET = Array(
 
 
 class _Dice:
-    """Seeded draws."""
+    """Seeded random draws."""
 
     def __init__(self, seed: int) -> None:
         self.random = np.random.default_rng(seed)
@@ -44,7 +44,10 @@ class _Dice:
 
 
 def random_scene(seed: int) -> Scene:
-    """Return a scene of one measurement, near and with few microphones; most overload no modulator."""
+    """Return a scene of one measurement at short range, with few microphones.
+
+    Few of the scenes overload a modulator.
+    """
     dice = _Dice(seed)
     points = tuple(_point(dice) for _ in range(dice.random.integers(1, 4)))
     spheres = (_sphere(dice),) if dice.chance(0.3) else ()
@@ -139,7 +142,10 @@ def _sensor(dice: _Dice) -> Sensor:
 
 
 def varied_scene(seed: int) -> Scene:
-    """Return a scene that also moves, rings, drifts, overloads, and differs in calls, windows and converters."""
+    """Return a scene that can also contain motion, ringing, clock drift and overload.
+
+    Calls, windows and converters vary, too.
+    """
     scene, dice = random_scene(seed), _Dice(seed + 2**32)
     sensors = [_varied(dice, sensor) for sensor in scene.sensors]
     while len(sensors) < 3 and dice.chance(0.3):

@@ -1,4 +1,4 @@
-"""The report of `reliability` as Markdown."""
+"""Markdown report of `reliability`."""
 
 from typing import Any
 

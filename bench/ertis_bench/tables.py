@@ -1,4 +1,4 @@
-"""Reports as Markdown, and where they go."""
+"""Reports as Markdown, and their places in files."""
 
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
@@ -57,7 +57,7 @@ def update(path: Path, name: str, text: str) -> None:
     Raises
     ------
     ArgumentError
-        The file cannot be read, or the markers are not in it.
+        The file cannot be read, or does not contain the markers.
     """
     head, tail = around(path, name)
     path.write_text(f"{head}\n{text.strip()}\n{tail}", encoding="utf-8")
@@ -69,7 +69,7 @@ def around(path: Path, name: str) -> tuple[str, str]:
     Raises
     ------
     ArgumentError
-        As in `update`; so a file can be refused before anything is measured for it.
+        As in `update`. Callers can therefore refuse a file before they measure.
     """
     begin, end = f"<!-- ertis bench {name} -->", f"<!-- /ertis bench {name} -->"
     try:
@@ -84,9 +84,9 @@ def around(path: Path, name: str) -> tuple[str, str]:
 
 
 def place(path: Path, command: str, parts: Sequence[str] = ()) -> tuple[str, str]:
-    """Return the form of a command's table that a file has markers for, and the name in these markers.
+    """Return the form of a command's table for which a file has markers, and the name in these markers.
 
-    Some parts of a benchmark have markers of their own, ``ertis bench NAME --only PART``, so that they never replace
+    Selected parts of a benchmark have their own markers, ``ertis bench NAME --only PART``, so that they never replace
     the table of all parts.
 
     Raises
@@ -154,7 +154,7 @@ def _conditions(report: dict[str, Any]) -> str:
 
 
 def accuracy(report: dict[str, Any]) -> str:
-    """Return all plans of each subject, and how they were measured."""
+    """Return all plans of each subject, and the conditions of the measurement."""
     head = [
         "error, dB",
         "predicted, dB",
@@ -184,7 +184,7 @@ def accuracy(report: dict[str, Any]) -> str:
 
 
 def accuracy_front(report: dict[str, Any]) -> str:
-    """Return the plans that no other one beats, and the paper's method."""
+    """Return the plans on the Pareto front, and the paper's method."""
     parts = []
     for name, rows, paper_ms in _subjects(report):
         cells = [
@@ -260,7 +260,7 @@ def scaling(report: dict[str, Any]) -> str:
 
 
 def simulation(report: dict[str, Any]) -> str:
-    """Return the duration of a measurement with some effects and with all, and the cost of each effect."""
+    """Return the times of a measurement with the relevant effects and with all effects, and the cost of each effect."""
     needed, everything = report["rows"]
     rows = [
         [row["effects"], f"{len(row['on'])}", _spread(**row), f"{1e3 / row['median_ms']:.1f}"]
@@ -282,7 +282,7 @@ def simulation(report: dict[str, Any]) -> str:
 
 
 def factorisation(report: dict[str, Any]) -> str:
-    """Return products per place: summed directly, from nodes of the whole array, and from those of its parts."""
+    """Return products per bin for direct sums, a beam grid of the whole array, and beam grids of its parts."""
     parts = list(report["rows"][0]["parts"])
     head = ["microphones", "directions", "no beam grid", "beam grid of the whole array"]
     head += [f"of {n} sub-arrays" for n in parts[1:]]
@@ -348,4 +348,4 @@ FORMS: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
     "budgets": {"budgets": budgets},
     "points": {"points": points},
 }
-"""What each command writes between which markers: a file chooses a form by the marker that it has."""
+"""Forms of the table of each command, by the name in the markers. The markers of a file select the form."""

@@ -1,4 +1,4 @@
-"""`ertis process --verify` against a slow referee, over random settings of every kind."""
+"""Comparison of `ertis process --verify` with a slow reference, over random settings of every kind."""
 
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -19,9 +19,9 @@ from ertis_numba.settings import Settings
 __all__ = ["MAX_DIFFERENCE_DB", "compared", "form", "run"]
 
 MAX_DIFFERENCE_DB = 1.0
-"""Largest difference of verified and true errors that is not reported as wrong."""
+"""Largest difference between verified and true errors that is not reported as wrong."""
 
-_FLOOR_DB = -100.0  # below, single precision is most of the error
+_FLOOR_DB = -100.0  # Below this level, rounding in single precision dominates the error.
 _SHORT_CALL_S = 5e-4
 
 _GROUPS: dict[str, Callable[[Settings], bool]] = {
@@ -46,9 +46,9 @@ def run(*, count: int, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
     ----------
     count : int
     seed : int
-        Seed of the first setting; the others have the seeds after it.
+        Seed of the first setting. Later settings use the following seeds.
     say : callable
-        Called with lines about what happens.
+        Called with a line of progress.
     """
     rows = []
     for each in range(seed, seed + count):
@@ -88,7 +88,7 @@ def form(report: dict[str, Any]) -> str:
 
 
 def _image(measurement: Measurement) -> Energyscape:
-    """Return the image by the plan for the drawn budget, or by the best plan for any error where none keeps it."""
+    """Return the image with the plan for the drawn budget, or with the most accurate plan if none keeps the budget."""
     try:
         pipeline = Pipeline(measurement.settings, "cpu", 1)
     except ArgumentError:

@@ -103,7 +103,7 @@ def _refused(address: str, given: Sequence[HostileHello]) -> list[Found]:
 
 
 def _slowest_ms(diary: Path, begin_ns: int, end_ns: int) -> float:
-    """Return the slowest acknowledgement, in ms, of measurements that arrived between two times of the monotonic clock."""
+    """Return the slowest acknowledgement of measurements that arrived between two monotonic times, in ms."""
     sent = read_diaries([diary])
     times_ns = [
         acked_ns - sent.arrived_ns[key]

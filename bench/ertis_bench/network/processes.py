@@ -48,7 +48,7 @@ class JsonLinesProcess:
         paths = os.pathsep.join(filter(None, sys.path))
         environment = os.environ | {"PYTHONPATH": paths, _MARK: mark or secrets.token_hex(4)}
         self.events: list[Event] = []
-        self._reported_names = stated
+        self._stderr_path = stated
         self._news = threading.Condition()
         with stated.open("ab") as stderr:
             self._process = subprocess.Popen(  # noqa: S603  this very package
@@ -94,9 +94,7 @@ class JsonLinesProcess:
                 if ended or not self._news.wait(min(0.5, max(0.0, end_s - time.monotonic()))):
                     if not ended and time.monotonic() < end_s:
                         continue
-                    raise DataError(
-                        f"event {name!r} of {self._reported_names.stem} did not arrive; {self.last_words()}"
-                    )
+                    raise DataError(f"event {name!r} of {self._stderr_path.stem} did not arrive; {self.last_words()}")
 
     def last_words(self) -> str:
         """Return the state of the process, and the last line of its stderr."""
@@ -104,8 +102,9 @@ class JsonLinesProcess:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._process.wait(1.0)
         code = self._process.poll()
-        stated = self._reported_names.read_text(errors="replace").strip().splitlines()
-        return f"the process {'runs' if code is None else f'ended with {code}'}; its last line is {stated[-1] if stated else ''!r}"
+        lines = self._stderr_path.read_text(errors="replace").strip().splitlines()
+        state = "runs" if code is None else f"ended with {code}"
+        return f"the process {state}; the last line of its stderr is {lines[-1] if lines else ''!r}"
 
     def ends_within(self, time_s: float) -> bool:
         """Wait for some time, and return True if the process has ended."""
@@ -140,7 +139,7 @@ class JsonLinesProcess:
         try:
             code = self._process.wait(timeout_s)
         except subprocess.TimeoutExpired as error:
-            raise DataError(f"{self._reported_names.stem} does not end within {timeout_s:g} s") from error
+            raise DataError(f"{self._stderr_path.stem} does not end within {timeout_s:g} s") from error
         self._listener.join(timeout_s)
         return code
 

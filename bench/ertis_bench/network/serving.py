@@ -57,7 +57,7 @@ class Serve:
 
     Attributes
     ----------
-    node : Process
+    node : JsonLinesProcess
     listen, publish : str
     mark : str
     unbalanced : int
