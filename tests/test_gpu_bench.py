@@ -110,7 +110,7 @@ def test_without_a_gpu_it_is_told_in_a_line_and_nothing_is_written(tmp_path):
 
 def test_simulator_is_refused(tmp_path, monkeypatch):
     monkeypatch.setenv("NUMBA_ENABLE_CUDASIM", "1")
-    with pytest.raises(DeviceError, match="is simulated here, and its times tell nothing; unset NUMBA_ENABLE_CUDASIM"):
+    with pytest.raises(DeviceError, match="is simulated here, so its times are meaningless; unset NUMBA"):
         gpu.run(results=tmp_path / "results", say=lambda _: None)
 
 
@@ -137,7 +137,7 @@ def test_newest_results_make_the_tables_without_a_gpu(report, tmp_path):
     text = full.read_text("utf-8")
     for line in (
         "| one at a time, words to image | not measured | 0.516 | not measured |",
-        "| times faster than that | – | 100× | – |",
+        "| paper's time / shortest single time | – | 100× | – |",
         "| upload | 0.0200 |",
         "| PyTorch: not installed |  | – | – | – | – |",
         "| CuPy: host to host | 90 | 9.000 | 0.500 | 18.0× | -130 |",
@@ -169,7 +169,7 @@ def test_without_results_tables_say_not_measured(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "results", [{}, {"parts": {}}, {"parts": {"paper": {"status": "not done after 9 s", "rows": []}}}]
+    "results", [{}, {"parts": {}}, {"parts": {"paper": {"status": "not finished after 9 s", "rows": []}}}]
 )
 def test_tables_are_made_of_whatever_parts_there_are(report, results):
     found = report[0] | results if results else report[0]

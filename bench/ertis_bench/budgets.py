@@ -209,12 +209,20 @@ def _words(random: np.random.Generator, settings: Settings, scene: str) -> NDArr
 
 def form(report: dict[str, Any]) -> str:
     """Return the report as Markdown."""
-    header = ["settings", "tried", "budget kept", "exceeded, warned", "exceeded in silence", "warned in vain"]
+    header = [
+        "settings",
+        "tried",
+        "budget kept",
+        "exceeded, warned",
+        "exceeded without a warning",
+        "unnecessary warning",
+    ]
     return (
         f"{table(header, list(_lines(report['rows'])))}\n\n{report['count']} random settings from seed "
-        f"{report['seed']}; {report['refused']} others have no plan for their budget, or a silent image. Errors are "
-        f"relative to the independent float64 image: in up to {_DIRECTIONS} directions for delay-and-sum, bright ones "
-        "more often, and in all directions for adaptive beamformers. "
+        f"{report['seed']}. {report['refused']} other settings were skipped, because they have no plan for their "
+        "budget or a silent image. Errors are relative to the independent float64 image. They cover all directions for "
+        f"adaptive beamformers, and up to {_DIRECTIONS} directions for delay-and-sum, chosen with a preference for "
+        "bright ones. "
         f"{sentence(report['machine'])}"
     )
 

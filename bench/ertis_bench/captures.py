@@ -180,7 +180,7 @@ def emulated(source: Path, folder: Path, *options: str) -> Iterator[list[str]]:
             assert process.stdout is not None  # noqa: S101  it is a pipe
             lines = [process.stdout.readline() for _ in range(n_sensors)]
             if not all(lines):
-                raise DataError(f"ertis emulate {source} ended with {process.wait(_WAIT_S)}; see what it said above")
+                raise DataError(f"ertis emulate {source} ended with {process.wait(_WAIT_S)}; see its output above")
             yield [json.loads(line)["link"] for line in lines]
         finally:
             process.send_signal(signal.SIGTERM)

@@ -131,7 +131,7 @@ LOOPS: Final = {
     "delay_and_sum_envelope.fill": _TERMS,
     "delay_and_sum.fill": _TERMS,
     "interpolated_beams_envelope.interpolate": Loop(
-        of="pair of nodes",
+        of="pair of grid points",
         passes=lambda given: int(given["n_pairs"]),
         loads=10,
         lines=2 + 8 * 2,

@@ -176,7 +176,7 @@ def _row(name: str, times_s: dict[str, list[tuple[float, float]]]) -> dict[str, 
 def many(report: dict[str, Any]) -> str:
     """Return the times and ratios, and the conditions of the measurement."""
     each = report["recordings"] * report["measurements"]
-    head = ["processed by", "s", "times faster", "without the start, s", "times faster", "measurements/s"]
+    head = ["configuration", "time, s", "speed-up", "time without the start, s", "speed-up", "measurements/s"]
     rows = [
         [
             row["crew"],
@@ -190,10 +190,11 @@ def many(report: dict[str, Any]) -> str:
     ]
     conditions = (
         f"{report['recordings']} recordings of {report['measurements']} measurements of {report['source']}, "
-        f"{report['bytes'] / 1e6:.0f} MB in all, each measurement a little later in its record than the one before. "
-        f"Medians of {report['rounds']} rounds, in which all take turns; ratios are to the first line, round by round. "
-        "Included: starting processes, reading and checking, planning, images, writing them and reading them back. "
-        "The start is what comes before the first recording is begun; that of the LocalCluster itself is in neither. "
-        "The files of all lines were equal, byte by byte, and an image was checked against the exact one."
+        f"{report['bytes'] / 1e6:.0f} MB in total. Each measurement is a little later in its record than the one "
+        f"before. Times are medians of {report['rounds']} rounds, in which the configurations take turns. Each ratio "
+        "is relative to the first line in the same round. Times include starting processes, reading and checking, "
+        "planning, computing images, writing them and reading them back. The start is the time before the first "
+        "recording is begun. Neither time includes the start of the LocalCluster itself. The files of all "
+        "configurations were equal, byte by byte, and an image was compared with the exact one."
     )
     return "\n\n".join([_table(head, rows), f"Measured on {sentence(report['machine'])}", conditions])

@@ -163,9 +163,10 @@ def form(report: dict[str, Any]) -> str:
     ]
     deviation = 100 * math.sqrt(0.6827 * 0.3173 / report["count"])
     return (
-        f"{table(header, lines)}\n\nPoints within one standard deviation along the range, and across; in parentheses "
-        f"the largest errors in standard deviations. Each cell has {report['count']} points, from seed "
-        f"{report['seed']}, so chance alone moves a value by {deviation:.0f} points. {sentence(report['machine'])}"
+        f"{table(header, lines)}\n\nShares of points within one standard deviation, along range / across it; in "
+        f"parentheses, the largest errors in standard deviations. Each cell has {report['count']} points, from seed "
+        f"{report['seed']}, so the standard deviation of a share is {deviation:.0f} percentage points. "
+        f"{sentence(report['machine'])}"
     )
 
 

@@ -250,7 +250,7 @@ def scaling(report: dict[str, Any]) -> str:
         f"{report['count']} measurements per line, device `cpu`, white noise, the lines of a table in turns of "
         f"{timing.BURST}. Other values are 1850 directions, 0.5–5 m, 32 microphones and all threads. Each line has "
         "the default plan for its settings. If a precision is named, every direction is summed without a beam grid, "
-        "with one sample per microphone. A batch is a number of measurements at a time, and its time is that of each. "
+        "with one sample per microphone. A batch contains several measurements, and the time is that of one of them. "
         "Every image was compared with the exact one before it was timed; "
         "warm-up calls of a fifth of a second are excluded. "
         "Limits are the best of as many runs, over arrays of 64 MiB and in "
@@ -300,7 +300,7 @@ def _scene_conditions(report: dict[str, Any]) -> str:
         "microphones, ten points in free field, and in the same scene a second sensor, walls, a sphere, a disc, "
         "motion, tones, noise, another sonar and unequal microphones, all too weak to matter. Times include everything "
         "from the scene to the words in memory. They exclude the choice of the effects, compilation, and warm-up "
-        f"calls. The images of both differ by {report['change_db']:.2g} dB at the most. `propagation` counts "
+        f"calls. The images of both differ by at most {report['change_db']:.2g} dB. `propagation` counts "
         "the transforms that all echoes share."
     )
 
@@ -318,8 +318,8 @@ def _reached(
     return (
         f"Delay-and-sum with envelope in {precision} takes {us_per_direction:.2f} µs per direction (the slope over "
         f"directions; the rest of the chain takes {rest_of_chain_ms:.2f} ms). That is {gop_s:.0f} Gop/s, "
-        f"{100 * of_arithmetic:.0f} % of what the arithmetic alone does here. Its images are written at "
-        f"{written_gb_s:.2f} GB/s, {100 * of_copy:.0f} % of what a copy writes."
+        f"{100 * of_arithmetic:.0f} % of the rate of the arithmetic alone. Its images are written at "
+        f"{written_gb_s:.2f} GB/s, {100 * of_copy:.0f} % of the rate of a copy."
     )
 
 

@@ -78,11 +78,11 @@ def compared(seed: int) -> dict[str, Any]:
 
 def form(report: dict[str, Any]) -> str:
     """Return the report as Markdown."""
-    header = ["settings", "tried", "errors above -100 dB", "more than 1 dB off", "largest difference"]
+    header = ["settings", "tried", "errors above -100 dB", "more than 1 dB apart", "largest difference"]
     lines = list(_lines(report["rows"]))
     return (
-        f"{table(header, lines)}\n\n{report['count']} random settings from seed {report['seed']}. Verified: by "
-        "`--verify`. True: by a float64 referee that sums bin by bin, in all directions and ranges. "
+        f"{table(header, lines)}\n\n{report['count']} random settings from seed {report['seed']}. Verified errors "
+        "come from `--verify`. True errors come from a separate float64 reference, in all directions and ranges. "
         f"{sentence(report['machine'])}"
     )
 

@@ -259,7 +259,7 @@ def _alternating(x: NDArray[Any], _: np.random.Generator) -> NDArray[Any]:
     return (np.arange(len(x)) % 2).astype(x.dtype)
 
 
-_ECHO = "a compact arrival from aside"
+_ECHO = "a compact arrival from the side"
 _BITS = (True,)
 _TWISTED = np.arange(32).reshape(4, 8)
 
@@ -271,17 +271,20 @@ FAULTS = {
     "intermittent contact": ArrayFault(_samples(_intermittent), ("stuck at times",)),
     "white bits, unconnected": ArrayFault(_samples(_white), ("white bits", "noisy")),
     "noise +20 dB": ArrayFault(_noisier(20.0), ("noisy", "white bits", "flipped bits")),
-    "noise +10 dB": ArrayFault(_noisier(10.0), ("noisy",), why="where microphones' noise, not echoes, is the floor"),
-    "gain +10 dB": ArrayFault(_amplified(10.0), ("gain",), why="sound that stands out of the noise by 9 dB"),
-    "gain -10 dB": ArrayFault(_amplified(-10.0), ("gain", "dead"), why="sound that stands out of the noise by 9 dB"),
-    "gain +6 dB": ArrayFault(_amplified(6.0), ("gain",), why="an echo; gains that spread by 0.5 dB"),
-    "gain -6 dB": ArrayFault(_amplified(-6.0), ("gain",), why="an echo; gains that spread by 0.5 dB"),
+    "noise +10 dB": ArrayFault(_noisier(10.0), ("noisy",), why="a noise floor of the microphones, not of echoes"),
+    "gain +10 dB": ArrayFault(_amplified(10.0), ("gain",), why="a sound at least 9 dB above the noise"),
+    "gain -10 dB": ArrayFault(_amplified(-10.0), ("gain", "dead"), why="a sound at least 9 dB above the noise"),
+    "gain +6 dB": ArrayFault(_amplified(6.0), ("gain",), why="an echo, and a gain spread of 0.5 dB"),
+    "gain -6 dB": ArrayFault(_amplified(-6.0), ("gain",), why="an echo, and a gain spread of 0.5 dB"),
     "inverted polarity": ArrayFault(_samples(_inverted), ("inverted polarity",), why="a compact arrival"),
     "two channels swapped": ArrayFault(
-        _swapped(apart=True), ("swapped",), why="an echo that reaches them 25 µs apart or more"
+        _swapped(apart=True), ("swapped",), why="an echo that reaches both at least 25 µs apart"
     ),
     "two channels swapped of nearly equal delay": ArrayFault(
-        _swapped(apart=False), ("swapped",), observable=False, why="delays differ by less than microphones may"
+        _swapped(apart=False),
+        ("swapped",),
+        observable=False,
+        why="the delay difference is below the tolerance of microphones",
     ),
     "order reversed": ArrayFault(_ordered(np.arange(32)[::-1]), ("order of channels",), why=_ECHO),
     "bits reversed in each byte": ArrayFault(_ordered(_TWISTED[:, ::-1].ravel()), ("order of channels",), why=_ECHO),
@@ -297,7 +300,10 @@ FAULTS = {
     ),
     "repeated block": ArrayFault(_rows(_repeated), ("repeated blocks",)),
     "50 words dropped": ArrayFault(
-        _rows(_dropped), ("shifted record",), observable=False, why="all channels alike; echoes merely come sooner"
+        _rows(_dropped),
+        ("shifted record",),
+        observable=False,
+        why="all channels are equal, and echoes only arrive earlier",
     ),
     "shifted by 1.1 ms": ArrayFault(_shifted, ("shifted record",), scene="direct sound", why="a direct sound"),
     "overload": ArrayFault(_signal(lambda x, t: x + 1.5 * np.sin(2.5e5 * t) * (t < 4e-3)), ("saturated",)),
@@ -307,16 +313,16 @@ FAULTS = {
     "half of the channels missing": ArrayFault(_half_missing, ("stuck at",)),
     "late by 50 µs": ArrayFault(_late(50e-6), ("late",), why="a compact arrival"),
     "late by 1 sample of PDM": ArrayFault(
-        _late(1 / 4.5e6), ("late",), observable=False, why="0.2 µs, less than microphones differ"
+        _late(1 / 4.5e6), ("late",), observable=False, why="0.2 µs, below the tolerance of microphones"
     ),
     "late by 10 samples of PDM": ArrayFault(
-        _late(10 / 4.5e6), ("late",), observable=False, why="2.2 µs, less than microphones differ"
+        _late(10 / 4.5e6), ("late",), observable=False, why="2.2 µs, below the tolerance of microphones"
     ),
     "bytes of numbers swapped": ArrayFault(
         _rows(lambda w, _: w.byteswap()), ("order of bytes",), encodings=(False,), why="any scene of 16-bit numbers"
     ),
     "crosstalk of -6 dB": ArrayFault(
-        _crosstalk, ("late", "gain"), observable=False, why="a sound of two arrivals looks the same"
+        _crosstalk, ("late", "gain"), observable=False, why="not distinguishable from a sound with two arrivals"
     ),
 }
 """All kinds of faults by name."""
