@@ -44,9 +44,9 @@ def sustained(source: Path, folder: Path, *, duration_s: float, rate_hz: float) 
     """Capture from one sensor that pulses trigger, and report losses and processor time."""
     target = folder / "sustained.h5"
     with emulated(source, folder, "--sync-rate", f"{rate_hz:g}") as ports:
-        lines = _captured(ports, target, "--trigger", "sync", "--duration", f"{duration_s:g}")
+        lines = _capture(ports, target, "--trigger", "sync", "--duration", f"{duration_s:g}")
     final = lines[-1]
-    found = _checked(target, lines[:-1], sent_by_emulators(folder))
+    found = _compare(target, lines[:-1], sent_by_emulators(folder))
     return {
         "seconds": duration_s,
         "rate_hz": rate_hz,
@@ -62,9 +62,9 @@ def chain(source: Path, folder: Path, *, n_groups: int, rate_hz: float) -> Line:
     """Capture from several sensors in one SYNC chain, and count complete and mixed groups."""
     target = folder / "chain.h5"
     with emulated(source, folder, "--sync-rate", f"{rate_hz:g}") as ports:
-        lines = _captured(ports, target, "--trigger", "sync", "-n", str(n_groups))
+        lines = _capture(ports, target, "--trigger", "sync", "-n", str(n_groups))
     sent = sent_by_emulators(folder)
-    found = _checked(target, lines[:-1], sent)
+    found = _compare(target, lines[:-1], sent)
     indices: dict[int, list[int]] = defaultdict(list)
     for (sensor, _), (check, sync_count) in found["rows"].items():
         indices[sync_count].append(sent[sensor, check])
@@ -90,8 +90,8 @@ def unplugs(source: Path, folder: Path, *, seed: int, count: int) -> Line:
         moments += ["--unplug", f"{at_s:.3f}:{away_s:.3f}"]
         at_s += away_s + 2.5
     with emulated(source, folder, "--sync-rate", "20", *moments) as ports:
-        lines = _captured(ports, target, "--trigger", "sync", "--duration", f"{at_s:.1f}")
-    found = _checked(target, lines[:-1], sent_by_emulators(folder))
+        lines = _capture(ports, target, "--trigger", "sync", "--duration", f"{at_s:.1f}")
+    found = _compare(target, lines[:-1], sent_by_emulators(folder))
     back_s = [line["away_s"] for line in lines if line["event"] == "back"]
     events = [json.loads(line) for line in (folder / "sent.ndjson").read_text().splitlines()]
     plugged_ns = [event["time_ns"] for event in events if event.get("event") == "plugged in"]
@@ -120,13 +120,13 @@ def kills(source: Path, folder: Path, *, seed: int, count: int) -> Line:
     with emulated(source, folder) as ports:
         for number in range(count):
             target = folder / f"killed-{number}.h5"
-            lines = _killed(ports, target, after_s=random_.uniform(0.0, 1.2), moments=moments)
+            lines = _capture_until_killed(ports, target, after_s=random_.uniform(0.0, 1.2), moments=moments)
             _recover(folder)
             if not target.exists():
                 unreadable += bool(lines)
                 continue
             try:
-                found = _checked(target, lines, sent_by_emulators(folder))
+                found = _compare(target, lines, sent_by_emulators(folder))
             except DataError:
                 unreadable += 1
                 continue
@@ -154,7 +154,7 @@ def disk_full(source: Path, folder: Path, disk: Path) -> Line:
     lines = [json.loads(line) for line in done.stdout.splitlines()]
     stored = [line for line in lines if line["event"] == "stored"]
     ertis("recover", str(disk), "--quiet")
-    found = _checked(target, stored, sent_by_emulators(folder))
+    found = _compare(target, stored, sent_by_emulators(folder))
     return {
         "exit code": done.returncode,
         "said": done.stderr.strip().splitlines()[-1].replace(str(disk), "DISK"),
@@ -197,7 +197,7 @@ def ertis(*arguments: str) -> "subprocess.CompletedProcess[str]":
     return subprocess.run(command, capture_output=True, text=True, check=False, timeout=_SEALED_S)  # noqa: S603
 
 
-def _captured(ports: list[str], target: Path, *options: str) -> list[Line]:
+def _capture(ports: list[str], target: Path, *options: str) -> list[Line]:
     """Run a capture until it ends, and return all lines that it printed."""
     done = ertis("capture", *_ports(ports), "-o", str(target), "--json", "--quiet", *options)
     if done.returncode:
@@ -205,7 +205,7 @@ def _captured(ports: list[str], target: Path, *options: str) -> list[Line]:
     return [json.loads(line) for line in done.stdout.splitlines()]
 
 
-def _killed(ports: list[str], target: Path, *, after_s: float, moments: Counter[str]) -> list[Line]:
+def _capture_until_killed(ports: list[str], target: Path, *, after_s: float, moments: Counter[str]) -> list[Line]:
     """Start a capture, kill it some time after its first line, and return its output.
 
     A sealing process that the capture has started continues.
@@ -239,7 +239,7 @@ def sent_by_emulators(folder: Path) -> dict[tuple[str, int], int]:
     return {(each["name"], each["crc32"]): each["index"] for each in entries if "crc32" in each}
 
 
-def _checked(target: Path, reported: list[Line], sent: dict[tuple[str, int], int]) -> Line:
+def _compare(target: Path, reported: list[Line], sent: dict[tuple[str, int], int]) -> Line:
     """Read a recording and compare it with the reported and the sent measurements.
 
     Returns

@@ -12,7 +12,7 @@ from ertis_numba.verification import ExactImage
 __all__ = ["MAX_ERROR_DB", "require_exact", "require_same_reflector"]
 
 MAX_ERROR_DB = -30.0
-_DIRECTIONS = 5  # compared with the exact image, spread over the grid
+_N_DIRECTIONS = 5  # compared with the exact image, spread over the grid
 _NEAR_RAD = math.radians(5)
 _NEAR_M = 0.01
 _SAME_LEVEL_DB = 1.5
@@ -26,7 +26,7 @@ def require_exact(image: Energyscape, measurement: Measurement, *, max_error_db:
     DataError
         The error exceeds ``max_error_db``.
     """
-    chosen = np.unique(np.linspace(0, len(image.amplitude) - 1, _DIRECTIONS + 2).astype(int)[1:-1])
+    chosen = np.unique(np.linspace(0, len(image.amplitude) - 1, _N_DIRECTIONS + 2).astype(int)[1:-1])
     exact = ExactImage(image, measurement)
     ranges = np.arange(image.amplitude.shape[1])
     expected = np.stack([exact.amplitudes(direction, ranges) for direction in chosen.tolist()])

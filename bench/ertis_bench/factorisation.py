@@ -45,7 +45,7 @@ def run(*, say: Callable[[str], None]) -> dict[str, Any]:
                 "microphones": n_mics,
                 "directions": len(grid),
                 "direct": n_mics * _DELAY_TAPS * _COMPLEX,
-                "parts": {str(n): _fewest(settings, _cut(positions_m, n), units) for n in _PARTS},
+                "parts": {str(n): _fewest_products(settings, _sub_arrays(positions_m, n), units) for n in _PARTS},
             }
         )
     return {"error_db": _ERROR_DB, "delay_taps": _DELAY_TAPS, "rows": rows}
@@ -59,7 +59,7 @@ def _array(settings: Settings, n_mics: int) -> NDArray[np.float64]:
     return np.random.default_rng(1).uniform(-half_m, half_m, (n_mics, 3))
 
 
-def _cut(positions_m: NDArray[np.float64], n_parts: int) -> list[NDArray[np.float64]]:
+def _sub_arrays(positions_m: NDArray[np.float64], n_parts: int) -> list[NDArray[np.float64]]:
     """Return sub-arrays with equal numbers of microphones, cut across the longer side."""
     parts = [positions_m]
     while len(parts) < n_parts:
@@ -73,7 +73,7 @@ def _halves(part_m: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:
     yield part_m[order[len(order) // 2 :]]
 
 
-def _fewest(settings: Settings, parts: list[NDArray[np.float64]], units: NDArray[np.float64]) -> int | None:
+def _fewest_products(settings: Settings, parts: list[NDArray[np.float64]], units: NDArray[np.float64]) -> int | None:
     """Return the smallest number of products per bin that keeps the error, or None if no beam grid does."""
     counts = []
     for n_taps, densities in _NODES.items():

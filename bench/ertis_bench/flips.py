@@ -120,7 +120,7 @@ def _damage(path: Path, rng: random.Random) -> str:
     return f"{path.name}, {'block' if how < 0.1 else 'end' if how < 0.2 else 'bit'} at {place}"
 
 
-def _judged(read: Callable[[], tuple[object, bool]], wanted: object) -> str:
+def _classify(read: Callable[[], tuple[object, bool]], wanted: object) -> str:
     """Classify the content that was read, together with the errors that were reported."""
     try:
         found, reported = read()
@@ -137,7 +137,7 @@ def _judged(read: Callable[[], tuple[object, bool]], wanted: object) -> str:
 # States
 
 
-def _made(state: str, folder: Path) -> list[list[Any]]:
+def _make_state(state: str, folder: Path) -> list[list[Any]]:
     """Create a state in a process that is then killed, and return the values that it reported."""
     folder.mkdir()
     command = [sys.executable, "-m", "ertis_bench.flips", state, str(folder)]
@@ -153,7 +153,7 @@ def _journal(state: str) -> Callable[[Path], Judge]:
         from ertis_numba.storage.sealing import seal  # noqa: PLC0415  the processes to be killed do without HDF5
         from ertis_numba.storage.verify import verify  # noqa: PLC0415
 
-        shown = {tuple(each) for each in _made(state, folder)}
+        shown = {tuple(each) for each in _make_state(state, folder)}
         whole = shutil.copytree(folder, folder.with_name(f"{state}-whole"))
         seal(whole / f"rec.h5{SUFFIX}")
         wanted = _content(whole / "rec.h5")
@@ -167,7 +167,7 @@ def _journal(state: str) -> Callable[[Path], Judge]:
             reported = bool(sealed.remark) or not all(report.is_intact for report in verify(sealed.recording))
             return _content(sealed.recording), reported
 
-        return lambda work: _judged(lambda: read(work), wanted)
+        return lambda work: _classify(lambda: read(work), wanted)
 
     return make
 
@@ -176,7 +176,7 @@ def _recording(folder: Path) -> Judge:
     from ertis_numba.storage.sealing import seal  # noqa: PLC0415
     from ertis_numba.storage.verify import verify  # noqa: PLC0415
 
-    _made("young", folder)
+    _make_state("young", folder)
     seal(folder / f"rec.h5{SUFFIX}")
     wanted = _content(folder / "rec.h5")
 
@@ -184,11 +184,11 @@ def _recording(folder: Path) -> Judge:
         reported = not all(report.is_intact for report in verify(work / "rec.h5"))
         return (None if reported else _content(work / "rec.h5")), reported
 
-    return lambda work: _judged(lambda: read(work), wanted)
+    return lambda work: _classify(lambda: read(work), wanted)
 
 
 def _spool(folder: Path) -> Judge:
-    shown = {tuple(each) for each in _made("spool", folder)}
+    shown = {tuple(each) for each in _make_state("spool", folder)}
 
     def read(work: Path) -> tuple[object, bool]:
         notes: list[str] = []
@@ -206,11 +206,11 @@ def _spool(folder: Path) -> Judge:
         # Discarded measurements may come back, because the central node recognises them.
         return found >= shown, bool(notes) or is_gap
 
-    return lambda work: _judged(lambda: read(work), wanted=True)
+    return lambda work: _classify(lambda: read(work), wanted=True)
 
 
 def _ledger(folder: Path) -> Judge:
-    _made("ledger", folder)
+    _make_state("ledger", folder)
     whole = Ledger(folder)
     wanted = (whole.acked_through, whole.open, whole.unsealed, whole.gaps)
 
@@ -220,11 +220,11 @@ def _ledger(folder: Path) -> Judge:
             return None, False  # The spool would discard later measurements, whatever it reports.
         return (ledger.acked_through, ledger.open, ledger.unsealed, ledger.gaps), bool(ledger.damage)
 
-    return lambda work: _judged(lambda: read(work), wanted)
+    return lambda work: _classify(lambda: read(work), wanted)
 
 
 def _keys(folder: Path) -> Judge:
-    _made("keys", folder)
+    _make_state("keys", folder)
 
     def read(work: Path) -> tuple[object, bool]:
         work.chmod(0o700)
@@ -232,7 +232,7 @@ def _keys(folder: Path) -> Judge:
         return (pair, public_key(work / "robot.public.toml"), AllowList.load(work / "allow.toml")), False
 
     wanted, _ = read(folder)
-    return lambda work: _judged(lambda: read(work), wanted)
+    return lambda work: _classify(lambda: read(work), wanted)
 
 
 _STATES: Final[dict[str, Callable[[Path], Judge]]] = {
@@ -309,7 +309,7 @@ def _begin_another_commit(journal: Journal) -> None:
         execute(insert_statement("measurements"), (1, _SESSION_ID, 10_000 + number, *[0] * 9, bytes(8192)))
 
 
-def _live(state: str, folder: Path) -> None:
+def _make_files(state: str, folder: Path) -> None:
     """Make the files of a state."""
     if state in {"young", "grown", "large"}:
         journal = Journal.create(folder / f"rec.h5{SUFFIX}", target="rec.h5", source="flips")
@@ -354,5 +354,5 @@ def _live(state: str, folder: Path) -> None:
 
 if __name__ == "__main__":
     with suppress(BrokenPipeError):
-        _live(sys.argv[1], Path(sys.argv[2]))
+        _make_files(sys.argv[1], Path(sys.argv[2]))
     os.kill(os.getpid(), signal.SIGKILL)

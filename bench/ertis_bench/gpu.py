@@ -59,7 +59,7 @@ _TESTED = (
     "tests/test_modulator.py",
     "tests/cuda",
 )
-_SANITIZED = "cuda and (demodulate or fold or delay_and_sum or quantise or interpolated)"  # selects tests by name
+_SANITIZED_TESTS = "cuda and (demodulate or fold or delay_and_sum or quantise or interpolated)"  # selects tests by name
 _SUMMARIES = {
     "memcheck": r"ERROR SUMMARY: (\d+) error",
     "racecheck": r"RACECHECK SUMMARY: (\d+) hazard",
@@ -123,7 +123,7 @@ def run(*, results: Path, say: Callable[[str], None], measure: bool = True) -> d
         "parts": {},
     }
     results.mkdir(parents=True, exist_ok=True)
-    target = results / f"{_plain(found['name'])}-{when:%Y%m%dT%H%M%SZ}.json"
+    target = results / f"{_as_file_name(found['name'])}-{when:%Y%m%dT%H%M%SZ}.json"
     for name, measured in parts().items():
         say(f"{name}: at most {BUDGETS_S[name]} s")
         begin_s = time.monotonic()
@@ -201,7 +201,7 @@ def sanitized(tool: str) -> dict[str, Any]:
     sanitizer = _sanitizer()
     if sanitizer is None:
         return {"status": "not available: no compute-sanitizer on PATH or in CUDA_HOME"}
-    command = [sanitizer, "--tool", tool, "--error-exitcode", "9", *_PYTEST, *_TESTED[:2], "-k", _SANITIZED]
+    command = [sanitizer, "--tool", tool, "--error-exitcode", "9", *_PYTEST, *_TESTED[:2], "-k", _SANITIZED_TESTS]
     done = execute(command, BUDGETS_S[tool])
     found = re.search(_SUMMARIES[tool], done.text)
     passed = re.search(r"(\d+) passed", done.text)
@@ -272,6 +272,6 @@ def _revision() -> str:
     return done.last_line if done.code == 0 else "unknown"
 
 
-def _plain(name: str) -> str:
+def _as_file_name(name: str) -> str:
     """Return a name in a form that suits file names."""
     return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")

@@ -32,13 +32,13 @@ from ertis_numba.stages.fast import FastChain
 
 __all__ = ["FULL", "PARTS", "Scale", "ceilings_of", "machine", "paper", "side_by_side"]
 
-_SAME_DB = -100.0  # between devices that add the same terms in another order
-_SAME_16_DB = -80.0  # limit where intermediate numbers are rounded to 16 bits
+_MAX_DIFFERENCE_DB = -100.0  # between devices that add the same terms in another order
+_MAX_DIFFERENCE_16_BIT_DB = -80.0  # limit where intermediate numbers are rounded to 16 bits
 _PUBLISHED_MS = dict(zip(map(str, DIRECTIONS), PUBLISHED_MS["GPU GTX 1080 Ti"], strict=True))
-_OPERATIONS, _BYTES = 8, 8  # per term and range: a complex multiply-add, and a complex64 to load
-_IMAGES = 8  # pinned images that a stream fills in turn
+_N_OPERATIONS, _N_BYTES = 8, 8  # per term and range: a complex multiply-add, and a complex64 to load
+_N_IMAGES = 8  # pinned images that a stream fills in turn
 _PACKAGES = ("numba-cuda", "cupy-cuda12x", "cupy-cuda13x", "cuda-bindings", "torch", "mach-beamform")
-_ASKED_OF_SMI = (
+_SMI_FIELDS = (
     "driver_version",
     "memory.total",
     "clocks.max.sm",
@@ -185,7 +185,10 @@ def ceilings_of(scale: Scale) -> Iterator[dict[str, Any]]:
     tables = rivals.tables_of(plan, measurement)
     seconds = stages(plan, _words(measurement), count=scale.count)["stages_ms"]["delay-and-sum with envelope"] / 1e3
     points = tables.n_terms * shape[0] * shape[1]
-    reached = {"float32_gop_s": points * _OPERATIONS / seconds / 1e9, "load_gb_s": points * _BYTES / seconds / 1e9}
+    reached = {
+        "float32_gop_s": points * _N_OPERATIONS / seconds / 1e9,
+        "load_gb_s": points * _N_BYTES / seconds / 1e9,
+    }
     shares = {name: rate / found[name] for name, rate in reached.items()}
     tighter = max(shares, key=lambda name: shares[name])
     yield {
@@ -225,7 +228,7 @@ def _checked(plain: Pipeline, recorded: Pipeline, measurement: Measurement) -> d
     error_db = checks.require_exact(image, measurement)
     same = Pipeline(plain.settings, device="cpu").process(measurement)
     difference_db = verification.error_db(image.amplitude, same.amplitude)
-    wanted_db = _SAME_DB if plain.settings.accuracy.precision == "float32" else _SAME_16_DB
+    wanted_db = _MAX_DIFFERENCE_DB if plain.settings.accuracy.precision == "float32" else _MAX_DIFFERENCE_16_BIT_DB
     if not difference_db <= wanted_db:
         raise DataError(
             f"image of {len(image.amplitude)} directions on 'cuda' differs from that on 'cpu' by {difference_db:.1f} "
@@ -244,9 +247,9 @@ def _streamed(plan: Settings, words: NDArray[Any], scale: Scale) -> dict[str, fl
     found: dict[str, float] = {}
     for name, graphs in {"plain": False, "graphs": True}.items():
         chain = FastChain(plan, kernels.load("cuda"), threads=1, graphs=graphs)
-        images = [chain.new_image() for _ in range(_IMAGES)]
+        images = [chain.new_image() for _ in range(_N_IMAGES)]
         stream = [words] * scale.stream
-        to_host = [images[number % _IMAGES] for number in range(scale.stream)]
+        to_host = [images[number % _N_IMAGES] for number in range(scale.stream)]
         subjects = {
             f"to the host, {name}": functools.partial(chain.process_batch, stream, to_host),
             f"stay on the GPU, {name}": functools.partial(chain.process_batch, stream, [None] * scale.stream),
@@ -278,7 +281,7 @@ def _version(number: int) -> str:
 
 def _smi(uuid: str) -> dict[str, str]:
     """Return properties of the GPU from nvidia-smi, or an empty dict if the tool is missing."""
-    command = ["nvidia-smi", *(["-i", uuid] if uuid else []), f"--query-gpu={','.join(_ASKED_OF_SMI)}"]
+    command = ["nvidia-smi", *(["-i", uuid] if uuid else []), f"--query-gpu={','.join(_SMI_FIELDS)}"]
     try:
         done = subprocess.run(  # noqa: S603
             [*command, "--format=csv,noheader"], capture_output=True, text=True, check=True, timeout=20
@@ -286,7 +289,7 @@ def _smi(uuid: str) -> dict[str, str]:
     except (OSError, subprocess.SubprocessError):
         return {}
     values = [value.strip() for value in done.stdout.strip().splitlines()[0].split(",")]
-    return dict(zip(_ASKED_OF_SMI, values, strict=True))
+    return dict(zip(_SMI_FIELDS, values, strict=True))
 
 
 def _main(name: str, path: Path) -> None:

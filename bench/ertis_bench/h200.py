@@ -84,34 +84,34 @@ class Loop:
     fetched: Callable[[Arguments, tuple[int, ...]], float]
 
 
-def _of_terms(given: Arguments, grid: tuple[int, ...]) -> float:
+def _bytes_of_terms(given: Arguments, grid: tuple[int, ...]) -> float:
     """Return the bytes that blocks fetch for a loop over terms.
 
     A block computes a group of directions and a tile of ranges. Terms of a group may share cache lines.
     """
     offsets = given["offsets"].reshape(-1, int(given["n_terms"])).astype(np.int64)
     return grid[1] * sum(
-        _distinct_lines(8 * offsets[first : first + DIRECTIONS], 8 * TILE)
+        _bytes_of_lines(8 * offsets[first : first + DIRECTIONS], 8 * TILE)
         for first in range(0, len(offsets), DIRECTIONS)
     )
 
 
-def _of_nodes(given: Arguments, grid: tuple[int, ...]) -> float:
+def _bytes_of_grid_points(given: Arguments, grid: tuple[int, ...]) -> float:
     places = given["places"].reshape(-1, int(given["n_pairs"])).astype(np.int64)
     row_bytes = 8 * int(given["width"])
     return grid[1] * sum(
-        _distinct_lines(row_bytes * (places[first : first + DIRECTIONS, :, None] + np.arange(2)), 8 * TILE)
+        _bytes_of_lines(row_bytes * (places[first : first + DIRECTIONS, :, None] + np.arange(2)), 8 * TILE)
         for first in range(0, len(places), DIRECTIONS)
     )
 
 
-def _of_words(given: Arguments, grid: tuple[int, ...]) -> float:
+def _bytes_of_words(given: Arguments, grid: tuple[int, ...]) -> float:
     n_taps, outputs = given["taps"].size, -(-given["out"].shape[1] // grid[0])
     words = n_taps + (outputs - 1) * int(given["factor"])
     return float(math.prod(grid) * (words * int(given["n_octets"]) + given["taps"].nbytes))
 
 
-def _distinct_lines(starts_bytes: NDArray[np.int64], n_bytes: int) -> float:
+def _bytes_of_lines(starts_bytes: NDArray[np.int64], n_bytes: int) -> float:
     """Return the size of all cache lines that runs of ``n_bytes`` touch, in bytes."""
     line = int(GPU["cache_line_bytes"])
     first, last = starts_bytes.ravel() // line, (starts_bytes.ravel() + n_bytes - 1) // line
@@ -125,7 +125,7 @@ _TERMS: Final = Loop(
     lines=2 + 4 * 3,
     chain=2,
     points=4,
-    fetched=_of_terms,
+    fetched=_bytes_of_terms,
 )
 LOOPS: Final = {
     "delay_and_sum_envelope.fill": _TERMS,
@@ -137,7 +137,7 @@ LOOPS: Final = {
         lines=2 + 8 * 2,
         chain=2,
         points=4,
-        fetched=_of_nodes,
+        fetched=_bytes_of_grid_points,
     ),
     "demodulate_words.sum_taps": Loop(
         of="tap",
@@ -146,7 +146,7 @@ LOOPS: Final = {
         lines=2,
         chain=1,
         points=1,
-        fetched=_of_words,
+        fetched=_bytes_of_words,
     ),
 }
 """Kernels that spend their time in a loop, by name."""

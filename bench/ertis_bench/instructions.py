@@ -13,7 +13,7 @@ _TARGET = re.compile(r"`\((?P<label>[^)]+)\)")
 _INTEGER = ("I", "UI", "LEA", "ULEA", "LOP", "ULOP", "SHF", "USHF", "PRMT", "UPRMT", "SEL", "USEL", "BMSK", "VI")
 _MULTIPLY_ADD = ("FFMA", "FMUL", "FADD")
 _ENDS = {"EXIT", "BRA", "RET.REL.NODEC"}
-_CALL = 10_000  # Number of loads that outweighs a call, so that paths with calls are avoided.
+_CALL_COST = 10_000  # Number of loads that outweighs a call, so that paths with calls are avoided.
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +61,7 @@ def way(code: Sequence[Instruction]) -> list[int]:
         if here.target >= 0:
             followers = [here.target, *followers]
         followers = [place for place in followers if at < place < len(code)]
-        worth[at] = -_CALL if here.name.startswith("CALL") else int(_kind(here.name) in {"loads", "multiply-adds"})
+        worth[at] = -_CALL_COST if here.name.startswith("CALL") else int(_kind(here.name) in {"loads", "multiply-adds"})
         if followers:
             ahead[at] = max(followers, key=worth.__getitem__)
             worth[at] += worth[ahead[at]]

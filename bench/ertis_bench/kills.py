@@ -32,11 +32,11 @@ __all__ = ["appending", "sealing"]
 _SETTINGS = Settings(recording=Recording(n_samples=32_768))
 _SENSORS = ("left", "right")
 _SESSION_ID = 7
-_LATE = 3  # Number of measurements of the first sensor before the second sensor joins.
+_SECOND_SENSOR_AFTER = 3  # Number of measurements of the first sensor before the second sensor joins.
 _MAX_REPORTED = 12  # maximum number of commits before the kill
 _LINES_OF_A_COMMIT = 170  # approximate
 _JITTER_S = 0.004
-_SAME_JOURNAL = 3  # consecutive processes that are killed over the same journal
+_KILLS_PER_JOURNAL = 3  # consecutive processes that are killed over the same journal
 _LIFE_S = 60  # lifetime of a process that is not killed
 _PACKAGE = Path(ertis_numba.__file__).parent
 _OURS = tuple(str(_PACKAGE / name) for name in ("journal", "storage", "atomic.py"))
@@ -57,10 +57,10 @@ def appending(folder: Path, *, seed: int, count: int) -> dict[str, int]:
     with _Nursery() as nursery:
         while found["kills"] < count:
             reported: set[tuple[str, int]] = set()
-            for _ in range(min(_SAME_JOURNAL, count - found["kills"])):
+            for _ in range(min(_KILLS_PER_JOURNAL, count - found["kills"])):
                 reported |= _killed_appending(nursery, path, rng, seed)
                 found["kills"] += 1
-            _look_into(path, reported, seed, found)
+            _count_content(path, reported, seed, found)
     return found
 
 
@@ -79,7 +79,7 @@ def _killed_appending(nursery: "_Nursery", path: Path, rng: random.Random, seed:
     return {(sensor, int(sequence)) for sensor, sequence in map(str.split, reported)}
 
 
-def _look_into(path: Path, reported: set[tuple[str, int]], seed: int, found: dict[str, int]) -> None:
+def _count_content(path: Path, reported: set[tuple[str, int]], seed: int, found: dict[str, int]) -> None:
     """Count the content of a journal, and remove the journal."""
     found["told"] += len(reported)
     if not path.exists():  # The process was killed before it created the journal.
@@ -109,7 +109,7 @@ def _append(*, path: str, seed: int) -> None:
     while True:
         entries = []
         for _ in range(rng.randint(1, 3)):
-            sensor = rng.choice(_SENSORS[: 1 + (counts[_SENSORS[0]] > _LATE)])
+            sensor = rng.choice(_SENSORS[: 1 + (counts[_SENSORS[0]] > _SECOND_SENSOR_AFTER)])
             if sensor not in journal.sensors:
                 journal.add_sensor(sensor, _SETTINGS, firmware="1.2.3")
             stamp = Stamp(sensor=sensor, sequence=counts[sensor], session_id=_SESSION_ID)
@@ -140,12 +140,12 @@ def sealing(folder: Path, *, seed: int, count: int) -> dict[str, int]:
     rng = random.Random(seed)  # noqa: S311  nothing is secret
     found = dict.fromkeys(("kills", "late", "broken", "different", "left_over"), 0)
     crashed, work = folder / "crashed", folder / "work"
-    _crash(crashed, seed)
+    _make_crashed_journal(crashed, seed)
     with _Nursery() as nursery:
-        n_lines, lasts_s, wanted = _undisturbed(nursery, crashed, work)
+        n_lines, lasts_s, wanted = _seal_undisturbed(nursery, crashed, work)
         while found["kills"] < count:
             path = shutil.copytree(crashed, work) / "rec.h5.journal"
-            for _ in range(min(rng.randint(1, _SAME_JOURNAL), count - found["kills"])):
+            for _ in range(min(rng.randint(1, _KILLS_PER_JOURNAL), count - found["kills"])):
                 found["late"] += not _killed_sealing(nursery, path, rng, n_lines, lasts_s)
                 found["kills"] += 1
                 found["broken"] += (work / "rec.h5").exists() and (work / "rec.h5").read_bytes() != wanted
@@ -157,7 +157,7 @@ def sealing(folder: Path, *, seed: int, count: int) -> dict[str, int]:
     return found
 
 
-def _crash(folder: Path, seed: int) -> None:
+def _make_crashed_journal(folder: Path, seed: int) -> None:
     """Create the journal of a killed process, with a write-ahead log, gaps, and a sensor without measurements."""
     made = folder.with_name("making")
     made.mkdir()
@@ -177,7 +177,7 @@ def _crash(folder: Path, seed: int) -> None:
     shutil.rmtree(made)
 
 
-def _undisturbed(nursery: "_Nursery", crashed: Path, work: Path) -> tuple[int, float, bytes]:
+def _seal_undisturbed(nursery: "_Nursery", crashed: Path, work: Path) -> tuple[int, float, bytes]:
     """Seal without a kill, and return the number of lines, the duration, and the recording."""
     n_lines, lasts_s, made = 0, 0.0, b""
     for counts in (True, False):
@@ -268,7 +268,7 @@ class _Nursery:
         self._input.flush()
 
 
-def _nurse() -> None:
+def _run_nursery() -> None:
     """Start and end processes according to requests on stdin."""
     pid = 0
     for line in sys.stdin:
@@ -281,10 +281,10 @@ def _nurse() -> None:
             import ertis_numba.storage.sealing  # noqa: F401, PLC0415  so that the copies need not
         pid = os.fork()
         if not pid:
-            _live(request)
+            _run_job(request)
 
 
-def _live(request: dict[str, Any]) -> NoReturn:
+def _run_job(request: dict[str, Any]) -> NoReturn:
     """Run a job until it ends or the process is killed."""
     signal.alarm(_LIFE_S)
     _emit_event(str(os.getpid()))
@@ -327,4 +327,4 @@ def _emit_event(line: str) -> None:
 
 
 if __name__ == "__main__":
-    _nurse()
+    _run_nursery()

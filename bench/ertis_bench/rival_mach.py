@@ -27,10 +27,10 @@ from ertis_numba.stages.plan_elements import spectrum_of
 
 __all__ = ["problem", "race", "settings_for"]
 
-_NEAR_DB = -25.0  # The budget for focal zones and linear interpolation is -30 dB.
+_MAX_DIFFERENCE_DB = -25.0  # The budget for focal zones and linear interpolation is -30 dB.
 _FRAMES = 16
 # mach uses the third axis as depth and scales the aperture with it, so that 0 m would leave no aperture.
-_AHEAD_M = 8.0
+_DEPTH_OFFSET_M = 8.0
 _F_NUMBER = 0.01
 
 
@@ -72,8 +72,8 @@ def problem(settings: Settings, measurement: Measurement, device: str) -> tuple[
     chain.close()
     return {
         "channel_data": samples[:, :, None],
-        "rx_coords_m": _turned(layout.enabled_positions_m),
-        "scan_coords_m": _turned(places_m),
+        "rx_coords_m": _with_depth_last(layout.enabled_positions_m),
+        "scan_coords_m": _with_depth_last(places_m),
         "tx_wave_arrivals_s": (np.tile(chain.range_m, len(units)) / speed_m_s).astype(np.float32),
         "rx_start_s": float(start_s),
         "sampling_freq_hz": float(rate_hz),
@@ -102,10 +102,10 @@ def race(settings: Settings, measurement: Measurement, count: int) -> dict[str, 
     run: Callable[..., Any] = functools.partial(_beamform, cupy, beamform)
     found = cupy.asnumpy(run(here)).reshape(image.shape) / len(arguments["rx_coords_m"])
     difference_db = verification.error_db(found, image)
-    if not difference_db <= _NEAR_DB:
+    if not difference_db <= _MAX_DIFFERENCE_DB:
         raise DataError(
-            f"image of mach differs from this package's by {difference_db:.1f} dB; the limit is {_NEAR_DB:g} dB. The "
-            "time is not reported, because the results differ"
+            f"image of mach differs from this package's by {difference_db:.1f} dB; "
+            f"the limit is {_MAX_DIFFERENCE_DB:g} dB. The time is not reported, because the results differ"
         )
     many = here | {"channel_data": cupy.ascontiguousarray(cupy.repeat(here["channel_data"], _FRAMES, axis=2))}
     times_ms = timing.round_robin(
@@ -131,8 +131,8 @@ def _beamform(cupy: Any, beamform: Callable[..., Any], arguments: dict[str, Any]
     return envelope
 
 
-def _turned(positions_m: NDArray[np.float64]) -> NDArray[np.float32]:
+def _with_depth_last(positions_m: NDArray[np.float64]) -> NDArray[np.float32]:
     """Return positions with the forward axis last, as depths."""
     depth_m = np.roll(positions_m, -1, axis=1)
-    depth_m[:, 2] += _AHEAD_M
+    depth_m[:, 2] += _DEPTH_OFFSET_M
     return depth_m.astype(np.float32)

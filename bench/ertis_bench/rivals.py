@@ -26,7 +26,7 @@ from ertis_numba.stages.fast import FastChain
 __all__ = ["LIBRARIES", "ArrayChain", "Library", "Tables", "is_installed", "numpy_library", "race", "tables_of"]
 
 _GATHERED_BYTES = 2**28  # size of the samples that are gathered at a time
-_SAME_DB = -100.0
+_MAX_DIFFERENCE_DB = -100.0
 _BURST = 10
 
 
@@ -255,10 +255,10 @@ def race(library: str, settings: Settings, measurement: Measurement, count: int)
         words, out = np.array(measurement.data).reshape(len(measurement.data), -1), np.empty_like(image)
         chain(words, out)
         difference_db = verification.error_db(out, image)
-        if not difference_db <= _SAME_DB:
+        if not difference_db <= _MAX_DIFFERENCE_DB:
             raise DataError(
-                f"image of {library} differs from this package's by {difference_db:.1f} dB; the limit is {_SAME_DB:g} "
-                "dB. The time is not reported, because the results differ"
+                f"image of {library} differs from this package's by {difference_db:.1f} dB; "
+                f"the limit is {_MAX_DIFFERENCE_DB:g} dB. The time is not reported, because the results differ"
             )
         subjects: dict[str, Callable[[], object]] = {
             "theirs": functools.partial(chain, words, image),  # The library also writes to pinned memory.

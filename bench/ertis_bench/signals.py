@@ -78,7 +78,7 @@ def send(folder: Path, source: Path, *, seed: int, count: int, only: Sequence[st
     """
     rng = random.Random(seed)  # noqa: S311  nothing is secret
     found: dict[str, dict[str, Any]] = {}
-    with _obeyed_signals(), captures.emulated(source, folder) as ports:
+    with _default_signals(), captures.emulated(source, folder) as ports:
         paths = _files(folder, source) | {"port": ports[0]}
         for command in only or COMMANDS:
             found[command] = _to_command(command, paths, folder / "out", rng, count)
@@ -94,7 +94,7 @@ def send(folder: Path, source: Path, *, seed: int, count: int, only: Sequence[st
 
 
 @contextmanager
-def _obeyed_signals() -> Iterator[None]:
+def _default_signals() -> Iterator[None]:
     """Restore default signal handling for new processes.
 
     A script or ``nohup`` that has started this process may ignore signals, and children inherit this.
@@ -134,7 +134,7 @@ def _files(folder: Path, source: Path) -> dict[str, str]:
 
 def _to_command(command: str, paths: dict[str, str], out: Path, rng: random.Random, count: int) -> dict[str, Any]:
     begins_s = _interpreter_s()
-    lasts_s, _, _, _ = _one(command, paths, out, None, _UNDISTURBED_S)
+    lasts_s, _, _, _ = _run_command(command, paths, out, None, _UNDISTURBED_S)
     found: dict[str, Any] = {"signals": 0, **dict.fromkeys(_FAULTS, 0), "slowest_s": 0.0}
     examples: Counter[str] = Counter()
     for _ in range(_MAX_TRIES * count):
@@ -142,7 +142,7 @@ def _to_command(command: str, paths: dict[str, str], out: Path, rng: random.Rand
             break
         number = rng.choice(_SIGNALS)
         at_s = rng.uniform(begins_s, max(lasts_s, begins_s))
-        _, took_s, code, errors = _one(command, paths, out, number, at_s)
+        _, took_s, code, errors = _run_command(command, paths, out, number, at_s)
         if not took_s or _in_interpreter(errors):
             continue
         found["signals"] += 1
@@ -180,7 +180,7 @@ def _interpreter_s() -> float:
     return max(once() for _ in range(_STARTS))
 
 
-def _one(
+def _run_command(
     command: str, paths: dict[str, str], out: Path, number: signal.Signals | None, at_s: float
 ) -> tuple[float, float, int, str]:
     """Run a command, send a signal at a time, and return its duration, the time to its end, its exit code and stderr.

@@ -31,13 +31,13 @@ from ertis_numba.simulation.snapshot import snapshot
 
 __all__ = ["free_field", "run"]
 
-_NOBODY_HEARS_DB = -180.0
-_FORCED = [name for name in EFFECTS if name != "microphone_faults"]  # A missing microphone is always relevant.
+_NEGLIGIBLE_DB = -180.0
+_ALL_EFFECTS = [name for name in EFFECTS if name != "microphone_faults"]  # A missing microphone is always relevant.
 
 
 def free_field() -> Scene:
     """Return a scene of ten points before a default eRTIS sensor, with a negligible source of every effect."""
-    weak = _NOBODY_HEARS_DB
+    weak = _NEGLIGIBLE_DB
     points = tuple(
         Point(azimuth_deg=-60.0 + 12 * n, range_m=0.8 + 0.35 * n, strength_db=-20.0 + 2 * n) for n in range(9)
     )
@@ -88,7 +88,7 @@ def run(*, count: int, say: Callable[[str], None]) -> dict[str, Any]:
     # Keys of the scene request most of these effects, which would keep them on. Here, only the change of the image
     # must decide.
     plan = make_plan(scene.replace(effects=dict.fromkeys(ASKED_FOR, False)))
-    everything = make_plan(scene.replace(effects=dict.fromkeys(_FORCED, True)))
+    everything = make_plan(scene.replace(effects=dict.fromkeys(_ALL_EFFECTS, True)))
     say("checking")
     change_db = _change_db(scene, plan, everything)
     allowed_db = scene.tolerance_db * len(everything.active - plan.active)

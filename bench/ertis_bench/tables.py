@@ -108,7 +108,7 @@ def paper(report: dict[str, Any]) -> str:
     """Return the times, the ratios and the paper's own times, with their conditions."""
     found = {(row["backend"], row["directions"]): row for row in report["rows"]}
     backends = list(dict.fromkeys(row["backend"] for row in report["rows"]))
-    measured = [[_MEANING[backend], *(_spread(**found[backend, n]) for n in DIRECTIONS)] for backend in backends]
+    measured = [[_MEANING[backend], *(_statistics(**found[backend, n]) for n in DIRECTIONS)] for backend in backends]
     ratios = [
         [
             f"`{backend}`",
@@ -232,7 +232,7 @@ def scaling(report: dict[str, Any]) -> str:
     for row in report["rows"]:
         sums = "" if row["plan"] == "default" else f", no beam grid, {row['plan']}"
         name = row["series"].replace("_m", ", m").replace("_", " ") + sums
-        series.setdefault(name, []).append([f"{row['value']:g}", _spread(**row), f"{row['n_ranges']}"])
+        series.setdefault(name, []).append([f"{row['value']:g}", _statistics(**row), f"{row['n_ranges']}"])
     parts = [_table([name, "ms, mean ± std (median)", "ranges"], rows) for name, rows in series.items()]
     columns = {
         "threads": "threads",
@@ -263,7 +263,7 @@ def simulation(report: dict[str, Any]) -> str:
     """Return the times of a measurement with the relevant effects and with all effects, and the cost of each effect."""
     needed, everything = report["rows"]
     rows = [
-        [row["effects"], f"{len(row['on'])}", _spread(**row), f"{1e3 / row['median_ms']:.1f}"]
+        [row["effects"], f"{len(row['on'])}", _statistics(**row), f"{1e3 / row['median_ms']:.1f}"]
         for row in (needed, everything)
     ]
     costs = [
@@ -323,7 +323,7 @@ def _reached(
     )
 
 
-def _spread(*, mean_ms: float, std_ms: float, median_ms: float, **_: object) -> str:
+def _statistics(*, mean_ms: float, std_ms: float, median_ms: float, **_: object) -> str:
     return f"{mean_ms:.2f} ± {std_ms:.2f} ({median_ms:.2f})"
 
 

@@ -24,7 +24,7 @@ from ertis_numba.stages.fast import FastChain
 
 __all__ = ["Trial", "run", "with_one"]
 
-_SURE = 300  # Relative to the noise of modulators, which changes such a reflector by less than 0.03 dB.
+_MIN_LEVEL_TO_NOISE = 300  # Relative to the noise of modulators, which changes such a reflector by less than 0.03 dB.
 _PLAN = Accuracy(
     precision="float32",
     oversampling=4,
@@ -86,8 +86,8 @@ class Trial:
 
     def __init__(self, scene: Scene, index: int = 0) -> None:
         self.scene, self.index = scene, index
-        self._signals = functools.lru_cache(maxsize=8)(self._rendered)
-        self._image = functools.lru_cache(maxsize=8)(self._imaged)
+        self._signals = functools.lru_cache(maxsize=8)(self._render_signals)
+        self._image = functools.lru_cache(maxsize=8)(self._render_image)
 
     def left_out(self, plan: EffectPlan) -> list[dict[str, Any]]:
         """Return the change of the images in dB by each effect that the plan omits."""
@@ -137,7 +137,7 @@ class Trial:
         """
         pipeline = Pipeline(sensor.settings())
         shown = Sight(self._shot(sensor), one.active)
-        sure = shown.shown & (shown.levels(shown.heard) > _SURE * shown.noise)
+        sure = shown.shown & (shown.levels(shown.heard) > _MIN_LEVEL_TO_NOISE * shown.noise)
         ranges_m = shown.heard.delay_s[sure] * shown.shot.speed_m_s / 2
 
         def levels_db(seed: int, plan: EffectPlan) -> NDArray[np.float64]:
@@ -154,14 +154,14 @@ class Trial:
     def _shot(self, sensor: Sensor) -> Snapshot:
         return snapshot(self.scene, sensor, self.index / self.scene.rate_hz)
 
-    def _rendered(self, name: str, plan: EffectPlan) -> NDArray[np.float64]:
+    def _render_signals(self, name: str, plan: EffectPlan) -> NDArray[np.float64]:
         signals = Simulator(self.scene, sensor=name, plan=plan).signals(self.index)
         dbfs = self.scene.sensor(name).electronics.noise_dbfs
         if "microphone_noise" in plan.active and dbfs is not None:
             signals += 10 ** (dbfs / 20) * _white_noise(self.scene.seed, signals.shape)
         return signals
 
-    def _imaged(self, name: str, plan: EffectPlan) -> NDArray[np.float32]:
+    def _render_image(self, name: str, plan: EffectPlan) -> NDArray[np.float32]:
         chain = _chain(self.scene.sensor(name).settings())
         image = np.empty((len(chain.grid), len(chain.range_m)), dtype=np.float32)
         chain.process_signals(self._signals(name, plan), image)

@@ -29,11 +29,11 @@ KINDS: Final[dict[str, float]] = {
 }
 """Probabilities of faults, which affect about half of all blocks."""
 
-_SHORTEST_S: Final = 0.04  # shortest time between two triggers
+_MIN_INTERVAL_S: Final = 0.04  # shortest time between two triggers
 _INTERVAL_S: Final = 0.05
 _BYTES_PER_S: Final = 1e6  # lower limit; large blocks are sent faster
 _BLOCK_S: Final = 0.02  # longest duration of a block
-_KEPT: Final = 64  # Number of recent blocks whose bytes may still be in the receiver.
+_MAX_REMEMBERED: Final = 64  # Number of recent blocks whose bytes may still be in the receiver.
 
 
 @dataclass(slots=True)
@@ -107,7 +107,7 @@ class Wire:
         seed: int = 0,
     ) -> None:
         self.report = BlockReport()
-        self._receiver = BlockReceiver(n_samples, expected=counter, shortest_s=_SHORTEST_S, bits=bits)
+        self._receiver = BlockReceiver(n_samples, expected=counter, shortest_s=_MIN_INTERVAL_S, bits=bits)
         self._faults, self._triggers, self._deadline_s = faults, triggers, deadline_s
         self._random = np.random.default_rng(seed)
         self._counter = counter
@@ -121,23 +121,23 @@ class Wire:
         counter, self._counter = self._counter, (self._counter + 1) % COUNTERS
         block = encode_block(counter, words)
         spoilt = self._faults.spoil(block)
-        self._note(counter, block, spoilt)
+        self._register(counter, block, spoilt)
         for piece in spoilt.pieces:
             if isinstance(piece, Stall):
                 self._now_s += piece.duration_s
             elif isinstance(piece, Unplug):
-                self._take(self._receiver.finish())
+                self._compare(self._receiver.finish())
                 self._receiver.expect(self._counter)
             else:
                 at_ns = round(self._now_s * 1e9) if self._triggers != "at once" else 0
                 self.report.fed += len(piece)
-                self._take(self._receiver.feed(piece, Instant(at_ns, at_ns, 0)))
+                self._compare(self._receiver.feed(piece, Instant(at_ns, at_ns, 0)))
                 self._now_s += len(piece) / self._bytes_per_s
 
     def finish(self) -> BlockReport:
         """End the transmission, and return the results for all blocks."""
         receiver, report = self._receiver, self.report
-        self._take(receiver.finish())
+        self._compare(receiver.finish())
         report.pending = receiver.pending + receiver.held * receiver.n_bytes
         report.lost, report.rejected, report.rejected_blocks = (
             receiver.lost,
@@ -152,20 +152,20 @@ class Wire:
         """Advance the time to the next trigger. If the deadline passes meanwhile, let the receiver expire."""
         interval_s = _INTERVAL_S
         if self._triggers == "irregular":
-            interval_s = _SHORTEST_S + float(self._random.exponential(_INTERVAL_S))
+            interval_s = _MIN_INTERVAL_S + float(self._random.exponential(_INTERVAL_S))
         self._trigger_s = max(self._trigger_s + interval_s, self._now_s)
         if self._deadline_s is not None and self._trigger_s - self._now_s > self._deadline_s:
             while self._receiver.missing:
-                self._take(self._receiver.expire())
+                self._compare(self._receiver.expire())
         self._now_s = self._trigger_s
 
-    def _note(self, counter: int, block: bytes, spoilt: Spoilt) -> None:
+    def _register(self, counter: int, block: bytes, spoilt: Spoilt) -> None:
         data, report = spoilt.data, self.report
         self._sent[counter] = _Sent(zlib.crc32(block[8:-4]), data, untouched=data == block)
         report.sent += 1
         report.spoilt += bool(spoilt.faults)
         report.untouched += data == block
-        if len(self._sent) > _KEPT:
+        if len(self._sent) > _MAX_REMEMBERED:
             self._forget(next(iter(self._sent)))
 
     def _forget(self, counter: int) -> None:
@@ -173,7 +173,7 @@ class Wire:
         self.report.delivered += sent.delivered
         self.report.untouched_lost += sent.untouched and not sent.delivered
 
-    def _take(self, blocks: list[Block]) -> None:
+    def _compare(self, blocks: list[Block]) -> None:
         """Compare accepted blocks with the sent ones."""
         report = self.report
         for block in blocks:

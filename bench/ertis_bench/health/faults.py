@@ -62,7 +62,7 @@ def _column(base: Base, channel: int) -> NDArray[Any]:
     return words[:, channel].copy()
 
 
-def _with(base: Base, columns: dict[int, NDArray[Any]], words: NDArray[Any] | None = None) -> NDArray[Any]:
+def _with_channels(base: Base, columns: dict[int, NDArray[Any]], words: NDArray[Any] | None = None) -> NDArray[Any]:
     """Return a copy of the words with other samples in some channels."""
     words = (base.measurement.data if words is None else words).copy()
     for channel, column in columns.items():
@@ -97,7 +97,7 @@ def _signal(change: Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray
     def inject(base: Base, rng: np.random.Generator) -> _Injected:
         channel = int(rng.integers(len(base.signals)))
         time_s = np.arange(base.signals.shape[1]) / base.sensor.recording.sample_rate_hz
-        return _with(base, {channel: _converted(base, change(base.signals[channel], time_s), rng)}), (channel,)
+        return _with_channels(base, {channel: _converted(base, change(base.signals[channel], time_s), rng)}), (channel,)
 
     return inject
 
@@ -107,7 +107,7 @@ def _samples(change: _Change) -> _Injection:
 
     def inject(base: Base, rng: np.random.Generator) -> _Injected:
         channel = int(rng.integers(len(base.signals)))
-        return _with(base, {channel: change(_column(base, channel), rng)}), (channel,)
+        return _with_channels(base, {channel: change(_column(base, channel), rng)}), (channel,)
 
     return inject
 
@@ -117,7 +117,7 @@ def _ordered(source: NDArray[np.intp]) -> _Injection:
 
     def inject(base: Base, _: np.random.Generator) -> _Injected:
         columns = {to: _column(base, int(origin)) for to, origin in enumerate(source) if to != origin}
-        return _with(base, columns), ()
+        return _with_channels(base, columns), ()
 
     return inject
 
@@ -165,7 +165,7 @@ def _noisier(more_db: float) -> _Injection:
         louder = base.sensor.electronics.replace(noise_dbfs=min((base.sensor.electronics.noise_dbfs or 0) + more_db, 0))
         noisy = replace(base, sensor=base.sensor.replace(electronics=louder))
         channel = int(rng.integers(len(base.signals)))
-        return _with(base, {channel: _converted(noisy, base.signals[channel], rng)}), (channel,)
+        return _with_channels(base, {channel: _converted(noisy, base.signals[channel], rng)}), (channel,)
 
     return inject
 
@@ -176,7 +176,7 @@ def _amplified(gain_db: float) -> _Injection:
         other = replace(base, sensor=base.sensor.replace(electronics=quieter))
         channel = int(rng.integers(len(base.signals)))
         signal = 10 ** (gain_db / 20) * base.signals[channel]
-        return _with(base, {channel: _converted(other, signal, rng)}), (channel,)
+        return _with_channels(base, {channel: _converted(other, signal, rng)}), (channel,)
 
     return inject
 
@@ -203,7 +203,7 @@ def _swapped(*, apart: bool) -> _Injection:
         if not len(fitting):
             fitting = np.argsort(differ_s)[-1:]
         other = int(rng.choice(fitting))
-        return _with(base, {one: _column(base, other), other: _column(base, one)}), (one, other)
+        return _with_channels(base, {one: _column(base, other), other: _column(base, one)}), (one, other)
 
     return inject
 
@@ -238,17 +238,17 @@ def _shifted(base: Base, rng: np.random.Generator) -> _Injected:
 
 def _crosstalk(base: Base, rng: np.random.Generator) -> _Injected:
     one, other = (int(channel) for channel in rng.choice(len(base.signals), 2, replace=False))
-    return _with(base, {one: _converted(base, base.signals[one] + 0.5 * base.signals[other], rng)}), (one,)
+    return _with_channels(base, {one: _converted(base, base.signals[one] + 0.5 * base.signals[other], rng)}), (one,)
 
 
 def _copied(base: Base, rng: np.random.Generator) -> _Injected:
     one, other = (int(channel) for channel in rng.choice(len(base.signals), 2, replace=False))
-    return _with(base, {one: _column(base, other)}), (one, other)
+    return _with_channels(base, {one: _column(base, other)}), (one, other)
 
 
 def _half_missing(base: Base, _: np.random.Generator) -> _Injected:
     silent = np.zeros(len(base.measurement.data), np.uint8)
-    return _with(base, dict.fromkeys(range(16), silent)), tuple(range(16))
+    return _with_channels(base, dict.fromkeys(range(16), silent)), tuple(range(16))
 
 
 def _inverted(x: NDArray[Any], _: np.random.Generator) -> NDArray[Any]:

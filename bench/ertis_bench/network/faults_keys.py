@@ -36,7 +36,7 @@ Found = dict[str, Any]
 
 
 @dataclass(slots=True, kw_only=True)
-class _Try:
+class _Client:
     """Sensor node that must be accepted or refused."""
 
     node: SensorNode
@@ -110,7 +110,7 @@ def keys(folder: Path, *, seed: int) -> Found:
         }
         diaries = {name: folder / f"{number}.ndjson" for number, name in enumerate(cases)}
         tries = {
-            name: _begin(stack, address, sensor, given, diaries[name], session_id=seed + number)
+            name: _start_client(stack, address, sensor, given, diaries[name], session_id=seed + number)
             for number, (name, (sensor, given)) in enumerate(cases.items())
         }
         _send(list(tries.values()), _TRIED_S)
@@ -127,7 +127,7 @@ def keys(folder: Path, *, seed: int) -> Found:
         _send([tries["the listed sensor"], tries["a listed sensor, until it is removed"]], _REMOVED_S)
         leaver = tries.pop("a listed sensor, until it is removed")
         after_s = leaver.acked_s - removed_s
-        raw = _speaks_without_keys(address) + _speaks_without_keys(listening["publish"])
+        raw = _accepts_without_keys(address) + _accepts_without_keys(listening["publish"])
         boss = ("--key", str(folder / "keys" / "boss.secret.toml"), "--server-key", server)
         status = state_of(address, *boss)
         until(lambda: tries["the listed sensor"].acked_through >= tries["the listed sensor"].sent - 1)
@@ -147,9 +147,9 @@ def keys(folder: Path, *, seed: int) -> Found:
     } | found
 
 
-def _begin(
+def _start_client(
     stack: ExitStack, address: str, sensor: str, given: ClientKeys | None, diary: Path, *, session_id: int
-) -> _Try:
+) -> _Client:
     """Start a sensor node."""
     notes: list[str] = []
     node = stack.enter_context(
@@ -160,12 +160,12 @@ def _begin(
             on_note=lambda *texts: notes.append(": ".join(texts)),
         )
     )
-    made = _Try(node=node, sensor=sensor, diary=Diary(diary), session_id=session_id, notes=notes)
+    made = _Client(node=node, sensor=sensor, diary=Diary(diary), session_id=session_id, notes=notes)
     node.add_sensor(sensor, SMALL)
     return made
 
 
-def _send(tries: Sequence[_Try], duration_s: float) -> None:
+def _send(tries: Sequence[_Client], duration_s: float) -> None:
     """Send measurements of all nodes in turns for some time."""
     end_s = time.monotonic() + duration_s
     while time.monotonic() < end_s:
@@ -174,7 +174,7 @@ def _send(tries: Sequence[_Try], duration_s: float) -> None:
         time.sleep(_INTERVAL_S * len(tries))
 
 
-def _receivers(address: str, watchers: dict[str, ClientKeys | None], sender: _Try) -> list[str]:
+def _receivers(address: str, watchers: dict[str, ClientKeys | None], sender: _Client) -> list[str]:
     """Return the names of receivers that receive anything while the listed sensor sends."""
     found = set()
     with ExitStack() as stack:
@@ -192,7 +192,7 @@ def _receivers(address: str, watchers: dict[str, ClientKeys | None], sender: _Tr
     return sorted(found)
 
 
-def _speaks_without_keys(address: str) -> int:
+def _accepts_without_keys(address: str) -> int:
     """Return 1 if an address completes a handshake with a peer without keys, otherwise 0."""
     with contextlib.suppress(OSError), ZmtpPeer(address, timeout_s=1.0):
         return 1

@@ -19,7 +19,7 @@ from ertis_numba.errors import DataError
 
 __all__ = ["RestartedRecorder", "centrals", "judged", "nodes", "sealings", "tracebacks"]
 
-_GONE_S: Final = 30.0  # time limit for children of a killed process to end
+_CHILDREN_END_S: Final = 30.0  # time limit for children of a killed process to end
 _ROTATE_MB: Final = 16
 _LINES_TO_LISTEN: Final = 2_500  # approximate lines of code that a central node runs until it listens
 _LINES_TO_BEGIN: Final = 1_000  # approximate lines of code that a sensor node runs until it sends
@@ -81,7 +81,7 @@ class RestartedRecorder:
             code = last.stop(timeout_s=timeout_s)
             if code:
                 raise DataError(f"ertis record ended with {code}; {last.last_words()}")
-        until(lambda: not survivors(self.mark), timeout_s=_GONE_S)
+        until(lambda: not survivors(self.mark), timeout_s=_CHILDREN_END_S)
         return {"unacked": unacked, "orphans": len(survivors(self.mark))}
 
 

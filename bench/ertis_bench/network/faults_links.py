@@ -20,9 +20,9 @@ from ertis_numba.errors import DataError
 __all__ = ["away", "disk_fails", "disk_full", "meddled", "state_of"]
 
 _RING_BYTES: Final = 64_000_000
-_ROOM_BYTES: Final = 24_000_000  # margin above a full ring, for other memory of a process
+_MARGIN_BYTES: Final = 24_000_000  # margin above a full ring, for other memory of a process
 _START_S: Final = 2.0  # time limit until a node listens and sensors are connected to it
-_QUIET_S: Final = 1.5  # time after which every acknowledgement that was sent has arrived
+_ACK_DELAY_S: Final = 1.5  # time after which every acknowledgement that was sent has arrived
 Found = dict[str, Any]
 
 
@@ -54,7 +54,7 @@ def disk_full(folder: Path, disk: Path, *, seed: int) -> Found:
         ballast.unlink()
 
     ballast.write_bytes(bytes(9_000_000))
-    return _faulty(folder, RestartedRecorder(folder, archive=archive), free, seed=seed, count=25)
+    return _send_through_fault(folder, RestartedRecorder(folder, archive=archive), free, seed=seed, count=25)
 
 
 def disk_fails(folder: Path, *, seed: int) -> Found:
@@ -63,10 +63,10 @@ def disk_fails(folder: Path, *, seed: int) -> Found:
     The counts are those of `disk_full`.
     """
     record = RestartedRecorder(folder)
-    return _faulty(folder, record, None, seed=seed, count=60)
+    return _send_through_fault(folder, record, None, seed=seed, count=60)
 
 
-def _faulty(
+def _send_through_fault(
     folder: Path, record: RestartedRecorder, free: Callable[[], None] | None, *, seed: int, count: int
 ) -> Found:
     """Send until the disk fails, repair it, and send the remaining measurements.
@@ -88,9 +88,9 @@ def _faulty(
             until(lambda: bool(read_diaries([diary]).acked()))
             _limit(node, 100_000)
         fault = node.wait_for("fault")
-        time.sleep(_QUIET_S)
+        time.sleep(_ACK_DELAY_S)
         acked = len(read_diaries([diary]).acked())
-        time.sleep(_QUIET_S)
+        time.sleep(_ACK_DELAY_S)
         acked_in_fault = len(read_diaries([diary]).acked()) - acked
         state = state_of(record.address)["state"]
         if free is None:
@@ -166,7 +166,7 @@ def away(folder: Path, *, seed: int, away_s: float, how: str) -> Found:
     return (
         found
         | ended
-        | {"left_over": overrun["left_over"], "most memory, MB": (_RING_BYTES + _ROOM_BYTES) / 1e6}
+        | {"left_over": overrun["left_over"], "most memory, MB": (_RING_BYTES + _MARGIN_BYTES) / 1e6}
         | {f"{name} too long": overrun[name] for name in ("lost", "missing", "wrong", "twice", "unexpected", "silent")}
     )
 

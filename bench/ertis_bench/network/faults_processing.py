@@ -22,7 +22,7 @@ from ertis_numba.network.subscriber import Subscriber
 __all__ = ["grouped", "groups", "workers"]
 
 _DIRECTIONS: Final = "2d:9"
-_WHILE_STARTING: Final = 0.1  # share of workers that are killed while they start
+_SHARE_WHILE_STARTING: Final = 0.1  # share of workers that are killed while they start
 
 Found = dict[str, Any]
 
@@ -54,7 +54,7 @@ def workers(folder: Path, *, seed: int, count: int) -> Found:
             fresh = [
                 each.pid
                 for each in (processing.workers if processing else ())
-                if each.pid not in seen and (each.state != "starting" or rng.random() < _WHILE_STARTING)
+                if each.pid not in seen and (each.state != "starting" or rng.random() < _SHARE_WHILE_STARTING)
             ]
             for pid in fresh[:1]:  # The other worker continues.
                 seen.add(pid)

@@ -28,14 +28,14 @@ from ertis_numba.network.subscriber import Subscriber
 
 __all__ = ["flips", "gone"]
 
-_BACKWARDS: Final = 0.1  # share of flips on the way to a client, which needs three seconds to detect one
+_SHARE_TO_CLIENT: Final = 0.1  # share of flips on the way to a client, which needs three seconds to detect one
 _FLIPPED_S: Final = 20.0
-_VICTIMS: Final = 5  # sensor nodes that are killed together
+_N_VICTIMS: Final = 5  # sensor nodes that are killed together
 _WINDOW: Final = 16  # measurements that a node may have under way
-_UNDER_WAY_S: Final = 1.0  # time limit until the window is full
+_FILL_WINDOW_S: Final = 1.0  # time limit until the window is full
 _RATE_HZ: Final = 20.0
 _RING_BYTES: Final = 500_000_000
-_CABLES: Final = 4  # connections to each port
+_N_CONNECTIONS: Final = 4  # connections to each port
 Found = dict[str, Any]
 
 
@@ -64,7 +64,7 @@ def flips(folder: Path, *, seed: int, count: int) -> Found:
         with ExitStack() as clients:
             cables = [
                 clients.enter_context(Meddler(listening[name], seed=rng.randrange(2**32)))
-                for name in ("address", "publish") * _CABLES
+                for name in ("address", "publish") * _N_CONNECTIONS
             ]
             job = SenderJob(
                 address=cables[0].address, diary=str(diary), rate_hz=_RATE_HZ, seed=seed, ring_bytes=_RING_BYTES
@@ -116,7 +116,7 @@ def _flip(cable: Meddler, rng: random.Random, count: int) -> None:
         The cable carries no more messages.
     """
     for number in range(count):
-        direction: Direction = "from target" if rng.random() < _BACKWARDS else "to target"
+        direction: Direction = "from target" if rng.random() < _SHARE_TO_CLIENT else "to target"
         cable.flip(direction)
         if not until(lambda number=number: sum(cable.did.values()) > number, timeout_s=_FLIPPED_S):  # type: ignore[misc]
             raise DataError(f"no message passes {cable.address} after {number} flips")
@@ -190,8 +190,8 @@ def gone(folder: Path, *, seed: int, count: int) -> Found:
         pid, before = node.node_pid, _tcp_sockets(node.node_pid)
         sender = stack.enter_context(job.start())
         sender.wait_for("begun")
-        for first in range(0, count, _VICTIMS):
-            victims = [folder / f"victim{number}.ndjson" for number in range(first, min(count, first + _VICTIMS))]
+        for first in range(0, count, _N_VICTIMS):
+            victims = [folder / f"victim{number}.ndjson" for number in range(first, min(count, first + _N_VICTIMS))]
             diaries += victims
             _kill_while_behind(node.node_pid, job, victims)
         until(lambda: _all_acked(steady, at_minimum=1))
@@ -219,7 +219,7 @@ def _kill_while_behind(pid: int, job: SenderJob, diaries: list[Path]) -> None:
         until(lambda: all(_all_acked(diary, at_minimum=1) for diary in diaries))
         begun_s = time.monotonic()
         os.kill(pid, signal.SIGUSR1)
-        until(lambda: all(_n_waiting(diary) > _WINDOW for diary in diaries), timeout_s=_UNDER_WAY_S)
+        until(lambda: all(_n_waiting(diary) > _WINDOW for diary in diaries), timeout_s=_FILL_WINDOW_S)
         for victim in victims:
             victim.kill()
         time.sleep(max(0.0, begun_s + BUSY_S - time.monotonic()))

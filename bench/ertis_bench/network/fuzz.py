@@ -113,7 +113,7 @@ def _plausible(rng: random.Random) -> list[bytes]:
             return [VALID["hello"], _SETTINGS]
 
 
-def _bent(rng: random.Random) -> bytes:
+def _corrupted(rng: random.Random) -> bytes:
     """Return a header with changed, additional or missing bytes."""
     data = bytearray(rng.choice(list(VALID.values())))
     for _ in range(rng.randint(1, 4)):
@@ -158,8 +158,8 @@ def _odd(rng: random.Random) -> bytes:
 
 
 _WAYS: Final[tuple[Callable[[random.Random], bytes], ...]] = (
-    _bent,
-    _bent,
+    _corrupted,
+    _corrupted,
     _odd_field,
     _odd_field,
     _spliced,

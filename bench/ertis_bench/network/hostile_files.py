@@ -216,7 +216,7 @@ def _unwritten(*names: str) -> Callable[[h5py.File, Path], None]:
     return spoil
 
 
-def _flat(name: str, shape: tuple[int, ...]) -> Callable[[h5py.File, Path], None]:
+def _of_shape(name: str, shape: tuple[int, ...]) -> Callable[[h5py.File, Path], None]:
     """Return a function that creates a variable of a shape without writing it."""
 
     def spoil(file: h5py.File, _: Path) -> None:
@@ -239,12 +239,14 @@ def _sizes() -> Iterator[HostileFile]:
     for name in ("time", "crc32", "temperature", "pdm", "gap_first", "gap_reason"):
         yield HostileFile(f"rows: {_ROWS:,} of {name}", _unwritten(name))
     for name in ("call", "microphone", "microphone_position", "calibration_gain"):
-        yield HostileFile(f"shape: {name} of a billion", _flat(name, (10**9, 3)[: 1 + (name == "microphone_position")]))
-        yield HostileFile(f"shape: {name} of four axes", _flat(name, (10, 10, 10, 10)))
-    yield HostileFile("shape: pdm of 1 TB", _flat("pdm", (10**6, 2**18)))
-    yield HostileFile("shape: pdm of no rows", _flat("pdm", (0, 32_768)))
-    yield HostileFile("shape: pdm of rows without samples", _flat("pdm", (3, 0)))
-    yield HostileFile("shape: settings of a million", _flat("settings", (10**6,)))
+        yield HostileFile(
+            f"shape: {name} of a billion", _of_shape(name, (10**9, 3)[: 1 + (name == "microphone_position")])
+        )
+        yield HostileFile(f"shape: {name} of four axes", _of_shape(name, (10, 10, 10, 10)))
+    yield HostileFile("shape: pdm of 1 TB", _of_shape("pdm", (10**6, 2**18)))
+    yield HostileFile("shape: pdm of no rows", _of_shape("pdm", (0, 32_768)))
+    yield HostileFile("shape: pdm of rows without samples", _of_shape("pdm", (3, 0)))
+    yield HostileFile("shape: settings of a million", _of_shape("settings", (10**6,)))
     yield HostileFile("compressed: 3 GB of zeros", _bomb)
     for n_bytes in (262_145, 10**6, 2**28):
         yield HostileFile(f"settings: text of {n_bytes:,} bytes", _long_settings(n_bytes))

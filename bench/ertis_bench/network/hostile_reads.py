@@ -43,7 +43,7 @@ def main() -> None:
     for name in _LOADED:
         importlib.import_module(name)
     good = write_good(given.folder / "good.h5")
-    _warm(good, given.folder)
+    _check_valid_file(good, given.folder)
     floor = {
         command: _read(command, given.folder / "nothing.h5", given.folder) for command in ("verify", "info", "process")
     }
@@ -54,7 +54,7 @@ def main() -> None:
     print(json.dumps(_summary(chosen, reads)))  # noqa: T201  read by who started it
 
 
-def _warm(good: Path, folder: Path) -> None:
+def _check_valid_file(good: Path, folder: Path) -> None:
     """Check that the commands accept the valid file.
 
     The check runs in forks, so that lazily imported modules stay out of the parent.
@@ -95,7 +95,7 @@ def _read(command: str, path: Path, folder: Path) -> _Read:
     begun_s = time.monotonic()
     pid = os.fork()
     if not pid:
-        _become(arguments, stated)
+        _run_in_this_process(arguments, stated)
     _, status, usage = os.wait4(pid, 0)
     took_s = time.monotonic() - begun_s
     lines = stated.read_text(errors="replace").strip().splitlines()
@@ -110,7 +110,7 @@ def _read(command: str, path: Path, folder: Path) -> _Read:
     )
 
 
-def _become(arguments: list[str], stated: Path) -> None:
+def _run_in_this_process(arguments: list[str], stated: Path) -> None:
     """Run a command in this process, and exit."""
     code = 70
     try:

@@ -20,7 +20,7 @@ from ertis_numba.storage import RecordingGap, open_recording, sensor_names
 
 __all__ = ["Archived", "Sent", "compare", "note", "read_diaries", "read_folder"]
 
-_UNTOLD: Final = "not among the measurements given"  # Reason that a recording states for unexplained missing numbers.
+_UNEXPLAINED: Final = "not among the measurements given"  # reason in recordings for unexplained gaps
 
 
 @dataclass(slots=True)
@@ -119,7 +119,7 @@ class Archived:
             for gap in self.gaps.get((key.sensor, key.session_id), ())
             if gap.first <= key.sequence <= gap.last
         ]
-        return next((reason for reason in reasons if reason != _UNTOLD), None)
+        return next((reason for reason in reasons if reason != _UNEXPLAINED), None)
 
 
 def read_folder(folder: Path) -> Archived:

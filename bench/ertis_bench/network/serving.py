@@ -23,14 +23,14 @@ from ertis_numba.settings import Settings
 
 __all__ = ["Serve", "accounts", "expected_of", "percentile", "some_words"]
 
-_KINDS: Final = 5  # number of different measurements
+_N_MEASUREMENTS: Final = 5  # number of different measurements
 
 Found = dict[str, Any]
 
 
 def some_words(settings: Settings, path: Path, *, seed: int) -> Path:
     """Write the words of some measurements of noise into a file."""
-    shape = (_KINDS, settings.recording.n_samples)
+    shape = (_N_MEASUREMENTS, settings.recording.n_samples)
     np.save(path, np.random.default_rng(seed).integers(0, 2**32, shape, dtype=np.uint32))
     return path
 

@@ -9,7 +9,7 @@ from ertis_bench.markdown import table
 __all__ = ["ROWS", "network", "network_faults", "row"]
 
 _STORED: Final = "{stored:,} stored, {lost} lost, {twice} twice, {wrong} wrong, {silent} unexplained"
-_NOT_HERE: Final = "not tried: requires root"
+_NEEDS_ROOT: Final = "not tried: requires root"
 
 _CONDITIONS: Final = (
     "CURVE encryption over loopback; sensor nodes, central node and application share the cores. Sensor-node "
@@ -171,17 +171,17 @@ def row(name: str, found: Mapping[str, Any] | None) -> tuple[str, str, str]:
     """
     tried, wanted, became = ROWS[name]
     if found is None:
-        return tried.partition(",")[0].partition("{")[0].rstrip(), wanted, _NOT_HERE
+        return tried.partition(",")[0].partition("{")[0].rstrip(), wanted, _NEEDS_ROOT
     if "reason" in found:
         return tried, wanted, f"not tried: {found['reason']}"
     values = dict(found)
     values["faults"] = sum(found.get("meddled", {}).values())
     for field in ("dropped", "refused", "let in", "taken", "crashes", "failed"):
-        values[f"{field} all"] = _all(found.get(field))
+        values[f"{field} all"] = _as_list(found.get(field))
     return tried.format(**values), wanted, became.format(**values)
 
 
-def _all(found: Any) -> str:
+def _as_list(found: Any) -> str:
     """Return counts by reason, or names, as a list in words."""
     if isinstance(found, Mapping):
         return ", ".join(f"{count:,} {reason}" for reason, count in sorted(found.items())) or "0"
@@ -220,7 +220,7 @@ def _figure(row: dict[str, Any]) -> dict[str, str]:
         )
         goal = row["goal"]
         found = (
-            f"{row['received']:,} = {row['published']:,} published + {_all(row['dropped'])} dropped; "
+            f"{row['received']:,} = {row['published']:,} published + {_as_list(row['dropped'])} dropped; "
             f"{row['images']:,} images received, {row['skipped']} skipped, {row['wrong']} wrong; capture to image p50 "
             f"{row['p50_ms']:.1f} ms, p99 {row['p99_ms']:.1f} ms, slowest {row['slowest_ms']:.0f} ms"
         )

@@ -45,7 +45,7 @@ def recover_archive(disk: Path, sent: Sent, rng: random.Random, *, by_command: b
     if by_command or rng.random() < 0.3:
         failed = _recover(folder, by_command=by_command)
     else:
-        failed, acked_through = _start(folder)
+        failed, acked_through = _open_archive(folder)
     archived = _read(folder)
     found = compare(sent, archived, sent.acked())
     # A sensor node discards measurements that are reported as stored.
@@ -66,7 +66,7 @@ def _read(folder: Path) -> Archived:
     return archived
 
 
-def _start(folder: Path) -> tuple[int, dict[SensorSession, int]]:
+def _open_archive(folder: Path) -> tuple[int, dict[SensorSession, int]]:
     """Open a folder as a central node does, and return the number of errors and the known sessions."""
     try:
         journal_store = JournalStore(folder, "recording", Ledger(folder), lambda _: None)

@@ -18,11 +18,11 @@ __all__ = ["SCENARIOS", "reason_not_to_try", "try_cuts"]
 
 SCENARIOS: Final = ("capture", "journal", "record", "serve", "spool")
 _SOURCE: Final = Path(__file__).parents[3] / "data" / "synthetic" / "reflectors.h5"
-_ACKED: Final = ("record", "serve")  # scenarios that count acknowledgements of the central node
+_CENTRAL: Final = ("record", "serve")  # scenarios that count acknowledgements of the central node
 _STATES_OF_A_RUN: Final = 100
-_AFTER_ACK: Final = 0.5  # share of cuts right after an acknowledgement
-_BY_COMMAND: Final = 0.005  # share of states that the real command recovers
-_MAX_FAILING: Final = 12  # maximum number of failing syncs per process
+_SHARE_AFTER_ACK: Final = 0.5  # share of cuts right after an acknowledgement
+_SHARE_BY_COMMAND: Final = 0.005  # share of states that the real command recovers
+_MAX_FAILING_SYNCS: Final = 12  # maximum number of failing syncs per process
 _FIRST_SYNC: Final = 5  # First sync that may fail. A node listens by then.
 
 
@@ -86,7 +86,7 @@ def try_cuts(
             place.mkdir()
             n_sent = rng.randint(min(4, n_measurements), n_measurements)
             first = _FIRST_SYNC + rng.randint(0, n_sent)  # about one sync per measurement
-            fail = (first, rng.randint(1, _MAX_FAILING), rng.getrandbits(16)) if fails else None
+            fail = (first, rng.randint(1, _MAX_FAILING_SYNCS), rng.getrandbits(16)) if fails else None
             setting = Setting(folder=place, disk_log=library, seed=rng.getrandbits(31), count=n_sent, fail=fail)
             trace = _run(name, setting)
             of_kind["runs"] += 1
@@ -124,7 +124,7 @@ def _cut(
     found["failed_syncs"] += sum(record.kind is logs.DiskOperation.SYNC_FAIL for record in records)
     moments: Counter[int] = Counter()
     for _ in range(count):
-        after_ack = acks and rng.random() < _AFTER_ACK
+        after_ack = acks and rng.random() < _SHARE_AFTER_ACK
         moments[rng.choice(acks) if after_ack else rng.randrange(len(records))] += 1
     disk, acknowledged = Disk(trace.setting.disk), AcknowledgedState()
     state = trace.setting.folder / "state"
@@ -137,7 +137,7 @@ def _cut(
                 kept = shutil.copytree(state, keep / f"{name}-{keep.stat().st_nlink}-{place}-{found['states']}")
             one = _recover(name, trace, state, acknowledged, rng)
             found["states"] += 1
-            found["acknowledged"] += len(acknowledged.sent.acked() if name in _ACKED else acknowledged.sent.kept)
+            found["acknowledged"] += len(acknowledged.sent.acked() if name in _CENTRAL else acknowledged.sent.kept)
             found.update(one)
             if any(one.values()):
                 say(f"{name} {trace.setting.fail} at record {place} of {len(records)}: {one}")
@@ -147,7 +147,7 @@ def _cut(
 
 
 def _recover(name: str, trace: Trace, state: Path, acknowledged: AcknowledgedState, rng: random.Random) -> Found:
-    by_command = rng.random() < _BY_COMMAND
+    by_command = rng.random() < _SHARE_BY_COMMAND
     if name in ("capture", "journal"):
         return recover_capture(state, acknowledged.sent, trace.sent_crc32, by_command=by_command)
     if name == "spool":
