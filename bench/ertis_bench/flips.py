@@ -217,7 +217,7 @@ def _ledger(folder: Path) -> Judge:
     def read(work: Path) -> tuple[object, bool]:
         ledger = Ledger(work)
         if any(last > whole.acked_through.get(run, -1) for run, last in ledger.acked_through.items()):
-            return None, False  # The spool would discard later measurements, whatever it reports.
+            return None, False  # The node would take later measurements for stored.
         return (ledger.acked_through, ledger.open, ledger.unsealed, ledger.gaps), bool(ledger.damage)
 
     return lambda work: _classify(lambda: read(work), wanted)

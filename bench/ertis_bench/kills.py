@@ -133,8 +133,8 @@ def sealing(folder: Path, *, seed: int, count: int) -> dict[str, int]:
     Returns
     -------
     dict of str to int
-        ``kills``; of them ``late``, after the end of the sealing. ``broken``, recordings that could not be read under
-        their final name at any time. ``different``, recordings that differ from that of an undisturbed sealing.
+        ``kills``; of them ``late``, after the end of the sealing. ``broken``, recordings that were unreadable under
+        their final name at least once. ``different``, recordings that differ from that of an undisturbed sealing.
         ``left_over``, remaining files.
     """
     rng = random.Random(seed)  # noqa: S311  nothing is secret

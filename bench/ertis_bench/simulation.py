@@ -84,12 +84,12 @@ def run(*, count: int, say: Callable[[str], None]) -> dict[str, Any]:
         The two images differ by more than the tolerance of the omitted effects.
     """
     scene = free_field()
-    say("deciding")
+    say("choosing the effects")
     # Keys of the scene request most of these effects, which would keep them on. Here, only the change of the image
     # must decide.
     plan = make_plan(scene.replace(effects=dict.fromkeys(ASKED_FOR, False)))
     everything = make_plan(scene.replace(effects=dict.fromkeys(_ALL_EFFECTS, True)))
-    say("checking")
+    say("comparing the images")
     change_db = _change_db(scene, plan, everything)
     allowed_db = scene.tolerance_db * len(everything.active - plan.active)
     if change_db > allowed_db:
@@ -98,7 +98,7 @@ def run(*, count: int, say: Callable[[str], None]) -> dict[str, Any]:
             "Do not use these times"
         )
     say(f"timing {count} of each")
-    simulators = {"called for": Simulator(scene, plan=plan), "everything": Simulator(scene, plan=everything)}
+    simulators = {"relevant effects": Simulator(scene, plan=plan), "all effects": Simulator(scene, plan=everything)}
     for simulator in simulators.values():
         simulator.render()
         simulator.clock.cost_ms.clear()

@@ -176,7 +176,7 @@ def healthy(seed: int) -> tuple[str, Measurement]:
 
 @functools.lru_cache(maxsize=128)
 def base(scene: str, seed: int, *, is_pdm: bool) -> Base:
-    """Return a healthy recording of a planar array of 32 microphones.
+    """Return a healthy recording of a two-dimensional array of 32 microphones.
 
     The recording contains an echo or the direct sound.
     """

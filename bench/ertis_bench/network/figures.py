@@ -259,7 +259,7 @@ def _settings(directions: str) -> Settings:
 
 
 def _overload(folder: Path, duration_s: float, seed: int) -> Found:
-    """Send twice the rate of images that the machine has reached before."""
+    """Measure the rate of images under full load, then send twice that rate."""
     (folder / "calibration").mkdir()
     (folder / "overload").mkdir()
     goal = "received = published + dropped; latency bounded"
