@@ -104,8 +104,8 @@ class _Names:
     def sync(self, folder: str | None, before: int) -> None:
         """Make changes before a time durable.
 
-        On a disk with order "any", only the changes of ``folder`` become durable. On one with order "journal", each sync
-        flushes the disk's journal, and all changes become durable. ``folder`` is None after the sync of a file.
+        On a disk with order "any", only the changes of ``folder`` become durable. On one with order "journal", each
+        sync flushes the disk's journal, and all changes become durable. ``folder`` is None after the sync of a file.
         """
         if folder is None and self._order == "any":
             return
