@@ -56,10 +56,12 @@ def in_background(place, command):
     """Run a command that ends with ``&`` until the block ends; it has told its ports when the block begins."""
     words = [sys.executable, "-m", "ertis_cli.main", *command.removesuffix("&").split()]
     with subprocess.Popen(words, cwd=place, env=environment(place), stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout.readline().startswith("/dev/")
-        yield
-        process.send_signal(signal.SIGTERM)
-        process.communicate()
+        try:
+            assert process.stdout.readline().startswith("/dev/")
+            yield
+        finally:
+            process.send_signal(signal.SIGTERM)
+            process.communicate()
 
 
 def run_here(place, command):

@@ -49,7 +49,7 @@ def test_predictions_for_random_scenes():
     assert not [pair for pair in outside if wrong(rated(pair[0]), PLANS[pair[1]], 2.5, 6.0)]
 
 
-def test_what_stands_for_the_exact_image_is_exact(real):
+def test_reference_image_is_exact(real):
     some = slice(0, 181, 45)
     settings = real.settings.replace(accuracy=BEST)
     azimuth_rad = np.radians(np.linspace(-90, 90, 181))[some]
@@ -60,7 +60,7 @@ def test_what_stands_for_the_exact_image_is_exact(real):
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_without_a_measurement_predictions_err_on_the_safe_side(seed):
+def test_predictions_without_a_measurement_are_pessimistic(seed):
     measurement, settings = random_measurement(seed)
     case = Rated(measurement, settings)
     for name in list(PLANS)[seed % 5 :: 5]:
@@ -72,7 +72,7 @@ def test_without_a_measurement_predictions_err_on_the_safe_side(seed):
             assert chosen.error_db > measured_db - 0.5, name
 
 
-def test_the_model_names_each_part_that_a_plan_has(real):
+def test_error_model_names_each_part_of_a_plan(real):
     wanted = {
         "delays 2 2": {"delays"},
         "nodes 4 2": {"delays", "beams"},
@@ -86,7 +86,7 @@ def test_the_model_names_each_part_that_a_plan_has(real):
         assert chosen.error_db == pytest.approx(decibels(sum(chosen.parts.values())))
 
 
-def test_texture_is_that_of_what_is_heard():
+def test_signal_model_describes_the_recorded_noise():
     """Noise of microphones that have nothing in common: a gain of 1, and a flat spectrum."""
     settings = Settings(processing=Processing(directions="2d:91"), accuracy=Accuracy())
     words = np.random.default_rng(1).integers(0, 2**32, settings.recording.n_samples, dtype=np.uint32)
@@ -100,19 +100,19 @@ def test_texture_is_that_of_what_is_heard():
     assert 8 < signal_model.crest < 20
 
 
-def test_silence_has_a_texture():
+def test_silence_has_a_signal_model():
     settings = Settings(processing=Processing(directions="2d:9"))
     case = Rated(Measurement(np.zeros(settings.recording.n_samples, dtype=np.uint32), settings), settings)
     chosen = case.predicted(PLANS["standard"])
     assert all(np.isfinite(power) and power >= 0 for power in chosen.parts.values())
 
 
-def test_nothing_has_a_level():
+def test_empty_image_has_a_level():
     assert decibels(0.0) == -300.0
     assert decibels(0.1) == pytest.approx(-10.0)
 
 
-def test_more_damping_lets_less_noise_through():
+def test_higher_stopband_attenuation_lowers_the_noise():
     """From 60 dB on; taps of 16 bits do no better than 40 dB for long, which is what the model is there to know."""
     planner = Planner(Settings(), CPU, threads=1)
     powers = [

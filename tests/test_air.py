@@ -20,7 +20,7 @@ airs = st.builds(
 
 
 @pytest.mark.parametrize(("temperature_c", "speed_m_s"), [(-20, 318.9), (0, 331.3), (20, 343.2), (40, 354.7)])
-def test_dry_air(temperature_c, speed_m_s):
+def test_speed_of_sound_in_dry_air_matches_tables(temperature_c, speed_m_s):
     assert sound_speed_m_s(Air(temperature_c=temperature_c, humidity_percent=0)) == pytest.approx(speed_m_s, abs=0.1)
 
 
@@ -46,23 +46,23 @@ def speed_by_cramer_m_s(temperature_c, humidity_percent, pressure_pa=101_325.0, 
 
 @pytest.mark.parametrize("temperature_c", [0, 10, 20, 30])
 @pytest.mark.parametrize("humidity_percent", [0, 50, 100])
-def test_humid_air(temperature_c, humidity_percent):
+def test_speed_of_sound_in_humid_air_matches_tables(temperature_c, humidity_percent):
     air = Air(temperature_c=temperature_c, humidity_percent=humidity_percent)
     assert sound_speed_m_s(air) == pytest.approx(speed_by_cramer_m_s(temperature_c, humidity_percent), rel=5e-4)
 
 
-def test_humidity_adds_up_to_four_parts_in_a_thousand_at_room_temperature():
+def test_humidity_adds_at_most_0_4_percent_at_room_temperature():
     dry, humid = (sound_speed_m_s(Air(humidity_percent=percent)) for percent in (0, 100))
     assert 0.003 < humid / dry - 1 < 0.0045
 
 
-def test_pressure_does_not_matter_without_humidity():
+def test_pressure_is_irrelevant_in_dry_air():
     thin, thick = (sound_speed_m_s(Air(humidity_percent=0, pressure_pa=pa)) for pa in (20_000, 200_000))
     assert thin == thick
 
 
 @given(airs)
-def test_air_of_any_kind_has_a_sensible_speed(air):
+def test_speed_of_sound_is_plausible_for_any_air(air):
     steam = math.sqrt(1.33 * 461.5 * 333.15)  # the fastest there is: water vapour at 60 °C
     assert 300 < sound_speed_m_s(air) <= steam + 1
 
@@ -90,26 +90,26 @@ TABLE_HZ = (20e3, 25e3, 30e3, 40e3, 50e3, 60e3, 80e3, 100e3)
         (20, 90, (0.347, 0.522, 0.722, 1.173, 1.660, 2.158, 3.149, 4.126)),
     ],
 )
-def test_absorption_is_that_of_the_standard(temperature_c, humidity_percent, wanted_db_m):
+def test_absorption_matches_iso_9613(temperature_c, humidity_percent, wanted_db_m):
     """At 101.325 kPa, to all the digits of the table."""
     air = Air(temperature_c=temperature_c, humidity_percent=humidity_percent)
     assert_allclose(absorption_db_m(air, np.array(TABLE_HZ)), wanted_db_m, atol=6e-4)
 
 
-def test_absorption_at_the_anchors_of_the_standard():
+def test_absorption_matches_iso_9613_table_1():
     """ISO 9613-1, table 1: 10 °C, 10 %."""
     air = Air(temperature_c=10, humidity_percent=10)
     assert_allclose(1000 * absorption_db_m(air, np.array([100.0, 1000.0])), [0.585, 21.6], rtol=0.005)
 
 
-def test_absorption_is_plausible_beside_measurements():
+def test_absorption_agrees_with_measurements():
     """B. D. Lawrence, J. A. Simmons, JASA 71, 1982: 0.7 dB/m at 30 kHz and 8 dB/m at 200 kHz."""
     measured_db_m = np.array([0.7, 8.0])
     assert_allclose(absorption_db_m(Air(temperature_c=25), np.array([30e3, 200e3])), [0.91, 9.24], rtol=0.005)
     assert_allclose(absorption_db_m(Air(temperature_c=25), np.array([30e3, 200e3])), measured_db_m, rtol=0.35)
 
 
-def test_dry_air_relaxes_no_oxygen():
+def test_dry_air_has_classical_absorption_at_ultrasound():
     """Without vapour oxygen relaxes at 24 Hz, and what is left in ultrasound is classical: it grows as f²."""
     dry = absorption_db_m(Air(humidity_percent=0), np.array([40e3, 80e3]))
     assert dry[1] / dry[0] == pytest.approx(4, rel=0.01)

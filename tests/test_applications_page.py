@@ -12,7 +12,7 @@ PAGE = page("applications")
 place, platform, ports = network.place, network.platform, network.ports
 
 
-def test_loop(tmp_path):
+def test_application_loop_of_the_page_runs(tmp_path):
     (code,) = python_in(PAGE)
     clouds = [cloud(number, position_m=[[0.3, 0.4, 0], [3, 0, 0]]) for number in range(6)]
     with Publisher() as publisher, publisher.playing(clouds):
@@ -24,7 +24,7 @@ def test_loop(tmp_path):
     assert max(numbers[:-1], default=0) < 3
 
 
-def test_commands(place, ports, platform):
+def test_application_commands_of_the_page_run(place, ports, platform):
     """Nothing is near: the vehicle may go."""
     lines = re.findall(r"^\$ (.*)$", PAGE, re.MULTILINE)
     assert [line.split()[1] for line in lines] == ["example", "emulate", "serve", "capture", "2_safety_stop.py"]

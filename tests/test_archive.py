@@ -98,7 +98,7 @@ def from_zero(count, first=0, **options):
     return entries(count, first=first, **options)
 
 
-def test_it_stores_in_order_and_tells_of_each_once(tmp_path):
+def test_archive_stores_in_order_and_reports_each_item_once(tmp_path):
     given = from_zero(40)
     with Opened(tmp_path) as opened:
         opened.give(*map(item_of, given), gap_of(40, 44), *map(item_of, from_zero(2, 45)))
@@ -108,7 +108,7 @@ def test_it_stores_in_order_and_tells_of_each_once(tmp_path):
     assert stored(tmp_path) == (wanted([*given, *from_zero(2, 45)]), [("left", EPOCH, 40, 44, "lost")])
 
 
-def test_what_does_not_follow_is_sent_back(tmp_path):
+def test_archive_returns_items_out_of_order(tmp_path):
     given = from_zero(3)
     with Opened(tmp_path) as opened:
         opened.give(item_of(given[0]), item_of(given[2]), item_of(given[1]))
@@ -117,7 +117,7 @@ def test_what_does_not_follow_is_sent_back(tmp_path):
     assert stored(tmp_path)[0] == wanted(given[:2])
 
 
-def test_an_item_that_no_journal_can_hold_harms_no_other(tmp_path):
+def test_unstorable_item_does_not_affect_others(tmp_path):
     others = from_zero(2, sensor="right")
     bad = item_of(
         from_zero(1)[0],
@@ -131,7 +131,7 @@ def test_an_item_that_no_journal_can_hold_harms_no_other(tmp_path):
     assert stored(tmp_path)[0] == wanted(others)
 
 
-def test_what_follows_an_item_that_no_journal_can_hold_is_sent_back(tmp_path):
+def test_items_after_an_unstorable_one_are_returned(tmp_path):
     given = from_zero(3)
     given[1:2] = from_zero(1, 1, settings=TINY.replace(recording=TINY.recording.replace(n_samples=8192)))
     others = from_zero(2, sensor="right")
@@ -147,7 +147,7 @@ def test_what_follows_an_item_that_no_journal_can_hold_is_sent_back(tmp_path):
     assert stored(tmp_path)[0] == wanted([given[0], *others])
 
 
-def test_a_number_that_comes_again_is_found_without_looking_at_all(tmp_path, monkeypatch):
+def test_repeated_number_is_found_without_a_full_search(tmp_path, monkeypatch):
     given, (other,) = from_zero(3), from_zero(1, 1, seed=2)
     again = [item_of(from_zero(3)[1]), item_of(other), item_of(from_zero(1, 9)[0])]
     for item in again:
@@ -166,7 +166,7 @@ def test_a_number_that_comes_again_is_found_without_looking_at_all(tmp_path, mon
     assert [event.differs for event in opened.events if isinstance(event, Twin)] == [False, False, True]
 
 
-def test_gaps_share_a_transaction(tmp_path, monkeypatch):
+def test_gaps_share_one_transaction(tmp_path, monkeypatch):
     notes, commits = Journal.note_gaps, []
     monkeypatch.setattr(Journal, "note_gaps", lambda journal, gaps: (commits.append(len(gaps)), notes(journal, gaps)))
     with Opened(tmp_path) as opened:
@@ -181,7 +181,7 @@ def test_gaps_share_a_transaction(tmp_path, monkeypatch):
     )
 
 
-def test_two_places_of_a_sensor_are_two_recordings_even_in_a_batch(tmp_path):
+def test_two_mountings_of_a_sensor_become_two_recordings(tmp_path):
     moved = JournalSensor.from_settings("left", TINY, translation_m=(1.0, 0.0, 0.0))
     first, second = from_zero(2)
     with Opened(tmp_path) as opened:
@@ -189,7 +189,7 @@ def test_two_places_of_a_sensor_are_two_recordings_even_in_a_batch(tmp_path):
     assert len(list(tmp_path.glob(f"*{SUFFIX}"))) == 2
 
 
-def test_a_thread_that_ends_is_noticed(tmp_path, monkeypatch):
+def test_ended_archive_thread_is_detected(tmp_path, monkeypatch):
     with Opened(tmp_path) as opened:
         assert opened.archive.stuck == ""
         monkeypatch.setattr(Archive, "_store", lambda *_: False)
@@ -198,7 +198,7 @@ def test_a_thread_that_ends_is_noticed(tmp_path, monkeypatch):
         assert "the storage thread has ended because of an internal error" in opened.archive.stuck
 
 
-def test_full_recordings_are_sealed_while_it_goes_on(tmp_path):
+def test_full_recordings_are_sealed_during_storage(tmp_path):
     given = from_zero(600)
     with Opened(tmp_path, seal=True, rotate_bytes=1e6) as opened:
         for begin in range(0, 600, 100):
@@ -211,7 +211,7 @@ def test_full_recordings_are_sealed_while_it_goes_on(tmp_path):
     assert sorted(stored(tmp_path)[0]) == sorted(wanted(given))
 
 
-def test_time_makes_a_recording_full(tmp_path, monkeypatch):
+def test_recording_is_full_after_its_time_limit(tmp_path, monkeypatch):
     with Opened(tmp_path) as opened:
         opened.give(item_of(from_zero(1)[0]))
         opened.until_stored(0)
@@ -242,7 +242,7 @@ def failing(monkeypatch, *, times, before=True, error=None):
 
 @pytest.mark.parametrize("before", [True, False])
 @pytest.mark.parametrize("times", [1, 4])
-def test_a_commit_that_fails_is_done_once(before, times, tmp_path, monkeypatch):
+def test_failed_commit_is_repeated_once(before, times, tmp_path, monkeypatch):
     failing(monkeypatch, times=times, before=before)
     given = from_zero(3)
     with Opened(tmp_path) as opened:
@@ -254,7 +254,7 @@ def test_a_commit_that_fails_is_done_once(before, times, tmp_path, monkeypatch):
     assert sorted(stored(tmp_path)[0]) == sorted(wanted(given))
 
 
-def test_any_error_is_a_fault_that_passes(tmp_path, monkeypatch):
+def test_any_error_is_a_temporary_fault(tmp_path, monkeypatch):
     failing(monkeypatch, times=3, error=OSError(5, "Input/output error"))
     with Opened(tmp_path) as opened:
         opened.give(*map(item_of, from_zero(2)))
@@ -263,7 +263,7 @@ def test_any_error_is_a_fault_that_passes(tmp_path, monkeypatch):
     assert faults == ["[Errno 5] Input/output error"]
 
 
-def test_a_journal_that_is_taken_away_is_followed_by_another(tmp_path, monkeypatch):
+def test_removed_journal_is_replaced_by_a_new_one(tmp_path, monkeypatch):
     monkeypatch.setattr("ertis_numba.network.central_node._archive._AGAIN_S", 0.01)
     with Opened(tmp_path) as opened:
         opened.give(item_of(from_zero(1)[0]))
@@ -276,7 +276,7 @@ def test_a_journal_that_is_taken_away_is_followed_by_another(tmp_path, monkeypat
     assert stored(tmp_path)[0] == wanted(from_zero(1, 1))
 
 
-def test_failed_journal_is_limited_and_its_rows_are_stored_in_a_new_one(tmp_path, monkeypatch):
+def test_rows_of_a_failed_journal_are_stored_in_a_new_one(tmp_path, monkeypatch):
     """After a failed sync a journal shows what never reaches the disk."""
     given = from_zero(3)
     with Opened(tmp_path) as opened:
@@ -296,7 +296,7 @@ def test_failed_journal_is_limited_and_its_rows_are_stored_in_a_new_one(tmp_path
     assert sorted(stored(tmp_path)[0]) == sorted(wanted(given))
 
 
-def test_a_journal_that_fails_before_anything_is_acknowledged_is_removed(tmp_path, monkeypatch):
+def test_journal_that_fails_before_any_acknowledgement_is_removed(tmp_path, monkeypatch):
     failing(monkeypatch, times=3, before=False)
     with Opened(tmp_path) as opened:
         opened.give(item_of(from_zero(1)[0]))
@@ -305,7 +305,7 @@ def test_a_journal_that_fails_before_anything_is_acknowledged_is_removed(tmp_pat
     assert stored(tmp_path)[0] == wanted(from_zero(1))
 
 
-def test_a_disk_without_room_keeps_its_journal(tmp_path, monkeypatch):
+def test_full_disk_keeps_its_journal(tmp_path, monkeypatch):
     given = from_zero(2)
     with Opened(tmp_path) as opened:
         opened.give(item_of(given[0]))
@@ -317,7 +317,7 @@ def test_a_disk_without_room_keeps_its_journal(tmp_path, monkeypatch):
     assert stored(tmp_path)[0] == wanted(given)
 
 
-def test_it_ends_although_the_disk_fails(tmp_path, monkeypatch):
+def test_archive_stops_although_the_disk_fails(tmp_path, monkeypatch):
     failing(monkeypatch, times=10**9)
     with Opened(tmp_path) as opened:
         opened.give(item_of(from_zero(1)[0]))
@@ -328,7 +328,7 @@ def test_it_ends_although_the_disk_fails(tmp_path, monkeypatch):
         assert opened.archive.acked_through(RUN) == -1
 
 
-def test_what_was_stored_before_a_fault_is_sealed_at_the_end(tmp_path, monkeypatch):
+def test_measurements_before_a_fault_are_sealed_at_the_end(tmp_path, monkeypatch):
     first, second = (item_of(entry) for entry in from_zero(2))
     with Opened(tmp_path, seal=True) as opened:
         opened.give(first)
@@ -341,7 +341,7 @@ def test_what_was_stored_before_a_fault_is_sealed_at_the_end(tmp_path, monkeypat
     assert reported(opened) == [0]
 
 
-def test_what_a_crash_leaves_is_known_and_sealed(tmp_path):
+def test_journals_left_by_a_crash_are_registered_and_sealed(tmp_path):
     given, left = from_zero(3), tmp_path / "left"
     left.mkdir()
     tmp_path = tmp_path / "running"
@@ -367,7 +367,7 @@ def gaps_in(folder):
 
 
 @pytest.mark.parametrize("how", ["ends", "killed"])
-def test_a_gap_before_any_measurement_is_told_by_the_recording_of_those(tmp_path, how):
+def test_gap_before_any_measurement_is_in_the_next_recording(tmp_path, how):
     """Although the journal that had it was sealed to nothing, as nothing had been measured."""
     with Opened(tmp_path, seal=how == "ends") as opened:
         opened.give(gap_of(0, 4, "ring overflow"))
@@ -391,7 +391,7 @@ def test_a_gap_before_any_measurement_is_told_by_the_recording_of_those(tmp_path
         assert not recording.gaps
 
 
-def test_names_tell_the_order_of_journals_of_one_second(tmp_path, monkeypatch):
+def test_journal_names_within_one_second_keep_their_order(tmp_path, monkeypatch):
     class Stopped(datetime):
         @classmethod
         def now(cls, tz=None):
@@ -409,7 +409,7 @@ def test_names_tell_the_order_of_journals_of_one_second(tmp_path, monkeypatch):
     assert journal_name(tmp_path, "run") == f"run_20260102T030405Z.h5{SUFFIX}"
 
 
-def test_a_gap_of_a_sensor_beside_another_is_told_later(tmp_path):
+def test_gap_of_a_sensor_beside_another_is_reported_later(tmp_path):
     with Opened(tmp_path, seal=True) as opened:
         right = ReceivedItem(
             SensorSession("right", EPOCH), 0, 4, JournalGap("right", 0, 4, "ring overflow", EPOCH), RIGHT, 0.0, b""
@@ -426,7 +426,7 @@ def test_a_gap_of_a_sensor_beside_another_is_told_later(tmp_path):
     assert ("right", 0, 4, "ring overflow") in gaps_in(tmp_path)
 
 
-def test_a_folder_without_a_ledger_is_read(tmp_path):
+def test_folder_without_a_ledger_is_read(tmp_path):
     with Opened(tmp_path, seal=True) as opened:
         opened.give(*map(item_of, from_zero(3)))
         opened.until_stored(2)
@@ -436,14 +436,14 @@ def test_a_folder_without_a_ledger_is_read(tmp_path):
         assert opened.archive.acked_through(RUN) == 4
 
 
-def test_a_journal_that_somebody_else_has_is_not_guessed(tmp_path):
+def test_locked_journal_is_not_assumed_readable(tmp_path):
     with create(tmp_path, from_zero(2)), pytest.raises(JournalInUseError, match="in use by another process"):
         Archive(tmp_path).open()
     with Opened(tmp_path) as opened:  # and the folder is free again
         assert opened.archive.acked_through(RUN) == 1
 
 
-def test_a_journal_that_cannot_be_sealed_is_tried_again(tmp_path, monkeypatch):
+def test_failed_sealing_is_repeated(tmp_path, monkeypatch):
     monkeypatch.setattr("ertis_numba.network.central_node._sealing._AGAIN_S", 0.05)
     with Opened(tmp_path) as opened:
         opened.give(item_of(from_zero(1)[0]))
@@ -459,7 +459,7 @@ def test_a_journal_that_cannot_be_sealed_is_tried_again(tmp_path, monkeypatch):
     assert opened.archive.status().sealing == 0
 
 
-def test_a_journal_that_somebody_else_recovers_is_done(tmp_path, monkeypatch):
+def test_journal_recovered_by_another_process_counts_as_sealed(tmp_path, monkeypatch):
     def seals(journal, **options):
         seal_in_subprocess(journal, **options)
         raise JournalInUseError("somebody else has it")
@@ -476,7 +476,7 @@ def test_a_journal_that_somebody_else_recovers_is_done(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(("share", "rests"), [(0.5, 4.0), (2.0, 0.5)], ids=["room", "scarce"])
-def test_sealing_rests_long_until_the_room_gets_scarce(tmp_path, monkeypatch, share, rests):
+def test_sealing_retries_are_rare_until_free_space_is_scarce(tmp_path, monkeypatch, share, rests):
     asked = []
 
     def seals(journal, **options):
@@ -503,12 +503,12 @@ def test_sealing_rests_long_until_the_room_gets_scarce(tmp_path, monkeypatch, sh
         ({"rotate_s": 0}, "time of a recording is 0"),
     ],
 )
-def test_options_that_cannot_be_used_are_refused(options, message, tmp_path):
+def test_archive_refuses_invalid_options(options, message, tmp_path):
     with pytest.raises(ArgumentError, match=message):
         Archive(tmp_path, **options)
 
 
-def test_a_folder_that_cannot_be_made_is_refused(tmp_path):
+def test_archive_refuses_a_folder_that_cannot_be_created(tmp_path):
     with pytest.raises(DataError, match="give a writable folder"):
         Archive(tmp_path / "no" / "folder").open()
 

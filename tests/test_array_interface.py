@@ -97,7 +97,7 @@ def test_beamform_gives_the_image_of_a_pipeline():
     assert error_db(image_of(pipeline.settings, measurement.data, image.range_m), image.amplitude) < -55
 
 
-def test_beamform_interpolates_the_ranges_asked_for():
+def test_beamform_interpolates_requested_ranges():
     measurement, ranges_m = noise(SHORT), np.arange(0.5, 0.8, 0.001)
     image = image_of(SHORT, measurement.data, ranges_m)
     for every in (slice(None, None, 7), slice(30, 31), slice(10, 60)):
@@ -120,7 +120,7 @@ def test_beamform_makes_real_signals_analytic():
     assert error_db(ertis.beamform(signals, **given), ertis.beamform(analytic, **given)) < -60
 
 
-def test_bits_are_demodulated_as_the_words_that_hold_them():
+def test_bits_are_demodulated_like_the_words_that_contain_them():
     bits = np.random.default_rng(3).integers(0, 2, (9_000, 11)).astype(bool)
     words = (bits @ (1 << np.arange(11))).astype(np.uint16)
     given = {"sample_rate_hz": 4.5e6, "decimation": 10}
@@ -130,7 +130,7 @@ def test_bits_are_demodulated_as_the_words_that_hold_them():
     assert signals.shape == (11, 900)
 
 
-def test_decimation_attenuates_what_would_alias():
+def test_decimation_attenuates_aliasing_frequencies():
     time_s = np.arange(450_000) / 4.5e6
     for frequency_hz, gain in ((151e3, 1.0), (291e3, 1e-3)):
         tone = np.sin(2 * math.pi * frequency_hz * time_s)
@@ -138,7 +138,7 @@ def test_decimation_attenuates_what_would_alias():
         assert math.sqrt(2) * signals[0, 500:-500].std() == pytest.approx(gain, abs=1.1e-3)
 
 
-def test_a_waveform_is_matched_as_the_call_that_it_samples():
+def test_waveform_is_matched_like_the_call_that_it_samples():
     call = Call()
     signals = np.random.default_rng(1).standard_normal((2, 3, 5_000))
     given = {"sample_rate_hz": 450e3, "band_hz": (19e3, 56e3)}

@@ -94,7 +94,7 @@ def test_windows_fall_with_the_distance_from_the_centre(window, layout):
 @given(
     st.lists(st.floats(0.0, 1e3), min_size=8, max_size=8).filter(lambda each: max(each) > 1e-3), st.floats(1e-2, 1e2)
 )
-def test_listed_weights_have_a_mean_of_1_whatever_their_scale(weights, scale):
+def test_listed_weights_are_scaled_to_a_mean_of_1(weights, scale):
     settings = SHORT.replace(array=LINE.replace(positions_m=LINE.positions_m[:8]))
     found = array_weights(weighted(settings, tuple(weights)))
     scaled = array_weights(weighted(settings, tuple(scale * weight for weight in weights)))

@@ -43,13 +43,13 @@ ASKING = {
 }
 
 
-def test_each_effect_with_a_key_of_its_own_is_known():
+def test_each_effect_with_its_own_key_is_listed():
     assert set(ASKING) == ASKED_FOR
     assert set(ESTIMATES) >= ASKED_FOR
 
 
 @pytest.mark.parametrize("name", ASKING)
-def test_effect_that_a_key_asks_for_is_simulated_even_if_no_image_shows_it(name):
+def test_requested_effect_is_simulated_although_no_image_shows_it(name):
     verdict = next(verdict for verdict in make_plan(ASKING[name]).verdicts if verdict.name == name)
     assert verdict.on
     assert verdict.forced
@@ -65,11 +65,11 @@ def test_effect_that_a_key_asks_for_is_simulated_even_if_no_image_shows_it(name)
         Scene(sensors=(SENSOR,), points=(LOUD,), sonars=(Sonar(level_db=-200.0, **AWAY),)),
     ],
 )
-def test_other_sources_are_simulated_even_if_no_image_shows_them(scene):
+def test_other_sources_are_simulated_although_no_image_shows_them(scene):
     assert "interference" in make_plan(scene).active
 
 
-def test_recorded_noise_has_the_level_that_the_scene_asks_for():
+def test_recorded_noise_has_the_level_of_the_scene():
     quiet = sensor(noise_dbfs=-60.0).replace(recording=Recording(n_samples=40_000, encoding="float32"))
     far = Point(range_m=0.35, strength_db=-3.0)  # over before the second half of the record
     simulator = Simulator(Scene(sensors=(quiet,), points=(far,)))
@@ -87,7 +87,7 @@ def test_tolerance_of_zero_keeps_every_effect():
     assert plan.active < set(EFFECTS)  # not those on which the scene has nothing to act
 
 
-def test_effects_left_out_are_in_the_summary_and_in_the_file(tmp_path):
+def test_omitted_effects_are_in_the_summary_and_in_the_file(tmp_path):
     path = tmp_path / "scene.toml"
     point = Point(range_m=0.6, velocity_m_s=(1e-4, 0.0, 0.0))
     path.write_text(scene_of(point).to_toml(), encoding="utf-8")

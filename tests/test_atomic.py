@@ -8,7 +8,7 @@ import pytest
 from ertis_numba.atomic_files import atomic_write
 
 
-def test_nothing_is_left_of_what_fails(tmp_path):
+def test_failed_write_leaves_no_file(tmp_path):
     def half(part):
         part.write_text("half")
         raise OSError(errno.EIO, "wanted", str(part))
@@ -19,7 +19,7 @@ def test_nothing_is_left_of_what_fails(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_came_first_is_told_where_nothing_can_be_removed(tmp_path, monkeypatch):
+def test_first_error_is_reported_if_cleanup_fails_too(tmp_path, monkeypatch):
     """As in a file system that has become read-only."""
 
     def refuse(path, *, missing_ok=False):
@@ -32,7 +32,7 @@ def test_what_came_first_is_told_where_nothing_can_be_removed(tmp_path, monkeypa
     assert caught.value.filename == str(tmp_path / "a.txt")
 
 
-def test_a_full_disk_is_told_with_the_name_of_the_file(tmp_path):
+def test_full_disk_is_reported_with_the_name_of_the_file(tmp_path):
     """Where the system tells an error of a file that is open, it has no name."""
     with pytest.raises(OSError, match="No space") as caught, atomic_write(tmp_path / "a.txt"):
         raise OSError(errno.ENOSPC, "No space left on device")

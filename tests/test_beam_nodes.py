@@ -75,7 +75,7 @@ def beams_of(aperture, points, spectra):
 @pytest.mark.parametrize(("n_taps", "density"), CHOICES)
 @pytest.mark.parametrize("grid", GRIDS)
 @pytest.mark.parametrize("array", ARRAYS_M)
-def test_nodes_make_all_beams_within_their_own_error(array, grid, n_taps, density):
+def test_interpolated_beams_stay_within_the_predicted_error(array, grid, n_taps, density):
     """Of microphones that hear noise of their own, the mean over some noises."""
     aperture = apertures(array, grid)
     nodes = nodes_of(aperture, n_taps, density)
@@ -96,7 +96,7 @@ def test_nodes_make_all_beams_within_their_own_error(array, grid, n_taps, densit
 
 
 @pytest.mark.parametrize("array", ARRAYS_M)
-def test_what_an_estimate_misses_is_what_it_says(array):
+def test_interpolation_residual_equals_its_prediction(array):
     """Waves of the directions themselves, and what is missed of them, add up to the mean error."""
     aperture = apertures(array, "half sphere")
     rough = nodes_of(aperture, 4, 2.0, estimate=True)
@@ -110,7 +110,7 @@ def test_what_an_estimate_misses_is_what_it_says(array):
 
 
 @pytest.mark.parametrize("array", ARRAYS_M)
-def test_nodes_lie_around_every_direction(array):
+def test_beam_grid_points_surround_every_direction(array):
     """Those about the rim of the half sphere lie beyond it, as points of the plane that are no directions."""
     aperture = apertures(array, "half sphere")
     spacing = aperture.spacing(2.0, high_hz=CALL.high_frequency_hz, sound_speed_m_s=SPEED_M_S)
@@ -127,7 +127,7 @@ def test_nodes_lie_around_every_direction(array):
 
 @pytest.mark.parametrize("range_m", [0.08, 0.5, math.inf])
 @pytest.mark.parametrize("array", ARRAYS_M)
-def test_delays_of_points_are_the_plain_ones(array, range_m):
+def test_beam_grid_delays_equal_direct_delays(array, range_m):
     aperture = apertures(array, "half sphere")
     axes = direction_grid(Processing(directions=GRIDS["half sphere"]))
     directions = unit_vectors(axes.azimuth_rad, axes.elevation_rad)
@@ -147,7 +147,7 @@ NO_PLANE = {
 
 
 @pytest.mark.parametrize("array", NO_PLANE)
-def test_arrays_that_are_no_plane_get_direct_sums(array):
+def test_nonplanar_arrays_use_direct_sums(array):
     settings = tuned(SHORT, max_error_db=-35.0).replace(
         array=NO_PLANE[array], processing=SHORT.processing.replace(directions="3d:800")
     )
@@ -175,13 +175,13 @@ def test_arrays_that_are_no_plane_get_direct_sums(array):
     ],
 )
 @pytest.mark.parametrize("array", NO_PLANE)
-def test_arrays_that_are_no_plane_refuse_nodes(array, plan):
+def test_nonplanar_arrays_refuse_a_beam_grid(array, plan):
     settings = SHORT.replace(array=NO_PLANE[array], accuracy=plan)
     with pytest.raises(ArgumentError, match=r"accuracy\.beam_taps is .*the array (has no extent|is neither).*give 0"):
         Pipeline(settings)
 
 
-def test_many_directions_are_made_of_nodes_and_few_are_not():
+def test_beam_grid_is_used_for_many_directions_only():
     counts = {}
     for directions in ("3d:60", "3d:3000"):
         settings = tuned(SHORT, max_error_db=-35.0)

@@ -31,7 +31,7 @@ LINE_16 = SENSOR.replace(
 
 
 @pytest.mark.parametrize("beamformer", OTHERS)
-def test_pipeline_gives_the_same_bits_on_any_number_of_threads(beamformer):
+def test_beamformers_give_the_same_bits_on_any_number_of_threads(beamformer):
     settings = cases.SHORT.replace(processing=cases.SHORT.processing.replace(directions="2d:90", beamformer=beamformer))
     measurement = cases.noise(settings)
     counts = range(1, KERNELS["cpu"].max_threads + 1)
@@ -43,7 +43,7 @@ def test_pipeline_gives_the_same_bits_on_any_number_of_threads(beamformer):
 
 @pytest.mark.parametrize("device", KERNELS)
 @pytest.mark.parametrize("beamformer", OTHERS)
-def test_the_chain_makes_zeros_of_zeros(device, beamformer):
+def test_beamformers_give_zero_for_zero_input(device, beamformer):
     settings = cases.CASES["line of 8"]
     settings = settings.replace(
         processing=settings.processing.replace(beamformer=beamformer),
@@ -75,7 +75,7 @@ def cut(points, **options):
         ({"beamformer": "capon"}, 11, 1.5, 0.3),
     ],
 )
-def test_side_lobes_are_lower_and_the_beam_is_narrower(options, lower_db, lost_db, narrower):
+def test_adaptive_beamformers_have_lower_side_lobes_and_narrower_beams(options, lower_db, lost_db, narrower):
     point = Point(azimuth_deg=10.0, range_m=1.2, strength_db=-20)
     azimuth_deg, plain_db = cut([point])
     _, found_db = cut([point], **options)
@@ -92,7 +92,7 @@ def dip_db(azimuth_deg, level_db, first_deg, second_deg):
     return min(tops) - level_db[(azimuth_deg > first_deg) & (azimuth_deg < second_deg)].min()
 
 
-def test_capon_parts_what_delay_and_sum_does_not():
+def test_capon_separates_two_points_that_delay_and_sum_merges():
     """Two points 8° apart, of which beams of 7.5° make one; 5 mm in range let them differ between snapshots."""
     points = [
         Point(azimuth_deg=side * 4.0, range_m=1.2 + place, strength_db=-20) for side, place in ((-1, 0), (1, 0.005))
@@ -103,7 +103,7 @@ def test_capon_parts_what_delay_and_sum_does_not():
 
 
 @pytest.mark.parametrize("device", KERNELS)
-def test_capon_parts_independent_sources_within_a_beam(device):
+def test_capon_separates_independent_sources_within_a_beam(device):
     """Narrow band, 16 microphones at half a wavelength: sources at 0.6 of the half-power width, 30 dB over noise."""
     random, sines = np.random.default_rng(6), np.linspace(-0.2, 0.2, 81)
     mics, apart = np.arange(16), 0.6 * 0.886 / 8
@@ -145,7 +145,7 @@ def test_capon_parts_independent_sources_within_a_beam(device):
         ),
     ],
 )
-def test_settings_that_cannot_be(options, reported):
+def test_invalid_beamformer_settings_are_refused(options, reported):
     with pytest.raises(ArgumentError, match=reported):
         Processing(**options)
 
@@ -153,7 +153,7 @@ def test_settings_that_cannot_be(options, reported):
 @pytest.mark.parametrize(
     ("case", "order", "many"), [("one microphone", 2, "1 microphone"), ("16 bits, disabled", 5, "4 microphones")]
 )
-def test_dmas_of_too_few_microphones(case, order, many):
+def test_dmas_of_too_few_microphones_is_refused(case, order, many):
     settings = cases.CASES[case]
     settings = settings.replace(processing=settings.processing.replace(beamformer="dmas", dmas_order=order))
     message = rf"dmas_order is {order}, but the array has {many}; .*Give a lower order or another"
@@ -161,7 +161,7 @@ def test_dmas_of_too_few_microphones(case, order, many):
         Pipeline(settings)
 
 
-def test_command_line(tmp_path):
+def test_process_command_selects_a_beamformer(tmp_path):
     recording, target = write_recording(tmp_path / "rec.h5", noise(count=1)), tmp_path / "img.h5"
     done = CliRunner().invoke(cli, ["process", str(recording), "-o", str(target), "--beamformer", "capon"])
     assert done.exit_code == 0, done.stderr

@@ -66,7 +66,7 @@ def all_of(kernel_set, name):
 
 
 @pytest.mark.parametrize("name", sized([*SHAPES][:3], [*SHAPES][3:]))
-def test_coherence_factor_is_the_referees(kernel_set, name):
+def test_coherence_factor_equals_its_reference(kernel_set, name):
     signals, offsets, weights, shape = beam_input(name)
     out = np.full(shape, 12_345, dtype=np.float32)
     kernel_set.combine_coherence(signals, offsets, weights, out)
@@ -81,7 +81,7 @@ def test_coherence_factor_is_the_referees(kernel_set, name):
         [("prime", 5), ("prime", 7), ("over a tile", 4), ("eRTIS", 2), ("eRTIS", 3), ("many microphones", 2)],
     ),
 )
-def test_dmas_is_all_products_written_out(kernel_set, name, order):
+def test_dmas_equals_the_sum_of_all_products(kernel_set, name, order):
     signals, offsets, weights, shape = beam_input(name)
     out = np.full(shape, 12_345, dtype=np.float32)
     kernel_set.combine_dmas(signals, offsets, weights, order, out)
@@ -91,7 +91,7 @@ def test_dmas_is_all_products_written_out(kernel_set, name, order):
 
 @pytest.mark.parametrize("name", sized(["two microphones", "one range"], [*SHAPES][2:]))
 @pytest.mark.parametrize(("n_snapshots", "loading"), [(5, 0.1), (1, 1e-3), (8, 1e-6), (4, 10.0), (32, 0.1)])
-def test_capon_is_the_referees(kernel_set, name, n_snapshots, loading):
+def test_capon_equals_its_reference(kernel_set, name, n_snapshots, loading):
     signals, offsets, weights, shape = beam_input(name)
     out = np.full(shape, 12_345, dtype=np.float32)
     kernel_set.combine_capon(signals, offsets, weights, n_snapshots, loading, out)
@@ -114,7 +114,7 @@ def test_results_do_not_depend_on_the_number_of_threads():
     [("coherence_factor", {}), ("capon", {}), ("capon", {"diagonal_loading": 1e-6, "snapshots": 32})]
     + [("dmas", {"dmas_order": order}) for order in (2, 5, 8)],
 )
-def test_what_all_microphones_hear_alike_keeps_its_level(kernel_set, beamformer, options, n_mics):
+def test_coherent_signals_keep_their_level(kernel_set, beamformer, options, n_mics):
     if options.get("dmas_order", 2) > n_mics:
         options = {"dmas_order": n_mics}
     signal = complex_noise(50)
@@ -123,7 +123,7 @@ def test_what_all_microphones_hear_alike_keeps_its_level(kernel_set, beamformer,
 
 
 @pytest.mark.parametrize(("beamformer", "order"), [("coherence_factor", 2), ("dmas", 2), ("dmas", 5), ("capon", 2)])
-def test_twice_as_loud_is_twice_as_high(kernel_set, beamformer, order):
+def test_beamformers_scale_with_the_amplitude(kernel_set, beamformer, order):
     signals = complex_noise(8, 40)
     found = [combined(kernel_set, beamformer, scale * signals, dmas_order=order) for scale in (1, 2, 1e-12)]
     np.testing.assert_allclose(found[1], 2 * found[0], rtol=2e-5)
@@ -131,19 +131,19 @@ def test_twice_as_loud_is_twice_as_high(kernel_set, beamformer, order):
 
 
 @pytest.mark.parametrize("beamformer", ["coherence_factor", "capon"])
-def test_one_microphone_is_its_envelope(kernel_set, beamformer):
+def test_beamformer_of_one_microphone_is_its_envelope(kernel_set, beamformer):
     signals = complex_noise(1, 40)
     np.testing.assert_allclose(combined(kernel_set, beamformer, signals), np.abs(signals[0]), rtol=1e-6)
 
 
-def test_capon_of_much_loading_is_delay_and_sum(kernel_set):
+def test_capon_with_high_diagonal_loading_is_delay_and_sum(kernel_set):
     signals = complex_noise(8, 40)
     expected = np.abs(signals.mean(axis=0))
     np.testing.assert_allclose(combined(kernel_set, "capon", signals, diagonal_loading=1e6), expected, rtol=1e-4)
 
 
 @pytest.mark.parametrize("loading", [1e-3, 0.1, 10.0])
-def test_capon_of_one_snapshot_knows_the_coherence_factor_only(kernel_set, loading):
+def test_capon_of_one_snapshot_depends_on_the_coherence_factor_only(kernel_set, loading):
     signals = complex_noise(8, 40)
     beams = np.abs(signals.mean(axis=0))
     factor = combined(kernel_set, "coherence_factor", signals) / beams
@@ -157,7 +157,7 @@ def test_capon_of_one_snapshot_knows_the_coherence_factor_only(kernel_set, loadi
 
 
 @pytest.mark.parametrize("beamformer", OTHERS)
-def test_silence_is_zero(kernel_set, beamformer):
+def test_beamformers_give_zero_for_silence(kernel_set, beamformer):
     """And what comes after it is what it would have been: here, the second half."""
     signals = complex_noise(4, 40)
     signals[:, :20] = 0
@@ -168,7 +168,7 @@ def test_silence_is_zero(kernel_set, beamformer):
     assert alone.all()
 
 
-def test_plain_forms_do_not_survive_silence():
+def test_naive_forms_fail_on_silence():
     y = np.zeros((4, 3), dtype=np.complex64)
     with np.errstate(all="ignore"):
         assert np.isnan(np.abs(y.sum(axis=0)) ** 2 / (4 * (np.abs(y) ** 2).sum(axis=0))).all()
@@ -178,7 +178,7 @@ def test_plain_forms_do_not_survive_silence():
 
 
 @pytest.mark.parametrize("beamformer", OTHERS)
-def test_what_is_next_to_nothing_stays_finite(kernel_set, beamformer):
+def test_beamformers_of_tiny_signals_are_finite(kernel_set, beamformer):
     """Squares of these are no numbers of single precision any more: the plain root is infinite."""
     signals = np.full((4, 40), 1e-25 + 1e-25j, dtype=np.complex64)
     with np.errstate(all="ignore"):
@@ -189,7 +189,7 @@ def test_what_is_next_to_nothing_stays_finite(kernel_set, beamformer):
     assert found.max() <= 1.5e-25
 
 
-def test_one_loud_microphone_does_not_drown_the_products_of_the_others(kernel_set):
+def test_loud_microphone_does_not_mask_dmas_products_of_others(kernel_set):
     """Power sums and Newton's identities lose everything but the loud one, which is in a part of all products only."""
     signals = complex_noise(8, 200)
     signals[3] *= 1e10
@@ -208,7 +208,7 @@ def test_one_loud_microphone_does_not_drown_the_products_of_the_others(kernel_se
     assert np.abs(out[0] / expected - 1).max() < 1e-4
 
 
-def test_capon_of_snapshots_that_are_nearly_equal(kernel_set):
+def test_capon_of_nearly_equal_snapshots_is_accurate(kernel_set):
     """The covariance of few snapshots is singular, and single precision loses what is left under the fraction."""
     loading, random, signals = 1e-6, np.random.default_rng(5), np.ones((16, 5), dtype=np.complex64)
     signals += (3e-4 * random.standard_normal((16, 5))).astype(np.float32)
@@ -230,7 +230,7 @@ def test_capon_of_snapshots_that_are_nearly_equal(kernel_set):
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 @pytest.mark.parametrize(("beamformer", "reach"), [("coherence_factor", 0), ("dmas", 0), ("capon", 2)])
-def test_bad_numbers_stay_where_they_are(kernel_set, beamformer, reach, value):
+def test_nan_affects_only_its_own_ranges(kernel_set, beamformer, reach, value):
     signals = complex_noise(4, 300)
     signals[2, 100] = value
     with np.errstate(all="ignore"), warnings.catch_warnings():

@@ -109,7 +109,7 @@ def test_delay_and_sum_is_the_slope_over_directions():
     assert found["of_copy"] == pytest.approx(0.2)  # 4 GB/s of the 20 that a copy writes
 
 
-def test_right_image_passes_and_its_error_is_told(image):
+def test_correct_image_passes_with_its_error(image):
     assert -60 < checks.require_exact(image, noise(SHORT)) < checks.MAX_ERROR_DB
     checks.require_same_reflector(image, image)
 
@@ -117,13 +117,13 @@ def test_right_image_passes_and_its_error_is_told(image):
 @pytest.mark.parametrize(
     "wrong", [lambda e: 1.1 * e, lambda e: np.roll(e, 1, axis=1), lambda e: np.full_like(e, np.nan)]
 )
-def test_refuses_a_wrong_image(image, wrong):
+def test_benchmark_refuses_a_wrong_image(image, wrong):
     with pytest.raises(DataError, match=r"image of 7 directions has an error of .* dB .*; the limit is -30 dB"):
         checks.require_exact(image.replace(amplitude=wrong(image.amplitude)), noise(SHORT))
 
 
 @pytest.mark.parametrize("shift", [(3, 0), (0, 30)])
-def test_refuses_another_strongest_reflector(image, shift):
+def test_benchmark_refuses_another_strongest_reflector(image, shift):
     amplitude = np.full_like(image.amplitude, 0.1)
     amplitude[2, 50] = 1.0
     with pytest.raises(DataError, match=r"strongest reflector of one image, at 0.591 m, has -20.0 dB in another"):
@@ -132,7 +132,7 @@ def test_refuses_another_strongest_reflector(image, shift):
         )
 
 
-def test_update_refuses_a_file_without_a_place(tmp_path):
+def test_update_refuses_a_file_without_markers(tmp_path):
     target = tmp_path / "a.md"
     with pytest.raises(ArgumentError, match=r"a\.md: .*No such file.*; give a readable Markdown file"):
         tables.update(target, "paper", "x")
@@ -144,7 +144,7 @@ def test_update_refuses_a_file_without_a_place(tmp_path):
     assert target.read_text("utf-8") == MARKED.format("scaling").replace("old", "| new |")
 
 
-def test_a_table_of_some_parts_never_replaces_the_table_of_all(tmp_path):
+def test_partial_table_never_replaces_the_complete_one(tmp_path):
     target = tmp_path / "a.md"
     target.write_text(MARKED.format("reliability"), "utf-8")
     assert tables.place(target, "reliability") == ("reliability", "reliability")
@@ -154,7 +154,7 @@ def test_a_table_of_some_parts_never_replaces_the_table_of_all(tmp_path):
     assert tables.place(target, "reliability", ["flips"]) == ("reliability", "reliability --only flips")
 
 
-def test_command_refuses_a_file_without_a_place_before_it_measures(tmp_path):
+def test_file_without_markers_is_refused_before_measuring(tmp_path):
     target = tmp_path / "a.md"
     target.write_text("nothing", "utf-8")
     result = CliRunner().invoke(cli, ["bench", "paper", "--count", "1", "--update", str(target)])
@@ -173,7 +173,7 @@ def test_subject_is_the_shipped_recording_or_noise(monkeypatch):
     assert measurement.data.shape == (163_840,)
 
 
-def test_machine_is_named(monkeypatch):
+def test_reports_name_the_machine(monkeypatch):
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "1")
     found = machine.describe()
     assert found["cores"] >= 1
@@ -262,7 +262,7 @@ def test_accuracy_rates_every_plan_on_both_subjects(tmp_path):
 
 
 @pytest.mark.usefixtures("quick")
-def test_accuracy_says_what_it_leaves_out(monkeypatch):
+def test_accuracy_benchmark_lists_omissions(monkeypatch):
     monkeypatch.setattr(subject, "_DISTRIBUTION", "no-such-distribution")
     monkeypatch.setattr(plans, "PLANS", FEW[:1])
     done = bench_accuracy()
@@ -275,7 +275,7 @@ def test_accuracy_says_what_it_leaves_out(monkeypatch):
     assert "| real" not in done.stdout
 
 
-def test_front_is_what_nothing_beats():
+def test_pareto_front_contains_undominated_plans():
     row = {"error_db": -40.0, "time_ms": 3.0}
     assert accuracy.beats({"error_db": -41.0, "time_ms": 3.0}, row)
     assert accuracy.beats({"error_db": -40.0, "time_ms": 2.0}, row)
@@ -283,7 +283,7 @@ def test_front_is_what_nothing_beats():
     assert not accuracy.beats({"error_db": -50.0, "time_ms": 3.1}, row)
 
 
-def test_front_is_joined_by_a_line_and_labelled():
+def test_pareto_front_is_drawn_as_a_labelled_line():
     rated = functools.partial(figures.Rated, series="room", time_ms=2.0)
     points = [rated(error_db=-20.0, on_front=True, label="draft"), rated(error_db=-10.0, on_front=False)]
     points += [rated(error_db=-60.0, on_front=True), rated(series="hall", error_db=-30.0, on_front=True)]
@@ -297,7 +297,7 @@ def test_front_is_joined_by_a_line_and_labelled():
 
 @pytest.mark.alone
 @pytest.mark.usefixtures("hardly_warm")
-def test_simulation_times_a_free_field_and_everything(tmp_path):
+def test_simulation_benchmark_times_free_field_and_all_effects(tmp_path):
     target = tmp_path / "README.md"
     target.write_text(MARKED.format("simulation"), "utf-8")
     result = CliRunner().invoke(cli, ["bench", "simulation", "--count", "1", "--json", "--update", str(target)])
@@ -313,7 +313,7 @@ def test_simulation_times_a_free_field_and_everything(tmp_path):
     assert "Time with all effects / time with the relevant effects: " in target.read_text("utf-8")
 
 
-def test_simulation_refuses_to_time_images_that_differ(monkeypatch):
+def test_simulation_benchmark_refuses_differing_images(monkeypatch):
     monkeypatch.setattr(simulation, "image_change_db", lambda *_, **__: 9.0)
     with pytest.raises(DataError, match=r"change the image by 9\.00 dB; the limit is .* dB\. Do not use these times"):
         simulation.run(count=1, say=lambda _: None)

@@ -97,13 +97,13 @@ SOUNDS = {
 
 
 @pytest.mark.parametrize("name", SOUNDS)
-def test_no_sound_is_refused_whatever_the_modulators_are(name):
+def test_sound_of_any_modulator_is_accepted_as_pdm(name):
     for order, dither in itertools.product((1, 2, 3, 4), (0.0, 0.5)):
         words = modulated(SOUNDS[name], order=order, dither=dither)
         assert (verdict(words), verdict(words, SLOW_HZ)) == (None, None), (order, dither)
 
 
-def test_the_real_measurement_is_not_refused():
+def test_real_measurement_is_accepted_as_pdm():
     """Nor is any piece of it, although it has words that were altered."""
     check = BitCheck(len(REAL), RATE_HZ, splices=True)
     assert check.check(REAL) is None
@@ -114,12 +114,12 @@ def test_the_real_measurement_is_not_refused():
 
 
 @pytest.mark.parametrize("name", ["reflectors", "reflectors_3d"])
-def test_recordings_are_not_refused(name):
+def test_recordings_are_accepted_as_pdm(name):
     assert verdict(recorded(name)) is None
 
 
 @pytest.mark.parametrize("path", sorted((SYNTHETIC / "scenes").glob("*.toml")), ids=lambda path: path.stem)
-def test_scenes_are_not_refused(path):
+def test_simulated_scenes_are_accepted_as_pdm(path):
     scene = load_scene(path)
     first = scene.sensors[0]
     sensors = (first.replace(recording=Recording(n_samples=2 * SHORT)), *scene.sensors[1:])
@@ -127,7 +127,7 @@ def test_scenes_are_not_refused(path):
     assert verdict(simulator.render().data) is None
 
 
-def test_broken_microphones_are_told_but_not_refused():
+def test_faulty_microphones_are_reported_but_accepted():
     """Nine of them, one lane of the words among them; they may break one by one while blocks come in."""
     check = BitCheck(SHORT, RATE_HZ, splices=True)
     words = modulated(SOUNDS["direct sound"])
@@ -138,7 +138,7 @@ def test_broken_microphones_are_told_but_not_refused():
     assert list(np.flatnonzero(check.density == 1)) == [0, 1, 2]
 
 
-def test_words_may_be_altered_one_by_one():
+def test_isolated_altered_words_are_accepted():
     """A real sensor does so: in ten words the upper half is nearly the lower half of the next word."""
     for word in GLITCHES:
         assert int(REAL[word] >> 16 ^ REAL[word + 1] & 0xFFFF).bit_count() <= 1
@@ -152,7 +152,7 @@ def test_words_may_be_altered_one_by_one():
 
 
 @pytest.mark.parametrize("largest", [2, 256], ids=["bits", "bytes"])
-def test_flipped_bits_are_not_told_from_what_a_real_sensor_does(largest):
+def test_flipped_bits_are_accepted_like_those_of_a_real_sensor(largest):
     random = np.random.default_rng(5)
     check = BitCheck(len(REAL), RATE_HZ, splices=True)
     clear_of_glitches = [
@@ -208,7 +208,7 @@ FOUND = {
 
 
 @pytest.mark.parametrize("name", FOUND)
-def test_splices_are_found(name):
+def test_splices_are_detected(name):
     words, random = REAL if name == "real" else recorded(name), np.random.default_rng(6)
     check = BitCheck(len(words), RATE_HZ, splices=True)
     for kind, smallest in FOUND[name].items():
@@ -219,7 +219,7 @@ def test_splices_are_found(name):
     assert BitCheck(len(words), RATE_HZ).check(KINDS["repeated"](words, random)) is None  # unless asked for
 
 
-def test_what_is_no_pdm_is_refused():
+def test_data_other_than_pdm_is_refused():
     random = np.random.default_rng(7)
     text = Path(__file__).read_bytes() * 20
     for words, reason in (
@@ -234,7 +234,7 @@ def test_what_is_no_pdm_is_refused():
 
 
 @pytest.mark.parametrize("first", [0, 20_000, len(REAL) - 5_000])
-def test_stretches_that_are_no_pdm_are_refused(first):
+def test_intervals_without_pdm_are_refused(first):
     stretch = slice(first, first + 5_000)
     random = np.random.default_rng(8).integers(0, 2**32, 5_000, dtype=np.uint32)
     for value, reason in ((0, "constant bits"), (0xFFFF_FFFF, "constant bits"), (random, "noise")):
@@ -243,7 +243,7 @@ def test_stretches_that_are_no_pdm_are_refused(first):
         assert verdict(words, splices=False) == reason
 
 
-def test_density_is_the_share_of_ones():
+def test_density_is_the_fraction_of_ones():
     check = BitCheck(len(REAL), RATE_HZ)
     assert check.density is None
     check.check(REAL)
@@ -251,7 +251,7 @@ def test_density_is_the_share_of_ones():
     assert np.array_equal(check.density, bits.mean(axis=0))
 
 
-def test_channels_without_a_microphone_do_not_count():
+def test_channels_without_a_microphone_are_ignored():
     words, enabled = modulated(SOUNDS["silence"]), np.arange(32) >= 8
     noisy = words & ~np.uint32(0xFF) | np.random.default_rng(9).integers(0, 256, SHORT, dtype=np.uint32)
     assert verdict(noisy, enabled=enabled) is None
@@ -259,7 +259,7 @@ def test_channels_without_a_microphone_do_not_count():
     assert verdict(words, enabled=np.zeros(32, dtype=bool)) is None
 
 
-def test_few_impulses_are_looked_at_however_many_there_are(monkeypatch):
+def test_number_of_examined_impulses_is_limited(monkeypatch):
     looked = []
     monkeypatch.setattr(splices.Splices, "_is_splice", lambda *arguments: looked.append(arguments[-2]) is not None)
     words = REAL.copy()
@@ -269,7 +269,7 @@ def test_few_impulses_are_looked_at_however_many_there_are(monkeypatch):
     assert len(looked) == len({at // 1_000 for at in looked}) == 8
 
 
-def test_words_may_be_read_only_and_are_left_alone():
+def test_read_only_words_are_accepted_and_unchanged():
     words = REAL.copy()
     words.flags.writeable = False
     assert verdict(words) is None
@@ -284,7 +284,7 @@ def test_words_may_be_read_only_and_are_left_alone():
         ({"enabled": np.ones(8, dtype=bool)}, r"enabled has shape \(8,\); give shape \(32,\)"),
     ],
 )
-def test_arguments_that_cannot_be_used(change, message):
+def test_pdm_check_refuses_invalid_arguments(change, message):
     with pytest.raises(ArgumentError, match=message):
         BitCheck(**{"n_samples": SHORT, "pdm_rate_hz": RATE_HZ} | change)
 
@@ -296,6 +296,6 @@ def test_arguments_that_cannot_be_used(change, message):
         (np.zeros(SHORT, dtype=np.uint16), r"words are uint16; give uint32"),
     ],
 )
-def test_words_that_are_none(words, message):
+def test_pdm_check_refuses_other_arrays(words, message):
     with pytest.raises(ArgumentError, match=message):
         BitCheck(SHORT, RATE_HZ).check(words)

@@ -122,7 +122,7 @@ def test_process_warns_on_stderr_and_in_the_file(tmp_path):
     assert "images may exceed the error budget" in reported
 
 
-def test_process_is_silent_where_the_budget_is_kept(tmp_path):
+def test_process_prints_no_warning_if_the_budget_is_kept(tmp_path):
     write_recording(tmp_path / "loud.h5", [pcm(PCM, echo=0.3)])
     done = CliRunner().invoke(cli, ["process", str(tmp_path / "loud.h5")])
     assert done.exit_code == 0, done.stderr
@@ -133,7 +133,7 @@ def test_process_is_silent_where_the_budget_is_kept(tmp_path):
 
 
 @pytest.mark.parametrize("seed", [39, 42, 415, 453])
-def test_seeds_that_once_missed_their_budget_silently_no_longer_do(seed):
+def test_budgets_once_missed_silently_are_kept_or_warned_of(seed):
     """Zones of two microphones, direct sound 110 dB above the image, and rounding of direct sound."""
     row = budgets.tried(seed)
     assert row is not None
@@ -186,7 +186,7 @@ def test_files_and_reports_name_the_scope_of_the_budget(tmp_path, processing, bu
 
 
 @pytest.mark.parametrize("seed", [44, 118])
-def test_predictions_of_adaptive_beamformers_are_within_2_db_and_warn_of_no_kept_budget(seed):
+def test_adaptive_predictions_are_within_2_db_without_false_warnings(seed):
     """Predictions for these seeds once were 7 to 8 dB too low, and images warned of if within 15 dB of the budget."""
     measurement, _ = budgets.measurement_of(seed)
     true_db, predicted = errors(measurement)

@@ -81,7 +81,7 @@ def test_acoular_finds_the_reflectors(tmp_path):
     assert {item.name for item in tmp_path.iterdir()} == {"signals.h5", "signals.xml"}  # no cache
 
 
-def test_signals_are_those_of_the_words():
+def test_exported_signals_equal_the_decoded_samples():
     """A call in one-bit words comes back, at its place and its level, within the noise of the bits."""
     settings = line(8, 8)
     rate_hz, n_samples = settings.recording.sample_rate_hz, settings.recording.n_samples
@@ -97,7 +97,7 @@ def test_signals_are_those_of_the_words():
         assert gain * (signal @ wanted) / (wanted @ wanted) == pytest.approx(1.0, abs=0.03)
 
 
-def test_what_is_in_the_files(tmp_path):
+def test_acoular_files_have_the_documented_content(tmp_path):
     settings = line(8, 8)
     settings = settings.replace(array=settings.array.replace(layout='my "<array>"', enabled=(False,) + (True,) * 7))
     (measurement,) = noise(settings, 1)
@@ -116,7 +116,7 @@ def test_what_is_in_the_files(tmp_path):
     assert np.array_equal(places_m, microphones(settings.array).enabled_positions_m)
 
 
-def test_what_is_refused(tmp_path, monkeypatch):
+def test_acoular_export_refuses_invalid_input(tmp_path, monkeypatch):
     for given, message in (
         (noise(), "contains signals of one measurement, but more than one measurement was given; give one"),
         ([], "but no measurement was given"),

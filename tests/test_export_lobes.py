@@ -48,7 +48,7 @@ def points(recording, tmp_path, *options):
         return list(csv.DictReader(file))
 
 
-def test_side_lobes_are_points_that_noise_hardly_moves(recording, tmp_path):
+def test_side_lobes_are_points_with_small_uncertainty(recording, tmp_path):
     found = points(recording, tmp_path)
     strongest = sorted(found, key=lambda row: -float(row["amplitude"]))
     lobes = strongest[2:]
@@ -57,7 +57,7 @@ def test_side_lobes_are_points_that_noise_hardly_moves(recording, tmp_path):
 
 
 @pytest.mark.parametrize("options", [["--min-level", "-5"], ["--top", "2"]])
-def test_options_leave_them_out(recording, tmp_path, options):
+def test_options_omit_side_lobes(recording, tmp_path, options):
     found = points(recording, tmp_path, *options)
     ranges_m = sorted(math.hypot(*(float(row[name]) for name in ("x_m", "y_m", "z_m"))) for row in found)
     assert ranges_m == pytest.approx([1.15, 1.6], abs=0.01)

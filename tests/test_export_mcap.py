@@ -79,7 +79,7 @@ def header(given, frame):
     return {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": frame}
 
 
-def test_topics(bag):
+def test_mcap_has_the_documented_topics(bag):
     messages, profiles, kinds = bag
     assert tuple(KINDS) == TOPICS
     wanted = {f"{base}/{topic}": kind for base in FRAMES.values() for topic, kind in KINDS.items()}
@@ -96,7 +96,7 @@ def test_topics(bag):
 
 
 @pytest.mark.parametrize("given", GIVEN, ids=["first", "second", "spatial"])
-def test_points(bag, given):
+def test_mcap_points_come_back(bag, given):
     sensor = given.stamp.sensor
     message = bag[0][f"{FRAMES[sensor]}/points", given.stamp.timestamp_ns]
     grid = Grid(given.azimuth_rad, given.elevation_rad)
@@ -120,7 +120,7 @@ def test_points(bag, given):
 
 
 @pytest.mark.parametrize("given", GIVEN, ids=["first", "second", "spatial"])
-def test_sonar_image(bag, given):
+def test_mcap_sonar_image_comes_back(bag, given):
     sensor = given.stamp.sensor
     message = bag[0][f"{FRAMES[sensor]}/sonar_image", given.stamp.timestamp_ns]
     amplitudes = message.image.data.view("<f4").reshape(len(given.range_m), len(given.azimuth_rad))
@@ -146,7 +146,7 @@ def test_sonar_image(bag, given):
     }
 
 
-def test_pictures(bag):
+def test_mcap_pictures_show_the_image(bag):
     """Planar: columns from the left, rows from the far end. In space: the brightest pixel is in the right direction."""
     messages, _, _ = bag
     planar = messages["/eRTIS_7/image", TIME_NS]
@@ -173,7 +173,7 @@ def _pixels(given):
 
 
 @pytest.mark.parametrize("direction", [0, 17, 33, 59])
-def test_map_of_directions(direction):
+def test_mcap_map_of_directions_is_correct(direction):
     given = spatial()
     amplitude = np.full_like(given.amplitude, 0.001)
     amplitude[direction, 20] = 1.0
@@ -191,14 +191,14 @@ def test_map_of_directions(direction):
     ("azimuth_deg", "elevation_deg", "shape"),
     [([5], [10], (1, 1)), ([-30, 0, 30], [10, 10, 10], (1, 3)), ([0, 0], [-9, 9], (2, 1))],
 )
-def test_maps_of_few_directions(azimuth_deg, elevation_deg, shape):
+def test_mcap_map_of_few_directions_is_correct(azimuth_deg, elevation_deg, shape):
     pixels = _pixels(image(azimuth_deg, elevation_deg))
     assert pixels.shape == shape
     assert pixels.max() == 255
 
 
 @pytest.mark.parametrize("azimuth_deg", [np.arange(150, 211, 10), [150, 160, 170, 180, -170, -160, -150]])
-def test_the_leftmost_direction_behind_the_sensor_is_the_first_column(azimuth_deg):
+def test_leftmost_direction_behind_the_sensor_is_the_first_column(azimuth_deg):
     """It is 210°, wherever azimuths are said to begin."""
     amplitude = np.geomspace(0.1, 1.0, 7, dtype=np.float32)[:, None].repeat(50, axis=1)  # the farther left, the louder
     pixels = _pixels(image(azimuth_deg, range_m=np.linspace(0.5, 1.5, 50)).replace(amplitude=amplitude))
@@ -206,7 +206,7 @@ def test_the_leftmost_direction_behind_the_sensor_is_the_first_column(azimuth_de
     assert (np.diff(pixels[0].astype(int)) < 0).all()
 
 
-def test_a_map_of_what_is_behind_the_sensor_is_that_of_what_is_ahead():
+def test_map_behind_the_sensor_equals_the_map_ahead():
     azimuth_deg, elevation_deg = (axis.ravel() for axis in np.meshgrid(np.arange(-30, 31, 5), np.arange(-20, 21, 5)))
     ahead = image(azimuth_deg, elevation_deg)
     behind = image((azimuth_deg + 360) % 360 - 180, elevation_deg)
@@ -215,7 +215,7 @@ def test_a_map_of_what_is_behind_the_sensor_is_that_of_what_is_ahead():
     np.testing.assert_array_equal(_pixels(behind), wanted)
 
 
-def test_static_transforms(bag):
+def test_mcap_has_static_transforms(bag):
     message = bag[0]["/tf_static", TIME_NS]
     found = {each.child_frame_id: (each.header.frame_id, reported(each.transform)) for each in message.transforms}
     assert set(found) == {"eRTIS-7", "eRTIS-7_sonar", "2.right", "2.right_sonar"}
@@ -233,7 +233,7 @@ def test_static_transforms(bag):
         np.testing.assert_allclose(turned, sensor, atol=1e-12)
 
 
-def test_definitions_are_those_of_ros():
+def test_message_definitions_equal_those_of_ros():
     """By the hashes of REP 2016; those of the marine messages are in no store and are compared by their fields."""
     own, theirs = get_typestore(Stores.EMPTY), get_typestore(Stores.ROS2_JAZZY)
     for name in ("tf2_msgs/msg/TFMessage", *KINDS.values()):
@@ -253,7 +253,7 @@ def test_definitions_are_those_of_ros():
     assert [field[0] for field in fields] == ["frequency", "sound_speed", "tx_beamwidths", "rx_beamwidths"]
 
 
-def test_settings_are_in_the_metadata(tmp_path):
+def test_mcap_metadata_contains_the_settings(tmp_path):
     from mcap.reader import make_reader  # noqa: PLC0415  one test needs it
 
     (path,) = export(tmp_path / "a.mcap", GIVEN[:1], topics=["points"])
@@ -269,7 +269,7 @@ def test_settings_are_in_the_metadata(tmp_path):
     assert read(path)[0]["/tf_static", TIME_NS].transforms == []
 
 
-def test_what_is_refused(tmp_path, monkeypatch):
+def test_mcap_export_refuses_invalid_input(tmp_path, monkeypatch):
     given = GIVEN[0]
     for items, options, message in (
         ([], {}, "no energyscape is given"),

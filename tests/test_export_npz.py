@@ -27,7 +27,7 @@ def images(count=3):
 
 
 @pytest.mark.parametrize("given", [tuple(images()), iter(images())], ids=["of known length", "as they come"])
-def test_all_comes_back(tmp_path, given):
+def test_npz_preserves_energyscapes_bit_by_bit(tmp_path, given):
     wanted = images()
     (path,) = export(tmp_path / "a.npz", given)
     with np.load(path, allow_pickle=False) as data:
@@ -46,12 +46,12 @@ def test_all_comes_back(tmp_path, given):
         assert len(settings.array.positions_m) == 32  # no other file is needed
 
 
-def test_the_same_images_give_the_same_bytes(tmp_path):
+def test_equal_images_give_equal_npz_files(tmp_path):
     first, second = (export(tmp_path / f"{name}.npz", images())[0].read_bytes() for name in "ab")
     assert first == second
 
 
-def test_what_cannot_share_axes(tmp_path):
+def test_images_with_different_axes_are_refused(tmp_path):
     first, second = images(2)
     cold = second.replace(settings=SMALL.replace(air=Air(temperature_c=0.0)))
     for other, message in (

@@ -85,7 +85,7 @@ def test_clouds_come_back_bit_by_bit(tmp_path, kind, read, text):
     assert np.array_equal(times_ns, np.repeat([each.stamp.timestamp_ns for each in given], counts))
 
 
-def test_csv_comes_back(tmp_path):
+def test_csv_points_come_back(tmp_path):
     given = images('left, and"right')  # which a recording would refuse
     (path,) = export(tmp_path / "a.csv", given, **FINDING)
     with path.open(newline="") as file:
@@ -106,14 +106,14 @@ def test_csv_comes_back(tmp_path):
 
 
 @pytest.mark.parametrize("timestamp_ns", [-1, 2_300_000_000_000_000_000])
-def test_csv_holds_any_time(tmp_path, timestamp_ns):
+def test_csv_stores_times_before_1970_and_after_2106(tmp_path, timestamp_ns):
     """Its times are nanoseconds, which those of ROS are not: there are none before 1970 nor after 2038."""
     (path,) = export(tmp_path / "a.csv", images(count=1, timestamp_ns=timestamp_ns), top=1)
     with path.open(newline="") as file:
         assert [int(row["timestamp_ns"]) for row in csv.DictReader(file)] == [timestamp_ns]
 
 
-def test_the_nearest_reflector_is_where_it_is(tmp_path):
+def test_exported_cloud_has_the_nearest_reflector_in_place(tmp_path):
     """From the words of a scene to a cloud that another program reads."""
     with ertis.open_recording(REFLECTORS) as recording:
         pipeline = ertis.Pipeline(recording.settings)
@@ -128,7 +128,7 @@ def test_the_nearest_reflector_is_where_it_is(tmp_path):
 
 @pytest.mark.parametrize("text", [False, True])
 @pytest.mark.parametrize(("kind", "read"), [("ply", read_ply), ("pcd", read_pcd)])
-def test_silence_is_a_cloud_without_points(tmp_path, kind, read, text):
+def test_silence_gives_an_empty_cloud(tmp_path, kind, read, text):
     silent = image().replace(amplitude=np.zeros_like(image().amplitude))
     (path,) = export(tmp_path / f"a.{kind}", [silent], text=text)
     if kind == "pcd" and text:  # which that reader cannot read
@@ -141,7 +141,7 @@ def test_silence_is_a_cloud_without_points(tmp_path, kind, read, text):
 
 @pytest.mark.parametrize("text", [False, True])
 @pytest.mark.parametrize(("kind", "read"), [("ply", read_ply), ("pcd", read_pcd)])
-def test_what_one_microphone_cannot_tell_is_infinite(tmp_path, kind, read, text):
+def test_single_microphone_has_infinite_angular_uncertainty(tmp_path, kind, read, text):
     given = images(sequence=1, count=1)[0]
     array = given.settings.array.replace(positions_m=((0.0, 0.0, 0.0),))
     export(tmp_path / f"a.{kind}", [given.replace(settings=given.settings.replace(array=array))], text=text)
@@ -150,7 +150,7 @@ def test_what_one_microphone_cannot_tell_is_infinite(tmp_path, kind, read, text)
     assert np.isinf(points["uncertainty_across"]).all()
 
 
-def test_of_an_unknown_mounting_the_frame_is_that_of_the_sensor(tmp_path):
+def test_unknown_mounting_gives_points_in_the_sensor_frame(tmp_path):
     given = images("left", 1)
     export(tmp_path / "a.ply", given, **FINDING)
     points, comments = read_ply(tmp_path / "a.ply")
@@ -173,7 +173,7 @@ def test_of_an_unknown_mounting_the_frame_is_that_of_the_sensor(tmp_path):
     ],
 )
 @pytest.mark.parametrize("kind", ["ply", "pcd"])
-def test_what_cannot_be_in_a_cloud(tmp_path, kind, given, options, message):
+def test_point_export_refuses_invalid_input(tmp_path, kind, given, options, message):
     with pytest.raises(ArgumentError, match=message):
         export(tmp_path / f"a.{kind}", given, **options)
     assert list(tmp_path.iterdir()) == []

@@ -11,7 +11,7 @@ from tests.files import image, line, noise
 
 @pytest.mark.parametrize("engine", ["h5netcdf", "netcdf4"])
 @pytest.mark.parametrize("settings", [line(8, 8), line(70, 16)], ids=["8", "70 in 5 words"])
-def test_recording(tmp_path, engine, settings):
+def test_xarray_opens_a_recording(tmp_path, engine, settings):
     given = noise(settings)
     path = write_recording(tmp_path / "rec.h5", given)
     with xarray.open_dataset(path, group="/sensors/eRTIS-7", engine=engine) as data:
@@ -23,7 +23,7 @@ def test_recording(tmp_path, engine, settings):
 
 
 @pytest.mark.parametrize("engine", ["h5netcdf", "netcdf4"])
-def test_energyscapes(tmp_path, engine):
+def test_xarray_opens_energyscapes(tmp_path, engine):
     path = write_energyscapes(tmp_path / "img.h5", [image(), image(seed=2)])
     with xarray.open_dataset(path, group="/sensors/sensor", engine=engine) as data:
         assert data["amplitude"].dims == ("time", "direction", "range")

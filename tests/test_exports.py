@@ -17,7 +17,7 @@ MODULES = sorted(
 
 
 @pytest.mark.parametrize("name", ["ertis_numba", *MODULES])
-def test_exports_are_what_is_public(name):
+def test_module_exports_equal_public_names(name):
     module = importlib.import_module(name)
     exported = getattr(module, "__all__", [])
     assert len(exported) == len(set(exported))

@@ -135,7 +135,7 @@ def test_missing_extra_is_named_in_one_line(place, name, blocked, line):
     assert files(place) == before
 
 
-def test_commands_without_any_extra(place):
+def test_commands_work_without_extras(place):
     blocked = [module for names in extras().values() for each in names for module in modules_of(each)]
     code, out, err = python(place, HELP.format(blocked=blocked))
     assert code == 0, (out, err)

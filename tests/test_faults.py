@@ -14,14 +14,14 @@ def spoilt_blocks(kinds, count=200, seed=3, size=500):
     return [(block, faults.spoil(block)) for block in (block_of(index, n_samples=size) for index in range(count))]
 
 
-def test_faults_are_the_same_for_the_same_seed():
+def test_equal_seeds_give_equal_faults():
     kinds = dict.fromkeys(KINDS, 0.3) | {"short_reads": True}
     first, again, other = (spoilt_blocks(kinds, seed=seed) for seed in (3, 3, 4))
     assert first == again
     assert first != other
 
 
-def test_without_faults_blocks_stay_as_they_are():
+def test_blocks_without_faults_are_unchanged():
     for block, spoilt in spoilt_blocks({}):
         assert (spoilt.data, spoilt.note, spoilt.faults) == (block, "", ())
         assert len(spoilt.pieces) == 1  # shorter than a terminal's buffer
@@ -42,7 +42,7 @@ def _as_told(block, fault, spoilt):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_notes_tell_what_was_done(kind):
+def test_notes_describe_the_injected_faults(kind):
     for block, spoilt in spoilt_blocks({kind: 1.0}):
         [fault] = spoilt.faults
         assert fault.kind == kind
@@ -57,7 +57,7 @@ def test_notes_tell_what_was_done(kind):
         assert isinstance(spoilt.pieces[-1:] and spoilt.pieces[-1], Unplug) == (kind == "unplug")
 
 
-def test_half_of_all_flips_are_in_the_frame_and_half_of_all_losses_whole_words():
+def test_flips_and_losses_have_their_documented_distribution():
     parts = [spoilt.faults[0].detail for _, spoilt in spoilt_blocks({"flip": 1.0}, count=1000)]
     assert {part: round(parts.count(part) / 1000, 1) for part in parts} == {
         "words": 0.5,
@@ -71,14 +71,14 @@ def test_half_of_all_flips_are_in_the_frame_and_half_of_all_losses_whole_words()
     assert max(loss.n_bytes for loss in losses) > 1000
 
 
-def test_stalls_have_a_length_and_a_limit():
+def test_stalls_have_a_duration_and_a_limit():
     faults = Faults(1, {"stall": 1.0}, longest_stall_s=0.5)
     stalls = [piece.duration_s for _ in range(50) for piece in faults.spoil(block_of(1)).pieces if type(piece) is Stall]
     assert len(stalls) == 50
     assert 0.25 < max(stalls) <= 0.5
 
 
-def test_even_a_block_of_nothing_may_be_spoilt():
+def test_empty_block_may_be_damaged():
     faults = Faults(1, dict.fromkeys(KINDS, 0.5))
     for _ in range(300):
         faults.spoil(encode_block(0, np.zeros(0, np.uint32)))
@@ -93,6 +93,6 @@ def test_even_a_block_of_nothing_may_be_spoilt():
         ({"longest_stall_s": -1}, "longest_stall_s is -1; give a number from 0 to 3600"),
     ],
 )
-def test_faults_that_there_are_not(arguments, message):
+def test_unknown_faults_are_refused(arguments, message):
     with pytest.raises(ArgumentError, match=message):
         Faults(**arguments)

@@ -64,12 +64,12 @@ def test_every_image_can_be_drawn(name):
 
 
 @pytest.mark.parametrize(("theme", "page"), [("dark", "#0b0d12"), ("light", "#ffffff")])
-def test_themes(theme, page):
+def test_every_theme_is_drawn(theme, page):
     assert matplotlib.colors.to_hex(drawn(plot(image(), theme=theme))[0, 0, :3] / 255) == page
 
 
 @pytest.mark.parametrize("kind", ["png", "svg", "pdf"])
-def test_formats(kind):
+def test_every_format_is_written(kind):
     file = io.BytesIO()
     plot(image()).savefig(file, format=kind)
     assert len(file.getvalue()) > 10_000
@@ -88,7 +88,7 @@ def brightest_m(figure):
 
 
 @pytest.mark.parametrize(("azimuth_deg", "range_m"), [(-60.0, 1.0), (0.0, 4.5), (45.0, 3.0)])
-def test_a_reflector_is_where_it_should_be(azimuth_deg, range_m):
+def test_reflector_is_drawn_at_its_position(azimuth_deg, range_m):
     given = image()
     amplitude = np.full_like(given.amplitude, 1e-4)
     amplitude[
@@ -100,7 +100,7 @@ def test_a_reflector_is_where_it_should_be(azimuth_deg, range_m):
     assert ahead_m == pytest.approx(range_m * np.cos(azimuth_rad), abs=0.03)
 
 
-def test_no_reflector_falls_between_pixels():
+def test_reflector_between_pixels_is_drawn():
     level_db = np.full((3, 4001), -40.0, dtype=np.float32)
     level_db[1, 1234] = 0.0
     range_m, joined_db = _sampling.join_ranges(np.linspace(0.0, 40.0, 4001), level_db)
@@ -110,7 +110,7 @@ def test_no_reflector_falls_between_pixels():
     assert joined_db.max() == 0.0
 
 
-def test_sphere_raster_is_blank_where_nothing_is_known():
+def test_sphere_raster_is_blank_without_directions():
     given = solid("3d:200")
     directions = unit_vectors(given.azimuth_rad, given.elevation_rad)
     raster = _sampling.sphere_raster(
@@ -123,13 +123,13 @@ def test_sphere_raster_is_blank_where_nothing_is_known():
     assert np.isnan(raster[0, 1])
 
 
-def test_words_name_the_settings():
+def test_caption_names_the_settings():
     texts = " ".join(text.get_text() for text in plot(image(), peaks=PEAKS).texts)
     for word in ("measurement 0", "eRTIS_v3D1", "call 25–50 kHz", "37 directions", "method fast", "20 °C", "+30.0°"):
         assert word in texts
 
 
-def test_arguments_that_are_refused():
+def test_plot_page_refuses_invalid_arguments():
     with pytest.raises(ArgumentError, match="dynamic_range_db is 0; give a number above 0"):
         plot(image(), dynamic_range_db=0)
     with pytest.raises(ArgumentError, match="theme 'drak' is unknown "):

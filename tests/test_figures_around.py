@@ -46,7 +46,7 @@ def names_of(axes):
         ([-90, 0, 90], 135.0, -90, 90),
     ],
 )
-def test_azimuths_run_on_from_behind_the_widest_gap(azimuth_deg, closed_deg, first_deg, last_deg):
+def test_azimuths_are_continuous_except_at_the_widest_gap(azimuth_deg, closed_deg, first_deg, last_deg):
     given = np.radians(np.asarray(azimuth_deg, dtype=float))
     moved_deg = np.degrees(unrolled_rad(given, np.radians(closed_deg)))
     assert (moved_deg.min(), moved_deg.max()) == pytest.approx((first_deg, last_deg))
@@ -55,7 +55,7 @@ def test_azimuths_run_on_from_behind_the_widest_gap(azimuth_deg, closed_deg, fir
 
 
 @pytest.mark.parametrize("azimuth_deg", [np.arange(100, 261, 2), REAR])
-def test_polar_shows_what_is_behind_the_sensor_and_nothing_else(azimuth_deg):
+def test_polar_plot_shows_directions_behind_the_sensor_only(azimuth_deg):
     (axes, *_) = figures.polar(image(azimuth_deg)).axes
     assert np.isfinite(shown_at(axes, (101, 140, 178.5, 180, -178.5, -140, -102))).all()
     assert np.isnan(shown_at(axes, (97, 90, 30, 0, -60, -90, -96))).all()
@@ -63,14 +63,14 @@ def test_polar_shows_what_is_behind_the_sensor_and_nothing_else(azimuth_deg):
 
 
 @pytest.mark.parametrize("azimuth_deg", [np.arange(-180, 178, 3), np.arange(0, 358, 3)])
-def test_polar_has_no_wedge_between_the_last_direction_and_the_first(azimuth_deg):
+def test_polar_plot_has_no_gap_between_last_and_first_direction(azimuth_deg):
     (axes, *_) = figures.polar(image(azimuth_deg)).axes
     assert np.isfinite(shown_at(axes, np.arange(-180, 180, 0.7))).all()
     assert "+180°" in names_of(axes)
     assert "−180°" not in names_of(axes)
 
 
-def test_polar_invents_nothing_between_directions_that_are_far_apart():
+def test_polar_plot_is_blank_between_distant_directions():
     (two, *_) = figures.polar(image([-30.0, 30.0])).axes
     assert np.isnan(shown_at(two, (-28, -15, 0, 15, 28))).all()
     assert np.isfinite(shown_at(two, (-29.5, 29.5))).all()
@@ -81,7 +81,7 @@ def test_polar_invents_nothing_between_directions_that_are_far_apart():
     assert np.isfinite(shown_at(coarser_behind, np.arange(-180, 180, 0.7))).all()
 
 
-def test_projection_rings_reflectors_behind_the_sensor():
+def test_projection_marks_reflectors_behind_the_sensor():
     """They are named from -180 to 180, whichever way directions were."""
     peaks = [Peak(azimuth_deg=at_deg, elevation_deg=0.0, range_m=2.0, level_db=0.0) for at_deg in (-142.0, 157.0)]
     figure = figures.projection(image(np.arange(100, 261, 2)), peaks=peaks)
@@ -92,7 +92,7 @@ def test_projection_rings_reflectors_behind_the_sensor():
     assert {"−150", "180", "150"} <= {text.get_text() for text in axes.get_xticklabels()}
 
 
-def test_spectrogram_of_a_long_record_has_all_echoes():
+def test_spectrogram_of_a_long_record_shows_all_echoes():
     """Each of 20 sweeps in 2.6 s is there from end to end, though a column is longer than a sweep."""
     recording = Recording(encoding="float32", sample_rate_hz=192e3, n_samples=500_000)
     settings = Settings(recording=recording, array=Array(layout="one", positions_m=((0.0, 0.0, 0.0),)), call=Call())
@@ -109,7 +109,7 @@ def test_spectrogram_of_a_long_record_has_all_echoes():
 
 
 @pytest.mark.parametrize(("length_m", "wanted"), [(1.0, "0.344°"), (2.0, "0.172°"), (10.9, "0.0315°")])
-def test_width_of_the_beam_of_a_large_array(length_m, wanted):
+def test_beam_width_of_a_large_array_matches_the_formula(length_m, wanted):
     """0.886 λ / (N d), of a line with uniform weights."""
     positions_m = tuple((0.0, y_m, 0.0) for y_m in np.linspace(-length_m / 2, length_m / 2, 64))
     settings = Settings(array=Array(layout="line", positions_m=positions_m, word_bits=32))
@@ -135,14 +135,14 @@ def test_numbers_have_no_exponents(value, digits, wanted):
     assert number(value, digits) == wanted
 
 
-def test_spans_say_where_they_end():
+def test_intervals_include_their_end():
     assert span(np.array([5.0, 600.0, 1299.6])) == "5–1300"
     assert span(np.array([3.0, 3.0011])) == "3–3.001"
     assert span(np.array([3.0])) == "3"
 
 
 @pytest.mark.parametrize("draw", [figures.polar, figures.slices])
-def test_a_single_range_can_be_seen(draw):
+def test_single_range_is_visible(draw):
     figure = draw(image(range_m=[3.0]))
     assert "3 m in 1 range ·" in " ".join(text.get_text() for text in figure.texts).replace("\n", " · ")
     assert np.isfinite(figure.axes[0].images[0].get_array()).mean() > 0.005
@@ -151,7 +151,7 @@ def test_a_single_range_can_be_seen(draw):
 @pytest.mark.parametrize(
     ("range_m", "wanted"), [(123.4, "123.40 m"), (4.4, "4.40 m"), (0.044, "0.0440 m"), (0.0033, "0.00330 m")]
 )
-def test_ranges_of_the_list_have_three_digits(range_m, wanted):
+def test_listed_ranges_have_three_digits(range_m, wanted):
     peaks = [Peak(azimuth_deg=0.0, elevation_deg=0.0, range_m=share * range_m, level_db=0.0) for share in (1, 0.5)]
     figure = figures.plot(image(range_m=np.linspace(range_m / 9, range_m * 1.1, 50)), peaks=peaks)
     (listed,) = [text.get_text() for text in figure.texts if text.get_text().startswith(" #")]
@@ -160,7 +160,7 @@ def test_ranges_of_the_list_have_three_digits(range_m, wanted):
     assert first.index(" m ") == second.index(" m ")
 
 
-def test_the_last_ring_has_its_name():
+def test_last_range_ring_has_a_label():
     """The last range of 0.5 to 5 m is less than a pixel before 5 m."""
     assert "5 m" in names_of(figures.plot(image(range_m=np.linspace(0.5, 4.998, 300))).axes[0])
     assert "5 m" not in names_of(figures.plot(image(range_m=np.linspace(0.5, 4.95, 300))).axes[0])

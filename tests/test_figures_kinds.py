@@ -130,7 +130,7 @@ def texts_of(figure):
 
 @pytest.mark.parametrize(("kind", "n_mics"), [(kind, count) for kind, counts in KINDS.items() for count in counts])
 @pytest.mark.parametrize("look", LOOKS)
-def test_no_words_overlap_or_leave_the_page(kind, look, n_mics):
+def test_texts_neither_overlap_nor_leave_the_page(kind, look, n_mics):
     figure = pictures(n_mics)[kind](**LOOKS[look])
     width_pt, height_pt = 72 * figure.get_size_inches()
     texts = texts_of(figure)
@@ -149,7 +149,7 @@ def test_no_words_overlap_or_leave_the_page(kind, look, n_mics):
 @pytest.mark.parametrize(
     "kind", [kind for kind in KINDS if not kind.startswith("polar,") and kind != "slices, upright"]
 )
-def test_pictures_say_what_they_show(kind):
+def test_pictures_have_units_and_settings(kind):
     """Units at all axes, and the settings that matter."""
     figure = pictures(32)[kind]()
     texts = [text for text, _ in texts_of(figure)]
@@ -170,14 +170,14 @@ def test_pictures_say_what_they_show(kind):
     assert any("dB" in text for text in texts)
 
 
-def test_a_picture_without_echoes_says_so():
+def test_picture_without_echoes_states_this():
     silent = solid()
     assert "no echo above the noise" in dict(texts_of(figures.plot(silent, peaks=[])))
     assert "no echo above the noise" not in dict(texts_of(figures.plot(silent)))
 
 
 @pytest.mark.parametrize("timestamp_ns", [0, 50_000_000, 5 * 10**9, 946_684_800 * 10**9 - 1])
-def test_clocks_that_were_not_set_are_no_time(timestamp_ns):
+def test_times_of_unset_clocks_are_omitted(timestamp_ns):
     """Simulations count from 0, and a board without a clock from 1970."""
     stamp = Stamp(sequence=1, timestamp_ns=timestamp_ns)
     measured = heard(1)
@@ -187,7 +187,7 @@ def test_clocks_that_were_not_set_are_no_time(timestamp_ns):
         assert "UTC" not in words
 
 
-def test_sizes_of_print():
+def test_printed_sizes_match_the_documentation():
     """85 and 170 mm, letters from 6 to 8 points, ink on white."""
     for columns, width_mm in ((1, 85.0), (2, 170.0)):
         figure = figures.plot(image(), theme="paper", columns=columns, font="serif", peaks=PEAKS)
@@ -200,7 +200,7 @@ def test_sizes_of_print():
 
 
 @pytest.mark.parametrize("kind", ["svg", "pdf"])
-def test_files_are_small_and_the_same_each_time(kind):
+def test_picture_files_are_small_and_reproducible(kind):
     """What is drawn in colours is a picture in them, and letters of a PDF are letters."""
     sizes = []
     for name in ("plot, hemisphere", "matched filter"):
@@ -216,7 +216,7 @@ def test_files_are_small_and_the_same_each_time(kind):
 
 @pytest.mark.alone
 @pytest.mark.parametrize("draw", [figures.plot, figures.slices, figures.projection])
-def test_big_images_are_drawn_within_2_s(draw):
+def test_large_images_are_drawn_within_2_s(draw):
     big = solid(3000, range_m=np.linspace(0.5, 5.0, 1178))
     once = lambda: figures.save(draw(big, peaks=PEAKS), io.BytesIO(), format="png")  # noqa: E731
     assert best_s(once, times=3, promised_s=2) < 2
@@ -262,6 +262,6 @@ def test_recordings_are_drawn_within_2_s(draw):
         (lambda: figures.array(Settings(), dynamic_range_db=0), "dynamic_range_db is 0; give a number above 0"),
     ],
 )
-def test_arguments_that_are_refused(draw, match):
+def test_plot_kinds_refuse_invalid_arguments(draw, match):
     with pytest.raises(ArgumentError, match=match):
         draw()

@@ -44,7 +44,7 @@ def with_reflector(azimuth_deg, elevation_deg, range_m):
     return given.replace(amplitude=amplitude), range_m * middle
 
 
-def test_slices_show_a_reflector_where_it_is():
+def test_slices_show_a_reflector_at_its_position():
     given, (ahead_m, left_m, up_m) = with_reflector(25.0, 12.0, 3.0)
     figure = figures.slices(given, height_m=float(up_m), left_m=float(left_m))
     level, upright = figure.axes[:2]
@@ -84,7 +84,7 @@ def test_slices_beside_a_single_direction_show_nothing():
         figures.slices(image([0.0], [30.0]))
 
 
-def test_projection_shows_a_reflector_where_it_is():
+def test_projection_shows_a_reflector_at_its_position():
     given, place_m = with_reflector(-40.0, 20.0, 2.0)
     (axes, *_) = figures.projection(given).axes
     elevation_deg = np.degrees(np.arcsin(place_m[2] / 2.0))
@@ -98,7 +98,7 @@ def test_polar_takes_the_strongest_elevation():
     assert brightest(axes) == pytest.approx((-3 * np.sin(azimuth_rad), 3 * np.cos(azimuth_rad)), abs=0.12)
 
 
-def test_reflectors_are_ringed_in_the_planes_that_they_lie_in():
+def test_reflectors_are_marked_in_their_planes():
     given, (ahead_m, left_m, up_m) = with_reflector(25.0, 12.0, 3.0)
     azimuth_deg, elevation_deg = np.degrees([np.arctan2(left_m, ahead_m), np.arcsin(up_m / 3)])
     peak = Peak(azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, range_m=3.0, level_db=0.0)
@@ -109,7 +109,7 @@ def test_reflectors_are_ringed_in_the_planes_that_they_lie_in():
 
 
 @pytest.mark.parametrize(("start_hz", "stop_hz"), [(50_000.0, 25_000.0), (20_000.0, 80_000.0)])
-def test_ridge_of_the_spectrogram_is_the_sweep(start_hz, stop_hz):
+def test_spectrogram_ridge_follows_the_sweep(start_hz, stop_hz):
     settings = SETTINGS.replace(call=Call(start_frequency_hz=start_hz, stop_frequency_hz=stop_hz))
     delay_s = 9e-3
     power, frequency_hz, times_s = spectrogram(signals(heard(1, delay_s, settings=settings)), settings)
@@ -121,7 +121,7 @@ def test_ridge_of_the_spectrogram_is_the_sweep(start_hz, stop_hz):
     np.testing.assert_allclose(ridge_hz, swept_hz, rtol=0.04)
 
 
-def test_signals_and_their_picture():
+def test_signals_plot_shows_the_signals():
     measurement = heard()
     settings = measurement.settings
     given = signals(measurement)
@@ -152,7 +152,7 @@ def test_signals_show_echoes_beside_a_louder_direct_sound():
     assert spectra.get_ylim()[1] == pytest.approx(measurement.settings.signal_rate_hz / 2e3, rel=0.01)
 
 
-def test_matched_filter_puts_the_echo_at_its_range():
+def test_matched_filter_plot_has_the_echo_at_its_range():
     measurement = heard(32, 9e-3)
     at_m = sound_speed_m_s(measurement.settings.air) * 9e-3 / 2
     given = echoes(measurement)
@@ -165,7 +165,7 @@ def test_matched_filter_puts_the_echo_at_its_range():
     assert brightest(lower)[0] == pytest.approx(at_m, abs=5e-3)
 
 
-def test_matched_filter_takes_calibration_out():
+def test_matched_filter_plot_removes_the_calibration():
     late_s, gain = (0.0, 40e-6), (1.0, 0.5)
     array = Array(layout="two", positions_m=((0, 0, 0), (0, 0.01, 0)), gain=gain, delay_s=late_s, word_bits=32)
     settings = SETTINGS.replace(array=array)
@@ -177,7 +177,7 @@ def test_matched_filter_takes_calibration_out():
 
 
 @pytest.mark.parametrize(("frequency_hz", "wanted_deg"), [(25e3, 10.7), (40e3, 6.7), (50e3, 5.35), (80e3, 3.3)])
-def test_beam_width_is_that_of_the_array(frequency_hz, wanted_deg):
+def test_drawn_beam_width_is_that_of_the_array(frequency_hz, wanted_deg):
     """What the line that is drawn falls to, for eRTIS_v3D1 with uniform weights."""
     axes = figures.array(Settings(), frequencies_hz=[frequency_hz]).axes[1]
     assert width_deg(*axes.lines[0].get_data(), 0.0) == pytest.approx(wanted_deg, abs=0.06)
@@ -191,7 +191,7 @@ def test_beam_width_of_the_mean_power_of_the_band():
     assert width_deg(*axes.lines[2].get_data(), 0.0) == pytest.approx(7.1, abs=0.1)
 
 
-def test_beam_of_a_line_is_the_formula():
+def test_beam_pattern_of_a_line_equals_the_formula():
     """sin(Nψ/2) / (N sin(ψ/2)), its first side lobe at −13.15 dB with 16 microphones, steered to 20°."""
     count, spacing_m, frequency_hz = 16, 0.004, 40e3
     array = Array(layout="line", positions_m=tuple((0.0, spacing_m * mic, 0.0) for mic in range(count)), word_bits=16)
@@ -205,7 +205,7 @@ def test_beam_of_a_line_is_the_formula():
     assert angle_deg[np.argmax(level_db)] == pytest.approx(20)
 
 
-def test_layout_is_drawn_as_it_is():
+def test_layout_plot_shows_the_microphone_positions():
     (axes, *_) = figures.array(Settings()).axes
     drawn_mm = axes.lines[0].get_xydata()
     assert drawn_mm.shape == (32, 2)
@@ -218,7 +218,7 @@ def test_layout_is_drawn_as_it_is():
     assert len(axes.texts) > 24
 
 
-def test_one_microphone_has_no_beam():
+def test_single_microphone_has_no_beam_pattern():
     axes = figures.array(Settings(array=ONE)).axes[1]
     assert np.abs(axes.lines[0].get_ydata()).max() < 1e-9
     assert ": none" in axes.get_legend().get_texts()[0].get_text()
@@ -229,7 +229,7 @@ def words_of_page(figure):
 
 
 @pytest.mark.parametrize("draw", [figures.plot, figures.polar, figures.projection, figures.slices])
-def test_an_image_of_nothing_says_so(draw):
+def test_plot_of_an_empty_image_states_this(draw):
     """Its colours alone would not."""
     given = image()
     assert "silence" not in words_of_page(draw(given))
@@ -238,7 +238,7 @@ def test_an_image_of_nothing_says_so(draw):
     assert "the strongest is −120 dB of full scale" in words_of_page(draw(given.replace(amplitude=faint)))
 
 
-def test_bits_that_never_change_are_told():
+def test_constant_bits_are_reported_in_the_plot():
     still = heard()
     still = Measurement(np.zeros_like(still.data), still.settings, still.stamp)
     assert "dB of full scale" in words_of_page(figures.matched_filter(still))
@@ -247,7 +247,7 @@ def test_bits_that_never_change_are_told():
 
 @pytest.mark.parametrize("look", [{}, {"theme": "paper"}, {"theme": "paper", "columns": 1}])
 @pytest.mark.parametrize("count", [0, 5, 9])
-def test_a_low_picture_has_a_whole_scale_and_list(look, count):
+def test_flat_picture_keeps_its_colour_bar_and_list(look, count):
     """The map of a planar image is a strip; its numbers mean nothing without the list."""
     peaks = [Peak(azimuth_deg=10.0 * n, elevation_deg=0.0, range_m=1.0, level_db=-n) for n in range(count)]
     figure = figures.projection(image(), peaks=peaks, **look)
@@ -264,7 +264,7 @@ def test_a_low_picture_has_a_whole_scale_and_list(look, count):
         assert text.get_window_extent().y0 > 0
 
 
-def test_both_parts_of_the_matched_filter_have_the_same_0_db():
+def test_matched_filter_panels_share_the_0_db_reference():
     """That of the strongest microphone; the mean of all is below it."""
     given = heard()
     figure = figures.matched_filter(given)

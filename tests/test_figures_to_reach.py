@@ -52,7 +52,7 @@ def test_warm_process_of_one_measurement_takes_less_than_1_5_s(recording, tmp_pa
 
 
 @pytest.mark.alone
-def test_first_run_takes_less_than_12_s_and_says_why(recording, tmp_path):
+def test_first_run_takes_less_than_12_s_and_reports_compilation(recording, tmp_path):
     for run in ("first", "again"):  # nothing of the first one is left to the other
         environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / run)}
         command = [*ERTIS, "process", recording, "-o", tmp_path / f"{run}.h5", "--directions", "3000"]
@@ -64,7 +64,7 @@ def test_first_run_takes_less_than_12_s_and_says_why(recording, tmp_path):
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="only Linux says how large a process ever was")
-def test_memory_does_not_grow_with_the_recording(tmp_path):
+def test_memory_is_independent_of_the_recording_length(tmp_path):
     """700 measurements are 460 MB; half of that in memory would be too much."""
     settings = Settings.from_preset("default_25_50").replace(
         processing=Processing(directions="2d:5", range_m=(0.5, 1.0))
@@ -97,7 +97,7 @@ def real(request):
 
 
 @pytest.mark.parametrize("budget", ["draft", "standard", "fine", "exact"])
-def test_images_of_the_real_measurement_are_as_exact_as_asked_for(real, budget):
+def test_images_of_the_real_measurement_keep_their_budget(real, budget):
     """Plans that know nothing of what is heard keep their budget; the standard one is that of the default settings."""
     measurement, some, exact = real
     budget_db = {"draft": -20, "standard": -35, "fine": -60, "exact": -100}[budget]

@@ -50,7 +50,7 @@ def test_command_lines_of_pages_parse(path):
 
 
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)
-def test_options_that_pages_name_exist(path):
+def test_options_named_on_pages_exist(path):
     """In the text, where commands are not complete."""
     for text in re.findall(r"`ertis ([^`]+)`", path.read_text("utf-8")):
         if not re.match(r"[a-z]", text):
@@ -60,14 +60,14 @@ def test_options_that_pages_name_exist(path):
         assert {word.partition("=")[0] for word in words if re.fullmatch(r"--?[a-z][\w-]*", word)} <= known, text
 
 
-def test_no_command_needs_a_file_of_the_source():
+def test_commands_of_pages_need_no_source_file():
     for path in PAGES:
         for line in commands(path.read_text("utf-8")):
             assert "data/synthetic" not in line, (path.name, line)
             assert "examples/" not in line, (path.name, line)
 
 
-def test_first_hour(tmp_path, monkeypatch):
+def test_first_hour_page_runs(tmp_path, monkeypatch):
     monkeypatch.setenv("ERTIS_EMULATED_DIR", str(tmp_path / "emulated"))
     text = page("first-hour")
     steps = re.findall(r"```console\n(.*?)```", text, re.DOTALL)

@@ -44,7 +44,7 @@ def errors_db(interpolation, n_taps, oversampling):
 
 @settings(max_examples=40, deadline=None)
 @given(call=calls, rate=rates, other=st.sampled_from(["nearest", "carrier", "linear", "cubic"]))
-def test_fitted_weights_err_no_more_than_others_with_as_many_taps(call, rate, other):
+def test_fitted_weights_have_the_smallest_error_for_their_taps(call, rate, other):
     spectrum, step_s = spectrum_of(call), step_s_of(call, rate)
     errors = {}
     for interpolation in ("fitted", other):
@@ -55,7 +55,7 @@ def test_fitted_weights_err_no_more_than_others_with_as_many_taps(call, rate, ot
 
 @settings(max_examples=40, deadline=None)
 @given(call=calls, rate=rates, n_taps=st.integers(1, 4))
-def test_another_tap_errs_no_more(call, rate, n_taps):
+def test_additional_tap_does_not_raise_the_error(call, rate, n_taps):
     """By half a decibel: the turns of the fit end a little before its minimum."""
     spectrum, step_s = spectrum_of(call), step_s_of(call, rate)
     few, many = (DelayFit("fitted", count, step_s, spectrum) for count in (n_taps, n_taps + 1))
@@ -69,7 +69,7 @@ def test_errors_fall_with_oversampling_by_6_db_for_each_tap(n_taps):
     assert np.diff(found_db) == pytest.approx(-6.02 * n_taps, abs=0.6)
 
 
-def test_one_fitted_tap_is_the_carrier_turned():
+def test_single_fitted_tap_is_a_rotated_carrier():
     assert errors_db("fitted", 1, 8) == pytest.approx(errors_db("carrier", 1, 8), abs=0.1)
     assert errors_db("carrier", 1, 8) < errors_db("nearest", 1, 8) - 10
 
@@ -92,7 +92,7 @@ def plain_errors(made, step_s, frequency_hz):
     [("fitted", n) for n in range(1, 6)] + [("nearest", None), ("carrier", None), ("linear", None), ("cubic", None)],
 )
 @pytest.mark.parametrize("oversampling", [1, 3, 10])
-def test_errors_are_those_of_a_plain_evaluation(interpolation, n_taps, oversampling):
+def test_fit_errors_equal_a_direct_evaluation(interpolation, n_taps, oversampling):
     step_s = 1 / (RATE_HZ * oversampling)
     made = DelayFit(interpolation, n_taps, step_s, DEFAULT)
     for wave in range(0, 40, 6):
@@ -103,7 +103,7 @@ def test_errors_are_those_of_a_plain_evaluation(interpolation, n_taps, oversampl
 
 @settings(max_examples=20, deadline=None)
 @given(call=calls, rate=rates, n_taps=st.integers(1, 6), seed=st.integers(0, 99))
-def test_a_delayed_wave_is_made_within_the_predicted_error(call, rate, n_taps, seed):
+def test_delayed_wave_is_within_the_predicted_error(call, rate, n_taps, seed):
     """Waves of all frequencies at once, with random phases, and delays before and after the first kept sample."""
     spectrum, step_s, random = spectrum_of(call), step_s_of(call, rate), np.random.default_rng(seed)
     made = DelayFit("fitted", n_taps, step_s, spectrum)
@@ -130,14 +130,14 @@ def test_simple_weights_are_exact_at_the_carrier(interpolation):
     assert max(plain_errors(made, step_s, DEFAULT.centre_hz)) < 1e-20
 
 
-def test_weights_keep_the_shape_of_the_fractions():
+def test_weights_have_the_shape_of_the_fractions():
     made = DelayFit("fitted", 3, 1 / RATE_HZ, DEFAULT)
     first, fractions = made.split(np.linspace(-1e-4, 1e-4, 20).reshape(4, 5))
     assert first.shape == fractions.shape == (4, 5)
     assert made.weights(fractions).shape == (4, 5, 3)
 
 
-def test_no_other_weights_and_no_other_gain_err_less():
+def test_fitted_weights_and_gain_are_a_minimum():
     """What `fit` returns is a minimum in weights and gain: any small step from it errs more."""
     random = np.random.default_rng(3)
     taps, targets = np.exp(1j * random.standard_normal((2, 12, 5)))[:, :, :3]
@@ -155,7 +155,7 @@ def test_no_other_weights_and_no_other_gain_err_less():
         assert error(gain * (1 + 1e-3 * np.exp(2j * np.pi * random.random(12))), weights) > smallest - 1e-3 * smallest
 
 
-def test_real_weights_are_the_best_real_ones():
+def test_real_fitted_weights_are_optimal():
     random = np.random.default_rng(4)
     taps, targets = np.exp(1j * random.standard_normal((2, 12, 4)))
     power = random.random(12)

@@ -191,7 +191,7 @@ def folder(tmp_path_factory):
 
 
 @pytest.mark.parametrize("line", COMMANDS.strip().splitlines())
-def test_foolish_commands_are_refused_in_one_line(line, folder, monkeypatch):
+def test_common_command_mistakes_are_refused_in_one_line(line, folder, monkeypatch):
     monkeypatch.chdir(folder)
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
     began_s = time.monotonic()

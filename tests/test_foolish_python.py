@@ -239,7 +239,7 @@ PYTHON = {
 
 
 @pytest.mark.parametrize("name", CALLS)
-def test_foolish_calls_are_refused_in_one_line(name, given):
+def test_common_call_mistakes_are_refused_in_one_line(name, given):
     began_s = time.monotonic()
     with pytest.raises((ertis.ErtisError, TypeError, IndexError)) as refused:
         CALLS[name](given)
@@ -251,5 +251,5 @@ def test_foolish_calls_are_refused_in_one_line(name, given):
     assert isinstance(refused.value, ertis.ErtisError) or name in PYTHON
 
 
-def test_no_foolish_call_has_written_anything(given):
+def test_refused_calls_write_no_file(given):
     assert {path.name for path in given.folder.iterdir()} == {"empty.h5", "text.h5", "dir.h5", "a.wav", "img.h5"}

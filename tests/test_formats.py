@@ -40,7 +40,7 @@ def rows(first):
         ("amplitude", [variable for variable in ENERGYSCAPE if variable not in SHARED]),
     ],
 )
-def test_tables(first, table):
+def test_format_tables_match_the_code(first, table):
     reported = list(rows(first))
     assert [row[0] for row in reported] == [variable.name for variable in table]
     for (_, axes, kinds, unit), variable in zip(reported, table, strict=True):
@@ -51,12 +51,12 @@ def test_tables(first, table):
             assert len(kinds) > 1
 
 
-def test_names_and_versions():
+def test_format_names_and_versions_match_the_code():
     assert f"`{CONVENTIONS}`" in PAGE
     assert f"`ertis_format_version` ({FORMAT_VERSION})" in PAGE
 
 
-def test_presets():
+def test_format_presets_match_the_code():
     for preset in PRESETS:
         line = next(line for line in PAGE.splitlines() if f"`{preset}`" in line)
         words = Settings.from_preset(preset).recording.n_samples

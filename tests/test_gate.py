@@ -23,7 +23,7 @@ def door(tmp_path):
     [(ROBOT, {"front", "left"}, False), (VIEWER, set(), True), (DESK, {"front", "left", "rear"}, True)],
     ids=["sensor", "application", "admin"],
 )
-def test_a_listed_key_is_let_in_as_what_it_is_listed(door, pair, sends, receives):
+def test_listed_key_is_admitted_with_its_role(door, pair, sends, receives):
     door.knock(pair)
     assert door.until(lambda: door.came)
     ((_, who),) = door.came
@@ -33,7 +33,7 @@ def test_a_listed_key_is_let_in_as_what_it_is_listed(door, pair, sends, receives
     assert not +door.gate.refused
 
 
-def test_an_unknown_key_is_refused_counted_and_told(door):
+def test_unknown_key_is_refused_counted_and_reported(door):
     client = door.knock(STRANGER)
     assert door.reported(client).startswith(
         "the central node does not know this key; add it there with 'ertis keys allow'"
@@ -43,33 +43,33 @@ def test_an_unknown_key_is_refused_counted_and_told(door):
     assert (door.came, +door.gate.refused) == ([], {"unknown key": 2})
 
 
-def test_a_node_that_expects_another_central_node_says_nothing_to_this_one(door):
+def test_node_expecting_another_server_key_sends_nothing(door):
     client = door.knock(ROBOT, server=STRANGER.public)
     assert "its key differs from --server-key, or it has none" in door.reported(client)
     assert door.until(lambda: door.gate.refused["no key"])
     assert not door.came
 
 
-def test_a_node_without_a_key_is_refused_and_counted(door):
+def test_node_without_a_key_is_refused_and_counted(door):
     client = door.knock(None)
     assert door.reported(client).endswith("give --key and --server-key")
     assert door.until(lambda: door.gate.refused["no key"])
     assert not door.came
 
 
-def test_a_password_is_no_key(door):
+def test_password_is_not_accepted_as_a_key(door):
     assert door.admits(None, options=[(zmq.PLAIN_USERNAME, b"admin"), (zmq.PLAIN_PASSWORD, b"admin")]) is None
     assert door.until(lambda: door.gate.refused["no key"])
 
 
-def test_a_node_with_keys_says_nothing_to_one_without(tmp_path):
+def test_node_with_keys_sends_nothing_to_one_without(tmp_path):
     with Door(tmp_path, with_keys=False) as door:
         client = door.knock(ROBOT)
         assert "key" in door.reported(client)
         assert not door.came
 
 
-def test_without_keys_everybody_may_do_everything(tmp_path):
+def test_without_keys_every_role_is_permitted(tmp_path):
     with Door(tmp_path, with_keys=False) as door:
         assert door.admits(None) is EVERYBODY
         assert EVERYBODY.may_send("any")
@@ -77,14 +77,14 @@ def test_without_keys_everybody_may_do_everything(tmp_path):
         assert door.gate.socket is None
 
 
-def test_a_routing_id_that_a_peer_has_chosen_is_refused(door):
+def test_chosen_routing_id_is_refused(door):
     door.knock(ROBOT, options=[(zmq.ROUTING_ID, b"front")])
     assert door.until(lambda: door.came)
     assert door.came == [(b"hello", None)]
     assert door.gate.refused["chosen routing id"] == 1
 
 
-def test_a_message_that_came_past_the_gate_is_nobodys(door):
+def test_unauthenticated_message_has_no_role(door):
     past = sockets.server(door.context, LOOPBACK, keys=None)
     client = sockets.client(door.outside, sockets.bound(past), keys=None)
     door.monitors[client] = sockets.Monitor(client)
@@ -110,21 +110,21 @@ class _LetsIn(ZapAuthenticator):
         return self._mark + STRANGER.public, ""
 
 
-def test_a_gate_that_fails_lets_nobody_in_and_goes_on(tmp_path):
+def test_failing_authenticator_admits_nobody_and_continues(tmp_path):
     with Door(tmp_path, gate=_Raises) as door:
         assert "does not know this key" in door.reported(door.knock(ROBOT))
         assert "does not know this key" in door.reported(door.knock(ROBOT))
         assert (door.came, +door.gate.refused) == ([], {"gate: KeyError": 2})
 
 
-def test_a_server_without_a_gate_lets_nobody_in(tmp_path):
+def test_server_without_an_authenticator_admits_nobody(tmp_path):
     """By itself, CURVE would let any key in: ZAP_ENFORCE_DOMAIN makes it ask, and nobody answers."""
     with Door(tmp_path, server_gate=False) as door:
         assert [door.admits(pair) for pair in (DESK, ROBOT, STRANGER)] == [None, None, None]
         assert not door.came
 
 
-def test_a_gate_that_is_not_served_or_closed_lets_nobody_in(door):
+def test_idle_or_closed_authenticator_admits_nobody(door):
     serve, door.gate.serve = door.gate.serve, lambda: None
     assert door.admits(DESK) is None
     door.gate.serve = serve
@@ -135,7 +135,7 @@ def test_a_gate_that_is_not_served_or_closed_lets_nobody_in(door):
     assert len(door.came) <= before + 1  # the one that had waited
 
 
-def test_whatever_a_gate_is_asked_the_answer_is_no_or_none(door):
+def test_malformed_zap_requests_are_never_accepted(door):
     """Seed 5: requests that are no requests, from within the context."""
     random_ = random.Random(5)
     asker = door.context.socket(zmq.DEALER)
@@ -160,7 +160,7 @@ def test_whatever_a_gate_is_asked_the_answer_is_no_or_none(door):
     assert door.admits(ROBOT).name == "robot"
 
 
-def test_a_self_test_passes_and_counts_nothing(door):
+def test_self_test_passes_and_counts_nothing(door):
     began_s = time.monotonic()
     door.gate.self_test(door.address)
     assert time.monotonic() - began_s < 2.0
@@ -170,24 +170,24 @@ def test_a_self_test_passes_and_counts_nothing(door):
     assert door.admits(ROBOT).name == "robot"
 
 
-def test_a_self_test_fails_where_an_unknown_key_is_let_in(tmp_path):
+def test_self_test_fails_if_an_unknown_key_is_admitted(tmp_path):
     with Door(tmp_path, gate=_LetsIn) as door, pytest.raises(NetworkError, match=r"accepts a node with unknown key"):
         door.gate.self_test(door.address)
 
 
-def test_a_self_test_fails_where_a_node_without_a_key_is_let_in(door):
+def test_self_test_fails_if_a_node_without_a_key_is_admitted(door):
     past = sockets.server(door.context, LOOPBACK, keys=None)
     with pytest.raises(NetworkError, match=r"accepts a node with no key"):
         door.gate.self_test(sockets.bound(past))
     past.close()
 
 
-def test_a_self_test_fails_where_nothing_answers(door, monkeypatch):
+def test_self_test_fails_without_an_answer(door, monkeypatch):
     monkeypatch.setattr("ertis_numba.network.zap_authenticator._SELF_TEST_S", 0.2)
     with pytest.raises(NetworkError, match=r"did not refuse a node with no key within 0\.2 s; start it when"):
         door.gate.self_test("tcp://127.0.0.1:1")
 
 
-def test_a_context_has_one_gate(door):
+def test_context_has_one_authenticator(door):
     with pytest.raises(ArgumentError, match="the context has an authenticator already; create one per context"):
         ZapAuthenticator(door.context, door.keys)

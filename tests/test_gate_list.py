@@ -25,7 +25,7 @@ def _replace(door, listed):
 # The list changes
 
 
-def test_a_removed_key_is_refused_within_a_second_although_connected(door):
+def test_removed_key_is_disconnected_within_a_second(door):
     client = door.knock(ROBOT)
     assert door.until(lambda: door.came)
     _replace(door, LISTED.remove("robot"))
@@ -44,14 +44,14 @@ def test_a_removed_key_is_refused_within_a_second_although_connected(door):
     assert door.gate.refused["unknown key"] == 1
 
 
-def test_a_key_that_is_listed_while_connections_wait_is_let_in(door):
+def test_newly_listed_key_is_admitted(door):
     assert door.admits(STRANGER) is None
     _replace(door, LISTED.allow(Permission(name="stranger", public=STRANGER.public, role="application")))
     assert door.until(lambda: door.changed == 1)
     assert door.admits(STRANGER).name == "stranger"
 
 
-def test_a_connection_has_the_role_and_serials_of_the_list_as_it_is_now(door):
+def test_connection_has_the_present_role_and_serials_of_its_key(door):
     client = door.knock(ROBOT)
     assert door.until(lambda: door.came)
     _replace(door, LISTED.allow(Permission(name="robot", public=ROBOT.public, role="sensor", serials=("rear",))))
@@ -73,7 +73,7 @@ def test_a_connection_has_the_role_and_serials_of_the_list_as_it_is_now(door):
     ],
     ids=["other", "cut", "bytes", "huge", "gone", "folder"],
 )
-def test_nobody_is_in_a_list_that_cannot_be_read(door, spoil):
+def test_unreadable_allow_list_admits_nobody(door, spoil):
     client = door.knock(DESK)
     assert door.until(lambda: door.came)
     spoil(door.list)
@@ -92,7 +92,7 @@ def test_nobody_is_in_a_list_that_cannot_be_read(door, spoil):
     assert door.admits(ROBOT).name == "robot"
 
 
-def test_a_list_that_somebody_is_writing_is_looked_at_twice(door):
+def test_allow_list_being_written_is_read_again(door):
     client = door.knock(DESK)
     assert door.until(lambda: door.came)
     door.list.write_text("keys = [")
@@ -111,7 +111,7 @@ def test_a_list_that_somebody_is_writing_is_looked_at_twice(door):
     [None, "keys = 7", f'[[keys]]\nname = "robot"\npublic = "{ROBOT.public}"\nrole = "sensor"\n'],
     ids=["missing", "no_list", "no_serials"],
 )
-def test_a_list_that_cannot_be_used_at_the_start_is_told(tmp_path, text):
+def test_invalid_allow_list_is_reported_at_the_start(tmp_path, text):
     path = tmp_path / "allow.toml"
     if text is not None:
         path.write_text(text)

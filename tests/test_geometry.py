@@ -32,12 +32,12 @@ NAMES = ("eRTIS_v2", "eRTIS_v2REC", "eRTIS_v3D1", "eRTIS_v3D1REC", "uRTIS_v1", "
 # ---- layouts ---------------------------------------------------------------------------------------
 
 
-def test_the_six_rtis_layouts_are_shipped():
+def test_six_rtis_layouts_are_included():
     assert layout_names() == NAMES
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_layouts_are_those_of_the_device(name):
+def test_layouts_equal_those_of_the_device(name):
     """The package of the device's makers is read as data; it is never imported."""
     files = importlib.metadata.distribution("rtisdev")
     path = files.locate_file(f"rtisdev/config/microphoneLayouts/{name}/mic_coordinates.mat")
@@ -51,13 +51,13 @@ def test_layouts_are_those_of_the_device(name):
     assert (layout.n_words, layout.word_bits) == (1, 32)
 
 
-def test_two_layouts_have_two_channels_without_a_microphone():
+def test_two_layouts_have_two_unused_channels():
     disabled = {name: int(np.sum(~load_layout(name).enabled)) for name in NAMES}
     assert {name for name, count in disabled.items() if count} == {"uRTIS_v1", "eRTIS_v3D1REC"}
     assert disabled["uRTIS_v1"] == disabled["eRTIS_v3D1REC"] == 2
 
 
-def test_v2_is_v3d1_with_its_channels_in_another_order():
+def test_layout_v2_is_v3d1_with_reordered_channels():
     order = [*range(0, 32, 2), *range(1, 32, 2)]
     v2, v3d1 = load_layout("eRTIS_v2").positions_m, load_layout("eRTIS_v3D1").positions_m
     assert_allclose(v2[order], v3d1, atol=1e-12)
@@ -65,7 +65,7 @@ def test_v2_is_v3d1_with_its_channels_in_another_order():
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_layouts_depend_on_no_file_once_written_out(name):
+def test_written_layouts_depend_on_no_file(name):
     layout = load_layout(name)
     again = microphones(layout.to_array())
     assert_allclose(again.positions_m, layout.positions_m, atol=1e-15)
@@ -74,7 +74,7 @@ def test_layouts_depend_on_no_file_once_written_out(name):
     assert_array_equal(again.delay_s, layout.delay_s)
 
 
-def test_positions_are_taken_from_the_centroid_of_the_enabled():
+def test_positions_are_relative_to_the_centroid_of_enabled_microphones():
     array = Array(positions_m=((0.1, 0.2, 0.3), (0.1, 0.4, 0.3), (9.0, 9.0, 9.0)), enabled=(True, True, False))
     layout = microphones(array)
     assert_allclose(layout.enabled_positions_m, [[0, -0.1, 0], [0, 0.1, 0]], atol=1e-15)
@@ -84,12 +84,12 @@ def test_positions_are_taken_from_the_centroid_of_the_enabled():
 @pytest.mark.parametrize(
     ("count", "word_bits", "n_words"), [(1, 8, 1), (8, 8, 1), (9, 8, 2), (33, 32, 2), (1024, 64, 16)]
 )
-def test_words_per_sample(count, word_bits, n_words):
+def test_words_per_sample_follow_from_channels(count, word_bits, n_words):
     positions_m = tuple((0.0, 0.0, 1e-3 * channel) for channel in range(count))
     assert microphones(Array(positions_m=positions_m, word_bits=word_bits)).n_words == n_words
 
 
-def test_layout_files(tmp_path):
+def test_layout_files_are_read(tmp_path):
     text = 'source = "drawing"\nword_bits = 16\ndisabled = [1]\npositions_mm = [[0, 0], [nan, nan], [4, 2]]\n'
     (tmp_path / "mine.toml").write_text(text)
     layout = load_layout(tmp_path / "mine.toml")
@@ -174,7 +174,7 @@ def limits(low, high):
 
 
 @pytest.mark.parametrize("name", PAPER_GRIDS)
-def test_paper_grids_have_their_count_within_their_limits(name):
+def test_paper_grids_have_their_number_of_directions(name):
     grid = direction_grid(Processing(directions=name, azimuth_limits_deg=(-1.0, 1.0)))  # its own limits count
     _, azimuth_deg, elevation_deg = PAPER_GRIDS[name]
     assert len(grid) == int(name)
@@ -194,7 +194,7 @@ def test_planar_grids_include_both_limits():
 
 @settings(max_examples=200, deadline=None)
 @given(count=st.integers(1, 4000), azimuth_deg=limits(-180, 180), elevation_deg=limits(-90, 90))
-def test_solid_grids_meet_count_and_limits(count, azimuth_deg, elevation_deg):
+def test_solid_grids_have_their_count_and_limits(count, azimuth_deg, elevation_deg):
     processing = Processing(
         directions=f"3d:{count}", azimuth_limits_deg=azimuth_deg, elevation_limits_deg=elevation_deg
     )
@@ -255,7 +255,7 @@ def test_grid_of_one_azimuth_repeats_no_direction():
     assert len(np.unique(grid.elevation_rad)) == 10
 
 
-def test_grid_from_csv(tmp_path):
+def test_grid_is_read_from_csv(tmp_path):
     path = tmp_path / "grid.csv"
     path.write_text("# azimuth, elevation\n-30, 0\n0, 45.5\n")
     grid = direction_grid(Processing(directions=str(path)))
@@ -297,7 +297,7 @@ def test_bad_grids_are_refused(tmp_path, directions, text, message):
 
 
 @given(st.floats(-np.pi, np.pi), st.floats(-np.pi / 2, np.pi / 2))
-def test_unit_vectors_are_of_length_one_and_turn_back(azimuth_rad, elevation_rad):
+def test_unit_vectors_convert_back_to_angles(azimuth_rad, elevation_rad):
     x, y, z = unit_vectors(np.array(azimuth_rad), np.array(elevation_rad))
     assert x**2 + y**2 + z**2 == pytest.approx(1)
     assert np.arcsin(np.clip(z, -1, 1)) == pytest.approx(elevation_rad, abs=1e-7)
@@ -305,19 +305,19 @@ def test_unit_vectors_are_of_length_one_and_turn_back(azimuth_rad, elevation_rad
         assert np.cos(np.arctan2(y, x) - azimuth_rad) == pytest.approx(1)
 
 
-def test_axes_of_the_sensor_frame():
+def test_sensor_frame_has_the_documented_axes():
     right = np.pi / 2
     axes = unit_vectors(np.array([0, right, 0]), np.array([0, 0, right]))
     assert_allclose(axes, np.eye(3), atol=1e-15)  # forward is x, azimuth 90° is y, elevation 90° is z
 
 
-def test_a_microphone_towards_the_source_hears_first():
+def test_microphone_nearest_the_source_receives_first():
     positions_m = np.array([[0, 0.1, 0], [0, -0.1, 0]])
     delays_s = far_field_delays(positions_m, unit_vectors(np.array([np.pi / 2]), np.zeros(1)), sound_speed_m_s=340.0)
     assert_allclose(delays_s, [[-0.1 / 340, 0.1 / 340]])
 
 
-def test_spherical_delays_become_those_of_plane_waves_with_distance():
+def test_spherical_delays_approach_plane_delays_with_distance():
     """The difference falls as p² / 2 r c, the curvature of the wave over the array."""
     positions_m = load_layout("eRTIS_v3D1").positions_m
     grid = direction_grid(Processing(directions="3d:100"))
@@ -329,7 +329,7 @@ def test_spherical_delays_become_those_of_plane_waves_with_distance():
         assert_allclose(bent_s, across_m2 / (2 * range_m * 343.0), atol=2e-7 / range_m**2 + 1e-14)
 
 
-def test_spherical_delays_at_the_origin_and_on_a_microphone():
+def test_spherical_delays_are_finite_at_origin_and_microphones():
     positions_m = np.array([[0.0, 0.0, 0.0], [0.03, 0.0, 0.0]])
     ahead = unit_vectors(np.zeros(1), np.zeros(1))
     at_origin = spherical_delays(positions_m, ahead, range_m=0.0, sound_speed_m_s=300.0)
@@ -338,14 +338,14 @@ def test_spherical_delays_at_the_origin_and_on_a_microphone():
     assert_allclose(on_microphone, [[0, -1e-4]], atol=1e-15)
 
 
-def test_spacing_is_that_of_the_grid():
+def test_grid_spacing_is_correct():
     for name, spacing_deg in (("2d:91", 2.0), ("2d:1", 180.0)):
         grid = direction_grid(Processing(directions=name))
         assert np.degrees(spacing_rad(unit_vectors(grid.azimuth_rad, grid.elevation_rad))) == pytest.approx(spacing_deg)
 
 
 @pytest.mark.parametrize("name", ["2d:7", "3d:10", "3d:500", "3d:4000", "3d:1"])
-def test_azimuth_columns_show_each_direction_about_its_azimuth(name):
+def test_azimuth_columns_contain_nearby_directions(name):
     grid = direction_grid(Processing(directions=name))
     shuffled = np.random.default_rng(1).permutation(len(grid))
     azimuth_rad, elevation_rad = grid.azimuth_rad[shuffled], grid.elevation_rad[shuffled]
@@ -361,7 +361,7 @@ def test_azimuth_columns_show_each_direction_about_its_azimuth(name):
         assert np.abs(at - azimuth_rad[direction]).min() <= spacing / 8 + 1e-9
 
 
-def test_azimuth_columns_of_few_directions_are_theirs():
+def test_azimuth_columns_of_few_directions_are_their_azimuths():
     azimuth_rad, elevation_rad = np.radians([[-45.0, 45.0, 0.0], [-19.0, -19.0, 41.0]])
     columns = azimuth_columns(azimuth_rad, elevation_rad)
     assert_allclose(np.degrees(columns.azimuth_rad), [-45.0, 0.0, 45.0])
@@ -381,7 +381,7 @@ def test_azimuth_columns_of_few_directions_are_theirs():
     ],
     ids=["none", "one", "even", "even and wide", "gap", "coarser part", "coarser by far"],
 )
-def test_something_is_known_as_far_as_directions_are_usually_apart(gaps_deg, wanted_deg):
+def test_image_extends_to_the_usual_spacing_of_directions(gaps_deg, wanted_deg):
     """1.3 of it, and among wider ones up to 10°."""
     assert_allclose(np.degrees(reach_rad(np.radians(gaps_deg))), wanted_deg)
 
@@ -401,11 +401,11 @@ def test_something_is_known_as_far_as_directions_are_usually_apart(gaps_deg, wan
     ],
     ids=["even", "turn", "one missing", "a little more", "three", "two", "ahead", "finer ahead", "finer, one missing"],
 )
-def test_directions_go_all_around_where_no_more_is_missing_than_elsewhere(azimuth_deg, wanted):
+def test_full_circle_is_recognised_by_its_largest_gap(azimuth_deg, wanted):
     assert is_closed(np.radians(azimuth_deg)) == wanted
 
 
-def test_metres_in_a_layout_are_refused(tmp_path):
+def test_layout_in_metres_is_refused(tmp_path):
     path = tmp_path / "mine.csv"
     path.write_text("0.02, 0\n0, 0.02\n-0.02, 0\n")
     with pytest.raises(

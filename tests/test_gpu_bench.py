@@ -98,7 +98,7 @@ def report(monkeypatch, tmp_path):
     return report, stated
 
 
-def test_without_a_gpu_it_is_told_in_a_line_and_nothing_is_written(tmp_path):
+def test_gpu_benchmark_without_a_gpu_writes_nothing(tmp_path):
     if "cuda" in kernels.usable():
         pytest.skip("there is a GPU here")
     done = CliRunner().invoke(cli, ["bench", "gpu", "--results", str(tmp_path / "results")])
@@ -108,13 +108,13 @@ def test_without_a_gpu_it_is_told_in_a_line_and_nothing_is_written(tmp_path):
     assert not (tmp_path / "results").exists()
 
 
-def test_simulator_is_refused(tmp_path, monkeypatch):
+def test_gpu_benchmark_refuses_the_simulator(tmp_path, monkeypatch):
     monkeypatch.setenv("NUMBA_ENABLE_CUDASIM", "1")
     with pytest.raises(DeviceError, match="is simulated here, so its times are meaningless; unset NUMBA"):
         gpu.run(results=tmp_path / "results", say=lambda _: None)
 
 
-def test_results_are_a_file_named_for_gpu_and_time(report, tmp_path):
+def test_results_file_is_named_after_gpu_and_time(report, tmp_path):
     found, stated = report
     (path,) = (tmp_path / "results").iterdir()
     assert path.name.startswith("nvidia-test-gpu-20")
@@ -125,7 +125,7 @@ def test_results_are_a_file_named_for_gpu_and_time(report, tmp_path):
     assert "memcheck: not available: no compute-sanitizer on PATH or in CUDA_HOME" in stated
 
 
-def test_newest_results_make_the_tables_without_a_gpu(report, tmp_path):
+def test_tables_show_the_newest_results_without_a_gpu(report, tmp_path):
     found, _ = report
     folder, full, short = tmp_path / "results", tmp_path / "full.md", tmp_path / "short.md"
     (folder / "a.json").write_text(json.dumps(found | {"date": "2020-01-01", "gpu": GPU | {"name": "Old"}}), "utf-8")
@@ -160,7 +160,7 @@ def test_newest_results_make_the_tables_without_a_gpu(report, tmp_path):
     ]
 
 
-def test_without_results_tables_say_not_measured(tmp_path):
+def test_tables_without_results_state_not_measured(tmp_path):
     done = CliRunner().invoke(cli, ["bench", "gpu", "--newest", "--results", str(tmp_path)])
     assert done.stdout.count("not measured") == 7 * 3
     assert "| the paper's GTX 1080 Ti | 5.93 | 51.58 | 77.02 |" in done.stdout
@@ -171,14 +171,14 @@ def test_without_results_tables_say_not_measured(tmp_path):
 @pytest.mark.parametrize(
     "results", [{}, {"parts": {}}, {"parts": {"paper": {"status": "not finished after 9 s", "rows": []}}}]
 )
-def test_tables_are_made_of_whatever_parts_there_are(report, results):
+def test_tables_show_all_existing_parts(report, results):
     found = report[0] | results if results else report[0]
     for part in found["parts"].values():
         part.setdefault("wall_s", 9.0)
     assert tables.gpu(found).startswith("| ms per measurement, median |")
 
 
-def test_part_that_hangs_is_ended_with_its_children():
+def test_hanging_part_is_ended_with_its_children():
     begin_s = time.monotonic()
     script = "import subprocess, sys; print('begun', flush=True); subprocess.run(['sleep', '60'])"
     done = gpu.execute([sys.executable, "-c", script], 1.5)
@@ -195,7 +195,7 @@ def test_rows_before_a_failure_are_kept(monkeypatch):
     assert gpu.part("paper") == {"status": "failed (1): no more", "rows": [{"a": 1}, {"b": 2}]}
 
 
-def test_tests_count_what_ran_on_the_gpu(monkeypatch, tmp_path):
+def test_test_part_counts_gpu_tests_only(monkeypatch, tmp_path):
     """Those of other devices do not run; where none is left, nothing is passed."""
     (tmp_path / "tests").mkdir()
     (tmp_path / "tests" / "test_it.py").write_text(
@@ -231,19 +231,19 @@ def test_sanitizer_passes_only_with_tests_and_without_errors(monkeypatch, tmp_pa
     assert gpu.sanitized("memcheck")["status"] == status
 
 
-def test_missing_sanitizer_is_no_pass(monkeypatch, tmp_path):
+def test_missing_sanitizer_is_not_a_pass(monkeypatch, tmp_path):
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setattr(gpu.shutil, "which", lambda *_, **__: None)
     assert gpu.sanitized("racecheck")["status"].startswith("not available: ")
 
 
-def test_budgets_add_up_to_less_than_ten_minutes():
+def test_time_limits_total_less_than_ten_minutes():
     assert sum(gpu.BUDGETS_S.values()) < 600
     assert set(gpu.BUDGETS_S) == {"machine", *gpu.parts()}
 
 
 @pytest.mark.parametrize("name", ["default", "first sample", "last sample", "64 bits, two words", "decimated by 15"])
-def test_array_operations_make_the_same_image(monkeypatch, name):
+def test_array_library_rivals_compute_the_same_image(monkeypatch, name):
     settings = CASES[name]
     settings = settings.replace(accuracy=settings.accuracy.replace(precision="float32", beam_taps=0))
     plan = Pipeline(settings, device="cpu").settings
@@ -273,7 +273,7 @@ def like_mach(*, channel_data, rx_coords_m, scan_coords_m, tx_wave_arrivals_s, r
     return beams
 
 
-def test_mach_gets_the_same_problem():
+def test_mach_rival_gets_the_same_input():
     settings = rival_mach.settings_for(SHORT.replace(processing=SHORT.processing.replace(directions="3d:20")))
     plan = Pipeline(settings, device="cpu").settings
     arguments, image = rival_mach.problem(plan, noise(settings), "cpu")

@@ -56,7 +56,7 @@ def four():
     return made
 
 
-def test_no_group_is_whole_while_sensors_still_come():
+def test_group_stays_open_while_sensors_still_arrive():
     platform = Platform(("a", 1))
     platform.register(0)
     platform.pulse(0)
@@ -68,7 +68,7 @@ def test_no_group_is_whole_while_sensors_still_come():
     assert platform.reported() == [(0, ("a", "b"), ())]
 
 
-def test_a_group_is_closed_when_all_have_come(four):
+def test_group_closes_when_it_is_complete(four):
     four.pulse(0)
     assert four.reported() == [(0, ("a", "b", "c", "d"), ())]
     assert four.closed[0].members == tuple((name, 1, 0) for name in "abcd")
@@ -76,7 +76,7 @@ def test_a_group_is_closed_when_all_have_come(four):
     assert four.groups.closed == {"complete": 1}
 
 
-def test_a_group_that_lacks_a_sensor_is_closed_after_a_while_and_says_so(four):
+def test_incomplete_group_closes_after_its_time_limit(four):
     for number in range(3):
         four.pulse(number, without=("c",) if number == 1 else ())
     assert [group.group for group in four.closed] == [0, 2]
@@ -85,7 +85,7 @@ def test_a_group_that_lacks_a_sensor_is_closed_after_a_while_and_says_so(four):
     assert four.closed[-1].missing == ("c",)
 
 
-def test_a_sensor_that_has_left_is_not_waited_for(four):
+def test_group_does_not_wait_for_a_departed_sensor(four):
     four.pulse(0)
     for number in range(1, 80):
         four.pulse(number, without=("d",))
@@ -93,7 +93,7 @@ def test_a_sensor_that_has_left_is_not_waited_for(four):
     assert four.reported()[-1] == (79, ("a", "b", "c"), ())
 
 
-def test_a_clock_that_steps_by_an_hour_flags_the_group_and_moves_nothing(four):
+def test_clock_step_flags_the_group_and_shifts_nothing(four):
     for number in range(20):
         four.ahead["b"] = HOUR_NS if number >= 10 else 0
         four.pulse(number)
@@ -103,7 +103,7 @@ def test_a_clock_that_steps_by_an_hour_flags_the_group_and_moves_nothing(four):
     assert four.closed[-1].spread_ns == HOUR_NS
 
 
-def test_counts_of_several_runs_are_aligned_by_time():
+def test_counts_of_several_sessions_are_aligned_by_time():
     platform = Platform(("a", 1), ("b", 2))
     platform.register()
     platform.shift["b"] = -7  # it was armed seven pulses later
@@ -114,7 +114,7 @@ def test_counts_of_several_runs_are_aligned_by_time():
 
 
 @pytest.mark.parametrize("shift", [-1, 1])
-def test_a_lost_or_double_pulse_flags_groups_and_the_others_go_on(shift):
+def test_lost_or_double_pulse_flags_its_groups_only(shift):
     platform = Platform(("a", 1), ("b", 2), ("c", 3))
     platform.register()
     for number in range(60):
@@ -135,7 +135,7 @@ def test_a_lost_or_double_pulse_flags_groups_and_the_others_go_on(shift):
     assert sum(not group.flags for group in platform.closed) >= 52
 
 
-def test_a_clock_step_of_a_run_of_its_own_moves_nothing():
+def test_clock_step_of_a_single_session_shifts_nothing():
     platform = Platform(("a", 1), ("b", 2))
     platform.register()
     for number in range(30):
@@ -146,7 +146,7 @@ def test_a_clock_step_of_a_run_of_its_own_moves_nothing():
     assert platform.reported()[-1] == (29, ("a", "b"), ("clock",))
 
 
-def test_a_clock_that_is_ahead_from_the_start_does_not_keep_a_sensor_apart():
+def test_fast_clock_does_not_separate_its_sensor():
     platform = Platform(("a", 1), ("b", 2))
     platform.register()
     for number in range(10):
@@ -158,7 +158,7 @@ def test_a_clock_that_is_ahead_from_the_start_does_not_keep_a_sensor_apart():
     assert platform.reported()[-1] == (29, ("a", "b"), ("clock",))
 
 
-def test_a_measurement_that_comes_too_late_is_counted(four):
+def test_late_measurement_is_counted(four):
     four.pulse(0, without=("d",))
     four.wait(12)
     four.runs = {"d": 1}
@@ -166,7 +166,7 @@ def test_a_measurement_that_comes_too_late_is_counted(four):
     assert four.groups.closed == {"incomplete": 1, "measurement too late": 1}
 
 
-def test_runs_that_come_and_go_are_forgotten(four):
+def test_ended_sessions_are_forgotten(four):
     for session_id in range(2, 80):
         four.runs = dict.fromkeys("abcd", session_id)
         for number in range(3):
@@ -175,7 +175,7 @@ def test_runs_that_come_and_go_are_forgotten(four):
     assert four.reported()[-1] == (233, ("a", "b", "c", "d"), ())
 
 
-def test_a_clock_that_is_behind_is_told_from_measurements_that_are_old():
+def test_slow_clock_is_distinguished_from_old_measurements():
     """A computer without a battery starts in the past; what it sends is as new as what the others send."""
     platform = Platform(("a", 1), ("b", 2))
     platform.register()
@@ -189,7 +189,7 @@ def test_a_clock_that_is_behind_is_told_from_measurements_that_are_old():
     assert sum(group.sensors == ("a", "b") for group in platform.closed) >= 25
 
 
-def test_a_node_that_catches_up_keeps_its_own_times():
+def test_node_that_catches_up_keeps_its_times():
     platform = Platform(("a", 1), ("b", 2))
     platform.register()
     for number in range(40):
@@ -213,7 +213,7 @@ def test_a_node_that_catches_up_keeps_its_own_times():
     ],
     ids=["timestamp", "count", "far", "away", "clock", "fast"],
 )
-def test_a_sensor_that_says_anything_takes_nobody_elses_groups(wrong):
+def test_faulty_sensor_does_not_change_groups_of_others(wrong):
     platform = Platform(("a", 1), ("b", 2))
     platform.register()
     values = {"timestamp_ns": 10**18, "monotonic_ns": 0, "sync_count": 0}
@@ -231,7 +231,7 @@ def test_a_sensor_that_says_anything_takes_nobody_elses_groups(wrong):
     assert len(both) >= 580
 
 
-def test_runs_that_come_after_a_sensor_that_says_anything_find_each_other():
+def test_sessions_after_a_faulty_sensor_are_grouped():
     platform = Platform(("evil", 9))
     platform.register()
     for number in range(300):

@@ -21,43 +21,46 @@ from tests.pages import DOCS, GUIDE, ROOT, commands_in, environment, in_backgrou
 from tests.publishing import Publisher, cloud
 
 RUN_BY = {
-    ("accuracy", "$"): ["test_guide::test_commands_of_a_page"],
-    ("applications", "$"): ["test_applications_page::test_commands"],
-    ("applications", "python"): ["test_applications_page::test_loop"],
-    ("beamformers", "$"): ["test_guide::test_commands_of_a_page"],
+    ("accuracy", "$"): ["test_guide::test_commands_of_the_guide_run"],
+    ("applications", "$"): ["test_applications_page::test_application_commands_of_the_page_run"],
+    ("applications", "python"): ["test_applications_page::test_application_loop_of_the_page_runs"],
+    ("beamformers", "$"): ["test_guide::test_commands_of_the_guide_run"],
     ("command-line", "$"): ["test_config::test_command_line_page_runs", "test_config::test_completion_for_each_shell"],
-    ("concepts", "python"): ["test_guide::test_python_on_concepts"],
-    ("cuda", "$"): ["test_guide::test_commands_on_cuda"],
-    ("cuda", "python"): ["test_guide::test_python_on_cuda"],
-    ("devices", "$"): ["test_readme::test_page_on_devices"],
+    ("concepts", "python"): ["test_guide::test_code_of_the_concepts_page_runs"],
+    ("cuda", "$"): ["test_guide::test_commands_of_the_gpu_page_run"],
+    ("cuda", "python"): ["test_guide::test_code_of_the_gpu_page_runs"],
+    ("devices", "$"): ["test_readme::test_commands_of_the_devices_page_run"],
     ("export", "$"): ["test_export::test_export_page_commands_and_code_run"],
     ("export", "python"): ["test_export::test_export_page_commands_and_code_run"],
-    ("first-hour", "$"): ["test_first_hour::test_first_hour"],
-    ("formats", "python"): ["test_guide::test_python_on_formats"],
-    ("gallery", "$"): ["test_readme::test_gallery_begins_as_the_readme"],
-    ("gpu", "$"): ["test_guide::test_commands_on_cuda"],
-    ("health", "$"): ["test_health_commands::test_page_shows_what_the_commands_print"],
+    ("first-hour", "$"): ["test_first_hour::test_first_hour_page_runs"],
+    ("formats", "python"): ["test_guide::test_code_of_the_formats_page_runs"],
+    ("gallery", "$"): ["test_readme::test_gallery_starts_like_the_readme"],
+    ("gpu", "$"): ["test_guide::test_commands_of_the_gpu_page_run"],
+    ("health", "$"): ["test_health_commands::test_health_page_shows_the_printed_output"],
     ("many", "$"): [
-        "test_many_docs::test_commands_in_their_order",
-        "test_many_cluster::test_the_line_of_the_page_runs",
+        "test_many_docs::test_commands_of_the_page_run_in_order",
+        "test_many_cluster::test_cluster_command_of_the_page_runs",
     ],
-    ("many", "python"): ["test_many_docs::test_python_lines"],
-    ("network", "$"): ["test_network_page::test_one_machine", "test_network_page::test_several_machines"],
-    ("network", "python"): ["test_guide::test_python_on_the_network"],
+    ("many", "python"): ["test_many_docs::test_code_of_the_page_runs"],
+    ("network", "$"): [
+        "test_network_page::test_network_page_on_one_machine_runs",
+        "test_network_page::test_network_page_on_several_machines_runs",
+    ],
+    ("network", "python"): ["test_guide::test_code_of_the_network_page_runs"],
     ("numpy", "python"): [
-        "test_numpy_page::test_examples_run",
+        "test_numpy_page::test_page_examples_run",
         "test_numpy_page::test_own_beamformer_finds_the_reflectors",
     ],
-    ("own-array", "$"): ["test_guide::test_own_array"],
-    ("own-array", "python"): ["test_guide::test_own_array"],
-    ("plots", "$"): ["test_plot::test_commands_of_the_page"],
-    ("plots", "python"): ["test_plot::test_python_of_the_page"],
-    ("python", "python"): ["test_guide::test_importing_loads_nothing_but_names"],
-    ("quickstart", "$"): ["test_guide::test_start"],
-    ("quickstart", "python"): ["test_guide::test_start"],
-    ("ros", "$"): ["test_guide::test_commands_on_ros"],
-    ("simulation", "$"): ["test_readme::test_page_on_simulation"],
-    ("simulation", "python"): ["test_readme::test_page_on_simulation"],
+    ("own-array", "$"): ["test_guide::test_own_array_page_runs"],
+    ("own-array", "python"): ["test_guide::test_own_array_page_runs"],
+    ("plots", "$"): ["test_plot::test_plot_commands_of_the_page_run"],
+    ("plots", "python"): ["test_plot::test_plot_code_of_the_page_runs"],
+    ("python", "python"): ["test_guide::test_import_loads_no_submodules"],
+    ("quickstart", "$"): ["test_guide::test_quickstart_page_runs"],
+    ("quickstart", "python"): ["test_guide::test_quickstart_page_runs"],
+    ("ros", "$"): ["test_guide::test_commands_of_the_ros_page_run"],
+    ("simulation", "$"): ["test_readme::test_commands_of_the_simulation_page_run"],
+    ("simulation", "python"): ["test_readme::test_commands_of_the_simulation_page_run"],
     ("view", "$"): ["test_view_command::test_commands_of_the_page_on_the_view_run"],
     ("view", "python"): ["test_view_command::test_commands_of_the_page_on_the_view_run"],
 }
@@ -75,7 +78,7 @@ def place(tmp_path, monkeypatch):
 # ---- all of it is run --------------------------------------------------------------------------------
 
 
-def test_all_that_pages_show_is_run():
+def test_all_code_of_the_guide_is_run():
     shown = set()
     for path in GUIDE:
         text = path.read_text("utf-8")
@@ -85,7 +88,7 @@ def test_all_that_pages_show_is_run():
 
 
 @pytest.mark.parametrize("about", RUN_BY, ids="-".join)
-def test_what_is_said_to_run_a_page_does_name_it(about):
+def test_tests_of_a_page_name_it(about):
     for named in RUN_BY[about]:
         file, name = named.split("::")
         text = (ROOT / "tests" / f"{file}.py").read_text("utf-8")
@@ -96,7 +99,7 @@ def test_what_is_said_to_run_a_page_does_name_it(about):
 # ---- pages without a file of tests of their own ------------------------------------------------------
 
 
-def test_start(place):
+def test_quickstart_page_runs(place):
     text = page("quickstart")
     with contextlib.ExitStack() as background:
         for command in commands_in(text):
@@ -110,7 +113,7 @@ def test_start(place):
     assert len(open_recording(place / "CAPTURED.h5")) == 10
 
 
-def test_own_array(place):
+def test_own_array_page_runs(place):
     text = page("own-array")
     files = re.findall(r"`([\w.]+)`:\n\n```\w+\n(.*?)```", text, re.DOTALL)
     assert [name for name, _ in files] == ["ring.csv", "ring8.toml", "mine.toml", "scene.toml", "pcm.toml", "call.toml"]
@@ -131,20 +134,20 @@ def test_own_array(place):
 
 
 @pytest.mark.parametrize("name", ["accuracy", "beamformers"])
-def test_commands_of_a_page(place, name):
+def test_commands_of_the_guide_run(place, name):
     for command in commands_in(page(name)):
         run_here(place, command)
     assert (place / "REC.energy.h5").exists()
 
 
-def test_python_on_concepts(place):
+def test_code_of_the_concepts_page_runs(place):
     run_here(place, "example reflectors")
     (code,) = python_in(page("concepts"))
     reported = run(place, sys.executable, "-W", "error", "-c", code + "\nprint(image.amplitude.shape[0])")
     assert reported.stdout.strip() == "81"
 
 
-def test_commands_on_cuda():
+def test_commands_of_the_gpu_page_run():
     """What `make test` runs, as it is there."""
     lines = re.findall(r"^\$ (.*?)\s+#", page("cuda") + page("gpu"), re.MULTILINE)
     legs = [line for line in lines if not line.startswith("pip install ")]
@@ -157,14 +160,14 @@ def test_commands_on_cuda():
         assert f"\t{variables[0]}$(PYTEST) {folder}" in recipes
 
 
-def test_commands_on_ros(place):
+def test_commands_of_the_ros_page_run(place):
     pytest.importorskip("mcap_ros2", reason="mcap comes with the extra ros")
     for command in commands_in(page("ros")):
         run_here(place, command)
     assert (place / "POINTS.mcap").stat().st_size > 1000
 
 
-def test_python_on_cuda():
+def test_code_of_the_gpu_page_runs():
     """On the processor where there is no GPU."""
     (code,) = python_in(page("cuda"))
     assert code.count('"cuda"') == 1
@@ -175,7 +178,7 @@ def test_python_on_cuda():
     assert (given["images"][0].amplitude == given["image"].amplitude).all()
 
 
-def test_python_on_formats(place):
+def test_code_of_the_formats_page_runs(place):
     """In a process of its own: netCDF-C and h5py each bring an HDF5."""
     (place / "REC.h5").symlink_to(ROOT / "data" / "synthetic" / "reflectors.h5")
     (code,) = python_in(page("formats"))
@@ -184,7 +187,7 @@ def test_python_on_formats(place):
     assert "'sample'" in reported
 
 
-def test_python_on_the_network(place):
+def test_code_of_the_network_page_runs(place):
     (code,) = python_in(page("network"))
     with Publisher() as publisher, publisher.playing([cloud(number) for number in range(3)]):
         code = code.replace("tcp://127.0.0.1:5602", publisher.address)
@@ -195,7 +198,7 @@ def test_python_on_the_network(place):
             process.terminate()
 
 
-def test_importing_loads_nothing_but_names(place):
+def test_import_loads_no_submodules(place):
     code = page("python").split("```python\n")[1].split("```")[0]
     modules = run(place, sys.executable, "-c", f"{code}\nimport sys; print(*sys.modules)").stdout.split()
     assert "ertis_numba" in modules
@@ -227,19 +230,19 @@ def taught(text):
                 yield f"{homes[node.value.id]}.{node.attr}"
 
 
-def test_python_names_all_that_is_public():
+def test_python_reference_lists_all_public_names():
     named = [path.removeprefix("ertis_numba.") for path in public()]
     assert sorted(name for name in named if "." not in name) == ertis_numba.__all__
 
 
-def test_what_python_names_is_exported():
+def test_names_in_the_python_reference_are_exported():
     for path in public():
         home, _, name = path.rpartition(".")
         assert name in pkgutil.resolve_name(home).__all__, path
 
 
 @pytest.mark.parametrize("path", [ROOT / "README.md", *GUIDE], ids=lambda path: path.stem)
-def test_what_pages_teach_is_public(path):
+def test_names_used_on_pages_are_public(path):
     """By any path that leads to it."""
     objects = {id(pkgutil.resolve_name(each)) for each in public()}
     homes = {each.rpartition(".")[0] for each in public()}
@@ -248,7 +251,7 @@ def test_what_pages_teach_is_public(path):
         assert each in homes if isinstance(meant, ModuleType) else id(meant) in objects, each
 
 
-def test_readers_have_what_the_page_says():
+def test_readers_have_the_documented_attributes():
     section = page("python").partition("## Files\n")[2].partition("\n## ")[0]
     rows = re.findall(r"^\| (`.*?`) \|", section, re.MULTILINE)
     names = [name for row in rows for name in re.findall(r"`(\w+)`", row)]
@@ -258,13 +261,13 @@ def test_readers_have_what_the_page_says():
         assert isinstance(recording.truth, GroundTruth)
 
 
-def test_every_page_is_in_the_guide():
+def test_every_page_is_in_the_table_of_contents():
     listed = " ".join(re.findall(r"```{toctree}\n(.*?)```", page("index"), re.DOTALL)).split()
     pages = {str(path.relative_to(DOCS).with_suffix("")) for path in GUIDE} - {"index"}
     assert {name for name in pages if not any(fnmatch.fnmatch(name, entry) for entry in listed)} == set()
 
 
-def test_tables_that_make_updates_have_their_markers():
+def test_tables_updated_by_make_have_their_markers():
     """`make bench` and `make soak` would refuse a page without them, after minutes or hours."""
     lines = re.findall(r"ertis (bench [\w-]+)(.*)", (ROOT / "Makefile").read_text("utf-8"))
     updates = [(name, path) for name, rest in lines for path in re.findall(r"--update (\S+)", rest)]

@@ -26,12 +26,12 @@ from tests.hard_cases.forced import EIGHT, FULL, forced, image_of
 from tests.scenes import bits_of, heard, only, scene_of, seen, sorted_ways
 
 
-def test_a_moving_target_that_flies_through_the_array():
+def test_target_moving_through_the_array_is_finite():
     point = Point(position_m=(0.01, 0.0, 0.0), velocity_m_s=(-20.0, 0.0, 0.0), strength_db=-90)
     assert np.all(np.isfinite(heard(scene_of(point), *EFFECTS)))
 
 
-def test_two_targets_in_one_place_add_up():
+def test_coincident_targets_add_up():
     one = scene_of(Point(azimuth_deg=10, range_m=0.4), sensor=EIGHT)
     two = scene_of(*2 * one.points, sensor=EIGHT)
     assert_allclose(heard(two, "spreading"), 2 * heard(one, "spreading"), atol=1e-12)
@@ -45,7 +45,7 @@ def test_two_targets_in_antiphase_cancel():
 
 
 @pytest.mark.parametrize("diameter_m", [0.0, 0.02])
-def test_a_target_behind_the_array(diameter_m):
+def test_target_behind_the_array_appears_as_documented(diameter_m):
     """A planar array without patterns shows it in front; behind a piston there is nothing."""
     scene = scene_of(
         Point(azimuth_deg=160, range_m=0.4, strength_db=-30),
@@ -58,13 +58,13 @@ def test_a_target_behind_the_array(diameter_m):
         assert (peak.azimuth_deg, peak.range_m) == (pytest.approx(20, abs=2), pytest.approx(0.4, abs=0.005))
 
 
-def test_no_targets_at_all():
+def test_scene_without_targets_is_rendered():
     image = image_of(scene_of(sensor=EIGHT))
     assert image.amplitude.max() < 1e-3  # the modulators' noise
     assert Simulator(forced(scene_of(sensor=EIGHT))).reflectors() == []
 
 
-def test_every_effect_with_nothing_there():
+def test_forced_effects_without_objects_change_nothing():
     """Forced on, effects that find nothing to act upon do nothing."""
     scene = Scene(sensors=(EIGHT.replace(emitter=Emitter(silent=True)),))
     assert not Simulator(forced(scene)).signals().any()
@@ -75,7 +75,7 @@ def test_every_effect_with_nothing_there():
     )
 
 
-def test_every_effect_with_everything_there():
+def test_all_effects_with_all_objects_are_finite():
     scene = Scene(
         seed=3,
         sensors=(
@@ -97,7 +97,7 @@ def test_every_effect_with_everything_there():
 
 
 @pytest.mark.parametrize("facing_deg", [(180.0, 0.0), (0.0, 0.0), (90.0, 0.0), (0.0, 90.0)])
-def test_a_wall_through_the_sensor(facing_deg):
+def test_wall_through_the_sensor_is_finite(facing_deg):
     """It mirrors nothing of the sensor itself, since no sound goes to it and back."""
     scene = scene_of(
         Point(range_m=0.4, azimuth_deg=10),
@@ -109,7 +109,7 @@ def test_a_wall_through_the_sensor(facing_deg):
 
 
 @pytest.mark.parametrize("place_m", [(1.5, 2.0, 1.25), (1.5, 2.0, 0.0), (1.5, 0.0, 0.0), (1.5 - 1e-9, 2.0 - 1e-9, 0.1)])
-def test_a_sensor_in_the_corner_of_a_box(place_m):
+def test_sensor_in_the_corner_of_a_box_is_finite(place_m):
     sensor = FULL.replace(position_m=place_m, yaw_deg=-140)
     scene = scene_of(
         Point(position_m=(1.3, 1.8, 0.1)),
@@ -119,14 +119,14 @@ def test_a_sensor_in_the_corner_of_a_box(place_m):
     image_of(scene)
 
 
-def test_a_target_upon_a_wall():
+def test_target_on_a_wall_is_finite():
     wall = Wall(position_m=(0.5, 0.0, 0.0), facing_deg=(180.0, 0.0))
     scene = scene_of(Point(position_m=(0.5, 0.1, 0.0)), sensor=FULL, walls=(wall,))
     image_of(scene)
     assert len(sorted_ways(scene, "occlusion")[0]) == 1  # what touches a wall is not behind it
 
 
-def test_a_sensor_inside_a_sphere_is_refused():
+def test_sensor_inside_a_sphere_is_refused():
     scene = scene_of(
         sensor=FULL,
         spheres=(Sphere(position_m=(0.0, 0.0, 0.0), radius_m=0.5), Sphere(position_m=(0.1, 0.0, 0.0), radius_m=0.5)),
@@ -135,17 +135,17 @@ def test_a_sensor_inside_a_sphere_is_refused():
         heard(scene, *EFFECTS)
 
 
-def test_two_sensors_in_one_place():
+def test_coincident_sensors_are_rendered():
     scene = Scene(sensors=(FULL, FULL.replace(name="twin")), points=(Point(range_m=0.4, strength_db=-40),))
     image_of(scene)
 
 
-def test_two_walls_in_one_place():
+def test_coincident_walls_are_rendered():
     wall = Wall(position_m=(0.5, 0.0, 0.0), facing_deg=(180.0, 0.0))
     image_of(scene_of(Point(range_m=0.3), sensor=FULL, walls=(wall, wall)))
 
 
-def test_a_scene_in_overload_recovers():
+def test_scene_recovers_from_overload():
     """Twenty times full scale: the bits stay bits, and quiet follows."""
     sensor = EIGHT.replace(recording=Recording(n_samples=40_000))
     scene = scene_of(Point(range_m=0.2, strength_db=0), sensor=sensor)

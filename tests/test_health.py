@@ -27,7 +27,7 @@ from tests.scenes import line_array
 
 
 @pytest.mark.parametrize("name", ["line", "reflectors", "reflectors_3d"])
-def test_shipped_recordings_are_in_order(name):
+def test_shipped_recordings_have_no_faults(name):
     with open_recording(DATA / f"{name}.h5") as recording:
         report = health(recording[0])
     assert (report.faults, report.tones_hz, report.unknown) == ({}, (), ())
@@ -35,7 +35,7 @@ def test_shipped_recordings_are_in_order(name):
 
 
 @pytest.mark.parametrize("n_samples", [163_840, 65_536, 40_961])
-def test_real_measurement_is_in_order(n_samples):
+def test_real_measurement_has_no_faults(n_samples):
     report = health(dataclasses.replace(real(), data=real().data[:n_samples]))
     assert (report.faults, report.tones_hz, report.unknown) == ({}, (), ())
     assert -65 < report.noise_dbfs < -45
@@ -51,7 +51,7 @@ def test_real_measurement_is_in_order(n_samples):
         Electronics(noise_dbfs=-45.0, gain_spread_db=2.0, delay_spread_s=3e-6, microphone_diameter_m=0.002),
     ],
 )
-def test_usual_microphones_are_in_order(electronics):
+def test_usual_microphones_have_no_faults(electronics):
     sensor = EIGHT.replace(electronics=electronics)
     direct = sensor.replace(emitter=sensor.emitter.replace(direct_sound_db=-65.0))
     for measurement in (rendered(sensor), rendered(direct)):
@@ -59,7 +59,7 @@ def test_usual_microphones_are_in_order(electronics):
 
 
 @pytest.mark.parametrize("name", cases.CASES)
-def test_white_bits_are_no_fault(name):
+def test_white_bits_are_not_a_fault(name):
     report = health(cases.noise(cases.CASES[name]))
     assert report.faults == {}
     assert "dead microphone" in report.unknown[0]
@@ -67,7 +67,7 @@ def test_white_bits_are_no_fault(name):
 
 
 @pytest.mark.parametrize("n_samples", [256, 1000, 5000])
-def test_white_bits_are_no_fault_by_chance(n_samples):
+def test_random_white_bits_are_not_a_fault(n_samples):
     settings = cases.SHORT.replace(recording=Recording(n_samples=n_samples))
     reports = [health(cases.noise(settings, seed)) for seed in range(60)]
     assert merge(reports).faults == {}
@@ -77,7 +77,7 @@ def test_white_bits_are_no_fault_by_chance(n_samples):
 # ---- faults ---------------------------------------------------------------------------------------
 
 
-def test_faults_of_the_simulator():
+def test_simulated_faults_are_named():
     sensor = EIGHT.replace(electronics=EIGHT.electronics.replace(dead_channels=(2, 5), stuck_low=(0,), stuck_high=(7,)))
     report = health(rendered(sensor))
     assert report.faults == {"stuck at 0": (0,), "dead": (2, 5), "stuck at 1": (7,)}
@@ -87,7 +87,7 @@ def test_faults_of_the_simulator():
 
 
 @pytest.mark.parametrize("name", BY_HAND)
-def test_faults_by_hand(name):
+def test_constructed_faults_are_named(name):
     report = health(BY_HAND[name]())
     assert 3 in report.faults[name]
     assert {channel for channels in report.faults.values() for channel in channels} == {3}
@@ -97,7 +97,7 @@ def test_faults_by_hand(name):
         assert report.channels[3].tone_hz == pytest.approx(31e3, abs=600)
 
 
-def test_all_silent():
+def test_silent_array_is_reported():
     report = health(dataclasses.replace(sound(), data=np.zeros_like(sound().data)))
     assert report.verdict() == "stuck at 0: every channel"
     assert (report.noise_dbfs, report.dynamic_range_db) == (None, None)
@@ -111,7 +111,7 @@ def numbers():
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1.0, 300.0])
-def test_numbers_have_no_full_scale(scale):
+def test_pcm_numbers_have_no_full_scale(scale):
     """Pascal, for one, goes as high as the sound; what was cut off before is told at any scale."""
     words = numbers().data * np.float32(scale)
     assert health(dataclasses.replace(numbers(), data=words)).faults == {}
@@ -119,7 +119,7 @@ def test_numbers_have_no_full_scale(scale):
     assert health(dataclasses.replace(numbers(), data=words)).faults == {"saturated": (5,)}
 
 
-def test_levels_of_numbers_beyond_1_refer_to_the_highest():
+def test_levels_above_full_scale_refer_to_the_highest_amplitude():
     words = numbers().data
     noise = np.random.default_rng(1).standard_normal(words.shape)
     noisy = 0.1 * words / np.abs(words).max() + 1e-4 * noise
@@ -137,7 +137,7 @@ def test_levels_of_numbers_beyond_1_refer_to_the_highest():
     assert at_full_scale[0] < -60
 
 
-def test_calibrated_gains_make_no_microphone_dead():
+def test_calibrated_gains_are_not_reported_as_dead():
     gain = (1.0, 2.0, 0.5, 3.0, 0.7, 3.0, 0.2, 3.0)
     words = numbers().data * np.float32(gain)
     assert health(dataclasses.replace(numbers(), data=words)).faults == {"dead": (6,)}
@@ -147,7 +147,7 @@ def test_calibrated_gains_make_no_microphone_dead():
     assert health(Measurement(words, settings)).faults == {"dead": (3,)}
 
 
-def test_disabled_channels_are_not_looked_at():
+def test_disabled_channels_are_ignored():
     dead = health(with_bits(with_bits(sound(), 3, np.zeros(65_536)), 6, np.zeros(65_536)))
     assert dead.faults == {"stuck at 0": (3, 6)}
     array = EIGHT.array.replace(enabled=tuple(channel not in {3, 6} for channel in range(8)))
@@ -157,7 +157,7 @@ def test_disabled_channels_are_not_looked_at():
     assert [item.channel for item in report.channels] == [0, 1, 2, 4, 5, 7]
 
 
-def test_a_tone_that_all_hear_is_no_fault():
+def test_tone_on_all_channels_is_not_a_fault():
     tone = Tone(position_m=(1.0, 0.5, 0.0), frequency_hz=34_000.0, level_db=-20.0)
     report = health(rendered(EIGHT, tones=(tone,)))
     assert report.faults == {}
@@ -165,7 +165,7 @@ def test_a_tone_that_all_hear_is_no_fault():
 
 
 @pytest.mark.parametrize("word_bits", [8, 16, 32, 64])
-def test_any_words(word_bits):
+def test_health_accepts_any_words(word_bits):
     sensor = EIGHT.replace(
         array=line_array(70, 0.002).replace(word_bits=word_bits),
         recording=Recording(n_samples=32_768),
@@ -174,7 +174,7 @@ def test_any_words(word_bits):
     assert health(rendered(sensor)).faults == {"dead": (9,), "stuck at 1": (69,)}
 
 
-def test_many_microphones():
+def test_health_accepts_many_microphones():
     sensor = EIGHT.replace(
         array=line_array(1024, 1e-4),
         recording=Recording(n_samples=20_000),

@@ -29,7 +29,7 @@ def test_health_names_no_fault_of_a_healthy_array(seed):
         200738,  # echoes cancel at one channel in the loudest eighth of the record
     ],
 )
-def test_health_names_no_fault_where_a_healthy_array_looks_faulty(seed):
+def test_health_names_no_fault_of_ambiguous_healthy_arrays(seed):
     assert false_alarms(seed)[1] == {}
 
 

@@ -37,7 +37,7 @@ def sick(tmp_path):
     return write_recording(tmp_path / "rec.h5", given)
 
 
-def test_info_tells_the_health(sick, tmp_path):
+def test_info_reports_the_health(sick, tmp_path):
     held = json.loads(run("info", sick, "--health", "--json").stdout)
     [section] = held["sensors"]
     assert (section["measurements"], section["looked_at"]) == (10, 8)
@@ -70,7 +70,7 @@ def faulty(tmp_path):
 FAST = ["--directions", "2d:5", "--range", "0.8:1.2", "--quiet", "--max-error", "-25"]
 
 
-def test_process_warns_once(faulty, tmp_path):
+def test_process_warns_once_of_a_fault(faulty, tmp_path):
     done = run("process", faulty, "-o", tmp_path / "img.h5", *FAST)
     assert done.stderr == (
         f"ertis: warning: {faulty}: sensor sensor has faulty microphones (stuck at 0: channel 4; stuck at 1: "
@@ -79,14 +79,14 @@ def test_process_warns_once(faulty, tmp_path):
     assert (tmp_path / "img.h5").exists()
 
 
-def test_process_refuses_if_asked_to(faulty, tmp_path):
+def test_process_strict_refuses_faulty_recordings(faulty, tmp_path):
     done = run("process", faulty, "-o", tmp_path / "img.h5", *FAST, "--strict", code=1)
     assert done.stderr.startswith(f"ertis: error: {faulty}: sensor sensor has faulty microphones (stuck at 0: channel")
     assert done.stderr.count("\n") == 1
     assert [item.name for item in tmp_path.iterdir()] == ["rec.h5"]
 
 
-def test_the_remedy_helps(faulty, tmp_path, monkeypatch):
+def test_suggested_remedy_fixes_the_fault(faulty, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     layout = load_layout("eRTIS_v3D1")
     rows = (1000 * layout.positions_m).tolist()
@@ -96,18 +96,18 @@ def test_the_remedy_helps(faulty, tmp_path, monkeypatch):
     assert done.stderr == ""
 
 
-def test_process_says_nothing_of_what_is_in_order(tmp_path):
+def test_process_prints_nothing_for_healthy_recordings(tmp_path):
     path = write_recording(tmp_path / "rec.h5", [real()])
     assert run("process", path, "-o", tmp_path / "img.h5", *FAST, "--strict").stderr == ""
 
 
-def test_silence_is_no_fault_of_single_microphones(tmp_path):
+def test_silence_is_not_a_fault_of_single_microphones(tmp_path):
     path = write_recording(tmp_path / "rec.h5", [dataclasses.replace(real(), data=0 * real().data)])
     reported = run("process", path, "-o", tmp_path / "img.h5", *FAST).stderr
     assert "(stuck at 0: every channel); check its cable and supply, or see" in reported
 
 
-def test_page_shows_what_the_commands_print(tmp_path, monkeypatch):
+def test_health_page_shows_the_printed_output(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("data").symlink_to(ROOT / "data")
     page = path_of("health").read_text("utf-8")
@@ -118,7 +118,7 @@ def test_page_shows_what_the_commands_print(tmp_path, monkeypatch):
             assert done.stdout + done.stderr == shown, command
 
 
-def test_page_has_the_limits():
+def test_health_page_has_the_limits():
     page = " ".join(path_of("health-checks").read_text("utf-8").split())
     for reported in (
         f"less than {100 * limits.MIN_CHANGES:g} % of",

@@ -21,7 +21,7 @@ from tests.health_recordings import (
 
 @pytest.mark.parametrize("n_samples", [0, 1, 2, 33, 255, 256, 257, 4000, 17_000])
 @pytest.mark.parametrize("bits", ["silent", "alternating", "real"])
-def test_short_records(n_samples, bits):
+def test_short_records_are_examined(n_samples, bits):
     rows = {"silent": 0 * real().data, "alternating": np.arange(163_840) % 2 * 0xFFFFFFFF, "real": real().data}
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -36,14 +36,14 @@ def test_short_records(n_samples, bits):
         assert len(report.faults) == 1
 
 
-def test_one_microphone_has_nothing_to_be_compared_with():
+def test_single_microphone_is_not_compared():
     report = health(cases.noise(cases.CASES["one microphone"]))
     assert report.unknown == ("a dead microphone: no other channel is available for comparison",)
     assert report.noise_dbfs == pytest.approx(-19.5, abs=1.5)
 
 
 @pytest.mark.parametrize("call", [Call(start_frequency_hz=39_500.0, stop_frequency_hz=40_500.0), Call()])
-def test_a_band_too_narrow_for_the_record_is_told(call):
+def test_band_too_narrow_for_the_record_is_reported(call):
     measurement = dataclasses.replace(sound(), settings=sound().settings.replace(call=call))
     assert health(measurement).unknown == (
         ("dead microphones, tones and noise: 65536 samples are too few to resolve the call's band",)
@@ -58,14 +58,14 @@ def test_words_of_another_array_are_refused(words):
         health(dataclasses.replace(sound(), data=words))
 
 
-def test_noise_of_white_bits_is_what_falls_into_the_band():
+def test_noise_of_white_bits_is_their_share_in_the_band():
     """Bits have a mean square of 1, spread evenly up to half of their rate."""
     report = health(cases.noise(cases.SHORT.replace(recording=Recording(n_samples=163_840))))
     assert report.noise_dbfs == pytest.approx(10 * np.log10(25e3 / 2.25e6), abs=0.3)
 
 
 @pytest.mark.parametrize("name", ["default", "wide band", "line of 8", "16 bits, disabled"])
-def test_dynamic_range_is_that_of_images(name):
+def test_dynamic_range_matches_that_of_images(name):
     """A full-scale echo is 1 in an image. What is quietest of a few channels is quieter than their mean."""
     measurements = [cases.noise(cases.CASES[name], seed) for seed in range(4)]
     pipeline = ertis.Pipeline(cases.CASES[name])
@@ -74,7 +74,7 @@ def test_dynamic_range_is_that_of_images(name):
     assert reported == pytest.approx(-10 * np.log10(noise), abs=1.2)
 
 
-def test_several_measurements_are_merged():
+def test_reports_of_several_measurements_are_merged():
     healthy, sick = health(sound()), health(BY_HAND["idle tone"]())
     report = merge([healthy, healthy, sick])
     assert report.measurements == 3
@@ -93,7 +93,7 @@ def test_several_measurements_are_merged():
 
 
 @pytest.mark.alone
-def test_it_is_quick():
+def test_health_is_quick():
     health(real())
     start_s = time.perf_counter()
     health(real())

@@ -66,7 +66,7 @@ def test_from_toml_accepts_many_numbers_in_a_line():
         ("#" + "é" * (Settings.max_bytes // 2), f"{Settings.max_bytes + 1} bytes; the limit is {Settings.max_bytes}"),
     ],
 )
-def test_from_toml_refuses_what_keeps_the_parser_busy(text, match):
+def test_from_toml_refuses_texts_that_are_slow_to_parse(text, match):
     with pytest.raises(SettingsError, match=match):
         Settings.from_toml(text)
 
@@ -78,7 +78,7 @@ def test_call_refuses_too_many_samples(duration_s, rate_hz):
 
 
 @pytest.mark.parametrize("table", [Array, Processing])
-def test_names_in_settings_have_a_limit(table):
+def test_names_in_settings_have_a_maximum_length(table):
     """HDF5 takes 64 kB as an attribute, and a longer layout kept a journal from being sealed."""
     name = "layout" if table is Array else "directions"
     with pytest.raises(ArgumentError, match=f"{name} has 5000 characters; the limit is 4096"):
@@ -138,7 +138,7 @@ def test_workers_refuse_settings_that_need_too_much_memory(changes, megabytes):
     assert predicted_bytes(Settings()) < chain.MAX_BYTES / 100
 
 
-def test_a_pipeline_has_a_limit_on_the_tables_of_its_plan(monkeypatch):
+def test_pipeline_limits_the_tables_of_its_plan(monkeypatch):
     monkeypatch.setattr(chain, "MAX_BYTES", predicted_bytes(Settings()) + 1000)
     with pytest.raises(ArgumentError, match="no plan fits into memory"):
         SharedPipeline(Settings().to_toml(), "numpy")
@@ -157,7 +157,7 @@ def _greeting(peer, size=1):
     return Greeting([_Frame(peer)], hello, [bytes(size)], "")
 
 
-def test_greetings_let_peers_take_turns():
+def test_hello_messages_of_peers_take_turns():
     """One node with hundreds of hellos must not keep another's waiting."""
     goes, order = threading.Event(), []
 
@@ -178,7 +178,7 @@ def test_greetings_let_peers_take_turns():
     assert order.index(2) <= 2
 
 
-def test_greetings_have_limits(monkeypatch):
+def test_number_of_waiting_hello_messages_is_limited(monkeypatch):
     monkeypatch.setattr(_validation, "MAX_WAITING_OF_PEER", 3)
     monkeypatch.setattr(_validation, "MAX_WAITING_BYTES", 1000)
     greetings = Greetings(lambda *_: None)
@@ -192,7 +192,7 @@ def test_greetings_have_limits(monkeypatch):
     greetings.offer(_greeting(b"b", 998))
 
 
-def test_a_central_node_acknowledges_others_while_it_reads_a_long_hello(tmp_path):
+def test_central_node_acknowledges_others_during_a_long_hello(tmp_path):
     given = entries(2)
     text = b"x = [" + b"[1111]," * 29_000 + b"]\n"  # a tenth of a second
     with running(tmp_path) as central, Node(central.address) as node, Node(central.address) as other:
@@ -213,7 +213,7 @@ def test_a_central_node_acknowledges_others_while_it_reads_a_long_hello(tmp_path
 
 
 @pytest.mark.parametrize("directions", ["/etc/passwd.csv/", "/dev/stdin", "2d:1000000000"])
-def test_a_hello_that_names_a_file_is_refused(tmp_path, directions):
+def test_hello_that_names_a_file_is_refused(tmp_path, directions):
     settings = TINY.replace(processing=TINY.processing.replace(directions=directions))
     with running(tmp_path) as central, Node(central.address) as node:
         answer = node.hello(settings=settings)
@@ -224,7 +224,7 @@ def test_a_hello_that_names_a_file_is_refused(tmp_path, directions):
     assert stored(tmp_path) == ([], [])
 
 
-def test_hostile_hellos(tmp_path):
+def test_hostile_hello_messages_are_refused(tmp_path):
     found = hostile.hellos(tmp_path, seed=1, count=30, alone_s=0.5)
     assert tables.row("hellos", found)
     assert (found["hellos"], found["taken"]) == (30, [])
@@ -235,7 +235,7 @@ def test_hostile_hellos(tmp_path):
     assert faults.LONG.n_hellos + faults.LONG.n_files > 200
 
 
-def test_hostile_files(tmp_path):
+def test_hostile_files_are_refused(tmp_path):
     found = hostile.files(tmp_path, count=20)
     assert tables.row("files", found)
     assert found["reads"] == 3 * found["files"] == 60

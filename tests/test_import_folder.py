@@ -51,7 +51,7 @@ def shipped(kind):
     return {path.stem: json.loads(path.read_text()) for path in folder.glob("*.json")}
 
 
-def test_words_and_numbers(tmp_path):
+def test_folder_import_keeps_samples_and_sequence_numbers(tmp_path):
     """By their numbers, not their names; a missing one is a gap."""
     reader = open_rtis_folder(folder_of(tmp_path, names=("m_9.bin", "m_10.bin", "m_12.bin")), sensor="left")
     assert len(reader) == 3
@@ -62,7 +62,7 @@ def test_words_and_numbers(tmp_path):
         assert measurement.settings is reader.settings
 
 
-def test_settings(tmp_path):
+def test_folder_import_reads_settings(tmp_path):
     reader = open_rtis_folder(folder_of(tmp_path))
     wanted = Settings.from_preset("short_25_50")
     processing = wanted.processing.replace(range_m=(0.4, 1.5), directions="2d:91")
@@ -70,7 +70,7 @@ def test_settings(tmp_path):
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_shipped_recording_settings_are_the_presets(tmp_path, preset):
+def test_recording_settings_of_rtisdev_equal_the_presets(tmp_path, preset):
     settings = shipped("recording")[preset]
     folder = folder_of(tmp_path, names=(), recording=settings, processing=None)
     (folder / "0.bin").write_bytes(bytes(4 * settings["microphoneSamples"]))
@@ -79,26 +79,26 @@ def test_shipped_recording_settings_are_the_presets(tmp_path, preset):
 
 
 @pytest.mark.parametrize("name", sorted(set(shipped("processing")) - {"custom_example_2D_5m_91"}))
-def test_shipped_processing_settings_can_be_used(tmp_path, name):
+def test_processing_settings_of_rtisdev_are_accepted(tmp_path, name):
     given = shipped("processing")[name]
     processing = open_rtis_folder(folder_of(tmp_path, processing=given)).settings.processing
     assert processing.range_m == (given["minRange"], given["maxRange"])
     assert processing.directions == f"{2 if given['2D'] else 3}d:{given['directions']}"
 
 
-def test_what_is_left_out_is_what_rtisdev_takes(tmp_path):
+def test_missing_keys_have_the_defaults_of_rtisdev(tmp_path):
     folder = folder_of(tmp_path, recording={"microphoneSamples": N_WORDS}, processing={"microphoneLayout": "eRTIS_v2"})
     assert open_rtis_folder(folder).settings == Settings.from_preset("short_25_50", array=Array(layout="eRTIS_v2"))
 
 
 @pytest.mark.parametrize("planar", [True, False])
-def test_json_may_say_yes_and_no(tmp_path, planar):
+def test_json_booleans_are_accepted(tmp_path, planar):
     processing = open_rtis_folder(folder_of(tmp_path, processing=PLANAR | {"2D": planar})).settings.processing
     assert processing.directions == f"{2 if planar else 3}d:91"
 
 
 @pytest.mark.parametrize("planar", [True, False])
-def test_all_settings_in_one(tmp_path, planar):
+def test_combined_settings_file_is_accepted(tmp_path, planar):
     """What ``dict(RTISSettings)`` yields, of which more is there than is needed."""
     azimuth_rad = np.radians(np.linspace(-60, 60, 5)).tolist()
     elevation_rad = [0.0] * 5 if planar else [0.0, 0.1, 0.2, 0.3, 0.4]
@@ -112,7 +112,7 @@ def test_all_settings_in_one(tmp_path, planar):
     assert np.allclose(processing.azimuth_limits_deg, (-60, 60) if planar else (-90, 90))
 
 
-def test_other_calls_and_clocks(tmp_path):
+def test_other_calls_and_clocks_are_imported(tmp_path):
     recording = SHORT | {"microphoneSampleFrequency": 1_125_000, "callDuration": 3.1, "callMaximumFrequency": 30_000}
     folder = folder_of(tmp_path, recording=recording, processing={"microphoneLayout": "uRTIS_v1"})
     settings = open_rtis_folder(folder).settings
@@ -122,7 +122,7 @@ def test_other_calls_and_clocks(tmp_path):
     assert math.isclose(settings.processing.range_m[1], 5.0)
 
 
-def test_options_take_the_place_of_the_folder(tmp_path):
+def test_options_override_files_of_the_folder(tmp_path):
     processing = PLANAR | {"microphoneLayout": "mine"}
     folder = folder_of(tmp_path, recording=SHORT | {"callEmissions": 3}, processing=processing)
     air = Air(temperature_c=3.0)
@@ -132,7 +132,7 @@ def test_options_take_the_place_of_the_folder(tmp_path):
     assert settings.air == air
 
 
-def test_the_measurement_that_comes_with_rtisdev(tmp_path):
+def test_example_measurement_of_rtisdev_is_imported(tmp_path):
     real = Path(importlib.metadata.distribution("rtisdev").locate_file("rtisdev/simulate.bin"))
     recording, processing = shipped("recording")["default_25_50"], shipped("processing")["2D_5m_181"]
     folder = folder_of(tmp_path, names=(), recording=recording, processing=processing)
@@ -143,7 +143,7 @@ def test_the_measurement_that_comes_with_rtisdev(tmp_path):
     assert measurement.stamp.sequence == 0
 
 
-def test_one_file_of_many_measurements(tmp_path):
+def test_file_of_many_measurements_is_imported(tmp_path):
     folder = folder_of(tmp_path, names=())
     (folder / "all.bin").write_bytes(words(1, 3).tobytes())
     assert [each.stamp.sequence for each in open_rtis_folder(folder)] == [0, 1, 2]
@@ -178,7 +178,7 @@ def test_one_file_of_many_measurements(tmp_path):
         ({"more": {"z.json": {"callDuration": 3}}}, r"z.json: callDuration is 3, but 2.5 in recording.json; keep one"),
     ],
 )
-def test_what_is_refused(tmp_path, made, message):
+def test_folder_import_refuses_invalid_folders(tmp_path, made, message):
     with pytest.raises(DataError, match=message):
         open_rtis_folder(folder_of(tmp_path, **made))
 
@@ -204,12 +204,12 @@ def test_what_is_refused(tmp_path, made, message):
         ),
     ],
 )
-def test_values_that_are_refused(tmp_path, recording, processing, message):
+def test_folder_import_refuses_invalid_values(tmp_path, recording, processing, message):
     with pytest.raises(ArgumentError, match=message):
         open_rtis_folder(folder_of(tmp_path, recording=recording, processing=processing))
 
 
-def test_json_that_is_refused_or_of_others(tmp_path):
+def test_invalid_or_foreign_json_is_handled(tmp_path):
     folder = folder_of(tmp_path, more={"list.json": [1, 2], "other.json": {"weather": "windy"}})
     assert len(open_rtis_folder(folder)) == 2
     (folder / "bad.json").write_text("{")
@@ -219,7 +219,7 @@ def test_json_that_is_refused_or_of_others(tmp_path):
         open_rtis_folder(tmp_path / "none")
 
 
-def test_numbers_that_overlap(tmp_path):
+def test_overlapping_sequence_numbers_are_refused(tmp_path):
     folder = folder_of(tmp_path)
     (folder / "m_0.bin").write_bytes(words(0, 2).tobytes())
     with pytest.raises(
@@ -229,12 +229,12 @@ def test_numbers_that_overlap(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["m_99999999999999999999999.bin", f"m_{2**63}.bin"], ids=["far", "just"])
-def test_numbers_that_no_recording_can_hold(tmp_path, name):
+def test_unstorable_sequence_numbers_are_refused(tmp_path, name):
     with pytest.raises(DataError, match=rf"{name} is number \d+, above the limit of recordings; give it a smaller one"):
         open_rtis_folder(folder_of(tmp_path, names=("m_0.bin", name)))
 
 
-def test_command(tmp_path):
+def test_import_command_accepts_a_folder(tmp_path):
     folder = folder_of(tmp_path, names=("m_5.bin", "m_7.bin"))
     done = CliRunner().invoke(cli, ["import", str(folder), "--temperature", "12.5", "--sensor", "left", "--json"])
     assert done.exit_code == 0, done.output
@@ -248,7 +248,7 @@ def test_command(tmp_path):
 
 
 @pytest.mark.parametrize("option", ["--layout", "--preset"])
-def test_files_need_what_a_folder_says(tmp_path, option):
+def test_import_of_files_needs_settings(tmp_path, option):
     (tmp_path / "a.bin").write_bytes(words(1).tobytes())
     given = {"--layout": "eRTIS_v3D1", "--preset": "short_25_50"}
     del given[option]

@@ -51,7 +51,7 @@ KINDS = {
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_wav_of_every_kind(tmp_path, kind):
+def test_wav_files_of_every_type_are_imported(tmp_path, kind):
     made, encoding, error = KINDS[kind]
     given = numbers()
     reader = ertis.open_pcm(write_wav(tmp_path / "a.wav", made(given)), PCM)
@@ -60,7 +60,7 @@ def test_wav_of_every_kind(tmp_path, kind):
     assert np.abs(measurement.data / reader.settings.recording.full_scale - given).max() <= error
 
 
-def test_wav_of_24_bits_keeps_them_all(tmp_path):
+def test_wav_of_24_bits_keeps_its_precision(tmp_path):
     given = np.random.default_rng(1).integers(-(2**23), 2**23, (500, 8))
     with wave.open(str(tmp_path / "a.wav"), "wb") as file:
         file.setnchannels(8)
@@ -71,14 +71,14 @@ def test_wav_of_24_bits_keeps_them_all(tmp_path):
     assert (measurement.data * 2.0**23 == given).all()
 
 
-def test_one_channel(tmp_path):
+def test_wav_of_one_channel_is_imported(tmp_path):
     one = PCM.replace(array=Array(layout="one", positions_m=((0.0, 0.0, 0.0),)))
     (measurement,) = ertis.open_pcm(write_wav(tmp_path / "a.wav", numbers()[:, 0].astype(np.float32)), one)
     assert measurement.data.shape == (3_000, 1)
     Pipeline(measurement.settings).process(measurement)
 
 
-def test_emissions_in_a_row(tmp_path):
+def test_consecutive_emissions_are_split(tmp_path):
     given = (numbers(10_000) * 2**15).astype(np.int16)
     paths = [write_wav(tmp_path / f"{name}.wav", given[: 10_000 - cut]) for name, cut in (("a", 0), ("b", 4_000))]
     reader = ertis.open_pcm(paths, PCM, skip_s=1_000 / RATE_HZ, length_s=2_500 / RATE_HZ)
@@ -90,7 +90,7 @@ def test_emissions_in_a_row(tmp_path):
     assert reader.rest_s == pytest.approx(1_500 / RATE_HZ)
 
 
-def test_periods_of_no_whole_number_of_samples_do_not_drift(tmp_path):
+def test_fractional_periods_do_not_drift(tmp_path):
     """100 emissions, each a seventieth of a second after the other: a click marks them."""
     given = np.zeros((RATE_HZ * 100 // 70, 8), np.int16)
     given[np.rint(np.arange(100) * RATE_HZ / 70).astype(int)] = 1_000
@@ -101,7 +101,7 @@ def test_periods_of_no_whole_number_of_samples_do_not_drift(tmp_path):
     assert measurements[70].stamp.timestamp_ns == 5 * 10**18 + 10**9
 
 
-def test_a_disabled_channel_may_hold_no_numbers(tmp_path):
+def test_disabled_channel_may_contain_nan(tmp_path):
     given = numbers().astype(np.float32)
     given[100:, 3] = np.nan
     settings = PCM.replace(array=RING.replace(enabled=tuple(channel != 3 for channel in range(8))))
@@ -109,14 +109,14 @@ def test_a_disabled_channel_may_hold_no_numbers(tmp_path):
     assert np.array_equal(measurement.data, np.where(np.isnan(given), 0, given))
 
 
-def test_files_of_other_lengths_are_one_measurement_each(tmp_path):
+def test_files_of_different_lengths_are_one_measurement_each(tmp_path):
     paths = [write_wav(tmp_path / f"{n}.wav", numbers(n)) for n in (6_000, 2_800)]
     reader = ertis.open_pcm(paths, PCM)
     assert [len(item.data) for item in reader] == [2_800, 2_800]
     assert reader.rest_s == pytest.approx(3_200 / RATE_HZ)
 
 
-def test_large_files_stay_on_the_disk(tmp_path):
+def test_large_files_are_not_loaded_into_memory(tmp_path):
     path = write_wav(tmp_path / "a.wav", (numbers(500_000) * 2**15).astype(np.int16))
     next(iter(ertis.open_pcm(path, PCM)))  # loads what reads WAV
     tracemalloc.start()
@@ -131,7 +131,7 @@ def test_large_files_stay_on_the_disk(tmp_path):
 
 @pytest.mark.parametrize("rate_hz", [110_000, 192_000, 500_000, 1_000_000])
 @pytest.mark.parametrize("call", [Call(), Call(start_frequency_hz=8_000.0, stop_frequency_hz=3_000.0)])
-def test_ranges_suit_rate_and_call(tmp_path, rate_hz, call):
+def test_imported_ranges_fit_sample_rate_and_call(tmp_path, rate_hz, call):
     """What the default, made for 4.5 MHz, would lose between two ranges."""
     settings = Settings(array=RING, call=call)
     reader = ertis.open_pcm(write_wav(tmp_path / "a.wav", numbers(rate_hz // 50), rate_hz), settings)
@@ -142,7 +142,7 @@ def test_ranges_suit_rate_and_call(tmp_path, rate_hz, call):
     Pipeline(made).process(next(iter(reader)))
 
 
-def test_what_was_asked_for_stays(tmp_path):
+def test_given_settings_are_kept(tmp_path):
     path = write_wav(tmp_path / "a.wav", numbers())
     asked = PCM.processing.replace(range_decimation=2, range_m=(0.2, 1.0))
     assert ertis.open_pcm(path, PCM.replace(processing=asked)).settings.processing == asked
@@ -256,13 +256,13 @@ def _cut(path):
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_is_refused(tmp_path, name):
+def test_pcm_import_refuses_invalid_input(tmp_path, name):
     given, options, message = REFUSED[name]
     with pytest.raises((DataError, ArgumentError), match=message):
         list(ertis.open_pcm(given(tmp_path), PCM, **options))
 
 
-def test_wav_alone_says_too_little(tmp_path):
+def test_wav_without_settings_is_refused(tmp_path):
     with pytest.raises(ArgumentError, match=r"contains no array and call; give settings"):
         ertis.open_pcm(write_wav(tmp_path / "a.wav", numbers()))
 
@@ -270,7 +270,7 @@ def test_wav_alone_says_too_little(tmp_path):
 # ---- Acoular --------------------------------------------------------------------------------------
 
 
-def test_what_was_exported_comes_back(tmp_path):
+def test_exported_signals_are_imported_again(tmp_path):
     """The image of exported signals is that of the recording, but for the low pass's ripple."""
     settings = PCM.replace(
         array=RING.replace(gain=(1.0, 2.0) * 4, enabled=(True, True, True, False) * 2),
@@ -290,7 +290,7 @@ def test_what_was_exported_comes_back(tmp_path):
     assert error_db(image.amplitude, wanted.amplitude) < -40
 
 
-def test_a_file_of_acoular_needs_settings_of_its_own(tmp_path):
+def test_acoular_file_without_settings_is_refused(tmp_path):
     given = numbers().astype(np.float32)
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["time_data"] = given
@@ -302,7 +302,7 @@ def test_a_file_of_acoular_needs_settings_of_its_own(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["int8", "int16", "int32", "float32", "float64"])
-def test_numbers_of_acoular_have_one_full_scale(tmp_path, kind):
+def test_acoular_samples_share_one_full_scale(tmp_path, kind):
     given = numbers()
     largest = 1.0 if kind.startswith("f") else -float(np.iinfo(kind).min)
     with h5py.File(tmp_path / "a.h5", "w") as file:
@@ -323,7 +323,7 @@ def write_acoular(path, given, rate_hz):
 
 
 @pytest.mark.parametrize("rate_hz", [np.array([192e3]), np.array([[192_000]]), 192_000], ids=["list", "table", "whole"])
-def test_a_rate_may_be_an_array_of_one_number(tmp_path, rate_hz):
+def test_acoular_sample_rate_may_be_an_array_of_one(tmp_path, rate_hz):
     path = write_acoular(tmp_path / "a.h5", numbers().astype(np.float32), rate_hz)
     assert ertis.open_pcm(path, PCM).settings.recording.sample_rate_hz == RATE_HZ
 
@@ -340,14 +340,14 @@ def test_a_rate_may_be_an_array_of_one_number(tmp_path, rate_hz):
     ],
     ids=["nan", "inf", "zero", "huge", "two", "text"],
 )
-def test_rates_that_are_refused(tmp_path, rate_hz, message):
+def test_invalid_sample_rates_are_refused(tmp_path, rate_hz, message):
     path = write_acoular(tmp_path / "a.h5", numbers().astype(np.float32), rate_hz)
     with pytest.raises(DataError, match=message):
         ertis.open_pcm(path, PCM, skip_s=0.001)
 
 
 @pytest.mark.parametrize("options", [{}, {"skip_s": 0.001}, {"length_s": 0.01}], ids=["all", "skip", "length"])
-def test_data_that_lie_the_other_way_round(tmp_path, options):
+def test_transposed_acoular_data_are_refused(tmp_path, options):
     path = write_acoular(tmp_path / "a.h5", numbers().astype(np.float32).T, RATE_HZ)
     with pytest.raises(DataError, match=r"a\.h5 has 3000 channels of 8 samples; transpose it"):
         ertis.open_pcm(path, PCM, **options)
@@ -368,7 +368,7 @@ def command(*arguments):
     return done.stdout
 
 
-def test_from_wav_to_reflectors(tmp_path, measurement):
+def test_wav_file_is_processed_to_reflectors(tmp_path, measurement):
     write_wav(tmp_path / "echoes.wav", measurement.data)
     (tmp_path / "ring.toml").write_text(PCM.replace(recording=Recording()).to_toml())
     command("import", tmp_path / "echoes.wav", "--settings", tmp_path / "ring.toml", "-o", tmp_path / "rec.h5")
@@ -378,7 +378,7 @@ def test_from_wav_to_reflectors(tmp_path, measurement):
     assert second["range_m"] == pytest.approx(1.6, abs=1e-3)
 
 
-def test_air_goes_before_that_of_the_signals(tmp_path, measurement):
+def test_given_air_overrides_that_of_the_signals(tmp_path, measurement):
     ertis.export(tmp_path / "a.h5", [measurement], file_format="acoular")
     command("import", tmp_path / "a.h5", "--temperature", 3, "-o", tmp_path / "rec.h5")
     with open_recording(tmp_path / "rec.h5") as recording:
@@ -387,7 +387,7 @@ def test_air_goes_before_that_of_the_signals(tmp_path, measurement):
         assert recording.settings.call == PCM.call
 
 
-def test_times_and_what_hinders_are_told(tmp_path):
+def test_import_reports_times_and_problems(tmp_path):
     write_wav(tmp_path / "a.wav", numbers(6_100).astype(np.float32))
     (tmp_path / "ring.toml").write_text(
         PCM.replace(recording=Recording(), processing=PCM.processing.replace(range_m=(0.5, 50.0))).to_toml()
@@ -414,7 +414,7 @@ STARTS = {
 
 
 @pytest.mark.parametrize("start", STARTS)
-def test_a_start_is_told_to_the_minute_or_better(tmp_path, start):
+def test_start_time_accepts_minutes_or_finer(tmp_path, start):
     write_wav(tmp_path / "a.wav", numbers().astype(np.float32))
     (tmp_path / "ring.toml").write_text(PCM.replace(recording=Recording()).to_toml())
     command("import", tmp_path / "a.wav", "--settings", tmp_path / "ring.toml", "--start", start)
@@ -423,7 +423,7 @@ def test_a_start_is_told_to_the_minute_or_better(tmp_path, start):
 
 
 @pytest.mark.parametrize("start", ["2300-01-01T00:00:00", "1970-01-01T00:00:00+02:00", "1969-12-31T23:59"])
-def test_starts_that_no_recording_can_hold(tmp_path, start):
+def test_unstorable_start_times_are_refused(tmp_path, start):
     write_wav(tmp_path / "a.wav", numbers().astype(np.float32))
     (tmp_path / "ring.toml").write_text(PCM.replace(recording=Recording()).to_toml())
     arguments = ["import", str(tmp_path / "a.wav"), "--settings", str(tmp_path / "ring.toml"), "--start", start]
@@ -433,14 +433,14 @@ def test_starts_that_no_recording_can_hold(tmp_path, start):
     assert "is outside the range of a recording; give a time from 1970 to 2262" in done.stderr
 
 
-def test_a_recording_needs_another_name_than_its_file(tmp_path):
+def test_recording_needs_another_name_than_its_source(tmp_path):
     path = write_acoular(tmp_path / "ac.h5", numbers().astype(np.float32), RATE_HZ)
     done = CliRunner().invoke(cli, ["import", str(path)])
     assert done.exit_code == 2
     assert f"{path} cannot become a recording of the same name; give another name (--output)" in done.stderr
 
 
-def test_options_of_pcm_are_refused_for_words(tmp_path):
+def test_pcm_options_are_refused_for_pdm(tmp_path):
     (tmp_path / "a.bin").write_bytes(bytes(4 * 65_536))
     for option, value in (("--skip", "1"), ("--length", "1"), ("--start", "2026-05-04T12:30:00")):
         done = CliRunner().invoke(cli, ["import", str(tmp_path / "a.bin"), option, value])

@@ -80,7 +80,7 @@ class Taken:
         return [message for message in self.sent if isinstance(message, Ack)]
 
 
-def test_what_is_sent_again_is_counted_and_shown_once():
+def test_repeated_measurement_is_counted_and_published_once():
     taken, given = Taken(), entries(3, first=0)
     taken.greet()
     taken.measure(*given)
@@ -97,7 +97,7 @@ def test_what_is_sent_again_is_counted_and_shown_once():
     assert (track.stored, track.repeated, track.waiting) == (3, 0, 0)
 
 
-def test_what_was_forgotten_of_an_older_turn_is_not_taken_twice():
+def test_measurement_of_an_earlier_connection_is_not_stored_twice():
     taken, given = Taken(), entries(3, first=0)
     taken.greet()
     taken.measure(*given)
@@ -111,7 +111,7 @@ def test_what_was_forgotten_of_an_older_turn_is_not_taken_twice():
     assert taken.intake.tracks["left"].repeated == 1
 
 
-def test_what_was_shown_is_known_when_its_node_comes_back():
+def test_published_measurement_is_recognised_after_reconnection():
     taken, given = Taken(), entries(2, first=0)
     taken.greet()
     taken.measure(*given)
@@ -125,7 +125,7 @@ def test_what_was_shown_is_known_when_its_node_comes_back():
 
 
 @pytest.mark.parametrize("first", [0, 1_000])
-def test_gaps_that_wait_are_bounded_too(first, monkeypatch):
+def test_number_of_waiting_gaps_is_bounded(first, monkeypatch):
     monkeypatch.setattr(_intake, "_WAITING_BYTES", 10_000)
     taken = Taken()
     taken.greet(first=first)
@@ -139,7 +139,7 @@ def test_gaps_that_wait_are_bounded_too(first, monkeypatch):
     assert taken.store.items[-1].last == 2_000
 
 
-def test_reasons_of_gaps_are_bounded():
+def test_length_of_gap_reasons_is_bounded():
     taken = Taken(store=False)
     taken.greet()
     for number in range(100):
@@ -150,7 +150,7 @@ def test_reasons_of_gaps_are_bounded():
     assert missing.total() == 100
 
 
-def test_an_ack_says_what_was_dropped_a_few_at_a_time():
+def test_ack_lists_dropped_numbers_in_parts():
     taken = Taken(store=False)
     taken.greet()
     taken.intake.dropped([("left", EPOCH, number, "superseded") for number in range(40)])
@@ -163,7 +163,7 @@ def test_an_ack_says_what_was_dropped_a_few_at_a_time():
     assert taken.acks()[-1].dropped == ()
 
 
-def test_a_sensor_that_another_node_sends_with_other_settings_is_refused():
+def test_sensor_sent_by_two_nodes_with_other_settings_is_refused():
     taken, other = Taken(), TINY.replace(air=Air(temperature_c=5.0))
     taken.greet(b"a")
     with pytest.raises(Unwanted, match="another sensor node sends sensor left, with other settings") as refused:
@@ -174,7 +174,7 @@ def test_a_sensor_that_another_node_sends_with_other_settings_is_refused():
     taken.greet(b"b", session_id=9)  # and who has left is in nobody's way
 
 
-def test_a_sensor_that_two_live_nodes_send_is_told_once():
+def test_sensor_sent_by_two_nodes_is_reported_once():
     taken = Taken()
     taken.greet(b"a")
     taken.greet(b"b", session_id=9)
@@ -187,7 +187,7 @@ def test_a_sensor_that_two_live_nodes_send_is_told_once():
     assert [more["sensor"] for event, more in taken.reported if event == "shared"] == ["left"]
 
 
-def test_a_key_has_fewer_peers_than_there_are_of_all(monkeypatch):
+def test_number_of_peers_per_key_is_limited(monkeypatch):
     monkeypatch.setattr(_admission, "_PEERS_OF_KEY", 2)
     taken = Taken()
     for peer in (b"a", b"b"):

@@ -12,7 +12,7 @@ SHORT = Settings.from_preset("short_25_50")
 N_BYTES = 4 * 65_536
 
 
-def test_measurements_come_in_the_order_of_the_files(tmp_path):
+def test_measurements_have_the_order_of_the_files(tmp_path):
     words = [measurement.data for measurement in noise(SHORT)]
     (tmp_path / "one.bin").write_bytes(words[0].tobytes())
     (tmp_path / "two.bin").write_bytes(words[1].tobytes() + words[2].tobytes())
@@ -27,7 +27,7 @@ def test_measurements_come_in_the_order_of_the_files(tmp_path):
 
 
 @pytest.mark.parametrize("settings", [line(8, 8), line(70, 16), line(64, 64)], ids=["8", "70 in 16", "64"])
-def test_words_of_any_size(tmp_path, settings):
+def test_raw_import_accepts_words_of_any_size(tmp_path, settings):
     (given,) = noise(settings, 1)
     (tmp_path / "raw.bin").write_bytes(given.data.tobytes())
     (back,) = open_raw(tmp_path / "raw.bin", settings)
@@ -57,7 +57,7 @@ def test_word_is_little_endian_and_bit_0_is_channel_0(tmp_path):
         ),
     ],
 )
-def test_lengths_that_are_refused(tmp_path, n_bytes, message):
+def test_raw_files_of_invalid_lengths_are_refused(tmp_path, n_bytes, message):
     (tmp_path / "raw.bin").write_bytes(bytes(n_bytes))
     with pytest.raises(DataError, match=message):
         open_raw(tmp_path / "raw.bin", SHORT)
@@ -71,14 +71,14 @@ def test_lengths_that_are_refused(tmp_path, n_bytes, message):
         pytest.param(line(64, 64), 4 * 163_840, r"copy it again if it is cut short", id="half of 64"),
     ],
 )
-def test_presets_that_fit_depend_on_the_array(tmp_path, settings, n_bytes, message):
+def test_suggested_presets_depend_on_the_array(tmp_path, settings, n_bytes, message):
     settings = settings.replace(recording=Recording(n_samples=100_003))
     (tmp_path / "raw.bin").write_bytes(bytes(n_bytes))
     with pytest.raises(DataError, match=message):
         open_raw(tmp_path / "raw.bin", settings)
 
 
-def test_places_that_are_refused(tmp_path):
+def test_unreadable_raw_paths_are_refused(tmp_path):
     with pytest.raises(DataError, match=r"none.bin: No such file or directory; give a file of raw words"):
         open_raw(tmp_path / "none.bin", SHORT)
     with pytest.raises(DataError, match="is a folder; give a file of raw words"):
@@ -89,7 +89,7 @@ def test_places_that_are_refused(tmp_path):
         open_raw(tmp_path, SHORT.replace(array=Array(layout="nothing")))
 
 
-def test_a_file_that_shrinks_meanwhile(tmp_path):
+def test_raw_file_that_shrinks_is_reported(tmp_path):
     path = tmp_path / "raw.bin"
     path.write_bytes(bytes(2 * N_BYTES))
     raw = iter(open_raw(path, SHORT))

@@ -74,7 +74,7 @@ def image_of(kernel_set, beams, window, n_ranges, n_blocks=1):
 
 
 @pytest.mark.parametrize("name", SHAPE_NAMES)
-def test_beams_of_nodes_are_the_referees(kernel_set, name):
+def test_interpolated_beams_equal_their_reference(kernel_set, name):
     beams, n_ranges = beam_input(name), SHAPES[name][3]
     expected = np.abs(reference.interpolated_beams(*beams, n_ranges))
     out = image_of(kernel_set, beams, (0, n_ranges), n_ranges)
@@ -82,7 +82,7 @@ def test_beams_of_nodes_are_the_referees(kernel_set, name):
 
 
 @pytest.mark.parametrize("window", WINDOWS)
-def test_beams_of_nodes_fill_their_window_and_nothing_else(kernel_set, window):
+def test_interpolated_beams_fill_only_their_window(kernel_set, window):
     beams, n_ranges = beam_input(SOME), SHAPES[SOME][3]
     expected = np.abs(reference.interpolated_beams(*beams, n_ranges))
     out = image_of(kernel_set, beams, window, n_ranges)
@@ -93,14 +93,14 @@ def test_beams_of_nodes_fill_their_window_and_nothing_else(kernel_set, window):
 
 
 @pytest.mark.parametrize("name", sized(["least"], ["prime", "six by six"]))
-def test_beams_of_nodes_have_the_same_bits_in_any_number_of_blocks(kernel_set, name):
+def test_interpolated_beams_are_independent_of_the_number_of_blocks(kernel_set, name):
     beams, n_ranges = beam_input(name), SHAPES[name][3]
     counts = (*range(1, MAX_BLOCKS + 1), SHAPES[name][5] + 3)  # blocks without a direction as well
     images = {image_of(kernel_set, beams, (0, n_ranges), n_ranges, count).tobytes() for count in counts}
     assert len(images) == 1
 
 
-def test_bad_numbers_of_nodes_stay_at_their_range(kernel_set):
+def test_nan_in_interpolated_beams_affects_only_its_range(kernel_set):
     beams, n_ranges = beam_input(SOME), SHAPES[SOME][3]
     beams[0][3, :, 100] = np.nan
     with np.errstate(invalid="ignore"):  # NumPy also says so
@@ -154,7 +154,7 @@ def expected_levels(tiles, beams, stop, n_ranges):
 
 @pytest.mark.parametrize("full_scale", [False, True])
 @pytest.mark.parametrize("name", SHAPE_NAMES)
-def test_whole_beams_of_nodes_are_the_referees(whole_kernel_set, name, full_scale):
+def test_int16_interpolated_beams_equal_their_reference(whole_kernel_set, name, full_scale):
     n_ranges = SHAPES[name][3]
     tiles, beams = whole_input(name, whole_kernel_set.tile_ranges, full_scale=full_scale)
     out = whole_image(whole_kernel_set, tiles, beams, n_ranges, n_ranges)
@@ -163,7 +163,7 @@ def test_whole_beams_of_nodes_are_the_referees(whole_kernel_set, name, full_scal
 
 
 @pytest.mark.parametrize("stop", [1, 50, 95, 96, 97, 150])
-def test_whole_beams_of_nodes_end_where_they_should(whole_kernel_set, stop):
+def test_int16_interpolated_beams_fill_only_their_window(whole_kernel_set, stop):
     (tiles, scales, starts), beams = whole_input(SOME, whole_kernel_set.tile_ranges)
     mine = starts < stop
     tiles = (tiles[mine], scales[mine], starts[mine])
@@ -172,14 +172,14 @@ def test_whole_beams_of_nodes_end_where_they_should(whole_kernel_set, stop):
 
 
 @pytest.mark.parametrize("name", sized(["least"], ["prime", "six by six"]))
-def test_whole_beams_of_nodes_have_the_same_bits_in_any_number_of_blocks(whole_kernel_set, name):
+def test_int16_interpolated_beams_are_independent_of_the_number_of_blocks(whole_kernel_set, name):
     n_ranges, counts = SHAPES[name][3], (*range(1, MAX_BLOCKS + 1), SHAPES[name][5] + 3)
     tiles, beams = whole_input(name, whole_kernel_set.tile_ranges)
     images = {whole_image(whole_kernel_set, tiles, beams, n_ranges, n_ranges, count).tobytes() for count in counts}
     assert len(images) == 1
 
 
-def test_beams_of_nodes_do_not_depend_on_the_number_of_threads():
+def test_interpolated_beams_are_independent_of_the_number_of_threads():
     cpu = KERNELS["cpu"]
     beams, n_ranges = beam_input("eRTIS"), SHAPES["eRTIS"][3]
     images = set()

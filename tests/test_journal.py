@@ -20,7 +20,7 @@ from tests.pages import path_of
 COUNTS = Path("/proc/self/io")
 
 
-def test_measurements_come_back(tmp_path):
+def test_journal_preserves_measurements(tmp_path):
     given = both()
     with create(tmp_path, given) as journal:
         assert all(entry.crc32 is not None for entry in given)
@@ -37,7 +37,7 @@ def test_measurements_come_back(tmp_path):
 
 
 @pytest.mark.parametrize("settings", [line(40, 8), line(4, 16), line(70, 64), TINY.replace(array=Array())])
-def test_all_kinds_of_words(tmp_path, settings):
+def test_journal_stores_all_sample_types(tmp_path, settings):
     settings = settings.replace(recording=Recording(n_samples=2048))
     given = entries(2, settings=settings)
     with create(tmp_path, given, settings=settings) as journal:
@@ -47,7 +47,7 @@ def test_all_kinds_of_words(tmp_path, settings):
         assert np.array_equal(came.measurement.data, wanted.measurement.data)
 
 
-def test_a_layout_file_is_not_needed_any_more(tmp_path):
+def test_journal_needs_no_layout_file(tmp_path):
     layout = tmp_path / "layout.csv"
     layout.write_text("0, 0\n10, 0\n0, 10\n")
     settings = TINY.replace(array=Array(layout=str(layout)))
@@ -61,7 +61,7 @@ def test_a_layout_file_is_not_needed_any_more(tmp_path):
     assert sensor.firmware == "3.1.4"
 
 
-def test_gaps_are_kept(tmp_path):
+def test_journal_stores_gaps(tmp_path):
     with create(tmp_path) as journal:
         journal.note_gap("left", 3, 3, "footer", session_id=EPOCH)
         journal.note_gap("left", 0, 2**63 - 1, "the sensor was unplugged", session_id=2**63 - 1)
@@ -72,7 +72,7 @@ def test_gaps_are_kept(tmp_path):
         )
 
 
-def test_zero_may_be_negative(tmp_path):
+def test_journal_stores_negative_zero(tmp_path):
     """SQLite stores -0.0 as 0.0: the CRC-32 of a row must not tell them apart."""
     with create(tmp_path, []) as journal:
         journal.add_sensor("left", TINY, translation_m=(-0.0, -1.0, 0.0))
@@ -80,7 +80,7 @@ def test_zero_may_be_negative(tmp_path):
         assert journal.sensors["left"].translation_m == (0.0, -1.0, 0.0)
 
 
-def test_numbers_rise_within_an_epoch(tmp_path):
+def test_numbers_must_rise_within_a_session(tmp_path):
     given = entries(3)
     with create(tmp_path, given) as journal:
         for late in (given[2], given[0]):
@@ -97,7 +97,7 @@ def test_numbers_rise_within_an_epoch(tmp_path):
         assert [key.sequence for key in journal.index()] == [10, 11, 12, 0, 13]
 
 
-def test_all_of_an_append_or_nothing(tmp_path, monkeypatch):
+def test_append_stores_all_or_nothing(tmp_path, monkeypatch):
     with create(tmp_path) as journal:
         with pytest.raises(ArgumentError, match="follows 21"):
             journal.append([*entries(2, first=20), *entries(1, first=5)])
@@ -197,7 +197,7 @@ def spoilt(words=None, **changes):
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_what_does_not_fit_is_refused(tmp_path, name):
+def test_journal_refuses_unstorable_measurements(tmp_path, name):
     act, message = BAD[name]
     with create(tmp_path) as journal:
         with pytest.raises(ArgumentError, match=message):
@@ -205,7 +205,7 @@ def test_what_does_not_fit_is_refused(tmp_path, name):
         assert (len(journal.index()), list(journal.sensors), journal.gaps) == (3, ["left"], ())
 
 
-def test_a_crc_of_the_sender_is_kept_and_compared(tmp_path):
+def test_sender_crc_is_stored_and_compared(tmp_path):
     (entry,) = entries(1)
     entry.crc32 = 0x1234
     with (
@@ -218,7 +218,7 @@ def test_a_crc_of_the_sender_is_kept_and_compared(tmp_path):
         next(journal.entries())
 
 
-def test_threads_may_share_a_journal(tmp_path):
+def test_threads_share_a_journal(tmp_path):
     names = ["left", "right", "front"]
     with create(tmp_path, []) as journal:
 
@@ -237,7 +237,7 @@ def test_threads_may_share_a_journal(tmp_path):
             assert [key.sequence for key in journal.index(name)] == list(range(10, 18))
 
 
-def test_a_commit_reaches_the_disk_and_the_log_stays_small(tmp_path):
+def test_commit_reaches_the_disk_and_the_log_stays_small(tmp_path):
     with create(tmp_path, entries(1)) as journal:
         wanted = {"synchronous": 2, "journal_mode": "wal", "locking_mode": "exclusive"}
         assert {name: journal._database.execute(f"PRAGMA {name}")[0][0] for name in wanted} == wanted  # noqa: SLF001  nobody else can ask
@@ -250,7 +250,7 @@ def test_a_commit_reaches_the_disk_and_the_log_stays_small(tmp_path):
         assert not (tmp_path / "rec.h5.journal-shm").exists()
 
 
-def test_long_commits_do_without_the_log(tmp_path):
+def test_large_commits_bypass_the_log(tmp_path):
     log, begin = (tmp_path / f"rec.h5.journal{end}" for end in ("-wal", "-journal"))
     given = entries(24, settings=Settings())
     wanted = {"synchronous": 2, "journal_mode": "delete", "locking_mode": "exclusive"}
@@ -269,7 +269,7 @@ def test_long_commits_do_without_the_log(tmp_path):
 
 
 @pytest.mark.skipif(not COUNTS.exists(), reason="only Linux counts what a process writes")
-def test_all_but_a_little_is_written_once(tmp_path):
+def test_samples_are_written_once(tmp_path):
     given = entries(32, settings=Settings())
     words_bytes = sum(entry.measurement.data.nbytes for entry in given)
     with create(tmp_path, [], settings=Settings()) as journal:
@@ -285,7 +285,7 @@ def written_bytes():
 
 
 @pytest.mark.parametrize("target", ["../b/other.h5", "/tmp/other.h5", "other.h5", "..", "", "a/../../other.h5"])
-def test_recording_is_named_after_its_journal_whatever_that_says(tmp_path, target):
+def test_recording_is_named_after_its_journal_file(tmp_path, target):
     with create(tmp_path, target=target) as journal:
         assert journal.target == tmp_path / "rec.h5"
     with Journal.open(journal.path) as journal:
@@ -300,7 +300,7 @@ def test_recording_of_a_renamed_journal_stays_in_its_folder(tmp_path, target):
         assert journal.target == tmp_path / ("other.h5" if "other" in target else "renamed.h5")
 
 
-def test_an_older_journal_is_never_overwritten(tmp_path):
+def test_existing_journal_is_never_overwritten(tmp_path):
     create(tmp_path).close()
     with pytest.raises(ArgumentError, match=r"rec.h5.journal exists from an interrupted capture; run 'ertis recover"):
         create(tmp_path)
@@ -308,7 +308,7 @@ def test_an_older_journal_is_never_overwritten(tmp_path):
         assert len(journal) == 3
 
 
-def test_closed(tmp_path):
+def test_closed_journal_refuses_operations(tmp_path):
     journal = create(tmp_path)
     journal.close()
     journal.close()
@@ -316,12 +316,12 @@ def test_closed(tmp_path):
         journal.append(entries(1, first=20))
 
 
-def test_taking_measurements_in_loads_no_hdf5():
+def test_journal_loads_no_hdf5():
     done = python("import ertis_numba.journal, sys; print(*sys.modules)")
     assert not {"h5py", "scipy", "numba", "ertis_numba.storage"} & set(done.stdout.split())
 
 
-def test_tables_are_documented():
+def test_journal_tables_are_documented():
     page = path_of("formats").read_text("utf-8")
     page = page[page.index("## Journal") :]
     assert f"version {VERSION}" in page

@@ -55,7 +55,7 @@ DAMAGED = {
 
 
 @pytest.mark.parametrize("name", DAMAGED)
-def test_a_damaged_measurement_leaves_the_others_readable(tmp_path, name):
+def test_damaged_measurement_leaves_others_readable(tmp_path, name):
     statement, message = DAMAGED[name]
     create(tmp_path).close()
     spoil(tmp_path / "rec.h5.journal", statement)
@@ -86,7 +86,7 @@ UNREADABLE = {
 
 
 @pytest.mark.parametrize("name", UNREADABLE)
-def test_a_damaged_journal_is_refused(tmp_path, name):
+def test_damaged_journal_is_refused(tmp_path, name):
     statement, message = UNREADABLE[name]
     with create(tmp_path) as journal:
         journal.note_gap("left", 1, 1, "x", session_id=7)
@@ -96,7 +96,7 @@ def test_a_damaged_journal_is_refused(tmp_path, name):
 
 
 @pytest.mark.parametrize("count", [1, 3])
-def test_measurements_may_be_deleted_from_the_front(tmp_path, count):
+def test_deleting_the_first_measurements_is_permitted(tmp_path, count):
     create(tmp_path).close()
     spoil(tmp_path / "rec.h5.journal", f"DELETE FROM measurements WHERE id <= {count}")
     with Journal.open(tmp_path / "rec.h5.journal") as journal:
@@ -119,7 +119,7 @@ def root_page(path, tree):
 
 @pytest.mark.parametrize("discarded", [0, 3])
 @pytest.mark.parametrize("tree", ["key", "measurements"])
-def test_rows_that_only_one_tree_has_lost(tmp_path, tree, discarded):
+def test_rows_missing_from_one_index_are_detected(tmp_path, tree, discarded):
     """A page in which fewer cells are counted is a sound one, for SQLite."""
     settings = line(8, 8).replace(recording=Recording(n_samples=64))
     with create(tmp_path, entries(20 + discarded, settings=settings), settings=settings) as journal:
@@ -136,7 +136,7 @@ def test_rows_that_only_one_tree_has_lost(tmp_path, tree, discarded):
 
 
 @pytest.mark.parametrize("discarded", [0, 1])
-def test_a_page_that_sqlite_cannot_read(tmp_path, discarded):
+def test_unreadable_page_is_damage_and_the_rest_is_sealed(tmp_path, discarded):
     """What is in it is damaged for ever; the rest is sealed."""
     with create(tmp_path, entries(20 + discarded, first=10 - discarded)) as journal:
         if discarded:
@@ -158,7 +158,7 @@ def test_a_page_that_sqlite_cannot_read(tmp_path, discarded):
     assert sealed.measurements == 20 - sealed.damaged
 
 
-def test_a_row_is_checked_in_a_way_that_every_language_can(tmp_path):
+def test_row_checksum_follows_the_documentation(tmp_path):
     """Built by hand as docs/reference/formats.md says."""
     create(tmp_path, entries(1)).close()
     reported = python(
@@ -178,7 +178,7 @@ def test_a_row_is_checked_in_a_way_that_every_language_can(tmp_path):
     assert row_crc32((7, "a")) == zlib.crc32(bytes.fromhex(example)) == int(check, 16)
 
 
-def test_what_the_disk_cannot_read_now_is_not_damaged(tmp_path, monkeypatch):
+def test_temporary_read_error_is_not_damage(tmp_path, monkeypatch):
     """It may be read later: nothing is sealed, and nothing goes."""
     create(tmp_path).close()
     path = tmp_path / "rec.h5.journal"
@@ -201,7 +201,7 @@ def test_what_the_disk_cannot_read_now_is_not_damaged(tmp_path, monkeypatch):
     assert seal(path).damaged == 0
 
 
-def test_a_measurement_that_is_another_one(tmp_path):
+def test_exchanged_measurement_is_detected(tmp_path):
     create(tmp_path).close()
     with Journal.open(tmp_path / "rec.h5.journal") as journal:
         key = journal.index()[1]
@@ -210,7 +210,7 @@ def test_a_measurement_that_is_another_one(tmp_path):
                 journal.entry(wrong)
 
 
-def test_one_damaged_bit_never_passes(tmp_path):
+def test_single_flipped_bit_is_always_detected(tmp_path):
     """Wherever it is, reading gives what was written or a `DataError` of one line."""
     given = entries(4)
     create(tmp_path, given).close()
@@ -238,7 +238,7 @@ CUT = [("log", 0), ("log", 1), ("log", 4096), ("commit", 0), ("commit", 4096), (
 
 
 @pytest.mark.parametrize(("moment", "n_bytes"), CUT)
-def test_a_journal_that_was_cut_short_keeps_its_log(tmp_path, moment, n_bytes):
+def test_truncated_journal_keeps_its_log(tmp_path, moment, n_bytes):
     """SQLite would throw away what is all that is left, or make up the rest with zeros."""
     path = crashed(tmp_path, moment=moment)
     log = path.with_name(f"{path.name}{'-wal' if moment == 'log' else '-journal'}")
@@ -251,7 +251,7 @@ def test_a_journal_that_was_cut_short_keeps_its_log(tmp_path, moment, n_bytes):
     assert (path.stat().st_size, log.read_bytes()) == (n_bytes, before)
 
 
-def test_a_copy_without_its_log(tmp_path):
+def test_copy_without_its_log_is_intact_or_damaged(tmp_path):
     """What a commit was changing when the journal was copied is as it was or damaged, and nothing is made up."""
     path = crashed(tmp_path, moment="commit")
     path.with_name(f"{path.name}-journal").unlink()
@@ -271,7 +271,7 @@ def test_a_copy_without_its_log(tmp_path):
         assert all(same(*pair) for pair in zip(journal.entries(), entries(), strict=True))
 
 
-def test_a_journal_that_was_removed_takes_no_more(tmp_path):
+def test_removed_journal_refuses_measurements(tmp_path):
     with create(tmp_path, entries(2)) as journal:
         journal.path.unlink()
         with pytest.raises(
@@ -280,7 +280,7 @@ def test_a_journal_that_was_removed_takes_no_more(tmp_path):
             journal.append(entries(1, first=20))
 
 
-def test_settings_of_a_journal_that_cannot_be_used(tmp_path):
+def test_unusable_settings_of_a_journal_are_reported(tmp_path):
     """As a newer version might write them that forgot to count itself up."""
     create(tmp_path).close()
     row = ("left", "[air]\nwind_m_s = 3.0\n", "", 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # its mounting is unknown
@@ -303,7 +303,7 @@ FOREIGN = {
 
 
 @pytest.mark.parametrize("name", FOREIGN)
-def test_what_is_no_journal(tmp_path, name):
+def test_other_files_are_refused_as_journals(tmp_path, name):
     content, message = FOREIGN[name]
     path = tmp_path / "rec.db"
     if content is not None:
@@ -313,7 +313,7 @@ def test_what_is_no_journal(tmp_path, name):
     assert content is None or path.read_bytes() == content
 
 
-def test_a_database_of_somebody_else_is_not_touched(tmp_path):
+def test_foreign_database_is_not_changed(tmp_path):
     path = tmp_path / "their.journal"
     spoil(path, "CREATE TABLE x (y)")
     before = path.read_bytes()
@@ -323,7 +323,7 @@ def test_a_database_of_somebody_else_is_not_touched(tmp_path):
 
 
 @pytest.mark.parametrize("again", [True, False])
-def test_sealed_by_another_process_in_the_last_moment(tmp_path, monkeypatch, again):
+def test_journal_sealed_meanwhile_by_another_process(tmp_path, monkeypatch, again):
     create(tmp_path).close()
     path = tmp_path / "rec.h5.journal"
     execute = Database.execute
@@ -342,13 +342,13 @@ def test_sealed_by_another_process_in_the_last_moment(tmp_path, monkeypatch, aga
     assert path.exists() == again
 
 
-def test_newer_version(tmp_path):
+def test_newer_journal_version_is_refused(tmp_path):
     create(tmp_path).close()
     spoil(tmp_path / "rec.h5.journal", "PRAGMA user_version = 3")
     with pytest.raises(FormatVersionError, match="has format version 3, but this package reads up to 2; update"):
         Journal.open(tmp_path / "rec.h5.journal")
 
 
-def test_no_place_for_a_journal(tmp_path):
+def test_journal_in_an_unwritable_folder_is_refused(tmp_path):
     with pytest.raises(DataError, match="No such file or directory; give a writable folder"):
         Journal.create(tmp_path / "none" / "rec.h5.journal", target="rec.h5")

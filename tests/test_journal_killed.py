@@ -24,7 +24,7 @@ except JournalInUseError as error:
 """
 
 
-def test_nobody_else_can_open_it(tmp_path):
+def test_open_journal_is_locked_for_other_processes(tmp_path):
     message = "is in use by another process, a capture or its sealing; wait until that has ended"
     with create(tmp_path) as journal:
         with pytest.raises(JournalInUseError, match=message):
@@ -44,7 +44,7 @@ time.sleep(60)
 """
 
 
-def test_a_killed_process_holds_nothing(tmp_path):
+def test_killed_process_holds_no_lock(tmp_path):
     with subprocess.Popen(
         [sys.executable, "-c", HOLD, tmp_path], env=ENVIRONMENT, stdout=subprocess.PIPE, text=True
     ) as process:
@@ -59,7 +59,7 @@ def test_a_killed_process_holds_nothing(tmp_path):
 
 
 @pytest.mark.parametrize("moment", ["file", "file and log", "tables"])
-def test_killed_while_it_was_made(tmp_path, moment):
+def test_kill_during_creation_leaves_a_usable_or_no_journal(tmp_path, moment):
     """What there is then: an empty file; one that has become a database; one with tables and no sensor."""
     path = tmp_path / "rec.h5.journal"
     if moment == "tables":
@@ -80,7 +80,7 @@ def test_killed_while_it_was_made(tmp_path, moment):
 
 
 @pytest.mark.parametrize("moment", ["between", "commit", "log"])
-def test_what_a_killed_process_leaves(tmp_path, moment):
+def test_journal_of_a_killed_process_is_complete(tmp_path, moment):
     path = crashed(tmp_path, moment=moment)
     log, begin = (path.with_name(f"{path.name}{end}") for end in ("-wal", "-journal"))
     if moment == "log":
@@ -98,13 +98,13 @@ def test_what_a_killed_process_leaves(tmp_path, moment):
 
 
 @pytest.mark.parametrize("moment", ["between", "commit", "log"])
-def test_what_a_killed_process_leaves_is_sealed(tmp_path, moment):
+def test_journal_of_a_killed_process_is_sealed(tmp_path, moment):
     sealed = seal(crashed(tmp_path, moment=moment))
     assert (sealed.measurements, sealed.missing, sealed.damaged) == (3, 0, 0)
     assert [path.name for path in tmp_path.iterdir()] == ["rec.h5"]
 
 
-def test_processes_that_are_killed_lose_nothing(tmp_path):
+def test_killed_processes_lose_nothing(tmp_path):
     found = kills.appending(tmp_path, seed=1, count=20)
     assert found["told"] > 40
     assert {name: found[name] for name in ("lost", "wrong", "unexpected")} == {"lost": 0, "wrong": 0, "unexpected": 0}

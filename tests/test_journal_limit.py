@@ -46,7 +46,7 @@ def test_open_deletes_rows_above_the_limit(tmp_path):
         assert numbers(journal) == [10, 11, 12, 13]
 
 
-def test_open_deletes_gaps_and_runs_that_were_never_acknowledged(tmp_path):
+def test_open_deletes_unacknowledged_gaps_and_sessions(tmp_path):
     with create(tmp_path) as journal:
         journal.note_gap("left", 13, 13, "kept", session_id=EPOCH)
         journal.note_gap("left", 14, 15, "given up", session_id=EPOCH)
@@ -67,7 +67,7 @@ def test_recording_of_a_limited_journal_holds_acknowledged_measurements(tmp_path
     assert sorted(each.name for each in tmp_path.iterdir()) == ["rec.h5"]
 
 
-def test_give_up_without_acknowledgements_removes_the_journal(tmp_path):
+def test_abandon_without_acknowledgements_removes_the_journal(tmp_path):
     path = crashed(tmp_path)
     Journal.abandon(path, {})
     assert not list(tmp_path.iterdir())
@@ -121,7 +121,7 @@ def test_open_raises_if_the_log_cannot_be_synced(tmp_path, monkeypatch):
         assert len(journal) == 3
 
 
-def test_append_fails_where_the_name_of_the_log_is_not_durable(tmp_path, monkeypatch):
+def test_append_fails_if_the_folder_of_the_log_cannot_be_synced(tmp_path, monkeypatch):
     """SQLite syncs the folder of a new log, and ignores an error of that."""
     with create(tmp_path) as journal:
         pass
@@ -145,7 +145,7 @@ def test_append_fails_if_the_old_log_may_reappear(tmp_path, monkeypatch):
         journal.append(more)
 
 
-def test_create_leaves_nothing_where_it_fails(tmp_path, monkeypatch):
+def test_failed_create_leaves_no_file(tmp_path, monkeypatch):
     failing_sync(monkeypatch, folders=True)
     with pytest.raises(DataError, match="Input/output error"):
         create(tmp_path, [])

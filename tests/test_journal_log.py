@@ -43,7 +43,7 @@ def stored(path):
 
 @pytest.mark.parametrize("counted", [True, False])
 @pytest.mark.parametrize("place", [0.1, 0.3, 0.5, 0.7, 0.9])
-def test_one_flipped_bit_in_the_log_costs_one_measurement_at_most(tmp_path, place, counted):
+def test_flipped_bit_in_the_log_loses_one_measurement_at_most(tmp_path, place, counted):
     given = entries(COUNT)
     path = crashed(tmp_path, given)
     if not counted:  # as after a power cut
@@ -59,7 +59,7 @@ def test_one_flipped_bit_in_the_log_costs_one_measurement_at_most(tmp_path, plac
 
 
 @pytest.mark.parametrize("counted", [True, False])
-def test_flipped_bit_in_the_words_is_reported_by_recover_and_verify(tmp_path, counted):
+def test_flipped_bit_in_samples_is_reported_by_recover_and_verify(tmp_path, counted):
     given = entries(COUNT, settings=LARGE)
     path = crashed(tmp_path, given, settings=LARGE)
     if not counted:
@@ -124,7 +124,7 @@ def test_copy_of_a_damaged_log_replaces_no_earlier_copy(tmp_path):
     }
 
 
-def test_damaged_last_commit_is_noticed_by_the_tally(tmp_path):
+def test_damaged_last_commit_is_detected_by_the_tally(tmp_path):
     """After a power cut, it could not be told from one that was torn."""
     given = entries(COUNT, settings=LARGE)
     path = crashed(tmp_path, given, settings=LARGE)
@@ -145,7 +145,7 @@ def test_log_damaged_in_its_first_transaction_keeps_the_source(tmp_path):
 
 
 @pytest.mark.parametrize("cut", ["last", "half", "header", "all", "gone"])
-def test_log_that_was_cut_short_is_noticed(tmp_path, cut):
+def test_truncated_log_is_detected(tmp_path, cut):
     path = crashed(tmp_path, entries(COUNT))
     n_bytes = log_of(path).stat().st_size
     if cut == "gone":
@@ -168,7 +168,7 @@ def test_log_that_was_cut_short_is_noticed(tmp_path, cut):
             verify(path)
 
 
-def test_damaged_header_of_the_log_costs_nothing(tmp_path):
+def test_damaged_log_header_loses_nothing(tmp_path):
     for place in (0, 10, 17, 26):
         folder = tmp_path / str(place)
         folder.mkdir()
@@ -177,7 +177,7 @@ def test_damaged_header_of_the_log_costs_nothing(tmp_path):
         assert stored(path) == (list(range(10, 10 + COUNT)), ())
 
 
-def test_torn_end_of_a_log_is_no_damage(tmp_path):
+def test_torn_end_of_a_log_is_not_damage(tmp_path):
     """As a power cut leaves it: the last transaction was not synced, and nobody was told of it."""
     path = crashed(tmp_path, entries(COUNT))
     tally_of(path).unlink()
@@ -188,7 +188,7 @@ def test_torn_end_of_a_log_is_no_damage(tmp_path):
     assert [item.name for item in tmp_path.iterdir()] == ["rec.h5.journal"]
 
 
-def test_leftovers_of_two_torn_ends_are_no_damage(tmp_path):
+def test_remains_of_two_torn_ends_are_not_damage(tmp_path):
     """Frames of a transaction that was torn earlier lie behind the end and carry the salts of the log."""
     path = crashed(tmp_path, entries(COUNT))
     tally_of(path).unlink()
@@ -218,7 +218,7 @@ def test_tally_is_removed_with_the_log(tmp_path):
 
 
 @pytest.mark.parametrize("killed", [False, True])
-def test_discarded_measurements_are_not_missed(tmp_path, killed):
+def test_discarded_measurements_are_not_reported_missing(tmp_path, killed):
     (tmp_path / "running").mkdir()
     with create(tmp_path / "running", entries(COUNT)) as journal:
         journal.discard("left", EPOCH, 9 + COUNT)
@@ -238,7 +238,7 @@ def test_tally_of_another_journal_is_ignored(tmp_path):
     assert stored(tmp_path / "rec.h5.journal") == ([10, 11], ())
 
 
-def test_tally_of_another_journal_is_gone_once_a_journal_grows(tmp_path):
+def test_tally_of_another_journal_is_removed_on_append(tmp_path):
     (tmp_path / "other").mkdir()
     other = crashed(tmp_path / "other", entries(COUNT), target="other")
     create(tmp_path, entries(2)).close()
@@ -267,7 +267,7 @@ def test_damaged_tally_changes_nothing(tmp_path):
 
 
 @pytest.mark.parametrize("place", [0.1, 0.3, 0.5, 0.7, 0.9, 0.99])
-def test_flipped_bit_in_a_log_whose_pages_were_moved_ruins_nothing(tmp_path, place):
+def test_flipped_bit_in_a_checkpointed_log_loses_nothing(tmp_path, place):
     """SQLite would put the old pages before the damage over the new ones in the main file."""
     killed = tmp_path / "killed"
     killed.mkdir()
@@ -284,7 +284,7 @@ def test_flipped_bit_in_a_log_whose_pages_were_moved_ruins_nothing(tmp_path, pla
 
 
 @pytest.mark.parametrize("place", [0.2, 0.4, 0.6])
-def test_damaged_log_does_not_ruin_a_main_file_that_has_later_pages(tmp_path, place):
+def test_damaged_log_keeps_later_pages_of_the_main_file(tmp_path, place):
     """The log begins after a checkpoint, so its first part lacks pages that only a later commit of it changes.
 
     Ten rows fill one page and begin the next; the last rows begin a third page, and change the root for it.

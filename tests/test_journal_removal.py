@@ -19,7 +19,7 @@ def version(path):
     return int.from_bytes(path.read_bytes()[60:64], "big")  # as SQLite's file format says
 
 
-def test_what_others_hold_can_be_discarded(tmp_path):
+def test_acknowledged_measurements_can_be_discarded(tmp_path):
     """Of each sensor by itself, whose rows lie between those of the others."""
     given = both()
     with create(tmp_path, given) as journal:
@@ -48,13 +48,13 @@ def test_what_others_hold_can_be_discarded(tmp_path):
         assert [entry.measurement.stamp.sequence for entry in journal.entries()] == [100]
 
 
-def test_a_journal_of_which_nothing_was_discarded_is_one_for_older_packages(tmp_path):
+def test_journal_without_discards_has_version_1(tmp_path):
     with create(tmp_path) as journal:
         assert version(journal.path) in (0, 1)
     assert version(journal.path) == 1
 
 
-def test_what_is_left_is_sealed(tmp_path):
+def test_remaining_measurements_are_sealed(tmp_path):
     with create(tmp_path, both()) as journal:
         journal.discard("left", EPOCH, 10)
         journal.discard("right", EPOCH, 0)
@@ -63,7 +63,7 @@ def test_what_is_left_is_sealed(tmp_path):
     assert [measurement.stamp.sequence for measurement in open_recording(sealed.recording, sensor="left")] == [11, 12]
 
 
-def test_room_that_was_discarded_is_used_again(tmp_path):
+def test_discarded_space_is_reused(tmp_path):
     """What is deleted is not overwritten, and the file does not grow."""
     settings = line(32, 32).replace(recording=Recording(n_samples=65_536))
     given = entries(60, settings=settings)
@@ -92,7 +92,7 @@ with Journal.open(Path(sys.argv[1])) as journal:
 
 
 @pytest.mark.parametrize("how", ["log", "once"])
-def test_killed_while_it_discards(tmp_path, how):
+def test_kill_during_discard_keeps_other_measurements(tmp_path, how):
     """What was appended and not discarded is there; what was discarded never comes back."""
     create(tmp_path, both()).close()
     path, last = tmp_path / "rec.h5.journal", {"left": 12, "right": 12}
@@ -121,7 +121,7 @@ def test_killed_while_it_discards(tmp_path, how):
 
 
 @pytest.mark.parametrize("act", [Journal.remove, Journal.set_aside])
-def test_removing_waits_for_its_turn(tmp_path, act):
+def test_remove_waits_for_the_lock(tmp_path, act):
     with create(tmp_path) as journal:
         thread = threading.Thread(target=act, args=(journal,))
         with journal._lock:  # noqa: SLF001  as while another thread appends
@@ -136,7 +136,7 @@ def test_removing_waits_for_its_turn(tmp_path, act):
 
 @pytest.mark.parametrize("moment", ["between", "commit", "log"])
 @pytest.mark.parametrize("aside", [False, True])
-def test_removing_takes_all_of_it_away(tmp_path, aside, moment):
+def test_remove_deletes_all_files(tmp_path, aside, moment):
     with Journal.open(crashed(tmp_path, moment=moment)) as journal:
         journal.append(entries(1, first=20))
         left = [journal.set_aside().name] if aside else journal.remove() or []
@@ -152,7 +152,7 @@ def test_removing_takes_all_of_it_away(tmp_path, aside, moment):
 
 
 @pytest.mark.parametrize("act", [Journal.remove, Journal.set_aside])
-def test_closing_takes_nothing_away_from_a_journal_made_since(tmp_path, monkeypatch, act):
+def test_close_keeps_files_of_a_newer_journal(tmp_path, monkeypatch, act):
     """Whoever makes one of the same name while this one is about to be closed has a log of that name."""
     with Journal.open(crashed(tmp_path, moment="between")) as journal, monkeypatch.context() as patch:
         journal.append(entries(1, first=20))

@@ -13,7 +13,7 @@ from ertis_numba.journal._database import Database
 from tests.journals import ENVIRONMENT, EPOCH, TINY, create, entries, same
 
 
-def test_a_nearly_full_disk_is_left_enough_to_seal(tmp_path, monkeypatch):
+def test_journal_leaves_enough_space_to_seal(tmp_path, monkeypatch):
     usage = shutil.disk_usage(tmp_path)
     with create(tmp_path) as journal:
         with monkeypatch.context() as patch:
@@ -58,7 +58,7 @@ with Journal.open(journal.path) as journal:
 """
 
 
-def test_a_disk_that_fails(tmp_path):
+def test_failing_disk_is_reported(tmp_path):
     """The limit on the size of a file stands for a disk that cannot be written."""
     done = subprocess.run(
         [sys.executable, "-c", APPEND, tmp_path, "unguarded"],
@@ -75,7 +75,7 @@ def test_a_disk_that_fails(tmp_path):
 
 
 @pytest.mark.parametrize("times", [1, 2])
-def test_a_commit_that_fails_when_all_is_written(tmp_path, monkeypatch, times):
+def test_commit_that_fails_at_its_sync_can_be_repeated(tmp_path, monkeypatch, times):
     """As when the disk cannot say that the end of a commit has reached it: that can be tried again."""
     more, right = entries(1, first=20), entries(1, sensor="right")
     with create(tmp_path) as journal:
@@ -125,7 +125,7 @@ def on_a_small_disk(folder, code, *arguments):
 
 
 @pytest.mark.skipif(shutil.which("unshare") is None, reason="only Linux has namespaces")
-def test_a_full_disk(tmp_path):
+def test_full_disk_keeps_stored_measurements(tmp_path):
     number, message = on_a_small_disk(tmp_path, APPEND, "unguarded", "freed")
     assert number > 60
     assert "rec.h5.journal has no room on its disk; free some space: what was committed before is safe" in message
@@ -176,7 +176,7 @@ else:
 
 @pytest.mark.skipif(shutil.which("unshare") is None, reason="only Linux has namespaces")
 @pytest.mark.parametrize("freed", [False, True])
-def test_a_full_disk_with_a_log(tmp_path, freed):
+def test_full_disk_keeps_the_log(tmp_path, freed):
     """It stays, and is read; only where there is room does it go."""
     number, message = on_a_small_disk(tmp_path, LEFT, *["freed"] * freed)
     assert number == 100
@@ -195,7 +195,7 @@ assert os.listdir(sys.argv[1]) == ["rec.h5"]
 
 
 @pytest.mark.skipif(shutil.which("unshare") is None, reason="only Linux has namespaces")
-def test_what_a_small_disk_has_taken_can_be_sealed_there(tmp_path):
+def test_journal_on_a_small_disk_can_be_sealed_there(tmp_path):
     number, message = on_a_small_disk(tmp_path, APPEND + SEAL)
     assert number > 10
     assert "MB free, but" in message

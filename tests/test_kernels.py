@@ -116,7 +116,7 @@ def beam_input(name):
 
 @pytest.mark.parametrize("device", KERNELS)
 @pytest.mark.parametrize("name", CONTRACTS)
-def test_signature_is_the_contract(device, name):
+def test_kernel_signatures_match_their_contracts(device, name):
     kernel = getattr(kernels.load(device), name)
     kernel = getattr(kernel, "py_func", kernel)
     wanted = list(inspect.signature(CONTRACTS[name].__call__).parameters)[1:]
@@ -124,12 +124,12 @@ def test_signature_is_the_contract(device, name):
     assert kernel.__name__ == name
 
 
-def test_contracts_are_complete():
+def test_kernel_contracts_are_complete():
     assert set(CONTRACTS) == set(KERNEL_NAMES)
 
 
 @pytest.mark.parametrize("name", WORD_NAMES)
-def test_unpack_bits(kernel_set, name):
+def test_unpack_bits_equals_its_reference(kernel_set, name):
     words, channels = words_of(name)
     out = filled(len(channels), len(words))
     kernel_set.unpack_bits(words, channels, out)
@@ -138,7 +138,7 @@ def test_unpack_bits(kernel_set, name):
 
 @pytest.mark.parametrize("first", [0, 3, -5, 200, -300])
 @pytest.mark.parametrize("dtype", [np.int16, np.float32])
-def test_unpack_pcm(kernel_set, dtype, first):
+def test_unpack_pcm_equals_its_reference(kernel_set, dtype, first):
     random = np.random.default_rng(4)
     words = (20_000 * random.standard_normal((150, 5))).clip(-32_768, 32_767).astype(dtype)
     words[10], words[11] = 1, -2
@@ -155,7 +155,7 @@ def test_unpack_pcm(kernel_set, dtype, first):
     ("shape", "n_taps", "factor"),
     sized([((1, 1), 1, 1), ((2, 50), 61, 7), ((1, 20), 1, 10), ((2, 999), 61, 5)], [((32, 4096), 512, 10)]),
 )
-def test_decimate(kernel_set, shape, n_taps, factor):
+def test_decimate_equals_its_reference(kernel_set, shape, n_taps, factor):
     signals, taps = real_noise(*shape), taps_of(n_taps)
     out = filled(shape[0], -(-shape[1] // factor))
     kernel_set.decimate(signals, taps, factor, out)
@@ -165,7 +165,7 @@ def test_decimate(kernel_set, shape, n_taps, factor):
 @pytest.mark.parametrize(
     ("n_samples", "delay", "n_out"), [(10, 0, 10), (10, 3, 10), (10, 3, 5), (10, 20, 4), (1, 0, 1)]
 )
-def test_remove_group_delay(kernel_set, n_samples, delay, n_out):
+def test_remove_group_delay_equals_its_reference(kernel_set, n_samples, delay, n_out):
     signals, out = real_noise(3, n_samples), filled(3, n_out)
     kernel_set.remove_group_delay(signals, delay, out)
     expected = np.concatenate([signals, np.zeros((3, delay + n_out))], axis=1)[:, delay : delay + n_out]
@@ -175,9 +175,7 @@ def test_remove_group_delay(kernel_set, n_samples, delay, n_out):
 @pytest.mark.parametrize("taps_type", [np.int16, np.int32])
 @pytest.mark.parametrize("name", WORD_NAMES)
 @pytest.mark.parametrize(("factor", "first", "n_outputs", "n_out"), DECIMATIONS)
-def test_demodulate_words_is_unpack_decimate_and_group_delay(
-    kernel_set, name, factor, first, n_outputs, n_out, taps_type
-):
+def test_demodulate_words_equals_its_three_parts(kernel_set, name, factor, first, n_outputs, n_out, taps_type):
     words, channels = words_of(name)
     taps = np.rint(0.98 * np.iinfo(taps_type).max * taps_of(61).astype(float)).astype(taps_type)
     out = filled(len(channels), n_out)
@@ -193,7 +191,7 @@ def test_demodulate_words_is_unpack_decimate_and_group_delay(
 
 @pytest.mark.parametrize("word", [0, 0xFFFF_FFFF])
 @pytest.mark.parametrize("taps_type", [np.int16, np.int32])
-def test_demodulate_words_bears_taps_at_the_limit(kernel_set, word, taps_type):
+def test_demodulate_words_handles_taps_at_the_limit(kernel_set, word, taps_type):
     limit = np.iinfo(taps_type).max
     taps = np.array([-1_000, 3_000, limit - 8_000, 3_000, -1_000], dtype=taps_type)
     out = filled(32, 64)
@@ -203,7 +201,7 @@ def test_demodulate_words_bears_taps_at_the_limit(kernel_set, word, taps_type):
 
 
 @pytest.mark.parametrize("shape", sized([(1, 1), (3, 17), (2, 131)], [(32, 1009)]))
-def test_multiply_spectra(kernel_set, shape):
+def test_multiply_spectra_equals_its_reference(kernel_set, shape):
     spectra, response, out = complex_noise(*shape), complex_noise(shape[1], seed=2), filled(*shape, dtype=np.complex64)
     kernel_set.multiply_spectra(spectra, response, out)
     assert np.abs(out - spectra.astype(complex) * response).max() < 10 * FLOAT32
@@ -217,7 +215,7 @@ def test_multiply_spectra(kernel_set, shape):
         [(700, 600, 97, 10, 134)],
     ),
 )
-def test_multiply_and_fold(kernel_set, n_bins, first_bin, n_band, n_phases, n_out, own_responses):
+def test_multiply_and_fold_equals_its_reference(kernel_set, n_bins, first_bin, n_band, n_phases, n_out, own_responses):
     spectra, responses = complex_noise(3, n_bins), complex_noise(3 if own_responses else 1, n_phases, n_band, seed=2)
     out = filled(3, n_phases, n_out, dtype=np.complex64)
     kernel_set.multiply_and_fold(spectra, responses, first_bin, out)
@@ -228,7 +226,7 @@ def test_multiply_and_fold(kernel_set, n_bins, first_bin, n_band, n_phases, n_ou
 
 
 @pytest.mark.parametrize("name", SHAPE_NAMES)
-def test_delay_and_sum_and_envelope(kernel_set, name):
+def test_delay_and_sum_and_envelope_equal_their_references(kernel_set, name):
     signals, offsets, weights, shape = beam_input(name)
     expected = reference.delay_and_sum(signals, offsets, weights, shape[1])
     beams, amplitude, fused = filled(*shape, dtype=np.complex64), filled(*shape), filled(*shape)
@@ -242,7 +240,7 @@ def test_delay_and_sum_and_envelope(kernel_set, name):
 
 
 @pytest.mark.parametrize("shape", sized([(1, 1, 1), (3, 2, 50), (5, 7, 131)], [(32, 10, 300)]))
-def test_quantise_tiles(kernel_set, shape):
+def test_quantise_tiles_equals_its_reference(kernel_set, shape):
     signals = complex_noise(*shape)
     starts = np.array([0, shape[2] // 3, shape[2] - 1], dtype=np.int32)
     signals[:, :, : starts[1]] *= 1e-4  # the first tile is far weaker than the others
@@ -258,7 +256,7 @@ def test_quantise_tiles(kernel_set, shape):
         assert not tiles[tile, :, :, part.shape[2] :].any()
 
 
-def test_quantise_tiles_of_silence(kernel_set):
+def test_quantise_tiles_of_silence_gives_zeros(kernel_set):
     tiles, scales = filled(1, 2, 3, 10, 2, dtype=np.int16), filled(1)
     kernel_set.quantise_tiles(np.zeros((2, 3, 10), np.complex64), np.zeros(1, np.int32), np.float32(100), tiles, scales)
     assert not tiles.any()
@@ -267,7 +265,7 @@ def test_quantise_tiles_of_silence(kernel_set):
 
 @pytest.mark.parametrize("n_ranges", [1, 95, 96, 97, 300])
 @pytest.mark.parametrize("n_mics", sized([1, 32], [1000]))
-def test_delay_and_sum_envelope_int16(kernel_set, n_ranges, n_mics):
+def test_delay_and_sum_envelope_int16_equals_its_reference(kernel_set, n_ranges, n_mics):
     tile_ranges = kernel_set.tile_ranges
     if not tile_ranges:
         pytest.skip("this processor has no 16-bit dot product (AVX-512 VNNI or AVX-VNNI)")
@@ -295,7 +293,7 @@ def test_delay_and_sum_envelope_int16(kernel_set, n_ranges, n_mics):
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_bad_numbers_stay_where_they_are(kernel_set, value):
+def test_nan_and_infinity_affect_only_their_own_outputs(kernel_set, value):
     """No kernel may be compiled with flags that let NaN and infinities be assumed away."""
     signals, offsets, weights, shape = beam_input("small prime" if SIMULATED else "prime")
     signals[3, :, 100] = value
@@ -322,7 +320,7 @@ def test_pipeline_gives_the_same_bits_every_time(precision):
     assert len({pipeline.process(measurement).amplitude.tobytes() for _ in range(30)}) == 1
 
 
-def test_results_do_not_depend_on_the_number_of_threads():
+def test_kernels_are_independent_of_the_number_of_threads():
     cpu = KERNELS["cpu"]
     signals, offsets, weights, shape = beam_input("eRTIS")
     words, channels = words_of("eRTIS")
@@ -355,7 +353,7 @@ def add_paths_plainly(call, turns, amplitude, first_bin, nodes_per_bin, out):
     ("n_paths", "n_mics", "n_bins", "n_nodes", "first_bin"),
     [(0, 2, 5, 1, 0), (1, 1, 1, 1, 0), (3, 2, 21, 1, 7), (2, 3, 100, 5, 0), (1, 2, 333, 40, 11)],
 )
-def test_add_paths(kernel_set, one_call, n_paths, n_mics, n_bins, n_nodes, first_bin):
+def test_add_paths_equals_its_reference(kernel_set, one_call, n_paths, n_mics, n_bins, n_nodes, first_bin):
     random = np.random.default_rng(4)
     call = random.standard_normal((2, 1 if one_call else n_mics, n_bins))
     call = call[0] + 1j * call[1]

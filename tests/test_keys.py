@@ -57,7 +57,7 @@ def _permission(**changes):
         ("tcp://[::]:5601", False),
     ],
 )
-def test_only_a_literal_loopback_address_may_do_without_keys(text, loopback):
+def test_only_literal_loopback_addresses_need_no_keys(text, loopback):
     endpoint = addresses.endpoint(text)
     assert endpoint == text
     assert addresses.is_loopback(endpoint) is loopback
@@ -93,14 +93,14 @@ def test_only_a_literal_loopback_address_may_do_without_keys(text, loopback):
         5,
     ],
 )
-def test_what_is_no_address_is_refused(text):
+def test_invalid_address_is_refused(text):
     with pytest.raises(ArgumentError, match="cannot be used") as caught:
         addresses.endpoint(text)
     assert len(str(caught.value).splitlines()) == 1
 
 
 @given(st.text(max_size=40))
-def test_whatever_is_given_for_an_address_is_one_or_refused(text):
+def test_any_text_is_an_address_or_refused(text):
     with contextlib.suppress(ArgumentError):
         assert addresses.endpoint("tcp://" + text).startswith("tcp://")
 
@@ -108,7 +108,7 @@ def test_whatever_is_given_for_an_address_is_one_or_refused(text):
 # Keys
 
 
-def test_keys_are_read_as_they_were_saved_and_nobody_else_can(folder):
+def test_saved_keys_are_read_back_and_private(folder):
     secret, public = PAIR.save(folder)
     assert KeyPair.load(secret) == PAIR
     assert public_key(public) == (PAIR.public, "robot")
@@ -121,14 +121,14 @@ def test_keys_are_read_as_they_were_saved_and_nobody_else_can(folder):
 
 
 @pytest.mark.parametrize("mode", [0o640, 0o604, 0o660, 0o610, 0o602])
-def test_a_secret_that_others_may_use_is_refused(folder, mode):
+def test_secret_key_readable_by_others_is_refused(folder, mode):
     secret, _ = PAIR.save(folder)
     secret.chmod(mode)
     with pytest.raises(SettingsError, match=f"other users may read it \\(mode {mode:04o}\\); run 'chmod 600"):
         KeyPair.load(secret)
 
 
-def test_a_folder_that_others_may_use_holds_no_secrets(folder):
+def test_secret_key_is_not_written_to_a_shared_folder(folder):
     folder.mkdir(mode=0o700)
     folder.chmod(0o750)
     with pytest.raises(ArgumentError, match=r"other users can access .* \(mode 0750\); run 'chmod 700"):
@@ -136,7 +136,7 @@ def test_a_folder_that_others_may_use_holds_no_secrets(folder):
     assert not list(folder.iterdir())
 
 
-def test_a_secret_in_a_folder_that_others_may_use_is_refused(folder):
+def test_secret_key_in_a_shared_folder_is_refused(folder):
     secret, _ = PAIR.save(folder)
     folder.chmod(0o755)
     with pytest.raises(
@@ -145,14 +145,14 @@ def test_a_secret_in_a_folder_that_others_may_use_is_refused(folder):
         KeyPair.load(secret)
 
 
-def test_keys_are_never_written_over(folder):
+def test_keys_are_never_overwritten(folder):
     PAIR.save(folder)
     with pytest.raises(ArgumentError, match="exists; give another name"):
         KeyPair.new("robot").save(folder)
     assert KeyPair.load(folder / "robot.secret.toml") == PAIR
 
 
-def test_a_file_of_a_secret_is_its_owners_from_its_first_byte(folder, monkeypatch):
+def test_secret_key_file_is_private_from_its_creation(folder, monkeypatch):
     modes, make = [], os.open
 
     def opened(path, flags, mode=0o777, **options):
@@ -177,7 +177,7 @@ def test_a_file_of_a_secret_is_its_owners_from_its_first_byte(folder, monkeypatc
     ],
     ids=["empty", "no_keys", "not_its_own", "path", "no_toml"],
 )
-def test_a_file_that_holds_no_keys_is_refused(tmp_path, text, reported):
+def test_file_without_keys_is_refused(tmp_path, text, reported):
     path = tmp_path / "robot.secret.toml"
     path.write_text(text)
     path.chmod(0o600)
@@ -186,13 +186,13 @@ def test_a_file_that_holds_no_keys_is_refused(tmp_path, text, reported):
     assert PAIR.secret not in str(caught.value)
 
 
-def test_a_missing_file_is_told(tmp_path):
+def test_missing_key_file_is_reported(tmp_path):
     with pytest.raises(SettingsError, match="create keys with 'ertis keys new'"):
         KeyPair.load(tmp_path / "none")
 
 
 @pytest.mark.parametrize("name", ["", "a/b", "..", "a b", "x" * 65, "-x", "ä"])
-def test_a_name_that_is_no_name_of_a_file_is_refused(name):
+def test_key_name_unfit_for_a_file_is_refused(name):
     with pytest.raises(ArgumentError, match="cannot be used"):
         KeyPair.new(name)
 
@@ -202,14 +202,14 @@ def test_a_name_that_is_no_name_of_a_file_is_refused(name):
     ["", "short", "~" * 40, "#" * 40, PAIR.public[:-1], PAIR.public + "0"],
     ids=["none", "word", "no_z85", "too_much", "39", "41"],
 )
-def test_a_key_that_is_none_is_refused(key):
+def test_invalid_key_is_refused(key):
     with pytest.raises(ArgumentError, match="give the 40 characters from 'ertis keys list'"):
         ClientKeys(PAIR, key)
     with pytest.raises(ArgumentError, match="is not a key"):
         _permission(public=key)
 
 
-def test_a_secret_is_not_taken_for_a_public_key(folder):
+def test_secret_key_is_refused_as_a_public_key(folder):
     secret, _ = PAIR.save(folder)
     with pytest.raises(SettingsError, match="contains a secret key"):
         public_key(secret)
@@ -228,7 +228,7 @@ def _flipped(path):
         yield
 
 
-def test_no_flipped_bit_of_a_list_changes_who_is_let_in(tmp_path):
+def test_flipped_bit_of_an_allow_list_is_detected(tmp_path):
     path = tmp_path / "allow.toml"
     listed = AllowList().allow(_permission())
     listed.save(path)
@@ -241,7 +241,7 @@ def test_no_flipped_bit_of_a_list_changes_who_is_let_in(tmp_path):
     assert n_refused > 1000
 
 
-def test_no_flipped_bit_of_a_key_file_changes_the_key(folder):
+def test_flipped_bit_of_a_key_file_is_detected(folder):
     secret, public = PAIR.save(folder)
     for path, read, wanted in (
         (secret, KeyPair.load, PAIR),
@@ -252,7 +252,7 @@ def test_no_flipped_bit_of_a_key_file_changes_the_key(folder):
                 assert read(path) == wanted
 
 
-def test_list_that_was_cut_short_is_refused(tmp_path):
+def test_truncated_allow_list_is_refused(tmp_path):
     path = tmp_path / "allow.toml"
     AllowList().allow(_permission()).save(path)
     whole = path.read_bytes()
@@ -262,7 +262,7 @@ def test_list_that_was_cut_short_is_refused(tmp_path):
             AllowList.load(path)
 
 
-def test_list_edited_by_hand_is_refused_with_a_remedy(tmp_path):
+def test_allow_list_edited_by_hand_is_refused_with_a_remedy(tmp_path):
     path = tmp_path / "allow.toml"
     AllowList().allow(_permission()).save(path)
     path.write_text(path.read_text().replace('"left"', '"rear"'))
@@ -275,7 +275,7 @@ def test_list_edited_by_hand_is_refused_with_a_remedy(tmp_path):
     assert AllowList.load(path).keys[0].serials == ("front", "rear")
 
 
-def test_a_list_is_read_as_it_was_saved(tmp_path):
+def test_allow_list_is_read_as_it_was_saved(tmp_path):
     other = Permission(name="viewer", public=KeyPair.new("viewer").public, role="application")
     listed = AllowList().allow(_permission()).allow(other)
     listed.save(tmp_path / "allow.toml")
@@ -286,7 +286,7 @@ def test_a_list_is_read_as_it_was_saved(tmp_path):
 
 
 @pytest.mark.parametrize(("what", "mode"), [("allow.toml", 0o664), ("allow.toml", 0o646), (".", 0o775)])
-def test_a_list_that_others_may_change_is_refused(tmp_path, what, mode):
+def test_allow_list_writable_by_others_is_refused(tmp_path, what, mode):
     path = tmp_path / "allow.toml"
     AllowList().allow(_permission()).save(path)
     (tmp_path / what).chmod(mode)
@@ -296,7 +296,7 @@ def test_a_list_that_others_may_change_is_refused(tmp_path, what, mode):
         ZapAuthenticator(context, ServerKeys(PAIR, path))
 
 
-def test_a_list_is_its_owners_whatever_files_are_by_default(tmp_path):
+def test_allow_list_is_private_for_any_umask(tmp_path):
     before = os.umask(0)
     try:
         AllowList().save(tmp_path / "allow.toml")
@@ -305,7 +305,7 @@ def test_a_list_is_its_owners_whatever_files_are_by_default(tmp_path):
     assert stat.S_IMODE((tmp_path / "allow.toml").stat().st_mode) == 0o644
 
 
-def test_changes_at_once_lose_nothing_of_each_other(tmp_path):
+def test_concurrent_changes_of_an_allow_list_are_all_kept(tmp_path):
     path, threads = tmp_path / "allow.toml", []
     for number in range(12):
         permission = _permission(name=f"n{number}", public=KeyPair.new("x").public)
@@ -325,7 +325,7 @@ def _slowly(permission):
     return change
 
 
-def test_a_key_that_is_allowed_again_has_what_was_said_last():
+def test_allowing_a_key_again_replaces_its_permission():
     listed = AllowList().allow(_permission()).allow(_permission(serials=("rear",)))
     assert listed.keys == (_permission(serials=("rear",)),)
 
@@ -342,19 +342,19 @@ def test_a_key_that_is_allowed_again_has_what_was_said_last():
         ({"name": "a b"}, "cannot be used"),
     ],
 )
-def test_a_permission_that_says_too_much_or_too_little_is_refused(changes, reported):
+def test_inconsistent_permission_is_refused(changes, reported):
     with pytest.raises(ArgumentError, match=reported):
         _permission(**changes)
 
 
 @pytest.mark.parametrize("what", ["name", "public"])
-def test_a_list_names_each_key_once(what):
+def test_allow_list_has_each_key_once(what):
     changes = {"name": "second", "public": KeyPair.new("x").public} | {what: getattr(_permission(), what)}
     with pytest.raises(ArgumentError, match="is listed twice"):
         AllowList(keys=(_permission(), _permission(**changes)))
 
 
-def test_a_list_says_what_it_cannot_do():
+def test_allow_list_refuses_invalid_operations():
     listed = AllowList().allow(_permission())
     with pytest.raises(ArgumentError, match="another key is listed as 'robot'"):
         listed.allow(_permission(public=KeyPair.new("x").public))
@@ -366,7 +366,7 @@ def test_a_list_says_what_it_cannot_do():
     ("role", "sends", "receives"),
     [("sensor", {"front"}, False), ("application", set(), True), ("admin", {"front", "rear"}, True)],
 )
-def test_a_role_may_do_what_it_is_for(role, sends, receives):
+def test_each_role_has_its_permissions(role, sends, receives):
     permission = _permission(role=role, serials=("front",) if role == "sensor" else ())
     assert {sensor for sensor in ("front", "rear") if permission.may_send(sensor)} == sends
     assert permission.may_receive is receives
@@ -397,12 +397,12 @@ def test_keys_are_made_allowed_listed_and_removed(folder):
     assert AllowList.load(folder / "allow.toml").keys == ()
 
 
-def test_a_secret_is_never_printed(folder):
+def test_secret_key_is_never_printed(folder):
     printed = _run("new", "robot") + _run("allow", str(folder / "robot.public.toml"), "--role", "admin") + _run("list")
     assert KeyPair.load(folder / "robot.secret.toml").secret not in printed
 
 
-def test_no_key_looks_like_an_option(monkeypatch):
+def test_keys_never_start_with_a_hyphen(monkeypatch):
     drawn = zmq.curve_keypair()
     while drawn[0].startswith(b"-"):
         drawn = zmq.curve_keypair()
@@ -412,7 +412,7 @@ def test_no_key_looks_like_an_option(monkeypatch):
     assert KeyPair.new("robot").public == drawn[0].decode()
 
 
-def test_a_key_without_a_file_needs_a_name(tmp_path):
+def test_key_given_as_text_needs_a_name(tmp_path):
     result = CliRunner().invoke(keys_command, ["allow", PAIR.public, "--role", "admin"])
     assert result.exit_code == 2
     assert "add --name" in result.output
@@ -433,13 +433,13 @@ def test_keys_may_be_given_by_file_or_by_name(folder):
 
 
 @pytest.mark.parametrize(("key", "server_key"), [("robot", None), (None, "robot")])
-def test_half_of_the_keys_is_refused(folder, key, server_key):
+def test_key_without_server_key_is_refused(folder, key, server_key):
     PAIR.save(folder)
     with pytest.raises(Exception, match="give both, or neither"):
         _network.client_keys(key, server_key)
 
 
-def test_a_list_without_a_key_is_refused(tmp_path):
+def test_allow_list_without_a_server_key_is_refused(tmp_path):
     with pytest.raises(Exception, match="--allow has no effect without --key"):
         _network.server_keys(None, tmp_path / "allow.toml")
 
@@ -452,7 +452,7 @@ def _as_somebody_elses(monkeypatch, path):
         monkeypatch.setattr(os, "geteuid", lambda: 12345)
 
 
-def test_a_list_of_another_user_is_refused(tmp_path, monkeypatch):
+def test_allow_list_of_another_user_is_refused(tmp_path, monkeypatch):
     path = tmp_path / "allow.toml"
     AllowList().allow(_permission()).save(path)
     _as_somebody_elses(monkeypatch, path)
@@ -460,7 +460,7 @@ def test_a_list_of_another_user_is_refused(tmp_path, monkeypatch):
         AllowList.load(path)
 
 
-def test_a_secret_of_another_user_is_refused(tmp_path, monkeypatch):
+def test_secret_key_of_another_user_is_refused(tmp_path, monkeypatch):
     secret, _ = PAIR.save(tmp_path / "keys")
     _as_somebody_elses(monkeypatch, secret)
     with pytest.raises(SettingsError, match=r"contains a secret, but other users may change .*\(owned by user \d+\)"):
@@ -468,7 +468,7 @@ def test_a_secret_of_another_user_is_refused(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("depth", [1, 2])
-def test_a_list_behind_links_into_a_folder_that_others_may_change_is_refused(tmp_path, depth):
+def test_allow_list_linked_through_a_shared_folder_is_refused(tmp_path, depth):
     """Also where the link leads on to one that leads back to a safe place: somebody may put another there."""
     (tmp_path / "open").mkdir()
     (tmp_path / "own").mkdir()
@@ -488,7 +488,7 @@ def test_a_list_behind_links_into_a_folder_that_others_may_change_is_refused(tmp
     assert AllowList.load(link).keys == (_permission(),)
 
 
-def test_a_list_below_a_folder_that_others_may_change_is_refused(tmp_path):
+def test_allow_list_below_a_shared_folder_is_refused(tmp_path):
     (tmp_path / "a" / "b").mkdir(parents=True)
     path = tmp_path / "a" / "b" / "allow.toml"
     AllowList().save(path)

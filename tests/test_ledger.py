@@ -13,7 +13,7 @@ from ertis_numba.network.central_node._received_items import SensorSession
 from tests.journals import EPOCH, create, entries
 
 
-def test_what_is_saved_is_read(tmp_path):
+def test_saved_ledger_is_read_back(tmp_path):
     acked_through = {SensorSession("left", 2**62): 7, SensorSession("left", 3): -1, SensorSession("right", 3): 2**62}
     ledger = Ledger(tmp_path)
     assert (ledger.is_new, ledger.acked_through, ledger.open, ledger.unsealed) == (True, {}, [], [])
@@ -24,7 +24,7 @@ def test_what_is_saved_is_read(tmp_path):
     assert read.gaps == ledger.gaps == gaps
 
 
-def test_a_ledger_of_version_1_is_read(tmp_path):
+def test_ledger_of_version_1_is_read(tmp_path):
     (tmp_path / ".ertis-ledger").write_text(
         '{"version": 1, "settled": {"left": {"3": 7}}, "open": ["a"], "unsealed": []}'
     )
@@ -45,7 +45,7 @@ def test_a_ledger_of_version_1_is_read(tmp_path):
         b'{"gaps": [["left", "1", 5, 4, "x"]]}',
     ],
 )
-def test_ledger_that_cannot_be_read_is_reported_and_left_out(content, tmp_path):
+def test_unreadable_ledger_is_reported_and_ignored(content, tmp_path):
     (tmp_path / ".ertis-ledger").write_bytes(content)
     read = Ledger(tmp_path)
     assert re.fullmatch(r"\S+\.ertis-ledger is damaged: [^\n]*read again from the recordings .*", read.damage)
@@ -68,7 +68,7 @@ def saved(folder):
     return (folder / ".ertis-ledger"), gaps
 
 
-def test_flipped_bit_of_a_ledger_is_noticed_and_raises_no_number(tmp_path):
+def test_flipped_bit_of_a_ledger_is_detected_and_raises_no_number(tmp_path):
     path, gaps = saved(tmp_path)
     whole = path.read_bytes()
     for bit in range(8 * len(whole)):
@@ -82,7 +82,7 @@ def test_flipped_bit_of_a_ledger_is_noticed_and_raises_no_number(tmp_path):
         assert {*read.gaps} <= {*gaps}
 
 
-def test_ledger_that_was_cut_short_is_noticed(tmp_path):
+def test_truncated_ledger_is_detected(tmp_path):
     path, _ = saved(tmp_path)
     whole = path.read_bytes()
     for n_bytes in range(len(whole)):
@@ -90,7 +90,7 @@ def test_ledger_that_was_cut_short_is_noticed(tmp_path):
         assert Ledger(tmp_path).damage
 
 
-def test_ledger_keeps_the_newest_runs_of_each_sensor(tmp_path):
+def test_ledger_keeps_the_newest_sessions_of_each_sensor(tmp_path):
     acked_through = {
         SensorSession(sensor, session_id): session_id for session_id in range(2_000) for sensor in ("left", "right")
     }
@@ -102,13 +102,13 @@ def test_ledger_keeps_the_newest_runs_of_each_sensor(tmp_path):
     assert {run.session_id for run in kept} == set(range(2_000 - 64, 2_000))
 
 
-def test_a_ledger_that_cannot_be_read_is_refused(tmp_path):
+def test_ledger_that_cannot_be_opened_is_refused(tmp_path):
     (tmp_path / ".ertis-ledger").mkdir()
     with pytest.raises(DataError, match="make it readable"):
         Ledger(tmp_path)
 
 
-def test_a_folder_is_for_one(tmp_path):
+def test_folder_belongs_to_one_central_node(tmp_path):
     lock = Lock(tmp_path)
     with pytest.raises(JournalInUseError, match="in use by another central node"):
         Lock(tmp_path)
@@ -119,7 +119,7 @@ def test_a_folder_is_for_one(tmp_path):
         Lock(tmp_path / "none")
 
 
-def test_recordings_are_looked_at(tmp_path):
+def test_recordings_are_examined_in_a_process(tmp_path):
     with create(tmp_path, [*entries(3), *entries(2, session_id=9), *entries(1, sensor="right")]) as journal:
         journal.note_gap("left", 20, 29, "lost", session_id=EPOCH)
     seal_in_subprocess(journal.path)
@@ -131,7 +131,7 @@ def test_recordings_are_looked_at(tmp_path):
     assert read_acked_through([]) == {}
 
 
-def test_a_recording_that_cannot_be_looked_at_is_told(tmp_path):
+def test_unreadable_recording_is_reported(tmp_path):
     (tmp_path / "bad.h5").write_text(json.dumps([]))
     with pytest.raises(DataError, match=r"recordings cannot be read .*bad\.h5"):
         read_acked_through([tmp_path / "bad.h5"])

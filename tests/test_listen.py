@@ -36,7 +36,7 @@ def events(done):
     return [json.loads(line) for line in done.stdout.splitlines()]
 
 
-def test_a_line_for_each_image():
+def test_listen_prints_a_line_per_image():
     done = heard([image(7, reflectors=[(-30, 2.0, 0.9), (24, 1.2, 0.5)]), image(8)], "-n", 2)
     assert done.exit_code == 0, done.stderr
     head, first, second = done.stdout.splitlines()
@@ -48,7 +48,7 @@ def test_a_line_for_each_image():
     assert done.stderr.splitlines() == ["2 received, 0 dropped"]
 
 
-def test_events_of_every_product():
+def test_listen_prints_events_of_every_product():
     items = [
         image(1, reflectors=[(0, 1.5, 1)]),
         cloud(2, position_m=[[3, 0, 0], [0, 0, 2]]),
@@ -78,7 +78,7 @@ def test_events_of_every_product():
     assert (last["event"], last["received"], last["dropped"], last["reconnects"]) == ("listened", 5, 0, 0)
 
 
-def test_saves_energyscapes_of_several_sensors(tmp_path):
+def test_listen_saves_energyscapes_of_several_sensors(tmp_path):
     path = tmp_path / "image.h5"
     sent = [image(1), image(5, sensor="left"), image(2)]
     done = heard(sent, "-n", 3, "--save", path)
@@ -90,7 +90,7 @@ def test_saves_energyscapes_of_several_sensors(tmp_path):
         np.testing.assert_array_equal(images.translation_m, Publisher.translation_m)
 
 
-def test_saves_measurements_as_a_recording_with_their_place(tmp_path):
+def test_listen_saves_measurements_with_their_mounting(tmp_path):
     path = tmp_path / "raw.h5"
     sent = [measurement(1), measurement(3, temperature_c=25.0)]
     done = heard(sent, "--product", "raw", "-n", 2, "--save", path, "-q")
@@ -105,7 +105,7 @@ def test_saves_measurements_as_a_recording_with_their_place(tmp_path):
 
 
 @pytest.mark.parametrize(("options", "code"), [((), 0), (("-n", "9"), 130)])
-def test_ctrl_c_ends_it_and_keeps_what_came(tmp_path, options, code):
+def test_ctrl_c_ends_listen_and_keeps_received_images(tmp_path, options, code):
     path = tmp_path / "image.h5"
     with Publisher() as publisher, publisher.playing([image(1)]):
         command = [sys.executable, "-m", "ertis_cli.main", "listen", publisher.address, "--json", "--save", str(path)]
@@ -122,7 +122,7 @@ def test_ctrl_c_ends_it_and_keeps_what_came(tmp_path, options, code):
         assert len(images) == 1
 
 
-def test_what_does_not_fit_into_a_file_ends_it_and_keeps_what_came(tmp_path):
+def test_unstorable_image_ends_listen_and_keeps_earlier_ones(tmp_path):
     path = tmp_path / "image.h5"
     shorter = image(2).replace(amplitude=image(2).amplitude[:, :50].copy(), range_m=image(2).range_m[:50])
     with Publisher(describes_each=True) as publisher, publisher.playing([image(1), shorter, image(3)]):
@@ -136,7 +136,7 @@ def test_what_does_not_fit_into_a_file_ends_it_and_keeps_what_came(tmp_path):
 
 
 @pytest.mark.parametrize("product", ["energyscape", "raw"])
-def test_no_file_of_nothing(tmp_path, product):
+def test_listen_without_images_writes_no_file(tmp_path, product):
     with Publisher() as publisher, publisher.playing([]):
         done = listen(
             publisher.address, "--product", product, "--save", tmp_path / "none.h5", "--duration", 0.2, "--json"
@@ -148,13 +148,13 @@ def test_no_file_of_nothing(tmp_path, product):
     assert not list(tmp_path.iterdir())
 
 
-def test_too_few_in_its_time():
+def test_listen_reports_too_few_images_within_its_duration():
     done = heard([image(1)], "-n", 2, "--duration", 0.5)
     assert done.exit_code == 1
     assert "received 1 of 2 products in 0.5 s; give a longer --duration" in done.stderr
 
 
-def test_where_nobody_answers_that_is_told_once(monkeypatch):
+def test_unanswered_address_is_reported_once(monkeypatch):
     monkeypatch.setattr("ertis_cli._heard._SOON_S", 0.1)
     text = "waiting for tcp://127.0.0.1:1: no answer; is 'ertis serve' running?"
     done = listen("tcp://127.0.0.1:1", "--duration", "0.6", "--json")
@@ -163,7 +163,7 @@ def test_where_nobody_answers_that_is_told_once(monkeypatch):
     assert waiting == {"event": "waiting", "address": "tcp://127.0.0.1:1", "text": text}
 
 
-def test_points_are_found_in_the_directions_of_each_image(capsys):
+def test_points_use_the_directions_of_each_image(capsys):
     """Also where a part of what came before is kept."""
     heard, flat = MicrophoneTable(as_json=True, quiet=True), image(1, reflectors=[(0, 1.5, 1)])
     raised = replace(flat, elevation_rad=np.full_like(flat.elevation_rad, np.radians(20.0)))
@@ -173,7 +173,7 @@ def test_points_are_found_in_the_directions_of_each_image(capsys):
     assert found == [0.0, 20.0]
 
 
-def test_who_comes_late_is_told_of(capsys):
+def test_late_sensor_is_reported(capsys):
     heard = MicrophoneTable(as_json=False, quiet=False)
     heard.unanswered("tcp://127.0.0.1:1", 2.0)
     heard.unanswered("tcp://127.0.0.1:1", 4.0)
@@ -181,14 +181,14 @@ def test_who_comes_late_is_told_of(capsys):
     assert [line.split()[0] for line in capsys.readouterr().err.splitlines()] == ["waiting", "connected"]
 
 
-def test_who_answers_at_once_is_not_told_of(capsys):
+def test_prompt_sensor_is_not_reported(capsys):
     heard = MicrophoneTable(as_json=False, quiet=False)
     heard.note("connected")
     heard.unanswered("tcp://127.0.0.1:1", 4.0)
     assert capsys.readouterr().err == ""
 
 
-def test_the_address_of_sensors_is_told_from_that_of_images(tmp_path):
+def test_sensor_address_is_distinguished_from_image_address(tmp_path):
     with running(tmp_path) as central:
         done = listen(central.address)
     assert done.exit_code == 1
@@ -200,14 +200,14 @@ def test_the_address_of_sensors_is_told_from_that_of_images(tmp_path):
 
 @pytest.mark.parametrize("product", ["energyscape", "raw"])
 @pytest.mark.parametrize("folder", ["none", "/proc"])
-def test_a_file_that_cannot_be_is_refused_at_once(product, folder):
+def test_invalid_output_file_is_refused_at_once(product, folder):
     done = listen("tcp://127.0.0.1:1", "--product", product, "--save", f"{folder}/x.h5")
     assert done.exit_code == 1
     (line,) = done.stderr.splitlines()
     assert line.startswith(f"ertis: error: --save {folder}/x.h5: folder {folder} cannot be written (No such file or")
 
 
-def test_a_time_and_a_key_that_cannot_be(tmp_path):
+def test_invalid_duration_and_key_are_refused(tmp_path):
     secret, _ = KeyPair.new("me").save(tmp_path / "keys")
     for arguments, reported in (
         (("--duration", "0"), "--duration is 0; give a number above 0"),
@@ -226,7 +226,7 @@ def test_a_time_and_a_key_that_cannot_be(tmp_path):
         (("--key", "me"), "--key is given without --server-key"),
     ],
 )
-def test_refuses_usage(arguments, match):
+def test_listen_refuses_invalid_usage(arguments, match):
     done = listen("tcp://127.0.0.1:1", *arguments)
     assert done.exit_code == 2
     assert match in done.stderr

@@ -56,7 +56,7 @@ def test_direct_sound_far_below_full_scale_changes_no_image():
 
 
 @pytest.mark.parametrize("noise_dbfs", [None, -30.0])
-def test_no_signal_exceeds_its_bound(noise_dbfs):
+def test_signals_stay_below_their_bound(noise_dbfs):
     for seed in range(10):
         scene = varied_scene(seed).replace(count=1)
         sensor = scene.sensors[0]
@@ -75,7 +75,7 @@ def test_verdicts_of_a_few_scenes_hold():
     assert report["wrong"] == []
 
 
-def test_bench_fails_where_a_verdict_is_wrong(monkeypatch):
+def test_benchmark_fails_on_a_wrong_verdict(monkeypatch):
     monkeypatch.setattr(Trial, "total_change_db", lambda *_: 0.5)
     slow = Point(range_m=0.5, strength_db=-26.0, velocity_m_s=(1e-5, 0.0, 0.0))
     sensor = Sensor(array=OCTET, **PCM)
@@ -96,7 +96,7 @@ def test_disc_too_near_for_its_model_is_noted():
     assert make_plan(scene_of(far)).notes == ()
 
 
-def test_loud_is_half_of_full_scale():
+def test_loud_means_half_of_full_scale():
     assert LOUD == 0.5
     point = Point(range_m=0.5, strength_db=0.0)
     scene = scene_of(point, sensor=SENSOR.replace(emitter=Emitter(level_db=-18.0)))

@@ -62,7 +62,7 @@ def states(folder):
     return {item.name: (item.stat().st_ino, item.stat().st_mtime_ns) for item in folder.iterdir()}
 
 
-def test_files_are_those_of_one_recording_at_a_time(runs, out, monkeypatch):
+def test_files_equal_those_of_single_recordings(runs, out, monkeypatch):
     found, pool = run_here(monkeypatch, [runs], out, CampaignOptions(settings=narrow))
     assert outcomes(found) == dict.fromkeys(["a.h5", "b.h5", "c.h5", "d.h5"], "made")
     assert [order.about["warm"] for order in pool.given if order.do == "plan"] == [True, False]  # one for each air
@@ -74,7 +74,7 @@ def test_files_are_those_of_one_recording_at_a_time(runs, out, monkeypatch):
         assert single.read_bytes() == (out / f"{name}.energy.h5").read_bytes()
 
 
-def test_one_is_told_of_like_many(runs, out, monkeypatch):
+def test_single_recording_is_reported_like_many(runs, out, monkeypatch):
     found, _ = run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=narrow, explain=True, verify=True))
     arguments = [str(runs / "a.h5"), "--range", "0.5:0.8", "--explain", "--verify", "--json"]
     single = json.loads(CliRunner().invoke(cli, ["process", *arguments]).stdout)
@@ -92,7 +92,7 @@ def test_one_is_told_of_like_many(runs, out, monkeypatch):
     assert single == many
 
 
-def test_a_plan_that_is_none_is_refused(runs, out, monkeypatch):
+def test_invalid_plan_is_refused(runs, out, monkeypatch):
     def on_paper(settings):
         return settings.replace(processing=settings.processing.replace(method="paper"))
 
@@ -100,7 +100,7 @@ def test_a_plan_that_is_none_is_refused(runs, out, monkeypatch):
     assert "needs a plan, but method 'paper' has none; give 'fast'" in found["a.h5"].error
 
 
-def test_what_is_there_is_left_alone(runs, out, monkeypatch):
+def test_existing_output_is_kept(runs, out, monkeypatch):
     run_here(monkeypatch, [runs], out, CampaignOptions(settings=narrow))
     before = states(out)
     (out / "b.energy.h5").unlink()
@@ -122,7 +122,7 @@ def test_what_is_there_is_left_alone(runs, out, monkeypatch):
         (CampaignOptions(settings=narrow, dtype="float16"), "contains float32, not float16"),
     ],
 )
-def test_what_was_made_otherwise_is_told_or_replaced(runs, out, monkeypatch, wanted, stated):
+def test_differing_output_is_reported_or_replaced(runs, out, monkeypatch, wanted, stated):
     run_here(monkeypatch, [runs / "a.h5", runs / "b.h5"], out, CampaignOptions(settings=narrow))
     before = states(out)
     found, _ = run_here(monkeypatch, [runs / "a.h5", runs / "b.h5"], out, wanted)
@@ -138,14 +138,14 @@ def test_what_was_made_otherwise_is_told_or_replaced(runs, out, monkeypatch, wan
     assert set(outcomes(found).values()) == {"kept"}
 
 
-def test_another_recording_of_the_same_name(runs, out, monkeypatch):
+def test_output_of_another_recording_is_reported(runs, out, monkeypatch):
     run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=narrow))
     write_recording(runs / "a.h5", noise(count=3, seed=9), overwrite=True)
     found, _ = run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=narrow))
     assert "exists and was made from another recording" in found["a.h5"].error
 
 
-def test_the_same_measurements_in_another_file(runs, out, monkeypatch):
+def test_output_of_a_copied_recording_is_kept(runs, out, monkeypatch):
     run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=narrow))
     with h5py.File(runs / "a.h5", "r+") as file:
         file.attrs["remark"] = "written to"
@@ -153,7 +153,7 @@ def test_the_same_measurements_in_another_file(runs, out, monkeypatch):
     assert "exists and was made from another file of the same recording" in found["a.h5"].error
 
 
-def test_another_version(runs, out, monkeypatch):
+def test_output_of_another_version_is_reported(runs, out, monkeypatch):
     run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=narrow))
     newer = {"ertis-numba": "99.0"}
     monkeypatch.setattr(existing_output, "software_versions", lambda: newer)
@@ -163,7 +163,7 @@ def test_another_version(runs, out, monkeypatch):
 
 
 @pytest.mark.parametrize("content", [b"", b"mine", None])
-def test_what_is_no_energyscape_file_is_not_touched(runs, out, monkeypatch, content):
+def test_foreign_file_is_not_replaced(runs, out, monkeypatch, content):
     out.mkdir()
     recording = content is None
     content = (runs / "b.h5").read_bytes() if recording else content
@@ -174,7 +174,7 @@ def test_what_is_no_energyscape_file_is_not_touched(runs, out, monkeypatch, cont
     assert (out / "a.energy.h5").read_bytes() == content
 
 
-def test_a_grid_whose_file_has_changed(runs, out, monkeypatch, tmp_path):
+def test_output_of_a_changed_grid_file_is_reported(runs, out, monkeypatch, tmp_path):
     grid = tmp_path / "grid.csv"
 
     def by_file(settings):
@@ -189,7 +189,7 @@ def test_a_grid_whose_file_has_changed(runs, out, monkeypatch, tmp_path):
     assert "other settings (grid of sensor eRTIS-7)" in found["a.h5"].error
 
 
-def test_one_that_fails_does_not_stop_the_rest(runs, out, monkeypatch):
+def test_failing_recording_does_not_stop_the_rest(runs, out, monkeypatch):
     with h5py.File(runs / "b.h5", "r+") as file:
         file["sensors/eRTIS-7/pdm"][1, 777] ^= 1 << 9
     (runs / "c.h5").write_bytes((runs / "c.h5").read_bytes()[:50_000])
@@ -201,7 +201,7 @@ def test_one_that_fails_does_not_stop_the_rest(runs, out, monkeypatch):
     assert names_in(out) == ["a.energy.h5", "d.energy.h5"]
 
 
-def test_settings_that_no_plan_can_keep_are_told_of_each(runs, out, monkeypatch):
+def test_unreachable_budget_is_reported_per_recording(runs, out, monkeypatch):
     def hopeless(settings):
         return narrow(settings).replace(accuracy=settings.accuracy.replace(max_error_db=-199.0))
 
@@ -213,7 +213,7 @@ def test_settings_that_no_plan_can_keep_are_told_of_each(runs, out, monkeypatch)
     assert names_in(out) == []
 
 
-def test_energyscape_files_are_passed_over_unless_named(runs, out, monkeypatch):
+def test_energyscape_files_are_skipped_unless_named(runs, out, monkeypatch):
     run_here(monkeypatch, [runs / "a.h5"], runs, CampaignOptions(settings=narrow))  # beside the recordings
     found, _ = run_here(monkeypatch, [runs], runs, CampaignOptions(settings=narrow))
     assert found["a.energy.h5"].outcome == "skipped"
@@ -222,7 +222,7 @@ def test_energyscape_files_are_passed_over_unless_named(runs, out, monkeypatch):
     assert "a.energy.h5 is an energyscape file, wanted a recording" in found["a.energy.h5"].error
 
 
-def test_sensors_of_a_recording_go_into_its_file(tmp_path, out, monkeypatch):
+def test_sensors_of_a_recording_share_its_output(tmp_path, out, monkeypatch):
     left = (replace(each, stamp=replace(each.stamp, sensor="left")) for each in noise(line(8, 8), count=2, seed=5))
     several = [*noise(count=2), *left]
     write_recording(tmp_path / "two.h5", several)
@@ -232,7 +232,7 @@ def test_sensors_of_a_recording_go_into_its_file(tmp_path, out, monkeypatch):
     assert "exists and contains sensor eRTIS-7, left, not left" in found["two.h5"].error
 
 
-def test_faulty_microphones_are_told_or_refused(tmp_path, out, monkeypatch):
+def test_faulty_microphones_are_reported_or_refused(tmp_path, out, monkeypatch):
     measurements = noise(count=2)
     for measurement in measurements:
         measurement.data[:] &= np.uint32(0xFFFFFFFE)
@@ -243,7 +243,7 @@ def test_faulty_microphones_are_told_or_refused(tmp_path, out, monkeypatch):
     assert "stuck at 0: channel 0" in found["worn.h5"].made["warnings"][0]
 
 
-def test_neither_memory_nor_orders_grow_with_the_number_of_recordings(tmp_path, out, monkeypatch):
+def test_memory_and_tasks_are_independent_of_the_number_of_recordings(tmp_path, out, monkeypatch):
     most_kept, most_in_hand = [], []
     follow = work.run_task
 
@@ -267,7 +267,7 @@ def test_neither_memory_nor_orders_grow_with_the_number_of_recordings(tmp_path, 
     assert max(most_in_hand) <= pool.size + 3
 
 
-def test_a_plan_that_fails_by_chance_is_tried_again(runs, out, monkeypatch):
+def test_temporary_planning_failure_is_repeated(runs, out, monkeypatch):
     chances = [{"error": "no memory", "by_chance": True}]
 
     def short_of_memory(do, *arguments):
@@ -282,7 +282,7 @@ def test_a_plan_that_fails_by_chance_is_tried_again(runs, out, monkeypatch):
 
 
 @pytest.mark.parametrize("error", [MemoryError(), OSError(5, "Input/output error")])
-def test_errors_that_may_pass_are_told_as_such(runs, monkeypatch, error):
+def test_temporary_errors_are_marked(runs, monkeypatch, error):
     def fails(*_, **__):
         raise error
 
@@ -291,7 +291,7 @@ def test_errors_that_may_pass_are_told_as_such(runs, monkeypatch, error):
     assert reported == {"error": str(error) or "MemoryError", "by_chance": True}
 
 
-def test_a_folder_is_searched_only_for_what_a_worker_that_died_may_have_left(runs, out, monkeypatch):
+def test_leftovers_are_searched_only_after_a_worker_died(runs, out, monkeypatch):
     searched = []
 
     def died_of_c(do, about, *more):
@@ -307,7 +307,7 @@ def test_a_folder_is_searched_only_for_what_a_worker_that_died_may_have_left(run
     assert searched[1:-1] == [{"c.energy.h5"}]  # between what is done before all and after it
 
 
-def test_a_pipeline_that_another_thread_has_made_again_is_closed(monkeypatch):
+def test_duplicate_pipeline_of_another_thread_is_closed(monkeypatch):
     existing_output = []
 
     class Counted:
@@ -346,7 +346,7 @@ class Watched(Here):
 
 
 @pytest.mark.parametrize(("workers", "largest"), [(None, 1), (3, 3)])
-def test_a_gpu_serves_one_at_a_time(tmp_path, out, monkeypatch, workers, largest):
+def test_gpu_runs_one_task_at_a_time(tmp_path, out, monkeypatch, workers, largest):
     """However many orders are in hand when it is known to be a GPU: no more come until there are fewer."""
 
     def on_a_gpu(*arguments):
@@ -378,13 +378,13 @@ def test_a_gpu_serves_one_at_a_time(tmp_path, out, monkeypatch, workers, largest
         (CampaignOptions(device="cuda"), 2, 9, 2),
     ],
 )
-def test_how_many_workers_share_the_cores(monkeypatch, tmp_path, wanted, workers, count, found):
+def test_number_of_workers_follows_the_cores(monkeypatch, tmp_path, wanted, workers, count, found):
     monkeypatch.setattr(campaign, "usable_cores", lambda: 4)
     recordings = [RecordingFile(Path(f"{number}.h5")) for number in range(count)]
     assert Campaign(recordings, tmp_path / "out", wanted, workers=workers).workers == found
 
 
-def test_half_files_go_before_and_after(runs, out, monkeypatch):
+def test_partial_files_are_removed_before_and_after(runs, out, monkeypatch):
     out.mkdir()
     (out / "a.energy.h5.0123abcd.part").write_bytes(b"half")
     (out / "z.energy.h5.0123abcd.part").write_bytes(b"of another campaign")
@@ -394,7 +394,7 @@ def test_half_files_go_before_and_after(runs, out, monkeypatch):
         assert len(images) == 3
 
 
-def test_a_folder_that_cannot_be_written_is_told_with_the_remedy(monkeypatch, tmp_path):
+def test_unwritable_folder_is_reported_with_a_remedy(monkeypatch, tmp_path):
     def refused(*_):
         raise OSError(errno.EROFS, "Read-only file system", str(tmp_path / "a.energy.h5.0123abcd.part"))
 

@@ -37,7 +37,7 @@ def test_all_pools_are_timed_and_compared(tmp_path, monkeypatch):
     assert "2 recordings of 2 measurements of data/synthetic/reflectors.h5" in text
 
 
-def test_more_cores_have_more_pools(monkeypatch):
+def test_more_cores_give_more_pools(monkeypatch):
     monkeypatch.setattr(many, "_cores", lambda: 4)
     crews = many._crews  # noqa: SLF001
     assert [tuple(pool.values()) for pool in crews("tcp://x:1").values()] == [
@@ -49,7 +49,7 @@ def test_more_cores_have_more_pools(monkeypatch):
     ]
 
 
-def test_files_that_differ_are_not_timed(tmp_path, monkeypatch):
+def test_differing_files_are_not_timed(tmp_path, monkeypatch):
     def timed(_, target, *, workers, threads):
         (target / "000.energy.h5").write_text(f"{workers} {threads}")
         (target / "001.energy.h5").write_text("x" * workers)
@@ -69,7 +69,7 @@ def test_files_that_differ_are_not_timed(tmp_path, monkeypatch):
         )
 
 
-def test_a_recording_that_fails_is_not_timed(tmp_path):
+def test_failing_recording_is_not_timed(tmp_path):
     (tmp_path / "runs").mkdir()
     (tmp_path / "runs" / "torn.h5").write_bytes(b"torn")
     with pytest.raises(DataError, match=r"torn\.h5 is failed \(.*not an HDF5 file.*\), so it is not timed"):

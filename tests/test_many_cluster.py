@@ -62,7 +62,7 @@ def runs(tmp_path):
     return tmp_path / "runs"
 
 
-def test_files_are_those_of_this_process(scheduler, runs, tmp_path, monkeypatch):
+def test_cluster_files_equal_local_files(scheduler, runs, tmp_path, monkeypatch):
     run_here(monkeypatch, [runs], tmp_path / "here", WANTED)
     (runs / "broken.h5").write_bytes(b"broken")
     monkeypatch.chdir(tmp_path)  # workers are elsewhere
@@ -89,7 +89,7 @@ def test_workers_of_a_cluster_name_recordings_of_another_call(scheduler, tmp_pat
         assert images.call_warning in warning
 
 
-def test_progress_is_told_and_to_close_it_ends_the_work(scheduler, runs, tmp_path, monkeypatch):
+def test_progress_is_reported_and_close_ends_the_work(scheduler, runs, tmp_path, monkeypatch):
     monkeypatch.setattr(dask_workers, "_REPORT_INTERVAL_S", 0.0)
     out = tmp_path / "out"
     events = Campaign(find_recordings([runs / "b.h5"]), out, WANTED, scheduler=scheduler).run()
@@ -108,7 +108,7 @@ def test_progress_is_told_and_to_close_it_ends_the_work(scheduler, runs, tmp_pat
     assert names_in(out) == []
 
 
-def test_workers_that_are_killed_lose_nothing(scheduler, runs, tmp_path):
+def test_killed_dask_workers_lose_nothing(scheduler, runs, tmp_path):
     out = tmp_path / "out"
     found = {}
     with Client(scheduler, set_as_default=False) as client:
@@ -122,7 +122,7 @@ def test_workers_that_are_killed_lose_nothing(scheduler, runs, tmp_path):
     assert names_in(out) == [f"{name}.energy.h5" for name in "abcd"]
 
 
-def test_the_line_of_the_page_runs(scheduler, runs, tmp_path, monkeypatch):
+def test_cluster_command_of_the_page_runs(scheduler, runs, tmp_path, monkeypatch):
     page = path_of("many").read_text("utf-8")
     (line,) = re.findall(r"\$ ertis (.* --scheduler .*)", page)
     monkeypatch.chdir(tmp_path)
@@ -133,7 +133,7 @@ def test_the_line_of_the_page_runs(scheduler, runs, tmp_path, monkeypatch):
     assert names_in(tmp_path / "images") == [f"{name}.energy.h5" for name in "acd"]
 
 
-def test_other_versions_are_told(monkeypatch):
+def test_other_versions_of_workers_are_reported(monkeypatch):
     class Elsewhere:
         address = "tcp://far:1"
 
@@ -171,7 +171,7 @@ class Dwindling:
         pass
 
 
-def test_a_worker_that_is_lost_makes_no_room(monkeypatch):
+def test_lost_worker_does_not_count_as_free(monkeypatch):
     monkeypatch.setattr(cluster, "connect", lambda *_, **__: Dwindling())
     monkeypatch.setattr(cluster, "require_workers", lambda *_, **__: None)
     monkeypatch.setattr(dask_workers, "_LOOK_S", 0.0)
@@ -193,13 +193,13 @@ def test_dask_is_silent_while_a_campaign_runs(monkeypatch):
     assert all(logger.isEnabledFor(logging.CRITICAL) for logger in loggers)
 
 
-def test_no_scheduler(monkeypatch, runs, tmp_path):
+def test_missing_scheduler_is_reported(monkeypatch, runs, tmp_path):
     monkeypatch.setattr(dask_workers, "_CONNECT_S", 0.5)
     with pytest.raises(NetworkError, match=r"no dask scheduler answers at tcp://127\.0\.0\.1:9"):
         list(Campaign(find_recordings([runs]), tmp_path / "out", scheduler="tcp://127.0.0.1:9").run())
 
 
-def test_no_workers(monkeypatch, runs, tmp_path):
+def test_missing_workers_are_reported(monkeypatch, runs, tmp_path):
     monkeypatch.setattr(dask_workers, "_CONNECT_S", 1.0)
     with (
         LocalCluster(n_workers=0, dashboard_address=":0", silence_logs=50) as local,
@@ -208,7 +208,7 @@ def test_no_workers(monkeypatch, runs, tmp_path):
         list(Campaign(find_recordings([runs]), tmp_path / "out", scheduler=local.scheduler_address).run())
 
 
-def test_a_scheduler_that_goes_is_told(runs, tmp_path):
+def test_lost_scheduler_is_reported(runs, tmp_path):
     for name in "efgh":  # more than can be done before it is gone
         shutil.copy(runs / "b.h5", runs / f"{name}.h5")
     local = LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0", silence_logs=50)

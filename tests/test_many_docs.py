@@ -47,7 +47,7 @@ def shape(text):
     return sorted(re.sub(r"[\d.]+|─+| +", " ", line).strip() for line in text.splitlines() if line.strip())
 
 
-def test_commands_in_their_order(place):
+def test_commands_of_the_page_run_in_order(place):
     first, again, as_json = BLOCKS[:3]
     assert shape(run(first[0]).stderr) == shape(first[1])
     assert shape(run(again[0]).stderr) == shape(again[1])
@@ -67,7 +67,7 @@ def test_commands_in_their_order(place):
     assert list(reported[-1]) == list(wanted[-1])
 
 
-def test_python_lines(place):
+def test_code_of_the_page_runs(place):
     (code,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
     (place / "runs" / "torn.h5").unlink(missing_ok=True)
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
@@ -77,7 +77,7 @@ def test_python_lines(place):
     assert "runs/front.h5 made" in done.stdout
 
 
-def test_the_table_is_there():
+def test_page_has_its_table():
     table = PAGE.partition("<!-- ertis bench many -->")[2].partition("<!-- /ertis bench many -->")[0]
     assert "| 1 worker of 1 thread |" in table
     assert "LocalCluster" in table

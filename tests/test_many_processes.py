@@ -70,7 +70,7 @@ def gone(pid):
     return False
 
 
-def test_bits_do_not_depend_on_the_workers(runs, tmp_path, monkeypatch):
+def test_bits_are_independent_of_the_workers(runs, tmp_path, monkeypatch):
     wanted = CampaignOptions(settings=narrow, batch=2)
     run_here(monkeypatch, [runs], tmp_path / "here", wanted)
     found = ended(Campaign(find_recordings([runs]), tmp_path / "out", wanted, workers=2).run())
@@ -78,7 +78,7 @@ def test_bits_do_not_depend_on_the_workers(runs, tmp_path, monkeypatch):
     assert contents(tmp_path / "out") == contents(tmp_path / "here")
 
 
-def test_a_worker_that_dies_takes_one_recording_with_it(long_runs, tmp_path, crews):
+def test_dying_worker_fails_one_recording(long_runs, tmp_path, crews):
     out, killed, found = tmp_path / "out", [], {}
     campaign = Campaign(find_recordings([long_runs]), out, CampaignOptions(settings=narrow, batch=1), workers=2)
     for event in campaign.run():
@@ -96,7 +96,7 @@ def test_a_worker_that_dies_takes_one_recording_with_it(long_runs, tmp_path, cre
     assert outcomes(again) == {"a.h5": "kept", "b.h5": "made", "c.h5": "kept", "d.h5": "kept"}
 
 
-def test_to_close_it_ends_all_work_at_once(long_runs, tmp_path, crews):
+def test_close_ends_all_work_at_once(long_runs, tmp_path, crews):
     """However far it is: processes that stand still would never be done with theirs."""
     events = Campaign(
         find_recordings([long_runs]), tmp_path / "out", CampaignOptions(settings=narrow, batch=1), workers=2
@@ -110,7 +110,7 @@ def test_to_close_it_ends_all_work_at_once(long_runs, tmp_path, crews):
     assert not [name for name in names_in(tmp_path / "out") if name.endswith(".part")]
 
 
-def test_a_worker_that_dies_of_nothing_is_replaced():
+def test_idle_worker_that_dies_is_replaced():
     pool = ProcessPool(1)
     try:
         (pid,) = pool.current_paths
@@ -125,7 +125,7 @@ def test_a_worker_that_dies_of_nothing_is_replaced():
         pool.close()
 
 
-def test_fewer_are_wanted_after_all():
+def test_number_of_workers_can_be_reduced():
     pool = ProcessPool(3)
     try:
         pids = list(pool.current_paths)
@@ -137,7 +137,7 @@ def test_fewer_are_wanted_after_all():
 
 
 @pytest.mark.parametrize("size", [1, 2])
-def test_fewer_are_wanted_while_all_are_busy(size):
+def test_number_of_busy_workers_can_be_reduced(size):
     """Never more orders in hand than there were, and soon no more than are wanted, by as many processes."""
     pool, numbers, in_hand, seen = ProcessPool(3), iter(range(12)), set(), []
     try:
@@ -164,7 +164,7 @@ def test_fewer_are_wanted_while_all_are_busy(size):
         pool.close()
 
 
-def test_processes_that_cannot_begin_are_told(runs, tmp_path, monkeypatch):
+def test_workers_that_cannot_start_are_reported(runs, tmp_path, monkeypatch):
     monkeypatch.setattr(processes, "_MODULE", "ertis_numba.no_such_module")
     with pytest.raises(
         DeviceError,
@@ -200,7 +200,7 @@ def until_a_part_grows(out):
     pytest.fail("nothing was begun")
 
 
-def test_a_kill_leaves_no_half_file_and_the_next_run_completes_it(long_runs, tmp_path, monkeypatch):
+def test_kill_leaves_no_partial_file_and_the_next_run_completes(long_runs, tmp_path, monkeypatch):
     run_here(monkeypatch, [long_runs], tmp_path / "here", CampaignOptions(settings=narrow, batch=1))
     wanted, out = contents(tmp_path / "here"), tmp_path / "out"
     for wait_s in (0.0, 0.15):
@@ -222,7 +222,7 @@ def test_a_kill_leaves_no_half_file_and_the_next_run_completes_it(long_runs, tmp
     assert reported[-1]["kept"] == len(left) - ("b.energy.h5" in left)
 
 
-def test_ctrl_c_ends_all_at_once(long_runs, tmp_path):
+def test_ctrl_c_ends_all_workers(long_runs, tmp_path):
     out = tmp_path / "out"
     with started(long_runs, out) as process:
         until_a_part_grows(out)

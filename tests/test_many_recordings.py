@@ -24,7 +24,7 @@ def names(*given):
     return [str(found.path) for found in find_recordings(given)]
 
 
-def test_files_folders_and_patterns():
+def test_files_folders_and_patterns_are_found():
     assert names("runs/b.h5", "more/a.h5") == ["runs/b.h5", "more/a.h5"]
     assert names("runs") == ["runs/a.h5", "runs/b.h5"]
     assert names("runs/*") == ["runs/a.h5", "runs/b.h5", "runs/notes.txt"]
@@ -32,12 +32,12 @@ def test_files_folders_and_patterns():
     assert names("odd[1].h5") == ["odd[1].h5"]
 
 
-def test_a_file_that_is_named_twice_is_processed_once():
+def test_repeated_file_is_processed_once():
     Path("link.h5").symlink_to("runs/b.h5")
     assert names("runs/b.h5", "runs", "runs/../runs/*.h5", "link.h5") == ["runs/b.h5", "runs/a.h5"]
 
 
-def test_a_file_counts_rather_than_a_link_to_it():
+def test_file_is_preferred_to_a_link_to_it():
     Path("runs/0.h5").symlink_to("b.h5")
     assert names("runs") == ["runs/b.h5", "runs/a.h5"]
     assert find_recordings(["runs/0.h5", "runs"])[0] == RecordingFile(Path("runs/b.h5"), named=True)
@@ -45,18 +45,18 @@ def test_a_file_counts_rather_than_a_link_to_it():
 
 
 @pytest.mark.parametrize("given", ["runs", "runs/*.h5"])
-def test_a_link_to_nothing_is_left_to_whoever_opens_it(given):
+def test_broken_link_is_reported_when_it_is_opened(given):
     Path("runs/lost.h5").symlink_to("gone.h5")
     Path("runs/round.h5").symlink_to("round.h5")
     assert names(given) == ["runs/a.h5", "runs/b.h5", "runs/lost.h5", "runs/round.h5"]
     assert len(output_paths(find_recordings([given]), Path("out"))) == 4
 
 
-def test_only_what_is_named_is_meant_for_sure():
+def test_only_named_files_are_required():
     assert [found.named for found in find_recordings(["runs/b.h5", "runs"])] == [True, False]
 
 
-def test_a_file_that_is_not_there_is_left_to_whoever_opens_it():
+def test_missing_file_is_reported_when_it_is_opened():
     assert names("none.h5") == ["none.h5"]
 
 
@@ -64,13 +64,13 @@ def test_a_file_that_is_not_there_is_left_to_whoever_opens_it():
     ("given", "stated"),
     [("runs/*.hdf", "no file matches runs/"), ("empty", r"folder empty contains no \*\.h5")],
 )
-def test_nothing_meant(given, stated):
+def test_pattern_without_matches_is_refused(given, stated):
     Path("empty").mkdir()
     with pytest.raises(DataError, match=stated):
         find_recordings([given])
 
 
-def test_each_has_its_own_output():
+def test_each_recording_has_its_own_output():
     assert output_paths(find_recordings(["runs/**/*.h5"]), Path("out")) == [
         Path(f"out/{name}.energy.h5") for name in "abc"
     ]
@@ -84,26 +84,26 @@ def test_each_has_its_own_output():
         (["runs"], "none/out", r"output none/out: folder none does not exist"),
     ],
 )
-def test_refused_before_anything_is_made(place, given, folder, stated):
+def test_conflicts_are_refused_before_processing(place, given, folder, stated):
     with pytest.raises(ArgumentError, match=stated):
         Campaign(find_recordings(given), folder)
     assert names_in(place) == ["more", "odd[1].h5", "runs"]
 
 
-def test_no_recording_is_replaced():
+def test_recordings_are_never_replaced():
     Path("runs/a.energy.h5").touch()
     with pytest.raises(ArgumentError, match=r"would become runs/a\.energy\.h5, which is itself to be processed"):
         output_paths([RecordingFile(Path("runs/a.h5")), RecordingFile(Path("runs/a.energy.h5"))], Path("runs"))
 
 
-def test_workers_and_a_scheduler():
+def test_workers_and_scheduler_exclude_each_other():
     with pytest.raises(ArgumentError, match="workers and scheduler exclude each other"):
         Campaign(find_recordings(["runs"]), "out", workers=2, scheduler="tcp://127.0.0.1:9")
     with pytest.raises(ArgumentError, match="workers is 0; give a whole number of at least 1"):
         Campaign(find_recordings(["runs"]), "out", workers=0)
 
 
-def test_one_campaign_at_a_time(place):
+def test_folder_is_locked_for_one_campaign(place):
     with exclusive_folder(place / "out"):
         with pytest.raises(ArgumentError, match="is in use by another campaign"), exclusive_folder(place / "out"):
             pytest.fail("two had the folder")
@@ -114,7 +114,7 @@ def test_one_campaign_at_a_time(place):
     assert names_in(place / "out") == []
 
 
-def test_parts_of_others_are_left_alone(place):
+def test_partial_files_of_other_programs_are_kept(place):
     kept = ["a.energy.h5", "a.energy.h5.12345678", "b.energy.h5.12345678.part", "xa.energy.h5.12345678.part"]
     for name in (*kept, "a.energy.h5.12345678.part", "a.energy.h5.abcdef01.part"):
         (place / "runs" / "deep" / name).touch()

@@ -47,7 +47,7 @@ def spoil_head(file):
 
 
 @pytest.mark.parametrize(("spoil", "stated"), [(spoil_energy, "is damaged"), (spoil_head, "is damaged")])
-def test_what_is_damaged_is_told_or_replaced(runs, out, monkeypatch, spoil, stated):
+def test_damaged_output_is_reported_or_replaced(runs, out, monkeypatch, spoil, stated):
     run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=narrow))
     whole = (out / "a.energy.h5").read_bytes()
     spoil(out / "a.energy.h5")
@@ -58,7 +58,7 @@ def test_what_is_damaged_is_told_or_replaced(runs, out, monkeypatch, spoil, stat
     assert (out / "a.energy.h5").read_bytes() == whole
 
 
-def test_a_library_that_stumbles_over_a_file_does_not_hold_up_its_replacement(runs, out, monkeypatch):
+def test_unreadable_output_can_be_replaced(runs, out, monkeypatch):
     def stumbles(_):
         raise RuntimeError("Unable to read attribute")
 
@@ -68,7 +68,7 @@ def test_a_library_that_stumbles_over_a_file_does_not_hold_up_its_replacement(ru
     assert outcomes(found) == {"a.h5": "made"}
 
 
-def test_strict_holds_for_what_is_there(tmp_path, out, monkeypatch):
+def test_strict_applies_to_existing_output(tmp_path, out, monkeypatch):
     measurements = noise(count=2)
     for measurement in measurements:
         measurement.data[:] &= np.uint32(0xFFFFFFFE)
@@ -82,7 +82,7 @@ def test_strict_holds_for_what_is_there(tmp_path, out, monkeypatch):
     assert state(out / "worn.energy.h5") == before
 
 
-def test_what_is_there_is_measured_by_the_plan_that_it_was_made_by(runs, out, monkeypatch):
+def test_existing_output_is_verified_with_its_own_plan(runs, out, monkeypatch):
     run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=exact))
     before = state(out / "a.energy.h5")
     found, pool = run_here(

@@ -48,7 +48,7 @@ WHOLE = Data(
 )
 
 
-def test_each_message_of_the_table_has_its_own_kind():
+def test_each_message_has_its_own_kind():
     assert len(KINDS) == 17
     assert len({kind.__struct_config__.tag for kind in KINDS}) == len(KINDS)
     assert {kind.__struct_config__.tag for kind in KINDS} == {kind.__name__.lower() for kind in KINDS}
@@ -93,13 +93,13 @@ def test_each_message_of_the_table_has_its_own_kind():
         credit=st.integers(1, 64),
     )
 )
-def test_what_is_encoded_is_decoded(message):
+def test_encoded_messages_are_decoded(message):
     header = encode(message)
     assert decode(header) == message == decode(memoryview(header), (type(message),))
     assert header[:5] == MAGIC + bytes([VERSION])
 
 
-def test_a_header_as_it_stands_on_the_wire():
+def test_encoded_header_has_the_documented_bytes():
     assert encode(Ping()) == b"eRTN\x01\x81\xa4kind\xa4ping"
 
 
@@ -120,7 +120,7 @@ def test_a_header_as_it_stands_on_the_wire():
         (encode(Ping()) + b"\0", "cannot be decoded"),
     ],
 )
-def test_what_is_no_header_is_refused_in_a_line(header, reported):
+def test_invalid_header_is_refused_in_one_line(header, reported):
     with pytest.raises(DataError, match=reported) as caught:
         decode(header)
     assert ";" in str(caught.value)
@@ -128,12 +128,12 @@ def test_what_is_no_header_is_refused_in_a_line(header, reported):
 
 
 @pytest.mark.parametrize("version", [0, 2, 255])
-def test_another_version_is_told_from_garbage(version):
+def test_other_version_is_distinguished_from_garbage(version):
     with pytest.raises(FormatVersionError, match=f"has protocol version {version}, but this node uses 1; use"):
         decode(MAGIC + bytes([version]) + b"anything")
 
 
-def test_a_message_that_is_not_expected_is_refused():
+def test_unexpected_message_is_refused():
     with pytest.raises(DataError, match="a message is 'ping'; send one of hello, data"):
         decode(encode(Ping()), (Hello, Data))
 
@@ -160,7 +160,7 @@ def test_a_message_that_is_not_expected_is_refused():
         ("crc32", None),
     ],
 )
-def test_a_value_beyond_its_limits_is_refused(field, value):
+def test_value_beyond_its_limits_is_refused(field, value):
     header = MAGIC + bytes([VERSION]) + msgspec.msgpack.encode({**msgspec.to_builtins(WHOLE), field: value})
     with pytest.raises(DataError, match="a header cannot be decoded"):
         decode(header)
@@ -174,12 +174,12 @@ def test_a_value_beyond_its_limits_is_refused(field, value):
         max_leaves=12,
     )
 )
-def test_any_other_messagepack_is_refused(value):
+def test_other_messagepack_is_refused(value):
     with pytest.raises(DataError):
         decode(MAGIC + bytes([VERSION]) + msgspec.msgpack.encode(value))
 
 
-def test_ten_thousand_malformed_headers_are_refused_and_nothing_else_happens():
+def test_malformed_headers_are_refused():
     """Seed 11: bytes turned, cut, doubled, put in and taken out of good headers, and plain noise."""
     random_ = random.Random(11)
     good = [encode(message) for message in _one_of_each()]

@@ -27,7 +27,7 @@ def _scraped(address):
     }
 
 
-def test_what_is_scraped_is_the_status_as_it_is_now():
+def test_metrics_report_the_present_status():
     now = [BUSY]
     with Metrics("127.0.0.1:0", lambda: now[0]) as metrics:
         values = _scraped(metrics.address)
@@ -53,7 +53,7 @@ def test_what_is_scraped_is_the_status_as_it_is_now():
     assert not any("sensor" in dict(labels) for _, *labels in after)
 
 
-def test_metrics_end():
+def test_metrics_server_ends():
     metrics = Metrics("127.0.0.1:0", lambda: BUSY)
     metrics.start()
     metrics.close()
@@ -63,17 +63,17 @@ def test_metrics_end():
 
 
 @pytest.mark.parametrize("address", ["0.0.0.0:9101", "*:9101", "example.org:9101", "192.0.2.1:9101"])
-def test_metrics_are_of_this_machine_only(address):
+def test_metrics_are_served_on_loopback_only(address):
     with pytest.raises(ArgumentError, match=r"can be reached from other machines; give 127\.0\.0\.1:PORT"):
         Metrics(address, lambda: BUSY)
 
 
-def test_an_address_in_use_is_told():
+def test_metrics_address_in_use_is_reported():
     with Metrics("127.0.0.1:0", lambda: BUSY) as first, pytest.raises(NetworkError, match="cannot listen at"):
         Metrics(first.address, lambda: BUSY).start()
 
 
-def test_without_prometheus_client_the_remedy_is_told(monkeypatch):
+def test_missing_prometheus_client_is_reported_with_a_remedy(monkeypatch):
     monkeypatch.setitem(sys.modules, "prometheus_client", None)
     with pytest.raises(ArgumentError, match=r"need prometheus-client .*; run \"pip install 'ertis-numba\[metrics\]'\""):
         Metrics("127.0.0.1:0", lambda: BUSY)
@@ -91,7 +91,7 @@ def lines():
     root.handlers[:], root.level, root.propagate = before
 
 
-def test_an_event_is_one_line_that_programs_can_take_apart(lines):
+def test_event_is_one_parseable_line(lines):
     stream = lines()
     log.logger("central_node").warning(
         "conflict", sensor="front", session_id=7, sequence=41, text="both are kept", of=None
@@ -102,7 +102,7 @@ def test_an_event_is_one_line_that_programs_can_take_apart(lines):
     assert time.endswith("Z")
 
 
-def test_an_event_as_json(lines):
+def test_event_is_printed_as_json(lines):
     stream = lines(as_json=True)
     log.logger("central_node").error("fault", sensor="front", text='a "b"\nc')
     reported = json.loads(stream.getvalue())
@@ -111,7 +111,7 @@ def test_an_event_as_json(lines):
 
 
 @pytest.mark.parametrize("text", ["a\nb", "a=b", 'say "x"', "", "tab\t", "\x1b[31m", "\u2028line"])
-def test_what_a_stranger_says_stays_in_its_field(lines, text):
+def test_foreign_text_stays_in_its_field(lines, text):
     stream = lines()
     log.logger("central_node").info("refused", text=text)
     (line,) = stream.getvalue().splitlines()
@@ -119,7 +119,7 @@ def test_what_a_stranger_says_stays_in_its_field(lines, text):
     assert line.isprintable()
 
 
-def test_what_is_below_the_level_is_not_shown(lines):
+def test_events_below_the_level_are_hidden(lines):
     stream = lines(level="WARNING")
     log.logger("central_node").info("joined", sensor="front")
     log.logger("central_node").debug("turn")

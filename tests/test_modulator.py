@@ -99,7 +99,7 @@ def in_band_snr_db(bits, signal, low_hz=20_000, high_hz=80_000):
 
 @pytest.mark.parametrize("device", KERNELS)
 @pytest.mark.parametrize("order", [1, 2, 3, 4])
-def test_modulator_does_what_its_equations_say(order, device):
+def test_modulator_follows_its_equations(order, device):
     n = 600 if SIMULATED else 3000
     ties = np.random.default_rng(1).integers(-(2**19), 2**19, n) * 2.0**-21  # half of them between two steps
     signals = np.stack([tone(0.4, n), np.zeros(n), np.full(n, 0.3), ties])
@@ -160,7 +160,7 @@ def test_array_without_microphones_gives_zeros():
 
 
 @pytest.mark.parametrize("rms", [0.003, 0.2])
-def test_noise_is_gaussian_nearly_and_has_its_rms(rms):
+def test_noise_is_nearly_gaussian_with_its_rms(rms):
     """Signs of noise on a constant tell its distribution: their mean is 1 − 2 P(noise < −constant)."""
     constants = np.array([-2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0])
     signals = np.repeat(rms * constants[:, None], 200_000, axis=1)
@@ -171,7 +171,7 @@ def test_noise_is_gaussian_nearly_and_has_its_rms(rms):
     assert within.min() == 1  # the sum cannot be larger
 
 
-def test_noise_has_the_power_stated():
+def test_noise_has_the_given_power():
     """In the band the modulator adds little of its own, so what is in the bits there is the noise."""
     n = 131_072
     bits = modulated(np.zeros((32, n)), noise_rms=0.02)
@@ -192,7 +192,7 @@ def test_noise_and_dither_are_white_and_independent():
     assert np.abs(correlation - np.eye(len(rows))).max() < 5 / math.sqrt(n)
 
 
-def test_noise_of_one_microphone_does_not_touch_another():
+def test_noise_of_microphones_is_separate():
     signals = np.stack([tone(0.3, 2000)] * 3)
     keys, gains = keys_of(3), np.array([*loop_gains(4, BAND), 0.5, 2.0])
     octets = np.empty((2, 2000, 1), dtype=np.uint8)
@@ -209,7 +209,7 @@ def test_modulator_keeps_the_band(order, min_db):
 
 
 @pytest.mark.parametrize("order", [1, 2, 3, 4])
-def test_noise_is_shaped_as_designed(order):
+def test_noise_has_the_designed_spectrum(order):
     """Bits less signal are the quantiser's error, filtered by the noise transfer function: no other filter is left."""
     signal = tone(0.4, 3000)
     bits, quantised = modulate_plainly(signal, 1, loop_gains(order, BAND), 0.5, np.inf)
@@ -246,7 +246,7 @@ def test_modulator_recovers_from_overload(overload):
     assert in_band_snr_db(bits[21_000:], signal[21_000:]) > 58
 
 
-def test_modulator_is_the_same_for_any_threads_and_blocks():
+def test_modulator_is_independent_of_threads_and_blocks():
     signals = np.stack([tone(0.5, 5000, 30_000 + 1000 * mic) for mic in range(37)])
     noise_rms = np.linspace(0, 0.01, 37)
     found = set()

@@ -122,7 +122,7 @@ def test_delay_and_stretch_over_a_sphere():
 # ---- what moves, and how ---------------------------------------------------------------------------
 
 
-def test_a_sensor_that_comes_is_a_target_that_comes():
+def test_approaching_sensor_equals_an_approaching_target():
     coming = scene_of(Point(position_m=(1.0, 0.0, 0.0), velocity_m_s=(-5.0, 0.0, 0.0)), sensor=EAR)
     going = scene_of(Point(position_m=(1.0, 0.0, 0.0)), sensor=EAR.replace(velocity_m_s=(5.0, 0.0, 0.0)))
     [of_target], [of_sensor] = ways(coming, "doppler"), ways(going, "doppler")
@@ -130,7 +130,7 @@ def test_a_sensor_that_comes_is_a_target_that_comes():
     assert_allclose(of_target.stretch, of_sensor.stretch, rtol=1e-12)
 
 
-def test_what_moves_together_hears_no_shift():
+def test_common_motion_causes_no_shift():
     velocity_m_s = (3.0, -4.0, 1.0)
     scene = scene_of(
         Point(position_m=(1.0, 0.5, 0.2), velocity_m_s=velocity_m_s), sensor=EAR.replace(velocity_m_s=velocity_m_s)
@@ -139,7 +139,7 @@ def test_what_moves_together_hears_no_shift():
     assert_allclose(echo.stretch, 1.0, atol=1e-12)
 
 
-def test_motion_across_the_line_of_sight_shifts_nothing():
+def test_motion_across_the_line_of_sight_causes_no_shift():
     """But for the second order of v / c, as the way turns while the sound is on it."""
     across = scene_of(Point(position_m=(1.0, 0.0, 0.0), velocity_m_s=(0.0, 5.0, 0.0)), sensor=EAR)
     [echo] = ways(across, "doppler")
@@ -147,14 +147,14 @@ def test_motion_across_the_line_of_sight_shifts_nothing():
 
 
 @pytest.mark.parametrize("speed_m_s", [3.0, -3.0])
-def test_the_image_in_a_wall_moves_twice_as_fast(speed_m_s):
+def test_wall_image_moves_twice_as_fast(speed_m_s):
     wall = Wall(position_m=(1.5, 0.0, 0.0), facing_deg=(180.0, 0.0), velocity_m_s=(-speed_m_s, 0.0, 0.0))
     [echo] = ways(scene_of(sensor=EAR, walls=(wall,)), "doppler", "walls")
     assert echo.stretch[0, 0] == pytest.approx(1 - 2 * speed_m_s / SPEED_M_S, abs=2.5 * (speed_m_s / SPEED_M_S) ** 2)
 
 
 @pytest.mark.parametrize("speed_m_s", [3.0, -3.0])
-def test_a_wall_that_comes_is_met_where_it_then_is(speed_m_s):
+def test_approaching_wall_echoes_at_its_momentary_position(speed_m_s):
     """Straight on it is as far as a point that comes as fast; within 0.02 samples at 450 kHz."""
     velocity_m_s = (-speed_m_s, 0.0, 0.0)
     wall = Wall(position_m=(1.5, 0.0, 0.0), facing_deg=(180.0, 0.0), velocity_m_s=velocity_m_s)
@@ -164,7 +164,7 @@ def test_a_wall_that_comes_is_met_where_it_then_is(speed_m_s):
     assert_allclose(over_wall.stretch, over_point.stretch, atol=1e-5)
 
 
-def test_a_wall_that_slides_in_its_plane_changes_nothing():
+def test_wall_sliding_in_its_plane_changes_nothing():
     wall = Wall(position_m=(1.5, 0.0, 0.0), facing_deg=(180.0, 0.0), velocity_m_s=(0.0, 7.0, 3.0))
     still = ways(scene_of(sensor=EAR, walls=(wall.replace(velocity_m_s=(0.0, 0.0, 0.0)),)), "walls")
     moving = ways(scene_of(sensor=EAR, walls=(wall,)), "doppler", "walls")
@@ -186,7 +186,7 @@ def frequency_of(signal, near_hz):
 
 
 @pytest.mark.parametrize("speed_m_s", [1.0, -1.0, 3.0])
-def test_doppler_shift_of_a_tone(speed_m_s):
+def test_doppler_shift_of_a_tone_matches_the_formula(speed_m_s):
     """Within 1 % of ``2 v / c``, and to all orders within 0.1 %."""
     sensor = EAR.replace(call=TONE)
     still, coming = (
@@ -228,7 +228,7 @@ def test_signals_of_many_microphones_are_stretched_calls(spacing_m, speed_m_s):
 
 @pytest.mark.parametrize("modulation", ["hyperbolic", "linear"])
 @pytest.mark.parametrize(("start_hz", "stop_hz"), [(50e3, 25e3), (25e3, 50e3)])
-def test_a_stretched_call_seems_to_come_as_much_earlier_as_is_reckoned(modulation, start_hz, stop_hz):
+def test_stretched_call_has_the_predicted_time_shift(modulation, start_hz, stop_hz):
     """``(s - 1) p₀ / p'``, of which the simulator judges whether motion matters, for both kinds of sweep."""
     call = Call(start_frequency_hz=start_hz, stop_frequency_hz=stop_hz, modulation=modulation)
     rate_hz, stretch = 5e6, 1 + 2 * 1.0 / SPEED_M_S
@@ -248,7 +248,7 @@ def test_without_motion_doppler_changes_no_signal():
 # ---- places ----------------------------------------------------------------------------------------
 
 
-def test_things_are_where_their_velocity_took_them():
+def test_objects_move_with_their_velocity():
     point = Point(position_m=(1.0, 0.0, 0.0), velocity_m_s=(0.5, 1.0, -2.0))
     scene = scene_of(point, sensor=EAR, rate_hz=10.0)
     assert_allclose(sorted_ways(scene, index=5)[0], 2 * np.linalg.norm([1.25, 0.5, -1.0]) / SPEED_M_S, atol=1e-12)
@@ -268,7 +268,7 @@ def test_things_are_where_their_velocity_took_them():
         (90, (2.0, 2.0, 0.0), (0.0, 0.0, 0.0)),
     ],
 )
-def test_things_follow_their_way_points(index, place_m, velocity_m_s):
+def test_objects_follow_their_waypoints(index, place_m, velocity_m_s):
     """They rest before the first and after the last."""
     waypoints = ((1.0, 1.0, 0.0, 0.0), (2.0, 2.0, 0.0, 0.0), (3.0, 2.0, 2.0, 0.0))
     for thing in (Point(waypoints=waypoints), EAR.replace(waypoints=waypoints).path()):
@@ -283,27 +283,27 @@ def test_things_follow_their_way_points(index, place_m, velocity_m_s):
     assert_allclose(reflector.velocity_m_s, np.negative(velocity_m_s), atol=1e-12)
 
 
-def test_velocity_is_seen_from_the_sensor():
+def test_velocity_is_in_the_sensor_frame():
     """Turned to the left by a right angle, it sees what goes along x go to its right."""
     sensor = EAR.replace(yaw_deg=90, velocity_m_s=(0.0, 1.0, 0.0))
     [reflector] = seen(scene_of(Point(position_m=(0.0, 2.0, 0.0), velocity_m_s=(3.0, 0.0, 0.5)), sensor=sensor))
     assert_allclose(reflector.velocity_m_s, (-1.0, -3.0, 0.5), atol=1e-12)
 
 
-def test_velocity_of_a_wall_is_that_along_the_line_of_sight():
+def test_velocity_of_a_wall_is_along_the_line_of_sight():
     wall = Wall(position_m=(1.5, 0.0, 0.0), facing_deg=(180.0, 0.0), velocity_m_s=(-2.0, 5.0, 0.0))
     [reflector] = seen(scene_of(sensor=EAR, walls=(wall,)), "walls")
     assert_allclose(reflector.velocity_m_s, (-2.0, 0.0, 0.0), atol=1e-12)
 
 
-def test_a_box_moves_with_all_its_walls():
+def test_box_moves_with_all_its_walls():
     box = Box(position_m=(2.0, 0.0, 0.0), size_m=(1.0, 1.0, 1.0), velocity_m_s=(1.0, 0.0, 0.0))
     [reflector] = seen(scene_of(sensor=EAR, boxes=(box,), rate_hz=10.0), "walls", "occlusion", index=5)
     assert (reflector.name, reflector.range_m) == ("boxes[0].back", pytest.approx(2.0))
     assert_allclose(reflector.velocity_m_s, (1.0, 0.0, 0.0), atol=1e-12)
 
 
-def test_a_scene_knows_whether_anything_moves():
+def test_scene_reports_motion():
     place, velocity = {"position_m": (1.0, 0.0, 0.0)}, {"velocity_m_s": (0.0, 0.1, 0.0)}
     resting, moving = Point(**place), Point(**place, **velocity)
     assert not scene_of(resting).moves
@@ -322,6 +322,6 @@ def test_measurements_follow_the_rate_of_the_scene():
     assert_array_equal(later, heard(scene_of(point.replace(position_m=(0.6, 0.0, 0.0)), sensor=sensor)))
 
 
-def test_a_negative_index_is_refused():
+def test_negative_index_is_refused():
     with pytest.raises(ArgumentError, match="index is -2; give a whole number of at least 0"):
         heard(scene_of(), index=-2)

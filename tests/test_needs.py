@@ -20,7 +20,7 @@ BATCHES = 10
 
 
 @pytest.mark.parametrize("batch", range(BATCHES))
-def test_what_is_left_out_changes_less_and_what_is_needed_more(batch):
+def test_omitted_effects_change_images_by_less_than_the_tolerance(batch):
     """The one promise of the planner, on 200 scenes and through the whole chain."""
     wrong, seeds, count = [], range(batch * 1000, (batch + 1) * 1000), 0
     for seed in seeds:
@@ -56,12 +56,12 @@ def test_what_is_left_out_changes_less_and_what_is_needed_more(batch):
         ),
     ],
 )
-def test_weak_echoes_count_as_long_as_an_image_shows_them(sensor, point, name):
+def test_weak_visible_echoes_count(sensor, point, name):
     """Some 14 and 19 dB above the modulators' noise, and changed by 10 and 20 dB."""
     assert name in make_plan(Scene(sensors=(sensor,), points=(point,))).active
 
 
-def test_verdicts_hold_in_images_from_bits():
+def test_verdicts_hold_for_pdm_images():
     """What is left out moves no reflector in images that went through the modulators, loud enough to be sure of it."""
     for seed in range(6):
         scene = random_scene(seed)
@@ -83,7 +83,7 @@ def test_verdicts_hold_in_images_from_bits():
                 assert abs(change_db) < loud.tolerance_db, (seed, name, range_m)
 
 
-def test_effects_that_go_in_a_circle_all_stay_on(monkeypatch):
+def test_mutually_dependent_effects_stay_on(monkeypatch):
     """Walls matter without the facing of discs only, and that only with the walls."""
 
     def of(name, matters):
@@ -98,7 +98,7 @@ def test_effects_that_go_in_a_circle_all_stay_on(monkeypatch):
         assert verdicts[name].reason.endswith("stays on, because other effects depend on it")
 
 
-def test_what_is_not_needed_is_not_imported():
+def test_unneeded_effects_are_not_imported():
     """In a process of its own, a free field loads what its plan names, and noise of nobody is not drawn."""
     code = """
 import sys
@@ -128,13 +128,13 @@ print(sorted(simulator.clock.cost_ms))
         {"sonars": (Sonar(position_m=(2.0, -1.0, 0.0), level_db=-85.0, offset_s=0.0),) * 30},
     ],
 )
-def test_interference_is_found(more):
+def test_interference_is_detected(more):
     """Of a sonar that the first measurement does not hear, of the narrowest noise, and of many that are weak."""
     scene = Scene(points=(Point(azimuth_deg=30.0, range_m=2.0),), **more)
     assert "interference" in make_plan(scene).active
 
 
-def test_what_happens_between_way_points_is_found():
+def test_events_between_waypoints_are_detected():
     """A screen that stands in the way for a fifth of a second out of five."""
     times_s = ((0.0, -5.0), (1.3, -5.0), (1.4, 0.0), (1.5, 0.0), (1.6, 5.0), (5.0, 5.0))
     screen = Wall(

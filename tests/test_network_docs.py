@@ -11,7 +11,7 @@ from tests.pages import page
 PAGE = page("network-protocol")
 
 
-def test_the_table_of_messages_is_complete():
+def test_table_of_messages_is_complete():
     rows = [line.split("|") for line in PAGE.splitlines() if re.match(r"\| `\w+` \| \w+.* → ", line)]
     reported = {row[1].strip(" `"): re.findall(r"`(\w+)`", row[4]) for row in rows}
     kinds = [kind for kind in vars(messages).values() if isinstance(kind, type) and kind.__name__ in messages.__all__]
@@ -25,11 +25,11 @@ def test_the_table_of_messages_is_complete():
     }
 
 
-def test_the_version_and_the_limits_are_those_of_the_code():
+def test_documented_version_and_limits_match_the_code():
     assert f"## Wire format, version {messages.VERSION}" in PAGE
     assert f"`{messages.MAGIC.decode()}`" in PAGE
     assert f"{messages.HEADER_BYTES:,} bytes" in PAGE
 
 
-def test_all_products_are_told():
+def test_all_products_are_documented():
     assert all(f"`{product}`" in PAGE for product in typing.get_args(messages.Product))

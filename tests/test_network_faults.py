@@ -72,27 +72,27 @@ def wrong_in(part, found):
     return {name: found[name] for name in NOTHING_WRONG if name in found and found[name] != 0}
 
 
-def test_killed_central_nodes(tmp_path):
+def test_killed_central_nodes_lose_nothing(tmp_path):
     found = faults_kills.centrals(tmp_path, seed=SEED, count=N_KILLS["centrals"], rate_hz=faults.SHORT.rate_hz)
     assert wrong_in("centrals", found) == {}
     assert (found["orphans"], found["unacked"]) == (0, 0)
     assert found["stored"] == found["promised"] > 10 * N_KILLS["centrals"]
 
 
-def test_killed_sensor_nodes(tmp_path):
+def test_killed_sensor_nodes_lose_nothing(tmp_path):
     found = faults_kills.nodes(tmp_path, seed=SEED, count=N_KILLS["nodes"])
     assert wrong_in("nodes", found) == {}
     assert (found["in_spool"], found["orphans"]) == (0, 0)
     assert found["promised"] > 5 * N_KILLS["nodes"]
 
 
-def test_killed_sealings(tmp_path):
+def test_killed_sealing_processes_lose_nothing(tmp_path):
     found = faults_kills.sealings(tmp_path, seed=SEED, count=2)
     assert wrong_in("sealings", found) == {}
     assert found["kills"] == 2
 
 
-def test_killed_workers(tmp_path):
+def test_killed_workers_lose_nothing(tmp_path):
     found = faults_processing.workers(tmp_path, seed=SEED, count=N_KILLS["workers"])
     assert wrong_in("workers", found) == {}
     assert {name: found[name] for name in ("unbalanced", "uncounted", "untold", "disordered", "foreign")} == {
@@ -105,7 +105,7 @@ def test_killed_workers(tmp_path):
     assert found["orphans"] == 0
 
 
-def test_a_full_disk(tmp_path):
+def test_full_disk_loses_nothing(tmp_path):
     disk = tmp_path / "disk"
     disk.mkdir()
     with reliability.small_disk(disk) as mounted:
@@ -118,21 +118,21 @@ def test_a_full_disk(tmp_path):
     assert "free" in found["said"]
 
 
-def test_a_disk_that_fails(tmp_path):
+def test_failing_disk_loses_nothing(tmp_path):
     found = faults_links.disk_fails(tmp_path, seed=SEED)
     assert wrong_in("disk_fails", found) == {}
     assert (found["state"], found["acked in fault"]) == ("fault", 0)
     assert found["offered"] == found["stored"] > found["acked before"] > 0
 
 
-def test_lost_acks_and_dead_cables(tmp_path):
+def test_lost_acks_and_dead_cables_lose_nothing(tmp_path):
     found = faults_links.meddled(tmp_path, seed=SEED, duration_s=2.0)
     assert wrong_in("meddled", found) == {}
     assert found["flushed"]
     assert {"ack lose", "ack repeat", "ack delay"} <= found["meddled"].keys()
 
 
-def test_keys(tmp_path):
+def test_keys_are_enforced(tmp_path):
     found = faults_keys.keys(tmp_path, seed=SEED)
     assert found["let in"] == ["the listed application", "the listed sensor"]
     assert found["raw"] == 0
@@ -143,7 +143,7 @@ def test_keys(tmp_path):
     assert found["notes"]
 
 
-def test_malformed_messages(tmp_path):
+def test_malformed_messages_harm_nothing(tmp_path):
     found = faults_peers.fuzzed(tmp_path, seed=SEED, count=10_000)
     assert wrong_in("fuzzed", found) == {}
     assert (found["inputs"], found["restarts"], found["exit code"]) == (10_000, 0, 0)
@@ -152,7 +152,7 @@ def test_malformed_messages(tmp_path):
     assert found["memory grew, MB"] < 50
 
 
-def test_flipped_bits_in_encrypted_connections_end_nothing_but_those_connections(tmp_path):
+def test_flipped_bits_end_only_their_encrypted_connections(tmp_path):
     found = faults_wire.flips(tmp_path, seed=SEED, count=faults.SHORT.n_flips)
     assert wrong_in("flips", found) == {}
     assert (found["flips"], found["restarts"], found["sockets left"]) == (faults.SHORT.n_flips, 0, 0)
@@ -160,7 +160,7 @@ def test_flipped_bits_in_encrypted_connections_end_nothing_but_those_connections
     assert found["exit code"] == 0
 
 
-def test_nodes_killed_while_the_central_node_is_behind_do_not_end_it(tmp_path):
+def test_killed_nodes_do_not_end_a_lagging_central_node(tmp_path):
     found = faults_wire.gone(tmp_path, seed=SEED, count=faults.SHORT.n_gone)
     assert wrong_in("gone", found) == {}
     assert (found["kills"], found["restarts"], found["sockets left"]) == (faults.SHORT.n_gone, 0, 0)
@@ -169,7 +169,7 @@ def test_nodes_killed_while_the_central_node_is_behind_do_not_end_it(tmp_path):
     assert (found["exit code"], found["orphans"]) == (0, 0)
 
 
-def test_a_node_that_loses_and_spoils_is_found_out(tmp_path, monkeypatch):
+def test_checker_detects_a_faulty_node(tmp_path, monkeypatch):
     (tmp_path / "spoiling").mkdir()
     (tmp_path / "spoiling" / "sitecustomize.py").write_text(SPOILING)
     monkeypatch.syspath_prepend(str(tmp_path / "spoiling"))
@@ -215,7 +215,7 @@ def judged(path, folder):
     return {name: count for name, count in found.items() if name not in ("promised", "stored") and count}
 
 
-def test_the_checker_finds_nothing_where_nothing_is_wrong(tmp_path, sent):
+def test_checker_accepts_correct_results(tmp_path, sent):
     path, measurements = sent
     stored(tmp_path / "a", measurements)
     assert judged(path, tmp_path / "a") == {}
@@ -224,7 +224,7 @@ def test_the_checker_finds_nothing_where_nothing_is_wrong(tmp_path, sent):
     assert reported.ack_times_ms() == pytest.approx([4e-6] * 4)
 
 
-def test_the_checker_finds_what_is_lost(tmp_path, sent):
+def test_checker_detects_losses(tmp_path, sent):
     path, measurements = sent
     stored(tmp_path / "a", [*measurements[:2], *measurements[3:]])
     assert judged(path, tmp_path / "a") == {"lost": 1, "silent": 1}
@@ -234,7 +234,7 @@ def test_the_checker_finds_what_is_lost(tmp_path, sent):
     assert judged(path, tmp_path / "c") == {"lost": 1}
 
 
-def test_the_checker_finds_what_is_changed(tmp_path, sent):
+def test_checker_detects_changes(tmp_path, sent):
     path, measurements = sent
     words = measurements[2].data.copy()
     words[30_000] ^= 1 << 31
@@ -250,7 +250,7 @@ def test_the_checker_finds_what_is_changed(tmp_path, sent):
         assert judged(path, folder) == {"wrong": 1}
 
 
-def test_the_checker_finds_what_is_there_twice_or_never_was(tmp_path, sent):
+def test_checker_detects_duplicates_and_inventions(tmp_path, sent):
     path, measurements = sent
     stored(tmp_path / "a", measurements)
     stored(tmp_path / "a", measurements[2:3], name="again.h5")
@@ -260,7 +260,7 @@ def test_the_checker_finds_what_is_there_twice_or_never_was(tmp_path, sent):
     assert judged(path, tmp_path / "a") == {"twice": 1, "unexpected": 1}
 
 
-def test_the_checker_finds_files_that_are_broken_or_ought_to_be_gone(tmp_path, sent):
+def test_checker_detects_broken_and_leftover_files(tmp_path, sent):
     path, measurements = sent
     stored(tmp_path / "a", measurements)
     whole = (tmp_path / "a" / "rec.h5").read_bytes()
@@ -271,7 +271,7 @@ def test_the_checker_finds_files_that_are_broken_or_ought_to_be_gone(tmp_path, s
         assert len(recording) == 6
 
 
-def test_half_a_line_of_a_diary_is_none(tmp_path, sent):
+def test_partial_diary_line_is_ignored(tmp_path, sent):
     path = tmp_path / "cut.ndjson"
     path.write_bytes(sent[0].read_bytes()[:-3])
     reported = read_diaries([path])
@@ -288,7 +288,7 @@ def test_images_are_counted(tmp_path):
     assert found.times_ms == {DiaryKey("a", 1, 0): 2.0, DiaryKey("a", 1, 3): 4.0}
 
 
-def test_accounts_that_do_not_add_up_are_told():
+def test_inconsistent_counts_are_reported():
     sensors = {"a": SensorStatus(received=9, published=5, dropped={"superseded": 3}, in_flight=0)}
     status = Status(version="", pid=1, host="", address="", state="processing", sensors=sensors)
     serve = serving.Serve(None, "", "", "", None, latest=status)
@@ -303,7 +303,7 @@ def test_accounts_that_do_not_add_up_are_told():
     assert found["untold"] == 1 + 1  # five were published, three came, one was told; numbers 2 and 3 are not there
 
 
-def test_mixed_groups_are_found():
+def test_mixed_groups_are_detected():
     pulse_of = {(sensor, number): number + (sensor == "b" and number > 2) for sensor in "ab" for number in range(6)}
     came = [
         Group(number=number, dropped=0, group=number, members=members, missing=(), spread_ns=0, flags=flags)
@@ -322,13 +322,13 @@ def test_mixed_groups_are_found():
     assert all(tables.row("groups", found))
 
 
-def test_a_part_that_could_not_be_tried_is_told():
+def test_part_that_could_not_run_is_reported():
     assert tables.row("hosts", None)[2] == "not tried: requires root"
     report = {"machine": machine.describe(), "seed": 3, "long": False, "only": ["hosts"], "hosts": None}
     assert "Command: `ertis bench network-faults --only hosts --seed 3`." in tables.network_faults(report)
 
 
-def test_frames_survive_any_cut():
+def test_frames_are_joined_from_any_chunks():
     frames = [zmtp.ZmtpFrame(1, bytes(300)), zmtp.ZmtpFrame(0, b"x"), zmtp.ZmtpFrame(4, b"\x04PING")]
     data = b"".join(frame.encode() for frame in frames)
     for size in (1, 2, 7, 300, len(data)):
@@ -338,11 +338,11 @@ def test_frames_survive_any_cut():
         assert [(frame.more, frame.is_command) for frame in came] == [(True, False), (False, False), (False, True)]
 
 
-def test_parts_and_their_texts_agree():
+def test_parts_match_their_descriptions():
     assert set(faults.PARTS) == set(tables.ROWS)
 
 
-def test_a_node_that_does_not_start_is_told(tmp_path):
+def test_node_that_does_not_start_is_reported(tmp_path):
     with (
         central("record", tmp_path, "-o", str(tmp_path / "file"), listen="tcp://nowhere") as node,
         pytest.raises(DataError, match=r"event 'listening' of central did not arrive; .* ended with 1; .*ertis: error"),

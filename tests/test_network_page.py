@@ -111,7 +111,7 @@ def lines_of(page, prompt):
     [next(block for block in page.split("```") if "$ ertis serve" in block) for page in (README, PAGE)],
     ids=["readme", "page"],
 )
-def test_one_machine(place, ports, platform, block):
+def test_network_page_on_one_machine_runs(place, ports, platform, block):
     lines = lines_of(block, "")
     assert [line.split()[0] for line in lines] == ["example", "emulate", "serve", "capture", "listen", "status"]
     with Shell(ports, platform) as shell:
@@ -123,7 +123,7 @@ def test_one_machine(place, ports, platform, block):
     assert {name for path in recordings for name in sensor_names(path)} == {"front", "left"}
 
 
-def test_several_machines(place, ports, platform):
+def test_network_page_on_several_machines_runs(place, ports, platform):
     lines = lines_of(PAGE, "(?:central|sensor)")
     assert [line.split()[0] for line in lines] == ["keys", "keys", "keys", "serve", "capture"]
     with Shell(ports, platform) as shell:
@@ -134,7 +134,7 @@ def test_several_machines(place, ports, platform):
     assert "0 lost" in reported or not reported
 
 
-def test_one_machine_stores(place, ports, platform):
+def test_network_page_on_one_machine_stores(place, ports, platform):
     with Shell(ports, platform) as shell:
         address = f"tcp://127.0.0.1:{ports['5601']}"
         shell.run("emulate examples/platform.toml &")

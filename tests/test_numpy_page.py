@@ -20,14 +20,14 @@ def place(tmp_path):
     return tmp_path
 
 
-def test_there_are_short_examples():
+def test_page_has_short_examples():
     assert len(EXAMPLES) == 4
     assert max(len(example.splitlines()) for example in EXAMPLES) <= 12
     assert max(map(len, "".join(EXAMPLES).splitlines())) <= 120
 
 
 @pytest.mark.parametrize("number", range(4))
-def test_examples_run(place, number):
+def test_page_examples_run(place, number):
     code = "import matplotlib; matplotlib.use('Agg')\n" + EXAMPLES[number]
     shown = run(place, sys.executable, "-W", "error", "-c", code).stdout
     if number == 1:

@@ -36,7 +36,7 @@ coordinates = st.tuples(*(st.floats(-2, 2) for _ in range(3)))
     st.tuples(st.floats(-180, 180), st.floats(-90, 90)),
     st.tuples(st.floats(0.1, 3), st.floats(0.1, 3)),
 )
-def test_walls_hide_exactly_what_is_behind_them(point_m, wall_m, facing_deg, size_m):
+def test_walls_hide_exactly_the_points_behind_them(point_m, wall_m, facing_deg, size_m):
     wall = Wall(position_m=wall_m, facing_deg=facing_deg, size_m=size_m)
     margin = {crosses((0, 0, 0), point_m, wall.replace(size_m=vector(np.multiply(size_m, k)))) for k in (0.999, 1.001)}
     far = np.linalg.norm(point_m) > 0.05 and abs(wall.axes()[0] @ np.subtract(point_m, wall_m)) > 1e-3
@@ -45,7 +45,7 @@ def test_walls_hide_exactly_what_is_behind_them(point_m, wall_m, facing_deg, siz
         assert len(sorted_ways(scene, "occlusion")[0]) == (not margin.pop())
 
 
-def test_walls_hide_images_too():
+def test_walls_hide_wall_images():
     """A screen stands between the sensor and a wall, and mirrors itself."""
     screen = Wall(position_m=(1.0, 0.0, 0.0), facing_deg=(180.0, 0.0), size_m=(0.4, 0.4))
     scene = scene_of(sensor=EAR, walls=(FRONT, screen))
@@ -53,13 +53,13 @@ def test_walls_hide_images_too():
     assert [reflector.name for reflector in seen(scene, "walls", "occlusion")] == ["walls[1]"]
 
 
-def test_a_wall_does_not_hide_what_it_mirrors():
+def test_wall_does_not_hide_its_own_images():
     point = Point(position_m=(0.8, 0.2, 0.1))
     scene = scene_of(point, sensor=EAR, walls=(FRONT,))
     assert_allclose(sorted_ways(scene, "walls", "occlusion"), sorted_ways(scene, "walls"))
 
 
-def test_a_target_behind_a_wall_is_hidden_for_the_other_leg_too():
+def test_target_hidden_from_the_microphone_is_silent():
     """The emitter sees the target, the microphone does not."""
     screen = Wall(position_m=(0.5, 0.0, 0.0), facing_deg=(180.0, 0.0), size_m=(0.3, 0.3))
     scene = listener_and_emitter(
@@ -74,7 +74,7 @@ def test_a_target_behind_a_wall_is_hidden_for_the_other_leg_too():
 
 
 @pytest.mark.parametrize("yaw_deg", [0.0, 30.0, -135.0])
-def test_a_box_is_six_walls(yaw_deg):
+def test_box_equals_six_walls(yaw_deg):
     box = Box(position_m=(0.2, -0.3, 0.1), size_m=(2.0, 3.0, 4.0), yaw_deg=yaw_deg, reflection_db=-4)
     turn = math.radians(yaw_deg)
     forward, left = np.array([math.cos(turn), math.sin(turn), 0]), np.array([-math.sin(turn), math.cos(turn), 0])
@@ -100,7 +100,7 @@ def test_a_box_is_six_walls(yaw_deg):
     assert_allclose(corner_m, 0, atol=1e-12)
 
 
-def test_a_box_ahead_shows_its_front_and_hides_the_rest():
+def test_box_ahead_shows_only_its_front():
     box = Box(position_m=(2.0, 0.0, 0.0), size_m=(1.0, 1.0, 1.0))
     points = (Point(position_m=(2.0, 0.1, 0.0)), Point(position_m=(4.0, 0.2, 0.0)), Point(position_m=(1.0, 0.2, 0.0)))
     found = seen(scene_of(*points, sensor=EAR, boxes=(box,)), "walls", "occlusion", "spreading")
@@ -110,7 +110,7 @@ def test_a_box_ahead_shows_its_front_and_hides_the_rest():
     assert all(set(name.split(" > ")) <= {"boxes[0].back", "points[2]"} for name in names)
 
 
-def test_a_sensor_in_a_box_hears_six_walls():
+def test_sensor_in_a_box_receives_six_wall_echoes():
     box = Box(position_m=(0.1, 0.2, 0.3), size_m=(3.0, 4.0, 2.5))
     scene = scene_of(sensor=EAR, boxes=(box,), max_reflections=1)
     found = {reflector.name: reflector.range_m for reflector in seen(scene, "walls", "occlusion")}
@@ -118,7 +118,7 @@ def test_a_sensor_in_a_box_hears_six_walls():
     assert found == {f"boxes[0].{side}": pytest.approx(range_m) for side, range_m in wanted.items()}
 
 
-def test_a_sensor_outside_does_not_hear_what_is_in_a_box():
+def test_box_hides_its_content_from_outside():
     box = Box(position_m=(2.0, 0.0, 0.0), size_m=(1.0, 1.0, 1.0))
     scene = listener_and_emitter((0.0, 0.0, 0.0), (2.0, 0.1, 0.1), boxes=(box,))
     assert not len(sorted_ways(scene, "walls", "occlusion", "cross_emission")[0])

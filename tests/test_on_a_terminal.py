@@ -66,7 +66,7 @@ def ends(terminal):
 
 
 @pytest.mark.parametrize("coloured", [True, False])
-def test_a_bar_says_how_far_it_is_and_goes(tmp_path, coloured):
+def test_progress_bar_shows_progress_and_disappears(tmp_path, coloured):
     with Terminal(BAR, tmp_path, "--wait", piped=True, **({} if coloured else {"NO_COLOR": "1"})) as terminal:
         for done in range(3):
             terminal.until(f"{done}/3")
@@ -83,7 +83,7 @@ def test_a_bar_says_how_far_it_is_and_goes(tmp_path, coloured):
 
 
 @pytest.mark.parametrize("columns", [20, 50, 200])
-def test_what_is_printed_meanwhile_stands_above_the_bar_and_is_whole(tmp_path, columns):
+def test_lines_are_printed_whole_above_the_bar(tmp_path, columns):
     with Terminal(BAR, tmp_path, columns=columns) as terminal:
         assert ends(terminal) == (0, None)
         expected = [line for both in zip(NOTES, RESULTS, strict=True) for line in both]
@@ -96,20 +96,20 @@ def test_what_is_printed_meanwhile_stands_above_the_bar_and_is_whole(tmp_path, c
 @pytest.mark.parametrize(
     ("arguments", "variables"), [(["--quiet"], {}), ([], {"TERM": "dumb"}), ([], {"TERM": "unknown"})]
 )
-def test_there_is_no_bar_where_nobody_wants_it_or_it_cannot_be_drawn(tmp_path, arguments, variables):
+def test_bar_is_omitted_if_unwanted_or_impossible(tmp_path, arguments, variables):
     with Terminal(BAR, tmp_path, *arguments, columns=200, piped=True, **variables) as terminal:
         assert terminal.finish()[0] == 0
         assert "\x1b" not in terminal.shown
         assert terminal.lines == [*NOTES, "False"]
 
 
-def test_there_is_no_bar_without_a_terminal(tmp_path):
+def test_bar_is_omitted_without_a_terminal(tmp_path):
     given = environment(tmp_path) | {"FORCE_COLOR": "1"}
     done = subprocess.run([sys.executable, "-c", BAR], env=given, capture_output=True, text=True, check=True)
     assert [line.rstrip() for line in done.stderr.splitlines()] == [*NOTES, "False"]
 
 
-def test_an_error_leaves_nothing_of_a_bar(tmp_path):
+def test_error_removes_the_bar(tmp_path):
     with Terminal(BAR, tmp_path, "--fail", columns=200, piped=True) as terminal:
         assert ends(terminal)[0] == 1
         assert "0/3" in terminal.shown
@@ -117,7 +117,7 @@ def test_an_error_leaves_nothing_of_a_bar(tmp_path):
 
 
 @pytest.mark.parametrize(("key", "code"), [(b"\x03", 130), (None, 143)])
-def test_an_end_from_outside_leaves_nothing_of_a_bar(tmp_path, key, code):
+def test_signal_removes_the_bar(tmp_path, key, code):
     with Terminal(BAR, tmp_path, "--wait", columns=200, piped=True) as terminal:
         terminal.until("0/3")
         terminal.go_on()
@@ -133,7 +133,7 @@ def test_an_end_from_outside_leaves_nothing_of_a_bar(tmp_path, key, code):
 # ---- tables ---------------------------------------------------------------------------------------
 
 
-def test_a_table_that_is_piped_is_plain_text_of_any_width(tmp_path):
+def test_piped_table_is_plain_text_of_any_width(tmp_path):
     given = environment(tmp_path) | {"FORCE_COLOR": "1", "COLUMNS": "20"}
     done = subprocess.run([sys.executable, "-c", TABLE], env=given, capture_output=True, text=True, check=True)
     assert done.stdout.splitlines() == [
@@ -145,7 +145,7 @@ def test_a_table_that_is_piped_is_plain_text_of_any_width(tmp_path):
 
 
 @pytest.mark.parametrize("coloured", [True, False])
-def test_a_table_on_a_terminal(tmp_path, coloured):
+def test_table_fits_the_terminal(tmp_path, coloured):
     with Terminal(TABLE, tmp_path, **({} if coloured else {"NO_COLOR": "1"})) as terminal:
         assert terminal.finish()[0] == 0
         head, first, second, loaded = terminal.lines
@@ -158,7 +158,7 @@ def test_a_table_on_a_terminal(tmp_path, coloured):
         assert bool(COLOUR.search(terminal.shown)) == coloured
 
 
-def test_a_table_on_a_dumb_terminal_is_plain(tmp_path):
+def test_table_on_a_dumb_terminal_is_plain(tmp_path):
     with Terminal(TABLE, tmp_path, TERM="dumb") as terminal:
         assert terminal.finish()[0] == 0
         assert "\x1b" not in terminal.shown
@@ -166,7 +166,7 @@ def test_a_table_on_a_dumb_terminal_is_plain(tmp_path):
 
 
 @pytest.mark.parametrize("columns", [15, 40, 60])
-def test_numbers_of_a_table_stay_whole_on_a_narrow_terminal(tmp_path, columns):
+def test_numbers_in_tables_are_never_wrapped(tmp_path, columns):
     with Terminal(TABLE, tmp_path, columns=columns) as terminal:
         assert terminal.finish()[0] == 0
         for number in ("12.345", "7", "-1.0", "123456"):
@@ -183,7 +183,7 @@ def test_numbers_of_a_table_stay_whole_on_a_narrow_terminal(tmp_path, columns):
             ]
 
 
-def test_a_command_says_the_same_on_a_terminal_and_in_a_pipe(tmp_path):
+def test_command_prints_the_same_on_a_terminal_and_in_a_pipe(tmp_path):
     path = write_energyscapes(tmp_path / "img.h5", [image()])
     piped = CliRunner().invoke(cli, ["peaks", str(path), "--top", "3"]).stdout
     with Terminal(IMPORT, tmp_path, "peaks", path, "--top", "3") as terminal:
@@ -192,11 +192,11 @@ def test_a_command_says_the_same_on_a_terminal_and_in_a_pipe(tmp_path):
         assert "\x1b[1m" in terminal.shown
 
 
-def test_a_table_without_rows():
+def test_table_without_rows_is_printed():
     assert list(_tables.TextTable({"what": "left", "ms": "right"}, []).lines()) == ["what  ms"]
 
 
-def test_the_status_is_neither_wrapped_nor_cut_in_a_pipe(capsys):
+def test_status_is_neither_wrapped_nor_cut_in_a_pipe(capsys):
     missing = {f"reason {number}": 3 for number in range(60)}
     sensors = {"front": msgspec.structs.replace(BUSY.sensors["front"], missing=missing)}
     _print(msgspec.structs.replace(BUSY, sensors=sensors), "", as_json=False)
@@ -205,7 +205,7 @@ def test_the_status_is_neither_wrapped_nor_cut_in_a_pipe(capsys):
     assert "3 reason 59  " in row
 
 
-def test_the_status_fits_on_a_terminal_of_80_columns():
+def test_status_fits_a_terminal_of_80_columns():
     screen = io.StringIO()
     Console(file=screen, width=80).print(_drawn(BUSY))
     row = next(line for line in screen.getvalue().splitlines() if line.startswith("front"))
@@ -216,7 +216,7 @@ def test_the_status_fits_on_a_terminal_of_80_columns():
 # ---- JSON -----------------------------------------------------------------------------------------
 
 
-def test_help_says_what_json_is():
+def test_help_describes_json_output():
     context = click.Context(cli)
     about = {}
     for name in COMMANDS:
@@ -232,7 +232,7 @@ def test_help_says_what_json_is():
     assert "one per line if there are several" in about["info info"]
 
 
-def test_every_line_of_json_is_an_object(capsys):
+def test_every_json_line_is_an_object(capsys):
     options.print_json({"text": "two\nlines", "value": 1.0})
     (line,) = capsys.readouterr().out.splitlines()
     assert json.loads(line) == {"text": "two\nlines", "value": 1.0}

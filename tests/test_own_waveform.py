@@ -53,7 +53,7 @@ def test_own_waveform_equal_to_the_default_sweep_gives_the_same_image(emitted, b
 
 
 @pytest.mark.parametrize("call", [SHORT, Call(start_frequency_hz=25e3, stop_frequency_hz=50e3)])
-def test_other_own_waveform_images_a_point_where_it_is(call):
+def test_own_waveform_images_a_point_at_its_position(call):
     shown = image(own(call), own(call))
     direction, place = np.unravel_index(np.argmax(shown.amplitude), shown.amplitude.shape)
     assert shown.range_m[place] == pytest.approx(0.8, abs=0.002)
@@ -116,7 +116,7 @@ def test_scene_reads_waveforms_of_sensors_and_sonars(tmp_path):
     assert isinstance(scene.sonars[0], Sonar)
 
 
-def test_recording_holds_the_samples(tmp_path):
+def test_recording_contains_the_waveform(tmp_path):
     np.save(tmp_path / "own.npy", SAMPLES)
     settings = Settings.load(_file(tmp_path / "mine.toml", 'call.waveform = "own.npy"\nrecording.n_samples = 65536'))
     words = np.zeros(65_536, np.uint32)
@@ -148,7 +148,7 @@ def test_emulated_sensor_receives_the_own_waveform(tmp_path, monkeypatch):
         assert device.registers.dac_rate_hz == 450_000
 
 
-def test_files_that_settings_from_elsewhere_name_are_not_opened(tmp_path):
+def test_files_named_in_received_settings_are_not_opened(tmp_path):
     np.save(tmp_path / "own.npy", SAMPLES)
     text = f'call.waveform = "{tmp_path / "own.npy"}"'
     with pytest.raises(SettingsError, match=r"call\.waveform is .*, the name of a file; send its samples instead"):
@@ -174,7 +174,7 @@ def test_files_that_settings_from_elsewhere_name_are_not_opened(tmp_path):
         ({"waveform": [["a"]]}, r"call.waveform\[0\] is|call.waveform is"),
     ],
 )
-def test_call_refuses(changes, message):
+def test_call_refuses_invalid_waveforms(changes, message):
     with pytest.raises(ArgumentError, match=message):
         Call(**{"waveform": SAMPLES, **changes})
 
@@ -192,19 +192,19 @@ def test_call_refuses(changes, message):
         ("own.npy", lambda path: np.save(path, np.zeros(100)), "call.waveform contains only 0"),
     ],
 )
-def test_settings_refuse_files(tmp_path, name, write, message):
+def test_settings_refuse_invalid_waveform_files(tmp_path, name, write, message):
     write(tmp_path / name)
     path = _file(tmp_path / "mine.toml", f'[call]\nwaveform = "{name}"\n')
     with pytest.raises((SettingsError, DataError), match=re.escape(message)):
         Settings.load(path)
 
 
-def test_wav_refuses_another_rate(tmp_path):
+def test_wav_of_another_rate_is_refused(tmp_path):
     wav(tmp_path / "own.wav")
     with pytest.raises(SettingsError, match=r"sample_rate_hz is 96000, but .* has 192000 Hz; leave out"):
         Call.from_file(tmp_path / "own.wav", sample_rate_hz=96_000)
 
 
-def test_settings_with_an_unread_file_are_refused_where_they_are_used():
+def test_settings_with_an_unread_waveform_are_refused():
     with pytest.raises(ArgumentError, match=r"the file 'own\.wav', which has not been read; give Call\.from_file"):
         Pipeline(Settings(call=Call(waveform="own.wav")), device="cpu")

@@ -23,7 +23,7 @@ def with_paper(settings: Settings, **changes) -> Settings:
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_image_is_the_plain_one(name):
+def test_paper_image_equals_its_float64_reference(name):
     settings = with_paper(CASES[name])
     pipeline = Pipeline(settings)
     measurement = noise(settings)
@@ -45,7 +45,7 @@ def echo(settings: Settings, *, azimuth_deg: float, range_m: float, level: float
 
 
 @pytest.mark.parametrize("call", [Call(), Call(start_frequency_hz=80e3, stop_frequency_hz=20e3)])
-def test_echo_lies_at_its_range_with_its_amplitude(call):
+def test_paper_echo_has_its_range_and_amplitude(call):
     """Group delays of all filters are gone, also those of the recursive ones."""
     settings = with_paper(SHORT.replace(call=call), directions="2d:181", range_decimation=10, range_m=(0.65, 0.75))
     words = echo(settings, azimuth_deg=20.0, range_m=0.7, level=0.8)
@@ -57,7 +57,7 @@ def test_echo_lies_at_its_range_with_its_amplitude(call):
     assert image.amplitude.max() == pytest.approx(0.8, rel=0.03)
 
 
-def test_image_agrees_with_the_exact_one_on_where_the_echo_is():
+def test_paper_and_exact_image_agree_on_the_echo():
     settings = with_paper(SHORT, directions="2d:61")
     words = echo(settings, azimuth_deg=-33.0, range_m=0.6, level=0.5)
     image = Pipeline(settings).process(Measurement(words, settings))
@@ -67,14 +67,14 @@ def test_image_agrees_with_the_exact_one_on_where_the_echo_is():
     assert image.amplitude.max() == pytest.approx(exact.max(), rel=0.12)  # both sample the range axis at 45 kHz
 
 
-def test_range_axis_is_that_of_the_paper():
+def test_range_axis_equals_that_of_the_paper():
     settings = with_paper(Settings())
     step_m = sound_speed_m_s(settings.air) / (2 * 45_000)
     indices = Pipeline(settings).range_m / step_m
     assert indices == pytest.approx(np.arange(131, 1309), abs=1e-9)  # 0.5 and 5 m in steps of 3.82 mm
 
 
-def test_rectified_carrier_is_gone():
+def test_envelope_has_no_carrier_ripple():
     """With every sample kept, the envelope of a call is smooth: no ripple at twice the carrier."""
     settings = with_paper(SHORT, directions="2d:1", range_decimation=10, range_m=(0.65, 0.75))
     words = echo(settings, azimuth_deg=0.0, range_m=0.7, level=1.0)
@@ -92,7 +92,7 @@ def test_rectified_carrier_is_gone():
         (Processing(range_m=(0.0, 0.1)), 9, "range_m ends at 0.1 m, but the record of 0.002 ms covers 0 m"),
     ],
 )
-def test_refuses_ranges(processing, n_samples, match):
+def test_paper_method_refuses_invalid_ranges(processing, n_samples, match):
     settings = Settings(recording=Recording(n_samples=n_samples), processing=processing.replace(method="paper"))
     with pytest.raises(ArgumentError, match=match):
         Pipeline(settings)

@@ -31,7 +31,7 @@ def measurement():
 
 @pytest.mark.parametrize("encoding", ["int16", "float32"])
 @pytest.mark.parametrize(("rate_hz", "step"), [(125_000.0, 2), (192_000.0, 4), (900_000.0, 18)])
-def test_reflectors_are_where_the_scene_has_them(encoding, rate_hz, step):
+def test_pcm_reflectors_match_the_scene(encoding, rate_hz, step):
     settings = PCM.replace(
         recording=Recording(sample_rate_hz=rate_hz, n_samples=round(rate_hz / 64), encoding=encoding),
         processing=PCM.processing.replace(range_decimation=step),
@@ -42,7 +42,7 @@ def test_reflectors_are_where_the_scene_has_them(encoding, rate_hz, step):
         assert peak.range_m == pytest.approx(point.range_m, abs=1e-3)
 
 
-def test_reflectors_of_linear_sweeps():
+def test_linear_sweep_reflectors_match_the_scene():
     settings = PCM.replace(call=Call(modulation="linear"))
     peaks = ertis.find_peaks(Pipeline(settings).process(heard(settings)), top=2)
     assert [peak.range_m for peak in peaks] == pytest.approx([point.range_m for point in POINTS], abs=1e-3)
@@ -50,7 +50,7 @@ def test_reflectors_of_linear_sweeps():
     assert abs(wrong[0].range_m - POINTS[0].range_m) > 0.02
 
 
-def test_image_is_that_of_the_bits():
+def test_pcm_image_equals_the_pdm_image():
     """Beside the modulators' noise, and what falls between ranges."""
     fine = PCM.processing.replace(range_decimation=1)
     bits = PCM.replace(recording=Recording(n_samples=70_000), processing=fine.replace(range_decimation=25))
@@ -61,7 +61,7 @@ def test_image_is_that_of_the_bits():
     assert of_bits.amplitude.max() == pytest.approx(of_numbers.amplitude.max(), rel=0.01)
 
 
-def test_noise_and_faults_of_converters():
+def test_pcm_converters_have_noise_and_faults():
     electronics = Electronics(noise_dbfs=-40.0, dead_channels=(2,), stuck_low=(5,), stuck_high=(6,))
     sensor = sensor_of(PCM, electronics=electronics)
     simulator = Simulator(Scene(seed=4, sensors=(sensor,)), plan=only("microphone_noise", "microphone_faults"))
@@ -76,7 +76,7 @@ def test_noise_and_faults_of_converters():
     assert (simulator.render().data == words).all()
 
 
-def test_what_is_too_loud_is_cut_off():
+def test_pcm_samples_clip_at_full_scale():
     loud = Point(azimuth_deg=0.0, elevation_deg=0.0, range_m=0.6, strength_db=20.0)
     words = Simulator(scene_of(PCM).replace(points=(loud,))).render().data
     assert (words.min(), words.max()) == (-32_768, 32_767)
@@ -86,7 +86,7 @@ def test_what_is_too_loud_is_cut_off():
 
 
 @pytest.mark.parametrize("name", ["PCM of 16 bits", "PCM, calibrated"])
-def test_recording_keeps_every_number(tmp_path, name):
+def test_pcm_recording_keeps_every_sample(tmp_path, name):
     given = cases.noise(cases.CASES[name])
     path = write_recording(tmp_path / "rec.h5", [given])
     with open_recording(path) as recording:
@@ -98,7 +98,7 @@ def test_recording_keeps_every_number(tmp_path, name):
     assert np.array_equal(image.amplitude, Pipeline(given.settings).process(given).amplitude)
 
 
-def test_recording_opens_in_xarray_with_names(tmp_path, measurement):
+def test_pcm_recording_opens_in_xarray(tmp_path, measurement):
     path = write_recording(tmp_path / "rec.h5", [measurement])
     for engine in ("h5netcdf", "netcdf4"):
         with xarray.open_dataset(path, group="/sensors/sensor", engine=engine, decode_timedelta=False) as data:
@@ -108,7 +108,7 @@ def test_recording_opens_in_xarray_with_names(tmp_path, measurement):
             assert "pdm" not in data
 
 
-def test_bits_and_numbers_of_two_sensors_share_a_recording(tmp_path, measurement):
+def test_pdm_and_pcm_sensors_share_a_recording(tmp_path, measurement):
     bits = cases.noise(cases.CASES["line of 8"])
     with RecordingWriter(tmp_path / "rec.h5") as writer:
         writer.write(dataclasses.replace(bits, stamp=ertis.Stamp(sensor="bits")))
@@ -118,7 +118,7 @@ def test_bits_and_numbers_of_two_sensors_share_a_recording(tmp_path, measurement
             assert np.array_equal(recording[0].data, given.data)
 
 
-def test_recording_whose_settings_say_something_else_is_refused(tmp_path, measurement):
+def test_recording_with_contradicting_settings_is_refused(tmp_path, measurement):
     path = write_recording(tmp_path / "rec.h5", [measurement])
     with h5py.File(path, "r+") as file:
         group = file["sensors/sensor"]
@@ -132,7 +132,7 @@ def test_recording_whose_settings_say_something_else_is_refused(tmp_path, measur
         open_recording(path)
 
 
-def test_journal_is_sealed_to_the_same(tmp_path, measurement):
+def test_pcm_journal_is_sealed_unchanged(tmp_path, measurement):
     path = tmp_path / "run.h5.journal"
     with Journal.create(path, target=tmp_path / "run.h5") as journal:
         journal.add_sensor("sensor", measurement.settings)
@@ -142,7 +142,7 @@ def test_journal_is_sealed_to_the_same(tmp_path, measurement):
         assert np.array_equal(recording[0].data, measurement.data)
 
 
-def test_a_journal_that_holds_no_number_is_sealed_all_the_same(tmp_path):
+def test_pcm_journal_with_nan_is_sealed(tmp_path):
     settings = PCM.replace(recording=PCM.recording.replace(encoding="float32"))
     words = np.zeros((3_000, 8), np.float32)
     words[17, 3] = np.nan
@@ -162,13 +162,13 @@ def test_a_journal_that_holds_no_number_is_sealed_all_the_same(tmp_path):
         (np.zeros(3_000, np.uint32), "has uint32 words"),
     ],
 )
-def test_other_words_are_refused(words, message):
+def test_samples_of_another_type_are_refused(words, message):
     with pytest.raises(DataError, match=message):
         Pipeline(PCM).process(ertis.Measurement(words, PCM))
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_numbers_that_are_none_are_refused(value):
+def test_pcm_samples_with_nan_are_refused(value):
     settings = PCM.replace(recording=PCM.recording.replace(encoding="float32"))
     words = np.zeros((3_000, 8), np.float32)
     words[17, 3] = value
@@ -176,7 +176,7 @@ def test_numbers_that_are_none_are_refused(value):
         Pipeline(settings).process(ertis.Measurement(words, settings))
 
 
-def test_a_sensor_of_bits_cannot_be_set_up_for_numbers():
+def test_pdm_sensor_refuses_pcm_settings():
     with pytest.raises(ArgumentError, match=r"recording\.encoding is 'int16', but a sensor sends bits; give 'pdm'"):
         ertis.Setup.of(Settings().replace(recording=Recording(n_samples=65_536, encoding="int16")))
 
@@ -184,7 +184,7 @@ def test_a_sensor_of_bits_cannot_be_set_up_for_numbers():
 # ---- health ---------------------------------------------------------------------------------------
 
 
-def test_faults_are_found_in_numbers():
+def test_faults_are_found_in_pcm():
     settings = PCM.replace(recording=PCM.recording.replace(n_samples=30_000))
     words = heard(settings).data.astype(np.float64)
     time_s = np.arange(len(words)) / RATE_HZ
@@ -209,7 +209,7 @@ def test_faults_are_found_in_numbers():
 
 @pytest.mark.parametrize("beamformer", ["delay_and_sum", "coherence_factor", "dmas", "capon"])
 @pytest.mark.parametrize("exponent", [-126, -60, 40, 100])
-def test_image_is_linear_in_samples_of_any_magnitude(beamformer, exponent):
+def test_image_is_linear_in_the_samples(beamformer, exponent):
     settings = PCM.replace(
         recording=PCM.recording.replace(encoding="float32"),
         processing=PCM.processing.replace(beamformer=beamformer),
@@ -225,7 +225,7 @@ def test_image_is_linear_in_samples_of_any_magnitude(beamformer, exponent):
     assert len(ertis.find_peaks(again, top=2)) == 2
 
 
-def test_image_that_float32_cannot_hold_is_refused():
+def test_image_beyond_float32_is_refused():
     given = heard(PCM.replace(recording=PCM.recording.replace(encoding="float32")))
     loudest = np.where(given.data >= 0, np.float32(3.4e38), np.float32(-3.4e38))  # square waves exceed their own peak
     with (

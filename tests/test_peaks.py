@@ -26,7 +26,7 @@ def images(tmp_path):
     return write_energyscapes(tmp_path / "img.h5", [given.replace(amplitude=amplitude)])
 
 
-def test_cfar_finds_what_is_weak(images):
+def test_cfar_finds_weak_reflectors(images):
     found = json.loads(run("peaks", images, "--detector", "cfar", "--json").stdout)["peaks"]
     assert min(peak["level_db"] for peak in found) < -30
     with open_energyscapes(images) as file:
@@ -38,7 +38,7 @@ def test_cfar_finds_what_is_weak(images):
     assert min(peak["level_db"] for peak in plain) >= -30
 
 
-def test_options_of_cfar(images):
+def test_cfar_options_change_the_peaks(images):
     limited = json.loads(run("peaks", images, "--detector", "cfar", "--min-level", -20, "--json").stdout)["peaks"]
     assert len(limited) == 1
     counts = [
@@ -60,5 +60,5 @@ def test_options_of_cfar(images):
         ("--detector cfar --false-alarm 2", 1, "--false-alarm is 2; give a number from 1e-09 to 0.5"),
     ],
 )
-def test_what_is_refused(images, options, code, match):
+def test_peaks_refuses_invalid_input(images, options, code, match):
     assert match in run("peaks", images, *options.split(), code=code).stderr

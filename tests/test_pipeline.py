@@ -41,7 +41,7 @@ def has_int16(device: str) -> bool:
 @pytest.mark.parametrize("precision", ["float32", "int16"])
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("name", [*CASES, "one range"])
-def test_image_is_the_exact_one(name, device, precision):
+def test_pipeline_image_is_exact(name, device, precision):
     if precision == "int16" and not has_int16(device):
         pytest.skip("this processor has no 16-bit dot product (AVX-512 VNNI or AVX-VNNI)")
     one_range = SHORT.replace(processing=SHORT.processing.replace(range_m=(0.7, 0.7)))
@@ -54,7 +54,7 @@ def test_image_is_the_exact_one(name, device, precision):
     assert reference.error_db(image.amplitude, exact(pipeline, measurement)) < settings.accuracy.max_error_db
 
 
-def test_error_falls_by_6_db_when_the_phases_double():
+def test_error_falls_by_6_db_per_doubling_of_phases():
     settings = SHORT.replace(processing=SHORT.processing.replace(directions="2d:41"))
     measurement = noise(settings)
     errors_db = []
@@ -65,7 +65,7 @@ def test_error_falls_by_6_db_when_the_phases_double():
     assert np.diff(errors_db) == pytest.approx([-6, -6], abs=1)
 
 
-def test_window_leaves_out_what_the_image_does_not_need():
+def test_window_omits_unneeded_samples():
     whole = Pipeline(SHORT.replace(processing=SHORT.processing.replace(range_m=(0.0, 1.5))))
     part = Pipeline(SHORT)
     measurement = noise(SHORT)
@@ -75,7 +75,7 @@ def test_window_leaves_out_what_the_image_does_not_need():
 
 
 @pytest.mark.parametrize("method", ["fast", "paper"])
-def test_axes_belong_to_the_result(method):
+def test_each_image_owns_its_axes(method):
     settings = SHORT.replace(processing=SHORT.processing.replace(method=method))
     image = Pipeline(settings).process(noise(settings))
     step_m = sound_speed_m_s(settings.air) / (2 * 45_000)
@@ -111,7 +111,7 @@ def test_spawned_processes_give_the_same_bits():
         assert pool.map(process_noise, [3, 4]) == [process_noise(3), process_noise(4)]
 
 
-def test_output_array_is_reused_and_nothing_else_of_its_size_is_made():
+def test_output_array_is_reused_without_allocation():
     settings = Settings(processing=Processing(directions="3000"))
     pipeline = Pipeline(settings, predict=False)
     measurement = noise(settings)
@@ -149,7 +149,7 @@ def test_output_array_is_reused_and_nothing_else_of_its_size_is_made():
         (SHORT.replace(array=Array(layout="eRTIS_v9")), "cpu", None, ArgumentError, "layout 'eRTIS_v9' is unknown"),
     ],
 )
-def test_refuses(settings, device, threads, error, match):
+def test_pipeline_refuses_invalid_arguments(settings, device, threads, error, match):
     with pytest.raises(error, match=match):
         Pipeline(settings, device=device, threads=threads)
 
@@ -165,7 +165,7 @@ def test_cuda_without_a_gpu_is_refused_with_a_remedy():
     assert "use device 'cpu', or install ertis-numba[cu12] or [cu13]" in error
 
 
-def test_batch_is_bit_by_bit_what_one_at_a_time_gives():
+def test_batch_equals_single_measurements():
     pipeline, measurements = Pipeline(SHORT), [noise(SHORT, seed) for seed in range(5)]
     single = [pipeline.process(measurement) for measurement in measurements]
     batch = pipeline.process_batch(iter(measurements))
@@ -181,7 +181,7 @@ def test_batch_with_a_wrong_measurement_processes_none():
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_graphs_are_refused_where_there_are_none(device):
+def test_cuda_graphs_are_refused_without_cuda(device):
     with pytest.raises(ArgumentError, match="graphs is True, but only device 'cuda' has CUDA graphs"):
         Pipeline(SHORT, device, graphs=True)
 
@@ -191,7 +191,7 @@ def test_empty_batch_gives_no_images():
 
 
 @pytest.mark.parametrize("method", ["fast", "paper"])
-def test_closed_pipeline_processes_no_more_and_keeps_its_axes(method):
+def test_closed_pipeline_refuses_work_and_keeps_its_axes(method):
     settings = SHORT.replace(processing=SHORT.processing.replace(method=method))
     with Pipeline(settings) as pipeline:
         image = pipeline.process(noise(settings))
@@ -205,18 +205,18 @@ def test_closed_pipeline_processes_no_more_and_keeps_its_axes(method):
 @pytest.mark.parametrize(
     "words", [np.zeros(10, np.uint32), np.zeros(40_960, np.uint16), np.zeros((40_960, 2), np.uint32)]
 )
-def test_refuses_words_of_other_settings(words):
+def test_pipeline_refuses_samples_of_other_settings(words):
     with pytest.raises(DataError, match=r"words of shape .* its settings describe uint32 of shape \(40960,\)"):
         Pipeline(SHORT).process(Measurement(words, SHORT))
 
 
 @pytest.mark.parametrize("out", [np.zeros((7, 3), np.float32), np.zeros((7, 131)), np.zeros((131, 7), np.float32).T])
-def test_refuses_out_of_another_shape(out):
+def test_pipeline_refuses_out_of_another_shape(out):
     with pytest.raises(ArgumentError, match=r"give contiguous float32 of shape \(7, 131\)"):
         Pipeline(SHORT).process(noise(SHORT), out=out)
 
 
-def test_the_tests_are_these():
+def test_tests_package_is_this_project():
     """Rtisdev's wheel brings a top-level package of the same name."""
     assert Path(cases.__file__).parent == Path(__file__).parent == Path(reference.__file__).parent
 
@@ -238,25 +238,25 @@ def test_the_tests_are_these():
         ),
     ],
 )
-def test_refuses_measurements_it_was_not_made_for(settings, match):
+def test_pipeline_refuses_measurements_of_other_settings(settings, match):
     with pytest.raises(DataError, match=match):
         Pipeline(SHORT).process(noise(settings))
 
 
-def test_a_named_layout_and_the_same_written_out_are_one():
+def test_named_and_written_layouts_are_equal():
     written_out = SHORT.replace(array=microphones(SHORT.array).to_array())
     named, other = Pipeline(SHORT), Pipeline(written_out)
     assert named.process(noise(written_out)).amplitude.tobytes() == other.process(noise(SHORT)).amplitude.tobytes()
 
 
-def test_paper_method_runs_on_numpy_and_says_so():
+def test_paper_method_reports_the_numpy_device():
     paper = SHORT.replace(processing=SHORT.processing.replace(method="paper"))
     assert Pipeline(paper).device == "numpy"
     with pytest.raises(DeviceError, match="method 'paper' has no kernels for device 'cpu'; use device 'numpy'"):
         Pipeline(paper, device="cpu")
 
 
-def test_read_only_words_do_not_compile_anything_anew():
+def test_read_only_samples_cause_no_compilation():
     pipeline = Pipeline(SHORT)
     compiled = kernels.load("cpu").demodulate_words.signatures
     before = len(compiled)

@@ -66,7 +66,7 @@ def test_processes_with_different_measured_costs_choose_the_same_plan_by_default
     assert "beam_taps = 0" in other_measured
 
 
-def test_the_default_plan_measures_nothing(monkeypatch, tmp_path):
+def test_default_plan_measures_nothing(monkeypatch, tmp_path):
     monkeypatch.setenv("ERTIS_CACHE_DIR", str(tmp_path))
     monkeypatch.setattr(costs, "_KNOWN", {})
     monkeypatch.setattr(costs, "measure", lambda *_: pytest.fail("costs were measured"))
@@ -75,7 +75,7 @@ def test_the_default_plan_measures_nothing(monkeypatch, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_images_hold_the_plan_that_was_chosen(monkeypatch, tmp_path):
+def test_images_contain_the_chosen_plan(monkeypatch, tmp_path):
     monkeypatch.setenv("ERTIS_CACHE_DIR", str(costs_where("pair", tmp_path / "pair")))
     monkeypatch.setattr(costs, "_KNOWN", {})
     with Pipeline(MANY, "cpu", plan="measured", predict=False) as pipeline:
@@ -106,7 +106,7 @@ def made_by(tmp_path, *arguments):
 
 
 @pytest.mark.parametrize("more", [[], ["--workers", "1"]])
-def test_process_chooses_plans_by_the_costs_asked_for(recording, tmp_path, more):
+def test_process_chooses_plans_by_the_given_costs(recording, tmp_path, more):
     grid = ["--directions", "3d:2000", "--range", "0.4:0.9", "--device", "cpu"]
     if not more:
         nominal, measured = (made_by(tmp_path, recording, *grid, "--plan", plan) for plan in costs.PLAN_COSTS)
@@ -145,7 +145,7 @@ def test_unknown_kinds_of_costs_are_refused():
 # ---- the table ---------------------------------------------------------------------------------------
 
 
-def test_the_table_is_what_the_command_writes():
+def test_cost_table_equals_the_output_of_the_command():
     path = ROOT / "ertis_numba" / "stages" / "nominal_costs.py"
     assert path.read_text("utf-8") == bench_costs.as_python(nominal_costs.NOMINAL_COSTS)
     assert set(nominal_costs.NOMINAL_COSTS) == set(kernels.DEVICES)
@@ -154,7 +154,7 @@ def test_the_table_is_what_the_command_writes():
         assert all(0 < value < 1 for value in table.values())
 
 
-def test_the_command_measures_and_updates_the_table(tmp_path, monkeypatch):
+def test_costs_command_measures_and_updates_the_table(tmp_path, monkeypatch):
     seconds = dict.fromkeys(costs.UNITS, 1.23456e-9)
     monkeypatch.setattr(bench_costs, "measure", lambda *_: costs.Costs(seconds))
     path = tmp_path / "nominal_costs.py"

@@ -32,7 +32,7 @@ def test_available_memory_is_zero_if_unknown(tmp_path):
     assert available_bytes(tmp_path / "none", tmp_path) == 0
 
 
-def test_plans_use_the_memory_of_the_machine_if_none_fits_the_usual_limit(monkeypatch):
+def test_plans_beyond_the_usual_limit_use_the_memory_of_the_machine(monkeypatch):
     usual = Planner(SETTINGS, CPU, threads=1).choose()
     monkeypatch.setattr(planner, "_USUAL_BYTES", 1)
     assert Planner(SETTINGS, CPU, threads=1).choose().settings == usual.settings

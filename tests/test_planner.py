@@ -56,7 +56,7 @@ def random_settings(seed):
 
 
 @pytest.mark.parametrize("seed", range(40))
-def test_the_true_error_keeps_the_budget(seed):
+def test_true_error_keeps_the_budget(seed):
     """On noise, which is heard in the whole band and by microphones that have nothing in common."""
     settings, measurement = random_settings(seed), noise(random_settings(seed), seed)
     chosen = chosen_for(settings)
@@ -70,7 +70,7 @@ def test_the_true_error_keeps_the_budget(seed):
 
 @pytest.mark.parametrize("device", ["cpu", "numpy"])
 @pytest.mark.parametrize("budget_db", ERROR_PRESETS_DB.values())
-def test_pipelines_of_all_presets_keep_them(device, budget_db):
+def test_pipelines_of_all_presets_keep_their_budget(device, budget_db):
     measurement = noise(SHORT)
     pipeline = Pipeline(SHORT, device=device, max_error_db=budget_db)
     assert is_complete(pipeline.settings.accuracy)
@@ -95,14 +95,14 @@ def test_pipelines_of_all_presets_keep_them(device, budget_db):
         {"interpolation": "linear", "oversampling": 12},
     ],
 )
-def test_what_is_given_is_kept(pinned):
+def test_given_choices_are_kept(pinned):
     found = chosen_for(SMALL, **pinned).settings.accuracy
     assert is_complete(found)
     assert {name: getattr(found, name) for name in pinned} == pinned
     assert found.delay_taps == (INTERPOLATIONS[found.interpolation] or found.delay_taps)
 
 
-def test_16_bits_are_kept_or_refused():
+def test_given_16_bits_are_kept_or_refused():
     if CPU.tile_ranges:
         assert chosen_for(SMALL, precision="int16").settings.accuracy.precision == "int16"
     else:
@@ -119,7 +119,7 @@ def test_16_bits_are_kept_or_refused():
         ({"stopband_attenuation_db": 40.0}, "noise aliased by the decimation"),
     ],
 )
-def test_a_budget_that_none_keeps_is_refused_with_the_best_there_is(pinned, part):
+def test_unreachable_budget_is_refused_with_the_smallest_error(pinned, part):
     with pytest.raises(
         ArgumentError, match=rf"max_error_db is -160, but the smallest error .* due to {part}\); give -\d+ or"
     ) as no:
@@ -131,7 +131,7 @@ def test_a_budget_that_none_keeps_is_refused_with_the_best_there_is(pinned, part
 
 
 @pytest.mark.parametrize("name", ["default", "wide band", "solid angle", "line of 8", "64 bits, two words"])
-def test_less_exact_is_never_slower(name):
+def test_larger_budget_is_never_slower(name):
     settings = CASES[name].replace(processing=CASES[name].processing.replace(directions="3d:700"))
     threads = CPU.max_threads  # plans are chosen by what they cost with all of them
     times_ms = [
@@ -141,12 +141,12 @@ def test_less_exact_is_never_slower(name):
     assert times_ms[-1] < 0.7 * times_ms[0]
 
 
-def test_the_same_costs_give_the_same_plan():
+def test_equal_costs_give_equal_plans():
     plans = {chosen_for(SMALL, max_error_db=budget_db).settings for budget_db in (-35.0, -60.0, -35.0, -60.0)}
     assert len(plans) == 2
 
 
-def test_costs_decide(monkeypatch):
+def test_costs_select_the_plan(monkeypatch):
     """Where nothing but sums takes time, beams are interpolated; where interpolation is dear, they are not."""
     usual = planner.nominal_costs(CPU)
     many = SMALL.replace(processing=SMALL.processing.replace(directions="3d:2000"))
@@ -156,7 +156,7 @@ def test_costs_decide(monkeypatch):
         assert bool(chosen_for(many).settings.accuracy.beam_taps) == wanted
 
 
-def test_complete_plans_are_left_alone():
+def test_complete_plans_are_kept():
     settings = SMALL.replace(accuracy=error_cases.BEST)
     assert is_complete(settings.accuracy)
     assert complete(settings, CPU, threads=1) == settings
@@ -166,27 +166,27 @@ def test_complete_plans_are_left_alone():
     assert complete(done, CPU, threads=1) == done
 
 
-def test_complete_plans_that_err_too_much_are_refused():
+def test_complete_plans_beyond_the_budget_are_refused():
     plan = error_cases.PLANS["delays 4 1"]
     assert complete(SMALL.replace(accuracy=plan.replace(max_error_db=-20.0)), CPU, threads=1)
     with pytest.raises(ArgumentError, match=r"max_error_db is -60, but the smallest error of these settings is -2\d"):
         complete(SMALL.replace(accuracy=plan.replace(max_error_db=-60.0)), CPU, threads=1)
 
 
-def test_the_papers_method_has_no_plan():
+def test_paper_method_has_no_plan():
     settings = SHORT.replace(processing=SHORT.processing.replace(method="paper"))
     assert complete(settings, CPU, threads=1) is settings
     assert Pipeline(settings).settings is settings
 
 
 @pytest.mark.parametrize("beamformer", ["coherence_factor", "dmas", "capon"])
-def test_other_beamformers_get_plans_that_they_can_use(beamformer):
+def test_adaptive_beamformers_get_usable_plans(beamformer):
     settings = SMALL.replace(processing=SMALL.processing.replace(beamformer=beamformer))
     found = chosen_for(settings).settings.accuracy
     assert (found.precision, found.delay_taps, found.beam_taps) == ("float32", 1, 0)
 
 
-def test_any_plan_is_rated_as_if_it_had_been_asked_for():
+def test_rated_plans_equal_requested_plans():
     """Whatever the planner's own settings leave open or do not."""
     for name in ("cubic", "nearest", "nodes 6 3", "nodes 2 2", "standard", "stop band 60"):
         plan = error_cases.PLANS[name].replace(max_error_db=-35.0)
@@ -197,7 +197,7 @@ def test_any_plan_is_rated_as_if_it_had_been_asked_for():
         assert (found.parts["beams"] > 0) == bool(plan.beam_taps)
 
 
-def test_lines_have_fewer_nodes_than_planes():
+def test_lines_need_fewer_beam_grid_points_than_planes():
     line = SMALL.replace(array=Array(layout="line", positions_m=LINE_8, word_bits=8))
     assert (
         chosen_for(line, beam_taps=4).stages_ms["interpolation"]

@@ -38,7 +38,7 @@ def recording(tmp_path):
     return write_recording(tmp_path / "rec.h5", noise(count=1))
 
 
-def test_budget_goes_into_the_plan(recording, tmp_path):
+def test_max_error_option_sets_the_budget_of_the_plan(recording, tmp_path):
     for given, wanted_db in [("-48.5", -48.5), *ERROR_PRESETS_DB.items()]:
         output = tmp_path / f"{given}.h5"
         run(recording, "-o", output, "--max-error", given)
@@ -48,7 +48,7 @@ def test_budget_goes_into_the_plan(recording, tmp_path):
         assert accuracy.oversampling is not None
 
 
-def test_explains_the_plan(recording, tmp_path):
+def test_explain_prints_the_plan_as_json(recording, tmp_path):
     plan = report(recording, "-o", tmp_path / "a.h5", "--explain", "--max-error", -30)["plan"]
     assert plan["accuracy"]["max_error_db"] == -30
     assert plan["safe_db"] <= -30
@@ -63,7 +63,7 @@ def test_explains_the_plan(recording, tmp_path):
     assert near["error_db"] - far["error_db"] == pytest.approx(20 * np.log10(0.9 / 0.4), abs=0.1)
 
 
-def test_explains_in_words(recording, tmp_path):
+def test_explain_prints_the_plan_as_text(recording, tmp_path):
     plain = run(recording, "-o", tmp_path / "a.h5", "--explain")
     assert plain.stdout == ""
     lines = plain.stderr.splitlines()
@@ -81,7 +81,7 @@ def test_explains_in_words(recording, tmp_path):
     assert "    one set of delays for each focal zone" in bent
 
 
-def test_explains_simple_interpolation(recording, tmp_path):
+def test_explain_names_linear_interpolation(recording, tmp_path):
     wishes = tmp_path / "wishes.toml"
     wishes.write_text('[accuracy]\ninterpolation = "linear"\nbeam_taps = 0\nprecision = "float32"\n', "utf-8")
     reported = run(recording, "-o", tmp_path / "a.h5", "--explain", "--settings", wishes).stderr
@@ -91,7 +91,7 @@ def test_explains_simple_interpolation(recording, tmp_path):
 
 
 @pytest.mark.parametrize("wavefront", ["plane", "spherical"])
-def test_verifies(recording, tmp_path, wavefront):
+def test_verify_prints_the_error_as_json(recording, tmp_path, wavefront):
     output = tmp_path / "a.h5"
     found = report(recording, "-o", output, "--verify", "--max-error", -50, "--wavefront", wavefront)["verified"]
     assert (found["max_error_db"], found["directions"], found["sequence"]) == (-50, 7, 10)
@@ -108,7 +108,7 @@ def test_verifies(recording, tmp_path, wavefront):
     assert found["peaks"]["level_db"] < 0.1
 
 
-def test_verifies_in_words(recording, tmp_path):
+def test_verify_prints_the_error_as_text(recording, tmp_path):
     reported = run(recording, "-o", tmp_path / "a.h5", "--verify").stderr.splitlines()
     reported = [line for line in reported if not line.startswith("eRTIS-7: the error of plane wavefronts")]
     assert reported[0].startswith("measurement 10 of eRTIS-7: error -")
@@ -116,7 +116,7 @@ def test_verifies_in_words(recording, tmp_path):
     assert reported[1].startswith("  10 of the strongest 10 reflectors found, within ")
 
 
-def test_refuses_a_plan_that_does_not_keep_its_budget(recording, tmp_path):
+def test_plan_beyond_its_budget_is_refused(recording, tmp_path):
     output, wishes = tmp_path / "a.h5", tmp_path / "wishes.toml"
     wishes.write_text(
         '[accuracy]\nprecision = "float32"\noversampling = 2\ninterpolation = "nearest"\ndelay_taps = 1\n'
@@ -130,7 +130,7 @@ def test_refuses_a_plan_that_does_not_keep_its_budget(recording, tmp_path):
     assert sorted(item.name for item in tmp_path.iterdir()) == ["rec.h5", "wishes.toml"]
 
 
-def test_writes_nothing_that_errs_too_much(recording, tmp_path, monkeypatch):
+def test_verify_writes_no_image_beyond_the_budget(recording, tmp_path, monkeypatch):
     """Predictions for what was never heard err on the safe side, so a true error beyond them has to be made up."""
     measured = verification.Measured(error_db=-30.0, n_directions=7, peaks=None)
     monkeypatch.setattr(verification, "measure", lambda *_, **__: measured)
@@ -141,7 +141,7 @@ def test_writes_nothing_that_errs_too_much(recording, tmp_path, monkeypatch):
     assert not output.exists()
 
 
-def test_refuses_a_budget_that_no_plan_keeps(recording, tmp_path):
+def test_unreachable_budget_is_refused(recording, tmp_path):
     done = run(recording, "-o", tmp_path / "a.h5", "--max-error", -150, code=1)
     assert done.stderr.splitlines()[-1].startswith(
         "ertis: error: accuracy.max_error_db is -150, but the smallest error"
@@ -157,20 +157,20 @@ def test_refuses_a_budget_that_no_plan_keeps(recording, tmp_path):
         (["--method", "paper", "--max-error", "fine"], "--max-error needs --method fast"),
     ],
 )
-def test_refuses_what_has_no_plan(recording, arguments, reported):
+def test_plan_options_need_the_fast_method(recording, arguments, reported):
     assert reported in run(recording, *arguments, code=2).stderr
 
 
-def test_silence_has_no_error():
+def test_verified_error_of_silence_is_zero():
     with pytest.raises(DataError, match="the exact image is silent"):
         verification.error_db(np.ones((2, 3), np.float32), np.zeros((2, 3), np.float32))
 
 
-def test_no_number_is_the_largest_error():
+def test_nan_counts_as_the_largest_error():
     assert verification.error_db(np.full((1, 1), np.nan, np.float32), np.ones((1, 1), np.float32)) == np.inf
 
 
-def test_peaks_are_compared_with_the_nearest(monkeypatch):
+def test_verify_compares_each_peak_with_the_nearest(monkeypatch):
     def peak(azimuth_deg, range_m, level_db):
         return Peak(azimuth_deg=azimuth_deg, elevation_deg=0.0, range_m=range_m, level_db=level_db)
 
@@ -185,7 +185,7 @@ def test_peaks_are_compared_with_the_nearest(monkeypatch):
     assert (none.lost, none.level_db) == (1, None)
 
 
-def test_words_of_a_plan():
+def test_plan_summary_names_all_choices():
     made = plans(kernels.load("cpu"))
     assert len(made) >= 20
     assert len({in_words(plan) for plan in made}) == len(made)

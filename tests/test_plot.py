@@ -58,7 +58,7 @@ def files(tmp_path_factory):
         ("layout.csv", "array", ""),
     ],
 )
-def test_each_kind_is_drawn(files, tmp_path, source, kind, options):
+def test_each_kind_of_plot_is_drawn(files, tmp_path, source, kind, options):
     target = tmp_path / "a.png"
     theme = [] if "--theme" in options else ["--theme", "paper", "--columns", 1]
     command = ["plot", files / source, "--kind", kind, *options.split(), *theme, "-o", target, "--json"]
@@ -72,7 +72,7 @@ def test_each_kind_is_drawn(files, tmp_path, source, kind, options):
             assert picture.width == pytest.approx(85 / 25.4 * 300, abs=1)
 
 
-def test_name_of_a_layout(tmp_path):
+def test_plot_accepts_the_name_of_a_layout(tmp_path):
     with contextlib.chdir(tmp_path):
         stated = run("plot", "uRTIS_v1", "--kind", "array").stderr
     assert stated == "uRTIS_v1.png: array of uRTIS_v1\n"
@@ -102,7 +102,7 @@ def test_name_of_a_layout(tmp_path):
         ("plot solid.h5 --kind slices --height 50", 1, "--height is 50, where the image shows nothing"),
     ],
 )
-def test_what_is_refused(files, tmp_path, command, code, match):
+def test_plot_refuses_invalid_input(files, tmp_path, command, code, match):
     name, source, *rest = command.split()
     source = files / source if (files / source).exists() else source
     stated = run(name, source, *rest, "-o", tmp_path / "a.png", code=code).stderr
@@ -110,7 +110,7 @@ def test_what_is_refused(files, tmp_path, command, code, match):
     assert not (tmp_path / "a.png").exists()
 
 
-def test_every_option_belongs_to_kinds():
+def test_every_plot_option_names_its_kinds():
     """Those of the table are there, and help names each kind."""
     names = {option.opts[0].removeprefix("--") for option in plot.params}
     assert set(_ONLY) <= names
@@ -118,7 +118,7 @@ def test_every_option_belongs_to_kinds():
     assert all(about in stated for about in _KINDS.values())
 
 
-def test_commands_of_the_page(tmp_path):
+def test_plot_commands_of_the_page_run(tmp_path):
     shutil.copy(ROOT / "data" / "synthetic" / "reflectors.h5", tmp_path / "REC.h5")
     (tmp_path / "data").symlink_to(ROOT / "data")
     commands = re.findall(r"^\$ ertis (.*?)(?:\s+#.*)?$", PAGE, re.MULTILINE)
@@ -130,7 +130,7 @@ def test_commands_of_the_page(tmp_path):
     assert all(f"`{kind}`" in PAGE for kind in _KINDS)
 
 
-def test_python_of_the_page(tmp_path):
+def test_plot_code_of_the_page_runs(tmp_path):
     shutil.copy(ROOT / "data" / "synthetic" / "reflectors.h5", tmp_path / "REC.h5")
     with contextlib.chdir(tmp_path):
         for code in re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL):

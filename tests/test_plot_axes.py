@@ -25,7 +25,7 @@ def drawn(axes):
 
 
 @pytest.mark.parametrize("azimuth_deg", [np.linspace(-90, 90, 37), np.linspace(-180, 175, 72), [-5.0, 5.0]])
-def test_planar_images_become_a_sector_to_scale(azimuth_deg):
+def test_planar_image_is_drawn_as_a_sector_to_scale(azimuth_deg):
     axes = axes_of()
     given = image(azimuth_deg)
     assert ertis.plot(given, ax=axes) is axes
@@ -40,7 +40,7 @@ def test_planar_images_become_a_sector_to_scale(azimuth_deg):
     assert top == pytest.approx(5.0, rel=0.01)
 
 
-def test_images_with_elevations_become_a_map():
+def test_image_with_elevations_is_drawn_as_a_map():
     axes = axes_of()
     solid = image(np.degrees(SOLID.azimuth_rad), np.degrees(SOLID.elevation_rad))
     ertis.plot(solid, ax=axes, dynamic_range_db=30, side_lobes=True)
@@ -50,7 +50,7 @@ def test_images_with_elevations_become_a_map():
     assert len(drawn(axes).reshape(-1, 4))
 
 
-def test_images_of_one_direction_become_a_curve():
+def test_image_of_one_direction_is_drawn_as_a_curve():
     axes = axes_of()
     given = image([0.0])
     ertis.plot(given, ax=axes)

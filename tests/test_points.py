@@ -61,7 +61,7 @@ def reference(image, *, top, min_level_db):
 
 @pytest.mark.parametrize("directions", ["2d:181", "3d:400", "3d:2", "2d:1"])
 @pytest.mark.parametrize("min_level_db", [-3.0, -20.0])
-def test_is_the_reference(directions, min_level_db):
+def test_point_extractor_equals_the_reference(directions, min_level_db):
     image = noise(directions)
     expected = reference(image, top=80, min_level_db=min_level_db)
     cloud = PointExtractor(image.settings, top=80, min_level_db=min_level_db)(image)
@@ -76,7 +76,7 @@ def test_is_the_reference(directions, min_level_db):
     assert cloud.uncertainty_m.dtype == np.float32
 
 
-def test_of_much_noise_the_strongest_are_found():
+def test_strongest_peaks_of_noise_are_found():
     image = noise("3d:800")
     cloud = PointExtractor(image.settings, top=10)(image)
     assert np.count_nonzero(image.amplitude > image.amplitude.max() / 10) > 640  # of which only these are looked at
@@ -85,7 +85,7 @@ def test_of_much_noise_the_strongest_are_found():
     np.testing.assert_allclose(cloud.amplitude, expected[:, 3], rtol=1e-5)
 
 
-def test_of_two_equal_bins_the_first_counts():
+def test_first_of_two_equal_bins_is_the_peak():
     image = noise("2d:31").replace(amplitude=np.zeros(noise("2d:31").amplitude.shape, np.float32))
     image.amplitude[10:12, 40] = 1.0
     (point,) = PointExtractor(image.settings)(image).position_m
@@ -93,7 +93,7 @@ def test_of_two_equal_bins_the_first_counts():
 
 
 @pytest.mark.parametrize(("directions", "within_m"), [("2d:181", 1e-3), ("3000", 0.01)])
-def test_reflectors_are_where_they_are(directions, within_m):
+def test_points_lie_at_the_reflectors(directions, within_m):
     reflectors = [(12.3, 0.0, 1.0, 1.0), (-33.3, 0.0, 1.1, 0.5), (50.1, 0.0, 1.25, 0.4)]
     image = image_of(reflectors, directions=directions, range_m=(0.9, 1.4), noise=0.001)
     cloud = PointExtractor(image.settings)(image)
@@ -105,7 +105,7 @@ def test_reflectors_are_where_they_are(directions, within_m):
         assert energy == pytest.approx(amplitude, rel=0.05)
 
 
-def test_agrees_with_the_slow_way_where_that_masks_no_less():
+def test_point_extractor_agrees_with_find_peaks():
     image = image_of([(12.3, 5, 1.0, 1.0), (-33.3, -20, 1.2, 0.5)], directions="3000", range_m=(0.9, 1.3))
     peaks = find_peaks(image, min_level_db=-20)
     cloud = PointExtractor(image.settings)(image)
@@ -133,7 +133,7 @@ def test_silence_and_short_images_have_no_points(n_ranges):
     assert len(extractor(short.replace(amplitude=ramp))) == 0  # highest at an end, of which nothing is known
 
 
-def test_the_input_is_left_alone():
+def test_point_extractor_leaves_its_input_unchanged():
     image = noise("3d:100")
     before = image.amplitude.copy()
     image.amplitude.flags.writeable = False
@@ -141,7 +141,7 @@ def test_the_input_is_left_alone():
     np.testing.assert_array_equal(image.amplitude, before)
 
 
-def test_platform_frame_turns_then_shifts():
+def test_platform_frame_rotates_then_translates():
     half = np.sqrt(0.5)
     cloud = PointCloud(
         np.array([[2, 0, 0], [0, 1, 3]], np.float32),
@@ -159,12 +159,12 @@ def test_platform_frame_turns_then_shifts():
     ("arguments", "match"),
     [({"top": 0}, "top is 0; give a whole number of at least 1"), ({"min_level_db": 3.0}, "min_level_db is 3")],
 )
-def test_refuses(arguments, match):
+def test_point_extractor_refuses_invalid_arguments(arguments, match):
     with pytest.raises(ArgumentError, match=match):
         PointExtractor(Settings(), **arguments)
 
 
-def test_refuses_an_image_of_another_grid():
+def test_point_extractor_refuses_an_image_of_another_grid():
     other = Settings(processing=Processing(directions="2d:7"))
     assert len(direction_grid(other.processing)) == 7
     with pytest.raises(ArgumentError, match="amplitude has shape"):
@@ -172,7 +172,7 @@ def test_refuses_an_image_of_another_grid():
 
 
 @pytest.mark.parametrize("directions", ["2d:61", "3d:500"])
-def test_uncertainty_is_the_spread_of_noisy_repetitions(directions):
+def test_uncertainty_is_the_spread_of_noisy_measurements(directions):
     """40 times the same echo with other noise, 30 dB below it: within a factor of 1.5, of which chance is 1.25."""
     sensor = Sensor(
         recording=Recording(n_samples=40_960),
@@ -208,7 +208,7 @@ def test_uncertainty_is_the_spread_of_noisy_repetitions(directions):
     assert 2e-5 < along_m < 5e-4 < across_m < 1e-2
 
 
-def test_uncertainty_goes_with_range_level_and_noise():
+def test_uncertainty_depends_on_range_level_and_noise():
     image = image_of([(12.3, 0.0, 1.0, 1.0), (-33.3, 0.0, 1.2, 0.5)], range_m=(0.9, 1.4), noise=0.01)
     extractor = PointExtractor(image.settings, min_level_db=-8.0)
     first, second, *_ = extractor(image).uncertainty_m
@@ -222,7 +222,7 @@ def test_uncertainty_goes_with_range_level_and_noise():
 
 
 @pytest.mark.parametrize(("method", "beamformer"), [("fast", "delay_and_sum"), ("paper", "delay_and_sum"), *OTHERS])
-def test_only_noise_of_delay_and_sum_is_told_by_its_median(method, beamformer):
+def test_noise_is_estimated_by_the_median_for_delay_and_sum_only(method, beamformer):
     """√ln 2 of the root mean square, as of a Rayleigh variable."""
     settings = Settings(
         recording=Recording(n_samples=65_536),
@@ -238,7 +238,7 @@ def test_only_noise_of_delay_and_sum_is_told_by_its_median(method, beamformer):
     assert (np.isnan(uncertainty_m) != is_rayleigh).all()
 
 
-def test_without_noise_nothing_is_known_of_it():
+def test_uncertainty_is_nan_without_noise():
     """As of an image that was cleaned: 0 would be as if nothing could be known better."""
     image = image_of([(12.3, 0.0, 1.0, 1.0), (-33.3, 0.0, 1.2, 0.5)], range_m=(0.9, 1.4), noise=0.01)
     cloud = PointExtractor(image.settings)(clean(image))
@@ -255,7 +255,7 @@ def test_without_noise_nothing_is_known_of_it():
         (((0.0, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.0, 0.02)), "3d:99", True),
     ],
 )
-def test_what_an_array_cannot_tell_is_infinite(positions_m, directions, is_finite):
+def test_uncertainty_is_infinite_along_unresolved_angles(positions_m, directions, is_finite):
     image = noise(directions)
     settings = image.settings.replace(array=Array(layout="few", positions_m=positions_m, word_bits=8))
     cloud = PointExtractor(settings)(image.replace(settings=settings))
@@ -279,7 +279,7 @@ def few_points():
     ],
     ids=["call", "array", "air", "beamformer"],
 )
-def test_a_finder_finds_what_an_extractor_does_though_settings_change(changes):
+def test_point_finder_follows_changed_settings(changes):
     image = few_points()
     changed = image.replace(settings=image.settings.replace(**changes))
     find = PointFinder(top=2)
@@ -290,14 +290,14 @@ def test_a_finder_finds_what_an_extractor_does_though_settings_change(changes):
     assert find(changed).settings is changed.settings
 
 
-def test_a_finder_finds_in_the_directions_of_each_sensor():
+def test_point_finder_uses_the_directions_of_each_sensor():
     image, other = few_points(), noise("3d:60")
     find = PointFinder()
     for each in (image, other, other.replace(stamp=Stamp(sensor="other")), image):
         np.testing.assert_array_equal(find(each).position_m, PointExtractor(each.settings)(each).position_m)
 
 
-def test_a_finder_makes_tables_once_for_a_sensor(monkeypatch):
+def test_point_finder_computes_tables_once_per_sensor(monkeypatch):
     made = []
     monkeypatch.setattr(finder, "PointExtractor", lambda *given: made.append(given) or PointExtractor(*given))
     find, image = PointFinder(), few_points()

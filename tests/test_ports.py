@@ -45,7 +45,7 @@ def plug_in(monkeypatch, **serial_numbers):
     monkeypatch.setattr(list_ports, "comports", lambda: [ListPortInfo("/dev/ttyS0"), *found])
 
 
-def test_an_emulated_device_by_all_its_names(folder, tmp_path):
+def test_emulated_device_is_found_by_all_its_names(folder, tmp_path):
     assert find_ports() == []
     link = folder / "left"
     with Emulator(WORDS, link=link) as device, Emulator(WORDS, link=folder / "right"):
@@ -73,7 +73,7 @@ def test_an_emulated_device_by_all_its_names(folder, tmp_path):
     assert find_ports() == []
 
 
-def test_what_a_killed_emulator_left_leads_nowhere(folder):
+def test_link_of_a_killed_emulator_is_not_followed(folder):
     """Its number is soon that of somebody's shell."""
     with Emulator(WORDS) as device:
         folder.mkdir()
@@ -85,7 +85,7 @@ def test_what_a_killed_emulator_left_leads_nowhere(folder):
                 resolve(name)
 
 
-def test_usb_devices_by_all_their_names(monkeypatch, tmp_path):
+def test_usb_device_is_found_by_all_its_names(monkeypatch, tmp_path):
     plug_in(monkeypatch, ttyACM1="SN7", ttyACM0="SN8", ttyUSB0=None)
     (tmp_path / "by-id").mkdir()
     link = tmp_path / "by-id" / "usb-CoSys_eRTIS_SN7-if00"
@@ -98,14 +98,14 @@ def test_usb_devices_by_all_their_names(monkeypatch, tmp_path):
     assert [str(port) for port in (first, adapter)] == ["/dev/ttyACM0 (SN8)", "/dev/ttyUSB0 (eRTIS)"]
 
 
-def test_the_same_usb_device_under_another_number(monkeypatch):
+def test_usb_device_is_found_under_a_new_port_number(monkeypatch):
     plug_in(monkeypatch, ttyACM0="SN7", ttyACM1="SN8")
     seventh = resolve("/dev/ttyACM0")
     plug_in(monkeypatch, ttyACM0="SN8", ttyACM5="SN7")
     assert find_again(seventh).path == "/dev/ttyACM5"
 
 
-def test_a_port_without_a_file_and_one_that_is_not_of_usb(monkeypatch):
+def test_ports_without_file_or_usb_are_handled(monkeypatch):
     monkeypatch.setattr(list_ports, "comports", lambda: [ListPortInfo("COM7")])
     assert resolve("COM7") == Port(path="COM7")
     with Emulator(WORDS) as device:
@@ -113,7 +113,7 @@ def test_a_port_without_a_file_and_one_that_is_not_of_usb(monkeypatch):
         assert not resolve(device.port).may_be_sonar
 
 
-def test_several_ports_of_one_serial_number(monkeypatch):
+def test_several_ports_of_one_serial_number_are_refused(monkeypatch):
     plug_in(monkeypatch, ttyACM0="SN7", ttyACM1="SN7")
     wanted = re.escape("'SN7' matches 2 ports: /dev/ttyACM0 (SN7), /dev/ttyACM1 (SN7); give the path of one")
     with pytest.raises(SonarError, match=wanted) as caught:
@@ -121,7 +121,7 @@ def test_several_ports_of_one_serial_number(monkeypatch):
     assert caught.value.errno == errno.EINVAL
 
 
-def test_a_port_that_is_not_there(monkeypatch):
+def test_missing_port_is_refused(monkeypatch):
     with pytest.raises(
         SonarError, match=r"serial port 'SN7' does not exist; no port exists: .* 'ertis emulate'"
     ) as caught:
@@ -155,7 +155,7 @@ def listed(*arguments, code=0):
 
 
 @pytest.mark.usefixtures("four")
-def test_all_ports_are_asked_at_once():
+def test_ports_are_queried_in_parallel():
     before = time.monotonic()
     answers = {answer.port.serial_number: answer for answer in survey(find_ports())}
     assert time.monotonic() - before < 1
@@ -170,7 +170,7 @@ def test_all_ports_are_asked_at_once():
     assert "does not answer" in str(answers["mute"].error)
 
 
-def test_the_list_of_devices(four):
+def test_devices_command_prints_a_table(four):
     done = listed()
     assert [re.split("  +", line) for line in done.stdout.splitlines()] == [
         ["port", "serial number", "state", "firmware", "call", "what"],
@@ -182,7 +182,7 @@ def test_the_list_of_devices(four):
     assert f"{four['mute'].port} does not answer" in done.stderr
 
 
-def test_the_list_of_devices_for_programs(four):
+def test_devices_command_prints_json(four):
     done = listed("--json", "--port", "call", "-p", four["used"].port)
     assert (done.stdout.count("\n"), done.stderr) == (1, "")
     ready, used = json.loads(done.stdout)["devices"]
@@ -200,14 +200,14 @@ def test_the_list_of_devices_for_programs(four):
 
 
 @pytest.mark.usefixtures("four")
-def test_a_port_that_was_asked_for_and_has_no_sensor():
+def test_given_port_without_a_sensor_is_reported():
     done = listed("-p", "mute", "-p", "new", code=1)
     assert [re.split("  +", line)[2] for line in done.stdout.splitlines()[1:]] == ["no answer", "ready"]
     assert "does not answer 'firmware version?'" in str(done.exception)
     assert "serial port 'moot' does not exist" in str(listed("-p", "moot", code=1).exception)
 
 
-def test_no_devices_at_all(monkeypatch):
+def test_devices_command_without_devices(monkeypatch):
     assert survey([]) == []
     plug_in(monkeypatch, ttyUSB0="FTDI")  # it is no CDC-ACM port, so that nothing is said to it
     done = listed()

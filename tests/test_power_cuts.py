@@ -19,7 +19,7 @@ NOTHING_WRONG = dict.fromkeys(("lost", "twice", "wrong", "failed", "left_over"),
 
 
 @pytest.mark.parametrize("name", N_STATES)
-def test_power_cuts_lose_and_repeat_nothing(tmp_path, name):
+def test_power_cuts_lose_and_duplicate_nothing(tmp_path, name):
     """Half of the commands run with syncs that fail."""
     reason = powercuts.reason_not_to_try(tmp_path)
     if reason:
@@ -102,7 +102,7 @@ def test_disk_loses_and_tears_what_was_not_synced(happens, after):
     assert any(content[:512] == bytes(512) and b"x" in content for content in contents)
 
 
-def test_disk_never_has_what_a_failed_sync_was_to_write(happens, after):
+def test_disk_never_holds_data_of_a_failed_sync(happens, after):
     happens(DiskOperation.CREATE, "a")
     happens(DiskOperation.WRITE, "a", b"x" * 512)
     happens.sync("a", ends=DiskOperation.SYNC_FAIL)
@@ -127,7 +127,7 @@ def test_disk_may_lose_names_until_their_folder_is_synced(happens, after):
     assert {frozenset(state) for state in happens.states(after / "0")} == {frozenset({"b"})}
 
 
-def test_log_has_what_a_process_does(tmp_path):
+def test_log_contains_the_operations_of_a_process(tmp_path):
     reason = powercuts.reason_not_to_try(tmp_path)
     if reason:
         pytest.skip(reason)

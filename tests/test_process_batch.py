@@ -51,7 +51,7 @@ def run(*arguments, code=0):
     return done
 
 
-def test_file_is_the_same_whatever_the_batch(recording, tmp_path, monkeypatch):
+def test_file_is_independent_of_the_batch_size(recording, tmp_path, monkeypatch):
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")  # what else would differ is when it was made
     files = []
     for batch in (1, 3, COUNT, 100):
@@ -67,7 +67,7 @@ def test_file_is_the_same_whatever_the_batch(recording, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "wanted"), [([], [7]), (["--batch", 3], [3, 3, 1]), (["--batch", 1], [1] * 7), (["--batch", 9], [7])]
 )
-def test_batches_have_the_size_asked_for(recording, tmp_path, sizes, arguments, wanted):
+def test_batches_have_the_given_size(recording, tmp_path, sizes, arguments, wanted):
     run(recording, "-o", tmp_path / "img.h5", *FAST, *arguments)
     predicted, *made = sizes.pop("sizes")  # the error of the first image is predicted before
     assert (predicted, made, sizes) == (1, wanted, {"closed": 1})
@@ -84,7 +84,7 @@ def test_batch_of_large_images_is_smaller(recording, tmp_path, sizes, monkeypatc
         assert sizes["sizes"] == [1, *wanted]  # the first image is made once more, to predict its error
 
 
-def test_time_is_that_of_one_measurement(recording, tmp_path, monkeypatch):
+def test_reported_time_is_per_measurement(recording, tmp_path, monkeypatch):
     clock_s = iter(np.arange(0.0, 100.0, 0.7).tolist())  # of every batch, then
     monkeypatch.setattr(sensor_processing.time, "perf_counter", lambda: next(clock_s))
     done = run(recording, "-o", tmp_path / "img.h5", *FAST)
@@ -93,7 +93,7 @@ def test_time_is_that_of_one_measurement(recording, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("batch", [1, 3, 8])
-def test_damage_amid_a_batch_is_told_and_leaves_nothing(recording, tmp_path, batch):
+def test_damage_within_a_batch_is_reported_and_leaves_no_file(recording, tmp_path, batch):
     with h5py.File(recording, "r+") as file:
         file["sensors/eRTIS-7/pdm"][4, 777] ^= 1 << 9
     done = run(recording, "-o", tmp_path / "img.h5", *FAST, "--batch", batch, code=1)
@@ -102,7 +102,7 @@ def test_damage_amid_a_batch_is_told_and_leaves_nothing(recording, tmp_path, bat
     assert [item.name for item in tmp_path.iterdir()] == ["rec.h5"]
 
 
-def test_other_air_amid_a_batch_leaves_nothing(tmp_path):
+def test_failure_within_a_batch_leaves_no_file(tmp_path):
     measurements = noise(count=5)
     warm = SMALL.replace(air=Air(temperature_c=35.0))
     measurements[3] = noise(warm, count=5)[3]
@@ -112,5 +112,5 @@ def test_other_air_amid_a_batch_leaves_nothing(tmp_path):
     assert [item.name for item in tmp_path.iterdir()] == ["rec.h5"]
 
 
-def test_no_batch_is_refused(recording):
+def test_batch_of_zero_is_refused(recording):
     assert "0 is not in the range x>=1" in run(recording, "--batch", 0, code=2).stderr

@@ -40,7 +40,7 @@ def here(monkeypatch):
 
 
 @pytest.mark.usefixtures("here")
-def test_each_is_told_as_it_ends_and_all_at_the_end(runs, tmp_path):
+def test_process_reports_each_recording_and_a_summary(runs, tmp_path):
     done = run("runs/*.h5", "-o", "out/", *FAST, "--json", code=1)
     *each, total = [json.loads(line) for line in done.stdout.splitlines()]
     assert {one["recording"]: one["outcome"] for one in each} == {
@@ -72,7 +72,7 @@ def test_each_is_told_as_it_ends_and_all_at_the_end(runs, tmp_path):
     assert "2 recordings: 2 kept; 0 measurements in " in done.stderr
 
 
-def test_plans_are_told_of_each_and_measured(runs, monkeypatch):
+def test_process_reports_plans_and_verifies_each_recording(runs, monkeypatch):
     (runs / "broken.h5").unlink()
     done = run("runs", "-o", "out", *FAST, "--explain", "--verify", "--json")
     *each, _ = [json.loads(line) for line in done.stdout.splitlines()]
@@ -90,7 +90,7 @@ def test_plans_are_told_of_each_and_measured(runs, monkeypatch):
 
 
 @pytest.mark.usefixtures("here")
-def test_what_errs_too_much_is_not_written(runs, monkeypatch):
+def test_images_beyond_the_budget_are_not_written(runs, monkeypatch):
     measured = verification.Measured(error_db=-30.0, n_directions=7, peaks=None)
     monkeypatch.setattr(verification, "measure", lambda *_, **__: measured)
     done = run("runs", "-o", "out", *FAST, "--verify", code=1)
@@ -120,14 +120,14 @@ def test_what_errs_too_much_is_not_written(runs, monkeypatch):
         (["runs", "-o", "out", "--method", "paper", "--explain"], 2, "--explain needs --method fast"),
     ],
 )
-def test_wrong_usage(runs, arguments, code, stated):
+def test_process_refuses_invalid_usage(runs, arguments, code, stated):
     done = run(*arguments, code=code)
     assert stated in done.stderr
     assert done.stderr.count("\n") == 1
     assert not (runs.parent / "out").exists() or names_in(runs.parent / "out") == []
 
 
-def test_a_folder_for_one_recording(runs, tmp_path):
+def test_folder_as_output_of_one_recording(runs, tmp_path):
     run(runs / "a.h5", "-o", "out/", *FAST)
     assert names_in(tmp_path / "out") == ["a.energy.h5"]
 
@@ -138,7 +138,7 @@ class Terminal(io.StringIO):
 
 
 @pytest.mark.usefixtures("here")
-def test_bars_on_a_terminal(runs, monkeypatch, capsys):
+def test_progress_bars_appear_on_a_terminal(runs, monkeypatch, capsys):
     terminal = Terminal()
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", "100")
@@ -154,7 +154,7 @@ def test_bars_on_a_terminal(runs, monkeypatch, capsys):
     assert len(capsys.readouterr().out.splitlines()) == 3  # and nothing of the bars
 
 
-def test_there_is_a_bar_for_each_recording_under_way(monkeypatch):
+def test_each_recording_in_progress_has_a_bar(monkeypatch):
     monkeypatch.setattr(sys, "stderr", Terminal())
     bars = vars(_process_many)["_Bars"](3)
 
@@ -171,7 +171,7 @@ def test_there_is_a_bar_for_each_recording_under_way(monkeypatch):
     assert drawn() == [("recordings", 1, 3), ("a.h5", 0, 7)]
 
 
-def test_a_table_of_very_many_has_those_that_failed(monkeypatch, capsys):
+def test_long_table_lists_failed_recordings_only(monkeypatch, capsys):
     monkeypatch.setattr(_process_many, "_MAX_ROWS", 2)
     monkeypatch.setattr(_process_many, "_MAX_FAILED", 2)
     paths = [Path(f"runs/{number}.h5") for number in range(5)]

@@ -22,7 +22,7 @@ from tests.driven import ANY, MEASUREMENT, Application, driven, hello
 WIDE = SHORT.replace(processing=SHORT.processing.replace(directions="2d:9"))
 
 
-def test_images_points_and_raw_words_are_those_of_the_pipeline():
+def test_published_products_equal_those_of_the_pipeline():
     place = {"translation_m": (1.0, 2.0, 3.0), "rotation_xyzw": (0.0, 0.0, 1.0, 0.0)}
     with driven(device="cpu") as loop, Application(loop.processing.address) as application:
         application.subscribe("energyscape", "points", "raw", credit=8)
@@ -53,7 +53,7 @@ def test_images_points_and_raw_words_are_those_of_the_pipeline():
     assert image.received_ns < image.published_ns < time.monotonic_ns()
 
 
-def test_options_change_what_a_sensor_says():
+def test_options_override_settings_of_a_sensor():
     with (
         driven(device="cpu", processing={"directions": "2d:5"}, max_error_db=-30.0, dtype="float16") as loop,
         Application(loop.processing.address) as application,
@@ -103,7 +103,7 @@ def test_overload_drops_the_oldest_and_counts_each():
         assert loop.processing.counts("a").latency.p50_ms > 0
 
 
-def test_two_workers_publish_in_the_order_of_measurements():
+def test_two_workers_publish_in_order():
     with driven(workers=2) as loop, Application(loop.processing.address) as application:
         application.subscribe("energyscape", credit=64)
         loop.until(lambda: application.read() or application.others)
@@ -123,7 +123,7 @@ def test_two_workers_publish_in_the_order_of_measurements():
     assert sequences == sorted(sequences)
 
 
-def test_other_settings_of_a_sensor_make_other_images_and_what_waited_is_counted():
+def test_changed_settings_apply_and_waiting_measurements_are_counted():
     with driven() as loop, Application(loop.processing.address) as application:
         application.subscribe("energyscape", credit=8)
         loop.until(lambda: application.read() or application.others)
@@ -151,7 +151,7 @@ def test_other_settings_of_a_sensor_make_other_images_and_what_waited_is_counted
     assert np.frombuffer(hot)[-1] > np.frombuffer(cold)[-1]
 
 
-def test_what_is_under_way_at_the_end_is_counted():
+def test_measurements_in_progress_at_the_end_are_counted():
     with driven() as loop:
         loop.processing.register(hello(), SHORT)
         loop.offer()
@@ -160,7 +160,7 @@ def test_what_is_under_way_at_the_end_is_counted():
     assert (counts.received, counts.in_flight, counts.dropped) == (2, 0, {"the central node ended": 2})
 
 
-def test_the_end_waits_for_what_is_under_way():
+def test_stop_waits_for_measurements_in_progress():
     with driven() as loop:
         loop.processing.register(hello(), SHORT)
         loop.offer()
@@ -168,14 +168,14 @@ def test_the_end_waits_for_what_is_under_way():
     assert loop.processing.counts("front").published == 1
 
 
-def test_an_address_that_is_taken_is_told_in_a_line():
+def test_occupied_address_is_reported_in_one_line():
     with driven() as loop:
         other = ImageProcessing(ProcessingOptions(publish=loop.processing.address, device="numpy"))
         with pytest.raises(NetworkError, match="is in use by"):
             other.start()
 
 
-def test_start_returns_before_the_publisher_listens_once_it_is_to_stop():
+def test_stopped_start_returns_before_the_publisher_listens():
     processing = ImageProcessing(ProcessingOptions(publish=ANY, device="numpy"))
     try:
         processing.start(lambda: True)
@@ -184,7 +184,7 @@ def test_start_returns_before_the_publisher_listens_once_it_is_to_stop():
         processing.close()
 
 
-def test_status_reaches_who_asks_and_who_subscribes():
+def test_status_reaches_requests_and_subscriptions():
     with driven() as loop, Application(loop.processing.address) as application:
         application.subscribe("status")
         loop.until(lambda: application.read() or application.others)
@@ -196,7 +196,7 @@ def test_status_reaches_who_asks_and_who_subscribes():
     assert msgspec.msgpack.decode(payload, type=Status) == status
 
 
-def test_points_are_made_only_where_somebody_wants_them():
+def test_points_are_computed_only_for_subscribers():
     with driven() as loop, Application(loop.processing.address) as application:
         application.subscribe("points", sensors=("left",))
         loop.until(lambda: loop.processing.status().subscribers)
@@ -210,7 +210,7 @@ def test_points_are_made_only_where_somebody_wants_them():
     assert not any(isinstance(message, Image) for message, _ in application.got)
 
 
-def test_threads_of_one_measurement_change_its_image_by_nothing():
+def test_image_is_independent_of_the_number_of_threads():
     with Pipeline(SHORT, device="cpu") as pipeline:
         wanted = pipeline.process(MEASUREMENT)
         assert np.array_equal(pipeline.process(MEASUREMENT, threads=1).amplitude, wanted.amplitude)

@@ -35,7 +35,7 @@ def fed(data, cuts=()):
 
 
 @given(st.lists(WORDS.map(lambda words: block_of(3, words)) | JUNK, max_size=6).map(b"".join), st.lists(st.integers(0)))
-def test_it_does_not_matter_how_a_stream_is_cut(data, cuts):
+def test_parser_is_independent_of_the_chunks_of_a_stream(data, cuts):
     whole, found = fed(data)
     pieces, found_again = fed(data, cuts)
     assert reported(found_again) == reported(found)
@@ -44,7 +44,7 @@ def test_it_does_not_matter_how_a_stream_is_cut(data, cuts):
 
 
 @given(st.lists(WORDS, min_size=1, max_size=5), st.integers(0, 2**32 - 1))
-def test_what_was_sent_without_faults_is_received(sent, first):
+def test_faultless_stream_is_received_completely(sent, first):
     """False headers and footers in the words cost nothing as long as each block directly follows another."""
     data = [block_of(first + 1000 * index, words) for index, words in enumerate(sent)]
     parser, found = fed(b"".join(data))
@@ -53,7 +53,7 @@ def test_what_was_sent_without_faults_is_received(sent, first):
 
 
 @given(st.integers(0, N_BYTES - 1), st.integers(1, N_BYTES), st.binary(max_size=2 * N_BYTES), st.integers(0))
-def test_no_damage_costs_a_block_but_its_own(place, n_lost, added, seed):
+def test_damage_loses_only_the_damaged_block(place, n_lost, added, seed):
     """Bytes are lost, and others come in their place, at any alignment."""
     before, victim, after, last = (block_of(10 * seed + index) for index in range(4))
     damaged = victim[:place] + added + victim[place + n_lost :]
@@ -65,7 +65,7 @@ def test_no_damage_costs_a_block_but_its_own(place, n_lost, added, seed):
 
 
 @given(st.data())
-def test_one_after_another_is_found_behind_any_junk(data):
+def test_consecutive_blocks_are_found_after_any_junk(data):
     """Random bytes with whole headers among them: a header of junk costs no block either."""
     junk = data.draw(st.lists(JUNK | st.just(WORD.pack(HEADER)), max_size=4).map(b"".join))
     sent = [block_of(index) for index in range(3)]
@@ -73,7 +73,7 @@ def test_one_after_another_is_found_behind_any_junk(data):
     assert reported(found)[-3:] == sent
 
 
-def test_the_header_of_a_junk_block_within_words_costs_nothing():
+def test_false_header_within_samples_loses_no_block():
     """Behind a damaged block, where nobody knows whether a header is one, words that hold headers are searched."""
     damaged = block_of(1)[:-1]
     sent = [block_of(index, [HEADER, 7, HEADER, FOOTER, HEADER]) for index in (2, 3)]
@@ -84,7 +84,7 @@ def test_the_header_of_a_junk_block_within_words_costs_nothing():
 
 
 @pytest.mark.parametrize(("later_s", "taken"), [(0.05, [3]), (0.02, [1, 3])])
-def test_two_damaged_blocks_that_have_the_right_length_together_are_none(later_s, taken):
+def test_two_damaged_blocks_are_not_joined_to_one(later_s, taken):
     """The header of the second tells if it came later; else it might as well be one of the first one's words."""
     first, second, third = block_of(1), block_of(2), block_of(3)
     parser = BlockParser(N_SAMPLES, apart_s=0.03)
@@ -104,7 +104,7 @@ def test_rejected_bytes_have_reasons():
     assert parser.missing == 0
 
 
-def test_after_a_deadline_the_rest_is_searched_for_the_block_that_has_begun_since():
+def test_search_after_a_deadline_finds_the_next_block():
     parser = BlockParser(N_SAMPLES)
     parser.feed(block_of(1)[:14] + block_of(2)[:10], at(0))
     parser.expire()
@@ -113,7 +113,7 @@ def test_after_a_deadline_the_rest_is_searched_for_the_block_that_has_begun_sinc
     assert parser.rejected == {"cut short": 14}
 
 
-def test_a_part_of_a_header_may_be_given_up():
+def test_partial_header_may_be_discarded():
     parser = BlockParser(N_SAMPLES)
     parser.feed(b"x" + WORD.pack(HEADER)[:3], at(0))
     assert parser.missing == N_BYTES - 3
@@ -124,7 +124,7 @@ def test_a_part_of_a_header_may_be_given_up():
     assert not parser.rejected_blocks
 
 
-def test_a_block_arrives_with_its_first_byte():
+def test_arrival_time_is_that_of_the_first_byte():
     parser = BlockParser(N_SAMPLES)
     stream = b"abc" + block_of(1) + block_of(2) + block_of(3)
     found = []
@@ -134,7 +134,7 @@ def test_a_block_arrives_with_its_first_byte():
     assert [block.arrived for block in found] == [at(first - first % 7) for first in firsts]
 
 
-def test_a_block_that_was_searched_for_arrives_with_its_first_byte_too():
+def test_arrival_time_after_a_search_is_that_of_the_first_byte():
     parser = BlockParser(N_SAMPLES)
     parser.feed(block_of(1)[:-5], at(1))
     parser.feed(block_of(2)[:20], at(2))
@@ -142,7 +142,7 @@ def test_a_block_that_was_searched_for_arrives_with_its_first_byte_too():
     assert block.arrived == at(2)
 
 
-def test_words_have_memory_of_their_own():
+def test_samples_own_their_memory():
     parser = BlockParser(N_SAMPLES)
     [block] = parser.feed(block_of(1), at(0))
     assert block.data.flags.owndata
@@ -153,7 +153,7 @@ def test_words_have_memory_of_their_own():
 
 
 @pytest.mark.alone
-def test_a_block_takes_two_milliseconds_at_most():
+def test_parsing_a_block_takes_two_milliseconds_at_most():
     receiver = BlockReceiver(163_840, expected=0, shortest_s=0.04)
     times_s = []
     for counter in range(20):
@@ -166,7 +166,7 @@ def test_a_block_takes_two_milliseconds_at_most():
     assert np.median(times_s) < 2e-3
 
 
-def test_the_time_for_a_stream_does_not_grow_with_its_pieces_squared():
+def test_parsing_time_is_linear_in_the_number_of_chunks():
     """A block of 8 MB in pieces of 512 bytes: copied at each, that would be 70 GB."""
     data = block_of(1, n_samples=2**21)
     parser = BlockParser(2**21)
@@ -185,7 +185,7 @@ def lawful(report, n_samples=128):
 
 @pytest.mark.parametrize("triggers", ["regular", "irregular"])
 @pytest.mark.parametrize("deadline_s", [None, 0.01])
-def test_a_line_with_faults_on_half_of_all_blocks(triggers, deadline_s):
+def test_parser_survives_faults_in_half_of_all_blocks(triggers, deadline_s):
     report = wire_faults.send(3000, triggers=triggers, deadline_s=deadline_s)
     lawful(report)
     assert 0.4 < report.spoilt / report.sent < 0.6
@@ -194,7 +194,7 @@ def test_a_line_with_faults_on_half_of_all_blocks(triggers, deadline_s):
     assert set(report.rejected) == {"no header", "footer", "counter", "cut short"}
 
 
-def test_what_is_altered_within_the_words_is_told_by_bits_only():
+def test_altered_samples_are_detected_by_the_bit_check_only():
     """Here the bits tell everything, since they are compared with those of all blocks."""
     kinds = {"flip": 0.3, "swap": 0.3}
     report = wire_faults.send(1000, kinds=kinds)
@@ -208,7 +208,7 @@ def test_what_is_altered_within_the_words_is_told_by_bits_only():
     assert checked.delivered == report.delivered
 
 
-def test_blocks_may_be_stretches_of_a_recording():
+def test_blocks_may_come_from_a_recording():
     words = np.arange(1000, dtype=np.uint32)
     seen = []
     report = wire_faults.send(50, words=words, kinds={}, n_samples=64, bits=seen.append)
@@ -220,7 +220,7 @@ def test_blocks_may_be_stretches_of_a_recording():
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**32), st.dictionaries(st.sampled_from(KINDS), st.floats(0, 0.4)), st.booleans())
-def test_each_byte_is_counted_once_whatever_happens(seed, kinds, short_reads):
+def test_each_byte_is_counted_once(seed, kinds, short_reads):
     report = wire_faults.send(60, seed=seed, kinds=kinds | {"short_reads": short_reads}, n_samples=16)
     taken = report.delivered + report.altered + report.mixed + report.wrong_counter + report.twice
     assert report.fed == taken * 76 + report.rejected.total() + report.pending

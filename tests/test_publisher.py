@@ -35,7 +35,7 @@ def publish(loop, count):
         loop.settle()
 
 
-def test_without_credit_the_latest_waits_and_what_it_replaces_is_counted():
+def test_latest_image_waits_for_credit_and_replaced_ones_are_counted():
     with serving() as (loop, application):
         subscribed(loop, application, "energyscape", credit=2)
         publish(loop, 7)
@@ -52,7 +52,7 @@ def test_without_credit_the_latest_waits_and_what_it_replaces_is_counted():
     assert loop.processing.counts("front").published == 7  # a slow application drops nothing of others
 
 
-def test_each_product_of_each_sensor_waits_by_itself():
+def test_each_product_of_each_sensor_waits_separately():
     with serving() as (loop, application):
         loop.processing.register(hello("left"), SHORT)
         subscribed(loop, application, "raw", "energyscape", credit=1)
@@ -74,7 +74,7 @@ def test_each_product_of_each_sensor_waits_by_itself():
     assert [message.dropped for message, _ in application.got][-1] == 3
 
 
-def test_sensors_and_products_are_those_that_were_asked_for():
+def test_only_subscribed_sensors_and_products_are_sent():
     with serving() as (loop, application):
         loop.processing.register(hello("left"), SHORT)
         subscribed(loop, application, "energyscape", sensors=("left",), credit=8)
@@ -85,7 +85,7 @@ def test_sensors_and_products_are_those_that_were_asked_for():
     assert [(type(message), message.sensor) for message, _ in application.got] == [(Image, "left")]
 
 
-def test_a_publisher_that_is_killed_comes_back_at_its_address_and_what_it_had_is_counted():
+def test_killed_publisher_restarts_and_its_images_are_counted():
     with serving() as (loop, application):
         subscribed(loop, application, "energyscape", credit=64)
         publisher = loop.processing.status().publisher_pid
@@ -105,7 +105,7 @@ def test_a_publisher_that_is_killed_comes_back_at_its_address_and_what_it_had_is
     assert [image.sequence for image, _ in application.got] == [1]
 
 
-def test_a_publisher_that_comes_back_listens_where_it_was_told_to(tmp_path):
+def test_restarted_publisher_keeps_its_address(tmp_path):
     central, viewer = KeyPair.new("central"), KeyPair.new("viewer")
     AllowList().save(tmp_path / "allow.toml")
     with driven(publish="tcp://0.0.0.0:0", keys=ServerKeys(central, tmp_path / "allow.toml")) as loop:
@@ -118,7 +118,7 @@ def test_a_publisher_that_comes_back_listens_where_it_was_told_to(tmp_path):
 
 
 @pytest.mark.alone  # who is silent for seconds is forgotten, and a busy machine makes an application be silent
-def test_a_sensor_may_change_as_often_as_it_likes():
+def test_sensor_may_change_its_settings_often():
     with serving() as (loop, application):
         subscribed(loop, application, "energyscape", "raw", credit=64)
         for number in range(300):  # each describes what products of it are about
@@ -136,7 +136,7 @@ def test_a_sensor_may_change_as_often_as_it_likes():
     assert places == [0.0, 0.0, 100.0, 100.0, 200.0, 200.0, 200.0, 200.0]
 
 
-def test_a_publisher_that_does_not_die_at_once_holds_nobody_up(monkeypatch):
+def test_slowly_ending_publisher_blocks_nothing(monkeypatch):
     with serving() as (loop, _):
         publisher = loop.processing._publisher  # noqa: SLF001  to have it seem to end slowly
         child = publisher._child  # noqa: SLF001
@@ -149,7 +149,7 @@ def test_a_publisher_that_does_not_die_at_once_holds_nobody_up(monkeypatch):
         loop.until(lambda: publisher.serves)
 
 
-def test_a_publisher_that_hangs_is_killed(monkeypatch):
+def test_hanging_publisher_is_killed(monkeypatch):
     monkeypatch.setattr("ertis_numba.network.processing.publisher._HUNG_S", 1.5)
     with serving() as (loop, _):
         os.kill(loop.processing.status().publisher_pid, signal.SIGSTOP)
@@ -164,7 +164,7 @@ def test_a_publisher_that_hangs_is_killed(monkeypatch):
     assert counts.published >= 1
 
 
-def test_messages_that_nobody_can_use_are_refused_and_counted():
+def test_invalid_messages_are_refused_and_counted():
     with serving() as (loop, application):
         application.socket.send(b"garbage")
         application.socket.send_multipart([encode(Ping()), b"more"])
@@ -179,7 +179,7 @@ def test_messages_that_nobody_can_use_are_refused_and_counted():
     assert isinstance(application.others[-1], Pong)
 
 
-def test_who_says_goodbye_gets_nothing_more():
+def test_unsubscribed_application_receives_nothing_more():
     with serving() as (loop, application):
         subscribed(loop, application, "energyscape", credit=8)
         loop.until(lambda: loop.processing.status().subscribers)
@@ -205,7 +205,7 @@ class TestKeys:
     def connected(self, loop, pairs, name):
         return Application(loop.processing.address, ClientKeys(pairs[name], pairs["central"].public))
 
-    def test_a_listed_application_is_served_until_its_key_is_removed(self, pairs, tmp_path):
+    def test_listed_application_is_served_until_its_key_is_removed(self, pairs, tmp_path):
         keys = ServerKeys(pairs["central"], tmp_path / "allow.toml")
         with driven(keys=keys) as loop, self.connected(loop, pairs, "viewer") as application:
             loop.processing.register(hello(), SHORT)
@@ -226,7 +226,7 @@ class TestKeys:
             application.read()
         assert application.kinds() == ["Image", "Report", "Report"]
 
-    def test_a_sensor_is_no_application_and_a_stranger_is_nobody(self, pairs, tmp_path):
+    def test_sensor_keys_and_unknown_keys_cannot_subscribe(self, pairs, tmp_path):
         keys = ServerKeys(pairs["central"], tmp_path / "allow.toml")
         with (
             driven(keys=keys) as loop,
@@ -256,13 +256,13 @@ class TestSubscribers:
     def hear(self, subscribers, number, name):
         return subscribers.hear([self.Frame(bytes([0, number]))], name, Subscribe(products=("raw",)))
 
-    def test_a_key_cannot_take_the_places_of_others(self):
+    def test_one_key_cannot_occupy_all_connections(self):
         subscribers = Subscribers(self.Socket(), with_keys=True)
         assert [self.hear(subscribers, number, "a") for number in range(20)] == [True] * 16 + [False] * 4
         assert self.hear(subscribers, 100, "b")
         assert self.hear(subscribers, 3, "a")  # is there already
 
-    def test_those_of_a_key_that_are_silent_make_room(self):
+    def test_silent_connections_of_a_key_are_closed_for_new_ones(self):
         subscribers = Subscribers(self.Socket(), with_keys=True)
         for number in range(16):
             self.hear(subscribers, number, "a")
@@ -270,7 +270,7 @@ class TestSubscribers:
         assert self.hear(subscribers, 50, "a")
         assert not self.hear(subscribers, 51, "a")
 
-    def test_without_keys_nobody_can_be_told_from_others(self):
+    def test_connections_without_keys_share_one_limit(self):
         subscribers = Subscribers(self.Socket())
         assert all(self.hear(subscribers, number, "loopback") for number in range(40))
 
@@ -283,7 +283,7 @@ class TestSubscriber:
         wants = Subscribe(products=("raw",), **values)
         return ConnectedSubscriber((), "app", wants, before=wants.consumed)
 
-    def test_credit_is_what_it_says_less_what_is_under_way(self):
+    def test_credit_is_reduced_by_images_in_flight(self):
         one = self.made(credit=1)
         one.offer(self.item())
         key, number, _ = one.next()
@@ -294,7 +294,7 @@ class TestSubscriber:
         one.consumed(Subscribe(products=("raw",), consumed=1, credit=1))
         assert one.next()[1] == 1
 
-    def test_bytes_under_way_are_bounded_whatever_the_credit(self):
+    def test_bytes_in_flight_are_bounded_for_any_credit(self):
         one = self.made(credit=64)
         for _ in range(64):
             one.offer(self.item(14_000_000))
@@ -303,7 +303,7 @@ class TestSubscriber:
         assert sum(one.under_way) < 80_000_000
         assert (one.sent, one.dropped) == (5, 58)
 
-    def test_a_count_that_cannot_be_gives_no_more_credit_than_there_is(self):
+    def test_impossible_count_gives_no_extra_credit(self):
         one = self.made(credit=1, consumed=50)
         one.offer(self.item())
         one.was_sent(("raw", "front"))
@@ -312,7 +312,7 @@ class TestSubscriber:
         one.consumed(Subscribe(products=("raw",), consumed=0, credit=1))
         assert len(one.under_way) == 0
 
-    def test_what_is_not_wanted_any_more_is_counted(self):
+    def test_images_without_subscribers_are_counted(self):
         one = self.made()
         one.offer(self.item())
         one.consumed(Subscribe(products=("status",)))

@@ -42,13 +42,13 @@ def place(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_python_lines(place):
+def test_readme_code_runs(place):
     (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     run(place, sys.executable, "-W", "error", "-c", code)
     assert (place / "image.png").stat().st_size > 10_000
 
 
-def test_every_folder_is_told_of():
+def test_readme_describes_every_folder():
     reported = page("architecture")
     folders = {path.parent.name for path in (ROOT / "ertis_numba").glob("*/__init__.py")}
     assert {
@@ -56,7 +56,7 @@ def test_every_folder_is_told_of():
     } == set()
 
 
-def test_commands(place):
+def test_readme_commands_run(place):
     """Each in a process of its own where it is shown first."""
     started = set()
     with contextlib.ExitStack() as background:
@@ -79,7 +79,7 @@ def test_commands(place):
     assert (place / "shelf.png").stat().st_size > 10_000
 
 
-def test_page_on_devices(place):
+def test_commands_of_the_devices_page_run(place):
     with contextlib.ExitStack() as background:
         for command in commands_in(DEVICES):
             if command.endswith("&"):
@@ -90,7 +90,7 @@ def test_page_on_devices(place):
         assert 10 <= len(recording) <= 20  # a busy emulator ignores pulses while it still measures
 
 
-def test_example(place):
+def test_readme_example_runs(place):
     """The nearest of the strong reflectors of the recording that is emulated."""
     with in_background(place, "emulate data/synthetic/reflectors.h5 &"):
         reported = run(
@@ -99,7 +99,7 @@ def test_example(place):
     assert reported.stdout.splitlines() == [f"#{number}: 1.15 m at -38°" for number in range(5)]
 
 
-def test_page_on_simulation(place):
+def test_commands_of_the_simulation_page_run(place):
     (code,) = re.findall(r"```python\n(.*?)```", SIMULATION, re.DOTALL)
     reported = run(place, sys.executable, "-W", "error", "-c", code).stdout
     assert "absorption True" in reported
@@ -109,13 +109,13 @@ def test_page_on_simulation(place):
     assert "points[0]" in reported
 
 
-def test_gallery_begins_as_the_readme():
+def test_gallery_starts_like_the_readme():
     gallery = page("gallery")
     assert set(commands_in(gallery)) <= set(commands_in(README))
 
 
 @pytest.mark.parametrize("name", PAGES)
-def test_files_named_are_there(name):
+def test_files_named_on_pages_exist(name):
     path = ROOT / name
     for target in re.findall(r"\]\(([^)#]+)\)", path.read_text()):
         assert "://" in target or (path.parent / target).exists(), target
@@ -124,7 +124,7 @@ def test_files_named_are_there(name):
 @pytest.mark.parametrize(
     "name", ["README.md", "docs/tutorial/quickstart.md", "docs/how-to/network.md", "docs/how-to/applications.md"]
 )
-def test_blocks_that_emulate_can_be_pasted_as_they_are(name):
+def test_emulator_blocks_can_be_pasted_unchanged(name):
     """Commands that follow at once find no sensor, so they wait for it."""
     blocks = [block for block in (ROOT / name).read_text().split("```") if "$ ertis emulate" in block]
     assert blocks

@@ -71,7 +71,7 @@ def agreeing(found, wanted):
     )
 
 
-def test_ten_strongest_reflectors_are_where_the_exact_image_has_them(processed, exact_image):
+def test_ten_strongest_reflectors_match_the_exact_image(processed, exact_image):
     layout, path, _ = processed
     found = json.loads(run("peaks", path, "--top", 10, "--json"))["peaks"]
     wanted = ertis.find_peaks(exact_image, top=10)
@@ -83,7 +83,7 @@ def test_ten_strongest_reflectors_are_where_the_exact_image_has_them(processed, 
         assert agreeing(found, wanted) <= 1
 
 
-def test_image_is_the_exact_one(processed, exact_image):
+def test_image_of_the_real_measurement_is_exact(processed, exact_image):
     layout, _, image = processed
     error_db = reference.error_db(image.amplitude, exact_image.amplitude.astype(float))
     brightest_db = 20 * np.log10(image.amplitude.max() / exact_image.amplitude.max())

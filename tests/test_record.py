@@ -56,13 +56,13 @@ class Recording:
         raise AssertionError(f"it ended with {self.process.wait()} without {name}")
 
 
-def test_it_listens_soon(tmp_path):
+def test_record_listens_soon_after_its_start(tmp_path):
     begun_s = time.monotonic()
     with Recording(tmp_path):
         assert time.monotonic() - begun_s < 5.0  # 0.3 s where nothing else runs
 
 
-def test_nothing_that_was_acked_is_lost_or_there_twice_when_it_is_killed(tmp_path):
+def test_killed_record_neither_loses_nor_repeats_acknowledged_data(tmp_path):
     given = entries(60, first=0)
     acked_through = -1
     for kill in range(5):
@@ -87,7 +87,7 @@ def test_nothing_that_was_acked_is_lost_or_there_twice_when_it_is_killed(tmp_pat
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_it_well(number, tmp_path):
+def test_signal_ends_record_cleanly(number, tmp_path):
     given = entries(3, first=0)
     with Recording(tmp_path, "--every", "--name", "tour") as central, Node(central.address) as node:
         node.hello(first=0)
@@ -105,7 +105,7 @@ def test_a_signal_ends_it_well(number, tmp_path):
     assert stored(tmp_path)[0] == wanted(given)
 
 
-def test_it_ends_after_its_time(tmp_path):
+def test_record_ends_after_its_duration(tmp_path):
     arguments = ["record", "--listen", "tcp://127.0.0.1:0", "-o", str(tmp_path / "new"), "--duration", "0.1"]
     result = CliRunner().invoke(cli, arguments)
     assert result.exit_code == 0, result.output
@@ -125,7 +125,7 @@ def test_it_ends_after_its_time(tmp_path):
         (["--metrics", "{taken}"], "cannot listen at"),
     ],
 )
-def test_what_is_refused_has_left_nothing(options, message, tmp_path):
+def test_refused_record_leaves_no_files(options, message, tmp_path):
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()
@@ -140,13 +140,13 @@ def test_what_is_refused_has_left_nothing(options, message, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_folder_that_was_there_stays(tmp_path):
+def test_existing_folder_is_kept(tmp_path):
     result = CliRunner().invoke(cli, ["record", "-o", str(tmp_path), "--listen", "tcp://10.1.1.1:5601", "-q"])
     assert result.exit_code == 1
     assert tmp_path.is_dir()
 
 
-def test_where_it_listens_is_told_as_it_is(tmp_path):
+def test_record_reports_its_actual_address(tmp_path):
     pair = KeyPair.new("central")
     secret, _ = pair.save(tmp_path / "keys")
     AllowList().save(tmp_path / "keys" / "allow.toml")
@@ -157,7 +157,7 @@ def test_where_it_listens_is_told_as_it_is(tmp_path):
     assert re.search(r"info listening address=tcp://0\.0\.0\.0:[1-9]", result.stderr)
 
 
-def test_a_longer_measurement_is_taken_where_that_is_asked_for(tmp_path):
+def test_max_bytes_option_admits_longer_measurements(tmp_path):
     settings = TINY.replace(recording=TINY.recording.replace(n_samples=8192))
     given = entries(1, first=0, settings=settings)
     n_bytes = given[0].measurement.data.nbytes
@@ -171,7 +171,7 @@ def test_a_longer_measurement_is_taken_where_that_is_asked_for(tmp_path):
             node.hear_settled(0)
 
 
-def test_it_reports_what_serve_does(tmp_path):
+def test_record_reports_the_same_status_as_serve(tmp_path):
     with Recording(tmp_path) as central, Node(central.address) as node:
         node.hello(first=2)
         node.measure(*entries(3, first=2))
@@ -187,14 +187,14 @@ def test_it_reports_what_serve_does(tmp_path):
     assert reported["missing"] == reported["sensors"]["left"]["missing"]
 
 
-def test_metrics_are_served_while_it_runs(tmp_path):
+def test_record_serves_metrics(tmp_path):
     arguments = ["record", "--listen", "tcp://127.0.0.1:0", "-o", str(tmp_path), "--duration", "0.1", "-q"]
     result = CliRunner().invoke(cli, [*arguments, "--metrics", "127.0.0.1:0"])
     assert result.exit_code == 0, result.output
     assert result.stderr == ""
 
 
-def test_who_does_not_read_its_events_holds_nothing_up():
+def test_unread_events_do_not_block_record():
     reader, writer = os.pipe()
     with os.fdopen(writer, "w", encoding="utf-8") as stream:
         lines = JsonLines(stream, largest=1000)

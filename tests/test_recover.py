@@ -23,7 +23,7 @@ def run(*arguments, code=0):
     return done
 
 
-def test_apart(tmp_path):
+def test_sealing_process_seals_a_journal(tmp_path):
     with create(tmp_path, [*entries(4), *entries(1, sensor="right")]) as journal:
         path = journal.path
     shutil.copy(path, tmp_path / "kept")
@@ -36,13 +36,13 @@ def test_apart(tmp_path):
     assert [report.measurements for report in verify(tmp_path / "rec.h5")] == [4, 1]
 
 
-def test_apart_nothing_was_measured(tmp_path):
+def test_sealing_process_removes_an_empty_journal(tmp_path):
     create(tmp_path, []).close()
     sealed = seal_in_subprocess(tmp_path / "rec.h5.journal")
     assert (sealed.recording, sealed.remark) == (None, f"{tmp_path}/rec.h5.journal: no measurement was captured")
 
 
-def test_apart_refused(tmp_path):
+def test_sealing_process_reports_a_refusal(tmp_path):
     with (
         create(tmp_path) as journal,
         pytest.raises(JournalInUseError, match=r"rec.h5.journal is in use by another process"),
@@ -80,14 +80,14 @@ def instead(tmp_path, monkeypatch):
         ),
     ],
 )
-def test_apart_and_lost(tmp_path, instead, line, reason):
+def test_sealing_process_that_dies_is_reported(tmp_path, instead, line, reason):
     instead(line)
     with pytest.raises(DataError, match=f"rec.h5.journal: the process that seals it {reason}"):
         seal_in_subprocess(crashed(tmp_path))
 
 
 @pytest.mark.parametrize("late", [False, True])
-def test_apart_and_interrupted(tmp_path, instead, late):
+def test_sealing_process_can_be_interrupted(tmp_path, instead, late):
     path = crashed(tmp_path)
     steps = [{"done": 1, "of": 3}, {"journal": "it was not asked to end", "recording": "none", "set_aside": None}]
     reported, late_told = (json.dumps(json.dumps(step)) for step in steps)
@@ -109,7 +109,7 @@ def test_apart_and_interrupted(tmp_path, instead, late):
 # The command.
 
 
-def test_recover_a_folder(tmp_path):
+def test_recover_seals_a_folder(tmp_path):
     (tmp_path / "sub").mkdir()
     crashed(tmp_path)
     crashed(tmp_path, entries(1), name="b.h5")
@@ -127,7 +127,7 @@ def test_recover_a_folder(tmp_path):
     assert verify(tmp_path / "rec.h5")[0].is_intact
 
 
-def test_recover_what_cannot_be_sealed(tmp_path):
+def test_recover_reports_unsealable_journals(tmp_path):
     path = crashed(tmp_path)
     (tmp_path / "rec.h5").write_text("mine")
     crashed(tmp_path, name="b.h5")
@@ -141,7 +141,7 @@ def test_recover_what_cannot_be_sealed(tmp_path):
     assert verify(tmp_path / "rec.h5")[0].is_intact
 
 
-def test_recover_damaged_measurements(tmp_path):
+def test_recover_reports_damaged_measurements(tmp_path):
     create(tmp_path).close()
     path = tmp_path / "rec.h5.journal"
     spoil(path, "UPDATE measurements SET words = x'00' WHERE id = 1")
@@ -149,14 +149,14 @@ def test_recover_damaged_measurements(tmp_path):
     assert reported in run("recover", path, code=3).stderr
 
 
-def test_recover_nothing(tmp_path):
+def test_recover_without_journals(tmp_path):
     assert run("recover", tmp_path).stderr == f"no journal in {tmp_path}\n"
     assert run("recover", tmp_path, "--quiet").stderr == ""
     assert json.loads(run("recover", tmp_path, "--json").stdout) == {"journals": []}
     assert "none.journal: No such file or directory" in run("recover", tmp_path / "none.journal", code=1).stderr
 
 
-def test_recover_from_a_folder_with_a_module_in_it(tmp_path, monkeypatch):
+def test_recover_ignores_modules_in_the_folder(tmp_path, monkeypatch):
     crashed(tmp_path)
     (tmp_path / "h5py.py").write_text("raise SystemExit('the wrong one')")
     monkeypatch.chdir(tmp_path)
@@ -167,7 +167,7 @@ def interrupted(*_, **__):
     raise KeyboardInterrupt
 
 
-def test_recover_is_interrupted(tmp_path, monkeypatch):
+def test_recover_can_be_interrupted(tmp_path, monkeypatch):
     path = crashed(tmp_path)
     monkeypatch.setattr(sealing_client.subprocess, "Popen", interrupted)
     done = run("recover", path, code=130)
@@ -184,7 +184,7 @@ def test_recover_is_interrupted(tmp_path, monkeypatch):
 LOST = SonarError("left: it was unplugged; plug it in")
 
 
-def test_a_capture_tells_of_damage(tmp_path, capsys):
+def test_capture_reports_damage(tmp_path, capsys):
     create(tmp_path).close()
     path = tmp_path / "rec.h5.journal"
     spoil(path, "UPDATE measurements SET words = x'00' WHERE id = 1")
@@ -193,7 +193,7 @@ def test_a_capture_tells_of_damage(tmp_path, capsys):
     assert len(verify(tmp_path / "rec.h5")) == 1
 
 
-def test_a_capture_that_fails_and_cannot_be_sealed(tmp_path, capsys):
+def test_failed_capture_that_cannot_be_sealed_is_reported(tmp_path, capsys):
     path = crashed(tmp_path)
     (tmp_path / "rec.h5").write_text("mine")
     reported = (
@@ -211,7 +211,7 @@ def test_a_capture_that_fails_and_cannot_be_sealed(tmp_path, capsys):
     assert verify(tmp_path / "rec.h5")[0].is_intact
 
 
-def test_a_capture_of_nothing(tmp_path):
+def test_empty_capture_is_reported(tmp_path):
     for failure, wanted in ((None, "rec.h5.journal: no measurement was captured"), (LOST, "left: it was unplugged")):
         create(tmp_path, []).close()
         with pytest.raises((DataError, SonarError), match=wanted):
@@ -220,7 +220,7 @@ def test_a_capture_of_nothing(tmp_path):
 
 
 @pytest.mark.parametrize("failure", [None, LOST])
-def test_a_capture_whose_sealing_is_interrupted(tmp_path, monkeypatch, capsys, failure):
+def test_capture_with_interrupted_sealing_keeps_its_journal(tmp_path, monkeypatch, capsys, failure):
     path = crashed(tmp_path)
     monkeypatch.setattr(sealing_client.subprocess, "Popen", interrupted)
     with pytest.raises(KeyboardInterrupt if failure is None else SonarError):

@@ -28,7 +28,7 @@ def received(settings: Settings, path_m):
 
 
 @pytest.mark.parametrize("call", [Call(), Call(start_frequency_hz=80e3, stop_frequency_hz=20e3)])
-def test_plane_wave_has_its_amplitude_at_its_place(call):
+def test_plane_wave_has_its_amplitude_and_position(call):
     settings = SHORT.replace(call=call)
     positions_m = microphones(settings.array).enabled_positions_m
     words = received(settings, 2 * 0.7 - positions_m @ directions_of(25.0)[0])
@@ -41,7 +41,7 @@ def test_plane_wave_has_its_amplitude_at_its_place(call):
     assert image.max() == pytest.approx(0.9, rel=0.01)
 
 
-def test_near_point_needs_spherical_delays():
+def test_near_point_requires_spherical_delays():
     settings = SHORT
     positions_m = microphones(settings.array).enabled_positions_m
     point_m = 0.3 * directions_of(10.0)[0]
@@ -54,7 +54,7 @@ def test_near_point_needs_spherical_delays():
     assert plane < 0.96 * spherical
 
 
-def test_spherical_delays_become_plane_ones_when_the_array_is_small():
+def test_spherical_delays_of_a_small_array_are_plane():
     tiny = SHORT.replace(array=Array(layout="pair", positions_m=((0.0, 1e-4, 0.0), (0.0, -1e-4, 0.0)), word_bits=8))
     plane, spherical = (
         reference.exact(noise(tiny).data, tiny, directions_of([-40.0, 40.0]), [1.5], spherical=spherical)
@@ -63,7 +63,7 @@ def test_spherical_delays_become_plane_ones_when_the_array_is_small():
     assert reference.error_db(plane, spherical) < -80
 
 
-def test_32_microphones_gain_15_db_on_white_noise():
+def test_gain_of_32_microphones_on_white_noise_is_15_db():
     settings = Settings(recording=Recording(n_samples=163_840))
     range_m = np.linspace(0.2, 5.5, 1500)
     power = np.mean(reference.exact(noise(settings).data, settings, directions_of(0.0), range_m) ** 2)
@@ -88,11 +88,11 @@ def beam_width_deg(frequency_hz, weights=None):
     ("frequency_hz", "width_deg"),
     [([25e3], 10.7), ([40e3], 6.7), ([50e3], 5.35), ([80e3], 3.3), (np.linspace(25e3, 50e3, 101), 7.1)],
 )
-def test_beam_of_the_array_has_its_width(frequency_hz, width_deg):
+def test_beam_pattern_has_the_width_of_the_formula(frequency_hz, width_deg):
     assert beam_width_deg(frequency_hz) == pytest.approx(width_deg, rel=0.01)
 
 
-def test_beam_of_the_image_has_the_width_of_the_array():
+def test_image_beam_has_the_width_of_the_beam_pattern():
     positions_m = microphones(SHORT.array).enabled_positions_m
     words = received(SHORT, 2 * 0.7 - positions_m @ directions_of(0.0)[0])
     azimuth_deg = np.linspace(-6, 6, 121)

@@ -12,7 +12,7 @@ SEED = 1
 
 
 @pytest.mark.alone
-def test_nothing_is_lost_of_a_sustained_capture(tmp_path):
+def test_sustained_capture_loses_nothing(tmp_path):
     """Once in three times: a machine that does something else for a tenth of a second is not what this is about."""
     for attempt in range(3):
         folder = tmp_path / str(attempt)
@@ -35,24 +35,24 @@ def test_groups_of_a_sync_chain_are_complete(tmp_path):
     assert SHORT.n_groups / 2 <= found["complete"] <= found["groups"] <= SHORT.n_groups + 2
 
 
-def test_no_fault_on_the_wire_is_taken_for_a_measurement():
+def test_faults_on_the_line_never_become_measurements():
     found = reliability.wire(SHORT.n_blocks, SEED)
     assert found["spoilt"] > SHORT.n_blocks / 3
     assert found["delivered"] >= found["untouched"] > SHORT.n_blocks / 3
     assert found["untouched_lost"] == found["mixed"] == found["wrong_counter"] == found["twice"] == 0
 
 
-def test_a_plug_after_which_nothing_came_has_no_time():
+def test_unplugging_without_later_data_has_no_reconnection_time():
     assert vars(captures)["_waits_s"]([1_000_000_000, 5_000_000_000], [0, 4_000_000_000, 2_500_000_000]) == [1.5]
 
 
-def test_a_pulled_plug(tmp_path):
+def test_unplugged_sensor_is_reconnected(tmp_path):
     found = captures.unplugs(SOURCE, tmp_path, seed=SEED, count=SHORT.n_unplugs)
     assert (found["noticed"], found["wrong"]) == (SHORT.n_unplugs, 0)
     assert found["slowest_s"] < 3.0
 
 
-def test_killed_captures(tmp_path):
+def test_killed_captures_lose_nothing(tmp_path):
     found = captures.kills(SOURCE, tmp_path, seed=SEED, count=SHORT.n_kills)
     assert found["reported"] > 0
     assert (found["lost"], found["wrong"], found["unreadable"], found["left over"]) == (0, 0, 0, 0)
@@ -65,7 +65,7 @@ def test_damage_to_files_is_reported(tmp_path):
     assert (found["silent"], found["crashed"]) == (0, 0)
 
 
-def test_a_full_disk(tmp_path):
+def test_full_disk_loses_nothing(tmp_path):
     disk = tmp_path / "disk"
     disk.mkdir()
     with reliability.small_disk(disk) as mounted:
@@ -78,6 +78,6 @@ def test_a_full_disk(tmp_path):
     assert "free some space" in found["said"]
 
 
-def test_an_emulator_that_does_not_start_is_told(tmp_path):
+def test_emulator_that_does_not_start_is_reported(tmp_path):
     with pytest.raises((DataError, OSError)):
         captures.sustained(tmp_path / "none.h5", tmp_path, duration_s=1.0, rate_hz=20.0)

@@ -40,7 +40,7 @@ def rooms_of(mouth_m, receiver_m, largest):
 
 @pytest.mark.parametrize(("mouth_m", "receiver_m"), PLACES)
 @pytest.mark.parametrize(("largest", "count"), [(0, 1), (1, 7), (2, 25), (3, 63)])
-def test_image_sources_agree(mouth_m, receiver_m, largest, count):
+def test_image_sources_agree_with_pyroomacoustics(mouth_m, receiver_m, largest, count):
     room, scene = rooms_of(mouth_m, receiver_m, largest)
     delay_s, amplitude = sorted_ways(scene, "walls", "occlusion", "spreading", "cross_emission")
     [source] = room.sources
@@ -54,7 +54,7 @@ def test_image_sources_agree(mouth_m, receiver_m, largest, count):
 
 
 @pytest.mark.parametrize(("mouth_m", "receiver_m"), PLACES[:2])
-def test_rendered_signals_agree(mouth_m, receiver_m):
+def test_rendered_signals_agree_with_pyroomacoustics(mouth_m, receiver_m):
     """The call through the other simulator's impulse response, sampled at 450 kHz."""
     room, scene = rooms_of(mouth_m, receiver_m, 2)
     sensors = tuple(sensor.replace(recording=Recording(n_samples=140_000)) for sensor in scene.sensors)
@@ -66,7 +66,7 @@ def test_rendered_signals_agree(mouth_m, receiver_m):
     assert error_db(signal[::10][: len(wanted)], wanted) < -55
 
 
-def test_a_sensor_hears_its_own_images_as_well():
+def test_sensor_receives_wall_echoes_of_its_own_emitter():
     """The microphone is apart from the emitter, as the second of a pair is."""
     pair = Array(layout="pair", positions_m=((0.0, -0.15, 0.1), (0.0, 0.15, -0.1)), word_bits=8)
     middle_m = (1.1, 1.7, 0.9)
@@ -82,7 +82,7 @@ def test_a_sensor_hears_its_own_images_as_well():
     assert_allclose(amplitude, (source.damping[0] / way_m)[echoes][order], rtol=1e-5)
 
 
-def test_a_turned_room_is_the_same_room():
+def test_rotated_room_gives_the_same_signals():
     _, scene = rooms_of(*PLACES[0], 2)
     [box] = scene.boxes
     turn = np.radians(35)
@@ -99,7 +99,7 @@ def test_a_turned_room_is_the_same_room():
     assert_allclose(sorted_ways(other, *names), sorted_ways(scene, *names), rtol=1e-9)
 
 
-def test_a_target_in_a_room_is_heard_over_all_walls():
+def test_target_in_a_room_echoes_over_all_walls():
     """Emitter to target and target to microphone are two rooms' worth of images, up to two walls together."""
     point_m = (1.9, 1.3, 0.8)
     middle_m = (1.0, 2.5, 1.1)

@@ -138,18 +138,18 @@ def crc(words):
 
 @pytest.mark.parametrize("way", ["windows", "linux"])
 class TestBothWays:
-    def test_it_finds_the_device(self, driven, way):
+    def test_rtisdev_finds_the_emulator(self, driven, way):
         assert driven[way].report["opened"] is True
         assert driven[way].report["firmware"] == "v1.0.0"
 
-    def test_what_it_configures_arrives(self, driven, way):
+    def test_rtisdev_configuration_arrives(self, driven, way):
         reported = driven[way].registers
         assert (reported.n_bytes, reported.clock, reported.emissions) == (4 * N_SAMPLES, 0, 3)
         assert (reported.dac_rate_hz, reported.n_codes) == (480_000, 601)
         assert (reported.armed, reported.pin, reported.active, reported.amplifier) == (1, 2, 1, 0)
         assert driven[way].refused == 0
 
-    def test_its_call_is_the_one_that_settings_describe(self, driven, way):
+    def test_rtisdev_call_equals_that_of_the_settings(self, driven, way):
         reported = driven[way].registers
         call = Call(start_frequency_hz=80e3, stop_frequency_hz=20e3, duration_s=1.25e-3, sample_rate_hz=480e3)
         assert reported.hash == driven[way].report["hash"] == call_hash(reported.codes[:601])
@@ -157,16 +157,16 @@ class TestBothWays:
         assert error[62:-62].max() <= 1
         assert error.max() <= 0.02 * 2047  # its ramps are those of a Hann window of another length
 
-    def test_triggered_measurements_are_those_of_the_pulses(self, driven, way):
+    def test_rtisdev_triggered_measurements_match_the_pulses(self, driven, way):
         # 77 is the counter that was set; the chain numbers its pulses from 0.
         assert driven[way].report["triggered"] == [[77, crc(WORDS[0])], [78, crc(WORDS[1])]]
 
 
-def test_measurements_have_the_words_of_the_device(driven):
+def test_rtisdev_measurements_have_the_samples_of_the_device(driven):
     assert driven["linux"].report["active"] == [0, crc(WORDS[0])]
     assert driven["linux"].report["passive"] == [1, crc(PASSIVE[1])]
 
 
-def test_for_windows_active_and_passive_are_swapped(driven):
+def test_rtisdev_for_windows_swaps_active_and_passive(driven):
     assert driven["windows"].report["active"] == [0, crc(PASSIVE[0])]
     assert driven["windows"].report["passive"] == [1, crc(WORDS[1])]

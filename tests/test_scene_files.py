@@ -111,12 +111,12 @@ def test_scenes_survive_toml(scene):
     assert Scene.from_toml(scene.to_toml()) == scene
 
 
-def test_an_empty_file_is_one_sensor_in_silence():
+def test_empty_scene_file_is_one_sensor_in_silence():
     assert Scene.from_toml("") == Scene()
     assert Scene().sensor().settings() == Settings()
 
 
-def test_places_from_direction_and_range():
+def test_positions_from_direction_and_range():
     by_angles = Point(azimuth_deg=90, elevation_deg=30, range_m=2.0)
     assert_allclose(by_angles.position_at(0.0), (0.0, math.sqrt(3), 1.0), atol=1e-12)
     assert_allclose(Point(range_m=2.0).position_at(0.0), (2.0, 0.0, 0.0))
@@ -125,7 +125,7 @@ def test_places_from_direction_and_range():
 # ---- files -----------------------------------------------------------------------------------------
 
 
-def test_a_scene_file_depends_on_no_other(tmp_path):
+def test_scene_stores_the_layout_beside_its_file(tmp_path):
     """A layout that it names is looked for beside it."""
     (tmp_path / "line.csv").write_text("0, 0\n5, 0\n10, 0\n")
     (tmp_path / "scene.toml").write_text('[[sensors]]\narray.layout = "line.csv"\n[[points]]\nrange_m = 1\n')
@@ -142,7 +142,7 @@ def test_named_layouts_stay_names(tmp_path):
     assert load_scene(tmp_path / "scene.toml").sensor().array == Array(layout="uRTIS_v1")
 
 
-def test_a_missing_file_is_refused(tmp_path):
+def test_missing_scene_file_is_refused(tmp_path):
     with pytest.raises(SettingsError, match=r"none\.toml: .*; give a readable scene file"):
         load_scene(tmp_path / "none.toml")
 
@@ -306,7 +306,7 @@ def test_unknown_sensors_and_fields_are_refused():
 
 
 @given(st.floats(-180, 180), st.floats(-90, 90), st.floats(-180, 180))
-def test_rotation_and_quaternion_are_one(yaw_deg, pitch_deg, roll_deg):
+def test_rotation_and_quaternion_are_equivalent(yaw_deg, pitch_deg, roll_deg):
     sensor = Sensor(yaw_deg=yaw_deg, pitch_deg=pitch_deg, roll_deg=roll_deg)
     rotation = sensor.rotation()
     assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
@@ -316,7 +316,7 @@ def test_rotation_and_quaternion_are_one(yaw_deg, pitch_deg, roll_deg):
     assert_allclose(rotation[[0, 2], 0], wanted_m, atol=1e-12)  # nose to the left, then up
 
 
-def test_an_error_in_a_long_scene_is_found_soon():
+def test_error_in_a_long_scene_is_found_quickly():
     lines = ["[[points]]\nrange_m = 1"] * 1000 + ["[[points]]\nrnage_m = 1"] + ["[[points]]\nrange_m = 1"] * 1000
     started_s = time.perf_counter()
     with pytest.raises(SettingsError, match=r"scene, line 2002, points\[1000\]: unknown key `rnage_m`"):

@@ -45,7 +45,7 @@ def two_sensors(folder):
     return journal.path, [entry.measurement for entry in given]
 
 
-def test_a_journal_becomes_a_recording(tmp_path):
+def test_journal_is_sealed_into_a_recording(tmp_path):
     path, given = two_sensors(tmp_path)
     sealed = seal(path)
     assert (sealed.recording, sealed.measurements, sealed.missing, sealed.damaged) == (tmp_path / "rec.h5", 5, 9, 0)
@@ -72,7 +72,7 @@ def test_a_journal_becomes_a_recording(tmp_path):
         assert np.array_equal(came.data, wanted.data)
 
 
-def test_it_is_the_recording_that_would_have_been_written_at_once(tmp_path):
+def test_sealed_recording_equals_a_directly_written_one(tmp_path):
     given = [entry.measurement for entry in entries()]
     write_recording(tmp_path / "at_once.h5", given)
     seal(crashed(tmp_path))
@@ -80,7 +80,7 @@ def test_it_is_the_recording_that_would_have_been_written_at_once(tmp_path):
         assert one.uuid == other.uuid
 
 
-def test_what_was_sealed_is_not_written_again(tmp_path):
+def test_sealed_recording_is_not_written_again(tmp_path):
     path, _ = two_sensors(tmp_path)
     shutil.copy(path, tmp_path / "kept")
     first = seal(path)
@@ -95,7 +95,7 @@ def test_what_was_sealed_is_not_written_again(tmp_path):
     assert sorted(item.name for item in tmp_path.iterdir()) == ["kept", "rec.h5", "rec.h5.12345678.part"]
 
 
-def test_a_recording_beside_a_journal_that_never_was(tmp_path):
+def test_missing_journal_is_refused(tmp_path):
     seal(crashed(tmp_path))
     (tmp_path / "rec.h5").rename(tmp_path / "typo.h5")
     write_recording(tmp_path / "rec.h5", [entry.measurement for entry in entries()])
@@ -130,7 +130,7 @@ OTHERS = {
 
 
 @pytest.mark.parametrize("name", OTHERS)
-def test_a_file_with_other_content_is_left_alone(tmp_path, name):
+def test_file_with_other_content_is_not_replaced(tmp_path, name):
     with create(tmp_path, []) as journal:
         journal.add_sensor("left", TINY)
         journal.append(entries())
@@ -144,7 +144,7 @@ def test_a_file_with_other_content_is_left_alone(tmp_path, name):
 
 
 @pytest.mark.parametrize("tables", [True, False])
-def test_nothing_was_measured(tmp_path, tables, capsys):
+def test_empty_journal_is_removed(tmp_path, tables, capsys):
     path = tmp_path / "rec.h5.journal"
     if tables:
         with create(tmp_path, []) as journal:
@@ -156,7 +156,7 @@ def test_nothing_was_measured(tmp_path, tables, capsys):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_damaged_measurement_is_a_gap_and_the_journal_is_kept(tmp_path, capsys):
+def test_damaged_measurement_becomes_a_gap_and_the_journal_is_kept(tmp_path, capsys):
     create(tmp_path).close()
     path = tmp_path / "rec.h5.journal"
     spoil(path, "UPDATE measurements SET words = zeroblob(4096) WHERE id = 2")
@@ -172,7 +172,7 @@ def test_a_damaged_measurement_is_a_gap_and_the_journal_is_kept(tmp_path, capsys
     assert seal(path).set_aside == tmp_path / "rec.h5.journal.2.damaged"  # killed in between: the same recording
 
 
-def test_all_measurements_are_damaged(tmp_path):
+def test_journal_of_damaged_measurements_is_kept(tmp_path):
     create(tmp_path, [*entries(2), *entries(1, sensor="right")]).close()
     path = tmp_path / "rec.h5.journal"
     spoil(path, "UPDATE measurements SET words = zeroblob(4096) WHERE sensor = 1")
@@ -190,7 +190,7 @@ def test_all_measurements_are_damaged(tmp_path):
     assert not (tmp_path / "rec.h5").exists()
 
 
-def test_a_journal_in_use(tmp_path, capsys):
+def test_journal_in_use_is_not_sealed(tmp_path, capsys):
     with create(tmp_path) as journal:
         with pytest.raises(JournalInUseError, match="is in use by another process"):
             seal(journal.path)
@@ -199,7 +199,7 @@ def test_a_journal_in_use(tmp_path, capsys):
         assert len(list(journal.entries())) == 3
 
 
-def test_no_room_to_seal(tmp_path, monkeypatch, capsys):
+def test_sealing_without_free_space_is_refused(tmp_path, monkeypatch, capsys):
     path = crashed(tmp_path)
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(atomic_files.shutil, "disk_usage", lambda _: usage._replace(free=5_000_000))
@@ -211,7 +211,7 @@ def test_no_room_to_seal(tmp_path, monkeypatch, capsys):
     assert seal(path).measurements == 3
 
 
-def test_no_place_for_the_recording(tmp_path):
+def test_sealing_into_an_unwritable_folder_is_refused(tmp_path):
     create(tmp_path).close()
     (tmp_path / "rec.h5").mkdir()
     with pytest.raises(ArgumentError, match=r"output .* is a folder; give"):
@@ -241,7 +241,7 @@ def test_sealing_follows_no_link(tmp_path, name):
     assert (tmp_path / "victim").read_text() == "precious"
 
 
-def test_a_process_of_its_own(tmp_path):
+def test_sealing_runs_in_its_own_process(tmp_path):
     path, _ = two_sensors(tmp_path)
     code = "import runpy; runpy.run_module('ertis_numba.storage.sealing', run_name='__main__')"
     done = python(code, path, "--json")
@@ -258,7 +258,7 @@ def test_a_process_of_its_own(tmp_path):
     )
 
 
-def test_it_goes_on_when_nobody_listens_any_more(tmp_path):
+def test_sealing_process_continues_without_its_parent(tmp_path):
     path = crashed(tmp_path)
     command = [sys.executable, "-m", "ertis_numba.storage.sealing_process", "--json", str(path)]
     with subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
@@ -267,7 +267,7 @@ def test_it_goes_on_when_nobody_listens_any_more(tmp_path):
     assert [item.name for item in tmp_path.iterdir()] == ["rec.h5"]
 
 
-def test_interrupted(tmp_path, monkeypatch):
+def test_sealing_can_be_interrupted(tmp_path, monkeypatch):
     path = crashed(tmp_path)
 
     def interrupt(*_, **__):
@@ -278,7 +278,7 @@ def test_interrupted(tmp_path, monkeypatch):
     assert [item.name for item in tmp_path.iterdir()] == ["rec.h5.journal"]
 
 
-def test_processes_that_are_killed_leave_no_broken_file(tmp_path):
+def test_killed_sealing_processes_leave_no_broken_file(tmp_path):
     found = kills.sealing(tmp_path, seed=1, count=16)
     assert found["late"] < 8
     assert {name: found[name] for name in ("broken", "different", "left_over")} == {
@@ -299,7 +299,7 @@ def naive_gaps(numbers, noted):
     return {number: reason for number, reason in reasons.items() if number not in numbers}
 
 
-def test_gaps_are_those_of_a_naive_count():
+def test_gaps_equal_a_naive_count():
     rng = np.random.default_rng(3)
     for _ in range(300):
         present = np.flatnonzero(rng.random(40) < rng.random()).tolist() or [7]
@@ -319,7 +319,7 @@ def test_gaps_are_those_of_a_naive_count():
             assert before[1] + 1 < after[0] or before[2] != after[2]  # joined where they can be
 
 
-def test_gaps_where_numbers_start_again():
+def test_gaps_are_counted_per_session():
     numbers = SequenceNumbers()
     for number in (5, 6, 0, 1, 4):
         numbers.add(number)
@@ -333,13 +333,13 @@ def test_gaps_where_numbers_start_again():
         ("right", "x", "a gap is given for sensor 'right', which has no measurement"),
     ],
 )
-def test_gaps_that_no_recording_can_hold(tmp_path, sensor, reason, message):
+def test_unstorable_gaps_are_refused(tmp_path, sensor, reason, message):
     with pytest.raises(ArgumentError, match=message):
         with_gap(tmp_path / "rec.h5", [entries(1)[0].measurement], sensor=sensor, reason=reason)
     assert not list(tmp_path.iterdir())
 
 
-def test_firmware_of_a_sensor_of_which_nothing_came(tmp_path):
+def test_firmware_of_a_sensor_without_measurements_is_stored(tmp_path):
     with (
         pytest.raises(ArgumentError, match="firmware is given for sensor 'right', which has no measurement"),
         RecordingWriter(tmp_path / "rec.h5", firmware={"right": "1"}) as writer,

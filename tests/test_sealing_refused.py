@@ -99,13 +99,13 @@ def test_verify_reports_a_sensor_of_a_journal_that_cannot_be_used(left):
     assert "call has 5000000 samples" in bad.fault
 
 
-def test_seal_apart_returns_what_was_refused(left):
+def test_sealing_process_returns_refused_sensors(left):
     sealed = seal_in_subprocess(left)
     assert (sealed.measurements, list(sealed.refused), sealed.set_aside.exists()) == (3, ["bad"], True)
 
 
 @pytest.mark.usefixtures("left")
-def test_an_archive_seals_the_other_sensors_and_counts_what_is_set_aside(tmp_path):
+def test_archive_seals_other_sensors_and_counts_set_aside_journals(tmp_path):
     with Opened(tmp_path, seal=True) as opened:
         event = opened.until(SealedOne)
         status = opened.archive.status()

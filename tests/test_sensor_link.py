@@ -18,7 +18,7 @@ from tests.stand_in import StandIn
 __all__ = ["impatient"]  # a fixture
 
 
-def test_a_central_node_that_has_forgotten_this_one_is_greeted_at_once(monkeypatch):
+def test_forgetful_central_node_gets_a_hello_at_once(monkeypatch):
     """Without waiting for what is under way to be settled."""
     monkeypatch.setattr(runs, "_PATIENCE_S", 1000.0)
     given = entries(20)
@@ -34,7 +34,7 @@ def test_a_central_node_that_has_forgotten_this_one_is_greeted_at_once(monkeypat
 
 @IMPATIENT
 @pytest.mark.parametrize("seed", range(3))
-def test_acks_may_be_lost_repeated_and_reordered(seed):
+def test_link_accepts_lost_repeated_and_reordered_acks(seed):
     given = entries(120)
     with StandIn(seed=seed) as central, Node(central.address) as node:
         central.lost, central.repeated, central.late, central.ignored = 0.3, 0.3, 0.3, 0.05
@@ -48,7 +48,7 @@ def test_acks_may_be_lost_repeated_and_reordered(seed):
 
 
 @IMPATIENT
-def test_an_ack_of_what_was_not_sent_is_none():
+def test_ack_of_unsent_numbers_is_ignored():
     given = entries(3)
     with StandIn() as central, Node(central.address) as node:
         central.refusal = lambda message: (
@@ -67,7 +67,7 @@ def test_an_ack_of_what_was_not_sent_is_none():
 
 @IMPATIENT
 @pytest.mark.parametrize("forget", [False, True])
-def test_a_central_node_that_dies_and_comes_back(forget):
+def test_link_survives_restarts_of_the_central_node(forget):
     """Five times; with ``forget``, it acknowledges what it has in memory only, which is then gone."""
     given = entries(100)
     with StandIn(acks="accepted" if forget else "stored") as central, Node(central.address) as node:
@@ -88,7 +88,7 @@ def test_a_central_node_that_dies_and_comes_back(forget):
 
 
 @IMPATIENT
-def test_who_is_refused_is_told_once_and_tries_again_while_others_pass():
+def test_refused_sensor_retries_while_others_continue():
     left, right = entries(5), entries(5, sensor="right")
     with StandIn() as central, Node(central.address, ("left", "right")) as node:
         asked = queue.Queue()
@@ -109,7 +109,7 @@ def test_who_is_refused_is_told_once_and_tries_again_while_others_pass():
 
 
 @IMPATIENT
-def test_a_reason_that_holds_another_number_each_time_is_told_once():
+def test_refusal_with_varying_numbers_is_reported_once():
     asked = queue.Queue()
 
     def refuse(message):
@@ -129,7 +129,7 @@ def test_a_reason_that_holds_another_number_each_time_is_told_once():
 
 
 @IMPATIENT
-def test_another_version_is_told():
+def test_other_protocol_version_is_reported():
     with StandIn() as central, Node(central.address) as node:
         central.version = 9
         node.append(entries(1))
@@ -139,7 +139,7 @@ def test_another_version_is_told():
 
 
 @IMPATIENT
-def test_a_fault_holds_measurements_back():
+def test_fault_of_the_central_node_delays_measurements():
     given = entries(30)
     with StandIn() as central, Node(central.address) as node:
         node.append(given[:1])
@@ -158,7 +158,7 @@ def test_a_fault_holds_measurements_back():
 
 
 @IMPATIENT
-def test_silence_is_answered_by_a_new_connection():
+def test_silence_causes_a_new_connection():
     given = entries(10)
     with StandIn() as central, Node(central.address) as node:
         node.append(given[:5])
@@ -184,7 +184,7 @@ def test_silence_is_answered_by_a_new_connection():
         (True, True, None),
     ],
 )
-def test_keys(tmp_path, listed, server, message):
+def test_link_authenticates_with_keys(tmp_path, listed, server, message):
     mine, theirs, other = (KeyPair.new(name) for name in ("node", "central", "other"))
     allow = tmp_path / "allow.toml"
     who = mine if listed else other
@@ -203,7 +203,7 @@ def test_keys(tmp_path, listed, server, message):
 
 
 @IMPATIENT
-def test_a_failing_listener_stops_nothing(caplog):
+def test_failing_event_listener_stops_nothing(caplog):
     given = entries(6)
 
     def fail(_):
@@ -224,7 +224,7 @@ def test_a_failing_listener_stops_nothing(caplog):
     assert sorted(reported) == [f"{name} failed: OSError: the pipe is closed" for name in ("on_acked", "on_note")]
 
 
-def test_a_link_that_fails_is_made_again(monkeypatch):
+def test_failed_link_is_replaced(monkeypatch):
     monkeypatch.setattr(link, "_FAILED_S", 0.0)
     given, failures = entries(3), [MemoryError("no room")]
     frames_of = link.frames_of

@@ -19,7 +19,7 @@ from tests.stand_in import StandIn
 __all__ = ["impatient"]  # a fixture
 
 
-def test_measurements_arrive_with_all_that_belongs_to_them():
+def test_measurements_arrive_with_stamp_air_and_settings():
     given = entries(50, first=0)
     warm = TINY.replace(air=Air(temperature_c=31.5, humidity_percent=12.0, pressure_pa=99_000.0))
     given[3] = replace(given[3], measurement=replace(given[3].measurement, settings=warm))
@@ -45,7 +45,7 @@ def test_measurements_arrive_with_all_that_belongs_to_them():
     )
 
 
-def test_gaps_arrive_in_their_turn():
+def test_gaps_arrive_in_order():
     given = entries(6, first=3)
     with StandIn() as central, Node(central.address) as node:
         node.append(given[:2])
@@ -58,7 +58,7 @@ def test_gaps_arrive_in_their_turn():
     assert central.gaps[KEY] == [(5, 5, "footer"), (6, 6, "unplugged"), (7, 7, runs.NEVER_GIVEN)]
 
 
-def test_several_sensors_and_runs():
+def test_several_sensors_and_sessions_arrive():
     left, right, later = entries(20), entries(20, sensor="right", seed=2), entries(5, first=0, session_id=9, seed=3)
     with StandIn(window=2) as central, Node(central.address, ("left", "right")) as node:
         for pair in zip(left, right, strict=True):
@@ -71,7 +71,7 @@ def test_several_sensors_and_runs():
     assert [hello.session_id for hello, _ in central.hellos.queue if hello.sensor == "left"] == [EPOCH, 9]
 
 
-def test_no_more_is_under_way_than_the_window_has_room_for():
+def test_measurements_in_flight_stay_within_the_window():
     with StandIn(window=4) as central, Node(central.address) as node:
         central.ignored = 1.0
         node.append(entries(20))
@@ -82,7 +82,7 @@ def test_no_more_is_under_way_than_the_window_has_room_for():
         assert node.flush(SOON_S)
 
 
-def test_runs_that_are_over_are_taken_leave_of():
+def test_ended_sessions_are_closed():
     given = [entries(2, session_id=session_id) for session_id in range(20)]
     with StandIn() as central, Node(central.address) as node:
         central.max_runs = 3
@@ -94,7 +94,7 @@ def test_runs_that_are_over_are_taken_leave_of():
         assert has_all(central, several, ("left", session_id))
 
 
-def test_a_full_memory_forgets_the_oldest():
+def test_full_memory_drops_the_oldest():
     given = entries(40, first=0)
     central = StandIn()
     with central:
@@ -113,7 +113,7 @@ def test_a_full_memory_forgets_the_oldest():
     assert central.gaps[KEY] == [(0, 29, runs.MEMORY_FULL)]
 
 
-def test_memory_is_flat_while_nobody_takes_anything():
+def test_memory_is_constant_without_a_central_node():
     """Even if every other number is a gap of its own kind."""
     small = TINY.replace(recording=Recording(n_samples=64))
     (blank,) = entries(1, settings=small)
@@ -132,7 +132,7 @@ def test_memory_is_flat_while_nobody_takes_anything():
 
 
 @IMPATIENT
-def test_memory_is_flat_while_one_sensor_is_not_let_in():
+def test_memory_is_constant_while_one_sensor_is_refused():
     small = TINY.replace(recording=Recording(n_samples=64))
     refused = messages.Refused(code="serial", reason="no", sensor="left", session_id=EPOCH)
     with StandIn() as central, SensorNode(central.address) as node:
@@ -148,7 +148,7 @@ def test_memory_is_flat_while_one_sensor_is_not_let_in():
         assert len(node._spool._order) < 1010  # noqa: SLF001  nobody else can tell
 
 
-def test_a_run_of_which_the_central_node_has_more_holds_no_later_one():
+def test_session_acknowledged_beyond_its_end_does_not_block_later_ones():
     """As when the end of a spool was lost with the power."""
     later = entries(3, first=0, session_id=EPOCH + 1)
     with StandIn() as central, Node(central.address) as node:
@@ -178,7 +178,7 @@ def test_numbers_of_any_kind_are_sent():
     assert central.gaps[KEY] == [(2, 4, "footer")]
 
 
-def test_what_is_thrown_away_is_counted_once():
+def test_dropped_measurements_are_counted_once():
     given = entries(8, first=0)
     with StandIn(acks="accepted") as central, Node(central.address) as node:
         central.dropped = ((2, "superseded"), (3, "superseded"), (5, "failed twice"))
@@ -192,7 +192,7 @@ def test_what_is_thrown_away_is_counted_once():
     assert reported == [central.dropped]
 
 
-def test_numbers_hold_whatever_happens():  # noqa: C901  it is a list of what may
+def test_counts_match_a_model_for_random_events():  # noqa: C901  it is a list of what may
     """A run against an obvious model: random losses, evictions, acks late and beyond."""
     chance = random.Random(4)
     for _ in range(30):
@@ -293,7 +293,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_what_does_not_fit_is_refused(name):
+def test_unsendable_measurements_are_refused(name):
     act, message = BAD[name]
     with Node("tcp://127.0.0.1:1", ring_bytes=100_000) as node:
         node.append(entries())
@@ -302,7 +302,7 @@ def test_what_does_not_fit_is_refused(name):
         assert node.counts["left"].accepted == node.unacked == 3
 
 
-def test_words_of_any_kind_are_sent_little_endian():
+def test_samples_of_any_type_are_sent_little_endian():
     (given,) = entries(1, first=0)
     strided = np.repeat(given.measurement.data, 2)[::2]
     given.measurement = replace(given.measurement, data=strided)
@@ -312,7 +312,7 @@ def test_words_of_any_kind_are_sent_little_endian():
     assert central.held[KEY][0][1] == strided.tobytes()
 
 
-def test_a_sensor_node_loads_nothing_heavy():
+def test_sensor_node_imports_no_heavy_library():
     done = python("import ertis_numba.network.sensor_node, sys; print(*sys.modules)")
     assert not {"h5py", "scipy", "numba", "ertis_numba.storage", "ertis_numba.pipeline"} & set(done.stdout.split())
     assert "zmq" in done.stdout

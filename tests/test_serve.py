@@ -108,7 +108,7 @@ def is_gone(pid):
         return True
 
 
-def test_images_reach_an_application_and_measurements_a_recording(tmp_path):
+def test_serve_publishes_images_and_stores_measurements(tmp_path):
     storing = (
         "--record",
         str(tmp_path),
@@ -154,7 +154,7 @@ def test_images_reach_an_application_and_measurements_a_recording(tmp_path):
             assert [measurement.stamp.sequence for measurement in stored] == [0, 1, 2, 3]
 
 
-def test_a_killed_worker_costs_no_measurement_and_nothing_outlives_the_central_node():
+def test_killed_worker_loses_no_measurement_and_no_process_remains():
     with (
         serving(*LOOPBACK, "--workers", "1", "--device", "numpy") as served,
         SensorNode(served.listen) as node,
@@ -184,7 +184,7 @@ def test_a_killed_worker_costs_no_measurement_and_nothing_outlives_the_central_n
             os.sched_yield()
 
 
-def test_with_keys_each_node_gets_what_it_is_listed_for(tmp_path):
+def test_keys_grant_each_node_its_listed_permissions(tmp_path):
     pairs = {name: KeyPair.new(name) for name in ("central", "viewer", "front")}
     for pair in pairs.values():
         pair.save(tmp_path / "keys")
@@ -227,7 +227,7 @@ def test_with_keys_each_node_gets_what_it_is_listed_for(tmp_path):
         (("--range", "5:1"), "processing.range_m runs from 5 to 1"),
     ],
 )
-def test_what_cannot_be_is_refused_in_a_line(options, reported):
+def test_serve_refuses_invalid_options_in_one_line(options, reported):
     command = [sys.executable, "-m", "ertis_cli", "serve", "--listen", "tcp://127.0.0.1:0", *options]
     environment = {**os.environ, "PYTHONPATH": str(Path("cli").absolute())}
     done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=TIMEOUT_S, check=False)
@@ -236,7 +236,7 @@ def test_what_cannot_be_is_refused_in_a_line(options, reported):
     assert reported in line
 
 
-def test_what_is_refused_has_left_nothing(tmp_path):
+def test_refused_serve_leaves_no_files(tmp_path):
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()
@@ -250,7 +250,7 @@ def test_what_is_refused_has_left_nothing(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_numbers_of_pcm_go_all_the_way(tmp_path):
+def test_serve_handles_pcm(tmp_path):
     """Sent, stored and imaged like bits."""
     given = noise(CASES["PCM, calibrated"])
     with (

@@ -109,7 +109,7 @@ def test_band_edges_survive_toml_and_raise_the_signal_rate():
     assert (Settings().decimation, made.decimation) == (20, 10)
 
 
-def test_an_empty_file_is_the_default_measurement():
+def test_empty_settings_file_gives_the_defaults():
     assert Settings.from_toml("") == Settings() == Settings.from_preset("default_25_50")
 
 
@@ -119,7 +119,7 @@ def test_settings_are_read_from_a_file(tmp_path):
     assert Settings.load(path).air == Air(temperature_c=3.0)
 
 
-def test_nothing_can_be_changed_in_place():
+def test_settings_are_immutable():
     with pytest.raises(AttributeError, match="immutable"):
         Settings().air.temperature_c = 3.0
 
@@ -270,13 +270,13 @@ def test_bad_arguments_are_refused(make, message):
         ),
     ],
 )
-def test_what_stands_for_a_field_is_taken_as_a_file_gives_it(made, wanted):
+def test_fields_accept_the_forms_of_settings_files(made, wanted):
     assert made == wanted
     assert hash(made) == hash(wanted)
     assert repr(made) == repr(wanted)  # 1 is equal to 1.0, and a number of NumPy to Python's
 
 
-def test_each_interpolation_takes_the_taps_that_it_implies():
+def test_each_interpolation_has_its_number_of_taps():
     for interpolation, taps in INTERPOLATIONS.items():
         assert Accuracy(interpolation=interpolation, delay_taps=taps).delay_taps == taps
 
@@ -297,7 +297,7 @@ def test_unreadable_files_are_refused(tmp_path, content):
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_presets(name):
+def test_presets_have_the_documented_values(name):
     made = Settings.from_preset(name)
     words = {"short": 65_536, "default": 163_840, "long": 294_912}[name.split("_")[0]]
     low_hz, high_hz = (1000 * int(edge) for edge in name.split("_")[1:])
@@ -308,7 +308,7 @@ def test_presets(name):
     assert echo_ends_s <= made.recording.duration_s
 
 
-def test_rates_and_durations():
+def test_rates_and_durations_are_derived():
     made = Settings()
     assert made.recording.duration_s == pytest.approx(36.4e-3, abs=1e-5)
     assert (made.signal_rate_hz, made.output_rate_hz) == (225_000, 45_000)
@@ -337,7 +337,7 @@ def test_every_section_refuses_unknown_fields():
         ("long_20_80", "paper", 10),
     ],
 )
-def test_decimation_suits_method_and_band(preset, method, decimation):
+def test_decimation_is_checked_for_method_and_band(preset, method, decimation):
     made = Settings.from_preset(preset)
     made = made.replace(processing=made.processing.replace(method=method))
     assert made.decimation == decimation
@@ -349,7 +349,7 @@ def test_range_decimation_without_a_useful_divisor_is_refused():
         Settings(processing=Processing(range_decimation=101))
 
 
-def test_microphones_far_away_are_refused():
+def test_distant_microphones_are_refused():
     with pytest.raises(ArgumentError, match=r"array.positions_m\[1\] is 40; give a number from -10 to 10"):
         Array(positions_m=((0.0, 0.0, 0.0), (40.0, 0.0, 0.0)))
 
@@ -361,7 +361,7 @@ def test_settings_of_older_recordings_are_read():
     assert Settings.from_toml(former).recording.sample_rate_hz == 1_125_000
 
 
-def test_files_that_settings_name_are_beside_them(tmp_path, monkeypatch):
+def test_files_named_in_settings_are_relative_to_the_settings_file(tmp_path, monkeypatch):
     folder = tmp_path / "mine"
     folder.mkdir()
     (folder / "line.csv").write_text("0, 0\n10, 0\n")
@@ -378,7 +378,7 @@ def test_files_that_settings_name_are_beside_them(tmp_path, monkeypatch):
     assert Settings.load("mine/s.toml") == named
 
 
-def test_a_file_changes_what_it_holds_and_names_files_beside_it(tmp_path, monkeypatch):
+def test_settings_file_updates_only_its_keys(tmp_path, monkeypatch):
     folder = tmp_path / "mine"
     folder.mkdir()
     monkeypatch.chdir(tmp_path)
@@ -398,7 +398,7 @@ def test_a_file_changes_what_it_holds_and_names_files_beside_it(tmp_path, monkey
     assert changed.processing == known.processing.replace(directions=str(Path("mine/far.csv")))
 
 
-def test_a_file_that_does_not_suit_the_rest_is_refused(tmp_path):
+def test_inconsistent_settings_file_is_refused(tmp_path):
     (tmp_path / "s.toml").write_text("[processing]\nrange_decimation = 50\n")
     known = Settings(processing=Processing(decimation=20))
     with pytest.raises(SettingsError, match=r"s\.toml: processing\.decimation is 20; give a divisor of .* \(50\)"):
@@ -416,13 +416,13 @@ def test_a_file_that_does_not_suit_the_rest_is_refused(tmp_path):
         pytest.param(192e3, (15e3, 90e3), 1, id="no room"),
     ],
 )
-def test_ranges_suit_rate_and_band(rate_hz, band_hz, step):
+def test_ranges_are_checked_for_rate_and_band(rate_hz, band_hz, step):
     call = Call(start_frequency_hz=band_hz[1], stop_frequency_hz=band_hz[0])
     recording = Recording(sample_rate_hz=rate_hz, n_samples=round(rate_hz / 20))
     assert fit_ranges(Processing(), recording, call).range_decimation == step
 
 
-def test_a_window_is_where_the_whole_echo_fits():
+def test_range_window_ends_where_the_whole_echo_fits():
     def window_m(n_samples, **processing):
         recording = Recording(sample_rate_hz=1e6, n_samples=n_samples)
         return fit_ranges(Processing(**processing), recording, Call()).range_m

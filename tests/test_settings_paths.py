@@ -32,7 +32,7 @@ def test_paths_change_tables_that_are_given_beside_them():
     assert Settings().replace() == Settings()
 
 
-def test_values_that_are_none_can_be_given():
+def test_values_may_be_none():
     fixed = Settings().replace("accuracy.delay_taps", 2)
     assert fixed.replace("accuracy.delay_taps", None) == Settings()
 

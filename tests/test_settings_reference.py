@@ -33,7 +33,7 @@ def structures(kind):
 
 
 @pytest.mark.parametrize("document", DOCUMENTS)
-def test_every_key_has_all_that_a_user_needs(document):
+def test_every_key_is_fully_described(document):
     for section in reference(document):
         assert section.about
         for key in section.keys:
@@ -44,7 +44,7 @@ def test_every_key_has_all_that_a_user_needs(document):
             assert key.unit or not re.search(r"_(hz|m|mm|s|deg|db|dbfs|c|pa|ppm|percent|m_s)$", key.name)
 
 
-def test_no_key_is_missing():
+def test_reference_lists_every_key():
     listed = {key.name for document in DOCUMENTS for section in reference(document) for key in section.keys}
     tables = {section.header.strip("[]").rpartition(".")[2] for name in DOCUMENTS for section in reference(name)}
     for kind in {each for document in DOCUMENTS.values() for each in structures(document)}:
@@ -58,7 +58,7 @@ def test_file_of_examples_is_accepted(document):
 
 
 @pytest.mark.parametrize("document", DOCUMENTS)
-def test_template_without_a_change_is_the_default(document):
+def test_unchanged_template_gives_the_defaults(document):
     """All of its lines are comments until somebody takes the marks away."""
     text = CliRunner().invoke(cli, ["settings", document]).stdout
     assert tomllib.loads(text) == {}
@@ -68,21 +68,21 @@ def test_template_without_a_change_is_the_default(document):
             assert f"# {key.example}\n" in text
 
 
-def test_settings_template_with_a_key_set(tmp_path):
+def test_template_with_a_changed_key_is_accepted(tmp_path):
     text = CliRunner().invoke(cli, ["settings"]).stdout
     path = tmp_path / "mine.toml"
     path.write_text(text.replace("# [air]", "[air]").replace("# temperature_c", "temperature_c"))
     assert Settings.load(path).air.temperature_c == 24.5
 
 
-def test_reference_as_json():
+def test_settings_reference_is_printed_as_json():
     reported = json.loads(CliRunner().invoke(cli, ["settings", "layout", "--json"]).stdout)
     (table,) = reported["tables"]
     (found,) = (key for key in table["keys"] if key["name"] == "positions_mm")
     assert (found["unit"], found["default"]) == ("mm", "required")
 
 
-def test_page_has_every_key():
+def test_reference_page_has_every_key():
     conf = runpy.run_path(str(ROOT / "docs" / "conf.py"))
     source = [page("settings")]
     conf["_write_reference"](None, "reference/settings", source)

@@ -16,7 +16,7 @@ from tests.journals import ENVIRONMENT
 SEED = 1
 
 
-def test_signals_are_tried_on_every_command():
+def test_signal_tests_cover_every_command():
     assert list(signals.COMMANDS) == list(COMMANDS)
 
 
@@ -33,7 +33,7 @@ def run(program):
 
 
 @pytest.mark.parametrize(("number", "code"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
-def test_signal_is_sent_again_where_a_library_swallows_it(number, code):
+def test_swallowed_signal_is_sent_again(number, code):
     done = run(f"""
         try:
             signal.raise_signal(signal.{number})
@@ -47,7 +47,7 @@ def test_signal_is_sent_again_where_a_library_swallows_it(number, code):
     assert (done.returncode, done.stderr) == (code, "")
 
 
-def test_signal_is_not_sent_again_while_a_command_clears_up():
+def test_signal_is_not_repeated_during_cleanup():
     done = run("""
         try:
             try:
@@ -82,14 +82,14 @@ main()
 
 
 @pytest.mark.parametrize("number", ["SIGINT", "SIGTERM"])
-def test_signal_before_the_handlers_are_there_prints_nothing(number):
+def test_signal_before_the_handlers_exist_prints_nothing(number):
     done = run_command("ertis_cli._signals", number)
     assert (done.returncode, done.stderr) == (-getattr(signal, number), "")
 
 
 @pytest.mark.parametrize(("number", "code"), [("SIGINT", 130), ("SIGTERM", 143)])
 @pytest.mark.parametrize("module", ["ertis_cli.main", "ertis_cli.devices"])
-def test_signal_is_not_sent_again_once_the_command_has_ended(module, number, code):
+def test_signal_is_not_repeated_after_the_command_has_ended(module, number, code):
     done = run_command(
         module,
         number,
@@ -105,7 +105,7 @@ def test_signal_is_not_sent_again_once_the_command_has_ended(module, number, cod
     assert done.stderr.strip() in ("", "ertis: error: interrupted")
 
 
-def test_interrupted_command_does_not_finalise_what_it_has_interrupted():
+def test_interrupted_command_does_not_finalise_the_interpreter():
     done = run_command(
         "ertis_cli.devices",
         "SIGTERM",

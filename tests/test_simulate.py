@@ -32,7 +32,7 @@ def simulate(*arguments):
     return CliRunner().invoke(cli, ["simulate", *map(str, arguments)])
 
 
-def test_it_writes_what_is_rendered(scene_file, tmp_path):
+def test_simulate_writes_the_rendered_samples(scene_file, tmp_path):
     target = tmp_path / "out.h5"
     result = simulate(scene_file, "-o", target, "--count", 3, "--seed", 11, "--json", "--quiet")
     assert result.exit_code == 0
@@ -56,7 +56,7 @@ def test_it_writes_what_is_rendered(scene_file, tmp_path):
     assert [[reflector.name for reflector in row] for row in truth.reflectors] == [["points[0]"]] * 3
 
 
-def test_it_writes_beside_the_scene_and_overwrites_when_told(scene_file):
+def test_simulate_writes_beside_the_scene_and_overwrites_with_force(scene_file):
     assert simulate(scene_file).exit_code == 0
     assert scene_file.with_suffix(".h5").exists()
     refused = simulate(scene_file)
@@ -65,7 +65,7 @@ def test_it_writes_beside_the_scene_and_overwrites_when_told(scene_file):
     assert simulate(scene_file, "--force").exit_code == 0
 
 
-def test_it_records_all_sensors_or_one(tmp_path):
+def test_simulate_records_all_sensors_or_one(tmp_path):
     path = tmp_path / "pair.toml"
     path.write_text(PAIR.to_toml(), encoding="utf-8")
     assert simulate(path, "--count", 2, "--quiet").exit_code == 0
@@ -81,7 +81,7 @@ def test_it_records_all_sensors_or_one(tmp_path):
         assert recording[0].stamp.sensor == "right"
 
 
-def test_truth_follows_what_moves(tmp_path):
+def test_ground_truth_follows_moving_objects(tmp_path):
     point = Point(position_m=(0.5, 0.0, 0.0), velocity_m_s=(1.0, 0.0, 0.0))
     path = tmp_path / "moving.toml"
     path.write_text(scene_of(point, sensor=EAR, rate_hz=10.0, count=3).to_toml(), encoding="utf-8")
@@ -92,7 +92,7 @@ def test_truth_follows_what_moves(tmp_path):
     assert_allclose([reflector.velocity_m_s for reflector in reflectors], [(1.0, 0.0, 0.0)] * 3)
 
 
-def test_it_records_scenes_without_reflectors(tmp_path):
+def test_simulate_records_scenes_without_reflectors(tmp_path):
     path = tmp_path / "empty.toml"
     path.write_text(SCENE.replace(points=()).to_toml(), encoding="utf-8")
     result = simulate(path, "--json", "--quiet")
@@ -100,7 +100,7 @@ def test_it_records_scenes_without_reflectors(tmp_path):
     assert json.loads(result.stdout)["sensors"] == [{"sensor": "sensor", "reflectors": []}]
 
 
-def test_it_explains_in_json(scene_file):
+def test_simulate_explains_effects_as_json(scene_file):
     result = simulate(scene_file, "--explain", "--json", "--quiet")
     assert result.exit_code == 0
     effects = json.loads(result.stdout)["effects"]
@@ -114,7 +114,7 @@ def test_it_explains_in_json(scene_file):
     assert costs["propagation"] > 0
 
 
-def test_it_explains_in_a_table(scene_file):
+def test_simulate_explains_effects_in_a_table(scene_file):
     result = simulate(scene_file, "--explain", "--quiet")
     assert result.exit_code == 0
     lines = result.stdout.splitlines()
@@ -122,7 +122,7 @@ def test_it_explains_in_a_table(scene_file):
         assert any(re.match(rf"{name} +(on|off)\b", line) for line in lines)
 
 
-def test_tolerance_decides(scene_file):
+def test_tolerance_selects_the_effects(scene_file):
     def active(*arguments):
         report = json.loads(simulate(scene_file, "--force", "--explain", "--json", "--quiet", *arguments).stdout)
         return {effect["name"] for effect in report["effects"] if effect["on"]}
@@ -143,7 +143,7 @@ def test_tolerance_decides(scene_file):
         ("", ("--seed", "-1"), 2, "--seed"),
     ],
 )
-def test_it_refuses(tmp_path, text, arguments, code, message):
+def test_simulate_refuses_invalid_input(tmp_path, text, arguments, code, message):
     path = tmp_path / "scene.toml"
     if text is not None:
         path.write_text(text)
@@ -154,7 +154,7 @@ def test_it_refuses(tmp_path, text, arguments, code, message):
     assert list(tmp_path.iterdir()) == ([path] if text is not None else [])
 
 
-def test_it_says_when_modulators_are_overloaded(tmp_path):
+def test_simulate_reports_overloaded_modulators(tmp_path):
     path = tmp_path / "loud.toml"
     path.write_text(SCENE.replace(points=(SCENE.points[0].replace(strength_db=10.0),)).to_toml(), encoding="utf-8")
     result = simulate(path)
@@ -162,7 +162,7 @@ def test_it_says_when_modulators_are_overloaded(tmp_path):
     assert "of full scale, but modulators follow only up to 0.6; lower emitter.level_db" in result.stderr
 
 
-def test_it_writes_to_no_device_and_no_link(scene_file, tmp_path):
+def test_simulate_refuses_devices_and_links_as_output(scene_file, tmp_path):
     link = tmp_path / "link.h5"
     link.symlink_to(tmp_path / "nowhere.h5")
     for target in ("/dev/null", link):

@@ -34,7 +34,7 @@ def simulate(*arguments):
     return CliRunner().invoke(cli, ["simulate", *map(str, arguments)])
 
 
-def test_simulation_without_room_is_refused_before_anything_is_computed(path, monkeypatch):
+def test_simulation_without_free_space_is_refused_before_computing(path, monkeypatch):
     monkeypatch.setattr("ertis_numba.simulation.plan.make_plan", lambda _: pytest.fail("a plan was made"))
     began_s = time.monotonic()
     refused = simulate(path, "--count", 10**9)
@@ -47,7 +47,7 @@ def test_simulation_without_room_is_refused_before_anything_is_computed(path, mo
     assert not list(path.parent.glob("scene.h5*"))
 
 
-def test_truth_counts_for_the_room(path, monkeypatch):
+def test_ground_truth_is_part_of_the_required_space(path, monkeypatch):
     usage = namedtuple("usage", "total used free")  # noqa: PYI024  as in shutil
     words = 2 * 40_000
     free = 10**7 + words
@@ -58,7 +58,7 @@ def test_truth_counts_for_the_room(path, monkeypatch):
     assert "for 1 measurement of 1 sensor" in refused.stderr
 
 
-def test_truth_is_computed_measurement_by_measurement(path, monkeypatch):
+def test_ground_truth_is_computed_per_measurement(path, monkeypatch):
     done = []
     render, reflectors = Engine.render, Engine.reflectors
     monkeypatch.setattr(Engine, "render", lambda self, index=0: done.append(("words", index)) or render(self, index))
@@ -70,7 +70,7 @@ def test_truth_is_computed_measurement_by_measurement(path, monkeypatch):
     assert reported == [(kind, index) for index in (1, 2, 3) for kind in ("truth", "words")]
 
 
-def test_interrupted_simulation_leaves_nothing(path, monkeypatch):
+def test_interrupted_simulation_leaves_no_file(path, monkeypatch):
     def interrupt(self, index=0):
         if index == 2:
             raise KeyboardInterrupt
@@ -82,7 +82,7 @@ def test_interrupted_simulation_leaves_nothing(path, monkeypatch):
     assert [each.name for each in path.parent.iterdir()] == ["scene.toml"]
 
 
-def test_truth_log_of_several_blocks_reads_back(tmp_path, monkeypatch):
+def test_ground_truth_log_of_several_blocks_is_read_back(tmp_path, monkeypatch):
     monkeypatch.setattr("ertis_numba.storage.truth._BLOCK_ROWS", 2)
     rows = [
         tuple(
@@ -110,7 +110,7 @@ def test_truth_log_of_several_blocks_reads_back(tmp_path, monkeypatch):
     assert truth.left_out == ("doppler", "walls")
 
 
-def test_truth_log_names_the_folder_that_cannot_be_written(tmp_path):
+def test_ground_truth_log_names_the_unwritable_folder(tmp_path):
     with pytest.raises(DataError, match=r"gone: a temporary file cannot be written \(No such file or directory\); "):
         GroundTruthLog("", 5, folder=tmp_path / "gone")
 
@@ -165,13 +165,13 @@ def test_measurement_that_would_exceed_the_memory_is_refused_with_its_number(mon
         ({"tones": (Tone(frequency_hz=4e4, position_m=(0.0, 0.013, 0.01)),)}, r"tones\[0\]"),
     ],
 )
-def test_things_on_their_sensor_are_noted(changes, name):
+def test_objects_on_their_sensor_are_noted(changes, name):
     notes = make_plan(Scene(sensors=(SENSOR,), **changes)).notes
     assert re.match(rf"{name} is [\d.]+ mm from an emitter or a microphone of sensor at 0 s", notes[0])
     assert make_plan(scene_of(Point(range_m=0.6))).notes == ()
 
 
-def test_things_near_an_emitter_beside_the_array_are_noted():
+def test_objects_near_an_emitter_beside_the_array_are_noted():
     beside = SENSOR.replace(emitter=SENSOR.emitter.replace(position_m=(0.0, 0.2, 0.0)))
     near = make_plan(Scene(sensors=(beside,), points=(Point(position_m=(0.005, 0.2, 0.0)),))).notes
     assert re.match(r"points\[0\] is 5 mm from an emitter", near[0])

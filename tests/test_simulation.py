@@ -52,7 +52,7 @@ CALLS = {
 # ---- arrivals --------------------------------------------------------------------------------------
 
 
-def test_arrivals_follow_the_ways_of_the_sound():
+def test_arrival_times_follow_the_sound_paths():
     [echo] = ways(SCENE, "spreading")
     point_m = 0.7 * unit_vectors(np.radians(25), np.radians(-10))
     back_m = np.linalg.norm(point_m - microphones(SENSOR.array).positions_m, axis=1)
@@ -61,7 +61,7 @@ def test_arrivals_follow_the_ways_of_the_sound():
     assert echo.stretch is None
 
 
-def test_arrivals_carry_the_calibration_that_processing_takes_out():
+def test_arrivals_include_the_calibration_of_the_layout():
     array = SENSOR.array.replace(gain=(1.0, 0.5, 2.0), delay_s=(0.0, 1e-5, -1e-6))
     [plain], [calibrated] = ways(SCENE), ways(SCENE.replace(sensors=(SENSOR.replace(array=array),)))
     assert_allclose(calibrated.delay_s - plain.delay_s, [[0.0, 1e-5, -1e-6]], atol=1e-12)
@@ -88,7 +88,7 @@ def test_calls_arrive_on_time(range_m):
         assert abs(arrival_s(signal, SENSOR.call, wanted_s + 3e-7) - wanted_s) * 450e3 < 1e-5
 
 
-def test_bits_hold_the_arrival_and_the_amplitude():
+def test_bits_preserve_arrival_time_and_amplitude():
     """Through 4th order bits with dither, an arrival moves by less than 0.002 of a sample at 450 kHz."""
     scene = scene_of(Point(azimuth_deg=-40, range_m=0.6, strength_db=-15))
     simulator = Simulator(scene, plan=only("spreading"))
@@ -104,7 +104,7 @@ def test_bits_hold_the_arrival_and_the_amplitude():
 
 
 @pytest.mark.parametrize("name", CALLS)
-def test_signals_are_those_written_out_in_time(name):
+def test_rendered_signals_equal_the_time_domain_sum(name):
     call, bound_db = CALLS[name]
     points = (Point(azimuth_deg=20, range_m=0.5), Point(azimuth_deg=-60, range_m=0.6321), Point(range_m=0.05))
     scene = scene_of(*points, sensor=SENSOR.replace(call=call))
@@ -122,7 +122,7 @@ def test_fractional_delay_conserves_energy():
 
 
 @pytest.mark.parametrize("block", [4099, 16_384, 65_536])
-def test_blocks_do_not_show_in_signals(monkeypatch, block):
+def test_signals_are_independent_of_the_block_length(monkeypatch, block):
     sensor = SENSOR.replace(emitter=Emitter(diameter_m=0.02, direct_sound_db=-40))
     scene = scene_of(Point(azimuth_deg=30, range_m=0.7), Point(range_m=1.2), sensor=sensor)
     names = ("spreading", "absorption", "emitter_directivity", "direct_sound")
@@ -131,7 +131,7 @@ def test_blocks_do_not_show_in_signals(monkeypatch, block):
     assert error_db(heard(scene, *names), whole) < -100
 
 
-def test_an_echo_goes_on_in_the_next_block():
+def test_echo_continues_in_the_next_block():
     """The call spans the first edge between blocks."""
     scene = scene_of(Point(range_m=1.1), sensor=EAR)
     [echo] = ways(scene)
@@ -139,21 +139,21 @@ def test_an_echo_goes_on_in_the_next_block():
     assert error_db(heard(scene), written_out(SENSOR.call, echo.delay_s, echo.amplitude[..., 0], 40_000)) < -85
 
 
-def test_an_echo_past_the_record_is_not_heard():
+def test_echo_after_the_record_is_omitted():
     assert not heard(scene_of(Point(range_m=900))).any()
 
 
-def test_a_silent_sensor_hears_no_echo_of_its_own():
+def test_silent_sensor_receives_no_own_echo():
     scene = scene_of(Point(range_m=0.5), sensor=SENSOR.replace(emitter=Emitter(silent=True, direct_sound_db=0)))
     assert not heard(scene, "spreading", "direct_sound").any()
 
 
-def test_level_of_the_emitter_counts():
+def test_emitter_level_scales_the_echoes():
     quiet = SCENE.replace(sensors=(SENSOR.replace(emitter=Emitter(level_db=-12)),))
     assert_allclose(heard(quiet), heard(SCENE) * 10 ** (-12 / 20), atol=1e-15)
 
 
-def test_call_is_far_below_half_the_pdm_rate():
+def test_call_spectrum_is_far_below_half_the_pdm_rate():
     """What justifies evaluating the call at the PDM rate: nothing of it is left where it would alias."""
     fine = np.fft.rfft(call_at(CALLS["wide"][0], np.arange(400_000) / (8 * RATE_HZ)))
     frequency_hz = np.fft.rfftfreq(400_000, 1 / (8 * RATE_HZ))
@@ -164,7 +164,7 @@ def test_call_is_far_below_half_the_pdm_rate():
 # ---- bits ------------------------------------------------------------------------------------------
 
 
-def test_seed_and_index_decide_every_bit():
+def test_seed_and_index_determine_every_bit():
     first = render(NOISY)
     assert_array_equal(first.data, render(NOISY).data)
     others = [render(NOISY, 1), render(NOISY.replace(seed=8)), render(SCENE)]
@@ -174,7 +174,7 @@ def test_seed_and_index_decide_every_bit():
     assert (stamp.sensor, stamp.sequence, stamp.sync_count, stamp.timestamp_ns) == ("sensor", 1, 1, 50_000_000)
 
 
-def test_words_are_those_of_an_earlier_version():
+def test_simulated_words_equal_those_of_earlier_versions():
     """A change of these bits changes every shipped recording: then rebuild data/synthetic, and say so."""
     words = render(NOISY).data
     assert hashlib.sha256(words.tobytes()).hexdigest()[:16] == "6ef2f5669f9743ea"
@@ -186,7 +186,7 @@ def test_sensors_of_a_scene_differ_in_their_noise():
     assert np.mean(words[0] != words[1]) > 0.1
 
 
-def test_threads_do_not_decide_bits():
+def test_bits_are_independent_of_the_number_of_threads():
     words = [
         Simulator(NOISY, threads=threads).render().data for threads in range(1, kernels.load("cpu").max_threads + 1)
     ]
@@ -194,7 +194,7 @@ def test_threads_do_not_decide_bits():
         assert_array_equal(other, words[0])
 
 
-def test_the_order_of_measurements_does_not_matter():
+def test_measurements_are_independent_of_their_order():
     forth, back = Simulator(NOISY), Simulator(NOISY)
     words = [forth.render(index).data for index in (0, 1, 2)]
     for index in (2, 1, 0):
@@ -202,7 +202,7 @@ def test_the_order_of_measurements_does_not_matter():
 
 
 @pytest.mark.parametrize(("word_bits", "n_channels"), [(8, 1), (8, 8), (16, 17), (32, 33), (64, 64), (64, 1024)])
-def test_channels_lie_in_their_bits(word_bits, n_channels):
+def test_each_channel_is_in_its_bit(word_bits, n_channels):
     array = line_array(n_channels, 1e-3).replace(word_bits=word_bits)
     sensor = SENSOR.replace(array=array, recording=Recording(n_samples=601))
     measurement = Simulator(scene_of(sensor=sensor), plan=only()).render()
@@ -214,7 +214,7 @@ def test_channels_lie_in_their_bits(word_bits, n_channels):
     assert np.all(np.abs(bits[:n_channels].mean(axis=1)) < 0.2)
 
 
-def test_parts_of_a_large_array_hear_as_the_whole():
+def test_large_array_is_rendered_in_equal_parts():
     """Channels are rendered 128 at a time; none of them notices."""
     sensor = SENSOR.replace(array=line_array(300, 1e-3), recording=Recording(n_samples=12_000))
     scene = scene_of(Point(range_m=0.2, azimuth_deg=40, strength_db=-50), sensor=sensor)
@@ -232,12 +232,12 @@ def test_disabled_channels_hold_zeros():
 
 
 @pytest.mark.parametrize("n_samples", [1, 7, 4099, 32_769])
-def test_odd_records_render(n_samples):
+def test_records_of_odd_length_are_rendered(n_samples):
     scene = scene_of(Point(range_m=0.05), sensor=EAR.replace(recording=Recording(n_samples=n_samples)))
     assert Simulator(scene, plan=only("spreading")).render().data.shape == (n_samples,)
 
 
-def test_memory_does_not_grow_with_the_record():
+def test_memory_is_independent_of_the_record_length():
     long = SCENE.replace(sensors=(SENSOR.replace(recording=Recording(n_samples=1_500_000)),))
     simulator = Simulator(long, plan=only("spreading"))
     tracemalloc.start()
@@ -247,17 +247,17 @@ def test_memory_does_not_grow_with_the_record():
     assert peak < 15e6  # the words take 1.5 MB, the signals would take 36 MB
 
 
-def test_index_is_checked():
+def test_invalid_measurement_index_is_refused():
     with pytest.raises(ArgumentError, match="index is -1; give a whole number of at least 0"):
         render(SCENE, -1)
 
 
-def test_sensor_is_checked():
+def test_unknown_sensor_is_refused():
     with pytest.raises(ArgumentError, match="sensor 'left' is unknown; known are sensor"):
         Simulator(SCENE, sensor="left")
 
 
-def test_a_plan_is_made_where_none_is_given():
+def test_effect_plan_is_made_by_default():
     simulator = Simulator(SCENE)
     assert simulator.plan == make_plan(SCENE)
     assert "spreading" in simulator.plan.active
@@ -266,7 +266,7 @@ def test_a_plan_is_made_where_none_is_given():
 # ---- truth -----------------------------------------------------------------------------------------
 
 
-def test_reflectors_are_the_points_strongest_first():
+def test_reflectors_are_sorted_by_level():
     points = (
         Point(azimuth_deg=10, range_m=1.0, strength_db=-20),
         Point(azimuth_deg=-20, elevation_deg=5, range_m=2.0, strength_db=0),
@@ -279,7 +279,7 @@ def test_reflectors_are_the_points_strongest_first():
     assert Simulator(scene_of()).reflectors() == []
 
 
-def test_reflectors_are_seen_from_a_turned_sensor():
+def test_reflectors_are_in_the_frame_of_a_rotated_sensor():
     sensor = SENSOR.replace(position_m=(1.0, 2.0, 0.5), yaw_deg=90, pitch_deg=30)
     ahead_m = np.array([1.0, 2.0, 0.5]) + 0.8 * unit_vectors(np.radians(90), np.radians(30))
     above_m = np.array([1.0, 2.0, 0.5]) + 0.9 * unit_vectors(np.radians(90), np.radians(50))

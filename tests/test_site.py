@@ -19,7 +19,7 @@ def helps(command):
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_addresses_of_nodes_are_no_links(name):
+def test_node_addresses_are_not_links(name):
     """Nobody can follow them."""
     core = pytest.importorskip("docutils.core", reason="docutils comes with what makes the site")
     nodes = pytest.importorskip("docutils.nodes")

@@ -25,19 +25,19 @@ def door(tmp_path):
 # Sockets
 
 
-def test_an_address_that_others_can_reach_needs_keys_on_both_sides():
+def test_public_address_requires_keys_on_both_sides():
     with zmq.Context() as context:
         for make in (sockets.server, sockets.client):
             with pytest.raises(ArgumentError, match="there are no keys"):
                 make(context, "tcp://192.0.2.1:5601", keys=None)
 
 
-def test_an_address_that_is_in_use_is_told(door):
+def test_address_in_use_is_reported(door):
     with pytest.raises(NetworkError, match="is in use by"):
         sockets.server(door.context, door.address, keys=None)
 
 
-def test_a_server_on_all_addresses_is_told_as_one_that_can_be_connected_to(tmp_path):
+def test_wildcard_server_reports_a_connectable_address(tmp_path):
     LISTED.save(tmp_path / "allow.toml")
     with (
         zmq.Context() as context,
@@ -46,7 +46,7 @@ def test_a_server_on_all_addresses_is_told_as_one_that_can_be_connected_to(tmp_p
         assert sockets.bound(server).startswith("tcp://127.0.0.1:")
 
 
-def test_a_refusal_that_comes_at_once_is_told(tmp_path):
+def test_immediate_refusal_is_reported(tmp_path):
     """Between connecting and watching, everything may have happened already."""
     with (
         Door(tmp_path) as door,
@@ -63,7 +63,7 @@ def test_a_refusal_that_comes_at_once_is_told(tmp_path):
 # Hostile connections
 
 
-def test_a_server_has_room_for_more_connections_than_a_process_has_by_default():
+def test_server_accepts_more_connections_than_the_default_limit():
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (1024, hard))
     try:
@@ -73,7 +73,7 @@ def test_a_server_has_room_for_more_connections_than_a_process_has_by_default():
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
-def test_garbage_on_the_port_harms_nobody(door):
+def test_garbage_on_the_port_affects_no_client(door):
     """Seed 3."""
     random_ = random.Random(3)
     robot = door.knock(ROBOT)
@@ -91,7 +91,7 @@ def test_garbage_on_the_port_harms_nobody(door):
     assert {who.name for _, who in door.came} == {"robot", "viewer"}
 
 
-def test_a_frame_that_is_too_long_ends_its_connection_alone(tmp_path):
+def test_overlong_frame_closes_only_its_connection(tmp_path):
     with Door(tmp_path, with_keys=False, max_bytes=1000) as door:
         good, bad = door.knock(None), door.knock(None, text=bytes(2000))
         assert door.until(lambda: door.came)
@@ -101,7 +101,7 @@ def test_a_frame_that_is_too_long_ends_its_connection_alone(tmp_path):
         assert not any(len(text) > 1000 for text, _ in door.came)
 
 
-def test_two_hundred_slow_connections_keep_nobody_out_and_are_hung_up_on(door):
+def test_slow_connections_are_closed_and_block_nobody(door):
     handshakes = [raw.create_connection(("127.0.0.1", door.port)) for _ in range(200)]
     try:
         for number, stranger in enumerate(handshakes):

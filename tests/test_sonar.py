@@ -123,14 +123,14 @@ def refusal(device, *, timeout_s=0.2):
 # Opening
 
 
-def test_open(device):
+def test_driver_opens_a_device(device):
     with SonarDriver.open(device.port) as sonar:
         assert (sonar.port, sonar.serial_number, sonar.firmware) == (device.port, "left", "1.0.0")
         assert sonar.call_hash() == 0
         assert sonar.dropped == 0
 
 
-def test_a_port_that_another_program_has_open(device):
+def test_port_in_use_is_refused(device):
     with serial.Serial(device.port, exclusive=True), pytest.raises(SonarError, match="is in use by another") as caught:
         SonarDriver.open("left")
     assert caught.value.errno == errno.EBUSY
@@ -138,13 +138,13 @@ def test_a_port_that_another_program_has_open(device):
     SonarDriver.open("left").close()
 
 
-def test_what_is_no_serial_port(tmp_path):
+def test_path_other_than_a_serial_port_is_refused(tmp_path):
     (tmp_path / "file.txt").touch()
     with pytest.raises(SonarError, match=r"file\.txt is not a usable serial port \(.*; give another"):
         SonarDriver.open(str(tmp_path / "file.txt"))
 
 
-def test_a_program_is_told_what_is_wrong_with_a_port(tmp_path, monkeypatch):
+def test_driver_errors_name_the_port_and_the_fault(tmp_path, monkeypatch):
     (tmp_path / "file.txt").touch()
     with pytest.raises(SonarError) as caught:
         SonarDriver.open(str(tmp_path / "file.txt"))
@@ -162,7 +162,7 @@ def test_a_program_is_told_what_is_wrong_with_a_port(tmp_path, monkeypatch):
     assert caught.value.errno == errno.EINVAL
 
 
-def test_a_port_in_a_program_with_more_than_a_thousand_open_files(device):
+def test_driver_works_with_more_than_1000_open_files(device):
     before = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(4096, before[1]), before[1]))
     with ExitStack() as stack:
@@ -179,7 +179,7 @@ def test_a_port_in_a_program_with_more_than_a_thousand_open_files(device):
 @pytest.mark.parametrize(
     ("code", "text"), [(errno.EACCES, "requires permission; .*dialout"), (errno.EIO, "does not exist any more")]
 )
-def test_a_port_that_the_system_refuses(device, monkeypatch, code, text):
+def test_port_without_permission_is_refused(device, monkeypatch, code, text):
     def refuse(*_, **__):
         raise serial.SerialException(code, "could not open port")
 
@@ -189,7 +189,7 @@ def test_a_port_that_the_system_refuses(device, monkeypatch, code, text):
     assert caught.value.errno == (errno.ENOENT if code == errno.EIO else code)
 
 
-def test_a_silent_device(device):
+def test_silent_device_is_reported(device):
     device.quirks = Quirks(silent=True)
     wanted = r"does not answer 'firmware version\?' within 0.2 s; is it an eRTIS"
     with pytest.raises(SonarError, match=wanted) as caught:
@@ -197,7 +197,7 @@ def test_a_silent_device(device):
     assert caught.value.errno == errno.ETIMEDOUT
 
 
-def test_a_device_of_another_kind():
+def test_device_of_another_kind_is_reported():
     error = refusal(Fake(lambda _, write: write(b"OK")))
     assert "does not answer 'firmware version?' within 0.2 s, but sends b'OK'" in str(error)
     error = refusal(Fake(lambda _, write: write(b"unknown command\r\n")))
@@ -207,7 +207,7 @@ def test_a_device_of_another_kind():
     assert "answers 'firmware version?' with 1 and then with 2" in str(error)
 
 
-def test_a_device_that_never_stops_sending():
+def test_endlessly_sending_device_is_reported():
     ended = threading.Event()
     with Fake(obedient) as device:
 
@@ -225,7 +225,7 @@ def test_a_device_that_never_stops_sending():
             talker.join()
 
 
-def test_a_stream_that_a_crashed_program_left(device):
+def test_stream_left_by_a_crashed_program_is_discarded(device):
     registers = device.registers
     registers.n_bytes, registers.armed = 4 * N_SAMPLES, 1
     with SyncChain([device], 50.0):
@@ -238,7 +238,7 @@ def test_a_stream_that_a_crashed_program_left(device):
             assert not sonar.receiver.rejected
 
 
-def test_half_a_command_that_a_crashed_program_left(device):
+def test_partial_command_left_by_a_crashed_program_is_discarded(device):
     with serial.Serial(device.port) as port:
         port.write(b"!C,12")
     SonarDriver.open("left").close()
@@ -247,7 +247,7 @@ def test_half_a_command_that_a_crashed_program_left(device):
 # Setting up
 
 
-def test_everything_is_told(device, caplog):
+def test_driver_sends_the_whole_configuration(device, caplog):
     setup = Setup.of(SETTINGS.replace(recording=Recording(n_samples=65_536, sample_rate_hz=1_125_000.0)), emissions=3)
     with SonarDriver.open("left") as sonar:
         assert device.registers.armed == 0
@@ -269,7 +269,7 @@ def test_everything_is_told(device, caplog):
         assert (reported.counter, caplog.text) == (12, "")
 
 
-def test_a_slow_device_gets_its_call(device):
+def test_slow_device_receives_its_call(device):
     device.quirks = Quirks(answer_delay_s=2e-3)
     setup = Setup.of(SETTINGS.replace(call=Call(duration_s=2e-4)))
     with SonarDriver.open("left", timeout_s=0.2) as sonar:
@@ -277,7 +277,7 @@ def test_a_slow_device_gets_its_call(device):
         assert np.array_equal(device.registers.codes[: len(setup.codes)], setup.codes)
 
 
-def test_a_call_that_did_not_arrive(device):
+def test_call_that_did_not_arrive_is_reported(device):
     device.quirks = Quirks(wrong_hash=True)
     setup = Setup.of(SETTINGS)
     wanted, held = f"{call_hash(setup.codes):#06x}", f"{call_hash(setup.codes) ^ 1:#06x}"
@@ -288,14 +288,14 @@ def test_a_call_that_did_not_arrive(device):
         sonar.configure(setup)
 
 
-def test_a_device_that_falls_silent(device):
+def test_device_that_falls_silent_is_reported(device):
     with SonarDriver.open("left", timeout_s=0.1) as sonar:
         device.quirks = Quirks(silent=True)
         with pytest.raises(SonarError, match=r"does not answer 'SYNC input 1: off' within 0\.1 s"):
             sonar.configure(Setup.of(SETTINGS))
 
 
-def test_answers_that_are_missing_name_their_command():
+def test_missing_answers_name_their_command():
     def forgetful(line, write):
         if not line.startswith((b"!C,21,", b"!L")):
             obedient(line, write)
@@ -313,7 +313,7 @@ def test_answers_that_are_missing_name_their_command():
 # Measuring
 
 
-def test_measurements_on_command(sonar):
+def test_driver_measures_on_command(sonar):
     before = time.monotonic_ns(), time.time_ns()
     blocks = [sonar.measure() for _ in range(4)]
     assert all(is_block(block, index, WORDS[index % 3]) for index, block in enumerate(blocks))
@@ -325,7 +325,7 @@ def test_measurements_on_command(sonar):
     assert (sonar.dropped, sonar.receiver.lost, sonar.receiver.rejected.total()) == (0, 0, 0)
 
 
-def test_what_cannot_be_emitted_is_refused(device):
+def test_unplayable_call_is_refused(device):
     setup = Setup.of(SETTINGS, active=False)
     with SonarDriver.open("left") as sonar:
         sonar.configure(setup)
@@ -338,7 +338,7 @@ def test_what_cannot_be_emitted_is_refused(device):
         assert is_block(sonar.measure(), 2, PASSIVE[2])
 
 
-def test_what_lay_there_is_dropped(sonar, device):
+def test_stale_bytes_are_dropped(sonar, device):
     device.registers.armed = 1
     assert device.trigger()
     wait_for_bytes(device)
@@ -346,7 +346,7 @@ def test_what_lay_there_is_dropped(sonar, device):
     assert sonar.dropped == BLOCK_BYTES
 
 
-def test_a_measurement_that_comes_too_late(sonar, device):
+def test_late_measurement_is_not_taken_for_the_next(sonar, device):
     device.quirks = Quirks(bytes_per_s=200_000)
     with pytest.raises(
         SonarError, match=r"no complete measurement within 0\.53 s; \d+ of 131084 bytes arrived: measure"
@@ -360,7 +360,7 @@ def test_a_measurement_that_comes_too_late(sonar, device):
 
 
 @pytest.mark.parametrize("pause_s", [0.0, 0.02])
-def test_a_measurement_that_comes_in_the_next_one_s_place(pause_s):
+def test_delayed_measurement_is_recognised_by_its_number(pause_s):
     """It is wholly there, but its number tells."""
     asked = []
 
@@ -381,7 +381,7 @@ def test_a_measurement_that_comes_in_the_next_one_s_place(pause_s):
         assert sonar.receiver.rejected == {"counter": BLOCK_BYTES}
 
 
-def test_a_byte_that_is_lost_costs_one_measurement():
+def test_lost_byte_loses_one_measurement():
     counters = itertools.count()
 
     def lossy(line, write):
@@ -399,7 +399,7 @@ def test_a_byte_that_is_lost_costs_one_measurement():
         assert sonar.receiver.rejected == {"cut short": BLOCK_BYTES - 1}
 
 
-def test_a_command_that_is_lost_does_not_shift_the_numbers():
+def test_lost_command_does_not_shift_the_numbers():
     """Each measurement has one of its own, even if the device has not counted."""
     counters = []
 
@@ -418,7 +418,7 @@ def test_a_command_that_is_lost_does_not_shift_the_numbers():
 
 
 @pytest.mark.usefixtures("device")
-def test_bits_that_cannot_be_true():
+def test_implausible_bits_are_refused():
     with SonarDriver.open("left") as sonar:
         sonar.configure(Setup.of(SETTINGS), bits=lambda words: "odd" if np.array_equal(words, WORDS[0]) else None)
         with pytest.raises(SonarError, match="no complete measurement"):
@@ -430,7 +430,7 @@ def test_bits_that_cannot_be_true():
 # Listening
 
 
-def test_twenty_pulses_a_second(folder):
+def test_driver_receives_twenty_pulses_per_second(folder):
     """All that the device sent is here; on a busy machine it drops what nobody reads in time, and says so."""
     log = Log()
     with Emulator(WORDS, link=folder / "right", log=log) as device, SonarDriver.open("right") as sonar:
@@ -461,7 +461,7 @@ def test_listening_stops_at_once(armed):
     timer.join()
 
 
-def test_a_stopped_dialogue_fails_and_can_be_repeated(device):
+def test_stopped_command_fails_and_can_be_repeated(device):
     setup = Setup.of(SETTINGS)
     with pytest.raises(SonarError):
         SonarDriver.open(device.port, stop=lambda: True)
@@ -475,7 +475,7 @@ def test_a_stopped_dialogue_fails_and_can_be_repeated(device):
         assert sonar.measure().data.shape == WORDS[0].shape
 
 
-def test_closing_ends_listening_and_disarms(armed, device):
+def test_close_ends_listening_and_disarms_the_trigger(armed, device):
     timer = threading.Timer(0.1, armed.close)
     timer.start()
     assert list(armed.listen(stop=lambda: False, timeout_s=TIMEOUT_S)) == []
@@ -490,12 +490,12 @@ def test_closing_ends_listening_and_disarms(armed, device):
         list(armed.listen(stop=lambda: False, timeout_s=TIMEOUT_S))
 
 
-def test_nothing_to_listen_to(armed):
+def test_listening_without_pulses_ends(armed):
     with pytest.raises(SonarError, match=r"nothing arrived within 0\.\d+ s; check the trigger and its cable"):
         list(armed.listen(stop=lambda: False, timeout_s=0.1))
 
 
-def test_listening_without_a_byte_sent(device):
+def test_listening_needs_no_sent_byte(device):
     """Somebody else has set the device up; the counter may stand anywhere."""
     registers = device.registers
     registers.n_bytes, registers.armed, registers.counter = 4 * N_SAMPLES, 1, 40
@@ -510,7 +510,7 @@ def test_listening_without_a_byte_sent(device):
     assert device.registers.n_codes == 0
 
 
-def test_listening_for_another_length(device):
+def test_listening_with_another_record_length_is_reported(device):
     registers = device.registers
     registers.n_bytes, registers.armed = 4 * N_SAMPLES, 1
     with SonarDriver.open("left", passive=True) as sonar, SyncChain([device], 50.0):
@@ -521,7 +521,7 @@ def test_listening_for_another_length(device):
             list(sonar.listen(stop=lambda: False, timeout_s=0.1))
 
 
-def test_a_pause_within_a_measurement(monkeypatch):
+def test_pause_within_a_measurement_drops_it(monkeypatch):
     """What began is given up, and the next one is whole."""
     monkeypatch.setattr("ertis_numba.devices.sonar._MARGIN_S", 0.1)
 
@@ -547,7 +547,7 @@ def test_a_pause_within_a_measurement(monkeypatch):
 
 
 @pytest.mark.usefixtures("device")
-def test_what_needs_something_else_first():
+def test_operations_out_of_order_are_refused():
     with SonarDriver.open("left") as sonar:
         with pytest.raises(SonarError, match=r"is not configured; call configure\(\) first"):
             sonar.measure()
@@ -562,7 +562,7 @@ def test_what_needs_something_else_first():
 # Unplugged
 
 
-def test_unplugged_within_a_measurement(sonar, device):
+def test_unplugging_within_a_measurement_is_reported(sonar, device):
     first = sonar.port
     assert is_block(sonar.measure(), 0, WORDS[0])
     device.quirks = Quirks(bytes_per_s=400_000)
@@ -580,7 +580,7 @@ def test_unplugged_within_a_measurement(sonar, device):
     assert is_block(sonar.measure(), 2, WORDS[2])
 
 
-def test_unplugged_while_listening(armed, device):
+def test_unplugging_while_listening_is_reported(armed, device):
     with SyncChain([device], 50.0):
         blocks = taken(armed, 3)
         device.unplug()
@@ -597,7 +597,7 @@ def test_unplugged_while_listening(armed, device):
     assert counters[-1] + 1 <= back.counter < counters[-1] + 20
 
 
-def test_a_device_that_does_not_come_back(sonar, device):
+def test_device_that_does_not_return_is_reported(sonar, device):
     device.unplug()
     with pytest.raises(SonarDisconnectedError, match=r"did not return within 0\.1 s: serial port .* does not exist"):
         sonar.reconnect(within_s=0.1)
@@ -608,7 +608,7 @@ def test_a_device_that_does_not_come_back(sonar, device):
     timer.join()
 
 
-def test_a_device_that_takes_nothing(monkeypatch):
+def test_device_that_reads_nothing_is_reported(monkeypatch):
     """Its side of the line is full, since it does not read."""
     monkeypatch.setattr("ertis_numba.devices.line._WRITE_S", 0.05)
     master, slave = os.openpty()

@@ -11,7 +11,7 @@ MODULE = importlib.import_module("ertis_numba.kernels._cuda.combine_capon")
 N_MICS, N_RANGES, N_DIRECTIONS, N_SNAPSHOTS = 3, 40, 5, 4
 
 
-def test_rounds_of_directions_and_of_windows_leave_nothing_out(monkeypatch):
+def test_capon_rounds_cover_all_directions_and_ranges(monkeypatch):
     random = np.random.default_rng(1)
     signals = random.standard_normal((N_MICS, 1, N_RANGES + 9, 2)).astype(np.float32).view(np.complex64)[..., 0]
     offsets = np.arange(N_MICS) * (N_RANGES + 9) + random.integers(0, 10, (N_DIRECTIONS, N_MICS))

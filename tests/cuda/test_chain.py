@@ -21,7 +21,7 @@ def pair(request):
         yield Pipeline(settings, device="cpu"), cuda, bound_db
 
 
-def test_image_is_the_processors(pair):
+def test_gpu_image_equals_cpu_image(pair):
     cpu, cuda, bound_db = pair
     assert cuda.settings == cpu.settings
     measurement = noise(cuda.settings)
@@ -36,7 +36,7 @@ def cuda():
         yield pipeline
 
 
-def test_batch_of_more_than_there_are_lanes_is_bit_by_bit_what_one_at_a_time_gives(cuda):
+def test_batch_beyond_the_lanes_equals_single_measurements(cuda):
     measurements = [noise(cuda.settings, seed) for seed in range(4)]
     single = [cuda.process(measurement).amplitude.copy() for measurement in (measurements[0], measurements[3])]
     batch = [image.amplitude for image in cuda.process_batch(measurements)]
@@ -44,14 +44,14 @@ def test_batch_of_more_than_there_are_lanes_is_bit_by_bit_what_one_at_a_time_giv
     assert len({amplitude.tobytes() for amplitude in batch}) == 4
 
 
-def test_image_goes_where_it_is_wanted(cuda):
+def test_image_is_written_to_the_given_array(cuda):
     out = np.full((len(cuda.grid), len(cuda.range_m)), -1.0, dtype=np.float32)
     measurement = noise(cuda.settings)
     assert cuda.process(measurement, out).amplitude is out
     assert (out == cuda.process(measurement).amplitude).all()
 
 
-def test_signals_and_analytic_signals_are_the_processors():
+def test_gpu_signals_equal_cpu_signals():
     settings = PLANS["float32"][0]
     words = noise(settings).data.reshape(-1, 1)
     signals = 0.5 * np.random.default_rng(3).standard_normal((2, settings.recording.n_samples))

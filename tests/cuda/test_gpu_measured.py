@@ -41,7 +41,7 @@ def _quick(monkeypatch):
     monkeypatch.setattr(timing, "_WARM_UP_S", 0.0)
 
 
-def test_ceilings_compute():
+def test_gpu_ceiling_kernels_compute():
     sums = cuda.to_device(np.zeros(4, np.float32))
     ceilings.multiply_add(3, sums)  # each of eight sums tends to 1 / (1 - 1/2)
     assert sums.copy_to_host() == pytest.approx(16)
@@ -56,7 +56,7 @@ def test_ceilings_compute():
     assert SIMULATED or min(rates.values()) > 0
 
 
-def test_stopwatch_adds_up_what_has_one_name():
+def test_stopwatch_adds_parts_of_the_same_name():
     watch, lane = Stopwatch(), kernels.load("cuda").memory().lane()
     with lane.entered():
         for _ in range(2):  # the second time from the start again
@@ -82,7 +82,7 @@ def test_paper_and_ceilings_report_rows():
     assert (reached["terms"], reached["directions"]) == (2, "2d:2")  # one microphone, two samples
 
 
-def test_rivals_race_after_their_images_were_compared(monkeypatch):
+def test_rival_images_are_compared_before_timing(monkeypatch):
     monkeypatch.setattr(rivals, "LIBRARIES", {"NumPy": "numpy", "Louder": "numpy", "Missing": "no_such_module"})
     library = rivals.numpy_library()
     louder = dataclasses.replace(library, rfft=lambda signals: 1.01 * library.rfft(signals))
@@ -106,7 +106,7 @@ def test_wrong_image_is_not_timed(monkeypatch):
         next(gpu_parts.paper(SCALE))
 
 
-def test_simulator_is_refused():
+def test_gpu_benchmark_refuses_the_simulator():
     if not SIMULATED:
         pytest.skip("a GPU is not refused")
     with pytest.raises(DeviceError, match="device 'cuda' is simulated here, so its times are meaningless"):

@@ -16,12 +16,12 @@ def _nothing(out):
 
 
 @pytest.mark.parametrize("grid", [(1, 65_536), (1, 1, 70_000)])
-def test_grid_of_too_many_blocks(grid):
+def test_launch_of_too_many_blocks_is_refused(grid):
     with pytest.raises(DeviceError, match=r"a grid of \d+,\d+ blocks; the limit is 65,535\. Give a shorter"):
         lane.launch(_nothing, grid, (1,), np.zeros(1, np.float32))
 
 
-def test_more_numbers_than_32_bits_can_index():
+def test_arrays_beyond_32_bit_indices_are_refused():
     too_many = types.SimpleNamespace(size=2**32)
     with pytest.raises(DeviceError, match=r"would have to index 4,294,967,296 numbers; the limit is 4,294,967,295\."):
         terms.indexed(too_many)

@@ -36,7 +36,7 @@ def made(monkeypatch):
     return found
 
 
-def test_all_is_made_before_the_second_measurement(made):
+def test_no_memory_is_allocated_after_the_first_measurement(made):
     with Pipeline(SETTINGS, device="cuda") as pipeline:
         images = pipeline.process_batch([noise(SETTINGS)] * 3)
         n_made = len(made)
@@ -46,7 +46,7 @@ def test_all_is_made_before_the_second_measurement(made):
         assert len(made) == n_made
 
 
-def test_close_gives_all_back_without_the_garbage_collector(made):
+def test_close_frees_gpu_memory_without_garbage_collection(made):
     pipeline = Pipeline(SETTINGS, device="cuda")
     image = pipeline.process(noise(SETTINGS))
     before = image.amplitude.copy()
@@ -60,7 +60,7 @@ def test_close_gives_all_back_without_the_garbage_collector(made):
     assert (image.amplitude == before).all()
 
 
-def test_pipelines_share_a_gpu():
+def test_several_pipelines_share_a_gpu():
     settings = [SETTINGS, PLANS["float32"][0]]
     with Pipeline(settings[0], device="cuda") as first, Pipeline(settings[1], device="cuda") as second:
         images = [pipeline.process(noise(TINY)).amplitude.copy() for pipeline in (first, second, first, second)]
@@ -70,7 +70,7 @@ def test_pipelines_share_a_gpu():
 
 
 @pytest.mark.parametrize("n_before", [0, 5])
-def test_too_little_memory_is_told_with_how_much_and_what_to_do(monkeypatch, n_before):
+def test_too_little_gpu_memory_is_reported_with_size_and_remedy(monkeypatch, n_before):
     left = [n_before]
 
     def full(array, *_, make=cuda.to_device):
@@ -89,7 +89,7 @@ def test_too_little_memory_is_told_with_how_much_and_what_to_do(monkeypatch, n_b
 
 
 @pytest.mark.parametrize("use", [lambda lane, _: lane.send(np.zeros(5)), lambda _, memory: memory.image((3, 4))])
-def test_memory_that_cannot_be_pinned_is_told(monkeypatch, use):
+def test_unpinnable_memory_is_reported(monkeypatch, use):
     def full(*_):
         raise CudaAPIError(2, "CUDA_ERROR_OUT_OF_MEMORY")
 
@@ -102,7 +102,7 @@ def test_memory_that_cannot_be_pinned_is_told(monkeypatch, use):
     assert [memory.image((3, 4)).shape for _ in range(9)] == [(3, 4)] * 9
 
 
-def test_what_did_not_fit_is_gone_where_the_error_is_caught(monkeypatch, made):
+def test_failed_allocation_is_freed_when_its_error_is_caught(monkeypatch, made):
     """So that a smaller pipeline can be made there."""
     left = [6]
 
@@ -121,7 +121,7 @@ def test_what_did_not_fit_is_gone_where_the_error_is_caught(monkeypatch, made):
     assert not alive
 
 
-def test_close_waits_for_what_is_under_way():
+def test_close_waits_for_running_measurements():
     """And refuses what comes later; the image of the measurement that was under way is whole."""
     pipeline = Pipeline(SETTINGS, device="cuda")
     expected = pipeline.process(noise(SETTINGS)).amplitude.copy()
@@ -146,7 +146,7 @@ def test_close_waits_for_what_is_under_way():
         chain.process(noise(SETTINGS).data.reshape(-1, 1), images[0])
 
 
-def test_other_errors_of_the_driver_are_not_hidden(monkeypatch):
+def test_other_driver_errors_are_not_hidden(monkeypatch):
     def broken(*_):
         raise CudaAPIError(700, "CUDA_ERROR_ILLEGAL_ADDRESS")
 
@@ -155,7 +155,7 @@ def test_other_errors_of_the_driver_are_not_hidden(monkeypatch):
         Pipeline(SETTINGS, device="cuda")
 
 
-def test_memory_of_an_image_is_used_again_when_nobody_looks_at_any_part_of_it():
+def test_image_memory_is_reused_once_no_view_of_it_exists():
     memory = kernels.load("cuda").memory()
     first = memory.image((3, 4))
     first[:] = 1
@@ -169,7 +169,7 @@ def test_memory_of_an_image_is_used_again_when_nobody_looks_at_any_part_of_it():
     assert (second == 2).all()
 
 
-def test_images_without_number_are_not_all_pinned(made, monkeypatch):
+def test_number_of_pinned_images_is_limited(made, monkeypatch):
     monkeypatch.setattr(_images, "_MAX_BYTES", 9 * 48)
     memory = kernels.load("cuda").memory()
     images = [memory.image((3, 4)) for _ in range(50)]

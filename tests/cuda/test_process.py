@@ -41,7 +41,7 @@ def run(recording, device, *arguments):
         return json.loads(done.stdout), np.array([image.amplitude for image in images])
 
 
-def test_device_is_told_and_all_measurements_are_there(made):
+def test_cuda_process_reports_device_and_all_measurements(made):
     for (plan, device), (report, amplitudes) in made.items():
         count = COUNT if plan == "explicit" else 1
         assert (report["device"], report["measurements"]) == (device, count)
@@ -49,38 +49,38 @@ def test_device_is_told_and_all_measurements_are_there(made):
         assert len({amplitude.tobytes() for amplitude in amplitudes}) == count
 
 
-def test_images_of_one_plan_differ_by_rounding_only(made):
+def test_cpu_and_cuda_images_differ_by_rounding_only(made):
     """Single precision, of which the two devices add up the terms in another order: -100 dB at most."""
     for cpu, cuda in zip(made["explicit", "cpu"][1], made["explicit", "cuda"][1], strict=True):
         assert reference.error_db(cpu, cuda) < -100
 
 
 @pytest.mark.parametrize("device", ["cpu", "cuda"])
-def test_chosen_plan_keeps_its_budget(made, device):
+def test_cuda_plan_keeps_its_budget(made, device):
     for exact, image in zip(made["exact", "cpu"][1], made["chosen", device][1], strict=True):
         assert reference.error_db(exact, image) < BUDGET_DB
 
 
-def test_images_of_plans_chosen_for_each_device_differ_by_their_errors_at_most(made):
+def test_images_of_cpu_and_cuda_plans_differ_by_their_errors_at_most(made):
     for cpu, cuda in zip(made["chosen", "cpu"][1], made["chosen", "cuda"][1], strict=True):
         assert reference.error_db(cpu, cuda) < BUDGET_DB + 6.1  # each as far off, on opposite sides
 
 
-def test_file_is_the_same_one_at_a_time(made, tmp_path):
+def test_cuda_file_is_independent_of_the_batch_size(made, tmp_path):
     recording = write_recording(tmp_path / "rec.h5", noise(TINIER.replace(accuracy=DIRECT), count=COUNT))
     report, amplitudes = run(recording, "cuda", "--batch", 1)
     assert report["measurements"] == COUNT
     assert amplitudes.tobytes() == made["explicit", "cuda"][1].tobytes()
 
 
-def test_threads_are_refused(tmp_path):
+def test_cuda_process_refuses_threads(tmp_path):
     recording = write_recording(tmp_path / "rec.h5", noise(TINIER, count=1))
     done = CliRunner().invoke(cli, ["process", str(recording), "--device", "cuda", "--threads", "2"])
     assert done.exit_code == 1
     assert done.stderr.startswith("ertis: error: --threads is 2; ")
 
 
-def test_simulator_is_never_chosen_by_itself(tmp_path):
+def test_auto_device_never_selects_the_simulator(tmp_path):
     if not kernels.load("cuda").simulated:
         pytest.skip("a GPU is chosen by itself")
     recording = write_recording(tmp_path / "rec.h5", noise(TINIER, count=1))

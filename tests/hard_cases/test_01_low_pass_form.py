@@ -56,7 +56,7 @@ def farthest(found, wanted):
     return float(max(min(abs(pole - other) for other in found) for pole in wanted))
 
 
-def test_poles_move_10_000_times_as_far_in_the_polynomial():
+def test_polynomial_poles_move_10_000_times_as_far_as_section_poles():
     _, denominator = scipy.signal.butter(ORDER, CUTOFF_HZ, fs=RATE_HZ)
     sections = scipy.signal.butter(ORDER, CUTOFF_HZ, fs=RATE_HZ, output="sos")
     wanted = true_poles()
@@ -65,7 +65,7 @@ def test_poles_move_10_000_times_as_far_in_the_polynomial():
     assert farthest([pole for section in sections for pole in roots(section[3:])], wanted) < 1e-6  # 2.4e-7
 
 
-def test_impulse_response_of_sections_errs_by_less_than_115_db():
+def test_sections_have_an_impulse_response_error_below_115_db():
     """-119 dB; the polynomial gives -23 dB in float32, and -196 dB in float64."""
     wanted = true_impulse_response()
     impulse = np.eye(1, N_SAMPLES)[0]
@@ -86,7 +86,7 @@ def test_impulse_response_of_sections_errs_by_less_than_115_db():
         ((25e3, 50e3), "bandpass", 4.5e6, 1.4),
     ],
 )
-def test_polynomial_is_unstable(band_hz, kind, rate_hz, largest):
+def test_polynomial_form_is_unstable(band_hz, kind, rate_hz, largest):
     """Radii of 1.02 at half the cutoff and of 1.03 for the paper's band pass; sections stay within."""
     _, denominator = scipy.signal.butter(ORDER, band_hz, kind, fs=rate_hz)
     sections = scipy.signal.butter(ORDER, band_hz, kind, fs=rate_hz, output="sos")
@@ -95,7 +95,7 @@ def test_polynomial_is_unstable(band_hz, kind, rate_hz, largest):
 
 
 @pytest.mark.filterwarnings("ignore:.*encountered:RuntimeWarning")
-def test_image_of_the_paper_needs_the_sections(monkeypatch):
+def test_paper_image_needs_second_order_sections(monkeypatch):
     """Within -100 dB of the float64 image as it is; with the same filters as polynomials it is lost."""
     settings = SHORT.replace(processing=SHORT.processing.replace(method="paper"))
     pipeline, measurement = Pipeline(settings), noise(SHORT)

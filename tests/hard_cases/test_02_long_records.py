@@ -45,7 +45,7 @@ def shifted_image(first, precision, shift=0):
 
 
 @pytest.mark.parametrize("precision", ["float32", "auto"])
-def test_the_end_of_the_record_is_imaged_as_its_beginning(precision):
+def test_end_of_a_long_record_is_imaged_like_its_start(precision):
     """At 640 m the image is that of the same bits at 0.4 m, to the last bit where both windows fall alike."""
     near, far = shifted_image(1000, precision), shifted_image(1000, precision, LATER)
     n_ranges = min(near.shape[1], far.shape[1])  # the last range may fall on either side of the window's edge
@@ -89,7 +89,7 @@ def peak_bytes(path, n_samples):
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="only Linux says how large a process ever was")
-def test_memory_grows_by_the_words_and_no_more(tmp_path):
+def test_memory_grows_only_by_the_samples(tmp_path):
     """Two records of 16 MiB at a time, the last and the next, of a file of 64 MiB; signals would take 128 MiB."""
     grown = peak_bytes(tmp_path / "long.h5", N_SAMPLES) - peak_bytes(tmp_path / "short.h5", 2**17)
     assert grown < 2.5 * N_SAMPLES

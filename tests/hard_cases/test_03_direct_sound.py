@@ -74,7 +74,7 @@ def strongest(image):
         (heard, 100, 1.9),
     ],
 )
-def test_an_echo_under_the_direct_sound_is_at_its_place(image_of, below_db, range_m):
+def test_echo_below_the_direct_sound_has_the_right_position(image_of, below_db, range_m):
     """Within 0.5° and 2 mm, at its level within 1.5 dB, and nothing else comes near to it beyond 0.5 m."""
     level_db = LOUDEST_DB - below_db
     simulator = simulator_of(echo(20.0, range_m, level_db), direct_sound_db=DIRECT_DB)
@@ -89,7 +89,7 @@ def test_an_echo_under_the_direct_sound_is_at_its_place(image_of, below_db, rang
 
 
 @pytest.mark.parametrize(("farther_m", "min_db"), [(0.1, 50), (0.2, 75), (0.3, 90), (0.5, 135), (1.5, 140)])
-def test_direct_sound_dies_out(farther_m, min_db):
+def test_direct_sound_decays_with_range(farther_m, min_db):
     """Of the loudest microphone: -54 dB at 10 cm, -77 at 20, -96 at 30, -143 at 50 and -149 beyond (float32)."""
     image = heard(simulator_of(direct_sound_db=DIRECT_DB))
     assert 20 * np.log10(beyond(image, farther_m).amplitude.max()) - LOUDEST_DB < -min_db
@@ -97,7 +97,7 @@ def test_direct_sound_dies_out(farther_m, min_db):
 
 @pytest.mark.parametrize("azimuth_deg", [25.0, -20.0])
 @pytest.mark.parametrize("image_of", [recorded, heard])
-def test_two_echoes_60_db_and_half_a_metre_apart(image_of, azimuth_deg):
+def test_echo_60_db_below_another_is_found(image_of, azimuth_deg):
     """Both within 0.5° and 2 mm, also in one direction."""
     points = echo(-20.0, 0.8, -10.0), echo(azimuth_deg, 1.3, -70.0)
     image = image_of(simulator_of(*points, direct_sound_db=-250.0))
@@ -128,7 +128,7 @@ def test_direct_sound_does_not_wrap_to_far_ranges(method):
     assert far_db[-100:].max() < -80
 
 
-def test_circular_convolution_wraps():
+def test_circular_convolution_wraps_around():
     """The naive form, a transform as long as the record: what precedes its start comes out at its end, unabated."""
     settings = Settings.from_preset("short_25_50")
     signal = (full_scale_noise(settings) & 1) * 2.0 - 1.0

@@ -55,14 +55,14 @@ def require_echo(image, changed_db, abs_db):
 
 @pytest.mark.parametrize(("method", "largest_db"), [("fast", -130), ("paper", -180)])
 @pytest.mark.parametrize("name", SILENT)
-def test_words_without_sound_give_nothing(name, method, largest_db):
+def test_record_without_sound_gives_an_empty_image(name, method, largest_db):
     """-146 dB of full scale at the most where the record is whole: offset and clock lie far out of the band."""
     settings = SETTINGS.replace(processing=SETTINGS.processing.replace(method=method))
     assert level_db(image_of(SILENT[name], settings)) < largest_db
 
 
 @pytest.mark.parametrize(("name", "largest_db"), [("all zero", -70), ("all one", -70), ("alternating", -100)])
-def test_the_step_at_the_beginning_of_the_record_is_all_there_is(name, largest_db):
+def test_constant_record_shows_only_its_initial_step(name, largest_db):
     """A constant begins at sample 0, a step of full scale: -79 dB there, -124 dB beyond 0.5 m."""
     image = image_of(SILENT[name], SETTINGS.replace(processing=SETTINGS.processing.replace(range_m=(0.0, 1.0))))
     assert level_db(image) < largest_db
@@ -70,26 +70,26 @@ def test_the_step_at_the_beginning_of_the_record_is_all_there_is(name, largest_d
 
 
 @pytest.mark.parametrize("fault", FAULTS.values(), ids=FAULTS)
-def test_one_channel_less_costs_its_share(fault):
+def test_missing_channel_lowers_the_level_by_its_share(fault):
     """One of 32: -0.28 dB."""
     require_echo(image_of(fault(echo_words(SETTINGS, **ECHO))), 20 * np.log10(31 / 32), 0.02)
 
 
 @pytest.mark.parametrize(("offset", "abs_db"), [(-0.01, 0.02), (0.1, 0.05), (0.3, 0.1)])
-def test_offset_changes_nothing(offset, abs_db):
+def test_offset_leaves_the_level_unchanged(offset, abs_db):
     """An offset of 0.3 of full scale changes the level by 0.05 dB, which is the bits' own noise."""
     require_echo(image_of(words_of(echo_signals(SETTINGS, **ECHO) + offset)), 0, abs_db)
 
 
 @pytest.mark.parametrize("rate_hz", [30_000.0, 40_000.0, 45_000.0])
-def test_idle_tone_of_one_channel_leaves_the_echo(rate_hz):
+def test_idle_tone_of_one_channel_keeps_the_echo(rate_hz):
     """A tone of -29 dB in the middle of the band, in place of the microphone's signal."""
     words = (echo_words(SETTINGS, **ECHO) & ~CHANNEL) | (pulses(rate_hz) * CHANNEL)
     require_echo(image_of(words), 20 * np.log10(31 / 32), 0.05)
 
 
 @pytest.mark.parametrize("rate_hz", [30_000.0, 40_000.0, 45_000.0])
-def test_idle_tone_of_all_channels_is_as_strong_as_the_filter_lets_it_be(rate_hz):
+def test_idle_tone_of_all_channels_has_the_gain_of_the_filter(rate_hz):
     """Compression spreads a tone over the length of the call: within 0.3 dB of the filter's gain there."""
     image = image_of(pulses(rate_hz) * ALL)
     n_fft, signal_rate_hz = 2**14, SETTINGS.signal_rate_hz

@@ -25,7 +25,7 @@ SPEED_M_S = 343.0
 
 
 @pytest.mark.parametrize(("range_m", "plane_db"), [(0.05, -9.0), (0.1, -3.2), (0.2, -0.8), (0.3, -0.4)])
-def test_plane_waves_lose_what_spherical_ones_keep(range_m, plane_db):
+def test_spherical_wavefronts_keep_the_level_of_near_echoes(range_m, plane_db):
     """Focused on plane waves, the echo of a point is weaker by 0.4 dB at 30 cm and by 9 dB at 5 cm.
 
     At 5 cm the array of 7 cm is no longer small, and the image's peak stands 11° off; from 10 cm on it is within
@@ -56,7 +56,7 @@ def test_range_0_is_in_the_image():
 @pytest.mark.parametrize(
     ("range_m", "bound_s"), [(0.0, 1e-19), (1e-9, 1e-19), (0.05, 1e-18), (1.0, 1e-17), (640.0, 2e-15), (1e4, 3e-14)]
 )
-def test_delays_of_points_are_true_to_the_last_digit(range_m, bound_s):
+def test_delays_of_points_are_exact_to_the_last_digit(range_m, bound_s):
     """Against 50 digits: at 10 km, ``‖r u − p‖ − r`` cancels 11 of 16 digits and leaves 7e-15 s; float32 leaves 4e-6 s.
 
     A period of 50 kHz is 2e-5 s long, and a phase of the image 2e-6 s or less.
@@ -72,7 +72,7 @@ def test_delays_of_points_are_true_to_the_last_digit(range_m, bound_s):
                 assert abs(wanted_s - mpmath.mpf(delay_s)) < bound_s
 
 
-def test_delays_in_float32_are_off_by_a_fifth_of_a_period_at_10_km():
+def test_delays_in_float32_err_by_a_fifth_of_a_period_at_10_km():
     """The naive form: 4e-6 s at 10 km, 3e-7 s at 640 m."""
     toward = unit_vectors(np.linspace(-1.5, 1.5, 20), np.zeros(20))
     for range_m, error_s in ((640.0, 1e-7), (1e4, 2e-6)):
@@ -82,7 +82,7 @@ def test_delays_in_float32_are_off_by_a_fifth_of_a_period_at_10_km():
         assert np.abs(naive_s - exact_s).max() > error_s
 
 
-def test_a_microphone_exactly_at_the_focus():
+def test_microphone_at_the_focus_has_a_finite_delay():
     """It hears the echo sooner by the whole range, and no distance of 0 is divided by."""
     place_m = PLACES_M[5]
     range_m = float(np.linalg.norm(place_m))
@@ -104,7 +104,7 @@ def test_delays_of_a_point_at_the_centre_are_distances():
 
 
 @pytest.mark.parametrize("range_m", [0.05, 0.1])
-def test_a_target_so_near_is_found(range_m):
+def test_target_within_the_length_of_the_call_is_found(range_m):
     """Its echo comes before the call is over."""
     scene = scene_of(Point(azimuth_deg=20, range_m=range_m, strength_db=-60), sensor=EIGHT)
     [peak] = find_peaks(image_of(scene), top=1)
@@ -113,14 +113,14 @@ def test_a_target_so_near_is_found(range_m):
 
 
 @pytest.mark.parametrize("range_m", [0.001, 0.005])
-def test_a_target_upon_the_array_is_bounded(range_m):
+def test_target_on_the_array_has_a_bounded_level(range_m):
     scene = scene_of(Point(range_m=range_m, strength_db=-90), sensor=EIGHT)
     assert image_of(scene).amplitude.max() < 1
     assert np.abs(heard(scene, "spreading")).max() < 1.001 * 10 ** (-90 / 20) * 1e4
 
 
 @pytest.mark.parametrize("place_m", [(0.0, 0.0, 0.0), SENSOR.array.positions_m[1]])
-def test_a_target_at_emitter_or_microphone_is_bounded(place_m):
+def test_target_at_emitter_or_microphone_has_a_bounded_level(place_m):
     sensor = SENSOR.replace(emitter=Emitter(diameter_m=0.02), electronics=Electronics(microphone_diameter_m=0.002))
     scene = scene_of(Point(position_m=place_m, strength_db=-90), sensor=sensor)
     signals = heard(scene, *EFFECTS)
@@ -128,7 +128,7 @@ def test_a_target_at_emitter_or_microphone_is_bounded(place_m):
     assert np.abs(signals).max() < 1.001 * 10 ** (-90 / 20) * 1e4
 
 
-def test_the_truth_of_a_target_in_the_middle_of_the_array():
+def test_ground_truth_of_a_target_at_the_centre_is_finite():
     [reflector] = seen(scene_of(Point(position_m=(0.0, 0.0, 0.0))), "spreading")
     assert reflector.range_m == 0
     assert np.isfinite(reflector.azimuth_deg)

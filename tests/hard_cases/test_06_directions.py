@@ -51,7 +51,7 @@ def require_exact(settings, measurement):
 
 
 @pytest.mark.parametrize("azimuth_deg", [-90.0, 90.0])
-def test_an_echo_along_the_plane_of_the_array(azimuth_deg):
+def test_echo_in_the_plane_of_the_array_is_found(azimuth_deg):
     """Within 5° where the beam is broadest, at its level; the other end of the axis is at least 20 dB below."""
     settings = with_processing(directions="2d:181")
     image = Pipeline(settings).process(
@@ -65,7 +65,7 @@ def test_an_echo_along_the_plane_of_the_array(azimuth_deg):
     assert other < near / 10
 
 
-def test_a_planar_array_hears_no_difference_between_front_and_back():
+def test_planar_array_has_equal_images_of_front_and_back():
     """Azimuths α and 180° − α have the same delays: rounding apart, the same image."""
     amplitude = require_exact(with_processing(directions="2d:9", azimuth_limits_deg=(-180.0, 180.0)), noise(SHORT))
     require_same(amplitude[[5, 8, 0]], amplitude[[7, 4, 4]])  # 45° and 135°, 180° and 0°
@@ -73,13 +73,13 @@ def test_a_planar_array_hears_no_difference_between_front_and_back():
 
 
 @pytest.mark.parametrize("pole_deg", [-90, 90])
-def test_at_a_pole_the_azimuth_does_not_matter(tmp_path, pole_deg):
+def test_azimuth_is_irrelevant_at_the_poles(tmp_path, pole_deg):
     rows = [(azimuth, pole_deg) for azimuth in (-180, -90, -37.5, 0, 90, 180)]
     amplitude = require_exact(with_grid(tmp_path, rows), noise(SHORT))
     require_same(amplitude, amplitude[3])
 
 
-def test_an_echo_from_the_pole_is_found_there_once(tmp_path):
+def test_echo_from_the_pole_is_found_once(tmp_path):
     """Though six entries of the grid are one direction."""
     rows = [(azimuth, 90) for azimuth in range(0, 360, 60)]
     rows += [(azimuth, elevation) for elevation in (70, 75, 80, 85) for azimuth in range(-180, 180, 10)]
@@ -97,7 +97,7 @@ def test_an_echo_from_the_pole_is_found_there_once(tmp_path):
 
 @pytest.mark.parametrize("array", [SHORT.array, ONE], ids=["32 microphones", "one microphone"])
 @pytest.mark.parametrize("range_m", [(0.7, 0.7), (0.0, 0.0)])
-def test_one_direction_and_one_range(array, range_m):
+def test_image_of_one_direction_and_one_range_is_exact(array, range_m):
     """An image of one number, and it is the exact one."""
     settings = tuned(
         with_processing(SHORT.replace(array=array), directions="2d:1", range_m=range_m), max_error_db=-60.0
@@ -105,7 +105,7 @@ def test_one_direction_and_one_range(array, range_m):
     assert require_exact(settings, noise(settings)).shape == (1, 1)
 
 
-def test_two_microphones_in_one_place_hear_as_one():
+def test_coincident_microphones_act_as_one():
     """With equal bits the image is that of one microphone, and the same in all directions."""
     pair, single = SHORT.replace(array=TWO_IN_ONE_PLACE), SHORT.replace(array=ONE)
     bits = np.random.default_rng(1).integers(0, 2, SHORT.recording.n_samples, dtype=np.uint8)
@@ -115,7 +115,7 @@ def test_two_microphones_in_one_place_hear_as_one():
     require_same(both, both[0])
 
 
-def test_two_microphones_in_one_place_are_averaged():
+def test_coincident_microphones_are_averaged():
     pair = SHORT.replace(array=TWO_IN_ONE_PLACE)
     require_exact(pair, noise(pair))
 
@@ -123,13 +123,13 @@ def test_two_microphones_in_one_place_are_averaged():
 # ---- through the simulator -------------------------------------------------------------------------
 
 
-def test_one_microphone():
+def test_image_of_one_microphone_is_its_envelope():
     scene = scene_of(Point(range_m=0.4, strength_db=-20), sensor=EIGHT.replace(array=EAR.array))
     [peak] = find_peaks(image_of(scene), top=1)
     assert peak.range_m == pytest.approx(0.4, abs=0.005)
 
 
-def test_microphones_in_one_place():
+def test_array_of_coincident_microphones_is_accepted():
     array = Array(layout="pair", positions_m=((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), word_bits=8)
     scene = scene_of(Point(azimuth_deg=40, range_m=0.3), sensor=SENSOR.replace(array=array))
     first, second = heard(scene, *EFFECTS)

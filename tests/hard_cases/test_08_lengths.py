@@ -63,7 +63,7 @@ def test_image_of_any_length_is_the_exact_one(n_samples, precision):
 
 
 @pytest.mark.parametrize("n_samples", [1009, 12_347, 32_769])
-def test_whole_blocks_only_would_lose_the_end(n_samples):
+def test_truncation_to_whole_blocks_loses_the_end(n_samples):
     """The naive form: without the samples past the last multiple of 32 the image is off by -15 to -52 dB."""
     settings = of_length(n_samples)
     words = noise(settings).data
@@ -79,7 +79,7 @@ def test_whole_blocks_only_would_lose_the_end(n_samples):
 
 
 @pytest.mark.parametrize("n_samples", [1, 100, 4097])
-def test_records_shorter_than_the_call(n_samples):
+def test_records_shorter_than_the_call_are_handled(n_samples):
     sensor = Sensor(array=EAR.array, recording=Recording(n_samples=n_samples), emitter=FULL.emitter)
     assert Simulator(forced(scene_of(Point(range_m=0.05), sensor=sensor)), plan=only(*EFFECTS)).render().data.shape == (
         n_samples,

@@ -50,7 +50,7 @@ PLACES = [
 ]
 
 
-def test_every_kind_of_number_is_among_the_places():
+def test_tested_places_cover_every_kind_of_number():
     assert len(PLACES) >= 20
     assert {("array", "gain"), ("array", "positions_m"), ("processing", "range_m"), ("air", "pressure_pa")} < {*PLACES}
     assert {section for section, _ in PLACES} == {*SECTIONS}
@@ -58,7 +58,7 @@ def test_every_kind_of_number_is_among_the_places():
 
 @pytest.mark.parametrize("bad", NO_NUMBERS)
 @pytest.mark.parametrize(("section", "field"), PLACES)
-def test_settings_refuse_what_is_no_number(section, field, bad):
+def test_settings_refuse_nan_and_infinity(section, field, bad):
     part = getattr(FULL, section)
     for value in spoiled(getattr(part, field), bad):
         with pytest.raises(
@@ -70,7 +70,7 @@ def test_settings_refuse_what_is_no_number(section, field, bad):
 
 @pytest.mark.parametrize("bad", ["nan", "inf", "-inf"])
 @pytest.mark.parametrize(("section", "field"), PLACES)
-def test_settings_files_refuse_what_is_no_number(section, field, bad):
+def test_settings_files_refuse_nan_and_infinity(section, field, bad):
     """In TOML, where NaN and infinities can be written."""
     if isinstance(getattr(getattr(FULL, section), field), tuple):
         given = str(next(spoiled(getattr(getattr(FULL, section), field), math.nan)))
@@ -85,7 +85,7 @@ def test_settings_files_refuse_what_is_no_number(section, field, bad):
 
 @pytest.mark.parametrize("bad", ["inf", "-inf", "1e999", "nan"])
 @pytest.mark.parametrize("suffix", ["csv", "toml"])
-def test_layout_files_refuse_what_is_no_number(tmp_path, bad, suffix):
+def test_layout_files_refuse_nan_and_infinity(tmp_path, bad, suffix):
     path = tmp_path / f"l.{suffix}"
     path.write_text(f"0, 0\n1, {bad}\n" if suffix == "csv" else f"positions_mm = [[0, 0], [1, {bad}]]\n")
     with pytest.raises(ArgumentError, match=rf"l\.{suffix}.*positions_mm holds -?(nan|inf) at \[1, 2\]; give finite"):
@@ -93,7 +93,7 @@ def test_layout_files_refuse_what_is_no_number(tmp_path, bad, suffix):
 
 
 @pytest.mark.parametrize("bad", ["inf", "-inf", "nan"])
-def test_grids_refuse_what_is_no_number(tmp_path, bad):
+def test_grids_refuse_nan_and_infinity(tmp_path, bad):
     path = tmp_path / "g.csv"
     path.write_text(f"0, 0\n{bad}, 1\n")
     with pytest.raises(ArgumentError, match=r"g\.csv holds -?(nan|inf) at \[1, 0\]; give finite numbers"):
@@ -104,7 +104,7 @@ def test_grids_refuse_what_is_no_number(tmp_path, bad):
 
 
 @pytest.mark.parametrize(("temperature_c", "humidity_percent"), CORNERS)
-def test_air_at_its_ends_puts_the_echo_at_its_place(temperature_c, humidity_percent):
+def test_extreme_temperatures_keep_the_range_of_the_echo(temperature_c, humidity_percent):
     """Within 0.5 mm at 0.7 m; with 343 m/s for all air, at -40 °C it would lie 8 cm too far."""
     air = Air(temperature_c=temperature_c, humidity_percent=humidity_percent)
     settings = SHORT.replace(air=air, processing=SHORT.processing.replace(directions="2d:91"))
@@ -118,7 +118,7 @@ def test_air_at_its_ends_puts_the_echo_at_its_place(temperature_c, humidity_perc
 
 @pytest.mark.parametrize(("temperature_c", "humidity_percent"), CORNERS)
 @pytest.mark.parametrize("pressure_pa", [10_000.0, 101_325.0, 200_000.0])
-def test_air_is_evaluated_to_12_digits(temperature_c, humidity_percent, pressure_pa):
+def test_speed_of_sound_is_exact_to_12_digits(temperature_c, humidity_percent, pressure_pa):
     """The equations again in 50 digits. Dry air must not divide by its vapour, nor hot thin air hold too much of it."""
     air = Air(temperature_c=temperature_c, humidity_percent=humidity_percent, pressure_pa=pressure_pa)
     frequency_hz = np.array([1.0, 20e3, 50e3, 80e3, 200e3])
@@ -157,7 +157,7 @@ def true_air(air, frequency_hz):
 
 @pytest.mark.parametrize("humidity_percent", [0, 100])
 @pytest.mark.parametrize("temperature_c", [-40, 60])
-def test_extreme_air(temperature_c, humidity_percent):
+def test_extreme_air_gives_finite_values(temperature_c, humidity_percent):
     air = Air(temperature_c=temperature_c, humidity_percent=humidity_percent)
     scene = scene_of(Point(azimuth_deg=-10, range_m=0.5, strength_db=-20), sensor=EIGHT.replace(air=air))
     [peak] = find_peaks(image_of(scene), top=1)
@@ -165,6 +165,6 @@ def test_extreme_air(temperature_c, humidity_percent):
     assert peak.azimuth_deg == pytest.approx(-10, abs=2)
 
 
-def test_thin_air():
+def test_thin_air_gives_finite_values():
     air = Air(temperature_c=60, humidity_percent=100, pressure_pa=10_000)
     assert image_of(scene_of(Point(range_m=0.4), sensor=EIGHT.replace(air=air))).amplitude.max() > 0

@@ -44,7 +44,7 @@ def time_ratio(usual, other, *, times=5, rounds=12):
 @pytest.mark.alone
 @pytest.mark.parametrize("method", ["fast", "paper"])
 @pytest.mark.parametrize("name", ["all zero", "alternating", "noise, then alternating"])
-def test_words_of_silence_take_no_longer(name, method):
+def test_silent_words_take_no_longer_than_noise(name, method):
     settings = SETTINGS.replace(processing=SETTINGS.processing.replace(method=method))
     pipeline = Pipeline(settings, threads=1)
     words = noise(settings).data
@@ -60,7 +60,7 @@ def test_words_of_silence_take_no_longer(name, method):
 
 @pytest.mark.alone
 @pytest.mark.parametrize("name", ["0", "1e-11", "1e-30", "1e-40", "decays to 1e-41"])
-def test_signals_that_have_decayed_take_no_longer(name):
+def test_decayed_signals_take_no_longer_than_noise(name):
     """Signals that were never modulated may be as small as they like."""
     chain = chain_of(SETTINGS)
     out = np.empty((len(chain.grid), len(chain.range_m)), dtype=np.float32)
@@ -72,7 +72,7 @@ def test_signals_that_have_decayed_take_no_longer(name):
 
 
 @pytest.mark.alone
-def test_numbers_that_have_decayed_take_no_longer():
+def test_denormal_samples_take_no_longer_than_noise():
     settings = SETTINGS.replace(recording=SETTINGS.recording.replace(encoding="float32"))
     chain = chain_of(settings)
     out = np.empty((len(chain.grid), len(chain.range_m)), dtype=np.float32)
@@ -83,7 +83,7 @@ def test_numbers_that_have_decayed_take_no_longer():
     assert not out.any()
 
 
-def test_a_recursive_filter_decays_into_denormals():
+def test_recursive_filter_decays_into_denormals():
     """The naive form: band-passed in float32, three quarters of a second half of silence are denormal, not 0."""
     sections = scipy.signal.butter(6, (25e3, 50e3), "bandpass", fs=450e3, output="sos").astype(np.float32)
     signal = np.zeros(20_000, dtype=np.float32)

@@ -94,33 +94,33 @@ def usual_digests(precision):
 
 
 @pytest.mark.parametrize("precision", ["float32", "int16"])
-def test_any_number_of_threads_gives_the_same_bits(precision):
+def test_results_are_independent_of_the_number_of_threads(precision):
     found = usual_digests(precision)
     assert len(found) == 4
     assert len(set(found)) == 1
 
 
-def test_layer_without_reentrance_gives_the_same_bits():
+def test_workqueue_threading_layer_gives_the_same_bits():
     """Numba falls back to its workqueue where there is neither OpenMP nor TBB."""
     found = digests("float32", NUMBA_NUM_THREADS="4", NUMBA_THREADING_LAYER="workqueue")
     assert found == usual_digests("float32")
 
 
-def test_kernels_just_compiled_give_the_bits_of_those_from_the_cache(tmp_path):
+def test_compiled_and_cached_kernels_give_the_same_bits(tmp_path):
     """A kernel from the cache is optimised once more; where its sums leave a choice, it may be taken the other way."""
     fresh, kept = (digests("", COMBINE, NUMBA_CACHE_DIR=str(tmp_path)) for _ in range(2))
     assert len(fresh) == 4
     assert fresh == kept
 
 
-def test_what_numba_cannot_do_is_said_in_a_line():
+def test_numba_limits_are_reported_in_one_line():
     code = "from ertis_numba import kernels; kernels.load('cpu')"
     environment = os.environ | {"NUMBA_DISABLE_JIT": "1"}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
     assert re.search("DeviceError: NUMBA_DISABLE_JIT is set, .* use device 'numpy'", done.stderr.splitlines()[-1])
 
 
-def test_processor_with_fewer_features_is_served(tmp_path):
+def test_processor_with_fewer_features_is_supported(tmp_path):
     """Numba may be told to compile for an older processor; what that lacks is not used."""
     older = {"NUMBA_CPU_NAME": "generic", "NUMBA_CACHE_DIR": str(tmp_path), "NUMBA_NUM_THREADS": "4"}
     assert len(set(digests("auto", **older))) == 1
@@ -137,7 +137,7 @@ def test_modulators_give_the_same_bits_on_every_processor(tmp_path):
 
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize(("precision", "bound_db"), [("float32", -120), ("int16", -95)])
-def test_devices_agree(name, precision, bound_db):
+def test_devices_agree_within_rounding(name, precision, bound_db):
     """Numba and NumPy add up in other orders: -131 dB in float32 and -106 dB through 16 bits at the worst."""
     settings = tuned(CASES[name], precision=precision)
     if precision == "int16" and not all(kernels.load(device).tile_ranges for device in ("cpu", "numpy")):

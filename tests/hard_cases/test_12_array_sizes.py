@@ -35,13 +35,13 @@ def spiral(n_mics, word_bits):
 @pytest.mark.parametrize("precision", ["float32", "int16"])
 @pytest.mark.parametrize("word_bits", [8, 16, 32, 64])
 @pytest.mark.parametrize("n_mics", [1, 2, 31, 33, 64])
-def test_image_is_the_exact_one(n_mics, word_bits, precision):
+def test_image_of_any_array_size_is_exact(n_mics, word_bits, precision):
     """-42 dB, or less: a bit in a wrong place would leave -15 dB of 33 microphones."""
     require_exact(spiral(n_mics, word_bits), precision)
 
 
 @pytest.mark.parametrize(("word_bits", "precision"), [(8, "float32"), (64, "int16")])
-def test_image_of_1024_microphones_is_the_exact_one(word_bits, precision):
+def test_image_of_1024_microphones_is_exact(word_bits, precision):
     require_exact(spiral(1024, word_bits), precision)
 
 
@@ -60,7 +60,7 @@ def require_exact(array, precision):
 # ---- through the simulator -------------------------------------------------------------------------
 
 
-def test_1024_microphones():
+def test_pipeline_handles_1024_microphones():
     """In memory for 128 of them at a time."""
     sensor = EIGHT.replace(array=line_array(1024, 1e-3), recording=Recording(n_samples=40_000))
     scene = scene_of(Point(range_m=0.5, azimuth_deg=30, strength_db=-20), sensor=sensor)

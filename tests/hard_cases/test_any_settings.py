@@ -180,7 +180,7 @@ def words_for(pipeline, kind, seed):
 @given(
     made=any_settings(), kind=st.sampled_from(DATA), seed=st.integers(0, 99), device=st.sampled_from(["cpu", "numpy"])
 )
-def test_any_settings_and_any_data_give_an_image_or_one_line(made, kind, seed, device):
+def test_any_settings_and_data_give_an_image_or_one_line(made, kind, seed, device):
     if made is None:
         event("refused when made")
         return
@@ -207,7 +207,7 @@ def test_any_settings_and_any_data_give_an_image_or_one_line(made, kind, seed, d
 # ---- what the search has found ---------------------------------------------------------------------
 
 
-def test_a_call_shorter_than_a_period_is_refused():
+def test_call_shorter_than_a_period_is_refused():
     """Sampled at the signals' rate it was all zeros, and the matched filter divided by its power."""
     with pytest.raises(
         ArgumentError, match=r"call\.duration_s is 8e-05, less than a period of 2000 Hz; give 0\.0005 or"
@@ -215,7 +215,7 @@ def test_a_call_shorter_than_a_period_is_refused():
         Call(start_frequency_hz=2001.0, stop_frequency_hz=2000.0, duration_s=8e-5)
 
 
-def test_a_sweep_too_narrow_for_the_paper_is_refused():
+def test_sweep_too_narrow_for_the_paper_is_refused():
     """Its band pass rang for a minute, and 3 GB of it were computed."""
     call = Call(start_frequency_hz=40_000.5, stop_frequency_hz=40_000.0)
     Settings(call=call)
@@ -225,7 +225,7 @@ def test_a_sweep_too_narrow_for_the_paper_is_refused():
         Settings(call=call, processing=Processing(method="paper"))
 
 
-def test_peaks_are_found_where_the_rate_cuts_the_edge_of_the_band():
+def test_peaks_are_found_if_the_sample_rate_cuts_the_band_edge():
     """The paper's method may have a rate at which the matched filter's band reaches past half of it."""
     processing = Processing(method="paper", directions="2d:31", range_decimation=160, decimation=80, range_m=(0.2, 0.5))
     call = Call(start_frequency_hz=25_000.0, stop_frequency_hz=10_000.0)

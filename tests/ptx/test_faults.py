@@ -66,24 +66,24 @@ def found(kernel, **given):
     return faults(one, compiling.code_of(one, CC))
 
 
-def test_good_kernel_has_no_faults():
+def test_correct_kernel_has_no_faults():
     assert found(good) == []
     assert found(good, grid=(2**31 - 1, 65_535, 65_535), block=(32, 32)) == []
 
 
-def test_double_precision_is_found():
+def test_double_precision_is_detected():
     assert found(double) == ["computes in double precision"]
 
 
-def test_stack_is_found():
+def test_stack_use_is_detected():
     assert found(stacked) == ["has 4000 bytes on the stack"]
 
 
-def test_calls_are_found():
+def test_function_calls_are_detected():
     assert "calls a function" in found(calling)
 
 
-def test_spills_are_found():
+def test_register_spills_are_detected():
     assert any(fault.startswith("spills ") for fault in found(spilling()))
 
 
@@ -96,12 +96,12 @@ def test_spills_are_found():
         ((1,), (32, 64), "has 2048 threads in a block"),
     ],
 )
-def test_launches_beyond_bounds_are_found(grid, block, fault):
+def test_launches_beyond_bounds_are_detected(grid, block, fault):
     one = dataclasses.replace(recorded(good), grid=grid, block=block)  # `launch` itself would refuse some
     assert faults(one, compiling.code_of(one, CC)) == [fault]
 
 
-def test_too_many_registers_and_too_much_shared_memory_are_found():
+def test_excess_registers_and_shared_memory_are_detected():
     one = recorded(good, block=(1024,))
     code = compiling.code_of(one, CC)
     assert faults(one, dataclasses.replace(code, registers=64)) == []
@@ -109,7 +109,7 @@ def test_too_many_registers_and_too_much_shared_memory_are_found():
     assert faults(one, dataclasses.replace(code, shared_bytes=49_153)) == ["shares 49153 bytes"]
 
 
-def test_contraction_is_found():
+def test_contraction_is_detected():
     code = compiling.code_of(recorded(contracted, dtype=np.float64), CC)
     assert contracts(code.ptx)
     assert contracts(compiling.disassembled(code))
@@ -118,7 +118,7 @@ def test_contraction_is_found():
     assert not contracts(compiling.disassembled(single))
 
 
-def test_shared_memory_is_told():
+def test_shared_memory_is_reported():
     @cuda.jit
     def sharing(x, out):
         shared = cuda.shared.array(256, np.float32)
@@ -129,7 +129,7 @@ def test_shared_memory_is_told():
     assert compiling.code_of(recorded(sharing), CC).shared_bytes == 1024
 
 
-def test_arguments_have_the_types_of_a_gpu():
+def test_arguments_have_gpu_types():
     x = np.zeros(100, np.float32)
     x.flags.writeable = False
     (one,) = compiling.recorded(lambda _: launch(good, (1,), (32,), x, x))
@@ -137,20 +137,20 @@ def test_arguments_have_the_types_of_a_gpu():
     assert one.arguments["x"] is x
 
 
-def test_compiles_once(monkeypatch):
+def test_kernel_is_compiled_once(monkeypatch):
     one, other = recorded(good), recorded(good, grid=(7,))
     code = compiling.code_of(one, CC)
     monkeypatch.setattr(compiling.cuda, "compile_ptx", None)
     assert compiling.code_of(other, CC) is code
 
 
-def test_refuses_the_simulator(monkeypatch):
+def test_ptx_checks_refuse_the_simulator(monkeypatch):
     monkeypatch.setattr(compiling, "SIMULATED", True)
     with pytest.raises(DeviceError, match=r"^kernels are not compiled if the GPU is simulated; unset NUMBA_ENABLE_"):
         compiling.recorded(print)
 
 
-def test_names_the_compiler_that_is_missing(monkeypatch):
+def test_missing_compiler_is_named(monkeypatch):
     monkeypatch.setattr(pathfinder, "find_nvidia_binary_utility", lambda _: None)
     monkeypatch.setenv("PATH", "")
     with pytest.raises(DeviceError, match=r"needs numba-cuda, ptxas and nvdisasm, but ptxas is missing; install them"):
@@ -160,7 +160,7 @@ def test_names_the_compiler_that_is_missing(monkeypatch):
         compiling.require_compilers()
 
 
-def test_tells_why_a_program_refuses():
+def test_compiler_error_is_reported():
     code = compiling.code_of(recorded(good), (6, 0))
     with pytest.raises(DeviceError, match=r'^nvdisasm fails \(.*"SM60" is deprecated.*\); install'):
         compiling.disassembled(code)

@@ -10,7 +10,7 @@ CCS = [(6, 0), (7, 5), (9, 0)]  # the oldest that CUDA 12 compiles for, the olde
 CONTRACTS = sorted(KERNEL_NAMES)
 
 
-def test_every_contract_is_launched(launched):
+def test_every_kernel_contract_is_launched(launched):
     assert sorted(launched) == CONTRACTS
     assert len(CONTRACTS) == 19
 
@@ -22,7 +22,7 @@ def test_compiles_without_faults(launched, name, cc):
     assert {one for one in found if len(one) > 1} == set()
 
 
-def test_exceptions_are_needed(launched):
+def test_allowed_faults_are_present(launched):
     for name in faults.DOUBLE:
         assert any(".f64" in compiling.code_of(launch, (9, 0)).ptx for launch in launched[name])
     for name in faults.LIBRARY_CALLS:
@@ -38,12 +38,12 @@ def test_modulator_rounds_every_product(launched, cc):
     assert not faults.contracts(compiling.disassembled(code))
 
 
-def test_words_of_all_sizes_and_taps_of_both_are_launched(launched):
+def test_all_word_sizes_and_tap_types_are_launched(launched):
     taps = {str(launch.arguments["taps"].dtype) for launch in launched["demodulate_words"]}
     assert taps == {"int16", "int32"}
     octets = {launch.arguments["n_octets"] for launch in launched["demodulate_words"]}
     assert octets >= {2, 4, 8, 16}
 
 
-def test_orders_of_dmas_are_kernels_of_their_own(launched):
+def test_each_dmas_order_has_its_own_kernel(launched):
     assert len({launch.kernel for launch in launched["combine_dmas"]}) == 1 + 4  # roots, and orders 2, 3, 5 and 8

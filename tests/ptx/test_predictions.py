@@ -44,7 +44,7 @@ def report():
     return ptx.run(say=lambda _: None)
 
 
-def test_way_goes_through_the_work_and_past_calls():
+def test_instruction_path_follows_the_work_and_skips_calls():
     code = instructions.parse(CODE)
     assert len(code) == 18
     names = [code[at].name for at in instructions.way(code)]
@@ -53,7 +53,7 @@ def test_way_goes_through_the_work_and_past_calls():
     ]  # fmt: skip
 
 
-def test_innermost_loops_and_kinds():
+def test_innermost_loops_and_their_instructions_are_found():
     code = instructions.parse(CODE)
     assert instructions.loops(code) == [range(4, 8)]
     assert instructions.kinds(code[4:8]) == {"loads": 1, "multiply-adds": 1, "integer": 1, "others": 1}
@@ -62,11 +62,11 @@ def test_innermost_loops_and_kinds():
 @pytest.mark.parametrize(
     ("registers", "warps_per_block", "wanted"), [(32, 4, 64), (33, 4, 48), (40, 4, 48), (255, 8, 8), (16, 1, 32)]
 )
-def test_resident_warps(registers, warps_per_block, wanted):
+def test_resident_warps_are_computed(registers, warps_per_block, wanted):
     assert h200.resident_warps(registers, warps_per_block) == wanted
 
 
-def test_docs_are_what_the_code_is(report):
+def test_gpu_documentation_matches_the_compiled_code(report):
     head, tail = tables.around(DOCS, "ptx")
     published = DOCS.read_text("utf-8").removeprefix(head).removesuffix(tail)
     (made,) = re.findall(r"^Counted in code for compute capability 9\.0 \((.+)\)\.", published, re.MULTILINE)
@@ -76,7 +76,7 @@ def test_docs_are_what_the_code_is(report):
     assert published.strip() == tables.ptx(report).strip(), "run: ertis bench ptx --update docs/explanation/gpu.md"
 
 
-def test_loops_do_nothing_that_is_not_needed(report):
+def test_loops_contain_only_needed_instructions(report):
     loops = {loop["kernel"]: loop for loop in report["loops"]}
     sums = loops["delay_and_sum_envelope.fill"]
     assert (sums["loads"], sums["multiply-adds"]) == (6, 16)  # offset, weight, four samples; four multiply-adds each
@@ -101,7 +101,7 @@ def test_default_plans_reach_the_goals(report):
             assert plan["per_second"]["images left on the GPU"] >= ptx.GOALS["streamed_per_s"]
 
 
-def test_prediction_is_arithmetic_that_can_be_done_by_hand(report):
+def test_prediction_equals_a_calculation_by_hand(report):
     """3000 direct beams: 57 blocks on the busiest multiprocessor, of four warps, 32 terms, 14 lines each."""
     (row,) = [row for row in report["plans"][-1]["launches"] if row["kernel"] == "delay_and_sum_envelope.fill"]
     assert row["grid"] == [750, 10]
