@@ -148,7 +148,7 @@ def test_tables_show_the_newest_results_without_a_gpu(report, tmp_path):
         assert line in text
     assert "with gaps in which the GPU waited for launches" in text
     assert "driver 570.1, CUDA of the driver 12.8" in text
-    assert "clock just after load 1980 MHz" in text
+    assert "clock right after load 1980 MHz" in text
     assert "No GPU has run" not in text
     assert "\nold\n" not in text
     text = short.read_text("utf-8")
