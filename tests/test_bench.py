@@ -118,7 +118,7 @@ def test_correct_image_passes_with_its_error(image):
     "wrong", [lambda e: 1.1 * e, lambda e: np.roll(e, 1, axis=1), lambda e: np.full_like(e, np.nan)]
 )
 def test_benchmark_refuses_a_wrong_image(image, wrong):
-    with pytest.raises(DataError, match=r"image of 7 directions is .* dB off the exact one; wanted at most -30 dB"):
+    with pytest.raises(DataError, match=r"image of 7 directions has an error of .* dB .*; the limit is -30 dB"):
         checks.require_exact(image.replace(amplitude=wrong(image.amplitude)), noise(SHORT))
 
 
@@ -266,7 +266,7 @@ def test_accuracy_benchmark_lists_omissions(monkeypatch):
     monkeypatch.setattr(subject, "_DISTRIBUTION", "no-such-distribution")
     monkeypatch.setattr(plans, "PLANS", FEW[:1])
     done = bench_accuracy()
-    assert "real measurement: left out, as the package rtisdev, which has it, is not installed" in done.stderr
+    assert "real measurement: skipped, because its package rtisdev is not installed" in done.stderr
     assert (
         "reflectors without a peak from `find_peaks` within 5° and 2 cm. Not installed here: real measurement."
         in done.stdout
@@ -310,10 +310,10 @@ def test_simulation_benchmark_times_free_field_and_all_effects(tmp_path):
     assert report["change_db"] < 0.1
     assert report["times_faster"] > 3
     assert needed["median_ms"] < 200  # 5 measurements per second
-    assert "What the scene calls for takes" in target.read_text("utf-8")
+    assert "Time with all effects / time with the relevant effects: " in target.read_text("utf-8")
 
 
 def test_simulation_benchmark_refuses_differing_images(monkeypatch):
     monkeypatch.setattr(simulation, "image_change_db", lambda *_, **__: 9.0)
-    with pytest.raises(DataError, match=r"change the image by 9\.00 dB, allowed are .* dB; do not trust these times"):
+    with pytest.raises(DataError, match=r"change the image by 9\.00 dB; the limit is .* dB\. Do not use these times"):
         simulation.run(count=1, say=lambda _: None)

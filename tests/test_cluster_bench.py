@@ -40,6 +40,6 @@ def test_cluster_bench_measures_and_updates_the_page(tmp_path):
     assert row["added_p99_ms"] == row["p99_ms"] - 2.0
     assert (row["offered_hz"], row["max_hz"], row["max_here_hz"]) == (40.0, 20.0, 40.0)
     text = target.read_text("utf-8")
-    assert "| a dask cluster on this machine, 2 workers, 90 directions, 4 × 10 Hz for 1 s |" in text
-    assert "; 20 images/s of 40 that were offered, 40 by workers of its own. Of a core: central node " in text
+    assert "| dask cluster on this machine, 2 workers, 90 directions, 4 × 10 Hz for 1 s |" in text
+    assert "; 20 images/s of 40 offered, 40 with the node's own workers. Processor time in % of one core: " in text
     assert "; the cluster's scheduler and workers are not counted |" in text

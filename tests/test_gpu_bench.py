@@ -110,7 +110,7 @@ def test_gpu_benchmark_without_a_gpu_writes_nothing(tmp_path):
 
 def test_gpu_benchmark_refuses_the_simulator(tmp_path, monkeypatch):
     monkeypatch.setenv("NUMBA_ENABLE_CUDASIM", "1")
-    with pytest.raises(DeviceError, match="is simulated here, and its times tell nothing; unset NUMBA_ENABLE_CUDASIM"):
+    with pytest.raises(DeviceError, match="is simulated here, so its times are meaningless; unset NUMBA"):
         gpu.run(results=tmp_path / "results", say=lambda _: None)
 
 
@@ -137,7 +137,7 @@ def test_tables_show_the_newest_results_without_a_gpu(report, tmp_path):
     text = full.read_text("utf-8")
     for line in (
         "| one at a time, words to image | not measured | 0.516 | not measured |",
-        "| times faster than that | – | 100× | – |",
+        "| paper's time / shortest single time | – | 100× | – |",
         "| upload | 0.0200 |",
         "| PyTorch: not installed |  | – | – | – | – |",
         "| CuPy: host to host | 90 | 9.000 | 0.500 | 18.0× | -130 |",
@@ -148,7 +148,7 @@ def test_tables_show_the_newest_results_without_a_gpu(report, tmp_path):
         assert line in text
     assert "with gaps in which the GPU waited for launches" in text
     assert "driver 570.1, CUDA of the driver 12.8" in text
-    assert "clock just after load 1980 MHz" in text
+    assert "clock right after load 1980 MHz" in text
     assert "No GPU has run" not in text
     assert "\nold\n" not in text
     text = short.read_text("utf-8")
@@ -169,7 +169,7 @@ def test_tables_without_results_state_not_measured(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "results", [{}, {"parts": {}}, {"parts": {"paper": {"status": "not done after 9 s", "rows": []}}}]
+    "results", [{}, {"parts": {}}, {"parts": {"paper": {"status": "not finished after 9 s", "rows": []}}}]
 )
 def test_tables_show_all_existing_parts(report, results):
     found = report[0] | results if results else report[0]

@@ -60,8 +60,8 @@ def test_differing_files_are_not_timed(tmp_path, monkeypatch):
     monkeypatch.setattr(many, "_require_exact", lambda *_: None)
     crews = {"one": {"workers": 1, "threads": 1}, "two": {"workers": 2, "threads": 1}}
     message = (
-        r"two made other files than 1 worker of 1 thread \(000\.energy\.h5: 1 of 3 bytes, from 0 to 0, "
-        r"001\.energy\.h5: 2 bytes for 1\); do not trust it"
+        r"files of two differ from those of 1 worker of 1 thread \(000\.energy\.h5: 1 of 3 bytes differ, from 0 to 0, "
+        r"001\.energy\.h5: 2 bytes instead of 1\); do not use it"
     )
     with pytest.raises(DataError, match=message):
         many._measured(  # noqa: SLF001
@@ -72,5 +72,5 @@ def test_differing_files_are_not_timed(tmp_path, monkeypatch):
 def test_failing_recording_is_not_timed(tmp_path):
     (tmp_path / "runs").mkdir()
     (tmp_path / "runs" / "torn.h5").write_bytes(b"torn")
-    with pytest.raises(DataError, match=r"torn\.h5 is failed \(.*not an HDF5 file.*\); it is not timed"):
+    with pytest.raises(DataError, match=r"torn\.h5 is failed \(.*not an HDF5 file.*\), so it is not timed"):
         many._timed(tmp_path / "runs", tmp_path / "out", workers=1)  # noqa: SLF001

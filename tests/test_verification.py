@@ -215,5 +215,5 @@ def test_random_settings_cover_every_kind():
 
 
 def test_random_settings_refuse_impossible_limits():
-    with pytest.raises(ArgumentError, match=r"100 draws gave no valid settings, the last one because: .*; give wider"):
+    with pytest.raises(ArgumentError, match=r"100 draws gave no valid settings; the last error: .*Widen the limits"):
         random_settings(np.random.default_rng(1), Limits(max_samples=0))

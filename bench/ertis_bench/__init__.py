@@ -1,1 +1,1 @@
-"""Measure speed: `paper` and `scaling` are run by ``ertis bench``."""
+"""Benchmarks of the processing chain, the network and the files, run by ``ertis bench``."""

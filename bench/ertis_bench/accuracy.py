@@ -1,4 +1,4 @@
-"""Error against time: many plans, and which of them no other one beats."""
+"""Error versus time of many plans, with the plans on the Pareto front."""
 
 import functools
 from collections.abc import Callable, Iterator, Sequence
@@ -24,7 +24,9 @@ DIRECTIONS = "3000"
 PAPER = "the paper's method"
 _RANGE_M = (0.5, 5.0)
 TURN = 5
-"""Calls in a row, few because a turn of all plans takes some seconds, over which machines change."""
+"""Consecutive calls per plan. The number is small because a turn of all plans takes seconds, and the speed of a machine
+drifts meanwhile.
+"""
 
 
 def run(*, count: int, say: Callable[[str], None], directions: str = DIRECTIONS) -> dict[str, Any]:
@@ -35,9 +37,9 @@ def run(*, count: int, say: Callable[[str], None], directions: str = DIRECTIONS)
     count : int
         Measurements per plan.
     say : callable
-        Told what goes on.
+        Called with a line of progress.
     directions : str
-        As ``processing.directions``.
+        Direction grid, as ``processing.directions``.
     """
     kernel_set = kernels.load("cpu")
     found, left_out = _subjects(say)
@@ -59,7 +61,7 @@ def run(*, count: int, say: Callable[[str], None], directions: str = DIRECTIONS)
 
 
 def plot(report: dict[str, Any], path: Path) -> None:
-    """Draw error and time of all plans; the first subject's presets are named."""
+    """Draw error and time of all plans. Labels name the presets of the first subject."""
     points = []
     for row in report["rows"]:
         label = PAPER if row["plan"] == PAPER else row["plan"].partition(":")[0] if ":" in row["plan"] else ""
@@ -72,17 +74,17 @@ def plot(report: dict[str, Any], path: Path) -> None:
                 label=label if row["subject"] == report["rows"][0]["subject"] else "",
             )
         )
-    title = f"What exactness costs · {report['directions']} directions"
+    title = f"Accuracy versus processing time · {report['directions']} directions"
     figures.front(points, title=title, note=report["machine"]["cpu"]).savefig(path)
 
 
 def _subjects(say: Callable[[str], None]) -> tuple[dict[str, tuple[Measurement, str]], list[str]]:
-    """Return the measured subjects, and the unavailable ones."""
+    """Return the available subjects, and the names of unavailable ones."""
     found, left_out = {}, []
     room = subject.real()
     if room is None:
         left_out.append("real measurement")
-        say("real measurement: left out, as the package rtisdev, which has it, is not installed")
+        say("real measurement: skipped, because its package rtisdev is not installed")
     else:
         found["real"] = room
     found["synthetic"] = subject.measurement()
@@ -90,7 +92,7 @@ def _subjects(say: Callable[[str], None]) -> tuple[dict[str, tuple[Measurement, 
 
 
 def _settings(settings: Settings, directions: str) -> Settings:
-    """Return settings with the range axis of the paper's method, so that all images have the same."""
+    """Return settings with the range axis of the paper's method, so that all images have the same axis."""
     processing = settings.processing.replace(directions=directions, range_m=_RANGE_M, wavefront="plane")
     range_m = Pipeline(settings.replace(processing=processing.replace(method="paper"))).range_m
     half_m = float(range_m[1] - range_m[0]) / 2
@@ -99,7 +101,7 @@ def _settings(settings: Settings, directions: str) -> Settings:
 
 
 class _Subject:
-    """One measurement, its exact image and its signal model."""
+    """Measurement with its exact image and its signal model."""
 
     def __init__(
         self,
@@ -118,7 +120,7 @@ class _Subject:
         self._signal_model = signal_model_of(measurement, settings, kernel_set, threads=self._threads)
 
     def rows(self, count: int) -> list[dict[str, Any]]:
-        """Return a row per plan, those that err most first."""
+        """Return one row per plan, in descending order of the error."""
         self._say(f"{self._name}: making plans")
         pipelines = dict(self._pipelines())
         self._say(f"{self._name}: errors of {len(pipelines)} plans")
@@ -172,7 +174,7 @@ class _Subject:
 
 
 def beats(one: dict[str, Any], other: dict[str, Any]) -> bool:
-    """Return True if a plan has no larger error and no longer time than another, and is better in one of them."""
+    """Return True if ``one`` has no larger error and no longer time than ``other``, and is better in at least one."""
     pairs = [(one[key], other[key]) for key in ("error_db", "time_ms")]
     return all(a <= b for a, b in pairs) and any(a < b for a, b in pairs)
 

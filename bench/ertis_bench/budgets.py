@@ -1,4 +1,7 @@
-"""Error budgets over random settings and scenes: kept, or exceeded with a warning on stderr and in the file."""
+"""Error budgets over random settings and scenes.
+
+Each image must keep its budget, or the command must warn on stderr and in the file.
+"""
 
 import math
 import tempfile
@@ -24,8 +27,8 @@ from ertis_numba.waveform import call_at
 
 __all__ = ["form", "measurement_of", "run", "tried"]
 
-_FLOOR_DB: Final = -100.0  # below, single precision is most of the error
-_DIRECTIONS: Final = 24  # that are compared
+_FLOOR_DB: Final = -100.0  # Below this level, rounding in single precision dominates the error.
+_DIRECTIONS: Final = 24  # compared with the exact image
 _BEAMFORMERS: Final[tuple[Literal["delay_and_sum", "coherence_factor", "dmas", "capon"], ...]] = (
     "delay_and_sum",
     "delay_and_sum",
@@ -47,16 +50,16 @@ _GROUPS: dict[str, Callable[[dict[str, Any]], bool]] = {
 
 
 def run(*, count: int, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
-    """Process ``count`` random recordings by the command line, and return the report.
+    """Process ``count`` random recordings through the command line, and return the report.
 
     Parameters
     ----------
     count : int
-        Settings that have a plan and an image that is not silent.
+        Number of settings that have a plan and an image that is not silent.
     seed : int
-        Seed of the first setting; the others have the seeds after it.
+        Seed of the first setting. Later settings use the following seeds.
     say : callable
-        Called with lines about what happens.
+        Called with a line of progress for each recording.
     """
     rows: list[dict[str, Any]] = []
     refused = 0
@@ -76,7 +79,7 @@ def run(*, count: int, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
 
 
 def tried(seed: int) -> dict[str, Any] | None:
-    """Return the result for one random recording; None if its settings have no plan, or its image is silent."""
+    """Return the result for one random recording, or None if its settings have no plan or its image is silent."""
     measurement, scene = measurement_of(seed)
     settings = measurement.settings
     with tempfile.TemporaryDirectory() as folder:
@@ -92,7 +95,8 @@ def tried(seed: int) -> dict[str, Any] | None:
             predicted_db, stored = images.predicted_error_db, images.error_warning
     if not np.any(image.amplitude):
         return None
-    # Predictions for adaptive beamformers are measured in a sample of the directions: all are compared here.
+    # Predictions for adaptive beamformers come from a sample of the directions. Comparing all directions also
+    # tests that sample.
     if settings.processing.beamformer == "delay_and_sum":
         chosen, weights = verification.sampled(np.square(image.amplitude, dtype=np.float64).sum(axis=1), _DIRECTIONS)
     else:
@@ -118,7 +122,7 @@ def tried(seed: int) -> dict[str, Any] | None:
 
 
 def measurement_of(seed: int) -> tuple[Measurement, str]:
-    """Return a random measurement, and the name of its scene."""
+    """Return a random measurement and the name of its scene."""
     random = np.random.default_rng([seed, 16])
     scene = str(random.choice(_SCENES))
     settings = _settings(random)
@@ -165,7 +169,7 @@ def _settings(random: np.random.Generator) -> Settings:
 
 
 def _array(random: np.random.Generator) -> Array:
-    """Return a shipped layout, or 1 to 64 microphones at random places."""
+    """Return a shipped layout, or 1 to 64 microphones at random positions."""
     if random.integers(3) == 0:
         return Array(layout=str(random.choice(["eRTIS_v3D1", "eRTIS_v2", "uRTIS_v1"])))
     n_mics = int(random.choice([1, 1, 2, 3, int(random.integers(4, 65))]))
@@ -176,7 +180,10 @@ def _array(random: np.random.Generator) -> Array:
 
 
 def _words(random: np.random.Generator, settings: Settings, scene: str) -> NDArray[Any]:
-    """Return the words of a scene: echoes in the window, and in some scenes louder sound outside of window or band."""
+    """Return the words of a scene with echoes in the window.
+
+    Some scenes add louder sound outside of the window or of the band.
+    """
     layout, recording, call = microphones(settings.array), settings.recording, settings.call
     speed_m_s = sound_speed_m_s(settings.air)
     time_s = np.arange(recording.n_samples) / recording.sample_rate_hz
@@ -202,12 +209,20 @@ def _words(random: np.random.Generator, settings: Settings, scene: str) -> NDArr
 
 def form(report: dict[str, Any]) -> str:
     """Return the report as Markdown."""
-    header = ["settings", "tried", "budget kept", "exceeded, warned", "exceeded in silence", "warned in vain"]
+    header = [
+        "settings",
+        "tried",
+        "budget kept",
+        "exceeded, warned",
+        "exceeded without a warning",
+        "unnecessary warning",
+    ]
     return (
         f"{table(header, list(_lines(report['rows'])))}\n\n{report['count']} random settings from seed "
-        f"{report['seed']}; {report['refused']} others have no plan for their budget, or a silent image. Errors are "
-        f"relative to the independent float64 image: in up to {_DIRECTIONS} directions for delay-and-sum, bright ones "
-        "more often, and in all directions for adaptive beamformers. "
+        f"{report['seed']}. {report['refused']} other settings were skipped, because they have no plan for their "
+        "budget or a silent image. Errors are relative to the independent float64 image. They cover all directions for "
+        f"adaptive beamformers, and up to {_DIRECTIONS} directions for delay-and-sum, chosen with a preference for "
+        "bright ones. "
         f"{sentence(report['machine'])}"
     )
 

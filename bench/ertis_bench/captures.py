@@ -1,7 +1,7 @@
-"""Captures from emulated sensors with the user's commands: losses, and their circumstances.
+"""Captures from emulated sensors with the user's commands, to find losses and their circumstances.
 
-Nothing is looked at but what users see: lines on stdout, exit codes, and what the reader of recordings returns. The
-emulators' log, of what they sent, is the truth.
+The checks use only data that users see: lines on stdout, exit codes, and measurements that the reader of recordings
+returns. The reference is the emulators' log of sent measurements.
 """
 
 import json
@@ -25,25 +25,28 @@ from ertis_numba.storage import open_recording, sensor_names
 __all__ = ["chain", "disk_full", "emulated", "ertis", "kills", "platform", "sent_by_emulators", "sustained", "unplugs"]
 
 _ERTIS = (sys.executable, "-m", "ertis_cli")
-_WAIT_S = 120.0  # for anything that ought to end by itself
-_SEALED_S = 900.0  # for a long capture to be sealed
+_WAIT_S = 120.0  # for any step that must end without help
+_SEALED_S = 900.0  # for sealing a long capture
 Line = dict[str, Any]
 
 
 def platform(n_sensors: int, *, n_measurements: int) -> Scene:
-    """Return a scene of sensors that look into all directions and a reflector that moves: no two measurements agree."""
+    """Return a scene of sensors that face all directions, with a moving reflector.
+
+    The motion makes all measurements different, so that mix-ups are visible.
+    """
     sensors = tuple(Sensor(name=f"sensor-{number + 1}", yaw_deg=-90.0 + 90.0 * number) for number in range(n_sensors))
     reflector = Point(range_m=1.5, velocity_m_s=(2.0, 0.0, 0.0))
     return Scene(sensors=sensors, points=(reflector,), count=n_measurements)
 
 
 def sustained(source: Path, folder: Path, *, duration_s: float, rate_hz: float) -> Line:
-    """Capture from one sensor, triggered by pulses, and report losses and costs."""
+    """Capture from one sensor that pulses trigger, and report losses and processor time."""
     target = folder / "sustained.h5"
     with emulated(source, folder, "--sync-rate", f"{rate_hz:g}") as ports:
-        lines = _captured(ports, target, "--trigger", "sync", "--duration", f"{duration_s:g}")
+        lines = _capture(ports, target, "--trigger", "sync", "--duration", f"{duration_s:g}")
     final = lines[-1]
-    found = _checked(target, lines[:-1], sent_by_emulators(folder))
+    found = _compare(target, lines[:-1], sent_by_emulators(folder))
     return {
         "seconds": duration_s,
         "rate_hz": rate_hz,
@@ -56,12 +59,12 @@ def sustained(source: Path, folder: Path, *, duration_s: float, rate_hz: float) 
 
 
 def chain(source: Path, folder: Path, *, n_groups: int, rate_hz: float) -> Line:
-    """Capture from several sensors in one SYNC chain, and tell how many groups are complete, and how many mixed."""
+    """Capture from several sensors in one SYNC chain, and count complete and mixed groups."""
     target = folder / "chain.h5"
     with emulated(source, folder, "--sync-rate", f"{rate_hz:g}") as ports:
-        lines = _captured(ports, target, "--trigger", "sync", "-n", str(n_groups))
+        lines = _capture(ports, target, "--trigger", "sync", "-n", str(n_groups))
     sent = sent_by_emulators(folder)
-    found = _checked(target, lines[:-1], sent)
+    found = _compare(target, lines[:-1], sent)
     indices: dict[int, list[int]] = defaultdict(list)
     for (sensor, _), (check, sync_count) in found["rows"].items():
         indices[sync_count].append(sent[sensor, check])
@@ -77,18 +80,18 @@ def chain(source: Path, folder: Path, *, n_groups: int, rate_hz: float) -> Line:
 
 
 def unplugs(source: Path, folder: Path, *, seed: int, count: int) -> Line:
-    """Pull the plug at random moments, also within a measurement, and tell how long it took to be back."""
+    """Unplug a sensor at random times, also during measurements, and report the time until it measures again."""
     random_ = random.Random(seed)  # noqa: S311  a seed is to give the same moments again
     target = folder / "unplugs.h5"
-    moments, at_s = [], 5.0  # seconds that a busy machine takes to begin the capture
+    moments, at_s = [], 5.0  # A busy machine takes seconds to start the capture.
     for _ in range(count):
         at_s += random_.uniform(1.0, 2.0)
         away_s = random_.uniform(0.2, 1.0)
         moments += ["--unplug", f"{at_s:.3f}:{away_s:.3f}"]
         at_s += away_s + 2.5
     with emulated(source, folder, "--sync-rate", "20", *moments) as ports:
-        lines = _captured(ports, target, "--trigger", "sync", "--duration", f"{at_s:.1f}")
-    found = _checked(target, lines[:-1], sent_by_emulators(folder))
+        lines = _capture(ports, target, "--trigger", "sync", "--duration", f"{at_s:.1f}")
+    found = _compare(target, lines[:-1], sent_by_emulators(folder))
     back_s = [line["away_s"] for line in lines if line["event"] == "back"]
     events = [json.loads(line) for line in (folder / "sent.ndjson").read_text().splitlines()]
     plugged_ns = [event["time_ns"] for event in events if event.get("event") == "plugged in"]
@@ -104,26 +107,26 @@ def unplugs(source: Path, folder: Path, *, seed: int, count: int) -> Line:
 
 
 def _waits_s(plugged_ns: list[int], stored_ns: list[int]) -> list[float]:
-    """Return the times from each plug-in to the first measurement after it, where there is one."""
+    """Return the time from each reconnection to the first measurement after it, if there is one."""
     firsts = ((plugged, min((t for t in stored_ns if t > plugged), default=None)) for plugged in plugged_ns)
     return [(first - plugged) / 1e9 for plugged, first in firsts if first is not None]
 
 
 def kills(source: Path, folder: Path, *, seed: int, count: int) -> Line:
-    """Kill captures at random times, recover their journals, and count lost measurements among the reported ones."""
+    """Kill captures at random times, recover their journals, and count reported measurements that are lost."""
     random_ = random.Random(seed)  # noqa: S311  as above
     reported = lost = wrong = unreadable = 0
     moments: Counter[str] = Counter()
     with emulated(source, folder) as ports:
         for number in range(count):
             target = folder / f"killed-{number}.h5"
-            lines = _killed(ports, target, after_s=random_.uniform(0.0, 1.2), moments=moments)
+            lines = _capture_until_killed(ports, target, after_s=random_.uniform(0.0, 1.2), moments=moments)
             _recover(folder)
             if not target.exists():
                 unreadable += bool(lines)
                 continue
             try:
-                found = _checked(target, lines, sent_by_emulators(folder))
+                found = _compare(target, lines, sent_by_emulators(folder))
             except DataError:
                 unreadable += 1
                 continue
@@ -151,7 +154,7 @@ def disk_full(source: Path, folder: Path, disk: Path) -> Line:
     lines = [json.loads(line) for line in done.stdout.splitlines()]
     stored = [line for line in lines if line["event"] == "stored"]
     ertis("recover", str(disk), "--quiet")
-    found = _checked(target, stored, sent_by_emulators(folder))
+    found = _compare(target, stored, sent_by_emulators(folder))
     return {
         "exit code": done.returncode,
         "said": done.stderr.strip().splitlines()[-1].replace(str(disk), "DISK"),
@@ -163,7 +166,10 @@ def disk_full(source: Path, folder: Path, disk: Path) -> Line:
 
 @contextmanager
 def emulated(source: Path, folder: Path, *options: str) -> Iterator[list[str]]:
-    """Yield links to the ports of emulated sensors, which end with the block; they log to ``sent.ndjson``."""
+    """Yield links to the ports of emulated sensors, which log to ``sent.ndjson``.
+
+    The emulators end with the block.
+    """
     log = folder / "sent.ndjson"
     log.unlink(missing_ok=True)
     command = [*_ERTIS, "emulate", str(source), "--quiet", "--json", "--log", str(log), *options]
@@ -174,7 +180,7 @@ def emulated(source: Path, folder: Path, *options: str) -> Iterator[list[str]]:
             assert process.stdout is not None  # noqa: S101  it is a pipe
             lines = [process.stdout.readline() for _ in range(n_sensors)]
             if not all(lines):
-                raise DataError(f"ertis emulate {source} ended with {process.wait(_WAIT_S)}; see what it said above")
+                raise DataError(f"ertis emulate {source} ended with {process.wait(_WAIT_S)}; see its output above")
             yield [json.loads(line)["link"] for line in lines]
         finally:
             process.send_signal(signal.SIGTERM)
@@ -186,26 +192,29 @@ def _ports(ports: list[str]) -> list[str]:
 
 
 def ertis(*arguments: str) -> "subprocess.CompletedProcess[str]":
-    """Run a command to its end."""
+    """Run a command until it ends."""
     command = [*_ERTIS, *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=False, timeout=_SEALED_S)  # noqa: S603
 
 
-def _captured(ports: list[str], target: Path, *options: str) -> list[Line]:
-    """Capture to the end, and return all lines that were printed."""
+def _capture(ports: list[str], target: Path, *options: str) -> list[Line]:
+    """Run a capture until it ends, and return all lines that it printed."""
     done = ertis("capture", *_ports(ports), "-o", str(target), "--json", "--quiet", *options)
     if done.returncode:
         raise DataError(f"ertis capture ended with {done.returncode}: {done.stderr.strip()}")
     return [json.loads(line) for line in done.stdout.splitlines()]
 
 
-def _killed(ports: list[str], target: Path, *, after_s: float, moments: Counter[str]) -> list[Line]:
-    """Start a capture, kill it some time after its first line, and return its output; a sealing process continues."""
+def _capture_until_killed(ports: list[str], target: Path, *, after_s: float, moments: Counter[str]) -> list[Line]:
+    """Start a capture, kill it some time after its first line, and return its output.
+
+    A sealing process that the capture has started continues.
+    """
     command = [*_ERTIS, "capture", *_ports(ports), "-o", str(target), "--rate", "20", "--json", "--quiet", "-n", "16"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:  # noqa: S603
         assert process.stdout is not None  # noqa: S101  it is a pipe
         first = process.stdout.readline()
-        time.sleep(after_s)  # the moment is what is random here
+        time.sleep(after_s)  # The kill comes at a random time.
         ended = process.poll() is not None
         process.kill()
         lines = [json.loads(line) for line in [first, *process.stdout.readlines()] if line.endswith("\n")]
@@ -215,26 +224,29 @@ def _killed(ports: list[str], target: Path, *, after_s: float, moments: Counter[
 
 
 def _recover(folder: Path) -> None:
-    """Recover until no journal is left: a process that seals one may have outlived the capture."""
+    """Recover until no journal is left.
+
+    One call may not suffice, because a sealing process can outlive its capture and hold a journal.
+    """
     end_s = time.monotonic() + _WAIT_S
     while list(folder.glob("*.journal")) and time.monotonic() < end_s:
         ertis("recover", str(folder), "--quiet")
 
 
 def sent_by_emulators(folder: Path) -> dict[tuple[str, int], int]:
-    """Return the number of the words of each sensor and CRC-32 that an emulator has sent untouched."""
+    """Return the number of words by sensor and CRC-32, for measurements that an emulator sent without faults."""
     entries = [json.loads(line) for line in (folder / "sent.ndjson").read_text().splitlines() if line.endswith("}")]
     return {(each["name"], each["crc32"]): each["index"] for each in entries if "crc32" in each}
 
 
-def _checked(target: Path, reported: list[Line], sent: dict[tuple[str, int], int]) -> Line:
+def _compare(target: Path, reported: list[Line], sent: dict[tuple[str, int], int]) -> Line:
     """Read a recording and compare it with the reported and the sent measurements.
 
     Returns
     -------
     dict
-        rows, the CRC-32 and SYNC count by (sensor, sequence); lost, how many were reported and are not there; wrong,
-        how many are there and not what was reported, or were never sent.
+        ``rows``, CRC-32 and SYNC count by (sensor, sequence). ``lost``, number of reported measurements that are
+        missing. ``wrong``, number of stored measurements that differ from the report or were never sent.
     """
     rows: dict[tuple[str, int], tuple[int, int]] = {}
     for sensor in sensor_names(target):

@@ -1,4 +1,4 @@
-"""No time is reported for a wrong result: images are checked before they are timed."""
+"""Checks of images before they are timed, so that no benchmark reports the time of a wrong result."""
 
 import math
 
@@ -12,21 +12,21 @@ from ertis_numba.verification import ExactImage
 __all__ = ["MAX_ERROR_DB", "require_exact", "require_same_reflector"]
 
 MAX_ERROR_DB = -30.0
-_DIRECTIONS = 5  # checked against the exact image, spread over the grid
+_N_DIRECTIONS = 5  # compared with the exact image, spread over the grid
 _NEAR_RAD = math.radians(5)
 _NEAR_M = 0.01
 _SAME_LEVEL_DB = 1.5
 
 
 def require_exact(image: Energyscape, measurement: Measurement, *, max_error_db: float = MAX_ERROR_DB) -> float:
-    """Return the error of an image in dB, on some directions; refuse one above ``max_error_db``.
+    """Return the error of an image in dB, measured in some directions.
 
     Raises
     ------
     DataError
-        The image is wrong.
+        The error exceeds ``max_error_db``.
     """
-    chosen = np.unique(np.linspace(0, len(image.amplitude) - 1, _DIRECTIONS + 2).astype(int)[1:-1])
+    chosen = np.unique(np.linspace(0, len(image.amplitude) - 1, _N_DIRECTIONS + 2).astype(int)[1:-1])
     exact = ExactImage(image, measurement)
     ranges = np.arange(image.amplitude.shape[1])
     expected = np.stack([exact.amplitudes(direction, ranges) for direction in chosen.tolist()])
@@ -34,21 +34,21 @@ def require_exact(image: Energyscape, measurement: Measurement, *, max_error_db:
     error_db = 20 * math.log10(float(difference / np.linalg.norm(expected)))
     if not error_db <= max_error_db:
         raise DataError(
-            f"image of {len(image.amplitude)} directions is {error_db:.1f} dB off the exact one; wanted at most "
-            f"{max_error_db:g} dB: the times would be those of a wrong result"
+            f"image of {len(image.amplitude)} directions has an error of {error_db:.1f} dB relative to the exact "
+            f"image; the limit is {max_error_db:g} dB. Its time is not reported, because the result is wrong"
         )
     return error_db
 
 
 def require_same_reflector(image: Energyscape, other: Energyscape) -> None:
-    """Refuse two images unless the strongest place of one is among the strongest of the other, near by.
+    """Require the strongest bin of one image to be among the strongest of the other, at nearly the same place.
 
-    Methods sample pulses differently, so two reflectors of nearly one level may change places.
+    Methods sample pulses differently, so two reflectors of nearly equal level may change ranks.
 
     Raises
     ------
     DataError
-        The other image is weak there.
+        The other image is weak at that place.
     """
     direction, distance = np.unravel_index(np.argmax(image.amplitude), image.amplitude.shape)
     vectors = unit_vectors(other.azimuth_rad, other.elevation_rad)
@@ -58,6 +58,6 @@ def require_same_reflector(image: Energyscape, other: Energyscape) -> None:
     level_db = 20 * math.log10(ratio) if ratio else -math.inf
     if not level_db >= -_SAME_LEVEL_DB:
         raise DataError(
-            f"strongest reflector of one image, at {image.range_m[distance]:.3f} m, has {level_db:.1f} dB in another; "
-            f"wanted at least {-_SAME_LEVEL_DB:g} dB: the times would be those of a wrong result"
+            f"strongest reflector of one image, at {image.range_m[distance]:.3f} m, has {level_db:.1f} dB in the other "
+            f"image; the limit is {-_SAME_LEVEL_DB:g} dB. The time is not reported, because a result is wrong"
         )

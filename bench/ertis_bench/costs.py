@@ -1,4 +1,4 @@
-"""Costs of the kernels on this machine, and the table of nominal costs by which plans are chosen."""
+"""Costs of the kernels on this machine, and the table of nominal costs from which plans are chosen."""
 
 import statistics
 from collections.abc import Callable, Mapping
@@ -44,18 +44,21 @@ def run(*, count: int, say: Callable[[str], None]) -> dict[str, Any]:
             continue
         say(f"device {device}: measuring {count} times with {kernel_set.max_threads} threads")
         rounds = [measure(kernel_set, kernel_set.max_threads).seconds for _ in range(count)]
-        best = sorted(rounds, key=_geometric_mean)[: max(1, count // 3)]  # Others may have used the processor.
+        best = sorted(rounds, key=_geometric_mean)[: max(1, count // 3)]  # Slower rounds may have shared the processor.
         found[device] = {name: float(f"{statistics.median(each[name] for each in best):.2e}") for name in UNITS}
     return {"machine": machine.describe(), "count": count, "costs": found}
 
 
 def _geometric_mean(costs: Mapping[str, float]) -> float:
-    """Return the mean of the costs, without that of the image, which is a small difference of two times."""
+    """Return the geometric mean of the costs, without the cost of the image.
+
+    The cost of the image is a small difference of two times, and therefore noisy.
+    """
     return statistics.geometric_mean(cost for name, cost in costs.items() if name != "image")
 
 
 def as_python(costs: Mapping[str, Mapping[str, float]]) -> str:
-    """Return the module of nominal costs."""
+    """Return the source of the module of nominal costs."""
     lines = [_HEAD]
     for device in sorted(costs):
         lines.append(f'    "{device}": {{\n')
@@ -65,7 +68,7 @@ def as_python(costs: Mapping[str, Mapping[str, float]]) -> str:
 
 
 def as_markdown(report: Mapping[str, Any]) -> str:
-    """Return the measured costs beside the nominal ones as a table."""
+    """Return a table of the measured and the nominal costs."""
     measured = report["costs"]
     head = ["ns per unit of work", *(f"{device}, {kind}" for device in measured for kind in ("here", "nominal"))]
     rows = [
@@ -76,5 +79,8 @@ def as_markdown(report: Mapping[str, Any]) -> str:
 
 
 def update(path: Path, report: Mapping[str, Any]) -> None:
-    """Write the measured costs into the module of nominal costs; devices that were not measured keep theirs."""
+    """Write the measured costs into the module of nominal costs.
+
+    Devices without a measurement keep their costs.
+    """
     path.write_text(as_python({**NOMINAL_COSTS, **report["costs"]}), "utf-8")

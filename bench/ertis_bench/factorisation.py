@@ -1,7 +1,7 @@
-"""Products per place of an image: summed directly, from nodes of the whole array, and from those of sub-arrays.
+"""Products per bin of an image for direct sums, a beam grid of the whole array, and beam grids of sub-arrays.
 
-Nothing is timed here. What is counted is the least number of real products among the nodes that keep an error of
--36 dB, for arrays that do not exist as well.
+This module counts operations and measures no times. The count is the smallest number of real products among the beam
+grids with an error of at most -36 dB. It includes arrays that do not exist.
 """
 
 from collections.abc import Callable, Iterator
@@ -24,12 +24,15 @@ CASES = ((32, "3000"), (32, "3d:30000"), (256, "3000"), (256, "3d:30000"), (1024
 _PARTS = (1, 2, 4, 8)
 _ERROR_DB = -36.0
 _DELAY_TAPS = 2
-_COMPLEX, _REAL = 4, 2  # real products of a complex number by a complex weight, and by a real one
-_NODES = {2: (1.5, 2.0, 2.5, 3.0, 4.0), 4: (1.25, 1.5, 1.75, 2.0)}  # densities by taps
+_COMPLEX, _REAL = 4, 2  # real products of a complex number with a complex and with a real weight
+_NODES = {2: (1.5, 2.0, 2.5, 3.0, 4.0), 4: (1.25, 1.5, 1.75, 2.0)}  # beam densities by number of taps
 
 
 def run(*, say: Callable[[str], None]) -> dict[str, Any]:
-    """Return the counts; arrays larger than eRTIS have its density of microphones, placed at random."""
+    """Return the counts.
+
+    Arrays larger than eRTIS have its density of microphones, at random positions.
+    """
     settings = Settings.from_preset("default_25_50")
     rows = []
     for n_mics, directions in CASES:
@@ -42,7 +45,7 @@ def run(*, say: Callable[[str], None]) -> dict[str, Any]:
                 "microphones": n_mics,
                 "directions": len(grid),
                 "direct": n_mics * _DELAY_TAPS * _COMPLEX,
-                "parts": {str(n): _fewest(settings, _cut(positions_m, n), units) for n in _PARTS},
+                "parts": {str(n): _fewest_products(settings, _sub_arrays(positions_m, n), units) for n in _PARTS},
             }
         )
     return {"error_db": _ERROR_DB, "delay_taps": _DELAY_TAPS, "rows": rows}
@@ -56,8 +59,8 @@ def _array(settings: Settings, n_mics: int) -> NDArray[np.float64]:
     return np.random.default_rng(1).uniform(-half_m, half_m, (n_mics, 3))
 
 
-def _cut(positions_m: NDArray[np.float64], n_parts: int) -> list[NDArray[np.float64]]:
-    """Return sub-arrays of as many microphones each, cut across the longer side."""
+def _sub_arrays(positions_m: NDArray[np.float64], n_parts: int) -> list[NDArray[np.float64]]:
+    """Return sub-arrays with equal numbers of microphones, cut across the longer side."""
     parts = [positions_m]
     while len(parts) < n_parts:
         parts = [half for part in parts for half in _halves(part)]
@@ -70,8 +73,8 @@ def _halves(part_m: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:
     yield part_m[order[len(order) // 2 :]]
 
 
-def _fewest(settings: Settings, parts: list[NDArray[np.float64]], units: NDArray[np.float64]) -> int | None:
-    """Return the least number of products per place that keeps the error, None if no nodes do."""
+def _fewest_products(settings: Settings, parts: list[NDArray[np.float64]], units: NDArray[np.float64]) -> int | None:
+    """Return the smallest number of products per bin that keeps the error, or None if no beam grid does."""
     counts = []
     for n_taps, densities in _NODES.items():
         for density in densities:
@@ -79,17 +82,17 @@ def _fewest(settings: Settings, parts: list[NDArray[np.float64]], units: NDArray
             if None in node_products:
                 continue
             near = n_taps**2
-            # Beams of sub-arrays are delayed for the second sum, as signals are for the first.
+            # The second sum delays the beams of sub-arrays, as the first sum delays signals.
             second = near * _REAL if len(parts) == 1 else len(parts) * near * _DELAY_TAPS * _COMPLEX
             counts.append(round(sum(filter(None, node_products)) / len(units)) + second)
-            break  # denser ones cost more
+            break  # Denser grids cost more.
     return min(counts, default=None)
 
 
 def _node_products(
     settings: Settings, part_m: NDArray[np.float64], units: NDArray[np.float64], n_taps: int, density: float
 ) -> int | None:
-    """Return the products of the beams of a sub-array's nodes at one range, None if they err too much."""
+    """Return the products for a sub-array's beam grid at one range, or None if its error is too large."""
     aperture = Aperture.of(part_m - part_m.mean(axis=0), units)
     options = {"high_hz": settings.call.high_frequency_hz, "sound_speed_m_s": sound_speed_m_s(settings.air)}
     with one_thread():

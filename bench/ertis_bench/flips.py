@@ -1,7 +1,7 @@
-"""Random damage to every kind of file: whatever is lost or changed has to be reported by whoever reads it.
+"""Random damage to every kind of file. Each reader must report all data that is lost or changed.
 
-``python -m ertis_bench.flips STATE FOLDER`` makes files of one kind, prints what it was told to be stored, and ends by
-SIGKILL. The oracle reads recordings by h5py and zlib alone.
+``python -m ertis_bench.flips STATE FOLDER`` makes files of one kind, prints the measurements that were reported as
+stored, and ends by SIGKILL. The reference reader uses only h5py and zlib.
 """
 
 import json
@@ -42,12 +42,12 @@ _BLOCK_BYTES: Final = 512
 _OTHER_AT_EACH_SEALING: Final = {"/@date_created", "/@history"}
 
 Judge = Callable[[Path], str]
-"""Return "harmless", "noticed", "silent" or "crashed" for a damaged copy of a state."""
+"""Function that returns "harmless", "noticed", "silent" or "crashed" for a damaged copy of a state."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Kind:
-    """Files of one kind: the state they belong to, their names, and the share of all tries."""
+    """Files of one kind: their state, their names, and their share of all trials."""
 
     state: str
     pattern: str
@@ -68,12 +68,14 @@ _KINDS: Final = {
 
 
 def flips(folder: Path, *, seed: int, count: int, only: str = "") -> dict[str, Any]:
-    """Damage files ``count`` times: a flipped bit, or one time in ten each, a zeroed block or a lost end.
+    """Damage files ``count`` times.
+
+    One trial in ten zeroes a block, one in ten truncates a file, and the others flip a bit.
 
     Returns
     -------
     dict
-        ``tried``, ``noticed``, ``harmless``, ``silent`` and ``crashed`` in all, and ``kinds`` with the same of each.
+        Totals ``tried``, ``noticed``, ``harmless``, ``silent`` and ``crashed``. ``kinds`` has the same counts per kind.
     """
     rng = random.Random(seed)  # noqa: S311  nothing is secret
     kinds: dict[str, dict[str, int]] = {}
@@ -104,7 +106,7 @@ _VERDICTS: Final = ("noticed", "harmless", "silent", "crashed")
 
 
 def _damage(path: Path, rng: random.Random) -> str:
-    """Damage a file, and return how."""
+    """Damage a file, and return a description of the damage."""
     content = bytearray(path.read_bytes())
     place = rng.randrange(len(content))
     how = rng.random()
@@ -118,8 +120,8 @@ def _damage(path: Path, rng: random.Random) -> str:
     return f"{path.name}, {'block' if how < 0.1 else 'end' if how < 0.2 else 'bit'} at {place}"
 
 
-def _judged(read: Callable[[], tuple[object, bool]], wanted: object) -> str:
-    """Classify the content that was read, with the errors that were reported."""
+def _classify(read: Callable[[], tuple[object, bool]], wanted: object) -> str:
+    """Classify the content that was read, together with the errors that were reported."""
     try:
         found, reported = read()
     except ErtisError as error:
@@ -135,14 +137,14 @@ def _judged(read: Callable[[], tuple[object, bool]], wanted: object) -> str:
 # States
 
 
-def _made(state: str, folder: Path) -> list[list[Any]]:
-    """Have a process create a state and kill it; return the values that it reported."""
+def _make_state(state: str, folder: Path) -> list[list[Any]]:
+    """Create a state in a process that is then killed, and return the values that it reported."""
     folder.mkdir()
     command = [sys.executable, "-m", "ertis_bench.flips", state, str(folder)]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)  # noqa: S603
     if done.returncode != -signal.SIGKILL:
-        raise RuntimeError(f"the process that makes {state} ended with {done.returncode}: {done.stderr[-500:]}")
+        raise RuntimeError(f"process that makes {state!r} ended with {done.returncode}: {done.stderr[-500:]}")
     return [json.loads(line) for line in done.stdout.splitlines()]
 
 
@@ -151,12 +153,12 @@ def _journal(state: str) -> Callable[[Path], Judge]:
         from ertis_numba.storage.sealing import seal  # noqa: PLC0415  the processes to be killed do without HDF5
         from ertis_numba.storage.verify import verify  # noqa: PLC0415
 
-        shown = {tuple(each) for each in _made(state, folder)}
+        shown = {tuple(each) for each in _make_state(state, folder)}
         whole = shutil.copytree(folder, folder.with_name(f"{state}-whole"))
         seal(whole / f"rec.h5{SUFFIX}")
         wanted = _content(whole / "rec.h5")
         if shown != _measured(whole / "rec.h5"):
-            raise RuntimeError(f"without damage, a journal ({state}) is not what was told")
+            raise RuntimeError(f"undamaged journal ({state}) differs from the reported measurements")
 
         def read(work: Path) -> tuple[object, bool]:
             sealed = seal(work / f"rec.h5{SUFFIX}")
@@ -165,7 +167,7 @@ def _journal(state: str) -> Callable[[Path], Judge]:
             reported = bool(sealed.remark) or not all(report.is_intact for report in verify(sealed.recording))
             return _content(sealed.recording), reported
 
-        return lambda work: _judged(lambda: read(work), wanted)
+        return lambda work: _classify(lambda: read(work), wanted)
 
     return make
 
@@ -174,7 +176,7 @@ def _recording(folder: Path) -> Judge:
     from ertis_numba.storage.sealing import seal  # noqa: PLC0415
     from ertis_numba.storage.verify import verify  # noqa: PLC0415
 
-    _made("young", folder)
+    _make_state("young", folder)
     seal(folder / f"rec.h5{SUFFIX}")
     wanted = _content(folder / "rec.h5")
 
@@ -182,11 +184,11 @@ def _recording(folder: Path) -> Judge:
         reported = not all(report.is_intact for report in verify(work / "rec.h5"))
         return (None if reported else _content(work / "rec.h5")), reported
 
-    return lambda work: _judged(lambda: read(work), wanted)
+    return lambda work: _classify(lambda: read(work), wanted)
 
 
 def _spool(folder: Path) -> Judge:
-    shown = {tuple(each) for each in _made("spool", folder)}
+    shown = {tuple(each) for each in _make_state("spool", folder)}
 
     def read(work: Path) -> tuple[object, bool]:
         notes: list[str] = []
@@ -201,28 +203,28 @@ def _spool(folder: Path) -> Judge:
                 else:
                     found.add((run.sensor.name, item.first, zlib.crc32(entry.measurement.data.tobytes())))
         spool.close()
-        # Discarded measurements may come back: the central node recognises them.
+        # Discarded measurements may come back, because the central node recognises them.
         return found >= shown, bool(notes) or is_gap
 
-    return lambda work: _judged(lambda: read(work), wanted=True)
+    return lambda work: _classify(lambda: read(work), wanted=True)
 
 
 def _ledger(folder: Path) -> Judge:
-    _made("ledger", folder)
+    _make_state("ledger", folder)
     whole = Ledger(folder)
     wanted = (whole.acked_through, whole.open, whole.unsealed, whole.gaps)
 
     def read(work: Path) -> tuple[object, bool]:
         ledger = Ledger(work)
         if any(last > whole.acked_through.get(run, -1) for run, last in ledger.acked_through.items()):
-            return None, False  # measurements to come would be thrown away, whatever is reported
+            return None, False  # The node would take later measurements for stored.
         return (ledger.acked_through, ledger.open, ledger.unsealed, ledger.gaps), bool(ledger.damage)
 
-    return lambda work: _judged(lambda: read(work), wanted)
+    return lambda work: _classify(lambda: read(work), wanted)
 
 
 def _keys(folder: Path) -> Judge:
-    _made("keys", folder)
+    _make_state("keys", folder)
 
     def read(work: Path) -> tuple[object, bool]:
         work.chmod(0o700)
@@ -230,7 +232,7 @@ def _keys(folder: Path) -> Judge:
         return (pair, public_key(work / "robot.public.toml"), AllowList.load(work / "allow.toml")), False
 
     wanted, _ = read(folder)
-    return lambda work: _judged(lambda: read(work), wanted)
+    return lambda work: _classify(lambda: read(work), wanted)
 
 
 _STATES: Final[dict[str, Callable[[Path], Judge]]] = {
@@ -242,11 +244,11 @@ _STATES: Final[dict[str, Callable[[Path], Judge]]] = {
 }
 
 
-# The oracle
+# Reference reader
 
 
 def _measured(path: Path) -> set[tuple[str, int, int]]:
-    """Return sensor, number and CRC-32 of the words of all measurements of a recording."""
+    """Return sensor, sequence number and CRC-32 of the words of all measurements in a recording."""
     with h5py.File(path) as file:
         return {
             (name, int(number), zlib.crc32(np.ascontiguousarray(words).tobytes()))
@@ -298,16 +300,16 @@ def _emit_event(entries: list[JournalEntry]) -> None:
 
 
 def _begin_another_commit(journal: Journal) -> None:
-    """Change pages that a rollback journal brings back."""
+    """Change pages that a rollback journal restores."""
     execute = journal._database.execute  # noqa: SLF001  nobody else can be killed in mid commit
-    execute("PRAGMA cache_size = 1")  # what does not fit is written before the commit
+    execute("PRAGMA cache_size = 1")  # Pages that exceed the cache are written before the commit.
     execute("BEGIN")
     execute("UPDATE measurements SET crc32 = 0 WHERE id % 9 = 1")
     for number in range(60):
         execute(insert_statement("measurements"), (1, _SESSION_ID, 10_000 + number, *[0] * 9, bytes(8192)))
 
 
-def _live(state: str, folder: Path) -> None:
+def _make_files(state: str, folder: Path) -> None:
     """Make the files of a state."""
     if state in {"young", "grown", "large"}:
         journal = Journal.create(folder / f"rec.h5{SUFFIX}", target="rec.h5", source="flips")
@@ -352,5 +354,5 @@ def _live(state: str, folder: Path) -> None:
 
 if __name__ == "__main__":
     with suppress(BrokenPipeError):
-        _live(sys.argv[1], Path(sys.argv[2]))
+        _make_files(sys.argv[1], Path(sys.argv[2]))
     os.kill(os.getpid(), signal.SIGKILL)

@@ -1,7 +1,7 @@
-"""Everything that only an NVIDIA GPU can tell, in one run of less than ten minutes: tests, times, rivals, ceilings.
+"""Tests, times, comparisons with other libraries, and ceilings of an NVIDIA GPU, in one run of less than ten minutes.
 
-Each part is a process of its own with a time of its own, so that one that fails, hangs or breaks the GPU's context does
-not take the others with it.
+Each part runs in its own process with its own time limit. A part that fails, hangs or breaks the GPU's context
+therefore does not affect the others.
 """
 
 import datetime as dt
@@ -38,7 +38,7 @@ __all__ = [
 ]
 
 REFUSED = 3
-"""Exit code of a process that has no GPU; what it says is why."""
+"""Exit code of a process without a GPU. Its output states the reason."""
 
 BUDGETS_S = {
     "machine": 60,
@@ -49,7 +49,7 @@ BUDGETS_S = {
     "side by side": 90,
     "ceilings": 50,
 }
-"""Longest time of each part in seconds; together less than ten minutes."""
+"""Time limit of each part in seconds. The sum is less than ten minutes."""
 
 _ROOT = Path(__file__).parents[2]
 _TESTED = (
@@ -59,7 +59,7 @@ _TESTED = (
     "tests/test_modulator.py",
     "tests/cuda",
 )
-_SANITIZED = "cuda and (demodulate or fold or delay_and_sum or quantise or interpolated)"  # names of tests
+_SANITIZED_TESTS = "cuda and (demodulate or fold or delay_and_sum or quantise or interpolated)"  # selects tests by name
 _SUMMARIES = {
     "memcheck": r"ERROR SUMMARY: (\d+) error",
     "racecheck": r"RACECHECK SUMMARY: (\d+) hazard",
@@ -75,9 +75,9 @@ class FinishedProcess:
     Attributes
     ----------
     code : int or None
-        None where its time was over.
+        Exit code, or None after a timeout.
     text : str
-        What it said on stdout and stderr.
+        Output on stdout and stderr.
     """
 
     code: int | None
@@ -85,26 +85,26 @@ class FinishedProcess:
 
     @property
     def last_line(self) -> str:
-        """Last line of its output."""
+        """Last line of the output."""
         return self.text.strip().rpartition("\n")[2][:600]
 
 
 def run(*, results: Path, say: Callable[[str], None], measure: bool = True) -> dict[str, Any]:
-    """Measure, write the results to a file of their own, and return them.
+    """Measure, write the results to a new file, and return them.
 
     Parameters
     ----------
     results : Path
-        Folder; a file in it is named for the GPU and the time.
+        Folder of the new file, whose name contains the GPU and the time.
     say : callable
-        Told what goes on.
+        Called with a line of progress.
     measure : bool
-        Otherwise return the newest results of the folder, or none.
+        If False, measure nothing and return the newest results of the folder, or an empty report.
 
     Raises
     ------
     DeviceError
-        There is no GPU, or one that is only simulated; then nothing is written.
+        There is no GPU, or only a simulated one. Nothing is written then.
     """
     if not measure:
         return newest(results)
@@ -123,27 +123,29 @@ def run(*, results: Path, say: Callable[[str], None], measure: bool = True) -> d
         "parts": {},
     }
     results.mkdir(parents=True, exist_ok=True)
-    target = results / f"{_plain(found['name'])}-{when:%Y%m%dT%H%M%SZ}.json"
+    target = results / f"{_as_file_name(found['name'])}-{when:%Y%m%dT%H%M%SZ}.json"
     for name, measured in parts().items():
         say(f"{name}: at most {BUDGETS_S[name]} s")
         begin_s = time.monotonic()
         outcome = measured()
         report["parts"][name] = {**outcome, "wall_s": round(time.monotonic() - begin_s, 1)}
         report["wall_s"] = round(time.monotonic() - started_s, 1)
-        target.write_text(json.dumps(report, indent=1) + "\n", "utf-8")  # after each: what is known is kept
+        target.write_text(
+            json.dumps(report, indent=1) + "\n", "utf-8"
+        )  # Writing after each part keeps results if a later part fails.
         say(f"{name}: {outcome['status']}")
-    say(f"{target}: {report['wall_s']:g} s in all")
+    say(f"{target}: {report['wall_s']:g} s in total")
     return report
 
 
 def newest(results: Path) -> dict[str, Any]:
-    """Return the newest results of a folder; an empty report where there are none."""
+    """Return the newest results of a folder, or an empty report if there are none."""
     reports = [json.loads(path.read_text("utf-8")) for path in sorted(results.glob("*.json"))]
     return max(reports, key=lambda report: str(report["date"]), default={})
 
 
 def parts() -> dict[str, Callable[[], dict[str, Any]]]:
-    """Return the parts in the order of their importance."""
+    """Return the parts, the most important first."""
     return {
         "tests": tested,
         "paper": lambda: part("paper"),
@@ -155,12 +157,15 @@ def parts() -> dict[str, Callable[[], dict[str, Any]]]:
 
 
 def part(name: str) -> dict[str, Any]:
-    """Run one of `gpu_parts` in a process of its own; return its rows, also where it failed on the way."""
+    """Run one part of `gpu_parts` in its own process, and return its rows.
+
+    Rows that were written before a failure are included.
+    """
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "rows"
         file.touch()
         done = execute([sys.executable, "-m", "ertis_bench.gpu_parts", name, str(file)], BUDGETS_S[name])
-        lines = file.read_text("utf-8").split("\n")[:-1]  # the last one is empty, or was cut off
+        lines = file.read_text("utf-8").split("\n")[:-1]  # The last element is empty or truncated.
     status = "done" if done.code == 0 else _failed(name, done)
     return {"status": done.last_line if done.code == REFUSED else status, "rows": [json.loads(line) for line in lines]}
 
@@ -196,7 +201,7 @@ def sanitized(tool: str) -> dict[str, Any]:
     sanitizer = _sanitizer()
     if sanitizer is None:
         return {"status": "not available: no compute-sanitizer on PATH or in CUDA_HOME"}
-    command = [sanitizer, "--tool", tool, "--error-exitcode", "9", *_PYTEST, *_TESTED[:2], "-k", _SANITIZED]
+    command = [sanitizer, "--tool", tool, "--error-exitcode", "9", *_PYTEST, *_TESTED[:2], "-k", _SANITIZED_TESTS]
     done = execute(command, BUDGETS_S[tool])
     found = re.search(_SUMMARIES[tool], done.text)
     passed = re.search(r"(\d+) passed", done.text)
@@ -214,12 +219,12 @@ def _sanitizer() -> str | None:
 
 
 def execute(command: Sequence[str], limit_s: float) -> FinishedProcess:
-    """Run a command in the repository, and end it with all that it started where its time is over."""
+    """Run a command in the repository. After the time limit, kill it with all its children."""
     environment = os.environ | {
         "PYTHONPATH": os.pathsep.join(
             [*(str(_ROOT / part) for part in (".", "cli", "bench")), *filter(None, sys.path)]
         ),
-        "NUMBA_CUDA_LOW_OCCUPANCY_WARNINGS": "0",  # small images have small grids
+        "NUMBA_CUDA_LOW_OCCUPANCY_WARNINGS": "0",  # Small images have small grids.
     }
     with subprocess.Popen(  # noqa: S603
         command,
@@ -244,13 +249,13 @@ def execute(command: Sequence[str], limit_s: float) -> FinishedProcess:
 
 
 def _end(process: "subprocess.Popen[str]") -> None:
-    with suppress(ProcessLookupError):  # it may have ended just now
+    with suppress(ProcessLookupError):  # The process may have ended just now.
         os.killpg(process.pid, signal.SIGKILL)
 
 
 def _failed(name: str, done: FinishedProcess) -> str:
     if done.code is None:
-        return f"not done after {BUDGETS_S[name]} s"
+        return f"not finished after {BUDGETS_S[name]} s"
     return f"failed ({done.code}): {done.last_line}"
 
 
@@ -259,7 +264,7 @@ def _name(case: ET.Element) -> str:
 
 
 def _revision() -> str:
-    """Return the revision of the repository, and whether files differ from it."""
+    """Return the revision of the repository, with a suffix if files differ from it."""
     git = shutil.which("git")
     if git is None:
         return "unknown"
@@ -267,6 +272,6 @@ def _revision() -> str:
     return done.last_line if done.code == 0 else "unknown"
 
 
-def _plain(name: str) -> str:
-    """Return a name as part of a file's name."""
+def _as_file_name(name: str) -> str:
+    """Return a name in a form that suits file names."""
     return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")

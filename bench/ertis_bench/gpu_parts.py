@@ -1,7 +1,6 @@
 """Parts of the GPU benchmark, each in a separate process: ``python -m ertis_bench.gpu_parts NAME FILE``.
 
-A part yields rows, and each is written to the file as a line of JSON at once: what was measured before a part failed is
-not lost.
+A part yields rows. Each row is written to the file at once as a line of JSON, so that a later failure loses no results.
 """
 
 import functools
@@ -33,13 +32,13 @@ from ertis_numba.stages.fast import FastChain
 
 __all__ = ["FULL", "PARTS", "Scale", "ceilings_of", "machine", "paper", "side_by_side"]
 
-_SAME_DB = -100.0  # between devices that add up the same terms in another order
-_SAME_16_DB = -80.0  # and where numbers are rounded to 16 bits on the way
+_MAX_DIFFERENCE_DB = -100.0  # between devices that add the same terms in another order
+_MAX_DIFFERENCE_16_BIT_DB = -80.0  # limit where intermediate numbers are rounded to 16 bits
 _PUBLISHED_MS = dict(zip(map(str, DIRECTIONS), PUBLISHED_MS["GPU GTX 1080 Ti"], strict=True))
-_OPERATIONS, _BYTES = 8, 8  # of one term at one range: a complex multiply-add, and a complex64 to load
-_IMAGES = 8  # that a stream goes to in turn: all of them pinned
+_N_OPERATIONS, _N_BYTES = 8, 8  # per term and range: a complex multiply-add, and a complex64 to load
+_N_IMAGES = 8  # pinned images that a stream fills in turn
 _PACKAGES = ("numba-cuda", "cupy-cuda12x", "cupy-cuda13x", "cuda-bindings", "torch", "mach-beamform")
-_ASKED_OF_SMI = (
+_SMI_FIELDS = (
     "driver_version",
     "memory.total",
     "clocks.max.sm",
@@ -59,17 +58,18 @@ class Scale:
     Attributes
     ----------
     subject : callable
-        Returns the measurement and what it is.
+        Returns the measurement and its description.
     directions : tuple of str
-        As ``processing.directions``.
+        Direction grids, as ``processing.directions``.
     range_m : tuple of float
     count : int
-        Measurements one at a time.
+        Measurements that are processed one at a time.
     stream : int
-        Measurements in a stream.
+        Measurements per stream.
     streams : int
+        Number of streams.
     rivals : int
-        Measurements of each rival.
+        Measurements per compared library.
     ceilings : tuple of (str, int)
         Names and values of further parameters of `ceilings.ceilings`.
     """
@@ -84,7 +84,7 @@ class Scale:
     ceilings: tuple[tuple[str, int], ...] = ()
 
     def settings(self, directions: str) -> tuple[Settings, Measurement]:
-        """Return settings for a grid, and the measurement."""
+        """Return settings for a direction grid, and the measurement."""
         measurement, _ = self.subject()
         processing = measurement.settings.processing.replace(
             directions=directions, range_m=self.range_m, method="fast", wavefront="plane"
@@ -101,11 +101,11 @@ def machine(_: Scale) -> Iterator[dict[str, Any]]:
     Raises
     ------
     DeviceError
-        There is none, or one that is only simulated.
+        There is no GPU, or only a simulated one.
     """
     kernel_set = kernels.load("cuda")
     if kernel_set.simulated:
-        raise DeviceError("device 'cuda' is simulated here, and its times tell nothing; unset NUMBA_ENABLE_CUDASIM")
+        raise DeviceError("device 'cuda' is simulated here, so its times are meaningless; unset NUMBA_ENABLE_CUDASIM")
     import cupy  # noqa: PLC0415 - there with a GPU only
 
     properties = ceilings.properties()
@@ -122,12 +122,14 @@ def machine(_: Scale) -> Iterator[dict[str, Any]]:
 
 
 def paper(scale: Scale) -> Iterator[dict[str, Any]]:
-    """Yield a row per grid: one at a time, in stages, and streamed, after images were checked.
+    """Yield one row per direction grid, with times of single measurements, stages and streams.
+
+    Images are checked before they are timed.
 
     Raises
     ------
     DataError
-        A result is wrong, so it is not timed.
+        A result is wrong and therefore not timed.
     """
     for directions in scale.directions:
         settings, measurement = scale.settings(directions)
@@ -155,9 +157,9 @@ def paper(scale: Scale) -> Iterator[dict[str, Any]]:
 
 
 def side_by_side(scale: Scale) -> Iterator[dict[str, Any]]:
-    """Yield a row per grid and library: the same sums by it and by this package, in turns, after images were compared.
+    """Yield one row per direction grid and library, with its times and those of this package for the same sums.
 
-    What fails is said in its row, and the others go on.
+    Both take turns, after their images have been compared. A failure is reported in its row, and the other rows follow.
     """
     for library, directions in itertools.product(rivals.LIBRARIES, scale.directions):
         row = {"library": library, "directions": directions}
@@ -172,7 +174,7 @@ def side_by_side(scale: Scale) -> Iterator[dict[str, Any]]:
 
 
 def ceilings_of(scale: Scale) -> Iterator[dict[str, Any]]:
-    """Yield the limits of the GPU, and the share that delay-and-sum without a beam grid reaches."""
+    """Yield the limits of the GPU, and the share of them that delay-and-sum without a beam grid reaches."""
     found = ceilings.ceilings(scale.count, **dict(scale.ceilings))
     rounded = {name: round(value, 1) for name, value in found.items()}
     yield {"ceilings": rounded, **_smi(ceilings.properties()["uuid"])}
@@ -183,7 +185,10 @@ def ceilings_of(scale: Scale) -> Iterator[dict[str, Any]]:
     tables = rivals.tables_of(plan, measurement)
     seconds = stages(plan, _words(measurement), count=scale.count)["stages_ms"]["delay-and-sum with envelope"] / 1e3
     points = tables.n_terms * shape[0] * shape[1]
-    reached = {"float32_gop_s": points * _OPERATIONS / seconds / 1e9, "load_gb_s": points * _BYTES / seconds / 1e9}
+    reached = {
+        "float32_gop_s": points * _N_OPERATIONS / seconds / 1e9,
+        "load_gb_s": points * _N_BYTES / seconds / 1e9,
+    }
     shares = {name: rate / found[name] for name, rate in reached.items()}
     tighter = max(shares, key=lambda name: shares[name])
     yield {
@@ -207,36 +212,44 @@ PARTS: dict[str, Callable[[Scale], Iterator[dict[str, Any]]]] = {
 
 
 def _checked(plain: Pipeline, recorded: Pipeline, measurement: Measurement) -> dict[str, float]:
-    """Return errors of an image, which are small: from the exact one, and from the processor's of the same plan."""
+    """Return the error relative to the exact image, and the difference from the CPU's image of the same plan.
+
+    Raises
+    ------
+    DataError
+        An error is too large, or a CUDA graph changes the image.
+    """
     image = plain.process(measurement)
-    again = [recorded.process(measurement) for _ in range(3)]  # launched, recorded, played
+    again = [
+        recorded.process(measurement) for _ in range(3)
+    ]  # The first call launches kernels, the second records a graph, and the third plays it.
     if any(not np.array_equal(other.amplitude, image.amplitude) for other in again):
-        raise DataError("a recorded chain makes another image than a launched one; do not use graphs=True")
+        raise DataError("image of a CUDA graph differs from that of launched kernels; do not use graphs=True")
     error_db = checks.require_exact(image, measurement)
     same = Pipeline(plain.settings, device="cpu").process(measurement)
     difference_db = verification.error_db(image.amplitude, same.amplitude)
-    wanted_db = _SAME_DB if plain.settings.accuracy.precision == "float32" else _SAME_16_DB
+    wanted_db = _MAX_DIFFERENCE_DB if plain.settings.accuracy.precision == "float32" else _MAX_DIFFERENCE_16_BIT_DB
     if not difference_db <= wanted_db:
         raise DataError(
-            f"image of {len(image.amplitude)} directions on 'cuda' is {difference_db:.1f} dB off that on 'cpu'; the "
-            f"limit is {wanted_db:g} dB: the times would be those of a wrong result"
+            f"image of {len(image.amplitude)} directions on 'cuda' differs from that on 'cpu' by {difference_db:.1f} "
+            f"dB; the limit is {wanted_db:g} dB. Its time is not reported, because the result is wrong"
         )
     return {"error_db": round(error_db, 1), "off_cpu_db": round(difference_db, 1)}
 
 
 def _pinned(pipeline: Pipeline, measurement: Measurement) -> NDArray[np.float32]:
-    """Return the array of an image as the pipeline makes it, which is the quickest to be filled."""
+    """Return the pinned array of an image as the pipeline creates it. Transfers to pinned memory are the fastest."""
     return pipeline.process(measurement).amplitude
 
 
 def _streamed(plan: Settings, words: NDArray[Any], scale: Scale) -> dict[str, float]:
-    """Return medians of the time per measurement: images to the host, and images that stay on the GPU."""
+    """Return median times per measurement, for images copied to the host and for images that stay on the GPU."""
     found: dict[str, float] = {}
     for name, graphs in {"plain": False, "graphs": True}.items():
         chain = FastChain(plan, kernels.load("cuda"), threads=1, graphs=graphs)
-        images = [chain.new_image() for _ in range(_IMAGES)]
+        images = [chain.new_image() for _ in range(_N_IMAGES)]
         stream = [words] * scale.stream
-        to_host = [images[number % _IMAGES] for number in range(scale.stream)]
+        to_host = [images[number % _N_IMAGES] for number in range(scale.stream)]
         subjects = {
             f"to the host, {name}": functools.partial(chain.process_batch, stream, to_host),
             f"stay on the GPU, {name}": functools.partial(chain.process_batch, stream, [None] * scale.stream),
@@ -267,8 +280,8 @@ def _version(number: int) -> str:
 
 
 def _smi(uuid: str) -> dict[str, str]:
-    """Return the output of nvidia-smi for the GPU; empty if the tool is missing."""
-    command = ["nvidia-smi", *(["-i", uuid] if uuid else []), f"--query-gpu={','.join(_ASKED_OF_SMI)}"]
+    """Return properties of the GPU from nvidia-smi, or an empty dict if the tool is missing."""
+    command = ["nvidia-smi", *(["-i", uuid] if uuid else []), f"--query-gpu={','.join(_SMI_FIELDS)}"]
     try:
         done = subprocess.run(  # noqa: S603
             [*command, "--format=csv,noheader"], capture_output=True, text=True, check=True, timeout=20
@@ -276,7 +289,7 @@ def _smi(uuid: str) -> dict[str, str]:
     except (OSError, subprocess.SubprocessError):
         return {}
     values = [value.strip() for value in done.stdout.strip().splitlines()[0].split(",")]
-    return dict(zip(_ASKED_OF_SMI, values, strict=True))
+    return dict(zip(_SMI_FIELDS, values, strict=True))
 
 
 def _main(name: str, path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Duration of each stage of the chain on a GPU, by the GPU's own clock."""
+"""Duration of each stage of the chain on a GPU, measured with the GPU's own clock."""
 
 import dataclasses
 import functools
@@ -38,24 +38,24 @@ _BEAMFORM = (
 
 
 def stages(settings: Settings, words: NDArray[Any], *, count: int) -> dict[str, Any]:
-    """Return the median of each stage, of one measurement at a time, with nothing else on the GPU.
+    """Return the median duration of each stage, for one measurement at a time on an otherwise idle GPU.
 
-    All launches wait behind a kernel that keeps the GPU busy for milliseconds, so what the processor takes to launch
-    is not in the times.
+    All launches wait behind a kernel that keeps the GPU busy for milliseconds. The times therefore exclude the
+    processor's time for the launches.
 
     Parameters
     ----------
     settings : Settings
-        Their plan leaves nothing open.
+        Settings with a complete plan.
     words : (sample, word)
     count : int
-        Measurements; the first two are not counted.
+        Number of measurements. The first two are not counted.
 
     Returns
     -------
     dict
-        ``stages_ms`` by name, their sums with and without ``TRANSFERS``, and ``queued``: whether all was launched while
-        the GPU was still busy, each time.
+        ``stages_ms`` by name; their sums with and without ``TRANSFERS``; and ``queued``, True if in every measurement
+        all launches were queued while the GPU was still busy.
     """
     watch = _LaunchStopwatch()
     chain = FastChain(settings, _watched(kernels.load("cuda"), watch), threads=1)
@@ -82,7 +82,7 @@ def stages(settings: Settings, words: NDArray[Any], *, count: int) -> dict[str, 
 
 
 class _LaunchStopwatch(Stopwatch):
-    """A stopwatch that also knows how long the processor took to launch everything."""
+    """Stopwatch that also measures the processor's time for all launches."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -100,12 +100,12 @@ class _LaunchStopwatch(Stopwatch):
 
     @property
     def launched_ms(self) -> float:
-        """Time from the start to the last mark, by the processor's clock."""
+        """Time from the start to the last mark, measured with the processor's clock."""
         return 1e3 * (self._end_s - self._begin_s)
 
 
 def _watched(kernel_set: KernelSet, watch: _LaunchStopwatch) -> KernelSet:
-    """Return kernels that set marks where a stage ends."""
+    """Return kernels that set marks at the end of each stage."""
     before = {"multiply_and_fold": "forward transforms", **dict.fromkeys(_BEAMFORM, "inverse transforms")}
     after = {"demodulate_words": "demodulate", "multiply_and_fold": "multiply and fold"}
     after |= dict.fromkeys(_BEAMFORM, "delay-and-sum with envelope")
@@ -124,7 +124,7 @@ def _run(kernel: Callable[..., None], watch: _LaunchStopwatch, before: str | Non
 
 
 class _TimedMemory:
-    """A memory whose lanes set marks; all else is the device's."""
+    """Memory of the device whose lanes set marks."""
 
     def __init__(self, make: Callable[..., Memory], watch: _LaunchStopwatch, *, graphs: bool = False) -> None:
         self._memory, self._watch = make(graphs=graphs), watch
@@ -137,7 +137,7 @@ class _TimedMemory:
 
 
 class _TimedLane:
-    """A lane that is kept busy before the words are sent, and that sets marks at both transfers."""
+    """Lane that is kept busy before the words are sent, and that sets marks at both transfers."""
 
     def __init__(self, lane: Lane, watch: _LaunchStopwatch, sums: NDArray[np.float32]) -> None:
         self._lane, self._watch, self._sums = lane, watch, sums

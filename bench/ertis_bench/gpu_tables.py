@@ -1,4 +1,4 @@
-"""The report of `gpu` as Markdown."""
+"""Markdown report of `gpu`."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -16,7 +16,7 @@ _PAPER = f"the paper's {_PUBLISHED.removeprefix('GPU ')}"
 
 
 def gpu(report: dict[str, Any]) -> str:
-    """Return all that was measured on a GPU; that nothing was, where the report is empty."""
+    """Return all measurements on a GPU, or a note that there are none if the report is empty."""
     if not report:
         return f"{_times(_lines({}))}\n\n{_NO_RESULTS}"
     parts = [_stages(report), _rivals(report), _reached(report), _verdicts(report), _machine(report)]
@@ -24,9 +24,9 @@ def gpu(report: dict[str, Any]) -> str:
 
 
 def gpu_short(report: dict[str, Any]) -> str:
-    """Return the times of the paper's grids, launched and one at a time, in a stream, and the paper's."""
+    """Return the times of single measurements and streams for the paper's direction grids, with the paper's times."""
     if not report:
-        return "No GPU has run the kernels yet: they are simulated and compiled, and nothing is measured."
+        return "No GPU has run the kernels yet. They are simulated and compiled, but not measured."
     lines = _lines(report)
     times = _times({name: lines[name] for name in (_ONE_AT_A_TIME, _STREAMED, _PAPER)})
     about = f"Medians on {report['gpu']['name']}, {report['date'][:10]}; docs/explanation/gpu.md has the rest."
@@ -39,7 +39,7 @@ def _rows(report: dict[str, Any], part: str) -> list[dict[str, Any]]:
 
 
 def _lines(report: dict[str, Any]) -> dict[str, list[str]]:
-    """Return the times of a measurement by grid; a grid that was not measured says so."""
+    """Return the times per measurement by direction grid. Grids without a measurement are marked."""
     rows = {row["directions"]: row for row in _rows(report, "paper")}
     lines: dict[str, list[str]] = {
         _ONE_AT_A_TIME: [],
@@ -47,7 +47,7 @@ def _lines(report: dict[str, Any]) -> dict[str, list[str]]:
         "on the GPU alone, without transfers": [],
         **{f"streamed, images {name}": [] for name in _STREAMS},
         _PAPER: [],
-        "times faster than that": [],
+        "paper's time / shortest single time": [],
     }
     for directions, published in zip(DIRECTIONS, PUBLISHED_MS[_PUBLISHED], strict=True):
         row = rows.get(str(directions))
@@ -78,8 +78,8 @@ def _stages(report: dict[str, Any]) -> str:
     lines = [[name, *(f"{row['stages_ms'][name]:.4f}" for row in rows)] for name in rows[0]["stages_ms"]]
     lines.append(["sum without transfers", *(f"{row['without_transfers_ms']:.4f}" for row in rows)])
     plans = "; ".join(
-        f"{row['directions']} directions, {row['ranges']} ranges: {row['plan']}, {row['error_db']:.1f} dB off the "
-        f"exact image, {row['off_cpu_db']:.1f} dB off `cpu`"
+        f"{row['directions']} directions, {row['ranges']} ranges: {row['plan']}, error {row['error_db']:.1f} dB "
+        f"relative to the exact image and {row['off_cpu_db']:.1f} dB relative to `cpu`"
         + ("" if row["queued"] else ", with gaps in which the GPU waited for launches")
         for row in rows
     )
@@ -101,7 +101,9 @@ def _rivals(report: dict[str, Any]) -> str:
         ]
         for row in rows
     ]
-    return table(["the same sums", "directions", "theirs, ms", "ours, ms", "times faster", "apart, dB"], cells)
+    return table(
+        ["library", "directions", "library, ms", "this package, ms", "library / this package", "difference, dB"], cells
+    )
 
 
 def _reached(report: dict[str, Any]) -> str:
@@ -112,15 +114,15 @@ def _reached(report: dict[str, Any]) -> str:
     names = {
         "copy_gb_s": "copy in device memory, read and written, GB/s",
         "float32_gop_s": "float32 multiply-add, Gop/s",
-        "load_gb_s": "loads from the first cache level, GB/s",
-        "load_unaligned_gb_s": "the same from the sample after a line's begin, GB/s",
+        "load_gb_s": "loads from the first-level cache, GB/s",
+        "load_unaligned_gb_s": "the same, one sample after the start of a cache line, GB/s",
     }
     shares = reached.get("shares", {})
     cells = [
         [text, f"{found[name]:,.0f}", f"{100 * shares[name]:.0f} %" if name in shares else "–"]
         for name, text in names.items()
     ]
-    text = table(["at most", "measured", "delay-and-sum reaches"], cells)
+    text = table(["limit", "measured", "share that delay-and-sum reaches"], cells)
     if not reached:
         return text
     return (
@@ -130,7 +132,7 @@ def _reached(report: dict[str, Any]) -> str:
 
 
 def _verdicts(report: dict[str, Any]) -> str:
-    """Return the result of each part, failures included."""
+    """Return the result of each part, including failures."""
     lines = []
     for name, part in report["parts"].items():
         reported = [part["status"]]
@@ -156,7 +158,7 @@ def _machine(report: dict[str, Any]) -> str:
         "power limit": card.get("power.limit"),
     }
     under_load = next((row["clocks.sm"] for row in _rows(report, "ceilings") if "clocks.sm" in row), None)
-    reported = [f"{name} {value}" for name, value in {**known, "clock just after load": under_load}.items() if value]
+    reported = [f"{name} {value}" for name, value in {**known, "clock right after load": under_load}.items() if value]
     packages = ", ".join(f"{name} {value}" for name, value in card["packages"].items())
     return (
         f"Measured on {card['name']} ({card['multiprocessors']} multiprocessors, compute capability "
@@ -166,12 +168,13 @@ def _machine(report: dict[str, Any]) -> str:
 
 
 _NO_RESULTS = """\
-No GPU has run these kernels yet: `make gpu` would fill this table, and confirm the predictions below or refute them."""
+No GPU has run these kernels yet. `make gpu` fills this table, which will confirm or refute the predictions below."""
 _CONDITIONS = """\
-{date}, revision {revision}, the measurement is {source}, 0.5–5 m, the plan that settings without any wish give on this
-GPU. Images are checked before they are timed: against the exact one, the processor's of the same plan, and a rival's
-against this package's. One at a time: from the words in memory to the image in pinned memory, one after the other,
-launched or as a CUDA graph, in turns. On the GPU alone: by the GPU's own clock, all launches waiting behind a kernel
-that keeps it busy. Streamed: 64 measurements in three lanes. The same measurement is processed again and again, so the
-GPU's caches may hold more of the tables than they would beside other work. Rivals run the same algorithm with the same
-tables and every direction's own beam, in turns with this package; mach computes its delays itself."""
+{date}, revision {revision}; the measurement is {source}, 0.5–5 m, with the default plan for this GPU. Images are
+checked before they are timed. They are compared with the exact image, with the CPU's image of the same plan, and
+with the images of other libraries. One at a time: from the words in memory to the image in pinned memory, with
+separate launches and with a CUDA graph, in turns. On the GPU alone: with the GPU's own clock, while all launches
+wait behind a kernel that keeps the GPU busy. Streamed: 64 measurements in three lanes. The same measurement is
+processed repeatedly, so that the GPU's caches may hold more of the tables than they would beside other work. Other
+libraries run the same algorithm with the same tables and without a beam grid, in turns with this package. mach
+computes its delays itself."""

@@ -1,4 +1,7 @@
-"""Estimated time of a kernel on an NVIDIA H200 SXM: arithmetic with published figures, to be tested on a GPU."""
+"""Estimated time of a kernel on an NVIDIA H200 SXM.
+
+The estimates are arithmetic with published figures, and remain to be confirmed on a GPU.
+"""
 
 import math
 from collections.abc import Callable
@@ -15,30 +18,31 @@ __all__ = ["ASSUMED", "CC", "GPU", "LOOPS", "Loop", "main_loop", "predicted_us",
 
 CC: Final = (9, 0)
 GPU: Final[dict[str, float]] = {
-    # NVIDIA, "H200 Tensor Core GPU", data sheet, and "H100 Tensor Core GPU Architecture", white paper: the same chip
+    # NVIDIA, "H200 Tensor Core GPU", data sheet, and "H100 Tensor Core GPU Architecture", white paper. Both GPUs
+    # have the same chip.
     "multiprocessors": 132,
-    "clock_hz": 1.98e9,  # the highest; under load it may be less
+    "clock_hz": 1.98e9,  # highest clock; lower under load
     "memory_bytes_s": 4.8e12,
-    "schedulers": 4,  # of a multiprocessor: an instruction of a warp each per clock, for 32 lanes each
-    "cache_line_bytes": 128,  # what the first cache level gives per clock
-    # NVIDIA, "CUDA C++ Programming Guide", technical specifications per compute capability: 9.0
+    "schedulers": 4,  # per multiprocessor; each issues one instruction of a warp per clock, for 32 lanes
+    "cache_line_bytes": 128,  # per clock from the first-level cache
+    # NVIDIA, "CUDA C++ Programming Guide", technical specifications for compute capability 9.0
     "warps": 64,
     "blocks": 32,
     "registers": 65_536,
-    "registers_at_a_time": 256,  # in which warps are given registers
+    "registers_at_a_time": 256,  # granularity of the registers of a warp
     # Luo et al., "Benchmarking and dissecting the NVIDIA Hopper GPU architecture" (2024), measured on an H100
     "cache_latency_clocks": 41,
 }
 ASSUMED: Final[dict[str, float]] = {
     "second_cache_bytes_s": 5.5e12,  # to all multiprocessors together
-    "pcie_bytes_s": 55e9,  # PCIe 5 x16 gives 63 GB/s less its protocol; pinned memory
-    "copy_bytes_s": 10e9,  # of one core, words into pinned memory
-    "between_kernels_us": 2.0,  # of a graph, each waiting for the one before
-    "transform_kernels": 2,  # of cuFFT for each transform; each reads and writes its arrays once
-    "transform_kernel_us": 3.0,  # at least
-    "graph_us": 10.0,  # the processor's, for one graph
-    "host_us": 30.0,  # the processor's, for all else of a measurement, in Python
-    # numba-cuda, pull request 288: a launch, and each of its arrays
+    "pcie_bytes_s": 55e9,  # from pinned memory; PCIe 5 x16 has 63 GB/s including its protocol
+    "copy_bytes_s": 10e9,  # one core that copies words to pinned memory
+    "between_kernels_us": 2.0,  # between dependent kernels of a graph
+    "transform_kernels": 2,  # kernels of cuFFT per transform; each reads and writes its arrays once
+    "transform_kernel_us": 3.0,  # lower limit per kernel
+    "graph_us": 10.0,  # processor time to start a graph
+    "host_us": 30.0,  # processor time for all other work of a measurement, in Python
+    # numba-cuda, pull request 288: time of a launch, and of each of its arrays
     "launch_us": 6.6,
     "launch_array_us": 4.0,
     "transform_launch_us": 10.0,
@@ -54,20 +58,21 @@ class Loop:
     Attributes
     ----------
     of : str
-        What the passes go over.
+        Unit that a pass processes.
     passes : callable
-        How often a thread goes round, from the launch's arguments.
+        Returns the number of passes of a thread, from the launch's arguments.
     loads : int
-        Load instructions of a pass, by which it is seen how many passes the compiler made one.
+        Load instructions of a pass. Their number in machine code shows how many passes the compiler has merged.
     lines : int
-        Lines of the first cache level that the loads of a warp take. A warp that loads 256 bytes takes two, and three
-        where they do not begin at a line; one that loads the same number 32 times takes one.
+        Lines of the first-level cache that the loads of a warp read. A warp that loads 256 bytes reads two lines, or
+        three if the bytes do not start at a line. A warp that loads the same number 32 times reads one line.
     chain : int
-        Loads that wait for each other.
+        Loads that depend on each other.
     points : int
-        Results of a thread.
+        Results per thread.
     fetched : callable
-        Bytes that blocks bring from the second cache level to the first, each line once per block.
+        Returns the bytes that blocks fetch from the second-level to the first-level cache, with each line once per
+        block.
     """
 
     of: str
@@ -79,32 +84,35 @@ class Loop:
     fetched: Callable[[Arguments, tuple[int, ...]], float]
 
 
-def _of_terms(given: Arguments, grid: tuple[int, ...]) -> float:
-    """Blocks take groups of directions, whose terms may lie in the same lines, and tiles of ranges."""
+def _bytes_of_terms(given: Arguments, grid: tuple[int, ...]) -> float:
+    """Return the bytes that blocks fetch for a loop over terms.
+
+    A block computes a group of directions and a tile of ranges. Terms of a group may share cache lines.
+    """
     offsets = given["offsets"].reshape(-1, int(given["n_terms"])).astype(np.int64)
     return grid[1] * sum(
-        _distinct_lines(8 * offsets[first : first + DIRECTIONS], 8 * TILE)
+        _bytes_of_lines(8 * offsets[first : first + DIRECTIONS], 8 * TILE)
         for first in range(0, len(offsets), DIRECTIONS)
     )
 
 
-def _of_nodes(given: Arguments, grid: tuple[int, ...]) -> float:
+def _bytes_of_grid_points(given: Arguments, grid: tuple[int, ...]) -> float:
     places = given["places"].reshape(-1, int(given["n_pairs"])).astype(np.int64)
     row_bytes = 8 * int(given["width"])
     return grid[1] * sum(
-        _distinct_lines(row_bytes * (places[first : first + DIRECTIONS, :, None] + np.arange(2)), 8 * TILE)
+        _bytes_of_lines(row_bytes * (places[first : first + DIRECTIONS, :, None] + np.arange(2)), 8 * TILE)
         for first in range(0, len(places), DIRECTIONS)
     )
 
 
-def _of_words(given: Arguments, grid: tuple[int, ...]) -> float:
+def _bytes_of_words(given: Arguments, grid: tuple[int, ...]) -> float:
     n_taps, outputs = given["taps"].size, -(-given["out"].shape[1] // grid[0])
     words = n_taps + (outputs - 1) * int(given["factor"])
     return float(math.prod(grid) * (words * int(given["n_octets"]) + given["taps"].nbytes))
 
 
-def _distinct_lines(starts_bytes: NDArray[np.int64], n_bytes: int) -> float:
-    """Return how many bytes the lines have that runs of ``n_bytes`` touch."""
+def _bytes_of_lines(starts_bytes: NDArray[np.int64], n_bytes: int) -> float:
+    """Return the size of all cache lines that runs of ``n_bytes`` touch, in bytes."""
     line = int(GPU["cache_line_bytes"])
     first, last = starts_bytes.ravel() // line, (starts_bytes.ravel() + n_bytes - 1) // line
     return float(line * len(np.unique(np.concatenate([first + k for k in range(int((last - first).max()) + 1)]))))
@@ -117,19 +125,19 @@ _TERMS: Final = Loop(
     lines=2 + 4 * 3,
     chain=2,
     points=4,
-    fetched=_of_terms,
+    fetched=_bytes_of_terms,
 )
 LOOPS: Final = {
     "delay_and_sum_envelope.fill": _TERMS,
     "delay_and_sum.fill": _TERMS,
     "interpolated_beams_envelope.interpolate": Loop(
-        of="pair of nodes",
+        of="pair of grid points",
         passes=lambda given: int(given["n_pairs"]),
         loads=10,
         lines=2 + 8 * 2,
         chain=2,
         points=4,
-        fetched=_of_nodes,
+        fetched=_bytes_of_grid_points,
     ),
     "demodulate_words.sum_taps": Loop(
         of="tap",
@@ -138,7 +146,7 @@ LOOPS: Final = {
         lines=2,
         chain=1,
         points=1,
-        fetched=_of_words,
+        fetched=_bytes_of_words,
     ),
 }
 """Kernels that spend their time in a loop, by name."""
@@ -151,7 +159,10 @@ def main_loop(code: list[Instruction]) -> list[Instruction]:
 
 
 def resident_warps(registers: int, warps_per_block: int) -> int:
-    """Return how many warps of a kernel a multiprocessor holds at a time; no kernel here uses shared memory."""
+    """Return the number of warps of a kernel that a multiprocessor holds at a time.
+
+    Shared memory is no limit, because no kernel here uses it.
+    """
     at_a_time = GPU["registers_at_a_time"]
     of_warp = math.ceil(32 * registers / at_a_time) * at_a_time
     by_registers = GPU["registers"] // (of_warp * warps_per_block)
@@ -167,20 +178,20 @@ def predicted_us(
     block: tuple[int, ...],
     arguments: Arguments,
 ) -> dict[str, float]:
-    """Return how long each part of the GPU is busy with a launch, in microseconds; the longest is the prediction.
+    """Return the busy time of each part of the GPU during a launch, in microseconds. The longest is the prediction.
 
     Parameters
     ----------
     name : str
-        In `LOOPS`, or no loop counts.
+        Kernel. Loops count only for kernels in `LOOPS`.
     code : list of Instruction
     registers : int
     grid, block : tuple of int
     arguments : dict
-        As in `Launch`; each array is read or written once.
+        Arguments as in `Launch`. Each array is read or written once.
     """
     warps_per_block = -(-math.prod(block) // 32)
-    blocks = -(-math.prod(grid) // GPU["multiprocessors"])  # of the multiprocessor that has the most
+    blocks = -(-math.prod(grid) // GPU["multiprocessors"])  # on the multiprocessor with the most blocks
     resident = resident_warps(registers, warps_per_block)
     instructions, lines, waits, fetched = float(len(way(code))), 0.0, 0.0, 0.0
     if name in LOOPS:

@@ -1,4 +1,4 @@
-"""Analysis of a kernel's machine code: its path, the loops on it, and their instructions by kind."""
+"""Analysis of a kernel's machine code: the executed path, its loops, and their instructions by kind."""
 
 import re
 from collections import Counter
@@ -13,20 +13,20 @@ _TARGET = re.compile(r"`\((?P<label>[^)]+)\)")
 _INTEGER = ("I", "UI", "LEA", "ULEA", "LOP", "ULOP", "SHF", "USHF", "PRMT", "UPRMT", "SEL", "USEL", "BMSK", "VI")
 _MULTIPLY_ADD = ("FFMA", "FMUL", "FADD")
 _ENDS = {"EXIT", "BRA", "RET.REL.NODEC"}
-_CALL = 10_000  # loads that would have to make up for a call
+_CALL_COST = 10_000  # Number of loads that outweighs a call, so that paths with calls are avoided.
 
 
 @dataclass(frozen=True, slots=True)
 class Instruction:
-    """An instruction of a warp.
+    """Instruction of a warp.
 
     Attributes
     ----------
     name : str
-        As ``FFMA`` or ``LDG.E.64``.
+        Name such as ``FFMA`` or ``LDG.E.64``.
     conditional : bool
     target : int
-        Where a branch within the kernel leads, as an index of instructions; -1 of others.
+        Target of a branch within the kernel, as an index of instructions; -1 for other instructions.
     """
 
     name: str
@@ -35,7 +35,7 @@ class Instruction:
 
 
 def parse(text: str) -> list[Instruction]:
-    """Return the instructions of nvdisasm's text."""
+    """Return the instructions in nvdisasm's text."""
     found: list[tuple[str, bool, str]] = []
     places: dict[str, int] = {}
     for line in text.splitlines():
@@ -48,10 +48,11 @@ def parse(text: str) -> list[Instruction]:
 
 
 def way(code: Sequence[Instruction]) -> list[int]:
-    """Return the instructions that a warp meets if it goes once through every loop, as indices.
+    """Return the indices of the instructions that a warp executes if it runs once through every loop.
 
-    Where the way forks it is the one with more loads, multiplications and additions: that of threads with all their
-    work to do. No function is called: those are for roots of numbers near the ends of float32's range, and the like.
+    At a branch, the path with more loads, multiplications and additions is taken. Threads with a full share of the work
+    follow this path. Paths with function calls are avoided, because functions only handle rare operands, such as roots
+    of numbers near the limits of float32.
     """
     worth, ahead = [0] * len(code), [-1] * len(code)
     for at in reversed(range(len(code))):
@@ -60,7 +61,7 @@ def way(code: Sequence[Instruction]) -> list[int]:
         if here.target >= 0:
             followers = [here.target, *followers]
         followers = [place for place in followers if at < place < len(code)]
-        worth[at] = -_CALL if here.name.startswith("CALL") else int(_kind(here.name) in {"loads", "multiply-adds"})
+        worth[at] = -_CALL_COST if here.name.startswith("CALL") else int(_kind(here.name) in {"loads", "multiply-adds"})
         if followers:
             ahead[at] = max(followers, key=worth.__getitem__)
             worth[at] += worth[ahead[at]]
@@ -71,7 +72,7 @@ def way(code: Sequence[Instruction]) -> list[int]:
 
 
 def loops(code: Sequence[Instruction]) -> list[range]:
-    """Return the innermost loops on the `way`, as indices, in their order."""
+    """Return the innermost loops on the `way`, as ranges of indices, in their order."""
     met = set(way(code))
     found = [range(each.target, at + 1) for at, each in enumerate(code) if at in met and -1 < each.target < at]
     return [one for one in found if not any(_within(other, one) for other in found)]
@@ -82,7 +83,7 @@ def _within(inner: range, outer: range) -> bool:
 
 
 def kinds(part: Sequence[Instruction]) -> dict[str, int]:
-    """Return how many instructions load, multiply or add floats, count with integers, or do other things."""
+    """Return the numbers of loads, float multiplications and additions, integer instructions, and others."""
     counts = Counter(_kind(each.name) for each in part)
     return {name: counts[name] for name in ("loads", "multiply-adds", "integer", "others")}
 

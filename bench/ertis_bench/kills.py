@@ -1,8 +1,8 @@
-"""Processes that are killed while they write a journal, and while they seal one: nothing that was told may be lost.
+"""Kills of processes that write or seal a journal. Reported measurements must survive each kill.
 
-A nursery, ``python -m ertis_bench.kills``, loads all that is needed once, and makes each process to be killed as a
-copy of itself. That takes milliseconds, so that hundreds can be killed. Half of them are killed after a random time,
-the others before a random line of this package's own code, as most time goes by inside of few calls.
+A nursery process, ``python -m ertis_bench.kills``, imports all modules once, and forks each process to be killed. A
+fork takes milliseconds, so that hundreds of kills are possible. Half of the processes are killed after a random time.
+The others are killed before a random line of this package's own code, because most time is spent inside few calls.
 """
 
 import json
@@ -32,24 +32,24 @@ __all__ = ["appending", "sealing"]
 _SETTINGS = Settings(recording=Recording(n_samples=32_768))
 _SENSORS = ("left", "right")
 _SESSION_ID = 7
-_LATE = 3  # measurements of the first sensor after which the second one comes
-_MAX_REPORTED = 12  # commits until a process is killed
-_LINES_OF_A_COMMIT = 170  # about
+_SECOND_SENSOR_AFTER = 3  # Number of measurements of the first sensor before the second sensor joins.
+_MAX_REPORTED = 12  # maximum number of commits before the kill
+_LINES_OF_A_COMMIT = 170  # approximate
 _JITTER_S = 0.004
-_SAME_JOURNAL = 3  # processes that are killed one after the other over the same journal
-_LIFE_S = 60  # of a process that nobody kills
+_KILLS_PER_JOURNAL = 3  # consecutive processes that are killed over the same journal
+_LIFE_S = 60  # lifetime of a process that is not killed
 _PACKAGE = Path(ertis_numba.__file__).parent
 _OURS = tuple(str(_PACKAGE / name) for name in ("journal", "storage", "atomic.py"))
 
 
 def appending(folder: Path, *, seed: int, count: int) -> dict[str, int]:
-    """Kill ``count`` processes that append to journals, and count lost measurements among the reported ones.
+    """Kill ``count`` processes that append to journals, and count reported measurements that are lost.
 
     Returns
     -------
     dict of str to int
-        ``kills``, measurements ``reported``; of them ``lost`` and ``wrong``; ``unrecorded``, which are there although
-        nobody told of them any more; and ``unexpected``, which are no such measurements.
+        ``kills``, and measurements ``reported``; of the reported ones, ``lost`` and ``wrong``; ``untold``, stored
+        although the kill came before the report; and ``unexpected``, never appended.
     """
     rng = random.Random(seed)  # noqa: S311  nothing is secret
     found = dict.fromkeys(("kills", "told", "lost", "wrong", "untold", "unexpected"), 0)
@@ -57,15 +57,15 @@ def appending(folder: Path, *, seed: int, count: int) -> dict[str, int]:
     with _Nursery() as nursery:
         while found["kills"] < count:
             reported: set[tuple[str, int]] = set()
-            for _ in range(min(_SAME_JOURNAL, count - found["kills"])):
+            for _ in range(min(_KILLS_PER_JOURNAL, count - found["kills"])):
                 reported |= _killed_appending(nursery, path, rng, seed)
                 found["kills"] += 1
-            _look_into(path, reported, seed, found)
+            _count_content(path, reported, seed, found)
     return found
 
 
 def _killed_appending(nursery: "_Nursery", path: Path, rng: random.Random, seed: int) -> set[tuple[str, int]]:
-    """Kill a process while it appends, and return the keys that it told."""
+    """Kill a process while it appends, and return the keys that it reported."""
     lines = rng.randrange(_MAX_REPORTED * _LINES_OF_A_COMMIT) if rng.random() < 0.5 else None
     nursery.begin("append", path=str(path), seed=seed, dies_after_lines=lines)
     reported: list[str] = []
@@ -79,10 +79,10 @@ def _killed_appending(nursery: "_Nursery", path: Path, rng: random.Random, seed:
     return {(sensor, int(sequence)) for sensor, sequence in map(str.split, reported)}
 
 
-def _look_into(path: Path, reported: set[tuple[str, int]], seed: int, found: dict[str, int]) -> None:
-    """Count the content of a journal, and remove it."""
+def _count_content(path: Path, reported: set[tuple[str, int]], seed: int, found: dict[str, int]) -> None:
+    """Count the content of a journal, and remove the journal."""
     found["told"] += len(reported)
-    if not path.exists():  # killed before it was made
+    if not path.exists():  # The process was killed before it created the journal.
         found["lost"] += len(reported)
         return
     with Journal.open(path) as journal:
@@ -101,7 +101,7 @@ def _look_into(path: Path, reported: set[tuple[str, int]], seed: int, found: dic
 
 
 def _append(*, path: str, seed: int) -> None:
-    """Append to a journal for ever, and tell the keys that are durable."""
+    """Append to a journal until killed, and print the keys of durable measurements."""
     place = Path(path)
     journal = Journal.open(place) if place.exists() else Journal.create(place, target="rec.h5", source="kills")
     rng = random.Random(f"{seed} {len(journal)}")  # noqa: S311  nothing is secret
@@ -109,7 +109,7 @@ def _append(*, path: str, seed: int) -> None:
     while True:
         entries = []
         for _ in range(rng.randint(1, 3)):
-            sensor = rng.choice(_SENSORS[: 1 + (counts[_SENSORS[0]] > _LATE)])
+            sensor = rng.choice(_SENSORS[: 1 + (counts[_SENSORS[0]] > _SECOND_SENSOR_AFTER)])
             if sensor not in journal.sensors:
                 journal.add_sensor(sensor, _SETTINGS, firmware="1.2.3")
             stamp = Stamp(sensor=sensor, sequence=counts[sensor], session_id=_SESSION_ID)
@@ -122,7 +122,7 @@ def _append(*, path: str, seed: int) -> None:
 
 
 def _words(seed: int, sensor: str, sequence: int) -> NDArray[np.uint32]:
-    """Return the words of a measurement, which nobody has to remember."""
+    """Return the words of a measurement, which its key determines."""
     rng = np.random.default_rng([seed, _SENSORS.index(sensor), sequence])
     return rng.integers(0, 2**32, _SETTINGS.recording.n_samples, dtype=np.uint32)
 
@@ -133,18 +133,19 @@ def sealing(folder: Path, *, seed: int, count: int) -> dict[str, int]:
     Returns
     -------
     dict of str to int
-        ``kills``; of them ``late``, where it had ended already. Recordings under their final name that were ``broken``
-        at any time; ``different`` from the one that is made when nobody is killed; and files ``left_over``.
+        ``kills``; of them ``late``, after the end of the sealing. ``broken``, recordings that were unreadable under
+        their final name at least once. ``different``, recordings that differ from that of an undisturbed sealing.
+        ``left_over``, remaining files.
     """
     rng = random.Random(seed)  # noqa: S311  nothing is secret
     found = dict.fromkeys(("kills", "late", "broken", "different", "left_over"), 0)
     crashed, work = folder / "crashed", folder / "work"
-    _crash(crashed, seed)
+    _make_crashed_journal(crashed, seed)
     with _Nursery() as nursery:
-        n_lines, lasts_s, wanted = _undisturbed(nursery, crashed, work)
+        n_lines, lasts_s, wanted = _seal_undisturbed(nursery, crashed, work)
         while found["kills"] < count:
             path = shutil.copytree(crashed, work) / "rec.h5.journal"
-            for _ in range(min(rng.randint(1, _SAME_JOURNAL), count - found["kills"])):
+            for _ in range(min(rng.randint(1, _KILLS_PER_JOURNAL), count - found["kills"])):
                 found["late"] += not _killed_sealing(nursery, path, rng, n_lines, lasts_s)
                 found["kills"] += 1
                 found["broken"] += (work / "rec.h5").exists() and (work / "rec.h5").read_bytes() != wanted
@@ -156,8 +157,8 @@ def sealing(folder: Path, *, seed: int, count: int) -> dict[str, int]:
     return found
 
 
-def _crash(folder: Path, seed: int) -> None:
-    """Make the journal of a process that was killed: with a log, gaps and a sensor that nothing came of."""
+def _make_crashed_journal(folder: Path, seed: int) -> None:
+    """Create the journal of a killed process, with a write-ahead log, gaps, and a sensor without measurements."""
     made = folder.with_name("making")
     made.mkdir()
     with Journal.create(made / "rec.h5.journal", target="rec.h5", source="kills") as journal:
@@ -172,11 +173,11 @@ def _crash(folder: Path, seed: int) -> None:
                 journal.append([JournalEntry(Measurement(words, _SETTINGS, stamp), monotonic_ns=sequence)])
         journal.note_gap("left", 4, 4, "footer", session_id=_SESSION_ID)
         journal.note_gap("absent", 0, 6, "it was silent", session_id=_SESSION_ID)
-        shutil.copytree(made, folder)  # nothing is written now: to the files, it is as if this process was killed
+        shutil.copytree(made, folder)  # Nothing is being written, so the copy equals the files after a kill.
     shutil.rmtree(made)
 
 
-def _undisturbed(nursery: "_Nursery", crashed: Path, work: Path) -> tuple[int, float, bytes]:
+def _seal_undisturbed(nursery: "_Nursery", crashed: Path, work: Path) -> tuple[int, float, bytes]:
     """Seal without a kill, and return the number of lines, the duration, and the recording."""
     n_lines, lasts_s, made = 0, 0.0, b""
     for counts in (True, False):
@@ -192,7 +193,7 @@ def _undisturbed(nursery: "_Nursery", crashed: Path, work: Path) -> tuple[int, f
 
 
 def _killed_sealing(nursery: "_Nursery", path: Path, rng: random.Random, n_lines: int, lasts_s: float) -> bool:
-    """Kill a process while it seals, and return whether it came in time."""
+    """Kill a process while it seals, and return True if the kill came before its end."""
     if rng.random() < 0.5:
         nursery.begin("seal", path=str(path), dies_after_lines=rng.randrange(n_lines))
     else:
@@ -210,12 +211,12 @@ def _seal(*, path: str) -> None:
 
 
 class _Nursery:
-    """Makes processes that have loaded everything already."""
+    """Process that forks others, after it has imported all modules."""
 
     def __enter__(self) -> Self:
         environment = os.environ | {
             "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
-            "SOURCE_DATE_EPOCH": "1700000000",  # files are compared byte by byte
+            "SOURCE_DATE_EPOCH": "1700000000",  # Files are compared byte by byte.
         }
         self._process = subprocess.Popen(
             [sys.executable, "-m", "ertis_bench.kills"],
@@ -236,12 +237,18 @@ class _Nursery:
     def begin(
         self, job: str, *, dies_after_lines: int | None = None, counts_lines: bool = False, **arguments: Any
     ) -> None:
-        """Begin a process, which may kill itself before a line of code, or tell at its end how many it ran."""
+        """Start a process.
+
+        It may kill itself before a given line of code, or report the number of executed lines at its end.
+        """
         self._ask({"job": job, "lines": dies_after_lines, "counts": counts_lines, "arguments": arguments})
         self._pid = int(self.line())
 
     def kill(self) -> None:
-        """Kill the process; it is not forgotten before `end`, so nobody else can have its number."""
+        """Kill the process.
+
+        Its process id stays reserved until `end`, so that no other process can get the same id.
+        """
         os.kill(self._pid, signal.SIGKILL)
 
     def end(self) -> list[str]:
@@ -253,7 +260,7 @@ class _Nursery:
         """Return the next line of the process."""
         line = self._output.readline().rstrip("\n")
         if not line or line.startswith("failed"):
-            raise RuntimeError(f"a process to be killed {line or 'was lost'}")
+            raise RuntimeError(f"process to be killed failed: {line or 'no output'}")
         return line
 
     def _ask(self, request: dict[str, Any]) -> None:
@@ -261,8 +268,8 @@ class _Nursery:
         self._input.flush()
 
 
-def _nurse() -> None:
-    """Begin and end processes, as asked on stdin."""
+def _run_nursery() -> None:
+    """Start and end processes according to requests on stdin."""
     pid = 0
     for line in sys.stdin:
         request = json.loads(line)
@@ -274,11 +281,11 @@ def _nurse() -> None:
             import ertis_numba.storage.sealing  # noqa: F401, PLC0415  so that the copies need not
         pid = os.fork()
         if not pid:
-            _live(request)
+            _run_job(request)
 
 
-def _live(request: dict[str, Any]) -> NoReturn:
-    """Do a job, unless something ends this process before."""
+def _run_job(request: dict[str, Any]) -> NoReturn:
+    """Run a job until it ends or the process is killed."""
     signal.alarm(_LIFE_S)
     _emit_event(str(os.getpid()))
     try:
@@ -298,14 +305,14 @@ def _live(request: dict[str, Any]) -> NoReturn:
 
 
 class _LineCounter:
-    """Counts the lines of this package's code that run, and kills the process before one."""
+    """Trace function that counts executed lines of this package, and kills the process before a given line."""
 
     def __init__(self, largest: int | None) -> None:
         self.count = 0
         self._max = largest
 
     def __call__(self, frame: FrameType, _event: str, _argument: object) -> Callable[..., Any] | None:
-        """Look into a function that is called, if it is one of ours."""
+        """Trace a called function if it belongs to this package."""
         return self._line if frame.f_code.co_filename.startswith(_OURS) else None
 
     def _line(self, _frame: FrameType, event: str, _argument: object) -> Callable[..., Any]:
@@ -316,8 +323,8 @@ class _LineCounter:
 
 
 def _emit_event(line: str) -> None:
-    os.write(1, f"{line}\n".encode())  # at once, and in one piece
+    os.write(1, f"{line}\n".encode())  # A single write makes the line atomic and immediate.
 
 
 if __name__ == "__main__":
-    _nurse()
+    _run_nursery()

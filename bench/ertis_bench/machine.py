@@ -11,7 +11,7 @@ from ertis_numba.cpu_cores import usable_cores
 __all__ = ["describe", "sentence"]
 
 _LIBRARIES = ("numpy", "scipy", "numba", "llvmlite")
-_FLAGS = ("fma", "avx2", "avx512f", "avx512_vnni", "avx_vnni", "asimd")  # what the kernels can make use of
+_FLAGS = ("fma", "avx2", "avx512f", "avx512_vnni", "avx_vnni", "asimd")  # instruction sets that the kernels can use
 _ENVIRONMENT = (
     "OPENBLAS_NUM_THREADS",
     "OMP_WAIT_POLICY",
@@ -22,7 +22,7 @@ _ENVIRONMENT = (
 
 
 def describe() -> dict[str, Any]:
-    """Return processor, cores, versions, and the environment variables that decide about threads."""
+    """Return processor, cores, versions, and the environment variables that affect threads."""
     processor = _processor()
     flags = processor.get("flags", processor.get("Features", "")).split()
     return {
@@ -37,7 +37,7 @@ def describe() -> dict[str, Any]:
 
 
 def _processor() -> dict[str, str]:
-    """Return the first processor of Linux's list; nothing elsewhere."""
+    """Return the first processor in Linux's list, or an empty dict on other systems."""
     path = Path("/proc/cpuinfo")
     if not path.exists():
         return {}

@@ -1,4 +1,4 @@
-"""Many recordings at once: gain by further workers, on this machine and as a dask cluster."""
+"""Speed-up of processing many recordings with more workers, on this machine and on a dask cluster."""
 
 import itertools
 import os
@@ -24,12 +24,13 @@ from ertis_numba.storage import open_energyscapes, open_recording, write_recordi
 
 __all__ = ["many", "run"]
 
-_MEASUREMENTS: Final = 20  # of each recording
-_SESSION_ID: Final = "1700000000"  # what would differ between files is when they were made
+_MEASUREMENTS: Final = 20  # per recording
+# Fixed creation time of all files, without which their bytes would differ.
+_CREATED_S: Final = "1700000000"
 
 
 def run(*, count: int, rounds: int, say: Callable[[str], None]) -> dict[str, Any]:
-    """Process the same recordings by all crews in turns, compare all files, and return the report.
+    """Process the same recordings with each configuration in turns, compare all files, and return the report.
 
     Parameters
     ----------
@@ -37,6 +38,7 @@ def run(*, count: int, rounds: int, say: Callable[[str], None]) -> dict[str, Any
         Recordings.
     rounds : int
     say : callable
+        Called with a line of progress.
 
     Raises
     ------
@@ -44,7 +46,7 @@ def run(*, count: int, rounds: int, say: Callable[[str], None]) -> dict[str, Any
         A recording failed, an image is wrong, or files differ.
     """
     before = os.environ.get("SOURCE_DATE_EPOCH")
-    os.environ["SOURCE_DATE_EPOCH"] = _SESSION_ID
+    os.environ["SOURCE_DATE_EPOCH"] = _CREATED_S
     try:
         with tempfile.TemporaryDirectory(prefix="ertis-") as place, ExitStack() as stack:
             say(f"writing {count} recordings")
@@ -87,7 +89,7 @@ def _crews(address: str) -> dict[str, dict[str, Any]]:
 
 
 def _recordings(folder: Path, count: int) -> tuple[Path, str]:
-    """Write recordings with different measurements, derived from a simulated one; return also its description."""
+    """Write recordings of measurements derived from a simulated one. Return their folder and a description."""
     folder.mkdir()
     first, source = subject.measurement()
     for number in range(count):
@@ -96,7 +98,7 @@ def _recordings(folder: Path, count: int) -> tuple[Path, str]:
 
 
 def _measurements(first: Measurement, number: int) -> Iterator[Measurement]:
-    """Yield a measurement again and again, a little later in its record each time."""
+    """Yield copies of a measurement, each a little later in its record than the one before."""
     for index in range(_MEASUREMENTS):
         stamp = replace(first.stamp, sequence=index, sync_count=index, timestamp_ns=50_000_000 * index)
         yield replace(first, data=np.roll(first.data, number * _MEASUREMENTS + index), stamp=stamp)
@@ -105,11 +107,14 @@ def _measurements(first: Measurement, number: int) -> Iterator[Measurement]:
 def _measured(
     folder: Path, out: Path, crews: dict[str, dict[str, Any]], rounds: int, say: Callable[[str], None]
 ) -> dict[str, list[tuple[float, float]]]:
-    """Return how long each crew took in each round: in all, and from the first recording that it began."""
+    """Return the times of each configuration in each round, in seconds.
+
+    Each entry has the total time, and the time from the start of the first recording.
+    """
     times_s: dict[str, list[tuple[float, float]]] = {name: [] for name in crews}
     wanted: dict[str, bytes] = {}
     for turn, (name, chosen) in itertools.product(range(rounds + 1), crews.items()):
-        say(f"round {turn} of {rounds}: {name}" if turn else f"to warm up: {name}")
+        say(f"round {turn} of {rounds}: {name}" if turn else f"warm-up: {name}")
         with tempfile.TemporaryDirectory(dir=out.parent) as target:
             took_s = _timed(folder, Path(target), **chosen)
             files = {path.name: path.read_bytes() for path in sorted(Path(target).iterdir())}
@@ -118,20 +123,20 @@ def _measured(
                 wanted = files
         if files != wanted:
             others = ", ".join(_differences(files, wanted))
-            raise DataError(f"{name} made other files than 1 worker of 1 thread ({others}); do not trust it")
-        if turn:  # files and kernels come from memory from now on
+            raise DataError(f"files of {name} differ from those of 1 worker of 1 thread ({others}); do not use it")
+        if turn:  # From the second round on, files and kernels are cached.
             times_s[name].append(took_s)
     return times_s
 
 
 def _differences(files: dict[str, bytes], wanted: dict[str, bytes]) -> Iterator[str]:
-    """Yield how each file that differs does, by which whoever looks for the reason can begin."""
+    """Yield the difference of each unequal file, as a starting point for a diagnosis."""
     for name in sorted(files | wanted):
         one, other = (np.frombuffer(each.get(name, b""), np.uint8) for each in (files, wanted))
         if len(one) != len(other):
-            yield f"{name}: {len(one)} bytes for {len(other)}"
+            yield f"{name}: {len(one)} bytes instead of {len(other)}"
         elif (places := np.flatnonzero(one != other)).size:
-            yield f"{name}: {places.size} of {len(one)} bytes, from {places[0]} to {places[-1]}"
+            yield f"{name}: {places.size} of {len(one)} bytes differ, from {places[0]} to {places[-1]}"
 
 
 def _timed(folder: Path, target: Path, *, threads: int | None = None, **pool: Any) -> tuple[float, float]:
@@ -140,7 +145,7 @@ def _timed(folder: Path, target: Path, *, threads: int | None = None, **pool: An
         if isinstance(event, RecordingStarted) and first_s == begin_s:
             first_s = time.perf_counter()
         if isinstance(event, RecordingEnded) and event.outcome != "made":
-            raise DataError(f"{event.recording} is {event.outcome} ({event.error}); it is not timed")
+            raise DataError(f"{event.recording} is {event.outcome} ({event.error}), so it is not timed")
     end_s = time.perf_counter()
     return end_s - begin_s, end_s - first_s
 
@@ -153,7 +158,10 @@ def _require_exact(folder: Path, target: Path) -> None:
 
 
 def _row(name: str, times_s: dict[str, list[tuple[float, float]]]) -> dict[str, Any]:
-    """Return medians, and the medians of the ratios in each round, whose halves had the machine alike."""
+    """Return median times, and medians of the ratios per round.
+
+    Both times of a ratio come from the same round, so that a drift of the machine's speed cancels.
+    """
     base = next(iter(times_s.values()))
     ratios = [(one[0] / mine[0], one[1] / mine[1]) for one, mine in zip(base, times_s[name], strict=True)]
     return {
@@ -166,9 +174,9 @@ def _row(name: str, times_s: dict[str, list[tuple[float, float]]]) -> dict[str, 
 
 
 def many(report: dict[str, Any]) -> str:
-    """Return the times and ratios, and how they were measured."""
+    """Return the times and ratios, and the conditions of the measurement."""
     each = report["recordings"] * report["measurements"]
-    head = ["processed by", "s", "times faster", "without the start, s", "times faster", "measurements/s"]
+    head = ["configuration", "time, s", "speed-up", "time without the start, s", "speed-up", "measurements/s"]
     rows = [
         [
             row["crew"],
@@ -182,10 +190,11 @@ def many(report: dict[str, Any]) -> str:
     ]
     conditions = (
         f"{report['recordings']} recordings of {report['measurements']} measurements of {report['source']}, "
-        f"{report['bytes'] / 1e6:.0f} MB in all, each measurement a little later in its record than the one before. "
-        f"Medians of {report['rounds']} rounds, in which all take turns; ratios are to the first line, round by round. "
-        "Included: starting processes, reading and checking, planning, images, writing them and reading them back. "
-        "The start is what comes before the first recording is begun; that of the LocalCluster itself is in neither. "
-        "The files of all lines were equal, byte by byte, and an image was checked against the exact one."
+        f"{report['bytes'] / 1e6:.0f} MB in total. Each measurement is a little later in its record than the one "
+        f"before. Times are medians of {report['rounds']} rounds, in which the configurations take turns. Each ratio "
+        "is relative to the first line in the same round. Times include starting processes, reading and checking, "
+        "planning, computing images, writing them and reading them back. The start is the time before the first "
+        "recording is begun. Neither time includes the start of the LocalCluster itself. The files of all "
+        "configurations were equal, byte by byte, and an image was compared with the exact one."
     )
     return "\n\n".join([_table(head, rows), f"Measured on {sentence(report['machine'])}", conditions])

@@ -1,4 +1,4 @@
-"""The paper's three configurations, from bits to energyscape."""
+"""Times of the paper's three configurations, from bits to energyscape."""
 
 import functools
 from collections.abc import Callable
@@ -21,7 +21,7 @@ BACKENDS = {
     "numpy": {"method": "fast", "device": "numpy"},
     "cpu": {"method": "fast", "device": "cpu"},
 }
-"""What is measured: name of a backend to method and device."""
+"""Backends by name, each with its method and device."""
 
 PUBLISHED_MS = {
     "CPU i7-7567U": ((132.53, 4.89), (976.33, 14.54), (1541.41, 20.30)),
@@ -30,23 +30,23 @@ PUBLISHED_MS = {
     "GPU GTX 1050": ((23.03, 2.38), (202.37, 20.85), (323.83, 33.18)),
     "GPU GTX 1080 Ti": ((5.93, 0.66), (51.58, 6.38), (77.02, 7.81)),
 }
-"""Mean and standard deviation of 100 measurements at 90, 1850 and 3000 directions (Jansen et al., 2019)."""
+"""Mean and standard deviation of 100 measurements in ms, at 90, 1850 and 3000 directions (Jansen et al., 2019)."""
 
 
 def run(*, count: int, say: Callable[[str], None]) -> dict[str, Any]:
-    """Measure all backends and return the report: machine, rows, and conditions.
+    """Measure all backends, and return a report with machine, rows and conditions.
 
     Parameters
     ----------
     count : int
         Measurements per backend and number of directions.
     say : callable
-        Told what goes on.
+        Called with a line of progress.
 
     Raises
     ------
     DataError
-        A result is wrong, so it is not timed.
+        A result is wrong and therefore not timed.
     """
     measurement, source = subject.measurement()
     with one_thread():
@@ -65,7 +65,7 @@ def run(*, count: int, say: Callable[[str], None]) -> dict[str, Any]:
 def _measure(
     measurement: Measurement, count: int, say: Callable[[str], None]
 ) -> tuple[list[dict[str, Any]], dict[str, dict[str, float]]]:
-    """Return the rows, and the errors of those that approximate the exact image by number of directions."""
+    """Return the rows, and the errors of backends that approximate the exact image by number of directions."""
     rows, errors_db = [], {}
     for n_directions in DIRECTIONS:
         say(f"{n_directions} directions: checking results")
@@ -85,7 +85,7 @@ def _pipeline(measurement: Measurement, n_directions: int, *, method: str, devic
 
 
 def _check(pipelines: dict[str, Pipeline], measurement: Measurement) -> dict[str, float]:
-    """Check all images and return the errors of those that approximate the exact one."""
+    """Check all images, and return the errors of backends that approximate the exact image."""
     images = {name: pipeline.process(measurement) for name, pipeline in pipelines.items()}
     checks.require_same_reflector(images["scipy"], images["cpu"])
     return {name: round(checks.require_exact(images[name], measurement), 1) for name in ("numpy", "cpu")}

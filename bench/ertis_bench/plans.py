@@ -1,4 +1,4 @@
-"""Plans to compare, with their names."""
+"""Compared plans, and their names."""
 
 from ertis_numba.kernels import KernelSet
 from ertis_numba.settings import INTERPOLATIONS, Accuracy
@@ -50,12 +50,15 @@ PLANS: tuple[tuple[str, str | int, int, float, tuple[int, float] | None], ...] =
     ("float32", 3, 4, 80.0, None),
     ("float32", 3, 4, 120.0, None),
 )
-"""Precision; the way of interpolation, or from how many samples where it is fitted; samples per range; stop band in dB;
-nodes along each axis and their density, None where every direction's own beam is summed. The naive ones first."""
+"""Compared plans, the simplest first.
+
+Each has a precision; an interpolation, or a number of samples if it is fitted; samples per range; stopband attenuation
+in dB; and grid points along each axis with their density, or None without a beam grid.
+"""
 
 
 def in_words(accuracy: Accuracy) -> str:
-    """Return a complete plan in a few words, such as ``int16, 2 samples of 2 per range, beam grid 4 × 1.75, 60 dB``."""
+    """Return the name of a complete plan, such as ``int16, 2 samples of 2 per range, beam grid 4 × 1.75, 60 dB``."""
     n_phases, n_taps = accuracy.oversampling, accuracy.delay_taps
     fitted = f"{n_taps} {'sample' if n_taps == 1 else 'samples'} of {n_phases} per range"
     parts = [accuracy.precision, _SAMPLES.get(accuracy.interpolation, fitted).format(n=n_phases)]
@@ -68,7 +71,7 @@ def in_words(accuracy: Accuracy) -> str:
 
 
 def plans(kernels: KernelSet) -> list[Accuracy]:
-    """Return `PLANS`, complete; those in 16 bits where the device can."""
+    """Return complete plans for `PLANS`. Plans with 16 bits are included if the device supports them."""
     return [_plan(*row) for row in PLANS if row[0] != "int16" or kernels.tile_ranges]
 
 

@@ -1,4 +1,7 @@
-"""Coverage of the uncertainties of points: single echoes at random places in noise, over budgets, grids and levels."""
+"""Coverage of the uncertainties of points.
+
+Single echoes at random positions in noise are detected for several budgets, direction grids and levels.
+"""
 
 import math
 from collections.abc import Callable
@@ -34,12 +37,12 @@ _AMPLITUDE = 0.01
 
 
 class Trials:
-    """Echoes of plane waves at random places in noise, and errors of the points found.
+    """Echoes of plane waves from random positions in noise, and errors of the detected points.
 
     Parameters
     ----------
     directions : str
-        Grid, as in `Processing`.
+        Direction grid, as in `Processing`.
     max_error_db : float
         Error budget of the images.
     """
@@ -68,7 +71,7 @@ class Trials:
         self._noise = self._image(self._echo(np.array([1.0, 0.0, 0.0]), 0.85)).max() / math.sqrt(np.mean(noise**2))
 
     def standardised_errors(self, ratio: float, count: int, seed: int) -> NDArray[np.float64]:
-        """Return errors along range and across, relative to the reported uncertainties: (point, 2) float64.
+        """Return errors along range and across it, relative to the reported uncertainties: (point, 2) float64.
 
         Parameters
         ----------
@@ -120,12 +123,12 @@ class Trials:
 
 
 def run(*, count: int, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
-    """Measure how many of ``count`` points lie within their uncertainty, for each grid, budget and level.
+    """Measure the share of ``count`` points within their uncertainty, for each grid, budget and level.
 
     Parameters
     ----------
     count : int
-        Points of each cell.
+        Points per cell.
     seed : int
     say : callable
         Called with a line for each cell.
@@ -160,9 +163,10 @@ def form(report: dict[str, Any]) -> str:
     ]
     deviation = 100 * math.sqrt(0.6827 * 0.3173 / report["count"])
     return (
-        f"{table(header, lines)}\n\nPoints within one standard deviation along the range, and across; in parentheses "
-        f"the largest errors in standard deviations. Each cell has {report['count']} points, from seed "
-        f"{report['seed']}, so chance alone moves a value by {deviation:.0f} points. {sentence(report['machine'])}"
+        f"{table(header, lines)}\n\nShares of points within one standard deviation, along range / across it; in "
+        f"parentheses, the largest errors in standard deviations. Each cell has {report['count']} points, from seed "
+        f"{report['seed']}, so the standard deviation of a share is {deviation:.0f} percentage points. "
+        f"{sentence(report['machine'])}"
     )
 
 

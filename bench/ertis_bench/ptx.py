@@ -1,6 +1,6 @@
 """Machine code of the default plan's kernels, and their estimated time on an H200. No GPU is needed.
 
-Registers and instructions are counted; times are arithmetic with them (`h200`). Nothing is measured here.
+This module counts registers and instructions, and derives times from them (`h200`). It measures nothing.
 """
 
 from collections.abc import Callable
@@ -22,13 +22,17 @@ from ertis_numba.stages.fast import FastChain
 __all__ = ["GOALS", "run"]
 
 GOALS = {"one_ms": 1.0, "streamed_per_s": 5000.0, "of_ceiling": 0.5}
-"""A measurement from host to host, measurements per second with images left on the GPU, and delay-and-sum's share."""
+"""Goals for three figures.
+
+They are the time of a measurement from host to host, measurements per second with images left on the GPU, and the share
+of its ceiling that delay-and-sum reaches.
+"""
 
 _PLANS: dict[str, dict[str, Any]] = {"default": {}, "own beams": {"beam_taps": 0, "delay_taps": 1}}
 
 
 def run(*, say: Callable[[str], None]) -> dict[str, Any]:
-    """Return the report: launches of each plan with registers and predicted times, loops, and totals.
+    """Return a report of the launches of each plan with registers and predicted times, the loops, and the totals.
 
     Raises
     ------
@@ -55,7 +59,7 @@ def run(*, say: Callable[[str], None]) -> dict[str, Any]:
 def _versions() -> dict[str, str]:
     found = {}
     for name in ("numba", "numba-cuda", "nvidia-cuda-nvcc-cu12"):
-        with suppress(PackageNotFoundError):  # ptxas may be a toolkit's
+        with suppress(PackageNotFoundError):  # ptxas may come from an installed toolkit instead of the package.
             found[name] = version(name)
     return found
 
@@ -127,14 +131,14 @@ def _without_loop(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def _transform_us(n_bytes: float) -> float:
-    """Return the time of a transform whose passes each move ``n_bytes``."""
+    """Return the time of a transform whose passes each move ``n_bytes``, in microseconds."""
     assumed = h200.ASSUMED
     pass_us = max(1e6 * float(n_bytes) / h200.GPU["memory_bytes_s"], assumed["transform_kernel_us"])
     return round(assumed["transform_kernels"] * pass_us, 2)
 
 
 def _loops(plans: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the instructions of each main loop, by the work of one pass."""
+    """Return the instructions of each main loop, relative to the work of one pass."""
     rows = {row["kernel"]: row for plan in plans for row in plan["launches"] if row["kernel"] in h200.LOOPS}
     return [{"kernel": kernel, **_loop(h200.LOOPS[kernel], row["loop"])} for kernel, row in sorted(rows.items())]
 
@@ -157,7 +161,7 @@ def _totals(
     transforms: list[dict[str, Any]],
     sizes: dict[str, Any],
 ) -> dict[str, Any]:
-    """Return the times of one measurement by itself, and the rates of many in a row."""
+    """Return the times of a single measurement, and the rates of many consecutive ones."""
     assumed = h200.ASSUMED
     up_us, down_us = (1e6 * sizes[name] / assumed["pcie_bytes_s"] for name in ("words_bytes", "image_bytes"))
     stage_us = 1e6 * sizes["words_bytes"] / assumed["copy_bytes_s"]
@@ -193,11 +197,15 @@ def _launching_us(launch: compiling.Launch) -> float:
 
 
 def _ceiling(plan: dict[str, Any]) -> dict[str, Any]:
-    """Return the share of the tighter limit that delay-and-sum would reach: samples from cache, or multiply-adds."""
+    """Return the share of its tighter ceiling that delay-and-sum would reach.
+
+    The ceilings are the rate of samples from the first-level cache, and the rate of multiply-adds.
+    """
     row = next(row for row in plan["launches"] if row["kernel"] == "delay_and_sum_envelope.fill")
     gpu = h200.GPU
     lanes = 32 * gpu["schedulers"]
-    clocks = {"first cache": 8 / gpu["cache_line_bytes"], "multiply-adds": 4 / lanes}  # of a point: 8 bytes, 4 products
+    # per point: 8 bytes and 4 products
+    clocks = {"first cache": 8 / gpu["cache_line_bytes"], "multiply-adds": 4 / lanes}
     n_terms = 32 * plan["accuracy"]["delay_taps"]
     points = plan["points"] * n_terms
     times_us = {name: 1e6 * points * clock / gpu["multiprocessors"] / gpu["clock_hz"] for name, clock in clocks.items()}

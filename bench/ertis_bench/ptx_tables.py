@@ -1,4 +1,4 @@
-"""The report of `ptx` as Markdown."""
+"""Markdown report of `ptx`."""
 
 from typing import Any
 
@@ -7,30 +7,39 @@ from ertis_bench.markdown import table
 __all__ = ["ptx"]
 
 _LOOP = ("loads", "multiply-adds", "integer", "others")
-_PARTS = ("instructions", "first cache", "second cache", "memory", "waiting")
+_PARTS = {
+    "instructions": "instructions",
+    "first cache": "first-level cache",
+    "second cache": "second-level cache",
+    "memory": "memory",
+    "waiting": "waiting",
+}
+"""Parts of the GPU in a report, with their headings."""
 _ASSUMED = """\
-Counted in code for compute capability 9.0 ({made}). Times are arithmetic:
+Counts are from code for compute capability 9.0 ({made}). Times are arithmetic with these assumptions:
 
 - H200 SXM: {multiprocessors:g} multiprocessors, each with {schedulers:g} instructions of a warp per clock, at
-  {clock_ghz:g} GHz, its highest clock.
-- Instructions are those of a warp's way through the kernel, its main loop as often as it runs, on the multiprocessor
-  that has the most blocks.
-- First cache: {cache_line_bytes:g} bytes per clock. A warp's load of 256 bytes takes two lines, three if it does not
-  begin at one: samples do not, nodes do. A load of one number for all threads takes one.
-- Second cache: {second_cache_gb_s:,.0f} GB/s, a guess from tests of an H100, and each block fetches each of its lines
-  itself. That is the worst case: where it decides, the prediction is a range whose lower end leaves it out. Totals
-  take the upper end.
-- Memory: {memory_gb_s:,.0f} GB/s, and each array is moved once, though most stay in the second cache.
-- Waiting: {cache_latency_clocks:g} clocks per load that the next one depends on (Luo et al., 2024, on an H100), once
+  its highest clock of {clock_ghz:g} GHz.
+- Instructions are those of a warp's path through the kernel, with all passes of its main loop, on the multiprocessor
+  with the most blocks.
+- First-level cache: {cache_line_bytes:g} bytes per clock. A warp's load of 256 bytes reads two lines, or three if it
+  does not start at a line. Loads of samples do not, but loads of grid points do. A load of one number for all threads
+  reads one line.
+- Second-level cache: {second_cache_gb_s:,.0f} GB/s, an estimate from tests of an H100. Each block fetches each of its
+  lines itself, which is the worst case. Where this cache decides, the prediction is a range whose lower end excludes
+  it. Totals use the upper end.
+- Memory: {memory_gb_s:,.0f} GB/s. Each array is moved once, though most stay in the second-level cache.
+- Waiting: {cache_latency_clocks:g} clocks per load on which the next load depends (Luo et al., 2024, on an H100), once
   for each round of resident blocks.
-- A launch takes the longest of these.
-- Transforms: {transform_kernels:g} kernels each, which move their arrays once and take {transform_kernel_us:g} µs or
-  more. Kernels follow each other after {between_kernels_us:g} µs.
-- PCIe 5 x16 and pinned memory: {pcie_gb_s:g} GB/s each way. Words are copied to pinned memory at {copy_gb_s:g} GB/s.
-- The processor takes {graph_us:g} µs to start a graph and {host_us:g} µs for all else. Without a graph it takes
+- The longest of these times is the time of a launch.
+- Transforms: {transform_kernels:g} kernels each. They move their arrays once, and take at least
+  {transform_kernel_us:g} µs. The gap between kernels is {between_kernels_us:g} µs.
+- PCIe 5 x16 with pinned memory: {pcie_gb_s:g} GB/s each way. Words are copied to pinned memory at {copy_gb_s:g} GB/s.
+- The processor needs {graph_us:g} µs to start a graph, and {host_us:g} µs for all other work. Without a graph it needs
   {launch_us:g} µs per launch and {launch_array_us:g} µs per array (numba-cuda, pull request 288), and
   {transform_launch_us:g} µs per transform.
-- Measurements in a row: words up, kernels, images down and the processor run beside each other; the slowest decides."""
+- Consecutive measurements: uploads, kernels, downloads and the processor overlap, so that the slowest determines the
+  rate."""
 
 
 def ptx(report: dict[str, Any]) -> str:
@@ -45,9 +54,9 @@ def ptx(report: dict[str, Any]) -> str:
 def _title(plan: dict[str, Any]) -> str:
     accuracy = plan["accuracy"]
     beams = (
-        f"beams of nodes, {accuracy['beam_taps']} taps per axis, {accuracy['beam_density']:g} nodes per beam width"
+        f"beam grid with {accuracy['beam_taps']} taps per axis and {accuracy['beam_density']:g} points per beam width"
         if accuracy["beam_taps"]
-        else "every direction's own beam"
+        else "no beam grid"
     )
     name = "the default plan" if plan["plan"] == "default" else "direct sums"
     return (
@@ -57,7 +66,7 @@ def _title(plan: dict[str, Any]) -> str:
 
 
 def _launches(plan: dict[str, Any]) -> str:
-    head = ["kernel", "grid × block", "registers", "resident warps", *(f"{name}, µs" for name in _PARTS)]
+    head = ["kernel", "grid × block", "registers", "resident warps", *(f"{heading}, µs" for heading in _PARTS.values())]
     rows = [
         [
             f"`{row['kernel']}`",
@@ -83,7 +92,7 @@ def _range(smallest: float, largest: float) -> str:
 
 
 def _loops(loops: list[dict[str, Any]]) -> str:
-    head = ["kernel", "a pass is for a", "passes at once", *_LOOP, "all", "all, per point", "cache lines"]
+    head = ["kernel", "unit of a pass", "merged passes", *_LOOP, "all", "all, per point", "cache lines"]
     rows = [
         [
             f"`{row['kernel']}`",
@@ -113,13 +122,16 @@ def _totals(report: dict[str, Any]) -> str:
 
 
 def _ceiling(ceiling: dict[str, Any], goal: float) -> str:
-    limits = " and ".join(f"{time_us:g} µs of {name}" for name, time_us in ceiling["ceilings_us"].items())
+    limits = " and ".join(
+        f"{time_us:g} µs of {_PARTS.get(name, name)}" for name, time_us in ceiling["ceilings_us"].items()
+    )
     smallest, largest = ceiling["of_ceiling"]
     return (
-        f"`delay_and_sum_envelope` of 3000 direct beams, {ceiling['points'] / 1e6:.0f} million points: ceilings are "
-        f"{limits} (a sample of 8 bytes, four multiply-adds). Predicted: {_range(ceiling['least_us'], ceiling['us'])} "
-        f"µs, {100 * largest:.0f} % of the tighter one if blocks find in the first cache what others have fetched, and "
-        f"{100 * smallest:.0f} % if none does; wanted are {100 * goal:.0f} %."
+        "`delay_and_sum_envelope` of 3000 directions without a beam grid has "
+        f"{ceiling['points'] / 1e6:.0f} million points. Its ceilings are {limits} (8 bytes and four multiply-adds per "
+        f"point). The prediction is {_range(ceiling['least_us'], ceiling['us'])} µs. This is {100 * largest:.0f} % of "
+        "the tighter ceiling if blocks find samples in the first-level cache that other blocks have fetched, and "
+        f"{100 * smallest:.0f} % otherwise. The goal is {100 * goal:.0f} %."
     )
 
 

@@ -1,4 +1,4 @@
-"""Random scenes of some of everything, from far too weak to matter to strong."""
+"""Random scenes with many kinds of objects and effects, from negligible to strong."""
 
 import math
 from typing import Any
@@ -20,8 +20,8 @@ OCTET = Array(
 )
 
 
-class _Dice:
-    """Seeded draws."""
+class _Draws:
+    """Seeded random draws."""
 
     def __init__(self, seed: int) -> None:
         self.random = np.random.default_rng(seed)
@@ -44,8 +44,11 @@ class _Dice:
 
 
 def random_scene(seed: int) -> Scene:
-    """Return a scene of one measurement, near and with few microphones; most overload no modulator."""
-    dice = _Dice(seed)
+    """Return a scene of one measurement at short range, with few microphones.
+
+    Few of the scenes overload a modulator.
+    """
+    dice = _Draws(seed)
     points = tuple(_point(dice) for _ in range(dice.random.integers(1, 4)))
     spheres = (_sphere(dice),) if dice.chance(0.3) else ()
     walls = _walls(dice)
@@ -67,7 +70,7 @@ def random_scene(seed: int) -> Scene:
     )
 
 
-def _point(dice: _Dice) -> Point:
+def _point(dice: _Draws) -> Point:
     place = dice.place()
     more: dict[str, Any] = {}
     if dice.chance(0.3):
@@ -77,13 +80,13 @@ def _point(dice: _Dice) -> Point:
     return Point(**place, strength_db=dice.between(-50, -3) + 40 * math.log10(place["range_m"]), **more)
 
 
-def _sphere(dice: _Dice) -> Sphere:
+def _sphere(dice: _Draws) -> Sphere:
     place, radius_m = dice.place(), dice.decades(2e-3, 0.2)
     echo_db = dice.between(-18, -3) + 40 * math.log10(place["range_m"]) - 20 * math.log10(radius_m / 2)
     return Sphere(**place, radius_m=radius_m, reflection_db=min(0.0, echo_db))
 
 
-def _walls(dice: _Dice) -> tuple[Wall, ...]:
+def _walls(dice: _Draws) -> tuple[Wall, ...]:
     walls = []
     if dice.chance(0.3):
         place = (0.0, dice.between(0.6, 1.4) * (1 if dice.chance(0.5) else -1), 0.0)
@@ -95,7 +98,7 @@ def _walls(dice: _Dice) -> tuple[Wall, ...]:
     return tuple(walls)
 
 
-def _sources(dice: _Dice) -> dict[str, Any]:
+def _sources(dice: _Draws) -> dict[str, Any]:
     found: dict[str, Any] = {}
     if dice.chance(0.2):
         tone = Tone(**dice.place(), frequency_hz=dice.decades(15e3, 90e3), level_db=dice.between(-100, -30))
@@ -111,7 +114,7 @@ def _sources(dice: _Dice) -> dict[str, Any]:
     return found
 
 
-def _sensor(dice: _Dice) -> Sensor:
+def _sensor(dice: _Draws) -> Sensor:
     electronics: dict[str, Any] = {}
     emitter: dict[str, Any] = {"level_db": -15.0}
     if dice.chance(0.5):
@@ -139,8 +142,11 @@ def _sensor(dice: _Dice) -> Sensor:
 
 
 def varied_scene(seed: int) -> Scene:
-    """Return a scene that also moves, rings, drifts, overloads, and differs in calls, windows and converters."""
-    scene, dice = random_scene(seed), _Dice(seed + 2**32)
+    """Return a scene that can also contain motion, ringing, clock drift and overload.
+
+    Calls, windows and converters vary, too.
+    """
+    scene, dice = random_scene(seed), _Draws(seed + 2**32)
     sensors = [_varied(dice, sensor) for sensor in scene.sensors]
     while len(sensors) < 3 and dice.chance(0.3):
         sensors.append(
@@ -167,7 +173,7 @@ def varied_scene(seed: int) -> Scene:
     )
 
 
-def _varied(dice: _Dice, sensor: Sensor) -> Sensor:
+def _varied(dice: _Draws, sensor: Sensor) -> Sensor:
     emitter, electronics = sensor.emitter, sensor.electronics
     changes: dict[str, Any] = {}
     if dice.chance(0.3):
@@ -188,11 +194,11 @@ def _varied(dice: _Dice, sensor: Sensor) -> Sensor:
     return sensor.replace(emitter=emitter, electronics=electronics, **changes)
 
 
-def _call(dice: _Dice) -> Call:
+def _call(dice: _Draws) -> Call:
     low_hz, high_hz = dice.between(20e3, 35e3), dice.between(45e3, 80e3)
     both = (high_hz, low_hz) if dice.chance(0.7) else (low_hz, high_hz)
     return Call(start_frequency_hz=both[0], stop_frequency_hz=both[1], duration_s=dice.between(1e-3, 3e-3))
 
 
-def _louder(dice: _Dice, point: Point) -> Point:
+def _louder(dice: _Draws, point: Point) -> Point:
     return point.replace(strength_db=point.strength_db + dice.between(0, 20)) if dice.chance(0.3) else point

@@ -17,7 +17,7 @@ from ertis_numba.waveform import call_at
 
 __all__ = ["Limits", "random_measurement", "random_settings", "recorded"]
 
-_DRAWS = 100  # of settings that their constructors refuse, before the limits are to blame
+_DRAWS = 100  # Draws that constructors may refuse, before the limits are considered too narrow.
 
 _ENCODINGS: Final[tuple[Literal["pdm", "int16", "float32"], ...]] = ("pdm", "pdm", "int16", "float32")
 _BEAMFORMERS: Final[tuple[Literal["delay_and_sum", "coherence_factor", "dmas", "capon"], ...]] = (
@@ -31,7 +31,7 @@ _BEAMFORMERS: Final[tuple[Literal["delay_and_sum", "coherence_factor", "dmas", "
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Sizes that random settings stay within, so that slow references can follow.
+    """Maximum sizes of random settings, which keep slow references feasible.
 
     Attributes
     ----------
@@ -40,7 +40,7 @@ class Limits:
     max_mics : int
     max_directions, max_ranges : int
     max_products : int
-        Products of ``dmas``, which a reference may want to write out.
+        Products of ``dmas``, which a reference may write out.
     """
 
     max_samples: int = 60_000
@@ -53,7 +53,7 @@ class Limits:
 def random_measurement(seed: int, limits: Limits | None = None) -> Measurement:
     """Return a measurement whose settings and words are drawn from a seed.
 
-    Words hold noise, echoes from random places, or both; see `random_settings`.
+    Words contain noise, echoes from random positions, or both; see `random_settings`.
     """
     random = np.random.default_rng(seed)
     settings = random_settings(random, limits or Limits())
@@ -61,7 +61,9 @@ def random_measurement(seed: int, limits: Limits | None = None) -> Measurement:
 
 
 def random_settings(random: np.random.Generator, limits: Limits) -> Settings:
-    """Return valid settings with nothing left out: calls that are short or rampless, PDM and PCM, every beamformer.
+    """Return valid and complete settings.
+
+    They cover short calls, calls without ramps, PDM and PCM, and every beamformer.
 
     Raises
     ------
@@ -74,7 +76,7 @@ def random_settings(random: np.random.Generator, limits: Limits) -> Settings:
             return _drawn(random, limits)
         except ArgumentError as error:
             refused = str(error)
-    raise ArgumentError(f"{_DRAWS} draws gave no valid settings, the last one because: {refused}; give wider limits")
+    raise ArgumentError(f"{_DRAWS} draws gave no valid settings; the last error: {refused}. Widen the limits")
 
 
 def _drawn(random: np.random.Generator, limits: Limits) -> Settings:
@@ -91,7 +93,10 @@ def _drawn(random: np.random.Generator, limits: Limits) -> Settings:
 
 
 def _array(random: np.random.Generator, limits: Limits) -> Array:
-    """Return a shipped layout, a line, a plane or a cloud of microphones, calibrated in every third draw."""
+    """Return a shipped layout, or microphones on a line, in a plane or in a volume.
+
+    Every third array is calibrated.
+    """
     kind = random.choice(["shipped", "line", "plane", "cloud"])
     if kind == "shipped" and limits.max_mics >= 32:
         return Array(layout=str(random.choice(["eRTIS_v3D1", "eRTIS_v2", "uRTIS_v1"])))
@@ -109,7 +114,7 @@ def _array(random: np.random.Generator, limits: Limits) -> Array:
 
 
 def _call(random: np.random.Generator) -> Call:
-    """Return a sweep of 0.05 to 5 ms; every third has no ramp, so that it starts and ends with a step."""
+    """Return a sweep of 0.05 to 5 ms. Every third sweep has no ramp, so that it starts and ends with a step."""
     low_hz = float(random.uniform(5e3, 45e3))
     high_hz = float(random.uniform(1.1 * low_hz, 90e3))
     edges_hz = (high_hz, low_hz) if random.integers(2) else (low_hz, high_hz)
@@ -134,10 +139,10 @@ def _recording(random: np.random.Generator, limits: Limits) -> Recording:
 def _processing(
     random: np.random.Generator, limits: Limits, call: Call, recording: Recording, n_mics: int, air: Air
 ) -> Processing:
-    """Return an image within the record, with as few ranges as the limits want."""
+    """Return processing settings for an image within the record, with at most the limit's number of ranges."""
     low_hz, high_hz = call.low_frequency_hz, call.high_frequency_hz
     step = max(1, round(recording.sample_rate_hz / (high_hz - low_hz + 10e3) / random.uniform(1.0, 3.0)))
-    step = max(1, min(step - step % 10 if step > 20 else step, 2_000))  # round numbers have more divisors
+    step = max(1, min(step - step % 10 if step > 20 else step, 2_000))  # Round numbers have more divisors.
     step_m = sound_speed_m_s(air) / 2 * step / recording.sample_rate_hz
     record_m = sound_speed_m_s(air) / 2 * recording.duration_s
     width_m = step_m * float(random.uniform(2, limits.max_ranges))
@@ -161,7 +166,7 @@ def _processing(
 
 
 def _words(random: np.random.Generator, settings: Settings) -> NDArray[Any]:
-    """Return the words of some echoes in white noise, from near silence to nothing but noise."""
+    """Return the words of some echoes in white noise. Levels range from near silence to inaudible echoes."""
     layout, recording = microphones(settings.array), settings.recording
     speed_m_s = sound_speed_m_s(settings.air)
     time_s = np.arange(recording.n_samples) / recording.sample_rate_hz

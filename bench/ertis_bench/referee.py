@@ -1,7 +1,7 @@
-"""A slow float64 referee of exact images, written as the documentation defines them and sharing no stage with them.
+"""Slow float64 reference for exact images, independent of all stages and written according to the documentation.
 
-Nothing is decimated or planned: the spectrum of the samples themselves is matched, delayed by exact phase shifts and
-summed bin by bin at each range.
+It neither decimates nor plans. It matches the spectrum of the samples themselves, delays it by exact phase shifts, and
+sums it bin by bin at each range.
 """
 
 import itertools
@@ -46,7 +46,7 @@ def exact(words: NDArray[Any], settings: Settings, directions: Floats, range_m: 
 
 
 def delays_s(positions_m: Floats, direction: Floats, range_m: Floats | None, speed_m_s: float) -> Floats:
-    """Return delays relative to the centroid, of plane waves or of points at ranges: (mic, 1) or (mic, range)."""
+    """Return delays relative to the centroid: (mic, 1) for plane waves, or (mic, range) for points at ranges."""
     if range_m is None:
         return np.asarray(-(positions_m @ direction)[:, None] / speed_m_s)
     points_m = range_m[:, None] * direction - positions_m[:, None]
@@ -54,7 +54,7 @@ def delays_s(positions_m: Floats, direction: Floats, range_m: Floats | None, spe
 
 
 def delayed(spectra: Delayed, frequency_hz: Floats, at_range: Delayed, delay_s: Floats) -> Delayed:
-    """Return the signals of a direction: (mic, range) complex128."""
+    """Return the delayed signals of a direction: (mic, range) complex128."""
     out = np.empty((len(spectra), len(at_range)), dtype=np.complex128)
     for mic, (spectrum, delay) in enumerate(zip(spectra, delay_s, strict=True)):
         turns = np.exp(2j * np.pi * frequency_hz * delay[:, None])  # (1 or range, bin)
@@ -65,7 +65,10 @@ def delayed(spectra: Delayed, frequency_hz: Floats, at_range: Delayed, delay_s: 
 def calibrated_spectra(
     words: NDArray[Any], array: Array, call: Call, recording: Recording, edges_hz: tuple[float, float] | None
 ) -> tuple[Delayed, Floats]:
-    """Return spectra after the matched filter, without delays and gains of microphones, and their frequencies."""
+    """Return spectra and their frequencies after the matched filter.
+
+    Delays and gains of microphones are corrected.
+    """
     layout = microphones(array)
     signals = signals_of(words, np.flatnonzero(layout.enabled), recording)
     spectra, frequency_hz = _matched_spectra(signals, call, recording.sample_rate_hz, edges_hz)
@@ -99,7 +102,7 @@ def _matched_spectra(
 
 
 def beamformed(y: Delayed, processing: Processing) -> Floats:
-    """Return the amplitude of one direction: (mic, range) to (range,); it must not be silent."""
+    """Return the amplitude of one direction: (mic, range) to (range,). The signals must not be silent."""
     if processing.beamformer == "delay_and_sum":
         return amplitudes(y)
     if processing.beamformer == "coherence_factor":
@@ -115,19 +118,19 @@ def amplitudes(y: Delayed) -> Floats:
 
 
 def coherence_factor(y: Delayed) -> Floats:
-    """Return the sum times the coherent relative to the total power."""
+    """Return the amplitude of the sum, weighted by the coherent power relative to the total power."""
     beams = np.abs(y.sum(axis=0))
     return np.asarray(beams * beams**2 / (len(y) * (np.abs(y) ** 2).sum(axis=0)))
 
 
 def dmas(z: Delayed, order: int) -> Floats:
-    """Return the mean of the products of all choices of roots, written out."""
+    """Return the mean of the products of all combinations of roots, computed term by term."""
     choices = np.array(list(itertools.combinations(range(len(z)), order)))
     return np.asarray(np.abs(np.prod(z[choices], axis=1).mean(axis=0)))
 
 
 def capon(y: Delayed, n_snapshots: int, loading: float) -> Floats:
-    """Return the beam by the weights of least variance, from the whole covariance matrix."""
+    """Return the beam with the weights of least variance, from the whole covariance matrix."""
     n_mics, n_ranges = y.shape
     image, n_snapshots = np.empty(n_ranges), min(n_snapshots, n_ranges)
     for place in range(n_ranges):
@@ -141,7 +144,7 @@ def capon(y: Delayed, n_snapshots: int, loading: float) -> Floats:
 
 
 def signals_of(words: NDArray[Any], channels: NDArray[np.intp], recording: Recording) -> Floats:
-    """Return the signals of bits or numbers, full scale 1: (mic, sample) float64."""
+    """Return the signals of bits or numbers, relative to full scale: (mic, sample) float64."""
     if recording.is_pdm:
         return unpack_bits(words, channels)
     return np.asarray(words[:, channels].T / recording.full_scale, np.float64)

@@ -1,4 +1,4 @@
-"""Losses under faults on the wire, pulled plugs, killed processes and full disks."""
+"""Losses of captures under wire faults, unplugged sensors, killed processes and full disks."""
 
 import os
 import subprocess
@@ -21,33 +21,33 @@ __all__ = ["LONG", "ONE_SENSOR", "PARTS", "SHORT", "TrialCounts", "run", "small_
 
 _ROOT = Path(__file__).parents[2]
 ONE_SENSOR = _ROOT / "data" / "synthetic" / "reflectors.h5"
-"""What is captured, where one sensor will do."""
+"""Recording from which a single sensor is emulated."""
 
 _DISK_MB = 20
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrialCounts:
-    """Numbers of trials.
+    """Extent of the trials.
 
     Attributes
     ----------
     duration_s : float
-        Of the sustained capture.
+        Duration of the sustained capture.
     n_groups : int
         Pulses of the SYNC chain.
     n_blocks : int
-        With faults on the wire.
+        Blocks on a line with faults.
     n_unplugs : int
     n_kills : int
-        Of captures, and as many of processes that do nothing but write a journal.
+        Killed captures, and the same number of killed processes that only write a journal.
     n_seal_kills : int
     n_signals : int
-        To each command.
+        Signals to each command.
     n_power_cuts : int
         States of a disk after a power cut.
     n_flips : int
-        Files that are damaged.
+        Damaged files.
     """
 
     duration_s: float
@@ -88,7 +88,7 @@ LONG = TrialCounts(
 def run(
     *, say: Callable[[str], None], long: bool = False, seed: int | None = None, only: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Try everything, or only some of `PARTS`, and return the report."""
+    """Run all trials, or only some of `PARTS`, and return the report."""
     return try_parts(PARTS, LONG if long else SHORT, say=say, long=long, seed=seed, only=only)
 
 
@@ -106,19 +106,19 @@ def _disk_full(_: TrialCounts, folder: Path, __: int) -> dict[str, Any] | None:
 
 
 def wire(n_blocks: int, seed: int, *, splices: bool = False) -> dict[str, Any]:
-    """Send blocks of the least length, with the words of a sensor, over a line with faults."""
+    """Send the shortest blocks with the words of a sensor over a line with faults."""
     with open_recording(ONE_SENSOR) as recording:
         words = recording[0].data
     check = BitCheck(LENGTH_STEP, ERTIS_PDM_RATE_HZ, splices=splices)
     found = wire_faults.send(n_blocks, seed=seed, n_samples=LENGTH_STEP, words=words, bits=check.check)
-    # Not by asdict, which makes pairs the keys of a Counter.
+    # asdict would turn the keys of a Counter into pairs.
     values = {each.name: getattr(found, each.name) for each in fields(found)}
     return {name: dict(value) if isinstance(value, Counter) else value for name, value in values.items()}
 
 
 @contextmanager
 def small_disk(folder: Path) -> Iterator[Path | None]:
-    """Yield ``folder`` as a disk of its own in memory, or None where only root may mount one."""
+    """Yield ``folder`` with a small disk in memory mounted, or None if only root may mount one."""
     command = ["mount", "-t", "tmpfs", "-o", f"size={_DISK_MB}m", "ertis", str(folder)]
     try:
         mounted = os.name == "posix" and subprocess.run(command, capture_output=True, check=False).returncode == 0  # noqa: S603
@@ -133,17 +133,17 @@ def small_disk(folder: Path) -> Iterator[Path | None]:
 
 PARTS: Parts[TrialCounts] = {
     "sustained": (
-        "capturing at 20 Hz for {duration_s:g} s",
+        "capture at 20 Hz for {duration_s:g} s",
         lambda extent, folder, _: captures.sustained(ONE_SENSOR, folder, duration_s=extent.duration_s, rate_hz=20.0),
     ),
     "chain": ("{n_groups} pulses to four sensors", _chain),
     "wire": ("{n_blocks} blocks over a line with faults", lambda extent, _, seed: wire(extent.n_blocks, seed)),
     "splices": (
-        "{n_blocks} blocks again, and splices are looked for",
+        "{n_blocks} blocks again, with a check for splices",
         lambda extent, _, seed: wire(extent.n_blocks, seed, splices=True),
     ),
     "unplugs": (
-        "{n_unplugs} times without its plug",
+        "{n_unplugs} unplugged sensors",
         lambda extent, folder, seed: captures.unplugs(ONE_SENSOR, folder, seed=seed, count=extent.n_unplugs),
     ),
     "kills": (
@@ -162,7 +162,7 @@ PARTS: Parts[TrialCounts] = {
         "{n_flips} damaged files",
         lambda extent, folder, seed: flips(folder, seed=seed, count=extent.n_flips),
     ),
-    "disk_full": ("a small disk", _disk_full),
+    "disk_full": ("small disk", _disk_full),
     "signals": (
         "{n_signals} signals to each command",
         lambda extent, folder, seed: signals.send(folder, ONE_SENSOR, seed=seed, count=extent.n_signals),
@@ -174,4 +174,4 @@ PARTS: Parts[TrialCounts] = {
         ),
     ),
 }
-"""What is tried: what to say of it, and how."""
+"""Trials by name, each with its progress message and its function."""

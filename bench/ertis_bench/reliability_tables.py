@@ -1,4 +1,4 @@
-"""The report of `reliability` as Markdown."""
+"""Markdown report of `reliability`."""
 
 from typing import Any
 
@@ -19,15 +19,15 @@ _CHAIN = (
 )
 _WIRE = (
     (
-        "{sent:,} blocks, {spoilt:,} with faults: bytes lost, added, changed, swapped; blocks cut, doubled, dropped; "
-        "stalls and pulled plugs; read in pieces of 1 to 4,095 bytes"
+        "{sent:,} blocks, {spoilt:,} with faults: bytes lost, added, changed, swapped; blocks truncated, duplicated, "
+        "dropped; stalls and unplugged cables; read in chunks of 1 to 4,095 bytes"
     ),
     "0 false accepts; 0 untouched lost",
     "{false_accepts} displaced, mixed, wrongly numbered or repeated blocks accepted; {untouched_lost} untouched lost",
 )
 _ALTERED = (
-    "of these, whole ones in which words were changed at their place, or lost and others added",
-    "nothing in a block tells but its bits",
+    "of these, complete blocks with changed words, or with as many words lost as added",
+    "only the bits can reveal the fault",
     "{altered:,} accepted",
 )
 _SPLICES = (
@@ -36,43 +36,43 @@ _SPLICES = (
     "{altered:,} accepted; {untouched_lost} untouched lost",
 )
 _UNPLUGS = (
-    "{unplugged} times unplugged while it measured",
-    "back within 3 s; 0 wrong",
-    "{noticed} times back; {slowest_s:.2f} s from plug to measurement at most; {wrong} wrong",
+    "sensor unplugged {unplugged} times during measurements",
+    "reconnected within 3 s; 0 wrong",
+    "reconnected {noticed} times; at most {slowest_s:.2f} s from connection to measurement; {wrong} wrong",
 )
 _KILLS = (
     "{kills:,} captures ended by kill -9",
-    "0 lost of what was reported; all readable",
+    "0 reported measurements lost; all readable",
     "{reported:,} reported, {lost} lost, {wrong} wrong, {unreadable} unreadable, {left over} files left over",
 )
 _JOURNALS = (
     "{kills:,} writers of journals ended by kill -9",
-    "0 lost of what was reported",
+    "0 reported measurements lost",
     "{told:,} reported, {lost} lost, {wrong} wrong, {unexpected} unexpected",
 )
 _SEALS = (
-    "{kills:,} sealings ended by kill -9, and done again",
+    "{kills:,} sealings ended by kill -9, then repeated",
     "0 broken files",
-    "{broken} broken, {different} other than without a kill, {left_over} files left over",
+    "{broken} broken, {different} different from an undisturbed sealing, {left_over} files left over",
 )
 _FLIPS = (
-    "{tried:,} damaged files: a flipped bit, a zeroed block or a lost end ({each})",
-    "0 lost or changed in silence; 0 tracebacks",
+    "{tried:,} damaged files: a flipped bit, a zeroed block or a truncation ({each})",
+    "0 silent losses or changes; 0 tracebacks",
     "{noticed:,} reported, {harmless:,} without effect, {silent} silent, {crashed} tracebacks",
 )
 _FULL = (
     "disk full",
-    "an error; nothing reported that is not stored",
+    "an error; all reported measurements stored",
     "exit code {exit code}: “{said}”; {reported} reported, {lost} lost, {wrong} wrong",
 )
 _SIGNALS = (
-    "{signals:,} signals at random moments of {commands} commands",
+    "{signals:,} signals at random times of {commands} commands",
     "each ends within 1 s with its documented exit code",
-    "{late} later, {slowest_s:.2f} s at most (`ertis {slowest}`); {codes} other codes; {tracebacks} tracebacks",
+    "{late} late, at most {slowest_s:.2f} s (`ertis {slowest}`); {codes} other codes; {tracebacks} tracebacks",
 )
 _POWER_CUTS = (
     "power cuts of captures, with and without failing syncs",
-    "0 lost of what was reported, 0 twice",
+    "0 reported measurements lost, 0 twice",
     "{states:,} states of the disk: {acknowledged:,} reported, {lost} lost, {twice} twice, {wrong} wrong",
 )
 
@@ -99,13 +99,14 @@ def reliability(report: dict[str, Any]) -> str:
     rows = [_row(texts, report[name]) for name, texts in _ROWS if name in report]
     options = [*(["--long"] if report["long"] else []), *(f"--only {name}" for name in report["only"])]
     made = " ".join(["ertis bench reliability", *options, f"--seed {report['seed']}"])
-    return f"{table(('tried', 'wanted', 'found'), rows, numbers=False)}\n\nBy `{made}`. {sentence(report['machine'])}"
+    cells = table(("trial", "required", "result"), rows, numbers=False)
+    return f"{cells}\n\nCommand: `{made}`. {sentence(report['machine'])}"
 
 
 def _row(texts: tuple[str, str, str], found: dict[str, Any] | None) -> tuple[str, str, str]:
     tried, wanted, became = texts
     if found is None:
-        return tried, wanted, "not tried: only root may mount a small disk"
+        return tried, wanted, "not tried: mounting a small disk requires root"
     if "reason" in found:
         return tried, wanted, f"not tried: {found['reason']}"
     if "wrong_counter" in found:

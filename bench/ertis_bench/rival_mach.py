@@ -1,8 +1,8 @@
 """Delay-and-sum by mach, the ultrasound beamformer of Forest Neurotech, on this package's analytic signals.
 
-mach interpolates demodulated samples on straight lines and turns them back by the carrier, at the delay of each place
-of the image, which it computes on the way. So this package does the same: waves are spherical, samples lie eight to a
-range and are interpolated the same way, from tables of delays that hold for a zone of ranges.
+mach interpolates demodulated samples linearly, and restores the phase of the carrier at the delay of each point of the
+image. It computes the delays in the same kernel. For the comparison, this package uses spherical waves, eight samples
+per range and linear interpolation, too. Its delays come from tables for focal zones.
 """
 
 import functools
@@ -27,14 +27,15 @@ from ertis_numba.stages.plan_elements import spectrum_of
 
 __all__ = ["problem", "race", "settings_for"]
 
-_NEAR_DB = -25.0  # zones of range and straight lines are allowed -30 dB here
+_MAX_DIFFERENCE_DB = -25.0  # The budget for focal zones and linear interpolation is -30 dB.
 _FRAMES = 16
-_AHEAD_M = 8.0  # mach takes the third axis for depth and opens the aperture with it: 0 m would close it
+# mach uses the third axis as depth and scales the aperture with it, so that 0 m would leave no aperture.
+_DEPTH_OFFSET_M = 8.0
 _F_NUMBER = 0.01
 
 
 def settings_for(settings: Settings) -> Settings:
-    """Return settings that leave mach's way of interpolation."""
+    """Return settings with which this package interpolates as mach does."""
     accuracy = settings.accuracy.replace(
         max_error_db=-30.0, precision="float32", interpolation="linear", oversampling=8, delay_taps=2, beam_taps=0
     )
@@ -42,15 +43,15 @@ def settings_for(settings: Settings) -> Settings:
 
 
 def problem(settings: Settings, measurement: Measurement, device: str) -> tuple[dict[str, Any], NDArray[np.float32]]:
-    """Return the arguments of ``mach.kernel.beamform``, arrays of NumPy among them, and this package's image.
+    """Return the arguments of ``mach.kernel.beamform`` with NumPy arrays, and this package's image.
 
     Parameters
     ----------
     settings : Settings
-        Complete.
+        Complete settings.
     measurement : Measurement
     device : str
-        That the image and the analytic signals come from.
+        Device that computes the image and the analytic signals.
     """
     chain = FastChain(settings, kernels.load(device), threads=1)
     image = chain.new_image()
@@ -71,8 +72,8 @@ def problem(settings: Settings, measurement: Measurement, device: str) -> tuple[
     chain.close()
     return {
         "channel_data": samples[:, :, None],
-        "rx_coords_m": _turned(layout.enabled_positions_m),
-        "scan_coords_m": _turned(places_m),
+        "rx_coords_m": _with_depth_last(layout.enabled_positions_m),
+        "scan_coords_m": _with_depth_last(places_m),
         "tx_wave_arrivals_s": (np.tile(chain.range_m, len(units)) / speed_m_s).astype(np.float32),
         "rx_start_s": float(start_s),
         "sampling_freq_hz": float(rate_hz),
@@ -84,12 +85,12 @@ def problem(settings: Settings, measurement: Measurement, device: str) -> tuple[
 
 
 def race(settings: Settings, measurement: Measurement, count: int) -> dict[str, Any]:
-    """Return times of mach and of this package for delay-and-sum with envelope, everything on the GPU.
+    """Return times of mach and of this package for delay-and-sum with envelope, entirely on the GPU.
 
     Raises
     ------
     DataError
-        Its image is another one.
+        The images differ.
     """
     import cupy  # noqa: PLC0415 - there with a GPU only
     from mach.kernel import beamform  # noqa: PLC0415 - rarely there
@@ -101,10 +102,10 @@ def race(settings: Settings, measurement: Measurement, count: int) -> dict[str, 
     run: Callable[..., Any] = functools.partial(_beamform, cupy, beamform)
     found = cupy.asnumpy(run(here)).reshape(image.shape) / len(arguments["rx_coords_m"])
     difference_db = verification.error_db(found, image)
-    if not difference_db <= _NEAR_DB:
+    if not difference_db <= _MAX_DIFFERENCE_DB:
         raise DataError(
-            f"image of mach is {difference_db:.1f} dB off this package's; wanted at most {_NEAR_DB:g} dB: the times "
-            "would be those of another result"
+            f"image of mach differs from this package's by {difference_db:.1f} dB; "
+            f"the limit is {_MAX_DIFFERENCE_DB:g} dB. The time is not reported, because the results differ"
         )
     many = here | {"channel_data": cupy.ascontiguousarray(cupy.repeat(here["channel_data"], _FRAMES, axis=2))}
     times_ms = timing.round_robin(
@@ -130,8 +131,8 @@ def _beamform(cupy: Any, beamform: Callable[..., Any], arguments: dict[str, Any]
     return envelope
 
 
-def _turned(positions_m: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return positions with the axis to the front last, as depths."""
+def _with_depth_last(positions_m: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return positions with the forward axis last, as depths."""
     depth_m = np.roll(positions_m, -1, axis=1)
-    depth_m[:, 2] += _AHEAD_M
+    depth_m[:, 2] += _DEPTH_OFFSET_M
     return depth_m.astype(np.float32)

@@ -1,6 +1,6 @@
-"""The same sums with the array operations of other libraries, against this package's kernels.
+"""Delay-and-sum with the array operations of other libraries, compared with this package's kernels.
 
-The algorithm and its tables are this package's, with every direction's own beam: what differs is who computes.
+The algorithm and its tables are this package's, without a beam grid. Only the implementation of the arithmetic differs.
 """
 
 import dataclasses
@@ -25,14 +25,14 @@ from ertis_numba.stages.fast import FastChain
 
 __all__ = ["LIBRARIES", "ArrayChain", "Library", "Tables", "is_installed", "numpy_library", "race", "tables_of"]
 
-_GATHERED_BYTES = 2**28  # of samples that are gathered at a time
-_SAME_DB = -100.0
+_GATHERED_BYTES = 2**28  # size of the samples that are gathered at a time
+_MAX_DIFFERENCE_DB = -100.0
 _BURST = 10
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tables:
-    """Arguments of the kernels of a chain, and the processor's image from them.
+    """Arguments of the kernels of a chain, and the CPU's image from them.
 
     Attributes
     ----------
@@ -40,7 +40,7 @@ class Tables:
     taps : (tap,) int16 or int32
     scale : float
     factor, first, n_signals : int
-        Of `DemodulateWords`.
+        Arguments of `DemodulateWords`.
     n_fft : int
     responses : (mic, phase, b) or (1, phase, b) complex64
     first_bin : int
@@ -65,12 +65,12 @@ class Tables:
 
     @property
     def n_terms(self) -> int:
-        """Samples that are added up for a place of the image."""
+        """Number of samples that are summed per bin of the image."""
         return int(self.zones[0][0].shape[1])
 
 
 def tables_of(settings: Settings, measurement: Measurement) -> Tables:
-    """Return the tables of a complete plan in single precision without nodes, as its kernels see them."""
+    """Return the tables that kernels receive for a complete plan in single precision without a beam grid."""
     kernel_set = kernels.load("cpu")
     seen: dict[str, list[tuple[Any, ...]]] = {}
 
@@ -109,7 +109,7 @@ def tables_of(settings: Settings, measurement: Measurement) -> Tables:
 
 @dataclass(frozen=True, slots=True)
 class Library:
-    """Differences between libraries; slices, indices, sums and products are the same in all of them."""
+    """Differences between libraries. Slices, indices, sums and products are the same in all of them."""
 
     upload: Callable[[NDArray[Any]], Any]
     download: Callable[[Any, NDArray[Any]], None]
@@ -121,7 +121,7 @@ class Library:
 
 
 def numpy_library() -> Library:
-    """Return NumPy, which shows without a GPU that the sums are right."""
+    """Return NumPy, with which the sums can be checked without a GPU."""
     return Library(
         upload=np.asarray,
         download=lambda array, out: np.copyto(out, array),
@@ -149,7 +149,7 @@ def cupy_library() -> Library:
 
 
 def torch_library(device: str = "cuda") -> Library:
-    """Return PyTorch; 32-bit products are not rounded, as it has it by default."""
+    """Return PyTorch. Its 32-bit products are not rounded to TF32, which is also its default."""
     import torch  # noqa: PLC0415 - rarely there
 
     return Library(
@@ -164,7 +164,7 @@ def torch_library(device: str = "cuda") -> Library:
 
 
 class ArrayChain:
-    """Words to image by array operations."""
+    """Chain from words to image with array operations."""
 
     def __init__(self, tables: Tables, library: Library) -> None:
         self._tables, self._library = tables, library
@@ -184,7 +184,7 @@ class ArrayChain:
         ]
 
     def __call__(self, words: NDArray[Any], out: NDArray[np.float32]) -> None:
-        """Fill ``out``, (direction, range), from ``data``, (sample, word)."""
+        """Process ``words``, (sample, word), and fill ``out``, (direction, range)."""
         octets = self._library.upload(words.view(np.uint8).reshape(len(words), -1))
         analytic = self._analytic(self._signals(octets))
         image = self._library.zeros(out.shape, "float32")
@@ -198,7 +198,7 @@ class ArrayChain:
         self._library.download(image, out)
 
     def _signals(self, octets: Any) -> Any:
-        """Return signals, (mic, sample): a step of the filter is a product of matrices."""
+        """Return signals, (mic, sample). Each step of the filter is a matrix product."""
         tables, library = self._tables, self._library
         begin, end = max(0, self._begin), min(len(octets), self._begin + self._n_inputs)
         bits = (octets[begin:end][:, self._octets] >> self._shifts) & 1
@@ -211,7 +211,7 @@ class ArrayChain:
         return signals
 
     def _analytic(self, signals: Any) -> Any:
-        """Return analytic signals, flat: (mic · phase · sample,)."""
+        """Return flattened analytic signals: (mic · phase · sample,)."""
         tables, library = self._tables, self._library
         n_bins, n_out = tables.responses.shape[2], tables.n_outputs
         spectra = library.rfft(signals)[:, None, tables.first_bin : tables.first_bin + n_bins] * self._responses
@@ -226,7 +226,7 @@ class ArrayChain:
 
 
 LIBRARIES = {"CuPy": "cupy", "PyTorch": "torch", "mach": "mach"}
-"""Names of libraries, and what is imported."""
+"""Libraries by name, with the imported module."""
 _MAKERS = {"CuPy": cupy_library, "PyTorch": torch_library}
 
 
@@ -236,12 +236,14 @@ def is_installed(library: str) -> bool:
 
 
 def race(library: str, settings: Settings, measurement: Measurement, count: int) -> dict[str, Any]:
-    """Return times of a library and of this package, host to host, for the same sums; mach has delay-and-sum alone.
+    """Return times of a library and of this package for the same sums, from host to host.
+
+    mach is compared for delay-and-sum only.
 
     Raises
     ------
     DataError
-        Its image is another one.
+        The images differ.
     """
     if library == "mach":
         return rival_mach.race(settings, measurement, count)
@@ -253,13 +255,13 @@ def race(library: str, settings: Settings, measurement: Measurement, count: int)
         words, out = np.array(measurement.data).reshape(len(measurement.data), -1), np.empty_like(image)
         chain(words, out)
         difference_db = verification.error_db(out, image)
-        if not difference_db <= _SAME_DB:
+        if not difference_db <= _MAX_DIFFERENCE_DB:
             raise DataError(
-                f"image of {library} is {difference_db:.1f} dB off this package's; wanted at most {_SAME_DB:g} dB: the "
-                "times would be those of another result"
+                f"image of {library} differs from this package's by {difference_db:.1f} dB; "
+                f"the limit is {_MAX_DIFFERENCE_DB:g} dB. The time is not reported, because the results differ"
             )
         subjects: dict[str, Callable[[], object]] = {
-            "theirs": functools.partial(chain, words, image),  # to pinned memory as well
+            "theirs": functools.partial(chain, words, image),  # The library also writes to pinned memory.
             "ours": functools.partial(pipeline.process, measurement, out=image),
         }
         times_ms = timing.round_robin(subjects, count=count, burst=_BURST)

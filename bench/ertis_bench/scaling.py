@@ -14,8 +14,8 @@ from ertis_numba.settings import Array, Settings
 
 __all__ = ["OPERATIONS_PER_POINT", "SERIES", "reached", "run"]
 
-OPERATIONS_PER_POINT = 8  # one complex multiply-add per direction, range and microphone, in direct sums
-_DEFAULT = "default"  # plan; the others are direct sums, called by their precision
+OPERATIONS_PER_POINT = 8  # one complex multiply-add per direction, range and microphone, without a beam grid
+_DEFAULT = "default"  # Name of the default plan. Plans without a beam grid have the name of their precision.
 _BASE = {"directions": 1850, "last_range_m": 5.0, "microphones": 32}
 SERIES: dict[str, tuple[float, ...]] = {
     "directions": (90, 250, 500, 1000, 1850, 3000, 6000),
@@ -23,11 +23,14 @@ SERIES: dict[str, tuple[float, ...]] = {
     "microphones": (8, 16, 32, 64, 128),
     "batch": (1, 2, 4, 8, 16),
 }
-"""What is varied; all else stays at 1850 directions, 0.5-5 m, 32 microphones, all threads, the default plan."""
+"""Varied parameters and their values.
+
+The other values are 1850 directions, 0.5-5 m, 32 microphones, all threads, and the default plan.
+"""
 
 _FIRST_RANGE_M = 0.5
 _APERTURE_M = 0.1
-_STREAM = 16 * 2**20  # numbers of an array: 64 MiB, several times the last cache level
+_STREAM = 16 * 2**20  # numbers per array: 64 MiB, several times the last-level cache
 _TURNS = 200_000
 _STRANDS_PER_THREAD = 8
 
@@ -38,14 +41,14 @@ def run(*, count: int, say: Callable[[str], None]) -> dict[str, Any]:
     Parameters
     ----------
     count : int
-        Measurements per point.
+        Measurements per value.
     say : callable
-        Told what goes on.
+        Called with a line of progress.
 
     Raises
     ------
     DataError
-        A result is wrong, so it is not timed.
+        A result is wrong and therefore not timed.
     """
     rows = []
     for series, plan in _series():
@@ -74,7 +77,7 @@ def _precisions() -> list[str]:
 
 
 def _measure(series: str, plan: str, count: int) -> Iterator[dict[str, Any]]:
-    """Yield a row per value; the values take turns, so that a drift does not look like a trend."""
+    """Yield one row per value. The values take turns, so that a drift of the machine does not look like a trend."""
     subjects: dict[str, Callable[[], object]] = {}
     n_ranges: dict[str, int] = {}
     for value in _thread_counts() if series == "threads" else SERIES[series]:
@@ -100,7 +103,7 @@ def _thread_counts() -> list[int]:
 
 
 def _settings(plan: str, *, directions: float, last_range_m: float, microphones: float) -> tuple[Settings, int]:
-    """Return settings and words per sample, with microphones at random places on a disc."""
+    """Return settings and words per sample, with microphones at random positions on a disc."""
     n_mics, settings = int(microphones), Settings.from_preset("default_25_50")
     random = np.random.default_rng(1)
     radius_m = _APERTURE_M / 2 * np.sqrt(random.random(n_mics))
@@ -118,7 +121,7 @@ def _settings(plan: str, *, directions: float, last_range_m: float, microphones:
 
 
 def _ceilings(n_threads: int, count: int) -> dict[str, float]:
-    """Return the best of ``count`` runs: a limit is not an average."""
+    """Return the best rates of ``count`` runs. A limit is not an average."""
     a, b, out = (np.ones(_STREAM, dtype=np.float32) for _ in range(3))
     n_strands = n_threads * _STRANDS_PER_THREAD
     strands = {"float32": np.empty(n_strands, dtype=np.float32), "int16": np.empty(n_strands, dtype=np.int32)}
@@ -145,16 +148,16 @@ def _ceilings(n_threads: int, count: int) -> dict[str, float]:
 def reached(rows: list[dict[str, Any]], precision: str, ceiling: dict[str, float]) -> dict[str, Any]:
     """Return the share of the limits that delay-and-sum with envelope reaches.
 
-    Its time per direction is the slope of a line through the times over directions; what does not depend on directions,
-    the line's start, is the rest of the chain.
+    Its time per direction is the slope of a line through the times over directions. The intercept of the line is the
+    time of the rest of the chain, which does not depend on the number of directions.
 
     Parameters
     ----------
     rows : list of dict
-        Those of the series ``directions`` whose plan is direct sums at this precision are used.
+        Measured rows. Only those of the series ``directions`` without a beam grid at this precision are used.
     precision : {"float32", "int16"}
     ceiling : dict
-        What the machine does on as many threads.
+        Limits of the machine with the same number of threads.
     """
     points = [row for row in rows if (row["series"], row["plan"]) == ("directions", precision)]
     directions = np.array([row["value"] for row in points])

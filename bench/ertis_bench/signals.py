@@ -1,7 +1,7 @@
-"""Signals at random moments of every command: each ends soon, with its documented exit code and without a traceback.
+"""Signals at random times of every command. Each command must end soon, with its documented exit code and no traceback.
 
-Commands run as real processes. A signal comes at a moment drawn evenly between the first line of the command and the
-end of an undisturbed run. Before that line Python itself starts, and answers signals with its own defaults.
+Commands run as real processes. The time of a signal is uniformly distributed between the first line of the command and
+the end of an undisturbed run. Before that line Python itself starts, and handles signals with its own defaults.
 """
 
 import random
@@ -24,12 +24,12 @@ from ertis_numba.storage import open_recording
 __all__ = ["COMMANDS", "MAX_END_S", "send"]
 
 MAX_END_S: Final = 1.0
-"""Longest time from a signal to the end of the process."""
+"""Longest permitted time from a signal to the end of the process, in seconds."""
 
 _SCENE = Path(__file__).parents[2] / "data" / "synthetic" / "scenes" / "two_facing_sensors.toml"
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _STARTS = 5
-_MAX_TRIES = 10  # for each signal, of which those count that reach a running process
+_MAX_TRIES = 10  # Tries per signal. Only signals that reach a running process count.
 _UNDISTURBED_S = 4.0
 _TIMEOUT_S = 30.0
 _FAULTS = ("late", "codes", "tracebacks")
@@ -63,7 +63,7 @@ COMMANDS: Final[dict[str, Sequence[str]]] = {
     "verify": ("{recording}",),
     "view": ("{recording}", "--port", "0", "--no-open"),
 }
-"""Arguments of each command; a test compares the names with those of the command line."""
+"""Arguments of each command. A test compares the names with those of the command line."""
 
 
 def send(folder: Path, source: Path, *, seed: int, count: int, only: Sequence[str] = ()) -> dict[str, Any]:
@@ -72,13 +72,13 @@ def send(folder: Path, source: Path, *, seed: int, count: int, only: Sequence[st
     Returns
     -------
     dict
-        ``signals`` of all commands; of them ``late``, after which the process took longer than `MAX_END_S`;
-        ``codes``, after which its exit code was not the documented one; and ``tracebacks``. ``slowest_s`` is the
-        longest time, and ``slowest`` its command. ``by_command`` has the same of each command, with examples.
+        Over all commands: ``signals``; ``late``, signals after which the process took longer than `MAX_END_S`;
+        ``codes``, signals after which the exit code was not the documented one; and ``tracebacks``. ``slowest_s`` is
+        the longest time, and ``slowest`` its command. ``by_command`` has the same counts per command, with examples.
     """
     rng = random.Random(seed)  # noqa: S311  nothing is secret
     found: dict[str, dict[str, Any]] = {}
-    with _obeyed_signals(), captures.emulated(source, folder) as ports:
+    with _default_signals(), captures.emulated(source, folder) as ports:
         paths = _files(folder, source) | {"port": ports[0]}
         for command in only or COMMANDS:
             found[command] = _to_command(command, paths, folder / "out", rng, count)
@@ -94,8 +94,11 @@ def send(folder: Path, source: Path, *, seed: int, count: int, only: Sequence[st
 
 
 @contextmanager
-def _obeyed_signals() -> Iterator[None]:
-    """Have processes begin with all signals obeyed, also where a script or ``nohup`` started this one."""
+def _default_signals() -> Iterator[None]:
+    """Restore default signal handling for new processes.
+
+    A script or ``nohup`` that has started this process may ignore signals, and children inherit this.
+    """
     ignored = [number for number in _SIGNALS if signal.getsignal(number) is signal.SIG_IGN]
     for number in ignored:
         signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
@@ -107,7 +110,7 @@ def _obeyed_signals() -> Iterator[None]:
 
 
 def _files(folder: Path, source: Path) -> dict[str, str]:
-    """Make the files that commands read, and return the names by which `COMMANDS` refers to them."""
+    """Create the files that commands read, and return the names by which `COMMANDS` refers to them."""
     raw, images, crashed = folder / "raw.bin", folder / "images.h5", folder / "crashed"
     with open_recording(source) as recording:
         measurement = recording[0]
@@ -117,7 +120,7 @@ def _files(folder: Path, source: Path) -> dict[str, str]:
         with Journal.create(made / f"rec.h5{SUFFIX}", target="rec.h5", source="signals") as journal:
             journal.add_sensor(measurement.stamp.sensor, measurement.settings)
             journal.append([JournalEntry(measurement, monotonic_ns=0)])
-            shutil.copytree(made, crashed)  # as a killed process leaves it
+            shutil.copytree(made, crashed)  # The copy equals the files of a killed process.
     done = captures.ertis("process", str(source), "-o", str(images), "--quiet")
     done.check_returncode()
     return {
@@ -131,7 +134,7 @@ def _files(folder: Path, source: Path) -> dict[str, str]:
 
 def _to_command(command: str, paths: dict[str, str], out: Path, rng: random.Random, count: int) -> dict[str, Any]:
     begins_s = _interpreter_s()
-    lasts_s, _, _, _ = _one(command, paths, out, None, _UNDISTURBED_S)
+    lasts_s, _, _, _ = _run_command(command, paths, out, None, _UNDISTURBED_S)
     found: dict[str, Any] = {"signals": 0, **dict.fromkeys(_FAULTS, 0), "slowest_s": 0.0}
     examples: Counter[str] = Counter()
     for _ in range(_MAX_TRIES * count):
@@ -139,7 +142,7 @@ def _to_command(command: str, paths: dict[str, str], out: Path, rng: random.Rand
             break
         number = rng.choice(_SIGNALS)
         at_s = rng.uniform(begins_s, max(lasts_s, begins_s))
-        _, took_s, code, errors = _one(command, paths, out, number, at_s)
+        _, took_s, code, errors = _run_command(command, paths, out, number, at_s)
         if not took_s or _in_interpreter(errors):
             continue
         found["signals"] += 1
@@ -161,13 +164,13 @@ def _to_command(command: str, paths: dict[str, str], out: Path, rng: random.Rand
 def _in_interpreter(errors: str) -> bool:
     """Return True if a signal arrived before Python ran the first line of the command.
 
-    Python may take longer to start than `_interpreter_s` says. No frame of its traceback is then in our code.
+    Python may take longer to start than `_interpreter_s` measures. Its traceback then has no frame in this package.
     """
     return "Traceback" in errors and "ertis_cli" not in errors
 
 
 def _interpreter_s() -> float:
-    """Return how long Python takes to start and to find a module, at worst of a few times."""
+    """Return the longest time that Python takes to start and to find a module, in a few runs."""
 
     def once() -> float:
         begin_s = time.monotonic()
@@ -177,12 +180,12 @@ def _interpreter_s() -> float:
     return max(once() for _ in range(_STARTS))
 
 
-def _one(
+def _run_command(
     command: str, paths: dict[str, str], out: Path, number: signal.Signals | None, at_s: float
 ) -> tuple[float, float, int, str]:
-    """Run a command, send it a signal at a time, and return how long it ran, the time to its end, its code and stderr.
+    """Run a command, send a signal at a time, and return its duration, the time to its end, its exit code and stderr.
 
-    Without a signal it is killed at that time, if it still runs.
+    Without a signal the process is killed at that time, if it is still running.
     """
     shutil.rmtree(out, ignore_errors=True)
     shutil.copytree(paths["crashed"], out / "crashed")

@@ -31,13 +31,13 @@ from ertis_numba.simulation.snapshot import snapshot
 
 __all__ = ["free_field", "run"]
 
-_NOBODY_HEARS_DB = -180.0
-_FORCED = [name for name in EFFECTS if name != "microphone_faults"]  # a missing microphone always matters
+_NEGLIGIBLE_DB = -180.0
+_ALL_EFFECTS = [name for name in EFFECTS if name != "microphone_faults"]  # A missing microphone is always relevant.
 
 
 def free_field() -> Scene:
-    """Return ten points before a default eRTIS sensor, and with them something for every effect, too weak to matter."""
-    weak = _NOBODY_HEARS_DB
+    """Return a scene of ten points before a default eRTIS sensor, with a negligible source of every effect."""
+    weak = _NEGLIGIBLE_DB
     points = tuple(
         Point(azimuth_deg=-60.0 + 12 * n, range_m=0.8 + 0.35 * n, strength_db=-20.0 + 2 * n) for n in range(9)
     )
@@ -69,35 +69,36 @@ def free_field() -> Scene:
 
 
 def run(*, count: int, say: Callable[[str], None]) -> dict[str, Any]:
-    """Time measurements of `free_field`, modulators included.
+    """Measure the time of measurements of `free_field`, including modulators.
 
     Parameters
     ----------
     count : int
-        Measurements each.
+        Measurements per set of effects.
     say : callable
-        Told what goes on.
+        Called with a line of progress.
 
     Raises
     ------
     DataError
-        The two images differ by more than the effects are allowed to change.
+        The two images differ by more than the tolerance of the omitted effects.
     """
     scene = free_field()
-    say("deciding")
-    # Keys ask for most of these effects, which keeps them on: here only the image is to decide.
+    say("choosing the effects")
+    # Keys of the scene request most of these effects, which would keep them on. Here, only the change of the image
+    # must decide.
     plan = make_plan(scene.replace(effects=dict.fromkeys(ASKED_FOR, False)))
-    everything = make_plan(scene.replace(effects=dict.fromkeys(_FORCED, True)))
-    say("checking")
+    everything = make_plan(scene.replace(effects=dict.fromkeys(_ALL_EFFECTS, True)))
+    say("comparing the images")
     change_db = _change_db(scene, plan, everything)
     allowed_db = scene.tolerance_db * len(everything.active - plan.active)
     if change_db > allowed_db:
         raise DataError(
-            f"effects that are not called for change the image by {change_db:.2f} dB, allowed are {allowed_db:.1f} dB; "
-            "do not trust these times"
+            f"omitted effects change the image by {change_db:.2f} dB; the limit is {allowed_db:.1f} dB. "
+            "Do not use these times"
         )
     say(f"timing {count} of each")
-    simulators = {"called for": Simulator(scene, plan=plan), "everything": Simulator(scene, plan=everything)}
+    simulators = {"relevant effects": Simulator(scene, plan=plan), "all effects": Simulator(scene, plan=everything)}
     for simulator in simulators.values():
         simulator.render()
         simulator.clock.cost_ms.clear()
@@ -131,7 +132,7 @@ def run(*, count: int, say: Callable[[str], None]) -> dict[str, Any]:
 
 
 def _change_db(scene: Scene, plan: EffectPlan, everything: EffectPlan) -> float:
-    """Return by how much the images of both plans differ."""
+    """Return the difference between the images of both plans in dB."""
     sensor = scene.sensors[0]
     pipeline = Pipeline(sensor.settings())
     images = [pipeline.process(Simulator(scene, plan=each).render()).amplitude for each in (plan, everything)]

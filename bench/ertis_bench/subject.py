@@ -17,9 +17,9 @@ _DISTRIBUTION = "rtisdev"
 
 
 def measurement() -> tuple[Measurement, str]:
-    """Return a measurement of the default preset with its description for the report.
+    """Return a measurement of the default preset, and its description for the report.
 
-    It comes from data/synthetic; where this package runs without the repository around it, it is noise.
+    It comes from data/synthetic, or is noise if this package runs outside of the repository.
     """
     if not _RECORDING.exists():
         return noise(Settings.from_preset("default_25_50")), "white noise, seed 1"
@@ -28,7 +28,7 @@ def measurement() -> tuple[Measurement, str]:
 
 
 def real() -> tuple[Measurement, str] | None:
-    """Return the only measurement of a room in the package rtisdev, with its description; None without the package.
+    """Return the measurement of a real room in the package rtisdev, and its description; None without the package.
 
     The package's code is not imported.
     """

@@ -1,4 +1,4 @@
-"""Reports as Markdown, and where they go."""
+"""Reports as Markdown, and their places in files."""
 
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
@@ -57,7 +57,7 @@ def update(path: Path, name: str, text: str) -> None:
     Raises
     ------
     ArgumentError
-        The file cannot be read, or the markers are not in it.
+        The file cannot be read, or does not contain the markers.
     """
     head, tail = around(path, name)
     path.write_text(f"{head}\n{text.strip()}\n{tail}", encoding="utf-8")
@@ -69,7 +69,7 @@ def around(path: Path, name: str) -> tuple[str, str]:
     Raises
     ------
     ArgumentError
-        As in `update`; so a file can be refused before anything is measured for it.
+        As in `update`. Callers can therefore refuse a file before they measure.
     """
     begin, end = f"<!-- ertis bench {name} -->", f"<!-- /ertis bench {name} -->"
     try:
@@ -84,9 +84,9 @@ def around(path: Path, name: str) -> tuple[str, str]:
 
 
 def place(path: Path, command: str, parts: Sequence[str] = ()) -> tuple[str, str]:
-    """Return the form of a command's table that a file has markers for, and the name in these markers.
+    """Return the form of a command's table for which a file has markers, and the name in these markers.
 
-    Some parts of a benchmark have markers of their own, ``ertis bench NAME --only PART``, so that they never replace
+    Selected parts of a benchmark have their own markers, ``ertis bench NAME --only PART``, so that they never replace
     the table of all parts.
 
     Raises
@@ -108,7 +108,7 @@ def paper(report: dict[str, Any]) -> str:
     """Return the times, the ratios and the paper's own times, with their conditions."""
     found = {(row["backend"], row["directions"]): row for row in report["rows"]}
     backends = list(dict.fromkeys(row["backend"] for row in report["rows"]))
-    measured = [[_MEANING[backend], *(_spread(**found[backend, n]) for n in DIRECTIONS)] for backend in backends]
+    measured = [[_MEANING[backend], *(_statistics(**found[backend, n]) for n in DIRECTIONS)] for backend in backends]
     ratios = [
         [
             f"`{backend}`",
@@ -154,7 +154,7 @@ def _conditions(report: dict[str, Any]) -> str:
 
 
 def accuracy(report: dict[str, Any]) -> str:
-    """Return all plans of each subject, and how they were measured."""
+    """Return all plans of each subject, and the conditions of the measurement."""
     head = [
         "error, dB",
         "predicted, dB",
@@ -184,7 +184,7 @@ def accuracy(report: dict[str, Any]) -> str:
 
 
 def accuracy_front(report: dict[str, Any]) -> str:
-    """Return the plans that no other one beats, and the paper's method."""
+    """Return the plans on the Pareto front, and the paper's method."""
     parts = []
     for name, rows, paper_ms in _subjects(report):
         cells = [
@@ -232,7 +232,7 @@ def scaling(report: dict[str, Any]) -> str:
     for row in report["rows"]:
         sums = "" if row["plan"] == "default" else f", no beam grid, {row['plan']}"
         name = row["series"].replace("_m", ", m").replace("_", " ") + sums
-        series.setdefault(name, []).append([f"{row['value']:g}", _spread(**row), f"{row['n_ranges']}"])
+        series.setdefault(name, []).append([f"{row['value']:g}", _statistics(**row), f"{row['n_ranges']}"])
     parts = [_table([name, "ms, mean ± std (median)", "ranges"], rows) for name, rows in series.items()]
     columns = {
         "threads": "threads",
@@ -250,7 +250,7 @@ def scaling(report: dict[str, Any]) -> str:
         f"{report['count']} measurements per line, device `cpu`, white noise, the lines of a table in turns of "
         f"{timing.BURST}. Other values are 1850 directions, 0.5–5 m, 32 microphones and all threads. Each line has "
         "the default plan for its settings. If a precision is named, every direction is summed without a beam grid, "
-        "with one sample per microphone. A batch is a number of measurements at a time, and its time is that of each. "
+        "with one sample per microphone. A batch contains several measurements, and the time is that of one of them. "
         "Every image was compared with the exact one before it was timed; "
         "warm-up calls of a fifth of a second are excluded. "
         "Limits are the best of as many runs, over arrays of 64 MiB and in "
@@ -260,10 +260,10 @@ def scaling(report: dict[str, Any]) -> str:
 
 
 def simulation(report: dict[str, Any]) -> str:
-    """Return the duration of a measurement with some effects and with all, and the cost of each effect."""
+    """Return the times of a measurement with the relevant effects and with all effects, and the cost of each effect."""
     needed, everything = report["rows"]
     rows = [
-        [row["effects"], f"{len(row['on'])}", _spread(**row), f"{1e3 / row['median_ms']:.1f}"]
+        [row["effects"], f"{len(row['on'])}", _statistics(**row), f"{1e3 / row['median_ms']:.1f}"]
         for row in (needed, everything)
     ]
     costs = [
@@ -282,7 +282,7 @@ def simulation(report: dict[str, Any]) -> str:
 
 
 def factorisation(report: dict[str, Any]) -> str:
-    """Return products per place: summed directly, from nodes of the whole array, and from those of its parts."""
+    """Return products per bin for direct sums, a beam grid of the whole array, and beam grids of its parts."""
     parts = list(report["rows"][0]["parts"])
     head = ["microphones", "directions", "no beam grid", "beam grid of the whole array"]
     head += [f"of {n} sub-arrays" for n in parts[1:]]
@@ -300,7 +300,7 @@ def _scene_conditions(report: dict[str, Any]) -> str:
         "microphones, ten points in free field, and in the same scene a second sensor, walls, a sphere, a disc, "
         "motion, tones, noise, another sonar and unequal microphones, all too weak to matter. Times include everything "
         "from the scene to the words in memory. They exclude the choice of the effects, compilation, and warm-up "
-        f"calls. The images of both differ by {report['change_db']:.2g} dB at the most. `propagation` counts "
+        f"calls. The images of both differ by at most {report['change_db']:.2g} dB. `propagation` counts "
         "the transforms that all echoes share."
     )
 
@@ -318,12 +318,12 @@ def _reached(
     return (
         f"Delay-and-sum with envelope in {precision} takes {us_per_direction:.2f} µs per direction (the slope over "
         f"directions; the rest of the chain takes {rest_of_chain_ms:.2f} ms). That is {gop_s:.0f} Gop/s, "
-        f"{100 * of_arithmetic:.0f} % of what the arithmetic alone does here. Its images are written at "
-        f"{written_gb_s:.2f} GB/s, {100 * of_copy:.0f} % of what a copy writes."
+        f"{100 * of_arithmetic:.0f} % of the rate of the arithmetic alone. Its images are written at "
+        f"{written_gb_s:.2f} GB/s, {100 * of_copy:.0f} % of the rate of a copy."
     )
 
 
-def _spread(*, mean_ms: float, std_ms: float, median_ms: float, **_: object) -> str:
+def _statistics(*, mean_ms: float, std_ms: float, median_ms: float, **_: object) -> str:
     return f"{mean_ms:.2f} ± {std_ms:.2f} ({median_ms:.2f})"
 
 
@@ -348,4 +348,4 @@ FORMS: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
     "budgets": {"budgets": budgets},
     "points": {"points": points},
 }
-"""What each command writes between which markers: a file chooses a form by the marker that it has."""
+"""Forms of the table of each command, by the name in the markers. The markers of a file select the form."""

@@ -1,4 +1,4 @@
-"""Time several things fairly."""
+"""Fair timing of several functions."""
 
 import gc
 import time
@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 
 __all__ = ["BURST", "round_robin", "summary"]
 
-_WARM_UP = 3  # calls at least …
-_WARM_UP_S = 0.2  # … and so long: after other work it takes a hundred short calls until threads lie on cores for good
-BURST = 100  # calls in a row, as in a stream
+_WARM_UP = 3  # minimum number of warm-up calls
+# Minimum time of warm-up calls. After other work, threads need about a hundred short calls to settle on cores.
+_WARM_UP_S = 0.2
+BURST = 100  # consecutive calls, as in a stream
 
 
 def round_robin(
@@ -19,8 +20,8 @@ def round_robin(
 ) -> dict[str, NDArray[np.float64]]:
     """Return the times of ``count`` calls of each subject in milliseconds: (call,) float64 each.
 
-    Subjects take turns of ``burst`` calls, so that whatever slows the machine for a while hits all of them. The
-    first calls of each turn are not counted, and the garbage collector is off.
+    Subjects take turns of ``burst`` calls, so that temporary slowdowns of the machine affect all of them. The first
+    calls of each turn are not counted, and the garbage collector is off.
     """
     times_ms: dict[str, list[float]] = {name: [] for name in subjects}
     collecting = gc.isenabled()

@@ -1,4 +1,4 @@
-"""Things that are tried one after the other, each in a folder of its own."""
+"""Sequential trials, each in its own folder."""
 
 import json
 import secrets
@@ -14,7 +14,7 @@ __all__ = ["Parts", "try_parts"]
 
 Extent = TypeVar("Extent")
 Parts = Mapping[str, tuple[str, Callable[[Extent, Path, int], Any]]]
-"""What to say of each, and how it is tried: with the extent, a folder and a seed."""
+"""Progress message of each trial, and its function of extent, folder and seed."""
 
 
 def try_parts(
@@ -27,23 +27,23 @@ def try_parts(
     only: Sequence[str],
     say_found: bool = False,
 ) -> dict[str, Any]:
-    """Try everything, or only some of the parts, and return the report.
+    """Run all trials, or only some of them, and return the report.
 
     Parameters
     ----------
     parts : mapping of str to (str, callable)
     extent : dataclass
-        How much is tried; what is said may name its fields.
+        Extent of the trials. Progress messages may refer to its fields.
     say : callable
-        Called with lines about what happens.
+        Called with a line of progress.
     long : bool
-        Noted in the report.
+        Stored in the report.
     seed : int, optional
-        Drawn by default.
+        Random by default.
     only : sequence of str
-        All if it is empty.
+        Names of trials; all trials if empty.
     say_found : bool
-        Whether what a part finds is said at once: hours later something else may end the program.
+        If True, log the result of each trial at once, so that it survives if the program ends hours later.
     """
     seed = secrets.randbits(31) if seed is None else seed
     say(f"seed {seed}")
@@ -52,7 +52,7 @@ def try_parts(
         if only and name not in only:
             continue
         say(about.format(**asdict(extent)))
-        # An error of a part is not to be hidden by that of clearing up after it.
+        # An error while removing the folder must not hide an error of the trial.
         with tempfile.TemporaryDirectory(prefix="ertis-", ignore_cleanup_errors=True) as folder:
             report[name] = part(extent, Path(folder), seed)
         if say_found:

@@ -1,4 +1,4 @@
-"""Verdicts on effects, tried on random scenes: each effect put in and left out, and the images compared."""
+"""Trials of verdicts on effects with random scenes. Images with and without each effect are compared."""
 
 import dataclasses
 import functools
@@ -24,7 +24,7 @@ from ertis_numba.stages.fast import FastChain
 
 __all__ = ["Trial", "run", "with_one"]
 
-_SURE = 300  # times the noise of modulators: it changes such a reflector by less than 0.03 dB
+_MIN_LEVEL_TO_NOISE = 300  # Relative to the noise of modulators, which changes such a reflector by less than 0.03 dB.
 _PLAN = Accuracy(
     precision="float32",
     oversampling=4,
@@ -37,21 +37,22 @@ _PLAN = Accuracy(
 
 
 def run(*, count: int, say: Callable[[str], None], first: int = 0) -> dict[str, Any]:
-    """Try the verdicts on some random scenes.
+    """Check the verdicts on some random scenes.
 
     Parameters
     ----------
     count : int
-        Scenes.
+        Number of scenes.
     say : callable
-        Called with what is under way.
+        Called with a line of progress.
     first : int
         Seed of the first scene.
 
     Returns
     -------
     dict
-        Number of verdicts, and those effects that were left out and change an image by more than the tolerance.
+        Numbers of scenes, verdicts and A/B renders, and the omitted effects that change an image by more than the
+        tolerance.
     """
     tried, rendered, wrong = 0, 0, []
     for seed in range(first, first + count):
@@ -74,22 +75,22 @@ def with_one(plan: EffectPlan, name: str, *, on: bool) -> EffectPlan:
 
 
 class Trial:
-    """Compares images of one measurement of a scene with different effects.
+    """Comparison of images of one measurement of a scene with different effects.
 
     Parameters
     ----------
     scene : Scene
     index : int
-        Of the measurement.
+        Index of the measurement.
     """
 
     def __init__(self, scene: Scene, index: int = 0) -> None:
         self.scene, self.index = scene, index
-        self._signals = functools.lru_cache(maxsize=8)(self._rendered)
-        self._image = functools.lru_cache(maxsize=8)(self._imaged)
+        self._signals = functools.lru_cache(maxsize=8)(self._render_signals)
+        self._image = functools.lru_cache(maxsize=8)(self._render_image)
 
     def left_out(self, plan: EffectPlan) -> list[dict[str, Any]]:
-        """Return by how much each effect that the plan leaves out changes the images."""
+        """Return the change of the images in dB by each effect that the plan omits."""
         return [
             {
                 "effect": verdict.name,
@@ -103,7 +104,10 @@ class Trial:
         ]
 
     def total_change_db(self, plan: EffectPlan, name: str) -> float:
-        """Return by how much an effect changes the images, those from loud signals as words."""
+        """Return the change of the images by an effect in dB.
+
+        Images of loud signals are also compared after modulation.
+        """
         changed_db = self.change_db(plan, name)
         other = with_one(plan, name, on=name not in plan.active)
         if max(self.loudest(each) for each in (plan, other)) < LOUD:
@@ -115,7 +119,7 @@ class Trial:
         return max(float(np.abs(self._signals(sensor.name, plan)).max()) for sensor in self.scene.sensors)
 
     def change_db(self, plan: EffectPlan, name: str) -> float:
-        """Return by how much an effect changes images before modulators, which add other noise each time."""
+        """Return the change of images in dB by an effect before modulators, whose noise differs in each render."""
         other = with_one(plan, name, on=name not in plan.active)
         changes_db = []
         for sensor in self.scene.sensors:
@@ -127,13 +131,13 @@ class Trial:
         return max(changes_db)
 
     def reflector_change_db(self, sensor: Sensor, one: EffectPlan, other: EffectPlan) -> float:
-        """Return by how much the levels of reflectors far above the noise differ in images from words.
+        """Return the change of the levels in dB of reflectors far above the noise, in images from words.
 
-        What another draw of the noise changes as much is no difference.
+        A change that another realisation of the noise also causes is subtracted.
         """
         pipeline = Pipeline(sensor.settings())
         shown = Sight(self._shot(sensor), one.active)
-        sure = shown.shown & (shown.levels(shown.heard) > _SURE * shown.noise)
+        sure = shown.shown & (shown.levels(shown.heard) > _MIN_LEVEL_TO_NOISE * shown.noise)
         ranges_m = shown.heard.delay_s[sure] * shown.shot.speed_m_s / 2
 
         def levels_db(seed: int, plan: EffectPlan) -> NDArray[np.float64]:
@@ -150,14 +154,14 @@ class Trial:
     def _shot(self, sensor: Sensor) -> Snapshot:
         return snapshot(self.scene, sensor, self.index / self.scene.rate_hz)
 
-    def _rendered(self, name: str, plan: EffectPlan) -> NDArray[np.float64]:
+    def _render_signals(self, name: str, plan: EffectPlan) -> NDArray[np.float64]:
         signals = Simulator(self.scene, sensor=name, plan=plan).signals(self.index)
         dbfs = self.scene.sensor(name).electronics.noise_dbfs
         if "microphone_noise" in plan.active and dbfs is not None:
             signals += 10 ** (dbfs / 20) * _white_noise(self.scene.seed, signals.shape)
         return signals
 
-    def _imaged(self, name: str, plan: EffectPlan) -> NDArray[np.float32]:
+    def _render_image(self, name: str, plan: EffectPlan) -> NDArray[np.float32]:
         chain = _chain(self.scene.sensor(name).settings())
         image = np.empty((len(chain.grid), len(chain.range_m)), dtype=np.float32)
         chain.process_signals(self._signals(name, plan), image)

@@ -1,4 +1,4 @@
-"""`ertis process --verify` against a slow referee, over random settings of every kind."""
+"""Comparison of `ertis process --verify` with a slow reference, over random settings of every kind."""
 
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -19,9 +19,9 @@ from ertis_numba.settings import Settings
 __all__ = ["MAX_DIFFERENCE_DB", "compared", "form", "run"]
 
 MAX_DIFFERENCE_DB = 1.0
-"""Largest difference of verified and true errors that is not reported as wrong."""
+"""Largest difference between verified and true errors that is not reported as wrong."""
 
-_FLOOR_DB = -100.0  # below, single precision is most of the error
+_FLOOR_DB = -100.0  # Below this level, rounding in single precision dominates the error.
 _SHORT_CALL_S = 5e-4
 
 _GROUPS: dict[str, Callable[[Settings], bool]] = {
@@ -46,9 +46,9 @@ def run(*, count: int, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
     ----------
     count : int
     seed : int
-        Seed of the first setting; the others have the seeds after it.
+        Seed of the first setting. Later settings use the following seeds.
     say : callable
-        Called with lines about what happens.
+        Called with a line of progress.
     """
     rows = []
     for each in range(seed, seed + count):
@@ -78,17 +78,17 @@ def compared(seed: int) -> dict[str, Any]:
 
 def form(report: dict[str, Any]) -> str:
     """Return the report as Markdown."""
-    header = ["settings", "tried", "errors above -100 dB", "more than 1 dB off", "largest difference"]
+    header = ["settings", "tried", "errors above -100 dB", "more than 1 dB apart", "largest difference"]
     lines = list(_lines(report["rows"]))
     return (
-        f"{table(header, lines)}\n\n{report['count']} random settings from seed {report['seed']}. Verified: by "
-        "`--verify`. True: by a float64 referee that sums bin by bin, in all directions and ranges. "
+        f"{table(header, lines)}\n\n{report['count']} random settings from seed {report['seed']}. Verified errors "
+        "come from `--verify`. True errors come from a separate float64 reference, in all directions and ranges. "
         f"{sentence(report['machine'])}"
     )
 
 
 def _image(measurement: Measurement) -> Energyscape:
-    """Return the image by the plan for the drawn budget, or by the best plan for any error where none keeps it."""
+    """Return the image with the plan for the drawn budget, or with the most accurate plan if none keeps the budget."""
     try:
         pipeline = Pipeline(measurement.settings, "cpu", 1)
     except ArgumentError:

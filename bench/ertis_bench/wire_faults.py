@@ -1,4 +1,4 @@
-"""Blocks on a line with faults, and the receiver's results."""
+"""Simulated line with faults between blocks and a receiver, and the receiver's results."""
 
 import zlib
 from collections import Counter
@@ -27,13 +27,13 @@ KINDS: Final[dict[str, float]] = {
     "unplug": 0.01,
     "short_reads": True,
 }
-"""Faults on about half of all blocks."""
+"""Probabilities of faults, which affect about half of all blocks."""
 
-_SHORTEST_S: Final = 0.04  # between two triggers
+_MIN_INTERVAL_S: Final = 0.04  # shortest time between two triggers
 _INTERVAL_S: Final = 0.05
-_BYTES_PER_S: Final = 1e6  # at least; a block takes …
-_BLOCK_S: Final = 0.02  # … so long at most
-_KEPT: Final = 64  # emissions, as long as something of them may still be in the receiver
+_BYTES_PER_S: Final = 1e6  # lower limit; large blocks are sent faster
+_BLOCK_S: Final = 0.02  # longest duration of a block
+_MAX_REMEMBERED: Final = 64  # Number of recent blocks whose bytes may still be in the receiver.
 
 
 @dataclass(slots=True)
@@ -43,26 +43,26 @@ class BlockReport:
     Attributes
     ----------
     sent, spoilt, untouched : int
-        All blocks; those that something was done to; those whose bytes came as they were, stalled or not.
+        All blocks; blocks with a fault; and blocks whose bytes arrived unchanged, even if stalled.
     delivered : int
-        With their own number and words.
+        Blocks that were delivered with their own number and words.
     untouched_lost : int
-        Untouched and not delivered.
+        Untouched blocks that were not delivered.
     mixed : int
-        Accepted, but of pieces of several blocks, or displaced.
+        Accepted blocks that consist of pieces of several blocks, or are displaced.
     wrong_counter : int
-        Accepted under a number that is not theirs.
+        Blocks that were accepted with a wrong number.
     twice : int
-        Accepted again.
+        Blocks that were accepted again.
     altered : int
-        Accepted under their number with words of their own, but not all as they were sent: flipped in place, or as many
-        bytes lost as were added. Nothing in the frame tells; the check of the bits may.
+        Blocks that were accepted with their number and changed words. Bits were flipped, or as many bytes were lost as
+        were added. The frame cannot reveal such faults, but the check of the bits may.
     lost, pending : int
-        As the receiver counts them; ``pending`` with the bytes of what it holds.
+        Counts of the receiver. ``pending`` includes the bytes of blocks that it holds.
     fed : int
-        Bytes that it was given.
+        Bytes that the receiver was given.
     rejected, rejected_blocks : Counter of str
-        As the receiver counts them.
+        Counts of the receiver, by reason.
     """
 
     sent: int = 0
@@ -84,13 +84,13 @@ class BlockReport:
 @dataclass(slots=True)
 class _Sent:
     crc32: int
-    data: bytes  # as it was sent
+    data: bytes  # as sent, including faults
     untouched: bool
     delivered: bool = False
 
 
 class Wire:
-    """Triggers, a line with faults, and a receiver whose blocks are compared with those that were sent.
+    """Triggers, a line with faults, and a receiver. Received blocks are compared with the sent ones.
 
     Parameters are those of `send`.
     """
@@ -107,7 +107,7 @@ class Wire:
         seed: int = 0,
     ) -> None:
         self.report = BlockReport()
-        self._receiver = BlockReceiver(n_samples, expected=counter, shortest_s=_SHORTEST_S, bits=bits)
+        self._receiver = BlockReceiver(n_samples, expected=counter, shortest_s=_MIN_INTERVAL_S, bits=bits)
         self._faults, self._triggers, self._deadline_s = faults, triggers, deadline_s
         self._random = np.random.default_rng(seed)
         self._counter = counter
@@ -121,23 +121,23 @@ class Wire:
         counter, self._counter = self._counter, (self._counter + 1) % COUNTERS
         block = encode_block(counter, words)
         spoilt = self._faults.spoil(block)
-        self._note(counter, block, spoilt)
+        self._register(counter, block, spoilt)
         for piece in spoilt.pieces:
             if isinstance(piece, Stall):
                 self._now_s += piece.duration_s
             elif isinstance(piece, Unplug):
-                self._take(self._receiver.finish())
+                self._compare(self._receiver.finish())
                 self._receiver.expect(self._counter)
             else:
                 at_ns = round(self._now_s * 1e9) if self._triggers != "at once" else 0
                 self.report.fed += len(piece)
-                self._take(self._receiver.feed(piece, Instant(at_ns, at_ns, 0)))
+                self._compare(self._receiver.feed(piece, Instant(at_ns, at_ns, 0)))
                 self._now_s += len(piece) / self._bytes_per_s
 
     def finish(self) -> BlockReport:
-        """Return the results for all blocks; nothing is sent any more."""
+        """End the transmission, and return the results for all blocks."""
         receiver, report = self._receiver, self.report
-        self._take(receiver.finish())
+        self._compare(receiver.finish())
         report.pending = receiver.pending + receiver.held * receiver.n_bytes
         report.lost, report.rejected, report.rejected_blocks = (
             receiver.lost,
@@ -149,23 +149,23 @@ class Wire:
         return report
 
     def _wait(self) -> None:
-        """Let time pass until the next trigger, and a deadline with it."""
+        """Advance the time to the next trigger. If the deadline passes meanwhile, let the receiver expire."""
         interval_s = _INTERVAL_S
         if self._triggers == "irregular":
-            interval_s = _SHORTEST_S + float(self._random.exponential(_INTERVAL_S))
+            interval_s = _MIN_INTERVAL_S + float(self._random.exponential(_INTERVAL_S))
         self._trigger_s = max(self._trigger_s + interval_s, self._now_s)
         if self._deadline_s is not None and self._trigger_s - self._now_s > self._deadline_s:
             while self._receiver.missing:
-                self._take(self._receiver.expire())
+                self._compare(self._receiver.expire())
         self._now_s = self._trigger_s
 
-    def _note(self, counter: int, block: bytes, spoilt: Spoilt) -> None:
+    def _register(self, counter: int, block: bytes, spoilt: Spoilt) -> None:
         data, report = spoilt.data, self.report
         self._sent[counter] = _Sent(zlib.crc32(block[8:-4]), data, untouched=data == block)
         report.sent += 1
         report.spoilt += bool(spoilt.faults)
         report.untouched += data == block
-        if len(self._sent) > _KEPT:
+        if len(self._sent) > _MAX_REMEMBERED:
             self._forget(next(iter(self._sent)))
 
     def _forget(self, counter: int) -> None:
@@ -173,7 +173,7 @@ class Wire:
         self.report.delivered += sent.delivered
         self.report.untouched_lost += sent.untouched and not sent.delivered
 
-    def _take(self, blocks: list[Block]) -> None:
+    def _compare(self, blocks: list[Block]) -> None:
         """Compare accepted blocks with the sent ones."""
         report = self.report
         for block in blocks:
@@ -208,19 +208,19 @@ def send(
     Parameters
     ----------
     n_blocks : int
-        The counter runs over its end half-way.
+        Number of blocks. The counter wraps around half-way.
     seed : int
     n_samples : int
         Words of a block.
     words : (sample,) uint32, optional
-        Of which each block has a stretch from a random place; random words by default.
+        Words from which each block uses a random section. By default, blocks contain random words.
     kinds : mapping of str to float
-        As `Faults` takes them.
+        Probabilities, as for `Faults`.
     triggers : {"regular", "irregular", "at once"}
-        Every 50 ms; 40 ms apart and 50 ms more on average; all bytes without a moment between them, so that time tells
-        nothing.
+        ``regular`` triggers every 50 ms. ``irregular`` triggers with a pause of 40 ms, and 50 ms more on average. ``at
+        once`` sends all bytes without pauses, so that their times contain no information.
     deadline_s : float, optional
-        Silence after which what has begun is given up; never by default.
+        Silence after which the receiver gives an incomplete block up. By default, it never does.
     bits : callable, optional
         The receiver's check of the bits.
     progress : callable, optional
@@ -228,7 +228,7 @@ def send(
 
     Returns
     -------
-    Report
+    BlockReport
     """
     random = np.random.default_rng(seed)
     wire = Wire(

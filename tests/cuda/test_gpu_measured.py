@@ -90,7 +90,7 @@ def test_rival_images_are_compared_before_timing(monkeypatch):
     good, bad, missing = gpu_parts.side_by_side(SCALE)
     assert good["off_db"] < -100
     assert good["times_faster"] == pytest.approx(good["theirs_ms"] / good["ours_ms"], rel=0.1, abs=0.01)
-    assert bad["status"].startswith("failed: image of Louder is -40.0 dB off this package's; the limit is -100 dB")
+    assert bad["status"].startswith("failed: image of Louder differs from this package's by -40.0 dB; the limit is")
     assert missing == {"library": "Missing", "directions": "2d:2", "status": "not installed"}
 
 
@@ -102,12 +102,12 @@ def test_gpu_benchmark_refuses_to_time_a_wrong_image(monkeypatch):
         return image.replace(amplitude=1.001 * image.amplitude) if self.device == "cuda" else image
 
     monkeypatch.setattr(Pipeline, "process", louder)
-    with pytest.raises(DataError, match=r"on 'cuda' is -60.0 dB off that on 'cpu'; the limit is -100 dB"):
+    with pytest.raises(DataError, match=r"on 'cuda' differs from that on 'cpu' by -60.0 dB; the limit is -100 dB"):
         next(gpu_parts.paper(SCALE))
 
 
 def test_gpu_benchmark_refuses_the_simulator():
     if not SIMULATED:
         pytest.skip("a GPU is not refused")
-    with pytest.raises(DeviceError, match="device 'cuda' is simulated here, and its times tell nothing"):
+    with pytest.raises(DeviceError, match="device 'cuda' is simulated here, so its times are meaningless"):
         next(gpu_parts.machine(SCALE))

@@ -69,7 +69,7 @@ def test_resident_warps_are_computed(registers, warps_per_block, wanted):
 def test_gpu_documentation_matches_the_compiled_code(report):
     head, tail = tables.around(DOCS, "ptx")
     published = DOCS.read_text("utf-8").removeprefix(head).removesuffix(tail)
-    (made,) = re.findall(r"^Counted in code for compute capability 9\.0 \((.+)\)\.", published, re.MULTILINE)
+    (made,) = re.findall(r"^Counts are from code for compute capability 9\.0 \((.+)\)\.", published, re.MULTILINE)
     here = ", ".join(f"{name} {number}" for name, number in report["compiled"].items())
     if made != here:
         pytest.skip(f"other compilers make other code: the page is of {made}, and here are {here}")

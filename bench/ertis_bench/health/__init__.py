@@ -1,4 +1,4 @@
-"""Campaign of the health checks: healthy arrays of all kinds, and every kind of fault."""
+"""Trials of the health checks with healthy arrays of many kinds, and with every kind of fault."""
 
 from ertis_bench.health.campaign import run
 

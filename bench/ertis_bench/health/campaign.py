@@ -1,4 +1,4 @@
-"""The campaign: false alarms in healthy arrays, and faults that are named."""
+"""Trials of the health checks: false alarms in healthy arrays, and the share of injected faults that are named."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -13,18 +13,18 @@ from ertis_numba.analysis.health import Health, health
 __all__ = ["MIN_SHARE", "false_alarms", "named", "run"]
 
 MIN_SHARE = 0.95
-"""Of trials in which an observable fault must be named."""
+"""Smallest share of trials in which an observable fault must be named."""
 _SHORT, _LONG = (40, 1), (1000, 30)
 
 
 def false_alarms(seed: int) -> tuple[str, dict[str, tuple[int, ...]]]:
-    """Return the scene of a healthy array, and the faults that are named nevertheless."""
+    """Return the scene of a healthy array, and the faults that the checks report by mistake."""
     scene, measurement = healthy(seed)
     return scene, health(measurement).faults
 
 
 def named(name: str, seed: int) -> tuple[bool, Health]:
-    """Return whether one trial of a fault names it on its channels, and the report."""
+    """Run one trial of a fault. Return True if the report names it on its channels, and the report."""
     fault = FAULTS[name]
     is_pdm = fault.encodings[seed % len(fault.encodings)]
     rng = np.random.default_rng((seed, list(FAULTS).index(name)))
@@ -44,7 +44,7 @@ def _is_named(fault: ArrayFault, channels: tuple[int, ...], report: Health) -> b
 
 
 def run(*, long: bool, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
-    """Return the counts."""
+    """Return the counts of all trials."""
     n_healthy, trials = _LONG if long else _SHORT
     alarms: list[dict[str, Any]] = []
     scenes: Counter[str] = Counter()
@@ -57,7 +57,7 @@ def run(*, long: bool, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
             alarms.append({"seed": seed + number, "scene": scene, "faults": faults})
     rows = []
     counts = dict.fromkeys(FAULTS, 0)
-    for trial in range(trials):  # the recordings of a trial serve every fault
+    for trial in range(trials):  # All faults of a trial use the same recordings.
         say(f"faults: trial {trial + 1} of {trials}")
         for name in FAULTS:
             counts[name] += named(name, seed + trial)[0]

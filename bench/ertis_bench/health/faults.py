@@ -1,4 +1,4 @@
-"""Table of faults: how each is put into a healthy recording, and the scene in which a single recording shows it."""
+"""Table of faults, with the injection of each into a healthy recording, and the scene in which a recording shows it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -24,22 +24,22 @@ _Change = Callable[[NDArray[Any], np.random.Generator], NDArray[Any]]
 
 @dataclass(frozen=True, slots=True)
 class ArrayFault:
-    """A fault that can be put into a recording.
+    """Fault that can be injected into a recording.
 
     Attributes
     ----------
     inject : callable
-        Returns new words and the faulty channels; none where the whole record is faulty.
+        Returns new words and the faulty channels. The channels are empty if the whole record is faulty.
     names : tuple of str
-        Faults of the report that count as named.
+        Faults of the report that count as correct.
     scene : str
-        ``one echo`` or ``direct sound``; the scene that shows it best.
+        ``one echo`` or ``direct sound``, the scene that shows the fault best.
     observable : bool
-        A single recording of that scene shows it.
+        True if a single recording of that scene shows the fault.
     why : str
-        Reason, or the condition.
+        Condition, or the reason why the fault is not observable.
     encodings : tuple of bool
-        PDM or not.
+        True for PDM, False for PCM.
     """
 
     inject: Callable[[Base, np.random.Generator], _Injected]
@@ -62,8 +62,8 @@ def _column(base: Base, channel: int) -> NDArray[Any]:
     return words[:, channel].copy()
 
 
-def _with(base: Base, columns: dict[int, NDArray[Any]], words: NDArray[Any] | None = None) -> NDArray[Any]:
-    """Return the words with other samples in some channels."""
+def _with_channels(base: Base, columns: dict[int, NDArray[Any]], words: NDArray[Any] | None = None) -> NDArray[Any]:
+    """Return a copy of the words with other samples in some channels."""
     words = (base.measurement.data if words is None else words).copy()
     for channel, column in columns.items():
         if base.sensor.recording.is_pdm:
@@ -75,7 +75,7 @@ def _with(base: Base, columns: dict[int, NDArray[Any]], words: NDArray[Any] | No
 
 
 def _converted(base: Base, signal: NDArray[np.float64], rng: np.random.Generator) -> NDArray[Any]:
-    """Return the samples that one microphone makes of a signal."""
+    """Return the samples that one microphone produces for a signal."""
     electronics, recording = base.sensor.electronics, base.sensor.recording
     rms = 10 ** ((electronics.noise_dbfs or -300.0) / 20)
     if not recording.is_pdm:
@@ -92,38 +92,38 @@ def _converted(base: Base, signal: NDArray[np.float64], rng: np.random.Generator
 
 
 def _signal(change: Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]) -> _Injection:
-    """Return the injection that changes the signal of one channel, a function of signal and time."""
+    """Return an injection that changes the signal of one channel, by a function of signal and time."""
 
     def inject(base: Base, rng: np.random.Generator) -> _Injected:
         channel = int(rng.integers(len(base.signals)))
         time_s = np.arange(base.signals.shape[1]) / base.sensor.recording.sample_rate_hz
-        return _with(base, {channel: _converted(base, change(base.signals[channel], time_s), rng)}), (channel,)
+        return _with_channels(base, {channel: _converted(base, change(base.signals[channel], time_s), rng)}), (channel,)
 
     return inject
 
 
 def _samples(change: _Change) -> _Injection:
-    """Return the injection that changes the samples of one channel."""
+    """Return an injection that changes the samples of one channel."""
 
     def inject(base: Base, rng: np.random.Generator) -> _Injected:
         channel = int(rng.integers(len(base.signals)))
-        return _with(base, {channel: change(_column(base, channel), rng)}), (channel,)
+        return _with_channels(base, {channel: change(_column(base, channel), rng)}), (channel,)
 
     return inject
 
 
 def _ordered(source: NDArray[np.intp]) -> _Injection:
-    """Return the injection that gives each channel the samples of another."""
+    """Return an injection that permutes the channels."""
 
     def inject(base: Base, _: np.random.Generator) -> _Injected:
         columns = {to: _column(base, int(origin)) for to, origin in enumerate(source) if to != origin}
-        return _with(base, columns), ()
+        return _with_channels(base, columns), ()
 
     return inject
 
 
 def _rows(change: _Change) -> _Injection:
-    """Return the injection that changes all words alike."""
+    """Return an injection that changes all words."""
 
     def inject(base: Base, rng: np.random.Generator) -> _Injected:
         return change(base.measurement.data, rng), ()
@@ -165,7 +165,7 @@ def _noisier(more_db: float) -> _Injection:
         louder = base.sensor.electronics.replace(noise_dbfs=min((base.sensor.electronics.noise_dbfs or 0) + more_db, 0))
         noisy = replace(base, sensor=base.sensor.replace(electronics=louder))
         channel = int(rng.integers(len(base.signals)))
-        return _with(base, {channel: _converted(noisy, base.signals[channel], rng)}), (channel,)
+        return _with_channels(base, {channel: _converted(noisy, base.signals[channel], rng)}), (channel,)
 
     return inject
 
@@ -176,7 +176,7 @@ def _amplified(gain_db: float) -> _Injection:
         other = replace(base, sensor=base.sensor.replace(electronics=quieter))
         channel = int(rng.integers(len(base.signals)))
         signal = 10 ** (gain_db / 20) * base.signals[channel]
-        return _with(base, {channel: _converted(other, signal, rng)}), (channel,)
+        return _with_channels(base, {channel: _converted(other, signal, rng)}), (channel,)
 
     return inject
 
@@ -189,23 +189,27 @@ def _late(delay_s: float) -> _Injection:
 
 
 def _swapped(*, apart: bool) -> _Injection:
-    """Return the injection that swaps two microphones whose delays differ by more than microphones may, or by less."""
+    """Return an injection that swaps two microphones.
+
+    Their delays differ by more than the tolerance between microphones if ``apart``, otherwise by as little as possible.
+    """
 
     def inject(base: Base, rng: np.random.Generator) -> _Injected:
         delay_s = base.echo_s()
         one = int(rng.integers(len(delay_s)))
         differ_s = np.abs(delay_s - delay_s[one])
         fitting = np.flatnonzero(differ_s > _APART_S) if apart else np.argsort(differ_s)[1:2]
-        if not len(fitting):  # in the middle of the array: the one at its end is far from it
+        # A microphone in the middle of the array may have no partner. The farthest microphone replaces it.
+        if not len(fitting):
             fitting = np.argsort(differ_s)[-1:]
         other = int(rng.choice(fitting))
-        return _with(base, {one: _column(base, other), other: _column(base, one)}), (one, other)
+        return _with_channels(base, {one: _column(base, other), other: _column(base, one)}), (one, other)
 
     return inject
 
 
 def _of_layout(base: Base, rng: np.random.Generator) -> _Injected:
-    """Return the channels of an eRTIS_v2 in the order of an eRTIS_v3D1, or the other way round."""
+    """Return the channels of an eRTIS_v2 in the order of an eRTIS_v3D1, or vice versa."""
     names = ("eRTIS_v2", "eRTIS_v3D1")
     own = base.sensor.array.layout
     other = names[1 - names.index(own)]
@@ -234,17 +238,17 @@ def _shifted(base: Base, rng: np.random.Generator) -> _Injected:
 
 def _crosstalk(base: Base, rng: np.random.Generator) -> _Injected:
     one, other = (int(channel) for channel in rng.choice(len(base.signals), 2, replace=False))
-    return _with(base, {one: _converted(base, base.signals[one] + 0.5 * base.signals[other], rng)}), (one,)
+    return _with_channels(base, {one: _converted(base, base.signals[one] + 0.5 * base.signals[other], rng)}), (one,)
 
 
 def _copied(base: Base, rng: np.random.Generator) -> _Injected:
     one, other = (int(channel) for channel in rng.choice(len(base.signals), 2, replace=False))
-    return _with(base, {one: _column(base, other)}), (one, other)
+    return _with_channels(base, {one: _column(base, other)}), (one, other)
 
 
 def _half_missing(base: Base, _: np.random.Generator) -> _Injected:
     silent = np.zeros(len(base.measurement.data), np.uint8)
-    return _with(base, dict.fromkeys(range(16), silent)), tuple(range(16))
+    return _with_channels(base, dict.fromkeys(range(16), silent)), tuple(range(16))
 
 
 def _inverted(x: NDArray[Any], _: np.random.Generator) -> NDArray[Any]:
@@ -255,7 +259,7 @@ def _alternating(x: NDArray[Any], _: np.random.Generator) -> NDArray[Any]:
     return (np.arange(len(x)) % 2).astype(x.dtype)
 
 
-_ECHO = "a compact arrival from aside"
+_ECHO = "a compact arrival from the side"
 _BITS = (True,)
 _TWISTED = np.arange(32).reshape(4, 8)
 
@@ -267,17 +271,20 @@ FAULTS = {
     "intermittent contact": ArrayFault(_samples(_intermittent), ("stuck at times",)),
     "white bits, unconnected": ArrayFault(_samples(_white), ("white bits", "noisy")),
     "noise +20 dB": ArrayFault(_noisier(20.0), ("noisy", "white bits", "flipped bits")),
-    "noise +10 dB": ArrayFault(_noisier(10.0), ("noisy",), why="where microphones' noise, not echoes, is the floor"),
-    "gain +10 dB": ArrayFault(_amplified(10.0), ("gain",), why="sound that stands out of the noise by 9 dB"),
-    "gain -10 dB": ArrayFault(_amplified(-10.0), ("gain", "dead"), why="sound that stands out of the noise by 9 dB"),
-    "gain +6 dB": ArrayFault(_amplified(6.0), ("gain",), why="an echo; gains that spread by 0.5 dB"),
-    "gain -6 dB": ArrayFault(_amplified(-6.0), ("gain",), why="an echo; gains that spread by 0.5 dB"),
+    "noise +10 dB": ArrayFault(_noisier(10.0), ("noisy",), why="a noise floor of the microphones, not of echoes"),
+    "gain +10 dB": ArrayFault(_amplified(10.0), ("gain",), why="a sound at least 9 dB above the noise"),
+    "gain -10 dB": ArrayFault(_amplified(-10.0), ("gain", "dead"), why="a sound at least 9 dB above the noise"),
+    "gain +6 dB": ArrayFault(_amplified(6.0), ("gain",), why="an echo, and a gain spread of 0.5 dB"),
+    "gain -6 dB": ArrayFault(_amplified(-6.0), ("gain",), why="an echo, and a gain spread of 0.5 dB"),
     "inverted polarity": ArrayFault(_samples(_inverted), ("inverted polarity",), why="a compact arrival"),
     "two channels swapped": ArrayFault(
-        _swapped(apart=True), ("swapped",), why="an echo that reaches them 25 µs apart or more"
+        _swapped(apart=True), ("swapped",), why="an echo that reaches both at least 25 µs apart"
     ),
     "two channels swapped of nearly equal delay": ArrayFault(
-        _swapped(apart=False), ("swapped",), observable=False, why="delays differ by less than microphones may"
+        _swapped(apart=False),
+        ("swapped",),
+        observable=False,
+        why="the delay difference is below the tolerance of microphones",
     ),
     "order reversed": ArrayFault(_ordered(np.arange(32)[::-1]), ("order of channels",), why=_ECHO),
     "bits reversed in each byte": ArrayFault(_ordered(_TWISTED[:, ::-1].ravel()), ("order of channels",), why=_ECHO),
@@ -293,7 +300,10 @@ FAULTS = {
     ),
     "repeated block": ArrayFault(_rows(_repeated), ("repeated blocks",)),
     "50 words dropped": ArrayFault(
-        _rows(_dropped), ("shifted record",), observable=False, why="all channels alike; echoes merely come sooner"
+        _rows(_dropped),
+        ("shifted record",),
+        observable=False,
+        why="all channels are equal, and echoes only arrive earlier",
     ),
     "shifted by 1.1 ms": ArrayFault(_shifted, ("shifted record",), scene="direct sound", why="a direct sound"),
     "overload": ArrayFault(_signal(lambda x, t: x + 1.5 * np.sin(2.5e5 * t) * (t < 4e-3)), ("saturated",)),
@@ -303,16 +313,16 @@ FAULTS = {
     "half of the channels missing": ArrayFault(_half_missing, ("stuck at",)),
     "late by 50 µs": ArrayFault(_late(50e-6), ("late",), why="a compact arrival"),
     "late by 1 sample of PDM": ArrayFault(
-        _late(1 / 4.5e6), ("late",), observable=False, why="0.2 µs, less than microphones differ"
+        _late(1 / 4.5e6), ("late",), observable=False, why="0.2 µs, below the tolerance of microphones"
     ),
     "late by 10 samples of PDM": ArrayFault(
-        _late(10 / 4.5e6), ("late",), observable=False, why="2.2 µs, less than microphones differ"
+        _late(10 / 4.5e6), ("late",), observable=False, why="2.2 µs, below the tolerance of microphones"
     ),
     "bytes of numbers swapped": ArrayFault(
         _rows(lambda w, _: w.byteswap()), ("order of bytes",), encodings=(False,), why="any scene of 16-bit numbers"
     ),
     "crosstalk of -6 dB": ArrayFault(
-        _crosstalk, ("late", "gain"), observable=False, why="a sound of two arrivals looks the same"
+        _crosstalk, ("late", "gain"), observable=False, why="not distinguishable from a sound with two arrivals"
     ),
 }
-"""Every kind of fault by its name."""
+"""All kinds of faults by name."""

@@ -1,4 +1,4 @@
-"""Random healthy arrays and scenes, and the recordings that faults are put into."""
+"""Random healthy arrays and scenes, and the recordings into which faults are injected."""
 
 import functools
 import math
@@ -29,13 +29,13 @@ _CALLS = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Base:
-    """A healthy recording into which faults are put.
+    """Healthy recording into which faults are injected.
 
     Attributes
     ----------
     measurement : Measurement
     signals : (mic, sample) float64
-        Before converters and modulators, without their noise.
+        Signals before converters and modulators, without their noise.
     sensor : Sensor
     scene : Scene
     """
@@ -46,7 +46,7 @@ class Base:
     scene: Scene
 
     def echo_s(self) -> NDArray[np.float64]:
-        """Return the delay of the echo at each microphone, from that at the centre: (mic,) float64."""
+        """Return the delay of the echo at each microphone, relative to the centre of the array: (mic,) float64."""
         point = self.scene.points[0]
         azimuth, elevation = math.radians(point.azimuth_deg or 0.0), math.radians(point.elevation_deg or 0.0)
         unit = (math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation))
@@ -54,7 +54,7 @@ class Base:
 
 
 def _array(rng: np.random.Generator, n_mics: int) -> Array:
-    """Return microphones on a line, on a ring, or anywhere in a box, 4 mm apart in the mean."""
+    """Return microphones on a line, on a ring or in a box, with a mean spacing of 4 mm."""
     names = layout_names()
     if rng.random() < 0.5:
         return Array(layout=str(rng.choice(names)))
@@ -72,7 +72,7 @@ def _array(rng: np.random.Generator, n_mics: int) -> Array:
 
 
 def _point(rng: np.random.Generator, level_dbfs: float) -> Point:
-    """Return a point whose echo has a level at the array."""
+    """Return a point whose echo has the given level at the array."""
     range_m = float(rng.uniform(0.3, 1.4))
     return Point(
         azimuth_deg=float(rng.uniform(-60, 60)),
@@ -142,7 +142,7 @@ def _scene(
     seed: int, array: Array, recording: Recording, call: Call, electronics: Electronics, what: dict[str, Any]
 ) -> Scene:
     direct_db = what.pop("direct_db", None)
-    if direct_db is not None:  # which is the level at the nearest microphone
+    if direct_db is not None:  # ``direct_db`` is the level at the nearest microphone.
         nearest_m = np.linalg.norm(microphones(array).enabled_positions_m, axis=1).min()
         direct_db += 20 * math.log10(max(nearest_m, 1e-3))
     sensor = Sensor(
@@ -157,7 +157,7 @@ def _scene(
 
 
 def healthy(seed: int) -> tuple[str, Measurement]:
-    """Return the kind of scene and the recording of a healthy array that the seed decides."""
+    """Return the kind of scene and the recording of a healthy array. The seed determines both."""
     rng = np.random.default_rng((seed, 1))
     name = list(SCENES)[seed % len(SCENES)]
     is_pdm = rng.random() < 0.7
@@ -176,7 +176,10 @@ def healthy(seed: int) -> tuple[str, Measurement]:
 
 @functools.lru_cache(maxsize=128)
 def base(scene: str, seed: int, *, is_pdm: bool) -> Base:
-    """Return a healthy recording of an array of 32 microphones that spans a plane: of an echo, or the direct sound."""
+    """Return a healthy recording of a two-dimensional array of 32 microphones.
+
+    The recording contains an echo or the direct sound.
+    """
     rng = np.random.default_rng((seed, 2))
     names = ("eRTIS_v2", "eRTIS_v3D1")
     what: dict[str, Any] = {}

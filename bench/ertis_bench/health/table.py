@@ -1,4 +1,4 @@
-"""Report of the campaign as Markdown."""
+"""Markdown report of the health checks' trials."""
 
 from typing import Any
 
@@ -27,6 +27,6 @@ def health(report: dict[str, Any]) -> str:
             f"Faults named in healthy arrays: {len(report['alarms'])} of {report['healthy']} ({scenes}).",
             f"Observable faults named on their channels: {counted[0]} of {counted[1]}.",
             table(["fault", "named", "observable", "condition or reason"], rows),
-            f"By `{command}`.",
+            f"Command: `{command}`.",
         ]
     )

@@ -1,6 +1,6 @@
-"""A central node that falls behind with reading on demand: ``python -m ertis_bench.network.busy COMMAND …``.
+"""Central node that falls behind with reading on demand: ``python -m ertis_bench.network.busy COMMAND …``.
 
-SIGUSR1 holds its loop, as a slow disk or a long computation would. The threads of ZeroMQ go on.
+SIGUSR1 blocks its event loop, as a slow disk or a long computation would. The threads of ZeroMQ continue.
 """
 
 import runpy
@@ -13,7 +13,7 @@ from typing import Final
 __all__ = ["BUSY_S"]
 
 BUSY_S: Final = 3.5
-"""Time that one signal costs: kill and two heartbeats of a second fit in."""
+"""Blocking time per signal in seconds. A kill and two heartbeats of one second fit in."""
 
 
 def _wait(_number: int, _frame: FrameType | None) -> None:

@@ -1,8 +1,8 @@
-"""Two hosts and a cable: namespaces of the network, and a process that carries their packets, or loses them.
+"""Two hosts and a cable: network namespaces, and a process that carries their packets or loses them.
 
-Each host has an interface that hands its packets to a program (TUN) instead of to a card. What carries them loses,
-delays, repeats and reorders them, and can be pulled out; the hosts have the kernel's own TCP. ``tc netem`` could do so
-between two virtual cards, but not every kernel has it.
+Each host has a TUN interface, which hands its packets to a program instead of a network card. The program loses,
+delays, repeats and reorders packets, and can be unplugged. The hosts use the kernel's own TCP. ``tc netem`` between two
+virtual cards would do the same, but not every kernel has it.
 """
 
 import contextlib
@@ -27,12 +27,12 @@ __all__ = ["Cable", "Weather", "cable"]
 _TUN: Final = Path("/dev/net/tun")
 _TUNSETIFF, _IFF_TUN, _IFF_NO_PI = 0x400454CA, 0x0001, 0x1000
 _MTU: Final = 1500
-_QUEUE: Final = 2000  # packets under way; what does not fit is lost, as in any switch
+_QUEUE: Final = 2000  # Maximum number of packets under way. Further packets are lost, as in any switch.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Weather:
-    """Effects of a cable on packets: shares of lost, repeated and late ones, and the delay of all."""
+    """Effects of a cable on packets: shares of lost, repeated and late packets, and the delay of all packets."""
 
     lose: float = 0.0
     repeat: float = 0.0
@@ -43,20 +43,20 @@ class Weather:
 
 @dataclass(slots=True)
 class Cable:
-    """The ends of a cable.
+    """Cable between two hosts.
 
     Attributes
     ----------
     hosts : (str, str)
-        Names of two namespaces; ``ip netns exec NAME`` runs a command in one.
+        Names of two namespaces. ``ip netns exec NAME`` runs a command in one.
     addresses : (str, str)
-        Of the two, without a port.
+        Addresses of the hosts, without a port.
     weather : Weather
-        It may be changed at any time.
+        Effects on packets. They may be changed at any time.
     plugged : bool
-        Whether anything is carried.
+        False while the cable is unplugged and carries nothing.
     carried, lost : int
-        Packets.
+        Numbers of packets.
     """
 
     hosts: tuple[str, str]
@@ -67,11 +67,11 @@ class Cable:
     lost: int = 0
 
     def inside(self, end: int, command: list[str]) -> list[str]:
-        """Return a command that runs another one in one of the hosts."""
+        """Return a command that runs another command in one of the hosts."""
         return ["ip", "netns", "exec", self.hosts[end], *command]
 
     def _carry(self, ends: tuple[int, int], rng: random.Random, closing: int) -> None:
-        """Carry packets until something comes to be read from ``closing``."""
+        """Carry packets until ``closing`` becomes readable."""
         due: list[tuple[float, int, int, bytes]] = []
         number = 0
         while True:
@@ -93,13 +93,16 @@ class Cable:
             while due and due[0][0] <= time.monotonic():
                 _, _, sink, packet = heapq.heappop(due)
                 self.carried += 1
-                with contextlib.suppress(OSError):  # a host whose interface is full loses it
+                with contextlib.suppress(OSError):  # The packet is lost if the host's interface is full.
                     os.write(sink, packet)
 
 
 @contextmanager
 def cable(*, seed: int) -> Iterator[Cable | None]:
-    """Yield a cable between two hosts, which are gone afterwards; None where this user may not make them."""
+    """Yield a cable between two hosts, and remove the hosts afterwards.
+
+    Yield None if this user may not create namespaces.
+    """
     token = secrets.token_hex(3)
     made = Cable((f"ertis-{token}-a", f"ertis-{token}-b"), ("10.231.0.1", "10.231.0.2"))
     ends: list[int] = []
@@ -134,7 +137,7 @@ def _turned(addresses: tuple[str, str], number: int) -> tuple[str, str]:
 
 
 def _interface(host: str, name: str, own: str, other: str) -> int:
-    """Create an interface of a host, and return the carrier of its packets."""
+    """Create an interface of a host, and return the file descriptor that carries its packets."""
     end = os.open(_TUN, os.O_RDWR)
     try:
         fcntl.ioctl(end, _TUNSETIFF, struct.pack("16sH", name.encode(), _IFF_TUN | _IFF_NO_PI))

@@ -1,4 +1,4 @@
-"""Diary of a sender, which survives any end of the sender."""
+"""Log of a sender on disk, called its diary, which survives any end of the sender."""
 
 import json
 import os
@@ -28,38 +28,38 @@ class Row(NamedTuple):
 
     @classmethod
     def of(cls, measurement: Measurement) -> "Row":
-        """Return that of a measurement, whose CRC-32 is made here."""
+        """Return the row of a measurement, with a newly computed CRC-32."""
         stamp = measurement.stamp
         return cls(zlib.crc32(measurement.data.data), stamp.sync_count, stamp.timestamp_ns)
 
 
 class Diary:
-    """Diary of a sender, line by line.
+    """Diary of a sender, one JSON line per event.
 
     Parameters
     ----------
     path : Path
-        It is appended to.
+        File that is appended to.
     """
 
     def __init__(self, path: Path) -> None:
         self._file = os.open(path, os.O_CREAT | os.O_APPEND | os.O_WRONLY, 0o644)
 
     def offered(self, key: DiaryKey, row: Row, monotonic_ns: int) -> None:
-        """Write that a measurement is going to be handed over."""
+        """Record that a measurement is about to be handed over."""
         self._write("offered", *key, *row, monotonic_ns)
 
     def kept(self, key: DiaryKey) -> None:
-        """Write that it was accepted."""
+        """Record that a measurement was accepted."""
         self._write("kept", *key)
 
     def acked_through(self, sensor: str, session_id: int, acked_through: int, status: str, monotonic_ns: int) -> None:
-        """Write an acknowledgement to the diary."""
+        """Record an acknowledgement."""
         self._write("acked_through", sensor, session_id, acked_through, status, monotonic_ns)
 
     def dropped(self, sensor: str, session_id: int, sequence: int, reason: str) -> None:
-        """Write that the sender was told of one that was thrown away."""
+        """Record that the sender reported a measurement as discarded."""
         self._write("dropped", sensor, session_id, sequence, reason)
 
     def _write(self, *words: object) -> None:
-        os.write(self._file, f"{json.dumps(words)}\n".encode())  # at once and in one piece
+        os.write(self._file, f"{json.dumps(words)}\n".encode())  # A single write makes the line atomic and immediate.

@@ -1,4 +1,7 @@
-"""Faults of a network and their consequences: killed nodes, bad disks, lost messages, hostile peers, overload."""
+"""Trials of network faults and their consequences.
+
+The faults are killed nodes, bad disks, lost messages, hostile peers and overload.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -25,29 +28,30 @@ __all__ = ["LONG", "PARTS", "SHORT", "NetworkFaultCounts", "run"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NetworkFaultCounts:
-    """Numbers of trials.
+    """Extent of the trials.
 
     Attributes
     ----------
     n_kills : int
-        Of central nodes, and as many of sensor nodes.
+        Kills of central nodes, and the same number of kills of sensor nodes.
     rate_hz : float
-        Of each sensor whose central node is killed.
+        Rate of each sensor whose central node is killed.
     n_seal_kills, n_worker_kills : int
+        Kills of sealing processes, and of workers.
     away_s : float
-        How long a central node is away.
+        Time without a central node.
     meddled_s, cable_s : float
-        How long messages are lost, and packets.
+        Time with lost messages, and with lost packets.
     n_captures : int
-        Kills while emulated sensors are captured from.
+        Kills during captures from emulated sensors.
     n_hostile, n_fuzzed : int
-        Connections and messages.
+        Numbers of hostile connections and of malformed messages.
     n_hellos, n_files : int
-        Hostile hellos, and hostile files; there are fewer if these are all.
+        Maximum numbers of hostile hello messages and of hostile files. Fewer are tried if fewer exist.
     overload_s, slow_s : float
-        How long there is too much to do, and how long there are slow applications.
+        Time with overload, and time with slow applications.
     n_pulses : int
-        Of a SYNC chain.
+        Pulses of a SYNC chain.
     n_power_cuts : int
         States of a disk after a power cut.
     n_flips : int
@@ -91,7 +95,7 @@ LONG = NetworkFaultCounts(
 def run(
     *, say: Callable[[str], None], long: bool = False, seed: int | None = None, only: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Try everything, or only some of `PARTS`, and return the report."""
+    """Run all trials, or only some of `PARTS`, and return the report."""
     return try_parts(PARTS, LONG if long else SHORT, say=say, long=long, seed=seed, only=only, say_found=True)
 
 
@@ -125,9 +129,9 @@ PARTS: Parts[NetworkFaultCounts] = {
         "{n_worker_kills} workers killed",
         lambda extent, folder, seed: faults_processing.workers(folder, seed=seed, count=extent.n_worker_kills),
     ),
-    "disk_full": ("a small disk", _disk_full),
+    "disk_full": ("small disk", _disk_full),
     "disk_fails": (
-        "a disk that fails",
+        "failing disk",
         lambda _, folder, seed: faults_links.disk_fails(folder, seed=seed),
     ),
     "away": (
@@ -135,7 +139,7 @@ PARTS: Parts[NetworkFaultCounts] = {
         lambda extent, folder, seed: faults_links.away(folder, seed=seed, away_s=extent.away_s, how="killed"),
     ),
     "stopped": (
-        "{away_s:g} s in which it stands still",
+        "{away_s:g} s with a stopped central node",
         lambda extent, folder, seed: faults_links.away(folder, seed=seed, away_s=extent.away_s, how="stopped"),
     ),
     "meddled": (
@@ -150,7 +154,7 @@ PARTS: Parts[NetworkFaultCounts] = {
         "{n_hostile} hostile connections",
         lambda extent, folder, seed: faults_peers.hostile(folder, seed=seed, count=extent.n_hostile),
     ),
-    "keys": ("all wrong keys", lambda _, folder, seed: faults_keys.keys(folder, seed=seed)),
+    "keys": ("invalid keys and roles", lambda _, folder, seed: faults_keys.keys(folder, seed=seed)),
     "fuzzed": (
         "{n_fuzzed} malformed messages",
         lambda extent, folder, seed: faults_peers.fuzzed(folder, seed=seed, count=extent.n_fuzzed),
@@ -172,7 +176,7 @@ PARTS: Parts[NetworkFaultCounts] = {
         lambda extent, folder, seed: faults_wire.gone(folder, seed=seed, count=extent.n_gone),
     ),
     "overload": (
-        "{overload_s:g} s of twice as much as can be done",
+        "{overload_s:g} s at twice the capacity",
         lambda extent, folder, seed: faults_load.overload(folder, seed=seed, duration_s=extent.overload_s),
     ),
     "subscribers": (
@@ -180,7 +184,7 @@ PARTS: Parts[NetworkFaultCounts] = {
         lambda extent, folder, seed: faults_load.subscribers(folder, seed=seed, duration_s=extent.slow_s),
     ),
     "groups": (
-        "{n_pulses} pulses, lost, double, and with a wrong clock",
+        "{n_pulses} pulses with lost and double SYNC, and with a wrong clock",
         lambda extent, folder, seed: faults_processing.groups(folder, seed=seed, count=extent.n_pulses),
     ),
     "power_cuts": (
@@ -190,4 +194,4 @@ PARTS: Parts[NetworkFaultCounts] = {
         ),
     ),
 }
-"""What is tried: what to say of it, and how."""
+"""Trials by name, each with its progress message and its function."""

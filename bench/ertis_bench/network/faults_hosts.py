@@ -1,4 +1,4 @@
-"""Whole ways: from emulated sensors through captures that are killed, and between hosts over a bad cable."""
+"""End-to-end trials: emulated sensors with captures that are killed, and two hosts with a bad cable."""
 
 import random
 import secrets
@@ -26,9 +26,9 @@ Found = dict[str, Any]
 
 
 def captures(folder: Path, *, seed: int, count: int) -> Found:
-    """Kill captures of emulated sensors, and the central node that they send to, all of it as users run it.
+    """Kill captures of emulated sensors, and the central node to which they send. All run as users run them.
 
-    What the emulators log is the truth, what captures say to be kept is the promise.
+    The emulators' log is the reference. Measurements that captures report as kept must be stored.
     """
     rng = random.Random(seed)  # noqa: S311  a seed is to give the same moments again
     record = RestartedRecorder(folder)
@@ -84,11 +84,12 @@ def captures(folder: Path, *, seed: int, count: int) -> Found:
 
 
 def hosts(folder: Path, *, seed: int, duration_s: float) -> Found | None:
-    """Send from one host to another over a cable that loses, repeats and delays packets, and is pulled out.
+    """Send from one host to another over a cable that loses, repeats and delays packets, and is unplugged.
 
     Returns
     -------
-    dict, or None where hosts cannot be made
+    dict or None
+        Results, or None if this user may not create hosts.
     """
     archive, diary, allowed = folder / "recordings", folder / "sender.ndjson", folder / "allow.toml"
     archive.mkdir()

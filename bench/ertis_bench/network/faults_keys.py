@@ -1,4 +1,7 @@
-"""Access control: every wrong key and role is tried at both addresses of a central node, beside the right ones."""
+"""Trials of access control with invalid and valid keys.
+
+Each wrong key and role is tried at both addresses of a central node, together with the right ones.
+"""
 
 import contextlib
 import time
@@ -26,15 +29,15 @@ from ertis_numba.network.subscriber import Subscriber
 
 __all__ = ["keys"]
 
-_TRIED_S: Final = 2.5  # a wrong key has been refused some times by then
+_TRIED_S: Final = 2.5  # long enough for several refusals of a wrong key
 _REMOVED_S: Final = 2.0
 _INTERVAL_S: Final = 0.02
 Found = dict[str, Any]
 
 
 @dataclass(slots=True, kw_only=True)
-class _Try:
-    """A sensor node that ought to get in, or not."""
+class _Client:
+    """Sensor node that must be accepted or refused."""
 
     node: SensorNode
     sensor: str
@@ -46,7 +49,7 @@ class _Try:
     notes: list[str] = field(default_factory=list)
 
     def note_acked(self, message: Any) -> None:
-        """Note an acknowledgement, with its time."""
+        """Record an acknowledgement, with its time."""
         self.acked_through, self.acked_s = max(self.acked_through, message.acked_through), time.monotonic()
         self.diary.acked_through(
             message.sensor, message.session_id, message.acked_through, message.status, time.monotonic_ns()
@@ -71,9 +74,9 @@ def keys(folder: Path, *, seed: int) -> Found:
     Returns
     -------
     dict
-        ``let in``, names of those who got something in or out; ``refused``, as the central node counts them by reason;
-        ``notes``, what the refused nodes were reported; ``removed``, seconds from the removal of a key to the last ack
-        to its owner; and what is in the recordings, of the listed sensor only.
+        ``let in``, names of nodes that were accepted. ``refused``, refusals by reason, as the central node counts them.
+        ``notes``, messages to the refused nodes. ``removed, s``, seconds from the removal of a key to the last
+        acknowledgement to its owner. Also results for the recordings, which may contain the listed sensor only.
     """
     archive, allowed = folder / "recordings", folder / "allow.toml"
     archive.mkdir()
@@ -107,7 +110,7 @@ def keys(folder: Path, *, seed: int) -> Found:
         }
         diaries = {name: folder / f"{number}.ndjson" for number, name in enumerate(cases)}
         tries = {
-            name: _begin(stack, address, sensor, given, diaries[name], session_id=seed + number)
+            name: _start_client(stack, address, sensor, given, diaries[name], session_id=seed + number)
             for number, (name, (sensor, given)) in enumerate(cases.items())
         }
         _send(list(tries.values()), _TRIED_S)
@@ -124,7 +127,7 @@ def keys(folder: Path, *, seed: int) -> Found:
         _send([tries["the listed sensor"], tries["a listed sensor, until it is removed"]], _REMOVED_S)
         leaver = tries.pop("a listed sensor, until it is removed")
         after_s = leaver.acked_s - removed_s
-        raw = _speaks_without_keys(address) + _speaks_without_keys(listening["publish"])
+        raw = _accepts_without_keys(address) + _accepts_without_keys(listening["publish"])
         boss = ("--key", str(folder / "keys" / "boss.secret.toml"), "--server-key", server)
         status = state_of(address, *boss)
         until(lambda: tries["the listed sensor"].acked_through >= tries["the listed sensor"].sent - 1)
@@ -144,9 +147,9 @@ def keys(folder: Path, *, seed: int) -> Found:
     } | found
 
 
-def _begin(
+def _start_client(
     stack: ExitStack, address: str, sensor: str, given: ClientKeys | None, diary: Path, *, session_id: int
-) -> _Try:
+) -> _Client:
     """Start a sensor node."""
     notes: list[str] = []
     node = stack.enter_context(
@@ -157,13 +160,13 @@ def _begin(
             on_note=lambda *texts: notes.append(": ".join(texts)),
         )
     )
-    made = _Try(node=node, sensor=sensor, diary=Diary(diary), session_id=session_id, notes=notes)
+    made = _Client(node=node, sensor=sensor, diary=Diary(diary), session_id=session_id, notes=notes)
     node.add_sensor(sensor, SMALL)
     return made
 
 
-def _send(tries: Sequence[_Try], duration_s: float) -> None:
-    """Send a measurement of each in turns for some time."""
+def _send(tries: Sequence[_Client], duration_s: float) -> None:
+    """Send measurements of all nodes in turns for some time."""
     end_s = time.monotonic() + duration_s
     while time.monotonic() < end_s:
         for each in tries:
@@ -171,8 +174,8 @@ def _send(tries: Sequence[_Try], duration_s: float) -> None:
         time.sleep(_INTERVAL_S * len(tries))
 
 
-def _receivers(address: str, watchers: dict[str, ClientKeys | None], sender: _Try) -> list[str]:
-    """Return who gets anything while the listed sensor sends."""
+def _receivers(address: str, watchers: dict[str, ClientKeys | None], sender: _Client) -> list[str]:
+    """Return the names of receivers that receive anything while the listed sensor sends."""
     found = set()
     with ExitStack() as stack:
         subscribers = {
@@ -183,14 +186,14 @@ def _receivers(address: str, watchers: dict[str, ClientKeys | None], sender: _Tr
         while time.monotonic() < end_s:
             sender.send()
             for name, subscriber in subscribers.items():
-                with contextlib.suppress(ErtisError):  # it may be told so
+                with contextlib.suppress(ErtisError):  # The receiver may raise an error for the refusal.
                     if subscriber.receive(timeout_s=0.02) is not None:
                         found.add(name)
     return sorted(found)
 
 
-def _speaks_without_keys(address: str) -> int:
-    """Return 1 if an address shakes hands with a peer of no keys at all."""
+def _accepts_without_keys(address: str) -> int:
+    """Return 1 if an address completes a handshake with a peer without keys, otherwise 0."""
     with contextlib.suppress(OSError), ZmtpPeer(address, timeout_s=1.0):
         return 1
     return 0

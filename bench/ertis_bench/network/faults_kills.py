@@ -1,4 +1,7 @@
-"""Nodes of a network that are killed: nothing that was acked, or kept in a spool, may be lost or stored twice."""
+"""Trials with killed nodes of a network.
+
+No measurement that was acknowledged, or kept in a spool, may be lost or stored twice.
+"""
 
 import os
 import random
@@ -16,23 +19,23 @@ from ertis_numba.errors import DataError
 
 __all__ = ["RestartedRecorder", "centrals", "judged", "nodes", "sealings", "tracebacks"]
 
-_GONE_S: Final = 30.0  # for what a killed process has started
+_CHILDREN_END_S: Final = 30.0  # time limit for children of a killed process to end
 _ROTATE_MB: Final = 16
-_LINES_TO_LISTEN: Final = 2_500  # of code that a central node runs until it listens, about
-_LINES_TO_BEGIN: Final = 1_000  # and a sensor node until it sends
-_LINES_OF_A_LIFE: Final = 12_000  # in a second of either, about
-_LIFE_S: Final = 1.0  # of a process that has not come so far
+_LINES_TO_LISTEN: Final = 2_500  # approximate lines of code that a central node runs until it listens
+_LINES_TO_BEGIN: Final = 1_000  # approximate lines of code that a sensor node runs until it sends
+_LINES_OF_A_LIFE: Final = 12_000  # approximate lines of code that either runs in a second
+_LIFE_S: Final = 1.0  # lifetime of a process that does not reach its line
 _RING_BYTES: Final = 500_000_000
 Found = dict[str, Any]
 
 
 class RestartedRecorder:
-    """``ertis record`` that is started again and again, at one address, into one folder.
+    """``ertis record`` that is restarted repeatedly, at one address and with one folder.
 
     Parameters
     ----------
     folder : Path
-        Of the harness; recordings go to ``recordings`` in it.
+        Folder of the trial. Recordings go to its subfolder ``recordings``.
     *options : str
 
     Attributes
@@ -40,7 +43,7 @@ class RestartedRecorder:
     archive : Path
     address : str
     mark : str
-        By which all that it has started is found.
+        Mark by which all processes are found that the command has started.
     """
 
     def __init__(self, folder: Path, *options: str, archive: Path | None = None) -> None:
@@ -50,18 +53,22 @@ class RestartedRecorder:
         self.address, self.mark = free_address(), secrets.token_hex(8)
 
     def start(self, *, max_lines: int | None = None, busy: bool = False) -> JsonLinesProcess:
-        """Start it, to be killed after some lines of its code, or to be held by SIGUSR1; it need not listen yet."""
+        """Start the command, without waiting until it listens.
+
+        It can be killed after ``max_lines`` lines of its code, or blocked by SIGUSR1 if ``busy``.
+        """
         options = ("-o", str(self.archive), *self._options)
         common: dict[str, Any] = {"listen": self.address, "mark": self.mark}
         return central("record", self.folder, *options, **common, max_lines=max_lines, busy=busy)
 
     def finish(self, senders: list[JsonLinesProcess], *, timeout_s: float = 120.0) -> Found:
-        """Start it once more, let senders end, which brings all that they still have, and let it seal.
+        """Start the command a last time. Wait until senders have sent all measurements and these are sealed.
 
         Returns
         -------
         dict
-            ``unacked``, senders that did not get rid of all; ``orphans``, processes that ought to have ended.
+            ``unacked``, number of senders with unacknowledged measurements; ``orphans``, processes that should have
+            ended.
         """
         unacked = 0
         with self.start() as last:
@@ -74,12 +81,12 @@ class RestartedRecorder:
             code = last.stop(timeout_s=timeout_s)
             if code:
                 raise DataError(f"ertis record ended with {code}; {last.last_words()}")
-        until(lambda: not survivors(self.mark), timeout_s=_GONE_S)
+        until(lambda: not survivors(self.mark), timeout_s=_CHILDREN_END_S)
         return {"unacked": unacked, "orphans": len(survivors(self.mark))}
 
 
 def tracebacks(folder: Path) -> int:
-    """Return the number of tracebacks in the output of a harness."""
+    """Return the number of tracebacks in the output of a trial."""
     return sum(path.read_text(errors="replace").count("Traceback (most") for path in folder.glob("*.txt"))
 
 
@@ -89,10 +96,12 @@ def judged(folder: Path, archive: Path, diaries: list[Path], *, kept: list[Path]
     Parameters
     ----------
     folder, archive : Path
-        Of the harness, and of the recordings.
+        Folders of the trial and of the recordings.
     diaries : list of Path
+        Diaries of all senders.
     kept : list of Path, optional
-        Those whose senders promise that all they keep is stored; all by default. Of others, what was acked.
+        Diaries of senders whose kept measurements must all be stored; all diaries by default. From other senders, only
+        acknowledged measurements must be stored.
     """
     sent = read_diaries(diaries)
     surely: Sent = sent if kept is None else read_diaries(kept)
@@ -107,8 +116,8 @@ def judged(folder: Path, archive: Path, diaries: list[Path], *, kept: list[Path]
 def centrals(folder: Path, *, seed: int, count: int, rate_hz: float) -> Found:
     """Kill a central node while two sensors send to it, also while it starts, rotates and seals.
 
-    Half of the kills come at a random moment, the others before a random line of code. What comes while there is no
-    central node must go while there is one: in the long run, sensors are slower.
+    Half of the kills come at a random time, the others before a random line of code. Measurements from times without a
+    central node must be sent while it runs. The long trials therefore use a lower sensor rate.
     """
     rng = random.Random(seed)  # noqa: S311  a seed is to give the same moments again
     record = RestartedRecorder(folder, "--rotate-size", str(_ROTATE_MB))
@@ -122,7 +131,7 @@ def centrals(folder: Path, *, seed: int, count: int, rate_hz: float) -> Found:
                 if max_lines is not None:
                     by_line += until(lambda node=node: _killed_itself(node), timeout_s=_LIFE_S)  # type: ignore[misc]
                 else:
-                    if rng.random() < 0.8:  # others are killed while they start
+                    if rng.random() < 0.8:  # The other processes are killed while they start.
                         node.wait_for("listening")
                     time.sleep(rng.uniform(0.0, 0.5))
                 node.kill()
@@ -131,19 +140,19 @@ def centrals(folder: Path, *, seed: int, count: int, rate_hz: float) -> Found:
 
 
 def _killed_itself(node: JsonLinesProcess) -> bool:
-    """Return True if a central node was killed before a line: it has ended, or was started again."""
+    """Return True if a central node was killed before a line, so that it has ended or was restarted."""
     return not node.running or node.restarts > 0
 
 
 def _some_lines(rng: random.Random, n_first: int, n_more: int) -> int:
-    """Return after how many lines to kill a process: a third of the times, while it starts."""
+    """Return the number of lines before a kill. One third of the kills come while the process starts."""
     return rng.randrange(n_first) if rng.random() < 1 / 3 else n_first + rng.randrange(n_more)
 
 
 def nodes(folder: Path, *, seed: int, count: int) -> Found:
-    """Kill sensor nodes, of which one keeps a spool on disk; that one is to lose nothing at all.
+    """Kill two sensor nodes, one of them with a spool on disk. The node with a spool may lose nothing.
 
-    Half of the kills come at a random moment, the others before a random line of code.
+    Half of the kills come at a random time, the others before a random line of code.
     """
     rng = random.Random(seed)  # noqa: S311  as above
     record = RestartedRecorder(folder, "--rotate-size", str(_ROTATE_MB))
@@ -199,7 +208,7 @@ def sealings(folder: Path, *, seed: int, count: int) -> Found:
             fresh = [pid for pid in sealers if pid not in seen]
             if not fresh:
                 if not node.running:
-                    raise DataError(f"the central node has ended; {node.last_words()}")
+                    raise DataError(f"central node has ended; {node.last_words()}")
                 time.sleep(0.01)
                 continue
             seen.update(fresh)
@@ -215,7 +224,7 @@ def sealings(folder: Path, *, seed: int, count: int) -> Found:
 
 
 def _killed(pid: int) -> bool:
-    """Kill a process, and return whether it was still there."""
+    """Kill a process, and return True if it was still running."""
     try:
         os.kill(pid, signal.SIGKILL)
     except ProcessLookupError:

@@ -1,4 +1,4 @@
-"""Disks that are full or fail, central nodes that are away, and messages that get lost on the way."""
+"""Trials with full or failing disks, absent central nodes, and messages that are lost."""
 
 import json
 import os
@@ -20,9 +20,9 @@ from ertis_numba.errors import DataError
 __all__ = ["away", "disk_fails", "disk_full", "meddled", "state_of"]
 
 _RING_BYTES: Final = 64_000_000
-_ROOM_BYTES: Final = 24_000_000  # more than a full ring, for what else a process may take and keep
-_START_S: Final = 2.0  # at most, until a node listens and sensors have found it
-_QUIET_S: Final = 1.5  # after which an ack that has been sent has come
+_MARGIN_BYTES: Final = 24_000_000  # margin above a full ring, for other memory of a process
+_START_S: Final = 2.0  # time limit until a node listens and sensors are connected to it
+_ACK_DELAY_S: Final = 1.5  # time after which every acknowledgement that was sent has arrived
 Found = dict[str, Any]
 
 
@@ -32,7 +32,7 @@ def state_of(address: str, *keys: str) -> dict[str, Any]:
     Raises
     ------
     DataError
-        It does not answer.
+        The node does not answer.
     """
     done = ask("status", address, "--json", "--once", *keys)
     if done.returncode:
@@ -42,7 +42,10 @@ def state_of(address: str, *keys: str) -> dict[str, Any]:
 
 
 def disk_full(folder: Path, disk: Path, *, seed: int) -> Found:
-    """Fill a small disk while a sensor sends, free it again, and see that nothing was acked in between nor lost."""
+    """Fill a small disk while a sensor sends, and free it again.
+
+    Count measurements that were acknowledged meanwhile, and lost measurements. Both counts must be 0.
+    """
     ballast = disk / "ballast"
     archive = disk / "recordings"
     archive.mkdir()
@@ -51,25 +54,28 @@ def disk_full(folder: Path, disk: Path, *, seed: int) -> Found:
         ballast.unlink()
 
     ballast.write_bytes(bytes(9_000_000))
-    return _faulty(folder, RestartedRecorder(folder, archive=archive), free, seed=seed, count=25)
+    return _send_through_fault(folder, RestartedRecorder(folder, archive=archive), free, seed=seed, count=25)
 
 
 def disk_fails(folder: Path, *, seed: int) -> Found:
-    """Let each write beyond a place in a file fail, as by EIO, allow it again, and see the same."""
+    """Let each write beyond a position in a file fail, as with EIO, and allow writes again.
+
+    The counts are those of `disk_full`.
+    """
     record = RestartedRecorder(folder)
-    return _faulty(folder, record, None, seed=seed, count=60)
+    return _send_through_fault(folder, record, None, seed=seed, count=60)
 
 
-def _faulty(
+def _send_through_fault(
     folder: Path, record: RestartedRecorder, free: Callable[[], None] | None, *, seed: int, count: int
 ) -> Found:
-    """Send until the disk fails, mend it, and send the rest.
+    """Send until the disk fails, repair it, and send the remaining measurements.
 
     Parameters
     ----------
     free : callable, optional
-        Mends the disk. By default the kernel refuses the process to write beyond some 100 kB of a file, and what
-        mends that is to let it again.
+        Repairs the disk. By default, a kernel limit makes writes of the process fail beyond about 100 kB of a file, and
+        the repair removes the limit.
     """
     diary = folder / "sender.ndjson"
     job = SenderJob(address=record.address, diary=str(diary), rate_hz=20.0, count=count, seed=seed, patience_s=60.0)
@@ -82,9 +88,9 @@ def _faulty(
             until(lambda: bool(read_diaries([diary]).acked()))
             _limit(node, 100_000)
         fault = node.wait_for("fault")
-        time.sleep(_QUIET_S)
+        time.sleep(_ACK_DELAY_S)
         acked = len(read_diaries([diary]).acked())
-        time.sleep(_QUIET_S)
+        time.sleep(_ACK_DELAY_S)
         acked_in_fault = len(read_diaries([diary]).acked()) - acked
         state = state_of(record.address)["state"]
         if free is None:
@@ -106,17 +112,17 @@ def _faulty(
 
 
 def _limit(process: JsonLinesProcess, max_bytes: int) -> None:
-    """Let writes beyond a place in any file fail: with EFBIG, which SQLite takes for a fault of the disk."""
+    """Make writes beyond a position in any file fail with EFBIG, which SQLite treats as a disk error."""
     resource.prlimit(process.node_pid, resource.RLIMIT_FSIZE, (max_bytes, resource.RLIM_INFINITY))
 
 
 def away(folder: Path, *, seed: int, away_s: float, how: str) -> Found:
-    """Stop a central node for a while: first within the capacity of a ring in memory, then beyond it.
+    """Stop a central node for a while, first within the capacity of a ring in memory, then beyond it.
 
     Parameters
     ----------
     how : {"killed", "stopped"}
-        Whether its process is ended, or stands still and keeps its connections.
+        ``killed`` ends the process. ``stopped`` suspends it, so that its connections stay open.
     """
     record = RestartedRecorder(folder)
     diary = folder / "sender.ndjson"
@@ -160,13 +166,13 @@ def away(folder: Path, *, seed: int, away_s: float, how: str) -> Found:
     return (
         found
         | ended
-        | {"left_over": overrun["left_over"], "most memory, MB": (_RING_BYTES + _ROOM_BYTES) / 1e6}
+        | {"left_over": overrun["left_over"], "most memory, MB": (_RING_BYTES + _MARGIN_BYTES) / 1e6}
         | {f"{name} too long": overrun[name] for name in ("lost", "missing", "wrong", "twice", "unexpected", "silent")}
     )
 
 
 def meddled(folder: Path, *, seed: int, duration_s: float) -> Found:
-    """Lose, repeat and delay acks, drop connections, and pull the cable without a word to either end."""
+    """Lose, repeat and delay acknowledgements, drop connections, and unplug the cable without notice to either end."""
     record = RestartedRecorder(folder)
     diary = folder / "sender.ndjson"
     with ExitStack() as stack:

@@ -1,4 +1,4 @@
-"""More work than can be done, and applications that are slow or stand still."""
+"""Trials with more work than the machine can do, and with slow or stopped applications."""
 
 import signal
 import time
@@ -16,13 +16,13 @@ from ertis_bench.network.serving import Serve, accounts, percentile, some_words
 __all__ = ["overload", "subscribers"]
 
 _PAPER: Final = ("--method", "paper", "--directions", "1850")
-"""What takes long enough that a sender can ask for twice as much."""
+"""Options that make images slow to compute, so that a sender can easily send twice the possible rate."""
 
 Found = dict[str, Any]
 
 
 def overload(folder: Path, *, seed: int, duration_s: float) -> Found:
-    """Send twice as much as can be processed, after finding out how much that is."""
+    """Measure the capacity of image processing, then send twice as much."""
     words = some_words(SMALL, folder / "words.npy", seed=seed)
     job = SenderJob(address="", diary="", sensors=("a", "b", "c", "d"), seed=seed, words=str(words))
     rate_hz = _published(folder / "calibration", job.replace(rate_hz=100.0), duration_s=5.0)["images per s"]
@@ -31,7 +31,7 @@ def overload(folder: Path, *, seed: int, duration_s: float) -> Found:
 
 
 def _published(folder: Path, job: SenderJob, *, duration_s: float) -> Found:
-    """Send for a while, and sum up the results."""
+    """Send for a while, and summarise the results."""
     folder.mkdir()
     diary, warm, images = folder / "sender.ndjson", folder / "warm.ndjson", folder / "images.ndjson"
     with ExitStack() as stack:
@@ -39,7 +39,7 @@ def _published(folder: Path, job: SenderJob, *, duration_s: float) -> Found:
         receiver = stack.enter_context(ReceiverJob(address=serve.publish, diary=str(images), credit=8).start())
         receiver.wait_for("subscribed")
         with job.replace(address=serve.listen, diary=str(warm), rate_hz=1.0, count=2).start() as first:
-            first.wait_for("sent")  # pipelines are made before it counts
+            first.wait_for("sent")  # Pipelines are created before the measurement starts.
             until(lambda: len(read_received(images).numbers) > 0)
         sender = stack.enter_context(job.replace(address=serve.listen, diary=str(diary)).start())
         sender.wait_for("begun")
@@ -71,9 +71,9 @@ def _published(folder: Path, job: SenderJob, *, duration_s: float) -> Found:
 
 
 def subscribers(folder: Path, *, seed: int, duration_s: float) -> Found:
-    """See whether an application notices that others are slow, or stand still.
+    """Measure the effect of slow and stopped applications on another application.
 
-    Each quarter of the time without them is followed by one with them, as a machine is never the same for long.
+    Each quarter of the time without them is followed by a quarter with them, because the speed of a machine drifts.
     """
     words = some_words(SMALL, folder / "words.npy", seed=seed)
     times_ms: dict[bool, list[float]] = {False: [], True: []}

@@ -1,4 +1,4 @@
-"""Peers and messages to refuse: keys, hostile connections, malformed headers."""
+"""Trials with hostile connections and malformed messages, which the central node must refuse."""
 
 import contextlib
 import random
@@ -34,8 +34,8 @@ def fuzzed(folder: Path, *, seed: int, count: int) -> Found:
     Returns
     -------
     dict
-        ``inputs`` that were sent, and ``answers`` that came; ``closed``, how often a connection was; ``restarts`` of
-        any of its processes; and what became of the sensor's measurements.
+        ``inputs``, sent messages, and ``answers`` to them; ``closed``, number of closed connections; ``restarts`` of
+        its processes; and the results for the sensor's measurements.
     """
     archive, diary = folder / "recordings", folder / "sender.ndjson"
     archive.mkdir()
@@ -63,7 +63,10 @@ def fuzzed(folder: Path, *, seed: int, count: int) -> Found:
 
 
 def _send_all(address: str, rng: random.Random, count: int, found: Found, *, max_bytes: int | None = None) -> None:
-    """Send inputs, whose frames are cut where they are too long for the other side to listen any further."""
+    """Send inputs.
+
+    Frames longer than ``max_bytes`` are truncated, because the other side would close the connection.
+    """
     for batch in inputs(rng, count, _BATCH):
         for attempt in range(3):
             try:
@@ -81,13 +84,13 @@ def _send_all(address: str, rng: random.Random, count: int, found: Found, *, max
 
 
 def hostile(folder: Path, *, seed: int, count: int, rate_hz: float = 20.0) -> Found:
-    """Open connections that say nothing, something else, far too much or far too slowly, while a sensor sends.
+    """Open hostile connections while a sensor sends. They are silent, send garbage, send too much, or send too slowly.
 
     Returns
     -------
     dict
-        ``connections``, largest of them ``at once``; the slowest ack and how much memory grew; and what became of the
-        sensor's measurements.
+        ``connections``, and the largest number of them ``at once``; the slowest acknowledgement; the growth of the
+        memory; and the results for the sensor's measurements.
     """
     record = RestartedRecorder(folder)
     diary = folder / "sender.ndjson"
@@ -100,7 +103,7 @@ def hostile(folder: Path, *, seed: int, count: int, rate_hz: float = 20.0) -> Fo
         until(lambda: diary.exists() and len(read_diaries([diary]).acked()) > rate_hz)
         before = node.memory_bytes
         with _crowd(record.address, seed, count) as crowd:
-            end_s = time.monotonic() + max(4.0, count / 50)  # slow handshakes are given up after three seconds
+            end_s = time.monotonic() + max(4.0, count / 50)  # Slow handshakes are closed after three seconds.
             while time.monotonic() < end_s:
                 crowd.whisper()
                 max_memory = max(max_memory, node.memory_bytes)
@@ -124,12 +127,12 @@ def hostile(folder: Path, *, seed: int, count: int, rate_hz: float = 20.0) -> Fo
 
 
 def record_ended(node: JsonLinesProcess, record: RestartedRecorder) -> Found:
-    """Stop a central node, and check its remains."""
+    """Stop a central node, and check for remaining processes and tracebacks."""
     return {"exit code": node.stop()} | record.finish([])
 
 
 class _Crowd:
-    """Connections of peers that mean no good."""
+    """Set of hostile connections."""
 
     def __init__(self, address: str, seed: int) -> None:
         self._address, self._rng = address, random.Random(seed)  # noqa: S311  as above
@@ -155,7 +158,7 @@ class _Crowd:
         self.opened = 0
 
     def join(self, count: int) -> None:
-        """Open connections, each of which does something else that is wrong."""
+        """Open connections, each with a different kind of hostile behaviour."""
         for number in range(count):
             each = socket.socket()
             each.settimeout(1.0)
@@ -166,7 +169,7 @@ class _Crowd:
                 self._kinds[number % len(self._kinds)](each)
 
     def whisper(self) -> None:
-        """Go on with handshakes that never end."""
+        """Continue handshakes that never end."""
         for each in self._slow:
             with contextlib.suppress(OSError):
                 each.sendall(b"\xff")
@@ -182,7 +185,7 @@ class _Crowd:
 
 @contextmanager
 def _crowd(address: str, seed: int, count: int) -> Iterator[_Crowd]:
-    """Yield hostile connections that are opened meanwhile, and closed at the end."""
+    """Yield hostile connections, which open during the block and close at its end."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(hard, max(soft, count + 500)), hard))
     crowd = _Crowd(address, seed)

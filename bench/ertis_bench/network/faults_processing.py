@@ -1,4 +1,4 @@
-"""Faults of image processing: dying workers, lost pulses, wrong clocks."""
+"""Trials of image processing with dying workers, lost pulses and wrong clocks."""
 
 import os
 import random
@@ -22,7 +22,7 @@ from ertis_numba.network.subscriber import Subscriber
 __all__ = ["grouped", "groups", "workers"]
 
 _DIRECTIONS: Final = "2d:9"
-_WHILE_STARTING: Final = 0.1  # share of the workers that are killed before they can do anything
+_SHARE_WHILE_STARTING: Final = 0.1  # share of workers that are killed while they start
 
 Found = dict[str, Any]
 
@@ -54,9 +54,9 @@ def workers(folder: Path, *, seed: int, count: int) -> Found:
             fresh = [
                 each.pid
                 for each in (processing.workers if processing else ())
-                if each.pid not in seen and (each.state != "starting" or rng.random() < _WHILE_STARTING)
+                if each.pid not in seen and (each.state != "starting" or rng.random() < _SHARE_WHILE_STARTING)
             ]
-            for pid in fresh[:1]:  # the other one goes on
+            for pid in fresh[:1]:  # The other worker continues.
                 seen.add(pid)
                 time.sleep(rng.uniform(0.0, 0.1))
                 os.kill(pid, signal.SIGKILL)
@@ -65,7 +65,7 @@ def workers(folder: Path, *, seed: int, count: int) -> Found:
         flushed = sender.wait_for("sent")["flushed"]
         sent = read_diaries([diary])
         acked_through = serve.settle(len(sent.kept))
-        time.sleep(0.5)  # for the last image to be written down
+        time.sleep(0.5)  # time for the receiver to log the last image
         receiver.signal(signal.SIGTERM)
         receiver.wait()
         found = accounts(serve, sent, read_received(images))
@@ -85,7 +85,10 @@ def workers(folder: Path, *, seed: int, count: int) -> Found:
 
 
 def groups(folder: Path, *, seed: int, count: int) -> Found:
-    """Let a sensor miss a pulse, another see one twice, and the clock of a third be an hour wrong from a pulse on."""
+    """Run three sensors in a SYNC chain with faults.
+
+    One sensor misses a pulse, one counts a pulse twice, and the clock of one is wrong by an hour from a pulse on.
+    """
     at = {"lost": count // 4, "double": count // 2, "clock": 3 * count // 4}
     begins_ns, start_s = time.time_ns(), time.monotonic() + 4.0
     job = SenderJob(address="", diary="", rate_hz=10.0, count=count, seed=seed, begins_ns=begins_ns)
@@ -126,7 +129,7 @@ def groups(folder: Path, *, seed: int, count: int) -> Found:
 def grouped(
     came: list[Group], pulse_of: dict[tuple[str, int], int], at: dict[str, int], *, n_sensors: int, count: int
 ) -> Found:
-    """Compare groups with the pulses that measurements were made at."""
+    """Compare groups with the pulses at which their measurements were captured."""
     pulses = [{pulse_of[sensor, sequence] for sensor, _, sequence in group.members} for group in came]
     whole = {
         min(each): group.flags

@@ -1,4 +1,4 @@
-"""Damage below the protocol: flipped bits in encrypted connections, and nodes that go while their messages wait."""
+"""Trials below the protocol: bits flipped in encrypted connections, and nodes that end while their messages wait."""
 
 import contextlib
 import os
@@ -28,14 +28,14 @@ from ertis_numba.network.subscriber import Subscriber
 
 __all__ = ["flips", "gone"]
 
-_BACKWARDS: Final = 0.1  # share of flips on the way to a client, which needs three seconds to notice
+_SHARE_TO_CLIENT: Final = 0.1  # share of flips on the way to a client, which needs three seconds to detect one
 _FLIPPED_S: Final = 20.0
-_VICTIMS: Final = 5  # nodes that are killed together
+_N_VICTIMS: Final = 5  # sensor nodes that are killed together
 _WINDOW: Final = 16  # measurements that a node may have under way
-_UNDER_WAY_S: Final = 1.0  # at most, until it has
+_FILL_WINDOW_S: Final = 1.0  # time limit until the window is full
 _RATE_HZ: Final = 20.0
 _RING_BYTES: Final = 500_000_000
-_CABLES: Final = 4  # to each port
+_N_CONNECTIONS: Final = 4  # connections to each port
 Found = dict[str, Any]
 
 
@@ -45,8 +45,8 @@ def flips(folder: Path, *, seed: int, count: int) -> Found:
     Returns
     -------
     dict
-        ``flips``, ``restarts`` of the central node or its publisher, and ``sockets left`` of both together when
-        the clients are gone; and what became of the sensor's measurements.
+        ``flips``; ``restarts`` of the central node or its publisher; ``sockets left``, open sockets of both after the
+        clients have ended; and the results for the sensor's measurements.
     """
     rng = random.Random(seed)  # noqa: S311  a seed is to give the same faults again
     archive, diary = folder / "recordings", folder / "sender.ndjson"
@@ -64,7 +64,7 @@ def flips(folder: Path, *, seed: int, count: int) -> Found:
         with ExitStack() as clients:
             cables = [
                 clients.enter_context(Meddler(listening[name], seed=rng.randrange(2**32)))
-                for name in ("address", "publish") * _CABLES
+                for name in ("address", "publish") * _N_CONNECTIONS
             ]
             job = SenderJob(
                 address=cables[0].address, diary=str(diary), rate_hz=_RATE_HZ, seed=seed, ring_bytes=_RING_BYTES
@@ -93,7 +93,7 @@ def flips(folder: Path, *, seed: int, count: int) -> Found:
 
 
 def _listed(folder: Path) -> dict[str, KeyPair]:
-    """Make keys of a central node, a sensor, an application and an admin, and the list of those."""
+    """Create keys for a central node, a sensor, an application and an admin, and their allow list."""
     pairs = {name: KeyPair.new(name) for name in ("central", "front", "viewer", "boss")}
     for pair in pairs.values():
         pair.save(folder / "keys")
@@ -108,23 +108,23 @@ def _listed(folder: Path) -> dict[str, KeyPair]:
 
 
 def _flip(cable: Meddler, rng: random.Random, count: int) -> None:
-    """Flip one bit after the other in a cable.
+    """Flip bits in a cable, one at a time.
 
     Raises
     ------
     DataError
-        Nothing goes through it any more.
+        The cable carries no more messages.
     """
     for number in range(count):
-        direction: Direction = "from target" if rng.random() < _BACKWARDS else "to target"
+        direction: Direction = "from target" if rng.random() < _SHARE_TO_CLIENT else "to target"
         cable.flip(direction)
         if not until(lambda number=number: sum(cable.did.values()) > number, timeout_s=_FLIPPED_S):  # type: ignore[misc]
-            raise DataError(f"nothing goes through {cable.address} any more, after {number} flips")
+            raise DataError(f"no message passes {cable.address} after {number} flips")
 
 
 @contextmanager
 def _repeating(turn: Callable[[threading.Event], None]) -> Iterator[None]:
-    """Do something again and again until the block ends, whatever becomes of connections."""
+    """Repeat a function until the block ends, even if connections fail."""
     ended = threading.Event()
 
     def run() -> None:
@@ -149,21 +149,21 @@ def _watch(address: str, keys: ClientKeys, ended: threading.Event) -> None:
 
 
 def _ask(address: str, keys: ClientKeys, ended: threading.Event) -> None:
-    """Ask for the status."""
+    """Request the status."""
     with Asking(address, keys=keys) as asking:
         while not ended.wait(0.02):
             asking.ask(patience_s=0.5)
 
 
 def _tcp_sockets(pid: int) -> int:
-    """Return how many TCP sockets a process has open, also those of connections that are over; Linux only.
+    """Return the number of open TCP sockets of a process, including sockets of ended connections; Linux only.
 
-    A process that is gone has none.
+    A process that has ended has none.
     """
     links = set()
     with contextlib.suppress(FileNotFoundError):
         for each in Path(f"/proc/{pid}/fd").iterdir():
-            with contextlib.suppress(OSError):  # it was closed meanwhile
+            with contextlib.suppress(OSError):  # The socket was closed meanwhile.
                 links.add(str(each.readlink()))
     local = {f"socket:[{line.split()[6]}]" for line in Path("/proc/net/unix").read_text().splitlines()[1:]}
     return sum(link.startswith("socket:") for link in links - local)
@@ -175,8 +175,8 @@ def gone(folder: Path, *, seed: int, count: int) -> Found:
     Returns
     -------
     dict
-        ``kills``, ``restarts`` of the central node and ``sockets left``; and what became of the measurements of
-        a node that is left alone, and of those that were killed.
+        ``kills``; ``restarts`` of the central node; ``sockets left``; and the results for the measurements of an
+        undisturbed node and of the killed nodes.
     """
     record = RestartedRecorder(folder)
     steady = folder / "steady.ndjson"
@@ -190,8 +190,8 @@ def gone(folder: Path, *, seed: int, count: int) -> Found:
         pid, before = node.node_pid, _tcp_sockets(node.node_pid)
         sender = stack.enter_context(job.start())
         sender.wait_for("begun")
-        for first in range(0, count, _VICTIMS):
-            victims = [folder / f"victim{number}.ndjson" for number in range(first, min(count, first + _VICTIMS))]
+        for first in range(0, count, _N_VICTIMS):
+            victims = [folder / f"victim{number}.ndjson" for number in range(first, min(count, first + _N_VICTIMS))]
             diaries += victims
             _kill_while_behind(node.node_pid, job, victims)
         until(lambda: _all_acked(steady, at_minimum=1))
@@ -208,7 +208,7 @@ def gone(folder: Path, *, seed: int, count: int) -> Found:
 
 
 def _kill_while_behind(pid: int, job: SenderJob, diaries: list[Path]) -> None:
-    """Hold the loop of the central node, have nodes send all that they may, and kill them."""
+    """Block the event loop of the central node, let nodes send until their windows are full, and kill them."""
     with ExitStack() as stack:
         victims = [
             stack.enter_context(
@@ -219,14 +219,14 @@ def _kill_while_behind(pid: int, job: SenderJob, diaries: list[Path]) -> None:
         until(lambda: all(_all_acked(diary, at_minimum=1) for diary in diaries))
         begun_s = time.monotonic()
         os.kill(pid, signal.SIGUSR1)
-        until(lambda: all(_n_waiting(diary) > _WINDOW for diary in diaries), timeout_s=_UNDER_WAY_S)
+        until(lambda: all(_n_waiting(diary) > _WINDOW for diary in diaries), timeout_s=_FILL_WINDOW_S)
         for victim in victims:
             victim.kill()
         time.sleep(max(0.0, begun_s + BUSY_S - time.monotonic()))
 
 
 def _n_waiting(diary: Path) -> int:
-    """Return how many measurements a node has taken that are not acked."""
+    """Return the number of measurements that a node has accepted and that are not acknowledged."""
     sent = read_diaries([diary])
     return len(sent.kept - sent.acked())
 

@@ -1,4 +1,4 @@
-"""Performance of a central node on this machine: storage, processing, overload; with keys."""
+"""Performance of a central node on this machine with encryption: storage, image processing and overload."""
 
 import tempfile
 import time
@@ -29,7 +29,7 @@ _STORAGE_S: Final = 300.0
 _OTHERS_S: Final = 60.0
 _CALIBRATION_S: Final = 8.0
 _CLUSTER_WORKERS: Final = 2
-_SENDERS: Final = 2  # processes that are sensor nodes: each has its share of the sensors
+_SENDERS: Final = 2  # Sensor-node processes, among which the sensors are divided.
 _BYTES: Final = 4 * SETTINGS.recording.n_samples
 Found = dict[str, Any]
 Keys = tuple[str, str]
@@ -43,17 +43,18 @@ def run(
     only: Sequence[str] = (),
     folder: Path | None = None,
 ) -> dict[str, Any]:
-    """Measure everything, or only some of `PARTS`, and return the report.
+    """Run all measurements, or only some of `PARTS`, and return the report.
 
     Parameters
     ----------
     say : callable
+        Called with a line of progress.
     duration_s : float, optional
-        Of each; five minutes of storage and one of all else by default.
+        Duration of each part. By default, storage takes five minutes and each other part one minute.
     seed : int
     only : sequence of str
     folder : Path, optional
-        Where there is room for what is stored, 220 MB for each second; the system's folder for such things by default.
+        Folder for the stored measurements, which need 220 MB per second. By default, the system's temporary folder.
     """
     rows = []
     for name, (about, part) in PARTS.items():
@@ -67,7 +68,7 @@ def run(
 
 
 def _keys(folder: Path, sensors: Sequence[str]) -> tuple[list[str], Keys, ClientKeys]:
-    """Create keys, and return options of a central node, those of a sensor or an application, and an admin's."""
+    """Create keys. Return options of a central node, the keys of a sensor or an application, and those of an admin."""
     pairs = {name: KeyPair.new(name) for name in ("central", "node", "boss")}
     secret = {name: pair.save(folder / "keys")[0] for name, pair in pairs.items()}
     allowed = (
@@ -93,7 +94,7 @@ class _Load:
         self._begun_s = time.monotonic()
 
     def percent(self) -> dict[str, float]:
-        """Return how much of a core each has taken since."""
+        """Return the share of a core that each process has used since the start, in percent."""
         lasted_s = time.monotonic() - self._begun_s
         return {name: 100 * (_cpu_s(pids) - self._begun[name]) / lasted_s for name, pids in self._pids.items()}
 
@@ -105,7 +106,7 @@ def _cpu_s(pids: Sequence[int]) -> float:
 def storage(
     folder: Path, duration_s: float, seed: int, *, n_sensors: int = 8, rate_hz: float = 20.0, n_senders: int = _SENDERS
 ) -> Found:
-    """Store the measurements of sensors, and read all of them again."""
+    """Store the measurements of sensors, and read them all again."""
     sensors = [f"sensor-{number + 1}" for number in range(n_sensors)]
     options, given, _ = _keys(folder, sensors)
     archive, mark = folder / "recordings", f"storage{time.monotonic_ns()}"
@@ -138,7 +139,7 @@ def storage(
         cpu_percent = load.percent()
         for sender in senders:
             if not sender.wait_for("sent", timeout_s=duration_s + 180.0)["flushed"]:
-                raise DataError(f"not all was acked; {sender.last_words()}")
+                raise DataError(f"some measurements were not acknowledged; {sender.last_words()}")
         node.stop(timeout_s=900.0)
         until(lambda: not survivors(mark))
     diaries = [Path(job.diary) for job in jobs]
@@ -171,7 +172,7 @@ def processing(
     credit: int = 2,
     scheduler: str | None = None,
 ) -> Found:
-    """Process the measurements of sensors, here or on a dask cluster, and compare the images in an application."""
+    """Process the measurements of sensors here or on a dask cluster, and check the images in an application."""
     sensors = [f"sensor-{number + 1}" for number in range(n_sensors)]
     options, given, boss = _keys(folder, sensors)
     if scheduler is not None:
@@ -190,7 +191,8 @@ def processing(
         receiver.wait_for("subscribed")
         job = SenderJob(address=serve.listen, diary=str(warm), sensors=tuple(sensors), rate_hz=5.0, words=str(words))
         job = job.replace(small=False, keys=given, seed=seed)
-        with job.replace(count=round(5.0 * _WARM_UP_S)).start() as first:  # pipelines are made before it counts
+        # Pipelines are created before the measurement starts.
+        with job.replace(count=round(5.0 * _WARM_UP_S)).start() as first:
             first.wait_for("sent", timeout_s=120.0)
         until(lambda: bool(read_received(images).numbers), timeout_s=120.0)
         time.sleep(_WARM_UP_S)
@@ -243,7 +245,10 @@ def processing(
 
 
 def _since(begun: Found, found: Found) -> Found:
-    """Return counts without those from before pipelines were created; faults count all the same."""
+    """Return counts without those from the time before pipelines were created.
+
+    Counts of faults include that time.
+    """
     since = {name: found[name] - begun[name] for name in ("sent", "received", "published", "images", "skipped")}
     dropped = {name: count - begun["dropped"].get(name, 0) for name, count in found["dropped"].items()}
     return found | since | {"dropped": {name: count for name, count in dropped.items() if count}}
@@ -254,7 +259,7 @@ def _settings(directions: str) -> Settings:
 
 
 def _overload(folder: Path, duration_s: float, seed: int) -> Found:
-    """Send twice as much as images were made of when there was more than enough."""
+    """Measure the rate of images under full load, then send twice that rate."""
     (folder / "calibration").mkdir()
     (folder / "overload").mkdir()
     goal = "received = published + dropped; latency bounded"
@@ -265,14 +270,18 @@ def _overload(folder: Path, duration_s: float, seed: int) -> Found:
 
 
 def _cluster(folder: Path, duration_s: float, seed: int) -> Found:
-    """Make the same images by workers of `ertis serve` and by those of a cluster, and as many as each of them can.
+    """Compute the same images with workers of `ertis serve` and with a cluster, then measure the maximum rate of each.
 
-    The processor time of the cluster's scheduler and workers is in none of the shares: they are not the node's.
+    The processor time of the cluster's scheduler and workers is not counted, because they do not belong to the node.
     """
-    options: dict[str, Any] = {"directions": "90", "n_sensors": 4, "goal": "its added latency and rate are told"}
-    options["part"] = f"a dask cluster on this machine, {_CLUSTER_WORKERS} workers"
+    options: dict[str, Any] = {
+        "directions": "90",
+        "n_sensors": 4,
+        "goal": "report added latency and maximum rate",
+    }
+    options["part"] = f"dask cluster on this machine, {_CLUSTER_WORKERS} workers"
     found: dict[str, Found] = {}
-    with cluster.local_cluster(_CLUSTER_WORKERS) as scheduler:  # idle, while others work
+    with cluster.local_cluster(_CLUSTER_WORKERS) as scheduler:  # The cluster idles while the node's own workers run.
         for name, where in (("here", None), ("there", scheduler)):
             for pace, lasts_s, rate_hz in (("paced", duration_s, 10.0), ("most", _CALIBRATION_S, 40.0)):
                 place = folder / f"{name}-{pace}"
@@ -289,7 +298,7 @@ def _cluster(folder: Path, duration_s: float, seed: int) -> Found:
 
 
 PARTS: dict[str, tuple[str, Callable[[Path, float, int], Found]]] = {
-    "storage": ("8 sensors × 20 Hz are stored", storage),
+    "storage": ("storage of 8 sensors × 20 Hz", storage),
     "processing": (
         "90 directions, 4 sensors × 10 Hz",
         lambda folder, duration_s, seed: processing(
@@ -308,7 +317,7 @@ PARTS: dict[str, tuple[str, Callable[[Path, float, int], Found]]] = {
             folder, duration_s, seed, directions="3000", n_sensors=1, rate_hz=20.0, goal="0 dropped (the paper: 10 Hz)"
         ),
     ),
-    "overload": ("twice as much as can be done", _overload),
-    "cluster": ("90 directions, 4 sensors × 10 Hz, here and on a dask cluster", _cluster),
+    "overload": ("twice the capacity", _overload),
+    "cluster": ("90 directions, 4 sensors × 10 Hz, with own workers and on a dask cluster", _cluster),
 }
-"""What is measured: what to say of it, and how."""
+"""Measurements by name, each with its progress message and its function."""

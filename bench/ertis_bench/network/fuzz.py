@@ -1,4 +1,4 @@
-"""Messages that no node sends: valid ones that are bent, headers of nothing, and lists of frames that make no sense."""
+"""Messages that no node sends: corrupted valid messages, invalid headers, and meaningless lists of frames."""
 
 import random
 import struct
@@ -38,7 +38,7 @@ def _header(kind: str, fields: dict[str, object]) -> bytes:
 
 
 VALID: Final = {kind: _header(kind, fields) for kind, fields in _FIELDS.items()}
-"""A header of each kind that a node could send, none of which brings a measurement."""
+"""Valid header of each kind that a node could send. None of them delivers a measurement."""
 
 _ODD_VALUES: Final[tuple[object, ...]] = (
     None, True, -1, 2**63, 2**64 - 1, -(2**63), 1e308, float("nan"), float("inf"), "", "x" * 300, "../../etc", "\0",
@@ -64,7 +64,7 @@ _ODD_HEADERS: Final = (
 
 
 def inputs(rng: random.Random, count: int, size: int) -> Iterator[list[list[bytes]]]:
-    """Yield messages, each a list of frames, in batches of some size."""
+    """Yield batches of messages. Each message is a list of frames."""
     made = 0
     while made < count:
         batch = [_input(rng) for _ in range(min(size, count - made))]
@@ -90,7 +90,7 @@ def _input(rng: random.Random) -> list[bytes]:
 
 
 def _plausible(rng: random.Random) -> list[bytes]:
-    """Return a message that is well-formed, of a run that a node may know, and makes no sense."""
+    """Return a well-formed message of a session that a node may know, with meaningless content."""
     number = rng.choice((0, 1, 2, 7, rng.randrange(1000), 2**31, 2**62, 2**63 - 1))
     other = rng.choice((0, number, number + 1, 2**63 - 1)) % 2**63
     fields = {"sensor": rng.choice(("fuzz", "fuzz2")), "session_id": rng.choice((1, 1, 1, 2, 2**63 - 1))}
@@ -113,8 +113,8 @@ def _plausible(rng: random.Random) -> list[bytes]:
             return [VALID["hello"], _SETTINGS]
 
 
-def _bent(rng: random.Random) -> bytes:
-    """Return a header of which some bytes are other ones, too many or too few."""
+def _corrupted(rng: random.Random) -> bytes:
+    """Return a header with changed, additional or missing bytes."""
     data = bytearray(rng.choice(list(VALID.values())))
     for _ in range(rng.randint(1, 4)):
         place = rng.randrange(len(data) + 1)
@@ -131,7 +131,7 @@ def _bent(rng: random.Random) -> bytes:
 
 
 def _odd_field(rng: random.Random) -> bytes:
-    """Return a header with a value that its field cannot have, a field too many or one too few."""
+    """Return a header with an invalid value, an additional field or a missing field."""
     kind = rng.choice(list(_FIELDS))
     fields = dict(_FIELDS[kind])
     name = rng.choice([*fields, "more"])
@@ -158,8 +158,8 @@ def _odd(rng: random.Random) -> bytes:
 
 
 _WAYS: Final[tuple[Callable[[random.Random], bytes], ...]] = (
-    _bent,
-    _bent,
+    _corrupted,
+    _corrupted,
     _odd_field,
     _odd_field,
     _spliced,

@@ -1,4 +1,4 @@
-"""Hostile hello messages against a central node, and hostile files against commands that read them."""
+"""Trials of hostile hello messages to a central node, and of hostile files with commands that read them."""
 
 import contextlib
 import json
@@ -27,24 +27,26 @@ Found = dict[str, Any]
 
 
 def hellos(folder: Path, *, seed: int, count: int | None = None, alone_s: float = 3.0, rate_hz: float = 20.0) -> Found:
-    """Send hostile hellos to a central node that stores and processes, while a sensor sends to it.
+    """Send hostile hello messages to a central node that stores and processes, while a sensor sends to it.
 
     Parameters
     ----------
     folder : Path
     seed : int
-        Of the words.
+        Seed of the words.
     count : int, optional
-        At most so many hellos, spread over all of them.
+        Maximum number of hello messages, spread evenly over all of them.
     alone_s : float
-        Time in which the acks of the sensor are measured before.
+        Duration of the reference measurement of the sensor's acknowledgements, before the first hello message.
     rate_hz : float
+        Rate of the sensor.
 
     Returns
     -------
     dict
-        ``hellos`` that were sent and ``taken`` ones among them; the slowest refusal, the memory that the central node
-        and its workers grew by at most, the slowest ack meanwhile and before; and what became of the measurements.
+        ``hellos`` that were sent, and ``taken`` ones among them; the slowest refusal; the largest growth of the memory
+        of the central node and its workers; the slowest acknowledgement during the trial and before it; and the results
+        for the measurements.
     """
     archive, diary = folder / "recordings", folder / "sender.ndjson"
     archive.mkdir()
@@ -60,7 +62,7 @@ def hellos(folder: Path, *, seed: int, count: int | None = None, alone_s: float 
         begun_ns, before = time.monotonic_ns(), _peak_bytes(node, reset=True)
         refused = _refused(listening["address"], _spread(list(hostile_hellos()), count))
         ended_ns, grew = time.monotonic_ns(), _peak_bytes(node) - before
-        time.sleep(0.5)  # in which acks of the last measurements come
+        time.sleep(0.5)  # time for the last acknowledgements to arrive
         sender.signal(signal.SIGTERM)
         flushed = sender.wait_for("sent")["flushed"]
         code = node.stop()
@@ -79,13 +81,13 @@ def hellos(folder: Path, *, seed: int, count: int | None = None, alone_s: float 
 
 
 def _spread(given: list[HostileHello], count: int | None) -> list[HostileHello]:
-    """Return at most so many, taken evenly."""
+    """Return at most ``count`` hello messages, spread evenly."""
     step = 1.0 if count is None else max(1.0, len(given) / count)
     return [given[int(place * step)] for place in range(int(len(given) / step))]
 
 
 def _refused(address: str, given: Sequence[HostileHello]) -> list[Found]:
-    """Send hellos, one after the other, and return the result of each."""
+    """Send hello messages one after the other, and return the result of each."""
     found: list[Found] = []
     with ZmtpPeer(address, timeout_s=_WAIT_S) as peer:
         for hello in given:
@@ -94,14 +96,14 @@ def _refused(address: str, given: Sequence[HostileHello]) -> list[Found]:
             try:
                 answer = messages.decode(peer.receive()[0])
             except OSError as error:
-                raise DataError(f"the central node does not answer to hello {hello.name!r} ({error})") from error
+                raise DataError(f"central node does not answer hello {hello.name!r} ({error})") from error
             took_s = round(time.monotonic() - begun_s, 3)
             found.append({"name": hello.name, "took_s": took_s, "refused": isinstance(answer, messages.Refused)})
     return found
 
 
 def _slowest_ms(diary: Path, begin_ns: int, end_ns: int) -> float:
-    """Return the slowest ack of measurements that arrived between two moments, by the monotonic clock."""
+    """Return the slowest acknowledgement of measurements that arrived between two monotonic times, in ms."""
     sent = read_diaries([diary])
     times_ns = [
         acked_ns - sent.arrived_ns[key]
@@ -112,7 +114,7 @@ def _slowest_ms(diary: Path, begin_ns: int, end_ns: int) -> float:
 
 
 def _peak_bytes(node: JsonLinesProcess, *, reset: bool = False) -> int:
-    """Return the peak of the memory of a process and its children, since it was reset; 0 where that cannot be told."""
+    """Return the peak memory of a process and its children since the last reset, or 0 if it is unknown."""
     total = 0
     for pid in (node.pid, *_children(node.pid)):
         with contextlib.suppress(OSError):
@@ -133,24 +135,24 @@ def _children(pid: int) -> list[int]:
 
 
 def files(folder: Path, *, count: int | None = None) -> Found:
-    """Have `ertis verify`, `info` and `process` read hostile files, each in a process whose memory is measured.
+    """Let `ertis verify`, `info` and `process` read hostile files, each in a process whose memory is measured.
 
     Parameters
     ----------
     folder : Path
     count : int, optional
-        At most so many files, spread over all of them.
+        Maximum number of files, spread evenly over all of them.
 
     Returns
     -------
     dict
-        ``files``, ``reads`` of them, those that were ``taken``, that ``failed`` with a traceback, and ``crashes``; the
-        slowest and the largest of them.
+        ``files``; ``reads`` of them; reads that were ``taken``, or that ``failed`` with a traceback; ``crashes``; and
+        the maximum time and memory of a read.
     """
     options = [] if count is None else [f"--count={count}"]
     command = [sys.executable, "-m", "ertis_bench.network.hostile_reads", str(folder), *options]
     ran = subprocess.run(command, capture_output=True, text=True, check=False, timeout=3600.0)  # noqa: S603  our own
     if ran.returncode:
-        raise DataError(f"hostile files could not be tried; {(ran.stderr.strip().splitlines() or ['no word'])[-1]}")
+        raise DataError(f"hostile files could not be tried; {(ran.stderr.strip().splitlines() or ['no output'])[-1]}")
     found: Found = json.loads(ran.stdout)
     return found

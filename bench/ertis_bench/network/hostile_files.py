@@ -1,4 +1,7 @@
-"""Recordings that commands must refuse: links, foreign data, rows that are not there, odd types, endless settings."""
+"""Recordings that commands must refuse.
+
+They contain links, foreign data, missing rows, unexpected types and excessive settings.
+"""
 
 import shutil
 from collections.abc import Callable, Iterator
@@ -31,15 +34,15 @@ _ROWS: Final = 10**8
 
 @dataclass(frozen=True, slots=True)
 class HostileFile:
-    """A recording that is spoiled.
+    """Recording with a defect.
 
     Attributes
     ----------
     name : str
     spoil : callable
-        Called with the open file and its path, a copy of a good one.
+        Adds the defect. Called with the open file, which is a copy of a valid one, and its path.
     harmless_to : tuple of str
-        Commands that may take it, as they read none of it.
+        Commands that may accept the file, because they do not read the defect.
     """
 
     name: str
@@ -47,14 +50,14 @@ class HostileFile:
     harmless_to: tuple[str, ...] = ()
 
     def make(self, good: Path, path: Path) -> None:
-        """Write it."""
+        """Write the file."""
         shutil.copy(good, path)
         with h5py.File(path, "r+", libver=("v110", "v110")) as file:
             self.spoil(file, path)
 
 
 def write_good(path: Path) -> Path:
-    """Write a recording of three measurements that nothing is wrong with."""
+    """Write a valid recording of three measurements."""
     rng = np.random.default_rng(1)
     words = rng.integers(0, 2**32, (3, 32_768), dtype=np.uint32)
     stamps = [
@@ -64,7 +67,7 @@ def write_good(path: Path) -> Path:
 
 
 def hostile_files() -> Iterator[HostileFile]:
-    """Yield all of them, those of one kind one after the other."""
+    """Yield all hostile files, grouped by kind."""
     for name in _READ:
         yield from _links(name)
         yield from _elsewhere(name)
@@ -76,7 +79,7 @@ def hostile_files() -> Iterator[HostileFile]:
     yield from _attributes()
     yield from _names()
     for name, text in hostile_texts():
-        if text.strip(b"\0"):  # HDF5 fills texts up with zeros
+        if text.strip(b"\0"):  # HDF5 pads strings with zeros.
             yield HostileFile(f"settings: {name}", _settings(text))
 
 
@@ -93,7 +96,7 @@ def _replace(file: h5py.File, name: str, data: Any, **options: Any) -> h5py.Data
 
 
 def _move(file: h5py.File, name: str, put: Callable[[str], Any]) -> None:
-    """Move a variable out of the way, and put something in its place."""
+    """Rename a variable, and put another object in its place."""
     file.move(f"{_GROUP}/{name}", "moved")
     file[f"{_GROUP}/{name}"] = put("/moved")
 
@@ -213,7 +216,7 @@ def _unwritten(*names: str) -> Callable[[h5py.File, Path], None]:
     return spoil
 
 
-def _flat(name: str, shape: tuple[int, ...]) -> Callable[[h5py.File, Path], None]:
+def _of_shape(name: str, shape: tuple[int, ...]) -> Callable[[h5py.File, Path], None]:
     """Return a function that creates a variable of a shape without writing it."""
 
     def spoil(file: h5py.File, _: Path) -> None:
@@ -236,12 +239,14 @@ def _sizes() -> Iterator[HostileFile]:
     for name in ("time", "crc32", "temperature", "pdm", "gap_first", "gap_reason"):
         yield HostileFile(f"rows: {_ROWS:,} of {name}", _unwritten(name))
     for name in ("call", "microphone", "microphone_position", "calibration_gain"):
-        yield HostileFile(f"shape: {name} of a billion", _flat(name, (10**9, 3)[: 1 + (name == "microphone_position")]))
-        yield HostileFile(f"shape: {name} of four axes", _flat(name, (10, 10, 10, 10)))
-    yield HostileFile("shape: pdm of 1 TB", _flat("pdm", (10**6, 2**18)))
-    yield HostileFile("shape: pdm of no rows", _flat("pdm", (0, 32_768)))
-    yield HostileFile("shape: pdm of rows without samples", _flat("pdm", (3, 0)))
-    yield HostileFile("shape: settings of a million", _flat("settings", (10**6,)))
+        yield HostileFile(
+            f"shape: {name} of a billion", _of_shape(name, (10**9, 3)[: 1 + (name == "microphone_position")])
+        )
+        yield HostileFile(f"shape: {name} of four axes", _of_shape(name, (10, 10, 10, 10)))
+    yield HostileFile("shape: pdm of 1 TB", _of_shape("pdm", (10**6, 2**18)))
+    yield HostileFile("shape: pdm of no rows", _of_shape("pdm", (0, 32_768)))
+    yield HostileFile("shape: pdm of rows without samples", _of_shape("pdm", (3, 0)))
+    yield HostileFile("shape: settings of a million", _of_shape("settings", (10**6,)))
     yield HostileFile("compressed: 3 GB of zeros", _bomb)
     for n_bytes in (262_145, 10**6, 2**28):
         yield HostileFile(f"settings: text of {n_bytes:,} bytes", _long_settings(n_bytes))
@@ -295,7 +300,7 @@ def _names() -> Iterator[HostileFile]:
         return lambda file, _: file.move(_GROUP, f"sensors/{name}")
 
     def shared(file: h5py.File, _: Path) -> None:
-        """Hold the same rows under many names, each of which takes as long to read."""
+        """Store the same rows under many names. Each name takes the full time to read."""
         for number in range(200):
             made = file.create_group(f"sensors/s{number}")
             for name, dataset in file[_GROUP].items():

@@ -1,4 +1,7 @@
-"""Hello messages that a central node must refuse: settings that are too long, too deep, too large, or name files."""
+"""Hello messages that a central node must refuse.
+
+Their settings are too long, too deep or too large, or they name files.
+"""
 
 import zlib
 from collections.abc import Iterator
@@ -49,7 +52,7 @@ _LAYOUTS: Final = (
 
 @dataclass(frozen=True, slots=True)
 class HostileHello:
-    """A message that must be refused.
+    """Hello message that must be refused.
 
     Attributes
     ----------
@@ -64,13 +67,13 @@ class HostileHello:
 
 
 def hello_header(text: bytes, **changes: Any) -> bytes:
-    """Return the header of a hello whose settings are ``text``."""
+    """Return the header of a hello message whose settings are ``text``."""
     fields = {"sensor": "bad", "session_id": 1, "next_sequence": 0, "settings_crc32": zlib.crc32(text)} | changes
     return _MAGIC + msgspec.msgpack.encode({"kind": "hello"} | fields)
 
 
 def hostile_hellos() -> Iterator[HostileHello]:
-    """Yield all of them, the cheap ones and the expensive ones mixed."""
+    """Yield all hostile hello messages, with cheap and expensive ones mixed."""
     for name, text in hostile_texts():
         yield HostileHello(name, hello_header(text), (text,))
     good = _GOOD.to_toml().encode()
@@ -97,7 +100,7 @@ def hostile_hellos() -> Iterator[HostileHello]:
 
 
 def hostile_texts() -> Iterator[tuple[str, bytes]]:
-    """Yield names and settings that no node and no file may have."""
+    """Yield names and settings that are invalid in every message and file."""
     for name, text in _texts():
         yield name, text.encode("utf-8", "surrogatepass")
     yield "bytes: not UTF-8", b"\xff\xfe" * 1000
@@ -137,7 +140,7 @@ def _texts() -> Iterator[tuple[str, str]]:
 
 
 def _shapes() -> Iterator[tuple[str, str]]:
-    """Yield texts whose length, lines, depth or keys keep a parser busy."""
+    """Yield texts whose length, lines, depth or keys make parsing slow."""
     end = "bogus = 1\n"
     for count in (1_000, 25_000, _MAX - 20):
         yield f"lines: {count} blank ones", "\n" * count + end

@@ -1,7 +1,6 @@
 """Commands that read hostile files, each in a forked process: ``python -m ertis_bench.network.hostile_reads FOLDER``.
 
-A process that has loaded all that commands need is forked for each of them, so that time and memory are those of the
-command alone.
+The parent has imported all modules. Time and memory of each fork are therefore those of the command alone.
 """
 
 import argparse
@@ -36,7 +35,7 @@ class _Read(NamedTuple):
 
 
 def main() -> None:
-    """Try the files and print the results as JSON."""
+    """Try the files, and print the results as JSON."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--count", type=int)
@@ -44,7 +43,7 @@ def main() -> None:
     for name in _LOADED:
         importlib.import_module(name)
     good = write_good(given.folder / "good.h5")
-    _warm(good, given.folder)
+    _check_valid_file(good, given.folder)
     floor = {
         command: _read(command, given.folder / "nothing.h5", given.folder) for command in ("verify", "info", "process")
     }
@@ -55,12 +54,15 @@ def main() -> None:
     print(json.dumps(_summary(chosen, reads)))  # noqa: T201  read by who started it
 
 
-def _warm(good: Path, folder: Path) -> None:
-    """Check that the good file is accepted; lazily loaded modules stay out of the parent."""
+def _check_valid_file(good: Path, folder: Path) -> None:
+    """Check that the commands accept the valid file.
+
+    The check runs in forks, so that lazily imported modules stay out of the parent.
+    """
     for command in ("verify", "info"):
         read = _read(command, good, folder)
         if read.code:
-            raise SystemExit(f"ertis {command} of the file that is sound ended with {read.code}: {read.stated}")
+            raise SystemExit(f"ertis {command} of the valid file ended with {read.code}: {read.stated}")
 
 
 def _reads(each: HostileFile, good: Path, folder: Path, floor: dict[str, _Read]) -> list[dict[str, Any]]:
@@ -86,14 +88,14 @@ def _reads(each: HostileFile, good: Path, folder: Path, floor: dict[str, _Read])
 
 
 def _read(command: str, path: Path, folder: Path) -> _Read:
-    """Run a command on a file in a process of its own."""
+    """Run a command on a file in a forked process."""
     stated, out = folder / "said.txt", folder / "image.h5"
     out.unlink(missing_ok=True)
     arguments = ["ertis", command, str(path), *(["-o", str(out), "--quiet"] if command == "process" else [])]
     begun_s = time.monotonic()
     pid = os.fork()
     if not pid:
-        _become(arguments, stated)
+        _run_in_this_process(arguments, stated)
     _, status, usage = os.wait4(pid, 0)
     took_s = time.monotonic() - begun_s
     lines = stated.read_text(errors="replace").strip().splitlines()
@@ -108,8 +110,8 @@ def _read(command: str, path: Path, folder: Path) -> _Read:
     )
 
 
-def _become(arguments: list[str], stated: Path) -> None:
-    """Run a command in this process, and end it."""
+def _run_in_this_process(arguments: list[str], stated: Path) -> None:
+    """Run a command in this process, and exit."""
     code = 70
     try:
         signal.signal(signal.SIGALRM, signal.SIG_DFL)

@@ -1,4 +1,4 @@
-"""A cable between nodes that loses, repeats and delays whole messages, or goes dead, and tells nobody."""
+"""Proxy between nodes that loses, repeats and delays whole messages, or goes silent without notice to either end."""
 
 import contextlib
 import random
@@ -15,13 +15,13 @@ __all__ = ["ACKS", "Direction", "Meddler", "Odds"]
 
 Direction = Literal["to target", "from target"]
 _READ_BYTES: Final = 262_144
-_HEAD_BYTES: Final = 26  # of a message of CURVE: its length, command, and nonce
+_HEAD_BYTES: Final = 26  # length, command and nonce of a CURVE message
 _SHARE_OF_HEAD: Final = 0.25
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Odds:
-    """Effects on a kind of message: shares that are lost, repeated, and delayed, by up to ``max_s``."""
+    """Effects on one kind of message: shares that are lost, repeated, and delayed by up to ``max_s``."""
 
     lose: float = 0.0
     repeat: float = 0.0
@@ -30,7 +30,7 @@ class Odds:
 
 
 ACKS: Final = {"ack": Odds(lose=0.25, repeat=0.25, delay=0.25), "welcome": Odds(lose=0.1, repeat=0.1)}
-"""Acks are lost, repeated and overtake each other."""
+"""Odds with which acknowledgements are lost, repeated and reordered."""
 
 
 class Meddler:
@@ -39,17 +39,17 @@ class Meddler:
     Parameters
     ----------
     target : str
-        ``tcp://HOST:PORT``. Odds apply to a node without keys only, whose messages can be read.
+        ``tcp://HOST:PORT``. Odds apply only to a node without keys, because other messages cannot be read.
     seed : int
     odds : mapping of str to Odds
-        By the kind of a message.
+        Effects by kind of message.
 
     Attributes
     ----------
     address : str
-        For those who are to reach the target.
+        Address to which clients of the target connect.
     did : Counter of str
-        What was done, such as ``ack lose``.
+        Numbers of effects by name, such as ``ack lose``.
     """
 
     def __init__(self, target: str, *, seed: int = 0, odds: Mapping[str, Odds] | None = None) -> None:
@@ -65,7 +65,7 @@ class Meddler:
         threading.Thread(target=self._accept, daemon=True).start()
 
     def cut(self) -> None:
-        """Pass nothing on, and tell nobody, as a cable that is pulled out does."""
+        """Forward nothing, without notice to either end, as an unplugged cable."""
         self._plugged.clear()
 
     def mend(self) -> None:
@@ -79,14 +79,14 @@ class Meddler:
                 each.shutdown(socket.SHUT_RDWR)
 
     def flip(self, direction: Direction) -> None:
-        """Flip a bit of the next message that goes in a direction; ``did`` counts it."""
+        """Flip a bit of the next message in a direction. ``did`` counts it."""
         self._flips[direction] += 1
 
     def _accept(self) -> None:
         while True:
             try:
                 near, _ = self._server.accept()
-            except OSError:  # it is closed
+            except OSError:  # The socket is closed.
                 return
             if not self._plugged.is_set():
                 near.close()
@@ -102,13 +102,13 @@ class Meddler:
                 (near, far, "to target"),
                 (far, near, "from target"),
             )
-            for end in (near, far):  # before a thread may close them
+            for end in (near, far):  # Shut the sockets down before a thread may close them.
                 end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             for way in ways:
                 threading.Thread(target=self._relay, args=way, daemon=True).start()
 
     def _relay(self, source: socket.socket, sink: socket.socket, direction: Direction) -> None:
-        """Pass on one direction of a connection until it ends."""
+        """Forward one direction of a connection until it ends."""
         frames, greeted, body, turn = ZmtpFrameParser(), 0, list[ZmtpFrame](), threading.Lock()
         with contextlib.suppress(OSError):
             while data := source.recv(_READ_BYTES):
@@ -153,7 +153,7 @@ class Meddler:
         _send(sink, data, turn)
 
     def _flipped(self, data: bytes) -> bytes:
-        """Return a message with one bit flipped: of its head in a quarter of the cases, anywhere otherwise."""
+        """Return a message with one flipped bit, in its head in a quarter of the cases, and anywhere otherwise."""
         head = min(len(data), _HEAD_BYTES) if self._random.random() < _SHARE_OF_HEAD else len(data)
         place = self._random.randrange(8 * head)
         flipped = bytearray(data)
@@ -170,7 +170,7 @@ class Meddler:
 
 
 def _kind(header: bytes) -> str:
-    """Return which message a header is of, empty where it is none."""
+    """Return the kind of message to which a header belongs, or an empty string if there is none."""
     _, found, rest = header.partition(b"\xa4kind")
     return rest[1 : 1 + (rest[0] & 0x1F)].decode() if found and rest else ""
 
@@ -182,7 +182,7 @@ def _later(delay_s: float, sink: socket.socket, data: bytes, turn: threading.Loc
 
 
 def _send(sink: socket.socket, data: bytes, turn: threading.Lock) -> None:
-    """Send in one piece; messages that cannot be sent any more are lost."""
+    """Send data in one piece. Messages to a closed socket are lost."""
     if not data:
         return
     with turn, contextlib.suppress(OSError):

@@ -1,8 +1,8 @@
-"""Comparison of the sent measurements, from the senders' logs, with those that readers of recordings return.
+"""Comparison of sent measurements, according to the senders' diaries, with those that readers of recordings return.
 
-A sender writes a line before and after it hands a measurement over, and whenever it is told what is settled. The file
-is opened to append, so that it holds what was written whatever ends the sender. Nothing here knows of journals, acks or
-ledgers: the words of every measurement are read by `open_recording`, and their CRC-32 is made anew.
+A sender writes a line before and after it hands a measurement over, and for every acknowledgement. The file is opened
+for appending, so that its lines survive any end of the sender. The comparison is independent of journals,
+acknowledgements and ledgers: `open_recording` reads the words of every measurement, and their CRC-32 is recomputed.
 """
 
 import json
@@ -20,7 +20,7 @@ from ertis_numba.storage import RecordingGap, open_recording, sensor_names
 
 __all__ = ["Archived", "Sent", "compare", "note", "read_diaries", "read_folder"]
 
-_UNTOLD: Final = "not among the measurements given"  # what a recording says of numbers that nobody has explained
+_UNEXPLAINED: Final = "not among the measurements given"  # reason in recordings for unexplained gaps
 
 
 @dataclass(slots=True)
@@ -30,18 +30,19 @@ class Sent:
     Attributes
     ----------
     offered : dict of DiaryKey to Row
-        All that may be there.
+        All measurements that may be stored.
     arrived_ns : dict of DiaryKey to int
-        When all of it was there, at the sender.
+        Time at which the whole measurement was at the sender.
     kept : set of DiaryKey
-        What was accepted.
-    acked_through : dict of (sensor, epoch) to int
-        The highest number that was acked, and all before it.
+        Accepted measurements.
+    acked_through : dict of (sensor, session_id) to int
+        Number up to which all measurements were acknowledged.
     acked_ns : dict of DiaryKey to int
-        When the first ack that covers it came.
+        Time of the first acknowledgement that covers the measurement.
     statuses : Counter of str
-        Acks by what they mean.
+        Numbers of acknowledgements by status.
     dropped : dict of DiaryKey to str
+        Reasons of discarded measurements.
     """
 
     offered: dict[DiaryKey, Row] = field(default_factory=dict)
@@ -53,11 +54,11 @@ class Sent:
     dropped: dict[DiaryKey, str] = field(default_factory=dict)
 
     def acked(self) -> set[DiaryKey]:
-        """Return the measurements that were acked."""
+        """Return the measurements that were acknowledged."""
         return {key for key in self.kept if key.sequence <= self.acked_through.get((key.sensor, key.session_id), -1)}
 
     def ack_times_ms(self) -> list[float]:
-        """Return how long each ack took, from the arrival of the measurement at the sender."""
+        """Return the time of each acknowledgement after the arrival of the measurement at the sender, in ms."""
         return sorted((at_ns - self.arrived_ns[key]) / 1e6 for key, at_ns in self.acked_ns.items())
 
 
@@ -72,7 +73,7 @@ def read_diaries(paths: Iterable[Path]) -> Sent:
 
 
 def note(sent: Sent, what: str, sensor: str, session_id: int, number: int, *rest: int | str) -> None:
-    """Take note of one line of a diary."""
+    """Add one line of a diary to ``sent``."""
     key = DiaryKey(sensor, session_id, number)
     match what, rest:
         case "offered", (int(crc32), int(sync_count), int(timestamp_ns), int(monotonic_ns)):
@@ -99,10 +100,10 @@ class Archived:
     Attributes
     ----------
     rows : dict of DiaryKey to list of Row
-        More than one where something was stored twice.
-    gaps : dict of (sensor, epoch) to list of Gap
+        Stored measurements. A list has more than one row if a measurement was stored twice.
+    gaps : dict of (sensor, session_id) to list of Gap
     recordings, broken, left_over : list of str
-        Names of files: those that were read; those that could not be; those that ought to be gone.
+        Names of files: recordings that were read, unreadable recordings, and files that should have been removed.
     """
 
     rows: dict[DiaryKey, list[Row]] = field(default_factory=lambda: defaultdict(list))
@@ -112,17 +113,17 @@ class Archived:
     left_over: list[str] = field(default_factory=list)
 
     def reason(self, key: DiaryKey) -> str | None:
-        """Return why a measurement is missing, None where no recording tells."""
+        """Return the reason why a measurement is missing, or None if no recording states one."""
         reasons = [
             gap.reason
             for gap in self.gaps.get((key.sensor, key.session_id), ())
             if gap.first <= key.sequence <= gap.last
         ]
-        return next((reason for reason in reasons if reason != _UNTOLD), None)
+        return next((reason for reason in reasons if reason != _UNEXPLAINED), None)
 
 
 def read_folder(folder: Path) -> Archived:
-    """Read all recordings of a folder, every word of them."""
+    """Read all recordings of a folder, including every word."""
     found = Archived()
     for path in sorted(folder.iterdir()):
         if path.suffix != ".h5":
@@ -150,22 +151,22 @@ def _measurements(path: Path, found: Archived) -> Iterator[tuple[str, Measuremen
 
 
 def compare(sent: Sent, archived: Archived, promised: AbstractSet[DiaryKey]) -> dict[str, int]:
-    """Return the differences.
+    """Return the differences between sent and stored measurements.
 
     Parameters
     ----------
     sent : Sent
     archived : Archived
     promised : set of DiaryKey
-        What has to be there, such as all that was acked.
+        Measurements that must be stored, such as all acknowledged ones.
 
     Returns
     -------
     dict of str to int
-        ``promised`` and ``stored``. Then what ought to be 0: of what was promised, ``lost`` without a word, and
-        ``missing`` with a reason reported; ``wrong``, with other words or another time than were sent; ``twice``;
-        ``unexpected``, never sent; ``silent``, numbers below the highest of a run that neither are there nor told to be
-        missing; ``broken`` recordings; files ``left_over``.
+        ``promised`` and ``stored``, and counts that must be 0. Of the promised measurements: ``lost`` without a reason,
+        and ``missing`` with a reason. Of the stored ones: ``wrong``, with other words or another time than sent;
+        ``twice``; and ``unexpected``, never sent. ``silent``, numbers below the highest of a session that are neither
+        stored nor reported as missing. ``broken`` recordings, and files ``left_over``.
     """
     rows = archived.rows
     absent = {key: archived.reason(key) for key in promised if key not in rows}

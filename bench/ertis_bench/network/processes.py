@@ -1,4 +1,4 @@
-"""Processes that speak: they are started, listened to, killed, and looked for when they ought to be gone."""
+"""Child processes that report events: start, wait for events, kill, and search for survivors."""
 
 import contextlib
 import json
@@ -20,7 +20,7 @@ from ertis_numba.errors import DataError
 __all__ = ["ERTIS", "JsonLinesProcess", "ask", "central", "free_address", "survivors", "until"]
 
 ERTIS: Final = (sys.executable, "-m", "ertis_cli")
-_WAIT_S: Final = 60.0  # for anything that ought to happen by itself
+_WAIT_S: Final = 60.0  # time limit for events that need no further action
 _MARK: Final = "ERTIS_BENCH_MARK"
 _PAGE_BYTES: Final = os.sysconf("SC_PAGE_SIZE") if hasattr(os, "sysconf") else 4096
 _TICKS_PER_S: Final = os.sysconf("SC_CLK_TCK") if hasattr(os, "sysconf") else 100
@@ -28,27 +28,27 @@ Event = dict[str, Any]
 
 
 class JsonLinesProcess:
-    """A process that reports events as lines of JSON on stdout; use it in a ``with`` statement.
+    """Process that reports events as lines of JSON on stdout; use it in a ``with`` statement.
 
     Parameters
     ----------
     command : sequence of str
     stated : Path
-        Where what it says on stderr is appended.
+        File to which stderr is appended.
     mark : str
-        By which `survivors` finds it, and what it has started.
+        Mark by which `survivors` finds the process and its children.
 
     Attributes
     ----------
     events : list of dict
-        What it has told so far.
+        Events so far.
     """
 
     def __init__(self, command: Sequence[str], *, stated: Path, mark: str = "") -> None:
         paths = os.pathsep.join(filter(None, sys.path))
         environment = os.environ | {"PYTHONPATH": paths, _MARK: mark or secrets.token_hex(4)}
         self.events: list[Event] = []
-        self._reported_names = stated
+        self._stderr_path = stated
         self._news = threading.Condition()
         with stated.open("ab") as stderr:
             self._process = subprocess.Popen(  # noqa: S603  this very package
@@ -68,7 +68,7 @@ class JsonLinesProcess:
         for line in self._process.stdout or ():
             try:
                 event = json.loads(line)
-            except ValueError:  # a process that is killed may have told half of it
+            except ValueError:  # A killed process may leave a truncated line.
                 continue
             with self._news:
                 self.events.append(event)
@@ -77,12 +77,12 @@ class JsonLinesProcess:
             self._news.notify_all()
 
     def wait_for(self, name: str, *, timeout_s: float = _WAIT_S, since: int = 0) -> Event:
-        """Return the first event of a name, of those after the first ``since``.
+        """Return the first event with a name, after skipping ``since`` of them.
 
         Raises
         ------
         DataError
-            It did not come.
+            The event did not arrive in time.
         """
         end_s = time.monotonic() + timeout_s
         with self._news:
@@ -94,19 +94,20 @@ class JsonLinesProcess:
                 if ended or not self._news.wait(min(0.5, max(0.0, end_s - time.monotonic()))):
                     if not ended and time.monotonic() < end_s:
                         continue
-                    raise DataError(f"no event {name!r} came of {self._reported_names.stem}; {self.last_words()}")
+                    raise DataError(f"event {name!r} of {self._stderr_path.stem} did not arrive; {self.last_words()}")
 
     def last_words(self) -> str:
-        """Return how it is, and the last line that it has said."""
-        if not self._listener.is_alive():  # it has closed its stdout, and so will have ended in a moment
+        """Return the state of the process, and the last line of its stderr."""
+        if not self._listener.is_alive():  # The process has closed its stdout, and so is about to end.
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._process.wait(1.0)
         code = self._process.poll()
-        stated = self._reported_names.read_text(errors="replace").strip().splitlines()
-        return f"it {'runs' if code is None else f'ended with {code}'}, saying {stated[-1] if stated else 'nothing'!r}"
+        lines = self._stderr_path.read_text(errors="replace").strip().splitlines()
+        state = "runs" if code is None else f"ended with {code}"
+        return f"the process {state}; the last line of its stderr is {lines[-1] if lines else ''!r}"
 
     def ends_within(self, time_s: float) -> bool:
-        """Wait for some time, and return whether it has ended."""
+        """Wait for some time, and return True if the process has ended."""
         try:
             self._process.wait(time_s)
         except subprocess.TimeoutExpired:
@@ -114,54 +115,54 @@ class JsonLinesProcess:
         return True
 
     def kill(self) -> None:
-        """Kill it, as by kill -9: whatever it has started is not touched."""
+        """Kill the process with SIGKILL. Its children continue."""
         self._process.kill()
         self.wait()
 
     def signal(self, number: int) -> None:
-        """Send it a signal, unless it has ended."""
+        """Send a signal to the process, unless it has ended."""
         self._process.send_signal(number)
 
     def stop(self, *, timeout_s: float = _WAIT_S) -> int:
-        """Ask it to end, and return its exit code."""
+        """Ask the process to end, and return its exit code."""
         self.signal(signal.SIGTERM)
         return self.wait(timeout_s=timeout_s)
 
     def wait(self, *, timeout_s: float = _WAIT_S) -> int:
-        """Wait until it has ended by itself, and return its exit code.
+        """Wait until the process has ended, and return its exit code.
 
         Raises
         ------
         DataError
-            It does not end.
+            The process does not end in time.
         """
         try:
             code = self._process.wait(timeout_s)
         except subprocess.TimeoutExpired as error:
-            raise DataError(f"{self._reported_names.stem} does not end within {timeout_s:g} s") from error
+            raise DataError(f"{self._stderr_path.stem} does not end within {timeout_s:g} s") from error
         self._listener.join(timeout_s)
         return code
 
     @property
     def running(self) -> bool:
-        """True until it has ended."""
+        """True until the process has ended."""
         return self._process.poll() is None
 
     @property
     def node_pid(self) -> int:
-        """Process that does the work: the latest child of a supervisor, as its events name it."""
+        """Process id of the working process, which is the latest child of a supervisor according to its events."""
         with self._news:
             return next((each["pid"] for each in reversed(self.events) if each.get("event") == "listening"), self.pid)
 
     @property
     def restarts(self) -> int:
-        """Processes of a central node that its supervisor has replaced."""
+        """Number of processes of a central node that its supervisor has replaced."""
         with self._news:
             return sum(each.get("event") == "restarted" for each in self.events)
 
     @property
     def memory_bytes(self) -> int:
-        """Resident memory; 0 if unknown."""
+        """Resident memory in bytes, or 0 if unknown."""
         try:
             pages = Path(f"/proc/{self.node_pid}/statm").read_text("ascii").split()[1]
         except (OSError, IndexError):
@@ -170,7 +171,7 @@ class JsonLinesProcess:
 
     @staticmethod
     def cpu_s_of(pid: int) -> float:
-        """Return the processor time that a process has taken, without its children; 0 where that cannot be told."""
+        """Return the processor time of a process without its children in seconds, or 0 if it is unknown."""
         try:
             fields = Path(f"/proc/{pid}/stat").read_text("ascii").rpartition(")")[2].split()
         except OSError:
@@ -187,7 +188,8 @@ class JsonLinesProcess:
             self._process.kill()
         self._process.wait()
         self._listener.join(_WAIT_S)
-        if self._process.stdout is not None and not self._listener.is_alive():  # to close it would wait for the reader
+        # Closing the pipe would otherwise wait for the reader.
+        if self._process.stdout is not None and not self._listener.is_alive():
             self._process.stdout.close()
 
 
@@ -200,20 +202,20 @@ def central(
     max_lines: int | None = None,
     busy: bool = False,
 ) -> JsonLinesProcess:
-    """Start ``ertis record`` or ``ertis serve``, with errors in ``central.txt`` of a folder.
+    """Start ``ertis record`` or ``ertis serve``, with stderr in ``central.txt`` of a folder.
 
     Parameters
     ----------
     command : {"record", "serve"}
     folder : Path
-        Of the harness.
+        Folder of the trial.
     *options : str
     listen : str
     mark : str
     max_lines : int, optional
-        Of its code, after which it is killed.
+        Number of lines of its code after which the process is killed.
     busy : bool
-        SIGUSR1 holds its loop, see `ertis_bench.network.busy`.
+        If True, SIGUSR1 blocks its event loop, see `ertis_bench.network.busy`.
     """
     ertis = ERTIS if max_lines is None else (sys.executable, "-m", "ertis_bench.network.trap", str(max_lines))
     if busy:
@@ -223,13 +225,13 @@ def central(
 
 
 def free_address() -> str:
-    """Return an address of this machine that nobody listens at, for nodes that are started again and again."""
+    """Return a free address of this machine, for nodes that are restarted at the same address."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         return f"tcp://127.0.0.1:{server.getsockname()[1]}"
 
 
 def ask(*arguments: str) -> "subprocess.CompletedProcess[str]":
-    """Run an ``ertis`` command to its end."""
+    """Run an ``ertis`` command until it ends."""
     command = [*ERTIS, *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=False, timeout=600.0)  # noqa: S603
 
@@ -242,13 +244,13 @@ def survivors(mark: str) -> dict[int, str]:
         try:
             if wanted in (folder / "environ").read_bytes().split(b"\0"):
                 found[int(folder.name)] = (folder / "cmdline").read_bytes().replace(b"\0", b" ").decode().strip()
-        except OSError:  # it has ended meanwhile
+        except OSError:  # The process has ended meanwhile.
             continue
-    return {pid: line for pid, line in found.items() if line}  # without a command line: it has ended
+    return {pid: line for pid, line in found.items() if line}  # A process without a command line has ended.
 
 
 def until(holds: Callable[[], bool], *, timeout_s: float = _WAIT_S, every_s: float = 0.02) -> bool:
-    """Wait until something holds, and return whether it does."""
+    """Wait until ``holds`` returns True, and return False after a timeout."""
     end_s = time.monotonic() + timeout_s
     while not holds():
         if time.monotonic() > end_s:

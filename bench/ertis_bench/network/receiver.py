@@ -1,4 +1,4 @@
-"""An application that looks at every image, and keeps a diary: ``python -m ertis_bench.network.receiver JOB``."""
+"""Application that checks every image, and writes a diary: ``python -m ertis_bench.network.receiver JOB``."""
 
 import json
 import os
@@ -22,9 +22,10 @@ from ertis_numba.network.subscriber import Subscriber
 __all__ = ["STEP", "Received", "ReceiverJob", "read_received"]
 
 STEP: Final = 61
-"""Every so manieth value of an image is compared with the right one, in all of its rows and columns in turn."""
+"""Distance of compared values. One value in 61 is compared, so that all rows and columns are covered in turn."""
 
-_TOLERANCE: Final = 0.1  # of the largest value: each process chooses its own plan; other measurements are far beyond
+# Relative to the largest value. Each process chooses its own plan, and images of other measurements differ far more.
+_TOLERANCE: Final = 0.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,9 +38,9 @@ class ReceiverJob:
     products : tuple of str
     keys : (path of a secret, public key of the central node), optional
     expected : str, optional
-        File of what images of some measurements should be, in turn, by `serving.expected_of`.
+        File of expected images, written by `serving.expected_of`. Measurements use them in turn.
     waits_s : float
-        How long it does something else after each product.
+        Pause after each product, as for other work.
     credit : int
     """
 
@@ -56,7 +57,7 @@ class ReceiverJob:
         return replace(self, **changes)
 
     def start(self, *, mark: str = "") -> JsonLinesProcess:
-        """Start it; its stderr goes to a file beside its diary."""
+        """Start the receiver. Its stderr goes to a file beside its diary."""
         command = [sys.executable, "-m", "ertis_bench.network.receiver", json.dumps(asdict(self))]
         return JsonLinesProcess(command, stated=Path(self.diary).with_suffix(".txt"), mark=mark)
 
@@ -68,13 +69,13 @@ class Received:
     Attributes
     ----------
     times_ms : dict of DiaryKey to float
-        From the arrival of each measurement at the sensor node to its image in the receiver's hands.
+        Time from the arrival of each measurement at the sensor node until the receiver has its image.
     twice, disordered, wrong : int
-        Images that came again; whose number does not rise; that are not what they should be.
+        Images that came again, images whose number does not rise, and images with wrong values.
     numbers : list of int
-        Of all products.
+        Numbers of all products.
     dropped : int
-        As the publisher told with the last one.
+        Number of dropped products, as the publisher reported it with the last one.
     """
 
     times_ms: dict[DiaryKey, float] = field(default_factory=dict)
@@ -86,7 +87,7 @@ class Received:
 
     @property
     def unrecorded(self) -> int:
-        """Numbers that were left out and not told to be dropped, or the other way round."""
+        """Difference between the number of missing products and the reported number of dropped ones."""
         return abs(max(self.numbers, default=-1) + 1 - len(self.numbers) - self.dropped)
 
 
@@ -128,7 +129,7 @@ class _Expected:
 
 
 def main(look: ReceiverJob) -> None:
-    """Receive until SIGTERM comes, or for ever."""
+    """Receive until SIGTERM."""
     keys = None if look.keys is None else ClientKeys(pair=KeyPair.load(Path(look.keys[0])), server=look.keys[1])
     expected = None if look.expected is None else _Expected.load(look.expected)
     diary = os.open(look.diary, os.O_CREAT | os.O_APPEND | os.O_WRONLY, 0o644)

@@ -1,7 +1,7 @@
-"""A sensor node that measures nothing, but keeps a diary: ``python -m ertis_bench.network.sender JOB``.
+"""Sensor node without a sensor that writes a diary: ``python -m ertis_bench.network.sender JOB``.
 
-It hands measurements to a `SensorNode` as a capture does, and writes in its diary what it hands over, what was taken,
-and what it is told to be settled.
+It hands measurements to a `SensorNode` as a capture does. Its diary contains the measurements that it hands over, those
+that the node accepts, and the acknowledgements.
 """
 
 import json
@@ -35,7 +35,7 @@ SETTINGS: Final = Settings()
 SMALL: Final = Settings(
     recording=Recording(n_samples=32_768), processing=Processing(directions="2d:9", range_m=(0.3, 1.0))
 )
-"""Measurements of 131 kB, from which an image can be made in no time."""
+"""Settings of measurements of 131 kB, from which images are computed quickly."""
 
 _SYNC_OF_FIRST: Final = 1000
 
@@ -49,31 +49,31 @@ class SenderJob:
     address, diary : str
     sensors : tuple of str
     rate_hz : float
-        Of each sensor; all of them measure at the same time.
+        Rate of each sensor. All sensors measure at the same time.
     count : int, optional
-        Measurements of each sensor; until it is ended by default.
+        Measurements of each sensor. By default, the sender runs until it is stopped.
     seed : int
-        Of the words.
+        Seed of the words.
     small : bool
-        Measurements of `SMALL` rather than of `SETTINGS`.
+        Settings are `SMALL` instead of `SETTINGS`.
     spool : str, optional
     ring_bytes, spool_bytes : int, optional
     keys : (path of a secret, public key of the central node), optional
     patience_s : float
-        How long it waits at its end until all is settled.
+        Time limit for the last acknowledgements.
     words : str, optional
-        File of the words of some measurements, which are sent in turn; noise that is never the same by default.
+        File with the words of some measurements, which are sent in turn. By default, each measurement has new noise.
     first_pulse, begins_ns : int, optional
         SYNC count and timestamp of the first measurement.
     lost_pulse, double_pulse : int, optional
-        A pulse that the sensors do not see, so that they measure nothing and count one too few from then on; one that
-        they count twice, so that a number is left out.
+        Pulse that the sensors miss, so that they measure nothing and count one pulse too few from then on; and pulse
+        that they count twice, so that a number is left out.
     clock_step : (number, seconds), optional
-        From which pulse on the clock is wrong, and by how much.
+        Pulse from which the clock is wrong, and its error.
     max_lines : int, optional
-        Of code of nodes and journals, after which it is killed.
+        Number of lines of code of nodes and journals after which the sender is killed.
     start_s : float, optional
-        When to begin, by `time.monotonic`.
+        Start time on the clock of `time.monotonic`.
     """
 
     address: str
@@ -102,21 +102,21 @@ class SenderJob:
         return replace(self, **changes)
 
     def sequence_of(self, pulse: int) -> int:
-        """Return the number of the measurement of a pulse."""
+        """Return the sequence number of a pulse's measurement."""
         missed = self.lost_pulse is not None and pulse > self.lost_pulse
         return pulse - missed + (self.double_pulse is not None and pulse >= self.double_pulse)
 
     def command(self) -> list[str]:
-        """Return the command that runs it."""
+        """Return the command that runs the sender."""
         return [sys.executable, "-m", "ertis_bench.network.sender", json.dumps(asdict(self))]
 
     def start(self, *, mark: str = "") -> JsonLinesProcess:
-        """Start it; its stderr goes to a file beside its diary."""
+        """Start the sender. Its stderr goes to a file beside its diary."""
         return JsonLinesProcess(self.command(), stated=Path(self.diary).with_suffix(".txt"), mark=mark)
 
 
 def words_of(base: NDArray[np.uint32], session_id: int, sequence: int) -> NDArray[np.uint32]:
-    """Return words that no other measurement has."""
+    """Return words that are unique to a measurement."""
     words = base.copy()
     words[:4] = sequence & 0xFFFFFFFF, sequence >> 32, session_id & 0xFFFFFFFF, session_id >> 32
     return words
@@ -133,7 +133,7 @@ class _Sender:
     reported: Counter[str] = field(default_factory=Counter)
 
     def acked_through(self, message: Any) -> None:
-        """Note an acknowledgement of the node."""
+        """Record an acknowledgement of the node."""
         now_ns = time.monotonic_ns()
         self.diary.acked_through(message.sensor, message.session_id, message.acked_through, message.status, now_ns)
         for sequence, reason in message.dropped:
@@ -141,11 +141,11 @@ class _Sender:
             self.reported[reason] += 1
 
     def note(self, *texts: str) -> None:
-        """Report a note of the node."""
+        """Report a message of the node."""
         _emit_event(event="note", text=": ".join(texts))
 
     def run(self, node: SensorNode) -> int:
-        """Send, and return how many pulses that took."""
+        """Send the measurements, and return the number of pulses."""
         job = self.job
         for sensor in job.sensors:
             node.add_sensor(sensor, self.settings, firmware="bench")
@@ -196,7 +196,7 @@ class _Sender:
         )
 
     def _entry(self, stamp: Stamp, words: NDArray[np.uint32]) -> JournalEntry:
-        """Return a measurement, once it stands in the diary."""
+        """Return a journal entry of a measurement, after the diary has recorded it."""
         measurement = Measurement(words, self.settings, stamp)
         row, now_ns = Row.of(measurement), time.monotonic_ns()
         entry = JournalEntry(measurement, monotonic_ns=now_ns)
@@ -218,7 +218,7 @@ def _stop(sender: _Sender, _number: int, _frame: FrameType | None) -> None:
 
 
 def main(job: SenderJob) -> None:
-    """Send until the count is reached or SIGTERM comes, then wait until all is settled."""
+    """Send until the count is reached or SIGTERM comes, then wait until all measurements are acknowledged."""
     options: dict[str, Any] = {
         name: value for name in ("ring_bytes", "spool_bytes") if (value := getattr(job, name)) is not None
     }

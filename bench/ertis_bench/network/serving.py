@@ -1,4 +1,4 @@
-"""A central node that processes images: its status, and a check of its sums."""
+"""Central node that processes images, its status, and a check of its counts."""
 
 import os
 import time
@@ -23,20 +23,20 @@ from ertis_numba.settings import Settings
 
 __all__ = ["Serve", "accounts", "expected_of", "percentile", "some_words"]
 
-_KINDS: Final = 5  # different measurements
+_N_MEASUREMENTS: Final = 5  # number of different measurements
 
 Found = dict[str, Any]
 
 
 def some_words(settings: Settings, path: Path, *, seed: int) -> Path:
     """Write the words of some measurements of noise into a file."""
-    shape = (_KINDS, settings.recording.n_samples)
+    shape = (_N_MEASUREMENTS, settings.recording.n_samples)
     np.save(path, np.random.default_rng(seed).integers(0, 2**32, shape, dtype=np.uint32))
     return path
 
 
 def expected_of(settings: Settings, words: NDArray[np.uint32], path: Path) -> Path:
-    """Write some values of the image of each measurement into a file, computed here and now."""
+    """Compute the image of each measurement in this process, and write a part of its values into a file."""
     pipeline = Pipeline(settings)
     images = [pipeline.process(Measurement(each, settings)).amplitude for each in words]
     n_values = images[0].size // STEP - 1
@@ -46,7 +46,7 @@ def expected_of(settings: Settings, words: NDArray[np.uint32], path: Path) -> Pa
 
 
 def percentile(times_ms: Sequence[float], share: float) -> float:
-    """Return a percentile, 0 of nothing."""
+    """Return a percentile, or 0 for an empty sequence."""
     ordered = sorted(times_ms)
     return round(ordered[round(share * (len(ordered) - 1))], 2) if ordered else 0.0
 
@@ -57,11 +57,11 @@ class Serve:
 
     Attributes
     ----------
-    node : Process
+    node : JsonLinesProcess
     listen, publish : str
     mark : str
     unbalanced : int
-        How often a status came in which what was received is not what was published, dropped and is under way.
+        Number of statuses in which received measurements differ from published, dropped and waiting ones.
     latest : Status or None
     """
 
@@ -77,7 +77,7 @@ class Serve:
     @classmethod
     @contextmanager
     def running(cls, folder: Path, *options: str, keys: ClientKeys | None = None) -> "Iterator[Serve]":
-        """Start it and yield it."""
+        """Start the node and yield it."""
         mark = f"serve{os.getpid()}{time.monotonic_ns()}"
         with central("serve", folder, "--publish", "tcp://127.0.0.1:*", *options, mark=mark) as node:
             listening = node.wait_for("listening")
@@ -85,7 +85,7 @@ class Serve:
                 yield cls(node, listening["address"], listening["publish"], mark, watcher)
 
     def look(self, *, timeout_s: float = 5.0) -> Status | None:
-        """Return the next status, None if none comes."""
+        """Return the next status, or None if none arrives in time."""
         status = self.watcher.receive(timeout_s)
         if status is not None:
             self.latest = status
@@ -96,7 +96,7 @@ class Serve:
         return status
 
     def settle(self, n_sent: int, *, timeout_s: float = 30.0) -> bool:
-        """Wait until all that was sent has become something, and return whether it has."""
+        """Wait until all sent measurements have been published or dropped. Return False after a timeout."""
         end_s = time.monotonic() + timeout_s
         while time.monotonic() < end_s:
             status = self.look()
@@ -107,15 +107,16 @@ class Serve:
 
 
 def accounts(serve: Serve, sent: Sent, received: Received) -> Found:
-    """Sum up the results of all measurements.
+    """Summarise the results of all measurements.
 
     Returns
     -------
     dict
-        ``received``, ``published`` and ``dropped`` as the central node says; ``images`` that an application has, and
-        those that were ``skipped`` for it. Then what ought to be 0: ``unbalanced``, see `Serve`; ``uncounted``,
-        measurements that the central node does not count; ``unrecorded``, images that neither came nor were told to be
-        skipped; and images that came ``twice``, ``disordered`` or ``wrong``, or of what was never sent (``foreign``).
+        ``received``, ``published`` and ``dropped``, as the central node counts them; ``images`` that an application
+        received, and images that were ``skipped`` for it. All other counts must be 0: ``unbalanced``, see `Serve`;
+        ``uncounted``, measurements that the central node did not count; ``untold``, images that neither arrived nor
+        were reported as skipped; and images that arrived ``twice``, ``disordered`` or ``wrong``, or whose measurement
+        was never sent (``foreign``).
     """
     sensors = [] if serve.latest is None else list(serve.latest.sensors.values())
     dropped: dict[str, int] = {}

@@ -1,4 +1,4 @@
-"""The reports of `faults` and `figures` as Markdown."""
+"""Markdown reports of `faults` and `figures`."""
 
 from collections.abc import Mapping
 from typing import Any, Final
@@ -9,15 +9,15 @@ from ertis_bench.markdown import table
 __all__ = ["ROWS", "network", "network_faults", "row"]
 
 _STORED: Final = "{stored:,} stored, {lost} lost, {twice} twice, {wrong} wrong, {silent} unexplained"
-_NOT_HERE: Final = "not tried: only root may"
+_NEEDS_ROOT: Final = "not tried: requires root"
 
 _CONDITIONS: Final = (
-    "CURVE on, loopback; sensor nodes, central node and application share the cores. "
-    "Measurements of 655 kB come of processes that are sensor nodes but for the sensor: words of noise, all sensors at "
-    "the same time. Every word that was stored was read again and compared; every image was compared with one that was "
-    "computed apart, at one place in 61. Times are from the whole measurement being at the sensor node to its ack, or "
-    "to its image being in the application's hands. Not included: the sensor itself, its USB, other hosts, and the "
-    "first seconds, in which pipelines are made."
+    "CURVE encryption over loopback; sensor nodes, central node and application share the cores. Sensor-node "
+    "processes send measurements of 655 kB without sensors: words of noise, from all sensors at the same time. "
+    "Every stored word was read again and compared. One value in 61 of every image was compared with a separate "
+    "computation. Times start when the whole measurement is at the sensor node. They end when its ack arrives "
+    "there, or when its image is in the application. They exclude sensors, USB, other hosts, and the first seconds,"
+    " in which pipelines are created."
 )
 ROWS: Final[dict[str, tuple[str, str, str]]] = {
     "centrals": (
@@ -25,7 +25,7 @@ ROWS: Final[dict[str, tuple[str, str, str]]] = {
         "0 acked lost, 0 twice",
         "{kills:,} kills, {before a line:,} of them before a random line of code: {acked:,} acked, "
         + _STORED
-        + ", {left_over} files left over; {missing:,} told to be missing, as the sensor node's memory ran over",
+        + ", {left_over} files left over; {missing:,} reported missing because the sensor node's memory was full",
     ),
     "nodes": (
         "kill -9 of sensor nodes, mid-stream",
@@ -38,78 +38,79 @@ ROWS: Final[dict[str, tuple[str, str, str]]] = {
         "{kills:,} kills: {kept:,} kept, {stored:,} stored, {lost} lost, {twice} twice, {wrong} wrong",
     ),
     "sealings": (
-        "kill -9 while sealing, {with central:,} times of the central node with it",
+        "kill -9 while sealing, {with central:,} times together with the central node",
         "0 broken files",
         "{kills:,} kills: {broken} broken, " + _STORED,
     ),
     "workers": (
         "kill -9 of a worker",
-        "0 lost beyond policy, ingest untouched",
+        "0 lost except by policy, storage unaffected",
         (
             "{kills:,} kills: {received:,} = {published:,} published + {dropped all} dropped; images: {untold} "
             "unexplained, {wrong} wrong, {twice} twice; {lost} lost, acked within {slowest ack, ms:.0f} ms"
         ),
     ),
     "disk_full": (
-        "disk full (20 MB), and freed again",
-        "no ack, state FAULT, resumes; 0 lost",
-        "{acked in fault} acked meanwhile, state {state}, “{said}”; then " + _STORED,
+        "full disk (20 MB), freed later",
+        "no acks, state FAULT, then resumed; 0 lost",
+        "{acked in fault} acked during the fault, state {state}, “{said}”; then " + _STORED,
     ),
     "disk_fails": (
-        "disk that fails, and is mended",
-        "no ack, state FAULT, resumes; 0 lost",
-        "{acked in fault} acked meanwhile, state {state}; then " + _STORED,
+        "failing disk, repaired later",
+        "no acks, state FAULT, then resumed; 0 lost",
+        "{acked in fault} acked during the fault, state {state}; then " + _STORED,
     ),
     "away": (
-        "central node away for {away_s:g} s",
-        "0 lost, 0 twice, memory flat",
-        _STORED + "; back in {back after, s:.1f} s, {memory grew, MB:.0f} MB in the ring; with 2.5 times as much as it "
-        "holds: {missing too long:,} told to be missing, {lost too long} lost, {memory grew too long, MB:.0f} MB",
+        "central node killed for {away_s:g} s",
+        "0 lost, 0 twice, bounded memory",
+        _STORED + "; back after {back after, s:.1f} s, {memory grew, MB:.0f} MB in the ring; with 2.5 times its "
+        "capacity: {missing too long:,} reported missing, {lost too long} lost, {memory grew too long, MB:.0f} MB",
     ),
     "stopped": (
-        "central node stands still for {away_s:g} s",
-        "0 lost, 0 twice, memory flat",
-        _STORED + "; back in {back after, s:.1f} s, {memory grew, MB:.0f} MB in the ring; with 2.5 times as much as it "
-        "holds: {missing too long:,} told to be missing, {lost too long} lost, {memory grew too long, MB:.0f} MB",
+        "central node suspended for {away_s:g} s",
+        "0 lost, 0 twice, bounded memory",
+        _STORED + "; back after {back after, s:.1f} s, {memory grew, MB:.0f} MB in the ring; with 2.5 times its "
+        "capacity: {missing too long:,} reported missing, {lost too long} lost, {memory grew too long, MB:.0f} MB",
     ),
     "meddled": (
-        "acks lost, repeated and reordered; {drops} connections dropped, {cuts} cables pulled out",
+        "acks lost, repeated and reordered; {drops} connections dropped, cable unplugged {cuts} times",
         "0 lost, 0 twice",
         "{faults:,} faults: " + _STORED,
     ),
     "hosts": (
-        "two hosts; 1 % of packets lost, 1 % twice, 2 % late; cable pulled out {cuts} times",
+        "two hosts; 1 % of packets lost, 1 % twice, 2 % late; cable unplugged {cuts} times",
         "0 lost, 0 twice",
-        _STORED + "; {packets:,} packets, back in {slowest back, s:.1f} s at most",
+        _STORED + "; {packets:,} packets, back after at most {slowest back, s:.1f} s",
     ),
     "hostile": (
         "{connections:,} hostile connections: garbage, huge frames, slow handshakes",
-        "real sensors miss nothing; memory + < 50 MB",
-        _STORED + "; slowest ack {slowest ack, ms:.0f} ms; memory + {memory grew, MB:.0f} MB",
+        "real sensors lose nothing; memory growth < 50 MB",
+        _STORED + "; slowest ack {slowest ack, ms:.0f} ms; memory growth {memory grew, MB:.0f} MB",
     ),
     "keys": (
         "no key, unknown key, wrong server key, wrong role, another's serial, key removed while connected",
-        "refused and counted, the last within 1 s",
+        "refused and counted; a removed key within 1 s",
         "{tried} tried, let in: {let in all}; refused: {refused all}; last ack {removed, s:.2f} s after the removal; "
         + _STORED,
     ),
     "fuzzed": (
         "{inputs:,} malformed messages",
         "refused, no crash",
-        "{answers:,} answers, {restarts} restarts, memory + {memory grew, MB:.0f} MB; of the real sensor " + _STORED,
+        "{answers:,} answers, {restarts} restarts, memory growth {memory grew, MB:.0f} MB; real sensor: " + _STORED,
     ),
     "hellos": (
         "{hellos:,} hostile hellos: sizes, names, lines, depth, numbers",
-        "refused within 1 s, memory + < 200 MB; acks of others < 200 ms",
-        "accepted: {taken all}; slowest refusal {slowest refusal, s:.2f} s, memory + {memory grew, MB:.0f} MB; slowest "
-        "ack {slowest ack, ms:.0f} ms, {slowest ack alone, ms:.0f} ms before; of the real sensor " + _STORED,
+        "refused within 1 s, memory growth < 200 MB; acks of others < 200 ms",
+        "accepted: {taken all}; slowest refusal {slowest refusal, s:.2f} s, memory growth {memory grew, MB:.0f} MB; "
+        "slowest ack {slowest ack, ms:.0f} ms, and {slowest ack alone, ms:.0f} ms before the trial; real sensor: "
+        + _STORED,
     ),
     "files": (
         "{files:,} hostile files read by `ertis verify`, `info` and `process`",
-        "refused within 1 s, memory + < 200 MB",
+        "refused within 1 s, memory growth < 200 MB",
         (
             "{reads:,} reads; accepted: {taken all}; crashes: {crashes all}; tracebacks: {failed all}; slowest "
-            "{slowest, s:.2f} s ({slowest, s of CPU:.2f} s of a processor), memory + {memory grew, MB:.0f} MB"
+            "{slowest, s:.2f} s ({slowest, s of CPU:.2f} s of processor time), memory growth {memory grew, MB:.0f} MB"
         ),
     ),
     "flips": (
@@ -123,7 +124,7 @@ ROWS: Final[dict[str, tuple[str, str, str]]] = {
         "{restarts} restarts, sockets left over: {sockets left}; {acked:,} acked, " + _STORED,
     ),
     "overload": (
-        "overload 2×, {capacity per s:.0f} images/s being possible",
+        "overload 2×, with a capacity of {capacity per s:.0f} images/s",
         "received = published + dropped; latency bounded",
         (
             "{received:,} = {published:,} + {dropped all}; p50 {p50, ms:.0f} ms, p99 {p99, ms:.0f} ms, slowest "
@@ -131,16 +132,19 @@ ROWS: Final[dict[str, tuple[str, str, str]]] = {
         ),
     ),
     "subscribers": (
-        "a slow application and one that stands still",
-        "p99 of others + < 10 %",
-        "p99 {p99 alone, ms:.1f} ms alone, {p99 beside, ms:.1f} ms beside ({grew, %:+.1f} %); {untold} unexplained",
+        "one slow and one stopped application",
+        "p99 of other applications grows by < 10 %",
+        (
+            "p99 {p99 alone, ms:.1f} ms without them, {p99 beside, ms:.1f} ms with them ({grew, %:+.1f} %); "
+            "{untold} unexplained"
+        ),
     ),
     "groups": (
         "lost and double SYNC, clock step of an hour",
         "that group flagged, others aligned by SYNC count",
         (
-            "{complete:,} of {pulses:,} groups complete, {mixed} mixed; {pulse flags} flagged for a pulse; "
-            "{clock flags after} of {complete after} for the clock after its step, {clock flags before} before"
+            "{complete:,} of {pulses:,} groups complete, {mixed} mixed; flagged for a pulse: {pulse flags}; "
+            "for the clock: {clock flags after} of {complete after} after its step, {clock flags before} before"
         ),
     ),
     "power_cuts": (
@@ -156,24 +160,28 @@ def network_faults(report: dict[str, Any]) -> str:
     rows = [row(name, report[name]) for name in ROWS if name in report]
     options = [*(["--long"] if report["long"] else []), *(f"--only {name}" for name in report["only"])]
     made = " ".join(["ertis bench network-faults", *options, f"--seed {report['seed']}"])
-    return f"{table(('fault', 'wanted', 'found'), rows, numbers=False)}\n\nBy `{made}`. {sentence(report['machine'])}"
+    cells = table(("fault", "required", "result"), rows, numbers=False)
+    return f"{cells}\n\nCommand: `{made}`. {sentence(report['machine'])}"
 
 
 def row(name: str, found: Mapping[str, Any] | None) -> tuple[str, str, str]:
-    """Return trials, limits and results of one part; None if it could not be tried."""
+    """Return the trials, limits and results of one part.
+
+    ``found`` is None if the part could not be tried.
+    """
     tried, wanted, became = ROWS[name]
     if found is None:
-        return tried.partition(",")[0].partition("{")[0].rstrip(), wanted, _NOT_HERE
+        return tried.partition(",")[0].partition("{")[0].rstrip(), wanted, _NEEDS_ROOT
     if "reason" in found:
         return tried, wanted, f"not tried: {found['reason']}"
     values = dict(found)
     values["faults"] = sum(found.get("meddled", {}).values())
     for field in ("dropped", "refused", "let in", "taken", "crashes", "failed"):
-        values[f"{field} all"] = _all(found.get(field))
+        values[f"{field} all"] = _as_list(found.get(field))
     return tried.format(**values), wanted, became.format(**values)
 
 
-def _all(found: Any) -> str:
+def _as_list(found: Any) -> str:
     """Return counts by reason, or names, as a list in words."""
     if isinstance(found, Mapping):
         return ", ".join(f"{count:,} {reason}" for reason, count in sorted(found.items())) or "0"
@@ -201,7 +209,7 @@ def _figure(row: dict[str, Any]) -> dict[str, str]:
         )
         goal = "0 lost; ack p99 < 100 ms"
         found = (
-            f"{row['stored']:,} of {row['offered']:,} stored, {row['lost']} lost, {row['missing']} told to be missing, "
+            f"{row['stored']:,} of {row['offered']:,} stored, {row['lost']} lost, {row['missing']} reported missing, "
             f"{row['wrong']} wrong, {row['twice']} twice; ack p50 {row['p50_ms']:.1f} ms, p99 {row['p99_ms']:.1f} ms, "
             f"slowest {row['slowest_ms']:.0f} ms; {row['rate_reached_hz']:.1f} Hz reached"
         )
@@ -212,15 +220,15 @@ def _figure(row: dict[str, Any]) -> dict[str, str]:
         )
         goal = row["goal"]
         found = (
-            f"{row['received']:,} = {row['published']:,} published + {_all(row['dropped'])} dropped; "
-            f"{row['images']:,} images here, {row['skipped']} skipped, {row['wrong']} wrong; capture to image p50 "
+            f"{row['received']:,} = {row['published']:,} published + {_as_list(row['dropped'])} dropped; "
+            f"{row['images']:,} images received, {row['skipped']} skipped, {row['wrong']} wrong; capture to image p50 "
             f"{row['p50_ms']:.1f} ms, p99 {row['p99_ms']:.1f} ms, slowest {row['slowest_ms']:.0f} ms"
         )
     if "max_hz" in row:
         found += (
-            f"; beside workers of its own in the same run p50 {row['added_p50_ms']:+.1f} ms, p99 "
-            f"{row['added_p99_ms']:+.1f} ms; {row['max_hz']:.0f} images/s of {row['offered_hz']:.0f} that were "
-            f"offered, {row['max_here_hz']:.0f} by workers of its own"
+            f"; relative to the node's own workers in the same run: p50 {row['added_p50_ms']:+.1f} ms, p99 "
+            f"{row['added_p99_ms']:+.1f} ms; {row['max_hz']:.0f} images/s of {row['offered_hz']:.0f} "
+            f"offered, {row['max_here_hz']:.0f} with the node's own workers"
         )
         cpu += "; the cluster's scheduler and workers are not counted"
-    return {"what": what, "goal": goal, "found": f"{found}. Of a core: {cpu}"}
+    return {"what": what, "goal": goal, "found": f"{found}. Processor time in % of one core: {cpu}"}

@@ -1,6 +1,6 @@
-"""A node that kills itself before a line of its own code: ``python -m ertis_bench.network.trap LINES COMMAND …``.
+"""Node that kills itself before a line of its own code: ``python -m ertis_bench.network.trap LINES COMMAND …``.
 
-Most of a node's time goes by inside few calls, so that a kill at a random moment hardly ever comes between two lines.
+A node spends most of its time inside few calls. A kill at a random time therefore rarely comes between two lines.
 """
 
 import os
@@ -22,7 +22,10 @@ _OURS: Final = tuple(str(_PACKAGE / name) for name in ("network", "journal", "at
 
 
 def set_trap(max_lines: int) -> None:
-    """Kill this process when so many lines of nodes and journals have run, in this thread and those to come."""
+    """Kill this process after ``max_lines`` lines of nodes and journals.
+
+    The count includes this thread and all later threads.
+    """
     count = 0
 
     def line(_frame: FrameType, event: str, _argument: object) -> Callable[..., Any]:

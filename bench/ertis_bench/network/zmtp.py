@@ -1,6 +1,6 @@
-"""ZeroMQ's own protocol (ZMTP 3.1, without keys) over plain sockets, for messages that no honest node sends.
+"""ZMTP 3.1, the protocol of ZeroMQ, over plain sockets and without keys, for messages that no honest node sends.
 
-It is written after https://rfc.zeromq.org/spec/37, and shares nothing with what is tested.
+The code follows https://rfc.zeromq.org/spec/37, and shares nothing with the tested code.
 """
 
 import socket
@@ -24,7 +24,7 @@ GREETING: Final = greeting()
 
 
 class ZmtpFrame(NamedTuple):
-    """A frame as it was on the wire."""
+    """Frame as it is on the wire."""
 
     flags: int
     body: bytes
@@ -40,7 +40,7 @@ class ZmtpFrame(NamedTuple):
         return bool(self.flags & _COMMAND)
 
     def encode(self) -> bytes:
-        """Return its bytes."""
+        """Return the bytes of the frame."""
         flags = self.flags & ~_LONG
         if len(self.body) > 255:
             return struct.pack(">BQ", flags | _LONG, len(self.body)) + self.body
@@ -49,12 +49,12 @@ class ZmtpFrame(NamedTuple):
 
 @dataclass(slots=True)
 class ZmtpFrameParser:
-    """Takes bytes as they come, and gives the frames in them."""
+    """Incremental parser of frames."""
 
     _data: bytearray = field(default_factory=bytearray)
 
     def feed(self, data: bytes) -> list[ZmtpFrame]:
-        """Return the frames that are complete now."""
+        """Return the frames that are complete after adding bytes."""
         self._data += data
         found, place = [], 0
         while len(self._data) - place >= 2:
@@ -87,26 +87,26 @@ def ready(socket_type: bytes = b"DEALER", identity: bytes = b"", extra: Iterable
 
 
 def host_and_port(address: str) -> tuple[str, int]:
-    """Return the parts of ``tcp://HOST:PORT``."""
+    """Return host and port of ``tcp://HOST:PORT``."""
     host, _, port = address.removeprefix("tcp://").rpartition(":")
     return host, int(port)
 
 
 class ZmtpPeer:
-    """A socket that has shaken hands as a DEALER without keys; use it in a ``with`` statement.
+    """Socket with a finished handshake as a DEALER without keys; use it in a ``with`` statement.
 
     Parameters
     ----------
     address : str
     identity : bytes
-        Routing id that it asks for.
+        Routing id that the peer requests.
     timeout_s : float
-        How long to wait for whatever is sent or received.
+        Time limit for sending and receiving.
 
     Raises
     ------
     OSError
-        The other side has closed it, or says nothing.
+        The other side has closed the connection, or does not answer.
     """
 
     def __init__(self, address: str, *, identity: bytes = b"", timeout_s: float = 10.0) -> None:
@@ -137,7 +137,7 @@ class ZmtpPeer:
         self.socket.sendall(b"".join(map(message, messages)))
 
     def receive(self) -> list[bytes]:
-        """Return the next message; commands between sockets are answered."""
+        """Return the next message. Commands between sockets are answered."""
         body: list[bytes] = []
         while True:
             while self._came:

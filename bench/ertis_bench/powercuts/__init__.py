@@ -1,4 +1,4 @@
-"""Power cuts: possible states of disks after one, and their recovery."""
+"""Power cuts: possible states of disks after one, and recovery from these states."""
 
 from ertis_bench.powercuts.trial import SCENARIOS, reason_not_to_try, try_cuts
 

@@ -1,8 +1,8 @@
-"""A disk as it may look after a power cut.
+"""Model of a disk after a power cut.
 
-What was synced is there. What was not may be lost, torn or reordered, in sectors. Names are durable once their folder
-was synced, or, on a disk with an ordered journal as that of ext4, once anything later was synced. A write whose sync
-failed never reaches the disk, as Linux marks its pages as written.
+Synced data is durable. Other data may be lost, torn or reordered, in sectors. Names are durable after a sync of their
+folder. On a disk with an ordered journal, such as ext4, they are also durable after any later sync. A write whose sync
+failed never reaches the disk, because Linux marks its pages as written.
 """
 
 import random
@@ -19,14 +19,14 @@ Order = Literal["any", "journal"]
 
 _SECTORS: Final = (512, 4096)
 _KEEP: Final = (0.0, 0.1, 0.5, 0.9, 1.0)
-"""Shares of what was not synced that a power cut leaves."""
+"""Possible shares of unsynced data that survive a power cut."""
 
 
 @dataclass(slots=True, eq=False)
 class _FileState:
     durable: bytearray = field(default_factory=bytearray)
     pending: list[tuple[int, int, bytes | None]] = field(default_factory=list)
-    """Time, offset and data; without data, a truncation."""
+    """Time, offset and data. Without data, the entry is a truncation."""
 
     def sync(self, before: int) -> None:
         """Make data durable that was written before a time."""
@@ -40,7 +40,7 @@ class _FileState:
         self.pending = [each for each in self.pending if each[0] >= before or each[2] is None]
 
     def after_cut(self, rng: random.Random) -> bytearray:
-        """Return the content that a power cut leaves."""
+        """Return the content after a power cut."""
         content = bytearray(self.durable)
         keep, sector = rng.choice(_KEEP), rng.choice(_SECTORS)
         for _, offset, data in self.pending:
@@ -69,7 +69,10 @@ def _apply(content: bytearray, offset: int, data: bytes | None) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Change:
-    """Of names: ``path`` goes, and ``target`` becomes a file, or a folder where there is none."""
+    """Change of names.
+
+    ``path`` is removed. ``target`` becomes a file, or a folder if the change has no file.
+    """
 
     time: int
     gone: str
@@ -88,7 +91,7 @@ class _Change:
 
 
 class _Names:
-    """Names that are durable, and changes of them that are not yet."""
+    """Durable names, and changes of names that are not durable yet."""
 
     def __init__(self, order: Order) -> None:
         self._order: Final = order
@@ -99,7 +102,11 @@ class _Names:
         self._pending.append(change)
 
     def sync(self, folder: str | None, before: int) -> None:
-        """Make changes before a time durable, of a folder; or, where a file was synced and so the journal, of all."""
+        """Make changes before a time durable.
+
+        On a disk with order "any", only the changes of ``folder`` become durable. On one with order "journal", each
+        sync flushes the disk's journal, and all changes become durable. ``folder`` is None after the sync of a file.
+        """
         if folder is None and self._order == "any":
             return
         left = []
@@ -140,7 +147,7 @@ class Disk:
         self._syncs: dict[tuple[int, int, str], int] = {}
 
     def take(self, record: DiskRecord) -> None:
-        """Let the next record happen."""
+        """Apply the next record."""
         self._time += 1
         path = record.path
         match record.kind:
@@ -189,7 +196,7 @@ class Disk:
         target.mkdir()
         for name, file in sorted(names.items()):
             place = target / name[len(self._folder) + 1 :]
-            if not place.parent.is_dir():  # its name was lost
+            if not place.parent.is_dir():  # The name of the folder was lost.
                 continue
             if file is None:
                 place.mkdir()

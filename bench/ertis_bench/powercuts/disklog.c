@@ -1,4 +1,4 @@
-/* Log of everything that reaches the file system below a folder. Load it by LD_PRELOAD.
+/* Log of all operations that reach the file system below a folder. Load this library with LD_PRELOAD.
 
    Environment:
      POWERCUT_FOLDER  absolute path; files below it are logged
@@ -199,7 +199,7 @@ static int synced(int fd, int (*sync)(int)) {
     errno = EIO;
     return -1;
   }
-  int result = 0; /* the model decides what is durable, so the true disk need not be waited for */
+  int result = 0; /* The disk model decides which data is durable, so a real sync is not needed. */
   put(SYNC_END, status.st_ino, S_ISDIR(status.st_mode), path, NULL, 0);
   return result;
 }

@@ -19,7 +19,7 @@ _ENTRY: Final = struct.Struct("=IIQQII")
 
 
 class DiskOperation(IntEnum):
-    """Kinds of records; the numbers are those of ``disklog.c``."""
+    """Kinds of records. The numbers are those of ``disklog.c``."""
 
     CREATE = 1
     WRITE = 2
@@ -39,12 +39,12 @@ class DiskRecord(NamedTuple):
 
     Attributes
     ----------
-    kind : Kind
+    kind : DiskOperation
     pid : int
     inode, offset : int
     path : str
     data : bytes
-        What was written or acknowledged, or the new name.
+        Written or acknowledged data, or the new name.
     """
 
     kind: DiskOperation
@@ -83,11 +83,11 @@ def environment(
     ----------
     library : Path
     folder : Path
-        Whose files are logged.
+        Folder whose files are logged.
     log : Path
-        To append to.
+        File that is appended to.
     acks : Path, optional
-        File in which the process notes what was acknowledged; its stdout by default.
+        File in which the process records acknowledged measurements; its stdout by default.
     fail : (first, count, seed), optional
         Syncs that fail.
     """
@@ -103,7 +103,7 @@ def environment(
 
 
 def read(log: Path) -> Iterator[DiskRecord]:
-    """Yield the records of a log; a last one that was cut short is none."""
+    """Yield the complete records of a log. A truncated last record is ignored."""
     content = log.read_bytes()
     place = 0
     while place + _ENTRY.size <= len(content):

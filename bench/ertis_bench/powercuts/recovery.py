@@ -20,9 +20,9 @@ from ertis_numba.storage.sealing import seal
 __all__ = ["Found", "recover_archive", "recover_capture", "recover_spool"]
 
 Found = dict[str, int]
-"""Counts that must be 0: ``lost``, ``twice``, ``wrong``, and ``failed`` where recovery itself fails."""
+"""Counts that must be 0: ``lost``, ``twice``, ``wrong``, and ``failed`` for failures of the recovery itself."""
 
-_SPOOL_RING_BYTES = 1  # everything is read from the disk
+_SPOOL_RING_BYTES = 1  # Almost no memory, so that all measurements are read from the disk.
 
 
 def recover_capture(disk: Path, sent: Sent, sent_crc32: AbstractSet[int] | None, *, by_command: bool) -> Found:
@@ -37,7 +37,7 @@ def recover_capture(disk: Path, sent: Sent, sent_crc32: AbstractSet[int] | None,
 
 
 def recover_archive(disk: Path, sent: Sent, rng: random.Random, *, by_command: bool) -> Found:
-    """Recover the recordings of a central node, by its own start or by ``ertis recover``."""
+    """Recover the recordings of a central node, by starting the node or by ``ertis recover``."""
     folder = disk / "recordings"
     if not folder.is_dir():
         return _found(compare(sent, Archived(), sent.acked()), failed=0)
@@ -45,7 +45,7 @@ def recover_archive(disk: Path, sent: Sent, rng: random.Random, *, by_command: b
     if by_command or rng.random() < 0.3:
         failed = _recover(folder, by_command=by_command)
     else:
-        failed, acked_through = _start(folder)
+        failed, acked_through = _open_archive(folder)
     archived = _read(folder)
     found = compare(sent, archived, sent.acked())
     # A sensor node discards measurements that are reported as stored.
@@ -60,14 +60,14 @@ def recover_archive(disk: Path, sent: Sent, rng: random.Random, *, by_command: b
 
 
 def _read(folder: Path) -> Archived:
-    """Read recordings; of the other files, only a journal may be missing."""
+    """Read recordings. Of all other files, only a journal may be missing."""
     archived = read_folder(folder)
     archived.left_over = [name for name in archived.left_over if name.endswith(SUFFIX)]
     return archived
 
 
-def _start(folder: Path) -> tuple[int, dict[SensorSession, int]]:
-    """Open a folder as a central node does, and return the number of errors and the sessions that it knows."""
+def _open_archive(folder: Path) -> tuple[int, dict[SensorSession, int]]:
+    """Open a folder as a central node does, and return the number of errors and the known sessions."""
     try:
         journal_store = JournalStore(folder, "recording", Ledger(folder), lambda _: None)
         acked_through = dict(journal_store.acked_through)
@@ -79,7 +79,7 @@ def _start(folder: Path) -> tuple[int, dict[SensorSession, int]]:
 
 
 def _recover(folder: Path, *, by_command: bool) -> int:
-    """Seal all journals of a folder, and return how many errors there were."""
+    """Seal all journals of a folder, and return the number of errors."""
     if by_command:
         return int(ask("recover", str(folder), "--quiet").returncode != 0)
     return sum(_fails(seal, path) for path in sorted(folder.glob(f"*{SUFFIX}")))
@@ -94,7 +94,7 @@ def _fails(act: Callable[[Path], object], path: Path) -> bool:
 
 
 def recover_spool(disk: Path, sent: Sent) -> Found:
-    """Take a spool up as a sensor node does when it starts, and look for all that the central node does not have."""
+    """Open a spool as a sensor node does at its start, and search for all measurements that the central node lacks."""
     notes: list[str] = []
     held: dict[DiaryKey, list[Row]] = {}
     folder = disk / "spool"
@@ -115,7 +115,7 @@ def recover_spool(disk: Path, sent: Sent) -> Found:
             spool.close()
     promised = sent.kept - sent.acked()
     found = compare(sent, Archived(rows=held), promised)
-    found["silent"] = 0  # numbers that the central node has are gone from the spool
+    found["silent"] = 0  # Numbers that the central node has acknowledged are missing from the spool as intended.
     return _found(found, failed=len(notes))
 
 

@@ -1,4 +1,4 @@
-"""Commands that run on a disk of which everything is logged."""
+"""Commands that run on a disk whose operations are all logged."""
 
 import json
 import random
@@ -20,7 +20,7 @@ from ertis_numba.errors import DataError
 __all__ = ["AcknowledgedState", "Fail", "Setting", "Trace", "capture", "central", "journal", "spool"]
 
 Fail = tuple[int, int, int] | None
-"""Syncs that fail: the first, how many, and a seed."""
+"""Failing syncs: index of the first, number, and seed."""
 
 _PATIENCE_S: Final = 30.0
 
@@ -32,7 +32,7 @@ class Setting:
     Attributes
     ----------
     folder : Path
-        Empty; of this run alone.
+        Empty folder for this run only.
     disk_log : Path
     seed : int
     count : int
@@ -48,7 +48,7 @@ class Setting:
 
     @property
     def disk(self) -> Path:
-        """Folder that is logged."""
+        """Logged folder."""
         return self.folder / "disk"
 
     @property
@@ -65,7 +65,7 @@ class Setting:
 
 @dataclass(slots=True)
 class AcknowledgedState:
-    """Measurements that were acknowledged up to some record of a log.
+    """Measurements that were acknowledged up to a record of a log.
 
     Attributes
     ----------
@@ -76,7 +76,7 @@ class AcknowledgedState:
     _lines: dict[int, bytes] = field(default_factory=dict)
 
     def take(self, record: DiskRecord) -> None:
-        """Take note of the next record."""
+        """Apply the next record."""
         if record.kind is not DiskOperation.ACK:
             return
         *lines, self._lines[record.pid] = (self._lines.get(record.pid, b"") + record.data).split(b"\n")
@@ -91,19 +91,19 @@ class AcknowledgedState:
                 key = DiaryKey(reported["sensor"], reported["session_id"], reported["sequence"])
                 self.sent.offered[key] = Row(reported["crc32"], reported["sync_count"], reported["timestamp_ns"])
                 self.sent.kept.add(key)
-            elif reported.get("event") == "discarded":  # from now on, what is left of it need not be there
+            elif reported.get("event") == "discarded":  # Discarded measurements need not be stored from now on.
                 self.sent.kept = {key for key in self.sent.kept if key.sequence > reported["sequence"]}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trace:
-    """A command that has run.
+    """Finished run of a command.
 
     Attributes
     ----------
     setting : Setting
     sent_crc32 : set of int, optional
-        Words that were measured; where None, they are not compared.
+        CRC-32 of the measured words. With None, words are not compared.
     """
 
     setting: Setting
@@ -111,7 +111,7 @@ class Trace:
 
 
 def capture(setting: Setting, source: Path) -> Trace:
-    """Run ``ertis capture -o`` from an emulated sensor."""
+    """Run ``ertis capture -o`` with an emulated sensor."""
     setting.disk.mkdir()
     with captures.emulated(source, setting.folder) as ports:
         command = [*ERTIS, "capture", "--port", ports[0], "-o", str(setting.disk / "rec.h5"), "--json", "--quiet"]
@@ -125,14 +125,14 @@ def capture(setting: Setting, source: Path) -> Trace:
 
 
 def journal(setting: Setting) -> Trace:
-    """Run a process that does nothing but append to a journal."""
+    """Run a process that only appends to a journal."""
     setting.disk.mkdir()
     command = [sys.executable, "-m", "ertis_bench.powercuts.writer", str(setting.disk), str(setting.seed)]
     command = setting.preloaded([*command, str(setting.count)], fail=setting.fail)
     with _process(setting, command) as process:
         code = process.wait()
         if code and setting.fail is None:
-            raise DataError(f"the writer of a journal ended with {code}; {process.last_words()}")
+            raise DataError(f"journal writer ended with {code}; {process.last_words()}")
     return Trace(setting=setting)
 
 

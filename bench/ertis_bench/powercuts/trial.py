@@ -1,4 +1,4 @@
-"""Power cuts at random times of commands, and the fate of acknowledged measurements."""
+"""Power cuts at random times of commands, with checks that acknowledged measurements survive."""
 
 import random
 import shutil
@@ -18,16 +18,16 @@ __all__ = ["SCENARIOS", "reason_not_to_try", "try_cuts"]
 
 SCENARIOS: Final = ("capture", "journal", "record", "serve", "spool")
 _SOURCE: Final = Path(__file__).parents[3] / "data" / "synthetic" / "reflectors.h5"
-_ACKED: Final = ("record", "serve")  # where what counts is that the central node has acknowledged it
+_CENTRAL: Final = ("record", "serve")  # scenarios that count acknowledgements of the central node
 _STATES_OF_A_RUN: Final = 100
-_AFTER_ACK: Final = 0.5  # share of cuts right after an acknowledgement
-_BY_COMMAND: Final = 0.005  # share of states that the true command recovers
-_MAX_FAILING: Final = 12  # syncs of a process
-_FIRST_SYNC: Final = 5  # that may fail: by then a node listens
+_SHARE_AFTER_ACK: Final = 0.5  # share of cuts right after an acknowledgement
+_SHARE_BY_COMMAND: Final = 0.005  # share of states that the real command recovers
+_MAX_FAILING_SYNCS: Final = 12  # maximum number of failing syncs per process
+_FIRST_SYNC: Final = 5  # First sync that may fail. A node listens by then.
 
 
 def reason_not_to_try(folder: Path) -> str:
-    """Return why power cuts cannot be tried on this machine; empty where they can."""
+    """Return the reason why power cuts cannot be tried on this machine, or an empty string if they can."""
     try:
         logs.build(folder)
     except DataError as error:
@@ -51,25 +51,25 @@ def try_cuts(
     Parameters
     ----------
     folder : Path
-        Empty.
+        Empty folder.
     seed, count : int
     only : sequence of str
-        Of `SCENARIOS`.
+        Names of `SCENARIOS`.
     n_measurements : int
-        Of each sensor in a run, at most.
+        Maximum number of measurements of each sensor in a run.
     states_of_a_run : int
         Power cuts tried with the log of one run.
     say : callable
-        Called with lines about what is wrong.
+        Called with a line for each error.
     keep : Path, optional
-        Folder for states of which recovery is wrong.
+        Folder for states whose recovery is wrong.
 
     Returns
     -------
     dict
         ``states`` of disks, ``runs`` of commands and ``failed_syncs`` in them; measurements that were ``acknowledged``
         before the cuts; of these ``lost`` or stored ``twice``; ``wrong`` ones; recoveries that ``failed``; journals
-        ``left_over``. All of them for each scenario, too. Or only a ``reason`` why none can be tried.
+        ``left_over``. The same counts for each scenario. If none can be tried, only a ``reason``.
     """
     reason = reason_not_to_try(folder)
     if reason:
@@ -85,8 +85,8 @@ def try_cuts(
             place = folder / "run"
             place.mkdir()
             n_sent = rng.randint(min(4, n_measurements), n_measurements)
-            first = _FIRST_SYNC + rng.randint(0, n_sent)  # about one sync for each measurement
-            fail = (first, rng.randint(1, _MAX_FAILING), rng.getrandbits(16)) if fails else None
+            first = _FIRST_SYNC + rng.randint(0, n_sent)  # about one sync per measurement
+            fail = (first, rng.randint(1, _MAX_FAILING_SYNCS), rng.getrandbits(16)) if fails else None
             setting = Setting(folder=place, disk_log=library, seed=rng.getrandbits(31), count=n_sent, fail=fail)
             trace = _run(name, setting)
             of_kind["runs"] += 1
@@ -124,7 +124,7 @@ def _cut(
     found["failed_syncs"] += sum(record.kind is logs.DiskOperation.SYNC_FAIL for record in records)
     moments: Counter[int] = Counter()
     for _ in range(count):
-        after_ack = acks and rng.random() < _AFTER_ACK
+        after_ack = acks and rng.random() < _SHARE_AFTER_ACK
         moments[rng.choice(acks) if after_ack else rng.randrange(len(records))] += 1
     disk, acknowledged = Disk(trace.setting.disk), AcknowledgedState()
     state = trace.setting.folder / "state"
@@ -137,7 +137,7 @@ def _cut(
                 kept = shutil.copytree(state, keep / f"{name}-{keep.stat().st_nlink}-{place}-{found['states']}")
             one = _recover(name, trace, state, acknowledged, rng)
             found["states"] += 1
-            found["acknowledged"] += len(acknowledged.sent.acked() if name in _ACKED else acknowledged.sent.kept)
+            found["acknowledged"] += len(acknowledged.sent.acked() if name in _CENTRAL else acknowledged.sent.kept)
             found.update(one)
             if any(one.values()):
                 say(f"{name} {trace.setting.fail} at record {place} of {len(records)}: {one}")
@@ -147,7 +147,7 @@ def _cut(
 
 
 def _recover(name: str, trace: Trace, state: Path, acknowledged: AcknowledgedState, rng: random.Random) -> Found:
-    by_command = rng.random() < _BY_COMMAND
+    by_command = rng.random() < _SHARE_BY_COMMAND
     if name in ("capture", "journal"):
         return recover_capture(state, acknowledged.sent, trace.sent_crc32, by_command=by_command)
     if name == "spool":

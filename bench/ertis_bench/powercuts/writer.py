@@ -1,6 +1,6 @@
-"""A process that appends to one journal and goes on after errors: ``python -m ertis_bench.powercuts.writer``.
+"""Process that appends to one journal and continues after errors: ``python -m ertis_bench.powercuts.writer``.
 
-Its commits are short and long: those of more than 4 MB do without a write-ahead log.
+Its commits are short and long. Commits of more than 4 MB bypass the write-ahead log.
 """
 
 import json
@@ -19,11 +19,11 @@ from ertis_numba.settings import Recording, Settings
 
 _SETTINGS = Settings(recording=Recording(n_samples=32_768))
 _SENSOR, _SESSION_ID = "front", 7
-_LONG, _SHORT = 34, 3  # measurements of a commit; 34 are more than 4 MB
+_LONG, _SHORT = 34, 3  # Measurements per commit. 34 measurements have more than 4 MB.
 
 
 def main(folder: Path, seed: int, n_commits: int) -> None:
-    """Append commits to a journal of ``rec.h5``, and print a line for each measurement that is durable."""
+    """Append commits to a journal of ``rec.h5``, and print a line for each durable measurement."""
     rng = random.Random(seed)  # noqa: S311  nothing is secret
     words = np.random.default_rng(seed).integers(0, 2**32, _SETTINGS.recording.n_samples, dtype=np.uint32)
     long_from = rng.randrange(n_commits + 2)
@@ -45,7 +45,7 @@ def main(folder: Path, seed: int, n_commits: int) -> None:
 
 
 def _append(journal: Journal, entries: list[JournalEntry], rng: random.Random) -> None:
-    """Append until it works, or let these measurements be lost, as a full spool does."""
+    """Retry an append until it succeeds, or discard the measurements, as a full spool does."""
     while True:
         try:
             journal.append(entries)
@@ -68,7 +68,7 @@ def _append(journal: Journal, entries: list[JournalEntry], rng: random.Random) -
 
 
 def _discard(journal: Journal, up_to: int) -> None:
-    """Discard measurements as a spool does; from now on they may be gone."""
+    """Discard measurements as a spool does. From now on they need not be stored."""
     _print({"event": "discarded", "sensor": _SENSOR, "session_id": _SESSION_ID, "sequence": up_to})
     try:
         journal.discard(_SENSOR, _SESSION_ID, up_to)
