@@ -65,7 +65,7 @@ def states(folder):
 def test_files_equal_those_of_single_recordings(runs, out, monkeypatch):
     found, pool = run_here(monkeypatch, [runs], out, CampaignOptions(settings=narrow))
     assert outcomes(found) == dict.fromkeys(["a.h5", "b.h5", "c.h5", "d.h5"], "made")
-    assert [task.arguments["warm"] for task in pool.given if task.action == "plan"] == [True, False]  # one for each air
+    assert [task.arguments["warm"] for task in pool.given if task.action == "plan"] == [True, False]  # one per air
     assert found["a.h5"].made["measurements"] == 3
     for name in "abcd":
         single = out / "single.h5"
@@ -209,7 +209,7 @@ def test_unreachable_budget_is_reported_per_recording(runs, out, monkeypatch):
     assert set(outcomes(found).values()) == {"failed"}
     for name, event in found.items():
         assert event.error.startswith(f"{runs / name}: accuracy.max_error_db is -199, but the smallest error")
-    assert [task.action for task in pool.given].count("plan") == 2  # each tried once
+    assert [task.action for task in pool.given].count("plan") == 2  # each is planned once
     assert names_in(out) == []
 
 
@@ -253,7 +253,7 @@ def test_memory_and_tasks_are_independent_of_the_number_of_recordings(tmp_path, 
         return result
 
     monkeypatch.setattr("tests.campaigns.run_task", watched)
-    for number in range(12):  # each has air of its own, and so a pipeline of its own
+    for number in range(12):  # each has its own air temperature and so its own pipeline
         settings = SMALL.replace(air=Air(temperature_c=float(number)))
         write_recording(tmp_path / f"{number:02}.h5", noise(settings, count=1, seed=number))
     found, pool = run_here(monkeypatch, [tmp_path], out, CampaignOptions(settings=narrow))
@@ -328,7 +328,7 @@ def test_duplicate_pipeline_of_another_thread_is_closed(monkeypatch):
 
 
 class Watched(InlinePool):
-    """Worker pool that notes its number of tasks whenever it gets one, and when it is limited."""
+    """Worker pool that records the number of its tasks at each submission and at each new limit."""
 
     def __init__(self, size):
         super().__init__(size)
@@ -347,7 +347,7 @@ class Watched(InlinePool):
 
 @pytest.mark.parametrize(("workers", "largest"), [(None, 1), (3, 3)])
 def test_gpu_runs_one_task_at_a_time(tmp_path, out, monkeypatch, workers, largest):
-    """However many tasks are in hand when it is known to be a GPU: no more come until there are fewer."""
+    """Once a worker reports a GPU, the campaign submits no task until fewer are in progress than the limit."""
 
     def on_a_gpu(*arguments):
         return {name: "cuda" if name == "device" else value for name, value in work.run_task(*arguments).items()}

@@ -21,7 +21,7 @@ def _small(monkeypatch):
 def test_all_pools_are_timed_and_compared(tmp_path, monkeypatch):
     pool = Campaign._pool  # noqa: SLF001
     chosen = lambda campaign: pool(campaign) if vars(campaign)["_scheduler"] else InlinePool()  # noqa: E731
-    monkeypatch.setattr(Campaign, "_pool", chosen)  # of processes, which take long to start, other tests know
+    monkeypatch.setattr(Campaign, "_pool", chosen)  # processes start slowly, and other tests cover them
     target = tmp_path / "page.md"
     target.write_text("<!-- ertis bench many -->\nold\n<!-- /ertis bench many -->\n", "utf-8")
     done = CliRunner().invoke(

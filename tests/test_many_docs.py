@@ -33,7 +33,7 @@ def place(tmp_path_factory):
 @pytest.fixture(autouse=True)
 def _there(place, monkeypatch):
     monkeypatch.chdir(place)
-    monkeypatch.setattr(Campaign, "_pool", lambda _: InlinePool())  # which takes less to start
+    monkeypatch.setattr(Campaign, "_pool", lambda _: InlinePool())  # starts faster than processes
 
 
 def run(command, code=0):

@@ -42,7 +42,7 @@ def long_runs(runs):
 
 @pytest.fixture
 def pools(monkeypatch):
-    """All that are started."""
+    """Collect all process pools that a test starts."""
     made, begin = [], ProcessPool.__init__
 
     def kept(self, size):
@@ -97,7 +97,7 @@ def test_dying_worker_fails_one_recording(long_runs, tmp_path, pools):
 
 
 def test_close_ends_all_work_at_once(long_runs, tmp_path, pools):
-    """However far it is: processes that stand still would never be done with theirs."""
+    """Close must not wait for the current tasks: stopped processes never complete theirs."""
     events = Campaign(
         find_recordings([long_runs]), tmp_path / "out", CampaignOptions(settings=narrow, batch=1), workers=2
     ).run()
@@ -138,7 +138,7 @@ def test_number_of_workers_can_be_reduced():
 
 @pytest.mark.parametrize("size", [1, 2])
 def test_number_of_busy_workers_can_be_reduced(size):
-    """Never more tasks in hand than there were, and soon no more than are wanted, by as many processes."""
+    """The numbers of tasks in progress and of processes only fall, until both reach the new size."""
     pool, numbers, in_hand, seen = ProcessPool(3), iter(range(12)), set(), []
     try:
 

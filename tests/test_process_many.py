@@ -34,8 +34,8 @@ def run(*arguments, code=0):
 
 
 @pytest.fixture
-def here(monkeypatch):
-    """No processes, which takes less to start."""
+def in_test_process(monkeypatch):
+    """Process recordings in the test's own process, because worker processes start slowly."""
     monkeypatch.setattr(Campaign, "_pool", lambda _: InlinePool())
 
 
