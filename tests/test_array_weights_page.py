@@ -1,4 +1,4 @@
-"""Table of array weights in docs/explanation/beamformers.md, computed again."""
+"""Test of the table of array weights in docs/explanation/beamformers.md."""
 
 import math
 import re
@@ -21,7 +21,7 @@ RANGES_M = np.linspace(0.0, 0.02, 6)
 
 
 def levels_db(spread, y, z):
-    """Highest level over the range offsets of the compressed pulse; levels at −Δr are those at −Δu."""
+    """Highest level over the range offsets of the compressed pulse; the levels are symmetric in Δr and Δu."""
     forward = np.sqrt(np.maximum(1 - y**2 - z**2, 0.0)) - 1
     away = np.stack([forward, y, z], axis=-1).reshape(-1, 3)
     away = np.concatenate([away, -away])

@@ -1,4 +1,4 @@
-"""Effects that a scene asks for, effects that it leaves out, and where this is said."""
+"""Tests of requested and omitted effects of a scene, and of the reports about them."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""Files appear complete or not at all, and what went wrong is told by the name that they were to have."""
+"""Files appear completely or not at all, and errors name the final path."""
 
 import errno
 from pathlib import Path
@@ -20,7 +20,7 @@ def test_failed_write_leaves_no_file(tmp_path):
 
 
 def test_first_error_is_reported_if_cleanup_fails_too(tmp_path, monkeypatch):
-    """As in a file system that has become read-only."""
+    """A file system that has become read-only behaves so."""
 
     def refuse(path, *, missing_ok=False):
         assert missing_ok
@@ -33,7 +33,7 @@ def test_first_error_is_reported_if_cleanup_fails_too(tmp_path, monkeypatch):
 
 
 def test_full_disk_is_reported_with_the_name_of_the_file(tmp_path):
-    """Where the system tells an error of a file that is open, it has no name."""
+    """The system does not name the file if an error concerns an open file."""
     with pytest.raises(OSError, match="No space") as caught, atomic_write(tmp_path / "a.txt"):
         raise OSError(errno.ENOSPC, "No space left on device")
     assert caught.value.filename == str(tmp_path / "a.txt")

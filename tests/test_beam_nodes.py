@@ -1,4 +1,4 @@
-"""Beams made of those of nodes: within the error that the nodes themselves predict, for any flat array."""
+"""Interpolated beams stay within the error that the beam grid predicts, for any flat array."""
 
 import math
 
@@ -26,7 +26,7 @@ SPECTRUM = Spectrum(*matched_noise_spectrum(Settings(call=CALL), n_waves=40))
 
 
 def random_plane(n_mics, seed):
-    """Microphones anywhere in a tilted plane, off the origin."""
+    """Random microphones in a tilted plane with an offset from the origin."""
     random = np.random.default_rng(seed)
     axes = np.linalg.qr(random.standard_normal((3, 2)))[0]
     places = random.uniform(-0.03, 0.03, (n_mics, 2)) @ axes.T
@@ -62,7 +62,7 @@ def nodes_of(aperture, n_taps, density, **more):
 
 
 def predicted_db_of(aperture, n_taps, density):
-    """The error by an estimate, weighted by what is heard at each frequency."""
+    """Predicted error, weighted by the spectrum of the signals."""
     return 10 * np.log10(nodes_of(aperture, n_taps, density, estimate=True).errors @ SPECTRUM.power)
 
 
@@ -76,7 +76,7 @@ def beams_of(aperture, points, spectra):
 @pytest.mark.parametrize("grid", GRIDS)
 @pytest.mark.parametrize("array", ARRAYS_M)
 def test_interpolated_beams_stay_within_the_predicted_error(array, grid, n_taps, density):
-    """Of microphones that hear noise of their own, the mean over some noises."""
+    """The microphones receive independent noise; the error is the mean over several noises."""
     aperture = apertures(array, grid)
     nodes = nodes_of(aperture, n_taps, density)
     random = np.random.default_rng(5)
@@ -97,7 +97,7 @@ def test_interpolated_beams_stay_within_the_predicted_error(array, grid, n_taps,
 
 @pytest.mark.parametrize("array", ARRAYS_M)
 def test_interpolation_residual_equals_its_prediction(array):
-    """Waves of the directions themselves, and what is missed of them, add up to the mean error."""
+    """Waves from all directions and their residuals add up to the mean error."""
     aperture = apertures(array, "half sphere")
     rough = nodes_of(aperture, 4, 2.0, estimate=True)
     n_mics, n_directions = min(len(ARRAYS_M[array]), 40), min(len(aperture.directions), 40)
@@ -111,7 +111,7 @@ def test_interpolation_residual_equals_its_prediction(array):
 
 @pytest.mark.parametrize("array", ARRAYS_M)
 def test_beam_grid_points_surround_every_direction(array):
-    """Those about the rim of the half sphere lie beyond it, as points of the plane that are no directions."""
+    """At the rim of the half sphere, grid points lie outside of the unit circle."""
     aperture = apertures(array, "half sphere")
     spacing = aperture.spacing(2.0, high_hz=CALL.high_frequency_hz, sound_speed_m_s=SPEED_M_S)
     nodes = nodes_of(aperture, 4, 2.0)

@@ -1,4 +1,4 @@
-"""What coherence factor, DMAS and Capon make of recordings, and how they are chosen."""
+"""Images by coherence factor, DMAS and Capon, and the choice of the beamformer."""
 
 import math
 
@@ -57,7 +57,7 @@ def test_beamformers_give_zero_for_zero_input(device, beamformer):
 
 
 def cut(points, **options):
-    """Levels of a ring about 1.2 m over azimuth: (direction,) in degrees and in dB of the strongest."""
+    """Levels at 1.2 m versus azimuth: (direction,) in degrees, and in dB relative to the strongest."""
     scene = scene_of(*points, sensor=LINE_16)
     measurement = Simulator(scene, plan=only("spreading", "modulation")).render()
     settings = scene.sensor(None).settings()
@@ -87,13 +87,13 @@ def test_adaptive_beamformers_have_lower_side_lobes_and_narrower_beams(options, 
 
 
 def dip_db(azimuth_deg, level_db, first_deg, second_deg):
-    """How far the level falls between two directions, below the lower of both; each is sought within a degree."""
+    """Depth of the level between two directions, below the lower of their two peaks; each is sought within a degree."""
     tops = [level_db[np.abs(azimuth_deg - place) <= 1].max() for place in (first_deg, second_deg)]
     return min(tops) - level_db[(azimuth_deg > first_deg) & (azimuth_deg < second_deg)].min()
 
 
 def test_capon_separates_two_points_that_delay_and_sum_merges():
-    """Two points 8° apart, of which beams of 7.5° make one; 5 mm in range let them differ between snapshots."""
+    """The points are 8° apart, and beams 7.5° wide. 5 mm in range make their snapshots differ."""
     points = [
         Point(azimuth_deg=side * 4.0, range_m=1.2 + place, strength_db=-20) for side, place in ((-1, 0), (1, 0.005))
     ]
@@ -104,7 +104,7 @@ def test_capon_separates_two_points_that_delay_and_sum_merges():
 
 @pytest.mark.parametrize("device", KERNELS)
 def test_capon_separates_independent_sources_within_a_beam(device):
-    """Narrow band, 16 microphones at half a wavelength: sources at 0.6 of the half-power width, 30 dB over noise."""
+    """Narrow band, 16 microphones at half a wavelength: sources 0.6 half-power widths apart, 30 dB above noise."""
     random, sines = np.random.default_rng(6), np.linspace(-0.2, 0.2, 81)
     mics, apart = np.arange(16), 0.6 * 0.886 / 8
     steer = np.exp(1j * np.pi * np.multiply.outer(mics, [-apart / 2, apart / 2]))

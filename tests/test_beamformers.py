@@ -1,4 +1,4 @@
-"""Coherence factor, DMAS and Capon: against their referees, where they break, and what each is good for."""
+"""Coherence factor, DMAS and Capon: equality with their references, limits, and benefits."""
 
 import warnings
 
@@ -44,7 +44,7 @@ def beam_input(name):
 
 
 def combined(kernel_set, beamformer, signals, **options):
-    """What a beamformer makes of signals that reach the microphones at once: (range,) float32."""
+    """Output of a beamformer for signals that reach all microphones at once: (range,) float32."""
     n_mics, n_ranges = signals.shape
     weights = np.full((1, n_mics), 1 / n_mics, dtype=np.complex64)
     offsets = np.arange(n_mics, dtype=np.int32)[None] * n_ranges
@@ -56,7 +56,7 @@ def combined(kernel_set, beamformer, signals, **options):
 
 
 def all_of(kernel_set, name):
-    """The images of all three kernels, one after the other."""
+    """Images of all three kernels, one after the other."""
     signals, offsets, weights, shape = beam_input(name)
     out = np.full((3, *shape), 12_345, dtype=np.float32)
     kernel_set.combine_coherence(signals, offsets, weights, out[0])
@@ -158,7 +158,7 @@ def test_capon_of_one_snapshot_depends_on_the_coherence_factor_only(kernel_set, 
 
 @pytest.mark.parametrize("beamformer", OTHERS)
 def test_beamformers_give_zero_for_silence(kernel_set, beamformer):
-    """And what comes after it is what it would have been: here, the second half."""
+    """The following signal, here the second half, is unaffected."""
     signals = complex_noise(4, 40)
     signals[:, :20] = 0
     found = combined(kernel_set, beamformer, signals, snapshots=3)
@@ -179,7 +179,7 @@ def test_naive_forms_fail_on_silence():
 
 @pytest.mark.parametrize("beamformer", OTHERS)
 def test_beamformers_of_tiny_signals_are_finite(kernel_set, beamformer):
-    """Squares of these are no numbers of single precision any more: the plain root is infinite."""
+    """Their squares underflow in single precision, so the naive root is infinite."""
     signals = np.full((4, 40), 1e-25 + 1e-25j, dtype=np.complex64)
     with np.errstate(all="ignore"):
         power = signals.real**2 + signals.imag**2
@@ -190,7 +190,7 @@ def test_beamformers_of_tiny_signals_are_finite(kernel_set, beamformer):
 
 
 def test_loud_microphone_does_not_mask_dmas_products_of_others(kernel_set):
-    """Power sums and Newton's identities lose everything but the loud one, which is in a part of all products only."""
+    """Power sums with Newton's identities lose all products without the loud microphone."""
     signals = complex_noise(8, 200)
     signals[3] *= 1e10
     order = 4
@@ -209,7 +209,7 @@ def test_loud_microphone_does_not_mask_dmas_products_of_others(kernel_set):
 
 
 def test_capon_of_nearly_equal_snapshots_is_accurate(kernel_set):
-    """The covariance of few snapshots is singular, and single precision loses what is left under the fraction."""
+    """The covariance of few snapshots is singular, so the denominator loses its digits in single precision."""
     loading, random, signals = 1e-6, np.random.default_rng(5), np.ones((16, 5), dtype=np.complex64)
     signals += (3e-4 * random.standard_normal((16, 5))).astype(np.float32)
     covariance = signals.astype(complex) @ signals.astype(complex).conj().T

@@ -1,4 +1,4 @@
-"""The benchmarks measure what they say, refuse wrong results, and write their tables where they belong."""
+"""Benchmarks measure as documented, refuse wrong results, and write their tables to the markers."""
 
 import functools
 import json
@@ -29,7 +29,7 @@ def image():
 
 @pytest.fixture
 def hardly_warm(monkeypatch):
-    """One call before those that are timed: what is tested is what is timed, not how long it takes."""
+    """Warm up with one call: these tests check the timing code, not the times."""
     monkeypatch.setattr(timing, "_WARM_UP", 1)
     monkeypatch.setattr(timing, "_WARM_UP_S", 0.0)
 
@@ -217,7 +217,7 @@ FEW = [("float32", "nearest", 2, 40.0, None), ("float32", 3, 4, 80.0, None), ("i
 
 @pytest.fixture
 def quick(monkeypatch, hardly_warm):  # noqa: ARG001 - it is used by what it does
-    """Few plans, and calls that are hardly warmed up."""
+    """Use few plans and hardly any warm-up."""
     monkeypatch.setattr(plans, "PLANS", FEW)
 
 

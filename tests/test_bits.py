@@ -1,8 +1,8 @@
-"""Words that no microphones sent are told from those that they did, whatever these heard.
+"""Tests of the check that words are PDM.
 
-The second matters more: a corrupt measurement among thousands is a nuisance, a genuine one refused is lost. What is
-genuine here: a real measurement and its pieces, and simulated ones, of which the hard ones come straight from the
-modulators: overload, clicks, noise, low orders, no dither.
+Refusing a genuine measurement is worse than accepting a corrupt one. Genuine data are a real measurement and its
+pieces, and simulated ones. The hard ones come directly from modulators with overload, clicks, noise, low orders or no
+dither.
 """
 
 import importlib.metadata
@@ -51,18 +51,18 @@ def modulated(signals, seed=1, order=4, dither=0.5, noise=1e-3):
 
 
 def earlier_s(azimuth_deg):
-    """By how much sound from aside comes earlier to each microphone: (mic, 1)."""
+    """Lead of sound from the side at each microphone: (mic, 1)."""
     return LAYOUT.positions_m[:, 1:2] * np.sin(np.radians(azimuth_deg)) / SPEED_M_S
 
 
 def clicks(width_s, amplitude, azimuth_deg=0.0):
-    """Short pulses at five places."""
+    """Short pulses at five times."""
     since_s = TIME_S + earlier_s(azimuth_deg)
     return amplitude * sum(np.exp(-(((since_s - begin_s) / width_s) ** 2)) for begin_s in np.arange(1, 6) * 1.13e-3)
 
 
 def hiss(low_hz, high_hz, rms, azimuth_deg=0.0):
-    """Noise from one place."""
+    """Noise from one direction."""
     frequency_hz = np.fft.rfftfreq(SHORT, 1 / RATE_HZ)
     spectrum = np.fft.rfft(np.random.default_rng(2).standard_normal(SHORT))
     spectrum[(frequency_hz < low_hz) | (frequency_hz > high_hz)] = 0
@@ -71,7 +71,7 @@ def hiss(low_hz, high_hz, rms, azimuth_deg=0.0):
 
 
 def direct_sound(amplitude):
-    """A sweep from 50 to 25 kHz, loud at once and at each microphone a little later."""
+    """Sweep from 50 to 25 kHz that begins loudly, with a small delay between microphones."""
     since_s = TIME_S - np.arange(32)[:, None] * 5e-6 - 0.4e-3
     inside = (since_s > 0) & (since_s < 2.5e-3)
     return np.where(inside, amplitude * np.sin(2 * np.pi * (50e3 * since_s - 5e6 * since_s**2)), 0)
@@ -104,7 +104,7 @@ def test_sound_of_any_modulator_is_accepted_as_pdm(name):
 
 
 def test_real_measurement_is_accepted_as_pdm():
-    """Nor is any piece of it, although it has words that were altered."""
+    """All of its pieces are accepted too, although some words are altered."""
     check = BitCheck(len(REAL), RATE_HZ, splices=True)
     assert check.check(REAL) is None
     for n_samples in (4 * SHORT, SHORT):
@@ -128,7 +128,7 @@ def test_simulated_scenes_are_accepted_as_pdm(path):
 
 
 def test_faulty_microphones_are_reported_but_accepted():
-    """Nine of them, one lane of the words among them; they may break one by one while blocks come in."""
+    """Nine are faulty, including all of one byte lane; they may fail one by one between blocks."""
     check = BitCheck(SHORT, RATE_HZ, splices=True)
     words = modulated(SOUNDS["direct sound"])
     for mask in np.cumsum(1 << np.array([30, 8, 9, 10, 11, 12, 13, 14, 15])):
@@ -139,7 +139,7 @@ def test_faulty_microphones_are_reported_but_accepted():
 
 
 def test_isolated_altered_words_are_accepted():
-    """A real sensor does so: in ten words the upper half is nearly the lower half of the next word."""
+    """A real sensor does so: in ten words, the upper half is nearly the lower half of the next word."""
     for word in GLITCHES:
         assert int(REAL[word] >> 16 ^ REAL[word + 1] & 0xFFFF).bit_count() <= 1
     random = np.random.default_rng(4)
@@ -165,7 +165,7 @@ def test_flipped_bits_are_accepted_like_those_of_a_real_sensor(largest):
 
 
 def lost_and_added(words, random, *, repeats, largest=4_000):
-    """Words of which some bytes are missing in one place while in another as many are too many, at least 8 away."""
+    """Words that lack some bytes at one place and have as many extra bytes at another, at least 8 words away."""
     data, n_bytes = words.tobytes(), int(random.integers(1, largest + 1))
     lost, added = 0, 0
     while abs(lost - added) < n_bytes + 8:
@@ -179,14 +179,14 @@ def lost_and_added(words, random, *, repeats, largest=4_000):
 
 
 def replaced(words, random):
-    """Words with a part of others in the middle: what was recorded at another time."""
+    """Words whose middle part is from another measurement."""
     first, last = np.sort(random.integers(0, len(words), 2))
     other = np.roll(words, random.integers(1, len(words)))
     return np.concatenate([words[:first], other[first:last], words[last:]])
 
 
 def packets_lost(words, random):
-    """Words of which packets of 512 bytes are missing; what comes after is of the next block, or so."""
+    """Words that lack packets of 512 bytes and end with the start of the next block."""
     n_words = 128 * int(random.integers(1, 8))
     place = int(random.integers(QUIET.start, QUIET.stop - n_words) if len(words) == len(REAL) else len(words) // 2)
     return np.concatenate([words[:place], words[place + n_words :], words[:n_words]])

@@ -134,7 +134,7 @@ def test_process_prints_no_warning_if_the_budget_is_kept(tmp_path):
 
 @pytest.mark.parametrize("seed", [39, 42, 415, 453])
 def test_budgets_once_missed_silently_are_kept_or_warned_of(seed):
-    """Zones of two microphones, direct sound 110 dB above the image, and rounding of direct sound."""
+    """The causes were zones of two microphones, direct sound 110 dB above the image, and its rounding."""
     row = budgets.tried(seed)
     assert row is not None
     assert row["outcome"] != "missed"
@@ -187,7 +187,7 @@ def test_files_and_reports_name_the_scope_of_the_budget(tmp_path, processing, bu
 
 @pytest.mark.parametrize("seed", [44, 118])
 def test_adaptive_predictions_are_within_2_db_without_false_warnings(seed):
-    """Predictions for these seeds once were 7 to 8 dB too low, and images warned of if within 15 dB of the budget."""
+    """Predictions for these seeds were once 7 to 8 dB too low, and warnings appeared within 15 dB of the budget."""
     measurement, _ = budgets.measurement_of(seed)
     true_db, predicted = errors(measurement)
     assert abs(true_db - predicted.predicted_error_db) < predicted.uncertainty_db <= 2.0

@@ -25,7 +25,7 @@ REVERSED = CALL.replace(start_frequency_hz=CALL.stop_frequency_hz, stop_frequenc
 
 
 def heard(emitted, *, echoes=((6e-3, 1.0),), noise=0.0, seed=0, settings=SETTINGS):
-    """A measurement of echoes, ``(delay, amplitude)``, of a call that need not be that of the settings."""
+    """Measurement of echoes ``(delay, amplitude)`` of a call that may differ from that of the settings."""
     random = np.random.default_rng(seed)
     time_s = np.arange(settings.recording.n_samples) / settings.recording.sample_rate_hz
     signal = np.zeros(len(time_s))

@@ -1,6 +1,6 @@
-"""Acoular opens what is made for it, and its own beamformer finds the reflector where it is.
+"""Acoular opens exported files, and its own beamformer finds the reflectors.
 
-Acoular runs in a process of its own: importing it changes Numba's threads, and warns where NumPy was there before.
+Acoular runs in a separate process, because its import changes Numba's threads and warns if NumPy is already loaded.
 """
 
 import json
@@ -52,7 +52,7 @@ print(json.dumps({"azimuth_deg": azimuth_deg[power.argmax()], "rate_hz": float(w
 
 
 def test_acoular_finds_the_reflectors(tmp_path):
-    """The first of them at -38° and 1.15 m, by a window about its echo."""
+    """The nearest is at -38° and 1.15 m, within a window around its echo."""
     with ertis.open_recording(REFLECTORS) as recording:
         measurement = recording[0]
     path, geometry = export(tmp_path / "signals.h5", [measurement])
@@ -82,7 +82,7 @@ def test_acoular_finds_the_reflectors(tmp_path):
 
 
 def test_exported_signals_equal_the_decoded_samples():
-    """A call in one-bit words comes back, at its place and its level, within the noise of the bits."""
+    """A call in PDM words keeps its time and level, within the quantisation noise."""
     settings = line(8, 8)
     rate_hz, n_samples = settings.recording.sample_rate_hz, settings.recording.n_samples
     given = 0.5 * call_at(settings.call, np.arange(n_samples) / rate_hz - 2e-3)

@@ -1,4 +1,4 @@
-"""What docs/how-to/export.md says of points that no reflector is at, with eight microphones on a ring."""
+"""Side lobes as points, as docs/how-to/export.md describes them, with eight microphones on a ring."""
 
 import csv
 import math

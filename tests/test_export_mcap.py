@@ -1,4 +1,4 @@
-"""MCAP as rosbags reads it, which shares no code with what writes: every field is what went in."""
+"""MCAP files as rosbags reads them; rosbags shares no code with the writer."""
 
 import sys
 
@@ -46,7 +46,7 @@ FRAMES = {"eRTIS-7": "/eRTIS_7", "2.right": "/sensor_2_right"}
 
 
 def read(path):
-    """What rosbags finds: (topic, time) to message, and the profiles of topics."""
+    """Content as rosbags reads it: messages by (topic, time), and the profiles of the topics."""
     messages, profiles, kinds = {}, {}, {}
     with AnyReader([path]) as reader:
         for connection in reader.connections:
@@ -64,7 +64,7 @@ def bag(tmp_path_factory):
 
 
 def reported(message):
-    """A message as dicts, lists and numbers."""
+    """Message as dicts, lists and numbers."""
     if hasattr(message, "__msgtype__"):
         return {
             name: reported(value) for name, value in vars(message).items() if name.islower() and name != "__msgtype__"
@@ -147,7 +147,7 @@ def test_mcap_sonar_image_comes_back(bag, given):
 
 
 def test_mcap_pictures_show_the_image(bag):
-    """Planar: columns from the left, rows from the far end. In space: the brightest pixel is in the right direction."""
+    """A planar image has columns from the left and rows from the far end; a spatial one has its maximum in place."""
     messages, _, _ = bag
     planar = messages["/eRTIS_7/image", TIME_NS]
     given = GIVEN[0]
@@ -199,7 +199,7 @@ def test_mcap_map_of_few_directions_is_correct(azimuth_deg, elevation_deg, shape
 
 @pytest.mark.parametrize("azimuth_deg", [np.arange(150, 211, 10), [150, 160, 170, 180, -170, -160, -150]])
 def test_leftmost_direction_behind_the_sensor_is_the_first_column(azimuth_deg):
-    """It is 210°, wherever azimuths are said to begin."""
+    """It is 210°, for any start of the azimuths."""
     amplitude = np.geomspace(0.1, 1.0, 7, dtype=np.float32)[:, None].repeat(50, axis=1)  # the farther left, the louder
     pixels = _pixels(image(azimuth_deg, range_m=np.linspace(0.5, 1.5, 50)).replace(amplitude=amplitude))
     assert pixels.shape == (50, 7)
@@ -234,7 +234,7 @@ def test_mcap_has_static_transforms(bag):
 
 
 def test_message_definitions_equal_those_of_ros():
-    """By the hashes of REP 2016; those of the marine messages are in no store and are compared by their fields."""
+    """Hashes of REP 2016 confirm them; the marine messages are compared by their fields."""
     own, theirs = get_typestore(Stores.EMPTY), get_typestore(Stores.ROS2_JAZZY)
     for name in ("tf2_msgs/msg/TFMessage", *KINDS.values()):
         own.register(get_types_from_msg(schema(name), name))

@@ -1,4 +1,4 @@
-"""Energyscapes come back from NPZ bit by bit, without pickle."""
+"""NPZ files preserve energyscapes bit by bit, without pickle."""
 
 import numpy as np
 import pytest

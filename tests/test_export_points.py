@@ -1,4 +1,4 @@
-"""Points come back from PLY, PCD and CSV, as readers that share no code with the writers see them."""
+"""Point clouds in PLY, PCD and CSV, as readers without shared code see them."""
 
 import csv
 from pathlib import Path
@@ -22,7 +22,7 @@ FINDING = {"top": 40, "min_level_db": -60.0}
 
 
 def images(sensor="eRTIS-7", count=2, **stamp):
-    """Planar images of noise and a reflector, with stamps of large numbers."""
+    """Planar images of noise and a reflector, with large numbers in their stamps."""
     return [
         image(seed=seed + 1).replace(
             stamp=Stamp(
@@ -41,7 +41,7 @@ def images(sensor="eRTIS-7", count=2, **stamp):
 
 
 def expected(given, **mounting):
-    """The clouds of images, by the stage that finds them."""
+    """Clouds that the point stage finds in the images."""
     return [
         PointExtractor(each.settings, Grid(each.azimuth_rad, each.elevation_rad), **FINDING)(each).replace(**mounting)
         for each in given
@@ -107,14 +107,14 @@ def test_csv_points_come_back(tmp_path):
 
 @pytest.mark.parametrize("timestamp_ns", [-1, 2_300_000_000_000_000_000])
 def test_csv_stores_times_before_1970_and_after_2106(tmp_path, timestamp_ns):
-    """Its times are nanoseconds, which those of ROS are not: there are none before 1970 nor after 2038."""
+    """CSV times are int64 nanoseconds; times of ROS are limited."""
     (path,) = export(tmp_path / "a.csv", images(count=1, timestamp_ns=timestamp_ns), top=1)
     with path.open(newline="") as file:
         assert [int(row["timestamp_ns"]) for row in csv.DictReader(file)] == [timestamp_ns]
 
 
 def test_exported_cloud_has_the_nearest_reflector_in_place(tmp_path):
-    """From the words of a scene to a cloud that another program reads."""
+    """The test runs from the samples of a scene to a cloud that another program reads."""
     with ertis.open_recording(REFLECTORS) as recording:
         pipeline = ertis.Pipeline(recording.settings)
         export(tmp_path / "a.ply", [pipeline.process(recording[0])])

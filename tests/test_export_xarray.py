@@ -1,4 +1,4 @@
-"""Recordings and energyscape files open in xarray by h5netcdf, as they do by netCDF4."""
+"""xarray opens recordings and energyscape files by h5netcdf and by netCDF4."""
 
 import numpy as np
 import pytest
@@ -36,7 +36,7 @@ def test_xarray_opens_energyscapes(tmp_path, engine):
 
 
 def test_float16_is_read_by_h5netcdf(tmp_path):
-    """netCDF-C crashes on it; docs/reference/formats.md says so."""
+    """netCDF-C crashes on it, as docs/reference/formats.md states."""
     path = write_energyscapes(tmp_path / "img.h5", [image()], dtype="float16")
     with xarray.open_dataset(path, group="/sensors/sensor", engine="h5netcdf") as data:
         np.testing.assert_allclose(data["amplitude"].values[0], image().amplitude, rtol=2**-10, atol=1e-7)

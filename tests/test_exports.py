@@ -1,4 +1,4 @@
-"""What modules say they export is what they hold; ruff keeps the lists in order."""
+"""`__all__` of each module lists its public names; ruff keeps the lists sorted."""
 
 import importlib
 import pkgutil

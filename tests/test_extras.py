@@ -1,4 +1,4 @@
-"""Commands in an environment without an extra: one line names the extra, and all else works."""
+"""Commands in an environment without an extra: one line names the extra, and all other commands work."""
 
 import re
 import subprocess
@@ -76,7 +76,7 @@ def extras():
 
 
 def modules_of(distribution):
-    """Names that a distribution can be imported by; none if it is not installed."""
+    """Import names of a distribution; none if it is not installed."""
     return [module for module, names in PACKAGES.items() if _plain(distribution) in map(_plain, names)]
 
 
@@ -85,7 +85,7 @@ def _plain(name):
 
 
 def cases():
-    """Each package of each extra is missing once, and all packages of the extra together."""
+    """Each package of each extra is missing once, and then all packages of the extra together."""
     for name, distributions in extras().items():
         missing = [found for each in distributions if (found := modules_of(each))]
         every = [module for each in missing for module in each]

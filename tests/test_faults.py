@@ -1,4 +1,4 @@
-"""Faults do what their notes say, the same ones for the same seed."""
+"""Injected faults equal their descriptions, and are the same for the same seed."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def test_blocks_without_faults_are_unchanged():
 
 
 def _as_told(block, fault, spoilt):
-    """What one fault makes of a block, by its note."""
+    """Apply one fault to a block, as its description says."""
     place, count = fault.place, fault.n_bytes
     again = int(fault.detail.removeprefix("at ")) if fault.kind == "swap" else place
     left = {"add": block, "duplicate": block, "stall": block, "cut": block[:place], "unplug": block[:place]}

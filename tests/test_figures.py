@@ -1,4 +1,4 @@
-"""Pictures show what is there, where it is, in each kind of image."""
+"""Plots show the content of each kind of image at its position."""
 
 import io
 
@@ -51,7 +51,7 @@ IMAGES = {
 
 
 def drawn(figure):
-    """The pixels of a figure, coarse to be quick."""
+    """Pixels of a figure, at a low resolution for speed."""
     assert isinstance(figure, Figure)
     figure.set_dpi(40)
     figure.canvas.draw()
@@ -76,7 +76,7 @@ def test_every_format_is_written(kind):
 
 
 def brightest_m(figure):
-    """Where the brightest pixel of the last raster is, in the coordinates of its axes."""
+    """Position of the brightest pixel of the last raster, in the coordinates of its axes."""
     shown = [axes.images[0] for axes in figure.axes if axes.images and axes.get_label() != "<colorbar>"][-1]
     values = np.ma.filled(shown.get_array(), -np.inf)
     row, column = np.unravel_index(np.nanargmax(values), values.shape)

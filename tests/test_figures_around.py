@@ -1,4 +1,4 @@
-"""Pictures of directions all around, behind the sensor and with gaps; of ranges large, small and single; in words."""
+"""Plots of directions all around, behind the sensor and with gaps, and of large, small and single ranges."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ REAR = np.concatenate([np.arange(-180, -99, 3), np.arange(100, 178, 3)])
 
 
 def shown_at(axes, azimuth_deg, range_m=3.0):
-    """The levels that a sector shows at places, NaN for nothing."""
+    """Levels that a sector shows at given positions; NaN where it is blank."""
     (shown,) = axes.images
     values = np.ma.filled(shown.get_array(), np.nan)
     left, right, bottom, top = shown.get_extent()
@@ -82,7 +82,7 @@ def test_polar_plot_is_blank_between_distant_directions():
 
 
 def test_projection_marks_reflectors_behind_the_sensor():
-    """They are named from -180 to 180, whichever way directions were."""
+    """Labels are from -180 to 180°, for any convention of the directions."""
     peaks = [Peak(azimuth_deg=at_deg, elevation_deg=0.0, range_m=2.0, level_db=0.0) for at_deg in (-142.0, 157.0)]
     figure = figures.projection(image(np.arange(100, 261, 2)), peaks=peaks)
     (axes, *_) = figure.axes
@@ -93,7 +93,7 @@ def test_projection_marks_reflectors_behind_the_sensor():
 
 
 def test_spectrogram_of_a_long_record_shows_all_echoes():
-    """Each of 20 sweeps in 2.6 s is there from end to end, though a column is longer than a sweep."""
+    """All 20 sweeps in 2.6 s are complete, although a column is longer than a sweep."""
     recording = Recording(encoding="float32", sample_rate_hz=192e3, n_samples=500_000)
     settings = Settings(recording=recording, array=Array(layout="one", positions_m=((0.0, 0.0, 0.0),)), call=Call())
     time_s = np.arange(500_000) / settings.signal_rate_hz
@@ -110,7 +110,7 @@ def test_spectrogram_of_a_long_record_shows_all_echoes():
 
 @pytest.mark.parametrize(("length_m", "wanted"), [(1.0, "0.344°"), (2.0, "0.172°"), (10.9, "0.0315°")])
 def test_beam_width_of_a_large_array_matches_the_formula(length_m, wanted):
-    """0.886 λ / (N d), of a line with uniform weights."""
+    """It is 0.886 λ / (N d) for a line with uniform weights."""
     positions_m = tuple((0.0, y_m, 0.0) for y_m in np.linspace(-length_m / 2, length_m / 2, 64))
     settings = Settings(array=Array(layout="line", positions_m=positions_m, word_bits=32))
     axes = figures.array(settings, frequencies_hz=[50e3]).axes[1]

@@ -1,4 +1,4 @@
-"""Each kind of picture shows what is there, where it is, in each theme, with one microphone and with many."""
+"""Each kind of plot shows its content in place, in each theme, with one microphone and with many."""
 
 import functools
 import io
@@ -35,7 +35,7 @@ PEAKS = [
 
 
 def heard(n_mics=32, delay_s=9e-3, *, settings=SETTINGS):
-    """A measurement of one call that reaches all microphones at the same time."""
+    """Measurement of one call that reaches all microphones simultaneously."""
     settings = settings.replace(array=ARRAYS[n_mics])
     time_s = np.arange(settings.recording.n_samples) / settings.recording.sample_rate_hz
     signal = 0.5 * call_at(settings.call, time_s - delay_s)
@@ -43,7 +43,7 @@ def heard(n_mics=32, delay_s=9e-3, *, settings=SETTINGS):
 
 
 def solid(count=300, settings=None, **more):
-    """A hemisphere of speckle."""
+    """Hemisphere of speckle."""
     grid = direction_grid(Processing(directions=f"3d:{count}", azimuth_limits_deg=(-80.0, 80.0)))
     more = {"settings": settings} if settings else more
     return image(np.degrees(grid.azimuth_rad), np.degrees(grid.elevation_rad), **more).replace(stamp=STAMP)
@@ -51,7 +51,7 @@ def solid(count=300, settings=None, **more):
 
 @functools.cache
 def pictures(n_mics):
-    """Each kind of picture, by its name."""
+    """Each kind of plot by its name."""
     settings = SETTINGS.replace(array=ARRAYS[n_mics])
     planar, hemisphere = image().replace(stamp=STAMP, settings=settings), solid(settings=settings)
     measurement = heard(n_mics)
@@ -100,7 +100,7 @@ KINDS = {
 
 
 def texts_of(figure):
-    """All that is written, as text and box in points."""
+    """All texts of a figure with their boxes in points."""
     for axes in figure.axes:
         for drawn in (*axes.images, *axes.collections):
             drawn.set_visible(False)  # takes most of the time
@@ -150,7 +150,7 @@ def test_texts_neither_overlap_nor_leave_the_page(kind, look, n_mics):
     "kind", [kind for kind in KINDS if not kind.startswith("polar,") and kind != "slices, upright"]
 )
 def test_pictures_have_units_and_settings(kind):
-    """Units at all axes, and the settings that matter."""
+    """All axes have units, and captions have the significant settings."""
     figure = pictures(32)[kind]()
     texts = [text for text, _ in texts_of(figure)]
     for axes in figure.axes:
@@ -188,7 +188,7 @@ def test_times_of_unset_clocks_are_omitted(timestamp_ns):
 
 
 def test_printed_sizes_match_the_documentation():
-    """85 and 170 mm, letters from 6 to 8 points, ink on white."""
+    """They are 85 and 170 mm wide, with letters of 6 to 8 points in black on white."""
     for columns, width_mm in ((1, 85.0), (2, 170.0)):
         figure = figures.plot(image(), theme="paper", columns=columns, font="serif", peaks=PEAKS)
         assert figure.get_size_inches()[0] * 25.4 == pytest.approx(width_mm)
@@ -201,7 +201,7 @@ def test_printed_sizes_match_the_documentation():
 
 @pytest.mark.parametrize("kind", ["svg", "pdf"])
 def test_picture_files_are_small_and_reproducible(kind):
-    """What is drawn in colours is a picture in them, and letters of a PDF are letters."""
+    """Coloured areas are stored as images, and letters of a PDF as text."""
     sizes = []
     for name in ("plot, hemisphere", "matched filter"):
         files, figure = [io.BytesIO(), io.BytesIO()], pictures(32)[name](theme="paper", columns=1)

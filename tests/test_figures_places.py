@@ -1,4 +1,4 @@
-"""What pictures show is where it is: reflectors, echoes, sweeps, microphones and beams."""
+"""Plots show reflectors, echoes, sweeps, microphones and beams at their positions."""
 
 from pathlib import Path
 
@@ -22,7 +22,7 @@ from tests.test_figures_kinds import ONE, SETTINGS, STAMP, heard, solid
 
 
 def brightest(axes):
-    """Where the brightest pixel of the raster is, in the coordinates of its axes."""
+    """Position of the brightest pixel of the raster, in the coordinates of its axes."""
     shown = axes.images[0]
     values = np.ma.filled(shown.get_array(), -np.inf)
     row, column = np.unravel_index(np.nanargmax(values), values.shape)
@@ -34,7 +34,7 @@ def brightest(axes):
 
 
 def with_reflector(azimuth_deg, elevation_deg, range_m):
-    """A hemisphere that is dark but for one reflector as wide as a beam, and the bin that is its middle."""
+    """Dark hemisphere with one reflector as wide as a beam, and the bin of its centre."""
     given = solid(3000, range_m=np.linspace(0.5, 5.0, 600))
     looks = unit_vectors(given.azimuth_rad, given.elevation_rad)
     middle = looks[np.argmax(looks @ unit_vectors(np.radians(azimuth_deg), np.radians(elevation_deg)))]
@@ -67,7 +67,7 @@ def test_slices_list_the_reflectors_in_their_planes_only():
 
 @pytest.mark.parametrize("azimuth_deg", [0.0, 35.0])
 def test_slices_show_a_single_direction_as_a_narrow_beam(azimuth_deg):
-    """As wide as the sector draws it, not all of the plane."""
+    """It is as wide as in a sector plot and does not fill the plane."""
     (axes, *_) = figures.slices(image([azimuth_deg], range_m=np.linspace(0.5, 5.0, 600))).axes
     (shown,) = axes.images
     rows, columns = np.nonzero(~np.ma.getmaskarray(np.ma.masked_invalid(shown.get_array())))
@@ -178,7 +178,7 @@ def test_matched_filter_plot_removes_the_calibration():
 
 @pytest.mark.parametrize(("frequency_hz", "wanted_deg"), [(25e3, 10.7), (40e3, 6.7), (50e3, 5.35), (80e3, 3.3)])
 def test_drawn_beam_width_is_that_of_the_array(frequency_hz, wanted_deg):
-    """What the line that is drawn falls to, for eRTIS_v3D1 with uniform weights."""
+    """The drawn line of eRTIS_v3D1 with uniform weights falls to half the power at this width."""
     axes = figures.array(Settings(), frequencies_hz=[frequency_hz]).axes[1]
     assert width_deg(*axes.lines[0].get_data(), 0.0) == pytest.approx(wanted_deg, abs=0.06)
     assert f"{frequency_hz / 1e3:g} kHz" in axes.get_legend().get_texts()[0].get_text()
@@ -192,7 +192,7 @@ def test_beam_width_of_the_mean_power_of_the_band():
 
 
 def test_beam_pattern_of_a_line_equals_the_formula():
-    """sin(Nψ/2) / (N sin(ψ/2)), its first side lobe at −13.15 dB with 16 microphones, steered to 20°."""
+    """sin(Nψ/2) / (N sin(ψ/2)), whose first side lobe is at −13.15 dB for 16 microphones, steered to 20°."""
     count, spacing_m, frequency_hz = 16, 0.004, 40e3
     array = Array(layout="line", positions_m=tuple((0.0, spacing_m * mic, 0.0) for mic in range(count)), word_bits=16)
     settings = Settings(array=array)
@@ -230,7 +230,7 @@ def words_of_page(figure):
 
 @pytest.mark.parametrize("draw", [figures.plot, figures.polar, figures.projection, figures.slices])
 def test_plot_of_an_empty_image_states_this(draw):
-    """Its colours alone would not."""
+    """Colours alone would not show it."""
     given = image()
     assert "silence" not in words_of_page(draw(given))
     assert "silence: all values are 0" in words_of_page(draw(given.replace(amplitude=np.zeros_like(given.amplitude))))
@@ -248,7 +248,7 @@ def test_constant_bits_are_reported_in_the_plot():
 @pytest.mark.parametrize("look", [{}, {"theme": "paper"}, {"theme": "paper", "columns": 1}])
 @pytest.mark.parametrize("count", [0, 5, 9])
 def test_flat_picture_keeps_its_colour_bar_and_list(look, count):
-    """The map of a planar image is a strip; its numbers mean nothing without the list."""
+    """The map of a planar image is a strip, which is useless without the list."""
     peaks = [Peak(azimuth_deg=10.0 * n, elevation_deg=0.0, range_m=1.0, level_db=-n) for n in range(count)]
     figure = figures.projection(image(), peaks=peaks, **look)
     figure.draw_without_rendering()
@@ -265,7 +265,7 @@ def test_flat_picture_keeps_its_colour_bar_and_list(look, count):
 
 
 def test_matched_filter_panels_share_the_0_db_reference():
-    """That of the strongest microphone; the mean of all is below it."""
+    """It is the strongest microphone; the mean of all is below it."""
     given = heard()
     figure = figures.matched_filter(given)
     upper, lower, scale = figure.axes

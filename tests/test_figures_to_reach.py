@@ -1,4 +1,4 @@
-"""The promised times and sizes, measured on whole processes. The best of a few runs counts: machines are shared."""
+"""Promised times and sizes, measured on whole processes. The best of a few runs counts, because machines are shared."""
 
 import os
 import re
@@ -22,7 +22,7 @@ ERTIS = [sys.executable, "-m", "ertis_cli"]
 
 
 def seconds(command, *, times, promised_s, **options):
-    """The quickest of some runs, the last of which keeps the promise if any does, and what that one said."""
+    """Return the shortest time of some runs, and the output of the last one."""
     stated = []
 
     def once():
@@ -65,7 +65,7 @@ def test_first_run_takes_less_than_12_s_and_reports_compilation(recording, tmp_p
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="only Linux says how large a process ever was")
 def test_memory_is_independent_of_the_recording_length(tmp_path):
-    """700 measurements are 460 MB; half of that in memory would be too much."""
+    """700 measurements are 460 MB; using half of that would be too much."""
     settings = Settings.from_preset("default_25_50").replace(
         processing=Processing(directions="2d:5", range_m=(0.5, 1.0))
     )
@@ -86,7 +86,7 @@ def test_memory_is_independent_of_the_recording_length(tmp_path):
 
 @pytest.fixture(scope="module", params=["2d:181", "3000"])
 def real(request):
-    """The real measurement, and the exact image of some of the directions of a grid."""
+    """The real measurement, and the exact image of some directions of a grid."""
     settings = Settings.from_preset("default_25_50")
     settings = settings.replace(processing=settings.processing.replace(directions=request.param))
     measurement = Measurement(np.fromfile(RAW, dtype="<u4"), settings)
@@ -98,7 +98,7 @@ def real(request):
 
 @pytest.mark.parametrize("budget", ["draft", "standard", "fine", "exact"])
 def test_images_of_the_real_measurement_keep_their_budget(real, budget):
-    """Plans that know nothing of what is heard keep their budget; the standard one is that of the default settings."""
+    """Plans without knowledge of the signals keep their budget; 'standard' is that of the default settings."""
     measurement, some, exact = real
     budget_db = {"draft": -20, "standard": -35, "fine": -60, "exact": -100}[budget]
     pipeline = ertis.Pipeline(measurement.settings, max_error_db=None if budget == "standard" else budget_db)

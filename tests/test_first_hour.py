@@ -1,4 +1,4 @@
-"""The page on the first hour, in a folder outside the source, and the commands of all pages."""
+"""The page on the first hour runs in a folder outside the source; the commands of all pages parse."""
 
 import contextlib
 import json
@@ -25,13 +25,13 @@ processing.range_decimation = 4
 
 
 def commands(text):
-    """Lines that begin with a prompt, without it, without variables and without what follows."""
+    """Lines that begin with a prompt, without prompt, variables and redirections."""
     for line in re.findall(r"^\w*\$ (?:[A-Z_]+=\S+ )*ertis (.*?)(?:\s+#.*)?$", text, re.MULTILINE):
         yield line.partition(" | ")[0].partition(" > ")[0].removesuffix("&").strip()
 
 
 def found(words):
-    """The command that words name, and those that come after."""
+    """The command that the words name, and the remaining words."""
     command, rest = cli, words[2:] if words[0] == "--config" else list(words)
     while isinstance(command, click.Group) and rest:
         name = rest.pop(0)
@@ -43,7 +43,7 @@ def found(words):
 
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)
 def test_command_lines_of_pages_parse(path):
-    """Without running them."""
+    """They are not run."""
     for line in commands(path.read_text("utf-8")):
         command, rest = found(shlex.split(line))
         command.make_context(line, rest)
@@ -51,7 +51,7 @@ def test_command_lines_of_pages_parse(path):
 
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)
 def test_options_named_on_pages_exist(path):
-    """In the text, where commands are not complete."""
+    """This includes options in the prose."""
     for text in re.findall(r"`ertis ([^`]+)`", path.read_text("utf-8")):
         if not re.match(r"[a-z]", text):
             continue  # as ertis --help, and ertis COMMAND --help

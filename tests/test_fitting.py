@@ -1,4 +1,4 @@
-"""Fitted weights: they err no more than others, as much as they say, and less with more samples to choose from."""
+"""Fitted weights: their error is minimal and predicted, and falls with oversampling."""
 
 import numpy as np
 import pytest
@@ -34,7 +34,7 @@ DEFAULT = spectrum_of(Call())
 
 
 def power_of(made):
-    """What a fit errs by in all."""
+    """Total error of a fit."""
     return float((made.errors + made.biases) @ DEFAULT.power)
 
 
@@ -56,7 +56,7 @@ def test_fitted_weights_have_the_smallest_error_for_their_taps(call, rate, other
 @settings(max_examples=40, deadline=None)
 @given(call=calls, rate=rates, n_taps=st.integers(1, 4))
 def test_additional_tap_does_not_raise_the_error(call, rate, n_taps):
-    """By half a decibel: the turns of the fit end a little before its minimum."""
+    """Half a decibel is permitted: the iterations of the fit end slightly before the minimum."""
     spectrum, step_s = spectrum_of(call), step_s_of(call, rate)
     few, many = (DelayFit("fitted", count, step_s, spectrum) for count in (n_taps, n_taps + 1))
     assert (many.errors + many.biases) @ spectrum.power <= 1.12 * (few.errors + few.biases) @ spectrum.power + FLOOR
@@ -64,7 +64,7 @@ def test_additional_tap_does_not_raise_the_error(call, rate, n_taps):
 
 @pytest.mark.parametrize("n_taps", [1, 2, 3, 4])
 def test_errors_fall_with_oversampling_by_6_db_for_each_tap(n_taps):
-    """Of a polynomial of that order, and of anything that does as well."""
+    """A polynomial of that order has this slope, and so has any equally good method."""
     found_db = [errors_db("fitted", n_taps, oversampling) for oversampling in (4, 8, 16)]
     assert np.diff(found_db) == pytest.approx(-6.02 * n_taps, abs=0.6)
 
@@ -104,7 +104,7 @@ def test_fit_errors_equal_a_direct_evaluation(interpolation, n_taps, oversamplin
 @settings(max_examples=20, deadline=None)
 @given(call=calls, rate=rates, n_taps=st.integers(1, 6), seed=st.integers(0, 99))
 def test_delayed_wave_is_within_the_predicted_error(call, rate, n_taps, seed):
-    """Waves of all frequencies at once, with random phases, and delays before and after the first kept sample."""
+    """The wave has all frequencies with random phases, and delays before and after the first kept sample."""
     spectrum, step_s, random = spectrum_of(call), step_s_of(call, rate), np.random.default_rng(seed)
     made = DelayFit("fitted", n_taps, step_s, spectrum)
     delays_s = random.uniform(-0.1, 0.1, 1500)  # so long that no two waves agree
@@ -138,7 +138,7 @@ def test_weights_have_the_shape_of_the_fractions():
 
 
 def test_fitted_weights_and_gain_are_a_minimum():
-    """What `fit` returns is a minimum in weights and gain: any small step from it errs more."""
+    """Any small change of the result of `fit` has a larger error."""
     random = np.random.default_rng(3)
     taps, targets = np.exp(1j * random.standard_normal((2, 12, 5)))[:, :, :3]
     power = random.random(12)

@@ -1,4 +1,4 @@
-"""Commands that newcomers get wrong: each is refused in one line with its exit code, and soon."""
+"""Common mistakes of newcomers on the command line are refused quickly, in one line and with the exit code."""
 
 import shutil
 import time

@@ -1,5 +1,5 @@
 # ruff: noqa: ARG005
-"""Inputs to public functions that newcomers get wrong: each is refused in one line, and soon."""
+"""Common mistakes of newcomers in calls of public functions are refused quickly, in one line."""
 
 import time
 from dataclasses import replace
@@ -20,7 +20,7 @@ MAX_LENGTH = 500
 
 @pytest.fixture(scope="module")
 def given(tmp_path_factory):
-    """Sound inputs, from which calls make foolish ones."""
+    """Valid inputs, from which the invalid calls are made."""
     folder = tmp_path_factory.mktemp("foolish")
     with open_recording(RECORDING) as recording:
         measurement = recording[0]

@@ -1,4 +1,4 @@
-"""The page on file formats and the tables in the code say the same."""
+"""The page on file formats agrees with the tables in the code."""
 
 import re
 
@@ -24,7 +24,7 @@ EITHER = [each for variable in RECORDING for each in ([variable, PCM] if variabl
 
 
 def rows(first):
-    """The variables of the table that begins with ``first``: name, axes, types, unit."""
+    """Variables of the table that begins with ``first``: name, axes, types, unit."""
     table = PAGE[PAGE.index(f"| `{first}` |") :].split("\n\n", 1)[0]
     for line in table.splitlines():
         name, axes, kinds, unit = (cell.strip() for cell in line.strip("|").split("|")[:4])

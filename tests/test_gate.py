@@ -1,4 +1,4 @@
-"""Who is let in, over real sockets with CURVE: those who are listed, as what they are, for as long as they are."""
+"""Authentication over real sockets with CURVE: listed keys are admitted with their role, and no others."""
 
 import random
 import time
@@ -118,7 +118,7 @@ def test_failing_authenticator_admits_nobody_and_continues(tmp_path):
 
 
 def test_server_without_an_authenticator_admits_nobody(tmp_path):
-    """By itself, CURVE would let any key in: ZAP_ENFORCE_DOMAIN makes it ask, and nobody answers."""
+    """CURVE alone would admit any key; ZAP_ENFORCE_DOMAIN makes it ask, and nothing answers."""
     with Door(tmp_path, server_gate=False) as door:
         assert [door.admits(pair) for pair in (DESK, ROBOT, STRANGER)] == [None, None, None]
         assert not door.came
@@ -136,7 +136,7 @@ def test_idle_or_closed_authenticator_admits_nobody(door):
 
 
 def test_malformed_zap_requests_are_never_accepted(door):
-    """Seed 5: requests that are no requests, from within the context."""
+    """Malformed requests from within the context, with seed 5."""
     random_ = random.Random(5)
     asker = door.context.socket(zmq.DEALER)
     asker.connect("inproc://zeromq.zap.01")

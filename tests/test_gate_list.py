@@ -1,4 +1,4 @@
-"""The list of keys while it changes, is written, or cannot be read."""
+"""Authentication while the allow list changes, is written, or cannot be read."""
 
 import time
 

@@ -1,4 +1,4 @@
-"""Layouts against the device's own files, grids against areas, delays against each other."""
+"""Layouts agree with the device's files, grids with areas, and delays with each other."""
 
 import importlib.metadata
 
@@ -38,7 +38,7 @@ def test_six_rtis_layouts_are_included():
 
 @pytest.mark.parametrize("name", NAMES)
 def test_layouts_equal_those_of_the_device(name):
-    """The package of the device's makers is read as data; it is never imported."""
+    """The package of the manufacturer is read as data; it is never imported."""
     files = importlib.metadata.distribution("rtisdev")
     path = files.locate_file(f"rtisdev/config/microphoneLayouts/{name}/mic_coordinates.mat")
     their_m = np.asarray(loadmat(path)["mic_pos_final_pos"], dtype=np.float64)[:, :2] / 1000
@@ -234,7 +234,7 @@ def test_solid_cells_have_equal_area(count, azimuth_deg, elevation_deg):
 
 @pytest.mark.parametrize("name", ["1850", "3000"])
 def test_solid_grids_cover_evenly(name):
-    """No direction within the limits is further from the grid than the corner of a square cell, by a little."""
+    """No direction within the limits is much further from the grid than the corner of a square cell."""
     grid = direction_grid(Processing(directions=name))
     _, azimuth_deg, elevation_deg = PAPER_GRIDS[name]
     random = np.random.default_rng(1)
@@ -318,7 +318,7 @@ def test_microphone_nearest_the_source_receives_first():
 
 
 def test_spherical_delays_approach_plane_delays_with_distance():
-    """The difference falls as p² / 2 r c, the curvature of the wave over the array."""
+    """The difference falls as p² / 2 r c, the curvature of the wavefront over the array."""
     positions_m = load_layout("eRTIS_v3D1").positions_m
     grid = direction_grid(Processing(directions="3d:100"))
     directions = unit_vectors(grid.azimuth_rad, grid.elevation_rad)
@@ -382,7 +382,7 @@ def test_azimuth_columns_of_few_directions_are_their_azimuths():
     ids=["none", "one", "even", "even and wide", "gap", "coarser part", "coarser by far"],
 )
 def test_image_extends_to_the_usual_spacing_of_directions(gaps_deg, wanted_deg):
-    """1.3 of it, and among wider ones up to 10°."""
+    """The limit is 1.3 times the spacing, and 10° at most."""
     assert_allclose(np.degrees(reach_rad(np.radians(gaps_deg))), wanted_deg)
 
 

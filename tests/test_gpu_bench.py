@@ -1,4 +1,4 @@
-"""`ertis bench gpu` without a GPU: it refuses, keeps what it has when a part fails, and its rivals compute the same."""
+"""`ertis bench gpu` without a GPU: it refuses, keeps rows before a failure, and compares the images of its rivals."""
 
 import json
 import sys
@@ -90,7 +90,7 @@ PARTS = {
 
 @pytest.fixture
 def report(monkeypatch, tmp_path):
-    """What a run writes whose parts end as above, and what it says."""
+    """Report of a run whose parts end in the given ways, and its output."""
     stated = []
     monkeypatch.setattr(gpu, "part", lambda name: {"status": "done", "rows": [GPU]} if name == "machine" else None)
     monkeypatch.setattr(gpu, "parts", lambda: {name: dict(part).copy for name, part in PARTS.items()})
@@ -196,7 +196,7 @@ def test_rows_before_a_failure_are_kept(monkeypatch):
 
 
 def test_test_part_counts_gpu_tests_only(monkeypatch, tmp_path):
-    """Those of other devices do not run; where none is left, nothing is passed."""
+    """Tests of other devices do not run; if none remains, the part has not passed."""
     (tmp_path / "tests").mkdir()
     (tmp_path / "tests" / "test_it.py").write_text(
         "import pytest\n@pytest.mark.parametrize('device', ['cpu', 'cuda'])\ndef test_a(device): pass\n"
@@ -256,7 +256,7 @@ def test_array_library_rivals_compute_the_same_image(monkeypatch, name):
 
 
 def like_mach(*, channel_data, rx_coords_m, scan_coords_m, tx_wave_arrivals_s, rx_start_s, sampling_freq_hz, **given):
-    """What mach's kernel computes for one frame, as its source has it (src/mach/kernel.cu, version 0.2)."""
+    """Computation of mach's kernel for one frame, after its source (src/mach/kernel.cu, version 0.2)."""
     assert given["tukey_alpha"] == 0
     beams = np.zeros(len(scan_coords_m), np.complex128)
     aperture_m = scan_coords_m[:, 2] / (2 * given["f_number"])

@@ -1,4 +1,4 @@
-"""Which measurements belong together, whatever happens to pulses, clocks and networks."""
+"""Grouping of measurements with faults of pulses, clocks and networks."""
 
 import msgspec
 import pytest
@@ -13,7 +13,7 @@ LATENCY_NS = 3_000_000
 
 
 class Platform:
-    """Sensors on one SYNC chain: a clock of each run that nobody sets, and one that somebody may."""
+    """Sensors on one SYNC chain, with a monotonic clock per session and a wall clock that may be set."""
 
     def __init__(self, *runs):
         self.groups = Groups()
@@ -176,7 +176,7 @@ def test_ended_sessions_are_forgotten(four):
 
 
 def test_slow_clock_is_distinguished_from_old_measurements():
-    """A computer without a battery starts in the past; what it sends is as new as what the others send."""
+    """A computer without a battery starts in the past, but its measurements are as new as those of others."""
     platform = Platform(("a", 1), ("b", 2))
     platform.register()
     for number in range(10):

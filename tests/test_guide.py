@@ -1,4 +1,4 @@
-"""What the pages of the guide say runs, and they name everything that there is."""
+"""The code on the pages of the guide runs, and the pages name all public parts."""
 
 import ast
 import contextlib
@@ -148,7 +148,7 @@ def test_code_of_the_concepts_page_runs(place):
 
 
 def test_commands_of_the_gpu_page_run():
-    """What `make test` runs, as it is there."""
+    """The same as `make test` runs."""
     lines = re.findall(r"^\$ (.*?)\s+#", page("cuda") + page("gpu"), re.MULTILINE)
     legs = [line for line in lines if not line.startswith("pip install ")]
     assert len(legs) == 2
@@ -168,7 +168,7 @@ def test_commands_of_the_ros_page_run(place):
 
 
 def test_code_of_the_gpu_page_runs():
-    """On the processor where there is no GPU."""
+    """On the CPU if there is no GPU."""
     (code,) = python_in(page("cuda"))
     assert code.count('"cuda"') == 1
     measurements = noise()
@@ -179,7 +179,7 @@ def test_code_of_the_gpu_page_runs():
 
 
 def test_code_of_the_formats_page_runs(place):
-    """In a process of its own: netCDF-C and h5py each bring an HDF5."""
+    """In a separate process, because netCDF-C and h5py each have their own HDF5."""
     (place / "REC.h5").symlink_to(ROOT / "data" / "synthetic" / "reflectors.h5")
     (code,) = python_in(page("formats"))
     (*_, last) = code.splitlines()
@@ -209,12 +209,12 @@ def test_import_loads_no_submodules(place):
 
 
 def public():
-    """The paths that the page on Python has."""
+    """Paths on the page of the Python reference."""
     return re.findall(r"^\.\. auto\w+:: (ertis_numba[\w.]+)$", page("python"), re.MULTILINE)
 
 
 def taught(text):
-    """The paths into the package that a page names, or that its Python uses."""
+    """Paths of the package that a page names or that its code uses."""
     yield from re.findall(r"`(ertis_numba(?:\.\w+)+)`", text)
     for code in python_in(text):
         tree, homes = ast.parse(code), {}
@@ -243,7 +243,7 @@ def test_names_in_the_python_reference_are_exported():
 
 @pytest.mark.parametrize("path", [ROOT / "README.md", *GUIDE], ids=lambda path: path.stem)
 def test_names_used_on_pages_are_public(path):
-    """By any path that leads to it."""
+    """Any public path to the object is sufficient."""
     objects = {id(pkgutil.resolve_name(each)) for each in public()}
     homes = {each.rpartition(".")[0] for each in public()}
     for each in taught(path.read_text("utf-8")):
@@ -268,7 +268,7 @@ def test_every_page_is_in_the_table_of_contents():
 
 
 def test_tables_updated_by_make_have_their_markers():
-    """`make bench` and `make soak` would refuse a page without them, after minutes or hours."""
+    """`make bench` and `make soak` would refuse a page without markers after minutes or hours."""
     lines = re.findall(r"ertis (bench [\w-]+)(.*)", (ROOT / "Makefile").read_text("utf-8"))
     updates = [(name, path) for name, rest in lines for path in re.findall(r"--update (\S+)", rest)]
     assert len(updates) > 10

@@ -1,4 +1,4 @@
-"""Scenes that break simulators: the result is finite and sensible, and nothing warns."""
+"""Difficult scenes give finite and plausible results without warnings."""
 
 import numpy as np
 import pytest
@@ -39,14 +39,14 @@ def test_coincident_targets_add_up():
 
 
 def test_two_targets_in_antiphase_cancel():
-    """They stand a quarter of a wavelength apart for one frequency; energy is missing, and nothing else happens."""
+    """They are a quarter of a wavelength apart for one frequency, which loses energy; nothing else changes."""
     scene = scene_of(Point(range_m=0.4), Point(range_m=0.4023), sensor=EIGHT)
     assert image_of(scene).amplitude.max() > 0
 
 
 @pytest.mark.parametrize("diameter_m", [0.0, 0.02])
 def test_target_behind_the_array_appears_as_documented(diameter_m):
-    """A planar array without patterns shows it in front; behind a piston there is nothing."""
+    """A planar array without directivity shows it in front; a piston emitter makes it silent."""
     scene = scene_of(
         Point(azimuth_deg=160, range_m=0.4, strength_db=-30),
         sensor=EIGHT.replace(emitter=Emitter(diameter_m=diameter_m)),
@@ -65,7 +65,7 @@ def test_scene_without_targets_is_rendered():
 
 
 def test_forced_effects_without_objects_change_nothing():
-    """Forced on, effects that find nothing to act upon do nothing."""
+    """Forced effects without objects to act on leave the signals unchanged."""
     scene = Scene(sensors=(EIGHT.replace(emitter=Emitter(silent=True)),))
     assert not Simulator(forced(scene)).signals().any()
     plan = make_plan(forced(scene))
@@ -98,7 +98,7 @@ def test_all_effects_with_all_objects_are_finite():
 
 @pytest.mark.parametrize("facing_deg", [(180.0, 0.0), (0.0, 0.0), (90.0, 0.0), (0.0, 90.0)])
 def test_wall_through_the_sensor_is_finite(facing_deg):
-    """It mirrors nothing of the sensor itself, since no sound goes to it and back."""
+    """It reflects nothing of the sensor itself, because the path has no length."""
     scene = scene_of(
         Point(range_m=0.4, azimuth_deg=10),
         sensor=FULL,
@@ -146,7 +146,7 @@ def test_coincident_walls_are_rendered():
 
 
 def test_scene_recovers_from_overload():
-    """Twenty times full scale: the bits stay bits, and quiet follows."""
+    """At twenty times full scale, the output remains PDM, and silence follows."""
     sensor = EIGHT.replace(recording=Recording(n_samples=40_000))
     scene = scene_of(Point(range_m=0.2, strength_db=0), sensor=sensor)
     bits = bits_of(Simulator(scene, plan=only("spreading")).render())[:8]

@@ -1,4 +1,4 @@
-"""Faults are named on the right channel, and what is in order raises no alarm."""
+"""Health checks name faults on the right channel, and report nothing for healthy arrays."""
 
 import dataclasses
 import functools
@@ -105,14 +105,14 @@ def test_silent_array_is_reported():
 
 @functools.cache
 def numbers():
-    """What microphones give that speak float32."""
+    """Signals of microphones with float32 samples."""
     recording = rings.PCM.recording.replace(encoding="float32", n_samples=12_000)
     return rings.heard(rings.PCM.replace(recording=recording))
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1.0, 300.0])
 def test_pcm_numbers_have_no_full_scale(scale):
-    """Pascal, for one, goes as high as the sound; what was cut off before is told at any scale."""
+    """Samples in pascals, for example, have no limit; clipping is reported at any scale."""
     words = numbers().data * np.float32(scale)
     assert health(dataclasses.replace(numbers(), data=words)).faults == {}
     words[:, 5] = np.clip(words[:, 5], -0.4 * np.abs(words).max(), 0.4 * np.abs(words).max())

@@ -1,4 +1,4 @@
-"""Short form of the campaign: no false alarm in healthy arrays, and every observable fault is named."""
+"""Short form of the campaign: no false alarm for healthy arrays, and every observable fault is named."""
 
 import json
 

@@ -66,7 +66,7 @@ def test_noise_of_white_bits_is_their_share_in_the_band():
 
 @pytest.mark.parametrize("name", ["default", "wide band", "line of 8", "16 bits, disabled"])
 def test_dynamic_range_matches_that_of_images(name):
-    """A full-scale echo is 1 in an image. What is quietest of a few channels is quieter than their mean."""
+    """A full-scale echo is 1 in an image. The quietest of a few channels is below their mean."""
     measurements = [cases.noise(cases.CASES[name], seed) for seed in range(4)]
     pipeline = ertis.Pipeline(cases.CASES[name])
     noise = np.mean([np.mean(pipeline.process(measurement).amplitude ** 2) for measurement in measurements])

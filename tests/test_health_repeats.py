@@ -1,4 +1,4 @@
-"""Repeated blocks of words: buffers that come twice are reported, cycles of silent modulators are not."""
+"""Repeated blocks of words: buffers sent twice are reported, cycles of silent modulators are not."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Settings from other machines and files: bounded in size, depth and memory, and without names of files."""
+"""Settings from other machines and files are bounded in size, depth and memory, and name no files."""
 
 import itertools
 import threading
@@ -25,7 +25,7 @@ from tests.journals import TINY, entries
 
 
 def test_from_toml_names_the_line_after_thousands_of_blank_lines():
-    """Each line once cost a parse of all before it: 25,000 of them took 36 s."""
+    """Formerly each line caused a parse of all lines before it: 25,000 lines took 36 s."""
     begun_s = time.process_time()
     with pytest.raises(SettingsError, match="s, line 25001: unknown key `bogus`"):
         Settings.from_toml("\n" * 25_000 + "bogus = 1\n", "s")
@@ -79,7 +79,7 @@ def test_call_refuses_too_many_samples(duration_s, rate_hz):
 
 @pytest.mark.parametrize("table", [Array, Processing])
 def test_names_in_settings_have_a_maximum_length(table):
-    """HDF5 takes 64 kB as an attribute, and a longer layout kept a journal from being sealed."""
+    """An HDF5 attribute has at most 64 kB, and a longer layout once prevented the sealing of a journal."""
     name = "layout" if table is Array else "directions"
     with pytest.raises(ArgumentError, match=f"{name} has 5000 characters; the limit is 4096"):
         table(**{name: "x" * 5000})
@@ -158,7 +158,7 @@ def _greeting(peer, size=1):
 
 
 def test_hello_messages_of_peers_take_turns():
-    """One node with hundreds of hellos must not keep another's waiting."""
+    """One node with hundreds of hello messages must not delay another."""
     goes, order = threading.Event(), []
 
     def read(_, payload):

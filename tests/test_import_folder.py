@@ -1,4 +1,4 @@
-"""Folders of RTIS Dev become recordings, as far as what is in them is known."""
+"""Folders of RTIS Dev become recordings, as far as their content is known."""
 
 import importlib.metadata
 import json
@@ -46,13 +46,13 @@ def folder_of(tmp_path, *, names=("m_0.bin", "m_1.bin"), recording=SHORT, proces
 
 
 def shipped(kind):
-    """The settings that come with rtisdev, by their names."""
+    """Settings files of rtisdev by their names."""
     folder = Path(importlib.metadata.distribution("rtisdev").locate_file(f"rtisdev/config/premadeSettings/{kind}"))
     return {path.stem: json.loads(path.read_text()) for path in folder.glob("*.json")}
 
 
 def test_folder_import_keeps_samples_and_sequence_numbers(tmp_path):
-    """By their numbers, not their names; a missing one is a gap."""
+    """Files are ordered by number instead of name; a missing number is a gap."""
     reader = open_rtis_folder(folder_of(tmp_path, names=("m_9.bin", "m_10.bin", "m_12.bin")), sensor="left")
     assert len(reader) == 3
     for (number, sequence), measurement in zip(enumerate((9, 10, 12)), reader, strict=True):
@@ -99,7 +99,7 @@ def test_json_booleans_are_accepted(tmp_path, planar):
 
 @pytest.mark.parametrize("planar", [True, False])
 def test_combined_settings_file_is_accepted(tmp_path, planar):
-    """What ``dict(RTISSettings)`` yields, of which more is there than is needed."""
+    """``dict(RTISSettings)`` yields this, with more keys than necessary."""
     azimuth_rad = np.radians(np.linspace(-60, 60, 5)).tolist()
     elevation_rad = [0.0] * 5 if planar else [0.0, 0.1, 0.2, 0.3, 0.4]
     dumped = {**SHORT, **{name: PLANAR[name] for name in ("microphoneLayout", "minRange", "maxRange")}}

@@ -1,4 +1,4 @@
-"""WAV and Acoular's files to recordings: every kind of number, emissions in a row, and what is refused."""
+"""Import of WAV and Acoular files: all sample types, consecutive emissions, and refusals."""
 
 import json
 import tracemalloc
@@ -91,7 +91,7 @@ def test_consecutive_emissions_are_split(tmp_path):
 
 
 def test_fractional_periods_do_not_drift(tmp_path):
-    """100 emissions, each a seventieth of a second after the other: a click marks them."""
+    """100 emissions follow each other after a seventieth of a second; a click marks each."""
     given = np.zeros((RATE_HZ * 100 // 70, 8), np.int16)
     given[np.rint(np.arange(100) * RATE_HZ / 70).astype(int)] = 1_000
     reader = ertis.open_pcm(write_wav(tmp_path / "a.wav", given), PCM, length_s=1 / 70, start_ns=5 * 10**18)
@@ -132,7 +132,7 @@ def test_large_files_are_not_loaded_into_memory(tmp_path):
 @pytest.mark.parametrize("rate_hz", [110_000, 192_000, 500_000, 1_000_000])
 @pytest.mark.parametrize("call", [Call(), Call(start_frequency_hz=8_000.0, stop_frequency_hz=3_000.0)])
 def test_imported_ranges_fit_sample_rate_and_call(tmp_path, rate_hz, call):
-    """What the default, made for 4.5 MHz, would lose between two ranges."""
+    """The default step, made for 4.5 MHz, would lose echoes between two ranges."""
     settings = Settings(array=RING, call=call)
     reader = ertis.open_pcm(write_wav(tmp_path / "a.wav", numbers(rate_hz // 50), rate_hz), settings)
     made = reader.settings
@@ -271,7 +271,7 @@ def test_wav_without_settings_is_refused(tmp_path):
 
 
 def test_exported_signals_are_imported_again(tmp_path):
-    """The image of exported signals is that of the recording, but for the low pass's ripple."""
+    """The image of exported signals equals that of the recording, except for the ripple of the low-pass filter."""
     settings = PCM.replace(
         array=RING.replace(gain=(1.0, 2.0) * 4, enabled=(True, True, True, False) * 2),
         recording=Recording(n_samples=70_000),

@@ -1,4 +1,4 @@
-"""The intake by itself: what it counts, what it shows, and what it holds, whatever its store says."""
+"""The intake alone: its counts, published measurements and limits, for any answers of its store."""
 
 import time
 import zlib
@@ -19,7 +19,7 @@ RUN = SensorSession("left", EPOCH)
 
 
 class Store:
-    """Takes items, and stores none."""
+    """Store that accepts items and never stores them."""
 
     def __init__(self):
         self.items = []
@@ -32,7 +32,7 @@ class Store:
 
 
 class Viewer:
-    """Counts what it is shown."""
+    """Viewer that counts the items shown to it."""
 
     def __init__(self):
         self.shown = []
@@ -46,7 +46,7 @@ class Viewer:
 
 
 class Taken:
-    """An intake, and what it has sent and told."""
+    """Intake with its sent messages and reports."""
 
     def __init__(self, *, store=True):
         self.store, self.viewer = Store() if store else None, Viewer()

@@ -1,4 +1,4 @@
-"""Raw files become measurements, or are refused in a line."""
+"""Raw files become measurements, or are refused in one line."""
 
 import numpy as np
 import pytest

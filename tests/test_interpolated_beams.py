@@ -1,4 +1,4 @@
-"""The kernels that make beams of those of nodes, against their referees, to the last bit where numbers are whole."""
+"""Kernels of interpolated beams equal their references; results are bit-identical for integer inputs."""
 
 import numpy as np
 import pytest
@@ -35,21 +35,21 @@ def kernel_set(request):
 
 @pytest.fixture(params=KERNELS)
 def whole_kernel_set(request):
-    """A device that has the 16-bit kernels."""
+    """Device that has the 16-bit kernels."""
     if not KERNELS[request.param].tile_ranges:
         pytest.skip("this processor has no 16-bit dot product (AVX-512 VNNI or AVX-VNNI)")
     return KERNELS[request.param]
 
 
 def some_places(random, n_nodes, n_directions, n_pairs):
-    """Pairs anywhere, the first and the last nodes among them."""
+    """Random pairs of grid points, including the first and the last."""
     places = random.integers(0, n_nodes - 1, (n_directions, n_pairs)).astype(np.int32)
     places[0, 0], places[-1, -1] = 0, n_nodes - 2
     return places
 
 
 def some_rows(random, n_directions):
-    """Directions in any order."""
+    """Directions in random order."""
     return random.permutation(n_directions).astype(np.int32)
 
 
@@ -67,7 +67,7 @@ def beam_input(name):
 
 
 def image_of(kernel_set, beams, window, n_ranges, n_blocks=1):
-    """What the kernel makes of a window, amid garbage that it should not touch."""
+    """Output of the kernel for a window, within garbage that it must not change."""
     out = np.full((len(beams[3]), n_ranges), GARBAGE, dtype=np.float32)
     kernel_set.interpolated_beams_envelope(*beams, *window, n_blocks, out)
     return out
@@ -112,7 +112,7 @@ def test_nan_in_interpolated_beams_affects_only_its_range(kernel_set):
 
 
 def whole_input(name, tile_ranges, *, full_scale=False):
-    """As much as the sums can bear: all terms of the first node at full scale and in phase, if asked for."""
+    """Input with the largest permitted sums; optionally with all terms of the first grid point at full scale."""
     n_mics, n_phases, n_terms, n_ranges, n_nodes, n_directions, n_pairs = SHAPES[name]
     random = np.random.default_rng(8)
     n_tiles, width = -(-n_ranges // tile_ranges), tile_ranges + 9
@@ -142,7 +142,7 @@ def whole_image(kernel_set, tiles, beams, stop, n_ranges, n_blocks=1):
 
 
 def expected_levels(tiles, beams, stop, n_ranges):
-    """The referee's sums are exact; they are levelled in single precision, as the contract's types say."""
+    """The sums of the reference are exact; its envelope is in single precision, as in the contract."""
     expected = np.full((len(beams[2]), n_ranges), GARBAGE)
     width = tiles[0].shape[3] - 9
     for tile, scale, start in zip(*tiles, strict=True):

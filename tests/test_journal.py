@@ -1,4 +1,4 @@
-"""What a journal says it stored is there, bit by bit, whatever ends the process that stored it."""
+"""A journal holds every acknowledged measurement bit by bit, however the process ends."""
 
 import re
 import threading
@@ -73,7 +73,7 @@ def test_journal_stores_gaps(tmp_path):
 
 
 def test_journal_stores_negative_zero(tmp_path):
-    """SQLite stores -0.0 as 0.0: the CRC-32 of a row must not tell them apart."""
+    """SQLite stores -0.0 as 0.0, so the CRC-32 of a row must not distinguish them."""
     with create(tmp_path, []) as journal:
         journal.add_sensor("left", TINY, translation_m=(-0.0, -1.0, 0.0))
     with Journal.open(journal.path) as journal:
@@ -189,7 +189,7 @@ BAD = {
 
 
 def spoilt(words=None, **changes):
-    """A measurement that does not fit to the others."""
+    """Measurement that does not match the others."""
     (entry,) = entries(1, first=99)
     measurement = entry.measurement
     stamp = replace(measurement.stamp, **changes)

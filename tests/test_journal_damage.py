@@ -1,4 +1,4 @@
-"""Journals that are not what they should be are refused in a line, and a full disk takes nothing away."""
+"""Damaged journals are refused in one line, and a full disk removes nothing."""
 
 import re
 import sqlite3
@@ -28,7 +28,7 @@ connection.commit()
 
 
 def spoil(path, *statements):
-    """Change a journal in the way of a failing disk that happens to obey SQL."""
+    """Change a journal by SQL, as a failing disk could."""
     done = python(SPOIL, path, *statements)
     assert not done.stderr
 
@@ -106,7 +106,7 @@ def test_deleting_the_first_measurements_is_permitted(tmp_path, count):
 
 
 def root_page(path, tree):
-    """The number of the first page of a table or an index."""
+    """Number of the first page of a table or an index."""
     reported = python(
         "import sqlite3, sys\n"
         "connection = sqlite3.connect(sys.argv[1])\n"
@@ -120,7 +120,7 @@ def root_page(path, tree):
 @pytest.mark.parametrize("discarded", [0, 3])
 @pytest.mark.parametrize("tree", ["key", "measurements"])
 def test_rows_missing_from_one_index_are_detected(tmp_path, tree, discarded):
-    """A page in which fewer cells are counted is a sound one, for SQLite."""
+    """SQLite accepts a page with a smaller number of cells."""
     settings = line(8, 8).replace(recording=Recording(n_samples=64))
     with create(tmp_path, entries(20 + discarded, settings=settings), settings=settings) as journal:
         if discarded:
@@ -137,7 +137,7 @@ def test_rows_missing_from_one_index_are_detected(tmp_path, tree, discarded):
 
 @pytest.mark.parametrize("discarded", [0, 1])
 def test_unreadable_page_is_damage_and_the_rest_is_sealed(tmp_path, discarded):
-    """What is in it is damaged for ever; the rest is sealed."""
+    """Its content is lost permanently; the rest is sealed."""
     with create(tmp_path, entries(20 + discarded, first=10 - discarded)) as journal:
         if discarded:
             journal.discard("left", EPOCH, 9)
@@ -159,7 +159,7 @@ def test_unreadable_page_is_damage_and_the_rest_is_sealed(tmp_path, discarded):
 
 
 def test_row_checksum_follows_the_documentation(tmp_path):
-    """Built by hand as docs/reference/formats.md says."""
+    """The row is built by hand as docs/reference/formats.md says."""
     create(tmp_path, entries(1)).close()
     reported = python(
         "import sqlite3, sys\n"
@@ -179,7 +179,7 @@ def test_row_checksum_follows_the_documentation(tmp_path):
 
 
 def test_temporary_read_error_is_not_damage(tmp_path, monkeypatch):
-    """It may be read later: nothing is sealed, and nothing goes."""
+    """A later attempt may succeed, so nothing is sealed and nothing is removed."""
     create(tmp_path).close()
     path = tmp_path / "rec.h5.journal"
     execute = Database.execute
@@ -211,7 +211,7 @@ def test_exchanged_measurement_is_detected(tmp_path):
 
 
 def test_single_flipped_bit_is_always_detected(tmp_path):
-    """Wherever it is, reading gives what was written or a `DataError` of one line."""
+    """For any bit, reading returns the original or raises a `DataError` of one line."""
     given = entries(4)
     create(tmp_path, given).close()
     path = tmp_path / "rec.h5.journal"
@@ -239,7 +239,7 @@ CUT = [("log", 0), ("log", 1), ("log", 4096), ("commit", 0), ("commit", 4096), (
 
 @pytest.mark.parametrize(("moment", "n_bytes"), CUT)
 def test_truncated_journal_keeps_its_log(tmp_path, moment, n_bytes):
-    """SQLite would throw away what is all that is left, or make up the rest with zeros."""
+    """SQLite would delete the log, or fill the file with zeros."""
     path = crashed(tmp_path, moment=moment)
     log = path.with_name(f"{path.name}{'-wal' if moment == 'log' else '-journal'}")
     before = log.read_bytes()
@@ -252,7 +252,7 @@ def test_truncated_journal_keeps_its_log(tmp_path, moment, n_bytes):
 
 
 def test_copy_without_its_log_is_intact_or_damaged(tmp_path):
-    """What a commit was changing when the journal was copied is as it was or damaged, and nothing is made up."""
+    """Data of a commit during the copy are original or damaged, and nothing is invented."""
     path = crashed(tmp_path, moment="commit")
     path.with_name(f"{path.name}-journal").unlink()
     n_damaged = 0
@@ -281,7 +281,7 @@ def test_removed_journal_refuses_measurements(tmp_path):
 
 
 def test_unusable_settings_of_a_journal_are_reported(tmp_path):
-    """As a newer version might write them that forgot to count itself up."""
+    """A newer version that did not raise its version number could write them."""
     create(tmp_path).close()
     row = ("left", "[air]\nwind_m_s = 3.0\n", "", 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # its mounting is unknown
     spoil(

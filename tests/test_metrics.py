@@ -1,4 +1,4 @@
-"""Metrics as Prometheus reads them, over HTTP, and log lines."""
+"""Metrics over HTTP as Prometheus reads them, and log lines."""
 
 import http.client
 import io

@@ -1,4 +1,4 @@
-"""The sigma-delta modulators against their own equations, and what they keep of the band."""
+"""Sigma-delta modulators follow their equations and preserve the signal band."""
 
 import math
 
@@ -20,7 +20,7 @@ COMPARATOR = np.zeros(8)  # without integrators and dither, bits are the signs o
 
 
 def modulate_plainly(signal, key, gains, dither, limit, noise_rms=0.0):
-    """Step through `modulate_pdm` for one microphone with Python's own numbers; return bits and what was quantised."""
+    """Step through `modulate_pdm` for one microphone in plain Python; return the bits and the quantiser's input."""
     c1, c2, c3, c4, r1, r2 = gains
     s1 = s2 = s3 = s4 = 0.0
     scale = noise_rms * (1 / math.sqrt((2**24 - 1) / 3))
@@ -74,7 +74,7 @@ def modulated(signals, order=4, dither=0.5, noise_rms=0.0):
 
 
 def compared(signals, keys, noise_rms, dither=0.0):
-    """Return ±1, the signs of signal, noise and dither: (mic, sample)."""
+    """Return ±1, the signs of signal plus noise plus dither: (mic, sample)."""
     out = np.empty((signals.shape[1], -(-len(signals) // 8)), dtype=np.uint8)
     loop = COMPARATOR.copy()
     loop[6] = dither
@@ -161,7 +161,7 @@ def test_array_without_microphones_gives_zeros():
 
 @pytest.mark.parametrize("rms", [0.003, 0.2])
 def test_noise_is_nearly_gaussian_with_its_rms(rms):
-    """Signs of noise on a constant tell its distribution: their mean is 1 − 2 P(noise < −constant)."""
+    """The signs of noise on a constant reveal its distribution: their mean is 1 − 2 P(noise < −constant)."""
     constants = np.array([-2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0])
     signals = np.repeat(rms * constants[:, None], 200_000, axis=1)
     means = compared(signals, keys_of(7), np.full(7, rms)).mean(axis=1)
@@ -172,7 +172,7 @@ def test_noise_is_nearly_gaussian_with_its_rms(rms):
 
 
 def test_noise_has_the_given_power():
-    """In the band the modulator adds little of its own, so what is in the bits there is the noise."""
+    """The modulator adds little in the band, so the noise of the bits there is the given noise."""
     n = 131_072
     bits = modulated(np.zeros((32, n)), noise_rms=0.02)
     spectrum = np.abs(np.fft.rfft((2.0 * bits - 1) * np.hanning(n))) ** 2 / np.sum(np.hanning(n) ** 2)
@@ -210,7 +210,7 @@ def test_modulator_keeps_the_band(order, min_db):
 
 @pytest.mark.parametrize("order", [1, 2, 3, 4])
 def test_noise_has_the_designed_spectrum(order):
-    """Bits less signal are the quantiser's error, filtered by the noise transfer function: no other filter is left."""
+    """Bits minus signal are the quantiser's error after the noise transfer function only."""
     signal = tone(0.4, 3000)
     bits, quantised = modulate_plainly(signal, 1, loop_gains(order, BAND), 0.5, np.inf)
     error = 2.0 * np.array(bits) - 1 - quantised
@@ -230,7 +230,7 @@ def test_zeros_lie_on_the_unit_circle_and_poles_within(order):
 
 
 def test_dither_leaves_no_idle_tones():
-    """Constant inputs make a modulator sing; with dither no line in the band rises above −85 dB of full scale."""
+    """Constant inputs cause idle tones; with dither, no line in the band exceeds −85 dB of full scale."""
     n = 65_536
     constants = np.concatenate([[0, 1 / 512, 1 / 256, 1 / 64], np.random.default_rng(0).uniform(-0.3, 0.3, 28)])
     bits = modulated(np.repeat(constants[:, None], n, axis=1))

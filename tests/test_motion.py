@@ -1,4 +1,4 @@
-"""What moves: where it is, and what its motion does to the call."""
+"""Motion: positions, and the effect on the call."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ STEP_S = 1e-5
 
 
 def met_s(leaves_s, start_m, place_m, velocity_m_s):
-    """Solve for when what leaves a place at a time meets something that moves."""
+    """Solve for the time at which sound from a place meets a moving object."""
     return scipy.optimize.brentq(
         lambda time_s: np.linalg.norm(place_m + time_s * velocity_m_s - start_m) - SPEED_M_S * (time_s - leaves_s),
         leaves_s,
@@ -43,7 +43,7 @@ def met_s(leaves_s, start_m, place_m, velocity_m_s):
 
 
 def arrives_s(leaves_s, transmitter, *others):
-    """Solve for when what leaves an emitter has met all others, each a place and a velocity."""
+    """Solve for the time at which sound of an emitter has met all objects, each a place and a velocity."""
     place_m = transmitter[0] + leaves_s * transmitter[1]
     for other in others:
         leaves_s = met_s(leaves_s, place_m, *other)
@@ -52,7 +52,7 @@ def arrives_s(leaves_s, transmitter, *others):
 
 
 def brute_force(*things):
-    """Return delay and stretch of a sound over things."""
+    """Return delay and stretch of sound over objects."""
     early_s, on_time_s, late_s = (arrives_s(leaves_s, *things) for leaves_s in (-STEP_S, 0.0, STEP_S))
     return on_time_s, (late_s - early_s) / (2 * STEP_S)
 
@@ -90,7 +90,7 @@ def test_delay_and_stretch_straight_from_another_sensor(seed):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_delay_and_stretch_over_a_wall_at_rest(seed):
-    """The images of what moves move as it does, mirrored."""
+    """Images of moving objects have the mirrored velocity."""
     random = np.random.default_rng(seed)
     place_m, velocity_m_s = random.uniform(-0.3, 0.3, 3), random.uniform(-5, 5, 3)
     target = random.uniform(0.3, 1.0, 3), random.uniform(-5, 5, 3)
@@ -110,7 +110,7 @@ def test_delay_and_stretch_over_a_wall_at_rest(seed):
 
 
 def test_delay_and_stretch_over_a_sphere():
-    """On the line of sight its surface is a point."""
+    """On the line of sight, its surface acts as a point."""
     sphere = Sphere(position_m=(1.1, 0.0, 0.0), radius_m=0.1, velocity_m_s=(-3.0, 0.0, 0.0))
     point = Point(position_m=(1.0, 0.0, 0.0), velocity_m_s=(-3.0, 0.0, 0.0))
     [round_echo] = ways(scene_of(sensor=EAR, spheres=(sphere,)), "doppler", "target_size")
@@ -140,7 +140,7 @@ def test_common_motion_causes_no_shift():
 
 
 def test_motion_across_the_line_of_sight_causes_no_shift():
-    """But for the second order of v / c, as the way turns while the sound is on it."""
+    """A second-order term in v / c remains, because the path rotates while the sound travels."""
     across = scene_of(Point(position_m=(1.0, 0.0, 0.0), velocity_m_s=(0.0, 5.0, 0.0)), sensor=EAR)
     [echo] = ways(across, "doppler")
     assert_allclose(echo.stretch, 1.0, atol=2.1 * (5.0 / SPEED_M_S) ** 2)
@@ -155,7 +155,7 @@ def test_wall_image_moves_twice_as_fast(speed_m_s):
 
 @pytest.mark.parametrize("speed_m_s", [3.0, -3.0])
 def test_approaching_wall_echoes_at_its_momentary_position(speed_m_s):
-    """Straight on it is as far as a point that comes as fast; within 0.02 samples at 450 kHz."""
+    """At normal incidence it equals an approaching point, within 0.02 samples at 450 kHz."""
     velocity_m_s = (-speed_m_s, 0.0, 0.0)
     wall = Wall(position_m=(1.5, 0.0, 0.0), facing_deg=(180.0, 0.0), velocity_m_s=velocity_m_s)
     [over_wall] = ways(scene_of(sensor=EAR, walls=(wall,)), "doppler", "walls")
@@ -176,7 +176,7 @@ def test_wall_sliding_in_its_plane_changes_nothing():
 
 
 def frequency_of(signal, near_hz):
-    """The frequency at which the spectrum of a signal is largest."""
+    """Frequency of the maximum of a signal's spectrum."""
     width_hz = 0.5 / TONE.duration_s
     return scipy.optimize.minimize_scalar(
         lambda frequency_hz: -abs(spectrum_at(signal, np.array([frequency_hz]))[0]),
@@ -187,7 +187,7 @@ def frequency_of(signal, near_hz):
 
 @pytest.mark.parametrize("speed_m_s", [1.0, -1.0, 3.0])
 def test_doppler_shift_of_a_tone_matches_the_formula(speed_m_s):
-    """Within 1 % of ``2 v / c``, and to all orders within 0.1 %."""
+    """Within 1 % of ``2 v / c``, and within 0.1 % of the exact formula."""
     sensor = EAR.replace(call=TONE)
     still, coming = (
         scene_of(Point(position_m=(0.3, 0.0, 0.0), velocity_m_s=(-speed, 0.0, 0.0)), sensor=sensor)
@@ -218,7 +218,7 @@ def test_signals_are_stretched_calls(call, speed_m_s):
 
 @pytest.mark.parametrize(("spacing_m", "speed_m_s"), [(0.005, 1.0), (0.02, 5.0), (0.2, 20.0)])
 def test_signals_of_many_microphones_are_stretched_calls(spacing_m, speed_m_s):
-    """Few stretches are computed for many microphones that are near each other, and all for those that are not."""
+    """Near microphones share few stretched calls; distant ones have their own."""
     point = Point(position_m=(0.5, 0.3, 0.0), velocity_m_s=(-speed_m_s, speed_m_s, 0.0))
     scene = scene_of(point, sensor=SENSOR.replace(array=line_array(9, spacing_m)))
     [echo] = ways(scene, "doppler", "spreading")
@@ -229,7 +229,7 @@ def test_signals_of_many_microphones_are_stretched_calls(spacing_m, speed_m_s):
 @pytest.mark.parametrize("modulation", ["hyperbolic", "linear"])
 @pytest.mark.parametrize(("start_hz", "stop_hz"), [(50e3, 25e3), (25e3, 50e3)])
 def test_stretched_call_has_the_predicted_time_shift(modulation, start_hz, stop_hz):
-    """``(s - 1) p₀ / p'``, of which the simulator judges whether motion matters, for both kinds of sweep."""
+    """The simulator judges the effect of motion by ``(s - 1) p₀ / p'``, for both kinds of sweep."""
     call = Call(start_frequency_hz=start_hz, stop_frequency_hz=stop_hz, modulation=modulation)
     rate_hz, stretch = 5e6, 1 + 2 * 1.0 / SPEED_M_S
     time_s = np.arange(40_000) / rate_hz - 2e-3
@@ -284,7 +284,7 @@ def test_objects_follow_their_waypoints(index, place_m, velocity_m_s):
 
 
 def test_velocity_is_in_the_sensor_frame():
-    """Turned to the left by a right angle, it sees what goes along x go to its right."""
+    """For a sensor rotated left by 90°, motion along x is motion to the right."""
     sensor = EAR.replace(yaw_deg=90, velocity_m_s=(0.0, 1.0, 0.0))
     [reflector] = seen(scene_of(Point(position_m=(0.0, 2.0, 0.0), velocity_m_s=(3.0, 0.0, 0.5)), sensor=sensor))
     assert_allclose(reflector.velocity_m_s, (-1.0, -3.0, 0.5), atol=1e-12)

@@ -1,4 +1,4 @@
-"""Only what the scene calls for: 200 random scenes, each effect left out and put in, and what the images say of it."""
+"""Choice of effects: 200 random scenes, each effect omitted and added, and the change of the images."""
 
 import subprocess
 import sys
@@ -21,7 +21,7 @@ BATCHES = 10
 
 @pytest.mark.parametrize("batch", range(BATCHES))
 def test_omitted_effects_change_images_by_less_than_the_tolerance(batch):
-    """The one promise of the planner, on 200 scenes and through the whole chain."""
+    """This is the only promise of the planner, tested on 200 scenes through the whole chain."""
     wrong, seeds, count = [], range(batch * 1000, (batch + 1) * 1000), 0
     for seed in seeds:
         if count == 200 // BATCHES:
@@ -57,12 +57,12 @@ def test_omitted_effects_change_images_by_less_than_the_tolerance(batch):
     ],
 )
 def test_weak_visible_echoes_count(sensor, point, name):
-    """Some 14 and 19 dB above the modulators' noise, and changed by 10 and 20 dB."""
+    """They are about 14 and 19 dB above the modulators' noise, and change by 10 and 20 dB."""
     assert name in make_plan(Scene(sensors=(sensor,), points=(point,))).active
 
 
 def test_verdicts_hold_for_pdm_images():
-    """What is left out moves no reflector in images that went through the modulators, loud enough to be sure of it."""
+    """Omitted effects move no reflector in images of PDM signals; levels are high enough to be certain."""
     for seed in range(6):
         scene = random_scene(seed)
         loud = scene.replace(points=tuple(point.replace(strength_db=-12.0) for point in scene.points), spheres=())
@@ -84,7 +84,7 @@ def test_verdicts_hold_for_pdm_images():
 
 
 def test_mutually_dependent_effects_stay_on(monkeypatch):
-    """Walls matter without the facing of discs only, and that only with the walls."""
+    """Walls matter only without the facing of discs, which matters only with the walls."""
 
     def of(name, matters):
         return lambda sight: Estimate(change_db=6.0 if matters(sight.active) else 0.0, reason=name)
@@ -99,7 +99,7 @@ def test_mutually_dependent_effects_stay_on(monkeypatch):
 
 
 def test_unneeded_effects_are_not_imported():
-    """In a process of its own, a free field loads what its plan names, and noise of nobody is not drawn."""
+    """In a separate process, a free field loads only the effects of its plan, and draws no unused noise."""
     code = """
 import sys
 from ertis_numba.simulation import Point, Scene
@@ -129,13 +129,13 @@ print(sorted(simulator.clock.cost_ms))
     ],
 )
 def test_interference_is_detected(more):
-    """Of a sonar that the first measurement does not hear, of the narrowest noise, and of many that are weak."""
+    """Cases: a sonar that the first measurement does not receive, very narrow noise, and many weak sources."""
     scene = Scene(points=(Point(azimuth_deg=30.0, range_m=2.0),), **more)
     assert "interference" in make_plan(scene).active
 
 
 def test_events_between_waypoints_are_detected():
-    """A screen that stands in the way for a fifth of a second out of five."""
+    """A screen blocks the path for 0.2 s out of 5 s."""
     times_s = ((0.0, -5.0), (1.3, -5.0), (1.4, 0.0), (1.5, 0.0), (1.6, 5.0), (5.0, 5.0))
     screen = Wall(
         waypoints=tuple((time_s, 1.0, y, 0.0) for time_s, y in times_s), facing_deg=(180.0, 0.0), size_m=(0.5, 0.5)

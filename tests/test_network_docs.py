@@ -1,4 +1,4 @@
-"""What docs/reference/network-protocol.md says of the wire is what is spoken."""
+"""docs/reference/network-protocol.md agrees with the messages on the wire."""
 
 import re
 import typing

@@ -1,7 +1,6 @@
-"""What is lost when nodes are killed, disks fail and strangers come: the short form of `ertis bench network-faults`.
+"""Short form of `ertis bench network-faults`: killed nodes, failing disks and hostile connections.
 
-Each part is tried with another seed every time that the long form runs; here it is the same one, so that what fails
-can be tried again.
+The long form uses a new seed in each run; here the seed is fixed, so that a failure can be repeated.
 """
 
 import shutil
@@ -67,7 +66,7 @@ if "record" in sys.argv:
 
 
 def wrong_in(part, found):
-    """What ought to be 0 and is not; that it can be told is tried as well."""
+    """Counts that should be 0 and are not; tests also check that they can be detected."""
     assert all(tables.row(part, found))
     return {name: found[name] for name in NOTHING_WRONG if name in found and found[name] != 0}
 
@@ -187,7 +186,7 @@ def test_checker_detects_a_faulty_node(tmp_path, monkeypatch):
 
 @pytest.fixture(scope="module")
 def sent(tmp_path_factory):
-    """A diary, and the measurements that it tells of."""
+    """Diary, and the measurements that it lists."""
     path = tmp_path_factory.mktemp("sent") / "sender.ndjson"
     diary, measurements = Diary(path), []
     for number, made in enumerate(noise(SMALL, 6, SEED)):

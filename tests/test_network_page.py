@@ -1,7 +1,7 @@
 """Network commands of the README and of docs/how-to/network.md, with other ports, hosts and sounds.
 
-The emulated sensors hear two measurements over and over, from a recording of the scene: to render them takes longer
-than all else together.
+The emulated sensors repeat two measurements of a recording of the scene, because rendering takes longer than all other
+work together.
 """
 
 import contextlib
@@ -27,7 +27,7 @@ READY = {"emulate": "/dev/", "serve": '"listening"', "capture": '"kept"'}
 
 @pytest.fixture(scope="session")
 def platform(tmp_path_factory):
-    """The platform's scene as a recording, rendered once for all processes that test."""
+    """The platform's scene as a recording, rendered once for all test processes."""
     folder = tmp_path_factory.getbasetemp().parent
     path = folder / "platform.h5"
     if not path.exists():
@@ -41,7 +41,7 @@ def platform(tmp_path_factory):
 
 @pytest.fixture
 def place(tmp_path, monkeypatch):
-    """A folder to be in, keys and emulated sensors of its own, and two ports that nobody listens at."""
+    """Working folder with its own keys and emulated sensors, and two free ports."""
     monkeypatch.setenv("ERTIS_EMULATED_DIR", str(tmp_path / "emulated"))
     monkeypatch.setenv("ERTIS_KEYS_DIR", str(tmp_path / "keys"))
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(str(ROOT / folder) for folder in (".", "cli", "bench")))
@@ -61,7 +61,7 @@ def ports():
 
 
 class Shell:
-    """Runs lines of a page; those that end with ``&`` until the test ends."""
+    """Run lines of a page; those that end with ``&`` run until the test ends."""
 
     def __init__(self, ports, platform):
         self.ports, self.platform = ports, platform

@@ -38,7 +38,7 @@ def test_page_examples_run(place, number):
 
 
 def test_own_beamformer_finds_the_reflectors(place):
-    """Its image shows what an image of the pipeline shows."""
+    """Its image agrees with an image of the pipeline."""
     code = EXAMPLES[0] + (
         "from ertis_numba.storage import write_energyscapes\n"
         "near = (signals.range_m >= 0.5) & (signals.range_m <= 5)\n"

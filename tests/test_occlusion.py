@@ -1,4 +1,4 @@
-"""What walls and boxes hide, against lines through rectangles."""
+"""Occlusion by walls and boxes, compared with lines through rectangles."""
 
 import math
 
@@ -17,7 +17,7 @@ FRONT = Wall(position_m=(1.5, 0.0, 0.0), facing_deg=(180.0, 0.0), reflection_db=
 
 
 def crosses(start_m, stop_m, wall):
-    """Whether a straight line goes through a rectangle, by solving for where it meets the plane."""
+    """Return True if a straight line crosses a rectangle, from its intersection with the plane."""
     _, width, height = wall.axes()
     matrix = np.stack([np.subtract(stop_m, start_m), -width, -height], axis=1)
     if abs(np.linalg.det(matrix)) < 1e-12:
@@ -46,7 +46,7 @@ def test_walls_hide_exactly_the_points_behind_them(point_m, wall_m, facing_deg, 
 
 
 def test_walls_hide_wall_images():
-    """A screen stands between the sensor and a wall, and mirrors itself."""
+    """A screen stands between the sensor and a wall, and has its own images."""
     screen = Wall(position_m=(1.0, 0.0, 0.0), facing_deg=(180.0, 0.0), size_m=(0.4, 0.4))
     scene = scene_of(sensor=EAR, walls=(FRONT, screen))
     assert {reflector.name for reflector in seen(scene, "walls")} == {"walls[0]", "walls[1]"}

@@ -1,4 +1,4 @@
-"""Bars and tables as somebody sees them on a terminal, and what is left of them elsewhere."""
+"""Progress bars and tables on a terminal, and plain output elsewhere."""
 
 import io
 import json
@@ -56,7 +56,7 @@ COLOUR = re.compile(r"\x1b\[[\d;]*\b(?:3[0-8]|4[0-8]|9\d|10\d)[\d;]*m")
 
 
 def ends(terminal):
-    """Let it end, with the cursor where somebody sees it."""
+    """End the process with its cursor visible."""
     code, reported = terminal.finish()
     assert terminal.shown.rfind("\x1b[?25h") >= terminal.shown.rfind("\x1b[?25l")
     return code, reported

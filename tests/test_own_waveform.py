@@ -34,7 +34,7 @@ def own(call):
 
 
 def image(emitted, matched):
-    """The image of a point at 0.8 m and 30° of a sensor that emits one call and matches another."""
+    """Image of a point at 0.8 m and 30° from a sensor that emits one call and matches another."""
     sensor = Sensor(processing=PROCESSING, recording=RECORDING, call=emitted)
     measurement = Simulator(Scene(sensors=(sensor,), points=(Point(range_m=0.8, azimuth_deg=30.0),))).render()
     settings = Settings(processing=PROCESSING, recording=RECORDING, call=matched)

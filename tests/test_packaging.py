@@ -1,4 +1,4 @@
-"""What is installed is everything there is."""
+"""The installed package is complete."""
 
 import configparser
 import subprocess

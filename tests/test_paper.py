@@ -1,4 +1,4 @@
-"""The paper's algorithm against its plain float64 form, and against an echo made by formula."""
+"""The paper's algorithm equals its float64 form, and finds an analytic echo."""
 
 import math
 
@@ -35,7 +35,7 @@ def test_paper_image_equals_its_float64_reference(name):
 
 
 def echo(settings: Settings, *, azimuth_deg: float, range_m: float, level: float):
-    """One plane echo of the call, in the words of the settings' array."""
+    """One plane echo of the call, in words for the array of the settings."""
     speed_m_s = sound_speed_m_s(settings.air)
     direction = unit_vectors(np.radians(azimuth_deg), np.float64(0))
     delay_s = -(microphones(settings.array).enabled_positions_m @ direction) / speed_m_s
@@ -46,7 +46,7 @@ def echo(settings: Settings, *, azimuth_deg: float, range_m: float, level: float
 
 @pytest.mark.parametrize("call", [Call(), Call(start_frequency_hz=80e3, stop_frequency_hz=20e3)])
 def test_paper_echo_has_its_range_and_amplitude(call):
-    """Group delays of all filters are gone, also those of the recursive ones."""
+    """The group delays of all filters are removed, including those of recursive ones."""
     settings = with_paper(SHORT.replace(call=call), directions="2d:181", range_decimation=10, range_m=(0.65, 0.75))
     words = echo(settings, azimuth_deg=20.0, range_m=0.7, level=0.8)
     image = Pipeline(settings).process(Measurement(words, settings))
@@ -75,7 +75,7 @@ def test_range_axis_equals_that_of_the_paper():
 
 
 def test_envelope_has_no_carrier_ripple():
-    """With every sample kept, the envelope of a call is smooth: no ripple at twice the carrier."""
+    """Without decimation, the envelope of a call has no ripple at twice the carrier."""
     settings = with_paper(SHORT, directions="2d:1", range_decimation=10, range_m=(0.65, 0.75))
     words = echo(settings, azimuth_deg=0.0, range_m=0.7, level=1.0)
     row = Pipeline(settings).process(Measurement(words, settings)).amplitude[0]

@@ -1,4 +1,4 @@
-"""PCM: arrays whose microphones give numbers, from scenes to recordings and images."""
+"""Arrays with PCM samples, from scenes to recordings and images."""
 
 import dataclasses
 
@@ -51,7 +51,7 @@ def test_linear_sweep_reflectors_match_the_scene():
 
 
 def test_pcm_image_equals_the_pdm_image():
-    """Beside the modulators' noise, and what falls between ranges."""
+    """Differences are the modulators' noise and echoes between ranges."""
     fine = PCM.processing.replace(range_decimation=1)
     bits = PCM.replace(recording=Recording(n_samples=70_000), processing=fine.replace(range_decimation=25))
     numbers = PCM.replace(processing=fine)

@@ -1,7 +1,7 @@
-"""The whole chain against the exact image, on words that are plain noise.
+"""The whole chain equals the exact image, on random words.
 
-The chain is linear up to the magnitude, so noise tells everything that echoes would, at all ranges and
-directions at once, and needs no renderer.
+The chain is linear up to the magnitude. Noise therefore tests all ranges and directions at once, and needs no
+simulator.
 """
 
 import concurrent.futures
@@ -155,7 +155,7 @@ def test_pipeline_refuses_invalid_arguments(settings, device, threads, error, ma
 
 
 def test_cuda_without_a_gpu_is_refused_with_a_remedy():
-    """In a process of its own that sees no GPU, on machines that have one too."""
+    """In a separate process that sees no GPU, even if the machine has one."""
     code = "from ertis_numba import kernels; print(kernels.usable()); kernels.load('cuda')"
     environment = {**os.environ, "CUDA_VISIBLE_DEVICES": "-1", "NUMBA_ENABLE_CUDASIM": "0"}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
@@ -217,7 +217,7 @@ def test_pipeline_refuses_out_of_another_shape(out):
 
 
 def test_tests_package_is_this_project():
-    """Rtisdev's wheel brings a top-level package of the same name."""
+    """The wheel of rtisdev has a top-level package of the same name."""
     assert Path(cases.__file__).parent == Path(__file__).parent == Path(reference.__file__).parent
 
 

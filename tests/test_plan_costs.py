@@ -177,7 +177,7 @@ def test_costs_command_measures_and_updates_the_table(tmp_path, monkeypatch):
 
 
 def test_plans_differ_only_in_time():
-    """Both keep the budget, whatever the costs."""
+    """Both keep the budget, for any costs."""
     images = {}
     for plan in costs.PLAN_COSTS:
         with Pipeline(SHORT, "cpu", plan=plan, predict=False) as pipeline:

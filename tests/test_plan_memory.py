@@ -1,4 +1,4 @@
-"""Memory of plans: 2 GiB first, then what the machine has, and both numbers in the refusal."""
+"""Memory of plans: 2 GiB first, then the memory of the machine; a refusal states both numbers."""
 
 import pytest
 

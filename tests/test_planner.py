@@ -1,4 +1,4 @@
-"""Plans: the budget is kept by the true error, what is given is kept, and exactness has its price."""
+"""Plans keep the budget by the true error, keep given choices, and trade accuracy for time."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ SMALL = SHORT.replace(processing=SHORT.processing.replace(directions="3d:300"), 
 
 
 def is_complete(accuracy):
-    """Whether a plan leaves nothing open."""
+    """Return True if a plan leaves nothing open."""
     return accuracy.precision != "auto" and None not in (
         accuracy.oversampling,
         accuracy.delay_taps,
@@ -34,7 +34,7 @@ def chosen_for(settings, *, threads=1, **pinned):
 
 
 def random_settings(seed):
-    """Any array, grid, call and budget."""
+    """Random array, grid, call and budget."""
     random = np.random.default_rng(seed)
     extent_m = random.uniform(0.01, 0.08, 3) * (1, 1, random.random() < 0.3) * (random.random(3) < 0.9)
     positions_m = random.uniform(-0.5, 0.5, (random.integers(1, 33), 3)) * extent_m[::-1]
@@ -57,7 +57,7 @@ def random_settings(seed):
 
 @pytest.mark.parametrize("seed", range(40))
 def test_true_error_keeps_the_budget(seed):
-    """On noise, which is heard in the whole band and by microphones that have nothing in common."""
+    """The input is noise in the whole band, independent between microphones."""
     settings, measurement = random_settings(seed), noise(random_settings(seed), seed)
     chosen = chosen_for(settings)
     images = [
@@ -147,7 +147,7 @@ def test_equal_costs_give_equal_plans():
 
 
 def test_costs_select_the_plan(monkeypatch):
-    """Where nothing but sums takes time, beams are interpolated; where interpolation is dear, they are not."""
+    """If only sums take time, beams are interpolated; if interpolation is expensive, they are not."""
     usual = planner.nominal_costs(CPU)
     many = SMALL.replace(processing=SMALL.processing.replace(directions="3d:2000"))
     for dear, wanted in (("sum", True), ("pair", False)):
@@ -187,7 +187,7 @@ def test_adaptive_beamformers_get_usable_plans(beamformer):
 
 
 def test_rated_plans_equal_requested_plans():
-    """Whatever the planner's own settings leave open or do not."""
+    """This holds for complete and incomplete settings."""
     for name in ("cubic", "nearest", "nodes 6 3", "nodes 2 2", "standard", "stop band 60"):
         plan = error_cases.PLANS[name].replace(max_error_db=-35.0)
         device = error_cases.kernels_for(plan)

@@ -1,4 +1,4 @@
-"""What is heard beside a sensor's own call: other sensors, tones, noise, other sonars, the room."""
+"""Sounds other than the own call: other sensors, tones, noise, other sonars, the room."""
 
 import math
 
@@ -39,7 +39,7 @@ def places_of(sensor):
 
 
 def test_foreign_call_travels_over_the_target():
-    """From emitter j to the target to microphone i, and straight from j to i."""
+    """From emitter j over the target to microphone i, and directly from j to i."""
     point_m = np.array([1.0, 0.5, -0.2])
     left = SENSOR.replace(name="left", position_m=(0.0, 0.5, 0.0), yaw_deg=-20)
     right = SENSOR.replace(name="right", position_m=(0.2, -0.4, 0.3), emitter=Emitter(level_db=-6))
@@ -60,7 +60,7 @@ def test_foreign_call_travels_over_the_target():
 
 
 def test_facing_sensors_receive_each_others_calls():
-    """1 m apart: the sound takes 1 m / c, and half of it would be the range of an image."""
+    """At 1 m, the sound takes 1 m / c, which is twice its range in an image."""
     near = EAR.replace(name="near", emitter=Emitter(diameter_m=0.02, level_db=-20))
     far = near.replace(name="far", position_m=(1.0, 0.0, 0.0), yaw_deg=180)
     scene = Scene(sensors=(near, far))
@@ -90,7 +90,7 @@ def test_silent_sensors_emit_no_call():
 
 @pytest.mark.parametrize(("place", "wanted_ns"), [(0, (0, 400, 800)), (1, (-400, 0, 400)), (2, (-800, -400, 0))])
 def test_each_sensor_of_the_chain_starts_400_ns_later(place, wanted_ns):
-    """What is heard of another shifts by as much as its emitter starts after the record."""
+    """Sounds of another sensor shift by the delay of its emission after the record starts."""
     sensors = tuple(EAR.replace(name=f"s{n}", position_m=(0.0, 0.3 * n, 0.0)) for n in range(3))
     scene = Scene(sensors=sensors, points=(Point(position_m=(1.0, 0.2, 0.0)),))
     name = f"s{place}"
@@ -118,7 +118,7 @@ def test_delays_of_the_chain_appear_in_signals():
 @pytest.mark.parametrize("index", [0, 3])
 @pytest.mark.parametrize("frequency_hz", [39_990.0, 41_234.5])
 def test_tones_have_frequency_level_and_phase(frequency_hz, index):
-    """``a / r · sin(2π f (t - r / c))`` at every microphone, t running on from measurement to measurement."""
+    """``a / r · sin(2π f (t - r / c))`` at every microphone; t continues from measurement to measurement."""
     tone = Tone(position_m=(0.6, -0.8, 0.3), frequency_hz=frequency_hz, level_db=-30)
     signals = heard(scene_of(sensor=LISTENS, tones=(tone,)), "interference", index=index)
     way_m = np.linalg.norm(places_of(LISTENS) - tone.position_m, axis=1)
@@ -160,7 +160,7 @@ def noisy(*noises, sensor=None, **more):
 
 @pytest.mark.parametrize("band_hz", [(20e3, 80e3), (38e3, 42e3)])
 def test_noise_has_level_and_band(band_hz):
-    """A thousand samples of 60 kHz of bandwidth tell the level to 0.3 dB."""
+    """A thousand samples with a bandwidth of 60 kHz give the level within 0.3 dB."""
     noise = Noise(position_m=(0.0, 0.0, 2.0), level_db=-20, band_hz=band_hz)
     signals = heard(noisy(noise), "interference")
     way_m = np.linalg.norm(places_of(LISTENS) - noise.position_m, axis=1)
@@ -178,7 +178,7 @@ def test_noise_has_level_and_band(band_hz):
 
 
 def test_noise_of_a_source_is_delayed_between_microphones():
-    """The peak of the correlation lies where the ways differ."""
+    """The peak of the correlation lies at the path difference."""
     sensor = LISTENS.replace(array=line_array(2, 0.1))
     noise = Noise(position_m=(1.0, 0.7, 0.0), level_db=0)
     first, second = heard(noisy(noise, sensor=sensor), "interference")
@@ -198,7 +198,7 @@ def test_noise_of_a_source_is_delayed_between_microphones():
 
 
 def test_noise_continues_between_blocks():
-    """Its level is the same everywhere, and it does not repeat."""
+    """Its level is constant, and it does not repeat."""
     [signal] = heard(noisy(Noise(position_m=(1.0, 0.0, 0.0), level_db=0), sensor=EAR), "interference")
     parts = signal[: 30 * 8192].reshape(30, 8192)
     assert np.mean(parts**2, axis=1).std() < 0.2
@@ -239,7 +239,7 @@ def test_ambient_noise_has_its_level_at_every_microphone():
 
 
 def test_ambient_noise_is_coherent_as_a_diffuse_field():
-    """``sin(k d) / (k d)`` between microphones d apart, at several frequencies."""
+    """``sin(k d) / (k d)`` between microphones at distance d, at several frequencies."""
     sensor = LISTENS.replace(array=line_array(11, 0.002), recording=Recording(n_samples=700_000))
     signals = heard(scene_of(sensor=sensor, ambient=Ambient(level_dbfs=-20)), "ambient_noise")
     frames = signals[:, : 170 * 4096].reshape(11, 170, 4096) * np.hanning(4096)
@@ -294,7 +294,7 @@ def test_disabled_effect_removes_all_sources():
 
 
 def test_sub_arrays_record_one_common_ambient_noise():
-    """Channels are rendered 128 at a time; those of different parts are as independent as their distance makes them."""
+    """Channels are rendered 128 at a time; the coherence between parts follows from their distance."""
     sensor = LISTENS.replace(array=line_array(256, 0.01), recording=Recording(n_samples=50_000))
     scene = scene_of(sensor=sensor, ambient=Ambient(level_dbfs=-30))
     whole = heard(scene, "ambient_noise")

@@ -1,4 +1,4 @@
-"""What a sensor node has put on its disk reaches the central node, whatever ends the one or the other."""
+"""Spooled measurements of a sensor node reach the central node, however either of them ends."""
 
 import shutil
 import signal
@@ -36,7 +36,7 @@ def journals(folder):
 
 
 def kept(folder, given, **options):
-    """Leave measurements in a spool, as a node does that met no central node."""
+    """Leave measurements in a spool, as a node without a central node does."""
     with Node(NOBODY, spool=folder, **options) as node:
         node.append(given)
 
@@ -107,7 +107,7 @@ def test_session_continues_after_a_restart(tmp_path):
 
 @IMPATIENT
 def test_stored_measurements_with_lost_acks_are_not_sent_again(tmp_path):
-    """What the central node has is not sent again, and leaves the disk."""
+    """Measurements that the central node has are removed from the disk instead."""
     given = entries(8)
     kept(tmp_path / "a", given)
     shutil.copytree(tmp_path / "a", tmp_path / "b")
@@ -196,10 +196,7 @@ def test_damaged_measurements_of_the_spool_become_gaps(tmp_path):
 
 
 def test_unsendable_journals_stay_in_the_spool(tmp_path):
-    """One that another process has, one that is cut short, one with numbers that cannot be sent, one twice.
-
-    And an empty one, which goes.
-    """
+    """Cases: locked, truncated, with unsendable numbers, and duplicate. An empty one is removed."""
     given = entries(4, session_id=7)
     kept(tmp_path, given)
     (path,) = journals(tmp_path)
@@ -259,7 +256,7 @@ with SensorNode(address, spool=folder) as node:
 
 @IMPATIENT
 def test_killed_sensor_and_central_nodes_lose_nothing(tmp_path):
-    """Everything that a node said it had kept arrives once."""
+    """All measurements that a node reported as kept arrive once."""
     accepted = {}
     with StandIn() as central:
         for session_id in range(5):
@@ -286,7 +283,7 @@ def test_killed_sensor_and_central_nodes_lose_nothing(tmp_path):
 
 
 def test_gap_kept_only_in_memory_is_reported_after_a_restart(tmp_path):
-    """The node was killed before its journal was told why."""
+    """The node was killed before its journal stored the reason."""
     kept(tmp_path, [*entries(2, first=0), *entries(2, first=5)])
     with StandIn() as central, Node(central.address, (), spool=tmp_path) as node:
         assert node.flush(SOON_S)

@@ -1,4 +1,4 @@
-"""How a central node is: asked of a real one, as tables and as JSON."""
+"""Status of a real central node, as tables and as JSON."""
 
 import contextlib
 import io
@@ -70,7 +70,7 @@ BUSY = Status(
 
 @contextlib.contextmanager
 def central_node(keys=None):
-    """A real one, in a thread of its own; its address."""
+    """Address of a real central node in a thread."""
     opened = queue.Queue()
 
     def run():
@@ -188,7 +188,7 @@ def test_command_without_an_answer_fails_with_one_line():
 
 
 class _Asked:
-    """Is there, away, and there again, and then there is nobody who asks."""
+    """Node that answers, is away, answers again, and then stops."""
 
     def __init__(self):
         self._answers = [

@@ -1,4 +1,4 @@
-"""Recordings and energyscapes survive the way to the disk and back, and other programs can read them."""
+"""Files preserve recordings and energyscapes, and other programs can read them."""
 
 import tracemalloc
 from collections.abc import Sequence

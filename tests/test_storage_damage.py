@@ -1,4 +1,4 @@
-"""Files that are not what they should be are refused in a line, and a full disk leaves nothing."""
+"""Damaged files are refused in one line, and a full disk leaves no file."""
 
 import os
 import resource
@@ -85,7 +85,7 @@ with h5py.File(sys.argv[1], "r+"):
 
 
 def held_open(path, **more):
-    """A process that has a file open for writing, once it has."""
+    """Start a process, and wait until it has opened a file for writing."""
     holder = subprocess.Popen(
         [sys.executable, "-c", HOLDING, str(path)],
         stdin=subprocess.PIPE,
@@ -225,7 +225,7 @@ def test_sensor_of_several_must_be_chosen(path):
 
 
 def test_any_damaged_bit_is_found(tmp_path):
-    """Wherever it is, reading gives what was written or a `DataError` of one line."""
+    """For any bit, reading returns the original or raises a `DataError` of one line."""
     given = noise(line(8, 8).replace(recording=Recording(n_samples=512)), 2)
     wall = Reflector(name="wall", azimuth_deg=10.0, elevation_deg=20.0, range_m=1.5, level_db=0.0)
     reported = GroundTruth(scene="", seed=1, reflectors=((), (wall,)))
@@ -285,7 +285,7 @@ except DataError as error:
 
 
 def test_disk_error_while_writing_leaves_no_file(tmp_path):
-    """The limit on the size of a file stands for a full disk: writing fails in the same way."""
+    """The limit on the size of a file replaces a full disk: writing fails in the same way."""
     done = subprocess.run(
         [sys.executable, "-c", WRITE_UNDER_A_LIMIT, tmp_path / "rec.h5"],
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, 1_000_000)),

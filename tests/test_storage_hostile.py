@@ -1,4 +1,4 @@
-"""Files that point elsewhere, or claim what they do not hold, are refused before anything of it is read."""
+"""Files with external links or false sizes are refused before their content is read."""
 
 import re
 
@@ -53,7 +53,7 @@ def test_template_of_hostile_files_is_sound(tmp_path):
 
 
 def test_recording_with_overlapping_variables_is_refused(tmp_path, monkeypatch):
-    """As chunks may that all lie at one place, of which a small file can name millions."""
+    """Chunks that share one place let a small file claim millions of them."""
     path = write_good(tmp_path / "good.h5")
     monkeypatch.setattr(structure, "stored_bytes", lambda _: 1_000_000)
     with pytest.raises(DataError, match="store more bytes than the file has"):

@@ -1,4 +1,4 @@
-"""Energyscape files know where their sensors are, if somebody said it, and so does what is made of them."""
+"""Energyscape files and files made from them keep the mounting of each sensor if it is known."""
 
 import csv
 
@@ -38,7 +38,7 @@ def place_of(path, sensor):
 
 @pytest.fixture
 def recorded(tmp_path):
-    """A recording of a platform with two sensors."""
+    """Recording of a platform with two sensors."""
     both = [*of("left", noise(SMALL, 2)), *of("right", noise(SMALL, 2, seed=2))]
     return write_recording(tmp_path / "rec.h5", both, mounting=PLACES)
 
@@ -120,7 +120,7 @@ def test_half_a_mounting_is_damage(tmp_path, spoil, reported):
 
 
 def older(path, **changes):
-    """Make a file one of those before the attribute ``mounting``."""
+    """Convert a file to the format before the attribute ``mounting``."""
     with h5py.File(path, "r+") as file:
         attributes = file["sensors/left"].attrs
         del attributes["mounting"]

@@ -1,4 +1,4 @@
-"""Several sensors in one file: each with settings, rows, place and checksums of its own."""
+"""Several sensors in one file, each with its own settings, rows, mounting and checksums."""
 
 from dataclasses import replace
 
@@ -28,7 +28,7 @@ def of(sensor, measurements):
 
 
 def two(settings=SMALL):
-    """Measurements of two sensors in turn, the second one an 8-microphone line with one measurement less."""
+    """Alternating measurements of two sensors; the second is a line of 8 microphones with one measurement less."""
     right, left = of("right", noise(settings)), of("left", noise(line(8, 8), 2, seed=2))
     return [right[0], left[0], left[1], right[1], right[2]]
 

@@ -1,4 +1,4 @@
-"""The truth of a simulated recording stays with it, and with the energyscapes made from it."""
+"""The ground truth of a simulated recording stays with it, and with its energyscapes."""
 
 from dataclasses import asdict, replace
 
@@ -34,7 +34,7 @@ def truth(reflectors=ROWS):
 
 
 def same(one, other):
-    """Angles go through radians, the unit of all angles in these files."""
+    """Angles are stored in radians, the unit of all angles in these files."""
     assert [[r.name for r in row] for row in one] == [[r.name for r in row] for row in other]
     for came, wanted in zip((r for row in one for r in row), (r for row in other for r in row), strict=True):
         for name, value in asdict(wanted).items():

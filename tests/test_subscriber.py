@@ -1,4 +1,4 @@
-"""Applications and what a publisher sends them: each product as it was sent, and no more than they have room for."""
+"""Applications and a publisher: each product arrives unchanged, within the credit."""
 
 import threading
 import time

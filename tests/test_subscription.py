@@ -1,4 +1,4 @@
-"""Applications and a publisher that goes, is silent, refuses, damages what it sends, and comes back."""
+"""Applications and a publisher that ends, is silent, refuses, damages messages, and returns."""
 
 import contextlib
 import os
@@ -41,7 +41,7 @@ def publisher():
 
 @pytest.fixture
 def hasty(monkeypatch):
-    """Nobody has to wait long to see that somebody waits."""
+    """Shorten the waiting times."""
     for name, time_s in {"_BEAT_S": 0.1, "_DEAD_S": 0.5, "_AGAIN_S": 0.1, "_UNMADE_S": 1.0}.items():
         monkeypatch.setattr(_subscription, name, time_s)
 
@@ -197,7 +197,7 @@ def test_refused_subscriber_gets_the_reason(keys, who, match):
 
 
 def offered(processing, subscriber, sequences):
-    """Return the images of measurements that a real central node's processing is given one after the other."""
+    """Return the images of measurements that a real central node processes one after the other."""
     came = []
     for sequence in sequences:
         given = measurement(sequence)

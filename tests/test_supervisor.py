@@ -1,4 +1,4 @@
-"""Central nodes whose process is ended by a signal: the command starts them again, and nothing acknowledged is lost."""
+"""Central nodes ended by a signal: the command restarts them, and no acknowledged measurement is lost."""
 
 import json
 import os
@@ -22,7 +22,7 @@ AT_START = "import os, sys\nif 'record' in sys.argv:\n    os.register_at_fork(af
 
 
 def environment_with(folder, action):
-    """Variables with which each process of a central node does something when it starts."""
+    """Variables that make each process of a central node run code at its start."""
     (folder / "sitecustomize.py").write_text(AT_START.format(action))
     return ENVIRONMENT | {"PYTHONPATH": os.pathsep.join([str(folder), ENVIRONMENT["PYTHONPATH"]])}
 

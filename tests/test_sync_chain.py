@@ -1,4 +1,4 @@
-"""Pulses to emulated devices: at a steady rate, to all of them, and the same ones."""
+"""Pulses to emulated devices arrive at a steady rate, at all devices, with equal numbers."""
 
 import queue
 import threading
@@ -15,7 +15,7 @@ from tests.emulated import TIMEOUT_S, Numbered, ask, block, opened
 
 
 class Listener:
-    """Stands in a chain and notes its pulses."""
+    """Device of a chain that notes its pulses."""
 
     def __init__(self, *, takes):
         self.takes = takes
@@ -39,7 +39,7 @@ def test_pulses_are_steady_and_pass_from_device_to_device():
 
 def test_missed_pulses_are_skipped():
     class Slow(Listener):
-        """Holds the chain up at its first pulse, for some periods."""
+        """Device that delays the chain at its first pulse by some periods."""
 
         def trigger(self, pulse, *, at_ns):
             if not pulse:
@@ -75,7 +75,7 @@ def test_four_devices_on_a_chain_measure_at_the_same_time():
     begun[0].set()
 
     def listen(place, port):
-        """Begin when the one before has: the later ones miss pulses."""
+        """Start sensors one after the other; later ones miss pulses."""
         assert begun[place].wait(TIMEOUT_S)
         ask(port, b"!J,1,1,0\n")
         for _ in range(6):

@@ -1,4 +1,4 @@
-"""Blocks of several sensors get the number of the pulse that triggered them, whatever their counters say."""
+"""Blocks of several sensors get the number of their pulse, whatever their counters are."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ SHORTEST_S = 0.0364
 
 
 def pulses_of(seed, *, n_sensors, rate_hz, n=60, lose=0.1, jitter_s=0.01, regular=True):
-    """Yield (sensor, counter, arrived_ns, pulse) as they arrive; sensors are armed one after the other."""
+    """Yield (sensor, counter, arrived_ns, pulse) in order of arrival; sensors are armed one after the other."""
     random = np.random.default_rng(seed)
     interval_s = np.full(n, 1 / rate_hz) if regular else random.uniform(1.0, 4.0, n) / rate_hz
     times_s = np.cumsum(interval_s) + 1.0
@@ -71,7 +71,7 @@ def test_returning_sensor_is_aligned_again(seed, n_sensors):
 
 
 def test_unnoticed_missed_pulse_is_corrected():
-    """As where a sensor ignores a pulse that comes while it still measures, and does not count it."""
+    """A sensor may ignore a pulse while it measures, and not count it."""
     events = [
         (sensor, counter - (sensor == "s1" and counter >= 30), now_ns, pulse)
         for sensor, counter, now_ns, pulse in pulses_of(3, n_sensors=2, rate_hz=10.0, lose=0.0)
@@ -105,7 +105,7 @@ def test_held_measurements_are_released_after_a_timeout():
 
 @pytest.mark.parametrize("seed", range(20))
 def test_late_blocks_change_nothing(seed):
-    """On a busy host a block may come when the next pulse has passed; what counts is what most of them say."""
+    """On a busy host, a block may arrive after the next pulse; the majority decides."""
     random = np.random.default_rng(seed)
     late = [
         (sensor, counter, now_ns + (round(random.uniform(0.05e9, 0.12e9)) if random.random() < 0.12 else 0), pulse)

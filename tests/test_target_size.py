@@ -1,4 +1,4 @@
-"""Spheres of some wavelengths and discs nearby, against series and integrals written out here."""
+"""Spheres of some wavelengths and near discs, compared with series and integrals."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ CENTRE_M = np.array([0.4, 0.0, 0.0])
 
 
 def pair(receiver_m, mouth_m, **more):
-    """A sensor that hears what an emitter elsewhere sends."""
+    """Sensor that receives sound of an emitter elsewhere."""
     receiver = EAR.replace(position_m=vector(receiver_m), emitter=Emitter(silent=True))
     transmitter = EAR.replace(name="mouth", position_m=vector(mouth_m))
     return scene_of(sensor=receiver, **more).replace(sensors=(receiver, transmitter))
@@ -27,7 +27,7 @@ def of_the_call(signal):
 
 
 def series_of_a_sphere(radius_m, first_m, second_m, cos_between, wave):
-    """Echo of a rigid sphere from a point source to a point, both nearby: ``jk Σ (2n+1) j'/h' h(kr₁) h(kr₂) Pₙ``."""
+    """Echo of a rigid sphere between two near points: ``jk Σ (2n+1) j'/h' h(kr₁) h(kr₂) Pₙ``."""
     orders = np.arange(int(wave * radius_m) + 20)
 
     def hankel(x, *, derivative=False):
@@ -63,7 +63,7 @@ def test_sphere_bistatic_echo_matches_the_partial_wave_series(radius_m):
 
 
 def test_small_sphere_follows_rayleigh_scattering():
-    """``5/6 a (ka)²`` straight back."""
+    """``5/6 a (ka)²`` for backscattering."""
     scene = scene_of(sensor=EAR, spheres=(Sphere(position_m=(1.0, 0.0, 0.0), radius_m=0.001),))
     for frequency_hz in (2_000.0, 5_000.0, 10_000.0):
         _, amplitude = sorted_ways(scene, "spreading", "target_size", frequency_hz=(frequency_hz,))
@@ -72,7 +72,7 @@ def test_small_sphere_follows_rayleigh_scattering():
 
 
 def kirchhoff(radius_m, mouth_m, receiver_m, normal, wave, count=200):
-    """Kirchhoff's integral over a disc at the origin, relative to its echo straight back from afar."""
+    """Kirchhoff's integral over a disc at the origin, relative to its far-field backscattering."""
     nodes, weights = np.polynomial.legendre.leggauss(count)
     places_m = radius_m * (nodes + 1) / 2
     around = 2 * np.pi * np.arange(count) / count
@@ -101,7 +101,7 @@ def test_disc_echo_matches_kirchhoffs_integral(diameter_m, turned_deg):
 
 
 def test_near_disc_echo_differs_between_microphones():
-    """A disc of 10 cm at 40 cm: a microphone 5 cm aside is almost in its shadow."""
+    """For a disc of 10 cm at 40 cm, a microphone 5 cm aside receives much less."""
     receiver = EAR.replace(array=line_array(3, 0.05))
     disc = Point(position_m=vector(CENTRE_M), diameter_m=0.1, facing_deg=(180, 0), strength_db=0.0)
     [echo] = ways(scene_of(disc, sensor=receiver), "target_size", frequency_hz=BAND_HZ)

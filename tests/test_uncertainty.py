@@ -1,4 +1,4 @@
-"""Uncertainties of points: two in three errors lie within, for all grids, budgets and levels of noise."""
+"""Uncertainties of points cover two in three errors, for all grids, budgets and noise levels."""
 
 import numpy as np
 import pytest

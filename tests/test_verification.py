@@ -1,4 +1,4 @@
-"""The verifier of images: against a slow referee, and where images of former versions were wrong."""
+"""The image verifier equals a slow reference, including cases where former images were wrong."""
 
 import json
 from pathlib import Path
@@ -40,7 +40,7 @@ def small(**changes):
 
 
 def measurement_of(settings, seed=1):
-    """White noise in the form that the settings ask for."""
+    """White noise in the encoding of the settings."""
     if settings.recording.is_pdm:
         return noise(settings, count=1, seed=seed)[0]
     shape = settings.recording.n_samples, len(settings.array.positions_m or range(32))
@@ -105,7 +105,7 @@ def test_band_edges_go_from_a_settings_file_into_the_energyscape_file(tmp_path):
     ids=["1 ms without a ramp", "0.1 ms without a ramp", "0.05 ms", "PCM without a ramp"],
 )
 def test_images_of_short_and_rampless_calls_keep_their_budgets(settings, budget_db):
-    """The matched filter once had the spectrum of a call that aliased at the decimated rate: up to 75 dB worse."""
+    """The matched filter once used an aliased spectrum of the call, with errors of up to 75 dB."""
     measurement = measurement_of(settings)
     image = Pipeline(settings, "cpu", 1, max_error_db=budget_db, predict=False).process(measurement)
     true_db = reference.error_db(image.amplitude, wanted_of(image, measurement))
@@ -114,7 +114,7 @@ def test_images_of_short_and_rampless_calls_keep_their_budgets(settings, budget_
 
 
 def test_verify_measures_errors_of_spherical_images(tmp_path):
-    """It once refused this image for an error of -27.9 dB, which was that of its own exact image."""
+    """It once refused this image because of an error of -27.9 dB in its own exact image."""
     output = tmp_path / "a.h5"
     arguments = ["--wavefront", "spherical", "--range", "0:2", "--max-error", "-35", "--directions", "2d:9"]
     done = CliRunner().invoke(cli, ["process", str(REFLECTORS), "-o", str(output), "--verify", "--json", *arguments])
@@ -148,7 +148,7 @@ def test_silence_gives_amplitudes_of_zero(beamformer):
 
 @pytest.mark.parametrize(("wavefront", "n_sampled"), [("plane", 80), ("spherical", 8)])
 def test_sampled_places_represent_all(monkeypatch, wavefront, n_sampled):
-    """A few of many places measure the error of all, as bright ones are drawn more often."""
+    """A few sampled places give the error of all, because bright ones are drawn more often."""
     with open_recording(REFLECTORS) as recording:
         measurement = recording[0]
     directions, range_m = ("2d:361", (0.5, 2.0)) if wavefront == "plane" else ("2d:25", (0.9, 1.3))
@@ -178,7 +178,7 @@ def test_sample_weights_add_up_to_the_total():
 
 @pytest.mark.parametrize("seed", range(10))
 def test_verified_errors_match_the_referee_for_random_settings(seed):
-    """The short form of `ertis bench verification`."""
+    """Short form of `ertis bench verification`."""
     found = campaign.compared(seed)
     assert not found["wrong"], found
 

@@ -1,4 +1,4 @@
-"""What is missing or damaged is found and told, all of it."""
+"""All missing or damaged parts are found and reported."""
 
 import json
 import shutil
@@ -29,14 +29,14 @@ def run(*arguments, code=0):
 
 
 def measurements(*sequences, sensor="left"):
-    """Measurements of one sensor with these numbers, in this order."""
+    """Measurements of one sensor with the given numbers, in this order."""
     made = {sequence: entries(1, sensor=sensor, first=sequence, seed=sequence)[0] for sequence in sequences}
     return [made[sequence].measurement for sequence in sequences]
 
 
 @pytest.fixture
 def recording(tmp_path):
-    """A recording with a gap of its own and two that somebody noted."""
+    """Recording with its own gap and two noted ones."""
     with RecordingWriter(tmp_path / "rec.h5") as writer:
         for measurement in measurements(10, 11, 12, 14, 15, 18):
             writer.write(measurement)
@@ -46,7 +46,7 @@ def recording(tmp_path):
 
 
 def flip(path, *rows, sensor="left"):
-    """Change a bit in some measurements of a recording."""
+    """Flip a bit in some measurements of a recording."""
     with h5py.File(path, "r+") as file:
         for row in rows:
             file[f"sensors/{sensor}/pdm"][row, 5] ^= 1
@@ -85,7 +85,7 @@ def test_gaps_and_damaged_measurements_are_reported(recording):
 
 @pytest.fixture
 def unnumbered(monkeypatch):
-    """Write as a program would that gives numbers as it likes."""
+    """Write as a program that gives numbers in any order."""
     monkeypatch.setattr(RecordingWriter, "_numbered", False)
 
 
@@ -114,7 +114,7 @@ def test_numbers_may_restart_in_a_new_session(tmp_path):
 
 
 def test_gaps_of_two_sessions_are_reported(tmp_path):
-    """Each run has its own numbers, also where both have given the same ones."""
+    """Each session has its own numbers, even if both use the same ones."""
     with create(tmp_path, [*entries(1, first=0, session_id=9), *entries(1, first=3, session_id=9)]) as journal:
         journal.append([*entries(2, first=0, session_id=4), *entries(1, first=3, session_id=4)])
         journal.note_gap("left", 2, 2, "footer", session_id=4)

@@ -1,4 +1,4 @@
-"""What the live view draws, without a browser: pictures, points, and what is fused."""
+"""Content of the live view without a browser: pictures, points and fusion."""
 
 import io
 import itertools
@@ -210,7 +210,7 @@ def test_saved_files_contain_the_drawn_view():
 
 
 def test_saved_points_are_the_drawn_points():
-    """Also where the strongest of the image lies beyond the window, and between directions."""
+    """This includes maxima beyond the window and between directions."""
     rng = np.random.default_rng(5)
     noisy = image(np.linspace(-90, 90, 91))
     amplitude = rng.rayleigh(0.05, noisy.amplitude.shape).astype(np.float32) + spot(11.3, 1.507).amplitude
@@ -226,7 +226,7 @@ def test_saved_points_are_the_drawn_points():
 
 
 def test_points_have_the_uncertainty_of_their_own_call():
-    """Also where a sensor calls otherwise from one image to the next."""
+    """The call of a sensor may change from one image to the next."""
     first = spot(10, 1.5)
     wider = first.settings.replace(call=Call(start_frequency_hz=90e3, stop_frequency_hz=20e3))
     second = first.replace(settings=wider)

@@ -1,4 +1,4 @@
-"""The live view as its users have it: a process that serves a page, and a browser that shows it and is offline."""
+"""The live view as users have it: a process that serves a page, and a real browser without a network."""
 
 import io
 import json
@@ -49,7 +49,7 @@ FLAGS = (
 
 
 class Page:
-    """A page of the viewer in a browser that loads nothing from elsewhere, and remembers what it was asked to."""
+    """Page of the viewer in a browser that blocks external requests and records them."""
 
     def __init__(self, browser, url):
         self.context = browser.new_context(
@@ -77,12 +77,12 @@ class Page:
         return self.page.inner_text(f"[data-name={name}]")
 
     def wait_until(self, name, condition):
-        """Wait until what is told of something, ``text``, fulfils a condition in JavaScript."""
+        """Wait until ``text`` fulfils a condition in JavaScript."""
         cell = f"document.querySelector('[data-name={name}]')"
         self.page.wait_for_function(f"() => {{ const text = {cell}?.innerText ?? ''; return {condition} }}")
 
     def control(self, label):
-        """What stands beside a label."""
+        """The control beside a label."""
         return self.page.locator("label", has_text=label).locator("xpath=ancestor::div[.//input or .//div[@id]][1]")
 
     def slide(self, label, value):
@@ -94,7 +94,7 @@ class Page:
         self.page.get_by_role("button", name=label, exact=True).click()
 
     def picture(self):
-        """The first picture as it is shown, and how its pixels are by those that were drawn."""
+        """The first picture as shown, and its scale in drawn pixels."""
         shown = self.page.locator("img").first
         drawn_px = shown.evaluate("image => image.decode().then(() => image.naturalWidth)")
         pixels = np.asarray(Image.open(io.BytesIO(shown.screenshot())).convert("RGB")).astype(int)
@@ -123,7 +123,7 @@ def browser():
 
 @contextmanager
 def viewing(*arguments):
-    """A process of ``ertis view``, and where its page is."""
+    """Process of ``ertis view``, and the address of its page."""
     command = [sys.executable, "-m", "ertis_cli", "view", *map(str, arguments)]
     command += ["--port", "0", "--no-open", "--quiet", "--json"]
     environment = {**os.environ, "PYTHONPATH": str(Path("cli").absolute())}
@@ -140,7 +140,7 @@ def viewing(*arguments):
 
 @pytest.fixture(scope="module")
 def playback(browser, tmp_path_factory):
-    """The page of a file with three images of the same reflectors."""
+    """Page of a file with three images of the same reflectors."""
     with open_recording(REFLECTORS) as recording, Pipeline(recording.settings) as pipeline:
         image = pipeline.process(recording[0])
     several = [
@@ -161,7 +161,7 @@ def reflectors():
 
 
 def spots(playback):
-    """The reflectors in the first picture: x, y and level of each, in the pixels that were drawn."""
+    """Reflectors in the first picture: x, y and level of each, in drawn pixels."""
     pixels, zoom = playback.picture()
     away, levels = KDTree(TABLE).query(pixels[: -round(66 * zoom)])  # but for the scale of colours
     levels[away > 25] = 0
@@ -273,7 +273,7 @@ def test_saved_page_can_be_opened(playback, browser, tmp_path):
     page.page.wait_for_selector("canvas")
 
     def is_drawn():
-        """Whether the image on the ground is there, in colours that nothing else has."""
+        """Return True if the image on the ground is present, by its unique colours."""
         drawn = np.asarray(Image.open(io.BytesIO(page.page.screenshot())).convert("RGB")).astype(int)
         return (np.ptp(drawn, axis=2) > 60).sum() > 200
 
@@ -283,7 +283,7 @@ def test_saved_page_can_be_opened(playback, browser, tmp_path):
 
 @contextmanager
 def measuring(address):
-    """A sensor node that measures a simulated reflector again and again until the block ends."""
+    """Sensor node that measures a simulated reflector repeatedly until the block ends."""
     processing = Processing(directions="2d:61", range_m=(0.5, 1.2))
     settings = Settings(recording=Recording(n_samples=40_960), processing=processing)
     sensor = Sensor(name="front", recording=settings.recording, processing=processing)

@@ -1,4 +1,4 @@
-"""``ertis view``: what it refuses, what it writes and what its page of the guide says."""
+"""``ertis view``: refusals, output, and its page of the guide."""
 
 import json
 import os
@@ -186,7 +186,7 @@ def test_recording_limit_matches_its_documentation():
 
 
 class InTerminal(webbrowser.GenericBrowser):
-    """A browser that returns when somebody ends it."""
+    """Browser that runs until somebody ends it."""
 
     def __init__(self):
         super().__init__("w3m")

@@ -1,4 +1,4 @@
-"""Which directions a picture shows: all around, behind, and not where nobody looked."""
+"""Directions that a picture shows: all around, behind, and no unmeasured ones."""
 
 import math
 
@@ -32,7 +32,7 @@ def test_full_circle_grid_has_no_gap(first_deg):
 
 
 def looking(azimuth_deg):
-    """Which azimuths a picture of some directions shows, of all whole degrees."""
+    """Azimuths that a picture of some directions shows, in whole degrees."""
     polar = Polar(image(azimuth_deg))
     around_rad = np.radians(np.arange(-179.0, 181.0))
     look = polar.look(-2 * np.sin(around_rad), 2 * np.cos(around_rad))

@@ -1,4 +1,4 @@
-"""Files along their time: what is shown at once, what is played, sought and skipped."""
+"""Playback of files: first image, playing, seeking and skipping."""
 
 import atexit
 import re
@@ -97,7 +97,7 @@ def test_missing_device_is_reported_before_the_first_image(tmp_path, monkeypatch
 
 
 def alternating(count, *, step_s=0.05):
-    """Images of two sensors by turns: in moment 2 n is the n-th of a, in moment 2 n + 1 that of b."""
+    """Alternating images of two sensors: time step 2 n is image n of a, and 2 n + 1 that of b."""
     return [
         spot(
             0, 1 + number / 10, sensor=name, sequence=number, timestamp_ns=round(1e18 + (2 * number + k) * step_s * 1e9)
@@ -275,7 +275,7 @@ def test_files_without_mountings_are_not_combined(tmp_path):
 
 
 def test_closing_waits_for_the_compiler(tmp_path, monkeypatch):
-    """An interpreter that ends while a thread is in it crashes."""
+    """An interpreter that ends while a thread compiles crashes."""
     path = write_energyscapes(tmp_path / "img.h5", stamped(1))
     at_exit, compiling, compiled = [], threading.Event(), threading.Event()
     monkeypatch.setattr(atexit, "register", at_exit.append)

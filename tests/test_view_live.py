@@ -1,4 +1,4 @@
-"""Images as they come of a central node: which are shown, for how long, and how old they are said to be."""
+"""Live images of a central node: selection, duration of display, and stated age."""
 
 import itertools
 import time
@@ -34,7 +34,7 @@ def view_of(source, **choices):
 
 
 def test_unset_clock_gives_no_age():
-    """Those of others beside them have."""
+    """Images of other sensors beside it have an age."""
     unset, timed = (taken(spot(0, 2.0, timestamp_ns=at_ns)) for at_ns in (50_000_000, 1_700_000_000 * 10**9))
     with Live("tcp://127.0.0.1:1") as live:
         assert live.latency_s([unset]) is None
@@ -149,7 +149,7 @@ def test_state_shows_sending_sensors():
 
 
 def notes_of(live):
-    """What is told next, if anything."""
+    """The next message to the user, if any."""
     return wait_for(live.notes)
 
 
@@ -180,7 +180,7 @@ def test_unknown_sensors_are_reported(monkeypatch):
 
 
 def test_refusal_is_reported_once():
-    """As an error, where this looks for applications at the port of sensors."""
+    """It is an error if the view subscribes at the address for sensors."""
     with Publisher(answers=False) as publisher, Live(publisher.address) as live:
         notes, failed = [], []
 
@@ -199,7 +199,7 @@ def test_refusal_is_reported_once():
 
 
 def come(view, source, number, *names, clock_s, moment=None):
-    """Let images of some sensors, of one moment, come."""
+    """Deliver images of some sensors for one time step."""
     source.clock_s = clock_s
     emitted_ns = round(1e18 + 0.2e9 * (number if moment is None else moment))
     source.waiting += [

@@ -1,4 +1,4 @@
-"""When measurements of a file are shown: clocks that were set late or never, and pauses that nobody would wait for."""
+"""Display times of measurements in a file: clocks set late or never, and long pauses."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""The page: who is served, and what is saved of it."""
+"""The page: access, and saved content."""
 
 import base64
 import http.client
@@ -37,7 +37,7 @@ def test_occupied_port_is_refused(tmp_path):
 
 
 def answer(port, origin, host, *, path="/", cookie=None):
-    """What the server says to a browser that connects: 101 lets it in."""
+    """Answer of the server to a connecting browser: 101 admits it."""
     key = base64.b64encode(bytes(16)).decode()
     headers = {"Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Version": "13", "Sec-WebSocket-Key": key}
     headers |= {"Host": host, "Sec-WebSocket-Protocol": f"viser-v{viser.__version__}"}
@@ -69,7 +69,7 @@ def test_pages_of_other_sites_are_refused(host):
 
 
 def get(url, **headers):
-    """The status of a page, and the cookie that it sets."""
+    """Status of a page, and the cookie that it sets."""
     parts = urlsplit(url)
     with closing(http.client.HTTPConnection("127.0.0.1", parts.port, timeout=PATIENCE_S)) as connection:
         connection.request("GET", f"{parts.path}?{parts.query}", headers=headers)
@@ -130,20 +130,20 @@ def test_failed_saving_is_reported_and_the_view_continues(tmp_path):
 
 
 def embedded(page):
-    """What a page holds, as viser keeps it."""
+    """Data embedded in a page, in the format of viser."""
     packed = base64.b64decode(re.search(r'__VISER_EMBED_DATA__="([^"]+)"', page)[1])
     return zstandard.ZstdDecompressor().decompressobj().decompress(packed[8:])
 
 
 def times_s(page):
-    """When something is drawn in a page, and how long it lasts."""
+    """Times at which a page draws, and its duration."""
     inner = embedded(page)
     held = msgspec.msgpack.decode(inner[8 : 8 + int.from_bytes(inner[:8], "little")])
     return {time_s for time_s, _ in held["messages"]}, held["durationSeconds"]
 
 
 def moving(count):
-    """Images of a reflector that is elsewhere in each, each of which takes 1.4 kB of a recording."""
+    """Images of a moving reflector, each of which needs 1.4 kB of a recording."""
     return [spot(2 * number, 2.0, sequence=number, timestamp_ns=round(1e18 + number * 5e7)) for number in range(count)]
 
 
@@ -174,7 +174,7 @@ def test_browser_does_not_end_the_recording_of_another(tmp_path):
 
 
 def test_saved_recording_lasts_from_its_start_to_its_end(tmp_path, monkeypatch):
-    """Not since what it begins with was drawn, and until its end though nothing more comes."""
+    """It does not start at the age of its first image, and lasts until its end even without new images."""
     source, client = Source(), Client()
     clock = SimpleNamespace(now_s=1000.0, monotonic=lambda: clock.now_s)
     monkeypatch.setattr(viewing, "time", clock)
@@ -259,7 +259,7 @@ def test_view_continues_after_a_full_recording(tmp_path, monkeypatch):
         sent = []
 
         def send():
-            """Send an image in each turn, until some have come after all was full."""
+            """Send images until some have been sent after the limit was reached."""
             sent.append(bool(notes and client.notices))
             if sum(sent) > 5:
                 view.stop()

@@ -1,4 +1,4 @@
-"""The scene in three dimensions: where the camera is, what is written on the ground, and how points fade."""
+"""The scene in three dimensions: camera, labels on the ground, and fading of points."""
 
 from types import SimpleNamespace
 
@@ -17,7 +17,7 @@ def of(name):
 
 
 def ground(view):
-    """Where the camera begins and what it looks at, and the distances on the ground."""
+    """Position and target of the camera, and the labelled distances on the ground."""
     space = view._page._space  # noqa: SLF001
     camera = space._server.initial_camera  # noqa: SLF001
     names = [label.text for label in space._labels]  # noqa: SLF001
@@ -25,7 +25,7 @@ def ground(view):
 
 
 def joined(*groups, **choices):
-    """What the ground is when sensors have come in groups."""
+    """Ground after sensors have joined in groups."""
     source = Source()
     with Viewer(source, port=0, choices=Choices(**choices)) as view:
         for group in groups:

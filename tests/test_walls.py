@@ -1,4 +1,4 @@
-"""Images in walls, what stands in the way, and boxes, against constructions by hand."""
+"""Wall images, occlusion and boxes, compared with constructions by hand."""
 
 import math
 
@@ -32,7 +32,7 @@ SIDE = Wall(position_m=(0.0, 1.0, 0.0), facing_deg=(-90.0, 0.0), reflection_db=-
 
 
 def lengths_m(*ways_m):
-    """Lengths of ways, each a row of places."""
+    """Lengths of paths, each a row of places."""
     return np.array([np.sum(np.linalg.norm(np.diff(np.asarray(way, dtype=float), axis=0), axis=1)) for way in ways_m])
 
 
@@ -79,7 +79,7 @@ def test_mirror_source_lies_behind_an_oblique_wall(facing_deg):
 
 
 def test_second_order_images_between_two_walls():
-    """Between parallel walls at 1.5 m and -1 m: there and back over both is 5 m, whichever comes first."""
+    """Between parallel walls at 1.5 m and -1 m, the path over both is 5 m, in either order."""
     back = Wall(position_m=(-1.0, 0.0, 0.0), facing_deg=(0.0, 0.0))
     scene = scene_of(sensor=EAR, walls=(FRONT, back))
     delay_s, amplitude = sorted_ways(scene, "walls", "spreading")
@@ -91,7 +91,7 @@ def test_second_order_images_between_two_walls():
 
 
 def test_corner_image_occurs_once():
-    """Emitter and microphone apart: of the two orders of the walls, one is possible."""
+    """With separate emitter and microphone, one of the two orders of the walls is possible."""
     scene = listener_and_emitter((0.0, 0.0, 0.0), (0.3, -0.5, 0.1), walls=(FRONT, SIDE))
     delay_s, amplitude = sorted_ways(scene, "walls", "spreading", "cross_emission")
     receiver_m = (0.0, 0.0, 0.0)
@@ -106,7 +106,7 @@ def test_corner_image_occurs_once():
 
 @pytest.mark.parametrize("place_m", [(0.0, 0.0, 0.0), (0.2, -0.7, 0.3)])
 def test_a_corner_returns_the_sound_to_where_it_came_from(place_m):
-    """A right angle sends all rays back, so the edge is seen as one echo over both walls."""
+    """A right angle returns all rays, so the edge gives one echo over both walls."""
     scene = scene_of(sensor=EAR.replace(position_m=place_m), walls=(FRONT, SIDE))
     edge_m = np.hypot(1.5 - place_m[0], 1.0 - place_m[1])
     delay_s, amplitude = sorted_ways(scene, "walls", "spreading")
@@ -116,7 +116,7 @@ def test_a_corner_returns_the_sound_to_where_it_came_from(place_m):
 
 
 def test_a_room_has_all_its_second_images_for_a_sensor_that_hears_itself():
-    """Six walls, six ways between opposite ones, twelve edges."""
+    """Six walls, six paths between opposite ones, twelve edges."""
     box = Box(position_m=(0.1, 0.2, 0.3), size_m=(3.0, 4.0, 2.5))
     assert len(seen(scene_of(sensor=EAR, boxes=(box,)), "walls", "occlusion")) == 6 + 6 + 12
 
@@ -137,7 +137,7 @@ def test_number_of_reflections_is_limited():
 @pytest.mark.parametrize(("aside_m", "there"), [(0.0, True), (0.49, True), (0.51, False), (2.0, False)])
 @pytest.mark.parametrize("axis", [1, 2])
 def test_wall_reflects_only_within_its_extent(aside_m, there, axis):
-    """The mirror point of the sensor itself lies straight ahead; the wall is 1 m wide and high."""
+    """The mirror point of the sensor is straight ahead; the wall is 1 m wide and high."""
     place_m = [1.5, 0.0, 0.0]
     place_m[axis] = aside_m
     wall = Wall(position_m=vector(place_m), facing_deg=(180.0, 0.0), size_m=(1.0, 1.0))
@@ -171,7 +171,7 @@ def test_walls_mirror_on_both_sides():
 
 @pytest.mark.parametrize("end", ["emitter", "microphone"])
 def test_patterns_are_mirrored(end):
-    """The emitter sends towards the mirror point; its image is turned about, not only moved."""
+    """The emitter radiates towards the mirror point; its image is mirrored, not only moved."""
     sensor = EAR.replace(
         yaw_deg=40,
         emitter=Emitter(diameter_m=0.02 if end == "emitter" else 0.0),
@@ -185,7 +185,7 @@ def test_patterns_are_mirrored(end):
 
 @pytest.mark.parametrize("end", ["emitter", "microphone"])
 def test_patterns_apply_at_both_ends_of_a_reflected_path(end):
-    """Of the two ways with one reflection, the emitter sends one to the wall and the other to the point."""
+    """Of the two paths with one reflection, one leaves the emitter to the wall, the other to the point."""
     sensor = EAR.replace(
         yaw_deg=20, emitter=Emitter(diameter_m=0.02), electronics=Electronics(microphone_diameter_m=0.02)
     )
@@ -207,7 +207,7 @@ def test_patterns_apply_at_both_ends_of_a_reflected_path(end):
 
 
 def test_signals_contain_all_images():
-    """Rendered, against calls written out at the places of the images."""
+    """Rendered signals are compared with calls at the positions of the images."""
     floor = Wall(position_m=(0.0, 0.0, -0.4), facing_deg=(0.0, 90.0), reflection_db=-2)
     sphere = Sphere(position_m=(0.85, 0.1, 0.0), radius_m=0.3)  # so large that it is a mirror at all frequencies
     scene = scene_of(Point(position_m=(0.5, -0.2, 0.1)), walls=(floor,), spheres=(sphere,))

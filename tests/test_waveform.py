@@ -1,4 +1,4 @@
-"""The call, its matched filter and the decimation filter against what their equations promise."""
+"""The call, its matched filter and the decimation filter agree with their equations."""
 
 import numpy as np
 import pytest
@@ -44,7 +44,7 @@ def settings_of(call, **others):
 
 
 def compressed(signal, call, n_fft):
-    """Return the analytic signal behind the matched filter: (sample,) complex."""
+    """Return the analytic signal after the matched filter: (sample,) complex."""
     matched = matched_filter_spectrum(settings_of(call), n_fft=n_fft)
     bins = slice(matched.first_bin, matched.first_bin + len(matched.values))
     spectrum = np.zeros(n_fft, dtype=complex)
@@ -133,7 +133,7 @@ def test_matched_filter_peaks_for_any_call(call, n_fft):
 
 @CALLS
 def test_matched_filter_ends_within_its_guard(call):
-    """An impulse rings for the call's length backwards and a guard on either side, down to −50 dB."""
+    """The impulse response lasts the call's length backwards plus a guard on either side, down to −50 dB."""
     n_fft, at = 16_384, 8192
     impulse = np.zeros(n_fft)
     impulse[at] = 1.0
@@ -175,7 +175,7 @@ def test_matched_filter_of_decimated_signals_has_the_bins_of_the_record(call):
     ids=["default", "default, wide band", "0.2 ms", "0.2 ms, wide band"],
 )
 def test_band_edges_change_an_echo_as_documented(call, band_edges_hz, difference_db):
-    """Relative to the textbook matched filter, which has no band."""
+    """The comparison is with the textbook matched filter, which has no band limits."""
     n_fft = 2**17
     spectrum = np.fft.rfft(call_samples(call, rate_hz=4.5e6), n_fft)
     textbook = np.fft.ifft(np.append(np.abs(spectrum) ** 2, np.zeros(n_fft - len(spectrum))))
@@ -259,7 +259,7 @@ def test_tap_sums_beyond_16_bits_are_refused():
 @pytest.mark.parametrize("modulation", ["hyperbolic", "linear"])
 @pytest.mark.parametrize(("start_hz", "stop_hz"), [(50e3, 25e3), (20e3, 80e3)])
 def test_instantaneous_frequency_follows_the_modulation(modulation, start_hz, stop_hz):
-    """The instantaneous frequency of the samples, by a quarter of them, against the definition."""
+    """Phase differences of the samples, except near the ends, are compared with the definition."""
     call = Call(start_frequency_hz=start_hz, stop_frequency_hz=stop_hz, modulation=modulation, ramp_fraction=0.0)
     rate_hz = 10e6
     analytic = scipy.signal.hilbert(call_samples(call, rate_hz=rate_hz))

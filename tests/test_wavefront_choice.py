@@ -1,4 +1,4 @@
-"""Wavefronts: their error is predicted and named, and ``auto`` chooses by the nearest range."""
+"""Wavefronts: their error is predicted and reported, and ``auto`` chooses by the nearest range."""
 
 import pytest
 from click.testing import CliRunner
@@ -33,7 +33,7 @@ def test_auto_chooses_wavefronts_by_the_first_range(changes, expected):
 
 
 def test_predicted_wavefront_error_matches_exact_images():
-    """Echoes of random directions are not planned for: the prediction is an upper bound within 10 dB."""
+    """The prediction is an upper bound within 10 dB, because it does not know the directions of echoes."""
     near = with_processing(range_m=(0.9, 1.2), directions="2d:31")
     measurement = heard(CALL, noise=0.3)
     images = []

@@ -1,4 +1,4 @@
-"""Worker processes that are killed, that hang, and that raise."""
+"""Worker processes that are killed, hang, or raise."""
 
 import os
 import signal
@@ -28,7 +28,7 @@ TIMEOUT_S = 30.0
 
 
 def stop_and_offer(loop):
-    """Have a worker that will never be done with its measurement; return its process."""
+    """Stop a worker within its measurement; return its process."""
     loop.until(lambda: loop.workers("idle"))
     (worker,) = loop.workers("idle")
     os.kill(worker.pid, signal.SIGSTOP)
@@ -38,7 +38,7 @@ def stop_and_offer(loop):
 
 
 def is_gone(pid):
-    """Whether a process has ended, though nobody may have asked how."""
+    """Return True if a process has ended, even if it was not waited for."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
     except (FileNotFoundError, ProcessLookupError):

@@ -51,13 +51,13 @@ def test_curvature_changes_equally_over_all_zones():
 
 
 def error_db(settings, image, *, spherical):
-    """Of the image of noise."""
+    """Error of the image of noise."""
     return reference.error_db(image, exact(settings.array, settings.processing.directions, spherical=spherical))
 
 
 @functools.cache
 def exact(array, directions, *, spherical):
-    """The same whatever the plan."""
+    """Exact image, independent of the plan."""
     settings = NEAR.replace(array=array, processing=NEAR.processing.replace(directions=directions))
     axes = Pipeline(settings)
     unit = unit_vectors(axes.grid.azimuth_rad, axes.grid.elevation_rad)
@@ -85,7 +85,7 @@ def test_interpolated_beams_are_within_the_budget():
 
 
 def test_plane_waves_exceed_the_budget_at_near_ranges():
-    """They are what they should be themselves, and wrong of points at such ranges."""
+    """They are correct for plane waves, but wrong for points at such ranges."""
     settings = NEAR.replace(processing=NEAR.processing.replace(wavefront="plane"))
     pipeline, measurement = Pipeline(settings), noise(settings)
     image = pipeline.process(measurement).amplitude
@@ -94,7 +94,7 @@ def test_plane_waves_exceed_the_budget_at_near_ranges():
 
 
 def test_near_echo_is_as_bright_as_a_far_one():
-    """Of a point at 15 cm, which plane waves lose a part of."""
+    """The echo is from a point at 15 cm, of which plane waves lose a part."""
     words = echo_words(NEAR, azimuth_deg=20.0, range_m=0.15, level=0.1, spherical=True)
     brightest = {}
     for wavefront in ("spherical", "plane"):
@@ -112,7 +112,7 @@ def test_near_echo_is_as_bright_as_a_far_one():
 
 
 def test_planner_uses_the_fewest_zones():
-    """More for less error, few for far ranges, one where waves are plane."""
+    """Smaller errors need more zones, far ranges few, and plane waves one."""
     counts = {}
     for name, range_m, budget_db in (
         ("near", (0.1, 1.0), -35.0),

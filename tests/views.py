@@ -1,4 +1,4 @@
-"""Images, sources and browsers that the tests of the live view share."""
+"""Images, sources and browsers for the tests of the live view."""
 
 import time
 
@@ -14,7 +14,7 @@ PATIENCE_S = 20.0
 
 
 def spot(azimuth_deg, range_m, *, sensor="front", sequence=0, level=0.5, **stamp):
-    """An image with one reflector, soft enough to lie between directions and ranges."""
+    """Image with one reflector, smooth enough to lie between directions and ranges."""
     made = image(np.linspace(-90, 90, 91))
     across = (np.degrees(made.azimuth_rad) - azimuth_deg) / 4
     along = (made.range_m - range_m) / 0.03
@@ -27,7 +27,7 @@ def taken(made, pose=None, time_s=0.0, interval_s=None):
 
 
 def brightest(picture):
-    """The middle of the pixels of the highest level, but for those of the scale below: x, y."""
+    """Centre of the pixels of the highest level, without those of the scale below: x, y."""
     away = np.abs(picture.astype(int) - TABLE[255].astype(int)).sum(axis=2)
     rows, columns = np.nonzero(away <= away.min() + 6)
     return columns.mean() + 0.5, rows.mean() + 0.5
@@ -50,7 +50,7 @@ def stamped(count, *, sensors=("front",), step_s=0.05):
 
 
 class Client:
-    """A browser that asks for a file."""
+    """Browser that requests a file."""
 
     def __init__(self, number=0):
         self.client_id = number
@@ -65,7 +65,7 @@ class Client:
 
 
 class Source:
-    """A live source whose clock and images are those that a test gives."""
+    """Live source with a clock and images that a test controls."""
 
     is_playback = False
     title, state, connected = "source", "live", True
@@ -87,7 +87,7 @@ class Source:
 
 
 def acked_through(view, *, within_s=0.12):
-    """Let a view draw what there is, and return what it told at last."""
+    """Let a view draw its pending images, and return its last message."""
     rows = {}
     page = view._page  # noqa: SLF001  what it tells goes to browsers only
     notify = page.notify

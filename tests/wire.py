@@ -1,4 +1,4 @@
-"""Blocks as they stand on the wire, short and each with words of its own."""
+"""Blocks as sent on the serial line, short and with distinct words."""
 
 import numpy as np
 

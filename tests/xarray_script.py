@@ -1,4 +1,4 @@
-"""A script that converts an image to xarray, and ends with the error in one line if xarray is not installed."""
+"""Script that converts an image to xarray, or ends with an error in one line if xarray is not installed."""
 
 import sys
 
