@@ -21,6 +21,9 @@ from ertis_numba.errors import ArgumentError, SettingsError
 
 __all__ = ["MAX_KEY_PARTS", "TomlDocument", "TomlTable"]
 
+_NO_VALUE: Final = object()
+"""Default of a value that was not given, because None is a value."""
+
 _HEADER = re.compile(r"\s*\[[\w\[. -]*\]")
 _KEY = re.compile(r"\s*([\w.-]+)\s*=")
 MAX_KEY_PARTS: Final = 16
@@ -65,7 +68,7 @@ class TomlTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         """Return the name of the table in errors."""
         return cls.__name__.lower().lstrip("_")
 
-    def replace(self, path: str = "", value: Any = None, /, **changes: Any) -> Self:
+    def replace(self, path: str | None = None, value: Any = _NO_VALUE, /, **changes: Any) -> Self:
         """Return a copy with some keys changed, checked again.
 
         Parameters
@@ -73,7 +76,7 @@ class TomlTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         path : str, optional
             Key to change, such as ``range_m``, or ``processing.range_m`` in a nested table.
         value : optional
-            New value of that key.
+            New value of that key, required with ``path``.
         **changes
             New values by key. Keys of nested tables are given as ``**{"processing.range_m": (0.5, 3)}``. All changes
             of a table are checked together.
@@ -85,7 +88,7 @@ class TomlTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         Raises
         ------
         ArgumentError
-            There is no such key, or a value cannot be used.
+            There is no such key, or a value is missing or cannot be used.
 
         Examples
         --------
@@ -96,7 +99,9 @@ class TomlTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         >>> changed.accuracy.max_error_db, changed.processing.directions
         (-50.0, '2d:181')
         """
-        if path:
+        if path is not None:
+            if value is _NO_VALUE:
+                raise ArgumentError(f"{path!r} has no value; give one, as in replace({path!r}, value)")
             changes = {path: value, **changes}
         own: dict[str, Any] = {}
         nested: dict[str, dict[str, Any]] = {}

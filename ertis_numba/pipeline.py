@@ -169,7 +169,7 @@ class Pipeline:
         Raises
         ------
         DataError
-            The measurement's array, call, record or air, or its words, are not those of the pipeline's settings.
+            The measurement's array, call, record or air, or its data, are not those of the pipeline's settings.
         ArgumentError
             ``out`` has another shape or type, or the device has fewer threads.
 
@@ -304,7 +304,7 @@ class Pipeline:
         Raises
         ------
         DataError
-            The measurement's array, call, record or air, or its words, are not those of the pipeline's settings.
+            The measurement's array, call, record or air, or its data, are not those of the pipeline's settings.
 
         Examples
         --------
@@ -314,7 +314,7 @@ class Pipeline:
         >>> signals.demodulated.shape == signals.matched.shape == (len(signals.positions_m), len(signals.time_s))
         True
         """
-        from ertis_numba.stages.signals import matched_signals_of, signals_of  # noqa: PLC0415  few want them
+        from ertis_numba.stages.signals import matched, signals_of  # noqa: PLC0415  few want them
 
         self._require_open()
         checks.instance("measurement", measurement, Measurement, "a recording holds")
@@ -323,7 +323,7 @@ class Pipeline:
         demodulated = signals_of(measurement, settings=self.settings)
         return MicrophoneSignals(
             demodulated=demodulated,
-            matched=matched_signals_of(measurement, settings=self.settings),
+            matched=matched(demodulated, self.settings),
             time_s=np.arange(demodulated.shape[1]) / rate_hz,
             sample_rate_hz=rate_hz,
             positions_m=layout.enabled_positions_m,

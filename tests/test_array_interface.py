@@ -24,7 +24,7 @@ def demodulated(settings, data, device="cpu"):
         data,
         sample_rate_hz=settings.recording.sample_rate_hz,
         decimation=settings.decimation,
-        band_hz=matched_band_hz(settings),
+        passband_hz=matched_band_hz(settings)[1],
         channels=np.flatnonzero(microphones(settings.array).enabled),
         stopband_attenuation_db=settings.accuracy.stopband_attenuation_db or 60.0,
         device=device,
@@ -112,7 +112,7 @@ def test_beamform_makes_real_signals_analytic():
     analytic = np.fft.ifft(spectra, axis=1)[:, : signals.shape[1]]
     given = {
         "positions_m": microphones(SHORT.array).enabled_positions_m,
-        "directions": [[0.1, 0.0], [-0.4, 0.2]],
+        "directions_rad": [[0.1, 0.0], [-0.4, 0.2]],
         "sample_rate_hz": SHORT.signal_rate_hz,
         "ranges_m": np.linspace(0.4, 0.9, 99),
         "band_hz": (20e3, 60e3),
@@ -141,7 +141,7 @@ def test_decimation_attenuates_aliasing_frequencies():
 def test_waveform_is_matched_like_the_call_that_it_samples():
     call = Call()
     signals = np.random.default_rng(1).standard_normal((2, 3, 5_000))
-    given = {"sample_rate_hz": 450e3, "band_hz": (19e3, 56e3)}
+    given = {"sample_rate_hz": 450e3, "band_edges_hz": (19e3, 56e3)}
     sampled = ertis.matched_filter(signals, call=call_samples(call), **given)
     assert error_db(sampled, ertis.matched_filter(signals, call=call, **given)) < -30
     assert ertis.matched_filter(signals, call=call, **given).shape == (2, 3, 5_000)
@@ -152,7 +152,7 @@ SIGNALS = np.ones((2, 900))
 BEAMFORM = {
     "signals": SIGNALS,
     "positions_m": np.zeros((2, 3)),
-    "directions": np.zeros((1, 2)),
+    "directions_rad": np.zeros((1, 2)),
     "sample_rate_hz": 450e3,
     "ranges_m": np.linspace(0.1, 0.2, 9),
 }
@@ -176,12 +176,12 @@ BEAMFORM = {
             "data has 12800 channels; the limit is 1024",
         ),
         (
-            lambda: ertis.demodulate(WORDS, sample_rate_hz=4.5e6, decimation=100, band_hz=(2e4, 5e4)),
+            lambda: ertis.demodulate(WORDS, sample_rate_hz=4.5e6, decimation=100, passband_hz=5e4),
             "decimation 100 gives a rate of 45000 Hz, too low for signals up to 50000 Hz",
         ),
         (
-            lambda: ertis.demodulate(WORDS, sample_rate_hz=4.5e6, decimation=9, band_hz=(5e4, 2e4)),
-            "band_hz is 50000 to 20000 Hz; give 0 <= low < high",
+            lambda: ertis.demodulate(WORDS, sample_rate_hz=4.5e6, decimation=9, passband_hz=-1.0),
+            "passband_hz is -1",
         ),
         (lambda: ertis.demodulate(WORDS, sample_rate_hz=4.5e6, decimation=9, device="tpu"), "device 'tpu' is unknown"),
         (lambda: ertis.matched_filter(SIGNALS, sample_rate_hz=9e4, call=Call()), "sample_rate_hz is 90000; give more"),
@@ -189,14 +189,14 @@ BEAMFORM = {
         (lambda: ertis.matched_filter(SIGNALS, sample_rate_hz=450e3, call=[1, 2]), "call has 2 samples; give 17 to"),
         (lambda: ertis.matched_filter(SIGNALS, sample_rate_hz=450e3, call="sweep"), "call holds <U5 of shape"),
         (
-            lambda: ertis.matched_filter(SIGNALS, sample_rate_hz=450e3, call=Call(), band_hz=(3e4, 6e4)),
-            "band_hz is 30000 to 60000 Hz, but the call sweeps over 25000 to 50000 Hz",
+            lambda: ertis.matched_filter(SIGNALS, sample_rate_hz=450e3, call=Call(), band_edges_hz=(3e4, 6e4)),
+            "band_edges_hz is 30000 to 60000 Hz, but the call sweeps over 25000 to 50000 Hz",
         ),
         (lambda: ertis.beamform(**BEAMFORM | {"signals": SIGNALS[0]}), "signals holds float64 of shape"),
         (lambda: ertis.beamform(**BEAMFORM | {"positions_m": np.zeros((3, 3))}), r"positions_m has shape \(3, 3\)"),
         (lambda: ertis.beamform(**BEAMFORM | {"positions_m": "here"}), "positions_m holds no array of numbers"),
-        (lambda: ertis.beamform(**BEAMFORM | {"directions": [[0.0, 45.0]]}), r"directions\[0, 1\] is 45; give radians"),
-        (lambda: ertis.beamform(**BEAMFORM | {"directions": [0.0, 1.0]}), r"directions holds float64 of shape \(2,\)"),
+        (lambda: ertis.beamform(**BEAMFORM | {"directions_rad": [[0.0, 45.0]]}), r"directions_rad\[0, 1\] is 45; give"),
+        (lambda: ertis.beamform(**BEAMFORM | {"directions_rad": [0.0, 1.0]}), "directions_rad holds float64 of shape"),
         (lambda: ertis.beamform(**BEAMFORM | {"ranges_m": [0.1, 0.2, 0.4]}), "ranges_m has steps from 0.1 to 0.2 m"),
         (lambda: ertis.beamform(**BEAMFORM | {"ranges_m": [0.2, 0.1]}), "ranges_m has steps from -0.1 to -0.1 m"),
         (lambda: ertis.beamform(**BEAMFORM | {"ranges_m": [-0.1, 0.1]}), "ranges_m begins at -0.1 m"),

@@ -40,8 +40,8 @@ def cfar(
     from one side.
 
     In Rayleigh-distributed noise, such as that of delay-and-sum, the share of detected bins is ``false_alarm`` at any
-    noise level. Beside a step of the noise level, the share is smaller on the lower side. The guide, under "Pictures
-    and reflectors", has the share on the higher side and beside reflectors.
+    noise level. Beside a step of the noise level, the share is smaller on the lower side. The page
+    docs/how-to/plots.md has the share on the higher side and beside reflectors.
 
     Parameters
     ----------

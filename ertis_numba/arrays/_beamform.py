@@ -33,7 +33,7 @@ _DIRECTIONS_AT_A_TIME: Final = 4096
 def beamform(
     signals: ArrayLike,
     positions_m: ArrayLike,
-    directions: ArrayLike,
+    directions_rad: ArrayLike,
     *,
     sample_rate_hz: float,
     ranges_m: ArrayLike,
@@ -58,7 +58,7 @@ def beamform(
         `scipy.signal.hilbert`.
     positions_m : (mic, 3) float
         Microphone positions x, y, z in metres; ranges count from the origin.
-    directions : (direction, 2) float
+    directions_rad : (direction, 2) float
         Azimuth and elevation in radians: x is azimuth 0, y is azimuth π/2, and z is elevation π/2.
     sample_rate_hz : float
         Rate of the signals in hertz.
@@ -100,7 +100,7 @@ def beamform(
     >>> image = ertis.beamform(
     ...     np.tile(pulse, (4, 1)),
     ...     positions_m=[[0, y, 0] for y in (-6e-3, -2e-3, 2e-3, 6e-3)],
-    ...     directions=np.radians([[-30, 0], [0, 0], [30, 0]]),
+    ...     directions_rad=np.radians([[-30, 0], [0, 0], [30, 0]]),
     ...     sample_rate_hz=450e3,
     ...     ranges_m=np.arange(0.3, 0.5, 0.001),
     ... )
@@ -119,7 +119,7 @@ def beamform(
         )
     checks.finite_array("signals", given)
     places_m = numbers_of("positions_m", positions_m, (len(given), 3))
-    angles_rad = directions_of(directions)
+    angles_rad = directions_of(directions_rad)
     range_m, step_m = ranges_of(ranges_m)
     record_m = speed_m_s * given.shape[1] / rate_hz / 2
     if range_m[-1] > record_m:

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ertis_numba import checks
-from ertis_numba.arrays._arguments import band_of
 from ertis_numba.arrays._device import on_device, window_from_start
 from ertis_numba.constants import MAX_MICROPHONES
 from ertis_numba.errors import ArgumentError
@@ -25,7 +24,7 @@ def demodulate(
     *,
     sample_rate_hz: float,
     decimation: int,
-    band_hz: tuple[float, float] | None = None,
+    passband_hz: float | None = None,
     channels: Sequence[int] | None = None,
     stopband_attenuation_db: float = 60.0,
     device: str = "auto",
@@ -45,9 +44,9 @@ def demodulate(
         PDM clock or PCM rate in hertz.
     decimation : int
         Input samples per output sample, 1 to 1000.
-    band_hz : (low, high), optional
-        Band of interest in hertz. Nothing aliases into 0 to ``high``. By default, ``high`` is 0.4 times the output
-        rate, as in `scipy.signal.decimate`.
+    passband_hz : float, optional
+        Highest frequency of interest in hertz: no signal aliases below it. By default 0.4 times the output rate, as in
+        `scipy.signal.decimate`.
     channels : sequence of int, optional
         Channels to return, in this order; all by default.
     stopband_attenuation_db : float, default 60
@@ -85,7 +84,7 @@ def demodulate(
     checks.between("stopband_attenuation_db", stopband_attenuation_db, 40.0, 140.0)
     rows, n_channels, full_scale = _rows_of(np.asarray(data))
     chosen = _channels(channels, n_channels)
-    pass_hz = _PASSBAND * rate_hz / decimation if band_hz is None else band_of("band_hz", band_hz)[1]
+    pass_hz = _PASSBAND * rate_hz / decimation if passband_hz is None else checks.positive("passband_hz", passband_hz)
     taps = _low_pass(rate_hz, decimation, pass_hz, stopband_attenuation_db, is_pdm=full_scale is None)
     count = -(-len(rows) // decimation)
     window = window_from_start(n_samples=count, n_fft=count, n_outputs=0)

@@ -14,20 +14,20 @@ __all__ = ["directions_of", "ranges_of", "weights_of"]
 _MAX_STEP_ERROR: Final = 1e-6  # relative to the spacing of ranges
 
 
-def directions_of(directions: ArrayLike) -> NDArray[np.float64]:
-    given = np.asarray(directions)
+def directions_of(directions_rad: ArrayLike) -> NDArray[np.float64]:
+    given = np.asarray(directions_rad)
     if given.ndim != 2 or given.shape[1] != 2 or not len(given) or given.dtype.kind not in "fiu":
         raise ArgumentError(
-            f"directions holds {given.dtype} of shape {given.shape}; give azimuth and elevation in radians, of shape "
-            "(direction, 2)"
+            f"directions_rad holds {given.dtype} of shape {given.shape}; give azimuth and elevation in radians, of "
+            "shape (direction, 2)"
         )
-    angles_rad = numbers_of("directions", given, given.shape)
+    angles_rad = numbers_of("directions_rad", given, given.shape)
     for axis, limit_rad in ((0, 2 * math.pi), (1, math.pi / 2)):
         wrong = np.flatnonzero(np.abs(angles_rad[:, axis]) > limit_rad * (1 + 1e-12))
         if wrong.size:
             raise ArgumentError(
-                f"directions[{wrong[0]}, {axis}] is {angles_rad[wrong[0], axis]:g}; give radians from {-limit_rad:.3g} "
-                f"to {limit_rad:.3g}, such as numpy.radians returns"
+                f"directions_rad[{wrong[0]}, {axis}] is {angles_rad[wrong[0], axis]:g}; give radians from "
+                f"{-limit_rad:.3g} to {limit_rad:.3g}, such as numpy.radians returns"
             )
     return angles_rad
 

@@ -23,7 +23,7 @@ def matched_filter(
     *,
     sample_rate_hz: float,
     call: Call | ArrayLike,
-    band_hz: tuple[float, float] | None = None,
+    band_edges_hz: tuple[float, float] | None = None,
     decimation: int = 1,
     device: str = "auto",
     threads: int | None = None,
@@ -41,8 +41,9 @@ def matched_filter(
         Rate of the signals in hertz, more than twice the call's highest frequency.
     call : Call or (sample,) float
         Emitted call. An array is a waveform at ``sample_rate_hz``, of 17 to 4096 samples.
-    band_hz : (low, high), optional
-        Frequencies in hertz at which the filter reaches 0. By default, each lies 5 kHz outside the call's band.
+    band_edges_hz : (low, high), optional
+        Frequencies in hertz at which the filter reaches 0. By default, each lies 5 kHz outside the call's band, or half
+        of the band's lowest frequency if that is less.
     decimation : int, default 1
         Decimation that `demodulate` applied. The call is sampled at ``decimation * sample_rate_hz``, so that a call
         without ramps does not alias.
@@ -81,7 +82,7 @@ def matched_filter(
     rate_hz = checks.positive("sample_rate_hz", sample_rate_hz)
     checks.integer("decimation", decimation, 1, 1000)
     given = _real("signals", signals)
-    settings = _call_settings(_call(call, rate_hz), rate_hz, decimation, band_hz)
+    settings = _call_settings(_call(call, rate_hz), rate_hz, decimation, band_edges_hz)
     rows = given.reshape(-1, given.shape[-1])
     n_samples = rows.shape[1]
     guard_s = settings.call.duration_s + 2 * matched_guard_s(settings)
@@ -124,14 +125,14 @@ def _call(call: Call | ArrayLike, rate_hz: float) -> Call:
         raise ArgumentError(str(error).replace("call.waveform", "call").replace("call.", "")) from error
 
 
-def _call_settings(call: Call, rate_hz: float, decimation: int, band_hz: tuple[float, float] | None) -> Settings:
+def _call_settings(call: Call, rate_hz: float, decimation: int, band_edges_hz: tuple[float, float] | None) -> Settings:
     """Return settings whose signals have a rate, so that the matched filter is that of a pipeline."""
     if rate_hz <= 2 * call.high_frequency_hz:
         raise ArgumentError(
             f"sample_rate_hz is {rate_hz:g}; give more than twice the call's highest frequency of "
             f"{call.high_frequency_hz:g} Hz"
         )
-    edges_hz = None if band_hz is None else band_of("band_hz", band_hz)
+    edges_hz = None if band_edges_hz is None else band_of("band_edges_hz", band_edges_hz)
     try:
         return Settings(
             call=call,
@@ -139,7 +140,7 @@ def _call_settings(call: Call, rate_hz: float, decimation: int, band_hz: tuple[f
             processing=Processing(range_decimation=decimation, decimation=decimation, band_edges_hz=edges_hz),
         )
     except ArgumentError as error:
-        raise ArgumentError(str(error).replace("processing.band_edges_hz", "band_hz")) from error
+        raise ArgumentError(str(error).replace("processing.band_edges_hz", "band_edges_hz")) from error
 
 
 def _real(name: str, signals: ArrayLike) -> NDArray[Any]:

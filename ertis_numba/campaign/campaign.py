@@ -57,7 +57,7 @@ class Campaign:
     Parameters
     ----------
     recordings : sequence of RecordingFile
-        Recordings to process, as `find` returns them.
+        Recordings to process, as `find_recordings` returns them.
     folder : str or Path
         Output folder. It is created if it does not exist.
     options : CampaignOptions, optional

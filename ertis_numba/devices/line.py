@@ -97,7 +97,7 @@ class SerialLine:
 
         Raises
         ------
-        SonarGoneError
+        SonarDisconnectedError
             The device was unplugged.
         SonarError
             ``stop`` said so, or the line is closed.
@@ -123,7 +123,7 @@ class SerialLine:
 
         Raises
         ------
-        SonarGoneError
+        SonarDisconnectedError
             The device was unplugged.
         SonarError
             It takes nothing, ``stop`` said so, or the line is closed.

@@ -192,7 +192,7 @@ class SonarDriver:
             It is to be emitted while the amplifier is off.
         SonarError
             No whole measurement came in time; the next one may be tried at once.
-        SonarGoneError
+        SonarDisconnectedError
             The sensor was unplugged.
         """
         self._speak()
@@ -259,7 +259,7 @@ class SonarDriver:
         ------
         SonarError
             None came for so long, or `close` was called before.
-        SonarGoneError
+        SonarDisconnectedError
             The sensor was unplugged.
         """
         (setup, receiver), deadline_s = self._state(), self.deadline_s
@@ -308,7 +308,7 @@ class SonarDriver:
 
         Raises
         ------
-        SonarGoneError
+        SonarDisconnectedError
             It is not back within that time.
         """
         began = time.monotonic()

@@ -101,7 +101,7 @@ def seal_in_subprocess(
 
     Returns
     -------
-    Sealed
+    SealingResult
         Result.
 
     Raises

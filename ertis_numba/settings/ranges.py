@@ -45,8 +45,8 @@ def fit_ranges(processing: Processing, recording: Recording, call: Call) -> Proc
 
     Examples
     --------
-    >>> from ertis_numba.settings import Call, Processing, Recording, suit_ranges
-    >>> suit_ranges(Processing(), Recording(n_samples=65_536), Call()).range_m
+    >>> from ertis_numba.settings import Call, Processing, Recording, fit_ranges
+    >>> fit_ranges(Processing(), Recording(n_samples=65_536), Call()).range_m
     (0.5, 1.8)
     """
     if recording.duration_s <= call.duration_s:

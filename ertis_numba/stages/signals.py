@@ -13,9 +13,9 @@ from ertis_numba.settings import Settings
 from ertis_numba.stages.demodulate import demodulation
 from ertis_numba.stages.plan_elements import chain_taps
 from ertis_numba.stages.window import TimeWindow
-from ertis_numba.waveform import matched_filter_spectrum
+from ertis_numba.waveform import matched_filter_spectrum, matched_guard_s
 
-__all__ = ["matched_signals_of", "signals_of"]
+__all__ = ["matched", "signals_of"]
 
 
 def signals_of(
@@ -65,31 +65,27 @@ def signals_of(
     return out
 
 
-def matched_signals_of(measurement: Measurement, *, settings: Settings | None = None) -> NDArray[np.complex64]:
+def matched(signals: NDArray[np.float32], settings: Settings) -> NDArray[np.complex64]:
     """Return the signals of `signals_of` after the call's matched filter.
 
     Parameters
     ----------
-    measurement : Measurement
-    settings : Settings, optional
-        By default, the settings of the measurement.
+    signals : (mic, sample) float32
+        Decimated signals from sample 0 on.
+    settings : Settings
+        Settings of the signals.
 
     Returns
     -------
     (mic, sample) complex64
         Analytic signals. An echo of amplitude 1 that starts at sample n has its peak there, with an envelope of 1.
-
-    Raises
-    ------
-    DataError
-        The samples do not match the settings.
     """
-    settings = settings or measurement.settings
-    signals = signals_of(measurement, settings=settings)
     count = signals.shape[1]
-    n_fft = count + math.ceil(settings.call.duration_s * settings.signal_rate_hz) + 1
-    matched = matched_filter_spectrum(settings, n_fft=n_fft)
-    occupied = slice(matched.first_bin, matched.first_bin + len(matched.values))
+    # The filter rings for the call's duration and a guard on either side; the padding keeps its ends apart.
+    guard_s = settings.call.duration_s + 2 * matched_guard_s(settings)
+    n_fft = count + math.ceil(guard_s * settings.signal_rate_hz) + 1
+    spectrum = matched_filter_spectrum(settings, n_fft=n_fft)
+    occupied = slice(spectrum.first_bin, spectrum.first_bin + len(spectrum.values))
     spectra = np.zeros((len(signals), n_fft), dtype=np.complex128)
-    spectra[:, occupied] = np.fft.rfft(signals, n_fft, axis=1)[:, occupied] * matched.values
+    spectra[:, occupied] = np.fft.rfft(signals, n_fft, axis=1)[:, occupied] * spectrum.values
     return np.fft.ifft(spectra, axis=1)[:, :count].astype(np.complex64)

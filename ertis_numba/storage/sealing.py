@@ -65,7 +65,7 @@ def seal(path: str | Path, *, overwrite: bool = False, progress: Progress = lamb
 
     Returns
     -------
-    Sealed
+    SealingResult
         Result.
 
     Raises

@@ -30,7 +30,7 @@ def with_legend(page: str, title: str, frame: DrawnFrame | None) -> str:
     page : str
         HTML, with a head and a body.
     title : str
-    frame : Frame or None
+    frame : DrawnFrame or None
         The pictures of its first four sensors are shown; they have colour bars.
     """
     sensors = [] if frame is None else [*frame.sensors.items()][:_MAX_PICTURES]

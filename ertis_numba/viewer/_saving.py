@@ -49,7 +49,7 @@ def points_ply(points: list[tuple[Energyscape, PointCloud, Pose | None]]) -> byt
     Parameters
     ----------
     points : list of (Energyscape, PointCloud, Pose or None)
-        As `Scene.latest` returns them.
+        As `ViewedScene.latest` returns them.
 
     Raises
     ------

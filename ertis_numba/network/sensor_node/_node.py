@@ -43,8 +43,8 @@ class _UserCallback(Generic[CallbackArgument]):
 class SensorNode:
     """Node that keeps measurements and sends them until the central node has acknowledged them.
 
-    Use it in a ``with`` statement. It is a sink of `ertis_numba.capture.Session`. Threads may share it. It never waits
-    for the network: while the central node is away, it keeps measurements in memory or on disk.
+    Use it in a ``with`` statement. It is a sink of `ertis_numba.capture.CaptureSession`. Threads may share it. It never
+    waits for the network: while the central node is away, it keeps measurements in memory or on disk.
 
     Parameters
     ----------
