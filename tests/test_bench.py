@@ -126,7 +126,7 @@ def test_benchmark_refuses_a_wrong_image(image, wrong):
 def test_benchmark_refuses_another_strongest_reflector(image, shift):
     amplitude = np.full_like(image.amplitude, 0.1)
     amplitude[2, 50] = 1.0
-    with pytest.raises(DataError, match=r"strongest reflector of one image, at 0.591 m, has -20.0 dB in another"):
+    with pytest.raises(DataError, match=r"strongest reflector of one image, at 0.591 m, has -20.0 dB in the other"):
         checks.require_same_reflector(
             image.replace(amplitude=amplitude), image.replace(amplitude=np.roll(amplitude, shift, axis=(0, 1)))
         )

@@ -173,7 +173,7 @@ def test_ports_are_queried_in_parallel():
 def test_devices_command_prints_a_table(four_devices):
     done = listed()
     assert [re.split("  +", line) for line in done.stdout.splitlines()] == [
-        ["port", "serial number", "state", "firmware", "call", "what"],
+        ["port", "serial number", "state", "firmware", "call", "description"],
         [four_devices["call"].port, "call", "ready", "1.0.0", "0x0523", "emulated eRTIS"],
         [four_devices["new"].port, "new", "ready", "1.0.0", "0x0000", "emulated eRTIS"],
         [four_devices["used"].port, "used", "in use", "-", "-", "emulated eRTIS"],

@@ -499,12 +499,12 @@ def test_listening_needs_no_sent_byte(device):
     """Another program has configured the device, so its counter may have any value."""
     registers = device.registers
     registers.n_bytes, registers.armed, registers.counter = 4 * N_SAMPLES, 1, 40
-    with SonarDriver.open("left", passive=True) as sonar, SyncChain([device], 50.0):
+    with SonarDriver.open("left", listen_only=True) as sonar, SyncChain([device], 50.0):
         assert sonar.firmware == ""
         sonar.configure(Setup.of(SETTINGS))
         counters = [block.counter for block in receive_blocks(sonar, 3)]
         assert 40 <= counters[0] < counters[1] < counters[2]  # Some may be dropped on a busy machine.
-        with pytest.raises(SonarError, match="is open as passive"):
+        with pytest.raises(SonarError, match="is open with listen_only"):
             sonar.measure()
     assert registers.armed == 1
     assert device.registers.n_codes == 0
@@ -513,7 +513,7 @@ def test_listening_needs_no_sent_byte(device):
 def test_listening_with_another_record_length_is_reported(device):
     registers = device.registers
     registers.n_bytes, registers.armed = 4 * N_SAMPLES, 1
-    with SonarDriver.open("left", passive=True) as sonar, SyncChain([device], 50.0):
+    with SonarDriver.open("left", listen_only=True) as sonar, SyncChain([device], 50.0):
         sonar.configure(Setup.of(SETTINGS.replace(recording=Recording(n_samples=2 * N_SAMPLES))))
         with pytest.raises(
             SonarError, match=r"\d+ bytes arrived within .* no complete measurement of 65536 samples; give"

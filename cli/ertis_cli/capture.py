@@ -201,7 +201,7 @@ def capture(
         if send is not None:
             stack.enter_context(send.node(_network.client_keys(key, server_key)))
         _wait_for(ports, wait_s, signals, quiet=quiet)
-        sonars = _named(ports, names, _opened(ports, signals, stack, passive=listen_only))
+        sonars = _named(ports, names, _opened(ports, signals, stack, listen_only=listen_only))
         target = target or Path(_default_name(list(sonars)))
         if send is None:
             check_target(target, overwrite=force)
@@ -327,11 +327,11 @@ def _interruptible(signals: Signals) -> "Iterator[Callable[[], bool]]":
         raise
 
 
-def _opened(ports: "Sequence[str]", signals: Signals, stack: ExitStack, *, passive: bool) -> "list[SonarDriver]":
+def _opened(ports: "Sequence[str]", signals: Signals, stack: ExitStack, *, listen_only: bool) -> "list[SonarDriver]":
     from ertis_numba.devices.sonar import SonarDriver
 
     with _interruptible(signals) as asked:
-        return [stack.enter_context(SonarDriver.open(port, passive=passive, stop=asked)) for port in ports]
+        return [stack.enter_context(SonarDriver.open(port, listen_only=listen_only, stop=asked)) for port in ports]
 
 
 def _configured(

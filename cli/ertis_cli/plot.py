@@ -84,7 +84,7 @@ _ONLY = {
     "--left", type=float, metavar="M", help="Position of the vertical section of slices, to the left; 0 by default."
 )
 @click.option(
-    "--microphone", type=int, metavar="BIT", help="Plot only this microphone, for signals and matched-filter."
+    "--microphone", type=int, metavar="CHANNEL", help="Plot only this microphone, for signals and matched-filter."
 )
 @click.option(
     "--frequency",

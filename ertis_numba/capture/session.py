@@ -238,7 +238,7 @@ class CaptureSession:
             )
         if self._synced:
             for sonar in self._sonars.values():
-                if not sonar.passive:
+                if not sonar.listen_only:
                     sonar.arm()
         pace = None if self._synced else TriggerClock(start_s=time.monotonic(), rate_hz=self._rate_hz, n=self._n)
         for sensor, sonar in self._sonars.items():

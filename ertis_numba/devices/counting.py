@@ -95,7 +95,7 @@ class CounterCheck:
         ----------
         block : Block
         rejected : float
-            Bytes that were rejected so far outside of blocks, by those of a block.
+            Number of bytes rejected outside of blocks up to now, relative to the size of a block.
         """
         place = bisect.bisect_right(self._burst_ns, block.arrived.monotonic_ns) - 1
         self._bursts += max(place, 0)

@@ -92,15 +92,15 @@ class SerialLine:
         Parameters
         ----------
         missing : int
-            Bytes that are still to come of something; 0 where a next thing may begin, whose first byte is then returned
-            by itself as soon as it comes, unless it has been lying there.
+            Bytes still missing of a block or answer. With 0, a new one may begin: its first byte is returned alone as
+            soon as it arrives, unless it has arrived before.
 
         Raises
         ------
         SonarDisconnectedError
             The device was unplugged.
         SonarError
-            ``stop`` said so, or the line is closed.
+            ``stop`` returned True, or the line is closed.
         """
         with self._lock:
             self._check()
@@ -126,7 +126,7 @@ class SerialLine:
         SonarDisconnectedError
             The device was unplugged.
         SonarError
-            It takes nothing, ``stop`` said so, or the line is closed.
+            The device reads nothing, ``stop`` returned True, or the line is closed.
         """
         with self._lock:
             self._check()

@@ -37,7 +37,7 @@ class SonarDriver:
     Attributes
     ----------
     firmware : str
-        Version such as ``1.2.3``; empty for a sensor that was opened as passive.
+        Version such as ``1.2.3``; empty if nothing was sent to the sensor (``listen_only``).
 
     Examples
     --------
@@ -47,13 +47,13 @@ class SonarDriver:
     """
 
     def __init__(
-        self, port: Port, *, timeout_s: float = 1.0, passive: bool = False, stop: Callable[[], bool] = lambda: False
+        self, port: Port, *, timeout_s: float = 1.0, listen_only: bool = False, stop: Callable[[], bool] = lambda: False
     ) -> None:
         checks.instance("port", port, Port, "find_ports or resolve of ertis_numba.devices.ports returns")
         self.firmware = ""
         self._port = port
         self._timeout_s = timeout_s
-        self._passive = passive
+        self._listen_only = listen_only
         self._closing = threading.Event()
         self._configured: tuple[Setup, BlockReceiver] | None = None
         self._next = 0  # Number of the next measurement.
@@ -65,7 +65,7 @@ class SonarDriver:
 
     @classmethod
     def open(
-        cls, port: str, *, timeout_s: float = 1.0, passive: bool = False, stop: Callable[[], bool] = lambda: False
+        cls, port: str, *, timeout_s: float = 1.0, listen_only: bool = False, stop: Callable[[], bool] = lambda: False
     ) -> Self:
         """Open a sensor, stop an unfinished measurement of an earlier program, and query its firmware.
 
@@ -74,9 +74,9 @@ class SonarDriver:
         port : str
             Path, link, serial number, or name of an emulated device; see `ports.resolve`.
         timeout_s : float
-            How long an answer may take.
-        passive : bool
-            Send nothing, ever: listen to a sensor that somebody else has set up.
+            Maximum time for an answer, in seconds.
+        listen_only : bool
+            Send nothing: receive from a sensor that another program has set up.
         stop : callable
             Polled during the dialogue; once it returns True, opening fails.
 
@@ -84,10 +84,10 @@ class SonarDriver:
         ------
         SonarError
             The port is missing, in use, may not be used, is ambiguous, or no eRTIS is there. Its ``errno`` is ENOENT,
-            EBUSY, EACCES, ETIMEDOUT where nothing sensible is answered, or EINVAL where ``port`` is no serial port or
+            EBUSY, EACCES, ETIMEDOUT without a valid answer, or EINVAL if ``port`` is not a serial port or matches
             several.
         """
-        return cls(resolve(port), timeout_s=timeout_s, passive=passive, stop=stop)
+        return cls(resolve(port), timeout_s=timeout_s, listen_only=listen_only, stop=stop)
 
     def __enter__(self) -> Self:
         return self
@@ -108,9 +108,9 @@ class SonarDriver:
         return self._port.serial_number
 
     @property
-    def passive(self) -> bool:
+    def listen_only(self) -> bool:
         """True if nothing is ever sent to it."""
-        return self._passive
+        return self._listen_only
 
     @property
     def receiver(self) -> BlockReceiver:
@@ -144,8 +144,8 @@ class SonarDriver:
     ) -> None:
         """Configure the sensor; the trigger stays off.
 
-        The call is sent only if the sensor has another one. Nothing is sent to a passive sensor: the setup then
-        describes its measurements.
+        The call is sent only if the sensor has another one. With ``listen_only``, nothing is sent, and the
+        setup describes the measurements.
 
         Parameters
         ----------
@@ -153,7 +153,7 @@ class SonarDriver:
         counter : int
             Number of the next measurement.
         bits : callable, optional
-            Says of words why they cannot be true, as `bits.BitCheck.check` does.
+            Returns the reason why words are invalid, or None, as `bits.BitCheck.check` does.
         stop : callable
             Polled during the dialogue; once it returns True, this fails.
 
@@ -164,13 +164,13 @@ class SonarDriver:
         """
         receiver = BlockReceiver(
             setup.n_samples,
-            expected=None if self._passive else counter,
+            expected=None if self._listen_only else counter,
             shortest_s=setup.n_samples / setup.pdm_rate_hz,
             bits=bits,
         )
         self._configured, self._next = (setup, receiver), counter
         self._is_armed = self._is_late = False
-        if self._passive:
+        if self._listen_only:
             return
         self._line.stop = lambda: self._closing.is_set() or stop()
         try:
@@ -184,14 +184,14 @@ class SonarDriver:
         Parameters
         ----------
         active : bool, optional
-            Whether the call is emitted; by default what the setup says.
+            True to emit the call; by default as in the setup.
 
         Raises
         ------
         ArgumentError
-            It is to be emitted while the amplifier is off.
+            The call is to be emitted, but the amplifier is off.
         SonarError
-            No whole measurement came in time; the next one may be tried at once.
+            No complete measurement arrived in time; the next one may be tried at once.
         SonarDisconnectedError
             The sensor was unplugged.
         """
@@ -251,14 +251,14 @@ class SonarDriver:
         Parameters
         ----------
         stop : callable
-            Asked some hundred times a second; once it is true, this ends.
+            Called some hundred times a second; listening ends once it returns True.
         timeout_s : float
-            How long to wait for a measurement; at least `deadline_s` whatever is given.
+            Maximum time to wait for a measurement, in seconds; not less than `deadline_s`.
 
         Raises
         ------
         SonarError
-            None came for so long, or `close` was called before.
+            No measurement arrived within this time, or the driver was closed before.
         SonarDisconnectedError
             The sensor was unplugged.
         """
@@ -293,23 +293,23 @@ class SonarDriver:
     def reconnect(self, *, within_s: float, stop: Callable[[], bool] = lambda: False) -> bool:
         """Wait for an unplugged sensor, and configure it again as before.
 
-        It is found by its serial number, by its link, or otherwise by its path. Its numbers continue.
+        The sensor is found by its serial number, by its link, or otherwise by its path. Its numbers continue.
 
         Parameters
         ----------
         within_s : float
         stop : callable
-            Once it is true, this gives up.
+            Waiting ends once it returns True.
 
         Returns
         -------
         bool
-            Whether it is back; if not, ``stop`` or `close` said so.
+            True if the sensor is back; False after ``stop`` or `close`.
 
         Raises
         ------
         SonarDisconnectedError
-            It is not back within that time.
+            The sensor is not back within that time.
         """
         began = time.monotonic()
         last: SonarError | None = None
@@ -345,7 +345,7 @@ class SonarDriver:
     def _opened(self, port: Port, stop: Callable[[], bool]) -> Dialogue:
         """Return the line to a quiet sensor, with its firmware version."""
         line = Dialogue(port.path, timeout_s=self._timeout_s, stop=stop)
-        if self._passive:
+        if self._listen_only:
             return line
         try:
             line.quieten(Command("J", 0, 1), within_s=self._timeout_s)
@@ -367,20 +367,20 @@ class SonarDriver:
             return
         setup, receiver = self._configured
         receiver.expire()
-        if not self._passive:
+        if not self._listen_only:
             self._line.notify(setup, counter=self._next)
             self._is_late = False
         if self._is_armed:
             self.arm()
 
     def _speak(self) -> None:
-        if self._passive:
-            raise SonarError(f"{self.port} is open as passive; open it without passive")
+        if self._listen_only:
+            raise SonarError(f"{self.port} is open with listen_only; open it without")
 
     def _require_armed(self) -> None:
         if self._closing.is_set():
             raise closed_error(self.port)
-        if not (self._is_armed or self._passive):
+        if not (self._is_armed or self._listen_only):
             raise SonarError(f"{self.port} is not armed; call arm() first")
 
     def _state(self) -> tuple[Setup, BlockReceiver]:

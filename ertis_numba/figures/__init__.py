@@ -2,7 +2,8 @@
 
 Figures do not use pyplot, so they need no global state and no window system. As x is forward, y left and z up in the
 sensor frame (REP-103), positive azimuth is on the left: a sector is seen from above, a map and an array from the
-sensor. Each function returns a figure; `save` writes it to a file. Only the live view also uses Matplotlib.
+sensor. Functions return a figure, or the axes given as ``ax``; `save` writes a figure to a file. Only the live view
+also uses Matplotlib.
 """
 
 from collections.abc import Sequence
@@ -188,7 +189,10 @@ def polar(
     side_lobes: bool = False,
     **look: Unpack[StyleOptions],
 ) -> Figure:
-    """Draw an energyscape as a sector in metres, of several elevations the strongest; arguments are those of `plot`."""
+    """Draw an energyscape as a sector in metres, with the maximum over elevation.
+
+    Arguments are those of `plot_page`.
+    """
     return _sector.draw(_canvas_of(image, dynamic_range_db, look, peaks), image, side_lobes=side_lobes)
 
 
@@ -200,7 +204,7 @@ def projection(
     side_lobes: bool = False,
     **look: Unpack[StyleOptions],
 ) -> Figure:
-    """Draw the maximum over range as a map of azimuth and elevation; arguments are those of `plot`."""
+    """Draw the maximum over range as a map of azimuth and elevation; arguments are those of `plot_page`."""
     return _sphere.draw_map(_canvas_of(image, dynamic_range_db, look, peaks), image, side_lobes=side_lobes)
 
 
@@ -213,24 +217,25 @@ def slices(
     peaks: Sequence[Peak] | None = None,
     **look: Unpack[StyleOptions],
 ) -> Figure:
-    """Draw cuts through an energyscape in metres: a level plane, and an upright one that runs forward.
+    """Draw a horizontal and a vertical section through an energyscape in metres.
 
-    A planar image has the level one only. Reflectors are marked in the planes that they lie in.
+    The vertical section runs forward. A planar image has a horizontal section only. Reflectors are marked in the
+    sections in which they lie.
 
     Parameters
     ----------
     image : Energyscape
     height_m : float
-        Of the level plane: its z.
+        Position z of the horizontal section in metres.
     left_m : float, optional
-        Where the upright plane is: its y; 0 by default.
+        Position y of the vertical section in metres; 0 by default.
     dynamic_range_db, peaks, **look
-        As for `plot`.
+        As for `plot_page`.
 
     Raises
     ------
     ArgumentError
-        An argument cannot be used, or a plane lies outside of the image; a planar one has no upright plane.
+        An argument is invalid, a section lies outside of the image, or a planar image has no vertical section.
     """
     checks.finite("height_m", height_m)
     if left_m is not None:
@@ -247,21 +252,20 @@ def signals(
 ) -> Figure:
     """Draw the signals of the microphones over time, and their spectrogram.
 
-    Signals are what the low pass of the decimation leaves of the bits. The spectrogram is the mean over the
-    microphones.
+    The signals are low-pass filtered and decimated. The spectrogram is the mean over the microphones.
 
     Parameters
     ----------
     measurement : Measurement
     microphone : int, optional
-        Only this one, by its bit in the words.
+        Channel of the only microphone to draw; all by default.
     dynamic_range_db, **look
-        As for `plot`.
+        As for `plot_page`.
 
     Raises
     ------
     ArgumentError
-        An argument cannot be used, or there is no such microphone.
+        An argument is invalid, or there is no such microphone.
     """
     checks.instance("measurement", measurement, Measurement, "a recording holds")
     return _signals.draw(_canvas(dynamic_range_db, look), measurement, microphone=microphone)
@@ -296,18 +300,18 @@ def array(
     Parameters
     ----------
     settings : Settings or str
-        Their array, call and air; or a layout's name, with the default call and air.
+        Settings with an array, call and air, or the name of a layout for the default call and air.
     frequencies_hz : sequence of float, optional
-        1 to 5; the ends of the call's band and the mean power over it by default.
+        One to five frequencies in hertz; by default the limits of the call's band, and the mean power over the band.
     azimuth_deg, elevation_deg : float
-        Where the beam is steered to, -90 to 90.
+        Steering direction in degrees, -90 to 90.
     dynamic_range_db, **look
-        As for `plot`.
+        As for `plot_page`.
 
     Raises
     ------
     ArgumentError
-        An argument cannot be used.
+        An argument is invalid.
     """
     checks.positive("dynamic_range_db", dynamic_range_db)
     if isinstance(settings, str):
@@ -324,7 +328,7 @@ def array(
 
 
 def front(points: Sequence[Rated], *, title: str, note: str = "", **look: Unpack[StyleOptions]) -> Figure:
-    """Draw error and time of plans; those that no other one beats are joined by a line.
+    """Draw error and time of plans, and the Pareto front as a line.
 
     Parameters
     ----------
@@ -332,7 +336,7 @@ def front(points: Sequence[Rated], *, title: str, note: str = "", **look: Unpack
     title, note : str
         Heading, and the line below it.
     **look
-        As for `plot`.
+        As for `plot_page`.
 
     Returns
     -------
@@ -354,7 +358,7 @@ def save(figure: Figure, target: str | Path | IO[bytes], *, format: str | None =
     figure : Figure
     target : str, Path or binary file
     format : {"png", "svg", "pdf"}, optional
-        By default what the name ends in.
+        By default the suffix of the name.
 
     Raises
     ------

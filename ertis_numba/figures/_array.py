@@ -115,7 +115,7 @@ def pattern_db(
 ) -> NDArray[np.float64]:
     """Return the level of plane waves from each direction in the beam to one, 0 dB there: (direction,) float64.
 
-    ``mean over f of |Σ_m w_m exp(jk p_m·(u − u₀)) / M|²``, as delay-and-sum with the array weights w has it.
+    ``mean over f of |Σ_m w_m exp(jk p_m·(u − u₀)) / M|²``, the beam pattern of delay-and-sum with array weights w.
     """
     positions_m = microphones(settings.array).enabled_positions_m
     looks = unit_vectors(np.radians(to_azimuth_deg), np.radians(to_elevation_deg))
@@ -156,7 +156,7 @@ def _lines(settings: Settings, frequencies_hz: Sequence[float] | None) -> list[C
     Raises
     ------
     ArgumentError
-        A frequency is not positive, or there are too many, or no list of them.
+        A frequency is not positive, there are too many, or they are not a list.
     """
     if frequencies_hz is None:
         low_hz, high_hz = settings.call.low_frequency_hz, settings.call.high_frequency_hz

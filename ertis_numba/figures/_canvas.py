@@ -44,7 +44,7 @@ class Canvas:
     ) -> tuple[FigurePage, list[PageBox], PageBox]:
         """Return a page with boxes for pictures, and the box of their scale and of the list of reflectors.
 
-        However low the pictures are, the scale and some reflectors find room.
+        There is room for the scale and some reflectors beside pictures of any height.
         """
         style, rows = self.style, self._rows()
         list_pt = _ROW * style.list_pt

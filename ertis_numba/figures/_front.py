@@ -25,12 +25,12 @@ class Rated:
     Attributes
     ----------
     series : str
-        What it was measured on; each has a line of its own.
+        Name of the measurement; each series has its own line.
     error_db, time_ms : float
     on_front : bool
-        No other plan is both faster and more exact.
+        True if no other plan is both faster and more accurate.
     label : str
-        Written beside it.
+        Text beside the point.
     """
 
     series: str

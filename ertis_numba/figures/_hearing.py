@@ -30,7 +30,7 @@ class MicrophoneTraces:
     axis : (place,) float64
         Seconds from the start of the emission, or metres.
     channels : (mic,) int64
-        Bits of the words.
+        Channel of each microphone.
     """
 
     values: NDArray[np.float32]
@@ -48,7 +48,7 @@ def signals(measurement: Measurement) -> MicrophoneTraces:
 def echoes(measurement: Measurement) -> MicrophoneTraces:
     """Return the envelope of each microphone's echoes at all samples of the range window.
 
-    1 is a full-scale echo of the whole call. Calibrated gains and delays are taken out.
+    An echo of the whole call at full scale is 1. Calibrated gains and delays are removed.
     """
     given = measurement.settings
     step = given.decimation

@@ -28,17 +28,17 @@ def name_points(
 ) -> None:
     """Write labels beside points, the first ones nearest; omit those without room.
 
-    The limits of the axes must be final. What was written into them before is kept free.
+    The limits of the axes must be final. Existing texts are not covered.
 
     Parameters
     ----------
     axes : Axes
     style : Style
     points : sequence of (x, y)
-        In the coordinates of the axes.
+        Positions in the coordinates of the axes.
     names : sequence of str
     ring_pt : float
-        Radius about each point that names stay out of.
+        Radius around each point that names avoid.
     colour : str
     bold : bool
     """

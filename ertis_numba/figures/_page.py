@@ -47,7 +47,7 @@ class FigurePage:
     heading : Heading
     width_pt : float
     body_pt : float
-        Height of what stands below the heading.
+        Height of the part below the heading.
     heading_pt : float
         Width that the heading may take.
 
@@ -151,23 +151,23 @@ def lay_out(
 ) -> tuple[FigurePage, list[PageBox], PageBox]:
     """Return a page, the boxes of its pictures and that of their colour bar and list.
 
-    On a wide page the pictures stand beside each other and the rest to their right, on a narrow one all stands below
-    each other.
+    On a wide page, the pictures are beside each other, with the rest on their right. On a narrow one, all parts are
+    below each other.
 
     Parameters
     ----------
     style : Style
     heading : Heading
     panels : sequence of callable
-        From the width of a picture to its height, both in points.
+        Functions that return the height of a picture from its width, both in points.
     width_pt : float
-        Of the page, where the style has none.
+        Width of the page if the style has none.
     side_pt : float
-        Width of the rest, if it is beside the pictures.
+        Width of the rest if it is beside the pictures.
     below_pt : float
-        Its height, if it is below them.
+        Height of the rest if it is below the pictures.
     side_tall_pt : float
-        Its height at least, if it is beside them.
+        Minimum height of the rest if it is beside the pictures.
     """
     width_pt = width_pt if style.width_pt is None else style.width_pt
     gap_pt, margin_pt = _GAP_EMS * style.em_pt, min(style.margin_pt, style.em_pt)

@@ -67,7 +67,7 @@ def polar_raster(
 ) -> NDArray[np.float32]:
     """Return levels at points of the horizontal plane: (row, column), NaN outside of the image.
 
-    Bilinear between directions and ranges; NaN as well where no direction is near.
+    Interpolation is bilinear between directions and ranges. The value is NaN if no direction is near.
 
     Parameters
     ----------
@@ -113,7 +113,8 @@ def sphere_raster(
 ) -> NDArray[np.float32]:
     """Return levels over azimuth and elevation: (row, column), NaN where no direction is near.
 
-    The four nearest directions, weighted by their inverse square distance: they may lie anyhow.
+    The value is the mean of the four nearest directions, weighted by their inverse square distance. Directions may be
+    in any arrangement.
 
     Parameters
     ----------
@@ -138,7 +139,7 @@ def volume_raster(
 ) -> NDArray[np.float32]:
     """Return levels at points of space: (row, column), NaN outside of the image.
 
-    Linear between ranges, else as `sphere_raster`.
+    Interpolation is linear between ranges, and that of `sphere_raster` between directions.
 
     Parameters
     ----------
@@ -180,7 +181,7 @@ def _around(
 def flattened(image: Energyscape, level_db: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
     """Return rising azimuths and their levels, (direction, range): the maximum over elevations.
 
-    They run on without a jump, and if they go all around the first is the last as well, a turn later.
+    Azimuths rise without a jump. For a full circle, the first azimuth is repeated at the end, 2π larger.
     """
     columns = azimuth_columns(image.azimuth_rad, image.elevation_rad)
     highest_db = columns.strongest(level_db)

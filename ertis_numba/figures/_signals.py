@@ -106,9 +106,9 @@ def spectrogram(
 ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float64]]:
     """Return the power of short spectra, mean over the microphones: (frequency, time) float32, frequencies and times.
 
-    The Hann window is about as long as the call stays within the bandwidth of the window, ``2 √(T / B)``: where a
-    sweep looks sharpest. Of a long record a column is the greatest of many spectra, which overlap by half at least, so
-    that no echo falls between them.
+    The length of the Hann window, ``2 √(T / B)``, is about the time for which the call stays within the bandwidth of
+    the window: a sweep is sharpest there. In a long record, a column is the maximum of many spectra with an overlap of
+    half or more, so that it misses no echo.
     """
     call, rate_hz = settings.call, settings.signal_rate_hz
     swept_hz = call.high_frequency_hz - call.low_frequency_hz
@@ -137,7 +137,7 @@ def spectrogram(
 def _traces(canvas: Canvas, axes: Axes, heard: MicrophoneTraces, loudest: float) -> None:
     """Draw a row for each trace, the first on top; louder parts are clipped.
 
-    Amplitudes are compressed, so that echoes are seen beside the direct sound, which is 20 to 40 dB louder.
+    Amplitudes are compressed, so that echoes are visible beside the direct sound, which is 20 to 40 dB louder.
     """
     linear = max(_COMPRESSED * loudest, 2 * float(np.median(np.abs(heard.values))))  # noise is not enlarged
     values = np.arcsinh(heard.values / linear) / math.asinh(loudest / linear)

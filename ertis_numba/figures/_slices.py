@@ -30,7 +30,7 @@ def draw(canvas: Canvas, image: Energyscape, *, height_m: float, left_m: float |
     Raises
     ------
     ArgumentError
-        The image does not reach to a plane, or it is planar and the upright one was asked for.
+        A section lies outside of the image, or a planar image has no vertical section.
     """
     if image.is_planar and left_m is not None:
         raise ArgumentError(
@@ -58,12 +58,12 @@ class _Cut:
     Attributes
     ----------
     name : str
-        Of the argument that places it.
+        Name of the argument that sets its position.
     at_m : float
     across, up, normal : int
         Axes of the sensor frame.
     extent_m : (left, right, bottom, top)
-        Of the picture; the left end is the greater one where y runs to the left.
+        Limits of the picture; the left limit is the larger one if y increases to the left.
     """
 
     name: str
@@ -80,7 +80,7 @@ class _Cut:
         Raises
         ------
         ArgumentError
-            The image does not reach to it.
+            The section lies outside of the image.
         """
         left, right, bottom, top = self.extent_m
         step_m = max(abs(right - left), top - bottom) / _PIXELS

@@ -28,7 +28,7 @@ class StyleOptions(TypedDict, total=False):
     Attributes
     ----------
     theme : {"dark", "light", "paper"}
-        Of a screen, or white with letters and lines of the size of print.
+        Theme for a screen, or for print: white, with letters and lines in printed size.
     columns : {1, 2}
         Width of ``paper``: 85 mm for one column or 170 mm for two, the default.
     font : {"sans", "serif"}
@@ -48,15 +48,15 @@ class Style:
     page, ink, faint, mark, colours : str
     font : str
     title_pt, label_pt, tick_pt, list_pt : float
-        Sizes of letters.
+        Font sizes.
     line_pt : float
     margin_pt : float
-        Around the page.
+        Margin around the page.
     side_pt : float
-        What is left beside pictures for scale and list, at least.
+        Minimum width beside the pictures for the scale and the list.
     dpi : int
     width_pt : float or None
-        Of the page; what the kind of picture takes where it is None.
+        Width of the page; None for the width of the kind of picture.
     """
 
     page: str
@@ -77,11 +77,11 @@ class Style:
 
     @property
     def em_pt(self) -> float:
-        """The size of labels, which distances go by."""
+        """Font size of labels, the unit of distances."""
         return self.label_pt
 
     def is_wide(self, width_pt: float) -> bool:
-        """Return True if pictures on a page of this width stand beside each other."""
+        """Return True if pictures on a page of this width are beside each other."""
         return width_pt >= _WIDE_EMS * self.em_pt
 
 
@@ -131,6 +131,6 @@ def style_of(
 
 
 def text_width_pt(text: str, size_pt: float, font: str, *, bold: bool = False) -> float:
-    """Return about how wide a line of text will be, and not less."""
+    """Return an upper estimate of the width of a line of text."""
     properties = FontProperties(family=font, size=size_pt, weight="bold" if bold else "normal")
     return _SLACK * text_to_path.get_text_width_height_descent(text, properties, ismath=False)[0]

@@ -40,13 +40,13 @@ class Place:
     Attributes
     ----------
     sensor_px : (x, y)
-        Of the sensor, from the upper left corner of the picture; it may lie outside.
+        Position of the sensor from the upper left corner of the picture; it may lie outside.
     scale_px_m : float
-        Pixels of a metre.
+        Pixels per metre.
     width_px, height_px : int
-        Of the picture.
+        Size of the picture.
     box_px : (left, top, right, bottom)
-        Of the sector.
+        Bounds of the sector.
     """
 
     sensor_px: tuple[float, float]
@@ -117,7 +117,7 @@ class Ink:
         Pixels of the flat picture.
     colours : (drawn, 3) float32
     cover : (drawn, 1) float32
-        How much of the picture they cover, 0 to 1.
+        Opacity of each pixel, 0 to 1.
     """
 
     places: NDArray[np.intp]

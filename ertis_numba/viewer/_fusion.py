@@ -57,7 +57,7 @@ class Fusion:
         Parameters
         ----------
         levels : sequence of (azimuth, range) uint8
-            Of `Polar.levels`, in the order of the sensors.
+            Results of `Polar.levels`, in the order of the sensors.
         table : (256, 3) uint8
             Colours of levels.
         """

@@ -32,7 +32,7 @@ class Live:
     Parameters
     ----------
     address : str
-        Where the central node publishes.
+        Address at which the central node publishes.
     sensors : str or sequence of str, optional
         All by default.
     keys : ClientKeys, optional
@@ -42,12 +42,12 @@ class Live:
     Attributes
     ----------
     received : int
-        How many images have come.
+        Number of received images.
 
     Raises
     ------
     ArgumentError
-        The address cannot be used, or not without keys.
+        The address cannot be used, or needs keys.
     """
 
     is_playback: Literal[False] = False

@@ -75,10 +75,10 @@ class Polar:
     Parameters
     ----------
     image : Energyscape
-        Whose axes they have: all of the range axis is shown.
+        Energyscape with the axes of the pictures; the complete range axis is shown.
     dynamic_range_db : float
     width_px : int
-        Of the pictures; their height follows.
+        Width of the pictures; the height follows from it.
 
     Raises
     ------
@@ -141,7 +141,7 @@ class Polar:
         Parameters
         ----------
         levels : (azimuth, range) uint8
-            Of `levels`.
+            Result of `levels`.
         table : (256, 3) uint8
             Colours of levels.
 

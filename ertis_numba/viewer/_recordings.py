@@ -88,7 +88,7 @@ class ToBrowser:
     ----------
     client : viser.ClientHandle
     name : str
-        Of the file.
+        Name of the file.
     """
 
     def __init__(self, client: Any, name: str) -> None:
@@ -148,7 +148,7 @@ class _PageRecording:
 class Recordings:
     """Recordings in progress, each from its beginning to its end.
 
-    Times come from any one clock. Time does not pass until something was drawn.
+    All times are from one clock. Time starts when the first frame is drawn.
 
     A separate thread builds and delivers a page, because this takes seconds for a long recording and would stop a live
     view.

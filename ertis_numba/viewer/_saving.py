@@ -54,7 +54,7 @@ def points_ply(points: list[tuple[Energyscape, PointCloud, Pose | None]]) -> byt
     Raises
     ------
     ArgumentError
-        There are several sensors, and it is not known where each of them is.
+        There are several sensors, and the mounting of one is unknown.
     """
     mountings = validated(
         {image.stamp.sensor: (pose.translation_m, pose.rotation_xyzw) for image, _, pose in points if pose}

@@ -72,7 +72,7 @@ class ViewedScene:
     Parameters
     ----------
     width_px : int
-        Of the pictures.
+        Width of the pictures.
     """
 
     def __init__(self, *, width_px: int = 520) -> None:
@@ -116,8 +116,8 @@ class ViewedScene:
         ----------
         choices : Choices
         now_s : float, optional
-            By the clock of their source, which says what has faded and who is overdue; the time of the latest image by
-            default.
+            Present time by the clock of the source, from which fading and overdue sensors follow; the time of the
+            latest image by default.
         """
         kept = dict(sorted(self._sensors.items()))
         if now_s is None:

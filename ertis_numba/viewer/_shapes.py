@@ -29,7 +29,7 @@ class Pose:
     ----------
     translation_m : (x, y, z)
     rotation_xyzw : (x, y, z, w)
-        The unit quaternion that turns the sensor frame into the platform's.
+        Unit quaternion that rotates the sensor frame into the platform frame.
     """
 
     translation_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -91,7 +91,7 @@ class Sector:
     colours : (row, column, 4) uint8
         The first row is farthest ahead, the first column farthest to the left.
     extent_m : (right, right, ahead, ahead)
-        Where it begins and ends to the right of the sensor and ahead of it.
+        Limits to the right of the sensor and ahead of it, in metres.
     """
 
     colours: NDArray[np.uint8]
@@ -108,7 +108,7 @@ class Dome:
         Sensor frame.
     colours : (direction, 3) uint8
     size_m : float
-        Of each point, such that they touch.
+        Diameter of the points, at which they touch.
     """
 
     position_m: NDArray[np.float32]
@@ -123,25 +123,25 @@ class Drawn:
     Attributes
     ----------
     pose : Pose or None
-        None where the sensor cannot be drawn on the platform: there are others, and nobody said where it is.
+        Mounting; None if it is unknown and there are several sensors, so that the platform view omits this one.
     stamp : Stamp
-        Of the image.
+        Stamp of the image.
     time_s : float
-        When it was, by the clock of its source.
+        Time of the image by the clock of its source.
     overdue : bool
-        It is so old that the sensor may be dead: it is drawn dim, and no part of what is fused.
+        True if the image is so old that the sensor may have failed. It is drawn dim, and not fused.
     picture : (row, column, 3) uint8
-        Range and azimuth, with axes.
+        Picture of range and azimuth, with axes.
     shape : Sector or Dome, optional
-        None where the image is part of one of several sensors, or not drawn on the platform.
+        Image on the platform; None if it is part of a fused image, or not drawn.
     position_m : (point, axis) float32
-        On the platform.
+        Points in the platform frame.
     colours : (point, 3) uint8
-        Of the points, by their levels.
+        Colours of the points by level.
     share_left : (point,) float32
-        Of each, 1 where it is new and 0 where it has faded.
+        Brightness of each point: 1 for a new one, 0 for a faded one.
     n_points : int
-        How many of the latest image are shown.
+        Number of points of the latest image.
     """
 
     pose: Pose | None
@@ -163,17 +163,17 @@ class DrawnFrame:
     Attributes
     ----------
     sensors : dict of str to Drawn
-        By their names.
+        Drawn objects by the name of the sensor.
     range_m : float
-        How far is seen.
+        Largest range on display.
     fused : Sector, optional
-        What several sensors that are level see, on the platform, but for those that are overdue; None where there are
-        no several, or one is tilted or has elevations.
+        Fused image of several level sensors, without overdue ones. None with fewer than two, or if one is tilted or
+        has elevations.
     height_m : float
-        Of the fused image on the platform.
+        Height of the fused image on the platform.
     until_s : float
-        For how long it is right if nothing comes, by the clock of the source: until a point fades or a sensor is
-        overdue.
+        Time by the clock of the source until which the frame is valid without new images: then a point fades, or a
+        sensor becomes overdue.
     """
 
     sensors: dict[str, Drawn]

@@ -25,7 +25,7 @@ class TimeStep:
     Attributes
     ----------
     time_s : float
-        Since the first.
+        Time since the first time step.
     measurements : tuple of (sensor, number)
     """
 
@@ -40,9 +40,9 @@ class SensorTimeline:
     Attributes
     ----------
     places, numbers : tuple of int
-        In which moments they are, rising, and their numbers in the file.
+        Rising indices of the time steps, and indices of the measurements in the file.
     interval_s : float or None
-        What usually lies between two; None of a single one.
+        Typical interval between measurements; None for a single one.
     """
 
     places: tuple[int, ...]

@@ -30,10 +30,10 @@ __all__ = ["Viewer"]
 _MIN_DRAW_S: Final = 1 / 15
 _LOOK_S: Final = 1 / 60
 _REPORT_INTERVAL_S: Final = 0.5
-_FADE_S: Final = 0.2  # between pictures of a recorded film in which nothing is new but what fades
-_TYPED_S: Final = 1.5  # after which a number that cannot be is not half of one that is being typed
-_LAST_S: Final = 1.0  # for which the last of a recorded film stays
-_OURS: Final = "ours"  # of recordings, the one that is not of a browser
+_FADE_S: Final = 0.2  # between frames of a recording in which only fading changes
+_TYPED_S: Final = 1.5  # after which an invalid number is not taken for one that is being typed
+_LAST_S: Final = 1.0  # for which the last frame of a recording stays
+_OURS: Final = "ours"  # name of the recording that no browser requested
 
 
 class Viewer:
@@ -121,17 +121,17 @@ class Viewer:
         ----------
         duration_s : float
         html : Path, optional
-            Recording of all that was shown, a page that needs neither server nor network; none is written where nothing
-            was.
+            Recording of all frames, as a page that needs neither server nor network. Without any frame, no page is
+            written.
         overwrite : bool
             Replace a file of this name.
 
         Raises
         ------
         DataError
-            A file cannot be read, or the recording not be written.
+            A file cannot be read, or the recording cannot be written.
         ArgumentError
-            No recording can be put there, or it would replace the film.
+            The recording cannot be written there, or would replace the source.
         RefusedError
             The central node has refused this viewer.
         """
@@ -170,9 +170,9 @@ class Viewer:
         Raises
         ------
         DataError
-            The file cannot be read, or the page not be written.
+            The file cannot be read, or the page cannot be written.
         ArgumentError
-            No page can be put there, or it is the file itself.
+            The page cannot be written there, or would replace the file itself.
         """
         playback = self._playback
         if playback is None:
@@ -180,7 +180,7 @@ class Viewer:
         self._begin(html, overwrite=overwrite)
         for place, time_step in enumerate(playback.time_steps):
             self._note_all()
-            if self._stopped():  # part of a film is not what was asked for
+            if self._stopped():  # a partial recording is not written
                 self._recordings.drop(_OURS)
                 return
             if _OURS not in self._recordings:

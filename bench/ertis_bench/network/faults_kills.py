@@ -204,7 +204,7 @@ def sealings(folder: Path, *, seed: int, count: int) -> Found:
         node = stack.enter_context(record.start())
         seen: set[int] = set()
         while killed < count:
-            sealers = [pid for pid, line in survivors(record.mark).items() if "sealing_process" in line]
+            sealers = [pid for pid, line in survivors(record.mark).items() if "-m ertis_numba.storage.sealing_process" in line]
             fresh = [pid for pid in sealers if pid not in seen]
             if not fresh:
                 if not node.running:

@@ -153,14 +153,14 @@ class Emulator:
     def trigger(self, pulse: int | None = None, *, at_ns: int | None = None) -> bool:
         """Receive a SYNC pulse at the selected pin, and return True if it starts a measurement.
 
-        It does not start one while the device is unplugged or records, or while its external trigger is off.
+        The device ignores it while it is unplugged or records, or while its external trigger is off.
 
         Parameters
         ----------
         pulse : int, optional
-            Number of the words; that of the counter by default.
+            Number of the words to send; that of the counter by default.
         at_ns : int, optional
-            When it came, by the monotonic clock; now by default.
+            Time of the trigger by the monotonic clock; now by default.
         """
         with self._changed:
             registers = self._board.registers

@@ -72,7 +72,7 @@ class Registers:
     Attributes
     ----------
     n_bytes : int
-        Of the words of one measurement.
+        Size of the words of one measurement.
     clock : int
         0: 4.5 MHz, 1: 1.125 MHz.
     dac_rate_hz, n_codes, emissions : int
@@ -80,7 +80,7 @@ class Registers:
         Samples of the call; the first ``n_codes`` count.
     active, amplifier : int
     armed, pin : int
-        Whether SYNC pulses count, and at which input.
+        1 if SYNC pulses trigger measurements, and the number of the input.
     counter : int
         Number of the next measurement.
     """
