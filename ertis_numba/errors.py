@@ -9,11 +9,11 @@
     │   ├── DamagedError                 its content is damaged; reading it again does not help
     │   ├── ForeignDataError             a file has links, filters, or data under several names or in other files
     │   ├── FormatVersionError           a newer version wrote the file
-    │   ├── JournalInUseError                   a journal belongs to another process
-    │   └── DiskFullError                  a disk is full; nothing was written
+    │   ├── JournalInUseError            a journal belongs to another process
+    │   └── DiskFullError                a disk is full; nothing was written
     ├── DeviceError (RuntimeError)       the compute device is not available
     ├── SonarError (OSError)             a sensor cannot be opened or does not answer as it should
-    │   └── SonarDisconnectedError               it was unplugged
+    │   └── SonarDisconnectedError       it was unplugged
     └── NetworkError (OSError)           another node cannot be reached or does not answer as it should
         └── RefusedError                 it denies access or rejects a request
 

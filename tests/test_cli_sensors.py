@@ -13,7 +13,7 @@ from ertis_numba.storage import GroundTruth, open_energyscapes, sensor_names, wr
 from tests.files import line, noise
 from tests.test_compare import LEFT, MIDDLE, RIGHT, ideal, true
 
-ERRORS = ("angle_rms_deg", "range_bias_m", "range_rms_m", "level_rms_db", "missed", "false")
+ERRORS = ("angle_rms_deg", "range_bias_m", "range_rms_m", "level_rms_db", "missed", "spurious")
 FAST = ["--range", "0.5:0.9", "--directions", "2d:9"]
 
 
@@ -138,7 +138,7 @@ def test_peaks_lists_all_sensors_or_a_selected_one(images):
 def test_peaks_truth_reports_errors_and_missed_reflectors(images):
     held = report("peaks", images, "--truth")
     assert [peak["truth"]["name"] if peak["truth"] else None for peak in held["peaks"]] == ["points[0]"] * 4 + [None]
-    assert [peak["false"] for peak in held["peaks"]] == [False] * 4 + [True]
+    assert [peak["spurious"] for peak in held["peaks"]] == [False] * 4 + [True]
     first = held["peaks"][0]
     assert first["truth"] == {
         "name": "points[0]",
@@ -161,7 +161,7 @@ def test_peaks_truth_table_has_error_columns(images):
     assert cells[0][:4] == ["rear", "0", "+3.30", "+0.00"]
     assert cells[0][-1] == "points[0]"
     assert cells[1][2:] == ["+55.50", "+0.00", "1.450", "-4.0", "missed", "-", "-", "points[0]"]
-    assert cells[2][6:] == ["false", "-", "-", "-"]
+    assert cells[2][6:] == ["spurious", "-", "-", "-"]
     assert len({len(line.rsplit(None, 1)[0].rstrip()) for line in lines[1:]}) == 1  # columns are aligned
 
 
@@ -171,8 +171,8 @@ def test_compare_reports_all_sensors(images):
         ("front", 2, 3),
         ("rear", 1, 1),
     ]
-    assert [(row["missed"], row["false"]) for row in held["sensors"]] == [(0, 0), (1, 1)]
-    assert (held["measurements"], held["matched"], held["missed"], held["false"]) == (3, 4, 1, 1)
+    assert [(row["missed"], row["spurious"]) for row in held["sensors"]] == [(0, 0), (1, 1)]
+    assert (held["measurements"], held["matched"], held["missed"], held["spurious"]) == (3, 4, 1, 1)
     for row in (held, *held["sensors"]):
         assert set(ERRORS) <= set(row)
         assert row["angle_rms_deg"] < 0.5
@@ -181,7 +181,7 @@ def test_compare_reports_all_sensors(images):
 
 def test_compare_selects_sensor_and_min_level(images):
     held = report("compare", images, "--sensor", "rear", "--min-level", -3)
-    assert (len(held["sensors"]), held["matched"], held["missed"], held["false"]) == (1, 1, 0, 0)
+    assert (len(held["sensors"]), held["matched"], held["missed"], held["spurious"]) == (1, 1, 0, 0)
 
 
 def test_compare_prints_an_aligned_table(images):

@@ -31,7 +31,7 @@ def ideal(*reflectors, **options):
 
 
 def counts(comparison):
-    return tuple(len(getattr(comparison, name)) for name in ("matched", "missed", "false", "explained"))
+    return tuple(len(getattr(comparison, name)) for name in ("matched", "missed", "spurious", "explained"))
 
 
 LEFT, MIDDLE, RIGHT = true(-40, 0.95, -6.0), true(3.3, 1.3), true(55.5, 1.45, -4.0)
@@ -53,7 +53,7 @@ def test_compare_measures_known_displacements():
     reported = [true(r.azimuth_deg + 2, r.range_m - 0.05, r.level_db) for r in (LEFT, MIDDLE, RIGHT)]
     exact = errors_of([compare(ideal(LEFT, MIDDLE, RIGHT), [MIDDLE, RIGHT, LEFT])])
     errors = errors_of([compare(ideal(LEFT, MIDDLE, RIGHT), reported)])
-    assert (errors.matched, errors.missed, errors.false) == (3, 0, 0)
+    assert (errors.matched, errors.missed, errors.spurious) == (3, 0, 0)
     assert errors.angle_rms_deg == pytest.approx(2, abs=2 * exact.angle_rms_deg)
     assert errors.range_bias_m == pytest.approx(0.05, abs=1e-3)
     assert errors.range_rms_m == pytest.approx(0.05, abs=1e-3)
@@ -70,7 +70,7 @@ def test_compare_levels_are_relative_to_the_strongest_match():
 def test_compare_lists_missed_reflectors_and_ghosts():
     comparison = compare(ideal(LEFT, MIDDLE), [MIDDLE, RIGHT])
     assert comparison.missed == (RIGHT,)
-    assert [peak.azimuth_deg for peak in comparison.false] == pytest.approx([-40], abs=1)
+    assert [peak.azimuth_deg for peak in comparison.spurious] == pytest.approx([-40], abs=1)
     assert counts(comparison) == (1, 1, 1, 0)
 
 
@@ -185,7 +185,7 @@ def test_compare_of_one_microphone_ignores_direction():
 def test_compare_of_empty_images_and_empty_truth(noise):
     comparison = compare(image_of([], noise=noise, range_m=(0.8, 3.2)), [])
     assert counts(comparison)[:2] == (0, 0)
-    assert len(comparison.false) == (100 if noise else 0)  # the list of ghosts in noise is limited
+    assert len(comparison.spurious) == (100 if noise else 0)  # the list of ghosts in noise is limited
     assert counts(compare(image_of([]), [MIDDLE])) == (0, 1, 0, 0)
 
 
@@ -199,13 +199,13 @@ def test_compare_accepts_small_images(n_ranges):
 def test_errors_of_combines_several_images():
     first, second = compare(ideal(MIDDLE), [MIDDLE]), compare(ideal(MIDDLE), [RIGHT])
     errors = errors_of([first, second])
-    assert (errors.measurements, errors.matched, errors.missed, errors.false) == (2, 1, 1, 1)
+    assert (errors.measurements, errors.matched, errors.missed, errors.spurious) == (2, 1, 1, 1)
     peak = Peak(azimuth_deg=0.0, elevation_deg=0.0, range_m=1.0, level_db=0.0)
     matches = [
         Match(reflector=MIDDLE, peak=peak, angle_deg=angle, range_m=range_m, level_db=level)
         for angle, range_m, level in [(3.0, 0.01, 1.0), (4.0, -0.02, -2.0)]
     ]
-    known = [Comparison(matched=(match,), missed=(), false=(), explained=()) for match in matches]
+    known = [Comparison(matched=(match,), missed=(), spurious=(), explained=()) for match in matches]
     errors = errors_of(known)
     assert errors.angle_rms_deg == pytest.approx(math.sqrt(12.5))
     assert errors.range_bias_m == pytest.approx(-0.005)
@@ -241,7 +241,7 @@ def test_compare_explains_cross_echoes_of_two_simulated_sensors():
         comparison = compare(
             Pipeline(measurement.settings).process(measurement), simulator.reflectors(), min_level_db=-12
         )
-        assert (len(comparison.matched), len(comparison.missed), len(comparison.false)) == (1, 0, 0)
+        assert (len(comparison.matched), len(comparison.missed), len(comparison.spurious)) == (1, 0, 0)
         assert comparison.explained
 
 

@@ -1,6 +1,7 @@
 """Docstrings of public names: their examples run, and functions document parameters, results and errors."""
 
 import doctest
+import importlib
 import inspect
 import shutil
 from pathlib import Path
@@ -65,12 +66,15 @@ def place(tmp_path, monkeypatch):
 
 
 def public():
-    """Yield public objects whose docstrings, or those of their methods, have examples."""
+    """Yield the docstrings of the package that have examples."""
     finder = doctest.DocTestFinder(exclude_empty=True)
-    for name in ertis.__all__:
-        for test in finder.find(getattr(ertis, name), name, globs={}):
-            if test.examples:
-                yield pytest.param(test, id=test.name)
+    root = Path(ertis.__file__).parent
+    for path in sorted(root.rglob("*.py")):
+        if ">>> " in path.read_text("utf-8"):
+            module = importlib.import_module(".".join(path.relative_to(root.parent).with_suffix("").parts))
+            for test in finder.find(module, globs={}):
+                if test.examples:
+                    yield pytest.param(test, id=test.name.removeprefix("ertis_numba."))
 
 
 @pytest.mark.usefixtures("place")

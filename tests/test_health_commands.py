@@ -40,12 +40,12 @@ def sick(tmp_path):
 def test_info_reports_the_health(sick, tmp_path):
     held = json.loads(run("info", sick, "--health", "--json").stdout)
     [section] = held["sensors"]
-    assert (section["measurements"], section["looked_at"]) == (10, 8)
+    assert (section["measurements"], section["examined"]) == (10, 8)
     assert section["faults"] == {"stuck at 0": [4]}
     assert [row["state"] for row in section["channels"][3:6]] == ["ok", "stuck at 0", "ok"]
     assert section["dynamic_range_db"] == pytest.approx(84, abs=3)
     lines = run("info", sick, "--health").stdout.splitlines()
-    assert "10, of which 8 looked at" in lines[1]
+    assert "10, of which 8 examined" in lines[1]
     assert lines[9].split()[:4] == ["4", "stuck", "at", "0"]
     assert len({len(line) for line in lines[4:37]}) == 1
     assert lines[37].startswith("not observable ") or lines[37].startswith("fault ")

@@ -60,7 +60,7 @@ def run(*, count: int, say: Callable[[str], None], first: int = 0) -> dict[str, 
         scene = varied_scene(seed)
         plan = make_plan(scene)
         tried += sum(verdict.estimate_db is not None for verdict in plan.verdicts)
-        rendered += sum(verdict.rehearsed for verdict in plan.verdicts)
+        rendered += sum(verdict.ab_rendered for verdict in plan.verdicts)
         index = int(np.random.default_rng(seed).integers(scene.count))
         found = Trial(scene, index).left_out(plan)
         wrong += [{"scene": seed, **each} for each in found if each["change_db"] > scene.tolerance_db]
@@ -96,7 +96,7 @@ class Trial:
                 "effect": verdict.name,
                 "measurement": self.index,
                 "estimate_db": verdict.estimate_db,
-                "rehearsed": verdict.rehearsed,
+                "ab_rendered": verdict.ab_rendered,
                 "change_db": self.total_change_db(plan, verdict.name),
             }
             for verdict in plan.verdicts

@@ -17,7 +17,7 @@ _NUMBERS = (
     "measurements",
     "matched",
     "missed",
-    "false",
+    "spurious",
     "angle_rms_deg",
     "range_bias_m",
     "range_rms_m",
@@ -35,7 +35,7 @@ def compare(*, path: Path, sensor: str | None, min_level: float, as_json: bool) 
 
     The file must come from a simulated recording, which contains the ground truth. Only reflectors that the image can
     show count: on its range axis, and within half of the array's main lobe from its directions. A reflector is matched
-    if a peak lies within 0.1 m and 1.5 main lobes of it. A peak is false if no reflector explains it. The exit code
+    if a peak lies within 0.1 m and 1.5 main lobes of it. A peak is spurious if no reflector explains it. The exit code
     is 0 even if nothing is matched.
     """
     from ertis_numba.analysis.compare import errors_of

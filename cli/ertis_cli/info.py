@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 __all__ = ["info"]
 
 _TIME = re.compile(r"(\d{4}-\d\d-\d\d)T(\d\d:\d\d:\d\d)(\.\d+)?(?:Z|\+00:00)")
-_LOOKED_AT = 8
+_MAX_EXAMINED = 8
 _WIDTH = 7  # minimum width of a column
 _COLUMNS = {  # name: digits in the report, and in the table
     "offset": (6, 4),
@@ -187,8 +187,8 @@ def _report_health(path: Path, *, as_json: bool) -> None:
     for name in options.sensors_of(path, None):
         with open_recording(path, sensor=name) as recording:
             last = len(recording) - 1
-            looked_at = sorted({round(last * step / (_LOOKED_AT - 1)) for step in range(_LOOKED_AT)})
-            report = merge([health(recording[index]) for index in looked_at])
+            examined = sorted({round(last * step / (_MAX_EXAMINED - 1)) for step in range(_MAX_EXAMINED)})
+            report = merge([health(recording[index]) for index in examined])
             sections.append({"sensor": name, "measurements": last + 1, **_health(report)})
     if as_json:
         options.print_json({"file": str(path), "sensors": sections})
@@ -205,7 +205,7 @@ def _report_health(path: Path, *, as_json: bool) -> None:
 
 def _health(report: "Health") -> dict[str, Any]:
     return {
-        "looked_at": report.measurements,
+        "examined": report.measurements,
         "faults": report.faults,
         "noise_dbfs": _rounded(report.noise_dbfs, 2),
         "dynamic_range_db": _rounded(report.dynamic_range_db, 2),
@@ -227,7 +227,7 @@ def _health(report: "Health") -> dict[str, Any]:
 def _health_lines(section: dict[str, Any]) -> Iterator[str]:
     """Yield the properties of an array."""
     yield f"sensor         {section['sensor']}"
-    yield f"measurements   {section['measurements']}, of which {section['looked_at']} looked at"
+    yield f"measurements   {section['measurements']}, of which {section['examined']} examined"
     yield f"noise          {_cell(section['noise_dbfs'], 1)} dBFS in the call's band"
     yield f"dynamic range  {_cell(section['dynamic_range_db'], 1)} dB"
     if section["tones_hz"]:

@@ -84,9 +84,9 @@ def peaks(
     --false-alarm is the probability per bin that noise alone is listed.
 
     With --truth, each true reflector comes first, with the errors of its matched peak or as missed. Then come peaks
-    that no reflector explains, as false, and peaks of reflectors that do not count, as explained (see
-    'ertis compare --help'). In JSON, "truth" of each peak is its true reflector or null, "false" is true or false, and
-    "missed" lists missed reflectors.
+    that no reflector explains, as spurious, and peaks of reflectors that do not count, as explained (see
+    'ertis compare --help'). In JSON, "truth" of each peak is its true reflector or null, "spurious" is true or
+    false, and "missed" lists missed reflectors.
     """
     if truth and top is not None:
         raise click.UsageError(
@@ -172,13 +172,13 @@ def _found(
 def _compared(place: dict[str, Any], comparison: "Comparison") -> Iterator[dict[str, Any]]:
     """Yield a row for each peak of a measurement, the strongest first."""
     shown: list[tuple[Peak, Match | None, bool]] = [(match.peak, match, False) for match in comparison.matched]
-    shown += [(peak, None, True) for peak in comparison.false]
+    shown += [(peak, None, True) for peak in comparison.spurious]
     shown += [(peak, None, False) for peak in comparison.explained]
-    for peak, match, is_false in sorted(shown, key=lambda entry: -entry[0].level_db):
+    for peak, match, is_spurious in sorted(shown, key=lambda entry: -entry[0].level_db):
         yield {
             **place,
             **_rounded(peak),
-            "false": is_false,
+            "spurious": is_spurious,
             "truth": _rounded(match.reflector) if match else None,
             "error": _error(match) if match else None,
         }
@@ -192,7 +192,7 @@ def _beside_the_truth(place: dict[str, Any], comparison: "Comparison") -> Iterat
         yield (*_cells(place, _rounded(match.reflector)), *reported, match.reflector.name)
     for reflector in comparison.missed:
         yield (*_cells(place, _rounded(reflector)), "missed", "-", "-", reflector.name)
-    for verdict, given in (("false", comparison.false), ("explained", comparison.explained)):
+    for verdict, given in (("spurious", comparison.spurious), ("explained", comparison.explained)):
         for peak in given:
             yield (*_cells(place, _rounded(peak)), verdict, "-", "-", "-")
 

@@ -178,7 +178,7 @@ def _effects(plan: "EffectPlan", simulators: "Sequence[Simulator]") -> list[dict
             "name": verdict.name,
             "on": verdict.on,
             "forced": verdict.forced,
-            "rehearsed": verdict.rehearsed,
+            "ab_rendered": verdict.ab_rendered,
             "coupled": verdict.coupled,
             "reason": verdict.reason,
             "estimate_db": None if verdict.estimate_db is None else round(verdict.estimate_db, 6),

@@ -157,14 +157,14 @@ def errors_table(takes: Takes) -> str:
                 f"{errors.measurements}",
                 f"{errors.matched}",
                 f"{errors.missed}",
-                f"{errors.false}",
+                f"{errors.spurious}",
                 _number(errors.angle_rms_deg, 2, "°"),
                 _number(errors.range_bias_m, 1, " mm", 1000),
                 _number(errors.range_rms_m, 1, " mm", 1000),
                 _number(errors.level_rms_db, 2, " dB"),
             )
         )
-    head = ("sensor", "down to", "images", "found", "missed", "false", "angle", "range, bias", "range", "level")
+    head = ("sensor", "down to", "images", "found", "missed", "spurious", "angle", "range, bias", "range", "level")
     return _table(head, "l" + 9 * "r", cells)
 
 

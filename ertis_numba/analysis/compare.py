@@ -59,7 +59,7 @@ class Comparison:
         Reflectors that were found, in the order of the ground truth.
     missed : tuple of Reflector
         Visible reflectors without a peak.
-    false : tuple of Peak
+    spurious : tuple of Peak
         Spurious peaks, which no reflector explains.
     explained : tuple of Peak
         Peaks of reflectors that do not count: too weak, outside of the image, of another sensor's call, or mirrored by
@@ -68,7 +68,7 @@ class Comparison:
 
     matched: tuple[Match, ...]
     missed: tuple[Reflector, ...]
-    false: tuple[Peak, ...]
+    spurious: tuple[Peak, ...]
     explained: tuple[Peak, ...]
 
 
@@ -78,7 +78,7 @@ class Errors:
 
     Attributes
     ----------
-    measurements, matched, missed, false : int
+    measurements, matched, missed, spurious : int
         Numbers of images, of reflectors found, of missed reflectors, and of spurious peaks.
     angle_rms_deg, range_bias_m, range_rms_m, level_rms_db : float or None
         Errors of the matched reflectors, None if there are none. The bias is positive if peaks are too far away.
@@ -90,7 +90,7 @@ class Errors:
     range_rms_m: float | None
     level_rms_db: float | None
     missed: int
-    false: int
+    spurious: int
     matched: int
 
 
@@ -136,7 +136,7 @@ def compare(image: Energyscape, reflectors: Sequence[Reflector], *, min_level_db
         measurement = simulator.render(index=0)
         image = ertis.Pipeline(measurement.settings).process(measurement)
         comparison = ertis.compare(image, simulator.reflectors(index=0))
-        print(len(comparison.matched), len(comparison.missed), len(comparison.false))
+        print(len(comparison.matched), len(comparison.missed), len(comparison.spurious))
     """
     checks.instance("image", image, Energyscape, "Pipeline.process returns")
     reflectors = list(checks.items("reflectors", reflectors, Reflector, "RecordingReader.reflectors returns"))
@@ -165,7 +165,7 @@ def compare(image: Energyscape, reflectors: Sequence[Reflector], *, min_level_db
     return Comparison(
         matched=tuple(_match(image, reflector, peak, step_db) for reflector, peak in pairs),
         missed=tuple(reflector for reflector in counted if not any(reflector is found for found, _ in pairs)),
-        false=tuple(peak for peak, due in zip(left, is_due, strict=True) if not due),
+        spurious=tuple(peak for peak, due in zip(left, is_due, strict=True) if not due),
         explained=tuple(peak for peak, due in zip(left, is_due, strict=True) if due),
     )
 
@@ -188,7 +188,7 @@ def errors_of(comparisons: Iterable[Comparison]) -> Errors:
         range_rms_m=_rms(ranges_m),
         level_rms_db=_rms(match.level_db for match in matches),
         missed=sum(len(comparison.missed) for comparison in given),
-        false=sum(len(comparison.false) for comparison in given),
+        spurious=sum(len(comparison.spurious) for comparison in given),
         matched=len(matches),
     )
 

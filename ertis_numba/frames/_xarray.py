@@ -60,7 +60,7 @@ def data_array(
         "sequence": stamp.sequence,
         "sync_count": stamp.sync_count,
         "session_id": stamp.session_id,
-        "time_uncertainty_ns": stamp.timestamp_uncertainty_ns,
+        "timestamp_uncertainty_ns": stamp.timestamp_uncertainty_ns,
         "settings": settings.to_toml(),
     }
     return xr.DataArray(values, coords=labels, dims=dims, name=name, attrs=attributes)

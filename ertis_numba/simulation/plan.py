@@ -18,7 +18,7 @@ from ertis_numba.simulation.snapshot import Snapshot, snapshot
 __all__ = ["EffectPlan", "Verdict", "make_plan"]
 
 ABRender = Callable[[int, frozenset[str], str], float | None]
-Rehearse = Callable[[], ABRender]
+RenderAB = Callable[[], ABRender]
 
 _INSTANTS, _MAX_CORNERS = 9, 40  # times at which a moving scene is examined: evenly spaced, and at waypoints
 _MAX_TOO_HIGH = 20.0  # largest factor of an overestimate; side lobes that overlap make some estimates far too low
@@ -44,7 +44,7 @@ class Verdict:
     forced : bool
         True if the scene overrides the estimate: by ``effects``, by a key that requests the effect, or by a tolerance
         of 0.
-    rehearsed : bool
+    ab_rendered : bool
         True if an A/B render measured the change, because the estimate was too close to the tolerance.
     coupled : bool
         True if the decision about this effect depends on another effect and vice versa. Both are then on, to be safe.
@@ -55,7 +55,7 @@ class Verdict:
     reason: str
     estimate_db: float | None = None
     forced: bool = False
-    rehearsed: bool = False
+    ab_rendered: bool = False
     coupled: bool = False
 
 
@@ -125,11 +125,11 @@ def make_plan(scene: Scene) -> EffectPlan:
         limits.require_clear(shot)
     notes = tuple(dict.fromkeys(note for _, shot in shots for note in limits.notes(shot)))
     verdicts: dict[str, Verdict] = {}
-    rehearse = functools.cache(lambda: _rehearsals(scene))
+    render_ab = functools.cache(lambda: _ab_render_of(scene))
     rounds = [_active(verdicts)]
     for _ in range(_ROUNDS):
         for name in EFFECTS:
-            verdicts[name] = _decided(scene, name, _active(verdicts) - {name}, shots, rehearse)
+            verdicts[name] = _decided(scene, name, _active(verdicts) - {name}, shots, render_ab)
         rounds.append(_active(verdicts))
         if rounds[-1] == rounds[-2]:
             return EffectPlan(tuple(verdicts.values()), notes)
@@ -170,7 +170,7 @@ def _decided(
     name: str,
     others: frozenset[str],
     shots: list[tuple[int, Snapshot]],
-    rehearse: Rehearse,
+    render_ab: RenderAB,
 ) -> Verdict:
     """Return the verdict on one effect, given the others."""
     if name in INDISPENSABLE:
@@ -188,14 +188,14 @@ def _decided(
     if worst.change_db / min(worst.sure, _MAX_TOO_HIGH) < scene.tolerance_db:
         indices = [index for estimate, index in estimates if estimate.change_db * estimate.sure > scene.tolerance_db]
         indices = [*dict.fromkeys(indices[:_MAX_RENDERED]), *_loudest(name, others, shots)]
-        measured_db = _measured_db(scene, rehearse, indices, others, name)
+        measured_db = _measured_db(scene, render_ab, indices, others, name)
     change_db = worst.change_db if measured_db is None else measured_db
     return Verdict(
         name=name,
         on=change_db > (_PART_ALLOWED if measured_db is not None and moves else 1.0) * scene.tolerance_db,
         reason=worst.reason if measured_db is None else f"{worst.reason}; change measured by A/B renders",
         estimate_db=change_db,
-        rehearsed=measured_db is not None,
+        ab_rendered=measured_db is not None,
     )
 
 
@@ -219,12 +219,12 @@ def _loudest(name: str, active: frozenset[str], shots: list[tuple[int, Snapshot]
 
 
 def _measured_db(
-    scene: Scene, rehearse: Rehearse, indices: list[int], others: frozenset[str], name: str
+    scene: Scene, render_ab: RenderAB, indices: list[int], others: frozenset[str], name: str
 ) -> float | None:
     """Return the greatest change of some measurements, up to the first that exceeds the tolerance."""
     worst_db: float | None = None
     for index in dict.fromkeys(indices):
-        change_db = rehearse()(index, others, name)
+        change_db = render_ab()(index, others, name)
         if change_db is not None:
             worst_db = max(change_db, worst_db or 0.0)
             if worst_db > scene.tolerance_db:
@@ -232,7 +232,7 @@ def _measured_db(
     return worst_db
 
 
-def _rehearsals(scene: Scene) -> ABRender:
+def _ab_render_of(scene: Scene) -> ABRender:
     # Imported here because it loads the whole signal chain, and most scenes are decided without it.
     from ertis_numba.simulation.ab_render import ABRender  # noqa: PLC0415
 

@@ -24,6 +24,7 @@ _ROTATE_MB: Final = 16
 _LINES_TO_LISTEN: Final = 2_500  # approximate lines of code that a central node runs until it listens
 _LINES_TO_BEGIN: Final = 1_000  # approximate lines of code that a sensor node runs until it sends
 _LINES_OF_A_LIFE: Final = 12_000  # approximate lines of code that either runs in a second
+_SEALING: Final = "-m ertis_numba.storage.sealing_process"  # in the command line of a sealing process
 _LIFE_S: Final = 1.0  # lifetime of a process that does not reach its line
 _RING_BYTES: Final = 500_000_000
 Found = dict[str, Any]
@@ -204,7 +205,7 @@ def sealings(folder: Path, *, seed: int, count: int) -> Found:
         node = stack.enter_context(record.start())
         seen: set[int] = set()
         while killed < count:
-            sealers = [pid for pid, line in survivors(record.mark).items() if "-m ertis_numba.storage.sealing_process" in line]
+            sealers = [pid for pid, line in survivors(record.mark).items() if _SEALING in line]
             fresh = [pid for pid in sealers if pid not in seen]
             if not fresh:
                 if not node.running:
