@@ -21,7 +21,7 @@ from ertis_numba.network.central_node._received_items import (
     SensorSession,
     StorageFault,
     Stored,
-    Twin,
+    StoredDuplicate,
 )
 from ertis_numba.network.central_node._volumes import journal_name
 from ertis_numba.storage import open_recording, sensor_names
@@ -159,11 +159,11 @@ def test_archive_finds_repeated_number_without_full_search(tmp_path, monkeypatch
         looked = []
         monkeypatch.setattr(Journal, "index", lambda *which: (looked.append(which), index(*which))[1])
         opened.give(again[0], again[2])
-        opened.until(Twin, lambda event: event.item is again[2])
+        opened.until(StoredDuplicate, lambda event: event.item is again[2])
         assert looked == []
         opened.give(again[1])
-        opened.until(Twin, lambda event: event.item is again[1])
-    assert [event.differs for event in opened.events if isinstance(event, Twin)] == [False, False, True]
+        opened.until(StoredDuplicate, lambda event: event.item is again[1])
+    assert [event.differs for event in opened.events if isinstance(event, StoredDuplicate)] == [False, False, True]
 
 
 def test_archive_writes_consecutive_gaps_in_one_transaction(tmp_path, monkeypatch):
@@ -523,8 +523,8 @@ def test_different_measurement_with_a_stored_number_is_kept_after_rotation(tmp_p
         opened.until_stored(2)
         opened.archive._journal_store.rotate()  # noqa: SLF001  as when it is full
         opened.give(*again)
-        opened.until(Twin, lambda event: event.item is again[1])
-    assert [event.differs for event in opened.events if isinstance(event, Twin)] == [False, True]
+        opened.until(StoredDuplicate, lambda event: event.item is again[1])
+    assert [event.differs for event in opened.events if isinstance(event, StoredDuplicate)] == [False, True]
     assert sorted(stored(tmp_path)[0]) == sorted(wanted([*given, other]))
 
 
@@ -542,8 +542,8 @@ def test_repeated_measurement_is_compared_after_a_restart(tmp_path, killed):
             shutil.copytree(folder, tmp_path / "b")
     with Opened(tmp_path / "b" if killed else folder) as opened:
         opened.give(*again)
-        opened.until(Twin, lambda event: event.item is again[1])
-    assert [event.differs for event in opened.events if isinstance(event, Twin)] == [False, True]
+        opened.until(StoredDuplicate, lambda event: event.item is again[1])
+    assert [event.differs for event in opened.events if isinstance(event, StoredDuplicate)] == [False, True]
 
 
 def test_repeated_measurement_without_a_known_checksum_is_kept(tmp_path):
@@ -555,7 +555,7 @@ def test_repeated_measurement_without_a_known_checksum_is_kept(tmp_path):
         opened.until_stored(29)
     with Opened(tmp_path) as opened:
         opened.give(item)
-        assert opened.until(Twin).differs
+        assert opened.until(StoredDuplicate).differs
     assert len(list(tmp_path.glob("*_conflicts.h5.journal"))) == 1
 
 

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from ertis_cli._heard import MicrophoneTable
+from ertis_cli._product_printer import MicrophoneTable
 from ertis_cli.main import cli
 
 from ertis_numba.network.keys import KeyPair
@@ -155,7 +155,7 @@ def test_listen_reports_too_few_images_within_its_duration():
 
 
 def test_unanswered_address_is_reported_once(monkeypatch):
-    monkeypatch.setattr("ertis_cli._heard._SOON_S", 0.1)
+    monkeypatch.setattr("ertis_cli._product_printer._SOON_S", 0.1)
     text = "waiting for tcp://127.0.0.1:1: no answer; is 'ertis serve' running?"
     done = listen("tcp://127.0.0.1:1", "--duration", "0.6", "--json")
     assert done.stderr.splitlines() == [text, "0 received, 0 dropped"]
@@ -234,7 +234,7 @@ def test_listen_refuses_invalid_usage(arguments, match):
 
 @pytest.mark.parametrize(("n_received", "lines"), [(0, 1), (3, 0)])
 def test_silence_is_reported_once(monkeypatch, capsys, n_received, lines):
-    monkeypatch.setattr("ertis_cli._heard._SILENT_S", 0.0)
+    monkeypatch.setattr("ertis_cli._product_printer._SILENT_S", 0.0)
     heard = MicrophoneTable(as_json=False, quiet=False)
     heard.silent("tcp://here", ("energyscape",), 0)  # not connected yet; another message reports this
     heard.subscribed("tcp://here", (), ("energyscape",))

@@ -174,7 +174,7 @@ class Dwindling:
 def test_lost_worker_does_not_count_as_free(monkeypatch):
     monkeypatch.setattr(cluster, "connect", lambda *_, **__: Dwindling())
     monkeypatch.setattr(cluster, "require_workers", lambda *_, **__: None)
-    monkeypatch.setattr(dask_workers, "_LOOK_S", 0.0)
+    monkeypatch.setattr(dask_workers, "_POLL_INTERVAL_S", 0.0)
     pool = dask_workers.DaskWorkerPool("tcp://far:1")
     for number in range(pool.free):
         pool.submit(Task(number, "look", {}))

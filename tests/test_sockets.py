@@ -11,7 +11,7 @@ import zmq
 from ertis_numba.errors import ArgumentError, NetworkError
 from ertis_numba.network import sockets
 from ertis_numba.network.keys import ClientKeys, ServerKeys
-from tests.door import CENTRAL, LISTED, LOOPBACK, MOMENT_S, ROBOT, STRANGER, VIEWER, Door
+from tests.zap_clients import CENTRAL, LISTED, LOOPBACK, MOMENT_S, ROBOT, STRANGER, VIEWER, Door
 
 GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x00NULL" + bytes(48)
 

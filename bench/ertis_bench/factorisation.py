@@ -14,7 +14,7 @@ from ertis_numba.air import sound_speed_m_s
 from ertis_numba.geometry import direction_grid, microphones, unit_vectors
 from ertis_numba.settings import Processing, Settings
 from ertis_numba.stages.accuracy import decibels
-from ertis_numba.stages.beam_grid import Aperture, BeamNodes
+from ertis_numba.stages.beam_grid import Aperture, BeamGrid
 from ertis_numba.stages.fitting import one_thread
 from ertis_numba.stages.plan_elements import spectrum_of
 
@@ -96,8 +96,8 @@ def _node_products(
     aperture = Aperture.of(part_m - part_m.mean(axis=0), units)
     options = {"high_hz": settings.call.high_frequency_hz, "sound_speed_m_s": sound_speed_m_s(settings.air)}
     with one_thread():
-        nodes = BeamNodes(aperture, spectrum_of(settings), n_taps=n_taps, density=density, estimate=True, **options)
+        nodes = BeamGrid(aperture, spectrum_of(settings), n_taps=n_taps, density=density, estimate=True, **options)
     if decibels(float(np.mean(nodes.errors))) > _ERROR_DB:
         return None
-    count = aperture.count_nodes(aperture.spacing(density, **options), n_taps)
+    count = aperture.count_grid_points(aperture.spacing(density, **options), n_taps)
     return count * len(part_m) * _DELAY_TAPS * _COMPLEX

@@ -10,7 +10,7 @@ from ertis_cli import options
 if TYPE_CHECKING:
     from ertis_numba.settings import Settings
 
-__all__ = ["require_plan", "said_of", "wavefront_note"]
+__all__ = ["report_lines", "require_plan", "wavefront_note"]
 
 _INTERPOLATIONS = {
     "fitted": "interpolated from {n} samples with least-squares weights",
@@ -32,7 +32,7 @@ def require_plan(settings: "Settings", *, explain: bool, verify: bool, max_error
             raise click.UsageError(f"{name} needs --method fast; method 'paper' has no plan", context)
 
 
-def said_of(sensor: str, reported: dict[str, Any]) -> Iterator[str]:
+def report_lines(sensor: str, reported: dict[str, Any]) -> Iterator[str]:
     """Yield the lines that report the plan of a sensor and its errors."""
     if "plan" in reported:
         yield from _explained(sensor, reported["plan"])

@@ -216,7 +216,7 @@ def _plan_lines(event: "RecordingEnded", *, reported: bool) -> Iterator[str]:
     for row in event.made.get("sensors", ()):
         if reported:
             kept = row if "plan" in row else {name: value for name, value in row.items() if name not in _WAVEFRONT}
-            yield from _plans.said_of(row["sensor"], kept)
+            yield from _plans.report_lines(row["sensor"], kept)
 
 
 def _plane_error(row: dict[str, Any]) -> tuple[float, float] | None:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 __all__ = ["capture"]
 
-_LOOK_S = 0.1  # interval between searches for ports
+_POLL_INTERVAL_S = 0.1  # interval between searches for ports
 
 
 @click.command()
@@ -311,7 +311,7 @@ def _wait_for(ports: tuple[str, ...], wait_s: float, signals: Signals, *, quiet:
                 except SonarError as error:
                     if error.errno != errno.ENOENT or time.monotonic() >= end_s:
                         raise
-                time.sleep(_LOOK_S)
+                time.sleep(_POLL_INTERVAL_S)
 
 
 @contextmanager

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = ["emulate"]
 
-_LOOK_S = 0.5  # interval between checks of the devices
+_POLL_INTERVAL_S = 0.5  # interval between checks of the devices
 
 
 class _Fault(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4 only
@@ -267,10 +267,10 @@ def _look_after(devices: "Sequence[Emulator]", absences: "list[tuple[float, floa
         for device in devices:
             if device.error is not None:
                 raise device.error
-        due_s = absences[0][0] - (time.monotonic() - began_s) if absences else _LOOK_S
+        due_s = absences[0][0] - (time.monotonic() - began_s) if absences else _POLL_INTERVAL_S
         if due_s <= 0:
             for device in devices:
                 device.unplug(for_s=absences[0][1])
             del absences[0]
         else:
-            ended.wait(min(due_s, _LOOK_S))
+            ended.wait(min(due_s, _POLL_INTERVAL_S))

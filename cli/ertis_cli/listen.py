@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ertis_cli import _network, options
-from ertis_cli._heard import MicrophoneTable
+from ertis_cli._product_printer import MicrophoneTable
 from ertis_cli._saving import PRODUCTS as FILED
 from ertis_cli._saving import saving
 from ertis_cli._signals import stopped_by_signals
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 __all__ = ["listen"]
 
 _PRODUCTS = ("energyscape", "points", "raw", "group", "status")
-_LOOK_S = 0.1
+_POLL_INTERVAL_S = 0.1
 
 
 @click.command()
@@ -101,7 +101,7 @@ def listen(
         signals.obey(subscriber.close)
         heard.head()
         while subscriber.counts.received != n and not signals.came and time.monotonic() < end_s and failure is None:
-            item = subscriber.receive(_LOOK_S)
+            item = subscriber.receive(_POLL_INTERVAL_S)
             if subscriber.connected:
                 heard.subscribed(address, sensors, products)
                 heard.silent(address, products, subscriber.counts.received)

@@ -246,7 +246,7 @@ def _process_one(path: Path, target: Path, wanted: "CampaignOptions", *, quiet: 
             yield [stack.enter_context(wait(settings)) for settings in several]
 
     def show(sensor: str, reported: dict[str, Any]) -> None:
-        for line in () if as_json or quiet else _plans.said_of(sensor, reported):
+        for line in () if as_json or quiet else _plans.report_lines(sensor, reported):
             click.echo(line, err=True)
 
     with prepare_recording(

@@ -16,7 +16,7 @@ from ertis_numba.storage.schema import software_versions
 __all__ = ["DaskWorkerPool", "run_on_dask_worker"]
 
 _CONNECT_S: Final = 10.0
-_LOOK_S: Final = 1.0
+_POLL_INTERVAL_S: Final = 1.0
 _REPORT_INTERVAL_S: Final = 0.5
 
 
@@ -115,7 +115,7 @@ class DaskWorkerPool:
 
     def _update_size(self) -> None:
         """Count the workers again from time to time."""
-        if time.monotonic() < self._looked_s + _LOOK_S:
+        if time.monotonic() < self._looked_s + _POLL_INTERVAL_S:
             return
         self._looked_s = time.monotonic()
         try:

@@ -29,7 +29,7 @@ EVERYBODY: Final = Permission(name="loopback", public="0" * 40, role="admin")
 """Permission of all peers without keys, on loopback only."""
 
 _ADDRESS: Final = "inproc://zeromq.zap.01"  # Address of RFC 27.
-_LOOK_S: Final = 0.25
+_POLL_INTERVAL_S: Final = 0.25
 _AT_ONCE: Final = 64
 _LIST_BYTES: Final = 4_000_000
 _SELF_TEST_S: Final = 3.0
@@ -180,7 +180,7 @@ class ZapAuthenticator:
         now_s = time.monotonic()
         if self._keys is None or now_s < self._next_look_s:
             return
-        path, before, self._next_look_s = self._keys.allow, self._allowed, now_s + _LOOK_S
+        path, before, self._next_look_s = self._keys.allow, self._allowed, now_s + _POLL_INTERVAL_S
         try:
             text = _read(path)
             if text == self._text:

@@ -106,7 +106,7 @@ def transmitter_of(shot: Snapshot, active: AbstractSet[str], number: int) -> Tra
     """Return the emitter of a sensor, at the sensor's origin or at its offset."""
     if "emitter_offset" in active:
         return cast("TransmitterPose", effect("emitter_offset")(shot, number))
-    return shot.mouths[number]
+    return shot.transmitters[number]
 
 
 def echoes(

@@ -96,7 +96,7 @@ def _emitters(shot: Snapshot) -> list[tuple[Sensor, NDArray[np.float64]]]:
 def _emitter_m(shot: Snapshot, number: int) -> NDArray[np.float64]:
     """Return the position of a sensor's emitter: (axis,) float64."""
     if not any(shot.scene.sensors[number].emitter.position_m):
-        return shot.mouths[number].position_m
+        return shot.transmitters[number].position_m
     # Imported here because most emitters are at the centre of the array.
     from ertis_numba.simulation.effects.emitter_offset import emitter_offset  # noqa: PLC0415
 

@@ -146,7 +146,7 @@ class Snapshot:
     channels : (mic,) int64
         Channels of the microphones.
     receiver : ReceiverPose
-    mouths : tuple of TransmitterPose
+    transmitters : tuple of TransmitterPose
         Emitters, one per sensor of the scene.
     targets : Targets
     mirrors : tuple of Mirror
@@ -162,7 +162,7 @@ class Snapshot:
     layout: Layout
     channels: NDArray[np.int64]
     receiver: ReceiverPose
-    mouths: tuple[TransmitterPose, ...]
+    transmitters: tuple[TransmitterPose, ...]
     targets: Targets
     mirrors: tuple[Mirror, ...]
     speed_m_s: float
@@ -183,7 +183,7 @@ class Snapshot:
     @property
     def transmitter(self) -> TransmitterPose:
         """The receiving sensor's own emitter."""
-        return self.mouths[self.number]
+        return self.transmitters[self.number]
 
     def of_mics(self, mics: slice) -> Self:
         """Return a copy with some of the microphones."""
@@ -213,7 +213,7 @@ def snapshot(scene: Scene, sensor: Sensor, time_s: float) -> Snapshot:
             velocity_m_s=place.velocity_at(time_s),
             axes=rotation.T,
         ),
-        mouths=tuple(
+        transmitters=tuple(
             TransmitterPose(
                 position_m=other.path().position_at(time_s),
                 velocity_m_s=other.path().velocity_at(time_s),

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.geometry import array_weights, effective_count
 from ertis_numba.settings import Settings
-from ertis_numba.stages.beam_grid import Aperture, BeamNodes
+from ertis_numba.stages.beam_grid import Aperture, BeamGrid
 from ertis_numba.stages.fitting import WAVES, DelayFit
 from ertis_numba.stages.focal_zones import NEAREST_M
 from ertis_numba.waveform import matched_band_hz, matched_noise_spectrum
@@ -79,7 +79,7 @@ class SignalModel:
         Quantiles of the power of the image points in ascending order, relative to the mean.
     covariance : (tile, wave, mic, mic) complex128, optional
         Covariance of the signals of some microphones in each tile of ranges, at the frequencies of an estimate of
-        `BeamNodes`; None by default.
+        `BeamGrid`; None by default.
     colour : float
         Margin on interpolation errors computed from ``shares``; 1 (the default) if ``shares`` was measured.
     loudness : float
@@ -159,8 +159,8 @@ class ErrorModel:
         independent = 0.5 * (1 + 1 / n_mics) * varying / signal_model.gain
         return signal_model.colour * (independent + (0.5 if fit.is_fitted else 1.0) * shared)
 
-    def beams(self, nodes: BeamNodes) -> float:
-        """Return the error power of beam interpolation, from an estimate of `BeamNodes`.
+    def beams(self, nodes: BeamGrid) -> float:
+        """Return the error power of beam interpolation, from an estimate of `BeamGrid`.
 
         Without a measured covariance, the signal spectrum weights the errors, as in `delays`. With a covariance R, the
         error is computed for each tile: the beam ``b = hᵀx`` and its error ``e = dᵀx`` are sums of the same signals x.
@@ -169,7 +169,7 @@ class ErrorModel:
             Re(C_eb)² / C_bb + ½ (C_ee − |C_eb|² / C_bb),   C_eb = dᵀ R h*, and likewise C_bb and C_ee.
         """
         covariance = self.signal_model.covariance
-        if covariance is None or nodes.is_bent:
+        if covariance is None or nodes.is_curved:
             return self._of(_UNLIKE * self.signal_model.colour * float(nodes.errors @ self.signal_model.shares))
         n_tiles, n_waves, _, _ = covariance.shape
         n_directions = nodes.steering.shape[2]

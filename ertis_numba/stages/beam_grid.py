@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ertis_numba.errors import ArgumentError
 from ertis_numba.stages.fitting import Spectrum, fit, gain_of, weights_of
 
-__all__ = ["FEWEST_RANGES", "Aperture", "BeamNodes", "estimated_mics", "require_nodes"]
+__all__ = ["FEWEST_RANGES", "Aperture", "BeamGrid", "estimated_mics", "require_beam_grid"]
 
 FEWEST_RANGES = 64
 """Minimum number of ranges of an image with beam interpolation. The kernels read blocks of this many samples."""
@@ -90,18 +90,18 @@ class Aperture:
         extent_m = np.ptp(self.positions_m, axis=0)
         return np.asarray(sound_speed_m_s / (high_hz * density * extent_m))
 
-    def lowest_nodes(self, spacing: NDArray[np.float64], n_taps: int) -> NDArray[np.int64]:
+    def fewest_grid_points(self, spacing: NDArray[np.float64], n_taps: int) -> NDArray[np.int64]:
         """Return the indices, along each axis, of the lowest grid point around each direction."""
         return np.asarray(np.floor(self.directions / spacing).astype(np.int64) - (n_taps // 2 - 1))
 
-    def count_nodes(self, spacing: NDArray[np.float64], n_taps: int) -> int:
+    def count_grid_points(self, spacing: NDArray[np.float64], n_taps: int) -> int:
         """Return the number of grid points that at least one direction uses."""
-        lowest = self.lowest_nodes(spacing, n_taps)
+        lowest = self.fewest_grid_points(spacing, n_taps)
         _, one = np.unique(_numbers(lowest), return_index=True)  # Many directions share their grid points.
         return len(np.unique(_numbers(_around(lowest[one], n_taps))))
 
 
-def require_nodes(aperture: Aperture, n_ranges: int) -> None:
+def require_beam_grid(aperture: Aperture, n_ranges: int) -> None:
     """Check that beams of the array and the image can be interpolated.
 
     Raises
@@ -138,12 +138,12 @@ def _numbers(nodes: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.asarray((nodes - low) @ np.concatenate([[1], np.cumprod(extent)[:-1]]))
 
 
-class BeamNodes:
+class BeamGrid:
     """Beam-grid points, and the weights that interpolate the beams of all directions from them.
 
     Attributes
     ----------
-    is_bent : bool
+    is_curved : bool
         True if the errors include those of spherical waves.
     steering, wrong : (mic, wave, direction) complex128
         Plane waves of some directions at some microphones, and their interpolation errors. Estimates only.
@@ -176,10 +176,10 @@ class BeamNodes:
     ) -> None:
         self.errors: NDArray[np.float64]
         self._aperture = aperture
-        self.is_bent = not math.isinf(nearest_m)
+        self.is_curved = not math.isinf(nearest_m)
         self._sound_speed_m_s = sound_speed_m_s
         spacing = aperture.spacing(density, high_hz=high_hz, sound_speed_m_s=sound_speed_m_s)
-        lowest = aperture.lowest_nodes(spacing, n_taps)
+        lowest = aperture.fewest_grid_points(spacing, n_taps)
         # All patches of grid points are alike, so only the position of the direction within its patch matters.
         self._inside = aperture.directions - lowest * spacing
         patch = _around(np.zeros((1, aperture.n_axes), dtype=np.int64), n_taps)[0] * spacing
@@ -196,8 +196,8 @@ class BeamNodes:
             )
             # Waves from about as far away as the array is wide are curved most in its plane.
             reach_m = math.sqrt(float(aperture.square_m2.max()))
-            for distance_m in {max(nearest_m, share * reach_m) for share in _REACHES} if self.is_bent else ():
-                bent = self._bent_errors(
+            for distance_m in {max(nearest_m, share * reach_m) for share in _REACHES} if self.is_curved else ():
+                bent = self._curvature_errors(
                     lowest[directions] * spacing, patch, directions, mics, gain, weights, distance_m
                 )
                 self.errors = np.maximum(self.errors, bent)
@@ -273,7 +273,7 @@ class BeamNodes:
         self.steering, self.wrong = (there * wanted).reshape(shape), (there * wrong).reshape(shape)
         return np.asarray(gain.reshape(shape[:2]))
 
-    def _bent_errors(
+    def _curvature_errors(
         self,
         moved: NDArray[np.float64],
         patch: NDArray[np.float64],

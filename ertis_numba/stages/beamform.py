@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.errors import DeviceError
 from ertis_numba.kernels import KernelSet, Memory
-from ertis_numba.stages.beam_grid import FEWEST_RANGES, BeamNodes
+from ertis_numba.stages.beam_grid import FEWEST_RANGES, BeamGrid
 from ertis_numba.stages.delays import Zone
 from ertis_numba.stages.window import TimeWindow
 
@@ -57,7 +57,7 @@ def beamform(
     memory: Memory,
     window: TimeWindow,
     zones: Sequence[Zone],
-    nodes: BeamNodes | None,
+    nodes: BeamGrid | None,
     *,
     n_phases: int,
     threads: int,
@@ -86,7 +86,7 @@ def beamform(
 class _NodeTables:
     """Beam-grid tables in device memory; ``weights`` have the data type of the precision."""
 
-    def __init__(self, memory: Memory, nodes: BeamNodes, weights: NDArray[Any]) -> None:
+    def __init__(self, memory: Memory, nodes: BeamGrid, weights: NDArray[Any]) -> None:
         self.places, self.rows = memory.table(nodes.places), memory.table(nodes.rows)
         self.weights = memory.table(weights)
 
@@ -102,7 +102,7 @@ class BeamformFloat32:
     zones : sequence of Zone
         Focal zones that together cover the range axis. Their beams are those of all directions, or of the beam-grid
         points if there are any.
-    nodes : BeamNodes or None
+    nodes : BeamGrid or None
         Beam grid from which the beams of all directions are interpolated.
     threads : int
         Number of threads.
@@ -114,7 +114,7 @@ class BeamformFloat32:
         memory: Memory,
         window: TimeWindow,
         zones: Sequence[Zone],
-        nodes: BeamNodes | None,
+        nodes: BeamGrid | None,
         *,
         threads: int,
     ) -> None:
@@ -198,7 +198,7 @@ class BeamformInt16:
         kernels: KernelSet,
         memory: Memory,
         zones: Sequence[Zone],
-        nodes: BeamNodes | None,
+        nodes: BeamGrid | None,
         *,
         n_phases: int,
         threads: int,

@@ -17,7 +17,7 @@ from ertis_numba.geometry import Grid, array_weights, direction_grid, microphone
 from ertis_numba.kernels import KernelSet
 from ertis_numba.settings import Settings
 from ertis_numba.stages.adaptive import AdaptiveBeamform
-from ertis_numba.stages.beam_grid import Aperture, require_nodes
+from ertis_numba.stages.beam_grid import Aperture, require_beam_grid
 from ertis_numba.stages.beamform import beamform
 from ertis_numba.stages.buffer_pool import BufferPool, MeasurementBuffers
 from ertis_numba.stages.delays import DelayTable, Zone
@@ -26,9 +26,9 @@ from ertis_numba.stages.fitting import one_thread
 from ertis_numba.stages.matched_filter import MatchedFilter
 from ertis_numba.stages.plan_elements import (
     ahead_of,
+    beam_grid_of,
     chain_taps,
     delay_fit,
-    nodes_of,
     ringing_db,
     spectrum_of,
     zones_of,
@@ -82,7 +82,7 @@ class FastChain:
         spectrum = spectrum_of(settings)
         n_phases = plan.oversampling or 1
         fit, step_s = delay_fit(settings, spectrum)
-        nodes = nodes_of(settings, aperture, spectrum)
+        nodes = beam_grid_of(settings, aperture, spectrum)
         points = aperture.directions if nodes is None else nodes.points
         own_s = layout.delay_s[layout.enabled]
         array_weight = array_weights(settings)
@@ -100,7 +100,7 @@ class FastChain:
             ringing_db=ringing_db(settings),
         )
         if plan.beam_taps:
-            require_nodes(aperture, len(window.range_m))
+            require_beam_grid(aperture, len(window.range_m))
         self.range_m = window.range_m
         self._lead = window.lead
         self._kernels = kernels

@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.settings import Processing, Recording, Settings
-from ertis_numba.stages.beam_grid import Aperture, BeamNodes
+from ertis_numba.stages.beam_grid import Aperture, BeamGrid
 from ertis_numba.stages.fitting import WAVES, DelayFit, Spectrum
 from ertis_numba.stages.focal_zones import zone_edges
 from ertis_numba.stages.window import time_window
 from ertis_numba.waveform import decimation_taps, integer_taps, matched_band_hz, matched_noise_spectrum
 
-__all__ = ["ahead_of", "chain_taps", "delay_fit", "nodes_of", "ringing_db", "spectrum_of", "zones_of"]
+__all__ = ["ahead_of", "beam_grid_of", "chain_taps", "delay_fit", "ringing_db", "spectrum_of", "zones_of"]
 
 _PCM_RANGE_DB = 125.0  # Dynamic range within which sound outside the window does not affect an image of PCM.
 _MAX_RINGING_DB = 160.0  # Below this level, rounding of single precision exceeds the ringing.
@@ -35,12 +35,12 @@ def _spectrum_of(settings: Settings) -> Spectrum:
     return Spectrum(*matched_noise_spectrum(settings, n_waves=WAVES))
 
 
-def nodes_of(settings: Settings, aperture: Aperture, spectrum: Spectrum) -> BeamNodes | None:
+def beam_grid_of(settings: Settings, aperture: Aperture, spectrum: Spectrum) -> BeamGrid | None:
     """Return the beam grid of a complete plan; None if every direction has its own beam."""
     plan = settings.accuracy
     if not plan.beam_taps or aperture.n_axes not in {1, 2}:
         return None
-    return BeamNodes(
+    return BeamGrid(
         aperture,
         spectrum,
         n_taps=plan.beam_taps,

@@ -13,7 +13,7 @@ from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import array_weights, direction_grid, effective_count, microphones, unit_vectors
 from ertis_numba.settings import Accuracy, Settings
 from ertis_numba.stages.accuracy import PARTS, ErrorModel, SignalModel
-from ertis_numba.stages.beam_grid import FEWEST_RANGES, Aperture, BeamNodes, require_nodes
+from ertis_numba.stages.beam_grid import FEWEST_RANGES, Aperture, BeamGrid, require_beam_grid
 from ertis_numba.stages.beamform import whole_limits
 from ertis_numba.stages.costs import Work
 from ertis_numba.stages.fitting import DelayFit, Spectrum
@@ -22,9 +22,9 @@ from ertis_numba.stages.plan_elements import ahead_of, chain_taps, spectrum_of, 
 from ertis_numba.stages.window import time_window
 from ertis_numba.waveform import matched_band_hz
 
-__all__ = ["COARSEST_STOP_BAND_DB", "TABLE_BYTES", "Delays", "ImagePlan", "Nodes", "PlanModel", "plan_of"]
+__all__ = ["MIN_STOPBAND_ATTENUATION_DB", "TABLE_BYTES", "Delays", "ImagePlan", "Nodes", "PlanModel", "plan_of"]
 
-COARSEST_STOP_BAND_DB = 40.0
+MIN_STOPBAND_ATTENUATION_DB = 40.0
 TABLE_BYTES = 44
 """Bytes of a delay and a weight, including both the computed form and the form that kernels read."""
 
@@ -104,7 +104,7 @@ class PlanModel:
         self._speed_m_s = sound_speed_m_s(settings.air)
         self.window = time_window(settings, largest_delay_s=self._reach_s(), n_taps=1)
         if settings.accuracy.beam_taps:
-            require_nodes(self.aperture, len(self.window.range_m))
+            require_beam_grid(self.aperture, len(self.window.range_m))
         self.delays = functools.cache(self._made_delays)
         self._zones = functools.cache(self._made_zones)
         self.nodes = functools.cache(self._made_nodes)
@@ -192,15 +192,15 @@ class PlanModel:
         )
         return fit.split(delays_s)[1].ravel()
 
-    def count_nodes(self, n_taps: int, density: float) -> int:
+    def count_grid_points(self, n_taps: int, density: float) -> int:
         """Return the number of beam-grid points."""
         high_hz = self.settings.call.high_frequency_hz
         spacing = self.aperture.spacing(density, high_hz=high_hz, sound_speed_m_s=self._speed_m_s)
-        return self.aperture.count_nodes(spacing, n_taps)
+        return self.aperture.count_grid_points(spacing, n_taps)
 
     def _made_nodes(self, n_taps: int, density: float) -> Nodes:
-        require_nodes(self.aperture, len(self.window.range_m))
-        nodes = BeamNodes(
+        require_beam_grid(self.aperture, len(self.window.range_m))
+        nodes = BeamGrid(
             self.aperture,
             self._spectrum,
             n_taps=n_taps,
@@ -211,7 +211,7 @@ class PlanModel:
             nearest_m=self._nearest_m,
         )
         n_pairs = n_taps**self.aperture.n_axes // 2
-        return Nodes(self.count_nodes(n_taps, density), n_pairs, self.errors.beams(nodes), nodes.squares)
+        return Nodes(self.count_grid_points(n_taps, density), n_pairs, self.errors.beams(nodes), nodes.squares)
 
     def _made_filter(self, stopband_attenuation_db: float) -> tuple[NDArray[Any], float]:
         try:
@@ -219,7 +219,7 @@ class PlanModel:
         except ArgumentError:
             if (
                 self.settings.accuracy.stopband_attenuation_db is not None
-                or stopband_attenuation_db == COARSEST_STOP_BAND_DB
+                or stopband_attenuation_db == MIN_STOPBAND_ATTENUATION_DB
             ):
                 raise
             return np.ones(1, dtype=np.int16), math.inf

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.geometry import array_weights, microphones
 from ertis_numba.settings import Settings
-from ertis_numba.stages.beam_grid import Aperture, BeamNodes
+from ertis_numba.stages.beam_grid import Aperture, BeamGrid
 from ertis_numba.stages.fitting import one_thread
-from ertis_numba.stages.plan_elements import ahead_of, delay_fit, nodes_of, spectrum_of
+from ertis_numba.stages.plan_elements import ahead_of, beam_grid_of, delay_fit, spectrum_of
 
 __all__ = ["Deviation", "deviation_of"]
 
@@ -75,7 +75,7 @@ def _computed(settings: Settings, directions: NDArray[np.float64]) -> Deviation 
     power = spectrum.power[chosen] / spectrum.power[chosen].sum()
     centre_hz = float(power @ frequency_hz)
     offset_hz = frequency_hz - centre_hz
-    nodes = nodes_of(settings, aperture, spectrum)
+    nodes = beam_grid_of(settings, aperture, spectrum)
     if nodes is None and not is_plane:
         return None
     points = aperture.directions if nodes is None else nodes.points
@@ -104,7 +104,7 @@ def _computed(settings: Settings, directions: NDArray[np.float64]) -> Deviation 
     return Deviation(centre_hz, mean.astype(np.complex64), slope_s.astype(np.complex64))
 
 
-def _interpolated(nodes: BeamNodes, made: NDArray[np.complex128]) -> NDArray[np.complex128]:
+def _interpolated(nodes: BeamGrid, made: NDArray[np.complex128]) -> NDArray[np.complex128]:
     """Return beams of all directions, (direction, mic), from those of beam-grid points."""
     beams = np.zeros((len(nodes.rows), made.shape[1]), dtype=np.complex128)
     for pair in range(nodes.places.shape[1]):

@@ -5,15 +5,15 @@ import math
 
 from ertis_numba.settings import INTERPOLATIONS, MAX_FOCAL_ZONES
 from ertis_numba.stages.beam_grid import FEWEST_RANGES
-from ertis_numba.stages.plan_model import COARSEST_STOP_BAND_DB, ImagePlan, PlanModel
+from ertis_numba.stages.plan_model import MIN_STOPBAND_ATTENUATION_DB, ImagePlan, PlanModel
 
 __all__ = ["open_plans"]
 
 _PHASES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
 _DELAY_TAPS = (1, 2, 3, 4, 5, 6)
 _DENSITIES = {2: (1.5, 2.0, 2.5, 3.0, 4.0), 4: (1.25, 1.5, 1.75, 2.0, 2.5, 3.0), 6: (1.75, 2.0, 2.5, 3.0)}
-_STOP_BANDS_DB = (COARSEST_STOP_BAND_DB, 60.0, 80.0, 100.0, 120.0, 140.0)
-_STOP_BANDS = 3  # Number of candidates; more attenuation brings no benefit.
+_STOPBAND_ATTENUATIONS_DB = (MIN_STOPBAND_ATTENUATION_DB, 60.0, 80.0, 100.0, 120.0, 140.0)
+_N_STOPBAND_ATTENUATIONS = 3  # Number of candidates; more attenuation brings no benefit.
 _NEEDLESS = 0.02  # Share of the budget below which the error of a step is negligible.
 _SMALL = 0.1  # Share of the budget for steps whose error costs little to reduce.
 
@@ -83,7 +83,7 @@ def _open_nodes(model: PlanModel, budget: float, *, adaptive: bool) -> list[tupl
     for beam_taps in [given.beam_taps] if given.beam_taps else _DENSITIES:
         densities = _DENSITIES[beam_taps] if given.beam_density is None else (given.beam_density,)
         for density in densities:  # The coarsest grid is the cheapest. The loop ends at needlessly accurate ones.
-            if not given.beam_taps and model.count_nodes(beam_taps, density) >= model.n_directions:
+            if not given.beam_taps and model.count_grid_points(beam_taps, density) >= model.n_directions:
                 break
             error = model.nodes(beam_taps, density).error
             if error <= budget or given.beam_taps:
@@ -97,11 +97,9 @@ def _stop_bands_db(model: PlanModel, budget: float) -> list[float]:
     """Return the stopband attenuations whose error is below the budget, or the best one if there are none."""
     if model.settings.accuracy.stopband_attenuation_db is not None:
         return [model.settings.accuracy.stopband_attenuation_db]
-    errors = {
-        stopband_attenuation_db: model.filter(stopband_attenuation_db)[1] for stopband_attenuation_db in _STOP_BANDS_DB
-    }
-    enough = [stopband_attenuation_db for stopband_attenuation_db, error in errors.items() if error < budget]
-    return enough[:_STOP_BANDS] or [min(errors, key=lambda stopband_attenuation_db: errors[stopband_attenuation_db])]
+    errors = {attenuation_db: model.filter(attenuation_db)[1] for attenuation_db in _STOPBAND_ATTENUATIONS_DB}
+    enough = [attenuation_db for attenuation_db, error in errors.items() if error < budget]
+    return enough[:_N_STOPBAND_ATTENUATIONS] or [min(errors, key=errors.__getitem__)]
 
 
 def _zone_count(model: PlanModel, budget: float) -> int:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Live"]
 
-_LOOK_S: Final = 0.1
+_POLL_INTERVAL_S: Final = 0.1
 _STOP_S: Final = 2.0
 _SOON_S: Final = 3.0  # Delay before missing answers or sensors are reported.
 _INTERVALS: Final = 9  # Number of intervals for the median, so that a single pause has no effect.
@@ -172,7 +172,7 @@ class Live:
     def _run(self) -> None:
         try:
             while not self._subscriber.closed:
-                item = self._subscriber.receive(_LOOK_S)
+                item = self._subscriber.receive(_POLL_INTERVAL_S)
                 arrival = self._subscriber.latest
                 if isinstance(item, Status):
                     self._find_sensors(item)

@@ -56,7 +56,7 @@ class ViewerPage:
         Name of the source.
     choices : Choices
         Initial choices.
-    n_moments : int, optional
+    n_time_steps : int, optional
         Length of the time line; there is none by default.
 
     Attributes
@@ -71,7 +71,7 @@ class ViewerPage:
     """
 
     def __init__(
-        self, host: str, port: int, *, orders: Orders, title: str, choices: Choices, n_moments: int | None = None
+        self, host: str, port: int, *, orders: Orders, title: str, choices: Choices, n_time_steps: int | None = None
     ) -> None:
         _require_free(host, port)
         self._orders, self.is_seen = orders, False
@@ -97,14 +97,14 @@ class ViewerPage:
         self._state = gui.add_html("")
         self._play = gui.add_button("Pause")
         self._play.on_click(lambda _: self._orders.put(ControlRequest("play")))
-        if n_moments is None:
+        if n_time_steps is None:
             self._button("Step", "step", value=1)
         else:
             steps = gui.add_button_group("Step", ("back", "ahead"))
             steps.on_click(
                 lambda event: self._orders.put(ControlRequest("step", 1 if event.target.value == "ahead" else -1))
             )
-            self._line = gui.add_slider("Measurement", 0, max(1, n_moments - 1), 1, 0, visible=n_moments > 1)
+            self._line = gui.add_slider("Measurement", 0, max(1, n_time_steps - 1), 1, 0, visible=n_time_steps > 1)
             self._obey(self._line, "seek")
         self._controls(choices)
 

@@ -26,7 +26,7 @@ from ertis_numba.viewer._time_steps import UNTIMED_S, SensorTimeline, TimeStep, 
 
 __all__ = ["Playback", "TimeStep"]
 
-_LOOK_S: Final = 1 / 60
+_POLL_INTERVAL_S: Final = 1 / 60
 
 
 class Playback:
@@ -214,7 +214,7 @@ class Playback:
                         self._advance(time.monotonic())
                     place, made, jumps, plays = self.place, self._made, self._jumps, self._plays
                 if place == made:
-                    self._closed.wait(_LOOK_S)
+                    self._closed.wait(_POLL_INTERVAL_S)
                     continue
                 last = {name: track.last(-1 if made is None else made, place) for name, track in self._tracks.items()}
                 due = {name: each for name, each in last.items() if each is not None}

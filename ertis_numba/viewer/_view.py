@@ -28,7 +28,7 @@ if TYPE_CHECKING:  # one brings HDF5, the other ZeroMQ
 __all__ = ["Viewer"]
 
 _MIN_DRAW_S: Final = 1 / 15
-_LOOK_S: Final = 1 / 60
+_POLL_INTERVAL_S: Final = 1 / 60
 _REPORT_INTERVAL_S: Final = 0.5
 _FADE_S: Final = 0.2  # between frames of a recording in which only fading changes
 _TYPED_S: Final = 1.5  # after which an invalid number is not taken for one that is being typed
@@ -86,7 +86,7 @@ class Viewer:
             orders=self._orders,
             title=source.title,
             choices=self.choices,
-            n_moments=None if self._playback is None else len(self._playback.time_steps),
+            n_time_steps=None if self._playback is None else len(self._playback.time_steps),
         )
         self._recordings = Recordings(self._page.serializer, self._completion)
         self._file: ToFile | None = None
@@ -305,7 +305,7 @@ class Viewer:
     def _obey(self) -> None:
         """Process requests; wait briefly for one."""
         try:
-            order = self._orders.get(timeout=_LOOK_S)
+            order = self._orders.get(timeout=_POLL_INTERVAL_S)
             while True:
                 if order is None:
                     self._ended = True

@@ -34,7 +34,7 @@ __all__ = ["Archive"]
 
 _GROUP: Final = 64
 _GROUP_BYTES: Final = 40_000_000
-_LOOK_S: Final = 0.5
+_POLL_INTERVAL_S: Final = 0.5
 _AGAIN_S: Final = 1.0
 _STUCK_S: Final = 5.0
 
@@ -211,7 +211,7 @@ class Archive:
         items: list[ReceivedItem] = []
         n_bytes = 0
         try:
-            item = self._queue.get(timeout=_LOOK_S)
+            item = self._queue.get(timeout=_POLL_INTERVAL_S)
             while item is not None:
                 items.append(item)
                 n_bytes += item.n_bytes
@@ -272,7 +272,7 @@ class Archive:
         now_s = time.monotonic()
         if now_s < self._next_look_s or self._journal_store is None:
             return
-        self._next_look_s = now_s + _LOOK_S
+        self._next_look_s = now_s + _POLL_INTERVAL_S
         made = ArchiveStatus(folder=str(self.folder), commit=self._commits.percentiles())
         try:
             made.free_bytes = shutil.disk_usage(self.folder).free

@@ -9,12 +9,12 @@ from typing import Any, Final
 from ertis_numba.journal import SealingResult
 from ertis_numba.network.central_node._received_items import ReceivedItem
 
-__all__ = ["Telling", "text_of"]
+__all__ = ["EventReporter", "text_of"]
 
 _LOG_INTERVAL_S: Final = 1.0  # Interval between events about internal errors.
 
 
-class Telling:
+class EventReporter:
     """Reporter of changes as events.
 
     Parameters

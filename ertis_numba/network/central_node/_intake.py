@@ -10,7 +10,7 @@ from ertis_numba.journal import JournalEntry, JournalSensor
 from ertis_numba.journal import JournalGap as NotedGap
 from ertis_numba.network.central_node._acks import Acks
 from ertis_numba.network.central_node._admission import entry_in, require_room, require_same, source_in
-from ertis_numba.network.central_node._received_items import ReceivedItem, SensorSession, Stored, Twin
+from ertis_numba.network.central_node._received_items import ReceivedItem, SensorSession, Stored, StoredDuplicate
 from ertis_numba.network.central_node._roles import MeasurementConsumer, Store, Unwanted
 from ertis_numba.network.central_node._sharing import Sharing
 from ertis_numba.network.central_node._streams import PeerConnection, SensorTrack, Stream
@@ -327,7 +327,7 @@ class Intake:
         if self._on_stored is not None:
             self._on_stored([item for item in event.items if isinstance(item.content, JournalEntry)])
 
-    def twin(self, event: Twin) -> None:
+    def twin(self, event: StoredDuplicate) -> None:
         """Process a duplicate."""
         stream = self._done(event.item)
         track = self.tracks.setdefault(event.item.run.sensor, SensorTrack())

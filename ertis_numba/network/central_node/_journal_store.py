@@ -18,14 +18,14 @@ from ertis_numba.network.central_node._received_items import (
     Remark,
     SensorSession,
     Stored,
-    Twin,
+    StoredDuplicate,
 )
 from ertis_numba.network.central_node._unrecorded_gaps import UnrecordedGaps
-from ertis_numba.network.central_node._volumes import Volume, journal_name, runs_of
+from ertis_numba.network.central_node._volumes import Volume, journal_name, sessions_in
 
 __all__ = ["JournalStore"]
 
-_TWINS_KEPT: Final = 4096
+_MAX_DUPLICATES: Final = 4096
 
 
 class JournalStore:
@@ -66,9 +66,9 @@ class JournalStore:
         self.acked_through: dict[SensorSession, int] = dict(ledger.acked_through)
         self._by_age = dict.fromkeys(ledger.acked_through)
         self.volume: Volume | None = None
-        self._twins: Volume | None = None
+        self._duplicates: Volume | None = None
         self._checksums = Checksums(ledger.tails)
-        self._known_twins: dict[tuple[SensorSession, int, int], None] = {}
+        self._known_duplicates: dict[tuple[SensorSession, int, int], None] = {}
         self._unsealed: set[str] = set(ledger.unsealed)
         self._unrecorded = UnrecordedGaps(ledger.gaps)
         self._failed: list[Volume] = []  # Closed, but not yet durably abandoned.
@@ -100,7 +100,7 @@ class JournalStore:
         recording = path.with_name(path.name.removesuffix(SUFFIX))
         if path.exists():
             with Journal.open(path) as journal:
-                self._settle(runs_of(journal))
+                self._settle(sessions_in(journal))
                 self._unrecorded.learn(journal)
                 if "_conflicts" not in path.name:  # Conflicting measurements are the second ones under their numbers.
                     self._checksums.learn(journal)
@@ -151,7 +151,7 @@ class JournalStore:
                 continue
             if item.again:
                 flush()
-                self._store_twin(item)
+                self._store_duplicate(item)
                 continue
             last = ahead.get(item.run, self.acked_through.get(item.run, -1))
             if item.last <= last:  # A commit that seemed to fail had succeeded.
@@ -215,26 +215,26 @@ class JournalStore:
                 self._checksums.add(item.run, item.first, item.content.crc32 or 0)
         self._emit_event(Stored(items, took_ms))
 
-    def _store_twin(self, item: ReceivedItem) -> None:
+    def _store_duplicate(self, item: ReceivedItem) -> None:
         """Store a duplicate with other content as a conflict; discard equal ones."""
         if not isinstance(item.content, JournalEntry):
             return
         key = (item.run, item.first, item.content.crc32 or 0)
-        differs = key not in self._known_twins and self._differs(item, item.content)
+        differs = key not in self._known_duplicates and self._differs(item, item.content)
         if differs:
-            if self._twins is not None and not self._twins.fits(item):
-                self._retire_volume(self._twins)
-                self._twins = None
-            if self._twins is None:
+            if self._duplicates is not None and not self._duplicates.fits(item):
+                self._retire_volume(self._duplicates)
+                self._duplicates = None
+            if self._duplicates is None:
                 name = journal_name(self._folder, self._name, end="_conflicts", taken=self._unsealed)
                 self._save(open_=self._open, also=[name])
-                self._twins = Volume.create(self._folder / name)
-            self._twins.append([item])
-            self._known_twins[key] = None
-            for old in list(islice(self._known_twins, max(0, len(self._known_twins) - _TWINS_KEPT))):
-                del self._known_twins[old]
+                self._duplicates = Volume.create(self._folder / name)
+            self._duplicates.append([item])
+            self._known_duplicates[key] = None
+            for old in list(islice(self._known_duplicates, max(0, len(self._known_duplicates) - _MAX_DUPLICATES))):
+                del self._known_duplicates[old]
         item.done = True
-        self._emit_event(Twin(item, differs=differs))
+        self._emit_event(StoredDuplicate(item, differs=differs))
 
     def _differs(self, item: ReceivedItem, entry: JournalEntry) -> bool:
         """Return True if a number holds another measurement, or one that cannot be compared any more."""
@@ -269,7 +269,7 @@ class JournalStore:
             A failed journal still fails; the next start recovers it.
         """
         self._abandon_failed()
-        volumes, self.volume, self._twins = (self.volume, self._twins), None, None
+        volumes, self.volume, self._duplicates = (self.volume, self._duplicates), None, None
         for volume in volumes:
             if volume is not None:
                 self._retire_volume(volume)
@@ -302,7 +302,7 @@ class JournalStore:
     def _free_logs(self) -> None:
         """Free the space of logs, which the next measurements need on a small disk."""
         try:
-            for volume in (self.volume, self._twins):
+            for volume in (self.volume, self._duplicates):
                 if volume is not None:
                     volume.journal.free_log()
         except (DataError, OSError):
@@ -310,7 +310,7 @@ class JournalStore:
 
     def _fail(self) -> None:
         """Close the open journals: after a failed sync, their visible content may never reach the disk."""
-        volumes, self.volume, self._twins = (self.volume, self._twins), None, None
+        volumes, self.volume, self._duplicates = (self.volume, self._duplicates), None, None
         for volume in volumes:
             if volume is not None:
                 self._failed.append(volume)

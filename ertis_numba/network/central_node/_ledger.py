@@ -27,7 +27,7 @@ __all__ = ["Ledger", "Lock", "read_acked_through"]
 _NAME: Final = ".ertis-ledger"
 _LOCK: Final = ".ertis-lock"
 _VERSION: Final = 3  # Version 1 had no gaps, version 2 no checksums.
-_RUNS_KEPT: Final = 64  # Limit per sensor.
+_MAX_SESSIONS: Final = 64  # Limit per sensor.
 _ALL_RUNS_KEPT: Final = 16_384
 
 
@@ -243,7 +243,7 @@ def _newest(acked_through: Mapping[SensorSession, int]) -> dict[SensorSession, i
     kept: list[SensorSession] = []
     for run in list(acked_through)[: -_ALL_RUNS_KEPT - 1 : -1]:
         counts[run.sensor] += 1
-        if counts[run.sensor] <= _RUNS_KEPT:
+        if counts[run.sensor] <= _MAX_SESSIONS:
             kept.append(run)
     return {run: acked_through[run] for run in reversed(kept)}
 

@@ -16,7 +16,7 @@ from ertis_numba.network.addresses import DEFAULT_LISTEN
 from ertis_numba.network.allow_list import Permission
 from ertis_numba.network.central_node._archive import Archive
 from ertis_numba.network.central_node._condition import Condition
-from ertis_numba.network.central_node._event_reporting import Telling, text_of
+from ertis_numba.network.central_node._event_reporting import EventReporter, text_of
 from ertis_numba.network.central_node._images import Guarded, ImageProducer
 from ertis_numba.network.central_node._intake import Intake
 from ertis_numba.network.central_node._reading import read, require_role
@@ -28,7 +28,7 @@ from ertis_numba.network.central_node._received_items import (
     SealingFailed,
     StorageFault,
     Stored,
-    Twin,
+    StoredDuplicate,
 )
 from ertis_numba.network.central_node._roles import Unwanted
 from ertis_numba.network.central_node._server_socket import ServerSocket
@@ -110,14 +110,14 @@ class CentralNode:
         self._images = None if processing is None else Guarded(processing, self._internal)
         self._window = checks.integer("window", window, 1, 1024)
         self._max_bytes = checks.integer("max_bytes", max_bytes, 4096, 2**31)
-        self._telling = Telling(on_event, on_stored)
+        self._event_reporter = EventReporter(on_event, on_stored)
         self._server = ServerSocket(keys)
         self._intake = Intake(
             store=archive,
             viewer=self._images,
             send=self._server.send,
-            notify=self._telling.notify,
-            on_stored=self._telling.stored,
+            notify=self._event_reporter.notify,
+            on_stored=self._event_reporter.stored,
             max_bytes=max_bytes,
         )
         self._condition = Condition(
@@ -149,7 +149,7 @@ class CentralNode:
                 return
         self._greetings_fd = self._greetings.open()
         self._server.open(self._listen, max_bytes=self._max_bytes)
-        self._telling.notify("listening", address=self._condition.address, pid=os.getpid())
+        self._event_reporter.notify("listening", address=self._condition.address, pid=os.getpid())
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -170,7 +170,7 @@ class CentralNode:
                 stack.callback(self._images.close, _FINISH_S)
             stack.callback(self._greetings.close)
             stack.callback(self._server.close)
-            self._telling.refused(self._server.refused)
+            self._event_reporter.refused(self._server.refused)
 
     def stop(self) -> None:
         """End `run` within a tenth of a second, or the start of processes in ``with``; any thread may call this."""
@@ -241,7 +241,7 @@ class CentralNode:
     def _internal(self, error: Exception) -> None:
         """Count and report an internal error."""
         self._server.refused["internal"] += 1
-        self._telling.internal(error)
+        self._event_reporter.internal(error)
 
     def _handle(self, frames: list[zmq.Frame]) -> None:
         """Process a message or refuse it; never raises for a message."""
@@ -339,22 +339,22 @@ class CentralNode:
             match event:
                 case Stored():
                     self._intake.stored(event)
-                case Twin():
+                case StoredDuplicate():
                     self._intake.twin(event)
                 case Forgotten(item, reason):
                     self._intake.forgotten(item, reason)
                 case StorageFault(text):
                     self._condition.fault = text
-                    self._telling.fault(self._condition.trouble)
+                    self._event_reporter.fault(self._condition.trouble)
                 case Resumed():
                     self._condition.fault = ""
-                    self._telling.fault(self._condition.trouble)
+                    self._event_reporter.fault(self._condition.trouble)
                 case SealedOne(sealed):
-                    self._telling.sealed(sealed)
+                    self._event_reporter.sealed(sealed)
                 case SealingFailed(text):
-                    self._telling.notify("unsealed", text=text)
+                    self._event_reporter.notify("unsealed", text=text)
                 case Remark(text):
-                    self._telling.notify("damage", text=text)
+                    self._event_reporter.notify("damage", text=text)
 
     def _tick(self) -> None:
         now_s = time.monotonic()
@@ -364,8 +364,8 @@ class CentralNode:
         self._intake.tick(now_s)
         if self._images is not None:
             self._images.tick(now_s)
-        self._telling.fault(self._condition.trouble)
-        self._telling.keys(self._server.note)
+        self._event_reporter.fault(self._condition.trouble)
+        self._event_reporter.keys(self._server.note)
         if now_s >= self._next_status_s:
             self._next_status_s = now_s + _STATUS_S
             self._note_status()
@@ -373,7 +373,7 @@ class CentralNode:
                 self._images.publish_status(self.latest)
         if now_s >= self._next_log_s:
             self._next_log_s = now_s + _LOG_INTERVAL_S
-            self._telling.refused(self._server.refused)
+            self._event_reporter.refused(self._server.refused)
 
     # Properties
 

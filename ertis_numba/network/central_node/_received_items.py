@@ -16,7 +16,7 @@ __all__ = [
     "SensorSession",
     "StorageFault",
     "Stored",
-    "Twin",
+    "StoredDuplicate",
 ]
 
 _OVERHEAD: Final = 2048  # Memory of an item in addition to its data.
@@ -87,7 +87,7 @@ class Forgotten:
 
 
 @dataclass(slots=True)
-class Twin:
+class StoredDuplicate:
     """Duplicate of an acknowledged number; ``True`` if its content differs and is kept, too."""
 
     item: ReceivedItem
@@ -127,4 +127,4 @@ class Remark:
     text: str
 
 
-Event: TypeAlias = Stored | Forgotten | Twin | StorageFault | Resumed | SealedOne | SealingFailed | Remark
+Event: TypeAlias = Stored | Forgotten | StoredDuplicate | StorageFault | Resumed | SealedOne | SealingFailed | Remark

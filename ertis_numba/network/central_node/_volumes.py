@@ -11,7 +11,7 @@ from ertis_numba.errors import DamagedError
 from ertis_numba.journal import SUFFIX, Journal, JournalEntry, JournalGap, JournalSensor
 from ertis_numba.network.central_node._received_items import ReceivedItem, SensorSession
 
-__all__ = ["Volume", "journal_name", "runs_of", "same"]
+__all__ = ["Volume", "journal_name", "same", "sessions_in"]
 
 _SOURCE = "central node"
 
@@ -28,7 +28,7 @@ def journal_name(folder: Path, name: str, *, end: str = "", taken: Iterable[str]
     return f"{stem}{f'_{last + 1:03}' if last else ''}{end}.h5{SUFFIX}"
 
 
-def runs_of(journal: Journal) -> dict[SensorSession, int]:
+def sessions_in(journal: Journal) -> dict[SensorSession, int]:
     """Return the highest number of each session in a journal, gaps included."""
     last: dict[SensorSession, int] = {}
     for key in journal.index():
@@ -63,7 +63,7 @@ class Volume:
         self._known: dict[str, JournalSensor] = dict(journal.sensors)
         self._counted = {SensorSession(key.sensor, key.session_id): key.sequence for key in journal.index()}
         self.n_bytes = sum(journal.sensors[key.sensor].n_bytes for key in journal.index())
-        self.acked = runs_of(journal)
+        self.acked = sessions_in(journal)
         self.begun_s = time.monotonic()
 
     @classmethod

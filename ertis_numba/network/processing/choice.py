@@ -10,7 +10,7 @@ __all__ = ["Choice", "Load", "Mode"]
 
 _BUSY: Final = 0.8  # Share of busy time above which measurements share the cores, …
 _CALM: Final = 0.7  # … and below which each gets all cores.
-_LOOK_S: Final = 3.0
+_POLL_INTERVAL_S: Final = 3.0
 _KEPT: Final = 32
 _RATE_S: Final = 3.0  # Interval over which the load is measured.
 _GAIN: Final = 1.05  # Required gain of a change, because times fluctuate.
@@ -89,7 +89,7 @@ class Choice:
         """
         if now_s < self._next_s or not all(self._times_s.values()):
             return False
-        self._next_s = now_s + _LOOK_S
+        self._next_s = now_s + _POLL_INTERVAL_S
         if self.wide == self.many:
             self.why = f"{self._named(self.wide)}: the only mode"
             return False

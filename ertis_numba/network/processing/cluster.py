@@ -31,7 +31,7 @@ from ertis_numba.network.wakeup_socket import WakeupSocket
 __all__ = ["Cluster"]
 
 _CONNECT_S: Final = 10.0
-_LOOK_S: Final = 1.0
+_POLL_INTERVAL_S: Final = 1.0
 
 
 @dataclass(slots=True, eq=False)
@@ -242,7 +242,7 @@ class Cluster:
         while not self._closing.is_set():
             try:
                 threads = {str(address): int(count) for address, count in self._client.nthreads().items()}
-                reached = lines.connected(threads.keys() - set(self._members), timeout_s=_LOOK_S)
+                reached = lines.connected(threads.keys() - set(self._members), timeout_s=_POLL_INTERVAL_S)
             except Exception as error:  # noqa: BLE001  whatever it is, it may pass
                 if not self._closing.is_set():
                     self._emit_event(
@@ -251,7 +251,7 @@ class Cluster:
             else:
                 joined = [_Member(name, line, pid, threads[name]) for name, (line, pid) in reached.items()]
                 self._emit_event("members", threads, joined)
-            self._closing.wait(_LOOK_S)
+            self._closing.wait(_POLL_INTERVAL_S)
 
     def _emit_event(self, *event: Any) -> None:
         """Pass an event to the loop; other threads call this."""

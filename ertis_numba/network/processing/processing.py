@@ -64,7 +64,7 @@ class ImageProcessing:
         self._groups = Groups()
         self._publisher = Publisher(options, log)
         self._runner: Runner | None = None
-        self._quarantine: DeadLetterQueue | None = None
+        self._dead_letter_queue: DeadLetterQueue | None = None
         self._sensors = Sensors(options, log, describe=self._publisher.describe, prepare=self._prepare)
         self._n_jobs = 0
         self._predicted: dict[str, int] = {}  # Number of the kind whose error was predicted, by sensor.
@@ -72,7 +72,7 @@ class ImageProcessing:
         self._load = Load()
         self._took = Latencies()
         self._retried = self._quarantined = 0
-        self._pauses = CircuitBreaker()
+        self._circuit_breaker = CircuitBreaker()
         self._final: ProcessingStatus | None = None
 
     @property
@@ -104,7 +104,7 @@ class ImageProcessing:
             if self._options.expected is not None:
                 self._sensors.expect(self._options.expected)
             if self._options.quarantine is not None:
-                self._quarantine = DeadLetterQueue(self._options.quarantine, self._log)
+                self._dead_letter_queue = DeadLetterQueue(self._options.quarantine, self._log)
         except BaseException:
             self.close(0.0)
             raise
@@ -129,7 +129,7 @@ class ImageProcessing:
         self._load.add(now_s)
         kind = self._sensors.kind_of(data)
         self._emit_event(self._groups.add(data, arrived_ns))
-        paused = self._pauses.holds(data.sensor, now_s)
+        paused = self._circuit_breaker.holds(data.sensor, now_s)
         if kind is None or paused:
             self._queues.take_in(data)
             self._queues.drop(data, _PAUSED if paused else _UNUSABLE)
@@ -213,9 +213,9 @@ class ImageProcessing:
             self._runner.close()
             self._runner = None
         self._publisher.close()
-        if self._quarantine is not None:
-            self._quarantine.close()
-            self._quarantine = None
+        if self._dead_letter_queue is not None:
+            self._dead_letter_queue.close()
+            self._dead_letter_queue = None
         for counts in self._queues.counts.values():
             counts.queue = 0
             if counts.in_flight:
@@ -260,7 +260,7 @@ class ImageProcessing:
                 case FinishedJob(job=job, took_s=took_s):
                     self._took.add(1e3 * took_s)
                     self._order.done(job)
-                    self._pauses.succeeded(job.data.sensor)
+                    self._circuit_breaker.succeeded(job.data.sensor)
                     self._publish_of(job.data.sensor)
                     if job.tries:
                         self._publish(job)
@@ -293,7 +293,7 @@ class ImageProcessing:
 
     def _failed_twice(self, sensor: str) -> None:
         """Suspend a sensor after successive failures: each has cost workers two deadlines, ahead of all other jobs."""
-        pause_s = self._pauses.failed(sensor)
+        pause_s = self._circuit_breaker.failed(sensor)
         if pause_s:
             self._log.error("paused", sensor=sensor, text=f"{_PAUSED}; it is tried again in {pause_s:g} s")
             self._queues.drop_sensor(sensor, _PAUSED)
@@ -301,11 +301,11 @@ class ImageProcessing:
     def _keep(self, job: Job) -> None:
         """Put a measurement into the dead-letter queue."""
         self._quarantined += 1
-        if self._quarantine is None:
+        if self._dead_letter_queue is None:
             return
         entry = entry_of(job, self._sensors[job.data.sensor].settings)
         if entry is not None:
-            self._quarantine.put(entry)
+            self._dead_letter_queue.put(entry)
 
     def _publish_of(self, sensor: str) -> None:
         """Publish a sensor's finished images in the order of its measurements."""

@@ -9,7 +9,7 @@ import zmq
 from ertis_numba.errors import ArgumentError, NetworkError
 from ertis_numba.network import sockets
 from ertis_numba.network.zap_authenticator import EVERYBODY, ZapAuthenticator
-from tests.door import DESK, LISTED, LOOPBACK, PATIENCE_S, ROBOT, STRANGER, VIEWER, Door
+from tests.zap_clients import DESK, LISTED, LOOPBACK, PATIENCE_S, ROBOT, STRANGER, VIEWER, Door
 
 
 @pytest.fixture

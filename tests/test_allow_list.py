@@ -9,7 +9,7 @@ from ertis_numba.errors import SettingsError
 from ertis_numba.network.allow_list import Permission
 from ertis_numba.network.keys import ServerKeys
 from ertis_numba.network.zap_authenticator import ZapAuthenticator
-from tests.door import CENTRAL, DESK, LISTED, ROBOT, STRANGER, Door
+from tests.zap_clients import CENTRAL, DESK, LISTED, ROBOT, STRANGER, Door
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import direction_grid, microphones, unit_vectors
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Accuracy, Air, Array, Call, Processing, Settings
-from ertis_numba.stages.beam_grid import Aperture, BeamNodes
+from ertis_numba.stages.beam_grid import Aperture, BeamGrid
 from ertis_numba.stages.fitting import Spectrum
 from ertis_numba.stages.planner import Planner
 from ertis_numba.waveform import matched_noise_spectrum
@@ -49,8 +49,8 @@ def apertures(array, grid):
     return Aperture.of(ARRAYS_M[array], unit_vectors(axes.azimuth_rad, axes.elevation_rad))
 
 
-def nodes_of(aperture, n_taps, density, **more):
-    return BeamNodes(
+def beam_grid_of(aperture, n_taps, density, **more):
+    return BeamGrid(
         aperture,
         SPECTRUM,
         n_taps=n_taps,
@@ -63,7 +63,7 @@ def nodes_of(aperture, n_taps, density, **more):
 
 def predicted_db_of(aperture, n_taps, density):
     """Predicted error, weighted by the spectrum of the signals."""
-    return 10 * np.log10(nodes_of(aperture, n_taps, density, estimate=True).errors @ SPECTRUM.power)
+    return 10 * np.log10(beam_grid_of(aperture, n_taps, density, estimate=True).errors @ SPECTRUM.power)
 
 
 def beams_of(aperture, points, spectra):
@@ -78,7 +78,7 @@ def beams_of(aperture, points, spectra):
 def test_interpolated_beams_stay_within_the_predicted_error(array, grid, n_taps, density):
     """The microphones receive independent noise; the error is the mean over several noises."""
     aperture = apertures(array, grid)
-    nodes = nodes_of(aperture, n_taps, density)
+    nodes = beam_grid_of(aperture, n_taps, density)
     random = np.random.default_rng(5)
     wrong = right = 0.0
     for _ in range(4):
@@ -99,7 +99,7 @@ def test_interpolated_beams_stay_within_the_predicted_error(array, grid, n_taps,
 def test_interpolation_residual_equals_its_prediction(array):
     """Waves from all directions and their residuals add up to the mean error."""
     aperture = apertures(array, "half sphere")
-    rough = nodes_of(aperture, 4, 2.0, estimate=True)
+    rough = beam_grid_of(aperture, 4, 2.0, estimate=True)
     n_mics, n_directions = min(len(ARRAYS_M[array]), 40), min(len(aperture.directions), 40)
     assert rough.steering.shape == rough.wrong.shape == (n_mics, len(SPECTRUM.power), n_directions)
     assert_allclose(np.mean(np.abs(rough.wrong) ** 2, axis=(0, 2)), rough.errors)
@@ -114,8 +114,8 @@ def test_beam_grid_points_surround_every_direction(array):
     """At the rim of the half sphere, grid points lie outside of the unit circle."""
     aperture = apertures(array, "half sphere")
     spacing = aperture.spacing(2.0, high_hz=CALL.high_frequency_hz, sound_speed_m_s=SPEED_M_S)
-    nodes = nodes_of(aperture, 4, 2.0)
-    assert len(nodes.points) == aperture.count_nodes(spacing, 4) == len(np.unique(nodes.points.round(9), axis=0))
+    nodes = beam_grid_of(aperture, 4, 2.0)
+    assert len(nodes.points) == aperture.count_grid_points(spacing, 4) == len(np.unique(nodes.points.round(9), axis=0))
     assert sorted(nodes.rows) == list(range(len(aperture.directions)))
     assert np.linalg.norm(nodes.points, axis=1).max() > 1
     near = nodes.points[nodes.places[:, :, None] + np.arange(2)]
