@@ -64,7 +64,7 @@ RUN_BY = {
     ("view", "$"): ["test_view_command::test_commands_of_the_page_on_the_view_run"],
     ("view", "python"): ["test_view_command::test_commands_of_the_page_on_the_view_run"],
 }
-"""Which tests run what a page has to be run: lines that begin with a prompt, or blocks of Python."""
+"""Tests that run the code of each page: lines that begin with a prompt, or blocks of Python."""
 
 
 @pytest.fixture
@@ -75,7 +75,7 @@ def place(tmp_path, monkeypatch):
     return tmp_path
 
 
-# ---- all of it is run --------------------------------------------------------------------------------
+# ---- all code is run --------------------------------------------------------------------------------
 
 
 def test_all_code_of_the_guide_is_run():
@@ -205,7 +205,7 @@ def test_import_loads_no_submodules(place):
     assert not {"numpy", "scipy", "numba", "h5py", "zmq", "matplotlib"} & set(modules)
 
 
-# ---- all of it is named ------------------------------------------------------------------------------
+# ---- all names are listed ------------------------------------------------------------------------------
 
 
 def public():
