@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from ertis_bench import accuracy, checks, machine, paper, plans, scaling, simulation, subject, tables, timing
+from ertis_bench import accuracy, checks, machine, markdown, paper, plans, scaling, simulation, subject, tables, timing
 from ertis_cli.main import cli
 
 from ertis_numba import figures, kernels
@@ -135,23 +135,24 @@ def test_benchmark_refuses_another_strongest_reflector(image, shift):
 def test_update_refuses_a_file_without_markers(tmp_path):
     target = tmp_path / "a.md"
     with pytest.raises(ArgumentError, match=r"a\.md: .*No such file.*; give a readable Markdown file"):
-        tables.update(target, "paper", "x")
+        markdown.update(target, "ertis bench paper", "x")
     target.write_text(MARKED.format("scaling"), "utf-8")
     with pytest.raises(ArgumentError, match=r"no place for this table; .* <!-- ertis bench paper --> and <!-- /ertis"):
-        tables.update(target, "paper", "x")
-    tables.update(target, "scaling", "| new |\n")
-    tables.update(target, "scaling", "| new |")
+        markdown.update(target, "ertis bench paper", "x")
+    markdown.update(target, "ertis bench scaling", "| new |\n")
+    markdown.update(target, "ertis bench scaling", "| new |")
     assert target.read_text("utf-8") == MARKED.format("scaling").replace("old", "| new |")
 
 
 def test_partial_table_never_replaces_the_complete_one(tmp_path):
     target = tmp_path / "a.md"
-    target.write_text(MARKED.format("reliability"), "utf-8")
-    assert tables.place(target, "reliability") == ("reliability", "reliability")
-    with pytest.raises(ArgumentError, match=r"for this table; .* <!-- ertis bench reliability --only flips -->"):
-        tables.place(target, "reliability", ["flips"])
-    target.write_text(MARKED.format("reliability --only flips"), "utf-8")
-    assert tables.place(target, "reliability", ["flips"]) == ("reliability", "reliability --only flips")
+    target.write_text(MARKED.format("network"), "utf-8")
+    assert markdown.place(target, "ertis bench", ["network"]) == ("network", "ertis bench network")
+    with pytest.raises(ArgumentError, match=r"for this table; .* <!-- ertis bench network --only storage -->"):
+        markdown.place(target, "ertis bench", ["network"], ["storage"])
+    target.write_text(MARKED.format("network --only storage"), "utf-8")
+    placed = markdown.place(target, "ertis bench", ["network"], ["storage"])
+    assert placed == ("network", "ertis bench network --only storage")
 
 
 def test_file_without_markers_is_refused_before_measuring(tmp_path):

@@ -156,7 +156,7 @@ view rec.h5 --threshold 5
 bench nope
 bench paper --count 0
 bench paper --update nope.md
-bench reliability --only nope
+bench network --only nope
 completion tcsh
 devices --port x
 doctor now

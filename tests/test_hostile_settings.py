@@ -6,8 +6,6 @@ import time
 import zlib
 
 import pytest
-from ertis_bench.network import faults, hostile, tables
-from ertis_bench.network.hostile_hellos import hostile_texts
 
 from ertis_numba.documents import MAX_KEY_PARTS
 from ertis_numba.errors import ArgumentError, SettingsError
@@ -21,6 +19,9 @@ from ertis_numba.network.processing.chain import SharedPipeline
 from ertis_numba.settings import MAX_CALL_SAMPLES, Array, Call, Processing, Recording, Settings
 from ertis_numba.stages.memory import predicted_bytes
 from tests.central import Node, running, stored
+from tests.faults.network import hostile, table
+from tests.faults.network import run as faults
+from tests.faults.network.hostile_hellos import hostile_texts
 from tests.journals import TINY, entries
 
 
@@ -226,7 +227,7 @@ def test_hello_that_names_a_file_is_refused(tmp_path, directions):
 
 def test_hostile_hello_messages_are_refused(tmp_path):
     found = hostile.hellos(tmp_path, seed=1, count=30, alone_s=0.5)
-    assert tables.row("hellos", found)
+    assert table.row("hellos", found)
     assert (found["hellos"], found["taken"]) == (30, [])
     assert (found["lost"], found["twice"], found["wrong"], found["tracebacks"]) == (0, 0, 0, 0)
     assert found["stored"] == found["promised"] > 0
@@ -237,7 +238,7 @@ def test_hostile_hello_messages_are_refused(tmp_path):
 
 def test_hostile_files_are_refused(tmp_path):
     found = hostile.files(tmp_path, count=20)
-    assert tables.row("files", found)
+    assert table.row("files", found)
     assert found["reads"] == 3 * found["files"] == 60
     assert (found["taken"], found["failed"], found["crashes"]) == ([], [], [])
     assert found["memory grew, MB"] < 200

@@ -5,12 +5,12 @@ import subprocess
 import sys
 
 import pytest
-from ertis_bench import kills
 
 from ertis_numba.errors import JournalInUseError
 from ertis_numba.journal import Journal
 from ertis_numba.journal._database import PAGE_BYTES
 from ertis_numba.storage.sealing import seal
+from tests.faults import kills
 from tests.journals import ENVIRONMENT, TINY, crashed, create, entries, python, same
 
 OPEN = """

@@ -1,4 +1,4 @@
-"""Short form of `ertis bench network-faults`: killed nodes, failing disks and hostile connections.
+"""Short form of `python -m tests.faults network`: killed nodes, failing disks and hostile connections.
 
 The long form uses a new seed in each run; here the seed is fixed, so that a failure can be repeated.
 """
@@ -7,19 +7,8 @@ import shutil
 from dataclasses import replace
 
 import pytest
-from ertis_bench import machine, reliability
-from ertis_bench.network import (
-    faults,
-    faults_keys,
-    faults_kills,
-    faults_links,
-    faults_peers,
-    faults_processing,
-    faults_wire,
-    serving,
-    tables,
-    zmtp,
-)
+from ertis_bench import machine
+from ertis_bench.network import serving
 from ertis_bench.network.diary import Diary, DiaryKey, Row
 from ertis_bench.network.oracle import Sent, compare, read_diaries, read_folder
 from ertis_bench.network.processes import central
@@ -31,6 +20,9 @@ from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.network.messages import Group
 from ertis_numba.network.status import SensorStatus, Status
 from ertis_numba.storage import RecordingWriter, open_recording
+from tests.faults import reliability
+from tests.faults.network import keys, kills, links, peers, processing, table, wire, zmtp
+from tests.faults.network import run as faults
 from tests.files import noise
 
 SEED = 1
@@ -67,32 +59,32 @@ if "record" in sys.argv:
 
 def wrong_in(part, found):
     """Counts that should be 0 and are not; tests also check that they can be detected."""
-    assert all(tables.row(part, found))
+    assert all(table.row(part, found))
     return {name: found[name] for name in NOTHING_WRONG if name in found and found[name] != 0}
 
 
 def test_killed_central_nodes_lose_nothing(tmp_path):
-    found = faults_kills.centrals(tmp_path, seed=SEED, count=N_KILLS["centrals"], rate_hz=faults.SHORT.rate_hz)
+    found = kills.centrals(tmp_path, seed=SEED, count=N_KILLS["centrals"], rate_hz=faults.SHORT.rate_hz)
     assert wrong_in("centrals", found) == {}
     assert (found["orphans"], found["unacked"]) == (0, 0)
     assert found["stored"] == found["promised"] > 10 * N_KILLS["centrals"]
 
 
 def test_killed_sensor_nodes_lose_nothing(tmp_path):
-    found = faults_kills.nodes(tmp_path, seed=SEED, count=N_KILLS["nodes"])
+    found = kills.nodes(tmp_path, seed=SEED, count=N_KILLS["nodes"])
     assert wrong_in("nodes", found) == {}
     assert (found["in_spool"], found["orphans"]) == (0, 0)
     assert found["promised"] > 5 * N_KILLS["nodes"]
 
 
 def test_killed_sealing_processes_lose_nothing(tmp_path):
-    found = faults_kills.sealings(tmp_path, seed=SEED, count=2)
+    found = kills.sealings(tmp_path, seed=SEED, count=2)
     assert wrong_in("sealings", found) == {}
     assert found["kills"] == 2
 
 
 def test_killed_workers_lose_nothing(tmp_path):
-    found = faults_processing.workers(tmp_path, seed=SEED, count=N_KILLS["workers"])
+    found = processing.workers(tmp_path, seed=SEED, count=N_KILLS["workers"])
     assert wrong_in("workers", found) == {}
     assert {name: found[name] for name in ("unbalanced", "uncounted", "untold", "disordered", "foreign")} == {
         "unbalanced": 0, "uncounted": 0, "untold": 0, "disordered": 0, "foreign": 0,
@@ -110,7 +102,7 @@ def test_full_disk_loses_nothing(tmp_path):
     with reliability.small_disk(disk) as mounted:
         if mounted is None:
             pytest.skip("only root may mount a small disk")
-        found = faults_links.disk_full(tmp_path, mounted, seed=SEED)
+        found = links.disk_full(tmp_path, mounted, seed=SEED)
     assert wrong_in("disk_full", found) == {}
     assert (found["state"], found["acked in fault"]) == ("fault", 0)
     assert found["offered"] == found["stored"] > found["acked before"] > 0
@@ -118,21 +110,21 @@ def test_full_disk_loses_nothing(tmp_path):
 
 
 def test_failing_disk_loses_nothing(tmp_path):
-    found = faults_links.disk_fails(tmp_path, seed=SEED)
+    found = links.disk_fails(tmp_path, seed=SEED)
     assert wrong_in("disk_fails", found) == {}
     assert (found["state"], found["acked in fault"]) == ("fault", 0)
     assert found["offered"] == found["stored"] > found["acked before"] > 0
 
 
 def test_lost_acks_and_dead_cables_lose_nothing(tmp_path):
-    found = faults_links.meddled(tmp_path, seed=SEED, duration_s=2.0)
+    found = links.meddled(tmp_path, seed=SEED, duration_s=2.0)
     assert wrong_in("meddled", found) == {}
     assert found["flushed"]
     assert {"ack lose", "ack repeat", "ack delay"} <= found["meddled"].keys()
 
 
 def test_keys_are_enforced(tmp_path):
-    found = faults_keys.keys(tmp_path, seed=SEED)
+    found = keys.keys(tmp_path, seed=SEED)
     assert found["let in"] == ["the listed application", "the listed sensor"]
     assert found["raw"] == 0
     assert found["removed, s"] < 1.0
@@ -143,7 +135,7 @@ def test_keys_are_enforced(tmp_path):
 
 
 def test_malformed_messages_harm_nothing(tmp_path):
-    found = faults_peers.fuzzed(tmp_path, seed=SEED, count=10_000)
+    found = peers.fuzzed(tmp_path, seed=SEED, count=10_000)
     assert wrong_in("fuzzed", found) == {}
     assert (found["inputs"], found["restarts"], found["exit code"]) == (10_000, 0, 0)
     assert found["answers"] > 100
@@ -152,7 +144,7 @@ def test_malformed_messages_harm_nothing(tmp_path):
 
 
 def test_flipped_bits_end_only_their_encrypted_connections(tmp_path):
-    found = faults_wire.flips(tmp_path, seed=SEED, count=faults.SHORT.n_flips)
+    found = wire.flips(tmp_path, seed=SEED, count=faults.SHORT.n_flips)
     assert wrong_in("flips", found) == {}
     assert (found["flips"], found["restarts"], found["sockets left"]) == (faults.SHORT.n_flips, 0, 0)
     assert found["flushed"]
@@ -160,7 +152,7 @@ def test_flipped_bits_end_only_their_encrypted_connections(tmp_path):
 
 
 def test_killed_nodes_do_not_end_a_lagging_central_node(tmp_path):
-    found = faults_wire.gone(tmp_path, seed=SEED, count=faults.SHORT.n_gone)
+    found = wire.gone(tmp_path, seed=SEED, count=faults.SHORT.n_gone)
     assert wrong_in("gone", found) == {}
     assert (found["kills"], found["restarts"], found["sockets left"]) == (faults.SHORT.n_gone, 0, 0)
     assert found["promised"] > faults.SHORT.n_gone
@@ -172,16 +164,16 @@ def test_checker_detects_a_faulty_node(tmp_path, monkeypatch):
     (tmp_path / "spoiling").mkdir()
     (tmp_path / "spoiling" / "sitecustomize.py").write_text(SPOILING)
     monkeypatch.syspath_prepend(str(tmp_path / "spoiling"))
-    record = faults_kills.RestartedRecorder(tmp_path)
+    record = kills.RestartedRecorder(tmp_path)
     diary = tmp_path / "sender.ndjson"
     with SenderJob(address=record.address, diary=str(diary), count=8, rate_hz=100.0).start() as sender:
         sender.wait_for("begun")
         record.finish([sender])
-    found = faults_kills.judged(tmp_path, record.archive, [diary])
+    found = kills.judged(tmp_path, record.archive, [diary])
     assert (found["lost"], found["wrong"], found["silent"]) == (1, 1, 1)
     (recording,) = record.archive.glob("*.h5")
     shutil.copy(recording, record.archive / "again.h5")
-    assert faults_kills.judged(tmp_path, record.archive, [diary])["twice"] == 7
+    assert kills.judged(tmp_path, record.archive, [diary])["twice"] == 7
 
 
 @pytest.fixture(scope="module")
@@ -316,15 +308,15 @@ def test_mixed_groups_are_detected():
         )
     ]
     at = {"lost": 2, "double": 3, "clock": 4}
-    found = faults_processing.grouped(came, pulse_of, at, n_sensors=2, count=6)
+    found = processing.grouped(came, pulse_of, at, n_sensors=2, count=6)
     assert (found["complete"], found["mixed"], found["clock flags after"], found["flagged pulses"]) == (2, 1, 1, [3])
-    assert all(tables.row("groups", found))
+    assert all(table.row("groups", found))
 
 
 def test_part_that_could_not_run_is_reported():
-    assert tables.row("hosts", None)[2] == "not tried: requires root"
+    assert table.row("hosts", None)[2] == "not tried: requires root"
     report = {"machine": machine.describe(), "seed": 3, "long": False, "only": ["hosts"], "hosts": None}
-    assert "Command: `ertis bench network-faults --only hosts --seed 3`." in tables.network_faults(report)
+    assert "Command: `python -m tests.faults network --only hosts --seed 3`." in table.network(report)
 
 
 def test_frames_are_joined_from_any_chunks():
@@ -338,7 +330,7 @@ def test_frames_are_joined_from_any_chunks():
 
 
 def test_parts_match_their_descriptions():
-    assert set(faults.PARTS) == set(tables.ROWS)
+    assert set(faults.PARTS) == set(table.ROWS)
 
 
 def test_node_that_does_not_start_is_reported(tmp_path):

@@ -6,11 +6,12 @@ import subprocess
 import sys
 
 import pytest
-from ertis_bench import powercuts, reliability_tables
-from ertis_bench.network import tables
-from ertis_bench.powercuts import log as logs
-from ertis_bench.powercuts.disk import Disk
-from ertis_bench.powercuts.log import DiskOperation, DiskRecord
+
+from tests.faults import powercuts, reliability_table
+from tests.faults.network import table
+from tests.faults.powercuts import log as logs
+from tests.faults.powercuts.disk import Disk
+from tests.faults.powercuts.log import DiskOperation, DiskRecord
 
 SEED = 1
 N_STATES = {"capture": 24, "record": 40, "spool": 36}
@@ -39,10 +40,10 @@ def test_power_cuts_without_a_compiler_are_reported_as_not_tried(tmp_path, monke
     found = powercuts.try_cuts(tmp_path, seed=SEED, count=1)
     assert found == {"reason": "power cuts need Linux and a C compiler; install gcc"}
     reported = f"not tried: {found['reason']}"
-    assert tables.row("power_cuts", found)[2] == reported
+    assert table.row("power_cuts", found)[2] == reported
     report = {"power_cuts": found, "machine": {}, "seed": SEED, "long": False, "only": []}
-    monkeypatch.setattr(reliability_tables, "sentence", lambda _: "")
-    assert reported in reliability_tables.reliability(report)
+    monkeypatch.setattr(reliability_table, "sentence", lambda _: "")
+    assert reported in reliability_table.reliability(report)
 
 
 class RecordedDisk:

@@ -7,13 +7,13 @@ import zlib
 
 import numpy as np
 import pytest
-from ertis_bench import wire_faults
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ertis_numba.devices.blocks import FOOTER, HEADER
 from ertis_numba.devices.emulator.faults import KINDS
 from ertis_numba.devices.protocol import BlockParser, BlockReceiver
+from tests.faults import wire_faults
 from tests.wire import N_BYTES, N_SAMPLES, at, block_of, counters, reported
 
 WORD = struct.Struct("<I")

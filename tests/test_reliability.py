@@ -1,10 +1,10 @@
-"""Data loss under faults: the short form of the one-hour run of `ertis bench reliability --long`."""
+"""Data loss under faults: the short form of the one-hour run of `python -m tests.faults reliability --long`."""
 
 import pytest
-from ertis_bench import captures, reliability
-from ertis_bench.flips import flips
 
 from ertis_numba.errors import DataError
+from tests.faults import captures, reliability
+from tests.faults.flips import flips
 
 SHORT = reliability.SHORT
 SOURCE = reliability.ONE_SENSOR

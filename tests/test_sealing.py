@@ -10,7 +10,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from ertis_bench import kills
 
 from ertis_numba import atomic_files
 from ertis_numba.errors import ArgumentError, DataError, JournalInUseError
@@ -19,6 +18,7 @@ from ertis_numba.storage import RecordingWriter, open_recording, sensor_names, w
 from ertis_numba.storage._gaps import UNKNOWN, SequenceNumbers
 from ertis_numba.storage.sealing import seal
 from ertis_numba.storage.sealing_process import IN_USE, NO_MEASUREMENTS, main
+from tests.faults import kills
 from tests.journals import ENVIRONMENT, EPOCH, TINY, crashed, create, entries, python
 from tests.test_journal_damage import spoil
 

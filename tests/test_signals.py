@@ -1,4 +1,4 @@
-"""Signals sent to commands: the short form of the run of `ertis bench reliability --long`."""
+"""Signals sent to commands: the short form of the run of `python -m tests.faults reliability --long`."""
 
 import os
 import signal
@@ -7,10 +7,10 @@ import sys
 import textwrap
 
 import pytest
-from ertis_bench import signals
-from ertis_bench.reliability import ONE_SENSOR
 from ertis_cli.main import COMMANDS
 
+from tests.faults import signals
+from tests.faults.reliability import ONE_SENSOR
 from tests.journals import ENVIRONMENT
 
 SEED = 1

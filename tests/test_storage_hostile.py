@@ -4,11 +4,11 @@ import re
 
 import h5py
 import pytest
-from ertis_bench.network.hostile_files import hostile_files, write_good
 
 from ertis_numba.errors import DataError, ForeignDataError
 from ertis_numba.storage import open_recording, structure
 from ertis_numba.storage.verify import verify
+from tests.faults.network.hostile_files import hostile_files, write_good
 
 REFUSED = {
     "link: pdm in another file": r"/sensors/front/pdm is a link into the file 'other.h5'; copy the data into one file",

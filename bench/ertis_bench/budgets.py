@@ -12,9 +12,10 @@ from typing import Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_bench import captures, machine
+from ertis_bench import machine
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table
+from ertis_bench.network.processes import ask
 from ertis_bench.random_settings import Limits, recorded
 from ertis_numba import verification
 from ertis_numba.air import sound_speed_m_s
@@ -85,7 +86,7 @@ def tried(seed: int) -> dict[str, Any] | None:
     with tempfile.TemporaryDirectory() as folder:
         recording, target = Path(folder) / "rec.h5", Path(folder) / "image.h5"
         write_recording(recording, [measurement])
-        done = captures.ertis("process", str(recording), "-o", str(target), "--device", "cpu", "--quiet")
+        done = ask("process", str(recording), "-o", str(target), "--device", "cpu", "--quiet")
         if done.returncode:
             if "max_error_db" in done.stderr and "smallest error" in done.stderr:
                 return None

@@ -1,8 +1,6 @@
 """Reports as Markdown, and their places in files."""
 
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
-from pathlib import Path
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from ertis_bench import timing
@@ -13,35 +11,28 @@ from ertis_bench.health.table import health
 from ertis_bench.machine import sentence
 from ertis_bench.many import many
 from ertis_bench.markdown import table as _table
-from ertis_bench.network.tables import network, network_faults
+from ertis_bench.network.table import network
 from ertis_bench.paper import DIRECTIONS, PUBLISHED_MS
 from ertis_bench.points import form as points
 from ertis_bench.ptx_tables import ptx
-from ertis_bench.reliability_tables import reliability
 from ertis_bench.verification import form as verification
-from ertis_numba.errors import ArgumentError
 from ertis_numba.verification import PEAKS
 
 __all__ = [
     "FORMS",
     "accuracy",
     "accuracy_front",
-    "around",
     "factorisation",
     "gpu",
     "gpu_short",
     "health",
     "many",
     "network",
-    "network_faults",
     "paper",
-    "place",
     "points",
     "ptx",
-    "reliability",
     "scaling",
     "simulation",
-    "update",
 ]
 
 _MEANING = {
@@ -49,59 +40,6 @@ _MEANING = {
     "numpy": "`numpy`: this package's algorithm, NumPy and SciPy",
     "cpu": "`cpu`: this package's algorithm, Numba",
 }
-
-
-def update(path: Path, name: str, text: str) -> None:
-    """Replace the text between the marker ``<!-- ertis bench NAME -->`` and its end in a file.
-
-    Raises
-    ------
-    ArgumentError
-        The file cannot be read, or does not contain the markers.
-    """
-    head, tail = around(path, name)
-    path.write_text(f"{head}\n{text.strip()}\n{tail}", encoding="utf-8")
-
-
-def around(path: Path, name: str) -> tuple[str, str]:
-    """Return a file's text up to the end of the first marker, and from the second marker on.
-
-    Raises
-    ------
-    ArgumentError
-        As in `update`. Callers can therefore refuse a file before they measure.
-    """
-    begin, end = f"<!-- ertis bench {name} -->", f"<!-- /ertis bench {name} -->"
-    try:
-        content = path.read_text("utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ArgumentError(f"{path}: {error}; give a readable Markdown file") from error
-    head, found, rest = content.partition(begin)
-    _, closed, tail = rest.partition(end)
-    if not (found and closed):
-        raise ArgumentError(f"{path} has no place for this table; give a file with the lines {begin} and {end}")
-    return head + begin, end + tail
-
-
-def place(path: Path, command: str, parts: Sequence[str] = ()) -> tuple[str, str]:
-    """Return the form of a command's table for which a file has markers, and the name in these markers.
-
-    Selected parts of a benchmark have their own markers, ``ertis bench NAME --only PART``, so that they never replace
-    the table of all parts.
-
-    Raises
-    ------
-    ArgumentError
-        As in `around`.
-    """
-    markers = {form: " ".join([form, *(f"--only {part}" for part in parts)]) for form in FORMS[command]}
-    first, *others = markers
-    for form in others:
-        with suppress(ArgumentError):
-            around(path, markers[form])
-            return form, markers[form]
-    around(path, markers[first])
-    return first, markers[first]
 
 
 def paper(report: dict[str, Any]) -> str:
@@ -338,9 +276,7 @@ FORMS: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
     "many": {"many": many},
     "factorisation": {"factorisation": factorisation},
     "ptx": {"ptx": ptx},
-    "reliability": {"reliability": reliability},
     "network": {"network": network},
-    "network-faults": {"network-faults": network_faults},
     "gpu": {"gpu": gpu, "gpu short": gpu_short},
     "health": {"health": health},
     "accuracy": {"accuracy": accuracy, "accuracy front": accuracy_front},

@@ -276,26 +276,6 @@ def of_health(**given: Any) -> None:
 
 
 @bench.command()
-@click.option("--long", is_flag=True, help="Run for an hour instead of a minute.")
-@click.option("--seed", type=click.IntRange(min=0), metavar="S", help="Seed of the failures; random by default.")
-@click.option(
-    "--only", multiple=True, metavar="PART", help="Run only this part, such as sustained, chain or wire; repeatable."
-)
-@_update
-@options.quiet
-@options.as_json
-def reliability(*, only: tuple[str, ...], **given: Any) -> None:
-    """Test failures: transmission faults, unplugged sensors, kill -9 and full disks; nothing is timed."""
-    from ertis_bench import reliability as benchmark
-
-    from ertis_numba import checks
-
-    for part in only:
-        checks.choice("--only", part, benchmark.PARTS)
-    _run("reliability", benchmark, only=only, **given)
-
-
-@bench.command()
 @click.option(
     "--duration",
     "duration_s",
@@ -330,26 +310,6 @@ def network(*, only: tuple[str, ...], **given: Any) -> None:
 
 
 @bench.command()
-@click.option("--long", is_flag=True, help="Run for two hours instead of two minutes.")
-@click.option("--seed", type=click.IntRange(min=0), metavar="S", help="Seed of the failures; random by default.")
-@click.option(
-    "--only", multiple=True, metavar="PART", help="Run only this part, such as centrals, nodes or keys; repeatable."
-)
-@_update
-@options.quiet
-@options.as_json
-def network_faults(*, only: tuple[str, ...], **given: Any) -> None:
-    """Test network failures: kill -9, bad disks and cables, wrong keys and overload; nothing is timed."""
-    from ertis_bench.network import faults as benchmark
-
-    from ertis_numba import checks
-
-    for part in only:
-        checks.choice("--only", part, benchmark.PARTS)
-    _run("network-faults", benchmark, only=only, **given)
-
-
-@bench.command()
 @click.option(
     "--results",
     type=click.Path(path_type=Path, file_okay=False),
@@ -374,15 +334,17 @@ def gpu(*, newest: bool, **given: Any) -> None:
 def _run(
     name: str, benchmark: ModuleType, *, targets: tuple[Path, ...], quiet: bool, as_json: bool, **given: Any
 ) -> dict[str, Any]:
-    from ertis_bench import tables
+    from ertis_bench import markdown, tables
 
     parts = given.get("only", ())
-    places = [(target, *tables.place(target, name, parts)) for target in targets]  # refuse before minutes of work
+    forms = tables.FORMS[name]
+    # Files without a place are refused before minutes of work.
+    places = [(target, *markdown.place(target, "ertis bench", forms, parts)) for target in targets]
     report: dict[str, Any] = benchmark.run(say=lambda text: options.say(text, quiet=quiet), **given)
     for target, form, marker in places:
-        tables.update(target, marker, tables.FORMS[name][form](report))
+        markdown.update(target, marker, forms[form](report))
     if as_json:
         options.print_json(report)
     elif not targets:
-        click.echo(tables.FORMS[name][name](report))
+        click.echo(forms[name](report))
     return report

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from ertis_bench import h200, instructions, ptx, tables
+from ertis_bench import h200, instructions, markdown, ptx, tables
 from ertis_cli.main import cli
 
 DOCS = Path(__file__).parents[2] / "docs" / "explanation" / "gpu.md"
@@ -67,7 +67,7 @@ def test_resident_warps_are_computed(registers, warps_per_block, wanted):
 
 
 def test_gpu_documentation_matches_the_compiled_code(report):
-    head, tail = tables.around(DOCS, "ptx")
+    head, tail = markdown.around(DOCS, "ertis bench ptx")
     published = DOCS.read_text("utf-8").removeprefix(head).removesuffix(tail)
     (made,) = re.findall(r"^Counts are from code for compute capability 9\.0 \((.+)\)\.", published, re.MULTILINE)
     here = ", ".join(f"{name} {number}" for name, number in report["compiled"].items())

@@ -1,1 +1,1 @@
-"""Benchmarks of the network: figures, faults, and the oracle that verifies them."""
+"""Benchmark of the network, and the oracle that verifies it."""

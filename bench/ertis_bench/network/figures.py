@@ -10,8 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from ertis_bench import machine
-from ertis_bench.network.faults_kills import judged
-from ertis_bench.network.oracle import read_diaries
+from ertis_bench.network.oracle import judged, read_diaries
 from ertis_bench.network.processes import JsonLinesProcess, central, survivors, until
 from ertis_bench.network.receiver import ReceiverJob, read_received
 from ertis_bench.network.sender import SETTINGS, SenderJob

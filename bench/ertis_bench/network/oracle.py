@@ -11,14 +11,14 @@ from collections.abc import Iterable, Iterator
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from ertis_bench.network.diary import DiaryKey, Row
 from ertis_numba.errors import ErtisError
 from ertis_numba.frames import Measurement
 from ertis_numba.storage import RecordingGap, open_recording, sensor_names
 
-__all__ = ["Archived", "Sent", "compare", "note", "read_diaries", "read_folder"]
+__all__ = ["Archived", "Sent", "compare", "judged", "note", "read_diaries", "read_folder", "tracebacks"]
 
 _UNEXPLAINED: Final = "not among the measurements given"  # reason in recordings for unexplained gaps
 
@@ -186,4 +186,32 @@ def compare(sent: Sent, archived: Archived, promised: AbstractSet[DiaryKey]) -> 
         "silent": sum(key not in rows and archived.reason(key) is None for key in numbers),
         "broken": len(archived.broken),
         "left_over": len(archived.left_over),
+    }
+
+
+def tracebacks(folder: Path) -> int:
+    """Return the number of tracebacks in the output of a trial."""
+    return sum(path.read_text(errors="replace").count("Traceback (most") for path in folder.glob("*.txt"))
+
+
+def judged(folder: Path, archive: Path, diaries: list[Path], *, kept: list[Path] | None = None) -> dict[str, Any]:
+    """Compare the sent measurements with the stored ones.
+
+    Parameters
+    ----------
+    folder, archive : Path
+        Folders of the trial and of the recordings.
+    diaries : list of Path
+        Diaries of all senders.
+    kept : list of Path, optional
+        Diaries of senders whose kept measurements must all be stored; all diaries by default. From other senders, only
+        acknowledged measurements must be stored.
+    """
+    sent = read_diaries(diaries)
+    surely: Sent = sent if kept is None else read_diaries(kept)
+    promised = surely.kept | sent.acked()
+    return compare(sent, read_folder(archive), promised) | {
+        "offered": len(sent.offered),
+        "acked": len(sent.acked()),
+        "tracebacks": tracebacks(folder),
     }

@@ -199,8 +199,7 @@ def central(
     *options: str,
     listen: str = "tcp://127.0.0.1:*",
     mark: str = "",
-    max_lines: int | None = None,
-    busy: bool = False,
+    ertis: Sequence[str] = ERTIS,
 ) -> JsonLinesProcess:
     """Start ``ertis record`` or ``ertis serve``, with stderr in ``central.txt`` of a folder.
 
@@ -212,14 +211,9 @@ def central(
     *options : str
     listen : str
     mark : str
-    max_lines : int, optional
-        Number of lines of its code after which the process is killed.
-    busy : bool
-        If True, SIGUSR1 blocks its event loop, see `ertis_bench.network.busy`.
+    ertis : sequence of str
+        Command that runs ``ertis``.
     """
-    ertis = ERTIS if max_lines is None else (sys.executable, "-m", "ertis_bench.network.trap", str(max_lines))
-    if busy:
-        ertis = (sys.executable, "-m", "ertis_bench.network.busy")
     line = [*ertis, command, "--listen", listen, *options, "--json", "--quiet"]
     return JsonLinesProcess(line, stated=folder / "central.txt", mark=mark)
 

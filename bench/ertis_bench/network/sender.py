@@ -11,6 +11,7 @@ import signal
 import sys
 import time
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -22,7 +23,6 @@ from numpy.typing import NDArray
 
 from ertis_bench.network.diary import Diary, DiaryKey, Row
 from ertis_bench.network.processes import JsonLinesProcess
-from ertis_bench.network.trap import set_trap
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.journal import JournalEntry
 from ertis_numba.network.keys import ClientKeys, KeyPair
@@ -70,8 +70,6 @@ class SenderJob:
         that they count twice, so that a number is left out.
     clock_step : (number, seconds), optional
         Pulse from which the clock is wrong, and its error.
-    max_lines : int, optional
-        Number of lines of code of nodes and journals after which the sender is killed.
     start_s : float, optional
         Start time on the clock of `time.monotonic`.
     """
@@ -94,7 +92,6 @@ class SenderJob:
     lost_pulse: int | None = None
     double_pulse: int | None = None
     clock_step: tuple[int, float] | None = None
-    max_lines: int | None = None
     start_s: float | None = None
 
     def replace(self, **changes: Any) -> Self:
@@ -110,9 +107,9 @@ class SenderJob:
         """Return the command that runs the sender."""
         return [sys.executable, "-m", "ertis_bench.network.sender", json.dumps(asdict(self))]
 
-    def start(self, *, mark: str = "") -> JsonLinesProcess:
-        """Start the sender. Its stderr goes to a file beside its diary."""
-        return JsonLinesProcess(self.command(), stated=Path(self.diary).with_suffix(".txt"), mark=mark)
+    def start(self, command: Sequence[str] | None = None, *, mark: str = "") -> JsonLinesProcess:
+        """Start the sender, or a variant of its command. Its stderr goes to a file beside its diary."""
+        return JsonLinesProcess(command or self.command(), stated=Path(self.diary).with_suffix(".txt"), mark=mark)
 
 
 def words_of(base: NDArray[np.uint32], session_id: int, sequence: int) -> NDArray[np.uint32]:
@@ -225,8 +222,6 @@ def main(job: SenderJob) -> None:
     keys = None if job.keys is None else ClientKeys(pair=KeyPair.load(Path(job.keys[0])), server=job.keys[1])
     sender = _Sender(job, SMALL if job.small else SETTINGS, Diary(Path(job.diary)))
     signal.signal(signal.SIGTERM, partial(_stop, sender))
-    if job.max_lines is not None:
-        set_trap(job.max_lines)
     with SensorNode(
         job.address,
         keys=keys,

@@ -1,0 +1,1 @@
+"""Trials of faults: kills, power cuts, damaged files, bad lines and hostile peers; ``make soak`` runs them."""

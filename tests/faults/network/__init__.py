@@ -1,0 +1,1 @@
+"""Trials of a network of sensor nodes, a central node and applications."""

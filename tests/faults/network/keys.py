@@ -1,0 +1,199 @@
+"""Trials of access control with invalid and valid keys.
+
+Each wrong key and role is tried at both addresses of a central node, together with the right ones.
+"""
+
+import contextlib
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from ertis_bench.network.diary import Diary, DiaryKey, Row
+from ertis_bench.network.oracle import judged
+from ertis_bench.network.processes import central, until
+from ertis_bench.network.sender import SMALL
+
+from ertis_numba.errors import ErtisError
+from ertis_numba.frames import Measurement, Stamp
+from ertis_numba.journal import JournalEntry
+from ertis_numba.network.allow_list import AllowList, Permission
+from ertis_numba.network.keys import ClientKeys, KeyPair
+from ertis_numba.network.sensor_node import SensorNode
+from ertis_numba.network.subscriber import Subscriber
+from tests.faults.network.links import state_of
+from tests.faults.network.zmtp import ZmtpPeer
+
+__all__ = ["keys"]
+
+_TRIED_S: Final = 2.5  # long enough for several refusals of a wrong key
+_REMOVED_S: Final = 2.0
+_INTERVAL_S: Final = 0.02
+Found = dict[str, Any]
+
+
+@dataclass(slots=True, kw_only=True)
+class _Client:
+    """Sensor node that must be accepted or refused."""
+
+    node: SensorNode
+    sensor: str
+    diary: Diary
+    session_id: int
+    sent: int = 0
+    acked_through: int = -1
+    acked_s: float = 0.0
+    notes: list[str] = field(default_factory=list)
+
+    def note_acked(self, message: Any) -> None:
+        """Record an acknowledgement, with its time."""
+        self.acked_through, self.acked_s = max(self.acked_through, message.acked_through), time.monotonic()
+        self.diary.acked_through(
+            message.sensor, message.session_id, message.acked_through, message.status, time.monotonic_ns()
+        )
+
+    def send(self) -> None:
+        """Hand over one measurement."""
+        words = np.random.default_rng([self.session_id, self.sent]).integers(0, 2**32, 32_768, dtype=np.uint32)
+        measurement = Measurement(
+            words, SMALL, Stamp(sensor=self.sensor, sequence=self.sent, session_id=self.session_id)
+        )
+        now_ns, key = time.monotonic_ns(), DiaryKey(self.sensor, self.session_id, self.sent)
+        self.diary.offered(key, Row.of(measurement), now_ns)
+        self.node.append([JournalEntry(measurement, monotonic_ns=now_ns)])
+        self.diary.kept(key)
+        self.sent += 1
+
+
+def keys(folder: Path, *, seed: int) -> Found:
+    """Try all keys.
+
+    Returns
+    -------
+    dict
+        ``let in``, names of nodes that were accepted. ``refused``, refusals by reason, as the central node counts them.
+        ``notes``, messages to the refused nodes. ``removed, s``, seconds from the removal of a key to the last
+        acknowledgement to its owner. Also results for the recordings, which may contain the listed sensor only.
+    """
+    archive, allowed = folder / "recordings", folder / "allow.toml"
+    archive.mkdir()
+    pairs = {name: KeyPair.new(name) for name in ("central", "front", "stranger", "viewer", "leaver", "boss")}
+    for pair in pairs.values():
+        pair.save(folder / "keys")
+    listed = (
+        Permission(name="front", public=pairs["front"].public, role="sensor", serials=("front",)),
+        Permission(name="leaver", public=pairs["leaver"].public, role="sensor", serials=("leaver",)),
+        Permission(name="viewer", public=pairs["viewer"].public, role="application"),
+        Permission(name="boss", public=pairs["boss"].public, role="admin"),
+    )
+    AllowList(keys=listed).save(allowed)
+    options = ["--key", str(folder / "keys" / "central.secret.toml"), "--allow", str(allowed), "--workers", "1"]
+    options += ["--publish", "tcp://127.0.0.1:*", "--record", str(archive), "--directions", "2d:9"]
+    with ExitStack() as stack:
+        node = stack.enter_context(central("serve", folder, *options))
+        listening = node.wait_for("listening")
+        server = pairs["central"].public
+        right = {name: ClientKeys(pair=pair, server=server) for name, pair in pairs.items()}
+        wrong_server = ClientKeys(pair=pairs["front"], server=pairs["stranger"].public)
+        address = listening["address"]
+        cases: dict[str, tuple[str, ClientKeys | None]] = {
+            "the listed sensor": ("front", right["front"]),
+            "a listed sensor, until it is removed": ("leaver", right["leaver"]),
+            "no key": ("front", None),
+            "an unknown key": ("front", right["stranger"]),
+            "the wrong server key": ("front", wrong_server),
+            "an application that sends": ("front", right["viewer"]),
+            "a sensor that sends for another": ("rear", right["front"]),
+        }
+        diaries = {name: folder / f"{number}.ndjson" for number, name in enumerate(cases)}
+        tries = {
+            name: _start_client(stack, address, sensor, given, diaries[name], session_id=seed + number)
+            for number, (name, (sensor, given)) in enumerate(cases.items())
+        }
+        _send(list(tries.values()), _TRIED_S)
+        watchers = {
+            "no key that subscribes": None,
+            "an unknown key that subscribes": right["stranger"],
+            "a sensor that subscribes": right["front"],
+            "the listed application": right["viewer"],
+        }
+        let_in = _receivers(listening["publish"], watchers, tries["the listed sensor"])
+        removed_s = time.monotonic()
+        allowed_list = AllowList.load(allowed).remove("leaver")
+        allowed_list.save(allowed)
+        _send([tries["the listed sensor"], tries["a listed sensor, until it is removed"]], _REMOVED_S)
+        leaver = tries.pop("a listed sensor, until it is removed")
+        after_s = leaver.acked_s - removed_s
+        raw = _accepts_without_keys(address) + _accepts_without_keys(listening["publish"])
+        boss = ("--key", str(folder / "keys" / "boss.secret.toml"), "--server-key", server)
+        status = state_of(address, *boss)
+        until(lambda: tries["the listed sensor"].acked_through >= tries["the listed sensor"].sent - 1)
+        let_in += [name for name, each in tries.items() if each.acked_through >= 0]
+        notes = sorted({note for name, each in tries.items() if name not in let_in for note in each.notes})
+        node.stop()
+    wanted = [diaries["the listed sensor"]]
+    found = judged(folder, archive, [*wanted, diaries["a listed sensor, until it is removed"]], kept=wanted)
+    return {
+        "tried": len(cases) + len(watchers) + 2,
+        "let in": sorted(let_in),
+        "raw": raw,
+        "refused": status["refused"],
+        "notes": notes,
+        "unsettled when removed": leaver.sent - 1 - leaver.acked_through,
+        "removed, s": round(max(0.0, after_s), 2),
+    } | found
+
+
+def _start_client(
+    stack: ExitStack, address: str, sensor: str, given: ClientKeys | None, diary: Path, *, session_id: int
+) -> _Client:
+    """Start a sensor node."""
+    notes: list[str] = []
+    node = stack.enter_context(
+        SensorNode(
+            address,
+            keys=given,
+            on_acked=lambda message: made.note_acked(message),  # noqa: PLW0108  it is made below
+            on_note=lambda *texts: notes.append(": ".join(texts)),
+        )
+    )
+    made = _Client(node=node, sensor=sensor, diary=Diary(diary), session_id=session_id, notes=notes)
+    node.add_sensor(sensor, SMALL)
+    return made
+
+
+def _send(tries: Sequence[_Client], duration_s: float) -> None:
+    """Send measurements of all nodes in turns for some time."""
+    end_s = time.monotonic() + duration_s
+    while time.monotonic() < end_s:
+        for each in tries:
+            each.send()
+        time.sleep(_INTERVAL_S * len(tries))
+
+
+def _receivers(address: str, watchers: dict[str, ClientKeys | None], sender: _Client) -> list[str]:
+    """Return the names of receivers that receive anything while the listed sensor sends."""
+    found = set()
+    with ExitStack() as stack:
+        subscribers = {
+            name: stack.enter_context(Subscriber(address, products=("energyscape",), keys=given))
+            for name, given in watchers.items()
+        }
+        end_s = time.monotonic() + _TRIED_S
+        while time.monotonic() < end_s:
+            sender.send()
+            for name, subscriber in subscribers.items():
+                with contextlib.suppress(ErtisError):  # The receiver may raise an error for the refusal.
+                    if subscriber.receive(timeout_s=0.02) is not None:
+                        found.add(name)
+    return sorted(found)
+
+
+def _accepts_without_keys(address: str) -> int:
+    """Return 1 if an address completes a handshake with a peer without keys, otherwise 0."""
+    with contextlib.suppress(OSError), ZmtpPeer(address, timeout_s=1.0):
+        return 1
+    return 0

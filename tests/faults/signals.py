@@ -1,0 +1,216 @@
+"""Signals at random times of every command. Each command must end soon, with its documented exit code and no traceback.
+
+Commands run as real processes. The time of a signal is uniformly distributed between the first line of the command and
+the end of an undisturbed run. Before that line Python itself starts, and handles signals with its own defaults.
+"""
+
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Final
+
+from ertis_bench.network.processes import ask
+
+from ertis_numba.journal import SUFFIX, Journal, JournalEntry
+from ertis_numba.storage import open_recording
+from tests.faults import captures
+
+__all__ = ["COMMANDS", "MAX_END_S", "send"]
+
+MAX_END_S: Final = 1.0
+"""Longest permitted time from a signal to the end of the process, in seconds."""
+
+_SCENE = Path(__file__).parents[2] / "data" / "synthetic" / "scenes" / "two_facing_sensors.toml"
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_STARTS = 5
+_MAX_TRIES = 10  # Tries per signal. Only signals that reach a running process count.
+_UNDISTURBED_S = 4.0
+_TIMEOUT_S = 30.0
+_FAULTS = ("late", "codes", "tracebacks")
+_UNCAUGHT = re.compile(r"Traceback|Error:|Exception|Fatal|Assertion")
+
+COMMANDS: Final[dict[str, Sequence[str]]] = {
+    "bench": ("scaling", "--count", "1", "--quiet"),
+    "capture": ("--port", "{port}", "-o", "{out}/captured.h5"),
+    "compare": ("{images}",),
+    "completion": ("bash",),
+    "demo": ("-o", "{out}/demo"),
+    "devices": (),
+    "doctor": (),
+    "emulate": ("{recording}",),
+    "example": ("reflectors", "-o", "{out}", "--force"),
+    "export": ("{images}", "-o", "{out}/cloud.ply"),
+    "import": ("{raw}", "-o", "{out}/imported.h5", "--layout", "eRTIS_v3D1", "--preset", "default_25_50"),
+    "info": ("--health", "{recording}"),
+    "keys": ("new", "fresh", "--dir", "{out}/keys"),
+    "layout": ("eRTIS_v3D1",),
+    "listen": ("tcp://127.0.0.1:1",),
+    "peaks": ("{images}",),
+    "plot": ("{recording}", "-o", "{out}/picture.png"),
+    "process": ("{recording}", "-o", "{out}/images.h5"),
+    "record": ("--listen", "tcp://127.0.0.1:0", "-o", "{out}/recordings"),
+    "recover": ("{out}/crashed",),
+    "serve": ("--listen", "tcp://127.0.0.1:0", "--publish", "tcp://127.0.0.1:0", "--record", "{out}/recordings"),
+    "settings": ("scene",),
+    "simulate": ("{scene}", "-o", "{out}/simulated.h5"),
+    "status": ("tcp://127.0.0.1:1",),
+    "verify": ("{recording}",),
+    "view": ("{recording}", "--port", "0", "--no-open"),
+}
+"""Arguments of each command. A test compares the names with those of the command line."""
+
+
+def send(folder: Path, source: Path, *, seed: int, count: int, only: Sequence[str] = ()) -> dict[str, Any]:
+    """Send ``count`` signals to each command, or to some of them only.
+
+    Returns
+    -------
+    dict
+        Over all commands: ``signals``; ``late``, signals after which the process took longer than `MAX_END_S`;
+        ``codes``, signals after which the exit code was not the documented one; and ``tracebacks``. ``slowest_s`` is
+        the longest time, and ``slowest`` its command. ``by_command`` has the same counts per command, with examples.
+    """
+    rng = random.Random(seed)
+    found: dict[str, dict[str, Any]] = {}
+    with _default_signals(), captures.emulated(source, folder) as ports:
+        paths = _files(folder, source) | {"port": ports[0]}
+        for command in only or COMMANDS:
+            found[command] = _to_command(command, paths, folder / "out", rng, count)
+    slowest = max(found, key=lambda command: float(found[command]["slowest_s"]))
+    total = {name: sum(each[name] for each in found.values()) for name in ("signals", *_FAULTS)}
+    return {
+        "commands": len(found),
+        **total,
+        "slowest": slowest,
+        "slowest_s": found[slowest]["slowest_s"],
+        "by_command": found,
+    }
+
+
+@contextmanager
+def _default_signals() -> Iterator[None]:
+    """Restore default signal handling for new processes.
+
+    A script or ``nohup`` that has started this process may ignore signals, and children inherit this.
+    """
+    ignored = [number for number in _SIGNALS if signal.getsignal(number) is signal.SIG_IGN]
+    for number in ignored:
+        signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
+    try:
+        yield
+    finally:
+        for number in ignored:
+            signal.signal(number, signal.SIG_IGN)
+
+
+def _files(folder: Path, source: Path) -> dict[str, str]:
+    """Create the files that commands read, and return the names by which `COMMANDS` refers to them."""
+    raw, images, crashed = folder / "raw.bin", folder / "images.h5", folder / "crashed"
+    with open_recording(source) as recording:
+        measurement = recording[0]
+        raw.write_bytes(measurement.data.tobytes())
+        made = folder / "journal"
+        made.mkdir()
+        with Journal.create(made / f"rec.h5{SUFFIX}", target="rec.h5", source="signals") as journal:
+            journal.add_sensor(measurement.stamp.sensor, measurement.settings)
+            journal.append([JournalEntry(measurement, monotonic_ns=0)])
+            shutil.copytree(made, crashed)  # The copy equals the files of a killed process.
+    done = ask("process", str(source), "-o", str(images), "--quiet")
+    done.check_returncode()
+    return {
+        "recording": str(source),
+        "scene": str(_SCENE),
+        "raw": str(raw),
+        "images": str(images),
+        "crashed": str(crashed),
+    }
+
+
+def _to_command(command: str, paths: dict[str, str], out: Path, rng: random.Random, count: int) -> dict[str, Any]:
+    begins_s = _interpreter_s()
+    lasts_s, _, _, _ = _run_command(command, paths, out, None, _UNDISTURBED_S)
+    found: dict[str, Any] = {"signals": 0, **dict.fromkeys(_FAULTS, 0), "slowest_s": 0.0}
+    examples: Counter[str] = Counter()
+    for _ in range(_MAX_TRIES * count):
+        if found["signals"] == count:
+            break
+        number = rng.choice(_SIGNALS)
+        at_s = rng.uniform(begins_s, max(lasts_s, begins_s))
+        _, took_s, code, errors = _run_command(command, paths, out, number, at_s)
+        if not took_s or _in_interpreter(errors):
+            continue
+        found["signals"] += 1
+        documented = {128 + number, -number, 0}
+        faults = {
+            "late": took_s > MAX_END_S,
+            "codes": code not in documented,
+            "tracebacks": _UNCAUGHT.search(errors) is not None,
+        }
+        for name, is_so in faults.items():
+            found[name] += is_so
+        if any(faults.values()):
+            examples[f"{number.name} after {at_s:.2f} s: {took_s:.2f} s, {code}: {errors.strip()[-300:]}"] += 1
+        found["slowest_s"] = max(found["slowest_s"], took_s)
+    found["slowest_s"] = round(found["slowest_s"], 3)
+    return found | ({"examples": list(examples)[:5]} if examples else {})
+
+
+def _in_interpreter(errors: str) -> bool:
+    """Return True if a signal arrived before Python ran the first line of the command.
+
+    Python may take longer to start than `_interpreter_s` measures. Its traceback then has no frame in this package.
+    """
+    return "Traceback" in errors and "ertis_cli" not in errors
+
+
+def _interpreter_s() -> float:
+    """Return the longest time that Python takes to start and to find a module, in a few runs."""
+
+    def once() -> float:
+        begin_s = time.monotonic()
+        subprocess.run([sys.executable, "-m", "this"], stdout=subprocess.DEVNULL, check=True)
+        return time.monotonic() - begin_s
+
+    return max(once() for _ in range(_STARTS))
+
+
+def _run_command(
+    command: str, paths: dict[str, str], out: Path, number: signal.Signals | None, at_s: float
+) -> tuple[float, float, int, str]:
+    """Run a command, send a signal at a time, and return its duration, the time to its end, its exit code and stderr.
+
+    Without a signal the process is killed at that time, if it is still running.
+    """
+    shutil.rmtree(out, ignore_errors=True)
+    shutil.copytree(paths["crashed"], out / "crashed")
+    arguments = [each.format(out=out, **paths) for each in COMMANDS[command]]
+    begin_s = time.monotonic()
+    with subprocess.Popen(
+        [sys.executable, "-m", "ertis_cli", command, *arguments],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        try:
+            _, errors = process.communicate(timeout=at_s)
+            return time.monotonic() - begin_s, 0.0, process.returncode, errors
+        except subprocess.TimeoutExpired:
+            pass
+        sent_s = time.monotonic()
+        process.send_signal(number or signal.SIGKILL)
+        try:
+            process.wait(_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+        ended_s = time.monotonic()
+        _, errors = process.communicate()
+        return ended_s - begin_s, ended_s - sent_s, process.returncode, errors
