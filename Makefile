@@ -72,9 +72,11 @@ bench: $(VENV)/ready  ## run the benchmarks and update the tables in the documen
 	$(BIN)/ertis bench many --update docs/how-to/many.md
 	$(BIN)/ertis bench network --update docs/explanation/network-guarantees.md
 
-soak: $(VENV)/ready-to-test  ## test faults, kills and full disks for hours; SEED=N repeats a run
+soak: $(VENV)/ready-to-test  ## test faults, kills, full disks and random scenes for hours; SEED=N repeats a run
 	$(BIN)/python -m tests.faults reliability --long $(if $(SEED),--seed $(SEED)) --update docs/explanation/reliability.md
 	$(BIN)/python -m tests.faults network --long $(if $(SEED),--seed $(SEED)) --update docs/explanation/network-guarantees.md
+	$(BIN)/ertis bench simulation --verdicts 1000
+	$(BIN)/ertis bench budgets --count 300
 
 gpu: $(VENV)/ready  ## test and time this machine's NVIDIA GPU in less than ten minutes; GPU=cu13 for CUDA 13
 	$(BIN)/python -m pip install --quiet --editable '.[test,$(GPU)]'

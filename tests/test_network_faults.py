@@ -26,7 +26,7 @@ from tests.faults.network import run as faults
 from tests.files import noise
 
 SEED = 1
-N_KILLS = {"centrals": 14, "nodes": 26, "workers": 10}
+N_KILLS = {"centrals": 6, "nodes": 10, "workers": 5}
 NOTHING_WRONG = dict.fromkeys(
     ("lost", "missing", "wrong", "twice", "unexpected", "silent", "broken", "left_over", "tracebacks"), 0
 )

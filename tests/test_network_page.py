@@ -1,7 +1,7 @@
 """Network commands of the README and of docs/how-to/network.md, with other ports, hosts and sounds.
 
-The emulated sensors repeat two measurements of a recording of the scene, because rendering takes longer than all other
-work together.
+The emulated sensors of the platform repeat one measurement, because rendering the scene takes longer than all other work
+together.
 """
 
 import contextlib
@@ -16,7 +16,9 @@ from pathlib import Path
 
 import pytest
 
-from ertis_numba.storage import open_recording, sensor_names
+from ertis_numba.frames import Measurement, Stamp
+from ertis_numba.simulation import Scene
+from ertis_numba.storage import open_recording, sensor_names, write_recording
 from tests.pages import page
 
 ROOT = Path(__file__).parents[1]
@@ -27,15 +29,12 @@ READY = {"emulate": "/dev/", "serve": '"listening"', "capture": '"kept"'}
 
 @pytest.fixture(scope="session")
 def platform(tmp_path_factory):
-    """The platform's scene as a recording, rendered once for all test processes."""
-    folder = tmp_path_factory.getbasetemp().parent
-    path = folder / "platform.h5"
-    if not path.exists():
-        part = tmp_path_factory.mktemp("platform") / "platform.h5"
-        command = [sys.executable, "-m", "ertis_cli", "simulate", ROOT / "examples" / "platform.toml", "-o", part]
-        folders = os.pathsep.join(str(ROOT / name) for name in (".", "cli", "bench"))
-        subprocess.run([*command, "--count", "2", "--quiet"], env=os.environ | {"PYTHONPATH": folders}, check=True)
-        part.replace(path)
+    """Recording with the sensors of the platform."""
+    path = tmp_path_factory.mktemp("platform") / "platform.h5"
+    with open_recording(ROOT / "data" / "synthetic" / "reflectors.h5") as recording:
+        words = recording[0].data
+    sensors = Scene.load(ROOT / "examples" / "platform.toml").sensors
+    write_recording(path, [Measurement(words, each.settings(), Stamp(sensor=each.name)) for each in sensors])
     return path
 
 
