@@ -5,6 +5,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +14,8 @@ from ertis_bench.verdicts import Trial, with_one
 
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.simulation import Emitter, Noise, Point, Scene, Sensor, Sonar, Wall
-from ertis_numba.simulation.needs import ESTIMATES, Estimate
+from ertis_numba.simulation.effects import EFFECTS
+from ertis_numba.simulation.estimates import Estimate
 from ertis_numba.simulation.plan import make_plan
 from ertis_numba.simulation.render import Simulator
 from ertis_numba.simulation.sight import SAME_RANGE_M, Sight
@@ -90,10 +92,11 @@ def test_mutually_dependent_effects_stay_on(monkeypatch):
     """Walls matter only without the facing of discs, which matters only with the walls."""
 
     def of(name, matters):
-        return lambda sight: Estimate(change_db=6.0 if matters(sight.active) else 0.0, reason=name)
+        estimate = lambda sight: Estimate(change_db=6.0 if matters(sight.active) else 0.0, reason=name)  # noqa: E731
+        return replace(EFFECTS[name], estimate=estimate)
 
-    monkeypatch.setitem(ESTIMATES, "walls", of("walls", lambda active: "target_size" not in active))
-    monkeypatch.setitem(ESTIMATES, "target_size", of("size", lambda active: "walls" in active))
+    monkeypatch.setitem(EFFECTS, "walls", of("walls", lambda active: "target_size" not in active))
+    monkeypatch.setitem(EFFECTS, "target_size", of("target_size", lambda active: "walls" in active))
     verdicts = {verdict.name: verdict for verdict in make_plan(Scene(points=(Point(range_m=1.0),))).verdicts}
     for name in ("walls", "target_size"):
         assert verdicts[name].on

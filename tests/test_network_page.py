@@ -1,7 +1,7 @@
 """Network commands of the README and of docs/how-to/network.md, with other ports, hosts and sounds.
 
-The emulated sensors of the platform repeat one measurement, because rendering the scene takes longer than all other work
-together.
+The emulated sensors of the platform repeat one measurement, because rendering the scene takes longer than all other
+work together.
 """
 
 import contextlib
