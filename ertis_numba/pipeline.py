@@ -45,8 +45,8 @@ class Pipeline:
         Settings, or the path of a TOML file with them.
     device : {"auto", "cpu", "cuda", "numpy"}
         Compute device. ``auto`` is ``cuda``, an NVIDIA GPU, if there is one and its libraries are installed, otherwise
-        ``cpu``. ``numpy`` runs the same algorithm without compiled kernels, for comparison. The paper's method always
-        runs on ``numpy``.
+        ``cpu``. ``numpy`` runs the same algorithm without compiled kernels, for comparison. For the paper's method,
+        ``numpy`` has the recursive filters of the authors, and the other devices have filters of linear phase.
     threads : int, optional
         Threads of one call of `process`; all cores by default. Neither the plan nor the result depends on it.
     max_error_db : float or {"draft", "standard", "fine", "exact"}, optional
@@ -122,7 +122,7 @@ class Pipeline:
         if isinstance(max_error_db, str):
             checks.choice("max_error_db", max_error_db, ERROR_PRESETS_DB)
             max_error_db = ERROR_PRESETS_DB[max_error_db]
-        kernel_set = kernels.load(_device_for(settings, device))
+        kernel_set = kernels.load(device)
         threads = kernel_set.max_threads if threads is None else threads
         with kernel_set.threads(threads):  # refuses an impossible number
             pass
@@ -464,23 +464,6 @@ def _rescaled(amplitude: NDArray[np.float32], exponent: int) -> NDArray[np.float
     return amplitude
 
 
-def _device_for(settings: Settings, device: str) -> str:
-    """Return the device to load; the paper's method runs only on NumPy.
-
-    Raises
-    ------
-    DeviceError
-        Another device is requested for the paper's method.
-    """
-    if settings.processing.method == "fast" or device not in {"auto", *kernels.DEVICES}:
-        return device
-    if device not in {"auto", "numpy"}:
-        raise DeviceError(
-            f"processing.method 'paper' has no kernels for device {device!r}; use device 'numpy' or 'auto'"
-        )
-    return "numpy"
-
-
 def _same_layout(array: Array, other: Array) -> bool:
     """Return True if two arrays have the same microphones, even if only one is given by its name."""
     came, wanted = microphones(array), microphones(other)
@@ -494,6 +477,8 @@ def _chain(settings: Settings, kernel_set: kernels.KernelSet, threads: int, *, g
     if settings.processing.method == "fast":
         return FastChain(settings, kernel_set, threads=threads, graphs=graphs)
     # Imported here because scipy.signal takes longer to import than the fast chain takes to start.
-    from ertis_numba.stages.paper import PaperChain  # noqa: PLC0415
+    from ertis_numba.stages import paper, paper_scipy  # noqa: PLC0415
 
-    return PaperChain(settings)
+    if kernel_set.device == "numpy":
+        return paper_scipy.ScipyPaperChain(settings)
+    return paper.PaperChain(settings, kernel_set, threads=threads, graphs=graphs)

@@ -202,9 +202,12 @@ def test_demodulate_words_handles_taps_at_the_limit(kernel_set, word, taps_type)
 
 @pytest.mark.parametrize("shape", sized([(1, 1), (3, 17), (2, 131)], [(32, 1009)]))
 def test_multiply_spectra_equals_its_reference(kernel_set, shape):
-    spectra, response, out = complex_noise(*shape), complex_noise(shape[1], seed=2), filled(*shape, dtype=np.complex64)
-    kernel_set.multiply_spectra(spectra, response, out)
-    assert np.abs(out - spectra.astype(complex) * response).max() < 10 * FLOAT32
+    spectra, response = complex_noise(*shape), complex_noise(shape[1], seed=2)
+    for n in (shape[1], 2 * shape[1] + 1):
+        out = filled(shape[0], n, dtype=np.complex64)
+        kernel_set.multiply_spectra(spectra, response, out)
+        assert np.abs(out[:, : shape[1]] - spectra.astype(complex) * response).max() < 10 * FLOAT32
+        assert not out[:, shape[1] :].any()
 
 
 @pytest.mark.parametrize("own_responses", [False, True])
@@ -231,11 +234,15 @@ def test_delay_and_sum_and_envelope_equal_their_references(kernel_set, name):
     expected = reference.delay_and_sum(signals, offsets, weights, shape[1])
     beams, amplitude, fused = filled(*shape, dtype=np.complex64), filled(*shape), filled(*shape)
     kernel_set.delay_and_sum(signals, offsets, weights, beams)
-    kernel_set.envelope(beams, amplitude)
+    kernel_set.envelope(beams, 1, amplitude)
     kernel_set.delay_and_sum_envelope(signals, offsets, weights, 0, shape[1], fused)
     bound = FLOAT32 * np.abs(expected).max()
     assert np.abs(beams - expected).max() < bound
     assert np.abs(amplitude - np.abs(expected)).max() < bound
+    for step in (2, 7):
+        fewer = filled(shape[0], -(-shape[1] // step))
+        kernel_set.envelope(beams, step, fewer)
+        assert fewer.tobytes() == amplitude[:, ::step].tobytes()
     assert np.abs(fused - np.abs(expected)).max() < bound
 
 

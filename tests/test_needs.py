@@ -3,8 +3,7 @@
 `ertis bench simulation --verdicts N` tests many more scenes.
 """
 
-import subprocess
-import sys
+import importlib
 from dataclasses import replace
 
 import numpy as np
@@ -104,23 +103,23 @@ def test_mutually_dependent_effects_stay_on(monkeypatch):
         assert verdicts[name].reason.endswith("stays on, because other effects depend on it")
 
 
-def test_unneeded_effects_are_not_imported():
-    """In a separate process, a free field loads only the effects of its plan, and draws no unused noise."""
-    code = """
-import sys
-from ertis_numba.simulation import Point, Scene
-from ertis_numba.simulation.render import Simulator
-simulator = Simulator(Scene(points=(Point(range_m=1.0), Point(range_m=3.0, azimuth_deg=30.0))))
-simulator.render()
-prefix = "ertis_numba.simulation.effects."
-print(sorted(name.removeprefix(prefix) for name in sys.modules if name.startswith(prefix)))
-print(sorted(simulator.plan.active))
-print(sorted(simulator.clock.cost_ms))
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    loaded, active, costs = done.stdout.splitlines()
-    assert loaded == "['absorption', 'propagation', 'spreading']"
-    assert active == costs == "['absorption', 'modulation', 'propagation', 'spreading']"
+def test_unneeded_effects_are_not_computed(monkeypatch):
+    """The rendering of a free field calls no function of any other effect."""
+
+    def unneeded(*_, **__):
+        raise AssertionError("an effect that is off was computed")
+
+    simulator = Simulator(Scene(points=(Point(range_m=1.0), Point(range_m=3.0, azimuth_deg=30.0))))
+    assert simulator.plan.active == {"absorption", "modulation", "propagation", "spreading"}
+    for name, each in EFFECTS.items():
+        if name not in simulator.plan.active:
+            module = importlib.import_module(f"ertis_numba.simulation.effects.{name}")
+            for function in set(module.__all__) - {"EFFECT"}:
+                monkeypatch.setattr(module, function, unneeded)
+            acts = {place: unneeded for place in ("gain", "microphones", "calls", "sounds") if getattr(each, place)}
+            monkeypatch.setitem(EFFECTS, name, replace(each, **acts))
+    simulator.render()
+    assert set(simulator.clock.cost_ms) == simulator.plan.active
 
 
 @pytest.mark.parametrize(

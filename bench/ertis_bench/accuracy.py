@@ -141,7 +141,7 @@ class _Subject:
     def _pipelines(self) -> Iterator[tuple[str, Pipeline]]:
         settings = self._settings
         processing = settings.processing.replace(method="paper")
-        yield PAPER, Pipeline(settings.replace(processing=processing))
+        yield PAPER, Pipeline(settings.replace(processing=processing), "numpy")
         chosen = {}
         for preset, max_error_db in ERROR_PRESETS_DB.items():
             pipeline = Pipeline(settings, max_error_db=max_error_db)

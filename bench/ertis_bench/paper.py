@@ -18,6 +18,7 @@ RANGE_M = (0.5, 5.0)
 
 BACKENDS = {
     "scipy": {"method": "paper", "device": "numpy"},
+    "paper": {"method": "paper", "device": "cpu"},
     "numpy": {"method": "fast", "device": "numpy"},
     "cpu": {"method": "fast", "device": "cpu"},
 }
@@ -87,7 +88,8 @@ def _pipeline(measurement: Measurement, n_directions: int, *, method: str, devic
 def _check(pipelines: dict[str, Pipeline], measurement: Measurement) -> dict[str, float]:
     """Check all images, and return the errors of backends that approximate the exact image."""
     images = {name: pipeline.process(measurement) for name, pipeline in pipelines.items()}
-    checks.require_same_reflector(images["scipy"], images["cpu"])
+    for name in ("scipy", "paper"):
+        checks.require_same_reflector(images[name], images["cpu"])
     return {name: round(checks.require_exact(images[name], measurement), 1) for name in ("numpy", "cpu")}
 
 

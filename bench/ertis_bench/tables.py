@@ -37,6 +37,7 @@ __all__ = [
 
 _MEANING = {
     "scipy": "`scipy`: the paper's algorithm, NumPy and SciPy",
+    "paper": "`paper`: the paper's method, Numba",
     "numpy": "`numpy`: this package's algorithm, NumPy and SciPy",
     "cpu": "`cpu`: this package's algorithm, Numba",
 }
@@ -73,7 +74,7 @@ def _checked(report: dict[str, Any]) -> str:
     worst_db = max(error_db for errors_db in report["error_db"].values() for error_db in errors_db.values())
     return (
         "Results were checked before they were timed: `numpy` and `cpu` differ from the exact image (float64, "
-        f"fractional delays) by at most {worst_db:.1f} dB, and `scipy` shows the strongest reflector at the same place."
+        f"fractional delays) by at most {worst_db:.1f} dB, and `scipy` and `paper` show the strongest reflector at the same place."
     )
 
 
@@ -86,6 +87,7 @@ def _conditions(report: dict[str, Any]) -> str:
         "exclude reading the file, creating the pipeline, compilation, and warm-up calls of a fifth of a second (at "
         "least three) before each turn. Images are written to one array. "
         "`scipy` runs on one thread, like its filters and sums, and processes the whole record, as the paper does. "
+        "`paper` takes the same steps with compiled kernels on all cores, and sums only the samples in the window. "
         "`numpy` and `cpu` process the part of the record that the image needs, `cpu` on all cores, `numpy` on one. "
         "The paper does not state the length of its records."
     )

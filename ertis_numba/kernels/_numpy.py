@@ -106,7 +106,9 @@ def _filtered(
 
 def multiply_spectra(spectra: Complex, response: Complex, out: Complex) -> None:
     """Multiply the spectrum of each microphone by a filter: ``out[mic, bin] = spectra · response``."""
-    np.multiply(spectra, response, out=out)
+    n_bins = spectra.shape[1]
+    np.multiply(spectra, response, out=out[:, :n_bins])
+    out[:, n_bins:] = 0
 
 
 def multiply_and_fold(spectra: Complex, responses: Complex, first_bin: int, out: Complex) -> None:
@@ -132,9 +134,9 @@ def delay_and_sum(signals: Complex, offsets: Index, weights: Complex, out: Compl
         np.matmul(weights[direction], rows, out=out[direction])
 
 
-def envelope(beams: Complex, out: Real) -> None:
-    """Compute the magnitude of analytic beams."""
-    np.abs(beams, out=out)
+def envelope(beams: Complex, step: int, out: Real) -> None:
+    """Compute the magnitude of every ``step``-th sample of analytic beams."""
+    np.abs(beams[:, : (out.shape[1] - 1) * step + 1 : step], out=out)
 
 
 def delay_and_sum_envelope(
@@ -143,7 +145,7 @@ def delay_and_sum_envelope(
     """`DelayAndSum` and `Envelope` in one pass over some ranges, without writing beams to memory."""
     beams: NDArray[Any] = np.empty((len(out), stop - first), dtype=np.complex64)
     delay_and_sum(signals, offsets + np.int32(first), weights, beams)
-    envelope(beams, out[:, first:stop])
+    envelope(beams, 1, out[:, first:stop])
 
 
 def interpolated_beams_envelope(

@@ -2,27 +2,21 @@
 
 import functools
 import math
-from collections import deque
-from collections.abc import Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import fft
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.geometry import Grid, array_weights, direction_grid, microphones, unit_vectors
-from ertis_numba.kernels import KernelSet
 from ertis_numba.settings import Settings
 from ertis_numba.stages.adaptive import AdaptiveBeamform
 from ertis_numba.stages.beam_grid import Aperture, require_beam_grid
 from ertis_numba.stages.beamform import beamform
-from ertis_numba.stages.buffer_pool import BufferPool, MeasurementBuffers
+from ertis_numba.stages.buffer_pool import MeasurementBuffers
 from ertis_numba.stages.delays import DelayTable, Zone
 from ertis_numba.stages.demodulate import FilterPcm, demodulation
-from ertis_numba.stages.fitting import one_thread
+from ertis_numba.stages.kernel_chain import KernelChain
 from ertis_numba.stages.matched_filter import MatchedFilter
 from ertis_numba.stages.plan_elements import (
     ahead_of,
@@ -40,7 +34,7 @@ __all__ = ["FastChain"]
 _TINY = 1e-30
 
 
-class FastChain:
+class FastChain(KernelChain):
     """Signal chain of demodulation, matched filter, beamformer and envelope, with tables computed once.
 
     Parameters
@@ -66,14 +60,8 @@ class FastChain:
         The device has too little memory.
     """
 
-    def __init__(self, settings: Settings, kernels: KernelSet, *, threads: int, graphs: bool = False) -> None:
-        self._memory = kernels.memory(graphs=graphs)
-        self._pool = BufferPool()
-        with one_thread():
-            self._make(settings, kernels, threads)
-
-    def _make(self, settings: Settings, kernels: KernelSet, threads: int) -> None:
-        memory = self._memory
+    def _make(self, settings: Settings) -> None:
+        memory, kernels, threads = self._memory, self._kernels, self._threads
         plan = settings.accuracy
         layout = microphones(settings.array)
         self.grid: Grid = direction_grid(settings.processing)
@@ -103,8 +91,6 @@ class FastChain:
             require_beam_grid(aperture, len(window.range_m))
         self.range_m = window.range_m
         self._lead = window.lead
-        self._kernels = kernels
-        self._threads = threads
         self._demodulate = demodulation(settings, layout, window, kernels, memory, taps=taps)
         self._made_unmodulated = functools.cache(
             lambda: FilterPcm(
@@ -153,48 +139,6 @@ class FastChain:
                 table.weights.astype(np.complex64),
             )
 
-    def process(
-        self, words: NDArray[np.unsignedinteger[Any]], out: NDArray[np.float32], *, threads: int | None = None
-    ) -> None:
-        """Compute the image of one measurement; parameters as for `Chain.process`."""
-        self._finish(self._begin(words, out, self._threads if threads is None else threads))
-
-    def process_batch(
-        self, words: Iterable[NDArray[np.unsignedinteger[Any]]], outs: Iterable[NDArray[np.float32] | None]
-    ) -> None:
-        """Process several measurements: on a GPU in lanes, on the CPU in parallel with one thread each.
-
-        If an item of ``outs`` is None, the image stays in GPU memory until the lane computes its next image.
-        """
-        pairs = list(zip(words, outs, strict=True))
-        if self._memory.n_lanes == 1:
-            self._side_by_side(pairs)
-            return
-        under_way: deque[MeasurementBuffers] = deque()
-        try:
-            for each, out in pairs:
-                if len(under_way) == self._memory.n_lanes:
-                    self._finish(under_way.popleft())
-                under_way.append(self._begin(each, out, self._threads))
-        finally:
-            while under_way:
-                self._finish(under_way.popleft())
-
-    def _side_by_side(self, pairs: list[tuple[NDArray[np.unsignedinteger[Any]], NDArray[np.float32] | None]]) -> None:
-        """Process each measurement on one thread, because threads of one kernel wait for each other after each stage.
-
-        Fewer measurements than threads are processed one after the other, on all threads.
-        """
-        if len(pairs) < self._threads or self._threads == 1:
-            for each, out in pairs:
-                self._finish(self._begin(each, out, self._threads))
-        else:
-            deque(self._executor.map(lambda pair: self._finish(self._begin(pair[0], pair[1], 1)), pairs), maxlen=0)
-
-    @functools.cached_property
-    def _executor(self) -> ThreadPoolExecutor:
-        return ThreadPoolExecutor(self._threads, thread_name_prefix="ertis-batch")
-
     def analytic(self, words: NDArray[np.unsignedinteger[Any]]) -> tuple[NDArray[np.complex64], int]:
         """Return the analytic signals, (mic, phase, sample), and the index of the sample at the first range."""
         heard = np.empty(self._matched_filter.shape, dtype=np.complex64)
@@ -217,71 +161,9 @@ class FastChain:
             buffers.lane.fetch(image, out)
         self._finish(buffers)
 
-    def warm_up(self, words: NDArray[np.unsignedinteger[Any]]) -> None:
-        """Process ``words`` once in every lane, which compiles kernels and allocates buffers."""
-        images = [self.new_image() for _ in range(self._memory.n_lanes)]
-        if len(images) == 1:
-            self.process(words, images[0])
-        else:
-            self.process_batch([words] * len(images), images)
-
-    def new_image(self) -> NDArray[np.float32]:
-        """Return an uninitialised array for an image: (direction, range) float32."""
-        return self._memory.image((len(self.grid), len(self.range_m)))
-
-    def close(self) -> None:
-        """Wait for measurements in progress, then free the memory of the device."""
-        self._pool.close()
-        for name in ("_demodulate", "_made_unmodulated", "_matched_filter", "_beamform", "_adaptive"):
-            self.__dict__.pop(name, None)
-        self._memory.close()
-
-    def _begin(
-        self, words: NDArray[np.unsignedinteger[Any]], out: NDArray[np.float32] | None, threads: int
-    ) -> MeasurementBuffers:
-        """Start to process one measurement; its image is in ``out`` once the lane has finished."""
-        with self._taken(threads) as buffers:
-            here = buffers.lane.send(words)
-            image = buffers.lane.target(self._no_image if out is None else out)
-
-            def steps() -> None:
-                self._demodulate(here, buffers.room, buffers.signals)
-                self._image(buffers, image, threads)
-
-            buffers.lane.run(steps)
-            if out is not None:
-                buffers.lane.fetch(image, out)
-        return buffers
-
-    def _finish(self, buffers: MeasurementBuffers) -> None:
-        try:
-            buffers.lane.wait()
-        finally:
-            self._pool.release(buffers)
-
     def _image(self, buffers: MeasurementBuffers, out: NDArray[np.float32], threads: int) -> None:
-        self._matched_filter(buffers.transforms, buffers.analytic, threads=threads)
         if self._adaptive is None:
-            self._beamform(buffers.analytic, buffers.beamform, out)
+            super()._image(buffers, out, threads)
         else:
+            self._matched_filter(buffers.transforms, buffers.analytic, threads=threads)
             self._adaptive(buffers.analytic, out)
-
-    @contextmanager
-    def _taken(self, threads: int) -> Iterator[MeasurementBuffers]:
-        """Run the enclosed kernels on buffers that no other thread uses, until `_finish` releases them."""
-        with self._pool.acquired(self._new_buffers) as buffers, self._kernels.threads(threads), buffers.lane.entered():
-            yield buffers
-
-    @functools.cached_property
-    def _no_image(self) -> NDArray[np.float32]:
-        """Zero-stride array in the shape of an image, for images that stay on a GPU."""
-        return np.broadcast_to(np.float32(0), (len(self.grid), len(self.range_m)))
-
-    def _new_buffers(self) -> MeasurementBuffers:
-        memory, lane = self._memory, self._memory.lane()
-        signals = memory.zeros(self._demodulate.shape, np.float32)
-        analytic = memory.zeros(self._matched_filter.shape, np.complex64)
-        transforms = fft.plan(self._kernels.transforms, signals, analytic, zeros=memory.zeros, stream=lane.stream)
-        return MeasurementBuffers(
-            lane, self._demodulate.new_room(), signals, analytic, transforms, self._beamform.new_buffers()
-        )

@@ -42,6 +42,7 @@ PLANS = {
         -120,
     ),
 }
+PLANS["paper"] = (TINY.replace(processing=TINY.processing.replace(method="paper")), -120)
 for _beamformer in ("coherence_factor", "dmas", "capon"):
     PLANS[_beamformer] = (
         TINY.replace(

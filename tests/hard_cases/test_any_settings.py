@@ -184,7 +184,6 @@ def test_any_settings_and_data_give_an_image_or_one_line(made, kind, seed, devic
     if made is None:
         event("refused when made")
         return
-    device = "auto" if made.processing.method == "paper" else device
     try:
         pipeline = Pipeline(made, device=device, threads=1, predict=False)
     except (ArgumentError, DataError, DeviceError) as error:  # the device has no 16-bit dot product
@@ -195,7 +194,7 @@ def test_any_settings_and_data_give_an_image_or_one_line(made, kind, seed, devic
     image = pipeline.process(Measurement(words_for(pipeline, kind, seed), made))
     assert image.amplitude.shape == (len(pipeline.grid), len(pipeline.range_m))
     assert np.isfinite(image.amplitude).all()
-    if made.processing.method == "fast":  # the paper's recursive low pass undershoots
+    if made.processing.method == "fast" or device == "cpu":  # the paper's recursive low pass undershoots
         assert image.amplitude.min() >= 0
     if made.processing.beamformer == "delay_and_sum":
         assert image.amplitude.max() < LOUDEST / min(made.array.gain or (1.0,))

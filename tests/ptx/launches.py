@@ -58,11 +58,11 @@ def _each(kernels):
         kernels.unpack_pcm(np.zeros((500, 8), number), channels, np.float32(1), np.float32(0), -5, signals)
     kernels.decimate(signals, np.zeros(61, np.float32), 10, np.zeros((8, 50), np.float32))
     kernels.remove_group_delay(signals, 3, np.zeros((8, 400), np.float32))
-    kernels.multiply_spectra(spectra, spectra[0].copy(), spectra)
+    kernels.multiply_spectra(spectra, spectra[0].copy(), np.zeros((8, 500), np.complex64))
     beams = np.zeros((90, 400), np.complex64)
     offsets, weights = np.zeros((90, 8), np.int32), np.zeros((90, 8), np.complex64)
     kernels.delay_and_sum(np.zeros((8, 2, 500), np.complex64), offsets, weights, beams)
-    kernels.envelope(beams, np.zeros((90, 400), np.float32))
+    kernels.envelope(beams, 10, np.zeros((90, 40), np.float32))
     double, octets = np.zeros((32, 500)), np.arange(32, dtype=np.int32).reshape(4, 8)
     kernels.add_paths(
         np.zeros((1, 251), np.complex128),

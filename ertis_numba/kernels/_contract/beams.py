@@ -36,15 +36,16 @@ class DelayAndSum(Protocol):
 
 
 class Envelope(Protocol):
-    """Compute the magnitude of analytic beams.
+    """Compute the magnitude of every ``step``-th sample of analytic beams: ``out[:, n] = |beams[:, n · step]|``.
 
     Parameters
     ----------
-    beams : (direction, range) complex64
+    beams : (direction, sample) complex64
+    step : int
     out : (direction, range) float32
     """
 
-    def __call__(self, beams: Complex, out: Real) -> None: ...
+    def __call__(self, beams: Complex, step: int, out: Real) -> None: ...
 
 
 class DelayAndSumEnvelope(Protocol):

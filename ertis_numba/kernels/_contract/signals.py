@@ -120,11 +120,14 @@ class DemodulateWords(Protocol):
 class MultiplySpectra(Protocol):
     """Multiply the spectrum of each microphone by a filter: ``out[mic, bin] = spectra · response``.
 
+    Further bins of ``out`` become 0. If these are the negative frequencies, the inverse transform is analytic.
+
     Parameters
     ----------
     spectra : (mic, bin) complex64
     response : (bin,) complex64
-    out : (mic, bin) complex64
+    out : (mic, n) complex64
+        At least as many bins as the spectra.
     """
 
     def __call__(self, spectra: Complex, response: Complex, out: Complex) -> None: ...

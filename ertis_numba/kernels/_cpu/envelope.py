@@ -1,4 +1,4 @@
-"""Compute the magnitude of analytic beams."""
+"""Compute the magnitude of every step-th sample of analytic beams."""
 
 import numpy as np
 from numba import njit, prange
@@ -9,9 +9,10 @@ __all__ = ["envelope"]
 
 
 @njit(parallel=True, nogil=True, cache=True, fastmath={"contract"})
-def envelope(beams, out):
-    """Compute the magnitude of analytic beams."""
-    n_directions, n_ranges = beams.shape
+def envelope(beams, step, out):
+    """Compute the magnitude of every ``step``-th sample of analytic beams."""
+    n_directions, n_ranges = out.shape
     for direction in prange(n_directions):
         for r in range(n_ranges):
-            out[direction, r] = np.float32(magnitude(beams[direction, r].real, beams[direction, r].imag))
+            beam = beams[direction, r * step]
+            out[direction, r] = np.float32(magnitude(beam.real, beam.imag))

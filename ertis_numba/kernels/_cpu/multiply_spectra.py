@@ -19,3 +19,4 @@ def multiply_spectra(spectra, response, out):
             real = (_ZERO + x.real * h.real) - x.imag * h.imag
             imag = (_ZERO + x.real * h.imag) + x.imag * h.real
             out[mic, b] = np.complex64(complex(real, imag))
+        out[mic, n_bins:] = np.complex64(0)

@@ -1,10 +1,9 @@
-"""Compute the magnitude of analytic beams."""
+"""Compute the magnitude of every step-th sample of analytic beams."""
 
 import numpy as np
 from numba import cuda
 
 from ertis_numba.kernels._cuda.lane import launch
-from ertis_numba.kernels._cuda.terms import complexes
 from ertis_numba.kernels._scalar import imag_of, magnitude, real_of
 
 __all__ = ["envelope"]
@@ -13,12 +12,13 @@ _BLOCK = 128
 
 
 @cuda.jit(cache=True)
-def _take(beams, out):
-    k = np.uint64(cuda.grid(1))
-    if k < np.uint64(out.size):
-        out[k] = magnitude(real_of(beams[k]), imag_of(beams[k]))
+def _take(beams, step, out):
+    r, direction = np.uint64(cuda.blockIdx.x * _BLOCK + cuda.threadIdx.x), np.uint64(cuda.blockIdx.y)
+    if r < np.uint64(out.shape[1]):
+        beam = beams[direction, r * np.uint64(step)]
+        out[direction, r] = magnitude(real_of(beam), imag_of(beam))
 
 
-def envelope(beams, out):
-    """Compute the magnitude of analytic beams."""
-    launch(_take, (-(-out.size // _BLOCK),), (_BLOCK,), complexes(beams), out.reshape(-1))
+def envelope(beams, step, out):
+    """Compute the magnitude of every ``step``-th sample of analytic beams."""
+    launch(_take, (-(-out.shape[1] // _BLOCK), out.shape[0]), (_BLOCK,), beams.view(np.uint64), step, out)

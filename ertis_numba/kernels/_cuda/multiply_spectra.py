@@ -14,7 +14,11 @@ _BLOCK = 128
 @cuda.jit(cache=True)
 def _multiply(spectra, response, out):
     k, mic = np.uint64(cuda.blockIdx.x * _BLOCK + cuda.threadIdx.x), np.uint64(cuda.blockIdx.y)
-    if k < np.uint64(response.size):
+    if k >= np.uint64(out.shape[1]):
+        return
+    if k >= np.uint64(response.size):
+        out[mic, k] = np.uint64(0)
+    else:
         x, h = spectra[mic, k], response[k]
         x_real, x_imag, h_real, h_imag = real_of(x), imag_of(x), real_of(h), imag_of(h)
         out[mic, k] = sample_of(x_real * h_real - x_imag * h_imag, x_real * h_imag + x_imag * h_real)

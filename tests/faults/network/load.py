@@ -14,7 +14,7 @@ from ertis_bench.network.serving import Serve, accounts, percentile, some_words
 
 __all__ = ["overload", "subscribers"]
 
-_PAPER: Final = ("--method", "paper", "--directions", "1850")
+_PAPER: Final = ("--method", "paper", "--device", "numpy", "--directions", "1850")
 """Options that make images slow to compute, so that a sender can easily send twice the possible rate."""
 
 Found = dict[str, Any]

@@ -1,0 +1,192 @@
+"""Signal chain of four stages on one device: demodulation, matched filter, beamformer and envelope."""
+
+import functools
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba import fft
+from ertis_numba.geometry import Grid
+from ertis_numba.kernels import KernelSet
+from ertis_numba.settings import Settings
+from ertis_numba.stages.beamform import Beamform
+from ertis_numba.stages.buffer_pool import BufferPool, MeasurementBuffers
+from ertis_numba.stages.demodulate import Demodulate
+from ertis_numba.stages.fitting import one_thread
+
+__all__ = ["Compress", "KernelChain"]
+
+
+class Compress(Protocol):
+    """Matched-filter stage: computes analytic signals from signals.
+
+    Attributes
+    ----------
+    shape : (mic, phase, sample)
+        Shape of the analytic signals.
+    """
+
+    shape: tuple[int, int, int]
+
+    def __call__(self, transforms: fft.Transforms, out: NDArray[np.complex64], *, threads: int) -> None:
+        """Fill ``out``, (mic, phase, sample) complex64, with ``transforms`` that were planned for this array."""
+        ...
+
+
+class KernelChain(ABC):
+    """Runs the stages of a measurement in buffers of its own, on lanes of the device; implements `Chain`.
+
+    Subclasses create the stages once, in `_make`.
+
+    Parameters
+    ----------
+    settings : Settings
+    kernels : KernelSet
+    threads : int
+        Default number of threads.
+    graphs : bool
+        True to record the chain as a CUDA graph on a GPU and replay it; False by default.
+
+    Attributes
+    ----------
+    grid : Grid
+        Directions of the image.
+    range_m : (range,) float64
+        Range axis in metres.
+
+    Raises
+    ------
+    DeviceError
+        The device has too little memory.
+    """
+
+    grid: Grid
+    range_m: NDArray[np.float64]
+    _demodulate: Demodulate
+    _matched_filter: Compress
+    _beamform: Beamform
+
+    def __init__(self, settings: Settings, kernels: KernelSet, *, threads: int, graphs: bool = False) -> None:
+        self._memory = kernels.memory(graphs=graphs)
+        self._pool = BufferPool()
+        self._kernels, self._threads = kernels, threads
+        with one_thread():
+            self._make(settings)
+
+    @abstractmethod
+    def _make(self, settings: Settings) -> None:
+        """Create the axes and the stages."""
+
+    def process(
+        self, words: NDArray[np.unsignedinteger[Any]], out: NDArray[np.float32], *, threads: int | None = None
+    ) -> None:
+        """Compute the image of one measurement; parameters as for `Chain.process`."""
+        self._finish(self._begin(words, out, self._threads if threads is None else threads))
+
+    def process_batch(
+        self, words: Iterable[NDArray[np.unsignedinteger[Any]]], outs: Iterable[NDArray[np.float32] | None]
+    ) -> None:
+        """Process several measurements: on a GPU in lanes, on the CPU in parallel with one thread each.
+
+        If an item of ``outs`` is None, the image stays in GPU memory until the lane computes its next image.
+        """
+        pairs = list(zip(words, outs, strict=True))
+        if self._memory.n_lanes == 1:
+            self._side_by_side(pairs)
+            return
+        under_way: deque[MeasurementBuffers] = deque()
+        try:
+            for each, out in pairs:
+                if len(under_way) == self._memory.n_lanes:
+                    self._finish(under_way.popleft())
+                under_way.append(self._begin(each, out, self._threads))
+        finally:
+            while under_way:
+                self._finish(under_way.popleft())
+
+    def _side_by_side(self, pairs: list[tuple[NDArray[np.unsignedinteger[Any]], NDArray[np.float32] | None]]) -> None:
+        """Process each measurement on one thread, because threads of one kernel wait for each other after each stage.
+
+        Fewer measurements than threads are processed one after the other, on all threads.
+        """
+        if len(pairs) < self._threads or self._threads == 1:
+            for each, out in pairs:
+                self._finish(self._begin(each, out, self._threads))
+        else:
+            deque(self._executor.map(lambda pair: self._finish(self._begin(pair[0], pair[1], 1)), pairs), maxlen=0)
+
+    @functools.cached_property
+    def _executor(self) -> ThreadPoolExecutor:
+        return ThreadPoolExecutor(self._threads, thread_name_prefix="ertis-batch")
+
+    def warm_up(self, words: NDArray[np.unsignedinteger[Any]]) -> None:
+        """Process ``words`` once in every lane, which compiles kernels and allocates buffers."""
+        images = [self.new_image() for _ in range(self._memory.n_lanes)]
+        if len(images) == 1:
+            self.process(words, images[0])
+        else:
+            self.process_batch([words] * len(images), images)
+
+    def new_image(self) -> NDArray[np.float32]:
+        """Return an uninitialised array for an image: (direction, range) float32."""
+        return self._memory.image((len(self.grid), len(self.range_m)))
+
+    def close(self) -> None:
+        """Wait for measurements in progress, then free the memory of the device."""
+        self._pool.close()
+        for name in ("_demodulate", "_made_unmodulated", "_matched_filter", "_beamform", "_adaptive"):
+            self.__dict__.pop(name, None)
+        self._memory.close()
+
+    def _begin(
+        self, words: NDArray[np.unsignedinteger[Any]], out: NDArray[np.float32] | None, threads: int
+    ) -> MeasurementBuffers:
+        """Start to process one measurement; its image is in ``out`` once the lane has finished."""
+        with self._taken(threads) as buffers:
+            here = buffers.lane.send(words)
+            image = buffers.lane.target(self._no_image if out is None else out)
+
+            def steps() -> None:
+                self._demodulate(here, buffers.room, buffers.signals)
+                self._image(buffers, image, threads)
+
+            buffers.lane.run(steps)
+            if out is not None:
+                buffers.lane.fetch(image, out)
+        return buffers
+
+    def _finish(self, buffers: MeasurementBuffers) -> None:
+        try:
+            buffers.lane.wait()
+        finally:
+            self._pool.release(buffers)
+
+    def _image(self, buffers: MeasurementBuffers, out: NDArray[np.float32], threads: int) -> None:
+        self._matched_filter(buffers.transforms, buffers.analytic, threads=threads)
+        self._beamform(buffers.analytic, buffers.beamform, out)
+
+    @contextmanager
+    def _taken(self, threads: int) -> Iterator[MeasurementBuffers]:
+        """Run the enclosed kernels on buffers that no other thread uses, until `_finish` releases them."""
+        with self._pool.acquired(self._new_buffers) as buffers, self._kernels.threads(threads), buffers.lane.entered():
+            yield buffers
+
+    @functools.cached_property
+    def _no_image(self) -> NDArray[np.float32]:
+        """Zero-stride array in the shape of an image, for images that stay on a GPU."""
+        return np.broadcast_to(np.float32(0), (len(self.grid), len(self.range_m)))
+
+    def _new_buffers(self) -> MeasurementBuffers:
+        memory, lane = self._memory, self._memory.lane()
+        signals = memory.zeros(self._demodulate.shape, np.float32)
+        analytic = memory.zeros(self._matched_filter.shape, np.complex64)
+        transforms = fft.plan(self._kernels.transforms, signals, analytic, zeros=memory.zeros, stream=lane.stream)
+        return MeasurementBuffers(
+            lane, self._demodulate.new_room(), signals, analytic, transforms, self._beamform.new_buffers()
+        )
