@@ -17,7 +17,7 @@ from typing import Any, ClassVar, Final, Literal, Self, get_args, get_origin
 import msgspec
 import tomli_w
 
-from ertis_numba.errors import ArgumentError, SettingsError
+from ertis_numba.errors import ArgumentError, SettingsError, reason_unreadable
 
 __all__ = ["MAX_KEY_PARTS", "TomlDocument", "TomlTable"]
 
@@ -238,7 +238,7 @@ class TomlDocument(TomlTable, frozen=True, kw_only=True):
         try:
             text = path.read_text(encoding="utf-8-sig")
         except (OSError, UnicodeDecodeError) as error:
-            reason = getattr(error, "strerror", None) or error
+            reason = reason_unreadable(error)
             raise SettingsError(f"{path}: {reason}; give a readable {cls.__name__.lower()} file") from error
         return cls.from_toml(text, str(path)), msgspec.toml.decode(cls._renamed(text))
 

@@ -5,6 +5,7 @@ work together.
 """
 
 import contextlib
+import json
 import os
 import re
 import signal
@@ -127,10 +128,13 @@ def test_network_page_on_several_machines_runs(place, ports, platform):
     assert [line.split()[0] for line in lines] == ["keys", "keys", "keys", "serve", "capture"]
     with Shell(ports, platform) as shell:
         shell.run("emulate examples/platform.toml &")
-        for line in lines:
+        for line in [*lines[:-1], f"{lines[-1]} --json"]:
             local = line.replace("HOST", "127.0.0.1").replace("0.0.0.0", "127.0.0.1")
             reported = shell.run(re.sub(r"(\w+\.public\.toml)", rf"{place}/keys/\1", local))
-    assert "0 lost" in reported or not reported
+    events = [json.loads(line) for line in reported.splitlines()]
+    acked = [each for each in events if each["event"] == "acked_through"]
+    assert {each["sensor"]: each["acked_through"] for each in acked} == {"front": 4, "left": 4}
+    assert not any(each["dropped"] for each in acked)
 
 
 def test_network_page_on_one_machine_stores(place, ports, platform):

@@ -135,6 +135,7 @@ def test_tolerance_selects_the_effects(scene_file):
     ("text", "arguments", "code", "message"),
     [
         (None, (), 1, r"scene\.toml: .*; give a readable scene file"),
+        (b"\xe9", (), 1, r"not text in UTF-8 \(byte 0xe9 at position 0\)"),
         ("sede = 1", (), 1, r"scene\.toml.*unknown key `sede`; correct it or remove it"),
         ("[[sensors]]\narray.layout = 'eRTIS'", (), 1, "layout 'eRTIS' is unknown"),
         ("", ("--sensor", "left"), 1, "sensor 'left' is unknown; known are sensor"),
@@ -146,7 +147,7 @@ def test_tolerance_selects_the_effects(scene_file):
 def test_simulate_refuses_invalid_input(tmp_path, text, arguments, code, message):
     path = tmp_path / "scene.toml"
     if text is not None:
-        path.write_text(text)
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
     result = simulate(path, *arguments)
     assert result.exit_code == code
     assert re.search(message, result.stderr)

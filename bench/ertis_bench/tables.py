@@ -74,7 +74,8 @@ def _checked(report: dict[str, Any]) -> str:
     worst_db = max(error_db for errors_db in report["error_db"].values() for error_db in errors_db.values())
     return (
         "Results were checked before they were timed: `numpy` and `cpu` differ from the exact image (float64, "
-        f"fractional delays) by at most {worst_db:.1f} dB, and `scipy` and `paper` show the strongest reflector at the same place."
+        f"fractional delays) by at most {worst_db:.1f} dB, and `scipy` and `paper` show the strongest reflector at the "
+        "same place."
     )
 
 
