@@ -91,10 +91,9 @@ class Child(Generic[Kind]):
     def wait(self) -> str:
         """Wait until the process is gone, and return how it ended, with the last line of a kept stderr."""
         code = self._process.wait()
+        self.close()
         if self._process.stderr is None:
             return _exit_text(code)
-        self._listener.join()
-        self._process.stderr.close()
         return f"{_exit_text(code)}, printing {repr(self._stderr[0]) if self._stderr else 'nothing'}"
 
     def close(self, timeout_s: float = 0.0) -> None:
@@ -105,6 +104,9 @@ class Child(Generic[Kind]):
         self.kill()
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(_REAPED_S)
+        if self._process.stderr is not None:
+            self._listener.join()
+            self._process.stderr.close()
 
 
 def _started(module: str, end: socket.socket, environment: dict[str, str], stderr: int | None) -> Process:
