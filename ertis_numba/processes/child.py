@@ -77,11 +77,7 @@ class Child(Generic[Kind]):
 
     def interrupt(self) -> None:
         """Interrupt the process, so that it ends cleanly if the system allows that."""
-        with suppress(OSError):
-            if os.name == "posix":
-                self._process.send_signal(signal.SIGINT)
-            else:
-                self._process.terminate()
+        self._process.send_signal(signal.SIGINT if os.name == "posix" else signal.SIGTERM)
 
     def kill(self) -> None:
         """Kill the process at once."""
