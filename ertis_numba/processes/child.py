@@ -10,7 +10,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from typing import Any, Final, Generic, TypeAlias, TypeVar
 
 from ertis_numba.processes.pipe import Pipe
@@ -18,7 +18,7 @@ from ertis_numba.processes.pipe import Pipe
 __all__ = ["Child", "connect", "is_child"]
 
 Kind = TypeVar("Kind")
-Process: TypeAlias = "subprocess.Popen[bytes]"
+_Process: TypeAlias = "subprocess.Popen[bytes]"
 _OPTION: Final = "--pipe="
 _REAPED_S: Final = 5.0
 _WATCH_INTERVAL_S: Final = 0.1
@@ -67,8 +67,9 @@ class Child(Generic[Kind]):
             self._listener.start()
 
     def _listen(self) -> None:
-        lines = (line.decode(errors="backslashreplace").strip() for line in self._process.stderr or ())
-        self._stderr.extend(filter(None, lines))
+        with self._process.stderr or nullcontext(()) as stream:
+            lines = (line.decode(errors="backslashreplace").strip() for line in stream)
+            self._stderr.extend(filter(None, lines))
 
     @property
     def ended(self) -> bool:
@@ -100,18 +101,17 @@ class Child(Generic[Kind]):
         self.kill()
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(_REAPED_S)
-        if self._process.stderr is not None:
-            self._listener.join()
-            self._process.stderr.close()
+        if self._listener.is_alive():
+            self._listener.join(_REAPED_S)
 
 
-def _started(module: str, end: socket.socket, environment: dict[str, str], stderr: int | None) -> Process:
+def _started(module: str, end: socket.socket, environment: dict[str, str], stderr: int | None) -> _Process:
     system: dict[str, Any]
     if sys.platform == "win32":  # It has process groups instead of sessions.
         system = {"stdin": subprocess.PIPE, "creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
     else:
         system = {"stdin": subprocess.DEVNULL, "pass_fds": [end.fileno()], "start_new_session": True}
-    process: Process = subprocess.Popen(  # noqa: S603  this very package
+    process: _Process = subprocess.Popen(  # noqa: S603  this very package
         # -P: Python must not import a file of the current folder in place of a standard module.
         [sys.executable, "-P", "-m", module, f"{_OPTION}{end.fileno()}"],
         stdout=subprocess.DEVNULL,
