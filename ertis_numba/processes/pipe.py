@@ -141,10 +141,7 @@ class Pipe(Generic[Kind]):
     def drain(self) -> None:
         """Wait until all messages are sent, or the other process is gone."""
         while self._out:
-            with _Selector() as selector:
-                selector.register(self._end, selectors.EVENT_WRITE)
-                selector.select()
-            self.flush()
+            self.wait(None)
 
     def close(self) -> None:
         """Close the pipe; the other process notices."""
