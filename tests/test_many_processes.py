@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from ertis_numba.campaign import Campaign, CampaignOptions, RecordingProgress, find_recordings, processes
-from ertis_numba.campaign.processes import ProcessPool
+from ertis_numba.campaign import Campaign, CampaignOptions, RecordingProgress, find_recordings, process_pool
+from ertis_numba.campaign.process_pool import ProcessPool
 from ertis_numba.campaign.tasks import Task
 from ertis_numba.errors import DeviceError
 from ertis_numba.storage import open_energyscapes, write_recording
@@ -165,7 +165,7 @@ def test_number_of_busy_workers_can_be_reduced(size):
 
 
 def test_workers_that_cannot_start_are_reported(runs, tmp_path, monkeypatch):
-    monkeypatch.setattr(processes, "_MODULE", "ertis_numba.no_such_module")
+    monkeypatch.setattr(process_pool, "_MODULE", "ertis_numba.no_such_module")
     with pytest.raises(
         DeviceError,
         match=r"worker processes end at once: the last one ended with 1, printing '.*no_such_module",

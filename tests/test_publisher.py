@@ -139,7 +139,7 @@ def test_sensor_may_change_its_settings_often():
 def test_slowly_ending_publisher_blocks_nothing(monkeypatch):
     with serving() as (loop, _):
         publisher = loop.processing._publisher  # noqa: SLF001  the test delays the end of its process
-        child = publisher._child  # noqa: SLF001
+        child = publisher._process.child  # noqa: SLF001
         monkeypatch.setattr(type(child), "ended", property(lambda _: False))
         monkeypatch.setattr(child, "close", lambda *_: pytest.fail("it is waited for"))
         os.kill(child.pid, signal.SIGKILL)

@@ -10,7 +10,8 @@ from ertis_cli.capture import _seal
 from ertis_cli.main import cli
 
 from ertis_numba.errors import DataError, JournalInUseError, SonarError
-from ertis_numba.journal import seal_in_subprocess, sealing_client
+from ertis_numba.journal import seal_in_subprocess
+from ertis_numba.processes import child
 from ertis_numba.storage.sealing import seal
 from ertis_numba.storage.verify import verify
 from tests.journals import crashed, create, entries
@@ -62,16 +63,23 @@ def fake_python(tmp_path, monkeypatch):
         script = tmp_path / "python"
         script.write_text(f"#!/bin/sh\n{line}\n")
         script.chmod(0o755)
-        monkeypatch.setattr(sealing_client.sys, "executable", str(script))
+        monkeypatch.setattr(child.sys, "executable", str(script))
 
     return replace_python
+
+
+HALF = """
+import os, sys
+os.write(int(sys.argv[-1].removeprefix("--pipe=")), bytes([5, 0, 0, 0, 1]))  # The first byte of five.
+os.kill(os.getpid(), 9)
+"""
 
 
 @pytest.mark.parametrize(
     ("line", "reason"),
     [
-        ("kill -9 $$", "ended with -9, printing nothing; seal it again"),
-        ('echo \'{"done": 1, "o\'; kill -9 $$', "ended with -9, printing nothing; seal it again"),
+        ("kill -9 $$", "was ended by SIGKILL, printing nothing; seal it again"),
+        (f"exec {sys.executable} -c '{HALF}' \"$@\"", "was ended by SIGKILL, printing nothing; seal it again"),
         ("echo Traceback >&2; echo; echo 'KeyError: 1' >&2; exit 1", "ended with 1, printing 'KeyError: 1'; seal it"),
         ("seq 100000 >&2; exit 3", "ended with 3, printing '100000'; seal it again"),  # Exceeds the capacity of a pipe.
         (
@@ -86,14 +94,25 @@ def test_sealing_process_that_dies_is_reported(tmp_path, fake_python, line, reas
         seal_in_subprocess(crashed(tmp_path))
 
 
+SLOW = """
+import time
+from pathlib import Path
+from ertis_numba.journal.storage_processes import Sealed, SealingProgress, SealingResult, SealJournal
+from ertis_numba.processes import connect
+
+pipe = connect(SealJournal, outlives_parent=True)
+pipe.send(SealingProgress(1, 3))
+time.sleep(5)
+pipe.send(Sealed(SealingResult(Path("it was not asked to end"), Path("none"))))
+"""
+
+
 @pytest.mark.parametrize("late", [False, True])
 def test_sealing_process_can_be_interrupted(tmp_path, fake_python, late):
     path = crashed(tmp_path)
-    steps = [{"done": 1, "of": 3}, {"journal": "it was not asked to end", "recording": "none", "set_aside": None}]
-    reported, late_told = (json.dumps(json.dumps(step)) for step in steps)
     slow = tmp_path / "slow.py"
-    slow.write_text(f"import time; print({reported}, flush=True); time.sleep(5); print({late_told})")
-    fake_python(f"trap '' INT; exec {sys.executable} \"$@\"" if late else f"exec {sys.executable} {slow}")
+    slow.write_text(SLOW)
+    fake_python(f"trap '' INT; exec {sys.executable} \"$@\"" if late else f'exec {sys.executable} {slow} "$4"')
 
     def interrupt(*_):
         raise KeyboardInterrupt
@@ -169,7 +188,7 @@ def interrupted(*_, **__):
 
 def test_recover_can_be_interrupted(tmp_path, monkeypatch):
     path = crashed(tmp_path)
-    monkeypatch.setattr(sealing_client.subprocess, "Popen", interrupted)
+    monkeypatch.setattr(child.subprocess, "Popen", interrupted)
     done = run("recover", path, code=130)
     assert (
         done.stderr.splitlines()[0] == f"the measurements are safe in {path}; recover them with 'ertis recover {path}'"
@@ -222,7 +241,7 @@ def test_empty_capture_is_reported(tmp_path):
 @pytest.mark.parametrize("failure", [None, LOST])
 def test_capture_with_interrupted_sealing_keeps_its_journal(tmp_path, monkeypatch, capsys, failure):
     path = crashed(tmp_path)
-    monkeypatch.setattr(sealing_client.subprocess, "Popen", interrupted)
+    monkeypatch.setattr(child.subprocess, "Popen", interrupted)
     with pytest.raises(KeyboardInterrupt if failure is None else SonarError):
         _seal(path, failure, overwrite=False)
     assert capsys.readouterr().err == f"the measurements are safe in {path}; recover them with 'ertis recover {path}'\n"

@@ -197,6 +197,24 @@ def test_same_content_gives_the_same_bytes(tmp_path, monkeypatch):
         assert a.uuid != c.uuid
 
 
+def test_bytes_do_not_depend_on_references_to_columns(tmp_path, monkeypatch):
+    """A profiler of threads, such as that of dask, may keep a column open while others are written."""
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")
+    wanted = write_recording(tmp_path / "a.h5", noise()).read_bytes()
+    held, write = [], h5py.Dataset.__setitem__
+
+    def write_and_hold(column, place, values):
+        write(column, place, values)
+        if column.name.endswith("/time"):
+            held.append(column)
+        elif column.name.endswith("/sync_count"):
+            held.clear()
+
+    monkeypatch.setattr(h5py.Dataset, "__setitem__", write_and_hold)
+    assert write_recording(tmp_path / "b.h5", noise()).read_bytes() == wanted
+    assert held == []
+
+
 def test_memory_does_not_grow_with_the_recording(tmp_path):
     long = Settings()  # 640 KiB a measurement
     words = noise(long, 1)[0].data

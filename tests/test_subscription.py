@@ -239,7 +239,7 @@ def test_images_continue_after_a_publisher_restart(keys):
         turned(processing, lambda: processing.status().subscribers)
         images = offered(processing, subscriber, range(3))
         # Whoever kills it must know it: it is nobody's business otherwise.
-        os.kill(processing._publisher._child.pid, signal.SIGKILL)  # noqa: SLF001
+        os.kill(processing._publisher.pid, signal.SIGKILL)  # noqa: SLF001
         turned(processing, lambda: processing.status().publisher_respawned == 1)
         turned(processing, lambda: processing.status().subscribers)
         images += offered(processing, subscriber, range(3, 6))

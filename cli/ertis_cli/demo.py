@@ -168,6 +168,7 @@ class _DemoRun:
         """
         typed = self._printed(words)
         with output.open("wb") as file:
+            # This is a command as a user types it, with its output in a file, rather than a `processes.Child`.
             process = subprocess.Popen(  # noqa: S603
                 [*_NODE, *map(str, words)],
                 env=self._environment,

@@ -136,7 +136,7 @@ class Campaign:
             from ertis_numba.campaign.dask_workers import DaskWorkerPool  # noqa: PLC0415  it loads dask
 
             return DaskWorkerPool(self._scheduler)
-        from ertis_numba.campaign.processes import ProcessPool  # noqa: PLC0415
+        from ertis_numba.campaign.process_pool import ProcessPool  # noqa: PLC0415
 
         return ProcessPool(self.workers)
 

@@ -2,14 +2,28 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Final, Literal, Protocol
+from typing import Any, Final, Literal, Protocol, TypeAlias
+
+import msgspec
 
 from ertis_numba import checks
 from ertis_numba.settings import Settings
 from ertis_numba.stages.costs import PLAN_COSTS, PlanCosts
 from ertis_numba.storage.recording import Mounting
 
-__all__ = ["MAX_WAITING_BYTES", "TASK_OPTIONS", "CampaignOptions", "Task", "TaskAction", "TaskUpdate", "WorkerPool"]
+__all__ = [
+    "MAX_WAITING_BYTES",
+    "TASK_OPTIONS",
+    "CampaignOptions",
+    "FromWorkerProcess",
+    "RunTask",
+    "Task",
+    "TaskAction",
+    "TaskReport",
+    "TaskUpdate",
+    "WorkerPool",
+    "WorkerReady",
+]
 
 MAX_WAITING_BYTES: Final = 256e6
 """Limit on images that wait to be written, of all workers together."""
@@ -118,6 +132,29 @@ class TaskUpdate:
     number: int
     done: int = 0
     result: dict[str, Any] | None = None
+
+
+class RunTask(msgspec.Struct, frozen=True, tag=True):
+    """Request to a worker process to run a `Task`, with its arguments as JSON."""
+
+    number: int
+    action: TaskAction
+    arguments: str
+
+
+class WorkerReady(msgspec.Struct, frozen=True, tag=True):
+    """A worker process has loaded its modules."""
+
+
+class TaskReport(msgspec.Struct, frozen=True, tag=True):
+    """`TaskUpdate` of a worker process, with the result as JSON; the first one reports the beginning of a task."""
+
+    number: int
+    done: int = 0
+    result: str = ""
+
+
+FromWorkerProcess: TypeAlias = WorkerReady | TaskReport
 
 
 class WorkerPool(Protocol):

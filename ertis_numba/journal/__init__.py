@@ -5,7 +5,7 @@ from ertis_numba.journal._records import JournalEntry, JournalGap, JournalKey, J
 from ertis_numba.journal._recovery import LOST
 from ertis_numba.journal._tables import TABLES, VERSION, Column
 from ertis_numba.journal._tally import TALLY
-from ertis_numba.journal.sealing_client import SealingResult, seal_in_subprocess
+from ertis_numba.journal.storage_processes import SealingResult, seal_in_subprocess, sessions_in_recordings
 
 __all__ = [
     "LOST",
@@ -22,4 +22,5 @@ __all__ = [
     "SealingResult",
     "require_same_settings",
     "seal_in_subprocess",
+    "sessions_in_recordings",
 ]

@@ -7,7 +7,7 @@ __all__ = ["WakeupSocket"]
 
 
 class WakeupSocket:
-    """Socket pair with a `fileno` to poll; it becomes readable after `wake`."""
+    """Socket pair with a `fileno` to poll; it becomes readable after `wake`. Both ends stay in this process."""
 
     def __init__(self) -> None:
         self._wakes, self._woken = socket.socketpair()

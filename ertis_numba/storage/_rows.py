@@ -93,6 +93,7 @@ class RowWriter:
             column = self._group[name]
             column.resize((self._n_rows,))
             column[self._n_stored :] = values
+            column.flush()  # Its place in the file must not depend on when the last reference to it ends.
             values.clear()
         self._n_stored = self._n_rows
 

@@ -195,9 +195,11 @@ class RecordingWriter(FileWriter[Measurement]):
             "gap_session_id": [gap.session_id for gap in gaps],
         }
         for name, column in values.items():
-            group[name].resize((len(gaps),))
+            variable = group[name]
+            variable.resize((len(gaps),))
             if len(column):
-                group[name][:] = column
+                variable[:] = column
+                variable.flush()  # As for rows: see `RowWriter.flush`.
 
 
 def create_sensor_variables(

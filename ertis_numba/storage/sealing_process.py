@@ -3,15 +3,19 @@
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import TextIO
 
+from msgspec import structs
+
 from ertis_numba.atomic_files import temporary_path
 from ertis_numba.errors import ErtisError, JournalInUseError
 from ertis_numba.journal import SUFFIX, SealingResult
+from ertis_numba.journal.storage_processes import FromSealing, Sealed, SealingProgress, SealJournal, StorageFailed
+from ertis_numba.processes import connect, is_child
 from ertis_numba.storage._gradual_sync import GradualSync, gradual_unlink
 from ertis_numba.storage.sealing import PART_TOKEN, seal
 
@@ -45,35 +49,39 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--json", action="store_true", help="print progress and result as JSON lines")
     given = parser.parse_args(arguments)
-    recording = given.journal.with_name(given.journal.name.removesuffix(SUFFIX))
-    pace = None if given.rests is None else GradualSync(temporary_path(recording, PART_TOKEN), given.rests)
+    return _seal(SealJournal(given.journal, given.force, given.rests), _print_json if given.json else _print_text)
+
+
+def _serve() -> int:
+    """Seal the journal that the parent requests; continue if the parent ends."""
+    pipe = connect(SealJournal, outlives_parent=True)
+    request = next(pipe.messages(), None)
+    code = INTERRUPTED if request is None else _seal(request, pipe.send)
+    pipe.drain()
+    return code
+
+
+def _seal(request: SealJournal, report: Callable[[FromSealing], None]) -> int:
+    recording = request.journal.with_name(request.journal.name.removesuffix(SUFFIX))
+    pace = None if request.rests is None else GradualSync(temporary_path(recording, PART_TOKEN), request.rests)
 
     def progress(done: int, of: int) -> None:
         if pace is not None:
             pace()
-        if given.json:
-            _report_progress(done, of)
+        if done == of or done % max(1, of // _STEPS) == 0:
+            report(SealingProgress(done, of))
 
     try:
-        with nullcontext() if given.rests is None else gradual_unlink(given.journal, given.rests):
-            sealed = seal(given.journal, overwrite=given.force, progress=progress)
+        with nullcontext() if request.rests is None else gradual_unlink(request.journal, request.rests):
+            sealed = seal(request.journal, overwrite=request.overwrite, progress=progress)
     except KeyboardInterrupt:
         return INTERRUPTED
     except (ErtisError, OSError, MemoryError) as error:
-        line = " ".join(str(error).split()) or type(error).__name__
+        line = _printable(" ".join(str(error).split()) or type(error).__name__)
         in_use = isinstance(error, JournalInUseError)
-        if given.json:
-            _emit_event({"error": line, "in_use": in_use})
-        else:
-            _write_line(line, sys.stderr)
+        report(StorageFailed(line, in_use))
         return IN_USE if in_use else FAILED
-    if given.json:
-        _emit_event({name: str(value) if isinstance(value, Path) else value for name, value in asdict(sealed).items()})
-    else:
-        if sealed.recording is not None:
-            _write_line(str(sealed.recording), sys.stdout)
-        if sealed.remark:
-            _write_line(sealed.remark, sys.stderr)
+    report(Sealed(sealed))
     return _exit_code(sealed)
 
 
@@ -83,20 +91,32 @@ def _exit_code(sealed: SealingResult) -> int:
     return NO_MEASUREMENTS if sealed.recording is None else 0
 
 
-def _report_progress(done: int, of: int) -> None:
-    if done == of or done % max(1, of // _STEPS) == 0:
-        _emit_event({"done": done, "of": of})
+def _print_json(note: FromSealing) -> None:
+    fields = asdict(note.result) if isinstance(note, Sealed) else structs.asdict(note)
+    values = {name: str(value) if isinstance(value, Path) else value for name, value in fields.items()}
+    _write_line(json.dumps(values), sys.stdout)
 
 
-def _emit_event(report: dict[str, object]) -> None:
-    _write_line(json.dumps(report), sys.stdout)
+def _print_text(note: FromSealing) -> None:
+    if isinstance(note, StorageFailed):
+        _write_line(note.error, sys.stderr)
+    elif isinstance(note, Sealed):
+        if note.result.recording is not None:
+            _write_line(str(note.result.recording), sys.stdout)
+        if note.result.remark:
+            _write_line(note.result.remark, sys.stderr)
 
 
 def _write_line(text: str, stream: TextIO) -> None:
     with suppress(OSError):  # The reader may have been killed: the recording is made all the same.
-        stream.write(text.encode(errors="backslashreplace").decode() + "\n")  # File names may not be valid text.
+        stream.write(_printable(text) + "\n")
         stream.flush()
 
 
+def _printable(text: str) -> str:
+    """Return text without surrogates, which come from file names that are not valid text."""
+    return text.encode(errors="backslashreplace").decode()
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(_serve() if is_child() else main())

@@ -1,19 +1,14 @@
-"""Print the sessions of all sensors in recordings, with their highest numbers, as JSON.
+"""Process that reads the sessions in recordings, for programs that must not load HDF5."""
 
-It runs as a separate process for programs that must not load HDF5.
-"""
-
-import argparse
-import json
-import sys
-from collections.abc import Sequence
 from pathlib import Path
 
 from ertis_numba.errors import DataError
+from ertis_numba.journal.storage_processes import FoundSessions, ReadSessions, StorageFailed
+from ertis_numba.processes import connect
 from ertis_numba.storage._reader import file_kind, sensor_names
 from ertis_numba.storage.recording import open_recording
 
-__all__ = ["main", "sessions_of"]
+__all__ = ["sessions_of"]
 
 
 def sessions_of(path: Path) -> list[tuple[str, int, int]]:
@@ -30,26 +25,17 @@ def sessions_of(path: Path) -> list[tuple[str, int, int]]:
     return found
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Print ``[[sensor, session_id, last], …]`` of all recordings given, and return an exit code.
-
-    Files that are not recordings are skipped; an unreadable recording is an error, printed in one line on stderr.
-    """
-    parser = argparse.ArgumentParser("python -m ertis_numba.storage.sessions_process", description=__doc__)
-    parser.add_argument("recordings", type=Path, nargs="*")
-    try:
-        found = [
-            run
-            for path in parser.parse_args(arguments).recordings
-            if file_kind(path) == "recording"
-            for run in sessions_of(path)
-        ]
-    except (DataError, OSError) as error:
-        sys.stderr.write(f"{' '.join(str(error).split())}\n")
-        return 1
-    sys.stdout.write(json.dumps(found))
-    return 0
+def _main() -> None:
+    """Reply to the parent, skipping files that are not recordings."""
+    pipe = connect(ReadSessions)
+    for request in pipe.messages():
+        try:
+            found = [run for path in request.recordings if file_kind(path) == "recording" for run in sessions_of(path)]
+        except (DataError, OSError) as error:
+            pipe.send(StorageFailed(" ".join(str(error).split())))
+        else:
+            pipe.send(FoundSessions(found))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    _main()

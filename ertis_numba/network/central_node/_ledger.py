@@ -2,7 +2,6 @@
 
 import contextlib
 import os
-import subprocess
 import sys
 import zlib
 from collections import Counter
@@ -14,7 +13,7 @@ import msgspec
 
 from ertis_numba.atomic_files import atomic_write
 from ertis_numba.errors import DataError, FormatVersionError, JournalInUseError
-from ertis_numba.journal import JournalGap
+from ertis_numba.journal import JournalGap, sessions_in_recordings
 from ertis_numba.network.central_node._received_items import SensorSession
 
 if sys.platform == "win32":
@@ -308,16 +307,9 @@ def read_acked_through(recordings: Iterable[Path]) -> dict[SensorSession, int]:
     DataError
         A recording cannot be read.
     """
-    paths = [str(path) for path in recordings]
-    if not paths:
-        return {}
-    command = [sys.executable, "-P", "-m", "ertis_numba.storage.sessions_process", "--", *paths]
-    done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=False)  # noqa: S603  our own
-    if done.returncode:
-        stated = done.stderr.decode(errors="backslashreplace").strip().splitlines() or ["nothing"]
-        raise DataError(f"recordings cannot be read ({stated[-1]}); move damaged ones elsewhere")
+    paths = list(recordings)
     acked_through: dict[SensorSession, int] = {}
-    for sensor, session_id, last in msgspec.json.decode(done.stdout, type=list[tuple[str, int, int]]):
+    for sensor, session_id, last in sessions_in_recordings(paths) if paths else ():
         run = SensorSession(sensor, session_id)
         acked_through[run] = max(last, acked_through.get(run, -1))
     return acked_through

@@ -25,6 +25,7 @@ __all__ = [
     "Release",
     "Served",
     "SlotMemory",
+    "StartWorker",
     "Started",
     "StatusNote",
     "ToPublisher",
@@ -36,6 +37,17 @@ __all__ = [
 
 class _Note(msgspec.Struct, frozen=True, kw_only=True, tag=True):
     pass
+
+
+class StartWorker(_Note, frozen=True, kw_only=True):
+    """Configuration of a worker: `ProcessingOptions`, and its share of the threads."""
+
+    device: str
+    dtype: str
+    threads: int
+    at_once: int
+    deadline_s: float
+    plan: Literal["nominal", "measured"]
 
 
 class SlotMemory(_Note, frozen=True, kw_only=True):
@@ -73,7 +85,7 @@ class Release(_Note, frozen=True, kw_only=True):
     kind: int
 
 
-ToWorker = SlotMemory | Prepare | ProcessJob | Release
+ToWorker = StartWorker | SlotMemory | Prepare | ProcessJob | Release
 
 
 class Ready(_Note, frozen=True, kw_only=True):

@@ -8,12 +8,12 @@ from ertis_numba.errors import NetworkError
 from ertis_numba.network.log import EventLog
 from ertis_numba.network.messages import Description, Group
 from ertis_numba.network.processing import pipe_messages
-from ertis_numba.network.processing.child import Child
 from ertis_numba.network.processing.options import ProcessingOptions
 from ertis_numba.network.processing.pipe_messages import FromPublisher
 from ertis_numba.network.processing.runner import Job
 from ertis_numba.network.processing.subscribers import DESCRIPTIONS
 from ertis_numba.network.status import Status, SubscriberStatus
+from ertis_numba.processes import SupervisedProcess
 
 if TYPE_CHECKING:
     from ertis_numba.network.processing.slots import Slot
@@ -30,7 +30,7 @@ _KEEP_MEMORY: Final = {
 }
 _STARTED_S: Final = 20.0
 _HUNG_S: Final = 10.0  # Limit on silence; it sends a message each second.
-_BACK_OFF_S: Final = (0.0, 0.2, 0.5, 1.0, 2.0, 5.0)
+_DELAYS_S: Final = (0.0, 0.2, 0.5, 1.0, 2.0, 5.0)
 _CLOSED_S: Final = 2.0
 
 
@@ -47,7 +47,6 @@ class Publisher:
     ----------
     address : str
         Address for applications; it stays the same after a restart.
-    respawned : int
     subscribers : tuple of SubscriberStatus
     refused : dict of str to int
         Refused messages and keys, by reason.
@@ -56,15 +55,11 @@ class Publisher:
     def __init__(self, options: ProcessingOptions, log: EventLog) -> None:
         self._options, self._log = options, log
         self.address = options.publish
-        self.respawned = 0
         self.subscribers: tuple[SubscriberStatus, ...] = ()
         self.refused: dict[str, int] = {}
         self._refused_before: dict[str, int] = {}
-        self._child: Child[FromPublisher] | None = None
+        self._process = SupervisedProcess[FromPublisher](_MODULE, FromPublisher, _DELAYS_S, _KEEP_MEMORY)
         self._serves = False
-        self._next_s = 0.0
-        self._deaths = 0
-        self._heard_s = 0.0
         self._points: tuple[str, ...] | None = ()
         self._jobs: dict[int, Job] = {}
         self._slots: dict[int, Slot] = {}
@@ -83,11 +78,11 @@ class Publisher:
         """
         self._begin()
         end_s = time.monotonic() + _STARTED_S
-        while self._child is not None and not self._serves and not stopping():
-            if time.monotonic() > end_s or self._child.pipe.closed:
+        while (child := self._process.child) is not None and not self._serves and not stopping():
+            if time.monotonic() > end_s or child.pipe.closed:
                 raise NetworkError(f"cannot listen at {self.address}: the publisher has ended or hangs; try again")
-            self._child.pipe.wait(0.2)
-            for note in self._child.pipe.receive():
+            child.pipe.wait(0.2)
+            for note in child.pipe.receive():
                 if isinstance(note, pipe_messages.Started) and note.error:
                     raise NetworkError(note.error)
                 self._take(note)
@@ -95,7 +90,12 @@ class Publisher:
     @property
     def pid(self) -> int:
         """Identifier of the process; 0 while there is none."""
-        return 0 if self._child is None else self._child.pid
+        return self._process.pid
+
+    @property
+    def respawned(self) -> int:
+        """Number of replaced processes."""
+        return self._process.restarts
 
     @property
     def serves(self) -> bool:
@@ -116,7 +116,7 @@ class Publisher:
 
     def publish(self, job: Job, publish: pipe_messages.Publish) -> bool:
         """Send a finished job, until `ProductsQueued` or the end of the process; return False without a description."""
-        child, slot = self._child, job.slot
+        child, slot = self._process.child, job.slot
         if child is None or slot is None:
             raise AssertionError("nothing can be published now; check serves first")
         described = self._descriptions.get(job.data.sensor, {})
@@ -139,55 +139,46 @@ class Publisher:
 
     def group(self, group: Group) -> None:
         """Send a closed group, unless the process does not listen."""
-        if self._child is not None and self._serves and not self._child.pipe.waiting:
-            self._child.pipe.send(pipe_messages.Grouped(group=group))
+        child = self._process.child
+        if child is not None and self._serves and not child.pipe.waiting:
+            child.pipe.send(pipe_messages.Grouped(group=group))
 
     def report(self, status: Status) -> None:
         """Send the status of the central node, if the previous one was accepted."""
-        if self._child is not None and self._serves and self._reports_sent - self._reports_taken < 3:
+        child = self._process.child
+        if child is not None and self._serves and self._reports_sent - self._reports_taken < 3:
             self._reports_sent += 1
-            self._child.pipe.send(pipe_messages.StatusNote(status=status.encode()))
+            child.pipe.send(pipe_messages.StatusNote(status=status.encode()))
 
     def fds(self) -> Iterable[int]:
         """Return the descriptors to poll now."""
-        return () if self._child is None or self._child.pipe.closed else (self._child.pipe.fileno(),)
+        return self._process.fds
 
     def ready(self) -> Sequence[tuple[Job, int]]:
         """Return published jobs, with the time."""
-        if self._child is None:
-            return ()
-        taken = [found for note in self._child.pipe.receive() if (found := self._take(note)) is not None]
-        if self._child.pipe.closed:  # `tick` cleans up once the process is gone.
-            self._child.kill()
-            self._serves = False
+        taken = [found for note in self._process.receive() if (found := self._take(note)) is not None]
+        self._serves = self._serves and bool(self._process.fds)  # `tick` cleans up once the process is gone.
         return taken
 
     def tick(self, now_s: float) -> tuple[Sequence[tuple[Job, int]], Sequence[Job]]:
         """Do as `ready`, return jobs lost with the process, and restart it or kill a hanging one."""
-        if self._child is None:
-            if now_s >= self._next_s:
+        match self._process.check(now_s):
+            case "due":
                 self._begin()
-            return (), ()
-        self._child.pipe.flush()
-        if now_s - self._heard_s > (_HUNG_S if self._serves else _STARTED_S):
-            self._log.warning("publisher_killed", pid=self._child.pid, text="it hangs")
-            self._child.kill()
-            self._heard_s = now_s
-        if not self._child.ended:
-            return (), ()
-        return self.ready(), self._died()
+            case "late":
+                self._log.warning("publisher_killed", pid=self.pid, text="it hangs")
+            case "ended":
+                return self.ready(), self._died()
+        return (), ()
 
     def close(self) -> None:
         """Close it."""
-        if self._child is not None:
-            self._child.close(_CLOSED_S if self._serves else 0.0)
-            self._child = None
+        self._process.close(_CLOSED_S if self._serves else 0.0)
         self._serves = False
 
     def _begin(self) -> None:
         keys = self._options.keys
-        self._child = Child(_MODULE, FromPublisher, environment=_KEEP_MEMORY)
-        self._heard_s = time.monotonic()
+        child = self._process.start(_STARTED_S)
         given: dict[str, Any] = {}
         if keys is not None:
             given = {
@@ -198,20 +189,22 @@ class Publisher:
             }
         # It listens at the previous port and the given host, which may have several addresses.
         address = f"{self._options.publish.rpartition(':')[0]}:{self.address.rpartition(':')[2]}"
-        self._child.pipe.send(pipe_messages.Begin(address=address, **given))
+        child.pipe.send(pipe_messages.Begin(address=address, **given))
 
     def _take(self, note: FromPublisher) -> tuple[Job, int] | None:
-        self._heard_s = time.monotonic()
+        self._process.expect(_HUNG_S if self._serves else _STARTED_S)
         match note:
             case pipe_messages.Started(address=address, error=error):
                 if error:
                     self._log.error("publisher_silent", text=error)
                 else:
                     self.address, self._serves = address, True
+                    self._process.expect(_HUNG_S)
             case pipe_messages.Wanted(points=points):
                 self._points = points
             case pipe_messages.Served():
-                self.subscribers, self._deaths = note.subscribers, 0
+                self.subscribers = note.subscribers
+                self._process.succeeded()
                 self._reports_taken = note.reports
                 if note.keys_note not in {self._keys_note, ""}:
                     self._log.error("keys", text=note.keys_note)
@@ -225,14 +218,9 @@ class Publisher:
 
     def _died(self) -> list[Job]:
         """Clean up after the process, and return the jobs lost with it."""
-        if self._child is None:
-            return []
-        self._child.close()
-        self._log.warning("publisher_died", pid=self._child.pid, text="another takes its place")
-        self._child, self._serves = None, False
-        self._next_s = time.monotonic() + _BACK_OFF_S[min(self._deaths, len(_BACK_OFF_S) - 1)]
-        self._deaths += 1
-        self.respawned += 1
+        self._log.warning("publisher_died", pid=self.pid, text="another takes its place")
+        self._process.clear()
+        self._serves = False
         self.subscribers, self._points = (), ()
         self._refused_before = self.refused
         self._reports_sent = self._reports_taken = 0

@@ -1,7 +1,6 @@
-"""Publisher process: ``python -m ertis_numba.network.processing.publisher_process DESCRIPTOR``."""
+"""Publisher process, which sends products to applications; `Publisher` starts it."""
 
 import os
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -30,14 +29,14 @@ from ertis_numba.network.messages import (
     encode,
 )
 from ertis_numba.network.processing import pipe_messages
-from ertis_numba.network.processing.child import pipe_of_child
 from ertis_numba.network.processing.pipe_messages import ToPublisher
 from ertis_numba.network.processing.slots import SlotView
 from ertis_numba.network.processing.subscribers import QueuedProduct, Subscribers
 from ertis_numba.network.zap_authenticator import ZapAuthenticator
+from ertis_numba.processes import connect
 
 if TYPE_CHECKING:
-    from ertis_numba.network.processing.pipe import Pipe
+    from ertis_numba.processes import Pipe
 
 _PIECE_BYTES: Final = 512 * 1024  # CURVE needs three times as long for the same bytes in one large frame.
 _AT_ONCE: Final = 64
@@ -225,17 +224,16 @@ def _pieces(data: memoryview) -> list[bytes]:
 
 
 def _main() -> None:
-    pipe: Pipe[ToPublisher] = pipe_of_child(sys.argv, ToPublisher)
-    pipe.wait(None)
-    for note in pipe.receive():
-        if isinstance(note, pipe_messages.Begin):
-            try:
-                publisher = _Publisher(pipe, note)
-            except (ErtisError, OSError) as error:
-                pipe.send(pipe_messages.Started(address="", error=str(error)))
-                return
-            publisher.run()
-            return
+    pipe: Pipe[ToPublisher] = connect(ToPublisher)
+    begin = next(pipe.messages(), None)
+    if not isinstance(begin, pipe_messages.Begin):
+        return
+    try:
+        publisher = _Publisher(pipe, begin)
+    except (ErtisError, OSError) as error:
+        pipe.send(pipe_messages.Started(address="", error=str(error)))
+    else:
+        publisher.run()
 
 
 if __name__ == "__main__":

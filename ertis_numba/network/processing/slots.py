@@ -2,11 +2,12 @@
 
 import mmap
 import os
-import tempfile
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
+
+from ertis_numba.processes import anonymous_memory
 
 __all__ = ["POINTS_BYTES", "Slot", "SlotView"]
 
@@ -57,9 +58,6 @@ class SlotView:
 class Slot:
     """Memory for one measurement and its products.
 
-    An anonymous file in memory, rather than one of `multiprocessing.shared_memory`: nothing is left behind even if
-    every process is killed at once.
-
     Parameters
     ----------
     number : int
@@ -76,9 +74,8 @@ class Slot:
 
     def __init__(self, number: int, words_bytes: int, image_bytes: int) -> None:
         self.number, self.words_bytes, self.image_bytes = number, words_bytes, image_bytes
-        self.descriptor = _nameless()
+        self.descriptor = anonymous_memory(_paged(words_bytes) + _paged(image_bytes) + POINTS_BYTES)
         try:
-            os.ftruncate(self.descriptor, _paged(words_bytes) + _paged(image_bytes) + POINTS_BYTES)
             self.view = SlotView(self.descriptor, words_bytes, image_bytes)
         except BaseException:
             os.close(self.descriptor)
@@ -91,10 +88,3 @@ class Slot:
     def close(self) -> None:
         """Release it; other processes keep their access."""
         os.close(self.descriptor)
-
-
-def _nameless() -> int:
-    if hasattr(os, "memfd_create"):
-        return os.memfd_create("ertis")
-    with tempfile.TemporaryFile() as file:  # Systems without anonymous memory get a deleted file.
-        return os.dup(file.fileno())

@@ -1,13 +1,14 @@
 """A local worker as its pool manages it: process, memory and current job."""
 
-from dataclasses import dataclass, field
-from typing import Final, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
-from ertis_numba.network.processing.child import Child
-from ertis_numba.network.processing.choice import Mode
 from ertis_numba.network.processing.pipe_messages import FromWorker, SlotMemory
-from ertis_numba.network.processing.runner import Job, JobKind
 from ertis_numba.network.processing.slots import Slot
+from ertis_numba.processes import SupervisedProcess
+
+if TYPE_CHECKING:
+    from ertis_numba.network.processing.choice import Mode
+    from ertis_numba.network.processing.runner import Job, JobKind
 
 __all__ = ["SLOTS", "Worker"]
 
@@ -15,15 +16,20 @@ SLOTS: Final = 2
 """Slots of each worker: one is processed while the publisher reads the other."""
 
 
-@dataclass(slots=True, eq=False)
-class Worker:
-    """A process that is restarted whenever it has died.
+_MODULE: Final = "ertis_numba.network.processing.worker_process"
+_DELAYS_S: Final = (0.0, 0.1, 0.2, 0.5, 1.0)
+
+
+class Worker(SupervisedProcess[FromWorker]):
+    """Supervised worker process.
+
+    Parameters
+    ----------
+    number : int
 
     Attributes
     ----------
     number : int
-    child : Child or None
-        None while there is no process.
     ready : bool
         True once it has reported that it is ready.
     slots, free : list of Slot
@@ -37,28 +43,22 @@ class Worker:
         Slot of the job.
     mode : Mode or None
         Mode of the job.
-    deadline_s, start_s : float
-        Times at which it is killed, and may be restarted, by `time.monotonic`.
-    deaths : int
-        Number of deaths since its last finished job.
     done : int
         Number of finished jobs.
     """
 
-    number: int
-    child: Child[FromWorker] | None = None
-    ready: bool = False
-    slots: list[Slot] = field(default_factory=list)
-    free: list[Slot] = field(default_factory=list)
-    kinds: set[int] = field(default_factory=set)
-    preparing: JobKind | None = None
-    job: Job | None = None
-    slot: Slot | None = None
-    mode: Mode | None = None
-    deadline_s: float = float("inf")
-    deaths: int = 0
-    start_s: float = 0.0
-    done: int = 0
+    def __init__(self, number: int) -> None:
+        super().__init__(_MODULE, FromWorker, _DELAYS_S)
+        self.number = number
+        self.ready = False
+        self.slots: list[Slot] = []
+        self.free: list[Slot] = []
+        self.kinds: set[int] = set()
+        self.preparing: JobKind | None = None
+        self.job: Job | None = None
+        self.slot: Slot | None = None
+        self.mode: Mode | None = None
+        self.done = 0
 
     @property
     def state(self) -> Literal["starting", "idle", "busy"]:

@@ -1,6 +1,5 @@
 """Pool of local worker processes: start, jobs, deadlines, restart."""
 
-import time
 from collections.abc import Iterable, Sequence
 from typing import Final
 
@@ -8,7 +7,6 @@ import numpy as np
 
 from ertis_numba.cpu_cores import usable_cores
 from ertis_numba.network.log import EventLog
-from ertis_numba.network.processing.child import Child
 from ertis_numba.network.processing.choice import Choice
 from ertis_numba.network.processing.options import ProcessingOptions
 from ertis_numba.network.processing.pipe_messages import (
@@ -21,6 +19,7 @@ from ertis_numba.network.processing.pipe_messages import (
     ProcessJob,
     Ready,
     Release,
+    StartWorker,
     Unusable,
 )
 from ertis_numba.network.processing.runner import (
@@ -39,9 +38,7 @@ from ertis_numba.network.status import WorkerStatus
 
 __all__ = ["LocalWorkerPool"]
 
-_MODULE: Final = "ertis_numba.network.processing.worker_process"
 _LOADING_S: Final = 60.0
-_BACK_OFF_S: Final = (0.0, 0.1, 0.2, 0.5, 1.0)  # Delays before a worker that dies repeatedly is restarted.
 _TRIES: Final = 3  # Limit on workers that die while preparing for a kind that has never been ready.
 
 
@@ -117,7 +114,7 @@ class LocalWorkerPool:
         worker.job, worker.mode = job, self._chosen.mode
         worker.slot = slot = worker.free.pop(0)
         slot.view.words(job.words.nbytes)[:] = bytes_of(job.words)
-        worker.deadline_s = time.monotonic() + self._options.deadline_s
+        worker.expect(self._options.deadline_s)
         worker.child.pipe.send(
             ProcessJob(
                 job=job.number,
@@ -138,13 +135,12 @@ class LocalWorkerPool:
 
     def fds(self) -> Iterable[int]:
         """Return the descriptors to poll now."""
-        children = (worker.child for worker in self._workers)
-        return [child.pipe.fileno() for child in children if child is not None and not child.pipe.closed]
+        return [fd for worker in self._workers for fd in worker.fds]
 
     def ready(self, fd: int) -> Sequence[Event]:
         """Return new events, after a descriptor became readable."""
         for worker in self._workers:
-            if worker.child is not None and worker.child.pipe.fileno() == fd:
+            if fd in worker.fds:
                 return self._heard(worker)
         return []
 
@@ -152,19 +148,15 @@ class LocalWorkerPool:
         """Return new events; call it ten times a second with the rate of arriving measurements."""
         found: list[Event] = []
         for worker in self._workers[: self._started]:
-            if worker.child is None:
-                if now_s >= worker.start_s:
+            match worker.check(now_s):
+                case "due":
                     self._start(worker)
-                continue
-            worker.child.pipe.flush()
-            if now_s > worker.deadline_s:
-                self._log.warning("worker_killed", pid=worker.child.pid, text="it missed its deadline")
-                worker.deadline_s = float("inf")
-                worker.child.kill()
-            if worker.child.ended:
-                found += self._heard(worker)  # It may have sent messages before.
-            else:
-                self._next_kind(worker)
+                case "late":
+                    self._log.warning("worker_killed", pid=worker.pid, text="it missed its deadline")
+                case "ended":
+                    found += self._heard(worker)  # It may have sent messages before.
+                case "running":
+                    self._next_kind(worker)
         if self._chosen.look(now_s, rate_hz):
             self._log.info("choice", text=self._chosen.why)
         return found
@@ -172,7 +164,7 @@ class LocalWorkerPool:
     def status(self) -> list[WorkerStatus]:
         """Return the status of the workers."""
         return [
-            WorkerStatus(pid=worker.child.pid, state=worker.state, done=worker.done)
+            WorkerStatus(pid=worker.pid, state=worker.state, done=worker.done)
             for worker in self._workers
             if worker.child is not None
         ]
@@ -183,41 +175,35 @@ class LocalWorkerPool:
             if worker.child is not None:
                 worker.child.kill()  # Left alone, it would end after its imports, without cleaning up either.
         for worker in self._workers:
-            if worker.child is not None:
-                worker.child.close()
-                worker.child = None
+            worker.close()
             for slot in worker.slots:
                 slot.close()
             worker.slots, worker.free = [], []
 
     def _start(self, worker: Worker) -> None:
-        threads = str(self._threads)
-        worker.child = Child(
-            _MODULE,
-            FromWorker,
-            [
-                self._options.device,
-                self._options.dtype,
-                threads,
-                str(len(self._workers)),
-                str(self._options.deadline_s),
-                self._options.plan,
-            ],
+        options = self._options
+        worker.start(_LOADING_S).pipe.send(
+            StartWorker(
+                device=options.device,
+                dtype=options.dtype,
+                threads=self._threads,
+                at_once=len(self._workers),
+                deadline_s=options.deadline_s,
+                plan=options.plan,
+            )
         )
-        worker.deadline_s = time.monotonic() + _LOADING_S
 
     def _heard(self, worker: Worker) -> list[Event]:
         """Return the events in a worker's messages."""
         found: list[Event] = []
         if worker.child is None:
             return found
-        for note in worker.child.pipe.receive():
+        for note in worker.receive():
             found += self._events_of(worker, note)
         if worker.child.ended:
             found += self._died(worker)
-        elif worker.child.pipe.closed:  # `tick` cleans up once the process is gone and writes no more.
+        elif worker.child.pipe.closed:  # `tick` cleans up.
             worker.ready = False
-            worker.child.kill()
         else:
             self._next_kind(worker)
         return found
@@ -229,7 +215,8 @@ class LocalWorkerPool:
             case Prepared():
                 return self._became_ready(worker, note)
             case Unusable(kind=kind, text=text):
-                worker.preparing, worker.deadline_s = None, float("inf")
+                worker.preparing = None
+                worker.expect(None)
                 if self._kinds.pop(kind, None) is not None:
                     return [KindFailed(kind, text)]
             case Predicted(sensor=sensor, event=event, warning=warning):
@@ -239,7 +226,8 @@ class LocalWorkerPool:
         return []
 
     def _loaded(self, worker: Worker, device: str, threads: int) -> None:
-        worker.ready, worker.deadline_s = True, float("inf")
+        worker.ready = True
+        worker.expect(None)
         if self._started == 1 and not self._kinds_known:
             if threads == 1 and self._options.workers is None and len(self._workers) > 1:
                 # A GPU, for example, serves one measurement faster than several.
@@ -255,7 +243,8 @@ class LocalWorkerPool:
 
     def _became_ready(self, worker: Worker, note: Prepared) -> list[Event]:
         kind = worker.preparing
-        worker.preparing, worker.deadline_s = None, float("inf")
+        worker.preparing = None
+        worker.expect(None)
         if worker.child is None or kind is None:
             return []
         if self._kinds.get(kind.number) is not kind:  # The kind was discarded meanwhile.
@@ -278,12 +267,12 @@ class LocalWorkerPool:
         if job is None or slot is None or note.job != job.number:
             return []
         worker.job = worker.slot = None
-        worker.deadline_s = float("inf")
+        worker.expect(None)
         if isinstance(note, JobFailed):
             worker.free.append(slot)
             return [Lost(job, note.text, note.again)]
         worker.done += 1
-        worker.deaths = 0
+        worker.succeeded()
         if worker.mode in (self._chosen.wide, self._chosen.many) and worker.mode is not None:
             self._chosen.took(worker.mode, note.took_s)
         job.slot, job.n_points = slot, note.n_points
@@ -298,22 +287,17 @@ class LocalWorkerPool:
         for number, kind in self._kinds.items():
             if number not in worker.kinds:
                 worker.preparing = kind
-                worker.deadline_s = time.monotonic() + self._options.prepare_s
+                worker.expect(self._options.prepare_s)
                 measure = not self._prepared
                 worker.child.pipe.send(Prepare(kind=number, settings=kind.settings, measure=measure))
                 return
 
     def _died(self, worker: Worker) -> list[Event]:
         """Clean up after a worker, and return the result for its job."""
-        if worker.child is None:
-            return []
-        pid, found = worker.child.pid, list[Event]()
-        worker.child.close()
-        worker.child, worker.ready = None, False
+        pid, found = worker.pid, list[Event]()
+        worker.clear()
+        worker.ready = False
         worker.kinds.clear()
-        worker.deadline_s = float("inf")
-        worker.start_s = time.monotonic() + _BACK_OFF_S[min(worker.deaths, len(_BACK_OFF_S) - 1)]
-        worker.deaths += 1
         self.respawned += 1
         kind, job, slot = worker.preparing, worker.job, worker.slot
         worker.preparing = worker.job = worker.slot = None

@@ -1,8 +1,7 @@
-"""Worker process that makes images: ``python -m ertis_numba.network.processing.worker_process DESCRIPTOR``."""
+"""Worker process that makes images; `LocalWorkerPool` starts it."""
 
 import faulthandler
 import os
-import sys
 import time
 from typing import TYPE_CHECKING, Final
 
@@ -11,7 +10,6 @@ import numpy as np
 from ertis_numba.errors import ArgumentError, DataError, DeviceError
 from ertis_numba.frames import Measurement
 from ertis_numba.network.processing._predictions import Predictions
-from ertis_numba.network.processing.child import pipe_of_child
 from ertis_numba.network.processing.pipe_messages import (
     FromWorker,
     JobFailed,
@@ -21,15 +19,16 @@ from ertis_numba.network.processing.pipe_messages import (
     Ready,
     Release,
     SlotMemory,
+    StartWorker,
     ToWorker,
     Unusable,
 )
 from ertis_numba.network.processing.slots import POINTS_BYTES, SlotView
+from ertis_numba.processes import connect
 
 if TYPE_CHECKING:
     from ertis_numba.network.processing.chain import SharedPipeline
-    from ertis_numba.network.processing.pipe import Pipe
-    from ertis_numba.stages.costs import PlanCosts
+    from ertis_numba.processes import Pipe
 
 _DRAIN_S: Final = 0.1
 # Number of deadlines after which a hanging worker ends by itself, if no process is left to kill it.
@@ -37,26 +36,22 @@ _NEGLECTED: Final = 3
 
 
 class _ImageWorker:
-    def __init__(self, pipe: "Pipe[ToWorker]", arguments: list[str]) -> None:
-        self._pipe = pipe
-        self._device, self._dtype = arguments[2:4]
-        self._threads, self._at_once = int(arguments[4]), int(arguments[5])
-        self._deadline_s = float(arguments[6])
-        self._plan: PlanCosts = "measured" if arguments[7] == "measured" else "nominal"
+    def __init__(self, pipe: "Pipe[ToWorker]", given: StartWorker) -> None:
+        self._pipe, self._given, self._threads = pipe, given, given.threads
         self._views: dict[int, SlotView] = {}
         self._chains: dict[int, SharedPipeline] = {}
-        self._predictions = Predictions(self._device)
+        self._predictions = Predictions(given.device)
 
     def run(self) -> None:
         from ertis_numba import kernels  # noqa: PLC0415  in this process alone
 
         try:
-            loaded: kernels.KernelSet | None = kernels.load(self._device)
+            loaded: kernels.KernelSet | None = kernels.load(self._given.device)
         except DeviceError:  # Creating the pipeline raises it again, at a time when it can be reported.
             loaded = None
         largest = 1 if loaded is None else loaded.max_threads
         self._threads = min(self._threads, largest)
-        self._pipe.send(Ready(device=self._device if loaded is None else loaded.device, threads=largest))
+        self._pipe.send(Ready(device=self._given.device if loaded is None else loaded.device, threads=largest))
         while not self._pipe.closed:
             self._pipe.wait(_DRAIN_S if self._predictions.busy else None)
             for order in self._pipe.receive():
@@ -82,8 +77,8 @@ class _ImageWorker:
         from ertis_numba.network.processing.chain import SharedPipeline  # noqa: PLC0415  in this process alone
 
         try:
-            chain = SharedPipeline(order.settings, self._device, self._plan)
-            times_s = chain.times_s(self._threads, self._at_once) if order.measure else (0.0, 0.0)
+            chain = SharedPipeline(order.settings, self._given.device, self._given.plan)
+            times_s = chain.times_s(self._threads, self._given.at_once) if order.measure else (0.0, 0.0)
             reported = chain.prepared(order.kind, *times_s)
         except (ArgumentError, DataError, DeviceError, MemoryError) as error:
             return Unusable(kind=order.kind, text=str(error) or type(error).__name__)
@@ -92,7 +87,7 @@ class _ImageWorker:
 
     def _processed(self, order: ProcessJob) -> FromWorker:
         begun_s = time.perf_counter()
-        faulthandler.dump_traceback_later(_NEGLECTED * self._deadline_s, exit=True)
+        faulthandler.dump_traceback_later(_NEGLECTED * self._given.deadline_s, exit=True)
         try:
             n_points = self._made(self._chains[order.kind], self._views[order.slot], order)
         except DataError as error:
@@ -105,13 +100,13 @@ class _ImageWorker:
 
     def _made(self, chain: "SharedPipeline", view: SlotView, order: ProcessJob) -> int:
         """Make the image in its slot, and the points; return the number of points."""
-        place = view.image_as(chain.shape, self._dtype)
+        place = view.image_as(chain.shape, self._given.dtype)
         words = view.words(order.words_bytes)
-        image = chain.image(words, place if self._dtype == "float32" else None, threads=order.threads)
+        image = chain.image(words, place if self._given.dtype == "float32" else None, threads=order.threads)
         if order.predict_for:
             measurement = Measurement(chain.format.from_bytes(bytes(words)), image.settings)
             self._predictions.add(order.predict_for, image.replace(amplitude=image.amplitude.copy()), measurement)
-        if self._dtype != "float32":
+        if self._given.dtype != "float32":
             np.copyto(place, image.amplitude, casting="same_kind")
         if not order.points:
             return 0
@@ -120,5 +115,12 @@ class _ImageWorker:
         return len(points)
 
 
+def _main() -> None:
+    pipe: Pipe[ToWorker] = connect(ToWorker)
+    given = next(pipe.messages(), None)
+    if isinstance(given, StartWorker):
+        _ImageWorker(pipe, given).run()
+
+
 if __name__ == "__main__":
-    _ImageWorker(pipe_of_child(sys.argv, ToWorker), sys.argv).run()
+    _main()

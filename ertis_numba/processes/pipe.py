@@ -1,16 +1,19 @@
-"""Pipes between the processes of a central node, for small messages and descriptors; sending never blocks."""
+"""Pipes between processes, for small messages and descriptors of memory; sending never blocks."""
 
 import os
-import select
+import selectors
 import socket
 import struct
+import sys
+import tempfile
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import Any, Final, Generic, TypeVar
 
 import msgspec
 
-__all__ = ["Pipe"]
+__all__ = ["Pipe", "anonymous_memory", "wait_for"]
 
 Kind = TypeVar("Kind")
 
@@ -18,12 +21,15 @@ _LENGTH: Final = struct.Struct("<I")
 _MAX_BYTES: Final = 64 * 2**20  # Limit on a message; a process of this package sends no longer one.
 _READ_BYTES: Final = 1 << 18
 _FILES: Final = 8  # Limit on descriptors per message.
+# epoll would open a descriptor for each wait; Windows has only select.
+_Selector: Final = getattr(selectors, "PollSelector", selectors.SelectSelector)
 
 
 class Pipe(Generic[Kind]):
     """One end of a connection between two processes.
 
-    Messages are MessagePack, never pickle: a corrupted worker cannot make the central node run code.
+    Messages are MessagePack, never pickle: a corrupted child cannot make its parent run code. Paths travel as bytes,
+    because names of files need not be valid text.
 
     Parameters
     ----------
@@ -43,8 +49,8 @@ class Pipe(Generic[Kind]):
     def __init__(self, end: socket.socket, kinds: Any) -> None:
         end.settimeout(0)
         self._end = end
-        self._encoder = msgspec.msgpack.Encoder()
-        self._decoder: msgspec.msgpack.Decoder[Kind] = msgspec.msgpack.Decoder(kinds)
+        self._encoder = msgspec.msgpack.Encoder(enc_hook=os.fsencode)
+        self._decoder: msgspec.msgpack.Decoder[Kind] = msgspec.msgpack.Decoder(kinds, dec_hook=_decoded)
         self._in = bytearray()
         self._out: deque[tuple[memoryview, Sequence[int]]] = deque()
         self.files: deque[int] = deque()
@@ -87,7 +93,10 @@ class Pipe(Generic[Kind]):
         self.flush()
         while not self.closed:
             try:
-                data, files, _, _ = socket.recv_fds(self._end, _READ_BYTES, _FILES)
+                if sys.platform == "win32":
+                    data, files = self._end.recv(_READ_BYTES), []
+                else:
+                    data, files, _, _ = socket.recv_fds(self._end, _READ_BYTES, _FILES)
             except BlockingIOError:
                 break
             except OSError:
@@ -96,6 +105,12 @@ class Pipe(Generic[Kind]):
             self._in += data
             self.closed = not data
         return self._messages()
+
+    def messages(self) -> Iterator[Kind]:
+        """Yield messages as they arrive, until the other process closes the pipe."""
+        while not self.closed:
+            self.wait(None)
+            yield from self.receive()
 
     def _messages(self) -> list[Kind]:
         found: list[Kind] = []
@@ -119,11 +134,14 @@ class Pipe(Generic[Kind]):
 
     def wait(self, timeout_s: float | None) -> bool:
         """Wait until there is something to `receive`, and send meanwhile."""
-        poll = select.poll()
-        poll.register(self._end, select.POLLIN | (select.POLLOUT if self._out else 0))
-        ready = poll.poll(None if timeout_s is None else 1000 * timeout_s)
+        ready = wait_for([self], timeout_s)
         self.flush()
-        return any(event & ~select.POLLOUT for _, event in ready)
+        return bool(ready)
+
+    def drain(self) -> None:
+        """Wait until all messages are sent, or the other process is gone."""
+        while self._out:
+            self.wait(None)
 
     def close(self) -> None:
         """Close the pipe; the other process notices."""
@@ -137,6 +155,39 @@ class Pipe(Generic[Kind]):
         for _, files in self._out:
             _close(files)
         self._out.clear()
+
+
+def wait_for(pipes: Iterable[Pipe[Any]], timeout_s: float | None) -> list[Pipe[Any]]:
+    """Wait until pipes have something to `Pipe.receive` or can send, and return those with something to receive."""
+    with _Selector() as selector:
+        for pipe in pipes:
+            selector.register(pipe, selectors.EVENT_READ | (selectors.EVENT_WRITE if pipe.waiting else 0), pipe)
+        return [key.data for key, events in selector.select(timeout_s) if events & selectors.EVENT_READ]
+
+
+def anonymous_memory(n_bytes: int) -> int:
+    """Return the descriptor of new memory that processes can share.
+
+    The system frees it with the last of them. Memory of `multiprocessing.shared_memory` has a name, by which it is left
+    behind if every process is killed at once.
+    """
+    if hasattr(os, "memfd_create"):
+        descriptor = os.memfd_create("ertis")
+    else:
+        with tempfile.TemporaryFile() as file:  # Systems without anonymous memory get a deleted file.
+            descriptor = os.dup(file.fileno())
+    try:
+        os.ftruncate(descriptor, n_bytes)
+    except BaseException:
+        os.close(descriptor)
+        raise
+    return descriptor
+
+
+def _decoded(kind: type, value: Any) -> Any:
+    if kind is Path:
+        return Path(os.fsdecode(value))
+    raise NotImplementedError(f"messages cannot contain {kind}")
 
 
 def _close(files: Iterable[int]) -> None:

@@ -1,0 +1,235 @@
+"""Sealing and reading of recordings in separate processes, because HDF5 can crash its process on a full disk."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, TypeAlias
+
+import msgspec
+
+from ertis_numba.errors import DataError, JournalInUseError
+from ertis_numba.processes import Child
+
+__all__ = [
+    "FoundSessions",
+    "FromSealing",
+    "ReadSessions",
+    "SealJournal",
+    "Sealed",
+    "SealingProgress",
+    "SealingResult",
+    "StorageFailed",
+    "seal_in_subprocess",
+    "sessions_in_recordings",
+]
+
+_SEALING: Final = "ertis_numba.storage.sealing_process"
+_READING: Final = "ertis_numba.storage.sessions_process"
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, slots=True)
+class SealingResult:
+    """Result of sealing a journal.
+
+    Attributes
+    ----------
+    journal : Path
+        Path of the journal.
+    recording : Path or None
+        Path of the recording; None if the journal had no measurement.
+    measurements : int
+        Number of measurements in the recording, by default 0.
+    missing : int
+        Number of missing measurements according to the recording, by default 0.
+    damaged : int
+        Number of missing measurements that were damaged in the journal, by default 0.
+    set_aside : Path or None
+        New path of the journal if it has damaged or refused measurements; otherwise None, and the journal was removed.
+    lost : int
+        Number of missing measurements that the journal had noted before its log was damaged, by default 0. Each number
+        belongs to a stored measurement or a gap, or was skipped by the sensor.
+    damage : str
+        Losses from a damaged log that no gap of the recording covers; empty if there are none.
+    refused : dict of str to str
+        Reasons why a recording cannot contain the measurements of some sensors, by sensor.
+    """
+
+    journal: Path
+    recording: Path | None
+    measurements: int = 0
+    missing: int = 0
+    damaged: int = 0
+    set_aside: Path | None = None
+    lost: int = 0
+    damage: str = ""
+    refused: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def remark(self) -> str:
+        """Irregularities in one line; empty if there are none."""
+        if self.recording is None and not self.refused:
+            return f"{self.journal}: no measurement was captured"
+        reported = []
+        if self.lost or self.damage:
+            reported.append(f"the log of {self.journal.name} was damaged; stored numbers lost: {self.lost}")
+        if self.damage:
+            reported.append(f"also lost: {self.damage}")
+        if self.damaged:
+            reported.append(
+                "1 measurement is damaged" if self.damaged == 1 else f"{self.damaged} measurements are damaged"
+            )
+        reported += [f"no recording can hold sensor {name} ({reason})" for name, reason in self.refused.items()]
+        if self.set_aside is not None:
+            reported.append(f"the journal is kept as {self.set_aside}")
+        return "; ".join(reported)
+
+
+class SealJournal(msgspec.Struct, frozen=True, tag=True):
+    """Request to seal a journal, with the options of `seal_in_subprocess`."""
+
+    journal: Path
+    overwrite: bool
+    rests: float | None
+
+
+class SealingProgress(msgspec.Struct, frozen=True, tag=True):
+    """Number of measurements written so far, and of all measurements."""
+
+    done: int
+    of: int
+
+
+class Sealed(msgspec.Struct, frozen=True, tag=True):
+    """A journal is sealed."""
+
+    result: SealingResult
+
+
+class StorageFailed(msgspec.Struct, frozen=True, tag=True):
+    """A request failed; with ``in_use``, because another process has the journal open."""
+
+    error: str
+    in_use: bool = False
+
+
+FromSealing: TypeAlias = SealingProgress | Sealed | StorageFailed
+
+
+class ReadSessions(msgspec.Struct, frozen=True, tag=True):
+    """Request to read the sessions in recordings."""
+
+    recordings: list[Path]
+
+
+class FoundSessions(msgspec.Struct, frozen=True, tag=True):
+    """Sessions in recordings: sensor, session_id, and the highest stored or missing number."""
+
+    sessions: list[tuple[str, int, int]]
+
+
+def seal_in_subprocess(
+    journal: Path,
+    *,
+    overwrite: bool = False,
+    rests: float | None = None,
+    progress: Progress = lambda _done, _of: None,
+) -> SealingResult:
+    """Make the recording of a journal in a separate process; see `ertis_numba.storage.sealing.seal`.
+
+    Ctrl-C in a terminal does not reach that process. However it ends, the measurements are in the journal or in the
+    recording, and sealing can be repeated.
+
+    Parameters
+    ----------
+    journal : Path
+        Path of the journal.
+    overwrite : bool
+        Replace an existing file, even if it has other content.
+    rests : float, optional
+        Run at low priority, and pause after each step for this multiple of its duration.
+    progress : callable, optional
+        Called with the number of written measurements and of all measurements, about a hundred times.
+
+    Returns
+    -------
+    SealingResult
+        Result.
+
+    Raises
+    ------
+    JournalInUseError
+        Another process has the journal open.
+    DataError
+        Sealing failed; the journal is still there.
+    OSError
+        No process can be started.
+    KeyboardInterrupt
+        The process was interrupted; the message states where the measurements are.
+    """
+    replies: list[Sealed | StorageFailed] = []
+    try:
+        reason = _seal(SealJournal(journal, overwrite, rests), replies, progress)
+    except KeyboardInterrupt as error:
+        raise KeyboardInterrupt(_interrupt_message(journal, replies)) from error
+    match replies:
+        case [Sealed(result=result)]:
+            return result
+        case [StorageFailed(error=text, in_use=True)]:
+            raise JournalInUseError(text)
+        case [StorageFailed(error=text)]:
+            raise DataError(text)
+    raise DataError(f"{journal}: the process that seals it {reason}; seal it again")
+
+
+def _seal(request: SealJournal, replies: list[Sealed | StorageFailed], progress: Progress) -> str:
+    """Run a sealing process, append its reply, and return how it ended."""
+    child: Child[FromSealing] = Child(_SEALING, FromSealing, keep_stderr=True)
+    child.pipe.send(request)
+    try:
+        _listen(child, replies, progress)
+    except BaseException:
+        child.interrupt()
+        _listen(child, replies, lambda _done, _of: None)
+        child.wait()
+        raise
+    return child.wait()
+
+
+def _listen(child: Child[FromSealing], replies: list[Sealed | StorageFailed], progress: Progress) -> None:
+    for note in child.pipe.messages():
+        if isinstance(note, SealingProgress):
+            progress(note.done, note.of)
+        else:
+            replies.append(note)
+
+
+def _interrupt_message(journal: Path, replies: list[Sealed | StorageFailed]) -> str:
+    """Return a line on where the measurements are after an interrupt; sealing may have ended before it."""
+    match replies:
+        case [Sealed(result=sealed)]:
+            return sealed.remark or f"the measurements are in {sealed.recording}"
+    return f"the measurements are safe in {journal}; recover them with 'ertis recover {journal}'"
+
+
+def sessions_in_recordings(recordings: Iterable[Path]) -> list[tuple[str, int, int]]:
+    """Return the sessions in recordings, read by a separate process; see `FoundSessions`.
+
+    Raises
+    ------
+    DataError
+        A recording cannot be read.
+    """
+    child: Child[Any] = Child(_READING, FoundSessions | StorageFailed, keep_stderr=True)
+    try:
+        child.pipe.send(ReadSessions(list(recordings)))
+        match next(child.pipe.messages(), None):
+            case FoundSessions(sessions=found):
+                return found
+            case StorageFailed(error=reason):
+                pass
+            case _:
+                reason = f"the process that reads them {child.wait()}"
+    finally:
+        child.close()
+    raise DataError(f"recordings cannot be read ({reason}); move damaged ones elsewhere")
