@@ -30,7 +30,6 @@ autodoc_default_options = {"members": True}
 suppress_warnings = ["misc.highlighting_failure"]  # tables of formats contain fragments of code
 
 MARKS = re.compile(r"(?<=\w)_(?!\w)|\*|(?<=\btcp):(?=//)")  # addresses of nodes must not become links
-EFFECTS = "<!-- table of effects -->"
 REFERENCE = re.compile(r"<!-- keys of (\w+) -->")
 OUTSIDE = r"\[([^\]]+)\]\(%s((?!\.\.|docs/)[^)#\s]+)\)"
 
@@ -59,19 +58,9 @@ def _name_what_is_outside(_: Any, page: str, source: list[str]) -> None:
 
 
 def _write_reference(_: Any, page: str, source: list[str]) -> None:
-    """Insert the keys of each kind of TOML file, and the effects of scenes."""
+    """Insert the keys of each kind of TOML file into the settings reference."""
     if page == "reference/settings":
         source[0] = REFERENCE.sub(lambda match: "\n".join(_tables(match[1])), source[0])
-    if page == "explanation/simulator":
-        source[0] = source[0].replace(EFFECTS, "\n".join(_effects()))
-
-
-def _effects() -> Iterator[str]:
-    from ertis_numba.simulation.effects import EFFECTS as effects  # noqa: N811, PLC0415  the paths are set above
-
-    yield from ("| effect | equation | source | needed if |", "|---|---|---|---|")
-    for each in effects.values():
-        yield f"| `{each.name}` | {each.equation} | {each.source} | {each.needed_if} |"
 
 
 def _tables(document: str) -> Iterator[str]:

@@ -6,7 +6,7 @@ from ertis_numba.air import sound_speed_m_s
 from ertis_numba.settings import Array, Call, Processing, Recording
 from ertis_numba.simulation import Emitter, Scene, Sensor
 from ertis_numba.simulation.arrivals import arrivals
-from ertis_numba.simulation.effects import EFFECTS
+from ertis_numba.simulation.names import EFFECTS, INDISPENSABLE
 from ertis_numba.simulation.plan import EffectPlan, Verdict
 from ertis_numba.simulation.render import Simulator
 from ertis_numba.simulation.snapshot import snapshot
@@ -27,8 +27,8 @@ def only(*names):
     """A plan with the given effects and the indispensable ones, whatever the scene needs."""
     return EffectPlan(
         tuple(
-            Verdict(name=name, on=name in names or bool(each.indispensable), reason="a test asks for it")
-            for name, each in EFFECTS.items()
+            Verdict(name=name, on=name in names or name in INDISPENSABLE, reason="a test asks for it", estimate_db=None)
+            for name in EFFECTS
         )
     )
 
@@ -47,7 +47,7 @@ def heard(scene, *names, index=0, sensor=None):
 def ways(scene, *names, index=0, sensor=None, frequency_hz=(40_000.0,)):
     """Arrivals of the calls with the given effects."""
     shot = snapshot(scene, scene.sensor(sensor), index / scene.rate_hz)
-    return arrivals(shot, only(*names).active, np.asarray(frequency_hz, dtype=np.float64), CostStopwatch())
+    return arrivals(shot, {*names, *INDISPENSABLE}, np.asarray(frequency_hz, dtype=np.float64), CostStopwatch())
 
 
 def sorted_ways(scene, *names, **options):

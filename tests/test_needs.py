@@ -3,8 +3,8 @@
 `ertis bench simulation --verdicts N` tests many more scenes.
 """
 
-import importlib
-from dataclasses import replace
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -13,8 +13,7 @@ from ertis_bench.verdicts import Trial, with_one
 
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.simulation import Emitter, Noise, Point, Scene, Sensor, Sonar, Wall
-from ertis_numba.simulation.effects import EFFECTS
-from ertis_numba.simulation.estimates import Estimate
+from ertis_numba.simulation.needs import ESTIMATES, Estimate
 from ertis_numba.simulation.plan import make_plan
 from ertis_numba.simulation.render import Simulator
 from ertis_numba.simulation.sight import SAME_RANGE_M, Sight
@@ -91,11 +90,10 @@ def test_mutually_dependent_effects_stay_on(monkeypatch):
     """Walls matter only without the facing of discs, which matters only with the walls."""
 
     def of(name, matters):
-        estimate = lambda sight: Estimate(change_db=6.0 if matters(sight.active) else 0.0, reason=name)  # noqa: E731
-        return replace(EFFECTS[name], estimate=estimate)
+        return lambda sight: Estimate(change_db=6.0 if matters(sight.active) else 0.0, reason=name)
 
-    monkeypatch.setitem(EFFECTS, "walls", of("walls", lambda active: "target_size" not in active))
-    monkeypatch.setitem(EFFECTS, "target_size", of("target_size", lambda active: "walls" in active))
+    monkeypatch.setitem(ESTIMATES, "walls", of("walls", lambda active: "target_size" not in active))
+    monkeypatch.setitem(ESTIMATES, "target_size", of("size", lambda active: "walls" in active))
     verdicts = {verdict.name: verdict for verdict in make_plan(Scene(points=(Point(range_m=1.0),))).verdicts}
     for name in ("walls", "target_size"):
         assert verdicts[name].on
@@ -103,23 +101,23 @@ def test_mutually_dependent_effects_stay_on(monkeypatch):
         assert verdicts[name].reason.endswith("stays on, because other effects depend on it")
 
 
-def test_unneeded_effects_are_not_computed(monkeypatch):
-    """The rendering of a free field calls no function of any other effect."""
-
-    def unneeded(*_, **__):
-        raise AssertionError("an effect that is off was computed")
-
-    simulator = Simulator(Scene(points=(Point(range_m=1.0), Point(range_m=3.0, azimuth_deg=30.0))))
-    assert simulator.plan.active == {"absorption", "modulation", "propagation", "spreading"}
-    for name, each in EFFECTS.items():
-        if name not in simulator.plan.active:
-            module = importlib.import_module(f"ertis_numba.simulation.effects.{name}")
-            for function in set(module.__all__) - {"EFFECT"}:
-                monkeypatch.setattr(module, function, unneeded)
-            acts = {place: unneeded for place in ("gain", "microphones", "calls", "sounds") if getattr(each, place)}
-            monkeypatch.setitem(EFFECTS, name, replace(each, **acts))
-    simulator.render()
-    assert set(simulator.clock.cost_ms) == simulator.plan.active
+def test_unneeded_effects_are_not_imported():
+    """In a separate process, a free field loads only the effects of its plan, and draws no unused noise."""
+    code = """
+import sys
+from ertis_numba.simulation import Point, Scene
+from ertis_numba.simulation.render import Simulator
+simulator = Simulator(Scene(points=(Point(range_m=1.0), Point(range_m=3.0, azimuth_deg=30.0))))
+simulator.render()
+prefix = "ertis_numba.simulation.effects."
+print(sorted(name.removeprefix(prefix) for name in sys.modules if name.startswith(prefix)))
+print(sorted(simulator.plan.active))
+print(sorted(simulator.clock.cost_ms))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded, active, costs = done.stdout.splitlines()
+    assert loaded == "['absorption', 'propagation', 'spreading']"
+    assert active == costs == "['absorption', 'modulation', 'propagation', 'spreading']"
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ from ertis_numba.simulation import (
     Wall,
 )
 from ertis_numba.simulation.ab_render import image_change_db
-from ertis_numba.simulation.effects import EFFECTS
+from ertis_numba.simulation.names import ASKED_FOR, EFFECTS
 from ertis_numba.simulation.plan import EffectPlan, make_plan
 from ertis_numba.simulation.render import Simulator
 from ertis_numba.simulation.sight import Sight
@@ -87,7 +87,7 @@ def run(*, count: int, say: Callable[[str], None]) -> dict[str, Any]:
     say("choosing the effects")
     # Keys of the scene request most of these effects, which would keep them on. Here, only the change of the image
     # must decide.
-    plan = make_plan(scene.replace(effects={name: False for name, each in EFFECTS.items() if each.requested}))
+    plan = make_plan(scene.replace(effects=dict.fromkeys(ASKED_FOR, False)))
     everything = make_plan(scene.replace(effects=dict.fromkeys(_ALL_EFFECTS, True)))
     say("comparing the images")
     change_db = _change_db(scene, plan, everything)

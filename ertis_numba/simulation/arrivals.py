@@ -16,42 +16,12 @@ from ertis_numba.simulation.sensors import Emitter
 from ertis_numba.simulation.snapshot import Snapshot, TransmitterPose
 from ertis_numba.simulation.stopwatch import CostStopwatch
 
-__all__ = [
-    "Arrivals",
-    "EchoPaths",
-    "acting",
-    "arrivals",
-    "echoes",
-    "effect",
-    "emitted",
-    "gains",
-    "responses",
-    "transmitter_of",
-]
+__all__ = ["Arrivals", "arrivals", "echoes", "effect", "emitted", "gains", "responses", "transmitter_of"]
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 _TICK_S = 1e-12
 _LONGEST_STRETCH = 2.0  # of a call; speeds are limited to a third of the speed of sound
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class EchoPaths:
-    """Paths of echoes whose amplitude an effect changes.
-
-    Attributes
-    ----------
-    shot : Snapshot
-    paths : Paths
-    emitter : Emitter
-        Emitter of the call, which may be that of another sensor.
-    frequency_hz : (frequency,) float64
-    """
-
-    shot: Snapshot
-    paths: Paths
-    emitter: Emitter
-    frequency_hz: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,15 +49,8 @@ class Arrivals:
 
 
 def effect(name: str, function: str | None = None) -> Any:
-    """Return a function of an effect that acts at a place of its own; effects import this module."""
+    """Return the function of an effect; its module is imported at the first call."""
     return getattr(importlib.import_module(f"ertis_numba.simulation.effects.{name}"), function or name)
-
-
-def acting(active: AbstractSet[str], place: str) -> list[tuple[str, Any]]:
-    """Return the names and functions of the active effects that act at a place, an attribute of `Effect`."""
-    effects = importlib.import_module("ertis_numba.simulation.effects").EFFECTS.values()
-    found = ((each.name, getattr(each, place)) for each in effects if each.name in active)
-    return [(name, function) for name, function in found if function]
 
 
 def arrivals(shot: Snapshot, active: AbstractSet[str], frequency_hz: Floats, clock: CostStopwatch) -> list[Arrivals]:
@@ -126,13 +89,16 @@ def arrivals(shot: Snapshot, active: AbstractSet[str], frequency_hz: Floats, clo
                 delay_s, stretch = _times(shot, active, paths)
             amplitude = gain[:, None] * amplitude
             found.append(_arrivals(shot, active, number, delay_s + start_s, amplitude, late_s, stretch))
-    for name, calls in acting(active, "calls"):
-        with clock(name):
-            for added in calls(shot, active, gain):
-                if added.sensor is None:
-                    found.append(Arrivals(added.call, _ticks(added.delay_s + late_s), added.amplitude))
-                else:
-                    found.append(_arrivals(shot, active, added.sensor, added.delay_s, added.amplitude, late_s))
+    direct_db = shot.sensor.emitter.direct_sound_db
+    if "direct_sound" in active and direct_db is not None and not shot.sensor.emitter.silent:
+        with clock("direct_sound"):
+            paths = effect("direct_sound")(shot, transmitter_of(shot, active, shot.number))
+            amplitude = (_linear(direct_db) * gain * effect("spreading")(paths))[..., None]
+            delay_s = effect("propagation")(paths, shot.speed_m_s)
+            found.append(_arrivals(shot, active, shot.number, delay_s, amplitude, late_s))
+    if "interference" in active:
+        with clock("interference"):
+            found += _sonars(shot, gain, late_s)
     return found
 
 
@@ -213,12 +179,24 @@ def responses(
     """
     strength = _strength(paths, spreads="spreading" in active)
     amplitude = paths.reflection * strength[:, None, None] * np.ones((*paths.second_m.shape, 1))
-    given = EchoPaths(shot, paths, emitter, frequency_hz)
-    for name, gain in acting(active, "gain"):
-        with clock(name):
-            factor = gain(given)
-            if factor is not None:
-                amplitude = amplitude * factor
+    if "spreading" in active:
+        with clock("spreading"):
+            amplitude *= effect("spreading")(paths)[..., None]
+    if "target_size" in active and len(paths.targets):
+        with clock("target_size"):
+            amplitude = amplitude * effect("target_size", "patterns")(paths, frequency_hz, shot.speed_m_s)
+    if "absorption" in active:
+        with clock("absorption"):
+            amplitude = amplitude * effect("absorption")(paths, shot.sensor.air, frequency_hz)
+    if "emitter_directivity" in active and emitter.diameter_m:
+        with clock("emitter_directivity"):
+            pattern = effect("emitter_directivity")(paths, emitter.diameter_m, frequency_hz, shot.speed_m_s)
+            amplitude = amplitude * pattern
+    diameter_m = shot.sensor.electronics.microphone_diameter_m
+    if "microphone_directivity" in active and diameter_m:
+        with clock("microphone_directivity"):
+            pattern = effect("microphone_directivity")(paths, diameter_m, frequency_hz, shot.speed_m_s)
+            amplitude = amplitude * pattern
     return amplitude
 
 
@@ -235,10 +213,13 @@ def gains(shot: Snapshot, active: AbstractSet[str], clock: CostStopwatch) -> tup
     Both include the calibration of the settings and the uncalibrated spread. Processing corrects only the calibration.
     """
     gain, late_s = shot.layout.gain[shot.channels], shot.layout.delay_s[shot.channels]
-    for name, unequal in acting(active, "microphones"):
-        with clock(name):
-            more, later_s = unequal(shot)
+    if "microphone_spread" in active:
+        with clock("microphone_spread"):
+            more, later_s = effect("microphone_spread")(shot)
             gain, late_s = gain * more, late_s + later_s
+    if "microphone_faults" in active:
+        with clock("microphone_faults"):
+            gain = gain * effect("microphone_faults")(shot)
     return gain, late_s
 
 
@@ -260,6 +241,20 @@ def _times(shot: Snapshot, active: AbstractSet[str], paths: Paths) -> tuple[Floa
         delay_s, stretch = effect("doppler")(paths, shot.speed_m_s)
         return delay_s, stretch
     return effect("propagation")(paths, shot.speed_m_s), None
+
+
+def _sonars(shot: Snapshot, gain: Floats, late_s: Floats) -> list[Arrivals]:
+    found = []
+    for sonar in shot.scene.sonars:
+        paths = effect("interference", "way_from")(shot, sonar)
+        amplitude = _linear(sonar.level_db) * effect("spreading")(paths)
+        way_s = effect("propagation")(paths, shot.speed_m_s)
+        starts_s = effect("interference", "calls_of")(shot, sonar)
+        if len(starts_s):
+            delay_s = way_s + starts_s[:, None] + late_s
+            amplitude = np.repeat((gain * amplitude)[..., None], len(starts_s), axis=0)
+            found.append(Arrivals(sonar.call, _ticks(delay_s), amplitude))
+    return found
 
 
 def _arrivals(

@@ -12,7 +12,7 @@ from ertis_numba.frames import Measurement, Reflector, Stamp
 from ertis_numba.geometry import Layout, microphones
 from ertis_numba.sample_format import sample_format
 from ertis_numba.simulation import synthesis
-from ertis_numba.simulation.arrivals import acting, arrivals, effect, gains
+from ertis_numba.simulation.arrivals import arrivals, effect, gains
 from ertis_numba.simulation.converter import Converter
 from ertis_numba.simulation.limits import require_clear
 from ertis_numba.simulation.modulator import Modulator
@@ -179,13 +179,25 @@ class Engine:
         )
         gain, _ = gains(shot, active, self.clock)
         seed = self.scene.seed, index, self.scene.sensors.index(self.sensor)
-        added = [(name, sound) for name, sounds in acting(active, "sounds") for sound in sounds(shot, seed)]
+        fields = []
+        if "ambient_noise" in active and self.scene.ambient is not None:
+            fields.append(("ambient_noise", effect("ambient_noise")(shot, self.scene.ambient, (*seed, 0))))
+        if "interference" in active:
+            noise_of = effect("interference", "noise_of")
+            fields += [
+                ("interference", noise_of(shot, noise, (*seed, 1 + number)))
+                for number, noise in enumerate(self.scene.noises)
+            ]
+        tones = self.scene.tones if "interference" in active else ()
         for first, block in zip(_begins(recording.n_samples), blocks, strict=True):
-            if added:
+            if fields or tones:
                 more = np.zeros((len(block), min(synthesis.BLOCK, recording.n_samples - first)))
-                for name, sound in added:
+                for name, field in fields:
                     with self.clock(name):
-                        sound.add_to(more, first)
+                        field.add_to(more, first)
+                with self.clock("interference"):
+                    for tone in tones:
+                        effect("interference", "add_tone")(shot, tone, more, first)
                 block[:, : more.shape[1]] += gain[:, None] * more
             yield block
 

@@ -74,7 +74,7 @@ def noise(sight: Sight, level: float, reason: str) -> Estimate:
     )
 
 
-def unequal(sight: Sight, weight: NDArray[np.float64] | NDArray[np.complex128], reason: str) -> Estimate:
+def unequal(sight: Sight, weight: NDArray[np.complex128], reason: str) -> Estimate:
     """Return the change of the image by weights of the microphones: (mic, frequency)."""
     directions = sight.heard.direction[sight.shown]
     if not len(directions):  # echoes outside the range window may still reach into it, which an A/B render measures

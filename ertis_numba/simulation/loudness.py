@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.simulation.arrivals import Arrivals, arrivals, effect
-from ertis_numba.simulation.effects import EFFECTS
+from ertis_numba.simulation.names import EFFECTS
 from ertis_numba.simulation.snapshot import Snapshot
 from ertis_numba.simulation.sources import Noise, Tone
 from ertis_numba.simulation.stopwatch import CostStopwatch
@@ -17,6 +17,9 @@ Floats = NDArray[np.float64]
 
 LOUD = 0.5
 """Amplitude at which A/B renders start to include the converters: 6 dB below full scale."""
+_WEAKENING = frozenset(
+    {"occlusion", "absorption", "doppler", "emitter_response", "emitter_directivity", "microphone_directivity"}
+)
 _RIPPLE = 1.5  # largest factor by which spheres, or emitters away from the centre of their array, raise an echo
 _NODES = 5  # frequencies at which filters are evaluated
 _CREST = 4.5  # highest of some hundred thousand Gaussian numbers, relative to their RMS
@@ -26,7 +29,7 @@ def may_be_loud(shot: Snapshot, active: frozenset[str]) -> bool:
     """Return True if the signals may come within 6 dB of full scale for any choice of the other effects."""
     if "spreading" not in active:
         return True
-    return _RIPPLE * peak_bound(shot, frozenset(name for name, each in EFFECTS.items() if not each.weakens)) >= LOUD
+    return _RIPPLE * peak_bound(shot, frozenset(EFFECTS) - _WEAKENING) >= LOUD
 
 
 def peak_bound(shot: Snapshot, active: frozenset[str]) -> float:

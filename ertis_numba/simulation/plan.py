@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ertis_numba.simulation import limits
-from ertis_numba.simulation.effects import EFFECTS
-from ertis_numba.simulation.estimates import Estimate
 from ertis_numba.simulation.loudness import LOUD, may_be_loud, peak_bound
+from ertis_numba.simulation.names import ASKED_FOR, EFFECTS, INDISPENSABLE
+from ertis_numba.simulation.needs import ESTIMATES, Estimate
 from ertis_numba.simulation.scene import Scene
 from ertis_numba.simulation.sight import Sight
 from ertis_numba.simulation.snapshot import Snapshot, snapshot
@@ -88,7 +88,7 @@ class EffectPlan:
 def make_plan(scene: Scene) -> EffectPlan:
     """Decide for each effect whether it changes any image by more than the scene's tolerance.
 
-    Effects that a key of the scene requests are on, see `Effect.requested`. With a tolerance of 0, all effects that
+    Effects that a key of the scene requests are on, see `names.ASKED_FOR`. With a tolerance of 0, all effects that
     apply to something in the scene are on.
 
     The other effects are estimated for all sensors at the beginning, at the end, in between and at waypoints. The
@@ -173,14 +173,13 @@ def _decided(
     render_ab: RenderAB,
 ) -> Verdict:
     """Return the verdict on one effect, given the others."""
-    effect = EFFECTS[name]
-    if effect.indispensable:
-        return Verdict(name=name, on=True, reason=effect.indispensable)
+    if name in INDISPENSABLE:
+        return Verdict(name=name, on=True, reason=INDISPENSABLE[name])
     given = scene.effects.get(name)
-    forced = True if given is None and (effect.requested or not scene.tolerance_db) else given
+    forced = True if given is None and (name in ASKED_FOR or not scene.tolerance_db) else given
     estimates = _estimates(name, others, shots)
     if not estimates:
-        reason = f"it applies to nothing in the scene: {effect.about}"
+        reason = f"it applies to nothing in the scene: {EFFECTS[name]}"
         return Verdict(name=name, on=bool(given), reason=reason, forced=given is not None)
     worst = estimates[0][0]
     if forced is not None:
@@ -202,11 +201,10 @@ def _decided(
 
 def _estimates(name: str, active: frozenset[str], shots: list[tuple[int, Snapshot]]) -> list[tuple[Estimate, int]]:
     """Return the estimates of all snapshots with the indices of their measurements, greatest change first."""
-    estimate = EFFECTS[name].estimate
-    if estimate is None:
-        raise RuntimeError(f"effect {name} has neither an estimate nor a reason why it is indispensable")
-    found = [(estimate(Sight.of(shot, active)), index) for index, shot in shots]
-    return sorted(((each, index) for each, index in found if each is not None), key=lambda each: -each[0].change_db)
+    found = [(ESTIMATES[name](Sight.of(shot, active)), index) for index, shot in shots]
+    return sorted(
+        ((estimate, index) for estimate, index in found if estimate is not None), key=lambda each: -each[0].change_db
+    )
 
 
 def _loudest(name: str, active: frozenset[str], shots: list[tuple[int, Snapshot]]) -> list[int]:

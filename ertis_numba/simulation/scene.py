@@ -13,6 +13,7 @@ from ertis_numba.documents import TomlDocument
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import written_out
 from ertis_numba.settings import Array
+from ertis_numba.simulation.names import EFFECTS, INDISPENSABLE
 from ertis_numba.simulation.placed import Placed
 from ertis_numba.simulation.sensors import Sensor
 from ertis_numba.simulation.sources import Ambient, Noise, Sonar, Tone
@@ -86,23 +87,18 @@ class Scene(TomlDocument, frozen=True, kw_only=True):
         checks.integer("sync_every", self.sync_every, 1, 10**9)
         checks.between("tolerance_db", self.tolerance_db, 0.0, 60.0)
         checks.integer("max_reflections", self.max_reflections, 0, _MAX_REFLECTIONS)
-        if self.effects:
-            self._check_effects()
+        for name, wanted in self.effects.items():
+            checks.choice("effect", name, EFFECTS)
+            if name in INDISPENSABLE and not wanted:
+                raise ArgumentError(
+                    f"effect {name!r} cannot be left out ({INDISPENSABLE[name]}); remove it from effects"
+                )
         if not self.sensors:
             raise ArgumentError("the scene has no sensors; give at least one")
         names = [sensor.name for sensor in self.sensors]
         for name in names:
             if names.count(name) > 1:
                 raise ArgumentError(f"the scene has {names.count(name)} sensors named {name!r}; name each differently")
-
-    def _check_effects(self) -> None:
-        from ertis_numba.simulation.effects import EFFECTS  # noqa: PLC0415  effects act on scenes
-
-        for name, wanted in self.effects.items():
-            checks.choice("effect", name, EFFECTS)
-            reason = EFFECTS[name].indispensable
-            if reason and not wanted:
-                raise ArgumentError(f"effect {name!r} cannot be left out ({reason}); remove it from effects")
 
     @property
     def moves(self) -> bool:

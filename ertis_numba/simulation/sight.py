@@ -13,7 +13,7 @@ from ertis_numba.constants import ERTIS_PDM_RATE_HZ
 from ertis_numba.geometry import direction_grid, unit_vectors
 from ertis_numba.settings import Call, Settings
 from ertis_numba.simulation import pulse
-from ertis_numba.simulation.arrivals import acting, echoes, effect, emitted, responses
+from ertis_numba.simulation.arrivals import echoes, effect, emitted, responses
 from ertis_numba.simulation.converter import QUANTISATION_DBFS
 from ertis_numba.simulation.paths import Paths
 from ertis_numba.simulation.snapshot import Snapshot
@@ -22,6 +22,7 @@ from ertis_numba.simulation.stopwatch import CostStopwatch
 __all__ = ["SAME_RANGE_M", "Echoes", "Sight", "change_db"]
 
 Floats = NDArray[np.float64]
+_GEOMETRY = frozenset({"walls", "occlusion", "target_size", "emitter_offset"})  # effects that change sound paths
 _LAGS, _LAG_DIRECTIONS = 128, 64
 _BEAM_PATHS, _BEAM_DIRECTIONS = 6, 361
 _SHOWN_DB = 40.0  # dynamic range of an image: weaker reflectors are masked by side lobes
@@ -149,7 +150,7 @@ class Sight:
 
     def paths(self, number: int, active: frozenset[str]) -> list[Paths]:
         """Return the paths of an emitter's call to the centre of the array."""
-        middle, geometry = self._middle, frozenset(name for name, _ in acting(active, "changes_paths"))
+        middle, geometry = self._middle, active & _GEOMETRY
         return middle.once((number, geometry), lambda: echoes(middle, geometry, number, CostStopwatch()))
 
     def _seen(self, paths: Paths, number: int, active: frozenset[str]) -> Echoes:
@@ -290,7 +291,7 @@ class Sight:
         heard = (np.interp(at_s, lag_s, sound.real) + 1j * np.interp(at_s, lag_s, sound.imag)) * carrier
         return time_s, np.asarray(np.max(np.abs(heard @ amplitude) / len(amplitude), axis=1))
 
-    def beam_change(self, directions: Floats, weight: Floats | NDArray[np.complex128]) -> float:
+    def beam_change(self, directions: Floats, weight: NDArray[np.complex128]) -> float:
         """Return the greatest change of beams relative to the reflector, when weights apply to the microphones.
 
         Parameters

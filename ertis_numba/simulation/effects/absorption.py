@@ -1,20 +1,13 @@
 """Absorption of high frequencies by air."""
 
-from dataclasses import replace
-from typing import Final
-
 import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.air import absorption_db_m
 from ertis_numba.settings import Air
-from ertis_numba.simulation.arrivals import EchoPaths
-from ertis_numba.simulation.effects._effect import Effect
-from ertis_numba.simulation.estimates import Estimate, filtered
 from ertis_numba.simulation.paths import Paths
-from ertis_numba.simulation.sight import Sight
 
-__all__ = ["EFFECT", "absorption"]
+__all__ = ["absorption"]
 
 
 def absorption(paths: Paths, air: Air, frequency_hz: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -24,36 +17,3 @@ def absorption(paths: Paths, air: Air, frequency_hz: NDArray[np.float64]) -> NDA
     speed of sound, is neglected, as in the standard.
     """
     return np.asarray(10 ** (-paths.length_m[..., None] * (absorption_db_m(air, frequency_hz) / 20)))
-
-
-def _gain(echoes: EchoPaths) -> NDArray[np.float64]:
-    return absorption(echoes.paths, echoes.shot.sensor.air, echoes.frequency_hz)
-
-
-def _estimate(sight: Sight) -> Estimate | None:
-    """Compare echoes with those through air without absorption."""
-    if not len(sight.heard):
-        return None
-    own = sight.heard
-    from_air = absorption_db_m(sight.shot.sensor.air, sight.frequency_hz)
-    length_m = own.delay_s * sight.shot.speed_m_s
-    after = replace(own, gain=own.gain * 10 ** (-length_m[:, None] * from_air / 20))
-    longest_m = float(np.max(length_m, where=sight.reach(own.delay_s) > 0.1, initial=0.0))
-    return filtered(
-        sight,
-        after,
-        f"{longest_m:.2f} m of air absorb {from_air[0] * longest_m:.2g} dB at the lower end of the band and "
-        f"{from_air[-1] * longest_m:.2g} dB at the upper end",
-    )
-
-
-EFFECT: Final = Effect(
-    name="absorption",
-    about="absorption of high frequencies by air",
-    equation="10^(−α(f) (r₁ + r₂) / 20)",
-    source="ISO 9613-1",
-    needed_if="the longest path changes over the band",
-    weakens=True,
-    estimate=_estimate,
-    gain=_gain,
-)

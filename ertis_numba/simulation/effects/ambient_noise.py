@@ -1,17 +1,12 @@
 """Diffuse noise from all directions."""
 
-from typing import Final
-
 import numpy as np
 
-from ertis_numba.simulation.effects._effect import Effect, Sound
 from ertis_numba.simulation.effects._frames import FRAME, OverlappingFrames, band_bins, drawn, window
-from ertis_numba.simulation.estimates import Estimate, noise
-from ertis_numba.simulation.sight import Sight
 from ertis_numba.simulation.snapshot import Snapshot
 from ertis_numba.simulation.sources import Ambient
 
-__all__ = ["EFFECT", "ambient_noise"]
+__all__ = ["ambient_noise"]
 
 _OWN = 1e-6  # uncorrelated power of each microphone: without it the matrix is singular below some kilohertz
 _NODE_HZ = 2000.0  # frequency step: the coherence of microphones 15 cm apart changes by a few hundredths per step
@@ -36,29 +31,3 @@ def ambient_noise(shot: Snapshot, ambient: Ambient, seed: tuple[int, ...]) -> Ov
     mix = np.linalg.cholesky(coherence + _OWN * np.eye(len(every)))[:, np.searchsorted(every, shot.channels)]
     level = 10 ** (ambient.level_dbfs / 20)
     return OverlappingFrames(seed, lambda random: level * drawn(random, bins, mix[nodes]) * window())
-
-
-def _sounds(shot: Snapshot, seed: tuple[int, ...]) -> list[Sound]:
-    ambient = shot.scene.ambient
-    return [] if ambient is None else [ambient_noise(shot, ambient, (*seed, 0))]
-
-
-def _estimate(sight: Sight) -> Estimate | None:
-    """Compare diffuse noise with the weakest reflector."""
-    ambient = sight.shot.scene.ambient
-    if ambient is None:
-        return None
-    level = sight.of_white_noise(ambient.level_dbfs, band_hz=ambient.band_hz)
-    return noise(sight, level, f"{ambient.level_dbfs:g} dBFS at each microphone")
-
-
-EFFECT: Final = Effect(
-    name="ambient_noise",
-    about="diffuse noise from all directions",
-    equation="plane waves from all sides: coherence sin(k d) / (k d)",
-    source="Cook et al., 1955",
-    needed_if="it exceeds the noise floor of the image",
-    requested=True,
-    estimate=_estimate,
-    sounds=_sounds,
-)

@@ -1,17 +1,11 @@
 """Sample clocks that run fast or slow."""
 
-from dataclasses import replace
-from typing import Final
-
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.simulation.effects._effect import Effect
-from ertis_numba.simulation.estimates import Estimate
-from ertis_numba.simulation.sight import Sight, change_db
 from ertis_numba.simulation.snapshot import Snapshot
 
-__all__ = ["EFFECT", "clock_drift", "since_sync_s"]
+__all__ = ["clock_drift", "since_sync_s"]
 
 Floats = NDArray[np.float64]
 
@@ -46,41 +40,3 @@ def since_sync_s(shot: Snapshot) -> float:
     """Return the time from the last SYNC to the start of the measurement, in seconds."""
     scene = shot.scene
     return (round(shot.time_s * scene.rate_hz) % scene.sync_every) / scene.rate_hz
-
-
-def _estimate(sight: Sight) -> Estimate | None:
-    """Compute the shift of echoes due to drift of the sensors' clocks."""
-    shot = sight.shot
-    sensors = shot.scene.sensors
-    heard = [shot.number, *sight.emitters(sight.active)]
-    if not any(sensors[number].electronics.clock_drift_ppm for number in heard):
-        return None
-    worst = Estimate(change_db=0.0, reason="no echo arrives")
-    for number in sight.emitters(sight.active):
-        seen = sight.of_emitter(number, sight.active)
-        if not len(seen):
-            continue
-        counted_s, _ = clock_drift(shot, number, seen.delay_s[:, None], None)
-        moved = replace(seen, delay_s=counted_s[:, 0])
-        shift_s = moved.delay_s - seen.delay_s
-        reach = np.maximum(sight.reach(seen.delay_s), sight.reach(moved.delay_s))
-        change = change_db(sight.envelope_change(seen, moved) * reach, sight.beside(seen.delay_s))
-        if change >= worst.change_db:
-            largest = shift_s[np.argmax(np.abs(shift_s))]
-            reason = f"clock drift shifts the call of {sensors[number].name} by up to {1e9 * largest:+.3g} ns"
-            worst = Estimate(change_db=change, reason=reason, sure=200.0)
-    return worst
-
-
-EFFECT: Final = Effect(
-    name="clock_drift",
-    about="sample clocks that run fast or slow",
-    equation=(
-        "delay τ (1 + d) + T (d − e) / (1 + e), with the drift d of the receiver, the drift e of the emitter, and the "
-        "time T since the SYNC; "
-        "a foreign call is stretched by (1 + d) / (1 + e)"
-    ),
-    needed_if="an echo shifts",
-    requested=True,
-    estimate=_estimate,
-)

@@ -1,15 +1,8 @@
 """Calls of the other sensors of the scene."""
 
-from typing import Final
-
-import numpy as np
-
-from ertis_numba.simulation.effects._effect import Effect
-from ertis_numba.simulation.estimates import Estimate, ghosts
-from ertis_numba.simulation.sight import Sight
 from ertis_numba.simulation.snapshot import Snapshot
 
-__all__ = ["EFFECT", "cross_emission"]
+__all__ = ["cross_emission"]
 
 
 def cross_emission(shot: Snapshot) -> list[int]:
@@ -23,28 +16,3 @@ def cross_emission(shot: Snapshot) -> list[int]:
         for number, sensor in enumerate(shot.scene.sensors)
         if number != shot.number and not sensor.emitter.silent
     ]
-
-
-def _estimate(sight: Sight) -> Estimate | None:
-    """Find the strongest arrival of another sensor's call, including paths over walls."""
-    if len(sight.shot.scene.sensors) == 1 or not cross_emission(sight.shot):
-        return None
-    more = sight.echoes(sight.active | {"cross_emission", *(["walls"] if sight.shot.mirrors else [])})
-    own = sight.shot.sensor.name
-    foreign = np.array([_emitter(name, own) != own for name in more.names], dtype=np.bool_)
-    return ghosts(sight, more, foreign, "{name} appears at {range:.2f} m, {level:+.1f} dB relative to the image there")
-
-
-def _emitter(name: str, own: str) -> str:
-    """Return the name of the sensor whose call an echo is."""
-    sensor, colon, _ = name.partition(": ")
-    return sensor if colon else own
-
-
-EFFECT: Final = Effect(
-    name="cross_emission",
-    about="calls of the other sensors of the scene",
-    equation="path from emitter to target to another sensor's microphones: an ellipse",
-    needed_if="another sensor is audible",
-    estimate=_estimate,
-)

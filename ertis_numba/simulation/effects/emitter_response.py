@@ -1,18 +1,13 @@
 """Frequency response and ringing of the emitter's transducer."""
 
 import math
-from dataclasses import replace
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.simulation.effects._effect import Effect
-from ertis_numba.simulation.estimates import Estimate, filtered
 from ertis_numba.simulation.sensors import Emitter
-from ertis_numba.simulation.sight import Sight
 
-__all__ = ["EFFECT", "emitter_response", "ringing_s"]
+__all__ = ["emitter_response", "ringing_s"]
 
 _RUNG_OUT = 1e-6  # amplitude below which ringing is neglected
 
@@ -36,26 +31,3 @@ def ringing_s(emitter: Emitter) -> float:
     if emitter.resonance_hz is None:
         return 0.0
     return -math.log(_RUNG_OUT) * emitter.resonance_quality / (math.pi * emitter.resonance_hz)
-
-
-def _estimate(sight: Sight) -> Estimate | None:
-    """Compare echoes with those of a transducer with a flat frequency response."""
-    shot = sight.shot
-    emitters = [shot.scene.sensors[number].emitter for number in sight.emitters(sight.active)]
-    resonances_hz = [emitter.resonance_hz for emitter in emitters if emitter.resonance_hz is not None]
-    if not (resonances_hz and len(sight.heard)):
-        return None
-    reason = f"a resonance at {resonances_hz[0] / 1000:.3g} kHz changes {{name}} by {{change:.2f}} dB"
-    return replace(filtered(sight, "emitter_response", reason), sure=200.0)
-
-
-EFFECT: Final = Effect(
-    name="emitter_response",
-    about="frequency response and ringing of the transducer",
-    equation="H(f) = 1 / (1 + j Q (f / f₀ − f₀ / f)), which rings as exp(−π f₀ t / Q)",
-    source="Van Dyke, 1928",
-    needed_if="it filters or delays an echo",
-    requested=True,
-    weakens=True,
-    estimate=_estimate,
-)

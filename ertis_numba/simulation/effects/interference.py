@@ -1,25 +1,19 @@
 """Tones, noise and other sonars."""
 
 import math
-from collections.abc import Set as AbstractSet
-from typing import Final
 
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from ertis_numba.simulation.effects._effect import AddedCalls, Effect, Sound
 from ertis_numba.simulation.effects._frames import FRAME, OverlappingFrames, band_bins, drawn, window
-from ertis_numba.simulation.effects.propagation import propagation
 from ertis_numba.simulation.effects.spreading import spreading
-from ertis_numba.simulation.estimates import Estimate
 from ertis_numba.simulation.paths import Paths, without_target
 from ertis_numba.simulation.placed import Placed
-from ertis_numba.simulation.sight import Sight, change_db
 from ertis_numba.simulation.snapshot import Snapshot, TransmitterPose
 from ertis_numba.simulation.sources import Noise, Sonar, Tone
 
-__all__ = ["EFFECT", "add_tone", "calls_of", "noise_of", "way_from"]
+__all__ = ["add_tone", "calls_of", "noise_of", "way_from"]
 
 
 def way_from(shot: Snapshot, source: Placed) -> Paths:
@@ -49,14 +43,6 @@ def add_tone(shot: Snapshot, tone: Tone, signals: NDArray[np.float64], first: in
     start_rad = 2 * math.pi * turns
     signals += np.outer(amplitude * np.cos(start_rad), np.sin(swing_rad))
     signals += np.outer(amplitude * np.sin(start_rad), np.cos(swing_rad))
-
-
-class _ToneSound:
-    def __init__(self, shot: Snapshot, tone: Tone) -> None:
-        self._shot, self._tone = shot, tone
-
-    def add_to(self, signals: NDArray[np.float64], first: int) -> None:
-        add_tone(self._shot, self._tone, signals, first)
 
 
 def noise_of(shot: Snapshot, noise: Noise, seed: tuple[int, ...]) -> OverlappingFrames:
@@ -92,72 +78,3 @@ def calls_of(shot: Snapshot, sonar: Sonar) -> NDArray[np.float64]:
     latest_s = shot.time_s - way_s + shot.sensor.recording.duration_s - sonar.offset_s
     numbers = np.arange(max(0, math.ceil(earliest_s / sonar.period_s)), math.floor(latest_s / sonar.period_s) + 1)
     return np.asarray(sonar.offset_s + numbers * sonar.period_s - shot.time_s)
-
-
-def _calls(shot: Snapshot, _: AbstractSet[str], gain: NDArray[np.float64]) -> list[AddedCalls]:
-    """Return the calls of other sonars."""
-    found = []
-    for sonar in shot.scene.sonars:
-        paths = way_from(shot, sonar)
-        amplitude = float(10 ** (sonar.level_db / 20)) * spreading(paths)
-        starts_s = calls_of(shot, sonar)
-        if len(starts_s):
-            delay_s = propagation(paths, shot.speed_m_s) + starts_s[:, None]
-            amplitude = np.repeat((gain * amplitude)[..., None], len(starts_s), axis=0)
-            found.append(AddedCalls(call=sonar.call, delay_s=delay_s, amplitude=amplitude))
-    return found
-
-
-def _sounds(shot: Snapshot, seed: tuple[int, ...]) -> list[Sound]:
-    """Return noises and tones."""
-    scene = shot.scene
-    noises: list[Sound] = [noise_of(shot, noise, (*seed, 1 + number)) for number, noise in enumerate(scene.noises)]
-    return [*noises, *(_ToneSound(shot, tone) for tone in scene.tones)]
-
-
-def _estimate(sight: Sight) -> Estimate | None:
-    """Find the loudest of tones, noises and other sonars."""
-    scene, shot = sight.shot.scene, sight.shot
-    if not (scene.tones or scene.noises or scene.sonars):
-        return None
-    total, loudest, reason = 0.0, 0.0, "no source reaches the band"
-    for kind in ("tones", "noises", "sonars"):
-        for number, source in enumerate(getattr(scene, kind)):
-            paths = way_from(shot, source)
-            amplitude = float(10 ** (source.level_db / 20) * np.mean(spreading(paths)))
-            direction = -np.mean(paths.arriving, axis=1) @ paths.receiver.axes.T
-            level = float(sight.coverage(direction)[0])
-            if kind == "tones":
-                level *= sight.of_tone(amplitude, source.frequency_hz)
-            elif kind == "noises":
-                level *= sight.of_white_noise(20 * math.log10(amplitude), coherent=True, band_hz=source.band_hz)
-            else:
-                level *= amplitude * sight.likeness(source.call) * _part_in_window(sight, source)
-            total += level
-            if level > loudest:
-                loudest = level
-                level_db = 20 * math.log10(loudest / sight.floor)
-                reason = f"{kind}[{number}] reaches {level_db:+.1f} dB relative to the weakest reflector"
-    return Estimate(change_db=change_db(np.array([total]), np.array([sight.quietest])), reason=reason)
-
-
-def _part_in_window(sight: Sight, sonar: Sonar) -> float:
-    """Return the largest fraction of another sonar's call that reaches into the image of any measurement."""
-    scene, shot = sight.shot.scene, sight.shot
-    if scene.count > 1:
-        return 1.0  # its calls are not synchronised, so at least one measurement contains one
-    way = way_from(shot, sonar)
-    calls_s = calls_of(shot, sonar) + np.mean(way.length_m) / shot.speed_m_s
-    return float(np.max(sight.reach(calls_s), initial=0.0))
-
-
-EFFECT: Final = Effect(
-    name="interference",
-    about="tones, noise and other sonars",
-    equation="tones, coherent noise and foreign calls, each with 1 / r",
-    needed_if="one is audible in the band and the window",
-    requested=True,
-    estimate=_estimate,
-    calls=_calls,
-    sounds=_sounds,
-)

@@ -1,17 +1,11 @@
 """Gains and delays that the calibration does not contain."""
 
-import math
-from typing import Final
-
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.simulation.effects._effect import Effect
-from ertis_numba.simulation.estimates import Estimate, unequal
-from ertis_numba.simulation.sight import Sight
 from ertis_numba.simulation.snapshot import Snapshot
 
-__all__ = ["EFFECT", "microphone_spread"]
+__all__ = ["microphone_spread"]
 
 _TICK_S = 1e-12
 _GAIN_STEP = 2.0**-20
@@ -32,27 +26,3 @@ def microphone_spread(shot: Snapshot) -> tuple[NDArray[np.float64], NDArray[np.f
         np.rint(gain / _GAIN_STEP) * _GAIN_STEP,
         np.rint(electronics.delay_spread_s * delay_s / _TICK_S) * _TICK_S,
     )
-
-
-def _estimate(sight: Sight) -> Estimate | None:
-    """Compute the change of main lobe and side lobes by uncalibrated gains and delays."""
-    electronics = sight.shot.sensor.electronics
-    if not (electronics.gain_spread_db or electronics.delay_spread_s):
-        return None
-    gain, late_s = microphone_spread(sight.shot)
-    return unequal(
-        sight,
-        gain[:, None] * np.exp(-2j * math.pi * late_s[:, None] * sight.frequency_hz),
-        f"{electronics.gain_spread_db:g} dB and {1e6 * electronics.delay_spread_s:g} µs between microphones",
-    )
-
-
-EFFECT: Final = Effect(
-    name="microphone_spread",
-    about="gains and delays that the calibration does not contain",
-    equation="normal in dB and in seconds",
-    needed_if="beams change",
-    requested=True,
-    estimate=_estimate,
-    microphones=microphone_spread,
-)

@@ -1,14 +1,11 @@
 """Propagation delays."""
 
-from typing import Final
-
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.simulation.effects._effect import Effect
 from ertis_numba.simulation.paths import Paths
 
-__all__ = ["EFFECT", "propagation"]
+__all__ = ["propagation"]
 
 
 def propagation(paths: Paths, speed_m_s: float) -> NDArray[np.float64]:
@@ -18,12 +15,3 @@ def propagation(paths: Paths, speed_m_s: float) -> NDArray[np.float64]:
     sample and preserves the energy at each frequency.
     """
     return paths.length_m / speed_m_s
-
-
-EFFECT: Final = Effect(
-    name="propagation",
-    about="propagation delays, including fractions of a sample",
-    equation="delay (r₁ + r₂) / c, as exp(−2πi f τ)",
-    needed_if="always",
-    indispensable="images are computed from delays",
-)

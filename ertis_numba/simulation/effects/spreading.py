@@ -1,17 +1,11 @@
 """Decrease of amplitude with distance."""
 
-from typing import Final
-
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.simulation.arrivals import EchoPaths
-from ertis_numba.simulation.effects._effect import Effect
-from ertis_numba.simulation.estimates import Estimate, filtered
 from ertis_numba.simulation.paths import Paths
-from ertis_numba.simulation.sight import Sight
 
-__all__ = ["EFFECT", "NEAREST_M", "spreading"]
+__all__ = ["NEAREST_M", "spreading"]
 
 NEAREST_M = 0.01
 """Distance below which amplitudes no longer grow, because emitters, reflectors and microphones have a finite size."""
@@ -41,26 +35,3 @@ def spreading(paths: Paths) -> NDArray[np.float64]:
     along, across = r1 + r2 + 2 * r1 * r2 / (radius_m * cos), r1 + r2 + 2 * r1 * r2 * cos / radius_m
     amplitude[is_sphere] = 1 / np.sqrt(along * across)
     return np.asarray(amplitude)
-
-
-def _gain(echoes: EchoPaths) -> NDArray[np.float64]:
-    return spreading(echoes.paths)[..., None]
-
-
-def _estimate(sight: Sight) -> Estimate | None:
-    """Compare the levels of echoes with those without spreading."""
-    if not len(sight.heard):
-        return None
-    longest_m = float(np.max(sight.heard.delay_s)) * sight.shot.speed_m_s
-    return filtered(sight, "spreading", f"on paths of up to {longest_m:.2f} m {{name}} changes by {{change:.1f}} dB")
-
-
-EFFECT: Final = Effect(
-    name="spreading",
-    about="decrease of amplitude with distance",
-    equation="1 / (r₁ r₂) for points, 1 / (r₁ + r₂) for mirrors, 1 / √(A B) for spheres",
-    source="Pierce, Acoustics, 1989, chapter 8",
-    needed_if="there are echoes",
-    estimate=_estimate,
-    gain=_gain,
-)

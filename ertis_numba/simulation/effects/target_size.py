@@ -1,23 +1,18 @@
 """Surfaces of spheres, and size and orientation of discs."""
 
 import math
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.simulation.arrivals import EchoPaths
-from ertis_numba.simulation.effects._effect import Effect
 from ertis_numba.simulation.effects.disc import disc
 from ertis_numba.simulation.effects.rigid_sphere import LARGE, rigid_sphere
 from ertis_numba.simulation.effects.spreading import NEAREST_M
-from ertis_numba.simulation.estimates import Estimate, filtered
 from ertis_numba.simulation.mirrors import Seen
 from ertis_numba.simulation.paths import Paths, turning, unit
-from ertis_numba.simulation.sight import Sight
 from ertis_numba.simulation.snapshot import ReceiverPose, Targets, TransmitterPose
 
-__all__ = ["EFFECT", "over_surfaces", "patterns"]
+__all__ = ["over_surfaces", "patterns"]
 
 Floats = NDArray[np.float64]
 
@@ -70,32 +65,3 @@ def _disc_pattern(paths: Paths, chosen: NDArray[np.bool_], wave: Floats) -> NDAr
     pattern = disc((radius_m * aside)[..., None] * wave, (radius_m**2 * bent_m)[..., None] * wave)
     seen = (np.sum(to_receiver * normal, axis=-1) > 0) & (np.sum(to_transmitter * normal, axis=-1) > 0)
     return np.where(seen[..., None], pattern, 0.0)
-
-
-def _gain(echoes: EchoPaths) -> Floats | NDArray[np.complex128] | None:
-    if not len(echoes.paths.targets):
-        return None
-    return patterns(echoes.paths, echoes.frequency_hz, echoes.shot.speed_m_s)
-
-
-def _estimate(sight: Sight) -> Estimate | None:
-    """Compare echoes from surfaces with those from centres, and echoes of discs with those of points."""
-    targets = sight.shot.targets
-    if not (np.any(targets.radius_m) or np.any(targets.diameter_m)):
-        return None
-    return filtered(sight, "target_size", "{name} has a size: its echo changes by {change:.2f} dB")
-
-
-EFFECT: Final = Effect(
-    name="target_size",
-    about="surfaces of spheres, and size and orientation of discs",
-    equation=(
-        "spheres: the path turns on the surface, and below k a = 60 the partial-wave series scatters; "
-        "discs: ∫₀¹ J₀(v √t) exp(−j u t / 2) dt"
-    ),
-    source="Morse and Ingard, 1968, section 8.2; Born and Wolf, 7th edition, section 8.8",
-    needed_if="it shifts or filters an echo",
-    changes_paths=True,
-    estimate=_estimate,
-    gain=_gain,
-)
