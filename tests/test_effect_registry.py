@@ -1,5 +1,6 @@
 """Registry of effects: each effect changes recordings, and agrees with its module, its keys and the docs."""
 
+import dataclasses
 import pkgutil
 import re
 import typing
@@ -13,11 +14,13 @@ from ertis_numba.settings import Processing, Recording
 from ertis_numba.simulation import Scene, effects
 from ertis_numba.simulation.effects import EFFECTS, INDISPENSABLE, Place
 from ertis_numba.simulation.engine import Engine
+from ertis_numba.simulation.loudness import peak_bound
 from ertis_numba.simulation.plan import make_plan
+from ertis_numba.simulation.snapshot import snapshot
 from tests.scenes import THREE
 
 PAGE = Path(__file__).parents[1] / "docs/explanation/simulator.md"
-OMISSIBLE = [name for name in EFFECTS if name not in INDISPENSABLE]
+PLACES = [(name, place) for name, effect in EFFECTS.items() if name not in INDISPENSABLE for place in effect.places]
 
 
 def example_of(name):
@@ -35,11 +38,16 @@ def rendered(scene, active):
     return [Engine(scene, sensor, frozenset(active)).render().data for sensor in scene.sensors]
 
 
-@pytest.mark.parametrize("name", OMISSIBLE)
-def test_effect_changes_the_recordings_of_its_example(name):
-    """All other effects are on, so an effect that nothing calls makes no difference."""
-    scene = example_of(name)
-    without, with_effect = rendered(scene, EFFECTS.keys() - {name}), rendered(scene, EFFECTS.keys())
+def peak_bounds(scene, active):
+    return [peak_bound(snapshot(scene, sensor, 0.0), frozenset(active)) for sensor in scene.sensors]
+
+
+@pytest.mark.parametrize(("name", "place"), PLACES)
+def test_effect_changes_the_recordings_of_its_example(name, place, monkeypatch):
+    """The effect acts at one of its places, and all other effects are on. A place that nothing calls has no effect."""
+    monkeypatch.setitem(EFFECTS, name, dataclasses.replace(EFFECTS[name], places=(place,)))
+    scene, result = example_of(name), peak_bounds if place == "loudness" else rendered
+    without, with_effect = result(scene, EFFECTS.keys() - {name}), result(scene, EFFECTS.keys())
     assert any(np.any(np.abs(a - b) > 1e-6) for a, b in zip(without, with_effect, strict=True))
 
 

@@ -68,7 +68,7 @@ class Effect:
     summary : str
         Description for the user.
     example : str
-        Smallest scene that the effect changes, as TOML.
+        Small scene that the effect changes at each of its places, as TOML.
     places : tuple of str
         Functions of the module that the rendering calls.
     keys : tuple of str
@@ -237,7 +237,8 @@ EFFECTS: Final = {
             places=("arrivals", "sounds", "loudness"),
             keys=("tones", "noises", "sonars"),
             requested=True,
-            example="tones = [{position_m = [1.0, 0.0, 0.0], frequency_hz = 40e3, level_db = -40.0}]\n",
+            example="tones = [{position_m = [1.0, 0.0, 0.0], frequency_hz = 40e3, level_db = -40.0}]\n"
+            "sonars = [{position_m = [1.0, 0.0, 0.0], level_db = -40.0}]\n",
         ),
         Effect(
             name="ambient_noise",
@@ -269,7 +270,7 @@ EFFECTS: Final = {
             places=("microphones", "samples"),
             keys=tuple(f"sensors.electronics.{key}" for key in ("dead_channels", "stuck_low", "stuck_high")),
             requested=True,
-            example=_POINT + "sensors = [{electronics = {dead_channels = [1]}}]\n",
+            example=_POINT + "sensors = [{electronics = {dead_channels = [1], stuck_low = [2]}}]\n",
         ),
         Effect(
             name="modulation",
