@@ -10,7 +10,7 @@ import numpy as np
 from ertis_numba.frames import Measurement
 from ertis_numba.settings import Recording, Settings
 from ertis_numba.simulation import Electronics, Point
-from ertis_numba.simulation.names import EFFECTS
+from ertis_numba.simulation.effects import EFFECTS
 from ertis_numba.simulation.render import Simulator
 from tests.scenes import SENSOR, line_array, only, scene_of
 

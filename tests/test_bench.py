@@ -15,7 +15,7 @@ from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.kernels._cpu import ceilings
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import ERROR_PRESETS_DB
-from ertis_numba.simulation.names import EFFECTS
+from ertis_numba.simulation.effects import EFFECTS
 from tests.cases import SHORT, noise
 from tests.pages import path_of
 

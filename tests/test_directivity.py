@@ -10,7 +10,7 @@ from ertis_numba.geometry import unit_vectors
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Processing, Recording
 from ertis_numba.simulation import Electronics, Emitter, Point, Wall
-from ertis_numba.simulation.effects.piston import piston
+from ertis_numba.simulation.effects._piston import piston
 from ertis_numba.simulation.render import Simulator
 from tests.scenes import (
     BAND_HZ,

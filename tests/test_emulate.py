@@ -21,8 +21,8 @@ from ertis_numba.errors import ArgumentError, SonarError
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.settings import Call, Processing, Recording, Settings
 from ertis_numba.simulation import Scene
+from ertis_numba.simulation.effects import EFFECTS
 from ertis_numba.simulation.engine import Engine
-from ertis_numba.simulation.names import EFFECTS
 from ertis_numba.storage import open_recording, write_recording
 from tests.emulated import N_SAMPLES, TIMEOUT_S, WORDS, ask, block, is_block
 from tests.files import noise

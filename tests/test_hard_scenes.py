@@ -19,7 +19,7 @@ from ertis_numba.simulation import (
     Tone,
     Wall,
 )
-from ertis_numba.simulation.names import EFFECTS
+from ertis_numba.simulation.effects import EFFECTS
 from ertis_numba.simulation.plan import make_plan
 from ertis_numba.simulation.render import Simulator
 from tests.hard_cases.forced import EIGHT, FULL, forced, image_of

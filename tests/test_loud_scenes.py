@@ -12,9 +12,9 @@ from ertis_cli.main import cli
 from ertis_numba.settings import Processing, Recording
 from ertis_numba.simulation import Electronics, Emitter, Point, Scene, Sensor
 from ertis_numba.simulation.ab_render import ABRender
+from ertis_numba.simulation.effects import EFFECTS
+from ertis_numba.simulation.estimates import Estimate
 from ertis_numba.simulation.loudness import LOUD, peak_bound
-from ertis_numba.simulation.names import EFFECTS
-from ertis_numba.simulation.needs import ESTIMATES, Estimate
 from ertis_numba.simulation.plan import make_plan
 from ertis_numba.simulation.snapshot import snapshot
 from tests.scenes import SENSOR, only, scene_of
@@ -121,6 +121,7 @@ def test_effect_at_half_of_the_tolerance_is_kept_in_moving_scenes(monkeypatch):
     scene = beside_an_emitter(-75.0, PCM).replace(effects={"absorption": False}, count=9)
     moving = scene.replace(points=(*scene.points[1:], scene.points[0].replace(velocity_m_s=(0.5, 0.0, 0.0))))
     monkeypatch.setattr(ABRender, "change_db", lambda *_: 0.07)
-    monkeypatch.setitem(ESTIMATES, "doppler", lambda _: Estimate(change_db=0.05, reason="a test", sure=20.0))
+    estimate = Estimate(change_db=0.05, reason="a test", sure=20.0)
+    monkeypatch.setattr("ertis_numba.simulation.effects.doppler.estimate", lambda _: estimate)
     assert "doppler" not in make_plan(scene).active
     assert "doppler" in make_plan(moving).active

@@ -13,7 +13,7 @@ from ertis_bench.verdicts import Trial, with_one
 
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.simulation import Emitter, Noise, Point, Scene, Sensor, Sonar, Wall
-from ertis_numba.simulation.needs import ESTIMATES, Estimate
+from ertis_numba.simulation.estimates import Estimate
 from ertis_numba.simulation.plan import make_plan
 from ertis_numba.simulation.render import Simulator
 from ertis_numba.simulation.sight import SAME_RANGE_M, Sight
@@ -92,9 +92,12 @@ def test_mutually_dependent_effects_stay_on(monkeypatch):
     def of(name, matters):
         return lambda sight: Estimate(change_db=6.0 if matters(sight.active) else 0.0, reason=name)
 
-    monkeypatch.setitem(ESTIMATES, "walls", of("walls", lambda active: "target_size" not in active))
-    monkeypatch.setitem(ESTIMATES, "target_size", of("size", lambda active: "walls" in active))
-    verdicts = {verdict.name: verdict for verdict in make_plan(Scene(points=(Point(range_m=1.0),))).verdicts}
+    effects = "ertis_numba.simulation.effects"
+    monkeypatch.setattr(f"{effects}.walls.estimate", of("walls", lambda active: "target_size" not in active))
+    monkeypatch.setattr(f"{effects}.target_size.estimate", of("size", lambda active: "walls" in active))
+    wall = Wall(position_m=(1.5, 0.0, 0.0), facing_deg=(180.0, 0.0))
+    scene = Scene(points=(Point(range_m=1.0, diameter_m=0.01),), walls=(wall,))
+    verdicts = {verdict.name: verdict for verdict in make_plan(scene).verdicts}
     for name in ("walls", "target_size"):
         assert verdicts[name].on
         assert verdicts[name].coupled

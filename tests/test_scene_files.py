@@ -28,8 +28,8 @@ from ertis_numba.simulation import (
     Wall,
     load_scene,
 )
+from ertis_numba.simulation.effects import EFFECTS, INDISPENSABLE
 from ertis_numba.simulation.limits import require_clear
-from ertis_numba.simulation.names import EFFECTS, INDISPENSABLE
 from ertis_numba.simulation.plan import make_plan
 from ertis_numba.simulation.snapshot import snapshot
 from tests.scenes import SENSOR

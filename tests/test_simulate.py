@@ -10,7 +10,7 @@ from ertis_cli.main import cli
 from numpy.testing import assert_allclose, assert_array_equal
 
 from ertis_numba.simulation import Point, Scene
-from ertis_numba.simulation.names import EFFECTS
+from ertis_numba.simulation.effects import EFFECTS
 from ertis_numba.simulation.render import Simulator
 from ertis_numba.storage import open_recording
 from tests.scenes import EAR, SENSOR, scene_of

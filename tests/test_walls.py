@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 
 from ertis_numba.geometry import microphones, unit_vectors
 from ertis_numba.simulation import Box, Electronics, Emitter, Point, Sphere, Wall
-from ertis_numba.simulation.effects.piston import piston
+from ertis_numba.simulation.effects._piston import piston
 from tests.scenes import (
     BAND_HZ,
     EAR,

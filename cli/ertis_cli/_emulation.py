@@ -81,8 +81,8 @@ class SceneRenderer:
     def _engine(self, name: str, *, active: bool) -> "Engine":
         if (name, active) not in self._engines:
             from ertis_numba.settings import Processing, fit_ranges
+            from ertis_numba.simulation.effects import EFFECTS
             from ertis_numba.simulation.engine import Engine
-            from ertis_numba.simulation.names import EFFECTS
 
             effects = frozenset(effect for effect in EFFECTS if self._scene.effects.get(effect, True))
             scene = self._scene.replace(

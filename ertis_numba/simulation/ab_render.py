@@ -86,10 +86,10 @@ class ABRender:
     def _rendered(self, name: str, index: int, active: frozenset[str]) -> NDArray[np.float64]:
         """Return the input of the modulators or converters, including noise: (mic, sample) float64."""
         sensor = self._scene.sensor(name)
-        signals = Engine(self._scene, sensor, active).signals(index)
-        dbfs = sensor.electronics.noise_dbfs
-        if "microphone_noise" in active and dbfs is not None:
-            signals += 10 ** (dbfs / 20) * self._noise(self._scene.seed, signals.shape)
+        engine = Engine(self._scene, sensor, active)
+        signals, rms = engine.signals(index), engine.noise_rms()
+        if rms:
+            signals += rms * self._noise(self._scene.seed, signals.shape)
         return signals
 
     def _imaged(self, name: str, index: int, active: frozenset[str]) -> tuple[Image, float]:

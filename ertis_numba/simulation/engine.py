@@ -1,5 +1,6 @@
 """Rendering of a scene with given effects to PDM bits or PCM samples."""
 
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -12,8 +13,9 @@ from ertis_numba.frames import Measurement, Reflector, Stamp
 from ertis_numba.geometry import Layout, microphones
 from ertis_numba.sample_format import sample_format
 from ertis_numba.simulation import synthesis
-from ertis_numba.simulation.arrivals import arrivals, effect, gains
+from ertis_numba.simulation.arrivals import arrivals, gains
 from ertis_numba.simulation.converter import Converter
+from ertis_numba.simulation.effects import acting
 from ertis_numba.simulation.limits import require_clear
 from ertis_numba.simulation.modulator import Modulator
 from ertis_numba.simulation.scene import Scene
@@ -77,14 +79,13 @@ class Engine:
         words = np.zeros(form.shape_2d, form.dtype)
         if not self.sensor.recording.is_pdm:
             self._convert(shot, index, words)
-            return Measurement(words, self._settings, self._stamp(shot, index))
-        for channels in range(0, len(self._layout.enabled), _CHANNELS):
+        for channels in range(0, len(self._layout.enabled) if self.sensor.recording.is_pdm else 0, _CHANNELS):
             part = slice(channels, channels + _CHANNELS)
             columns = slice(channels // self._layout.word_bits, (channels + _CHANNELS) // self._layout.word_bits)
             self._modulate(shot, index, part, words[:, columns])
-        if "microphone_faults" in self.active:
-            with self.clock("microphone_faults"):
-                effect("microphone_faults", "stick")(words.view(np.uint8), self.sensor.electronics)
+        for name, act in acting("samples", self.active):
+            with self.clock(name):
+                act(words, self.sensor)
         return Measurement(words.reshape(form.shape), self._settings, self._stamp(shot, index))
 
     def signals(self, index: int = 0) -> NDArray[np.float64]:
@@ -143,7 +144,7 @@ class Engine:
             return
         chosen = slice(mics[0], mics[-1] + 1)
         keys = self._keys(index, len(shot.channels))[chosen]
-        modulator = self._modulator(_part(self._layout, part), keys, self._noise_rms())
+        modulator = self._modulator(_part(self._layout, part), keys, self.noise_rms())
         for first, block in zip(_begins(len(out)), self._signals(shot.of_mics(chosen), index), strict=True):
             words = np.empty_like(out[first : first + synthesis.BLOCK], order="C")
             with self.clock("modulation"):
@@ -153,7 +154,7 @@ class Engine:
 
     def _convert(self, shot: Snapshot, index: int, out: NDArray[np.int16] | NDArray[np.float32]) -> None:
         """Write the PCM samples of all channels."""
-        converter = Converter(self.sensor.recording, self._keys(index, len(shot.channels)), self._noise_rms())
+        converter = Converter(self.sensor.recording, self._keys(index, len(shot.channels)), self.noise_rms())
         numbers = np.empty((synthesis.BLOCK, len(shot.channels)), out.dtype)
         for first, block in zip(_begins(len(out)), self._signals(shot, index), strict=True):
             rows = out[first : first + synthesis.BLOCK]
@@ -161,10 +162,6 @@ class Engine:
                 converter.process(block, out=numbers[: len(rows)])
                 self.loudest = max(self.loudest, float(np.abs(block[:, : len(rows)]).max()))
             rows[:, shot.channels] = numbers[: len(rows)]
-        if "microphone_faults" in self.active:
-            with self.clock("microphone_faults"):
-                full = self.sensor.recording.full_scale
-                effect("microphone_faults", "stick_numbers")(out, self.sensor.electronics, full)
 
     def _signals(self, shot: Snapshot, index: int) -> Iterator[NDArray[np.float64]]:
         active, recording = self.active, self.sensor.recording
@@ -179,33 +176,20 @@ class Engine:
         )
         gain, _ = gains(shot, active, self.clock)
         seed = self.scene.seed, index, self.scene.sensors.index(self.sensor)
-        fields = []
-        if "ambient_noise" in active and self.scene.ambient is not None:
-            fields.append(("ambient_noise", effect("ambient_noise")(shot, self.scene.ambient, (*seed, 0))))
-        if "interference" in active:
-            noise_of = effect("interference", "noise_of")
-            fields += [
-                ("interference", noise_of(shot, noise, (*seed, 1 + number)))
-                for number, noise in enumerate(self.scene.noises)
-            ]
-        tones = self.scene.tones if "interference" in active else ()
+        # The order determines the last digits of the sum. Recordings hold them, so the last registered stays first.
+        sounds = [(name, sound) for name, act in acting("sounds", active)[::-1] for sound in act(shot, seed)]
         for first, block in zip(_begins(recording.n_samples), blocks, strict=True):
-            if fields or tones:
+            if sounds:
                 more = np.zeros((len(block), min(synthesis.BLOCK, recording.n_samples - first)))
-                for name, field in fields:
+                for name, sound in sounds:
                     with self.clock(name):
-                        field.add_to(more, first)
-                with self.clock("interference"):
-                    for tone in tones:
-                        effect("interference", "add_tone")(shot, tone, more, first)
+                        sound.add_to(more, first)
                 block[:, : more.shape[1]] += gain[:, None] * more
             yield block
 
-    def _noise_rms(self) -> float:
-        level = self.sensor.electronics.noise_dbfs
-        if level is None or "microphone_noise" not in self.active:
-            return 0.0
-        return float(effect("microphone_noise")(level))
+    def noise_rms(self) -> float:
+        """Return the RMS of the white noise in each microphone, full scale 1."""
+        return math.hypot(*(act(self.sensor) for _, act in acting("noise_rms", self.active)))
 
     def _keys(self, index: int, n_mics: int) -> NDArray[np.uint64]:
         number = self.scene.sensors.index(self.sensor)

@@ -10,6 +10,8 @@ from ertis_numba.simulation.sight import Echoes, Sight, change_db
 
 __all__ = ["Estimate", "filtered", "ghosts", "noise", "unequal"]
 
+Floats = NDArray[np.float64]
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Estimate:
@@ -74,7 +76,7 @@ def noise(sight: Sight, level: float, reason: str) -> Estimate:
     )
 
 
-def unequal(sight: Sight, weight: NDArray[np.complex128], reason: str) -> Estimate:
+def unequal(sight: Sight, weight: Floats | NDArray[np.complex128], reason: str) -> Estimate:
     """Return the change of the image by weights of the microphones: (mic, frequency)."""
     directions = sight.heard.direction[sight.shown]
     if not len(directions):  # echoes outside the range window may still reach into it, which an A/B render measures

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.errors import ArgumentError
+from ertis_numba.simulation.arrivals import transmitter_of
 from ertis_numba.simulation.effects.spreading import NEAREST_M
 from ertis_numba.simulation.sensors import Sensor
 from ertis_numba.simulation.snapshot import Snapshot
@@ -95,9 +96,5 @@ def _emitters(shot: Snapshot) -> list[tuple[Sensor, NDArray[np.float64]]]:
 
 def _emitter_m(shot: Snapshot, number: int) -> NDArray[np.float64]:
     """Return the position of a sensor's emitter: (axis,) float64."""
-    if not any(shot.scene.sensors[number].emitter.position_m):
-        return shot.transmitters[number].position_m
-    # Imported here because most emitters are at the centre of the array.
-    from ertis_numba.simulation.effects.emitter_offset import emitter_offset  # noqa: PLC0415
-
-    return emitter_offset(shot, number).position_m
+    offset = {"emitter_offset"} if any(shot.scene.sensors[number].emitter.position_m) else set()
+    return transmitter_of(shot, offset, number).position_m

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ertis_numba.simulation.bounds import require_few_mirrors
 from ertis_numba.simulation.snapshot import Mirror, ReceiverPose, TransmitterPose
 
-__all__ = ["Seen", "blocked", "images", "reflected"]
+__all__ = ["Seen", "Views", "blocked", "images", "reflected"]
 
 Floats = NDArray[np.float64]
 End = TypeVar("End", TransmitterPose, ReceiverPose)
@@ -48,6 +48,12 @@ class Seen(Generic[End]):
         """Return the distances from the end to the mirror points along the paths: (wall, place) float64."""
         legs_m = np.sqrt(np.sum(np.diff(self.corners_m[:, places], axis=0) ** 2, axis=-1))
         return np.asarray(np.cumsum(legs_m, axis=0)[:-1])
+
+
+Views = tuple[tuple[Seen[TransmitterPose], ...], tuple[Seen[ReceiverPose], ...], tuple[Seen[TransmitterPose], ...]]
+"""Emitter and microphones as seen from the targets, and the emitter as seen from the microphones.
+
+Each tuple starts with the end itself; its mirror images may follow."""
 
 
 def images(end: End, places_m: Floats, mirrors: Sequence[Mirror], largest: int) -> list[Seen[End]]:

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ertis_numba.simulation import limits
+from ertis_numba.simulation.effects import ASKED_FOR, EFFECTS, INDISPENSABLE, module
+from ertis_numba.simulation.estimates import Estimate
 from ertis_numba.simulation.loudness import LOUD, may_be_loud, peak_bound
-from ertis_numba.simulation.names import ASKED_FOR, EFFECTS, INDISPENSABLE
-from ertis_numba.simulation.needs import ESTIMATES, Estimate
 from ertis_numba.simulation.scene import Scene
 from ertis_numba.simulation.sight import Sight
 from ertis_numba.simulation.snapshot import Snapshot, snapshot
@@ -88,7 +88,7 @@ class EffectPlan:
 def make_plan(scene: Scene) -> EffectPlan:
     """Decide for each effect whether it changes any image by more than the scene's tolerance.
 
-    Effects that a key of the scene requests are on, see `names.ASKED_FOR`. With a tolerance of 0, all effects that
+    Effects that a key of the scene requests are on, see `effects.ASKED_FOR`. With a tolerance of 0, all effects that
     apply to something in the scene are on.
 
     The other effects are estimated for all sensors at the beginning, at the end, in between and at waypoints. The
@@ -179,7 +179,7 @@ def _decided(
     forced = True if given is None and (name in ASKED_FOR or not scene.tolerance_db) else given
     estimates = _estimates(name, others, shots)
     if not estimates:
-        reason = f"it applies to nothing in the scene: {EFFECTS[name]}"
+        reason = f"it applies to nothing in the scene: {EFFECTS[name].summary}"
         return Verdict(name=name, on=bool(given), reason=reason, forced=given is not None)
     worst = estimates[0][0]
     if forced is not None:
@@ -201,7 +201,9 @@ def _decided(
 
 def _estimates(name: str, active: frozenset[str], shots: list[tuple[int, Snapshot]]) -> list[tuple[Estimate, int]]:
     """Return the estimates of all snapshots with the indices of their measurements, greatest change first."""
-    found = [(ESTIMATES[name](Sight.of(shot, active)), index) for index, shot in shots]
+    if not shots or not EFFECTS[name].may_apply(shots[0][1].scene):
+        return []
+    found = [(module(name).estimate(Sight.of(shot, active)), index) for index, shot in shots]
     return sorted(
         ((estimate, index) for estimate, index in found if estimate is not None), key=lambda each: -each[0].change_db
     )

@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.settings import Call, Settings
-from ertis_numba.simulation.arrivals import effect
-from ertis_numba.simulation.sensors import Emitter
+from ertis_numba.simulation.arrivals import CallFilter
 from ertis_numba.waveform import MatchedFilterSpectrum, call_spectrum, matched_band_hz, matched_filter_spectrum
 
 __all__ = ["N_NODES", "band", "baseband", "envelope", "match", "matched"]
@@ -27,42 +26,42 @@ def match(settings: Settings) -> tuple[MatchedFilterSpectrum, float, int]:
     return matched_filter_spectrum(settings, n_fft=n_fft), rate_hz, n_fft
 
 
-def matched(settings: Settings, call: Call, emitter: Emitter | None = None) -> NDArray[np.complex128]:
+def matched(settings: Settings, call: Call, filters: tuple[CallFilter, ...] = ()) -> NDArray[np.complex128]:
     """Return a call of amplitude 1 after the sensor's matched filter: (lag,) complex128, starting at lag 0.
 
-    If an emitter is given, the call includes the response of its transducer.
+    The call includes the given filters of its emitter.
     """
     rate_hz = settings.signal_rate_hz
-    rings_s = 0.0 if emitter is None else effect("emitter_response", "ringing_s")(emitter)
+    rings_s = sum(each.rings_s for each in filters)
     n_fft = 2 ** math.ceil(math.log2(4 * (call.duration_s + settings.call.duration_s + rings_s) * rate_hz))
     mine = matched_filter_spectrum(settings, n_fft=n_fft)
     bins = slice(mine.first_bin, mine.first_bin + len(mine.values))
     spectrum = np.zeros(n_fft, dtype=np.complex128)
     spectrum[bins] = call_spectrum(call, settings, n_fft=n_fft)[bins] * mine.values
-    if emitter is not None:
-        spectrum[bins] *= effect("emitter_response")(emitter, np.arange(bins.start, bins.stop) * rate_hz / n_fft)
+    for each in filters:
+        spectrum[bins] *= each.response(np.arange(bins.start, bins.stop) * rate_hz / n_fft)
     return np.asarray(np.fft.ifft(spectrum))
 
 
 @functools.lru_cache(maxsize=16)
-def baseband(settings: Settings, emitter: Emitter | None = None) -> tuple[Floats, NDArray[np.complex128]]:
+def baseband(settings: Settings, filters: tuple[CallFilter, ...] = ()) -> tuple[Floats, NDArray[np.complex128]]:
     """Return lags in seconds, and the matched call without its carrier: (lag,) float64, (lag,) complex128."""
-    pulse = np.fft.fftshift(matched(settings, settings.call, emitter))
+    pulse = np.fft.fftshift(matched(settings, settings.call, filters))
     lag_s = (np.arange(len(pulse)) - len(pulse) // 2) / settings.signal_rate_hz
     frequency_hz, power = band(settings)
     return lag_s, pulse * np.exp(-2j * math.pi * float(frequency_hz @ power) * lag_s)
 
 
 @functools.lru_cache(maxsize=16)
-def envelope(settings: Settings, emitter: Emitter | None = None) -> tuple[Floats, Floats]:
+def envelope(settings: Settings, filters: tuple[CallFilter, ...] = ()) -> tuple[Floats, Floats]:
     """Return lags of at least 0 and the envelope of the matched call: both (lag,) float64.
 
-    If an emitter with a ringing transducer is given, the envelope is relative to its peak.
+    With filters that ring, the envelope is relative to its peak.
     """
-    lag_s, pulse = baseband(settings, emitter)
+    lag_s, pulse = baseband(settings, filters)
     middle = len(lag_s) // 2
     after = np.abs(pulse[middle:])
-    return lag_s[middle:], after if emitter is None else after / after.max()
+    return lag_s[middle:], after / after.max() if filters else after
 
 
 @functools.lru_cache(maxsize=16)

@@ -13,8 +13,9 @@ from ertis_numba.constants import ERTIS_PDM_RATE_HZ
 from ertis_numba.geometry import direction_grid, unit_vectors
 from ertis_numba.settings import Call, Settings
 from ertis_numba.simulation import pulse
-from ertis_numba.simulation.arrivals import echoes, effect, emitted, responses
+from ertis_numba.simulation.arrivals import call_filters, echoes, emitted, emitters, responses
 from ertis_numba.simulation.converter import QUANTISATION_DBFS
+from ertis_numba.simulation.effects import EFFECTS
 from ertis_numba.simulation.paths import Paths
 from ertis_numba.simulation.snapshot import Snapshot
 from ertis_numba.simulation.stopwatch import CostStopwatch
@@ -22,7 +23,8 @@ from ertis_numba.simulation.stopwatch import CostStopwatch
 __all__ = ["SAME_RANGE_M", "Echoes", "Sight", "change_db"]
 
 Floats = NDArray[np.float64]
-_GEOMETRY = frozenset({"walls", "occlusion", "target_size", "emitter_offset"})  # effects that change sound paths
+# Effects that change sound paths.
+_GEOMETRY = frozenset(each.name for each in EFFECTS.values() if {"transmitter", "views", "turns"} & {*each.places})
 _LAGS, _LAG_DIRECTIONS = 128, 64
 _BEAM_PATHS, _BEAM_DIRECTIONS = 6, 361
 _SHOWN_DB = 40.0  # dynamic range of an image: weaker reflectors are masked by side lobes
@@ -92,7 +94,7 @@ class Sight:
         self.active = active
         self.settings = shot.sensor.settings()
         self.frequency_hz, self.power = pulse.band(self.settings)
-        self._rings = shot.sensor.emitter if "emitter_response" in active else None
+        self._rings = call_filters(active, shot.sensor.emitter)
 
     @classmethod
     def of(cls, shot: Snapshot, active: frozenset[str]) -> Self:
@@ -133,8 +135,7 @@ class Sight:
 
     def emitters(self, active: frozenset[str]) -> list[int]:
         """Return the numbers of the sensors whose calls arrive, given some effects."""
-        own = [] if self.shot.sensor.emitter.silent else [self.shot.number]
-        return own + (effect("cross_emission")(self.shot) if "cross_emission" in active else [])
+        return emitters(self.shot, active)
 
     def of_emitter(self, number: int, active: frozenset[str]) -> Echoes:
         """Return the echoes of one sensor's call; a call unlike the receiving sensor's appears only weakly."""
@@ -291,7 +292,7 @@ class Sight:
         heard = (np.interp(at_s, lag_s, sound.real) + 1j * np.interp(at_s, lag_s, sound.imag)) * carrier
         return time_s, np.asarray(np.max(np.abs(heard @ amplitude) / len(amplitude), axis=1))
 
-    def beam_change(self, directions: Floats, weight: NDArray[np.complex128]) -> float:
+    def beam_change(self, directions: Floats, weight: Floats | NDArray[np.complex128]) -> float:
         """Return the greatest change of beams relative to the reflector, when weights apply to the microphones.
 
         Parameters

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ertis_numba import kernels
 from ertis_numba.settings import Call
-from ertis_numba.simulation.arrivals import Arrivals, effect
+from ertis_numba.simulation.arrivals import Arrivals
 from ertis_numba.simulation.stopwatch import CostStopwatch
 from ertis_numba.waveform import call_at
 
@@ -105,8 +105,7 @@ def _length(arrived: Sequence[Arrivals], delay_samples: Sequence[Floats], rate_h
     step = 1
     for entry, delay in zip(arrived, delay_samples, strict=True):
         stretch = 1.0 if entry.stretch is None else float(entry.stretch.max(initial=1.0))
-        rings_s = 0.0 if entry.emitter is None else effect("emitter_response", "ringing_s")(entry.emitter)
-        call = max(call, math.ceil(stretch * (entry.call.duration_s + rings_s) * rate_hz))
+        call = max(call, math.ceil(stretch * (entry.call.duration_s + entry.rings_s) * rate_hz))
         spread = max(spread, math.ceil(np.ptp(delay, axis=1).max(initial=0.0)))
         if entry.stretch is not None:
             step = math.lcm(step, _step(entry.call, rate_hz))
@@ -149,14 +148,13 @@ def _add(
         still = np.abs(stretch - 1).max(axis=1) < _STILL
         for path in np.flatnonzero(~still):
             call = _stretched(entry.call, stretch[path], rate_hz, n_fft, n_bins)
-            if entry.emitter is not None:
-                at_hz = np.outer(stretch[path], np.arange(n_bins) * rate_hz / n_fft)
-                call = call * effect("emitter_response")(entry.emitter, at_hz)
+            for each in entry.filters:
+                call = call * each.response(np.outer(stretch[path], np.arange(n_bins) * rate_hz / n_fft))
             add(call, np.array([path]))
     if still.any():
         call = _spectrum(entry.call, rate_hz, n_fft)[None, :n_bins]
-        if entry.emitter is not None:
-            call = call * effect("emitter_response")(entry.emitter, np.arange(n_bins) * rate_hz / n_fft)
+        for each in entry.filters:
+            call = call * each.response(np.arange(n_bins) * rate_hz / n_fft)
         add(call, np.flatnonzero(still))
     spectra[:, :n_bins] += out
     return n_bins

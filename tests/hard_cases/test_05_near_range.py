@@ -10,7 +10,7 @@ from ertis_numba.geometry import far_field_delays, microphones, spherical_delays
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Array, Recording
 from ertis_numba.simulation import Electronics, Emitter, Point
-from ertis_numba.simulation.names import EFFECTS
+from ertis_numba.simulation.effects import EFFECTS
 from tests import reference
 from tests.cases import SHORT
 from tests.hard_cases.echoes import echo_words

@@ -13,7 +13,7 @@ from ertis_numba.geometry import microphones, unit_vectors
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Array
 from ertis_numba.simulation import Point
-from ertis_numba.simulation.names import EFFECTS
+from ertis_numba.simulation.effects import EFFECTS
 from tests import reference
 from tests.cases import SHORT, noise, words_of
 from tests.hard_cases.echoes import echo_signals, echo_words

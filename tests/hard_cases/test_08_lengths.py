@@ -8,7 +8,7 @@ from ertis_numba.geometry import unit_vectors
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Array, Recording
 from ertis_numba.simulation import Point, Sensor
-from ertis_numba.simulation.names import EFFECTS
+from ertis_numba.simulation.effects import EFFECTS
 from ertis_numba.simulation.render import Simulator
 from ertis_numba.waveform import decimation_taps, matched_band_hz
 from tests import reference

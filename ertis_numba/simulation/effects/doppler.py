@@ -1,12 +1,16 @@
 """Shift and stretch of the call due to motion."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.simulation.estimates import Estimate
 from ertis_numba.simulation.paths import Paths
-from ertis_numba.simulation.snapshot import ReceiverPose, TransmitterPose
+from ertis_numba.simulation.sight import Sight, change_db
+from ertis_numba.simulation.snapshot import ReceiverPose, Snapshot, TransmitterPose
 
-__all__ = ["doppler"]
+__all__ = ["estimate", "times"]
 
 Floats = NDArray[np.float64]
 _ROUNDS = 60  # each iteration reduces the error by the factor v / c, so that few are needed
@@ -14,7 +18,12 @@ _ENOUGH_S = 1e-16
 _STEP_S = 1e-5
 
 
-def doppler(paths: Paths, speed_m_s: float) -> tuple[Floats, Floats]:
+def times(shot: Snapshot, paths: Paths, times: tuple[Floats, Floats | None]) -> tuple[Floats, Floats | None]:
+    """Return delays and stretches due to motion, instead of those at rest: both (path, mic) float64."""
+    return _moved(paths, shot.speed_m_s)
+
+
+def _moved(paths: Paths, speed_m_s: float) -> tuple[Floats, Floats]:
     """Return the arrival time of the call's beginning, and its stretch: both (path, mic) float64.
 
     All velocities are constant. Sound that leaves at t₀ meets the moving target at t₁ and the moving microphone at t₂:
@@ -82,3 +91,56 @@ def _mean(time_s: Floats, length_m: Floats) -> Floats:
 
 def _length(vectors: Floats) -> Floats:
     return np.asarray(np.sqrt(np.sum(vectors**2, axis=-1)))
+
+
+def estimate(sight: Sight) -> Estimate | None:
+    """Compute the shift of pulses due to the motion of targets and sensors.
+
+    A hyperbolic chirp stretched by s equals the chirp shifted by ``-(s - 1) p₀ / p'``. Here p₀ is its first period, and
+    p' the growth of its periods with time. For a linear chirp this holds in the mean over its frequencies.
+    """
+    shot = sight.shot
+    scene = shot.scene
+    moving = [*scene.points, *scene.spheres, *scene.walls, *scene.boxes, *(sensor.path() for sensor in scene.sensors)]
+    if not (len(sight.heard) and any(thing.moves for thing in moving)):
+        return None
+    shifts_s, turns_s, stretches, asides = [], [], [], []
+    for number in sight.emitters(sight.active):
+        call = scene.sensors[number].call
+        rise = (1 / call.stop_frequency_hz - 1 / call.start_frequency_hz) / call.duration_s
+        for paths in sight.paths(number, sight.active):
+            delay_s, stretch = _moved(paths, shot.speed_m_s)
+            late_s = delay_s - paths.length_m / shot.speed_m_s
+            coupled_s = (stretch - 1) / call.start_frequency_hz / rise
+            shifts_s.append(np.mean(late_s - coupled_s, axis=1))
+            turns_s.append(np.mean(np.abs(late_s) + np.abs(coupled_s), axis=1))
+            stretches.append(np.mean(stretch, axis=1))
+            asides.append(_aside_rad(paths, shot.speed_m_s))
+    shift_s, turn_s, stretch, aside_rad = (np.concatenate(parts) for parts in (shifts_s, turns_s, stretches, asides))
+    own = sight.heard
+    moved = replace(own, delay_s=own.delay_s + shift_s)
+    change = np.maximum(sight.envelope_change(own, moved, turn_s), sight.turn_change(own, aside_rad))
+    change *= sight.reach(own.delay_s)
+    worst = int(np.argmax(np.abs(shift_s)))
+    return Estimate(
+        change_db=change_db(change, sight.beside(own.delay_s)),
+        sure=200.0,
+        reason=f"{own.names[worst]}, {_reported_m_s(float(stretch[worst]), shot.speed_m_s)}, shifts by "
+        f"{shift_s[worst] * shot.speed_m_s / 2 * 1000:.3g} mm",
+    )
+
+
+def _reported_m_s(stretch: float, speed_m_s: float) -> str:
+    """Return the velocity of a reflector that causes a stretch of the call, as text."""
+    away_m_s = speed_m_s * (stretch - 1) / (stretch + 1)
+    return f"{'going' if away_m_s > 0 else 'coming'} at {abs(away_m_s):.3g} m/s"
+
+
+def _aside_rad(paths: Paths, speed_m_s: float) -> NDArray[np.float64]:
+    """Return the angle that targets move across the line of sight until the sound meets them: (path,) float64."""
+    if not len(paths.targets):
+        return np.zeros(len(paths))
+    way = paths.arriving[:, 0]
+    across_m_s = paths.targets.velocities_m_s - paths.receiver.velocity_m_s
+    across_m_s = across_m_s - np.sum(across_m_s * way, axis=-1, keepdims=True) * way
+    return np.asarray(np.linalg.norm(across_m_s, axis=-1) * paths.first_m[:, 0] / speed_m_s / paths.second_m[:, 0])

@@ -5,22 +5,41 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.simulation.effects.piston import piston
+from ertis_numba.simulation.effects._piston import piston
+from ertis_numba.simulation.estimates import Estimate, filtered
 from ertis_numba.simulation.paths import Paths
+from ertis_numba.simulation.sensors import Emitter
+from ertis_numba.simulation.sight import Sight
+from ertis_numba.simulation.snapshot import Snapshot
 
-__all__ = ["emitter_directivity"]
+__all__ = ["estimate", "gain"]
 
 
-def emitter_directivity(
-    paths: Paths, diameter_m: float, frequency_hz: NDArray[np.float64], speed_m_s: float
-) -> NDArray[np.float64]:
+def gain(
+    shot: Snapshot, paths: Paths, emitter: Emitter, frequency_hz: NDArray[np.float64]
+) -> NDArray[np.float64] | float:
     """Return the emitter's directivity towards the paths: (path, mic, frequency) float64.
 
     The model is a circular piston in a baffle, ``2 J₁(v) / v`` with ``v = π d f sin θ / c``, and 0 behind it. The
     second axis has length 1 if all microphones share the direction to the target.
     """
+    if not emitter.diameter_m:
+        return 1.0
     leaving = paths.leaving[:, :1] if len(paths.targets) and not paths.surface else paths.leaving
     cos = leaving @ paths.transmitter.facing
     sin = np.sqrt(np.maximum(1 - cos**2, 0.0))
-    pattern = piston(math.pi * diameter_m / speed_m_s * sin[..., None] * frequency_hz)
+    pattern = piston(math.pi * emitter.diameter_m / shot.speed_m_s * sin[..., None] * frequency_hz)
     return np.asarray(np.where(cos[..., None] >= 0, pattern, 0.0))
+
+
+def estimate(sight: Sight) -> Estimate | None:
+    """Compare echoes with those of omnidirectional emitters."""
+    sensors = sight.shot.scene.sensors
+    diameter_m = max((sensors[number].emitter.diameter_m for number in sight.emitters(sight.active)), default=0.0)
+    if not (diameter_m and len(sight.heard)):
+        return None
+    return filtered(
+        sight,
+        "emitter_directivity",
+        f"a piston of {1000 * diameter_m:.3g} mm changes {{name}} by {{change:.2f}} dB",
+    )

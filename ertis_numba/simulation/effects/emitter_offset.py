@@ -4,18 +4,30 @@ from dataclasses import replace
 
 import numpy as np
 
+from ertis_numba.simulation.estimates import Estimate, filtered
+from ertis_numba.simulation.sight import Sight
 from ertis_numba.simulation.snapshot import Snapshot, TransmitterPose
 
-__all__ = ["emitter_offset"]
+__all__ = ["estimate", "transmitter"]
 
 
-def emitter_offset(shot: Snapshot, number: int) -> TransmitterPose:
+def transmitter(shot: Snapshot, number: int, transmitter: TransmitterPose) -> TransmitterPose:
     """Return a sensor's emitter at its mounting position, ``o + R p``.
 
     ``o`` is the sensor's origin, ``R`` its rotation and ``p`` the setting ``emitter.position_m``. A path is then
     bistatic: its length is ``|x - (o + R p)| + |x - m|`` for a target x and a microphone m.
     """
-    sensor, transmitter = shot.scene.sensors[number], shot.transmitters[number]
+    sensor = shot.scene.sensors[number]
     return replace(
         transmitter, position_m=transmitter.position_m + sensor.rotation() @ np.array(sensor.emitter.position_m)
+    )
+
+
+def estimate(sight: Sight) -> Estimate | None:
+    """Compare paths from emitters at their positions with those from the centres of their arrays."""
+    sensors = sight.shot.scene.sensors
+    if not any(any(sensors[number].emitter.position_m) for number in sight.emitters(sight.active)):
+        return None
+    return replace(
+        filtered(sight, "emitter_offset", "the emitter's position changes {name} by {change:.2f} dB"), sure=200.0
     )

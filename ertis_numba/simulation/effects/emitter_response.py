@@ -1,33 +1,55 @@
 """Frequency response and ringing of the emitter's transducer."""
 
 import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.simulation.estimates import Estimate, filtered
 from ertis_numba.simulation.sensors import Emitter
+from ertis_numba.simulation.sight import Sight
 
-__all__ = ["emitter_response", "ringing_s"]
+__all__ = ["call_filter", "estimate"]
 
 _RUNG_OUT = 1e-6  # amplitude below which ringing is neglected
 
 
-def emitter_response(emitter: Emitter, frequency_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
-    """Return the response of a transducer with one resonance: complex128, shaped like the input, 1 at the resonance.
-
-    The response is ``H(f) = 1 / (1 + j Q (f / f₀ - f₀ / f))``. This is the current in the series branch of the
-    Butterworth-Van Dyke circuit (K. S. Van Dyke, The piezo-electric resonator and its equivalent network, Proc. IRE 16,
-    1928). Its bandwidth is ``f₀ / Q``; after the call it rings as ``exp(-π f₀ t / Q)``.
-    """
-    if emitter.resonance_hz is None:
-        return np.ones(frequency_hz.shape, dtype=np.complex128)
-    ratio = frequency_hz / emitter.resonance_hz
-    damped = 1j * ratio / emitter.resonance_quality
-    return np.asarray(damped / (1 - ratio**2 + damped))
+def call_filter(emitter: Emitter) -> "_Resonance | None":
+    """Return the resonance of an emitter's transducer, or None if its response is flat."""
+    return None if emitter.resonance_hz is None else _Resonance(emitter.resonance_hz, emitter.resonance_quality)
 
 
-def ringing_s(emitter: Emitter) -> float:
-    """Return the time until ringing has decayed by 120 dB, in seconds."""
-    if emitter.resonance_hz is None:
-        return 0.0
-    return -math.log(_RUNG_OUT) * emitter.resonance_quality / (math.pi * emitter.resonance_hz)
+@dataclass(frozen=True)
+class _Resonance:
+    """Transducer with one resonance: `CallFilter` of a resonance f₀ in Hz and a quality factor Q."""
+
+    resonance_hz: float
+    quality: float
+
+    def response(self, frequency_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """Return the response: complex128, shaped like the input, 1 at the resonance.
+
+        The response is ``H(f) = 1 / (1 + j Q (f / f₀ - f₀ / f))``. This is the current in the series branch of the
+        Butterworth-Van Dyke circuit (K. S. Van Dyke, The piezo-electric resonator and its equivalent network, Proc. IRE
+        16, 1928). Its bandwidth is ``f₀ / Q``; after the call it rings as ``exp(-π f₀ t / Q)``.
+        """
+        ratio = frequency_hz / self.resonance_hz
+        damped = 1j * ratio / self.quality
+        return np.asarray(damped / (1 - ratio**2 + damped))
+
+    @property
+    def rings_s(self) -> float:
+        """Time until ringing has decayed by 120 dB, in seconds."""
+        return -math.log(_RUNG_OUT) * self.quality / (math.pi * self.resonance_hz)
+
+
+def estimate(sight: Sight) -> Estimate | None:
+    """Compare echoes with those of a transducer with a flat frequency response."""
+    shot = sight.shot
+    emitters = [shot.scene.sensors[number].emitter for number in sight.emitters(sight.active)]
+    resonances_hz = [emitter.resonance_hz for emitter in emitters if emitter.resonance_hz is not None]
+    if not (resonances_hz and len(sight.heard)):
+        return None
+    reason = f"a resonance at {resonances_hz[0] / 1000:.3g} kHz changes {{name}} by {{change:.2f}} dB"
+    return replace(filtered(sight, "emitter_response", reason), sure=200.0)

@@ -5,21 +5,40 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.simulation.effects.piston import piston
+from ertis_numba.simulation.effects._piston import piston
+from ertis_numba.simulation.estimates import Estimate, filtered
 from ertis_numba.simulation.paths import Paths
+from ertis_numba.simulation.sensors import Emitter
+from ertis_numba.simulation.sight import Sight
+from ertis_numba.simulation.snapshot import Snapshot
 
-__all__ = ["microphone_directivity"]
+__all__ = ["estimate", "gain"]
 
 
-def microphone_directivity(
-    paths: Paths, diameter_m: float, frequency_hz: NDArray[np.float64], speed_m_s: float
-) -> NDArray[np.float64]:
+def gain(
+    shot: Snapshot, paths: Paths, emitter: Emitter, frequency_hz: NDArray[np.float64]
+) -> NDArray[np.float64] | float:
     """Return the microphones' directivity towards the paths: (path, mic, frequency) float64.
 
     By reciprocity the model is a circular piston in a baffle, ``2 J₁(v) / v`` with ``v = π d f sin θ / c``, and 0 from
     behind.
     """
+    diameter_m = shot.sensor.electronics.microphone_diameter_m
+    if not diameter_m:
+        return 1.0
     cos = -paths.arriving @ paths.receiver.axes[0]
     sin = np.sqrt(np.maximum(1 - cos**2, 0.0))
-    pattern = piston(math.pi * diameter_m / speed_m_s * sin[..., None] * frequency_hz)
+    pattern = piston(math.pi * diameter_m / shot.speed_m_s * sin[..., None] * frequency_hz)
     return np.asarray(np.where(cos[..., None] >= 0, pattern, 0.0))
+
+
+def estimate(sight: Sight) -> Estimate | None:
+    """Compare echoes with those at omnidirectional microphones."""
+    diameter_m = sight.shot.sensor.electronics.microphone_diameter_m
+    if not (diameter_m and len(sight.heard)):
+        return None
+    return filtered(
+        sight,
+        "microphone_directivity",
+        f"ports of {1000 * diameter_m:.3g} mm change {{name}} by {{change:.2f}} dB",
+    )

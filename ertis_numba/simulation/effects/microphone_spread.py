@@ -1,17 +1,28 @@
 """Gains and delays that the calibration does not contain."""
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.simulation.estimates import Estimate, unequal
+from ertis_numba.simulation.sight import Sight
 from ertis_numba.simulation.snapshot import Snapshot
 
-__all__ = ["microphone_spread"]
+__all__ = ["estimate", "microphones"]
 
+Floats = NDArray[np.float64]
 _TICK_S = 1e-12
 _GAIN_STEP = 2.0**-20
 
 
-def microphone_spread(shot: Snapshot) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def microphones(shot: Snapshot, gain: Floats, delay_s: Floats) -> tuple[Floats, Floats]:
+    """Return sensitivities and delays that include the spread: both (mic,) float64."""
+    more, later_s = _spread(shot)
+    return gain * more, delay_s + later_s
+
+
+def _spread(shot: Snapshot) -> tuple[Floats, Floats]:
     """Return the gain and the delay of each microphone: both (mic,) float64.
 
     They are normally distributed in decibels and in seconds. The scene's seed and the name of the sensor determine them
@@ -25,4 +36,17 @@ def microphone_spread(shot: Snapshot) -> tuple[NDArray[np.float64], NDArray[np.f
     return (
         np.rint(gain / _GAIN_STEP) * _GAIN_STEP,
         np.rint(electronics.delay_spread_s * delay_s / _TICK_S) * _TICK_S,
+    )
+
+
+def estimate(sight: Sight) -> Estimate | None:
+    """Compute the change of main lobe and side lobes by uncalibrated gains and delays."""
+    electronics = sight.shot.sensor.electronics
+    if not (electronics.gain_spread_db or electronics.delay_spread_s):
+        return None
+    gain, late_s = _spread(sight.shot)
+    return unequal(
+        sight,
+        gain[:, None] * np.exp(-2j * math.pi * late_s[:, None] * sight.frequency_hz),
+        f"{electronics.gain_spread_db:g} dB and {1e6 * electronics.delay_spread_s:g} µs between microphones",
     )

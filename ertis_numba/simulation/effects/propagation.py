@@ -4,14 +4,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.simulation.paths import Paths
+from ertis_numba.simulation.snapshot import Snapshot
 
-__all__ = ["propagation"]
+__all__ = ["times"]
+
+Floats = NDArray[np.float64]
 
 
-def propagation(paths: Paths, speed_m_s: float) -> NDArray[np.float64]:
-    """Return the delays of the paths, ``(r₁ + r₂) / c``: (path, mic) float64, in seconds.
+def times(shot: Snapshot, paths: Paths, times: tuple[Floats, Floats | None]) -> tuple[Floats, Floats | None]:
+    """Return delays later by those of the paths, ``(r₁ + r₂) / c``: (path, mic) float64, in seconds.
 
     Delays are not rounded to samples. The factor ``exp(-2πi f τ)`` in the spectrum delays the call by any fraction of a
     sample and preserves the energy at each frequency.
     """
-    return paths.length_m / speed_m_s
+    delay_s, stretch = times
+    return delay_s + paths.length_m / shot.speed_m_s, stretch

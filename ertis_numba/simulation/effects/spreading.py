@@ -3,12 +3,21 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.simulation.estimates import Estimate, filtered
 from ertis_numba.simulation.paths import Paths
+from ertis_numba.simulation.sensors import Emitter
+from ertis_numba.simulation.sight import Sight
+from ertis_numba.simulation.snapshot import Snapshot
 
-__all__ = ["NEAREST_M", "spreading"]
+__all__ = ["NEAREST_M", "estimate", "gain", "spreading"]
 
 NEAREST_M = 0.01
 """Distance below which amplitudes no longer grow, because emitters, reflectors and microphones have a finite size."""
+
+
+def gain(shot: Snapshot, paths: Paths, emitter: Emitter, frequency_hz: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the amplitude gain due to geometric spreading, equal at all frequencies: (path, mic, 1) float64."""
+    return spreading(paths)[..., None]
 
 
 def spreading(paths: Paths) -> NDArray[np.float64]:
@@ -35,3 +44,11 @@ def spreading(paths: Paths) -> NDArray[np.float64]:
     along, across = r1 + r2 + 2 * r1 * r2 / (radius_m * cos), r1 + r2 + 2 * r1 * r2 * cos / radius_m
     amplitude[is_sphere] = 1 / np.sqrt(along * across)
     return np.asarray(amplitude)
+
+
+def estimate(sight: Sight) -> Estimate | None:
+    """Compare the levels of echoes with those without spreading."""
+    if not len(sight.heard):
+        return None
+    longest_m = float(np.max(sight.heard.delay_s)) * sight.shot.speed_m_s
+    return filtered(sight, "spreading", f"on paths of up to {longest_m:.2f} m {{name}} changes by {{change:.1f}} dB")

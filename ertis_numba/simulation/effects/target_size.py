@@ -1,23 +1,31 @@
 """Surfaces of spheres, and size and orientation of discs."""
 
+import functools
 import math
 
 import numpy as np
+import scipy.special
 from numpy.typing import NDArray
 
-from ertis_numba.simulation.effects.disc import disc
-from ertis_numba.simulation.effects.rigid_sphere import LARGE, rigid_sphere
+from ertis_numba.simulation.effects._piston import piston
 from ertis_numba.simulation.effects.spreading import NEAREST_M
+from ertis_numba.simulation.estimates import Estimate, filtered
 from ertis_numba.simulation.mirrors import Seen
-from ertis_numba.simulation.paths import Paths, turning, unit
-from ertis_numba.simulation.snapshot import ReceiverPose, Targets, TransmitterPose
+from ertis_numba.simulation.paths import Paths, by_targets, turning, unit
+from ertis_numba.simulation.sensors import Emitter
+from ertis_numba.simulation.sight import Sight
+from ertis_numba.simulation.snapshot import ReceiverPose, Snapshot, Targets, TransmitterPose
 
-__all__ = ["over_surfaces", "patterns"]
+__all__ = ["estimate", "gain", "turns"]
 
 Floats = NDArray[np.float64]
+_LARGE = 60.0  # k a, circumference in wavelengths, above which a sphere is a mirror; in backscatter they differ by 2 %
+_FADES = 40.0  # between this value and `_LARGE`, the series blends into the mirror
+_ORDERS = np.arange(int(_LARGE) + 15)  # beyond k a the terms fall faster than exponentially
+_FAR = 0.02  # below this u, the far field of a disc is accurate to a few thousandths
 
 
-def over_surfaces(
+def turns(
     first: Seen[TransmitterPose], second: Seen[ReceiverPose], targets: Targets, chosen: NDArray[np.intp]
 ) -> Paths:
     """Return paths that turn on the surface of spheres instead of at their centres.
@@ -28,27 +36,33 @@ def over_surfaces(
     ends approximate those from the surface. This is exact for equal distances; otherwise the error is of third order in
     radius / distance.
     """
+    if not np.any(targets.radius_m):
+        return by_targets(first, second, targets, chosen)
     centre_m = targets.positions_m[chosen, None, :]
     outwards = unit(unit(first.end.position_m - centre_m) + unit(second.end.positions_m - centre_m))
     turns_m = centre_m + targets.radius_m[chosen, None, None] * outwards
     return turning(first, second, targets, chosen, turns_m, surface=True)
 
 
-def patterns(paths: Paths, frequency_hz: Floats, speed_m_s: float) -> Floats | NDArray[np.complex128]:
+def gain(
+    shot: Snapshot, paths: Paths, emitter: Emitter, frequency_hz: Floats
+) -> Floats | NDArray[np.complex128] | float:
     """Return the gain of echoes due to the size of their targets: (path, mic, frequency), 1 for points.
 
-    Spheres of a few wavelengths follow `rigid_sphere`, and larger ones are mirrors. Discs follow `disc`; their echo is
-    0 unless emitter and microphone lie in the half space that the disc faces. The type is float64, or complex128 if a
-    target shifts the phase.
+    Spheres of a few wavelengths follow `_rigid_sphere`, and larger ones are mirrors. Discs follow `_disc`. Their echo
+    is 0 unless emitter and microphone lie in the half space that the disc faces. The type is float64, or complex128 if
+    a target shifts the phase.
     """
-    wave = 2 * math.pi / speed_m_s * frequency_hz
     targets = paths.targets
+    if not len(targets):
+        return 1.0
+    wave = 2 * math.pi / shot.speed_m_s * frequency_hz
     found = np.ones((*paths.second_m.shape, len(wave)), dtype=np.complex128)
     lowest = float(wave.min(initial=math.inf, where=wave > 0))
-    small = (targets.radius_m > 0) & (targets.radius_m * lowest < LARGE)
+    small = (targets.radius_m > 0) & (targets.radius_m * lowest < _LARGE)
     if small.any():
         cos_turn = np.sum(paths.leaving[small] * paths.arriving[small], axis=-1)
-        found[small] = rigid_sphere(targets.radius_m[small, None] * wave, cos_turn)
+        found[small] = _rigid_sphere(targets.radius_m[small, None] * wave, cos_turn)
     is_disc = targets.diameter_m > 0
     if is_disc.any():
         found[is_disc] = _disc_pattern(paths, is_disc, wave)
@@ -62,6 +76,88 @@ def _disc_pattern(paths: Paths, chosen: NDArray[np.bool_], wave: Floats) -> NDAr
     both = to_receiver + to_transmitter
     aside = np.linalg.norm(both - np.sum(both * normal, axis=-1, keepdims=True) * normal, axis=-1)
     bent_m = 1 / np.maximum(paths.first_m[chosen], NEAREST_M) + 1 / np.maximum(paths.second_m[chosen], NEAREST_M)
-    pattern = disc((radius_m * aside)[..., None] * wave, (radius_m**2 * bent_m)[..., None] * wave)
+    pattern = _disc((radius_m * aside)[..., None] * wave, (radius_m**2 * bent_m)[..., None] * wave)
     seen = (np.sum(to_receiver * normal, axis=-1) > 0) & (np.sum(to_transmitter * normal, axis=-1) > 0)
     return np.where(seen[..., None], pattern, 0.0)
+
+
+def _disc(tilt: Floats, nearness: Floats) -> NDArray[np.complex128]:
+    """Return the echo relative to the far-field echo along the normal: complex128, shaped like the arguments.
+
+    The echo is ``∫₀¹ J₀(v √t) exp(-j u t / 2) dt``. This is Kirchhoff's integral over a disc in Fresnel's
+    approximation, as for the field near the focus of a lens (M. Born, E. Wolf, Principles of Optics, 7th edition,
+    section 8.8). On the axis it is ``exp(-j u / 4) sin(u / 4) / (u / 4)``. In the far field, u is 0 and the echo has
+    the pattern of a piston, ``2 J₁(v) / v``.
+
+    Parameters
+    ----------
+    tilt : float64
+        ``v = k a |s|``. Here s is the component in the disc's plane of the sum of the unit vectors towards emitter and
+        microphone.
+    nearness : float64
+        ``u = k a² (1 / r₁ + 1 / r₂)``.
+    """
+    found = piston(tilt).astype(np.complex128)
+    near = nearness > _FAR
+    if near.any():
+        v, u = tilt[near], nearness[near]
+        turns = (float(u.max()) / 2 + float(v.max())) / (2 * math.pi)
+        places, weights = _nodes(16 + 8 * math.ceil(turns / 2))  # four per turn, and some for the ends
+        total = np.zeros(len(v), dtype=np.complex128)
+        for place, weight in zip((places + 1) / 2, weights / 2, strict=True):
+            total += weight * scipy.special.j0(v * math.sqrt(place)) * np.exp(-0.5j * u * place)
+        found[near] = total
+    return found
+
+
+@functools.lru_cache(maxsize=16)
+def _nodes(count: int) -> tuple[Floats, Floats]:
+    places, weights = np.polynomial.legendre.leggauss(count)
+    return places, weights
+
+
+def _rigid_sphere(size: Floats, cos_turn: Floats) -> NDArray[np.complex128]:
+    """Return the echo relative to that of a curved mirror: (path, mic, frequency) complex128.
+
+    The echo is the partial-wave series of a rigid sphere in a plane wave,
+    ``f = -(j / k) Σ (2n + 1) jₙ'(ka) / hₙ'(ka) Pₙ(cos Θ)``. The time factor is ``exp(jωt)``, so the spherical Hankel
+    functions are of the second kind (P. M. Morse, K. U. Ingard, Theoretical Acoustics, 1968, section 8.2). The echo of
+    the mirror is ``(a / 2) exp(2 j k a sin(Θ / 2))``, relative to the sphere's centre. For small k a the ratio falls
+    as (k a)² (Rayleigh scattering); near k a = 1 the creeping wave around the sphere makes it oscillate.
+
+    Parameters
+    ----------
+    size : (path, frequency) float64
+        ``k a``, wave number times radius.
+    cos_turn : (path, mic) float64
+        Cosine of the scattering angle Θ; -1 is backscatter.
+    """
+    wanted = (size > 0) & (size < _LARGE)
+    safe = np.where(wanted, size, 1.0)
+    terms = np.stack([_terms(row.tobytes()) for row in safe], axis=1)
+    legendre = scipy.special.eval_legendre(_ORDERS[:, None, None], cos_turn)
+    # Summed without BLAS, because starting its threads takes longer than these sums.
+    series = np.einsum("opm,opf->pmf", legendre, terms)
+    back = 2 * np.sqrt(np.maximum((1 - cos_turn) / 2, 0.0))  # extra path to the centre, in radii
+    ratio = -2j / safe[:, None] * series * np.exp(-1j * back[..., None] * safe[:, None])
+    weight = np.where(wanted, np.clip((_LARGE - safe) / (_LARGE - _FADES), 0.0, 1.0), 0.0)
+    return np.asarray(1 + weight[:, None] * (ratio - 1))
+
+
+@functools.lru_cache(maxsize=64)
+def _terms(sizes: bytes) -> NDArray[np.complex128]:
+    """Return ``(2n + 1) jₙ' / hₙ'`` for sizes given as the bytes of a float64 array: (order, size) complex128."""
+    size, orders = np.frombuffer(sizes), _ORDERS[:, None]
+    near = scipy.special.spherical_jn(orders, size, derivative=True)
+    far = scipy.special.spherical_yn(orders, size, derivative=True)
+    # Where the second function overflows, the term is negligible.
+    ratio = np.divide(near, near - 1j * far, out=np.zeros(near.shape, dtype=np.complex128), where=np.isfinite(far))
+    return np.asarray((2 * orders + 1) * ratio)
+
+
+def estimate(sight: Sight) -> Estimate | None:
+    """Compare echoes from surfaces with those from centres, and echoes of discs with those of points."""
+    targets = sight.shot.targets
+    if not (np.any(targets.radius_m) or np.any(targets.diameter_m)):
+        return None
+    return filtered(sight, "target_size", "{name} has a size: its echo changes by {change:.2f} dB")
