@@ -19,7 +19,7 @@ from ertis_numba.errors import ArgumentError
 from ertis_numba.figures import _array, _curve, _echoes, _front, _sector, _signals, _slices, _sphere
 from ertis_numba.figures._canvas import Canvas
 from ertis_numba.figures._front import Rated
-from ertis_numba.figures._style import StyleOptions, style_of
+from ertis_numba.figures.style import StyleOptions, style_of
 from ertis_numba.frames import Energyscape, Measurement, Peak
 from ertis_numba.settings import Array, Settings
 

@@ -16,7 +16,7 @@ from ertis_numba.errors import ArgumentError
 from ertis_numba.figures import _words
 from ertis_numba.figures._marks import name_points
 from ertis_numba.figures._page import lay_out
-from ertis_numba.figures._style import LINES, Style
+from ertis_numba.figures.style import LINES, Style, angle
 from ertis_numba.geometry import Layout, array_weights, microphones, unit_vectors
 from ertis_numba.settings import Settings
 
@@ -57,7 +57,7 @@ def draw(
     size_mm = 1e3 * (high_m - low_m)
     deep_mm, wide_mm, tall_mm = map(_words.number, np.round(size_mm, 6))
     spread = f"aperture {wide_mm} × {tall_mm} mm" + (f", {deep_mm} mm deep" if size_mm[0] > 1e-6 else "")
-    steering = f"steered to azimuth {_words.angle(azimuth_deg)}, elevation {_words.angle(elevation_deg)}"
+    steering = f"steered to azimuth {angle(azimuth_deg)}, elevation {angle(elevation_deg)}"
     legend_pt = (_LEGEND_LINES * (len(lines) + 1) + 1.0) * style.tick_pt
     page, boxes, _ = lay_out(
         style,
@@ -73,9 +73,7 @@ def draw(
     ]
     page.caption(inner[0], "microphones, seen from behind", above_pt=_ROOF_EMS * em_pt)
     _draw_layout(style, page.axes(inner[0], x="y, left (mm)", y="z, up (mm)"), layout)
-    reported = [
-        f"{name} {_words.angle(value)}" for name, value in (("azimuth", azimuth_deg), ("elevation", elevation_deg))
-    ]
+    reported = [f"{name} {angle(value)}" for name, value in (("azimuth", azimuth_deg), ("elevation", elevation_deg))]
     for box, axis, at_deg, other in (
         (inner[1], "azimuth", azimuth_deg, reported[1]),
         (inner[2], "elevation", elevation_deg, reported[0]),

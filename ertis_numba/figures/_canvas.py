@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from ertis_numba.analysis.levels import below_strongest_db
 from ertis_numba.figures._marks import name_points
 from ertis_numba.figures._page import FigurePage, PageBox, lay_out
-from ertis_numba.figures._style import MONOSPACE, Style, text_width_pt
-from ertis_numba.figures._words import Heading, minus
+from ertis_numba.figures._words import Heading
+from ertis_numba.figures.style import MONOSPACE, Style, minus, text_width_pt
 from ertis_numba.frames import Peak
 
 __all__ = ["Canvas"]

@@ -10,8 +10,8 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from ertis_numba.figures._page import lay_out
-from ertis_numba.figures._style import Style
 from ertis_numba.figures._words import Heading
+from ertis_numba.figures.style import Style
 
 __all__ = ["Rated", "draw"]
 

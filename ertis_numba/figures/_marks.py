@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.patheffects import withStroke
 from matplotlib.transforms import Bbox, BboxBase
 
-from ertis_numba.figures._style import Style, text_width_pt
+from ertis_numba.figures.style import Style, text_width_pt
 
 __all__ = ["name_points"]
 

@@ -8,8 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from ertis_numba.figures._style import Style, text_width_pt
 from ertis_numba.figures._words import Heading
+from ertis_numba.figures.style import Style, text_width_pt
 
 __all__ = ["FigurePage", "PageBox", "lay_out"]
 

@@ -13,6 +13,7 @@ from ertis_numba.figures import _words
 from ertis_numba.figures._canvas import Canvas
 from ertis_numba.figures._page import FigurePage, PageBox
 from ertis_numba.figures._sampling import centres, join_ranges, thickened, volume_raster
+from ertis_numba.figures.style import minus
 from ertis_numba.frames import Energyscape, Peak
 from ertis_numba.geometry import unit_vectors
 
@@ -136,13 +137,13 @@ class _Cut:
 
 def _level(image: Energyscape, height_m: float) -> _Cut:
     spans = _spans(image)
-    title = f"level plane at z = {_words.minus(f'{height_m:g}')} m"
+    title = f"level plane at z = {minus(f'{height_m:g}')} m"
     return _Cut("height_m", height_m, 1, 0, 2, title, (spans[1][1], spans[1][0], *spans[0]))
 
 
 def _upright(image: Energyscape, left_m: float) -> _Cut:
     spans = _spans(image)
-    title = f"upright plane at y = {_words.minus(f'{left_m:g}')} m"
+    title = f"upright plane at y = {minus(f'{left_m:g}')} m"
     return _Cut("left_m", left_m, 0, 2, 1, title, (*spans[0], *spans[2]))
 
 

@@ -13,7 +13,8 @@ from ertis_numba.analysis.side_lobes import without_side_lobes
 from ertis_numba.figures import _sector, _words
 from ertis_numba.figures._canvas import Canvas
 from ertis_numba.figures._page import FigurePage, PageBox
-from ertis_numba.figures._sampling import PIXELS, flattened, sphere_raster
+from ertis_numba.figures._sampling import PIXELS, sphere_raster
+from ertis_numba.figures.style import minus
 from ertis_numba.frames import Energyscape
 from ertis_numba.geometry import spacing_rad, unit_vectors, unrolled_rad
 
@@ -27,15 +28,16 @@ _X, _Y = "azimuth (°)", "elevation (°)"
 def draw(canvas: Canvas, image: Energyscape, *, side_lobes: bool) -> Figure:
     """Draw the maximum over range as a map, and the maximum over elevation as a sector."""
     image = image if side_lobes else without_side_lobes(image)
-    level_db = canvas.level_db(image.amplitude)
-    azimuth_rad, highest_db = flattened(image, level_db)
-    panels = [_Map(canvas, image).height, _sector.height_of(canvas, azimuth_rad, image.range_m)]
+    panels = [_Map(canvas, image).height, _sector.height_of(canvas, _sector.fan_of(image))]
     page, boxes, side = canvas.lay_out(_words.of_image(image), panels, width_pt=1008.0)
     _Map(canvas, image).draw_into(
-        page, boxes[0], level_db.max(axis=1), _words.highest_over("range", hidden=not side_lobes)
+        page,
+        boxes[0],
+        canvas.level_db(image.amplitude).max(axis=1),
+        _words.highest_over("range", hidden=not side_lobes),
     )
     title = _words.highest_over("elevation", hidden=not side_lobes)
-    shown = _sector.draw_into(canvas, page, boxes[1], azimuth_rad, image.range_m, highest_db, title=title)
+    shown = _sector.draw_into(canvas, page, boxes[1], image, title=title)
     return canvas.side(page, side, shown)
 
 
@@ -122,4 +124,4 @@ class _Map:
 
 def _name(azimuth_deg: float, _: object = None) -> str:
     """Return the name of a tick, as reflectors have azimuths: from -180 to 180."""
-    return _words.minus(f"{math.remainder(azimuth_deg, 360.0):g}")
+    return minus(f"{math.remainder(azimuth_deg, 360.0):g}")

@@ -9,7 +9,19 @@ from matplotlib.textpath import text_to_path
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError
 
-__all__ = ["COLUMNS_MM", "FONTS", "LINES", "MONOSPACE", "THEMES", "Style", "StyleOptions", "style_of", "text_width_pt"]
+__all__ = [
+    "COLUMNS_MM",
+    "FONTS",
+    "LINES",
+    "MONOSPACE",
+    "THEMES",
+    "Style",
+    "StyleOptions",
+    "angle",
+    "minus",
+    "style_of",
+    "text_width_pt",
+]
 
 COLUMNS_MM = {1: 85.0, 2: 170.0}
 """Width of a picture for print over so many columns of a page."""
@@ -134,3 +146,14 @@ def text_width_pt(text: str, size_pt: float, font: str, *, bold: bool = False) -
     """Return an upper estimate of the width of a line of text."""
     properties = FontProperties(family=font, size=size_pt, weight="bold" if bold else "normal")
     return _SLACK * text_to_path.get_text_width_height_descent(text, properties, ismath=False)[0]
+
+
+def angle(degrees: float) -> str:
+    """Return an angle with its sign, as the axes write it."""
+    text = minus(f"{degrees:+.1f}".removesuffix(".0"))
+    return "0°" if text in {"+0", "−0"} else f"{text}°"
+
+
+def minus(text: str) -> str:
+    """Return a number with the sign that printers use."""
+    return text.replace("-", "−")
