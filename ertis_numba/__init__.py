@@ -50,7 +50,7 @@ if TYPE_CHECKING:
         SonarDisconnectedError,
         SonarError,
     )
-    from ertis_numba.figures import plot, plot_page
+    from ertis_numba.figures import plot
     from ertis_numba.frames import Energyscape, Measurement, MicrophoneSignals, Peak, PointCloud, Reflector, Stamp
     from ertis_numba.geometry import load_layout
     from ertis_numba.interop import export, open_pcm, open_raw, open_rtis_folder
@@ -123,7 +123,6 @@ __all__ = [
     "open_recording",
     "open_rtis_folder",
     "plot",
-    "plot_page",
     "render",
     "write_energyscapes",
     "write_recording",
@@ -152,7 +151,7 @@ _HOMES = {
         "SonarError",
         "SonarDisconnectedError",
     ),
-    "figures": ("plot", "plot_page"),
+    "figures": ("plot",),
     "frames": ("Energyscape", "Measurement", "MicrophoneSignals", "Peak", "PointCloud", "Reflector", "Stamp"),
     "geometry": ("load_layout",),
     "interop": ("export", "open_pcm", "open_raw", "open_rtis_folder"),

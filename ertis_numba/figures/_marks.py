@@ -64,8 +64,6 @@ def name_points(
             xytext=offset_pt,
             textcoords="offset points",
             color=colour,
-            fontsize=size_pt,
-            family=style.font,
             fontweight="bold" if bold else "normal",
             ha="center",
             va="center",

@@ -9,18 +9,21 @@ from matplotlib.text import Annotation
 from ertis_numba.figures.style import Style, angle
 from ertis_numba.geometry import Fan, plan_m
 
-__all__ = ["draw_grid"]
+__all__ = ["draw_grid", "part_names"]
+
+_APART_PX = 2.0  # Minimum distance of names.
+_METRES = " m"
 
 
 def draw_grid(
     axes: Axes, style: Style, fan: Fan, *, first_m: float = 0.0, largest: int = 6, spare_m: float = 0.0
 ) -> None:
-    """Draw rings and rays with their labels.
+    """Draw rings and rays with their labels in the present font of Matplotlib.
 
     Parameters
     ----------
     axes : Axes
-        Metres to the right of the sensor and ahead of it; position and limits must be final.
+        Metres to the right of the sensor and ahead of it; limits must be final.
     style : Style
     fan : Fan
     first_m : float
@@ -38,18 +41,16 @@ def draw_grid(
         axes.plot(*plan_m(math.radians(ray_deg), fan.range_m), **line)
         align = (_side(across, "right", "left"), _side(ahead, "top", "bottom"))
         place, offset_pt = (math.radians(ray_deg), fan.range_m[1]), (0.5 * size_pt * across, 0.5 * size_pt * ahead)
-        _name(axes, style, place, angle(math.remainder(ray_deg, 360)), offset_pt, align)
+        _name(axes, place, angle(math.remainder(ray_deg, 360)), offset_pt, align)
     # Names of rings stand beside the first edge, outside of the sector, or under or over it where that edge runs level.
     if abs(math.degrees(math.asin(math.cos(first_rad)))) < 20:
         offset_pt, align = (0.0, math.copysign(1.4 * size_pt, math.sin(first_rad))), ("center", "center")
     else:
         offset_pt, align = (0.8 * size_pt, math.copysign(0.8 * size_pt, -math.cos(first_rad))), ("left", "center")
-    names = []
     for ring_m in fan.rings_m(first_m, largest=largest, spare_m=spare_m):
         if ring_m >= fan.range_m[0] - spare_m:
             axes.plot(*plan_m(fan.arc_rad, ring_m), **line)
-        names.append(_name(axes, style, (first_rad, ring_m), f"{ring_m:g} m", offset_pt, align))
-    _part(axes, names)
+        _name(axes, (first_rad, ring_m), f"{ring_m:g}{_METRES}", offset_pt, align)
 
 
 def _side(towards: float, before: str, behind: str) -> str:
@@ -58,36 +59,25 @@ def _side(towards: float, before: str, behind: str) -> str:
 
 
 def _name(
-    axes: Axes,
-    style: Style,
-    place: tuple[float, float],
-    text: str,
-    offset_pt: tuple[float, float],
-    align: tuple[str, str],
-) -> Annotation:
-    return axes.annotate(
-        text,
-        tuple(plan_m(*place)),
-        xytext=offset_pt,
-        textcoords="offset points",
-        color=style.faint,
-        fontsize=style.tick_pt,
-        family=style.font,
-        ha=align[0],
-        va=align[1],
-        annotation_clip=False,
-    )
+    axes: Axes, place: tuple[float, float], text: str, offset_pt: tuple[float, float], align: tuple[str, str]
+) -> None:
+    options: dict[str, Any] = {"textcoords": "offset points", "annotation_clip": False}
+    axes.annotate(text, tuple(plan_m(*place)), xytext=offset_pt, ha=align[0], va=align[1], **options)
 
 
-def _part(axes: Axes, names: list[Annotation]) -> None:
-    """Move names of rings into the figure, and remove those that overlap others; the last ring keeps its name."""
+def part_names(axes: Axes) -> None:
+    """Move names of rings into the figure, and remove those that overlap others; the last ring keeps its name.
+
+    The position of the axes must be final.
+    """
     right_px, px_per_pt = axes.figure.bbox.x1, axes.figure.dpi / 72
-    kept = [text.get_window_extent() for text in axes.texts if text not in names]
-    for name in reversed(names):
+    rings = [text for text in axes.texts if isinstance(text, Annotation) and text.get_text().endswith(_METRES)]
+    kept = [text.get_window_extent() for text in axes.texts if text not in rings]
+    for name in reversed(rings):
         beyond_px = max(0.0, name.get_window_extent().x1 - right_px)
         x_pt, y_pt = name.xyann
         name.xyann = (x_pt - beyond_px / px_per_pt, y_pt)
-        box = name.get_window_extent().padded(2.0)
+        box = name.get_window_extent().padded(_APART_PX)
         if any(box.overlaps(other) for other in kept):
             name.remove()
         else:

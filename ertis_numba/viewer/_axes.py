@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.transforms import IdentityTransform
 from numpy.typing import NDArray
 
-from ertis_numba.figures.sector_grid import draw_grid
+from ertis_numba.figures.sector_grid import draw_grid, part_names
 from ertis_numba.figures.style import THEMES, minus
 from ertis_numba.geometry import Fan, plan_m
 
@@ -122,6 +122,7 @@ class Ink:
         flat[self.places] = (under + self.colours * self.cover + 0.5).astype(np.uint8)
 
 
+@_STYLE.applied()
 def draw_axes(place: Place, fan: Fan, dynamic_range_db: float) -> Ink:
     """Draw rings in metres, rays in degrees, the sensor, and the numbers of the colour bar."""
     (x, y), scale = place.sensor_px, place.scale_px_m
@@ -133,21 +134,23 @@ def draw_axes(place: Place, fan: Fan, dynamic_range_db: float) -> Ink:
     (low_m, high_m), half_m = fan.range_m, 0.5 / scale
     rings = max(1, min(6, int((high_m - low_m) * scale / _RING_PX)))
     draw_grid(axes, _STYLE, fan, first_m=low_m, largest=rings, spare_m=half_m)
+    part_names(axes)
     if 0 <= x <= place.width_px and 0 <= y <= place.height_px - _FLOOR_PX + 1:
         axes.plot(0, 0, marker="^", markersize=8, color=_STYLE.ink, scalex=False, scaley=False)
     left, right, top, bottom = place.scale_px
-    letters = {"color": _STYLE.faint, "fontsize": _STYLE.tick_pt, "transform": IdentityTransform()}  # Pixels, y up.
+    pixels = IdentityTransform()  # From the lower left corner.
     for share in (0.0, 0.5, 1.0):
         name, name_px = minus(f"{-dynamic_range_db * (1 - share) + 0.0:g}"), left + share * (right - left)
-        axes.text(name_px, place.height_px - bottom - 3, name, ha="center", va="top", **letters)
-    axes.text(right + 14, place.height_px - (top + bottom) / 2, "dB", ha="left", va="center", **letters)
+        axes.text(name_px, place.height_px - bottom - 3, name, ha="center", va="top", transform=pixels)
+    axes.text(right + 14, place.height_px - (top + bottom) / 2, "dB", va="center", transform=pixels)
     return _ink(figure)
 
 
+@_STYLE.applied()
 def draw_text(place: Place, text: str) -> Ink:
     """Draw a text in the middle of an empty picture."""
     figure = _sheet(place)
-    figure.text(0.5, 0.5, text, color=_STYLE.faint, fontsize=_TEXT_PT, ha="center", va="center", parse_math=False)
+    figure.text(0.5, 0.5, text, fontsize=_TEXT_PT, ha="center", va="center")
     return _ink(figure)
 
 
