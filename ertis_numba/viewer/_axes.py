@@ -14,10 +14,11 @@ from ertis_numba.figures.sector_grid import draw_grid, part_names
 from ertis_numba.figures.style import THEMES, minus
 from ertis_numba.geometry import Fan, plan_m
 
-__all__ = ["PAGE", "SIDE_PX", "Ink", "Place", "draw_axes", "draw_text"]
+__all__ = ["PAGE", "SIDE_PX", "STYLE", "Ink", "Place", "draw_axes", "draw_text"]
 
-_STYLE: Final = THEMES["dark"]
-PAGE: Final = tuple(bytes.fromhex(_STYLE.page[1:]))
+STYLE: Final = THEMES["dark"]
+"""Style of the pictures."""
+PAGE: Final = tuple(bytes.fromhex(STYLE.page[1:]))
 """Background colour: red, green, blue."""
 SIDE_PX: Final = 44
 """Margin at the sides of the sector, for labels."""
@@ -122,7 +123,7 @@ class Ink:
         flat[self.places] = (under + self.colours * self.cover + 0.5).astype(np.uint8)
 
 
-@_STYLE.applied()
+@STYLE.applied()
 def draw_axes(place: Place, fan: Fan, dynamic_range_db: float) -> Ink:
     """Draw rings in metres, rays in degrees, the sensor, and the numbers of the colour bar."""
     (x, y), scale = place.sensor_px, place.scale_px_m
@@ -133,10 +134,10 @@ def draw_axes(place: Place, fan: Fan, dynamic_range_db: float) -> Ink:
     axes.set_axis_off()
     (low_m, high_m), half_m = fan.range_m, 0.5 / scale
     rings = max(1, min(6, int((high_m - low_m) * scale / _RING_PX)))
-    draw_grid(axes, _STYLE, fan, first_m=low_m, largest=rings, spare_m=half_m)
+    draw_grid(axes, STYLE, fan, first_m=low_m, largest=rings, spare_m=half_m)
     part_names(axes)
     if 0 <= x <= place.width_px and 0 <= y <= place.height_px - _FLOOR_PX + 1:
-        axes.plot(0, 0, marker="^", markersize=8, color=_STYLE.ink, scalex=False, scaley=False)
+        axes.plot(0, 0, marker="^", markersize=8, color=STYLE.ink, scalex=False, scaley=False)
     left, right, top, bottom = place.scale_px
     pixels = IdentityTransform()  # From the lower left corner.
     for share in (0.0, 0.5, 1.0):
@@ -146,7 +147,7 @@ def draw_axes(place: Place, fan: Fan, dynamic_range_db: float) -> Ink:
     return _ink(figure)
 
 
-@_STYLE.applied()
+@STYLE.applied()
 def draw_text(place: Place, text: str) -> Ink:
     """Draw a text in the middle of an empty picture."""
     figure = _sheet(place)
