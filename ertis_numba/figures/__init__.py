@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Unpack, overload
 
-import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -21,7 +20,7 @@ from ertis_numba.figures import _array, _front, _images, _signals, _slices, _wor
 from ertis_numba.figures._canvas import Canvas
 from ertis_numba.figures._front import Rated
 from ertis_numba.figures._page import compose
-from ertis_numba.figures.style import StyleOptions, style_of
+from ertis_numba.figures.style import StyleOptions, parameters, style_of
 from ertis_numba.frames import Energyscape, Measurement, Peak
 from ertis_numba.settings import Array, Settings
 
@@ -333,7 +332,7 @@ def save(figure: Figure, target: str | Path | IO[bytes], *, format: str | None =
             else f"{target} ends in none of .pdf, .png and .svg; give such a name, or format"
         )
     undated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind)
-    with mpl.rc_context({"pdf.fonttype": 42, "svg.hashsalt": "ertis"}):
+    with parameters({"pdf.fonttype": 42, "svg.hashsalt": "ertis"}):
         figure.savefig(target, format=kind, metadata=undated)
 
 

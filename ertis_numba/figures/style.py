@@ -24,6 +24,7 @@ __all__ = [
     "StyleOptions",
     "angle",
     "minus",
+    "parameters",
     "style_of",
     "text_width_pt",
 ]
@@ -125,8 +126,8 @@ class Style:
 
     @contextmanager
     def applied(self) -> Iterator[None]:
-        """Draw in this style; one thread at a time, because parameters of Matplotlib are global."""
-        with _LOCK, mpl.rc_context(self.rc):
+        """Draw in this style."""
+        with parameters(self.rc):
             yield
 
     @property
@@ -155,6 +156,13 @@ THEMES = {
         width_pt=COLUMNS_MM[2] * _PT_PER_MM,
     ),
 }
+
+
+@contextmanager
+def parameters(rc: Any) -> Iterator[None]:
+    """Set parameters of Matplotlib for a while; one thread at a time, because they are global."""
+    with _LOCK, mpl.rc_context(rc):
+        yield
 
 
 def style_of(
