@@ -437,7 +437,12 @@ def test_fan_extent_includes_sensor_and_arc(azimuth_deg, wanted_m):
 
 @pytest.mark.parametrize(
     ("range_m", "wanted_m"),
-    [((0.5, 5.0), [1, 2, 3, 4, 5]), ((0.0, 0.3), [0.05, 0.1, 0.15, 0.2, 0.25, 0.3]), ((3.0, 3.004), [3, 3.001, 3.002])],
+    [
+        ((0.5, 5.0), [1, 2, 3, 4, 5]),
+        ((0.0, 0.3), [0.05, 0.1, 0.15, 0.2, 0.25, 0.3]),
+        ((3.0, 3.004), [3, 3.001, 3.002]),
+        ((1.0, 1.0), [1]),
+    ],
 )
 def test_fan_has_rings_at_round_ranges(range_m, wanted_m):
     rings_m = fan([-10, 0, 10], range_m).rings_m(range_m[0], largest=6, spare_m=1e-6)

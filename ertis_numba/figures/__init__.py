@@ -1,9 +1,8 @@
 """Figures of energyscapes, signals and arrays, and of accuracy versus processing time.
 
-Figures do not use pyplot, so they need no window system. As x is forward, y left and z up in the
-sensor frame (REP-103), positive azimuth is on the left: a sector is seen from above, a map and an array from the
-sensor. Functions return a figure, or the axes given as ``ax``; `save` writes a figure to a file. Only the live view
-also uses Matplotlib.
+Figures do not use pyplot, so they need no window system. As x is forward, y left and z up in the sensor frame
+(REP-103), positive azimuth is on the left: a sector is seen from above, a map and an array from the sensor. Functions
+return a figure, or the axes given as ``ax``; `save` writes a figure to a file. Only the live view also uses Matplotlib.
 """
 
 from collections.abc import Sequence

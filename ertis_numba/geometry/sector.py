@@ -92,13 +92,13 @@ class Fan:
     def rings_m(self, first_m: float, *, largest: int, spare_m: float) -> list[float]:
         """Return round ranges from a range to the last one or a little more, about so many."""
         first_m, last_m = max(first_m, 0.0), self.range_m[1]
-        rings_m: list[float] = []
+        rings_m = [last_m]
+        if last_m - first_m <= spare_m:
+            return rings_m
         for count in range(largest, _MAX_RINGS):
-            step_m = round_step(max(last_m - first_m, spare_m), count)
-            numbers = range(
-                max(1, math.ceil((first_m - spare_m) / step_m)), math.floor((last_m + spare_m) / step_m) + 1
-            )
-            rings_m = [number * step_m for number in numbers]
+            step_m = round_step(last_m - first_m, count)
+            first, last = math.ceil((first_m - spare_m) / step_m), math.floor((last_m + spare_m) / step_m)
+            rings_m = [number * step_m for number in range(max(1, first), last + 1)]
             if len(rings_m) > 1:
                 break
         return rings_m
