@@ -29,7 +29,7 @@ def sector(canvas: Canvas, image: Energyscape, *, hidden: bool = False) -> Panel
     step_m = max(right - left, top - bottom) / PIXELS
 
     def paint(axes: Axes) -> AxesImage:
-        range_m, level_db = join_ranges(image.range_m, fan.strongest(canvas.level_db(image.amplitude)))
+        range_m, level_db = join_ranges(image.range_m, canvas.level_db(fan.strongest(image.amplitude)))
         range_m, level_db = thickened(range_m, level_db)
         right_m, ahead_m = centres(left, right, step_m), centres(bottom, top, step_m)
         raster = polar_raster(level_db, fan, range_m, right_m=right_m, ahead_m=ahead_m)
@@ -66,7 +66,7 @@ def direction_map(canvas: Canvas, image: Energyscape, *, hidden: bool) -> Panel:
     def paint(axes: Axes) -> AxesImage:
         step_deg = max(west - east, high - low) / (PIXELS / 2)
         raster = sphere_raster(
-            canvas.level_db(image.amplitude).max(axis=1),
+            canvas.level_db(image.amplitude.max(axis=1)),
             directions,
             azimuth_rad=np.radians(np.arange(west - step_deg / 2, east, -step_deg)),
             elevation_rad=np.radians(np.arange(low + step_deg / 2, high, step_deg)),
