@@ -7,9 +7,7 @@ import time
 import pytest
 
 from ertis_numba.network import messages
-from ertis_numba.network.sensor_node import SensorNode
-from ertis_numba.network.sensor_node import _link as link
-from ertis_numba.network.sensor_node import _runs as runs
+from ertis_numba.network.sensor_node import SensorNode, _link as link, _runs as runs
 from tests.journals import EPOCH, TINY
 
 KEY = "left", EPOCH

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from ertis_numba import kernels, verification
 from ertis_numba.analysis.compare import _Lobe

@@ -28,7 +28,6 @@ DOCUMENTED = [
     ertis.matched_filter,
     ertis.beamform,
     ertis.plot,
-    ertis.plot_page,
     ertis.open_energyscapes,
     ertis.write_energyscapes,
     ertis.Pipeline,

@@ -129,7 +129,7 @@ def test_caption_names_the_settings():
         assert word in texts
 
 
-def test_plot_page_refuses_invalid_arguments():
+def test_plot_refuses_invalid_arguments():
     with pytest.raises(ArgumentError, match="dynamic_range_db is 0; give a number above 0"):
         plot(image(), dynamic_range_db=0)
     with pytest.raises(ArgumentError, match="theme 'drak' is unknown "):

@@ -225,7 +225,7 @@ def test_single_microphone_has_no_beam_pattern():
 
 
 def words_of_page(figure):
-    return " ".join(text.get_text() for text in figure.texts)
+    return " ".join(text.get_text() for text in [*figure.texts, *(axes.title for axes in figure.axes)])
 
 
 @pytest.mark.parametrize("draw", [figures.plot, figures.polar, figures.projection, figures.slices])

@@ -4,8 +4,7 @@ import importlib.metadata
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.io import loadmat
 from scipy.spatial import cKDTree
@@ -13,6 +12,7 @@ from scipy.spatial import cKDTree
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import (
     PAPER_GRIDS,
+    Fan,
     azimuth_columns,
     direction_grid,
     far_field_delays,
@@ -20,6 +20,7 @@ from ertis_numba.geometry import (
     layout_names,
     load_layout,
     microphones,
+    plan_m,
     reach_rad,
     spacing_rad,
     spherical_delays,
@@ -412,3 +413,47 @@ def test_layout_in_metres_is_refused(tmp_path):
         ArgumentError, match=r"microphones lie within 0\.04 mm, too close .*; give positions in millimetres"
     ):
         load_layout(path)
+
+
+def fan(azimuth_deg, range_m=(0.5, 5.0)):
+    azimuth_rad = np.radians(np.asarray(azimuth_deg, float))
+    return Fan.of(azimuth_rad, np.zeros(len(azimuth_rad)), np.asarray(range_m))
+
+
+@pytest.mark.parametrize(
+    ("azimuth_deg", "wanted_m"),
+    [
+        (np.linspace(-90, 90, 37), (-5, 5, 0, 5)),
+        (np.arange(-180, 180, 5), (-5, 5, -5, 5)),
+        (np.linspace(0, 90, 19), (-5, 0, 0, 5)),
+        ([30.0], (-5 * np.sin(np.radians(31)), 0, 0, 5 * np.cos(np.radians(29)))),
+    ],
+    ids=["half disc", "circle", "left", "one direction"],
+)
+def test_fan_extent_includes_sensor_and_arc(azimuth_deg, wanted_m):
+    assert fan(azimuth_deg).extent_m() == pytest.approx(wanted_m, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("range_m", "wanted_m"),
+    [
+        ((0.5, 5.0), [1, 2, 3, 4, 5]),
+        ((0.0, 0.3), [0.05, 0.1, 0.15, 0.2, 0.25, 0.3]),
+        ((3.0, 3.004), [3, 3.001, 3.002]),
+        ((1.0, 1.0), [1]),
+    ],
+)
+def test_fan_has_rings_at_round_ranges(range_m, wanted_m):
+    rings_m = fan([-10, 0, 10], range_m).rings_m(range_m[0], largest=6, spare_m=1e-6)
+    assert rings_m[: len(wanted_m)] == pytest.approx(wanted_m)
+
+
+def test_fan_finds_directions_and_gaps():
+    right_m, ahead_m = plan_m(np.radians([-30.0, -29.5, 0.0, 12.5, 30.0, 40.0]), 2.0)
+    place, near = fan([*range(-30, -9, 5), *range(10, 31, 5)]).directions(right_m, ahead_m)
+    assert near.tolist() == [True, True, False, True, True, False]
+    assert place[near] == pytest.approx([0, 0.1, 5.5, 9])
+
+
+def test_fan_of_a_full_circle_has_each_ray_once():
+    assert fan(np.arange(0, 360, 2)).rays_deg() == [*range(-150, 181, 30)]

@@ -5,8 +5,7 @@ import json
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from ertis_bench import health as benchmark
-from ertis_bench import tables
+from ertis_bench import health as benchmark, tables
 from ertis_bench.health.campaign import false_alarms, named
 from ertis_bench.health.faults import FAULTS
 from ertis_bench.health.scenes import base

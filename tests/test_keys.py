@@ -12,8 +12,7 @@ import zmq
 from click.testing import CliRunner
 from ertis_cli import _network
 from ertis_cli.keys import keys as keys_command
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from ertis_numba.errors import ArgumentError, SettingsError
 from ertis_numba.network import addresses

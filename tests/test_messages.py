@@ -4,8 +4,7 @@ import random
 
 import msgspec
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 
 from ertis_numba.errors import DataError, FormatVersionError
 from ertis_numba.network import messages

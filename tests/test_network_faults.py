@@ -21,8 +21,7 @@ from ertis_numba.network.messages import Group
 from ertis_numba.network.status import SensorStatus, Status
 from ertis_numba.storage import RecordingWriter, open_recording
 from tests.faults import reliability
-from tests.faults.network import keys, kills, links, peers, processing, table, wire, zmtp
-from tests.faults.network import run as faults
+from tests.faults.network import keys, kills, links, peers, processing, run as faults, table, wire, zmtp
 from tests.files import noise
 
 SEED = 1

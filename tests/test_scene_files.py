@@ -6,8 +6,7 @@ import time
 import numpy as np
 import pytest
 import scipy.spatial.transform
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from numpy.testing import assert_allclose
 
 from ertis_numba.errors import ArgumentError, SettingsError

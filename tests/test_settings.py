@@ -7,8 +7,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
-from hypothesis import strategies as st
+from hypothesis import assume, given, settings, strategies as st
 
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError, SettingsError

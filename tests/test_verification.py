@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from ertis_bench import referee
-from ertis_bench import verification as campaign
+from ertis_bench import referee, verification as campaign
 from ertis_bench.random_settings import Limits, random_measurement, random_settings
 from ertis_cli.main import cli
 

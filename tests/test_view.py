@@ -12,7 +12,7 @@ from PIL import Image
 
 from ertis_numba.analysis.side_lobes import without_side_lobes
 from ertis_numba.errors import ArgumentError
-from ertis_numba.geometry import direction_grid
+from ertis_numba.geometry import Fan, direction_grid
 from ertis_numba.settings import Call, Processing
 from ertis_numba.viewer import COLOURS, Choices, Dome, Polar, Pose, ReceivedImage, Sector, ViewedScene, _axes
 from ertis_numba.viewer._axes import PAGE
@@ -85,9 +85,9 @@ def test_rings_and_rays_match_their_labels():
 def test_labels_do_not_overlap(half_deg, range_m, monkeypatch):
     drawn = []
     monkeypatch.setattr(_axes, "_ink", drawn.append)
-    fan_rad = np.radians([-half_deg, 0, half_deg])
-    place = _axes.Place.of(fan_rad, range_m, 640)
-    _axes.draw_axes(place, fan_rad, range_m, 40.0)
+    fan = Fan.of(np.radians([-half_deg, 0, half_deg]), np.zeros(3), np.array(range_m))
+    place = _axes.Place.of(fan, 640)
+    _axes.draw_axes(place, fan, 40.0)
     names = [text for text in drawn[0].axes[0].texts if text.get_text()]
     assert sum(text.get_text().endswith(" m") for text in names) >= 1
     boxes = [text.get_window_extent() for text in names]

@@ -18,8 +18,7 @@ from ertis_numba.storage import write_energyscapes
 from ertis_numba.viewer import ViewedScene, Viewer
 from ertis_numba.viewer._recordings import MAX_BYTES
 from tests.pages import commands_in, path_of, run, run_here
-from tests.publishing import Publisher
-from tests.publishing import image as published
+from tests.publishing import Publisher, image as published
 from tests.views import PATIENCE_S, stamped
 
 BIND = socket.socket.bind

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from ertis_numba.geometry import Fan
 from ertis_numba.viewer import Polar, _axes
 from tests.files import image
 from tests.views import TABLE, brightest
@@ -68,13 +69,16 @@ def test_reflector_behind_is_drawn_at_its_position():
 
 
 @pytest.mark.parametrize(
-    ("fan_deg", "rays"),
-    [((100, 260), "−150° −120° +120° +150° +180°"), ((-180, 180), "−150° −120° −90° −60° −30° 0° +30° +60°")],
+    ("azimuth_deg", "rays"),
+    [
+        (np.arange(100, 261, 2), "+120° +150° +180° −150° −120°"),
+        (np.arange(-180, 180, 2), "−150° −120° −90° −60° −30° 0° +30° +60° +90° +120° +150° +180°"),
+    ],
 )
-def test_rays_behind_are_labelled(fan_deg, rays, monkeypatch):
+def test_rays_behind_are_labelled(azimuth_deg, rays, monkeypatch):
     drawn = []
     monkeypatch.setattr(_axes, "_ink", drawn.append)
-    fan_rad = np.radians(fan_deg)
-    _axes.draw_axes(_axes.Place.of(fan_rad, (0.5, 5.0), 640), fan_rad, (0.5, 5.0), 40.0)
+    fan = Fan.of(np.radians(azimuth_deg), np.zeros(len(azimuth_deg)), np.array([0.5, 5.0]))
+    _axes.draw_axes(_axes.Place.of(fan, 640), fan, 40.0)
     names = [text.get_text() for text in drawn[0].axes[0].texts]
-    assert [name for name in names if name.endswith("°")][:8] == rays.split()
+    assert [name for name in names if name.endswith("°")] == rays.split()

@@ -10,8 +10,7 @@ from ertis_numba.network.messages import Refused
 from ertis_numba.network.status import SensorStatus
 from ertis_numba.viewer import Choices, Live, Pose, Viewer, _live
 from ertis_numba.viewer._page import ControlRequest
-from tests.publishing import Publisher, status
-from tests.publishing import image as published
+from tests.publishing import Publisher, image as published, status
 from tests.views import TABLE, Source, acked_through, spot, taken, wait_for
 
 

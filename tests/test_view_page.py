@@ -15,9 +15,7 @@ import zstandard
 
 from ertis_numba.errors import ArgumentError, NetworkError
 from ertis_numba.storage import write_energyscapes
-from ertis_numba.viewer import Choices, Playback, Viewer
-from ertis_numba.viewer import _recordings as recordings
-from ertis_numba.viewer import _view as viewing
+from ertis_numba.viewer import Choices, Playback, Viewer, _recordings as recordings, _view as viewing
 from ertis_numba.viewer._origins import is_loopback
 from ertis_numba.viewer._page import ControlRequest
 from tests.views import PATIENCE_S, Client, Source, spot, stamped, taken, wait_for

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from ertis_numba.geometry import round_step
 from ertis_numba.viewer import Choices, Pose, Viewer
-from ertis_numba.viewer._space import round_step
 from tests.views import Source, acked_through, spot, taken
 
 PLACES = {"left": Pose((0.0, 3.0, 0.0)), "front": Pose((2.0, 0.0, 0.0)), "right": Pose((0.0, -1.0, 0.0))}

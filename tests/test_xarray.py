@@ -13,8 +13,7 @@ from ertis_numba.interop._points import PointTable
 from ertis_numba.settings import Processing
 from ertis_numba.storage import open_energyscapes, write_energyscapes, write_recording
 from ertis_numba.storage.schema import ENERGYSCAPE
-from tests.cases import CASES
-from tests.cases import noise as one_noise
+from tests.cases import CASES, noise as one_noise
 from tests.files import image, line, noise
 
 SOLID = direction_grid(Processing(directions="3d:60"))

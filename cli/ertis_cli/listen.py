@@ -12,8 +12,7 @@ import click
 
 from ertis_cli import _network, options
 from ertis_cli._product_printer import MicrophoneTable
-from ertis_cli._saving import PRODUCTS as FILED
-from ertis_cli._saving import saving
+from ertis_cli._saving import PRODUCTS as FILED, saving
 from ertis_cli._signals import stopped_by_signals
 
 if TYPE_CHECKING:

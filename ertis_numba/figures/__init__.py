@@ -1,25 +1,25 @@
 """Figures of energyscapes, signals and arrays, and of accuracy versus processing time.
 
-Figures do not use pyplot, so they need no global state and no window system. As x is forward, y left and z up in the
-sensor frame (REP-103), positive azimuth is on the left: a sector is seen from above, a map and an array from the
-sensor. Functions return a figure, or the axes given as ``ax``; `save` writes a figure to a file. Only the live view
-also uses Matplotlib.
+Figures do not use pyplot, so they need no window system. As x is forward, y left and z up in the sensor frame
+(REP-103), positive azimuth is on the left: a sector is seen from above, a map and an array from the sensor. Functions
+return a figure, or the axes given as ``ax``; `save` writes a figure to a file. Only the live view also uses Matplotlib.
 """
 
 from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Unpack, overload
 
-import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ertis_numba import checks
+from ertis_numba.analysis.side_lobes import without_side_lobes
 from ertis_numba.errors import ArgumentError
-from ertis_numba.figures import _array, _curve, _echoes, _front, _sector, _signals, _slices, _sphere
+from ertis_numba.figures import _array, _front, _images, _signals, _slices, _words
 from ertis_numba.figures._canvas import Canvas
 from ertis_numba.figures._front import Rated
-from ertis_numba.figures._style import StyleOptions, style_of
+from ertis_numba.figures._page import compose
+from ertis_numba.figures.style import StyleOptions, parameters, style_of
 from ertis_numba.frames import Energyscape, Measurement, Peak
 from ertis_numba.settings import Array, Settings
 
@@ -30,7 +30,6 @@ __all__ = [
     "front",
     "matched_filter",
     "plot",
-    "plot_page",
     "polar",
     "projection",
     "save",
@@ -70,10 +69,11 @@ def plot(
     side_lobes: bool = False,
     **look: Unpack[StyleOptions],
 ) -> Figure | Axes:
-    """Draw an energyscape into given axes, or on a composed page.
+    """Draw an energyscape on a page with a heading, a colour bar and a list of reflectors, or into given axes.
 
-    A planar image becomes a sector in metres. An image of one direction becomes a curve over range. On given axes, an
-    image with elevations becomes a map of azimuth and elevation. Without axes, the page is that of `plot_page`.
+    A planar image becomes a sector in metres. An image of one direction becomes a curve over range. An image with
+    elevations becomes a map of azimuth and elevation, which shows the maximum over range. A page also shows its
+    maximum over elevation as a sector.
 
     Parameters
     ----------
@@ -86,7 +86,9 @@ def plot(
     peaks : sequence of Peak, optional
         Reflectors to mark, as `find_peaks` returns them; a page lists them, too.
     side_lobes : bool, default False
-        Show the side lobes of an image with elevations, see `plot_page`.
+        Show the side lobes of an image with elevations, too. By default, points that lie
+        `ertis_numba.analysis.side_lobes.SIDE_LOBE_DB` below the strongest of about the same range are left out: a
+        maximum over directions would otherwise show an arc at the range of each echo.
     **look
         ``theme``, ``columns`` and ``font``: see `StyleOptions`. The theme is ``light`` for given axes and ``dark``
         otherwise.
@@ -94,7 +96,7 @@ def plot(
     Returns
     -------
     matplotlib.axes.Axes or matplotlib.figure.Figure
-        ``ax`` if it is given, otherwise the figure.
+        ``ax`` if it is given, otherwise the page. Save it with `save`, or with ``savefig("image.png")``.
 
     Raises
     ------
@@ -107,78 +109,29 @@ def plot(
     >>> import ertis_numba as ertis
     >>> with ertis.open_recording("reflectors.h5") as recording:
     ...     image = ertis.Pipeline(recording.settings).process(recording[0])
+    >>> ertis.plot(image, peaks=ertis.find_peaks(image, top=5)).savefig("image.png")
     >>> figure, axes = plt.subplots(1, 2)
     >>> ertis.plot(image, ax=axes[0]) is axes[0]
     True
     >>> bar = figure.colorbar(axes[0].images[-1], ax=axes[0], label="dB")
     """
-    if ax is None:
-        return plot_page(image, dynamic_range_db=dynamic_range_db, peaks=peaks, side_lobes=side_lobes, **look)
-    if not isinstance(ax, Axes) or ax.name != "rectilinear":
+    if ax is not None and (not isinstance(ax, Axes) or ax.name != "rectilinear"):
         name = f"{ax.name} axes" if isinstance(ax, Axes) else f"of type {type(ax).__name__}"
         raise ArgumentError(f"ax is {name}; give rectilinear Axes, such as matplotlib.pyplot.subplots returns")
-    checks.instance("image", image, Energyscape, "Pipeline.process returns")
-    canvas = _canvas(dynamic_range_db, {"theme": "light", **look}, peaks)
-    if len(image.azimuth_rad) == 1:
-        _curve.draw_on(canvas, ax, image)
-    elif image.is_planar:
-        _sector.draw_on(canvas, ax, image, side_lobes=side_lobes)
-    else:
-        _sphere.draw_on(canvas, ax, image, side_lobes=side_lobes)
-    return ax
-
-
-def plot_page(
-    image: Energyscape,
-    *,
-    dynamic_range_db: float = 40.0,
-    peaks: Sequence[Peak] | None = None,
-    side_lobes: bool = False,
-    **look: Unpack[StyleOptions],
-) -> Figure:
-    """Draw an energyscape as a page with a heading, a colour scale and a list of reflectors.
-
-    A planar image becomes a sector in metres. An image with elevations becomes two pictures: the maximum over range as
-    a map of azimuth and elevation, and the maximum over elevation as a sector. An image of one direction becomes a
-    curve over range.
-
-    Parameters
-    ----------
-    image : Energyscape
-    dynamic_range_db : float, default 40
-        Level below the strongest point at which the colour scale ends, in dB.
-    peaks : sequence of Peak, optional
-        Reflectors to mark and list, as `find_peaks` returns them.
-    side_lobes : bool, default False
-        Show the side lobes of an image with elevations, too. By default, points that lie
-        `ertis_numba.analysis.side_lobes.SIDE_LOBE_DB` below the strongest of about the same range are left out: a
-        maximum over directions would otherwise show an arc at the range of each echo.
-    **look
-        ``theme``, ``columns`` and ``font``: see `StyleOptions`.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        Save it with `save`, or with ``savefig("image.png")``.
-
-    Raises
-    ------
-    ArgumentError
-        An argument has another type or value than listed above.
-
-    Examples
-    --------
-    >>> import ertis_numba as ertis
-    >>> with ertis.open_recording("reflectors.h5") as recording:
-    ...     image = ertis.Pipeline(recording.settings).process(recording[0])
-    >>> ertis.plot_page(image, peaks=ertis.find_peaks(image, top=5)).savefig("image.png")
-    """
+    if ax is not None:
+        look = {"theme": "light", **look}
     canvas = _canvas_of(image, dynamic_range_db, look, peaks)
     if len(image.azimuth_rad) == 1:
-        return _curve.draw(canvas, image)
-    if image.is_planar:
-        return _sector.draw(canvas, image, side_lobes=side_lobes)
-    return _sphere.draw(canvas, image, side_lobes=side_lobes)
+        panels = [_images.curve(canvas, image)]
+    elif image.is_planar:
+        panels = [_images.sector(canvas, image)]
+    else:
+        shown, hidden = _seen(image, side_lobes=side_lobes)
+        panels = [draw(canvas, shown, hidden=hidden) for draw in (_images.direction_map, _images.sector)]
+    if ax is None:
+        return compose(canvas, _words.of_image(image), panels, width_pt=720.0 if len(panels) == 1 else 1008.0)
+    panels[0].draw_on(ax, canvas.style)
+    return ax
 
 
 def polar(
@@ -191,9 +144,11 @@ def polar(
 ) -> Figure:
     """Draw an energyscape as a sector in metres, with the maximum over elevation.
 
-    Arguments are those of `plot_page`.
+    Arguments are those of `plot`.
     """
-    return _sector.draw(_canvas_of(image, dynamic_range_db, look, peaks), image, side_lobes=side_lobes)
+    canvas = _canvas_of(image, dynamic_range_db, look, peaks)
+    shown, hidden = _seen(image, side_lobes=side_lobes)
+    return compose(canvas, _words.of_image(image), [_images.sector(canvas, shown, hidden=hidden)])
 
 
 def projection(
@@ -204,8 +159,10 @@ def projection(
     side_lobes: bool = False,
     **look: Unpack[StyleOptions],
 ) -> Figure:
-    """Draw the maximum over range as a map of azimuth and elevation; arguments are those of `plot_page`."""
-    return _sphere.draw_map(_canvas_of(image, dynamic_range_db, look, peaks), image, side_lobes=side_lobes)
+    """Draw the maximum over range as a map of azimuth and elevation; arguments are those of `plot`."""
+    canvas = _canvas_of(image, dynamic_range_db, look, peaks)
+    shown, hidden = _seen(image, side_lobes=side_lobes)
+    return compose(canvas, _words.of_image(image), [_images.direction_map(canvas, shown, hidden=hidden)])
 
 
 def slices(
@@ -230,7 +187,7 @@ def slices(
     left_m : float, optional
         Position y of the vertical section in metres; 0 by default.
     dynamic_range_db, peaks, **look
-        As for `plot_page`.
+        As for `plot`.
 
     Raises
     ------
@@ -260,7 +217,7 @@ def signals(
     microphone : int, optional
         Channel of the only microphone to draw; all by default.
     dynamic_range_db, **look
-        As for `plot_page`.
+        As for `plot`.
 
     Raises
     ------
@@ -283,7 +240,7 @@ def matched_filter(
     Arguments are those of `signals`.
     """
     checks.instance("measurement", measurement, Measurement, "a recording holds")
-    return _echoes.draw(_canvas(dynamic_range_db, look), measurement, microphone=microphone)
+    return _signals.draw_echoes(_canvas(dynamic_range_db, look), measurement, microphone=microphone)
 
 
 def array(
@@ -306,7 +263,7 @@ def array(
     azimuth_deg, elevation_deg : float
         Steering direction in degrees, -90 to 90.
     dynamic_range_db, **look
-        As for `plot_page`.
+        As for `plot`.
 
     Raises
     ------
@@ -318,9 +275,8 @@ def array(
         settings = Settings(array=Array(layout=settings))
     checks.instance("settings", settings, Settings, "Settings.load reads, or the name of a layout")
     return _array.draw(
-        style_of(**look),
+        Canvas(style_of(**look), dynamic_range_db),
         settings,
-        dynamic_range_db=dynamic_range_db,
         frequencies_hz=frequencies_hz,
         azimuth_deg=checks.between("azimuth_deg", azimuth_deg, -90.0, 90.0),
         elevation_deg=checks.between("elevation_deg", elevation_deg, -90.0, 90.0),
@@ -336,7 +292,7 @@ def front(points: Sequence[Rated], *, title: str, note: str = "", **look: Unpack
     title, note : str
         Heading, and the line below it.
     **look
-        As for `plot_page`.
+        As for `plot`.
 
     Returns
     -------
@@ -375,8 +331,14 @@ def save(figure: Figure, target: str | Path | IO[bytes], *, format: str | None =
             else f"{target} ends in none of .pdf, .png and .svg; give such a name, or format"
         )
     undated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind)
-    with mpl.rc_context({"pdf.fonttype": 42, "svg.hashsalt": "ertis"}):
+    with parameters({"pdf.fonttype": 42, "svg.hashsalt": "ertis"}):
         figure.savefig(target, format=kind, metadata=undated)
+
+
+def _seen(image: Energyscape, *, side_lobes: bool) -> tuple[Energyscape, bool]:
+    """Return the image to draw, and whether its side lobes are hidden."""
+    hidden = not (image.is_planar or side_lobes)
+    return (without_side_lobes(image) if hidden else image), hidden
 
 
 def _canvas_of(image: Energyscape, dynamic_range_db: float, look: StyleOptions, peaks: Sequence[Peak] | None) -> Canvas:

@@ -3,8 +3,8 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -14,16 +14,15 @@ from ertis_numba import checks
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError
 from ertis_numba.figures import _words
+from ertis_numba.figures._canvas import Canvas
 from ertis_numba.figures._marks import name_points
-from ertis_numba.figures._page import lay_out
-from ertis_numba.figures._style import LINES, Style
+from ertis_numba.figures._page import Panel, compose
+from ertis_numba.figures.style import LINES, angle
 from ertis_numba.geometry import Layout, array_weights, microphones, unit_vectors
 from ertis_numba.settings import Settings
 
 __all__ = ["Cut", "draw", "pattern_db", "width_deg"]
 
-_LEFT_EMS, _RIGHT_EMS, _FLOOR_EMS, _ROOF_EMS = 5.0, 1.4, 4.0, 1.8
-_SHADES = (0.6, 0.8, 0.45, 0.95)  # places in the map of colours, of the second line on
 _MAX_LINES = 5
 _LEGEND_LINES = 1.4  # height of its lines, by the size of their letters
 _MAX_NAMES = 64
@@ -42,66 +41,51 @@ class Cut:
 
 
 def draw(
-    style: Style,
+    canvas: Canvas,
     settings: Settings,
     *,
-    dynamic_range_db: float,
     frequencies_hz: Sequence[float] | None,
     azimuth_deg: float,
     elevation_deg: float,
 ) -> Figure:
     """Draw the layout, and the pattern along azimuth and along elevation."""
-    layout, em_pt = microphones(settings.array), style.em_pt
-    lines = _lines(settings, frequencies_hz)
+    layout, lines = microphones(settings.array), _lines(settings, frequencies_hz)
     low_m, high_m = (edge(layout.enabled_positions_m, axis=0) for edge in (np.min, np.max))
     size_mm = 1e3 * (high_m - low_m)
     deep_mm, wide_mm, tall_mm = map(_words.number, np.round(size_mm, 6))
     spread = f"aperture {wide_mm} × {tall_mm} mm" + (f", {deep_mm} mm deep" if size_mm[0] > 1e-6 else "")
-    steering = f"steered to azimuth {_words.angle(azimuth_deg)}, elevation {_words.angle(elevation_deg)}"
-    legend_pt = (_LEGEND_LINES * (len(lines) + 1) + 1.0) * style.tick_pt
-    page, boxes, _ = lay_out(
-        style,
-        _words.of_array(settings, spread, steering),
-        [lambda width_pt: 0.72 * width_pt + legend_pt + (_FLOOR_EMS + _ROOF_EMS) * em_pt] * 3,
-        width_pt=1080.0,
-        side_pt=0.0,
-        below_pt=0.0,
-    )
-    inner = [
-        box.inset(left=_LEFT_EMS * em_pt, right=_RIGHT_EMS * em_pt, bottom=_FLOOR_EMS * em_pt, top=_ROOF_EMS * em_pt)
-        for box in boxes
-    ]
-    page.caption(inner[0], "microphones, seen from behind", above_pt=_ROOF_EMS * em_pt)
-    _draw_layout(style, page.axes(inner[0], x="y, left (mm)", y="z, up (mm)"), layout)
-    reported = [
-        f"{name} {_words.angle(value)}" for name, value in (("azimuth", azimuth_deg), ("elevation", elevation_deg))
-    ]
-    for box, axis, at_deg, other in (
-        (inner[1], "azimuth", azimuth_deg, reported[1]),
-        (inner[2], "elevation", elevation_deg, reported[0]),
-    ):
-        sweep_deg = _sweep(at_deg)
-        across_deg, up_deg = (
-            sweep_deg if name == axis else np.full_like(sweep_deg, still_deg)
-            for name, still_deg in (("azimuth", azimuth_deg), ("elevation", elevation_deg))
-        )
-        page.caption(box, f"along {axis}, at {other}", above_pt=_ROOF_EMS * em_pt)
-        axes = page.axes(box.inset(top=legend_pt), x=f"{axis} (°)", y="level (dB)")
+    beam_deg = {"azimuth": azimuth_deg, "elevation": elevation_deg}
+    reported = {axis: f"{axis} {angle(at_deg)}" for axis, at_deg in beam_deg.items()}
+
+    def paint_cut(axes: Axes, axis: str, other: str) -> None:
+        sweep_deg = _sweep(beam_deg[axis])
+        to_deg = {axis: sweep_deg, other: np.full_like(sweep_deg, beam_deg[other])}
         for number, line in enumerate(lines):
-            level_db = pattern_db(
-                settings, line.frequencies_hz, across_deg, up_deg, azimuth_deg=azimuth_deg, elevation_deg=elevation_deg
-            )
-            width = width_deg(sweep_deg, level_db, at_deg)
-            axes.plot(
-                sweep_deg,
-                level_db,
-                LINES[number % len(LINES)],
-                color=_colour(style, number),
-                linewidth=1.2 * style.line_pt,
-                label=f"{line.name}: " + ("none" if width is None else f"{_words.number(width)}°"),
-            )
-        _finish(style, axes, dynamic_range_db, mirrored=axis == "azimuth")
-    return page.figure
+            level_db = pattern_db(settings, line.frequencies_hz, to_deg["azimuth"], to_deg["elevation"], **steering_deg)
+            width = width_deg(sweep_deg, level_db, beam_deg[axis])
+            label = f"{line.name}: " + ("none" if width is None else f"{_words.number(width)}°")
+            style: dict[str, Any] = {"linestyle": LINES[number % len(LINES)], "linewidth": 1.2 * canvas.style.line_pt}
+            axes.plot(sweep_deg, level_db, label=label, **style)
+        axes.set_xlabel(f"{axis} (°)")
+        axes.set_ylabel("level (dB)")
+        _finish(canvas, axes, f"along {axis}, at {reported[other]}", mirrored=axis == "azimuth")
+
+    def height(width_pt: float) -> float:
+        return 0.8 * width_pt + (_LEGEND_LINES * (len(lines) + 2) + 1.0) * canvas.style.tick_pt
+
+    steering_deg = {"azimuth_deg": azimuth_deg, "elevation_deg": elevation_deg}
+    panels = [
+        Panel(
+            lambda axes: _paint_layout(canvas, axes, layout),
+            height,
+            lambda axes: _fit_layout(canvas, axes, layout),
+            "microphones, seen from behind",
+        ),
+        Panel(lambda axes: paint_cut(axes, "azimuth", "elevation"), height),
+        Panel(lambda axes: paint_cut(axes, "elevation", "azimuth"), height),
+    ]
+    heading = _words.of_array(settings, spread, "steered to " + ", ".join(reported.values()))
+    return compose(canvas, heading, panels, width_pt=1080.0)
 
 
 def pattern_db(
@@ -174,48 +158,39 @@ def _lines(settings: Settings, frequencies_hz: Sequence[float] | None) -> list[C
     ]
 
 
-def _colour(style: Style, number: int) -> object:
-    return style.mark if number == 0 else mpl.colormaps[style.colours](_SHADES[number - 1])
+def _paint_layout(canvas: Canvas, axes: Axes, layout: Layout) -> None:
+    style, seen_mm = canvas.style, 1e3 * layout.positions_m[layout.enabled, 1:]
+    size_pt = (5.0 if len(seen_mm) <= _MAX_NAMES else 2.0) * style.line_pt
+    axes.plot(*seen_mm.T, "o", color=style.mark, markersize=size_pt, markeredgewidth=0)
+    axes.set_xlabel("y, left (mm)")
+    axes.set_ylabel("z, up (mm)")
+    axes.locator_params(nbins=6)
+    canvas.grid(axes)
 
 
-def _draw_layout(style: Style, axes: Axes, layout: Layout) -> None:
-    places_mm = 1e3 * layout.positions_m[:, 1:]
-    on = layout.enabled
-    seen_mm = places_mm[on]
+def _fit_layout(canvas: Canvas, axes: Axes, layout: Layout) -> None:
+    """Set limits with one scale for both axes and room around, and name the microphones if they are few."""
+    style, on = canvas.style, layout.enabled
+    seen_mm, box = 1e3 * layout.positions_m[on, 1:], axes.bbox
     middle, reach = (seen_mm.min(axis=0) + seen_mm.max(axis=0)) / 2, np.ptp(seen_mm, axis=0)
-    box = axes.bbox
-    # One scale for both axes, and room around.
     scale = 1.25 * max(reach[0] / box.width, reach[1] / box.height) or 20 / box.width
     axes.set_xlim(middle[0] + scale * box.width / 2, middle[0] - scale * box.width / 2)
     axes.set_ylim(middle[1] - scale * box.height / 2, middle[1] + scale * box.height / 2)
-    axes.grid(color=style.faint, alpha=0.3, linewidth=0.6 * style.line_pt)
-    axes.locator_params(nbins=6)
-    size_pt = 5.0 * style.line_pt if len(seen_mm) <= _MAX_NAMES else 2.0 * style.line_pt
-    axes.plot(*seen_mm.T, "o", color=style.mark, markersize=size_pt, markeredgewidth=0)
     if len(seen_mm) <= _MAX_NAMES:
         names = [str(channel) for channel in np.flatnonzero(on)]
         points = [(float(y), float(z)) for y, z in seen_mm]
-        name_points(axes, style, points, names, ring_pt=0.7 * size_pt, colour=style.faint)
+        name_points(axes, style, points, names, ring_pt=3.5 * style.line_pt, colour=style.faint)
 
 
-def _finish(style: Style, axes: Axes, dynamic_range_db: float, *, mirrored: bool) -> None:
+def _finish(canvas: Canvas, axes: Axes, title: str, *, mirrored: bool) -> None:
+    style, floor_db = canvas.style, -canvas.dynamic_range_db
     axes.axhline(_HALF_POWER_DB, color=style.faint, linewidth=0.6 * style.line_pt, alpha=0.6)
     axes.set_xlim(90, -90) if mirrored else axes.set_xlim(-90, 90)
-    axes.set_ylim(-dynamic_range_db, 3.0)
+    axes.set_ylim(floor_db, 3.0)
     axes.set_xticks(range(-90, 91, 30))
-    step = max(1.0, 10.0 * round(dynamic_range_db / 50))
-    axes.set_yticks(np.arange(0.0, -dynamic_range_db - 1e-9, -step))
-    axes.grid(color=style.faint, alpha=0.3, linewidth=0.6 * style.line_pt)
-    legend = axes.legend(
-        loc="lower center",
-        bbox_to_anchor=(0.5, 1.0),
-        borderaxespad=0.4,
-        borderpad=0.2,
-        labelspacing=0.25,
-        title="half-power width",
-        frameon=False,
-        labelcolor=style.ink,
-        prop={"family": style.font, "size": style.tick_pt},
-        title_fontproperties={"family": style.font, "size": style.tick_pt},
-    )
-    legend.get_title().set_color(style.faint)
+    step = max(1.0, 10.0 * round(-floor_db / 50))
+    axes.set_yticks(np.arange(0.0, floor_db - 1e-9, -step))
+    canvas.grid(axes)
+    above: dict[str, Any] = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "borderaxespad": 0.4}
+    legend = axes.legend(title=f"{title}\nhalf-power width", borderpad=0.2, labelspacing=0.25, frameon=False, **above)
+    legend.get_title().set_multialignment("center")

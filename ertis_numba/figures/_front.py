@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import cycle
+from typing import Any
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
@@ -9,13 +11,12 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from ertis_numba.figures._page import lay_out
-from ertis_numba.figures._style import Style
+from ertis_numba.figures._canvas import Canvas
+from ertis_numba.figures._page import Panel, compose
 from ertis_numba.figures._words import Heading
+from ertis_numba.figures.style import Style
 
 __all__ = ["Rated", "draw"]
-
-_COLOURS = (0.75, 0.45, 0.6, 0.9)  # places in the theme's map, of the second series on
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,50 +43,28 @@ class Rated:
 
 def draw(style: Style, points: Sequence[Rated], *, title: str, note: str) -> Figure:
     """Draw the points of each series in its colour, and a line through its front."""
-    em_pt = style.em_pt
-    page, (box,), _ = lay_out(
-        style,
-        Heading((title,), (note,) if note else ()),
-        [lambda width_pt: 0.48 * width_pt],
-        width_pt=720.0,
-        side_pt=0.0,
-        below_pt=0.0,
-    )
-    axes = page.axes(
-        box.inset(left=5.0 * em_pt, right=1.5 * em_pt, bottom=4.0 * em_pt, top=em_pt),
-        x="error of the image (dB)",
-        y="time of a measurement (ms)",
-    )
-    axes.set_yscale("log")
-    shades = mpl.colormaps[style.colours]
-    for number, series in enumerate(dict.fromkeys(point.series for point in points)):
-        colour = shades(_COLOURS[(number - 1) % len(_COLOURS)]) if number else style.mark
-        _draw_series(axes, style, [point for point in points if point.series == series], series, colour)
-    for point in points:
-        if point.label:
-            axes.annotate(
-                point.label,
-                (point.error_db, point.time_ms),
-                xytext=(0, -1.5 * em_pt),
-                textcoords="offset points",
-                ha="center",
-                color=style.ink,
-                fontsize=style.label_pt,
-                family=style.font,
-                path_effects=[withStroke(linewidth=2.5 * style.line_pt, foreground=style.page)],
-            )
-    axes.margins(x=0.05, y=0.1)
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.yaxis.set_minor_formatter(NullFormatter())
-    axes.grid(color=style.faint, alpha=0.3, linewidth=0.6 * style.line_pt)
-    axes.legend(
-        facecolor=style.page,
-        edgecolor=style.faint,
-        labelcolor=style.ink,
-        prop={"family": style.font, "size": style.label_pt},
-    )
-    return page.figure
+
+    def paint(axes: Axes) -> None:
+        axes.set_xlabel("error of the image (dB)")
+        axes.set_ylabel("time of a measurement (ms)")
+        axes.set_yscale("log")
+        names = dict.fromkeys(point.series for point in points)
+        for look, name in zip(cycle(mpl.rcParams["axes.prop_cycle"]), names, strict=False):
+            _draw_series(axes, style, [point for point in points if point.series == name], name, look["color"])
+        stroke = [withStroke(linewidth=2.5 * style.line_pt, foreground=style.page)]
+        letters: dict[str, Any] = {"color": style.ink, "fontsize": style.label_pt, "path_effects": stroke}
+        for point in (each for each in points if each.label):
+            place, offset_pt = (point.error_db, point.time_ms), (0, -1.5 * style.em_pt)
+            axes.annotate(point.label, place, xytext=offset_pt, textcoords="offset points", ha="center", **letters)
+        axes.margins(x=0.05, y=0.1)
+        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axes.yaxis.set_minor_formatter(NullFormatter())
+        axes.grid(color=style.faint, alpha=0.3, linewidth=0.6 * style.line_pt)
+        axes.legend(fontsize=style.label_pt)
+
+    panel = Panel(paint, lambda width_pt: 0.46 * width_pt)
+    return compose(Canvas(style), Heading((title,), (note,) if note else ()), [panel])
 
 
 def _draw_series(axes: Axes, style: Style, points: Sequence[Rated], name: str, colour: object) -> None:

@@ -1,13 +1,16 @@
 """Labels beside points, without overlaps."""
 
+import itertools
 import math
 from collections.abc import Sequence
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patheffects import withStroke
-from matplotlib.transforms import Bbox, BboxBase
+from matplotlib.transforms import Bbox
+from numpy.typing import NDArray
 
-from ertis_numba.figures._style import Style, text_width_pt
+from ertis_numba.figures.style import Style, text_width_pt
 
 __all__ = ["name_points"]
 
@@ -42,64 +45,38 @@ def name_points(
     colour : str
     bold : bool
     """
-    figure = axes.figure
-    scale = figure.dpi / 72
-    size_pt = style.tick_pt
+    px_per_pt, size_pt, page = axes.figure.dpi / 72, style.tick_pt, axes.figure.bbox
     taken = [text.get_window_extent() for text in axes.texts if text.get_text()]
-    places = [tuple(axes.transData.transform(point)) for point in points]
-    rings = [_box(x, y, 2 * ring_pt * scale, 2 * ring_pt * scale) for x, y in places]
-    for number, (name, (x, y)) in enumerate(zip(names, places, strict=True)):
-        width_pt, height_pt = text_width_pt(name, size_pt, style.font, bold=bold), 1.15 * size_pt
-        others = rings[:number] + rings[number + 1 :]
-        for reach in _REACHES:
-            offset_pt = _free(x, y, reach, ring_pt, width_pt, height_pt, scale, [*taken, *others], figure.bbox)
-            if offset_pt is not None:
+    places = [axes.transData.transform(point) for point in points]
+    ring_px = np.full(2, ring_pt * px_per_pt)
+    rings = [_box(place, 2 * ring_px) for place in places]
+    for number, (name, place) in enumerate(zip(names, places, strict=True)):
+        size_px = px_per_pt * np.array([text_width_pt(name, size_pt, style.font, bold=bold), 1.15 * size_pt])
+        others = [*taken, *rings[:number], *rings[number + 1 :]]
+        for reach, turn_deg in itertools.product(_REACHES, _TURNS_DEG):
+            turn = math.radians(turn_deg)
+            offset_px = np.array([math.cos(turn), math.sin(turn)]) * (reach * ring_px + size_px / 2 + px_per_pt)
+            box = _box(place + offset_px, size_px)
+            inside = page.contains(*box.min) and page.contains(*box.max)
+            if inside and not any(box.overlaps(other) for other in others):
                 break
         else:
             continue
-        taken.append(_box(x + offset_pt[0] * scale, y + offset_pt[1] * scale, width_pt * scale, height_pt * scale))
+        taken.append(box)
+        arrow = {"arrowstyle": "-", "color": colour, "linewidth": 0.5 * style.line_pt, "shrinkB": ring_pt}
         axes.annotate(
             name,
             points[number],
-            xytext=offset_pt,
+            xytext=tuple(offset_px / px_per_pt),
             textcoords="offset points",
             color=colour,
-            fontsize=size_pt,
-            family=style.font,
             fontweight="bold" if bold else "normal",
             ha="center",
             va="center",
             path_effects=[withStroke(linewidth=2.5 * style.line_pt, foreground=style.page)],
-            arrowprops={"arrowstyle": "-", "color": colour, "linewidth": 0.5 * style.line_pt, "shrinkB": ring_pt}
-            if reach > _NEAR
-            else None,
+            arrowprops=arrow if reach > _NEAR else None,
         )
 
 
-def _free(
-    x: float,
-    y: float,
-    reach: float,
-    ring_pt: float,
-    width_pt: float,
-    height_pt: float,
-    scale: float,
-    taken: Sequence[Bbox],
-    page: BboxBase,
-) -> tuple[float, float] | None:
-    """Return an offset in points at which a label covers nothing."""
-    for turn_deg in _TURNS_DEG:
-        turn = math.radians(turn_deg)
-        offset_pt = (
-            math.cos(turn) * (reach * ring_pt + 0.5 * width_pt + 1),
-            math.sin(turn) * (reach * ring_pt + 0.5 * height_pt + 1),
-        )
-        box = _box(x + offset_pt[0] * scale, y + offset_pt[1] * scale, width_pt * scale, height_pt * scale)
-        inside = page.x0 <= box.x0 and box.x1 <= page.x1 and page.y0 <= box.y0 and box.y1 <= page.y1
-        if inside and not any(box.overlaps(other) for other in taken):
-            return offset_pt
-    return None
-
-
-def _box(x: float, y: float, width: float, height: float) -> Bbox:
-    return Bbox.from_bounds(x - width / 2, y - height / 2, width, height)
+def _box(middle: NDArray[np.float64], size: NDArray[np.float64]) -> Bbox:
+    return Bbox([middle - size / 2, middle + size / 2])

@@ -1,201 +1,190 @@
-"""Layout of a page, in points from its lower left corner: heading, pictures, colour bar."""
+"""Page of a figure: heading, pictures, colour bar and list of reflectors."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 
-from ertis_numba.figures._style import Style, text_width_pt
+from ertis_numba.figures._canvas import Canvas
 from ertis_numba.figures._words import Heading
+from ertis_numba.figures.style import MONOSPACE, Style, text_width_pt
 
-__all__ = ["FigurePage", "PageBox", "lay_out"]
+__all__ = ["Panel", "compose"]
 
-_TITLE_LINE, _LINE = 1.35, 1.55  # heights of lines, by the size of their letters
+_TITLE_LINE, _LINE, _ROW = 1.35, 1.55, 1.6  # heights of lines, by the size of their letters
 _DOT = " · "
-_GAP_EMS = 2.0  # between pictures
+_WIDE_EMS = 55.0  # from which on pictures are beside each other
+_ACROSS_EMS, _UP_EMS = 6.5, 6.0  # what ticks and names take around a picture
+_MAX_ROWS = 24  # of the list below a picture
+_MIN_ROWS = 12  # beside one, whatever its height
+_LABEL_EMS = 13.0  # length of what is written along the colour bar
+_SHARE_ALONE = 0.8  # of its box that a colour bar takes which no list is under
 
 
 @dataclass(frozen=True, slots=True)
-class PageBox:
-    """A rectangle on a page, in points."""
-
-    left: float
-    bottom: float
-    width: float
-    height: float
-
-    def inset(self, *, left: float = 0.0, right: float = 0.0, bottom: float = 0.0, top: float = 0.0) -> "PageBox":
-        """Return the box within margins."""
-        return PageBox(self.left + left, self.bottom + bottom, self.width - left - right, self.height - bottom - top)
-
-    def fitted(self, ratio: float) -> "PageBox":
-        """Return the largest inner box with a given ratio of height to width, centred at the top."""
-        width = min(self.width, self.height / ratio)
-        height = width * ratio
-        return PageBox(self.left + (self.width - width) / 2, self.bottom + self.height - height, width, height)
-
-
-class FigurePage:
-    """Figure with its heading.
-
-    Parameters
-    ----------
-    style : Style
-    heading : Heading
-    width_pt : float
-    body_pt : float
-        Height of the part below the heading.
-    heading_pt : float
-        Width that the heading may take.
+class Panel:
+    """Picture that is drawn in two steps, because labels find their places only after the axes have theirs.
 
     Attributes
     ----------
-    figure : Figure
-    style : Style
+    paint : callable
+        Draws into axes and returns the raster that the colour bar explains, or None.
+    height : callable
+        Returns the height of the axes from their width, both in points.
+    finish : callable
+        Draws what depends on the final position of the axes.
+    title : str
+    title_ems : float
+        Distance of the title from the axes.
+    box_aspect : float, optional
+        Height of the axes relative to their width on a page.
     """
 
-    def __init__(self, style: Style, heading: Heading, *, width_pt: float, body_pt: float, heading_pt: float) -> None:
-        title = _wrapped(heading.title, style.title_pt, style.font, heading_pt, bold=True)
-        lines = _wrapped(heading.settings, style.label_pt, style.font, heading_pt)
-        title_pt = _TITLE_LINE * style.title_pt * len(title)
-        head_pt = style.margin_pt * 0.6 + title_pt + _LINE * style.label_pt * len(lines) + 0.4 * style.em_pt
-        self.style = style
-        self._size_pt = width_pt, body_pt + head_pt
-        size_in = (width_pt / 72, (body_pt + head_pt) / 72)
-        self.figure = Figure(figsize=size_in, dpi=style.dpi, facecolor=style.page)
-        FigureCanvasAgg(self.figure)
-        top_pt = body_pt + head_pt - style.margin_pt * 0.6
-        self.text("\n".join(title), style.margin_pt, top_pt, style.title_pt, bold=True, spacing=_TITLE_LINE)
-        self.text(
-            "\n".join(lines), style.margin_pt, top_pt - title_pt, style.label_pt, colour=style.faint, spacing=_LINE
-        )
+    paint: Callable[[Axes], AxesImage | None]
+    height: Callable[[float], float]
+    finish: Callable[[Axes], None] = lambda _: None
+    title: str = ""
+    title_ems: float = 0.7
+    box_aspect: float | None = None
 
-    def text(
-        self,
-        text: str,
-        left_pt: float,
-        top_pt: float,
-        size_pt: float,
-        *,
-        bold: bool = False,
-        colour: str | None = None,
-        font: str | None = None,
-        align: str = "left",
-        spacing: float = _LINE,
-    ) -> None:
-        """Write lines whose upper left corner is given."""
-        width_pt, height_pt = self._size_pt
-        self.figure.text(
-            left_pt / width_pt,
-            top_pt / height_pt,
-            text,
-            color=colour or self.style.ink,
-            fontsize=size_pt,
-            fontweight="bold" if bold else "normal",
-            family=font or self.style.font,
-            linespacing=spacing / 1.2,  # Matplotlib's lines are a fifth higher than their letters
-            ha=align,
-            va="top",
-            parse_math=False,  # a file's name may hold a dollar sign
-        )
-
-    def caption(self, box: PageBox, text: str, *, above_pt: float = 0.0) -> None:
-        """Write a line at the top of a box, or so far above it, in its middle."""
-        if text:
-            left_pt, top_pt = box.left + box.width / 2, box.bottom + (box.height + above_pt)
-            self.text(text, left_pt, top_pt, self.style.label_pt, colour=self.style.faint, align="center")
-
-    def axes(self, box: PageBox, *, title: str = "", x: str = "", y: str = "") -> Axes:
-        """Return new axes in the colours and letters of the style."""
-        width_pt, height_pt = self._size_pt
-        style = self.style
-        axes = self.figure.add_axes(
-            (box.left / width_pt, box.bottom / height_pt, box.width / width_pt, box.height / height_pt)
-        )
-        axes.set_facecolor(style.page)
-        axes.tick_params(
-            colors=style.faint,
-            labelsize=style.tick_pt,
-            labelfontfamily=style.font,
-            width=0.8 * style.line_pt,
-            length=3.5 * style.line_pt,
-        )
-        for spine in axes.spines.values():
-            spine.set_color(style.faint)
-            spine.set_linewidth(0.8 * style.line_pt)
-        label: dict[str, Any] = {
-            "color": style.faint,
-            "fontsize": style.label_pt,
-            "family": style.font,
-            "parse_math": False,
-        }
-        axes.set_xlabel(x, **label)
-        axes.set_ylabel(y, **label)
-        if title:
-            axes.set_title(title, pad=0.6 * style.em_pt, **label)
-        return axes
+    def draw_on(self, axes: Axes, style: Style) -> None:
+        """Draw into axes of a figure of somebody else."""
+        with style.applied():
+            self.paint(axes)
+            axes.apply_aspect()  # so that names are placed where they are drawn
+            self.finish(axes)
 
 
-def lay_out(
-    style: Style,
-    heading: Heading,
-    panels: Sequence[Callable[[float], float]],
-    *,
-    width_pt: float,
-    side_pt: float,
-    below_pt: float,
-    side_tall_pt: float = 0.0,
-) -> tuple[FigurePage, list[PageBox], PageBox]:
-    """Return a page, the boxes of its pictures and that of their colour bar and list.
+def compose(
+    canvas: Canvas, heading: Heading, panels: Sequence[Panel], *, width_pt: float = 720.0, stacked: bool = False
+) -> Figure:
+    """Return a page; Matplotlib's constrained layout places the pictures.
 
-    On a wide page, the pictures are beside each other, with the rest on their right. On a narrow one, all parts are
-    below each other.
+    On a wide page, the pictures are beside each other, with colour bar and list on their right. On a narrow one, all
+    parts are below each other.
 
     Parameters
     ----------
-    style : Style
+    canvas : Canvas
     heading : Heading
-    panels : sequence of callable
-        Functions that return the height of a picture from its width, both in points.
+    panels : sequence of Panel
     width_pt : float
         Width of the page if the style has none.
-    side_pt : float
-        Width of the rest if it is beside the pictures.
-    below_pt : float
-        Height of the rest if it is below the pictures.
-    side_tall_pt : float
-        Minimum height of the rest if it is beside the pictures.
+    stacked : bool
+        Place pictures below each other on a wide page, too.
     """
+    style, em_pt, rows = canvas.style, canvas.style.em_pt, canvas.rows()
     width_pt = width_pt if style.width_pt is None else style.width_pt
-    gap_pt, margin_pt = _GAP_EMS * style.em_pt, min(style.margin_pt, style.em_pt)
-    if style.is_wide(width_pt):
-        side_pt = max(side_pt, style.side_pt) if side_pt else 0.0
-        each_pt = (width_pt - side_pt - 2 * margin_pt - gap_pt * (len(panels) - 1)) / len(panels)
-        tall_pt = max(side_tall_pt, *(panel(each_pt) for panel in panels))
-        page = FigurePage(
-            style,
-            heading,
-            width_pt=width_pt,
-            body_pt=tall_pt + margin_pt,
-            heading_pt=width_pt - side_pt - style.margin_pt - margin_pt,
-        )
-        boxes = [
-            PageBox(margin_pt + number * (each_pt + gap_pt), margin_pt, each_pt, tall_pt)
-            for number in range(len(panels))
-        ]
-        return page, boxes, PageBox(width_pt - side_pt, margin_pt, side_pt - margin_pt, tall_pt)
-    each_pt = width_pt - 2 * margin_pt
-    heights = [panel(each_pt) for panel in panels]
-    body_pt = sum(heights) + gap_pt * (len(panels) - 1) + below_pt + margin_pt
-    page = FigurePage(style, heading, width_pt=width_pt, body_pt=body_pt, heading_pt=width_pt - 2 * style.margin_pt)
-    boxes, top_pt = [], body_pt
-    for height_pt in heights:
-        boxes.append(PageBox(margin_pt, top_pt - height_pt, each_pt, height_pt))
-        top_pt -= height_pt + gap_pt
-    return page, boxes, PageBox(margin_pt, margin_pt, each_pt, below_pt)
+    wide, margin_pt = width_pt >= _WIDE_EMS * em_pt, min(style.margin_pt, em_pt)
+    columns = len(panels) if wide and not stacked else 1
+    with style.applied():
+        figure = Figure(layout="constrained")
+        FigureCanvasAgg(figure)
+        pictures: list[Axes] = list(figure.subplots(len(panels) // columns, columns, squeeze=False).flat)
+        shown = [panel.paint(axes) for panel, axes in zip(panels, pictures, strict=True)]
+        raster = next((each for each in reversed(shown) if each is not None), None)
+        list_pt, beside_pt, below_pt = _ROW * style.list_pt, 0.0, 0.0
+        if raster is not None and wide:
+            widest_pt = max((text_width_pt(row, style.list_pt, MONOSPACE) for row in rows), default=0.0)
+            beside_pt = max(widest_pt + 3 * em_pt, 7 * em_pt, style.side_pt)
+        elif raster is not None:
+            below_pt = 6 * em_pt + list_pt * min(len(rows), _MAX_ROWS)
+        each_pt = (width_pt - beside_pt - 2 * margin_pt) / columns - _ACROSS_EMS * em_pt
+        heights_pt = [panel.height(each_pt) + _UP_EMS * em_pt for panel in panels]
+        body_pt = max(heights_pt) if columns > 1 else sum(heights_pt)
+        if beside_pt:  # There is room for the colour bar and some reflectors beside pictures of any height.
+            lying_pt = 6.3 * em_pt + list_pt * min(len(rows), _MIN_ROWS)
+            body_pt = max(body_pt, lying_pt if rows else _LABEL_EMS / _SHARE_ALONE * em_pt + 1.0)
+        lines, head_pt = _lines(style, heading, width_pt - beside_pt - style.margin_pt - margin_pt)
+        size_pt = width_pt, head_pt + body_pt + below_pt + margin_pt
+        figure.set_size_inches(size_pt[0] / 72, size_pt[1] / 72)
+        for top_pt, options in lines:
+            _write(figure, style.margin_pt, size_pt[1] - top_pt, **options)
+        _place(figure, pictures, panels, heights_pt, (margin_pt, margin_pt + below_pt, width_pt - beside_pt, body_pt))
+        if raster is not None:
+            left_pt, tall_pt = (width_pt - beside_pt, body_pt) if wide else (margin_pt, below_pt)
+            _explain(figure, style, raster, rows, (left_pt, margin_pt, width_pt - left_pt - margin_pt, tall_pt))
+        for panel, axes in zip(panels, pictures, strict=True):
+            panel.finish(axes)
+    return figure
+
+
+def _place(
+    figure: Figure,
+    pictures: Sequence[Axes],
+    panels: Sequence[Panel],
+    heights_pt: Sequence[float],
+    box_pt: tuple[float, float, float, float],
+) -> None:
+    """Place the pictures in a box, which is left, bottom, right and height, once and for all."""
+    width_pt, height_pt = 72 * figure.get_size_inches()
+    grid: Any = pictures[0].get_gridspec()
+    if grid.ncols == 1:
+        grid.set_height_ratios(heights_pt)
+    pad_pt = max(panel.title_ems for panel in panels) * mpl.rcParams["axes.labelsize"]
+    for panel, axes in zip(panels, pictures, strict=True):
+        axes.set_title(panel.title, pad=pad_pt)
+        axes.set_box_aspect(panel.box_aspect)
+        axes.set_anchor("N")
+    left_pt, bottom_pt, right_pt, tall_pt = box_pt
+    engine: Any = figure.get_layout_engine()
+    rect = (left_pt / width_pt, bottom_pt / height_pt, (right_pt - 2 * left_pt) / width_pt, tall_pt / height_pt)
+    engine.set(rect=rect, w_pad=0.02, h_pad=0.02, wspace=0.03, hspace=0.03)
+    engine.execute(figure)
+    figure.set_layout_engine("none")
+
+
+def _explain(
+    figure: Figure,
+    style: Style,
+    raster: AxesImage,
+    rows: list[str],
+    box_pt: tuple[float, float, float, float],
+) -> None:
+    """Draw the colour bar into a box, which is left, bottom, width and height, and the list of reflectors below it."""
+    (left_pt, bottom_pt, width_pt, tall_pt), em_pt = box_pt, style.em_pt
+    bar_pt, top_pt = min(16 * em_pt, (0.45 if rows else _SHARE_ALONE) * tall_pt), bottom_pt + tall_pt
+    upright = bar_pt >= _LABEL_EMS * em_pt and width_pt < 30 * em_pt
+    if upright:
+        bar = (left_pt + em_pt, top_pt - bar_pt - 2 * em_pt, 1.3 * em_pt, bar_pt)
+    else:
+        bar = (left_pt + 0.1 * width_pt, top_pt - 2.2 * em_pt, 0.8 * width_pt, em_pt)
+    across_pt, up_pt = 72 * figure.get_size_inches()
+    axes = figure.add_axes((bar[0] / across_pt, bar[1] / up_pt, bar[2] / across_pt, bar[3] / up_pt))
+    orientation = "vertical" if upright else "horizontal"
+    figure.colorbar(raster, cax=axes, orientation=orientation, label="dB re strongest")
+    for solid in axes.collections:
+        solid.set_rasterized(True)  # hundreds of colours are one picture in a file of vectors
+    top_pt = bar[1] - (2.0 if upright else 3.6) * em_pt
+    fitting = int((top_pt - bottom_pt) / (_ROW * style.list_pt))
+    if len(rows) > fitting:
+        rows = [*rows[: max(fitting - 1, 0)], f"and {len(rows) - max(fitting - 1, 1)} more"]
+    if rows and fitting >= min(2, len(rows)):
+        left_pt += em_pt if upright else 0
+        _write(figure, left_pt, top_pt, "\n".join(rows), size=style.list_pt, family=MONOSPACE, color=style.ink)
+
+
+def _lines(style: Style, heading: Heading, width_pt: float) -> tuple[list[tuple[float, dict[str, Any]]], float]:
+    """Return the texts of the heading with their distances from the top, and the height of all."""
+    title = _wrapped(heading.title, style.title_pt, style.font, width_pt, bold=True)
+    settings = _wrapped(heading.settings, style.label_pt, style.font, width_pt)
+    top_pt = 0.6 * style.margin_pt
+    below_pt = top_pt + _TITLE_LINE * style.title_pt * len(title)
+    bold = {"text": "\n".join(title), "size": style.title_pt, "weight": "bold", "color": style.ink}
+    plain = {"text": "\n".join(settings), "size": style.label_pt}
+    texts = [(top_pt, {**bold, "line": _TITLE_LINE}), (below_pt, plain)]
+    return texts, below_pt + _LINE * style.label_pt * len(settings) + 0.4 * style.em_pt
+
+
+def _write(figure: Figure, left_pt: float, top_pt: float, text: str, *, line: float = _LINE, **look: Any) -> None:
+    """Write lines whose upper left corner is given; Matplotlib's lines are a fifth higher than their letters."""
+    width_pt, height_pt = 72 * figure.get_size_inches()
+    figure.text(left_pt / width_pt, top_pt / height_pt, text, va="top", linespacing=line / 1.2, **look)
 
 
 def _wrapped(parts: Sequence[str], size_pt: float, font: str, width_pt: float, *, bold: bool = False) -> list[str]:

@@ -1,18 +1,14 @@
 """Resampling from directions and ranges to the pixels of a raster."""
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from ertis_numba.frames import Energyscape
-from ertis_numba.geometry import azimuth_columns, is_closed, reach_rad, spacing_rad, unit_vectors, unrolled_rad
+from ertis_numba.geometry import Fan, reach_rad, spacing_rad, unit_vectors
 
 __all__ = [
     "PIXELS",
     "centres",
-    "flattened",
     "join_ranges",
     "polar_raster",
     "sphere_raster",
@@ -23,7 +19,6 @@ __all__ = [
 PIXELS = 1000  # along the longer side of a raster
 _RADIAL_BINS = 500
 _NEAREST = 4  # directions that a place between them is interpolated from
-_SAME_RAD = 1e-9  # between directions that are one
 _THIN = 0.005  # of the range, to either side: ranges within it would be too thin to be seen
 
 
@@ -59,10 +54,10 @@ def thickened(
 
 def polar_raster(
     level_db: NDArray[np.float32],
-    azimuth_rad: NDArray[np.float64],
+    fan: Fan,
     range_m: NDArray[np.float64],
     *,
-    left_m: NDArray[np.float64],
+    right_m: NDArray[np.float64],
     ahead_m: NDArray[np.float64],
 ) -> NDArray[np.float32]:
     """Return levels at points of the horizontal plane: (row, column), NaN outside of the image.
@@ -71,24 +66,20 @@ def polar_raster(
 
     Parameters
     ----------
-    level_db : (direction, range) float32
-    azimuth_rad : (direction,) float64
-        Rising, within a turn.
+    level_db : (azimuth, range) float32
+        For the azimuths of ``fan``.
+    fan : Fan
     range_m : (range,) float64
         Rising.
-    left_m : (column,) float64
+    right_m : (column,) float64
     ahead_m : (row,) float64
     """
-    radius_m = np.hypot(left_m, ahead_m[:, None])
-    first_rad = azimuth_rad[0]
-    look_rad = first_rad + (np.arctan2(left_m, ahead_m[:, None]) - first_rad) % (2 * math.pi)
-    direction = np.interp(look_rad, azimuth_rad, np.arange(len(azimuth_rad)), right=np.nan)
-    column = np.interp(radius_m, range_m, np.arange(len(range_m)), left=np.nan, right=np.nan)
-    nearest_rad = azimuth_rad[np.rint(np.nan_to_num(direction)).astype(np.intp)]
-    gap = np.minimum(np.nan_to_num(direction).astype(np.intp), len(azimuth_rad) - 2)
-    near = np.abs(look_rad - nearest_rad) <= reach_rad(np.diff(azimuth_rad))[gap] + _SAME_RAD
-    inside = np.isfinite(direction) & np.isfinite(column) & near
-    raster = np.full(radius_m.shape, np.nan, dtype=np.float32)
+    ahead_m = ahead_m[:, None]
+    direction, near = fan.directions(right_m, ahead_m)
+    places = np.arange(len(range_m))
+    column = np.interp(np.hypot(right_m, ahead_m), range_m, places, left=np.nan, right=np.nan)
+    inside = near & np.isfinite(column)
+    raster = np.full(inside.shape, np.nan, dtype=np.float32)
     raster[inside] = _bilinear(level_db, direction[inside], column[inside])
     return raster
 
@@ -176,20 +167,3 @@ def _around(
     gaps_rad = np.full(max(1, len(directions) - 1), spacing_rad(directions))
     weight[distance[:, 0] > reach_rad(gaps_rad)[0]] = np.nan
     return place.reshape(-1, nearest), weight.astype(np.float32)
-
-
-def flattened(image: Energyscape, level_db: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Return rising azimuths and their levels, (direction, range): the maximum over elevations.
-
-    Azimuths rise without a jump. For a full circle, the first azimuth is repeated at the end, 2π larger.
-    """
-    columns = azimuth_columns(image.azimuth_rad, image.elevation_rad)
-    highest_db = columns.strongest(level_db)
-    azimuth_rad = unrolled_rad(columns.azimuth_rad)
-    order = np.argsort(azimuth_rad, kind="stable")
-    azimuth_rad, highest_db = azimuth_rad[order], highest_db[order]
-    starts = np.flatnonzero(np.diff(azimuth_rad, prepend=-np.inf) > _SAME_RAD)
-    azimuth_rad, highest_db = azimuth_rad[starts], np.maximum.reduceat(highest_db, starts, axis=0)
-    if is_closed(azimuth_rad):
-        return np.append(azimuth_rad, azimuth_rad[0] + 2 * math.pi), np.concatenate([highest_db, highest_db[:1]])
-    return azimuth_rad, highest_db

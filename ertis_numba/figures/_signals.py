@@ -1,4 +1,4 @@
-"""Signals of the microphones: a trace of each, and a spectrogram."""
+"""Signals of the microphones over time, and their matched-filter output over range."""
 
 import math
 
@@ -15,65 +15,80 @@ from ertis_numba import checks
 from ertis_numba.errors import ArgumentError
 from ertis_numba.figures import _words
 from ertis_numba.figures._canvas import Canvas
-from ertis_numba.figures._hearing import MicrophoneTraces, signals
+from ertis_numba.figures._hearing import MicrophoneTraces, echoes, signals
+from ertis_numba.figures._page import Panel, compose
+from ertis_numba.figures._sampling import join_ranges
 from ertis_numba.frames import Measurement
 from ertis_numba.settings import Settings
 
-__all__ = ["chosen", "draw", "row_ticks", "spectrogram"]
+__all__ = ["draw", "draw_echoes", "spectrogram"]
 
-_LEFT_EMS, _RIGHT_EMS, _FLOOR_EMS, _ROOF_EMS = 4.6, 1.4, 4.0, 1.8
 _MAX_TRACES = 64
 _COLUMNS = 1200  # of a trace: the least and the greatest of each are drawn
 _MAX_SPECTRA = 600  # columns of a spectrogram: of the spectra in each the greatest is drawn
 _CHUNK = 2**20  # samples of spectra at a time, so that memory stays bounded
 _COMPRESSED = 10 ** (-40 / 20)  # of the loudest; below that, amplitudes are linear
 _LOUDEST = 0.999  # share of the samples that stay within their row
+_CURVE_EMS = 11.0
+_MAX_PLACES = 1000
 
 
 def draw(canvas: Canvas, measurement: Measurement, *, microphone: int | None) -> Figure:
     """Draw the traces of all microphones or of one, and the mean of their spectrograms."""
     settings, em_pt = measurement.settings, canvas.style.em_pt
-    heard = chosen(signals(measurement), microphone)
+    heard = _chosen(signals(measurement), microphone)
     step = -(-len(heard.values) // _MAX_TRACES)  # of a large array some, evenly spaced
     heard = MicrophoneTraces(heard.values[::step], heard.axis, heard.channels[::step])
     rows = len(heard.values)
-
-    def traces_pt(width_pt: float) -> float:
-        return min(0.75 * width_pt, (8 + 1.1 * rows) * em_pt) + (_FLOOR_EMS + _ROOF_EMS) * em_pt
-
-    def spectrogram_pt(width_pt: float) -> float:
-        return 0.62 * width_pt + (_FLOOR_EMS + _ROOF_EMS) * em_pt
-
     some_ms, all_ms = 1e3 * len(heard.axis) / settings.signal_rate_hz, 1e3 * settings.recording.duration_s
     some_in_words, all_in_words = _words.number(some_ms, 4), _words.number(all_ms, 4)
-    page, boxes, side = canvas.lay_out(
-        _words.of_measurement(
-            "Microphone signals",
-            settings,
-            measurement.stamp,
-            f"{_words.number(settings.signal_rate_hz / 1e3, 4)} kHz sample rate",
-            f"{all_in_words} ms" if some_ms > 0.999 * all_ms else f"the first {some_in_words} of {all_in_words} ms",
-            values=heard.values,
-        ),
-        [traces_pt, spectrogram_pt],
-        width_pt=1008.0,
+    heading = _words.of_measurement(
+        "Microphone signals",
+        settings,
+        measurement.stamp,
+        f"{_words.number(settings.signal_rate_hz / 1e3, 4)} kHz sample rate",
+        f"{all_in_words} ms" if some_ms > 0.999 * all_ms else f"the first {some_in_words} of {all_in_words} ms",
+        values=heard.values,
     )
-    inner = [
-        box.inset(left=_LEFT_EMS * em_pt, right=_RIGHT_EMS * em_pt, bottom=_FLOOR_EMS * em_pt, top=_ROOF_EMS * em_pt)
-        for box in boxes
-    ]
     loudest = float(np.quantile(np.abs(heard.values), _LOUDEST)) or 1.0
-    row = f"a row is ±{_words.number(loudest, 2)} of full scale, compressed"
-    page.caption(inner[0], row, above_pt=_ROOF_EMS * em_pt)
-    axes = page.axes(inner[0], x="time (ms)", y="microphone (channel)")
-    _traces(canvas, axes, heard, loudest)
     whose = f"mean of {rows} microphones" if rows > 1 else f"microphone {heard.channels[0]}"
-    page.caption(inner[1], f"spectrogram, {whose}", above_pt=_ROOF_EMS * em_pt)
-    axes = page.axes(inner[1], x="time (ms)", y="frequency (kHz)")
-    return canvas.side(page, side, _spectrogram(canvas, axes, heard, settings))
+    traces = Panel(
+        lambda axes: _traces(canvas, axes, heard, loudest),
+        lambda width_pt: min(0.84 * width_pt, (8 + 1.1 * rows) * em_pt),
+        lambda axes: _row_ticks(axes, heard.channels, em_pt=em_pt),
+        f"a row is ±{_words.number(loudest, 2)} of full scale, compressed",
+    )
+    spectra = Panel(
+        lambda axes: _spectrogram(canvas, axes, heard, settings),
+        lambda width_pt: 0.7 * width_pt,
+        title=f"spectrogram, {whose}",
+    )
+    return compose(canvas, heading, [traces, spectra], width_pt=1008.0)
 
 
-def chosen(heard: MicrophoneTraces, microphone: int | None) -> MicrophoneTraces:
+def draw_echoes(canvas: Canvas, measurement: Measurement, *, microphone: int | None) -> Figure:
+    """Draw the mean level over range, and below it a row for each microphone."""
+    em_pt, heard = canvas.style.em_pt, _chosen(echoes(measurement), microphone)
+    range_m, count = heard.axis, len(heard.values)
+    every = f" every {_words.number(1e3 * (range_m[1] - range_m[0]), 2)} mm" if len(range_m) > 1 else ""
+    axis = f"{_words.span(range_m)} m{every}"
+    title = "Matched-filter output"
+    heading = _words.of_measurement(title, measurement.settings, measurement.stamp, axis, values=heard.values)
+    # A mean is below the strongest, as microphones differ: both parts of the picture have the same 0 dB.
+    upper = Panel(
+        lambda axes: _curve(canvas, axes, heard),
+        lambda width_pt: _CURVE_EMS * em_pt if count > 1 else max(0.35 * width_pt, _CURVE_EMS * em_pt),
+        title=f"mean of {count} microphones, and each of them" if count > 1 else f"microphone {heard.channels[0]}",
+    )
+    lower = Panel(
+        lambda axes: _rows(canvas, axes, heard),
+        lambda _: min(30.0, 8 + 0.8 * count) * em_pt,
+        lambda axes: _row_ticks(axes, heard.channels, em_pt=em_pt),
+    )
+    return compose(canvas, heading, [upper, lower][: 1 + (count > 1)], stacked=True)
+
+
+def _chosen(heard: MicrophoneTraces, microphone: int | None) -> MicrophoneTraces:
     """Return the traces of one microphone, or of all.
 
     Raises
@@ -92,8 +107,9 @@ def chosen(heard: MicrophoneTraces, microphone: int | None) -> MicrophoneTraces:
     return MicrophoneTraces(heard.values[place], heard.axis, heard.channels[place])
 
 
-def row_ticks(axes: Axes, channels: NDArray[np.int64], *, height_pt: float, em_pt: float) -> None:
+def _row_ticks(axes: Axes, channels: NDArray[np.int64], *, em_pt: float) -> None:
     """Label the rows 0, 1, … of an axis with their channels, as many as fit."""
+    height_pt = axes.bbox.height * 72 / axes.figure.dpi
     step = max(1, math.ceil(len(channels) * 1.6 * em_pt / height_pt))
     step = next(nice for nice in (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024) if nice >= step)
     places = np.arange(0, len(channels), step)
@@ -155,8 +171,8 @@ def _traces(canvas: Canvas, axes: Axes, heard: MicrophoneTraces, loudest: float)
     axes.add_collection(lines, autolim=False)
     axes.set_xlim(0.0, heard.axis[-1] * 1e3)
     axes.set_ylim(len(values) - 0.4, -0.6)
-    height_pt = axes.bbox.height * 72 / axes.figure.dpi
-    row_ticks(axes, heard.channels, height_pt=height_pt, em_pt=canvas.style.em_pt)
+    axes.set_xlabel("time (ms)")
+    axes.set_ylabel("microphone (channel)")
 
 
 def _ends(
@@ -179,5 +195,39 @@ def _spectrogram(canvas: Canvas, axes: Axes, heard: MicrophoneTraces, settings: 
     )
     shown = canvas.show(axes, canvas.level_db(np.sqrt(power)), extent=extent)
     axes.set_xlim(0.0, heard.axis[-1] * 1e3)
+    axes.set_xlabel("time (ms)")
+    axes.set_ylabel("frequency (kHz)")
     canvas.grid(axes)
+    return shown
+
+
+def _curve(canvas: Canvas, axes: Axes, heard: MicrophoneTraces) -> None:
+    """Draw the mean power over range, below the strongest of all microphones."""
+    mean = np.sqrt(np.mean(np.square(heard.values, dtype=np.float64), axis=0))
+    strongest = float(heard.values.max(initial=0.0)) or 1.0
+    floor = strongest * 10 ** (-canvas.dynamic_range_db / 20)
+    level_db = 20 * np.log10(np.maximum(mean, floor) / strongest)
+    axes.plot(heard.axis, level_db, linewidth=0.7 * canvas.style.line_pt, rasterized=True)
+    axes.set_ylim(-canvas.dynamic_range_db, 3.0)
+    spare_m = 0.0 if len(heard.axis) > 1 else 0.1
+    axes.set_xlim(float(heard.axis[0]) - spare_m, float(heard.axis[-1]) + spare_m)
+    canvas.grid(axes)
+    axes.set_ylabel("dB re strongest")
+    if len(heard.values) > 1:
+        axes.tick_params(labelbottom=False)
+    else:
+        axes.set_xlabel("range (m)")
+
+
+def _rows(canvas: Canvas, axes: Axes, heard: MicrophoneTraces) -> AxesImage:
+    """Draw a row for each microphone, the first on top."""
+    range_m, level_db = join_ranges(heard.axis, canvas.level_db(heard.values), largest=_MAX_PLACES)
+    half_m = float(range_m[-1] - range_m[0]) / max(1, 2 * (len(range_m) - 1)) or 0.05
+    rows = len(level_db)
+    extent = (float(range_m[0]) - half_m, float(range_m[-1]) + half_m, rows - 0.5, -0.5)
+    shown = canvas.show(axes, level_db[::-1], extent=extent)
+    spare_m = 0.0 if len(heard.axis) > 1 else 0.1
+    axes.set_xlim(float(heard.axis[0]) - spare_m, float(heard.axis[-1]) + spare_m)
+    axes.set_xlabel("range (m)")
+    axes.set_ylabel("microphone (channel)")
     return shown

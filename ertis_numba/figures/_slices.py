@@ -1,9 +1,9 @@
 """Cuts through an image: a level plane and an upright one, in metres of the sensor frame."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from numpy.typing import NDArray
@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from ertis_numba.errors import ArgumentError
 from ertis_numba.figures import _words
 from ertis_numba.figures._canvas import Canvas
-from ertis_numba.figures._page import FigurePage, PageBox
+from ertis_numba.figures._page import Panel, compose
 from ertis_numba.figures._sampling import centres, join_ranges, thickened, volume_raster
+from ertis_numba.figures.style import minus
 from ertis_numba.frames import Energyscape, Peak
 from ertis_numba.geometry import unit_vectors
 
@@ -20,7 +21,6 @@ __all__ = ["draw"]
 
 _PIXELS = 500  # along the longer side
 _NEAR_M = 0.05  # of a plane, or a fiftieth of the range: reflectors that are ringed in it
-_LEFT_EMS, _RIGHT_EMS, _FLOOR_EMS, _ROOF_EMS = 4.6, 1.4, 4.0, 1.8
 _MAX_RATIO = 1.1
 
 
@@ -44,11 +44,8 @@ def draw(canvas: Canvas, image: Energyscape, *, height_m: float, left_m: float |
     rasters = [cut.sample(level_db, image) for cut in cuts]
     drawn = tuple(peak for peak in canvas.peaks if any(cut.place(peak) for cut in cuts))
     canvas = replace(canvas, peaks=drawn)  # the list has the reflectors in the planes only
-    page, boxes, side = canvas.lay_out(
-        _words.of_image(image), [cut.height_at(canvas) for cut in cuts], width_pt=720.0 if len(cuts) == 1 else 1008.0
-    )
-    shown = [cut.draw_into(canvas, page, box, raster) for cut, box, raster in zip(cuts, boxes, rasters, strict=True)]
-    return canvas.side(page, side, shown[0])
+    panels = [cut.panel(canvas, raster) for cut, raster in zip(cuts, rasters, strict=True)]
+    return compose(canvas, _words.of_image(image), panels, width_pt=720.0 if len(cuts) == 1 else 1008.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,32 +95,23 @@ class _Cut:
             )
         return raster
 
-    def height_at(self, canvas: Canvas) -> Callable[[float], float]:
-        """Return the function from the width of the picture to its height, both with labels, in points."""
-        em_pt, ratio = canvas.style.em_pt, min(_MAX_RATIO, self._ratio)
-        return lambda width_pt: (width_pt - (_LEFT_EMS + _RIGHT_EMS) * em_pt) * ratio + (_FLOOR_EMS + _ROOF_EMS) * em_pt
-
-    @property
-    def _ratio(self) -> float:
+    def panel(self, canvas: Canvas, raster: NDArray[np.float32]) -> Panel:
+        """Return the picture of the plane and the reflectors in it."""
         left, right, bottom, top = self.extent_m
-        return (top - bottom) / abs(right - left)
-
-    def draw_into(self, canvas: Canvas, page: FigurePage, box: PageBox, raster: NDArray[np.float32]) -> AxesImage:
-        """Draw the plane and the reflectors in it."""
-        em_pt = canvas.style.em_pt
-        inner = box.inset(
-            left=_LEFT_EMS * em_pt, right=_RIGHT_EMS * em_pt, bottom=_FLOOR_EMS * em_pt, top=_ROOF_EMS * em_pt
-        ).fitted(self._ratio)
-        page.caption(inner, self.title, above_pt=_ROOF_EMS * em_pt)
         names = "x, forward (m)", "y, left (m)", "z, up (m)"
-        axes = page.axes(inner, x=names[self.across], y=names[self.up])
-        shown = canvas.show(axes, raster, extent=self.extent_m)
-        axes.set_xlim(*self.extent_m[:2])
-        axes.set_ylim(*self.extent_m[2:])
-        axes.locator_params(min_n_ticks=1)  # more would run into each other in a narrow picture
-        canvas.grid(axes)
-        canvas.mark_peaks(axes, self.place)
-        return shown
+
+        def paint(axes: Axes) -> AxesImage:
+            axes.set_xlabel(names[self.across])
+            axes.set_ylabel(names[self.up])
+            shown = canvas.show(axes, raster, extent=self.extent_m, aspect="equal")
+            axes.locator_params(min_n_ticks=1)  # more would run into each other in a narrow picture
+            canvas.grid(axes)
+            return shown
+
+        ratio = min(_MAX_RATIO, (top - bottom) / abs(right - left))
+        return Panel(
+            paint, lambda width_pt: ratio * width_pt, lambda axes: canvas.mark_peaks(axes, self.place), self.title
+        )
 
     def place(self, peak: Peak) -> tuple[float, float] | None:
         """Return where a reflector is in the picture; None if it is not in the plane."""
@@ -136,13 +124,13 @@ class _Cut:
 
 def _level(image: Energyscape, height_m: float) -> _Cut:
     spans = _spans(image)
-    title = f"level plane at z = {_words.minus(f'{height_m:g}')} m"
+    title = f"level plane at z = {minus(f'{height_m:g}')} m"
     return _Cut("height_m", height_m, 1, 0, 2, title, (spans[1][1], spans[1][0], *spans[0]))
 
 
 def _upright(image: Energyscape, left_m: float) -> _Cut:
     spans = _spans(image)
-    title = f"upright plane at y = {_words.minus(f'{left_m:g}')} m"
+    title = f"upright plane at y = {minus(f'{left_m:g}')} m"
     return _Cut("left_m", left_m, 0, 2, 1, title, (*spans[0], *spans[2]))
 
 

@@ -6,16 +6,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.figures.style import angle, minus
 from ertis_numba.frames import Energyscape, Stamp
 from ertis_numba.geometry import microphones
 from ertis_numba.settings import Settings
 
 __all__ = [
     "Heading",
-    "angle",
     "highest_over",
     "khz",
-    "minus",
     "number",
     "of_array",
     "of_image",
@@ -137,14 +136,3 @@ def span(values: NDArray[np.float64]) -> str:
         if low != high:
             return f"{low}–{high}"
     return low
-
-
-def angle(degrees: float) -> str:
-    """Return an angle with its sign, as the axes write it."""
-    text = minus(f"{degrees:+.1f}".removesuffix(".0"))
-    return "0°" if text in {"+0", "−0"} else f"{text}°"
-
-
-def minus(text: str) -> str:
-    """Return a number with the sign that printers use."""
-    return text.replace("-", "−")

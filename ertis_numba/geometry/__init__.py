@@ -20,6 +20,7 @@ from ertis_numba.geometry.layouts import (
 from ertis_numba.geometry.mountings import mounting
 from ertis_numba.geometry.neighbours import azimuth_columns, spacing_rad
 from ertis_numba.geometry.received import received_settings
+from ertis_numba.geometry.sector import Fan, plan_m, round_step
 from ertis_numba.geometry.weights import array_weights, effective_count
 
 __all__ = [
@@ -27,6 +28,7 @@ __all__ = [
     "FAR",
     "MAX_DIRECTIONS",
     "PAPER_GRIDS",
+    "Fan",
     "Grid",
     "Layout",
     "array_weights",
@@ -41,8 +43,10 @@ __all__ = [
     "load_layout",
     "microphones",
     "mounting",
+    "plan_m",
     "reach_rad",
     "received_settings",
+    "round_step",
     "self_contained",
     "spacing_rad",
     "spherical_delays",

@@ -16,8 +16,7 @@ from ertis_numba.angles import DegreesFromRadians
 from ertis_numba.atomic_files import check_target
 from ertis_numba.errors import ArgumentError, DamagedError
 from ertis_numba.frames import Energyscape
-from ertis_numba.geometry import mounting as mounted
-from ertis_numba.geometry import self_contained
+from ertis_numba.geometry import mounting as mounted, self_contained
 from ertis_numba.storage._mounting import read_mounting, write_mounting
 from ertis_numba.storage._reader import FileReader
 from ertis_numba.storage._rows import RowReader

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement
-from ertis_numba.geometry import Layout, microphones, self_contained, storable
-from ertis_numba.geometry import mounting as mounted
+from ertis_numba.geometry import Layout, microphones, mounting as mounted, self_contained, storable
 from ertis_numba.sample_format import SampleFormat, sample_format
 from ertis_numba.settings import Air, Settings
 from ertis_numba.storage._gaps import MissingNumbers

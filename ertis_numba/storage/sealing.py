@@ -20,8 +20,7 @@ import numpy as np
 from ertis_numba.atomic_files import fsync, temporary_path
 from ertis_numba.errors import DataError
 from ertis_numba.frames import Measurement
-from ertis_numba.geometry import mounting as mounted
-from ertis_numba.geometry import storable
+from ertis_numba.geometry import mounting as mounted, storable
 from ertis_numba.journal import LOST, SUFFIX, Journal, JournalSensor, SealingResult
 from ertis_numba.storage._journal_rows import JournalRows
 from ertis_numba.storage._reader import sensor_names

@@ -3,33 +3,31 @@
 import io
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import Final
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.transforms import IdentityTransform
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from matplotlib.transforms import BboxBase
+from ertis_numba.figures.sector_grid import draw_grid, part_names
+from ertis_numba.figures.style import THEMES, minus
+from ertis_numba.geometry import Fan, plan_m
 
-__all__ = ["PAGE", "SIDE_PX", "Ink", "Place", "draw_axes", "draw_text"]
+__all__ = ["PAGE", "SIDE_PX", "STYLE", "Ink", "Place", "draw_axes", "draw_text"]
 
-PAGE: Final = (11, 13, 18)
+STYLE: Final = THEMES["dark"]
+"""Style of the pictures."""
+PAGE: Final = tuple(bytes.fromhex(STYLE.page[1:]))
 """Background colour: red, green, blue."""
 SIDE_PX: Final = 44
 """Margin at the sides of the sector, for labels."""
 
-_FAINT: Final = "#9aa0b0"
 _DPI: Final = 100
-_LETTERS: Final[dict[str, Any]] = {"color": _FAINT, "fontsize": 8.5}
-_LINE: Final[dict[str, Any]] = {"color": _FAINT, "alpha": 0.4, "linewidth": 0.7}
 _TEXT_PT: Final = 11.0
 _ROOF_PX, _FLOOR_PX = 26, 66  # Margins above and below the sector: labels of rays; labels of rings, and the colour bar.
 _SCALE_PX: Final = 10  # Height of the colour bar.
 _RING_PX: Final = 36  # Minimum distance of rings, with room for their labels.
-_APART_PX: Final = 2  # Minimum distance of labels.
 _MIN_RATIO, _MAX_RATIO = 0.25, 1.0  # Height of the sector relative to its width.
 
 
@@ -56,13 +54,9 @@ class Place:
     box_px: tuple[int, int, int, int]
 
     @classmethod
-    def of(cls, azimuth_rad: NDArray[np.float64], range_m: tuple[float, float], width_px: int) -> "Place":
+    def of(cls, fan: Fan, width_px: int) -> "Place":
         """Return the position of a sector in a picture of a given width."""
-        arc = np.linspace(azimuth_rad[0], azimuth_rad[-1], 361)
-        right_m = -np.outer(range_m, np.sin(arc))
-        ahead_m = np.outer(range_m, np.cos(arc))
-        west, east = float(right_m.min()), float(right_m.max())
-        low, high = float(ahead_m.min()), float(ahead_m.max())
+        west, east, low, high = fan.extent_m(fan.range_m[0])
         inner_px = width_px - 2 * SIDE_PX
         scale_px_m = min(inner_px / (east - west), inner_px * _MAX_RATIO / (high - low))
         tall_px = max(inner_px * _MIN_RATIO, (high - low) * scale_px_m)
@@ -89,9 +83,8 @@ class Place:
 
     def pixel_of(self, azimuth_deg: float, range_m: float) -> tuple[float, float]:
         """Return the pixel of a position, from the upper left corner: x to the right, y down."""
-        (x, y), scale = self.sensor_px, self.scale_px_m
-        azimuth_rad = math.radians(azimuth_deg)
-        return x - range_m * math.sin(azimuth_rad) * scale, y - range_m * math.cos(azimuth_rad) * scale
+        right_m, ahead_m = plan_m(math.radians(azimuth_deg), range_m)
+        return self.sensor_px[0] + right_m * self.scale_px_m, self.sensor_px[1] - ahead_m * self.scale_px_m
 
     def place_of(self, x_px: float, y_px: float) -> tuple[float, float]:
         """Return azimuth in degrees and range in metres of a pixel; the inverse of `pixel_of`."""
@@ -130,84 +123,40 @@ class Ink:
         flat[self.places] = (under + self.colours * self.cover + 0.5).astype(np.uint8)
 
 
-def draw_axes(place: Place, fan_rad: NDArray[np.float64], range_m: tuple[float, float], dynamic_range_db: float) -> Ink:
-    """Draw rings in metres, rays in degrees, the sensor, and the numbers of the colour bar.
-
-    Parameters
-    ----------
-    place : Place
-    fan_rad : (azimuth,) float64
-        Rising.
-    range_m : (first, last)
-    dynamic_range_db : float
-    """
-    figure, axes = _sheet(place)
-    first_deg, last_deg = math.degrees(fan_rad[0]), math.degrees(fan_rad[-1])
-    _draw_rings(axes, place, first_deg, last_deg, range_m)
-    _draw_rays(axes, place, first_deg, last_deg, range_m)
-    x, y = place.sensor_px
+@STYLE.applied()
+def draw_axes(place: Place, fan: Fan, dynamic_range_db: float) -> Ink:
+    """Draw rings in metres, rays in degrees, the sensor, and the numbers of the colour bar."""
+    (x, y), scale = place.sensor_px, place.scale_px_m
+    figure = _sheet(place)
+    axes = figure.add_axes((0, 0, 1, 1), frameon=False)
+    axes.set_xlim(-x / scale, (place.width_px - x) / scale)
+    axes.set_ylim((y - place.height_px) / scale, y / scale)
+    axes.set_axis_off()
+    (low_m, high_m), half_m = fan.range_m, 0.5 / scale
+    rings = max(1, min(6, int((high_m - low_m) * scale / _RING_PX)))
+    draw_grid(axes, STYLE, fan, first_m=low_m, largest=rings, spare_m=half_m)
+    part_names(axes)
     if 0 <= x <= place.width_px and 0 <= y <= place.height_px - _FLOOR_PX + 1:
-        axes.plot(x, y, marker="^", markersize=8, color="#e8eaf0")
-    left, right, _, bottom = place.scale_px
+        axes.plot(0, 0, marker="^", markersize=8, color=STYLE.ink, scalex=False, scaley=False)
+    left, right, top, bottom = place.scale_px
+    pixels = IdentityTransform()  # From the lower left corner.
     for share in (0.0, 0.5, 1.0):
-        name = f"{-dynamic_range_db * (1 - share):g}".replace("-", "−").replace("−0", "0")
-        axes.text(left + share * (right - left), bottom + 3, name, ha="center", va="top", **_LETTERS)
-    axes.text(right + 14, bottom - _SCALE_PX / 2, "dB", ha="left", va="center", **_LETTERS)
+        name, name_px = minus(f"{-dynamic_range_db * (1 - share) + 0.0:g}"), left + share * (right - left)
+        axes.text(name_px, place.height_px - bottom - 3, name, ha="center", va="top", transform=pixels)
+    axes.text(right + 14, place.height_px - (top + bottom) / 2, "dB", va="center", transform=pixels)
     return _ink(figure)
 
 
-def _draw_rings(axes: Axes, place: Place, first_deg: float, last_deg: float, range_m: tuple[float, float]) -> None:
-    """Draw rings with their labels, except overlapping ones: in a narrow window the labels have many digits."""
-    arc_deg = np.linspace(first_deg, last_deg, 181)
-    named_deg = first_deg if last_deg - first_deg < 350 else -135  # No ray has its label there.
-    level = abs(first_deg + 90) < 20  # The labels of rings then stand below the edge, otherwise beside it.
-    (low_m, high_m), half_m = range_m, 0.5 / place.scale_px_m
-    rings = max(1, min(6, int((high_m - low_m) * place.scale_px_m / _RING_PX)))
-    named: list[BboxBase] = []
-    for ring_m in MaxNLocator(nbins=rings, steps=[1, 2, 5, 10]).tick_values(low_m, high_m):
-        if not low_m - half_m <= ring_m <= high_m + half_m or ring_m <= 0:
-            continue
-        axes.plot(*np.array([place.pixel_of(at, ring_m) for at in arc_deg]).T, **_LINE)
-        x, y = place.pixel_of(named_deg, ring_m)
-        at_px = (x, y + 5) if level else (x + 6, y + 4)
-        name = axes.text(*at_px, f"{ring_m:g} m", ha="center" if level else "left", va="top", **_LETTERS)
-        name.set_x(at_px[0] - max(0.0, name.get_window_extent().x1 - place.width_px))
-        box = name.get_window_extent().padded(_APART_PX)
-        if any(box.overlaps(other) for other in named):
-            name.remove()
-        else:
-            named.append(box)
-
-
-def _draw_rays(axes: Axes, place: Place, first_deg: float, last_deg: float, range_m: tuple[float, float]) -> None:
-    """Draw rays with their labels."""
-    step_deg = 15 if last_deg - first_deg < 100 else 30
-    first, last = math.ceil((first_deg - 1e-6) / step_deg), math.floor((last_deg + 1e-6) / step_deg)
-    for ray_deg in sorted({180 - (180 - number * step_deg) % 360 for number in range(first, last + 1)}):
-        axes.plot(*np.array([place.pixel_of(ray_deg, at_m) for at_m in range_m]).T, **_LINE)
-        x, y = place.pixel_of(ray_deg, range_m[1] + 4 / place.scale_px_m)
-        across = -math.sin(math.radians(ray_deg))
-        side = "center" if abs(across) < 0.3 else "left" if across > 0 else "right"
-        below = "top" if math.cos(math.radians(ray_deg)) < -0.3 else "bottom"
-        axes.text(x, y, f"{ray_deg:+d}°".replace("-", "−").replace("+0", "0"), ha=side, va=below, **_LETTERS)
-
-
+@STYLE.applied()
 def draw_text(place: Place, text: str) -> Ink:
     """Draw a text in the middle of an empty picture."""
-    figure, axes = _sheet(place)
-    at_px = place.width_px / 2, place.height_px / 2
-    axes.text(*at_px, text, color=_FAINT, fontsize=_TEXT_PT, ha="center", va="center", parse_math=False)
+    figure = _sheet(place)
+    figure.text(0.5, 0.5, text, fontsize=_TEXT_PT, ha="center", va="center")
     return _ink(figure)
 
 
-def _sheet(place: Place) -> tuple[Figure, Axes]:
-    """Return the drawing surface, in pixels from the upper left corner."""
-    figure = Figure(figsize=(place.width_px / _DPI, place.height_px / _DPI), dpi=_DPI)
-    axes = figure.add_axes((0, 0, 1, 1), frameon=False)
-    axes.set_xlim(0, place.width_px)
-    axes.set_ylim(place.height_px, 0)
-    axes.set_axis_off()
-    return figure, axes
+def _sheet(place: Place) -> Figure:
+    return Figure(figsize=(place.width_px / _DPI, place.height_px / _DPI), dpi=_DPI)
 
 
 def _ink(figure: Figure) -> Ink:

@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 import viser
 
 from ertis_numba.errors import NetworkError
+from ertis_numba.geometry import round_step
 from ertis_numba.viewer._choices import COLOURS, DYNAMIC_RANGE_DB, LOWEST_THRESHOLD_DB, MAX_DECAY_S, Choices
 from ertis_numba.viewer._origins import is_loopback, own_pages
 from ertis_numba.viewer._recordings import MAX_BYTES
 from ertis_numba.viewer._shapes import DrawnFrame
-from ertis_numba.viewer._space import Space, round_step
+from ertis_numba.viewer._space import Space
 
 if TYPE_CHECKING:
     from queue import SimpleQueue

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ertis_numba.analysis.levels import below_strongest_db
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Energyscape
-from ertis_numba.geometry import ALONE_RAD, azimuth_columns, is_closed, reach_rad, unrolled_rad
+from ertis_numba.geometry import Fan
 from ertis_numba.viewer._axes import PAGE, SIDE_PX, Ink, Place, draw_axes, draw_text
 
 __all__ = ["Polar", "PolarSampling", "cropped", "is_within"]
@@ -90,21 +90,10 @@ class Polar:
         if width_px < 4 * SIDE_PX:
             raise ArgumentError(f"width_px is {width_px}; give at least {4 * SIDE_PX}")
         self._dynamic_range_db = dynamic_range_db
-        self._columns = azimuth_columns(unrolled_rad(image.azimuth_rad), image.elevation_rad)
-        azimuth_rad = self._columns.azimuth_rad
-        self._range_m = float(image.range_m[0]), float(image.range_m[-1])
-        if self._range_m[1] <= 0:
+        if image.range_m[-1] <= 0:
             raise ArgumentError("the image ends at range 0; give one with ranges")
-        self._fan_rad = azimuth_rad
-        is_thin = azimuth_rad[-1] - azimuth_rad[0] < ALONE_RAD
-        if is_thin:  # Too thin to be visible.
-            middle = float(azimuth_rad.mean())
-            self._fan_rad = np.array([middle - ALONE_RAD, middle + ALONE_RAD])
-        self._is_closed = is_closed(azimuth_rad)
-        if self._is_closed:  # The gap between the last and the first direction is covered, too.
-            self._fan_rad = np.append(azimuth_rad, azimuth_rad[0] + 2 * math.pi)
-        self._reach_rad = np.array([math.inf]) if is_thin else reach_rad(np.diff(self._fan_rad))
-        self._place = Place.of(self._fan_rad, self._range_m, width_px)
+        self._fan = Fan.of(image.azimuth_rad, image.elevation_rad, image.range_m)
+        self._place = Place.of(self._fan, width_px)
         self._bins = self._joined_ranges(image.range_m)
         ends = np.append(self._bins[1:], len(image.range_m)) - 1
         self._bins_m = (image.range_m[self._bins] + image.range_m[ends]) / 2
@@ -131,8 +120,7 @@ class Polar:
     def levels(self, amplitude: NDArray[np.float32]) -> NDArray[np.uint8]:
         """Return the levels to draw: (azimuth, range) uint8, 255 for the strongest and 0 for none."""
         joined = np.maximum.reduceat(amplitude, self._bins, axis=1)
-        highest = self._columns.strongest(joined)
-        level_db = below_strongest_db(highest, self._dynamic_range_db)
+        level_db = below_strongest_db(self._fan.strongest(joined), self._dynamic_range_db)
         return np.asarray(np.rint(255 * (1 + level_db / self._dynamic_range_db)), dtype=np.uint8)
 
     def picture(self, levels: NDArray[np.uint8], table: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -160,14 +148,14 @@ class Polar:
     def empty(self, window_m: tuple[float, float] | None) -> NDArray[np.uint8]:
         """Return an empty picture with a note that the window contains no range: (row, column, 3) uint8."""
         made = np.full((*self.shape, 3), PAGE, dtype=np.uint8)
-        (first_m, last_m), (low_m, high_m) = window_m or (0.0, 0.0), self._range_m
+        (first_m, last_m), (low_m, high_m) = window_m or (0.0, 0.0), self._fan.range_m
         text = f"nothing from {first_m:g} to {last_m:g} m:\nthe image covers {low_m:.2f} to {high_m:.2f} m"
         draw_text(self._place, text).onto(made.reshape(-1, 3))
         return made
 
     @functools.cached_property
     def _axes(self) -> Ink:
-        return draw_axes(self._place, self._fan_rad, self._range_m, self._dynamic_range_db)
+        return draw_axes(self._place, self._fan, self._dynamic_range_db)
 
     def sector(self, levels: NDArray[np.uint8], table: NDArray[np.uint8], *, thin: int = 2) -> NDArray[np.uint8]:
         """Return the image alone, transparent outside: (row, column, 4) uint8, one pixel of ``thin``."""
@@ -192,30 +180,15 @@ class Polar:
         ----------
         right_m, ahead_m : (place,) float64
         """
-        radius_m = np.hypot(right_m, ahead_m)
-        azimuth_rad = np.arctan2(-right_m, ahead_m)
-        first_rad = self._fan_rad[0] - 1e-9
-        azimuth_rad = first_rad + (azimuth_rad - first_rad) % (2 * math.pi)
-        half_m = 0.5 / self._place.scale_px_m
-        inside = (radius_m >= self._range_m[0] - half_m) & (radius_m <= self._range_m[1] + half_m)
-        inside &= azimuth_rad <= self._fan_rad[-1] + 1e-9
-        gap = np.clip(np.searchsorted(self._fan_rad, azimuth_rad, side="right") - 1, 0, len(self._reach_rad) - 1)
-        away_rad = np.minimum(azimuth_rad - self._fan_rad[gap], self._fan_rad[gap + 1] - azimuth_rad)
-        inside &= away_rad <= self._reach_rad[gap]
-        n_azimuths, n_bins = len(self._columns.azimuth_rad), len(self._bins_m)
-        last = n_azimuths if self._is_closed else n_azimuths - 1
-        at = np.interp(azimuth_rad[inside], self._fan_rad, np.linspace(0, last, len(self._fan_rad)))
-        before = np.floor(at).astype(np.intp)
-        share = np.rint((at - before) * _SHARES).astype(np.uint16)
-        after = np.minimum(before + 1, last) % n_azimuths
-        before %= n_azimuths
-        bins = np.searchsorted((self._bins_m[1:] + self._bins_m[:-1]) / 2, radius_m[inside])
-        return PolarSampling(
-            np.flatnonzero(inside),
-            before * n_bins + bins,
-            after * n_bins + bins,
-            share,
-        )
+        radius_m, half_m = np.hypot(right_m, ahead_m), 0.5 / self._place.scale_px_m
+        first_m, last_m = self._fan.range_m
+        at, near = self._fan.directions(right_m, ahead_m)
+        inside = near & (radius_m >= first_m - half_m) & (radius_m <= last_m + half_m)
+        before = np.floor(at[inside]).astype(np.intp)
+        share = np.rint((at[inside] - before) * _SHARES).astype(np.uint16)
+        after = np.minimum(before + 1, len(self._fan.azimuth_rad) - 1)
+        bins, n_bins = np.searchsorted((self._bins_m[1:] + self._bins_m[:-1]) / 2, radius_m[inside]), len(self._bins_m)
+        return PolarSampling(np.flatnonzero(inside), before * n_bins + bins, after * n_bins + bins, share)
 
     def _look_of_picture(self) -> PolarSampling:
         """Return the interpolation for the pixels of the picture."""

@@ -6,9 +6,10 @@ from typing import Any, Final
 import numpy as np
 import viser
 
+from ertis_numba.geometry import round_step
 from ertis_numba.viewer._shapes import Dome, Drawn, DrawnFrame, Sector
 
-__all__ = ["Space", "round_step"]
+__all__ = ["Space"]
 
 _RINGS: Final = 7  # distances on the ground at most
 _GROUND: Final = 0.001  # by the range that is seen, that the ground lies below the sensors
@@ -118,13 +119,6 @@ class Space:
             if not self._stood or np.allclose(there_m, before_m, atol=_STILL * np.linalg.norm(before_m)):
                 camera.position, camera.look_at = position_m, look_at_m
         self._stood = True
-
-
-def round_step(length: float, largest: int) -> float:
-    """Return the smallest step of 1, 2 or 5 times a power of ten that divides a length into at most so many parts."""
-    smallest = length / largest * (1 - 1e-9)
-    power = 10.0 ** math.floor(math.log10(smallest))
-    return next(each * power for each in (1, 2, 5, 10) if each * power >= smallest)
 
 
 class _Nodes:

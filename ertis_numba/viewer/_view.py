@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING, Any, Final, Self
 
 from ertis_numba.errors import ArgumentError, ErtisError
 from ertis_numba.viewer._choices import Choices
-from ertis_numba.viewer._legend import with_legend
 from ertis_numba.viewer._origins import is_loopback
 from ertis_numba.viewer._page import ControlRequest, ViewerPage
 from ertis_numba.viewer._pause import Pause
 from ertis_numba.viewer._recordings import Recordings, ToBrowser, ToFile
 from ertis_numba.viewer._rows import FrameCounts, rows_of
-from ertis_numba.viewer._saving import picture_png, points_ply
+from ertis_numba.viewer._saving import picture_png, points_ply, with_legend
 from ertis_numba.viewer._scene import ViewedScene
 
 if TYPE_CHECKING:  # one brings HDF5, the other ZeroMQ

@@ -7,8 +7,7 @@ import os
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, Phase, event, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, Phase, event, given, settings, strategies as st
 
 from ertis_numba.analysis.detect import find_peaks
 from ertis_numba.errors import ArgumentError, DataError, DeviceError

@@ -7,8 +7,7 @@ acknowledgements and ledgers: `open_recording` reads the words of every measurem
 
 import json
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator
-from collections.abc import Set as AbstractSet
+from collections.abc import Iterable, Iterator, Set as AbstractSet
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final

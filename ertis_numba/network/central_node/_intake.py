@@ -6,8 +6,7 @@ from collections.abc import Callable, Iterable
 from typing import Final
 
 from ertis_numba.errors import ArgumentError
-from ertis_numba.journal import JournalEntry, JournalSensor
-from ertis_numba.journal import JournalGap as NotedGap
+from ertis_numba.journal import JournalEntry, JournalGap as NotedGap, JournalSensor
 from ertis_numba.network.central_node._acks import Acks
 from ertis_numba.network.central_node._admission import entry_in, require_room, require_same, source_in
 from ertis_numba.network.central_node._received_items import ReceivedItem, SensorSession, Stored, StoredDuplicate

@@ -1,8 +1,7 @@
 """Server socket of the central node with its authenticator."""
 
 from collections import Counter
-from collections.abc import Mapping
-from collections.abc import Set as AbstractSet
+from collections.abc import Mapping, Set as AbstractSet
 from contextlib import ExitStack, suppress
 from typing import Any, Final
 

@@ -29,8 +29,7 @@ place               arguments                                             result
 """
 
 import importlib
-from collections.abc import Callable
-from collections.abc import Set as AbstractSet
+from collections.abc import Callable, Set as AbstractSet
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any, Final, Literal

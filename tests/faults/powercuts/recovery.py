@@ -2,8 +2,7 @@
 
 import random
 import zlib
-from collections.abc import Callable
-from collections.abc import Set as AbstractSet
+from collections.abc import Callable, Set as AbstractSet
 from pathlib import Path
 
 from ertis_bench.network.diary import DiaryKey, Row

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from ertis_numba.errors import DataError
-from tests.faults.powercuts import log as logs
-from tests.faults.powercuts import scenarios
+from tests.faults.powercuts import log as logs, scenarios
 from tests.faults.powercuts.disk import Disk
 from tests.faults.powercuts.recovery import Found, recover_archive, recover_capture, recover_spool
 from tests.faults.powercuts.scenarios import AcknowledgedState, Setting, Trace

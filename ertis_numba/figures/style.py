@@ -1,15 +1,33 @@
 """Styles of figures: colours, letters and sizes, on a screen and in print."""
 
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Literal, TypedDict
+from typing import Any, Literal, TypedDict
 
+import matplotlib as mpl
+from cycler import cycler
 from matplotlib.font_manager import FontProperties
 from matplotlib.textpath import text_to_path
 
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError
 
-__all__ = ["COLUMNS_MM", "FONTS", "LINES", "MONOSPACE", "THEMES", "Style", "StyleOptions", "style_of", "text_width_pt"]
+__all__ = [
+    "COLUMNS_MM",
+    "FONTS",
+    "LINES",
+    "MONOSPACE",
+    "THEMES",
+    "Style",
+    "StyleOptions",
+    "angle",
+    "minus",
+    "parameters",
+    "style_of",
+    "text_width_pt",
+]
 
 COLUMNS_MM = {1: 85.0, 2: 170.0}
 """Width of a picture for print over so many columns of a page."""
@@ -19,7 +37,8 @@ LINES: tuple[str, ...] = ("-", "--", "-.", ":")  # which tell curves apart where
 
 _PT_PER_MM = 72 / 25.4
 _SLACK = 1.03  # letters are set to whole pixels on a screen
-_WIDE_EMS = 55.0
+_LOCK = threading.RLock()
+_SHADES = (0.6, 0.8, 0.45, 0.95)  # of the map of colours, for the second line on
 
 
 class StyleOptions(TypedDict, total=False):
@@ -76,13 +95,45 @@ class Style:
     width_pt: float | None = None
 
     @property
+    def rc(self) -> Any:
+        """Parameters of Matplotlib in which figures of this style are drawn."""
+        faint, line_pt = self.faint, self.line_pt
+        ticks = {"color": faint, "labelsize": self.tick_pt, "major.width": 0.8 * line_pt, "major.size": 3.5 * line_pt}
+        return {
+            **{f"{axis}tick.{name}": value for axis in "xy" for name, value in ticks.items()},
+            "figure.dpi": self.dpi,
+            "figure.facecolor": self.page,
+            "axes.facecolor": self.page,
+            "axes.edgecolor": faint,
+            "axes.linewidth": 0.8 * line_pt,
+            "axes.labelcolor": faint,
+            "axes.labelsize": self.label_pt,
+            "axes.titlecolor": faint,
+            "axes.titlesize": self.label_pt,
+            "axes.prop_cycle": cycler(color=[self.mark, *(mpl.colormaps[self.colours](at) for at in _SHADES)]),
+            "font.family": self.font,
+            "font.size": self.tick_pt,
+            "image.cmap": self.colours,
+            "legend.facecolor": self.page,
+            "legend.edgecolor": faint,
+            "legend.labelcolor": self.ink,
+            "legend.fontsize": self.tick_pt,
+            "legend.title_fontsize": self.tick_pt,
+            "lines.linewidth": line_pt,
+            "text.color": faint,
+            "text.parse_math": False,  # A file's name may hold a dollar sign.
+        }
+
+    @contextmanager
+    def applied(self) -> Iterator[None]:
+        """Draw in this style."""
+        with parameters(self.rc):
+            yield
+
+    @property
     def em_pt(self) -> float:
         """Font size of labels, the unit of distances."""
         return self.label_pt
-
-    def is_wide(self, width_pt: float) -> bool:
-        """Return True if pictures on a page of this width are beside each other."""
-        return width_pt >= _WIDE_EMS * self.em_pt
 
 
 THEMES = {
@@ -105,6 +156,13 @@ THEMES = {
         width_pt=COLUMNS_MM[2] * _PT_PER_MM,
     ),
 }
+
+
+@contextmanager
+def parameters(rc: Any) -> Iterator[None]:
+    """Set parameters of Matplotlib for a while; one thread at a time, because they are global."""
+    with _LOCK, mpl.rc_context(rc):
+        yield
 
 
 def style_of(
@@ -134,3 +192,14 @@ def text_width_pt(text: str, size_pt: float, font: str, *, bold: bool = False) -
     """Return an upper estimate of the width of a line of text."""
     properties = FontProperties(family=font, size=size_pt, weight="bold" if bold else "normal")
     return _SLACK * text_to_path.get_text_width_height_descent(text, properties, ismath=False)[0]
+
+
+def angle(degrees: float) -> str:
+    """Return an angle with its sign, as the axes write it."""
+    text = minus(f"{degrees:+.1f}".removesuffix(".0"))
+    return "0°" if text in {"+0", "−0"} else f"{text}°"
+
+
+def minus(text: str) -> str:
+    """Return a number with the sign that printers use."""
+    return text.replace("-", "−")
