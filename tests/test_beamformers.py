@@ -1,16 +1,21 @@
 """Coherence factor, DMAS and Capon: equality with their references, limits, and benefits."""
 
+import re
 import warnings
+from typing import get_args
 
 import numpy as np
 import pytest
 
+from ertis_numba.beamformers import ADAPTIVE_BEAMFORMERS, BEAMFORMERS, BeamformerName
+from ertis_numba.errors import ArgumentError
 from ertis_numba.settings import Processing
 from ertis_numba.stages.adaptive import AdaptiveBeamform
+from ertis_numba.verification import combine
 from tests import reference
 from tests.on_device import KERNELS, sized
+from tests.pages import page
 
-OTHERS = ("coherence_factor", "dmas", "capon")
 FLOAT32 = 2e-6  # relative to the largest number of an image
 SHAPES = {
     # microphones, phases, samples, ranges, directions
@@ -99,6 +104,43 @@ def test_capon_equals_its_reference(kernel_set, name, n_snapshots, loading):
     assert np.abs(out - expected).max() < FLOAT32 * expected.max()
 
 
+@pytest.mark.parametrize("name", sized(["one range", "just over a tile"], ["two microphones", "prime", "eRTIS"]))
+@pytest.mark.parametrize("beamformer", ADAPTIVE_BEAMFORMERS)
+def test_every_beamformer_equals_its_definition(kernel_set, beamformer, name):
+    signals, offsets, weights, (n_directions, n_ranges) = beam_input(name)
+    processing, n_mics = Processing(beamformer=beamformer), offsets.shape[1]
+    weights /= np.abs(weights).sum(axis=1, keepdims=True)
+    out = np.full((n_directions, n_ranges), 12_345, dtype=np.float32)
+    AdaptiveBeamform(processing, kernel_set, kernel_set.memory(), offsets, weights)(signals, out)
+    delayed = n_mics * reference.delayed(signals, offsets, weights, n_ranges)
+    expected = np.stack([combine(y, processing) for y in delayed])
+    assert np.abs(out - expected).max() < 2 * FLOAT32 * expected.max()
+
+
+@pytest.mark.parametrize("name", BEAMFORMERS)
+def test_page_lists_every_beamformer_with_its_options(name):
+    (row,) = re.findall(rf"^\| `{name}` \|([^|]*)\|[^|]+\|[^|]+\|$", page("beamformers"), re.MULTILINE)
+    options = {option.name for option in BEAMFORMERS[name].options}
+    assert set(re.findall(r"`(\w+)`", row)) - {"array_weights"} == options
+
+
+def test_registry_names_are_those_of_the_type():
+    assert tuple(BEAMFORMERS) == get_args(BeamformerName)
+    options = {option.name for each in BEAMFORMERS.values() for option in each.options}
+    assert options <= set(Processing.__struct_fields__)
+
+
+@pytest.mark.parametrize(
+    "option", [option for each in BEAMFORMERS.values() for option in each.options], ids=lambda option: option.name
+)
+def test_options_keep_their_limits(option):
+    for value in (option.low, option.high):
+        assert getattr(Processing(**{option.name: value}), option.name) == value
+    for value in (option.low - 1, option.high + 1):
+        with pytest.raises(ArgumentError, match=f"processing.{option.name}"):
+            Processing(**{option.name: value})
+
+
 def test_results_do_not_depend_on_the_number_of_threads():
     cpu, found = KERNELS["cpu"], set()
     for count in range(1, cpu.max_threads + 1):
@@ -156,7 +198,7 @@ def test_capon_of_one_snapshot_depends_on_the_coherence_factor_only(kernel_set, 
 # Hard cases, and how the plain form fails.
 
 
-@pytest.mark.parametrize("beamformer", OTHERS)
+@pytest.mark.parametrize("beamformer", ADAPTIVE_BEAMFORMERS)
 def test_beamformers_give_zero_for_silence(kernel_set, beamformer):
     """The following signal, here the second half, is unaffected."""
     signals = complex_noise(4, 40)
@@ -177,7 +219,7 @@ def test_naive_forms_fail_on_silence():
         np.linalg.solve(y @ y.conj().T, np.ones(4))
 
 
-@pytest.mark.parametrize("beamformer", OTHERS)
+@pytest.mark.parametrize("beamformer", ADAPTIVE_BEAMFORMERS)
 def test_beamformers_of_tiny_signals_are_finite(kernel_set, beamformer):
     """Their squares underflow in single precision, so the naive root is infinite."""
     signals = np.full((4, 40), 1e-25 + 1e-25j, dtype=np.complex64)

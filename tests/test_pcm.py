@@ -8,6 +8,7 @@ import pytest
 import xarray
 
 import ertis_numba as ertis
+from ertis_numba.beamformers import BEAMFORMERS
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.journal import Journal
 from ertis_numba.pipeline import Pipeline
@@ -207,7 +208,7 @@ def test_faults_are_found_in_pcm():
     assert report.channels[7].faults == ()
 
 
-@pytest.mark.parametrize("beamformer", ["delay_and_sum", "coherence_factor", "dmas", "capon"])
+@pytest.mark.parametrize("beamformer", BEAMFORMERS)
 @pytest.mark.parametrize("exponent", [-126, -60, 40, 100])
 def test_image_is_linear_in_the_samples(beamformer, exponent):
     settings = PCM.replace(

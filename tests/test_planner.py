@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from ertis_numba import kernels
+from ertis_numba.beamformers import ADAPTIVE_BEAMFORMERS
 from ertis_numba.errors import ArgumentError, DeviceError
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import ERROR_PRESETS_DB, INTERPOLATIONS, Accuracy, Array, Call, Processing
@@ -179,7 +180,7 @@ def test_paper_method_has_no_plan():
     assert Pipeline(settings).settings is settings
 
 
-@pytest.mark.parametrize("beamformer", ["coherence_factor", "dmas", "capon"])
+@pytest.mark.parametrize("beamformer", ADAPTIVE_BEAMFORMERS)
 def test_adaptive_beamformers_get_usable_plans(beamformer):
     settings = SMALL.replace(processing=SMALL.processing.replace(beamformer=beamformer))
     found = chosen_for(settings).settings.accuracy

@@ -9,6 +9,7 @@ from ertis_numba.analysis.cfar import clean
 from ertis_numba.analysis.detect import find_peaks, neighbours_of
 from ertis_numba.analysis.finder import PointFinder
 from ertis_numba.analysis.points import PointExtractor
+from ertis_numba.beamformers import ADAPTIVE_BEAMFORMERS
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Energyscape, PointCloud, Stamp
 from ertis_numba.geometry import direction_grid, unit_vectors
@@ -22,7 +23,7 @@ from tests.parabolas import interpolated
 from tests.scenes import heard
 from tests.test_detect import image_of
 
-OTHERS = [("fast", beamformer) for beamformer in ("coherence_factor", "dmas", "capon")]
+OTHERS = [("fast", beamformer) for beamformer in ADAPTIVE_BEAMFORMERS]
 
 
 def noise(directions, range_m=(0.9, 1.2), seed=1):

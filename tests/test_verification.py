@@ -11,6 +11,7 @@ from ertis_bench.random_settings import Limits, random_measurement, random_setti
 from ertis_cli.main import cli
 
 from ertis_numba import verification
+from ertis_numba.beamformers import ADAPTIVE_BEAMFORMERS, BEAMFORMERS
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import unit_vectors
@@ -123,7 +124,7 @@ def test_verify_measures_errors_of_spherical_images(tmp_path):
     assert sensor["verified"]["peaks"]["lost"] == 0
 
 
-@pytest.mark.parametrize("beamformer", ["coherence_factor", "dmas", "capon"])
+@pytest.mark.parametrize("beamformer", ADAPTIVE_BEAMFORMERS)
 def test_verify_measures_errors_of_every_beamformer(tmp_path, beamformer):
     recording = write_recording(tmp_path / "rec.h5", noise(count=1))
     arguments = ["-o", str(tmp_path / "a.h5"), "--beamformer", beamformer, "--max-error", "0", "--verify", "--json"]
@@ -137,7 +138,7 @@ def test_verify_measures_errors_of_every_beamformer(tmp_path, beamformer):
     assert sensor["verified"]["error_db"] == pytest.approx(true_db, abs=0.05)
 
 
-@pytest.mark.parametrize("beamformer", ["coherence_factor", "dmas", "capon"])
+@pytest.mark.parametrize("beamformer", ADAPTIVE_BEAMFORMERS)
 def test_silence_gives_amplitudes_of_zero(beamformer):
     settings = small(recording=PCM, processing=FIVE.replace(range_decimation=10, beamformer=beamformer))
     measurement = Measurement(np.zeros((PCM.n_samples, 32), dtype=np.int16), settings)
@@ -201,12 +202,7 @@ def test_bench_verification_names_the_error(monkeypatch):
 
 def test_random_settings_cover_every_kind():
     drawn = [random_settings(np.random.default_rng(seed), Limits()) for seed in range(60)]
-    assert {settings.processing.beamformer for settings in drawn} == {
-        "delay_and_sum",
-        "coherence_factor",
-        "dmas",
-        "capon",
-    }
+    assert {settings.processing.beamformer for settings in drawn} == set(BEAMFORMERS)
     assert {settings.processing.wavefront for settings in drawn} == {"plane", "spherical"}
     assert {settings.recording.encoding for settings in drawn} == {"pdm", "int16", "float32"}
     assert sum(settings.call.ramp_fraction == 0 for settings in drawn) > 10

@@ -19,6 +19,7 @@ from ertis_bench.network.processes import ask
 from ertis_bench.random_settings import Limits, recorded
 from ertis_numba import verification
 from ertis_numba.air import sound_speed_m_s
+from ertis_numba.beamformers import ADAPTIVE_BEAMFORMERS, BeamformerName
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones
@@ -30,13 +31,11 @@ __all__ = ["form", "measurement_of", "run", "tried"]
 
 _FLOOR_DB: Final = -100.0  # Below this level, rounding in single precision dominates the error.
 _DIRECTIONS: Final = 24  # compared with the exact image
-_BEAMFORMERS: Final[tuple[Literal["delay_and_sum", "coherence_factor", "dmas", "capon"], ...]] = (
+_BEAMFORMERS: Final[tuple[BeamformerName, ...]] = (
     "delay_and_sum",
     "delay_and_sum",
     "delay_and_sum",
-    "coherence_factor",
-    "dmas",
-    "capon",
+    *ADAPTIVE_BEAMFORMERS,
 )
 _SCENES: Final = ("quiet", "loud", "direct sound", "hum", "one echo", "echoes")
 

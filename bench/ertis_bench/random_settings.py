@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.air import sound_speed_m_s
+from ertis_numba.beamformers import ADAPTIVE_BEAMFORMERS, BeamformerName
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones
@@ -20,13 +21,7 @@ __all__ = ["Limits", "random_measurement", "random_settings", "recorded"]
 _DRAWS = 100  # Draws that constructors may refuse, before the limits are considered too narrow.
 
 _ENCODINGS: Final[tuple[Literal["pdm", "int16", "float32"], ...]] = ("pdm", "pdm", "int16", "float32")
-_BEAMFORMERS: Final[tuple[Literal["delay_and_sum", "coherence_factor", "dmas", "capon"], ...]] = (
-    "delay_and_sum",
-    "delay_and_sum",
-    "coherence_factor",
-    "dmas",
-    "capon",
-)
+_BEAMFORMERS: Final[tuple[BeamformerName, ...]] = ("delay_and_sum", "delay_and_sum", *ADAPTIVE_BEAMFORMERS)
 
 
 @dataclass(frozen=True, slots=True)

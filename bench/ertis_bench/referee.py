@@ -5,7 +5,7 @@ sums it bin by bin at each range.
 """
 
 import itertools
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import scipy.fft
@@ -14,12 +14,16 @@ from numpy.typing import NDArray
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.geometry import array_weights, microphones
 from ertis_numba.settings import Array, Call, Processing, Recording, Settings
+from ertis_numba.verification import combine
 from ertis_numba.waveform import call_at
 
 __all__ = ["amplitudes", "beamformed", "capon", "coherence_factor", "dmas", "exact", "signals_of", "unpack_bits"]
 
 Floats = NDArray[np.float64]
 Delayed = NDArray[np.complex128]
+
+_DEFINED: Final = frozenset({"delay_and_sum", "coherence_factor", "dmas", "capon"})
+"""Beamformers with a second definition here; `verification` defines the others."""
 
 
 def exact(words: NDArray[Any], settings: Settings, directions: Floats, range_m: Floats) -> Floats:
@@ -103,6 +107,8 @@ def _matched_spectra(
 
 def beamformed(y: Delayed, processing: Processing) -> Floats:
     """Return the amplitude of one direction: (mic, range) to (range,). The signals must not be silent."""
+    if processing.beamformer not in _DEFINED:
+        return combine(y, processing)
     if processing.beamformer == "delay_and_sum":
         return amplitudes(y)
     if processing.beamformer == "coherence_factor":

@@ -10,6 +10,7 @@ from ertis_bench.machine import sentence
 from ertis_bench.markdown import table
 from ertis_bench.random_settings import random_measurement
 from ertis_numba import verification
+from ertis_numba.beamformers import BEAMFORMERS
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.geometry import unit_vectors
@@ -34,7 +35,7 @@ _GROUPS: dict[str, Callable[[Settings], bool]] = {
     "other edges of the band": lambda settings: settings.processing.band_edges_hz is not None,
     **{
         f"`{name}`": lambda settings, name=name: settings.processing.beamformer == name  # type: ignore[misc]
-        for name in ("delay_and_sum", "coherence_factor", "dmas", "capon")
+        for name in BEAMFORMERS
     },
 }
 

@@ -9,6 +9,7 @@ import click
 
 from ertis_cli import _mountings, _plans, _process_many, options
 from ertis_cli._config import typed
+from ertis_numba.beamformers import BEAMFORMERS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -47,7 +48,7 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
 )
 @click.option(
     "--beamformer",
-    type=click.Choice(["delay_and_sum", "coherence_factor", "dmas", "capon"]),
+    type=click.Choice(list(BEAMFORMERS)),
     help="Beamformer; the recording's own by default.",
 )
 @click.option(

@@ -7,6 +7,7 @@ import click
 
 from ertis_cli import _central_watch, _network, _supervisor, options
 from ertis_cli._saving import withdrawn
+from ertis_numba.beamformers import BEAMFORMERS
 
 __all__ = ["serve"]
 
@@ -30,7 +31,7 @@ _FOLDER = click.Path(path_type=Path)
 @click.option("--method", type=click.Choice(["fast", "paper"]), help="Processing method; the sensor's own by default.")
 @click.option(
     "--beamformer",
-    type=click.Choice(["delay_and_sum", "coherence_factor", "dmas", "capon"]),
+    type=click.Choice(list(BEAMFORMERS)),
     help="Beamformer; the sensor's own by default.",
 )
 @click.option(

@@ -6,13 +6,14 @@ from dataclasses import dataclass, fields
 from typing import Any, Final, Self
 
 from ertis_numba.kernels import _contract
+from ertis_numba.kernels._contract.adaptive import AdaptiveKernels
 from ertis_numba.kernels._memory import NewMemory, Threads
 
-__all__ = ["KERNEL_NAMES", "KernelSet", "twins_in"]
+__all__ = ["CONTRACTS", "KERNEL_NAMES", "KernelSet", "twins_in"]
 
 
-@dataclass(frozen=True, slots=True)
-class KernelSet:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KernelSet(AdaptiveKernels):
     """Kernels of one device, and properties of the device.
 
     Every attribute that is not listed below is a kernel; its contract documents it.
@@ -61,9 +62,6 @@ class KernelSet:
     quantise_tiles: _contract.QuantiseTiles
     delay_and_sum_envelope_int16: _contract.DelayAndSumEnvelopeInt16
     interpolated_beams_envelope_int16: _contract.InterpolatedBeamsEnvelopeInt16
-    combine_coherence: _contract.CombineCoherence
-    combine_dmas: _contract.CombineDmas
-    combine_capon: _contract.CombineCapon
     add_paths: _contract.AddPaths
     modulate_pdm: _contract.ModulatePdm
 
@@ -73,7 +71,12 @@ class KernelSet:
         return cls(**facts, **{name: twins[name] for name in KERNEL_NAMES})
 
 
-KERNEL_NAMES: Final = tuple(field.name for field in fields(KernelSet) if field.type in vars(_contract).values())
+CONTRACTS: Final = {
+    field.name: field.type for field in fields(KernelSet) if field.type.__module__.startswith(_contract.__name__)
+}
+"""Contracts of the kernels, by the attribute of a `KernelSet`."""
+
+KERNEL_NAMES: Final = tuple(CONTRACTS)
 """Attributes of a `KernelSet` that are kernels, which means that they have a contract."""
 
 

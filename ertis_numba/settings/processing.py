@@ -4,6 +4,7 @@ import math
 from typing import Final, Literal
 
 from ertis_numba import checks
+from ertis_numba.beamformers import BEAMFORMERS, BeamformerName
 from ertis_numba.constants import MAX_MICROPHONES, MAX_NAME_LENGTH
 from ertis_numba.documents import TomlTable
 from ertis_numba.errors import ArgumentError
@@ -45,9 +46,9 @@ class Processing(TomlTable, frozen=True, kw_only=True):
         Shape of an echo's wavefront. ``plane`` is that of the paper. ``spherical`` focuses on each range, which matters
         at ranges below some ten apertures. ``auto`` chooses ``spherical`` if plane wavefronts exceed the error budget
         at the first range, and ``plane`` otherwise and for adaptive beamformers.
-    beamformer : {"delay_and_sum", "coherence_factor", "dmas", "capon"}, default "delay_and_sum"
-        Combination of the delayed signals; ``docs/explanation/beamformers.md`` compares them. All except delay_and_sum
-        need the fast method and plane wavefronts.
+    beamformer : str, default "delay_and_sum"
+        Combination of the delayed signals, one of `BEAMFORMERS`; ``docs/explanation/beamformers.md`` compares them. All
+        except delay_and_sum need the fast method and plane wavefronts.
     dmas_order : int, default 2
         Number of microphone signals that ``dmas`` multiplies at a time, 2 to 8.
     snapshots : int, default 5
@@ -71,7 +72,7 @@ class Processing(TomlTable, frozen=True, kw_only=True):
     band_edges_hz: tuple[float, float] | None = None
     decimation: int | None = None
     wavefront: Literal["plane", "spherical", "auto"] = "plane"
-    beamformer: Literal["delay_and_sum", "coherence_factor", "dmas", "capon"] = "delay_and_sum"
+    beamformer: BeamformerName = "delay_and_sum"
     dmas_order: int = 2
     snapshots: int = 5
     diagonal_loading: float = 1.0
@@ -157,10 +158,13 @@ class Processing(TomlTable, frozen=True, kw_only=True):
 
     def _check_beamformer(self) -> None:
         """Refuse options of beamformers that are out of range, and those that only delay-and-sum supports."""
-        checks.choice("processing.beamformer", self.beamformer, ("delay_and_sum", "coherence_factor", "dmas", "capon"))
-        checks.integer("processing.dmas_order", self.dmas_order, 2, 8)
-        checks.integer("processing.snapshots", self.snapshots, 1, 32)
-        checks.between("processing.diagonal_loading", self.diagonal_loading, 1e-6, 1e6)
+        checks.choice("processing.beamformer", self.beamformer, tuple(BEAMFORMERS))
+        for option in (option for each in BEAMFORMERS.values() for option in each.options):
+            value = getattr(self, option.name)
+            if isinstance(option.low, int) and isinstance(option.high, int):
+                checks.integer(f"processing.{option.name}", value, option.low, option.high)
+            else:
+                checks.between(f"processing.{option.name}", value, option.low, option.high)
         if self.beamformer == "delay_and_sum":
             return
         for name, value, remedy in (("method", "paper", "'fast'"), ("wavefront", "spherical", "'plane'")):

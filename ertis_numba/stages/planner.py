@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ertis_numba import checks
+from ertis_numba.beamformers import BEAMFORMERS
 from ertis_numba.errors import ArgumentError
 from ertis_numba.kernels import KernelSet
 from ertis_numba.settings import Accuracy, Settings
 from ertis_numba.stages.accuracy import PARTS, ErrorModel, SignalModel, decibels
-from ertis_numba.stages.adaptive import require_order
 from ertis_numba.stages.beamform import require_int16
 from ertis_numba.stages.costs import PLAN_COSTS, Costs, PlanCosts, cache_file, measured_costs, nominal_costs
 from ertis_numba.stages.fitting import one_thread
@@ -125,8 +125,8 @@ class Planner:
             require_int16(kernels)
         self._threads = threads
         self._plans = PlanModel(settings, signal_model, tile_ranges=kernels.tile_ranges)
-        if settings.processing.beamformer == "dmas":
-            require_order(settings.processing.dmas_order, self._plans.n_mics)
+        beamformer = BEAMFORMERS[settings.processing.beamformer]
+        beamformer.check(self._plans.n_mics, *beamformer.values(settings.processing))
         self._sensitivity = sensitivity or Sensitivity.of(settings.processing, self._plans.n_mics)
 
     @property

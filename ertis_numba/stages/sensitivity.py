@@ -4,12 +4,10 @@ import math
 from dataclasses import dataclass
 from typing import Self
 
+from ertis_numba.beamformers import BEAMFORMERS
 from ertis_numba.settings import Processing
 
 __all__ = ["Sensitivity"]
-
-_COHERENCE = 3.0
-_CAPON = 10.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,22 +30,11 @@ class Sensitivity:
     def of(cls, processing: Processing, n_mics: int) -> Self:
         """Return a safe estimate for any sound.
 
-        The estimate results from perturbed weights in noise and in scenes of one echo and of 12 echoes. DMAS of order n
-        multiplies n signals, so the powers of their errors add up. The coherence factor raises the amplitude to the
-        third power where microphones agree. Capon cancels an echo with delay errors, in proportion to the number of
-        microphones divided by the diagonal loading.
+        The registry of beamformers declares it. The estimates result from perturbed weights in noise and in scenes of
+        one echo and of 12 echoes.
         """
-        match processing.beamformer:
-            case "coherence_factor":
-                return cls(_COHERENCE)
-            case "dmas":
-                return cls(float(processing.dmas_order))
-            case "capon":
-                return cls(
-                    1 + (_CAPON - 1) / (1 + processing.diagonal_loading / 0.01), n_mics / processing.diagonal_loading
-                )
-            case _:
-                return cls()
+        beamformer = BEAMFORMERS[processing.beamformer]
+        return cls(*beamformer.sensitivity(n_mics, *beamformer.values(processing)))
 
     def output(self, power: float) -> float:
         """Return the error power of the image for an error power of the beams."""

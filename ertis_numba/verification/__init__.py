@@ -1,5 +1,6 @@
 """Errors of images relative to exact ones, which are computed independently in float64."""
 
+from ertis_numba.verification._beamformers import combine
 from ertis_numba.verification._exact import ExactImage
 from ertis_numba.verification._measured import Measured, error_db, exact_image, measure, sampled, sampled_error_db
 from ertis_numba.verification._peaks import PEAKS, PeakErrors, peak_errors
@@ -9,6 +10,7 @@ __all__ = [
     "ExactImage",
     "Measured",
     "PeakErrors",
+    "combine",
     "error_db",
     "exact_image",
     "measure",

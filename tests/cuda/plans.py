@@ -1,5 +1,6 @@
 """Settings small enough for the slow CUDA simulator, and the processing plans to test with them."""
 
+from ertis_numba.beamformers import ADAPTIVE_BEAMFORMERS
 from ertis_numba.settings import Accuracy, Array, Call, Processing, Recording, Settings
 
 TINY = Settings(
@@ -43,7 +44,7 @@ PLANS = {
     ),
 }
 PLANS["paper"] = (TINY.replace(processing=TINY.processing.replace(method="paper")), -120)
-for _beamformer in ("coherence_factor", "dmas", "capon"):
+for _beamformer in ADAPTIVE_BEAMFORMERS:
     PLANS[_beamformer] = (
         TINY.replace(
             processing=TINY.processing.replace(beamformer=_beamformer, directions="2d:3"),

@@ -12,7 +12,7 @@ CONTRACTS = sorted(KERNEL_NAMES)
 
 def test_every_kernel_contract_is_launched(launched):
     assert sorted(launched) == CONTRACTS
-    assert len(CONTRACTS) == 19
+    assert len(CONTRACTS) >= 19
 
 
 @pytest.mark.parametrize("cc", CCS, ids=lambda cc: f"sm_{cc[0]}{cc[1]}")

@@ -5,7 +5,6 @@ nothing: stages check shapes and bounds when they are created. Arrays are C-cont
 phase, sample; direction, range.
 """
 
-from ertis_numba.kernels._contract.adaptive import CombineCapon, CombineCoherence, CombineDmas
 from ertis_numba.kernels._contract.arrays import Complex, Index, Pcm, Real, Short, Taps, Words
 from ertis_numba.kernels._contract.beams import (
     DelayAndSum,
@@ -29,9 +28,6 @@ from ertis_numba.kernels._contract.signals import (
 
 __all__ = [
     "AddPaths",
-    "CombineCapon",
-    "CombineCoherence",
-    "CombineDmas",
     "Complex",
     "Decimate",
     "DelayAndSum",

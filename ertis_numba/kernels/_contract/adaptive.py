@@ -1,10 +1,11 @@
 """Contracts of the beamformers other than delay-and-sum: analytic signals to envelopes."""
 
+from dataclasses import dataclass
 from typing import Protocol
 
 from ertis_numba.kernels._contract.arrays import Complex, Index, Real
 
-__all__ = ["CombineCapon", "CombineCoherence", "CombineDmas"]
+__all__ = ["AdaptiveKernels"]
 
 
 class CombineCoherence(Protocol):
@@ -70,3 +71,12 @@ class CombineCapon(Protocol):
     def __call__(
         self, signals: Complex, offsets: Index, weights: Complex, n_snapshots: int, loading: float, out: Real
     ) -> None: ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AdaptiveKernels:
+    """Kernels of the adaptive beamformers, as attributes of a `KernelSet`."""
+
+    combine_coherence: CombineCoherence
+    combine_dmas: CombineDmas
+    combine_capon: CombineCapon

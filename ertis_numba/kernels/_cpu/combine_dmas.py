@@ -1,3 +1,4 @@
+# mypy: ignore-errors
 """Multiply the roots of the microphones' signals with one another, and sum the products.
 
 The root of a product is the product of the roots. Roots are therefore computed once per sample and once per weight, not

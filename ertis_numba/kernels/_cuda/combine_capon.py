@@ -1,3 +1,4 @@
+# mypy: ignore-errors
 """Combine the microphones with minimum-variance weights; the method and its equations are those of the CPU kernel.
 
 Each thread handles one window of ranges at a time. Its matrix is in global memory, interleaved with those of the other

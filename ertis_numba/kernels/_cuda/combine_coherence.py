@@ -1,3 +1,4 @@
+# mypy: ignore-errors
 """Sum the microphones, and weight the sum by their coherence factor."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# mypy: ignore-errors
 """Multiply the roots of the microphones' signals with one another, and sum the products.
 
 Each order has its own kernel, so that the sums stay in registers. Indices that are known only at run time would force

@@ -1,0 +1,119 @@
+"""Registry of beamformers: options, kernel, weights and error of each, in one place."""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+from ertis_numba.errors import ArgumentError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+__all__ = ["ADAPTIVE_BEAMFORMERS", "BEAMFORMERS", "Beamformer", "BeamformerName", "BeamformerOption"]
+
+BeamformerName = Literal["delay_and_sum", "coherence_factor", "dmas", "capon"]
+
+
+@dataclass(frozen=True, slots=True)
+class BeamformerOption:
+    """Setting of a beamformer: a key of `Processing` and its limits. Limits of integers are of type int."""
+
+    name: str
+    low: float
+    high: float
+
+
+def _amplitudes(weights: "NDArray[np.complex64]", *_: float) -> "NDArray[np.complex64]":
+    """Return weights whose magnitudes have a mean of 1, so that a mean over the microphones keeps amplitudes."""
+    scaled: NDArray[np.complex64] = weights.shape[1] * weights
+    return scaled
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Beamformer:
+    """Declaration of a beamformer.
+
+    The functions receive the values of the options after their first argument, in the order of ``options``.
+
+    Attributes
+    ----------
+    kernel : str
+        Kernel that computes ``out`` from ``(analytic, offsets, weights, *options, out)``. Empty for delay-and-sum,
+        whose kernels depend on the plan.
+    options : tuple of BeamformerOption
+    weights : callable
+        Returns the weights for the kernel, (direction, mic) complex64, from weights whose magnitudes add up to about 1
+        in each direction. By default, multiplies them by the number of microphones.
+    sensitivity : callable
+        Returns the coefficients of `Sensitivity` from the number of microphones; 1 and 0 by default.
+    check : callable
+        Raises `ArgumentError` if the beamformer does not support the number of microphones.
+    """
+
+    kernel: str
+    options: tuple[BeamformerOption, ...] = ()
+    weights: Callable[..., "NDArray[np.complex64]"] = _amplitudes
+    sensitivity: Callable[..., tuple[float, float]] = lambda *_: (1.0, 0.0)
+    check: Callable[..., None] = lambda *_: None
+
+    def values(self, processing: object) -> tuple[Any, ...]:
+        """Return the values of the options in processing settings."""
+        return tuple(getattr(processing, option.name) for option in self.options)
+
+
+def _require_order(n_mics: int, order: int) -> None:
+    """Check that the order of DMAS does not exceed the number of microphones."""
+    if n_mics < order:
+        raise ArgumentError(
+            f"processing.dmas_order is {order}, but the array has {n_mics} microphone{'s' * (n_mics != 1)}; "
+            "the order must not exceed the number of microphones. Give a lower order or another processing.beamformer"
+        )
+
+
+def _dmas_roots(weights: "NDArray[np.complex64]", order: int) -> "NDArray[np.complex64]":
+    """Return roots of the weights, divided by a root of the number of products in the sum."""
+    import numpy as np  # noqa: PLC0415  The help of commands reads this module, and need not wait for NumPy.
+
+    n_mics = weights.shape[1]
+    exact = _amplitudes(weights).astype(np.complex128)
+    level = np.abs(exact)
+    shrunk = np.power(level, 1 / order - 1, out=np.zeros_like(level), where=level != 0)
+    # Every product has ``order`` factors, and each factor carries that root of the divisor. No sum overflows float32.
+    roots = exact * shrunk * math.comb(n_mics, order) ** (-1 / order)
+    return np.asarray(roots, dtype=np.complex64)
+
+
+def _capon_sensitivity(n_mics: int, _: int, loading: float) -> tuple[float, float]:
+    """Return coefficients for a beamformer that cancels an echo with delay errors, the less the more loading."""
+    return 1 + 9 / (1 + loading / 0.01), n_mics / loading
+
+
+BEAMFORMERS: Final[Mapping[BeamformerName, Beamformer]] = MappingProxyType(
+    {
+        "delay_and_sum": Beamformer(kernel=""),
+        "coherence_factor": Beamformer(
+            kernel="combine_coherence",
+            weights=lambda weights: weights,
+            sensitivity=lambda _: (3.0, 0.0),  # the amplitude is raised to the third power where microphones agree
+        ),
+        "dmas": Beamformer(
+            kernel="combine_dmas",
+            options=(BeamformerOption("dmas_order", 2, 8),),
+            weights=_dmas_roots,
+            sensitivity=lambda _, order: (float(order), 0.0),  # error powers of the factors add up
+            check=_require_order,
+        ),
+        "capon": Beamformer(
+            kernel="combine_capon",
+            options=(BeamformerOption("snapshots", 1, 32), BeamformerOption("diagonal_loading", 1e-6, 1e6)),
+            sensitivity=_capon_sensitivity,
+        ),
+    }
+)
+"""Beamformers by name, in the order of `BeamformerName`."""
+
+ADAPTIVE_BEAMFORMERS: Final = tuple(name for name, each in BEAMFORMERS.items() if each.kernel)
+"""Names of all beamformers except delay-and-sum."""
