@@ -257,6 +257,12 @@ def test_central_node_requires_archive_or_processing():
         CentralNode("tcp://127.0.0.1:0")
 
 
+def test_message_without_handler_is_refused_at_the_start(tmp_path, monkeypatch):
+    monkeypatch.setattr("ertis_numba.network.central_node._reading.ACCEPTED", (Ping, messages.Pong))
+    with pytest.raises(TypeError, match="CentralNode has no handler of pong; define _on_pong"):
+        CentralNode("tcp://127.0.0.1:0", archive=Archive(tmp_path))
+
+
 def test_central_node_run_requires_with_statement(tmp_path):
     with pytest.raises(ArgumentError, match="not open"):
         CentralNode("tcp://127.0.0.1:0", archive=Archive(tmp_path)).run()

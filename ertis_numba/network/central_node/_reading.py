@@ -1,6 +1,8 @@
-"""Decoding of messages, with checks of their senders' roles."""
+"""Decoding of messages, checks of their senders' roles, and their handlers, by the declarations of the messages."""
 
-from typing import Final
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final
 
 import zmq
 
@@ -8,11 +10,56 @@ from ertis_numba.errors import DataError, FormatVersionError
 from ertis_numba.network import messages
 from ertis_numba.network.allow_list import Permission
 from ertis_numba.network.central_node._roles import Unwanted
-from ertis_numba.network.messages import AskStatus, Bye, Data, Gap, Hello, Message, Ping, Subscribe
+from ertis_numba.network.messages import MESSAGES, Message, Subscribe
 
-__all__ = ["read", "require_role"]
+__all__ = ["Received", "handlers_of", "read", "require_role"]
 
-_TAKEN: Final = (Hello, Data, Gap, Ping, Bye, AskStatus)
+ACCEPTED: Final = tuple(kind for kind in MESSAGES if kind.senders_to("central"))
+
+
+@dataclass(slots=True, eq=False)
+class Received:
+    """Sender and frames of a message.
+
+    Attributes
+    ----------
+    frames : list of zmq.Frame
+        Sender, header and payload.
+    who : Permission
+    arrived_ns : int
+        Time of arrival, by `time.monotonic_ns`.
+    """
+
+    frames: list[zmq.Frame]
+    who: Permission
+    arrived_ns: int
+
+    @property
+    def sender(self) -> bytes:
+        """Identifier of the sender."""
+        return self.frames[0].bytes
+
+    @property
+    def payload(self) -> list[zmq.Frame]:
+        """Frames after the header."""
+        return self.frames[2:]
+
+
+def handlers_of(node: object) -> dict[type[Message], Callable[[Any, Received], None]]:
+    """Return the handlers of all messages to the central node: its methods ``_on_KIND``.
+
+    Raises
+    ------
+    TypeError
+        A message has no handler.
+    """
+    missing = [kind.kind() for kind in ACCEPTED if not hasattr(node, f"_on_{kind.kind()}")]
+    if missing:
+        raise TypeError(
+            f"{type(node).__name__} has no handler of {', '.join(missing)}; define _on_{missing[0]}, or remove the "
+            "route to the central node from the declaration"
+        )
+    return {kind: getattr(node, f"_on_{kind.kind()}") for kind in ACCEPTED}
 
 
 def read(frames: list[zmq.Frame]) -> Message:
@@ -20,7 +67,7 @@ def read(frames: list[zmq.Frame]) -> Message:
     if len(frames) < 2:
         raise Unwanted("message", "a message is empty; send a header", "message")
     try:
-        message: Message = messages.decode(frames[1].buffer, (*_TAKEN, Subscribe))
+        message: Message = messages.decode(frames[1].buffer, (*ACCEPTED, Subscribe))
     except FormatVersionError as error:
         raise Unwanted("version", str(error), "version") from error
     except DataError as error:
@@ -36,14 +83,11 @@ def read(frames: list[zmq.Frame]) -> Message:
 
 def require_role(who: Permission, message: Message) -> None:
     """Refuse a message that its sender's role does not allow."""
-    if isinstance(message, AskStatus):
-        if not who.may_receive:
-            raise Unwanted("role", f"key {who.name} has the role sensor, which may not request the status", "role")
-    elif who.may_receive and who.role != "admin":
-        raise Unwanted("role", f"key {who.name} has the role application, which may not send measurements", "role")
-    if isinstance(message, Hello | Data | Gap) and not who.may_send(message.sensor):
+    if who.role not in ("admin", *message.senders_to("central")):
+        action = "request the status" if who.role == "sensor" else "send measurements"
+        raise Unwanted("role", f"key {who.name} has the role {who.role}, which may not {action}", "role")
+    sensor = getattr(message, "sensor", None)
+    if sensor is not None and not who.may_send(sensor):
         raise Unwanted(
-            "serial",
-            f"key {who.name} may not send for sensor {message.sensor}; allow it with 'ertis keys allow'",
-            "serial",
+            "serial", f"key {who.name} may not send for sensor {sensor}; allow it with 'ertis keys allow'", "serial"
         )
