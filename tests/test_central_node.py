@@ -8,7 +8,7 @@ import pytest
 from ertis_numba.errors import ArgumentError, JournalInUseError
 from ertis_numba.network import messages
 from ertis_numba.network.central_node import Archive, CentralNode
-from ertis_numba.network.central_node._condition import Condition
+from ertis_numba.network.central_node._reporting import Condition
 from ertis_numba.network.messages import Ack, Gap, Ping, Pong, Refused, Report, Welcome
 from ertis_numba.network.status import Status
 from ertis_numba.settings import Air, Recording
@@ -258,7 +258,7 @@ def test_central_node_requires_archive_or_processing():
 
 
 def test_message_without_handler_is_refused_at_the_start(tmp_path, monkeypatch):
-    monkeypatch.setattr("ertis_numba.network.central_node._reading.ACCEPTED", (Ping, messages.Pong))
+    monkeypatch.setattr("ertis_numba.network.central_node._admission.ACCEPTED", (Ping, messages.Pong))
     with pytest.raises(TypeError, match="CentralNode has no handler of pong; define _on_pong"):
         CentralNode("tcp://127.0.0.1:0", archive=Archive(tmp_path))
 

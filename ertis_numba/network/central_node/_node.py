@@ -6,19 +6,17 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
 import zmq
 
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError
 from ertis_numba.network.addresses import DEFAULT_LISTEN
+from ertis_numba.network.central_node._admission import Received, Unwanted, handlers_of, read, require_role
 from ertis_numba.network.central_node._archive import Archive
-from ertis_numba.network.central_node._condition import Condition
-from ertis_numba.network.central_node._event_reporting import EventReporter, text_of
-from ertis_numba.network.central_node._images import Guarded, ImageProducer
+from ertis_numba.network.central_node._images import Guarded
 from ertis_numba.network.central_node._intake import Intake
-from ertis_numba.network.central_node._reading import Received, handlers_of, read, require_role
 from ertis_numba.network.central_node._received_items import (
     Forgotten,
     Remark,
@@ -29,7 +27,7 @@ from ertis_numba.network.central_node._received_items import (
     Stored,
     StoredDuplicate,
 )
-from ertis_numba.network.central_node._roles import Unwanted
+from ertis_numba.network.central_node._reporting import Condition, EventReporter, text_of
 from ertis_numba.network.central_node._server_socket import ServerSocket
 from ertis_numba.network.central_node._validation import Greeting, Greetings
 from ertis_numba.network.fields import State, as_line
@@ -48,6 +46,9 @@ from ertis_numba.network.messages import (
     Welcome,
 )
 from ertis_numba.network.status import Status
+
+if TYPE_CHECKING:
+    from ertis_numba.network.processing import ImageProcessing
 
 __all__ = ["CentralNode"]
 
@@ -70,7 +71,7 @@ class CentralNode:
         Required for addresses that other machines can reach.
     archive : Archive, optional
         Storage of measurements; acks then confirm storage.
-    processing : ImageProducer, optional
+    processing : ImageProcessing, optional
         Processing of measurements into images.
     max_bytes : int
         Size of the largest accepted measurement.
@@ -97,7 +98,7 @@ class CentralNode:
         *,
         keys: ServerKeys | None = None,
         archive: Archive | None = None,
-        processing: ImageProducer | None = None,
+        processing: "ImageProcessing | None" = None,
         max_bytes: int = MAX_BYTES,
         window: int = 16,
         on_event: Callable[[dict[str, Any]], None] = lambda _: None,
