@@ -21,7 +21,7 @@ from ertis_numba.network.messages import MESSAGES, Data, Hello, Message, Refused
 from ertis_numba.settings import Settings
 
 __all__ = [
-    "Received",
+    "ReceivedMessage",
     "Unwanted",
     "entry_in",
     "handlers_of",
@@ -31,6 +31,15 @@ __all__ = [
     "require_same",
     "source_in",
 ]
+
+
+ACCEPTED: Final = tuple(kind for kind in MESSAGES if kind.senders_to("central"))
+"""Messages that the central node accepts, by their declarations."""
+
+_STREAMS: Final = 64  # Limit per peer.
+_SENSORS: Final = 1024
+_PEERS: Final = 1024
+_PEERS_OF_KEY: Final = 64
 
 
 class Unwanted(Exception):  # noqa: N818  it is an answer
@@ -56,11 +65,8 @@ class Unwanted(Exception):  # noqa: N818  it is an answer
         return Refused(code=self.code, reason=as_line(str(self)), sensor=sensor, session_id=session_id)
 
 
-ACCEPTED: Final = tuple(kind for kind in MESSAGES if kind.senders_to("central"))
-
-
 @dataclass(slots=True, eq=False)
-class Received:
+class ReceivedMessage:
     """Sender and frames of a message.
 
     Attributes
@@ -87,7 +93,7 @@ class Received:
         return self.frames[2:]
 
 
-def handlers_of(node: object) -> dict[type[Message], Callable[[Any, Received], None]]:
+def handlers_of(node: object) -> dict[type[Message], Callable[[Any, ReceivedMessage], None]]:
     """Return the handlers of all messages to the central node: its methods ``_on_KIND``.
 
     Raises
@@ -133,12 +139,6 @@ def require_role(who: Permission, message: Message) -> None:
         raise Unwanted(
             "serial", f"key {who.name} may not send for sensor {sensor}; allow it with 'ertis keys allow'", "serial"
         )
-
-
-_STREAMS: Final = 64  # Limit per peer.
-_SENSORS: Final = 1024
-_PEERS: Final = 1024
-_PEERS_OF_KEY: Final = 64
 
 
 def source_in(hello: Hello, payload: list[bytes], *, max_bytes: int) -> JournalSensor:

@@ -13,7 +13,7 @@ import zmq
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError
 from ertis_numba.network.addresses import DEFAULT_LISTEN
-from ertis_numba.network.central_node._admission import Received, Unwanted, handlers_of, read, require_role
+from ertis_numba.network.central_node._admission import ReceivedMessage, Unwanted, handlers_of, read, require_role
 from ertis_numba.network.central_node._archive import Archive
 from ertis_numba.network.central_node._images import Guarded
 from ertis_numba.network.central_node._intake import Intake
@@ -260,7 +260,7 @@ class CentralNode:
                 return
             message = read(frames)
             require_role(who, message)
-            self._handlers[type(message)](message, Received(frames, who, arrived_ns))
+            self._handlers[type(message)](message, ReceivedMessage(frames, who, arrived_ns))
         except Exception as error:  # noqa: BLE001  whatever somebody sends, the others are served
             self._fail(sender, error, message)
         else:
@@ -314,28 +314,28 @@ class CentralNode:
             ),
         )
 
-    def _on_data(self, data: Data, received: Received) -> None:
+    def _on_data(self, data: Data, received: ReceivedMessage) -> None:
         payload = [frame.buffer for frame in received.payload]
         self._intake.measure(received.sender, data, payload, received.arrived_ns)
 
-    def _on_gap(self, gap: Gap, received: Received) -> None:
+    def _on_gap(self, gap: Gap, received: ReceivedMessage) -> None:
         self._intake.miss(received.sender, gap)
 
-    def _on_ping(self, _: Ping, received: Received) -> None:
+    def _on_ping(self, _: Ping, received: ReceivedMessage) -> None:
         self._intake.ping(received.sender)
         text = self._condition.trouble or self._intake.remark(received.sender)
         self._server.send(received.sender, Pong(state=self.state, text=as_line(text)))
 
-    def _on_hello(self, hello: Hello, received: Received) -> None:
+    def _on_hello(self, hello: Hello, received: ReceivedMessage) -> None:
         key = "" if self._keys is None else received.who.public
         payload = [frame.bytes for frame in received.payload]
         self._greetings.offer(Greeting(received.frames[:2], hello, payload, key))
 
-    def _on_bye(self, _: Bye, received: Received) -> None:
+    def _on_bye(self, _: Bye, received: ReceivedMessage) -> None:
         self._greetings.forget(received.sender)
         self._intake.bye(received.sender)
 
-    def _on_askstatus(self, _: AskStatus, received: Received) -> None:
+    def _on_askstatus(self, _: AskStatus, received: ReceivedMessage) -> None:
         self._server.send(received.sender, Report(), self._condition.report())
 
     def _hear(self) -> None:

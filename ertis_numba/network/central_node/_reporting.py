@@ -23,6 +23,7 @@ __all__ = ["Condition", "EventReporter", "text_of"]
 
 _REPORT_S: Final = 0.2  # Maximum age of a requested status.
 _VERSION: Final = version("ertis-numba")
+_LOG_INTERVAL_S: Final = 1.0  # Interval between events about internal errors.
 
 
 class Condition:
@@ -123,9 +124,6 @@ def _memory_bytes() -> int:
             return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except (OSError, ValueError, IndexError):
         return 0
-
-
-_LOG_INTERVAL_S: Final = 1.0  # Interval between events about internal errors.
 
 
 class EventReporter:

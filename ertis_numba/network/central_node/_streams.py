@@ -23,6 +23,7 @@ _RECENT_S: Final = 3.0
 _DROPS_KEPT: Final = 256  # Limit per session.
 _REASONS: Final = 32  # Limit on reasons for missing numbers, per sensor.
 _NUMBERS_KEPT: Final = 512  # Limit on kept CRC-32 values, per session.
+_DROPS: Final = 32  # Limit on the drops in one ack.
 
 
 def source_of(hello: Hello, text: bytes, *, max_bytes: int) -> JournalSensor:
@@ -202,9 +203,6 @@ class PeerConnection:
     heard_s: float = 0.0
     waiting_bytes: int = 0
     key: str = ""
-
-
-_DROPS: Final = 32  # Limit on the drops in one ack.
 
 
 class Acks:

@@ -15,6 +15,9 @@ from ertis_numba.network.central_node._received_items import ReceivedItem, Senso
 __all__ = ["Checksums", "UnrecordedGaps", "Volume", "journal_name", "same", "sessions_in"]
 
 _SOURCE = "central node"
+_KEPT: Final = 65_536  # Takes about 15 MB.
+_LEARNED: Final = 1024  # Number of newest measurements of a journal left by a crash.
+_TAIL: Final = 16  # Per session: the largest window of a sensor node.
 
 
 def journal_name(folder: Path, name: str, *, end: str = "", taken: Iterable[str] = ()) -> str:
@@ -153,11 +156,6 @@ def same(one: JournalSensor, other: JournalSensor) -> bool:
         lambda sensor: sensor.rotation_xyzw,
     )
     return all(part(one) == part(other) for part in parts)
-
-
-_KEPT: Final = 65_536  # Takes about 15 MB.
-_LEARNED: Final = 1024  # Number of newest measurements of a journal left by a crash.
-_TAIL: Final = 16  # Per session: the largest window of a sensor node.
 
 
 class Checksums:
