@@ -8,7 +8,7 @@ import pytest
 from ertis_numba.errors import ArgumentError, JournalInUseError
 from ertis_numba.network import messages
 from ertis_numba.network.central_node import Archive, CentralNode
-from ertis_numba.network.central_node._condition import Condition
+from ertis_numba.network.central_node._reporting import Condition
 from ertis_numba.network.messages import Ack, Gap, Ping, Pong, Refused, Report, Welcome
 from ertis_numba.network.status import Status
 from ertis_numba.settings import Air, Recording
@@ -255,6 +255,12 @@ def test_silent_sensor_node_must_send_hello_again(tmp_path, monkeypatch):
 def test_central_node_requires_archive_or_processing():
     with pytest.raises(ArgumentError, match="neither archive nor processing"):
         CentralNode("tcp://127.0.0.1:0")
+
+
+def test_message_without_handler_is_refused_at_the_start(tmp_path, monkeypatch):
+    monkeypatch.setattr("ertis_numba.network.central_node._admission.ACCEPTED", (Ping, messages.Pong))
+    with pytest.raises(TypeError, match="CentralNode has no handler of pong; define _on_pong"):
+        CentralNode("tcp://127.0.0.1:0", archive=Archive(tmp_path))
 
 
 def test_central_node_run_requires_with_statement(tmp_path):

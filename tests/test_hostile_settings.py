@@ -11,7 +11,7 @@ from ertis_numba.documents import MAX_KEY_PARTS
 from ertis_numba.errors import ArgumentError, SettingsError
 from ertis_numba.geometry import received_settings, storable
 from ertis_numba.network.central_node import _validation
-from ertis_numba.network.central_node._roles import Unwanted
+from ertis_numba.network.central_node._admission import Unwanted
 from ertis_numba.network.central_node._validation import Greeting, Greetings
 from ertis_numba.network.messages import Ack, Hello, Refused, Welcome
 from ertis_numba.network.processing import chain

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from ertis_numba.network.central_node import _admission, _intake
+from ertis_numba.network.central_node._admission import Unwanted
 from ertis_numba.network.central_node._intake import Intake
 from ertis_numba.network.central_node._received_items import Forgotten, SensorSession, Stored
-from ertis_numba.network.central_node._roles import Unwanted
 from ertis_numba.network.messages import Ack, Gap, Hello, Refused
 from ertis_numba.settings import Air
 from tests.central import data_of

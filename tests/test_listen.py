@@ -168,7 +168,9 @@ def test_points_use_the_directions_of_each_image(capsys):
     heard, flat = MicrophoneTable(as_json=True, quiet=True), image(1, reflectors=[(0, 1.5, 1)])
     raised = replace(flat, elevation_rad=np.full_like(flat.elevation_rad, np.radians(20.0)))
     for item in (flat, raised):
-        heard.product(Arrival(item, SimpleNamespace(number=0), 0, 0, 0), SimpleNamespace(dropped=0))
+        heard.product(
+            Arrival(item, SimpleNamespace(number=0, product="energyscape"), 0, 0, 0), SimpleNamespace(dropped=0)
+        )
     found = [json.loads(line)["nearest"]["elevation_deg"] for line in capsys.readouterr().out.splitlines()]
     assert found == [0.0, 20.0]
 

@@ -4,6 +4,7 @@ import random
 
 import msgspec
 import pytest
+from ertis_cli._product_printer import PRINTERS
 from hypothesis import HealthCheck, given, settings, strategies as st
 
 from ertis_numba.errors import DataError, FormatVersionError
@@ -21,6 +22,8 @@ from ertis_numba.network.messages import (
     decode,
     encode,
 )
+from ertis_numba.network.products import _DECODERS
+from tests.faults.network.fuzz import VALID
 
 KINDS = [
     kind
@@ -47,10 +50,24 @@ WHOLE = Data(
 )
 
 
-def test_each_message_has_its_own_kind():
-    assert len(KINDS) == 17
-    assert len({kind.__struct_config__.tag for kind in KINDS}) == len(KINDS)
-    assert {kind.__struct_config__.tag for kind in KINDS} == {kind.__name__.lower() for kind in KINDS}
+def test_each_message_is_declared_once():
+    assert sorted(kind.__name__ for kind in KINDS) == sorted(kind.__name__ for kind in messages.MESSAGES)
+    kinds = [kind.__struct_config__.tag for kind in messages.MESSAGES]
+    assert kinds == [kind.kind() for kind in messages.MESSAGES]
+    assert len(set(kinds)) == len(kinds)
+    assert all(kind.routes for kind in messages.MESSAGES)
+
+
+def test_each_product_is_brought_by_one_message_with_a_decoder():
+    brought = {kind.product: kind for kind in messages.MESSAGES if kind.product}
+    assert sorted(brought) == sorted(messages.PRODUCTS)
+    assert set(brought.values()) == _DECODERS.keys()
+    assert PRINTERS.keys() == brought.keys()
+
+
+@pytest.mark.parametrize("kind", messages.MESSAGES)
+def test_valid_header_of_each_message_is_decoded(kind):
+    assert type(decode(VALID[kind.kind()])) is kind
 
 
 @given(

@@ -3,8 +3,9 @@
 import functools
 import time
 import zlib
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
@@ -12,11 +13,13 @@ from ertis_cli import options
 
 if TYPE_CHECKING:
     from ertis_numba.analysis.finder import PointFinder
-    from ertis_numba.frames import PointCloud
+    from ertis_numba.frames import Measurement, PointCloud
+    from ertis_numba.network.messages import Group
     from ertis_numba.network.products import Arrival
+    from ertis_numba.network.status import Status
     from ertis_numba.network.subscriber import SubscriberCounts
 
-__all__ = ["MicrophoneTable"]
+__all__ = ["PRINTERS", "MicrophoneTable"]
 
 _HEAD = f"{'sensor':12}  {'sequence':>8}  {'age':>8}  {'made in':>8}  {'dropped':>7}  what"
 _SOON_S = 3.0
@@ -91,15 +94,15 @@ class MicrophoneTable:
 
     def product(self, arrival: "Arrival", counts: "SubscriberCounts") -> None:
         """Print a received product."""
-        about, text = self._about(arrival)
         header = arrival.header
+        about, text = PRINTERS[header.product](self, arrival.item)
         age_s, made_in_s = arrival.age_s, arrival.made_in_s
         if self._as_json:
             stamp = {name: getattr(header, name) for name in _STAMP if hasattr(header, name)}
             times = {"age_ms": age_s, "made_in_ms": made_in_s}
             rounded = {name: None if value is None else round(1e3 * value, 3) for name, value in times.items()}
             options.print_json(
-                {"event": about.pop("product"), "number": header.number, "dropped": counts.dropped}
+                {"event": header.product, "number": header.number, "dropped": counts.dropped}
                 | stamp
                 | rounded
                 | {"arrived_ns": arrival.arrived_ns}
@@ -135,54 +138,59 @@ class MicrophoneTable:
         again = f", {options.counted(counts.reconnects, 'reconnect')}" if counts.reconnects else ""
         options.say(f"{where}{counts.received} received, {counts.dropped} dropped{again}", quiet=self._quiet)
 
-    def _about(self, arrival: "Arrival") -> tuple[dict[str, Any], str]:
-        """Return the description of a product, as JSON fields and as text."""
-        from ertis_numba.frames import Energyscape, Measurement, PointCloud
-        from ertis_numba.network.messages import Group
-
-        item = arrival.item
-        if isinstance(item, Energyscape):
-            return self._of_points("energyscape", self._find(item))
-        if isinstance(item, PointCloud):
-            return self._of_points("points", item)
-        if isinstance(item, Measurement):
-            crc32 = zlib.crc32(item.data.data)
-            return {"product": "raw", "crc32": crc32}, f"{item.data.nbytes} bytes, CRC-32 {crc32:08x}"
-        if isinstance(item, Group):
-            odd = "".join(f", {flag}" for flag in item.flags)
-            about = {"group": item.group, "sensors": item.sensors, "missing": item.missing, "flags": item.flags}
-            return {"product": "group", **about, "spread_ns": item.spread_ns}, f"{' '.join(item.sensors)}{odd}"
-        received = sum(each.received for each in item.sensors.values())
-        return (
-            {"product": "status", "state": item.state, "received": received},
-            f"{item.state}, {len(item.sensors)} sensors, {received} received",
-        )
-
     @functools.cached_property
-    def _find(self) -> "PointFinder":
+    def find(self) -> "PointFinder":
+        """Finder of points in energyscapes."""
         from ertis_numba.analysis.finder import PointFinder
 
         return PointFinder()
 
-    @staticmethod
-    def _of_points(product: str, cloud: "PointCloud") -> tuple[dict[str, Any], str]:
-        """Return the number of points and the nearest point, as JSON fields and as text."""
-        import numpy as np
-
-        about: dict[str, Any] = {"product": product, "n_points": len(cloud), "nearest": None}
-        if not len(cloud):
-            return about, "no reflector"
-        x, y, z = cloud.position_m[np.argmin(np.linalg.norm(cloud.position_m, axis=1))].tolist()
-        range_m = float(np.linalg.norm((x, y, z)))
-        azimuth_deg = float(np.degrees(np.arctan2(y, x)))
-        elevation_deg = float(np.degrees(np.arcsin(z / range_m)))
-        about["nearest"] = {
-            "azimuth_deg": round(azimuth_deg, 2),
-            "elevation_deg": round(elevation_deg, 2),
-            "range_m": round(range_m, 4),
-        }
-        return about, f"{range_m:.3f} m at {azimuth_deg:+.1f}°, {elevation_deg:+.1f}°"
-
 
 def _reported(time_s: float | None) -> str:
     return "-" if time_s is None else f"{1e3 * time_s:.1f} ms"
+
+
+def _of_points(cloud: "PointCloud") -> tuple[dict[str, Any], str]:
+    """Return the number of points and the nearest point, as JSON fields and as text."""
+    import numpy as np
+
+    about: dict[str, Any] = {"n_points": len(cloud), "nearest": None}
+    if not len(cloud):
+        return about, "no reflector"
+    x, y, z = cloud.position_m[np.argmin(np.linalg.norm(cloud.position_m, axis=1))].tolist()
+    range_m = float(np.linalg.norm((x, y, z)))
+    azimuth_deg = float(np.degrees(np.arctan2(y, x)))
+    elevation_deg = float(np.degrees(np.arcsin(z / range_m)))
+    about["nearest"] = {
+        "azimuth_deg": round(azimuth_deg, 2),
+        "elevation_deg": round(elevation_deg, 2),
+        "range_m": round(range_m, 4),
+    }
+    return about, f"{range_m:.3f} m at {azimuth_deg:+.1f}°, {elevation_deg:+.1f}°"
+
+
+def _of_measurement(item: "Measurement") -> tuple[dict[str, Any], str]:
+    crc32 = zlib.crc32(item.data.data)
+    return {"crc32": crc32}, f"{item.data.nbytes} bytes, CRC-32 {crc32:08x}"
+
+
+def _of_group(item: "Group") -> tuple[dict[str, Any], str]:
+    odd = "".join(f", {flag}" for flag in item.flags)
+    about = {"group": item.group, "sensors": item.sensors, "missing": item.missing, "flags": item.flags}
+    return about | {"spread_ns": item.spread_ns}, f"{' '.join(item.sensors)}{odd}"
+
+
+def _of_status(item: "Status") -> tuple[dict[str, Any], str]:
+    received = sum(each.received for each in item.sensors.values())
+    text = f"{item.state}, {len(item.sensors)} sensors, {received} received"
+    return {"state": item.state, "received": received}, text
+
+
+PRINTERS: Final[dict[str, Callable[[MicrophoneTable, Any], tuple[dict[str, Any], str]]]] = {
+    "energyscape": lambda table, item: _of_points(table.find(item)),
+    "points": lambda _, item: _of_points(item),
+    "raw": lambda _, item: _of_measurement(item),
+    "group": lambda _, item: _of_group(item),
+    "status": lambda _, item: _of_status(item),
+}
+"""Description of each product, as JSON fields and as text."""

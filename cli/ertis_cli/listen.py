@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ertis_cli import _network, options
-from ertis_cli._product_printer import MicrophoneTable
+from ertis_cli._product_printer import PRINTERS, MicrophoneTable
 from ertis_cli._saving import PRODUCTS as FILED, saving
 from ertis_cli._signals import stopped_by_signals
 
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
 __all__ = ["listen"]
 
-_PRODUCTS = ("energyscape", "points", "raw", "group", "status")
 _POLL_INTERVAL_S = 0.1
 
 
@@ -38,7 +37,7 @@ _POLL_INTERVAL_S = 0.1
     "--product",
     "products",
     multiple=True,
-    type=click.Choice(_PRODUCTS),
+    type=click.Choice(tuple(PRINTERS)),
     help="Product to receive; repeatable; energyscape by default.",
 )
 @click.option(

@@ -1,6 +1,6 @@
 """Field types of messages, with limits on length and size, and the fields of each measurement."""
 
-from typing import Annotated, Final, Literal
+from typing import Annotated, ClassVar, Final, Literal
 
 import msgspec
 from msgspec import Meta
@@ -17,6 +17,7 @@ __all__ = [
     "Name",
     "Number",
     "OfMeasurement",
+    "Party",
     "Position",
     "Quaternion",
     "Reason",
@@ -36,6 +37,7 @@ AckedThrough = Annotated[int, Meta(ge=-1, le=MAX_SEQUENCE)]
 Int64 = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 Uint32 = Annotated[int, Meta(ge=0, le=2**32 - 1)]
 State = Literal["storage", "processing", "fault", "closing"]
+Party = Literal["sensor", "application", "central", "publisher"]
 Position = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
@@ -46,7 +48,31 @@ def as_line(text: str) -> str:
 
 
 class Message(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="kind", tag=str.lower):
-    """Header of a message."""
+    """Header of a message. Its class declares the message once: tables, checks of roles and handlers derive from it.
+
+    Attributes
+    ----------
+    routes : tuple of (sender, receiver)
+        Nodes that send and receive the message.
+    payload : str
+        Content of its payload frames, for the documentation; empty without payload.
+    product : str
+        Product that the message brings to applications; empty for other messages.
+    """
+
+    routes: ClassVar[tuple[tuple[Party, Party], ...]] = ()
+    payload: ClassVar[str] = ""
+    product: ClassVar[str] = ""
+
+    @classmethod
+    def kind(cls) -> str:
+        """Return the name of the message in its header."""
+        return cls.__name__.lower()
+
+    @classmethod
+    def senders_to(cls, receiver: Party) -> tuple[Party, ...]:
+        """Return the nodes that may send the message to a receiver."""
+        return tuple(sender for sender, other in cls.routes if other == receiver)
 
 
 class OfMeasurement(Message, frozen=True, kw_only=True):

@@ -6,6 +6,8 @@ code, and every field of a header has a maximum length.
 """
 
 from collections.abc import Sequence
+from functools import reduce
+from operator import or_
 from typing import Annotated, Any, Final, Literal
 
 import msgspec
@@ -44,6 +46,7 @@ __all__ = [
     "HEADER_BYTES",
     "MAGIC",
     "MAX_SEQUENCE",
+    "MESSAGES",
     "PRODUCTS",
     "VERSION",
     "Ack",
@@ -91,6 +94,9 @@ class Hello(Message, frozen=True, kw_only=True):
         Mounting of the sensor on its platform; None if it is unknown.
     """
 
+    routes = (("sensor", "central"),)
+    payload = "settings (TOML)"
+
     sensor: Name
     session_id: Count
     next_sequence: Number
@@ -115,6 +121,8 @@ class Welcome(Message, frozen=True, kw_only=True):
         Highest number up to which each measurement is stored, or known to be missing; -1 if there is none.
     """
 
+    routes = (("central", "sensor"),)
+
     sensor: Name
     session_id: Count
     state: State
@@ -134,6 +142,9 @@ class Data(OfMeasurement, frozen=True, kw_only=True):
         CRC-32 of the payload.
     """
 
+    routes = (("sensor", "central"),)
+    payload = "samples"
+
     temperature_c: float
     humidity_percent: float
     pressure_pa: float
@@ -149,6 +160,8 @@ class Data(OfMeasurement, frozen=True, kw_only=True):
 
 class Gap(Message, frozen=True, kw_only=True):
     """Missing sequence numbers, ``first`` and ``last`` included, and the reason."""
+
+    routes = (("sensor", "central"),)
 
     sensor: Name
     session_id: Count
@@ -171,6 +184,8 @@ class Ack(Message, frozen=True, kw_only=True):
         Measurements that the node has discarded since the previous ack.
     """
 
+    routes = (("central", "sensor"),)
+
     sensor: Name
     session_id: Count
     acked_through: AckedThrough
@@ -181,9 +196,13 @@ class Ack(Message, frozen=True, kw_only=True):
 class Ping(Message, frozen=True, kw_only=True):
     """Sign of life of a node, sent each second; answered by a `Pong`, and by an `Ack` of every greeted session."""
 
+    routes = (("sensor", "central"), ("application", "publisher"))
+
 
 class Pong(Message, frozen=True, kw_only=True):
     """Sign of life of the central node, with its state."""
+
+    routes = (("central", "sensor"), ("publisher", "application"))
 
     state: State
     text: Line = ""
@@ -191,6 +210,8 @@ class Pong(Message, frozen=True, kw_only=True):
 
 class Bye(Message, frozen=True, kw_only=True):
     """A node disconnects normally."""
+
+    routes = (("sensor", "central"), ("application", "publisher"))
 
 
 class Refused(Message, frozen=True, kw_only=True):
@@ -207,6 +228,8 @@ class Refused(Message, frozen=True, kw_only=True):
     session_id : int
     """
 
+    routes = (("central", "sensor"), ("central", "application"), ("publisher", "application"))
+
     code: Literal["version", "message", "role", "serial", "hello", "settings", "size"]
     reason: Line
     sensor: Annotated[str, Meta(max_length=64)] = ""
@@ -216,13 +239,17 @@ class Refused(Message, frozen=True, kw_only=True):
 class AskStatus(Message, frozen=True, kw_only=True):
     """Request for a `Report`."""
 
+    routes = (("application", "central"), ("application", "publisher"))
 
-_MESSAGES = (
-    Hello | Welcome | Data | Gap | Ack | Ping | Pong | Bye | Refused | Subscribe | Description | Image | Points | Raw
-    | Group | AskStatus | Report
+
+MESSAGES: Final[tuple[type[Message], ...]] = (
+    Hello, Welcome, Data, Gap, Ack, Ping, Pong, Bye, Refused, Subscribe, Description, Image, Points, Raw, Group,
+    AskStatus, Report,
 )  # fmt: skip
+"""All messages of the network."""
+
 _encoder = msgspec.msgpack.Encoder()
-_decoder: msgspec.msgpack.Decoder[Any] = msgspec.msgpack.Decoder(_MESSAGES)
+_decoder: msgspec.msgpack.Decoder[Any] = msgspec.msgpack.Decoder(reduce(or_, MESSAGES))
 _BEGINNING: Final = MAGIC + bytes([VERSION])
 
 

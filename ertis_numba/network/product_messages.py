@@ -27,6 +27,8 @@ class Subscribe(Message, frozen=True, kw_only=True):
         Number of further products that the publisher may send.
     """
 
+    routes = (("application", "publisher"),)
+
     sensors: Annotated[tuple[Name, ...], Meta(max_length=32)] | None = None
     products: Annotated[tuple[Product, ...], Meta(min_length=1, max_length=8)]
     consumed: Count = 0
@@ -45,6 +47,9 @@ class Description(Message, frozen=True, kw_only=True):
         Number by which products refer to it, until the connection ends.
     sensor, translation_m, rotation_xyzw
     """
+
+    routes = (("publisher", "application"),)
+    payload = "settings (TOML), azimuth, elevation, range (float64)"
 
     number: Count
     sensor: Name
@@ -73,6 +78,10 @@ class Image(_Product, frozen=True, kw_only=True):
         Arrival of the measurement at the central node, and departure of the image, by a monotonic clock there.
     """
 
+    routes = (("publisher", "application"),)
+    payload = "amplitude, in frames of 512 KiB"
+    product = "energyscape"
+
     shape: tuple[Count, Count]
     dtype: Literal["float32", "float16"]
     received_ns: Int64
@@ -89,6 +98,10 @@ class Points(_Product, frozen=True, kw_only=True):
         As in `Image`.
     """
 
+    routes = (("publisher", "application"),)
+    payload = "`(point, 4)` float32: x, y, z in m, amplitude"
+    product = "points"
+
     n_points: Count
     received_ns: Int64
     published_ns: Int64
@@ -102,6 +115,10 @@ class Raw(_Product, frozen=True, kw_only=True):
     temperature_c, humidity_percent, pressure_pa : float
     crc32 : int
     """
+
+    routes = (("publisher", "application"),)
+    payload = "samples"
+    product = "raw"
 
     temperature_c: float
     humidity_percent: float
@@ -129,6 +146,9 @@ class Group(Message, frozen=True, kw_only=True):
         twice.
     """
 
+    routes = (("publisher", "application"),)
+    product = "group"
+
     number: Count
     dropped: Count
     group: Int64
@@ -151,6 +171,10 @@ class Report(Message, frozen=True, kw_only=True):
     number, dropped
         As in `Image`; 0 in the answer to `AskStatus`.
     """
+
+    routes = (("central", "application"), ("publisher", "application"))
+    payload = "status (MessagePack)"
+    product = "status"
 
     number: Count = 0
     dropped: Count = 0

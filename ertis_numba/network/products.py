@@ -1,9 +1,9 @@
 """Decoding of a publisher's messages to frames."""
 
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeAlias
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ertis_numba.errors import DataError, ErtisError
 from ertis_numba.frames import Energyscape, Measurement, PointCloud, Stamp
 from ertis_numba.geometry import received_settings
-from ertis_numba.network.messages import Description, Group, Image, Points, Raw, Report
+from ertis_numba.network.messages import Description, Group, Image, Message, Points, Raw, Report
 from ertis_numba.network.status import Status
 from ertis_numba.sample_format import sample_format
 from ertis_numba.settings import Settings
@@ -130,7 +130,7 @@ class ProductReader:
 
     def description(self, number: int) -> Description:
         """Return the description of a product."""
-        return self._of(number).header
+        return self.described(number).header
 
     def read(self, header: Header, payload: Payload) -> Item:
         """Return the frame of a message.
@@ -140,46 +140,40 @@ class ProductReader:
         DataError
             The payload contradicts its header, or has no description.
         """
-        if isinstance(header, Group):
-            return header
-        if isinstance(header, Report):
-            return Status.decode(b"".join(payload))
-        described = self._of(header.description)
-        if isinstance(header, Image):
-            return _image(header, payload, described, header.stamp)
-        if isinstance(header, Points):
-            return _points(header, payload, described, header.stamp)
-        return _measurement(header, payload, described, header.stamp)
+        return _DECODERS[type(header)](self, header, payload)
 
-    def _of(self, number: int) -> _Described:
+    def described(self, number: int) -> _Described:
+        """Return a description with its settings and axes; raises the errors of `read`."""
         if number not in self._described:
             raise DataError(f"a product refers to description {number}, which has not arrived; send it first")
         return self._described[number]
 
 
-def _image(header: Image, payload: Payload, described: _Described, stamp: Stamp) -> Energyscape:
+def _image(reader: ProductReader, header: Image, payload: Payload) -> Energyscape:
+    described = reader.described(header.description)
     azimuth_rad, elevation_rad, range_m = described.axes
     wanted = (len(azimuth_rad), len(range_m))
     if header.shape != wanted or len(elevation_rad) != len(azimuth_rad):
         raise DataError(f"an image has shape {header.shape}, but its axes give {wanted}; send matching axes")
     amplitude = _array(payload, header.shape, header.dtype).astype(np.float32, copy=False)
-    return Energyscape(amplitude, azimuth_rad, elevation_rad, range_m, described.settings, stamp)
+    return Energyscape(amplitude, azimuth_rad, elevation_rad, range_m, described.settings, header.stamp)
 
 
-def _points(header: Points, payload: Payload, described: _Described, stamp: Stamp) -> PointCloud:
+def _points(reader: ProductReader, header: Points, payload: Payload) -> PointCloud:
+    described = reader.described(header.description)
     rows = _array(payload, (header.n_points, _COLUMNS), "float32")
     return PointCloud(
         np.ascontiguousarray(rows[:, :3]),
         np.ascontiguousarray(rows[:, 3]),
         described.settings,
-        stamp,
+        header.stamp,
         described.header.translation_m,
         described.header.rotation_xyzw,
     )
 
 
-def _measurement(header: Raw, payload: Payload, described: _Described, stamp: Stamp) -> Measurement:
-    settings = described.settings
+def _measurement(reader: ProductReader, header: Raw, payload: Payload) -> Measurement:
+    settings = reader.described(header.description).settings
     wanted = sample_format(settings)
     words = _array(payload, wanted.shape, wanted.dtype.name)
     if zlib.crc32(words.data) != header.crc32:
@@ -192,7 +186,7 @@ def _measurement(header: Raw, payload: Payload, described: _Described, stamp: St
         humidity_percent=header.humidity_percent,
         pressure_pa=header.pressure_pa,
     )
-    return Measurement(words, settings if air == settings.air else settings.replace(air=air), stamp)
+    return Measurement(words, settings if air == settings.air else settings.replace(air=air), header.stamp)
 
 
 def _array(payload: Payload, shape: tuple[int, ...], dtype: str) -> NDArray[Any]:
@@ -210,3 +204,13 @@ def _array(payload: Payload, shape: tuple[int, ...], dtype: str) -> NDArray[Any]
         flat[start : start + len(frame)] = np.frombuffer(frame, np.uint8)
         start += len(frame)
     return made.astype(kind.newbyteorder("="), copy=False)
+
+
+_DECODERS: Final[dict[type[Message], Callable[[ProductReader, Any, Payload], Item]]] = {
+    Image: _image,
+    Points: _points,
+    Raw: _measurement,
+    Group: lambda _, header, __: header,
+    Report: lambda _, __, payload: Status.decode(b"".join(payload)),
+}
+"""Decoder of each product."""

@@ -1,27 +1,144 @@
-"""Admission of sensors and measurements: validation of Hello and Data messages."""
+"""Admission of messages, sensors and measurements: decoding, roles, handlers, and validation of Hello and Data."""
 
 import zlib
-from collections.abc import Mapping, Sequence
-from typing import Final
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
 
 import numpy as np
+import zmq
 
-from ertis_numba.errors import ArgumentError
+from ertis_numba.errors import ArgumentError, DataError, FormatVersionError
 from ertis_numba.frames import Measurement
 from ertis_numba.journal import JournalEntry, JournalSensor
+from ertis_numba.network import messages
+from ertis_numba.network.allow_list import Permission
 from ertis_numba.network.central_node._received_items import SensorSession
-from ertis_numba.network.central_node._roles import Unwanted
 from ertis_numba.network.central_node._streams import PeerConnection, SensorTrack, Stream, source_of
 from ertis_numba.network.central_node._volumes import same
-from ertis_numba.network.messages import Data, Hello
+from ertis_numba.network.fields import as_line
+from ertis_numba.network.messages import MESSAGES, Data, Hello, Message, Refused, Subscribe
 from ertis_numba.settings import Settings
 
-__all__ = ["entry_in", "require_room", "require_same", "source_in"]
+__all__ = [
+    "ReceivedMessage",
+    "Unwanted",
+    "entry_in",
+    "handlers_of",
+    "read",
+    "require_role",
+    "require_room",
+    "require_same",
+    "source_in",
+]
+
+
+ACCEPTED: Final = tuple(kind for kind in MESSAGES if kind.senders_to("central"))
+"""Messages that the central node accepts, by their declarations."""
 
 _STREAMS: Final = 64  # Limit per peer.
 _SENSORS: Final = 1024
 _PEERS: Final = 1024
 _PEERS_OF_KEY: Final = 64
+
+
+class Unwanted(Exception):  # noqa: N818  it is an answer
+    """Refused message.
+
+    Parameters
+    ----------
+    code : str
+        As in `ertis_numba.network.messages.Refused`.
+    reason : str
+        Reason for the sender, in one line.
+    kind : str
+        Category in the counts.
+    """
+
+    def __init__(self, code: Any, reason: str, kind: str) -> None:
+        super().__init__(reason)
+        self.code, self.kind = code, kind
+
+    def answer(self, about: Message) -> Refused:
+        """Return the answer to the sender."""
+        sensor, session_id = getattr(about, "sensor", ""), getattr(about, "session_id", 0)
+        return Refused(code=self.code, reason=as_line(str(self)), sensor=sensor, session_id=session_id)
+
+
+@dataclass(slots=True, eq=False)
+class ReceivedMessage:
+    """Sender and frames of a message.
+
+    Attributes
+    ----------
+    frames : list of zmq.Frame
+        Sender, header and payload.
+    who : Permission
+    arrived_ns : int
+        Time of arrival, by `time.monotonic_ns`.
+    """
+
+    frames: list[zmq.Frame]
+    who: Permission
+    arrived_ns: int
+
+    @property
+    def sender(self) -> bytes:
+        """Identifier of the sender."""
+        return self.frames[0].bytes
+
+    @property
+    def payload(self) -> list[zmq.Frame]:
+        """Frames after the header."""
+        return self.frames[2:]
+
+
+def handlers_of(node: object) -> dict[type[Message], Callable[[Any, ReceivedMessage], None]]:
+    """Return the handlers of all messages to the central node: its methods ``_on_KIND``.
+
+    Raises
+    ------
+    TypeError
+        A message has no handler.
+    """
+    missing = [kind.kind() for kind in ACCEPTED if not hasattr(node, f"_on_{kind.kind()}")]
+    if missing:
+        raise TypeError(
+            f"{type(node).__name__} has no handler of {', '.join(missing)}; define _on_{missing[0]}, or remove the "
+            "route to the central node from the declaration"
+        )
+    return {kind: getattr(node, f"_on_{kind.kind()}") for kind in ACCEPTED}
+
+
+def read(frames: list[zmq.Frame]) -> Message:
+    """Return the message in frames, or refuse invalid ones."""
+    if len(frames) < 2:
+        raise Unwanted("message", "a message is empty; send a header", "message")
+    try:
+        message: Message = messages.decode(frames[1].buffer, (*ACCEPTED, Subscribe))
+    except FormatVersionError as error:
+        raise Unwanted("version", str(error), "version") from error
+    except DataError as error:
+        raise Unwanted("message", str(error), "message") from error
+    if isinstance(message, Subscribe):
+        raise Unwanted(
+            "message",
+            "this address is for sensor nodes; applications use the address that 'ertis serve' prints as publish",
+            "message",
+        )
+    return message
+
+
+def require_role(who: Permission, message: Message) -> None:
+    """Refuse a message that its sender's role does not allow."""
+    if who.role not in ("admin", *message.senders_to("central")):
+        action = "request the status" if who.role == "sensor" else "send measurements"
+        raise Unwanted("role", f"key {who.name} has the role {who.role}, which may not {action}", "role")
+    sensor = getattr(message, "sensor", None)
+    if sensor is not None and not who.may_send(sensor):
+        raise Unwanted(
+            "serial", f"key {who.name} may not send for sensor {sensor}; allow it with 'ertis keys allow'", "serial"
+        )
 
 
 def source_in(hello: Hello, payload: list[bytes], *, max_bytes: int) -> JournalSensor:

@@ -1,83 +1,35 @@
-"""Interface of image processing to the central node, whose errors never stop the intake."""
+"""Image processing of the central node, whose errors never stop the intake."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any, Protocol, TypeVar
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.network.messages import Data, Hello
-from ertis_numba.network.status import Percentiles, ProcessingStatus, Status
+from ertis_numba.network.status import Status
 from ertis_numba.settings import Settings
 
-__all__ = ["Guarded", "ImageProducer"]
+if TYPE_CHECKING:
+    from ertis_numba.network.processing import ImageProcessing
+
+__all__ = ["Guarded"]
 
 _Result = TypeVar("_Result")
 
 
-class ImageCounts(Protocol):
-    """Counts of one sensor's measurements."""
-
-    published: int
-    dropped: Counter[str]
-    in_flight: int
-    queue: int
-    latency: Percentiles
-
-
-class ImageProducer(Protocol):
-    """Interface of image processing, implemented by `ertis_numba.network.processing.ImageProcessing`."""
-
-    @property
-    def refused(self) -> Mapping[str, int]:
-        """Refused applications, by reason."""
-
-    def start(self, stopping: Callable[[], bool]) -> None:
-        """Start; return early once ``stopping`` returns True."""
-
-    def register(self, hello: Hello, settings: Settings) -> None:
-        """Register a sensor."""
-
-    def offer(self, data: Data, words: NDArray[np.unsignedinteger[Any]], arrived_ns: int) -> None:
-        """Accept a measurement, whose data must not change any more; never blocks."""
-
-    def fds(self) -> Iterable[int]:
-        """Return the descriptors to poll."""
-
-    def ready(self, fd: int) -> None:
-        """Read from a descriptor."""
-
-    def tick(self, now_s: float) -> None:
-        """Do periodic work."""
-
-    def counts(self, sensor: str) -> Any:
-        """Return the counts of a sensor's measurements."""
-
-    def drain_dropped(self) -> list[tuple[str, int, int, str]]:
-        """Return new drops: sensor, session_id, sequence and reason of each."""
-
-    def status(self) -> ProcessingStatus:
-        """Return the status."""
-
-    def publish_status(self, status: Status) -> None:
-        """Publish the status to applications."""
-
-    def close(self, timeout_s: float) -> None:
-        """Close."""
-
-
 class Guarded:
-    """Image processing whose errors are reported and cost measurements at most; a `Viewer`.
+    """Image processing whose errors are reported and cost measurements at most.
 
     Parameters
     ----------
-    images : ImageProducer
+    images : ImageProcessing
     on_error : callable
         Called with the exception.
     """
 
-    def __init__(self, images: ImageProducer, on_error: Callable[[Exception], None]) -> None:
+    def __init__(self, images: "ImageProcessing", on_error: Callable[[Exception], None]) -> None:
         self._images, self._on_error = images, on_error
 
     def _try(self, act: Callable[[], _Result], instead: _Result) -> _Result:
@@ -88,7 +40,7 @@ class Guarded:
             return instead
 
     def start(self, stopping: Callable[[], bool]) -> None:
-        """Start; raise the errors of `ImageProducer.start`."""
+        """Start; raise the errors of `ImageProcessing.start`."""
         self._images.start(stopping)
 
     def register(self, hello: Hello, settings: Settings) -> None:
@@ -126,7 +78,7 @@ class Guarded:
     def _fill(self, status: Status) -> None:
         status.processing = self._images.status()
         for name, sensor in status.sensors.items():
-            counts: ImageCounts = self._images.counts(name)
+            counts = self._images.counts(name)
             sensor.published, sensor.dropped = counts.published, dict(counts.dropped)
             sensor.in_flight, sensor.queue = counts.in_flight, counts.queue
             sensor.image_latency = counts.latency

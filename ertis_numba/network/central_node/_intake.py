@@ -7,12 +7,11 @@ from typing import Final
 
 from ertis_numba.errors import ArgumentError
 from ertis_numba.journal import JournalEntry, JournalGap as NotedGap, JournalSensor
-from ertis_numba.network.central_node._acks import Acks
-from ertis_numba.network.central_node._admission import entry_in, require_room, require_same, source_in
+from ertis_numba.network.central_node._admission import Unwanted, entry_in, require_room, require_same, source_in
+from ertis_numba.network.central_node._archive import Archive
+from ertis_numba.network.central_node._images import Guarded
 from ertis_numba.network.central_node._received_items import ReceivedItem, SensorSession, Stored, StoredDuplicate
-from ertis_numba.network.central_node._roles import MeasurementConsumer, Store, Unwanted
-from ertis_numba.network.central_node._sharing import Sharing
-from ertis_numba.network.central_node._streams import PeerConnection, SensorTrack, Stream
+from ertis_numba.network.central_node._streams import Acks, PeerConnection, SensorTrack, Sharing, Stream
 from ertis_numba.network.fields import as_line
 from ertis_numba.network.messages import Data, Gap, Hello, Message, Refused
 
@@ -30,9 +29,9 @@ class Intake:
 
     Parameters
     ----------
-    store : Store or None
+    store : Archive or None
         None if nothing is stored; accepted measurements are then acknowledged at once.
-    viewer : Viewer or None
+    viewer : Guarded or None
     send : callable
         Called with a peer and a message to it.
     notify : callable
@@ -52,8 +51,8 @@ class Intake:
     def __init__(
         self,
         *,
-        store: Store | None,
-        viewer: MeasurementConsumer | None,
+        store: Archive | None,
+        viewer: Guarded | None,
         send: Callable[[bytes, Message], None],
         notify: Callable[..., None],
         on_stored: Callable[[list[ReceivedItem]], None] | None,

@@ -9,7 +9,6 @@ from typing import Final
 
 from ertis_numba.errors import ArgumentError, DataError, DiskFullError
 from ertis_numba.journal import SUFFIX, Journal, JournalEntry
-from ertis_numba.network.central_node._checksums import Checksums
 from ertis_numba.network.central_node._ledger import Ledger, read_acked_through
 from ertis_numba.network.central_node._received_items import (
     Event,
@@ -20,8 +19,7 @@ from ertis_numba.network.central_node._received_items import (
     Stored,
     StoredDuplicate,
 )
-from ertis_numba.network.central_node._unrecorded_gaps import UnrecordedGaps
-from ertis_numba.network.central_node._volumes import Volume, journal_name, sessions_in
+from ertis_numba.network.central_node._volumes import Checksums, UnrecordedGaps, Volume, journal_name, sessions_in
 
 __all__ = ["JournalStore"]
 

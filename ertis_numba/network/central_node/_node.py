@@ -6,20 +6,17 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
 import zmq
 
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError
 from ertis_numba.network.addresses import DEFAULT_LISTEN
-from ertis_numba.network.allow_list import Permission
+from ertis_numba.network.central_node._admission import ReceivedMessage, Unwanted, handlers_of, read, require_role
 from ertis_numba.network.central_node._archive import Archive
-from ertis_numba.network.central_node._condition import Condition
-from ertis_numba.network.central_node._event_reporting import EventReporter, text_of
-from ertis_numba.network.central_node._images import Guarded, ImageProducer
+from ertis_numba.network.central_node._images import Guarded
 from ertis_numba.network.central_node._intake import Intake
-from ertis_numba.network.central_node._reading import read, require_role
 from ertis_numba.network.central_node._received_items import (
     Forgotten,
     Remark,
@@ -30,7 +27,7 @@ from ertis_numba.network.central_node._received_items import (
     Stored,
     StoredDuplicate,
 )
-from ertis_numba.network.central_node._roles import Unwanted
+from ertis_numba.network.central_node._reporting import Condition, EventReporter, text_of
 from ertis_numba.network.central_node._server_socket import ServerSocket
 from ertis_numba.network.central_node._validation import Greeting, Greetings
 from ertis_numba.network.fields import State, as_line
@@ -49,6 +46,9 @@ from ertis_numba.network.messages import (
     Welcome,
 )
 from ertis_numba.network.status import Status
+
+if TYPE_CHECKING:
+    from ertis_numba.network.processing import ImageProcessing
 
 __all__ = ["CentralNode"]
 
@@ -71,7 +71,7 @@ class CentralNode:
         Required for addresses that other machines can reach.
     archive : Archive, optional
         Storage of measurements; acks then confirm storage.
-    processing : ImageProducer, optional
+    processing : ImageProcessing, optional
         Processing of measurements into images.
     max_bytes : int
         Size of the largest accepted measurement.
@@ -98,7 +98,7 @@ class CentralNode:
         *,
         keys: ServerKeys | None = None,
         archive: Archive | None = None,
-        processing: ImageProducer | None = None,
+        processing: "ImageProcessing | None" = None,
         max_bytes: int = MAX_BYTES,
         window: int = 16,
         on_event: Callable[[dict[str, Any]], None] = lambda _: None,
@@ -123,6 +123,7 @@ class CentralNode:
         self._condition = Condition(
             listen, self._server, self._intake, archive=archive, images=self._images, keys=keys is not None
         )
+        self._handlers = handlers_of(self)
         self._greetings = Greetings(self._intake.read)
         self._archive_fd = self._greetings_fd = -1
         self._stopping = threading.Event()
@@ -259,7 +260,7 @@ class CentralNode:
                 return
             message = read(frames)
             require_role(who, message)
-            self._take(frames, who, message, arrived_ns)
+            self._handlers[type(message)](message, ReceivedMessage(frames, who, arrived_ns))
         except Exception as error:  # noqa: BLE001  whatever somebody sends, the others are served
             self._fail(sender, error, message)
         else:
@@ -313,25 +314,29 @@ class CentralNode:
             ),
         )
 
-    def _take(self, frames: list[zmq.Frame], who: Permission, message: Message, arrived_ns: int) -> None:
-        sender = frames[0].bytes
-        match message:
-            case Data():
-                self._intake.measure(sender, message, [frame.buffer for frame in frames[2:]], arrived_ns)
-            case Gap():
-                self._intake.miss(sender, message)
-            case Ping():
-                self._intake.ping(sender)
-                text = self._condition.trouble or self._intake.remark(sender)
-                self._server.send(sender, Pong(state=self.state, text=as_line(text)))
-            case Hello():
-                key = "" if self._keys is None else who.public
-                self._greetings.offer(Greeting(frames[:2], message, [frame.bytes for frame in frames[2:]], key))
-            case Bye():
-                self._greetings.forget(sender)
-                self._intake.bye(sender)
-            case AskStatus():
-                self._server.send(sender, Report(), self._condition.report())
+    def _on_data(self, data: Data, received: ReceivedMessage) -> None:
+        payload = [frame.buffer for frame in received.payload]
+        self._intake.measure(received.sender, data, payload, received.arrived_ns)
+
+    def _on_gap(self, gap: Gap, received: ReceivedMessage) -> None:
+        self._intake.miss(received.sender, gap)
+
+    def _on_ping(self, _: Ping, received: ReceivedMessage) -> None:
+        self._intake.ping(received.sender)
+        text = self._condition.trouble or self._intake.remark(received.sender)
+        self._server.send(received.sender, Pong(state=self.state, text=as_line(text)))
+
+    def _on_hello(self, hello: Hello, received: ReceivedMessage) -> None:
+        key = "" if self._keys is None else received.who.public
+        payload = [frame.bytes for frame in received.payload]
+        self._greetings.offer(Greeting(received.frames[:2], hello, payload, key))
+
+    def _on_bye(self, _: Bye, received: ReceivedMessage) -> None:
+        self._greetings.forget(received.sender)
+        self._intake.bye(received.sender)
+
+    def _on_askstatus(self, _: AskStatus, received: ReceivedMessage) -> None:
+        self._server.send(received.sender, Report(), self._condition.report())
 
     def _hear(self) -> None:
         """Process the results of the archive."""

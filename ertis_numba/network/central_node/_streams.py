@@ -1,27 +1,29 @@
-"""Greeted sessions with their next numbers, and the counts of each sensor."""
+"""Greeted sessions with their next numbers and acknowledgements, and the counts of each sensor."""
 
 import time
 from collections import Counter, OrderedDict, deque
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import count
-from typing import Final
+from typing import Final, Literal
 
 from ertis_numba.errors import ArgumentError, SettingsError
 from ertis_numba.geometry import received_settings
 from ertis_numba.journal import JournalSensor
 from ertis_numba.network.central_node._received_items import SensorSession
-from ertis_numba.network.messages import Data, Hello
-from ertis_numba.network.status import SensorStatus
+from ertis_numba.network.messages import Ack, Data, Hello, Message
+from ertis_numba.network.status import Latencies, SensorStatus
 from ertis_numba.settings import Air, Settings
 
-__all__ = ["PeerConnection", "SensorTrack", "Stream", "source_of"]
+__all__ = ["Acks", "PeerConnection", "SensorTrack", "Sharing", "Stream", "source_of"]
 
 _turns = count()
 _RECENT_S: Final = 3.0
 _DROPS_KEPT: Final = 256  # Limit per session.
 _REASONS: Final = 32  # Limit on reasons for missing numbers, per sensor.
 _NUMBERS_KEPT: Final = 512  # Limit on kept CRC-32 values, per session.
+_DROPS: Final = 32  # Limit on the drops in one ack.
 
 
 def source_of(hello: Hello, text: bytes, *, max_bytes: int) -> JournalSensor:
@@ -201,3 +203,106 @@ class PeerConnection:
     heard_s: float = 0.0
     waiting_bytes: int = 0
     key: str = ""
+
+
+class Acks:
+    """Pending acks, one per session for any number of measurements.
+
+    Parameters
+    ----------
+    send : callable
+        Called with a peer and a message to it.
+    status : {"stored", "accepted"}
+        Place of acknowledged measurements: on disk, or in memory.
+
+    Attributes
+    ----------
+    latencies : Latencies
+        Time from the arrival of a measurement to its ack.
+    """
+
+    def __init__(self, send: Callable[[bytes, Message], None], status: Literal["stored", "accepted"]) -> None:
+        self._send: Final = send
+        self._status: Final = status
+        self._due: dict[tuple[str, int], Stream] = {}  # By sensor and session.
+        self._arrived_s: list[float] = []
+        self.latencies = Latencies()
+
+    def owe(self, stream: Stream) -> None:
+        """Schedule an ack of a session."""
+        self._due[stream.run] = stream
+
+    def acked_through(self, arrived_s: float) -> None:
+        """Count a measurement that the next ack acknowledges."""
+        self._arrived_s.append(arrived_s)
+
+    def forget(self, stream: Stream) -> None:
+        """Send no more acks for a session."""
+        self._due.pop(stream.run, None)
+
+    def send(self) -> None:
+        """Send pending acks."""
+        for (sensor, session_id), stream in self._due.items():
+            if not stream.owner:
+                continue
+            dropped = tuple(stream.dropped.popleft() for _ in range(min(_DROPS, len(stream.dropped))))
+            ack = Ack(
+                sensor=sensor,
+                session_id=session_id,
+                acked_through=stream.acked_through,
+                status=self._status,
+                dropped=dropped,
+            )
+            self._send(stream.owner, ack)
+        self._due.clear()
+        if self._arrived_s:
+            now_s = time.monotonic()
+            for arrived_s in self._arrived_s:
+                self.latencies.add(1e3 * (now_s - arrived_s))
+            self._arrived_s.clear()
+
+
+class Sharing:
+    """Detector of sensors that several nodes send; reports each once.
+
+    Parameters
+    ----------
+    notify : callable
+        Called with the name of an event and its fields.
+    """
+
+    def __init__(self, notify: Callable[..., None]) -> None:
+        self._emit_event = notify
+        self._sensors: set[str] = set()
+
+    @staticmethod
+    def joins(track: SensorTrack, peer_id: bytes, now_s: float) -> None:
+        """Register that a node sends a sensor."""
+        if track.peers - {peer_id} and peer_id not in track.peers:
+            track.shared_s = now_s
+        track.peers.add(peer_id)
+
+    def leaves(self, track: SensorTrack, sensor: str, peer_id: bytes) -> None:
+        """Register that a node no longer sends a sensor."""
+        track.peers.discard(peer_id)
+        if len(track.peers) < 2:
+            self._sensors.discard(sensor)
+
+    def tick(self, tracks: Mapping[str, SensorTrack], peers: Mapping[bytes, PeerConnection]) -> None:
+        """Report new ones."""
+        for sensor, track in tracks.items():
+            # A reconnected node may be noticed as gone only seconds later.
+            if track.shared_s and all(peers[each].heard_s > track.shared_s for each in track.peers):
+                track.shared_s = 0.0
+                if len(track.peers) > 1:
+                    self._sensors.add(sensor)
+                    self._emit_event(
+                        "shared", sensor=sensor, text="several sensor nodes send it; give each its own name"
+                    )
+
+    def remark(self, peer: PeerConnection | None) -> str:
+        """Return a remark for a node, one line; empty if there is none."""
+        shared = () if peer is None else sorted(self._sensors & {run.sensor for run in peer.streams})
+        if not shared:
+            return ""
+        return f"another sensor node sends sensor {shared[0]}, too; give each its own name (--name), or end one"

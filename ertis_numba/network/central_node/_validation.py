@@ -9,7 +9,7 @@ from typing import Final
 import zmq
 
 from ertis_numba.journal import JournalSensor
-from ertis_numba.network.central_node._roles import Unwanted
+from ertis_numba.network.central_node._admission import Unwanted
 from ertis_numba.network.messages import Hello
 from ertis_numba.network.wakeup_socket import WakeupSocket
 

@@ -1,19 +1,23 @@
-"""Journals of an archive: names, and the measurements that fit into each."""
+"""Journals of an archive, and the checksums and gaps to keep when a journal is sealed."""
 
 import re
 import time
-from collections.abc import Callable, Iterable
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Self
+from typing import Final, Self
 
 from ertis_numba.errors import DamagedError
 from ertis_numba.journal import SUFFIX, Journal, JournalEntry, JournalGap, JournalSensor
 from ertis_numba.network.central_node._received_items import ReceivedItem, SensorSession
 
-__all__ = ["Volume", "journal_name", "same", "sessions_in"]
+__all__ = ["Checksums", "UnrecordedGaps", "Volume", "journal_name", "same", "sessions_in"]
 
 _SOURCE = "central node"
+_KEPT: Final = 65_536  # Takes about 15 MB.
+_LEARNED: Final = 1024  # Number of newest measurements of a journal left by a crash.
+_TAIL: Final = 16  # Per session: the largest window of a sensor node.
 
 
 def journal_name(folder: Path, name: str, *, end: str = "", taken: Iterable[str] = ()) -> str:
@@ -152,3 +156,80 @@ def same(one: JournalSensor, other: JournalSensor) -> bool:
         lambda sensor: sensor.rotation_xyzw,
     )
     return all(part(one) == part(other) for part in parts)
+
+
+class Checksums:
+    """CRC-32 of the newest measurements by session and number.
+
+    Parameters
+    ----------
+    tails : mapping of SensorSession to dict of int to int
+        CRC-32 by session and number, from earlier processes.
+    """
+
+    def __init__(self, tails: Mapping[SensorSession, Mapping[int, int]]) -> None:
+        self._kept: OrderedDict[tuple[SensorSession, int], int] = OrderedDict()
+        for run, numbers in tails.items():
+            for number, crc32 in numbers.items():
+                self._kept[run, number] = crc32
+
+    def find(self, run: SensorSession, number: int) -> int | None:
+        """Return the CRC-32 of a measurement; None if it is not kept."""
+        return self._kept.get((run, number))
+
+    def add(self, run: SensorSession, number: int, crc32: int) -> None:
+        """Keep the CRC-32 of a measurement that is stored."""
+        self._kept[run, number] = crc32
+        if len(self._kept) > _KEPT:
+            self._kept.popitem(last=False)
+
+    def learn(self, journal: Journal) -> None:
+        """Keep the CRC-32 of the newest measurements of a journal."""
+        for sensor, session_id, number, crc32 in journal.newest(_LEARNED):
+            self.add(SensorSession(sensor, session_id), number, crc32)
+
+    def tails(self, runs: Iterable[SensorSession]) -> dict[SensorSession, dict[int, int]]:
+        """Return the CRC-32 of the newest measurements of given sessions, for the next process."""
+        found: dict[SensorSession, dict[int, int]] = {run: {} for run in runs}
+        for (run, number), crc32 in reversed(self._kept.items()):
+            if run in found and len(found[run]) < _TAIL:
+                found[run][number] = crc32
+        return {run: dict(sorted(numbers.items())) for run, numbers in found.items() if numbers}
+
+
+class UnrecordedGaps:
+    """Gaps of sensors without a measurement in their journal, so that its recording cannot contain them.
+
+    The next recording with a measurement of the sensor contains them. Until then the ledger keeps them, so that the
+    reasons for missing numbers are never lost. A gap that is recorded twice, after a crash, is harmless.
+
+    Parameters
+    ----------
+    gaps : iterable of JournalGap
+    """
+
+    def __init__(self, gaps: Iterable[JournalGap]) -> None:
+        self._gaps = dict.fromkeys(gaps)
+
+    @property
+    def gaps(self) -> list[JournalGap]:
+        """All gaps, in order of arrival."""
+        return list(self._gaps)
+
+    def learn(self, journal: Journal) -> None:
+        """Add the gaps of a journal to seal."""
+        gaps = journal.gaps
+        if gaps:
+            measured = {key.sensor for key in journal.index()}
+            self.reported(gap for gap in gaps if gap.sensor in measured)
+            self._gaps |= dict.fromkeys(gap for gap in gaps if gap.sensor not in measured)
+
+    def of(self, sensors: Iterable[str]) -> list[JournalGap]:
+        """Return the gaps of given sensors."""
+        wanted = set(sensors) if self._gaps else set()
+        return [gap for gap in self._gaps if gap.sensor in wanted]
+
+    def reported(self, gaps: Iterable[JournalGap]) -> None:
+        """Remove gaps that a journal with measurements of their sensor now contains durably."""
+        for gap in gaps:
+            self._gaps.pop(gap, None)

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Final
 
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError
@@ -22,10 +22,6 @@ _AIR_STEPS: Final = {"temperature_c": 0.5, "humidity_percent": 5.0, "pressure_pa
 _MAX_BYTES: Final = 256_000_000  # Limit on an image as float32.
 _AGAIN_S: Final = 60.0  # Delay before a pipeline that failed is tried again …
 _GREETED_S: Final = 10.0  # … and after a Hello of its sensor.
-
-
-class _Describe(Protocol):
-    def __call__(self, description: Description, payloads: tuple[bytes, ...]) -> None: ...
 
 
 @dataclass(slots=True)
@@ -67,7 +63,12 @@ class Sensors:
     """
 
     def __init__(
-        self, options: ProcessingOptions, log: EventLog, *, describe: _Describe, prepare: Callable[[JobKind], None]
+        self,
+        options: ProcessingOptions,
+        log: EventLog,
+        *,
+        describe: Callable[[Description, tuple[bytes, ...]], None],
+        prepare: Callable[[JobKind], None],
     ) -> None:
         self._options, self._log, self._emit_event, self._prepare = options, log, describe, prepare
         self._known: dict[str, RegisteredSensor] = {}

@@ -7,30 +7,61 @@ from collections.abc import Callable, Iterator
 from typing import Final
 
 import msgspec
+from msgspec import inspect
 
+from ertis_numba.network.messages import MAGIC, MESSAGES, PRODUCTS, VERSION, Message
 from ertis_numba.settings import Recording, Settings
 
 __all__ = ["VALID", "inputs"]
 
-_MAGIC: Final = b"eRTN\x01"
-_SENSOR: Final = {"sensor": "fuzz", "session_id": 1}
+_MAGIC: Final = MAGIC + bytes([VERSION])
 _BYTES: Final = 4 * 4096
 _SETTINGS: Final = Settings(recording=Recording(n_samples=_BYTES // 4)).to_toml().encode()
-_PRODUCTS: Final = ("energyscape", "points", "raw", "group", "status")
-_STAMPS: Final = {"sequence": 0, "sync_count": 0, "timestamp_ns": 0, "uncertainty_ns": 0, "monotonic_ns": 0}
-_AIR: Final = {"temperature_c": 20.0, "humidity_percent": 50.0, "pressure_pa": 101_325.0}
-_FIELDS: Final[dict[str, dict[str, object]]] = {
-    "hello": _SENSOR | {"next_sequence": 0, "settings_crc32": zlib.crc32(_SETTINGS)},
-    "data": _SENSOR | _STAMPS | _AIR | {"crc32": 1},
-    "gap": _SENSOR | {"first": 0, "last": 3, "reason": "fuzz"},
-    "ping": {},
-    "bye": {},
-    "ack": _SENSOR | {"acked_through": 5, "status": "stored"},
-    "welcome": _SENSOR | {"state": "storage", "acks": "stored", "window": 16, "acked_through": 3},
-    "subscribe": {"products": ["energyscape", "status"], "consumed": 0, "credit": 2},
-    "askstatus": {},
-    "refused": {"code": "hello", "reason": "fuzz"},
+_VALUES: Final[dict[str, object]] = {
+    "session_id": 1,
+    "settings_crc32": zlib.crc32(_SETTINGS),
+    "temperature_c": 20.0,
+    "humidity_percent": 50.0,
+    "pressure_pa": 101_325.0,
+    "crc32": 1,
+    "last": 3,
+    "acked_through": 5,
+    "products": ["energyscape", "status"],
 }
+"""Values of fields by name; other fields get a value of their type."""
+
+
+def _value(declared: inspect.Type) -> object:
+    """Return a valid value of a type."""
+    match declared:
+        case inspect.IntType():
+            return max(0, declared.ge or 0)
+        case inspect.FloatType():
+            return 0.0
+        case inspect.StrType():
+            return "fuzz"
+        case inspect.LiteralType():
+            return declared.values[0]
+        case inspect.TupleType():
+            return [_value(item) for item in declared.item_types]
+        case inspect.VarTupleType():
+            return []
+    raise TypeError(f"no value of {declared} is defined; add a case, or the field to _VALUES")
+
+
+def _fields(kind: type[Message]) -> dict[str, object]:
+    """Return the required fields of a message, all valid."""
+    declared = inspect.type_info(kind)
+    if not isinstance(declared, inspect.StructType):
+        raise TypeError(f"{kind.__name__} is not a structure; declare messages as in ertis_numba.network.messages")
+    return {
+        field.name: _VALUES[field.name] if field.name in _VALUES else _value(field.type)
+        for field in declared.fields
+        if field.required
+    }
+
+
+_FIELDS: Final = {kind.kind(): _fields(kind) for kind in MESSAGES}
 
 
 def _header(kind: str, fields: dict[str, object]) -> bytes:
@@ -38,7 +69,7 @@ def _header(kind: str, fields: dict[str, object]) -> bytes:
 
 
 VALID: Final = {kind: _header(kind, fields) for kind, fields in _FIELDS.items()}
-"""Valid header of each kind that a node could send. None of them delivers a measurement."""
+"""Valid header of each message. None of them delivers a measurement."""
 
 _ODD_VALUES: Final[tuple[object, ...]] = (
     None, True, -1, 2**63, 2**64 - 1, -(2**63), 1e308, float("nan"), float("inf"), "", "x" * 300, "../../etc", "\0",
@@ -102,7 +133,7 @@ def _plausible(rng: random.Random) -> list[bytes]:
         case 2:
             return [_header("bye", {})]
         case 3:
-            wanted = {"products": rng.sample(_PRODUCTS, rng.randint(1, 5)), "consumed": number, "credit": 64}
+            wanted = {"products": rng.sample(PRODUCTS, rng.randint(1, 5)), "consumed": number, "credit": 64}
             return [_header("subscribe", wanted)]
         case 4:
             payload = rng.randbytes(rng.choice((_BYTES, _BYTES, 0, _BYTES - 4)))
