@@ -112,6 +112,7 @@ def reason_unreadable(error: OSError | UnicodeDecodeError) -> str:
 
     Examples
     --------
+    >>> from ertis_numba.errors import reason_unreadable
     >>> reason_unreadable(FileNotFoundError(2, "No such file or directory"))
     'No such file or directory'
     """

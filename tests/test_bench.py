@@ -61,7 +61,7 @@ def test_paper_command_reports_and_updates(tmp_path):
     report = json.loads(result.stdout)
     assert {"cpu", "cores", "python", "numpy", "numba"} <= report["machine"].keys()
     assert [(row["backend"], row["directions"]) for row in report["rows"]] == [
-        (backend, directions) for directions in (90, 1850, 3000) for backend in ("scipy", "numpy", "cpu")
+        (backend, directions) for directions in (90, 1850, 3000) for backend in ("scipy", "paper", "numpy", "cpu")
     ]
     assert all(set(row) == {"backend", "directions", "mean_ms", "std_ms", "median_ms"} for row in report["rows"])
     assert all(row["median_ms"] > 0 for row in report["rows"])
