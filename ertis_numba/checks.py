@@ -22,6 +22,7 @@ __all__ = [
     "items",
     "length",
     "positive",
+    "reason_unreadable",
     "sensor_name",
     "sequence_gap",
     "shape",
@@ -136,3 +137,17 @@ def sequence_gap(first: int, last: int, reason: str) -> None:
     integer("last missing sequence number", last, integer("first missing sequence number", first, 0), 2**63 - 1)
     if not reason or not reason.isprintable() or len(reason.encode()) > _MAX_REASON_BYTES:
         raise ArgumentError(f"reason of a gap is {reason!r}; give a line of 1 to {_MAX_REASON_BYTES} bytes")
+
+
+def reason_unreadable(error: OSError | UnicodeDecodeError) -> str:
+    """Return why a text file cannot be read, in words.
+
+    Examples
+    --------
+    >>> from ertis_numba.checks import reason_unreadable
+    >>> reason_unreadable(FileNotFoundError(2, "No such file or directory"))
+    'No such file or directory'
+    """
+    if isinstance(error, UnicodeDecodeError):
+        return f"it is not text in UTF-8 (byte {error.object[error.start]:#04x} at position {error.start})"
+    return error.strerror or str(error)

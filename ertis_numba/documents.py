@@ -17,7 +17,8 @@ from typing import Any, ClassVar, Final, Literal, Self, get_args, get_origin
 import msgspec
 import tomli_w
 
-from ertis_numba.errors import ArgumentError, SettingsError, reason_unreadable
+from ertis_numba import checks
+from ertis_numba.errors import ArgumentError, SettingsError
 
 __all__ = ["MAX_KEY_PARTS", "TomlDocument", "TomlTable"]
 
@@ -238,7 +239,7 @@ class TomlDocument(TomlTable, frozen=True, kw_only=True):
         try:
             text = path.read_text(encoding="utf-8-sig")
         except (OSError, UnicodeDecodeError) as error:
-            reason = reason_unreadable(error)
+            reason = checks.reason_unreadable(error)
             raise SettingsError(f"{path}: {reason}; give a readable {cls.__name__.lower()} file") from error
         return cls.from_toml(text, str(path)), msgspec.toml.decode(cls._renamed(text))
 

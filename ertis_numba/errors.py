@@ -39,7 +39,6 @@ __all__ = [
     "SettingsError",
     "SonarDisconnectedError",
     "SonarError",
-    "reason_unreadable",
 ]
 
 
@@ -105,17 +104,3 @@ class ErrorBudgetWarning(UserWarning):
 
 class CallMismatchWarning(UserWarning):
     """Echoes do not match the call in the settings, so that ranges in images are wrong."""
-
-
-def reason_unreadable(error: OSError | UnicodeDecodeError) -> str:
-    """Return why a text file cannot be read, in words.
-
-    Examples
-    --------
-    >>> from ertis_numba.errors import reason_unreadable
-    >>> reason_unreadable(FileNotFoundError(2, "No such file or directory"))
-    'No such file or directory'
-    """
-    if isinstance(error, UnicodeDecodeError):
-        return f"it is not text in UTF-8 (byte {error.object[error.start]:#04x} at position {error.start})"
-    return error.strerror or str(error)

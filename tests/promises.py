@@ -1,8 +1,4 @@
-"""Documented time limits, scaled for slower machines.
-
-The limits apply to a machine that imports the libraries of all commands in 0.4 s. That time is an estimate, not a
-measurement. A machine with slower imports may take proportionally longer.
-"""
+"""Promised times, as multiples of the time of importing the libraries, which is measured in the same run."""
 
 import functools
 import subprocess
@@ -12,27 +8,26 @@ import time
 import numpy as np
 
 IMPORTS = [sys.executable, "-c", "import numba, scipy.fft, h5py"]
-IMPORTS_S = 0.4
 
 
-def best_s(once, *, times, promised_s):
-    """Seconds of the fastest run, scaled to the assumed machine; stop after the first run within the limit."""
+def best_ratio(once, *, times, promised):
+    """Time of the fastest run divided by the time of the imports; stop after the first run within the promise."""
     best = np.inf
     for _ in range(times):
         start = time.perf_counter()
         once()
-        best = min(best, (time.perf_counter() - start) / slowness())
-        if best < promised_s:
+        best = min(best, (time.perf_counter() - start) / imports_s())
+        if best < promised:
             break
     return best
 
 
 @functools.cache
-def slowness():
-    """Import time on this machine relative to the assumed one, at least 1."""
+def imports_s():
+    """Shortest time of an interpreter that imports the libraries of all commands."""
     taken_s = []
     for _ in range(5):
         start = time.perf_counter()
         subprocess.run(IMPORTS, check=True)
         taken_s.append(time.perf_counter() - start)
-    return max(1.0, min(taken_s) / IMPORTS_S)
+    return min(taken_s)

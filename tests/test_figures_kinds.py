@@ -18,7 +18,7 @@ from ertis_numba.settings import Array, Processing, Recording, Settings
 from ertis_numba.waveform import call_at
 from tests.cases import words_of
 from tests.files import image
-from tests.promises import best_s
+from tests.promises import best_ratio
 
 STAMP = Stamp(sensor="eRTIS-7", sequence=12, timestamp_ns=1_700_000_000_123_456_789)
 SETTINGS = Settings(recording=Recording(n_samples=81_920), processing=Processing(range_m=(0.5, 2.4)))
@@ -216,18 +216,18 @@ def test_picture_files_are_small_and_reproducible(kind):
 
 @pytest.mark.alone
 @pytest.mark.parametrize("draw", [figures.plot, figures.slices, figures.projection])
-def test_large_images_are_drawn_within_2_s(draw):
+def test_large_images_are_drawn_within_five_imports(draw):
     big = solid(3000, range_m=np.linspace(0.5, 5.0, 1178))
     once = lambda: figures.save(draw(big, peaks=PEAKS), io.BytesIO(), format="png")  # noqa: E731
-    assert best_s(once, times=3, promised_s=2) < 2
+    assert best_ratio(once, times=3, promised=5) < 5
 
 
 @pytest.mark.alone
 @pytest.mark.parametrize("draw", [figures.signals, figures.matched_filter])
-def test_recordings_are_drawn_within_2_s(draw):
+def test_recordings_are_drawn_within_five_imports(draw):
     measurement = heard(settings=Settings.from_preset("default_25_50"))
     once = lambda: figures.save(draw(measurement), io.BytesIO(), format="png")  # noqa: E731
-    assert best_s(once, times=3, promised_s=2) < 2
+    assert best_ratio(once, times=3, promised=5) < 5
 
 
 @pytest.mark.parametrize(

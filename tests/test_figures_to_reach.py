@@ -15,21 +15,21 @@ from ertis_numba.geometry import unit_vectors
 from ertis_numba.settings import Processing, Settings
 from tests import reference
 from tests.cases import noise
-from tests.promises import best_s
+from tests.promises import best_ratio
 from tests.test_real import RAW
 
 ERTIS = [sys.executable, "-m", "ertis_cli"]
 
 
-def seconds(command, *, times, promised_s, **options):
-    """Return the shortest time of some runs, and the output of the last one."""
+def ratio(command, *, times, promised, **options):
+    """Return the shortest time of some runs relative to the imports, and the output of the last one."""
     stated = []
 
     def once():
         done = subprocess.run([*map(str, command)], capture_output=True, text=True, check=True, **options)
         stated.append(done.stderr)
 
-    return best_s(once, times=times, promised_s=promised_s), stated[-1]
+    return best_ratio(once, times=times, promised=promised), stated[-1]
 
 
 @pytest.fixture(scope="module")
@@ -41,26 +41,26 @@ def recording(tmp_path_factory):
 
 
 @pytest.mark.alone
-def test_help_answers_in_0_3_s():
-    assert seconds([*ERTIS, "--help"], times=5, promised_s=0.3)[0] < 0.3
+def test_help_takes_less_time_than_importing_the_libraries():
+    assert ratio([*ERTIS, "--help"], times=5, promised=0.75)[0] < 0.75
 
 
 @pytest.mark.alone
-def test_warm_process_of_one_measurement_takes_less_than_1_5_s(recording, tmp_path):
+def test_warm_process_of_one_measurement_takes_less_time_than_four_imports(recording, tmp_path):
     command = [*ERTIS, "process", recording, "-o", tmp_path / "image.h5", "--directions", "3000", "--force"]
-    assert seconds(command, times=6, promised_s=1.5)[0] < 1.5
+    assert ratio(command, times=6, promised=3.75)[0] < 3.75
 
 
 @pytest.mark.alone
-def test_first_run_takes_less_than_12_s_and_reports_compilation(recording, tmp_path):
+def test_first_run_takes_less_time_than_30_imports_and_reports_compilation(recording, tmp_path):
     for run in ("first", "again"):  # nothing of the first one is left to the other
         environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / run)}
         command = [*ERTIS, "process", recording, "-o", tmp_path / f"{run}.h5", "--directions", "3000"]
-        taken_s, stated = seconds(command, times=1, promised_s=12, env=environment)
+        found, stated = ratio(command, times=1, promised=30, env=environment)
         assert "a first run compiles kernels" in stated
-        if taken_s < 12:
+        if found < 30:
             break
-    assert taken_s < 12
+    assert found < 30
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="only Linux says how large a process ever was")

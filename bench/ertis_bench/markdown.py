@@ -4,7 +4,8 @@ from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from ertis_numba.errors import ArgumentError, reason_unreadable
+from ertis_numba import checks
+from ertis_numba.errors import ArgumentError
 
 __all__ = ["around", "place", "table", "update"]
 
@@ -42,7 +43,7 @@ def around(path: Path, marker: str) -> tuple[str, str]:
     try:
         content = path.read_text("utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise ArgumentError(f"{path}: {reason_unreadable(error)}; give a readable Markdown file") from error
+        raise ArgumentError(f"{path}: {checks.reason_unreadable(error)}; give a readable Markdown file") from error
     head, found, rest = content.partition(begin)
     _, closed, tail = rest.partition(end)
     if not (found and closed):

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ertis_numba import air, checks
 from ertis_numba.arrays._arguments import band_of, numbers_of
-from ertis_numba.arrays._device import on_device, window_from_start
+from ertis_numba.arrays._device import on_device
 from ertis_numba.arrays._geometry import directions_of, ranges_of, weights_of
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import unit_vectors
@@ -19,6 +19,7 @@ from ertis_numba.stages.beamform import BeamformFloat32
 from ertis_numba.stages.delays import DelayTable, Zone
 from ertis_numba.stages.fitting import WAVES, DelayFit, Spectrum, one_thread
 from ertis_numba.stages.focal_zones import NEAREST_M, zone_edges
+from ertis_numba.stages.window import TimeWindow
 
 __all__ = ["beamform"]
 
@@ -148,7 +149,7 @@ def beamform(
             spectra, spacing_hz, start_s=start_s, rate_hz=output_rate_hz, n_phases=n_phases,
             n_outputs=len(range_m) + 2 * lead,
         )  # fmt: skip
-        window = window_from_start(n_samples=0, n_fft=0, n_outputs=analytic.shape[2])
+        window = TimeWindow.from_start(0, n_fft=0, n_outputs=analytic.shape[2])
         with on_device(device, threads) as here:
             sent = here.lane.send(analytic)
             image = here.memory.zeros((len(angles_rad), len(range_m)), np.float32)

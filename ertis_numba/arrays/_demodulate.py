@@ -7,10 +7,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ertis_numba import checks
-from ertis_numba.arrays._device import on_device, window_from_start
+from ertis_numba.arrays._device import on_device
 from ertis_numba.constants import MAX_MICROPHONES
 from ertis_numba.errors import ArgumentError
 from ertis_numba.stages.demodulate import Demodulate, DemodulatePdm, FilterPcm
+from ertis_numba.stages.window import TimeWindow
 from ertis_numba.waveform import decimation_taps, integer_taps
 
 __all__ = ["demodulate"]
@@ -87,7 +88,7 @@ def demodulate(
     pass_hz = _PASSBAND * rate_hz / decimation if passband_hz is None else checks.positive("passband_hz", passband_hz)
     taps = _low_pass(rate_hz, decimation, pass_hz, stopband_attenuation_db, is_pdm=full_scale is None)
     count = -(-len(rows) // decimation)
-    window = window_from_start(n_samples=count, n_fft=count, n_outputs=0)
+    window = TimeWindow.from_start(count, n_fft=count)
     with on_device(device, threads) as here:
         stage: Demodulate
         if full_scale is None:

@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks, kernels
-from ertis_numba.stages.window import TimeWindow
 
-__all__ = ["DeviceCall", "on_device", "window_from_start"]
+__all__ = ["DeviceCall", "on_device"]
 
 
 class DeviceCall(NamedTuple):
@@ -41,16 +40,3 @@ def on_device(device: str, threads: int | None) -> Iterator[DeviceCall]:
             yield DeviceCall(kernel_set, memory, lane, count)
     finally:
         memory.close()
-
-
-def window_from_start(*, n_samples: int, n_fft: int, n_outputs: int) -> TimeWindow:
-    """Return a window that begins at sample 0."""
-    return TimeWindow(
-        range_m=np.zeros(0),
-        first_sample=0,
-        n_samples=n_samples,
-        n_fft=n_fft,
-        n_outputs=n_outputs,
-        lead=0,
-        start_s=0.0,
-    )

@@ -9,10 +9,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from ertis_numba import checks, fft
 from ertis_numba.arrays._arguments import band_of
-from ertis_numba.arrays._device import on_device, window_from_start
+from ertis_numba.arrays._device import on_device
 from ertis_numba.errors import ArgumentError
 from ertis_numba.settings import Call, Processing, Recording, Settings
 from ertis_numba.stages.matched_filter import MatchedFilter
+from ertis_numba.stages.window import TimeWindow
 from ertis_numba.waveform import integer_taps, matched_guard_s
 
 __all__ = ["matched_filter"]
@@ -87,7 +88,7 @@ def matched_filter(
     n_samples = rows.shape[1]
     guard_s = settings.call.duration_s + 2 * matched_guard_s(settings)
     n_fft = int(scipy.fft.next_fast_len(n_samples + math.ceil(guard_s * rate_hz) + 1))
-    window = window_from_start(n_samples=n_samples, n_fft=n_fft, n_outputs=n_fft)
+    window = TimeWindow.from_start(n_samples, n_fft=n_fft, n_outputs=n_fft)
     padded = np.zeros((len(rows), n_fft), dtype=np.float32)
     padded[:, :n_samples] = rows
     unfiltered = integer_taps(np.ones(1))

@@ -119,7 +119,7 @@ class CaptureSession:
     settings : Settings
         Settings of all sensors.
     trigger : {"command", "sync"}
-        Source of triggers: commands of this session, or pulses of the SYNC chain.
+        Source of triggers: commands of this computer, or pulses of the SYNC chain.
     rate_hz : float
         Rate of commands in Hz, by default 10.
     n : int, optional

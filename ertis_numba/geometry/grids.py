@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ertis_numba import checks
 from ertis_numba.angles import DegreesFromRadians
-from ertis_numba.errors import ArgumentError, reason_unreadable
+from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry._csv import csv_rows
 from ertis_numba.settings import Processing
 
@@ -158,7 +158,7 @@ def _csv_grid(path: str) -> Grid:
     try:
         text = Path(path).read_text("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        reason = reason_unreadable(error)
+        reason = checks.reason_unreadable(error)
         raise ArgumentError(
             f"directions {path}: {reason}; give a readable CSV of azimuth, elevation in degrees"
         ) from error

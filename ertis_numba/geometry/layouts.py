@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ertis_numba import checks
 from ertis_numba.documents import TomlDocument
-from ertis_numba.errors import ArgumentError, reason_unreadable
+from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry._csv import csv_rows
 from ertis_numba.geometry.grids import grid_count
 from ertis_numba.settings import Array, Settings
@@ -175,7 +175,7 @@ def load_layout(name: str | Path) -> Layout:
     try:
         text = path.read_text("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        reason = reason_unreadable(error)
+        reason = checks.reason_unreadable(error)
         raise ArgumentError(
             f"layout {name}: {reason}; give a readable file or one of {', '.join(layout_names())}"
         ) from error

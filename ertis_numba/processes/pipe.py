@@ -187,7 +187,7 @@ def anonymous_memory(n_bytes: int) -> int:
 def _decoded(kind: type, value: Any) -> Any:
     if kind is Path:
         return Path(os.fsdecode(value))
-    raise NotImplementedError(f"messages cannot contain {kind}")
+    raise NotImplementedError(f"messages cannot contain {kind}")  # the error that msgspec expects
 
 
 def _close(files: Iterable[int]) -> None:

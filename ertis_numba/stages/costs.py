@@ -296,7 +296,7 @@ def _front(bench: _Bench, random: np.random.Generator) -> dict[str, float]:
     # Noise, because untouched zeros are a single page of memory, which is always in the nearest cache.
     signals = random.standard_normal((_MICS, n_fft), dtype=np.float32)
     tiny = np.zeros((2, 4), dtype=np.complex64)
-    found = {"call": bench.best(kernels.envelope, tiny, np.zeros((2, 4), dtype=np.float32))}
+    found = {"call": bench.best(kernels.envelope, tiny, 1, np.zeros((2, 4), dtype=np.float32))}
     taps = np.arange(n_taps).astype(np.int16)
     took_s = bench.best(
         kernels.demodulate_words, words, channels, taps, np.float32(1), factor, 3, n_samples - 8, signals

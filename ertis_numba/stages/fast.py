@@ -35,29 +35,9 @@ _TINY = 1e-30
 
 
 class FastChain(KernelChain):
-    """Signal chain of demodulation, matched filter, beamformer and envelope, with tables computed once.
+    """Signal chain that computes only the samples and beams of an image; parameters and errors as for `KernelChain`.
 
-    Parameters
-    ----------
-    settings : Settings
-        Settings with a complete plan: see `planner.complete`.
-    kernels : KernelSet
-    threads : int
-        Default number of threads.
-    graphs : bool
-        True to record the chain as a CUDA graph on a GPU and replay it; False by default.
-
-    Attributes
-    ----------
-    grid : Grid
-        Directions of the image.
-    range_m : (range,) float64
-        Range axis in metres.
-
-    Raises
-    ------
-    DeviceError
-        The device has too little memory.
+    The settings have a complete plan: see `planner.complete`.
     """
 
     def _make(self, settings: Settings) -> None:

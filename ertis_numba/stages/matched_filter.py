@@ -12,7 +12,7 @@ from ertis_numba.settings import Settings
 from ertis_numba.stages.window import TimeWindow
 from ertis_numba.waveform import filter_response, matched_filter_spectrum
 
-__all__ = ["Gain", "MatchedFilter"]
+__all__ = ["Gain", "MatchedFilter", "flat_spectrum"]
 
 Gain = Callable[[NDArray[np.float64]], NDArray[np.complex128]]
 """Function of frequencies in hertz, (bin,), that returns gains, (mic, bin) or (1, bin)."""
@@ -56,18 +56,14 @@ class MatchedFilter:
         gain: Gain,
     ) -> None:
         rate_hz = settings.signal_rate_hz
-        matched = matched_filter_spectrum(settings, n_fft=window.n_fft)
+        first_bin, frequency_hz, flat = flat_spectrum(settings, taps, n_fft=window.n_fft)
         n_phases = settings.accuracy.oversampling or 1
-        frequency_hz = (matched.first_bin + np.arange(len(matched.values))) * rate_hz / window.n_fft
-        flat = matched.values / filter_response(
-            taps / taps.sum(dtype=np.int64), frequency_hz / settings.recording.sample_rate_hz
-        )
         phase_s = np.arange(n_phases)[:, None] / (n_phases * settings.output_rate_hz)
         lag_s = window.start_s - window.first_sample / rate_hz + phase_s
         # Neither transform divides by its length. This division by the forward length supplies the missing factor.
         shifted = flat / window.n_fft * np.exp(2j * math.pi * frequency_hz * lag_s)
         self._responses = memory.table((gain(frequency_hz)[:, None, :] * shifted).astype(np.complex64))
-        self._first_bin = matched.first_bin
+        self._first_bin = first_bin
         self._kernel = kernels.multiply_and_fold
         self.shape = (n_mics, n_phases, window.n_outputs)
 
@@ -76,3 +72,20 @@ class MatchedFilter:
         spectra = transforms.forward(threads=threads)
         self._kernel(spectra, self._responses, self._first_bin, out)
         transforms.inverse(threads=threads)
+
+
+def flat_spectrum(
+    settings: Settings, taps: NDArray[np.int16] | NDArray[np.int32], *, n_fft: int
+) -> tuple[int, NDArray[np.float64], NDArray[np.complex128]]:
+    """Return the matched filter, divided by the gain of the decimation filter.
+
+    Returns
+    -------
+    first_bin : int
+    frequency_hz : (bin,) float64
+    values : (bin,) complex128
+    """
+    matched = matched_filter_spectrum(settings, n_fft=n_fft)
+    frequency_hz = (matched.first_bin + np.arange(len(matched.values))) * settings.signal_rate_hz / n_fft
+    decimated = filter_response(taps / taps.sum(dtype=np.int64), frequency_hz / settings.recording.sample_rate_hz)
+    return matched.first_bin, frequency_hz, matched.values / decimated

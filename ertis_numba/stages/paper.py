@@ -20,10 +20,11 @@ from ertis_numba.settings import Settings
 from ertis_numba.stages.beamform import Buffers
 from ertis_numba.stages.demodulate import FilterPcm, Room
 from ertis_numba.stages.kernel_chain import KernelChain
+from ertis_numba.stages.matched_filter import flat_spectrum
 from ertis_numba.stages.paper_scipy import range_axis
 from ertis_numba.stages.plan_elements import chain_taps
 from ertis_numba.stages.window import TimeWindow
-from ertis_numba.waveform import filter_response, matched_filter_spectrum, matched_guard_s
+from ertis_numba.waveform import matched_guard_s
 
 __all__ = ["PaperChain"]
 
@@ -57,10 +58,15 @@ class PaperChain(KernelChain):
         guard_s = settings.call.duration_s + 2 * matched_guard_s(settings)
         n_fft = n_samples + 2 * lead + math.ceil(guard_s * settings.signal_rate_hz) + 1
         n_fft += n_fft % 2
+        window, factor = TimeWindow.from_start(n_samples, n_fft=n_fft), settings.decimation
         if settings.recording.is_pdm:
-            self._demodulate = _UnpackAndFilter(settings, channels, kernels, memory, taps=taps, n_fft=n_fft)
+            n_recorded = settings.recording.n_samples
+            self._demodulate = _UnpackAndFilter(
+                channels, window, kernels, memory, taps=taps, factor=factor, n_recorded=n_recorded
+            )
         else:
-            self._demodulate = _filter_pcm(settings, channels, kernels, memory, taps=taps, n_fft=n_fft)
+            scale = settings.recording.full_scale
+            self._demodulate = FilterPcm(channels, window, kernels, memory, taps=taps, factor=factor, full_scale=scale)
         self._matched_filter = _MultiplyByTemplate(
             settings, kernels, memory, taps=taps, shape=(len(channels), 1, n_fft), lead=lead
         )
@@ -72,26 +78,25 @@ class PaperChain(KernelChain):
 
 
 class _UnpackAndFilter:
-    """Demodulation of PDM bits in three passes, with a full scale of 1; implements `Demodulate`."""
+    """Demodulation of PDM bits in three passes; parameters as for `DemodulatePdm`; implements `Demodulate`."""
 
     def __init__(
         self,
-        settings: Settings,
         channels: NDArray[np.int32],
+        window: TimeWindow,
         kernels: KernelSet,
         memory: Memory,
         *,
         taps: NDArray[np.int16] | NDArray[np.int32],
-        n_fft: int,
+        factor: int,
+        n_recorded: int,
     ) -> None:
-        factor = self._factor = settings.decimation
-        self._kernels, self._memory = kernels, memory
+        self._kernels, self._memory, self._factor, self._n_recorded = kernels, memory, factor, n_recorded
         # Zeros on both sides make the group delay a multiple of the decimation, so that it can be removed exactly.
         self._n_ahead = -(-(len(taps) // 2) // factor)
         padded = np.pad(taps / taps.sum(dtype=np.int64), self._n_ahead * factor - len(taps) // 2)
         self._taps, self._channels = memory.table(padded.astype(np.float32)), memory.table(channels)
-        self._n_recorded = settings.recording.n_samples
-        self.shape = (len(channels), n_fft)
+        self.shape = (len(channels), window.n_fft)
 
     def new_room(self) -> Room:
         """Return the arrays of unpacked and of decimated samples for one measurement at a time."""
@@ -105,23 +110,6 @@ class _UnpackAndFilter:
         self._kernels.unpack_bits(words, self._channels, unpacked)
         self._kernels.decimate(unpacked, self._taps, self._factor, decimated)
         self._kernels.remove_group_delay(decimated, self._n_ahead, out)
-
-
-def _filter_pcm(
-    settings: Settings,
-    channels: NDArray[np.int32],
-    kernels: KernelSet,
-    memory: Memory,
-    *,
-    taps: NDArray[np.int16] | NDArray[np.int32],
-    n_fft: int,
-) -> FilterPcm:
-    n_samples = -(-settings.recording.n_samples // settings.decimation)
-    window = TimeWindow(
-        range_m=np.zeros(0), first_sample=0, n_samples=n_samples, n_fft=n_fft, n_outputs=0, lead=0, start_s=0.0
-    )
-    full_scale = settings.recording.full_scale
-    return FilterPcm(channels, window, kernels, memory, taps=taps, factor=settings.decimation, full_scale=full_scale)
 
 
 class _MultiplyByTemplate:
@@ -138,12 +126,8 @@ class _MultiplyByTemplate:
         lead: int,
     ) -> None:
         n_fft = shape[2]
-        matched = matched_filter_spectrum(settings, n_fft=n_fft)
-        bins = matched.first_bin + np.arange(len(matched.values))
-        frequency_hz = bins * settings.signal_rate_hz / n_fft
-        flat = matched.values / filter_response(
-            taps / taps.sum(dtype=np.int64), frequency_hz / settings.recording.sample_rate_hz
-        )
+        first_bin, _, flat = flat_spectrum(settings, taps, n_fft=n_fft)
+        bins = first_bin + np.arange(len(flat))
         template = np.zeros(n_fft // 2 + 1, dtype=np.complex64)
         # Neither transform divides by its length. This division supplies the missing factor.
         template[bins] = flat / n_fft * np.exp(-2j * math.pi * bins * lead / n_fft)

@@ -18,6 +18,7 @@ __all__ = ["ahead_of", "beam_grid_of", "chain_taps", "delay_fit", "ringing_db", 
 
 _PCM_RANGE_DB = 125.0  # Dynamic range within which sound outside the window does not affect an image of PCM.
 _MAX_RINGING_DB = 160.0  # Below this level, rounding of single precision exceeds the ringing.
+_MAX_PASS_BAND = 0.45  # relative to the signal rate; the filter becomes long beyond it
 _SHORT_TAPS_DB = 65.0  # Rounding taps to 16 bits limits the stopband attenuation to this value.
 
 
@@ -62,13 +63,16 @@ def chain_taps(settings: Settings) -> NDArray[np.int16] | NDArray[np.int32]:
     if settings.decimation == 1 and not settings.recording.is_pdm:
         return integer_taps(np.ones(1))
     stopband_attenuation_db = settings.accuracy.stopband_attenuation_db or 60.0
+    # The paper's method also accepts rates at which the band of the matched filter exceeds half the signal rate.
+    highest_hz = max(settings.call.high_frequency_hz, _MAX_PASS_BAND * settings.signal_rate_hz)
     taps = decimation_taps(
         sample_rate_hz=settings.recording.sample_rate_hz,
         decimation=settings.decimation,
-        pass_hz=matched_band_hz(settings)[1],
+        pass_hz=min(matched_band_hz(settings)[1], highest_hz),
         stopband_attenuation_db=stopband_attenuation_db,
     )
-    return integer_taps(taps, bits=16 if stopband_attenuation_db <= _SHORT_TAPS_DB else 32)
+    short = settings.processing.method == "fast" and stopband_attenuation_db <= _SHORT_TAPS_DB
+    return integer_taps(taps, bits=16 if short else 32)
 
 
 def ringing_db(settings: Settings) -> float:

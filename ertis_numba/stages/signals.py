@@ -53,9 +53,7 @@ def signals_of(
     layout = microphones(settings.array)
     recorded = settings.recording.n_samples
     count = -(-min(recorded, max_samples or recorded) // settings.decimation)
-    window = window or TimeWindow(
-        range_m=np.zeros(0), first_sample=0, n_samples=count, n_fft=count, n_outputs=0, lead=0, start_s=0.0
-    )
+    window = window or TimeWindow.from_start(count, n_fft=count)
     plain = kernels.load("numpy")  # These need no compilation, and all devices return the same signals of PDM.
     memory = plain.memory()
     demodulate = demodulation(settings, layout, window, plain, memory, taps=chain_taps(settings))

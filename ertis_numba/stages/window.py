@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 import scipy.fft
@@ -42,6 +43,19 @@ class TimeWindow:
     n_outputs: int
     lead: int
     start_s: float
+
+    @classmethod
+    def from_start(cls, n_samples: int, *, n_fft: int, n_outputs: int = 0) -> Self:
+        """Return a window that begins at sample 0, without a range axis."""
+        return cls(
+            range_m=np.zeros(0),
+            first_sample=0,
+            n_samples=n_samples,
+            n_fft=n_fft,
+            n_outputs=n_outputs,
+            lead=0,
+            start_s=0.0,
+        )
 
 
 def time_window(settings: Settings, *, largest_delay_s: float, n_taps: int, ringing_db: float = 60.0) -> TimeWindow:

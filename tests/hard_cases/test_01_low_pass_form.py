@@ -99,7 +99,7 @@ def test_polynomial_form_is_unstable(band_hz, kind, rate_hz, largest):
 def test_paper_image_needs_second_order_sections(monkeypatch):
     """Sections keep the image within -100 dB of the float64 image; the same filters as polynomials destroy it."""
     settings = SHORT.replace(processing=SHORT.processing.replace(method="paper"))
-    pipeline, measurement = Pipeline(settings), noise(SHORT)
+    pipeline, measurement = Pipeline(settings, "numpy"), noise(SHORT)
     directions = unit_vectors(pipeline.grid.azimuth_rad, pipeline.grid.elevation_rad)
     wanted, _ = reference.paper(measurement.data, settings, directions)
     assert reference.error_db(pipeline.process(measurement).amplitude, wanted) < -100

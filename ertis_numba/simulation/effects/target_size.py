@@ -150,7 +150,7 @@ def _terms(sizes: bytes) -> NDArray[np.complex128]:
     size, orders = np.frombuffer(sizes), _ORDERS[:, None]
     near = scipy.special.spherical_jn(orders, size, derivative=True)
     far = scipy.special.spherical_yn(orders, size, derivative=True)
-    # Where the second function overflows, the term is negligible.
+    # The term is negligible where ``far`` overflows.
     ratio = np.divide(near, near - 1j * far, out=np.zeros(near.shape, dtype=np.complex128), where=np.isfinite(far))
     return np.asarray((2 * orders + 1) * ratio)
 
