@@ -42,6 +42,11 @@ TIMEOUT_S = 60.0
 RATE_HZ = 5.0
 OFFLINE = "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1"
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "microsoft-edge")
+# A picture that is replaced while it is being decoded is refused once, and then decoded again.
+DECODED = """async image => {
+    while (!await image.decode().then(() => true, () => false)) await new Promise(requestAnimationFrame)
+    return image.naturalWidth
+}"""
 FLAGS = (
     *("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"),
     *("--disable-component-update", "--disable-sync", OFFLINE),
@@ -96,7 +101,7 @@ class Page:
     def picture(self):
         """The first picture as shown, and its scale in drawn pixels."""
         shown = self.page.locator("img").first
-        drawn_px = shown.evaluate("image => image.decode().then(() => image.naturalWidth)")
+        drawn_px = shown.evaluate(DECODED)
         pixels = np.asarray(Image.open(io.BytesIO(shown.screenshot())).convert("RGB")).astype(int)
         return pixels, pixels.shape[1] / drawn_px
 
