@@ -43,7 +43,13 @@ PLANS = {
         -120,
     ),
 }
-PLANS["paper"] = (TINY.replace(processing=TINY.processing.replace(method="paper")), -120)
+PLANS["paper"] = (
+    TINY.replace(
+        recording=Recording(n_samples=4_096),
+        processing=TINY.processing.replace(method="paper", directions="2d:3", range_m=(0.08, 0.14)),
+    ),
+    -120,
+)
 for _beamformer in ADAPTIVE_BEAMFORMERS:
     PLANS[_beamformer] = (
         TINY.replace(
