@@ -18,8 +18,8 @@ SOON_S = 20.0
 def impatient(monkeypatch):
     """Shorten all timeouts to fractions of a second."""
     for module, name, value in (
-        (link, "_PING_S", 0.05),
-        (link, "_DEAD_S", 0.5),
+        (link, "PING_INTERVAL_S", 0.05),
+        (link, "SILENCE_LIMIT_S", 0.5),
         (link, "_GREET_AGAIN_S", 0.1),
         (link, "_REFUSED_S", 0.1),
         (link, "_TURN_MS", 10),

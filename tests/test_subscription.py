@@ -42,7 +42,7 @@ def publisher():
 @pytest.fixture
 def hasty(monkeypatch):
     """Shorten the waiting times."""
-    for name, time_s in {"_BEAT_S": 0.1, "_DEAD_S": 0.5, "_AGAIN_S": 0.1, "_UNMADE_S": 1.0}.items():
+    for name, time_s in {"PING_INTERVAL_S": 0.1, "SILENCE_LIMIT_S": 0.5, "_AGAIN_S": 0.1, "_UNMADE_S": 1.0}.items():
         monkeypatch.setattr(_subscription, name, time_s)
 
 

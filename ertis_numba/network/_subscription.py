@@ -13,6 +13,8 @@ from ertis_numba.errors import ErtisError, FormatVersionError, RefusedError
 from ertis_numba.network import sockets
 from ertis_numba.network.keys import ClientKeys
 from ertis_numba.network.messages import (
+    PING_INTERVAL_S,
+    SILENCE_LIMIT_S,
     Bye,
     Description,
     Group,
@@ -35,8 +37,6 @@ from ertis_numba.network.wakeup_socket import WakeupSocket
 __all__ = ["SubscriberCounts", "Subscription"]
 
 _EXPECTED: Final = (Description, Image, Points, Raw, Group, Report, Pong, Refused)
-_BEAT_S: Final = 1.0
-_DEAD_S: Final = 3.0
 _UNMADE_S: Final = 5.0  # ZeroMQ gives up after a refusal, whose event may precede the monitor.
 _AGAIN_S: Final = 0.5
 _MAX_AGAIN_S: Final = 5.0
@@ -168,8 +168,8 @@ class Subscription:
             self._read_all()
         connection, now_s = self._connection, time.monotonic()
         since_s = connection.heard_s if connection.heard_s is not None else connection.first_asked_s
-        if since_s is not None and now_s - since_s > _DEAD_S:
-            self._again(f"the publisher has been silent for {_DEAD_S:g} s; connecting again", now_s)
+        if since_s is not None and now_s - since_s > SILENCE_LIMIT_S:
+            self._again(f"the publisher has been silent for {SILENCE_LIMIT_S:g} s; connecting again", now_s)
         elif since_s is None and self._socket is not None and now_s - connection.begun_s > _UNMADE_S:
             self._again("", now_s)
 
@@ -237,7 +237,7 @@ class Subscription:
             if self._taken.popleft() == connection.number:
                 connection.taken += 1
                 self._ask = True
-        beat = connection.asked_s is None or now_s - connection.asked_s >= _BEAT_S
+        beat = connection.asked_s is None or now_s - connection.asked_s >= PING_INTERVAL_S
         if not (beat or self._ask):
             return
         wanted = Subscribe(

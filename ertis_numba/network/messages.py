@@ -47,7 +47,9 @@ __all__ = [
     "MAGIC",
     "MAX_SEQUENCE",
     "MESSAGES",
+    "PING_INTERVAL_S",
     "PRODUCTS",
+    "SILENCE_LIMIT_S",
     "VERSION",
     "Ack",
     "AskStatus",
@@ -75,6 +77,11 @@ __all__ = [
 MAGIC: Final = b"eRTN"
 VERSION: Final = 1
 HEADER_BYTES: Final = 4096
+PING_INTERVAL_S: Final = 1.0
+"""Interval between signs of life of a node: the `Ping` of a sensor node, the `Subscribe` of an application."""
+
+SILENCE_LIMIT_S: Final = 3.0
+"""Silence after which a peer is taken for dead: nodes connect again, and a publisher removes an application."""
 
 
 class Hello(Message, frozen=True, kw_only=True):

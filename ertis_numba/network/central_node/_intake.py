@@ -13,14 +13,15 @@ from ertis_numba.network.central_node._images import Guarded
 from ertis_numba.network.central_node._received_items import ReceivedItem, SensorSession, Stored, StoredDuplicate
 from ertis_numba.network.central_node._streams import Acks, PeerConnection, SensorTrack, Sharing, Stream
 from ertis_numba.network.fields import as_line
-from ertis_numba.network.messages import Data, Gap, Hello, Message, Refused
+from ertis_numba.network.messages import PING_INTERVAL_S, SILENCE_LIMIT_S, Data, Gap, Hello, Message, Refused
 
 __all__ = ["Intake"]
 
 _LEFT_KEPT: Final = 4096  # Limit on inactive sessions.
 _WAITING_BYTES: Final = 64_000_000  # Limit per peer.
 _ALL_WAITING_BYTES: Final = 512_000_000
-_SILENT_S: Final = 4.0
+# One ping longer than a node waits, so that the node connects again before it is removed.
+_SILENT_S: Final = SILENCE_LIMIT_S + PING_INTERVAL_S
 _NEVER: Final = "never reached the central node"
 
 

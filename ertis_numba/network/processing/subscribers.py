@@ -10,7 +10,18 @@ from typing import Any, Final, TypeAlias
 import msgspec
 import zmq
 
-from ertis_numba.network.messages import Group, Image, Message, Points, Product, Raw, Report, Subscribe, encode
+from ertis_numba.network.messages import (
+    SILENCE_LIMIT_S,
+    Group,
+    Image,
+    Message,
+    Points,
+    Product,
+    Raw,
+    Report,
+    Subscribe,
+    encode,
+)
 from ertis_numba.network.status import SubscriberStatus
 
 __all__ = ["DESCRIPTIONS", "ConnectedSubscriber", "QueuedProduct", "Subscribers"]
@@ -21,7 +32,6 @@ DESCRIPTIONS: Final = 4
 _MAX: Final = 256
 _MAX_OF_KEY: Final = 16
 _DESCRIBED: Final = 16  # Number of descriptions of each sensor that an application keeps.
-_SILENT_S: Final = 3.0
 _UNDER_WAY_BYTES: Final = 64_000_000  # Limit on the bytes under way to an application.
 _AFTER_S: Final = 60.0  # Time after which a silent application is forgotten.
 
@@ -215,7 +225,7 @@ class Subscribers:
         for routing_id, each in list(self._all.items()):
             if now_s - each.heard_s > _AFTER_S or (each.active and not may_receive(each.frames)):
                 self.forget(routing_id)
-            elif each.active and now_s - each.heard_s > _SILENT_S:
+            elif each.active and now_s - each.heard_s > SILENCE_LIMIT_S:
                 each.retire()
             elif each.active:
                 self._send(routing_id, each)

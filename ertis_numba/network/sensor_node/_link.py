@@ -11,6 +11,7 @@ import zmq
 from ertis_numba.errors import DataError, FormatVersionError
 from ertis_numba.network import messages, sockets
 from ertis_numba.network.keys import ClientKeys
+from ertis_numba.network.messages import PING_INTERVAL_S, SILENCE_LIMIT_S
 from ertis_numba.network.sensor_node._runs import OutgoingSession
 from ertis_numba.network.sensor_node._spool import Spool
 from ertis_numba.network.sensor_node._wire import Acknowledged, Frames, frames_of, greeting
@@ -20,8 +21,6 @@ __all__ = ["Central", "Link"]
 
 Central = Literal["away", "storage", "processing", "fault", "closing"]
 
-_PING_S = 1.0
-_DEAD_S = 3.0
 _GREET_AGAIN_S = 2.0
 _REFUSED_S = 5.0
 _FAILED_S = 1.0
@@ -154,10 +153,10 @@ class Link(threading.Thread):
             self._is_blocked = False
         self._receive(socket)
         now_s = time.monotonic()
-        if now_s - self._heard_s > _DEAD_S:
+        if now_s - self._heard_s > SILENCE_LIMIT_S:
             self._lose()
             return
-        if now_s - self._ping_s > _PING_S and self._send(socket, [messages.encode(messages.Ping())]):
+        if now_s - self._ping_s > PING_INTERVAL_S and self._send(socket, [messages.encode(messages.Ping())]):
             self._ping_s = now_s
         self._send_pending(socket, now_s)
 
