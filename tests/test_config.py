@@ -1,5 +1,6 @@
 """Precedence of options: command line, environment variables, configuration file, defaults."""
 
+import contextlib
 import json
 import os
 import re
@@ -9,6 +10,8 @@ import sys
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
+from ertis_cli.main import cli
 
 from tests.pages import path_of
 
@@ -17,16 +20,10 @@ REFLECTORS = ROOT / "data" / "synthetic" / "reflectors.h5"
 
 
 def ertis(*arguments, folder, **variables):
-    clean = {name: value for name, value in os.environ.items() if not name.startswith("ERTIS_")}
-    return subprocess.run(
-        [sys.executable, "-m", "ertis_cli", *map(str, arguments)],
-        cwd=folder,
-        env=clean | {"PYTHONPATH": os.pathsep.join(str(ROOT / each) for each in (".", "cli", "bench"))} | variables,
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
+    """Run a command in this process, in a folder, with no other variables of ertis than these."""
+    unset = dict.fromkeys(name for name in os.environ if name.startswith("ERTIS_"))
+    with contextlib.chdir(folder):
+        return CliRunner().invoke(cli, [str(each) for each in arguments], env=unset | variables)
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +32,7 @@ def images(tmp_path_factory):
     folder = tmp_path_factory.mktemp("config")
     (folder / "ertis.toml").write_text('[process]\ndirections = "2d:31"\nrange = "0.5:4"\nquiet = true\n')
     done = ertis("--config", "ertis.toml", "process", REFLECTORS, "-o", "img.h5", "--json", folder=folder)
-    assert (done.returncode, done.stderr) == (0, "")
+    assert (done.exit_code, done.stderr) == (0, "")
     return folder, json.loads(done.stdout)
 
 
@@ -49,7 +46,7 @@ def test_options_override_variables_and_variables_override_files(images):
 
     def number(*options, **variables):
         done = ertis(*options, folder=folder, **variables)
-        assert done.returncode == 0, done.stderr
+        assert done.exit_code == 0, done.stderr
         return len(json.loads(done.stdout)["peaks"])
 
     plain = number("peaks", "img.h5", "--json")
@@ -64,9 +61,9 @@ def test_options_override_variables_and_variables_override_files(images):
 def test_shared_variable_applies_to_commands_with_that_option(images):
     folder, _ = images
     done = ertis("info", "img.h5", folder=folder, ERTIS_THREADS="x")
-    assert done.returncode == 0  # info has no option --threads
+    assert done.exit_code == 0  # info has no option --threads
     done = ertis("process", REFLECTORS, "-o", "b.h5", folder=folder, ERTIS_THREADS="x")
-    assert done.returncode == 2
+    assert done.exit_code == 2
     assert "'x' is not a valid integer (from the variable ERTIS_THREADS); see 'ertis process --help'" in done.stderr
     done = ertis("process", REFLECTORS, "-o", "b.h5", folder=folder, ERTIS_THREADS="1", ERTIS_PROCESS_THREADS="y")
     assert "'y' is not a valid integer (from the variable ERTIS_PROCESS_THREADS)" in done.stderr
@@ -87,7 +84,7 @@ def test_unknown_ertis_variable_causes_one_warning(images, name, meant):
     """The command continues, because other programs may use such a name."""
     folder, _ = images
     done = ertis("info", "img.h5", "--json", folder=folder, **{name: "3"})
-    assert done.returncode == 0
+    assert done.exit_code == 0
     assert json.loads(done.stdout)
     assert done.stderr == f"ertis: warning: no command reads the variable {name}; {meant}\n"
 
@@ -103,7 +100,7 @@ def test_variables_that_are_not_options_cause_no_warning(images):
         "ERTIS_THREADS": "1",
     }
     done = ertis("info", "img.h5", folder=folder, **of_folders, **given, ERTIS_BENCH_MARK="1")
-    assert (done.returncode, done.stderr) == (0, "")
+    assert (done.exit_code, done.stderr) == (0, "")
 
 
 @pytest.mark.parametrize(
@@ -115,7 +112,7 @@ def test_variables_that_are_not_options_cause_no_warning(images):
 )
 def test_unknown_command_suggests_known_ones(tmp_path, line, message):
     done = ertis(*line.split(), folder=tmp_path)
-    assert done.returncode == 2
+    assert done.exit_code == 2
     assert done.stderr.startswith(f"ertis: error: {message}")
     assert len(done.stderr.splitlines()) == 1
 
@@ -135,7 +132,7 @@ def test_unknown_command_suggests_known_ones(tmp_path, line, message):
 def test_invalid_config_file_is_refused_in_one_line(tmp_path, text, message):
     (tmp_path / "ertis.toml").write_text(text)
     done = ertis("--config", "ertis.toml", "process", REFLECTORS, "-o", "a.h5", folder=tmp_path)
-    assert done.returncode in {1, 2}
+    assert done.exit_code in {1, 2}
     assert message in done.stderr
     assert len(done.stderr.splitlines()) == 1
     assert list(tmp_path.iterdir()) == [tmp_path / "ertis.toml"]
@@ -143,7 +140,7 @@ def test_invalid_config_file_is_refused_in_one_line(tmp_path, text, message):
 
 def test_missing_config_file_is_reported(tmp_path):
     done = ertis("--config", "none.toml", "info", REFLECTORS, folder=tmp_path)
-    assert (done.returncode, done.stderr) == (
+    assert (done.exit_code, done.stderr) == (
         1,
         "ertis: error: none.toml: No such file or directory; give a readable TOML file (--config)\n",
     )
@@ -153,7 +150,7 @@ def test_help_and_completion_work_without_config_file(tmp_path):
     """Every new shell requests completions, and users need help most when something is broken."""
     for line in ("--help", "completion bash"):
         done = ertis(*line.split(), folder=tmp_path, ERTIS_CONFIG="none.toml")
-        assert done.returncode == 0, line
+        assert done.exit_code == 0, line
         assert len(done.stdout.splitlines()) > 10
         warned = (
             done.stderr
@@ -183,10 +180,10 @@ def test_inapplicable_option_is_refused_only_if_typed(images, tmp_path):
         (("import", raw, "--layout", "eRTIS_v3D1", "--preset", "short_25_50"), ("--skip", 1), "is for PCM (.wav, .h5)"),
     ):
         done = ertis(*given, *typed, folder=tmp_path)
-        assert done.returncode != 0
+        assert done.exit_code != 0
         assert message in done.stderr
         done = ertis("--config", "mine.toml", *given, folder=tmp_path)
-        assert done.returncode == 0, done.stderr
+        assert done.exit_code == 0, done.stderr
 
 
 def test_command_line_page_runs(tmp_path):
@@ -198,7 +195,7 @@ def test_command_line_page_runs(tmp_path):
     for variables, line in re.findall(r"^\$ ((?:\w+=\S+ )?)ertis (--config.*)$", page, re.MULTILINE):
         given = dict(each.split("=") for each in variables.split())
         done = ertis(*line.split(), "--json", folder=tmp_path, **given)
-        assert done.returncode == 0, done.stderr
+        assert done.exit_code == 0, done.stderr
         counts.append(json.loads(done.stdout)["directions"])
     assert counts == [3000, 90]
     assert "Numba's" in ertis("doctor", folder=tmp_path).stdout
@@ -244,7 +241,7 @@ def test_bash_completes_commands_options_and_values(tmp_path, line, wanted):
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
 def test_completion_for_each_shell(tmp_path, shell):
     done = ertis("completion", shell, folder=tmp_path)
-    assert done.returncode == 0
+    assert done.exit_code == 0
     assert "_ERTIS_COMPLETE" in done.stdout
 
 
