@@ -130,6 +130,37 @@ def test_signal_removes_the_bar(tmp_path, key, code):
         assert terminal.lines == [NOTES[0], "ended"]
 
 
+# ---- status lines ---------------------------------------------------------------------------------
+
+STATUS = """
+import sys
+from ertis_cli._progress import StatusLine
+
+line = StatusLine(sys.stderr.write, quiet="--quiet" in sys.argv)
+for count in range(3):
+    line.draw(f"{count} stored   " + 30 * "x")
+    sys.stderr.write(line.above(f"note {count}\\n"))
+line.draw("last")
+line.clear()
+sys.stderr.flush()
+"""
+
+
+@pytest.mark.parametrize("columns", [20, 200])
+def test_status_line_fits_its_terminal_and_leaves_only_notes(tmp_path, columns):
+    with Terminal(STATUS, tmp_path, columns=columns) as terminal:
+        assert terminal.finish()[0] == 0
+        assert "2 stored   xxxx" in terminal.shown
+        assert terminal.lines == ["note 0", "note 1", "note 2"]
+
+
+@pytest.mark.parametrize(("arguments", "variables"), [(["--quiet"], {}), ([], {"TERM": "dumb"})])
+def test_status_line_is_omitted_if_unwanted_or_impossible(tmp_path, arguments, variables):
+    with Terminal(STATUS, tmp_path, *arguments, **variables) as terminal:
+        assert terminal.finish()[0] == 0
+        assert terminal.shown.split() == ["note", "0", "note", "1", "note", "2"]
+
+
 # ---- tables ---------------------------------------------------------------------------------------
 
 

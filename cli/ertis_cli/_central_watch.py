@@ -14,6 +14,7 @@ import click
 
 from ertis_cli import options
 from ertis_cli._lines import JsonLines
+from ertis_cli._progress import StatusLine
 from ertis_cli._signals import stopped_by_signals
 
 if TYPE_CHECKING:
@@ -88,7 +89,7 @@ class CentralWatch:
         show(level="CRITICAL" if quiet else "INFO", stream=self._err)
         self._log = logger("central_node")
         self.life, self.quiet, self.as_json = life, quiet, as_json
-        self._line = sys.stderr.isatty() and not quiet
+        self._line = StatusLine(self._err.write, quiet=quiet)
         self._ended = threading.Event()
         self._thread: threading.Thread | None = None
         self.recordings: list[str] = []
@@ -104,8 +105,7 @@ class CentralWatch:
             self._print(event)
         if self.quiet:
             return
-        if self._line:
-            self._err.write("\r\x1b[K")
+        self._line.clear()
         fields = {name: value for name, value in event.items() if name != "event" and value != ""}
         (self._log.info if event["event"] in _EXPECTED else self._log.warning)(event["event"], **fields)
 
@@ -120,7 +120,7 @@ class CentralWatch:
 
     def shows(self, status: "Callable[[], Status]") -> "Self":
         """Draw a progress line on a terminal until the ``with`` block ends."""
-        if self._line:
+        if self._line.is_drawn:
             self._thread = threading.Thread(target=self._draw, args=(status,), daemon=True)
         return self
 
@@ -135,7 +135,7 @@ class CentralWatch:
         if self._thread is not None:
             self._ended.set()
             self._thread.join()
-            self._err.write("\r\x1b[K")
+            self._line.clear()
 
     def close(self) -> None:
         """Write pending lines, and report lines that were dropped."""
@@ -146,7 +146,7 @@ class CentralWatch:
 
     def _draw(self, status: "Callable[[], Status]") -> None:
         while not self._ended.wait(_REFRESH_S):
-            self._err.write(f"\r\x1b[K{_progress(status())}")
+            self._line.draw(_progress(status()))
 
 
 def archive(folder: Path, name: str, rotate_mb: float, rotate_s: float) -> "Archive":
@@ -282,4 +282,4 @@ def _progress(status: "Status") -> str:
         parts.append(f"{sum(sum(each.dropped.values()) for each in sensors)} dropped")
     if status.state == "fault":
         parts.append(f"FAULT: {status.fault}")
-    return f"{time.strftime('%H:%M:%S')}   {'   '.join(parts)}"[:160]
+    return f"{time.strftime('%H:%M:%S')}   {'   '.join(parts)}"

@@ -1,10 +1,10 @@
-"""Progress bars on a terminal."""
+"""Progress bars and status lines on a terminal."""
 
 import io
 import os
 import sys
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
 from typing import TYPE_CHECKING, TextIO, TypeVar
 
@@ -12,9 +12,12 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress, TaskID
 
-__all__ = ["bar", "bars", "drawn", "is_drawn_on"]
+__all__ = ["StatusLine", "bar", "bars", "drawn", "is_drawn_on"]
 
 Item = TypeVar("Item")
+
+_CLEAR = "\r\x1b[K"  # not by rich, whose live display makes a central node wait for a slow terminal
+_COLUMNS = 80  # of a terminal that does not tell its width
 
 
 def is_drawn_on(stream: TextIO) -> bool:
@@ -82,6 +85,38 @@ def _is_one_terminal() -> bool:
         return os.ttyname(sys.stdout.fileno()) == os.ttyname(sys.stderr.fileno())
     except (OSError, ValueError):  # one of them is not a terminal or, as in tests, has no file descriptor
         return False
+
+
+class StatusLine:
+    """Line on stderr that is drawn again in its place; nothing is drawn if ``quiet`` or off a terminal.
+
+    ``write`` writes text to stderr.
+    """
+
+    def __init__(self, write: Callable[[str], object], *, quiet: bool) -> None:
+        self.is_drawn = not quiet and is_drawn_on(sys.stderr)
+        self._write = write
+
+    def draw(self, text: str) -> None:
+        """Replace the line. Text beyond the width of the terminal would start a second line, and is cut off."""
+        if self.is_drawn:
+            self._write(self.above(text[: _columns() - 1]))
+
+    def clear(self) -> None:
+        """Remove the line."""
+        if self.is_drawn:
+            self._write(self.above(""))
+
+    def above(self, text: str) -> str:
+        """Return text that replaces the line where it is written."""
+        return _CLEAR + text if self.is_drawn else text
+
+
+def _columns() -> int:
+    try:
+        return os.get_terminal_size(sys.stderr.fileno()).columns or _COLUMNS
+    except (OSError, ValueError):  # the terminal is gone
+        return _COLUMNS
 
 
 class _Above(io.TextIOBase):

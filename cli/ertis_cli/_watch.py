@@ -1,15 +1,16 @@
 """Reports of a capture: events, progress and summary."""
 
-import sys
 import threading
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from ertis_cli import options
+from ertis_cli._progress import StatusLine
 
 if TYPE_CHECKING:
     from ertis_numba.capture import CaptureSession
@@ -34,7 +35,7 @@ class Watch:
     def __init__(self, *, quiet: bool, as_json: bool) -> None:
         self._quiet, self._as_json = quiet, as_json
         self._turn = threading.Lock()
-        self._line = sys.stderr.isatty() and not quiet
+        self._line = StatusLine(partial(click.echo, err=True, nl=False), quiet=quiet)
         self._next_s = 0.0
         self.took: dict[str, float] = {}
         self._session: CaptureSession | None = None
@@ -58,8 +59,7 @@ class Watch:
             raise
         finally:
             self.took = {"seconds": time.monotonic() - begun_s, "cpu_s": time.process_time() - cpu_s}
-            if self._line:
-                click.echo("\r\x1b[K", err=True, nl=False)
+            self._line.clear()
         return None
 
     def stored(self, entries: "list[JournalEntry]") -> None:
@@ -82,9 +82,9 @@ class Watch:
 
     def tick(self) -> None:
         """Redraw the progress line when due."""
-        if self._line and time.monotonic() >= self._next_s:
+        if self._line.is_drawn and time.monotonic() >= self._next_s:
             self._next_s = time.monotonic() + _REFRESH_S
-            click.echo(f"\r\x1b[K{self._progress()}", err=True, nl=False)
+            self._line.draw(self._progress())
 
     def note(self, sensor: str, text: str) -> None:
         """Report an event of a sensor."""
@@ -103,7 +103,7 @@ class Watch:
             options.print_json(event)
 
     def _say(self, text: str) -> None:
-        options.say(("\r\x1b[K" if self._line else "") + text, quiet=self._quiet)
+        options.say(self._line.above(text), quiet=self._quiet)
 
     def _progress(self) -> str:
         session = self._session
@@ -117,7 +117,7 @@ class Watch:
             *self._more(),
             *(f"{sensor}: {text}" for sensor, text in self._health()),
         ]
-        return "   ".join(parts)[:160]
+        return "   ".join(parts)
 
     def _more(self) -> Iterator[str]:
         """Yield further parts of the progress line."""
