@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from ertis_numba.network import messages
+from ertis_numba.network import connection, messages
 from ertis_numba.network.sensor_node import SensorNode, _link as link, _runs as runs
 from tests.journals import EPOCH, TINY
 
@@ -18,11 +18,11 @@ SOON_S = 20.0
 def impatient(monkeypatch):
     """Shorten all timeouts to fractions of a second."""
     for module, name, value in (
-        (link, "PING_INTERVAL_S", 0.05),
+        (connection, "PING_INTERVAL_S", 0.05),
         (link, "SILENCE_LIMIT_S", 0.5),
         (link, "_GREET_AGAIN_S", 0.1),
         (link, "_REFUSED_S", 0.1),
-        (link, "_TURN_MS", 10),
+        (link, "_TURN_S", 0.01),
         (runs, "_PATIENCE_S", 0.05),
         (runs, "_MAX_PATIENCE_S", 0.2),
     ):

@@ -12,7 +12,7 @@ import pytest
 import zmq
 
 from ertis_numba.errors import RefusedError
-from ertis_numba.network import _subscription, messages
+from ertis_numba.network import _subscription, connection, messages
 from ertis_numba.network.allow_list import AllowList
 from ertis_numba.network.keys import ClientKeys, KeyPair, ServerKeys
 from ertis_numba.network.processing import ImageProcessing, ProcessingOptions
@@ -42,7 +42,8 @@ def publisher():
 @pytest.fixture
 def hasty(monkeypatch):
     """Shorten the waiting times."""
-    for name, time_s in {"PING_INTERVAL_S": 0.1, "SILENCE_LIMIT_S": 0.5, "_AGAIN_S": 0.1, "_UNMADE_S": 1.0}.items():
+    monkeypatch.setattr(connection, "PING_INTERVAL_S", 0.1)
+    for name, time_s in {"SILENCE_LIMIT_S": 0.5, "_AGAIN_S": 0.1, "_UNMADE_S": 1.0}.items():
         monkeypatch.setattr(_subscription, name, time_s)
 
 

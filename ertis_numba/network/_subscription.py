@@ -3,24 +3,21 @@
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Final
 
 import zmq
 
 from ertis_numba.errors import ErtisError, FormatVersionError, RefusedError
-from ertis_numba.network import sockets
+from ertis_numba.network.connection import Connection
 from ertis_numba.network.keys import ClientKeys
 from ertis_numba.network.messages import (
-    PING_INTERVAL_S,
     SILENCE_LIMIT_S,
     Bye,
     Description,
     Group,
     Image,
-    Message,
-    Ping,
     Points,
     Pong,
     Product,
@@ -41,6 +38,7 @@ _UNMADE_S: Final = 5.0  # ZeroMQ gives up after a refusal, whose event may prece
 _AGAIN_S: Final = 0.5
 _MAX_AGAIN_S: Final = 5.0
 _REFUSALS: Final = 3  # Limit on refusals before the first answer, after which retrying is useless.
+_TURN_S: Final = 0.1
 _AT_ONCE: Final = 64
 
 
@@ -69,14 +67,10 @@ class SubscriberCounts:
 
 
 @dataclass(slots=True)
-class _Connection:
+class _Numbers:
     """Counts since a connection was made."""
 
-    number: int
-    begun_s: float
-    first_asked_s: float | None = None
-    asked_s: float | None = None
-    heard_s: float | None = None
+    connection: int
     taken: int = 0
     received: int = 0
     next_number: int = 0
@@ -115,9 +109,8 @@ class Subscription:
         self._sensors, self._products = sensors, products
         self._note, self._counts, self._deliver = on_note, counts, deliver
         self._context: zmq.Context[zmq.Socket[bytes]]
-        self._socket: zmq.Socket[bytes] | None = None
-        self._monitor: sockets.Monitor | None = None
-        self._connection = _Connection(0, 0.0)
+        self._connection: Connection | None = None
+        self._numbers = _Numbers(0)
         self._taken: deque[int] = deque()
         self._ask = True
         self._wait_until_s = 0.0
@@ -129,7 +122,7 @@ class Subscription:
     @property
     def connected(self) -> bool:
         """Return True if the publisher has answered on this connection."""
-        return self._connection.heard_s is not None
+        return self._connection is not None and self._connection.heard_s is not None
 
     def taken(self, arrival: Arrival) -> None:
         """Register that the application has taken a product, so that another may be sent."""
@@ -141,7 +134,8 @@ class Subscription:
         self._context = context
         try:
             yield
-            self._send(Bye())
+            if self._connection is not None:
+                self._connection.send(encode(Bye()))
         finally:
             self._close()
 
@@ -153,47 +147,37 @@ class Subscription:
         RefusedError
             The publisher refuses this application, and has never accepted it.
         """
-        if self._socket is None:
+        connection = self._connection
+        if connection is None:
             if now_s < self._wait_until_s:
-                _wait(woken, min(0.1, self._wait_until_s - now_s))
+                _wait(woken, min(_TURN_S, self._wait_until_s - now_s))
                 return
-            self._open(now_s)
-        self._subscribe(now_s)
-        ready = self._poll(woken)
-        if self._monitor is not None and self._monitor.socket in ready:
-            for text in self._monitor.read()[-1:]:
-                self._refuse(text, time.monotonic())
-                return
-        if self._socket in ready:
-            self._read_all()
-        connection, now_s = self._connection, time.monotonic()
-        since_s = connection.heard_s if connection.heard_s is not None else connection.first_asked_s
+            connection = self._open()
+        self._subscribe(connection, now_s)
+        connection.wait(_TURN_S, woken)
+        for text in connection.refusals()[-1:]:
+            self._refuse(text, time.monotonic())
+            return
+        self._read_all(connection)
+        if connection is not self._connection:
+            return
+        since_s, now_s = connection.heard_s or connection.sent_s, time.monotonic()
         if since_s is not None and now_s - since_s > SILENCE_LIMIT_S:
             self._again(f"the publisher has been silent for {SILENCE_LIMIT_S:g} s; connecting again", now_s)
-        elif since_s is None and self._socket is not None and now_s - connection.begun_s > _UNMADE_S:
+        elif since_s is None and now_s - connection.opened_s > _UNMADE_S:
             self._again("", now_s)
 
-    def _poll(self, woken: WakeupSocket) -> list[object]:
-        poller = zmq.Poller()
-        poller.register(woken, zmq.POLLIN)
-        for socket in (self._socket, self._monitor.socket if self._monitor else None):
-            if socket is not None:
-                poller.register(socket, zmq.POLLIN)
-        return [socket for socket, _ in poller.poll(100)]
-
-    def _open(self, now_s: float) -> None:
-        self._socket = sockets.client(self._context, self._address, keys=self._keys)
-        self._monitor = sockets.Monitor(self._socket)
-        self._connection = _Connection(self._connection.number + 1, now_s)
+    def _open(self) -> Connection:
+        self._connection = Connection(self._context, self._address, keys=self._keys)
+        self._numbers = _Numbers(self._numbers.connection + 1)
         self._ask = True
+        return self._connection
 
-    def _close(self, now_s: float = 0.0) -> None:
-        if self._monitor is not None:
-            self._monitor.close()
-        if self._socket is not None:
-            self._socket.close(linger=0)
-        self._socket = self._monitor = None
-        self._connection = _Connection(self._connection.number, now_s)
+    def _close(self) -> None:
+        if self._connection is not None:
+            self._connection.close()
+        self._connection = None
+        self._numbers = _Numbers(self._numbers.connection)
 
     def _again(self, text: str, now_s: float, *, wait_s: float = 0.0) -> None:
         """Start a new connection, whose numbers count from 0."""
@@ -201,7 +185,7 @@ class Subscription:
             self._counts.reconnects += 1
         self._emit_event(text)
         self._count_anew()
-        self._close(now_s)
+        self._close()
         self._wait_until_s = now_s + wait_s
 
     def _count_anew(self) -> None:
@@ -213,8 +197,8 @@ class Subscription:
 
         The consumed count continues: a publisher counts from the first value that it receives.
         """
-        connection = self._connection
-        connection.reader, connection.received, connection.next_number = ProductReader(), 0, 0
+        numbers = self._numbers
+        numbers.reader, numbers.received, numbers.next_number = ProductReader(), 0, 0
         self._counts.reconnects += 1
         self._count_anew()
 
@@ -230,45 +214,30 @@ class Subscription:
             self._reported = text
             self._note(text)
 
-    def _subscribe(self, now_s: float) -> None:
-        """Send the subscription, each second and after a product was taken."""
-        connection = self._connection
+    def _subscribe(self, connection: Connection, now_s: float) -> None:
+        """Send the subscription, with each ping and after a product was taken."""
         while self._taken:
-            if self._taken.popleft() == connection.number:
-                connection.taken += 1
+            if self._taken.popleft() == self._numbers.connection:
+                self._numbers.taken += 1
                 self._ask = True
-        beat = connection.asked_s is None or now_s - connection.asked_s >= PING_INTERVAL_S
-        if not (beat or self._ask):
+        if not (self._ask or connection.ping_is_due(now_s)):
             return
         wanted = Subscribe(
-            sensors=self._sensors, products=self._products, consumed=connection.taken, credit=self._credit
+            sensors=self._sensors, products=self._products, consumed=self._numbers.taken, credit=self._credit
         )
-        if self._send(wanted):
+        if connection.send(encode(wanted)):
             self._ask = False
-            if beat:
-                connection.asked_s = now_s
-                connection.first_asked_s = connection.first_asked_s or now_s
-                self._send(Ping())
+            connection.ping(now_s)
 
-    def _send(self, message: Message) -> bool:
-        """Send a message if the connection has room for it."""
-        if self._socket is None:
-            return False
-        with suppress(zmq.Again):
-            self._socket.send(encode(message), zmq.NOBLOCK)
-            return True
-        return False
-
-    def _read_all(self) -> None:
+    def _read_all(self, connection: Connection) -> None:
         for _ in range(_AT_ONCE):
-            if self._socket is None:
+            if connection is not self._connection:
+                return
+            frames = connection.receive()
+            if frames is None:
                 return
             try:
-                frames = self._socket.recv_multipart(zmq.NOBLOCK, copy=False)
-            except zmq.Again:
-                return
-            try:
-                self._read([frame.buffer for frame in frames])
+                self._read(connection, frames)
             except FormatVersionError as error:
                 self._refuse(str(error), time.monotonic())
             except RefusedError:
@@ -277,9 +246,8 @@ class Subscription:
                 self._counts.damaged += 1
                 self._again(str(error), time.monotonic())
 
-    def _read(self, frames: list[memoryview]) -> None:
+    def _read(self, connection: Connection, frames: list[memoryview]) -> None:
         message = decode(frames[0], _EXPECTED)
-        connection = self._connection
         if isinstance(message, Refused):
             self._refuse(message.reason, time.monotonic())
             return
@@ -289,26 +257,26 @@ class Subscription:
             self._reported = ""
         connection.heard_s = time.monotonic()
         if isinstance(message, Description):
-            if message.number in connection.reader:
+            if message.number in self._numbers.reader:
                 self._restarted()
-            connection.reader.describe(message, frames[1:])
+            self._numbers.reader.describe(message, frames[1:])
         elif not isinstance(message, Pong):
             self._take(message, frames[1:])
 
     def _take(self, header: Header, payload: list[memoryview]) -> None:
         """Deliver a product, and count the missing ones before it."""
-        connection = self._connection
-        if header.number < connection.next_number:  # Numbers must rise.
+        numbers = self._numbers
+        if header.number < numbers.next_number:  # Numbers must rise.
             self._restarted()
-        item = connection.reader.read(header, payload)
+        item = numbers.reader.read(header, payload)
         arrived_ns, arrived_utc_ns = time.monotonic_ns(), time.time_ns()
-        connection.received += 1
-        connection.next_number = header.number + 1
-        self._counts.missed = self._missed_before + connection.next_number - connection.received
+        numbers.received += 1
+        numbers.next_number = header.number + 1
+        self._counts.missed = self._missed_before + numbers.next_number - numbers.received
         self._counts.dropped = max(self._counts.dropped, self._dropped_before + header.dropped)
-        arrival = Arrival(item, header, arrived_ns, arrived_utc_ns, connection.number)
+        arrival = Arrival(item, header, arrived_ns, arrived_utc_ns, numbers.connection)
         if isinstance(header, Image | Points | Raw):
-            about = connection.reader.description(header.description)
+            about = numbers.reader.description(header.description)
             arrival = replace(arrival, translation_m=about.translation_m, rotation_xyzw=about.rotation_xyzw)
         self._deliver(arrival)
 

@@ -7,7 +7,8 @@ from typing import Final, Self
 import zmq
 
 from ertis_numba.errors import NetworkError, RefusedError
-from ertis_numba.network import addresses, messages, sockets
+from ertis_numba.network import addresses, messages
+from ertis_numba.network.connection import Connection
 from ertis_numba.network.keys import ClientKeys
 from ertis_numba.network.messages import AskStatus, Refused, Report
 from ertis_numba.network.status import Status
@@ -16,6 +17,7 @@ __all__ = ["Asking"]
 
 _REPORT_BYTES: Final = 4_000_000
 _AGAIN_S: Final = 0.5
+_TURN_S: Final = 0.1
 
 
 class Asking:
@@ -38,8 +40,7 @@ class Asking:
         self._address, self._keys = addresses.endpoint(address), keys
         addresses.require_keys(self._address, keys=keys)
         self._context: zmq.Context[zmq.Socket[bytes]] | None = None
-        self._socket: zmq.Socket[bytes] | None = None
-        self._monitor: sockets.Monitor | None = None
+        self._connection: Connection | None = None
 
     def __enter__(self) -> Self:
         self._context = zmq.Context()
@@ -72,20 +73,16 @@ class Asking:
         """
         end_s, asked_s, why = time.monotonic() + patience_s, 0.0, ""
         while time.monotonic() < end_s:
-            socket, monitor = self._connection()
-            if time.monotonic() - asked_s > _AGAIN_S and socket.poll(0, zmq.POLLOUT):
-                socket.send(messages.encode(AskStatus()), zmq.NOBLOCK)
+            connection = self._opened()
+            if time.monotonic() - asked_s > _AGAIN_S and connection.send(messages.encode(AskStatus())):
                 asked_s = time.monotonic()
-            poller = zmq.Poller()
-            poller.register(socket, zmq.POLLIN)
-            poller.register(monitor.socket, zmq.POLLIN)
-            ready = dict(poller.poll(20))  # A new connection does not wake the poller.
-            if socket in ready:
-                answer = _read(socket.recv_multipart())
+            connection.wait(min(_TURN_S, patience_s))
+            while frames := connection.receive():
+                answer = _read(frames)
                 if answer is not None:
                     return answer
-            why = next(iter(monitor.read()), why)
-            if monitor.final:
+            why = next(iter(connection.refusals()), why)
+            if connection.has_ended:
                 break
         self._hang_up()
         if why:
@@ -95,23 +92,20 @@ class Asking:
             "record' or 'ertis serve', or correct the address"
         )
 
-    def _connection(self) -> tuple["zmq.Socket[bytes]", sockets.Monitor]:
+    def _opened(self) -> Connection:
         if self._context is None:
             raise NetworkError("this client is not open; use it in a with statement")
-        if self._socket is None or self._monitor is None:
-            self._socket = sockets.client(self._context, self._address, keys=self._keys, max_bytes=_REPORT_BYTES)
-            self._monitor = sockets.Monitor(self._socket)
-        return self._socket, self._monitor
+        if self._connection is None:
+            self._connection = Connection(self._context, self._address, keys=self._keys, max_bytes=_REPORT_BYTES)
+        return self._connection
 
     def _hang_up(self) -> None:
-        if self._monitor is not None:
-            self._monitor.close()
-        if self._socket is not None:
-            self._socket.close(linger=0)
-        self._monitor = self._socket = None
+        if self._connection is not None:
+            self._connection.close()
+        self._connection = None
 
 
-def _read(frames: list[bytes]) -> Status | None:
+def _read(frames: list[memoryview]) -> Status | None:
     """Return a status; None for other messages."""
     message = messages.decode(frames[0])
     if isinstance(message, Refused):

@@ -9,12 +9,13 @@ from typing import Final, Literal
 import zmq
 
 from ertis_numba.errors import DataError, FormatVersionError
-from ertis_numba.network import messages, sockets
+from ertis_numba.network import messages
+from ertis_numba.network.connection import Connection
 from ertis_numba.network.keys import ClientKeys
-from ertis_numba.network.messages import PING_INTERVAL_S, SILENCE_LIMIT_S
+from ertis_numba.network.messages import SILENCE_LIMIT_S
 from ertis_numba.network.sensor_node._runs import OutgoingSession
 from ertis_numba.network.sensor_node._spool import Spool
-from ertis_numba.network.sensor_node._wire import Acknowledged, Frames, frames_of, greeting
+from ertis_numba.network.sensor_node._wire import Acknowledged, frames_of, greeting
 from ertis_numba.network.wakeup_socket import WakeupSocket
 
 __all__ = ["Central", "Link"]
@@ -24,7 +25,7 @@ Central = Literal["away", "storage", "processing", "fault", "closing"]
 _GREET_AGAIN_S = 2.0
 _REFUSED_S = 5.0
 _FAILED_S = 1.0
-_TURN_MS = 100
+_TURN_S = 0.1
 _UNDER_WAY_BYTES = 32_000_000
 _AT_ONCE = 32  # Limit on messages before other work has its turn.
 _LINE_CHARACTERS = 400
@@ -64,13 +65,9 @@ class Link(threading.Thread):
         self._address, self._keys, self._spool = address, keys, spool
         self._on_acked, self._on_note = on_acked, on_note
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        self._socket: zmq.Socket[bytes] | None = None
-        self._monitor: sockets.Monitor | None = None
-        self._poller = zmq.Poller()
+        self._connection: Connection | None = None
         self._wakeup_socket = WakeupSocket()
         self._stopping = threading.Event()
-        self._heard_s = self._ping_s = 0.0
-        self._is_blocked = False
         self._was_there = False
         self._reported: set[tuple[str, str]] = set()  # Subject and sensor.
         self._refusals: dict[str, str] = {}  # By sensor; "" stands for all.
@@ -95,7 +92,7 @@ class Link(threading.Thread):
         self.wake()
         if self.ident is not None:
             self.join()
-        self._disconnect(linger_ms=_TURN_MS)
+        self._disconnect(linger_s=_TURN_S)
         self._context.term()
         self._wakeup_socket.close()
 
@@ -110,55 +107,41 @@ class Link(threading.Thread):
                 self._stopping.wait(_FAILED_S)
                 with suppress(Exception):
                     self._connect()
-        if self._socket is not None:
-            self._send(self._socket, [messages.encode(messages.Bye())])
+        if self._connection is not None:
+            self._connection.send(messages.encode(messages.Bye()))
 
     def _connect(self) -> None:
-        """Create a new socket: messages in the old one were acknowledged, or will be sent again."""
+        """Make a new connection: messages in the old one were acknowledged, or will be sent again."""
         self._disconnect()
-        self._socket = sockets.client(self._context, self._address, keys=self._keys)
-        self._monitor = sockets.Monitor(self._socket)
-        self._poller = zmq.Poller()
-        self._poller.register(self._wakeup_socket.fileno(), zmq.POLLIN)
-        self._poller.register(self._monitor.socket, zmq.POLLIN)
-        self._is_blocked = False
+        self._connection = Connection(self._context, self._address, keys=self._keys)
         self._greeted.clear()
-        self._heard_s, self._ping_s = time.monotonic(), 0.0
         with self._spool.turn:
             for run in self._spool.runs.values():
                 if run.stage != "waiting":
                     run.stage = "new"
 
-    def _disconnect(self, linger_ms: int = 0) -> None:
-        if self._monitor is not None:
-            self._monitor.close()
-        if self._socket is not None:
-            self._socket.close(linger=linger_ms)
-        self._socket = self._monitor = None
+    def _disconnect(self, linger_s: float = 0.0) -> None:
+        if self._connection is not None:
+            self._connection.close(linger_s)
+        self._connection = None
 
     def _turn(self) -> None:
-        socket, monitor = self._socket, self._monitor
-        if socket is None or monitor is None:
+        connection = self._connection
+        if connection is None:
             self._connect()
             return
-        self._poller.register(socket, zmq.POLLIN | (zmq.POLLOUT if self._is_blocked else 0))
-        events = dict(self._poller.poll(_TURN_MS))
-        if self._wakeup_socket.fileno() in events:
-            self._wakeup_socket.clear()
-        if monitor.socket in events:
-            for text in monitor.read():
-                self._refusals[""] = text
-                self._note(text, text)  # There are only a few of them.
-        if events.get(socket, 0) & zmq.POLLOUT:
-            self._is_blocked = False
-        self._receive(socket)
+        connection.wait(_TURN_S, self._wakeup_socket)
+        self._wakeup_socket.clear()
+        for text in connection.refusals():
+            self._refusals[""] = text
+            self._note(text, text)  # There are only a few of them.
+        self._receive(connection)
         now_s = time.monotonic()
-        if now_s - self._heard_s > SILENCE_LIMIT_S:
+        if now_s - (connection.heard_s or connection.opened_s) > SILENCE_LIMIT_S:
             self._lose()
             return
-        if now_s - self._ping_s > PING_INTERVAL_S and self._send(socket, [messages.encode(messages.Ping())]):
-            self._ping_s = now_s
-        self._send_pending(socket, now_s)
+        connection.ping(now_s)
+        self._send_pending(connection, now_s)
 
     def _lose(self) -> None:
         if self.central != "away" or not self._was_there:
@@ -171,23 +154,22 @@ class Link(threading.Thread):
 
     # Received messages
 
-    def _receive(self, socket: "zmq.Socket[bytes]") -> None:
+    def _receive(self, connection: Connection) -> None:
         for _ in range(_AT_ONCE):
-            try:
-                frames = socket.recv_multipart(zmq.NOBLOCK)
-            except zmq.Again:
+            frames = connection.receive()
+            if frames is None:
                 return
             try:
                 message = messages.decode(frames[0], _WANTED)
             except FormatVersionError as error:
-                self._heard_s = time.monotonic()
+                connection.heard_s = time.monotonic()
                 self._refusals[""] = str(error)
                 with self._spool.turn:
                     self._wait(list(self._spool.runs.values()), str(error), "version")
             except DataError as error:
                 self._note(f"a message from the central node cannot be decoded: {error}", "message")
             else:
-                self._heard_s = time.monotonic()
+                connection.heard_s = time.monotonic()
                 self._take(message)
 
     def _take(self, message: messages.Message) -> None:
@@ -262,10 +244,12 @@ class Link(threading.Thread):
 
     def _send_bye(self) -> bool:
         """Send bye for some finished sessions, within the available room; return True if there were any."""
-        socket = self._socket
+        connection = self._connection
         with self._spool.turn:
             going_on = {run.key for run in self._spool.runs.values() if run.items}
-        if socket is None or not self._greeted - going_on or not self._send(socket, [messages.encode(messages.Bye())]):
+        if connection is None or not self._greeted - going_on:
+            return False
+        if not connection.send(messages.encode(messages.Bye())):
             return False
         self._greeted.clear()
         with self._spool.turn:
@@ -299,7 +283,7 @@ class Link(threading.Thread):
                     active.setdefault(run.sensor.name, run)
         return list(active.values())
 
-    def _send_pending(self, socket: "zmq.Socket[bytes]", now_s: float) -> None:
+    def _send_pending(self, connection: Connection, now_s: float) -> None:
         runs = self._active(now_s)
         for run in runs:
             with self._spool.turn:
@@ -307,31 +291,31 @@ class Link(threading.Thread):
                     run.go_back(now_s)
                     run.stage = "new"  # The central node may have less than before: it gets the present items.
             if run.stage == "new" or (run.stage == "asked" and now_s - run.since_s > _GREET_AGAIN_S):
-                self._greet(socket, run, now_s)
+                self._greet(connection, run, now_s)
         runs = [run for run in runs if run.stage == "welcome"]
         n_sent, before = 0, -1
-        while runs and not self._is_blocked and before < n_sent < _AT_ONCE:
+        while runs and not connection.is_blocked and before < n_sent < _AT_ONCE:
             before = n_sent
             for _ in runs:  # In turn, beginning with another one each time.
                 self._next_sensor += 1
-                n_sent += self._send_next(socket, runs, runs[self._next_sensor % len(runs)])
+                n_sent += self._send_next(connection, runs, runs[self._next_sensor % len(runs)])
         if n_sent >= _AT_ONCE:
             self.wake()
 
-    def _greet(self, socket: "zmq.Socket[bytes]", run: OutgoingSession, now_s: float) -> None:
+    def _greet(self, connection: Connection, run: OutgoingSession, now_s: float) -> None:
         with self._spool.turn:
             if not run.items:
                 return
             frames = greeting(run)
-        if self._send(socket, frames):
+        if connection.send(*frames):
             run.stage, run.since_s = "asked", now_s
             self._greeted.add(run.key)
 
-    def _send_next(self, socket: "zmq.Socket[bytes]", runs: list[OutgoingSession], run: OutgoingSession) -> bool:
+    def _send_next(self, connection: Connection, runs: list[OutgoingSession], run: OutgoingSession) -> bool:
         """Send the next item of a session, and return True if one was sent."""
         window = 1 if self.central == "fault" else run.window
         with self._spool.turn:
-            item = None if self._is_blocked else run.to_send(window)
+            item = None if connection.is_blocked else run.to_send(window)
             if item is None:
                 return False
             under_way = sum(sent.n_bytes for each in runs for sent in each.under_way())
@@ -345,18 +329,10 @@ class Link(threading.Thread):
         if entry is None and not item.reason:  # The item was replaced by a gap meanwhile.
             return False
         frames, last = frames_of(run, item, entry)
-        if not self._send(socket, frames):
+        if not connection.send(*frames):
             return False
         with self._spool.turn:
             run.mark_sent(last, time.monotonic())
-        return True
-
-    def _send(self, socket: "zmq.Socket[bytes]", frames: Frames) -> bool:
-        try:
-            socket.send_multipart(frames, zmq.NOBLOCK, copy=False)
-        except zmq.Again:  # Not connected, or the other side is slow.
-            self._is_blocked = True
-            return False
         return True
 
 

@@ -1,0 +1,112 @@
+"""Connection of a client to a central node or a publisher."""
+
+import time
+from contextlib import suppress
+
+import zmq
+
+from ertis_numba.network import sockets
+from ertis_numba.network.keys import ClientKeys
+from ertis_numba.network.messages import PING_INTERVAL_S, Ping, encode
+from ertis_numba.network.wakeup_socket import WakeupSocket
+
+__all__ = ["Connection"]
+
+
+class Connection:
+    """Socket of a client with its monitor: sends, receives, pings, and reports refusals. One thread uses it.
+
+    ZeroMQ connects and reconnects in the background. A client that has been refused, or hears nothing, closes its
+    connection and makes a new one.
+
+    Parameters
+    ----------
+    context : zmq.Context
+    address : str
+    keys : ClientKeys or None
+        None on loopback only.
+    max_bytes : int
+        Longest frame.
+
+    Attributes
+    ----------
+    opened_s : float
+    sent_s : float or None
+        Time of the first message that was sent, which requires a peer.
+    heard_s : float or None
+        Time of the last valid message; its reader sets it.
+    is_blocked : bool
+        There was no room for a message. `wait` ends when there is room again.
+
+    Raises
+    ------
+    ArgumentError
+        The address cannot be used, or requires keys.
+    NetworkError
+        The address can never be connected to.
+    """
+
+    def __init__(
+        self,
+        context: "zmq.Context[zmq.Socket[bytes]]",
+        address: str,
+        *,
+        keys: ClientKeys | None,
+        max_bytes: int = sockets.MAX_BYTES,
+    ) -> None:
+        self._socket = sockets.client(context, address, keys=keys, max_bytes=max_bytes)
+        self._monitor = sockets.Monitor(self._socket)
+        self._ping_s: float | None = None
+        self.opened_s = time.monotonic()
+        self.sent_s: float | None = None
+        self.heard_s: float | None = None
+        self.is_blocked = False
+
+    @property
+    def has_ended(self) -> bool:
+        """Return True if ZeroMQ has given up; see `refusals` for the reason."""
+        return self._monitor.final
+
+    def wait(self, timeout_s: float, wakeup_socket: WakeupSocket | None = None) -> None:
+        """Wait until there is a message, a refusal, room for a message, or a wake-up."""
+        poller = zmq.Poller()
+        poller.register(self._socket, zmq.POLLIN | (zmq.POLLOUT if self.is_blocked else 0))
+        poller.register(self._monitor.socket, zmq.POLLIN)
+        if wakeup_socket is not None:
+            poller.register(wakeup_socket, zmq.POLLIN)
+        if dict(poller.poll(round(1000 * timeout_s))).get(self._socket, 0) & zmq.POLLOUT:
+            self.is_blocked = False
+
+    def refusals(self) -> list[str]:
+        """Return the reasons of new refusals as lines, each once."""
+        return self._monitor.read()
+
+    def receive(self) -> list[memoryview] | None:
+        """Return the frames of the next message, or None if there is none."""
+        with suppress(zmq.Again):
+            return [frame.buffer for frame in self._socket.recv_multipart(zmq.NOBLOCK, copy=False)]
+        return None
+
+    def send(self, *frames: bytes | memoryview) -> bool:
+        """Send a message, and return True if there was room for it."""
+        try:
+            self._socket.send_multipart(frames, zmq.NOBLOCK, copy=False)
+        except zmq.Again:  # Not connected, or the peer is slow.
+            self.is_blocked = True
+            return False
+        self.sent_s = self.sent_s or time.monotonic()
+        return True
+
+    def ping_is_due(self, now_s: float) -> bool:
+        """Return True if the last ping was sent an interval ago, or never."""
+        return self._ping_s is None or now_s - self._ping_s >= PING_INTERVAL_S
+
+    def ping(self, now_s: float) -> None:
+        """Send a ping if it is due and there is room for it."""
+        if self.ping_is_due(now_s) and self.send(encode(Ping())):
+            self._ping_s = now_s
+
+    def close(self, linger_s: float = 0.0) -> None:
+        """Close the socket, after it has sent its messages or the time is up."""
+        self._monitor.close()
+        self._socket.close(linger=round(1000 * linger_s))
