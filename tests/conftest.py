@@ -2,6 +2,9 @@
 
 import logging
 import os
+import random
+import threading
+import types
 
 import numpy as np
 import pytest
@@ -37,6 +40,42 @@ def _garbage_in_new_arrays_of_the_gpu():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(cuda, "device_array", filled)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _simulated_gpu_threads_in_turn():
+    """Run the threads of a simulated GPU block one after another, in an arbitrary order.
+
+    The simulator starts a thread of Python for each of them, and polls them while they run: five times as long. Turns
+    suffice because no kernel waits for other threads of its block. An arbitrary order shows dependences on the order.
+    """
+    if os.environ.get("NUMBA_ENABLE_CUDASIM") != "1":
+        yield
+        return
+    from numba.cuda.simulator import kernel, kernelapi  # noqa: PLC0415 - only the simulator's process has them
+
+    running = threading.local()
+    order = random.Random(1)
+
+    def run(block, place, *arguments):
+        points = list(np.ndindex(*block._block_dim))
+        order.shuffle(points)
+        for point in points:
+            thread = kernel.BlockThread(lambda: block._f(*arguments), block, place, point, block._debug)
+            running.thread = thread
+            thread.run()
+            if thread.exception:
+                error, traceback = thread.exception
+                raise error.with_traceback(traceback)
+
+    def wait(_):
+        raise NotImplementedError("a kernel waits for other threads of its block; tests/conftest.py runs them in turn")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(kernelapi, "threading", types.SimpleNamespace(current_thread=lambda: running.thread))
+        patch.setattr(kernel.BlockManager, "run", run)
+        patch.setattr(kernel.BlockThread, "syncthreads", wait)
         yield
 
 

@@ -43,5 +43,5 @@ SIMULATED = any(kernel_set.simulated for kernel_set in KERNELS.values())
 
 
 def sized(small, large):
-    """Return small and large cases, or only small ones in the simulator, which takes 0.2 ms per GPU thread."""
+    """Return small and large cases, or only small ones in the simulator, whose GPU threads are calls of Python."""
     return list(small) if SIMULATED else [*small, *large]
