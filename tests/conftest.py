@@ -59,10 +59,11 @@ def _simulated_gpu_threads_in_turn():
     order = random.Random(1)
 
     def run(block, place, *arguments):
-        points = list(np.ndindex(*block._block_dim))
+        function, shape, debug = (vars(block)[name] for name in ("_f", "_block_dim", "_debug"))
+        points = list(np.ndindex(*shape))
         order.shuffle(points)
         for point in points:
-            thread = kernel.BlockThread(lambda: block._f(*arguments), block, place, point, block._debug)
+            thread = kernel.BlockThread(lambda: function(*arguments), block, place, point, debug)
             running.thread = thread
             thread.run()
             if thread.exception:
