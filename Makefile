@@ -24,10 +24,10 @@ $(VENV)/ready-to-test: $(VENV)/ready  # packages for tests and checks, of which 
 demo: $(VENV)/ready
 	$(BIN)/ertis demo --force
 
-# Tests that measure times run first, alone. Then two groups run at a time, and each prints its result when it ends.
+# Two groups run at a time, and each prints its result when it ends. Tests that measure times run last, alone.
 test: $(VENV)/ready-to-test
-	$(PYTEST) -m alone $(ELSEWHERE)
 	$(MAKE) --no-print-directory --jobs 2 --keep-going --output-sync=target test-kernels test-ptx test-host test-simulator
+	$(PYTEST) -m alone $(ELSEWHERE)
 
 test-kernels: $(VENV)/ready-to-test  # compile all kernels in one process, because parallel processes could corrupt the cache
 	$(PYTEST) -m "not alone" $(KERNELS)

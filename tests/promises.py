@@ -1,9 +1,12 @@
-"""Promised times, as multiples of the time of importing the libraries, which is measured in the same run."""
+"""Promised processor times, as multiples of that of importing the libraries, which is measured in the same run.
+
+Processor time is nearly independent of other programs, unlike the time by the clock.
+"""
 
 import functools
 import subprocess
 import sys
-import time
+from resource import RUSAGE_CHILDREN, RUSAGE_SELF, getrusage
 
 import numpy as np
 
@@ -11,23 +14,28 @@ IMPORTS = [sys.executable, "-c", "import numba, scipy.fft, h5py"]
 
 
 def best_ratio(once, *, times, promised):
-    """Time of the fastest run divided by the time of the imports; stop after the first run within the promise."""
+    """Processor time of the cheapest run divided by that of the imports; stop after the first run within the promise."""
     best = np.inf
     for _ in range(times):
-        start = time.perf_counter()
-        once()
-        best = min(best, (time.perf_counter() - start) / imports_s())
+        best = min(best, cpu_s(once) / imports_s())
         if best < promised:
             break
     return best
 
 
+def cpu_s(once):
+    """Processor time of a call, its threads and the processes that it waits for."""
+    start_s = _used_s()
+    once()
+    return _used_s() - start_s
+
+
 @functools.cache
 def imports_s():
-    """Shortest time of an interpreter that imports the libraries of all commands."""
-    taken_s = []
-    for _ in range(5):
-        start = time.perf_counter()
-        subprocess.run(IMPORTS, check=True)
-        taken_s.append(time.perf_counter() - start)
-    return min(taken_s)
+    """Least processor time of an interpreter that imports the libraries of all commands."""
+    return min(cpu_s(lambda: subprocess.run(IMPORTS, check=True)) for _ in range(5))
+
+
+def _used_s():
+    used = [getrusage(who) for who in (RUSAGE_SELF, RUSAGE_CHILDREN)]
+    return sum(each.ru_utime + each.ru_stime for each in used)

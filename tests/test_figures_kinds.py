@@ -214,7 +214,6 @@ def test_picture_files_are_small_and_reproducible(kind):
     assert max(sizes) < 1_500_000, sizes  # of noise, which cannot be compressed
 
 
-@pytest.mark.alone
 @pytest.mark.parametrize("draw", [figures.plot, figures.slices, figures.projection])
 def test_large_images_are_drawn_within_five_imports(draw):
     big = solid(3000, range_m=np.linspace(0.5, 5.0, 1178))
@@ -222,7 +221,6 @@ def test_large_images_are_drawn_within_five_imports(draw):
     assert best_ratio(once, times=3, promised=5) < 5
 
 
-@pytest.mark.alone
 @pytest.mark.parametrize("draw", [figures.signals, figures.matched_filter])
 def test_recordings_are_drawn_within_five_imports(draw):
     measurement = heard(settings=Settings.from_preset("default_25_50"))

@@ -1,4 +1,4 @@
-"""Promised times and sizes, measured on whole processes. The best of a few runs counts, because machines are shared."""
+"""Promised processor times and sizes of whole processes. The best of a few runs counts, because caches are shared."""
 
 import os
 import re
@@ -22,7 +22,7 @@ ERTIS = [sys.executable, "-m", "ertis_cli"]
 
 
 def ratio(command, *, times, promised, **options):
-    """Return the shortest time of some runs relative to the imports, and the output of the last one."""
+    """Return the least processor time of some runs relative to the imports, and the output of the last one."""
     stated = []
 
     def once():
@@ -40,18 +40,15 @@ def recording(tmp_path_factory):
     return path
 
 
-@pytest.mark.alone
 def test_help_takes_less_time_than_importing_the_libraries():
     assert ratio([*ERTIS, "--help"], times=5, promised=0.75)[0] < 0.75
 
 
-@pytest.mark.alone
 def test_warm_process_of_one_measurement_takes_less_time_than_four_imports(recording, tmp_path):
     command = [*ERTIS, "process", recording, "-o", tmp_path / "image.h5", "--directions", "3000", "--force"]
     assert ratio(command, times=6, promised=3.75)[0] < 3.75
 
 
-@pytest.mark.alone
 def test_first_run_takes_less_time_than_30_imports_and_reports_compilation(recording, tmp_path):
     for run in ("first", "again"):  # nothing of the first one is left to the other
         environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / run)}

@@ -151,16 +151,15 @@ def test_parsed_samples_own_their_memory():
     assert reported([block]) == [block_of(1)]
 
 
-@pytest.mark.alone
 def test_parsing_a_block_takes_two_milliseconds_at_most():
     receiver = BlockReceiver(163_840, expected=0, shortest_s=0.04)
     times_s = []
     for counter in range(20):
         data = block_of(counter, n_samples=163_840)
         pieces = [data[begin : begin + 4095] for begin in range(0, len(data), 4095)]
-        began = time.perf_counter()
+        began = time.process_time()
         found = [block for piece in pieces for block in receiver.feed(piece, at(0.05 * counter))]
-        times_s.append(time.perf_counter() - began)
+        times_s.append(time.process_time() - began)
         assert counters(found) == [counter]
     assert np.median(times_s) < 2e-3
 
