@@ -14,7 +14,7 @@ IMPORTS = [sys.executable, "-c", "import numba, scipy.fft, h5py"]
 
 
 def best_ratio(once, *, times, promised):
-    """Processor time of the cheapest run divided by that of the imports; stop after the first run within the promise."""
+    """Processor time of the cheapest run relative to the imports; stop after the first run within the promise."""
     best = np.inf
     for _ in range(times):
         best = min(best, cpu_s(once) / imports_s())
