@@ -54,7 +54,7 @@ class FastChain(KernelChain):
         points = aperture.directions if nodes is None else nodes.points
         own_s = layout.delay_s[layout.enabled]
         array_weight = array_weights(settings)
-        ahead_s = ahead_of(fit, array_weight, step_s)
+        ahead_s = ahead_of(array_weight, step_s)
         edges = zones_of(settings)
         largest_s = max(
             float(np.max(np.abs(own_s + aperture.delays_s(points, sound_speed_m_s=speed_m_s, range_m=range_m))))
