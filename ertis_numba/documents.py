@@ -156,7 +156,7 @@ class TomlDocument(TomlTable, frozen=True, kw_only=True):
     Attributes
     ----------
     former_keys : dict of str to str
-        Former and present names of keys, so that documents in older recordings stay readable.
+        Patterns of former keys, and present names, so that documents in older recordings stay readable.
     max_bytes : int
         Limit on the length of a document in UTF-8.
     max_items : int

@@ -38,10 +38,6 @@ PLANS = {
         f"delays {oversampling} {taps}": _plan(oversampling=oversampling, delay_taps=taps)
         for oversampling, taps in [(1, 2), (4, 1), (16, 1), (2, 2), (6, 2), (3, 3), (1, 4), (2, 4), (4, 4), (2, 6)]
     },
-    "nearest": _plan(interpolation="nearest", oversampling=32, delay_taps=None),
-    "carrier": _plan(interpolation="carrier", oversampling=8, delay_taps=None),
-    "linear": _plan(interpolation="linear", oversampling=4, delay_taps=None),
-    "cubic": _plan(interpolation="cubic", oversampling=3, delay_taps=None),
     **{
         f"nodes {taps} {density:g}": _plan(beam_taps=taps, beam_density=density)
         for taps, density in [(2, 2.0), (2, 4.0), (4, 1.25), (4, 2.0), (4, 3.0), (6, 1.75), (6, 3.0)]

@@ -213,7 +213,15 @@ def test_generated_readme_has_all_tables(name):
     assert "| ---: |" in table
 
 
-FEW = [("float32", "nearest", 2, 40.0, None), ("float32", 3, 4, 80.0, None), ("int16", 2, 2, 40.0, (4, 1.75))]
+def test_interpolation_benchmark_gives_the_documented_errors():
+    done = CliRunner().invoke(cli, ["bench", "interpolation", "--quiet", "--json"])
+    assert done.exit_code == 0, (done.output, done.exception)
+    found = {row["oversampling"]: row["error_db"] for row in json.loads(done.stdout)["rows"]}
+    assert found[2]["fitted, 2 taps"] == pytest.approx(-44, abs=0.5)
+    assert found[2]["linear between rotated carriers"] == pytest.approx(-33, abs=0.5)
+
+
+FEW = [("float32", 1, 2, 40.0, None), ("float32", 3, 4, 80.0, None), ("int16", 2, 2, 40.0, (4, 1.75))]
 
 
 @pytest.fixture
@@ -240,7 +248,7 @@ def test_accuracy_rates_every_plan_on_both_subjects(tmp_path):
         rows = [row for row in report["rows"] if row["subject"] == subject_name]
         names = [row["plan"].partition(":")[0] for row in rows]
         assert {accuracy.PAPER, *ERROR_PRESETS_DB} <= set(names)
-        assert "float32, nearest sample of 2 per range, 40 dB" in names
+        assert "float32, 1 sample of 2 per range, 40 dB" in names
         assert [row["error_db"] for row in rows] == sorted((row["error_db"] for row in rows), reverse=True)
         for row in rows:
             assert row["time_ms"] > 0

@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from ertis_bench.interpolation import TEXTBOOK, fitted_error, textbook_error
 from hypothesis import given, settings, strategies as st
 from numpy.testing import assert_allclose
 
-from ertis_numba.settings import INTERPOLATIONS, Call, Settings
+from ertis_numba.settings import Call, Settings
 from ertis_numba.stages.fitting import DelayFit, Spectrum, fit, weights_of
 from ertis_numba.waveform import matched_noise_spectrum
 
@@ -32,24 +33,16 @@ def step_s_of(call, rate):
 DEFAULT = spectrum_of(Call())
 
 
-def power_of(made):
-    """Total error of a fit."""
-    return float((made.errors + made.biases) @ DEFAULT.power)
-
-
-def errors_db(interpolation, n_taps, oversampling):
-    return 10 * np.log10(power_of(DelayFit(interpolation, n_taps, 1 / (RATE_HZ * oversampling), DEFAULT)))
+def errors_db(error, which):
+    return np.array([10 * np.log10(error(DEFAULT, 1 / (RATE_HZ * oversampling), which)) for oversampling in (4, 8, 16)])
 
 
 @settings(max_examples=40, deadline=None)
-@given(call=calls, rate=rates, other=st.sampled_from(["nearest", "carrier", "linear", "cubic"]))
+@given(call=calls, rate=rates, other=st.sampled_from(list(TEXTBOOK)))
 def test_fitted_weights_have_the_smallest_error_for_their_taps(call, rate, other):
     spectrum, step_s = spectrum_of(call), step_s_of(call, rate)
-    errors = {}
-    for interpolation in ("fitted", other):
-        made = DelayFit(interpolation, INTERPOLATIONS[other], step_s, spectrum)
-        errors[interpolation] = float((made.errors + made.biases) @ spectrum.power)
-    assert errors["fitted"] <= errors[other] * (1 + 1e-9) + FLOOR
+    fitted = fitted_error(spectrum, step_s, TEXTBOOK[other][0])
+    assert fitted <= textbook_error(spectrum, step_s, other) * (1 + 1e-9) + FLOOR
 
 
 @settings(max_examples=40, deadline=None)
@@ -57,20 +50,25 @@ def test_fitted_weights_have_the_smallest_error_for_their_taps(call, rate, other
 def test_additional_tap_does_not_raise_the_error(call, rate, n_taps):
     """Half a decibel is permitted: the iterations of the fit end slightly before the minimum."""
     spectrum, step_s = spectrum_of(call), step_s_of(call, rate)
-    few, many = (DelayFit("fitted", count, step_s, spectrum) for count in (n_taps, n_taps + 1))
+    few, many = (DelayFit(count, step_s, spectrum) for count in (n_taps, n_taps + 1))
     assert (many.errors + many.biases) @ spectrum.power <= 1.12 * (few.errors + few.biases) @ spectrum.power + FLOOR
 
 
 @pytest.mark.parametrize("n_taps", [1, 2, 3, 4])
 def test_errors_fall_with_oversampling_by_6_db_for_each_tap(n_taps):
     """A polynomial of that order has this slope, and so has any equally good method."""
-    found_db = [errors_db("fitted", n_taps, oversampling) for oversampling in (4, 8, 16)]
-    assert np.diff(found_db) == pytest.approx(-6.02 * n_taps, abs=0.6)
+    assert np.diff(errors_db(fitted_error, n_taps)) == pytest.approx(-6.02 * n_taps, abs=0.6)
+
+
+@pytest.mark.parametrize("name", TEXTBOOK)
+def test_errors_of_textbook_weights_fall_by_6_db_for_each_tap(name):
+    assert np.diff(errors_db(textbook_error, name)) == pytest.approx(-6.02 * TEXTBOOK[name][0], abs=0.6)
 
 
 def test_single_fitted_tap_is_a_rotated_carrier():
-    assert errors_db("fitted", 1, 8) == pytest.approx(errors_db("carrier", 1, 8), abs=0.1)
-    assert errors_db("carrier", 1, 8) < errors_db("nearest", 1, 8) - 10
+    rotated_db = errors_db(textbook_error, "nearest sample, carrier rotated")
+    assert errors_db(fitted_error, 1) == pytest.approx(rotated_db, abs=0.1)
+    assert (rotated_db < errors_db(textbook_error, "nearest sample") - 10).all()
 
 
 def plain_errors(made, step_s, frequency_hz):
@@ -86,14 +84,14 @@ def plain_errors(made, step_s, frequency_hz):
     return np.var(wrong), np.abs(np.mean(wrong)) ** 2
 
 
-@pytest.mark.parametrize(
-    ("interpolation", "n_taps"),
-    [("fitted", n) for n in range(1, 6)] + [("nearest", None), ("carrier", None), ("linear", None), ("cubic", None)],
-)
+@pytest.mark.parametrize("n_taps", range(1, 6))
 @pytest.mark.parametrize("oversampling", [1, 3, 10])
-def test_fit_errors_equal_a_direct_evaluation(interpolation, n_taps, oversampling):
+def test_fit_errors_equal_a_direct_evaluation(n_taps, oversampling):
     step_s = 1 / (RATE_HZ * oversampling)
-    made = DelayFit(interpolation, n_taps, step_s, DEFAULT)
+    made = DelayFit(n_taps, step_s, DEFAULT)
+    assert fitted_error(DEFAULT, step_s, n_taps) == pytest.approx(
+        (made.errors + made.biases) @ DEFAULT.power, rel=0.01, abs=FLOOR
+    )
     for wave in range(0, 40, 6):
         varying, shared = plain_errors(made, step_s, DEFAULT.frequency_hz[wave])
         assert made.errors[wave] == pytest.approx(varying, rel=0.01, abs=FLOOR)
@@ -105,7 +103,7 @@ def test_fit_errors_equal_a_direct_evaluation(interpolation, n_taps, oversamplin
 def test_delayed_wave_is_within_the_predicted_error(call, rate, n_taps, seed):
     """The wave has all frequencies with random phases, and delays before and after the first kept sample."""
     spectrum, step_s, random = spectrum_of(call), step_s_of(call, rate), np.random.default_rng(seed)
-    made = DelayFit("fitted", n_taps, step_s, spectrum)
+    made = DelayFit(n_taps, step_s, spectrum)
     delays_s = random.uniform(-0.1, 0.1, 1500)  # so long that no two waves agree
     first, fractions = made.split(delays_s)
     lowest = (n_taps - 1) // 2 - 0.5 * (n_taps % 2)
@@ -122,15 +120,13 @@ def test_delayed_wave_is_within_the_predicted_error(call, rate, n_taps, seed):
     assert np.mean(np.abs(wrong) ** 2) < 1.3 * predicted + FLOOR
 
 
-@pytest.mark.parametrize("interpolation", ["carrier", "linear", "cubic"])
-def test_simple_weights_are_exact_at_the_carrier(interpolation):
-    step_s = 1 / RATE_HZ
-    made = DelayFit(interpolation, None, step_s, DEFAULT)
-    assert max(plain_errors(made, step_s, DEFAULT.centre_hz)) < 1e-20
+@pytest.mark.parametrize("name", list(TEXTBOOK)[1:])
+def test_textbook_weights_are_exact_at_the_carrier(name):
+    assert textbook_error(Spectrum(np.array([37e3]), np.ones(1)), 1 / RATE_HZ, name) < 1e-20
 
 
 def test_weights_have_the_shape_of_the_fractions():
-    made = DelayFit("fitted", 3, 1 / RATE_HZ, DEFAULT)
+    made = DelayFit(3, 1 / RATE_HZ, DEFAULT)
     first, fractions = made.split(np.linspace(-1e-4, 1e-4, 20).reshape(4, 5))
     assert first.shape == fractions.shape == (4, 5)
     assert made.weights(fractions).shape == (4, 5, 3)

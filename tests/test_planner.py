@@ -7,7 +7,7 @@ from ertis_numba import kernels
 from ertis_numba.beamformers import ADAPTIVE_BEAMFORMERS
 from ertis_numba.errors import ArgumentError, DeviceError
 from ertis_numba.pipeline import Pipeline
-from ertis_numba.settings import ERROR_PRESETS_DB, INTERPOLATIONS, Accuracy, Array, Call, Processing
+from ertis_numba.settings import ERROR_PRESETS_DB, Accuracy, Array, Call, Processing
 from ertis_numba.stages import planner
 from ertis_numba.stages.planner import Planner, complete
 from tests import error_cases, reference
@@ -92,15 +92,12 @@ def test_pipelines_of_all_presets_keep_their_budget(device, budget_db):
         {"beam_taps": 4, "beam_density": 3.5, "oversampling": 3, "delay_taps": 3},
         {"stopband_attenuation_db": 77.0},
         {"focal_zones": 3},
-        {"interpolation": "cubic"},
-        {"interpolation": "linear", "oversampling": 12},
     ],
 )
 def test_given_choices_are_kept(pinned):
     found = chosen_for(SMALL, **pinned).settings.accuracy
     assert is_complete(found)
     assert {name: getattr(found, name) for name in pinned} == pinned
-    assert found.delay_taps == (INTERPOLATIONS[found.interpolation] or found.delay_taps)
 
 
 def test_given_16_bits_are_kept_or_refused():
@@ -115,7 +112,7 @@ def test_given_16_bits_are_kept_or_refused():
     ("pinned", "part"),
     [
         ({}, "single precision"),
-        ({"interpolation": "nearest", "oversampling": 12}, "interpolation of delayed samples"),
+        ({"delay_taps": 1, "oversampling": 12}, "interpolation of delayed samples"),
         ({"beam_taps": 2, "beam_density": 1.5}, "interpolation between beam-grid points"),
         ({"stopband_attenuation_db": 40.0}, "noise aliased by the decimation"),
     ],
@@ -189,7 +186,7 @@ def test_adaptive_beamformers_get_usable_plans(beamformer):
 
 def test_rated_plans_equal_requested_plans():
     """This holds for complete and incomplete settings."""
-    for name in ("cubic", "nearest", "nodes 6 3", "nodes 2 2", "standard", "stop band 60"):
+    for name in ("delays 4 1", "delays 4 4", "nodes 6 3", "nodes 2 2", "standard", "stop band 60"):
         plan = error_cases.PLANS[name].replace(max_error_db=-35.0)
         device = error_cases.kernels_for(plan)
         own = Planner(SMALL.replace(accuracy=plan), device, threads=1).chosen(plan)

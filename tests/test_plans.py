@@ -81,12 +81,12 @@ def test_explain_prints_the_plan_as_text(recording, tmp_path):
     assert "    one set of delays for each focal zone" in bent
 
 
-def test_explain_names_linear_interpolation(recording, tmp_path):
+def test_explain_names_the_given_parts_of_a_plan(recording, tmp_path):
     wishes = tmp_path / "wishes.toml"
-    wishes.write_text('[accuracy]\ninterpolation = "linear"\nbeam_taps = 0\nprecision = "float32"\n', "utf-8")
+    wishes.write_text('[accuracy]\ndelay_taps = 2\nbeam_taps = 0\nprecision = "float32"\n', "utf-8")
     reported = run(recording, "-o", tmp_path / "a.h5", "--explain", "--settings", wishes).stderr
     assert "single precision" in reported
-    assert "interpolated linearly from two samples" in reported
+    assert "a delayed sample is a weighted sum of 2 samples" in reported
     assert "the beam of every direction is summed directly" in reported
 
 
@@ -119,7 +119,7 @@ def test_verify_prints_the_error_as_text(recording, tmp_path):
 def test_plan_beyond_its_budget_is_refused(recording, tmp_path):
     output, wishes = tmp_path / "a.h5", tmp_path / "wishes.toml"
     wishes.write_text(
-        '[accuracy]\nprecision = "float32"\noversampling = 2\ninterpolation = "nearest"\ndelay_taps = 1\n'
+        '[accuracy]\nprecision = "float32"\noversampling = 2\ndelay_taps = 1\n'
         "beam_taps = 0\nbeam_density = 2.0\nstop_band_db = 60.0\nfocal_zones = 1\n",
         "utf-8",
     )

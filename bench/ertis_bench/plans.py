@@ -1,27 +1,11 @@
 """Compared plans, and their names."""
 
 from ertis_numba.kernels import KernelSet
-from ertis_numba.settings import INTERPOLATIONS, Accuracy
+from ertis_numba.settings import Accuracy
 
 __all__ = ["PLANS", "in_words", "plans"]
 
-_SAMPLES = {
-    "nearest": "nearest sample of {n} per range",
-    "carrier": "nearest of {n} per range, carrier turned",
-    "linear": "linear between {n} per range",
-    "cubic": "cubic between {n} per range",
-}
-
-PLANS: tuple[tuple[str, str | int, int, float, tuple[int, float] | None], ...] = (
-    ("float32", "nearest", 2, 40.0, None),
-    ("float32", "nearest", 8, 40.0, None),
-    ("float32", "nearest", 32, 40.0, None),
-    ("float32", "carrier", 2, 40.0, None),
-    ("float32", "carrier", 8, 40.0, None),
-    ("float32", "linear", 2, 40.0, None),
-    ("float32", "linear", 8, 80.0, None),
-    ("float32", "cubic", 2, 80.0, None),
-    ("float32", "cubic", 8, 80.0, None),
+PLANS: tuple[tuple[str, int, int, float, tuple[int, float] | None], ...] = (
     ("float32", 1, 8, 40.0, None),
     ("float32", 1, 32, 80.0, None),
     ("float32", 2, 2, 40.0, None),
@@ -52,16 +36,15 @@ PLANS: tuple[tuple[str, str | int, int, float, tuple[int, float] | None], ...] =
 )
 """Compared plans, the simplest first.
 
-Each has a precision; an interpolation, or a number of samples if it is fitted; samples per range; stopband attenuation
-in dB; and grid points along each axis with their density, or None without a beam grid.
+Each has a precision; delay taps; samples per range; stopband attenuation in dB; and grid points along each axis with
+their density, or None without a beam grid.
 """
 
 
 def in_words(accuracy: Accuracy) -> str:
     """Return the name of a complete plan, such as ``int16, 2 samples of 2 per range, beam grid 4 × 1.75, 60 dB``."""
     n_phases, n_taps = accuracy.oversampling, accuracy.delay_taps
-    fitted = f"{n_taps} {'sample' if n_taps == 1 else 'samples'} of {n_phases} per range"
-    parts = [accuracy.precision, _SAMPLES.get(accuracy.interpolation, fitted).format(n=n_phases)]
+    parts = [accuracy.precision, f"{n_taps} {'sample' if n_taps == 1 else 'samples'} of {n_phases} per range"]
     if accuracy.beam_taps:
         parts.append(f"beam grid {accuracy.beam_taps} × {accuracy.beam_density:g}")
     parts.append(f"{accuracy.stopband_attenuation_db:g} dB")
@@ -76,14 +59,13 @@ def plans(kernels: KernelSet) -> list[Accuracy]:
 
 
 def _plan(
-    precision: str, way: str | int, n_phases: int, stopband_attenuation_db: float, nodes: tuple[int, float] | None
+    precision: str, n_taps: int, n_phases: int, stopband_attenuation_db: float, nodes: tuple[int, float] | None
 ) -> Accuracy:
     beam_taps, beam_density = nodes or (0, 2.0)
     return Accuracy().replace(
         precision=precision,
         oversampling=n_phases,
-        interpolation=way if isinstance(way, str) else "fitted",
-        delay_taps=INTERPOLATIONS[way] if isinstance(way, str) else way,
+        delay_taps=n_taps,
         beam_taps=beam_taps,
         beam_density=beam_density,
         stopband_attenuation_db=stopband_attenuation_db,

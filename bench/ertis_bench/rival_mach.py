@@ -27,7 +27,7 @@ from ertis_numba.stages.plan_elements import spectrum_of
 
 __all__ = ["problem", "race", "settings_for"]
 
-_MAX_DIFFERENCE_DB = -25.0  # The budget for focal zones and linear interpolation is -30 dB.
+_MAX_DIFFERENCE_DB = -25.0  # The budget is -30 dB, and mach adds the error of its linear interpolation.
 _FRAMES = 16
 # mach uses the third axis as depth and scales the aperture with it, so that 0 m would leave no aperture.
 _DEPTH_OFFSET_M = 8.0
@@ -35,9 +35,9 @@ _F_NUMBER = 0.01
 
 
 def settings_for(settings: Settings) -> Settings:
-    """Return settings with which this package interpolates as mach does."""
+    """Return settings with which this package interpolates between as many samples as mach does."""
     accuracy = settings.accuracy.replace(
-        max_error_db=-30.0, precision="float32", interpolation="linear", oversampling=8, delay_taps=2, beam_taps=0
+        max_error_db=-30.0, precision="float32", oversampling=8, delay_taps=2, beam_taps=0
     )
     return settings.replace(accuracy=accuracy, processing=settings.processing.replace(wavefront="spherical"))
 

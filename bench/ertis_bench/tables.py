@@ -8,6 +8,7 @@ from ertis_bench.accuracy import PAPER, TURN
 from ertis_bench.budgets import form as budgets
 from ertis_bench.gpu_tables import gpu, gpu_short
 from ertis_bench.health.table import health
+from ertis_bench.interpolation import form as interpolation
 from ertis_bench.machine import sentence
 from ertis_bench.many import many
 from ertis_bench.markdown import table as _table
@@ -157,11 +158,12 @@ def _accuracy_conditions(report: dict[str, Any]) -> str:
         f"{report['directions']} directions, {first_m:g}–{last_m:g} m, device `cpu`, all threads, but one for the "
         f"paper's method. Times are medians of {report['count']} measurements in turns of {TURN}, without warm-up "
         "calls of a fifth of a second. Bold: no other plan is both faster and more accurate. The name of a plan states "
-        "the precision of its samples, the interpolation of a delayed sample, the number of samples kept per range, "
-        "the grid points along each axis of the array and their density if beams are interpolated, and the stopband "
-        "attenuation of the decimation. The planner chose draft, standard, fine and exact here. Error: norm of the "
-        "difference relative to the norm of the exact image, in float64 over all directions and ranges. Predicted: by "
-        "the error model with the signal model of the measurement, before the image is computed. Level, range, angle: "
+        "the precision of its samples, the number of samples that a delayed sample is interpolated from, the number "
+        "of samples kept per range, the grid points along each axis of the array and their density if beams are "
+        "interpolated, and the stopband attenuation of the decimation. The planner chose draft, standard, fine and "
+        "exact here. Error: norm of the difference relative to the norm of the exact image, in float64 over all "
+        "directions and ranges. Predicted: by the error model with the signal model of the measurement, before the "
+        "image is computed. Level, range, angle: "
         f"largest errors among the strongest {PEAKS} reflectors, with levels relative to the strongest. Missed: "
         f"reflectors without a peak from `find_peaks` within 5° and 2 cm.{left_out}"
     )
@@ -278,6 +280,7 @@ FORMS: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
     "simulation": {"simulation": simulation},
     "many": {"many": many},
     "factorisation": {"factorisation": factorisation},
+    "interpolation": {"interpolation": interpolation},
     "ptx": {"ptx": ptx},
     "network": {"network": network},
     "gpu": {"gpu": gpu, "gpu short": gpu_short},

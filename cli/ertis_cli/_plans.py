@@ -12,13 +12,6 @@ if TYPE_CHECKING:
 
 __all__ = ["report_lines", "require_plan", "wavefront_note"]
 
-_INTERPOLATIONS = {
-    "fitted": "interpolated from {n} samples with least-squares weights",
-    "nearest": "the nearest sample",
-    "carrier": "the nearest sample with its carrier phase corrected",
-    "linear": "interpolated linearly from two samples",
-    "cubic": "interpolated from four samples with a Lagrange cubic",
-}
 _MIN_MS = 0.005
 _PART = "  {name:52}  {safe:>8}  {predicted:>14}"
 
@@ -63,7 +56,7 @@ def _explained(sensor: str, plan: dict[str, Any]) -> Iterator[str]:
     from ertis_numba.settings import Accuracy
 
     accuracy = Accuracy(**plan["accuracy"])
-    sample = _INTERPOLATIONS[accuracy.interpolation].format(n=accuracy.delay_taps)
+    taps = options.counted(accuracy.delay_taps or 1, "sample")
     yield f"plan of {sensor} for an error budget of {accuracy.max_error_db:g} dB:"
     if plan["budget_applies_to"] == "beams":
         yield (
@@ -72,7 +65,7 @@ def _explained(sensor: str, plan: dict[str, Any]) -> Iterator[str]:
         )
     precision = "16 bits" if accuracy.precision == "int16" else "single precision"
     kept = options.counted(accuracy.oversampling or 1, "sample")
-    yield f"  {precision}, {kept} kept per range; a delayed sample is {sample}"
+    yield f"  {precision}, {kept} kept per range; a delayed sample is a weighted sum of {taps}"
     if accuracy.beam_taps:
         yield (
             f"  beams interpolated from {accuracy.beam_taps} beam-grid points along each axis of the array, "

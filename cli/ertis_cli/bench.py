@@ -91,7 +91,7 @@ def paper(**given: Any) -> None:
 @options.quiet
 @options.as_json
 def accuracy(*, picture: Path | None, **given: Any) -> None:
-    """Measure image error versus time for about forty plans and the paper's method."""
+    """Measure image error versus time for about thirty plans and the paper's method."""
     from ertis_bench import accuracy as benchmark
 
     if picture and not picture.absolute().parent.is_dir():  # refuse now rather than after minutes
@@ -247,6 +247,17 @@ def factorisation(**given: Any) -> None:
     from ertis_bench import factorisation as benchmark
 
     _run("factorisation", benchmark, **given)
+
+
+@bench.command()
+@_update
+@options.quiet
+@options.as_json
+def interpolation(**given: Any) -> None:
+    """Compare the errors of fitted and of textbook weights for delays; nothing is timed."""
+    from ertis_bench import interpolation as benchmark
+
+    _run("interpolation", benchmark, **given)
 
 
 @bench.command()

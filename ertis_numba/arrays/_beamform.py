@@ -169,7 +169,7 @@ def beamform(
 def _delay_fit(output_rate_hz: float, spectrum: Spectrum) -> tuple[DelayFit, int]:
     """Return the interpolation of delays, with the least oversampling that keeps its error small."""
     for n_phases in _PHASES:
-        fit = DelayFit("fitted", _DELAY_TAPS, 1 / (output_rate_hz * n_phases), spectrum)
+        fit = DelayFit(_DELAY_TAPS, 1 / (output_rate_hz * n_phases), spectrum)
         if float((fit.errors + fit.biases) @ spectrum.power) <= 10 ** (_DELAY_ERROR_DB / 10):
             return fit, n_phases
     raise ArgumentError(

@@ -56,7 +56,7 @@ def draw(style: Style, points: Sequence[Rated], *, title: str, note: str) -> Fig
         for point in (each for each in points if each.label):
             place, offset_pt = (point.error_db, point.time_ms), (0, -1.5 * style.em_pt)
             axes.annotate(point.label, place, xytext=offset_pt, textcoords="offset points", ha="center", **letters)
-        axes.margins(x=0.05, y=0.1)
+        axes.margins(x=0.08, y=0.1)
         axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axes.yaxis.set_minor_formatter(NullFormatter())

@@ -4,7 +4,7 @@ A structure checks its values when it is created and refuses unknown keys. ``Set
 measurement; ``Settings.from_preset`` returns the settings of an RTIS recording preset.
 """
 
-from ertis_numba.settings.accuracy import ERROR_PRESETS_DB, INTERPOLATIONS, MAX_FOCAL_ZONES, Accuracy
+from ertis_numba.settings.accuracy import ERROR_PRESETS_DB, MAX_FOCAL_ZONES, Accuracy
 from ertis_numba.settings.array import Array
 from ertis_numba.settings.call import MAX_CALL_SAMPLES, Call
 from ertis_numba.settings.processing import Processing
@@ -17,7 +17,6 @@ from ertis_numba.settings.windows import ArrayWindow, parse_window
 __all__ = [
     "ENCODINGS",
     "ERROR_PRESETS_DB",
-    "INTERPOLATIONS",
     "MAX_CALL_SAMPLES",
     "MAX_FOCAL_ZONES",
     "MAX_WAVEFORM_SAMPLES",

@@ -4,12 +4,8 @@ from typing import Literal
 
 from ertis_numba import checks
 from ertis_numba.documents import TomlTable
-from ertis_numba.errors import ArgumentError
 
-__all__ = ["ERROR_PRESETS_DB", "INTERPOLATIONS", "MAX_FOCAL_ZONES", "Accuracy"]
-
-INTERPOLATIONS = {"fitted": None, "nearest": 1, "carrier": 1, "linear": 2, "cubic": 4}
-"""Interpolation methods of delayed samples, and the taps of each; None if ``delay_taps`` decides."""
+__all__ = ["ERROR_PRESETS_DB", "MAX_FOCAL_ZONES", "Accuracy"]
 
 ERROR_PRESETS_DB = {"draft": -20.0, "standard": -35.0, "fine": -60.0, "exact": -100.0}
 """Named error budgets in dB."""
@@ -33,12 +29,8 @@ class Accuracy(TomlTable, frozen=True, kw_only=True):
         Number format of the samples that are summed to beams. ``int16`` needs a processor with a 16-bit dot product.
     oversampling : int, optional, default None
         Samples kept per range of the energyscape, 1 to 64.
-    interpolation : {"fitted", "nearest", "carrier", "linear", "cubic"}, default "fitted"
-        Interpolation of delayed samples. ``fitted`` uses the weights with the least error over the call's band. The
-        others are for comparison: ``nearest`` is the nearest sample, ``carrier`` the nearest sample with its carrier
-        rotated to the right phase, ``linear`` and ``cubic`` are Lagrange polynomials between rotated carriers.
     delay_taps : int, optional, default None
-        Samples that a delayed sample is interpolated from, 1 to 8. Interpolations other than ``fitted`` determine it.
+        Samples that a delayed sample is interpolated from, 1 to 8, with the weights of least error in the call's band.
     beam_taps : int, optional, default None
         Beam-grid points along each axis of the array from which a beam is interpolated: 2, 4 or 6. With 0, the beam of
         every direction is summed itself.
@@ -54,7 +46,6 @@ class Accuracy(TomlTable, frozen=True, kw_only=True):
     max_error_db: float = -35.0
     precision: Literal["auto", "float32", "int16"] = "auto"
     oversampling: int | None = None
-    interpolation: Literal["fitted", "nearest", "carrier", "linear", "cubic"] = "fitted"
     delay_taps: int | None = None
     beam_taps: int | None = None
     beam_density: float | None = None
@@ -65,7 +56,6 @@ class Accuracy(TomlTable, frozen=True, kw_only=True):
         super().__post_init__()
         checks.between("accuracy.max_error_db", self.max_error_db, -200.0, 0.0)
         checks.choice("accuracy.precision", self.precision, ("auto", "float32", "int16"))
-        checks.choice("accuracy.interpolation", self.interpolation, INTERPOLATIONS)
         for name, low, high in (("oversampling", 1, 64), ("delay_taps", 1, 8), ("focal_zones", 1, MAX_FOCAL_ZONES)):
             if getattr(self, name) is not None:
                 checks.integer(f"accuracy.{name}", getattr(self, name), low, high)
@@ -74,9 +64,3 @@ class Accuracy(TomlTable, frozen=True, kw_only=True):
         for name, smallest, largest in (("beam_density", 1.1, 8.0), ("stopband_attenuation_db", 40.0, 140.0)):
             if getattr(self, name) is not None:
                 checks.between(f"accuracy.{name}", getattr(self, name), smallest, largest)
-        implied = INTERPOLATIONS[self.interpolation]
-        if implied is not None and self.delay_taps not in {None, implied}:
-            raise ArgumentError(
-                f"accuracy.delay_taps is {self.delay_taps}, but accuracy.interpolation {self.interpolation!r} needs "
-                f"{implied}; leave out delay_taps"
-            )

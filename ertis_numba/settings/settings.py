@@ -6,7 +6,7 @@ from typing import Any, ClassVar, Self
 from ertis_numba import checks
 from ertis_numba.documents import TomlDocument
 from ertis_numba.errors import ArgumentError, SettingsError
-from ertis_numba.settings.accuracy import INTERPOLATIONS, Accuracy
+from ertis_numba.settings.accuracy import Accuracy
 from ertis_numba.settings.array import Array
 from ertis_numba.settings.call import Call
 from ertis_numba.settings.processing import Processing
@@ -72,6 +72,8 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
         "stop_band_db": "stopband_attenuation_db",
         "zones": "focal_zones",
         "loading": "diagonal_loading",
+        # Earlier versions stored this line, which has no effect, with all settings. It becomes a comment.
+        r'(?<=\n)interpolation(?=\s*=\s*"fitted")': "# interpolation",
     }
 
     def __post_init__(self) -> None:
@@ -130,10 +132,9 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
         if self.processing.beamformer == "delay_and_sum":
             return
         accuracy = self.accuracy
-        taps = accuracy.delay_taps or INTERPOLATIONS[accuracy.interpolation] or 1
         for name, value, wanted in (
             ("beam_taps", accuracy.beam_taps or 0, 0),
-            ("delay_taps", taps, 1),
+            ("delay_taps", accuracy.delay_taps or 1, 1),
             ("precision", "float32" if accuracy.precision == "auto" else accuracy.precision, "float32"),
         ):
             if value != wanted:

@@ -135,10 +135,9 @@ class ErrorModel:
     def delays(self, fit: DelayFit, *, n_mics: float, fractions: NDArray[np.float64] | None = None) -> float:
         """Return the error power of delay interpolation: the residual of the fit, weighted by the signal spectrum.
 
-        The mean error over all delays acts as a filter on the image itself, whether or not echoes are coherent. With
-        simple interpolation, that filter is an attenuation, and all of it changes magnitudes. The remaining error
-        differs between microphones, so its phase is independent of the beam. With few microphones, it averages out
-        less: the error of a single microphone is a filter on its own signal.
+        The mean error over all delays acts as a filter on the image itself, whether or not echoes are coherent. The
+        remaining error differs between microphones, so its phase is independent of the beam. With few microphones, it
+        averages out less: the error of a single microphone is a filter on its own signal.
 
         Parameters
         ----------
@@ -157,7 +156,7 @@ class ErrorModel:
             )
         varying, shared = (float(errors @ signal_model.shares) for errors in (fit.errors, fit.biases))
         independent = 0.5 * (1 + 1 / n_mics) * varying / signal_model.gain
-        return signal_model.colour * (independent + (0.5 if fit.is_fitted else 1.0) * shared)
+        return signal_model.colour * (independent + 0.5 * shared)
 
     def beams(self, nodes: BeamGrid) -> float:
         """Return the error power of beam interpolation, from an estimate of `BeamGrid`.

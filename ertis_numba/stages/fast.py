@@ -54,7 +54,7 @@ class FastChain(KernelChain):
         points = aperture.directions if nodes is None else nodes.points
         own_s = layout.delay_s[layout.enabled]
         array_weight = array_weights(settings)
-        ahead_s = ahead_of(fit, array_weight, step_s)
+        ahead_s = ahead_of(array_weight, step_s)
         edges = zones_of(settings)
         largest_s = max(
             float(np.max(np.abs(own_s + aperture.delays_s(points, sound_speed_m_s=speed_m_s, range_m=range_m))))
@@ -77,18 +77,14 @@ class FastChain(KernelChain):
                 np.arange(len(own_s), dtype=np.int32), window, kernels, memory, taps=taps, factor=settings.decimation
             )
         )
-        self._matched_filter = MatchedFilter(
-            settings,
-            window,
-            kernels,
-            memory,
-            taps=taps,
-            n_mics=len(own_s),
+        new_filter = functools.partial(MatchedFilter, settings, window, kernels, memory, taps=taps, n_mics=len(own_s))
+        self._made_plain_filter = functools.cache(lambda: new_filter(gain=lambda _: np.ones((1, 1), np.complex128)))
+        self._matched_filter = new_filter(
             gain=lambda frequency_hz: (
                 fit.gain(frequency_hz)
                 * (1 if nodes is None else nodes.gain(frequency_hz))
                 * np.exp(2j * math.pi * ahead_s[:, None] * frequency_hz)
-            ),
+            )
         )
         amplitudes = array_weight / (layout.gain[layout.enabled] * len(own_s))
         zones = [
@@ -120,12 +116,15 @@ class FastChain(KernelChain):
             )
 
     def analytic(self, words: NDArray[np.unsignedinteger[Any]]) -> tuple[NDArray[np.complex64], int]:
-        """Return the analytic signals, (mic, phase, sample), and the index of the sample at the first range."""
+        """Return the analytic signals, (mic, phase, sample), and the index of the sample at the first range.
+
+        They have neither the gains nor the fractional-delay offsets of the plan.
+        """
         heard = np.empty(self._matched_filter.shape, dtype=np.complex64)
         with self._taken(self._threads) as buffers:
             here = buffers.lane.send(words)
             self._demodulate(here, buffers.room, buffers.signals)
-            self._matched_filter(buffers.transforms, buffers.analytic, threads=self._threads)
+            self._made_plain_filter()(buffers.transforms, buffers.analytic, threads=self._threads)
             buffers.lane.fetch(buffers.analytic, heard)
         self._finish(buffers)
         return heard, self._lead

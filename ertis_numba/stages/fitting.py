@@ -27,8 +27,6 @@ import threadpoolctl
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
-from ertis_numba.settings import INTERPOLATIONS
-
 __all__ = ["WAVES", "DelayFit", "Spectrum", "fit", "gain_of", "one_thread", "weights_of"]
 
 WAVES = 40
@@ -155,10 +153,8 @@ class DelayFit:
 
     Parameters
     ----------
-    interpolation : str
-        A name of `ertis_numba.settings.INTERPOLATIONS`.
-    n_taps : int or None
-        Number of taps, if the interpolation does not determine it.
+    n_taps : int
+        Number of taps.
     step_s : float
         Time between stored samples, in seconds.
     spectrum : Spectrum
@@ -173,19 +169,16 @@ class DelayFit:
         Error power relative to the sample at each frequency of the spectrum: the variance over delays spread evenly
         over one step.
     biases : (wave,) float64
-        Power of the mean error, which all microphones share. It is smaller for fitted weights than for others.
+        Power of the mean error, which all microphones share.
     """
 
-    def __init__(self, interpolation: str, n_taps: int | None, step_s: float, spectrum: Spectrum) -> None:
-        self.n_taps = INTERPOLATIONS[interpolation] or n_taps or 1
-        self._interpolation = interpolation
+    def __init__(self, n_taps: int, step_s: float, spectrum: Spectrum) -> None:
+        self.n_taps = n_taps
         self._step_s = step_s
         self._spectrum = spectrum
         self._middle = (self.n_taps - 1) // 2 + 0.5 * (1 - self.n_taps % 2)
         self.fractions = (np.arange(_TARGETS) + 0.5) / _TARGETS + self._middle - 0.5
-        self._gain = np.ones(len(spectrum.power), dtype=np.complex128)
-        if interpolation == "fitted":
-            self._gain, _ = fit(self._taps(spectrum.frequency_hz), self._wanted(self.fractions), spectrum.power)
+        self._gain, _ = fit(self._taps(spectrum.frequency_hz), self._wanted(self.fractions), spectrum.power)
         made = self.gain(spectrum.frequency_hz)[:, None] * (
             self._taps(spectrum.frequency_hz) @ self.weights(self.fractions).T
         )
@@ -198,11 +191,6 @@ class DelayFit:
         found = np.unique(np.round(fractions, 4))
         made = self.gain(frequency_hz)[:, None] * (self._taps(frequency_hz) @ self.weights(found).T)
         return np.asarray(np.mean(np.abs(made - self._wanted(found)) ** 2, axis=1))
-
-    @property
-    def is_fitted(self) -> bool:
-        """True if the weights are those of the least-squares fit."""
-        return self._interpolation == "fitted"
 
     def split(self, delays_s: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return the first stored sample that contributes to each delayed sample, and the delay after it, in steps."""
@@ -230,30 +218,14 @@ class DelayFit:
         return np.asarray(np.linalg.solve(chebyshev.chebvander(places, degree), values))
 
     def _weights(self, fractions: NDArray[np.float64]) -> NDArray[np.complex128]:
-        if self._interpolation != "fitted":
-            return self._simple_weights(fractions)
         taps = self._taps(self._spectrum.frequency_hz)
         return weights_of(self._gain, taps, self._wanted(fractions), self._spectrum.power)
 
     def gain(self, frequency_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Return the gain that complements the weights: (frequency,) complex128."""
-        if self._interpolation != "fitted":
-            return np.ones(len(frequency_hz), dtype=np.complex128)
         made = self._taps(frequency_hz) @ self.weights(self.fractions).T
         wanted = self._wave(frequency_hz, self.fractions)
         return gain_of(made, wanted)
-
-    def _simple_weights(self, fractions: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """Return the weights, (tap, target), of the interpolations that do not depend on the band."""
-        if self._interpolation == "nearest":
-            return np.ones((1, len(fractions)), dtype=np.complex128)
-        nodes = np.arange(self.n_taps)
-        shape = np.ones((self.n_taps, len(fractions)))
-        for tap in nodes:  # Lagrange polynomials: constant for a single tap, linear for two.
-            for other in nodes[nodes != tap]:
-                shape[tap] *= (fractions - other) / (tap - other)
-        carrier = 2j * math.pi * self._spectrum.centre_hz * self._step_s
-        return np.asarray(shape * np.exp(carrier * (fractions - nodes[:, None])))
 
     def _taps(self, frequency_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
         return self._wave(frequency_hz, np.arange(self.n_taps, dtype=np.float64))

@@ -140,7 +140,8 @@ class KernelChain(ABC):
     def close(self) -> None:
         """Wait for measurements in progress, then free the memory of the device."""
         self._pool.close()
-        for name in ("_demodulate", "_made_unmodulated", "_matched_filter", "_beamform", "_adaptive"):
+        filters = ("_made_unmodulated", "_made_plain_filter", "_matched_filter")
+        for name in ("_demodulate", *filters, "_beamform", "_adaptive"):
             self.__dict__.pop(name, None)
         self._memory.close()
 

@@ -55,7 +55,7 @@ def delay_fit(settings: Settings, spectrum: Spectrum) -> tuple[DelayFit, float]:
     """Return the fractional-delay filters of a complete plan, and the time between their input samples in seconds."""
     plan = settings.accuracy
     step_s = 1 / (settings.output_rate_hz * (plan.oversampling or 1))
-    return DelayFit(plan.interpolation, plan.delay_taps, step_s, spectrum), step_s
+    return DelayFit(plan.delay_taps or 1, step_s, spectrum), step_s
 
 
 def chain_taps(settings: Settings) -> NDArray[np.int16] | NDArray[np.int32]:
@@ -87,15 +87,13 @@ def ringing_db(settings: Settings) -> float:
     return max(60.0, 1.2 * (settings.accuracy.stopband_attenuation_db or 60.0) - 12.0)
 
 
-def ahead_of(fit: DelayFit, weights: NDArray[np.float64], step_s: float) -> NDArray[np.float64]:
-    """Return each microphone's fractional-delay offset in seconds, positive if earlier: (mic,) float64, or (1,) zeros.
+def ahead_of(weights: NDArray[np.float64], step_s: float) -> NDArray[np.float64]:
+    """Return each microphone's fractional-delay offset in seconds, positive if earlier: (mic,) float64.
 
     Without offsets, microphones with equal delays, such as those of the direction straight ahead, would have equal
     interpolation errors. Multiples of the golden ratio spread the offsets of any few consecutive microphones evenly.
     The order is that of descending array weights, so the offsets of a few dominant microphones are spread evenly, too.
     """
-    if not fit.is_fitted:
-        return np.zeros(1)
     rank = np.empty(len(weights), dtype=np.intp)
     rank[np.argsort(-weights, kind="stable")] = np.arange(len(weights))
     return np.asarray(rank * (math.sqrt(5) - 1) / 2 % 1.0 * step_s)

@@ -37,7 +37,6 @@ class ImagePlan(NamedTuple):
 
     precision: str
     n_phases: int
-    interpolation: str
     delay_taps: int
     beam_taps: int
     density: float
@@ -112,7 +111,7 @@ class PlanModel:
 
     def parts(self, plan: ImagePlan) -> dict[str, float]:
         """Return the error power of each step of a plan, relative to the exact image."""
-        delays = self.delays(plan.n_phases, plan.interpolation, plan.delay_taps)
+        delays = self.delays(plan.n_phases, plan.delay_taps)
         nodes = self.nodes(plan.beam_taps, plan.density) if plan.beam_taps else None
         _, filter_error = self.filter(plan.stopband_attenuation_db)
         parts = dict.fromkeys(PARTS, 0.0)
@@ -171,9 +170,9 @@ class PlanModel:
     def _zone_scale(self) -> float:
         return self.errors.zones(self.aperture, 1.0, sound_speed_m_s=self._speed_m_s)
 
-    def _made_delays(self, n_phases: int, interpolation: str, n_taps: int) -> Delays:
+    def _made_delays(self, n_phases: int, n_taps: int) -> Delays:
         step_s = 1 / (self.settings.output_rate_hz * n_phases)
-        fit, weights = _fitted(self._spectrum, interpolation, n_taps, step_s)
+        fit, weights = _fitted(self._spectrum, n_taps, step_s)
         return Delays(
             n_taps=fit.n_taps,
             error=self.errors.delays(fit, n_mics=self._n_effective, fractions=self._few_fractions(fit, step_s)),
@@ -187,7 +186,7 @@ class PlanModel:
             return None
         delays_s = (
             self._own_s
-            - ahead_of(fit, self._weights, step_s)
+            - ahead_of(self._weights, step_s)
             + self.aperture.delays_s(self.aperture.directions, sound_speed_m_s=self._speed_m_s, range_m=math.inf)
         )
         return fit.split(delays_s)[1].ravel()
@@ -255,9 +254,9 @@ class PlanModel:
 
 
 @functools.lru_cache(maxsize=_MAX_FITS)
-def _fitted(spectrum: Spectrum, interpolation: str, n_taps: int, step_s: float) -> tuple[DelayFit, NDArray[np.float64]]:
+def _fitted(spectrum: Spectrum, n_taps: int, step_s: float) -> tuple[DelayFit, NDArray[np.float64]]:
     """Return a fit and the magnitudes of its weights, cached because fits would dominate the time of a planner."""
-    fit = DelayFit(interpolation, n_taps, step_s, spectrum)
+    fit = DelayFit(n_taps, step_s, spectrum)
     return fit, np.abs(fit.weights(fit.fractions))
 
 
@@ -266,7 +265,6 @@ def plan_of(accuracy: Accuracy) -> ImagePlan:
     return ImagePlan(
         accuracy.precision,
         accuracy.oversampling or 1,
-        accuracy.interpolation,
         accuracy.delay_taps or 1,
         accuracy.beam_taps or 0,
         accuracy.beam_density or 2.0,

@@ -81,7 +81,7 @@ def _computed(settings: Settings, directions: NDArray[np.float64]) -> Deviation 
     points = aperture.directions if nodes is None else nodes.points
     delays_s = aperture.delays_s(points, sound_speed_m_s=speed_m_s)
     fit, step_s = delay_fit(settings, spectrum)
-    ahead_s = ahead_of(fit, array_weights(settings), step_s)
+    ahead_s = ahead_of(array_weights(settings), step_s)
     taken_s = layout.delay_s[layout.enabled] - ahead_s + delays_s
     first, fractions = fit.split(taken_s)
     weights = fit.weights(fractions)

@@ -3,7 +3,7 @@
 import itertools
 import math
 
-from ertis_numba.settings import INTERPOLATIONS, MAX_FOCAL_ZONES
+from ertis_numba.settings import MAX_FOCAL_ZONES
 from ertis_numba.stages.beam_grid import FEWEST_RANGES
 from ertis_numba.stages.plan_model import MIN_STOPBAND_ATTENUATION_DB, ImagePlan, PlanModel
 
@@ -36,16 +36,7 @@ def open_plans(model: PlanModel, budget: float, *, has_int16: bool) -> list[Imag
         precisions.append("int16")
     zones = _zone_count(model, budget)
     return [
-        ImagePlan(
-            precision,
-            n_phases,
-            given.interpolation,
-            n_taps,
-            beam_taps,
-            density,
-            stopband_attenuation_db,
-            zones,
-        )
+        ImagePlan(precision, n_phases, n_taps, beam_taps, density, stopband_attenuation_db, zones)
         for precision, (n_phases, n_taps), (beam_taps, density), stopband_attenuation_db in itertools.product(
             precisions,
             _open_delays(model, budget, adaptive=adaptive),
@@ -59,13 +50,11 @@ def _open_delays(model: PlanModel, budget: float, *, adaptive: bool) -> list[tup
     """Return the candidates for phases and delay taps that meet the budget and are not needlessly accurate."""
     given = model.settings.accuracy
     phases = _PHASES if given.oversampling is None else (given.oversampling,)
-    taps = _DELAY_TAPS if given.delay_taps is None else (given.delay_taps,)
-    if INTERPOLATIONS[given.interpolation] or adaptive:
-        taps = (INTERPOLATIONS[given.interpolation] or 1,)
+    taps = (1,) if adaptive else _DELAY_TAPS if given.delay_taps is None else (given.delay_taps,)
     found = []
     for n_taps in taps:
         for n_phases in phases:
-            error = model.delays(n_phases, given.interpolation, n_taps).error
+            error = model.delays(n_phases, n_taps).error
             if error <= budget:
                 found.append((n_phases, n_taps))
             if error <= _NEEDLESS * budget:

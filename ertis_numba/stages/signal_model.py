@@ -66,7 +66,6 @@ def signal_model_of(
         accuracy=Accuracy(
             precision="float32",
             oversampling=min(64, max(2, math.ceil(2 * (high_hz - low_hz) / settings.output_rate_hz))),
-            interpolation="linear",
             delay_taps=ROUGH_DELAY_TAPS,
             beam_taps=0,
             beam_density=2.0,

@@ -54,7 +54,7 @@ for _beamformer in ADAPTIVE_BEAMFORMERS:
     PLANS[_beamformer] = (
         TINY.replace(
             processing=TINY.processing.replace(beamformer=_beamformer, directions="2d:3"),
-            accuracy=DIRECT.replace(interpolation="carrier", oversampling=8, delay_taps=1),
+            accuracy=DIRECT.replace(oversampling=8, delay_taps=1),
         ),
         -110,
     )

@@ -86,7 +86,6 @@ TUNING = {
     "precision": st.sampled_from(["auto", "float32", "int16"]),
     "oversampling": st.integers(1, 64),
     "max_error_db": st.sampled_from([-20.0, -35.0, -60.0, -100.0]) | st.floats(-120, 0),
-    "interpolation": st.sampled_from(["fitted", "fitted", "nearest", "carrier", "linear", "cubic"]),
     "delay_taps": st.sampled_from([None, None, 1, 2, 4, 8]),
     "beam_taps": st.sampled_from([None, 0, 2, 4, 6]),
     "beam_density": st.floats(1.1, 8),
