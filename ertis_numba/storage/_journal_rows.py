@@ -60,8 +60,10 @@ class JournalRows:
     @property
     def missing(self) -> list[SequenceGap]:
         """Missing numbers in order, damaged ones included."""
+        keys = (self.keys[item.index] for item in self.damaged)
         lost = [
-            SequenceGap(self._sensor, item.sequence, item.sequence, _DAMAGED, self.keys[item.index].session_id)
-            for item in self.damaged
+            SequenceGap(key.sensor, key.sequence, key.sequence, _DAMAGED, key.session_id)
+            for key in keys
+            if min(key.sequence, key.session_id) >= 0  # A negative number is damaged itself.
         ]
         return self._numbers.missing(self._sensor, [*lost, *self._noted])
