@@ -1,6 +1,6 @@
 """Imaging sonar in air: from one-bit microphone data to energyscapes and reflectors.
 
-These examples use the files that ``ertis example reflectors corridor`` copies::
+These examples use the files that ``ertis example reflectors corridor`` writes::
 
     import ertis_numba as ertis
 

@@ -24,12 +24,10 @@ __all__ = [
     "positive",
     "reason_unreadable",
     "sensor_name",
-    "sequence_gap",
     "shape",
 ]
 
 _ItemType = TypeVar("_ItemType")
-_MAX_REASON_BYTES = 64
 _SENSOR_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.@+-]{0,254}")
 
 
@@ -130,13 +128,6 @@ def sensor_name(name: str) -> str:
             "also . @ + -; at most 255 characters"
         )
     return name
-
-
-def sequence_gap(first: int, last: int, reason: str) -> None:
-    """Refuse a gap, from sequence number ``first`` to ``last``, that files cannot store with this reason."""
-    integer("last missing sequence number", last, integer("first missing sequence number", first, 0), 2**63 - 1)
-    if not reason or not reason.isprintable() or len(reason.encode()) > _MAX_REASON_BYTES:
-        raise ArgumentError(f"reason of a gap is {reason!r}; give a line of 1 to {_MAX_REASON_BYTES} bytes")
 
 
 def reason_unreadable(error: OSError | UnicodeDecodeError) -> str:

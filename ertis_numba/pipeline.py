@@ -89,7 +89,7 @@ class Pipeline:
     Examples
     --------
     Close a pipeline to free its memory, or use it in a ``with`` statement. The command ``ertis example reflectors``
-    copies the recording:
+    simulates the recording:
 
     >>> import ertis_numba as ertis
     >>> with ertis.open_recording("reflectors.h5") as recording, ertis.Pipeline(recording.settings) as pipeline:
@@ -261,7 +261,7 @@ class Pipeline:
 
         Examples
         --------
-        The command ``ertis example reflectors`` copies the recording:
+        The command ``ertis example reflectors`` simulates the recording:
 
         >>> import ertis_numba as ertis
         >>> with ertis.open_recording("reflectors.h5") as recording:

@@ -9,7 +9,8 @@ from datetime import datetime
 import pytest
 
 from ertis_numba.errors import ArgumentError, DataError, DiskFullError, JournalInUseError
-from ertis_numba.journal import SUFFIX, Journal, JournalGap, JournalSensor, seal_in_subprocess
+from ertis_numba.frames import SequenceGap
+from ertis_numba.journal import SUFFIX, Journal, JournalSensor, seal_in_subprocess
 from ertis_numba.network.central_node import Archive, _volumes
 from ertis_numba.network.central_node._received_items import (
     Forgotten,
@@ -49,7 +50,7 @@ def item_of(entry, source=SOURCE):
 
 def gap_of(first, last, reason="lost", sensor="left"):
     return ReceivedItem(
-        SensorSession(sensor, EPOCH), first, last, JournalGap(sensor, first, last, reason, EPOCH), SOURCE, 0.0, b""
+        SensorSession(sensor, EPOCH), first, last, SequenceGap(sensor, first, last, reason, EPOCH), SOURCE, 0.0, b""
     )
 
 
@@ -412,7 +413,7 @@ def test_journal_names_within_one_second_keep_their_order(tmp_path, monkeypatch)
 def test_gap_of_sensor_without_data_is_in_its_next_recording(tmp_path):
     with Opened(tmp_path, seal=True) as opened:
         right = ReceivedItem(
-            SensorSession("right", EPOCH), 0, 4, JournalGap("right", 0, 4, "ring overflow", EPOCH), RIGHT, 0.0, b""
+            SensorSession("right", EPOCH), 0, 4, SequenceGap("right", 0, 4, "ring overflow", EPOCH), RIGHT, 0.0, b""
         )
         opened.give(right, *map(item_of, from_zero(2)))
         opened.until_stored(1)

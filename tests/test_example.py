@@ -1,6 +1,7 @@
-"""Files that `ertis example` copies and the demonstration that `ertis demo` runs."""
+"""Files that `ertis example` writes and the demonstration that `ertis demo` runs."""
 
 import json
+import shutil
 from pathlib import Path, PurePath
 
 import pytest
@@ -35,12 +36,21 @@ def test_example_lists_every_file_with_a_sentence():
 def test_every_example_equals_its_source_file():
     sources = {path.name: path for path in (*(ROOT / "examples").iterdir(), *(ROOT / "data").rglob("*"))}
     for name, item in _examples.examples().items():
-        assert item.read_bytes() == sources[name].read_bytes()
+        assert item.read_bytes() == sources[name.replace(".h5", ".toml")].read_bytes()
 
 
-def test_example_copies_a_scene_and_its_recording():
-    run("example", "reflectors")
-    assert len(open_recording("reflectors.h5")) == 1
+def test_every_recording_of_the_repository_is_an_example():
+    recordings = {path.name: path for path in (ROOT / "data").rglob("*.h5")}
+    examples = _examples.examples()
+    assert set(recordings) == {name for name in examples if name.endswith(".h5")}
+    assert all(_examples.is_written(path, examples[name]) for name, path in recordings.items())
+
+
+def test_example_copies_a_scene_and_simulates_its_recording(monkeypatch):
+    monkeypatch.setenv("ERTIS_SIMULATE_SEED", "7")
+    assert "reflectors.h5: 1 measurement, 5 reflectors" in run("example", "reflectors").stderr
+    report = json.loads((ROOT / "data" / "synthetic" / "reflectors.json").read_text("utf-8"))
+    assert _examples.words_sha256(Path("reflectors.h5"), "sensor") == report["sensors"][0]["words_sha256"]
     assert len(load_scene("reflectors.toml").points) == 5
     run("example", "platform.toml", "-o", ".")
     assert {path.name for path in Path().iterdir()} == {"reflectors.h5", "reflectors.toml", "platform.toml"}
@@ -65,7 +75,11 @@ def test_example_overwrites_only_with_force():
     assert not Path("line.h5").exists()
     run("example", "line", "--force")
     again = json.loads(run("example", "line", "--json").stdout)  # an identical copy is no conflict
-    assert again == {"files": ["line.h5", "line.toml"], "copied": []}
+    assert again == {"files": ["line.h5", "line.toml"], "written": []}
+    shutil.copy(ROOT / "data" / "synthetic" / "reflectors.h5", "line.h5")
+    assert "line.h5 exists" in run("example", "line", code=1).stderr
+    Path("line.h5").write_text("mine")
+    assert "line.h5 exists" in run("example", "line", code=1).stderr
 
 
 def test_example_suggests_a_name():

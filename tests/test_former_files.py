@@ -7,7 +7,8 @@ import h5py
 import numpy as np
 import pytest
 
-from ertis_numba.journal import Journal, JournalGap
+from ertis_numba.frames import SequenceGap
+from ertis_numba.journal import Journal
 from ertis_numba.network.central_node._ledger import Ledger
 from ertis_numba.network.central_node._received_items import SensorSession
 from ertis_numba.settings import Settings
@@ -51,7 +52,7 @@ def test_former_ledger_is_read(tmp_path):
     shutil.copy(FILES / ".ertis-ledger", tmp_path)
     ledger = Ledger(tmp_path)
     assert ledger.acked_through == {SensorSession("left", SESSION_ID): 12}
-    assert ledger.gaps == [JournalGap("left", 3, 9, "the spool was full", SESSION_ID)]
+    assert ledger.gaps == [SequenceGap("left", 3, 9, "the spool was full", SESSION_ID)]
     assert not ledger.damage
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from ertis_numba.errors import ArgumentError, DataError
-from ertis_numba.frames import Measurement
-from ertis_numba.journal import TABLES, VERSION, Journal, JournalGap
+from ertis_numba.frames import Measurement, SequenceGap
+from ertis_numba.journal import TABLES, VERSION, Journal
 from ertis_numba.journal._database import LOG_BYTES, PAGE_BYTES
 from ertis_numba.settings import Array, Recording, Settings
 from tests.files import line
@@ -67,8 +67,8 @@ def test_journal_stores_gaps(tmp_path):
         journal.note_gap("left", 0, 2**63 - 1, "the sensor was unplugged", session_id=2**63 - 1)
     with Journal.open(journal.path) as journal:
         assert journal.gaps == (
-            JournalGap("left", 3, 3, "footer", EPOCH),
-            JournalGap("left", 0, 2**63 - 1, "the sensor was unplugged", 2**63 - 1),
+            SequenceGap("left", 3, 3, "footer", EPOCH),
+            SequenceGap("left", 0, 2**63 - 1, "the sensor was unplugged", 2**63 - 1),
         )
 
 

@@ -7,7 +7,8 @@ import zlib
 import pytest
 
 from ertis_numba.errors import DataError, FormatVersionError, JournalInUseError
-from ertis_numba.journal import JournalGap, seal_in_subprocess
+from ertis_numba.frames import SequenceGap
+from ertis_numba.journal import seal_in_subprocess
 from ertis_numba.network.central_node._ledger import Ledger, Lock, read_acked_through
 from ertis_numba.network.central_node._received_items import SensorSession
 from tests.journals import EPOCH, create, entries
@@ -17,7 +18,7 @@ def test_saved_ledger_is_read_back(tmp_path):
     acked_through = {SensorSession("left", 2**62): 7, SensorSession("left", 3): -1, SensorSession("right", 3): 2**62}
     ledger = Ledger(tmp_path)
     assert (ledger.is_new, ledger.acked_through, ledger.open, ledger.unsealed) == (True, {}, [], [])
-    gaps = [JournalGap("left", 0, 2**62, "ring overflow", 2**63 - 1)]
+    gaps = [SequenceGap("left", 0, 2**62, "ring overflow", 2**63 - 1)]
     ledger.save(acked_through, open_=["a"], unsealed=["b", "c"], gaps=gaps)
     read = Ledger(tmp_path)
     assert (read.is_new, read.acked_through, read.open, read.unsealed) == (False, acked_through, ["a"], ["b", "c"])
@@ -63,7 +64,7 @@ SETTLED = {SensorSession("left", 2**62): 7, SensorSession("left", 3): 5, SensorS
 
 
 def saved(folder):
-    gaps = [JournalGap("left", 0, 9, "ring overflow", 4)]
+    gaps = [SequenceGap("left", 0, 9, "ring overflow", 4)]
     Ledger(folder).save(SETTLED, open_=["a.h5.journal"], unsealed=["b.h5.journal"], gaps=gaps)
     return (folder / ".ertis-ledger"), gaps
 

@@ -1,11 +1,13 @@
 """The installed package is complete."""
 
 import configparser
+import os
 import subprocess
 import sys
 import zipfile
 from pathlib import Path
 
+import pytest
 from ertis_cli import _examples
 
 ROOT = Path(__file__).parents[1]
@@ -30,11 +32,19 @@ def test_every_package_is_listed():
     assert listed == found
 
 
-def test_wheel_contains_every_example(tmp_path):
-    """Built as `pip install .` builds it, without a network."""
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    """The wheel as `pip install .` builds it, without a network, and without files that an earlier build has left."""
+    folder = tmp_path_factory.mktemp("wheel")
+    (folder / "build.cfg").write_text(f"[build]\nbuild_base = {folder / 'build'}\n")
     command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-build-isolation", "--no-deps", "--no-index"]
-    subprocess.run([*command, "--wheel-dir", tmp_path, ROOT], check=True, timeout=240)
-    (wheel,) = tmp_path.glob("*.whl")
+    environment = os.environ | {"DIST_EXTRA_CONFIG": str(folder / "build.cfg")}
+    subprocess.run([*command, "--wheel-dir", folder, ROOT], env=environment, check=True, timeout=240)
+    (path,) = folder.glob("*.whl")
+    return path
+
+
+def test_wheel_contains_every_example(wheel):
     with zipfile.ZipFile(wheel) as archive:
         sizes = {Path(each.filename).name: each.file_size for each in archive.infolist() if "examples" in each.filename}
         layouts = {Path(name).name for name in archive.namelist() if "/layouts/" in name}
@@ -42,6 +52,14 @@ def test_wheel_contains_every_example(tmp_path):
     assert {"reflectors.h5", "reflectors.toml", "platform.toml", "corridor.toml", "1_nearest_reflector.py"} <= set(
         examples
     )
-    assert {name: len(item.read_bytes()) for name, item in examples.items()}.items() <= sizes.items()
+    assert {item.name: len(item.read_bytes()) for item in examples.values()}.items() <= sizes.items()
+    assert {f"{Path(name).stem}.json" for name in examples if name.endswith(".h5")} <= set(sizes)
     assert {path.name for path in (ROOT / "ertis_numba" / "layouts").glob("*.toml")} <= layouts
-    assert wheel.stat().st_size < 3e6
+
+
+def test_wheel_is_small_and_contains_no_recording_and_no_test(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        names = [name for name in archive.namelist() if ".dist-info/" not in name]
+    assert {name.partition("/")[0] for name in names} == {"ertis_bench", "ertis_cli", "ertis_examples", "ertis_numba"}
+    assert {Path(name).suffix for name in names} <= {".json", ".py", ".pyi", ".toml", ".typed", ""}
+    assert wheel.stat().st_size <= 1.5e6

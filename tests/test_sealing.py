@@ -18,6 +18,7 @@ from ertis_numba.storage import RecordingWriter, open_recording, sensor_names, w
 from ertis_numba.storage._gaps import UNKNOWN, SequenceNumbers
 from ertis_numba.storage.sealing import seal
 from ertis_numba.storage.sealing_process import IN_USE, NO_MEASUREMENTS, main
+from ertis_numba.storage.verify import verify
 from tests.faults import kills
 from tests.journals import ENVIRONMENT, EPOCH, TINY, crashed, create, entries, python
 from tests.test_journal_damage import spoil
@@ -170,6 +171,16 @@ def test_damaged_measurement_becomes_a_gap_and_the_journal_is_kept(tmp_path, cap
         assert [(gap.first, gap.last, gap.reason) for gap in recording.gaps] == [(11, 11, "damaged in the journal")]
     shutil.move(tmp_path / "kept", path)
     assert seal(path).set_aside == tmp_path / "rec.h5.journal.2.damaged"  # As after a kill before that.
+
+
+@pytest.mark.parametrize("column", ["sequence", "epoch"])
+def test_measurement_with_a_damaged_number_does_not_prevent_sealing(tmp_path, column):
+    create(tmp_path).close()
+    path = tmp_path / "rec.h5.journal"
+    spoil(path, f"UPDATE measurements SET {column} = -5 WHERE id = 3")
+    assert not verify(path)[0].gaps
+    sealed = seal(path)
+    assert (sealed.measurements, sealed.damaged, sealed.missing) == (2, 1, 0)
 
 
 def test_journal_of_damaged_measurements_is_kept(tmp_path):

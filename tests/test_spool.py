@@ -155,7 +155,7 @@ def test_full_spool_refuses_new_measurements(tmp_path):
 @pytest.mark.parametrize("text", ["the disk is full", "the disk fails"])
 def test_spool_survives_a_disk_that_is_full_for_a_while(tmp_path, monkeypatch, text):
     given = entries(9)
-    append, note_gap = Journal.append, Journal.note_gap
+    append, note_gaps = Journal.append, Journal.note_gaps
 
     def fail(*_arguments, **_options):
         raise DataError(text)
@@ -164,11 +164,11 @@ def test_spool_survives_a_disk_that_is_full_for_a_while(tmp_path, monkeypatch, t
         node.append(given[:3])
         with monkeypatch.context() as patch:
             patch.setattr(Journal, "append", fail)
-            patch.setattr(Journal, "note_gap", fail)
+            patch.setattr(Journal, "note_gaps", fail)
             for entry in given[3:6]:
                 assert node.append([entry]) == []
             node.note_gap("left", 16, 16, "footer", session_id=EPOCH)
-        assert (Journal.append, Journal.note_gap) == (append, note_gap)
+        assert (Journal.append, Journal.note_gaps) == (append, note_gaps)
         assert node.append(given[7:]) == given[7:]
         assert node.flush(SOON_S)
         assert list(node.notes.queue) == [text]

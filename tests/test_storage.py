@@ -9,13 +9,12 @@ import pytest
 import xarray
 
 from ertis_numba.errors import ArgumentError, DataError
-from ertis_numba.frames import Measurement, Stamp
+from ertis_numba.frames import Measurement, SequenceGap, Stamp
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.sample_format import sample_format
 from ertis_numba.settings import Air, Array, Call, Processing, Recording, Settings
 from ertis_numba.storage import (
     EnergyscapeWriter,
-    RecordingGap,
     RecordingWriter,
     file_kind,
     open_energyscapes,
@@ -23,6 +22,7 @@ from ertis_numba.storage import (
     write_energyscapes,
     write_recording,
 )
+from ertis_numba.storage._gaps import UNKNOWN
 from ertis_numba.storage.schema import ENERGYSCAPE, RECORDING, create_variables
 from tests.files import SMALL, image, line, noise
 
@@ -86,9 +86,8 @@ def test_gaps_sessions_and_air_are_kept(tmp_path):
         tmp_path / "rec.h5", (Measurement(words, warm if s.sequence == 9 else SMALL, s) for s in stamps), settings=SMALL
     )
     with open_recording(tmp_path / "rec.h5") as recording:
-        assert [(gap.first, gap.last, gap.session_id) for gap in recording.gaps] == [(5, 8, 7), (2, 2, 2**40)]
+        assert recording.gaps == (SequenceGap("sensor", 5, 8, UNKNOWN, 7), SequenceGap("sensor", 2, 2, UNKNOWN, 2**40))
         assert recording.stamps() == stamps
-        assert isinstance(recording.gaps[0], RecordingGap)
         assert [m.settings.air for m in recording] == [SMALL.air] * 2 + [warm.air] + [SMALL.air] * 3
         assert recording.settings.air == SMALL.air
     with h5py.File(tmp_path / "rec.h5") as file:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ertis_numba import atomic_files
-from ertis_numba.errors import ArgumentError, DataError, FormatVersionError
+from ertis_numba.errors import ArgumentError, DamagedError, DataError, FormatVersionError
 from ertis_numba.frames import Reflector
 from ertis_numba.settings import Recording
 from ertis_numba.storage import (
@@ -45,6 +45,16 @@ def test_text_file_is_not_a_recording(tmp_path, content, message):
     if content is not None:
         path.write_bytes(content)
     with pytest.raises(DataError, match=message):
+        open_recording(path)
+
+
+def test_impossible_gap_is_damage(path):
+    with h5py.File(path, "a") as file:
+        for name, value in {"": 0.0, "_first": 3, "_last": 2, "_reason": b"footer", "_session_id": 0}.items():
+            column = file[f"{GROUP}/gap{name}"]
+            column.resize((1,))
+            column[0] = value
+    with pytest.raises(DamagedError, match=r"a gap of sensor eRTIS-7 is damaged .*is 2; give.*copy the file again"):
         open_recording(path)
 
 

@@ -1,35 +1,44 @@
-"""Scenes, recordings and scripts that the package ships: their names, descriptions and contents."""
+"""Scenes and scripts of the package, and recordings simulated from its scenes: names, descriptions and content."""
 
 import ast
+import hashlib
+import json
 from importlib import resources
 from importlib.resources.abc import Traversable
-from pathlib import PurePath
+from pathlib import Path, PurePath
 from typing import Final
 
 from ertis_cli._config import instead
 
-__all__ = ["description", "examples", "named"]
+__all__ = ["description", "examples", "is_written", "named", "words_sha256"]
 
 _FOLDERS: Final = (("ertis_examples", ()), ("ertis_examples.synthetic", ()), ("ertis_examples.synthetic", ("scenes",)))
-"""Packages, and folders in them, with files to copy."""
+"""Packages, and folders in them, with examples."""
 
-_SUFFIXES: Final = {".toml", ".h5", ".py"}
+_SUFFIXES: Final = {".toml", ".py"}
 _TOOLS: Final = {"__init__.py", "build.py", "gallery.py"}
 """Files of these packages that are not examples."""
 
 
 def examples() -> dict[str, Traversable]:
-    """Return the files by their names, in alphabetical order."""
+    """Return the sources of examples by name, in alphabetical order.
+
+    The source of a recording is its scene. A file ``NAME.json`` beside the scene has the checksums of its samples.
+    """
     found = {}
     for package, parts in _FOLDERS:
-        for item in resources.files(package).joinpath(*parts).iterdir():
-            if PurePath(item.name).suffix in _SUFFIXES and item.name not in _TOOLS:
+        folder = resources.files(package).joinpath(*parts)
+        for item in folder.iterdir():
+            name = PurePath(item.name)
+            if name.suffix == ".json":
+                found[f"{name.stem}.h5"] = folder / f"{name.stem}.toml"
+            elif name.suffix in _SUFFIXES and item.name not in _TOOLS:
                 found[item.name] = item
     return dict(sorted(found.items()))
 
 
 def named(name: str) -> dict[str, Traversable]:
-    """Return the file of a name, or without a suffix all files of that name.
+    """Return the source of the example with this name, or without a suffix of all examples of that name.
 
     Raises
     ------
@@ -45,6 +54,34 @@ def named(name: str) -> dict[str, Traversable]:
             f"example {name!r} does not exist; {instead(name, {PurePath(file).stem for file in every})}"
         )
     return found
+
+
+def is_written(path: Path, item: Traversable) -> bool:
+    """Return True if a file is the example with its name: a copy of the source, or a recording with equal samples."""
+    from ertis_numba.errors import ErtisError
+
+    if path.is_symlink() or not path.is_file():
+        return False
+    if path.suffix != ".h5":
+        return path.read_bytes() == item.read_bytes()
+    report = resources.files("ertis_examples.synthetic") / f"{path.stem}.json"
+    sensors = json.loads(report.read_text("utf-8"))["sensors"]
+    try:
+        return all(words_sha256(path, each["sensor"]) == each["words_sha256"] for each in sensors)
+    except ErtisError:
+        return False
+
+
+def words_sha256(path: Path, sensor: str) -> str:
+    """Return the SHA-256 of the concatenated samples of all measurements of a sensor."""
+    from ertis_numba.storage import open_recording
+
+    digest = hashlib.sha256()
+    with open_recording(path, sensor=sensor) as recording:
+        for measurement in recording:
+            words = measurement.data
+            digest.update(words.astype(words.dtype.newbyteorder("<")).tobytes())
+    return digest.hexdigest()
 
 
 def description(name: str, item: Traversable) -> str:

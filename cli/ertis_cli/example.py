@@ -1,5 +1,6 @@
-"""``ertis example``: shipped scenes, recordings and scripts."""
+"""``ertis example``: list or write example scenes, recordings and scripts."""
 
+from importlib.resources import as_file
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING
 
@@ -28,37 +29,53 @@ def _complete(ctx: click.Context, param: click.Parameter, incomplete: str) -> li
     type=click.Path(path_type=Path, file_okay=False),
     default=".",
     metavar="DIR",
-    help="Folder to copy to; the current one by default.",
+    help="Folder to write to; the current one by default.",
 )
 @options.force
 @options.quiet
 @options.as_json
-def example(*, names: tuple[str, ...], folder: Path, force: bool, quiet: bool, as_json: bool) -> None:
-    """List or copy shipped scenes, recordings and scripts.
+@click.pass_context
+def example(
+    ctx: click.Context, *, names: tuple[str, ...], folder: Path, force: bool, quiet: bool, as_json: bool
+) -> None:
+    """List or write example scenes, recordings and scripts.
 
-    NAME is a file name, or a file name without its suffix: 'reflectors' copies the scene reflectors.toml and its
-    recording reflectors.h5. A different file of the same name is overwritten only with --force.
+    NAME is a file name, or a file name without its suffix: 'reflectors' copies the scene reflectors.toml and simulates
+    its recording reflectors.h5. A different file of the same name is overwritten only with --force.
     """
     if not names:
         _list(as_json=as_json)
         return
     from ertis_numba.atomic_files import atomic_write, check_target
 
-    chosen: dict[str, Traversable] = {}
+    sources: dict[Path, Traversable] = {}
     for name in names:
-        chosen |= _examples.named(name)
-    contents = {folder / name: item.read_bytes() for name, item in chosen.items()}
-    # An existing copy stays, so that commands from several pages can be run one after the other.
-    missing = {path: content for path, content in contents.items() if not _holds(path, content)}
+        sources |= {folder / file: item for file, item in _examples.named(name).items()}
+    # An example that was written before stays, so that commands from several pages can be run one after the other.
+    missing = [path for path, item in sources.items() if not _examples.is_written(path, item)]
     for path in missing:
         check_target(path, overwrite=force)
-    for path, content in missing.items():
-        with atomic_write(path, overwrite=force) as part:
-            part.write_bytes(content)
-    for path in contents:
-        options.say(f"{path}{'' if path in missing else ': copied before'}", quiet=quiet or as_json)
+    quiet = quiet or as_json
+    for path, item in sources.items():
+        if path not in missing:
+            options.say(f"{path}: written before", quiet=quiet)
+        elif path.suffix == ".h5":
+            _simulate(ctx, item, path, force=force, quiet=quiet)
+        else:
+            with atomic_write(path, overwrite=force) as part:
+                part.write_bytes(item.read_bytes())
+            options.say(str(path), quiet=quiet)
     if as_json:
-        options.print_json({"files": [str(path) for path in contents], "copied": [str(path) for path in missing]})
+        options.print_json({"files": [str(path) for path in sources], "written": [str(path) for path in missing]})
+
+
+def _simulate(ctx: click.Context, scene: "Traversable", target: Path, *, force: bool, quiet: bool) -> None:
+    """Run ``ertis simulate``, regardless of its variables and its section of a configuration file."""
+    from ertis_cli.simulate import simulate
+
+    unset = dict.fromkeys(["count", "seed", "sensor", "tolerance_db"])
+    with as_file(scene) as path:
+        ctx.invoke(simulate, path=path, target=target, force=force, quiet=quiet, explain=False, as_json=False, **unset)
 
 
 def _list(*, as_json: bool) -> None:
@@ -67,8 +84,3 @@ def _list(*, as_json: bool) -> None:
         options.print_json({"examples": [{"name": name, "description": about} for name, about in rows]})
         return
     _tables.TextTable({"name": "left", "description": "left"}, rows).print()
-
-
-def _holds(path: Path, content: bytes) -> bool:
-    """Return True if a file is already a copy of the example."""
-    return path.is_file() and not path.is_symlink() and path.read_bytes() == content

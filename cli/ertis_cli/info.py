@@ -142,7 +142,7 @@ def _recording(reader: "RecordingReader") -> dict[str, Any]:
         "duration_ms": round(1000 * recording.duration_s, 3),
         "first": stamps[0].iso,
         "last": stamps[-1].iso,
-        "missing": sum(gap.last - gap.first + 1 for gap in reader.gaps),
+        "missing": sum(gap.n_missing for gap in reader.gaps),
         **({"firmware": reader.firmware} if reader.firmware else {}),
         **_mounting(reader),
     }

@@ -26,7 +26,7 @@ COMMANDS = {
         "ertis_cli.emulate:emulate",
         "Emulate the sensors of a scene or a recording.",
     ),
-    "example": ("ertis_cli.example:example", "List or copy shipped scenes, recordings and scripts."),
+    "example": ("ertis_cli.example:example", "List or write example scenes, recordings and scripts."),
     "export": ("ertis_cli.export:export", "Export images or signals for other programs."),
     "import": ("ertis_cli.import_raw:import_raw", "Import raw eRTIS data or PCM into a recording."),
     "info": ("ertis_cli.info:info", "Show the contents of a recording or an energyscape file."),

@@ -1,1 +1,1 @@
-"""Scenes and the recordings simulated from them; ``ertis example`` copies them."""
+"""Scenes, and the recordings that ``ertis example`` simulates from them."""

@@ -12,7 +12,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from ertis_numba import open_recording
+from ertis_cli._examples import words_sha256
 
 HERE = Path(__file__).parent
 DATE = "1767225600"  # 2026-01-01: fixed, so that recordings do not depend on the day of the build
@@ -45,16 +45,6 @@ def build(folder: Path) -> None:
         }
         target.with_suffix(".json").write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     write_sums(folder)
-
-
-def words_sha256(path: Path, sensor: str) -> str:
-    """Return the SHA-256 of the concatenated samples of all measurements of a sensor."""
-    digest = hashlib.sha256()
-    with open_recording(path, sensor=sensor) as recording:
-        for measurement in recording:
-            words = measurement.data
-            digest.update(words.astype(words.dtype.newbyteorder("<")).tobytes())
-    return digest.hexdigest()
 
 
 def write_sums(folder: Path) -> None:

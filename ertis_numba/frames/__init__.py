@@ -1,9 +1,19 @@
-"""Data that flow through the system: measurements, signals, energyscapes, reflectors, peaks and point clouds."""
+"""Data that flow through the system: measurements, gaps, signals, energyscapes, reflectors, peaks and point clouds."""
 
 from ertis_numba.frames._energyscape import Energyscape
+from ertis_numba.frames._gap import SequenceGap
 from ertis_numba.frames._measurement import Measurement, MicrophoneSignals
 from ertis_numba.frames._point_cloud import PointCloud
 from ertis_numba.frames._reflectors import Peak, Reflector
 from ertis_numba.frames._stamp import Stamp
 
-__all__ = ["Energyscape", "Measurement", "MicrophoneSignals", "Peak", "PointCloud", "Reflector", "Stamp"]
+__all__ = [
+    "Energyscape",
+    "Measurement",
+    "MicrophoneSignals",
+    "Peak",
+    "PointCloud",
+    "Reflector",
+    "SequenceGap",
+    "Stamp",
+]

@@ -9,8 +9,9 @@ from types import MappingProxyType, TracebackType
 from typing import Final, Self
 
 from ertis_numba.errors import ArgumentError, DamagedError, DataError
+from ertis_numba.frames import SequenceGap
 from ertis_numba.journal._database import Database
-from ertis_numba.journal._records import JournalEntry, JournalGap, JournalKey, JournalSensor, verified_values
+from ertis_numba.journal._records import JournalEntry, JournalKey, JournalSensor, verified_values
 from ertis_numba.journal._tables import COMPLETE_VERSION, select_statement
 
 __all__ = ["SUFFIX", "ReadableJournal"]
@@ -113,14 +114,14 @@ class ReadableJournal:
         return MappingProxyType({name: (reason, count) for name, reason, count in self._unusable.values()})
 
     @property
-    def gaps(self) -> tuple[JournalGap, ...]:
+    def gaps(self) -> tuple[SequenceGap, ...]:
         """Noted gaps, in order."""
         with self._lock:
             rows = self._database.execute(select_statement("gaps", "ORDER BY id"))
         names = {number: name for name, number in self._ids.items()}
         made = (verified_values(self.path, "a gap", row) for row in rows)
         return tuple(
-            JournalGap(names[number], first, last, why, session_id)
+            SequenceGap(names[number], first, last, why, session_id)
             for number, session_id, first, last, why in made
             if number not in self._unusable
         )

@@ -17,7 +17,7 @@ from ertis_numba.journal._tables import row_crc32
 from ertis_numba.sample_format import sample_format
 from ertis_numba.settings import Air, Settings
 
-__all__ = ["JournalEntry", "JournalGap", "JournalKey", "JournalSensor", "require_same_settings", "verified_values"]
+__all__ = ["JournalEntry", "JournalKey", "JournalSensor", "require_same_settings", "verified_values"]
 
 _INT64 = (-(2**63), 2**63 - 1)
 _UNKNOWN = 7 * (0.0,)  # Unknown mounting: translation, and a rotation that no mounting has.
@@ -51,21 +51,6 @@ class JournalKey(NamedTuple):
     sensor: str
     session_id: int
     sequence: int
-
-
-@dataclass(frozen=True, slots=True)
-class JournalGap:
-    """Missing sequence numbers of a sensor's session, ``first`` and ``last`` included, with the reason."""
-
-    sensor: str
-    first: int
-    last: int
-    reason: str
-    session_id: int
-
-    def __post_init__(self) -> None:
-        checks.sequence_gap(self.first, self.last, self.reason)
-        checks.integer("session_id", self.session_id, 0, _INT64[1])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from ertis_numba.errors import ArgumentError, DamagedError, DataError
+from ertis_numba.frames import SequenceGap
 from ertis_numba.journal._database import Database
 from ertis_numba.journal._files import keep_damaged_log
 from ertis_numba.journal._log import WriteAheadLog
-from ertis_numba.journal._records import JournalEntry, JournalGap, JournalSensor, verified_values
+from ertis_numba.journal._records import JournalEntry, JournalSensor, verified_values
 from ertis_numba.journal._tables import select_statement
 
 if TYPE_CHECKING:
@@ -39,8 +40,8 @@ class _RecoveredRows:
     header: list[Any] = field(default_factory=list)
     sensors: list[JournalSensor] = field(default_factory=list)
     entries: list[JournalEntry] = field(default_factory=list)
-    gaps: list[JournalGap] = field(default_factory=list)
-    lost: list[JournalGap] = field(default_factory=list)
+    gaps: list[SequenceGap] = field(default_factory=list)
+    lost: list[SequenceGap] = field(default_factory=list)
     n_unreadable: int = 0
     is_complete: bool = False
 
@@ -88,14 +89,14 @@ def recover_rows(journal: "Journal", database: Database, log: WriteAheadLog | No
     return "; ".join(unrecorded)
 
 
-def _record_lost(journal: "Journal", gaps: Iterable[JournalGap]) -> list[str]:
+def _record_lost(journal: "Journal", gaps: Iterable[SequenceGap]) -> list[str]:
     """Note lost numbers as gaps, and return the losses of sensors that the journal does not contain."""
     unrecorded = []
     for gap in list(gaps):
         if gap.sensor in journal.sensors:
             journal.note_gaps(list(_missing_parts(journal, gap)))
         else:
-            unrecorded.append(f"up to {gap.last - gap.first + 1} numbers of sensor {gap.sensor}")
+            unrecorded.append(f"up to {gap.n_missing} numbers of sensor {gap.sensor}")
     return unrecorded
 
 
@@ -107,7 +108,7 @@ def _stored_ranges(journal: "Journal") -> Iterator[tuple[tuple[str, int], int, i
         yield (gap.sensor, gap.session_id), gap.first, gap.last
 
 
-def _missing(journal: "Journal") -> Iterator[JournalGap]:
+def _missing(journal: "Journal") -> Iterator[SequenceGap]:
     """Yield the numbers that the tally lists and the journal lacks."""
     if not journal.tally.ranges:
         return
@@ -117,16 +118,16 @@ def _missing(journal: "Journal") -> Iterator[JournalGap]:
     for run, mark in journal.tally.ranges.items():
         before = max(highest.get(run, -1), mark.first - 1, mark.discarded)
         if mark.last > before:
-            yield JournalGap(mark.sensor, before + 1, mark.last, LOST, mark.session_id)
+            yield SequenceGap(mark.sensor, before + 1, mark.last, LOST, mark.session_id)
 
 
-def _missing_parts(journal: "Journal", gap: JournalGap) -> Iterator[JournalGap]:
+def _missing_parts(journal: "Journal", gap: SequenceGap) -> Iterator[SequenceGap]:
     """Yield the parts of a gap without numbers that the journal contains."""
     begin = gap.first
     held = sorted((first, last) for run, first, last in _stored_ranges(journal) if run == (gap.sensor, gap.session_id))
     for first, last in [*held, (gap.last + 1, gap.last + 1)]:
         if begin < first <= gap.last + 1:
-            yield JournalGap(gap.sensor, begin, first - 1, gap.reason, gap.session_id)
+            yield SequenceGap(gap.sensor, begin, first - 1, gap.reason, gap.session_id)
         begin = max(begin, last + 1)
 
 
@@ -173,14 +174,14 @@ def _read(journal: "Journal", database: Database, repaired: Database) -> _Recove
             found.entries.append(sensors[record[0]].entry(journal.path, row))
         except (DamagedError, KeyError, ValueError):
             if record and record[0] in sensors:
-                found.lost.append(JournalGap(sensors[record[0]].name, record[2], record[2], LOST, record[1]))
+                found.lost.append(SequenceGap(sensors[record[0]].name, record[2], record[2], LOST, record[1]))
             else:
                 found.n_unreadable += 1
     gaps = repaired.execute(select_statement("gaps", "WHERE id > ? ORDER BY id"), ends[1:])
     for row in gaps:
         with suppress(DamagedError, KeyError):
             number, session_id, first, last, reason = verified_values(journal.path, "a gap", row)
-            found.gaps.append(JournalGap(sensors[number].name, first, last, reason, session_id))
+            found.gaps.append(SequenceGap(sensors[number].name, first, last, reason, session_id))
     found.is_complete = (
         not found.n_unreadable
         and len(found.gaps) == len(gaps)

@@ -6,11 +6,12 @@ from pathlib import Path
 from typing import Any, Final
 
 from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.frames import SequenceGap
 from ertis_numba.journal import _free_space
 from ertis_numba.journal._contents import ReadableJournal
 from ertis_numba.journal._database import LOG_BYTES, Database
 from ertis_numba.journal._files import disk_errors
-from ertis_numba.journal._records import JournalEntry, JournalGap, JournalSensor, require_same_settings
+from ertis_numba.journal._records import JournalEntry, JournalSensor, require_same_settings
 from ertis_numba.journal._tables import VERSION, insert_statement, row_crc32
 from ertis_numba.journal._tally import Tally
 from ertis_numba.settings import Settings
@@ -146,9 +147,9 @@ class WritableJournal(ReadableJournal):
         DataError
             The journal is not writable.
         """
-        self.note_gaps([JournalGap(sensor, first, last, reason, session_id)])
+        self.note_gaps([SequenceGap(sensor, first, last, reason, session_id)])
 
-    def note_gaps(self, gaps: Sequence[JournalGap]) -> None:
+    def note_gaps(self, gaps: Sequence[SequenceGap]) -> None:
         """Store gaps durably, all or none.
 
         Raises

@@ -2,8 +2,7 @@
 
 from ertis_numba import checks
 from ertis_numba.frames import Measurement
-from ertis_numba.settings import Array, Processing, Recording
-from ertis_numba.simulation.ab_render import ABRender
+from ertis_numba.settings import Array, Recording
 from ertis_numba.simulation.engine import Engine
 from ertis_numba.simulation.plan import EffectPlan, make_plan
 from ertis_numba.simulation.scene import Scene
@@ -85,16 +84,14 @@ def render(scene: Scene, index: int = 0, *, sensor: str | None = None) -> Measur
 
 
 def compile_kernels() -> None:
-    """Compile the kernels for rendering and A/B renders, on a scene with one point.
+    """Compile the kernels for rendering, on a scene with one point.
 
-    Callers can then report the reason for the delay.
+    Callers can then report the reason for the delay. Kernels for A/B renders, which few scenes need, are not compiled.
     """
     sensor = Sensor(
         array=Array(layout="one", positions_m=((0.0, 0.0, 0.0),)),
         recording=Recording(n_samples=20_000),
-        processing=Processing(directions="2d:1", range_m=(0.2, 0.3)),
     )
     scene = Scene(sensors=(sensor,), points=(Point(range_m=0.25),))
     effects = frozenset({"propagation", "spreading", "modulation"})
     Engine(scene, sensor, effects).render()
-    ABRender(scene).change_db(0, effects, "absorption")

@@ -9,7 +9,6 @@ from ertis_numba.storage.energyscape import (
     write_energyscapes,
 )
 from ertis_numba.storage.recording import (
-    RecordingGap,
     RecordingReader,
     RecordingWriter,
     open_recording,
@@ -22,7 +21,6 @@ __all__ = [
     "EnergyscapeWriter",
     "GroundTruth",
     "GroundTruthLog",
-    "RecordingGap",
     "RecordingReader",
     "RecordingWriter",
     "atomic_write",

@@ -2,9 +2,10 @@
 
 import bisect
 from collections.abc import Iterable, Iterator, Sequence
-from typing import NamedTuple
 
-__all__ = ["UNKNOWN", "MissingNumbers", "SensorSequences", "SequenceNumbers"]
+from ertis_numba.frames import SequenceGap
+
+__all__ = ["UNKNOWN", "SensorSequences", "SequenceNumbers"]
 
 Range = tuple[int, int]
 ReasonedRange = tuple[int, int, str]
@@ -13,15 +14,6 @@ UNKNOWN = "not among the measurements given"
 """Reason of a gap without a noted reason."""
 
 _END = 2**63  # Above all sequence numbers.
-
-
-class MissingNumbers(NamedTuple):
-    """Missing sequence numbers of a sensor's session, ``first`` and ``last`` included, with the reason."""
-
-    first: int
-    last: int
-    reason: str
-    session_id: int = 0
 
 
 class SensorSequences:
@@ -38,19 +30,13 @@ class SensorSequences:
         """Add the next number of a session."""
         self._numbers.setdefault(session_id, SequenceNumbers()).add(number)
 
-    def missing(self, noted: Iterable[MissingNumbers]) -> list[MissingNumbers]:
-        """Return the missing numbers of all sessions: in order of arrival, then sessions of which only gaps are known.
-
-        Parameters
-        ----------
-        noted : iterable of MissingNumbers
-            Noted gaps.
-        """
+    def missing(self, sensor: str, noted: Iterable[SequenceGap]) -> list[SequenceGap]:
+        """Return the gaps of all sessions, given noted ones: in order of arrival, then sessions without a number."""
         known: dict[int, list[ReasonedRange]] = {}
-        for first, last, reason, session_id in noted:
-            known.setdefault(session_id, []).append((first, last, reason))
+        for gap in noted:
+            known.setdefault(gap.session_id, []).append((gap.first, gap.last, gap.reason))
         return [
-            MissingNumbers(*hole, session_id)
+            SequenceGap(sensor, *hole, session_id)
             for session_id in (*self._numbers, *sorted(known.keys() - self._numbers.keys()))
             for hole in self._numbers.get(session_id, SequenceNumbers()).missing(known.get(session_id, ()))
         ]

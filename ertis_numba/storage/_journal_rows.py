@@ -4,8 +4,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from ertis_numba.errors import DamagedError
+from ertis_numba.frames import SequenceGap
 from ertis_numba.journal import Journal, JournalEntry
-from ertis_numba.storage._gaps import MissingNumbers, SensorSequences
+from ertis_numba.storage._gaps import SensorSequences
 
 __all__ = ["DamagedMeasurement", "JournalRows"]
 
@@ -35,13 +36,9 @@ class JournalRows:
     """
 
     def __init__(self, journal: Journal, sensor: str) -> None:
-        self._journal = journal
+        self._journal, self._sensor = journal, sensor
         self.keys = journal.index(sensor)
-        self._noted = [
-            MissingNumbers(gap.first, gap.last, gap.reason, gap.session_id)
-            for gap in journal.gaps
-            if gap.sensor == sensor
-        ]
+        self._noted = [gap for gap in journal.gaps if gap.sensor == sensor]
         self._numbers = SensorSequences()
         self.damaged: list[DamagedMeasurement] = []
 
@@ -61,10 +58,12 @@ class JournalRows:
             yield entry
 
     @property
-    def missing(self) -> list[MissingNumbers]:
+    def missing(self) -> list[SequenceGap]:
         """Missing numbers in order, damaged ones included."""
+        keys = (self.keys[item.index] for item in self.damaged)
         lost = [
-            MissingNumbers(item.sequence, item.sequence, _DAMAGED, self.keys[item.index].session_id)
-            for item in self.damaged
+            SequenceGap(key.sensor, key.sequence, key.sequence, _DAMAGED, key.session_id)
+            for key in keys
+            if min(key.sequence, key.session_id) >= 0  # A negative number is damaged itself.
         ]
-        return self._numbers.missing([*lost, *self._noted])
+        return self._numbers.missing(self._sensor, [*lost, *self._noted])

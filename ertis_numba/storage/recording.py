@@ -2,7 +2,6 @@
 
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -11,12 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks
-from ertis_numba.errors import ArgumentError, DataError
-from ertis_numba.frames import Measurement
+from ertis_numba.errors import ArgumentError, DamagedError, DataError
+from ertis_numba.frames import Measurement, SequenceGap
 from ertis_numba.geometry import Layout, microphones, mounting as mounted, self_contained, storable
 from ertis_numba.sample_format import SampleFormat, sample_format
 from ertis_numba.settings import Air, Settings
-from ertis_numba.storage._gaps import MissingNumbers
 from ertis_numba.storage._mounting import read_mounting, write_mounting
 from ertis_numba.storage._reader import FileReader
 from ertis_numba.storage._rows import RowWriter
@@ -34,7 +32,6 @@ from ertis_numba.waveform import call_samples
 
 __all__ = [
     "JOURNAL_DAMAGE",
-    "RecordingGap",
     "RecordingReader",
     "RecordingWriter",
     "create_sensor_variables",
@@ -49,16 +46,6 @@ Mounting = tuple[Sequence[float], Sequence[float]]
 """Position of a sensor, x, y, z in m, and its orientation, a unit quaternion x, y, z, w."""
 
 _AIR = {"temperature": "temperature_c", "humidity": "humidity_percent", "pressure": "pressure_pa"}
-
-
-@dataclass(frozen=True, slots=True)
-class RecordingGap:
-    """Missing sequence numbers of a sensor's session, ``first`` and ``last`` included, with the reason."""
-
-    first: int
-    last: int
-    reason: str
-    session_id: int = 0
 
 
 class RecordingWriter(FileWriter[Measurement]):
@@ -109,7 +96,7 @@ class RecordingWriter(FileWriter[Measurement]):
         self._formats: dict[str, SampleFormat] = {}
         self._mounting = {sensor: mounted(sensor, *given) for sensor, given in (mounting or {}).items()}
         self._firmware = firmware or {}
-        self._noted: dict[str, list[MissingNumbers]] = {}
+        self._noted: dict[str, list[SequenceGap]] = {}
 
     def note_gap(self, sensor: str, first: int, last: int, reason: str, session_id: int = 0) -> None:
         """Store why sequence numbers are missing, ``first`` and ``last`` included; in any order, at any time.
@@ -123,10 +110,7 @@ class RecordingWriter(FileWriter[Measurement]):
         ArgumentError
             ``last`` comes before ``first``, or the reason is not a line of at most 64 bytes.
         """
-        checks.sequence_gap(first, last, reason)
-        self._noted.setdefault(sensor, []).append(
-            MissingNumbers(first, last, reason, checks.integer("session_id", session_id, 0))
-        )
+        self._noted.setdefault(sensor, []).append(SequenceGap(sensor, first, last, reason, session_id))
 
     def _begin(self, group: h5py.Group, first: Measurement) -> None:
         sensor = first.stamp.sensor
@@ -185,7 +169,7 @@ class RecordingWriter(FileWriter[Measurement]):
 
     def _complete(self, group: h5py.Group, rows: RowWriter) -> None:
         sensor = group.name.rpartition("/")[2]
-        gaps = rows.runs.missing(self._noted.get(sensor, ()))
+        gaps = rows.runs.missing(sensor, self._noted.get(sensor, ()))
         values: dict[str, list[Any]] = {
             "gap": [0.0] * len(gaps),
             "gap_first": [gap.first for gap in gaps],
@@ -274,7 +258,7 @@ class RecordingReader(FileReader[Measurement]):
 
     Attributes
     ----------
-    gaps : tuple of RecordingGap
+    gaps : tuple of SequenceGap
         Missing sequence numbers with their reasons.
     firmware : str
         Version of the sensor's firmware; empty if unknown.
@@ -286,7 +270,7 @@ class RecordingReader(FileReader[Measurement]):
 
     _kind: ClassVar[str] = "recording"
 
-    gaps: tuple[RecordingGap, ...]
+    gaps: tuple[SequenceGap, ...]
     firmware: str
     translation_m: NDArray[np.float64] | None
     rotation_xyzw: NDArray[np.float64] | None
@@ -300,10 +284,13 @@ class RecordingReader(FileReader[Measurement]):
         session_ids = (
             self._group["gap_session_id"][:].tolist() if "gap_session_id" in self._group else itertools.repeat(0)
         )
-        self.gaps = tuple(
-            RecordingGap(first, last, reason.decode(), session_id)
-            for (first, last, reason), session_id in zip(zip(*columns, strict=True), session_ids, strict=False)
-        )
+        try:
+            self.gaps = tuple(
+                SequenceGap(self.sensor, first, last, reason.decode(), session_id)
+                for (first, last, reason), session_id in zip(zip(*columns, strict=True), session_ids, strict=False)
+            )
+        except ArgumentError as error:
+            raise DamagedError(f"a gap of sensor {self.sensor} is damaged ({error}); copy the file again") from error
         self.firmware = str(to_python(self._group.attrs["firmware"]))
         self.translation_m, self.rotation_xyzw = read_mounting(self._group, self.path)
 

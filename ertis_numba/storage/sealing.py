@@ -220,7 +220,7 @@ def _write(
                 n_written += 1
                 progress(n_written, len(journal))
             for gap in held.missing:
-                writer.note_gap(name, *gap)
+                writer.note_gap(name, gap.first, gap.last, gap.reason, gap.session_id)
         if not n_written:
             raise DataError(f"{journal.path}: all {len(journal)} measurements are damaged; copy it again if you can")
         if damage := _damage(journal, rows):
@@ -234,7 +234,7 @@ def _history_of_lost_sensors(rows: dict[str, JournalRows]) -> Iterator[str]:
     for name, held in rows.items():
         if len(held) == len(held.damaged):
             yield f"sensor {name} has no measurement"
-            yield from (f"{first} to {last}: {reason}" for first, last, reason, _ in held.missing)
+            yield from (f"{gap.first} to {gap.last}: {gap.reason}" for gap in held.missing)
 
 
 def _is_complete_recording(target: Path, journal: Journal, rows: dict[str, JournalRows]) -> bool:
@@ -260,7 +260,7 @@ def _same(sensor: JournalSensor, rows: JournalRows, recording: RecordingReader) 
         for entry, back in zip_longest(rows, recording):
             if entry is None or back is None or not _equal(entry.measurement, back):
                 return False
-        return [(gap.first, gap.last, gap.reason, gap.session_id) for gap in recording.gaps] == rows.missing
+        return list(recording.gaps) == rows.missing
 
 
 def _equal(one: Measurement, other: Measurement) -> bool:
@@ -281,8 +281,8 @@ def _summary(
     for name in sensor_names(recording):
         with open_recording(recording, sensor=name) as reader:
             n_measurements += len(reader)
-            n_missing += sum(gap.last - gap.first + 1 for gap in reader.gaps)
-            n_lost += sum(gap.last - gap.first + 1 for gap in reader.gaps if gap.reason == LOST)
+            n_missing += sum(gap.n_missing for gap in reader.gaps)
+            n_lost += sum(gap.n_missing for gap in reader.gaps if gap.reason == LOST)
             damage = str(reader.attributes.get(JOURNAL_DAMAGE, ""))
     return SealingResult(path, recording, n_measurements, n_missing, damaged, set_aside, n_lost, damage, refused or {})
 

@@ -5,11 +5,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ertis_numba.errors import ArgumentError, DamagedError, DataError, ForeignDataError
+from ertis_numba.frames import SequenceGap
 from ertis_numba.journal import Journal
 from ertis_numba.storage._axes_check import find_damage
 from ertis_numba.storage._journal_rows import DamagedMeasurement, JournalRows
 from ertis_numba.storage._reader import sensor_names
-from ertis_numba.storage.recording import JOURNAL_DAMAGE, RecordingGap, RecordingReader, open_recording
+from ertis_numba.storage.recording import JOURNAL_DAMAGE, RecordingReader, open_recording
 
 __all__ = ["DamagedMeasurement", "SensorReport", "verify"]
 
@@ -26,7 +27,7 @@ class SensorReport:
         Name of the sensor.
     measurements : int
         Number of measurements, damaged ones included.
-    gaps : tuple of RecordingGap
+    gaps : tuple of SequenceGap
         Missing sequence numbers with their reasons.
     damaged : tuple of DamagedMeasurement
         Damaged measurements.
@@ -40,7 +41,7 @@ class SensorReport:
 
     sensor: str
     measurements: int = 0
-    gaps: tuple[RecordingGap, ...] = ()
+    gaps: tuple[SequenceGap, ...] = ()
     damaged: tuple[DamagedMeasurement, ...] = ()
     out_of_order: tuple[int, ...] = ()
     fault: str = ""
@@ -49,7 +50,7 @@ class SensorReport:
     @property
     def missing(self) -> int:
         """Number of missing sequence numbers."""
-        return sum(gap.last - gap.first + 1 for gap in self.gaps)
+        return sum(gap.n_missing for gap in self.gaps)
 
     @property
     def is_intact(self) -> bool:
@@ -148,7 +149,7 @@ def _of_journal(journal: Journal, sensor: str) -> SensorReport:
     return SensorReport(
         sensor=sensor,
         measurements=len(rows),
-        gaps=tuple(RecordingGap(*item) for item in rows.missing),
+        gaps=tuple(rows.missing),
         damaged=tuple(rows.damaged),
         out_of_order=_out_of_order((key.session_id, key.sequence) for key in rows.keys),
         remark=f"lost in a damaged journal: {journal.damage}" if journal.damage else "",

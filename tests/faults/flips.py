@@ -23,8 +23,8 @@ import h5py
 import numpy as np
 
 from ertis_numba.errors import ErtisError
-from ertis_numba.frames import Measurement, Stamp
-from ertis_numba.journal import SUFFIX, Journal, JournalEntry, JournalGap, JournalSensor
+from ertis_numba.frames import Measurement, SequenceGap, Stamp
+from ertis_numba.journal import SUFFIX, Journal, JournalEntry, JournalSensor
 from ertis_numba.journal._tables import insert_statement
 from ertis_numba.network.allow_list import AllowList, Permission
 from ertis_numba.network.central_node._ledger import Ledger
@@ -337,7 +337,7 @@ def _make_files(state: str, folder: Path) -> None:
             for session_id in range(8)
             for sensor in _SENSORS
         }
-        gaps = [JournalGap("left", 3, 9, "the spool was full", 5)]
+        gaps = [SequenceGap("left", 3, 9, "the spool was full", 5)]
         tails = {run: {last - number: last * number for number in range(16)} for run, last in runs.items()}
         Ledger(folder).save(runs, open_=["a.h5.journal"], unsealed=["b.h5.journal"], gaps=gaps, tails=tails)
     else:

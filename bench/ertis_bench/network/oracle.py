@@ -14,8 +14,8 @@ from typing import Any, Final
 
 from ertis_bench.network.diary import DiaryKey, Row
 from ertis_numba.errors import ErtisError
-from ertis_numba.frames import Measurement
-from ertis_numba.storage import RecordingGap, open_recording, sensor_names
+from ertis_numba.frames import Measurement, SequenceGap
+from ertis_numba.storage import open_recording, sensor_names
 
 __all__ = ["Archived", "Sent", "compare", "judged", "note", "read_diaries", "read_folder", "tracebacks"]
 
@@ -100,13 +100,13 @@ class Archived:
     ----------
     rows : dict of DiaryKey to list of Row
         Stored measurements. A list has more than one row if a measurement was stored twice.
-    gaps : dict of (sensor, session_id) to list of Gap
+    gaps : dict of (sensor, session_id) to list of SequenceGap
     recordings, broken, left_over : list of str
         Names of files: recordings that were read, unreadable recordings, and files that should have been removed.
     """
 
     rows: dict[DiaryKey, list[Row]] = field(default_factory=lambda: defaultdict(list))
-    gaps: dict[tuple[str, int], list[RecordingGap]] = field(default_factory=lambda: defaultdict(list))
+    gaps: dict[tuple[str, int], list[SequenceGap]] = field(default_factory=lambda: defaultdict(list))
     recordings: list[str] = field(default_factory=list)
     broken: list[str] = field(default_factory=list)
     left_over: list[str] = field(default_factory=list)

@@ -6,7 +6,8 @@ from collections.abc import Callable, Iterable
 from typing import Final
 
 from ertis_numba.errors import ArgumentError
-from ertis_numba.journal import JournalEntry, JournalGap as NotedGap, JournalSensor
+from ertis_numba.frames import SequenceGap
+from ertis_numba.journal import JournalEntry, JournalSensor
 from ertis_numba.network.central_node._admission import Unwanted, entry_in, require_room, require_same, source_in
 from ertis_numba.network.central_node._archive import Archive
 from ertis_numba.network.central_node._images import Guarded
@@ -145,7 +146,7 @@ class Intake:
         """Register numbers as missing that the node does not have any more."""
         if stream.begins > stream.taken + 1:
             first, last = stream.taken + 1, stream.begins - 1
-            self._take_gap(stream, NotedGap(stream.run.sensor, first, last, _NEVER, stream.run.session_id))
+            self._take_gap(stream, SequenceGap(stream.run.sensor, first, last, _NEVER, stream.run.session_id))
 
     def _stream(self, peer_id: bytes, message: Data | Gap) -> Stream:
         peer = self.peers.get(peer_id)
@@ -218,12 +219,12 @@ class Intake:
             self.acks.owe(stream)
         else:
             try:
-                noted = NotedGap(gap.sensor, stream.taken + 1, gap.last, gap.reason, gap.session_id)
+                noted = SequenceGap(gap.sensor, stream.taken + 1, gap.last, gap.reason, gap.session_id)
             except ArgumentError as error:
                 raise Unwanted("message", str(error), "message") from error
             self._take_gap(stream, noted)
 
-    def _take_gap(self, stream: Stream, gap: NotedGap) -> None:
+    def _take_gap(self, stream: Stream, gap: SequenceGap) -> None:
         item = ReceivedItem(
             stream.run, gap.first, gap.last, gap, stream.source, time.monotonic(), stream.owner, stream.turn
         )
@@ -232,7 +233,7 @@ class Intake:
             return
         self._take(stream, item)
         if self._store is None:
-            stream.track.miss(gap.reason, gap.last - gap.first + 1)
+            stream.track.miss(gap.reason, gap.n_missing)
 
     def _take(self, stream: Stream, item: ReceivedItem) -> None:
         stream.taken = item.last

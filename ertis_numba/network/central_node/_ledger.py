@@ -13,7 +13,8 @@ import msgspec
 
 from ertis_numba.atomic_files import atomic_write
 from ertis_numba.errors import DataError, FormatVersionError, JournalInUseError
-from ertis_numba.journal import JournalGap, sessions_in_recordings
+from ertis_numba.frames import SequenceGap
+from ertis_numba.journal import sessions_in_recordings
 from ertis_numba.network.central_node._received_items import SensorSession
 
 if sys.platform == "win32":
@@ -99,7 +100,7 @@ class Ledger:
         The session that grew last comes last.
     open, unsealed : list of str
         Names of journals that may contain more than ``acked_through``, and of those to seal.
-    gaps : list of JournalGap
+    gaps : list of SequenceGap
         Missing numbers that no recording contains yet.
     tails : dict of SensorSession to dict of int to int
         CRC-32 of the newest measurements of sessions, by number.
@@ -119,7 +120,7 @@ class Ledger:
         self.acked_through: dict[SensorSession, int] = {}
         self.open: list[str] = []
         self.unsealed: list[str] = []
-        self.gaps: list[JournalGap] = []
+        self.gaps: list[SequenceGap] = []
         self.tails: dict[SensorSession, dict[int, int]] = {}
         if not self.is_new:
             self._read()
@@ -160,7 +161,7 @@ class Ledger:
             for session_id, last in runs.items()
         }
         self.gaps = [
-            JournalGap(sensor, first, last, why, int(session_id)) for sensor, session_id, first, last, why in old.gaps
+            SequenceGap(sensor, first, last, why, int(session_id)) for sensor, session_id, first, last, why in old.gaps
         ]
         self.acked_through, self.open, self.unsealed = acked_through, old.open, old.unsealed
 
@@ -177,7 +178,7 @@ class Ledger:
             case _Unsealed(name):
                 self.unsealed.append(name)
             case _Gap(sensor, session_id, first, last, reason):
-                self.gaps.append(JournalGap(sensor, first, last, reason, session_id))
+                self.gaps.append(SequenceGap(sensor, first, last, reason, session_id))
             case _Tail(sensor, session_id, numbers):
                 self.tails[SensorSession(sensor, session_id)] = dict(numbers)
 
@@ -193,7 +194,7 @@ class Ledger:
         *,
         open_: Iterable[str],
         unsealed: Iterable[str],
-        gaps: Sequence[JournalGap] = (),
+        gaps: Sequence[SequenceGap] = (),
         tails: Mapping[SensorSession, Mapping[int, int]] | None = None,
     ) -> None:
         """Replace the content of the file durably.
@@ -203,7 +204,7 @@ class Ledger:
         acked_through : mapping of SensorSession to int
             The session that grew last comes last. Only the newest sessions of each sensor are kept.
         open_, unsealed : iterable of str
-        gaps : sequence of JournalGap
+        gaps : sequence of SequenceGap
         tails : mapping of SensorSession to dict of int to int, optional
             CRC-32 of the newest measurements of each session.
 

@@ -3,7 +3,8 @@
 from dataclasses import dataclass
 from typing import Final, NamedTuple, TypeAlias
 
-from ertis_numba.journal import JournalEntry, JournalGap, JournalSensor, SealingResult
+from ertis_numba.frames import SequenceGap
+from ertis_numba.journal import JournalEntry, JournalSensor, SealingResult
 
 __all__ = [
     "Event",
@@ -38,7 +39,7 @@ class ReceivedItem:
     run : SensorSession
     first, last : int
         Numbers acknowledged once it is stored.
-    content : JournalEntry or JournalGap
+    content : JournalEntry or SequenceGap
     source : JournalSensor
         Sensor for the journal.
     arrived_s : float
@@ -56,7 +57,7 @@ class ReceivedItem:
     run: SensorSession
     first: int
     last: int
-    content: JournalEntry | JournalGap
+    content: JournalEntry | SequenceGap
     source: JournalSensor
     arrived_s: float
     owner: bytes

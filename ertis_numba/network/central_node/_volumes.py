@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Final, Self
 
 from ertis_numba.errors import DamagedError
-from ertis_numba.journal import SUFFIX, Journal, JournalEntry, JournalGap, JournalSensor
+from ertis_numba.frames import SequenceGap
+from ertis_numba.journal import SUFFIX, Journal, JournalEntry, JournalSensor
 from ertis_numba.network.central_node._received_items import ReceivedItem, SensorSession
 
 __all__ = ["Checksums", "UnrecordedGaps", "Volume", "journal_name", "same", "sessions_in"]
@@ -106,14 +107,14 @@ class Volume:
             self._add(item.source)
         entries = [item.content for item in items if isinstance(item.content, JournalEntry)]
         if not entries:
-            self.note_gaps([item.content for item in items if isinstance(item.content, JournalGap)])
+            self.note_gaps([item.content for item in items if isinstance(item.content, SequenceGap)])
             return
         self.journal.append(entries)
         for item in items:
             self._counted[item.run] = self.acked[item.run] = item.last
             self.n_bytes += item.source.n_bytes
 
-    def note_gaps(self, gaps: list[JournalGap]) -> None:
+    def note_gaps(self, gaps: list[SequenceGap]) -> None:
         """Store gaps durably; see `Journal.note_gaps`."""
         self.journal.note_gaps(gaps)
         for gap in gaps:
@@ -205,14 +206,14 @@ class UnrecordedGaps:
 
     Parameters
     ----------
-    gaps : iterable of JournalGap
+    gaps : iterable of SequenceGap
     """
 
-    def __init__(self, gaps: Iterable[JournalGap]) -> None:
+    def __init__(self, gaps: Iterable[SequenceGap]) -> None:
         self._gaps = dict.fromkeys(gaps)
 
     @property
-    def gaps(self) -> list[JournalGap]:
+    def gaps(self) -> list[SequenceGap]:
         """All gaps, in order of arrival."""
         return list(self._gaps)
 
@@ -224,12 +225,12 @@ class UnrecordedGaps:
             self.reported(gap for gap in gaps if gap.sensor in measured)
             self._gaps |= dict.fromkeys(gap for gap in gaps if gap.sensor not in measured)
 
-    def of(self, sensors: Iterable[str]) -> list[JournalGap]:
+    def of(self, sensors: Iterable[str]) -> list[SequenceGap]:
         """Return the gaps of given sensors."""
         wanted = set(sensors) if self._gaps else set()
         return [gap for gap in self._gaps if gap.sensor in wanted]
 
-    def reported(self, gaps: Iterable[JournalGap]) -> None:
+    def reported(self, gaps: Iterable[SequenceGap]) -> None:
         """Remove gaps that a journal with measurements of their sensor now contains durably."""
         for gap in gaps:
             self._gaps.pop(gap, None)

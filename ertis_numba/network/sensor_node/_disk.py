@@ -12,7 +12,8 @@ from typing import Final, Literal
 from ertis_numba import checks
 from ertis_numba.atomic_files import make_folder
 from ertis_numba.errors import DamagedError, DataError, JournalInUseError, NetworkError
-from ertis_numba.journal import LOST, SUFFIX, Journal, JournalEntry, JournalGap
+from ertis_numba.frames import SequenceGap
+from ertis_numba.journal import LOST, SUFFIX, Journal, JournalEntry
 from ertis_numba.network.messages import MAX_SEQUENCE
 from ertis_numba.network.sensor_node._runs import OutgoingSession, UnackedItem
 from ertis_numba.network.sensor_node._spool import SensorCounts, Spool
@@ -48,7 +49,7 @@ class DiskSpool(Spool):
         self._writing = threading.RLock()  # Acquired before `turn`, and never while `turn` is held.
         self._journals: dict[int, Journal] = {}  # Journals for measurements of this process, by session.
         self._found: list[Journal] = []
-        self._open_gaps: dict[tuple[str, int], JournalGap] = {}  # Gaps not yet written to the journal.
+        self._open_gaps: dict[tuple[str, int], SequenceGap] = {}  # Gaps not yet written to the journal.
         self._discards: dict[tuple[str, int], tuple[Journal, int]] = {}
         self._failing = ""
         self._sweep_now, self._stopping = threading.Event(), threading.Event()
@@ -84,7 +85,7 @@ class DiskSpool(Spool):
 
     def _report_losses(self, journal: Journal) -> None:
         """Report the losses of a damaged log; the central node receives them as gaps, too."""
-        n_lost = sum(gap.last - gap.first + 1 for gap in journal.gaps if gap.reason == LOST)
+        n_lost = sum(gap.n_missing for gap in journal.gaps if gap.reason == LOST)
         if n_lost:
             self._on_note(f"the log of {journal.path.name} was damaged; up to {n_lost} stored measurements are lost")
         if journal.damage:
@@ -198,7 +199,7 @@ class DiskSpool(Spool):
             self._report_gap(key)
             gap = None
         first = stamp.sequence if gap is None else gap.first
-        self._open_gaps[key] = JournalGap(stamp.sensor, first, stamp.sequence, SPOOL_FULL, stamp.session_id)
+        self._open_gaps[key] = SequenceGap(stamp.sensor, first, stamp.sequence, SPOOL_FULL, stamp.session_id)
         with self.turn:
             self.counts[stamp.sensor].refused += 1
             self._run(*key).add_gap(stamp.sequence, stamp.sequence, SPOOL_FULL)
@@ -211,23 +212,21 @@ class DiskSpool(Spool):
         if gap is None:
             return
         with suppress(DataError):
-            self._journal(gap.session_id, [gap.sensor]).note_gap(
-                gap.sensor, gap.first, gap.last, gap.reason, session_id=gap.session_id
-            )
+            self._journal(gap.session_id, [gap.sensor]).note_gaps([gap])
             del self._open_gaps[key]
 
-    def note_gap(self, sensor: str, first: int, last: int, reason: str, *, session_id: int) -> None:
+    def note_gap(self, gap: SequenceGap) -> None:
         """Register missing numbers of a sensor with their reason, durably if the disk allows."""
         with self._writing:
-            super().note_gap(sensor, first, last, reason, session_id=session_id)
+            super().note_gap(gap)
             try:
-                journal = self._journal(session_id, [sensor])
-                journal.note_gap(sensor, first, last, reason, session_id=session_id)
+                journal = self._journal(gap.session_id, [gap.sensor])
+                journal.note_gaps([gap])
             except DataError as error:
                 self._report_failure(str(error))
             else:
                 with self.turn:
-                    self._run(sensor, session_id).journal = journal
+                    self._run(gap.sensor, gap.session_id).journal = journal
 
     def entry(self, item: UnackedItem, run: OutgoingSession) -> JournalEntry | None:
         """Return the measurement of an item, read if it is not in memory; None if it is a gap."""

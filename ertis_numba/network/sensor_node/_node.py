@@ -7,6 +7,7 @@ from typing import Generic, Self, TypeVar
 
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError
+from ertis_numba.frames import SequenceGap
 from ertis_numba.journal import JournalEntry, JournalSensor
 from ertis_numba.network import addresses
 from ertis_numba.network.keys import ClientKeys
@@ -178,11 +179,9 @@ class SensorNode:
             The sensor or session is unknown, ``last`` comes before ``first``, or the reason is not a line of at most 64
             bytes.
         """
-        checks.sequence_gap(first, last, reason)
-        last = checks.integer("last missing sequence number", last, 0, MAX_SEQUENCE)
-        self._spool.note_gap(
-            sensor, int(first), last, reason, session_id=checks.integer("session_id", session_id, 0, 2**63 - 1)
-        )
+        gap = SequenceGap(sensor, first, last, reason, session_id)
+        checks.integer("last missing sequence number", gap.last, 0, MAX_SEQUENCE)
+        self._spool.note_gap(gap)
         self._wake()
 
     def _wake(self) -> None:

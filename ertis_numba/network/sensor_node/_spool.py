@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError
-from ertis_numba.frames import Stamp
+from ertis_numba.frames import SequenceGap, Stamp
 from ertis_numba.journal import JournalEntry, JournalSensor, require_same_settings
 from ertis_numba.network.messages import MAX_SEQUENCE
 from ertis_numba.network.sensor_node._runs import OutgoingSession, UnackedItem
@@ -204,11 +204,11 @@ class Spool:
         if len(self._order) > 2 * sum(counts.unacked for counts in self.counts.values()) + _ACKED_IN_ORDER:
             self._order = deque(pair for pair in self._order if pair[1].entry is not None)
 
-    def note_gap(self, sensor: str, first: int, last: int, reason: str, *, session_id: int) -> None:
+    def note_gap(self, gap: SequenceGap) -> None:
         """Register missing numbers of a sensor, with their reason."""
         with self.turn:
-            self._run(sensor, session_id).add_gap(first, last, reason)
-            self.counts[sensor].missing[reason] += last - first + 1
+            self._run(gap.sensor, gap.session_id).add_gap(gap.first, gap.last, gap.reason)
+            self.counts[gap.sensor].missing[gap.reason] += gap.n_missing
 
     def entry(self, item: UnackedItem, run: OutgoingSession) -> JournalEntry | None:  # noqa: ARG002  another spool has to ask the run
         """Return the measurement of an item; None if it has become a gap."""
