@@ -12,13 +12,13 @@ from tests.files import SMALL, noise
 NAMES = ("a", "b", "c", "d")
 
 
-def write_recordings(folder, names=NAMES, count=3, **more):
+def write_recordings(folder, names=NAMES, count=3, settings=SMALL, **more):
     """Write recordings with different samples, in air of two temperatures."""
     folder.mkdir(exist_ok=True)
     found = []
     for number, name in enumerate(names):
-        settings = SMALL.replace(air=Air(temperature_c=20.0 + number % 2))
-        found.append(write_recording(folder / f"{name}.h5", noise(settings, count=count, seed=number), **more))
+        at_this_air = settings.replace(air=Air(temperature_c=20.0 + number % 2))
+        found.append(write_recording(folder / f"{name}.h5", noise(at_this_air, count=count, seed=number), **more))
     return found
 
 

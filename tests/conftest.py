@@ -80,6 +80,21 @@ def _simulated_gpu_threads_in_turn():
         yield
 
 
+@pytest.fixture(scope="module")
+def _driven_processing():
+    """Run image processing for all tests of a module that need no other options: its processes start slowly."""
+    from tests.driven import driven  # noqa: PLC0415 - only these tests need ZeroMQ
+
+    with driven() as loop:
+        yield loop
+
+
+@pytest.fixture
+def loop(_driven_processing):
+    """Return a loop over image processing that other tests have used; use sensors with other names."""
+    return _driven_processing.fresh()
+
+
 @pytest.fixture(autouse=True)
 def _log_as_before():
     """Restore the log's handlers, because commands that a test runs in this process replace them."""

@@ -3,20 +3,24 @@
 import select
 import time
 import zlib
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 import zmq
 
 from ertis_numba.network import sockets
 from ertis_numba.network.log import EventLog
-from ertis_numba.network.messages import Data, Description, Hello, Subscribe, decode, encode
+from ertis_numba.network.messages import Bye, Data, Description, Hello, Subscribe, decode, encode
 from ertis_numba.network.processing import ImageProcessing, ProcessingOptions
-from ertis_numba.settings import Settings
-from tests.cases import SHORT, noise
+from ertis_numba.settings import Recording, Settings
+from tests import cases
 
 TIMEOUT_S = 60.0
 ANY = "tcp://127.0.0.1:0"
-MEASUREMENT = noise(SHORT)
+SHORT = cases.CASES["line of 8"].replace(
+    recording=Recording(n_samples=20_480), processing=cases.SHORT.processing.replace(range_m=(0.3, 0.6))
+)
+"""Settings with small records and images, because the tests concern processes and messages."""
+MEASUREMENT = cases.noise(SHORT)
 
 
 def hello(sensor="front", settings=SHORT, session_id=7, **changes):
@@ -47,6 +51,13 @@ class Loop:
         self.offered = 0
         self._sensors = set()
         self._tick_s = 0.0
+
+    def fresh(self):
+        """Return a loop over the same processing that has seen no sensor, with an empty log."""
+        self.lines.clear()
+        loop = Loop(self.processing)
+        loop.lines = self.lines
+        return loop
 
     def step(self):
         processing = self.processing
@@ -171,4 +182,6 @@ class Application:
 
     def __exit__(self, *_):
         self.running.remove(self)
-        self._context.destroy(linger=0)
+        with suppress(zmq.Again):
+            self.send(Bye())  # Other tests may use the publisher.
+        self._context.destroy(linger=200)

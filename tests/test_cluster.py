@@ -10,14 +10,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from distributed import Client, LocalCluster
+from distributed import Client
 
 import ertis_numba as ertis
-from ertis_numba.cluster import connect
+from ertis_numba.cluster import connect, local_cluster
 from ertis_numba.network.messages import Data
 from ertis_numba.network.processing.cluster import Cluster
 from ertis_numba.network.processing.options import ProcessingOptions
 from ertis_numba.network.processing.runner import FinishedJob, Job, JobKind, KindFailed, KindReady, Lost
+from tests.dask_clusters import cluster_of_threads
+from tests.driven import MEASUREMENT
 
 RECORDING = Path(__file__).parents[1] / "data" / "synthetic" / "reflectors.h5"
 LONG_S = 60.0
@@ -31,10 +33,8 @@ def measurement():
 
 @pytest.fixture(scope="module")
 def scheduler():
-    with LocalCluster(
-        n_workers=2, threads_per_worker=1, dashboard_address=":0", worker_dashboard_address=":0", silence_logs=50
-    ) as cluster:
-        yield cluster.scheduler_address
+    with cluster_of_threads(2) as address:
+        yield address
 
 
 @pytest.fixture
@@ -142,7 +142,16 @@ def test_cluster_reports_samples_of_wrong_length(cluster, measurement):
     assert "bytes" in event.text
 
 
-def test_cluster_recovers_jobs_of_a_killed_worker(cluster, measurement):
+@pytest.fixture
+def cluster_to_kill():
+    with local_cluster(2) as address:
+        runner = Cluster(ProcessingOptions(cluster=address, device="numpy", deadline_s=30.0), lambda _: None)
+        yield runner
+        runner.close()
+
+
+def test_cluster_recovers_jobs_of_a_killed_worker(cluster_to_kill):
+    cluster, measurement = cluster_to_kill, MEASUREMENT
     kind = kind_of(measurement)
     cluster.prepare(kind)
     events_of(cluster)

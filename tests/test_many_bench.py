@@ -10,12 +10,14 @@ from ertis_cli.main import cli
 from ertis_numba.campaign import Campaign
 from ertis_numba.errors import DataError
 from tests.campaigns import InlinePool
+from tests.dask_clusters import cluster_of_threads
 
 
 @pytest.fixture(autouse=True)
 def _small(monkeypatch):
     monkeypatch.setattr(many, "_MEASUREMENTS", 2)
     monkeypatch.setattr(many, "_cores", lambda: 1)
+    monkeypatch.setattr(many.cluster, "local_cluster", cluster_of_threads)
 
 
 def test_all_pools_are_timed_and_compared(tmp_path, monkeypatch):

@@ -3,13 +3,12 @@
 import logging
 import os
 import re
-import shutil
 import signal
 import time
 
 import pytest
 from click.testing import CliRunner
-from distributed import Client, LocalCluster
+from distributed import Client
 from ertis_cli.main import cli
 
 from ertis_numba import cluster
@@ -25,11 +24,13 @@ from ertis_numba.campaign.tasks import Task
 from ertis_numba.errors import NetworkError
 from ertis_numba.storage import open_energyscapes, write_recording
 from tests.campaigns import ended, names_in, outcomes, run_here, write_recordings
-from tests.files import noise
+from tests.dask_clusters import cluster_of_threads
+from tests.files import line, noise
 from tests.pages import path_of
 from tests.test_call_match import CALL, REVERSED, heard
 
-LONG = 150
+FEW_MICS = line(8, 8)
+LONG = 20  # measurements; without compiled kernels, such a recording takes a while to process
 PATIENCE_S = 60.0
 
 
@@ -38,6 +39,7 @@ def narrow(settings):
 
 
 WANTED = CampaignOptions(settings=narrow, batch=1)
+SLOW = CampaignOptions(settings=narrow, batch=1, device="numpy")
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -49,32 +51,45 @@ def _same_date():
 
 @pytest.fixture(scope="module")
 def scheduler(_same_date):
-    with LocalCluster(
-        n_workers=2, threads_per_worker=1, dashboard_address=":0", worker_dashboard_address=":0", silence_logs=50
-    ) as local:
-        yield local.scheduler_address
+    """Return the address of a scheduler of two workers in this process."""
+    with cluster_of_threads(2) as address:
+        yield address
+
+
+@pytest.fixture(scope="module")
+def process_scheduler(_same_date):
+    """Return the address of a scheduler of one worker in its own process, which is slow to start."""
+    with cluster.local_cluster(1) as address:
+        yield address
 
 
 @pytest.fixture
 def runs(tmp_path):
-    write_recordings(tmp_path / "runs")
-    write_recording(tmp_path / "runs" / "b.h5", noise(count=LONG, seed=1), overwrite=True)
+    write_recordings(tmp_path / "runs", settings=FEW_MICS)
     return tmp_path / "runs"
 
 
-def test_cluster_files_equal_local_files(scheduler, runs, tmp_path, monkeypatch):
-    run_here(monkeypatch, [runs], tmp_path / "here", WANTED)
+@pytest.fixture
+def long_runs(runs):
+    write_recording(runs / "b.h5", noise(FEW_MICS, count=LONG, seed=1), overwrite=True)
+    return runs
+
+
+def test_cluster_files_equal_local_files(process_scheduler, scheduler, runs, tmp_path, monkeypatch):
+    run_here(monkeypatch, [runs], tmp_path / "here", SLOW)
     (runs / "broken.h5").write_bytes(b"broken")
-    monkeypatch.chdir(tmp_path)  # the workers have another current folder
-    events = list(Campaign(find_recordings(["runs"]), "out", WANTED, scheduler=scheduler).run())
+    monkeypatch.chdir(tmp_path)  # the worker has another current folder
+    events = list(Campaign(find_recordings(["runs"]), "out", SLOW, scheduler=process_scheduler).run())
     found = ended(events)
     assert outcomes(found) == {**dict.fromkeys(["a.h5", "b.h5", "c.h5", "d.h5"], "made"), "broken.h5": "failed"}
     assert "broken.h5 is not an HDF5 file" in found["broken.h5"].error
     assert names_in(tmp_path / "out") == names_in(tmp_path / "here")
     here, there = ({item.name: item.read_bytes() for item in (tmp_path / name).iterdir()} for name in ("here", "out"))
     assert [name for name in here if here[name] != there[name]] == []
-    again = ended(Campaign(find_recordings(["runs"]), "out", WANTED, scheduler=scheduler).run())
+    again = ended(Campaign(find_recordings(["runs"]), "out", SLOW, scheduler=process_scheduler).run())
     assert set(outcomes(again).values()) == {"kept", "failed"}
+    ended(Campaign(find_recordings(["runs"]), "both", SLOW, scheduler=scheduler).run())
+    assert [name for name in here if here[name] != (tmp_path / "both" / name).read_bytes()] == []
 
 
 def test_cluster_workers_report_recordings_with_another_call(scheduler, tmp_path):
@@ -89,10 +104,10 @@ def test_cluster_workers_report_recordings_with_another_call(scheduler, tmp_path
         assert images.call_warning in warning
 
 
-def test_progress_is_reported_and_close_ends_the_work(scheduler, runs, tmp_path, monkeypatch):
+def test_progress_is_reported_and_close_ends_the_work(scheduler, long_runs, tmp_path, monkeypatch):
     monkeypatch.setattr(dask_workers, "_REPORT_INTERVAL_S", 0.0)
     out = tmp_path / "out"
-    events = Campaign(find_recordings([runs / "b.h5"]), out, WANTED, scheduler=scheduler).run()
+    events = Campaign(find_recordings([long_runs / "b.h5"]), out, SLOW, scheduler=scheduler).run()
     kinds = []
     for event in events:
         kinds.append(type(event))
@@ -108,12 +123,12 @@ def test_progress_is_reported_and_close_ends_the_work(scheduler, runs, tmp_path,
     assert names_in(out) == []
 
 
-def test_killed_dask_workers_lose_nothing(scheduler, runs, tmp_path):
-    out = tmp_path / "out"
+def test_killed_dask_workers_lose_nothing(process_scheduler, long_runs, tmp_path):
+    scheduler, out = process_scheduler, tmp_path / "out"
     found = {}
     with Client(scheduler, set_as_default=False) as client:
         pids = client.run(os.getpid)
-        for event in Campaign(find_recordings([runs]), out, WANTED, scheduler=scheduler).run():
+        for event in Campaign(find_recordings([long_runs]), out, SLOW, scheduler=scheduler).run():
             if isinstance(event, RecordingStarted) and event.measurements == LONG:
                 for pid in pids.values():
                     os.kill(pid, signal.SIGKILL)
@@ -122,15 +137,15 @@ def test_killed_dask_workers_lose_nothing(scheduler, runs, tmp_path):
     assert names_in(out) == [f"{name}.energy.h5" for name in "abcd"]
 
 
-def test_cluster_command_of_the_page_runs(scheduler, runs, tmp_path, monkeypatch):
+@pytest.mark.usefixtures("runs")
+def test_cluster_command_of_the_page_runs(scheduler, tmp_path, monkeypatch):
     page = path_of("many").read_text("utf-8")
     (line,) = re.findall(r"\$ ertis (.* --scheduler .*)", page)
     monkeypatch.chdir(tmp_path)
-    (runs / "b.h5").unlink()
     words = line.replace("'", "").replace("tcp://127.0.0.1:8786", scheduler).split()
     done = CliRunner().invoke(cli, words)
     assert done.exit_code == 0, done.output
-    assert names_in(tmp_path / "images") == [f"{name}.energy.h5" for name in "acd"]
+    assert names_in(tmp_path / "images") == [f"{name}.energy.h5" for name in "abcd"]
 
 
 def test_other_versions_of_workers_are_reported(monkeypatch):
@@ -202,18 +217,15 @@ def test_missing_scheduler_is_reported(monkeypatch, runs, tmp_path):
 def test_missing_workers_are_reported(monkeypatch, runs, tmp_path):
     monkeypatch.setattr(dask_workers, "_CONNECT_S", 1.0)
     with (
-        LocalCluster(n_workers=0, dashboard_address=":0", silence_logs=50) as local,
+        cluster_of_threads(0) as address,
         pytest.raises(NetworkError, match=r"has no workers; start some with 'dask worker tcp://"),
     ):
-        list(Campaign(find_recordings([runs]), tmp_path / "out", scheduler=local.scheduler_address).run())
+        list(Campaign(find_recordings([runs]), tmp_path / "out", scheduler=address).run())
 
 
 def test_lost_scheduler_is_reported(runs, tmp_path):
-    for name in "efgh":  # more than the cluster can process before it closes
-        shutil.copy(runs / "b.h5", runs / f"{name}.h5")
-    local = LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0", silence_logs=50)
-    events = Campaign(find_recordings([runs]), tmp_path / "out", WANTED, scheduler=local.scheduler_address).run()
-    next(events)
-    local.close()
+    with cluster_of_threads(1) as address:
+        events = Campaign(find_recordings([runs]), tmp_path / "out", WANTED, scheduler=address).run()
+        next(events)  # From here on, the campaign submits no task until the next event is requested.
     with pytest.raises(NetworkError, match=r"is gone; finished output stays"):
         list(events)

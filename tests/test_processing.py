@@ -16,15 +16,22 @@ from ertis_numba.network.processing._predictions import Predictions
 from ertis_numba.network.status import Status
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Air
-from tests.cases import SHORT
-from tests.driven import ANY, MEASUREMENT, Application, driven, hello
+from tests import cases
+from tests.driven import ANY, MEASUREMENT, SHORT, Application, driven, hello
 
 WIDE = SHORT.replace(processing=SHORT.processing.replace(directions="2d:9"))
 
 
-def test_published_products_equal_those_of_the_pipeline():
+@pytest.fixture(scope="module")
+def cpu_loop():
+    with driven(device="cpu") as loop:
+        yield loop
+
+
+def test_published_products_equal_those_of_the_pipeline(cpu_loop):
+    loop = cpu_loop.fresh()
     place = {"translation_m": (1.0, 2.0, 3.0), "rotation_xyzw": (0.0, 0.0, 1.0, 0.0)}
-    with driven(device="cpu") as loop, Application(loop.processing.address) as application:
+    with Application(loop.processing.address) as application:
         application.subscribe("energyscape", "points", "raw", credit=8)
         loop.until(lambda: loop.processing.status().subscribers)
         loop.processing.register(hello(**place), SHORT)
@@ -55,7 +62,7 @@ def test_published_products_equal_those_of_the_pipeline():
 
 def test_options_override_settings_of_a_sensor():
     with (
-        driven(device="cpu", processing={"directions": "2d:5"}, max_error_db=-30.0, dtype="float16") as loop,
+        driven(processing={"directions": "2d:5"}, max_error_db=-30.0, dtype="float16") as loop,
         Application(loop.processing.address) as application,
     ):
         application.subscribe("energyscape")
@@ -67,7 +74,7 @@ def test_options_override_settings_of_a_sensor():
     assert image.shape[0] == 5
     applied = application.descriptions[image.description][1]
     assert (applied.processing.directions, applied.accuracy.max_error_db) == ("2d:5", -30.0)
-    with Pipeline(applied, device="cpu") as pipeline:
+    with Pipeline(applied, device="numpy") as pipeline:
         wanted = pipeline.process(MEASUREMENT).amplitude.astype(np.float16)
     assert image.dtype == "float16"
     assert np.array_equal(np.frombuffer(amplitude, "<f2").reshape(image.shape), wanted)
@@ -123,23 +130,23 @@ def test_two_workers_publish_in_order():
     assert sequences == sorted(sequences)
 
 
-def test_changed_settings_count_waiting_measurements():
-    with driven() as loop, Application(loop.processing.address) as application:
+def test_changed_settings_count_waiting_measurements(loop):
+    with Application(loop.processing.address) as application:
         application.subscribe("energyscape", credit=8)
         loop.until(lambda: application.read() or application.others)
-        loop.processing.register(hello(), SHORT)
-        loop.offer()
+        loop.processing.register(hello("changed"), SHORT)
+        loop.offer("changed")
         loop.settle()
-        loop.offer()
-        loop.offer()
-        loop.processing.register(hello(settings=WIDE), WIDE)
-        loop.offer()
+        loop.offer("changed")
+        loop.offer("changed")
+        loop.processing.register(hello("changed", WIDE), WIDE)
+        loop.offer("changed")
         loop.settle()
         warmer = Air(temperature_c=35.0)
-        loop.offer(temperature_c=warmer.temperature_c)  # Other air needs a pipeline of its own.
-        loop.offer(temperature_c=float("nan"))
+        loop.offer("changed", temperature_c=warmer.temperature_c)  # Other air needs a pipeline of its own.
+        loop.offer("changed", temperature_c=float("nan"))
         loop.settle()
-        counts = loop.processing.counts("front")
+        counts = loop.processing.counts("changed")
         loop.until(lambda: application.read() or len(application.got) == counts.published)
     assert counts.received == 6
     assert counts.dropped["its settings cannot be used"] == 1
@@ -168,11 +175,10 @@ def test_stop_waits_for_measurements_in_progress():
     assert loop.processing.counts("front").published == 1
 
 
-def test_occupied_address_is_reported_in_one_line():
-    with driven() as loop:
-        other = ImageProcessing(ProcessingOptions(publish=loop.processing.address, device="numpy"))
-        with pytest.raises(NetworkError, match="is in use by"):
-            other.start()
+def test_occupied_address_is_reported_in_one_line(loop):
+    other = ImageProcessing(ProcessingOptions(publish=loop.processing.address, device="numpy"))
+    with pytest.raises(NetworkError, match="is in use by"):
+        other.start()
 
 
 def test_stopped_start_returns_before_the_publisher_listens():
@@ -184,8 +190,8 @@ def test_stopped_start_returns_before_the_publisher_listens():
         processing.close()
 
 
-def test_status_reaches_requests_and_subscriptions():
-    with driven() as loop, Application(loop.processing.address) as application:
+def test_status_reaches_requests_and_subscriptions(loop):
+    with Application(loop.processing.address) as application:
         application.subscribe("status")
         loop.until(lambda: application.read() or application.others)
         status = Status(version="1", pid=1, host="here", address="x", state="processing")
@@ -196,8 +202,8 @@ def test_status_reaches_requests_and_subscriptions():
     assert msgspec.msgpack.decode(payload, type=Status) == status
 
 
-def test_points_are_computed_only_for_subscribers():
-    with driven() as loop, Application(loop.processing.address) as application:
+def test_points_are_computed_only_for_subscribers(loop):
+    with Application(loop.processing.address) as application:
         application.subscribe("points", sensors=("left",))
         loop.until(lambda: loop.processing.status().subscribers)
         for sensor in ("left", "right"):
@@ -219,18 +225,19 @@ def test_image_is_independent_of_the_number_of_threads():
         assert np.array_equal(pipeline.process(MEASUREMENT).amplitude, wanted.amplitude)
 
 
-def test_missed_error_budget_is_logged_once_per_sensor():
-    silence = np.zeros_like(MEASUREMENT.data)
+def test_missed_error_budget_is_logged_once_per_sensor(cpu_loop):
+    loop = cpu_loop.fresh()
+    words = cases.noise(cases.SHORT).data
+    silence = np.zeros_like(words)
     silence[::2] = ~silence[::2]
-    with driven(device="cpu") as loop:
-        for sensor in ("loud", "quiet"):
-            loop.processing.register(hello(sensor), SHORT)
-        for _ in range(3):
-            loop.offer("loud")
-            loop.offer("quiet", silence)
-            loop.settle()
-        loop.until(lambda: any(event == "error_budget" for event, _ in loop.lines))
-        found = [fields for event, fields in loop.lines if event == "error_budget"]
+    for sensor in ("loud", "quiet"):
+        loop.processing.register(hello(sensor, cases.SHORT), cases.SHORT)
+    for _ in range(3):
+        loop.offer("loud", words)
+        loop.offer("quiet", silence)
+        loop.settle()
+    loop.until(lambda: any(event == "error_budget" for event, _ in loop.lines))
+    found = [fields for event, fields in loop.lines if event == "error_budget"]
     assert [fields["sensor"] for fields in found] == ["quiet"]
     assert "images may exceed the error budget" in found[0]["text"]
 

@@ -2,7 +2,7 @@
 
 import os
 import signal
-from contextlib import contextmanager
+from collections import Counter
 
 import pytest
 
@@ -11,17 +11,17 @@ from ertis_numba.network.keys import ClientKeys, KeyPair, ServerKeys
 from ertis_numba.network.messages import AskStatus, Bye, Image, Ping, Pong, Raw, Refused, Subscribe, encode
 from ertis_numba.network.processing.subscribers import ConnectedSubscriber, QueuedProduct, Subscribers
 from ertis_numba.network.status import Status
-from tests.cases import SHORT
-from tests.driven import Application, driven, hello
+from tests.driven import SHORT, Application, driven, hello
 
 
-@contextmanager
-def serving(**options):
-    """Run processing with a registered sensor and connect an application."""
-    with driven(**options) as loop, Application(loop.processing.address) as application:
+@pytest.fixture
+def application(loop):
+    """Connect an application after the sensor ``front`` was registered; no other application is connected."""
+    loop.until(lambda: loop.workers("idle"))
+    loop.until(lambda: not loop.processing.status().subscribers)
+    with Application(loop.processing.address) as application:
         loop.processing.register(hello(), SHORT)
-        loop.until(lambda: loop.workers("idle"))
-        yield loop, application
+        yield application
 
 
 def subscribed(loop, application, *products, **values):
@@ -29,40 +29,39 @@ def subscribed(loop, application, *products, **values):
     loop.until(lambda: application.read() or any(isinstance(other, Pong) for other in application.others))
 
 
-def publish(loop, count):
+def publish(loop, count, sensor="front"):
     for _ in range(count):
-        loop.offer()
+        loop.offer(sensor)
         loop.settle()
 
 
-def test_latest_image_waits_for_credit():
-    with serving() as (loop, application):
-        subscribed(loop, application, "energyscape", credit=2)
-        publish(loop, 7)
-        loop.until(lambda: application.read() or len(application.got) == 2)
-        application.consumed = 1
-        application.subscribe("energyscape", credit=2)
-        loop.until(lambda: application.read() or len(application.got) == 3)
-        reported = loop.processing.status
-        loop.until(lambda: reported().subscribers and reported().subscribers[0].sent == 3)
-        (status,) = reported().subscribers
+def test_latest_image_waits_for_credit(loop, application):
+    loop.processing.register(hello("slow"), SHORT)
+    subscribed(loop, application, "energyscape", credit=2)
+    publish(loop, 7, "slow")
+    loop.until(lambda: application.read() or len(application.got) == 2)
+    application.consumed = 1
+    application.subscribe("energyscape", credit=2)
+    loop.until(lambda: application.read() or len(application.got) == 3)
+    reported = loop.processing.status
+    loop.until(lambda: reported().subscribers and reported().subscribers[0].sent == 3)
+    (status,) = reported().subscribers
     images = [image for image, _ in application.got]
     assert [(image.sequence, image.number, image.dropped) for image in images] == [(0, 0, 0), (1, 1, 0), (6, 6, 4)]
     assert (status.sent, status.dropped, status.products) == (3, 4, ("energyscape",))
-    assert loop.processing.counts("front").published == 7  # A slow application causes no drops for others.
+    assert loop.processing.counts("slow").published == 7  # A slow application causes no drops for others.
 
 
-def test_each_product_of_each_sensor_waits_separately():
-    with serving() as (loop, application):
-        loop.processing.register(hello("left"), SHORT)
-        subscribed(loop, application, "raw", "energyscape", credit=1)
-        for sensor in ("front", "left", "front", "left"):
-            loop.offer(sensor)
-            loop.settle()
-        for consumed in range(1, 6):
-            application.consumed = consumed
-            application.subscribe("raw", "energyscape", credit=1)
-            loop.until(lambda consumed=consumed: application.read() or len(application.got) == min(consumed + 1, 5))
+def test_each_product_of_each_sensor_waits_separately(loop, application):
+    loop.processing.register(hello("left"), SHORT)
+    subscribed(loop, application, "raw", "energyscape", credit=1)
+    for sensor in ("front", "left", "front", "left"):
+        loop.offer(sensor)
+        loop.settle()
+    for consumed in range(1, 6):
+        application.consumed = consumed
+        application.subscribe("raw", "energyscape", credit=1)
+        loop.until(lambda consumed=consumed: application.read() or len(application.got) == min(consumed + 1, 5))
     got = [(type(message), message.sensor, message.sequence, message.number) for message, _ in application.got]
     assert got == [
         (Image, "front", 0, 0),
@@ -74,34 +73,34 @@ def test_each_product_of_each_sensor_waits_separately():
     assert [message.dropped for message, _ in application.got][-1] == 3
 
 
-def test_only_subscribed_sensors_and_products_are_sent():
-    with serving() as (loop, application):
-        loop.processing.register(hello("left"), SHORT)
-        subscribed(loop, application, "energyscape", sensors=("left",), credit=8)
-        for sensor in ("front", "left"):
-            loop.offer(sensor)
-        loop.settle()
-        loop.until(lambda: application.read() or application.got)
+def test_only_subscribed_sensors_and_products_are_sent(loop, application):
+    loop.processing.register(hello("left"), SHORT)
+    subscribed(loop, application, "energyscape", sensors=("left",), credit=8)
+    for sensor in ("front", "left"):
+        loop.offer(sensor)
+    loop.settle()
+    loop.until(lambda: application.read() or application.got)
     assert [(type(message), message.sensor) for message, _ in application.got] == [(Image, "left")]
 
 
-def test_killed_publisher_restarts_and_its_images_are_counted():
-    with serving() as (loop, application):
-        subscribed(loop, application, "energyscape", credit=64)
-        publisher = loop.processing.status().publisher_pid
-        os.kill(publisher, signal.SIGSTOP)
-        loop.offer()
-        loop.until(lambda: loop.processing.status().workers[0].done == 1)
-        os.kill(publisher, signal.SIGKILL)
-        loop.settle()
-        counts = loop.processing.counts("front")
-        assert (counts.published, counts.dropped) == (0, {"the publisher died": 1})
-        loop.until(lambda: loop.processing.status().publisher_pid not in {0, publisher})
-        application.others.clear()
-        loop.until(lambda: application.subscribe("energyscape", credit=64) or application.read() or application.others)
-        publish(loop, 1)
-        loop.until(lambda: application.read() or application.got)
-        assert loop.processing.status().publisher_respawned == 1
+def test_killed_publisher_restarts_and_its_images_are_counted(loop, application):
+    loop.processing.register(hello("killed"), SHORT)
+    before = loop.processing.status()
+    subscribed(loop, application, "energyscape", credit=64)
+    publisher = loop.processing.status().publisher_pid
+    os.kill(publisher, signal.SIGSTOP)
+    loop.offer("killed")
+    loop.until(lambda: loop.processing.status().workers[0].done == before.workers[0].done + 1)
+    os.kill(publisher, signal.SIGKILL)
+    loop.settle()
+    counts = loop.processing.counts("killed")
+    assert (counts.published, counts.dropped) == (0, {"the publisher died": 1})
+    loop.until(lambda: loop.processing.status().publisher_pid not in {0, publisher})
+    application.others.clear()
+    loop.until(lambda: application.subscribe("energyscape", credit=64) or application.read() or application.others)
+    publish(loop, 1)
+    loop.until(lambda: application.read() or application.got)
+    assert loop.processing.status().publisher_respawned == before.publisher_respawned + 1
     assert [image.sequence for image, _ in application.got] == [1]
 
 
@@ -118,74 +117,74 @@ def test_restarted_publisher_keeps_its_address(tmp_path):
 
 
 @pytest.mark.alone  # An application delayed by a busy machine loses its subscription.
-def test_sensor_may_change_its_settings_often():
-    with serving() as (loop, application):
-        subscribed(loop, application, "energyscape", "raw", credit=64)
-        for number in range(300):  # Each registration announces a new position.
-            place = {"translation_m": (float(number), 0.0, 0.0)}
-            loop.processing.register(hello("left", **place), SHORT)
-            application.keep()  # The loop may outlast the timeout for silent applications.
-            if number % 100 == 0:
-                loop.processing.register(hello("front", **place), SHORT)
-                publish(loop, 1)
-        loop.processing.publish_status(Status(version="1", pid=1, host="here", address="x", state="processing"))
-        publish(loop, 1)
-        loop.until(lambda: application.read() or len(application.got) == 8)
-        assert loop.processing.status().publisher_respawned == 0
+def test_sensor_may_change_its_settings_often(loop, application):
+    respawned = loop.processing.status().publisher_respawned
+    subscribed(loop, application, "energyscape", "raw", credit=64)
+    for number in range(300):  # Each registration announces a new position.
+        place = {"translation_m": (float(number), 0.0, 0.0)}
+        loop.processing.register(hello("left", **place), SHORT)
+        application.keep()  # The loop may outlast the timeout for silent applications.
+        if number % 100 == 0:
+            loop.processing.register(hello("front", **place), SHORT)
+            publish(loop, 1)
+    loop.processing.publish_status(Status(version="1", pid=1, host="here", address="x", state="processing"))
+    publish(loop, 1)
+    loop.until(lambda: application.read() or len(application.got) == 8)
+    assert loop.processing.status().publisher_respawned == respawned
     places = [application.descriptions[image.description][0].translation_m[0] for image, _ in application.got]
     assert places == [0.0, 0.0, 100.0, 100.0, 200.0, 200.0, 200.0, 200.0]
 
 
-def test_slowly_ending_publisher_blocks_nothing(monkeypatch):
-    with serving() as (loop, _):
-        publisher = loop.processing._publisher  # noqa: SLF001  the test delays the end of its process
-        child = publisher._process.child  # noqa: SLF001
-        monkeypatch.setattr(type(child), "ended", property(lambda _: False))
-        monkeypatch.setattr(child, "close", lambda *_: pytest.fail("it is waited for"))
-        os.kill(child.pid, signal.SIGKILL)
-        loop.until(lambda: not publisher.serves)
-        assert child.pipe.fileno() not in loop.processing.fds()
-        monkeypatch.undo()
-        loop.until(lambda: publisher.serves)
+def test_slowly_ending_publisher_blocks_nothing(loop, monkeypatch):
+    publisher = loop.processing._publisher  # noqa: SLF001  the test delays the end of its process
+    child = publisher._process.child  # noqa: SLF001
+    monkeypatch.setattr(type(child), "ended", property(lambda _: False))
+    monkeypatch.setattr(child, "close", lambda *_: pytest.fail("it is waited for"))
+    os.kill(child.pid, signal.SIGKILL)
+    loop.until(lambda: not publisher.serves)
+    assert child.pipe.fileno() not in loop.processing.fds()
+    monkeypatch.undo()
+    loop.until(lambda: publisher.serves)
 
 
-def test_hanging_publisher_is_killed(monkeypatch):
+def test_hanging_publisher_is_killed(loop, monkeypatch):
     monkeypatch.setattr("ertis_numba.network.processing.publisher._HUNG_S", 1.5)
-    with serving() as (loop, _):
-        os.kill(loop.processing.status().publisher_pid, signal.SIGSTOP)
-        for _ in range(5):
-            loop.offer()  # There are fewer slots.
-        loop.until(lambda: loop.processing.status().publisher_respawned == 1)
-        loop.settle()
-        publish(loop, 1)
-        counts = loop.processing.counts("front")
+    loop.processing.register(hello("hung"), SHORT)
+    loop.until(lambda: loop.workers("idle"))
+    respawned = loop.processing.status().publisher_respawned
+    os.kill(loop.processing.status().publisher_pid, signal.SIGSTOP)
+    for _ in range(5):
+        loop.offer("hung")  # There are fewer slots.
+    loop.until(lambda: loop.processing.status().publisher_respawned > respawned)
+    loop.settle()
+    publish(loop, 1, "hung")
+    counts = loop.processing.counts("hung")
     assert counts.received == 6
     assert counts.dropped["the publisher died"] >= 1
     assert counts.published >= 1
 
 
-def test_invalid_messages_are_refused_and_counted():
-    with serving() as (loop, application):
-        application.socket.send(b"garbage")
-        application.socket.send_multipart([encode(Ping()), b"more"])
-        application.socket.send(encode(Ping())[:4] + b"\xff" + encode(Ping())[5:])
-        application.send(Refused(code="hello", reason="no application sends this"))
-        application.send(Ping())
-        loop.until(lambda: application.read() or len(application.others) == 5)
-        loop.until(lambda: sum(loop.processing.refused.values()) == 4)
-        assert loop.processing.refused == {"message": 3, "version": 1}
+def test_invalid_messages_are_refused_and_counted(loop, application):
+    before = Counter(loop.processing.refused)
+    application.socket.send(b"garbage")
+    application.socket.send_multipart([encode(Ping()), b"more"])
+    application.socket.send(encode(Ping())[:4] + b"\xff" + encode(Ping())[5:])
+    application.send(Refused(code="hello", reason="no application sends this"))
+    application.send(Ping())
+    loop.until(lambda: application.read() or len(application.others) == 5)
+    loop.until(lambda: sum(loop.processing.refused.values()) == before.total() + 4)
+    assert Counter(loop.processing.refused) - before == {"message": 3, "version": 1}
     codes = [message.code for message in application.others if isinstance(message, Refused)]
     assert codes == ["message", "message", "version", "message"]
     assert isinstance(application.others[-1], Pong)
 
 
-def test_unsubscribed_application_receives_nothing_more():
-    with serving() as (loop, application):
-        subscribed(loop, application, "energyscape", credit=8)
-        loop.until(lambda: loop.processing.status().subscribers)
-        application.send(Bye())
-        loop.until(lambda: not loop.processing.status().subscribers)
-        publish(loop, 1)
+def test_unsubscribed_application_receives_nothing_more(loop, application):
+    subscribed(loop, application, "energyscape", credit=8)
+    loop.until(lambda: loop.processing.status().subscribers)
+    application.send(Bye())
+    loop.until(lambda: not loop.processing.status().subscribers)
+    publish(loop, 1)
     assert application.got == []
 
 

@@ -245,7 +245,7 @@ def test_any_damaged_bit_is_found(tmp_path):
     whole = path.read_bytes()
     rng = np.random.default_rng(5)
     refusals = []
-    for place in rng.integers(0, len(whole), 300):
+    for place in rng.integers(0, len(whole), 100):  # `make soak` tries many more
         spoilt = bytearray(whole)
         spoilt[place] ^= 1 << rng.integers(0, 8)
         path.write_bytes(spoilt)
@@ -257,7 +257,7 @@ def test_any_damaged_bit_is_found(tmp_path):
                     assert back.stamp == measurement.stamp
         except DataError as error:
             refusals.append(str(error))
-    assert len(refusals) > 30
+    assert len(refusals) > 10
     assert not any("\n" in refusal for refusal in refusals)
 
 

@@ -21,18 +21,17 @@ from ertis_numba.network.processing.dead_letter_queue import DeadLetterQueue
 from ertis_numba.network.processing.pipe_messages import Release
 from ertis_numba.network.processing.runner import JobKind, Lost
 from ertis_numba.network.processing.sensors import Sensors
-from tests.cases import SHORT
-from tests.driven import ANY, MEASUREMENT, Lines, data, driven, hello
+from tests.driven import ANY, MEASUREMENT, SHORT, Lines, data, driven, hello
 
 TIMEOUT_S = 30.0
 
 
-def stop_and_offer(loop):
+def stop_and_offer(loop, sensor):
     """Stop a worker within its measurement; return its process."""
     loop.until(lambda: loop.workers("idle"))
     (worker,) = loop.workers("idle")
     os.kill(worker.pid, signal.SIGSTOP)
-    loop.offer()
+    loop.offer(sensor)
     loop.until(lambda: loop.workers("busy"))
     return worker.pid
 
@@ -45,32 +44,32 @@ def is_gone(pid):
         return True
 
 
-def test_measurement_of_a_killed_worker_is_retried():
-    with driven() as loop:
-        loop.processing.register(hello(), SHORT)
-        pid = stop_and_offer(loop)
-        os.kill(pid, signal.SIGKILL)
-        loop.settle()
-        counts, status = loop.processing.counts("front"), loop.processing.status()
+def test_measurement_of_a_killed_worker_is_retried(loop):
+    loop.processing.register(hello("retried"), SHORT)
+    before = loop.processing.status()
+    pid = stop_and_offer(loop, "retried")
+    os.kill(pid, signal.SIGKILL)
+    loop.settle()
+    counts, status = loop.processing.counts("retried"), loop.processing.status()
     assert (counts.received, counts.published, counts.dropped) == (1, 1, {})
-    assert (status.respawned, status.retried, status.quarantined) == (1, 1, 0)
+    assert (status.respawned, status.retried) == (before.respawned + 1, before.retried + 1)
+    assert status.quarantined == before.quarantined
     assert status.workers[0].pid != pid
     ((_, about),) = [line for line in loop.lines if line[0] == "retried"]
-    assert (about["sensor"], about["session_id"], about["sequence"]) == ("front", 7, 0)
+    assert (about["sensor"], about["session_id"], about["sequence"]) == ("retried", 7, 0)
 
 
-def test_idle_worker_killed_loses_nothing():
-    with driven() as loop:
-        loop.processing.register(hello(), SHORT)
-        for _ in range(3):
-            loop.until(lambda: loop.workers("idle"))
-            loop.offer()
-            loop.settle()
-            os.kill(loop.workers("idle")[0].pid, signal.SIGKILL)
-            respawned = loop.processing.status().respawned
-            loop.until(lambda before=respawned: loop.processing.status().respawned > before)
-        counts = loop.processing.counts("front")
-    assert (counts.received, counts.published) == (3, 3)
+def test_idle_worker_killed_loses_nothing(loop):
+    loop.processing.register(hello("idle"), SHORT)
+    for _ in range(2):
+        loop.until(lambda: loop.workers("idle"))
+        loop.offer("idle")
+        loop.settle()
+        os.kill(loop.workers("idle")[0].pid, signal.SIGKILL)
+        respawned = loop.processing.status().respawned
+        loop.until(lambda before=respawned: loop.processing.status().respawned > before)
+    counts = loop.processing.counts("idle")
+    assert (counts.received, counts.published) == (2, 2)
 
 
 def test_measurement_that_hangs_two_workers_is_quarantined(tmp_path):
@@ -94,35 +93,35 @@ def test_measurement_that_hangs_two_workers_is_quarantined(tmp_path):
     assert entry.measurement.stamp.sequence == 0
 
 
-def test_failing_sensor_is_suspended_and_others_continue(monkeypatch):
+def test_failing_sensor_is_suspended_and_others_continue(loop, monkeypatch):
     monkeypatch.setattr("ertis_numba.network.processing.circuit_breaker._PAUSE_S", 0.5)
-    with driven() as loop:
-        for sensor in ("bad", "good"):
-            loop.processing.register(hello(sensor), SHORT)
-        loop.until(lambda: loop.workers("idle"))
-        runner = loop.processing._runner  # noqa: SLF001  to have measurements fail
-        with monkeypatch.context() as patch:
-            patch.setattr(runner, "submit", lambda job: failed.append(Lost(job, "it hangs", again=True)))
-            failed = []
-            for _ in range(3):
-                loop.offer("bad")
-                loop.step()
-                for _ in range(2):
-                    loop.processing._handle([failed.pop()])  # noqa: SLF001
-                    loop.processing._dispatch()  # noqa: SLF001
-        counts = loop.processing.counts("bad")
-        assert counts.dropped == {"failed twice": 3}
-        loop.offer("bad")
-        assert counts.dropped["sensor suspended after repeated failures"] == 1
-        reported = loop.processing.drain_dropped()
-        assert reported == [("bad", 7, number, "failed twice") for number in range(3)] + [
-            ("bad", 7, 3, "sensor suspended after repeated failures")
-        ]
-        assert loop.processing.drain_dropped() == []
-        loop.offer("good")
-        loop.settle()
-        assert loop.processing.counts("good").published == 1
-        loop.until(lambda: loop.offer("bad") or counts.published)  # after its pause
+    for sensor in ("bad", "good"):
+        loop.processing.register(hello(sensor), SHORT)
+    loop.until(lambda: loop.workers("idle"))
+    loop.processing.drain_dropped()
+    runner = loop.processing._runner  # noqa: SLF001  to have measurements fail
+    with monkeypatch.context() as patch:
+        patch.setattr(runner, "submit", lambda job: failed.append(Lost(job, "it hangs", again=True)))
+        failed = []
+        for _ in range(3):
+            loop.offer("bad")
+            loop.step()
+            for _ in range(2):
+                loop.processing._handle([failed.pop()])  # noqa: SLF001
+                loop.processing._dispatch()  # noqa: SLF001
+    counts = loop.processing.counts("bad")
+    assert counts.dropped == {"failed twice": 3}
+    loop.offer("bad")
+    assert counts.dropped["sensor suspended after repeated failures"] == 1
+    reported = loop.processing.drain_dropped()
+    assert reported == [("bad", 7, number, "failed twice") for number in range(3)] + [
+        ("bad", 7, 3, "sensor suspended after repeated failures")
+    ]
+    assert loop.processing.drain_dropped() == []
+    loop.offer("good")
+    loop.settle()
+    assert loop.processing.counts("good").published == 1
+    loop.until(lambda: loop.offer("bad") or counts.published)  # after its pause
 
 
 def test_quarantine_is_bounded(tmp_path):
@@ -155,38 +154,36 @@ def test_quarantine_closes_without_its_disk(tmp_path, monkeypatch):
     answers.set()
 
 
-def test_released_kind_is_released_in_a_preparing_worker():
-    with driven() as loop:
-        loop.processing.register(hello(), SHORT)
-        loop.until(lambda: loop.workers("idle"))
-        runner = loop.processing._runner  # noqa: SLF001
-        (worker,) = runner._workers  # noqa: SLF001
-        sent = []
-        pipe, send = worker.child.pipe, worker.child.pipe.send
-        pipe.send = lambda note, **files: (sent.append(note), send(note, **files))
-        kind = JobKind(99, SHORT.replace(air=SHORT.air.replace(temperature_c=3.0)).to_toml(), MEASUREMENT.data.nbytes)
-        runner.prepare(kind)
-        runner.forget(kind)
-        loop.until(lambda: loop.workers("idle"))
-        assert [type(note).__name__ for note in sent] == ["Prepare", "Release"]
-        assert 99 not in worker.kinds
+def test_released_kind_is_released_in_a_preparing_worker(loop, monkeypatch):
+    loop.processing.register(hello(), SHORT)
+    loop.until(lambda: loop.workers("idle"))
+    runner = loop.processing._runner  # noqa: SLF001
+    (worker,) = runner._workers  # noqa: SLF001
+    sent = []
+    pipe, send = worker.child.pipe, worker.child.pipe.send
+    monkeypatch.setattr(pipe, "send", lambda note, **files: (sent.append(note), send(note, **files)))
+    kind = JobKind(99, SHORT.replace(air=SHORT.air.replace(temperature_c=3.0)).to_toml(), MEASUREMENT.data.nbytes)
+    runner.prepare(kind)
+    runner.forget(kind)
+    loop.until(lambda: loop.workers("idle"))
+    assert [type(note).__name__ for note in sent] == ["Prepare", "Release"]
+    assert 99 not in worker.kinds
 
 
-def test_slowly_dying_worker_delays_nothing(monkeypatch):
-    with driven() as loop:
-        loop.processing.register(hello(), SHORT)
-        loop.until(lambda: loop.workers("idle"))
-        (worker,) = loop.processing._runner._workers  # noqa: SLF001  to have it seem to end slowly
-        child = worker.child
-        monkeypatch.setattr(type(child), "ended", property(lambda _: False))
-        monkeypatch.setattr(child, "close", lambda *_: pytest.fail("it is waited for"))
-        os.kill(child.pid, signal.SIGKILL)
-        loop.until(lambda: worker.state == "starting")
-        assert child.pipe.fileno() not in loop.processing.fds()
-        loop.offer()
-        monkeypatch.undo()
-        loop.settle()
-        assert loop.processing.counts("front").published == 1
+def test_slowly_dying_worker_delays_nothing(loop, monkeypatch):
+    loop.processing.register(hello("slowly"), SHORT)
+    loop.until(lambda: loop.workers("idle"))
+    (worker,) = loop.processing._runner._workers  # noqa: SLF001  to have it seem to end slowly
+    child = worker.child
+    monkeypatch.setattr(type(child), "ended", property(lambda _: False))
+    monkeypatch.setattr(child, "close", lambda *_: pytest.fail("it is waited for"))
+    os.kill(child.pid, signal.SIGKILL)
+    loop.until(lambda: worker.state == "starting")
+    assert child.pipe.fileno() not in loop.processing.fds()
+    loop.offer("slowly")
+    monkeypatch.undo()
+    loop.settle()
+    assert loop.processing.counts("slowly").published == 1
 
 
 class TestSensors:
@@ -240,43 +237,43 @@ class TestSensors:
         assert kinds == [kind] * 4
 
 
-def test_measurement_of_the_wrong_size_is_dropped():
-    with driven() as loop:
-        loop.processing.register(hello(), SHORT)
-        loop.offer(words=MEASUREMENT.data[:-1])
-        loop.offer()
-        loop.settle()
-        counts, status = loop.processing.counts("front"), loop.processing.status()
+def test_measurement_of_the_wrong_size_is_dropped(loop):
+    loop.processing.register(hello("wrong"), SHORT)
+    before = loop.processing.status()
+    loop.offer("wrong", words=MEASUREMENT.data[:-1])
+    loop.offer("wrong")
+    loop.settle()
+    counts, status = loop.processing.counts("wrong"), loop.processing.status()
     assert (counts.published, counts.dropped) == (1, {"it cannot be processed": 1})
-    assert (status.respawned, status.retried) == (0, 0)
+    assert (status.respawned, status.retried) == (before.respawned, before.retried)
 
 
-def test_failing_measurement_is_tried_twice():
-    with driven() as loop:
-        loop.processing.register(hello(), SHORT)
-        loop.until(lambda: loop.workers("idle"))
-        runner = loop.processing._runner  # noqa: SLF001  to have a worker make a mistake
-        runner._workers[0].child.pipe.send(Release(kind=1))  # noqa: SLF001  it has no pipeline: KeyError
-        loop.offer()
-        loop.settle()
-        counts, status = loop.processing.counts("front"), loop.processing.status()
+def test_failing_measurement_is_tried_twice(loop):
+    settings = SHORT.replace(processing=SHORT.processing.replace(directions="2d:3"))  # a kind of its own
+    loop.processing.register(hello("mistaken", settings), settings)
+    loop.until(lambda: loop.workers("idle"))
+    before, runner = loop.processing.status(), loop.processing._runner  # noqa: SLF001  to have a worker make a mistake
+    kind = loop.processing._sensors["mistaken"].kind.number  # noqa: SLF001
+    runner._workers[0].child.pipe.send(Release(kind=kind))  # noqa: SLF001  it has no pipeline: KeyError
+    loop.offer("mistaken")
+    loop.settle()
+    counts, status = loop.processing.counts("mistaken"), loop.processing.status()
     assert counts.dropped == {"failed twice": 1}
-    assert (status.respawned, status.retried) == (0, 1)
-    assert [fields["text"] for event, fields in loop.lines if event == "failed_twice"] == ["KeyError: 1"]
+    assert (status.respawned, status.retried) == (before.respawned, before.retried + 1)
+    assert [fields["text"] for event, fields in loop.lines if event == "failed_twice"] == [f"KeyError: {kind}"]
 
 
-def test_unusable_settings_drop_only_their_sensor():
+def test_unusable_settings_drop_only_their_sensor(loop):
     unusable = SHORT.replace(processing=SHORT.processing.replace(range_m=(9.0, 9.5)))  # beyond the record
-    with driven() as loop:
-        loop.processing.register(hello("bad", unusable), unusable)
-        loop.processing.register(hello("good"), SHORT)
-        for _ in range(2):
-            loop.offer("bad")
-            loop.offer("good")
-        loop.settle()
-        loop.offer("bad")
-        assert loop.processing.counts("bad").dropped == {"its settings cannot be used": 3}
-        assert loop.processing.counts("good").published == 2
+    loop.processing.register(hello("unusable", unusable), unusable)
+    loop.processing.register(hello("usable"), SHORT)
+    for _ in range(2):
+        loop.offer("unusable")
+        loop.offer("usable")
+    loop.settle()
+    loop.offer("unusable")
+    assert loop.processing.counts("unusable").dropped == {"its settings cannot be used": 3}
+    assert loop.processing.counts("usable").published == 2
 
 
 PARENT = """

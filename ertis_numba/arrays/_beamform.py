@@ -4,7 +4,7 @@ import math
 from typing import Any, Final, Literal
 
 import numpy as np
-import scipy.fft
+import scipy  # Each submodule is loaded at its first use.
 from numpy.typing import ArrayLike, NDArray
 
 from ertis_numba import air, checks

@@ -2,24 +2,10 @@
 
 Each recording becomes one output file, complete or not at all. An interrupted campaign therefore continues at the next
 recording. Workers are independent processes: a crash affects only the recording in progress.
+
+Names are imported when they are first used, because a worker needs only the modules that run its tasks.
 """
 
-from ertis_numba.campaign.campaign import Campaign
-from ertis_numba.campaign.events import Event, RecordingEnded, RecordingProgress, RecordingStarted
-from ertis_numba.campaign.recording_job import RecordingJob, prepare_recording
-from ertis_numba.campaign.recordings import RecordingFile, find_recordings, output_paths
-from ertis_numba.campaign.tasks import CampaignOptions
+import lazy_loader
 
-__all__ = [
-    "Campaign",
-    "CampaignOptions",
-    "Event",
-    "RecordingEnded",
-    "RecordingFile",
-    "RecordingJob",
-    "RecordingProgress",
-    "RecordingStarted",
-    "find_recordings",
-    "output_paths",
-    "prepare_recording",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

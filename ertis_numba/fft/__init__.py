@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from ertis_numba.fft._protocol import Transforms
-from ertis_numba.fft._scipy import ScipyTransforms
 
 __all__ = ["Transforms", "plan"]
 
@@ -45,6 +44,8 @@ def plan(
         The GPU has too little memory.
     """
     if library == "scipy":
+        from ertis_numba.fft._scipy import ScipyTransforms  # noqa: PLC0415 - scipy.fft takes long to import
+
         return ScipyTransforms(signals, analytic)
     from ertis_numba.fft._cufft import CufftTransforms  # noqa: PLC0415 - CuPy is installed only with GPU support
 

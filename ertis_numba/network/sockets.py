@@ -2,20 +2,30 @@
 
 import secrets
 import socket as names
+import struct
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from typing import Final
 
 import zmq
-from zmq.utils.monitor import parse_monitor_message
 
 from ertis_numba.errors import NetworkError
 from ertis_numba.network import addresses
 from ertis_numba.network.keys import ClientKeys, ServerKeys
 
-__all__ = ["DOMAIN", "MAX_BYTES", "HandshakeMonitor", "Monitor", "bound", "client", "server", "was_chosen"]
+__all__ = [
+    "DOMAIN",
+    "MAX_BYTES",
+    "HandshakeMonitor",
+    "Monitor",
+    "bound",
+    "client",
+    "monitor_event",
+    "server",
+    "was_chosen",
+]
 
 MAX_BYTES: Final = 16 * 2**20
 DOMAIN: Final = b"ertis"
@@ -168,6 +178,15 @@ def was_chosen(routing_id: bytes) -> bool:
     return not routing_id.startswith(b"\0")
 
 
+def monitor_event(frames: Sequence[bytes]) -> tuple[int, int]:
+    """Return event and value of a message from a monitor socket.
+
+    ``zmq.utils.monitor`` does the same, but importing it loads asyncio, which nothing else in these processes needs.
+    """
+    event, value = struct.unpack("=hi", frames[0])  # A 16-bit event and a 32-bit value, without padding.
+    return event, value
+
+
 class _Events:
     """Connection events of a socket."""
 
@@ -181,8 +200,7 @@ class _Events:
                 frames = self.socket.recv_multipart(zmq.NOBLOCK)
             except zmq.Again:
                 return
-            event = parse_monitor_message(frames)
-            yield int(event["event"]), int(event["value"])
+            yield monitor_event(frames)
 
     def close(self) -> None:
         """Close the monitor; close it before its socket."""

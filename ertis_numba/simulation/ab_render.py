@@ -4,7 +4,7 @@ import functools
 import math
 
 import numpy as np
-import scipy.ndimage
+import scipy  # Each submodule is loaded at its first use.
 from numpy.typing import NDArray
 
 from ertis_numba import kernels

@@ -180,7 +180,9 @@ class SensorGroup(h5py.Group):  # type: ignore[misc]  # h5py has no annotations
 
     def stored_name(self, name: str) -> str:
         """Return the name of a variable in this file."""
-        former = FORMER_NAMES.get(name, name)
+        former = FORMER_NAMES.get(name)
+        if former is None:  # Each look-up in the file takes time, and most variables never had another name.
+            return name
         return former if super().__contains__(former) and not super().__contains__(name) else name
 
     def __getitem__(self, name: str) -> Any:

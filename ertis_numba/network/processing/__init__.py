@@ -1,7 +1,8 @@
-"""Image processing: worker processes make images of measurements, and a publisher sends them to applications."""
+"""Image processing: worker processes make images of measurements, and a publisher sends them to applications.
 
-from ertis_numba.network.processing.options import ProcessingOptions
-from ertis_numba.network.processing.processing import ImageProcessing
-from ertis_numba.network.processing.queues import ProcessingCounts
+Names are imported when they are first used: child processes import single modules, and start faster without the rest.
+"""
 
-__all__ = ["ImageProcessing", "ProcessingCounts", "ProcessingOptions"]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
