@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from ertis_numba.fft._protocol import Transforms
-from ertis_numba.fft._scipy import ScipyTransforms
 
 __all__ = ["Transforms", "plan"]
 
@@ -45,6 +44,9 @@ def plan(
         The GPU has too little memory.
     """
     if library == "scipy":
+        # Imported here because scipy.fft takes as long to import as everything else that a central node imports.
+        from ertis_numba.fft._scipy import ScipyTransforms  # noqa: PLC0415
+
         return ScipyTransforms(signals, analytic)
     from ertis_numba.fft._cufft import CufftTransforms  # noqa: PLC0415 - CuPy is installed only with GPU support
 

@@ -2,20 +2,20 @@
 
 import secrets
 import socket as names
+import struct
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from typing import Final
 
 import zmq
-from zmq.utils.monitor import parse_monitor_message
 
 from ertis_numba.errors import NetworkError
 from ertis_numba.network import addresses
 from ertis_numba.network.keys import ClientKeys, ServerKeys
 
-__all__ = ["DOMAIN", "MAX_BYTES", "HandshakeMonitor", "Monitor", "bound", "client", "server", "was_chosen"]
+__all__ = ["DOMAIN", "MAX_BYTES", "HandshakeMonitor", "Monitor", "bound", "client", "event_of", "server", "was_chosen"]
 
 MAX_BYTES: Final = 16 * 2**20
 DOMAIN: Final = b"ertis"
@@ -168,6 +168,15 @@ def was_chosen(routing_id: bytes) -> bool:
     return not routing_id.startswith(b"\0")
 
 
+def event_of(frames: Sequence[bytes]) -> tuple[int, int]:
+    """Return event and value of a message from a monitor's socket.
+
+    ``zmq.utils.monitor`` has the same function, but importing it imports asyncio, which no node needs.
+    """
+    event, value = struct.unpack("=Hi", frames[0])
+    return event, value
+
+
 class _Events:
     """Connection events of a socket."""
 
@@ -181,8 +190,7 @@ class _Events:
                 frames = self.socket.recv_multipart(zmq.NOBLOCK)
             except zmq.Again:
                 return
-            event = parse_monitor_message(frames)
-            yield int(event["event"]), int(event["value"])
+            yield event_of(frames)
 
     def close(self) -> None:
         """Close the monitor; close it before its socket."""

@@ -15,13 +15,12 @@ from typing import Final
 
 import zmq
 from zmq.utils import z85
-from zmq.utils.monitor import parse_monitor_message
 
 from ertis_numba.errors import ArgumentError, NetworkError, SettingsError
 from ertis_numba.network.allow_list import AllowList, Permission
 from ertis_numba.network.keys import ServerKeys
 from ertis_numba.network.own_files import require_own
-from ertis_numba.network.sockets import DOMAIN, HandshakeMonitor, was_chosen
+from ertis_numba.network.sockets import DOMAIN, HandshakeMonitor, event_of, was_chosen
 
 __all__ = ["EVERYBODY", "ZapAuthenticator"]
 
@@ -237,7 +236,7 @@ class ZapAuthenticator:
                     self.serve()
                     self.tick()
                     while monitor.poll(0):
-                        event = int(parse_monitor_message(monitor.recv_multipart())["event"])
+                        event, _ = event_of(monitor.recv_multipart())
                         if event == _SUCCEEDED:
                             raise NetworkError(f"{endpoint} accepts a node with {reason}; do not use this installation")
                         # Either side may detect first that only one has keys, and close the connection.
