@@ -64,18 +64,25 @@ def sensors(tmp_path, words):
         yield one, two
 
 
-def start(tmp_path, *arguments, ports=("one",)):
+def command(tmp_path, *arguments, ports=("one",)):
     given = [part for port in ports for part in ("--port", str(tmp_path / port), "--name", port)]
-    command = [*ERTIS, "capture", "--settings", "settings.toml", "--json", *given, *map(str, arguments)]
+    return ["capture", "--settings", "settings.toml", "--json", *given, *map(str, arguments)]
+
+
+def start(tmp_path, *arguments):
+    """Start a capture in its own process, which signals may end."""
+    line = [*ERTIS, *command(tmp_path, *arguments)]
     return subprocess.Popen(
-        command, cwd=tmp_path, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        line, cwd=tmp_path, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
 
 
 def run(tmp_path, *arguments, **options):
-    with start(tmp_path, *arguments, **options) as process:
-        out, err = process.communicate(timeout=SOON_S)
-    return process.returncode, [json.loads(line) for line in out.splitlines()], err
+    """Run a capture in this process."""
+    with contextlib.chdir(tmp_path):
+        done = CliRunner().invoke(cli, command(tmp_path, *arguments, **options))
+    assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
+    return done.exit_code, [json.loads(line) for line in done.stdout.splitlines()], done.stderr
 
 
 def held_crc32(central):

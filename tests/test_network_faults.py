@@ -22,10 +22,11 @@ from ertis_numba.network.status import SensorStatus, Status
 from ertis_numba.storage import RecordingWriter, open_recording
 from tests.faults import reliability
 from tests.faults.network import keys, kills, links, peers, processing, run as faults, table, wire, zmtp
+from tests.faults.network.sender_thread import SenderThread
 from tests.files import noise
 
 SEED = 1
-N_KILLS = {"centrals": 6, "nodes": 10, "workers": 5}
+N_KILLS = {"centrals": 4, "nodes": 4, "workers": 2}
 NOTHING_WRONG = dict.fromkeys(
     ("lost", "missing", "wrong", "twice", "unexpected", "silent", "broken", "left_over", "tracebacks"), 0
 )
@@ -91,7 +92,7 @@ def test_killed_workers_lose_nothing(tmp_path):
     assert found["respawned"] >= found["kills"] == N_KILLS["workers"]
     assert found["acked_through"]
     assert set(found["dropped"]) <= {"superseded", "failed twice", "the workers were getting ready"}
-    assert found["images"] > found["sent"] / 10
+    assert found["images after the kills"] > 4  # more than were on the way
     assert found["orphans"] == 0
 
 
@@ -165,7 +166,7 @@ def test_checker_detects_a_faulty_node(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(tmp_path / "spoiling"))
     record = kills.RestartedRecorder(tmp_path)
     diary = tmp_path / "sender.ndjson"
-    with SenderJob(address=record.address, diary=str(diary), count=8, rate_hz=100.0).start() as sender:
+    with SenderThread(SenderJob(address=record.address, diary=str(diary), count=8, rate_hz=100.0)) as sender:
         sender.wait_for("begun")
         record.finish([sender])
     found = kills.judged(tmp_path, record.archive, [diary])

@@ -1,13 +1,14 @@
-"""Network commands of the README and of docs/how-to/network.md, with other ports, hosts and sounds.
+"""Network commands of the README and of docs/how-to/network.md, with other ports, hosts, sounds and grids.
 
 The emulated sensors of the platform repeat one measurement, because rendering the scene takes longer than all other
-work together.
+work together. Commands that end by themselves run in this process.
 """
 
 import contextlib
 import json
 import os
 import re
+import shlex
 import signal
 import socket
 import subprocess
@@ -17,37 +18,60 @@ from pathlib import Path
 
 import pytest
 
+from ertis_numba.devices.emulator import Emulator
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.simulation import Scene
 from ertis_numba.storage import open_recording, sensor_names, write_recording
-from tests.pages import page
+from tests.pages import page, run_here
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text("utf-8")
 PAGE = page("network")
-READY = {"emulate": "/dev/", "serve": '"listening"', "capture": '"kept"'}
+READY = {"emulate": "/dev/", "serve": '"listening"', "record": '"listening"', "capture": '"kept"'}
+SENSORS = ("front", "left")
+"""The sensors of the platform from which the commands capture."""
 
 
-@pytest.fixture(scope="session")
-def platform(tmp_path_factory):
-    """Recording with the sensors of the platform."""
-    path = tmp_path_factory.mktemp("platform") / "platform.h5"
+@pytest.fixture(scope="module")
+def words():
     with open_recording(ROOT / "data" / "synthetic" / "reflectors.h5") as recording:
-        words = recording[0].data
-    sensors = Scene.load(ROOT / "examples" / "platform.toml").sensors
-    write_recording(path, [Measurement(words, each.settings(), Stamp(sensor=each.name)) for each in sensors])
+        return recording[0].data
+
+
+@pytest.fixture(scope="module")
+def platform(tmp_path_factory, words):
+    """Recording with sensors of the platform."""
+    path = tmp_path_factory.mktemp("platform") / "platform.h5"
+    scene = Scene.load(ROOT / "examples" / "platform.toml")
+    given = [Measurement(words, scene.sensor(name).settings(), Stamp(sensor=name)) for name in SENSORS]
+    write_recording(path, given)
     return path
 
 
 @pytest.fixture
 def place(tmp_path, monkeypatch):
-    """Working folder with its own keys and emulated sensors, and two free ports."""
+    """Working folder with its own keys and emulated sensors.
+
+    Central nodes compute small images in one process, so that none is dropped while they start.
+    """
+    for name, value in (("WORKERS", "1"), ("DIRECTIONS", "2d:9"), ("RANGE", "0.5:1.5")):
+        monkeypatch.setenv(f"ERTIS_SERVE_{name}", value)
     monkeypatch.setenv("ERTIS_EMULATED_DIR", str(tmp_path / "emulated"))
     monkeypatch.setenv("ERTIS_KEYS_DIR", str(tmp_path / "keys"))
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(str(ROOT / folder) for folder in (".", "cli", "bench")))
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     monkeypatch.chdir(tmp_path)
     return tmp_path
+
+
+@pytest.fixture
+def emulators(place, words):
+    """Sensors of the platform, emulated in this process."""
+    (place / "emulated").mkdir()
+    with contextlib.ExitStack() as stack:
+        for name in SENSORS:
+            stack.enter_context(Emulator([words], name=name, link=place / "emulated" / name))
+        yield
 
 
 @pytest.fixture
@@ -61,10 +85,10 @@ def ports():
 
 
 class Shell:
-    """Run lines of a page; those that end with ``&`` run until the test ends."""
+    """Run lines of a page; those that end with ``&`` run as processes until the test ends."""
 
-    def __init__(self, ports, platform):
-        self.ports, self.platform = ports, platform
+    def __init__(self, place, ports, platform=None):
+        self.place, self.ports, self.platform = place, ports, platform
         self.running, self.readers = [], []
 
     def __enter__(self):
@@ -87,11 +111,9 @@ class Shell:
             arguments += ["--publish", f"tcp://127.0.0.1:{self.ports['5602']}"]
         if name == "emulate":
             arguments[0] = str(self.platform)
-        command = [sys.executable, "-m", "ertis_cli", name, *arguments]
         if not line.endswith("&"):
-            done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-            assert done.returncode == 0, (line, done.stderr)
-            return done.stdout
+            return run_here(self.place, shlex.join([name, *arguments]))
+        command = [sys.executable, "-m", "ertis_cli", name, *arguments]
         as_json = [] if name == "emulate" else ["--json"]
         process = subprocess.Popen([*command, *as_json], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
         self.running.append(process)
@@ -106,42 +128,46 @@ def lines_of(page, prompt):
     return re.findall(rf"^{prompt}\$\s+ertis (.*?)(?:\s+#.*)?$", page, re.MULTILINE)
 
 
-@pytest.mark.parametrize(
-    "block",
-    [next(block for block in page.split("```") if "$ ertis serve" in block) for page in (README, PAGE)],
-    ids=["readme", "page"],
-)
-def test_network_page_on_one_machine_runs(place, ports, platform, block):
-    lines = lines_of(block, "")
+def on_one_machine(text):
+    return lines_of(next(block for block in text.split("```") if "$ ertis serve" in block), "")
+
+
+def test_network_commands_of_the_readme_are_those_of_the_page():
+    assert on_one_machine(README) == on_one_machine(PAGE)
+
+
+def test_network_page_on_one_machine_runs(place, ports, platform):
+    lines = on_one_machine(PAGE)
     assert [line.split()[0] for line in lines] == ["example", "emulate", "serve", "capture", "listen", "status"]
-    with Shell(ports, platform) as shell:
+    with Shell(place, ports, platform) as shell:
         *_, heard, status = [shell.run(line) for line in lines]
     assert len([line for line in heard.splitlines() if re.match(r"(front|left) ", line)]) == 10
     assert "front" in status
     assert "published at" in status
     recordings = list((place / "RECORDINGS").glob("*.h5"))
-    assert {name for path in recordings for name in sensor_names(path)} == {"front", "left"}
+    assert {name for path in recordings for name in sensor_names(path)} == set(SENSORS)
 
 
-def test_network_page_on_several_machines_runs(place, ports, platform):
+@pytest.mark.usefixtures("emulators")
+def test_network_page_on_several_machines_runs(place, ports, monkeypatch):
     lines = lines_of(PAGE, "(?:central|sensor)")
     assert [line.split()[0] for line in lines] == ["keys", "keys", "keys", "serve", "capture"]
-    with Shell(ports, platform) as shell:
-        shell.run("emulate examples/platform.toml &")
+    # Two measurements of a sensor wait while the central node plans its images, and a third would drop the first.
+    monkeypatch.setenv("ERTIS_CAPTURE_RATE", "2")
+    with Shell(place, ports) as shell:
         for line in [*lines[:-1], f"{lines[-1]} --json"]:
             local = line.replace("HOST", "127.0.0.1").replace("0.0.0.0", "127.0.0.1")
             reported = shell.run(re.sub(r"(\w+\.public\.toml)", rf"{place}/keys/\1", local))
     events = [json.loads(line) for line in reported.splitlines()]
     acked = [each for each in events if each["event"] == "acked_through"]
-    assert {each["sensor"]: each["acked_through"] for each in acked} == {"front": 4, "left": 4}
+    assert {each["sensor"]: each["acked_through"] for each in acked} == dict.fromkeys(SENSORS, 4)
     assert not any(each["dropped"] for each in acked)
 
 
-def test_network_page_on_one_machine_stores(place, ports, platform):
-    with Shell(ports, platform) as shell:
+@pytest.mark.usefixtures("emulators")
+def test_network_page_on_one_machine_stores(place, ports):
+    with Shell(place, ports) as shell:
         address = f"tcp://127.0.0.1:{ports['5601']}"
-        shell.run("emulate examples/platform.toml &")
-        READY["record"] = '"listening"'
         shell.run(f"record --listen {address} -o RECORDINGS &")
         shell.run(f"capture --port front -n 3 --to {address}")
     (path,) = (place / "RECORDINGS").glob("*.h5")

@@ -107,6 +107,7 @@ class RowReader:
     def __init__(self, group: h5py.Group, data: str) -> None:
         self._group = group
         self._data = group[data]
+        self._columns: dict[str, h5py.Dataset] = {}  # Opening a column takes longer than reading a number of it.
 
     def __len__(self) -> int:
         return int(self._data.shape[0])
@@ -120,7 +121,7 @@ class RowReader:
             The array does not match its CRC-32.
         """
         row = np.asarray(self._data[index])
-        wanted, got = int(self._group["crc32"][index]), zlib.crc32(row.data)
+        wanted, got = int(self.column("crc32", index)), zlib.crc32(row.data)
         if got != wanted:
             raise DamagedError(
                 f"measurement {index} has CRC-32 {got:08x}, but the file states {wanted:08x}: the file is "
@@ -142,4 +143,6 @@ class RowReader:
 
     def column(self, name: str, index: int) -> Any:
         """Return the number of one measurement in a column."""
-        return self._group[name][index].item()
+        if name not in self._columns:
+            self._columns[name] = self._group[name]
+        return self._columns[name][index].item()

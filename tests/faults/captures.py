@@ -14,12 +14,13 @@ import time
 import zlib
 from collections import Counter, defaultdict
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 from ertis_bench.network.processes import ask
 
+from ertis_numba.devices.emulator import Emulator
 from ertis_numba.errors import DataError
 from ertis_numba.simulation import Point, Scene, Sensor
 from ertis_numba.storage import open_recording, sensor_names
@@ -170,10 +171,14 @@ def disk_full(source: Path, folder: Path, disk: Path) -> Line:
 def emulated(source: Path, folder: Path, *options: str) -> Iterator[list[str]]:
     """Yield links to the ports of emulated sensors, which log to ``sent.ndjson``.
 
-    The emulators end with the block.
+    The emulators end with the block. Without options, those of a recording run in this process, which starts faster.
     """
     log = folder / "sent.ndjson"
     log.unlink(missing_ok=True)
+    if source.suffix == ".h5" and not options:
+        with _emulated_here(source, folder / "emulated", log) as ports:
+            yield ports
+        return
     command = [*_ERTIS, "emulate", str(source), "--quiet", "--json", "--log", str(log), *options]
     environment = os.environ | {"ERTIS_EMULATED_DIR": str(folder / "emulated")}
     n_sensors = len(Scene.load(source).sensors) if source.suffix == ".toml" else len(sensor_names(source))
@@ -187,6 +192,18 @@ def emulated(source: Path, folder: Path, *options: str) -> Iterator[list[str]]:
         finally:
             process.send_signal(signal.SIGTERM)
             process.wait(_WAIT_S)
+
+
+@contextmanager
+def _emulated_here(source: Path, links: Path, log: Path) -> Iterator[list[str]]:
+    links.mkdir(exist_ok=True)
+    with ExitStack() as stack:
+        file = stack.enter_context(log.open("a", encoding="utf-8"))
+        for name in sensor_names(source):
+            with open_recording(source, sensor=name) as recording:
+                words = [measurement.data for measurement in recording]
+            stack.enter_context(Emulator(words, name=name, link=links / name, log=file))
+        yield [str(links / name) for name in sensor_names(source)]
 
 
 def _ports(ports: list[str]) -> list[str]:

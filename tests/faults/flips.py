@@ -1,7 +1,7 @@
 """Random damage to every kind of file. Each reader must report all data that is lost or changed.
 
-``python -m tests.faults.flips STATE FOLDER`` makes files of one kind, prints the measurements that were reported as
-stored, and ends by SIGKILL. The reference reader uses only h5py and zlib.
+``python -m tests.faults.flips FOLDER STATE...`` makes files of several kinds, each in a process that ends by SIGKILL,
+and prints the measurements that were reported as stored. The reference reader uses only h5py and zlib.
 """
 
 import json
@@ -11,10 +11,10 @@ import shutil
 import signal
 import subprocess
 import sys
+import traceback
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -36,6 +36,8 @@ from ertis_numba.settings import Recording, Settings
 __all__ = ["flips"]
 
 _SETTINGS: Final = Settings(recording=Recording(n_samples=4_096))
+_LONG: Final = Settings(recording=Recording(n_samples=32_768))
+"""Settings of measurements for large files, which take less time to check than as many bytes in short ones."""
 _SESSION_ID: Final = 7
 _SENSORS: Final = ("left", "right")
 _BLOCK_BYTES: Final = 512
@@ -43,6 +45,9 @@ _OTHER_AT_EACH_SEALING: Final = {"/@date_created", "/@history"}
 
 Judge = Callable[[Path], str]
 """Function that returns "harmless", "noticed", "silent" or "crashed" for a damaged copy of a state."""
+
+Shown = set[tuple[str, int, int]]
+"""Sensor, sequence number and CRC-32 of measurements that a process has reported as stored."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,12 +85,12 @@ def flips(folder: Path, *, seed: int, count: int, only: str = "") -> dict[str, A
     rng = random.Random(seed)
     kinds: dict[str, dict[str, int]] = {}
     judges: dict[str, Judge] = {}
-    for name, kind in _KINDS.items():
-        if only and only != name:
-            continue
+    chosen = {name: kind for name, kind in _KINDS.items() if not only or only == name}
+    shown = _make_states(folder, {kind.state for kind in chosen.values()})
+    for name, kind in chosen.items():
         made = folder / kind.state
         if kind.state not in judges:
-            judges[kind.state] = _STATES[kind.state](made)
+            judges[kind.state] = _STATES[kind.state](made, shown[kind.state])
         counts: Counter[str] = Counter()
         for _ in range(max(1, round(count * kind.share))):
             work = shutil.copytree(made, folder / "work")
@@ -137,23 +142,24 @@ def _classify(read: Callable[[], tuple[object, bool]], wanted: object) -> str:
 # States
 
 
-def _make_state(state: str, folder: Path) -> list[list[Any]]:
-    """Create a state in a process that is then killed, and return the values that it reported."""
-    folder.mkdir()
-    command = [sys.executable, "-m", "tests.faults.flips", state, str(folder)]
+def _make_states(folder: Path, states: Iterable[str]) -> dict[str, Shown]:
+    """Create states, each in a process that is then killed, and return the measurements that these reported."""
+    command = [sys.executable, "-m", "tests.faults.flips", str(folder), *sorted(states)]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    if done.returncode != -signal.SIGKILL:
-        raise RuntimeError(f"process that makes {state!r} ended with {done.returncode}: {done.stderr[-500:]}")
-    return [json.loads(line) for line in done.stdout.splitlines()]
+    if done.returncode:
+        raise RuntimeError(f"process that makes {command[4:]} ended with {done.returncode}: {done.stderr[-500:]}")
+    shown: dict[str, Shown] = {state: set() for state in states}
+    for state, *measurement in map(json.loads, done.stdout.splitlines()):
+        shown[state].add(tuple(measurement))
+    return shown
 
 
-def _journal(state: str) -> Callable[[Path], Judge]:
-    def make(folder: Path) -> Judge:
+def _journal(state: str) -> Callable[[Path, Shown], Judge]:
+    def make(folder: Path, shown: Shown) -> Judge:
         from ertis_numba.storage.sealing import seal  # noqa: PLC0415  the processes to be killed do without HDF5
         from ertis_numba.storage.verify import verify  # noqa: PLC0415
 
-        shown = {tuple(each) for each in _make_state(state, folder)}
         whole = shutil.copytree(folder, folder.with_name(f"{state}-whole"))
         seal(whole / f"rec.h5{SUFFIX}")
         wanted = _content(whole / "rec.h5")
@@ -172,11 +178,10 @@ def _journal(state: str) -> Callable[[Path], Judge]:
     return make
 
 
-def _recording(folder: Path) -> Judge:
+def _recording(folder: Path, _: Shown) -> Judge:
     from ertis_numba.storage.sealing import seal  # noqa: PLC0415
     from ertis_numba.storage.verify import verify  # noqa: PLC0415
 
-    _make_state("young", folder)
     seal(folder / f"rec.h5{SUFFIX}")
     wanted = _content(folder / "rec.h5")
 
@@ -187,9 +192,7 @@ def _recording(folder: Path) -> Judge:
     return lambda work: _classify(lambda: read(work), wanted)
 
 
-def _spool(folder: Path) -> Judge:
-    shown = {tuple(each) for each in _make_state("spool", folder)}
-
+def _spool(_: Path, shown: Shown) -> Judge:
     def read(work: Path) -> tuple[object, bool]:
         notes: list[str] = []
         spool = DiskSpool(work, 10**9, None, on_note=notes.append)
@@ -209,8 +212,7 @@ def _spool(folder: Path) -> Judge:
     return lambda work: _classify(lambda: read(work), wanted=True)
 
 
-def _ledger(folder: Path) -> Judge:
-    _make_state("ledger", folder)
+def _ledger(folder: Path, _: Shown) -> Judge:
     whole = Ledger(folder)
     wanted = (whole.acked_through, whole.open, whole.unsealed, whole.gaps)
 
@@ -223,9 +225,7 @@ def _ledger(folder: Path) -> Judge:
     return lambda work: _classify(lambda: read(work), wanted)
 
 
-def _keys(folder: Path) -> Judge:
-    _make_state("keys", folder)
-
+def _keys(folder: Path, _: Shown) -> Judge:
     def read(work: Path) -> tuple[object, bool]:
         work.chmod(0o700)
         pair = KeyPair.load(work / "robot.secret.toml")
@@ -235,7 +235,7 @@ def _keys(folder: Path) -> Judge:
     return lambda work: _classify(lambda: read(work), wanted)
 
 
-_STATES: Final[dict[str, Callable[[Path], Judge]]] = {
+_STATES: Final[dict[str, Callable[[Path, Shown], Judge]]] = {
     **{state: _journal(state) for state in ("young", "grown", "large")},
     "recording": _recording,
     "spool": _spool,
@@ -247,7 +247,7 @@ _STATES: Final[dict[str, Callable[[Path], Judge]]] = {
 # Reference reader
 
 
-def _measured(path: Path) -> set[tuple[str, int, int]]:
+def _measured(path: Path) -> Shown:
     """Return sensor, sequence number and CRC-32 of the words of all measurements in a recording."""
     with h5py.File(path) as file:
         return {
@@ -282,20 +282,20 @@ def _attribute(file: h5py.File, value: Any, key: str) -> object:
 # Processes that are killed
 
 
-def _entries(count: int, first: int = 0) -> Iterator[JournalEntry]:
-    for number in range(first, first + count):
+def _entries(count: int, settings: Settings = _SETTINGS) -> Iterator[JournalEntry]:
+    for number in range(count):
         for sensor in _SENSORS:
             words = np.random.default_rng([number, _SENSORS.index(sensor)]).integers(
-                0, 2**32, _SETTINGS.recording.n_samples, dtype=np.uint32
+                0, 2**32, settings.recording.n_samples, dtype=np.uint32
             )
             stamp = Stamp(sensor=sensor, sequence=number, session_id=_SESSION_ID, timestamp_ns=1_000_000_007 * number)
-            yield JournalEntry(Measurement(words, _SETTINGS, stamp), monotonic_ns=number)
+            yield JournalEntry(Measurement(words, settings, stamp), monotonic_ns=number)
 
 
-def _emit_event(entries: list[JournalEntry]) -> None:
+def _emit_event(state: str, entries: list[JournalEntry]) -> None:
     for entry in entries:
         stamp = entry.measurement.stamp
-        sys.stdout.write(json.dumps([stamp.sensor, stamp.sequence, entry.crc32]) + "\n")
+        sys.stdout.write(json.dumps([state, stamp.sensor, stamp.sequence, entry.crc32]) + "\n")
     sys.stdout.flush()
 
 
@@ -311,15 +311,16 @@ def _begin_another_commit(journal: Journal) -> None:
 
 def _make_files(state: str, folder: Path) -> None:
     """Make the files of a state."""
-    if state in {"young", "grown", "large"}:
+    if state in {"young", "recording", "grown", "large"}:
         journal = Journal.create(folder / f"rec.h5{SUFFIX}", target="rec.h5", source="flips")
+        settings = _LONG if state in {"grown", "large"} else _SETTINGS
         for sensor in _SENSORS:
-            journal.add_sensor(sensor, _SETTINGS, firmware="1.2.3")
-        size = 320 if state == "large" else 1
-        entries = list(_entries({"young": 12, "grown": 150, "large": 160}[state]))
+            journal.add_sensor(sensor, settings, firmware="1.2.3")
+        entries = list(_entries({"grown": 19, "large": 20}.get(state, 12), settings))
+        size = len(entries) if state == "large" else 1
         for begin in range(0, len(entries), size):
             journal.append(entries[begin : begin + size])
-            _emit_event(entries[begin : begin + size])
+            _emit_event(state, entries[begin : begin + size])
         if state == "large":
             _begin_another_commit(journal)
     elif state == "spool":
@@ -330,7 +331,7 @@ def _make_files(state: str, folder: Path) -> None:
         entries = list(_entries(20))
         for entry in entries:
             spool.append([entry])
-        _emit_event(entries)
+        _emit_event(state, entries)
     elif state == "ledger":
         runs = {
             SensorSession(sensor, 2**40 + session_id): 1_000 * session_id
@@ -352,7 +353,22 @@ def _make_files(state: str, folder: Path) -> None:
         (folder / "made").rmdir()
 
 
+def _make_and_die(state: str, folder: Path) -> None:
+    """Make the files of a state in a process that ends by SIGKILL; raise an error if it ends otherwise."""
+    folder.mkdir()
+    pid = os.fork()
+    if pid == 0:
+        try:
+            _make_files(state, folder)
+            os.kill(os.getpid(), signal.SIGKILL)
+        finally:
+            traceback.print_exc()
+            os._exit(1)
+    _, status = os.waitpid(pid, 0)
+    if os.waitstatus_to_exitcode(status) != -signal.SIGKILL:
+        raise RuntimeError(f"process that makes {state!r} ended with status {status}")
+
+
 if __name__ == "__main__":
-    with suppress(BrokenPipeError):
-        _make_files(sys.argv[1], Path(sys.argv[2]))
-    os.kill(os.getpid(), signal.SIGKILL)
+    for each in sys.argv[2:]:
+        _make_and_die(each, Path(sys.argv[1]) / each)

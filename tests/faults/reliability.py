@@ -64,13 +64,13 @@ class TrialCounts:
 SHORT = TrialCounts(
     duration_s=5.0,
     n_groups=12,
-    n_blocks=3_000,
+    n_blocks=800,
     n_unplugs=1,
-    n_kills=3,
+    n_kills=2,
     n_seal_kills=5,
     n_signals=2,
     n_power_cuts=40,
-    n_flips=30,
+    n_flips=20,
 )
 LONG = TrialCounts(
     duration_s=600.0,

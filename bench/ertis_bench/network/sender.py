@@ -11,7 +11,7 @@ import signal
 import sys
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -29,7 +29,7 @@ from ertis_numba.network.keys import ClientKeys, KeyPair
 from ertis_numba.network.sensor_node import SensorNode
 from ertis_numba.settings import Processing, Recording, Settings
 
-__all__ = ["SETTINGS", "SMALL", "SenderJob", "words_of"]
+__all__ = ["SETTINGS", "SMALL", "Sender", "SenderJob", "words_of"]
 
 SETTINGS: Final = Settings()
 SMALL: Final = Settings(
@@ -119,36 +119,75 @@ def words_of(base: NDArray[np.uint32], session_id: int, sequence: int) -> NDArra
     return words
 
 
-@dataclass(slots=True)
-class _Sender:
-    job: SenderJob
-    settings: Settings
-    diary: Diary
-    session_id: int = field(default_factory=lambda: secrets.randbits(62))
-    stopped: bool = False
-    seen_dropped: set[DiaryKey] = field(default_factory=set)
-    reported: Counter[str] = field(default_factory=Counter)
+def _print_event(**event: object) -> None:
+    os.write(1, f"{json.dumps(event)}\n".encode())
 
-    def acked_through(self, message: Any) -> None:
+
+@dataclass(slots=True)
+class Sender:
+    """Sensor node that writes a diary.
+
+    Attributes
+    ----------
+    job : SenderJob
+    emit : callable
+        Called with the fields of each event, which are printed by default.
+    stopped : bool
+        Set it to end the measurements.
+    """
+
+    job: SenderJob
+    emit: Callable[..., None] = _print_event
+    stopped: bool = False
+    _settings: Settings = field(init=False)
+    _diary: Diary = field(init=False)
+    _session_id: int = field(default_factory=lambda: secrets.randbits(62), init=False)
+    _reported: Counter[str] = field(default_factory=Counter, init=False)
+
+    def __post_init__(self) -> None:
+        self._settings = SMALL if self.job.small else SETTINGS
+        self._diary = Diary(Path(self.job.diary))
+
+    def send(self) -> None:
+        """Send until the count is reached or `stopped` is set, then wait until all measurements are acknowledged."""
+        job = self.job
+        options: dict[str, Any] = {
+            name: value for name in ("ring_bytes", "spool_bytes") if (value := getattr(job, name)) is not None
+        }
+        keys = None if job.keys is None else ClientKeys(pair=KeyPair.load(Path(job.keys[0])), server=job.keys[1])
+        with SensorNode(
+            job.address,
+            keys=keys,
+            spool=None if job.spool is None else Path(job.spool),
+            on_acked=self._acked_through,
+            on_note=self._note,
+            **options,
+        ) as node:
+            sent = self._run(node)
+            self.emit(event="done", sent=sent)
+            flushed = node.flush(job.patience_s)
+            self.emit(event="sent", sent=sent, flushed=flushed, dropped=dict(self._reported))
+
+    def _acked_through(self, message: Any) -> None:
         """Record an acknowledgement of the node."""
         now_ns = time.monotonic_ns()
-        self.diary.acked_through(message.sensor, message.session_id, message.acked_through, message.status, now_ns)
+        self._diary.acked_through(message.sensor, message.session_id, message.acked_through, message.status, now_ns)
         for sequence, reason in message.dropped:
-            self.diary.dropped(message.sensor, message.session_id, sequence, reason)
-            self.reported[reason] += 1
+            self._diary.dropped(message.sensor, message.session_id, sequence, reason)
+            self._reported[reason] += 1
 
-    def note(self, *texts: str) -> None:
+    def _note(self, *texts: str) -> None:
         """Report a message of the node."""
-        _emit_event(event="note", text=": ".join(texts))
+        self.emit(event="note", text=": ".join(texts))
 
-    def run(self, node: SensorNode) -> int:
+    def _run(self, node: SensorNode) -> int:
         """Send the measurements, and return the number of pulses."""
         job = self.job
         for sensor in job.sensors:
-            node.add_sensor(sensor, self.settings, firmware="bench")
-        _emit_event(event="begun", session_id=self.session_id, pid=os.getpid())
+            node.add_sensor(sensor, self._settings, firmware="bench")
+        self.emit(event="begun", session_id=self._session_id, pid=os.getpid())
         rng = np.random.default_rng(job.seed)
-        n_samples = self.settings.recording.n_samples
+        n_samples = self._settings.recording.n_samples
         given = np.load(job.words) if job.words else None
         bases = {sensor: rng.integers(0, 2**32, n_samples, dtype=np.uint32) for sensor in job.sensors}
         start_s = time.monotonic() if job.start_s is None else job.start_s
@@ -167,14 +206,14 @@ class _Sender:
             entries = [
                 self._entry(
                     replace(stamp, sensor=sensor),
-                    words_of(bases[sensor], self.session_id, sequence)
+                    words_of(bases[sensor], self._session_id, sequence)
                     if given is None
                     else given[sequence % len(given)],
                 )
                 for sensor in job.sensors
             ]
             for entry in node.append(entries):
-                self.diary.kept(_key(entry))
+                self._diary.kept(_key(entry))
             pulse += 1
         return pulse
 
@@ -187,17 +226,17 @@ class _Sender:
         return Stamp(
             sequence=sequence,
             sync_count=job.first_pulse + sequence,
-            session_id=self.session_id,
+            session_id=self._session_id,
             timestamp_ns=start_ns + round(1e9 * pulse / job.rate_hz) + step_ns,
             timestamp_uncertainty_ns=100_000,
         )
 
     def _entry(self, stamp: Stamp, words: NDArray[np.uint32]) -> JournalEntry:
         """Return a journal entry of a measurement, after the diary has recorded it."""
-        measurement = Measurement(words, self.settings, stamp)
+        measurement = Measurement(words, self._settings, stamp)
         row, now_ns = Row.of(measurement), time.monotonic_ns()
         entry = JournalEntry(measurement, monotonic_ns=now_ns)
-        self.diary.offered(_key(entry), row, now_ns)
+        self._diary.offered(_key(entry), row, now_ns)
         return entry
 
 
@@ -206,34 +245,15 @@ def _key(entry: JournalEntry) -> DiaryKey:
     return DiaryKey(stamp.sensor, stamp.session_id, stamp.sequence)
 
 
-def _emit_event(**event: object) -> None:
-    os.write(1, f"{json.dumps(event)}\n".encode())
-
-
-def _stop(sender: _Sender, _number: int, _frame: FrameType | None) -> None:
+def _stop(sender: Sender, _number: int, _frame: FrameType | None) -> None:
     sender.stopped = True
 
 
 def main(job: SenderJob) -> None:
-    """Send until the count is reached or SIGTERM comes, then wait until all measurements are acknowledged."""
-    options: dict[str, Any] = {
-        name: value for name in ("ring_bytes", "spool_bytes") if (value := getattr(job, name)) is not None
-    }
-    keys = None if job.keys is None else ClientKeys(pair=KeyPair.load(Path(job.keys[0])), server=job.keys[1])
-    sender = _Sender(job, SMALL if job.small else SETTINGS, Diary(Path(job.diary)))
+    """Send until SIGTERM comes, or until the count is reached."""
+    sender = Sender(job)
     signal.signal(signal.SIGTERM, partial(_stop, sender))
-    with SensorNode(
-        job.address,
-        keys=keys,
-        spool=None if job.spool is None else Path(job.spool),
-        on_acked=sender.acked_through,
-        on_note=sender.note,
-        **options,
-    ) as node:
-        sent = sender.run(node)
-        _emit_event(event="done", sent=sent)
-        flushed = node.flush(job.patience_s)
-        _emit_event(event="sent", sent=sent, flushed=flushed, dropped=dict(sender.reported))
+    sender.send()
 
 
 if __name__ == "__main__":

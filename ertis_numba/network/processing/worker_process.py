@@ -43,7 +43,9 @@ class _ImageWorker:
         self._predictions = Predictions(given.device)
 
     def run(self) -> None:
-        from ertis_numba import kernels  # noqa: PLC0415  in this process alone
+        # In this process alone, and before it is ready: the first sensor need not wait for the imports of a pipeline.
+        from ertis_numba import kernels  # noqa: PLC0415
+        from ertis_numba.network.processing import chain  # noqa: F401, PLC0415
 
         try:
             loaded: kernels.KernelSet | None = kernels.load(self._given.device)

@@ -31,7 +31,7 @@ __all__ = ["keys"]
 
 _TRIED_S: Final = 2.5  # long enough for several refusals of a wrong key
 _REMOVED_S: Final = 2.0
-_INTERVAL_S: Final = 0.02
+_INTERVAL_S: Final = 0.05
 Found = dict[str, Any]
 
 

@@ -10,24 +10,28 @@ import signal
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from ertis_bench.network.oracle import judged
+from ertis_bench.network.oracle import judged, read_diaries
 from ertis_bench.network.processes import ERTIS, JsonLinesProcess, central, free_address, survivors, until
 from ertis_bench.network.sender import SenderJob
 
 from ertis_numba.errors import DataError
+from tests.faults.network.sender_thread import SenderThread
 from tests.faults.network.trap import in_trap
 
 __all__ = ["RestartedRecorder", "centrals", "nodes", "sealings"]
 
 _CHILDREN_END_S: Final = 30.0  # time limit for children of a killed process to end
+_SEARCH_INTERVAL_S: Final = 0.05  # between two searches for processes, each of which reads a file of every process
 _ROTATE_MB: Final = 16
 _LINES_TO_LISTEN: Final = 2_500  # approximate lines of code that a central node runs until it listens
 _LINES_TO_BEGIN: Final = 1_000  # approximate lines of code that a sensor node runs until it sends
 _LINES_OF_A_LIFE: Final = 12_000  # approximate lines of code that either runs in a second
 _SEALING: Final = "-m ertis_numba.storage.sealing_process"  # in the command line of a sealing process
+_N_KEPT: Final = 20  # measurements that a sensor node keeps before it is killed at a random time
 _LIFE_S: Final = 1.0  # lifetime of a process that does not reach its line
 _RING_BYTES: Final = 500_000_000
 Found = dict[str, Any]
@@ -61,8 +65,8 @@ class RestartedRecorder:
         options = ("-o", str(self.archive), *self._options)
         return central("record", self.folder, *options, listen=self.address, mark=self.mark, ertis=ertis)
 
-    def finish(self, senders: list[JsonLinesProcess], *, timeout_s: float = 120.0) -> Found:
-        """Start the command a last time. Wait until senders have sent all measurements and these are sealed.
+    def finish(self, senders: Sequence[JsonLinesProcess | SenderThread] = (), *, timeout_s: float = 120.0) -> Found:
+        """Wait until senders have sent all measurements and these are sealed; start the command again if necessary.
 
         Returns
         -------
@@ -71,6 +75,10 @@ class RestartedRecorder:
             ended.
         """
         unacked = 0
+        if not senders:
+            ended = until(lambda: not survivors(self.mark), timeout_s=_CHILDREN_END_S, every_s=_SEARCH_INTERVAL_S)
+            if ended and not list(self.archive.glob("*.journal*")):
+                return {"unacked": 0, "orphans": 0}
         with self.start() as last:
             last.wait_for("listening")
             for sender in senders:
@@ -81,7 +89,7 @@ class RestartedRecorder:
             code = last.stop(timeout_s=timeout_s)
             if code:
                 raise DataError(f"ertis record ended with {code}; {last.last_words()}")
-        until(lambda: not survivors(self.mark), timeout_s=_CHILDREN_END_S)
+        until(lambda: not survivors(self.mark), timeout_s=_CHILDREN_END_S, every_s=_SEARCH_INTERVAL_S)
         return {"unacked": unacked, "orphans": len(survivors(self.mark))}
 
 
@@ -95,7 +103,7 @@ def centrals(folder: Path, *, seed: int, count: int, rate_hz: float) -> Found:
     record = RestartedRecorder(folder, "--rotate-size", str(_ROTATE_MB))
     diary, by_line = folder / "sender.ndjson", 0
     job = SenderJob(address=record.address, diary=str(diary), sensors=("left", "right"), rate_hz=rate_hz, seed=seed)
-    with job.replace(ring_bytes=_RING_BYTES, patience_s=60.0).start() as sender:
+    with SenderThread(job.replace(ring_bytes=_RING_BYTES, patience_s=60.0)) as sender:
         sender.wait_for("begun")
         for _ in range(count):
             max_lines = _some_lines(rng, _LINES_TO_LISTEN, _LINES_OF_A_LIFE) if rng.random() < 0.5 else None
@@ -124,7 +132,7 @@ def _some_lines(rng: random.Random, n_first: int, n_more: int) -> int:
 def nodes(folder: Path, *, seed: int, count: int) -> Found:
     """Kill two sensor nodes, one of them with a spool on disk. The node with a spool may lose nothing.
 
-    Half of the kills come at a random time, the others before a random line of code.
+    Every other pair is killed before a random line of code, the others at a random time while they send.
     """
     rng = random.Random(seed)
     record = RestartedRecorder(folder, "--rotate-size", str(_ROTATE_MB))
@@ -140,19 +148,21 @@ def nodes(folder: Path, *, seed: int, count: int) -> Found:
     by_line = 0
     with record.start() as node:
         node.wait_for("listening")
-        for _ in range((count + 1) // 2):
+        for number in range((count + 1) // 2):
             with ExitStack() as stack:
-                lines = _some_lines(rng, _LINES_TO_BEGIN, _LINES_OF_A_LIFE) if rng.random() < 0.5 else None
+                lines = _some_lines(rng, _LINES_TO_BEGIN, _LINES_OF_A_LIFE) if number % 2 else None
+                n_before = _n_kept(diaries["spool"])
                 senders = [stack.enter_context(job.start(in_trap(lines, job.command()))) for job in jobs.values()]
+                if lines is None:
+                    until(lambda n_before=n_before: _n_kept(diaries["spool"]) >= n_before + _N_KEPT)  # type: ignore[misc]
                 for sender in rng.sample(senders, 2):
                     if lines is not None:
                         by_line += sender.ends_within(_LIFE_S)
                     else:
-                        sender.wait_for("begun")
                         time.sleep(rng.uniform(0.0, 0.3))
                     sender.kill()
         node.stop()
-    with jobs["spool"].replace(count=1).start() as sender:
+    with SenderThread(jobs["spool"].replace(count=1)) as sender:
         sender.wait_for("done")
         ended = record.finish([sender])
     found = judged(folder, record.archive, list(diaries.values()), kept=[diaries["spool"]])
@@ -164,6 +174,10 @@ def nodes(folder: Path, *, seed: int, count: int) -> Found:
     )
 
 
+def _n_kept(diary: Path) -> int:
+    return len(read_diaries([diary]).kept) if diary.exists() else 0
+
+
 def sealings(folder: Path, *, seed: int, count: int) -> Found:
     """Kill sealing processes while the central node continues, and sometimes the central node with them."""
     rng = random.Random(seed)
@@ -172,7 +186,7 @@ def sealings(folder: Path, *, seed: int, count: int) -> Found:
     job = SenderJob(address=record.address, diary=str(diary), rate_hz=20.0, seed=seed, ring_bytes=_RING_BYTES)
     killed = with_central = 0
     with ExitStack() as stack:
-        sender = stack.enter_context(job.replace(patience_s=60.0).start())
+        sender = stack.enter_context(SenderThread(job.replace(patience_s=60.0)))
         node = stack.enter_context(record.start())
         seen: set[int] = set()
         while killed < count:
@@ -181,10 +195,15 @@ def sealings(folder: Path, *, seed: int, count: int) -> Found:
             if not fresh:
                 if not node.running:
                     raise DataError(f"central node has ended; {node.last_words()}")
-                time.sleep(0.01)
+                time.sleep(_SEARCH_INTERVAL_S)
                 continue
             seen.update(fresh)
-            time.sleep(rng.uniform(0.0, 0.6))
+            if rng.random() < 0.5:  # The others are killed after they have begun to write.
+                time.sleep(rng.uniform(0.0, 0.4))
+            else:
+                writes = partial(_writes, record.archive, fresh[0])
+                until(writes, every_s=0.002)
+                time.sleep(rng.uniform(0.0, 0.03))
             killed += _killed(fresh[0])
             if rng.random() < 0.2:
                 node.kill()
@@ -193,6 +212,11 @@ def sealings(folder: Path, *, seed: int, count: int) -> Found:
         node.stop()
         ended = record.finish([sender])
     return {"kills": killed, "with central": with_central} | ended | judged(folder, record.archive, [diary])
+
+
+def _writes(archive: Path, pid: int) -> bool:
+    """Return True if a sealing process has begun to write a recording, or has ended."""
+    return any(archive.glob("*.part")) or not Path(f"/proc/{pid}/cmdline").exists()
 
 
 def _killed(pid: int) -> bool:

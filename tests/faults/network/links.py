@@ -10,13 +10,16 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final
 
+from click.testing import CliRunner
 from ertis_bench.network.oracle import judged, read_diaries
-from ertis_bench.network.processes import JsonLinesProcess, ask, until
+from ertis_bench.network.processes import JsonLinesProcess, until
 from ertis_bench.network.sender import SenderJob
+from ertis_cli.main import cli
 
 from ertis_numba.errors import DataError
 from tests.faults.network.kills import RestartedRecorder
 from tests.faults.network.meddler import ACKS, Meddler
+from tests.faults.network.sender_thread import SenderThread
 
 __all__ = ["away", "disk_fails", "disk_full", "meddled", "state_of"]
 
@@ -35,9 +38,9 @@ def state_of(address: str, *keys: str) -> dict[str, Any]:
     DataError
         The node does not answer.
     """
-    done = ask("status", address, "--json", "--once", *keys)
-    if done.returncode:
-        raise DataError(f"ertis status ended with {done.returncode}: {done.stderr.strip()}")
+    done = CliRunner().invoke(cli, ["status", address, "--json", "--once", *keys])
+    if done.exit_code:
+        raise DataError(f"ertis status ended with {done.exit_code}: {done.stderr.strip()}")
     status: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return status
 
@@ -83,7 +86,7 @@ def _send_through_fault(
     with ExitStack() as stack:
         node = stack.enter_context(record.start())
         node.wait_for("listening")
-        sender = stack.enter_context(job.start())
+        sender = stack.enter_context(SenderThread(job))
         sender.wait_for("begun")
         if free is None:
             until(lambda: bool(read_diaries([diary]).acked()))
@@ -101,7 +104,7 @@ def _send_through_fault(
         node.wait_for("resumed")
         sender.wait_for("sent")
         node.stop()
-        ended = record.finish([])
+        ended = record.finish()
     return {
         "state": state,
         "said": " ".join(str(fault.get("text", fault.get("reason", ""))).split()).replace(str(record.archive), "DISK"),
@@ -162,7 +165,7 @@ def away(folder: Path, *, seed: int, away_s: float, how: str) -> Found:
                 node = stack.enter_context(record.start())
                 node.wait_for("listening")
         node.stop()
-        ended = record.finish([])
+        ended = record.finish()
     overrun = judged(folder, record.archive, [diary])
     return (
         found
@@ -181,7 +184,7 @@ def meddled(folder: Path, *, seed: int, duration_s: float) -> Found:
         node.wait_for("listening")
         cable = stack.enter_context(Meddler(record.address, seed=seed, odds=ACKS))
         job = SenderJob(address=cable.address, diary=str(diary), rate_hz=40.0, seed=seed, ring_bytes=10 * _RING_BYTES)
-        sender = stack.enter_context(job.replace(sensors=("left", "right"), patience_s=60.0).start())
+        sender = stack.enter_context(SenderThread(job.replace(sensors=("left", "right"), patience_s=60.0)))
         sender.wait_for("begun")
         end_s = time.monotonic() + duration_s
         drops = cuts = 0
@@ -197,7 +200,7 @@ def meddled(folder: Path, *, seed: int, duration_s: float) -> Found:
         sender.signal(signal.SIGTERM)
         flushed = sender.wait_for("sent", timeout_s=120.0)["flushed"]
         node.stop()
-        ended = record.finish([])
+        ended = record.finish()
         did = dict(cable.did)
     return (
         {"drops": drops, "cuts": cuts, "flushed": flushed, "meddled": did}

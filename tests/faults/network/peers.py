@@ -19,6 +19,7 @@ from ertis_bench.network.sender import SenderJob
 from tests.faults.network.fuzz import inputs
 from tests.faults.network.kills import RestartedRecorder
 from tests.faults.network.links import state_of
+from tests.faults.network.sender_thread import SenderThread
 from tests.faults.network.zmtp import GREETING, ZmtpPeer, greeting, host_and_port, message, ready
 
 __all__ = ["fuzzed", "hostile"]
@@ -46,7 +47,7 @@ def fuzzed(folder: Path, *, seed: int, count: int) -> Found:
         node = stack.enter_context(central("serve", folder, *options))
         listening = node.wait_for("listening")
         job = SenderJob(address=listening["address"], diary=str(diary), rate_hz=10.0, seed=seed)
-        sender = stack.enter_context(job.start())
+        sender = stack.enter_context(SenderThread(job))
         until(lambda: diary.exists() and bool(read_diaries([diary]).acked()))
         before = node.memory_bytes
         rng = random.Random(seed)
@@ -129,7 +130,7 @@ def hostile(folder: Path, *, seed: int, count: int, rate_hz: float = 20.0) -> Fo
 
 def record_ended(node: JsonLinesProcess, record: RestartedRecorder) -> Found:
     """Stop a central node, and check for remaining processes and tracebacks."""
-    return {"exit code": node.stop()} | record.finish([])
+    return {"exit code": node.stop()} | record.finish()
 
 
 class _Crowd:

@@ -73,7 +73,7 @@ class NetworkFaultCounts:
 SHORT = NetworkFaultCounts(
     n_kills=20, rate_hz=40.0, n_seal_kills=3, n_worker_kills=10, away_s=2.0, meddled_s=3.0, cable_s=6.0, n_captures=2,
     n_hostile=200, n_fuzzed=10_000, n_hellos=60, n_files=60, overload_s=3.0, slow_s=8.0, n_pulses=40, n_power_cuts=60,
-    n_flips=30, n_gone=5,
+    n_flips=16, n_gone=3,
 )  # fmt: skip
 LONG = NetworkFaultCounts(
     n_kills=1_000, rate_hz=10.0, n_seal_kills=200, n_worker_kills=500, away_s=30.0, meddled_s=120.0, cable_s=120.0,

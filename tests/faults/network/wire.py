@@ -26,6 +26,7 @@ from tests.faults.network.busy import BUSY_ERTIS, BUSY_S
 from tests.faults.network.kills import RestartedRecorder
 from tests.faults.network.links import state_of
 from tests.faults.network.meddler import Direction, Meddler
+from tests.faults.network.sender_thread import SenderThread
 
 __all__ = ["flips", "gone"]
 
@@ -70,9 +71,8 @@ def flips(folder: Path, *, seed: int, count: int) -> Found:
             job = SenderJob(
                 address=cables[0].address, diary=str(diary), rate_hz=_RATE_HZ, seed=seed, ring_bytes=_RING_BYTES
             )
-            sender = clients.enter_context(
-                job.replace(keys=(str(folder / "keys" / "front.secret.toml"), server)).start()
-            )
+            key = str(folder / "keys" / "front.secret.toml")
+            sender = clients.enter_context(SenderThread(job.replace(keys=(key, server))))
             viewer, admin = (ClientKeys(pair=pairs[name], server=server) for name in ("viewer", "boss"))
             clients.enter_context(_repeating(partial(_watch, cables[1].address, viewer)))
             for cable in cables[2:]:
@@ -189,7 +189,7 @@ def gone(folder: Path, *, seed: int, count: int) -> Found:
         node = stack.enter_context(record.start(BUSY_ERTIS))
         node.wait_for("listening")
         pid, before = node.node_pid, _tcp_sockets(node.node_pid)
-        sender = stack.enter_context(job.start())
+        sender = stack.enter_context(SenderThread(job))
         sender.wait_for("begun")
         for first in range(0, count, _N_VICTIMS):
             victims = [folder / f"victim{number}.ndjson" for number in range(first, min(count, first + _N_VICTIMS))]
@@ -203,7 +203,7 @@ def gone(folder: Path, *, seed: int, count: int) -> Found:
         until(lambda: _tcp_sockets(pid) <= before, timeout_s=5.0)
         left = _tcp_sockets(pid) - before if restarts == 0 else 0
         code = node.stop()
-    ended = record.finish([])
+    ended = record.finish()
     found = {"kills": len(diaries) - 1, "restarts": restarts, "sockets left": max(0, left), "flushed": flushed}
     return found | {"exit code": code} | ended | judged(folder, record.archive, diaries, kept=[steady])
 
