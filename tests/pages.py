@@ -107,13 +107,13 @@ class Forked(NamedTuple):
 _FORKING = """
 import gc, importlib, json, os, sys
 
-preload, folder = json.loads(sys.stdin.readline())
+preload, unloaded, folder = json.loads(sys.stdin.readline())
 for name in preload:
     importlib.import_module(name)
 if "numba" in preload:
     sys.modules["numba"].njit(lambda: 0)()  # loads what each compiled function needs
-ours = [name for name in sys.modules if name.partition(".")[0] in {"ertis_numba", "ertis_cli", "ertis_bench"}]
-assert not ours, ours
+loaded = {name.partition(".")[0] for name in sys.modules}
+assert loaded.isdisjoint(unloaded), sorted(loaded.intersection(unloaded))
 gc.freeze()  # the last collection of each program would scan and copy all of it
 for program in iter(sys.stdin.readline, ""):
     child = os.fork()
@@ -128,12 +128,14 @@ for program in iter(sys.stdin.readline, ""):
 
 
 @contextlib.contextmanager
-def forking(place, output, preload=("numpy", "scipy.fft", "scipy.spatial", "numba", "h5py", "click", "msgspec")):
+def forking(
+    place, output, preload=("numpy", "scipy.fft", "scipy.spatial", "numba", "h5py", "click", "msgspec"), unloaded=()
+):
     """Yield a function that runs a Python program in a fork of one interpreter and returns a `Forked`.
 
-    That interpreter has imported only the libraries named in ``preload``. Each program imports the modules of this
-    project itself, as in a process of its own, but takes a third of the processor time. The function writes files to
-    the folder ``output``.
+    That interpreter has imported only the libraries named in ``preload``, and none of ``unloaded``. Each program
+    imports the modules of this project itself, as in a process of its own, but takes a third of the processor time.
+    The function writes files to the folder ``output``.
     """
     with subprocess.Popen(
         [sys.executable, "-W", "error", "-c", _FORKING],
@@ -149,7 +151,8 @@ def forking(place, output, preload=("numpy", "scipy.fft", "scipy.spatial", "numb
             code = int(process.stdout.readline())
             return Forked(code, *((output / end).read_text("utf-8") for end in ("out", "err")))
 
-        print(json.dumps([list(preload), str(output.absolute())]), file=process.stdin, flush=True)
+        unloaded = [*unloaded, "ertis_numba", "ertis_cli", "ertis_bench"]
+        print(json.dumps([list(preload), unloaded, str(output.absolute())]), file=process.stdin, flush=True)
         yield run_forked
     assert process.returncode == 0
 
