@@ -5,7 +5,7 @@ import subprocess
 import sys
 
 from tests import test_network_page as network
-from tests.pages import environment, page, python_in, run
+from tests.pages import environment, page, python_in, run_code_here
 from tests.publishing import Publisher, cloud
 
 PAGE = page("applications")
@@ -17,15 +17,16 @@ def test_application_loop_of_the_page_runs(tmp_path):
     clouds = [cloud(number, position_m=[[0.3, 0.4, 0], [3, 0, 0]]) for number in range(6)]
     with Publisher() as publisher, publisher.playing(clouds):
         code = code.replace("tcp://127.0.0.1:5602", publisher.address)
-        reported = run(tmp_path, sys.executable, "-W", "error", "-c", code).stdout.splitlines()
+        reported = run_code_here(tmp_path, code).splitlines()
     numbers = [int(re.fullmatch(r"#(\d): nearest at 0\.50 m, 2 points", line)[1]) for line in reported]
     assert numbers == sorted(set(numbers))
     assert numbers[-1] >= 3
     assert max(numbers[:-1], default=0) < 3
 
 
-def test_application_commands_of_the_page_run(place, ports, platform):
+def test_application_commands_of_the_page_run(place, ports, platform, monkeypatch):
     """Nothing is near, so the vehicle may go."""
+    monkeypatch.setenv("ERTIS_SERVE_WORKERS", "1")
     lines = re.findall(r"^\$ (.*)$", PAGE, re.MULTILINE)
     assert [line.split()[1] for line in lines] == ["example", "emulate", "serve", "capture", "2_safety_stop.py"]
     *commands, example = lines

@@ -14,6 +14,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
+from ertis_cli.main import cli
 
 from ertis_numba.capture import CaptureSession
 from ertis_numba.capture.gap_reasons import DROPPED, NOT_TRIGGERED
@@ -372,9 +374,10 @@ def start(tmp_path, *arguments):
 
 
 def run(tmp_path, *arguments):
-    process = start(tmp_path, *arguments)
-    out, err = process.communicate(timeout=60)
-    return process.returncode, [json.loads(line) for line in out.splitlines()], err
+    """Run the command in this process."""
+    with contextlib.chdir(tmp_path):
+        done = CliRunner().invoke(cli, ["capture", "--settings", str(settings_file(tmp_path)), *arguments])
+    return done.exit_code, [json.loads(line) for line in done.stdout.splitlines()], done.stderr
 
 
 def has_open(process, path):
@@ -402,9 +405,8 @@ def test_capture_command_reports_and_writes_a_recording(tmp_path, sensor, words)
     [(signal.SIGINT, (), 0), (signal.SIGTERM, (), 0), (signal.SIGINT, ("-n", "1000"), 130)],
 )
 def test_capture_command_completes_its_file_on_signal(tmp_path, sensor, number, arguments, code):
-    process = start(
-        tmp_path, "--port", str(sensor.link), "--rate", "20", "--json", "-o", "rec.h5", "--quiet", *arguments
-    )
+    command = ["--port", str(sensor.link), "--rate", "20", "--json", "-o", "rec.h5", "--quiet", "--no-check-bits"]
+    process = start(tmp_path, *command, *arguments)
     first = [process.stdout.readline() for _ in range(3)]
     process.send_signal(number)
     out, err = process.communicate(timeout=30)
@@ -447,13 +449,9 @@ def test_capture_command_does_not_load_hdf5(tmp_path, sensor):
 
 
 def test_capture_dry_run_prints_commands_and_opens_no_port(tmp_path):
-    done = subprocess.run(
-        [*ERTIS, "capture", "--port", "none", "--dry-run", "--trigger", "sync", "--pin", "2"],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    with contextlib.chdir(tmp_path):
+        done = CliRunner().invoke(cli, ["capture", "--port", "none", "--dry-run", "--trigger", "sync", "--pin", "2"])
+    assert done.exit_code == 0, done.stderr
     assert "!G,655360,0,0         measurement length: 655360 bytes\n" in done.stdout
     assert "!C,0… to 1125         samples of the call, unless the sensor already has them\n" in done.stdout
     assert not list(tmp_path.iterdir())

@@ -28,6 +28,7 @@ from tests.emulated import N_SAMPLES, TIMEOUT_S, WORDS, ask, block, is_block
 from tests.files import noise
 
 MODULE = [sys.executable, "-m", "ertis_cli", "emulate"]
+SHORT = Settings(recording=Recording(n_samples=N_SAMPLES), processing=Processing(range_m=(0.3, 0.5)))
 ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
 
 
@@ -174,22 +175,6 @@ range_m = 0.4
 """
 
 
-def test_emulate_renders_a_scene(emulate, tmp_path):
-    (tmp_path / "scene.toml").write_text(SCENE)
-    process = emulate(tmp_path / "scene.toml", "--seed", 4, "--quiet")
-    scene = Scene.from_toml(SCENE).replace(seed=4)
-    (sensor,) = scene.sensors
-    silent = scene.replace(sensors=(sensor.replace(emitter=sensor.emitter.replace(silent=True)),))
-    with serial.Serial(process.stdout.readline().rstrip(), timeout=TIMEOUT_S) as port:
-        ask(port, b"!G,131072,0,0\n")
-        for counter, active in enumerate((1, 1, 0, 1)):
-            port.write(b"!A,%d,0,0\n" % active)
-            heard = scene if active else silent  # all effects are on, as selecting the relevant ones is slow
-            words = Engine(heard, heard.sensors[0], frozenset(EFFECTS)).render(counter % 2).data
-            assert is_block(block(port), counter, words)
-    assert ended(process, signal.SIGTERM) == (143, "", "")
-
-
 @pytest.mark.parametrize(
     ("options", "code", "message"),
     [
@@ -222,39 +207,46 @@ def captured(port, settings):
         return sonar.measure().data
 
 
-def test_emulate_renders_a_scene_for_the_configured_call(emulate, tmp_path):
-    (tmp_path / "scene.toml").write_text(SCENE)
-    process = emulate(tmp_path / "scene.toml", "--quiet")
-    settings = Settings.from_preset("short_20_80")
-    words = captured(process.stdout.readline().rstrip(), settings)
-    (sensor,) = Scene.from_toml(SCENE).sensors
-    sensor = sensor.replace(call=settings.call, recording=settings.recording, processing=settings.processing)
-    scene = Scene.from_toml(SCENE).replace(sensors=(sensor,))
-    assert np.array_equal(words, Engine(scene, sensor, frozenset(EFFECTS)).render().data)
-    assert ended(process, signal.SIGTERM)[0] == 143
-
-
-@pytest.mark.parametrize(
-    ("source", "reported"),
-    [
-        ("scene", "only received a call that is neither a preset's nor its scene's (50 to 25 kHz in 2.5 ms)"),
-        ("recording", "left was recorded with a call of 50 to 25 kHz in 2.5 ms and 32768 samples at 4.5 MHz"),
-    ],
-)
-def test_emulate_rejects_a_call_without_measurements(emulate, recording, tmp_path, source, reported):
-    (tmp_path / "scene.toml").write_text(SCENE)
-    process = emulate(*([tmp_path / "scene.toml"] if source == "scene" else [recording, "--sensor", "left"]), "--quiet")
-    port = process.stdout.readline().rstrip()
-    settings = Settings(
-        call=Call(start_frequency_hz=25e3, stop_frequency_hz=50e3), recording=Recording(n_samples=N_SAMPLES)
-    )
-    settings = settings.replace(processing=Processing(range_m=(0.3, 0.5)))
-    for _ in range(2):  # the device keeps the call for the second attempt
+def rejected(process, port, settings, message):
+    """Check that a device rejects a call twice, although it keeps the call for the second attempt."""
+    other = Call(start_frequency_hz=settings.call.stop_frequency_hz, stop_frequency_hz=settings.call.start_frequency_hz)
+    for _ in range(2):
         with pytest.raises(SonarError, match="'ertis emulate' prints the reason"):
-            captured(port, settings)
-        assert process.stderr.readline().startswith(f"ertis: warning: {reported}")
-    accepted = settings.replace(call=Call())
-    assert len(captured(port, accepted)) == N_SAMPLES
+            captured(port, settings.replace(call=other))
+        assert process.stderr.readline().startswith(f"ertis: warning: {message}")
+
+
+def test_emulate_renders_a_scene_for_the_configured_call(emulate, tmp_path):
+    """The device renders the call of its scene and the calls of presets, and rejects others."""
+    (tmp_path / "scene.toml").write_text(SCENE)
+    process = emulate(tmp_path / "scene.toml", "--seed", 4, "--quiet")
+    path = process.stdout.readline().rstrip()
+    scene = Scene.from_toml(SCENE).replace(seed=4)
+    (sensor,) = scene.sensors
+    silent = scene.replace(sensors=(sensor.replace(emitter=sensor.emitter.replace(silent=True)),))
+    with serial.Serial(path, timeout=TIMEOUT_S) as port:
+        ask(port, b"!G,131072,0,0\n")
+        for counter, active in enumerate((1, 1, 0, 1)):
+            port.write(b"!A,%d,0,0\n" % active)
+            heard = scene if active else silent  # all effects are on, as selecting the relevant ones is slow
+            words = Engine(heard, heard.sensors[0], frozenset(EFFECTS)).render(counter % 2).data
+            assert is_block(block(port), counter, words)
+    settings = Settings.from_preset("short_20_80")
+    sensor = sensor.replace(call=settings.call, recording=settings.recording, processing=settings.processing)
+    engine = Engine(scene.replace(sensors=(sensor,)), sensor, frozenset(EFFECTS))
+    assert np.array_equal(captured(path, settings), engine.render().data)
+    message = "only received a call that is neither a preset's nor its scene's (50 to 25 kHz in 2.5 ms)"
+    rejected(process, path, SHORT, message)
+    assert len(captured(path, SHORT)) == N_SAMPLES
+    assert ended(process, signal.SIGTERM) == (143, "", "")
+
+
+def test_emulate_rejects_a_call_without_measurements(emulate, recording):
+    process = emulate(recording, "--sensor", "left", "--quiet")
+    port = process.stdout.readline().rstrip()
+    message = "left was recorded with a call of 50 to 25 kHz in 2.5 ms and 32768 samples at 4.5 MHz"
+    rejected(process, port, SHORT, message)
+    assert len(captured(port, SHORT)) == N_SAMPLES
     assert ended(process, signal.SIGTERM) == (143, "", "")
 
 
@@ -273,8 +265,7 @@ def test_emulate_renders_a_scene_before_answering_pulses(emulate, tmp_path):
     (tmp_path / "scene.toml").write_text(SCENE)
     process = emulate(tmp_path / "scene.toml", "--sync-rate", 5)
     with SonarDriver.open(process.stdout.readline().rstrip()) as sonar:
-        settings = Settings(recording=Recording(n_samples=N_SAMPLES), processing=Processing(range_m=(0.3, 0.5)))
-        sonar.configure(Setup.of(settings))
+        sonar.configure(Setup.of(SHORT))
         sonar.arm()
         blocks = sonar.listen(stop=lambda: False, timeout_s=TIMEOUT_S)
         words = [next(blocks).data for _ in range(3)]

@@ -2,11 +2,14 @@
 
 import json
 import shutil
+import subprocess
+import sys
 from pathlib import Path, PurePath
+from types import SimpleNamespace
 
 import pytest
 from click.testing import CliRunner
-from ertis_cli import _examples
+from ertis_cli import _examples, demo
 from ertis_cli.main import cli
 
 from ertis_numba.simulation import load_scene
@@ -96,11 +99,25 @@ def test_demo_keeps_files_of_an_earlier_demo():
 
 
 def test_demo_writes_recording_and_picture_of_four_sensors(tmp_path, monkeypatch):
-    """Each sensor renders one measurement instead of the thirty of the shipped scene."""
+    """Each sensor renders one measurement instead of the thirty of the shipped scene.
+
+    Nodes run as processes, and commands that end by themselves in this process.
+    """
+    ran = []
+
+    def run_here(command, *, env, **_):
+        assert command[:3] == [sys.executable, "-m", "ertis_cli"]
+        ran.append(command[3])
+        return SimpleNamespace(returncode=CliRunner(env=env).invoke(cli, command[3:]).exit_code)
+
     scene = tmp_path / "small.toml"
     scene.write_text(_examples.examples()["platform.toml"].read_text("utf-8").replace("count = 30", "count = 1"))
     monkeypatch.setattr(_examples, "named", lambda name: {name: scene})
+    replaced = SimpleNamespace(**vars(subprocess) | {"run": run_here})
+    monkeypatch.setattr(demo, "subprocess", replaced)
+    monkeypatch.setenv("ERTIS_SERVE_WORKERS", "1")
     run("demo", "-n", "2", "--quiet")
+    assert ran == ["devices", "capture", "status", "verify", "process", "peaks", "plot"]
     (recording,) = Path("demo/recordings").glob("*.h5")
     assert 1 <= len(open_recording(recording, sensor="front")) <= 2
     assert Path("demo/image.png").stat().st_size > 10_000

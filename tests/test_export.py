@@ -3,8 +3,6 @@
 import csv
 import json
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +19,7 @@ from ertis_numba.interop import FORMATS, TOPICS, choose_format, export, output_f
 from ertis_numba.settings import Air
 from ertis_numba.storage import write_energyscapes, write_recording
 from tests.files import SMALL, image, noise
-from tests.pages import page
+from tests.pages import page, run_code_here
 
 ROOT = Path(__file__).parents[1]
 PAGE = page("export")
@@ -286,7 +284,4 @@ def test_export_page_commands_and_code_run(place):
     with ertis.open_recording("REC.h5") as recording:
         assert [stamp.sequence for stamp in recording.stamps()] == [3, 4]
     code = "\n".join(re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL))
-    command = [sys.executable, "-W", "error", "-c", code]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=place)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines() == ["(1, 181, 1178) sensor", "{'time': 1, 'sample': 163840}"]
+    assert run_code_here(place, code).splitlines() == ["(1, 181, 1178) sensor", "{'time': 1, 'sample': 163840}"]

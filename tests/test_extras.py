@@ -1,8 +1,6 @@
 """Commands in an environment without an extra: one line names the extra, and all other commands work."""
 
 import re
-import subprocess
-import sys
 from configparser import ConfigParser
 from importlib.metadata import packages_distributions
 from pathlib import Path
@@ -10,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.files import noise
-from tests.pages import environment
+from tests.pages import forking
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = packages_distributions()
@@ -46,7 +44,7 @@ RUN = (
 if {words!r}[0].endswith(".py"):
     runpy.run_path({words!r}[0], run_name="__main__")
 else:
-    from ertis_cli.main import main
+    from ertis_cli.__main__ import main
     sys.argv[1:] = {words!r}
     main()
 """
@@ -95,14 +93,6 @@ def cases():
             yield pytest.param(name, blocked, line, id=f"{name}-{'+'.join(blocked)}-{line.split()[0]}")
 
 
-def python(place, code):
-    command = [sys.executable, "-c", code]
-    done = subprocess.run(
-        command, cwd=place, env=environment(place), capture_output=True, text=True, timeout=60, check=False
-    )
-    return done.returncode, done.stdout, done.stderr
-
-
 def files(place):
     """Files of the folder, except Matplotlib's list of fonts."""
     return {path for path in place.rglob("*") if path.is_file() and not path.name.startswith("fontlist")}
@@ -118,14 +108,23 @@ def place(tmp_path_factory):
     return folder
 
 
+@pytest.fixture(scope="module")
+def run_forked(place, tmp_path_factory):
+    """Run programs that import none of the packages of extras before they are blocked."""
+    blocked = {module for names in extras().values() for each in names for module in modules_of(each)}
+    preload = ("numpy", "scipy.fft", "scipy.spatial", "h5py", "click", "msgspec", "matplotlib.figure")
+    with forking(place, tmp_path_factory.mktemp("output"), preload, unloaded=sorted(blocked)) as run_forked:
+        yield run_forked
+
+
 def test_every_extra_has_a_command_that_needs_it():
     assert set(NEEDED_BY) == set(extras())
 
 
 @pytest.mark.parametrize(("name", "blocked", "line"), [*cases()])
-def test_missing_extra_is_named_in_one_line(place, name, blocked, line):
+def test_missing_extra_is_named_in_one_line(place, run_forked, name, blocked, line):
     before = files(place)
-    code, out, err = python(place, RUN.format(blocked=blocked, words=line.format(root=ROOT).split()))
+    code, out, err = run_forked(RUN.format(blocked=blocked, words=line.format(root=ROOT).split()))
     assert code == 1, (out, err)
     lines = err.splitlines()
     assert len(lines) == 1, err
@@ -135,11 +134,11 @@ def test_missing_extra_is_named_in_one_line(place, name, blocked, line):
     assert files(place) == before
 
 
-def test_commands_work_without_extras(place):
+def test_commands_work_without_extras(run_forked):
     blocked = [module for names in extras().values() for each in names for module in modules_of(each)]
-    code, out, err = python(place, HELP.format(blocked=blocked))
+    code, out, err = run_forked(HELP.format(blocked=blocked))
     assert code == 0, (out, err)
     line = "process a.h5 -o {} --force --quiet --device cpu"
     for words in (line.format("images.h5"), "export images.h5 -o cloud.ply", "plot images.h5 -o image.png"):
-        code, out, err = python(place, RUN.format(blocked=blocked, words=words.split()))
+        code, out, err = run_forked(RUN.format(blocked=blocked, words=words.split()))
         assert code == 0, (words, out, err)

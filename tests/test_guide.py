@@ -17,7 +17,19 @@ import ertis_numba
 from ertis_numba import kernels
 from ertis_numba.storage import GroundTruth, open_recording
 from tests.files import noise
-from tests.pages import DOCS, GUIDE, ROOT, commands_in, environment, in_background, page, python_in, run, run_here
+from tests.pages import (
+    DOCS,
+    GUIDE,
+    ROOT,
+    commands_in,
+    environment,
+    in_background,
+    page,
+    python_in,
+    run,
+    run_code_here,
+    run_here,
+)
 from tests.publishing import Publisher, cloud
 
 RUN_BY = {
@@ -108,7 +120,7 @@ def test_quickstart_page_runs(place):
             elif command != "doctor":  # test_doctor
                 run_here(place, command)
     (code,) = python_in(text)
-    assert "1.15 m at" in run(place, sys.executable, "-W", "error", "-c", code).stdout
+    assert "1.15 m at" in run_code_here(place, code)
     assert (place / "image.png").stat().st_size > 10_000
     assert len(open_recording(place / "CAPTURED.h5")) == 10
 
@@ -129,7 +141,7 @@ def test_own_array_page_runs(place):
     assert ertis_numba.load_layout(place / "ring8.toml").word_bits == 8
     assert (open_recording(place / "echoes.h5")[0].data == numbers[192:]).all()
     (code,) = python_in(text)
-    run(place, sys.executable, "-W", "error", "-c", code)
+    run_code_here(place, code)
     assert open_recording(place / "mine.h5")[0].data.dtype == "u4"
 
 
@@ -143,8 +155,8 @@ def test_commands_of_the_guide_run(place, name):
 def test_code_of_the_concepts_page_runs(place):
     run_here(place, "example reflectors")
     (code,) = python_in(page("concepts"))
-    reported = run(place, sys.executable, "-W", "error", "-c", code + "\nprint(image.amplitude.shape[0])")
-    assert reported.stdout.strip() == "81"
+    reported = run_code_here(place, code + "\nprint(image.amplitude.shape[0])")
+    assert reported.strip() == "81"
 
 
 def test_commands_of_the_gpu_page_run():

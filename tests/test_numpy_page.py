@@ -1,13 +1,12 @@
 """The examples of ``docs/how-to/numpy.md`` run, and are short."""
 
 import re
-import sys
 
 import pytest
 
 from ertis_numba.analysis.compare import compare
 from ertis_numba.storage import open_recording
-from tests.pages import ROOT, page, python_in, run
+from tests.pages import ROOT, page, python_in, run_code_here
 
 PAGE = page("numpy")
 EXAMPLES = python_in(PAGE)
@@ -28,8 +27,7 @@ def test_page_has_short_examples():
 
 @pytest.mark.parametrize("number", range(4))
 def test_page_examples_run(place, number):
-    code = "import matplotlib; matplotlib.use('Agg')\n" + EXAMPLES[number]
-    shown = run(place, sys.executable, "-W", "error", "-c", code).stdout
+    shown = run_code_here(place, EXAMPLES[number])
     if number == 1:
         assert (place / "numpy.png").stat().st_size > 10_000
     if number == 2:
@@ -53,7 +51,7 @@ def test_own_beamformer_finds_the_reflectors(place):
         "    with ertis_numba.open_recording('reflectors.h5') as recording:\n"
         "        return recording[index]\n"
     )
-    run(place, sys.executable, "-W", "error", "-c", before + code)
+    run_code_here(place, before + code)
     from ertis_numba.storage import open_energyscapes  # noqa: PLC0415
 
     with open_recording(RECORDING) as recording, open_energyscapes(place / "own.h5") as images:

@@ -51,10 +51,16 @@ CLASSES_ALLOWED = {"Lane": "the protocol of every device, and its implementation
 """Class names that are used twice, and why."""
 
 
+NAMED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef, ast.arg, ast.Assign, ast.AnnAssign)
+
+
 @cache
 def modules():
+    """Return the nodes of each module that document or define a name."""
     return {
-        path.relative_to(ROOT).as_posix(): ast.parse(path.read_text("utf-8"))
+        path.relative_to(ROOT).as_posix(): [
+            node for node in ast.walk(ast.parse(path.read_text("utf-8"))) if isinstance(node, NAMED)
+        ]
         for package in PACKAGES
         for path in sorted((ROOT / package).rglob("*.py"))
     }
@@ -62,8 +68,8 @@ def modules():
 
 def documented():
     """Yield (path, name, docstring) of every module, class and function."""
-    for path, tree in modules().items():
-        for node in ast.walk(tree):
+    for path, nodes in modules().items():
+        for node in nodes:
             if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
                 text = ast.get_docstring(node)
                 if text:
@@ -72,8 +78,8 @@ def documented():
 
 def identifiers():
     """Yield (path, identifier) of every class, function, parameter, constant and attribute that is defined."""
-    for path, tree in modules().items():
-        for node in ast.walk(tree):
+    for path, nodes in modules().items():
+        for node in nodes:
             match node:
                 case ast.ClassDef(name=name) | ast.FunctionDef(name=name) | ast.arg(arg=name):
                     yield path, name
@@ -147,8 +153,8 @@ def test_identifiers_use_the_words_of_the_glossary():
 
 def test_class_names_are_used_once():
     places = defaultdict(list)
-    for path, tree in modules().items():
-        for node in ast.walk(tree):
+    for path, nodes in modules().items():
+        for node in nodes:
             if isinstance(node, ast.ClassDef):
                 places[node.name].append(path)
     twice = {name: paths for name, paths in places.items() if len(paths) > 1}
@@ -173,8 +179,8 @@ def sentences_of(text):
 
 def test_docstrings_name_existing_parameters_and_attributes():
     bad = []
-    for path, tree in modules().items():
-        for node in ast.walk(tree):
+    for path, nodes in modules().items():
+        for node in nodes:
             if isinstance(node, ast.ClassDef | ast.FunctionDef) and (text := ast.get_docstring(node)):
                 known = names_within(node)
                 for section in ("Parameters", "Attributes"):
@@ -209,4 +215,4 @@ def names_within(node):
 
 @cache
 def classes():
-    return {node.name: node for tree in modules().values() for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}
+    return {node.name: node for nodes in modules().values() for node in nodes if isinstance(node, ast.ClassDef)}

@@ -3,6 +3,7 @@
 import contextlib
 import importlib.metadata
 import re
+import shlex
 import shutil
 import sys
 from pathlib import Path
@@ -12,7 +13,7 @@ from ertis_cli.main import COMMANDS
 
 from ertis_numba.storage import open_recording, write_recording
 from tests.files import SMALL, noise
-from tests.pages import commands_in, in_background, page, run, run_here
+from tests.pages import command_program, commands_in, forking, in_background, page, run_code_here, run_here
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -44,7 +45,7 @@ def place(tmp_path, monkeypatch):
 
 def test_readme_code_runs(place):
     (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
-    run(place, sys.executable, "-W", "error", "-c", code)
+    run_code_here(place, code)
     assert (place / "image.png").stat().st_size > 10_000
 
 
@@ -56,22 +57,24 @@ def test_readme_describes_every_folder():
     } == set()
 
 
-def test_readme_commands_run(place):
-    """Run each command in its own process at its first occurrence."""
+def test_readme_commands_run(place, tmp_path_factory):
+    """Each command imports its own modules at its first occurrence."""
     started = set()
-    with contextlib.ExitStack() as background:
+    with contextlib.ExitStack() as stack:
+        run_forked = stack.enter_context(forking(place, tmp_path_factory.mktemp("output")))
         for command in commands_in(README.replace(NETWORK, "")):
-            name, *arguments = command.split()
+            name, *arguments = shlex.split(command)
             if name in ELSEWHERE:
                 continue
             if (place / "REC.h5").exists() and "REC.h5" in arguments and name in {"import", "simulate"}:
                 (place / "REC.h5").unlink()  # The README shows two ways to make a recording.
-            if arguments and arguments[-1] == "&":
-                background.enter_context(in_background(place, command))
+            if arguments[-1:] == ["&"]:
+                stack.enter_context(in_background(place, command))
             elif name in started:
                 run_here(place, command)
             else:
-                run(place, sys.executable, "-m", "ertis_cli.main", name, *arguments)
+                done = run_forked(command_program([name, *arguments]))
+                assert done.code == 0, (command, done)
             started.add(name)
     assert started == {*COMMANDS} - ELSEWHERE - {"bench"}
     assert (place / "IMAGES" / "first.energy.h5").exists()
@@ -90,18 +93,18 @@ def test_commands_of_the_devices_page_run(place):
         assert 10 <= len(recording) <= 20  # A busy emulator ignores pulses during a measurement.
 
 
-def test_readme_example_runs(place):
+def test_readme_example_runs(place, monkeypatch):
     """The example prints the nearest strong reflector of the emulated recording."""
+    example = ROOT / "examples" / "1_nearest_reflector.py"
+    monkeypatch.setattr(sys, "argv", [str(example), "sensor"])
     with in_background(place, "emulate data/synthetic/reflectors.h5 &"):
-        reported = run(
-            place, sys.executable, "-W", "error", str(ROOT / "examples" / "1_nearest_reflector.py"), "sensor"
-        )
-    assert reported.stdout.splitlines() == [f"#{number}: 1.15 m at -38°" for number in range(5)]
+        reported = run_code_here(place, example.read_text("utf-8"), str(example))
+    assert reported.splitlines() == [f"#{number}: 1.15 m at -38°" for number in range(5)]
 
 
 def test_commands_of_the_simulation_page_run(place):
     (code,) = re.findall(r"```python\n(.*?)```", SIMULATION, re.DOTALL)
-    reported = run(place, sys.executable, "-W", "error", "-c", code).stdout
+    reported = run_code_here(place, code)
     assert "absorption True" in reported
     assert reported.endswith("() ()\n")  # No missed reflector and no ghost.
     for command in commands_in(SIMULATION):

@@ -7,11 +7,11 @@ filters and installs other top-level packages.
 import functools
 import importlib.metadata
 import json
-import subprocess
-import sys
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
+from ertis_cli.main import cli
 
 import ertis_numba as ertis
 from ertis_numba.geometry import unit_vectors
@@ -21,10 +21,8 @@ RAW = importlib.metadata.distribution("rtisdev").locate_file("rtisdev/simulate.b
 
 
 def run(*command):
-    done = subprocess.run(
-        [sys.executable, "-m", "ertis_cli", *map(str, command)], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
+    done = CliRunner().invoke(cli, [*map(str, command)])
+    assert done.exit_code == 0, (done.stderr, done.exception)
     return done.stdout
 
 

@@ -5,7 +5,6 @@ import os
 import re
 import signal
 import socket
-import sys
 import threading
 import webbrowser
 
@@ -17,7 +16,7 @@ from ertis_cli.main import cli
 from ertis_numba.storage import write_energyscapes
 from ertis_numba.viewer import ViewedScene, Viewer
 from ertis_numba.viewer._recordings import MAX_BYTES
-from tests.pages import commands_in, path_of, run, run_here
+from tests.pages import commands_in, path_of, run_code_here, run_here
 from tests.publishing import Publisher, image as published
 from tests.views import PATIENCE_S, stamped
 
@@ -174,8 +173,7 @@ def test_commands_of_the_page_on_the_view_run(tmp_path):
                 assert reported["source"] == words.split()[1]
     assert (tmp_path / "PAGE.html").stat().st_size > 500_000
     (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    done = run(tmp_path, sys.executable, "-W", "error", "-c", code)
-    assert done.stdout.startswith("http://127.0.0.1:")
+    assert run_code_here(tmp_path, code).startswith("http://127.0.0.1:")
 
 
 def test_recording_limit_matches_its_documentation():

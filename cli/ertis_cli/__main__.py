@@ -1,5 +1,6 @@
 """Entry point of the ``ertis`` command, also as ``python -m ertis_cli``."""
 
+import gc
 import sys
 
 _INTERRUPTED = 130
@@ -11,11 +12,11 @@ def main() -> None:
         code = _run()
     except KeyboardInterrupt:  # before the handlers are installed
         code = _interrupted()
+    gc.freeze()  # the last collection would scan all modules and free nothing that matters; it takes 0.1 to 0.3 s
     sys.exit(code)
 
 
 def _run() -> str | int | None:
-    import gc
     import signal
 
     gc.set_threshold(50_000)  # imports create many permanent objects; scanning them takes 60 ms

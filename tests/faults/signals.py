@@ -13,14 +13,13 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-from ertis_bench.network.processes import ask
-
 from ertis_numba.journal import SUFFIX, Journal, JournalEntry
-from ertis_numba.storage import open_recording
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.storage import open_recording, write_energyscapes
 from tests.faults import captures
 
 __all__ = ["COMMANDS", "MAX_END_S", "send"]
@@ -80,10 +79,15 @@ def send(folder: Path, source: Path, *, seed: int, count: int, only: Sequence[st
     """
     rng = random.Random(seed)
     found: dict[str, dict[str, Any]] = {}
-    with _default_signals(), captures.emulated(source, folder) as ports:
-        paths = _files(folder, source) | {"port": ports[0]}
-        for command in only or COMMANDS:
-            found[command] = _to_command(command, paths, folder / "out", rng, count)
+    commands = only or tuple(COMMANDS)
+    begins_s = _interpreter_s()
+    with ExitStack() as stack:
+        stack.enter_context(_default_signals())
+        paths = _files(folder, source)
+        if any("{port}" in COMMANDS[command] for command in commands):
+            paths["port"] = stack.enter_context(captures.emulated(source, folder))[0]
+        for command in commands:
+            found[command] = _to_command(command, paths, folder / "out", rng, count, begins_s)
     slowest = max(found, key=lambda command: float(found[command]["slowest_s"]))
     total = {name: sum(each[name] for each in found.values()) for name in ("signals", *_FAULTS)}
     return {
@@ -123,8 +127,8 @@ def _files(folder: Path, source: Path) -> dict[str, str]:
             journal.add_sensor(measurement.stamp.sensor, measurement.settings)
             journal.append([JournalEntry(measurement, monotonic_ns=0)])
             shutil.copytree(made, crashed)  # The copy equals the files of a killed process.
-    done = ask("process", str(source), "-o", str(images), "--quiet")
-    done.check_returncode()
+        with Pipeline(measurement.settings) as pipeline:
+            write_energyscapes(images, [pipeline.process(measurement)])
     return {
         "recording": str(source),
         "scene": str(_SCENE),
@@ -134,8 +138,9 @@ def _files(folder: Path, source: Path) -> dict[str, str]:
     }
 
 
-def _to_command(command: str, paths: dict[str, str], out: Path, rng: random.Random, count: int) -> dict[str, Any]:
-    begins_s = _interpreter_s()
+def _to_command(
+    command: str, paths: dict[str, str], out: Path, rng: random.Random, count: int, begins_s: float
+) -> dict[str, Any]:
     lasts_s, _, _, _ = _run_command(command, paths, out, None, _UNDISTURBED_S)
     found: dict[str, Any] = {"signals": 0, **dict.fromkeys(_FAULTS, 0), "slowest_s": 0.0}
     examples: Counter[str] = Counter()
