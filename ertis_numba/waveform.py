@@ -63,14 +63,21 @@ def call_at(call: Call, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
     A custom waveform is oversampled 16 times by its Fourier series, and then interpolated by cubic splines. Their error
     is -100 dB at half of the sample rate, and less at lower frequencies.
     """
-    inside_s = np.clip(time_s, 0.0, call.duration_s)
+    time_s = np.asarray(time_s)
+    inside = (time_s >= 0.0) & (time_s <= call.duration_s)
+    values = np.zeros(time_s.shape)
+    values[inside] = _inside(call, time_s[inside])
+    return values
+
+
+def _inside(call: Call, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the call at times within ``[0, duration_s]``."""
     if call.waveform is not None:
-        return np.where(inside_s == time_s, _interpolator(call)(inside_s), 0.0)
-    phase_rad = _phase_rad(call, inside_s)
-    edge_s = np.minimum(inside_s, call.duration_s - inside_s)
+        return _interpolator(call)(time_s)
+    edge_s = np.minimum(time_s, call.duration_s - time_s)
     ramp_s = call.ramp_fraction * call.duration_s
     ramp = np.sin(math.pi / 2 * np.minimum(edge_s, ramp_s) / ramp_s) ** 2 if ramp_s else 1.0
-    return np.where(inside_s == time_s, np.sin(phase_rad) * ramp, 0.0)
+    return np.asarray(np.sin(_phase_rad(call, time_s)) * ramp)
 
 
 @functools.lru_cache(maxsize=8)

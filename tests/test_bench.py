@@ -15,9 +15,12 @@ from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.kernels._cpu import ceilings
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import ERROR_PRESETS_DB
+from ertis_numba.simulation import Point
 from ertis_numba.simulation.effects import EFFECTS
 from tests.cases import SHORT, noise
+from tests.hard_cases.forced import EIGHT
 from tests.pages import path_of
+from tests.scenes import scene_of
 
 MARKED = "# Mine\n\n<!-- ertis bench {0} -->\nold\n<!-- /ertis bench {0} -->\n\nrest\n"
 
@@ -48,8 +51,15 @@ def test_summary_is_mean_deviation_and_median():
     assert timing.summary(np.array([1.0, 2.0, 6.0])) == {"mean_ms": 3.0, "std_ms": 2.16, "median_ms": 2.0}
 
 
+def of_few_directions(settings, **options):
+    """Return a pipeline of fewer directions, for tests of reports whose times do not matter."""
+    count = 9 + int(settings.processing.directions) // 90
+    return Pipeline(settings.replace(processing=settings.processing.replace(directions=f"2d:{count}")), **options)
+
+
 @pytest.mark.usefixtures("hardly_warm")
-def test_paper_command_reports_and_updates(tmp_path):
+def test_paper_command_reports_and_updates(monkeypatch, tmp_path):
+    monkeypatch.setattr(paper, "Pipeline", of_few_directions)
     target = tmp_path / "README.md"
     target.write_text(MARKED.format("paper"), "utf-8")
     other = tmp_path / "other.md"
@@ -78,7 +88,10 @@ def test_paper_command_reports_and_updates(tmp_path):
 def test_scaling_measures_every_series(monkeypatch):
     series = {"directions": (90, 180), "last_range_m": (1.0,), "microphones": (40,)}
     monkeypatch.setattr(scaling, "SERIES", series)
+    monkeypatch.setattr(scaling, "_BASE", {"directions": 90, "last_range_m": 1.5, "microphones": 32})
+    monkeypatch.setattr(scaling, "_PRESET", "short_25_50")
     monkeypatch.setattr(scaling, "_STREAM", 2**16)
+    monkeypatch.setattr(scaling, "_TURNS", 10_000)
     report = scaling.run(count=1, say=lambda _: None)
     found = {(row["series"], row["plan"], row["value"]) for row in report["rows"]}
     assert {
@@ -203,6 +216,7 @@ def test_ceiling_of_dot_products_computes():
 
 
 def test_published_times_have_one_entry_per_configuration():
+    assert paper.DIRECTIONS == (90, 1850, 3000)
     assert all(len(times) == len(paper.DIRECTIONS) for times in paper.PUBLISHED_MS.values())
 
 
@@ -231,7 +245,7 @@ def quick(monkeypatch, hardly_warm):  # noqa: ARG001 - it is used by what it doe
 
 
 def bench_accuracy(*arguments):
-    done = CliRunner().invoke(cli, ["bench", "accuracy", "--count", "1", "--directions", "2d:90", *map(str, arguments)])
+    done = CliRunner().invoke(cli, ["bench", "accuracy", "--count", "1", "--directions", "2d:46", *map(str, arguments)])
     assert done.exit_code == 0, (done.output, done.exception)
     return done
 
@@ -325,5 +339,6 @@ def test_simulation_benchmark_times_free_field_and_all_effects(tmp_path):
 
 def test_simulation_benchmark_refuses_differing_images(monkeypatch):
     monkeypatch.setattr(simulation, "image_change_db", lambda *_, **__: 9.0)
+    monkeypatch.setattr(simulation, "free_field", lambda: scene_of(Point(range_m=0.5), sensor=EIGHT))
     with pytest.raises(DataError, match=r"change the image by 9\.00 dB; the limit is .* dB\. Do not use these times"):
         simulation.run(count=1, say=lambda _: None)

@@ -1,6 +1,7 @@
 """Error budgets: kept, or exceeded with a warning on stderr and in the file, for every beamformer and dynamic range."""
 
 import json
+import subprocess
 
 import numpy as np
 import pytest
@@ -133,6 +134,18 @@ def test_process_prints_no_warning_if_the_budget_is_kept(tmp_path):
         assert images.predicted_error_db < images.max_error_db == -35.0
 
 
+@pytest.fixture
+def asked_here(monkeypatch):
+    """Run the commands of a benchmark in this process, which is faster than starting one for each."""
+
+    def ask(*arguments):
+        done = CliRunner().invoke(cli, arguments)
+        return subprocess.CompletedProcess(arguments, done.exit_code, done.stdout, done.stderr)
+
+    monkeypatch.setattr(budgets, "ask", ask)
+
+
+@pytest.mark.usefixtures("asked_here")
 @pytest.mark.parametrize("seed", [39, 42, 415, 453])
 def test_budgets_once_missed_silently_are_kept_or_warned_of(seed):
     """The causes were zones of two microphones, direct sound 110 dB above the image, and its rounding."""
@@ -141,6 +154,7 @@ def test_budgets_once_missed_silently_are_kept_or_warned_of(seed):
     assert row["outcome"] != "missed"
 
 
+@pytest.mark.usefixtures("asked_here")
 def test_random_settings_keep_their_budget_or_are_warned_of():
     rows = [row for seed in range(5) if (row := budgets.tried(seed))]
     assert len(rows) >= 3

@@ -58,6 +58,11 @@ def test_first_run_takes_less_time_than_30_imports_and_reports_compilation(recor
         if found < 30:
             break
     assert found < 30
+    with ertis.open_energyscapes(tmp_path / f"{run}.h5") as images, ertis.open_recording(recording) as measurements:
+        (given,) = measurements
+        settings = given.settings.replace(processing=given.settings.processing.replace(directions="3000"))
+        again = ertis.Pipeline(settings).process(Measurement(given.data, settings))
+        assert again.amplitude.tobytes() == images[0].amplitude.tobytes()  # kernels of this process are from a cache
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="only Linux says how large a process ever was")

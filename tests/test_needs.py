@@ -19,33 +19,34 @@ from ertis_numba.simulation.render import Simulator
 from ertis_numba.simulation.sight import SAME_RANGE_M, Sight
 from ertis_numba.simulation.snapshot import snapshot
 
-BATCHES, SCENES_PER_BATCH = 3, 20
+# Of 60 scenes, those with each kind of verdict twice, and with the smallest differences from the tolerance.
+SEEDS = (1, 2, 3, 5, 7, 10, 11, 12, 13, 14, 15, 17, 18, 1009, 1014, 2000, 2006, 2008)
+ON = {"absorption", "cross_emission", "doppler", "spreading", "sync_delay", "target_size", "walls"}
+OFF = {"doppler", "occlusion", "sync_delay", "target_size", "walls"}
 
 
-@pytest.mark.parametrize("batch", range(BATCHES))
-def test_omitted_effects_change_images_by_less_than_the_tolerance(batch):
+def test_omitted_effects_change_images_by_less_than_the_tolerance():
     """This is the only promise of the planner, tested through the whole chain."""
-    wrong, seeds, count = [], range(batch * 1000, (batch + 1) * 1000), 0
-    for seed in seeds:
-        if count == SCENES_PER_BATCH:
-            break
+    wrong, tried = [], {True: set(), False: set()}
+    for seed in SEEDS:
         scene = random_scene(seed)
         plan = make_plan(scene)
         trial = Trial(scene)
-        if trial.loudest(plan) > 0.6:  # where the smallest change turns all bits round
-            continue
-        count += 1
+        assert trial.loudest(plan) <= 0.6  # above, the smallest change turns all bits round
         for verdict in plan.verdicts:
             if verdict.estimate_db is None:
                 continue  # indispensable, or nothing in the scene that it could act upon
-            if verdict.ab_rendered and batch:
-                continue  # measured in the same way already: the first batch shows that this is so
+            if verdict.on and (verdict.coupled or verdict.forced):
+                continue  # on, however little it changes
+            tried[verdict.on].add(verdict.name)
             changed_db = trial.change_db(plan, verdict.name)
-            if verdict.on and changed_db <= scene.tolerance_db and not (verdict.coupled or verdict.forced):
+            if verdict.on and changed_db <= scene.tolerance_db:
                 wrong.append((seed, verdict.name, "needed, yet it changes", changed_db))
             if not verdict.on and changed_db >= scene.tolerance_db:
                 wrong.append((seed, verdict.name, "left out, yet it changes", changed_db))
     assert not wrong
+    assert tried[True] >= ON
+    assert tried[False] >= OFF
 
 
 @pytest.mark.parametrize(
@@ -73,7 +74,7 @@ def test_verdicts_hold_for_pdm_images():
         if Trial(loud).loudest(plan) > 0.6:
             continue
         sensor = loud.sensors[0]
-        pipeline = Pipeline(sensor.settings())
+        pipeline = Pipeline(sensor.settings(), predict=False)
         bits = pipeline.process(Simulator(loud, plan=plan).render()).amplitude.astype(float)
         shown = Sight(snapshot(loud, sensor, 0.0), plan.active)
         sure = shown.shown & (shown.levels(shown.heard) > 300 * shown.noise)

@@ -114,7 +114,7 @@ class _Subject:
         self._name, self._measurement, self._settings = name, measurement, settings
         self._kernels, self._threads, self._say = kernel_set, kernel_set.max_threads, say
         say(f"{name}: computing the exact image")
-        exact = verification.exact_image(Pipeline(settings).process(measurement), measurement)
+        exact = verification.exact_image(Pipeline(settings, predict=False).process(measurement), measurement)
         self._exact = exact.amplitude
         self._wanted: Sequence[Peak] = find_peaks(exact, top=verification.PEAKS)
         self._signal_model = signal_model_of(measurement, settings, kernel_set, threads=self._threads)
@@ -141,14 +141,14 @@ class _Subject:
     def _pipelines(self) -> Iterator[tuple[str, Pipeline]]:
         settings = self._settings
         processing = settings.processing.replace(method="paper")
-        yield PAPER, Pipeline(settings.replace(processing=processing), "numpy")
+        yield PAPER, Pipeline(settings.replace(processing=processing), "numpy", predict=False)
         chosen = {}
         for preset, max_error_db in ERROR_PRESETS_DB.items():
-            pipeline = Pipeline(settings, max_error_db=max_error_db)
+            pipeline = Pipeline(settings, max_error_db=max_error_db, predict=False)
             chosen[in_words(pipeline.settings.accuracy)] = preset, pipeline
         for plan in plans(self._kernels):
             if in_words(plan) not in chosen:
-                yield in_words(plan), Pipeline(settings.replace(accuracy=plan.replace(max_error_db=0.0)))
+                yield in_words(plan), Pipeline(settings.replace(accuracy=plan.replace(max_error_db=0.0)), predict=False)
         for words, (preset, pipeline) in chosen.items():
             yield f"{preset}: {words}", pipeline
 

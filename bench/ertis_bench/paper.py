@@ -82,7 +82,7 @@ def _measure(
 def _pipeline(measurement: Measurement, n_directions: int, *, method: str, device: str) -> Pipeline:
     settings = measurement.settings
     processing = settings.processing.replace(directions=str(n_directions), range_m=RANGE_M, method=method)
-    return Pipeline(settings.replace(processing=processing), device=device)
+    return Pipeline(settings.replace(processing=processing), device=device, predict=False)
 
 
 def _check(pipelines: dict[str, Pipeline], measurement: Measurement) -> dict[str, float]:

@@ -62,7 +62,7 @@ class Trials:
         device = kernels.load("cpu")
         self._settings = planner.complete(settings, device, threads=1)
         self._chain = FastChain(self._settings, device, threads=1)
-        self._extract = PointExtractor(self._settings)
+        self._extract = PointExtractor(self._settings, top=1)
         self._grid = direction_grid(self._settings.processing)
         self._positions_m = microphones(self._settings.array).enabled_positions_m
         self._speed_m_s = sound_speed_m_s(self._settings.air)

@@ -28,6 +28,7 @@ SERIES: dict[str, tuple[float, ...]] = {
 The other values are 1850 directions, 0.5-5 m, 32 microphones, all threads, and the default plan.
 """
 
+_PRESET = "default_25_50"
 _FIRST_RANGE_M = 0.5
 _APERTURE_M = 0.1
 _STREAM = 16 * 2**20  # numbers per array: 64 MiB, several times the last-level cache
@@ -83,7 +84,8 @@ def _measure(series: str, plan: str, count: int) -> Iterator[dict[str, Any]]:
     for value in _thread_counts() if series == "threads" else SERIES[series]:
         threads = int(value) if series == "threads" else None
         settings, n_words = _settings(plan, **{**_BASE, **({series: value} if series in _BASE else {})})
-        pipeline, measurement = Pipeline(settings, "cpu", threads), subject.noise(settings, n_words=n_words)
+        pipeline = Pipeline(settings, "cpu", threads, predict=False)
+        measurement = subject.noise(settings, n_words=n_words)
         image = pipeline.process(measurement)
         checks.require_exact(image, measurement)
         subject_of: Callable[[], object] = functools.partial(pipeline.process, measurement, out=image.amplitude)
@@ -104,7 +106,7 @@ def _thread_counts() -> list[int]:
 
 def _settings(plan: str, *, directions: float, last_range_m: float, microphones: float) -> tuple[Settings, int]:
     """Return settings and words per sample, with microphones at random positions on a disc."""
-    n_mics, settings = int(microphones), Settings.from_preset("default_25_50")
+    n_mics, settings = int(microphones), Settings.from_preset(_PRESET)
     random = np.random.default_rng(1)
     radius_m = _APERTURE_M / 2 * np.sqrt(random.random(n_mics))
     angle_rad = 2 * np.pi * random.random(n_mics)

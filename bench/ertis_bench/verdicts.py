@@ -135,7 +135,7 @@ class Trial:
 
         A change that another realisation of the noise also causes is subtracted.
         """
-        pipeline = Pipeline(sensor.settings())
+        pipeline = Pipeline(sensor.settings(), predict=False)
         shown = Sight(self._shot(sensor), one.active)
         sure = shown.shown & (shown.levels(shown.heard) > _MIN_LEVEL_TO_NOISE * shown.noise)
         ranges_m = shown.heard.delay_s[sure] * shown.shot.speed_m_s / 2

@@ -1,7 +1,7 @@
 """Bit-identical results for any number of threads, processor and file round trip; devices agree within a bound."""
 
-import functools
 import hashlib
+import json
 import os
 import re
 import subprocess
@@ -22,59 +22,88 @@ from tests.cases import CASES, SHORT, noise
 from tests.hard_cases.tuned import tuned
 
 CODE = """
-import hashlib, sys
+import hashlib, json, sys
+import numpy as np
+from ertis_numba import kernels
 from ertis_numba.pipeline import Pipeline
 from tests.cases import SHORT, noise
 from tests.hard_cases.tuned import tuned
+
 settings = SHORT.replace(processing=SHORT.processing.replace(directions="3d:700"))
-settings = tuned(settings, precision=sys.argv[1])
-for threads in (1, 2, 3, 4):
-    image = Pipeline(settings, threads=threads).process(noise(settings))
-    print(hashlib.sha256(image.amplitude.tobytes()).hexdigest())
-"""
-
-MODULATE = """
-import hashlib, sys
-import numpy as np
-from ertis_numba import kernels
-cpu, random = kernels.load(sys.argv[1]), np.random.default_rng(1)
-signals, keys = random.uniform(-0.6, 0.6, (37, 2000)), random.integers(0, 2**64, 37, np.uint64)
-mics = np.append(np.arange(37, dtype=np.int32), [-1] * 11).astype(np.int32).reshape(6, 8)
-loop = np.array([0.8, 0.4, 0.2, 0.1, 0.02, 0.1, 0.5, 2.0])
-for threads in range(1, cpu.max_threads + 1):
-    octets, states = np.empty((2000, 6), np.uint8), np.zeros((37, 4))
-    with cpu.threads(threads):
-        cpu.modulate_pdm(signals, mics, keys, np.linspace(0, 0.1, 37), states, loop, 0, octets)
-    print(hashlib.sha256(octets.tobytes() + states.tobytes()).hexdigest())
-"""
-
-COMBINE = """
-import hashlib
-import numpy as np
-from ertis_numba import kernels
 cpu, random = kernels.load("cpu"), np.random.default_rng(1)
-noise = lambda *shape: (random.standard_normal(shape) + 1j * random.standard_normal(shape)).astype(np.complex64)
-signals, weights, first = noise(32, 2, 400), noise(20, 32), random.integers(0, 100, (20, 32))
-offsets = (np.arange(32) * 800 + first).astype(np.int32)
-for kernel, given in ((cpu.combine_dmas, (2,)), (cpu.combine_coherence, ()), (cpu.combine_capon, (3, 0.1))):
-    out = np.empty((20, 300), np.float32)
-    kernel(signals, offsets, weights, *given, out)
-    print(hashlib.sha256(out.tobytes()).hexdigest())
-short, folded = np.empty((20, 40), np.float32), np.empty((32, 2, 64), np.complex64)
-cpu.delay_and_sum_envelope(signals, offsets, weights, 0, 40, short)
-cpu.multiply_and_fold(signals[:, 0].copy(), noise(1, 2, 90), 5, folded)
-print(hashlib.sha256(short.tobytes() + folded.tobytes()).hexdigest())
+
+
+def digest(*arrays):
+    return hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()
+
+
+def imaged(precision, threads):
+    given = tuned(settings, precision=precision)
+    return digest(Pipeline(given, threads=threads, predict=False).process(noise(given)).amplitude)
+
+
+def modulated(device, threads):
+    kernel_set, random = kernels.load(device), np.random.default_rng(1)
+    signals, keys = random.uniform(-0.6, 0.6, (37, 2000)), random.integers(0, 2**64, 37, np.uint64)
+    mics = np.append(np.arange(37, dtype=np.int32), [-1] * 11).astype(np.int32).reshape(6, 8)
+    loop = np.array([0.8, 0.4, 0.2, 0.1, 0.02, 0.1, 0.5, 2.0])
+    octets, states = np.empty((2000, 6), np.uint8), np.zeros((37, 4))
+    with kernel_set.threads(threads):
+        kernel_set.modulate_pdm(signals, mics, keys, np.linspace(0, 0.1, 37), states, loop, 0, octets)
+    return digest(octets, states)
+
+
+def complex_noise(*shape):
+    return (random.standard_normal(shape) + 1j * random.standard_normal(shape)).astype(np.complex64)
+
+
+def combined():
+    signals, weights, first = complex_noise(32, 2, 400), complex_noise(20, 32), random.integers(0, 100, (20, 32))
+    offsets = (np.arange(32) * 800 + first).astype(np.int32)
+    coherent, short = np.empty((20, 300), np.float32), np.empty((20, 40), np.float32)
+    cpu.combine_coherence(signals, offsets, weights, coherent)
+    cpu.delay_and_sum_envelope(signals, offsets, weights, 0, 40, short)
+    return digest(coherent), digest(short)
+
+
+found, counts = {}, range(1, cpu.max_threads + 1)
+for name in sys.argv[1:]:
+    if name == "combined":
+        found[name] = combined()
+    elif name in {"cpu", "numpy"}:
+        found[name] = [modulated(name, threads) for threads in (counts if name == "cpu" else (1,))]
+    elif name != "int16" or cpu.tile_ranges:
+        found[name] = [imaged(name, threads) for threads in counts]
+print(json.dumps(found))
 """
 
 
-def digests(argument, code=CODE, **environment):
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])} | environment
-    command = [sys.executable, "-c", code, argument]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    if argument == "int16" and "no 16-bit dot product" in done.stderr:
-        pytest.skip("this processor has no 16-bit dot product (AVX-512 VNNI or AVX-VNNI)")
+def digests(*names, **environment):
+    """Digests of results by name, from another process with 4 threads."""
+    paths = {"PYTHONPATH": str(Path(__file__).parents[2]), "NUMBA_NUM_THREADS": "4"}
+    command = [sys.executable, "-c", CODE, *names]
+    done = subprocess.run(command, env=os.environ | paths | environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    return done.stdout.split()
+    return json.loads(done.stdout)
+
+
+@pytest.fixture(scope="module")
+def usual():
+    """Digests of all results on this processor."""
+    return digests("float32", "int16", "cpu", "numpy", "combined")
+
+
+@pytest.fixture(scope="module")
+def workqueue(usual):  # noqa: ARG001 - its process has filled the cache, so that this one compiles nothing
+    """Digests with the threading layer that Numba falls back to without OpenMP and TBB."""
+    return digests("float32", "combined", NUMBA_THREADING_LAYER="workqueue")
+
+
+@pytest.fixture(scope="module")
+def older(tmp_path_factory):
+    """Digests on an older processor, for which Numba can compile, without the features that it lacks."""
+    cache = tmp_path_factory.mktemp("older")
+    return digests("auto", "cpu", NUMBA_CPU_NAME="generic", NUMBA_CACHE_DIR=str(cache))
 
 
 @pytest.mark.parametrize("precision", ["float32", "auto"])
@@ -84,33 +113,29 @@ def test_one_and_two_threads_give_the_same_bits(precision):
         processing=Processing(directions="3d:301", range_m=(0.5, 1.5))
     )
     settings = tuned(settings, precision=precision)
-    images = [Pipeline(settings, threads=n).process(noise(settings)).amplitude for n in (1, 2)]
+    images = [Pipeline(settings, threads=n, predict=False).process(noise(settings)).amplitude for n in (1, 2)]
     assert images[0].tobytes() == images[1].tobytes()
 
 
-@functools.cache
-def usual_digests(precision):
-    return digests(precision, NUMBA_NUM_THREADS="4")
-
-
 @pytest.mark.parametrize("precision", ["float32", "int16"])
-def test_results_are_independent_of_the_number_of_threads(precision):
-    found = usual_digests(precision)
-    assert len(found) == 4
-    assert len(set(found)) == 1
+def test_results_are_independent_of_the_number_of_threads(usual, precision):
+    if precision not in usual:
+        pytest.skip("this processor has no 16-bit dot product (AVX-512 VNNI or AVX-VNNI)")
+    assert len(usual[precision]) == 4
+    assert len(set(usual[precision])) == 1
 
 
-def test_workqueue_threading_layer_gives_the_same_bits():
-    """Numba falls back to its workqueue layer without OpenMP and TBB."""
-    found = digests("float32", NUMBA_NUM_THREADS="4", NUMBA_THREADING_LAYER="workqueue")
-    assert found == usual_digests("float32")
+def test_workqueue_threading_layer_gives_the_same_bits(usual, workqueue):
+    assert workqueue["float32"] == usual["float32"]
 
 
-def test_compiled_and_cached_kernels_give_the_same_bits(tmp_path):
-    """Numba optimises a cached kernel once more, which could change the order of sums."""
-    fresh, kept = (digests("", COMBINE, NUMBA_CACHE_DIR=str(tmp_path)) for _ in range(2))
-    assert len(fresh) == 4
-    assert fresh == kept
+def test_compiled_and_cached_kernels_give_the_same_bits(workqueue, tmp_path):
+    """Numba optimises a cached kernel once more, which could change the order of sums.
+
+    One of these kernels multiplies and adds in its own loop, the other one in a function that it calls. The first run
+    of a command compiles the others, see tests/test_figures_to_reach.py.
+    """
+    assert digests("combined", NUMBA_CACHE_DIR=str(tmp_path))["combined"] == workqueue["combined"]
 
 
 def test_numba_limits_are_reported_in_one_line():
@@ -120,19 +145,15 @@ def test_numba_limits_are_reported_in_one_line():
     assert re.search("DeviceError: NUMBA_DISABLE_JIT is set, .* use device 'numpy'", done.stderr.splitlines()[-1])
 
 
-def test_processor_with_fewer_features_is_supported(tmp_path):
-    """Numba can compile for an older processor, without the features that it lacks."""
-    older = {"NUMBA_CPU_NAME": "generic", "NUMBA_CACHE_DIR": str(tmp_path), "NUMBA_NUM_THREADS": "4"}
-    assert len(set(digests("auto", **older))) == 1
+def test_processor_with_fewer_features_is_supported(older):
+    assert len(older["auto"]) == 4
+    assert len(set(older["auto"])) == 1
 
 
-def test_modulators_give_the_same_bits_on_every_processor(tmp_path):
+def test_modulators_give_the_same_bits_on_every_processor(usual, older):
     """Bits and states agree without AVX, fused multiply-add or a rounding instruction."""
-    older = {"NUMBA_CPU_NAME": "generic", "NUMBA_CACHE_DIR": str(tmp_path)}
-    found = digests("cpu", MODULATE, NUMBA_NUM_THREADS="4")
-    assert len(found) == 4
-    assert set(found) == set(digests("cpu", MODULATE, NUMBA_NUM_THREADS="2", **older))
-    assert set(found) == set(digests("numpy", MODULATE))
+    assert len(usual["cpu"]) == len(older["cpu"]) == 4
+    assert set(usual["cpu"]) == set(older["cpu"]) == set(usual["numpy"])
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -142,8 +163,8 @@ def test_devices_agree_within_rounding(name, precision, bound_db):
     settings = tuned(CASES[name], precision=precision)
     if precision == "int16" and not all(kernels.load(device).tile_ranges for device in ("cpu", "numpy")):
         pytest.skip("this processor has no 16-bit dot product (AVX-512 VNNI or AVX-VNNI)")
-    compiled = Pipeline(settings, device="cpu")
-    plain = Pipeline(compiled.settings, device="numpy")  # the same plan
+    compiled = Pipeline(settings, device="cpu", predict=False)
+    plain = Pipeline(compiled.settings, device="numpy", predict=False)  # the same plan
     images = [pipeline.process(noise(settings)).amplitude for pipeline in (compiled, plain)]
     assert np.array_equal(*images) or reference.error_db(*images) < bound_db
 
