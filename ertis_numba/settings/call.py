@@ -1,5 +1,6 @@
 """Emitted call: a frequency sweep or a custom waveform."""
 
+import functools
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -179,6 +180,7 @@ class Call(TomlTable, frozen=True, kw_only=True):
         return max(self.start_frequency_hz, self.stop_frequency_hz)
 
 
+@functools.cache
 def _default(name: str) -> Any:
     """Return the default of a field; a field with this value counts as not given."""
     return next(field.default for field in msgspec.structs.fields(Call) if field.name == name)

@@ -28,6 +28,7 @@ place               arguments                                             result
 ==================  ====================================================  =============================================
 """
 
+import functools
 import importlib
 from collections.abc import Callable, Set as AbstractSet
 from dataclasses import dataclass
@@ -101,11 +102,17 @@ def _is_set(thing: Any, key: str, *inner: str) -> bool:
         return any(_is_set(each, key, *inner) for each in thing)
     if not isinstance(thing, msgspec.Struct):
         return False
-    defaults = {each.name: each.default for each in msgspec.structs.fields(thing)}
+    defaults = _defaults(type(thing))
     names = [name for name in defaults if key in {name, "*"}]
     if inner:
         return any(_is_set(getattr(thing, name), *inner) for name in names)
     return any(getattr(thing, name) != defaults[name] for name in names)
+
+
+@functools.cache
+def _defaults(kind: type[msgspec.Struct]) -> dict[str, Any]:
+    """Return the defaults of all fields; msgspec evaluates the annotations of the class each time."""
+    return {field.name: field.default for field in msgspec.structs.fields(kind)}
 
 
 _POINT = "points = [{range_m = 0.5}]\n"
