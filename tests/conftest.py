@@ -1,5 +1,6 @@
 """Fixtures that apply to all tests."""
 
+import gc
 import logging
 import os
 import random
@@ -9,6 +10,20 @@ import types
 import numpy as np
 import pytest
 import threadpoolctl
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_collection():
+    """Exclude everything that lives until the end of the session from garbage collection.
+
+    The modules and tests are a million objects. The collections that pass over all of them took 2 s while tests were
+    collected, and 5 % of the processor time of the tests.
+    """
+    gc.disable()
+    collected = yield
+    gc.freeze()
+    gc.enable()
+    return collected
 
 
 @pytest.fixture(scope="session", autouse=True)

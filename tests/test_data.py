@@ -5,10 +5,7 @@ import functools
 import hashlib
 import importlib.util
 import json
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -91,11 +88,16 @@ def test_image_of_shipped_recording_shows_its_reflectors(name, method):
     assert_allclose(strongest, sorted(wanted["range_m"] for wanted in expected), atol=range_m)
 
 
+def script(name):
+    """Return a script of the folder as a module."""
+    spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
 def test_data_build_is_reproducible(tmp_path):
-    paths = os.pathsep.join(str(ROOT / folder) for folder in (".", "cli"))
-    subprocess.run(
-        [sys.executable, str(FOLDER / "build.py"), str(tmp_path)], env=os.environ | {"PYTHONPATH": paths}, check=True
-    )
+    script("build").build(tmp_path)
     for name in NAMES:
         assert (tmp_path / f"{name}.json").read_text() == (FOLDER / f"{name}.json").read_text()
     sums = (tmp_path / "SHA256SUMS").read_text().splitlines()
@@ -130,9 +132,7 @@ def test_gallery_shows_all_scenes():
 
 
 def test_gallery_update_rejects_page_without_markers():
-    spec = importlib.util.spec_from_file_location("gallery", FOLDER / "gallery.py")
-    gallery = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(gallery)
+    gallery = script("gallery")
     assert sorted(gallery.SHOWN) == SCENES
     reported = gallery.replaced("a <!-- scene x -->old<!-- /scene x --> b", "scene x", "new")
     assert reported == "a <!-- scene x -->\nnew\n<!-- /scene x --> b"

@@ -28,7 +28,6 @@ def solid(name, azimuth_deg=(-45.0, 45.0), elevation_deg=(-45.0, 45.0)):
 
 
 IMAGES = {
-    "half disc": image(),
     "narrow": image(np.linspace(-20, 20, 9)),
     "full circle": image(np.linspace(-180, 180, 73)),
     "unsorted": image([40.0, -10.0, 0.0, 25.0]),
@@ -68,10 +67,15 @@ def test_every_theme_is_drawn(theme, page):
     assert matplotlib.colors.to_hex(drawn(plot(image(), theme=theme))[0, 0, :3] / 255) == page
 
 
+@pytest.fixture(scope="module")
+def picture():
+    return plot(image(), peaks=PEAKS)
+
+
 @pytest.mark.parametrize("kind", ["png", "svg", "pdf"])
-def test_every_format_is_written(kind):
+def test_every_format_is_written(picture, kind):
     file = io.BytesIO()
-    plot(image()).savefig(file, format=kind)
+    picture.savefig(file, format=kind)
     assert len(file.getvalue()) > 10_000
 
 
@@ -123,8 +127,8 @@ def test_sphere_raster_is_blank_without_directions():
     assert np.isnan(raster[0, 1])
 
 
-def test_caption_names_the_settings():
-    texts = " ".join(text.get_text() for text in plot(image(), peaks=PEAKS).texts)
+def test_caption_names_the_settings(picture):
+    texts = " ".join(text.get_text() for text in picture.texts)
     for word in ("measurement 0", "eRTIS_v3D1", "call 25–50 kHz", "37 directions", "method fast", "20 °C", "+30.0°"):
         assert word in texts
 

@@ -193,8 +193,8 @@ def test_planar_grids_include_both_limits():
     assert_allclose(np.degrees(single.azimuth_rad), [20])
 
 
-@settings(max_examples=200, deadline=None)
-@given(count=st.integers(1, 4000), azimuth_deg=limits(-180, 180), elevation_deg=limits(-90, 90))
+@settings(max_examples=100, deadline=None)
+@given(count=st.integers(1, 1000), azimuth_deg=limits(-180, 180), elevation_deg=limits(-90, 90))
 def test_solid_grids_have_their_count_and_limits(count, azimuth_deg, elevation_deg):
     processing = Processing(
         directions=f"3d:{count}", azimuth_limits_deg=azimuth_deg, elevation_limits_deg=elevation_deg

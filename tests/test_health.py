@@ -176,10 +176,10 @@ def test_health_accepts_any_words(word_bits):
 
 def test_health_accepts_many_microphones():
     sensor = EIGHT.replace(
-        array=line_array(1024, 1e-4),
+        array=line_array(512, 1e-4),
         recording=Recording(n_samples=20_000),
-        electronics=EIGHT.electronics.replace(dead_channels=(1000,), stuck_low=(511, 512, 513)),
+        electronics=EIGHT.electronics.replace(dead_channels=(500,), stuck_low=(255, 256, 257)),
     )
     report = health(rendered(sensor, Point(range_m=0.35, strength_db=-20)))
-    assert report.verdict() == "stuck at 0: channels 511-513; dead: channel 1000"
-    assert len(report.channels) == 1024
+    assert report.verdict() == "stuck at 0: channels 255-257; dead: channel 500"
+    assert len(report.channels) == 512

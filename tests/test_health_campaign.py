@@ -8,14 +8,14 @@ from click.testing import CliRunner
 from ertis_bench import health as benchmark, tables
 from ertis_bench.health.campaign import false_alarms, named
 from ertis_bench.health.faults import FAULTS
-from ertis_bench.health.scenes import base
+from ertis_bench.health.scenes import SCENES, base
 from ertis_cli.main import cli
 
 from ertis_numba.analysis.health.kinds import KINDS
 from ertis_numba.storage import write_recording
 
 
-@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("seed", range(3 * len(SCENES)))
 def test_health_names_no_fault_of_a_healthy_array(seed):
     assert false_alarms(seed)[1] == {}
 

@@ -96,7 +96,7 @@ def test_kill_during_discard_keeps_other_measurements(tmp_path, how):
     """Appended measurements stay until they are discarded; discarded ones never reappear."""
     create(tmp_path, both()).close()
     path, last = tmp_path / "rec.h5.journal", {"left": 12, "right": 12}
-    for _ in range(6):
+    for _ in range(4):
         with subprocess.Popen(
             [sys.executable, "-c", DISCARD, path, str(max(last.values()) + 2), how],
             env=ENVIRONMENT,

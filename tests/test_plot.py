@@ -10,9 +10,11 @@ import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
 from ertis_cli.plot import _KINDS, _ONLY, plot
+from matplotlib.figure import Figure
 from PIL import Image
 
-from ertis_numba.geometry import direction_grid
+from ertis_numba import figures
+from ertis_numba.geometry import direction_grid, microphones
 from ertis_numba.settings import Processing, Settings
 from ertis_numba.storage import write_energyscapes, write_recording
 from tests.files import image, noise
@@ -46,30 +48,33 @@ def files(tmp_path_factory):
     ("source", "kind", "options"),
     [
         ("img.h5", "image", "--peaks 2 --font serif"),
-        ("solid.h5", "polar", "--theme light"),
-        ("solid.h5", "projection", "--peaks 0"),
-        ("solid.h5", "slices", "--height 0.5 --left -0.5 -m 0"),
-        ("rec.h5", "signals", "--microphone 3"),
+        ("solid.h5", "slices", "--peaks 0 -m 0"),
         ("rec.h5", "matched-filter", "-m 1 --sensor eRTIS-7"),
-        ("rec.h5", "array", ""),
         ("img.h5", "array", "--steer 20:-10 --frequency 25e3 --frequency 40000"),
-        ("settings.toml", "array", ""),
-        ("layout.toml", "array", ""),
-        ("layout.csv", "array", ""),
     ],
 )
-def test_each_kind_of_plot_is_drawn(files, tmp_path, source, kind, options):
+def test_plots_for_print_have_their_content_and_width(files, tmp_path, source, kind, options):
     target = tmp_path / "a.png"
-    theme = [] if "--theme" in options else ["--theme", "paper", "--columns", 1]
-    command = ["plot", files / source, "--kind", kind, *options.split(), *theme, "-o", target, "--json"]
+    command = ["plot", files / source, "--kind", kind, *options.split(), "--theme", "paper", "--columns", 1]
+    command += ["-o", target, "--json"]
     report = json.loads(run(*command).stdout)
     assert (report["output"], report["kind"]) == (str(target), kind)
     assert ("measurement" in report) == (kind != "array")
     with Image.open(target) as picture:
         assert picture.getpixel((0, 0))[:3] == (255, 255, 255)
         assert len(picture.convert("RGB").getcolors(2**24)) > 30
-        if not options.startswith("--theme"):
-            assert picture.width == pytest.approx(85 / 25.4 * 300, abs=1)
+        assert picture.width == pytest.approx(85 / 25.4 * 300, abs=1)
+
+
+@pytest.mark.parametrize(
+    ("source", "n_mics"), [("rec.h5", 32), ("img.h5", 32), ("settings.toml", 32), ("layout.toml", 3), ("layout.csv", 3)]
+)
+def test_arrays_of_all_sources_are_read(files, tmp_path, monkeypatch, source, n_mics):
+    given = []
+    monkeypatch.setattr(figures, "array", lambda settings, **_: given.append(settings) or Figure((1, 1)))
+    run("plot", files / source, "--kind", "array", "-o", tmp_path / "a.svg")
+    [settings] = given
+    assert len(microphones(settings.array).enabled) == n_mics
 
 
 def test_plot_accepts_the_name_of_a_layout(tmp_path):
@@ -126,6 +131,12 @@ def test_plot_commands_of_the_page_run(tmp_path):
         for command in commands:
             done = CliRunner().invoke(cli, command.split())
             assert done.exit_code == 0, (command, done.stderr, done.exception)
+    pictures = sorted(tmp_path.glob("*.png"))
+    assert len(pictures) == sum(command.endswith(".png") for command in commands)
+    for path in pictures:
+        with Image.open(path) as picture:
+            assert len(picture.convert("RGB").getcolors(2**24)) > 30, path
+            assert (picture.getpixel((0, 0))[:3] == (255, 255, 255)) == (path.stem == "polar"), path  # --theme light
     assert {kind for kind in _KINDS if f"--kind {kind}" in PAGE} == {*_KINDS} - {"image"}
     assert all(f"`{kind}`" in PAGE for kind in _KINDS)
 

@@ -215,10 +215,10 @@ def test_each_channel_is_in_its_bit(word_bits, n_channels):
 
 def test_large_array_is_rendered_in_equal_parts():
     """Channels are rendered 128 at a time, without an effect on their signals."""
-    sensor = SENSOR.replace(array=line_array(300, 1e-3), recording=Recording(n_samples=12_000))
+    sensor = SENSOR.replace(array=line_array(150, 1e-3), recording=Recording(n_samples=12_000))
     scene = scene_of(Point(range_m=0.2, azimuth_deg=40, strength_db=-50), sensor=sensor)
     simulator = Simulator(scene, plan=only("spreading"))
-    bits, clean = bits_of(simulator.render())[:300], simulator.signals()
+    bits, clean = bits_of(simulator.render())[:150], simulator.signals()
     assert_allclose(np.sum(bits * clean, axis=1) / np.sum(clean**2, axis=1), 1, atol=0.02)
 
 

@@ -7,12 +7,12 @@ machine. A recording also names the libraries that wrote it, so its checksum in 
 
 import hashlib
 import json
-import os
-import subprocess
 import sys
 from pathlib import Path
 
+from click.testing import CliRunner
 from ertis_cli._examples import words_sha256
+from ertis_cli.main import cli
 
 HERE = Path(__file__).parent
 DATE = "1767225600"  # 2026-01-01: fixed, so that recordings do not depend on the day of the build
@@ -20,22 +20,13 @@ DATE = "1767225600"  # 2026-01-01: fixed, so that recordings do not depend on th
 
 def build(folder: Path) -> None:
     """Write the recordings, their reflectors and the checksums of all files to ``folder``."""
+    runner = CliRunner(env={"SOURCE_DATE_EPOCH": DATE})
     for scene in sorted(HERE.glob("*.toml")):
         target = folder / f"{scene.stem}.h5"
-        command = [
-            sys.executable,
-            "-m",
-            "ertis_cli.main",
-            "simulate",
-            str(scene),
-            "-o",
-            str(target),
-            "--force",
-            "--json",
-        ]
-        environment = os.environ | {"SOURCE_DATE_EPOCH": DATE}
-        made = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)  # noqa: S603 - ours
-        reported = json.loads(made.stdout)
+        done = runner.invoke(cli, ["simulate", str(scene), "-o", str(target), "--force", "--json"])
+        if done.exit_code:
+            sys.exit(done.output)
+        reported = json.loads(done.stdout)
         report = {
             "scene": scene.name,
             "seed": reported["seed"],
