@@ -8,6 +8,7 @@ from click.testing import CliRunner
 from ertis_cli.main import cli
 
 from ertis_numba import kernels
+from ertis_numba.beamformers import ADAPTIVE_BEAMFORMERS
 from ertis_numba.errors import ArgumentError
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Processing, Recording
@@ -22,7 +23,6 @@ from tests.files import noise
 from tests.scenes import SENSOR, line_array, only, scene_of
 
 KERNELS = {name: kernels.load(name) for name in kernels.usable()}
-OTHERS = ("coherence_factor", "dmas", "capon")
 LINE_16 = SENSOR.replace(
     array=line_array(16, 0.004),
     recording=Recording(n_samples=45_000),
@@ -30,7 +30,7 @@ LINE_16 = SENSOR.replace(
 )
 
 
-@pytest.mark.parametrize("beamformer", OTHERS)
+@pytest.mark.parametrize("beamformer", ADAPTIVE_BEAMFORMERS)
 def test_beamformers_give_the_same_bits_on_any_number_of_threads(beamformer):
     settings = cases.SHORT.replace(processing=cases.SHORT.processing.replace(directions="2d:90", beamformer=beamformer))
     measurement = cases.noise(settings)
@@ -42,7 +42,7 @@ def test_beamformers_give_the_same_bits_on_any_number_of_threads(beamformer):
 
 
 @pytest.mark.parametrize("device", KERNELS)
-@pytest.mark.parametrize("beamformer", OTHERS)
+@pytest.mark.parametrize("beamformer", ADAPTIVE_BEAMFORMERS)
 def test_beamformers_give_zero_for_zero_input(device, beamformer):
     settings = cases.CASES["line of 8"]
     settings = settings.replace(

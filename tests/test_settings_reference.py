@@ -107,3 +107,8 @@ def test_commands_page_shows_values_as_they_are_typed(line, plain):
     lines = [line]
     conf["_write_plainly"](None, None, lines)
     assert lines == [plain]
+
+
+def test_scenes_page_has_every_key_of_scenes():
+    keys = [key.name for section in reference("scene") for key in section.keys]
+    assert [key for key in keys if not re.search(rf"[`.\[]{key}[`\]]", page("scenes"))] == []

@@ -59,7 +59,7 @@ def load(device: str = "auto") -> KernelSet:
     except DeviceError:
         raise
     except ImportError as error:
-        if device != "cuda":
+        if device != "cuda" or (error.name or "").startswith("ertis_numba"):  # a fault of a kernel, not of the machine
             raise
         # Numba will drop its own CUDA target; the package numba-cuda continues it.
         raise DeviceError(

@@ -17,7 +17,7 @@ from ertis_numba.network.central_node._received_items import SensorSession
 from ertis_numba.network.central_node._streams import PeerConnection, SensorTrack, Stream, source_of
 from ertis_numba.network.central_node._volumes import same
 from ertis_numba.network.fields import as_line
-from ertis_numba.network.messages import MESSAGES, Data, Hello, Message, Refused, Subscribe
+from ertis_numba.network.messages import MESSAGES, AskStatus, Data, Gap, Hello, Message, Refused, Subscribe
 from ertis_numba.settings import Settings
 
 __all__ = [
@@ -36,6 +36,7 @@ __all__ = [
 ACCEPTED: Final = tuple(kind for kind in MESSAGES if kind.senders_to("central"))
 """Messages that the central node accepts, by their declarations."""
 
+_ACTIONS: Final = {AskStatus: "request the status"} | dict.fromkeys((Hello, Data, Gap), "send measurements")
 _STREAMS: Final = 64  # Limit per peer.
 _SENSORS: Final = 1024
 _PEERS: Final = 1024
@@ -132,7 +133,7 @@ def read(frames: list[zmq.Frame]) -> Message:
 def require_role(who: Permission, message: Message) -> None:
     """Refuse a message that its sender's role does not allow."""
     if who.role not in ("admin", *message.senders_to("central")):
-        action = "request the status" if who.role == "sensor" else "send measurements"
+        action = _ACTIONS.get(type(message), f"send {message.kind()} messages")
         raise Unwanted("role", f"key {who.name} has the role {who.role}, which may not {action}", "role")
     sensor = getattr(message, "sensor", None)
     if sensor is not None and not who.may_send(sensor):
