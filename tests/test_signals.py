@@ -21,7 +21,7 @@ def test_signal_tests_cover_every_command():
 
 
 def test_signals_end_commands_while_they_start(tmp_path):
-    found = signals.send(tmp_path, ONE_SENSOR, seed=SEED, count=2, only=("listen", "peaks", "doctor"))
+    found = signals.send(tmp_path, ONE_SENSOR, seed=SEED, count=3, only=("listen", "peaks", "doctor"))
     assert (found["codes"], found["tracebacks"]) == (0, 0), found["by_command"]
 
 
