@@ -27,7 +27,8 @@ def test_page_has_short_examples():
 
 @pytest.mark.parametrize("number", range(4))
 def test_page_examples_run(place, number):
-    shown = run_code_here(place, EXAMPLES[number])
+    code = "import matplotlib; matplotlib.use('Agg')\n" + EXAMPLES[number]
+    shown = run_code_here(place, code)
     if number == 1:
         assert (place / "numpy.png").stat().st_size > 10_000
     if number == 2:
