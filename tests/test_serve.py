@@ -13,6 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
+from ertis_cli.main import cli
 
 from ertis_numba.frames import Energyscape, Measurement, Stamp
 from ertis_numba.journal import JournalEntry
@@ -228,10 +230,8 @@ def test_keys_grant_each_node_its_listed_permissions(tmp_path):
     ],
 )
 def test_serve_refuses_invalid_options_in_one_line(options, reported):
-    command = [sys.executable, "-m", "ertis_cli", "serve", "--listen", "tcp://127.0.0.1:0", *options]
-    environment = {**os.environ, "PYTHONPATH": str(Path("cli").absolute())}
-    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=TIMEOUT_S, check=False)
-    assert done.returncode == 1
+    done = CliRunner().invoke(cli, ["serve", "--listen", "tcp://127.0.0.1:0", *options])
+    assert done.exit_code == 1
     (line,) = done.stderr.splitlines()
     assert reported in line
 
@@ -242,10 +242,8 @@ def test_refused_serve_leaves_no_files(tmp_path):
         other.listen()
         publish = ("--publish", f"tcp://127.0.0.1:{other.getsockname()[1]}")
         folders = ("--record", str(tmp_path / "new"), "--quarantine", str(tmp_path / "q"))
-        command = [sys.executable, "-m", "ertis_cli", "serve", "--listen", "tcp://127.0.0.1:0", *publish, *folders]
-        environment = {**os.environ, "PYTHONPATH": str(Path("cli").absolute())}
-        done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=TIMEOUT_S, check=False)
-    assert done.returncode == 1
+        done = CliRunner().invoke(cli, ["serve", "--listen", "tcp://127.0.0.1:0", *publish, *folders])
+    assert done.exit_code == 1
     assert "is in use by another program; end that program or give another --publish" in done.stderr.splitlines()[-1]
     assert not list(tmp_path.iterdir())
 
@@ -254,7 +252,7 @@ def test_serve_handles_pcm(tmp_path):
     """PCM measurements are sent, stored and imaged like one-bit ones."""
     given = noise(CASES["PCM, calibrated"])
     with (
-        serving(*LOOPBACK, "--record", str(tmp_path)) as served,
+        serving(*LOOPBACK, "--record", str(tmp_path), "--workers", "1") as served,
         Subscriber(served.publish, products=("energyscape", "status"), credit=64) as subscriber,
     ):
         received(subscriber, Status)
