@@ -178,12 +178,15 @@ def _n_kept(diary: Path) -> int:
     return len(read_diaries([diary]).kept) if diary.exists() else 0
 
 
-def sealings(folder: Path, *, seed: int, count: int) -> Found:
-    """Kill sealing processes while the central node continues, and sometimes the central node with them."""
+def sealings(folder: Path, *, seed: int, count: int, rate_hz: float = 20.0) -> Found:
+    """Kill sealing processes while the central node continues, and sometimes the central node with them.
+
+    The rate of the sensor determines how often a sealing process starts.
+    """
     rng = random.Random(seed)
     record = RestartedRecorder(folder, "--rotate-size", "2")
     diary = folder / "sender.ndjson"
-    job = SenderJob(address=record.address, diary=str(diary), rate_hz=20.0, seed=seed, ring_bytes=_RING_BYTES)
+    job = SenderJob(address=record.address, diary=str(diary), rate_hz=rate_hz, seed=seed, ring_bytes=_RING_BYTES)
     killed = with_central = 0
     with ExitStack() as stack:
         sender = stack.enter_context(SenderThread(job.replace(patience_s=60.0)))
