@@ -162,9 +162,9 @@ def nodes(folder: Path, *, seed: int, count: int) -> Found:
                         time.sleep(rng.uniform(0.0, 0.3))
                     sender.kill()
         node.stop()
-    with SenderThread(jobs["spool"].replace(count=1)) as sender:
-        sender.wait_for("done")
-        ended = record.finish([sender])
+    with SenderThread(jobs["spool"].replace(count=1)) as last:
+        last.wait_for("done")
+        ended = record.finish([last])
     found = judged(folder, record.archive, list(diaries.values()), kept=[diaries["spool"]])
     return (
         {"kills": 2 * ((count + 1) // 2), "before a line": by_line}
