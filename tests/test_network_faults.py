@@ -78,7 +78,7 @@ def test_killed_sensor_nodes_lose_nothing(tmp_path):
 
 
 def test_killed_sealing_processes_lose_nothing(tmp_path):
-    found = kills.sealings(tmp_path, seed=SEED, count=2)
+    found = kills.sealings(tmp_path, seed=SEED, count=2, rate_hz=10.0)
     assert wrong_in("sealings", found) == {}
     assert found["kills"] == 2
 

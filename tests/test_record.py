@@ -63,9 +63,9 @@ def test_record_listens_soon_after_its_start(tmp_path):
 
 
 def test_killed_record_neither_loses_nor_repeats_acknowledged_data(tmp_path):
-    given = entries(60, first=0)
+    given = entries(36, first=0)
     acked_through = -1
-    for kill in range(5):
+    for kill in range(3):
         with Recording(tmp_path, "--rotate-size", "1") as central, Node(central.address) as node:
             known = node.hello(first=acked_through + 1).acked_through
             assert known >= acked_through
@@ -77,7 +77,7 @@ def test_killed_record_neither_loses_nor_repeats_acknowledged_data(tmp_path):
         assert node.hello(first=acked_through + 1).acked_through >= acked_through
         node.measure(*given[acked_through + 1 :])
         node.send(Ping())
-        node.hear_settled(59)
+        node.hear_settled(35)
         central.process.send_signal(signal.SIGINT)
         reported = central.event("recorded")
         assert central.process.wait() == 0

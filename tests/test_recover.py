@@ -10,8 +10,9 @@ from ertis_cli.capture import _seal
 from ertis_cli.main import cli
 
 from ertis_numba.errors import DataError, JournalInUseError, SonarError
-from ertis_numba.journal import seal_in_subprocess
+from ertis_numba.journal import seal_in_subprocess, storage_processes
 from ertis_numba.processes import child
+from ertis_numba.storage import sealing_process
 from ertis_numba.storage.sealing import seal
 from ertis_numba.storage.verify import verify
 from tests.journals import crashed, create, entries
@@ -22,6 +23,22 @@ def run(*arguments, code=0):
     done = CliRunner().invoke(cli, [str(argument) for argument in arguments])
     assert done.exit_code == code, (done.stdout, done.stderr, done.exception)
     return done
+
+
+@pytest.fixture
+def sealed_here(monkeypatch):
+    """Run what sealing processes run in this process, for tests of what is reported of their replies."""
+
+    def seal_here(request, replies, progress):
+        def report(note):
+            if isinstance(note, storage_processes.SealingProgress):
+                progress(note.done, note.of)
+            else:
+                replies.append(note)
+
+        return f"ended with {vars(sealing_process)['_seal'](request, report)}"
+
+    monkeypatch.setattr(storage_processes, "_seal", seal_here)
 
 
 def test_sealing_process_seals_a_journal(tmp_path):
@@ -146,6 +163,7 @@ def test_recover_seals_a_folder(tmp_path):
     assert verify(tmp_path / "rec.h5")[0].is_intact
 
 
+@pytest.mark.usefixtures("sealed_here")
 def test_recover_reports_unsealable_journals(tmp_path):
     path = crashed(tmp_path)
     (tmp_path / "rec.h5").write_text("mine")
@@ -160,6 +178,7 @@ def test_recover_reports_unsealable_journals(tmp_path):
     assert verify(tmp_path / "rec.h5")[0].is_intact
 
 
+@pytest.mark.usefixtures("sealed_here")
 def test_recover_reports_damaged_measurements(tmp_path):
     create(tmp_path).close()
     path = tmp_path / "rec.h5.journal"
@@ -203,6 +222,7 @@ def test_recover_can_be_interrupted(tmp_path, monkeypatch):
 LOST = SonarError("left: it was unplugged; plug it in")
 
 
+@pytest.mark.usefixtures("sealed_here")
 def test_capture_reports_damage(tmp_path, capsys):
     create(tmp_path).close()
     path = tmp_path / "rec.h5.journal"
@@ -212,6 +232,7 @@ def test_capture_reports_damage(tmp_path, capsys):
     assert len(verify(tmp_path / "rec.h5")) == 1
 
 
+@pytest.mark.usefixtures("sealed_here")
 def test_failed_capture_that_cannot_be_sealed_is_reported(tmp_path, capsys):
     path = crashed(tmp_path)
     (tmp_path / "rec.h5").write_text("mine")
@@ -230,6 +251,7 @@ def test_failed_capture_that_cannot_be_sealed_is_reported(tmp_path, capsys):
     assert verify(tmp_path / "rec.h5")[0].is_intact
 
 
+@pytest.mark.usefixtures("sealed_here")
 def test_empty_capture_is_reported(tmp_path):
     for failure, wanted in ((None, "rec.h5.journal: no measurement was captured"), (LOST, "left: it was unplugged")):
         create(tmp_path, []).close()

@@ -13,6 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
+from ertis_cli.main import cli
 
 from ertis_numba.frames import Energyscape, Measurement, Stamp
 from ertis_numba.journal import JournalEntry
@@ -109,6 +111,8 @@ def is_gone(pid):
 
 
 def test_serve_publishes_images_and_stores_measurements(tmp_path):
+    """Measurements of one-bit and of PCM microphones are sent, stored and imaged alike."""
+    pcm = noise(CASES["PCM, calibrated"])
     storing = (
         "--record",
         str(tmp_path),
@@ -134,6 +138,10 @@ def test_serve_publishes_images_and_stores_measurements(tmp_path):
                 assert product is not None
                 images += [product] * isinstance(product, Energyscape)
                 groups += [product] * isinstance(product, Group)
+        node.add_sensor("ring", pcm.settings)
+        stamp = Stamp(sensor="ring", session_id=11, timestamp_ns=time.time_ns())
+        node.append([JournalEntry(Measurement(pcm.data, pcm.settings, stamp), time.monotonic_ns())])
+        image_of_pcm = received(subscriber, Energyscape)
         assert node.flush(TIMEOUT_S)
         reported = served.end()
     assert set(reported) == REPORTED
@@ -141,15 +149,19 @@ def test_serve_publishes_images_and_stores_measurements(tmp_path):
     with Pipeline(SHORT, device="cpu") as pipeline:
         wanted = pipeline.process(MEASUREMENT)
     assert all(np.array_equal(image.amplitude, wanted.amplitude) for image in images)
+    with Pipeline(image_of_pcm.settings, max_error_db=image_of_pcm.settings.accuracy.max_error_db) as pipeline:
+        assert np.array_equal(image_of_pcm.amplitude, pipeline.process(pcm).amplitude)
     assert {(image.stamp.sensor, image.stamp.sequence) for image in images} == set(
         itertools.product(("left", "right"), range(4))
     )
     assert [(group.sensors, group.flags) for group in groups] == [(("left", "right"), ())] * 4
+    (recording,) = reported["recordings"]
+    assert Path(recording).name.startswith("tour_")
+    with open_recording(recording, sensor="ring") as stored:
+        assert np.array_equal(stored[0].data, pcm.data)
     for name in ("left", "right"):
         sensor = reported["sensors"][name]
         assert (sensor["received"], sensor["published"], sensor["stored"], sensor["dropped"]) == (4, 4, 4, {})
-        (recording,) = reported["recordings"]
-        assert Path(recording).name.startswith("tour_")
         with open_recording(recording, sensor=name) as stored:
             assert [measurement.stamp.sequence for measurement in stored] == [0, 1, 2, 3]
 
@@ -228,10 +240,8 @@ def test_keys_grant_each_node_its_listed_permissions(tmp_path):
     ],
 )
 def test_serve_refuses_invalid_options_in_one_line(options, reported):
-    command = [sys.executable, "-m", "ertis_cli", "serve", "--listen", "tcp://127.0.0.1:0", *options]
-    environment = {**os.environ, "PYTHONPATH": str(Path("cli").absolute())}
-    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=TIMEOUT_S, check=False)
-    assert done.returncode == 1
+    done = CliRunner().invoke(cli, ["serve", "--listen", "tcp://127.0.0.1:0", *options])
+    assert done.exit_code == 1
     (line,) = done.stderr.splitlines()
     assert reported in line
 
@@ -242,31 +252,7 @@ def test_refused_serve_leaves_no_files(tmp_path):
         other.listen()
         publish = ("--publish", f"tcp://127.0.0.1:{other.getsockname()[1]}")
         folders = ("--record", str(tmp_path / "new"), "--quarantine", str(tmp_path / "q"))
-        command = [sys.executable, "-m", "ertis_cli", "serve", "--listen", "tcp://127.0.0.1:0", *publish, *folders]
-        environment = {**os.environ, "PYTHONPATH": str(Path("cli").absolute())}
-        done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=TIMEOUT_S, check=False)
-    assert done.returncode == 1
+        done = CliRunner().invoke(cli, ["serve", "--listen", "tcp://127.0.0.1:0", *publish, *folders])
+    assert done.exit_code == 1
     assert "is in use by another program; end that program or give another --publish" in done.stderr.splitlines()[-1]
     assert not list(tmp_path.iterdir())
-
-
-def test_serve_handles_pcm(tmp_path):
-    """PCM measurements are sent, stored and imaged like one-bit ones."""
-    given = noise(CASES["PCM, calibrated"])
-    with (
-        serving(*LOOPBACK, "--record", str(tmp_path)) as served,
-        Subscriber(served.publish, products=("energyscape", "status"), credit=64) as subscriber,
-    ):
-        received(subscriber, Status)
-        with SensorNode(served.listen) as node:
-            node.add_sensor("ring", given.settings)
-            stamp = Stamp(sensor="ring", session_id=11, timestamp_ns=time.time_ns())
-            node.append([JournalEntry(Measurement(given.data, given.settings, stamp), time.monotonic_ns())])
-            assert node.flush(timeout_s=TIMEOUT_S)
-            image = received(subscriber, Energyscape)
-        served.end()
-    with Pipeline(image.settings, max_error_db=image.settings.accuracy.max_error_db) as pipeline:
-        assert np.array_equal(image.amplitude, pipeline.process(given).amplitude)
-    (path,) = tmp_path.rglob("*.h5")
-    with open_recording(path) as recording:
-        assert np.array_equal(recording[0].data, given.data)

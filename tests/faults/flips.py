@@ -231,7 +231,7 @@ def _keys(folder: Path, _: Shown) -> Judge:
         pair = KeyPair.load(work / "robot.secret.toml")
         return (pair, public_key(work / "robot.public.toml"), AllowList.load(work / "allow.toml")), False
 
-    wanted, _ = read(folder)
+    wanted = read(folder)[0]
     return lambda work: _classify(lambda: read(work), wanted)
 
 

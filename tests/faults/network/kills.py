@@ -162,9 +162,9 @@ def nodes(folder: Path, *, seed: int, count: int) -> Found:
                         time.sleep(rng.uniform(0.0, 0.3))
                     sender.kill()
         node.stop()
-    with SenderThread(jobs["spool"].replace(count=1)) as sender:
-        sender.wait_for("done")
-        ended = record.finish([sender])
+    with SenderThread(jobs["spool"].replace(count=1)) as last:
+        last.wait_for("done")
+        ended = record.finish([last])
     found = judged(folder, record.archive, list(diaries.values()), kept=[diaries["spool"]])
     return (
         {"kills": 2 * ((count + 1) // 2), "before a line": by_line}
@@ -178,12 +178,15 @@ def _n_kept(diary: Path) -> int:
     return len(read_diaries([diary]).kept) if diary.exists() else 0
 
 
-def sealings(folder: Path, *, seed: int, count: int) -> Found:
-    """Kill sealing processes while the central node continues, and sometimes the central node with them."""
+def sealings(folder: Path, *, seed: int, count: int, rate_hz: float = 20.0) -> Found:
+    """Kill sealing processes while the central node continues, and sometimes the central node with them.
+
+    The rate of the sensor determines how often a sealing process starts.
+    """
     rng = random.Random(seed)
     record = RestartedRecorder(folder, "--rotate-size", "2")
     diary = folder / "sender.ndjson"
-    job = SenderJob(address=record.address, diary=str(diary), rate_hz=20.0, seed=seed, ring_bytes=_RING_BYTES)
+    job = SenderJob(address=record.address, diary=str(diary), rate_hz=rate_hz, seed=seed, ring_bytes=_RING_BYTES)
     killed = with_central = 0
     with ExitStack() as stack:
         sender = stack.enter_context(SenderThread(job.replace(patience_s=60.0)))
