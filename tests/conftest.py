@@ -34,6 +34,8 @@ def _one_blas_thread():
     threads took a third of the suite's processor time and saved nothing. Commands that tests start in their own
     processes keep the default number of threads.
     """
+    import scipy.linalg  # noqa: F401, PLC0415 - it has a BLAS of its own, which can be limited once it is loaded
+
     with threadpoolctl.threadpool_limits(1, user_api="blas"):
         yield
 

@@ -15,6 +15,7 @@ from ertis_cli.main import cli
 from ertis_numba import verification
 from ertis_numba.campaign import Campaign, CampaignOptions, RecordingEnded, RecordingProgress, RecordingStarted
 from tests.campaigns import InlinePool, names_in, write_recordings
+from tests.files import line
 
 FAST = ["--range", "0.5:0.8", "--directions", "2d:9", "--workers", "1"]
 
@@ -22,7 +23,7 @@ FAST = ["--range", "0.5:0.8", "--directions", "2d:9", "--workers", "1"]
 @pytest.fixture
 def runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    write_recordings(tmp_path / "runs", names="ab")
+    write_recordings(tmp_path / "runs", names="ab", settings=line(8, 8))
     (tmp_path / "runs" / "broken.h5").write_bytes(b"broken")
     return tmp_path / "runs"
 
@@ -72,7 +73,8 @@ def test_process_reports_each_recording_and_a_summary(runs, tmp_path):
     assert "2 recordings: 2 kept; 0 measurements in " in done.stderr
 
 
-def test_process_reports_plans_and_verifies_each_recording(runs, monkeypatch):
+@pytest.mark.usefixtures("in_test_process")
+def test_process_reports_plans_and_verifies_each_recording(runs):
     (runs / "broken.h5").unlink()
     done = run("runs", "-o", "out", *FAST, "--explain", "--verify", "--json")
     *each, _ = [json.loads(line) for line in done.stdout.splitlines()]
@@ -81,7 +83,6 @@ def test_process_reports_plans_and_verifies_each_recording(runs, monkeypatch):
         assert sensor["verified"]["error_db"] <= sensor["verified"]["max_error_db"]
         assert sensor["plan"]["safe_db"] <= -35.0
         assert "lines" not in sensor
-    monkeypatch.setattr(Campaign, "_pool", lambda _: InlinePool())
     done = run("runs", "-o", "more", *FAST, "--explain")
     assert done.stderr.count("plan of eRTIS-7 for an error budget of -35 dB:") == 2
     again = run("runs", "-o", "more", *FAST, "--explain")
@@ -102,6 +103,7 @@ def test_images_beyond_the_budget_are_not_written(runs, monkeypatch):
     assert names_in(runs.parent / "out") == []
 
 
+@pytest.mark.usefixtures("in_test_process")
 @pytest.mark.parametrize(
     ("arguments", "code", "stated"),
     [

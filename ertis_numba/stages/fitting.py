@@ -64,13 +64,16 @@ class _OneThread:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._inside = 0
-        self._limits: threadpoolctl.threadpool_limits | None = None
+        self._controller: threadpoolctl.ThreadpoolController | None = None
+        self._limits: Any = None
 
     def __enter__(self) -> None:
         with self._lock:
             self._inside += 1
             if self._inside == 1:
-                self._limits = threadpoolctl.threadpool_limits(1, user_api="blas")
+                # Finding the libraries takes milliseconds. NumPy, whose BLAS fits, has loaded it by now.
+                self._controller = self._controller or threadpoolctl.ThreadpoolController()
+                self._limits = self._controller.limit(limits=1, user_api="blas")
 
     def __exit__(self, *_: object) -> None:
         with self._lock:

@@ -4,6 +4,7 @@ Both kinds are HDF5 and netCDF-4 at once: every axis is a dimension scale, so th
 same names. One group ``/sensors/<name>`` holds one sensor.
 """
 
+import functools
 import hashlib
 import math
 import os
@@ -368,6 +369,7 @@ def software_versions() -> dict[str, str]:
     return {name: _version(name) for name in ("ertis-numba", "numba", "numpy", "scipy")}
 
 
+@functools.cache  # Each look-up reads files.
 def _version(distribution: str) -> str:
     try:
         return metadata.version(distribution)
