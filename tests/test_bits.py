@@ -212,7 +212,7 @@ def test_splices_are_detected(name):
     words, random = REAL if name == "real" else recorded(name), np.random.default_rng(6)
     check = BitCheck(len(words), RATE_HZ, splices=True)
     for kind, smallest in FOUND[name].items():
-        found = [check.check(KINDS[kind](words, random)) for _ in range(40)]
+        found = [check.check(KINDS[kind](words, random)) for _ in range(100)]
         assert {*found} <= {None, "splice", "noise"}
         assert np.mean([item is not None for item in found]) >= smallest, kind
     assert check.check(words) is None
