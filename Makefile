@@ -78,6 +78,7 @@ soak: $(VENV)/ready-to-test  ## test faults, kills, full disks and random scenes
 	$(BIN)/python -m tests.faults network --long $(if $(SEED),--seed $(SEED)) --update docs/explanation/network-guarantees.md
 	$(BIN)/ertis bench simulation --verdicts 1000
 	$(BIN)/ertis bench budgets --count 300
+	ERTIS_EXAMPLES=3000 $(PYTEST) --timeout 0 tests/hard_cases/test_any_settings.py
 
 gpu: $(VENV)/ready  ## test and time this machine's NVIDIA GPU in less than ten minutes; GPU=cu13 for CUDA 13
 	$(BIN)/python -m pip install --quiet --editable '.[test,$(GPU)]'

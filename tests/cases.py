@@ -3,6 +3,7 @@
 import numpy as np
 
 from ertis_numba.frames import Measurement, Stamp
+from ertis_numba.pipeline import Pipeline
 from ertis_numba.sample_format import sample_format
 from ertis_numba.settings import Accuracy, Air, Array, Call, Processing, Recording, Settings
 
@@ -76,6 +77,11 @@ def noise(settings: Settings, seed: int = 1) -> Measurement:
     else:
         numbers = (0.1 * settings.recording.full_scale * random.standard_normal(words.shape)).astype(words.dtype)
     return Measurement(numbers, settings, Stamp(sequence=5))
+
+
+def process_noise(seed: int) -> bytes:
+    """Amplitudes of the image of white noise. Other processes import this module faster than one of tests."""
+    return Pipeline(SHORT, predict=False).process(noise(SHORT, seed)).amplitude.tobytes()
 
 
 def words_of(signals, seed: int = 1):

@@ -1,5 +1,6 @@
 """Images as arrays, settings paths, argument checks, and noise thresholds of peaks."""
 
+import functools
 import json
 
 import numpy as np
@@ -17,11 +18,16 @@ from tests.scenes import only, scene_of
 SETTINGS = EIGHT.settings()
 
 
+@functools.cache
+def quiet(*points):
+    """An image of points without noise."""
+    measurement = Simulator(scene_of(*points, sensor=EIGHT), plan=only("spreading")).render()
+    return ertis.Pipeline(SETTINGS, predict=False).process(measurement)
+
+
 def image(*points, noise_dbfs=-60.0, seed=0):
     """An image of points with white noise in every beam."""
-    scene = scene_of(*points, sensor=EIGHT)
-    measurement = Simulator(scene, plan=only("spreading")).render()
-    made = ertis.Pipeline(SETTINGS, predict=False).process(measurement)
+    made = quiet(*points)
     rng = np.random.default_rng(seed)
     noise = rng.normal(size=(2, *made.amplitude.shape)) * 10 ** (noise_dbfs / 20) / np.sqrt(2)
     return made.replace(amplitude=np.hypot(made.amplitude + noise[0], noise[1]).astype(np.float32))

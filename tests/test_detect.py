@@ -32,7 +32,11 @@ def image_of(reflectors, *, directions="2d:181", range_m=(0.8, 1.6), noise=0.0, 
         source = unit_vectors(np.radians([azimuth_deg]), np.radians([elevation_deg]))
         actual_m = positions_m + errors_m * np.random.default_rng(2).standard_normal(positions_m.shape)
         paths_m = looks @ positions_m.T - source @ actual_m.T  # (direction, mic)
-        pattern = np.stack([np.exp(-1j * k * paths_m).mean(axis=1) for k in wave_1_m], axis=1)
+        turned, turn = np.exp(-1j * wave_1_m[0] * paths_m), np.exp(-1j * (wave_1_m[1] - wave_1_m[0]) * paths_m)
+        pattern = np.empty((len(looks), len(wave_1_m)), dtype=complex)
+        for place in range(len(wave_1_m)):  # from each wave number to the next one by a multiplication
+            pattern[:, place] = turned.mean(axis=1)
+            turned *= turn
         shape = np.exp(2j * wave_1_m[:, None] * (ranges_m - reflector_m)) * power[:, None]
         beams += amplitude * pattern @ shape
     amplitude = np.abs(beams + noise * np.random.default_rng(1).standard_normal(beams.shape))

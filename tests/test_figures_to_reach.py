@@ -12,7 +12,7 @@ import pytest
 import ertis_numba as ertis
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.geometry import unit_vectors
-from ertis_numba.settings import Processing, Settings
+from ertis_numba.settings import Processing, Recording, Settings
 from tests import reference
 from tests.cases import noise
 from tests.promises import best_ratio
@@ -67,13 +67,13 @@ def test_first_run_takes_less_time_than_30_imports_and_reports_compilation(recor
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="only Linux says how large a process ever was")
 def test_memory_is_independent_of_the_recording_length(tmp_path):
-    """700 measurements are 460 MB; using half of that would be too much."""
+    """220 long measurements are 460 MB; using half of that would be too much."""
     settings = Settings.from_preset("default_25_50").replace(
-        processing=Processing(directions="2d:5", range_m=(0.5, 1.0))
+        recording=Recording(n_samples=2**19), processing=Processing(directions="2d:5", range_m=(0.5, 1.0))
     )
     words = noise(settings).data
     path = tmp_path / "long.h5"
-    ertis.write_recording(path, (Measurement(words, settings, Stamp(sequence=n)) for n in range(700)))
+    ertis.write_recording(path, (Measurement(words, settings, Stamp(sequence=n)) for n in range(220)))
     code = (
         "import sys; from ertis_cli.main import cli\n"
         "try: cli.main(sys.argv[1:])\n"

@@ -236,8 +236,8 @@ def test_hostile_hello_messages_are_refused(tmp_path):
 
 
 def test_hostile_files_are_refused(tmp_path):
-    found = hostile.files(tmp_path, count=20)
+    found = hostile.files(tmp_path, count=8)
     assert table.row("files", found)
-    assert found["reads"] == 3 * found["files"] == 60
+    assert found["reads"] == 3 * found["files"] == 24
     assert (found["taken"], found["failed"], found["crashes"]) == ([], [], [])
     assert found["memory grew, MB"] < 200

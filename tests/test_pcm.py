@@ -213,7 +213,7 @@ def test_faults_are_found_in_pcm():
 def test_image_is_linear_in_the_samples(beamformer, exponent):
     settings = PCM.replace(
         recording=PCM.recording.replace(encoding="float32"),
-        processing=PCM.processing.replace(beamformer=beamformer),
+        processing=PCM.processing.replace(beamformer=beamformer, directions="2d:31"),
         accuracy=Accuracy(max_error_db=-20.0),
     )
     given = heard(settings)

@@ -23,7 +23,7 @@ from ertis_numba.geometry import microphones, unit_vectors
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Array, Processing, Settings
 from tests import cases, reference
-from tests.cases import CASES, SHORT, noise
+from tests.cases import CASES, SHORT, noise, process_noise
 from tests.hard_cases.tuned import tuned
 
 DEVICES = ("cpu", "numpy")
@@ -46,7 +46,7 @@ def test_pipeline_image_is_exact(name, device, precision):
         pytest.skip("this processor has no 16-bit dot product (AVX-512 VNNI or AVX-VNNI)")
     one_range = SHORT.replace(processing=SHORT.processing.replace(range_m=(0.7, 0.7)))
     settings = tuned(CASES.get(name, one_range), precision=precision)
-    pipeline = Pipeline(settings, device=device)
+    pipeline = Pipeline(settings, device=device, predict=False)
     measurement = noise(settings)
     image = pipeline.process(measurement)
     assert image.amplitude.shape == (len(pipeline.grid), len(pipeline.range_m))
@@ -100,10 +100,6 @@ def test_one_pipeline_serves_several_threads_at_a_time():
         together = list(pool.map(pipeline.process, measurements))
     for one, other in zip(alone, together, strict=True):
         assert one.tobytes() == other.amplitude.tobytes()
-
-
-def process_noise(seed: int) -> bytes:
-    return Pipeline(SHORT).process(noise(SHORT, seed)).amplitude.tobytes()
 
 
 def test_spawned_processes_give_the_same_bits():

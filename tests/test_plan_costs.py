@@ -1,8 +1,6 @@
 """Plans are chosen by nominal costs unless measured ones are asked for."""
 
 import json
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -20,19 +18,10 @@ from ertis_numba.stages import costs, nominal_costs, planner
 from ertis_numba.storage import open_energyscapes, write_recording
 from tests.cases import SHORT, noise
 from tests.files import noise as many_noise
-from tests.pages import ROOT, environment
+from tests.pages import ROOT
 
 CPU = kernels.load("cpu")
 MANY = SHORT.replace(processing=SHORT.processing.replace(directions="3d:2000"), accuracy=Accuracy(max_error_db=-35.0))
-PLAN_OF = """
-import json, sys
-from ertis_numba.pipeline import Pipeline
-from ertis_numba.settings import Settings
-
-settings = Settings.from_toml(sys.stdin.read())
-plans = [Pipeline(settings, device="cpu", plan=plan).settings.to_toml() for plan in sys.argv[1:]]
-print(json.dumps(plans))
-"""
 
 
 def costs_where(dear, folder):
@@ -45,21 +34,16 @@ def costs_where(dear, folder):
     return folder
 
 
-def plans_in_a_process(folder, *names):
-    done = subprocess.run(
-        [sys.executable, "-c", PLAN_OF, *names],
-        input=MANY.to_toml(),
-        env=environment(folder) | {"ERTIS_CACHE_DIR": str(folder)},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    return json.loads(done.stdout)
+def plans_of_another_machine(folder, monkeypatch):
+    """The nominal and the measured plan, without what this process knows about its own machine."""
+    monkeypatch.setenv("ERTIS_CACHE_DIR", str(folder))
+    monkeypatch.setattr(costs, "_KNOWN", {})
+    return [Pipeline(MANY, device="cpu", plan=plan).settings.to_toml() for plan in ("nominal", "measured")]
 
 
-def test_processes_with_different_measured_costs_choose_the_same_plan_by_default(tmp_path):
+def test_machines_with_different_measured_costs_choose_the_same_plan_by_default(tmp_path, monkeypatch):
     folders = [costs_where(dear, tmp_path / dear) for dear in ("sum", "pair")]
-    plans = [plans_in_a_process(folder, "nominal", "measured") for folder in folders]
+    plans = [plans_of_another_machine(folder, monkeypatch) for folder in folders]
     (nominal, measured), (other_nominal, other_measured) = plans
     assert nominal == other_nominal
     assert measured != other_measured
@@ -113,19 +97,15 @@ def test_process_chooses_plans_by_the_given_costs(recording, tmp_path, more):
         assert made_by(tmp_path, recording, *grid) == nominal
     else:
         write_recording(tmp_path / "other.h5", many_noise(count=1))
-        found = []
-        for plan in costs.PLAN_COSTS:
-            options = CampaignOptions(
-                settings=lambda recorded: recorded.replace(processing=MANY.processing), device="cpu", plan=plan
-            )
-            folder = tmp_path / plan
-            campaign = Campaign(
-                list(find_recordings([tmp_path / "rec.h5", tmp_path / "other.h5"])), folder, options, workers=1
-            )
-            assert all(getattr(event, "outcome", "made") == "made" for event in campaign.run())
-            with open_energyscapes(folder / "rec.energy.h5") as images:
-                found.append(images.settings.accuracy)
-        nominal, measured = found
+        nominal = planner.complete(MANY, CPU, threads=1).accuracy  # other campaigns have nominal plans
+        options = CampaignOptions(
+            settings=lambda recorded: recorded.replace(processing=MANY.processing), device="cpu", plan="measured"
+        )
+        paths = [tmp_path / "rec.h5", tmp_path / "other.h5"]
+        campaign = Campaign(list(find_recordings(paths)), tmp_path / "images", options, workers=1)
+        assert all(getattr(event, "outcome", "made") == "made" for event in campaign.run())
+        with open_energyscapes(tmp_path / "images" / "rec.energy.h5") as images:
+            measured = images.settings.accuracy
     assert nominal.beam_taps > 0
     assert measured.beam_taps == 0
 

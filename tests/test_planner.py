@@ -73,7 +73,7 @@ def test_true_error_keeps_the_budget(seed):
 @pytest.mark.parametrize("budget_db", ERROR_PRESETS_DB.values())
 def test_pipelines_of_all_presets_keep_their_budget(device, budget_db):
     measurement = noise(SHORT)
-    pipeline = Pipeline(SHORT, device=device, max_error_db=budget_db)
+    pipeline = Pipeline(SHORT, device=device, max_error_db=budget_db, predict=False)
     assert is_complete(pipeline.settings.accuracy)
     assert pipeline.settings.accuracy.max_error_db == budget_db
     exact = error_cases.image_of(measurement, SHORT.replace(accuracy=error_cases.BEST))
@@ -130,10 +130,10 @@ def test_unreachable_budget_is_refused_with_the_smallest_error(pinned, part):
 
 @pytest.mark.parametrize("name", ["default", "wide band", "solid angle", "line of 8", "64 bits, two words"])
 def test_larger_budget_is_never_slower(name):
-    settings = CASES[name].replace(processing=CASES[name].processing.replace(directions="3d:700"))
+    settings = CASES[name].replace(processing=CASES[name].processing.replace(directions="3d:500"))
     threads = CPU.max_threads  # plans are chosen by what they cost with all of them
     times_ms = [
-        chosen_for(settings, threads=threads, max_error_db=float(budget_db)).time_ms for budget_db in range(-100, 0, 10)
+        chosen_for(settings, threads=threads, max_error_db=float(budget_db)).time_ms for budget_db in range(-100, 0, 15)
     ]
     assert (np.diff(times_ms) <= 1e-9).all()
     assert times_ms[-1] < 0.7 * times_ms[0]

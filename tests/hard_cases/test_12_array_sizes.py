@@ -49,7 +49,7 @@ def require_exact(array, precision):
     settings = tuned(SLOW.replace(array=array), precision=precision)
     if precision == "int16" and not kernels.load().tile_ranges:
         pytest.skip("this processor has no 16-bit dot product (AVX-512 VNNI or AVX-VNNI)")
-    pipeline, measurement = Pipeline(settings), noise(settings)
+    pipeline, measurement = Pipeline(settings, predict=False), noise(settings)
     assert measurement.data.dtype.itemsize * 8 == array.word_bits
     amplitude = pipeline.process(measurement).amplitude
     directions = unit_vectors(pipeline.grid.azimuth_rad, pipeline.grid.elevation_rad)

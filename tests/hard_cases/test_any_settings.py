@@ -17,7 +17,7 @@ from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Air, Array, Call, Processing, Recording, Settings
 from tests.hard_cases.tuned import tuned
 
-EXAMPLES = int(os.environ.get("ERTIS_EXAMPLES", "300"))
+EXAMPLES = int(os.environ.get("ERTIS_EXAMPLES", "120"))
 MAX_SAMPLES = 500_000
 LOUDEST = 100.0  # limit of an image with a full scale of 1, before calibrated gains
 DATA = ("noise", "zeros", "ones", "alternating", "sparse", "stuck")
