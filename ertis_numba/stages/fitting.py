@@ -17,6 +17,7 @@ min-max interpolation, IEEE Trans. Signal Process. 51, 2003).
 
 import functools
 import math
+import sys
 import threading
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -66,19 +67,25 @@ class _OneThread:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._inside = 0
-        self._limits: threadpoolctl.threadpool_limits | None = None
+        self._limits: Any = None
 
     def __enter__(self) -> None:
         with self._lock:
             self._inside += 1
             if self._inside == 1:
-                self._limits = threadpoolctl.threadpool_limits(1, user_api="blas")
+                self._limits = _libraries(len(sys.modules)).limit(limits=1, user_api="blas")
 
     def __exit__(self, *_: object) -> None:
         with self._lock:
             self._inside -= 1
             if self._inside == 0 and self._limits is not None:
                 self._limits.restore_original_limits()
+
+
+@functools.lru_cache(maxsize=1)
+def _libraries(_n_modules: int) -> threadpoolctl.ThreadpoolController:
+    """Return the numerical libraries of this process. Only imports load more, and searching them takes up to 3 ms."""
+    return threadpoolctl.ThreadpoolController()
 
 
 _ONE_THREAD = _OneThread()
