@@ -134,19 +134,19 @@ def points(count):
     ("scene", "message"),
     [
         (
-            Scene(sensors=(SENSOR,), points=points(20), boxes=(ROOM,), max_reflections=4),
+            lambda: Scene(sensors=(SENSOR,), points=points(20), boxes=(ROOM,), max_reflections=4),
             r"at least 20\d+ sound paths to one sensor; the limit is 20000\. Lower",
         ),
-        (Scene(sensors=(SENSOR,), points=points(20_001)), r"at least 20001 sound paths .*; the limit is 20000"),
+        (lambda: Scene(sensors=(SENSOR,), points=points(20_001)), r"at least 20001 sound paths .*; the limit is 20000"),
         (
-            Scene(sensors=(SENSOR,), points=points(1), boxes=(ROOM,) * 31, max_reflections=3),
+            lambda: Scene(sensors=(SENSOR,), points=points(1), boxes=(ROOM,) * 31, max_reflections=3),
             r"scene has 6400446 mirror points, from 186 walls \(6 per box\), 1 targets and max_reflections 3; ",
         ),
     ],
 )
 def test_scene_exceeding_the_memory_is_refused(scene, message):
     with pytest.raises(ArgumentError, match=message):
-        make_plan(scene)
+        make_plan(scene())
 
 
 def test_measurement_exceeding_the_memory_is_refused(monkeypatch):

@@ -160,9 +160,15 @@ def _noise(seed: int, shape: tuple[int, ...]) -> NDArray[np.float64]:
 
 def _chain(settings: Settings) -> FastChain:
     kernel_set = kernels.load("cpu")
-    threads = kernel_set.max_threads
+    return FastChain(_planned(settings), kernel_set, threads=kernel_set.max_threads)
+
+
+@functools.lru_cache(maxsize=64)
+def _planned(settings: Settings) -> Settings:
+    """Return settings with the plan of a chain. It takes as long as a render, and scenes often share their sensors."""
+    kernel_set = kernels.load("cpu")
     single = settings.replace(
         processing=settings.processing.replace(method="fast"),
         accuracy=settings.accuracy.replace(precision="float32"),
     )
-    return FastChain(planner.complete(single, kernel_set, threads=threads), kernel_set, threads=threads)
+    return planner.complete(single, kernel_set, threads=kernel_set.max_threads)
