@@ -8,7 +8,7 @@ from ertis_numba import verification
 from ertis_numba.campaign import CampaignOptions, existing_output
 from ertis_numba.storage import write_recording
 from tests.campaigns import outcomes, run_here, write_recordings
-from tests.files import noise
+from tests.files import line, noise
 
 
 def narrow(settings):
@@ -22,7 +22,7 @@ def exact(settings):
 @pytest.fixture
 def runs(tmp_path, monkeypatch):
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")  # otherwise the creation dates would differ
-    write_recordings(tmp_path / "runs", names="a")
+    write_recordings(tmp_path / "runs", names="a", settings=line(8, 8))
     return tmp_path / "runs"
 
 

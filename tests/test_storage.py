@@ -222,7 +222,7 @@ def test_memory_does_not_grow_with_the_recording(tmp_path):
         with open_recording(tmp_path / "rec.h5") as recording:
             write_recording(tmp_path / "copy.h5", recording)
 
-    write_recording(tmp_path / "rec.h5", (Measurement(words, long, Stamp(sequence=i)) for i in range(60)))
+    write_recording(tmp_path / "rec.h5", (Measurement(words, long, Stamp(sequence=i)) for i in range(20)))
     tracemalloc.start()
     try:
         copy()
