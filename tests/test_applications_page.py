@@ -9,7 +9,7 @@ from tests.pages import environment, page, python_in, run_code_here
 from tests.publishing import Publisher, cloud
 
 PAGE = page("applications")
-place, platform, ports = network.place, network.platform, network.ports
+place, platform, ports, words = network.place, network.platform, network.ports, network.words
 
 
 def test_application_loop_of_the_page_runs(tmp_path):
@@ -24,13 +24,12 @@ def test_application_loop_of_the_page_runs(tmp_path):
     assert max(numbers[:-1], default=0) < 3
 
 
-def test_application_commands_of_the_page_run(place, ports, platform, monkeypatch):
+def test_application_commands_of_the_page_run(place, ports, platform):
     """Nothing is near, so the vehicle may go."""
-    monkeypatch.setenv("ERTIS_SERVE_WORKERS", "1")
     lines = re.findall(r"^\$ (.*)$", PAGE, re.MULTILINE)
     assert [line.split()[1] for line in lines] == ["example", "emulate", "serve", "capture", "2_safety_stop.py"]
     *commands, example = lines
-    with network.Shell(ports, platform) as shell:
+    with network.Shell(place, ports, platform) as shell:
         for command in commands:
             shell.run(command.removeprefix("ertis "))
         words = [sys.executable, "-u", *example.replace("5602", ports["5602"]).split()[1:]]
