@@ -185,7 +185,7 @@ def test_subscriber_with_keys_receives_products(keys):
     ("who", "match"),
     [
         ("unknown", "the central node does not know this key"),
-        ("none", "requires a key; give --key and --server-key"),
+        ("none", "requires a key[;,] give --key and --server-key"),
         ("wrong server", "server-key"),
     ],
 )
