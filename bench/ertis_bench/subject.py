@@ -1,4 +1,4 @@
-"""Measurements for benchmarks."""
+"""Input measurements for benchmarks."""
 
 import importlib.metadata
 from pathlib import Path

@@ -60,7 +60,7 @@ _update = click.option(
 
 @click.group()
 def bench() -> None:
-    """Run benchmarks, and check each result before timing it."""
+    """Run benchmarks of speed and accuracy. Results are checked before they are timed."""
 
 
 @bench.command()
@@ -69,7 +69,7 @@ def bench() -> None:
 @options.quiet
 @options.as_json
 def paper(**given: Any) -> None:
-    """Time the whole signal chain at the paper's 90, 1850 and 3000 directions."""
+    """Time the signal chain at 90, 1850 and 3000 directions."""
     from ertis_bench import paper as benchmark
 
     _run("paper", benchmark, **given)
@@ -91,7 +91,10 @@ def paper(**given: Any) -> None:
 @options.quiet
 @options.as_json
 def accuracy(*, picture: Path | None, **given: Any) -> None:
-    """Measure image error versus time for about thirty plans and the paper's method."""
+    """Measure image error versus time.
+
+    Compares about twenty plans and the paper's method.
+    """
     from ertis_bench import accuracy as benchmark
 
     if picture and not picture.absolute().parent.is_dir():  # refuse now rather than after minutes
@@ -113,7 +116,10 @@ def accuracy(*, picture: Path | None, **given: Any) -> None:
 @options.quiet
 @options.as_json
 def costs(*, count: int, target: Path | None, quiet: bool, as_json: bool) -> None:
-    """Measure the costs of the kernels, from which the planner predicts times, beside the nominal costs."""
+    """Measure the kernel costs that the planner uses.
+
+    The table also has the nominal costs.
+    """
     from ertis_bench import costs as benchmark
 
     if target is not None and target.name != "nominal_costs.py":
@@ -135,7 +141,10 @@ def costs(*, count: int, target: Path | None, quiet: bool, as_json: bool) -> Non
 @options.quiet
 @options.as_json
 def verification(**given: Any) -> None:
-    """Compare --verify with a slow float64 reference over random settings; nothing is timed."""
+    """Compare --verify with a float64 reference.
+
+    Settings are random; nothing is timed.
+    """
     from ertis_bench import verification as benchmark
 
     _run("verification", benchmark, **given)
@@ -147,7 +156,10 @@ def verification(**given: Any) -> None:
 @options.quiet
 @options.as_json
 def budgets(**given: Any) -> None:
-    """Count random settings that meet or exceed their error budget, with and without a warning; nothing is timed."""
+    """Count random settings that exceed their error budget.
+
+    Distinguishes settings with and without a warning; nothing is timed.
+    """
     from ertis_bench import budgets as benchmark
 
     _run("budgets", benchmark, **given)
@@ -162,7 +174,10 @@ def budgets(**given: Any) -> None:
 @options.quiet
 @options.as_json
 def points(**given: Any) -> None:
-    """Compare point errors with their stated uncertainties over grids, error budgets and noise; nothing is timed."""
+    """Compare errors of points with their uncertainties.
+
+    Varies grids, error budgets and noise; nothing is timed.
+    """
     from ertis_bench import points as benchmark
 
     _run("points", benchmark, **given)
@@ -174,7 +189,10 @@ def points(**given: Any) -> None:
 @options.quiet
 @options.as_json
 def scaling(**given: Any) -> None:
-    """Measure time versus the number of directions, ranges, microphones and threads."""
+    """Measure time versus directions, ranges and threads.
+
+    Also varies the number of microphones.
+    """
     from ertis_bench import scaling as benchmark
 
     _run("scaling", benchmark, **given)
@@ -192,7 +210,7 @@ def scaling(**given: Any) -> None:
 @options.quiet
 @options.as_json
 def simulation(*, verdicts: int | None, **given: Any) -> None:
-    """Time the simulation with only the relevant effects of a scene, and with all effects."""
+    """Time simulations with relevant and with all effects."""
     from ertis_bench import simulation as benchmark
 
     if verdicts is None:
@@ -232,7 +250,10 @@ def simulation(*, verdicts: int | None, **given: Any) -> None:
 @options.quiet
 @options.as_json
 def many(**given: Any) -> None:
-    """Time many recordings with one worker, several workers and a dask cluster, and compare all output files."""
+    """Time many recordings on workers and a dask cluster.
+
+    Compares all output files.
+    """
     from ertis_bench import many as benchmark
 
     _run("many", benchmark, **given)
@@ -243,7 +264,10 @@ def many(**given: Any) -> None:
 @options.quiet
 @options.as_json
 def factorisation(**given: Any) -> None:
-    """Count multiplications per image point, with and without sub-arrays; nothing is timed."""
+    """Count multiplications with and without sub-arrays.
+
+    Nothing is timed.
+    """
     from ertis_bench import factorisation as benchmark
 
     _run("factorisation", benchmark, **given)
@@ -254,7 +278,10 @@ def factorisation(**given: Any) -> None:
 @options.quiet
 @options.as_json
 def interpolation(**given: Any) -> None:
-    """Compare the errors of fitted and of textbook weights for delays; nothing is timed."""
+    """Compare fitted and textbook weights for delays.
+
+    Nothing is timed.
+    """
     from ertis_bench import interpolation as benchmark
 
     _run("interpolation", benchmark, **given)
@@ -265,7 +292,10 @@ def interpolation(**given: Any) -> None:
 @options.quiet
 @options.as_json
 def ptx(**given: Any) -> None:
-    """Compile the GPU kernels and estimate their time on an H200; no GPU is needed, and nothing is timed."""
+    """Estimate the time of GPU kernels without a GPU.
+
+    Compiles them for an H200; nothing is timed.
+    """
     from ertis_bench import ptx as benchmark
 
     _run("ptx", benchmark, **given)
@@ -280,7 +310,7 @@ def ptx(**given: Any) -> None:
 @options.quiet
 @options.as_json
 def of_health(**given: Any) -> None:
-    """Count false alarms of the health checks in healthy arrays, and correctly named faults."""
+    """Count false alarms and named faults of health checks."""
     from ertis_bench import health as benchmark
 
     _run("health", benchmark, **given)
@@ -308,7 +338,10 @@ def of_health(**given: Any) -> None:
 @options.quiet
 @options.as_json
 def network(*, only: tuple[str, ...], **given: Any) -> None:
-    """Measure storage and imaging of a central node with keys, and check every sample and image."""
+    """Measure storage and imaging of a central node.
+
+    Uses keys, and checks every sample and image.
+    """
     from ertis_bench.network import figures as benchmark
 
     from ertis_numba import checks
@@ -336,7 +369,10 @@ def network(*, only: tuple[str, ...], **given: Any) -> None:
 @options.quiet
 @options.as_json
 def gpu(*, newest: bool, **given: Any) -> None:
-    """Test and time this machine's NVIDIA GPU in less than ten minutes, and compare with other libraries and limits."""
+    """Test and time the NVIDIA GPU of this machine.
+
+    Takes less than ten minutes, and compares with other libraries and limits.
+    """
     from ertis_bench import gpu as benchmark
 
     _run("gpu", benchmark, measure=not newest, **given)

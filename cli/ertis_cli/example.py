@@ -41,7 +41,8 @@ def example(
     """List or write example scenes, recordings and scripts.
 
     NAME is a file name, or a file name without its suffix: 'reflectors' copies the scene reflectors.toml and simulates
-    its recording reflectors.h5. A different file of the same name is overwritten only with --force.
+    its recording reflectors.h5. Without NAME, list all examples. An unchanged example is kept; a different file of
+    the same name is overwritten only with --force.
     """
     if not names:
         _list(as_json=as_json)
@@ -58,7 +59,7 @@ def example(
     quiet = quiet or as_json
     for path, item in sources.items():
         if path not in missing:
-            options.say(f"{path}: written before", quiet=quiet)
+            options.say(f"{path}: unchanged", quiet=quiet)
         elif path.suffix == ".h5":
             _simulate(ctx, item, path, force=force, quiet=quiet)
         else:

@@ -30,7 +30,7 @@ class Accuracy(TomlTable, frozen=True, kw_only=True):
     oversampling : int, optional, default None
         Samples kept per range of the energyscape, 1 to 64.
     delay_taps : int, optional, default None
-        Samples that a delayed sample is interpolated from, 1 to 8, with the weights of least error in the call's band.
+        Samples from which a delayed sample is interpolated, 1 to 8. The weights minimise the error in the call's band.
     beam_taps : int, optional, default None
         Beam-grid points along each axis of the array from which a beam is interpolated: 2, 4 or 6. With 0, the beam of
         every direction is summed itself.

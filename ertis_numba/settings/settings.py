@@ -72,7 +72,7 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
         "stop_band_db": "stopband_attenuation_db",
         "zones": "focal_zones",
         "loading": "diagonal_loading",
-        # Earlier versions stored this line, which has no effect, with all settings. It becomes a comment.
+        # Earlier versions stored this line, which had no effect. A comment in its place keeps their files readable.
         r'(?<=\n)interpolation(?=\s*=\s*"fitted")': "# interpolation",
     }
 

@@ -118,7 +118,7 @@ class FastChain(KernelChain):
     def analytic(self, words: NDArray[np.unsignedinteger[Any]]) -> tuple[NDArray[np.complex64], int]:
         """Return the analytic signals, (mic, phase, sample), and the index of the sample at the first range.
 
-        They have neither the gains nor the fractional-delay offsets of the plan.
+        The gains and fractional-delay offsets of the plan are not applied.
         """
         heard = np.empty(self._matched_filter.shape, dtype=np.complex64)
         with self._taken(self._threads) as buffers:

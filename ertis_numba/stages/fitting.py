@@ -71,7 +71,7 @@ class _OneThread:
         with self._lock:
             self._inside += 1
             if self._inside == 1:
-                # Finding the libraries takes milliseconds. NumPy, whose BLAS fits, has loaded it by now.
+                # Finding the libraries takes milliseconds. NumPy has loaded the BLAS of the fit by now.
                 self._controller = self._controller or threadpoolctl.ThreadpoolController()
                 self._limits = self._controller.limit(limits=1, user_api="blas")
 

@@ -64,6 +64,6 @@ class JournalRows:
         lost = [
             SequenceGap(key.sensor, key.sequence, key.sequence, _DAMAGED, key.session_id)
             for key in keys
-            if min(key.sequence, key.session_id) >= 0  # A negative number is damaged itself.
+            if min(key.sequence, key.session_id) >= 0  # A negative number is itself damaged, and names no gap.
         ]
         return self._numbers.missing(self._sensor, [*lost, *self._noted])
