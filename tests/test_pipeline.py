@@ -93,7 +93,7 @@ def test_default_image_has_the_range_axis_of_the_paper():
 
 
 def test_one_pipeline_serves_several_threads_at_a_time():
-    pipeline = Pipeline(SHORT, predict=False)
+    pipeline = Pipeline(SHORT)
     measurements = [noise(SHORT, seed) for seed in range(16)]
     alone = [pipeline.process(measurement).amplitude.copy() for measurement in measurements]
     with concurrent.futures.ThreadPoolExecutor(4) as pool:
@@ -162,7 +162,7 @@ def test_cuda_without_a_gpu_is_refused_with_a_remedy():
 
 
 def test_batch_equals_single_measurements():
-    pipeline, measurements = Pipeline(SHORT, predict=False), [noise(SHORT, seed) for seed in range(5)]
+    pipeline, measurements = Pipeline(SHORT), [noise(SHORT, seed) for seed in range(5)]
     single = [pipeline.process(measurement) for measurement in measurements]
     batch = pipeline.process_batch(iter(measurements))
     assert [image.amplitude.tobytes() for image in batch] == [image.amplitude.tobytes() for image in single]
