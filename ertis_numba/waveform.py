@@ -28,6 +28,7 @@ __all__ = [
 _TRANSITION_HZ = 5_000.0  # wide enough for the matched filter to ring for only 0.4 ms
 _MIN_TRANSITION = 0.02  # relative to the decimated rate; the length of the filter is proportional to the inverse
 _STOPBAND_ATTENUATION_DB = 60.0
+_MAX_FILTERS = 32  # About five times the number of filters in one search for a plan.
 _STOPBAND_TOLERANCE_DB = 0.5  # tolerance of the stopband attenuation
 _WAVEFORM_OVERSAMPLING = 16  # oversampling of a custom waveform before spline interpolation
 _MAX_ROUNDING_ERROR_DB = (
@@ -252,6 +253,15 @@ def decimation_taps(
     ArgumentError
         The decimated rate is too low for ``pass_hz``.
     """
+    taps = _decimation_taps(sample_rate_hz, decimation, pass_hz, stopband_attenuation_db)
+    return taps.copy()
+
+
+@functools.lru_cache(maxsize=_MAX_FILTERS)
+def _decimation_taps(
+    sample_rate_hz: float, decimation: int, pass_hz: float, stopband_attenuation_db: float
+) -> NDArray[np.float64]:
+    """Design the filter. Designs are cached, because a planner tries several for each pipeline."""
     rate_hz = sample_rate_hz / decimation
     transition_hz = rate_hz - 2 * pass_hz
     if transition_hz < _MIN_TRANSITION * rate_hz:

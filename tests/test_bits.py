@@ -78,28 +78,29 @@ def direct_sound(amplitude):
 
 
 SOUNDS = {
-    "silence": np.zeros(SHORT),
-    "direct sound": direct_sound(0.3),
-    "overload": direct_sound(3.0),
-    "overload thirtyfold": direct_sound(30.0),
-    "clicks from ahead": clicks(2e-6, 0.3),
-    "loud clicks from ahead": clicks(2e-6, 3.0),
-    "clicks to 1 MHz from ahead": clicks(0.3e-6, 1.0),
-    "clicks from nearly ahead": clicks(6e-6, 0.5, azimuth_deg=2.0),
-    "clicks from aside": clicks(6e-6, 0.5, azimuth_deg=20.0),
-    "loud clicks from aside": clicks(6e-6, 5.0, azimuth_deg=5.0),
-    "thuds": clicks(300e-6, 5.0),
-    "wind": hiss(10.0, 400.0, 0.3) * np.linspace(0.0, 3.0, 32)[:, None],
-    "noise from ahead": hiss(20e3, 160e3, 0.1),
-    "noise to 1 MHz from ahead": hiss(20e3, 1e6, 0.1),
-    "loud noise from aside": hiss(20e3, 80e3, 0.3, azimuth_deg=30.0),
+    "silence": lambda: np.zeros(SHORT),
+    "direct sound": lambda: direct_sound(0.3),
+    "overload": lambda: direct_sound(3.0),
+    "overload thirtyfold": lambda: direct_sound(30.0),
+    "clicks from ahead": lambda: clicks(2e-6, 0.3),
+    "loud clicks from ahead": lambda: clicks(2e-6, 3.0),
+    "clicks to 1 MHz from ahead": lambda: clicks(0.3e-6, 1.0),
+    "clicks from nearly ahead": lambda: clicks(6e-6, 0.5, azimuth_deg=2.0),
+    "clicks from aside": lambda: clicks(6e-6, 0.5, azimuth_deg=20.0),
+    "loud clicks from aside": lambda: clicks(6e-6, 5.0, azimuth_deg=5.0),
+    "thuds": lambda: clicks(300e-6, 5.0),
+    "wind": lambda: hiss(10.0, 400.0, 0.3) * np.linspace(0.0, 3.0, 32)[:, None],
+    "noise from ahead": lambda: hiss(20e3, 160e3, 0.1),
+    "noise to 1 MHz from ahead": lambda: hiss(20e3, 1e6, 0.1),
+    "loud noise from aside": lambda: hiss(20e3, 80e3, 0.3, azimuth_deg=30.0),
 }
 
 
 @pytest.mark.parametrize("name", SOUNDS)
 def test_sound_of_any_modulator_is_accepted_as_pdm(name):
+    signals = SOUNDS[name]()
     for order, dither in itertools.product((1, 2, 3, 4), (0.0, 0.5)):
-        words = modulated(SOUNDS[name], order=order, dither=dither)
+        words = modulated(signals, order=order, dither=dither)
         assert (verdict(words), verdict(words, SLOW_HZ)) == (None, None), (order, dither)
 
 
@@ -123,14 +124,14 @@ def test_simulated_scenes_are_accepted_as_pdm(path):
     scene = load_scene(path)
     first = scene.sensors[0]
     sensors = (first.replace(recording=Recording(n_samples=2 * SHORT)), *scene.sensors[1:])
-    simulator = Simulator(scene.replace(sensors=sensors))
+    simulator = Simulator(scene.replace(sensors=sensors, count=1))  # effects are planned for all measurements
     assert verdict(simulator.render().data) is None
 
 
 def test_faulty_microphones_are_reported_but_accepted():
     """Nine are faulty, including all of one byte lane; they may fail one by one between blocks."""
     check = BitCheck(SHORT, RATE_HZ, splices=True)
-    words = modulated(SOUNDS["direct sound"])
+    words = modulated(SOUNDS["direct sound"]())
     for mask in np.cumsum(1 << np.array([30, 8, 9, 10, 11, 12, 13, 14, 15])):
         assert check.check(words & ~np.uint32(mask)) is None
     assert list(np.flatnonzero(check.density == 0)) == [8, 9, 10, 11, 12, 13, 14, 15, 30]
@@ -252,7 +253,7 @@ def test_density_is_the_fraction_of_ones():
 
 
 def test_channels_without_a_microphone_are_ignored():
-    words, enabled = modulated(SOUNDS["silence"]), np.arange(32) >= 8
+    words, enabled = modulated(SOUNDS["silence"]()), np.arange(32) >= 8
     noisy = words & ~np.uint32(0xFF) | np.random.default_rng(9).integers(0, 256, SHORT, dtype=np.uint32)
     assert verdict(noisy, enabled=enabled) is None
     assert verdict(words & np.uint32(0xFF), enabled=enabled) == "constant bits"

@@ -20,7 +20,7 @@ from ertis_numba.simulation.sight import SAME_RANGE_M, Sight
 from ertis_numba.simulation.snapshot import snapshot
 
 # Of 60 scenes, those with each kind of verdict twice, and with the smallest differences from the tolerance.
-SEEDS = (1, 2, 3, 5, 7, 10, 11, 12, 13, 14, 15, 17, 18, 1009, 1014, 2000, 2006, 2008)
+SEEDS = (3, 5, 10, 11, 12, 13, 14, 15, 1009, 1014, 2000, 2006, 2008)
 ON = {"absorption", "cross_emission", "doppler", "spreading", "sync_delay", "target_size", "walls"}
 OFF = {"doppler", "occlusion", "sync_delay", "target_size", "walls"}
 

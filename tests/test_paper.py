@@ -29,7 +29,7 @@ def with_paper(settings: Settings, **changes) -> Settings:
 @pytest.mark.parametrize("name", CASES)
 def test_recursive_filters_of_the_paper_equal_their_float64_reference(name):
     settings = with_paper(CASES[name])
-    pipeline = Pipeline(settings, "numpy")
+    pipeline = Pipeline(settings, "numpy", predict=False)
     measurement = noise(settings)
     image = pipeline.process(measurement)
     directions = unit_vectors(pipeline.grid.azimuth_rad, pipeline.grid.elevation_rad)
@@ -52,7 +52,7 @@ def in_float64(words, settings):
     flat = matched.values / filter_response(taps, bins / n_fft / step)
     spectra[:, bins] = np.fft.fft(slow, n_fft)[:, bins] * flat
     analytic = np.fft.ifft(spectra) * (array_weights(settings) / layout.gain[layout.enabled])[:, None]
-    pipeline = Pipeline(settings, "numpy")
+    pipeline = Pipeline(settings, "numpy", predict=False)
     sample = np.rint(pipeline.range_m * 2 / sound_speed_m_s(settings.air) * rate_hz).astype(int)
     images = []
     for direction in unit_vectors(pipeline.grid.azimuth_rad, pipeline.grid.elevation_rad):
@@ -96,7 +96,7 @@ def test_paper_echo_has_its_range_and_amplitude(call, device):
     """The group delays of all filters are removed, including those of recursive ones."""
     settings = with_paper(SHORT.replace(call=call), directions="2d:181", range_decimation=10, range_m=(0.65, 0.75))
     words = echo(settings, azimuth_deg=20.0, range_m=0.7, level=0.8)
-    image = Pipeline(settings, device).process(Measurement(words, settings))
+    image = Pipeline(settings, device, predict=False).process(Measurement(words, settings))
     direction, distance = np.unravel_index(np.argmax(image.amplitude), image.amplitude.shape)
     assert math.degrees(image.azimuth_rad[direction]) == pytest.approx(20.0, abs=1.0)
     # Two samples of 0.38 mm: the recursive low pass delays a pulse a little more than its lowest frequency.
@@ -107,7 +107,7 @@ def test_paper_echo_has_its_range_and_amplitude(call, device):
 def test_paper_and_exact_image_agree_on_the_echo(device):
     settings = with_paper(SHORT, directions="2d:61")
     words = echo(settings, azimuth_deg=-33.0, range_m=0.6, level=0.5)
-    image = Pipeline(settings, device).process(Measurement(words, settings))
+    image = Pipeline(settings, device, predict=False).process(Measurement(words, settings))
     directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
     exact = reference.exact(words, settings, directions, image.range_m)
     assert np.argmax(image.amplitude) == np.argmax(exact)
@@ -125,7 +125,7 @@ def test_envelope_has_no_carrier_ripple(device):
     """Without decimation, the envelope of a call has no ripple at twice the carrier."""
     settings = with_paper(SHORT, directions="2d:1", range_decimation=10, range_m=(0.65, 0.75))
     words = echo(settings, azimuth_deg=0.0, range_m=0.7, level=1.0)
-    row = Pipeline(settings, device).process(Measurement(words, settings)).amplitude[0]
+    row = Pipeline(settings, device, predict=False).process(Measurement(words, settings)).amplitude[0]
     spectrum = np.abs(np.fft.rfft(row * np.hanning(len(row))))
     frequency_hz = np.fft.rfftfreq(len(row), 1 / 450e3)
     assert spectrum[frequency_hz > 45e3].max() < 2e-3 * spectrum.max()
@@ -149,7 +149,7 @@ def test_both_forms_of_the_paper_agree_on_an_echo():
     """Filters of linear phase and the authors' recursive ones give the same reflector, not the same side lobes."""
     settings = with_paper(SHORT, directions="2d:61")
     measurement = Measurement(echo(settings, azimuth_deg=-33.0, range_m=0.6, level=0.5), settings)
-    recursive, linear = (Pipeline(settings, device).process(measurement) for device in ("numpy", "cpu"))
+    recursive, linear = (Pipeline(settings, device, predict=False).process(measurement) for device in ("numpy", "cpu"))
     assert np.array_equal(recursive.range_m, linear.range_m)
     assert np.argmax(recursive.amplitude) == np.argmax(linear.amplitude)
     assert linear.amplitude.max() == pytest.approx(recursive.amplitude.max(), rel=0.06)

@@ -37,7 +37,7 @@ def test_pcm_reflectors_match_the_scene(encoding, rate_hz, step):
         recording=Recording(sample_rate_hz=rate_hz, n_samples=round(rate_hz / 64), encoding=encoding),
         processing=PCM.processing.replace(range_decimation=step),
     )
-    peaks = ertis.find_peaks(Pipeline(settings).process(heard(settings)), top=2)
+    peaks = ertis.find_peaks(Pipeline(settings, predict=False).process(heard(settings)), top=2)
     for peak, point in zip(peaks, POINTS, strict=True):
         assert peak.azimuth_deg == pytest.approx(point.azimuth_deg, abs=0.2)
         assert peak.range_m == pytest.approx(point.range_m, abs=1e-3)
@@ -45,9 +45,11 @@ def test_pcm_reflectors_match_the_scene(encoding, rate_hz, step):
 
 def test_linear_sweep_reflectors_match_the_scene():
     settings = PCM.replace(call=Call(modulation="linear"))
-    peaks = ertis.find_peaks(Pipeline(settings).process(heard(settings)), top=2)
+    peaks = ertis.find_peaks(Pipeline(settings, predict=False).process(heard(settings)), top=2)
     assert [peak.range_m for peak in peaks] == pytest.approx([point.range_m for point in POINTS], abs=1e-3)
-    wrong = ertis.find_peaks(Pipeline(PCM).process(dataclasses.replace(heard(settings), settings=PCM)), top=1)
+    wrong = ertis.find_peaks(
+        Pipeline(PCM, predict=False).process(dataclasses.replace(heard(settings), settings=PCM)), top=1
+    )
     assert abs(wrong[0].range_m - POINTS[0].range_m) > 0.02
 
 
@@ -56,7 +58,9 @@ def test_pcm_image_equals_the_pdm_image():
     fine = PCM.processing.replace(range_decimation=1)
     bits = PCM.replace(recording=Recording(n_samples=70_000), processing=fine.replace(range_decimation=25))
     numbers = PCM.replace(processing=fine)
-    of_bits, of_numbers = (Pipeline(given, max_error_db="fine").process(heard(given)) for given in (bits, numbers))
+    of_bits, of_numbers = (
+        Pipeline(given, max_error_db="fine", predict=False).process(heard(given)) for given in (bits, numbers)
+    )
     levels = [[peak.level_db for peak in ertis.find_peaks(image, top=2)] for image in (of_bits, of_numbers)]
     assert levels[0] == pytest.approx(levels[1], abs=0.1)
     assert of_bits.amplitude.max() == pytest.approx(of_numbers.amplitude.max(), rel=0.01)
@@ -95,8 +99,8 @@ def test_pcm_recording_keeps_every_sample(tmp_path, name):
         assert np.array_equal(back.data, given.data)
         assert back.data.dtype == given.data.dtype
         assert recording.settings.recording == given.settings.recording
-        image = Pipeline(recording.settings).process(back)
-    assert np.array_equal(image.amplitude, Pipeline(given.settings).process(given).amplitude)
+        image = Pipeline(recording.settings, predict=False).process(back)
+    assert np.array_equal(image.amplitude, Pipeline(given.settings, predict=False).process(given).amplitude)
 
 
 def test_pcm_recording_opens_in_xarray(tmp_path, measurement):
@@ -165,7 +169,7 @@ def test_pcm_journal_with_nan_is_sealed(tmp_path):
 )
 def test_samples_of_another_type_are_refused(words, message):
     with pytest.raises(DataError, match=message):
-        Pipeline(PCM).process(ertis.Measurement(words, PCM))
+        Pipeline(PCM, predict=False).process(ertis.Measurement(words, PCM))
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
@@ -174,7 +178,7 @@ def test_pcm_samples_with_nan_are_refused(value):
     words = np.zeros((3_000, 8), np.float32)
     words[17, 3] = value
     with pytest.raises(DataError, match=rf"holds {value} at sample 17 of channel 3; give finite numbers"):
-        Pipeline(settings).process(ertis.Measurement(words, settings))
+        Pipeline(settings, predict=False).process(ertis.Measurement(words, settings))
 
 
 def test_pdm_sensor_refuses_pcm_settings():
@@ -218,7 +222,7 @@ def test_image_is_linear_in_the_samples(beamformer, exponent):
     )
     given = heard(settings)
     scaled = dataclasses.replace(given, data=np.ldexp(given.data, exponent))
-    with Pipeline(settings, device="numpy") as pipeline:
+    with Pipeline(settings, device="numpy", predict=False) as pipeline:
         wanted, found = (pipeline.process(each).amplitude.astype(np.float64) for each in (given, scaled))
         (again,) = pipeline.process_batch([scaled])
     np.testing.assert_allclose(np.ldexp(found, -exponent), wanted, rtol=1e-3, atol=1e-6 * wanted.max())
@@ -230,7 +234,7 @@ def test_image_beyond_float32_is_refused():
     given = heard(PCM.replace(recording=PCM.recording.replace(encoding="float32")))
     loudest = np.where(given.data >= 0, np.float32(3.4e38), np.float32(-3.4e38))  # square waves exceed their own peak
     with (
-        Pipeline(given.settings, device="numpy") as pipeline,
+        Pipeline(given.settings, device="numpy", predict=False) as pipeline,
         pytest.raises(
             DataError, match=r"reach 2\^128, so its image exceeds the largest float32, .* divide the samples"
         ),

@@ -158,6 +158,15 @@ class ErrorModel:
         independent = 0.5 * (1 + 1 / n_mics) * varying / signal_model.gain
         return signal_model.colour * (independent + 0.5 * shared)
 
+    @property
+    def needs_steering(self) -> bool:
+        """True if the error of plane-wave beams depends on a measured covariance."""
+        return self.signal_model.covariance is not None
+
+    def uniform_beams(self, errors: NDArray[np.float64]) -> float:
+        """Return the error power of beam interpolation without a covariance, from the errors at each frequency."""
+        return self._of(_UNLIKE * self.signal_model.colour * float(errors @ self.signal_model.shares))
+
     def beams(self, nodes: BeamGrid) -> float:
         """Return the error power of beam interpolation, from an estimate of `BeamGrid`.
 
@@ -169,7 +178,7 @@ class ErrorModel:
         """
         covariance = self.signal_model.covariance
         if covariance is None or nodes.is_curved:
-            return self._of(_UNLIKE * self.signal_model.colour * float(nodes.errors @ self.signal_model.shares))
+            return self.uniform_beams(nodes.errors)
         n_tiles, n_waves, _, _ = covariance.shape
         n_directions = nodes.steering.shape[2]
         beams, errors = np.zeros((2, n_tiles, n_directions))

@@ -29,6 +29,7 @@ TABLE_BYTES = 44
 """Bytes of a delay and a weight, including both the computed form and the form that kernels read."""
 
 _MANY_FRACTIONS = 16  # Microphones times delay range in steps, above which the delays spread evenly over a step.
+_MAX_APERTURES = 8  # Arrays with their directions.
 _MAX_FITS = 288  # Four times the number of fits in one search.
 
 
@@ -64,6 +65,18 @@ class Delays:
     squares: float
 
 
+class _Beams(NamedTuple):
+    """Determines a beam grid and its errors; equal if its elements are, arrays by identity."""
+
+    aperture: Aperture
+    spectrum: Spectrum
+    n_taps: int
+    density: float
+    high_hz: float
+    sound_speed_m_s: float
+    nearest_m: float
+
+
 class PlanModel:
     """Predictions about complete plans for one kind of measurement.
 
@@ -94,7 +107,9 @@ class PlanModel:
         layout, grid = microphones(settings.array), direction_grid(settings.processing)
         self.n_mics, self._n_words = int(layout.enabled.sum()), layout.n_words
         self._own_s = layout.delay_s[layout.enabled]
-        self.aperture = Aperture.of(layout.enabled_positions_m, unit_vectors(grid.azimuth_rad, grid.elevation_rad))
+        self.aperture = _aperture_of(
+            layout.enabled_positions_m.tobytes(), unit_vectors(grid.azimuth_rad, grid.elevation_rad).tobytes()
+        )
         self._weights = array_weights(settings)
         amplitudes = self._weights / layout.gain[layout.enabled]
         self._spread = float(np.max(amplitudes**2) / np.mean(amplitudes**2))  # The largest amplitude sets the scale.
@@ -193,24 +208,23 @@ class PlanModel:
 
     def count_grid_points(self, n_taps: int, density: float) -> int:
         """Return the number of beam-grid points."""
+        return _grid_points(self._beams(n_taps, density))
+
+    def _beams(self, n_taps: int, density: float) -> _Beams:
         high_hz = self.settings.call.high_frequency_hz
-        spacing = self.aperture.spacing(density, high_hz=high_hz, sound_speed_m_s=self._speed_m_s)
-        return self.aperture.count_grid_points(spacing, n_taps)
+        return _Beams(self.aperture, self._spectrum, n_taps, density, high_hz, self._speed_m_s, self._nearest_m)
 
     def _made_nodes(self, n_taps: int, density: float) -> Nodes:
         require_beam_grid(self.aperture, len(self.window.range_m))
-        nodes = BeamGrid(
-            self.aperture,
-            self._spectrum,
-            n_taps=n_taps,
-            density=density,
-            high_hz=self.settings.call.high_frequency_hz,
-            sound_speed_m_s=self._speed_m_s,
-            estimate=True,
-            nearest_m=self._nearest_m,
-        )
+        beams = self._beams(n_taps, density)
+        if self.errors.needs_steering and math.isinf(self._nearest_m):
+            nodes = _estimated(beams)
+            error, squares = self.errors.beams(nodes), nodes.squares
+        else:
+            power, squares = _estimated_errors(beams)
+            error = self.errors.uniform_beams(power)
         n_pairs = n_taps**self.aperture.n_axes // 2
-        return Nodes(self.count_grid_points(n_taps, density), n_pairs, self.errors.beams(nodes), nodes.squares)
+        return Nodes(self.count_grid_points(n_taps, density), n_pairs, error, squares)
 
     def _made_filter(self, stopband_attenuation_db: float) -> tuple[NDArray[Any], float]:
         try:
@@ -270,4 +284,38 @@ def plan_of(accuracy: Accuracy) -> ImagePlan:
         accuracy.beam_density or 2.0,
         accuracy.stopband_attenuation_db or 60.0,
         accuracy.focal_zones or 1,
+    )
+
+
+@functools.lru_cache(maxsize=_MAX_APERTURES)
+def _aperture_of(positions_m: bytes, directions: bytes) -> Aperture:
+    """Return the aperture, as the same object for the same positions and directions, so its errors can be cached."""
+    return Aperture.of(*(np.frombuffer(values).reshape(-1, 3) for values in (positions_m, directions)))
+
+
+@functools.lru_cache(maxsize=_MAX_FITS)
+def _grid_points(beams: _Beams) -> int:
+    """Return the number of beam-grid points, cached because it is the same for many pipelines."""
+    aperture = beams.aperture
+    spacing = aperture.spacing(beams.density, high_hz=beams.high_hz, sound_speed_m_s=beams.sound_speed_m_s)
+    return aperture.count_grid_points(spacing, beams.n_taps)
+
+
+@functools.lru_cache(maxsize=_MAX_FITS)
+def _estimated_errors(beams: _Beams) -> tuple[NDArray[np.float64], float]:
+    """Return the errors and the squares of a beam grid, cached because they dominate the time of a planner."""
+    nodes = _estimated(beams)
+    return nodes.errors, nodes.squares
+
+
+def _estimated(beams: _Beams) -> BeamGrid:
+    return BeamGrid(
+        beams.aperture,
+        beams.spectrum,
+        n_taps=beams.n_taps,
+        density=beams.density,
+        high_hz=beams.high_hz,
+        sound_speed_m_s=beams.sound_speed_m_s,
+        estimate=True,
+        nearest_m=beams.nearest_m,
     )

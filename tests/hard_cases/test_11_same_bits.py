@@ -53,23 +53,19 @@ def modulated(device, threads):
     return digest(octets, states)
 
 
-def complex_noise(*shape):
-    return (random.standard_normal(shape) + 1j * random.standard_normal(shape)).astype(np.complex64)
-
-
-def combined():
-    signals, weights, first = complex_noise(32, 2, 400), complex_noise(20, 32), random.integers(0, 100, (20, 32))
-    offsets = (np.arange(32) * 800 + first).astype(np.int32)
-    coherent, short = np.empty((20, 300), np.float32), np.empty((20, 40), np.float32)
-    cpu.combine_coherence(signals, offsets, weights, coherent)
-    cpu.delay_and_sum_envelope(signals, offsets, weights, 0, 40, short)
-    return digest(coherent), digest(short)
+def delayed_and_summed():
+    signals = (random.standard_normal((32, 2, 400)) + 1j * random.standard_normal((32, 2, 400))).astype(np.complex64)
+    weights = (random.standard_normal((20, 32)) + 1j * random.standard_normal((20, 32))).astype(np.complex64)
+    offsets = (np.arange(32) * 800 + random.integers(0, 100, (20, 32))).astype(np.int32)
+    envelope = np.empty((20, 40), np.float32)
+    cpu.delay_and_sum_envelope(signals, offsets, weights, 0, 40, envelope)
+    return digest(envelope)
 
 
 found, counts = {}, range(1, cpu.max_threads + 1)
 for name in sys.argv[1:]:
-    if name == "combined":
-        found[name] = combined()
+    if name == "delay_and_sum":
+        found[name] = delayed_and_summed()
     elif name in {"cpu", "numpy"}:
         found[name] = [modulated(name, threads) for threads in (counts if name == "cpu" else (1,))]
     elif name != "int16" or cpu.tile_ranges:
@@ -90,13 +86,13 @@ def digests(*names, **environment):
 @pytest.fixture(scope="module")
 def usual():
     """Digests of all results on this processor."""
-    return digests("float32", "int16", "cpu", "numpy", "combined")
+    return digests("float32", "int16", "cpu", "numpy", "delay_and_sum")
 
 
 @pytest.fixture(scope="module")
 def workqueue(usual):  # noqa: ARG001 - its process has filled the cache, so that this one compiles nothing
     """Digests with the threading layer that Numba falls back to without OpenMP and TBB."""
-    return digests("float32", "combined", NUMBA_THREADING_LAYER="workqueue")
+    return digests("float32", "delay_and_sum", NUMBA_THREADING_LAYER="workqueue")
 
 
 @pytest.fixture(scope="module")
@@ -132,10 +128,11 @@ def test_workqueue_threading_layer_gives_the_same_bits(usual, workqueue):
 def test_compiled_and_cached_kernels_give_the_same_bits(workqueue, tmp_path):
     """Numba optimises a cached kernel once more, which could change the order of sums.
 
-    One of these kernels multiplies and adds in its own loop, the other one in a function that it calls. The first run
-    of a command compiles the others, see tests/test_figures_to_reach.py.
+    This kernel multiplies and adds in a function that it calls. The first run of a command compiles those that do so
+    in their own loops, see tests/test_figures_to_reach.py.
     """
-    assert digests("combined", NUMBA_CACHE_DIR=str(tmp_path))["combined"] == workqueue["combined"]
+    compiled = digests("delay_and_sum", NUMBA_CACHE_DIR=str(tmp_path))
+    assert compiled["delay_and_sum"] == workqueue["delay_and_sum"]
 
 
 def test_numba_limits_are_reported_in_one_line():
