@@ -251,8 +251,7 @@ def test_sync_capture_accepts_pulses_before_the_first_sensors(captures):
     assert capture.session.complete >= 4
 
 
-@pytest.mark.alone
-@pytest.mark.parametrize("trigger", ["command", "sync"])
+@pytest.mark.parametrize("trigger", ["command", pytest.param("sync", marks=pytest.mark.alone)])
 def test_capture_resumes_when_unplugged_sensor_returns(captures, words, trigger):
     capture = captures(trigger=trigger, rate_hz=20.0)
     runner = threading.Thread(target=capture.session.run, args=(capture.journal,))
@@ -288,7 +287,7 @@ def test_capture_continues_numbers_after_counter_reset(captures):
     runner = threading.Thread(target=capture.session.run, args=(capture.journal,))
     with SyncChain(capture.emulators, rate_hz=20.0):
         runner.start()
-        capture.wait_for(12)
+        capture.wait_for(6)
         capture.emulators[0].registers.counter = 3
         capture.wait_for(len(capture.stored) + 12)
         capture.session.stop()

@@ -112,7 +112,7 @@ def place(tmp_path_factory):
 def run_forked(place, tmp_path_factory):
     """Run programs that import none of the packages of extras before they are blocked."""
     blocked = {module for names in extras().values() for each in names for module in modules_of(each)}
-    preload = ("numpy", "scipy.fft", "scipy.spatial", "h5py", "click", "msgspec", "matplotlib.figure")
+    preload = ("numpy", "scipy.fft", "scipy.spatial", "numba", "h5py", "click", "msgspec", "matplotlib.figure")
     with forking(place, tmp_path_factory.mktemp("output"), preload, unloaded=sorted(blocked)) as run_forked:
         yield run_forked
 

@@ -58,11 +58,14 @@ def test_readme_describes_every_folder():
 
 
 def test_readme_commands_run(place, tmp_path_factory):
-    """Each command imports its own modules at its first occurrence."""
+    """Each command imports its own modules at its first occurrence.
+
+    The first emulator replays a recording of its scene, which starts sooner.
+    """
     started = set()
     with contextlib.ExitStack() as stack:
         run_forked = stack.enter_context(forking(place, tmp_path_factory.mktemp("output")))
-        for command in commands_in(README.replace(NETWORK, "")):
+        for command in commands_in(README.replace(NETWORK, "").replace("emulate SCENE.toml", "emulate reflectors.h5")):
             name, *arguments = shlex.split(command)
             if name in ELSEWHERE:
                 continue

@@ -1,9 +1,10 @@
 """Data loss under faults: the short form of the one-hour run of `python -m tests.faults reliability --long`."""
 
+import numpy as np
 import pytest
 
 from ertis_numba.errors import DataError
-from ertis_numba.frames import Measurement
+from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.settings import Recording
 from ertis_numba.storage import open_recording, write_recording
 from tests.faults import captures, reliability
@@ -44,8 +45,15 @@ def test_sustained_capture_loses_nothing(tmp_path):
 
 @pytest.mark.alone
 def test_groups_of_a_sync_chain_are_complete(tmp_path):
-    platform = tmp_path / "platform.toml"
-    platform.write_text(captures.platform(4, n_measurements=3).to_toml())
+    """Shifted samples differ between sensors and measurements, so that mix-ups are visible."""
+    with open_recording(SOURCE) as recording:
+        words, settings = recording[0].data, recording.settings
+    sent = [
+        Measurement(np.roll(words, 30 * sensor + index), settings, Stamp(sensor=f"sensor-{sensor}", sequence=index))
+        for sensor in range(4)
+        for index in range(3)
+    ]
+    platform = write_recording(tmp_path / "platform.h5", sent)
     found = captures.chain(platform, tmp_path, n_groups=SHORT.n_groups, rate_hz=10.0)
     assert (found["mixed"], found["wrong"]) == (0, 0)
     # The first pulse may arrive during arming, and a busy emulator ignores pulses during a measurement.

@@ -27,21 +27,33 @@ from ertis_numba.devices.emulator.registers import Registers
 from ertis_numba.devices.setup import call_codes, call_hash
 from ertis_numba.settings import Call
 
-pytestmark = pytest.mark.alone  # The driver's timeouts are short.
 N_SAMPLES = 65_536
 WORDS = [np.random.default_rng(index).integers(0, 2**32, N_SAMPLES, dtype=np.uint32) for index in range(3)]
 PASSIVE = [words[::-1].copy() for words in WORDS]
-PULSES_HZ = 2.0  # The first pulse comes 0.5 s after the driver starts listening.
+PULSES_HZ = 10.0
 
-DRIVER = """
+DRIVER = '''
 import json, os, sys, types, zlib
 import serial
 
 way, port = sys.argv[1:]
 
+awaited = []
+
+class Port(serial.Serial):
+    """Port with timeouts for a busy machine, which reports the first read of a listener."""
+
+    def __init__(self, port, baud, timeout=None):
+        super().__init__(port, baud, timeout=None if timeout is None else 30)
+
+    def read(self, count=1):
+        if awaited:
+            print(awaited.pop(), flush=True)
+        return super().read(count)
+
 class RtisSerial(types.ModuleType):
     def connect(self, port, baud):
-        self.port = serial.Serial(port, baud, timeout=10)
+        self.port = Port(port, baud, timeout=30)
     def flush(self):
         self.port.reset_input_buffer()
     def command(self, line, answered):
@@ -65,7 +77,7 @@ import rtisdev
 from rtisdev import RTISDev
 
 if way == "windows":
-    RTISDev.serial, RTISDev.os = serial, Windows()
+    RTISDev.serial, RTISDev.os = types.SimpleNamespace(**vars(serial) | {"Serial": Port}), Windows()
 
 def told(measurement):
     return int(measurement.index), zlib.crc32(measurement.rawData.tobytes())
@@ -90,13 +102,13 @@ def came(measurement):
         listener.stop_thread()
 
 listener = rtisdev.create_measure_external_trigger_callback(came, config)
-print("listening", flush=True)
+awaited.append("listening")
 listener.run()
 rtisdev.toggle_amplifier(0)
 rtisdev.close_connection()
 report = {key: int(value) if key == "hash" else value for key, value in report.items()}
 print(json.dumps(report), flush=True)
-"""
+'''
 
 
 @dataclass
@@ -124,9 +136,10 @@ def driven():
         }
         results = {}
         for way, driver in drivers.items():
-            assert driver.stdout.readline() == "listening\n", driver.communicate(timeout=10)
-            with SyncChain([devices[way]], PULSES_HZ):
-                out, errors = driver.communicate(timeout=30)
+            assert driver.stdout.readline() == "listening\n", driver.communicate(timeout=60)
+            stack.enter_context(SyncChain([devices[way]], PULSES_HZ))
+        for way, driver in drivers.items():
+            out, errors = driver.communicate(timeout=60)
             assert driver.returncode == 0, errors
             results[way] = Driven(json.loads(out), devices[way].registers, devices[way].refused)
         return results

@@ -1,6 +1,7 @@
 """Energyscape files and files made from them keep the mounting of each sensor if it is known."""
 
 import csv
+import pickle
 
 import h5py
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
+from ertis_numba.campaign import Campaign
 from ertis_numba.errors import ArgumentError, DamagedError
 from ertis_numba.frames import PointCloud
 from ertis_numba.journal import Journal, JournalEntry
@@ -16,6 +18,7 @@ from ertis_numba.network.messages import Hello, decode, encode
 from ertis_numba.storage import open_energyscapes, open_recording, write_energyscapes, write_recording
 from ertis_numba.storage.sealing import seal
 from ertis_numba.storage.truth import GroundTruth
+from tests.campaigns import InlinePool
 from tests.files import SMALL, image, noise
 from tests.test_storage_sensors import TURNED, of
 
@@ -249,7 +252,10 @@ def test_process_accepts_missing_mountings(tmp_path):
     assert "contains no mounting of a sensor" in bare.stderr
 
 
-def test_process_repeats_images_for_another_mounting(tmp_path):
+def test_process_repeats_images_for_another_mounting(tmp_path, monkeypatch):
+    pool = InlinePool()  # Its tasks arrive as at a worker process, which would start slowly.
+    monkeypatch.setattr(pool, "submit", lambda task: InlinePool.submit(pool, pickle.loads(pickle.dumps(task))))
+    monkeypatch.setattr(Campaign, "_pool", lambda _: pool)
     moved = {"left": ((0.2, 0.3, -0.2), TURNED), "right": PLACES["right"]}
     both = [*of("left", noise(SMALL, 1)), *of("right", noise(SMALL, 1, seed=2))]
     unknown = write_recording(tmp_path / "rec.h5", both)

@@ -20,7 +20,7 @@ from typing import Any
 
 from ertis_bench.network.processes import ask
 
-from ertis_numba.devices.emulator import Emulator
+from ertis_numba.devices.emulator import Emulator, SyncChain
 from ertis_numba.errors import DataError
 from ertis_numba.simulation import Point, Scene, Sensor
 from ertis_numba.storage import open_recording, sensor_names
@@ -46,7 +46,7 @@ def platform(n_sensors: int, *, n_measurements: int) -> Scene:
 def sustained(source: Path, folder: Path, *, duration_s: float, rate_hz: float) -> Line:
     """Capture from one sensor that pulses trigger, and report losses and processor time."""
     target = folder / "sustained.h5"
-    with emulated(source, folder, "--sync-rate", f"{rate_hz:g}") as ports:
+    with emulated(source, folder, pulses_hz=rate_hz) as ports:
         lines = _capture(ports, target, "--trigger", "sync", "--duration", f"{duration_s:g}")
     final = lines[-1]
     found = _compare(target, lines[:-1], sent_by_emulators(folder))
@@ -64,7 +64,7 @@ def sustained(source: Path, folder: Path, *, duration_s: float, rate_hz: float) 
 def chain(source: Path, folder: Path, *, n_groups: int, rate_hz: float) -> Line:
     """Capture from several sensors in one SYNC chain, and count complete and mixed groups."""
     target = folder / "chain.h5"
-    with emulated(source, folder, "--sync-rate", f"{rate_hz:g}") as ports:
+    with emulated(source, folder, pulses_hz=rate_hz) as ports:
         lines = _capture(ports, target, "--trigger", "sync", "-n", str(n_groups))
     sent = sent_by_emulators(folder)
     found = _compare(target, lines[:-1], sent)
@@ -168,7 +168,7 @@ def disk_full(source: Path, folder: Path, disk: Path) -> Line:
 
 
 @contextmanager
-def emulated(source: Path, folder: Path, *options: str) -> Iterator[list[str]]:
+def emulated(source: Path, folder: Path, *options: str, pulses_hz: float | None = None) -> Iterator[list[str]]:
     """Yield links to the ports of emulated sensors, which log to ``sent.ndjson``.
 
     The emulators end with the block. Without options, those of a recording run in this process, which starts faster.
@@ -176,9 +176,11 @@ def emulated(source: Path, folder: Path, *options: str) -> Iterator[list[str]]:
     log = folder / "sent.ndjson"
     log.unlink(missing_ok=True)
     if source.suffix == ".h5" and not options:
-        with _emulated_here(source, folder / "emulated", log) as ports:
+        with _emulated_here(source, folder / "emulated", log, pulses_hz) as ports:
             yield ports
         return
+    if pulses_hz is not None:
+        options += ("--sync-rate", f"{pulses_hz:g}")
     command = [*_ERTIS, "emulate", str(source), "--quiet", "--json", "--log", str(log), *options]
     environment = os.environ | {"ERTIS_EMULATED_DIR": str(folder / "emulated")}
     n_sensors = len(Scene.load(source).sensors) if source.suffix == ".toml" else len(sensor_names(source))
@@ -195,14 +197,17 @@ def emulated(source: Path, folder: Path, *options: str) -> Iterator[list[str]]:
 
 
 @contextmanager
-def _emulated_here(source: Path, links: Path, log: Path) -> Iterator[list[str]]:
+def _emulated_here(source: Path, links: Path, log: Path, pulses_hz: float | None) -> Iterator[list[str]]:
     links.mkdir(exist_ok=True)
+    emulators = []
     with ExitStack() as stack:
         file = stack.enter_context(log.open("a", encoding="utf-8"))
         for name in sensor_names(source):
             with open_recording(source, sensor=name) as recording:
                 words = [measurement.data for measurement in recording]
-            stack.enter_context(Emulator(words, name=name, link=links / name, log=file))
+            emulators.append(stack.enter_context(Emulator(words, name=name, link=links / name, log=file)))
+        if pulses_hz is not None:
+            stack.enter_context(SyncChain(emulators, pulses_hz))
         yield [str(links / name) for name in sensor_names(source)]
 
 

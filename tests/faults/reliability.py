@@ -62,7 +62,7 @@ class TrialCounts:
 
 
 SHORT = TrialCounts(
-    duration_s=5.0,
+    duration_s=3.0,
     n_groups=12,
     n_blocks=800,
     n_unplugs=1,
