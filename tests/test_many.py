@@ -3,6 +3,7 @@
 import errno
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -46,12 +47,35 @@ def warm(settings):
     return narrow(settings).replace(air=Air(temperature_c=30.0))
 
 
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """Return a folder of recordings, which tests copy."""
+    folder = tmp_path_factory.mktemp("recorded") / "runs"
+    write_recordings(folder, settings=FEW_MICS)
+    return folder
+
+
 @pytest.fixture
-def runs(tmp_path, monkeypatch):
+def runs(recorded, tmp_path, monkeypatch):
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")  # otherwise the creation dates would differ
     monkeypatch.chdir(tmp_path)
-    write_recordings(tmp_path / "runs", settings=FEW_MICS)
-    return tmp_path / "runs"
+    return shutil.copytree(recorded, tmp_path / "runs")
+
+
+@pytest.fixture(scope="module")
+def made_once(recorded, tmp_path_factory):
+    """Return a folder with the output of all recordings."""
+    folder = tmp_path_factory.mktemp("made_once")
+    with pytest.MonkeyPatch.context() as patch:
+        found, _ = run_here(patch, [recorded], folder, CampaignOptions(settings=narrow))
+    assert set(outcomes(found).values()) == {"made"}
+    return folder
+
+
+@pytest.fixture
+def made(made_once, out):
+    """Put the output of all recordings into the folder of a test."""
+    return shutil.copytree(made_once, out)
 
 
 @pytest.fixture
@@ -68,7 +92,7 @@ def test_files_equal_those_of_single_recordings(runs, out, monkeypatch):
     assert outcomes(found) == dict.fromkeys(["a.h5", "b.h5", "c.h5", "d.h5"], "made")
     assert [task.arguments["warm"] for task in pool.given if task.action == "plan"] == [True, False]  # one per air
     assert found["a.h5"].made["measurements"] == 3
-    for name in "abcd":
+    for name in "ad":  # at different air temperatures, and d with a plan made for b
         single = out / "single.h5"
         arguments = [str(runs / f"{name}.h5"), "-o", str(single), "--range", "0.5:0.8", "--force"]
         assert CliRunner().invoke(cli, ["process", *arguments]).exit_code == 0
@@ -101,8 +125,8 @@ def test_invalid_plan_is_refused(runs, out, monkeypatch):
     assert "needs a plan, but method 'paper' has none; give 'fast'" in found["a.h5"].error
 
 
+@pytest.mark.usefixtures("made")
 def test_existing_output_is_kept(runs, out, monkeypatch):
-    run_here(monkeypatch, [runs], out, CampaignOptions(settings=narrow))
     before = states(out)
     (out / "b.energy.h5").unlink()
     found, pool = run_here(monkeypatch, [runs], out, CampaignOptions(settings=narrow, overwrite=True))
@@ -123,8 +147,8 @@ def test_existing_output_is_kept(runs, out, monkeypatch):
         (CampaignOptions(settings=narrow, dtype="float16"), "contains float32, not float16"),
     ],
 )
+@pytest.mark.usefixtures("made")
 def test_differing_output_is_reported_or_replaced(runs, out, monkeypatch, wanted, stated):
-    run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=narrow))
     before = states(out)
     found, _ = run_here(monkeypatch, [runs / "a.h5"], out, wanted)
     for event in found.values():
@@ -139,23 +163,23 @@ def test_differing_output_is_reported_or_replaced(runs, out, monkeypatch, wanted
     assert set(outcomes(found).values()) == {"kept"}
 
 
+@pytest.mark.usefixtures("made")
 def test_output_of_another_recording_is_reported(runs, out, monkeypatch):
-    run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=narrow))
     write_recording(runs / "a.h5", noise(FEW_MICS, count=3, seed=9), overwrite=True)
     found, _ = run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=narrow))
     assert "exists and was made from another recording" in found["a.h5"].error
 
 
+@pytest.mark.usefixtures("made")
 def test_output_of_a_copied_recording_is_kept(runs, out, monkeypatch):
-    run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=narrow))
     with h5py.File(runs / "a.h5", "r+") as file:
         file.attrs["remark"] = "written to"
     found, _ = run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=narrow))
     assert "exists and was made from another file of the same recording" in found["a.h5"].error
 
 
+@pytest.mark.usefixtures("made")
 def test_output_of_another_version_is_reported(runs, out, monkeypatch):
-    run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=narrow))
     newer = {"ertis-numba": "99.0"}
     monkeypatch.setattr(existing_output, "software_versions", lambda: newer)
     found, _ = run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=narrow))
@@ -254,8 +278,8 @@ def test_memory_and_tasks_are_independent_of_the_number_of_recordings(tmp_path, 
         return result
 
     monkeypatch.setattr("tests.campaigns.run_task", watched)
-    for number in range(7):  # each has its own air temperature and so its own pipeline
-        settings = FEW_MICS.replace(air=Air(temperature_c=float(number)))
+    for number in range(7):  # successive ones differ in air temperature and so need different pipelines
+        settings = FEW_MICS.replace(air=Air(temperature_c=float(number % 3)))
         write_recording(tmp_path / f"{number:02}.h5", noise(settings, count=1, seed=number))
     found, pool = run_here(monkeypatch, [tmp_path], out, CampaignOptions(settings=narrow))
     assert set(outcomes(found).values()) == {"made"}

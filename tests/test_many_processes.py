@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -18,7 +19,7 @@ from tests.campaigns import ended, names_in, outcomes, run_here, write_recording
 from tests.files import line, noise
 
 PATIENCE_S = 60.0
-LONG = 20  # measurements; without compiled kernels, such a recording takes a while to process
+LONG = 20  # measurements; without compiled kernels, a recording of so many takes a while to process
 FEW_MICS = line(8, 8)
 
 
@@ -29,31 +30,45 @@ def narrow(settings):
 SLOW = CampaignOptions(settings=narrow, batch=1, device="numpy")
 
 
-@pytest.fixture
-def runs(tmp_path, monkeypatch):
-    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")
-    write_recordings(tmp_path / "runs", settings=FEW_MICS)
-    return tmp_path / "runs"
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """Return a folder of recordings, which tests only read; processing of b takes a while."""
+    folder = tmp_path_factory.mktemp("recorded") / "runs"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SOURCE_DATE_EPOCH", "1700000000")
+        write_recordings(folder, settings=FEW_MICS)
+        write_recording(folder / "b.h5", noise(FEW_MICS, count=LONG, seed=1), overwrite=True)
+        yield folder
+
+
+@pytest.fixture(scope="module")
+def made_here(runs, tmp_path_factory):
+    """Return the contents of output files by name, written without worker processes."""
+    out = tmp_path_factory.mktemp("made_here")
+    with pytest.MonkeyPatch.context() as patch:
+        run_here(patch, [runs], out, SLOW)
+    return contents(out)
+
+
+@pytest.fixture(scope="module")
+def pools():
+    """Return the process pools that tests of this module share, as workers start slowly; the last may be open."""
+    started = []
+    yield started
+    for each in started:
+        each.close()
 
 
 @pytest.fixture
-def long_runs(runs):
-    for seed, name in enumerate(("b", "c")):
-        write_recording(runs / f"{name}.h5", noise(FEW_MICS, count=LONG, seed=seed), overwrite=True)
-    return runs
-
-
-@pytest.fixture
-def pools(monkeypatch):
-    """Collect all process pools that a test starts."""
-    made, begin = [], ProcessPool.__init__
-
-    def kept(self, size):
-        made.append(self)
-        begin(self, size)
-
-    monkeypatch.setattr(ProcessPool, "__init__", kept)
-    return made
+def pool(pools, monkeypatch):
+    """Let campaigns use one process pool of two workers, which stays open at their end."""
+    if not pools or not pools[-1].current_paths:
+        pools.append(ProcessPool(2))
+    kept = pools[-1]
+    with monkeypatch.context() as patch:
+        patch.setattr(kept, "close", lambda: None)
+        patch.setattr(Campaign, "_pool", lambda _: kept)
+        yield kept
 
 
 def contents(folder):
@@ -73,40 +88,39 @@ def gone(pid):
     return False
 
 
+@pytest.mark.usefixtures("pool")
 def test_bits_are_independent_of_the_workers(runs, tmp_path, monkeypatch):
     wanted = CampaignOptions(settings=narrow, batch=2)
     run_here(monkeypatch, [runs], tmp_path / "here", wanted)
-    found = ended(Campaign(find_recordings([runs]), tmp_path / "out", wanted, workers=2).run())
+    found = ended(Campaign(find_recordings([runs]), tmp_path / "out", wanted).run())
     assert outcomes(found) == dict.fromkeys(["a.h5", "b.h5", "c.h5", "d.h5"], "made")
     assert contents(tmp_path / "out") == contents(tmp_path / "here")
 
 
-def test_dying_worker_fails_one_recording(long_runs, tmp_path, pools, monkeypatch):
+def test_dying_worker_fails_one_recording(runs, made_here, tmp_path, pool):
     out, killed, found = tmp_path / "out", [], {}
-    campaign = Campaign(find_recordings([long_runs]), out, SLOW, workers=2)
-    for event in campaign.run():
+    for event in Campaign(find_recordings([runs]), out, SLOW).run():
         if isinstance(event, RecordingProgress) and event.recording.name == "b.h5" and not killed:
-            (pool,) = pools
             (pid,) = [pid for pid, path in pool.current_paths.items() if path.endswith("b.h5")]
             os.kill(pid, signal.SIGKILL)
             killed.append(pid)
         found |= ended([event])
     assert killed
     assert outcomes(found) == {"a.h5": "made", "b.h5": "failed", "c.h5": "made", "d.h5": "made"}
-    assert f"{long_runs / 'b.h5'}: its worker process was ended by SIGKILL" in found["b.h5"].error
-    assert names_in(out) == ["a.energy.h5", "c.energy.h5", "d.energy.h5"]
-    again, _ = run_here(monkeypatch, [long_runs], out, SLOW)
-    assert outcomes(again) == {"a.h5": "kept", "b.h5": "made", "c.h5": "kept", "d.h5": "kept"}
+    assert f"{runs / 'b.h5'}: its worker process was ended by SIGKILL" in found["b.h5"].error
+    assert contents(out) == {name: content for name, content in made_here.items() if name != "b.energy.h5"}
 
 
-def test_close_ends_all_work_at_once(long_runs, tmp_path, pools):
+def test_close_ends_all_work_at_once(runs, tmp_path, pool, monkeypatch):
     """Close must not wait for the current tasks: stopped processes never complete theirs."""
-    events = Campaign(find_recordings([long_runs]), tmp_path / "out", SLOW, workers=2).run()
+    monkeypatch.setattr(pool, "close", partial(ProcessPool.close, pool))
+    events = Campaign(find_recordings([runs]), tmp_path / "out", SLOW).run()
     next(event for event in events if isinstance(event, RecordingProgress))
-    pids = list(pools[0].current_paths)
+    pids = list(pool.current_paths)
     for pid in pids:
         os.kill(pid, signal.SIGSTOP)
     events.close()
+    assert len(pids) == 2
     assert all(gone(pid) for pid in pids)
     assert not [name for name in names_in(tmp_path / "out") if name.endswith(".part")]
 
@@ -127,20 +141,8 @@ def test_idle_worker_that_dies_is_replaced():
 
 
 def test_number_of_workers_can_be_reduced():
-    pool = ProcessPool(3)
-    try:
-        pids = list(pool.current_paths)
-        pool.limit(1)
-        assert (pool.size, pool.free, list(pool.current_paths)) == (1, 1, pids[:1])
-        assert all(gone(pid) for pid in pids[1:])
-    finally:
-        pool.close()
-
-
-@pytest.mark.parametrize("size", [1, 2])
-def test_number_of_busy_workers_can_be_reduced(size):
     """The numbers of tasks in progress and of processes only fall, until both reach the new size."""
-    pool, numbers, in_hand, seen = ProcessPool(3), iter(range(12)), set(), []
+    pool, numbers, in_hand, seen = ProcessPool(4), iter(range(12)), set(), []
     try:
 
         def feed():
@@ -149,18 +151,22 @@ def test_number_of_busy_workers_can_be_reduced(size):
                 in_hand.add(number)
             return len(in_hand)
 
-        assert feed() == 3
-        pool.limit(size)
+        assert feed() == 4
+        pool.limit(2)  # all workers are busy
         assert pool.free == 0
         while feed():
             seen.append((len(in_hand), len(pool.current_paths)))
             in_hand -= {news.number for news in pool.wait(PATIENCE_S) if news.result is not None}
         assert next(numbers, None) is None
         assert seen == sorted(seen, reverse=True)
-        assert seen[0] == (3, 3)
-        assert (size, size) in seen
-        assert max(processes for given, processes in seen if given <= size) == size
-        assert len(pool.current_paths) == size
+        assert seen[0] == (4, 4)
+        assert (2, 2) in seen
+        assert max(processes for given, processes in seen if given <= 2) == 2
+        pids = list(pool.current_paths)
+        assert len(pids) == 2
+        pool.limit(1)  # all workers are idle
+        assert (pool.size, pool.free, list(pool.current_paths)) == (1, 1, pids[:1])
+        assert gone(pids[1])
     finally:
         pool.close()
 
@@ -201,10 +207,9 @@ def until_a_part_grows(out):
     pytest.fail("nothing was begun")
 
 
-def test_kill_leaves_no_partial_file_and_the_next_run_completes(long_runs, tmp_path, monkeypatch):
-    run_here(monkeypatch, [long_runs], tmp_path / "here", SLOW)
-    wanted, out = contents(tmp_path / "here"), tmp_path / "out"
-    with started(long_runs, out) as process:
+def test_kill_leaves_no_partial_file_and_the_next_run_completes(runs, made_here, tmp_path, monkeypatch):
+    wanted, out = made_here, tmp_path / "out"
+    with started(runs, out) as process:
         until_a_part_grows(out)
         workers = children_of(process.pid)
         process.kill()
@@ -213,14 +218,14 @@ def test_kill_leaves_no_partial_file_and_the_next_run_completes(long_runs, tmp_p
     left = contents(out)
     assert {name: content for name, content in left.items() if wanted.get(name) != content} == {}
     assert set(left) < set(wanted)
-    found, _ = run_here(monkeypatch, [long_runs], out, SLOW)
+    found, _ = run_here(monkeypatch, [runs], out, SLOW)
     assert contents(out) == wanted
     assert sorted(outcomes(found).values()) == sorted(["kept"] * len(left) + ["made"] * (4 - len(left)))
 
 
-def test_ctrl_c_ends_all_workers(long_runs, tmp_path):
+def test_ctrl_c_ends_all_workers(runs, tmp_path):
     out = tmp_path / "out"
-    with started(long_runs, out) as process:
+    with started(runs, out) as process:
         until_a_part_grows(out)
         workers = children_of(process.pid)
         for pid in workers:  # stopped workers never complete their tasks

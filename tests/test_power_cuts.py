@@ -14,7 +14,7 @@ from tests.faults.powercuts.disk import Disk
 from tests.faults.powercuts.log import DiskOperation, DiskRecord
 
 SEED = 1
-N_STATES = {"capture": 12, "record": 16, "spool": 16}
+N_STATES = {"capture": 12, "record": 10, "spool": 16}
 N_MEASUREMENTS = 8
 NOTHING_WRONG = dict.fromkeys(("lost", "twice", "wrong", "failed", "left_over"), 0)
 

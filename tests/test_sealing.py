@@ -290,8 +290,8 @@ def test_sealing_can_be_interrupted(tmp_path, monkeypatch):
 
 
 def test_killed_sealing_processes_leave_no_broken_file(tmp_path):
-    found = kills.sealing(tmp_path, seed=1, count=16)
-    assert found["late"] < 8
+    found = kills.sealing(tmp_path, seed=1, count=10)
+    assert found["late"] < 5
     assert {name: found[name] for name in ("broken", "different", "left_over")} == {
         "broken": 0,
         "different": 0,

@@ -70,7 +70,7 @@ SHORT = TrialCounts(
     n_seal_kills=5,
     n_signals=2,
     n_power_cuts=40,
-    n_flips=20,
+    n_flips=12,
 )
 LONG = TrialCounts(
     duration_s=600.0,

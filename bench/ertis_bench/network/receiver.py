@@ -5,6 +5,7 @@ import os
 import signal
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, Self
@@ -19,7 +20,7 @@ from ertis_numba.network.keys import ClientKeys, KeyPair
 from ertis_numba.network.messages import Product
 from ertis_numba.network.subscriber import Subscriber
 
-__all__ = ["STEP", "Received", "ReceiverJob", "read_received"]
+__all__ = ["STEP", "Received", "ReceiverJob", "read_received", "receive", "subscriber_of"]
 
 STEP: Final = 61
 """Distance of compared values. One value in 61 is compared, so that all rows and columns are covered in turn."""
@@ -130,18 +131,23 @@ class _Expected:
 
 def main(look: ReceiverJob) -> None:
     """Receive until SIGTERM."""
-    keys = None if look.keys is None else ClientKeys(pair=KeyPair.load(Path(look.keys[0])), server=look.keys[1])
-    expected = None if look.expected is None else _Expected.load(look.expected)
-    diary = os.open(look.diary, os.O_CREAT | os.O_APPEND | os.O_WRONLY, 0o644)
-    subscriber = Subscriber(
-        look.address,
-        products=look.products,
-        keys=keys,
-        credit=look.credit,
-        on_note=lambda text: _emit_event(event="note", text=text),
-    )
+    subscriber = subscriber_of(look, on_note=lambda text: _emit_event(event="note", text=text))
     signal.signal(signal.SIGTERM, lambda *_: subscriber.close())
     _emit_event(event="subscribed", pid=os.getpid())
+    receive(look, subscriber)
+    _emit_event(event="received", **asdict(subscriber.counts))
+
+
+def subscriber_of(look: ReceiverJob, *, on_note: Callable[[str], None]) -> Subscriber[Any]:
+    """Return the subscriber of a receiver."""
+    keys = None if look.keys is None else ClientKeys(pair=KeyPair.load(Path(look.keys[0])), server=look.keys[1])
+    return Subscriber(look.address, products=look.products, keys=keys, credit=look.credit, on_note=on_note)
+
+
+def receive(look: ReceiverJob, subscriber: Subscriber[Any]) -> None:
+    """Check all products, and write them into the diary, until the subscriber is closed."""
+    expected = None if look.expected is None else _Expected.load(look.expected)
+    diary = os.open(look.diary, os.O_CREAT | os.O_APPEND | os.O_WRONLY, 0o644)
     with subscriber:
         for item in subscriber:
             now_ns = time.monotonic_ns()
@@ -157,7 +163,7 @@ def main(look: ReceiverJob) -> None:
             os.write(diary, f"{json.dumps(line)}\n".encode())
             if look.waits_s:
                 time.sleep(look.waits_s)
-    _emit_event(event="received", **asdict(subscriber.counts))
+    os.close(diary)
 
 
 def _emit_event(**event: object) -> None:

@@ -14,20 +14,20 @@ from typing import Any, Final
 import numpy as np
 from ertis_bench.network.diary import Diary, DiaryKey, Row
 from ertis_bench.network.oracle import judged
-from ertis_bench.network.processes import central, until
+from ertis_bench.network.processes import until
 from ertis_bench.network.sender import SMALL
 
 from ertis_numba.errors import ErtisError
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.journal import JournalEntry
-from ertis_numba.network.allow_list import AllowList, Permission
-from ertis_numba.network.keys import ClientKeys, KeyPair
+from ertis_numba.network.allow_list import AllowList
+from ertis_numba.network.keys import ClientKeys
 from ertis_numba.network.sensor_node import SensorNode
 from ertis_numba.network.subscriber import Subscriber
-from tests.faults.network.links import state_of
+from tests.faults.network.keyed_node import KeyedNode
 from tests.faults.network.zmtp import ZmtpPeer
 
-__all__ = ["keys"]
+__all__ = ["keys", "try_keys"]
 
 _TRIED_S: Final = 2.5  # long enough for several refusals of a wrong key
 _REMOVED_S: Final = 2.0
@@ -74,69 +74,60 @@ def keys(folder: Path, *, seed: int) -> Found:
     Returns
     -------
     dict
+        Results of `try_keys`, and results for the recordings, which may contain the listed sensor only.
+    """
+    with KeyedNode.running(folder) as keyed:
+        found, wanted, removed = try_keys(keyed, folder, seed=seed)
+        keyed.node.stop()
+    return found | judged(folder, keyed.archive, [wanted, removed], kept=[wanted])
+
+
+def try_keys(keyed: KeyedNode, folder: Path, *, seed: int) -> tuple[Found, Path, Path]:
+    """Try all keys at a running node, and return the results, and the diaries of the listed and the removed sensor.
+
+    Returns
+    -------
+    dict
         ``let in``, names of nodes that were accepted. ``refused``, refusals by reason, as the central node counts them.
         ``notes``, messages to the refused nodes. ``removed, s``, seconds from the removal of a key to the last
-        acknowledgement to its owner. Also results for the recordings, which may contain the listed sensor only.
+        acknowledgement to its owner.
+    listed, removed : Path
     """
-    archive, allowed = folder / "recordings", folder / "allow.toml"
-    archive.mkdir()
-    pairs = {name: KeyPair.new(name) for name in ("central", "front", "stranger", "viewer", "leaver", "boss")}
-    for pair in pairs.values():
-        pair.save(folder / "keys")
-    listed = (
-        Permission(name="front", public=pairs["front"].public, role="sensor", serials=("front",)),
-        Permission(name="leaver", public=pairs["leaver"].public, role="sensor", serials=("leaver",)),
-        Permission(name="viewer", public=pairs["viewer"].public, role="application"),
-        Permission(name="boss", public=pairs["boss"].public, role="admin"),
-    )
-    AllowList(keys=listed).save(allowed)
-    options = ["--key", str(folder / "keys" / "central.secret.toml"), "--allow", str(allowed), "--workers", "1"]
-    options += ["--publish", "tcp://127.0.0.1:*", "--record", str(archive), "--directions", "2d:9"]
     with ExitStack() as stack:
-        node = stack.enter_context(central("serve", folder, *options))
-        listening = node.wait_for("listening")
-        server = pairs["central"].public
-        right = {name: ClientKeys(pair=pair, server=server) for name, pair in pairs.items()}
-        wrong_server = ClientKeys(pair=pairs["front"], server=pairs["stranger"].public)
-        address = listening["address"]
+        wrong_server = ClientKeys(pair=keyed.pairs["front"], server=keyed.pairs["stranger"].public)
         cases: dict[str, tuple[str, ClientKeys | None]] = {
-            "the listed sensor": ("front", right["front"]),
-            "a listed sensor, until it is removed": ("leaver", right["leaver"]),
+            "the listed sensor": ("front", keyed.client("front")),
+            "a listed sensor, until it is removed": ("leaver", keyed.client("leaver")),
             "no key": ("front", None),
-            "an unknown key": ("front", right["stranger"]),
+            "an unknown key": ("front", keyed.client("stranger")),
             "the wrong server key": ("front", wrong_server),
-            "an application that sends": ("front", right["viewer"]),
-            "a sensor that sends for another": ("rear", right["front"]),
+            "an application that sends": ("front", keyed.client("viewer")),
+            "a sensor that sends for another": ("rear", keyed.client("front")),
         }
         diaries = {name: folder / f"{number}.ndjson" for number, name in enumerate(cases)}
         tries = {
-            name: _start_client(stack, address, sensor, given, diaries[name], session_id=seed + number)
+            name: _start_client(stack, keyed.address, sensor, given, diaries[name], session_id=seed + number)
             for number, (name, (sensor, given)) in enumerate(cases.items())
         }
         _send(list(tries.values()), _TRIED_S)
         watchers = {
             "no key that subscribes": None,
-            "an unknown key that subscribes": right["stranger"],
-            "a sensor that subscribes": right["front"],
-            "the listed application": right["viewer"],
+            "an unknown key that subscribes": keyed.client("stranger"),
+            "a sensor that subscribes": keyed.client("front"),
+            "the listed application": keyed.client("viewer"),
         }
-        let_in = _receivers(listening["publish"], watchers, tries["the listed sensor"])
+        let_in = _receivers(keyed.publish, watchers, tries["the listed sensor"])
         removed_s = time.monotonic()
-        allowed_list = AllowList.load(allowed).remove("leaver")
-        allowed_list.save(allowed)
+        AllowList.load(keyed.allowed).remove("leaver").save(keyed.allowed)
         _send([tries["the listed sensor"], tries["a listed sensor, until it is removed"]], _REMOVED_S)
         leaver = tries.pop("a listed sensor, until it is removed")
         after_s = leaver.acked_s - removed_s
-        raw = _accepts_without_keys(address) + _accepts_without_keys(listening["publish"])
-        boss = ("--key", str(folder / "keys" / "boss.secret.toml"), "--server-key", server)
-        status = state_of(address, *boss)
+        raw = _accepts_without_keys(keyed.address) + _accepts_without_keys(keyed.publish)
+        status = keyed.status()
         until(lambda: tries["the listed sensor"].acked_through >= tries["the listed sensor"].sent - 1)
         let_in += [name for name, each in tries.items() if each.acked_through >= 0]
         notes = sorted({note for name, each in tries.items() if name not in let_in for note in each.notes})
-        node.stop()
-    wanted = [diaries["the listed sensor"]]
-    found = judged(folder, archive, [*wanted, diaries["a listed sensor, until it is removed"]], kept=wanted)
-    return {
+    found = {
         "tried": len(cases) + len(watchers) + 2,
         "let in": sorted(let_in),
         "raw": raw,
@@ -144,7 +135,8 @@ def keys(folder: Path, *, seed: int) -> Found:
         "notes": notes,
         "unsettled when removed": leaver.sent - 1 - leaver.acked_through,
         "removed, s": round(max(0.0, after_s), 2),
-    } | found
+    }
+    return found, diaries["the listed sensor"], diaries["a listed sensor, until it is removed"]
 
 
 def _start_client(

@@ -17,6 +17,7 @@ from ertis_bench.network.serving import Serve, accounts, expected_of, some_words
 
 from ertis_numba.network.messages import Group
 from ertis_numba.network.subscriber import Subscriber
+from tests.faults.network.receiver_thread import ReceiverThread
 from tests.faults.network.sender_thread import SenderThread
 
 __all__ = ["grouped", "groups", "workers"]
@@ -40,9 +41,8 @@ def workers(folder: Path, *, seed: int, count: int) -> Found:
     with ExitStack() as stack:
         serve = stack.enter_context(Serve.running(folder, *options))
         receiver = stack.enter_context(
-            ReceiverJob(address=serve.publish, diary=str(images), expected=str(expected)).start()
+            ReceiverThread(ReceiverJob(address=serve.publish, diary=str(images), expected=str(expected)))
         )
-        receiver.wait_for("subscribed")
         job = SenderJob(
             address=serve.listen, diary=str(diary), sensors=("left", "right"), rate_hz=25.0, words=str(words)
         )
@@ -70,8 +70,7 @@ def workers(folder: Path, *, seed: int, count: int) -> Found:
         sent = read_diaries([diary])
         acked_through = serve.settle(len(sent.kept))
         time.sleep(0.5)  # time for the receiver to log the last image
-        receiver.signal(signal.SIGTERM)
-        receiver.wait()
+        receiver.stop()
         found = accounts(serve, sent, read_received(images))
         processing = None if serve.latest is None else serve.latest.processing
         if processing is not None:

@@ -14,21 +14,20 @@ from pathlib import Path
 from typing import Any, Final
 
 from ertis_bench.network.oracle import judged, read_diaries
-from ertis_bench.network.processes import central, until
+from ertis_bench.network.processes import until
 from ertis_bench.network.sender import SenderJob
 
 from ertis_numba.errors import DataError, ErtisError
-from ertis_numba.network.allow_list import AllowList, Permission
-from ertis_numba.network.keys import ClientKeys, KeyPair
+from ertis_numba.network.keys import ClientKeys
 from ertis_numba.network.status_client import Asking
 from ertis_numba.network.subscriber import Subscriber
 from tests.faults.network.busy import BUSY_ERTIS, BUSY_S
+from tests.faults.network.keyed_node import KeyedNode
 from tests.faults.network.kills import RestartedRecorder
-from tests.faults.network.links import state_of
 from tests.faults.network.meddler import Direction, Meddler
 from tests.faults.network.sender_thread import SenderThread
 
-__all__ = ["flips", "gone"]
+__all__ = ["flip_bits", "flips", "gone"]
 
 _SHARE_TO_CLIENT: Final = 0.1  # share of flips on the way to a client, which needs three seconds to detect one
 _FLIPPED_S: Final = 20.0
@@ -47,65 +46,53 @@ def flips(folder: Path, *, seed: int, count: int) -> Found:
     Returns
     -------
     dict
-        ``flips``; ``restarts`` of the central node or its publisher; ``sockets left``, open sockets of both after the
-        clients have ended; and the results for the sensor's measurements.
+        Results of `flip_bits`, and the results for the sensor's measurements.
     """
-    rng = random.Random(seed)
-    archive, diary = folder / "recordings", folder / "sender.ndjson"
-    archive.mkdir()
-    pairs = _listed(folder)
-    server = pairs["central"].public
-    boss = ("--key", str(folder / "keys" / "boss.secret.toml"), "--server-key", server)
-    options = ["--key", str(folder / "keys" / "central.secret.toml"), "--allow", str(folder / "allow.toml")]
-    options += ["--publish", "tcp://127.0.0.1:*", "--record", str(archive), "--directions", "2d:9", "--workers", "1"]
-    with ExitStack() as stack:
-        node = stack.enter_context(central("serve", folder, *options))
-        listening = node.wait_for("listening")
-        pids = [node.node_pid, state_of(listening["address"], *boss)["processing"]["publisher_pid"]]
-        before = [_tcp_sockets(pid) for pid in pids]
-        with ExitStack() as clients:
-            cables = [
-                clients.enter_context(Meddler(listening[name], seed=rng.randrange(2**32)))
-                for name in ("address", "publish") * _N_CONNECTIONS
-            ]
-            job = SenderJob(
-                address=cables[0].address, diary=str(diary), rate_hz=_RATE_HZ, seed=seed, ring_bytes=_RING_BYTES
-            )
-            key = str(folder / "keys" / "front.secret.toml")
-            sender = clients.enter_context(SenderThread(job.replace(keys=(key, server))))
-            viewer, admin = (ClientKeys(pair=pairs[name], server=server) for name in ("viewer", "boss"))
-            clients.enter_context(_repeating(partial(_watch, cables[1].address, viewer)))
-            for cable in cables[2:]:
-                clients.enter_context(_repeating(partial(_ask, cable.address, admin)))
-            sender.wait_for("begun")
-            with ThreadPoolExecutor(len(cables)) as pool:
-                shares = [len(range(number, count, len(cables))) for number in range(len(cables))]
-                rngs = [random.Random(rng.random()) for _ in cables]
-                list(pool.map(_flip, cables, rngs, shares))
-            sender.signal(signal.SIGTERM)
-            flushed = sender.wait_for("sent", timeout_s=120.0)["flushed"]
-        until(lambda: [_tcp_sockets(pid) for pid in pids] <= before, timeout_s=10.0)
-        left = sum(_tcp_sockets(pid) for pid in pids) - sum(before)
-        restarts = node.restarts + state_of(listening["address"], *boss)["processing"]["publisher_respawned"]
-        code = node.stop()
-    flipped = sum(sum(cable.did.values()) for cable in cables)
-    found = {"flips": flipped, "flushed": flushed, "restarts": restarts, "sockets left": max(0, left)}
-    return found | {"exit code": code} | judged(folder, archive, [diary])
+    with KeyedNode.running(folder) as keyed:
+        found, diary = flip_bits(keyed, folder, seed=seed, count=count)
+        code = keyed.node.stop()
+    return found | {"exit code": code} | judged(folder, keyed.archive, [diary])
 
 
-def _listed(folder: Path) -> dict[str, KeyPair]:
-    """Create keys for a central node, a sensor, an application and an admin, and their allow list."""
-    pairs = {name: KeyPair.new(name) for name in ("central", "front", "viewer", "boss")}
-    for pair in pairs.values():
-        pair.save(folder / "keys")
-    AllowList(
-        keys=(
-            Permission(name="front", public=pairs["front"].public, role="sensor", serials=("front",)),
-            Permission(name="viewer", public=pairs["viewer"].public, role="application"),
-            Permission(name="boss", public=pairs["boss"].public, role="admin"),
+def flip_bits(keyed: KeyedNode, folder: Path, *, seed: int, count: int) -> tuple[Found, Path]:
+    """Flip bits in the encrypted connections of a running node, and return the results and the sensor's diary.
+
+    Returns
+    -------
+    dict
+        ``flips``; ``restarts`` of the central node or its publisher; ``sockets left``, open sockets of both after the
+        clients have ended.
+    diary : Path
+    """
+    rng, diary = random.Random(seed), folder / "sender.ndjson"
+    node = keyed.node
+    pids = [node.node_pid, keyed.status()["processing"]["publisher_pid"]]
+    before = [_tcp_sockets(pid) for pid in pids]
+    with ExitStack() as clients:
+        cables = [
+            clients.enter_context(Meddler(address, seed=rng.randrange(2**32)))
+            for address in (keyed.address, keyed.publish) * _N_CONNECTIONS
+        ]
+        job = SenderJob(
+            address=cables[0].address, diary=str(diary), rate_hz=_RATE_HZ, seed=seed, ring_bytes=_RING_BYTES
         )
-    ).save(folder / "allow.toml")
-    return pairs
+        key = str(keyed.keys / "front.secret.toml")
+        sender = clients.enter_context(SenderThread(job.replace(keys=(key, keyed.server))))
+        clients.enter_context(_repeating(partial(_watch, cables[1].address, keyed.client("viewer"))))
+        for cable in cables[2:]:
+            clients.enter_context(_repeating(partial(_ask, cable.address, keyed.client("boss"))))
+        sender.wait_for("begun")
+        with ThreadPoolExecutor(len(cables)) as pool:
+            shares = [len(range(number, count, len(cables))) for number in range(len(cables))]
+            rngs = [random.Random(rng.random()) for _ in cables]
+            list(pool.map(_flip, cables, rngs, shares))
+        sender.signal(signal.SIGTERM)
+        flushed = sender.wait_for("sent", timeout_s=120.0)["flushed"]
+    until(lambda: [_tcp_sockets(pid) for pid in pids] <= before, timeout_s=10.0)
+    left = sum(_tcp_sockets(pid) for pid in pids) - sum(before)
+    restarts = node.restarts + keyed.status()["processing"]["publisher_respawned"]
+    flipped = sum(sum(cable.did.values()) for cable in cables)
+    return {"flips": flipped, "flushed": flushed, "restarts": restarts, "sockets left": max(0, left)}, diary
 
 
 def _flip(cable: Meddler, rng: random.Random, count: int) -> None:
