@@ -11,6 +11,7 @@ import pytest
 
 from ertis_numba import figures
 from ertis_numba.errors import ArgumentError
+from ertis_numba.figures import _images, _slices
 from ertis_numba.figures._words import of_image, of_measurement
 from ertis_numba.frames import Measurement, Peak, Stamp
 from ertis_numba.geometry import direction_grid
@@ -135,8 +136,8 @@ def texts_of(figure):
 )
 def test_texts_of_pictures_are_legible_and_complete(monkeypatch, kind, n_mics, look):
     """No text overlaps another or leaves the page, all axes have units, and captions have the significant settings."""
-    monkeypatch.setattr(figures._images, "PIXELS", 250)  # the rasters are not drawn
-    monkeypatch.setattr(figures._slices, "_PIXELS", 50)
+    monkeypatch.setattr(_images, "PIXELS", 250)  # the rasters are not drawn
+    monkeypatch.setattr(_slices, "_PIXELS", 50)
     figure = pictures(n_mics)[kind](**LOOKS[look])
     texts = texts_of(figure)
     require_places(figure, texts)

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from ertis_numba import figures
-from ertis_numba.figures import style
+from ertis_numba.figures import _images, _slices, style
 from ertis_numba.geometry import direction_grid, microphones
 from ertis_numba.settings import Processing, Settings
 from ertis_numba.storage import write_energyscapes, write_recording
@@ -34,7 +34,8 @@ def run(*arguments, code=0):
 
 def n_colours(picture):
     """Return the number of colours of one in 16 pixels."""
-    return len(picture.convert("RGB").resize((picture.width // 4, picture.height // 4), Image.NEAREST).getcolors(2**24))
+    some = picture.convert("RGB").resize((picture.width // 4, picture.height // 4), Image.NEAREST)
+    return len(some.getcolors(some.width * some.height))
 
 
 @pytest.fixture(scope="module")
@@ -135,6 +136,8 @@ def _coarse(monkeypatch):
     """Save a quarter of the pixels along each side: other tests check the resolution."""
     coarse = {name: dataclasses.replace(theme, dpi=theme.dpi // 4) for name, theme in style.THEMES.items()}
     monkeypatch.setattr(style, "THEMES", coarse)
+    monkeypatch.setattr(_images, "PIXELS", 250)
+    monkeypatch.setattr(_slices, "_PIXELS", 125)
 
 
 @pytest.mark.usefixtures("_coarse")
