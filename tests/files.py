@@ -45,3 +45,10 @@ def image(azimuth_deg=None, elevation_deg=None, *, range_m=None, seed=1, setting
     amplitude = (0.002 * rng.rayleigh(size=(len(azimuth_deg), len(range_m)))).astype(np.float32)
     amplitude[len(azimuth_deg) // 2, len(range_m) // 2] = 0.5
     return Energyscape(amplitude, np.radians(azimuth_deg), np.radians(elevation_deg), range_m, settings)
+
+
+def open_dataset(path, **options):
+    """Open a file by `xarray.open_dataset`."""
+    import xarray  # noqa: PLC0415 - it imports pandas, which few tests need
+
+    return xarray.open_dataset(path, **options)

@@ -77,18 +77,22 @@ def test_threshold_factor_gives_the_false_alarm_probability(method, false_alarm)
 
 ROWS = {1e-2: 5_000, 1e-3: 30_000, 1e-4: 160_000}
 """Trials: for some twenty false alarms."""
+STEP = np.where(np.arange(37) < MIDDLE, 0.1, 1.0)  # the middle bin is the first of the louder side
+BESIDE = np.where((np.arange(37) >= MIDDLE + 5) & (np.arange(37) < MIDDLE + 8), 100.0, 1.0)  # 40 dB above the noise
 
 
-@functools.cache
-def noise_alone(false_alarm):
-    return rayleigh(ROWS[false_alarm])
+@functools.lru_cache(maxsize=1)
+def noise_for(false_alarm, scene):
+    """Noise for as many trials as a probability needs; all methods see the same noise."""
+    scale, seed = {"noise": (1.0, 1), "step": (STEP, 3), "reflector": (BESIDE, 4)}[scene]
+    return rayleigh(ROWS[false_alarm], scale, seed=seed)
 
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("false_alarm", [1e-2, 1e-3, 1e-4])
 def test_false_alarm_rate_in_noise(method, false_alarm):
     """The rate holds in the middle and at both ends, at every noise level."""
-    given = noise_alone(false_alarm)
+    given = noise_for(false_alarm, "noise")
     found = cfar(given, false_alarm=false_alarm, method=method)
     for place in (0, MIDDLE, -1):
         assert_share(found[:, place], false_alarm)
@@ -104,8 +108,7 @@ def test_false_alarm_rate_in_noise(method, false_alarm):
 @pytest.mark.parametrize("false_alarm", [1e-2, 1e-3, 1e-4])
 def test_false_alarm_rate_beside_a_clutter_edge(method, false_alarm):
     """With a step of 20 dB, the rate at the edge is the theoretical one."""
-    step = np.where(np.arange(37) < MIDDLE, 0.1, 1.0)  # the middle bin is the first of the louder side
-    found = cfar(rayleigh(ROWS[false_alarm], step, seed=3), false_alarm=false_alarm, method=method)
+    found = cfar(noise_for(false_alarm, "step"), false_alarm=false_alarm, method=method)
     wanted = exact(method, np.where(np.arange(N) < N // 2, 0.1, 1.0), false_alarm)
     assert_share(found[:, MIDDLE], wanted)
     # The quieter side has fewer false alarms than requested.
@@ -120,9 +123,7 @@ def test_false_alarm_rate_beside_a_clutter_edge(method, false_alarm):
 @pytest.mark.parametrize("false_alarm", [1e-2, 1e-3, 1e-4])
 def test_false_alarm_rate_beside_a_strong_reflector(method, false_alarm):
     """With a reflector 40 dB above the noise, only the ordered statistic keeps some sensitivity."""
-    scale = np.ones(37)
-    scale[MIDDLE + 5 : MIDDLE + 8] = 100.0
-    found = cfar(rayleigh(ROWS[false_alarm], scale, seed=4), false_alarm=false_alarm, method=method)[:, MIDDLE]
+    found = cfar(noise_for(false_alarm, "reflector"), false_alarm=false_alarm, method=method)[:, MIDDLE]
     assert interval(int(np.count_nonzero(found)), len(found))[0] <= false_alarm
     if method == "ordered_statistic":
         scales = np.ones(N)

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from distributed import Client
 
 import ertis_numba as ertis
 from ertis_numba.cluster import connect, local_cluster
@@ -227,6 +226,7 @@ def test_cluster_reports_a_missing_scheduler(monkeypatch):
 @pytest.mark.parametrize("address", ["foo", "http://127.0.0.1:9", "silent"])
 def test_connect_rejects_other_servers_and_closes_its_client(address):
     """An unclosed client would wait for an answer until the process ends, and then print an error."""
+    from distributed import Client  # noqa: PLC0415 - a slow import that few tests need
 
     def unclosed():
         clients = {each for each in gc.get_objects() if issubclass(type(each), Client)}

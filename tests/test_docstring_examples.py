@@ -1,6 +1,7 @@
 """Docstrings of public names: their examples run, and functions document parameters, results and errors."""
 
 import doctest
+import functools
 import importlib
 import inspect
 import shutil
@@ -76,9 +77,14 @@ def public():
                     yield pytest.param(test, id=test.name.removeprefix("ertis_numba."))
 
 
+shared_pipeline = functools.cache(ertis.Pipeline)
+
+
 @pytest.mark.usefixtures("place")
 @pytest.mark.parametrize("example", list(public()))
-def test_docstring_examples_run(example):
+def test_docstring_examples_run(example, monkeypatch):
+    if not example.name.startswith(ertis.Pipeline.__module__):
+        monkeypatch.setattr(ertis, "Pipeline", shared_pipeline)  # which takes most of the time to build
     runner = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE)
     shown = []
     runner.run(example, out=shown.append)

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import plyfile
 import pytest
-from pypcd4 import PointCloud as Pcd
 
 import ertis_numba as ertis
 from ertis_numba.analysis.points import PointExtractor
@@ -54,6 +53,8 @@ def read_ply(path):
 
 
 def read_pcd(path):
+    from pypcd4 import PointCloud as Pcd  # noqa: PLC0415 - it imports pandas, which few tests need
+
     cloud = Pcd.from_path(path)
     lines = path.read_bytes().partition(b"DATA")[0].decode().splitlines()
     return cloud.pc_data, [line.removeprefix("# ") for line in lines if line.startswith("#")]

@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-import xarray
 
 from ertis_numba.storage import write_energyscapes, write_recording
 from ertis_numba.storage.schema import ENERGYSCAPE, RECORDING
-from tests.files import image, line, noise
+from tests.files import image, line, noise, open_dataset
 
 
 @pytest.mark.parametrize("engine", ["h5netcdf", "netcdf4"])
@@ -14,7 +13,7 @@ from tests.files import image, line, noise
 def test_xarray_opens_a_recording(tmp_path, engine, settings):
     given = noise(settings)
     path = write_recording(tmp_path / "rec.h5", given)
-    with xarray.open_dataset(path, group="/sensors/eRTIS-7", engine=engine) as data:
+    with open_dataset(path, group="/sensors/eRTIS-7", engine=engine) as data:
         assert data["pdm"].dims == ("time", "sample", "word")[: given[0].data.ndim + 1]
         assert np.array_equal(data["pdm"].values, [each.data for each in given])
         assert data["microphone_position"].dims == ("microphone", "axis")
@@ -25,7 +24,7 @@ def test_xarray_opens_a_recording(tmp_path, engine, settings):
 @pytest.mark.parametrize("engine", ["h5netcdf", "netcdf4"])
 def test_xarray_opens_energyscapes(tmp_path, engine):
     path = write_energyscapes(tmp_path / "img.h5", [image(), image(seed=2)])
-    with xarray.open_dataset(path, group="/sensors/sensor", engine=engine) as data:
+    with open_dataset(path, group="/sensors/sensor", engine=engine) as data:
         assert data["amplitude"].dims == ("time", "direction", "range")
         assert np.array_equal(data["amplitude"].values, [image().amplitude, image(seed=2).amplitude])
         assert {*data.coords} == {"azimuth", "elevation", "range", "time"}
@@ -38,5 +37,5 @@ def test_xarray_opens_energyscapes(tmp_path, engine):
 def test_float16_is_read_by_h5netcdf(tmp_path):
     """netCDF-C crashes on it, as docs/reference/formats.md states."""
     path = write_energyscapes(tmp_path / "img.h5", [image()], dtype="float16")
-    with xarray.open_dataset(path, group="/sensors/sensor", engine="h5netcdf") as data:
+    with open_dataset(path, group="/sensors/sensor", engine="h5netcdf") as data:
         np.testing.assert_allclose(data["amplitude"].values[0], image().amplitude, rtol=2**-10, atol=1e-7)

@@ -2,7 +2,7 @@
 
 import re
 from configparser import ConfigParser
-from importlib.metadata import packages_distributions
+from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 
 import pytest
@@ -11,7 +11,6 @@ from tests.files import noise
 from tests.pages import forking
 
 ROOT = Path(__file__).parents[1]
-PACKAGES = packages_distributions()
 FOR_AUTHORS = {"test", "docs", "check"}
 NEEDED_BY = {
     "browser": ["{root}/docs/pictures/view.py"],
@@ -73,13 +72,18 @@ def extras():
     }
 
 
-def modules_of(distribution):
-    """Import names of a distribution; none if it is not installed."""
-    return [module for module, names in PACKAGES.items() if _plain(distribution) in map(_plain, names)]
+def modules_of(name):
+    """Import names of a distribution; none if it is not installed.
 
-
-def _plain(name):
-    return re.sub("[-_.]+", "-", name).lower()
+    The names are those of `importlib.metadata.packages_distributions`, which takes a second to read all distributions.
+    """
+    try:
+        found = distribution(name)
+    except PackageNotFoundError:
+        return []
+    declared = (found.read_text("top_level.txt") or "").split()
+    files = [file for file in found.files or [] if file.suffix == ".py"]
+    return declared or sorted({file.parts[0] if len(file.parts) > 1 else file.stem for file in files})
 
 
 def cases():

@@ -8,7 +8,6 @@ import time
 
 import pytest
 from click.testing import CliRunner
-from distributed import Client
 from ertis_cli.main import cli
 
 from ertis_numba import cluster
@@ -24,7 +23,7 @@ from ertis_numba.campaign.tasks import Task
 from ertis_numba.errors import NetworkError
 from ertis_numba.storage import open_energyscapes, write_recording
 from tests.campaigns import ended, names_in, outcomes, run_here, write_recordings
-from tests.dask_clusters import cluster_of_threads
+from tests.dask_clusters import client_of, cluster_of_threads
 from tests.files import line, noise
 from tests.pages import path_of
 from tests.test_call_match import CALL, REVERSED, heard
@@ -116,7 +115,7 @@ def test_progress_is_reported_and_close_ends_the_work(scheduler, long_runs, tmp_
     events.close()
     assert kinds[0] is RecordingStarted
     assert kinds[-1] is RecordingProgress
-    with Client(scheduler, set_as_default=False) as client:
+    with client_of(scheduler) as client:
         end_s = time.monotonic() + PATIENCE_S
         while any(client.call_stack().values()) and time.monotonic() < end_s:
             time.sleep(0.05)
@@ -126,7 +125,7 @@ def test_progress_is_reported_and_close_ends_the_work(scheduler, long_runs, tmp_
 def test_killed_dask_workers_lose_nothing(process_scheduler, long_runs, tmp_path):
     scheduler, out = process_scheduler, tmp_path / "out"
     found = {}
-    with Client(scheduler, set_as_default=False) as client:
+    with client_of(scheduler) as client:
         pids = client.run(os.getpid)
         for event in Campaign(find_recordings([long_runs]), out, SLOW, scheduler=scheduler).run():
             if isinstance(event, RecordingStarted) and event.measurements == LONG:

@@ -5,7 +5,6 @@ import dataclasses
 import h5py
 import numpy as np
 import pytest
-import xarray
 
 import ertis_numba as ertis
 from ertis_numba.beamformers import BEAMFORMERS
@@ -18,6 +17,7 @@ from ertis_numba.simulation.render import Simulator
 from ertis_numba.storage import RecordingWriter, open_recording, write_recording
 from ertis_numba.storage.sealing import seal
 from tests import cases
+from tests.files import open_dataset
 from tests.rings import PCM, POINTS, RATE_HZ, heard, scene_of, sensor_of
 from tests.scenes import only
 
@@ -106,7 +106,7 @@ def test_pcm_recording_keeps_every_sample(tmp_path, name):
 def test_pcm_recording_opens_in_xarray(tmp_path, measurement):
     path = write_recording(tmp_path / "rec.h5", [measurement])
     for engine in ("h5netcdf", "netcdf4"):
-        with xarray.open_dataset(path, group="/sensors/sensor", engine=engine, decode_timedelta=False) as data:
+        with open_dataset(path, group="/sensors/sensor", engine=engine, decode_timedelta=False) as data:
             assert data["pcm"].dims == ("time", "sample", "microphone")
             assert data["pcm"].attrs["sample_rate_hz"] == RATE_HZ
             assert np.array_equal(data["pcm"][0], measurement.data)

@@ -1,6 +1,7 @@
 """``ertis plot`` draws each kind of plot from its source file, and the examples of ``docs/how-to/plots.md`` run."""
 
 import contextlib
+import dataclasses
 import json
 import re
 import shutil
@@ -14,6 +15,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from ertis_numba import figures
+from ertis_numba.figures import _images, _slices, style
 from ertis_numba.geometry import direction_grid, microphones
 from ertis_numba.settings import Processing, Settings
 from ertis_numba.storage import write_energyscapes, write_recording
@@ -28,6 +30,12 @@ def run(*arguments, code=0):
     done = CliRunner().invoke(cli, [str(argument) for argument in arguments])
     assert done.exit_code == code, (done.stderr, done.exception)
     return done
+
+
+def n_colours(picture):
+    """Return the number of colours of one in 16 pixels."""
+    some = picture.convert("RGB").resize((picture.width // 4, picture.height // 4), Image.NEAREST)
+    return len(some.getcolors(some.width * some.height))
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +70,7 @@ def test_plots_for_print_have_their_content_and_width(files, tmp_path, source, k
     assert ("measurement" in report) == (kind != "array")
     with Image.open(target) as picture:
         assert picture.getpixel((0, 0))[:3] == (255, 255, 255)
-        assert len(picture.convert("RGB").getcolors(2**24)) > 30
+        assert n_colours(picture) > 30
         assert picture.width == pytest.approx(85 / 25.4 * 300, abs=1)
 
 
@@ -123,6 +131,16 @@ def test_every_plot_option_names_its_kinds():
     assert all(about in stated for about in _KINDS.values())
 
 
+@pytest.fixture
+def _coarse(monkeypatch):
+    """Save a quarter of the pixels along each side: other tests check the resolution."""
+    coarse = {name: dataclasses.replace(theme, dpi=theme.dpi // 4) for name, theme in style.THEMES.items()}
+    monkeypatch.setattr(style, "THEMES", coarse)
+    monkeypatch.setattr(_images, "PIXELS", 250)
+    monkeypatch.setattr(_slices, "_PIXELS", 125)
+
+
+@pytest.mark.usefixtures("_coarse")
 def test_plot_commands_of_the_page_run(tmp_path):
     shutil.copy(ROOT / "data" / "synthetic" / "reflectors.h5", tmp_path / "REC.h5")
     (tmp_path / "data").symlink_to(ROOT / "data")
@@ -135,12 +153,13 @@ def test_plot_commands_of_the_page_run(tmp_path):
     assert len(pictures) == sum(command.endswith(".png") for command in commands)
     for path in pictures:
         with Image.open(path) as picture:
-            assert len(picture.convert("RGB").getcolors(2**24)) > 30, path
+            assert n_colours(picture) > 30, path
             assert (picture.getpixel((0, 0))[:3] == (255, 255, 255)) == (path.stem == "polar"), path  # --theme light
     assert {kind for kind in _KINDS if f"--kind {kind}" in PAGE} == {*_KINDS} - {"image"}
     assert all(f"`{kind}`" in PAGE for kind in _KINDS)
 
 
+@pytest.mark.usefixtures("_coarse")
 def test_plot_code_of_the_page_runs(tmp_path):
     shutil.copy(ROOT / "data" / "synthetic" / "reflectors.h5", tmp_path / "REC.h5")
     with contextlib.chdir(tmp_path):

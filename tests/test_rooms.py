@@ -1,7 +1,6 @@
 """Simulated rooms against pyroomacoustics: delays and levels of image sources in a shoebox room."""
 
 import numpy as np
-import pyroomacoustics
 import pytest
 from numpy.testing import assert_allclose
 
@@ -23,6 +22,8 @@ LOW_RATE_HZ = 450_000
 
 def equal_rooms(emitter_m, receiver_m, largest):
     """Return a pyroomacoustics room and the equal scene: one corner at the origin, a receiver and a transmitter."""
+    import pyroomacoustics  # noqa: PLC0415 - a slow import
+
     room = pyroomacoustics.ShoeBox(
         SIZE_M, fs=LOW_RATE_HZ, max_order=largest, materials=pyroomacoustics.Material(1 - AMPLITUDE**2)
     )
@@ -56,6 +57,8 @@ def test_image_sources_agree_with_pyroomacoustics(emitter_m, receiver_m, largest
 @pytest.mark.parametrize(("emitter_m", "receiver_m"), PLACES[:2])
 def test_rendered_signals_agree_with_pyroomacoustics(emitter_m, receiver_m):
     """Convolve the call with the impulse response of pyroomacoustics, sampled at 450 kHz."""
+    import pyroomacoustics  # noqa: PLC0415 - a slow import
+
     room, scene = equal_rooms(emitter_m, receiver_m, 2)
     sensors = tuple(sensor.replace(recording=Recording(n_samples=140_000)) for sensor in scene.sensors)
     [signal] = heard(scene.replace(sensors=sensors), "walls", "occlusion", "spreading", "cross_emission")

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 import h5py
 import numpy as np
 import pytest
-import xarray
 
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement, SequenceGap, Stamp
@@ -24,7 +23,7 @@ from ertis_numba.storage import (
 )
 from ertis_numba.storage._gaps import UNKNOWN
 from ertis_numba.storage.schema import ENERGYSCAPE, RECORDING, create_variables
-from tests.files import SMALL, image, line, noise
+from tests.files import SMALL, image, line, noise, open_dataset
 
 
 @pytest.mark.parametrize(
@@ -119,13 +118,13 @@ def test_calibration_is_kept(tmp_path):
 def test_xarray_shows_named_axes(tmp_path):
     write_recording(tmp_path / "rec.h5", noise())
     write_energyscapes(tmp_path / "img.h5", [image()])
-    with xarray.open_dataset(tmp_path / "rec.h5", group="/sensors/eRTIS-7", engine="netcdf4") as data:
+    with open_dataset(tmp_path / "rec.h5", group="/sensors/eRTIS-7", engine="netcdf4") as data:
         assert data["pdm"].dims == ("time", "sample")
         assert data["pdm"].dtype == np.uint32
         assert data["microphone_position"].dims == ("microphone", "axis")
         assert data["time"].values[0] == np.datetime64(1_700_000_000_123_456_789, "ns")
         assert set(data.variables) == {variable.name for variable in RECORDING}
-    with xarray.open_dataset(tmp_path / "img.h5", group="/sensors/sensor", engine="netcdf4") as data:
+    with open_dataset(tmp_path / "img.h5", group="/sensors/sensor", engine="netcdf4") as data:
         assert data["amplitude"].dims == ("time", "direction", "range")
         assert {"azimuth", "elevation", "range", "time"} == set(data.coords)
         assert data["range"].attrs["units"] == "m"
@@ -134,7 +133,7 @@ def test_xarray_shows_named_axes(tmp_path):
 
 def test_words_of_wide_arrays_have_their_own_axis(tmp_path):
     write_recording(tmp_path / "rec.h5", noise(line(33, 32)))
-    with xarray.open_dataset(tmp_path / "rec.h5", group="/sensors/eRTIS-7", engine="netcdf4") as data:
+    with open_dataset(tmp_path / "rec.h5", group="/sensors/eRTIS-7", engine="netcdf4") as data:
         assert data["pdm"].dims == ("time", "sample", "word")
 
 

@@ -5,7 +5,6 @@ from dataclasses import replace
 import h5py
 import numpy as np
 import pytest
-import xarray
 
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.pipeline import Pipeline
@@ -18,7 +17,7 @@ from ertis_numba.storage import (
     write_energyscapes,
     write_recording,
 )
-from tests.files import SMALL, image, line, noise
+from tests.files import SMALL, image, line, noise, open_dataset
 
 TURNED = (0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5))
 
@@ -45,7 +44,7 @@ def test_sensors_are_read_back_unchanged(tmp_path):
                 assert np.array_equal(back.data, measurement.data)
                 assert back.stamp == measurement.stamp
             assert recording.settings.replace(array=wanted.array) == wanted
-    with xarray.open_dataset(path, group="/sensors/left", engine="netcdf4") as data:
+    with open_dataset(path, group="/sensors/left", engine="netcdf4") as data:
         assert data["pdm"].shape == (2, 40_960)
 
 

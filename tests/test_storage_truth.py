@@ -5,13 +5,12 @@ from dataclasses import asdict, replace
 import h5py
 import numpy as np
 import pytest
-import xarray
 
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Reflector
 from ertis_numba.storage import GroundTruth, open_energyscapes, open_recording, write_energyscapes, write_recording
 from ertis_numba.storage.schema import TRUTH
-from tests.files import image, noise
+from tests.files import image, noise, open_dataset
 
 SENSOR = "eRTIS-7"
 GROUP = f"sensors/{SENSOR}/truth"
@@ -66,12 +65,12 @@ def test_measurements_without_reflectors_have_empty_truth(tmp_path):
     write_recording(tmp_path / "rec.h5", noise(), truth={SENSOR: truth(((), (), ()))})
     with open_recording(tmp_path / "rec.h5") as recording:
         assert recording.truth.reflectors == ((), (), ())
-    with xarray.open_dataset(tmp_path / "rec.h5", group=f"/{GROUP}", engine="netcdf4") as data:
+    with open_dataset(tmp_path / "rec.h5", group=f"/{GROUP}", engine="netcdf4") as data:
         assert data["velocity"].shape == (3, 0, 3)
 
 
 def test_xarray_shows_named_axes(path):
-    with xarray.open_dataset(path, group=f"/{GROUP}", engine="netcdf4") as data:
+    with open_dataset(path, group=f"/{GROUP}", engine="netcdf4") as data:
         assert data["range"].dims == ("measurement", "target")
         assert data["velocity"].dims == ("measurement", "target", "axis")
         assert data["name"].values[0, 0] == "points[0]"

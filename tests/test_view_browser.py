@@ -19,7 +19,6 @@ import numpy as np
 import plyfile
 import pytest
 from PIL import Image
-from playwright.sync_api import sync_playwright
 from scipy import ndimage
 from scipy.spatial import KDTree
 
@@ -121,6 +120,8 @@ def browser():
     path = next(filter(None, map(shutil.which, BROWSERS)), None)
     if path is None and not os.environ.get("CI"):
         pytest.skip("there is no Chromium; install it (apt-get install chromium)")
+    from playwright.sync_api import sync_playwright  # noqa: PLC0415 - a slow import
+
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=path, args=FLAGS)
         yield browser

@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import pytest
-import xarray
 
 import ertis_numba as ertis
 from ertis_numba.air import sound_speed_m_s
@@ -14,7 +13,7 @@ from ertis_numba.settings import Processing
 from ertis_numba.storage import open_energyscapes, write_energyscapes, write_recording
 from ertis_numba.storage.schema import ENERGYSCAPE
 from tests.cases import CASES, noise as one_noise
-from tests.files import image, line, noise
+from tests.files import image, line, noise, open_dataset
 
 SOLID = direction_grid(Processing(directions="3d:60"))
 
@@ -26,11 +25,18 @@ def solid():
 # ---- xarray ------------------------------------------------------------------------------------------
 
 
+def joined_over_time(frames):
+    """Join arrays of frames as xarray users do."""
+    import xarray  # noqa: PLC0415 - it imports pandas, which few tests need
+
+    return xarray.concat([each.to_xarray() for each in frames], "time")
+
+
 def test_energyscapes_have_the_names_and_values_of_their_files(tmp_path):
     images = [image(), image(seed=2)]
     path = write_energyscapes(tmp_path / "img.h5", images)
-    joined = xarray.concat([each.to_xarray() for each in images], "time")
-    with xarray.open_dataset(path, group="/sensors/sensor", engine="h5netcdf") as data:
+    joined = joined_over_time(images)
+    with open_dataset(path, group="/sensors/sensor", engine="h5netcdf") as data:
         stored = data["amplitude"]
         assert joined.name == stored.name
         assert joined.dims == stored.dims
@@ -58,8 +64,8 @@ def test_energyscapes_share_memory_with_xarray_and_select_by_label():
 def test_measurements_have_the_names_and_values_of_their_files(tmp_path, settings):
     given = noise(settings)
     path = write_recording(tmp_path / "rec.h5", given)
-    joined = xarray.concat([each.to_xarray() for each in given], "time")
-    with xarray.open_dataset(path, group="/sensors/eRTIS-7", engine="h5netcdf") as data:
+    joined = joined_over_time(given)
+    with open_dataset(path, group="/sensors/eRTIS-7", engine="h5netcdf") as data:
         assert joined.dims == data["pdm"].dims
         assert np.array_equal(joined.values, data["pdm"].values)
         assert np.array_equal(joined["time"].values, data["time"].values)

@@ -9,7 +9,7 @@ import numpy as np
 
 from ertis_bench import machine, subject, timing
 from ertis_bench.plans import in_words, plans
-from ertis_numba import figures, kernels, verification
+from ertis_numba import kernels, verification
 from ertis_numba.analysis.detect import find_peaks
 from ertis_numba.frames import Measurement, Peak
 from ertis_numba.kernels import KernelSet
@@ -62,6 +62,8 @@ def run(*, count: int, say: Callable[[str], None], directions: str = DIRECTIONS)
 
 def plot(report: dict[str, Any], path: Path) -> None:
     """Draw error and time of all plans. Labels name the presets of the first subject."""
+    from ertis_numba import figures  # noqa: PLC0415 - Matplotlib is slow to import, and tables need no figure
+
     points = []
     for row in report["rows"]:
         label = PAPER if row["plan"] == PAPER else row["plan"].partition(":")[0] if ":" in row["plan"] else ""
