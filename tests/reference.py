@@ -11,8 +11,8 @@ import math
 
 import numpy as np
 import scipy.signal
-from ertis_bench import referee
-from ertis_bench.referee import signals_of
+from ertis_bench import reference_image
+from ertis_bench.reference_image import signals_of
 
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.geometry import array_weights, microphones
@@ -62,15 +62,15 @@ class _Same:
 @functools.lru_cache(maxsize=32)
 def _exact(words, directions, range_m, weights, array, call, recording, air, spherical, delay_rate_hz):
     words, directions, range_m = words.values, directions.values, range_m.values
-    spectra, frequency_hz = referee.calibrated_spectra(words, array, call, recording, None)
+    spectra, frequency_hz = reference_image.calibrated_spectra(words, array, call, recording, None)
     spectra = spectra * weights.values[:, None]
     positions_m, speed_m_s = microphones(array).enabled_positions_m, sound_speed_m_s(air)
     at_range = np.exp(2j * np.pi * frequency_hz * (2 * range_m / speed_m_s)[:, None])  # (range, bin)
     image = np.empty((len(directions), len(range_m)))
     for index, direction in enumerate(directions):
-        delay_s = referee.delays_s(positions_m, direction, range_m if spherical else None, speed_m_s)
+        delay_s = reference_image.delays_s(positions_m, direction, range_m if spherical else None, speed_m_s)
         if spherical:
-            image[index] = referee.amplitudes(referee.delayed(spectra, frequency_hz, at_range, delay_s))
+            image[index] = reference_image.amplitudes(reference_image.delayed(spectra, frequency_hz, at_range, delay_s))
             continue
         if delay_rate_hz:
             delay_s = np.rint(delay_s * delay_rate_hz) / delay_rate_hz
@@ -160,18 +160,20 @@ def delayed(signals, offsets, weights, n_ranges):
 
 def coherence_factor(signals, offsets, weights, n_ranges):
     """Delay-and-sum times coherent / total power: (direction, range) float64; signals must not be 0."""
-    return np.stack([referee.coherence_factor(y) for y in delayed(signals, offsets, weights, n_ranges)])
+    return np.stack([reference_image.coherence_factor(y) for y in delayed(signals, offsets, weights, n_ranges)])
 
 
 def dmas(signals, offsets, weights, order, n_ranges):
     """Sum of products over all combinations of microphones: (direction, range) float64; signals must not be 0."""
     z = delayed(signals / np.abs(signals).astype(float) ** (1 - 1 / order), offsets, weights, n_ranges)
-    return np.stack([math.comb(len(rows), order) * referee.dmas(rows, order) for rows in z])
+    return np.stack([math.comb(len(rows), order) * reference_image.dmas(rows, order) for rows in z])
 
 
 def capon(signals, offsets, weights, n_snapshots, loading, n_ranges):
     """Capon beams from the full covariance matrix: (direction, range) float64; signals must not be 0."""
-    return np.stack([referee.capon(y, n_snapshots, loading) for y in delayed(signals, offsets, weights, n_ranges)])
+    return np.stack(
+        [reference_image.capon(y, n_snapshots, loading) for y in delayed(signals, offsets, weights, n_ranges)]
+    )
 
 
 def interpolated_beams(signals, offsets, weights, places, tap_weights, rows, n_ranges):

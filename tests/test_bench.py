@@ -9,7 +9,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from ertis_bench import accuracy, checks, machine, markdown, paper, plans, scaling, simulation, subject, tables, timing
+from ertis_bench import (
+    accuracy,
+    checks,
+    input_measurements,
+    machine,
+    markdown,
+    paper,
+    plans,
+    scaling,
+    simulation,
+    tables,
+    timing,
+)
 from ertis_cli.main import cli
 
 from ertis_numba import figures, kernels
@@ -180,11 +192,11 @@ def test_file_without_markers_is_refused_before_measuring(tmp_path):
 
 
 def test_subject_is_the_shipped_recording_or_noise(monkeypatch):
-    measurement, source = subject.measurement()
+    measurement, source = input_measurements.measurement()
     assert source == "data/synthetic/reflectors.h5"
     assert measurement.data.shape == (163_840,)
-    monkeypatch.setattr(subject, "_RECORDING", Path("nowhere.h5"))
-    measurement, source = subject.measurement()
+    monkeypatch.setattr(input_measurements, "_RECORDING", Path("nowhere.h5"))
+    measurement, source = input_measurements.measurement()
     assert source == "white noise, seed 1"
     assert measurement.data.shape == (163_840,)
 
@@ -289,7 +301,7 @@ def test_accuracy_rates_every_plan_on_both_subjects(tmp_path):
 
 @pytest.mark.usefixtures("quick")
 def test_accuracy_benchmark_lists_omissions(monkeypatch):
-    monkeypatch.setattr(subject, "_DISTRIBUTION", "no-such-distribution")
+    monkeypatch.setattr(input_measurements, "_DISTRIBUTION", "no-such-distribution")
     monkeypatch.setattr(plans, "PLANS", FEW[:1])
     done = bench_accuracy()
     assert "real measurement: skipped, because its package rtisdev is not installed" in done.stderr

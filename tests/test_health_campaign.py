@@ -5,10 +5,10 @@ import json
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from ertis_bench import health as benchmark, tables
-from ertis_bench.health.campaign import false_alarms, named
-from ertis_bench.health.faults import FAULTS
-from ertis_bench.health.scenes import SCENES, base
+from ertis_bench import health_trials as benchmark, tables
+from ertis_bench.health_trials.campaign import false_alarms, named
+from ertis_bench.health_trials.faults import FAULTS
+from ertis_bench.health_trials.scenes import SCENES, base
 from ertis_cli.main import cli
 
 from ertis_numba.analysis.health.kinds import KINDS

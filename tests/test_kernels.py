@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from ertis_bench import referee
+from ertis_bench import reference_image
 
 from ertis_numba import kernels
 from ertis_numba.kernels._kernel_set import CONTRACTS
@@ -114,7 +114,7 @@ def test_unpack_bits_equals_its_reference(kernel_set, name):
     words, channels = words_of(name)
     out = filled(len(channels), len(words))
     kernel_set.unpack_bits(words, channels, out)
-    assert (out == referee.unpack_bits(words, channels)).all()
+    assert (out == reference_image.unpack_bits(words, channels)).all()
 
 
 @pytest.mark.parametrize("first", [0, 3, -5, 200, -300])
@@ -161,7 +161,7 @@ def test_demodulate_words_equals_its_three_parts(kernel_set, name, factor, first
     taps = np.rint(0.98 * np.iinfo(taps_type).max * taps_of(61).astype(float)).astype(taps_type)
     out = filled(len(channels), n_out)
     kernel_set.demodulate_words(words, channels, taps, np.float32(0.25), factor, first, n_outputs, out)
-    signals = referee.unpack_bits(words, channels)
+    signals = reference_image.unpack_bits(words, channels)
     filtered = np.stack([np.convolve(signal, taps.astype(float)) for signal in signals])
     places = (first + np.arange(n_outputs)) * factor + len(taps) // 2
     inside = (places >= 0) & (places < filtered.shape[1])

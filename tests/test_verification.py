@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from ertis_bench import referee, verification as campaign
+from ertis_bench import reference_image, verify_trials as campaign
 from ertis_bench.random_settings import Limits, random_measurement, random_settings
 from ertis_cli.main import cli
 
@@ -49,7 +49,7 @@ def measurement_of(settings, seed=1):
 
 def wanted_of(image, measurement):
     directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
-    return referee.exact(measurement.data, image.settings, directions, image.range_m)
+    return reference_image.exact(measurement.data, image.settings, directions, image.range_m)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ertis_bench import machine, subject, timing
+from ertis_bench import input_measurements, machine, timing
 from ertis_bench.plans import in_words, plans
 from ertis_numba import kernels, verification
 from ertis_numba.analysis.detect import find_peaks
@@ -83,13 +83,13 @@ def plot(report: dict[str, Any], path: Path) -> None:
 def _subjects(say: Callable[[str], None]) -> tuple[dict[str, tuple[Measurement, str]], list[str]]:
     """Return the available subjects, and the names of unavailable ones."""
     found, left_out = {}, []
-    room = subject.real()
+    room = input_measurements.real()
     if room is None:
         left_out.append("real measurement")
         say("real measurement: skipped, because its package rtisdev is not installed")
     else:
         found["real"] = room
-    found["synthetic"] = subject.measurement()
+    found["synthetic"] = input_measurements.measurement()
     return found, left_out
 
 

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ertis_bench import machine, subject
+from ertis_bench import input_measurements, machine
 from ertis_numba.errors import DeviceError
 
 __all__ = [
@@ -119,7 +119,7 @@ def run(*, results: Path, say: Callable[[str], None], measure: bool = True) -> d
         "revision": _revision(),
         "gpu": found,
         "machine": machine.describe(),
-        "source": subject.measurement()[1],
+        "source": input_measurements.measurement()[1],
         "parts": {},
     }
     results.mkdir(parents=True, exist_ok=True)

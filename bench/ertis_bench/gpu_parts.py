@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_bench import checks, rivals, subject, timing
+from ertis_bench import checks, input_measurements, rivals, timing
 from ertis_bench.gpu import REFUSED
 from ertis_bench.gpu_stages import stages
 from ertis_bench.paper import DIRECTIONS, PUBLISHED_MS, RANGE_M
@@ -74,7 +74,7 @@ class Scale:
         Names and values of further parameters of `ceilings.ceilings`.
     """
 
-    subject: Callable[[], tuple[Measurement, str]] = subject.measurement
+    subject: Callable[[], tuple[Measurement, str]] = input_measurements.measurement
     directions: tuple[str, ...] = ("90", "1850", "3000")
     range_m: tuple[float, float] = RANGE_M
     count: int = 200

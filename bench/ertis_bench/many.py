@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from ertis_bench import checks, machine, subject
+from ertis_bench import checks, input_measurements, machine
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table as _table
 from ertis_numba import cluster
@@ -91,7 +91,7 @@ def _crews(address: str) -> dict[str, dict[str, Any]]:
 def _recordings(folder: Path, count: int) -> tuple[Path, str]:
     """Write recordings of measurements derived from a simulated one. Return their folder and a description."""
     folder.mkdir()
-    first, source = subject.measurement()
+    first, source = input_measurements.measurement()
     for number in range(count):
         write_recording(folder / f"{number:03}.h5", _measurements(first, number))
     return folder, source

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ertis_bench import checks, machine, subject, timing
+from ertis_bench import checks, input_measurements, machine, timing
 from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.stages.fitting import one_thread
@@ -49,7 +49,7 @@ def run(*, count: int, say: Callable[[str], None]) -> dict[str, Any]:
     DataError
         A result is wrong and therefore not timed.
     """
-    measurement, source = subject.measurement()
+    measurement, source = input_measurements.measurement()
     with one_thread():
         rows, errors_db = _measure(measurement, count, say)
     return {

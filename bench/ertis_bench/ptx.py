@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ertis_bench import h200, subject
+from ertis_bench import h200, input_measurements
 from ertis_bench.instructions import kinds, parse
 from ertis_bench.paper import DIRECTIONS, RANGE_M
 from ertis_numba.kernels import KernelSet
@@ -65,7 +65,7 @@ def _versions() -> dict[str, str]:
 
 
 def _settings(directions: int, accuracy: dict[str, Any]) -> Settings:
-    settings = subject.measurement()[0].settings
+    settings = input_measurements.measurement()[0].settings
     processing = settings.processing.replace(directions=str(directions), range_m=RANGE_M)
     return settings.replace(processing=processing, accuracy=settings.accuracy.replace(precision="float32", **accuracy))
 
@@ -77,7 +77,7 @@ def _plan(settings: Settings) -> dict[str, Any]:
     def steps(kernels: KernelSet) -> None:
         complete = planner.complete(settings, kernels, threads=1)
         chain = FastChain(complete, kernels, threads=1)
-        words, image = subject.measurement()[0].data, chain.new_image()
+        words, image = input_measurements.measurement()[0].data, chain.new_image()
         sizes.update(
             accuracy={
                 name: getattr(complete.accuracy, name)

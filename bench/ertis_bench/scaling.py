@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ertis_bench import checks, machine, subject, timing
+from ertis_bench import checks, input_measurements, machine, timing
 from ertis_numba import kernels
 from ertis_numba.kernels._cpu import ceilings
 from ertis_numba.pipeline import Pipeline
@@ -85,7 +85,7 @@ def _measure(series: str, plan: str, count: int) -> Iterator[dict[str, Any]]:
         threads = int(value) if series == "threads" else None
         settings, n_words = _settings(plan, **{**_BASE, **({series: value} if series in _BASE else {})})
         pipeline = Pipeline(settings, "cpu", threads, predict=False)
-        measurement = subject.noise(settings, n_words=n_words)
+        measurement = input_measurements.noise(settings, n_words=n_words)
         image = pipeline.process(measurement)
         checks.require_exact(image, measurement)
         subject_of: Callable[[], object] = functools.partial(pipeline.process, measurement, out=image.amplitude)

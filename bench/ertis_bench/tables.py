@@ -7,16 +7,16 @@ from ertis_bench import timing
 from ertis_bench.accuracy import PAPER, TURN
 from ertis_bench.budgets import form as budgets
 from ertis_bench.gpu_tables import gpu, gpu_short
-from ertis_bench.health.table import health
+from ertis_bench.health_trials.table import health
 from ertis_bench.interpolation import form as interpolation
 from ertis_bench.machine import sentence
 from ertis_bench.many import many
 from ertis_bench.markdown import table as _table
 from ertis_bench.network.table import network
 from ertis_bench.paper import DIRECTIONS, PUBLISHED_MS
-from ertis_bench.points import form as points
+from ertis_bench.point_errors import form as points
 from ertis_bench.ptx_tables import ptx
-from ertis_bench.verification import form as verification
+from ertis_bench.verify_trials import form as verification
 from ertis_numba.verification import PEAKS
 
 __all__ = [

@@ -145,7 +145,7 @@ def verification(**given: Any) -> None:
 
     Settings are random; nothing is timed.
     """
-    from ertis_bench import verification as benchmark
+    from ertis_bench import verify_trials as benchmark
 
     _run("verification", benchmark, **given)
 
@@ -178,7 +178,7 @@ def points(**given: Any) -> None:
 
     Varies grids, error budgets and noise; nothing is timed.
     """
-    from ertis_bench import points as benchmark
+    from ertis_bench import point_errors as benchmark
 
     _run("points", benchmark, **given)
 
@@ -311,7 +311,7 @@ def ptx(**given: Any) -> None:
 @options.as_json
 def of_health(**given: Any) -> None:
     """Count false alarms and named faults of health checks."""
-    from ertis_bench import health as benchmark
+    from ertis_bench import health_trials as benchmark
 
     _run("health", benchmark, **given)
 

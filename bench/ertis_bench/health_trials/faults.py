@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_bench.health.scenes import Base
+from ertis_bench.health_trials.scenes import Base
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import load_layout, microphones
 from ertis_numba.settings import Array

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from ertis_bench import machine, referee
+from ertis_bench import machine, reference_image
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table
 from ertis_bench.random_settings import random_measurement
@@ -64,7 +64,7 @@ def compared(seed: int) -> dict[str, Any]:
     measurement = random_measurement(seed)
     image = _image(measurement)
     directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
-    exact = referee.exact(measurement.data, image.settings, directions, image.range_m)
+    exact = reference_image.exact(measurement.data, image.settings, directions, image.range_m)
     true_db = verification.error_db(image.amplitude, exact)
     verified_db = verification.measure(image, measurement).error_db
     return {

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from ertis_bench.health.faults import FAULTS, ArrayFault
-from ertis_bench.health.scenes import base, healthy
+from ertis_bench.health_trials.faults import FAULTS, ArrayFault
+from ertis_bench.health_trials.scenes import base, healthy
 from ertis_numba.analysis.health import Health, health
 
 __all__ = ["MIN_SHARE", "false_alarms", "named", "run"]
