@@ -156,7 +156,9 @@ class TomlDocument(TomlTable, frozen=True, kw_only=True):
     Attributes
     ----------
     former_keys : dict of str to str
-        Patterns of former keys, and present names, so that documents in older recordings stay readable.
+        Present names of keys by former names, so that documents in older recordings stay readable.
+    removed_lines : tuple of str
+        Lines of older documents that had no effect; they are ignored.
     max_bytes : int
         Limit on the length of a document in UTF-8.
     max_items : int
@@ -164,6 +166,7 @@ class TomlDocument(TomlTable, frozen=True, kw_only=True):
     """
 
     former_keys: ClassVar[dict[str, str]] = {}
+    removed_lines: ClassVar[tuple[str, ...]] = ()
     max_bytes: ClassVar[int] = 16 * 2**20
     max_items: ClassVar[int] = 2**20
 
@@ -247,6 +250,8 @@ class TomlDocument(TomlTable, frozen=True, kw_only=True):
     def _renamed(cls, text: str) -> str:
         for former, key in cls.former_keys.items():
             text = re.sub(rf"\b{former}(?=\s*=)", key, text)
+        for line in cls.removed_lines:
+            text = re.sub(rf"(?m)^[ \t]*{re.escape(line)}(?=[ \t\r]*$)", "", text)  # keeps the numbers of lines
         return text
 
     def to_toml(self) -> str:

@@ -12,19 +12,21 @@ from numpy.typing import NDArray
 
 from ertis_numba import checks, kernels
 from ertis_numba.air import sound_speed_m_s
+from ertis_numba.analysis.call_match import call_match
 from ertis_numba.errors import ArgumentError, CallMismatchWarning, DataError, DeviceError, ErrorBudgetWarning
 from ertis_numba.frames import Energyscape, Measurement, MicrophoneSignals
 from ertis_numba.geometry import Grid, microphones
+from ertis_numba.prediction import BudgetMonitor
 from ertis_numba.sample_format import sample_format
 from ertis_numba.settings import ERROR_PRESETS_DB, Array, Settings
-from ertis_numba.stages import planner
+from ertis_numba.stages import paper, paper_scipy, planner
 from ertis_numba.stages.chain import Chain
 from ertis_numba.stages.costs import PLAN_COSTS, PlanCosts
 from ertis_numba.stages.fast import FastChain
 from ertis_numba.stages.memory import require_memory
 
 if TYPE_CHECKING:
-    from ertis_numba.prediction import BudgetMonitor, Prediction
+    from ertis_numba.prediction import Prediction
 
 __all__ = ["Pipeline"]
 
@@ -355,9 +357,6 @@ class Pipeline:
         """Compare echoes with the call in the first measurements, until one has sound above the noise."""
         if self._remaining_call_checks <= 0:
             return
-        # Imported here because scipy.fft takes longer to import than the fast chain takes to start.
-        from ertis_numba.analysis.call_match import call_match  # noqa: PLC0415
-
         self._remaining_call_checks -= 1
         match = call_match(replace(measurement, settings=self.settings))
         if match is not None:
@@ -435,13 +434,10 @@ class Pipeline:
         return out
 
 
-def _budget_monitor(kernel_set: kernels.KernelSet, threads: int) -> "BudgetMonitor | None":
+def _budget_monitor(kernel_set: kernels.KernelSet, threads: int) -> BudgetMonitor | None:
     """Return a monitor of the budget; None for simulated kernels, which would take minutes for a prediction."""
     if kernel_set.simulated:
         return None
-    # Imported here because scipy.fft takes longer to import than the fast chain takes to start.
-    from ertis_numba.prediction import BudgetMonitor  # noqa: PLC0415
-
     return BudgetMonitor(kernel_set, threads)
 
 
@@ -476,9 +472,6 @@ def _same_layout(array: Array, other: Array) -> bool:
 def _chain(settings: Settings, kernel_set: kernels.KernelSet, threads: int, *, graphs: bool) -> Chain:
     if settings.processing.method == "fast":
         return FastChain(settings, kernel_set, threads=threads, graphs=graphs)
-    # Imported here because scipy.signal takes longer to import than the fast chain takes to start.
-    from ertis_numba.stages import paper, paper_scipy  # noqa: PLC0415
-
     if kernel_set.device == "numpy":
         return paper_scipy.ScipyPaperChain(settings)
     return paper.PaperChain(settings, kernel_set, threads=threads, graphs=graphs)

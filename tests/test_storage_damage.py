@@ -54,7 +54,7 @@ def test_impossible_gap_is_damage(path):
             column = file[f"{GROUP}/gap{name}"]
             column.resize((1,))
             column[0] = value
-    with pytest.raises(DamagedError, match=r"a gap of sensor eRTIS-7 is damaged .*is 2; give.*copy the file again"):
+    with pytest.raises(DamagedError, match=r"a gap of sensor eRTIS-7 is damaged .*is 2\); copy it again"):
         open_recording(path)
 
 

@@ -1,8 +1,9 @@
 """Delay-and-sum by mach, the ultrasound beamformer of Forest Neurotech, on this package's analytic signals.
 
 mach interpolates demodulated samples linearly, and restores the phase of the carrier at the delay of each point of the
-image. It computes the delays in the same kernel. For the comparison, this package uses spherical waves, eight samples
-per range and linear interpolation, too. Its delays come from tables for focal zones.
+image. It computes the delays in the same kernel. For the comparison, this package uses spherical waves and eight
+samples per range, too. It interpolates between two samples with fitted weights. Its delays come from tables for focal
+zones.
 """
 
 import functools

@@ -12,7 +12,10 @@ from ertis_cli._config import instead
 
 __all__ = ["description", "examples", "is_written", "named", "words_sha256"]
 
-_FOLDERS: Final = (("ertis_examples", ()), ("ertis_examples.synthetic", ()), ("ertis_examples.synthetic", ("scenes",)))
+_RECORDINGS: Final = "ertis_examples.synthetic"
+"""Package with the scenes and checksums of recordings."""
+
+_FOLDERS: Final = (("ertis_examples", ()), (_RECORDINGS, ()), (_RECORDINGS, ("scenes",)))
 """Packages, and folders in them, with examples."""
 
 _SUFFIXES: Final = {".toml", ".py"}
@@ -30,7 +33,7 @@ def examples() -> dict[str, Traversable]:
         folder = resources.files(package).joinpath(*parts)
         for item in folder.iterdir():
             name = PurePath(item.name)
-            if name.suffix == ".json":
+            if name.suffix == ".json" and package == _RECORDINGS:
                 found[f"{name.stem}.h5"] = folder / f"{name.stem}.toml"
             elif name.suffix in _SUFFIXES and item.name not in _TOOLS:
                 found[item.name] = item
@@ -64,7 +67,7 @@ def is_written(path: Path, item: Traversable) -> bool:
         return False
     if path.suffix != ".h5":
         return path.read_bytes() == item.read_bytes()
-    report = resources.files("ertis_examples.synthetic") / f"{path.stem}.json"
+    report = resources.files(_RECORDINGS) / f"{path.stem}.json"
     sensors = json.loads(report.read_text("utf-8"))["sensors"]
     try:
         return all(words_sha256(path, each["sensor"]) == each["words_sha256"] for each in sensors)

@@ -56,7 +56,8 @@ def _explained(sensor: str, plan: dict[str, Any]) -> Iterator[str]:
     from ertis_numba.settings import Accuracy
 
     accuracy = Accuracy(**plan["accuracy"])
-    taps = options.counted(accuracy.delay_taps or 1, "sample")
+    taps = accuracy.delay_taps or 1
+    interpolated = "one weighted sample" if taps == 1 else f"a weighted sum of {taps} samples"
     yield f"plan of {sensor} for an error budget of {accuracy.max_error_db:g} dB:"
     if plan["budget_applies_to"] == "beams":
         yield (
@@ -65,7 +66,7 @@ def _explained(sensor: str, plan: dict[str, Any]) -> Iterator[str]:
         )
     precision = "16 bits" if accuracy.precision == "int16" else "single precision"
     kept = options.counted(accuracy.oversampling or 1, "sample")
-    yield f"  {precision}, {kept} kept per range; a delayed sample is a weighted sum of {taps}"
+    yield f"  {precision}, {kept} kept per range; a delayed sample is {interpolated}"
     if accuracy.beam_taps:
         yield (
             f"  beams interpolated from {accuracy.beam_taps} beam-grid points along each axis of the array, "

@@ -1,6 +1,5 @@
 """``ertis view``: live or recorded images on a page in the browser."""
 
-import gc
 import math
 import os
 import re
@@ -177,7 +176,6 @@ def view(
                 asked = {"asked": bool(opened)}
                 threading.Thread(target=_open, args=(shown.url,), kwargs=asked, name="ertis-open", daemon=True).start()
             shown.run(duration_s=math.inf if duration is None else duration, html=html, overwrite=force)
-    gc.freeze()  # skips a garbage collection of 0.2 s at exit
     if html is not None:
         _report_recorded(location, html, shown.recorded, quiet=quiet, as_json=as_json)
 

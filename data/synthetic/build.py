@@ -2,7 +2,7 @@
 
 ``ertis simulate`` turns each ``NAME.toml`` into ``NAME.h5``. ``NAME.json`` lists the reflectors that an image of each
 sensor should show, and the SHA-256 of the sensor's samples as little-endian bytes. The samples are the same on every
-machine. A recording also names the libraries that wrote it, so its checksum in SHA256SUMS is that of the shipped file.
+machine. A recording also names the libraries that wrote it, so SHA256SUMS has the checksum of the repository's file.
 """
 
 import hashlib
@@ -23,7 +23,7 @@ def build(folder: Path) -> None:
     runner = CliRunner(env={"SOURCE_DATE_EPOCH": DATE})
     for scene in sorted(HERE.glob("*.toml")):
         target = folder / f"{scene.stem}.h5"
-        done = runner.invoke(cli, ["simulate", str(scene), "-o", str(target), "--force", "--json"])
+        done = runner.invoke(cli, ["simulate", str(scene), "-o", str(target), "--force", "--json", "--quiet"])
         if done.exit_code:
             sys.exit(done.output)
         reported = json.loads(done.stdout)

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy  # Each submodule is loaded at its first use.
+import scipy
 from numpy.typing import NDArray
 
 from ertis_numba import checks

@@ -4,7 +4,7 @@ import math
 from typing import Any, Final, Literal
 
 import numpy as np
-import scipy  # Each submodule is loaded at its first use.
+import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from ertis_numba import air, checks
@@ -218,11 +218,9 @@ def _resampled(
 
     A chirp z-transform evaluates the inverse transform at any spacing of times.
     """
-    from scipy.signal import CZT  # noqa: PLC0415  takes longer to import than all other modules here
-
     n_bins = spectra.shape[1]
     frequency_hz = np.arange(n_bins) * spacing_hz
-    transform = CZT(n_bins, n_outputs, w=np.exp(2j * math.pi * spacing_hz / rate_hz))
+    transform = scipy.signal.CZT(n_bins, n_outputs, w=np.exp(2j * math.pi * spacing_hz / rate_hz))
     analytic = np.empty((len(spectra), n_phases, n_outputs), dtype=np.complex64)
     for phase in range(n_phases):
         shift = np.exp(2j * math.pi * frequency_hz * (start_s + phase / (n_phases * rate_hz)))

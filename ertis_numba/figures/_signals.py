@@ -3,7 +3,7 @@
 import math
 
 import numpy as np
-import scipy  # Each submodule is loaded at its first use.
+import scipy
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure

@@ -13,7 +13,28 @@ _MAX_REASON_BYTES = 64
 
 @dataclass(frozen=True, slots=True)
 class SequenceGap:
-    """Missing sequence numbers of a sensor's session, ``first`` and ``last`` included, with the reason."""
+    """Missing sequence numbers of a sensor's session, with the reason.
+
+    Attributes
+    ----------
+    sensor : str
+    first, last : int
+        First and last missing number.
+    reason : str
+        Line of at most 64 bytes in UTF-8.
+    session_id : int
+
+    Raises
+    ------
+    ArgumentError
+        A number is negative or exceeds 63 bits, ``last`` comes before ``first``, or the reason is not such a line.
+
+    Examples
+    --------
+    >>> from ertis_numba.frames import SequenceGap
+    >>> SequenceGap("front", 10, 12, "the sensor was unplugged", session_id=0).n_missing
+    3
+    """
 
     sensor: str
     first: int

@@ -72,9 +72,8 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
         "stop_band_db": "stopband_attenuation_db",
         "zones": "focal_zones",
         "loading": "diagonal_loading",
-        # Earlier versions stored this line, which had no effect. A comment in its place keeps their files readable.
-        r'(?<=\n)interpolation(?=\s*=\s*"fitted")': "# interpolation",
     }
+    removed_lines: ClassVar[tuple[str, ...]] = ('interpolation = "fitted"',)
 
     def __post_init__(self) -> None:
         super().__post_init__()

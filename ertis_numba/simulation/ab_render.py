@@ -4,7 +4,7 @@ import functools
 import math
 
 import numpy as np
-import scipy  # Each submodule is loaded at its first use.
+import scipy
 from numpy.typing import NDArray
 
 from ertis_numba import kernels
@@ -163,9 +163,9 @@ def _chain(settings: Settings) -> FastChain:
     return FastChain(_planned(settings), kernel_set, threads=kernel_set.max_threads)
 
 
-@functools.lru_cache(maxsize=64)
+@functools.lru_cache(maxsize=8)  # Planning takes as long as a render, and scenes often share their sensors.
 def _planned(settings: Settings) -> Settings:
-    """Return settings with the plan of a chain. It takes as long as a render, and scenes often share their sensors."""
+    """Return settings with the plan of a chain."""
     kernel_set = kernels.load("cpu")
     single = settings.replace(
         processing=settings.processing.replace(method="fast"),

@@ -78,7 +78,9 @@ class FastChain(KernelChain):
             )
         )
         new_filter = functools.partial(MatchedFilter, settings, window, kernels, memory, taps=taps, n_mics=len(own_s))
-        self._made_plain_filter = functools.cache(lambda: new_filter(gain=lambda _: np.ones((1, 1), np.complex128)))
+        self._made_plain_filter = functools.cache(  # Only signal models need it.
+            lambda: new_filter(gain=lambda frequency_hz: np.ones((1, len(frequency_hz)), np.complex128))
+        )
         self._matched_filter = new_filter(
             gain=lambda frequency_hz: (
                 fit.gain(frequency_hz)

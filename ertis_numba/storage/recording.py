@@ -290,7 +290,8 @@ class RecordingReader(FileReader[Measurement]):
                 for (first, last, reason), session_id in zip(zip(*columns, strict=True), session_ids, strict=False)
             )
         except ArgumentError as error:
-            raise DamagedError(f"a gap of sensor {self.sensor} is damaged ({error}); copy the file again") from error
+            problem = str(error).partition(";")[0]
+            raise DamagedError(f"a gap of sensor {self.sensor} is damaged ({problem}); copy it again") from error
         self.firmware = str(to_python(self._group.attrs["firmware"]))
         self.translation_m, self.rotation_xyzw = read_mounting(self._group, self.path)
 

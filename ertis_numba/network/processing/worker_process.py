@@ -43,8 +43,9 @@ class _ImageWorker:
         self._predictions = Predictions(given.device)
 
     def run(self) -> None:
-        # In this process alone, and before it is ready: the first sensor need not wait for the imports of a pipeline.
+        # In this process alone, and before it is ready, so that the first sensor does not wait for imports.
         from ertis_numba import kernels  # noqa: PLC0415
+        from ertis_numba.fft import _scipy  # noqa: F401, PLC0415
         from ertis_numba.network.processing import chain  # noqa: F401, PLC0415
 
         try:

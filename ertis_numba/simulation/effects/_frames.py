@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-import scipy  # Each submodule is loaded at its first use.
+import scipy
 from numpy.typing import NDArray
 
 __all__ = ["FRAME", "OverlappingFrames", "band_bins", "drawn", "window"]

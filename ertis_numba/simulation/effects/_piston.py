@@ -1,7 +1,7 @@
 """Directivity of a circular piston, shared by emitters, microphones and discs."""
 
 import numpy as np
-import scipy  # Each submodule is loaded at its first use.
+import scipy
 from numpy.typing import NDArray
 
 __all__ = ["piston"]

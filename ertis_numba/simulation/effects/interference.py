@@ -5,7 +5,7 @@ from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 
 import numpy as np
-import scipy  # Each submodule is loaded at its first use.
+import scipy
 from numpy.typing import NDArray
 
 from ertis_numba.simulation.arrivals import Arrivals, gains, rounded_s

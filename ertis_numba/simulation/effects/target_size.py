@@ -4,7 +4,7 @@ import functools
 import math
 
 import numpy as np
-import scipy  # Each submodule is loaded at its first use.
+import scipy
 from numpy.typing import NDArray
 
 from ertis_numba.simulation.effects._piston import piston
