@@ -45,8 +45,9 @@ def test_help_takes_less_time_than_importing_the_libraries():
 
 
 def test_warm_process_of_one_measurement_takes_less_time_than_four_imports(recording, tmp_path):
-    command = [*ERTIS, "process", recording, "-o", tmp_path / "image.h5", "--directions", "3000", "--force"]
-    assert ratio(command, times=6, promised=3.75)[0] < 3.75
+    """One thread, because threads that wait for each other on a busy machine use processor time."""
+    command = [*ERTIS, "process", recording, "-o", tmp_path / "image.h5", "--directions", "3000", "--threads", "1"]
+    assert ratio([*command, "--force"], times=6, promised=3.75)[0] < 3.75
 
 
 def test_first_run_takes_less_time_than_30_imports_and_reports_compilation(recording, tmp_path):

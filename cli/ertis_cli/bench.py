@@ -60,7 +60,7 @@ _update = click.option(
 
 @click.group()
 def bench() -> None:
-    """Run benchmarks of speed and accuracy. Results are checked before they are timed."""
+    """Run benchmarks of speed and accuracy."""
 
 
 @bench.command()

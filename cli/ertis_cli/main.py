@@ -15,7 +15,7 @@ from ertis_cli._signals import interruption, obey_signals
 __all__ = ["COMMANDS", "cli", "main"]
 
 COMMANDS = {
-    "bench": ("ertis_cli.bench:bench", "Run benchmarks, and check each result before timing it."),
+    "bench": ("ertis_cli.bench:bench", "Run benchmarks of speed and accuracy."),
     "capture": ("ertis_cli.capture:capture", "Record measurements, or send them to a central node."),
     "compare": ("ertis_cli.compare:compare", "Compare an energyscape file with the scene's ground truth."),
     "completion": ("ertis_cli.completion:completion", "Print a script that completes commands and options in a shell."),
