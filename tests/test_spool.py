@@ -276,7 +276,7 @@ def test_killed_sensor_and_central_nodes_lose_nothing(tmp_path):
         (*key, number): message.crc32 for key, held in central.held.items() for number, (message, _) in held.items()
     }
     assert accepted.items() <= arrived.items()
-    assert len(arrived) <= len(accepted) + 6  # which were kept, and killed before they were told of
+    assert len(arrived) <= len(accepted) + 6  # kept, but killed before the report
     assert central.wrong == []
     assert not journals(tmp_path)
 

@@ -62,10 +62,26 @@ def delayed_and_summed():
     return digest(envelope)
 
 
+def combined():
+    def noise(*shape):
+        return (random.standard_normal(shape) + 1j * random.standard_normal(shape)).astype(np.complex64)
+
+    random = np.random.default_rng(2)
+    signals, weights = noise(32, 2, 400), noise(20, 32)
+    offsets = (np.arange(32) * 800 + random.integers(0, 100, (20, 32))).astype(np.int32)
+    outs = np.empty((3, 20, 300), np.float32)
+    cpu.combine_coherence(signals, offsets, weights, outs[0])
+    cpu.combine_dmas(signals, offsets, weights, 2, outs[1])
+    cpu.combine_capon(signals, offsets, weights, 3, 0.1, outs[2])
+    return digest(outs)
+
+
 found, counts = {}, range(1, cpu.max_threads + 1)
 for name in sys.argv[1:]:
     if name == "delay_and_sum":
         found[name] = delayed_and_summed()
+    elif name == "combined":
+        found[name] = combined()
     elif name in {"cpu", "numpy"}:
         found[name] = [modulated(name, threads) for threads in (counts if name == "cpu" else (1,))]
     elif name != "int16" or cpu.tile_ranges:
@@ -86,13 +102,13 @@ def digests(*names, **environment):
 @pytest.fixture(scope="module")
 def usual():
     """Digests of all results on this processor."""
-    return digests("float32", "int16", "cpu", "numpy", "delay_and_sum")
+    return digests("float32", "int16", "cpu", "numpy", "delay_and_sum", "combined")
 
 
 @pytest.fixture(scope="module")
 def workqueue(usual):  # noqa: ARG001 - its process has filled the cache, so that this one compiles nothing
     """Digests with the threading layer that Numba falls back to without OpenMP and TBB."""
-    return digests("float32", "delay_and_sum", NUMBA_THREADING_LAYER="workqueue")
+    return digests("float32", "delay_and_sum", "combined", NUMBA_THREADING_LAYER="workqueue")
 
 
 @pytest.fixture(scope="module")
@@ -128,11 +144,11 @@ def test_workqueue_threading_layer_gives_the_same_bits(usual, workqueue):
 def test_compiled_and_cached_kernels_give_the_same_bits(workqueue, tmp_path):
     """Numba optimises a cached kernel once more, which could change the order of sums.
 
-    This kernel multiplies and adds in a function that it calls. The first run of a command compiles those that do so
-    in their own loops, see tests/test_figures_to_reach.py.
+    The first run of a command compiles the kernels of the default chain, see tests/test_figures_to_reach.py.
     """
-    compiled = digests("delay_and_sum", NUMBA_CACHE_DIR=str(tmp_path))
-    assert compiled["delay_and_sum"] == workqueue["delay_and_sum"]
+    compiled = digests("delay_and_sum", "combined", NUMBA_CACHE_DIR=str(tmp_path))
+    for name in ("delay_and_sum", "combined"):
+        assert compiled[name] == workqueue[name]
 
 
 def test_numba_limits_are_reported_in_one_line():
