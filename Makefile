@@ -10,7 +10,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 KERNELS := tests/test_kernels.py tests/test_interpolated_beams.py tests/test_beamformers.py tests/test_modulator.py
 ELSEWHERE := --ignore=tests/cuda --ignore=tests/ptx
 
-.PHONY: demo test test-kernels test-host test-simulator test-ptx check docs data pictures bench soak gpu clean
+.PHONY: demo test test-kernels test-host test-simulator test-ptx check docs data pictures bench peers soak gpu clean
 
 $(VENV)/ready: setup.cfg pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -72,6 +72,10 @@ bench: $(VENV)/ready  ## run the benchmarks and update the tables in the documen
 	$(BIN)/ertis bench simulation --update docs/reference/benchmarks.md
 	$(BIN)/ertis bench many --update docs/how-to/many.md
 	$(BIN)/ertis bench network --update docs/explanation/network-guarantees.md
+
+peers: $(VENV)/ready  ## compare with Acoular, PyTorch and JAX; on Linux, PyTorch from PyPI brings CUDA libraries
+	$(BIN)/python -m pip install --quiet --editable '.[peers]'
+	$(BIN)/ertis bench peers --update docs/reference/benchmarks.md
 
 soak: $(VENV)/ready-to-test  ## test faults, kills, full disks and random scenes for hours; SEED=N repeats a run
 	$(BIN)/python -m tests.faults reliability --long $(if $(SEED),--seed $(SEED)) --update docs/explanation/reliability.md

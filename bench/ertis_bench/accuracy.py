@@ -18,11 +18,11 @@ from ertis_numba.settings import ERROR_PRESETS_DB, Settings
 from ertis_numba.stages.planner import Planner
 from ertis_numba.stages.signal_model import signal_model_of
 
-__all__ = ["DIRECTIONS", "PAPER", "TURN", "beats", "plot", "run"]
+__all__ = ["DIRECTIONS", "PAPER", "RANGE_M", "TURN", "beats", "comparable", "plot", "run"]
 
 DIRECTIONS = "3000"
 PAPER = "the paper's method"
-_RANGE_M = (0.5, 5.0)
+RANGE_M = (0.5, 5.0)
 TURN = 5
 """Consecutive calls per plan. The number is small because a turn of all plans takes seconds, and the speed of a machine
 drifts meanwhile.
@@ -45,7 +45,7 @@ def run(*, count: int, say: Callable[[str], None], directions: str = DIRECTIONS)
     found, left_out = _subjects(say)
     rows, sources = [], []
     for name, (measurement, source) in found.items():
-        settings = _settings(measurement.settings, directions)
+        settings = comparable(measurement.settings, directions)
         scene = _Subject(name, measurement, settings, kernel_set, say)
         sources.append({"subject": name, "source": source})
         rows += scene.rows(count)
@@ -54,7 +54,7 @@ def run(*, count: int, say: Callable[[str], None], directions: str = DIRECTIONS)
         "rows": rows,
         "count": count,
         "directions": directions,
-        "range_m": list(_RANGE_M),
+        "range_m": list(RANGE_M),
         "subjects": sources,
         "left_out": left_out,
     }
@@ -93,9 +93,9 @@ def _subjects(say: Callable[[str], None]) -> tuple[dict[str, tuple[Measurement, 
     return found, left_out
 
 
-def _settings(settings: Settings, directions: str) -> Settings:
+def comparable(settings: Settings, directions: str) -> Settings:
     """Return settings with the range axis of the paper's method, so that all images have the same axis."""
-    processing = settings.processing.replace(directions=directions, range_m=_RANGE_M, wavefront="plane")
+    processing = settings.processing.replace(directions=directions, range_m=RANGE_M, wavefront="plane")
     range_m = Pipeline(settings.replace(processing=processing.replace(method="paper"))).range_m
     half_m = float(range_m[1] - range_m[0]) / 2
     window_m = (float(range_m[0]), float(range_m[-1]) + half_m)

@@ -9,7 +9,7 @@ from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.geometry import unit_vectors
 from ertis_numba.verification import ExactImage
 
-__all__ = ["MAX_ERROR_DB", "require_exact", "require_same_reflector"]
+__all__ = ["MAX_ERROR_DB", "require_error", "require_exact", "require_same_reflector"]
 
 MAX_ERROR_DB = -30.0
 _N_DIRECTIONS = 5  # compared with the exact image, spread over the grid
@@ -32,10 +32,21 @@ def require_exact(image: Energyscape, measurement: Measurement, *, max_error_db:
     expected = np.stack([exact.amplitudes(direction, ranges) for direction in chosen.tolist()])
     difference = np.linalg.norm(image.amplitude[chosen] - expected)
     error_db = 20 * math.log10(float(difference / np.linalg.norm(expected)))
+    return require_error(error_db, f"image of {len(image.amplitude)} directions", max_error_db=max_error_db)
+
+
+def require_error(error_db: float, name: str, *, max_error_db: float = MAX_ERROR_DB) -> float:
+    """Return the error of a named image in dB, relative to the exact image.
+
+    Raises
+    ------
+    DataError
+        The error exceeds ``max_error_db``.
+    """
     if not error_db <= max_error_db:
         raise DataError(
-            f"image of {len(image.amplitude)} directions has an error of {error_db:.1f} dB relative to the exact "
-            f"image; the limit is {max_error_db:g} dB. Its time is not reported, because the result is wrong"
+            f"{name} has an error of {error_db:.1f} dB relative to the exact image; the limit is {max_error_db:g} dB. "
+            "Its time is not reported, because the result is wrong"
         )
     return error_db
 

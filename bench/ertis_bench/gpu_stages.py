@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_bench.plans import BEAMFORMING_KERNELS
 from ertis_numba import kernels
 from ertis_numba.kernels import KernelSet, Lane, Memory
 from ertis_numba.kernels._cuda.ceilings import occupy
@@ -27,13 +28,6 @@ STAGES = (
     "inverse transforms",
     "delay-and-sum with envelope",
     "download",
-)
-_BEAMFORM = (
-    "quantise_tiles",
-    "delay_and_sum_envelope",
-    "interpolated_beams_envelope",
-    "delay_and_sum_envelope_int16",
-    "interpolated_beams_envelope_int16",
 )
 
 
@@ -106,9 +100,9 @@ class _LaunchStopwatch(Stopwatch):
 
 def _watched(kernel_set: KernelSet, watch: _LaunchStopwatch) -> KernelSet:
     """Return kernels that set marks at the end of each stage."""
-    before = {"multiply_and_fold": "forward transforms", **dict.fromkeys(_BEAMFORM, "inverse transforms")}
+    before = {"multiply_and_fold": "forward transforms", **dict.fromkeys(BEAMFORMING_KERNELS, "inverse transforms")}
     after = {"demodulate_words": "demodulate", "multiply_and_fold": "multiply and fold"}
-    after |= dict.fromkeys(_BEAMFORM, "delay-and-sum with envelope")
+    after |= dict.fromkeys(BEAMFORMING_KERNELS, "delay-and-sum with envelope")
     changes: dict[str, Any] = {
         name: functools.partial(_run, getattr(kernel_set, name), watch, before.get(name), end)
         for name, end in after.items()

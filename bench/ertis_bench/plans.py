@@ -3,7 +3,16 @@
 from ertis_numba.kernels import KernelSet
 from ertis_numba.settings import Accuracy
 
-__all__ = ["PLANS", "in_words", "plans"]
+__all__ = ["BEAMFORMING_KERNELS", "PLANS", "in_words", "plans"]
+
+BEAMFORMING_KERNELS = (
+    "quantise_tiles",
+    "delay_and_sum_envelope",
+    "interpolated_beams_envelope",
+    "delay_and_sum_envelope_int16",
+    "interpolated_beams_envelope_int16",
+)
+"""Kernels from analytic signals to an image, of all plans for delay-and-sum."""
 
 PLANS: tuple[tuple[str, int, int, float, tuple[int, float] | None], ...] = (
     ("float32", 1, 8, 40.0, None),

@@ -14,6 +14,7 @@ from ertis_bench.many import many
 from ertis_bench.markdown import table as _table
 from ertis_bench.network.table import network
 from ertis_bench.paper import DIRECTIONS, PUBLISHED_MS
+from ertis_bench.peers.table import peers
 from ertis_bench.point_errors import form as points
 from ertis_bench.ptx_tables import ptx
 from ertis_bench.verify_trials import form as verification
@@ -30,6 +31,7 @@ __all__ = [
     "many",
     "network",
     "paper",
+    "peers",
     "points",
     "ptx",
     "scaling",
@@ -275,6 +277,7 @@ def _or_dash(value: float | None, digits: int) -> str:
 
 FORMS: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
     "paper": {"paper": paper},
+    "peers": {"peers": peers},
     "scaling": {"scaling": scaling},
     "simulation": {"simulation": simulation},
     "many": {"many": many},

@@ -76,6 +76,21 @@ def paper(**given: Any) -> None:
 
 
 @bench.command()
+@_count(5)
+@_update
+@options.quiet
+@options.as_json
+def peers(**given: Any) -> None:
+    """Compare with NumPy, Acoular, PyTorch and JAX.
+
+    Libraries that are not installed are left out: pip install 'ertis-numba[peers]'.
+    """
+    from ertis_bench import peers as benchmark
+
+    _run("peers", benchmark, **given)
+
+
+@bench.command()
 @_count(20)
 @click.option(
     "--directions", metavar="GRID", default="3000", show_default=True, help="Directions, as in 'ertis process'."

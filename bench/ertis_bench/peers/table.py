@@ -1,0 +1,91 @@
+"""Table of the comparison with other libraries."""
+
+from typing import Any
+
+from ertis_bench import accuracy
+from ertis_bench.machine import sentence
+from ertis_bench.markdown import table
+from ertis_bench.peers.comparison import OURS, PAPER
+from ertis_bench.peers.problem import N_PHASES
+
+__all__ = ["peers"]
+
+_NOT_INSTALLED = "not installed (`pip install 'ertis-numba[peers]'`)"
+
+Rows = dict[tuple[str, int], dict[str, Any]]
+
+
+def peers(report: dict[str, Any]) -> str:
+    """Return times, errors, the results in which another implementation is better, and the conditions."""
+    rows: Rows = {(row["name"], row["directions"]): row for row in report["rows"]}
+    directions = list(dict.fromkeys(row["directions"] for row in report["rows"]))
+    versions, last = report["versions"], directions[-1]
+    times, others = [], []
+    for name, version in versions.items():
+        if version is None:
+            times.append([name, _NOT_INSTALLED, *[""] * (len(directions) - 1)])
+            continue
+        mine = [rows[name, n] for n in directions]
+        times.append([f"{name} ({version})", *(_time(row, rows[OURS, row["directions"]]) for row in mine)])
+        errors = [f"{row['error_db']:.1f}" for row in mine]
+        points = mine[-1]["points_per_s"]
+        rate = "–" if points is None else f"{points / 1e6:.1f}"
+        others.append([name, f"{mine[-1]['threads']}", *errors, f"{mine[-1]['first_s']:.2f}", rate])
+    columns = [f"{n} directions" for n in directions]
+    return "\n\n".join(
+        [
+            table(["ms, median (time / time of this package)", *columns], times),
+            table(
+                ["", "threads", *(f"error, dB, {text}" for text in columns), "first image, s", "million points/s"],
+                others,
+            ),
+            _better(rows, directions),
+            f"Measured on {sentence(report['machine'])}",
+            _conditions(report, last),
+        ]
+    )
+
+
+def _time(row: dict[str, Any], ours: dict[str, Any]) -> str:
+    ratio = row["median_ms"] / ours["median_ms"]
+    return f"{row['median_ms']:.2f}" if row is ours else f"{row['median_ms']:.2f} ({ratio:.1f}×)"
+
+
+def _better(rows: Rows, directions: list[int]) -> str:
+    """Return a sentence about all results of other implementations that are better than those of this package."""
+    last = directions[-1]
+    measures = [(f"time of {n} directions", "median_ms", n) for n in directions]
+    measures += [(f"error of {n} directions", "error_db", n) for n in directions]
+    measures += [("first image", "first_s", last), ("delay-and-sum alone", "points_per_s", last)]
+    found = []
+    for text, key, n in measures:
+        ours = rows[OURS, n][key]
+        sign = -1 if key == "points_per_s" else 1
+        values = {name: row[key] for (name, of), row in rows.items() if of == n and row[key] is not None}
+        names = [name for name, value in values.items() if sign * value < sign * ours]
+        if names:
+            found.append(f"{text}: {', '.join(names)}")
+    if not found:
+        return "No other implementation has a better result in any column."
+    return f"Better results than those of this package: {'; '.join(found)}."
+
+
+def _conditions(report: dict[str, Any], last: int) -> str:
+    first_m, last_m = report["range_m"]
+    return (
+        f"The same measurement was processed {report['count']} times in one process, in turns of {accuracy.TURN} per "
+        f"implementation: {report['words']:,} words of 32 microphones ({report['source']}) to an energyscape of "
+        f"{first_m:g}–{last_m:g} m. Times include everything from the words in memory to the image in memory. They "
+        "exclude reading the file, imports, tables, compilation, and warm-up calls of a fifth of a second (at least "
+        f"three) before each turn. The first image, of {last} directions, includes tables and compilation. Numba's "
+        "kernels, of this package and of Acoular, have been loaded before. Errors are relative to the exact image "
+        "(float64, fractional delays), in all directions and ranges, and were checked before the times, as was the "
+        f"place of the strongest reflector. Points per second: directions × ranges of {last} directions by "
+        "delay-and-sum with envelope alone, from each implementation's signals after its matched filter. "
+        f"{PAPER}, processes the whole record, with delays of whole samples. NumPy, PyTorch and JAX process the same "
+        f"part of the record as this package, in float32, with {N_PHASES} samples per range, delays of whole samples, "
+        "and the phase of the carrier corrected. It is the smallest number of samples within -35 dB, the default "
+        "budget of this package. Acoular's `BeamformerTime` interpolates the same samples linearly, in float64, behind "
+        "the front end in NumPy. JAX compiles with `jit`. PyTorch runs without `torch.compile`, which needs a C++ "
+        "compiler. This package runs its default plan. GPUs and batches are left out."
+    )
