@@ -234,7 +234,7 @@ def test_published_times_have_one_entry_per_configuration():
     assert all(len(times) == len(paper.DIRECTIONS) for times in paper.PUBLISHED_MS.values())
 
 
-@pytest.mark.parametrize("name", ["paper", "accuracy", "scaling"])
+@pytest.mark.parametrize("name", ["paper", "peers", "accuracy", "scaling"])
 def test_generated_readme_has_all_tables(name):
     text = path_of("benchmarks").read_text("utf-8")
     table = text.partition(f"<!-- ertis bench {name} -->")[2].partition(f"<!-- /ertis bench {name} -->")[0]

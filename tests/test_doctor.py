@@ -121,7 +121,8 @@ def test_doctor_checks_all_extras(doctor):
     brought = {
         extra: {re.split(r"[\[<>=]", line)[0] for line in lines.split("\n") if line}
         for extra, lines in parser["options.extras_require"].items()
-        if extra not in {"cu12", "cu13", "test", "docs", "check", "peers"}  # GPUs have their own check; others are not for users
+        if extra
+        not in {"cu12", "cu13", "test", "docs", "check", "peers"}  # GPUs have their own check; others are not for users
     }
     packages = packages_distributions()
     looked_at = {

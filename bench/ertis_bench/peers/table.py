@@ -8,7 +8,7 @@ from ertis_bench.markdown import table
 from ertis_bench.peers.comparison import OURS, PAPER
 from ertis_bench.peers.problem import N_PHASES
 
-__all__ = ["peers"]
+__all__ = ["better", "peers"]
 
 _NOT_INSTALLED = "not installed (`pip install 'ertis-numba[peers]'`)"
 
@@ -39,7 +39,7 @@ def peers(report: dict[str, Any]) -> str:
                 ["", "threads", *(f"error, dB, {text}" for text in columns), "first image, s", "million points/s"],
                 others,
             ),
-            _better(rows, directions),
+            better(rows, directions),
             f"Measured on {sentence(report['machine'])}",
             _conditions(report, last),
         ]
@@ -51,7 +51,7 @@ def _time(row: dict[str, Any], ours: dict[str, Any]) -> str:
     return f"{row['median_ms']:.2f}" if row is ours else f"{row['median_ms']:.2f} ({ratio:.1f}×)"
 
 
-def _better(rows: Rows, directions: list[int]) -> str:
+def better(rows: Rows, directions: list[int]) -> str:
     """Return a sentence about all results of other implementations that are better than those of this package."""
     last = directions[-1]
     measures = [(f"time of {n} directions", "median_ms", n) for n in directions]
@@ -84,7 +84,7 @@ def _conditions(report: dict[str, Any], last: int) -> str:
         "delay-and-sum with envelope alone, from each implementation's signals after its matched filter. "
         f"{PAPER}, processes the whole record, with delays of whole samples. NumPy, PyTorch and JAX process the same "
         f"part of the record as this package, in float32, with {N_PHASES} samples per range, delays of whole samples, "
-        "and the phase of the carrier corrected. It is the smallest number of samples within -35 dB, the default "
+        "and the phase of the carrier corrected. This is the smallest number that keeps -35 dB, the default "
         "budget of this package. Acoular's `BeamformerTime` interpolates the same samples linearly, in float64, behind "
         "the front end in NumPy. JAX compiles with `jit`. PyTorch runs without `torch.compile`, which needs a C++ "
         "compiler. This package runs its default plan. GPUs and batches are left out."
