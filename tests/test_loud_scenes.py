@@ -111,9 +111,9 @@ def test_ab_render_measures_change_despite_a_sensor_without_image():
     beyond = Processing(directions="2d:31", range_m=(5.0, 6.0))
     blind = sensor.replace(name="blind", position_m=(0.0, 5.0, 0.0), processing=beyond)
     active = frozenset({"propagation", "modulation"})
-    changed_db = ABRender(scene.replace(sensors=(blind, sensor))).change_db(0, active, "spreading")
-    assert changed_db == pytest.approx(ABRender(scene).change_db(0, active, "spreading"))
-    assert ABRender(scene.replace(sensors=(blind,))).change_db(0, active, "spreading") is None
+    changed_db = ABRender(scene.replace(sensors=(blind, sensor))).change_db(0, sensor.name, active, "spreading")
+    assert changed_db == pytest.approx(ABRender(scene).change_db(0, sensor.name, active, "spreading"))
+    assert ABRender(scene.replace(sensors=(blind,))).change_db(0, blind.name, active, "spreading") is None
 
 
 def test_effect_at_half_of_the_tolerance_is_kept_in_moving_scenes(monkeypatch):

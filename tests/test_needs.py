@@ -77,7 +77,7 @@ def test_verdicts_hold_for_pdm_images():
         pipeline = Pipeline(sensor.settings(), predict=False)
         bits = pipeline.process(Simulator(loud, plan=plan).render()).amplitude.astype(float)
         shown = Sight(snapshot(loud, sensor, 0.0), plan.active)
-        sure = shown.shown & (shown.levels(shown.heard) > 300 * shown.noise)
+        sure = shown.shown & (shown.heard.level > 300 * shown.noise)
         echo_ranges_m = shown.heard.delay_s[sure] * shown.shot.speed_m_s / 2
         for name in {verdict.name for verdict in plan.verdicts if not verdict.on and verdict.estimate_db is not None}:
             turned = pipeline.process(Simulator(loud, plan=with_one(plan, name, on=True)).render()).amplitude

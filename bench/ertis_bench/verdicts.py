@@ -137,7 +137,7 @@ class Trial:
         """
         pipeline = Pipeline(sensor.settings(), predict=False)
         shown = Sight(self._shot(sensor), one.active)
-        sure = shown.shown & (shown.levels(shown.heard) > _MIN_LEVEL_TO_NOISE * shown.noise)
+        sure = shown.shown & (shown.heard.level > _MIN_LEVEL_TO_NOISE * shown.noise)
         ranges_m = shown.heard.delay_s[sure] * shown.shot.speed_m_s / 2
 
         def levels_db(seed: int, plan: EffectPlan) -> NDArray[np.float64]:

@@ -49,39 +49,39 @@ class ABRender:
         # All renderings share one noise, because drawing it takes as long as the rest of a rendering.
         self._noise = functools.lru_cache(maxsize=1)(_noise)
 
-    def change_db(self, index: int, others: frozenset[str], name: str) -> float | None:
-        """Return the greatest change of any sensor's image by an effect, in decibels.
+    def change_db(self, index: int, name: str, others: frozenset[str], effect: str) -> float | None:
+        """Return the greatest change of a sensor's image by an effect, in decibels.
 
-        Sensors whose settings yield no image, such as a range window beyond the end of their records, are left out.
-        The result is None if no sensor yields an image.
+        The result is None if the sensor's settings yield no image, for example because its range window is beyond the
+        end of its records.
 
         Parameters
         ----------
         index : int
             Index of the measurement.
+        name : str
+            Name of the sensor.
         others : frozenset of str
             The other effects that are simulated.
-        name : str
+        effect : str
             The effect to test.
         """
-        changes_db = []
-        for sensor in self._scene.sensors:
-            both = others, others | {name}
-            try:
-                self._chain(sensor.settings())
-            except ArgumentError:
-                continue
-            shot = snapshot(self._scene, sensor, index / self._scene.rate_hz)
-            spacing_m = shot.speed_m_s / 2 / sensor.settings().output_rate_hz
-            floor = min(Sight(shot, active).floor for active in both)
-            (before, one), (after, other) = (self._image(sensor.name, index, active) for active in both)
-            changes_db.append(image_change_db(before, after, spacing_m=spacing_m, floor=floor))
-            if max(one, other) >= LOUD:
-                pairs = [self._images(sensor.name, index, active) for active in both]
-                noise = np.min([_local(np.abs(pair[1] - pair[0]), spacing_m) for pair in pairs], axis=0)
-                change_db = image_change_db(pairs[0][0], pairs[1][0], spacing_m=spacing_m, floor=floor, noise=noise)
-                changes_db.append(change_db)
-        return max(changes_db, default=None)
+        sensor, both = self._scene.sensor(name), (others, others | {effect})
+        try:
+            self._chain(sensor.settings())
+        except ArgumentError:
+            return None
+        shot = snapshot(self._scene, sensor, index / self._scene.rate_hz)
+        spacing_m = shot.speed_m_s / 2 / sensor.settings().output_rate_hz
+        floor = min(Sight(shot, active).floor for active in both)
+        (before, one), (after, other) = (self._image(name, index, active) for active in both)
+        change_db = image_change_db(before, after, spacing_m=spacing_m, floor=floor)
+        if max(one, other) < LOUD:
+            return change_db
+        pairs = [self._images(name, index, active) for active in both]
+        noise = np.min([_local(np.abs(pair[1] - pair[0]), spacing_m) for pair in pairs], axis=0)
+        converted_db = image_change_db(pairs[0][0], pairs[1][0], spacing_m=spacing_m, floor=floor, noise=noise)
+        return max(change_db, converted_db)
 
     def _rendered(self, name: str, index: int, active: frozenset[str]) -> NDArray[np.float64]:
         """Return the input of the modulators or converters, including noise: (mic, sample) float64."""

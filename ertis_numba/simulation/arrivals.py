@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.settings import Call
-from ertis_numba.simulation.bounds import require_few_amplitudes, require_few_paths
+from ertis_numba.simulation.bounds import require_few_amplitudes
 from ertis_numba.simulation.effects import acting
 from ertis_numba.simulation.mirrors import Views, images
-from ertis_numba.simulation.paths import Paths, by_targets, without_target
+from ertis_numba.simulation.paths import Paths, by_targets, pairs, without_target
 from ertis_numba.simulation.sensors import Emitter
-from ertis_numba.simulation.snapshot import Snapshot, TransmitterPose
+from ertis_numba.simulation.snapshot import Snapshot, Transmitters
 from ertis_numba.simulation.stopwatch import CostStopwatch
 
 __all__ = [
@@ -34,6 +34,7 @@ __all__ = [
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 _TICK_S = 1e-12
+_AT_ONCE = 2**15  # paths × microphones whose filters are computed at a time
 _LONGEST_STRETCH = 2.0  # of a call; speeds are limited to a third of the speed of sound
 
 
@@ -130,7 +131,7 @@ def emitters(shot: Snapshot, active: AbstractSet[str]) -> list[int]:
     return others if shot.sensor.emitter.silent else [shot.number, *others]
 
 
-def transmitter_of(shot: Snapshot, active: AbstractSet[str], number: int) -> TransmitterPose:
+def transmitter_of(shot: Snapshot, active: AbstractSet[str], number: int) -> Transmitters:
     """Return the emitter of a sensor, at the sensor's origin or at its offset."""
     pose = shot.transmitters[number]
     for _, act in acting("transmitter", active):
@@ -161,11 +162,11 @@ def echoes(
     ArgumentError
         There are too many paths or amplitudes.
     """
-    transmitter = transmitter_of(shot, active, number)
+    transmitter, centre_m = transmitter_of(shot, active, number), shot.receiver.centre_m
     views: Views = (
-        tuple(images(transmitter, shot.targets.positions_m, (), 0)),
-        tuple(images(shot.receiver, shot.targets.positions_m, (), 0)),
-        tuple(images(transmitter, shot.receiver.centre_m[None], (), 0)),
+        images(transmitter, shot.targets.positions_m, shot.mirrors, 0),
+        images(shot.receiver, shot.targets.positions_m, shot.mirrors, 0),
+        images(transmitter, centre_m, shot.mirrors, 0),
     )
     for name, act in acting("views", active):
         with clock(name):
@@ -174,21 +175,18 @@ def echoes(
     over = by_targets
     for _, act in acting("turns", active):
         over = act
-    found, n_paths = [], 0
-    for first in firsts:
-        for second in seconds:
-            chosen = np.flatnonzero(first.exists & second.exists)
-            if len(chosen) and len(first.mirrors) + len(second.mirrors) <= shot.scene.max_reflections:
-                n_paths += len(chosen)
-                require_few_paths(n_paths)
-                require_few_amplitudes(n_paths, len(shot.channels), n_frequencies)
-                found.append(over(first, second, shot.targets, chosen))
-    here = np.arange(1)
-    return found + [
-        without_target(seen.end, shot.receiver, shot.targets, seen.to_corners_m(here))
-        for seen in specular
-        if seen.exists[0] and (seen.mirrors or number != shot.number)
+    one, other = pairs(firsts, seconds, shot.scene.max_reflections)
+    require_few_amplitudes(len(one), len(shot.channels), n_frequencies)
+    step = max(1, _AT_ONCE // shot.receiver.positions_m.shape[1])
+    found = [
+        over(firsts.chosen(one[first : first + step]), seconds.chosen(other[first : first + step]), shot.targets)
+        for first in range(0, len(one), step)
     ]
+    # The call of the sensor itself does not arrive directly.
+    specular = specular.chosen((specular.n_mirrors > 0) | (number != shot.number))
+    if len(specular):
+        found.append(without_target(specular.images, shot.receiver, shot.targets, specular.to_corners_m()))
+    return found
 
 
 def responses(
@@ -204,7 +202,7 @@ def responses(
     The type is float64, or complex128 if a target shifts the phase. `emitted` returns the transducer's own response.
     """
     strength = _strength(paths, spreads="spreading" in active)
-    amplitude = paths.reflection * strength[:, None, None] * np.ones((*paths.second_m.shape, 1))
+    amplitude = (paths.reflection * strength)[:, None, None] * np.ones((*paths.second_m.shape, 1))
     for name, act in acting("gain", active):
         with clock(name):
             amplitude = amplitude * act(shot, paths, emitter, frequency_hz)
@@ -250,7 +248,7 @@ def _strength(paths: Paths, *, spreads: bool) -> Floats:
     """
     targets = paths.targets
     if not len(targets):
-        return np.ones(1)
+        return np.ones(len(paths))
     as_point = (targets.radius_m > 0) & (not (paths.surface and spreads))
     return np.asarray(targets.strength * np.where(as_point, targets.radius_m / 2, 1.0))
 

@@ -12,15 +12,15 @@ __all__ = [
 ]
 
 MAX_PATHS = 20_000
-"""Limit on the sound paths to one sensor in one measurement. The time of estimates grows with its square."""
+"""Limit on the sound paths to one sensor in one measurement."""
 MAX_MIRROR_POINTS = 2**21
-"""Limit on chains of walls × mirrored targets: 300 MB with four reflections."""
+"""Limit on chains of walls × mirrored targets, which bounds the time to trace them."""
 MAX_AMPLITUDES = 2**26
 """Limit on paths × microphones × frequencies: about 2 GB during computation."""
 
 
 def require_few_mirrors(n_walls: int, order: int, n_places: int) -> None:
-    """Raise an error if the mirror images of a scene would need too much memory.
+    """Raise an error if the mirror images of a scene would take too long.
 
     Raises
     ------

@@ -6,7 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.simulation.sight import Echoes, Sight, change_db
+from ertis_numba.simulation.echoes import Echoes
+from ertis_numba.simulation.sight import Sight
+from ertis_numba.simulation.surroundings import change_db, greatest
 
 __all__ = ["Estimate", "filtered", "ghosts", "noise", "unequal"]
 
@@ -36,14 +38,14 @@ def ghosts(sight: Sight, seen: Echoes, new: NDArray[np.bool_], wording: str) -> 
     """Return the change of the image by new echoes."""
     if not new.any():
         return Estimate(change_db=0.0, reason="no such sound arrives")
-    level, beside = sight.levels(seen) * sight.reach(seen.delay_s) * new, sight.beside(seen.delay_s)
-    worst = int(np.argmax(level / beside))
+    level, around = seen.level * sight.reach(seen.delay_s) * new, sight.surroundings()
+    worst, ratio = greatest(level / around.floor, lambda part: level[part] / around.at(seen.delay_s[part]))
     return Estimate(
-        change_db=change_db(level, beside),
+        change_db=20 * math.log10(1 + ratio),
         reason=wording.format(
             name=seen.names[worst],
             range=seen.delay_s[worst] * sight.shot.speed_m_s / 2,
-            level=20 * math.log10(max(level[worst] / beside[worst], 1e-15)),
+            level=20 * math.log10(max(ratio, 1e-15)),
         ),
     )
 
@@ -59,10 +61,9 @@ def filtered(sight: Sight, after: Echoes | str, wording: str) -> Estimate:
     reach = sight.reach(own.delay_s)
     if name is not None:  # with ringing, an echo may reach into the window that did not before
         reach = np.maximum(reach, Sight.of(sight.shot, sight.active | {name}).reach(own.delay_s))
-    ratio = sight.envelope_change(own, after) * reach / sight.beside(own.delay_s, after)
-    worst = int(np.argmax(ratio))
-    found = 20 * math.log10(1 + ratio[worst])
-    if not ratio[worst]:
+    worst, ratio = sight.most_changed(own, after, sight.surroundings(after), reach)
+    found = 20 * math.log10(1 + ratio)
+    if not ratio:
         return Estimate(change_db=0.0, reason="no echo in the range window changes")
     return Estimate(change_db=found, reason=wording.format(name=own.names[worst], change=found))
 

@@ -24,7 +24,7 @@ def notes(shot: Snapshot) -> list[str]:
 def _near_targets(shot: Snapshot) -> list[str]:
     """Return a note for each target or source so close to an emitter or a microphone that its amplitude is limited."""
     scene, sensor = shot.scene, shot.sensor
-    ends_m = np.concatenate([shot.receiver.positions_m, _emitter_m(shot, shot.number)[None]])
+    ends_m = np.concatenate([shot.receiver.positions_m[0], _emitter_m(shot, shot.number)[None]])
     targets = shot.targets
     things = list(zip(targets.names, targets.positions_m, strict=True))
     for kind in ("tones", "noises", "sonars"):
@@ -72,7 +72,7 @@ def require_clear(shot: Snapshot) -> None:
     places = {f"emitter of {other.name}": place for other, place in _emitters(shot)}
     places |= {
         f"microphone {channel} of {shot.sensor.name}": place
-        for channel, place in zip(shot.channels, shot.receiver.positions_m, strict=True)
+        for channel, place in zip(shot.channels, shot.receiver.positions_m[0], strict=True)
     }
     apart_m = np.linalg.norm(targets.positions_m[:, None] - np.array([*places.values()]), axis=2)
     blocked = np.argwhere((apart_m < targets.radius_m[:, None] + _MIN_DISTANCE_M) & (targets.radius_m[:, None] > 0))
@@ -97,4 +97,5 @@ def _emitters(shot: Snapshot) -> list[tuple[Sensor, NDArray[np.float64]]]:
 def _emitter_m(shot: Snapshot, number: int) -> NDArray[np.float64]:
     """Return the position of a sensor's emitter: (axis,) float64."""
     offset = {"emitter_offset"} if any(shot.scene.sensors[number].emitter.position_m) else set()
-    return transmitter_of(shot, offset, number).position_m
+    [position_m] = transmitter_of(shot, offset, number).position_m
+    return np.asarray(position_m)

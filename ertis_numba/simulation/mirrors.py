@@ -1,63 +1,86 @@
 """Mirror images in walls, and occlusion by walls."""
 
-from collections.abc import Sequence
+import operator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.simulation.bounds import require_few_mirrors
-from ertis_numba.simulation.snapshot import Mirror, ReceiverPose, TransmitterPose
+from ertis_numba.simulation.snapshot import Mirrors, Receivers, Transmitters
 
-__all__ = ["Seen", "Views", "blocked", "images", "reflected"]
+__all__ = ["Seen", "Views", "blocked", "images"]
 
 Floats = NDArray[np.float64]
-End = TypeVar("End", TransmitterPose, ReceiverPose)
+Indices = NDArray[np.intp]
+End = TypeVar("End", Transmitters, Receivers)
 _SKIN = 1e-9  # of a leg's length: a leg that only touches a wall does not cross it
 # The path from a sensor over two walls back to itself meets exactly their common edge. With a small offset, one order
 # of the two walls is valid in a corner of a room, and none at the corner of a box.
 _NUDGE_M = np.array([1.1e-7, 1.7e-7, 2.3e-7])
-
-
-_Chain = tuple[tuple[int, ...], tuple[Any, ...]]  # walls, and the end point with its images in them
+_AT_ONCE = 2**16  # chains × places that are traced at a time
+_NO_WALL = -1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seen(Generic[End]):
-    """One end of the paths to some places, direct or mirrored in walls.
+    """Ways from one end of sound paths to some places, direct or mirrored in walls.
 
     Attributes
     ----------
-    end : TransmitterPose or ReceiverPose
-        The end itself or its mirror image.
-    exists : (place,) bool
-        True if all mirror points lie on their walls.
-    corners_m : (corner, place, axis) float64
-        Corners of the paths from the end to the places, both included.
-    mirrors : tuple of int
-        The wall at each inner corner.
+    ends : Transmitters or Receivers
+        The end itself, and its mirror images that are visible from some place.
+    image, place : (way,) int
+        The image and the place that each way joins.
+    mirrors : (wall, way) int
+        The wall at each mirror point, starting at the end; `_NO_WALL` beyond the last.
+    corners_m : (corner, way, axis) float64
+        Corners of each way from the end to the place, both included. The place repeats beyond the last wall.
     """
 
-    end: End
-    exists: NDArray[np.bool_]
+    ends: End
+    image: Indices
+    place: Indices
+    mirrors: Indices
     corners_m: Floats
-    mirrors: tuple[int, ...]
 
-    def to_corners_m(self, places: NDArray[np.intp]) -> Floats:
-        """Return the distances from the end to the mirror points along the paths: (wall, place) float64."""
-        legs_m = np.sqrt(np.sum(np.diff(self.corners_m[:, places], axis=0) ** 2, axis=-1))
+    def __len__(self) -> int:
+        return len(self.image)
+
+    @property
+    def n_mirrors(self) -> Indices:
+        """Number of walls of each way: (way,) int."""
+        return np.asarray(np.sum(self.mirrors != _NO_WALL, axis=0))
+
+    @property
+    def images(self) -> End:
+        """The end or its mirror image, one per way."""
+        return self.ends.chosen(self.image)
+
+    def to_corners_m(self) -> Floats:
+        """Return the distances from the end to the mirror points along the ways: (wall, way) float64."""
+        legs_m = np.sqrt(np.sum(np.diff(self.corners_m, axis=0) ** 2, axis=-1))
         return np.asarray(np.cumsum(legs_m, axis=0)[:-1])
 
+    def chosen(self, ways: Indices | NDArray[np.bool_]) -> Self:
+        """Return a selection of ways, by index or by a mask."""
+        return replace(
+            self,
+            image=self.image[ways],
+            place=self.place[ways],
+            mirrors=self.mirrors[:, ways],
+            corners_m=self.corners_m[:, ways],
+        )
 
-Views = tuple[tuple[Seen[TransmitterPose], ...], tuple[Seen[ReceiverPose], ...], tuple[Seen[TransmitterPose], ...]]
-"""Emitter and microphones as seen from the targets, and the emitter as seen from the microphones.
 
-Each tuple starts with the end itself; its mirror images may follow."""
+Views = tuple[Seen[Transmitters], Seen[Receivers], Seen[Transmitters]]
+"""Emitter and microphones as seen from the targets, and the emitter as seen from the microphones."""
 
 
-def images(end: End, places_m: Floats, mirrors: Sequence[Mirror], largest: int) -> list[Seen[End]]:
-    """Return an end and its images of up to ``largest`` reflections that are visible from some place.
+def images(end: End, places_m: Floats, mirrors: Mirrors, largest: int) -> Seen[End]:
+    """Return the ways to an end and to its images of up to ``largest`` reflections that are visible from some place.
 
     The image of an image is ``p' = p - 2 ((p - q)·n) n`` (J. B. Allen, D. A. Berkley, Image method for efficiently
     simulating small-room acoustics, JASA 65, 1979). It is valid where every mirror point lies within its wall
@@ -65,9 +88,10 @@ def images(end: End, places_m: Floats, mirrors: Sequence[Mirror], largest: int) 
 
     Parameters
     ----------
-    end : TransmitterPose or ReceiverPose
+    end : Transmitters or Receivers
+        The end without images.
     places_m : (place, axis) float64
-    mirrors : sequence of Mirror
+    mirrors : Mirrors
     largest : int
         Maximum number of reflections.
 
@@ -78,111 +102,184 @@ def images(end: End, places_m: Floats, mirrors: Sequence[Mirror], largest: int) 
     """
     n_places = len(places_m)
     require_few_mirrors(len(mirrors), largest, n_places)
-    straight = np.stack([np.broadcast_to(_position(end), places_m.shape), places_m])
-    found = [Seen(end, np.ones(n_places, dtype=np.bool_), straight, ())]
-    chains: list[_Chain] = [((), (end,))]
-    for _ in range(largest):
-        chains = _longer(chains, mirrors)
-        for walls, ends in chains:
-            exists, corners_m = _corners(ends, [mirrors[number] for number in walls], places_m + _NUDGE_M)
-            if exists.any():
-                found.append(Seen(ends[-1], exists, corners_m, walls))
-    return found
+    straight = np.stack([np.broadcast_to(end.centre_m, places_m.shape), places_m])
+    ends, image, place = [end], [np.zeros(n_places, dtype=np.intp)], [np.arange(n_places)]
+    walls, corners_m = [np.zeros((0, n_places), dtype=np.intp)], [straight]
+    chains, tips_m = np.zeros((0, 1), dtype=np.intp), end.centre_m[None]
+    n_images = 1
+    for _ in range(largest if len(mirrors) else 0):
+        chains, tips_m = _longer(chains, tips_m, mirrors)
+        for part in _parts(chains.shape[1], n_places):
+            chain, there, traced_m = _traced(chains[:, part], tips_m[:, part], mirrors, places_m + _NUDGE_M)
+            visible, own = np.unique(chain, return_inverse=True)
+            numbers = chains[:, part][:, visible]
+            ends.append(_reflected(end, numbers, mirrors))
+            image.append(n_images + own)
+            place.append(there)
+            walls.append(numbers[:, own])
+            corners_m.append(traced_m)
+            n_images += len(visible)
+    depth = max(len(each) for each in walls)
+    return Seen(
+        ends=_joined(ends, depth),
+        image=np.concatenate(image),
+        place=np.concatenate(place),
+        mirrors=np.concatenate([_deeper(each, depth, _NO_WALL) for each in walls], axis=1),
+        corners_m=_repeated(corners_m, depth + 2),
+    )
 
 
-def reflected(end: End, mirror: Mirror) -> End:
-    """Return the image of an end in one more wall."""
-    normal: Floats = mirror.axes[0]
-    sway_m_s = 2 * (mirror.velocity_m_s @ normal) * normal
-    velocity_m_s = _turned(end.velocity_m_s, normal) + sway_m_s
-    sways_m_s = (*(_turned(earlier, normal) for earlier in end.sways_m_s), sway_m_s)
-    reflection = end.reflection * mirror.reflection
+def blocked(seen: Seen[End], mirrors: Mirrors) -> NDArray[np.bool_]:
+    """Return True for ways that a wall blocks: (way,) bool.
+
+    A leg is blocked by every wall that it crosses, except the walls at which it begins or ends.
+    """
+    stopped = np.zeros(len(seen), dtype=np.bool_)
+    touched = np.pad(seen.mirrors, ((1, 1), (0, 0)), constant_values=_NO_WALL)
+    for leg, (start_m, stop_m) in enumerate(zip(seen.corners_m[:-1], seen.corners_m[1:], strict=True)):
+        for number in range(len(mirrors)):
+            share, point_m = _crossing(start_m, stop_m, mirrors, number)
+            crossed = _crossed(share, point_m, mirrors, number)
+            stopped |= crossed & np.all(touched[leg : leg + 2] != number, axis=0)
+    return stopped
+
+
+def _parts(n_chains: int, n_places: int) -> Iterator[slice]:
+    step = max(1, _AT_ONCE // max(1, n_places))
+    return (slice(first, first + step) for first in range(0, n_chains, step))
+
+
+def _longer(chains: Indices, tips_m: Floats, mirrors: Mirrors) -> tuple[Indices, Floats]:
+    """Extend every chain by one more image, in each wall except its last.
+
+    Parameters
+    ----------
+    chains : (wall, chain) int
+    tips_m : (image, chain, axis) float64
+        Positions of the end and its images in the walls of the chain.
+    mirrors : Mirrors
+    """
+    number = np.tile(np.arange(len(mirrors)), chains.shape[1])
+    chain = np.repeat(np.arange(chains.shape[1]), len(mirrors))
+    if len(chains):
+        new = chains[-1, chain] != number
+        number, chain = number[new], chain[new]
+    before_m = tips_m[:, chain]
+    tip_m = _mirrored(before_m[-1], mirrors.points_m[number], mirrors.axes[number, 0])
+    return np.concatenate([chains[:, chain], number[None]]), np.concatenate([before_m, tip_m[None]])
+
+
+def _traced(chains: Indices, tips_m: Floats, mirrors: Mirrors, places_m: Floats) -> tuple[Indices, Indices, Floats]:
+    """Trace the sound back from the places over the walls to the end itself.
+
+    Returns
+    -------
+    chain, place : (way,) int
+        The chains that are visible from each place.
+    corners_m : (corner, way, axis) float64
+        The corners of these ways, starting at the end.
+    """
+    chain = np.repeat(np.arange(chains.shape[1]), len(places_m))
+    place = np.tile(np.arange(len(places_m)), chains.shape[1])
+    corners_m = places_m[place][None]
+    for walls, images_m in zip(chains[::-1], tips_m[:0:-1], strict=True):
+        number = walls[chain]
+        share, point_m = _crossing(corners_m[0], images_m[chain], mirrors, number)
+        hit = _crossed(share, point_m, mirrors, number)
+        chain, place = chain[hit], place[hit]
+        corners_m = np.concatenate([point_m[None, hit], corners_m[:, hit]])
+    return chain, place, np.concatenate([tips_m[:1, chain], corners_m])
+
+
+def _reflected(end: End, chains: Indices, mirrors: Mirrors) -> End:
+    """Return the images of an end in chains of walls, (wall, image)."""
+    ends = end.chosen(np.zeros(chains.shape[1], dtype=np.intp))
+    for number in chains:
+        ends = _reflected_once(ends, mirrors, number)
+    return ends
+
+
+def _reflected_once(ends: End, mirrors: Mirrors, number: Indices) -> End:
+    """Return the image of each end in one more wall."""
+    normal, points_m = mirrors.axes[number, 0], mirrors.points_m[number]
+    sway_m_s = 2 * _along(mirrors.velocities_m_s[number], normal)[..., None] * normal
+    velocity_m_s = _turned(ends.velocity_m_s, normal) + sway_m_s
+    sways_m_s = np.concatenate([_turned(ends.sways_m_s, normal), sway_m_s[None]])
+    reflection = ends.reflection * mirrors.reflection[number]
+    names = [(mirrors.names[each],) for each in number]
     # From an emitter the sound meets the walls in the order of the images; to a microphone, in the reverse order.
-    if isinstance(end, TransmitterPose):
+    if isinstance(ends, Transmitters):
         return replace(
-            end,
-            position_m=_image(end.position_m, mirror),
+            ends,
+            position_m=_mirrored(ends.position_m, points_m, normal),
             velocity_m_s=velocity_m_s,
-            facing=_turned(end.facing, normal),
+            facing=_turned(ends.facing, normal),
             sways_m_s=sways_m_s,
-            walls=(*end.walls, mirror.name),
+            walls=tuple(map(operator.add, ends.walls, names)),
             reflection=reflection,
         )
     return replace(
-        end,
-        positions_m=_image(end.positions_m, mirror),
-        centre_m=_image(end.centre_m, mirror),
+        ends,
+        positions_m=_mirrored(ends.positions_m, points_m[:, None], normal[:, None]),
+        centre_m=_mirrored(ends.centre_m, points_m, normal),
         velocity_m_s=velocity_m_s,
-        axes=_turned(end.axes, normal),
+        axes=_turned(ends.axes, normal[:, None]),
         sways_m_s=sways_m_s,
-        walls=(mirror.name, *end.walls),
+        walls=tuple(map(operator.add, names, ends.walls)),
         reflection=reflection,
     )
 
 
-def blocked(seen: Seen[End], mirrors: Sequence[Mirror]) -> NDArray[np.bool_]:
-    """Return True for places whose path is blocked by a wall: (place,) bool.
-
-    A leg is blocked by every wall that it crosses, except the walls at which it begins or ends.
-    """
-    stopped = np.zeros(seen.corners_m.shape[1], dtype=np.bool_)
-    touched = (-1, *seen.mirrors, -1)
-    for leg, (start_m, stop_m) in enumerate(zip(seen.corners_m[:-1], seen.corners_m[1:], strict=True)):
-        for number, mirror in enumerate(mirrors):
-            if number not in touched[leg : leg + 2]:
-                share, point_m = _crossing(start_m, stop_m, mirror)
-                stopped |= _crossed(share, point_m, mirror)
-    return stopped
+def _joined(ends: list[End], depth: int) -> End:
+    """Return all images as one structure, with ``depth`` walls."""
+    first = ends[0]
+    names = set(first.__slots__) - {"walls", "sways_m_s"}
+    return replace(
+        first,
+        walls=tuple(walls for each in ends for walls in each.walls),
+        sways_m_s=np.concatenate([_deeper(each.sways_m_s, depth, 0.0) for each in ends], axis=1),
+        **{name: np.concatenate([getattr(each, name) for each in ends]) for name in names},
+    )
 
 
-def _longer(chains: list[_Chain], mirrors: Sequence[Mirror]) -> list[_Chain]:
-    """Return every chain extended by one more image, in each wall except its last."""
-    return [
-        ((*walls, number), (*ends, reflected(ends[-1], mirror)))
-        for walls, ends in chains
-        for number, mirror in enumerate(mirrors)
-        if walls[-1:] != (number,)
-    ]
+def _deeper(values: NDArray[Any], depth: int, filler: float) -> NDArray[Any]:
+    """Return an array whose first axis is extended to ``depth``."""
+    more = np.full((depth - len(values), *values.shape[1:]), filler, dtype=values.dtype)
+    return np.concatenate([values, more])
 
 
-def _corners(ends: Sequence[End], walls: Sequence[Mirror], places_m: Floats) -> tuple[NDArray[np.bool_], Floats]:
-    """Trace the sound back from the places over the walls to the end itself."""
-    exists = np.ones(len(places_m), dtype=np.bool_)
-    corners_m = [places_m]
-    for image, mirror in zip(ends[:0:-1], walls[::-1], strict=True):
-        share, point_m = _crossing(corners_m[-1], np.broadcast_to(_position(image), places_m.shape), mirror)
-        exists &= _crossed(share, point_m, mirror)
-        corners_m.append(point_m)
-    corners_m.append(np.broadcast_to(_position(ends[0]), places_m.shape))
-    return exists, np.stack(corners_m[::-1])
+def _repeated(corners_m: list[Floats], n_corners: int) -> Floats:
+    """Return all corners as one array, with the last of each repeated: (corner, way, axis) float64."""
+    extended = [np.pad(each, ((0, n_corners - len(each)), (0, 0), (0, 0)), mode="edge") for each in corners_m]
+    return np.concatenate(extended, axis=1)
 
 
-def _crossing(start_m: Floats, stop_m: Floats, mirror: Mirror) -> tuple[Floats, Floats]:
-    """Return the crossings of lines with the plane of a wall: (place,) and (place, axis) float64.
+def _crossing(start_m: Floats, stop_m: Floats, mirrors: Mirrors, number: Indices | int) -> tuple[Floats, Floats]:
+    """Return the crossings of lines with the planes of walls: (way,) and (way, axis) float64.
 
     The first array holds the fraction of the line, −1 for lines parallel to the plane. The second holds the points.
     """
-    before = (start_m - mirror.point_m) @ mirror.axes[0]
-    after = (stop_m - mirror.point_m) @ mirror.axes[0]
-    apart = before - after
+    points_m, normal = mirrors.points_m[number], mirrors.axes[number, 0]
+    before = _along(start_m - points_m, normal)
+    apart = before - _along(stop_m - points_m, normal)
     share = np.divide(before, apart, out=np.full_like(before, -1.0), where=apart != 0)
     return share, start_m + share[:, None] * (stop_m - start_m)
 
 
-def _crossed(share: Floats, point_m: Floats, mirror: Mirror) -> NDArray[np.bool_]:
-    """Return True for lines that cross the wall itself; the arguments are from `_crossing`: (place,) bool."""
-    aside_m = np.abs((point_m - mirror.point_m) @ mirror.axes[1:].T)
-    inside = np.all(aside_m <= mirror.half_size_m, axis=-1)
-    return np.asarray(inside & (share > _SKIN) & (share < 1 - _SKIN))
+def _crossed(share: Floats, point_m: Floats, mirrors: Mirrors, number: Indices | int) -> NDArray[np.bool_]:
+    """Return True for lines that cross the wall itself; the arguments are those and the results of `_crossing`."""
+    from_m, half_sizes_m = point_m - mirrors.points_m[number], mirrors.half_sizes_m[number]
+    inside = [np.abs(_along(from_m, mirrors.axes[number, side])) <= half_sizes_m[..., side - 1] for side in (1, 2)]
+    return np.asarray(inside[0] & inside[1] & (share > _SKIN) & (share < 1 - _SKIN))
 
 
-def _position(end: TransmitterPose | ReceiverPose) -> Floats:
-    return end.position_m if isinstance(end, TransmitterPose) else end.centre_m
-
-
-def _image(points_m: Floats, mirror: Mirror) -> Floats:
-    return np.asarray(mirror.point_m + _turned(points_m - mirror.point_m, mirror.axes[0]))
+def _mirrored(places_m: Floats, points_m: Floats, normal: Floats) -> Floats:
+    return np.asarray(points_m + _turned(places_m - points_m, normal))
 
 
 def _turned(vectors: Floats, normal: Floats) -> Floats:
-    return np.asarray(vectors - 2 * (vectors @ normal)[..., None] * normal)
+    return np.asarray(vectors - 2 * _along(vectors, normal)[..., None] * normal)
+
+
+def _along(vectors: Floats, normal: Floats) -> Floats:
+    return np.asarray(np.einsum("...x,...x->...", vectors, normal))

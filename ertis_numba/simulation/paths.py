@@ -1,28 +1,31 @@
 """Sound paths: from an emitter, directly or over a target, to every microphone."""
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.simulation.bounds import require_few_paths
 from ertis_numba.simulation.mirrors import Seen
-from ertis_numba.simulation.snapshot import ReceiverPose, Targets, TransmitterPose
+from ertis_numba.simulation.snapshot import Receivers, Targets, Transmitters
 
-__all__ = ["Paths", "by_targets", "turning", "unit", "without_target"]
+__all__ = ["Paths", "by_targets", "pairs", "turning", "unit", "without_target"]
 
 Floats = NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Paths:
-    """Paths between one emitter and one set of microphones, or between their mirror images.
+    """Paths between emitters and sets of microphones, or between their mirror images.
 
     Attributes
     ----------
-    transmitter : TransmitterPose
-    receiver : ReceiverPose
+    transmitter : Transmitters
+    receiver : Receivers
+        One image of the emitter and of the microphones per path.
     targets : Targets
-        One per path. Without targets there is one direct path, counted as the second leg.
+        One per path, or none: paths without targets are direct, counted as the second leg.
     first_m, second_m : (path, mic) float64
         Lengths of the legs before and after the target.
     leaving, arriving : (path, mic, axis) float64
@@ -33,8 +36,8 @@ class Paths:
         True if legs end on the surface of spheres; False, the default, if they end at the centres.
     """
 
-    transmitter: TransmitterPose
-    receiver: ReceiverPose
+    transmitter: Transmitters
+    receiver: Receivers
     targets: Targets
     first_m: Floats
     second_m: Floats
@@ -47,13 +50,12 @@ class Paths:
     def __len__(self) -> int:
         return len(self.first_m)
 
-    @property
+    @functools.cached_property
     def names(self) -> tuple[str, ...]:
         """The target of each path, and the walls before and after it."""
-        before, after = self.transmitter.walls, self.receiver.walls
-        return tuple(" > ".join((*before, name, *after)) for name in self.targets.names) or (
-            " > ".join((*before, *after)) or "direct sound",
-        )
+        targets: list[tuple[str, ...]] = [(name,) for name in self.targets.names] or [()] * len(self)
+        ways = zip(self.transmitter.walls, targets, self.receiver.walls, strict=True)
+        return tuple(" > ".join((*before, *name, *after)) or "direct sound" for before, name, after in ways)
 
     @property
     def length_m(self) -> Floats:
@@ -61,78 +63,97 @@ class Paths:
         return self.first_m + self.second_m
 
     @property
-    def reflection(self) -> float:
-        """Amplitude reflection factor of all walls of the paths."""
+    def reflection(self) -> Floats:
+        """Amplitude reflection factor of all walls of each path: (path,) float64."""
         return self.transmitter.reflection * self.receiver.reflection
 
 
-def by_targets(
-    first: Seen[TransmitterPose], second: Seen[ReceiverPose], targets: Targets, chosen: NDArray[np.intp]
-) -> Paths:
+def pairs(
+    firsts: Seen[Transmitters], seconds: Seen[Receivers], largest: int
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the ways to and from each place that form a path of up to ``largest`` walls: (path,) int each.
+
+    Paths are in the order of the emitter's images, then the microphones' images, then the places.
+
+    Raises
+    ------
+    ArgumentError
+        There are too many paths.
+    """
+    rank = seconds.place * (largest + 1) + seconds.n_mirrors
+    sorted_ways = np.argsort(rank, kind="stable")
+    rank = rank[sorted_ways]
+    base = firsts.place * (largest + 1)
+    start, stop = np.searchsorted(rank, base), np.searchsorted(rank, base + largest - firsts.n_mirrors, "right")
+    counts = stop - start
+    n_paths = int(counts.sum())
+    require_few_paths(n_paths)
+    one = np.repeat(np.arange(len(firsts)), counts)
+    other = sorted_ways[np.arange(n_paths) + np.repeat(start - (np.cumsum(counts) - counts), counts)]
+    order = np.lexsort((firsts.place[one], seconds.image[other], firsts.image[one]))
+    return one[order], other[order]
+
+
+def by_targets(first: Seen[Transmitters], second: Seen[Receivers], targets: Targets) -> Paths:
     """Return the paths over some targets, at least one.
 
     Parameters
     ----------
     first, second : Seen
-        Emitter and microphones, or their mirror images.
+        Ways from the emitter to the targets, and from the microphones to the same targets; one per path.
     targets : Targets
         All targets of the scene.
-    chosen : (path,) int
-        Indices of the targets to use.
     """
-    return turning(first, second, targets, chosen, targets.positions_m[chosen, None, :], surface=False)
+    return turning(first, second, targets, targets.positions_m[first.place, None, :], surface=False)
 
 
 def turning(
-    first: Seen[TransmitterPose],
-    second: Seen[ReceiverPose],
-    targets: Targets,
-    chosen: NDArray[np.intp],
-    turns_m: Floats,
-    *,
-    surface: bool,
+    first: Seen[Transmitters], second: Seen[Receivers], targets: Targets, turns_m: Floats, *, surface: bool
 ) -> Paths:
     """Return the paths that turn at the places ``turns_m``, (path, mic, axis).
 
     The other arguments are those of `by_targets`.
     """
-    transmitter, receiver = first.end, second.end
-    there_m = turns_m - transmitter.position_m
+    transmitter, receiver = first.images, second.images
+    there_m = turns_m - transmitter.position_m[:, None]
     back_m = receiver.positions_m - turns_m
     shape = back_m.shape[:2]
     return Paths(
         transmitter=transmitter,
         receiver=receiver,
-        targets=targets.chosen(chosen),
+        targets=targets.chosen(first.place),
         first_m=np.broadcast_to(_length(there_m), shape),
         second_m=_length(back_m),
         leaving=np.broadcast_to(unit(there_m), back_m.shape),
         arriving=unit(back_m),
-        transmitter_corners_m=first.to_corners_m(chosen),
-        receiver_corners_m=second.to_corners_m(chosen),
+        transmitter_corners_m=first.to_corners_m(),
+        receiver_corners_m=second.to_corners_m(),
         surface=surface,
     )
 
 
 def without_target(
-    transmitter: TransmitterPose, receiver: ReceiverPose, targets: Targets, corners_m: Floats | None = None
+    transmitter: Transmitters, receiver: Receivers, targets: Targets, corners_m: Floats | None = None
 ) -> Paths:
-    """Return the direct path from an emitter or its mirror image to the microphones.
+    """Return the direct paths from an emitter or its mirror images to the microphones.
 
     Parameters
     ----------
-    transmitter : TransmitterPose
-    receiver : ReceiverPose
+    transmitter : Transmitters
+        One per path.
+    receiver : Receivers
+        The microphones without mirror images.
     targets : Targets
         All targets of the scene.
-    corners_m : (wall, 1) float64, optional
+    corners_m : (wall, path) float64, optional
         Distances of the mirror points from the emitter, along the path.
     """
-    none = np.zeros((0, 1))
-    way_m = (receiver.positions_m - transmitter.position_m)[None]
+    n_paths = len(transmitter.position_m)
+    none = np.zeros((0, n_paths))
+    way_m = receiver.positions_m - transmitter.position_m[:, None]
     return Paths(
         transmitter=transmitter,
-        receiver=receiver,
+        receiver=receiver.chosen(np.zeros(n_paths, dtype=np.intp)),
         targets=targets.chosen(np.arange(0)),
         first_m=np.zeros(way_m.shape[:2]),
         second_m=_length(way_m),

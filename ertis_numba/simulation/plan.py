@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ertis_numba.simulation import limits
+from ertis_numba.simulation.cache import Cache
 from ertis_numba.simulation.effects import ASKED_FOR, EFFECTS, INDISPENSABLE, module
 from ertis_numba.simulation.estimates import Estimate
 from ertis_numba.simulation.loudness import LOUD, may_be_loud, peak_bound
@@ -17,8 +18,9 @@ from ertis_numba.simulation.snapshot import Snapshot, snapshot
 
 __all__ = ["EffectPlan", "Verdict", "make_plan"]
 
-ABRender = Callable[[int, frozenset[str], str], float | None]
+ABRender = Callable[[int, str, frozenset[str], str], float | None]
 RenderAB = Callable[[], ABRender]
+Shots = list[tuple[int, Snapshot]]
 
 _INSTANTS, _MAX_CORNERS = 9, 40  # times at which a moving scene is examined: evenly spaced, and at waypoints
 _MAX_TOO_HIGH = 20.0  # largest factor of an overestimate; side lobes that overlap make some estimates far too low
@@ -120,16 +122,24 @@ def make_plan(scene: Scene) -> EffectPlan:
     True
     """
     indices = _indices(scene)
-    shots = [(index, snapshot(scene, sensor, index / scene.rate_hz)) for index in indices for sensor in scene.sensors]
+    cache = Cache()
+    shots = [
+        (index, snapshot(scene, sensor, index / scene.rate_hz, cache)) for index in indices for sensor in scene.sensors
+    ]
     for _, shot in shots:
         limits.require_clear(shot)
     notes = tuple(dict.fromkeys(note for _, shot in shots for note in limits.notes(shot)))
     verdicts: dict[str, Verdict] = {}
     render_ab = functools.cache(lambda: _ab_render_of(scene))
+    # The first round renders nothing, because its images would lack the effects that are not decided yet. Decisions
+    # repeat while the other effects stay the same.
+    decided = functools.cache(
+        lambda name, others, *, measure: _decided(scene, name, others, shots, render_ab if measure else None)
+    )
     rounds = [_active(verdicts)]
-    for _ in range(_ROUNDS):
+    for number in range(_ROUNDS):
         for name in EFFECTS:
-            verdicts[name] = _decided(scene, name, _active(verdicts) - {name}, shots, render_ab)
+            verdicts[name] = decided(name, _active(verdicts) - {name}, measure=number > 0)
         rounds.append(_active(verdicts))
         if rounds[-1] == rounds[-2]:
             return EffectPlan(tuple(verdicts.values()), notes)
@@ -169,10 +179,10 @@ def _decided(
     scene: Scene,
     name: str,
     others: frozenset[str],
-    shots: list[tuple[int, Snapshot]],
-    render_ab: RenderAB,
+    shots: Shots,
+    render_ab: RenderAB | None,
 ) -> Verdict:
-    """Return the verdict on one effect, given the others."""
+    """Return the verdict on one effect, given the others; without A/B renders, the estimate decides."""
     if name in INDISPENSABLE:
         return Verdict(name=name, on=True, reason=INDISPENSABLE[name])
     given = scene.effects.get(name)
@@ -181,14 +191,16 @@ def _decided(
     if not estimates:
         reason = f"it applies to nothing in the scene: {EFFECTS[name].summary}"
         return Verdict(name=name, on=bool(given), reason=reason, forced=given is not None)
-    worst = estimates[0][0]
+    worst, _ = estimates[0]
     if forced is not None:
         return Verdict(name=name, on=forced, reason=worst.reason, estimate_db=worst.change_db, forced=True)
     measured_db, moves = None, scene.moves and scene.count > 1
-    if worst.change_db / min(worst.sure, _MAX_TOO_HIGH) < scene.tolerance_db:
-        indices = [index for estimate, index in estimates if estimate.change_db * estimate.sure > scene.tolerance_db]
-        indices = [*dict.fromkeys(indices[:_MAX_RENDERED]), *_loudest(name, others, shots)]
-        measured_db = _measured_db(scene, render_ab, indices, others, name)
+    if render_ab is not None and worst.change_db / min(worst.sure, _MAX_TOO_HIGH) < scene.tolerance_db:
+        unsure = [shot for estimate, shot in estimates if estimate.change_db * estimate.sure > scene.tolerance_db]
+        indices = [index for index, _ in unsure[:_MAX_RENDERED]] + _loudest(name, others, shots)
+        # Sensors with certain estimates count as well, because their images may contain more echoes than estimated.
+        chosen = [shot for index in dict.fromkeys(indices) for _, shot in estimates if shot[0] == index]
+        measured_db = _measured_db(scene, render_ab, chosen, others, name)
     change_db = worst.change_db if measured_db is None else measured_db
     return Verdict(
         name=name,
@@ -199,17 +211,17 @@ def _decided(
     )
 
 
-def _estimates(name: str, active: frozenset[str], shots: list[tuple[int, Snapshot]]) -> list[tuple[Estimate, int]]:
-    """Return the estimates of all snapshots with the indices of their measurements, greatest change first."""
+def _estimates(name: str, active: frozenset[str], shots: Shots) -> list[tuple[Estimate, tuple[int, Snapshot]]]:
+    """Return the estimates of all snapshots, greatest change first."""
     if not shots or not EFFECTS[name].may_apply(shots[0][1].scene):
         return []
-    found = [(module(name).estimate(Sight.of(shot, active)), index) for index, shot in shots]
+    found = [(module(name).estimate(Sight.of(shot, active)), (index, shot)) for index, shot in shots]
     return sorted(
-        ((estimate, index) for estimate, index in found if estimate is not None), key=lambda each: -each[0].change_db
+        ((estimate, shot) for estimate, shot in found if estimate is not None), key=lambda each: -each[0].change_db
     )
 
 
-def _loudest(name: str, active: frozenset[str], shots: list[tuple[int, Snapshot]]) -> list[int]:
+def _loudest(name: str, active: frozenset[str], shots: Shots) -> list[int]:
     """Return the index of the measurement with the highest amplitude bound, if within 6 dB of full scale."""
     peaks = [
         (max(peak_bound(shot, active), peak_bound(shot, active | {name})), index)
@@ -220,13 +232,11 @@ def _loudest(name: str, active: frozenset[str], shots: list[tuple[int, Snapshot]
     return [index] if loudest >= LOUD else []
 
 
-def _measured_db(
-    scene: Scene, render_ab: RenderAB, indices: list[int], others: frozenset[str], name: str
-) -> float | None:
-    """Return the greatest change of some measurements, up to the first that exceeds the tolerance."""
+def _measured_db(scene: Scene, render_ab: RenderAB, shots: Shots, others: frozenset[str], name: str) -> float | None:
+    """Return the greatest change of some images, up to the first that exceeds the tolerance."""
     worst_db: float | None = None
-    for index in dict.fromkeys(indices):
-        change_db = render_ab()(index, others, name)
+    for index, shot in shots:
+        change_db = render_ab()(index, shot.sensor.name, others, name)
         if change_db is not None:
             worst_db = max(change_db, worst_db or 0.0)
             if worst_db > scene.tolerance_db:

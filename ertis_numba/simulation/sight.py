@@ -2,9 +2,7 @@
 
 import functools
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,61 +13,31 @@ from ertis_numba.settings import Call, Settings
 from ertis_numba.simulation import pulse
 from ertis_numba.simulation.arrivals import call_filters, echoes, emitted, emitters, responses
 from ertis_numba.simulation.converter import QUANTISATION_DBFS
+from ertis_numba.simulation.echoes import Echoes, Ways
 from ertis_numba.simulation.effects import EFFECTS
 from ertis_numba.simulation.paths import Paths
 from ertis_numba.simulation.snapshot import Snapshot
 from ertis_numba.simulation.stopwatch import CostStopwatch
+from ertis_numba.simulation.surroundings import Surroundings, envelope, greatest, parts
 
-__all__ = ["SAME_RANGE_M", "Echoes", "Sight", "change_db"]
+__all__ = ["SAME_RANGE_M", "Sight"]
 
 Floats = NDArray[np.float64]
 # Effects that change sound paths.
 _GEOMETRY = frozenset(each.name for each in EFFECTS.values() if {"transmitter", "views", "turns"} & {*each.places})
+# Effects that change the paths or the amplitudes of a call.
+_ON_ECHOES = _GEOMETRY | frozenset(each.name for each in EFFECTS.values() if {"gain", "call_filter"} & {*each.places})
 _LAGS, _LAG_DIRECTIONS = 128, 64
 _BEAM_PATHS, _BEAM_DIRECTIONS = 6, 361
 _SHOWN_DB = 40.0  # dynamic range of an image: weaker reflectors are masked by side lobes
 _ACROSS = 8192
 _SIDE_LOBE = 0.5  # of an array of a few dozen microphones
 _CUT = 0.05
-_TABLE_SIZE = 2**21  # elements of a paths × paths table that are in memory at a time
 _PEAK = 3.3  # highest of some ten thousand Rayleigh-distributed amplitudes, relative to their RMS
 SAME_RANGE_M = 0.05
 """Largest difference of ranges that count as the same range, in metres."""
 # Level of white noise equivalent to the noise of modulators of each order between 20 and 80 kHz at the clock of eRTIS.
 _MODULATOR_DBFS, _MAX_NOISE_DBFS = {1: -22.0, 2: -44.0, 3: -48.0, 4: -58.0}, -10.0
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Echoes:
-    """Echoes in an image, one per path.
-
-    Attributes
-    ----------
-    names : tuple of str
-    gain : (path, frequency) float64 or complex128
-    delay_s : (path,) float64
-        Delay at the centre of the array.
-    direction : (path, axis) float64
-        Unit vector towards the source of the sound, in the sensor frame.
-    """
-
-    names: tuple[str, ...]
-    gain: NDArray[np.inexact[Any]]
-    delay_s: Floats
-    direction: Floats
-
-    def __len__(self) -> int:
-        return len(self.names)
-
-    @classmethod
-    def joined(cls, parts: Sequence[Self]) -> Self:
-        """Return the echoes of all parts."""
-        return cls(
-            names=tuple(name for part in parts for name in part.names),
-            gain=np.concatenate([np.zeros((0, pulse.N_NODES)), *(part.gain for part in parts)]),
-            delay_s=np.concatenate([np.zeros(0), *(part.delay_s for part in parts)]),
-            direction=np.concatenate([np.zeros((0, 3)), *(part.direction for part in parts)]),
-        )
 
 
 class Sight:
@@ -101,22 +69,23 @@ class Sight:
         """Return the estimate with given effects; the snapshot caches it."""
         return shot.once((cls, active), lambda: cls(shot, active))
 
-    @functools.cached_property
+    @property
     def heard(self) -> Echoes:
         """Echoes of the sensor's own call, and of other sensors' calls if cross-emission is simulated."""
         return self.echoes(self.active)
 
-    @functools.cached_property
+    @property
     def shown(self) -> NDArray[np.bool_]:
         """True for echoes that the image shows: (path,) bool."""
-        level = self.levels(self.heard)
+        level = self.heard.level
         weakest = max(self.noise, float(level.max(initial=0.0)) * 10 ** (-_SHOWN_DB / 20))
         return np.asarray((level > weakest) & self.inside(self.heard.delay_s))
 
     @functools.cached_property
     def floor(self) -> float:
         """Amplitude of the weakest reflector that the image shows, or of its noise if it shows none."""
-        return float(np.min(self.levels(self.heard)[self.shown], initial=np.inf)) if self.shown.any() else self.noise
+        shown = self.shown
+        return float(np.min(self.heard.level[shown])) if shown.any() else self.noise
 
     @functools.cached_property
     def noise(self) -> float:
@@ -131,7 +100,13 @@ class Sight:
 
     def echoes(self, active: frozenset[str]) -> Echoes:
         """Return the echoes of all calls with other effects."""
-        return Echoes.joined([self.of_emitter(number, active) for number in self.emitters(active)])
+        numbers = self.emitters(active)
+        if len(numbers) == 1:
+            return self.of_emitter(numbers[0], active)
+        return self._middle.once(
+            ("echoes", *numbers, active & _ON_ECHOES),
+            lambda: Echoes.joined([self.of_emitter(number, active) for number in numbers], self.power),
+        )
 
     def emitters(self, active: frozenset[str]) -> list[int]:
         """Return the numbers of the sensors whose calls arrive, given some effects."""
@@ -139,35 +114,41 @@ class Sight:
 
     def of_emitter(self, number: int, active: frozenset[str]) -> Echoes:
         """Return the echoes of one sensor's call; a call unlike the receiving sensor's appears only weakly."""
-        found = Echoes.joined([self._seen(paths, number, active) for paths in self.paths(number, active)])
-        if number == self.shot.number:
-            return found
-        other = self.shot.scene.sensors[number]
-        return replace(
-            found,
-            names=tuple(f"{other.name}: {name}" for name in found.names),
-            gain=self.likeness(other.call) * found.gain,
-        )
+        return self._middle.once(("echoes", number, active & _ON_ECHOES), lambda: self._echoes(number, active))
+
+    def _echoes(self, number: int, active: frozenset[str]) -> Echoes:
+        ways, other = self._ways(number, active), self.shot.scene.sensors[number]
+        level = 10 ** (other.emitter.level_db / 20) * emitted(active, other.emitter, self.frequency_hz)
+        level = level * self.likeness(other.call)
+        gain = np.zeros((len(ways.delay_s), pulse.N_NODES))
+        parts = [
+            responses(self._middle, active, paths, other.emitter, self.frequency_hz, CostStopwatch())[:, 0]
+            for paths in ways.paths
+        ]
+        gain = level * np.concatenate([np.broadcast_to(part, (len(part), pulse.N_NODES)) for part in parts] or [gain])
+        return Echoes(ways.names, gain, ways.delay_s, ways.direction, ways.coverage, self.power)
 
     def paths(self, number: int, active: frozenset[str]) -> list[Paths]:
         """Return the paths of an emitter's call to the centre of the array."""
+        return self._ways(number, active).paths
+
+    def _ways(self, number: int, active: frozenset[str]) -> Ways:
         middle, geometry = self._middle, active & _GEOMETRY
-        return middle.once((number, geometry), lambda: echoes(middle, geometry, number, CostStopwatch()))
 
-    def _seen(self, paths: Paths, number: int, active: frozenset[str]) -> Echoes:
-        emitter = self.shot.scene.sensors[number].emitter
-        level = 10 ** (emitter.level_db / 20) * emitted(active, emitter, self.frequency_hz)
-        gain = level * responses(self._middle, active, paths, emitter, self.frequency_hz, CostStopwatch())[:, 0]
-        return Echoes(
-            names=paths.names,
-            gain=np.asarray(np.broadcast_to(gain, (len(paths), pulse.N_NODES))),
-            delay_s=paths.length_m[:, 0] / self.shot.speed_m_s,
-            direction=-paths.arriving[:, 0] @ paths.receiver.axes.T,
-        )
+        def found() -> Ways:
+            paths = echoes(middle, geometry, number, CostStopwatch())
+            own = "" if number == self.shot.number else f"{self.shot.scene.sensors[number].name}: "
+            direction = [np.einsum("pkx,px->pk", part.receiver.axes, -part.arriving[:, 0]) for part in paths]
+            towards = np.concatenate([np.zeros((0, 3)), *direction])
+            return Ways(
+                paths=paths,
+                names=tuple(own + name for part in paths for name in part.names),
+                delay_s=np.concatenate([np.zeros(0), *(part.length_m[:, 0] for part in paths)]) / self.shot.speed_m_s,
+                direction=towards,
+                coverage=self.coverage(towards),
+            )
 
-    def levels(self, seen: Echoes) -> Floats:
-        """Return the amplitude of each echo in the image: (path,) float64."""
-        return np.asarray(np.abs(seen.gain @ self.power) * self.coverage(seen.direction))
+        return middle.once(("ways", number, geometry), found)
 
     def inside(self, delay_s: Floats) -> NDArray[np.bool_]:
         """Return True for echoes in the image's range window: (path,) bool."""
@@ -185,28 +166,29 @@ class Sight:
         first_s, last_s = self._window_s()
         return np.maximum(np.maximum(first_s - delay_s, delay_s - last_s), 0.0)
 
-    def beside(self, delay_s: Floats, after: Echoes | None = None) -> Floats:
-        """Return the highest amplitude of the image at the ranges of some delays, at least its floor: (path,) float64.
+    def surroundings(self, after: Echoes | None = None) -> Surroundings:
+        """Return the highest amplitudes of the image.
 
-        Range side lobes count, including those of echoes outside of the window. If ``after`` has the same echoes under
-        another effect, the weaker of the two counts.
+        If ``after`` has the echoes of `heard` under another effect, the weaker of the two counts.
         """
-        level, floor = self.levels(self.heard), self.floor
+        level, floor = self.heard.level, self.floor
         if after is not None:
-            level = np.minimum(level, self.levels(after))
+            level = np.minimum(level, after.level)
             floor = max(float(np.min(level[self.shown], initial=floor)), self.noise)
-        inside_s = np.clip(delay_s, *self._window_s())
-        strongest = np.zeros(len(delay_s))
-        for part in _parts(len(delay_s), len(level)):
-            apart_s = np.abs(inside_s[part, None] - self.heard.delay_s)
-            apart_s = np.maximum(apart_s - 2 * SAME_RANGE_M / self.shot.speed_m_s, 0.0)
-            strongest[part] = np.max(level * self._lobe(apart_s), axis=1, initial=0.0)
-        return np.asarray(np.maximum(strongest, floor))
+        loud = level > floor
+        return Surroundings(
+            floor=floor,
+            level=level[loud],
+            delay_s=self.heard.delay_s[loud],
+            window_s=self._window_s(),
+            same_s=2 * SAME_RANGE_M / self.shot.speed_m_s,
+            lobe=self._lobe,
+        )
 
     @functools.cached_property
     def quietest(self) -> float:
         """Lowest of the highest amplitudes at each range of the image, at least its floor."""
-        return float(np.min(self.beside(np.linspace(*self._window_s(), _LAGS))))
+        return float(np.min(self.surroundings().at(np.linspace(*self._window_s(), _LAGS))))
 
     def _window_s(self) -> tuple[float, float]:
         first_m, last_m = self.settings.processing.range_m
@@ -222,7 +204,7 @@ class Sight:
         wave = 2 * math.pi * float(self.frequency_hz @ self.power) / self.shot.speed_m_s
         beams = np.exp(-1j * wave * (_directions(self.settings) @ self._positions_m.T))
         taken = np.zeros(len(direction))
-        for part in _parts(len(direction), max(beams.shape)):
+        for part in parts(len(direction), max(beams.shape)):
             waves = np.exp(1j * wave * (direction[part] @ self._positions_m.T))
             taken[part] = np.max(np.abs(beams @ waves.T), axis=0, initial=0.0)
         return taken / len(self._positions_m)
@@ -318,58 +300,79 @@ class Sight:
     def _positions_m(self) -> Floats:
         return self.shot.layout.positions_m[self.shot.channels]
 
-    def envelope_change(self, before: Echoes, after: Echoes, turn_s: Floats | None = None) -> Floats:
-        """Return the greatest change of the image by the same paths with other effects: (path,) float64.
+    def most_changed(
+        self,
+        before: Echoes,
+        after: Echoes,
+        around: Surroundings,
+        reach: Floats,
+        *,
+        turn_s: Floats | None = None,
+        aside: Floats | float = 0.0,
+    ) -> tuple[int, float]:
+        """Return the path that changes most relative to the image around it, and the ratio.
 
         The envelope of each path changes. Where a path overlaps the side lobes of others, the phase of its carrier
-        also matters. Its phase shift follows from ``turn_s``, or from the change of the delay by default.
+        also matters.
+
+        Parameters
+        ----------
+        before, after : Echoes
+            The same paths with different effects.
+        around : Surroundings
+            The image to which each change is relative.
+        reach : (path,) float64
+            Fraction of each echo that reaches into the range window.
+        turn_s : (path,) float64, optional
+            Time by which each carrier is shifted; the change of the delay by default.
+        aside : (path,) float64, optional
+            Other changes of each path; 0 by default.
         """
-        if not len(before):
-            return np.zeros(0)
         shift_s = after.delay_s - before.delay_s
         turn_s = np.abs(shift_s) if turn_s is None else turn_s
         centre_hz = float(self.frequency_hz @ self.power)
         turn = np.where(turn_s * centre_hz < 0.5, 2 * np.abs(np.sin(math.pi * centre_hz * turn_s)), 2.0)
-        near_s = np.linspace(-1.5, 1.5, 61) / np.ptp(self.frequency_hz)
         # Beyond a few pulse lengths the two no longer overlap, and the sampled spectrum would repeat them.
         shift_s = np.clip(shift_s, -8 / np.ptp(self.frequency_hz), 8 / np.ptp(self.frequency_hz))
-        change = turn * self._met(before)
-        turns = np.exp(2j * math.pi * np.outer(self.frequency_hz - self.frequency_hz.mean(), near_s))
-        later = np.exp(-2j * math.pi * np.outer(shift_s, self.frequency_hz - self.frequency_hz.mean()))
+        offset_hz = self.frequency_hz - self.frequency_hz.mean()
         was, is_now = before.gain * self.power, after.gain * self.power
-        coverage = self.coverage(before.direction)
-        for one, other in ((was, is_now * later), (was / later, is_now)):  # around the first pulse, then the second
-            own = np.max(np.abs(np.abs(one @ turns) - np.abs(other @ turns)), axis=1) * coverage
-            change = np.maximum(change, own)
-        return np.asarray(change)
+        later = np.exp(-2j * math.pi * np.outer(shift_s, offset_hz)) if shift_s.any() else np.ones((len(before), 1))
+        near_s = np.linspace(-1.5, 1.5, 61) / np.ptp(self.frequency_hz)
+        turns = np.exp(2j * math.pi * np.outer(offset_hz, near_s))
+
+        def ratio(part: NDArray[np.intp]) -> Floats:
+            change = np.maximum(turn[part] * self._met(before, part) if turn[part].any() else 0.0, aside_of[part])
+            # Around the first pulse, then around the second; they coincide without a shift.
+            both = [(was[part], is_now[part] * later[part]), (was[part] * later[part].conj(), is_now[part])]
+            for one, other in both if shift_s[part].any() else both[:1]:
+                own = np.max(np.abs(envelope(one, turns) - envelope(other, turns)), axis=1) * before.coverage[part]
+                change = np.maximum(change, own)
+            return np.asarray(change * reach[part] / around.at(before.delay_s[part]))
+
+        aside_of = np.broadcast_to(np.asarray(aside, dtype=np.float64), reach.shape)
+        most = np.sum(np.abs(was - is_now * later), axis=1) * before.coverage
+        most = np.maximum(np.maximum(most, aside_of), turn * _SIDE_LOBE * self._lobe(np.zeros(1)) * before.level)
+        return greatest(most * reach / around.floor, ratio)
 
     def turn_change(self, seen: Echoes, angle_rad: Floats) -> Floats:
         """Return the change of the image by a small change of the echoes' directions: (path,) float64."""
         aperture_m = math.sqrt(float(np.mean(np.sum(self._positions_m**2, axis=1))))
         wave = 2 * math.pi * float(self.frequency_hz @ self.power) / self.shot.speed_m_s
-        return np.asarray(self.levels(seen) * np.minimum(wave * aperture_m * angle_rad, 1.0))
+        return np.asarray(seen.level * np.minimum(wave * aperture_m * angle_rad, 1.0))
 
-    def _met(self, seen: Echoes) -> Floats:
-        """Return the highest overlap of each path with the side lobes of others: (path,) float64."""
-        level, others = self.levels(seen), self.levels(self.heard)
+    def _met(self, seen: Echoes, places: NDArray[np.intp]) -> Floats:
+        """Return the highest overlap of some paths with the side lobes of others: (path,) float64."""
+        level, delay_s, direction = seen.level[places], seen.delay_s[places], seen.direction[places]
+        heard = self.heard
         strongest = np.zeros(len(level))
-        for part in _parts(len(level), 3 * len(others)):
-            apart_s = np.abs(seen.delay_s[part, None] - self.heard.delay_s)
-            same = (apart_s == 0) & np.all(seen.direction[part, None] == self.heard.direction, axis=-1)
-            met = np.where(same, 0.0, _SIDE_LOBE * np.minimum(level[part, None], others) * self._lobe(apart_s))
+        for part in parts(len(level), 3 * len(heard)):
+            apart_s = np.abs(delay_s[part, None] - heard.delay_s)
+            met = _SIDE_LOBE * np.minimum(level[part, None], heard.level) * self._lobe(apart_s)
+            row, column = np.nonzero(apart_s == 0)
+            same = np.all(direction[part][row] == heard.direction[column], axis=-1)
+            met[row[same], column[same]] = 0.0
             strongest[part] = np.max(met, axis=1, initial=0.0)
         return strongest
-
-
-def change_db(part: Floats, beside: Floats) -> float:
-    """Return the greatest change in decibels of the amplitudes ``beside`` if ``part`` is added; 0 if empty."""
-    return float(20 * np.log10(1 + np.max(part / beside, initial=0.0)))
-
-
-def _parts(n_rows: int, n_columns: int) -> Iterator[slice]:
-    """Yield slices of a table's rows that fit into memory."""
-    rows = max(1, _TABLE_SIZE // max(1, n_columns))
-    return (slice(first, first + rows) for first in range(0, n_rows, rows))
 
 
 @functools.lru_cache(maxsize=16)

@@ -9,55 +9,66 @@ from numpy.typing import NDArray
 
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.geometry import Layout, microphones
+from ertis_numba.simulation.cache import Cache
 from ertis_numba.simulation.scene import Scene
 from ertis_numba.simulation.sensors import Sensor
 
-__all__ = ["Mirror", "ReceiverPose", "Snapshot", "Targets", "TransmitterPose", "snapshot"]
+__all__ = ["Mirrors", "Receivers", "Snapshot", "Targets", "Transmitters", "snapshot"]
 
 Floats = NDArray[np.float64]
 Found = TypeVar("Found")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TransmitterPose:
-    """Pose of an emitter, or of its mirror image in walls.
+class Transmitters:
+    """Poses of an emitter and of its mirror images in walls.
 
     Attributes
     ----------
-    position_m, velocity_m_s : (axis,) float64
-    facing : (axis,) float64
-        Unit vector along the emitter's axis.
-    sways_m_s : tuple of (axis,) float64
-        Velocity that the motion of each wall adds to the image, starting at the emitter.
-    walls : tuple of str
-        Names of the walls in the order in which the sound meets them.
-    reflection : float
+    position_m, velocity_m_s : (image, axis) float64
+    facing : (image, axis) float64
+        Unit vectors along the emitter's axis.
+    sways_m_s : (wall, image, axis) float64
+        Velocity that the motion of each wall adds to the image, starting at the emitter; 0 beyond an image's last wall.
+    walls : tuple of tuple of str
+        Names of each image's walls in the order in which the sound meets them.
+    reflection : (image,) float64
         Amplitude reflection factor of these walls.
     """
 
     position_m: Floats
     velocity_m_s: Floats
     facing: Floats
-    sways_m_s: tuple[Floats, ...] = ()
-    walls: tuple[str, ...] = ()
-    reflection: float = 1.0
+    sways_m_s: Floats = field(default_factory=lambda: np.zeros((0, 1, 3)))
+    walls: tuple[tuple[str, ...], ...] = ((),)
+    reflection: Floats = field(default_factory=lambda: np.ones(1))
+
+    @property
+    def centre_m(self) -> Floats:
+        """The positions: (image, axis) float64."""
+        return self.position_m
+
+    def chosen(self, images: NDArray[np.intp]) -> Self:
+        """Return a selection of images by index, which may repeat: (image,) int."""
+        return replace(self, **_arrays(self, images))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ReceiverPose:
-    """Poses of the microphones of a sensor, or of their mirror image in walls.
+class Receivers:
+    """Poses of the microphones of a sensor and of their mirror images in walls.
 
     Attributes
     ----------
-    positions_m : (mic, axis) float64
-    centre_m, velocity_m_s : (axis,) float64
-    axes : (3, axis) float64
+    positions_m : (image, mic, axis) float64
+    centre_m, velocity_m_s : (image, axis) float64
+    axes : (image, 3, axis) float64
         The sensor's x, y and z as unit vectors. An odd number of reflections makes them left-handed.
-    sways_m_s : tuple of (axis,) float64
-        Velocity that the motion of each wall adds to the image, starting at the microphones.
-    walls : tuple of str
-        Names of the walls in the order in which the sound meets them.
-    reflection : float
+    sways_m_s : (wall, image, axis) float64
+        Velocity that the motion of each wall adds to the image, starting at the microphones; 0 beyond an image's last
+        wall.
+    walls : tuple of tuple of str
+        Names of each image's walls in the order in which the sound meets them.
+    reflection : (image,) float64
         Amplitude reflection factor of these walls.
     """
 
@@ -65,9 +76,13 @@ class ReceiverPose:
     centre_m: Floats
     velocity_m_s: Floats
     axes: Floats
-    sways_m_s: tuple[Floats, ...] = ()
-    walls: tuple[str, ...] = ()
-    reflection: float = 1.0
+    sways_m_s: Floats = field(default_factory=lambda: np.zeros((0, 1, 3)))
+    walls: tuple[tuple[str, ...], ...] = ((),)
+    reflection: Floats = field(default_factory=lambda: np.ones(1))
+
+    def chosen(self, images: NDArray[np.intp]) -> Self:
+        """Return a selection of images by index, which may repeat: (image,) int."""
+        return replace(self, **_arrays(self, images))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,28 +121,31 @@ class Targets:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Mirror:
-    """Wall that reflects sound.
+class Mirrors:
+    """Walls that reflect sound.
 
     Attributes
     ----------
-    name : str
-    point_m, velocity_m_s : (axis,) float64
-        Centre of the wall, and its velocity.
-    axes : (3, axis) float64
+    names : tuple of str
+    points_m, velocities_m_s : (wall, axis) float64
+        Centres of the walls, and their velocities.
+    axes : (wall, 3, axis) float64
         Normal, width and height as unit vectors.
-    half_size_m : (2,) float64
+    half_sizes_m : (wall, 2) float64
         Half of width and height; infinite for an unbounded wall.
-    reflection : float
+    reflection : (wall,) float64
         Amplitude reflection factor.
     """
 
-    name: str
-    point_m: Floats
-    velocity_m_s: Floats
+    names: tuple[str, ...]
+    points_m: Floats
+    velocities_m_s: Floats
     axes: Floats
-    half_size_m: Floats
-    reflection: float
+    half_sizes_m: Floats
+    reflection: Floats
+
+    def __len__(self) -> int:
+        return len(self.names)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,15 +163,18 @@ class Snapshot:
         Microphones of the sensor.
     channels : (mic,) int64
         Channels of the microphones.
-    receiver : ReceiverPose
-    transmitters : tuple of TransmitterPose
-        Emitters, one per sensor of the scene.
+    receiver : Receivers
+        The microphones, without mirror images.
+    transmitters : tuple of Transmitters
+        Emitters without mirror images, one per sensor of the scene.
     targets : Targets
-    mirrors : tuple of Mirror
+    mirrors : Mirrors
     speed_m_s : float
         Speed of sound.
-    memory : dict
-        Cache of intermediate results for this snapshot.
+    token : object
+        Identity of the snapshot in the cache.
+    cache : Cache
+        Intermediate results, which snapshots may share.
     """
 
     scene: Scene
@@ -161,19 +182,17 @@ class Snapshot:
     time_s: float
     layout: Layout
     channels: NDArray[np.int64]
-    receiver: ReceiverPose
-    transmitters: tuple[TransmitterPose, ...]
+    receiver: Receivers
+    transmitters: tuple[Transmitters, ...]
     targets: Targets
-    mirrors: tuple[Mirror, ...]
+    mirrors: Mirrors
     speed_m_s: float
-    memory: dict[object, Any] = field(default_factory=dict, repr=False)
+    token: object = field(default_factory=object, repr=False)
+    cache: Cache = field(default_factory=Cache, repr=False)
 
     def once(self, key: object, make: Callable[[], Found]) -> Found:
-        """Return the cached result of ``make`` for this key; the first call computes it."""
-        if key not in self.memory:
-            self.memory[key] = make()
-        found: Found = self.memory[key]
-        return found
+        """Return the result of ``make`` for this key, computed at the first call unless the cache discards it."""
+        return self.cache.once((self.token, key), make)
 
     @property
     def number(self) -> int:
@@ -181,23 +200,23 @@ class Snapshot:
         return self.scene.sensors.index(self.sensor)
 
     @property
-    def transmitter(self) -> TransmitterPose:
+    def transmitter(self) -> Transmitters:
         """The receiving sensor's own emitter."""
         return self.transmitters[self.number]
 
     def of_mics(self, mics: slice) -> Self:
         """Return a copy with some of the microphones."""
-        receiver = replace(self.receiver, positions_m=self.receiver.positions_m[mics])
-        return replace(self, receiver=receiver, channels=self.channels[mics], memory={})
+        receiver = replace(self.receiver, positions_m=self.receiver.positions_m[:, mics])
+        return replace(self, receiver=receiver, channels=self.channels[mics], token=(self.token, mics.start, mics.stop))
 
     def at_centre(self) -> Self:
         """Return a copy with one microphone at the centre of the array."""
-        receiver = replace(self.receiver, positions_m=self.receiver.centre_m[None])
-        return self.once("centre", lambda: replace(self, receiver=receiver, memory={}))
+        receiver = replace(self.receiver, positions_m=self.receiver.centre_m[:, None])
+        return replace(self, receiver=receiver, token=(self.token, "centre"))
 
 
-def snapshot(scene: Scene, sensor: Sensor, time_s: float) -> Snapshot:
-    """Return the scene at a time in seconds, for one receiving sensor."""
+def snapshot(scene: Scene, sensor: Sensor, time_s: float, cache: Cache | None = None) -> Snapshot:
+    """Return the scene at a time in seconds, for one receiving sensor; it may share a cache with others."""
     layout = microphones(sensor.array)
     place, rotation = sensor.path(), sensor.rotation()
     centre_m = place.position_at(time_s)
@@ -207,33 +226,36 @@ def snapshot(scene: Scene, sensor: Sensor, time_s: float) -> Snapshot:
         time_s=time_s,
         layout=layout,
         channels=np.flatnonzero(layout.enabled),
-        receiver=ReceiverPose(
-            positions_m=centre_m + layout.enabled_positions_m @ rotation.T,
-            centre_m=centre_m,
-            velocity_m_s=place.velocity_at(time_s),
-            axes=rotation.T,
+        receiver=Receivers(
+            positions_m=(centre_m + layout.enabled_positions_m @ rotation.T)[None],
+            centre_m=centre_m[None],
+            velocity_m_s=place.velocity_at(time_s)[None],
+            axes=rotation.T[None],
         ),
         transmitters=tuple(
-            TransmitterPose(
-                position_m=other.path().position_at(time_s),
-                velocity_m_s=other.path().velocity_at(time_s),
-                facing=other.rotation()[:, 0],
+            Transmitters(
+                position_m=other.path().position_at(time_s)[None],
+                velocity_m_s=other.path().velocity_at(time_s)[None],
+                facing=other.rotation()[:, 0][None],
             )
             for other in scene.sensors
         ),
         targets=_targets(scene, time_s),
-        mirrors=tuple(
-            Mirror(
-                name=name,
-                point_m=wall.position_at(time_s),
-                velocity_m_s=wall.velocity_at(time_s),
-                axes=wall.axes(),
-                half_size_m=np.array(wall.size_m or (np.inf, np.inf)) / 2,
-                reflection=10 ** (wall.reflection_db / 20),
-            )
-            for name, wall in scene.all_walls()
-        ),
+        mirrors=_mirrors(scene, time_s),
         speed_m_s=sound_speed_m_s(sensor.air),
+        cache=cache or Cache(),
+    )
+
+
+def _mirrors(scene: Scene, time_s: float) -> Mirrors:
+    walls = scene.all_walls()
+    return Mirrors(
+        names=tuple(name for name, _ in walls),
+        points_m=np.array([wall.position_at(time_s) for _, wall in walls]).reshape(-1, 3),
+        velocities_m_s=np.array([wall.velocity_at(time_s) for _, wall in walls]).reshape(-1, 3),
+        axes=np.array([wall.axes() for _, wall in walls]).reshape(-1, 3, 3),
+        half_sizes_m=np.array([wall.size_m or (np.inf, np.inf) for _, wall in walls]).reshape(-1, 2) / 2,
+        reflection=10 ** (np.array([wall.reflection_db for _, wall in walls], dtype=np.float64) / 20),
     )
 
 
@@ -254,3 +276,14 @@ def _targets(scene: Scene, time_s: float) -> Targets:
         diameter_m=np.array([p.diameter_m for p in scene.points] + [0.0 for _ in scene.spheres]),
         normals=np.array([p.normal_at(time_s) for p in scene.points] + [none for _ in scene.spheres]).reshape(-1, 3),
     )
+
+
+def _arrays(poses: Transmitters | Receivers, images: NDArray[np.intp]) -> dict[str, Any]:
+    """Return the fields of a selection of images."""
+    arrays = {each.name: getattr(poses, each.name) for each in fields(poses)}
+    walls, sways_m_s = arrays.pop("walls"), arrays.pop("sways_m_s")
+    return {
+        "walls": tuple(walls[image] for image in images),
+        "sways_m_s": sways_m_s[:, images],
+        **{name: values[images] for name, values in arrays.items()},
+    }

@@ -81,10 +81,12 @@ def _levels(shot: Snapshot, sight: Sight, number: int) -> Floats:
 def _velocity_m_s(paths: Paths) -> Floats:
     """Return velocities in the sensor frame: (path, axis) float64."""
     transmitter, receiver, targets = paths.transmitter, paths.receiver, paths.targets
-    if len(targets) and not (transmitter.walls or receiver.walls):
-        return np.asarray((targets.velocities_m_s - receiver.velocity_m_s) @ receiver.axes.T)
     leaving, arriving = np.mean(paths.leaving, axis=1), np.mean(paths.arriving, axis=1)
-    corner_m_s = targets.velocities_m_s if len(targets) else np.broadcast_to(transmitter.velocity_m_s, leaving.shape)
+    corner_m_s = targets.velocities_m_s if len(targets) else transmitter.velocity_m_s
     longer_m_s = np.sum(leaving * (corner_m_s - transmitter.velocity_m_s), axis=1)
     longer_m_s += np.sum(arriving * (receiver.velocity_m_s - corner_m_s), axis=1)
-    return np.asarray(-arriving @ receiver.axes.T * (longer_m_s / 2)[:, None])
+    velocity_m_s = -arriving * (longer_m_s / 2)[:, None]
+    if len(targets):
+        direct = [not (before or after) for before, after in zip(transmitter.walls, receiver.walls, strict=True)]
+        velocity_m_s[direct] = (targets.velocities_m_s - receiver.velocity_m_s)[direct]
+    return np.asarray(np.einsum("pkx,px->pk", receiver.axes, velocity_m_s))

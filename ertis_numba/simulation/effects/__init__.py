@@ -14,7 +14,7 @@ place               arguments                                             result
 ``other_emitters``  shot                                                  other sensors whose calls arrive, as indices
 ``transmitter``     shot, number, transmitter                             pose of the emitter of sensor ``number``
 ``views``           shot, number, views                                   ends of paths, and their mirror images
-``turns``           first, second, targets, chosen                        paths over targets, instead of `by_targets`
+``turns``           first, second, targets                                paths over targets, instead of `by_targets`
 ``gain``            shot, paths, emitter, frequency_hz                    factor, broadcast to (path, mic, frequency)
 ``times``           shot, paths, times                                    delay and stretch of each path
 ``clock_times``     shot, number, delay_s, stretch                        the same on the receiver's clock

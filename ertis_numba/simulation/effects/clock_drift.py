@@ -1,12 +1,13 @@
 """Sample clocks that run fast or slow."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.simulation.estimates import Estimate
-from ertis_numba.simulation.sight import Sight, change_db
+from ertis_numba.simulation.sight import Sight
 from ertis_numba.simulation.snapshot import Snapshot
 
 __all__ = ["clock_times", "estimate", "since_sync_s"]
@@ -62,7 +63,8 @@ def estimate(sight: Sight) -> Estimate | None:
         moved = replace(seen, delay_s=counted_s[:, 0])
         shift_s = moved.delay_s - seen.delay_s
         reach = np.maximum(sight.reach(seen.delay_s), sight.reach(moved.delay_s))
-        change = change_db(sight.envelope_change(seen, moved) * reach, sight.beside(seen.delay_s))
+        _, ratio = sight.most_changed(seen, moved, sight.surroundings(), reach)
+        change = 20 * math.log10(1 + ratio)
         if change >= worst.change_db:
             largest = shift_s[np.argmax(np.abs(shift_s))]
             reason = f"clock drift shifts the call of {sensors[number].name} by up to {1e9 * largest:+.3g} ns"

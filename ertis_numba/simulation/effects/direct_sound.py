@@ -7,8 +7,9 @@ from ertis_numba.simulation.arrivals import Arrivals, arrived, gains, transmitte
 from ertis_numba.simulation.effects.spreading import spreading
 from ertis_numba.simulation.estimates import Estimate
 from ertis_numba.simulation.paths import Paths, without_target
-from ertis_numba.simulation.sight import Sight, change_db
+from ertis_numba.simulation.sight import Sight
 from ertis_numba.simulation.snapshot import Snapshot
+from ertis_numba.simulation.surroundings import change_db
 
 __all__ = ["arrivals", "estimate"]
 
@@ -41,7 +42,7 @@ def estimate(sight: Sight) -> Estimate | None:
     time_s, level = sight.near_field(amplitude, paths.length_m[0] / sight.shot.speed_m_s)
     over_m = sight.settings.call.duration_s * sight.shot.speed_m_s / 2
     return Estimate(
-        change_db=change_db(level, sight.beside(time_s)),
+        change_db=change_db(level, sight.surroundings().at(time_s)),
         reason=f"{20 * math.log10(amplitude.mean()):.0f} dB at the microphones, ends at {over_m:.2f} m; "
         f"the image begins at {sight.settings.processing.range_m[0]:.2f} m",
     )

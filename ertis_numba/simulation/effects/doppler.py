@@ -1,5 +1,6 @@
 """Shift and stretch of the call due to motion."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -7,8 +8,8 @@ from numpy.typing import NDArray
 
 from ertis_numba.simulation.estimates import Estimate
 from ertis_numba.simulation.paths import Paths
-from ertis_numba.simulation.sight import Sight, change_db
-from ertis_numba.simulation.snapshot import ReceiverPose, Snapshot, TransmitterPose
+from ertis_numba.simulation.sight import Sight
+from ertis_numba.simulation.snapshot import Receivers, Snapshot, Transmitters
 
 __all__ = ["estimate", "times"]
 
@@ -40,13 +41,11 @@ def _moved(paths: Paths, speed_m_s: float) -> tuple[Floats, Floats]:
 def _arrival_s(paths: Paths, start_s: float, speed_m_s: float) -> Floats:
     """Return the arrival time of sound emitted at a given time: (path, mic) float64."""
     transmitter, receiver = paths.transmitter, paths.receiver
-    sent_m = transmitter.position_m + start_s * _own_m_s(transmitter)
-    target_m = transmitter.position_m + paths.first_m[..., None] * paths.leaving
+    sent_m = (transmitter.position_m + start_s * _own_m_s(transmitter))[:, None]
+    target_m = transmitter.position_m[:, None] + paths.first_m[..., None] * paths.leaving
     met_s = start_s + paths.first_m / speed_m_s
     arrival_s = met_s + paths.second_m / speed_m_s
-    transmitter_sways, receiver_sways = (
-        any(np.any(sway_m_s) for sway_m_s in end.sways_m_s) for end in (transmitter, receiver)
-    )
+    transmitter_sways, receiver_sways = (bool(np.any(end.sways_m_s)) for end in (transmitter, receiver))
     for _ in range(_ROUNDS):
         before_s, from_m = arrival_s, sent_m
         if transmitter_sways:  # the sound meets a wall after the same fraction of the path as without motion
@@ -57,7 +56,7 @@ def _arrival_s(paths: Paths, start_s: float, speed_m_s: float) -> Floats:
         if len(paths.targets):
             met_m = target_m + met_s[..., None] * paths.targets.velocities_m_s[:, None, :]
             met_s = start_s + _length(met_m - from_m) / speed_m_s
-        receiver_m = receiver.positions_m + arrival_s[..., None] * _own_m_s(receiver)
+        receiver_m = receiver.positions_m + arrival_s[..., None] * _own_m_s(receiver)[:, None]
         if receiver_sways:
             back = _mean(arrival_s - met_s, paths.second_m)
             receiver_m = receiver_m + _swayed_m(receiver, np.mean(arrival_s, axis=1) - paths.receiver_corners_m * back)
@@ -67,20 +66,17 @@ def _arrival_s(paths: Paths, start_s: float, speed_m_s: float) -> Floats:
     return arrival_s
 
 
-def _own_m_s(end: TransmitterPose | ReceiverPose) -> Floats:
-    """Return the velocity of an image without the contribution of moving walls."""
-    return np.asarray(end.velocity_m_s - sum(end.sways_m_s, np.zeros(3)))
+def _own_m_s(end: Transmitters | Receivers) -> Floats:
+    """Return the velocity of each image without the contribution of moving walls: (path, axis) float64."""
+    return np.asarray(end.velocity_m_s - np.sum(end.sways_m_s, axis=0))
 
 
-def _swayed_m(end: TransmitterPose | ReceiverPose, met_s: Floats) -> Floats:
-    """Return the displacement of an image by moving walls: (path, 1, axis) float64.
+def _swayed_m(end: Transmitters | Receivers, met_s: Floats) -> Floats:
+    """Return the displacement of each image by moving walls: (path, 1, axis) float64.
 
     ``met_s`` holds the times at which the sound meets the walls, (wall, path).
     """
-    sway_m = np.zeros((met_s.shape[1], 1, 3))
-    for velocity_m_s, at_s in zip(end.sways_m_s, met_s, strict=True):
-        sway_m += at_s[:, None, None] * velocity_m_s
-    return sway_m
+    return np.asarray(np.sum(met_s[..., None] * end.sways_m_s, axis=0)[:, None])
 
 
 def _mean(time_s: Floats, length_m: Floats) -> Floats:
@@ -119,11 +115,17 @@ def estimate(sight: Sight) -> Estimate | None:
     shift_s, turn_s, stretch, aside_rad = (np.concatenate(parts) for parts in (shifts_s, turns_s, stretches, asides))
     own = sight.heard
     moved = replace(own, delay_s=own.delay_s + shift_s)
-    change = np.maximum(sight.envelope_change(own, moved, turn_s), sight.turn_change(own, aside_rad))
-    change *= sight.reach(own.delay_s)
+    _, ratio = sight.most_changed(
+        own,
+        moved,
+        sight.surroundings(),
+        sight.reach(own.delay_s),
+        turn_s=turn_s,
+        aside=sight.turn_change(own, aside_rad),
+    )
     worst = int(np.argmax(np.abs(shift_s)))
     return Estimate(
-        change_db=change_db(change, sight.beside(own.delay_s)),
+        change_db=20 * math.log10(1 + ratio),
         sure=200.0,
         reason=f"{own.names[worst]}, {_reported_m_s(float(stretch[worst]), shot.speed_m_s)}, shifts by "
         f"{shift_s[worst] * shot.speed_m_s / 2 * 1000:.3g} mm",

@@ -26,7 +26,7 @@ def gain(
     if not emitter.diameter_m:
         return 1.0
     leaving = paths.leaving[:, :1] if len(paths.targets) and not paths.surface else paths.leaving
-    cos = leaving @ paths.transmitter.facing
+    cos = np.einsum("pmx,px->pm", leaving, paths.transmitter.facing)
     sin = np.sqrt(np.maximum(1 - cos**2, 0.0))
     pattern = piston(math.pi * emitter.diameter_m / shot.speed_m_s * sin[..., None] * frequency_hz)
     return np.asarray(np.where(cos[..., None] >= 0, pattern, 0.0))

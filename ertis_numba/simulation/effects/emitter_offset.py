@@ -6,12 +6,12 @@ import numpy as np
 
 from ertis_numba.simulation.estimates import Estimate, filtered
 from ertis_numba.simulation.sight import Sight
-from ertis_numba.simulation.snapshot import Snapshot, TransmitterPose
+from ertis_numba.simulation.snapshot import Snapshot, Transmitters
 
 __all__ = ["estimate", "transmitter"]
 
 
-def transmitter(shot: Snapshot, number: int, transmitter: TransmitterPose) -> TransmitterPose:
+def transmitter(shot: Snapshot, number: int, transmitter: Transmitters) -> Transmitters:
     """Return a sensor's emitter at its mounting position, ``o + R p``.
 
     ``o`` is the sensor's origin, ``R`` its rotation and ``p`` the setting ``emitter.position_m``. A path is then

@@ -14,9 +14,10 @@ from ertis_numba.simulation.effects.spreading import spreading
 from ertis_numba.simulation.estimates import Estimate
 from ertis_numba.simulation.paths import Paths, without_target
 from ertis_numba.simulation.placed import Placed
-from ertis_numba.simulation.sight import Sight, change_db
-from ertis_numba.simulation.snapshot import Snapshot, TransmitterPose
+from ertis_numba.simulation.sight import Sight
+from ertis_numba.simulation.snapshot import Snapshot, Transmitters
 from ertis_numba.simulation.sources import Noise, Sonar, Tone
+from ertis_numba.simulation.surroundings import change_db
 
 __all__ = ["arrivals", "estimate", "loudness", "sounds"]
 
@@ -52,8 +53,10 @@ def loudness(shot: Snapshot) -> tuple[float, float]:
 
 def _way_from(shot: Snapshot, source: Placed) -> Paths:
     """Return the direct path from an omnidirectional source to the microphones."""
-    transmitter = TransmitterPose(
-        position_m=source.position_at(shot.time_s), velocity_m_s=source.velocity_at(shot.time_s), facing=np.zeros(3)
+    transmitter = Transmitters(
+        position_m=source.position_at(shot.time_s)[None],
+        velocity_m_s=source.velocity_at(shot.time_s)[None],
+        facing=np.zeros((1, 3)),
     )
     return without_target(transmitter, shot.receiver, shot.targets)
 
@@ -123,7 +126,7 @@ def estimate(sight: Sight) -> Estimate | None:
         for number, source in enumerate(getattr(scene, kind)):
             paths = _way_from(shot, source)
             amplitude = float(10 ** (source.level_db / 20) * np.mean(spreading(paths)))
-            direction = -np.mean(paths.arriving, axis=1) @ paths.receiver.axes.T
+            direction = -np.mean(paths.arriving, axis=1) @ paths.receiver.axes[0].T
             level = float(sight.coverage(direction)[0])
             if kind == "tones":
                 level *= sight.of_tone(amplitude, source.frequency_hz)

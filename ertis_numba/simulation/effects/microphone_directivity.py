@@ -26,7 +26,7 @@ def gain(
     diameter_m = shot.sensor.electronics.microphone_diameter_m
     if not diameter_m:
         return 1.0
-    cos = -paths.arriving @ paths.receiver.axes[0]
+    cos = -np.einsum("pmx,px->pm", paths.arriving, paths.receiver.axes[:, 0])
     sin = np.sqrt(np.maximum(1 - cos**2, 0.0))
     pattern = piston(math.pi * diameter_m / shot.speed_m_s * sin[..., None] * frequency_hz)
     return np.asarray(np.where(cos[..., None] >= 0, pattern, 0.0))

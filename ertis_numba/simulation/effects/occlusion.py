@@ -1,11 +1,14 @@
 """Walls that block sound paths."""
 
+import math
+
 import numpy as np
 
 from ertis_numba.simulation.estimates import Estimate
 from ertis_numba.simulation.mirrors import End, Seen, Views, blocked
-from ertis_numba.simulation.sight import Sight, change_db
-from ertis_numba.simulation.snapshot import Mirror, Snapshot
+from ertis_numba.simulation.sight import Sight
+from ertis_numba.simulation.snapshot import Mirrors, Snapshot
+from ertis_numba.simulation.surroundings import greatest
 
 __all__ = ["estimate", "views"]
 
@@ -16,8 +19,8 @@ def views(shot: Snapshot, number: int, views: Views) -> Views:
     return _open(firsts, shot.mirrors), _open(seconds, shot.mirrors), _open(specular, shot.mirrors)
 
 
-def _open(seen: tuple[Seen[End], ...], mirrors: tuple[Mirror, ...]) -> tuple[Seen[End], ...]:
-    return tuple(Seen(way.end, way.exists & ~blocked(way, mirrors), way.corners_m, way.mirrors) for way in seen)
+def _open(seen: Seen[End], mirrors: Mirrors) -> Seen[End]:
+    return seen.chosen(~blocked(seen, mirrors))
 
 
 def estimate(sight: Sight) -> Estimate | None:
@@ -25,15 +28,17 @@ def estimate(sight: Sight) -> Estimate | None:
     if not sight.shot.mirrors:
         return None
     left = sight.echoes(sight.active | {"occlusion"})
-    hidden = np.array([name not in left.names for name in sight.heard.names], dtype=np.bool_)
+    still = set(left.names)
+    hidden = np.array([name not in still for name in sight.heard.names], dtype=np.bool_)
     if not hidden.any():
         return Estimate(change_db=0.0, reason="no wall blocks any path")
-    level = hidden * sight.levels(sight.heard) * sight.reach(sight.heard.delay_s)
+    delay_s = sight.heard.delay_s
+    level = hidden * sight.heard.level * sight.reach(delay_s)
     worst = int(np.argmax(level))
-    open_sight = Sight.of(sight.shot, sight.active | {"occlusion"})
-    beside = open_sight.beside(sight.heard.delay_s)
+    around = Sight.of(sight.shot, sight.active | {"occlusion"}).surroundings()
+    _, ratio = greatest(level / around.floor, lambda part: level[part] / around.at(delay_s[part]))
     return Estimate(
-        change_db=change_db(level, beside),
+        change_db=20 * math.log10(1 + ratio),
         reason=f"a wall blocks {sight.heard.names[worst]}"
         + (f" and {int(hidden.sum()) - 1} more" if hidden.sum() > 1 else ""),
     )

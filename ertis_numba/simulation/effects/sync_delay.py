@@ -1,5 +1,6 @@
 """Later start of each sensor along the SYNC chain."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +9,7 @@ from numpy.typing import NDArray
 from ertis_numba.constants import SYNC_STEP_S
 from ertis_numba.simulation.effects.cross_emission import other_emitters
 from ertis_numba.simulation.estimates import Estimate
-from ertis_numba.simulation.sight import Sight, change_db
+from ertis_numba.simulation.sight import Sight
 from ertis_numba.simulation.snapshot import Snapshot
 
 __all__ = ["clock_times", "estimate"]
@@ -38,8 +39,8 @@ def estimate(sight: Sight) -> Estimate | None:
         foreign = sight.of_emitter(number, sight.active)
         late_s = _start_s(sight.shot, number)
         moved = replace(foreign, delay_s=foreign.delay_s + late_s)
-        shift = sight.envelope_change(foreign, moved) * sight.reach(foreign.delay_s)
-        change = change_db(shift, sight.beside(foreign.delay_s))
+        _, ratio = sight.most_changed(foreign, moved, sight.surroundings(), sight.reach(foreign.delay_s))
+        change = 20 * math.log10(1 + ratio)
         if change > worst.change_db:
             name = sight.shot.scene.sensors[number].name
             worst = Estimate(

@@ -14,7 +14,7 @@ from ertis_numba.simulation.mirrors import Seen
 from ertis_numba.simulation.paths import Paths, by_targets, turning, unit
 from ertis_numba.simulation.sensors import Emitter
 from ertis_numba.simulation.sight import Sight
-from ertis_numba.simulation.snapshot import ReceiverPose, Snapshot, Targets, TransmitterPose
+from ertis_numba.simulation.snapshot import Receivers, Snapshot, Targets, Transmitters
 
 __all__ = ["estimate", "gain", "turns"]
 
@@ -25,9 +25,7 @@ _ORDERS = np.arange(int(_LARGE) + 15)  # beyond k a the terms fall faster than e
 _FAR = 0.02  # below this u, the far field of a disc is accurate to a few thousandths
 
 
-def turns(
-    first: Seen[TransmitterPose], second: Seen[ReceiverPose], targets: Targets, chosen: NDArray[np.intp]
-) -> Paths:
+def turns(first: Seen[Transmitters], second: Seen[Receivers], targets: Targets) -> Paths:
     """Return paths that turn on the surface of spheres instead of at their centres.
 
     The arguments are those of `by_targets`.
@@ -37,11 +35,11 @@ def turns(
     radius / distance.
     """
     if not np.any(targets.radius_m):
-        return by_targets(first, second, targets, chosen)
-    centre_m = targets.positions_m[chosen, None, :]
-    outwards = unit(unit(first.end.position_m - centre_m) + unit(second.end.positions_m - centre_m))
-    turns_m = centre_m + targets.radius_m[chosen, None, None] * outwards
-    return turning(first, second, targets, chosen, turns_m, surface=True)
+        return by_targets(first, second, targets)
+    centre_m = targets.positions_m[first.place, None, :]
+    outwards = unit(unit(first.images.position_m[:, None] - centre_m) + unit(second.images.positions_m - centre_m))
+    turns_m = centre_m + targets.radius_m[first.place, None, None] * outwards
+    return turning(first, second, targets, turns_m, surface=True)
 
 
 def gain(
@@ -62,7 +60,7 @@ def gain(
     small = (targets.radius_m > 0) & (targets.radius_m * lowest < _LARGE)
     if small.any():
         cos_turn = np.sum(paths.leaving[small] * paths.arriving[small], axis=-1)
-        found[small] = _rigid_sphere(targets.radius_m[small, None] * wave, cos_turn)
+        found[small] = _rigid_sphere(targets.radius_m[small], wave, cos_turn)
     is_disc = targets.diameter_m > 0
     if is_disc.any():
         found[is_disc] = _disc_pattern(paths, is_disc, wave)
@@ -116,7 +114,7 @@ def _nodes(count: int) -> tuple[Floats, Floats]:
     return places, weights
 
 
-def _rigid_sphere(size: Floats, cos_turn: Floats) -> NDArray[np.complex128]:
+def _rigid_sphere(radius_m: Floats, wave: Floats, cos_turn: Floats) -> NDArray[np.complex128]:
     """Return the echo relative to that of a curved mirror: (path, mic, frequency) complex128.
 
     The echo is the partial-wave series of a rigid sphere in a plane wave,
@@ -127,21 +125,35 @@ def _rigid_sphere(size: Floats, cos_turn: Floats) -> NDArray[np.complex128]:
 
     Parameters
     ----------
-    size : (path, frequency) float64
-        ``k a``, wave number times radius.
+    radius_m : (path,) float64
+    wave : (frequency,) float64
+        Wave numbers.
     cos_turn : (path, mic) float64
         Cosine of the scattering angle Θ; -1 is backscatter.
     """
-    wanted = (size > 0) & (size < _LARGE)
-    safe = np.where(wanted, size, 1.0)
-    terms = np.stack([_terms(row.tobytes()) for row in safe], axis=1)
-    legendre = scipy.special.eval_legendre(_ORDERS[:, None, None], cos_turn)
-    # Summed without BLAS, because starting its threads takes longer than these sums.
-    series = np.einsum("opm,opf->pmf", legendre, terms)
-    back = 2 * np.sqrt(np.maximum((1 - cos_turn) / 2, 0.0))  # extra path to the centre, in radii
-    ratio = -2j / safe[:, None] * series * np.exp(-1j * back[..., None] * safe[:, None])
-    weight = np.where(wanted, np.clip((_LARGE - safe) / (_LARGE - _FADES), 0.0, 1.0), 0.0)
-    return np.asarray(1 + weight[:, None] * (ratio - 1))
+    found = np.empty((*cos_turn.shape, len(wave)), dtype=np.complex128)
+    for radius in np.unique(radius_m):
+        chosen = radius_m == radius
+        size, cos = radius * wave, cos_turn[chosen]
+        wanted = (size > 0) & (size < _LARGE)
+        safe = np.where(wanted, size, 1.0)
+        legendre, terms = _legendre(cos.ravel()), _terms(safe.tobytes())
+        # Products of real matrices: a complex one would convert the polynomials.
+        series = (legendre.T @ terms.real + 1j * (legendre.T @ terms.imag)).reshape(*cos.shape, -1)
+        back = 2 * np.sqrt(np.maximum((1 - cos) / 2, 0.0))  # extra path to the centre, in radii
+        ratio = -2j / safe * series * np.exp(-1j * back[..., None] * safe)
+        weight = np.where(wanted, np.clip((_LARGE - safe) / (_LARGE - _FADES), 0.0, 1.0), 0.0)
+        found[chosen] = 1 + weight * (ratio - 1)
+    return found
+
+
+def _legendre(argument: Floats) -> Floats:
+    """Return the Legendre polynomials of all orders: (order, argument) float64."""
+    found = np.empty((len(_ORDERS), len(argument)))
+    found[0], found[1] = 1.0, argument
+    for order in _ORDERS[1:-1]:
+        found[order + 1] = ((2 * order + 1) * argument * found[order] - order * found[order - 1]) / (order + 1)
+    return found
 
 
 @functools.lru_cache(maxsize=64)

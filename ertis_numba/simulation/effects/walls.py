@@ -13,15 +13,15 @@ __all__ = ["estimate", "views"]
 def views(shot: Snapshot, number: int, views: Views) -> Views:
     """Return three views: the emitter and the microphones from the targets, and the emitter from the microphones.
 
-    Each tuple starts with the object itself. Its visible mirror images in up to ``max_reflections`` walls follow.
+    Each contains the direct ways, and those over up to ``max_reflections`` walls.
     """
-    transmitter, largest = views[0][0].end, shot.scene.max_reflections
+    transmitter, largest = views[0].ends, shot.scene.max_reflections
     return shot.once(
-        ("walls", number, *transmitter.position_m),
+        ("walls", number, *transmitter.position_m[0]),
         lambda: (
-            tuple(images(transmitter, shot.targets.positions_m, shot.mirrors, largest)),
-            tuple(images(shot.receiver, shot.targets.positions_m, shot.mirrors, largest)),
-            tuple(images(transmitter, shot.receiver.centre_m[None], shot.mirrors, largest)),
+            images(transmitter, shot.targets.positions_m, shot.mirrors, largest),
+            images(shot.receiver, shot.targets.positions_m, shot.mirrors, largest),
+            images(transmitter, shot.receiver.centre_m, shot.mirrors, largest),
         ),
     )
 
@@ -31,5 +31,6 @@ def estimate(sight: Sight) -> Estimate | None:
     if not sight.shot.mirrors:
         return None
     more = sight.echoes(sight.active | {"walls"})
-    new = np.array([name not in sight.heard.names for name in more.names], dtype=np.bool_)
+    heard = set(sight.heard.names)
+    new = np.array([name not in heard for name in more.names], dtype=np.bool_)
     return ghosts(sight, more, new, "{name} appears at {range:.2f} m, {level:+.1f} dB relative to the image there")

@@ -1,0 +1,84 @@
+"""Echoes of a scene as its image contains them."""
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.simulation.paths import Paths
+
+__all__ = ["Echoes", "Ways"]
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Echoes:
+    """Echoes in an image, one per path.
+
+    Attributes
+    ----------
+    names : tuple of str
+    gain : (path, frequency) float64 or complex128
+    delay_s : (path,) float64
+        Delay at the centre of the array.
+    direction : (path, axis) float64
+        Unit vector towards the source of the sound, in the sensor frame.
+    coverage : (path,) float64
+        Gain of the best beam for a wave from this direction, at most 1.
+    power : (frequency,) float64
+        Fraction of the matched call's power at each frequency.
+    """
+
+    names: tuple[str, ...]
+    gain: NDArray[np.inexact[Any]]
+    delay_s: Floats
+    direction: Floats
+    coverage: Floats
+    power: Floats
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @functools.cached_property
+    def level(self) -> Floats:
+        """The amplitude of each echo in the image: (path,) float64."""
+        return np.asarray(np.abs(self.gain @ self.power) * self.coverage)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Self], power: Floats) -> Self:
+        """Return the echoes of all parts."""
+        if len(parts) == 1:
+            return parts[0]
+        return cls(
+            names=tuple(name for part in parts for name in part.names),
+            gain=np.concatenate([np.zeros((0, len(power))), *(part.gain for part in parts)]),
+            delay_s=np.concatenate([np.zeros(0), *(part.delay_s for part in parts)]),
+            direction=np.concatenate([np.zeros((0, 3)), *(part.direction for part in parts)]),
+            coverage=np.concatenate([np.zeros(0), *(part.coverage for part in parts)]),
+            power=power,
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ways:
+    """Paths of one emitter's call to the centre of the array.
+
+    Attributes
+    ----------
+    paths : list of Paths
+    names : tuple of str
+    delay_s : (path,) float64
+    direction : (path, axis) float64
+    coverage : (path,) float64
+        The last four are those of `Echoes`, for the paths one after the other.
+    """
+
+    paths: list[Paths]
+    names: tuple[str, ...]
+    delay_s: Floats
+    direction: Floats
+    coverage: Floats
