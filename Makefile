@@ -72,6 +72,7 @@ bench: $(VENV)/ready  ## run the benchmarks and update the tables in the documen
 	$(BIN)/ertis bench simulation --update docs/reference/benchmarks.md
 	$(BIN)/ertis bench many --update docs/how-to/many.md
 	$(BIN)/ertis bench network --update docs/explanation/network-guarantees.md
+	$(BIN)/ertis bench latency --update docs/explanation/network-guarantees.md
 
 soak: $(VENV)/ready-to-test  ## test faults, kills, full disks and random scenes for hours; SEED=N repeats a run
 	$(BIN)/python -m tests.faults reliability --long $(if $(SEED),--seed $(SEED)) --update docs/explanation/reliability.md

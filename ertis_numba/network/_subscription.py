@@ -28,7 +28,7 @@ from ertis_numba.network.messages import (
     decode,
     encode,
 )
-from ertis_numba.network.products import Arrival, Header, ProductReader
+from ertis_numba.network.products import Arrival, Header, ProductReader, trace
 from ertis_numba.network.wakeup_socket import WakeupSocket
 
 __all__ = ["SubscriberCounts", "Subscription"]
@@ -268,6 +268,7 @@ class Subscription:
         numbers = self._numbers
         if header.number < numbers.next_number:  # Numbers must rise.
             self._restarted()
+        trace("received", header)
         item = numbers.reader.read(header, payload)
         arrived_ns, arrived_utc_ns = time.monotonic_ns(), time.time_ns()
         numbers.received += 1

@@ -22,6 +22,7 @@ from ertis_numba.network.processing.runner import Event, FinishedJob, Job, JobKi
 from ertis_numba.network.processing.sensors import Sensors
 from ertis_numba.network.processing.worker_pool import LocalWorkerPool
 from ertis_numba.network.status import Latencies, ProcessingStatus, Status
+from ertis_numba.network.trace import mark
 from ertis_numba.settings import Settings
 
 __all__ = ["ImageProcessing"]
@@ -258,6 +259,7 @@ class ImageProcessing:
                     self._sensors.failed(kind, text)
                     self._queues.drop_kind(kind, _UNUSABLE)
                 case FinishedJob(job=job, took_s=took_s):
+                    mark("image known", job.data.sensor, job.data.sequence)
                     self._took.add(1e3 * took_s)
                     self._order.done(job)
                     self._circuit_breaker.succeeded(job.data.sensor)

@@ -32,6 +32,7 @@ from ertis_numba.network.processing import pipe_messages
 from ertis_numba.network.processing.pipe_messages import ToPublisher
 from ertis_numba.network.processing.slots import SlotView
 from ertis_numba.network.processing.subscribers import QueuedProduct, Subscribers
+from ertis_numba.network.trace import mark
 from ertis_numba.network.zap_authenticator import ZapAuthenticator
 from ertis_numba.processes import connect
 
@@ -134,6 +135,7 @@ class _Publisher:
     def _publish(self, note: pipe_messages.Publish) -> None:
         """Copy the subscribed parts out of a slot, and release it."""
         view, sensor = self._views[note.slot], note.data.sensor
+        mark("image fetched", sensor, note.data.sequence)
         common: dict[str, Any] = {
             name: getattr(note.data, name)
             for name in ("session_id", "sequence", "sync_count", "timestamp_ns", "uncertainty_ns", "monotonic_ns")
@@ -158,6 +160,7 @@ class _Publisher:
         self._pipe.send(pipe_messages.ProductsQueued(job=note.job, published_ns=time.monotonic_ns()))
         for item in items:
             self._subscribers.offer(item)
+        mark("published", sensor, note.data.sequence)
 
     def _hear(self, frames: list[zmq.Frame]) -> None:
         """Process a request of an application, or refuse it; never raises for its content."""

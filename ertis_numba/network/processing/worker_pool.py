@@ -35,6 +35,7 @@ from ertis_numba.network.processing.runner import (
 from ertis_numba.network.processing.slots import Slot
 from ertis_numba.network.processing.worker import SLOTS, Worker
 from ertis_numba.network.status import WorkerStatus
+from ertis_numba.network.trace import mark
 
 __all__ = ["LocalWorkerPool"]
 
@@ -126,6 +127,7 @@ class LocalWorkerPool:
                 predict_for=job.data.sensor if job.predict else "",
             )
         )
+        mark("submitted", job.data.sensor, job.data.sequence)
 
     def release(self, slot: Slot) -> None:
         """Release the slot of a finished job."""
