@@ -159,7 +159,7 @@ class ImageProcessing:
         """Do periodic work; ``now_s`` is a time of `time.monotonic`."""
         if self._runner is None:
             return
-        self._handle(self._runner.tick(now_s, self._load.rate_hz(now_s)))
+        self._handle(self._runner.tick(now_s, self._load))
         self._confirm(*self._publisher.tick(now_s))
         self._emit_event(self._groups.tick(time.monotonic_ns()))
         self._sensors.tick()

@@ -7,7 +7,7 @@ import numpy as np
 
 from ertis_numba.cpu_cores import usable_cores
 from ertis_numba.network.log import EventLog
-from ertis_numba.network.processing.choice import Choice
+from ertis_numba.network.processing.choice import Choice, Load
 from ertis_numba.network.processing.options import ProcessingOptions
 from ertis_numba.network.processing.pipe_messages import (
     FromWorker,
@@ -146,8 +146,8 @@ class LocalWorkerPool:
                 return self._heard(worker)
         return []
 
-    def tick(self, now_s: float, rate_hz: float) -> Sequence[Event]:
-        """Return new events; call it ten times a second with the rate of arriving measurements."""
+    def tick(self, now_s: float, load: Load) -> Sequence[Event]:
+        """Return new events; call it ten times a second with the load."""
         found: list[Event] = []
         for worker in self._workers[: self._started]:
             match worker.check(now_s):
@@ -159,7 +159,7 @@ class LocalWorkerPool:
                     found += self._heard(worker)  # It may have sent messages before.
                 case "running":
                     self._next_kind(worker)
-        if self._chosen.look(now_s, rate_hz):
+        if self._chosen.look(now_s, load.rate_hz(now_s), load.overlap):
             self._log.info("choice", text=self._chosen.why)
         return found
 
