@@ -332,7 +332,7 @@ end_after(0)
 end_after(0.2)
 hang()
 """
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)  # noqa: S603
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == -signal.SIGALRM
     assert "in hang" in done.stderr
 

@@ -315,7 +315,7 @@ class Intake:
         """Process stored items."""
         for item in event.items:
             stream = self._done(item)
-            track = self.tracks.setdefault(item.run.sensor, SensorTrack())
+            track = self.tracks.get(item.run.sensor) or self.tracks.setdefault(item.run.sensor, SensorTrack())
             if isinstance(item.content, JournalEntry):
                 mark("stored", item.run.sensor, item.first)
                 track.stored += 1

@@ -236,7 +236,7 @@ class ImageProcessing:
     def _dispatch(self) -> None:
         """Give waiting measurements to workers, as far as they accept them."""
         runner, found = self._runner, True
-        while runner is not None and found:
+        while runner is not None and found and not self._queues.is_empty:
             found = False
             for job in self._queues.turns():
                 if runner.takes(job.kind):

@@ -76,27 +76,37 @@ class _Publisher:
 
     def run(self) -> None:
         while not self._pipe.closed:
-            self._poller.poll(_TICK_MS)
-            self._authenticator.serve()
-            for note in self._pipe.receive():
-                self._obey(note)
-            for _ in range(_AT_ONCE):
-                try:
-                    frames = self._socket.recv_multipart(zmq.NOBLOCK, copy=False)
-                except zmq.Again:
-                    break
-                self._hear(frames)
+            ready = dict(self._poller.poll(_TICK_MS))
+            if self._authenticator.socket in ready:
+                self._authenticator.serve()
+            if self._pipe.fileno() in ready or self._pipe.waiting:
+                for note in self._pipe.receive():
+                    self._obey(note)
+            if self._socket in ready:
+                self._hear_all()
             self._tick(time.monotonic())
+
+    def _hear_all(self) -> None:
+        """Process waiting requests of applications."""
+        for _ in range(_AT_ONCE):
+            if not sockets.is_readable(self._socket):
+                break
+            self._hear(self._socket.recv_multipart(zmq.NOBLOCK, copy=False))
+        self._report_wanted()
+
+    def _report_wanted(self) -> None:
+        """Report the sensors whose points are subscribed, after each change."""
+        wanted = pipe_messages.Wanted(points=self._subscribers.sensors_for("points"))
+        if wanted != self._wanted:
+            self._wanted = wanted
+            self._pipe.send(wanted)
 
     def _tick(self, now_s: float) -> None:
         if now_s >= self._next_tick_s:
             self._next_tick_s = now_s + _TICK_MS / 1000
             self._authenticator.tick()
             self._subscribers.tick(self._may_receive)
-        wanted = pipe_messages.Wanted(points=self._subscribers.sensors_for("points"))
-        if wanted != self._wanted:
-            self._wanted = wanted
-            self._pipe.send(wanted)
+            self._report_wanted()
         if now_s >= self._next_report_s:
             self._next_report_s = now_s + _REPORT_INTERVAL_S
             self._subscribers.notify(Pong(state="processing"))

@@ -98,8 +98,9 @@ class LocalWorkerPool:
 
     def takes(self, kind: JobKind) -> bool:
         """Return True if a job of a kind can run now."""
-        busy = sum(worker.job is not None for worker in self._workers)
-        return busy < self._chosen.mode.at_once and self._idle(kind) is not None
+        if self._idle(kind) is None:
+            return False
+        return sum(worker.job is not None for worker in self._workers) < self._chosen.mode.at_once
 
     def _idle(self, kind: JobKind) -> Worker | None:
         for worker in self._workers:
