@@ -14,6 +14,7 @@ import pytest
 import ertis_numba as ertis
 from ertis_numba.cluster import connect, local_cluster
 from ertis_numba.network.messages import Data
+from ertis_numba.network.processing.choice import Load
 from ertis_numba.network.processing.cluster import Cluster
 from ertis_numba.network.processing.options import ProcessingOptions
 from ertis_numba.network.processing.runner import FinishedJob, Job, JobKind, KindFailed, KindReady, Lost
@@ -48,7 +49,7 @@ def events_of(runner, count=1):
     while len(found) < count and time.monotonic() < end_s:
         for fd in select.select(list(runner.fds()), [], [], 0.1)[0]:
             found += runner.ready(fd)
-        found += runner.tick(time.monotonic(), 10.0)
+        found += runner.tick(time.monotonic(), Load())
     assert len(found) >= count, "the cluster took longer than a minute"
     return found
 
@@ -57,7 +58,7 @@ def submit_when_possible(runner, job):
     """Submit a job as soon as a worker can accept it."""
     end_s = time.monotonic() + LONG_S
     while not runner.takes(job.kind) and time.monotonic() < end_s:
-        assert not runner.tick(time.monotonic(), 10.0)
+        assert not runner.tick(time.monotonic(), Load())
         time.sleep(0.01)
     runner.submit(job)
 
@@ -68,7 +69,7 @@ def get_all_ready(runner, n_workers, kind):
     members = runner._members  # noqa: SLF001
     while sum(kind.number in each.ready for each in members.values()) < n_workers:
         assert time.monotonic() < end_s, "workers took longer than a minute"
-        assert not runner.tick(time.monotonic(), 10.0)
+        assert not runner.tick(time.monotonic(), Load())
         time.sleep(0.01)
 
 
@@ -165,7 +166,7 @@ def test_cluster_recovers_jobs_of_a_killed_worker(cluster_to_kill):
         assert time.monotonic() < end_s, "it took longer than a minute"
         while waiting and cluster.takes(kind):
             cluster.submit(waiting.pop(0))
-        for event in cluster.tick(time.monotonic(), 10.0):
+        for event in cluster.tick(time.monotonic(), Load()):
             if isinstance(event, Lost):  # as with a local worker, the caller retries
                 assert event.again
                 waiting.insert(0, event.job)

@@ -16,7 +16,7 @@ import pytest
 from ertis_numba.errors import ArgumentError
 from ertis_numba.journal import Journal, JournalEntry
 from ertis_numba.network.processing import ProcessingOptions
-from ertis_numba.network.processing.choice import Choice, Mode
+from ertis_numba.network.processing.choice import Choice, Load, Mode
 from ertis_numba.network.processing.dead_letter_queue import DeadLetterQueue
 from ertis_numba.network.processing.pipe_messages import Release
 from ertis_numba.network.processing.runner import JobKind, Lost
@@ -318,6 +318,25 @@ def test_processing_options_are_checked(tmp_path):
         ProcessingOptions(processing={"range_m": (2.0, 1.0)})
 
 
+@pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="this system has no timer signals")
+def test_hanging_worker_without_parent_ends_with_a_traceback():
+    program = """
+from ertis_numba.network.processing.worker_process import end_after
+
+def hang():
+    while True:
+        pass
+
+end_after(60.0)
+end_after(0)
+end_after(0.2)
+hang()
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == -signal.SIGALRM
+    assert "in hang" in done.stderr
+
+
 class TestChoice:
     def test_idle_machine_uses_all_cores_per_measurement(self):
         choice = Choice(2, 2)
@@ -347,6 +366,20 @@ class TestChoice:
         for _ in range(8):
             choice.took(Mode(1, 2), 0.020)
         assert choice.look(0.0, 45.0)
+
+    def test_simultaneous_measurements_share_the_cores_even_at_a_low_rate(self):
+        load, choice = Load(), Choice(2, 2)
+        choice.seed(0.010, 0.016)
+        for pulse in range(4):
+            for sensor in range(4):
+                load.add(0.5 * pulse + 0.002 * sensor)
+        assert load.overlap(0.010) == 0.75
+        assert load.overlap(0.001) == 0.0
+        assert choice.look(2.0, load.rate_hz(2.0), load.overlap)
+        assert choice.mode == Mode(2, 1)
+        assert "75% of them waiting" in choice.why
+        assert choice.look(6.0, 8.0, lambda _: 0.3)
+        assert choice.mode == Mode(1, 2)
 
     def test_single_worker_uses_all_cores(self):
         choice = Choice(1, 4)

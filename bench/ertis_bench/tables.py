@@ -12,6 +12,7 @@ from ertis_bench.interpolation import form as interpolation
 from ertis_bench.machine import sentence
 from ertis_bench.many import many
 from ertis_bench.markdown import table as _table
+from ertis_bench.network.latency import latency
 from ertis_bench.network.table import network
 from ertis_bench.paper import DIRECTIONS, PUBLISHED_MS
 from ertis_bench.peers.table import peers
@@ -28,6 +29,7 @@ __all__ = [
     "gpu",
     "gpu_short",
     "health",
+    "latency",
     "many",
     "network",
     "paper",
@@ -284,6 +286,7 @@ FORMS: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
     "factorisation": {"factorisation": factorisation},
     "interpolation": {"interpolation": interpolation},
     "ptx": {"ptx": ptx},
+    "latency": {"latency": latency},
     "network": {"network": network},
     "gpu": {"gpu": gpu, "gpu short": gpu_short},
     "health": {"health": health},

@@ -370,6 +370,30 @@ def network(*, only: tuple[str, ...], **given: Any) -> None:
 
 @bench.command()
 @click.option(
+    "--duration",
+    "duration_s",
+    type=click.FloatRange(min=2.0),
+    default=30.0,
+    show_default=True,
+    metavar="S",
+    help="Duration of each run, without and with storage.",
+)
+@_seed("Seed of the samples.", default=1)
+@_update
+@options.quiet
+@options.as_json
+def latency(**given: Any) -> None:
+    """Time each stage from a sensor node to an application.
+
+    Also measures the processor time of each process.
+    """
+    from ertis_bench.network import latency as benchmark
+
+    _run("latency", benchmark, **given)
+
+
+@bench.command()
+@click.option(
     "--results",
     type=click.Path(path_type=Path, file_okay=False),
     default=Path("bench/results"),

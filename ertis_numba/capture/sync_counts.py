@@ -49,6 +49,8 @@ class PulseAligner(Generic[Item]):
     ----------
     realigned : int
         Number of offsets that were changed.
+    interval_ns : float
+        Interval between pulses; the minimum while it is unknown.
     """
 
     def __init__(self, sensors: list[str], *, shortest_s: float) -> None:
@@ -58,6 +60,7 @@ class PulseAligner(Generic[Item]):
         self._pulses: dict[int, int] = {}  # Time of the first block, by pulse number.
         self._intervals_ns: deque[float] = deque(maxlen=_MAX_PULSES)
         self.realigned = 0
+        self.interval_ns = float(self._shortest_ns)
 
     def reset(self, sensor: str) -> list[tuple[Item, int]]:
         """Align a sensor again, after it has missed pulses or restarted its counter; return its held blocks."""
@@ -111,11 +114,6 @@ class PulseAligner(Generic[Item]):
             found.append((each.item, number))
         state.held = []
         return found
-
-    @property
-    def interval_ns(self) -> float:
-        """Interval between pulses; the minimum while it is unknown."""
-        return statistics.median(self._intervals_ns) if self._intervals_ns else float(self._shortest_ns)
 
     def _is_offset_known(self, name: str, state: _SensorPulses[Item], now_ns: int, *, at_once: bool) -> bool:
         """Determine the offset of a sensor with held blocks; return True if it is now known."""
@@ -189,6 +187,7 @@ class PulseAligner(Generic[Item]):
         before_ns = self._pulses.get(number - 1)
         if before_ns is not None and arrived_ns > before_ns:
             self._intervals_ns.append(arrived_ns - before_ns)
+            self.interval_ns = statistics.median(self._intervals_ns)
         self._pulses[number] = arrived_ns
         while len(self._pulses) > _MAX_PULSES:
             del self._pulses[min(self._pulses)]

@@ -1,5 +1,6 @@
 """Sensors, measurements and gaps of a journal, and their rows."""
 
+import math
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -115,7 +116,7 @@ class JournalSensor:
     @property
     def n_bytes(self) -> int:
         """Size of one measurement's data."""
-        return int(np.prod(self.shape)) * self.dtype.itemsize
+        return math.prod(self.shape) * self.dtype.itemsize
 
     def row(self) -> tuple[Any, ...]:
         """Return the row in the table."""

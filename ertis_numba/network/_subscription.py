@@ -4,8 +4,8 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
-from typing import Final
+from dataclasses import dataclass, field
+from typing import Any, Final
 
 import zmq
 
@@ -28,12 +28,13 @@ from ertis_numba.network.messages import (
     decode,
     encode,
 )
-from ertis_numba.network.products import Arrival, Header, ProductReader
+from ertis_numba.network.products import Arrival, Header, ProductReader, trace
 from ertis_numba.network.wakeup_socket import WakeupSocket
 
 __all__ = ["SubscriberCounts", "Subscription"]
 
 _EXPECTED: Final = (Description, Image, Points, Raw, Group, Report, Pong, Refused)
+_DESCRIBED: Final = (Image, Points, Raw)
 _UNMADE_S: Final = 5.0  # ZeroMQ gives up after a refusal, whose event may precede the monitor.
 _AGAIN_S: Final = 0.5
 _MAX_AGAIN_S: Final = 5.0
@@ -268,17 +269,18 @@ class Subscription:
         numbers = self._numbers
         if header.number < numbers.next_number:  # Numbers must rise.
             self._restarted()
+        trace("received", header)
         item = numbers.reader.read(header, payload)
         arrived_ns, arrived_utc_ns = time.monotonic_ns(), time.time_ns()
         numbers.received += 1
         numbers.next_number = header.number + 1
         self._counts.missed = self._missed_before + numbers.next_number - numbers.received
         self._counts.dropped = max(self._counts.dropped, self._dropped_before + header.dropped)
-        arrival = Arrival(item, header, arrived_ns, arrived_utc_ns, numbers.connection)
-        if isinstance(header, Image | Points | Raw):
+        place: tuple[Any, Any] = (None, None)
+        if isinstance(header, _DESCRIBED):
             about = numbers.reader.description(header.description)
-            arrival = replace(arrival, translation_m=about.translation_m, rotation_xyzw=about.rotation_xyzw)
-        self._deliver(arrival)
+            place = about.translation_m, about.rotation_xyzw
+        self._deliver(Arrival(item, header, arrived_ns, arrived_utc_ns, numbers.connection, *place))
 
 
 def _wait(woken: WakeupSocket, timeout_s: float) -> None:

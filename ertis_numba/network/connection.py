@@ -1,7 +1,7 @@
 """Connection of a client to a central node or a publisher."""
 
 import time
-from contextlib import suppress
+from typing import Final
 
 import zmq
 
@@ -11,6 +11,8 @@ from ertis_numba.network.messages import PING_INTERVAL_S, Ping, encode
 from ertis_numba.network.wakeup_socket import WakeupSocket
 
 __all__ = ["Connection"]
+
+_READ_OR_WRITE: Final = zmq.POLLIN | zmq.POLLOUT
 
 
 class Connection:
@@ -56,6 +58,8 @@ class Connection:
     ) -> None:
         self._socket = sockets.client(context, address, keys=keys, max_bytes=max_bytes)
         self._monitor = sockets.Monitor(self._socket)
+        self._poller = zmq.Poller()
+        self._poller.register(self._monitor.socket, zmq.POLLIN)
         self._ping_s: float | None = None
         self.opened_s = time.monotonic()
         self.sent_s: float | None = None
@@ -69,12 +73,11 @@ class Connection:
 
     def wait(self, timeout_s: float, wakeup_socket: WakeupSocket | None = None) -> None:
         """Wait until there is a message, a refusal, room for a message, or a wake-up."""
-        poller = zmq.Poller()
-        poller.register(self._socket, zmq.POLLIN | (zmq.POLLOUT if self.is_blocked else 0))
-        poller.register(self._monitor.socket, zmq.POLLIN)
+        self._poller.register(self._socket, _READ_OR_WRITE if self.is_blocked else zmq.POLLIN)
         if wakeup_socket is not None:
-            poller.register(wakeup_socket, zmq.POLLIN)
-        if dict(poller.poll(round(1000 * timeout_s))).get(self._socket, 0) & zmq.POLLOUT:
+            self._poller.register(wakeup_socket, zmq.POLLIN)
+        ready = dict(self._poller.poll(round(1000 * timeout_s)))
+        if self.is_blocked and ready.get(self._socket, 0) & zmq.POLLOUT:
             self.is_blocked = False
 
     def refusals(self) -> list[str]:
@@ -83,9 +86,9 @@ class Connection:
 
     def receive(self) -> list[memoryview] | None:
         """Return the frames of the next message, or None if there is none."""
-        with suppress(zmq.Again):
-            return [frame.buffer for frame in self._socket.recv_multipart(zmq.NOBLOCK, copy=False)]
-        return None
+        if not sockets.is_readable(self._socket):
+            return None
+        return [frame.buffer for frame in self._socket.recv_multipart(zmq.NOBLOCK, copy=False)]
 
     def send(self, *frames: bytes | memoryview) -> bool:
         """Send a message, and return True if there was room for it."""

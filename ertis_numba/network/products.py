@@ -13,10 +13,11 @@ from ertis_numba.frames import Energyscape, Measurement, PointCloud, Stamp
 from ertis_numba.geometry import received_settings
 from ertis_numba.network.messages import Description, Group, Image, Message, Points, Raw, Report
 from ertis_numba.network.status import Status
+from ertis_numba.network.trace import mark
 from ertis_numba.sample_format import sample_format
 from ertis_numba.settings import Settings
 
-__all__ = ["Arrival", "Header", "Item", "Payload", "ProductReader"]
+__all__ = ["Arrival", "Header", "Item", "Payload", "ProductReader", "trace"]
 
 Item: TypeAlias = Energyscape | PointCloud | Measurement | Group | Status
 """Products that an application receives."""
@@ -147,6 +148,12 @@ class ProductReader:
         if number not in self._described:
             raise DataError(f"a product refers to description {number}, which has not arrived; send it first")
         return self._described[number]
+
+
+def trace(stage: str, header: Header) -> None:
+    """Record that an image has passed a stage; see `ertis_numba.network.trace`."""
+    if isinstance(header, Image):
+        mark(stage, header.sensor, header.sequence)
 
 
 def _image(reader: ProductReader, header: Image, payload: Payload) -> Energyscape:

@@ -15,7 +15,7 @@ from ertis_numba.network import addresses
 from ertis_numba.network._subscription import SubscriberCounts, Subscription
 from ertis_numba.network.keys import ClientKeys
 from ertis_numba.network.messages import PRODUCTS, Group, Product
-from ertis_numba.network.products import Arrival
+from ertis_numba.network.products import Arrival, trace
 from ertis_numba.network.wakeup_socket import WakeupSocket
 
 if TYPE_CHECKING:
@@ -213,6 +213,7 @@ class Subscriber(Generic[Kind_co]):
             return None
         if isinstance(arrival, Exception):
             raise arrival
+        trace("taken", arrival.header)
         self.latest = arrival
         self.counts.received += 1
         self._subscription.taken(arrival)

@@ -26,8 +26,7 @@ class WakeupSocket:
     def clear(self) -> None:
         """Discard pending wake-ups; the loop calls it before it looks for work."""
         with suppress(OSError):
-            while self._woken.recv(4096):
-                pass
+            self._woken.recv(65_536)  # Any byte beyond them, which is possible in theory only, wakes the loop again.
 
     def close(self) -> None:
         """Close the socket; later calls of `wake` have no effect."""

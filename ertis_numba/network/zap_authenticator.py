@@ -20,7 +20,7 @@ from ertis_numba.errors import ArgumentError, NetworkError, SettingsError
 from ertis_numba.network.allow_list import AllowList, Permission
 from ertis_numba.network.keys import ServerKeys
 from ertis_numba.network.own_files import require_own
-from ertis_numba.network.sockets import DOMAIN, HandshakeMonitor, monitor_event, was_chosen
+from ertis_numba.network.sockets import DOMAIN, HandshakeMonitor, is_readable, monitor_event, was_chosen
 
 __all__ = ["EVERYBODY", "ZapAuthenticator"]
 
@@ -109,10 +109,9 @@ class ZapAuthenticator:
         if self.socket is None:
             return
         for _ in range(_AT_ONCE):
-            try:
-                request = self.socket.recv_multipart(zmq.NOBLOCK)
-            except zmq.Again:
+            if not is_readable(self.socket):
                 return
+            request = self.socket.recv_multipart(zmq.NOBLOCK)
             # Routing id, delimiter, version, request, domain, address, identity, mechanism, credentials.
             if len(request) < 4 or request[1] != b"":
                 continue  # It cannot be answered; the peer waits in vain.

@@ -11,7 +11,8 @@ import numpy as np
 
 from ertis_bench import machine
 from ertis_bench.network.oracle import judged, read_diaries
-from ertis_bench.network.processes import JsonLinesProcess, central, survivors, until
+from ertis_bench.network.processes import central, survivors, until
+from ertis_bench.network.processor_time import ProcessorTime
 from ertis_bench.network.receiver import ReceiverJob, read_received
 from ertis_bench.network.sender import SETTINGS, SenderJob
 from ertis_bench.network.serving import Serve, accounts, expected_of, percentile, some_words
@@ -84,24 +85,6 @@ def _shared(sensors: Sequence[str], n_senders: int) -> list[tuple[str, ...]]:
     return [tuple(sensors[first::n_senders]) for first in range(min(n_senders, len(sensors)))]
 
 
-class _Load:
-    """Processor time of processes and of their children."""
-
-    def __init__(self, **processes: list[int]) -> None:
-        self._pids = processes
-        self._begun = {name: _cpu_s(pids) for name, pids in processes.items()}
-        self._begun_s = time.monotonic()
-
-    def percent(self) -> dict[str, float]:
-        """Return the share of a core that each process has used since the start, in percent."""
-        lasted_s = time.monotonic() - self._begun_s
-        return {name: 100 * (_cpu_s(pids) - self._begun[name]) / lasted_s for name, pids in self._pids.items()}
-
-
-def _cpu_s(pids: Sequence[int]) -> float:
-    return sum(JsonLinesProcess.cpu_s_of(pid) for pid in pids)
-
-
 def storage(
     folder: Path, duration_s: float, seed: int, *, n_sensors: int = 8, rate_hz: float = 20.0, n_senders: int = _SENDERS
 ) -> Found:
@@ -133,7 +116,7 @@ def storage(
         for sender in senders:
             sender.wait_for("begun")
         time.sleep(max(0.0, start_s - time.monotonic()))
-        load = _Load(**{"central node": [node.node_pid], "sensor nodes": [each.pid for each in senders]})
+        load = ProcessorTime({"central node": [node.node_pid], "sensor nodes": [each.pid for each in senders]})
         time.sleep(max(0.0, start_s + duration_s - 1.0 - time.monotonic()))
         cpu_percent = load.percent()
         for sender in senders:
@@ -170,12 +153,19 @@ def processing(
     part: str = "processing",
     credit: int = 2,
     scheduler: str | None = None,
+    archive: Path | None = None,
 ) -> Found:
-    """Process the measurements of sensors here or on a dask cluster, and check the images in an application."""
+    """Process the measurements of sensors here or on a dask cluster, and check the images in an application.
+
+    With ``archive``, the central node also stores the measurements in this folder.
+    """
     sensors = [f"sensor-{number + 1}" for number in range(n_sensors)]
     options, given, boss = _keys(folder, sensors)
     if scheduler is not None:
         options += ["--scheduler", scheduler]
+    if archive is not None:
+        archive.mkdir()
+        options += ["--record", str(archive)]
     settings = _settings(directions)
     words = some_words(SETTINGS, folder / "words.npy", seed=seed)
     expected = expected_of(settings, np.load(words), folder / "expected.npz")
@@ -202,19 +192,13 @@ def processing(
             job.replace(diary=str(diary), rate_hz=rate_hz, count=round(duration_s * rate_hz)).start()
         )
         sender.wait_for("begun")
-        family = [pid for pid in survivors(serve.mark) if pid != serve.node.node_pid]
-        load = _Load(
-            **{
-                "central node": [serve.node.node_pid],
-                "its workers and publisher": family,
-                "sensor nodes": [sender.pid],
-                "application": [receiver.pid],
-            }
-        )
+        load = ProcessorTime(_processes(serve) | {"sensor nodes": [sender.pid], "application": [receiver.pid]})
+        n_before = len(read_received(images).numbers)
         end_s = time.monotonic() + duration_s - 1.0
         while time.monotonic() < end_s:
             serve.look(timeout_s=1.0)
-        cpu_percent = load.percent()
+        n_images = len(read_received(images).numbers) - n_before
+        cpu_percent, cpu_ms = load.percent(), load.rows(n_images)
         sender.wait_for("sent", timeout_s=duration_s + 60.0)
         sent = read_diaries([warm, diary])
         serve.settle(len(sent.kept))
@@ -240,7 +224,17 @@ def processing(
         "p99_ms": percentile(times_ms, 0.99),
         "slowest_ms": percentile(times_ms, 1.0),
         "cpu_percent": cpu_percent,
+        "cpu_ms": cpu_ms,
+        "cpu_total_ms": sum(time_ms for *_, time_ms in cpu_ms),
     }
+
+
+def _processes(serve: Serve) -> dict[str, list[int]]:
+    """Return the processes of a central node."""
+    others = {pid: line for pid, line in survivors(serve.mark).items() if pid != serve.node.node_pid}
+    publisher = [pid for pid, line in others.items() if "publisher_process" in line]
+    workers = [pid for pid in others if pid not in publisher]
+    return {"central node": [serve.node.node_pid], "workers": workers, "publisher": publisher}
 
 
 def _since(begun: Found, found: Found) -> Found:

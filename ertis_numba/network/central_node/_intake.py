@@ -15,6 +15,7 @@ from ertis_numba.network.central_node._received_items import ReceivedItem, Senso
 from ertis_numba.network.central_node._streams import Acks, PeerConnection, SensorTrack, Sharing, Stream
 from ertis_numba.network.fields import as_line
 from ertis_numba.network.messages import PING_INTERVAL_S, SILENCE_LIMIT_S, Data, Gap, Hello, Message, Refused
+from ertis_numba.network.trace import mark
 
 __all__ = ["Intake"]
 
@@ -165,7 +166,9 @@ class Intake:
             The measurement cannot be accepted.
         """
         stream = self._stream(peer_id, data)
+        mark("arrived", data.sensor, data.sequence)
         entry, source = entry_in(stream, data, payload), stream.source
+        mark("checked", data.sensor, data.sequence)
         item = ReceivedItem(
             stream.run, data.sequence, data.sequence, entry, source, 1e-9 * arrived_ns, peer_id, stream.turn
         )
@@ -312,8 +315,9 @@ class Intake:
         """Process stored items."""
         for item in event.items:
             stream = self._done(item)
-            track = self.tracks.setdefault(item.run.sensor, SensorTrack())
+            track = self.tracks.get(item.run.sensor) or self.tracks.setdefault(item.run.sensor, SensorTrack())
             if isinstance(item.content, JournalEntry):
+                mark("stored", item.run.sensor, item.first)
                 track.stored += 1
                 self.acks.acked_through(item.arrived_s)
             else:

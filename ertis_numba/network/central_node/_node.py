@@ -126,6 +126,8 @@ class CentralNode:
         self._handlers = handlers_of(self)
         self._greetings = Greetings(self._intake.read)
         self._archive_fd = self._greetings_fd = -1
+        self._poller = zmq.Poller()
+        self._polled: set[int] = set()  # Descriptors of image processing, which change as its processes do.
         self._stopping = threading.Event()
         self._next_tick_s = self._next_log_s = self._next_status_s = 0.0
         self.latest = self.status()
@@ -150,6 +152,10 @@ class CentralNode:
                 return
         self._greetings_fd = self._greetings.open()
         self._server.open(self._listen, max_bytes=self._max_bytes)
+        self._server.register(self._poller)
+        if self._archive is not None:
+            self._poller.register(self._archive_fd, zmq.POLLIN)
+        self._poller.register(self._greetings_fd, zmq.POLLIN)
         self._event_reporter.notify("listening", address=self._condition.address, pid=os.getpid())
 
     def __exit__(
@@ -207,15 +213,8 @@ class CentralNode:
 
     def _turn(self) -> None:
         """Wait for an event, and process it."""
-        poller = zmq.Poller()
-        self._server.register(poller)
-        others = set() if self._images is None else set(self._images.fds())
-        if self._archive is not None:
-            poller.register(self._archive_fd, zmq.POLLIN)
-        poller.register(self._greetings_fd, zmq.POLLIN)
-        for fd in others:
-            poller.register(fd, zmq.POLLIN)
-        ready = dict(poller.poll(max(0, round(1e3 * (self._next_tick_s - time.monotonic())))))
+        self._follow_processes()
+        ready = dict(self._poller.poll(max(0, round(1e3 * (self._next_tick_s - time.monotonic())))))
         called = self._server.serve(ready)
         if self._archive_fd in ready:
             self._hear()
@@ -223,7 +222,7 @@ class CentralNode:
             for greeting in self._greetings.take():
                 self._answer_greeting(greeting)
         if self._images is not None:
-            for fd in ready.keys() & others:
+            for fd in ready.keys() & self._polled:
                 self._images.ready(fd)
             self._intake.dropped(self._images.drain_dropped())
         if called:
@@ -231,6 +230,15 @@ class CentralNode:
         self._intake.acknowledge()
         if time.monotonic() >= self._next_tick_s:
             self._tick()
+
+    def _follow_processes(self) -> None:
+        """Poll the processes that exist now."""
+        others = set() if self._images is None else set(self._images.fds())
+        for fd in self._polled - others:
+            self._poller.unregister(fd)
+        for fd in others - self._polled:
+            self._poller.register(fd, zmq.POLLIN)
+        self._polled = others
 
     def _receive(self) -> None:
         for _ in range(_TURN):

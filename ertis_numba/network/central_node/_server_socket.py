@@ -93,12 +93,9 @@ class ServerSocket:
 
     def receive(self) -> list[zmq.Frame] | None:
         """Return the frames of a message, the first of them if there are too many; None if there is no message."""
-        if self._socket is None:
+        if self._socket is None or not sockets.is_readable(self._socket):
             return None
-        try:
-            frames = [self._socket.recv(zmq.NOBLOCK, copy=False)]
-        except zmq.Again:
-            return None
+        frames = [self._socket.recv(zmq.NOBLOCK, copy=False)]
         while frames[-1].more:
             frame = self._socket.recv(zmq.NOBLOCK, copy=False)
             if len(frames) < _FRAMES:

@@ -12,6 +12,7 @@ import numpy as np
 
 from ertis_numba.cluster import RemoteError, WorkerActors, connect
 from ertis_numba.network.processing import _cluster_worker as there
+from ertis_numba.network.processing.choice import Load
 from ertis_numba.network.processing.options import ProcessingOptions
 from ertis_numba.network.processing.pipe_messages import Prepared
 from ertis_numba.network.processing.runner import (
@@ -216,8 +217,8 @@ class Cluster:
             self._wakeup_socket.clear()
         return self._heard()
 
-    def tick(self, now_s: float, rate_hz: float) -> Sequence[Event]:  # noqa: ARG002  time is the client's matter
-        """Return new events; call it ten times a second with the rate of arriving measurements."""
+    def tick(self, now_s: float, load: Load) -> Sequence[Event]:  # noqa: ARG002  time is the client's matter
+        """Return new events; call it ten times a second with the load."""
         return self._heard()
 
     def status(self) -> list[WorkerStatus]:

@@ -22,6 +22,7 @@ from ertis_numba.network.processing.runner import Event, FinishedJob, Job, JobKi
 from ertis_numba.network.processing.sensors import Sensors
 from ertis_numba.network.processing.worker_pool import LocalWorkerPool
 from ertis_numba.network.status import Latencies, ProcessingStatus, Status
+from ertis_numba.network.trace import mark
 from ertis_numba.settings import Settings
 
 __all__ = ["ImageProcessing"]
@@ -158,7 +159,7 @@ class ImageProcessing:
         """Do periodic work; ``now_s`` is a time of `time.monotonic`."""
         if self._runner is None:
             return
-        self._handle(self._runner.tick(now_s, self._load.rate_hz(now_s)))
+        self._handle(self._runner.tick(now_s, self._load))
         self._confirm(*self._publisher.tick(now_s))
         self._emit_event(self._groups.tick(time.monotonic_ns()))
         self._sensors.tick()
@@ -235,7 +236,7 @@ class ImageProcessing:
     def _dispatch(self) -> None:
         """Give waiting measurements to workers, as far as they accept them."""
         runner, found = self._runner, True
-        while runner is not None and found:
+        while runner is not None and found and not self._queues.is_empty:
             found = False
             for job in self._queues.turns():
                 if runner.takes(job.kind):
@@ -258,6 +259,7 @@ class ImageProcessing:
                     self._sensors.failed(kind, text)
                     self._queues.drop_kind(kind, _UNUSABLE)
                 case FinishedJob(job=job, took_s=took_s):
+                    mark("image known", job.data.sensor, job.data.sequence)
                     self._took.add(1e3 * took_s)
                     self._order.done(job)
                     self._circuit_breaker.succeeded(job.data.sensor)

@@ -32,6 +32,7 @@ from ertis_numba.network.processing import pipe_messages
 from ertis_numba.network.processing.pipe_messages import ToPublisher
 from ertis_numba.network.processing.slots import SlotView
 from ertis_numba.network.processing.subscribers import QueuedProduct, Subscribers
+from ertis_numba.network.trace import mark
 from ertis_numba.network.zap_authenticator import ZapAuthenticator
 from ertis_numba.processes import connect
 
@@ -75,27 +76,37 @@ class _Publisher:
 
     def run(self) -> None:
         while not self._pipe.closed:
-            self._poller.poll(_TICK_MS)
-            self._authenticator.serve()
-            for note in self._pipe.receive():
-                self._obey(note)
-            for _ in range(_AT_ONCE):
-                try:
-                    frames = self._socket.recv_multipart(zmq.NOBLOCK, copy=False)
-                except zmq.Again:
-                    break
-                self._hear(frames)
+            ready = dict(self._poller.poll(_TICK_MS))
+            if self._authenticator.socket in ready:
+                self._authenticator.serve()
+            if self._pipe.fileno() in ready or self._pipe.waiting:
+                for note in self._pipe.receive():
+                    self._obey(note)
+            if self._socket in ready:
+                self._hear_all()
             self._tick(time.monotonic())
+
+    def _hear_all(self) -> None:
+        """Process waiting requests of applications."""
+        for _ in range(_AT_ONCE):
+            if not sockets.is_readable(self._socket):
+                break
+            self._hear(self._socket.recv_multipart(zmq.NOBLOCK, copy=False))
+        self._report_wanted()
+
+    def _report_wanted(self) -> None:
+        """Report the sensors whose points are subscribed, after each change."""
+        wanted = pipe_messages.Wanted(points=self._subscribers.sensors_for("points"))
+        if wanted != self._wanted:
+            self._wanted = wanted
+            self._pipe.send(wanted)
 
     def _tick(self, now_s: float) -> None:
         if now_s >= self._next_tick_s:
             self._next_tick_s = now_s + _TICK_MS / 1000
             self._authenticator.tick()
             self._subscribers.tick(self._may_receive)
-        wanted = pipe_messages.Wanted(points=self._subscribers.sensors_for("points"))
-        if wanted != self._wanted:
-            self._wanted = wanted
-            self._pipe.send(wanted)
+            self._report_wanted()
         if now_s >= self._next_report_s:
             self._next_report_s = now_s + _REPORT_INTERVAL_S
             self._subscribers.notify(Pong(state="processing"))
@@ -134,6 +145,7 @@ class _Publisher:
     def _publish(self, note: pipe_messages.Publish) -> None:
         """Copy the subscribed parts out of a slot, and release it."""
         view, sensor = self._views[note.slot], note.data.sensor
+        mark("image fetched", sensor, note.data.sequence)
         common: dict[str, Any] = {
             name: getattr(note.data, name)
             for name in ("session_id", "sequence", "sync_count", "timestamp_ns", "uncertainty_ns", "monotonic_ns")
@@ -158,6 +170,7 @@ class _Publisher:
         self._pipe.send(pipe_messages.ProductsQueued(job=note.job, published_ns=time.monotonic_ns()))
         for item in items:
             self._subscribers.offer(item)
+        mark("published", sensor, note.data.sequence)
 
     def _hear(self, frames: list[zmq.Frame]) -> None:
         """Process a request of an application, or refuse it; never raises for its content."""

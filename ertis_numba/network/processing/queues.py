@@ -67,7 +67,15 @@ class Queues:
 
     def counts_of(self, sensor: str) -> ProcessingCounts:
         """Return the counts of a sensor, which begin at 0."""
-        return self.counts.setdefault(sensor, ProcessingCounts())
+        counts = self.counts.get(sensor)
+        if counts is None:
+            counts = self.counts[sensor] = ProcessingCounts()
+        return counts
+
+    @property
+    def is_empty(self) -> bool:
+        """True if no measurement waits."""
+        return not (self._again or any(self._waiting.values()))
 
     def take_in(self, data: Data) -> ProcessingCounts:
         """Count a received measurement; return the counts of its sensor."""

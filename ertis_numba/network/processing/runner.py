@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.network.messages import Data
+from ertis_numba.network.processing.choice import Load
 from ertis_numba.network.processing.pipe_messages import Prepared
 from ertis_numba.network.processing.slots import Slot
 from ertis_numba.network.status import WorkerStatus
@@ -154,8 +155,8 @@ class Runner(Protocol):
         """Return new events, after a descriptor became readable."""
         ...
 
-    def tick(self, now_s: float, rate_hz: float) -> Sequence[Event]:
-        """Return new events; call it ten times a second with the rate of arriving measurements."""
+    def tick(self, now_s: float, load: Load) -> Sequence[Event]:
+        """Return new events; call it ten times a second with the load."""
         ...
 
     def status(self) -> list[WorkerStatus]:

@@ -39,6 +39,8 @@ class RegisteredSensor:
         None if no pipeline can use its settings.
     raw, image : int
         Numbers of the descriptions of its products.
+    air : (float, float, float), optional
+        Temperature, humidity and pressure of the latest measurement.
     """
 
     hello: Hello
@@ -47,6 +49,7 @@ class RegisteredSensor:
     kind: JobKind | None
     raw: int = -1
     image: int = -1
+    air: tuple[float, float, float] | None = None
 
 
 class Sensors:
@@ -108,14 +111,17 @@ class Sensors:
         0.09 % for temperature, 0.02 % for humidity and 0.003 % for pressure: 6 mm at 5 m for all together.
         """
         known = self._known[data.sensor]
-        try:
-            came = data.air
-        except ArgumentError:
-            return None
-        air = _about(came, known.settings.air)
-        if air != known.settings.air:
-            self._take(known.hello, known.stated, known.settings.replace(air=air))
-        kind = self._known[data.sensor].kind
+        came = data.temperature_c, data.humidity_percent, data.pressure_pa
+        if came != known.air:
+            try:
+                air = _about(data.air, known.settings.air)
+            except ArgumentError:
+                return None
+            if air != known.settings.air:
+                self._take(known.hello, known.stated, known.settings.replace(air=air))
+                known = self._known[data.sensor]
+            known.air = came
+        kind = known.kind
         return None if kind is None or kind.number in self._unusable else kind
 
     def is_ready(self, kind: JobKind) -> bool:

@@ -1,5 +1,6 @@
 """Anonymous memory shared between processes, freed by the system with the last of them."""
 
+import math
 import mmap
 import os
 from typing import Any, Final
@@ -52,7 +53,7 @@ class SlotView:
     def image_as(self, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
         """Return the image as an array."""
         dtype = np.dtype(dtype)
-        return np.frombuffer(self.image(int(np.prod(shape)) * dtype.itemsize), dtype).reshape(shape)
+        return np.frombuffer(self.image(math.prod(shape) * dtype.itemsize), dtype).reshape(shape)
 
 
 class Slot:

@@ -7,7 +7,7 @@ import numpy as np
 
 from ertis_numba.cpu_cores import usable_cores
 from ertis_numba.network.log import EventLog
-from ertis_numba.network.processing.choice import Choice
+from ertis_numba.network.processing.choice import Choice, Load
 from ertis_numba.network.processing.options import ProcessingOptions
 from ertis_numba.network.processing.pipe_messages import (
     FromWorker,
@@ -35,6 +35,7 @@ from ertis_numba.network.processing.runner import (
 from ertis_numba.network.processing.slots import Slot
 from ertis_numba.network.processing.worker import SLOTS, Worker
 from ertis_numba.network.status import WorkerStatus
+from ertis_numba.network.trace import mark
 
 __all__ = ["LocalWorkerPool"]
 
@@ -97,8 +98,9 @@ class LocalWorkerPool:
 
     def takes(self, kind: JobKind) -> bool:
         """Return True if a job of a kind can run now."""
-        busy = sum(worker.job is not None for worker in self._workers)
-        return busy < self._chosen.mode.at_once and self._idle(kind) is not None
+        if self._idle(kind) is None:
+            return False
+        return sum(worker.job is not None for worker in self._workers) < self._chosen.mode.at_once
 
     def _idle(self, kind: JobKind) -> Worker | None:
         for worker in self._workers:
@@ -126,6 +128,7 @@ class LocalWorkerPool:
                 predict_for=job.data.sensor if job.predict else "",
             )
         )
+        mark("submitted", job.data.sensor, job.data.sequence)
 
     def release(self, slot: Slot) -> None:
         """Release the slot of a finished job."""
@@ -144,8 +147,8 @@ class LocalWorkerPool:
                 return self._heard(worker)
         return []
 
-    def tick(self, now_s: float, rate_hz: float) -> Sequence[Event]:
-        """Return new events; call it ten times a second with the rate of arriving measurements."""
+    def tick(self, now_s: float, load: Load) -> Sequence[Event]:
+        """Return new events; call it ten times a second with the load."""
         found: list[Event] = []
         for worker in self._workers[: self._started]:
             match worker.check(now_s):
@@ -157,7 +160,7 @@ class LocalWorkerPool:
                     found += self._heard(worker)  # It may have sent messages before.
                 case "running":
                     self._next_kind(worker)
-        if self._chosen.look(now_s, rate_hz):
+        if self._chosen.look(now_s, load.rate_hz(now_s), load.overlap):
             self._log.info("choice", text=self._chosen.why)
         return found
 

@@ -2,6 +2,7 @@
 
 import faulthandler
 import os
+import signal
 import time
 from typing import TYPE_CHECKING, Final
 
@@ -25,6 +26,8 @@ from ertis_numba.network.processing.pipe_messages import (
 )
 from ertis_numba.network.processing.slots import POINTS_BYTES, SlotView
 from ertis_numba.processes import connect
+
+__all__ = ["end_after"]
 
 if TYPE_CHECKING:
     from ertis_numba.network.processing.chain import SharedPipeline
@@ -90,7 +93,7 @@ class _ImageWorker:
 
     def _processed(self, order: ProcessJob) -> FromWorker:
         begun_s = time.perf_counter()
-        faulthandler.dump_traceback_later(_NEGLECTED * self._given.deadline_s, exit=True)
+        end_after(_NEGLECTED * self._given.deadline_s)
         try:
             n_points = self._made(self._chains[order.kind], self._views[order.slot], order)
         except DataError as error:
@@ -98,7 +101,7 @@ class _ImageWorker:
         except Exception as error:  # noqa: BLE001  a mistake in one measurement's way must not end the others'
             return JobFailed(job=order.job, text=f"{type(error).__name__}: {error}", again=True)
         finally:
-            faulthandler.cancel_dump_traceback_later()
+            end_after(0)
         return JobFinished(job=order.job, took_s=time.perf_counter() - begun_s, n_points=n_points)
 
     def _made(self, chain: "SharedPipeline", view: SlotView, order: ProcessJob) -> int:
@@ -116,6 +119,20 @@ class _ImageWorker:
         points = chain.points(image, POINTS_BYTES // 16)
         view.points(points.nbytes)[:] = points.tobytes()
         return len(points)
+
+
+def end_after(time_s: float) -> None:
+    """End this process after a time, with a traceback on stderr; 0 cancels that.
+
+    A timer of the system costs a hundredth of `faulthandler.dump_traceback_later`, which starts a thread.
+    """
+    if hasattr(signal, "setitimer"):
+        faulthandler.register(signal.SIGALRM, chain=True)  # The default action follows, which ends the process.
+        signal.setitimer(signal.ITIMER_REAL, time_s)
+    elif time_s:
+        faulthandler.dump_traceback_later(time_s, exit=True)
+    else:
+        faulthandler.cancel_dump_traceback_later()
 
 
 def _main() -> None:

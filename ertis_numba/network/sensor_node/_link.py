@@ -16,6 +16,7 @@ from ertis_numba.network.messages import SILENCE_LIMIT_S
 from ertis_numba.network.sensor_node._runs import OutgoingSession
 from ertis_numba.network.sensor_node._spool import Spool
 from ertis_numba.network.sensor_node._wire import Acknowledged, frames_of, greeting
+from ertis_numba.network.trace import mark
 from ertis_numba.network.wakeup_socket import WakeupSocket
 
 __all__ = ["Central", "Link"]
@@ -199,6 +200,7 @@ class Link(threading.Thread):
                     dropped = run.newly_dropped(message.dropped)
                     self._spool.settle(run, done, message.status, dropped)
                 if done or dropped:
+                    mark("acknowledged", run.sensor.name, run.acked_through)
                     self._on_acked(Acknowledged(*run.key, run.acked_through, message.status, dropped))
 
     def _see(self, state: Literal["storage", "processing", "fault", "closing"], text: str | None = None) -> None:
@@ -331,6 +333,7 @@ class Link(threading.Thread):
         frames, last = frames_of(run, item, entry)
         if not connection.send(*frames):
             return False
+        mark("sent", run.sensor.name, last)
         with self._spool.turn:
             run.mark_sent(last, time.monotonic())
         return True

@@ -17,6 +17,7 @@ from ertis_numba.network.sensor_node._disk import DiskSpool
 from ertis_numba.network.sensor_node._link import Central, Link
 from ertis_numba.network.sensor_node._spool import SensorCounts, Spool
 from ertis_numba.network.sensor_node._wire import Acknowledged
+from ertis_numba.network.trace import mark
 from ertis_numba.settings import Settings
 
 __all__ = ["SensorNode"]
@@ -167,6 +168,8 @@ class SensorNode:
             A measurement does not match its sensor, or its number does not rise.
         """
         kept = self._spool.append(entries)
+        for entry in kept:
+            mark("kept", entry.measurement.stamp.sensor, entry.measurement.stamp.sequence)
         self._wake()
         return kept
 
