@@ -1,4 +1,4 @@
-"""Registry of beamformers: options, kernel, weights and error of each, in one place."""
+"""Registry of beamformers and weightings: options, kernel, weights and error of each, in one place."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -12,9 +12,19 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-__all__ = ["ADAPTIVE_BEAMFORMERS", "BEAMFORMERS", "Beamformer", "BeamformerName", "BeamformerOption"]
+__all__ = [
+    "ADAPTIVE_COMBINATIONS",
+    "BEAMFORMERS",
+    "WEIGHTINGS",
+    "Beamformer",
+    "BeamformerName",
+    "BeamformerOption",
+    "Weighting",
+    "WeightingName",
+]
 
-BeamformerName = Literal["delay_and_sum", "coherence_factor", "dmas", "capon"]
+BeamformerName = Literal["delay_and_sum", "dmas", "capon"]
+WeightingName = Literal["none", "coherence_factor"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +74,22 @@ class Beamformer:
         return tuple(getattr(processing, option.name) for option in self.options)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Weighting:
+    """Declaration of a weighting: a factor from 0 to 1 that multiplies each amplitude of any beamformer.
+
+    Attributes
+    ----------
+    kernel : str
+        Kernel that multiplies ``out`` by the factor, from ``(analytic, offsets, weights, out)``. Empty for none.
+    sensitivity : float
+        Increase of the relative error of the image by the weighting, in units of that of delay-and-sum beams.
+    """
+
+    kernel: str
+    sensitivity: float = 0.0
+
+
 def _require_order(n_mics: int, order: int) -> None:
     """Check that the order of DMAS does not exceed the number of microphones."""
     if n_mics < order:
@@ -94,11 +120,6 @@ def _capon_sensitivity(n_mics: int, _: int, loading: float) -> tuple[float, floa
 BEAMFORMERS: Final[Mapping[BeamformerName, Beamformer]] = MappingProxyType(
     {
         "delay_and_sum": Beamformer(kernel=""),
-        "coherence_factor": Beamformer(
-            kernel="combine_coherence",
-            weights=lambda weights: weights,
-            sensitivity=lambda _: (3.0, 0.0),  # the amplitude is raised to the third power where microphones agree
-        ),
         "dmas": Beamformer(
             kernel="combine_dmas",
             options=(BeamformerOption("dmas_order", 2, 8),),
@@ -115,5 +136,20 @@ BEAMFORMERS: Final[Mapping[BeamformerName, Beamformer]] = MappingProxyType(
 )
 """Beamformers by name, in the order of `BeamformerName`."""
 
-ADAPTIVE_BEAMFORMERS: Final = tuple(name for name, each in BEAMFORMERS.items() if each.kernel)
-"""Names of all beamformers except delay-and-sum."""
+WEIGHTINGS: Final[Mapping[WeightingName, Weighting]] = MappingProxyType(
+    {
+        "none": Weighting(kernel=""),
+        # Delay-and-sum with this weighting has the third power of the beam where microphones agree, and three times
+        # the error power in noise.
+        "coherence_factor": Weighting(kernel="weight_coherence", sensitivity=math.sqrt(3) - 1),
+    }
+)
+"""Weightings by name, in the order of `WeightingName`."""
+
+ADAPTIVE_COMBINATIONS: Final = tuple(
+    (beamformer, weighting)
+    for weighting in WEIGHTINGS
+    for beamformer in BEAMFORMERS
+    if (beamformer, weighting) != ("delay_and_sum", "none")
+)
+"""All pairs of a beamformer and a weighting, except delay-and-sum without a weighting."""

@@ -157,8 +157,8 @@ class TomlDocument(TomlTable, frozen=True, kw_only=True):
     ----------
     former_keys : dict of str to str
         Present names of keys by former names, so that documents in older recordings stay readable.
-    removed_lines : tuple of str
-        Lines of older documents that had no effect; they are ignored.
+    former_lines : dict of str to str
+        Text by the former line that it replaces, empty if the line had no effect.
     max_bytes : int
         Limit on the length of a document in UTF-8.
     max_items : int
@@ -166,7 +166,7 @@ class TomlDocument(TomlTable, frozen=True, kw_only=True):
     """
 
     former_keys: ClassVar[dict[str, str]] = {}
-    removed_lines: ClassVar[tuple[str, ...]] = ()
+    former_lines: ClassVar[dict[str, str]] = {}
     max_bytes: ClassVar[int] = 16 * 2**20
     max_items: ClassVar[int] = 2**20
 
@@ -250,8 +250,8 @@ class TomlDocument(TomlTable, frozen=True, kw_only=True):
     def _renamed(cls, text: str) -> str:
         for former, key in cls.former_keys.items():
             text = re.sub(rf"\b{former}(?=\s*=)", key, text)
-        for line in cls.removed_lines:
-            text = re.sub(rf"(?m)^[ \t]*{re.escape(line)}(?=[ \t\r]*$)", "", text)  # keeps the numbers of lines
+        for line, present in cls.former_lines.items():
+            text = re.sub(rf"(?m)^[ \t]*{re.escape(line)}(?=[ \t\r]*(?:#.*)?$)", present, text)
         return text
 
     def to_toml(self) -> str:

@@ -71,6 +71,7 @@ class Prediction:
         ``beams`` if no plan keeps the budget for any image of an adaptive beamformer. The plan then keeps it for the
         delay-and-sum beams of the same signals.
     beamformer : str
+        Beamformer, and its weighting if it has one.
     """
 
     predicted_error_db: float
@@ -117,7 +118,7 @@ def planner_of(image: Energyscape, measurement: Measurement, kernels: KernelSet,
     threads : int
     """
     settings = image.settings
-    adaptive = settings.processing.beamformer != "delay_and_sum"
+    adaptive = settings.processing.is_adaptive
     amplitude = None if adaptive else image.amplitude
     signal_model = signal_model_of(measurement, settings, kernels, threads=threads, amplitude=amplitude)
     if not adaptive:
@@ -138,21 +139,21 @@ def planner_of(image: Energyscape, measurement: Measurement, kernels: KernelSet,
 def predict(planner: Planner) -> Prediction:
     """Return a planner's prediction for its complete plan, with the budget."""
     settings = planner.settings
-    beamformer = settings.processing.beamformer
-    adaptive = beamformer != "delay_and_sum"
+    processing = settings.processing
+    weighted = "" if processing.weighting == "none" else f" with {processing.weighting}"
     return Prediction(
         predicted_error_db=round(planner.error_db(settings.accuracy), 2),
         max_error_db=settings.accuracy.max_error_db,
-        uncertainty_db=ADAPTIVE_UNCERTAINTY_DB if adaptive else UNCERTAINTY_DB,
+        uncertainty_db=ADAPTIVE_UNCERTAINTY_DB if processing.is_adaptive else UNCERTAINTY_DB,
         budget_applies_to="image" if planner.keeps_budget_of_images(settings.accuracy) else "beams",
-        beamformer=beamformer,
+        beamformer=f"{processing.beamformer}{weighted}",
     )
 
 
 def memory_bytes(image: Energyscape) -> int:
     """Return an estimate of the memory for a prediction: signals, squares of an image, and tables of a rough one."""
     settings, table = image.settings, 0
-    if settings.processing.beamformer != "delay_and_sum":
+    if settings.processing.is_adaptive:
         n_mics = int(microphones(settings.array).enabled.sum())
         n_zones = 1 if settings.processing.wavefront == "plane" else ROUGH_ZONES
         table = TABLE_BYTES * len(image.amplitude) * n_mics * ROUGH_DELAY_TAPS * n_zones

@@ -12,7 +12,7 @@ from ertis_numba import kernels, verification
 from ertis_numba.analysis.compare import _Lobe
 from ertis_numba.analysis.point_spread import PointSpread
 from ertis_numba.analysis.uncertainty import _effective_covariance_m2
-from ertis_numba.beamformers import ADAPTIVE_BEAMFORMERS
+from ertis_numba.beamformers import ADAPTIVE_COMBINATIONS
 from ertis_numba.errors import ArgumentError
 from ertis_numba.figures import _words
 from ertis_numba.figures._array import pattern_db, width_deg
@@ -252,10 +252,10 @@ def test_unusable_array_weights_are_refused_in_one_line(weights, message):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("beamformer", ADAPTIVE_BEAMFORMERS)
+@pytest.mark.parametrize(("beamformer", "weighting"), ADAPTIVE_COMBINATIONS)
 @pytest.mark.parametrize("weights", ["hann", (1.0,) * 32])
-def test_adaptive_beamformers_support_uniform_weights_only(beamformer, weights):
-    processing = SHORT.processing.replace(beamformer=beamformer)
+def test_adaptive_beamformers_support_uniform_weights_only(beamformer, weighting, weights):
+    processing = SHORT.processing.replace(beamformer=beamformer, weighting=weighting)
     with pytest.raises(ArgumentError, match="supports only 'uniform'; leave array_weights out"):
         processing.replace(array_weights=weights)
 

@@ -8,7 +8,7 @@ from click.testing import CliRunner
 from ertis_cli.main import cli
 
 from ertis_numba import kernels
-from ertis_numba.beamformers import ADAPTIVE_BEAMFORMERS
+from ertis_numba.beamformers import ADAPTIVE_COMBINATIONS
 from ertis_numba.errors import ArgumentError
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Processing, Recording
@@ -30,9 +30,11 @@ LINE_16 = SENSOR.replace(
 )
 
 
-@pytest.mark.parametrize("beamformer", ADAPTIVE_BEAMFORMERS)
-def test_beamformers_give_the_same_bits_on_any_number_of_threads(beamformer):
-    settings = cases.SHORT.replace(processing=cases.SHORT.processing.replace(directions="2d:90", beamformer=beamformer))
+@pytest.mark.parametrize(("beamformer", "weighting"), ADAPTIVE_COMBINATIONS)
+def test_beamformers_give_the_same_bits_on_any_number_of_threads(beamformer, weighting):
+    settings = cases.SHORT.replace(
+        processing=cases.SHORT.processing.replace(directions="2d:90", beamformer=beamformer, weighting=weighting)
+    )
     measurement = cases.noise(settings)
     counts = range(1, KERNELS["cpu"].max_threads + 1)
     images = [Pipeline(settings, threads=count, predict=False).process(measurement).amplitude for count in counts]
@@ -42,11 +44,11 @@ def test_beamformers_give_the_same_bits_on_any_number_of_threads(beamformer):
 
 
 @pytest.mark.parametrize("device", KERNELS)
-@pytest.mark.parametrize("beamformer", ADAPTIVE_BEAMFORMERS)
-def test_beamformers_give_zero_for_zero_input(device, beamformer):
+@pytest.mark.parametrize(("beamformer", "weighting"), ADAPTIVE_COMBINATIONS)
+def test_beamformers_give_zero_for_zero_input(device, beamformer, weighting):
     settings = cases.CASES["line of 8"]
     settings = settings.replace(
-        processing=settings.processing.replace(beamformer=beamformer),
+        processing=settings.processing.replace(beamformer=beamformer, weighting=weighting),
         accuracy=settings.accuracy.replace(max_error_db=-35.0),  # the case's -45 is beyond 8 microphones and one tap
     )
     planned = planner.complete(settings, KERNELS[device], threads=1)
@@ -69,9 +71,10 @@ def cut(points, **options):
 @pytest.mark.parametrize(
     ("options", "lower_db", "lost_db", "narrower"),
     [
-        ({"beamformer": "coherence_factor"}, 25, 0.2, 0.7),
+        ({"weighting": "coherence_factor"}, 25, 0.2, 0.7),
         ({"beamformer": "dmas"}, 11, 0.1, 0.8),
         ({"beamformer": "dmas", "dmas_order": 5}, 40, 0.2, 0.6),
+        ({"beamformer": "dmas", "dmas_order": 5, "weighting": "coherence_factor"}, 60, 0.3, 0.5),
         ({"beamformer": "capon"}, 11, 1.5, 0.3),
     ],
 )
@@ -128,6 +131,11 @@ def test_capon_separates_independent_sources_within_a_beam(device):
 @pytest.mark.parametrize(
     ("options", "reported"),
     [
+        (
+            {"beamformer": "coherence_factor"},
+            r"'coherence_factor' is a weighting; give it as processing\.weighting, with",
+        ),
+        ({"weighting": "cf"}, r"processing\.weighting 'cf' is unknown; known are none, coherence_factor"),
         ({"beamformer": "mvdr"}, r"processing\.beamformer 'mvdr' is unknown; known are delay_and_sum, .*capon"),
         ({"dmas_order": 1}, r"processing\.dmas_order is 1; give a whole number from 2 to 8"),
         ({"dmas_order": 9}, r"processing\.dmas_order is 9; give a whole number from 2 to 8"),
@@ -137,11 +145,15 @@ def test_capon_separates_independent_sources_within_a_beam(device):
         ({"diagonal_loading": math.nan}, r"processing\.diagonal_loading is nan; give a finite number"),
         (
             {"beamformer": "dmas", "method": "paper"},
-            r"processing\.method is 'paper', which supports only .*'delay_and_sum'; give 'fast' with .*'dmas'",
+            r"processing\.method is 'paper', which supports only .*'delay_and_sum' .*; give 'fast' with .*'dmas'",
         ),
         (
             {"beamformer": "capon", "wavefront": "spherical"},
-            r"processing\.wavefront is 'spherical', which supports only .*'delay_and_sum'; give 'plane' with .*'capon'",
+            r"processing\.wavefront is 'spherical', which supports only .*'delay_and_sum' .*; give 'plane' .*'capon'",
+        ),
+        (
+            {"weighting": "coherence_factor", "method": "paper"},
+            r"processing\.method is 'paper', .* give 'fast' with processing\.weighting 'coherence_factor'",
         ),
     ],
 )

@@ -7,7 +7,7 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from ertis_numba.beamformers import ADAPTIVE_BEAMFORMERS, BEAMFORMERS, BeamformerName
+from ertis_numba.beamformers import ADAPTIVE_COMBINATIONS, BEAMFORMERS, WEIGHTINGS, BeamformerName, WeightingName
 from ertis_numba.errors import ArgumentError
 from ertis_numba.settings import Processing
 from ertis_numba.stages.adaptive import AdaptiveBeamform
@@ -63,8 +63,8 @@ def combined(kernel_set, beamformer, signals, **options):
 def all_of(kernel_set, name):
     """Images of all three kernels, one after the other."""
     signals, offsets, weights, shape = beam_input(name)
-    out = np.full((3, *shape), 12_345, dtype=np.float32)
-    kernel_set.combine_coherence(signals, offsets, weights, out[0])
+    out = np.full((3, *shape), 1, dtype=np.float32)
+    kernel_set.weight_coherence(signals, offsets, weights, out[0])
     kernel_set.combine_dmas(signals, offsets, weights, 2, out[1])
     kernel_set.combine_capon(signals, offsets, weights, 5, 0.1, out[2])
     return out
@@ -73,9 +73,10 @@ def all_of(kernel_set, name):
 @pytest.mark.parametrize("name", sized([*SHAPES][:3], [*SHAPES][3:]))
 def test_coherence_factor_equals_its_reference(kernel_set, name):
     signals, offsets, weights, shape = beam_input(name)
-    out = np.full(shape, 12_345, dtype=np.float32)
-    kernel_set.combine_coherence(signals, offsets, weights, out)
-    expected = reference.coherence_factor(signals, offsets, weights, shape[1])
+    given = np.abs(complex_noise(*shape, seed=4))
+    out = given.copy()
+    kernel_set.weight_coherence(signals, offsets, weights, out)
+    expected = given * reference.coherence_factor(signals, offsets, weights, shape[1])
     assert np.abs(out - expected).max() < FLOAT32 * expected.max()
 
 
@@ -105,10 +106,10 @@ def test_capon_equals_its_reference(kernel_set, name, n_snapshots, loading):
 
 
 @pytest.mark.parametrize("name", sized(["one range", "just over a tile"], ["two microphones", "prime", "eRTIS"]))
-@pytest.mark.parametrize("beamformer", ADAPTIVE_BEAMFORMERS)
-def test_every_beamformer_equals_its_definition(kernel_set, beamformer, name):
+@pytest.mark.parametrize(("beamformer", "weighting"), ADAPTIVE_COMBINATIONS)
+def test_every_beamformer_equals_its_definition(kernel_set, beamformer, weighting, name):
     signals, offsets, weights, (n_directions, n_ranges) = beam_input(name)
-    processing, n_mics = Processing(beamformer=beamformer), offsets.shape[1]
+    processing, n_mics = Processing(beamformer=beamformer, weighting=weighting), offsets.shape[1]
     weights /= np.abs(weights).sum(axis=1, keepdims=True)
     out = np.full((n_directions, n_ranges), 12_345, dtype=np.float32)
     AdaptiveBeamform(processing, kernel_set, kernel_set.memory(), offsets, weights)(signals, out)
@@ -124,8 +125,14 @@ def test_page_lists_every_beamformer_with_its_options(name):
     assert set(re.findall(r"`(\w+)`", row)) - {"array_weights"} == options
 
 
+@pytest.mark.parametrize("name", WEIGHTINGS)
+def test_page_lists_every_weighting(name):
+    assert re.search(rf"^\| `{name}` \|[^|]+\|[^|]+\|$", page("beamformers"), re.MULTILINE)
+
+
 def test_registry_names_are_those_of_the_type():
     assert tuple(BEAMFORMERS) == get_args(BeamformerName)
+    assert tuple(WEIGHTINGS) == get_args(WeightingName)
     options = {option.name for each in BEAMFORMERS.values() for option in each.options}
     assert options <= set(Processing.__struct_fields__)
 
@@ -153,7 +160,8 @@ def test_results_do_not_depend_on_the_number_of_threads():
 @pytest.mark.parametrize("n_mics", [2, 8, 31])
 @pytest.mark.parametrize(
     ("beamformer", "options"),
-    [("coherence_factor", {}), ("capon", {}), ("capon", {"diagonal_loading": 1e-6, "snapshots": 32})]
+    [("delay_and_sum", {"weighting": "coherence_factor"}), ("capon", {})]
+    + [("capon", {"diagonal_loading": 1e-6, "snapshots": 32})]
     + [("dmas", {"dmas_order": order}) for order in (2, 5, 8)],
 )
 def test_coherent_signals_keep_their_level(kernel_set, beamformer, options, n_mics):
@@ -164,18 +172,22 @@ def test_coherent_signals_keep_their_level(kernel_set, beamformer, options, n_mi
     np.testing.assert_allclose(found, np.abs(signal), rtol=3e-6)
 
 
-@pytest.mark.parametrize(("beamformer", "order"), [*((name, 2) for name in ADAPTIVE_BEAMFORMERS), ("dmas", 5)])
-def test_beamformers_scale_with_the_amplitude(kernel_set, beamformer, order):
-    signals = complex_noise(8, 40)
-    found = [combined(kernel_set, beamformer, scale * signals, dmas_order=order) for scale in (1, 2, 1e-12)]
+@pytest.mark.parametrize(
+    ("beamformer", "weighting", "order"), [*((*both, 2) for both in ADAPTIVE_COMBINATIONS), ("dmas", "none", 5)]
+)
+def test_beamformers_scale_with_the_amplitude(kernel_set, beamformer, weighting, order):
+    signals, options = complex_noise(8, 40), {"weighting": weighting, "dmas_order": order}
+    found = [combined(kernel_set, beamformer, scale * signals, **options) for scale in (1, 2, 1e-12)]
     np.testing.assert_allclose(found[1], 2 * found[0], rtol=2e-5)
     np.testing.assert_allclose(found[2], 1e-12 * found[0], rtol=2e-5)
 
 
-@pytest.mark.parametrize("beamformer", ["coherence_factor", "capon"])
-def test_beamformer_of_one_microphone_is_its_envelope(kernel_set, beamformer):
+@pytest.mark.parametrize("weighting", WEIGHTINGS)
+@pytest.mark.parametrize("beamformer", ["delay_and_sum", "capon"])
+def test_beamformer_of_one_microphone_is_its_envelope(kernel_set, beamformer, weighting):
     signals = complex_noise(1, 40)
-    np.testing.assert_allclose(combined(kernel_set, beamformer, signals), np.abs(signals[0]), rtol=1e-6)
+    found = combined(kernel_set, beamformer, signals, weighting=weighting)
+    np.testing.assert_allclose(found, np.abs(signals[0]), rtol=1e-6)
 
 
 def test_capon_with_high_diagonal_loading_is_delay_and_sum(kernel_set):
@@ -188,7 +200,7 @@ def test_capon_with_high_diagonal_loading_is_delay_and_sum(kernel_set):
 def test_capon_of_one_snapshot_depends_on_the_coherence_factor_only(kernel_set, loading):
     signals = complex_noise(8, 40)
     beams = np.abs(signals.mean(axis=0))
-    factor = combined(kernel_set, "coherence_factor", signals) / beams
+    factor = combined(kernel_set, "delay_and_sum", signals, weighting="coherence_factor") / beams
     expected = beams * loading / (loading + 8 * (1 - factor))
     np.testing.assert_allclose(
         combined(kernel_set, "capon", signals, snapshots=1, diagonal_loading=loading), expected, rtol=1e-5
@@ -198,14 +210,14 @@ def test_capon_of_one_snapshot_depends_on_the_coherence_factor_only(kernel_set, 
 # Hard cases, and how the plain form fails.
 
 
-@pytest.mark.parametrize("beamformer", ADAPTIVE_BEAMFORMERS)
-def test_beamformers_give_zero_for_silence(kernel_set, beamformer):
+@pytest.mark.parametrize(("beamformer", "weighting"), ADAPTIVE_COMBINATIONS)
+def test_beamformers_give_zero_for_silence(kernel_set, beamformer, weighting):
     """The following signal, here the second half, is unaffected."""
     signals = complex_noise(4, 40)
     signals[:, :20] = 0
-    found = combined(kernel_set, beamformer, signals, snapshots=3)
+    found = combined(kernel_set, beamformer, signals, weighting=weighting, snapshots=3)
     assert not found[:19].any()
-    alone = combined(kernel_set, beamformer, signals[:, 20:], snapshots=3)
+    alone = combined(kernel_set, beamformer, signals[:, 20:], weighting=weighting, snapshots=3)
     np.testing.assert_allclose(found[21:], alone[1:], rtol=1e-6)
     assert alone.all()
 
@@ -219,14 +231,14 @@ def test_naive_forms_fail_on_silence():
         np.linalg.solve(y @ y.conj().T, np.ones(4))
 
 
-@pytest.mark.parametrize("beamformer", ADAPTIVE_BEAMFORMERS)
-def test_beamformers_of_tiny_signals_are_finite(kernel_set, beamformer):
+@pytest.mark.parametrize(("beamformer", "weighting"), ADAPTIVE_COMBINATIONS)
+def test_beamformers_of_tiny_signals_are_finite(kernel_set, beamformer, weighting):
     """Their squares underflow in single precision, so the naive root is infinite."""
     signals = np.full((4, 40), 1e-25 + 1e-25j, dtype=np.complex64)
     with np.errstate(all="ignore"):
         power = signals.real**2 + signals.imag**2
         assert not np.isfinite(signals * power ** np.float32(-0.25)).any()
-    found = combined(kernel_set, beamformer, signals)
+    found = combined(kernel_set, beamformer, signals, weighting=weighting)
     assert np.all(np.isfinite(found))
     assert found.max() <= 1.5e-25
 
@@ -271,12 +283,12 @@ def test_capon_of_nearly_equal_snapshots_is_accurate(kernel_set):
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-@pytest.mark.parametrize("beamformer", ADAPTIVE_BEAMFORMERS)
-def test_nan_affects_only_its_own_ranges(kernel_set, beamformer, value):
+@pytest.mark.parametrize(("beamformer", "weighting"), ADAPTIVE_COMBINATIONS)
+def test_nan_affects_only_its_own_ranges(kernel_set, beamformer, weighting, value):
     reach = {"capon": 2}.get(beamformer, 0)  # half of its 5 snapshots
     signals = complex_noise(4, 300)
     signals[2, 100] = value
     with np.errstate(all="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # NumPy also says so
-        found = combined(kernel_set, beamformer, signals)
+        found = combined(kernel_set, beamformer, signals, weighting=weighting)
     assert np.flatnonzero(~np.isfinite(found)).tolist() == list(range(100 - reach, 101 + reach))

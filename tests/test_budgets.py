@@ -10,7 +10,7 @@ from ertis_bench import budgets
 from ertis_cli.main import cli
 
 from ertis_numba import kernels, verification
-from ertis_numba.beamformers import BEAMFORMERS
+from ertis_numba.beamformers import ADAPTIVE_COMBINATIONS
 from ertis_numba.errors import ErrorBudgetWarning
 from ertis_numba.frames import Measurement
 from ertis_numba.pipeline import Pipeline
@@ -95,8 +95,8 @@ def test_budgets_of_adaptive_beamformers_are_kept_or_warned_of(processing):
 
 
 def test_sensitivity_has_an_inverse_and_makes_plans_more_exact():
-    for beamformer in BEAMFORMERS:
-        processing = Processing(beamformer=beamformer, dmas_order=4, diagonal_loading=1e-2)
+    for beamformer, weighting in (("delay_and_sum", "none"), *ADAPTIVE_COMBINATIONS):
+        processing = Processing(beamformer=beamformer, weighting=weighting, dmas_order=4, diagonal_loading=1e-2)
         sensitivity = Sensitivity.of(processing, 32)
         for power in (1e-10, 1e-5, 1e-2):
             assert sensitivity.output(sensitivity.beams(power)) == pytest.approx(power)

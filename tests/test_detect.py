@@ -90,7 +90,7 @@ def test_find_peaks_ignores_side_lobes_of_an_imperfect_array(errors_m):
 
 def test_find_peaks_keeps_weak_reflectors_of_coherence_factor():
     linear = image_of([(0.0, 0.0, 1.2, 1.0), (40.0, 0.0, 1.2, 0.6)], range_m=(1.05, 1.35))
-    settings = linear.settings.replace(processing=linear.settings.processing.replace(beamformer="coherence_factor"))
+    settings = linear.settings.replace(processing=linear.settings.processing.replace(weighting="coherence_factor"))
     image = linear.replace(amplitude=linear.amplitude**2, settings=settings)
     assert [round(peak.azimuth_deg) for peak in find_peaks(image, min_level_db=-12)] == [0, 40]
 

@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from ertis_numba import export, figures
 from ertis_numba.analysis.compare import compare
 from ertis_numba.analysis.health import health
-from ertis_numba.beamformers import ADAPTIVE_BEAMFORMERS
+from ertis_numba.beamformers import ADAPTIVE_COMBINATIONS
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import load_layout, microphones, received_settings, self_contained
 from ertis_numba.pipeline import Pipeline
@@ -100,7 +100,7 @@ def test_settings_file_with_only_disabled_keeps_the_array(tmp_path):
         {},
         {"method": "paper"},
         {"wavefront": "spherical"},
-        *({"beamformer": name} for name in ADAPTIVE_BEAMFORMERS),
+        *({"beamformer": beamformer, "weighting": weighting} for beamformer, weighting in ADAPTIVE_COMBINATIONS),
     ],
     ids=lambda changes: "-".join(changes.values()) or "fast",
 )

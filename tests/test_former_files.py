@@ -41,6 +41,16 @@ def test_former_settings_keys_are_read():
     assert settings.processing.diagonal_loading == 2.0
 
 
+@pytest.mark.parametrize("remark", ["", "  # clean pictures"])
+def test_former_beamformer_coherence_factor_is_a_weighting(remark):
+    text = f'[processing]\nbeamformer = "coherence_factor"{remark}\nsnapshots = 3\n'
+    processing = Settings.from_toml(text).processing
+    assert (processing.beamformer, processing.weighting) == ("delay_and_sum", "coherence_factor")
+    assert processing.snapshots == 3
+    again = Settings.from_toml(Settings(processing=processing).to_toml())
+    assert again.processing == processing
+
+
 def test_former_journal_is_read(tmp_path):
     for path in FILES.glob("rec.h5.journal*"):
         shutil.copy(path, tmp_path)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ertis_numba import kernels
-from ertis_numba.beamformers import ADAPTIVE_BEAMFORMERS
+from ertis_numba.beamformers import ADAPTIVE_COMBINATIONS
 from ertis_numba.errors import ArgumentError, DeviceError
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import ERROR_PRESETS_DB, Accuracy, Array, Call, Processing
@@ -177,9 +177,9 @@ def test_paper_method_has_no_plan():
     assert Pipeline(settings).settings is settings
 
 
-@pytest.mark.parametrize("beamformer", ADAPTIVE_BEAMFORMERS)
-def test_adaptive_beamformers_get_usable_plans(beamformer):
-    settings = SMALL.replace(processing=SMALL.processing.replace(beamformer=beamformer))
+@pytest.mark.parametrize(("beamformer", "weighting"), ADAPTIVE_COMBINATIONS)
+def test_adaptive_beamformers_get_usable_plans(beamformer, weighting):
+    settings = SMALL.replace(processing=SMALL.processing.replace(beamformer=beamformer, weighting=weighting))
     found = chosen_for(settings).settings.accuracy
     assert (found.precision, found.delay_taps, found.beam_taps) == ("float32", 1, 0)
 

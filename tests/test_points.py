@@ -9,7 +9,7 @@ from ertis_numba.analysis.cfar import clean
 from ertis_numba.analysis.detect import find_peaks, neighbours_of
 from ertis_numba.analysis.finder import PointFinder
 from ertis_numba.analysis.points import PointExtractor
-from ertis_numba.beamformers import ADAPTIVE_BEAMFORMERS
+from ertis_numba.beamformers import ADAPTIVE_COMBINATIONS
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Energyscape, PointCloud, Stamp
 from ertis_numba.geometry import direction_grid, unit_vectors
@@ -23,7 +23,8 @@ from tests.parabolas import interpolated
 from tests.scenes import heard
 from tests.test_detect import image_of
 
-OTHERS = [("fast", beamformer) for beamformer in ADAPTIVE_BEAMFORMERS]
+PLAIN = [("fast", "delay_and_sum", "none"), ("paper", "delay_and_sum", "none")]
+OTHERS = [("fast", *combination) for combination in ADAPTIVE_COMBINATIONS]
 
 
 def noise(directions, range_m=(0.9, 1.2), seed=1):
@@ -225,17 +226,19 @@ def test_uncertainty_depends_on_range_level_and_noise():
     assert extractor(louder).uncertainty_m[0] == pytest.approx(2 * first, rel=1e-3)
 
 
-@pytest.mark.parametrize(("method", "beamformer"), [("fast", "delay_and_sum"), ("paper", "delay_and_sum"), *OTHERS])
-def test_noise_is_estimated_by_the_median_for_delay_and_sum_only(method, beamformer):
+@pytest.mark.parametrize(("method", "beamformer", "weighting"), [*PLAIN, *OTHERS])
+def test_noise_is_estimated_by_the_median_for_delay_and_sum_only(method, beamformer, weighting):
     """The median of Rayleigh-distributed amplitudes is √ln 2 times their root mean square."""
     settings = Settings(
         recording=Recording(n_samples=65_536),
-        processing=Processing(directions="2d:9", range_m=(0.3, 2.0), method=method, beamformer=beamformer),
+        processing=Processing(
+            directions="2d:9", range_m=(0.3, 2.0), method=method, beamformer=beamformer, weighting=weighting
+        ),
     )
     with Pipeline(settings, device="numpy") as pipeline:
         image = pipeline.process(words_of_noise(settings, 1))
     ratio = np.median(image.amplitude) / np.sqrt(np.mean(np.square(image.amplitude, dtype=float)))
-    is_rayleigh = beamformer == "delay_and_sum"
+    is_rayleigh = not settings.processing.is_adaptive
     assert (ratio == pytest.approx(np.sqrt(np.log(2)), rel=0.02)) == is_rayleigh
     uncertainty_m = PointExtractor(settings)(image).uncertainty_m
     assert len(uncertainty_m) > 3

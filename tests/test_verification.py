@@ -11,7 +11,7 @@ from ertis_bench.random_settings import Limits, random_measurement, random_setti
 from ertis_cli.main import cli
 
 from ertis_numba import verification
-from ertis_numba.beamformers import ADAPTIVE_BEAMFORMERS, BEAMFORMERS
+from ertis_numba.beamformers import ADAPTIVE_COMBINATIONS, BEAMFORMERS, WEIGHTINGS
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import unit_vectors
@@ -61,8 +61,11 @@ def wanted_of(image, measurement):
         pytest.param(small(recording=PCM, processing=FIVE.replace(range_decimation=10)), id="PCM"),
         pytest.param(small(processing=FIVE.replace(wavefront="spherical", range_m=(0.0, 0.6))), id="spherical"),
         pytest.param(small(processing=FIVE.replace(band_edges_hz=(5e3, 90e3))), id="wide band"),
-        pytest.param(small(processing=FIVE.replace(beamformer="coherence_factor")), id="coherence factor"),
+        pytest.param(small(processing=FIVE.replace(weighting="coherence_factor")), id="coherence factor"),
         pytest.param(small(processing=FIVE.replace(beamformer="dmas", dmas_order=3), array=CALIBRATED), id="dmas"),
+        pytest.param(
+            small(processing=FIVE.replace(beamformer="dmas", weighting="coherence_factor")), id="weighted dmas"
+        ),
         pytest.param(small(processing=FIVE.replace(beamformer="capon", diagonal_loading=1e-3)), id="capon"),
     ],
 )
@@ -126,23 +129,36 @@ def test_verify_measures_errors_of_spherical_images(tmp_path):
     assert sensor["verified"]["peaks"]["lost"] == 0
 
 
-@pytest.mark.parametrize("beamformer", ADAPTIVE_BEAMFORMERS)
-def test_verify_measures_errors_of_every_beamformer(tmp_path, beamformer):
+@pytest.mark.parametrize(("beamformer", "weighting"), ADAPTIVE_COMBINATIONS)
+def test_verify_measures_errors_of_every_beamformer(tmp_path, beamformer, weighting):
     recording = write_recording(tmp_path / "rec.h5", noise(count=1))
-    arguments = ["-o", str(tmp_path / "a.h5"), "--beamformer", beamformer, "--max-error", "0", "--verify", "--json"]
+    arguments = [
+        "-o",
+        str(tmp_path / "a.h5"),
+        "--beamformer",
+        beamformer,
+        "--weighting",
+        weighting,
+        "--max-error",
+        "0",
+        "--verify",
+        "--json",
+    ]
     done = CliRunner().invoke(cli, ["process", str(recording), *arguments])
     assert done.exit_code == 0, done.stderr
     (sensor,) = json.loads(done.stdout)["sensors"]
     (measurement,) = noise(count=1)
-    settings = SMALL.replace(processing=SMALL.processing.replace(beamformer=beamformer))
+    settings = SMALL.replace(processing=SMALL.processing.replace(beamformer=beamformer, weighting=weighting))
     image = Pipeline(settings, max_error_db=0, predict=False).process(measurement)
     true_db = reference.error_db(image.amplitude, wanted_of(image, measurement))
     assert sensor["verified"]["error_db"] == pytest.approx(true_db, abs=0.05)
 
 
-@pytest.mark.parametrize("beamformer", ADAPTIVE_BEAMFORMERS)
-def test_silence_gives_amplitudes_of_zero(beamformer):
-    settings = small(recording=PCM, processing=FIVE.replace(range_decimation=10, beamformer=beamformer))
+@pytest.mark.parametrize(("beamformer", "weighting"), ADAPTIVE_COMBINATIONS)
+def test_silence_gives_amplitudes_of_zero(beamformer, weighting):
+    settings = small(
+        recording=PCM, processing=FIVE.replace(range_decimation=10, beamformer=beamformer, weighting=weighting)
+    )
     measurement = Measurement(np.zeros((PCM.n_samples, 32), dtype=np.int16), settings)
     image = Pipeline(settings, "cpu", 1, max_error_db=0, predict=False).process(measurement)
     assert not ExactImage(image, measurement).amplitudes(2, np.arange(len(image.range_m))).any()
@@ -205,6 +221,7 @@ def test_bench_verification_names_the_error(monkeypatch):
 def test_random_settings_cover_every_kind():
     drawn = [random_settings(np.random.default_rng(seed), Limits()) for seed in range(60)]
     assert {settings.processing.beamformer for settings in drawn} == set(BEAMFORMERS)
+    assert {settings.processing.weighting for settings in drawn} == set(WEIGHTINGS)
     assert {settings.processing.wavefront for settings in drawn} == {"plane", "spherical"}
     assert {settings.recording.encoding for settings in drawn} == {"pdm", "int16", "float32"}
     assert sum(settings.call.ramp_fraction == 0 for settings in drawn) > 10

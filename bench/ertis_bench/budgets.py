@@ -19,7 +19,7 @@ from ertis_bench.network.processes import ask
 from ertis_bench.random_settings import Limits, recorded
 from ertis_numba import verification
 from ertis_numba.air import sound_speed_m_s
-from ertis_numba.beamformers import ADAPTIVE_BEAMFORMERS, BeamformerName
+from ertis_numba.beamformers import BEAMFORMERS, WEIGHTINGS, BeamformerName, WeightingName
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones
@@ -31,12 +31,14 @@ __all__ = ["form", "measurement_of", "run", "tried"]
 
 _FLOOR_DB: Final = -100.0  # Below this level, rounding in single precision dominates the error.
 _DIRECTIONS: Final = 24  # compared with the exact image
-_BEAMFORMERS: Final[tuple[BeamformerName, ...]] = (
-    "delay_and_sum",
-    "delay_and_sum",
-    "delay_and_sum",
-    *ADAPTIVE_BEAMFORMERS,
+_PLAIN: Final[tuple[BeamformerName, WeightingName]] = ("delay_and_sum", "none")
+_COMBINATIONS: Final[tuple[tuple[BeamformerName, WeightingName], ...]] = (
+    *(3 * [_PLAIN]),
+    ("delay_and_sum", "coherence_factor"),
+    ("dmas", "none"),
+    ("capon", "none"),
 )
+_WEIGHTED: Final = 3  # One of so many images of other beamformers has the coherence factor as well.
 _SCENES: Final = ("quiet", "loud", "direct sound", "hum", "one echo", "echoes")
 
 _GROUPS: dict[str, Callable[[dict[str, Any]], bool]] = {
@@ -44,7 +46,8 @@ _GROUPS: dict[str, Callable[[dict[str, Any]], bool]] = {
     "PDM": lambda row: bool(row["pdm"]),
     "PCM": lambda row: not row["pdm"],
     "one microphone": lambda row: bool(row["microphones"] == 1),
-    **{f"`{name}`": lambda row, name=name: row["beamformer"] == name for name in sorted(set(_BEAMFORMERS))},  # type: ignore[misc]
+    **{f"`{name}`": lambda row, name=name: row["beamformer"] == name for name in BEAMFORMERS},  # type: ignore[misc]
+    **{f"`{name}`": lambda row, name=name: row["weighting"] == name for name in WEIGHTINGS if name != "none"},  # type: ignore[misc]
     **{f"scene: {name}": lambda row, name=name: row["scene"] == name for name in _SCENES},  # type: ignore[misc]
 }
 
@@ -97,7 +100,7 @@ def tried(seed: int) -> dict[str, Any] | None:
         return None
     # Predictions for adaptive beamformers come from a sample of the directions. Comparing all directions also
     # tests that sample.
-    if settings.processing.beamformer == "delay_and_sum":
+    if not settings.processing.is_adaptive:
         chosen, weights = verification.sampled(np.square(image.amplitude, dtype=np.float64).sum(axis=1), _DIRECTIONS)
     else:
         chosen, weights = np.arange(len(image.amplitude)), np.ones(len(image.amplitude))
@@ -113,6 +116,7 @@ def tried(seed: int) -> dict[str, Any] | None:
         "pdm": settings.recording.is_pdm,
         "microphones": int(microphones(settings.array).enabled.sum()),
         "beamformer": settings.processing.beamformer,
+        "weighting": settings.processing.weighting,
         "budget_db": settings.accuracy.max_error_db,
         "error_db": error_db,
         "predicted_db": predicted_db,
@@ -145,11 +149,14 @@ def _settings(random: np.random.Generator) -> Settings:
         recording = Recording(sample_rate_hz=450e3, n_samples=5_400, encoding=encoding)
         step = int(random.choice([4, 6, 10]))
     first_m = float(random.uniform(0.3, 0.8))
-    beamformer = _BEAMFORMERS[random.integers(len(_BEAMFORMERS))]
+    beamformer, weighting = _COMBINATIONS[random.integers(len(_COMBINATIONS))]
     n_mics = len(microphones(array).enabled_positions_m)
     if n_mics < Limits().max_mics and beamformer == "dmas" and n_mics < 2:
         beamformer = "delay_and_sum"
-    spherical = beamformer == "delay_and_sum" and random.integers(3) == 0
+    # A generator of its own, so that the seeds of former reports still give the same settings otherwise.
+    if beamformer in {"dmas", "capon"} and random.spawn(1)[0].integers(_WEIGHTED) == 0:
+        weighting = "coherence_factor"
+    spherical = (beamformer, weighting) == _PLAIN and random.integers(3) == 0
     return Settings(
         array=array,
         call=call,
@@ -160,6 +167,7 @@ def _settings(random: np.random.Generator) -> Settings:
             range_decimation=step,
             wavefront="spherical" if spherical else "plane",
             beamformer=beamformer,
+            weighting=weighting,
             dmas_order=int(random.integers(2, min(8, max(2, n_mics)) + 1)),
             snapshots=int(random.integers(1, 9)),
             diagonal_loading=float(10 ** random.uniform(-3, 1)),

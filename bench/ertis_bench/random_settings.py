@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.air import sound_speed_m_s
-from ertis_numba.beamformers import ADAPTIVE_BEAMFORMERS, BeamformerName
+from ertis_numba.beamformers import ADAPTIVE_COMBINATIONS, BeamformerName, WeightingName
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones
@@ -21,7 +21,8 @@ __all__ = ["Limits", "random_measurement", "random_settings", "recorded"]
 _DRAWS = 100  # Draws that constructors may refuse, before the limits are considered too narrow.
 
 _ENCODINGS: Final[tuple[Literal["pdm", "int16", "float32"], ...]] = ("pdm", "pdm", "int16", "float32")
-_BEAMFORMERS: Final[tuple[BeamformerName, ...]] = ("delay_and_sum", "delay_and_sum", *ADAPTIVE_BEAMFORMERS)
+_PLAIN: Final[tuple[BeamformerName, WeightingName]] = ("delay_and_sum", "none")
+_COMBINATIONS: Final[tuple[tuple[BeamformerName, WeightingName], ...]] = (_PLAIN, _PLAIN, *ADAPTIVE_COMBINATIONS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,9 +143,9 @@ def _processing(
     record_m = sound_speed_m_s(air) / 2 * recording.duration_s
     width_m = step_m * float(random.uniform(2, limits.max_ranges))
     first_m = max(0.0, float(random.uniform(-0.2, 0.8)) * (record_m - width_m))
-    beamformer = _BEAMFORMERS[random.integers(len(_BEAMFORMERS))]
+    beamformer, weighting = _COMBINATIONS[random.integers(len(_COMBINATIONS))]
     orders = [order for order in range(2, min(8, n_mics) + 1) if math.comb(n_mics, order) <= limits.max_products]
-    spherical = beamformer == "delay_and_sum" and random.integers(2) == 0
+    spherical = (beamformer, weighting) == _PLAIN and random.integers(2) == 0
     widened = random.integers(5) == 0
     edges_hz = (low_hz * float(random.uniform(0.1, 0.9)), high_hz + float(random.uniform(1e3, 2e4)))
     return Processing(
@@ -153,6 +154,7 @@ def _processing(
         range_decimation=step,
         wavefront="spherical" if spherical else "plane",
         beamformer=beamformer,
+        weighting=weighting,
         dmas_order=int(random.choice(orders)),
         snapshots=int(random.integers(1, 9)),
         diagonal_loading=float(10 ** random.uniform(-3, 1)),

@@ -22,7 +22,8 @@ __all__ = ["amplitudes", "beamformed", "capon", "coherence_factor", "dmas", "exa
 Floats = NDArray[np.float64]
 Delayed = NDArray[np.complex128]
 
-_DEFINED: Final = frozenset({"delay_and_sum", "coherence_factor", "dmas", "capon"})
+_DEFINED: Final = frozenset({"delay_and_sum", "dmas", "capon"})
+_WEIGHTINGS: Final = frozenset({"none", "coherence_factor"})
 """Beamformers with a second definition here; `verification` defines the others."""
 
 
@@ -107,12 +108,15 @@ def _matched_spectra(
 
 def beamformed(y: Delayed, processing: Processing) -> Floats:
     """Return the amplitude of one direction: (mic, range) to (range,). The signals must not be silent."""
-    if processing.beamformer not in _DEFINED:
+    if processing.beamformer not in _DEFINED or processing.weighting not in _WEIGHTINGS:
         return combine(y, processing)
+    factor = coherence_factor(y) if processing.weighting == "coherence_factor" else 1.0
+    return factor * _unweighted(y, processing)
+
+
+def _unweighted(y: Delayed, processing: Processing) -> Floats:
     if processing.beamformer == "delay_and_sum":
         return amplitudes(y)
-    if processing.beamformer == "coherence_factor":
-        return coherence_factor(y / len(y))
     if processing.beamformer == "dmas":
         return dmas(y / np.abs(y) ** (1 - 1 / processing.dmas_order), processing.dmas_order)
     return capon(y, processing.snapshots, processing.diagonal_loading)
@@ -124,9 +128,8 @@ def amplitudes(y: Delayed) -> Floats:
 
 
 def coherence_factor(y: Delayed) -> Floats:
-    """Return the amplitude of the sum, weighted by the coherent power relative to the total power."""
-    beams = np.abs(y.sum(axis=0))
-    return np.asarray(beams * beams**2 / (len(y) * (np.abs(y) ** 2).sum(axis=0)))
+    """Return the coherent power relative to the total power."""
+    return np.asarray(np.abs(y.sum(axis=0)) ** 2 / (len(y) * (np.abs(y) ** 2).sum(axis=0)))
 
 
 def dmas(z: Delayed, order: int) -> Floats:

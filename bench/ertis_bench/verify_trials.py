@@ -10,7 +10,7 @@ from ertis_bench.machine import sentence
 from ertis_bench.markdown import table
 from ertis_bench.random_settings import random_measurement
 from ertis_numba import verification
-from ertis_numba.beamformers import BEAMFORMERS
+from ertis_numba.beamformers import BEAMFORMERS, WEIGHTINGS
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.geometry import unit_vectors
@@ -36,6 +36,11 @@ _GROUPS: dict[str, Callable[[Settings], bool]] = {
     **{
         f"`{name}`": lambda settings, name=name: settings.processing.beamformer == name  # type: ignore[misc]
         for name in BEAMFORMERS
+    },
+    **{
+        f"`{name}`": lambda settings, name=name: settings.processing.weighting == name  # type: ignore[misc]
+        for name in WEIGHTINGS
+        if name != "none"
     },
 }
 

@@ -9,7 +9,7 @@ import click
 
 from ertis_cli import _mountings, _plans, _process_many, options
 from ertis_cli._config import typed
-from ertis_numba.beamformers import BEAMFORMERS
+from ertis_numba.beamformers import BEAMFORMERS, WEIGHTINGS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -50,6 +50,11 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
     "--beamformer",
     type=click.Choice(list(BEAMFORMERS)),
     help="Beamformer; the recording's own by default.",
+)
+@click.option(
+    "--weighting",
+    type=click.Choice(list(WEIGHTINGS)),
+    help="Weighting of amplitudes; the recording's own by default.",
 )
 @click.option(
     "--array-weights",
@@ -128,6 +133,7 @@ def process(
     range_m: tuple[float, float] | None,
     method: str | None,
     beamformer: str | None,
+    weighting: str | None,
     array_weights: str | None,
     wavefront: str | None,
     max_error_db: float | None,
@@ -172,6 +178,7 @@ def process(
             range_m=range_m,
             method=method,
             beamformer=beamformer,
+            weighting=weighting,
             array_weights=array_weights,
             wavefront=wavefront,
             max_error_db=max_error_db,

@@ -7,7 +7,7 @@ import click
 
 from ertis_cli import _central_watch, _network, _supervisor, options
 from ertis_cli._saving import withdrawn
-from ertis_numba.beamformers import BEAMFORMERS
+from ertis_numba.beamformers import BEAMFORMERS, WEIGHTINGS
 
 __all__ = ["serve"]
 
@@ -33,6 +33,11 @@ _FOLDER = click.Path(path_type=Path)
     "--beamformer",
     type=click.Choice(list(BEAMFORMERS)),
     help="Beamformer; the sensor's own by default.",
+)
+@click.option(
+    "--weighting",
+    type=click.Choice(list(WEIGHTINGS)),
+    help="Weighting of amplitudes; the sensor's own by default.",
 )
 @click.option(
     "--max-error",
@@ -84,6 +89,7 @@ def serve(
     range_m: tuple[float, float] | None,
     method: str | None,
     beamformer: str | None,
+    weighting: str | None,
     max_error_db: float | None,
     plan: Literal["nominal", "measured"],
     device: str,
@@ -115,7 +121,13 @@ def serve(
     _network.require_duration(duration)
     served = _network.metrics(metrics, lambda: node.latest)
     publish = life.addresses.get("publish") or publish or DEFAULT_PUBLISH
-    changes = {"directions": directions, "range_m": range_m, "method": method, "beamformer": beamformer}
+    changes = {
+        "directions": directions,
+        "range_m": range_m,
+        "method": method,
+        "beamformer": beamformer,
+        "weighting": weighting,
+    }
     keys = _network.server_keys(key, allow)
     with withdrawn(folder, quarantine) as made:
         if quarantine is not None:

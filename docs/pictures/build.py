@@ -16,7 +16,7 @@ from ertis_numba import figures
 HERE = Path(__file__).parent
 BEAMFORMERS: dict[str, dict[str, Any]] = {
     "Delay-and-sum": {},
-    "Coherence factor": {"beamformer": "coherence_factor"},
+    "Coherence factor": {"weighting": "coherence_factor"},
     "DMAS of order 2": {"beamformer": "dmas"},
     "Capon": {"beamformer": "capon"},
 }

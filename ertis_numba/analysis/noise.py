@@ -21,7 +21,7 @@ def noise_of(image: Energyscape) -> float:
     The result is the lower tercile of estimates from the medians of blocks of ranges. The noise of beamformers other
     than delay-and-sum is unknown, because it is not Rayleigh-distributed.
     """
-    if image.settings.processing.beamformer != "delay_and_sum" or not image.amplitude.size:
+    if image.settings.processing.is_adaptive or not image.amplitude.size:
         return 0.0
     some = image.amplitude[:: max(1, image.amplitude.size // _SAMPLE)]
     blocks = np.array_split(some, min(_BLOCKS, some.shape[1]), axis=1)

@@ -89,7 +89,7 @@ class PeakInterpolator:
         rows, columns = _bins(directions, self._neighbours[directions], ranges, last=len(image.range_m) - 1)
         measured = np.log(np.maximum(image.amplitude[rows, columns].astype(np.float64), np.finfo(np.float32).tiny))
         found = self._tops(directions, measured)
-        if self._point_spread is not None and image.settings.processing.beamformer == "delay_and_sum":
+        if self._point_spread is not None and not image.settings.processing.is_adaptive:
             found = self._corrected(self._point_spread, found, directions, measured, (rows, columns), step_m, image)
         shift, offset, level = found[:, 0], found[:, 1:4], found[:, 4]
         top = self._directions[directions] + offset

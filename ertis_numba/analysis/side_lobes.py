@@ -118,7 +118,7 @@ class SideLobes:
         Only the strongest maxima of separate ranges are compared, because one of them may be the only reflector at its
         range. Adaptive beamformers have weaker side lobes than predicted, so their uncertainty is 0.
         """
-        if self._image.settings.processing.beamformer != "delay_and_sum":
+        if self._image.settings.processing.is_adaptive:
             return 0.0
         ratios: list[float] = []
         ranges_m: list[float] = []

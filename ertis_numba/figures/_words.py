@@ -44,7 +44,8 @@ def of_image(image: Energyscape) -> Heading:
         directions = f"azimuth {angle(azimuth_deg)}, elevation {angle(elevation_deg)}"
     else:
         directions = f"{len(image.azimuth_rad)} directions"
-    adaptive = "" if processing.beamformer == "delay_and_sum" else f", {processing.beamformer.replace('_', ' ')}"
+    parts = (processing.beamformer, "delay_and_sum"), (processing.weighting, "none")
+    adaptive = "".join(f", {name.replace('_', ' ')}" for name, usual in parts if name != usual)
     budget_db = settings.accuracy.max_error_db
     return Heading(
         ("Energyscape", image.stamp.sensor, f"measurement {image.stamp.sequence}", *_if_faint(image.amplitude)),

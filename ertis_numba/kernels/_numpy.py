@@ -246,12 +246,12 @@ def _delayed(
         yield direction, windows[places] * weights[direction].astype(np.complex128)[:, None]
 
 
-def combine_coherence(signals: Complex, offsets: Index, weights: Complex, out: Real) -> None:
-    """Delay-and-sum times the coherence factor of Mallart and Fink (1994), which measures agreement of microphones."""
+def weight_coherence(signals: Complex, offsets: Index, weights: Complex, out: Real) -> None:
+    """Multiply amplitudes by the coherence factor of Mallart and Fink (1994), which measures agreement."""
     for direction, y in _delayed(signals, offsets, weights, out.shape[1]):
-        beams = np.abs(y.sum(axis=0))
+        coherent = np.abs(y.sum(axis=0)) ** 2
         total = len(y) * (y.real**2 + y.imag**2).sum(axis=0)
-        out[direction] = np.divide(beams**3, total, out=np.zeros_like(beams), where=total != 0)
+        out[direction] *= np.divide(coherent, total, out=np.zeros_like(coherent), where=total != 0)
 
 
 def combine_dmas(signals: Complex, offsets: Index, weights: Complex, order: int, out: Real) -> None:

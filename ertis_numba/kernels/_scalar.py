@@ -1,6 +1,6 @@
 """Scalar arithmetic, inlined into the kernels that call it and compiled for their device.
 
-Kernels of the CPU and of the GPU share `power`, `magnitude`, `coherent_level`, `between` and the constants. All other
+Kernels of the CPU and of the GPU share `power`, `magnitude`, `coherence_factor`, `between` and the constants. All other
 functions are for the GPU only: complex numbers that take a single load, roots and hashes.
 
 Compilers may fuse a product and a sum. In ``a b + c d`` either product may be fused, with different bits, and on the
@@ -21,7 +21,7 @@ __all__ = [
     "STEP",
     "TO_GRID",
     "between",
-    "coherent_level",
+    "coherence_factor",
     "dither_of",
     "hash_of",
     "imag_of",
@@ -122,15 +122,15 @@ def between(low, high, part):
 
 
 @njit(inline="always", error_model="numpy", cache=True)
-def coherent_level(real, imag, total_power, count):
-    """Return the magnitude of the sum of ``count`` numbers times their coherence factor.
+def coherence_factor(real, imag, total_power, count):
+    """Return the coherence factor of ``count`` numbers from their sum and the sum of their powers.
 
-    The factor is limited to 1, so that rounding errors cannot raise the level, and is 0 for zero power. NaN propagates.
+    The factor is limited to 1, so that rounding errors cannot raise a level, and is 0 for zero power. NaN propagates.
     """
     coherent = power(real, imag)
     total = count * total_power
     factor = coherent / total if total != 0 else np.float32(0)
-    return min(factor, np.float32(1)) * math.sqrt(coherent)
+    return min(factor, np.float32(1))
 
 
 @njit(inline="always", error_model="numpy", cache=True)

@@ -4,7 +4,7 @@ import math
 from typing import Final, Literal
 
 from ertis_numba import checks
-from ertis_numba.beamformers import BEAMFORMERS, BeamformerName
+from ertis_numba.beamformers import BEAMFORMERS, WEIGHTINGS, BeamformerName, WeightingName
 from ertis_numba.constants import MAX_MICROPHONES, MAX_NAME_LENGTH
 from ertis_numba.documents import TomlTable
 from ertis_numba.errors import ArgumentError
@@ -49,6 +49,9 @@ class Processing(TomlTable, frozen=True, kw_only=True):
     beamformer : str, default "delay_and_sum"
         Combination of the delayed signals, one of `BEAMFORMERS`; ``docs/explanation/beamformers.md`` compares them. All
         except delay_and_sum need the fast method and plane wavefronts.
+    weighting : {"none", "coherence_factor"}, default "none"
+        Factor from 0 to 1 that multiplies each amplitude, one of `WEIGHTINGS`. ``coherence_factor`` is the share of
+        the power that agrees between the microphones. It needs the fast method and plane wavefronts.
     dmas_order : int, default 2
         Number of microphone signals that ``dmas`` multiplies at a time, 2 to 8.
     snapshots : int, default 5
@@ -73,10 +76,16 @@ class Processing(TomlTable, frozen=True, kw_only=True):
     decimation: int | None = None
     wavefront: Literal["plane", "spherical", "auto"] = "plane"
     beamformer: BeamformerName = "delay_and_sum"
+    weighting: WeightingName = "none"
     dmas_order: int = 2
     snapshots: int = 5
     diagonal_loading: float = 1.0
     array_weights: str | tuple[float, ...] = "uniform"
+
+    @property
+    def is_adaptive(self) -> bool:
+        """True if amplitudes depend on the agreement of the microphones: all except unweighted delay-and-sum."""
+        return self.beamformer != "delay_and_sum" or self.weighting != "none"
 
     @property
     def azimuth_limits_rad(self) -> tuple[float, float]:
@@ -150,29 +159,42 @@ class Processing(TomlTable, frozen=True, kw_only=True):
         else:
             for channel, weight in enumerate(given):
                 checks.between(f"processing.array_weights[{channel}]", weight, 0.0, 1e6)
-        if given != "uniform" and self.beamformer != "delay_and_sum":
+        if given != "uniform" and self.is_adaptive:
             raise ArgumentError(
-                f"processing.array_weights is {_shortened(given)}, but processing.beamformer {self.beamformer!r} "
-                "supports only 'uniform'; leave array_weights out, or give processing.beamformer 'delay_and_sum'"
+                f"processing.array_weights is {_shortened(given)}, but {self._adaptive_part} supports only 'uniform'; "
+                "leave array_weights out, or give processing.beamformer 'delay_and_sum' and weighting 'none'"
             )
 
     def _check_beamformer(self) -> None:
         """Refuse options of beamformers that are out of range, and those that only delay-and-sum supports."""
+        if self.beamformer in WEIGHTINGS:
+            raise ArgumentError(
+                f"processing.beamformer {self.beamformer!r} is a weighting; give it as processing.weighting, with"
+                f" one of the beamformers {', '.join(BEAMFORMERS)}"
+            )
         checks.choice("processing.beamformer", self.beamformer, tuple(BEAMFORMERS))
+        checks.choice("processing.weighting", self.weighting, tuple(WEIGHTINGS))
         for option in (option for each in BEAMFORMERS.values() for option in each.options):
             value = getattr(self, option.name)
             if isinstance(option.low, int) and isinstance(option.high, int):
                 checks.integer(f"processing.{option.name}", value, option.low, option.high)
             else:
                 checks.between(f"processing.{option.name}", value, option.low, option.high)
-        if self.beamformer == "delay_and_sum":
+        if not self.is_adaptive:
             return
         for name, value, remedy in (("method", "paper", "'fast'"), ("wavefront", "spherical", "'plane'")):
             if getattr(self, name) == value:
                 raise ArgumentError(
-                    f"processing.{name} is {value!r}, which supports only processing.beamformer 'delay_and_sum'; give "
-                    f"{remedy} with beamformer {self.beamformer!r}"
+                    f"processing.{name} is {value!r}, which supports only processing.beamformer 'delay_and_sum' and "
+                    f"weighting 'none'; give {remedy} with {self._adaptive_part}"
                 )
+
+    @property
+    def _adaptive_part(self) -> str:
+        """Beamformer or weighting that makes amplitudes adaptive, as named in errors."""
+        if self.beamformer != "delay_and_sum":
+            return f"processing.beamformer {self.beamformer!r}"
+        return f"processing.weighting {self.weighting!r}"
 
 
 def _shortened(weights: str | tuple[float, ...]) -> str:

@@ -73,7 +73,10 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
         "zones": "focal_zones",
         "loading": "diagonal_loading",
     }
-    removed_lines: ClassVar[tuple[str, ...]] = ('interpolation = "fitted"',)
+    former_lines: ClassVar[dict[str, str]] = {
+        'interpolation = "fitted"': "",
+        'beamformer = "coherence_factor"': 'beamformer = "delay_and_sum"\nweighting = "coherence_factor"',
+    }
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -128,7 +131,7 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
 
     def _check_adaptive(self) -> None:
         """Refuse plans that only delay-and-sum supports."""
-        if self.processing.beamformer == "delay_and_sum":
+        if not self.processing.is_adaptive:
             return
         accuracy = self.accuracy
         for name, value, wanted in (

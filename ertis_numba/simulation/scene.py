@@ -61,7 +61,7 @@ class Scene(TomlDocument, frozen=True, kw_only=True):
     """
 
     former_keys: ClassVar[dict[str, str]] = Sensor.former_keys
-    removed_lines: ClassVar[tuple[str, ...]] = Sensor.removed_lines
+    former_lines: ClassVar[dict[str, str]] = Sensor.former_lines
 
     seed: int = 0
     rate_hz: float = 20.0

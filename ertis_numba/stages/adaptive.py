@@ -1,9 +1,9 @@
-"""Adaptive beamformers: all that the registry declares except delay-and-sum."""
+"""Adaptive beamformers and weightings: all combinations that the registry declares except delay-and-sum alone."""
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.beamformers import BEAMFORMERS
+from ertis_numba.beamformers import BEAMFORMERS, WEIGHTINGS
 from ertis_numba.kernels import KernelSet, Memory
 from ertis_numba.settings import Processing
 
@@ -19,7 +19,7 @@ class AdaptiveBeamform:
     Parameters
     ----------
     processing : Processing
-        Settings with a ``beamformer`` other than ``delay_and_sum``.
+        Settings with an adaptive beamformer or a weighting.
     kernels : KernelSet
     memory : Memory
     offsets : (direction, mic) int32
@@ -44,10 +44,25 @@ class AdaptiveBeamform:
         beamformer = BEAMFORMERS[processing.beamformer]
         self._options = beamformer.values(processing)
         beamformer.check(offsets.shape[1], *self._options)
-        self._kernel = getattr(kernels, beamformer.kernel)
-        self._offsets = memory.table(offsets)
-        self._weights = memory.table(beamformer.weights(weights, *self._options))
+        weighting = WEIGHTINGS[processing.weighting]
+        self._combine = getattr(kernels, beamformer.kernel) if beamformer.kernel else self._delay_and_sum
+        self._weight = getattr(kernels, weighting.kernel) if weighting.kernel else None
+        self._kernels = kernels
+        self._offsets, self._plain = memory.table(offsets), memory.table(weights)
+        scaled = beamformer.weights(weights, *self._options) if beamformer.kernel else weights
+        self._weights = memory.table(scaled)
 
     def __call__(self, analytic: NDArray[np.complex64], out: NDArray[np.float32]) -> None:
         """Fill ``out``, (direction, range) float32, from ``analytic``, (mic, phase, sample) complex64."""
-        self._kernel(analytic, self._offsets, self._weights, *self._options, out)
+        self._combine(analytic, self._offsets, self._weights, *self._options, out)
+        if self._weight is not None:
+            self._weight(analytic, self._offsets, self._plain, out)
+
+    def _delay_and_sum(
+        self,
+        analytic: NDArray[np.complex64],
+        offsets: NDArray[np.int32],
+        weights: NDArray[np.complex64],
+        out: NDArray[np.float32],
+    ) -> None:
+        self._kernels.delay_and_sum_envelope(analytic, offsets, weights, 0, out.shape[1], out)

@@ -107,7 +107,7 @@ class FastChain(KernelChain):
         self._beamform = beamform(
             plan.precision, kernels, memory, window, zones, nodes, n_phases=n_phases, threads=threads
         )
-        if settings.processing.beamformer != "delay_and_sum":
+        if settings.processing.is_adaptive:
             table = zones[0].table
             self._adaptive = AdaptiveBeamform(
                 settings.processing,

@@ -30,7 +30,7 @@ def open_plans(model: PlanModel, budget: float, *, has_int16: bool) -> list[Imag
         True if the device has a 16-bit dot product.
     """
     given = model.settings.accuracy
-    adaptive = model.settings.processing.beamformer != "delay_and_sum"
+    adaptive = model.settings.processing.is_adaptive
     precisions = ["float32"] if given.precision == "auto" else [given.precision]
     if given.precision == "auto" and has_int16 and not adaptive:
         precisions.append("int16")

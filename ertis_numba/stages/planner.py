@@ -211,7 +211,7 @@ class Planner:
 
         The answer holds for any sound: it depends neither on the signal model nor on the sensitivity of this planner.
         """
-        if self.settings.processing.beamformer == "delay_and_sum":
+        if not self.settings.processing.is_adaptive:
             return True
         safe = Planner(self.settings, self._kernels, threads=self._threads)
         return safe.error_db(accuracy) <= accuracy.max_error_db + _ROUNDED_DB

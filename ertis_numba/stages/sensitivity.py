@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Self
 
-from ertis_numba.beamformers import BEAMFORMERS
+from ertis_numba.beamformers import BEAMFORMERS, WEIGHTINGS
 from ertis_numba.settings import Processing
 
 __all__ = ["Sensitivity"]
@@ -30,11 +30,14 @@ class Sensitivity:
     def of(cls, processing: Processing, n_mics: int) -> Self:
         """Return a safe estimate for any sound.
 
-        The registry of beamformers declares it. The estimates result from perturbed weights in noise and in scenes of
-        one echo and of 12 echoes.
+        The registry of beamformers and weightings declares it. The estimates result from perturbed weights in noise and
+        in scenes of one echo and of 12 echoes.
         """
         beamformer = BEAMFORMERS[processing.beamformer]
-        return cls(*beamformer.sensitivity(n_mics, *beamformer.values(processing)))
+        linear, quadratic = beamformer.sensitivity(n_mics, *beamformer.values(processing))
+        # Beam and factor have errors of the same signals, so that their relative errors add up as amplitudes.
+        raised = math.sqrt(linear) + WEIGHTINGS[processing.weighting].sensitivity
+        return cls(raised**2, quadratic * raised / math.sqrt(linear))
 
     def output(self, power: float) -> float:
         """Return the error power of the image for an error power of the beams."""

@@ -25,7 +25,7 @@ def with_wavefront(settings: Settings, model: ErrorModel) -> Settings:
     processing = settings.processing
     spherical = (
         processing.method == "fast"
-        and processing.beamformer == "delay_and_sum"
+        and not processing.is_adaptive
         and plane_wave_error_db(model, settings, processing.range_m[0]) > settings.accuracy.max_error_db
     )
     return settings.replace(processing=processing.replace(wavefront="spherical" if spherical else "plane"))

@@ -1,4 +1,4 @@
-"""Reference beamformers in float64, as defined in docs/explanation/beamformers.md."""
+"""Reference beamformers and weightings in float64, as defined in docs/explanation/beamformers.md."""
 
 import math
 from collections.abc import Callable
@@ -25,17 +25,16 @@ def combine(y: Delayed, processing: Processing) -> NDArray[np.float64]:
         microphones.
     processing : Processing
     """
-    return _BEAMFORMERS[processing.beamformer](y, processing)
+    return _BEAMFORMERS[processing.beamformer](y, processing) * _WEIGHTINGS[processing.weighting](y)
 
 
 def _delay_and_sum(y: Delayed, _: Processing) -> NDArray[np.float64]:
     return np.asarray(np.abs(y.mean(axis=0)))
 
 
-def _coherence_factor(y: Delayed, processing: Processing) -> NDArray[np.float64]:
-    coherent = _delay_and_sum(y, processing)
-    total = np.mean(np.abs(y) ** 2, axis=0)
-    return np.divide(coherent**3, total, out=np.zeros_like(coherent), where=total > 0)
+def _coherence_factor(y: Delayed) -> NDArray[np.float64]:
+    coherent, total = np.abs(y.mean(axis=0)) ** 2, np.mean(np.abs(y) ** 2, axis=0)
+    return np.divide(coherent, total, out=np.zeros_like(coherent), where=total > 0)
 
 
 def _dmas(y: Delayed, processing: Processing) -> NDArray[np.float64]:
@@ -69,7 +68,10 @@ def _capon(y: Delayed, processing: Processing) -> NDArray[np.float64]:
 
 _BEAMFORMERS: dict[str, Callable[[Delayed, Processing], NDArray[np.float64]]] = {
     "delay_and_sum": _delay_and_sum,
-    "coherence_factor": _coherence_factor,
     "dmas": _dmas,
     "capon": _capon,
+}
+_WEIGHTINGS: dict[str, Callable[[Delayed], NDArray[np.float64]]] = {
+    "none": lambda y: np.ones(y.shape[1]),
+    "coherence_factor": _coherence_factor,
 }

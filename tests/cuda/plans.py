@@ -1,6 +1,6 @@
 """Settings small enough for the slow CUDA simulator, and the processing plans to test with them."""
 
-from ertis_numba.beamformers import ADAPTIVE_BEAMFORMERS
+from ertis_numba.beamformers import ADAPTIVE_COMBINATIONS
 from ertis_numba.settings import Accuracy, Array, Call, Processing, Recording, Settings
 
 TINY = Settings(
@@ -50,10 +50,10 @@ PLANS["paper"] = (
     ),
     -120,
 )
-for _beamformer in ADAPTIVE_BEAMFORMERS:
-    PLANS[_beamformer] = (
+for _beamformer, _weighting in ADAPTIVE_COMBINATIONS:
+    PLANS[f"{_beamformer}, {_weighting}"] = (
         TINY.replace(
-            processing=TINY.processing.replace(beamformer=_beamformer, directions="2d:3"),
+            processing=TINY.processing.replace(beamformer=_beamformer, weighting=_weighting, directions="2d:3"),
             accuracy=DIRECT.replace(oversampling=8, delay_taps=1),
         ),
         -110,

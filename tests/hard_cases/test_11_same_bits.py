@@ -70,7 +70,8 @@ def combined():
     signals, weights = noise(32, 2, 400), noise(20, 32)
     offsets = (np.arange(32) * 800 + random.integers(0, 100, (20, 32))).astype(np.int32)
     outs = np.empty((3, 20, 300), np.float32)
-    cpu.combine_coherence(signals, offsets, weights, outs[0])
+    outs[0] = 1
+    cpu.weight_coherence(signals, offsets, weights, outs[0])
     cpu.combine_dmas(signals, offsets, weights, 2, outs[1])
     cpu.combine_capon(signals, offsets, weights, 3, 0.1, outs[2])
     return digest(outs)

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, Phase, event, given, settings, strategies as st
 
 from ertis_numba.analysis.detect import find_peaks
-from ertis_numba.beamformers import ADAPTIVE_BEAMFORMERS
+from ertis_numba.beamformers import BEAMFORMERS, WEIGHTINGS
 from ertis_numba.errors import ArgumentError, DataError, DeviceError
 from ertis_numba.frames import Measurement
 from ertis_numba.pipeline import Pipeline
@@ -94,7 +94,8 @@ TUNING = {
 }
 COMBINING = {
     "wavefront": st.sampled_from(["plane", "spherical"]),
-    "beamformer": st.sampled_from(["delay_and_sum", "delay_and_sum", *ADAPTIVE_BEAMFORMERS]),
+    "beamformer": st.sampled_from(["delay_and_sum", *BEAMFORMERS]),
+    "weighting": st.sampled_from(["none", *WEIGHTINGS]),
     "dmas_order": st.integers(2, 8),
     "snapshots": st.integers(1, 32),
     "diagonal_loading": st.floats(1e-6, 1e6),

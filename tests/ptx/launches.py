@@ -4,7 +4,7 @@ import functools
 
 import numpy as np
 
-from ertis_numba.beamformers import ADAPTIVE_BEAMFORMERS
+from ertis_numba.beamformers import ADAPTIVE_COMBINATIONS
 from ertis_numba.kernels._cuda import compiling
 from ertis_numba.settings import Accuracy, Processing, Settings
 from ertis_numba.stages import planner
@@ -20,7 +20,10 @@ PLANS = {
     "int16": ({"precision": "int16", "beam_taps": 0, "delay_taps": 2}, {}),
     "int16, nodes": ({"precision": "int16", "beam_taps": 4}, {}),
     "near": ({}, {"range_m": (0.3, 1.0)}),  # several focal zones
-    **{name: ({}, {"beamformer": name, "directions": "90"}) for name in ADAPTIVE_BEAMFORMERS},
+    **{
+        f"{beamformer}, {weighting}": ({}, {"beamformer": beamformer, "weighting": weighting, "directions": "90"})
+        for beamformer, weighting in ADAPTIVE_COMBINATIONS
+    },
     **{f"dmas {order}": ({}, {"beamformer": "dmas", "dmas_order": order}) for order in (2, 3, 5, 8)},
 }
 

@@ -1,4 +1,4 @@
-"""Contracts of the beamformers other than delay-and-sum: analytic signals to envelopes."""
+"""Contracts of adaptive beamformers and weightings: analytic signals to envelopes."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -8,17 +8,18 @@ from ertis_numba.kernels._contract.arrays import Complex, Index, Real
 __all__ = ["AdaptiveKernels"]
 
 
-class CombineCoherence(Protocol):
-    """Delay-and-sum times the coherence factor of Mallart and Fink (1994), which measures agreement of microphones.
+class WeightCoherence(Protocol):
+    """Multiply amplitudes by the coherence factor of Mallart and Fink (1994), which measures agreement.
 
-    With ``y = weights[direction, mic] · signals.flat[offsets[direction, mic] + range]``,
-    ``out[direction, range] = |Σ y| · |Σ y|² / (M Σ |y|²)`` over the M microphones, and 0 if all are silent.
+    With ``y = weights[direction, mic] · signals.flat[offsets[direction, mic] + range]``, the factor is
+    ``|Σ y|² / (M Σ |y|²)`` over the M microphones, and 0 if all are silent.
 
     Parameters
     ----------
     signals, offsets, weights
         As in `DelayAndSum`.
     out : (direction, range) float32
+        Amplitudes, which the kernel replaces by their products with the factor.
     """
 
     def __call__(self, signals: Complex, offsets: Index, weights: Complex, out: Real) -> None: ...
@@ -52,7 +53,7 @@ class CombineDmas(Protocol):
 class CombineCapon(Protocol):
     """Combine the microphones with the Capon (minimum-variance distortionless response) weights.
 
-    Let y be as in `CombineCoherence`, and R its covariance over the ``n_snapshots`` ranges around a range. Near the
+    Let y be as in `WeightCoherence`, and R its covariance over the ``n_snapshots`` ranges around a range. Near the
     ends of the image, R uses the nearest ranges inside it. With M microphones and
     ``R' = R + loading · trace(R) / M · I``, the weights are ``w = R'⁻¹ 1 / (1ᵀ R'⁻¹ 1)``. The result is
     ``out[direction, range] = |wᴴ y|``, and 0 if all microphones are silent.
@@ -75,8 +76,8 @@ class CombineCapon(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AdaptiveKernels:
-    """Kernels of the adaptive beamformers, as attributes of a `KernelSet`."""
+    """Kernels of adaptive beamformers and weightings, as attributes of a `KernelSet`."""
 
-    combine_coherence: CombineCoherence
     combine_dmas: CombineDmas
     combine_capon: CombineCapon
+    weight_coherence: WeightCoherence

@@ -1,14 +1,14 @@
 # mypy: ignore-errors
-"""Sum the microphones, and weight the sum by their coherence factor."""
+"""Multiply amplitudes by the coherence factor of the microphones."""
 
 import numpy as np
 from numba import cuda
 
 from ertis_numba.kernels._cuda.lane import launch
 from ertis_numba.kernels._cuda.terms import BLOCK, DIRECTIONS, TILE, WARP, beam_grid, complexes
-from ertis_numba.kernels._scalar import coherent_level, imag_of, power, real_of
+from ertis_numba.kernels._scalar import coherence_factor, imag_of, power, real_of
 
-__all__ = ["combine_coherence"]
+__all__ = ["weight_coherence"]
 
 _ONE, _ZERO = np.uint64(1), np.float32(0)  # adding 0 determines which product is fused
 
@@ -23,7 +23,7 @@ def _add(sums, sample, w_real, w_imag):
 
 
 @cuda.jit(cache=True)
-def _combine(signals, offsets, weights, n_mics, out):
+def _weight(signals, offsets, weights, n_mics, out):
     direction = np.uint64(cuda.blockIdx.x * DIRECTIONS + cuda.threadIdx.y)
     n_ranges = np.int64(out.shape[1])
     place = np.int64(cuda.blockIdx.y * TILE + cuda.threadIdx.x)
@@ -47,16 +47,16 @@ def _combine(signals, offsets, weights, n_mics, out):
         c = _add(c, signals[at + step_2], w_real, w_imag)
         d = _add(d, signals[at + step_3], w_real, w_imag)
     r, count = np.uint64(place), np.float32(n_mics)
-    out[direction, r] = coherent_level(a[0], a[1], a[2], count)
+    out[direction, r] *= coherence_factor(a[0], a[1], a[2], count)
     if last >= WARP:
-        out[direction, r + step_1] = coherent_level(b[0], b[1], b[2], count)
+        out[direction, r + step_1] *= coherence_factor(b[0], b[1], b[2], count)
     if last >= 2 * WARP:
-        out[direction, r + step_2] = coherent_level(c[0], c[1], c[2], count)
+        out[direction, r + step_2] *= coherence_factor(c[0], c[1], c[2], count)
     if last >= 3 * WARP:
-        out[direction, r + step_3] = coherent_level(d[0], d[1], d[2], count)
+        out[direction, r + step_3] *= coherence_factor(d[0], d[1], d[2], count)
 
 
-def combine_coherence(signals, offsets, weights, out):
-    """Delay-and-sum times the coherence factor of Mallart and Fink (1994), which measures agreement of microphones."""
+def weight_coherence(signals, offsets, weights, out):
+    """Multiply amplitudes by the coherence factor of Mallart and Fink (1994), which measures agreement."""
     tables = offsets.reshape(-1), complexes(weights), offsets.shape[1]
-    launch(_combine, beam_grid(*out.shape), BLOCK, complexes(signals), *tables, out)
+    launch(_weight, beam_grid(*out.shape), BLOCK, complexes(signals), *tables, out)

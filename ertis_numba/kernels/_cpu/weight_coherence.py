@@ -1,20 +1,20 @@
 # mypy: ignore-errors
-"""Sum the microphones, and weight the sum by their coherence factor."""
+"""Multiply amplitudes by the coherence factor of the microphones."""
 
 import numpy as np
 from numba import njit, prange
 
-from ertis_numba.kernels._scalar import coherent_level
+from ertis_numba.kernels._scalar import coherence_factor
 
-__all__ = ["combine_coherence"]
+__all__ = ["weight_coherence"]
 
 _ZERO = np.float32(0)  # adding it determines which product is fused
 _TILE = 256  # ranges whose sums stay in the L1 cache during the loop over microphones
 
 
 @njit(parallel=True, nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
-def combine_coherence(signals, offsets, weights, out):
-    """Delay-and-sum times the coherence factor of Mallart and Fink (1994), which measures agreement of microphones."""
+def weight_coherence(signals, offsets, weights, out):
+    """Multiply amplitudes by the coherence factor of Mallart and Fink (1994), which measures agreement."""
     flat = signals.reshape(-1)
     n_directions, n_mics = offsets.shape
     n_ranges = out.shape[1]
@@ -35,4 +35,4 @@ def combine_coherence(signals, offsets, weights, out):
                     imag[r] += y_imag
                     total[r] = (total[r] + y_real * y_real) + y_imag * y_imag
             for r in range(count):
-                out[direction, first + r] = coherent_level(real[r], imag[r], total[r], np.float32(n_mics))
+                out[direction, first + r] *= coherence_factor(real[r], imag[r], total[r], np.float32(n_mics))
