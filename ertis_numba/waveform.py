@@ -29,6 +29,7 @@ _TRANSITION_HZ = 5_000.0  # wide enough for the matched filter to ring for only 
 _MIN_TRANSITION = 0.02  # relative to the decimated rate; the length of the filter is proportional to the inverse
 _STOPBAND_ATTENUATION_DB = 60.0
 _MAX_FILTERS = 32  # About five times the number of filters in one search for a plan.
+_MAX_SPECTRA = 8  # a plan and its pipeline use three; one takes at most some megabytes
 _STOPBAND_TOLERANCE_DB = 0.5  # tolerance of the stopband attenuation
 _WAVEFORM_OVERSAMPLING = 16  # oversampling of a custom waveform before spline interpolation
 _MAX_ROUNDING_ERROR_DB = (
@@ -122,7 +123,11 @@ def call_spectrum(
         Samples of the record per signal sample; that of the settings by default.
     """
     decimation = settings.decimation if decimation is None else decimation
-    samples = call_samples(call, rate_hz=settings.recording.sample_rate_hz)
+    return _call_spectrum(call, settings.recording.sample_rate_hz, n_fft, decimation)
+
+
+def _call_spectrum(call: Call, sample_rate_hz: float, n_fft: int, decimation: int) -> NDArray[np.complex128]:
+    samples = call_samples(call, rate_hz=sample_rate_hz)
     return np.asarray(np.fft.rfft(samples, n_fft * decimation)[: n_fft // 2 + 1] / decimation)
 
 
@@ -182,27 +187,38 @@ def matched_filter_spectrum(settings: Settings, *, n_fft: int, decimation: int |
 
     Returns
     -------
-    MatchedFilter
+    MatchedFilterSpectrum
+        Its values are read-only, because several callers share them.
     """
-    call = settings.call
     decimation = settings.decimation if decimation is None else decimation
-    spacing_hz = settings.recording.sample_rate_hz / decimation / n_fft
-    low_hz, high_hz = matched_band_hz(settings)
+    band_hz = matched_band_hz(settings)
+    return _matched_filter_spectrum(settings.call, settings.recording.sample_rate_hz, band_hz, n_fft, decimation)
+
+
+@functools.lru_cache(maxsize=_MAX_SPECTRA)
+def _matched_filter_spectrum(
+    call: Call, sample_rate_hz: float, band_hz: tuple[float, float], n_fft: int, decimation: int
+) -> MatchedFilterSpectrum:
+    """Compute the matched filter. Spectra are cached, because a plan needs each several times."""
+    spacing_hz = sample_rate_hz / decimation / n_fft
+    low_hz, high_hz = band_hz
     last_bin = min(
         math.floor(high_hz / spacing_hz), n_fft // 2
     )  # At the rates of the paper, the edge may exceed the Nyquist frequency.
     bins = np.arange(math.ceil(low_hz / spacing_hz), last_bin + 1)
     frequency_hz = bins * spacing_hz
-    spectrum = call_spectrum(call, settings, n_fft=n_fft, decimation=decimation)[bins]
+    spectrum = _call_spectrum(call, sample_rate_hz, n_fft, decimation)[bins]
     outside = np.maximum(
         (call.low_frequency_hz - frequency_hz) / (call.low_frequency_hz - low_hz),
         (frequency_hz - call.high_frequency_hz) / (high_hz - call.high_frequency_hz),
     )
     window = np.cos(math.pi / 2 * np.clip(outside, 0.0, 1.0)) ** 2
     power = np.abs(spectrum) ** 2 * window
+    values = np.conj(spectrum) * window * (n_fft / np.sum(power))
+    values.flags.writeable = False
     return MatchedFilterSpectrum(
         first_bin=int(bins[0]),
-        values=np.conj(spectrum) * window * (n_fft / np.sum(power)),
+        values=values,
         centre_hz=float(np.sum(frequency_hz * power) / np.sum(power)),
     )
 
