@@ -201,13 +201,18 @@ class Sight:
 
     def coverage(self, direction: Floats) -> Floats:
         """Return the gain of the best beam for a wave from each direction: (path,) float64, at most 1."""
-        wave = 2 * math.pi * float(self.frequency_hz @ self.power) / self.shot.speed_m_s
-        beams = np.exp(-1j * wave * (_directions(self.settings) @ self._positions_m.T))
+        wave, beams = self._beams
         taken = np.zeros(len(direction))
         for part in parts(len(direction), max(beams.shape)):
             waves = np.exp(1j * wave * (direction[part] @ self._positions_m.T))
             taken[part] = np.max(np.abs(beams @ waves.T), axis=0, initial=0.0)
         return taken / len(self._positions_m)
+
+    @functools.cached_property
+    def _beams(self) -> tuple[float, NDArray[np.complex128]]:
+        """Wavenumber at the mean frequency, and phases of the beams of all directions: (direction, mic)."""
+        wave = 2 * math.pi * float(self.frequency_hz @ self.power) / self.shot.speed_m_s
+        return wave, np.exp(-1j * wave * (_directions(self.settings) @ self._positions_m.T))
 
     def of_white_noise(
         self, dbfs: float, *, coherent: bool = False, band_hz: tuple[float, float] | None = None
