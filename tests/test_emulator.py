@@ -123,6 +123,7 @@ def test_emulator_truncates_or_repeats_samples_to_length():
             assert np.array_equal(words, np.concatenate([WORDS[0], WORDS[1], WORDS[0]])[:n_samples])
 
 
+@pytest.mark.alone  # the limit of 5 ms is a wall-clock time
 @pytest.mark.parametrize(("clock", "rate_hz"), [(0, 4.5e6), (1, 1.125e6)])
 def test_emulator_sends_first_byte_after_measurement_duration(port, clock, rate_hz):
     ask(port, b"!F,%d,0,0\n" % clock)
