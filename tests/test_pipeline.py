@@ -10,6 +10,7 @@ import os
 import subprocess
 import sys
 import tracemalloc
+import types
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ import pytest
 
 from ertis_numba import kernels
 from ertis_numba.air import sound_speed_m_s
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.errors import ArgumentError, DataError, DeviceError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones, unit_vectors
 from ertis_numba.pipeline import Pipeline
@@ -159,6 +160,28 @@ def test_cuda_without_a_gpu_is_refused_with_a_remedy():
     error = done.stderr.strip().splitlines()[-1]
     assert "DeviceError: device 'cuda' finds no NVIDIA GPU" in error
     assert "use device 'cpu', or install ertis-numba[cu12] or [cu13]" in error
+
+
+def fails_to_import(monkeypatch, module: str):
+    """Let the import of the CUDA kernels fail because of ``module``."""
+
+    def fail(_name):
+        raise ModuleNotFoundError(f"No module named {module!r}", name=module)
+
+    kernels.load("cpu")
+    monkeypatch.setattr("ertis_numba.kernels._dispatch.importlib", types.SimpleNamespace(import_module=fail))
+
+
+def test_cuda_without_numbas_target_is_refused_with_a_remedy(monkeypatch):
+    fails_to_import(monkeypatch, "numba.cuda")
+    with pytest.raises(DeviceError, match=r"'cuda' cannot be loaded \(No module named 'numba.cuda'\); use device"):
+        kernels.load.__wrapped__("cuda")
+
+
+def test_missing_module_of_a_cuda_kernel_is_not_taken_for_a_missing_gpu(monkeypatch):
+    fails_to_import(monkeypatch, "ertis_numba.kernels._cuda.lost")
+    with pytest.raises(ModuleNotFoundError, match="lost"):
+        kernels.load.__wrapped__("cuda")
 
 
 def test_batch_equals_single_measurements():
