@@ -40,7 +40,6 @@ MAX_MEMORY_BYTES: Final = 2**28
 """Limit on the memory for a prediction of real-time images."""
 
 _MAX_DIRECTIONS: Final = 64
-_BYTES_PER_SAMPLE: Final = 32  # signals of a few microphones, as noise is estimated over the whole record
 _FAINTER_RATIO: Final = 0.1
 _ROWS: Final = 16
 
@@ -151,13 +150,13 @@ def predict(planner: Planner) -> Prediction:
 
 
 def memory_bytes(image: Energyscape) -> int:
-    """Return an estimate of the memory for a prediction: signals, squares of an image, and tables of a rough one."""
+    """Return an estimate of the memory for a prediction: squares of an image, and tables of a rough one."""
     settings, table = image.settings, 0
     if settings.processing.is_adaptive:
         n_mics = int(microphones(settings.array).enabled.sum())
         n_zones = 1 if settings.processing.wavefront == "plane" else ROUGH_ZONES
         table = TABLE_BYTES * len(image.amplitude) * n_mics * ROUGH_DELAY_TAPS * n_zones
-    return table + 20 * image.amplitude.size + _BYTES_PER_SAMPLE * settings.recording.n_samples
+    return table + 20 * image.amplitude.size
 
 
 class BudgetMonitor:

@@ -7,13 +7,17 @@ dither.
 
 import importlib.metadata
 import itertools
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from ertis_numba import open_recording
 from ertis_numba.devices import splices
+from ertis_numba.devices.bit_means import BitMeans
 from ertis_numba.devices.bits import BitCheck
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import load_layout
@@ -300,3 +304,21 @@ def test_pdm_check_refuses_invalid_arguments(change, message):
 def test_pdm_check_refuses_other_arrays(words, message):
     with pytest.raises(ArgumentError, match=message):
         BitCheck(SHORT, RATE_HZ).check(words)
+
+
+@pytest.mark.parametrize("n_samples", [4096, 5000, 31 * 200, 31 * 200 + 15, 31 * 200 + 16])
+def test_bit_means_equal_means_of_samples(n_samples):
+    words = np.random.default_rng(n_samples).integers(0, 2**32, n_samples, dtype=np.uint32)
+    signs = 2.0 * (words[:, None] >> np.arange(32, dtype=np.uint32) & 1) - 1
+    padded = np.pad(signs, ((15, 30), (0, 0)))
+    wanted = [padded[first : first + 31].mean(axis=0) for first in range(0, n_samples + 15, 31)]
+    assert_allclose(BitMeans(n_samples)(words), np.transpose(wanted), atol=1e-6)
+
+
+def test_bit_check_loads_no_compiled_kernels():
+    program = (
+        "import sys, ertis_numba.capture, ertis_numba.devices.bits as bits, numpy as np\n"
+        "bits.BitCheck(4096, 4.5e6).check(np.zeros(4096, np.uint32))\n"
+        "sys.exit('numba' in sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True)

@@ -1,13 +1,18 @@
 """Memory of plans: 2 GiB first, then the memory of the machine; a refusal states both numbers."""
 
+import tracemalloc
+
+import numpy as np
 import pytest
 
 from ertis_numba import kernels
 from ertis_numba.errors import ArgumentError
-from ertis_numba.settings import Accuracy, Processing, Settings
+from ertis_numba.frames import Measurement
+from ertis_numba.settings import Accuracy, Processing, Recording, Settings
 from ertis_numba.stages import planner
 from ertis_numba.stages.memory import available_bytes
 from ertis_numba.stages.planner import Planner
+from ertis_numba.stages.signal_model import signal_model_of
 
 CPU = kernels.load("cpu")
 SETTINGS = Settings(
@@ -45,3 +50,18 @@ def test_planner_names_both_numbers_if_no_plan_fits(monkeypatch):
         Planner(SETTINGS, CPU, threads=1).choose()
     with pytest.raises(ArgumentError, match=r"the smallest needs \d+ MB, the limit is 0 MB"):
         Planner(SETTINGS, CPU, threads=1, max_bytes=1_000).choose()
+
+
+def test_memory_of_a_signal_model_does_not_grow_with_the_record():
+    def peak_bytes(n_samples):
+        settings = SETTINGS.replace(recording=Recording(n_samples=n_samples))
+        words = np.random.default_rng(1).integers(0, 2**32, n_samples, dtype=np.uint32)
+        image = np.ones((9, 100), dtype=np.float32)
+        tracemalloc.start()
+        signal_model_of(Measurement(words, settings), settings, CPU, amplitude=image)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return peak
+
+    peak_bytes(2**19)  # Compiled code and caches are allocated once.
+    assert peak_bytes(2**21) < peak_bytes(2**19) + 2**20  # Samples of one microphone have four bytes.

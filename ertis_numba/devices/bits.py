@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks
+from ertis_numba.devices.bit_means import MEAN_OF, BitMeans
 from ertis_numba.devices.blocks import CHANNELS
-from ertis_numba.devices.splices import MEAN_OF, Filter, Splices
+from ertis_numba.devices.splices import Splices
 from ertis_numba.errors import ArgumentError
 
 __all__ = ["BitCheck"]
@@ -78,10 +79,7 @@ class BitCheck:
         self.density: NDArray[np.float64] | None = None
         self._words = np.empty((n_samples, 1), dtype=np.uint32)
         self._changes = np.zeros((n_samples, 1), dtype=np.uint32)
-        self._mean, self._change = (
-            Filter(n_samples, np.ones(MEAN_OF, dtype=np.int16), 1 / MEAN_OF, MEAN_OF) for _ in range(2)
-        )
-        self._squares = np.empty_like(self._mean(self._words))
+        self._means = BitMeans(n_samples)
         self._is_fast = Splices.can_distinguish(pdm_rate_hz)
         self._splices = Splices(n_samples, pdm_rate_hz) if splices and self._is_fast else None
 
@@ -107,7 +105,7 @@ class BitCheck:
             raise ArgumentError(f"words are {words.dtype}; give uint32")
         self._words[:, 0] = words  # This copy avoids another compilation of the kernels for read-only arrays.
         np.bitwise_xor(self._words[1:], self._words[:-1], out=self._changes[1:])
-        mean, change = self._mean(self._words), self._change(self._changes)
+        mean, change = self._means(self._words[:, 0]), self._means(self._changes[:, 0])
         ones = np.rint((self._n_samples + MEAN_OF * mean.sum(axis=1, dtype=np.float64)) / 2)
         self.density = ones / self._n_samples
         moving = self._enabled & (self.density > 0) & (self.density < 1)
@@ -116,7 +114,7 @@ class BitCheck:
         # BLAS is avoided: on busy cores, its threads take longer to synchronise than the whole computation.
         weights = (moving / moving.sum()).astype(np.float32)
         share = np.einsum("m,mn->n", weights, change)[1:-2]  # 1 if all bits change each time, -1 if none does.
-        power = np.einsum("m,mn->n", weights, np.square(mean, out=self._squares))[1:-2]
+        power = np.einsum("m,mn->n", weights, np.square(mean))[1:-2]
         if self._stops(share, moving):
             return "constant bits"
         if found := self._chance(mean[moving], power, -share - power):

@@ -18,14 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import kernels
+from ertis_numba.devices.bit_means import MEAN_OF
 from ertis_numba.devices.blocks import CHANNELS
 
-__all__ = ["MEAN_OF", "Filter", "Splices"]
+__all__ = ["Splices"]
 
 Floats = NDArray[np.floating[Any]]
-
-MEAN_OF = 31
-"""Number of samples in means of bits."""
 
 _MIN_RATE_HZ = 4e6  # At the slower clock, modulators are quiet only below 40 kHz, where sound is.
 _BAND_HZ, _TAPS = (90e3, 130e3), 207  # Above all calls, below the modulators' shaped noise.
@@ -55,7 +53,7 @@ _MAX_OVER_LEVEL = 8.0  # Level there relative to that of the whole block.
 _LOUDEST, _LOUDEST_SHARE = 0.35, 0.8  # Full scale 1, in most channels: overload also destroys noise shaping.
 
 
-class Filter:
+class _Filter:
     """Decimation filter of the bits of all channels, on one thread.
 
     Parameters
@@ -96,7 +94,7 @@ class Splices:
         band = _analytic(_BAND_HZ, pdm_rate_hz, _TAPS)
         largest = (np.iinfo(np.int16).max - _TAPS) / np.abs(band.real).sum()
         taps = np.rint(band.real * largest).astype(np.int16)
-        self._filter = Filter(n_samples, taps, 1 / taps[_TAPS // 2], _STEP)
+        self._filter = _Filter(n_samples, taps, 1 / taps[_TAPS // 2], _STEP)
         half = _TAPS // 2
         at = np.arange(-(half + _REACH) // _FINE_STEP * _FINE_STEP, half + _REACH + 1, _FINE_STEP)
         self._reach = half - int(at[0])

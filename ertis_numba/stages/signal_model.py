@@ -28,6 +28,7 @@ _TILE = 96  # Number of ranges.
 _MAX_BINS = 2**18  # Number of image bins from which quantiles are computed.
 _MAX_MICS = 8  # Number of microphones whose noise is measured.
 _SEGMENT = 4096
+_SEGMENTS = 16  # Number of segments whose noise is measured at a time.
 _TAPERED = 0.5  # Tapered share of the ranges at each end.
 _QUANTILES = (np.arange(16) + 0.5) / 16
 
@@ -167,13 +168,18 @@ def _noise(words: NDArray[Any], settings: Settings, kernels: KernelSet) -> NDArr
     """Return the power density of samples from 0 to half their rate, relative to white bits: (bin,) float64."""
     channels = np.flatnonzero(microphones(settings.array).enabled).astype(np.int32)
     channels = np.ascontiguousarray(channels[:: max(1, len(channels) // _MAX_MICS)])
-    signals = np.empty((len(channels), len(words)), dtype=np.float32)
-    if settings.recording.is_pdm:
-        kernels.unpack_bits(words, channels, signals)
-    else:
-        scale = np.float32(1 / settings.recording.full_scale)
-        kernels.unpack_pcm(words, channels, scale, np.float32(0), 0, signals)
     segment = min(_SEGMENT, len(words) // 2 * 2)
-    cut = signals[:, : len(words) // segment * segment].reshape(-1, segment)
+    n_segments = len(words) // segment
     window = np.hanning(segment).astype(np.float32)
-    return np.asarray(np.mean(np.abs(scipy.fft.rfft(cut * window, axis=1)) ** 2, axis=0) / np.sum(window**2), float)
+    power = np.zeros(segment // 2 + 1)
+    for first in range(0, n_segments, _SEGMENTS):  # so that memory does not grow with the record
+        part = words[first * segment : min(first + _SEGMENTS, n_segments) * segment]
+        signals = np.empty((len(channels), len(part)), dtype=np.float32)
+        if settings.recording.is_pdm:
+            kernels.unpack_bits(part, channels, signals)
+        else:
+            scale = np.float32(1 / settings.recording.full_scale)
+            kernels.unpack_pcm(part, channels, scale, np.float32(0), 0, signals)
+        spectra = scipy.fft.rfft(signals.reshape(-1, segment) * window, axis=1)
+        power += np.sum(np.abs(spectra) ** 2, axis=0, dtype=np.float64)
+    return power / (len(channels) * n_segments * float(np.sum(window**2)))
