@@ -23,7 +23,9 @@ from ertis_numba.stages import paper, paper_scipy, planner
 from ertis_numba.stages.chain import Chain
 from ertis_numba.stages.costs import PLAN_COSTS, PlanCosts
 from ertis_numba.stages.fast import FastChain
+from ertis_numba.stages.kernel_chain import KernelChain
 from ertis_numba.stages.memory import require_memory
+from ertis_numba.stages.word_stream import WordStream
 
 if TYPE_CHECKING:
     from ertis_numba.prediction import Prediction
@@ -152,7 +154,12 @@ class Pipeline:
         self.range_m: NDArray[np.float64] = self._chain.range_m
 
     def process(
-        self, measurement: Measurement, out: NDArray[np.float32] | None = None, *, threads: int | None = None
+        self,
+        measurement: Measurement,
+        out: NDArray[np.float32] | None = None,
+        *,
+        threads: int | None = None,
+        stream: WordStream | None = None,
     ) -> Energyscape:
         """Return the energyscape of one measurement.
 
@@ -163,6 +170,9 @@ class Pipeline:
             Array for the amplitudes; a new one by default.
         threads : int, optional
             Number of threads; that of the pipeline by default.
+        stream : WordStream, optional
+            Stream to which the words of the measurement were added as they arrived; see `stream`. The image has the
+            same bits as without it.
 
         Returns
         -------
@@ -173,7 +183,7 @@ class Pipeline:
         DataError
             The measurement's array, call, record or air, or its data, are not those of the pipeline's settings.
         ArgumentError
-            ``out`` has another shape or type, or the device has fewer threads.
+            ``out`` has another shape or type, the device has fewer threads, or the stream is of another pipeline.
 
         Examples
         --------
@@ -186,11 +196,33 @@ class Pipeline:
         checks.instance("measurement", measurement, Measurement, "a recording holds")
         words, exponent = self._words_of(measurement)
         amplitude = self._chain.new_image() if out is None else self._checked_out(out)
-        self._chain.process(words, amplitude, threads=threads)
+        if stream is None or not isinstance(self._chain, KernelChain):
+            self._chain.process(words, amplitude, threads=threads)
+        else:
+            self._chain.process_streamed(stream, words, amplitude, threads=threads)
         image = self._energyscape(_rescaled(amplitude, exponent), measurement)
         self._check_call(measurement)
         self._check_budget(image, measurement)
         return image
+
+    def stream(self) -> WordStream:
+        """Return a stream that demodulates words while they arrive from a sensor; it has buffers of its own.
+
+        When the last words arrive, only the rest of the chain is left. Give the method `WordStream.add` to
+        `SonarDriver.configure`, and the stream to `process`:
+
+        Examples
+        --------
+        >>> with SonarDriver.open("/dev/ttyACM0") as sonar:  # doctest: +SKIP
+        ...     stream = pipeline.stream()
+        ...     sonar.configure(Setup.of(settings), on_words=stream.add)
+        ...     block = sonar.measure()
+        ...     image = pipeline.process(Measurement(block.data, settings), stream=stream)
+        """
+        self._require_open()
+        if not isinstance(self._chain, KernelChain):
+            return WordStream()
+        return self._chain.stream(np.zeros(self._format.shape_2d, self._format.dtype))
 
     def process_batch(self, measurements: Iterable[Measurement]) -> list[Energyscape]:
         """Return the energyscapes of several measurements, in their order, with the same bits as from `process`.

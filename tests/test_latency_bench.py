@@ -25,7 +25,10 @@ def test_latency_bench_reports_every_stage_and_updates_the_page(tmp_path):
     options = ["--duration", "2", "--json", "--quiet", "--update", str(target)]
     done = CliRunner().invoke(cli, ["bench", "latency", *options])
     assert done.exit_code == 0, (done.stderr, done.exception)
-    cases = json.loads(done.stdout)["cases"]
+    report = json.loads(done.stdout)
+    cases = report["cases"]
+    assert report["serial"]["blocks"] == 24
+    assert all(0 < report["serial"][name]["p50_ms"] < 1000 for name in ("streamed", "whole"))
     assert [stage for stage, *_ in cases["images"]["stages"]] == list(latency.STAGES)
     stages = [stage for stage, *_ in cases["images and storage"]["stages"]]
     assert stages == [*latency.STAGES, "stored", "acknowledged"]
@@ -44,6 +47,7 @@ def test_latency_bench_reports_every_stage_and_updates_the_page(tmp_path):
         assert case["wrong"] == case["uncounted"] == case["untold"] == 0
     text = target.read_text("utf-8")
     assert "| central node, archive | journal, fsync |" in text
+    assert "**Serial line** of 20 MB/s, without a network: last byte of a block to its image p50 " in text
     assert "**Images and storage**: last byte to application p50 " in text
 
 

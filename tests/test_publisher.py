@@ -8,7 +8,7 @@ import pytest
 
 from ertis_numba.network.allow_list import AllowList, Permission
 from ertis_numba.network.keys import ClientKeys, KeyPair, ServerKeys
-from ertis_numba.network.messages import AskStatus, Bye, Image, Ping, Pong, Raw, Refused, Subscribe, encode
+from ertis_numba.network.messages import AskStatus, Bye, Image, Ping, Pong, Raw, Refused, Report, Subscribe, encode
 from ertis_numba.network.processing.subscribers import ConnectedSubscriber, QueuedProduct, Subscribers
 from ertis_numba.network.status import Status
 from tests.driven import SHORT, Application, driven, hello
@@ -249,8 +249,11 @@ class TestSubscribers:
             self.bytes = content
 
     class Socket:
-        def send_multipart(self, *_, **__):
-            pass
+        def __init__(self):
+            self.sent = []
+
+        def send_multipart(self, parts, *_):
+            self.sent.append([bytes(part) for part in parts])
 
     def hear(self, subscribers, number, name):
         return subscribers.hear([self.Frame(bytes([0, number]))], name, Subscribe(products=("raw",)))
@@ -273,10 +276,25 @@ class TestSubscribers:
         subscribers = Subscribers(self.Socket())
         assert all(self.hear(subscribers, number, "loopback") for number in range(40))
 
+    def test_waiting_product_keeps_a_copy_of_borrowed_memory(self):
+        socket, memory = self.Socket(), bytearray(b"first")
+        subscribers = Subscribers(socket)
+        frames = [self.Frame(b"\0app")]
+        wants = Subscribe(products=("status",), credit=1)
+        assert subscribers.hear(frames, "app", wants)
+        items = [QueuedProduct("status", "", Report(), [memoryview(memory)], is_borrowed=True) for _ in range(2)]
+        subscribers.offer(items[0])
+        subscribers.offer(items[1])
+        assert isinstance(items[0].payloads[0], memoryview)  # It was sent at once, and needs no copy.
+        memory[:] = b"later"
+        assert [parts[-1] for parts in socket.sent] == [b"first"]
+        assert subscribers.hear(frames, "app", Subscribe(products=("status",), consumed=1, credit=1))
+        assert [parts[-1] for parts in socket.sent] == [b"first", b"first"]
+
 
 class TestSubscriber:
     def item(self, n_bytes=100):
-        return QueuedProduct("raw", "front", None, (bytes(n_bytes),))
+        return QueuedProduct("raw", "front", None, [bytes(n_bytes)])
 
     def made(self, **values):
         wants = Subscribe(products=("raw",), **values)

@@ -376,7 +376,7 @@ def network(*, only: tuple[str, ...], **given: Any) -> None:
     default=30.0,
     show_default=True,
     metavar="S",
-    help="Duration of each run, without and with storage.",
+    help="Duration of each run: images, images and storage, serial line.",
 )
 @_seed("Seed of the samples.", default=1)
 @_update

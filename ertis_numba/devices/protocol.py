@@ -15,6 +15,7 @@ __all__ = ["Block", "BlockParser", "BlockReceiver", "Instant"]
 
 _HEADER: Final = HEADER.to_bytes(4, "little")
 _FOOTER: Final = FOOTER.to_bytes(4, "little")
+_WORDS_AT: Final = 8  # After the header and the counter.
 _MAX_SKIPPED = 256  # Limit on the numbers that a block skips after it has cut another one short.
 
 
@@ -52,6 +53,7 @@ class BlockParser:
         self._data = bytearray()  # Begins with a header, or with a part of one.
         self._reason = "no header"  # Reason for rejecting bytes up to the next header.
         self._position = 0  # Position of the first byte in the stream.
+        self._shown = 0, 0  # Position of the block of which `new_words` has returned words, and their number.
         self._pieces: deque[tuple[int, Instant]] = deque()  # End of each piece in the stream, and its time of arrival.
 
     @property
@@ -63,6 +65,18 @@ class BlockParser:
     def missing(self) -> int:
         """Number of missing bytes of the incomplete block, 0 between blocks."""
         return self.n_bytes - len(self._data) if self._data else 0
+
+    def new_words(self) -> tuple[int, NDArray[np.uint32]]:
+        """Return the words of the incomplete block that this has not returned before, and the number of the first.
+
+        Call it after `take` has returned None. The block may still prove to be none.
+        """
+        begin, n_shown = self._shown
+        first = n_shown if begin == self._position else 0
+        stop = max(first, min((len(self._data) - _WORDS_AT) // 4, self._n_samples))
+        self._shown = self._position, stop
+        # The slice is a copy, because a bytearray with a view cannot change its size.
+        return first, np.frombuffer(self._data[_WORDS_AT + 4 * first : _WORDS_AT + 4 * stop], "<u4")
 
     def feed(self, data: bytes, arrived: Instant) -> list[Block]:
         """Return the blocks that ``data`` completes; all of it arrived at once."""
@@ -119,7 +133,7 @@ class BlockParser:
 
     def _accept(self) -> Block:
         # The copy releases the view, because a bytearray with a view cannot change its size.
-        words = np.frombuffer(self._data, "<u4", self._n_samples, 8).astype(np.uint32)
+        words = np.frombuffer(self._data, "<u4", self._n_samples, _WORDS_AT).astype(np.uint32)
         words.flags.writeable = False
         block = Block(self._counter(0), words, self._pieces[0][1])
         self._reason = "no header"
@@ -169,6 +183,9 @@ class BlockReceiver:
         Time from one measurement to the next at least.
     bits : callable, optional
         Returns for words, (sample,) uint32, why they cannot be what microphones gave, or None.
+    on_words : callable, optional
+        Called with words of an incomplete block as they arrive, and the number of the first of them, which is 0 for a
+        new block. The last words of a block are left out, and the block may still be rejected.
 
     Attributes
     ----------
@@ -183,7 +200,9 @@ class BlockReceiver:
         expected: int | None = None,
         shortest_s: float,
         bits: Callable[[NDArray[np.uint32]], str | None] | None = None,
+        on_words: Callable[[int, NDArray[np.uint32]], None] | None = None,
     ) -> None:
+        self._on_words = on_words
         self._parser = BlockParser(n_samples, apart_s=BURST * shortest_s)
         self._counters = CounterCheck(shortest_s=shortest_s, expected=expected)
         self._bits = bits
@@ -229,6 +248,10 @@ class BlockReceiver:
             self._parser.add(data, arrived)
         while (block := self._parser.take()) is not None:
             good += self._settle(self._counters.judge(block, self._parser.rejected.total() / self.n_bytes))
+        if self._on_words is not None:
+            first, words = self._parser.new_words()
+            if len(words):
+                self._on_words(first, words)
         return good
 
     def expire(self) -> list[Block]:

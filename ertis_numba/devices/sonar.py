@@ -140,6 +140,7 @@ class SonarDriver:
         *,
         counter: int = 0,
         bits: Callable[[NDArray[np.uint32]], str | None] | None = None,
+        on_words: Callable[[int, NDArray[np.uint32]], None] | None = None,
         stop: Callable[[], bool] = lambda: False,
     ) -> None:
         """Configure the sensor; the trigger stays off.
@@ -154,6 +155,9 @@ class SonarDriver:
             Number of the next measurement.
         bits : callable, optional
             Returns the reason why words are invalid, or None, as `bits.BitCheck.check` does.
+        on_words : callable, optional
+            Called with the number of the first and an array of words as they arrive, such as `WordStream.add` of
+            `Pipeline.stream`; 0 begins another block. The last words come with the block, which may still be rejected.
         stop : callable
             Polled during the dialogue; once it returns True, this fails.
 
@@ -167,6 +171,7 @@ class SonarDriver:
             expected=None if self._listen_only else counter,
             shortest_s=setup.n_samples / setup.pdm_rate_hz,
             bits=bits,
+            on_words=on_words,
         )
         self._configured, self._next = (setup, receiver), counter
         self._is_armed = self._is_late = False

@@ -137,12 +137,23 @@ class JournalSensor:
 
     def entry_row(self, entry: JournalEntry, sensor_id: int) -> tuple[Any, ...]:
         """Return the row of a measurement; refuse data that does not match this sensor."""
+        *values, words = self.entry_values(entry)
+        numbered = (sensor_id, *values)
+        return (*numbered, row_crc32(numbered), words)
+
+    def entry_values(self, entry: JournalEntry) -> tuple[Any, ...]:
+        """Return the values of a measurement and its data, and fill in its CRC-32.
+
+        Raises
+        ------
+        ArgumentError
+            A number is out of range, or the data does not match this sensor.
+        """
         stamp, air = entry.measurement.stamp, entry.measurement.settings.air
         words = self._sample_data(entry.measurement.data)
         if entry.crc32 is None:
             entry.crc32 = zlib.crc32(words.data)
-        values = (
-            sensor_id,
+        return (
             checks.integer("session_id", stamp.session_id, 0, _INT64[1]),
             checks.integer("sequence", stamp.sequence, 0, _INT64[1]),
             checks.integer("sync_count", stamp.sync_count, *_INT64),
@@ -153,8 +164,8 @@ class JournalSensor:
             float(air.humidity_percent),
             float(air.pressure_pa),
             checks.integer("crc32", entry.crc32, 0, 2**32 - 1),
+            words,
         )
-        return (*values, row_crc32(values), words)
 
     def _sample_data(self, words: NDArray[np.unsignedinteger[Any]]) -> NDArray[np.unsignedinteger[Any]]:
         checks.shape(f"a measurement of sensor {self.name}", words.shape, self.shape)

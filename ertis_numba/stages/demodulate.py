@@ -98,6 +98,25 @@ class DemodulatePdm:
             words, self._channels, self._taps, self._scale, self._factor, window.first_sample, window.n_samples, out
         )
 
+    @property
+    def n_signals(self) -> int:
+        """Number of signal samples without the zeros at the end."""
+        return self._window.n_samples
+
+    def n_ready(self, n_words: int) -> int:
+        """Return the number of signal samples that depend on the first words only."""
+        n_taps, window = len(self._taps), self._window
+        n_samples = (n_words + n_taps // 2 - n_taps) // self._factor - window.first_sample + 1
+        return min(max(0, n_samples), window.n_samples)
+
+    def part(self, words: NDArray[Any], first: int, out: NDArray[np.float32]) -> None:
+        """Fill ``out``, (mic, n), with the signal samples from ``first`` on; they have the same bits as of a call."""
+        window = self._window
+        n_samples = min(max(0, window.n_samples - first), out.shape[1])
+        self._kernel(
+            words, self._channels, self._taps, self._scale, self._factor, window.first_sample + first, n_samples, out
+        )
+
 
 class FilterPcm:
     """Low-pass filter and decimation of PCM samples; implements `Demodulate`.

@@ -12,13 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import fft
+from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import Grid
 from ertis_numba.kernels import KernelSet
 from ertis_numba.settings import Settings
 from ertis_numba.stages.beamform import Beamform
 from ertis_numba.stages.buffer_pool import BufferPool, MeasurementBuffers
-from ertis_numba.stages.demodulate import Demodulate
+from ertis_numba.stages.demodulate import Demodulate, DemodulatePdm
 from ertis_numba.stages.fitting import one_thread
+from ertis_numba.stages.word_stream import StreamedImage, WordStream
 
 __all__ = ["Compress", "KernelChain"]
 
@@ -88,6 +90,28 @@ class KernelChain(ABC):
     ) -> None:
         """Compute the image of one measurement; parameters as for `Chain.process`."""
         self._finish(self._begin(words, out, self._threads if threads is None else threads))
+
+    def stream(self, words: NDArray[np.unsignedinteger[Any]]) -> WordStream:
+        """Return a stream of words; ``words`` is an array for a whole measurement, (sample, word)."""
+        if self._kernels.device == "cuda" or not isinstance(self._demodulate, DemodulatePdm):
+            return WordStream()
+        return WordStream(
+            StreamedImage(self._demodulate, self._image, self._kernels, self._new_buffers(), words, self.new_image())
+        )
+
+    def process_streamed(
+        self,
+        stream: WordStream,
+        words: NDArray[np.unsignedinteger[Any]],
+        out: NDArray[np.float32],
+        *,
+        threads: int | None = None,
+    ) -> None:
+        """Compute the image of a measurement whose words, or some of them, were added to a stream of this chain."""
+        if not stream.is_of(self._demodulate):
+            raise ArgumentError("stream is of another pipeline; create it with the method stream() of this one")
+        if not stream.process(words, out, threads=threads or self._threads):
+            self.process(words, out, threads=threads)
 
     def process_batch(
         self, words: Iterable[NDArray[np.unsignedinteger[Any]]], outs: Iterable[NDArray[np.float32] | None]

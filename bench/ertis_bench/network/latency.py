@@ -1,4 +1,4 @@
-"""Time and processor time of each stage between the last byte at a sensor node and the image in an application."""
+"""Time and processor time of each stage between the last byte at a sensor and the image in an application."""
 
 import os
 import tempfile
@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-from ertis_bench import machine
+from ertis_bench import machine, serial_stream
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table
 from ertis_bench.network import figures
@@ -42,14 +42,14 @@ _ACKS: Final = {
 
 
 def run(*, say: Callable[[str], None], duration_s: float = 30.0, seed: int = 1) -> dict[str, Any]:
-    """Process measurements without and with storage, and return the times of all stages.
+    """Process measurements without and with storage, then from a serial line, and return the times of all stages.
 
     Parameters
     ----------
     say : callable
         Called with a line of progress.
     duration_s : float
-        Duration of each of both runs.
+        Duration of each run.
     seed : int
     """
     cases = {}
@@ -57,7 +57,9 @@ def run(*, say: Callable[[str], None], duration_s: float = 30.0, seed: int = 1) 
         say(f"{name}: 90 directions, 4 sensors × 10 Hz")
         with tempfile.TemporaryDirectory(prefix="ertis-") as place:
             cases[name] = _case(Path(place), duration_s, seed, stores=stores)
-    return {"machine": machine.describe(), "seed": seed, "duration_s": duration_s, "cases": cases}
+    say("serial line: 90 directions, 10 Hz")
+    serial = serial_stream.measure(duration_s=duration_s, seed=seed)
+    return {"machine": machine.describe(), "seed": seed, "duration_s": duration_s, "cases": cases, "serial": serial}
 
 
 def _case(folder: Path, duration_s: float, seed: int, *, stores: bool) -> dict[str, Any]:
@@ -134,6 +136,13 @@ def latency(report: dict[str, Any]) -> str:
             threads[process, kind][name] = time_ms
     rows = [(*key, *(f"{times.get(name, 0.0):.2f}" for name in names)) for key, times in threads.items()]
     columns = ("process", "threads", *(f"{name}, ms per measurement" for name in names))
+    serial = report["serial"]
+    line = (
+        f"**Serial line** of {serial['bytes_per_s'] / 1e6:.0f} MB/s, without a network: last byte of a block to its "
+        f"image p50 {serial['streamed']['p50_ms']:.1f} ms, p99 {serial['streamed']['p99_ms']:.1f} ms if words are "
+        f"processed as they arrive (`Pipeline.stream`), and p50 {serial['whole']['p50_ms']:.1f} ms, p99 "
+        f"{serial['whole']['p99_ms']:.1f} ms otherwise. All images have the bits of those of whole measurements."
+    )
     conditions = (
         f"90 directions, 4 sensors × 10 Hz for {report['duration_s']:g} s, CURVE over loopback. All sensors measure at "
         "the same time, so that four measurements wait for the same cores. Percentiles of stages do not add up. "
@@ -141,5 +150,5 @@ def latency(report: dict[str, Any]) -> str:
         "comparison in the application."
     )
     return "\n\n".join(
-        [*parts, table(columns, rows, numbers=False), f"Measured on {sentence(report['machine'])}", conditions]
+        [*parts, table(columns, rows, numbers=False), line, f"Measured on {sentence(report['machine'])}", conditions]
     )

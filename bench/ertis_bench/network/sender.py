@@ -203,16 +203,17 @@ class Sender:
                 continue
             stamp = self._stamp(pulse, start_ns)
             sequence = stamp.sequence
-            entries = [
-                self._entry(
-                    replace(stamp, sensor=sensor),
+            measurements = [
+                Measurement(
                     words_of(bases[sensor], self._session_id, sequence)
                     if given is None
                     else given[sequence % len(given)],
+                    self._settings,
+                    replace(stamp, sensor=sensor),
                 )
                 for sensor in job.sensors
             ]
-            for entry in node.append(entries):
+            for entry in node.append(self._entries(measurements)):
                 self._diary.kept(_key(entry))
             pulse += 1
         return pulse
@@ -231,13 +232,13 @@ class Sender:
             timestamp_uncertainty_ns=100_000,
         )
 
-    def _entry(self, stamp: Stamp, words: NDArray[np.uint32]) -> JournalEntry:
-        """Return a journal entry of a measurement, after the diary has recorded it."""
-        measurement = Measurement(words, self._settings, stamp)
-        row, now_ns = Row.of(measurement), time.monotonic_ns()
-        entry = JournalEntry(measurement, monotonic_ns=now_ns)
-        self._diary.offered(_key(entry), row, now_ns)
-        return entry
+    def _entries(self, measurements: Sequence[Measurement]) -> list[JournalEntry]:
+        """Return journal entries of measurements that arrive now, after the diary has recorded them."""
+        rows, now_ns = [Row.of(each) for each in measurements], time.monotonic_ns()
+        entries = [JournalEntry(each, monotonic_ns=now_ns) for each in measurements]
+        for entry, row in zip(entries, rows, strict=True):
+            self._diary.offered(_key(entry), row, now_ns)
+        return entries
 
 
 def _key(entry: JournalEntry) -> DiaryKey:

@@ -137,13 +137,13 @@ class _Publisher:
             case pipe_messages.Publish():
                 self._publish(note)
             case pipe_messages.Grouped():
-                self._subscribers.offer(QueuedProduct("group", "", note.group, ()))
+                self._subscribers.offer(QueuedProduct("group", "", note.group))
             case pipe_messages.StatusNote():
                 self._status, self._reports = note.status, self._reports + 1
-                self._subscribers.offer(QueuedProduct("status", "", Report(), (note.status,)))
+                self._subscribers.offer(QueuedProduct("status", "", Report(), [note.status]))
 
     def _publish(self, note: pipe_messages.Publish) -> None:
-        """Copy the subscribed parts out of a slot, and release it."""
+        """Send the subscribed parts of a slot, copy those that have to wait, and release it."""
         view, sensor = self._views[note.slot], note.data.sensor
         mark("image fetched", sensor, note.data.sequence)
         common: dict[str, Any] = {
@@ -158,18 +158,20 @@ class _Publisher:
             rows, columns = note.shape
             payloads = _pieces(view.image(rows * columns * (4 if note.dtype == "float32" else 2)))
             image = Image(description=note.description, shape=note.shape, dtype=note.dtype, **common, **times)
-            items.append(QueuedProduct("energyscape", sensor, image, payloads, about))
+            items.append(QueuedProduct("energyscape", sensor, image, payloads, about, is_borrowed=True))
         if about is not None and note.n_points >= 0 and self._subscribers.wanted("points", sensor):
             cloud = Points(description=note.description, n_points=note.n_points, **common, **times)
-            items.append(QueuedProduct("points", sensor, cloud, (bytes(view.points(16 * note.n_points)),), about))
+            points = view.points(16 * note.n_points)
+            items.append(QueuedProduct("points", sensor, cloud, [points], about, is_borrowed=True))
         if raw_about is not None and self._subscribers.wanted("raw", sensor):
             air = {name: getattr(note.data, name) for name in ("temperature_c", "humidity_percent", "pressure_pa")}
             raw = Raw(description=note.raw_description, crc32=note.data.crc32, **common, **air)
-            words = bytes(view.words(note.words_bytes))
-            items.append(QueuedProduct("raw", sensor, raw, (words,), raw_about))
-        self._pipe.send(pipe_messages.ProductsQueued(job=note.job, published_ns=time.monotonic_ns()))
+            words = view.words(note.words_bytes)
+            items.append(QueuedProduct("raw", sensor, raw, [words], raw_about, is_borrowed=True))
+        published_ns = time.monotonic_ns()
         for item in items:
             self._subscribers.offer(item)
+        self._pipe.send(pipe_messages.ProductsQueued(job=note.job, published_ns=published_ns))
         mark("published", sensor, note.data.sequence)
 
     def _hear(self, frames: list[zmq.Frame]) -> None:
@@ -231,9 +233,9 @@ def _is_greeting(frames: list[zmq.Frame]) -> bool:
         return False
 
 
-def _pieces(data: memoryview) -> list[bytes]:
-    """Return a copy of an image in frames that are quick to encrypt."""
-    return [bytes(data[begin : begin + _PIECE_BYTES]) for begin in range(0, len(data), _PIECE_BYTES)]
+def _pieces(data: memoryview) -> "list[bytes | memoryview]":
+    """Return an image in frames that are quick to encrypt."""
+    return [data[begin : begin + _PIECE_BYTES] for begin in range(0, len(data), _PIECE_BYTES)]
 
 
 def _main() -> None:

@@ -49,22 +49,30 @@ class QueuedProduct:
         Empty for products without a sensor.
     header : Message
         Header without its numbers.
-    payloads : sequence of bytes
+    payloads : list of bytes or memoryview
         Shared by all subscribers.
     description : (number, frames), optional
         Description to send before.
+    is_borrowed : bool
+        The memory of the payloads is used again after `Subscribers.offer`.
     """
 
     product: Product
     sensor: str
     header: Header
-    payloads: Sequence[bytes]
+    payloads: "list[bytes | memoryview]" = field(default_factory=list)
     description: tuple[int, Sequence[bytes]] | None = None
+    is_borrowed: bool = False
 
     @property
     def n_bytes(self) -> int:
         """Size of the payloads."""
         return sum(map(len, self.payloads))
+
+    def keep(self) -> None:
+        """Copy borrowed payloads, which are released once the last subscriber has the product."""
+        if self.is_borrowed:
+            self.payloads[:] = map(bytes, self.payloads)
 
 
 @dataclass(slots=True, eq=False)
@@ -218,6 +226,8 @@ class Subscribers:
             if each.active:
                 each.offer(item)
                 self._send(routing_id, each)
+        if any(item is waiting for each in self for _, waiting in each.waiting.values()):
+            item.keep()
 
     def tick(self, may_receive: Any) -> None:
         """Suspend silent applications, remove those that no longer ``may_receive``, and send waiting products."""
@@ -263,14 +273,15 @@ class Subscribers:
             if isinstance(item.header, Image | Points):
                 changes["published_ns"] = time.monotonic_ns()
             header = encode(msgspec.structs.replace(item.header, **changes))
+            # ZeroMQ copies each payload: a thread that released it later would cost more than the copy.
             if not self._put(routing_id, [header, *item.payloads]):
                 return
             each.was_sent(key)
 
-    def _put(self, routing_id: bytes, frames: Iterable[bytes]) -> bool:
+    def _put(self, routing_id: bytes, frames: "Iterable[bytes | memoryview]") -> bool:
         """Send a message to an application; return True on success, and remove an application that is gone."""
         try:
-            self._socket.send_multipart([routing_id, *frames], zmq.NOBLOCK, copy=False)
+            self._socket.send_multipart([routing_id, *frames], zmq.NOBLOCK)
         except zmq.Again:
             return False
         except zmq.ZMQError:  # there is no such peer any more

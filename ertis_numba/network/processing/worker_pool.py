@@ -157,7 +157,7 @@ class LocalWorkerPool:
                 case "late":
                     self._log.warning("worker_killed", pid=worker.pid, text="it missed its deadline")
                 case "ended":
-                    found += self._heard(worker)  # It may have sent messages before.
+                    found += self._heard(worker, has_ended=True)  # It may have sent messages before.
                 case "running":
                     self._next_kind(worker)
         if self._chosen.look(now_s, load.rate_hz(now_s), load.overlap):
@@ -196,14 +196,14 @@ class LocalWorkerPool:
             )
         )
 
-    def _heard(self, worker: Worker) -> list[Event]:
+    def _heard(self, worker: Worker, *, has_ended: bool = False) -> list[Event]:
         """Return the events in a worker's messages."""
         found: list[Event] = []
         if worker.child is None:
             return found
         for note in worker.receive():
             found += self._events_of(worker, note)
-        if worker.child.ended:
+        if has_ended or (worker.child.pipe.closed and worker.child.ended):
             found += self._died(worker)
         elif worker.child.pipe.closed:  # `tick` cleans up.
             worker.ready = False

@@ -132,9 +132,7 @@ class Spool:
                 require_same_settings(sensor, settings)
                 self._accepted[sensor.name] = settings
             # The encoder requires contiguous little-endian data and Python integers.
-            _, session_id, number, sync_count, time_ns, uncertainty_ns, *rest, crc32, _, words = sensor.entry_row(
-                entry, 0
-            )
+            session_id, number, sync_count, time_ns, uncertainty_ns, *rest, crc32, words = sensor.entry_values(entry)
             checks.integer("sequence", number, 0, MAX_SEQUENCE)
             stamp = Stamp(
                 sensor=sensor.name,

@@ -1,0 +1,131 @@
+"""Processing of a measurement while its words arrive."""
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.kernels import KernelSet
+from ertis_numba.stages.buffer_pool import MeasurementBuffers
+from ertis_numba.stages.demodulate import DemodulatePdm
+
+__all__ = ["StreamedImage", "WordStream"]
+
+_STEP = 512  # Signal samples per call of the kernel: 5120 words by default, which arrive in about a millisecond.
+
+
+class WordStream:
+    """Words of a measurement that has not arrived completely, and the part of its image that depends on these only.
+
+    Create it with `Pipeline.stream`. `Pipeline.process` uses it if the complete measurement begins with the same words.
+    The image has the same bits as without a stream, whatever was added. One thread may add words while another
+    processes a measurement.
+
+    For GPUs, PCM and the paper's method in NumPy, a stream does nothing.
+    """
+
+    def __init__(self, image: "StreamedImage | None" = None) -> None:
+        self._lock = threading.Lock()
+        self._image = image
+
+    def add(self, first: int, words: NDArray[np.unsignedinteger[Any]]) -> None:
+        """Add words as they arrive, and process them on one thread.
+
+        Parameters
+        ----------
+        first : int
+            Number of the first of them in its measurement. With 0, another measurement begins.
+        words : (sample,) unsigned integers
+        """
+        with self._lock:
+            if self._image is not None:
+                self._image.add(first, words)
+
+    def is_of(self, demodulate: object) -> bool:
+        """Return True if it demodulates with a stage, or does nothing."""
+        return self._image is None or self._image.demodulate is demodulate
+
+    def process(self, words: NDArray[Any], out: NDArray[np.float32], *, threads: int) -> bool:
+        """Fill ``out`` with the image of a measurement; return False if it begins with other words than were added."""
+        with self._lock:
+            return self._image is not None and self._image.complete(words, out, threads)
+
+
+class StreamedImage:
+    """Image of a measurement whose words arrive in pieces.
+
+    Parameters
+    ----------
+    demodulate : DemodulatePdm
+    image : callable
+        Computes an image from the signals in buffers: buffers, array for the image, and threads.
+    kernels : KernelSet
+    buffers : MeasurementBuffers
+        Buffers that nothing else uses.
+    words : (sample, word) unsigned integers
+        Array for a whole measurement.
+    amplitude : (direction, range) float32
+        Array for an image.
+    """
+
+    def __init__(
+        self,
+        demodulate: DemodulatePdm,
+        image: Callable[[MeasurementBuffers, NDArray[np.float32], int], None],
+        kernels: KernelSet,
+        buffers: MeasurementBuffers,
+        words: NDArray[Any],
+        amplitude: NDArray[np.float32],
+    ) -> None:
+        self.demodulate, self._image, self._kernels = demodulate, image, kernels
+        self._buffers, self._words, self._amplitude = buffers, words, amplitude
+        self._part = np.empty((demodulate.shape[0], _STEP), np.float32)
+        self._n_words = self._n_done = 0
+        self._is_done = False
+
+    def add(self, first: int, words: NDArray[Any]) -> None:
+        """Copy words, and compute signals that depend on no later ones, and the image once it has all signals."""
+        if first == 0:
+            self._n_words = self._n_done = 0
+            self._is_done = False
+        rows = words.reshape(-1, self._words.shape[1])
+        if first != self._n_words or self._n_words + len(rows) > len(self._words):
+            return  # Words are missing, so that the measurement is not one that was added from its beginning.
+        self._words[first : first + len(rows)] = rows
+        self._n_words += len(rows)
+        n_ready = self.demodulate.n_ready(self._n_words)
+        if self._is_done or n_ready < min(self._n_done + _STEP, self.demodulate.n_signals):
+            return
+        with self._kernels.threads(1):  # The words arrive more slowly than one thread processes them.
+            self._go_on(n_ready)
+            if n_ready == self.demodulate.n_signals:
+                self._finish(self._amplitude, 1)
+                self._is_done = True
+
+    def complete(self, words: NDArray[Any], out: NDArray[np.float32], threads: int) -> bool:
+        """Fill ``out`` with the image of a whole measurement; return False if it begins with other words."""
+        n_words, self._n_words = self._n_words, -1  # Only a new beginning can follow.
+        if n_words <= 0 or not np.array_equal(words[:n_words], self._words[:n_words]):
+            return False
+        if self._is_done:
+            np.copyto(out, self._amplitude)
+            return True
+        self._words[n_words:] = words[n_words:]
+        with self._kernels.threads(threads):
+            self._finish(out, threads)
+        return True
+
+    def _finish(self, out: NDArray[np.float32], threads: int) -> None:
+        self._go_on(self.demodulate.shape[1])
+        self._image(self._buffers, out, threads)
+
+    def _go_on(self, stop: int) -> None:
+        """Compute signal samples up to one, in equal steps except at the end."""
+        signals = self._buffers.signals
+        while self._n_done + _STEP <= stop or self._n_done < stop == signals.shape[1]:
+            first, n_samples = self._n_done, min(_STEP, stop - self._n_done)
+            self.demodulate.part(self._words, first, self._part)
+            signals[:, first : first + n_samples] = self._part[:, :n_samples]
+            self._n_done += n_samples
