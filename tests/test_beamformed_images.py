@@ -30,17 +30,23 @@ LINE_16 = SENSOR.replace(
 )
 
 
+@pytest.mark.parametrize("precision", ["float32", "int16"])
 @pytest.mark.parametrize(("beamformer", "weighting"), ADAPTIVE_COMBINATIONS)
-def test_beamformers_give_the_same_bits_on_any_number_of_threads(beamformer, weighting):
+def test_beamformers_give_the_same_bits_on_any_number_of_threads(beamformer, weighting, precision):
+    """In 16 bits, some numbers round the other way on another device."""
+    if precision == "int16" and (beamformer == "capon" or not KERNELS["cpu"].tile_ranges):
+        pytest.skip("no kernel")
     settings = cases.SHORT.replace(
         processing=cases.SHORT.processing.replace(directions="2d:90", beamformer=beamformer, weighting=weighting)
     )
+    settings = settings.replace(accuracy=settings.accuracy.replace(precision=precision, max_error_db=-30.0))
+    settings = planner.complete(settings, KERNELS["cpu"], threads=1)
     measurement = cases.noise(settings)
     counts = range(1, KERNELS["cpu"].max_threads + 1)
     images = [Pipeline(settings, threads=count, predict=False).process(measurement).amplitude for count in counts]
     assert len({image.tobytes() for image in images}) == 1
     plain = Pipeline(settings, device="numpy", predict=False).process(measurement).amplitude
-    assert np.abs(images[0] - plain).max() < 1e-5 * plain.max()
+    assert np.abs(images[0] - plain).max() < (1e-5 if precision == "float32" else 1e-3) * plain.max()
 
 
 @pytest.mark.parametrize("device", KERNELS)
@@ -149,7 +155,7 @@ def test_capon_separates_independent_sources_within_a_beam(device):
         ),
         (
             {"beamformer": "capon", "wavefront": "spherical"},
-            r"processing\.wavefront is 'spherical', which supports only .*'delay_and_sum' .*; give 'plane' .*'capon'",
+            r"processing\.wavefront is 'spherical', which .*'capon' does not support; give 'plane', or another",
         ),
         (
             {"weighting": "coherence_factor", "method": "paper"},

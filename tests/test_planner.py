@@ -180,8 +180,20 @@ def test_paper_method_has_no_plan():
 @pytest.mark.parametrize(("beamformer", "weighting"), ADAPTIVE_COMBINATIONS)
 def test_adaptive_beamformers_get_usable_plans(beamformer, weighting):
     settings = SMALL.replace(processing=SMALL.processing.replace(beamformer=beamformer, weighting=weighting))
-    found = chosen_for(settings).settings.accuracy
-    assert (found.precision, found.delay_taps, found.beam_taps) == ("float32", 1, 0)
+    chosen = chosen_for(settings)
+    assert is_complete(chosen.settings.accuracy)
+    assert chosen.error_db <= settings.accuracy.max_error_db
+    assert complete(chosen.settings, CPU, threads=1) == chosen.settings
+    exact = chosen_for(settings, precision="float32").settings.accuracy
+    assert (exact.precision, exact.delay_taps, exact.beam_taps) == ("float32", 1, 0)
+
+
+@pytest.mark.parametrize(("beamformer", "weighting"), ADAPTIVE_COMBINATIONS)
+def test_plans_of_former_files_keep_their_kernels(beamformer, weighting):
+    """A complete plan of one sample per microphone, without a precision, is that of all microphones at once."""
+    settings = SMALL.replace(processing=SMALL.processing.replace(beamformer=beamformer, weighting=weighting))
+    former = {"oversampling": 32, "delay_taps": 1, "beam_taps": 0, "max_error_db": -20.0}
+    assert chosen_for(settings, **former).settings.accuracy.precision == "float32"
 
 
 def test_rated_plans_equal_requested_plans():

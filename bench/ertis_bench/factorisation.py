@@ -94,10 +94,18 @@ def _node_products(
 ) -> int | None:
     """Return the products for a sub-array's beam grid at one range, or None if its error is too large."""
     aperture = Aperture.of(part_m - part_m.mean(axis=0), units)
-    options = {"high_hz": settings.call.high_frequency_hz, "sound_speed_m_s": sound_speed_m_s(settings.air)}
+    high_hz, speed_m_s = settings.call.high_frequency_hz, sound_speed_m_s(settings.air)
     with one_thread():
-        nodes = BeamGrid(aperture, spectrum_of(settings), n_taps=n_taps, density=density, estimate=True, **options)
+        nodes = BeamGrid(
+            aperture,
+            spectrum_of(settings),
+            n_taps=n_taps,
+            density=density,
+            high_hz=high_hz,
+            sound_speed_m_s=speed_m_s,
+            estimate=True,
+        )
     if decibels(float(np.mean(nodes.errors))) > _ERROR_DB:
         return None
-    count = aperture.count_grid_points(aperture.spacing(density, **options), n_taps)
+    count = aperture.count_grid_points(aperture.spacing(density, high_hz=high_hz, sound_speed_m_s=speed_m_s), n_taps)
     return count * len(part_m) * _DELAY_TAPS * _COMPLEX

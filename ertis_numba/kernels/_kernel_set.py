@@ -62,6 +62,8 @@ class KernelSet(AdaptiveKernels):
     quantise_tiles: _contract.QuantiseTiles
     delay_and_sum_envelope_int16: _contract.DelayAndSumEnvelopeInt16
     interpolated_beams_envelope_int16: _contract.InterpolatedBeamsEnvelopeInt16
+    quantise_streams: _contract.QuantiseStreams
+    combine_streams_int16: _contract.CombineStreamsInt16
     add_paths: _contract.AddPaths
     modulate_pdm: _contract.ModulatePdm
 

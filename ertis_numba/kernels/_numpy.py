@@ -225,6 +225,85 @@ def interpolated_beams_envelope_int16(
             out[rows[direction], start : start + n_ranges] = _level(parts, scales[tile] * weight_scale)
 
 
+def quantise_streams(
+    signals: Complex,
+    starts: Index,
+    limits: Real,
+    units: Real,
+    powers: Real,
+    turns: Index,
+    first: int,
+    stop: int,
+    tiles: Short,
+    scales: Real,
+) -> None:
+    """Compute streams of analytic signals, and store them like `QuantiseTiles`."""
+    level = np.abs(signals.astype(np.complex128))
+    unit = np.divide(signals, level, out=np.zeros(level.shape, np.complex128), where=level > 0)
+    tiles[:, first:stop] = 0
+    for stream in range(first, stop):
+        values = np.where(level > 0, level ** float(powers[stream]) * unit ** int(turns[stream]), 0)
+        for tile, start in enumerate(starts):
+            part = values[:, :, start : start + tiles.shape[4]]
+            largest = float(np.max(np.abs(part), initial=0.0))
+            scales[tile, stream] = largest / limits[stream] * units[stream]
+            if largest:
+                parts = np.stack([part.real, part.imag], axis=-1)
+                tiles[tile, stream, :, :, : part.shape[2]] = np.rint(parts * (limits[stream] / largest))
+
+
+def combine_streams_int16(
+    tiles: Short,
+    scales: Real,
+    starts: Index,
+    stop: int,
+    shapes: Index,
+    offsets: Index,
+    weights: Short,
+    places: Index,
+    tap_weights: Short,
+    rows: Index,
+    recipe: tuple[int, int, int, int],
+    out: Real,
+) -> None:
+    """Compute amplitudes from delay-and-sums of streams on 16-bit tiles."""
+    n_directions, n_mics = len(out), tiles.shape[2]
+    n_powers, order, beam, total = recipe
+    entries = np.concatenate([[0], np.cumsum(shapes[:, 0].astype(np.int64) * shapes[:, 1])])
+    pairs = np.concatenate([[0], np.cumsum(n_directions * shapes[:, 2].astype(np.int64))])
+    for tile, start in enumerate(starts):
+        n_ranges = min(_TILE_RANGES, stop - start)
+        sums: Any = np.zeros((len(shapes), n_directions, n_ranges), dtype=np.complex128)
+        for stream, (n_points, n_terms, n_pairs) in enumerate(shapes):
+            mine = slice(entries[stream], entries[stream + 1])
+            table = zip(
+                offsets[mine].reshape(n_points, n_terms), weights[mine].reshape(n_points, n_terms, 2, 2), strict=True
+            )
+            parts = np.stack([_whole_beam(tiles[tile, stream], *row) for row in table])
+            if n_pairs:
+                nodes, both = (parts + (1 << 15)) >> 16, slice(pairs[stream], pairs[stream + 1])
+                near = places[both].reshape(n_directions, n_pairs)
+                taps = tap_weights[both].reshape(n_directions, n_pairs, 2).astype(np.int32)
+                parts = sum(np.einsum("dptr,dp->dtr", nodes[near + one], taps[:, :, one]) for one in (0, 1))
+            beams = parts[:, 0, :n_ranges] + 1j * parts[:, 1, :n_ranges]
+            sums[stream] = beams * float(scales[tile, stream])
+        levels = np.abs(_elementary(sums[:n_powers], order))
+        if total >= 0:
+            coherent, whole = np.abs(sums[beam]) ** 2, n_mics * sums[total].real
+            share = np.maximum(whole, coherent)
+            levels *= np.divide(coherent, share, out=np.zeros_like(coherent), where=coherent > 0)
+        out[rows, start : start + n_ranges] = levels
+
+
+def _elementary(powers: NDArray[np.complex128], order: int) -> NDArray[np.complex128]:
+    """Return the elementary symmetric polynomial from power sums, by Newton's identities; missing sums are 0."""
+    found = [np.ones(powers.shape[1:], dtype=np.complex128)]
+    for k in range(1, order + 1):
+        terms = [(-1) ** (i - 1) * found[k - i] * powers[i - 1] for i in range(1, min(k, len(powers)) + 1)]
+        found.append(np.sum(terms, axis=0) / k)
+    return found[order]
+
+
 def _whole_beam(tile: Short, offsets: Index, weights: Short) -> NDArray[np.int32]:
     """Return the beam of one direction in integers: (part, range) int32."""
     flat = tile.reshape(-1, 2).astype(np.int32)

@@ -167,27 +167,31 @@ class Processing(TomlTable, frozen=True, kw_only=True):
 
     def _check_beamformer(self) -> None:
         """Refuse options of beamformers that are out of range, and those that only delay-and-sum supports."""
-        if self.beamformer in WEIGHTINGS:
+        weightings: tuple[str, ...] = tuple(WEIGHTINGS)
+        if self.beamformer in weightings:
             raise ArgumentError(
                 f"processing.beamformer {self.beamformer!r} is a weighting; give it as processing.weighting, with"
                 f" one of the beamformers {', '.join(BEAMFORMERS)}"
             )
         checks.choice("processing.beamformer", self.beamformer, tuple(BEAMFORMERS))
-        checks.choice("processing.weighting", self.weighting, tuple(WEIGHTINGS))
+        checks.choice("processing.weighting", self.weighting, weightings)
         for option in (option for each in BEAMFORMERS.values() for option in each.options):
             value = getattr(self, option.name)
             if isinstance(option.low, int) and isinstance(option.high, int):
                 checks.integer(f"processing.{option.name}", value, option.low, option.high)
             else:
                 checks.between(f"processing.{option.name}", value, option.low, option.high)
-        if not self.is_adaptive:
-            return
-        for name, value, remedy in (("method", "paper", "'fast'"), ("wavefront", "spherical", "'plane'")):
-            if getattr(self, name) == value:
-                raise ArgumentError(
-                    f"processing.{name} is {value!r}, which supports only processing.beamformer 'delay_and_sum' and "
-                    f"weighting 'none'; give {remedy} with {self._adaptive_part}"
-                )
+        if self.is_adaptive and self.method == "paper":
+            raise ArgumentError(
+                "processing.method is 'paper', which supports only processing.beamformer 'delay_and_sum' and weighting "
+                f"'none'; give 'fast' with {self._adaptive_part}"
+            )
+        beamformer = BEAMFORMERS[self.beamformer]
+        if self.wavefront == "spherical" and not beamformer.streams(*beamformer.values(self)):
+            raise ArgumentError(
+                f"processing.wavefront is 'spherical', which processing.beamformer {self.beamformer!r} does not "
+                "support; give 'plane', or another processing.beamformer"
+            )
 
     @property
     def _adaptive_part(self) -> str:

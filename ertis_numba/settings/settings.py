@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Self
 
 from ertis_numba import checks
+from ertis_numba.beamformers import BEAMFORMERS
 from ertis_numba.documents import TomlDocument
 from ertis_numba.errors import ArgumentError, SettingsError
 from ertis_numba.settings.accuracy import Accuracy
@@ -130,10 +131,11 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
             )
 
     def _check_adaptive(self) -> None:
-        """Refuse plans that only delay-and-sum supports."""
-        if not self.processing.is_adaptive:
+        """Refuse plans that a beamformer without streams does not support."""
+        processing, accuracy = self.processing, self.accuracy
+        beamformer = BEAMFORMERS[processing.beamformer]
+        if beamformer.streams(*beamformer.values(processing)):
             return
-        accuracy = self.accuracy
         for name, value, wanted in (
             ("beam_taps", accuracy.beam_taps or 0, 0),
             ("delay_taps", accuracy.delay_taps or 1, 1),
@@ -141,8 +143,8 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
         ):
             if value != wanted:
                 raise ArgumentError(
-                    f"accuracy.{name} is {value!r}, which processing.beamformer {self.processing.beamformer!r} does "
-                    f"not support; leave it out or give {wanted!r}"
+                    f"accuracy.{name} is {value!r}, which processing.beamformer {processing.beamformer!r} does not "
+                    f"support; leave it out or give {wanted!r}"
                 )
 
     @classmethod

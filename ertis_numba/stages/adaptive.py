@@ -1,5 +1,7 @@
 """Adaptive beamformers and weightings: all combinations that the registry declares except delay-and-sum alone."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -45,7 +47,7 @@ class AdaptiveBeamform:
         self._options = beamformer.values(processing)
         beamformer.check(offsets.shape[1], *self._options)
         weighting = WEIGHTINGS[processing.weighting]
-        self._combine = getattr(kernels, beamformer.kernel) if beamformer.kernel else self._delay_and_sum
+        self._combine: Any = getattr(kernels, beamformer.kernel) if beamformer.kernel else self._delay_and_sum
         self._weight = getattr(kernels, weighting.kernel) if weighting.kernel else None
         self._kernels = kernels
         self._offsets, self._plain = memory.table(offsets), memory.table(weights)

@@ -10,6 +10,7 @@ The grid lies in the axes of the array: a line array needs one axis, a plane arr
 plane, not of the sphere. Points outside the unit circle correspond to no direction but serve interpolation equally.
 """
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -36,6 +37,7 @@ _MAX_FITTED = 96  # Maximum number of directions, and of microphones, from which
 _WAVES = 17  # Number of frequencies; the gain of a microphone is smooth over frequency.
 _MAX_ESTIMATED, _WAVES_ESTIMATED = 40, 9  # These suffice for an error within some tenths of a decibel.
 _REACHES = (0.0, 0.3, 0.6, 1.0)  # Source distances to try, relative to the radius of the array.
+_MAX_COUNTS = 288  # Number of cached numbers of grid points.
 _FEWEST_EQUATIONS = 120  # Microphones times frequencies. With fewer equations, the weights would overfit.
 
 
@@ -96,9 +98,18 @@ class Aperture:
 
     def count_grid_points(self, spacing: NDArray[np.float64], n_taps: int) -> int:
         """Return the number of grid points that at least one direction uses."""
+        return _counted(self, tuple(spacing.tolist()), n_taps)
+
+    def _counted(self, spacing: NDArray[np.float64], n_taps: int) -> int:
         lowest = self.fewest_grid_points(spacing, n_taps)
         _, one = np.unique(_numbers(lowest), return_index=True)  # Many directions share their grid points.
         return len(np.unique(_numbers(_around(lowest[one], n_taps))))
+
+
+@functools.lru_cache(maxsize=_MAX_COUNTS)
+def _counted(aperture: Aperture, spacing: tuple[float, ...], n_taps: int) -> int:
+    """Return a number of grid points, cached because it is the same for many plans and pipelines."""
+    return aperture._counted(np.array(spacing), n_taps)  # noqa: SLF001  of the same module
 
 
 def require_beam_grid(aperture: Aperture, n_ranges: int) -> None:
@@ -141,6 +152,9 @@ def _numbers(nodes: NDArray[np.int64]) -> NDArray[np.int64]:
 class BeamGrid:
     """Beam-grid points, and the weights that interpolate the beams of all directions from them.
 
+    With ``with_gain=False``, no filter has to apply a gain to the signals. The errors of an estimate are those at the
+    frequencies of ``spectrum``, or at ``judged_hz`` if these are given.
+
     Attributes
     ----------
     is_curved : bool
@@ -173,6 +187,8 @@ class BeamGrid:
         sound_speed_m_s: float,
         estimate: bool = False,
         nearest_m: float = math.inf,
+        with_gain: bool = True,
+        judged_hz: NDArray[np.float64] | None = None,
     ) -> None:
         self.errors: NDArray[np.float64]
         self._aperture = aperture
@@ -188,11 +204,21 @@ class BeamGrid:
         self.frequency_hz = spectrum.frequency_hz[chosen]
         power = np.tile(spectrum.power[chosen] / spectrum.power[chosen].sum() / len(mics), len(mics))
         taps, wanted = (self._waves(points, mics) for points in (patch, self._inside[directions]))
-        gain, weights = fit(taps, wanted, power, real=True, min_power=_MIN_POWER)
+        self._has_gain = with_gain
+        if with_gain:
+            gain, weights = fit(taps, wanted, power, real=True, min_power=_MIN_POWER)
+        else:
+            gain = np.ones(len(taps), dtype=np.complex128)
+            weights = weights_of(gain, taps, wanted, power, real=True, min_power=_MIN_POWER)
         self.squares = float(np.mean(np.sum(np.abs(weights) ** 2, axis=0)))
         if estimate:
             gain = self._estimate(
-                lowest[directions] * spacing, patch, self._inside[directions], mics, weights, spectrum
+                lowest[directions] * spacing,
+                patch,
+                self._inside[directions],
+                mics,
+                weights,
+                spectrum.frequency_hz if judged_hz is None else judged_hz,
             )
             # Waves from about as far away as the array is wide are curved most in its plane.
             reach_m = math.sqrt(float(aperture.square_m2.max()))
@@ -260,12 +286,12 @@ class BeamGrid:
         inside: NDArray[np.float64],
         mics: NDArray[np.intp],
         weights: NDArray[np.complex128],
-        spectrum: Spectrum,
+        frequency_hz: NDArray[np.float64],
     ) -> NDArray[np.complex128]:
-        """Compute the errors at all frequencies of the spectrum, and return the gains there."""
-        self.frequency_hz = spectrum.frequency_hz
+        """Compute the errors at given frequencies, and return the gains there."""
+        self.frequency_hz = frequency_hz
         made, wanted = self._waves(patch, mics) @ weights, self._waves(inside, mics)
-        gain = gain_of(made, wanted)
+        gain = gain_of(made, wanted) if self._has_gain else np.ones(len(made), dtype=np.complex128)
         wrong = gain[:, None] * made - wanted
         shape = (len(mics), len(self.frequency_hz), len(inside))
         self.errors = np.mean(np.abs(wrong.reshape(shape)) ** 2, axis=(0, 2))

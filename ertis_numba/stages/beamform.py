@@ -11,10 +11,19 @@ from numpy.typing import NDArray
 from ertis_numba.errors import DeviceError
 from ertis_numba.kernels import KernelSet, Memory
 from ertis_numba.stages.beam_grid import FEWEST_RANGES, BeamGrid
-from ertis_numba.stages.delays import Zone
+from ertis_numba.stages.delays import DelayTable, Zone
 from ertis_numba.stages.window import TimeWindow
 
-__all__ = ["Beamform", "BeamformFloat32", "BeamformInt16", "Buffers", "beamform", "require_int16", "whole_limits"]
+__all__ = [
+    "Beamform",
+    "BeamformFloat32",
+    "BeamformInt16",
+    "Buffers",
+    "WholeWeights",
+    "beamform",
+    "require_int16",
+    "whole_limits",
+]
 
 _WEIGHT_BITS = 12  # With 32 microphones, 13 bits remain for samples. Both then have errors of about -85 dB.
 _TAP_BITS = 15  # Bits of the weights of grid points, before their sum is taken into account.
@@ -174,6 +183,51 @@ def whole_limits(sum_of_weights: float) -> tuple[int, int]:
     return 2**weight_bits - 1, math.floor(min(2.0 ** (bits - weight_bits), 2.0**15)) - 1
 
 
+class WholeWeights:
+    """Weights of delay-and-sum in 16 bits.
+
+    Parameters
+    ----------
+    tables : sequence of DelayTable
+        One for each focal zone.
+    nodes : BeamGrid or None
+
+    Attributes
+    ----------
+    weights : list of (beam, term, 2, 2) int16
+        ``((re w, −im w), (im w, re w))`` of each table.
+    tap_weights : (direction, pair, 2) int16
+        Weights of the beam-grid points; empty without a beam grid.
+    limit : float32
+        Largest magnitude of samples for which no sum overflows.
+    unit : float32
+        Value of 1 in the sums, relative to that of a sample.
+    last_sample : int
+        Largest index of a sample at the first range.
+    """
+
+    def __init__(self, tables: Sequence[DelayTable], nodes: BeamGrid | None) -> None:
+        largest = max(float(np.max(np.abs(table.weights))) for table in tables)
+        weight_limit, limit = whole_limits(
+            max(float(np.max(np.abs(table.weights).sum(axis=1))) for table in tables) / largest
+        )
+        unit = largest / weight_limit
+        self.limit = np.float32(limit)
+        self.weights = [_pairs(table.weights / np.float32(unit)) for table in tables]
+        for pairs in self.weights:
+            # Rounding may have increased a sum of many small weights.
+            sums = np.hypot(pairs[:, :, 0, 0], pairs[:, :, 1, 0], dtype=np.float64).sum(axis=1)
+            self.limit = min(self.limit, np.float32(_SAFE * 2**31 / max(1.0, float(sums.max())) - 1))
+        self.unit = np.float32(unit)
+        self.last_sample = max(int(table.samples.max()) for table in tables)
+        self.tap_weights: NDArray[np.int16] = np.empty((0, 0, 2), dtype=np.int16)
+        if nodes is not None:
+            most = float(np.max(np.abs(nodes.weights).sum(axis=(1, 2))))
+            scale = min(_SAFE * 2**_TAP_BITS / float(np.max(np.abs(nodes.weights))), _SAFE * 2**16 / most)
+            self.tap_weights = np.rint(nodes.weights * scale).astype(np.int16)
+            self.unit = np.float32(self.unit * 2**16 / scale)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _WholeZone:
     """Focal zone with integer weights, and the slice of its tiles."""
@@ -203,42 +257,28 @@ class BeamformInt16:
         n_phases: int,
         threads: int,
     ) -> None:
-        tables = [zone.table for zone in zones]
-        largest = max(float(np.max(np.abs(table.weights))) for table in tables)
-        weight_limit, limit = whole_limits(
-            max(float(np.max(np.abs(table.weights).sum(axis=1))) for table in tables) / largest
-        )
-        self._limit = np.float32(limit)
-        self._weight_scale = np.float32(largest / weight_limit)
+        whole = WholeWeights([zone.table for zone in zones], nodes)
+        self._limit, self._weight_scale = whole.limit, whole.unit
         self._kernels, self._memory, self._threads = kernels, memory, threads
-        width = kernels.tile_ranges + max(int(table.samples.max()) for table in tables) + 1
+        width = kernels.tile_ranges + whole.last_sample + 1
         starts: list[int] = []
         self._zones: list[_WholeZone] = []
-        for zone in zones:
+        for zone, weights in zip(zones, whole.weights, strict=True):
             mine = range(zone.first, zone.stop, kernels.tile_ranges)
-            offsets, weights = zone.table.offsets(width), _pairs(zone.table.weights / self._weight_scale)
-            # Rounding may have increased a sum of many small weights.
-            sums = np.hypot(weights[:, :, 0, 0], weights[:, :, 1, 0], dtype=np.float64).sum(axis=1)
-            self._limit = min(self._limit, np.float32(_SAFE * 2**31 / max(1.0, float(sums.max())) - 1))
             self._zones.append(
                 _WholeZone(
                     slice(len(starts), len(starts) + len(mine)),
                     memory.table(np.array(mine, dtype=np.int32)),
                     zone.stop,
-                    memory.table(offsets),
+                    memory.table(zone.table.offsets(width)),
                     memory.table(weights),
                 )
             )
             starts += mine
         self._starts = memory.table(np.array(starts, dtype=np.int32))
-        n_mics = 1 + int(tables[0].rows.max()) // n_phases
+        n_mics = 1 + int(zones[0].table.rows.max()) // n_phases
         self._shape = (len(starts), n_mics, n_phases, width, 2)
-        self._nodes = None
-        if nodes is not None:
-            sums = float(np.max(np.abs(nodes.weights).sum(axis=(1, 2))))
-            scale = min(_SAFE * 2**_TAP_BITS / float(np.max(np.abs(nodes.weights))), _SAFE * 2**16 / sums)
-            self._nodes = _NodeTables(memory, nodes, np.rint(nodes.weights * scale).astype(np.int16))
-            self._weight_scale = np.float32(self._weight_scale * 2**16 / scale)
+        self._nodes = None if nodes is None else _NodeTables(memory, nodes, whole.tap_weights)
 
     def new_buffers(self) -> Buffers:
         """Return the tiles and their scales for one call at a time."""

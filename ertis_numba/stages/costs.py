@@ -49,6 +49,9 @@ _MAX_S = 1.0  # Limit on the cost of a unit of work; a larger value is an error.
 _BEYOND = 0.2  # Samples of a tile beyond its ranges, relative to the tile.
 _PHASES = {"few": 1, "many": 12, "most": 64}  # The cost of a term is interpolated over the logarithm of their number.
 _FEW_PAIRS, _MANY_PAIRS = 2, 10
+_STREAM = 1.5  # Time of computing and rounding a sample of a stream, relative to rounding a sample.
+_PAIR = 2.0  # Time of a pair of beam-grid points of several streams, which exceed the L2 cache, relative to one grid.
+_COMBINE = 1.0  # Time of adding a stream to an amplitude, relative to the magnitude of a beam.
 UNITS: Final = (
     "call",
     "demodulate_16",
@@ -86,6 +89,10 @@ class Work:
     n_beams, n_terms, n_pairs : int
         Beams that are summed, terms of each, and pairs of beam-grid points per direction; 0 without a beam grid.
     precision : {"float32", "int16"}
+    n_streams : int
+        Streams of an adaptive beamformer; 0 (the default) if it has none.
+    term_cost : float
+        Time of a term relative to that of delay-and-sum; 1 by default.
     """
 
     n_mics: int
@@ -104,6 +111,8 @@ class Work:
     n_terms: int
     n_pairs: int
     precision: str
+    n_streams: int = 0
+    term_cost: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,10 +142,14 @@ class Costs:
             "matched filter": unit["forward"] * work.n_mics * _transform(work.n_fft)
             + unit["fold"] * rows * work.n_bins
             + unit["inverse"] * rows * _transform(work.n_outputs),
-            "16 bits": unit["quantise"] * quantised,
-            "sums": term * work.n_beams * work.n_terms * work.n_computed,
-            "interpolation": unit[f"pair_{work.precision}"] * work.n_directions * work.n_computed * work.n_pairs,
-            "image": unit["image"] * points,
+            "16 bits": unit["quantise"] * quantised * (1 + _STREAM * work.n_streams),
+            "sums": work.term_cost * term * work.n_beams * work.n_terms * work.n_computed,
+            "interpolation": unit[f"pair_{work.precision}"]
+            * work.n_directions
+            * work.n_computed
+            * work.n_pairs
+            * (_PAIR if work.n_streams else 1.0),
+            "image": unit["image"] * points * (1 + _COMBINE * work.n_streams),
             "calls": 6 * unit["call"],
         }
         return {name: 1000 * value for name, value in seconds.items()}

@@ -2,6 +2,7 @@
 
 import functools
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.geometry import Grid, array_weights, direction_grid, microphones, unit_vectors
+from ertis_numba.kernels import KernelSet, Memory
 from ertis_numba.settings import Settings
 from ertis_numba.stages.adaptive import AdaptiveBeamform
 from ertis_numba.stages.beam_grid import Aperture, require_beam_grid
@@ -16,6 +18,7 @@ from ertis_numba.stages.beamform import beamform
 from ertis_numba.stages.buffer_pool import MeasurementBuffers
 from ertis_numba.stages.delays import DelayTable, Zone
 from ertis_numba.stages.demodulate import FilterPcm, demodulation
+from ertis_numba.stages.fitting import Spectrum
 from ertis_numba.stages.kernel_chain import KernelChain
 from ertis_numba.stages.matched_filter import MatchedFilter
 from ertis_numba.stages.plan_elements import (
@@ -27,6 +30,8 @@ from ertis_numba.stages.plan_elements import (
     spectrum_of,
     zones_of,
 )
+from ertis_numba.stages.stream_beamform import StreamBeamform, StreamTables, amplitudes_of_stream
+from ertis_numba.stages.stream_plan import LINEAR, StreamPlanner, recipe_of, uses_streams
 from ertis_numba.stages.window import time_window
 
 __all__ = ["FastChain"]
@@ -49,16 +54,18 @@ class FastChain(KernelChain):
         aperture = Aperture.of(layout.enabled_positions_m, unit_vectors(self.grid.azimuth_rad, self.grid.elevation_rad))
         spectrum = spectrum_of(settings)
         n_phases = plan.oversampling or 1
+        streams = _Streams(settings, spectrum, aperture, speed_m_s) if uses_streams(settings.processing, plan) else None
         fit, step_s = delay_fit(settings, spectrum)
-        nodes = beam_grid_of(settings, aperture, spectrum)
-        points = aperture.directions if nodes is None else nodes.points
+        nodes = None if streams else beam_grid_of(settings, aperture, spectrum)
+        points = streams.points if streams else [aperture.directions if nodes is None else nodes.points]
         own_s = layout.delay_s[layout.enabled]
         array_weight = array_weights(settings)
         ahead_s = ahead_of(array_weight, step_s)
         edges = zones_of(settings)
         largest_s = max(
-            float(np.max(np.abs(own_s + aperture.delays_s(points, sound_speed_m_s=speed_m_s, range_m=range_m))))
+            float(np.max(np.abs(own_s + aperture.delays_s(some, sound_speed_m_s=speed_m_s, range_m=range_m))))
             for _, _, range_m in edges
+            for some in points
         )
         taps = chain_taps(settings)
         window = time_window(
@@ -81,20 +88,33 @@ class FastChain(KernelChain):
         self._made_plain_filter = functools.cache(  # Only signal models need it.
             lambda: new_filter(gain=lambda frequency_hz: np.ones((1, len(frequency_hz)), np.complex128))
         )
-        self._matched_filter = new_filter(
-            gain=lambda frequency_hz: (
-                fit.gain(frequency_hz)
-                * (1 if nodes is None else nodes.gain(frequency_hz))
-                * np.exp(2j * math.pi * ahead_s[:, None] * frequency_hz)
+
+        def advanced(gains: Callable[[NDArray[np.float64]], NDArray[np.complex128]]) -> MatchedFilter:
+            """Return the matched filter with gains, and the fractional-delay offset of each microphone."""
+            return new_filter(
+                gain=lambda frequency_hz: gains(frequency_hz) * np.exp(2j * math.pi * ahead_s[:, None] * frequency_hz)
             )
+
+        self._matched_filter = advanced(
+            streams.plain_gains
+            if streams
+            else lambda frequency_hz: fit.gain(frequency_hz) * (1 if nodes is None else nodes.gain(frequency_hz))
         )
+        self._linear_filter = None if streams is None or streams.linear is None else advanced(streams.linear_gains)
+        self._adaptive = None
+        if streams is not None:
+            taken_s = own_s - ahead_s
+            self._beamform = streams.beamform(
+                kernels, memory, taken_s, layout.gain[layout.enabled], edges, n_phases=n_phases, lead=window.lead
+            )
+            return
         amplitudes = array_weight / (layout.gain[layout.enabled] * len(own_s))
         zones = [
             Zone(
                 first,
                 stop,
                 DelayTable.of(
-                    own_s - ahead_s + aperture.delays_s(points, sound_speed_m_s=speed_m_s, range_m=range_m),
+                    own_s - ahead_s + aperture.delays_s(points[0], sound_speed_m_s=speed_m_s, range_m=range_m),
                     amplitudes,
                     fit,
                     n_phases=n_phases,
@@ -103,7 +123,6 @@ class FastChain(KernelChain):
             )
             for first, stop, range_m in edges
         ]
-        self._adaptive = None
         self._beamform = beamform(
             plan.precision, kernels, memory, window, zones, nodes, n_phases=n_phases, threads=threads
         )
@@ -143,8 +162,82 @@ class FastChain(KernelChain):
         self._finish(buffers)
 
     def _image(self, buffers: MeasurementBuffers, out: NDArray[np.float32], threads: int) -> None:
-        if self._adaptive is None:
+        if isinstance(self._beamform, StreamBeamform):
+            self._matched_filter(buffers.transforms, buffers.analytic, threads=threads)
+            self._beamform.take(buffers.analytic, buffers.beamform)
+            if self._linear_filter is not None:
+                self._linear_filter(buffers.transforms, buffers.analytic, threads=threads)
+                self._beamform.take(buffers.analytic, buffers.beamform, linear=True)
+            self._beamform.combine(buffers.beamform, out)
+        elif self._adaptive is None:
             super()._image(buffers, out, threads)
         else:
             self._matched_filter(buffers.transforms, buffers.analytic, threads=threads)
             self._adaptive(buffers.analytic, out)
+
+
+class _Streams:
+    """Streams of a complete plan, with the points whose beams are summed.
+
+    Attributes
+    ----------
+    points : list of (point, axis) float64
+        Beam-grid points of each stream, or the directions in the order of computation.
+    linear : int or None
+        Index of the stream of the signals themselves.
+    """
+
+    def __init__(self, settings: Settings, spectrum: Spectrum, aperture: Aperture, speed_m_s: float) -> None:
+        plan, recipe = settings.accuracy, recipe_of(settings.processing)
+        assert recipe is not None  # noqa: S101  `uses_streams` is true only with a recipe
+        planner = StreamPlanner(settings, recipe, spectrum, aperture, sound_speed_m_s=speed_m_s, nearest_m=math.inf)
+        taps, density = plan.beam_taps or 0, plan.beam_density or 2.0
+        self._recipe, self._aperture, self._speed_m_s = recipe, aperture, speed_m_s
+        self._planned = planner.plan(plan.oversampling or 1, plan.delay_taps or 1, taps, density)
+        self._grids = [planner.beam_grid(each, taps) for each in self._planned.streams]
+        grids = (grid.rows for grid in self._grids if grid is not None)
+        self._rows = next(grids, np.arange(len(aperture.directions), dtype=np.int32))
+        ordered = aperture.directions[self._rows]
+        self.points = [ordered if grid is None else grid.points for grid in self._grids]
+        linear = (k for k, each in enumerate(self._planned.streams) if each.stream == LINEAR)
+        self.linear = next(linear, None)
+
+    def plain_gains(self, frequency_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """Return the gains of the signals for nonlinear streams, which are 1."""
+        return np.ones((1, len(frequency_hz)), dtype=np.complex128)
+
+    def linear_gains(self, frequency_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """Return the gains of the signals for the linear stream: (mic, frequency) or (1, frequency)."""
+        assert self.linear is not None  # noqa: S101
+        grid = self._grids[self.linear]
+        gain = self._planned.streams[self.linear].fit.gain(frequency_hz)
+        return np.asarray(gain * (1 if grid is None else grid.gain(frequency_hz)))
+
+    def beamform(
+        self,
+        kernels: KernelSet,
+        memory: Memory,
+        own_s: NDArray[np.float64],
+        gain: NDArray[np.float64],
+        edges: list[tuple[int, int, float]],
+        *,
+        n_phases: int,
+        lead: int,
+    ) -> StreamBeamform:
+        """Return the beamformer of the streams for microphones with given delays and gains."""
+        tables = []
+        for planned, nodes, points in zip(self._planned.streams, self._grids, self.points, strict=True):
+            place = self._recipe.streams.index(planned.stream)
+            amplitudes = amplitudes_of_stream(self._recipe, place, gain, len(own_s))
+            delays_s = (
+                own_s + self._aperture.delays_s(points, sound_speed_m_s=self._speed_m_s, range_m=range_m)
+                for _, _, range_m in edges
+            )
+            found = [
+                DelayTable.of(each_s, amplitudes, planned.fit, n_phases=n_phases, lead=lead) for each_s in delays_s
+            ]
+            tables.append(StreamTables(nodes, found))
+        zones = [(first, stop) for first, stop, _ in edges]
+        return StreamBeamform(
+            kernels, memory, self._recipe, self._planned, tables, self._rows, zones, n_phases=n_phases
+        )

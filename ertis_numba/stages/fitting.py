@@ -162,10 +162,13 @@ class DelayFit:
         Time between stored samples, in seconds.
     spectrum : Spectrum
         Spectrum that weights the errors.
+    with_gain : bool
+        False if no filter can apply a gain, as for streams that are nonlinear functions of signals; True by default.
 
     Attributes
     ----------
     n_taps : int
+    spectrum : Spectrum
     fractions : (target,) float64
         Delays spread evenly over one step, as `split` returns them.
     errors : (wave,) float64
@@ -175,25 +178,36 @@ class DelayFit:
         Power of the mean error, which all microphones share.
     """
 
-    def __init__(self, n_taps: int, step_s: float, spectrum: Spectrum) -> None:
+    def __init__(self, n_taps: int, step_s: float, spectrum: Spectrum, *, with_gain: bool = True) -> None:
         self.n_taps = n_taps
         self._step_s = step_s
-        self._spectrum = spectrum
+        self.spectrum = spectrum
         self._middle = (self.n_taps - 1) // 2 + 0.5 * (1 - self.n_taps % 2)
         self.fractions = (np.arange(_TARGETS) + 0.5) / _TARGETS + self._middle - 0.5
-        self._gain, _ = fit(self._taps(spectrum.frequency_hz), self._wanted(self.fractions), spectrum.power)
+        self._has_gain, self._scale = with_gain, 1.0
+        self._gain: NDArray[np.complex128] = np.ones(len(spectrum.power), dtype=np.complex128)
+        if with_gain:
+            self._gain, _ = fit(self._taps(spectrum.frequency_hz), self._wanted(self.fractions), spectrum.power)
         made = self.gain(spectrum.frequency_hz)[:, None] * (
             self._taps(spectrum.frequency_hz) @ self.weights(self.fractions).T
         )
+        if not with_gain:
+            # Least squares shrink a single tap. All microphones share this error, so a larger variance is better.
+            shrunk = np.mean(made * np.conj(self._wanted(self.fractions)), axis=1).real
+            self._scale = 1 / float(shrunk @ spectrum.power)
+            made *= self._scale
         wrong = made - self._wanted(self.fractions)
         self.errors, self.biases = np.var(wrong, axis=1), np.abs(np.mean(wrong, axis=1)) ** 2
 
-    def errors_at(self, fractions: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the mean error power, including the shared error, at given fractions: (wave,) float64."""
-        frequency_hz = self._spectrum.frequency_hz
+    def errors_at(self, fractions: NDArray[np.float64], spectrum: Spectrum | None = None) -> NDArray[np.float64]:
+        """Return the mean error power, including the shared error, at given fractions: (wave,) float64.
+
+        The frequencies are those of another spectrum, if one is given.
+        """
+        frequency_hz = (spectrum or self.spectrum).frequency_hz
         found = np.unique(np.round(fractions, 4))
         made = self.gain(frequency_hz)[:, None] * (self._taps(frequency_hz) @ self.weights(found).T)
-        return np.asarray(np.mean(np.abs(made - self._wanted(found)) ** 2, axis=1))
+        return np.asarray(np.mean(np.abs(made - self._wave(frequency_hz, found)) ** 2, axis=1))
 
     def split(self, delays_s: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return the first stored sample that contributes to each delayed sample, and the delay after it, in steps."""
@@ -205,7 +219,7 @@ class DelayFit:
     def weights(self, fractions: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Return the weights of the taps: (..., tap) complex128, for fractions as `split` returns them."""
         found = chebyshev.chebval(2 * (fractions - self._middle), self._polynomials)
-        return np.ascontiguousarray(np.moveaxis(found, 0, -1))
+        return np.asarray(self._scale * np.ascontiguousarray(np.moveaxis(found, 0, -1)), np.complex128)
 
     @functools.cached_property
     def _polynomials(self) -> NDArray[np.complex128]:
@@ -214,18 +228,20 @@ class DelayFit:
         Each weight is a sum of waves at all frequencies of the spectrum. Their coefficients are Bessel functions of
         half the phase of a step. Beyond the degree below, they are negligible in double precision.
         """
-        half_phase = math.pi * float(self._spectrum.frequency_hz.max()) * self._step_s
+        half_phase = math.pi * float(np.abs(self.spectrum.frequency_hz).max()) * self._step_s
         degree = math.ceil(1.5 * half_phase) + 20
         places = chebyshev.chebpts1(degree + 1)
         values = self._weights(self._middle + places / 2).T
         return np.asarray(np.linalg.solve(chebyshev.chebvander(places, degree), values))
 
     def _weights(self, fractions: NDArray[np.float64]) -> NDArray[np.complex128]:
-        taps = self._taps(self._spectrum.frequency_hz)
-        return weights_of(self._gain, taps, self._wanted(fractions), self._spectrum.power)
+        taps = self._taps(self.spectrum.frequency_hz)
+        return weights_of(self._gain, taps, self._wanted(fractions), self.spectrum.power)
 
     def gain(self, frequency_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Return the gain that complements the weights: (frequency,) complex128."""
+        if not self._has_gain:
+            return np.ones(len(frequency_hz), dtype=np.complex128)
         made = self._taps(frequency_hz) @ self.weights(self.fractions).T
         wanted = self._wave(frequency_hz, self.fractions)
         return gain_of(made, wanted)
@@ -234,7 +250,7 @@ class DelayFit:
         return self._wave(frequency_hz, np.arange(self.n_taps, dtype=np.float64))
 
     def _wanted(self, fractions: NDArray[np.float64]) -> NDArray[np.complex128]:
-        return self._wave(self._spectrum.frequency_hz, fractions)
+        return self._wave(self.spectrum.frequency_hz, fractions)
 
     def _wave(self, frequency_hz: NDArray[np.float64], steps: NDArray[np.float64]) -> NDArray[np.complex128]:
         return np.asarray(np.exp(2j * math.pi * self._step_s * np.outer(frequency_hz, steps)))

@@ -10,11 +10,20 @@ from ertis_numba.air import sound_speed_m_s
 from ertis_numba.settings import Processing, Recording, Settings
 from ertis_numba.stages.beam_grid import Aperture, BeamGrid
 from ertis_numba.stages.fitting import WAVES, DelayFit, Spectrum
-from ertis_numba.stages.focal_zones import zone_edges
+from ertis_numba.stages.focal_zones import NEAREST_M, zone_edges
 from ertis_numba.stages.window import time_window
 from ertis_numba.waveform import decimation_taps, integer_taps, matched_band_hz, matched_noise_spectrum
 
-__all__ = ["ahead_of", "beam_grid_of", "chain_taps", "delay_fit", "ringing_db", "spectrum_of", "zones_of"]
+__all__ = [
+    "ahead_of",
+    "beam_grid_of",
+    "chain_taps",
+    "delay_fit",
+    "nearest_m_of",
+    "ringing_db",
+    "spectrum_of",
+    "zones_of",
+]
 
 _PCM_RANGE_DB = 125.0  # Dynamic range within which sound outside the window does not affect an image of PCM.
 _MAX_RINGING_DB = 160.0  # Below this level, rounding of single precision exceeds the ringing.
@@ -105,3 +114,10 @@ def zones_of(settings: Settings) -> list[tuple[int, int, float]]:
     if settings.processing.wavefront == "plane":
         return [(0, len(range_m), math.inf)]
     return zone_edges(range_m, settings.accuracy.focal_zones or 1)
+
+
+def nearest_m_of(settings: Settings) -> float:
+    """Return the distance of the most curved wavefronts of an image in metres; infinite for plane ones."""
+    if settings.processing.wavefront == "plane":
+        return math.inf
+    return max(settings.processing.range_m[0], NEAREST_M)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.air import sound_speed_m_s
+from ertis_numba.beamformers import BEAMFORMERS, WEIGHTINGS
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import array_weights, direction_grid, effective_count, microphones, unit_vectors
 from ertis_numba.settings import Accuracy, Settings
@@ -17,8 +18,10 @@ from ertis_numba.stages.beam_grid import FEWEST_RANGES, Aperture, BeamGrid, requ
 from ertis_numba.stages.beamform import whole_limits
 from ertis_numba.stages.costs import Work
 from ertis_numba.stages.fitting import DelayFit, Spectrum
-from ertis_numba.stages.focal_zones import NEAREST_M, squared_curvature
-from ertis_numba.stages.plan_elements import ahead_of, chain_taps, spectrum_of, zones_of
+from ertis_numba.stages.focal_zones import squared_curvature
+from ertis_numba.stages.plan_elements import ahead_of, chain_taps, nearest_m_of, spectrum_of, zones_of
+from ertis_numba.stages.sensitivity import Sensitivity
+from ertis_numba.stages.stream_plan import PlannedStreams, StreamPlanner, recipe_of, uses_streams
 from ertis_numba.stages.window import time_window
 from ertis_numba.waveform import matched_band_hz
 
@@ -116,6 +119,7 @@ class PlanModel:
         self._n_effective = effective_count(self._weights)
         self.n_directions = len(grid)
         self._speed_m_s = sound_speed_m_s(settings.air)
+        self._nearest_m = nearest_m_of(settings)
         self.window = time_window(settings, largest_delay_s=self._reach_s(), n_taps=1)
         if settings.accuracy.beam_taps:
             require_beam_grid(self.aperture, len(self.window.range_m))
@@ -123,9 +127,29 @@ class PlanModel:
         self._zones = functools.cache(self._made_zones)
         self.nodes = functools.cache(self._made_nodes)
         self.filter = functools.cache(self._made_filter)
+        self.streams = functools.cache(self._made_streams)
+        recipe = recipe_of(settings.processing)
+        self.has_streams = settings.processing.is_adaptive and recipe is not None
+        self._stream_planner = (
+            StreamPlanner(
+                settings,
+                recipe,
+                self._spectrum,
+                self.aperture,
+                sound_speed_m_s=self._speed_m_s,
+                nearest_m=self._nearest_m,
+            )
+            if recipe is not None
+            else None
+        )
 
     def parts(self, plan: ImagePlan) -> dict[str, float]:
-        """Return the error power of each step of a plan, relative to the exact image."""
+        """Return the error power of each step of a plan, relative to the exact image of delay-and-sum.
+
+        Errors of streams are those of the image, divided by the safe sensitivity of the beamformer.
+        """
+        if self.uses_streams(plan):
+            return self._stream_parts(plan)
         delays = self.delays(plan.n_phases, plan.delay_taps)
         nodes = self.nodes(plan.beam_taps, plan.density) if plan.beam_taps else None
         _, filter_error = self.filter(plan.stopband_attenuation_db)
@@ -139,12 +163,69 @@ class PlanModel:
         if self.settings.processing.wavefront == "spherical":
             parts["zones"] = self.zone_error(plan.focal_zones)
         if plan.precision == "int16":
-            parts["samples"] = self._whole_numbers(delays, nodes)
+            parts["samples"] = self._whole_numbers(delays, None if nodes is None else nodes.squares)
         return parts
+
+    def uses_streams(self, plan: ImagePlan) -> bool:
+        """Return True if a plan computes an adaptive beamformer from streams."""
+        accuracy = Accuracy(precision=plan.precision, delay_taps=plan.delay_taps, beam_taps=plan.beam_taps)  # type: ignore[arg-type]
+        return uses_streams(self.settings.processing, accuracy)
+
+    def _stream_parts(self, plan: ImagePlan) -> dict[str, float]:
+        assert self._stream_planner is not None  # noqa: S101
+        planned = self.streams(plan)
+        linear = Sensitivity.of(self.settings.processing, self.n_mics).linear
+        _, filter_error = self.filter(plan.stopband_attenuation_db)
+        parts = dict.fromkeys(PARTS, 0.0)
+        parts["filter"], parts["arithmetic"] = filter_error * self.noise_part, self.errors.arithmetic()
+        if self.settings.processing.wavefront == "spherical":
+            parts["zones"] = self.zone_error(plan.focal_zones)
+        amplified = 1.0
+        for each in planned.streams:
+            squares = None
+            if each.grid is not None:
+                squares = each.grid.squares
+                parts["beams"] += each.grid.error / linear
+                amplified = max(amplified, squares)
+            if plan.precision == "int16":
+                weights = np.abs(each.fit.weights(each.fit.fractions))
+                delays = Delays(
+                    n_taps=each.fit.n_taps,
+                    error=0.0,
+                    sum_of_weights=float(np.max(weights.sum(axis=1))),
+                    squares=float(np.mean(np.sum(weights**2, axis=1))),
+                )
+                parts["samples"] += each.shares.noise * self._whole_numbers(delays, squares) / linear
+        parts["delays"] = planned.delays * amplified / linear
+        return parts
+
+    @functools.cached_property
+    def noise_part(self) -> float:
+        """Effect of noise on an image computed from streams, relative to an image of noise only."""
+        assert self._stream_planner is not None  # noqa: S101
+        return min(1.0, self._stream_planner.noise_share + 1 / self.n_mics)
+
+    def _made_streams(self, plan: ImagePlan) -> PlannedStreams:
+        assert self._stream_planner is not None  # noqa: S101
+        step_s = 1 / (self.settings.output_rate_hz * plan.n_phases)
+        fit, _ = _fitted(self._spectrum, plan.delay_taps, step_s)
+        return self._stream_planner.plan(
+            plan.n_phases, plan.delay_taps, plan.beam_taps, plan.density, self._few_fractions(fit, step_s)
+        )
 
     def work(self, plan: ImagePlan) -> Work:
         """Return the work of a plan, from which its time is predicted."""
-        nodes = self.nodes(plan.beam_taps, plan.density) if plan.beam_taps else None
+        streamed = self.uses_streams(plan)
+        nodes = self.nodes(plan.beam_taps, plan.density) if plan.beam_taps and not streamed else None
+        n_beams, n_terms = self.n_directions if nodes is None else nodes.count, self.n_mics * plan.delay_taps
+        n_pairs = 0 if nodes is None else nodes.n_pairs
+        if streamed:
+            streams = self.streams(plan).streams
+            n_terms = self.n_mics
+            n_beams = sum(
+                (each.grid.n_points if each.grid else self.n_directions) * each.fit.n_taps for each in streams
+            )
+            n_pairs = sum(plan.beam_taps**self.aperture.n_axes // 2 for each in streams if each.grid)
         taps, _ = self.filter(plan.stopband_attenuation_db)
         tile = self._tile_ranges if plan.precision == "int16" else FEWEST_RANGES
         return Work(
@@ -160,18 +241,32 @@ class PlanModel:
             n_directions=self.n_directions,
             n_ranges=len(self.window.range_m),
             n_computed=tile * sum(-(-(stop - first) // tile) for first, stop, _ in self._zones(plan.focal_zones)),
-            n_beams=self.n_directions if nodes is None else nodes.count,
-            n_terms=self.n_mics * plan.delay_taps,
-            n_pairs=0 if nodes is None else nodes.n_pairs,
+            n_beams=n_beams,
+            n_terms=n_terms,
+            n_pairs=n_pairs,
             precision=plan.precision,
+            n_streams=len(self.streams(plan).streams) if streamed else 0,
+            term_cost=1.0 if streamed else self._kernel_cost(),
         )
+
+    def _kernel_cost(self) -> float:
+        """Return the time of the kernels of all microphones, relative to delay-and-sum in single precision."""
+        processing = self.settings.processing
+        beamformer = BEAMFORMERS[processing.beamformer]
+        return beamformer.cost(*beamformer.values(processing)) + WEIGHTINGS[processing.weighting].cost
 
     def n_bytes(self, plan: ImagePlan) -> int:
         """Return the memory of a plan's signals and delays, in bytes."""
+        signals = 16 * self.n_mics * plan.n_phases * self.window.n_outputs
+        if self.uses_streams(plan):
+            streams = self.streams(plan).streams
+            terms = sum((each.grid.n_points if each.grid else self.n_directions) * each.fit.n_taps for each in streams)
+            n_zones = len(self._zones(plan.focal_zones))
+            return TABLE_BYTES * terms * self.n_mics * n_zones + signals * (2 + len(streams)) // 2
         nodes = self.nodes(plan.beam_taps, plan.density) if plan.beam_taps else None
         n_beams = self.n_directions if nodes is None else nodes.count
         table = TABLE_BYTES * n_beams * self.n_mics * plan.delay_taps * len(self._zones(plan.focal_zones))
-        return table + 16 * self.n_mics * plan.n_phases * self.window.n_outputs
+        return table + signals
 
     def zone_error(self, count: int) -> float:
         """Return the error power of a given number of focal zones."""
@@ -238,24 +333,19 @@ class PlanModel:
             return np.ones(1, dtype=np.int16), math.inf
         return taps, self.errors.filter(taps)
 
-    def _whole_numbers(self, delays: Delays, nodes: Nodes | None) -> float:
+    def _whole_numbers(self, delays: Delays, node_squares: float | None) -> float:
+        """Return the error power of 16 bits; ``node_squares`` is that of `Nodes`, None without a beam grid."""
         weight_limit, limit = whole_limits(self.n_mics * delays.sum_of_weights)
-        squares = 1.0 if nodes is None else nodes.squares
+        squares = 1.0 if node_squares is None else node_squares
         error = self.errors.samples(
             n_terms=delays.n_taps, terms=delays.squares, limit=limit, weight_limit=weight_limit, taps=squares
         )
-        if nodes is not None:
+        if node_squares is not None:
             filled = limit * weight_limit * self.n_mics * delays.sum_of_weights / 2**31
             error += self.errors.nodes(
                 n_mics=self.n_mics, sum_of_terms=delays.sum_of_weights, taps=squares, filled=filled
             )
         return error * self._spread
-
-    @property
-    def _nearest_m(self) -> float:
-        if self.settings.processing.wavefront == "plane":
-            return math.inf
-        return max(float(self.window.range_m[0]), NEAREST_M)
 
     @functools.cached_property
     def _n_bins(self) -> int:

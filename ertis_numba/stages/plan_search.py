@@ -3,15 +3,16 @@
 import itertools
 import math
 
-from ertis_numba.settings import MAX_FOCAL_ZONES
+from ertis_numba.settings import MAX_FOCAL_ZONES, Accuracy
 from ertis_numba.stages.beam_grid import FEWEST_RANGES
 from ertis_numba.stages.plan_model import MIN_STOPBAND_ATTENUATION_DB, ImagePlan, PlanModel
+from ertis_numba.stages.stream_plan import GRID_DENSITIES
 
 __all__ = ["open_plans"]
 
 _PHASES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
 _DELAY_TAPS = (1, 2, 3, 4, 5, 6)
-_DENSITIES = {2: (1.5, 2.0, 2.5, 3.0, 4.0), 4: (1.25, 1.5, 1.75, 2.0, 2.5, 3.0), 6: (1.75, 2.0, 2.5, 3.0)}
+_STREAM_TAPS = (1, 2, 3, 4)  # Streams are not smooth enough for more.
 _STOPBAND_ATTENUATIONS_DB = (MIN_STOPBAND_ATTENUATION_DB, 60.0, 80.0, 100.0, 120.0, 140.0)
 _N_STOPBAND_ATTENUATIONS = 3  # Number of candidates; more attenuation brings no benefit.
 _NEEDLESS = 0.02  # Share of the budget below which the error of a step is negligible.
@@ -31,19 +32,76 @@ def open_plans(model: PlanModel, budget: float, *, has_int16: bool) -> list[Imag
     """
     given = model.settings.accuracy
     adaptive = model.settings.processing.is_adaptive
+    if adaptive and model.settings.processing.wavefront == "spherical":
+        return _open_streams(model, budget, has_int16=has_int16)
     precisions = ["float32"] if given.precision == "auto" else [given.precision]
     if given.precision == "auto" and has_int16 and not adaptive:
         precisions.append("int16")
     zones = _zone_count(model, budget)
-    return [
-        ImagePlan(precision, n_phases, n_taps, beam_taps, density, stopband_attenuation_db, zones)
-        for precision, (n_phases, n_taps), (beam_taps, density), stopband_attenuation_db in itertools.product(
-            precisions,
-            _open_delays(model, budget, adaptive=adaptive),
-            _open_nodes(model, budget, adaptive=adaptive),
-            _stop_bands_db(model, budget),
-        )
-    ]
+    plans = (
+        []
+        if adaptive and not _may_be_plain(given)
+        else [
+            ImagePlan(precision, n_phases, n_taps, beam_taps, density, stopband_attenuation_db, zones)
+            for precision, (n_phases, n_taps), (beam_taps, density), stopband_attenuation_db in itertools.product(
+                precisions,
+                _open_delays(model, budget, adaptive=adaptive),
+                _open_nodes(model, budget, adaptive=adaptive),
+                _stop_bands_db(model, budget),
+            )
+        ]
+    )
+    return plans + _open_streams(model, budget, has_int16=has_int16) if adaptive else plans
+
+
+def _may_be_plain(given: Accuracy) -> bool:
+    """Return True if the kernels of all microphones can keep the given parts of a plan."""
+    return given.precision != "int16" and given.delay_taps in {None, 1} and not given.beam_taps
+
+
+def _open_streams(model: PlanModel, budget: float, *, has_int16: bool) -> list[ImagePlan]:
+    """Return the candidates that compute an adaptive beamformer from streams."""
+    given = model.settings.accuracy
+    complete = _may_be_plain(given) and None not in {given.oversampling, given.delay_taps, given.beam_taps}
+    if not (model.has_streams and has_int16) or given.precision == "float32" or complete:
+        return []
+    zones, stop_bands_db = _zone_count(model, budget), _stop_bands_db(model, budget / model.noise_part)
+    found: list[ImagePlan] = []
+    for n_taps in _STREAM_TAPS if given.delay_taps is None else (given.delay_taps,):
+        phases = _PHASES if given.oversampling is None else (given.oversampling,)
+        for n_phases in phases:
+            direct = ImagePlan("int16", n_phases, n_taps, 0, given.beam_density or 2.0, stop_bands_db[0], zones)
+            error = model.parts(direct)["delays"]
+            if error <= budget or len(phases) == 1:
+                found += [
+                    direct._replace(beam_taps=beam_taps, density=density, stopband_attenuation_db=stop_band_db)
+                    for (beam_taps, density), stop_band_db in itertools.product(
+                        _stream_grids(model, budget, direct), stop_bands_db
+                    )
+                ]
+            if error <= _NEEDLESS * budget:
+                break
+    return found
+
+
+def _stream_grids(model: PlanModel, budget: float, direct: ImagePlan) -> list[tuple[int, float]]:
+    """Return the candidates for the beam grids of streams; 0 taps stand for one beam per direction."""
+    given = model.settings.accuracy
+    found: list[tuple[int, float]] = [] if given.beam_taps else [(0, direct.density)]
+    if given.beam_taps == 0 or model.aperture.n_axes not in {1, 2}:
+        return found
+    for beam_taps in [given.beam_taps] if given.beam_taps else GRID_DENSITIES:
+        densities = GRID_DENSITIES[beam_taps] if given.beam_density is None else (given.beam_density,)
+        for density in densities:
+            plan = direct._replace(beam_taps=beam_taps, density=density)
+            if not given.beam_taps and not any(each.grid for each in model.streams(plan).streams):
+                break
+            error = model.parts(plan)["beams"]
+            if error <= budget or given.beam_taps:
+                found.append((beam_taps, density))
+            if error <= _SMALL * budget:
+                break
+    return found
 
 
 def _open_delays(model: PlanModel, budget: float, *, adaptive: bool) -> list[tuple[int, int]]:
@@ -69,8 +127,8 @@ def _open_nodes(model: PlanModel, budget: float, *, adaptive: bool) -> list[tupl
     if adaptive or given.beam_taps == 0 or not (flat or given.beam_taps):
         return [(0, given.beam_density or 2.0)]
     found: list[tuple[int, float]] = [] if given.beam_taps else [(0, given.beam_density or 2.0)]
-    for beam_taps in [given.beam_taps] if given.beam_taps else _DENSITIES:
-        densities = _DENSITIES[beam_taps] if given.beam_density is None else (given.beam_density,)
+    for beam_taps in [given.beam_taps] if given.beam_taps else GRID_DENSITIES:
+        densities = GRID_DENSITIES[beam_taps] if given.beam_density is None else (given.beam_density,)
         for density in densities:  # The coarsest grid is the cheapest. The loop ends at needlessly accurate ones.
             if not given.beam_taps and model.count_grid_points(beam_taps, density) >= model.n_directions:
                 break

@@ -159,6 +159,8 @@ class Planner:
         budget = self._sensitivity.beams(allowed)
         with one_thread():
             plans = open_plans(self._plans, budget, has_int16=bool(self._kernels.tile_ranges))
+            if not plans:
+                raise ArgumentError(_no_plan(self.settings))
             sizes = [self._plans.n_bytes(plan) for plan in plans]
             limit = _USUAL_BYTES if self._max_bytes is None else self._max_bytes
             rated = self._rated(plans, sizes, 0, limit)
@@ -250,3 +252,12 @@ class Planner:
 def _worst(chosen: Chosen) -> str:
     name = max(chosen.parts, key=lambda part: chosen.parts[part])
     return f"{decibels(chosen.parts[name]):.1f} due to {PARTS[name]}"
+
+
+def _no_plan(settings: Settings) -> str:
+    """Return the reason why no plan exists: the device or the settings exclude streams, and wavefronts need them."""
+    return (
+        f"processing.beamformer {settings.processing.beamformer!r} with weighting {settings.processing.weighting!r} "
+        "needs 16-bit streams for these settings, but accuracy.precision or the processor excludes them; give "
+        "processing.wavefront 'plane', or accuracy.precision 'auto' on a processor with AVX-512 VNNI or AVX-VNNI"
+    )

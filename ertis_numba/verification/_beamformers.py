@@ -25,7 +25,9 @@ def combine(y: Delayed, processing: Processing) -> NDArray[np.float64]:
         microphones.
     processing : Processing
     """
-    return _BEAMFORMERS[processing.beamformer](y, processing) * _WEIGHTINGS[processing.weighting](y)
+    amplitude, factor = _BEAMFORMERS[processing.beamformer](y, processing), _WEIGHTINGS[processing.weighting](y)
+    found: NDArray[np.float64] = amplitude * factor
+    return found
 
 
 def _delay_and_sum(y: Delayed, _: Processing) -> NDArray[np.float64]:
@@ -34,7 +36,7 @@ def _delay_and_sum(y: Delayed, _: Processing) -> NDArray[np.float64]:
 
 def _coherence_factor(y: Delayed) -> NDArray[np.float64]:
     coherent, total = np.abs(y.mean(axis=0)) ** 2, np.mean(np.abs(y) ** 2, axis=0)
-    return np.divide(coherent, total, out=np.zeros_like(coherent), where=total > 0)
+    return np.asarray(np.divide(coherent, total, out=np.zeros_like(coherent), where=total > 0))
 
 
 def _dmas(y: Delayed, processing: Processing) -> NDArray[np.float64]:

@@ -58,3 +58,22 @@ for _beamformer, _weighting in ADAPTIVE_COMBINATIONS:
         ),
         -110,
     )
+for _name, _processing, _accuracy in (
+    ("dmas", {"beamformer": "dmas"}, {}),
+    ("coherence factor", {"weighting": "coherence_factor"}, {"beam_taps": 2, "beam_density": 3.0}),
+    ("both", {"beamformer": "dmas", "weighting": "coherence_factor"}, {}),
+):
+    PLANS[f"streams of {_name}"] = (
+        TINY.replace(
+            processing=TINY.processing.replace(**_processing, directions="2d:5"),
+            accuracy=DIRECT.replace(precision="int16", oversampling=4, max_error_db=0.0, **_accuracy),
+        ),
+        -60,
+    )
+PLANS["streams, two zones"] = (
+    TINY.replace(
+        processing=TINY.processing.replace(weighting="coherence_factor", directions="2d:3", wavefront="spherical"),
+        accuracy=DIRECT.replace(precision="int16", oversampling=4, max_error_db=0.0, focal_zones=2),
+    ),
+    -60,
+)

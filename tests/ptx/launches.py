@@ -11,6 +11,7 @@ from ertis_numba.stages import planner
 from ertis_numba.stages.fast import FastChain
 
 ERTIS = Settings.from_preset("default_25_50")
+STREAMS = {"precision": "int16", "oversampling": 8, "delay_taps": 2, "beam_taps": 4, "max_error_db": -10.0}
 PLANS = {
     # accuracy, processing
     "default": ({}, {}),
@@ -21,10 +22,19 @@ PLANS = {
     "int16, nodes": ({"precision": "int16", "beam_taps": 4}, {}),
     "near": ({}, {"range_m": (0.3, 1.0)}),  # several focal zones
     **{
-        f"{beamformer}, {weighting}": ({}, {"beamformer": beamformer, "weighting": weighting, "directions": "90"})
+        f"{beamformer}, {weighting}": (
+            {"precision": "float32"},
+            {"beamformer": beamformer, "weighting": weighting, "directions": "90"},
+        )
         for beamformer, weighting in ADAPTIVE_COMBINATIONS
     },
-    **{f"dmas {order}": ({}, {"beamformer": "dmas", "dmas_order": order}) for order in (2, 3, 5, 8)},
+    **{
+        f"dmas {order}": ({"precision": "float32"}, {"beamformer": "dmas", "dmas_order": order})
+        for order in (2, 3, 5, 8)
+    },
+    **{f"streams of dmas {order}": (STREAMS, {"beamformer": "dmas", "dmas_order": order}) for order in (2, 3, 5, 8)},
+    "streams of coherence factor": (STREAMS, {"weighting": "coherence_factor"}),
+    "streams of both": (STREAMS, {"beamformer": "dmas", "dmas_order": 5, "weighting": "coherence_factor"}),
 }
 
 

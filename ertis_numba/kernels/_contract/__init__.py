@@ -25,9 +25,11 @@ from ertis_numba.kernels._contract.signals import (
     UnpackBits,
     UnpackPcm,
 )
+from ertis_numba.kernels._contract.streams import CombineStreamsInt16, QuantiseStreams
 
 __all__ = [
     "AddPaths",
+    "CombineStreamsInt16",
     "Complex",
     "Decimate",
     "DelayAndSum",
@@ -42,6 +44,7 @@ __all__ = [
     "MultiplyAndFold",
     "MultiplySpectra",
     "Pcm",
+    "QuantiseStreams",
     "QuantiseTiles",
     "Real",
     "RemoveGroupDelay",

@@ -10,7 +10,7 @@ from numba.core import cgutils
 
 from ertis_numba.kernels._cpu.features import target_features
 
-__all__ = ["HAS_INT16_DOT", "INT32", "LANES", "RANGES", "SHORTS", "SUMS", "VECTORS", "Dot16"]
+__all__ = ["FLOATS", "HAS_INT16_DOT", "INT32", "LANES", "RANGES", "SHORTS", "SUMS", "VECTORS", "Dot16"]
 
 _FEATURES = target_features()
 HAS_INT16_DOT = not _FEATURES.isdisjoint({"avx512vnni", "avxvnni"})
@@ -62,22 +62,53 @@ class Dot16:
 
     def complex_terms(self, tiles, tile, offsets, weights, row):
         """Add ``Σ_term weights[row, term] · tiles[tile].flat[offsets[row, term] + k]`` to the sums of all k."""
+        n_terms = cgutils.unpack_tuple(self._builder, offsets.shape)[1]
+        self.flat_terms(tiles, tile, offsets, weights, self._builder.mul(row, n_terms), n_terms)
+
+    def flat_terms(self, tiles, tile, offsets, weights, begin, n_terms):
+        """Add ``Σ_term weights.flat[begin + term] · tiles[tile].flat[offsets.flat[begin + term] + k]`` likewise."""
         builder = self._builder
         shape = cgutils.unpack_tuple(builder, tiles.shape)
         in_tile = builder.mul(builder.mul(shape[1], shape[2]), shape[3])
         samples = builder.gep(builder.bitcast(tiles.data, INT32.as_pointer()), [builder.mul(tile, in_tile)])
         pairs = builder.bitcast(weights.data, INT32.as_pointer())
-        n_terms = cgutils.unpack_tuple(builder, offsets.shape)[1]
-        begin = builder.mul(row, n_terms)
         with cgutils.for_range(builder, n_terms) as loop:
             entry = builder.add(begin, loop.index)
-            offset = builder.sext(builder.load(builder.gep(offsets.data, [entry])), row.type)
-            even = builder.shl(entry, ir.Constant(row.type, 1))
-            both = [self.pair(pairs, index) for index in (even, builder.add(even, ir.Constant(row.type, 1)))]
+            offset = builder.sext(builder.load(builder.gep(offsets.data, [entry])), begin.type)
+            even = builder.shl(entry, ir.Constant(begin.type, 1))
+            both = [self.pair(pairs, index) for index in (even, builder.add(even, ir.Constant(begin.type, 1)))]
             for vector in range(VECTORS):
                 x = self.load(samples, offset, vector, align=4)
                 for part in (0, 1):
                     self.add(part, vector, x, both[part])
+
+    def node_pairs(self, pairs, skipped, places, weights, first_pair, n_pairs):
+        """Add the beams of grid points, stored in pairs from point ``skipped`` on, times their weights.
+
+        ``places`` and ``weights`` are flat arrays; the direction has ``n_pairs`` entries from ``first_pair`` on.
+        """
+        builder = self._builder
+        size = first_pair.type
+        values = builder.bitcast(weights.data, INT32.as_pointer())
+        with cgutils.for_range(builder, n_pairs) as loop:
+            entry = builder.add(first_pair, loop.index)
+            node = builder.sext(builder.load(builder.gep(places.data, [entry])), size)
+            begin = builder.mul(builder.sub(node, skipped), ir.Constant(size, 2 * RANGES))
+            weight = self.pair(values, entry)
+            for vector in range(VECTORS):
+                for part in (0, 1):
+                    at = builder.add(begin, ir.Constant(size, part * RANGES))
+                    self.add(part, vector, self.load(pairs, at, vector, align=4 * LANES), weight)
+
+    def store_parts(self, scale, target):
+        """Write ``scale`` times the sums to ``target`` (float*): real parts, then imaginary parts."""
+        builder = self._builder
+        scales = self.splat(scale, FLOATS)
+        for part in (0, 1):
+            for vector in range(VECTORS):
+                value = builder.fmul(builder.sitofp(builder.load(self._sums[part][vector]), FLOATS), scales)
+                place = builder.gep(target, [ir.Constant(ir.IntType(64), part * RANGES + vector * LANES)])
+                builder.store(value, builder.bitcast(place, FLOATS.as_pointer())).align = 4
 
     def store_levels(self, scale, target):
         """Write ``scale`` times the magnitude of the sums to ``target`` (float*)."""

@@ -6,79 +6,15 @@ tile stay in the L2 cache between the steps.
 """
 
 import numpy as np
-from llvmlite import ir
 from numba import njit, prange, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from ertis_numba.kernels._cpu.dot16 import INT32, LANES, RANGES, SHORTS, SUMS, VECTORS, Dot16
+from ertis_numba.kernels._cpu.dot16 import RANGES, Dot16
+from ertis_numba.kernels._cpu.nodes16 import fill_pairs, new_pairs
 from ertis_numba.kernels._cpu.spans import node_span
 
 __all__ = ["interpolated_beams_envelope_int16"]
-
-_LINE = 64  # bytes of a cache line
-
-
-@intrinsic
-def _address(typing_context, array):
-    """Return the address of an array's data; ``array.ctypes.data`` would exclude callers from Numba's cache."""
-    signature = types.intp(array)
-
-    def codegen(context, builder, signature, arguments):
-        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
-        return builder.ptrtoint(data, context.get_value_type(types.intp))
-
-    return signature, codegen
-
-
-@intrinsic
-def _node_tile(typing_context, tiles, tile, offsets, weights, node, rows, row):
-    """Fill ``rows[row]``, (part, range) int16, with the rounded upper 16 bits of the beam of a grid point."""
-    signature = types.void(tiles, types.intp, offsets, weights, types.intp, rows, types.intp)
-
-    def codegen(context, builder, signature, arguments):
-        def array(k):
-            return context.make_array(signature.args[k])(context, builder, arguments[k])
-
-        dot = Dot16(builder)
-        dot.complex_terms(array(0), arguments[1], array(2), array(3), arguments[4])
-        size = ir.Constant(arguments[6].type, 2 * RANGES)
-        dot.store_upper_halves(builder.gep(array(5).data, [builder.mul(arguments[6], size)]))
-        return context.get_dummy_value()
-
-    return signature, codegen
-
-
-@intrinsic
-def _pair_rows(typing_context, rows, lower, pairs, node):
-    """Fill ``pairs[node]`` with row ``lower`` in the low bits and the other row in the high bits.
-
-    The code uses LLVM's vector types, because LLVM does not vectorise such a loop.
-    """
-    signature = types.void(rows, types.intp, pairs, types.intp)
-
-    def codegen(context, builder, signature, arguments):
-        def array(k):
-            return context.make_array(signature.args[k])(context, builder, arguments[k])
-
-        size = arguments[1].type
-        low = builder.mul(arguments[1], ir.Constant(size, 2 * RANGES))
-        high = builder.sub(ir.Constant(size, 2 * RANGES), low)
-        begin = builder.mul(arguments[3], ir.Constant(size, 2 * RANGES))
-        for ahead in range(0, 2 * RANGES, LANES):
-            step = ir.Constant(size, ahead)
-            parts = []
-            for row in (low, high):
-                place = builder.gep(array(0).data, [builder.add(row, step)])
-                loaded = builder.load(builder.bitcast(place, SHORTS.as_pointer()))
-                loaded.align = 2
-                parts.append(builder.zext(loaded, SUMS))
-            both = builder.or_(parts[0], builder.shl(parts[1], ir.Constant(SUMS, [16] * LANES)))
-            place = builder.gep(array(2).data, [builder.add(begin, step)])
-            builder.store(both, builder.bitcast(place, SUMS.as_pointer())).align = 4 * LANES
-        return context.get_dummy_value()
-
-    return signature, codegen
 
 
 @intrinsic
@@ -94,39 +30,14 @@ def _interpolate_tile(typing_context, pairs, skipped, places, weights, direction
         def array(k):
             return context.make_array(signature.args[k])(context, builder, arguments[k])
 
-        direction = arguments[4]
-        size = direction.type
         n_pairs = cgutils.unpack_tuple(builder, array(2).shape)[1]
-        values = builder.bitcast(array(3).data, INT32.as_pointer())
-        first_pair = builder.mul(direction, n_pairs)
+        first_pair = builder.mul(arguments[4], n_pairs)
         dot = Dot16(builder)
-        with cgutils.for_range(builder, n_pairs) as loop:
-            entry = builder.add(first_pair, loop.index)
-            node = builder.sext(builder.load(builder.gep(array(2).data, [entry])), size)
-            begin = builder.mul(builder.sub(node, arguments[1]), ir.Constant(size, 2 * RANGES))
-            weight = dot.pair(values, entry)
-            for vector in range(VECTORS):
-                for part in (0, 1):
-                    at = builder.add(begin, ir.Constant(size, part * RANGES))
-                    dot.add(part, vector, dot.load(array(0).data, at, vector, align=4 * LANES), weight)
+        dot.node_pairs(array(0).data, arguments[1], array(2), array(3), first_pair, n_pairs)
         dot.store_levels(arguments[5], builder.gep(array(6).data, [arguments[7]]))
         return context.get_dummy_value()
 
     return signature, codegen
-
-
-@njit(nogil=True, cache=True)
-def _node_pairs(tiles, tile, offsets, weights, first, last):
-    """Return pairs of beams of the grid points ``first … last``: (point, part, range) int32, aligned to cache lines."""
-    raw = np.empty((last - first + 1) * 2 * RANGES + _LINE // 4, np.int32)
-    ahead = (-_address(raw) % _LINE) // 4
-    pairs = raw[ahead : ahead + (last - first + 1) * 2 * RANGES].reshape(last - first + 1, 2, RANGES)
-    both = np.empty((2, 2 * RANGES), np.int16)
-    for node in range(first, last + 1):
-        _node_tile(tiles, tile, offsets, weights, node, both, node % 2)
-        if node > first:
-            _pair_rows(both, 1 - node % 2, pairs, node - 1 - first)
-    return pairs
 
 
 @njit(parallel=True, nogil=True, cache=True)
@@ -144,7 +55,8 @@ def interpolated_beams_envelope_int16(
         if begin == end:
             continue
         first, last = node_span(places, begin, end)
-        pairs = _node_pairs(tiles, tile, offsets, weights, first, last)
+        pairs = new_pairs(last - first + 1)
+        fill_pairs(tiles, tile, offsets, weights, first, last, pairs)
         scale = scales[tile] * weight_scale
         short = np.empty((1, RANGES), np.float32)
         for direction in range(begin, end):

@@ -5,11 +5,11 @@ import math
 import numpy as np
 from numba import njit, prange
 
-__all__ = ["quantise_tiles"]
+__all__ = ["largest_in", "quantise_tiles"]
 
 
 @njit(nogil=True, cache=True)
-def _largest(parts, begin, end, powers, bits):
+def largest_in(parts, begin, end, powers, bits):
     """Return the largest magnitude in ``begin … end`` of ``parts``, (mic, phase, 2 samples) float32.
 
     Non-negative floats have the same order as their bits. A maximum of integers is one vector instruction, while a
@@ -45,7 +45,7 @@ def quantise_tiles(signals, starts, limit, tiles, scales):
     for tile in prange(n_tiles):
         begin, end = starts[tile], min(starts[tile] + width, signals.shape[2])
         powers = np.empty(width, np.float32)
-        largest = _largest(parts, begin, end, powers, powers.view(np.int32))
+        largest = largest_in(parts, begin, end, powers, powers.view(np.int32))
         scales[tile] = largest / limit
         factor = np.float32(0) if largest == 0 else limit / largest
         for mic in range(n_mics):

@@ -8,13 +8,13 @@ from ertis_numba.kernels._cuda.lane import launch, workspace
 from ertis_numba.kernels._cuda.terms import BLOCK, DIRECTIONS, ONE, WARPS_1, WARPS_2, indexed
 from ertis_numba.kernels._scalar import short_imag_of, short_real_of, upper_halves
 
-__all__ = ["interpolated_beams_envelope_int16"]
+__all__ = ["fill_nodes", "interpolated_beams_envelope_int16", "sum_short_nodes"]
 
 _WIDTH = np.uint64(TILE_RANGES)
 
 
 @cuda.jit(cache=True)
-def _fill_nodes(samples, per_tile, offsets, weights, n_terms, nodes):
+def fill_nodes(samples, per_tile, offsets, weights, n_terms, nodes):
     """Fill ``nodes``, (tile, point, range), with pairs of int16 as uint32."""
     node = np.uint64(cuda.blockIdx.x * DIRECTIONS + cuda.threadIdx.y)
     if node >= np.uint64(nodes.shape[1]):
@@ -29,16 +29,12 @@ def _fill_nodes(samples, per_tile, offsets, weights, n_terms, nodes):
     nodes[tile, node, k + WARPS_2] = upper_halves(c_real, c_imag)
 
 
-@cuda.jit(cache=True)
-def _interpolate(nodes, n_nodes, scales, starts, stop, places, n_pairs, tap_weights, rows, weight_scale, out):
-    """Fill ranges of ``out``; ``nodes``, ``places`` and ``tap_weights`` are flat.
+@cuda.jit(device=True)
+def sum_short_nodes(nodes, n_nodes, places, n_pairs, tap_weights, direction):
+    """Return the real and imaginary parts of an interpolated beam, and those one and two warps further.
 
-    ``nodes`` and ``tap_weights`` contain pairs of int16 as uint32.
+    ``nodes``, ``places`` and ``tap_weights`` are flat; ``nodes`` and ``tap_weights`` have pairs of int16 as uint32.
     """
-    direction = np.uint64(cuda.blockIdx.x * DIRECTIONS + cuda.threadIdx.y)
-    if direction >= np.uint64(rows.size):
-        return
-    tile = np.uint64(cuda.blockIdx.y)
     first = np.uint64(cuda.blockIdx.y * np.int64(n_nodes) * TILE_RANGES + cuda.threadIdx.x)
     a_real = a_imag = b_real = b_imag = c_real = c_imag = np.int32(0)
     entry = direction * np.uint64(n_pairs)
@@ -57,7 +53,17 @@ def _interpolate(nodes, n_nodes, scales, starts, stop, places, n_pairs, tap_weig
         x, y = nodes[at + WARPS_2], nodes[at + (_WIDTH + WARPS_2)]
         c_real = np.int32(np.int32(c_real + low * short_real_of(x)) + high * short_real_of(y))
         c_imag = np.int32(np.int32(c_imag + low * short_imag_of(x)) + high * short_imag_of(y))
-    sums = a_real, a_imag, b_real, b_imag, c_real, c_imag
+    return a_real, a_imag, b_real, b_imag, c_real, c_imag
+
+
+@cuda.jit(cache=True)
+def _interpolate(nodes, n_nodes, scales, starts, stop, places, n_pairs, tap_weights, rows, weight_scale, out):
+    """Fill ranges of ``out``; arrays as for `sum_short_nodes`."""
+    direction = np.uint64(cuda.blockIdx.x * DIRECTIONS + cuda.threadIdx.y)
+    if direction >= np.uint64(rows.size):
+        return
+    tile = np.uint64(cuda.blockIdx.y)
+    sums = sum_short_nodes(nodes, n_nodes, places, n_pairs, tap_weights, direction)
     row, scale = np.uint64(rows[direction]), np.float32(scales[tile] * weight_scale)
     store_tile(out, row, starts[tile], stop, scale, sums)
 
@@ -72,7 +78,7 @@ def interpolated_beams_envelope_int16(
     samples = indexed(tiles.reshape(-1).view(np.uint32))
     nodes = workspace(f"nodes of {n_tiles} tiles", (n_tiles, n_nodes, TILE_RANGES), np.uint32)
     launch(
-        _fill_nodes,
+        fill_nodes,
         (-(-n_nodes // DIRECTIONS), n_tiles),
         BLOCK,
         samples,

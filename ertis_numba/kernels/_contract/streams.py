@@ -1,0 +1,100 @@
+"""Contracts of adaptive beamformers from delay-and-sums of streams: analytic signals to envelopes.
+
+A stream is ``|x|^power · exp(i turns φ)`` of the samples ``x = |x| exp(iφ)`` of analytic signals. Sums of few delayed
+streams over the microphones determine DMAS and the coherence factor.
+"""
+
+from typing import Protocol
+
+from ertis_numba.kernels._contract.arrays import Complex, Index, Real, Short
+
+__all__ = ["CombineStreamsInt16", "QuantiseStreams"]
+
+
+class QuantiseStreams(Protocol):
+    """Compute streams of analytic signals, and store them like `QuantiseTiles`.
+
+    ``tiles[tile, stream, mic, phase, k] ≈ y · units[stream] / scales[tile, stream]``, rounded, as pairs of real and
+    imaginary part. y is the stream ``|x|^powers[stream] · exp(i turns[stream] φ)`` of the sample
+    ``x = signals[mic, phase, starts[tile] + k]``, and 0 for x = 0. The largest magnitude of a tile becomes
+    ``limits[stream]``. Beyond the end of the signals, tiles are 0.
+
+    Parameters
+    ----------
+    signals : (mic, phase, sample) complex64
+    starts : (tile,) int32
+    limits, units, powers : (stream,) float32
+    turns : (stream,) int32
+    first, stop : int
+        Streams to compute.
+    tiles : (tile, stream, mic, phase, k, 2) int16
+    scales : (tile, stream) float32
+    """
+
+    def __call__(
+        self,
+        signals: Complex,
+        starts: Index,
+        limits: Real,
+        units: Real,
+        powers: Real,
+        turns: Index,
+        first: int,
+        stop: int,
+        tiles: Short,
+        scales: Real,
+    ) -> None: ...
+
+
+class CombineStreamsInt16(Protocol):
+    """Compute amplitudes from delay-and-sums of streams on the tiles of `QuantiseStreams`, with integer sums.
+
+    The sums are those of the tiles times their scales. Let ``p_i`` be the sum of stream i − 1, and 0 for i above the
+    number of power sums. The amplitude is ``|e_order|`` from Newton's identities,
+    ``k e_k = Σ_i (−1)^(i − 1) e_(k − i) p_i`` with ``e_0 = 1``. It is multiplied by the coherence factor
+    ``|b|² / (M s)``, at most 1, with the sum b of one stream, the real part s of the sum of another, and M microphones.
+
+    A stream is summed for each direction, or for the points of a beam grid, as in `DelayAndSumEnvelopeInt16` and in
+    `InterpolatedBeamsEnvelopeInt16`. Tables of all streams follow one another in flat arrays.
+
+    Parameters
+    ----------
+    tiles, scales
+        As in `QuantiseStreams`.
+    starts : (tile,) int32
+        First range of each tile; starts are ``tile_ranges`` apart.
+    stop : int
+        End of the ranges to fill.
+    shapes : (stream, 3) int32
+        Numbers of points, of terms of each point, and of pairs of each direction. Without pairs, each direction is its
+        own point. This array is always in the memory of the host.
+    offsets : (entry,) int32
+        Offsets into one tile, in complex samples: points by terms of each stream.
+    weights : (entry, 2, 2) int16
+        ``((re w, −im w), (im w, re w))``.
+    places : (pair,) int32
+        The lower beam-grid point of each pair: directions by pairs of each stream.
+    tap_weights : (pair, 2) int16
+    rows : (direction,) int32
+        Row of each direction in ``out``.
+    recipe : (n_powers, order, beam, total)
+        Number of power sums, and order of the product; 1 and 1 for the magnitude of a beam. Then the streams of b and
+        s; −1 for no coherence factor.
+    out : (direction, range) float32
+    """
+
+    def __call__(
+        self,
+        tiles: Short,
+        scales: Real,
+        starts: Index,
+        stop: int,
+        shapes: Index,
+        offsets: Index,
+        weights: Short,
+        places: Index,
+        tap_weights: Short,
+        rows: Index,
+        recipe: tuple[int, int, int, int],
+        out: Real,
+    ) -> None: ...

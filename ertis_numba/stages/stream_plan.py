@@ -1,0 +1,417 @@
+"""Streams of a plan: the delay-and-sums from which an adaptive beamformer is computed, and the errors of each.
+
+DMAS of order n is the elementary symmetric polynomial e_n of the roots ``z = y |y|^(1/n − 1)`` of M microphones. By
+Newton's identities it follows from the power sums ``p_k = Σ z^k``, each a delay-and-sum of a stream ``z^k``. With
+``∂e_n / ∂p_k = ± e_(n−k) / k``, an error power ε of each ``z^k``, relative to its power, changes the image by
+
+    M / k² · C(M, n−k) / C(M, n) · ε          for microphones with independent signals,
+    M / k² · (C(M, n−k) / C(M, n))² · ε       for an echo that reaches all microphones alike.
+
+An error that all microphones share adds up to M² instead of M. With 32 microphones, higher power sums therefore need
+little accuracy, and those of the highest orders can be left out. The coherence factor follows from the sums of y and
+|y|². Each stream gets the fewest taps that keep its error far below that of the first stream.
+
+Where a signal is nearly zero, its stream changes too fast for interpolation. Echoes are hardly affected: they are
+bright where signals are strong, and their errors come from the spectrum there. The planner assumes echoes in noise. The
+noise has nine tenths of the power in the image of delay-and-sum, and much less in the images here. An image of noise
+only has a larger error.
+
+The matched filter can apply the gains of delay and beam interpolation to a stream of the signals themselves, see
+`fitting`. Other streams are nonlinear, so the signals for them have no gain.
+"""
+
+import functools
+import math
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.beamformers import BEAMFORMERS, WEIGHTINGS, Stream
+from ertis_numba.settings import Accuracy, Processing, Settings
+from ertis_numba.stages.beam_grid import Aperture, BeamGrid
+from ertis_numba.stages.fitting import DelayFit, Spectrum
+from ertis_numba.stages.stream_spectrum import StreamSpectrum, highest_hz, spectrum_of_stream
+
+__all__ = [
+    "GRID_DENSITIES",
+    "LINEAR",
+    "PlannedStream",
+    "PlannedStreams",
+    "Recipe",
+    "StreamPlanner",
+    "recipe_of",
+    "uses_streams",
+]
+
+LINEAR: Final = Stream(1.0, 1)
+"""Stream of the signals themselves, to which a filter can apply gains."""
+
+_SMALL: Final = 1.0  # Error that another stream may add, relative to that of the first stream.
+_FEW: Final = 0.6  # A grid with more points than this share of the directions is not worth its interpolation.
+GRID_DENSITIES: Final = {
+    2: (1.5, 2.0, 2.5, 3.0, 4.0),
+    4: (1.25, 1.5, 1.75, 2.0, 2.5, 3.0),
+    6: (1.75, 2.0, 2.5, 3.0),
+}
+"""Densities of beam grids that plans choose from, by the number of taps."""
+
+_NOISE_RATIO: Final = 9.0  # Power of noise relative to that of echoes in the image of delay-and-sum.
+_UNLIKE: Final = 2.5  # Margin for differences between images: 4 dB.
+_PEAKED: Final = 2.0  # Common errors rise with the fourth power of frequency, so that few sudden changes add much.
+_KEPT: Final = 512  # Number of cached fits.
+_CORRELATED: Final = 2  # The beam of the coherence factor and the first power sum have errors of the same samples.
+
+
+class Recipe(NamedTuple):
+    """Streams of a beamformer and a weighting, and the numbers that `kernels` need to combine their sums.
+
+    Attributes
+    ----------
+    streams : tuple of Stream
+        Power sums, then the streams of the coherence factor.
+    order : int
+        Order of the product; 1 for delay-and-sum.
+    beam, total : int
+        Streams of the coherence factor; −1 for none.
+    """
+
+    streams: tuple[Stream, ...]
+    order: int
+    beam: int
+    total: int
+
+
+def recipe_of(processing: Processing) -> Recipe | None:
+    """Return the streams of processing settings; None if only a kernel for all microphones can compute them."""
+    beamformer = BEAMFORMERS[processing.beamformer]
+    streams = beamformer.streams(*beamformer.values(processing))
+    if not streams:
+        return None
+    added = WEIGHTINGS[processing.weighting].streams
+    whole = streams + tuple(stream for stream in added if stream not in streams)
+    beam, total = (whole.index(stream) for stream in added) if added else (-1, -1)
+    return Recipe(whole, len(streams), beam, total)
+
+
+def uses_streams(processing: Processing, accuracy: Accuracy) -> bool:
+    """Return True if a complete plan computes an adaptive beamformer from streams, not from all microphones at once.
+
+    The kernels of all microphones read one sample of each, in single precision and for each direction.
+    """
+    plan = accuracy.precision, accuracy.delay_taps or 1, accuracy.beam_taps or 0
+    return processing.is_adaptive and recipe_of(processing) is not None and plan != ("float32", 1, 0)
+
+
+class Shares(NamedTuple):
+    """Error power of the image relative to that of a stream.
+
+    Attributes
+    ----------
+    noise, coherent : float
+        For errors that differ between microphones, in noise and for an echo that reaches all microphones alike.
+    common : float
+        For errors that all microphones share, and such an echo.
+    noise_share : float
+        Share of noise in the power of the image.
+    """
+
+    noise: float
+    coherent: float
+    common: float
+    noise_share: float
+
+    def error(self, *, whole: float, varying: float, common: float) -> float:
+        """Return the error power of an image of echoes and some noise.
+
+        Parameters
+        ----------
+        whole : float
+            Error power of the stream with the whole spectrum.
+        varying, common : float
+            Error power where the image is bright: the part that differs between microphones, and the rest.
+        """
+        return _UNLIKE * (
+            self.coherent * varying + _PEAKED * self.common * common + self.noise_share * self.noise * whole
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class StreamGrid:
+    """Beam grid of a stream.
+
+    Attributes
+    ----------
+    density : float
+    n_points : int
+    error : float
+        Error power of the image.
+    squares : float
+        Sum of a beam's squared weights.
+    """
+
+    density: float
+    n_points: int
+    error: float
+    squares: float
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedStream:
+    """Stream with its interpolation.
+
+    Attributes
+    ----------
+    stream : Stream
+    spectrum : StreamSpectrum
+    fit : DelayFit
+    high_hz : float
+        Frequency to which the density of its beam grid is relative.
+    grid : StreamGrid or None
+        Beam grid; None if every direction is summed itself.
+    shares : Shares
+    """
+
+    stream: Stream
+    spectrum: StreamSpectrum
+    fit: DelayFit
+    high_hz: float
+    grid: StreamGrid | None
+    shares: Shares
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedStreams:
+    """Streams of a plan.
+
+    Attributes
+    ----------
+    streams : list of PlannedStream
+        As in `Recipe`, without the highest power sums if these are negligible.
+    n_powers : int
+        Number of power sums among them.
+    delays : float
+        Error power of the image due to interpolation of delays and power sums that are left out.
+    """
+
+    streams: list[PlannedStream]
+    n_powers: int
+    delays: float
+
+
+class StreamPlanner:
+    """Planner of the streams of one sensor and one image.
+
+    Parameters
+    ----------
+    settings : Settings
+    recipe : Recipe
+    spectrum : Spectrum
+        Spectrum of the output of the matched filter.
+    aperture : Aperture
+    sound_speed_m_s, nearest_m : float
+        As for `BeamGrid`.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        recipe: Recipe,
+        spectrum: Spectrum,
+        aperture: Aperture,
+        *,
+        sound_speed_m_s: float,
+        nearest_m: float,
+    ) -> None:
+        self.recipe = recipe
+        self._spectrum, self._aperture = spectrum, aperture
+        self._call, self._rate_hz = settings.call, settings.output_rate_hz
+        self._speed_m_s, self._nearest_m = sound_speed_m_s, nearest_m
+        self._n_mics = len(aperture.positions_m)
+
+    def plan(
+        self, n_phases: int, n_taps: int, beam_taps: int, density: float, fractions: NDArray[np.float64] | None = None
+    ) -> PlannedStreams:
+        """Return the streams of a plan.
+
+        Parameters
+        ----------
+        n_phases, n_taps, beam_taps : int
+        density : float
+            As in `ImagePlan`.
+        fractions : (delay,) float64, optional
+            As for `ErrorModel.delays`.
+        """
+        step_s = 1 / (self._rate_hz * n_phases)
+        _, first = self._delays(0, n_taps, step_s, fractions)
+        error, small, order = first, _SMALL * first, self.recipe.order
+        n_powers = order
+        while n_powers > 1 and (missed := self._missed(n_powers - 1)) <= small:
+            error += missed
+            n_powers -= 1
+        streams: list[PlannedStream] = []
+        first_grid = 0.0
+        for place, stream in enumerate(self.recipe.streams):
+            if n_powers <= place < order:
+                continue
+            fewest = n_taps if place == 0 else 1
+            fits = (self._delays(place, few, step_s, fractions) for few in range(fewest, n_taps + 1))
+            fit, added = next(found for found in fits if found[1] <= small or found[0].n_taps == n_taps)
+            error += added if place else 0.0
+            high_hz = highest_hz(self._call.low_frequency_hz, self._call.high_frequency_hz, stream)
+            spectrum, shares = self._spectrum_of(stream), self._shares(place)
+            grid = None
+            if beam_taps:
+                limit = math.inf if place == 0 else _SMALL * (first + first_grid) if streams[0].grid else 0.0
+                grid = self._grid(spectrum, shares, beam_taps, density, high_hz, limit, has_gain=stream == LINEAR)
+            first_grid = grid.error if place == 0 and grid else first_grid
+            streams.append(PlannedStream(stream, spectrum, fit, high_hz, grid, shares))
+        return PlannedStreams(streams, n_powers, error)
+
+    def beam_grid(self, planned: PlannedStream, beam_taps: int) -> BeamGrid | None:
+        """Return the beam grid of a stream."""
+        if planned.grid is None:
+            return None
+        return BeamGrid(
+            self._aperture,
+            planned.spectrum.bright,
+            n_taps=beam_taps,
+            density=planned.grid.density,
+            high_hz=planned.high_hz,
+            sound_speed_m_s=self._speed_m_s,
+            with_gain=planned.stream == LINEAR,
+        )
+
+    def _grid(
+        self,
+        spectrum: StreamSpectrum,
+        shares: Shares,
+        beam_taps: int,
+        density: float,
+        high_hz: float,
+        limit: float,
+        *,
+        has_gain: bool,
+    ) -> StreamGrid | None:
+        """Return the coarsest beam grid with an error up to ``limit``, or that of ``density``, or None if neither pays.
+
+        The first stream, with an infinite limit, has the given density.
+        """
+        coarser = [each for each in GRID_DENSITIES[beam_taps] if each < density] if limit < math.inf else []
+        for each in (*coarser, density):
+            n_points = self._count(beam_taps, each, high_hz)
+            if not n_points:
+                return None
+            whole, bright, squares = _grid_errors(
+                self._aperture,
+                spectrum,
+                beam_taps,
+                each,
+                high_hz,
+                self._speed_m_s,
+                self._nearest_m,
+                with_gain=has_gain,
+            )
+            # The errors of neighbouring microphones are alike, so that they do not average out without a gain, which
+            # removes their mean, and only partly with it.
+            common = bright / math.sqrt(self._n_mics) if has_gain else bright
+            error = shares.error(whole=whole, varying=bright - common, common=common)
+            if error <= limit or each == density:
+                return StreamGrid(each, n_points, error, squares)
+        return None
+
+    def _missed(self, place: int) -> float:
+        """Return the error power of the image if a power sum is left out."""
+        return self._shares(place).error(whole=1.0, varying=0.0, common=1.0)
+
+    def _count(self, beam_taps: int, density: float, high_hz: float) -> int:
+        if self._aperture.n_axes not in {1, 2}:
+            return 0
+        spacing = self._aperture.spacing(density, high_hz=high_hz, sound_speed_m_s=self._speed_m_s)
+        count = self._aperture.count_grid_points(spacing, beam_taps)
+        return count if count <= _FEW * len(self._aperture.directions) else 0
+
+    def _spectrum_of(self, stream: Stream) -> StreamSpectrum:
+        return spectrum_of_stream(self._spectrum, stream)
+
+    def _delays(
+        self, place: int, n_taps: int, step_s: float, fractions: NDArray[np.float64] | None
+    ) -> tuple[DelayFit, float]:
+        """Return the fit of a stream's delays, and the error power of the image due to it."""
+        bright, whole = self._spectrum_of(self.recipe.streams[place])
+        fit = _fitted(bright, n_taps, step_s, with_gain=self.recipe.streams[place] == LINEAR)
+        if fractions is None:
+            whole_error, varying, common = _fit_errors(fit, whole)
+        else:
+            whole_error = varying = common = float(fit.errors_at(fractions, whole) @ whole.power)
+        return fit, self._shares(place).error(whole=whole_error, varying=varying, common=common)
+
+    def _shares(self, place: int) -> Shares:
+        """Return the shares of a stream, for an image of noise that is half as bright as expected."""
+        n_mics, order = self._n_mics, self.recipe.order
+        weighted, noise_share = self.recipe.total >= 0, self.noise_share
+        if place == self.recipe.total:
+            return Shares(2.0 / n_mics, 1.0 / n_mics, 1.0, noise_share)
+        if place == self.recipe.beam and order > 1:
+            return Shares(4.0 * _CORRELATED / (order + 2), 4.0 / n_mics, 4.0, noise_share)
+        k = place + 1
+        ratio = math.comb(n_mics, order - k) / math.comb(n_mics, order)
+        noise, coherent, common = n_mics / k**2 * ratio, n_mics / k**2 * ratio**2, (n_mics / k * ratio) ** 2
+        if weighted and order == 1:  # the third power of the beam
+            return Shares(3 * noise, 9 * coherent, 9 * common, noise_share)
+        raised = _CORRELATED if weighted and place == 0 else 1
+        return Shares(raised * noise, raised * coherent, raised * common, noise_share)
+
+    @functools.cached_property
+    def noise_share(self) -> float:
+        """Share of noise in the power of the image, from the mean power of Gaussian noise in each image."""
+        n_mics, order = self._n_mics, self.recipe.order
+        suppressed = n_mics * math.gamma(1 + 1 / order) ** order / math.comb(n_mics, order)
+        if self.recipe.total >= 0:
+            suppressed *= (order + 1) * (order + 2) / n_mics**2
+        return _NOISE_RATIO * suppressed / (1 + _NOISE_RATIO * suppressed)
+
+
+@functools.lru_cache(maxsize=_KEPT)
+def _fitted(spectrum: Spectrum, n_taps: int, step_s: float, *, with_gain: bool) -> DelayFit:
+    return DelayFit(n_taps, step_s, spectrum, with_gain=with_gain)
+
+
+@functools.lru_cache(maxsize=_KEPT)
+def _fit_errors(fit: DelayFit, whole: Spectrum) -> tuple[float, float, float]:
+    """Return the error power of a fit for the whole spectrum, and its two parts where the image is bright."""
+    power = fit.spectrum.power
+    error = float(fit.errors_at(fit.fractions, whole) @ whole.power)
+    return error, float(fit.errors @ power), float(fit.biases @ power)
+
+
+@functools.lru_cache(maxsize=_KEPT)
+def _grid_errors(
+    aperture: Aperture,
+    spectrum: StreamSpectrum,
+    n_taps: int,
+    density: float,
+    high_hz: float,
+    sound_speed_m_s: float,
+    nearest_m: float,
+    *,
+    with_gain: bool,
+) -> tuple[float, float, float]:
+    """Return the error power of a beam grid for both spectra, and the sum of its squared weights."""
+    both = np.concatenate([spectrum.bright.frequency_hz, spectrum.whole.frequency_hz])
+    estimate = BeamGrid(
+        aperture,
+        spectrum.bright,
+        n_taps=n_taps,
+        density=density,
+        high_hz=high_hz,
+        sound_speed_m_s=sound_speed_m_s,
+        estimate=True,
+        nearest_m=nearest_m,
+        with_gain=with_gain,
+        judged_hz=both,
+    )
+    n_bright = len(spectrum.bright.power)
+    bright = float(estimate.errors[:n_bright] @ spectrum.bright.power)
+    return float(estimate.errors[n_bright:] @ spectrum.whole.power), bright, estimate.squares

@@ -1,0 +1,138 @@
+"""Adaptive beamformers from streams: kernels, tables, errors and plans."""
+
+import math
+
+import numpy as np
+import pytest
+
+from ertis_numba.kernels import KernelSet
+from ertis_numba.verification import error_db
+from tests.on_device import KERNELS
+
+STREAMS = {
+    # powers, turns, and recipe: number of power sums, order, beam, total
+    "delay_and_sum": ([1.0], [1], (1, 1, -1, -1)),
+    "coherence factor": ([1.0, 2.0], [1, 0], (1, 1, 0, 1)),
+    "dmas 2": ([0.5, 1.0], [1, 2], (2, 2, -1, -1)),
+    "dmas 3 without the last power sum": ([1 / 3, 2 / 3], [1, 2], (2, 3, -1, -1)),
+    "dmas 5 with coherence factor": ([0.2, 0.4, 0.6, 1.0, 2.0], [1, 2, 3, 1, 0], (3, 5, 3, 4)),
+}
+N_MICS, N_PHASES, N_DIRECTIONS, N_PAIRS = 4, 2, 5, 2
+LIMIT = 4000.0
+
+
+@pytest.fixture(params=[name for name, each in KERNELS.items() if each.tile_ranges])
+def kernel_set(request):
+    return KERNELS[request.param]
+
+
+def noise(*shape, seed=1):
+    random = np.random.default_rng(seed)
+    return (random.standard_normal(shape) + 1j * random.standard_normal(shape)).astype(np.complex64)
+
+
+def values(signals, power, turns):
+    level = np.abs(signals.astype(complex))
+    unit = np.divide(signals, level, out=np.zeros(level.shape, complex), where=level > 0)
+    return np.where(level > 0, level**power * unit**turns, 0)
+
+
+def quantised(kernel_set: KernelSet, signals, powers, turns, starts, width, units):
+    tiles = np.full((len(starts), len(powers), *signals.shape[:2], width, 2), 99, dtype=np.int16)
+    scales = np.full((len(starts), len(powers)), 99, dtype=np.float32)
+    limits = np.full(len(powers), LIMIT, dtype=np.float32)
+    kernel_set.quantise_streams(
+        *(signals, starts, limits, np.array(units, np.float32), np.array(powers, np.float32)),
+        *(np.array(turns, np.int32), 0, len(powers), tiles, scales),
+    )
+    return tiles, scales
+
+
+@pytest.mark.parametrize("name", STREAMS)
+def test_quantised_streams_equal_their_definition(kernel_set, name):
+    powers, turns, _ = STREAMS[name]
+    signals = noise(N_MICS, N_PHASES, 150)
+    signals[1, 1, 20:40] = 0
+    starts, width = np.array([0, 96], dtype=np.int32), 100
+    tiles, scales = quantised(kernel_set, signals, powers, turns, starts, width, [1.0] * len(powers))
+    for tile, start in enumerate(starts):
+        part = signals[:, :, start : start + width]
+        for stream, (power, count) in enumerate(zip(powers, turns, strict=True)):
+            wanted = values(part, power, count)
+            found = tiles[tile, stream, :, :, : part.shape[2]] * float(scales[tile, stream])
+            step = np.abs(wanted).max() / LIMIT
+            assert scales[tile, stream] == pytest.approx(step, rel=2e-5)
+            assert np.abs(found[..., 0] + 1j * found[..., 1] - wanted).max() < 0.76 * step
+            assert not tiles[tile, stream, :, :, part.shape[2] :].any()
+
+
+@pytest.mark.parametrize("scale", [0.0, 1e-12, 1e12])
+def test_quantised_streams_keep_any_level(kernel_set, scale):
+    signals, starts = noise(2, 1, 60), np.zeros(1, dtype=np.int32)
+    powers, turns = [1.0, 0.2, 2.0], [1, 1, 0]
+    usual, _ = quantised(kernel_set, signals, powers, turns, starts, 64, [1.0] * 3)
+    tiles, scales = quantised(kernel_set, np.float32(scale) * signals, powers, turns, starts, 64, [2.0] * 3)
+    if scale:
+        assert np.abs(tiles.astype(int) - usual).max() <= 1
+        largest = scale * float(np.abs(signals).max())
+        np.testing.assert_allclose(scales[0], [2 * largest**power / LIMIT for power in powers], rtol=1e-4)
+    else:
+        assert not tiles.any()
+        assert not scales.any()
+
+
+def tables(name, *, grid):
+    """Return random tables of all streams: shapes, offsets, weights, places, tap weights and rows."""
+    random = np.random.default_rng(3)
+    n_streams = len(STREAMS[name][0])
+    n_points = [7 if grid and stream % 2 == 0 else N_DIRECTIONS for stream in range(n_streams)]
+    n_pairs = [N_PAIRS if grid and stream % 2 == 0 else 0 for stream in range(n_streams)]
+    n_terms = [N_MICS * (1 + stream % 2) for stream in range(n_streams)]
+    shapes = np.array(list(zip(n_points, n_terms, n_pairs, strict=True)), dtype=np.int32)
+    entries, pairs = int(np.sum(shapes[:, 0] * shapes[:, 1])), N_DIRECTIONS * sum(n_pairs) + 1
+    mics = np.concatenate([np.resize(np.arange(N_MICS), points * terms) for points, terms, _ in shapes.tolist()])
+    width = 96 + 8
+    offsets = (mics * N_PHASES + random.integers(0, N_PHASES, entries)) * width + random.integers(0, 8, entries)
+    w = random.integers(-100, 100, (2, entries))
+    weights = np.moveaxis(np.array([[w[0], -w[1]], [w[1], w[0]]]), 2, 0).astype(np.int16)
+    places, taps = random.integers(0, 6, pairs).astype(np.int32), random.integers(-9000, 9000, (pairs, 2))
+    rows = random.permutation(N_DIRECTIONS).astype(np.int32)
+    return shapes, offsets.astype(np.int32), np.ascontiguousarray(weights), places, taps.astype(np.int16), rows
+
+
+@pytest.mark.parametrize("grid", [False, True])
+@pytest.mark.parametrize("name", STREAMS)
+def test_combined_streams_equal_those_of_numpy(kernel_set, name, grid):
+    powers, turns, recipe = STREAMS[name]
+    numpy_set = KERNELS["numpy"]
+    starts, width = np.array([0, 96], dtype=np.int32), 104
+    signals = noise(N_MICS, N_PHASES, 250)
+    units = [1e-7 if grid and stream % 2 == 0 else 1e-3 for stream in range(len(powers))]
+    tiles, scales = quantised(numpy_set, signals, powers, turns, starts, width, units)
+    table = tables(name, grid=grid)
+    found, wanted = np.full((2, N_DIRECTIONS, 130), 12_345, dtype=np.float32)
+    for kernels, out in ((kernel_set, found), (numpy_set, wanted)):
+        if kernels.tile_ranges != numpy_set.tile_ranges:
+            pytest.skip("tiles of this processor have another length")
+        kernels.combine_streams_int16(tiles, scales, starts, 130, *table, recipe, out)
+    assert wanted.max() < 12_345
+    assert np.abs(found - wanted).max() < 2e-5 * wanted.max()
+
+
+def test_power_sums_give_the_sum_of_all_products():
+    """Newton's identities of the NumPy twin equal the definition, with every weight 1."""
+    signals, order = noise(N_MICS, 1, 100), 3
+    starts, kernels = np.zeros(1, dtype=np.int32), KERNELS["numpy"]
+    powers, turns = [k / order for k in (1, 2, 3)], [1, 2, 3]
+    tiles, scales = quantised(kernels, signals, powers, turns, starts, 96, [1.0] * 3)
+    shapes = np.array([[1, N_MICS, 0]] * 3, dtype=np.int32)
+    offsets = np.tile(np.arange(N_MICS, dtype=np.int32) * 96, 3)
+    weights = np.tile(np.eye(2, dtype=np.int16), (3 * N_MICS, 1, 1))
+    none = np.zeros(1, dtype=np.int32), np.zeros((1, 2), dtype=np.int16)
+    out = np.empty((1, 96), dtype=np.float32)
+    rows = np.zeros(1, dtype=np.int32)
+    kernels.combine_streams_int16(tiles, scales, starts, 96, shapes, offsets, weights, *none, rows, (3, 3, -1, -1), out)
+    z = values(signals[:, 0, :96], 1 / order, 1)
+    wanted = np.abs(z[0] * z[1] * z[2] + z[0] * z[1] * z[3] + z[0] * z[2] * z[3] + z[1] * z[2] * z[3])
+    assert error_db(out[0], wanted) < -60
+    assert math.comb(N_MICS, order) == 4
