@@ -21,6 +21,7 @@ PLANS = {
     "int16, nodes": ({"precision": "int16", "beam_taps": 4}, {}),
     "near": ({}, {"range_m": (0.3, 1.0)}),  # several focal zones
     **{name: ({}, {"beamformer": name, "directions": "90"}) for name in ADAPTIVE_BEAMFORMERS},
+    "double capon": ({}, {"beamformer": "capon", "diagonal_loading": 1e-5, "directions": "90"}),
     **{f"dmas {order}": ({}, {"beamformer": "dmas", "dmas_order": order}) for order in (2, 3, 5, 8)},
 }
 

@@ -5,7 +5,7 @@ nothing: stages check shapes and bounds when they are created. Arrays are C-cont
 phase, sample; direction, range.
 """
 
-from ertis_numba.kernels._contract.arrays import Complex, Index, Pcm, Real, Short, Taps, Words
+from ertis_numba.kernels._contract.arrays import Complex, ComplexOrDouble, Index, Pcm, Real, Short, Taps, Words
 from ertis_numba.kernels._contract.beams import (
     DelayAndSum,
     DelayAndSumEnvelope,
@@ -29,6 +29,7 @@ from ertis_numba.kernels._contract.signals import (
 __all__ = [
     "AddPaths",
     "Complex",
+    "ComplexOrDouble",
     "Decimate",
     "DelayAndSum",
     "DelayAndSumEnvelope",
