@@ -66,7 +66,7 @@ def all_of(kernel_set, name):
     out = np.full((3, *shape), 1, dtype=np.float32)
     kernel_set.weight_coherence(signals, offsets, weights, out[0])
     kernel_set.combine_dmas(signals, offsets, weights, 2, out[1])
-    kernel_set.combine_capon(signals, offsets, weights, 5, 0.1, out[2])
+    kernel_set.combine_capon(signals, offsets, weights, 5, 1.0, out[2])
     return out
 
 
@@ -100,9 +100,19 @@ def test_dmas_equals_the_sum_of_all_products(kernel_set, name, order):
 def test_capon_equals_its_reference(kernel_set, name, n_snapshots, loading):
     signals, offsets, weights, shape = beam_input(name)
     out = np.full(shape, 12_345, dtype=np.float32)
-    kernel_set.combine_capon(signals, offsets, weights, n_snapshots, loading, out)
+    kernel_set.combine_capon(signals, offsets, weights.astype(np.complex128), n_snapshots, loading, out)
     expected = reference.capon(signals, offsets, weights, n_snapshots, loading, shape[1])
     assert np.abs(out - expected).max() < FLOAT32 * expected.max()
+
+
+@pytest.mark.parametrize("name", sized(["two microphones", "one range"], [*SHAPES][2:]))
+@pytest.mark.parametrize(("n_snapshots", "loading"), [(5, 1.0), (1, 0.1), (8, 0.1), (4, 10.0), (32, 1.0)])
+def test_capon_in_single_precision_equals_its_reference(kernel_set, name, n_snapshots, loading):
+    signals, offsets, weights, shape = beam_input(name)
+    out = np.full(shape, 12_345, dtype=np.float32)
+    kernel_set.combine_capon(signals, offsets, weights, n_snapshots, loading, out)
+    expected = reference.capon(signals, offsets, weights, n_snapshots, loading, shape[1])
+    assert np.abs(out - expected).max() < (FLOAT32 + 3e-7 * offsets.shape[1] / loading) * expected.max()
 
 
 @pytest.mark.parametrize("name", sized(["one range", "just over a tile"], ["two microphones", "prime", "eRTIS"]))
@@ -263,12 +273,12 @@ def test_loud_microphone_does_not_mask_dmas_products_of_others(kernel_set):
 
 
 def test_capon_of_nearly_equal_snapshots_is_accurate(kernel_set):
-    """The covariance of few snapshots is singular, so the denominator loses its digits in single precision."""
+    """The covariance of few snapshots is singular, so its products lose their digits in single precision."""
     loading, random, signals = 1e-6, np.random.default_rng(5), np.ones((16, 5), dtype=np.complex64)
     signals += (3e-4 * random.standard_normal((16, 5))).astype(np.float32)
     covariance = signals.astype(complex) @ signals.astype(complex).conj().T
     assert np.linalg.cond(covariance) > 1e15
-    weights, offsets = np.ones((1, 16), dtype=np.complex64), np.arange(16, dtype=np.int32)[None] * 5
+    weights, offsets = np.ones((1, 16), dtype=np.complex128), np.arange(16, dtype=np.int32)[None] * 5
     expected = reference.capon(signals[:, None], offsets, weights, 5, loading, 5)
     out = np.empty((1, 5), dtype=np.float32)
     kernel_set.combine_capon(signals[:, None], offsets, weights, 5, loading, out)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks
-from ertis_numba.kernels._contract import Complex, Index, Pcm, Real, Short, Taps, Words
+from ertis_numba.kernels._contract import Complex, ComplexOrDouble, Index, Pcm, Real, Short, Taps, Words
 from ertis_numba.kernels._host import HostMemory
 from ertis_numba.kernels._kernel_set import KernelSet
 
@@ -317,7 +317,7 @@ def _level(parts: NDArray[np.int32], scale: np.float32) -> NDArray[np.float32]:
 
 
 def _delayed(
-    signals: Complex, offsets: Index, weights: Complex, n_ranges: int
+    signals: Complex, offsets: Index, weights: ComplexOrDouble, n_ranges: int
 ) -> Iterator[tuple[int, NDArray[np.complex128]]]:
     """Yield each direction with its delayed and weighted signals, (mic, range) complex128."""
     windows = np.lib.stride_tricks.sliding_window_view(signals.reshape(-1), n_ranges)
@@ -346,22 +346,22 @@ def combine_dmas(signals: Complex, offsets: Index, weights: Complex, order: int,
 
 
 def combine_capon(
-    signals: Complex, offsets: Index, weights: Complex, n_snapshots: int, loading: float, out: Real
+    signals: Complex, offsets: Index, weights: ComplexOrDouble, n_snapshots: int, loading: float, out: Real
 ) -> None:
     """See `CombineCapon`; the linear system has the size of the number of snapshots, as in the compiled kernel."""
-    n_mics, n_ranges = offsets.shape[1], out.shape[1]
+    n_ranges = out.shape[1]
     n_snapshots = min(n_snapshots, n_ranges)
     ranges = np.arange(n_ranges)
     first = np.clip(ranges - n_snapshots // 2, 0, n_ranges - n_snapshots)
     for direction, y in _delayed(signals, offsets, weights, n_ranges):
-        samples = y[:, first[:, None] + np.arange(n_snapshots)].transpose(1, 0, 2)  # (range, mic, snapshot)
-        gram = samples.conj().transpose(0, 2, 1) @ samples
-        trace = np.trace(gram, axis1=1, axis2=2).real
-        added = np.where(trace == 0, 1.0, loading * trace / n_mics)
-        beams = samples.conj().sum(axis=1)
-        solved = np.linalg.solve(gram + added[:, None, None] * np.eye(n_snapshots), beams[:, :, None])[:, :, 0]
-        fit = (beams.conj() * solved).sum(axis=1).real
-        out[direction] = np.abs(solved[ranges, ranges - first]) * added / (n_mics - fit)
+        places = first[:, None] + np.arange(n_snapshots)
+        means = y.mean(axis=0)
+        samples = (y - means)[:, places].transpose(1, 0, 2)  # (range, mic, snapshot)
+        power = (np.abs(y) ** 2).mean(axis=0)[places].sum(axis=1)
+        added = np.where(power == 0, 1.0, loading * power)[:, None, None]
+        matrix = samples.conj().transpose(0, 2, 1) @ samples + added * np.eye(n_snapshots)
+        solved = np.linalg.solve(matrix, added * means.conj()[places][:, :, None])[:, :, 0]
+        out[direction] = np.abs(solved[ranges, ranges - first])
 
 
 def add_paths(

@@ -11,6 +11,8 @@ from ertis_numba.settings import Processing
 
 __all__ = ["AdaptiveBeamform"]
 
+_NEGLIGIBLE = 0.01  # share of the budget
+
 
 class AdaptiveBeamform:
     """Adaptive beamformer: amplitude of every direction and range.
@@ -28,6 +30,8 @@ class AdaptiveBeamform:
         Index of each microphone's first sample in a flattened array of (mic, phase, sample).
     weights : (direction, mic) complex64
         Phase of the carrier and calibration; the magnitudes of a direction add up to about 1.
+    budget : float
+        Permitted error power of the image; by default 0, which requires the highest precision of the kernel.
 
     Raises
     ------
@@ -42,17 +46,21 @@ class AdaptiveBeamform:
         memory: Memory,
         offsets: NDArray[np.int32],
         weights: NDArray[np.complex64],
+        *,
+        budget: float = 0.0,
     ) -> None:
         beamformer = BEAMFORMERS[processing.beamformer]
         self._options = beamformer.values(processing)
-        beamformer.check(offsets.shape[1], *self._options)
+        n_mics = offsets.shape[1]
+        beamformer.check(n_mics, *self._options)
         weighting = WEIGHTINGS[processing.weighting]
         self._combine: Any = getattr(kernels, beamformer.kernel) if beamformer.kernel else self._delay_and_sum
         self._weight = getattr(kernels, weighting.kernel) if weighting.kernel else None
         self._kernels = kernels
         self._offsets, self._plain = memory.table(offsets), memory.table(weights)
+        single = beamformer.single_precision(n_mics, *self._options) <= _NEGLIGIBLE * budget
         scaled = beamformer.weights(weights, *self._options) if beamformer.kernel else weights
-        self._weights = memory.table(scaled)
+        self._weights = memory.table(scaled.astype(np.complex64 if single else np.complex128))
 
     def __call__(self, analytic: NDArray[np.complex64], out: NDArray[np.float32]) -> None:
         """Fill ``out``, (direction, range) float32, from ``analytic``, (mic, phase, sample) complex64."""

@@ -134,6 +134,7 @@ class FastChain(KernelChain):
                 memory,
                 table.offsets(window.n_outputs),
                 table.weights.astype(np.complex64),
+                budget=10 ** (plan.max_error_db / 10),
             )
 
     def analytic(self, words: NDArray[np.unsignedinteger[Any]]) -> tuple[NDArray[np.complex64], int]:

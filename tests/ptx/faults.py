@@ -4,7 +4,7 @@ import math
 import re
 
 DOUBLE = {
-    "combine_capon": "equations of nearly dependent snapshots",
+    "combine_capon": "equations of nearly dependent snapshots, with low diagonal loading",
     "add_paths": "delays of thousands of turns, to a millionth of one",
     "modulate_pdm": "bits that are those of the processor",
 }

@@ -35,6 +35,7 @@ PLANS = {
     **{f"streams of dmas {order}": (STREAMS, {"beamformer": "dmas", "dmas_order": order}) for order in (2, 3, 5, 8)},
     "streams of coherence factor": (STREAMS, {"weighting": "coherence_factor"}),
     "streams of both": (STREAMS, {"beamformer": "dmas", "dmas_order": 5, "weighting": "coherence_factor"}),
+    "double capon": ({}, {"beamformer": "capon", "diagonal_loading": 1e-5, "directions": "90"}),
 }
 
 

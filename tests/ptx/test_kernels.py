@@ -1,5 +1,6 @@
 """Every kernel compiled for several GPU generations with the types of the chain, and checked for faults."""
 
+import numpy as np
 import pytest
 
 from ertis_numba.kernels._cuda import compiling
@@ -27,6 +28,16 @@ def test_allowed_faults_are_present(launched):
         assert any(".f64" in compiling.code_of(launch, (9, 0)).ptx for launch in launched[name])
     for name in faults.LIBRARY_CALLS:
         assert any(compiling.code_of(launch, (9, 0)).stack_bytes for launch in launched[name])
+
+
+def test_capon_computes_in_the_precision_of_its_weights(launched):
+    precisions = set()
+    for launch in launched["combine_capon"]:
+        if "beams" in launch.arguments:
+            single = launch.arguments["beams"].dtype == np.float32
+            assert single == (".f64" not in compiling.code_of(launch, (9, 0)).ptx)
+            precisions.add((launch.name, single))
+    assert len(precisions) == 4  # sums and equations, both in single and in double precision
 
 
 @pytest.mark.parametrize("cc", CCS[1:], ids=lambda cc: f"sm_{cc[0]}{cc[1]}")

@@ -5,7 +5,7 @@ nothing: stages check shapes and bounds when they are created. Arrays are C-cont
 phase, sample; direction, range.
 """
 
-from ertis_numba.kernels._contract.arrays import Complex, Index, Pcm, Real, Short, Taps, Words
+from ertis_numba.kernels._contract.arrays import Complex, ComplexOrDouble, Index, Pcm, Real, Short, Taps, Words
 from ertis_numba.kernels._contract.beams import (
     DelayAndSum,
     DelayAndSumEnvelope,
@@ -31,6 +31,7 @@ __all__ = [
     "AddPaths",
     "CombineStreamsInt16",
     "Complex",
+    "ComplexOrDouble",
     "Decimate",
     "DelayAndSum",
     "DelayAndSumEnvelope",

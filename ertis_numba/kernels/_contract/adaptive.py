@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Protocol
 
-from ertis_numba.kernels._contract.arrays import Complex, Index, Real
+from ertis_numba.kernels._contract.arrays import Complex, ComplexOrDouble, Index, Real
 
 __all__ = ["AdaptiveKernels"]
 
@@ -60,8 +60,11 @@ class CombineCapon(Protocol):
 
     Parameters
     ----------
-    signals, offsets, weights
-        As in `DelayAndSum`. Weights of magnitude 1 make ``out`` an amplitude, because w adds up to 1.
+    signals, offsets
+        As in `DelayAndSum`.
+    weights : (direction, mic) complex64 or complex128
+        As in `DelayAndSum`; those of magnitude 1 make ``out`` an amplitude, because w adds up to 1. Their type selects
+        single or double precision. In single precision, the relative error is about 10⁻⁷ M / loading at most.
     n_snapshots : int
         At least 1; a value above the number of ranges means all ranges.
     loading : float
@@ -70,7 +73,7 @@ class CombineCapon(Protocol):
     """
 
     def __call__(
-        self, signals: Complex, offsets: Index, weights: Complex, n_snapshots: int, loading: float, out: Real
+        self, signals: Complex, offsets: Index, weights: ComplexOrDouble, n_snapshots: int, loading: float, out: Real
     ) -> None: ...
 
 

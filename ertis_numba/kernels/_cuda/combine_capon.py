@@ -3,6 +3,7 @@
 
 Each thread handles one window of ranges at a time. Its matrix is in global memory, interleaved with those of the other
 threads. The image is split into groups of directions, so that the memory stays within `_MAX_BYTES` for any image.
+Numbers have the precision of the weights: with those of single precision, no operation is in double precision.
 """
 
 import math
@@ -19,115 +20,143 @@ __all__ = ["combine_capon"]
 _BLOCK = 64
 _MAX_BYTES = 2**25  # for the lags, and the same for the matrices
 _MAX_BLOCKS = 65_535  # limit of the last two axes of a grid
+_NUMBERS = 32  # per thread that seeks the largest
+_23, _EXPONENT, _BIAS = np.uint32(23), np.uint32(255), np.int32(127)
+_LARGEST = np.int32(126)  # exponent whose inverse is the smallest normal number
+_ZERO, _ONE = np.float32(0), np.float32(1)
 
 
 @cuda.jit(cache=True)
-def _sum_lags(signals, offsets, weights, first, n_mics, beams, lags):
+def _clear(exponent):
+    exponent[0] = -_LARGEST
+
+
+@cuda.jit(cache=True)
+def _find_exponent(bits, exponent):
+    """Set ``exponent[0]`` to that of the largest finite number, given as uint32."""
+    largest = -_LARGEST
+    for k in range(cuda.grid(1), bits.size, cuda.gridsize(1)):
+        found = (bits[k] >> _23) & _EXPONENT
+        if found != _EXPONENT:
+            largest = max(largest, np.int32(found) - _BIAS)
+    cuda.atomic.max(exponent, 0, min(largest, _LARGEST))
+
+
+@cuda.jit(device=True)
+def _scale_of(exponent):
+    """Return 2 to the power of ``exponent``, from -126 to 126, as a float32."""
+    return np.uint32((exponent + _BIAS) << np.int32(23)).view(np.float32)
+
+
+@cuda.jit(cache=True)
+def _sum_lags(signals, offsets, weights, exponent, first, n_mics, beams, lags):
     """Fill ``beams[direction, part, r] = Σ y_r`` and ``lags[direction, lag, part, r] = Σ conj(y_r) y_(r + lag)``."""
     r, lag, direction = np.int64(cuda.blockIdx.x * _BLOCK + cuda.threadIdx.x), cuda.blockIdx.y, cuda.blockIdx.z
     if r + lag >= beams.shape[2]:
         return
-    real = imag = beam_real = beam_imag = 0.0
+    scale = _scale_of(-exponent[0])
+    real = imag = beam_real = beam_imag = _ZERO
     for mic in range(n_mics):
         entry = (first + direction) * n_mics + mic
-        w_real, w_imag = np.float64(real_of(weights[entry])), np.float64(imag_of(weights[entry]))
-        x = signals[offsets[entry] + r]
-        x_real, x_imag = np.float64(real_of(x)), np.float64(imag_of(x))
-        y_real, y_imag = x_real * w_real - x_imag * w_imag, x_real * w_imag + x_imag * w_real
-        x = signals[offsets[entry] + r + lag]
-        x_real, x_imag = np.float64(real_of(x)), np.float64(imag_of(x))
-        z_real, z_imag = x_real * w_real - x_imag * w_imag, x_real * w_imag + x_imag * w_real
+        w_real, w_imag = weights[2 * entry], weights[2 * entry + 1]
+        square = w_real * w_real + w_imag * w_imag
+        x, z = signals[offsets[entry] + r], signals[offsets[entry] + r + lag]
+        x_real, x_imag = real_of(x) * scale, imag_of(x) * scale
+        z_real, z_imag = real_of(z) * scale, imag_of(z) * scale
+        y_real, y_imag = x_real * square, x_imag * square
         real += y_real * z_real + y_imag * z_imag
         imag += y_real * z_imag - y_imag * z_real
-        beam_real += y_real
-        beam_imag += y_imag
+        beam_real += x_real * w_real - x_imag * w_imag
+        beam_imag += x_real * w_imag + x_imag * w_real
     lags[direction, lag, 0, r], lags[direction, lag, 1, r] = real, imag
     if lag == 0:
         beams[direction, 0, r], beams[direction, 1, r] = beam_real, beam_imag
 
 
 @cuda.jit(device=True)
-def _factor(lags, direction, first, epsilon, column, thread):
-    """Fill the lower triangle of ``column[i, j, part, thread]`` with L D of ``B = L D Lᴴ``; its diagonal is 1 / D."""
+def _eliminate(beams, lags, direction, first, centre, epsilon, share, column, thread):
+    """Return the magnitude of the solution of ``(ε I + D) t = s`` at range ``centre`` of a window.
+
+    ``column[i, j, part, thread]`` holds L D of ``ε I + D = L D Lᴴ`` below the diagonal, ``L⁻¹ s`` on it, and the
+    inverse of D in its last column.
+    """
     n_snapshots = column.shape[0]
+    last = n_snapshots - 1
+    real = imag = inverse = _ZERO
     for j in range(n_snapshots):
-        for i in range(j, n_snapshots):  # the conjugate of B_ji, which is lag i − j at sample j
-            real = lags[direction, i - j, 0, first + j]
-            imag = -lags[direction, i - j, 1, first + j]
+        p = centre if j == last else j + (j >= centre)
+        for i in range(j, n_snapshots):
+            q = centre if i == last else i + (i >= centre)
+            low, high = first + min(p, q), first + max(p, q)
+            x_real, x_imag = beams[direction, 0, low] * share, beams[direction, 1, low] * share
+            y_real, y_imag = beams[direction, 0, high], beams[direction, 1, high]
+            real = lags[direction, high - low, 0, low] - (x_real * y_real + x_imag * y_imag)
+            imag = lags[direction, high - low, 1, low] - (x_real * y_imag - x_imag * y_real)
+            if q < p:
+                imag = -imag
             for k in range(j):
-                inverse = column[k, k, 0, thread]
+                inverse = column[k, n_snapshots, 0, thread]
                 a_real, a_imag = column[i, k, 0, thread], column[i, k, 1, thread]
                 b_real, b_imag = column[j, k, 0, thread] * inverse, column[j, k, 1, thread] * inverse
                 real -= a_real * b_real + a_imag * b_imag
                 imag -= a_imag * b_real - a_real * b_imag
-            column[i, j, 0, thread], column[i, j, 1, thread] = real, imag
-        column[j, j, 0, thread] = 1.0 / (column[j, j, 0, thread] + epsilon)
-
-
-@cuda.jit(device=True)
-def _solve(beams, direction, first, column, t, thread):
-    """Fill ``t[i, part, thread]`` with ``B⁻¹ s`` and return ``sᴴ t``."""
-    n_snapshots = column.shape[0]
-    fit = 0.0
-    for i in range(n_snapshots):  # s is the conjugate of the beams
-        real, imag = beams[direction, 0, first + i], -beams[direction, 1, first + i]
-        for k in range(i):
-            inverse = column[k, k, 0, thread]
-            a_real, a_imag = column[i, k, 0, thread] * inverse, column[i, k, 1, thread] * inverse
-            b_real, b_imag = t[k, 0, thread], t[k, 1, thread]
+            if i == j:
+                column[j, n_snapshots, 0, thread] = _ONE / (real + epsilon)
+            else:
+                column[i, j, 0, thread], column[i, j, 1, thread] = real, imag
+        real, imag = beams[direction, 0, first + p], beams[direction, 1, first + p]
+        for k in range(j):
+            inverse = column[k, n_snapshots, 0, thread]
+            a_real, a_imag = column[j, k, 0, thread] * inverse, column[j, k, 1, thread] * inverse
+            b_real, b_imag = column[k, k, 0, thread], column[k, k, 1, thread]
             real -= a_real * b_real - a_imag * b_imag
             imag -= a_real * b_imag + a_imag * b_real
-        t[i, 0, thread], t[i, 1, thread] = real, imag
-        fit += (real * real + imag * imag) * column[i, i, 0, thread]
-    for i in range(n_snapshots - 1, -1, -1):
-        real, imag = t[i, 0, thread], t[i, 1, thread]
-        for k in range(i + 1, n_snapshots):
-            a_real, a_imag = column[k, i, 0, thread], column[k, i, 1, thread]
-            b_real, b_imag = t[k, 0, thread], t[k, 1, thread]
-            real -= a_real * b_real + a_imag * b_imag
-            imag -= a_real * b_imag - a_imag * b_real
-        inverse = column[i, i, 0, thread]
-        t[i, 0, thread], t[i, 1, thread] = real * inverse, imag * inverse
-    return fit
+        column[j, j, 0, thread], column[j, j, 1, thread] = real, imag
+    return math.sqrt(real * real + imag * imag) * column[last, n_snapshots, 0, thread]
 
 
 @cuda.jit(cache=True)
-def _combine(beams, lags, loading, n_mics, column, t, first, n_directions, out):
+def _combine(beams, lags, exponent, loading, share, column, first, n_directions, out):
     n_snapshots = column.shape[0]
     n_windows, middle = out.shape[1] - n_snapshots + 1, n_snapshots // 2
     thread = cuda.grid(1)
+    unit = share * _scale_of(exponent[0])
     for item in range(thread, n_directions * n_windows, column.shape[3]):
         direction, window = item // n_windows, item % n_windows
-        trace = 0.0
+        trace = _ZERO
         for k in range(window, window + n_snapshots):
             trace += lags[direction, 0, 0, k]
         # Without any power, every loading yields 0.
-        epsilon = loading * trace / n_mics if trace != 0.0 else 1.0
-        _factor(lags, direction, window, epsilon, column, thread)
-        scale = epsilon / (n_mics - _solve(beams, direction, window, column, t, thread))
+        epsilon = loading * trace if trace != _ZERO else loading
         # A window yields the range in its middle; the outermost two also yield those towards the ends.
         begin = 0 if window == 0 else middle
         end = n_snapshots if window == n_windows - 1 else middle + 1
         for c in range(begin, end):
-            x, y = t[c, 0, thread], t[c, 1, thread]
-            out[first + direction, window + c] = np.float32(scale * math.sqrt(x * x + y * y))
+            solved = _eliminate(beams, lags, direction, window, c, epsilon, share, column, thread)
+            out[first + direction, window + c] = epsilon * solved * unit
 
 
 def combine_capon(signals, offsets, weights, n_snapshots, loading, out):
     """Combine the microphones with the Capon (minimum-variance distortionless response) weights."""
     (n_directions, n_mics), n_ranges = offsets.shape, out.shape[1]
     n_snapshots = min(n_snapshots, n_ranges)
-    of_direction, of_thread = 16 * n_ranges * (n_snapshots + 1), 16 * n_snapshots * (n_snapshots + 1)
+    real = np.float32 if weights.dtype == np.complex64 else np.float64
+    n_bytes = 2 * np.dtype(real).itemsize
+    of_direction, of_thread = n_bytes * n_ranges * (n_snapshots + 1), n_bytes * n_snapshots * (n_snapshots + 1)
     group = max(1, min(_MAX_BYTES // of_direction, n_directions, _MAX_BLOCKS))
     n_windows = group * (n_ranges - n_snapshots + 1)
     n_blocks = -(-min(_MAX_BYTES // of_thread, n_windows) // _BLOCK)
-    beams = workspace("capon's beams", (group, 2, n_ranges), np.float64)
-    lags = workspace("capon's lags", (group, n_snapshots, 2, n_ranges), np.float64)
-    column = workspace("capon's matrices", (n_snapshots, n_snapshots, 2, n_blocks * _BLOCK), np.float64)
-    t = workspace("capon's solutions", (n_snapshots, 2, n_blocks * _BLOCK), np.float64)
-    tables = complexes(signals), offsets.reshape(-1), complexes(weights)
+    beams = workspace("capon's beams", (group, 2, n_ranges), real)
+    lags = workspace("capon's lags", (group, n_snapshots, 2, n_ranges), real)
+    column = workspace("capon's matrices", (n_snapshots, n_snapshots + 1, 2, n_blocks * _BLOCK), real)
+    exponent = workspace("capon's exponent", (1,), np.int32)
+    tables = complexes(signals), offsets.reshape(-1), weights.reshape(-1).view(real)
+    share, loading = real(1 / n_mics), real(loading / n_mics)
+    launch(_clear, (1,), (1,), exponent)
+    bits = signals.reshape(-1).view(np.uint32)
+    launch(_find_exponent, (-(-bits.size // (_BLOCK * _NUMBERS)),), (_BLOCK,), bits, exponent)
     for first in range(0, n_directions, group):
         count = min(group, n_directions - first)
         grid = -(-n_ranges // _BLOCK), n_snapshots, count
-        launch(_sum_lags, grid, (_BLOCK,), *tables, first, n_mics, beams, lags)
-        launch(_combine, (n_blocks,), (_BLOCK,), beams, lags, loading, n_mics, column, t, first, count, out)
+        launch(_sum_lags, grid, (_BLOCK,), *tables, exponent, first, n_mics, beams, lags)
+        launch(_combine, (n_blocks,), (_BLOCK,), beams, lags, exponent, loading, share, column, first, count, out)
