@@ -12,6 +12,11 @@ from ertis_numba.stages import costs
 from tests.cases import SHORT, noise
 
 CPU = kernels.load("cpu")
+WORK = {
+    "n_mics": 32, "n_words": 1, "n_samples": 5000, "n_taps": 101, "tap_bits": 16, "n_fft": 6000, "n_bins": 800,
+    "n_phases": 2, "n_outputs": 1500, "n_directions": 500, "n_ranges": 1200, "n_computed": 1248, "n_beams": 300,
+    "n_terms": 64, "n_pairs": 8, "precision": "float32",
+}  # fmt: skip
 
 
 @pytest.fixture
@@ -138,13 +143,15 @@ def test_costs_work_when_a_folder_blocks_the_cache_file():
 
 def test_predicted_time_grows_with_work():
     found = costs.measured_costs(CPU, 1)
-    work = {
-        "n_mics": 32, "n_words": 1, "n_samples": 5000, "n_taps": 101, "tap_bits": 16, "n_fft": 6000, "n_bins": 800,
-        "n_phases": 2, "n_outputs": 1500, "n_directions": 500, "n_ranges": 1200, "n_computed": 1248, "n_beams": 300,
-        "n_terms": 64, "n_pairs": 8, "precision": "float32",
-    }  # fmt: skip
-    usual_ms = sum(found.stages_ms(costs.Work(**work)).values())
+    usual_ms = sum(found.stages_ms(costs.Work(**WORK)).values())
     assert usual_ms > 0
-    for name in work.keys() - {"precision", "tap_bits"}:
-        more = work | {name: 2 * work[name]}
+    for name in WORK.keys() - {"precision", "tap_bits"}:
+        more = WORK | {name: 2 * WORK[name]}
         assert sum(found.stages_ms(costs.Work(**more)).values()) > usual_ms, name
+
+
+def test_many_phases_of_many_microphones_cost_more():
+    """Their samples exceed every cache, although each image point has as many terms as with few phases."""
+    plans = {n: costs.Work(**WORK | {"n_mics": 1024, "n_terms": 1024, "n_phases": n}) for n in (2, 8, 32)}
+    sums_ms = [costs.nominal_costs(CPU).stages_ms(plan)["sums"] for plan in plans.values()]
+    assert sums_ms[0] < sums_ms[1] < sums_ms[2]

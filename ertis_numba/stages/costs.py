@@ -134,7 +134,10 @@ class Costs:
         # The samples of a tile fit into the first cache level with few phases, and not even into the second with many.
         # More phases never count as cheaper, even if they were measured to be.
         terms = np.maximum.accumulate([unit[f"sum_{work.precision}_{name}"] for name in _PHASES])
-        term = float(np.interp(math.log2(rows / _MICS), np.log2(list(_PHASES.values())), terms))
+        octaves, known = math.log2(rows / _MICS), np.log2(list(_PHASES.values()))
+        # Beyond the largest measured number, as with a thousand microphones, the cost continues to rise.
+        rise = (terms[-1] - terms[-2]) / (known[-1] - known[-2])
+        term = float(np.interp(octaves, known, terms) + rise * max(0.0, octaves - known[-1]))
         points = work.n_directions * work.n_ranges
         quantised = rows * (1 + _BEYOND) * work.n_computed if work.precision == "int16" else 0.0
         seconds = {

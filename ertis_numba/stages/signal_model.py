@@ -176,7 +176,11 @@ def _noise(words: NDArray[Any], settings: Settings, kernels: KernelSet) -> NDArr
         part = words[first * segment : min(first + _SEGMENTS, n_segments) * segment]
         signals = np.empty((len(channels), len(part)), dtype=np.float32)
         if settings.recording.is_pdm:
-            kernels.unpack_bits(part, channels, signals)
+            octets = np.ascontiguousarray(part).view(np.uint8)  # Loading a kernel would take longer.
+            for signal, channel in zip(signals, channels, strict=True):
+                signal[:] = octets[:, channel // 8] >> np.uint8(channel % 8) & np.uint8(1)
+            signals *= 2
+            signals -= 1
         else:
             scale = np.float32(1 / settings.recording.full_scale)
             kernels.unpack_pcm(part, channels, scale, np.float32(0), 0, signals)
