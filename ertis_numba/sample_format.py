@@ -32,7 +32,7 @@ class SampleFormat(NamedTuple):
     @property
     def n_bytes(self) -> int:
         """Size of a measurement in bytes."""
-        return int(np.prod(self.shape)) * self.dtype.itemsize
+        return math.prod(self.shape) * self.dtype.itemsize
 
     @property
     def shape_2d(self) -> tuple[int, int]:

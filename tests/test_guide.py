@@ -41,6 +41,7 @@ RUN_BY = {
     ("concepts", "python"): ["test_guide::test_code_of_the_concepts_page_runs"],
     ("cuda", "$"): ["test_guide::test_commands_of_the_gpu_page_run"],
     ("cuda", "python"): ["test_guide::test_code_of_the_gpu_page_runs"],
+    ("devices", "python"): ["test_word_stream::test_code_of_the_page_on_sensors_runs"],
     ("devices", "$"): ["test_readme::test_commands_of_the_devices_page_run"],
     ("export", "$"): ["test_export::test_export_page_commands_and_code_run"],
     ("export", "python"): ["test_export::test_export_page_commands_and_code_run"],

@@ -1,6 +1,7 @@
 """Demodulation of words while they arrive: always the image of the whole measurement."""
 
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from ertis_numba.devices.blocks import Instant, encode_block
 from ertis_numba.devices.protocol import BlockReceiver
 from ertis_numba.errors import ArgumentError
 from ertis_numba.settings import Processing, Recording
+from tests.pages import python_in
 
 N_SAMPLES = 32_768
 SETTINGS = ertis.Settings(
@@ -152,6 +154,18 @@ def test_stream_of_another_pipeline_is_refused(pipeline):
         pytest.raises(ArgumentError, match="another pipeline; create it with the method stream"),
     ):
         image_of(pipeline, words_of(1), other.stream())
+
+
+def test_code_of_the_page_on_sensors_runs(pipeline, tmp_path, monkeypatch):
+    monkeypatch.setenv("ERTIS_EMULATED_DIR", str(tmp_path))
+    page = Path(__file__).parents[1] / "docs" / "how-to" / "devices.md"
+    (code,) = python_in(page.read_text("utf-8"))
+    words = words_of(13)
+    with ertis.Emulator([words], name="front") as device:
+        names = {"ertis": ertis, "port": device.port, "settings": SETTINGS}
+        exec(compile(code, str(page), "exec"), names)
+    np.testing.assert_array_equal(names["block"].data, words)
+    np.testing.assert_array_equal(names["image"].amplitude, image_of(pipeline, words))
 
 
 class Collected:
