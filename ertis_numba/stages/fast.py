@@ -195,7 +195,7 @@ class _Streams:
         taps, density = plan.beam_taps or 0, plan.beam_density or 2.0
         self._recipe, self._aperture, self._speed_m_s = recipe, aperture, speed_m_s
         self._planned = planner.plan(plan.oversampling or 1, plan.delay_taps or 1, taps, density)
-        self._grids = [planner.beam_grid(each, taps) for each in self._planned.streams]
+        self._grids = [planner.beam_grid(each) for each in self._planned.streams]
         grids = (grid.rows for grid in self._grids if grid is not None)
         self._rows = next(grids, np.arange(len(aperture.directions), dtype=np.int32))
         ordered = aperture.directions[self._rows]

@@ -177,7 +177,7 @@ class PlanModel:
         linear = Sensitivity.of(self.settings.processing, self.n_mics).linear
         _, filter_error = self.filter(plan.stopband_attenuation_db)
         parts = dict.fromkeys(PARTS, 0.0)
-        parts["filter"], parts["arithmetic"] = filter_error * self.noise_part, self.errors.arithmetic()
+        parts["filter"], parts["arithmetic"] = filter_error, self.errors.arithmetic()
         if self.settings.processing.wavefront == "spherical":
             parts["zones"] = self.zone_error(plan.focal_zones)
         amplified = 1.0
@@ -199,12 +199,6 @@ class PlanModel:
         parts["delays"] = planned.delays * amplified / linear
         return parts
 
-    @functools.cached_property
-    def noise_part(self) -> float:
-        """Effect of noise on an image computed from streams, relative to an image of noise only."""
-        assert self._stream_planner is not None  # noqa: S101
-        return min(1.0, self._stream_planner.noise_share + 1 / self.n_mics)
-
     def _made_streams(self, plan: ImagePlan) -> PlannedStreams:
         assert self._stream_planner is not None  # noqa: S101
         step_s = 1 / (self.settings.output_rate_hz * plan.n_phases)
@@ -225,7 +219,7 @@ class PlanModel:
             n_beams = sum(
                 (each.grid.n_points if each.grid else self.n_directions) * each.fit.n_taps for each in streams
             )
-            n_pairs = sum(plan.beam_taps**self.aperture.n_axes // 2 for each in streams if each.grid)
+            n_pairs = sum(each.grid.n_pairs for each in streams if each.grid)
         taps, _ = self.filter(plan.stopband_attenuation_db)
         tile = self._tile_ranges if plan.precision == "int16" else FEWEST_RANGES
         return Work(

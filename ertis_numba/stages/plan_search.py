@@ -65,7 +65,7 @@ def _open_streams(model: PlanModel, budget: float, *, has_int16: bool) -> list[I
     complete = _may_be_plain(given) and None not in {given.oversampling, given.delay_taps, given.beam_taps}
     if not (model.has_streams and has_int16) or given.precision == "float32" or complete:
         return []
-    zones, stop_bands_db = _zone_count(model, budget), _stop_bands_db(model, budget / model.noise_part)
+    zones, stop_bands_db = _zone_count(model, budget), _stop_bands_db(model, budget)
     found: list[ImagePlan] = []
     for n_taps in _STREAM_TAPS if given.delay_taps is None else (given.delay_taps,):
         phases = _PHASES if given.oversampling is None else (given.oversampling,)

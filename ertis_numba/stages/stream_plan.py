@@ -49,7 +49,6 @@ LINEAR: Final = Stream(1.0, 1)
 """Stream of the signals themselves, to which a filter can apply gains."""
 
 _SMALL: Final = 1.0  # Error that another stream may add, relative to that of the first stream.
-_FEW: Final = 0.6  # A grid with more points than this share of the directions is not worth its interpolation.
 GRID_DENSITIES: Final = {
     2: (1.5, 2.0, 2.5, 3.0, 4.0),
     4: (1.25, 1.5, 1.75, 2.0, 2.5, 3.0),
@@ -132,9 +131,7 @@ class Shares(NamedTuple):
         varying, common : float
             Error power where the image is bright: the part that differs between microphones, and the rest.
         """
-        return _UNLIKE * (
-            self.coherent * varying + _PEAKED * self.common * common + self.noise_share * self.noise * whole
-        )
+        return _UNLIKE * (self.coherent * varying + self.common * common + self.noise_share * self.noise * whole)
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,16 +140,20 @@ class StreamGrid:
 
     Attributes
     ----------
+    n_taps : int
     density : float
-    n_points : int
+    n_points, n_pairs : int
+        Points of the grid, and pairs of points for each direction.
     error : float
         Error power of the image.
     squares : float
         Sum of a beam's squared weights.
     """
 
+    n_taps: int
     density: float
     n_points: int
+    n_pairs: int
     error: float
     squares: float
 
@@ -262,21 +263,25 @@ class StreamPlanner:
             high_hz = highest_hz(self._call.low_frequency_hz, self._call.high_frequency_hz, stream)
             spectrum, shares = self._spectrum_of(stream), self._shares(place)
             grid = None
-            if beam_taps:
-                limit = math.inf if place == 0 else _SMALL * (first + first_grid) if streams[0].grid else 0.0
-                grid = self._grid(spectrum, shares, beam_taps, density, high_hz, limit, has_gain=stream == LINEAR)
+            if beam_taps and self._aperture.n_axes in {1, 2}:
+                limit = math.inf if place == 0 else _SMALL * (first + first_grid)
+                grid = self._grid(
+                    *(spectrum, shares, beam_taps, density, high_hz, limit),
+                    n_delay_taps=fit.n_taps,
+                    has_gain=stream == LINEAR,
+                )
             first_grid = grid.error if place == 0 and grid else first_grid
             streams.append(PlannedStream(stream, spectrum, fit, high_hz, grid, shares))
         return PlannedStreams(streams, n_powers, error)
 
-    def beam_grid(self, planned: PlannedStream, beam_taps: int) -> BeamGrid | None:
+    def beam_grid(self, planned: PlannedStream) -> BeamGrid | None:
         """Return the beam grid of a stream."""
         if planned.grid is None:
             return None
         return BeamGrid(
             self._aperture,
             planned.spectrum.bright,
-            n_taps=beam_taps,
+            n_taps=planned.grid.n_taps,
             density=planned.grid.density,
             high_hz=planned.high_hz,
             sound_speed_m_s=self._speed_m_s,
@@ -292,45 +297,52 @@ class StreamPlanner:
         high_hz: float,
         limit: float,
         *,
+        n_delay_taps: int,
         has_gain: bool,
     ) -> StreamGrid | None:
-        """Return the coarsest beam grid with an error up to ``limit``, or that of ``density``, or None if neither pays.
+        """Return the cheapest beam grid with an error up to ``limit``; None if direct sums are cheaper.
 
-        The first stream, with an infinite limit, has the given density.
+        It has at most the taps and the density of the plan. The first stream, with an infinite limit, has exactly
+        these.
         """
-        coarser = [each for each in GRID_DENSITIES[beam_taps] if each < density] if limit < math.inf else []
-        for each in (*coarser, density):
-            n_points = self._count(beam_taps, each, high_hz)
-            if not n_points:
+        open_grids = [(beam_taps, density)]
+        if limit < math.inf:
+            open_grids = [
+                (n_taps, each)
+                for n_taps in GRID_DENSITIES
+                for each in (*(some for some in GRID_DENSITIES[n_taps] if some < density), density)
+                if n_taps <= beam_taps
+            ]
+        counted = [(n_taps, each, self._count(n_taps, each, high_hz)) for n_taps, each in open_grids]
+        for n_taps, each, n_points in sorted(counted, key=lambda grid: self._terms(grid[0], grid[2], n_delay_taps)):
+            if self._terms(n_taps, n_points, n_delay_taps) >= self._terms(0, 0, n_delay_taps):
                 return None
             whole, bright, squares = _grid_errors(
-                self._aperture,
-                spectrum,
-                beam_taps,
-                each,
-                high_hz,
-                self._speed_m_s,
-                self._nearest_m,
-                with_gain=has_gain,
+                *(self._aperture, spectrum, n_taps, each, high_hz, self._speed_m_s, self._nearest_m), with_gain=has_gain
             )
             # The errors of neighbouring microphones are alike, so that they do not average out without a gain, which
             # removes their mean, and only partly with it.
-            common = bright / math.sqrt(self._n_mics) if has_gain else bright
+            common = bright * min(1.0, _PEAKED / math.sqrt(self._n_mics)) if has_gain else bright
             error = shares.error(whole=whole, varying=bright - common, common=common)
-            if error <= limit or each == density:
-                return StreamGrid(each, n_points, error, squares)
+            if error <= limit:
+                n_pairs = n_taps**self._aperture.n_axes // 2
+                return StreamGrid(n_taps, each, n_points, n_pairs, error, squares)
         return None
+
+    def _terms(self, beam_taps: int, n_points: int, n_delay_taps: int) -> int:
+        """Return the number of terms at each range, with a beam grid or with 0 taps; pairs count as terms."""
+        n_directions, n_terms = len(self._aperture.directions), self._n_mics * n_delay_taps
+        if not beam_taps:
+            return n_directions * n_terms
+        return n_points * n_terms + n_directions * beam_taps**self._aperture.n_axes // 2
 
     def _missed(self, place: int) -> float:
         """Return the error power of the image if a power sum is left out."""
         return self._shares(place).error(whole=1.0, varying=0.0, common=1.0)
 
     def _count(self, beam_taps: int, density: float, high_hz: float) -> int:
-        if self._aperture.n_axes not in {1, 2}:
-            return 0
         spacing = self._aperture.spacing(density, high_hz=high_hz, sound_speed_m_s=self._speed_m_s)
-        count = self._aperture.count_grid_points(spacing, beam_taps)
-        return count if count <= _FEW * len(self._aperture.directions) else 0
+        return self._aperture.count_grid_points(spacing, beam_taps)
 
     def _spectrum_of(self, stream: Stream) -> StreamSpectrum:
         return spectrum_of_stream(self._spectrum, stream)
@@ -345,12 +357,12 @@ class StreamPlanner:
             whole_error, varying, common = _fit_errors(fit, whole)
         else:
             whole_error = varying = common = float(fit.errors_at(fractions, whole) @ whole.power)
-        return fit, self._shares(place).error(whole=whole_error, varying=varying, common=common)
+        return fit, self._shares(place).error(whole=whole_error, varying=varying, common=_PEAKED * common)
 
     def _shares(self, place: int) -> Shares:
         """Return the shares of a stream, for an image of noise that is half as bright as expected."""
         n_mics, order = self._n_mics, self.recipe.order
-        weighted, noise_share = self.recipe.total >= 0, self.noise_share
+        weighted, noise_share = self.recipe.total >= 0, self._noise_share
         if place == self.recipe.total:
             return Shares(2.0 / n_mics, 1.0 / n_mics, 1.0, noise_share)
         if place == self.recipe.beam and order > 1:
@@ -364,7 +376,7 @@ class StreamPlanner:
         return Shares(raised * noise, raised * coherent, raised * common, noise_share)
 
     @functools.cached_property
-    def noise_share(self) -> float:
+    def _noise_share(self) -> float:
         """Share of noise in the power of the image, from the mean power of Gaussian noise in each image."""
         n_mics, order = self._n_mics, self.recipe.order
         suppressed = n_mics * math.gamma(1 + 1 / order) ** order / math.comb(n_mics, order)

@@ -62,6 +62,7 @@ def _factor(coherent, whole):
 @functools.cache
 def _kernel_of(n_powers, order, beam, total):
     """Return the kernel that combines the sums of a recipe."""
+    size = order + 1  # a constant of the compiler
 
     @cuda.jit(cache=True)
     def combine(sums, starts, stop, n_mics, rows, out):
@@ -75,10 +76,10 @@ def _kernel_of(n_powers, order, beam, total):
             return
         at = tile * np.uint64(TILE_RANGES) + np.uint64(k)
         # Power sums and elementary symmetric polynomials.
-        p_real = cuda.local.array(order + 1, np.float32)
-        p_imag = cuda.local.array(order + 1, np.float32)
-        real = cuda.local.array(order + 1, np.float32)
-        imag = cuda.local.array(order + 1, np.float32)
+        p_real = cuda.local.array(size, np.float32)
+        p_imag = cuda.local.array(size, np.float32)
+        real = cuda.local.array(size, np.float32)
+        imag = cuda.local.array(size, np.float32)
         real[0], imag[0] = np.float32(1), np.float32(0)
         for i in range(1, order + 1):
             p_real[i] = p_imag[i] = np.float32(0)
