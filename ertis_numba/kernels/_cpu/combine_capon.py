@@ -14,6 +14,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
+from ertis_numba.kernels._cpu.unrolled import solve_unrolled
 from ertis_numba.kernels._cpu.vectors import (
     REGISTER_BYTES,
     add_product,
@@ -33,7 +34,7 @@ _BEYOND = (
     64  # samples that are read beyond a tile, at most: lags up to those of the last group, and the rest of a vector
 )
 _PAIR = 2  # registers of each vector of equations: work on one fills the wait for the other
-_USUAL = 5  # number of snapshots that is compiled as a constant, so that LLVM unrolls the loops over them
+_USUAL = 5  # snapshots: the default, whose equations are compiled without loops
 
 
 @njit(nogil=True, cache=True)
@@ -121,7 +122,7 @@ def _subtract_mean(beams, n_mics, n_snapshots, width, power, lags):
             _store(real, imag, lags, place, width)
 
 
-@njit(inline="always")
+@njit(nogil=True, cache=True)
 def _solve(beams, power, lags, width, begin, end, centre, n_snapshots, loading, matrix, levels):
     """Set the levels at range ``centre`` of the windows from ``begin`` to ``end``.
 
@@ -170,13 +171,9 @@ def _solve(beams, power, lags, width, begin, end, centre, n_snapshots, loading, 
 
 
 @njit(nogil=True, cache=True)
-def _solve_usual(beams, power, lags, width, begin, end, centre, loading, matrix, levels):
-    _solve(beams, power, lags, width, begin, end, centre, _USUAL, loading, matrix, levels)
-
-
-@njit(nogil=True, cache=True)
-def _solve_any(beams, power, lags, width, begin, end, centre, n_snapshots, loading, matrix, levels):
-    _solve(beams, power, lags, width, begin, end, centre, n_snapshots, loading, matrix, levels)
+def _solve_usual(beams, power, lags, width, count, loading, levels):
+    for first in range(0, count, REGISTER_BYTES // lags.itemsize):
+        solve_unrolled(beams, power, lags, width, first, loading, levels, first, _USUAL)
 
 
 @njit(nogil=True, cache=True)
@@ -209,19 +206,19 @@ def _combine(planes, offsets, table, n_snapshots, loading, unit, out):
                     _sum_products(planes, offsets[direction], table[direction], first, width, group, beams, lags)
                 _subtract_mean(beams, n_mics, n_snapshots, width, power, lags)
                 if n_snapshots == _USUAL:
-                    _solve_usual(beams, power, lags, width, 0, count, middle, loading, matrix, levels)
+                    _solve_usual(beams, power, lags, width, count, loading, levels)
                 else:
-                    _solve_any(beams, power, lags, width, 0, count, middle, n_snapshots, loading, matrix, levels)
+                    _solve(beams, power, lags, width, 0, count, middle, n_snapshots, loading, matrix, levels)
                 _write(levels, width, count, unit, row[first + middle :])
                 # The outermost windows also yield the ranges towards the ends.
                 if first == 0:
                     for k in range(middle):
-                        _solve_any(beams, power, lags, width, 0, 1, k, n_snapshots, loading, matrix, levels)
+                        _solve(beams, power, lags, width, 0, 1, k, n_snapshots, loading, matrix, levels)
                         _write(levels, width, 1, unit, row[k:])
                 if first + count == n_windows:
                     for k in range(middle + 1, n_snapshots):
                         last = count - 1
-                        _solve_any(beams, power, lags, width, last, count, k, n_snapshots, loading, matrix, levels)
+                        _solve(beams, power, lags, width, last, count, k, n_snapshots, loading, matrix, levels)
                         _write(levels, width, 1, unit, row[first + last + k :])
 
 

@@ -14,7 +14,18 @@ from numba.extending import intrinsic, models, overload, register_model
 
 from ertis_numba.kernels._cpu.features import target_features
 
-__all__ = ["REGISTER_BYTES", "add_product", "load", "splat", "store", "subtract_product", "where_zero"]
+__all__ = [
+    "REGISTER_BYTES",
+    "Vector",
+    "add_product",
+    "fused",
+    "ir_type",
+    "load",
+    "splat",
+    "store",
+    "subtract_product",
+    "where_zero",
+]
 
 REGISTER_BYTES = 64 if "avx512f" in target_features() else 32
 
@@ -27,14 +38,15 @@ class Vector(types.Type):
         super().__init__(name=f"Vector({dtype}, {self.count})")
 
 
-def _ir_type(vector):
+def ir_type(vector):
+    """Return the LLVM type of a `Vector`."""
     return ir.VectorType(ir.FloatType() if vector.dtype == types.float32 else ir.DoubleType(), vector.count)
 
 
 @register_model(Vector)
 class _VectorModel(models.PrimitiveModel):
     def __init__(self, manager, vector):
-        super().__init__(manager, vector, _ir_type(vector))
+        super().__init__(manager, vector, ir_type(vector))
 
 
 def _add_operator(function, instruction):
@@ -63,7 +75,7 @@ for _function, _instruction in (
     _add_operator(_function, _instruction)
 
 
-def _fused(builder, a, b, c):
+def fused(builder, a, b, c):
     """Return ``a · b + c``, rounded once if the processor can."""
     name = f"llvm.fmuladd.v{a.type.count}f{32 if a.type.element == ir.FloatType() else 64}"
     function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(a.type, [a.type] * 3), name)
@@ -76,7 +88,7 @@ def add_product(typing_context, total, a, b):
 
     def codegen(context, builder, signature, arguments):
         total, a, b = arguments
-        return _fused(builder, a, b, total)
+        return fused(builder, a, b, total)
 
     return total(total, a, b), codegen
 
@@ -87,7 +99,7 @@ def subtract_product(typing_context, total, a, b):
 
     def codegen(context, builder, signature, arguments):
         total, a, b = arguments
-        return _fused(builder, builder.fneg(a), b, total)
+        return fused(builder, builder.fneg(a), b, total)
 
     return total(total, a, b), codegen
 
@@ -110,7 +122,7 @@ def splat(typing_context, array, number, n_registers):
     vector = Vector(array.dtype, n_registers.literal_value)
 
     def codegen(context, builder, signature, arguments):
-        kind = _ir_type(vector)
+        kind = ir_type(vector)
         value = context.cast(builder, arguments[1], signature.args[1], array.dtype)
         first = builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
         zeros = ir.Constant(ir.VectorType(ir.IntType(32), vector.count), [0] * vector.count)
@@ -147,4 +159,4 @@ def store(typing_context, vector, array, index):
 
 def _place(context, builder, vector, array_type, array, index):
     data = context.make_array(array_type)(context, builder, array).data
-    return builder.bitcast(builder.gep(data, [index]), _ir_type(vector).as_pointer())
+    return builder.bitcast(builder.gep(data, [index]), ir_type(vector).as_pointer())
