@@ -34,6 +34,7 @@ WAVES = 40
 
 _TURNS = 12  # Number of iterations; further ones reduce the error by less than 0.1 dB.
 _MIN_POWER = 1e-14  # Regularisation relative to the power of the taps. It keeps weights small if taps are nearly equal.
+_IMAGES = (-2, -1, 1, 2)  # The nearest images hold nearly all of the error.
 _TARGETS = 65  # Number of targets over one step of the stored samples.
 
 
@@ -182,18 +183,30 @@ class DelayFit:
         self._middle = (self.n_taps - 1) // 2 + 0.5 * (1 - self.n_taps % 2)
         self.fractions = (np.arange(_TARGETS) + 0.5) / _TARGETS + self._middle - 0.5
         self._gain, _ = fit(self._taps(spectrum.frequency_hz), self._wanted(self.fractions), spectrum.power)
-        made = self.gain(spectrum.frequency_hz)[:, None] * (
-            self._taps(spectrum.frequency_hz) @ self.weights(self.fractions).T
-        )
-        wrong = made - self._wanted(self.fractions)
+        wrong = self._wrong(self.fractions)
         self.errors, self.biases = np.var(wrong, axis=1), np.abs(np.mean(wrong, axis=1)) ** 2
 
     def errors_at(self, fractions: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the mean error power, including the shared error, at given fractions: (wave,) float64."""
+        return np.asarray(np.mean(np.abs(self._wrong(np.unique(np.round(fractions, 4)))) ** 2, axis=1))
+
+    @functools.cached_property
+    def images(self) -> dict[int, NDArray[np.float64]]:
+        """Share of the error in each image of the spectrum: (wave,) float64 by the number of the image.
+
+        Relative to the wave, the error has the period of a step. It therefore consists of waves whose frequencies are
+        those of the spectrum plus the number of the image times the rate of the stored samples.
+        """
+        relative = self._wrong(self.fractions) * np.conj(self._wanted(self.fractions))
+        power = np.abs(np.fft.fft(relative, axis=1)[:, _IMAGES]) ** 2
+        total = np.maximum(power.sum(axis=1, keepdims=True), np.finfo(np.float64).tiny)
+        return dict(zip(_IMAGES, (power / total).T, strict=True))
+
+    def _wrong(self, fractions: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """Return the error of unit waves: (wave, fraction)."""
         frequency_hz = self._spectrum.frequency_hz
-        found = np.unique(np.round(fractions, 4))
-        made = self.gain(frequency_hz)[:, None] * (self._taps(frequency_hz) @ self.weights(found).T)
-        return np.asarray(np.mean(np.abs(made - self._wanted(found)) ** 2, axis=1))
+        made = self.gain(frequency_hz)[:, None] * (self._taps(frequency_hz) @ self.weights(fractions).T)
+        return np.asarray(made - self._wanted(fractions))
 
     def split(self, delays_s: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return the first stored sample that contributes to each delayed sample, and the delay after it, in steps."""
