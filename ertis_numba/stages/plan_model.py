@@ -154,8 +154,7 @@ class PlanModel:
         """
         step_s = 1 / (self.settings.output_rate_hz * plan.n_phases)
         fit, _ = _fitted(self._spectrum, plan.delay_taps, step_s)
-        fractions = self._few_fractions(fit, step_s)
-        if nodes.grid is None or fractions is not None:
+        if nodes.grid is None or self._few_fractions(fit, step_s) is not None:
             return error * max(1.0, nodes.squares)
         passed = sum(share * nodes.grid.passed(order / step_s) for order, share in fit.images.items())
         return self.errors.delays(fit, n_mics=self._n_effective, passed=np.asarray(passed))
