@@ -84,8 +84,9 @@ def _conditions(report: dict[str, Any], last: int) -> str:
         "delay-and-sum with envelope alone, from each implementation's signals after its matched filter. "
         f"{PAPER}, processes the whole record, with delays of whole samples. NumPy, PyTorch and JAX process the same "
         f"part of the record as this package, in float32, with {N_PHASES} samples per range, delays of whole samples, "
-        "and the phase of the carrier corrected. This is the smallest number that keeps -35 dB, the default "
-        "budget of this package. Acoular's `BeamformerTime` interpolates the same samples linearly, in float64, behind "
-        "the front end in NumPy. JAX compiles with `jit`. PyTorch runs without `torch.compile`, which needs a C++ "
-        "compiler. This package runs its default plan. GPUs and batches are left out."
+        "and the phase of the carrier corrected. Fewer samples would exceed -35 dB, the default budget of this "
+        "package. Acoular's `BeamformerTime` interpolates the same samples linearly, in float64, behind the front end "
+        "in NumPy. Images are written to one array, except by Acoular and JAX, which return a new one. JAX compiles "
+        "with `jit`. PyTorch runs without `torch.compile`, which needs a C++ compiler. This package runs its default "
+        "plan. GPUs and batches are left out."
     )
