@@ -74,7 +74,8 @@ def _conditions(report: dict[str, Any], last: int) -> str:
     first_m, last_m = report["range_m"]
     return (
         f"The same measurement was processed {report['count']} times in one process, in turns of {accuracy.TURN} per "
-        f"implementation: {report['words']:,} words of 32 microphones ({report['source']}) to an energyscape of "
+        f"implementation, and a tenth as often by slow ones ({'; '.join(report['slow'])}): {report['words']:,} words "
+        f"of 32 microphones ({report['source']}) to an energyscape of "
         f"{first_m:g}–{last_m:g} m. Times include everything from the words in memory to the image in memory. They "
         "exclude reading the file, imports, tables, compilation, and warm-up calls of a fifth of a second (at least "
         f"three) before each turn. The first image, of {last} directions, includes tables and compilation. Numba's "
