@@ -42,6 +42,10 @@ PLANS = {
         f"nodes {taps} {density:g}": _plan(beam_taps=taps, beam_density=density)
         for taps, density in [(2, 2.0), (2, 4.0), (4, 1.25), (4, 2.0), (4, 3.0), (6, 1.75), (6, 3.0)]
     },
+    # Beam grids average the errors of delays, at most where delays are interpolated between fine steps.
+    "delays 16 1, nodes": _plan(oversampling=16, delay_taps=1, beam_taps=6, beam_density=3.0),
+    "delays 4 2, nodes": _plan(oversampling=4, delay_taps=2, beam_taps=6, beam_density=3.0),
+    "delays 2 2, nodes": _plan(oversampling=2, delay_taps=2, beam_taps=4, beam_density=3.0),
     "16 bits": _plan(precision="int16", oversampling=8, delay_taps=4),
     "16 bits, one tap": _plan(precision="int16", oversampling=64, delay_taps=1),
     "16 bits, nodes": _plan(precision="int16", beam_taps=4, beam_density=3.0),

@@ -109,6 +109,23 @@ def test_interpolation_residual_equals_its_prediction(array):
     assert_allclose(rough.steering, wanted, atol=1e-9)
 
 
+@pytest.mark.parametrize("shift_hz", [0.0, -90e3, 200e3, -720e3])
+@pytest.mark.parametrize(("n_taps", "density"), [(2, 2.0), (4, 2.0), (6, 3.0)])
+def test_estimate_predicts_the_power_of_shifted_waves(n_taps, density, shift_hz):
+    """The reference is the complete beam grid: all directions, and its own gain."""
+    aperture = apertures("eRTIS", "half sphere")
+    nodes = beam_grid_of(aperture, n_taps, density)
+    delays_s = aperture.delays_s(nodes.points, sound_speed_m_s=SPEED_M_S)
+    waves = np.exp(2j * math.pi * delays_s[:, :, None] * (SPECTRUM.frequency_hz + shift_hz))
+    waves *= nodes.gain(SPECTRUM.frequency_hz)
+    made = np.einsum("dpk,dpkmw->dmw", nodes.weights[::7], waves[nodes.places[::7, :, None] + np.arange(2)])
+    power = np.mean(np.abs(made) ** 2, axis=(0, 1)) @ SPECTRUM.power
+    found = beam_grid_of(aperture, n_taps, density, estimate=True).passed(shift_hz) @ SPECTRUM.power
+    assert found == pytest.approx(power, rel=0.15)
+    if not shift_hz:
+        assert found == pytest.approx(1.0, abs=0.02)
+
+
 @pytest.mark.parametrize("array", ARRAYS_M)
 def test_beam_grid_points_surround_every_direction(array):
     """At the rim of the half sphere, grid points lie outside of the unit circle."""

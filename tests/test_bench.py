@@ -284,7 +284,7 @@ def test_accuracy_rates_every_plan_on_both_subjects(tmp_path):
                 assert row["predicted_db"] is None
                 assert not row["on_front"]
             else:
-                assert abs(row["predicted_db"] - row["error_db"]) < 5, row
+                assert abs(row["predicted_db"] - row["error_db"]) < 3, row
         budgets = {row["plan"].partition(":")[0]: row["error_db"] for row in rows}
         assert all(budgets[preset] <= max_error_db for preset, max_error_db in ERROR_PRESETS_DB.items())
         exact_row = rows[-1]

@@ -60,6 +60,13 @@ def test_errors_fall_with_oversampling_by_6_db_for_each_tap(n_taps):
     assert np.diff(errors_db(fitted_error, n_taps)) == pytest.approx(-6.02 * n_taps, abs=0.6)
 
 
+def test_errors_of_a_single_tap_are_images_of_a_sawtooth():
+    """The phase error is proportional to the distance from the nearest sample, and a sawtooth has images of 1 / h²."""
+    images = DelayFit(1, 1 / (16 * RATE_HZ), DEFAULT).images
+    for number, share in images.items():
+        assert share @ DEFAULT.power == pytest.approx(0.4 / number**2, abs=0.02)
+
+
 @pytest.mark.parametrize("name", TEXTBOOK)
 def test_errors_of_textbook_weights_fall_by_6_db_for_each_tap(name):
     assert np.diff(errors_db(textbook_error, name)) == pytest.approx(-6.02 * TEXTBOOK[name][0], abs=0.6)

@@ -76,7 +76,7 @@ def paper(**given: Any) -> None:
 
 
 @bench.command()
-@_count(5)
+@_count(20)
 @_update
 @options.quiet
 @options.as_json

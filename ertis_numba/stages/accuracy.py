@@ -132,7 +132,14 @@ class ErrorModel:
         self.frequency_hz, _ = matched_noise_spectrum(settings, n_waves=WAVES)
         self._weights = array_weights(settings)
 
-    def delays(self, fit: DelayFit, *, n_mics: float, fractions: NDArray[np.float64] | None = None) -> float:
+    def delays(
+        self,
+        fit: DelayFit,
+        *,
+        n_mics: float,
+        fractions: NDArray[np.float64] | None = None,
+        passed: NDArray[np.float64] | None = None,
+    ) -> float:
         """Return the error power of delay interpolation: the residual of the fit, weighted by the signal spectrum.
 
         The mean error over all delays acts as a filter on the image itself, whether or not echoes are coherent. The
@@ -146,6 +153,8 @@ class ErrorModel:
             Effective number of microphones: see `ertis_numba.geometry.effective_count`.
         fractions : (delay,) float64, optional
             Fractional parts of the delays in steps, if there are too few delays to spread evenly over a step.
+        passed : (wave,) float64, optional
+            Share of the errors at beam-grid points that remains in the interpolated beams; 1 by default.
         """
         signal_model = self.signal_model
         if fractions is not None:
@@ -154,7 +163,8 @@ class ErrorModel:
                 * float(fit.errors_at(fractions) @ signal_model.shares)
                 * max(1.0, 0.5 / signal_model.gain)
             )
-        varying, shared = (float(errors @ signal_model.shares) for errors in (fit.errors, fit.biases))
+        errors = fit.errors if passed is None else fit.errors * passed
+        varying, shared = float(errors @ signal_model.shares), float(fit.biases @ signal_model.shares)
         independent = 0.5 * (1 + 1 / n_mics) * varying / signal_model.gain
         return signal_model.colour * (independent + 0.5 * shared)
 

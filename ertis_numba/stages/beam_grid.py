@@ -292,12 +292,22 @@ class BeamGrid:
         self.frequency_hz = frequency_hz
         made, wanted = self._waves(patch, mics) @ weights, self._waves(inside, mics)
         gain = gain_of(made, wanted) if self._has_gain else np.ones(len(made), dtype=np.complex128)
+        self._estimated = patch, mics, weights, gain
         wrong = gain[:, None] * made - wanted
         shape = (len(mics), len(self.frequency_hz), len(inside))
         self.errors = np.mean(np.abs(wrong.reshape(shape)) ** 2, axis=(0, 2))
         there = self._waves(moved, mics)  # Phase from the lowest point of each patch to the centre of the array.
         self.steering, self.wrong = (there * wanted).reshape(shape), (there * wrong).reshape(shape)
         return np.asarray(gain.reshape(shape[:2]))
+
+    def passed(self, shift_hz: float) -> NDArray[np.float64]:
+        """Return the mean power, (wave,), of unit waves whose frequencies have been shifted before the interpolation.
+
+        The gain is that of the original frequencies. Estimates only.
+        """
+        patch, mics, weights, gain = self._estimated
+        made = gain[:, None] * (self._waves(patch, mics, shift_hz=shift_hz) @ weights)
+        return np.asarray(np.mean(np.abs(made.reshape(len(mics), len(self.frequency_hz), -1)) ** 2, axis=(0, 2)))
 
     def _curvature_errors(
         self,
@@ -334,10 +344,12 @@ class BeamGrid:
             ]
         )
 
-    def _waves(self, points: NDArray[np.float64], mics: NDArray[np.intp]) -> NDArray[np.complex128]:
+    def _waves(
+        self, points: NDArray[np.float64], mics: NDArray[np.intp], *, shift_hz: float = 0.0
+    ) -> NDArray[np.complex128]:
         """Return plane waves: (mic · frequency, point) complex128."""
         delay_s = -self._aperture.positions_m[mics] @ points.T / self._sound_speed_m_s
-        turns = delay_s[:, None, :] * (2 * math.pi * self.frequency_hz[:, None])
+        turns = delay_s[:, None, :] * (2 * math.pi * (self.frequency_hz[:, None] + shift_hz))
         waves = np.empty(turns.shape, dtype=np.complex128)
         np.cos(turns, out=waves.real)  # Sine and cosine together take half as long as a complex exponential.
         np.sin(turns, out=waves.imag)

@@ -34,6 +34,7 @@ WAVES = 40
 
 _TURNS = 12  # Number of iterations; further ones reduce the error by less than 0.1 dB.
 _MIN_POWER = 1e-14  # Regularisation relative to the power of the taps. It keeps weights small if taps are nearly equal.
+_IMAGES = (-2, -1, 1, 2)  # The nearest images hold nearly all of the error.
 _TARGETS = 65  # Number of targets over one step of the stored samples.
 
 
@@ -188,15 +189,12 @@ class DelayFit:
         self._gain: NDArray[np.complex128] = np.ones(len(spectrum.power), dtype=np.complex128)
         if with_gain:
             self._gain, _ = fit(self._taps(spectrum.frequency_hz), self._wanted(self.fractions), spectrum.power)
-        made = self.gain(spectrum.frequency_hz)[:, None] * (
-            self._taps(spectrum.frequency_hz) @ self.weights(self.fractions).T
-        )
-        if not with_gain:
+        else:
             # Least squares shrink a single tap. All microphones share this error, so a larger variance is better.
+            made = self._wrong(self.fractions) + self._wanted(self.fractions)
             shrunk = np.mean(made * np.conj(self._wanted(self.fractions)), axis=1).real
             self._scale = 1 / float(shrunk @ spectrum.power)
-            made *= self._scale
-        wrong = made - self._wanted(self.fractions)
+        wrong = self._wrong(self.fractions)
         self.errors, self.biases = np.var(wrong, axis=1), np.abs(np.mean(wrong, axis=1)) ** 2
 
     def errors_at(self, fractions: NDArray[np.float64], spectrum: Spectrum | None = None) -> NDArray[np.float64]:
@@ -204,10 +202,26 @@ class DelayFit:
 
         The frequencies are those of another spectrum, if one is given.
         """
-        frequency_hz = (spectrum or self.spectrum).frequency_hz
         found = np.unique(np.round(fractions, 4))
-        made = self.gain(frequency_hz)[:, None] * (self._taps(frequency_hz) @ self.weights(found).T)
-        return np.asarray(np.mean(np.abs(made - self._wave(frequency_hz, found)) ** 2, axis=1))
+        return np.asarray(np.mean(np.abs(self._wrong(found, spectrum)) ** 2, axis=1))
+
+    @functools.cached_property
+    def images(self) -> dict[int, NDArray[np.float64]]:
+        """Share of the error in each image of the spectrum: (wave,) float64 by the number of the image.
+
+        Relative to the wave, the error has the period of a step. It therefore consists of waves whose frequencies are
+        those of the spectrum plus the number of the image times the rate of the stored samples.
+        """
+        relative = self._wrong(self.fractions) * np.conj(self._wanted(self.fractions))
+        power = np.abs(np.fft.fft(relative, axis=1)[:, _IMAGES]) ** 2
+        total = np.maximum(power.sum(axis=1, keepdims=True), np.finfo(np.float64).tiny)
+        return dict(zip(_IMAGES, (power / total).T, strict=True))
+
+    def _wrong(self, fractions: NDArray[np.float64], spectrum: Spectrum | None = None) -> NDArray[np.complex128]:
+        """Return the error of unit waves: (wave, fraction)."""
+        frequency_hz = (spectrum or self.spectrum).frequency_hz
+        made = self.gain(frequency_hz)[:, None] * (self._taps(frequency_hz) @ self.weights(fractions).T)
+        return np.asarray(made - self._wave(frequency_hz, fractions))
 
     def split(self, delays_s: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return the first stored sample that contributes to each delayed sample, and the delay after it, in steps."""

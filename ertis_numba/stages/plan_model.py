@@ -50,12 +50,16 @@ class ImagePlan(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Nodes:
-    """Predicted properties of a beam grid: its size, its error, and the sum of a beam's squared weights."""
+    """Predicted properties of a beam grid: its size, its error, and the sum of a beam's squared weights.
+
+    ``grid`` is the estimate from a measured signal model, or None.
+    """
 
     count: int
     n_pairs: int
     error: float
     squares: float
+    grid: BeamGrid | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,8 +162,7 @@ class PlanModel:
         parts["arithmetic"] = self.errors.arithmetic()
         if nodes is not None:
             parts["beams"] = nodes.error
-            # Large weights that nearly cancel each other add up the errors of their beam-grid points.
-            parts["delays"] *= max(1.0, nodes.squares)
+            parts["delays"] = self._delays_between(nodes, plan, delays.error)
         if self.settings.processing.wavefront == "spherical":
             parts["zones"] = self.zone_error(plan.focal_zones)
         if plan.precision == "int16":
@@ -206,6 +209,20 @@ class PlanModel:
         return self._stream_planner.plan(
             plan.n_phases, plan.delay_taps, plan.beam_taps, plan.density, self._few_fractions(fit, step_s)
         )
+
+    def _delays_between(self, nodes: Nodes, plan: ImagePlan, error: float) -> float:
+        """Return the error power of delays in beams that are interpolated between beam-grid points.
+
+        The interpolation averages errors that differ between grid points. These are images of the spectrum, waves of
+        other frequencies, which a fine grid suppresses. Without a measurement, the error is assumed to remain. Large
+        weights that nearly cancel each other add up the errors of their grid points.
+        """
+        step_s = 1 / (self.settings.output_rate_hz * plan.n_phases)
+        fit, _ = _fitted(self._spectrum, plan.delay_taps, step_s)
+        if nodes.grid is None or self._few_fractions(fit, step_s) is not None:
+            return error * max(1.0, nodes.squares)
+        passed = sum(share * nodes.grid.passed(order / step_s) for order, share in fit.images.items())
+        return self.errors.delays(fit, n_mics=self._n_effective, passed=np.asarray(passed))
 
     def work(self, plan: ImagePlan) -> Work:
         """Return the work of a plan, from which its time is predicted."""
@@ -307,13 +324,14 @@ class PlanModel:
         require_beam_grid(self.aperture, len(self.window.range_m))
         beams = self._beams(n_taps, density)
         if self.errors.needs_steering and math.isinf(self._nearest_m):
-            nodes = _estimated(beams)
-            error, squares = self.errors.beams(nodes), nodes.squares
+            grid = _estimated(beams)
+            error, squares = self.errors.beams(grid), grid.squares
         else:
+            grid = None
             power, squares = _estimated_errors(beams)
             error = self.errors.uniform_beams(power)
         n_pairs = n_taps**self.aperture.n_axes // 2
-        return Nodes(self.count_grid_points(n_taps, density), n_pairs, error, squares)
+        return Nodes(self.count_grid_points(n_taps, density), n_pairs, error, squares, grid)
 
     def _made_filter(self, stopband_attenuation_db: float) -> tuple[NDArray[Any], float]:
         try:

@@ -13,6 +13,7 @@ __all__ = ["analytic", "make"]
 
 def make(problem: Problem) -> Implementation:
     """Return the implementation with NumPy, which sums one direction at a time."""
+    image = np.empty((len(problem.starts), problem.n_ranges), np.float32)
 
     def signals(words: NDArray[Any]) -> NDArray[np.complex64]:
         phases = analytic(problem, words).reshape(problem.shape[0], -1, problem.shape[1])
@@ -20,7 +21,6 @@ def make(problem: Problem) -> Implementation:
 
     def delay_and_sum(heard: NDArray[np.complex64]) -> NDArray[np.float32]:
         parts = np.lib.stride_tricks.sliding_window_view(heard, problem.n_ranges)
-        image = np.empty((len(problem.starts), problem.n_ranges), np.float32)
         for out, starts, weights in zip(image, problem.starts, problem.weights, strict=True):
             np.abs(weights @ parts[starts], out=out)
         return image

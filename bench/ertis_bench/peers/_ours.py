@@ -47,14 +47,16 @@ def this_package(settings: Settings) -> Implementation:
 
         return repeat
 
-    def process(words: NDArray[Any]) -> NDArray[np.float32]:
-        return pipeline.process(Measurement(words, settings), out=image).amplitude
-
-    return Implementation(process, prepared, kernel_set.max_threads)
+    return Implementation(_process(pipeline, settings), prepared, kernel_set.max_threads)
 
 
 def paper(settings: Settings) -> Implementation:
     """Return the paper's algorithm in NumPy and SciPy."""
     processing = settings.processing.replace(method="paper")
     pipeline = Pipeline(settings.replace(processing=processing), device="numpy", predict=False)
-    return Implementation(lambda words: pipeline.process(Measurement(words, settings)).amplitude, None, threads=1)
+    return Implementation(_process(pipeline, settings), None, threads=1)
+
+
+def _process(pipeline: Pipeline, settings: Settings) -> Callable[[NDArray[Any]], NDArray[np.float32]]:
+    image = np.empty((len(pipeline.grid), len(pipeline.range_m)), np.float32)
+    return lambda words: pipeline.process(Measurement(words, settings), out=image).amplitude

@@ -25,6 +25,7 @@ def make(problem: Problem) -> Implementation:
     shifts, taps = torch.from_numpy((problem.channels % 8).astype(np.uint8)[:, None]), torch.from_numpy(problem.taps)
     response, weights = torch.from_numpy(problem.response), torch.from_numpy(problem.weights)
     starts = torch.from_numpy(problem.starts)
+    image = torch.empty((len(starts), problem.n_ranges))
 
     def signals(words: NDArray[Any]) -> Any:
         octets = torch.from_numpy(words[problem.words].view(np.uint8).reshape(-1, words.itemsize)).T.contiguous()
@@ -38,7 +39,6 @@ def make(problem: Problem) -> Implementation:
 
     def delay_and_sum(heard: Any) -> NDArray[np.float32]:
         parts = heard.unfold(0, problem.n_ranges, 1)
-        image = torch.empty((len(starts), problem.n_ranges))
         for first in range(0, len(starts), _DIRECTIONS):
             some = slice(first, first + _DIRECTIONS)
             rows = parts.index_select(0, starts[some].reshape(-1)).view(-1, n_mics, problem.n_ranges)

@@ -40,11 +40,14 @@ class Peer:
         Returns the implementation for settings.
     max_error_db : float
         Largest error of a correct image.
+    is_slow : bool
+        True to measure it a tenth as often.
     """
 
     package: str
     make: Callable[[Settings], Implementation]
     max_error_db: float = checks.MAX_ERROR_DB
+    is_slow: bool = False
 
 
 def _textbook(make: Callable[[Problem], Implementation]) -> Callable[[Settings], Implementation]:
@@ -52,9 +55,9 @@ def _textbook(make: Callable[[Problem], Implementation]) -> Callable[[Settings],
 
 
 PEERS: dict[str, Peer] = {
-    PAPER: Peer("scipy", _ours.paper, max_error_db=-15.0),
+    PAPER: Peer("scipy", _ours.paper, max_error_db=-15.0, is_slow=True),
     "NumPy": Peer("numpy", _textbook(_numpy.make)),
-    "Acoular": Peer("acoular", _textbook(_acoular.make)),
+    "Acoular": Peer("acoular", _textbook(_acoular.make), is_slow=True),
     "PyTorch": Peer("torch", _textbook(_torch.make)),
     "JAX": Peer("jax", _textbook(_jax.make)),
     OURS: Peer("ertis_numba", _ours.this_package),
@@ -68,7 +71,7 @@ def run(*, count: int, say: Callable[[str], None]) -> dict[str, Any]:
     Parameters
     ----------
     count : int
-        Measurements per implementation and number of directions.
+        Measurements per implementation and number of directions; a tenth of it for slow ones.
     say : callable
         Called with a line of progress.
 
@@ -92,6 +95,7 @@ def run(*, count: int, say: Callable[[str], None]) -> dict[str, Any]:
             for name, peer in PEERS.items()
         },
         "count": count,
+        "slow": [name for name, peer in PEERS.items() if peer.is_slow],
         "source": source,
         "range_m": list(accuracy.RANGE_M),
         "words": measurement.settings.recording.n_samples,
@@ -128,14 +132,24 @@ def _measured(
         if name in alone:
             _checked(name, alone[name](), exact, max_error_db)
     say(f"{n_directions} directions: timing {count} of each")
-    whole_ms = timing.round_robin(whole, count=count, burst=accuracy.TURN)
-    alone_ms = timing.round_robin(alone, count=count, burst=accuracy.TURN)
+    whole_ms, alone_ms = _times(peers, whole, count), _times(peers, alone, count)
     for row in rows:
         row.update(timing.summary(whole_ms[row["name"]]))
         row["points_per_s"] = None
         if row["name"] in alone_ms:
             row["points_per_s"] = round(1e3 * exact.amplitude.size / float(np.median(alone_ms[row["name"]])))
     return rows
+
+
+def _times(
+    peers: dict[str, Peer], calls: dict[str, Callable[[], NDArray[np.float32]]], count: int
+) -> dict[str, NDArray[np.float64]]:
+    """Return the times of all calls in milliseconds."""
+    found: dict[str, NDArray[np.float64]] = {}
+    for is_slow, n in ((False, count), (True, max(1, count // 10))):
+        some = {name: call for name, call in calls.items() if peers[name].is_slow == is_slow}
+        found |= timing.round_robin(some, count=n, burst=accuracy.TURN)
+    return found
 
 
 def _checked(name: str, amplitude: NDArray[np.float32], exact: Energyscape, max_error_db: float) -> float:

@@ -74,7 +74,8 @@ def _conditions(report: dict[str, Any], last: int) -> str:
     first_m, last_m = report["range_m"]
     return (
         f"The same measurement was processed {report['count']} times in one process, in turns of {accuracy.TURN} per "
-        f"implementation: {report['words']:,} words of 32 microphones ({report['source']}) to an energyscape of "
+        f"implementation, and a tenth as often by slow ones ({'; '.join(report['slow'])}): {report['words']:,} words "
+        f"of 32 microphones ({report['source']}) to an energyscape of "
         f"{first_m:g}–{last_m:g} m. Times include everything from the words in memory to the image in memory. They "
         "exclude reading the file, imports, tables, compilation, and warm-up calls of a fifth of a second (at least "
         f"three) before each turn. The first image, of {last} directions, includes tables and compilation. Numba's "
@@ -84,8 +85,9 @@ def _conditions(report: dict[str, Any], last: int) -> str:
         "delay-and-sum with envelope alone, from each implementation's signals after its matched filter. "
         f"{PAPER}, processes the whole record, with delays of whole samples. NumPy, PyTorch and JAX process the same "
         f"part of the record as this package, in float32, with {N_PHASES} samples per range, delays of whole samples, "
-        "and the phase of the carrier corrected. This is the smallest number that keeps -35 dB, the default "
-        "budget of this package. Acoular's `BeamformerTime` interpolates the same samples linearly, in float64, behind "
-        "the front end in NumPy. JAX compiles with `jit`. PyTorch runs without `torch.compile`, which needs a C++ "
-        "compiler. This package runs its default plan. GPUs and batches are left out."
+        "and the phase of the carrier corrected. Fewer samples would exceed -35 dB, the default budget of this "
+        "package. Acoular's `BeamformerTime` interpolates the same samples linearly, in float64, behind the front end "
+        "in NumPy. Images are written to one array, except by Acoular and JAX, which return a new one. JAX compiles "
+        "with `jit`. PyTorch runs without `torch.compile`, which needs a C++ compiler. This package runs its default "
+        "plan. GPUs and batches are left out."
     )
