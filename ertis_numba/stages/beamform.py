@@ -8,13 +8,12 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.errors import DeviceError
 from ertis_numba.kernels import KernelSet, Memory
 from ertis_numba.stages.beam_grid import FEWEST_RANGES, BeamGrid
 from ertis_numba.stages.delays import Zone
 from ertis_numba.stages.window import TimeWindow
 
-__all__ = ["Beamform", "BeamformFloat32", "BeamformInt16", "Buffers", "beamform", "require_int16", "whole_limits"]
+__all__ = ["Beamform", "BeamformFloat32", "BeamformInt16", "Buffers", "beamform", "whole_limits"]
 
 _WEIGHT_BITS = 12  # With 32 microphones, 13 bits remain for samples. Both then have errors of about -85 dB.
 _TAP_BITS = 15  # Bits of the weights of grid points, before their sum is taken into account.
@@ -34,21 +33,6 @@ class Beamform(Protocol):
     def __call__(self, analytic: NDArray[np.complex64], buffers: Buffers, out: NDArray[np.float32]) -> None:
         """Fill ``out``, (direction, range) float32, from ``analytic``, (mic, phase, sample) complex64."""
         ...
-
-
-def require_int16(kernels: KernelSet) -> None:
-    """Check that the device has a 16-bit dot product.
-
-    Raises
-    ------
-    DeviceError
-        The device has none.
-    """
-    if not kernels.tile_ranges:
-        raise DeviceError(
-            "accuracy.precision is 'int16', but this processor has no 16-bit dot product (AVX-512 VNNI or AVX-VNNI); "
-            "set accuracy.precision to 'float32' or 'auto'"
-        )
 
 
 def beamform(
@@ -71,15 +55,9 @@ def beamform(
         As for `BeamformFloat32`.
     n_phases : int
         Number of phases of the analytic signals.
-
-    Raises
-    ------
-    DeviceError
-        The precision is ``"int16"``, and the device has no 16-bit dot product.
     """
     if precision == "float32":
         return BeamformFloat32(kernels, memory, window, zones, nodes, threads=threads)
-    require_int16(kernels)
     return BeamformInt16(kernels, memory, zones, nodes, n_phases=n_phases, threads=threads)
 
 

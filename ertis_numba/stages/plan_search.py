@@ -18,7 +18,7 @@ _NEEDLESS = 0.02  # Share of the budget below which the error of a step is negli
 _SMALL = 0.1  # Share of the budget for steps whose error costs little to reduce.
 
 
-def open_plans(model: PlanModel, budget: float, *, has_int16: bool) -> list[ImagePlan]:
+def open_plans(model: PlanModel, budget: float) -> list[ImagePlan]:
     """Return the plans that the settings permit, except needlessly accurate ones.
 
     Parameters
@@ -26,13 +26,11 @@ def open_plans(model: PlanModel, budget: float, *, has_int16: bool) -> list[Imag
     model : PlanModel
     budget : float
         Largest error power of a plan, relative to the exact image.
-    has_int16 : bool
-        True if the device has a 16-bit dot product.
     """
     given = model.settings.accuracy
     adaptive = model.settings.processing.beamformer != "delay_and_sum"
     precisions = ["float32"] if given.precision == "auto" else [given.precision]
-    if given.precision == "auto" and has_int16 and not adaptive:
+    if given.precision == "auto" and not adaptive:
         precisions.append("int16")
     zones = _zone_count(model, budget)
     return [
