@@ -12,7 +12,7 @@ _KERNEL = vars(module)["_beam_tile"]
 
 @njit
 def _tile(tiles, offsets, weights, out):
-    _KERNEL(tiles, 0, offsets, weights, 0, 1.0, out, 0)
+    _KERNEL(tiles, 0, offsets, weights, 0, 1.0, out, 0, 96)
 
 
 if __name__ == "__main__":

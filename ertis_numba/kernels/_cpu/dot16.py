@@ -54,9 +54,9 @@ class Dot16:
         ]
 
     @contextlib.contextmanager
-    def passes(self, size):
-        """Emit a loop over the passes of a tile, with sums of 0; yield the first range of a pass."""
-        with passes(self._builder, size, RANGES, self._vectors * LANES) as first:
+    def passes(self, n_used):
+        """Emit a loop over the passes of a tile up to ``n_used`` ranges, with sums of 0; yield the first range."""
+        with passes(self._builder, n_used, RANGES, self._vectors * LANES) as first:
             for parts in self._sums:
                 for total in parts[0] + parts[1]:
                     self._builder.store(ir.Constant(TOTALS, [0] * TOTALS.count), total)

@@ -33,7 +33,7 @@ class _Sums:
     @contextlib.contextmanager
     def passes(self, size):
         """Emit a loop over the passes of a tile, with sums of 0; yield the first range of a pass."""
-        with passes(self._builder, size, TILE, self._at_a_time) as first:
+        with passes(self._builder, ir.Constant(size, TILE), TILE, self._at_a_time) as first:
             for row in self._sums:
                 for total in row:
                     self._builder.store(ir.Constant(_FLOATS, [0.0] * _LANES), total)

@@ -91,10 +91,12 @@ def vectors_per_pass(n_vectors: int, sums_each: int) -> int:
 
 
 @contextlib.contextmanager
-def passes(builder: Any, size: Any, n_ranges: int, at_a_time: int) -> Iterator[Any]:
-    """Emit a loop over a tile of ``n_ranges``; yield the first range of a pass, an integer of the type ``size``."""
+def passes(builder: Any, n_used: Any, n_ranges: int, at_a_time: int) -> Iterator[Any]:
+    """Emit a loop over the first ``n_used`` of the ``n_ranges`` of a tile; yield the first range of a pass."""
+    step = ir.Constant(n_used.type, at_a_time)
     if at_a_time == n_ranges:
-        yield ir.Constant(size, 0)
+        yield ir.Constant(n_used.type, 0)
         return
-    with cgutils.for_range(builder, ir.Constant(size, n_ranges // at_a_time)) as loop:
-        yield builder.mul(loop.index, ir.Constant(size, at_a_time))
+    count = builder.sdiv(builder.add(n_used, ir.Constant(n_used.type, at_a_time - 1)), step)
+    with cgutils.for_range(builder, count) as loop:
+        yield builder.mul(loop.index, step)

@@ -32,19 +32,22 @@ def _address(typing_context, array):
 
 
 @intrinsic
-def _node_tile(typing_context, tiles, tile, offsets, weights, node, rows, row):
-    """Fill ``rows[row]``, (part, range) int16, with the rounded upper 16 bits of the beam of a grid point."""
-    signature = types.void(tiles, types.intp, offsets, weights, types.intp, rows, types.intp)
+def _node_tile(typing_context, tiles, tile, offsets, weights, node, n_used, rows, row):
+    """Fill ``n_used`` ranges or more of ``rows[row]``, (part, range) int16, with a beam of a grid point.
+
+    The beam is that of the contract: the rounded upper 16 bits of its sums.
+    """
+    signature = types.void(tiles, types.intp, offsets, weights, types.intp, types.intp, rows, types.intp)
 
     def codegen(context, builder, signature, arguments):
         def array(k):
             return context.make_array(signature.args[k])(context, builder, arguments[k])
 
-        dot, size = Dot16(builder), arguments[6].type
-        begin = builder.mul(arguments[6], ir.Constant(size, 2 * RANGES))
-        with dot.passes(size) as first:
+        dot, row = Dot16(builder), arguments[7]
+        begin = builder.mul(row, ir.Constant(row.type, 2 * RANGES))
+        with dot.passes(arguments[5]) as first:
             dot.add_complex_terms(array(0), arguments[1], array(2), array(3), arguments[4], first)
-            dot.store_upper_halves(builder.gep(array(5).data, [builder.add(begin, first)]))
+            dot.store_upper_halves(builder.gep(array(6).data, [builder.add(begin, first)]))
         return context.get_dummy_value()
 
     return signature, codegen
@@ -86,14 +89,15 @@ def _interpolation(n_beams):
     """Return an intrinsic that interpolates one direction, or two that share their grid points."""
 
     @intrinsic
-    def interpolate(typing_context, pairs, skipped, places, weights, direction, scale, out, place, next_place):
-        """Fill ``out.flat[place : place + RANGES]``, and for a second direction ``next_place …``.
+    def interpolate(typing_context, pairs, skipped, places, weights, direction, scale, n_used, out, place, next_place):
+        """Fill ``out.flat[place : place + n_used]`` or more, up to `RANGES`; a second direction has ``next_place …``.
 
         ``pairs`` is (point, part, range) int32, and its first point is ``skipped``. Each number holds a grid point in
         its low 16 bits and the next one in its high 16 bits.
         """
-        integers = (types.intp, types.intp)
-        signature = types.void(pairs, types.intp, places, weights, types.intp, types.float32, out, *integers)
+        integer = types.intp
+        numbers = (integer, types.float32, integer)
+        signature = types.void(pairs, integer, places, weights, *numbers, out, integer, integer)
 
         def codegen(context, builder, signature, arguments):
             def array(k):
@@ -104,7 +108,7 @@ def _interpolation(n_beams):
             values = builder.bitcast(array(3).data, INT32.as_pointer())
             first_pair = builder.mul(direction, n_pairs)
             dot = Dot16(builder, n_beams)
-            with dot.passes(size) as first:
+            with dot.passes(arguments[6]) as first:
                 with cgutils.for_range(builder, n_pairs) as loop:
                     entry = builder.add(first_pair, loop.index)
                     node = builder.sext(builder.load(builder.gep(array(2).data, [entry])), size)
@@ -114,8 +118,8 @@ def _interpolation(n_beams):
                         array(0).data, builder.add(begin, first), [dot.pair(values, at) for at in entries]
                     )
                 for beam in range(n_beams):
-                    at = builder.add(arguments[7 + beam], first)
-                    dot.store_levels(beam, arguments[5], builder.gep(array(6).data, [at]))
+                    at = builder.add(arguments[8 + beam], first)
+                    dot.store_levels(beam, arguments[5], builder.gep(array(7).data, [at]))
             return context.get_dummy_value()
 
         return signature, codegen
@@ -127,14 +131,14 @@ _interpolate_one, _interpolate_two = _interpolation(1), _interpolation(2)
 
 
 @njit(nogil=True, cache=True)
-def _node_pairs(tiles, tile, offsets, weights, first, last):
+def _node_pairs(tiles, tile, offsets, weights, first, last, n_used):
     """Return pairs of beams of the grid points ``first … last``: (point, part, range) int32, aligned to cache lines."""
     raw = np.empty((last - first + 1) * 2 * RANGES + _LINE // 4, np.int32)
     ahead = (-_address(raw) % _LINE) // 4
     pairs = raw[ahead : ahead + (last - first + 1) * 2 * RANGES].reshape(last - first + 1, 2, RANGES)
     both = np.empty((2, 2 * RANGES), np.int16)
     for node in range(first, last + 1):
-        _node_tile(tiles, tile, offsets, weights, node, both, node % 2)
+        _node_tile(tiles, tile, offsets, weights, node, n_used, both, node % 2)
         if node > first:
             _pair_rows(both, 1 - node % 2, pairs, node - 1 - first)
     return pairs
@@ -156,10 +160,10 @@ def interpolated_beams_envelope_int16(
         if begin == end:
             continue
         first, last = node_span(places, begin, end)
-        pairs = _node_pairs(tiles, tile, offsets, weights, first, last)
-        scale = scales[tile] * weight_scale
         start = np.int64(starts[tile])
         n_used = min(RANGES, stop - start)
+        pairs = _node_pairs(tiles, tile, offsets, weights, first, last, n_used)
+        scale = scales[tile] * weight_scale
         short = np.empty((2, RANGES), np.float32)
         direction = begin
         while direction < end:
@@ -170,13 +174,13 @@ def interpolated_beams_envelope_int16(
                 prefetch_row(out, rows[min(direction + k, end - 1)], start, RANGES)
             if n_used < RANGES:
                 if two:
-                    _interpolate_two(pairs, first, places, tap_weights, direction, scale, short, 0, RANGES)
+                    _interpolate_two(pairs, first, places, tap_weights, direction, scale, n_used, short, 0, RANGES)
                 else:
-                    _interpolate_one(pairs, first, places, tap_weights, direction, scale, short, 0, 0)
+                    _interpolate_one(pairs, first, places, tap_weights, direction, scale, n_used, short, 0, 0)
                 for beam in range(2 if two else 1):
                     out[rows[direction + beam], start:stop] = short[beam, :n_used]
             elif two:
-                _interpolate_two(pairs, first, places, tap_weights, direction, scale, out, row, next_row)
+                _interpolate_two(pairs, first, places, tap_weights, direction, scale, RANGES, out, row, next_row)
             else:
-                _interpolate_one(pairs, first, places, tap_weights, direction, scale, out, row, row)
+                _interpolate_one(pairs, first, places, tap_weights, direction, scale, RANGES, out, row, row)
             direction += 2 if two else 1
