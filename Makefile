@@ -10,7 +10,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 KERNELS := tests/test_kernels.py tests/test_interpolated_beams.py tests/test_beamformers.py tests/test_modulator.py
 ELSEWHERE := --ignore=tests/cuda --ignore=tests/ptx
 
-.PHONY: demo test test-kernels test-host test-simulator test-ptx check docs data pictures bench peers soak gpu clean
+.PHONY: demo test test-kernels test-host test-simulator test-ptx test-arm check docs data pictures bench peers soak gpu clean
 
 $(VENV)/ready: setup.cfg pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -40,6 +40,9 @@ test-simulator: test-kernels
 
 test-ptx: $(VENV)/ready-to-test
 	$(PYTEST) tests/ptx
+
+test-arm: $(VENV)/ready-to-test  ## test the kernels on emulated aarch64; needs Debian and 1 GB in build/arm
+	$(BIN)/python -m tests.arm build/arm
 
 check: $(VENV)/ready-to-test
 	$(BIN)/ruff check .

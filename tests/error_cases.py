@@ -63,14 +63,9 @@ def tuned_for(settings, plan):
     return settings.replace(accuracy=plan)
 
 
-def kernels_for(plan):
-    """Kernels of the CPU, or those of NumPy for 16 bits if the processor has no 16-bit dot product."""
-    return CPU if plan.precision != "int16" or CPU.tile_ranges else kernels.load("numpy")
-
-
 def image_of(measurement, settings):
     """Compute an image with a complete plan: (direction, range) float32."""
-    chain = FastChain(settings, kernels_for(settings.accuracy), threads=1)
+    chain = FastChain(settings, CPU, threads=1)
     image = np.empty((len(chain.grid), len(chain.range_m)), dtype=np.float32)
     chain.process(measurement.data.reshape(len(measurement.data), -1), image)
     return image
@@ -87,7 +82,7 @@ class Rated:
     def predicted(self, plan):
         """Predict the error of a plan with the signal model of the measurement."""
         settings = tuned_for(self.settings, plan)
-        return Planner(settings, kernels_for(plan), threads=1, signal_model=self.signal_model).chosen(plan)
+        return Planner(settings, CPU, threads=1, signal_model=self.signal_model).chosen(plan)
 
     def measured_db(self, plan):
         image = image_of(self.measurement, tuned_for(self.settings, plan))

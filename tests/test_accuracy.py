@@ -10,7 +10,7 @@ from ertis_numba.settings import Accuracy, Processing, Settings
 from ertis_numba.stages.accuracy import PARTS, SignalModel, decibels
 from ertis_numba.stages.planner import Planner
 from tests import reference
-from tests.error_cases import BEST, CPU, PLANS, Rated, image_of, kernels_for, rated
+from tests.error_cases import BEST, CPU, PLANS, Rated, image_of, rated
 from tests.test_real import RAW
 
 OPTIMISTIC_DB, PESSIMISTIC_DB = 1.0, 3.0
@@ -65,7 +65,7 @@ def test_predicted_error_without_measurement_is_pessimistic(seed):
     for name in list(PLANS)[seed % 5 :: 5]:
         plan = PLANS[name]
         measured_db = case.measured_db(plan)
-        chosen = Planner(case.settings.replace(accuracy=plan), kernels_for(plan), threads=1).chosen(plan)
+        chosen = Planner(case.settings.replace(accuracy=plan), CPU, threads=1).chosen(plan)
         # The level of the modulators' noise relative to the echoes is unknown before a measurement.
         if chosen.parts["filter"] < 0.01 * sum(chosen.parts.values()) and measured_db > FLOOR_DB:
             assert chosen.error_db > measured_db - 0.5, name

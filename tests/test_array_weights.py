@@ -125,8 +125,6 @@ def test_single_microphone_has_the_weight_1():
 )
 def test_weighted_image_is_that_of_an_array_with_gains_divided_by_the_weights(device, plan):
     """A weight and the inverse of a gain are the same factor, so the float64 reference needs no weights."""
-    if plan["precision"] == "int16" and not kernels.load(device).tile_ranges:
-        pytest.skip("this processor has no 16-bit dot product (AVX-512 VNNI or AVX-VNNI)")
     wavefront = plan.get("wavefront", "plane")
     rest = {name: value for name, value in plan.items() if name != "wavefront"}
     processing = SHORT.processing.replace(wavefront=wavefront, directions="3d:12", array_weights="hann")

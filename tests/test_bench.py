@@ -2,6 +2,8 @@
 
 import functools
 import json
+import subprocess
+import sys
 import time
 import types
 from pathlib import Path
@@ -13,6 +15,7 @@ from ertis_bench import (
     accuracy,
     checks,
     input_measurements,
+    instruction_sets,
     machine,
     markdown,
     paper,
@@ -74,6 +77,7 @@ def of_few_directions(settings, **options):
 @pytest.mark.usefixtures("hardly_warm")
 def test_paper_command_reports_and_updates(monkeypatch, tmp_path):
     monkeypatch.setattr(paper, "Pipeline", of_few_directions)
+    monkeypatch.setattr(paper, "RESTRICTED", ())  # another process would have all directions
     target = tmp_path / "README.md"
     target.write_text(MARKED.format("paper"), "utf-8")
     other = tmp_path / "other.md"
@@ -96,6 +100,30 @@ def test_paper_command_reports_and_updates(monkeypatch, tmp_path):
     assert "not measured" not in text
     assert "| GPU GTX 1080 Ti | 5.93 ± 0.66 | 51.58 ± 6.38 | 77.02 ± 7.81 |" in text
     assert "timing 1 of each" in result.stderr
+    assert f"Numba, {kernels.load('cpu').instruction_set} |" in text
+
+
+def test_paper_benchmark_times_another_process(monkeypatch):
+    """The process has the instruction set of this one, so that it compiles nothing."""
+    monkeypatch.setattr(instruction_sets, "environment", lambda _: {})
+    with vars(paper)["_restricted"]("AVX2", 1) as child:
+        row, error_db = vars(paper)["_ask"](child, 90)
+    assert row["median_ms"] > 0
+    assert error_db < -35
+    broken, pipe = [sys.executable, "-c", "input()"], subprocess.PIPE
+    with (
+        subprocess.Popen(broken, stdin=pipe, stdout=pipe, text=True) as child,
+        pytest.raises(DataError, match="the process with older instructions has failed"),
+    ):
+        vars(paper)["_ask"](child, 90)
+
+
+@pytest.mark.skipif(not instruction_sets.lesser(), reason="this processor has no older instruction set")
+def test_older_instruction_sets_are_those_of_the_environment():
+    for name in instruction_sets.lesser():
+        code = "from ertis_numba import kernels; print(kernels.load('cpu').instruction_set)"
+        with instruction_sets.start(name, ["-c", code]) as child:
+            assert child.communicate()[0].strip() == name
 
 
 @pytest.mark.usefixtures("hardly_warm")
@@ -222,7 +250,6 @@ def test_ceilings_compute():
     assert strands == pytest.approx(24)
 
 
-@pytest.mark.skipif(kernels.load("cpu").fastest_precision != "int16", reason="this processor has no 16-bit dot product")
 def test_ceiling_of_dot_products_computes():
     strands = np.zeros(3, dtype=np.int32)
     ceilings.dot_16(100, strands)  # twelve sums from 0 to 11, each with 100 times two products of 1

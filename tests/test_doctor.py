@@ -42,9 +42,10 @@ def doctor(tmp_path, monkeypatch):
 
 def test_doctor_reports_a_working_installation(doctor):
     found = doctor()
-    for check in ("ertis", "libraries", "processing"):
+    for check in ("ertis", "libraries", "instructions", "processing"):
         assert {state for state, _, _ in found[check]} == {"good"}
     assert "numba" in found["libraries"][0][1]
+    assert found["instructions"][0][1].startswith(f"{kernels.load('cpu').instruction_set}: ")
     assert "an image of 90 directions takes" in found["processing"][0][1]
     assert "MB/s durably" in found["disk"][0][1]
     assert all(remedy for each in found.values() for state, _, remedy in each if state != "good")

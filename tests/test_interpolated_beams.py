@@ -33,14 +33,6 @@ def kernel_set(request):
     return KERNELS[request.param]
 
 
-@pytest.fixture(params=KERNELS)
-def whole_kernel_set(request):
-    """Device that has the 16-bit kernels."""
-    if not KERNELS[request.param].tile_ranges:
-        pytest.skip("this processor has no 16-bit dot product (AVX-512 VNNI or AVX-VNNI)")
-    return KERNELS[request.param]
-
-
 def some_places(random, n_nodes, n_directions, n_pairs):
     """Random pairs of grid points, including the first and the last."""
     places = random.integers(0, n_nodes - 1, (n_directions, n_pairs)).astype(np.int32)
@@ -154,28 +146,28 @@ def expected_levels(tiles, beams, stop, n_ranges):
 
 @pytest.mark.parametrize("full_scale", [False, True])
 @pytest.mark.parametrize("name", SHAPE_NAMES)
-def test_int16_interpolated_beams_equal_their_reference(whole_kernel_set, name, full_scale):
+def test_int16_interpolated_beams_equal_their_reference(kernel_set, name, full_scale):
     n_ranges = SHAPES[name][3]
-    tiles, beams = whole_input(name, whole_kernel_set.tile_ranges, full_scale=full_scale)
-    out = whole_image(whole_kernel_set, tiles, beams, n_ranges, n_ranges)
+    tiles, beams = whole_input(name, kernel_set.tile_ranges, full_scale=full_scale)
+    out = whole_image(kernel_set, tiles, beams, n_ranges, n_ranges)
     # Only rounding to single precision of exact sums: a sum that is off by one would be seen.
     assert out == pytest.approx(expected_levels(tiles, beams, n_ranges, n_ranges), rel=4e-7)
 
 
 @pytest.mark.parametrize("stop", [1, 50, 95, 96, 97, 150])
-def test_int16_interpolated_beams_fill_only_their_window(whole_kernel_set, stop):
-    (tiles, scales, starts), beams = whole_input(SOME, whole_kernel_set.tile_ranges)
+def test_int16_interpolated_beams_fill_only_their_window(kernel_set, stop):
+    (tiles, scales, starts), beams = whole_input(SOME, kernel_set.tile_ranges)
     mine = starts < stop
     tiles = (tiles[mine], scales[mine], starts[mine])
-    out = whole_image(whole_kernel_set, tiles, beams, stop, 151)
+    out = whole_image(kernel_set, tiles, beams, stop, 151)
     assert out == pytest.approx(expected_levels(tiles, beams, stop, 151), rel=4e-7)
 
 
 @pytest.mark.parametrize("name", sized(["least"], ["prime", "six by six"]))
-def test_int16_interpolated_beams_are_independent_of_the_number_of_blocks(whole_kernel_set, name):
+def test_int16_interpolated_beams_are_independent_of_the_number_of_blocks(kernel_set, name):
     n_ranges, counts = SHAPES[name][3], (*range(1, MAX_BLOCKS + 1), SHAPES[name][5] + 3)
-    tiles, beams = whole_input(name, whole_kernel_set.tile_ranges)
-    images = {whole_image(whole_kernel_set, tiles, beams, n_ranges, n_ranges, count).tobytes() for count in counts}
+    tiles, beams = whole_input(name, kernel_set.tile_ranges)
+    images = {whole_image(kernel_set, tiles, beams, n_ranges, n_ranges, count).tobytes() for count in counts}
     assert len(images) == 1
 
 
@@ -186,8 +178,7 @@ def test_interpolated_beams_are_independent_of_the_number_of_threads():
     for count in range(1, cpu.max_threads + 1):
         with cpu.threads(count):
             out = image_of(cpu, beams, (0, n_ranges), n_ranges, 2).tobytes()
-            if cpu.tile_ranges:
-                tiles, whole = whole_input("eRTIS", cpu.tile_ranges)
-                out += whole_image(cpu, tiles, whole, n_ranges, n_ranges, 2).tobytes()
+            tiles, whole = whole_input("eRTIS", cpu.tile_ranges)
+            out += whole_image(cpu, tiles, whole, n_ranges, n_ranges, 2).tobytes()
             images.add(out)
     assert len(images) == 1

@@ -255,8 +255,6 @@ def test_quantise_tiles_of_silence_gives_zeros(kernel_set):
 @pytest.mark.parametrize("n_mics", sized([1, 32], [1000]))
 def test_delay_and_sum_envelope_int16_equals_its_reference(kernel_set, n_ranges, n_mics):
     tile_ranges = kernel_set.tile_ranges
-    if not tile_ranges:
-        pytest.skip("this processor has no 16-bit dot product (AVX-512 VNNI or AVX-VNNI)")
     random = np.random.default_rng(1)
     n_tiles = -(-n_ranges // tile_ranges)
     starts = np.arange(n_tiles, dtype=np.int32) * np.int32(tile_ranges)
@@ -298,8 +296,6 @@ def test_nan_and_infinity_affect_only_their_own_outputs(kernel_set, value):
 @pytest.mark.parametrize("precision", ["float32", "int16"])
 def test_pipeline_gives_the_same_bits_every_time(precision):
     """The last tile of ranges is only partly filled in this case."""
-    if precision == "int16" and not KERNELS["cpu"].tile_ranges:
-        pytest.skip("this processor has no 16-bit dot product (AVX-512 VNNI or AVX-VNNI)")
     settings = cases.SHORT.replace(
         processing=cases.SHORT.processing.replace(directions="2d:1000", range_m=(0.4, 1.0)),
         accuracy=cases.SHORT.accuracy.replace(precision=precision),

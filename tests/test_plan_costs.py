@@ -1,5 +1,6 @@
 """Plans are chosen by nominal costs unless measured ones are asked for."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -18,7 +19,7 @@ from ertis_numba.stages import costs, nominal_costs, planner
 from ertis_numba.storage import open_energyscapes, write_recording
 from tests.cases import SHORT, noise
 from tests.files import noise as many_noise
-from tests.pages import ROOT
+from tests.pages import ROOT, path_of
 
 CPU = kernels.load("cpu")
 MANY = SHORT.replace(processing=SHORT.processing.replace(directions="3d:2000"), accuracy=Accuracy(max_error_db=-35.0))
@@ -71,7 +72,14 @@ def test_images_contain_the_chosen_plan(monkeypatch, tmp_path):
 def test_nominal_costs_do_not_depend_on_threads_or_hardware():
     plans = {planner.complete(MANY, CPU, threads=threads).to_toml() for threads in (1, CPU.max_threads)}
     assert len(plans) == 1
-    assert costs.nominal_costs(CPU).seconds == nominal_costs.NOMINAL_COSTS["cpu"]
+    assert costs.nominal_costs(CPU).seconds == nominal_costs.NOMINAL_COSTS[f"cpu {CPU.instruction_set}"]
+
+
+@pytest.mark.parametrize(("instruction_set", "precision"), [("AVX2", "int16"), ("NEON", "float32"), ("new", "float32")])
+def test_default_precision_is_the_fastest_of_the_instruction_set(instruction_set, precision):
+    """An unknown instruction set has the costs of NEON."""
+    kernel_set = dataclasses.replace(CPU, instruction_set=instruction_set)
+    assert planner.complete(MANY, kernel_set, threads=1).accuracy.precision == precision
 
 
 @pytest.fixture
@@ -128,7 +136,8 @@ def test_unknown_kinds_of_costs_are_refused():
 def test_cost_table_equals_the_output_of_the_command():
     path = ROOT / "ertis_numba" / "stages" / "nominal_costs.py"
     assert path.read_text("utf-8") == bench_costs.as_python(nominal_costs.NOMINAL_COSTS)
-    assert set(nominal_costs.NOMINAL_COSTS) == set(kernels.DEVICES)
+    assert {name.split()[0] for name in nominal_costs.NOMINAL_COSTS} == set(kernels.DEVICES)
+    assert f"cpu {CPU.instruction_set}" in nominal_costs.NOMINAL_COSTS
     for table in nominal_costs.NOMINAL_COSTS.values():
         assert set(table) == set(costs.UNITS)
         assert all(0 < value < 1 for value in table.values())
@@ -137,23 +146,35 @@ def test_cost_table_equals_the_output_of_the_command():
 def test_costs_command_measures_and_updates_the_table(tmp_path, monkeypatch):
     seconds = dict.fromkeys(costs.UNITS, 1.23456e-9)
     monkeypatch.setattr(bench_costs, "measure", lambda *_: costs.Costs(seconds))
+    monkeypatch.setattr(bench_costs.instruction_sets, "lesser", list)
+    own = f"cpu {CPU.instruction_set}"
     path = tmp_path / "nominal_costs.py"
     path.write_text("")
     done = CliRunner().invoke(cli, ["bench", "costs", "--count", "1", "--update", str(path), "--json", "--quiet"])
     assert done.exit_code == 0, done.output
-    assert json.loads(done.stdout)["costs"]["cpu"] == dict.fromkeys(costs.UNITS, 1.23e-9)
+    assert json.loads(done.stdout)["costs"][own] == dict.fromkeys(costs.UNITS, 1.23e-9)
     made = {}
     exec(path.read_text("utf-8"), made)
-    assert made["NOMINAL_COSTS"]["cpu"] == dict.fromkeys(costs.UNITS, 1.23e-9)
+    assert made["NOMINAL_COSTS"][own] == dict.fromkeys(costs.UNITS, 1.23e-9)
     assert made["NOMINAL_COSTS"]["cuda"] == nominal_costs.NOMINAL_COSTS["cuda"]
     done = CliRunner().invoke(cli, ["bench", "costs", "--count", "1", "--quiet"])
-    assert "| cpu, here | cpu, nominal |" in done.stdout
+    assert f"| {own}, here | {own}, nominal |" in done.stdout
     assert "| sum_float32_few | 1.23 |" in done.stdout
     other = tmp_path / "README.md"
     other.write_text("")
     done = CliRunner().invoke(cli, ["bench", "costs", "--update", str(other)])
+    assert done.exit_code == 1
+    assert "no place for this table" in done.stderr.replace("\n", " ")
+    other = tmp_path / "costs.py"
+    other.write_text("")
+    done = CliRunner().invoke(cli, ["bench", "costs", "--update", str(other)])
     assert done.exit_code == 2
-    assert "README.md is not nominal_costs.py" in done.stderr.replace("\n", " ")
+    assert "costs.py is not nominal_costs.py" in done.stderr.replace("\n", " ")
+
+
+def test_documented_costs_are_the_nominal_ones():
+    table = bench_costs.nominal_as_markdown(nominal_costs.NOMINAL_COSTS)
+    assert table in path_of("accuracy").read_text("utf-8")
 
 
 def test_plans_differ_only_in_time():

@@ -66,8 +66,6 @@ def exact(array, directions, *, spherical):
 @pytest.mark.parametrize("precision", ["float32", "int16"])
 @pytest.mark.parametrize("budget_db", [-35.0, -60.0])
 def test_near_ranges_are_within_the_budget(budget_db, precision):
-    if precision == "int16" and not kernels.load("cpu").tile_ranges:
-        pytest.skip("this processor has no 16-bit dot product (AVX-512 VNNI or AVX-VNNI)")
     settings = tuned(NEAR, max_error_db=budget_db, precision=precision)
     pipeline, measurement = Pipeline(settings, predict=False), noise(settings)
     image = pipeline.process(measurement)

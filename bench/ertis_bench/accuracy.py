@@ -148,7 +148,7 @@ class _Subject:
         for preset, max_error_db in ERROR_PRESETS_DB.items():
             pipeline = Pipeline(settings, max_error_db=max_error_db, predict=False)
             chosen[in_words(pipeline.settings.accuracy)] = preset, pipeline
-        for plan in plans(self._kernels):
+        for plan in plans():
             if in_words(plan) not in chosen:
                 yield in_words(plan), Pipeline(settings.replace(accuracy=plan.replace(max_error_db=0.0)), predict=False)
         for words, (preset, pipeline) in chosen.items():

@@ -1,6 +1,5 @@
 """Compared plans, and their names."""
 
-from ertis_numba.kernels import KernelSet
 from ertis_numba.settings import Accuracy
 
 __all__ = ["BEAMFORMING_KERNELS", "PLANS", "in_words", "plans"]
@@ -62,9 +61,9 @@ def in_words(accuracy: Accuracy) -> str:
     return ", ".join(parts)
 
 
-def plans(kernels: KernelSet) -> list[Accuracy]:
-    """Return complete plans for `PLANS`. Plans with 16 bits are included if the device supports them."""
-    return [_plan(*row) for row in PLANS if row[0] != "int16" or kernels.tile_ranges]
+def plans() -> list[Accuracy]:
+    """Return complete plans for `PLANS`."""
+    return [_plan(*row) for row in PLANS]
 
 
 def _plan(

@@ -15,6 +15,7 @@ from ertis_numba.settings import Array, Settings
 __all__ = ["OPERATIONS_PER_POINT", "SERIES", "reached", "run"]
 
 OPERATIONS_PER_POINT = 8  # one complex multiply-add per direction, range and microphone, without a beam grid
+_PRECISIONS = ("float32", "int16")
 _DEFAULT = "default"  # Name of the default plan. Plans without a beam grid have the name of their precision.
 _BASE = {"directions": 1850, "last_range_m": 5.0, "microphones": 32}
 SERIES: dict[str, tuple[float, ...]] = {
@@ -62,19 +63,15 @@ def run(*, count: int, say: Callable[[str], None]) -> dict[str, Any]:
         "rows": rows,
         "count": count,
         "ceilings": ceilings_found,
-        "delay_and_sum": [reached(rows, precision, ceilings_found[-1]) for precision in _precisions()],
+        "delay_and_sum": [reached(rows, precision, ceilings_found[-1]) for precision in _PRECISIONS],
     }
 
 
 def _series() -> Iterator[tuple[str, str]]:
     """Yield the series. Directions are also varied without a beam grid, which shows the rate of delay-and-sum."""
     for series in (*SERIES, "threads"):
-        for plan in [_DEFAULT, *_precisions()] if series == "directions" else [_DEFAULT]:
+        for plan in [_DEFAULT, *_PRECISIONS] if series == "directions" else [_DEFAULT]:
             yield series, plan
-
-
-def _precisions() -> list[str]:
-    return list(dict.fromkeys(["float32", kernels.load("cpu").fastest_precision]))
 
 
 def _measure(series: str, plan: str, count: int) -> Iterator[dict[str, Any]]:
@@ -132,7 +129,7 @@ def _ceilings(n_threads: int, count: int) -> dict[str, float]:
     subjects: dict[str, Callable[[], object]] = {
         "copy": functools.partial(ceilings.copy, a, out),
         "triad": functools.partial(ceilings.triad, a, b, np.float32(2), out),
-        **{name: functools.partial(turn[name], _TURNS, strands[name]) for name in _precisions()},
+        **{name: functools.partial(turn[name], _TURNS, strands[name]) for name in _PRECISIONS},
     }
     with kernels.load("cpu").threads(n_threads):
         best_s = {name: float(times.min()) / 1e3 for name, times in timing.round_robin(subjects, count=count).items()}
@@ -142,7 +139,7 @@ def _ceilings(n_threads: int, count: int) -> dict[str, float]:
         "triad_gb_s": round(3 * a.nbytes / best_s["triad"] / 1e9, 1),
         **{
             f"{name}_gop_s": round(n_strands * _TURNS * operations[name] / best_s[name] / 1e9, 1)
-            for name in _precisions()
+            for name in _PRECISIONS
         },
     }
 

@@ -14,7 +14,7 @@ from ertis_bench.many import many
 from ertis_bench.markdown import table as _table
 from ertis_bench.network.latency import latency
 from ertis_bench.network.table import network
-from ertis_bench.paper import DIRECTIONS, PUBLISHED_MS
+from ertis_bench.paper import DIRECTIONS, PUBLISHED_MS, RESTRICTED
 from ertis_bench.peers.table import peers
 from ertis_bench.point_errors import form as points
 from ertis_bench.ptx_tables import ptx
@@ -52,7 +52,11 @@ def paper(report: dict[str, Any]) -> str:
     """Return the times, the ratios and the paper's own times, with their conditions."""
     found = {(row["backend"], row["directions"]): row for row in report["rows"]}
     backends = list(dict.fromkeys(row["backend"] for row in report["rows"]))
-    measured = [[_MEANING[backend], *(_statistics(**found[backend, n]) for n in DIRECTIONS)] for backend in backends]
+    meaning = _MEANING | {
+        "cpu": f"{_MEANING['cpu']}, {report['instruction_set']}",
+        **{f"cpu, {name}": f"the same, {name} only" for name in RESTRICTED},
+    }
+    measured = [[meaning[backend], *(_statistics(**found[backend, n]) for n in DIRECTIONS)] for backend in backends]
     ratios = [
         [
             f"`{backend}`",
@@ -95,7 +99,8 @@ def _conditions(report: dict[str, Any]) -> str:
         "`scipy` runs on one thread, like its filters and sums, and processes the whole record, as the paper does. "
         "`paper` takes the same steps with compiled kernels on all cores, and sums only the samples in the window. "
         "`numpy` and `cpu` process the part of the record that the image needs, `cpu` on all cores, `numpy` on one. "
-        "The paper does not state the length of its records."
+        "Rows with an older instruction set were measured on the same machine, in turns with the others. ARM has no "
+        "row, because no such machine was available. The paper does not state the length of its records."
     )
 
 

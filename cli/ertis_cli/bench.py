@@ -123,30 +123,36 @@ def accuracy(*, picture: Path | None, **given: Any) -> None:
 @click.option("--count", type=click.IntRange(min=1), default=5, show_default=True, metavar="N", help="Repetitions.")
 @click.option(
     "--update",
-    "target",
+    "targets",
+    multiple=True,
     type=click.Path(path_type=Path, dir_okay=False, exists=True, writable=True),
     metavar="nominal_costs.py",
-    help="Write the costs into this file of nominal costs, by which plans are chosen. This changes images.",
+    help="Write the costs into this file of nominal costs, by which plans are chosen, or into the table of a Markdown "
+    "file; repeatable. New costs change images.",
 )
 @options.quiet
 @options.as_json
-def costs(*, count: int, target: Path | None, quiet: bool, as_json: bool) -> None:
+def costs(*, count: int, targets: tuple[Path, ...], quiet: bool, as_json: bool) -> None:
     """Measure the kernel costs that the planner uses.
 
-    The table also has the nominal costs.
+    Covers every instruction set of this machine. The table also has the nominal costs.
     """
-    from ertis_bench import costs as benchmark
+    from ertis_bench import costs as benchmark, markdown
 
-    if target is not None and target.name != "nominal_costs.py":
-        raise click.BadParameter(
-            f"{target} is not nominal_costs.py; give that of ertis_numba/stages", param_hint="--update"
-        )
+    for target in targets:
+        if target.suffix == ".md":
+            markdown.around(target, benchmark.MARKER)
+        elif target.name != "nominal_costs.py":
+            raise click.BadParameter(
+                f"{target} is not nominal_costs.py; give that of ertis_numba/stages, or a Markdown file",
+                param_hint="--update",
+            )
     report = benchmark.run(count=count, say=lambda text: options.say(text, quiet=quiet))
-    if target is not None:
+    for target in targets:
         benchmark.update(target, report)
     if as_json:
         options.print_json(report)
-    elif target is None:
+    elif not targets:
         click.echo(benchmark.as_markdown(report))
 
 

@@ -29,8 +29,9 @@ class KernelSet(AdaptiveKernels):
     max_threads : int
         Maximum number of threads.
     tile_ranges : int
-        Ranges in a tile of the 16-bit kernels; 0 if the device cannot run them.
-    fastest_precision : {"float32", "int16"}
+        Ranges in a tile of the 16-bit kernels.
+    instruction_set : str
+        Vector instructions of the CPU's kernels, such as "AVX2"; empty for other devices.
     simulated : bool
         True if the CPU simulates the device, which is fast enough only for tests.
     memory : callable
@@ -44,7 +45,7 @@ class KernelSet(AdaptiveKernels):
     transforms: str
     max_threads: int
     tile_ranges: int
-    fastest_precision: str
+    instruction_set: str
     simulated: bool
     memory: NewMemory
     threads: Threads

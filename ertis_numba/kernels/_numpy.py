@@ -17,7 +17,7 @@ __all__ = ["KERNELS"]
 
 Number = TypeVar("Number", np.float32, np.float64)
 
-_TILE_RANGES = 96  # the same number as in the compiled kernel with AVX-512
+_TILE_RANGES = 96  # as in the compiled kernels
 _NOISE_UNIT = 1 / math.sqrt((2.0**24 - 1) / 3)  # 1 / RMS of a sum of four integers from 0 to 4095, without its mean
 
 
@@ -436,6 +436,6 @@ KERNELS = KernelSet.of(
     memory=HostMemory,
     max_threads=1,
     tile_ranges=_TILE_RANGES,
-    fastest_precision="float32",
+    instruction_set="",
     threads=threads,
 )

@@ -26,7 +26,8 @@ class Accuracy(TomlTable, frozen=True, kw_only=True):
         Error budget in dB, -200 to 0: norm of the difference between the image and the exact image, relative to the
         norm of the exact image. `ERROR_PRESETS_DB` names some budgets.
     precision : {"auto", "float32", "int16"}, default "auto"
-        Number format of the samples that are summed to beams. ``int16`` needs a processor with a 16-bit dot product.
+        Number format of the samples that are summed to beams. ``auto`` chooses the
+        faster one on the instruction set.
     oversampling : int, optional, default None
         Samples kept per range of the energyscape, 1 to 64.
     delay_taps : int, optional, default None

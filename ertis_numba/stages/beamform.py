@@ -8,7 +8,6 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.errors import DeviceError
 from ertis_numba.kernels import KernelSet, Memory
 from ertis_numba.stages.beam_grid import FEWEST_RANGES, BeamGrid
 from ertis_numba.stages.delays import DelayTable, Zone
@@ -21,7 +20,6 @@ __all__ = [
     "Buffers",
     "WholeWeights",
     "beamform",
-    "require_int16",
     "whole_limits",
 ]
 
@@ -45,21 +43,6 @@ class Beamform(Protocol):
         ...
 
 
-def require_int16(kernels: KernelSet) -> None:
-    """Check that the device has a 16-bit dot product.
-
-    Raises
-    ------
-    DeviceError
-        The device has none.
-    """
-    if not kernels.tile_ranges:
-        raise DeviceError(
-            "accuracy.precision is 'int16', but this processor has no 16-bit dot product (AVX-512 VNNI or AVX-VNNI); "
-            "set accuracy.precision to 'float32' or 'auto'"
-        )
-
-
 def beamform(
     precision: str,
     kernels: KernelSet,
@@ -80,15 +63,9 @@ def beamform(
         As for `BeamformFloat32`.
     n_phases : int
         Number of phases of the analytic signals.
-
-    Raises
-    ------
-    DeviceError
-        The precision is ``"int16"``, and the device has no 16-bit dot product.
     """
     if precision == "float32":
         return BeamformFloat32(kernels, memory, window, zones, nodes, threads=threads)
-    require_int16(kernels)
     return BeamformInt16(kernels, memory, zones, nodes, n_phases=n_phases, threads=threads)
 
 

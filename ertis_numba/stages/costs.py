@@ -52,6 +52,7 @@ _FEW_PAIRS, _MANY_PAIRS = 2, 10
 _STREAM = 1.5  # Time of computing and rounding a sample of a stream, relative to rounding a sample.
 _PAIR = 2.0  # Time of a pair of beam-grid points of several streams, which exceed the L2 cache, relative to one grid.
 _COMBINE = 1.0  # Time of adding a stream to an amplitude, relative to the magnitude of a beam.
+_UNKNOWN: Final = "cpu NEON"  # costs of instruction sets without nominal costs; the sums of both have the same form
 UNITS: Final = (
     "call",
     "demodulate_16",
@@ -163,12 +164,13 @@ def _transform(n: int) -> float:
 
 
 def nominal_costs(kernels: KernelSet) -> Costs:
-    """Return the published costs of a device.
+    """Return the published costs of a device, and of the CPU's instruction set.
 
     They are the same on every machine, so that plans are the same on all machines with the same instruction set. Their
     ratios count, not their values: use `measured_costs` to predict times.
     """
-    return Costs(NOMINAL_COSTS[kernels.device])
+    name = f"{kernels.device} {kernels.instruction_set}".strip()
+    return Costs(NOMINAL_COSTS.get(name, NOMINAL_COSTS[_UNKNOWN]))
 
 
 def measured_costs(kernels: KernelSet, threads: int) -> Costs:
@@ -195,7 +197,8 @@ def cache_file(device: str, threads: int, hardware: str = "") -> Path:
 
     Its name depends on the machine, the GPU named by ``hardware``, and the versions of the libraries.
     """
-    machine = [platform.machine(), platform.processor(), platform.node(), os.environ.get("NUMBA_CPU_NAME", "")]
+    machine = [platform.machine(), platform.processor(), platform.node()]
+    machine += [os.environ.get(name, "") for name in ("NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES")]
     with suppress(OSError):
         machine.append(Path("/proc/cpuinfo").read_text("utf-8").partition("\n\n")[0].partition("model name")[2][:80])
     versions = [version(name) for name in ("ertis-numba", "numba", "numpy", "scipy")]
@@ -260,7 +263,7 @@ def measure(kernels: KernelSet, threads: int) -> Costs:
             **_sums(bench, random, 256 // small),
             **_pairs(bench, random, 1024 // small),
         }
-    return Costs({name: seconds.get(name, 1.0) for name in UNITS})  # A kernel that the device cannot run costs 1 s.
+    return Costs({name: seconds[name] for name in UNITS})
 
 
 class _Bench:
@@ -348,17 +351,16 @@ def _sums(bench: _Bench, random: np.random.Generator, n_beams: int) -> dict[str,
         weights = np.full((n_beams, _MICS), 0.01 + 0.02j, dtype=np.complex64)
         took_s = bench.best(kernels.delay_and_sum_envelope, signals, offsets, weights, 0, _RANGES, amplitude)
         found[f"sum_float32_{name}"] = took_s / points
-        if kernels.tile_ranges:
-            tiles, scales, starts = _tiles(kernels, _MICS, n_phases)
-            took_s = bench.best(kernels.quantise_tiles, signals, starts, np.float32(8000), tiles, scales)
-            found["quantise"] = took_s / (tiles.size / 2)
-            places = (rows * tiles.shape[3] + samples).astype(np.int32)
-            whole = np.ones((n_beams, _MICS, 2, 2), dtype=np.int16)
-            took_s = bench.best(
-                kernels.delay_and_sum_envelope_int16,
-                *(tiles, scales, starts, _RANGES, places, whole, np.float32(1), amplitude),
-            )
-            found[f"sum_int16_{name}"] = took_s / points
+        tiles, scales, starts = _tiles(kernels, _MICS, n_phases)
+        took_s = bench.best(kernels.quantise_tiles, signals, starts, np.float32(8000), tiles, scales)
+        found["quantise"] = took_s / (tiles.size / 2)
+        places = (rows * tiles.shape[3] + samples).astype(np.int32)
+        whole = np.ones((n_beams, _MICS, 2, 2), dtype=np.int16)
+        took_s = bench.best(
+            kernels.delay_and_sum_envelope_int16,
+            *(tiles, scales, starts, _RANGES, places, whole, np.float32(1), amplitude),
+        )
+        found[f"sum_int16_{name}"] = took_s / points
     return found
 
 
@@ -386,24 +388,22 @@ def _pairs(bench: _Bench, random: np.random.Generator, n_directions: int) -> dic
                 *(signals, offsets, weights, places, taps, rows, 0, _RANGES, 1, amplitude),
             )
         )
-        if kernels.tile_ranges:
-            tiles, scales, starts = _tiles(kernels, 1, 1)
-            whole = np.ones((n_nodes, 1, 2, 2), dtype=np.int16)
-            integer_taps = np.full((n_directions, n_pairs, 2), 900, dtype=np.int16)
-            took_s["int16"].append(
-                bench.best(
-                    kernels.interpolated_beams_envelope_int16,
-                    *(tiles, scales, starts, _RANGES, offsets, whole, places, integer_taps, rows, np.float32(1), 1),
-                    amplitude,
-                )
+        tiles, scales, starts = _tiles(kernels, 1, 1)
+        whole = np.ones((n_nodes, 1, 2, 2), dtype=np.int16)
+        integer_taps = np.full((n_directions, n_pairs, 2), 900, dtype=np.int16)
+        took_s["int16"].append(
+            bench.best(
+                kernels.interpolated_beams_envelope_int16,
+                *(tiles, scales, starts, _RANGES, offsets, whole, places, integer_taps, rows, np.float32(1), 1),
+                amplitude,
             )
+        )
     found: dict[str, float] = {}
     for precision, times_s in took_s.items():
-        if times_s:
-            few_s, many_s = (time_s / points for time_s in times_s)
-            pair = found[f"pair_{precision}"] = max((many_s - few_s) / (_MANY_PAIRS - _FEW_PAIRS), 1e-3 * many_s)
-            image = max(few_s - _FEW_PAIRS * pair, 1e-3 * few_s)
-            found["image"] = min(image, found.get("image", math.inf))
+        few_s, many_s = (time_s / points for time_s in times_s)
+        pair = found[f"pair_{precision}"] = max((many_s - few_s) / (_MANY_PAIRS - _FEW_PAIRS), 1e-3 * many_s)
+        image = max(few_s - _FEW_PAIRS * pair, 1e-3 * few_s)
+        found["image"] = min(image, found.get("image", math.inf))
     return found
 
 

@@ -19,7 +19,7 @@ _NEEDLESS = 0.02  # Share of the budget below which the error of a step is negli
 _SMALL = 0.1  # Share of the budget for steps whose error costs little to reduce.
 
 
-def open_plans(model: PlanModel, budget: float, *, has_int16: bool) -> list[ImagePlan]:
+def open_plans(model: PlanModel, budget: float) -> list[ImagePlan]:
     """Return the plans that the settings permit, except needlessly accurate ones.
 
     Parameters
@@ -27,15 +27,13 @@ def open_plans(model: PlanModel, budget: float, *, has_int16: bool) -> list[Imag
     model : PlanModel
     budget : float
         Largest error power of a plan, relative to the exact image.
-    has_int16 : bool
-        True if the device has a 16-bit dot product.
     """
     given = model.settings.accuracy
     adaptive = model.settings.processing.is_adaptive
     if adaptive and model.settings.processing.wavefront == "spherical":
-        return _open_streams(model, budget, has_int16=has_int16)
+        return _open_streams(model, budget)
     precisions = ["float32"] if given.precision == "auto" else [given.precision]
-    if given.precision == "auto" and has_int16 and not adaptive:
+    if given.precision == "auto" and not adaptive:
         precisions.append("int16")
     zones = _zone_count(model, budget)
     plans = (
@@ -51,7 +49,7 @@ def open_plans(model: PlanModel, budget: float, *, has_int16: bool) -> list[Imag
             )
         ]
     )
-    return plans + _open_streams(model, budget, has_int16=has_int16) if adaptive else plans
+    return plans + _open_streams(model, budget) if adaptive else plans
 
 
 def _may_be_plain(given: Accuracy) -> bool:
@@ -59,11 +57,11 @@ def _may_be_plain(given: Accuracy) -> bool:
     return given.precision != "int16" and given.delay_taps in {None, 1} and not given.beam_taps
 
 
-def _open_streams(model: PlanModel, budget: float, *, has_int16: bool) -> list[ImagePlan]:
+def _open_streams(model: PlanModel, budget: float) -> list[ImagePlan]:
     """Return the candidates that compute an adaptive beamformer from streams."""
     given = model.settings.accuracy
     complete = _may_be_plain(given) and None not in {given.oversampling, given.delay_taps, given.beam_taps}
-    if not (model.has_streams and has_int16) or given.precision == "float32" or complete:
+    if not model.has_streams or given.precision == "float32" or complete:
         return []
     zones, stop_bands_db = _zone_count(model, budget), _stop_bands_db(model, budget)
     found: list[ImagePlan] = []

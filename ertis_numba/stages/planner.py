@@ -11,7 +11,6 @@ from ertis_numba.errors import ArgumentError
 from ertis_numba.kernels import KernelSet
 from ertis_numba.settings import Accuracy, Settings
 from ertis_numba.stages.accuracy import PARTS, ErrorModel, SignalModel, decibels
-from ertis_numba.stages.beamform import require_int16
 from ertis_numba.stages.costs import PLAN_COSTS, Costs, PlanCosts, cache_file, measured_costs, nominal_costs
 from ertis_numba.stages.fitting import one_thread
 from ertis_numba.stages.memory import available_bytes
@@ -98,11 +97,6 @@ class Planner:
         Sensitivity of the beamformer; by default, a safe estimate for any sound.
     plan : {"nominal", "measured"}
         Costs that decide between plans and predict times: published ones, or those measured on this machine.
-
-    Raises
-    ------
-    DeviceError
-        The settings ask for int16, and the device has no dot product of 16 bits.
     """
 
     def __init__(
@@ -121,8 +115,6 @@ class Planner:
         self._costs_kind = plan
         self._kernels = kernels
         self._max_bytes = max_bytes
-        if settings.accuracy.precision == "int16":
-            require_int16(kernels)
         self._threads = threads
         self._plans = PlanModel(settings, signal_model, tile_ranges=kernels.tile_ranges)
         beamformer = BEAMFORMERS[settings.processing.beamformer]
@@ -158,7 +150,7 @@ class Planner:
         # budget applies to the beams; see `ertis_numba.prediction` for the warning.
         budget = self._sensitivity.beams(allowed)
         with one_thread():
-            plans = open_plans(self._plans, budget, has_int16=bool(self._kernels.tile_ranges))
+            plans = open_plans(self._plans, budget)
             if not plans:
                 raise ArgumentError(_no_plan(self.settings))
             sizes = [self._plans.n_bytes(plan) for plan in plans]

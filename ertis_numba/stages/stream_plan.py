@@ -334,7 +334,7 @@ class StreamPlanner:
         n_directions, n_terms = len(self._aperture.directions), self._n_mics * n_delay_taps
         if not beam_taps:
             return n_directions * n_terms
-        return n_points * n_terms + n_directions * beam_taps**self._aperture.n_axes // 2
+        return n_points * n_terms + int(n_directions * beam_taps**self._aperture.n_axes // 2)
 
     def _missed(self, place: int) -> float:
         """Return the error power of the image if a power sum is left out."""

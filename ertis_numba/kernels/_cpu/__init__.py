@@ -17,7 +17,8 @@ from numba.core import event
 from ertis_numba import checks
 from ertis_numba.errors import DeviceError
 from ertis_numba.kernels import _compiling
-from ertis_numba.kernels._cpu.dot16 import HAS_INT16_DOT, RANGES
+from ertis_numba.kernels._cpu.dot16 import RANGES
+from ertis_numba.kernels._cpu.features import INSTRUCTION_SET
 from ertis_numba.kernels._host import HostMemory
 from ertis_numba.kernels._kernel_set import KernelSet, twins_in
 
@@ -84,7 +85,7 @@ KERNELS = KernelSet.of(
     simulated=False,
     memory=HostMemory,
     max_threads=_MAX_THREADS,
-    tile_ranges=RANGES if HAS_INT16_DOT else 0,
-    fastest_precision="int16" if HAS_INT16_DOT else "float32",
+    tile_ranges=RANGES,
+    instruction_set=INSTRUCTION_SET.name,
     threads=threads,
 )

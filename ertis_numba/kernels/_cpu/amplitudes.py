@@ -10,10 +10,11 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from ertis_numba.kernels._cpu.dot16 import FLOATS, LANES, RANGES, VECTORS
+from ertis_numba.kernels._cpu.dot16 import FLOATS, LANES, RANGES
 
 __all__ = ["amplitudes_of"]
 
+_VECTORS = RANGES // LANES
 _SIZE, _FLOAT = ir.IntType(64), ir.FloatType()
 _ZEROS = ir.Constant(FLOATS, [0.0] * LANES)
 
@@ -65,20 +66,20 @@ def _newton(rows, sums, work, n_powers, k):
     """Store ``k e_k = Σ_i (−1)^(i − 1) e_(k − i) p_i``, divided by k, as row ``k − 1`` of ``work``."""
     builder, size = rows.builder, n_powers.type
     one = size(1)
-    totals = [[cgutils.alloca_once(builder, FLOATS) for _ in range(VECTORS)] for _ in (0, 1)]
+    totals = [[cgutils.alloca_once(builder, FLOATS) for _ in range(_VECTORS)] for _ in (0, 1)]
     last = builder.sub(k, one)
     has_own = builder.icmp_signed("<=", k, n_powers)
     sign = _sign(builder, k)
     own_row = builder.select(has_own, last, size(0))
     own_sign = rows.splat(builder.select(has_own, sign, _FLOAT(0.0)))
     for part in (0, 1):
-        for vector in range(VECTORS):
+        for vector in range(_VECTORS):
             builder.store(builder.fmul(rows.load(sums, own_row, part, vector), own_sign), totals[part][vector])
     count = builder.select(builder.icmp_signed("<", last, n_powers), last, n_powers)
     with cgutils.for_range(builder, count) as loop:  # of i − 1
         signs = rows.splat(_sign(builder, builder.add(loop.index, one)))
         less = builder.sub(builder.sub(last, one), loop.index)
-        for vector in range(VECTORS):
+        for vector in range(_VECTORS):
             x, y = (builder.fmul(rows.load(sums, loop.index, part, vector), signs) for part in (0, 1))
             a, b = (rows.load(work, less, part, vector) for part in (0, 1))
             real, imag = (builder.load(totals[part][vector]) for part in (0, 1))
@@ -88,7 +89,7 @@ def _newton(rows, sums, work, n_powers, k):
             builder.store(imag, totals[1][vector])
     share = rows.splat(builder.fdiv(_FLOAT(1.0), builder.sitofp(k, _FLOAT)))
     for part in (0, 1):
-        for vector in range(VECTORS):
+        for vector in range(_VECTORS):
             rows.store(builder.fmul(builder.load(totals[part][vector]), share), work, last, part, vector)
 
 
@@ -133,7 +134,7 @@ def amplitudes_of(typing_context, sums, n_powers, order, beam, total, n_mics, wo
             for branch, is_weighted in ((then, True), (otherwise, False)):
                 with branch:
                     count = rows.splat(n_mics)
-                    for vector in range(VECTORS):
+                    for vector in range(_VECTORS):
                         level = rows.root(rows.power(*(rows.load(work, last, part, vector) for part in (0, 1))))
                         if is_weighted:
                             level = builder.fmul(level, _coherence(rows, sums, beam, total, count, vector))

@@ -9,16 +9,13 @@ from numba import njit, prange, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from ertis_numba.kernels._cpu.features import target_features
+from ertis_numba.kernels._cpu.dot16 import LANES, PAIRS, SUMS, TOTALS, add_products
 
 __all__ = ["DOT_16_OPERATIONS", "MULTIPLY_ADD_OPERATIONS", "copy", "dot_16", "multiply_add", "triad"]
 
-_FEATURES = target_features()
-_LANES = 16 if "avx512f" in _FEATURES else 8
 _SUMS = 12  # independent sums: two units with a latency of four need at least eight
-_DOT_LANES = 16 if "avx512vnni" in _FEATURES else 8
-MULTIPLY_ADD_OPERATIONS = 2 * _LANES * _SUMS
-DOT_16_OPERATIONS = 4 * _DOT_LANES * _SUMS
+MULTIPLY_ADD_OPERATIONS = 2 * LANES * _SUMS
+DOT_16_OPERATIONS = 4 * LANES * _SUMS
 """Operations of one turn on one strand; a multiply-add counts as two."""
 
 
@@ -43,7 +40,7 @@ def _multiply_add(typing_context, turns, factor, addend):
 
     def codegen(context, builder, signature, arguments):
         turns, *numbers = arguments
-        vector = ir.VectorType(ir.FloatType(), _LANES)
+        vector = ir.VectorType(ir.FloatType(), LANES)
         x, y = (_splat(builder, number, vector) for number in numbers)
 
         def turn(total):
@@ -58,21 +55,17 @@ def _multiply_add(typing_context, turns, factor, addend):
 
 @intrinsic
 def _dot_16(typing_context, turns, factor, addend):
-    """Return the total of independent sums of 16-bit dot products, two products per lane and turn."""
+    """Return a total of independent sums of 16-bit dot products, two products per lane and turn."""
     signature = types.int32(turns, factor, addend)
 
     def codegen(context, builder, signature, arguments):
         turns, *numbers = arguments
-        vector = ir.VectorType(ir.IntType(32), _DOT_LANES)
-        pairs = ir.VectorType(ir.IntType(16), 2 * _DOT_LANES)
-        x, y = (builder.bitcast(_splat(builder, number, vector), pairs) for number in numbers)
-        dot_type = ir.FunctionType(vector, [vector, pairs, pairs])
-        dot = cgutils.get_or_insert_function(builder.module, dot_type, f"llvm.x86.avx512.vpdpwssd.{32 * _DOT_LANES}")
+        x, y = (builder.bitcast(_splat(builder, number, SUMS), PAIRS) for number in numbers)
 
         def turn(total):
-            builder.store(builder.call(dot, [builder.load(total), x, y]), total)
+            builder.store(add_products(builder, builder.load(total), x, y), total)
 
-        total = _run(builder, turns, vector, turn, builder.add)
+        total = _run(builder, turns, TOTALS, turn, builder.add)
         return builder.extract_element(total, ir.Constant(ir.IntType(32), 0))
 
     return signature, codegen

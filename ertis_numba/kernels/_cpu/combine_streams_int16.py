@@ -7,10 +7,11 @@ L1 cache until the amplitude is computed.
 
 import numpy as np
 from numba import njit, prange, types
+from numba.core import cgutils
 from numba.extending import intrinsic
 
 from ertis_numba.kernels._cpu.amplitudes import amplitudes_of
-from ertis_numba.kernels._cpu.dot16 import RANGES, Dot16
+from ertis_numba.kernels._cpu.dot16 import INT32, RANGES, Dot16
 from ertis_numba.kernels._cpu.nodes16 import fill_pairs, new_pairs
 from ertis_numba.kernels._cpu.spans import node_span
 
@@ -29,8 +30,9 @@ def _sum_terms(typing_context, tiles, tile, offsets, weights, begin, n_terms, sc
             return context.make_array(signature.args[k])(context, builder, arguments[k])
 
         dot = Dot16(builder)
-        dot.flat_terms(array(0), arguments[1], array(2), array(3), arguments[4], arguments[5])
-        dot.store_parts(arguments[6], builder.gep(array(7).data, [arguments[8]]))
+        with dot.passes(arguments[4].type(RANGES)) as first:
+            dot.add_flat_terms(array(0), arguments[1], array(2), array(3), arguments[4], arguments[5], first)
+            dot.store_parts(arguments[6], builder.gep(array(7).data, [builder.add(arguments[8], first)]))
         return context.get_dummy_value()
 
     return signature, codegen
@@ -45,9 +47,15 @@ def _sum_nodes(typing_context, pairs, skipped, places, weights, first_pair, n_pa
         def array(k):
             return context.make_array(signature.args[k])(context, builder, arguments[k])
 
-        dot = Dot16(builder)
-        dot.node_pairs(array(0).data, arguments[1], array(2), array(3), arguments[4], arguments[5])
-        dot.store_parts(arguments[6], builder.gep(array(7).data, [arguments[8]]))
+        size, dot = arguments[4].type, Dot16(builder)
+        values = builder.bitcast(array(3).data, INT32.as_pointer())
+        with dot.passes(size(RANGES)) as first:
+            with cgutils.for_range(builder, arguments[5]) as loop:
+                entry = builder.add(arguments[4], loop.index)
+                node = builder.sext(builder.load(builder.gep(array(2).data, [entry])), size)
+                begin = builder.mul(builder.sub(node, arguments[1]), size(2 * RANGES))
+                dot.add_real_term(array(0).data, builder.add(begin, first), [dot.pair(values, entry)])
+            dot.store_parts(arguments[6], builder.gep(array(7).data, [builder.add(arguments[8], first)]))
         return context.get_dummy_value()
 
     return signature, codegen
@@ -112,6 +120,7 @@ def combine_streams_int16(
                     weights[entry : entry + size].reshape(n_points, n_terms, 2, 2),
                     first,
                     last,
+                    RANGES,
                     pairs[row : row + last - first + 1],
                 )
             entry += size

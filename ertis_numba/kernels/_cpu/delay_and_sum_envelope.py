@@ -28,8 +28,9 @@ def _beam_tile(typing_context, signals, offsets, weights, direction, first, out,
 
         direction, first = arguments[3:5]
         dot = Dot32(builder)
-        dot.complex_terms(array(0), array(1), array(2), direction, first)
-        dot.store_levels(builder.gep(array(5).data, [arguments[6]]))
+        with dot.passes(first.type) as ahead:
+            dot.add_complex_terms(array(0), array(1), array(2), direction, builder.add(first, ahead))
+            dot.store_levels(builder.gep(array(5).data, [builder.add(arguments[6], ahead)]))
         return context.get_dummy_value()
 
     return signature, codegen

@@ -1,11 +1,11 @@
 """Unpack, decimate and remove the group delay in one pass over the PDM words.
 
-A word is used directly as a mask: bit m decides if a tap is added for microphone m. One tap of all microphones of a
-word is one masked vector addition, ``sums += bits(word) ? tap : 0``. Since ``x = 2 · bit − 1``, the filtered signal is
-twice that sum minus the sum of the taps.
+Bit m of a word decides if a tap is added for microphone m. One tap of all microphones of a word is one masked vector
+addition, ``sums += bits(word) ? tap : 0``. Since ``x = 2 · bit − 1``, the filtered signal is twice that sum minus the
+sum of the taps.
 
-With 16-bit taps, 32 microphones fit in one vector of AVX-512, and the word is loaded into a mask register unchanged.
-This is about five times as fast as a table of the filter's response to 10 bits at a time.
+With 16-bit taps, 32 microphones fit in one vector of AVX-512 or two of AVX2. This is about five times as fast as a
+table of the filter's response to 10 bits at a time.
 """
 
 import numpy as np
@@ -14,21 +14,23 @@ from numba import njit, prange, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+from ertis_numba.kernels._cpu.features import INSTRUCTION_SET
 from ertis_numba.kernels._cpu.spans import clear
 
 __all__ = ["demodulate_words"]
 
 _GROUP = 4  # outputs summed in parallel: enough chains to hide the latency of an addition
+_HAS_MASKS = INSTRUCTION_SET.has_masks
 _TILE = 32  # outputs collected before they are transposed from (sample, mic) to (mic, sample)
 
 
 @intrinsic
 def _sum_masked_taps(typing_context, words, first, step, taps, tile, row):
-    """Fill rows ``row … row + _GROUP`` of ``tile`` (output, bit) with the sums of the masked taps.
+    """Fill rows ``row … row + _GROUP`` of ``tile`` (output, lane) with the sums of the masked taps.
 
-    ``tile[row + g, bit] = Σ_t taps[t] · bit_of(words.flat[first + g · step + t · n_words])``; n_words is the last axis
-    of ``words``. The code uses LLVM's vector types, because no loop over bits keeps the sums of a whole word in
-    registers.
+    ``tile[row + g, lane] = Σ_t taps[t] · bit_of(words.flat[first + g · step + t · n_words])`` for the bit of `_lane`;
+    n_words is the last axis of ``words``. The code uses LLVM's vector types, because no loop over bits keeps the sums
+    of a whole word in registers.
     """
     signature = types.void(words, types.intp, types.intp, taps, tile, types.intp)
 
@@ -42,7 +44,6 @@ def _sum_masked_taps(typing_context, words, first, step, taps, tile, row):
         n_taps = cgutils.unpack_tuple(builder, taps_array.shape)[0]
         number = signature.args[3].dtype.bitwidth
         vector = ir.VectorType(ir.IntType(number), lanes)
-        mask = ir.VectorType(ir.IntType(1), lanes)
         lane_0 = ir.Constant(ir.IntType(32), 0)
         all_lanes_0 = ir.Constant(ir.VectorType(ir.IntType(32), lanes), [0] * lanes)
         zero = ir.Constant(vector, [0] * lanes)
@@ -58,7 +59,8 @@ def _sum_masked_taps(typing_context, words, first, step, taps, tile, row):
             ahead = builder.mul(loop.index, n_words)
             for start, total in zip(starts, sums, strict=True):
                 word = builder.load(builder.gep(words_array.data, [builder.add(start, ahead)]))
-                chosen = builder.select(builder.bitcast(word, mask), tap, zero)
+                is_set = _bits_of(builder, word, vector)
+                chosen = builder.select(is_set, tap, zero)
                 builder.store(builder.add(builder.load(total), chosen), total)
         for g, total in enumerate(sums):
             place = builder.mul(builder.add(row, ir.Constant(row.type, g)), ir.Constant(row.type, lanes))
@@ -69,13 +71,36 @@ def _sum_masked_taps(typing_context, words, first, step, taps, tile, row):
     return signature, codegen
 
 
+def _bits_of(builder, word, vector):
+    """Return a mask with the bit of each lane. Without mask registers, each lane tests a bit of the word."""
+    if _HAS_MASKS:
+        return builder.bitcast(word, ir.VectorType(ir.IntType(1), vector.count))
+    lanes, number = vector.count, vector.element.width
+    n_pieces = max(1, lanes // number)
+    whole = ir.VectorType(ir.IntType(n_pieces * number), lanes // n_pieces)
+    blank, index = ir.Constant(whole, ir.Undefined), ir.IntType(32)
+    word = builder.insert_element(blank, builder.zext(word, whole.element), ir.Constant(index, 0))
+    zeros = ir.Constant(ir.VectorType(index, whole.count), [0] * whole.count)
+    pieces = builder.bitcast(builder.shuffle_vector(word, blank, zeros), vector)
+    tested = ir.Constant(vector, [1 << lane // n_pieces for lane in range(lanes)])
+    return builder.icmp_unsigned("!=", builder.and_(pieces, tested), ir.Constant(vector, [0] * lanes))
+
+
+@njit(nogil=True, cache=True)
+def _lane(bit, word_bits, tap_bits):
+    """Return the lane of a bit. Without mask registers, consecutive lanes hold consecutive pieces of the word."""
+    if _HAS_MASKS:
+        return bit
+    return bit // tap_bits + bit % tap_bits * max(1, word_bits // tap_bits)
+
+
 @njit(nogil=True, cache=True)
 def _turn_tile(tile, word, channels, tap_total, scale, begin, end, out):
-    """Write the sums of one word's channels, from ``tile`` (sample, bit) to ``out`` (mic, sample)."""
+    """Write the sums of one word's channels, from ``tile`` (sample, lane) to ``out`` (mic, sample)."""
     word_bits = tile.shape[1]
     for mic in range(channels.size):
         if channels[mic] // word_bits == word:
-            bit = channels[mic] % word_bits
+            bit = _lane(channels[mic] % word_bits, word_bits, 8 * tile.itemsize)
             for n in range(begin, end):
                 out[mic, n] = np.float32(2 * np.int32(tile[n - begin, bit]) - tap_total) * scale
 

@@ -1,43 +1,66 @@
 """Beams on a coarse grid by delay-and-sum, interpolated to all directions, on 16-bit samples.
 
-Both steps use the CPU's 16-bit dot product. In the second step, a pair consists of two neighbouring grid points at one
+Both steps multiply pairs of 16-bit numbers. In the second step, a pair consists of two neighbouring grid points at one
 range. An instruction therefore adds two grid points at once, and loads never cross a cache line. The grid beams of a
 tile stay in the L2 cache between the steps.
 """
 
 import numpy as np
+from llvmlite import ir
 from numba import njit, prange, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from ertis_numba.kernels._cpu.dot16 import RANGES, Dot16
+from ertis_numba.kernels._cpu.dot16 import INT32, RANGES, Dot16
 from ertis_numba.kernels._cpu.nodes16 import fill_pairs, new_pairs
-from ertis_numba.kernels._cpu.spans import node_span
+from ertis_numba.kernels._cpu.spans import node_span, prefetch_row, same_places
 
 __all__ = ["interpolated_beams_envelope_int16"]
 
 
-@intrinsic
-def _interpolate_tile(typing_context, pairs, skipped, places, weights, direction, scale, out, place):
-    """Fill ``out.flat[place : place + RANGES]`` from the pairs of grid points around ``direction``.
+def _interpolation(n_beams):
+    """Return an intrinsic that interpolates one direction, or two that share their grid points."""
 
-    ``pairs`` is (point, part, range) int32, and its first point is ``skipped``. Each number holds a grid point in its
-    low 16 bits and the next one in its high 16 bits.
-    """
-    signature = types.void(pairs, types.intp, places, weights, types.intp, types.float32, out, types.intp)
+    @intrinsic
+    def interpolate(typing_context, pairs, skipped, places, weights, direction, scale, n_used, out, place, next_place):
+        """Fill ``out.flat[place : place + n_used]`` or more, up to `RANGES`; a second direction has ``next_place …``.
 
-    def codegen(context, builder, signature, arguments):
-        def array(k):
-            return context.make_array(signature.args[k])(context, builder, arguments[k])
+        ``pairs`` is (point, part, range) int32, and its first point is ``skipped``. Each number holds a grid point in
+        its low 16 bits and the next one in its high 16 bits.
+        """
+        integer = types.intp
+        numbers = (integer, types.float32, integer)
+        signature = types.void(pairs, integer, places, weights, *numbers, out, integer, integer)
 
-        n_pairs = cgutils.unpack_tuple(builder, array(2).shape)[1]
-        first_pair = builder.mul(arguments[4], n_pairs)
-        dot = Dot16(builder)
-        dot.node_pairs(array(0).data, arguments[1], array(2), array(3), first_pair, n_pairs)
-        dot.store_levels(arguments[5], builder.gep(array(6).data, [arguments[7]]))
-        return context.get_dummy_value()
+        def codegen(context, builder, signature, arguments):
+            def array(k):
+                return context.make_array(signature.args[k])(context, builder, arguments[k])
 
-    return signature, codegen
+            direction, size = arguments[4], arguments[4].type
+            n_pairs = cgutils.unpack_tuple(builder, array(2).shape)[1]
+            values = builder.bitcast(array(3).data, INT32.as_pointer())
+            first_pair = builder.mul(direction, n_pairs)
+            dot = Dot16(builder, n_beams)
+            with dot.passes(arguments[6]) as first:
+                with cgutils.for_range(builder, n_pairs) as loop:
+                    entry = builder.add(first_pair, loop.index)
+                    node = builder.sext(builder.load(builder.gep(array(2).data, [entry])), size)
+                    begin = builder.mul(builder.sub(node, arguments[1]), ir.Constant(size, 2 * RANGES))
+                    entries = [entry, builder.add(entry, n_pairs)][:n_beams]
+                    dot.add_real_term(
+                        array(0).data, builder.add(begin, first), [dot.pair(values, at) for at in entries]
+                    )
+                for beam in range(n_beams):
+                    at = builder.add(arguments[8 + beam], first)
+                    dot.store_levels(beam, arguments[5], builder.gep(array(7).data, [at]))
+            return context.get_dummy_value()
+
+        return signature, codegen
+
+    return interpolate
+
+
+_interpolate_one, _interpolate_two = _interpolation(1), _interpolation(2)
 
 
 @njit(parallel=True, nogil=True, cache=True)
@@ -48,6 +71,7 @@ def interpolated_beams_envelope_int16(
     n_directions, n_ranges = out.shape
     n_tiles = tiles.shape[0]
     block = (n_directions + n_blocks - 1) // n_blocks
+    same = same_places(places)
     for part in prange(n_tiles * n_blocks):
         tile = part // n_blocks
         begin = min(part % n_blocks * block, n_directions)
@@ -55,14 +79,28 @@ def interpolated_beams_envelope_int16(
         if begin == end:
             continue
         first, last = node_span(places, begin, end)
+        start = np.int64(starts[tile])
+        n_used = min(RANGES, stop - start)
         pairs = new_pairs(last - first + 1)
-        fill_pairs(tiles, tile, offsets, weights, first, last, pairs)
+        fill_pairs(tiles, tile, offsets, weights, first, last, n_used, pairs)
         scale = scales[tile] * weight_scale
-        short = np.empty((1, RANGES), np.float32)
-        for direction in range(begin, end):
-            if starts[tile] + RANGES > stop:
-                _interpolate_tile(pairs, first, places, tap_weights, direction, scale, short, 0)
-                out[rows[direction], starts[tile] : stop] = short[0, : stop - starts[tile]]
+        short = np.empty((2, RANGES), np.float32)
+        direction = begin
+        while direction < end:
+            two = direction + 1 < end and same[direction]
+            row = rows[direction] * np.int64(n_ranges) + start
+            next_row = rows[min(direction + 1, end - 1)] * np.int64(n_ranges) + start
+            for k in range(2, 4):
+                prefetch_row(out, rows[min(direction + k, end - 1)], start, RANGES)
+            if n_used < RANGES:
+                if two:
+                    _interpolate_two(pairs, first, places, tap_weights, direction, scale, n_used, short, 0, RANGES)
+                else:
+                    _interpolate_one(pairs, first, places, tap_weights, direction, scale, n_used, short, 0, 0)
+                for beam in range(2 if two else 1):
+                    out[rows[direction + beam], start:stop] = short[beam, :n_used]
+            elif two:
+                _interpolate_two(pairs, first, places, tap_weights, direction, scale, RANGES, out, row, next_row)
             else:
-                place = rows[direction] * np.int64(n_ranges) + starts[tile]
-                _interpolate_tile(pairs, first, places, tap_weights, direction, scale, out, place)
+                _interpolate_one(pairs, first, places, tap_weights, direction, scale, RANGES, out, row, row)
+            direction += 2 if two else 1

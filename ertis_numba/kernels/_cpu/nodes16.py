@@ -26,18 +26,22 @@ def _address(typing_context, array):
 
 
 @intrinsic
-def _node_tile(typing_context, tiles, tile, offsets, weights, node, rows, row):
-    """Fill ``rows[row]``, (part, range) int16, with the rounded upper 16 bits of the beam of a grid point."""
-    signature = types.void(tiles, types.intp, offsets, weights, types.intp, rows, types.intp)
+def _node_tile(typing_context, tiles, tile, offsets, weights, node, n_used, rows, row):
+    """Fill ``n_used`` ranges or more of ``rows[row]``, (part, range) int16, with a beam of a grid point.
+
+    The beam is that of the contract: the rounded upper 16 bits of its sums.
+    """
+    signature = types.void(tiles, types.intp, offsets, weights, types.intp, types.intp, rows, types.intp)
 
     def codegen(context, builder, signature, arguments):
         def array(k):
             return context.make_array(signature.args[k])(context, builder, arguments[k])
 
-        dot = Dot16(builder)
-        dot.complex_terms(array(0), arguments[1], array(2), array(3), arguments[4])
-        size = ir.Constant(arguments[6].type, 2 * RANGES)
-        dot.store_upper_halves(builder.gep(array(5).data, [builder.mul(arguments[6], size)]))
+        dot, row = Dot16(builder), arguments[7]
+        begin = builder.mul(row, ir.Constant(row.type, 2 * RANGES))
+        with dot.passes(arguments[5]) as first:
+            dot.add_complex_terms(array(0), arguments[1], array(2), array(3), arguments[4], first)
+            dot.store_upper_halves(builder.gep(array(6).data, [builder.add(begin, first)]))
         return context.get_dummy_value()
 
     return signature, codegen
@@ -84,13 +88,14 @@ def new_pairs(count):
 
 
 @njit(nogil=True, cache=True)
-def fill_pairs(tiles, tile, offsets, weights, first, last, pairs):
+def fill_pairs(tiles, tile, offsets, weights, first, last, n_used, pairs):
     """Fill ``pairs``, (point, part, range), with the beams of the grid points ``first … last`` and their successors.
 
-    Each number holds a grid point in its low 16 bits and the next one in its high 16 bits.
+    Each number holds a grid point in its low 16 bits and the next one in its high 16 bits. Ranges from ``n_used``
+    on are arbitrary.
     """
     both = np.empty((2, 2 * RANGES), np.int16)
     for node in range(first, last + 1):
-        _node_tile(tiles, tile, offsets, weights, node, both, node % 2)
+        _node_tile(tiles, tile, offsets, weights, node, n_used, both, node % 2)
         if node > first:
             _pair_rows(both, 1 - node % 2, pairs, node - 1 - first)

@@ -30,6 +30,6 @@ def kernel_set(*, hardware: str, transforms: str, memory: NewMemory) -> KernelSe
         memory=memory,
         max_threads=1,
         tile_ranges=TILE_RANGES,
-        fastest_precision="float32",
+        instruction_set="",
         threads=threads,
     )
