@@ -40,6 +40,8 @@ __all__ = [
     "PlannedStream",
     "PlannedStreams",
     "Recipe",
+    "Shares",
+    "StreamGrid",
     "StreamPlanner",
     "recipe_of",
     "uses_streams",
@@ -331,10 +333,11 @@ class StreamPlanner:
 
     def _terms(self, beam_taps: int, n_points: int, n_delay_taps: int) -> int:
         """Return the number of terms at each range, with a beam grid or with 0 taps; pairs count as terms."""
-        n_directions, n_terms = len(self._aperture.directions), self._n_mics * n_delay_taps
+        n_directions: int = len(self._aperture.directions)
+        n_terms = self._n_mics * n_delay_taps
         if not beam_taps:
             return n_directions * n_terms
-        return n_points * n_terms + n_directions * beam_taps**self._aperture.n_axes // 2
+        return n_points * n_terms + n_directions * int(beam_taps**self._aperture.n_axes) // 2
 
     def _missed(self, place: int) -> float:
         """Return the error power of the image if a power sum is left out."""
