@@ -9,7 +9,7 @@ from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones, unit_vectors
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Accuracy, Array, Processing, Recording, Settings
-from ertis_numba.stages.stream_plan import uses_streams
+from ertis_numba.stages.stream_recipe import uses_streams
 from ertis_numba.waveform import call_at
 
 CPU = kernels.load("cpu")

@@ -31,7 +31,8 @@ from ertis_numba.stages.plan_elements import (
     zones_of,
 )
 from ertis_numba.stages.stream_beamform import StreamBeamform, StreamTables, amplitudes_of_stream
-from ertis_numba.stages.stream_plan import LINEAR, StreamPlanner, recipe_of, uses_streams
+from ertis_numba.stages.stream_plan import StreamPlanner
+from ertis_numba.stages.stream_recipe import LINEAR, recipe_of, uses_streams
 from ertis_numba.stages.window import time_window
 
 __all__ = ["FastChain"]

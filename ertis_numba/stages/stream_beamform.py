@@ -12,7 +12,8 @@ from ertis_numba.kernels import KernelSet, Memory
 from ertis_numba.stages.beam_grid import BeamGrid
 from ertis_numba.stages.beamform import Buffers, WholeWeights
 from ertis_numba.stages.delays import DelayTable
-from ertis_numba.stages.stream_plan import LINEAR, PlannedStreams, Recipe
+from ertis_numba.stages.planned_streams import PlannedStreams
+from ertis_numba.stages.stream_recipe import LINEAR, Recipe
 
 __all__ = ["StreamBeamform", "StreamTables", "amplitudes_of_stream"]
 
