@@ -19,7 +19,7 @@ __all__ = [
     "Beamformer",
     "BeamformerName",
     "BeamformerOption",
-    "Stream",
+    "SignalStream",
     "Weighting",
     "WeightingName",
 ]
@@ -28,7 +28,7 @@ BeamformerName = Literal["delay_and_sum", "dmas", "capon"]
 WeightingName = Literal["none", "coherence_factor"]
 
 
-class Stream(NamedTuple):
+class SignalStream(NamedTuple):
     """Signal ``|y|^power · exp(i turns φ)`` of each microphone, made from its analytic signal ``y = |y| exp(iφ)``."""
 
     power: float
@@ -83,7 +83,7 @@ class Beamformer:
     options: tuple[BeamformerOption, ...] = ()
     weights: Callable[..., "NDArray[np.complex64]"] = _amplitudes
     sensitivity: Callable[..., tuple[float, float]] = lambda *_: (1.0, 0.0)
-    streams: Callable[..., tuple[Stream, ...]] = lambda *_: ()
+    streams: Callable[..., tuple[SignalStream, ...]] = lambda *_: ()
     cost: Callable[..., float] = lambda *_: 1.0
     single_precision: Callable[..., float] = lambda *_: 0.0
     check: Callable[..., None] = lambda *_: None
@@ -103,7 +103,7 @@ class Weighting:
         Kernel that multiplies ``out`` by the factor, from ``(analytic, offsets, weights, out)``. Empty for none.
     sensitivity : float
         Increase of the relative error of the image by the weighting, in units of that of delay-and-sum beams.
-    streams : tuple of Stream
+    streams : tuple of SignalStream
         Streams whose sums determine the factor.
     cost : float
         Time of ``kernel`` relative to delay-and-sum in single precision.
@@ -111,7 +111,7 @@ class Weighting:
 
     kernel: str
     sensitivity: float = 0.0
-    streams: tuple[Stream, ...] = ()
+    streams: tuple[SignalStream, ...] = ()
     cost: float = 0.0
 
 
@@ -147,7 +147,7 @@ def _capon_single_precision(n_mics: int, _: int, loading: float) -> float:
     return (1e-7 * n_mics / loading) ** 2  # -111 dB were measured for 32 microphones and a loading of 1
 
 
-_BEAM: Final = Stream(1.0, 1)
+_BEAM: Final = SignalStream(1.0, 1)
 
 BEAMFORMERS: Final[Mapping[BeamformerName, Beamformer]] = MappingProxyType(
     {
@@ -158,7 +158,7 @@ BEAMFORMERS: Final[Mapping[BeamformerName, Beamformer]] = MappingProxyType(
             weights=_dmas_roots,
             sensitivity=lambda _, order: (float(order), 0.0),  # error powers of the factors add up
             # Power sums, from which Newton's identities give the sum of the products.
-            streams=lambda order: tuple(Stream(turns / order, turns) for turns in range(1, order + 1)),
+            streams=lambda order: tuple(SignalStream(turns / order, turns) for turns in range(1, order + 1)),
             cost=lambda order: 3.0 + 4.0 * order,  # 11 and 25 times were measured for orders 2 and 5
             check=_require_order,
         ),
@@ -178,7 +178,7 @@ WEIGHTINGS: Final[Mapping[WeightingName, Weighting]] = MappingProxyType(
         # Delay-and-sum with this weighting has the third power of the beam where microphones agree, and three times
         # the error power in noise.
         "coherence_factor": Weighting(
-            kernel="weight_coherence", sensitivity=math.sqrt(3) - 1, streams=(_BEAM, Stream(2.0, 0)), cost=1.5
+            kernel="weight_coherence", sensitivity=math.sqrt(3) - 1, streams=(_BEAM, SignalStream(2.0, 0)), cost=1.5
         ),
     }
 )

@@ -109,7 +109,8 @@ def test_samples_of_disabled_microphones_do_not_change_images(processing):
     settings = without(SMALL.replace(processing=SMALL.processing.replace(**processing)), 4, 9)
     (measurement,) = noise(settings, count=1)
     other = dataclasses.replace(measurement, data=measurement.data ^ np.uint32(1 << 4 | 1 << 9))
-    with Pipeline(settings, device="numpy" if processing.get("method") == "paper" else "cpu") as pipeline:
+    device = "numpy" if processing.get("method") == "paper" else "cpu"
+    with Pipeline(settings, device=device, predict=False) as pipeline:  # an image of noise may exceed its budget
         assert_array_equal(pipeline.process(measurement).amplitude, pipeline.process(other).amplitude)
 
 

@@ -67,6 +67,8 @@ def _explained(sensor: str, plan: dict[str, Any]) -> Iterator[str]:
     precision = "16 bits" if accuracy.precision == "int16" else "single precision"
     kept = options.counted(accuracy.oversampling or 1, "sample")
     yield f"  {precision}, {kept} kept per range; a delayed sample is {interpolated}"
+    if plan["streams"]:
+        yield "  adaptive amplitudes from delay-and-sums of streams, some with fewer taps and coarser beam grids"
     if accuracy.beam_taps:
         yield (
             f"  beams interpolated from {accuracy.beam_taps} beam-grid points along each axis of the array, "

@@ -12,6 +12,7 @@ from ertis_numba.prediction import planner_of
 from ertis_numba.settings import Settings
 from ertis_numba.stages.accuracy import PARTS, ErrorModel, decibels
 from ertis_numba.stages.planner import Planner
+from ertis_numba.stages.stream_recipe import uses_streams
 from ertis_numba.stages.wavefronts import plane_wave_error_db
 
 __all__ = ["examine"]
@@ -97,6 +98,7 @@ def _plan(planners: dict[str, Planner], settings: Settings) -> dict[str, Any]:
         "time_ms": round(safe.time_ms, 3),
         "costs": str(planners["safe"].costs_file),
         "budget_applies_to": "image" if planners["safe"].keeps_budget_of_images(settings.accuracy) else "beams",
+        "streams": uses_streams(settings.processing, settings.accuracy),
         "decimated": settings.recording.is_pdm or settings.decimation != 1,
         "plane_waves": _plane_waves(planners["signal_model"].model, settings),
     }

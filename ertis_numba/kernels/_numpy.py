@@ -242,14 +242,19 @@ def quantise_streams(
     unit = np.divide(signals, level, out=np.zeros(level.shape, np.complex128), where=level > 0)
     tiles[:, first:stop] = 0
     for stream in range(first, stop):
-        values = np.where(level > 0, level ** float(powers[stream]) * unit ** int(turns[stream]), 0)
+        power, count = float(powers[stream]), int(turns[stream])
         for tile, start in enumerate(starts):
-            part = values[:, :, start : start + tiles.shape[4]]
-            largest = float(np.max(np.abs(part), initial=0.0))
-            scales[tile, stream] = largest / limits[stream] * units[stream]
-            if largest:
-                parts = np.stack([part.real, part.imag], axis=-1)
-                tiles[tile, stream, :, :, : part.shape[2]] = np.rint(parts * (limits[stream] / largest))
+            here = slice(start, start + tiles.shape[4])
+            largest = float(np.max(level[:, :, here], initial=0.0))
+            scales[tile, stream] = largest**power / limits[stream] * units[stream]
+            if not largest:
+                continue
+            relative = level[:, :, here] / largest
+            part = np.where(relative > 0, relative**power * unit[:, :, here] ** count, 0)
+            if count == 0:
+                part = part + 1j * np.sqrt(relative**power)
+            parts = np.stack([part.real, part.imag], axis=-1)
+            tiles[tile, stream, :, :, : part.shape[2]] = np.rint(parts * limits[stream])
 
 
 def combine_streams_int16(
@@ -263,12 +268,12 @@ def combine_streams_int16(
     places: Index,
     tap_weights: Short,
     rows: Index,
-    recipe: tuple[int, int, int, int],
+    recipe: tuple[int, int, int, int, float],
     out: Real,
 ) -> None:
     """Compute amplitudes from delay-and-sums of streams on 16-bit tiles."""
     n_directions, n_mics = len(out), tiles.shape[2]
-    n_powers, order, beam, total = recipe
+    n_powers, order, beam, total, bound = recipe
     entries = np.concatenate([[0], np.cumsum(shapes[:, 0].astype(np.int64) * shapes[:, 1])])
     pairs = np.concatenate([[0], np.cumsum(n_directions * shapes[:, 2].astype(np.int64))])
     for tile, start in enumerate(starts):
@@ -289,7 +294,9 @@ def combine_streams_int16(
             sums[stream] = beams * float(scales[tile, stream])
         levels = np.abs(_elementary(sums[:n_powers], order))
         if total >= 0:
-            coherent, whole = np.abs(sums[beam]) ** 2, n_mics * sums[total].real
+            unit = float(scales[tile, total]) * bound
+            least = n_mics * sums[total].imag ** 2 / unit if unit else 0.0
+            coherent, whole = np.abs(sums[beam]) ** 2, n_mics * np.maximum(sums[total].real, least)
             share = np.maximum(whole, coherent)
             levels *= np.divide(coherent, share, out=np.zeros_like(coherent), where=coherent > 0)
         out[rows, start : start + n_ranges] = levels

@@ -35,6 +35,8 @@ class Accuracy(TomlTable, frozen=True, kw_only=True):
     beam_taps : int, optional, default None
         Beam-grid points along each axis of the array from which a beam is interpolated: 2, 4 or 6. With 0, the beam of
         every direction is summed itself.
+        Adaptive beamformers combine all microphones at each point of the image if this is 0, ``delay_taps`` is 1 and
+        ``precision`` is ``float32``, and streams otherwise; see ``docs/explanation/beamformers.md``.
     beam_density : float, optional, default None
         Density of the beam grid relative to the resolution of the aperture at the call's highest frequency, 1.1 to 8.
     stopband_attenuation_db : float, optional, default None

@@ -48,10 +48,10 @@ class Processing(TomlTable, frozen=True, kw_only=True):
         at the first range, and ``plane`` otherwise and for adaptive beamformers.
     beamformer : str, default "delay_and_sum"
         Combination of the delayed signals, one of `BEAMFORMERS`; ``docs/explanation/beamformers.md`` compares them. All
-        except delay_and_sum need the fast method and plane wavefronts.
+        except delay_and_sum need the fast method, and capon also plane wavefronts.
     weighting : {"none", "coherence_factor"}, default "none"
         Factor from 0 to 1 that multiplies each amplitude, one of `WEIGHTINGS`. ``coherence_factor`` is the share of
-        the power that agrees between the microphones. It needs the fast method and plane wavefronts.
+        the power that agrees between the microphones. It needs the fast method.
     dmas_order : int, default 2
         Number of microphone signals that ``dmas`` multiplies at a time, 2 to 8.
     snapshots : int, default 5

@@ -31,7 +31,8 @@ from ertis_numba.stages.plan_elements import (
     zones_of,
 )
 from ertis_numba.stages.stream_beamform import StreamBeamform, StreamTables, amplitudes_of_stream
-from ertis_numba.stages.stream_plan import LINEAR, StreamPlanner, recipe_of, uses_streams
+from ertis_numba.stages.stream_plan import StreamPlanner
+from ertis_numba.stages.stream_recipe import LINEAR, recipe_of, uses_streams
 from ertis_numba.stages.window import time_window
 
 __all__ = ["FastChain"]
@@ -88,11 +89,15 @@ class FastChain(KernelChain):
         self._made_plain_filter = functools.cache(  # Only signal models need it.
             lambda: new_filter(gain=lambda frequency_hz: np.ones((1, len(frequency_hz)), np.complex128))
         )
+        # Streams are calibrated before powers are taken. Otherwise, weights include the calibration.
+        own_gain = layout.gain[layout.enabled] if streams else np.ones(len(own_s))
 
         def advanced(gains: Callable[[NDArray[np.float64]], NDArray[np.complex128]]) -> MatchedFilter:
             """Return the matched filter with gains, and the fractional-delay offset of each microphone."""
             return new_filter(
-                gain=lambda frequency_hz: gains(frequency_hz) * np.exp(2j * math.pi * ahead_s[:, None] * frequency_hz)
+                gain=lambda frequency_hz: (
+                    gains(frequency_hz) / own_gain[:, None] * np.exp(2j * math.pi * ahead_s[:, None] * frequency_hz)
+                )
             )
 
         self._matched_filter = advanced(
@@ -104,9 +109,7 @@ class FastChain(KernelChain):
         self._adaptive = None
         if streams is not None:
             taken_s = own_s - ahead_s
-            self._beamform = streams.beamform(
-                kernels, memory, taken_s, layout.gain[layout.enabled], edges, n_phases=n_phases, lead=window.lead
-            )
+            self._beamform = streams.beamform(kernels, memory, taken_s, edges, n_phases=n_phases, lead=window.lead)
             return
         amplitudes = array_weight / (layout.gain[layout.enabled] * len(own_s))
         zones = [
@@ -219,17 +222,16 @@ class _Streams:
         kernels: KernelSet,
         memory: Memory,
         own_s: NDArray[np.float64],
-        gain: NDArray[np.float64],
         edges: list[tuple[int, int, float]],
         *,
         n_phases: int,
         lead: int,
     ) -> StreamBeamform:
-        """Return the beamformer of the streams for microphones with given delays and gains."""
+        """Return the beamformer of the streams for microphones with given delays."""
         tables = []
         for planned, nodes, points in zip(self._planned.streams, self._grids, self.points, strict=True):
             place = self._recipe.streams.index(planned.stream)
-            amplitudes = amplitudes_of_stream(self._recipe, place, gain, len(own_s))
+            amplitudes = amplitudes_of_stream(self._recipe, place, len(own_s))
             delays_s = (
                 own_s + self._aperture.delays_s(points, sound_speed_m_s=self._speed_m_s, range_m=range_m)
                 for _, _, range_m in edges

@@ -20,8 +20,10 @@ from ertis_numba.stages.costs import Work
 from ertis_numba.stages.fitting import DelayFit, Spectrum
 from ertis_numba.stages.focal_zones import squared_curvature
 from ertis_numba.stages.plan_elements import ahead_of, chain_taps, nearest_m_of, spectrum_of, zones_of
+from ertis_numba.stages.planned_streams import PlannedStreams
 from ertis_numba.stages.sensitivity import Sensitivity
-from ertis_numba.stages.stream_plan import PlannedStreams, StreamPlanner, recipe_of, uses_streams
+from ertis_numba.stages.stream_plan import StreamPlanner
+from ertis_numba.stages.stream_recipe import recipe_of, uses_streams
 from ertis_numba.stages.window import time_window
 from ertis_numba.waveform import matched_band_hz
 

@@ -86,7 +86,8 @@ def _stream_grids(model: PlanModel, budget: float, direct: ImagePlan) -> list[tu
     """Return the candidates for the beam grids of streams; 0 taps stand for one beam per direction."""
     given = model.settings.accuracy
     found: list[tuple[int, float]] = [] if given.beam_taps else [(0, direct.density)]
-    if given.beam_taps == 0 or model.aperture.n_axes not in {1, 2}:
+    flat = model.aperture.n_axes in {1, 2} and len(model.window.range_m) >= FEWEST_RANGES
+    if given.beam_taps == 0 or not (flat or given.beam_taps):
         return found
     for beam_taps in [given.beam_taps] if given.beam_taps else GRID_DENSITIES:
         densities = GRID_DENSITIES[beam_taps] if given.beam_density is None else (given.beam_density,)

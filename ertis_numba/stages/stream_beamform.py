@@ -12,7 +12,8 @@ from ertis_numba.kernels import KernelSet, Memory
 from ertis_numba.stages.beam_grid import BeamGrid
 from ertis_numba.stages.beamform import Buffers, WholeWeights
 from ertis_numba.stages.delays import DelayTable
-from ertis_numba.stages.stream_plan import LINEAR, PlannedStreams, Recipe
+from ertis_numba.stages.planned_streams import PlannedStreams
+from ertis_numba.stages.stream_recipe import LINEAR, Recipe
 
 __all__ = ["StreamBeamform", "StreamTables", "amplitudes_of_stream"]
 
@@ -24,16 +25,14 @@ class StreamTables(NamedTuple):
     tables: list[DelayTable]
 
 
-def amplitudes_of_stream(recipe: Recipe, place: int, gain: NDArray[np.float64], n_mics: int) -> NDArray[np.float64]:
+def amplitudes_of_stream(recipe: Recipe, place: int, n_mics: int) -> NDArray[np.float64]:
     """Return the weight of each microphone in the sum of a stream: (mic,) float64.
 
     The products of an order are divided by their number, so that no sum overflows single precision.
     """
     stream = recipe.streams[place]
-    calibrated = gain**-stream.power
-    if place < recipe.order:
-        return np.asarray(calibrated * math.comb(n_mics, recipe.order) ** (-stream.turns / recipe.order))
-    return np.asarray(calibrated * float(n_mics) ** -stream.power)
+    number = math.comb(n_mics, recipe.order) ** (1 / recipe.order) if place < recipe.order else n_mics
+    return np.full(n_mics, float(number) ** -(stream.turns if place < recipe.order else stream.power))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,7 +124,8 @@ class StreamBeamform:
         self._turns = memory.table(np.array([stream.turns for stream in streams], dtype=np.int32))
         left_out = recipe.order - planned.n_powers
         beam, total = (k - left_out if k >= recipe.order else k for k in (recipe.beam, recipe.total))
-        self._recipe = (planned.n_powers, recipe.order, beam, total)
+        bound = float(whole[total].limit) / float(whole[total].unit) if total >= 0 else 1.0
+        self._recipe = (planned.n_powers, recipe.order, beam, total, bound)
         n_mics = 1 + int(tables[0].tables[0].rows.max()) // n_phases
         self._shape = (len(starts), len(streams), n_mics, n_phases, width, 2)
         self.linear = streams.index(LINEAR) if LINEAR in streams else -1

@@ -9,7 +9,7 @@ Newton's identities it follows from the power sums ``p_k = Σ z^k``, each a dela
 
 An error that all microphones share adds up to M² instead of M. With 32 microphones, higher power sums therefore need
 little accuracy, and those of the highest orders can be left out. The coherence factor follows from the sums of y and
-|y|². Each stream gets the fewest taps that keep its error far below that of the first stream.
+|y|². Each stream gets the fewest taps and the cheapest beam grid whose error is not above that of the first stream.
 
 Where a signal is nearly zero, its stream changes too fast for interpolation. Echoes are hardly affected: they are
 bright where signals are strong, and their errors come from the spectrum there. The planner assumes echoes in noise. The
@@ -22,31 +22,23 @@ The matched filter can apply the gains of delay and beam interpolation to a stre
 
 import functools
 import math
-from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.beamformers import BEAMFORMERS, WEIGHTINGS, Stream
-from ertis_numba.settings import Accuracy, Processing, Settings
+from ertis_numba.beamformers import SignalStream
+from ertis_numba.settings import Settings
 from ertis_numba.stages.beam_grid import Aperture, BeamGrid
 from ertis_numba.stages.fitting import DelayFit, Spectrum
+from ertis_numba.stages.planned_streams import ErrorShares, PlannedStream, PlannedStreams, StreamGrid
+from ertis_numba.stages.stream_recipe import LINEAR, Recipe
 from ertis_numba.stages.stream_spectrum import StreamSpectrum, highest_hz, spectrum_of_stream
 
 __all__ = [
     "GRID_DENSITIES",
-    "LINEAR",
-    "PlannedStream",
-    "PlannedStreams",
-    "Recipe",
     "StreamPlanner",
-    "recipe_of",
-    "uses_streams",
 ]
-
-LINEAR: Final = Stream(1.0, 1)
-"""Stream of the signals themselves, to which a filter can apply gains."""
 
 _SMALL: Final = 1.0  # Error that another stream may add, relative to that of the first stream.
 GRID_DENSITIES: Final = {
@@ -57,148 +49,9 @@ GRID_DENSITIES: Final = {
 """Densities of beam grids that plans choose from, by the number of taps."""
 
 _NOISE_RATIO: Final = 9.0  # Power of noise relative to that of echoes in the image of delay-and-sum.
-_UNLIKE: Final = 2.5  # Margin for differences between images: 4 dB.
 _PEAKED: Final = 2.0  # Common errors rise with the fourth power of frequency, so that few sudden changes add much.
 _KEPT: Final = 512  # Number of cached fits.
 _CORRELATED: Final = 2  # The beam of the coherence factor and the first power sum have errors of the same samples.
-
-
-class Recipe(NamedTuple):
-    """Streams of a beamformer and a weighting, and the numbers that `kernels` need to combine their sums.
-
-    Attributes
-    ----------
-    streams : tuple of Stream
-        Power sums, then the streams of the coherence factor.
-    order : int
-        Order of the product; 1 for delay-and-sum.
-    beam, total : int
-        Streams of the coherence factor; −1 for none.
-    """
-
-    streams: tuple[Stream, ...]
-    order: int
-    beam: int
-    total: int
-
-
-def recipe_of(processing: Processing) -> Recipe | None:
-    """Return the streams of processing settings; None if only a kernel for all microphones can compute them."""
-    beamformer = BEAMFORMERS[processing.beamformer]
-    streams = beamformer.streams(*beamformer.values(processing))
-    if not streams:
-        return None
-    added = WEIGHTINGS[processing.weighting].streams
-    whole = streams + tuple(stream for stream in added if stream not in streams)
-    beam, total = (whole.index(stream) for stream in added) if added else (-1, -1)
-    return Recipe(whole, len(streams), beam, total)
-
-
-def uses_streams(processing: Processing, accuracy: Accuracy) -> bool:
-    """Return True if a complete plan computes an adaptive beamformer from streams, not from all microphones at once.
-
-    The kernels of all microphones read one sample of each, in single precision and for each direction.
-    """
-    plan = accuracy.precision, accuracy.delay_taps or 1, accuracy.beam_taps or 0
-    return processing.is_adaptive and recipe_of(processing) is not None and plan != ("float32", 1, 0)
-
-
-class Shares(NamedTuple):
-    """Error power of the image relative to that of a stream.
-
-    Attributes
-    ----------
-    noise, coherent : float
-        For errors that differ between microphones, in noise and for an echo that reaches all microphones alike.
-    common : float
-        For errors that all microphones share, and such an echo.
-    noise_share : float
-        Share of noise in the power of the image.
-    """
-
-    noise: float
-    coherent: float
-    common: float
-    noise_share: float
-
-    def error(self, *, whole: float, varying: float, common: float) -> float:
-        """Return the error power of an image of echoes and some noise.
-
-        Parameters
-        ----------
-        whole : float
-            Error power of the stream with the whole spectrum.
-        varying, common : float
-            Error power where the image is bright: the part that differs between microphones, and the rest.
-        """
-        return _UNLIKE * (self.coherent * varying + self.common * common + self.noise_share * self.noise * whole)
-
-
-@dataclass(frozen=True, slots=True)
-class StreamGrid:
-    """Beam grid of a stream.
-
-    Attributes
-    ----------
-    n_taps : int
-    density : float
-    n_points, n_pairs : int
-        Points of the grid, and pairs of points for each direction.
-    error : float
-        Error power of the image.
-    squares : float
-        Sum of a beam's squared weights.
-    """
-
-    n_taps: int
-    density: float
-    n_points: int
-    n_pairs: int
-    error: float
-    squares: float
-
-
-@dataclass(frozen=True, slots=True)
-class PlannedStream:
-    """Stream with its interpolation.
-
-    Attributes
-    ----------
-    stream : Stream
-    spectrum : StreamSpectrum
-    fit : DelayFit
-    high_hz : float
-        Frequency to which the density of its beam grid is relative.
-    grid : StreamGrid or None
-        Beam grid; None if every direction is summed itself.
-    shares : Shares
-    """
-
-    stream: Stream
-    spectrum: StreamSpectrum
-    fit: DelayFit
-    high_hz: float
-    grid: StreamGrid | None
-    shares: Shares
-
-
-@dataclass(frozen=True, slots=True)
-class PlannedStreams:
-    """Streams of a plan.
-
-    Attributes
-    ----------
-    streams : list of PlannedStream
-        As in `Recipe`, without the highest power sums if these are negligible.
-    n_powers : int
-        Number of power sums among them.
-    delays : float
-        Error power of the image due to interpolation of delays and power sums that are left out.
-    """
-
-    streams: list[PlannedStream]
-    n_powers: int
-    delays: float
 
 
 class StreamPlanner:
@@ -291,7 +144,7 @@ class StreamPlanner:
     def _grid(
         self,
         spectrum: StreamSpectrum,
-        shares: Shares,
+        shares: ErrorShares,
         beam_taps: int,
         density: float,
         high_hz: float,
@@ -331,10 +184,11 @@ class StreamPlanner:
 
     def _terms(self, beam_taps: int, n_points: int, n_delay_taps: int) -> int:
         """Return the number of terms at each range, with a beam grid or with 0 taps; pairs count as terms."""
-        n_directions, n_terms = len(self._aperture.directions), self._n_mics * n_delay_taps
+        n_directions: int = len(self._aperture.directions)
+        n_terms = self._n_mics * n_delay_taps
         if not beam_taps:
             return n_directions * n_terms
-        return n_points * n_terms + int(n_directions * beam_taps**self._aperture.n_axes // 2)
+        return n_points * n_terms + n_directions * int(beam_taps**self._aperture.n_axes) // 2
 
     def _missed(self, place: int) -> float:
         """Return the error power of the image if a power sum is left out."""
@@ -344,7 +198,7 @@ class StreamPlanner:
         spacing = self._aperture.spacing(density, high_hz=high_hz, sound_speed_m_s=self._speed_m_s)
         return self._aperture.count_grid_points(spacing, beam_taps)
 
-    def _spectrum_of(self, stream: Stream) -> StreamSpectrum:
+    def _spectrum_of(self, stream: SignalStream) -> StreamSpectrum:
         return spectrum_of_stream(self._spectrum, stream)
 
     def _delays(
@@ -359,21 +213,21 @@ class StreamPlanner:
             whole_error = varying = common = float(fit.errors_at(fractions, whole) @ whole.power)
         return fit, self._shares(place).error(whole=whole_error, varying=varying, common=_PEAKED * common)
 
-    def _shares(self, place: int) -> Shares:
+    def _shares(self, place: int) -> ErrorShares:
         """Return the shares of a stream, for an image of noise that is half as bright as expected."""
         n_mics, order = self._n_mics, self.recipe.order
         weighted, noise_share = self.recipe.total >= 0, self._noise_share
         if place == self.recipe.total:
-            return Shares(2.0 / n_mics, 1.0 / n_mics, 1.0, noise_share)
+            return ErrorShares(2.0 / n_mics, 1.0 / n_mics, 1.0, noise_share)
         if place == self.recipe.beam and order > 1:
-            return Shares(4.0 * _CORRELATED / (order + 2), 4.0 / n_mics, 4.0, noise_share)
+            return ErrorShares(4.0 * _CORRELATED / (order + 2), 4.0 / n_mics, 4.0, noise_share)
         k = place + 1
         ratio = math.comb(n_mics, order - k) / math.comb(n_mics, order)
         noise, coherent, common = n_mics / k**2 * ratio, n_mics / k**2 * ratio**2, (n_mics / k * ratio) ** 2
         if weighted and order == 1:  # the third power of the beam
-            return Shares(3 * noise, 9 * coherent, 9 * common, noise_share)
+            return ErrorShares(3 * noise, 9 * coherent, 9 * common, noise_share)
         raised = _CORRELATED if weighted and place == 0 else 1
-        return Shares(raised * noise, raised * coherent, raised * common, noise_share)
+        return ErrorShares(raised * noise, raised * coherent, raised * common, noise_share)
 
     @functools.cached_property
     def _noise_share(self) -> float:

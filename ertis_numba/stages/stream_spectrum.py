@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ertis_numba.beamformers import Stream
+from ertis_numba.beamformers import SignalStream
 from ertis_numba.stages.fitting import WAVES, Spectrum
 
 __all__ = ["StreamSpectrum", "highest_hz", "spectrum_of_stream"]
@@ -28,7 +28,7 @@ class StreamSpectrum(NamedTuple):
 
 
 @functools.lru_cache(maxsize=_KEPT)
-def spectrum_of_stream(spectrum: Spectrum, stream: Stream) -> StreamSpectrum:
+def spectrum_of_stream(spectrum: Spectrum, stream: SignalStream) -> StreamSpectrum:
     """Return the spectra of a stream of signals with a given spectrum.
 
     Errors of ``|y|^a exp(ikφ)`` matter where y is strong. Weighted by ``|y|^(2 − 2a)``, the power of its derivative is
@@ -48,12 +48,12 @@ def spectrum_of_stream(spectrum: Spectrum, stream: Stream) -> StreamSpectrum:
     return StreamSpectrum(Spectrum(centre_hz + frequency_hz, power), _whole(spectrum, stream, stretch))
 
 
-def highest_hz(low_hz: float, high_hz: float, stream: Stream) -> float:
+def highest_hz(low_hz: float, high_hz: float, stream: SignalStream) -> float:
     """Return the highest frequency of a stream for a call of a given band, to which beam grids are relative."""
     return stream.turns * (low_hz + high_hz) / 2 + max(1.0, stream.power) * (high_hz - low_hz) / 2
 
 
-def _whole(spectrum: Spectrum, stream: Stream, stretch: float) -> Spectrum:
+def _whole(spectrum: Spectrum, stream: SignalStream, stretch: float) -> Spectrum:
     """Return the spectrum of a stream of Gaussian noise."""
     frequency_hz, centre_hz = spectrum.frequency_hz, spectrum.centre_hz
     width_hz = float(frequency_hz[-1] - frequency_hz[0]) + 1.0
@@ -75,7 +75,7 @@ def _whole(spectrum: Spectrum, stream: Stream, stretch: float) -> Spectrum:
     return Spectrum(stream.turns * centre_hz + (edges_hz[1:] + edges_hz[:-1]) / 2, found / found.sum())
 
 
-def _values(signals: NDArray[np.complex128], stream: Stream) -> NDArray[np.complex128]:
+def _values(signals: NDArray[np.complex128], stream: SignalStream) -> NDArray[np.complex128]:
     """Return the values of a stream."""
     level = np.abs(signals)
     unit = np.divide(signals, level, out=np.zeros_like(signals), where=level > 0)

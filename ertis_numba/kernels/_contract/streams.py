@@ -16,8 +16,11 @@ class QuantiseStreams(Protocol):
 
     ``tiles[tile, stream, mic, phase, k] ≈ y · units[stream] / scales[tile, stream]``, rounded, as pairs of real and
     imaginary part. y is the stream ``|x|^powers[stream] · exp(i turns[stream] φ)`` of the sample
-    ``x = signals[mic, phase, starts[tile] + k]``, and 0 for x = 0. The largest magnitude of a tile becomes
+    ``x = signals[mic, phase, starts[tile] + k]``, and 0 for x = 0. The largest magnitude X of a tile becomes
     ``limits[stream]``. Beyond the end of the signals, tiles are 0.
+
+    A stream without turns is real. Its imaginary part is ``limits[stream] · (|x| / X)^(power / 2)``, so that weak
+    signals also have some digits.
 
     Parameters
     ----------
@@ -53,6 +56,8 @@ class CombineStreamsInt16(Protocol):
     number of power sums. The amplitude is ``|e_order|`` from Newton's identities,
     ``k e_k = Σ_i (−1)^(i − 1) e_(k − i) p_i`` with ``e_0 = 1``. It is multiplied by the coherence factor
     ``|b|² / (M s)``, at most 1, with the sum b of one stream, the real part s of the sum of another, and M microphones.
+    In 16 bits, s is coarse for weak signals. It is therefore at least ``M t² / (bound · scale)`` with the imaginary
+    part t of that sum, by the inequality of Cauchy and Schwarz for weights with a sum of 1 / M.
 
     A stream is summed for each direction, or for the points of a beam grid, as in `DelayAndSumEnvelopeInt16` and in
     `InterpolatedBeamsEnvelopeInt16`. Tables of all streams follow one another in flat arrays.
@@ -77,9 +82,9 @@ class CombineStreamsInt16(Protocol):
     tap_weights : (pair, 2) int16
     rows : (direction,) int32
         Row of each direction in ``out``.
-    recipe : (n_powers, order, beam, total)
+    recipe : (n_powers, order, beam, total, bound)
         Number of power sums, and order of the product; 1 and 1 for the magnitude of a beam. Then the streams of b and
-        s; −1 for no coherence factor.
+        s; −1 for no coherence factor. Last, the limit of the stream of s relative to its unit.
     out : (direction, range) float32
     """
 
@@ -95,6 +100,6 @@ class CombineStreamsInt16(Protocol):
         places: Index,
         tap_weights: Short,
         rows: Index,
-        recipe: tuple[int, int, int, int],
+        recipe: tuple[int, int, int, int, float],
         out: Real,
     ) -> None: ...

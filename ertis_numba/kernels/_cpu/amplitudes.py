@@ -99,31 +99,35 @@ def _sign(builder, k):
     return builder.select(odd, _FLOAT(1.0), _FLOAT(-1.0))
 
 
-def _coherence(rows, sums, beam, total, n_mics, vector):
+def _coherence(rows, sums, beam, total, n_mics, least, vector):
     """Return the coherence factor; interpolation may leave slightly less power than the beam has."""
     builder = rows.builder
     coherent = rows.power(rows.load(sums, beam, 0, vector), rows.load(sums, beam, 1, vector))
-    whole = builder.fmul(rows.load(sums, total, 0, vector), n_mics)
+    power, root = (rows.load(sums, total, part, vector) for part in (0, 1))
+    bound = builder.fmul(builder.fmul(root, root), least)
+    power = builder.select(builder.fcmp_ordered(">", power, bound), power, bound)
+    whole = builder.fmul(power, n_mics)
     whole = builder.select(builder.fcmp_ordered(">", whole, coherent), whole, coherent)
     factor = builder.fdiv(coherent, whole)
     return builder.select(builder.fcmp_ordered(">", coherent, _ZEROS), factor, _ZEROS)
 
 
 @intrinsic
-def amplitudes_of(typing_context, sums, n_powers, order, beam, total, n_mics, work, levels, place):
+def amplitudes_of(typing_context, sums, n_powers, order, beam, total, n_mics, least, work, levels, place):
     """Fill ``levels.flat[place : place + RANGES]`` from the sums of all streams, (stream, part, range).
 
-    The other arguments are those of `CombineStreamsInt16`; ``work`` is an array of (order, part, range).
+    ``least`` is ``M / (bound · scale)``. The other arguments are those of `CombineStreamsInt16`; ``work`` is an array
+    of (order, part, range).
     """
     size = types.intp
-    signature = types.void(sums, size, size, size, size, types.float32, work, levels, size)
+    signature = types.void(sums, size, size, size, size, types.float32, types.float32, work, levels, size)
 
     def codegen(context, builder, signature, arguments):
         def array(k):
             return context.make_array(signature.args[k])(context, builder, arguments[k])
 
-        sums, work, levels = array(0).data, array(6).data, array(7).data
-        _, n_powers, order, beam, total, n_mics, _, _, place = arguments
+        sums, work, levels = array(0).data, array(7).data, array(8).data
+        _, n_powers, order, beam, total, n_mics, least, _, _, place = arguments
         rows = _Rows(builder)
         with cgutils.for_range(builder, order) as loop:
             _newton(rows, sums, work, n_powers, builder.add(loop.index, loop.index.type(1)))
@@ -133,11 +137,11 @@ def amplitudes_of(typing_context, sums, n_powers, order, beam, total, n_mics, wo
         with builder.if_else(weighted) as (then, otherwise):
             for branch, is_weighted in ((then, True), (otherwise, False)):
                 with branch:
-                    count = rows.splat(n_mics)
+                    count, factor = rows.splat(n_mics), rows.splat(least)
                     for vector in range(_VECTORS):
                         level = rows.root(rows.power(*(rows.load(work, last, part, vector) for part in (0, 1))))
                         if is_weighted:
-                            level = builder.fmul(level, _coherence(rows, sums, beam, total, count, vector))
+                            level = builder.fmul(level, _coherence(rows, sums, beam, total, count, factor, vector))
                         at = builder.gep(target, [_SIZE(vector * LANES)])
                         builder.store(level, builder.bitcast(at, FLOATS.as_pointer())).align = 4
         return context.get_dummy_value()

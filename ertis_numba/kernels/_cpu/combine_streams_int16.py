@@ -93,7 +93,7 @@ def combine_streams_int16(
     out,
 ):
     """Compute amplitudes from delay-and-sums of streams on 16-bit tiles."""
-    n_powers, order, beam, total = recipe
+    n_powers, order, beam, total, bound = recipe
     n_directions = out.shape[0]
     n_tiles, n_streams, n_mics, n_phases, width, _ = tiles.shape
     flat = tiles.reshape(n_tiles * n_streams, n_mics, n_phases, width, 2)
@@ -126,6 +126,8 @@ def combine_streams_int16(
             entry += size
         sums = np.empty((n_streams, 2, RANGES), np.float32)
         work = np.empty((order, 2, RANGES), np.float32)
+        unit = scales[tile, total] * np.float32(bound) if total >= 0 else np.float32(0)
+        least = np.float32(n_mics) / unit if unit > 0 else np.float32(0)
         short = np.empty((1, RANGES), np.float32)
         is_whole = starts[tile] + RANGES <= stop
         for direction in range(begin, end):
@@ -146,7 +148,7 @@ def combine_streams_int16(
                 entry += n_points * n_terms
             if is_whole:
                 target = rows[direction] * np.int64(out.shape[1]) + starts[tile]
-                amplitudes_of(sums, n_powers, order, beam, total, np.float32(n_mics), work, out, target)
+                amplitudes_of(sums, n_powers, order, beam, total, np.float32(n_mics), least, work, out, target)
             else:
-                amplitudes_of(sums, n_powers, order, beam, total, np.float32(n_mics), work, short, 0)
+                amplitudes_of(sums, n_powers, order, beam, total, np.float32(n_mics), least, work, short, 0)
                 out[rows[direction], starts[tile] : stop] = short[0, : stop - starts[tile]]

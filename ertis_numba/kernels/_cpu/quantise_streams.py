@@ -81,6 +81,13 @@ def _turned(real, imag, turns, magnitude, x, y):
 
 
 @njit(nogil=True, cache=True)
+def _silenced(real, imag, y):
+    """Set y to 0 where the direction has no length, because there is no sound."""
+    for k in range(len(y)):
+        y[k] *= (_ZERO + real[k] * real[k]) + imag[k] * imag[k]
+
+
+@njit(nogil=True, cache=True)
 def _rounded(x, y, target):
     """Fill ``target`` with the rounded numbers (x, y, x, y …), and with 0 beyond the end."""
     for k in range(len(x)):
@@ -114,4 +121,7 @@ def quantise_streams(signals, starts, limits, units, powers, turns, first, stop,
                 for stream in range(first, stop):
                     _magnitudes(logarithm, powers[stream], limits[stream], magnitude, bits)
                     _turned(real, imag, turns[stream], magnitude, x, y)
+                    if turns[stream] == 0:
+                        _magnitudes(logarithm, np.float32(0.5) * powers[stream], limits[stream], y, bits)
+                        _silenced(real, imag, y)
                     _rounded(x, y, targets[tile, stream, mic, phase])

@@ -52,10 +52,13 @@ def _sum_nodes(nodes, n_nodes, scales, stream, places, n_pairs, tap_weights, sum
 
 
 @cuda.jit(device=True)
-def _factor(coherent, whole):
+def _factor(coherent, total, unit, n_mics):
     """Return the coherence factor; interpolation may leave slightly less power than the beam has."""
+    power, root = real_of(total), imag_of(total)
+    if unit > np.float32(0):
+        power = max(power, n_mics * root * root / unit)
     if coherent > np.float32(0):
-        return coherent / max(whole, coherent)
+        return coherent / max(n_mics * power, coherent)
     return np.float32(0)
 
 
@@ -65,7 +68,7 @@ def _kernel_of(n_powers, order, beam, total):
     size = order + 1  # a constant of the compiler
 
     @cuda.jit(cache=True)
-    def combine(sums, starts, stop, n_mics, rows, out):
+    def combine(sums, scales, starts, stop, n_mics, bound, rows, out):
         direction = np.uint64(cuda.blockIdx.x * DIRECTIONS + cuda.threadIdx.y)
         tile = np.uint64(cuda.blockIdx.y)
         if direction >= np.uint64(rows.size):
@@ -101,7 +104,8 @@ def _kernel_of(n_powers, order, beam, total):
         if total >= 0:
             value = sums[np.uint64(beam), direction, at]
             coherent = power(real_of(value), imag_of(value))
-            level *= _factor(coherent, n_mics * real_of(sums[np.uint64(total), direction, at]))
+            unit = scales[tile, np.uint64(total)] * bound
+            level *= _factor(coherent, sums[np.uint64(total), direction, at], unit, n_mics)
         out[np.uint64(rows[direction]), np.uint64(place)] = level
 
     return combine
@@ -133,5 +137,6 @@ def combine_streams_int16(
         else:
             launch(_sum_terms, grid, BLOCK, mine, per_tile, scales, stream, *table, n_terms, sums)
         entry += size
-    kernel = _kernel_of(*map(int, recipe))
-    launch(kernel, (*grid, TILE_RANGES // WARP), BLOCK, sums, starts, stop, np.float32(n_mics), rows, out)
+    *numbers, bound = recipe
+    numbers_of_tiles = sums, scales, starts, stop, np.float32(n_mics), np.float32(bound)
+    launch(_kernel_of(*map(int, numbers)), (*grid, TILE_RANGES // WARP), BLOCK, *numbers_of_tiles, rows, out)

@@ -28,6 +28,8 @@ def _stream_of(sample, inverse, exponent, turns, limit):
     while turn < turns:
         x, y = x * real - y * imag, x * imag + y * real
         turn = np.int32(turn + 1)
+    if turns == np.int32(0):
+        y = limit * level ** (np.float32(0.5) * exponent)
     return x, y
 
 

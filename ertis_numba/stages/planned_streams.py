@@ -1,0 +1,110 @@
+"""Streams of a plan, with their interpolation and their errors."""
+
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+from ertis_numba.beamformers import SignalStream
+from ertis_numba.stages.fitting import DelayFit
+from ertis_numba.stages.stream_spectrum import StreamSpectrum
+
+__all__ = ["ErrorShares", "PlannedStream", "PlannedStreams", "StreamGrid"]
+
+_UNLIKE: Final = 2.5  # Margin for differences between images: 4 dB.
+
+
+class ErrorShares(NamedTuple):
+    """Error power of the image relative to that of a stream.
+
+    Attributes
+    ----------
+    noise, coherent : float
+        For errors that differ between microphones, in noise and for an echo that reaches all microphones alike.
+    common : float
+        For errors that all microphones share, and such an echo.
+    noise_share : float
+        Share of noise in the power of the image.
+    """
+
+    noise: float
+    coherent: float
+    common: float
+    noise_share: float
+
+    def error(self, *, whole: float, varying: float, common: float) -> float:
+        """Return the error power of an image of echoes and some noise.
+
+        Parameters
+        ----------
+        whole : float
+            Error power of the stream with the whole spectrum.
+        varying, common : float
+            Error power where the image is bright: the part that differs between microphones, and the rest.
+        """
+        return _UNLIKE * (self.coherent * varying + self.common * common + self.noise_share * self.noise * whole)
+
+
+@dataclass(frozen=True, slots=True)
+class StreamGrid:
+    """Beam grid of a stream.
+
+    Attributes
+    ----------
+    n_taps : int
+    density : float
+    n_points, n_pairs : int
+        Points of the grid, and pairs of points for each direction.
+    error : float
+        Error power of the image.
+    squares : float
+        Sum of a beam's squared weights.
+    """
+
+    n_taps: int
+    density: float
+    n_points: int
+    n_pairs: int
+    error: float
+    squares: float
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedStream:
+    """Stream with its interpolation.
+
+    Attributes
+    ----------
+    stream : SignalStream
+    spectrum : StreamSpectrum
+    fit : DelayFit
+    high_hz : float
+        Frequency to which the density of its beam grid is relative.
+    grid : StreamGrid or None
+        Beam grid; None if every direction is summed itself.
+    shares : ErrorShares
+    """
+
+    stream: SignalStream
+    spectrum: StreamSpectrum
+    fit: DelayFit
+    high_hz: float
+    grid: StreamGrid | None
+    shares: ErrorShares
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedStreams:
+    """Streams of a plan.
+
+    Attributes
+    ----------
+    streams : list of PlannedStream
+        As in `Recipe`, without the highest power sums if these are negligible.
+    n_powers : int
+        Number of power sums among them.
+    delays : float
+        Error power of the image due to interpolation of delays and power sums that are left out.
+    """
+
+    streams: list[PlannedStream]
+    n_powers: int
+    delays: float
