@@ -19,6 +19,7 @@ from ertis_numba.errors import DeviceError
 from ertis_numba.kernels import _compiling
 from ertis_numba.kernels._cpu.dot16 import RANGES
 from ertis_numba.kernels._cpu.features import INSTRUCTION_SET
+from ertis_numba.kernels._cpu.loading import load_without_compiler
 from ertis_numba.kernels._host import HostMemory
 from ertis_numba.kernels._kernel_set import KernelSet, twins_in
 
@@ -77,8 +78,11 @@ def threads(count: int) -> Iterator[None]:
             numba.set_num_threads(before)
 
 
+_TWINS = twins_in(__name__)
+load_without_compiler(_TWINS.values())
+
 KERNELS = KernelSet.of(
-    twins_in(__name__),
+    _TWINS,
     device="cpu",
     hardware="",
     transforms="scipy",
