@@ -2,6 +2,7 @@
 
 import re
 import warnings
+from types import SimpleNamespace
 from typing import get_args
 
 import numpy as np
@@ -239,6 +240,36 @@ def test_naive_forms_fail_on_silence():
         assert np.isnan(y / np.abs(y) ** 0.5).all()
     with pytest.raises(np.linalg.LinAlgError):
         np.linalg.solve(y @ y.conj().T, np.ones(4))
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1.0, 1e30])
+def test_capon_in_single_precision_is_accurate_at_any_amplitude(kernel_set, scale):
+    """Squares of these amplitudes exceed the limits of float32. Silence and NaN affect only their own ranges."""
+    signals = np.float32(scale) * complex_noise(8, 40)
+    signals[:, 20:26], signals[3, 33] = 0, np.nan
+    offsets, out = np.arange(8, dtype=np.int32)[None] * 40, np.empty((2, 1, 40), dtype=np.float32)
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for each, dtype in zip(out, (np.complex64, np.complex128), strict=True):
+            kernel_set.combine_capon(signals[:, None], offsets, np.ones((1, 8), dtype), 3, 0.5, each)
+    assert np.flatnonzero(~np.isfinite(out[0, 0])).tolist() == [32, 33, 34]
+    assert not out[:, 0, 20:26].any()
+    np.testing.assert_allclose(out[0], out[1], rtol=2e-5)
+
+
+def test_capon_has_double_precision_where_single_precision_may_exceed_the_budget():
+    """32 microphones; kernels use the precision of their weights."""
+    offsets, weights = np.zeros((1, 32), np.int32), np.full((1, 32), 1 / 32, np.complex64)
+    used = {}
+    for loading, budget_db in ((1.0, -35.0), (1e-2, -35.0), (1e-3, -35.0), (1.0, -100.0)):
+        kept = []
+        kernels = SimpleNamespace(combine_capon=lambda _signals, _offsets, weights, *_, kept=kept: kept.append(weights))
+        processing = Processing(beamformer="capon", diagonal_loading=loading)
+        budget = 10 ** (budget_db / 10)
+        beamform = AdaptiveBeamform(processing, kernels, KERNELS["cpu"].memory(), offsets, weights, budget=budget)
+        beamform(np.zeros((32, 1, 1), np.complex64), np.zeros((1, 1), np.float32))
+        used[loading, budget_db] = kept[0].dtype
+    assert list(used.values()) == [np.complex64, np.complex64, np.complex128, np.complex128]
 
 
 @pytest.mark.parametrize(("beamformer", "weighting"), ADAPTIVE_COMBINATIONS)
