@@ -203,7 +203,8 @@ class Planner:
     def keeps_budget_of_images(self, accuracy: Accuracy) -> bool:
         """Return False if a complete plan of an adaptive beamformer meets the budget for delay-and-sum beams only.
 
-        The answer holds for any sound: it depends neither on the signal model nor on the sensitivity of this planner.
+        The answer holds for any sound, or with streams for echoes in noise. It depends neither on the signal model nor
+        on the sensitivity of this planner.
         """
         if not self.settings.processing.is_adaptive:
             return True
