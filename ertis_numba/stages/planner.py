@@ -248,9 +248,9 @@ def _worst(chosen: Chosen) -> str:
 
 
 def _no_plan(settings: Settings) -> str:
-    """Return the reason why no plan exists: the device or the settings exclude streams, and wavefronts need them."""
+    """Return the reason why no plan exists: the settings exclude streams, and spherical wavefronts need them."""
     return (
         f"processing.beamformer {settings.processing.beamformer!r} with weighting {settings.processing.weighting!r} "
-        "needs 16-bit streams for these settings, but accuracy.precision or the processor excludes them; give "
-        "processing.wavefront 'plane', or accuracy.precision 'auto' on a processor with AVX-512 VNNI or AVX-VNNI"
+        "needs 16-bit streams for spherical wavefronts, but settings.accuracy excludes them; give "
+        "processing.wavefront 'plane', or leave accuracy.precision, delay_taps and beam_taps out"
     )
