@@ -251,6 +251,6 @@ def _no_plan(settings: Settings) -> str:
     """Return the reason why no plan exists: the settings exclude streams, and spherical wavefronts need them."""
     return (
         f"processing.beamformer {settings.processing.beamformer!r} with weighting {settings.processing.weighting!r} "
-        "needs 16-bit streams for spherical wavefronts, but settings.accuracy excludes them; give "
+        "needs 16-bit streams for spherical wavefronts, but the accuracy settings exclude them; give "
         "processing.wavefront 'plane', or leave accuracy.precision, delay_taps and beam_taps out"
     )
