@@ -200,6 +200,26 @@ def test_receiver_reports_words_as_they_arrive(n_bytes):
     assert collected.begun == (3 if n_bytes < 4 * n_samples else 0)
 
 
+def test_receiver_returns_a_complete_block_before_it_reports_words_of_the_next():
+    measurements = [words_of(seed)[:512] for seed in range(2)]
+    data = b"".join(encode_block(number, words) for number, words in enumerate(measurements))
+    calls = []
+
+    def failing(first, words):
+        calls.append((first, len(words)))
+        raise RuntimeError("the program is wrong")
+
+    receiver = BlockReceiver(512, expected=0, shortest_s=1e-9, on_words=failing)
+    (block,) = receiver.feed(data[: len(data) // 2 + 400], NOW)
+    assert (block.counter, calls) == (0, [])
+    with pytest.raises(RuntimeError, match="the program is wrong"):
+        receiver.feed(data[len(data) // 2 + 400 : len(data) // 2 + 600], NOW)
+    assert calls == [(0, (600 - 8) // 4)]
+    (block,) = receiver.feed(data[len(data) // 2 + 600 :], NOW)
+    np.testing.assert_array_equal(block.data, measurements[1])
+    assert (receiver.lost, receiver.rejected.total(), receiver.pending) == (0, 0, 0)
+
+
 def test_damaged_blocks_give_the_images_that_they_give_without_a_stream(pipeline):
     rng = np.random.default_rng(12)
     measurements = [words_of(seed) for seed in range(20, 26)]
