@@ -103,23 +103,63 @@ def test_signals_are_computed_as_words_arrive(pipeline, monkeypatch):
     assert parts == list(range(0, demodulate.shape[1], 512))  # Each sample once.
 
 
-def test_image_of_near_ranges_is_finished_before_the_last_words(monkeypatch):
+@pytest.fixture
+def near(monkeypatch):
+    """Return a pipeline of near ranges, a list to which each computed image is added, and a clock that a test sets."""
     settings = SETTINGS.replace(processing=SETTINGS.processing.replace(range_m=(0.3, 0.6)))
     with ertis.Pipeline(settings, "cpu", predict=False) as pipeline:
-        words, images = words_of(7), []
-        later = words.copy()
-        later[30_000:] ^= 1  # The image depends on no later word.
-        expected = image_of(pipeline, later)
+        images, clock = [], Clock()
         chain = type(pipeline._chain)  # noqa: SLF001  the only place where work is visible
         image = chain._image  # noqa: SLF001
-        monkeypatch.setattr(chain, "_image", lambda *given: (images.append(given), image(*given)))
-        stream = pipeline.stream()
-        add(stream, words, [4000] * 7)
-        assert not images
-        stream.add(28_000, words[28_000:30_000])
-        assert len(images) == 1
-        np.testing.assert_array_equal(image_of(pipeline, later, stream), expected)
-        assert len(images) == 1
+        monkeypatch.setattr("ertis_numba.stages.word_stream.perf_counter", clock)
+
+        def timed(*given):
+            images.append(given)
+            image(*given)
+            clock.now_s += clock.image_s
+
+        monkeypatch.setattr(chain, "_image", timed)
+        yield pipeline, images, clock
+
+
+class Clock:
+    """Clock that a test sets, on which an image takes a constant time."""
+
+    def __init__(self):
+        self.now_s, self.image_s = 0.0, 0.0
+
+    def __call__(self):
+        return self.now_s
+
+
+@pytest.mark.parametrize(
+    ("word_s", "image_s", "is_early"),
+    [(1e-6, 1e-3, True), (1e-6, 2e-3, False), (1e-7, 1e-3, False), (0.0, 1e-3, False)],
+)
+def test_image_of_near_ranges_is_finished_early_if_the_last_words_take_longer(near, word_s, image_s, is_early):
+    pipeline, images, clock = near
+    words = words_of(7)
+    later = words.copy()
+    later[30_000:] ^= 1  # The image depends on no later word.
+    expected = image_of(pipeline, later)
+    clock.image_s = image_s
+    stream = pipeline.stream()
+    images.clear()
+    for first in range(0, 30_000, 2000):
+        stream.add(first, words[first : first + 2000])
+        assert len(images) == (is_early and first == 28_000)
+        clock.now_s += word_s * 2000
+    np.testing.assert_array_equal(image_of(pipeline, later, stream), expected)
+    assert len(images) == 1
+
+
+def test_image_is_not_finished_early_if_the_rate_of_words_is_unknown(near):
+    pipeline, images, clock = near
+    stream = pipeline.stream()
+    images.clear()
+    clock.now_s += 1.0
+    add(stream, words_of(7), [30_000])
+    assert not images
 
 
 def test_number_of_threads_does_not_change_an_image(pipeline):
