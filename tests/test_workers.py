@@ -319,8 +319,18 @@ def test_processing_options_are_checked(tmp_path):
 
 
 @pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="this system has no timer signals")
-def test_hanging_worker_without_parent_ends_with_a_traceback():
-    program = """
+@pytest.mark.parametrize(
+    "inherited",
+    ["", "signal.signal(signal.SIGALRM, signal.SIG_IGN)", "signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGALRM])"],
+)
+def test_hanging_worker_without_parent_ends_with_a_traceback(inherited, tmp_path):
+    program = f"""
+import os, signal, sys
+
+if len(sys.argv) == 1:
+    {inherited or "pass"}
+    os.execv(sys.executable, [sys.executable, sys.argv[0], "child"])
+
 from ertis_numba.network.processing.worker_process import end_after
 
 def hang():
@@ -332,7 +342,9 @@ end_after(0)
 end_after(0.2)
 hang()
 """
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+    path = tmp_path / "hangs.py"
+    path.write_text(program)
+    done = subprocess.run([sys.executable, path], capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == -signal.SIGALRM
     assert "in hang" in done.stderr
 
