@@ -196,6 +196,28 @@ def test_stream_of_another_pipeline_is_refused(pipeline):
         image_of(pipeline, words_of(1), other.stream())
 
 
+def test_stream_is_refused_by_a_pipeline_that_has_none(pipeline):
+    settings = SETTINGS.replace(processing=SETTINGS.processing.replace(method="paper"))
+    with ertis.Pipeline(settings, "numpy", predict=False) as other:
+        words = words_of(1)
+        with pytest.raises(ArgumentError, match="another pipeline; create it with the method stream"):
+            image_of(other, words, pipeline.stream())
+        np.testing.assert_array_equal(image_of(other, words, other.stream()), image_of(other, words))
+
+
+@pytest.mark.parametrize("threads", [0, -1, 999])
+def test_number_of_threads_is_checked_for_streams_and_finished_images(near, threads):
+    pipeline, _, clock = near
+    words, stream = words_of(7), pipeline.stream()
+    for first in range(0, 32_000, 2000):
+        stream.add(first, words[first : first + 2000])
+        clock.now_s += 1e-3
+    with pytest.raises(ArgumentError, match="threads"):
+        image_of(pipeline, words, stream, threads=threads)
+    with pytest.raises(ArgumentError, match="threads"):
+        image_of(pipeline, words, pipeline.stream(), threads=threads)
+
+
 def test_code_of_the_page_on_sensors_runs(pipeline, tmp_path, monkeypatch):
     monkeypatch.setenv("ERTIS_EMULATED_DIR", str(tmp_path))
     page = Path(__file__).parents[1] / "docs" / "how-to" / "devices.md"

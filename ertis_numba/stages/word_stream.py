@@ -8,11 +8,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.errors import ArgumentError
 from ertis_numba.kernels import KernelSet
 from ertis_numba.stages.buffer_pool import MeasurementBuffers
 from ertis_numba.stages.demodulate import DemodulatePdm
 
-__all__ = ["StreamedImage", "WordStream"]
+__all__ = ["StreamedImage", "WordStream", "foreign_stream"]
 
 _STEP = 512  # Signal samples per call of the kernel: 5120 words by default, which arrive in about a millisecond.
 # Share of the time until the last word that an image may take on one thread. `StreamedImage.add` runs in the thread
@@ -55,6 +56,11 @@ class WordStream:
         """Fill ``out`` with the image of a measurement; return False if it begins with other words than were added."""
         with self._lock:
             return self._image is not None and self._image.complete(words, out, threads)
+
+
+def foreign_stream() -> ArgumentError:
+    """Return the error of a stream that was given to another pipeline."""
+    return ArgumentError("stream is of another pipeline; create it with the method stream() of this one")
 
 
 class StreamedImage:
