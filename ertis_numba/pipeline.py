@@ -25,7 +25,7 @@ from ertis_numba.stages.costs import PLAN_COSTS, PlanCosts
 from ertis_numba.stages.fast import FastChain
 from ertis_numba.stages.kernel_chain import KernelChain
 from ertis_numba.stages.memory import require_memory
-from ertis_numba.stages.word_stream import WordStream
+from ertis_numba.stages.word_stream import WordStream, foreign_stream
 
 if TYPE_CHECKING:
     from ertis_numba.prediction import Prediction
@@ -196,10 +196,12 @@ class Pipeline:
         checks.instance("measurement", measurement, Measurement, "a recording holds")
         words, exponent = self._words_of(measurement)
         amplitude = self._chain.new_image() if out is None else self._checked_out(out)
-        if stream is None or not isinstance(self._chain, KernelChain):
+        if stream is not None and isinstance(self._chain, KernelChain):
+            self._chain.process_streamed(stream, words, amplitude, threads=threads)
+        elif stream is None or stream.is_of(None):
             self._chain.process(words, amplitude, threads=threads)
         else:
-            self._chain.process_streamed(stream, words, amplitude, threads=threads)
+            raise foreign_stream()
         image = self._energyscape(_rescaled(amplitude, exponent), measurement)
         self._check_call(measurement)
         self._check_budget(image, measurement)

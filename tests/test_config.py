@@ -92,7 +92,7 @@ def test_unknown_ertis_variable_causes_one_warning(images, name, meant):
 def test_variables_that_are_not_options_cause_no_warning(images):
     folder, _ = images
     path = str(folder)
-    of_folders = dict.fromkeys(("ERTIS_CACHE_DIR", "ERTIS_EMULATED_DIR", "ERTIS_KEYS_DIR"), path)
+    of_folders = dict.fromkeys(("ERTIS_CACHE_DIR", "ERTIS_EMULATED_DIR", "ERTIS_KEYS_DIR", "ERTIS_TRACE"), path)
     given = {
         "ERTIS_PROCESS_MAX_ERROR": "-40",
         "ERTIS_SERVE_ALLOW": "x",

@@ -2,6 +2,8 @@
 
 import json
 import os
+import subprocess
+import sys
 import threading
 import time
 
@@ -11,6 +13,7 @@ from ertis_bench.network import figures, latency
 from ertis_bench.network.processor_time import ProcessorTime
 from ertis_cli.main import cli
 
+from ertis_numba.errors import ArgumentError
 from ertis_numba.network import trace
 
 
@@ -85,3 +88,31 @@ def test_trace_writes_one_line_per_mark(tmp_path):
     assert [line[:3] for line in lines] == [["sent", "front", "3"], ["sent", "left", "4"]]
     assert int(lines[0][3]) <= int(lines[1][3])
     assert trace.mark is trace.ignore
+
+
+def test_trace_to_a_missing_folder_is_refused(tmp_path):
+    with pytest.raises(
+        ArgumentError, match=r"ERTIS_TRACE is .*missing', which is not a folder .*; create it, or unset"
+    ):
+        trace.TraceWriter(tmp_path / "missing")
+    done = subprocess.run(
+        [sys.executable, "-m", "ertis_cli", "listen", "tcp://127.0.0.1:9"],
+        env={**os.environ, trace.VARIABLE: str(tmp_path / "missing")},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    (line,) = done.stderr.splitlines()
+    assert (done.returncode, line.startswith("ertis: error: ERTIS_TRACE is")) == (1, True)
+
+
+def test_trace_omits_marks_that_cannot_be_written(tmp_path):
+    (tmp_path / "kept").mkdir()
+    writer = trace.TraceWriter(tmp_path / "kept")
+    (tmp_path / "kept").rename(tmp_path / "moved")
+    writer("sent", "front", 3)
+    (tmp_path / "kept").mkdir()
+    writer("sent", "front", 4)
+    (path,) = (tmp_path / "kept").iterdir()
+    assert path.read_text("utf-8").startswith("sent\tfront\t4\t")

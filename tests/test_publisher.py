@@ -3,8 +3,11 @@
 import os
 import signal
 from collections import Counter
+from contextlib import ExitStack
 
+import numpy as np
 import pytest
+import zmq
 
 from ertis_numba.network.allow_list import AllowList, Permission
 from ertis_numba.network.keys import ClientKeys, KeyPair, ServerKeys
@@ -253,7 +256,7 @@ class TestSubscribers:
             self.sent = []
 
         def send_multipart(self, parts, *_):
-            self.sent.append([bytes(part) for part in parts])
+            self.sent.append(parts)
 
     def hear(self, subscribers, number, name):
         return subscribers.hear([self.Frame(bytes([0, number]))], name, Subscribe(products=("raw",)))
@@ -276,20 +279,46 @@ class TestSubscribers:
         subscribers = Subscribers(self.Socket())
         assert all(self.hear(subscribers, number, "loopback") for number in range(40))
 
-    def test_waiting_product_keeps_a_copy_of_borrowed_memory(self):
+    def test_product_is_copied_once_for_all_subscribers(self):
         socket, memory = self.Socket(), bytearray(b"first")
         subscribers = Subscribers(socket)
-        frames = [self.Frame(b"\0app")]
         wants = Subscribe(products=("status",), credit=1)
-        assert subscribers.hear(frames, "app", wants)
-        items = [QueuedProduct("status", "", Report(), [memoryview(memory)], is_borrowed=True) for _ in range(2)]
-        subscribers.offer(items[0])
-        subscribers.offer(items[1])
-        assert isinstance(items[0].payloads[0], memoryview)  # It was sent at once, and needs no copy.
-        memory[:] = b"later"
-        assert [parts[-1] for parts in socket.sent] == [b"first"]
-        assert subscribers.hear(frames, "app", Subscribe(products=("status",), consumed=1, credit=1))
-        assert [parts[-1] for parts in socket.sent] == [b"first", b"first"]
+        applications = [[self.Frame(b"\0app%d" % number)] for number in range(3)]
+        assert all(subscribers.hear(frames, "app", wants) for frames in applications)
+        items = [QueuedProduct("status", "", Report(), [memoryview(memory)]) for _ in range(2)]
+        for item in items:
+            subscribers.offer(item)
+        memory[:] = b"later"  # The slot is used again, while the second product waits for credit.
+        payloads = [parts[-1] for parts in socket.sent]
+        assert [payload.bytes for payload in payloads] == [b"first"] * 3
+        assert all(payload is items[0].payloads[0] for payload in payloads)
+        for frames in applications:
+            assert subscribers.hear(frames, "app", Subscribe(products=("status",), consumed=1, credit=1))
+        assert [parts[-1].bytes for parts in socket.sent] == [b"first"] * 6
+
+    def test_product_without_subscribers_is_not_copied(self):
+        subscribers = Subscribers(self.Socket())
+        payload = memoryview(b"image")
+        item = QueuedProduct("raw", "front", Report(), [payload])
+        assert subscribers.hear([self.Frame(b"\0app")], "app", Subscribe(products=("status",)))
+        subscribers.offer(item)
+        assert item.payloads == [payload]
+
+    def test_messages_of_all_subscribers_share_memory(self):
+        data, wants = os.urandom(1_000_000), Subscribe(products=("raw",), credit=1)
+        with zmq.Context() as context, context.socket(zmq.ROUTER) as router, ExitStack() as stack:
+            router.bind("inproc://products")
+            subscribers, dealers = Subscribers(router), []
+            for _ in range(3):
+                dealers.append(stack.enter_context(context.socket(zmq.DEALER)))
+                dealers[-1].connect("inproc://products")
+                dealers[-1].send(b"")
+                assert subscribers.hear(router.recv_multipart(copy=False), "app", wants)
+            subscribers.offer(QueuedProduct("raw", "front", Report(), [memoryview(data)]))
+            payloads = [dealer.recv_multipart(copy=False)[-1] for dealer in dealers]
+            assert all(payload.bytes == data for payload in payloads)
+            # Within one process, ZeroMQ passes messages on without copying them.
+            assert len({np.frombuffer(payload.buffer, np.uint8).ctypes.data for payload in payloads}) == 1
 
 
 class TestSubscriber:

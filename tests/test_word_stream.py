@@ -103,23 +103,63 @@ def test_signals_are_computed_as_words_arrive(pipeline, monkeypatch):
     assert parts == list(range(0, demodulate.shape[1], 512))  # Each sample once.
 
 
-def test_image_of_near_ranges_is_finished_before_the_last_words(monkeypatch):
+@pytest.fixture
+def near(monkeypatch):
+    """Return a pipeline of near ranges, a list to which each computed image is added, and a clock that a test sets."""
     settings = SETTINGS.replace(processing=SETTINGS.processing.replace(range_m=(0.3, 0.6)))
     with ertis.Pipeline(settings, "cpu", predict=False) as pipeline:
-        words, images = words_of(7), []
-        later = words.copy()
-        later[30_000:] ^= 1  # The image depends on no later word.
-        expected = image_of(pipeline, later)
+        images, clock = [], Clock()
         chain = type(pipeline._chain)  # noqa: SLF001  the only place where work is visible
         image = chain._image  # noqa: SLF001
-        monkeypatch.setattr(chain, "_image", lambda *given: (images.append(given), image(*given)))
-        stream = pipeline.stream()
-        add(stream, words, [4000] * 7)
-        assert not images
-        stream.add(28_000, words[28_000:30_000])
-        assert len(images) == 1
-        np.testing.assert_array_equal(image_of(pipeline, later, stream), expected)
-        assert len(images) == 1
+        monkeypatch.setattr("ertis_numba.stages.word_stream.perf_counter", clock)
+
+        def timed(*given):
+            images.append(given)
+            image(*given)
+            clock.now_s += clock.image_s
+
+        monkeypatch.setattr(chain, "_image", timed)
+        yield pipeline, images, clock
+
+
+class Clock:
+    """Clock that a test sets, on which an image takes a constant time."""
+
+    def __init__(self):
+        self.now_s, self.image_s = 0.0, 0.0
+
+    def __call__(self):
+        return self.now_s
+
+
+@pytest.mark.parametrize(
+    ("word_s", "image_s", "is_early"),
+    [(1e-6, 1e-3, True), (1e-6, 2e-3, False), (1e-7, 1e-3, False), (0.0, 1e-3, False)],
+)
+def test_image_of_near_ranges_is_finished_early_if_the_last_words_take_longer(near, word_s, image_s, is_early):
+    pipeline, images, clock = near
+    words = words_of(7)
+    later = words.copy()
+    later[30_000:] ^= 1  # The image depends on no later word.
+    expected = image_of(pipeline, later)
+    clock.image_s = image_s
+    stream = pipeline.stream()
+    images.clear()
+    for first in range(0, 30_000, 2000):
+        stream.add(first, words[first : first + 2000])
+        assert len(images) == (is_early and first == 28_000)
+        clock.now_s += word_s * 2000
+    np.testing.assert_array_equal(image_of(pipeline, later, stream), expected)
+    assert len(images) == 1
+
+
+def test_image_is_not_finished_early_if_the_rate_of_words_is_unknown(near):
+    pipeline, images, clock = near
+    stream = pipeline.stream()
+    images.clear()
+    clock.now_s += 1.0
+    add(stream, words_of(7), [30_000])
+    assert not images
 
 
 def test_number_of_threads_does_not_change_an_image(pipeline):
@@ -154,6 +194,28 @@ def test_stream_of_another_pipeline_is_refused(pipeline):
         pytest.raises(ArgumentError, match="another pipeline; create it with the method stream"),
     ):
         image_of(pipeline, words_of(1), other.stream())
+
+
+def test_stream_is_refused_by_a_pipeline_that_has_none(pipeline):
+    settings = SETTINGS.replace(processing=SETTINGS.processing.replace(method="paper"))
+    with ertis.Pipeline(settings, "numpy", predict=False) as other:
+        words = words_of(1)
+        with pytest.raises(ArgumentError, match="another pipeline; create it with the method stream"):
+            image_of(other, words, pipeline.stream())
+        np.testing.assert_array_equal(image_of(other, words, other.stream()), image_of(other, words))
+
+
+@pytest.mark.parametrize("threads", [0, -1, 999])
+def test_number_of_threads_is_checked_for_streams_and_finished_images(near, threads):
+    pipeline, _, clock = near
+    words, stream = words_of(7), pipeline.stream()
+    for first in range(0, 32_000, 2000):
+        stream.add(first, words[first : first + 2000])
+        clock.now_s += 1e-3
+    with pytest.raises(ArgumentError, match="threads"):
+        image_of(pipeline, words, stream, threads=threads)
+    with pytest.raises(ArgumentError, match="threads"):
+        image_of(pipeline, words, pipeline.stream(), threads=threads)
 
 
 def test_code_of_the_page_on_sensors_runs(pipeline, tmp_path, monkeypatch):
@@ -198,6 +260,26 @@ def test_receiver_reports_words_as_they_arrive(n_bytes):
                 assert len(before) >= n_samples - (n_bytes // 4 + 3)
     assert len(seen) == 3
     assert collected.begun == (3 if n_bytes < 4 * n_samples else 0)
+
+
+def test_receiver_returns_a_complete_block_before_it_reports_words_of_the_next():
+    measurements = [words_of(seed)[:512] for seed in range(2)]
+    data = b"".join(encode_block(number, words) for number, words in enumerate(measurements))
+    calls = []
+
+    def failing(first, words):
+        calls.append((first, len(words)))
+        raise RuntimeError("the program is wrong")
+
+    receiver = BlockReceiver(512, expected=0, shortest_s=1e-9, on_words=failing)
+    (block,) = receiver.feed(data[: len(data) // 2 + 400], NOW)
+    assert (block.counter, calls) == (0, [])
+    with pytest.raises(RuntimeError, match="the program is wrong"):
+        receiver.feed(data[len(data) // 2 + 400 : len(data) // 2 + 600], NOW)
+    assert calls == [(0, (600 - 8) // 4)]
+    (block,) = receiver.feed(data[len(data) // 2 + 600 :], NOW)
+    np.testing.assert_array_equal(block.data, measurements[1])
+    assert (receiver.lost, receiver.rejected.total(), receiver.pending) == (0, 0, 0)
 
 
 def test_damaged_blocks_give_the_images_that_they_give_without_a_stream(pipeline):

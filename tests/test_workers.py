@@ -319,8 +319,18 @@ def test_processing_options_are_checked(tmp_path):
 
 
 @pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="this system has no timer signals")
-def test_hanging_worker_without_parent_ends_with_a_traceback():
-    program = """
+@pytest.mark.parametrize(
+    "inherited",
+    ["", "signal.signal(signal.SIGALRM, signal.SIG_IGN)", "signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGALRM])"],
+)
+def test_hanging_worker_without_parent_ends_with_a_traceback(inherited, tmp_path):
+    program = f"""
+import os, signal, sys
+
+if len(sys.argv) == 1:
+    {inherited or "pass"}
+    os.execv(sys.executable, [sys.executable, sys.argv[0], "child"])
+
 from ertis_numba.network.processing.worker_process import end_after
 
 def hang():
@@ -332,57 +342,121 @@ end_after(0)
 end_after(0.2)
 hang()
 """
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+    path = tmp_path / "hangs.py"
+    path.write_text(program)
+    done = subprocess.run([sys.executable, path], capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == -signal.SIGALRM
     assert "in hang" in done.stderr
 
 
+def arriving(choice, *, period_s, n_periods, burst=1, begin_s=0.0):
+    """Let bursts arrive periodically, half a millisecond apart within each; return the number of changes."""
+    load, changes = Load(), 0
+    for period in range(n_periods):
+        now_s = begin_s + period * period_s
+        for number in range(burst):
+            load.add(now_s + 0.0005 * number)
+        changes += choice.update(now_s + 0.2 * period_s, load)
+    return changes
+
+
 class TestChoice:
+    def choice(self, cores, wide_s, many_s):
+        choice = Choice(cores, cores)
+        choice.seed(wide_s, many_s)
+        return choice
+
     def test_idle_machine_uses_all_cores_per_measurement(self):
-        choice = Choice(2, 2)
-        choice.seed(0.010, 0.016)
-        assert not choice.look(0.0, 50.0)
+        choice = self.choice(2, 0.010, 0.016)
+        assert not choice.update(0.0, Load())
+        assert "no load measured yet" in choice.why
+        assert arriving(choice, period_s=0.02, n_periods=300, begin_s=3.0) == 0
         assert choice.mode == Mode(1, 2)
         assert "50%" in choice.why
 
     def test_loaded_machine_processes_several_at_once(self):
-        choice = Choice(2, 2)
-        choice.seed(0.010, 0.016)
-        assert choice.look(0.0, 90.0)
+        choice = self.choice(2, 0.010, 0.016)
+        assert arriving(choice, period_s=1 / 90, n_periods=2000) == 1
         assert choice.mode == Mode(2, 1)
-        assert not choice.look(1.0, 10.0)  # it is too early to look again
-        assert choice.look(4.0, 10.0)
+        assert arriving(choice, period_s=0.1, n_periods=10, begin_s=22.3) == 0  # It is too early to choose again.
+        assert arriving(choice, period_s=0.1, n_periods=300, begin_s=30.0) == 1
         assert choice.mode == Mode(1, 2)
 
     def test_all_cores_per_measurement_if_parallel_jobs_are_slower(self):
-        choice = Choice(2, 2)
-        choice.seed(0.010, 0.030)
-        assert not choice.look(0.0, 200.0)
+        choice = self.choice(2, 0.010, 0.030)
+        assert arriving(choice, period_s=0.005, n_periods=4000) == 0
         assert choice.mode == Mode(1, 2)
 
     def test_recent_job_times_weigh_more(self):
-        choice = Choice(2, 2)
-        choice.seed(0.010, 0.016)
+        choice = self.choice(2, 0.010, 0.016)
         for _ in range(8):
             choice.took(Mode(1, 2), 0.020)
-        assert choice.look(0.0, 45.0)
+        choice.took(Mode(7, 7), 0.001)  # A job that began before the number of workers changed.
+        assert arriving(choice, period_s=1 / 45, n_periods=200)
 
-    def test_simultaneous_measurements_share_the_cores_even_at_a_low_rate(self):
-        load, choice = Load(), Choice(2, 2)
-        choice.seed(0.010, 0.016)
-        for pulse in range(4):
-            for sensor in range(4):
-                load.add(0.5 * pulse + 0.002 * sensor)
-        assert load.overlap(0.010) == 0.75
-        assert load.overlap(0.001) == 0.0
-        assert choice.look(2.0, load.rate_hz(2.0), load.overlap)
-        assert choice.mode == Mode(2, 1)
-        assert "75% of them waiting" in choice.why
-        assert choice.look(6.0, 8.0, lambda _: 0.3)
-        assert choice.mode == Mode(1, 2)
+    @pytest.mark.parametrize(
+        ("cores", "wide_s", "many_s", "burst", "expected"),
+        [
+            (2, 0.010, 0.016, 1, Mode(1, 2)),
+            (2, 0.010, 0.016, 2, Mode(2, 1)),
+            (2, 0.010, 0.016, 4, Mode(2, 1)),
+            (4, 0.010, 0.030, 2, Mode(2, 2)),
+            (4, 0.010, 0.030, 4, Mode(4, 1)),
+            (8, 0.010, 0.060, 2, Mode(1, 8)),
+            (8, 0.010, 0.060, 4, Mode(4, 2)),
+            (8, 0.010, 0.060, 16, Mode(8, 1)),
+            (16, 0.006, 0.060, 2, Mode(2, 8)),
+            (16, 0.006, 0.060, 4, Mode(4, 4)),
+            (16, 0.006, 0.060, 8, Mode(8, 2)),
+        ],
+    )
+    def test_simultaneous_measurements_share_the_cores_if_the_last_image_comes_sooner(
+        self, cores, wide_s, many_s, burst, expected
+    ):
+        choice = self.choice(cores, wide_s, many_s)
+        changes = arriving(choice, period_s=0.5, n_periods=100, burst=burst)
+        assert (choice.mode, changes) == (expected, int(expected.at_once > 1))
+        rounds = -(-burst // choice.mode.at_once)
+        share = (1 / choice.mode.threads - 1 / cores) / (1 - 1 / cores)
+        assert rounds * (wide_s + share * (many_s - wide_s)) <= burst * wide_s  # Never slower than one at a time.
+        assert choice.why.startswith(f"{choice.mode}: ")
+        arriving(choice, period_s=0.5, n_periods=200, begin_s=60.0)
+        assert choice.mode == Mode(1, cores)  # The bursts have ended.
+
+    @pytest.mark.parametrize("busy", [0.2, 0.45, 0.5, 0.55, 0.6, 0.75, 0.9])
+    @pytest.mark.parametrize(("cores", "many_s"), [(2, 0.016), (4, 0.030), (8, 0.060), (16, 0.100)])
+    def test_independent_sensors_change_the_mode_rarely(self, cores, many_s, busy):
+        rng, load, choice = np.random.default_rng(3), Load(), self.choice(cores, 0.010, many_s)
+        changes, now_s = 0, 0.0
+        while now_s < 600.0:
+            now_s += rng.exponential(0.010 / busy)
+            load.add(now_s)
+            changes += choice.update(now_s, load)
+        assert changes <= 3
+
+    def test_jobs_that_take_longer_than_predicted_end_a_mode(self):
+        choice = self.choice(4, 0.010, 0.030)
+        assert arriving(choice, period_s=0.5, n_periods=20, burst=2) == 1
+        assert choice.mode == Mode(2, 2)
+        choice.took(Mode(2, 2), 0.030)
+        assert arriving(choice, period_s=0.5, n_periods=200, burst=2, begin_s=20.0) == 1
+        assert choice.mode == Mode(1, 4)
+
+    def test_load_forgets_arrivals_that_nobody_reads(self):
+        load = Load()
+        for number in range(10_000):
+            load.add(0.01 * number)
+        rate_hz, arrivals_s = load.recent(100.0)
+        assert rate_hz == pytest.approx(100.0, abs=1.0)
+        assert len(load._arrivals_s) == len(arrivals_s) <= 301  # noqa: SLF001
+
+    def test_number_of_workers_bounds_the_measurements_at_once(self):
+        assert [mode.at_once for mode in Choice(6, 12).modes] == [1, 2, 4, 6]
+        assert [mode.threads for mode in Choice(6, 12).modes] == [12, 6, 3, 2]
 
     def test_single_worker_uses_all_cores(self):
         choice = Choice(1, 4)
         choice.seed(0.010, 0.010)
-        assert not choice.look(0.0, 1000.0)
+        assert arriving(choice, period_s=0.001, n_periods=5000) == 0
         assert choice.mode == Mode(1, 4)
+        assert "the only mode" in choice.why

@@ -24,7 +24,9 @@ __all__ = [
 _GENERAL = frozenset({"device", "quiet", "threads"})
 """Options with the same meaning in every command, such as ``ERTIS_THREADS``."""
 
-_NO_OPTIONS = frozenset(f"ERTIS_{name}" for name in ("BENCH_MARK", "CACHE_DIR", "CONFIG", "EMULATED_DIR", "KEYS_DIR"))
+_NO_OPTIONS = frozenset(
+    f"ERTIS_{name}" for name in ("BENCH_MARK", "CACHE_DIR", "CONFIG", "EMULATED_DIR", "KEYS_DIR", "TRACE")
+)
 """Variables that are not options: other parts of the package read them, and benchmarks mark their processes."""
 
 _FILE, _BROKEN = "ertis_cli.config_file", "ertis_cli.config_error"  # keys of click's `Context.meta`

@@ -185,7 +185,8 @@ class BlockReceiver:
         Returns for words, (sample,) uint32, why they cannot be what microphones gave, or None.
     on_words : callable, optional
         Called with words of an incomplete block as they arrive, and the number of the first of them, which is 0 for a
-        new block. The last words of a block are left out, and the block may still be rejected.
+        new block. The last words of a block are left out, and the block may still be rejected. `feed` raises its
+        exceptions, which lose no block.
 
     Attributes
     ----------
@@ -248,7 +249,8 @@ class BlockReceiver:
             self._parser.add(data, arrived)
         while (block := self._parser.take()) is not None:
             good += self._settle(self._counters.judge(block, self._parser.rejected.total() / self.n_bytes))
-        if self._on_words is not None:
+        # Complete blocks come first: an exception would lose them, and a new block discards what a stream has of one.
+        if self._on_words is not None and not good:
             first, words = self._parser.new_words()
             if len(words):
                 self._on_words(first, words)

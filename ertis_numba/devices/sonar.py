@@ -158,6 +158,7 @@ class SonarDriver:
         on_words : callable, optional
             Called with the number of the first and an array of words as they arrive, such as `WordStream.add` of
             `Pipeline.stream`; 0 begins another block. The last words come with the block, which may still be rejected.
+            `measure` and `listen` raise its exceptions, and can be called again.
         stop : callable
             Polled during the dialogue; once it returns True, this fails.
 

@@ -3,8 +3,11 @@
 import os
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
+
+from ertis_numba.errors import ArgumentError
 
 __all__ = ["VARIABLE", "TraceWriter", "ignore", "mark"]
 
@@ -13,18 +16,33 @@ VARIABLE: Final = "ERTIS_TRACE"
 
 
 class TraceWriter:
-    """Writer of one line per mark: stage, sensor, sequence and time; a killed process loses none."""
+    """Writer of one line per mark: stage, sensor, sequence and time; a killed process loses none.
+
+    A mark that cannot be written, as on a full disk, is omitted, because the event loops of nodes write them.
+
+    Raises
+    ------
+    ArgumentError
+        The folder does not exist, or nothing can be written there.
+    """
 
     def __init__(self, folder: Path) -> None:
+        if not (folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)):
+            raise ArgumentError(
+                f"{VARIABLE} is '{folder}', which is not a folder that this user can write to; create it, or unset "
+                f"{VARIABLE}"
+            )
         self._folder = folder
         self._files: dict[int, int] = {}  # By process: a forked process needs a file of its own.
 
     def __call__(self, stage: str, sensor: str, sequence: int) -> None:
         """Record that a measurement has passed a stage."""
         now_ns, pid = time.monotonic_ns(), os.getpid()
-        if pid not in self._files:
-            self._files[pid] = os.open(self._folder / f"{pid}.trace", os.O_CREAT | os.O_APPEND | os.O_WRONLY, 0o600)
-        os.write(self._files[pid], f"{stage}\t{sensor}\t{sequence}\t{now_ns}\n".encode())
+        with suppress(OSError):
+            if pid not in self._files:
+                path = self._folder / f"{pid}.trace"
+                self._files[pid] = os.open(path, os.O_CREAT | os.O_APPEND | os.O_WRONLY, 0o600)
+            os.write(self._files[pid], f"{stage}\t{sensor}\t{sequence}\t{now_ns}\n".encode())
 
 
 def ignore(stage: str, sensor: str, sequence: int) -> None:

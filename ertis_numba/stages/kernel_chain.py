@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import fft
-from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import Grid
 from ertis_numba.kernels import KernelSet
 from ertis_numba.settings import Settings
@@ -20,7 +19,7 @@ from ertis_numba.stages.beamform import Beamform
 from ertis_numba.stages.buffer_pool import BufferPool, MeasurementBuffers
 from ertis_numba.stages.demodulate import Demodulate, DemodulatePdm
 from ertis_numba.stages.fitting import one_thread
-from ertis_numba.stages.word_stream import StreamedImage, WordStream
+from ertis_numba.stages.word_stream import StreamedImage, WordStream, foreign_stream
 
 __all__ = ["Compress", "KernelChain"]
 
@@ -109,8 +108,11 @@ class KernelChain(ABC):
     ) -> None:
         """Compute the image of a measurement whose words, or some of them, were added to a stream of this chain."""
         if not stream.is_of(self._demodulate):
-            raise ArgumentError("stream is of another pipeline; create it with the method stream() of this one")
-        if not stream.process(words, out, threads=threads or self._threads):
+            raise foreign_stream()
+        threads = self._threads if threads is None else threads
+        with self._kernels.threads(threads):  # An image that is complete already would need none.
+            pass
+        if not stream.process(words, out, threads=threads):
             self.process(words, out, threads=threads)
 
     def process_batch(

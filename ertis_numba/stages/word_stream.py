@@ -2,18 +2,23 @@
 
 import threading
 from collections.abc import Callable
-from typing import Any
+from time import perf_counter
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.errors import ArgumentError
 from ertis_numba.kernels import KernelSet
 from ertis_numba.stages.buffer_pool import MeasurementBuffers
 from ertis_numba.stages.demodulate import DemodulatePdm
 
-__all__ = ["StreamedImage", "WordStream"]
+__all__ = ["StreamedImage", "WordStream", "foreign_stream"]
 
 _STEP = 512  # Signal samples per call of the kernel: 5120 words by default, which arrive in about a millisecond.
+# Share of the time until the last word that an image may take on one thread. `StreamedImage.add` runs in the thread
+# that reads words, so a longer image would delay them, and other threads could not help with it.
+_SHARE: Final = 0.5
 
 
 class WordStream:
@@ -53,6 +58,11 @@ class WordStream:
             return self._image is not None and self._image.complete(words, out, threads)
 
 
+def foreign_stream() -> ArgumentError:
+    """Return the error of a stream that was given to another pipeline."""
+    return ArgumentError("stream is of another pipeline; create it with the method stream() of this one")
+
+
 class StreamedImage:
     """Image of a measurement whose words arrive in pieces.
 
@@ -82,27 +92,50 @@ class StreamedImage:
         self.demodulate, self._image, self._kernels = demodulate, image, kernels
         self._buffers, self._words, self._amplitude = buffers, words, amplitude
         self._part = np.empty((demodulate.shape[0], _STEP), np.float32)
-        self._n_words = self._n_done = 0
+        self._n_words = self._n_first = self._n_done = 0
         self._is_done = False
+        self._begun_s, self._image_s = 0.0, self._time_s()
 
     def add(self, first: int, words: NDArray[Any]) -> None:
-        """Copy words, and compute signals that depend on no later ones, and the image once it has all signals."""
+        """Copy words, and compute signals that depend on no later ones.
+
+        Also compute the image once it has all signals, if it is finished before the last words arrive.
+        """
         if first == 0:
             self._n_words = self._n_done = 0
             self._is_done = False
+            self._begun_s = perf_counter()
         rows = words.reshape(-1, self._words.shape[1])
         if first != self._n_words or self._n_words + len(rows) > len(self._words):
             return  # Words are missing, so that the measurement is not one that was added from its beginning.
         self._words[first : first + len(rows)] = rows
         self._n_words += len(rows)
+        self._n_first = self._n_words if first == 0 else self._n_first
         n_ready = self.demodulate.n_ready(self._n_words)
         if self._is_done or n_ready < min(self._n_done + _STEP, self.demodulate.n_signals):
             return
         with self._kernels.threads(1):  # The words arrive more slowly than one thread processes them.
             self._go_on(n_ready)
-            if n_ready == self.demodulate.n_signals:
+            if n_ready == self.demodulate.n_signals and self._image_s < _SHARE * self._left_s():
                 self._finish(self._amplitude, 1)
                 self._is_done = True
+
+    def _left_s(self) -> float:
+        """Return the time until the last word, at the rate of those that have arrived after the first piece."""
+        n_timed = self._n_words - self._n_first
+        if not n_timed:
+            return 0.0
+        return (perf_counter() - self._begun_s) * (len(self._words) - self._n_words) / n_timed
+
+    def _time_s(self) -> float:
+        """Return the time of an image on one thread: the shorter of two, as the first one also touches new memory."""
+        times_s = []
+        with self._kernels.threads(1):
+            for _ in range(2):
+                begun_s = perf_counter()
+                self._image(self._buffers, self._amplitude, 1)
+                times_s.append(perf_counter() - begun_s)
+        return min(times_s)
 
     def complete(self, words: NDArray[Any], out: NDArray[np.float32], threads: int) -> bool:
         """Fill ``out`` with the image of a whole measurement; return False if it begins with other words."""

@@ -1,49 +1,50 @@
 """Choice between one measurement on all cores and several that share them."""
 
-import itertools
+import heapq
+import math
 import statistics
-import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
 __all__ = ["Choice", "Load", "Mode"]
 
-_BUSY: Final = 0.8  # Share of busy time above which measurements share the cores, …
-_CALM: Final = 0.7  # … and below which each gets all cores.
-_OVERLAP: Final = 0.4  # Share of measurements that would wait for others, above which they share the cores, too.
+_BUSY: Final = 0.8  # Share of busy time above which more measurements share the cores, …
+_CALM: Final = 0.7  # … and below which fewer may share them again.
 _POLL_INTERVAL_S: Final = 3.0
 _KEPT: Final = 32
 _RATE_S: Final = 3.0  # Interval over which the load is measured.
-_GAIN: Final = 1.05  # Required gain of a change, because times fluctuate.
+_GAIN: Final = 1.15  # Required gain of a change, because times fluctuate.
+_WEIGHT: Final = 0.2  # Weight of the latest interval, because the arrivals of independent sensors fluctuate.
 
 
 class Load:
-    """Rate of arriving measurements."""
+    """Arrivals of measurements within the last seconds."""
 
     def __init__(self) -> None:
         self._arrivals_s: deque[float] = deque()
-        self._begun_s = time.monotonic()
+        self._begun_s: float | None = None
 
     def add(self, now_s: float) -> None:
         """Count a measurement; ``now_s`` is a time of `time.monotonic`."""
+        self._begun_s = now_s if self._begun_s is None else self._begun_s
         self._arrivals_s.append(now_s)
+        self._forget(now_s)
 
-    def rate_hz(self, now_s: float) -> float:
-        """Return the recent rate."""
+    def recent(self, now_s: float) -> tuple[float, Sequence[float]]:
+        """Return the rate in measurements per second, and the times of arrival.
+
+        There are none before the load has been observed for as long as arrivals are kept.
+        """
+        self._forget(now_s)
+        if self._begun_s is None or now_s - self._begun_s < _RATE_S:
+            return 0.0, ()
+        return len(self._arrivals_s) / _RATE_S, tuple(self._arrivals_s)
+
+    def _forget(self, now_s: float) -> None:
         while self._arrivals_s and now_s - self._arrivals_s[0] > _RATE_S:
             self._arrivals_s.popleft()
-        return len(self._arrivals_s) / min(_RATE_S, max(now_s - self._begun_s, 0.5))
-
-    def overlap(self, time_s: float) -> float:
-        """Return the share of recent measurements that arrived less than a time after another one.
-
-        Sensors on a common SYNC line measure at the same time, so that their measurements arrive in bursts.
-        """
-        arrivals_s = list(self._arrivals_s)
-        n_close = sum(later_s - earlier_s < time_s for earlier_s, later_s in itertools.pairwise(arrivals_s))
-        return n_close / max(1, len(arrivals_s))
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,12 +54,16 @@ class Mode:
     at_once: int
     threads: int
 
+    def __str__(self) -> str:
+        threads = "1 thread" if self.threads == 1 else f"{self.threads} threads"
+        return f"{self.at_once} at once on {threads} each" if self.at_once > 1 else f"one at a time on {threads}"
+
 
 class Choice:
     """Choice by measured times and load.
 
-    One measurement on all cores is done soonest. Several at once, with a share of the cores each, wait less for each
-    other and give a higher throughput.
+    One measurement on all cores is done soonest. Several at once, with a share of the cores each, have a higher
+    throughput, and wait less for each other if they arrive in bursts, as from sensors on a common SYNC line.
 
     Parameters
     ----------
@@ -68,61 +73,107 @@ class Choice:
 
     Attributes
     ----------
+    modes : tuple of Mode
+        One at a time, then 2, 4, 8 and so on at once, up to the number of workers.
     mode : Mode
     why : str
         Reason in one line.
     """
 
     def __init__(self, workers: int, threads: int) -> None:
-        self.wide, self.many = Mode(1, threads), Mode(workers, max(1, threads // workers))
-        self.mode = self.wide
-        self._times_s: dict[Mode, deque[float]] = {mode: deque(maxlen=_KEPT) for mode in (self.wide, self.many)}
-        self._next_s = 0.0
-        self.why = f"{self._named(self.mode)}: no time measured yet"
+        powers = [2**power for power in range(workers.bit_length())]
+        self.modes = tuple(Mode(n, max(1, threads // n)) for n in sorted({*powers, workers}))
+        self.mode = self.modes[0]
+        self._times_s: dict[Mode, deque[float]] = {mode: deque(maxlen=_KEPT) for mode in self.modes}
+        self._rate_hz: float | None = None  # Smoothed, as are the delays of the last image of a burst.
+        self._delays_s: dict[Mode, float] = {}
+        self._next_s = -math.inf
+        self.why = f"{self.mode}: no load measured yet"
 
     def seed(self, wide_s: float, many_s: float) -> None:
-        """Add times that were measured before the first job."""
-        for mode, time_s in ((self.wide, wide_s), (self.many, many_s)):
+        """Add times that were measured before the first job, in the first and in the last mode."""
+        for mode, time_s in ((self.modes[0], wide_s), (self.modes[-1], many_s)):
             if time_s > 0:
                 self._times_s[mode].append(time_s)
 
     def took(self, mode: Mode, time_s: float) -> None:
-        """Add the time of a job."""
-        self._times_s[mode].append(time_s)
+        """Add the time of a job, unless its mode is a former one."""
+        if mode in self._times_s:
+            self._times_s[mode].append(time_s)
 
-    def look(self, now_s: float, rate_hz: float, overlap: Callable[[float], float] = lambda _: 0.0) -> bool:
-        """Choose again, if due; return True if the mode has changed.
-
-        Parameters
-        ----------
-        now_s : float
-        rate_hz : float
-            Measurements per second of all sensors together.
-        overlap : callable
-            `Load.overlap`; without bursts by default.
-        """
-        if now_s < self._next_s or not all(self._times_s.values()):
+    def update(self, now_s: float, load: Load) -> bool:
+        """Choose again, if due; return True if the mode has changed."""
+        wide, many = self.modes[0], self.modes[-1]
+        if now_s < self._next_s or not (self._times_s[wide] and self._times_s[many]):
+            return False
+        if wide == many:
+            self.why = f"{wide}: the only mode"
+            return False
+        rate_hz, arrivals_s = load.recent(now_s)
+        if not arrivals_s:
             return False
         self._next_s = now_s + _POLL_INTERVAL_S
-        if self.wide == self.many:
-            self.why = f"{self._named(self.wide)}: the only mode"
-            return False
-        before = self.mode
-        wide_s, many_s = (statistics.median(self._times_s[mode]) for mode in (self.wide, self.many))
-        busy, capacity_hz = rate_hz * wide_s, {self.wide: 1 / wide_s, self.many: self.many.at_once / many_s}
-        other = self.many if before == self.wide else self.wide
-        waits = overlap(wide_s)
-        if busy < (_BUSY if before == self.wide else _CALM) and waits < _OVERLAP:
-            self.mode = self.wide
-        elif capacity_hz[other] > _GAIN * capacity_hz[before]:
-            self.mode = other
+        times_s = {mode: self._time_s(mode) for mode in self.modes}
+        self._rate_hz = _smoothed(self._rate_hz, rate_hz)
+        for mode, time_s in times_s.items():
+            delay_s = _delay_s(arrivals_s, mode.at_once, time_s, apart_s=times_s[wide])
+            self._delays_s[mode] = _smoothed(self._delays_s.get(mode), delay_s)
+        before, self.mode = self.mode, self._best(self._rate_hz, times_s)
+        busy = self._rate_hz * times_s[wide]
         self.why = (
-            f"{self._named(self.mode)}: {rate_hz:.0f} measurements/s keep all cores busy {busy:.0%} of the time one by "
-            f"one ({1e3 * wide_s:.1f} ms each), {waits:.0%} of them waiting for another; {self.many.at_once} at once "
-            f"take {1e3 * many_s:.1f} ms"
+            f"{self.mode}: {self._rate_hz:.0f} measurements/s keep all cores busy {busy:.0%} of the time one by one "
+            f"({1e3 * times_s[wide]:.1f} ms each); delay of the last image of a burst: "
+            + ", ".join(f"{1e3 * self._delays_s[mode]:.1f} ms {mode}" for mode in self.modes)
         )
         return self.mode != before
 
-    def _named(self, mode: Mode) -> str:
-        threads = "1 thread" if mode.threads == 1 else f"{mode.threads} threads"
-        return f"{mode.at_once} at once on {threads} each" if mode.at_once > 1 else f"one at a time on {threads}"
+    def _best(self, rate_hz: float, times_s: dict[Mode, float]) -> Mode:
+        """Return the mode that delivers the last image of a burst soonest, of those that can keep up with the load."""
+
+        def keeps_up(mode: Mode) -> bool:
+            limit = _CALM if mode.at_once < self.mode.at_once else _BUSY
+            return rate_hz * times_s[mode] < limit * mode.at_once
+
+        able = [mode for mode in self.modes if keeps_up(mode)]
+        if not able:
+            slowness_s = {mode: times_s[mode] / mode.at_once for mode in self.modes}
+        elif self.mode in able:
+            slowness_s = {mode: self._delays_s[mode] for mode in able}
+        else:
+            return min(able, key=self._delays_s.__getitem__)
+        best = min(slowness_s, key=slowness_s.__getitem__)
+        return best if _GAIN * slowness_s[best] < slowness_s[self.mode] else self.mode
+
+    def _time_s(self, mode: Mode) -> float:
+        """Return the median time of a job in a mode, by Amdahl's law if there was none."""
+        if self._times_s[mode]:
+            return statistics.median(self._times_s[mode])
+        wide, many = self.modes[0], self.modes[-1]
+        wide_s, many_s = (statistics.median(self._times_s[each]) for each in (wide, many))
+        if wide.threads == many.threads:
+            return many_s
+        return wide_s + (many_s - wide_s) * (1 / mode.threads - 1 / wide.threads) / (
+            1 / many.threads - 1 / wide.threads
+        )
+
+
+def _smoothed(before: float | None, now: float) -> float:
+    return now if before is None else before + _WEIGHT * (now - before)
+
+
+def _delay_s(arrivals_s: Sequence[float], at_once: int, time_s: float, *, apart_s: float) -> float:
+    """Return the delay of the last image of a burst, by a replay of arrivals; mean over measurements.
+
+    Bursts are more than ``apart_s`` apart.
+    """
+    free_s = [-math.inf] * at_once
+    total_s = slowest_s = 0.0
+    n_burst, previous_s = 0, -math.inf
+    for arrival_s in arrivals_s:
+        if arrival_s - previous_s > apart_s:
+            total_s += n_burst * slowest_s
+            n_burst, slowest_s = 0, 0.0
+        done_s = max(arrival_s, free_s[0]) + time_s
+        heapq.heapreplace(free_s, done_s)
+        n_burst, slowest_s, previous_s = n_burst + 1, max(slowest_s, done_s - arrival_s), arrival_s
+    return (total_s + n_burst * slowest_s) / len(arrivals_s)

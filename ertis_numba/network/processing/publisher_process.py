@@ -143,7 +143,7 @@ class _Publisher:
                 self._subscribers.offer(QueuedProduct("status", "", Report(), [note.status]))
 
     def _publish(self, note: pipe_messages.Publish) -> None:
-        """Send the subscribed parts of a slot, copy those that have to wait, and release it."""
+        """Copy the subscribed parts of a slot once, send them to all subscribers, and release it."""
         view, sensor = self._views[note.slot], note.data.sensor
         mark("image fetched", sensor, note.data.sequence)
         common: dict[str, Any] = {
@@ -158,19 +158,19 @@ class _Publisher:
             rows, columns = note.shape
             payloads = _pieces(view.image(rows * columns * (4 if note.dtype == "float32" else 2)))
             image = Image(description=note.description, shape=note.shape, dtype=note.dtype, **common, **times)
-            items.append(QueuedProduct("energyscape", sensor, image, payloads, about, is_borrowed=True))
+            items.append(QueuedProduct("energyscape", sensor, image, payloads, about))
         if about is not None and note.n_points >= 0 and self._subscribers.wanted("points", sensor):
             cloud = Points(description=note.description, n_points=note.n_points, **common, **times)
             points = view.points(16 * note.n_points)
-            items.append(QueuedProduct("points", sensor, cloud, [points], about, is_borrowed=True))
+            items.append(QueuedProduct("points", sensor, cloud, [points], about))
         if raw_about is not None and self._subscribers.wanted("raw", sensor):
             air = {name: getattr(note.data, name) for name in ("temperature_c", "humidity_percent", "pressure_pa")}
             raw = Raw(description=note.raw_description, crc32=note.data.crc32, **common, **air)
             words = view.words(note.words_bytes)
-            items.append(QueuedProduct("raw", sensor, raw, [words], raw_about, is_borrowed=True))
-        published_ns = time.monotonic_ns()
+            items.append(QueuedProduct("raw", sensor, raw, [words], raw_about))
         for item in items:
             self._subscribers.offer(item)
+        published_ns = time.monotonic_ns()
         self._pipe.send(pipe_messages.ProductsQueued(job=note.job, published_ns=published_ns))
         mark("published", sensor, note.data.sequence)
 
@@ -233,7 +233,7 @@ def _is_greeting(frames: list[zmq.Frame]) -> bool:
         return False
 
 
-def _pieces(data: memoryview) -> "list[bytes | memoryview]":
+def _pieces(data: memoryview) -> "list[bytes | memoryview | zmq.Frame]":
     """Return an image in frames that are quick to encrypt."""
     return [data[begin : begin + _PIECE_BYTES] for begin in range(0, len(data), _PIECE_BYTES)]
 

@@ -49,30 +49,31 @@ class QueuedProduct:
         Empty for products without a sensor.
     header : Message
         Header without its numbers.
-    payloads : list of bytes or memoryview
-        Shared by all subscribers.
+    payloads : list of bytes, memoryview or zmq.Frame
+        Frames once `share` was called.
     description : (number, frames), optional
         Description to send before.
-    is_borrowed : bool
-        The memory of the payloads is used again after `Subscribers.offer`.
     """
 
     product: Product
     sensor: str
     header: Header
-    payloads: "list[bytes | memoryview]" = field(default_factory=list)
+    payloads: "list[bytes | memoryview | zmq.Frame]" = field(default_factory=list)
     description: tuple[int, Sequence[bytes]] | None = None
-    is_borrowed: bool = False
 
     @property
     def n_bytes(self) -> int:
         """Size of the payloads."""
         return sum(map(len, self.payloads))
 
-    def keep(self) -> None:
-        """Copy borrowed payloads, which are released once the last subscriber has the product."""
-        if self.is_borrowed:
-            self.payloads[:] = map(bytes, self.payloads)
+    def share(self) -> None:
+        """Copy the payloads into messages of ZeroMQ, which all subscribers share and the last one frees.
+
+        Their original memory may be used again afterwards.
+        """
+        self.payloads[:] = [
+            each if isinstance(each, zmq.Frame) else zmq.Frame(each, copy=True) for each in self.payloads
+        ]
 
 
 @dataclass(slots=True, eq=False)
@@ -202,10 +203,7 @@ class Subscribers:
             del kept[min(kept)]
 
     def description(self, sensor: str, number: int) -> tuple[int, Sequence[bytes]] | None:
-        """Return the description of a sensor's products for a `QueuedProduct`; None if it is not known (any more).
-
-        None if that is not known (any more).
-        """
+        """Return the description of a sensor's products for a `QueuedProduct`; None if it is not known (any more)."""
         frames = self._descriptions.get(sensor, {}).get(number)
         return None if frames is None else (number, frames)
 
@@ -222,12 +220,13 @@ class Subscribers:
 
     def offer(self, item: QueuedProduct) -> None:
         """Send a product to subscribers with credit; the others get it, or a newer one, later."""
+        if not self.wanted(item.product, item.sensor):
+            return
+        item.share()
         for routing_id, each in list(self._all.items()):
             if each.active:
                 each.offer(item)
                 self._send(routing_id, each)
-        if any(item is waiting for each in self for _, waiting in each.waiting.values()):
-            item.keep()
 
     def tick(self, may_receive: Any) -> None:
         """Suspend silent applications, remove those that no longer ``may_receive``, and send waiting products."""
@@ -273,12 +272,11 @@ class Subscribers:
             if isinstance(item.header, Image | Points):
                 changes["published_ns"] = time.monotonic_ns()
             header = encode(msgspec.structs.replace(item.header, **changes))
-            # ZeroMQ copies each payload: a thread that released it later would cost more than the copy.
             if not self._put(routing_id, [header, *item.payloads]):
                 return
             each.was_sent(key)
 
-    def _put(self, routing_id: bytes, frames: "Iterable[bytes | memoryview]") -> bool:
+    def _put(self, routing_id: bytes, frames: "Iterable[bytes | memoryview | zmq.Frame]") -> bool:
         """Send a message to an application; return True on success, and remove an application that is gone."""
         try:
             self._socket.send_multipart([routing_id, *frames], zmq.NOBLOCK)

@@ -160,7 +160,7 @@ class LocalWorkerPool:
                     found += self._heard(worker, has_ended=True)  # It may have sent messages before.
                 case "running":
                     self._next_kind(worker)
-        if self._chosen.look(now_s, load.rate_hz(now_s), load.overlap):
+        if self._chosen.update(now_s, load):
             self._log.info("choice", text=self._chosen.why)
         return found
 
@@ -276,7 +276,7 @@ class LocalWorkerPool:
             return [Lost(job, note.text, note.again)]
         worker.done += 1
         worker.succeeded()
-        if worker.mode in (self._chosen.wide, self._chosen.many) and worker.mode is not None:
+        if worker.mode is not None:
             self._chosen.took(worker.mode, note.took_s)
         job.slot, job.n_points = slot, note.n_points
         return [FinishedJob(job, note.took_s)]

@@ -1,6 +1,7 @@
 """Worker process that makes images; `LocalWorkerPool` starts it."""
 
 import faulthandler
+import functools
 import os
 import signal
 import time
@@ -127,12 +128,20 @@ def end_after(time_s: float) -> None:
     A timer of the system costs a hundredth of `faulthandler.dump_traceback_later`, which starts a thread.
     """
     if hasattr(signal, "setitimer"):
-        faulthandler.register(signal.SIGALRM, chain=True)  # The default action follows, which ends the process.
+        _arm()
         signal.setitimer(signal.ITIMER_REAL, time_s)
     elif time_s:
         faulthandler.dump_traceback_later(time_s, exit=True)
     else:
         faulthandler.cancel_dump_traceback_later()
+
+
+@functools.cache
+def _arm() -> None:
+    """Let the signal of the timer print a traceback and end this process, even if the parent ignores or blocks it."""
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    faulthandler.register(signal.SIGALRM, chain=True)  # The default action follows, which ends the process.
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGALRM})
 
 
 def _main() -> None:
