@@ -67,6 +67,7 @@ pictures: $(VENV)/ready  ## redraw the pictures of the README; the viewer needs 
 bench: $(VENV)/ready  ## run the benchmarks and update the tables in the documentation
 	$(BIN)/ertis bench paper --update docs/reference/benchmarks.md --update README.md
 	$(BIN)/ertis bench accuracy --update docs/reference/benchmarks.md --update docs/explanation/accuracy.md --plot docs/pictures/front.png
+	$(BIN)/ertis bench beamformers --update docs/explanation/beamformers.md
 	$(BIN)/ertis bench factorisation --update docs/decisions/0016-rejected-plans.md
 	$(BIN)/ertis bench interpolation --update docs/decisions/0016-rejected-plans.md
 	$(BIN)/ertis bench verification --update docs/explanation/accuracy.md

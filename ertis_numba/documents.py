@@ -5,6 +5,7 @@ unknown keys.
 """
 
 import bisect
+import datetime as dt
 import difflib
 import os
 import re
@@ -34,6 +35,7 @@ _NAME = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _LONG_KEY = re.compile(rf"(?<![\w-]){_NAME}(?:[ \t]*+\.[ \t]*+{_NAME}){{{MAX_KEY_PARTS}}}")
 _PATH_PART = re.compile(r"\.(\w+)|\[(\d+)\]")
 _EXPECTED = re.compile(r"Expected `([^`]*)`(?: of length (\d+), got (\d+))?")
+_TOML_TYPES: Final = (dt.datetime, dt.date, dt.time)
 _TYPE_NAMES = {
     "array": "a list",
     "bool": "true or false",
@@ -157,8 +159,8 @@ class TomlDocument(TomlTable, frozen=True, kw_only=True):
     ----------
     former_keys : dict of str to str
         Present names of keys by former names, so that documents in older recordings stay readable.
-    former_lines : dict of str to str
-        Text by the former line that it replaces, empty if the line had no effect.
+    former_values : dict of (str, str) to dict
+        Keys and values by the former key and value that they replace; none if it had no effect.
     max_bytes : int
         Limit on the length of a document in UTF-8.
     max_items : int
@@ -166,7 +168,7 @@ class TomlDocument(TomlTable, frozen=True, kw_only=True):
     """
 
     former_keys: ClassVar[dict[str, str]] = {}
-    former_lines: ClassVar[dict[str, str]] = {}
+    former_values: ClassVar[dict[tuple[str, str], dict[str, str]]] = {}
     max_bytes: ClassVar[int] = 16 * 2**20
     max_items: ClassVar[int] = 2**20
 
@@ -188,9 +190,8 @@ class TomlDocument(TomlTable, frozen=True, kw_only=True):
             The text is not TOML, has unknown keys, is too long, or a value cannot be used.
         """
         cls._require_size(text, source)
-        text = cls._renamed(text)
         try:
-            return msgspec.toml.decode(text, type=cls)
+            return cls._decoded(text)
         except msgspec.ValidationError as error:
             line = _line_of_error(cls, text, error) if find_line else 0
             raise SettingsError(_document_error(cls, source, error, f", line {line}" if line else "")) from error
@@ -244,15 +245,38 @@ class TomlDocument(TomlTable, frozen=True, kw_only=True):
         except (OSError, UnicodeDecodeError) as error:
             reason = checks.reason_unreadable(error)
             raise SettingsError(f"{path}: {reason}; give a readable {cls.__name__.lower()} file") from error
-        return cls.from_toml(text, str(path)), msgspec.toml.decode(cls._renamed(text))
+        return cls.from_toml(text, str(path)), cls._tables(text)
 
     @classmethod
-    def _renamed(cls, text: str) -> str:
+    def _decoded(cls, text: str) -> Self:
+        return msgspec.convert(cls._tables(text), cls, builtin_types=_TOML_TYPES, str_keys=True)
+
+    @classmethod
+    def _tables(cls, text: str) -> dict[str, Any]:
+        """Return the tables of a text with the present names of keys and values."""
+        tables: dict[str, Any] = msgspec.toml.decode(text)
+        return cls._present(tables) if cls.former_keys or cls.former_values else tables
+
+    @classmethod
+    def _present(cls, value: Any) -> Any:
+        """Replace former keys and values in a value and in the tables in it.
+
+        A former key beside its present name is left, and so refused, because their meaning is ambiguous.
+        """
+        if isinstance(value, list):
+            return [cls._present(item) for item in value]
+        if not isinstance(value, dict):
+            return value
+        table = {key: cls._present(item) for key, item in value.items()}
         for former, key in cls.former_keys.items():
-            text = re.sub(rf"\b{former}(?=\s*=)", key, text)
-        for line, present in cls.former_lines.items():
-            text = re.sub(rf"(?m)^[ \t]*{re.escape(line)}(?=[ \t\r]*(?:#.*)?$)", present, text)
-        return text
+            if former in table and key not in table:
+                table[key] = table.pop(former)
+        for (key, former), present in cls.former_values.items():
+            others = [(name, new) for name, new in present.items() if name != key]
+            if table.get(key) == former and all(table.get(name, new) == new for name, new in others):
+                del table[key]
+                table.update(present)
+        return table
 
     def to_toml(self) -> str:
         """Return TOML text that `from_toml` reads back to an equal structure."""
@@ -340,6 +364,7 @@ def _line_of_error(kind: type[TomlDocument], text: str, error: msgspec.Validatio
     begin, stop = starts[table], stops[table]
     reported, _, path = str(error).partition(" - at `$")
     named = {*re.findall(r"\w+", reported.partition(";")[0]), *re.findall(r"\w+", path.rpartition(".")[2])}
+    named |= {former for former, key in kind.former_keys.items() if key in named}
     keys = ((n, _KEY.match(lines[n - 1])) for n in range(begin, stop))
     is_table = bool(lines and _HEADER.match(lines[begin - 1]))
     return next((n for n, key in keys if key and not named.isdisjoint(key[1].split("."))), begin if is_table else 0)
@@ -347,7 +372,7 @@ def _line_of_error(kind: type[TomlDocument], text: str, error: msgspec.Validatio
 
 def _error(kind: type[TomlDocument], lines: list[str]) -> str:
     try:
-        msgspec.toml.decode("\n".join(lines), type=kind)
+        kind._decoded("\n".join(lines))  # noqa: SLF001  of its own kind
     except msgspec.DecodeError as error:
         return str(error)
     return ""

@@ -13,6 +13,7 @@ import pytest
 from click.testing import CliRunner
 from ertis_bench import (
     accuracy,
+    beamformers,
     checks,
     input_measurements,
     instruction_sets,
@@ -27,10 +28,12 @@ from ertis_bench import (
 )
 from ertis_cli.main import cli
 
-from ertis_numba import figures, kernels
+from ertis_numba import figures, kernels, verification
+from ertis_numba.beamformers import ADAPTIVE_COMBINATIONS
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.kernels._cpu import ceilings
 from ertis_numba.pipeline import Pipeline
+from ertis_numba.prediction import Prediction
 from ertis_numba.settings import ERROR_PRESETS_DB
 from ertis_numba.simulation import Point
 from ertis_numba.simulation.effects import EFFECTS
@@ -274,6 +277,37 @@ def test_interpolation_benchmark_gives_the_documented_errors():
     found = {row["oversampling"]: row["error_db"] for row in json.loads(done.stdout)["rows"]}
     assert found[2]["fitted, 2 taps"] == pytest.approx(-44, abs=0.5)
     assert found[2]["linear between rotated carriers"] == pytest.approx(-33, abs=0.5)
+
+
+@pytest.mark.usefixtures("hardly_warm")
+def test_beamformers_benchmark_rates_every_combination(tmp_path):
+    target = tmp_path / "page.md"
+    target.write_text(MARKED.format("beamformers"), "utf-8")
+    arguments = ["bench", "beamformers", "--count", "1", "--directions", "2d:46", "--json", "--update", str(target)]
+    done = CliRunner().invoke(cli, arguments)
+    assert done.exit_code == 0, (done.output, done.exception)
+    rows = json.loads(done.stdout)["rows"]
+    combinations = {(row["beamformer"].partition(",")[0], row["weighting"]) for row in rows}
+    assert combinations == {("delay_and_sum", "none"), *ADAPTIVE_COMBINATIONS}
+    assert rows[0]["relative_time"] == 1.0
+    for row in rows:
+        assert row["relative_time"] == pytest.approx(row["median_ms"] / rows[0]["median_ms"])
+        assert row["error_db"] <= ERROR_PRESETS_DB["draft"]
+        # Errors of adaptive beamformers are predicted from a sample, by up to 2 dB too low.
+        assert -2 < row["predicted_db"] - row["error_db"] < 3, row
+    table = target.read_text("utf-8")
+    assert table.count("\n| `") == len(rows)
+    assert f"\n| `dmas`, order 5 | `coherence_factor` | {rows[5]['relative_time']:.1f} |" in table
+    assert "\nold\n" not in table
+
+
+@pytest.mark.parametrize(("predicted_db", "limit_db"), [(-40.0, -35.0), (-30.0, -29.0), (-10.0, -20.0)])
+def test_beamformers_benchmark_refuses_unexpected_errors(predicted_db, limit_db, monkeypatch):
+    monkeypatch.setattr(verification, "measure", lambda *_: verification.Measured(limit_db + 0.1, 1, None))
+    monkeypatch.setattr(beamformers, "predict", lambda _: Prediction(predicted_db, -35.0))
+    reported = rf"image of delay_and_sum with weighting none has an error of {limit_db + 0.1:.1f} dB .* {limit_db:g} dB"
+    with pytest.raises(DataError, match=reported):
+        beamformers.run(count=1, say=lambda _: None, directions="2d:10")
 
 
 FEW = [("float32", 1, 2, 40.0, None), ("float32", 3, 4, 80.0, None), ("int16", 2, 2, 40.0, (4, 1.75))]

@@ -7,11 +7,13 @@ import h5py
 import numpy as np
 import pytest
 
+from ertis_numba.errors import SettingsError
 from ertis_numba.frames import SequenceGap
 from ertis_numba.journal import Journal
 from ertis_numba.network.central_node._ledger import Ledger
 from ertis_numba.network.central_node._received_items import SensorSession
 from ertis_numba.settings import Settings
+from ertis_numba.simulation import Scene
 from ertis_numba.storage import open_energyscapes, open_recording, write_energyscapes, write_recording
 from ertis_numba.storage.schema import FORMER_NAMES
 
@@ -41,14 +43,66 @@ def test_former_settings_keys_are_read():
     assert settings.processing.diagonal_loading == 2.0
 
 
-@pytest.mark.parametrize("remark", ["", "  # clean pictures"])
-def test_former_beamformer_coherence_factor_is_a_weighting(remark):
-    text = f'[processing]\nbeamformer = "coherence_factor"{remark}\nsnapshots = 3\n'
+@pytest.mark.parametrize(
+    "text",
+    [
+        '[processing]\nbeamformer = "coherence_factor"\nsnapshots = 3\n',
+        '[processing]\nbeamformer="coherence_factor"  # clean pictures\nsnapshots = 3\n',
+        "[processing]\nsnapshots = 3\n\t'beamformer'\t=\t'coherence_factor'",
+        '[ processing ]\r\nbeamformer = """coherence_factor"""\r\nsnapshots = 3\r\n',
+        'processing = {beamformer = "coherence_factor", snapshots = 3}',
+        'processing.snapshots = 3\nprocessing . "beamformer" = "coherence_factor"',
+        '[processing]\nbeamformer = "coherence_factor"\nweighting = "coherence_factor"\nsnapshots = 3\n',
+    ],
+)
+def test_former_beamformer_coherence_factor_is_a_weighting(text, tmp_path):
     processing = Settings.from_toml(text).processing
     assert (processing.beamformer, processing.weighting) == ("delay_and_sum", "coherence_factor")
     assert processing.snapshots == 3
     again = Settings.from_toml(Settings(processing=processing).to_toml())
     assert again.processing == processing
+    (tmp_path / "former.toml").write_text(text, newline="")
+    updated = Settings().replace("processing.beamformer", "dmas").updated_from_file(tmp_path / "former.toml")
+    assert (updated.processing.beamformer, updated.processing.weighting) == ("delay_and_sum", "coherence_factor")
+
+
+def test_former_keys_are_read_in_any_spelling():
+    accuracy = Settings.from_toml("accuracy = {\"zones\"=4, 'stop_band_db' = 50, interpolation='fitted'}").accuracy
+    assert (accuracy.focal_zones, accuracy.stopband_attenuation_db) == (4, 50.0)
+
+
+def test_former_keys_of_scenes_are_read():
+    scene = Scene.from_toml("sensors = [{name = 'a', processing = {beamformer='coherence_factor', loading=2}}]")
+    processing = scene.sensors[0].processing
+    assert (processing.weighting, processing.diagonal_loading) == ("coherence_factor", 2.0)
+
+
+def test_texts_that_mention_former_keys_are_unchanged():
+    assert Settings.from_toml("[array]\nlayout = 'zones = loading = 3.csv'").array.layout == "zones = loading = 3.csv"
+
+
+@pytest.mark.parametrize(
+    ("text", "reported"),
+    [
+        (
+            '[processing]\nbeamformer = "coherence_factor"\nsnapshots = 3\n\n[air]\ntemperature_c = "cold"\n',
+            r"s, line 6, air\.temperature_c: Expected `float`",
+        ),
+        (
+            '[processing]\nbeamformer = "coherence_factor"\nsnapshots = "many"\n',
+            r"s, line 3, processing\.snapshots: Expected `int`",
+        ),
+        ("[accuracy]\nprecision = 'auto'\nzones = 'many'\n", r"s, line 3, accuracy\.focal_zones: Expected `int"),
+        ("[accuracy]\nzones = 4\nfocal_zones = 3\n", r"s, line 2, accuracy: unknown key `zones`"),
+        (
+            '[processing]\nsnapshots = 3\nbeamformer = "coherence_factor"\nweighting = "none"\n',
+            r"s, line 3, processing\.beamformer: Invalid enum value 'coherence_factor'",
+        ),
+    ],
+)
+def test_errors_of_former_settings_name_the_line_of_the_text(text, reported):
+    with pytest.raises(SettingsError, match=reported):
+        Settings.from_toml(text, "s")
 
 
 def test_former_journal_is_read(tmp_path):

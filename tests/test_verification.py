@@ -222,7 +222,8 @@ def test_random_settings_cover_every_kind():
     drawn = [random_settings(np.random.default_rng(seed), Limits()) for seed in range(60)]
     assert {settings.processing.beamformer for settings in drawn} == set(BEAMFORMERS)
     assert {settings.processing.weighting for settings in drawn} == set(WEIGHTINGS)
-    assert {settings.processing.wavefront for settings in drawn} == {"plane", "spherical"}
+    shapes = {(settings.processing.wavefront, settings.processing.is_adaptive) for settings in drawn}
+    assert shapes == {(shape, adaptive) for shape in ("plane", "spherical") for adaptive in (False, True)}
     assert {settings.recording.encoding for settings in drawn} == {"pdm", "int16", "float32"}
     assert sum(settings.call.ramp_fraction == 0 for settings in drawn) > 10
     assert random_measurement(7).data.tobytes() == random_measurement(7).data.tobytes()

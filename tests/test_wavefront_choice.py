@@ -5,6 +5,7 @@ from click.testing import CliRunner
 from ertis_cli.main import cli
 
 from ertis_numba import kernels, verification
+from ertis_numba.errors import ArgumentError
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Accuracy
 from ertis_numba.stages.planner import Planner, complete
@@ -23,13 +24,23 @@ def with_processing(**changes):
     ("changes", "expected"),
     [
         ({"range_m": (0.3, 1.2)}, "spherical"),
-        ({"range_m": (0.3, 1.2), "beamformer": "dmas"}, "plane"),
+        ({"range_m": (0.3, 1.2), "beamformer": "dmas"}, "spherical"),
+        ({"range_m": (0.3, 1.2), "weighting": "coherence_factor"}, "spherical"),
+        ({"range_m": (0.3, 1.2), "beamformer": "capon"}, "plane"),
         ({"range_m": (2.5, 2.6)}, "plane"),
     ],
 )
 def test_auto_chooses_wavefronts_by_the_first_range(changes, expected):
     settings = with_processing(wavefront="auto", **changes).replace(accuracy=Accuracy(max_error_db=-25.0))
     assert complete(settings, CPU, threads=1).processing.wavefront == expected
+
+
+def test_auto_chooses_plane_wavefronts_if_the_settings_exclude_streams():
+    settings = with_processing(wavefront="auto", range_m=(0.3, 1.2), beamformer="dmas")
+    settings = settings.replace(accuracy=Accuracy(max_error_db=-25.0, precision="float32"))
+    with pytest.raises(ArgumentError, match="needs 16-bit streams"):
+        complete(settings.replace("processing.wavefront", "spherical"), CPU, threads=1)
+    assert complete(settings, CPU, threads=1).processing.wavefront == "plane"
 
 
 def test_predicted_wavefront_error_matches_exact_images():

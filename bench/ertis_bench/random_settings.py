@@ -145,7 +145,7 @@ def _processing(
     first_m = max(0.0, float(random.uniform(-0.2, 0.8)) * (record_m - width_m))
     beamformer, weighting = _COMBINATIONS[random.integers(len(_COMBINATIONS))]
     orders = [order for order in range(2, min(8, n_mics) + 1) if math.comb(n_mics, order) <= limits.max_products]
-    spherical = (beamformer, weighting) == _PLAIN and random.integers(2) == 0
+    spherical = beamformer != "capon" and random.integers(2) == 0
     widened = random.integers(5) == 0
     edges_hz = (low_hz * float(random.uniform(0.1, 0.9)), high_hz + float(random.uniform(1e3, 2e4)))
     return Processing(

@@ -5,6 +5,7 @@ from typing import Any
 
 from ertis_bench import timing
 from ertis_bench.accuracy import PAPER, TURN
+from ertis_bench.beamformers import form as beamformers
 from ertis_bench.budgets import form as budgets
 from ertis_bench.gpu_tables import gpu, gpu_short
 from ertis_bench.health_trials.table import health
@@ -296,6 +297,7 @@ FORMS: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
     "gpu": {"gpu": gpu, "gpu short": gpu_short},
     "health": {"health": health},
     "accuracy": {"accuracy": accuracy, "accuracy front": accuracy_front},
+    "beamformers": {"beamformers": beamformers},
     "verification": {"verification": verification},
     "budgets": {"budgets": budgets},
     "points": {"points": points},

@@ -172,6 +172,24 @@ def verification(**given: Any) -> None:
 
 
 @bench.command()
+@_count(20)
+@click.option(
+    "--directions", metavar="GRID", default="3000", show_default=True, help="Directions, as in 'ertis process'."
+)
+@_update
+@options.quiet
+@options.as_json
+def beamformers(**given: Any) -> None:
+    """Measure time and error of each beamformer.
+
+    Includes weightings, at the default error budget.
+    """
+    from ertis_bench import beamformers as benchmark
+
+    _run("beamformers", benchmark, **given)
+
+
+@bench.command()
 @_random_settings(300)
 @_update
 @options.quiet

@@ -45,7 +45,8 @@ class Processing(TomlTable, frozen=True, kw_only=True):
     wavefront : {"plane", "spherical", "auto"}, default "plane"
         Shape of an echo's wavefront. ``plane`` is that of the paper. ``spherical`` focuses on each range, which matters
         at ranges below some ten apertures. ``auto`` chooses ``spherical`` if plane wavefronts exceed the error budget
-        at the first range, and ``plane`` otherwise and for adaptive beamformers.
+        at the first range, and ``plane`` otherwise, for capon, and if no plan of an adaptive beamformer suits the rest
+        of the settings.
     beamformer : str, default "delay_and_sum"
         Combination of the delayed signals, one of `BEAMFORMERS`; ``docs/explanation/beamformers.md`` compares them. All
         except delay_and_sum need the fast method, and capon also plane wavefronts.

@@ -74,9 +74,9 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
         "zones": "focal_zones",
         "loading": "diagonal_loading",
     }
-    former_lines: ClassVar[dict[str, str]] = {
-        'interpolation = "fitted"': "",
-        'beamformer = "coherence_factor"': 'beamformer = "delay_and_sum"\nweighting = "coherence_factor"',
+    former_values: ClassVar[dict[tuple[str, str], dict[str, str]]] = {
+        ("interpolation", "fitted"): {},
+        ("beamformer", "coherence_factor"): {"beamformer": "delay_and_sum", "weighting": "coherence_factor"},
     }
 
     def __post_init__(self) -> None:

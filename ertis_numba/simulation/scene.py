@@ -61,7 +61,7 @@ class Scene(TomlDocument, frozen=True, kw_only=True):
     """
 
     former_keys: ClassVar[dict[str, str]] = Sensor.former_keys
-    former_lines: ClassVar[dict[str, str]] = Sensor.former_lines
+    former_values: ClassVar[dict[tuple[str, str], dict[str, str]]] = Sensor.former_values
 
     seed: int = 0
     rate_hz: float = 20.0

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.constants import ERTIS_PDM_RATE_HZ
 from ertis_numba.geometry import direction_grid, unit_vectors
-from ertis_numba.settings import Call, Settings
+from ertis_numba.settings import Call
 from ertis_numba.simulation import pulse
 from ertis_numba.simulation.arrivals import call_filters, echoes, emitted, emitters, responses
 from ertis_numba.simulation.converter import QUANTISATION_DBFS
@@ -31,6 +31,7 @@ _LAGS, _LAG_DIRECTIONS = 128, 64
 _BEAM_PATHS, _BEAM_DIRECTIONS = 6, 361
 _SHOWN_DB = 40.0  # dynamic range of an image: weaker reflectors are masked by side lobes
 _ACROSS = 8192
+_OWN_BYTES = 4_000  # with its settings and the snapshot of one microphone
 _SIDE_LOBE = 0.5  # of an array of a few dozen microphones
 _CUT = 0.05
 _PEAK = 3.3  # highest of some ten thousand Rayleigh-distributed amplitudes, relative to their RMS
@@ -68,6 +69,11 @@ class Sight:
     def of(cls, shot: Snapshot, active: frozenset[str]) -> Self:
         """Return the estimate with given effects; the snapshot caches it."""
         return shot.once((cls, active), lambda: cls(shot, active))
+
+    @property
+    def nbytes(self) -> int:
+        """Size of the object in bytes. All arrays with an element per path or direction are results of their own."""
+        return _OWN_BYTES
 
     @property
     def heard(self) -> Echoes:
@@ -201,18 +207,33 @@ class Sight:
 
     def coverage(self, direction: Floats) -> Floats:
         """Return the gain of the best beam for a wave from each direction: (path,) float64, at most 1."""
-        wave, beams = self._beams
+        # Sensors with equal settings share the beams, and no sight holds them: each takes a megabyte or more.
+        beams = self.shot.cache.once(("beams", self.settings), self._beams)
+        wave = self._wavenumber_rad_m
         taken = np.zeros(len(direction))
         for part in parts(len(direction), max(beams.shape)):
             waves = np.exp(1j * wave * (direction[part] @ self._positions_m.T))
             taken[part] = np.max(np.abs(beams @ waves.T), axis=0, initial=0.0)
         return taken / len(self._positions_m)
 
-    @functools.cached_property
-    def _beams(self) -> tuple[float, NDArray[np.complex128]]:
-        """Wavenumber at the mean frequency, and phases of the beams of all directions: (direction, mic)."""
-        wave = 2 * math.pi * float(self.frequency_hz @ self.power) / self.shot.speed_m_s
-        return wave, np.exp(-1j * wave * (_directions(self.settings) @ self._positions_m.T))
+    @property
+    def _wavenumber_rad_m(self) -> float:
+        """Wavenumber at the mean frequency."""
+        return 2 * math.pi * float(self.frequency_hz @ self.power) / self.shot.speed_m_s
+
+    def _beams(self) -> NDArray[np.complex128]:
+        """Return the phases of the beams of all directions: (direction, mic)."""
+        return np.asarray(np.exp(-1j * self._wavenumber_rad_m * (self._directions @ self._positions_m.T)))
+
+    @property
+    def _directions(self) -> Floats:
+        """Unit vectors towards the directions of the image: (direction, axis)."""
+
+        def found() -> Floats:
+            grid = direction_grid(self.settings.processing)
+            return unit_vectors(grid.azimuth_rad, grid.elevation_rad)
+
+        return self.shot.cache.once(("directions", self.settings.processing), found)
 
     def of_white_noise(
         self, dbfs: float, *, coherent: bool = False, band_hz: tuple[float, float] | None = None
@@ -271,8 +292,8 @@ class Sight:
         """
         begin_s = 2 * self.settings.processing.range_m[0] / self.shot.speed_m_s
         time_s = begin_s + np.linspace(0.0, self.settings.call.duration_s, _LAGS)
-        every = max(1, len(_directions(self.settings)) // _LAG_DIRECTIONS)
-        early_s = _directions(self.settings)[::every] @ self._positions_m.T / self.shot.speed_m_s
+        every = max(1, len(self._directions) // _LAG_DIRECTIONS)
+        early_s = self._directions[::every] @ self._positions_m.T / self.shot.speed_m_s
         lag_s, sound = pulse.baseband(self.settings, self._rings)
         at_s = time_s[:, None, None] - (delay_s + early_s)
         carrier = np.exp(2j * math.pi * float(self.frequency_hz @ self.power) * at_s)
@@ -290,10 +311,10 @@ class Sight:
         """
         nodes = slice(pulse.N_NODES % 8 // 2, None, 8)
         power = self.power[nodes] / self.power[nodes].sum()
-        every = max(1, len(_directions(self.settings)) // _BEAM_DIRECTIONS)
+        every = max(1, len(self._directions) // _BEAM_DIRECTIONS)
         change = 0.0
         for direction in directions[:_BEAM_PATHS]:
-            towards = np.concatenate([direction[None], _directions(self.settings)[::every]])
+            towards = np.concatenate([direction[None], self._directions[::every]])
             apart_m = (direction - towards) @ self._positions_m.T
             waves = np.exp(2j * math.pi / self.shot.speed_m_s * apart_m[..., None] * self.frequency_hz[nodes])
             before = np.abs(np.mean(waves, axis=1) @ power)
@@ -362,8 +383,7 @@ class Sight:
     def turn_change(self, seen: Echoes, angle_rad: Floats) -> Floats:
         """Return the change of the image by a small change of the echoes' directions: (path,) float64."""
         aperture_m = math.sqrt(float(np.mean(np.sum(self._positions_m**2, axis=1))))
-        wave = 2 * math.pi * float(self.frequency_hz @ self.power) / self.shot.speed_m_s
-        return np.asarray(seen.level * np.minimum(wave * aperture_m * angle_rad, 1.0))
+        return np.asarray(seen.level * np.minimum(self._wavenumber_rad_m * aperture_m * angle_rad, 1.0))
 
     def _met(self, seen: Echoes, places: NDArray[np.intp]) -> Floats:
         """Return the highest overlap of some paths with the side lobes of others: (path,) float64."""
@@ -378,9 +398,3 @@ class Sight:
             met[row[same], column[same]] = 0.0
             strongest[part] = np.max(met, axis=1, initial=0.0)
         return strongest
-
-
-@functools.lru_cache(maxsize=16)
-def _directions(settings: Settings) -> Floats:
-    grid = direction_grid(settings.processing)
-    return unit_vectors(grid.azimuth_rad, grid.elevation_rad)

@@ -74,10 +74,21 @@ def complete(
     """
     if settings.processing.method == "paper":
         return settings
-    if settings.processing.wavefront == "auto":
-        plane = settings.replace(processing=settings.processing.replace(wavefront="plane"))
-        settings = with_wavefront(plane, Planner(plane, kernels, threads=threads, max_bytes=max_bytes).model)
-    return Planner(settings, kernels, threads=threads, max_bytes=max_bytes, plan=plan).choose().settings
+
+    def chosen(wanted: Settings) -> Settings:
+        return Planner(wanted, kernels, threads=threads, max_bytes=max_bytes, plan=plan).choose().settings
+
+    if settings.processing.wavefront != "auto":
+        return chosen(settings)
+    plane = settings.replace(processing=settings.processing.replace(wavefront="plane"))
+    wanted = with_wavefront(plane, Planner(plane, kernels, threads=threads, max_bytes=max_bytes).model)
+    try:
+        return chosen(wanted)
+    except ArgumentError:
+        # Spherical wavefronts of adaptive beamformers need streams, which cannot keep every plan and budget.
+        if wanted == plane or not plane.processing.is_adaptive:
+            raise
+        return chosen(plane)
 
 
 class Planner:

@@ -1,6 +1,7 @@
 """Error of plane wavefronts relative to spherical ones, and the choice between both."""
 
 from ertis_numba.air import sound_speed_m_s
+from ertis_numba.beamformers import BEAMFORMERS
 from ertis_numba.geometry import direction_grid, microphones, unit_vectors
 from ertis_numba.settings import Settings
 from ertis_numba.stages.accuracy import ErrorModel, decibels
@@ -20,12 +21,13 @@ def plane_wave_error_db(model: ErrorModel, settings: Settings, range_m: float) -
 def with_wavefront(settings: Settings, model: ErrorModel) -> Settings:
     """Return settings with spherical wavefronts if plane ones exceed the error budget at the nearest range.
 
-    Adaptive beamformers and the paper's method support only plane wavefronts.
+    Beamformers without streams and the paper's method support only plane wavefronts.
     """
     processing = settings.processing
+    beamformer = BEAMFORMERS[processing.beamformer]
     spherical = (
         processing.method == "fast"
-        and not processing.is_adaptive
+        and bool(beamformer.streams(*beamformer.values(processing)))
         and plane_wave_error_db(model, settings, processing.range_m[0]) > settings.accuracy.max_error_db
     )
     return settings.replace(processing=processing.replace(wavefront="spherical" if spherical else "plane"))
