@@ -36,7 +36,10 @@ def recipe_of(processing: Processing) -> Recipe | None:
     streams = beamformer.streams(*beamformer.values(processing))
     if not streams:
         return None
-    added = WEIGHTINGS[processing.weighting].streams
+    weighting = WEIGHTINGS[processing.weighting]
+    added = weighting.streams
+    if weighting.kernel and not added:
+        return None
     whole = streams + tuple(stream for stream in added if stream not in streams)
     beam, total = (whole.index(stream) for stream in added) if added else (-1, -1)
     return Recipe(whole, len(streams), beam, total)
