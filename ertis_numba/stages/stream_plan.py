@@ -11,11 +11,11 @@ An error that all microphones share adds up to M² instead of M. With 32 microph
 little accuracy, and those of the highest orders can be left out. The coherence factor follows from the sums of y and
 |y|². Each stream gets the fewest taps and the cheapest beam grid whose error is not above that of the first stream.
 
-Where a signal is nearly zero, its stream changes too fast for interpolation. Echoes are hardly affected: they are
-bright where signals are strong, and their errors come from the spectrum there. The planner assumes echoes in noise. The
-noise has nine tenths of the power in the image of delay-and-sum, and much less in the images here. Where an echo sinks
-into noise, or overlaps others, microphones disagree as in noise. A minimum share of noise accounts for that. An image
-of noise only has a larger error.
+Where a signal is nearly zero, its stream changes too fast for interpolation. Echoes are less affected: they are bright
+where signals are strong. Their errors come from the spectrum there, or from one echo, whose envelope has zeros in all
+microphones, if that error is larger. The planner assumes echoes in noise. The noise has nine tenths of the power in the
+image of delay-and-sum, and much less in the images here. Images of noise only, or of echoes that overlap everywhere,
+may have larger errors.
 
 The matched filter can apply the gains of delay and beam interpolation to a stream of the signals themselves, see
 `fitting`. Other streams are nonlinear, so the signals for them have no gain.
@@ -34,7 +34,7 @@ from ertis_numba.stages.beam_grid import Aperture, BeamGrid
 from ertis_numba.stages.fitting import DelayFit, Spectrum
 from ertis_numba.stages.planned_streams import ErrorShares, ImageErrors, PlannedStream, PlannedStreams, StreamGrid
 from ertis_numba.stages.stream_recipe import LINEAR, Recipe
-from ertis_numba.stages.stream_spectrum import StreamSpectrum, highest_hz, spectrum_of_stream
+from ertis_numba.stages.stream_spectrum import StreamSpectrum, highest_hz, pulse_errors, spectrum_of_stream
 
 __all__ = [
     "GRID_DENSITIES",
@@ -50,11 +50,6 @@ GRID_DENSITIES: Final = {
 """Densities of beam grids that plans choose from, by the number of taps."""
 
 _NOISE_RATIO: Final = 9.0  # Power of noise relative to that of echoes in the image of delay-and-sum.
-# Share of an image of echoes with errors as in noise. The coherence factor is small where microphones disagree. With
-# half of the first, DMAS of order 5 exceeds −35 dB for 200 echoes; with the second, it has the errors in
-# tests/test_stream_budgets.py.
-_MIN_NOISE_SHARE: Final = 0.05
-_MIN_WEIGHTED_NOISE_SHARE: Final = 0.005
 _PEAKED: Final = 2.0  # Common errors rise with the fourth power of frequency, so that few sudden changes add much.
 _KEPT: Final = 512  # Number of cached fits.
 _CORRELATED: Final = 2  # The beam of the coherence factor and the first power sum have errors of the same samples.
@@ -216,9 +211,14 @@ class StreamPlanner:
         fit = _fitted(bright, n_taps, step_s, with_gain=self.recipe.streams[place] == LINEAR)
         if delays_s is None:
             whole_error, varying, common = _fit_errors(fit, whole)
+            common *= _PEAKED
+            if self.recipe.streams[place] != LINEAR:
+                pulse = pulse_errors(fit, self._spectrum, self.recipe.streams[place])
+                varying, common = max(varying, pulse[0]), max(common, pulse[1])
         else:
-            whole_error = varying = common = float(fit.errors_at(fit.split(delays_s)[1], whole) @ whole.power)
-        return fit, self._shares(place).errors(whole=whole_error, varying=varying, common=_PEAKED * common)
+            whole_error = varying = float(fit.errors_at(fit.split(delays_s)[1], whole) @ whole.power)
+            common = _PEAKED * whole_error
+        return fit, self._shares(place).errors(whole=whole_error, varying=varying, common=common)
 
     def _shares(self, place: int) -> ErrorShares:
         """Return the shares of a stream, for an image of noise that is half as bright as expected."""
@@ -243,8 +243,7 @@ class StreamPlanner:
         suppressed = n_mics * math.gamma(1 + 1 / order) ** order / math.comb(n_mics, order)
         if self.recipe.total >= 0:
             suppressed *= (order + 1) * (order + 2) / n_mics**2
-        least = _MIN_WEIGHTED_NOISE_SHARE if self.recipe.total >= 0 else _MIN_NOISE_SHARE
-        return max(least, _NOISE_RATIO * suppressed / (1 + _NOISE_RATIO * suppressed))
+        return _NOISE_RATIO * suppressed / (1 + _NOISE_RATIO * suppressed)
 
 
 @functools.lru_cache(maxsize=_KEPT)
