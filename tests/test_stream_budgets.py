@@ -82,8 +82,6 @@ def test_budgets_are_kept_with_calibrated_gains(combination, budget_db):
     positions_m[:, 1:] = np.random.default_rng(1).uniform(-0.03, 0.03, (16, 2))
     gain = tuple(np.geomspace(0.1, 10.0, 16).tolist())
     array = Array(layout="calibrated", positions_m=tuple(map(tuple, positions_m.tolist())), gain=gain)
-    image, _, error_db = imaged(
-        COMBINATIONS[combination], (30, 0.0), budget_db=budget_db, array=array, predict=False
-    )
+    image, _, error_db = imaged(COMBINATIONS[combination], (30, 0.0), budget_db=budget_db, array=array, predict=False)
     assert uses_streams(image.settings.processing, image.settings.accuracy) or budget_db < -35.0
     assert error_db <= budget_db

@@ -215,7 +215,7 @@ class Planner:
         safe, allowed_db = Planner(self.settings, self._kernels, threads=self._threads), accuracy.max_error_db
         if safe.error_db(accuracy) > allowed_db + _ROUNDED_DB:
             return "beams"
-        noise_db = decibels(sum(safe._image_parts(accuracy, noise_only=True).values()))  # noqa: SLF001
+        noise_db = decibels(sum(safe._image_parts(accuracy, noise_only=True).values()))
         return "image" if noise_db <= allowed_db + _ROUNDED_DB else "echoes"
 
     def _image_parts(self, accuracy: Accuracy, *, noise_only: bool = False) -> dict[str, float]:
