@@ -68,8 +68,9 @@ class Beamformer:
     sensitivity : callable
         Returns the coefficients of `Sensitivity` from the number of microphones; 1 and 0 by default.
     streams : callable
-        Returns the streams whose sums over the microphones are the power sums of an elementary symmetric polynomial,
-        the amplitude. Without streams, the default, only ``kernel`` can compute the beamformer.
+        Returns the streams from whose sums the kernels `combine_streams_int16` compute the amplitude. These are the
+        power sums ``|y|^(k/n) exp(ikφ)``, k = 1 … n, of an elementary symmetric polynomial of order n. Without streams,
+        the default, only ``kernel`` can compute the beamformer.
     cost : callable
         Returns the time of ``kernel`` relative to delay-and-sum in single precision.
     single_precision : callable
@@ -104,15 +105,15 @@ class Weighting:
     sensitivity : float
         Increase of the relative error of the image by the weighting, in units of that of delay-and-sum beams.
     streams : tuple of SignalStream
-        Streams of a coherence factor: that of the beam, and that of the total power. Without streams, the default,
-        only ``kernel`` can compute the factor.
+        Streams of a coherence factor: those of the beam and of the total power. Without streams, the default, only
+        ``kernel`` can compute the factor, and plans have no streams.
     cost : float
         Time of ``kernel`` relative to delay-and-sum in single precision.
     """
 
     kernel: str
     sensitivity: float = 0.0
-    streams: tuple[SignalStream, ...] = ()
+    streams: tuple[()] | tuple[SignalStream, SignalStream] = ()
     cost: float = 0.0
 
 

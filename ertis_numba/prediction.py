@@ -2,7 +2,7 @@
 
 import threading
 from dataclasses import dataclass
-from typing import Final, Literal, TypedDict
+from typing import Final, TypedDict
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.geometry import microphones
 from ertis_numba.kernels import KernelSet
 from ertis_numba.stages.plan_model import TABLE_BYTES
-from ertis_numba.stages.planner import Planner
+from ertis_numba.stages.planner import BudgetScope, Planner
 from ertis_numba.stages.sensitivity import Sensitivity
 from ertis_numba.stages.signal_model import ROUGH_DELAY_TAPS, ROUGH_ZONES, signal_model_of
 
@@ -25,8 +25,6 @@ __all__ = [
     "planner_of",
     "predict",
 ]
-
-BudgetScope = Literal["image", "beams"]
 
 UNCERTAINTY_DB: Final = 1.0
 """Largest amount by which a prediction may be too low: see tests/test_accuracy.py."""
@@ -66,9 +64,10 @@ class Prediction:
         The budget.
     uncertainty_db : float
         Largest amount by which the prediction may be too low.
-    budget_applies_to : {"image", "beams"}
-        ``beams`` if no plan keeps the budget for any image of an adaptive beamformer. The plan then keeps it for the
-        delay-and-sum beams of the same signals.
+    budget_applies_to : {"image", "echoes", "beams"}
+        Images for which the plan was chosen. ``echoes`` if images of noise, or of many overlapping echoes, may exceed
+        the budget of an adaptive beamformer with streams. ``beams`` if no plan keeps the budget for images of an
+        adaptive beamformer; the plan then keeps it for the delay-and-sum beams of the same signals.
     beamformer : str
         Beamformer, and its weighting if it has one.
     """
@@ -96,6 +95,11 @@ class Prediction:
         scope = ""
         if self.budget_applies_to == "beams":
             scope = f"; the plan keeps the budget for delay-and-sum beams only, not for images of {self.beamformer}"
+        elif self.budget_applies_to == "echoes":
+            scope = (
+                f"; the plan keeps the budget of {self.beamformer} for separate echoes only, not for noise or dense "
+                "echoes. Give a lower accuracy.max_error_db"
+            )
         return (
             f"images may exceed the error budget: predicted {self.predicted_error_db:.1f} dB "
             f"(up to {self.uncertainty_db:g} dB more), accuracy.max_error_db is {self.max_error_db:g} dB{scope}"
@@ -144,7 +148,7 @@ def predict(planner: Planner) -> Prediction:
         predicted_error_db=round(planner.error_db(settings.accuracy), 2),
         max_error_db=settings.accuracy.max_error_db,
         uncertainty_db=ADAPTIVE_UNCERTAINTY_DB if processing.is_adaptive else UNCERTAINTY_DB,
-        budget_applies_to="image" if planner.keeps_budget_of_images(settings.accuracy) else "beams",
+        budget_applies_to=planner.budget_scope(settings.accuracy),
         beamformer=f"{processing.beamformer}{weighted}",
     )
 

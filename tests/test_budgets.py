@@ -184,7 +184,8 @@ CAPON = PCM.processing.replace(beamformer="capon", diagonal_loading=1e-3, snapsh
     ("processing", "budget_db", "scope"),
     [
         (PCM.processing, -35.0, "image"),
-        (PCM.processing.replace(beamformer="dmas"), -35.0, "image"),
+        (PCM.processing.replace(weighting="coherence_factor"), -35.0, "image"),
+        (PCM.processing.replace(beamformer="dmas"), -35.0, "echoes"),
         (CAPON, -35.0, "beams"),
     ],
 )
@@ -198,6 +199,7 @@ def test_files_and_reports_name_the_scope_of_the_budget(tmp_path, processing, bu
         warned = "for delay-and-sum beams only, not for images of capon" in images.error_warning
         assert warned == (scope == "beams" and images.error_warning != "")
     assert ("meets it for delay-and-sum beams of the same signals" in done.stderr) == (scope == "beams")
+    assert ("images of noise, or of many overlapping echoes" in done.stderr) == (scope == "echoes")
 
 
 @pytest.mark.parametrize("seed", [44, 118])

@@ -1,11 +1,15 @@
 """Adaptive beamformers from streams: kernels, tables, errors and plans."""
 
-import math
+import itertools
 
+import msgspec
 import numpy as np
 import pytest
 
+from ertis_numba.beamformers import WEIGHTINGS, Weighting
 from ertis_numba.kernels import KernelSet
+from ertis_numba.settings import Processing
+from ertis_numba.stages import stream_recipe
 from ertis_numba.verification import error_db
 from tests.on_device import KERNELS
 
@@ -23,6 +27,11 @@ LIMIT = 4000.0
 
 @pytest.fixture(params=[name for name, each in KERNELS.items() if each.tile_ranges])
 def kernel_set(request):
+    return KERNELS[request.param]
+
+
+@pytest.fixture(params=[name for name, each in KERNELS.items() if each.tile_ranges and name != "numpy"])
+def compiled(request):
     return KERNELS[request.param]
 
 
@@ -105,7 +114,7 @@ def tables(name, *, grid):
 
 @pytest.mark.parametrize("grid", [False, True])
 @pytest.mark.parametrize("name", STREAMS)
-def test_combined_streams_equal_those_of_numpy(kernel_set, name, grid):
+def test_combined_streams_equal_those_of_numpy(compiled, name, grid):
     powers, turns, recipe = STREAMS[name]
     numpy_set = KERNELS["numpy"]
     starts, width = np.array([0, 96], dtype=np.int32), 104
@@ -114,30 +123,45 @@ def test_combined_streams_equal_those_of_numpy(kernel_set, name, grid):
     tiles, scales = quantised(numpy_set, signals, powers, turns, starts, width, units)
     table = tables(name, grid=grid)
     found, wanted = np.full((2, N_DIRECTIONS, 130), 12_345, dtype=np.float32)
-    for kernels, out in ((kernel_set, found), (numpy_set, wanted)):
-        if kernels.tile_ranges != numpy_set.tile_ranges:
-            pytest.skip("tiles of this processor have another length")
+    assert compiled.tile_ranges == numpy_set.tile_ranges
+    for kernels, out in ((compiled, found), (numpy_set, wanted)):
         kernels.combine_streams_int16(tiles, scales, starts, 130, *table, recipe, out)
     assert wanted.max() < 12_345
     assert np.abs(found - wanted).max() < 2e-5 * wanted.max()
 
 
-def test_power_sums_give_the_sum_of_all_products():
-    """Newton's identities of the NumPy twin equal the definition, with every weight 1."""
-    signals, order = noise(N_MICS, 1, 100), 3
-    starts, kernels = np.zeros(1, dtype=np.int32), KERNELS["numpy"]
-    powers, turns = [k / order for k in (1, 2, 3)], [1, 2, 3]
-    tiles, scales = quantised(kernels, signals, powers, turns, starts, 96, [1.0] * 3)
-    shapes = np.array([[1, N_MICS, 0]] * 3, dtype=np.int32)
-    offsets = np.tile(np.arange(N_MICS, dtype=np.int32) * 96, 3)
-    weights = np.tile(np.eye(2, dtype=np.int16), (3 * N_MICS, 1, 1))
+@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize("order", [1, 2, 3, 4])
+def test_combined_streams_equal_the_sum_of_all_products(kernel_set, order, weighted):
+    """Newton's identities and the coherence factor equal their definitions, with equal weights."""
+    signals, starts = noise(N_MICS, 1, 100), np.zeros(1, dtype=np.int32)
+    powers, turns = [k / order for k in range(1, order + 1)], list(range(1, order + 1))
+    beam, total = (order, order + 1) if weighted else (-1, -1)
+    if weighted:
+        powers, turns = [*powers, 1.0, 2.0], [*turns, 1, 0]
+    units = [1.0] * order + [1 / N_MICS, 1 / N_MICS**2] * weighted
+    tiles, scales = quantised(kernel_set, signals, powers, turns, starts, 96, units)
+    shapes = np.array([[1, N_MICS, 0]] * len(powers), dtype=np.int32)
+    offsets = np.tile(np.arange(N_MICS, dtype=np.int32) * 96, len(powers))
+    weights = np.tile(np.eye(2, dtype=np.int16), (len(powers) * N_MICS, 1, 1))
     none = np.zeros(1, dtype=np.int32), np.zeros((1, 2), dtype=np.int16)
     out = np.empty((1, 96), dtype=np.float32)
-    rows = np.zeros(1, dtype=np.int32)
-    kernels.combine_streams_int16(
-        tiles, scales, starts, 96, shapes, offsets, weights, *none, rows, (3, 3, -1, -1, 1.0), out
+    recipe = order, order, beam, total, N_MICS**2 * LIMIT
+    kernel_set.combine_streams_int16(
+        tiles, scales, starts, 96, shapes, offsets, weights, *none, np.zeros(1, dtype=np.int32), recipe, out
     )
-    z = values(signals[:, 0, :96], 1 / order, 1)
-    wanted = np.abs(z[0] * z[1] * z[2] + z[0] * z[1] * z[3] + z[0] * z[2] * z[3] + z[1] * z[2] * z[3])
-    assert error_db(out[0], wanted) < -60
-    assert math.comb(N_MICS, order) == 4
+    y = signals[:, 0, :96].astype(complex)
+    wanted = np.abs(sum(map(np.prod, itertools.combinations(values(y, 1 / order, 1), order), itertools.repeat(0))))
+    if weighted:
+        wanted *= np.abs(y.sum(axis=0)) ** 2 / (N_MICS * np.sum(np.abs(y) ** 2, axis=0))
+    assert error_db(out[0], wanted) < -55
+
+
+def test_weightings_without_streams_leave_images_to_their_kernel(monkeypatch):
+    """A new weighting is not ignored if only its kernel is declared."""
+    monkeypatch.setattr(stream_recipe, "WEIGHTINGS", {**WEIGHTINGS, "half": Weighting(kernel="weight_half")})
+    for beamformer in ("delay_and_sum", "dmas"):
+        processing = Processing(beamformer=beamformer)
+        assert stream_recipe.recipe_of(processing) is not None
+        msgspec.structs.force_setattr(processing, "weighting", "half")  # The settings accept registered names only.
+        assert stream_recipe.recipe_of(processing) is None

@@ -64,6 +64,8 @@ def _explained(sensor: str, plan: dict[str, Any]) -> Iterator[str]:
             "  no plan guarantees this budget for every image of this adaptive beamformer; "
             "this plan meets it for delay-and-sum beams of the same signals"
         )
+    elif plan["budget_applies_to"] == "echoes":
+        yield "  images of noise, or of many overlapping echoes, may exceed this budget; --verify measures the error"
     precision = "16 bits" if accuracy.precision == "int16" else "single precision"
     kept = options.counted(accuracy.oversampling or 1, "sample")
     yield f"  {precision}, {kept} kept per range; a delayed sample is {interpolated}"

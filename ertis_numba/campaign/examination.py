@@ -97,7 +97,7 @@ def _plan(planners: dict[str, Planner], settings: Settings) -> dict[str, Any]:
         "stages_ms": {name: round(time_ms, 3) for name, time_ms in safe.stages_ms.items()},
         "time_ms": round(safe.time_ms, 3),
         "costs": str(planners["safe"].costs_file),
-        "budget_applies_to": "image" if planners["safe"].keeps_budget_of_images(settings.accuracy) else "beams",
+        "budget_applies_to": planners["safe"].budget_scope(settings.accuracy),
         "streams": uses_streams(settings.processing, settings.accuracy),
         "decimated": settings.recording.is_pdm or settings.decimation != 1,
         "plane_waves": _plane_waves(planners["signal_model"].model, settings),

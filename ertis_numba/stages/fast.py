@@ -26,6 +26,8 @@ from ertis_numba.stages.plan_elements import (
     beam_grid_of,
     chain_taps,
     delay_fit,
+    few_delays,
+    nearest_m_of,
     ringing_db,
     spectrum_of,
     zones_of,
@@ -194,10 +196,13 @@ class _Streams:
     def __init__(self, settings: Settings, spectrum: Spectrum, aperture: Aperture, speed_m_s: float) -> None:
         plan, recipe = settings.accuracy, recipe_of(settings.processing)
         assert recipe is not None  # noqa: S101  `uses_streams` is true only with a recipe
-        planner = StreamPlanner(settings, recipe, spectrum, aperture, sound_speed_m_s=speed_m_s, nearest_m=math.inf)
-        taps, density = plan.beam_taps or 0, plan.beam_density or 2.0
+        nearest_m, layout = nearest_m_of(settings), microphones(settings.array)
+        planner = StreamPlanner(settings, recipe, spectrum, aperture, sound_speed_m_s=speed_m_s, nearest_m=nearest_m)
+        n_phases, taps, density = plan.oversampling or 1, plan.beam_taps or 0, plan.beam_density or 2.0
+        own_s, step_s = layout.delay_s[layout.enabled], 1 / (settings.output_rate_hz * n_phases)
+        delays_s = few_delays(aperture, own_s, array_weights(settings), step_s, sound_speed_m_s=speed_m_s)
         self._recipe, self._aperture, self._speed_m_s = recipe, aperture, speed_m_s
-        self._planned = planner.plan(plan.oversampling or 1, plan.delay_taps or 1, taps, density)
+        self._planned = planner.plan(n_phases, plan.delay_taps or 1, taps, density, delays_s)
         self._grids = [planner.beam_grid(each) for each in self._planned.streams]
         grids = (grid.rows for grid in self._grids if grid is not None)
         self._rows = next(grids, np.arange(len(aperture.directions), dtype=np.int32))

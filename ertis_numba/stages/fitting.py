@@ -169,6 +169,7 @@ class DelayFit:
     Attributes
     ----------
     n_taps : int
+    step_s : float
     spectrum : Spectrum
     fractions : (target,) float64
         Delays spread evenly over one step, as `split` returns them.
@@ -181,7 +182,7 @@ class DelayFit:
 
     def __init__(self, n_taps: int, step_s: float, spectrum: Spectrum, *, with_gain: bool = True) -> None:
         self.n_taps = n_taps
-        self._step_s = step_s
+        self.step_s = step_s
         self.spectrum = spectrum
         self._middle = (self.n_taps - 1) // 2 + 0.5 * (1 - self.n_taps % 2)
         self.fractions = (np.arange(_TARGETS) + 0.5) / _TARGETS + self._middle - 0.5
@@ -225,7 +226,7 @@ class DelayFit:
 
     def split(self, delays_s: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return the first stored sample that contributes to each delayed sample, and the delay after it, in steps."""
-        steps = delays_s / self._step_s
+        steps = delays_s / self.step_s
         nearest = np.rint(steps) if self.n_taps % 2 else np.floor(steps)
         first = nearest - (self.n_taps - 1) // 2
         return first.astype(np.int64), steps - first
@@ -242,7 +243,7 @@ class DelayFit:
         Each weight is a sum of waves at all frequencies of the spectrum. Their coefficients are Bessel functions of
         half the phase of a step. Beyond the degree below, they are negligible in double precision.
         """
-        half_phase = math.pi * float(np.abs(self.spectrum.frequency_hz).max()) * self._step_s
+        half_phase = math.pi * float(np.abs(self.spectrum.frequency_hz).max()) * self.step_s
         degree = math.ceil(1.5 * half_phase) + 20
         places = chebyshev.chebpts1(degree + 1)
         values = self._weights(self._middle + places / 2).T
@@ -267,4 +268,4 @@ class DelayFit:
         return self._wave(self.spectrum.frequency_hz, fractions)
 
     def _wave(self, frequency_hz: NDArray[np.float64], steps: NDArray[np.float64]) -> NDArray[np.complex128]:
-        return np.asarray(np.exp(2j * math.pi * self._step_s * np.outer(frequency_hz, steps)))
+        return np.asarray(np.exp(2j * math.pi * self.step_s * np.outer(frequency_hz, steps)))

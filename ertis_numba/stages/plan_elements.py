@@ -19,12 +19,14 @@ __all__ = [
     "beam_grid_of",
     "chain_taps",
     "delay_fit",
+    "few_delays",
     "nearest_m_of",
     "ringing_db",
     "spectrum_of",
     "zones_of",
 ]
 
+_MANY_FRACTIONS = 16  # Microphones times delay range in steps, above which the delays spread evenly over a step.
 _PCM_RANGE_DB = 125.0  # Dynamic range within which sound outside the window does not affect an image of PCM.
 _MAX_RINGING_DB = 160.0  # Below this level, rounding of single precision exceeds the ringing.
 _MAX_PASS_BAND = 0.45  # relative to the signal rate; the filter becomes long beyond it
@@ -65,6 +67,32 @@ def delay_fit(settings: Settings, spectrum: Spectrum) -> tuple[DelayFit, float]:
     plan = settings.accuracy
     step_s = 1 / (settings.output_rate_hz * (plan.oversampling or 1))
     return DelayFit(plan.delay_taps or 1, step_s, spectrum), step_s
+
+
+def few_delays(
+    aperture: Aperture,
+    own_s: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    step_s: float,
+    *,
+    sound_speed_m_s: float,
+) -> NDArray[np.float64] | None:
+    """Return all delays in seconds, (delay,) float64; None if they are so many that they spread evenly over a step.
+
+    Parameters
+    ----------
+    aperture : Aperture
+    own_s, weights : (mic,) float64
+        Delay and array weight of each microphone.
+    step_s : float
+        Time between samples in seconds.
+    sound_speed_m_s : float
+    """
+    reach_s = math.sqrt(float(np.max(aperture.square_m2, initial=0.0))) / sound_speed_m_s
+    if len(weights) * (1 + 2 * reach_s / step_s) > _MANY_FRACTIONS:
+        return None
+    waves_s = aperture.delays_s(aperture.directions, sound_speed_m_s=sound_speed_m_s, range_m=math.inf)
+    return np.asarray(own_s - ahead_of(weights, step_s) + waves_s).ravel()
 
 
 def chain_taps(settings: Settings) -> NDArray[np.int16] | NDArray[np.int32]:

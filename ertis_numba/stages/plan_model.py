@@ -19,7 +19,7 @@ from ertis_numba.stages.beamform import whole_limits
 from ertis_numba.stages.costs import Work
 from ertis_numba.stages.fitting import DelayFit, Spectrum
 from ertis_numba.stages.focal_zones import squared_curvature
-from ertis_numba.stages.plan_elements import ahead_of, chain_taps, nearest_m_of, spectrum_of, zones_of
+from ertis_numba.stages.plan_elements import chain_taps, few_delays, nearest_m_of, spectrum_of, zones_of
 from ertis_numba.stages.planned_streams import PlannedStreams
 from ertis_numba.stages.sensitivity import Sensitivity
 from ertis_numba.stages.stream_plan import StreamPlanner
@@ -33,7 +33,6 @@ MIN_STOPBAND_ATTENUATION_DB = 40.0
 TABLE_BYTES = 44
 """Bytes of a delay and a weight, including both the computed form and the form that kernels read."""
 
-_MANY_FRACTIONS = 16  # Microphones times delay range in steps, above which the delays spread evenly over a step.
 _MAX_APERTURES = 8  # Arrays with their directions.
 _MAX_FITS = 288  # Four times the number of fits in one search.
 
@@ -149,13 +148,14 @@ class PlanModel:
             else None
         )
 
-    def parts(self, plan: ImagePlan) -> dict[str, float]:
+    def parts(self, plan: ImagePlan, *, noise_only: bool = False) -> dict[str, float]:
         """Return the error power of each step of a plan, relative to the exact image of delay-and-sum.
 
-        Errors of streams are those of the image, divided by the safe sensitivity of the beamformer.
+        Errors of streams are those of the image, divided by the safe sensitivity of the beamformer. They are larger for
+        images of noise only; the other errors are the same.
         """
         if self.uses_streams(plan):
-            return self._stream_parts(plan)
+            return self._stream_parts(plan, noise_only=noise_only)
         delays = self.delays(plan.n_phases, plan.delay_taps)
         nodes = self.nodes(plan.beam_taps, plan.density) if plan.beam_taps else None
         _, filter_error = self.filter(plan.stopband_attenuation_db)
@@ -168,7 +168,7 @@ class PlanModel:
         if self.settings.processing.wavefront == "spherical":
             parts["zones"] = self.zone_error(plan.focal_zones)
         if plan.precision == "int16":
-            parts["samples"] = self._whole_numbers(delays, None if nodes is None else nodes.squares)
+            parts["samples"] = self._spread * self._whole_numbers(delays, None if nodes is None else nodes.squares)
         return parts
 
     def uses_streams(self, plan: ImagePlan) -> bool:
@@ -176,9 +176,9 @@ class PlanModel:
         accuracy = Accuracy(precision=plan.precision, delay_taps=plan.delay_taps, beam_taps=plan.beam_taps)  # type: ignore[arg-type]
         return uses_streams(self.settings.processing, accuracy)
 
-    def _stream_parts(self, plan: ImagePlan) -> dict[str, float]:
+    def _stream_parts(self, plan: ImagePlan, *, noise_only: bool) -> dict[str, float]:
         assert self._stream_planner is not None  # noqa: S101
-        planned = self.streams(plan)
+        planned, kind = self.streams(plan), "noise" if noise_only else "echoes"
         linear = Sensitivity.of(self.settings.processing, self.n_mics).linear
         _, filter_error = self.filter(plan.stopband_attenuation_db)
         parts = dict.fromkeys(PARTS, 0.0)
@@ -190,7 +190,7 @@ class PlanModel:
             squares = None
             if each.grid is not None:
                 squares = each.grid.squares
-                parts["beams"] += each.grid.error / linear
+                parts["beams"] += getattr(each.grid.errors, kind) / linear
                 amplified = max(amplified, squares)
             if plan.precision == "int16":
                 weights = np.abs(each.fit.weights(each.fit.fractions))
@@ -201,16 +201,13 @@ class PlanModel:
                     squares=float(np.mean(np.sum(weights**2, axis=1))),
                 )
                 parts["samples"] += each.shares.noise * self._whole_numbers(delays, squares) / linear
-        parts["delays"] = planned.delays * amplified / linear
+        parts["delays"] = getattr(planned.delays, kind) * amplified / linear
         return parts
 
     def _made_streams(self, plan: ImagePlan) -> PlannedStreams:
         assert self._stream_planner is not None  # noqa: S101
-        step_s = 1 / (self.settings.output_rate_hz * plan.n_phases)
-        fit, _ = _fitted(self._spectrum, plan.delay_taps, step_s)
-        return self._stream_planner.plan(
-            plan.n_phases, plan.delay_taps, plan.beam_taps, plan.density, self._few_fractions(fit, step_s)
-        )
+        delays_s = self._few_delays(1 / (self.settings.output_rate_hz * plan.n_phases))
+        return self._stream_planner.plan(plan.n_phases, plan.delay_taps, plan.beam_taps, plan.density, delays_s)
 
     def _delays_between(self, nodes: Nodes, plan: ImagePlan, error: float) -> float:
         """Return the error power of delays in beams that are interpolated between beam-grid points.
@@ -221,7 +218,7 @@ class PlanModel:
         """
         step_s = 1 / (self.settings.output_rate_hz * plan.n_phases)
         fit, _ = _fitted(self._spectrum, plan.delay_taps, step_s)
-        if nodes.grid is None or self._few_fractions(fit, step_s) is not None:
+        if nodes.grid is None or self._few_delays(step_s) is not None:
             return error * max(1.0, nodes.squares)
         passed = sum(share * nodes.grid.passed(order / step_s) for order, share in fit.images.items())
         return self.errors.delays(fit, n_mics=self._n_effective, passed=np.asarray(passed))
@@ -296,23 +293,17 @@ class PlanModel:
     def _made_delays(self, n_phases: int, n_taps: int) -> Delays:
         step_s = 1 / (self.settings.output_rate_hz * n_phases)
         fit, weights = _fitted(self._spectrum, n_taps, step_s)
+        delays_s = self._few_delays(step_s)
+        fractions = None if delays_s is None else fit.split(delays_s)[1]
         return Delays(
             n_taps=fit.n_taps,
-            error=self.errors.delays(fit, n_mics=self._n_effective, fractions=self._few_fractions(fit, step_s)),
+            error=self.errors.delays(fit, n_mics=self._n_effective, fractions=fractions),
             sum_of_weights=float(np.max(weights.sum(axis=1))),
             squares=float(np.mean(np.sum(weights**2, axis=1))),
         )
 
-    def _few_fractions(self, fit: DelayFit, step_s: float) -> NDArray[np.float64] | None:
-        """Return the fractions of all delays, if the delays are too few to spread evenly over a step."""
-        if self.n_mics * (1 + 2 * self._reach_s() / step_s) > _MANY_FRACTIONS:
-            return None
-        delays_s = (
-            self._own_s
-            - ahead_of(self._weights, step_s)
-            + self.aperture.delays_s(self.aperture.directions, sound_speed_m_s=self._speed_m_s, range_m=math.inf)
-        )
-        return fit.split(delays_s)[1].ravel()
+    def _few_delays(self, step_s: float) -> NDArray[np.float64] | None:
+        return few_delays(self.aperture, self._own_s, self._weights, step_s, sound_speed_m_s=self._speed_m_s)
 
     def count_grid_points(self, n_taps: int, density: float) -> int:
         """Return the number of beam-grid points."""
@@ -359,7 +350,7 @@ class PlanModel:
             error += self.errors.nodes(
                 n_mics=self.n_mics, sum_of_terms=delays.sum_of_weights, taps=squares, filled=filled
             )
-        return error * self._spread
+        return error
 
     @functools.cached_property
     def _n_bins(self) -> int:

@@ -7,9 +7,20 @@ from ertis_numba.beamformers import SignalStream
 from ertis_numba.stages.fitting import DelayFit
 from ertis_numba.stages.stream_spectrum import StreamSpectrum
 
-__all__ = ["ErrorShares", "PlannedStream", "PlannedStreams", "StreamGrid"]
+__all__ = ["ErrorShares", "ImageErrors", "PlannedStream", "PlannedStreams", "StreamGrid"]
 
 _UNLIKE: Final = 2.5  # Margin for differences between images: 4 dB.
+
+
+@dataclass(frozen=True, slots=True)
+class ImageErrors:
+    """Error powers of images: those of echoes with some noise, and the largest of any sound, usually of noise only."""
+
+    echoes: float = 0.0
+    noise: float = 0.0
+
+    def __add__(self, other: "ImageErrors") -> "ImageErrors":
+        return ImageErrors(self.echoes + other.echoes, self.noise + other.noise)
 
 
 class ErrorShares(NamedTuple):
@@ -22,7 +33,7 @@ class ErrorShares(NamedTuple):
     common : float
         For errors that all microphones share, and such an echo.
     noise_share : float
-        Share of noise in the power of the image.
+        Share of noise in the power of an image of echoes.
     """
 
     noise: float
@@ -30,8 +41,8 @@ class ErrorShares(NamedTuple):
     common: float
     noise_share: float
 
-    def error(self, *, whole: float, varying: float, common: float) -> float:
-        """Return the error power of an image of echoes and some noise.
+    def errors(self, *, whole: float, varying: float, common: float) -> ImageErrors:
+        """Return the error powers of images.
 
         Parameters
         ----------
@@ -40,7 +51,9 @@ class ErrorShares(NamedTuple):
         varying, common : float
             Error power where the image is bright: the part that differs between microphones, and the rest.
         """
-        return _UNLIKE * (self.coherent * varying + self.common * common + self.noise_share * self.noise * whole)
+        noise = _UNLIKE * self.noise * whole
+        echoes = _UNLIKE * (self.coherent * varying + self.common * common) + self.noise_share * noise
+        return ImageErrors(echoes, max(echoes, noise))
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,8 +66,7 @@ class StreamGrid:
     density : float
     n_points, n_pairs : int
         Points of the grid, and pairs of points for each direction.
-    error : float
-        Error power of the image.
+    errors : ImageErrors
     squares : float
         Sum of a beam's squared weights.
     """
@@ -63,7 +75,7 @@ class StreamGrid:
     density: float
     n_points: int
     n_pairs: int
-    error: float
+    errors: ImageErrors
     squares: float
 
 
@@ -101,10 +113,10 @@ class PlannedStreams:
         As in `Recipe`, without the highest power sums if these are negligible.
     n_powers : int
         Number of power sums among them.
-    delays : float
-        Error power of the image due to interpolation of delays and power sums that are left out.
+    delays : ImageErrors
+        Errors due to interpolation of delays and power sums that are left out.
     """
 
     streams: list[PlannedStream]
     n_powers: int
-    delays: float
+    delays: ImageErrors

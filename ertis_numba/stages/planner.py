@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from ertis_numba import checks
 from ertis_numba.beamformers import BEAMFORMERS
@@ -19,7 +20,10 @@ from ertis_numba.stages.plan_search import open_plans
 from ertis_numba.stages.sensitivity import Sensitivity
 from ertis_numba.stages.wavefronts import with_wavefront
 
-__all__ = ["Chosen", "Planner", "complete"]
+__all__ = ["BudgetScope", "Chosen", "Planner", "complete"]
+
+BudgetScope = Literal["image", "echoes", "beams"]
+"""Images for which a plan keeps its budget: any, those of echoes, or only the delay-and-sum beams of an image."""
 
 _USUAL_BYTES = (
     2**31
@@ -187,7 +191,7 @@ class Planner:
             cheapest = min(within, key=lambda plan: self._time(plan, costs)) if costs else within[0]
             return self.chosen(self._accuracy(cheapest))
         plan, parts = min(rated, key=lambda entry: sum(entry[1].values()))
-        if budget < sum(parts.values()) <= allowed:
+        if budget < sum(parts.values()) <= allowed and not self._plans.uses_streams(plan):
             return self.chosen(self._accuracy(plan))
         best = self.chosen(self._accuracy(plan))
         memory = f"; more accurate plans exceed {limit / 1e6:.0f} MB of memory" if len(rated) < len(plans) else ""
@@ -211,19 +215,23 @@ class Planner:
         """Return the predicted image error of a complete plan, in decibels."""
         return decibels(sum(self._image_parts(accuracy).values()))
 
-    def keeps_budget_of_images(self, accuracy: Accuracy) -> bool:
-        """Return False if a complete plan of an adaptive beamformer meets the budget for delay-and-sum beams only.
+    def budget_scope(self, accuracy: Accuracy) -> BudgetScope:
+        """Return the images for which a complete plan keeps its budget before a measurement.
 
-        The answer holds for any sound, or with streams for echoes in noise. It depends neither on the signal model nor
-        on the sensitivity of this planner.
+        The answer depends neither on the signal model nor on the sensitivity of this planner. Plans with streams may
+        exceed the budget where echoes are weaker than noise, or where many echoes overlap.
         """
         if not self.settings.processing.is_adaptive:
-            return True
-        safe = Planner(self.settings, self._kernels, threads=self._threads)
-        return safe.error_db(accuracy) <= accuracy.max_error_db + _ROUNDED_DB
+            return "image"
+        safe, allowed_db = Planner(self.settings, self._kernels, threads=self._threads), accuracy.max_error_db
+        if safe.error_db(accuracy) > allowed_db + _ROUNDED_DB:
+            return "beams"
+        noise_db = decibels(sum(safe._image_parts(accuracy, noise_only=True).values()))
+        return "image" if noise_db <= allowed_db + _ROUNDED_DB else "echoes"
 
-    def _image_parts(self, accuracy: Accuracy) -> dict[str, float]:
-        parts = self.parts(accuracy)
+    def _image_parts(self, accuracy: Accuracy, *, noise_only: bool = False) -> dict[str, float]:
+        with one_thread():
+            parts = self._plans.parts(plan_of(accuracy), noise_only=noise_only)
         beams = sum(parts.values())
         amplified = self._sensitivity.output(beams) / beams if 0 < beams < math.inf else 1.0
         return {name: amplified * power for name, power in parts.items()}

@@ -11,10 +11,11 @@ An error that all microphones share adds up to M² instead of M. With 32 microph
 little accuracy, and those of the highest orders can be left out. The coherence factor follows from the sums of y and
 |y|². Each stream gets the fewest taps and the cheapest beam grid whose error is not above that of the first stream.
 
-Where a signal is nearly zero, its stream changes too fast for interpolation. Echoes are hardly affected: they are
-bright where signals are strong, and their errors come from the spectrum there. The planner assumes echoes in noise. The
-noise has nine tenths of the power in the image of delay-and-sum, and much less in the images here. An image of noise
-only has a larger error.
+Where a signal is nearly zero, its stream changes too fast for interpolation. Echoes are less affected: they are bright
+where signals are strong. Their errors come from the spectrum there, or from one echo, whose envelope has zeros in all
+microphones, if that error is larger. The planner assumes echoes in noise. The noise has nine tenths of the power in the
+image of delay-and-sum, and much less in the images here. Images of noise only, or of echoes that overlap everywhere,
+may have larger errors.
 
 The matched filter can apply the gains of delay and beam interpolation to a stream of the signals themselves, see
 `fitting`. Other streams are nonlinear, so the signals for them have no gain.
@@ -31,9 +32,9 @@ from ertis_numba.beamformers import SignalStream
 from ertis_numba.settings import Settings
 from ertis_numba.stages.beam_grid import Aperture, BeamGrid
 from ertis_numba.stages.fitting import DelayFit, Spectrum
-from ertis_numba.stages.planned_streams import ErrorShares, PlannedStream, PlannedStreams, StreamGrid
+from ertis_numba.stages.planned_streams import ErrorShares, ImageErrors, PlannedStream, PlannedStreams, StreamGrid
 from ertis_numba.stages.stream_recipe import LINEAR, Recipe
-from ertis_numba.stages.stream_spectrum import StreamSpectrum, highest_hz, spectrum_of_stream
+from ertis_numba.stages.stream_spectrum import StreamSpectrum, highest_hz, pulse_errors, spectrum_of_stream
 
 __all__ = [
     "GRID_DENSITIES",
@@ -85,7 +86,7 @@ class StreamPlanner:
         self._n_mics = len(aperture.positions_m)
 
     def plan(
-        self, n_phases: int, n_taps: int, beam_taps: int, density: float, fractions: NDArray[np.float64] | None = None
+        self, n_phases: int, n_taps: int, beam_taps: int, density: float, delays_s: NDArray[np.float64] | None = None
     ) -> PlannedStreams:
         """Return the streams of a plan.
 
@@ -94,15 +95,15 @@ class StreamPlanner:
         n_phases, n_taps, beam_taps : int
         density : float
             As in `ImagePlan`.
-        fractions : (delay,) float64, optional
-            As for `ErrorModel.delays`.
+        delays_s : (delay,) float64, optional
+            All delays in seconds, if they are too few to spread evenly over a step, see `few_delays`.
         """
         step_s = 1 / (self._rate_hz * n_phases)
-        _, first = self._delays(0, n_taps, step_s, fractions)
-        error, small, order = first, _SMALL * first, self.recipe.order
+        _, first = self._delays(0, n_taps, step_s, delays_s)
+        errors, small, order = first, _SMALL * first.echoes, self.recipe.order
         n_powers = order
-        while n_powers > 1 and (missed := self._missed(n_powers - 1)) <= small:
-            error += missed
+        while n_powers > 1 and (missed := self._missed(n_powers - 1)).echoes <= small:
+            errors += missed
             n_powers -= 1
         streams: list[PlannedStream] = []
         first_grid = 0.0
@@ -110,22 +111,23 @@ class StreamPlanner:
             if n_powers <= place < order:
                 continue
             fewest = n_taps if place == 0 else 1
-            fits = (self._delays(place, few, step_s, fractions) for few in range(fewest, n_taps + 1))
-            fit, added = next(found for found in fits if found[1] <= small or found[0].n_taps == n_taps)
-            error += added if place else 0.0
+            fits = (self._delays(place, few, step_s, delays_s) for few in range(fewest, n_taps + 1))
+            fit, added = next(found for found in fits if found[1].echoes <= small or found[0].n_taps == n_taps)
+            if place:
+                errors += added
             high_hz = highest_hz(self._call.low_frequency_hz, self._call.high_frequency_hz, stream)
             spectrum, shares = self._spectrum_of(stream), self._shares(place)
             grid = None
             if beam_taps and self._aperture.n_axes in {1, 2}:
-                limit = math.inf if place == 0 else _SMALL * (first + first_grid)
+                limit = math.inf if place == 0 else _SMALL * (first.echoes + first_grid)
                 grid = self._grid(
                     *(spectrum, shares, beam_taps, density, high_hz, limit),
                     n_delay_taps=fit.n_taps,
                     has_gain=stream == LINEAR,
                 )
-            first_grid = grid.error if place == 0 and grid else first_grid
+            first_grid = grid.errors.echoes if place == 0 and grid else first_grid
             streams.append(PlannedStream(stream, spectrum, fit, high_hz, grid, shares))
-        return PlannedStreams(streams, n_powers, error)
+        return PlannedStreams(streams, n_powers, errors)
 
     def beam_grid(self, planned: PlannedStream) -> BeamGrid | None:
         """Return the beam grid of a stream."""
@@ -176,10 +178,10 @@ class StreamPlanner:
             # The errors of neighbouring microphones are alike, so that they do not average out without a gain, which
             # removes their mean, and only partly with it.
             common = bright * min(1.0, _PEAKED / math.sqrt(self._n_mics)) if has_gain else bright
-            error = shares.error(whole=whole, varying=bright - common, common=common)
-            if error <= limit:
+            errors = shares.errors(whole=whole, varying=bright - common, common=common)
+            if errors.echoes <= limit:
                 n_pairs = n_taps**self._aperture.n_axes // 2
-                return StreamGrid(n_taps, each, n_points, n_pairs, error, squares)
+                return StreamGrid(n_taps, each, n_points, n_pairs, errors, squares)
         return None
 
     def _terms(self, beam_taps: int, n_points: int, n_delay_taps: int) -> int:
@@ -190,9 +192,9 @@ class StreamPlanner:
             return n_directions * n_terms
         return n_points * n_terms + n_directions * int(beam_taps**self._aperture.n_axes) // 2
 
-    def _missed(self, place: int) -> float:
-        """Return the error power of the image if a power sum is left out."""
-        return self._shares(place).error(whole=1.0, varying=0.0, common=1.0)
+    def _missed(self, place: int) -> ImageErrors:
+        """Return the errors of images if a power sum is left out."""
+        return self._shares(place).errors(whole=1.0, varying=0.0, common=1.0)
 
     def _count(self, beam_taps: int, density: float, high_hz: float) -> int:
         spacing = self._aperture.spacing(density, high_hz=high_hz, sound_speed_m_s=self._speed_m_s)
@@ -202,16 +204,21 @@ class StreamPlanner:
         return spectrum_of_stream(self._spectrum, stream)
 
     def _delays(
-        self, place: int, n_taps: int, step_s: float, fractions: NDArray[np.float64] | None
-    ) -> tuple[DelayFit, float]:
-        """Return the fit of a stream's delays, and the error power of the image due to it."""
+        self, place: int, n_taps: int, step_s: float, delays_s: NDArray[np.float64] | None
+    ) -> tuple[DelayFit, ImageErrors]:
+        """Return the fit of a stream's delays, and the errors of images due to it."""
         bright, whole = self._spectrum_of(self.recipe.streams[place])
         fit = _fitted(bright, n_taps, step_s, with_gain=self.recipe.streams[place] == LINEAR)
-        if fractions is None:
+        if delays_s is None:
             whole_error, varying, common = _fit_errors(fit, whole)
+            common *= _PEAKED
+            if self.recipe.streams[place] != LINEAR:
+                pulse = pulse_errors(fit, self._spectrum, self.recipe.streams[place])
+                varying, common = max(varying, pulse[0]), max(common, pulse[1])
         else:
-            whole_error = varying = common = float(fit.errors_at(fractions, whole) @ whole.power)
-        return fit, self._shares(place).error(whole=whole_error, varying=varying, common=_PEAKED * common)
+            whole_error = varying = float(fit.errors_at(fit.split(delays_s)[1], whole) @ whole.power)
+            common = _PEAKED * whole_error
+        return fit, self._shares(place).errors(whole=whole_error, varying=varying, common=common)
 
     def _shares(self, place: int) -> ErrorShares:
         """Return the shares of a stream, for an image of noise that is half as bright as expected."""
@@ -231,7 +238,7 @@ class StreamPlanner:
 
     @functools.cached_property
     def _noise_share(self) -> float:
-        """Share of noise in the power of the image, from the mean power of Gaussian noise in each image."""
+        """Share of noise in the power of an image of echoes, from the mean power of Gaussian noise in each image."""
         n_mics, order = self._n_mics, self.recipe.order
         suppressed = n_mics * math.gamma(1 + 1 / order) ** order / math.comb(n_mics, order)
         if self.recipe.total >= 0:

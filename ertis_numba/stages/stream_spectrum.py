@@ -1,4 +1,4 @@
-"""Power spectra of streams, which are nonlinear functions of signals."""
+"""Power spectra of streams, which are nonlinear functions of signals, and errors of their delays for one echo."""
 
 import functools
 import math
@@ -9,15 +9,18 @@ import scipy
 from numpy.typing import NDArray
 
 from ertis_numba.beamformers import SignalStream
-from ertis_numba.stages.fitting import WAVES, Spectrum
+from ertis_numba.stages.fitting import WAVES, DelayFit, Spectrum
 
-__all__ = ["StreamSpectrum", "highest_hz", "spectrum_of_stream"]
+__all__ = ["StreamSpectrum", "highest_hz", "pulse_errors", "spectrum_of_stream"]
 
 _LENGTH, _RUNS = 2**15, 6  # Samples and repetitions of the noise.
 _OVERSAMPLING = 48  # Beyond this bandwidth, streams have less power than any plan with 64 samples per range misses.
 _TAIL_BINS = 12
+_FAINT = 1e-3  # Levels below this share of the largest count as this share.
 _SEED = 1
+_PULSE_WIDTHS, _PULSE_DENSITY = 6, 12  # Length of half a pulse, and its samples, relative to the reciprocal bandwidth.
 _KEPT = 64  # Number of cached spectra.
+_KEPT_FITS = 512
 
 
 class StreamSpectrum(NamedTuple):
@@ -51,6 +54,34 @@ def spectrum_of_stream(spectrum: Spectrum, stream: SignalStream) -> StreamSpectr
 def highest_hz(low_hz: float, high_hz: float, stream: SignalStream) -> float:
     """Return the highest frequency of a stream for a call of a given band, to which beam grids are relative."""
     return stream.turns * (low_hz + high_hz) / 2 + max(1.0, stream.power) * (high_hz - low_hz) / 2
+
+
+@functools.lru_cache(maxsize=_KEPT_FITS)
+def pulse_errors(fit: DelayFit, spectrum: Spectrum, stream: SignalStream) -> tuple[float, float]:
+    """Return the error powers of a stream's delays for one echo that reaches all microphones alike.
+
+    The signal y of an echo has the spectrum of the matched filter's output. Its envelope has zeros, where streams
+    change suddenly. An error of ``|y|^a exp(ikφ)`` changes the image by its product with ``|y|^(1 − a)``, but by
+    at most y for a > 1, because factors are limited. The result has the part that differs between microphones, and the
+    part that they share, relative to the power of y.
+    """
+    frequency_hz, power = spectrum.frequency_hz, spectrum.power
+    width_hz = float(frequency_hz[-1] - frequency_hz[0]) + 1.0
+    time_s = np.arange(-_PULSE_WIDTHS * _PULSE_DENSITY, _PULSE_WIDTHS * _PULSE_DENSITY) / (_PULSE_DENSITY * width_hz)
+    # Stored samples of each fraction of a step: (fraction, tap, time).
+    shift_s = (np.arange(fit.n_taps) - fit.fractions[:, None]) * fit.step_s
+    shifted = np.exp(2j * np.pi * frequency_hz * shift_s[..., None]) * power
+    stored = _values(shifted @ np.exp(2j * np.pi * frequency_hz[:, None] * time_s), stream)
+    signal = power @ np.exp(2j * np.pi * frequency_hz[:, None] * time_s)
+    level = np.abs(signal)
+    wrong = np.einsum("ak,akt->at", fit.weights(fit.fractions), stored) - _values(signal, stream)
+    wrong *= np.maximum(level, _FAINT * level.max()) ** (1 - stream.power)
+    if stream.power > 1:
+        wrong /= np.maximum(1.0, np.abs(wrong) / np.maximum(level, _FAINT * level.max()))
+    shared = float(np.sum(np.abs(wrong.mean(axis=0)) ** 2))
+    whole = float(np.mean(np.sum(np.abs(wrong) ** 2, axis=1)))
+    energy = float(np.sum(level**2))
+    return (whole - shared) / energy, shared / energy
 
 
 def _whole(spectrum: Spectrum, stream: SignalStream, stretch: float) -> Spectrum:

@@ -104,7 +104,7 @@ class EnergyscapeWriter(FileWriter[Energyscape]):
         *,
         predicted_error_db: float,
         max_error_db: float,
-        budget_applies_to: Literal["image", "beams"],
+        budget_applies_to: Literal["image", "echoes", "beams"],
         error_warning: str,
     ) -> None:
         """Store the predicted error of a sensor's images, the budget, its scope, and a warning if images may exceed it.
@@ -232,8 +232,9 @@ class EnergyscapeReader(FileReader[Energyscape], DegreesFromRadians):
         Error that the error model predicted for the first image, and the budget. None in older files and for images of
         the paper's method.
     budget_applies_to : str
+        ``echoes`` if images of noise or of many overlapping echoes may exceed the budget of the adaptive beamformer.
         ``beams`` if the budget is that of delay-and-sum beams only, because no plan keeps it for images of the adaptive
-        beamformer; otherwise ``image``. Empty if the file does not contain it.
+        beamformer. Otherwise ``image``. Empty if the file does not contain it.
     error_warning : str
         Warning that images may exceed the budget; empty if they do not, or if no error was predicted.
     wavefront_error_db : float, or None
