@@ -6,9 +6,9 @@ from .analysis.detect import find_peaks as find_peaks
 from .analysis.health import health as health
 from .analysis.points import PointExtractor as PointExtractor
 from .arrays import beamform as beamform, demodulate as demodulate, matched_filter as matched_filter
+from .devices.driver import SonarDriver as SonarDriver
 from .devices.emulator import Emulator as Emulator
 from .devices.setup import Setup as Setup
-from .devices.sonar import SonarDriver as SonarDriver
 from .errors import (
     ArgumentError as ArgumentError,
     CallMismatchWarning as CallMismatchWarning,

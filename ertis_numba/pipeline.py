@@ -20,7 +20,7 @@ from ertis_numba.prediction import BudgetMonitor
 from ertis_numba.sample_format import sample_format
 from ertis_numba.settings import ERROR_PRESETS_DB, Array, Settings
 from ertis_numba.stages import paper, paper_scipy, planner
-from ertis_numba.stages.chain import Chain
+from ertis_numba.stages.chain_protocol import Chain
 from ertis_numba.stages.costs import PLAN_COSTS, PlanCosts
 from ertis_numba.stages.fast import FastChain
 from ertis_numba.stages.kernel_chain import KernelChain

@@ -6,8 +6,8 @@ from ertis_numba.air import sound_speed_m_s
 from ertis_numba.settings import Array, Call, Processing, Recording
 from ertis_numba.simulation import Emitter, Scene, Sensor
 from ertis_numba.simulation.arrivals import arrivals
+from ertis_numba.simulation.effect_plan import EffectPlan, Verdict
 from ertis_numba.simulation.effects import EFFECTS, INDISPENSABLE
-from ertis_numba.simulation.plan import EffectPlan, Verdict
 from ertis_numba.simulation.render import Simulator
 from ertis_numba.simulation.snapshot import snapshot
 from ertis_numba.simulation.stopwatch import CostStopwatch

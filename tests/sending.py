@@ -7,7 +7,7 @@ import time
 import pytest
 
 from ertis_numba.network import connection, messages
-from ertis_numba.network.sensor_node import SensorNode, _link as link, _runs as runs
+from ertis_numba.network.sensor_node import SensorNode, _link as link, _outgoing_sessions as runs
 from tests.journals import EPOCH, TINY
 
 KEY = "left", EPOCH

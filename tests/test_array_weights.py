@@ -14,7 +14,7 @@ from ertis_numba.analysis.point_spread import PointSpread
 from ertis_numba.analysis.uncertainty import _effective_covariance_m2
 from ertis_numba.beamformers import ADAPTIVE_COMBINATIONS
 from ertis_numba.errors import ArgumentError
-from ertis_numba.figures import _words
+from ertis_numba.figures import _captions
 from ertis_numba.figures._array import pattern_db, width_deg
 from ertis_numba.geometry import array_weights, effective_count, microphones, unit_vectors
 from ertis_numba.pipeline import Pipeline
@@ -265,4 +265,4 @@ def test_every_window_has_an_error_free_name():
 
 @pytest.mark.parametrize(("weights", "name"), [("uniform", "uniform"), ("hann", "hann"), ((1.0,) * 32, "listed")])
 def test_picture_of_an_array_names_its_weights(weights, name):
-    assert f"{name} weights, plane waves" in _words.of_array(weighted(SHORT, weights)).settings
+    assert f"{name} weights, plane waves" in _captions.of_array(weighted(SHORT, weights)).settings

@@ -9,8 +9,8 @@ from ertis_cli.main import cli
 
 from ertis_numba.settings import Recording
 from ertis_numba.simulation import Ambient, Electronics, Emitter, Noise, Point, Scene, Sonar, Tone
+from ertis_numba.simulation.effect_plan import make_plan
 from ertis_numba.simulation.effects import ASKED_FOR, EFFECTS
-from ertis_numba.simulation.plan import make_plan
 from ertis_numba.simulation.render import Simulator
 from ertis_numba.storage import open_recording
 from tests.scenes import SENSOR, scene_of

@@ -13,7 +13,7 @@ from ertis_numba.geometry import direction_grid, microphones, unit_vectors
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Accuracy, Air, Array, Call, Processing, Settings
 from ertis_numba.stages.beam_grid import Aperture, BeamGrid
-from ertis_numba.stages.fitting import Spectrum
+from ertis_numba.stages.interpolation_fit import Spectrum
 from ertis_numba.stages.planner import Planner
 from ertis_numba.waveform import matched_noise_spectrum
 from tests import reference

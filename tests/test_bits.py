@@ -16,7 +16,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from ertis_numba import open_recording
-from ertis_numba.devices import splices
+from ertis_numba.devices import splice_detection
 from ertis_numba.devices.bit_means import BitMeans
 from ertis_numba.devices.bits import BitCheck
 from ertis_numba.errors import ArgumentError
@@ -266,7 +266,9 @@ def test_channels_without_a_microphone_are_ignored():
 
 def test_number_of_examined_impulses_is_limited(monkeypatch):
     looked = []
-    monkeypatch.setattr(splices.Splices, "_is_splice", lambda *arguments: looked.append(arguments[-2]) is not None)
+    monkeypatch.setattr(
+        splice_detection.Splices, "_is_splice", lambda *arguments: looked.append(arguments[-2]) is not None
+    )
     words = REAL.copy()
     for place in range(20_000, 150_000, 1_000):
         words[place:] = np.roll(words[place:], 3)

@@ -14,9 +14,9 @@ from click.testing import CliRunner
 from ertis_cli.main import cli
 
 from ertis_numba.capture import CaptureSession
+from ertis_numba.devices.driver import SonarDriver
 from ertis_numba.devices.emulator import Emulator
 from ertis_numba.devices.setup import Setup
-from ertis_numba.devices.sonar import SonarDriver
 from ertis_numba.network.allow_list import AllowList, Permission
 from ertis_numba.network.keys import KeyPair, ServerKeys
 from ertis_numba.network.log import logger

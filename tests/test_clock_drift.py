@@ -4,7 +4,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from ertis_numba.simulation import Electronics, Emitter, Point
-from ertis_numba.simulation.plan import make_plan
+from ertis_numba.simulation.effect_plan import make_plan
 from tests.scenes import EAR, SPEED_M_S, arrival_s, error_db, heard, scene_of, seen, vector, ways, written_out
 
 FAST = Electronics(clock_drift_ppm=200.0)

@@ -4,12 +4,12 @@ import json
 
 import pytest
 from click.testing import CliRunner
-from ertis_bench.network import figures
+from ertis_bench.network import performance
 from ertis_cli.main import cli
 
 from tests.dask_clusters import cluster_of_threads
 
-processing = figures.processing
+processing = performance.processing
 
 
 def only_on_the_cluster(folder, duration_s, seed, *, rate_hz, scheduler, **options):
@@ -22,9 +22,9 @@ def only_on_the_cluster(folder, duration_s, seed, *, rate_hz, scheduler, **optio
 
 @pytest.fixture(autouse=True)
 def _short(monkeypatch):
-    monkeypatch.setattr(figures, "_WARM_UP_S", 0.4)
-    monkeypatch.setattr(figures, "processing", only_on_the_cluster)
-    monkeypatch.setattr(figures.cluster, "local_cluster", cluster_of_threads)
+    monkeypatch.setattr(performance, "_WARM_UP_S", 0.4)
+    monkeypatch.setattr(performance, "processing", only_on_the_cluster)
+    monkeypatch.setattr(performance.cluster, "local_cluster", cluster_of_threads)
 
 
 def test_cluster_bench_measures_and_updates_the_page(tmp_path):

@@ -12,7 +12,7 @@ from ertis_numba.frames import Peak, Reflector
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Array
 from ertis_numba.simulation import Scene
-from ertis_numba.simulation.plan import EffectPlan, Verdict
+from ertis_numba.simulation.effect_plan import EffectPlan, Verdict
 from ertis_numba.simulation.render import Simulator
 from tests.test_detect import image_of
 

@@ -16,7 +16,7 @@ from ertis_numba.analysis.compare import compare
 from ertis_numba.analysis.detect import find_peaks
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.simulation import Scene, load_scene
-from ertis_numba.simulation.plan import make_plan
+from ertis_numba.simulation.effect_plan import make_plan
 from ertis_numba.simulation.render import Simulator
 from ertis_numba.storage import open_recording
 from tests.pages import page

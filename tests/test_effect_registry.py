@@ -12,10 +12,10 @@ import pytest
 from ertis_numba.errors import ArgumentError
 from ertis_numba.settings import Processing, Recording
 from ertis_numba.simulation import Scene, effects
+from ertis_numba.simulation.effect_plan import make_plan
 from ertis_numba.simulation.effects import EFFECTS, INDISPENSABLE, Place
 from ertis_numba.simulation.engine import Engine
 from ertis_numba.simulation.loudness import peak_bound
-from ertis_numba.simulation.plan import make_plan
 from ertis_numba.simulation.snapshot import snapshot
 from tests.scenes import THREE
 

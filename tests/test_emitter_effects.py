@@ -11,7 +11,7 @@ from ertis_numba.geometry import microphones
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Processing
 from ertis_numba.simulation import Electronics, Emitter, Point, Wall
-from ertis_numba.simulation.plan import make_plan
+from ertis_numba.simulation.effect_plan import make_plan
 from ertis_numba.simulation.render import Simulator
 from tests.scenes import (
     BAND_HZ,

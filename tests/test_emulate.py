@@ -15,8 +15,8 @@ from click.testing import CliRunner
 from ertis_cli.emulate import _get_ready
 from ertis_cli.main import cli
 
+from ertis_numba.devices.driver import SonarDriver
 from ertis_numba.devices.setup import Setup
-from ertis_numba.devices.sonar import SonarDriver
 from ertis_numba.errors import ArgumentError, SonarError
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.settings import Call, Processing, Recording, Settings

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from ertis_numba import figures
-from ertis_numba.figures._hearing import MicrophoneTraces
+from ertis_numba.figures._captions import number, span
+from ertis_numba.figures._microphone_traces import MicrophoneTraces
 from ertis_numba.figures._signals import spectrogram
-from ertis_numba.figures._words import number, span
 from ertis_numba.frames import Peak
 from ertis_numba.geometry import unrolled_rad
 from ertis_numba.settings import Array, Call, Recording, Settings

@@ -12,7 +12,7 @@ import pytest
 from ertis_numba import figures
 from ertis_numba.errors import ArgumentError
 from ertis_numba.figures import _images, _slices
-from ertis_numba.figures._words import of_image, of_measurement
+from ertis_numba.figures._captions import of_image, of_measurement
 from ertis_numba.frames import Measurement, Peak, Stamp
 from ertis_numba.geometry import direction_grid
 from ertis_numba.settings import Array, Processing, Recording, Settings

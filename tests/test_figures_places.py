@@ -9,9 +9,9 @@ from ertis_numba import figures
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError
 from ertis_numba.figures._array import pattern_db, width_deg
-from ertis_numba.figures._hearing import echoes, signals
+from ertis_numba.figures._captions import of_image
+from ertis_numba.figures._microphone_traces import echoes, signals
 from ertis_numba.figures._signals import spectrogram
-from ertis_numba.figures._words import of_image
 from ertis_numba.frames import Measurement, Peak
 from ertis_numba.geometry import unit_vectors
 from ertis_numba.settings import Array, Call, Settings

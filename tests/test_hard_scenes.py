@@ -19,8 +19,8 @@ from ertis_numba.simulation import (
     Tone,
     Wall,
 )
+from ertis_numba.simulation.effect_plan import make_plan
 from ertis_numba.simulation.effects import EFFECTS
-from ertis_numba.simulation.plan import make_plan
 from ertis_numba.simulation.render import Simulator
 from tests.hard_cases.forced import EIGHT, FULL, forced, image_of
 from tests.scenes import bits_of, heard, only, scene_of, seen, sorted_ways

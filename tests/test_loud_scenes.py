@@ -12,10 +12,10 @@ from ertis_cli.main import cli
 from ertis_numba.settings import Processing, Recording
 from ertis_numba.simulation import Electronics, Emitter, Point, Scene, Sensor
 from ertis_numba.simulation.ab_render import ABRender
+from ertis_numba.simulation.effect_plan import make_plan
 from ertis_numba.simulation.effects import EFFECTS
 from ertis_numba.simulation.estimates import Estimate
 from ertis_numba.simulation.loudness import LOUD, peak_bound
-from ertis_numba.simulation.plan import make_plan
 from ertis_numba.simulation.snapshot import snapshot
 from tests.scenes import SENSOR, only, scene_of
 

@@ -4,7 +4,7 @@ import json
 
 import pytest
 from click.testing import CliRunner
-from ertis_bench import many
+from ertis_bench import campaign_scaling
 from ertis_cli.main import cli
 
 from ertis_numba.campaign import Campaign
@@ -15,9 +15,9 @@ from tests.dask_clusters import cluster_of_threads
 
 @pytest.fixture(autouse=True)
 def _small(monkeypatch):
-    monkeypatch.setattr(many, "_MEASUREMENTS", 2)
-    monkeypatch.setattr(many, "_cores", lambda: 1)
-    monkeypatch.setattr(many.cluster, "local_cluster", cluster_of_threads)
+    monkeypatch.setattr(campaign_scaling, "_MEASUREMENTS", 2)
+    monkeypatch.setattr(campaign_scaling, "_cores", lambda: 1)
+    monkeypatch.setattr(campaign_scaling.cluster, "local_cluster", cluster_of_threads)
 
 
 def test_all_pools_are_timed_and_compared(tmp_path, monkeypatch):
@@ -40,8 +40,8 @@ def test_all_pools_are_timed_and_compared(tmp_path, monkeypatch):
 
 
 def test_more_cores_give_more_pools(monkeypatch):
-    monkeypatch.setattr(many, "_cores", lambda: 4)
-    crews = many._crews  # noqa: SLF001
+    monkeypatch.setattr(campaign_scaling, "_cores", lambda: 4)
+    crews = campaign_scaling._crews  # noqa: SLF001
     assert [tuple(pool.values()) for pool in crews("tcp://x:1").values()] == [
         (1, 1),
         (1, 4),
@@ -58,15 +58,15 @@ def test_differing_files_are_not_timed(tmp_path, monkeypatch):
         (target / "002.energy.h5").write_text("the same")
         return 1.0, 1.0
 
-    monkeypatch.setattr(many, "_timed", timed)
-    monkeypatch.setattr(many, "_require_exact", lambda *_: None)
+    monkeypatch.setattr(campaign_scaling, "_timed", timed)
+    monkeypatch.setattr(campaign_scaling, "_require_exact", lambda *_: None)
     crews = {"one": {"workers": 1, "threads": 1}, "two": {"workers": 2, "threads": 1}}
     message = (
         r"files of two differ from those of 1 worker of 1 thread \(000\.energy\.h5: 1 of 3 bytes differ, from 0 to 0, "
         r"001\.energy\.h5: 2 bytes instead of 1\); do not use it"
     )
     with pytest.raises(DataError, match=message):
-        many._measured(  # noqa: SLF001
+        campaign_scaling._measured(  # noqa: SLF001
             tmp_path, tmp_path / "out", crews, 1, lambda _: None
         )
 
@@ -75,4 +75,4 @@ def test_failing_recording_is_not_timed(tmp_path):
     (tmp_path / "runs").mkdir()
     (tmp_path / "runs" / "torn.h5").write_bytes(b"torn")
     with pytest.raises(DataError, match=r"torn\.h5 is failed \(.*not an HDF5 file.*\), so it is not timed"):
-        many._timed(tmp_path / "runs", tmp_path / "out", workers=1)  # noqa: SLF001
+        campaign_scaling._timed(tmp_path / "runs", tmp_path / "out", workers=1)  # noqa: SLF001

@@ -13,10 +13,10 @@ from ertis_bench.verdicts import Trial, with_one
 
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.simulation import Emitter, Noise, Point, Scene, Sensor, Sonar, Wall
+from ertis_numba.simulation.effect_plan import make_plan
 from ertis_numba.simulation.estimates import Estimate
-from ertis_numba.simulation.plan import make_plan
+from ertis_numba.simulation.image_estimate import SAME_RANGE_M, Sight
 from ertis_numba.simulation.render import Simulator
-from ertis_numba.simulation.sight import SAME_RANGE_M, Sight
 from ertis_numba.simulation.snapshot import snapshot
 
 # Of 60 scenes, those with each kind of verdict twice, and with the smallest differences from the tolerance.

@@ -9,9 +9,9 @@ from ertis_cli.main import cli
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.io import wavfile
 
+from ertis_numba.devices.driver import SonarDriver as Driver
 from ertis_numba.devices.emulator import Emulator
 from ertis_numba.devices.setup import Setup, call_codes
-from ertis_numba.devices.sonar import SonarDriver as Driver
 from ertis_numba.errors import ArgumentError, DataError, SettingsError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import received_settings

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from ertis_numba import kernels
-from ertis_numba.analysis import finder
+from ertis_numba.analysis import point_finder
 from ertis_numba.analysis.cfar import clean
 from ertis_numba.analysis.detect import find_peaks, neighbours_of
-from ertis_numba.analysis.finder import PointFinder
+from ertis_numba.analysis.point_finder import PointFinder
 from ertis_numba.analysis.points import PointExtractor
 from ertis_numba.beamformers import ADAPTIVE_COMBINATIONS
 from ertis_numba.errors import ArgumentError
@@ -306,7 +306,7 @@ def test_point_finder_uses_the_directions_of_each_sensor():
 
 def test_point_finder_computes_tables_once_per_sensor(monkeypatch):
     made = []
-    monkeypatch.setattr(finder, "PointExtractor", lambda *given: made.append(given) or PointExtractor(*given))
+    monkeypatch.setattr(point_finder, "PointExtractor", lambda *given: made.append(given) or PointExtractor(*given))
     find, image = PointFinder(), few_points()
     warmer = image.settings.replace(air=Air(temperature_c=35.0))
     for sensor in ("front", "left", "front", "left"):

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
+from ertis_numba.devices.block_receiver import BlockParser, BlockReceiver
 from ertis_numba.devices.blocks import FOOTER, HEADER
 from ertis_numba.devices.emulator.faults import KINDS
-from ertis_numba.devices.protocol import BlockParser, BlockReceiver
 from tests.faults import wire_faults
 from tests.wire import N_BYTES, N_SAMPLES, at, block_of, counters, reported
 

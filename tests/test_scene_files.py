@@ -27,10 +27,10 @@ from ertis_numba.simulation import (
     Wall,
     load_scene,
 )
+from ertis_numba.simulation.effect_plan import make_plan
 from ertis_numba.simulation.effects import EFFECTS, INDISPENSABLE
-from ertis_numba.simulation.limits import require_clear
-from ertis_numba.simulation.plan import make_plan
 from ertis_numba.simulation.snapshot import snapshot
+from ertis_numba.simulation.target_validity import require_clear
 from tests.scenes import SENSOR
 
 # ---- round trip ------------------------------------------------------------------------------------

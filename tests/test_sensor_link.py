@@ -8,7 +8,7 @@ import pytest
 from ertis_numba.network import messages
 from ertis_numba.network.allow_list import AllowList, Permission
 from ertis_numba.network.keys import ClientKeys, KeyPair, ServerKeys
-from ertis_numba.network.sensor_node import SensorNode, _link as link, _runs as runs
+from ertis_numba.network.sensor_node import SensorNode, _link as link, _outgoing_sessions as runs
 from tests.journals import EPOCH, TINY, entries
 from tests.sending import IMPATIENT, SOON_S, Node, has_all, impatient, until
 from tests.stand_in import StandIn

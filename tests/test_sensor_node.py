@@ -9,7 +9,7 @@ import pytest
 from ertis_numba.errors import ArgumentError
 from ertis_numba.journal import JournalEntry, JournalSensor
 from ertis_numba.network import messages
-from ertis_numba.network.sensor_node import SensorNode, _runs as runs
+from ertis_numba.network.sensor_node import SensorNode, _outgoing_sessions as runs
 from ertis_numba.settings import Air, Recording
 from tests.journals import EPOCH, TINY, entries, python
 from tests.sending import IMPATIENT, KEY, SOON_S, Node, has_all, impatient, until

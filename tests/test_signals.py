@@ -83,7 +83,7 @@ main()
 
 @pytest.mark.parametrize("number", ["SIGINT", "SIGTERM"])
 def test_signal_before_the_handlers_exist_prints_nothing(number):
-    done = run_command("ertis_cli._signals", number)
+    done = run_command("ertis_cli._stop_signals", number)
     assert (done.returncode, done.stderr) == (-getattr(signal, number), "")
 
 

@@ -14,8 +14,8 @@ from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Reflector
 from ertis_numba.geometry import layouts, load_layout
 from ertis_numba.simulation import Box, Point, Scene, Tone
+from ertis_numba.simulation.effect_plan import make_plan
 from ertis_numba.simulation.engine import Engine
-from ertis_numba.simulation.plan import make_plan
 from ertis_numba.storage import GroundTruthLog, open_recording, write_recording
 from tests.files import noise
 from tests.scenes import SENSOR, scene_of
@@ -35,7 +35,7 @@ def simulate(*arguments):
 
 
 def test_simulation_without_free_space_is_refused_before_computing(path, monkeypatch):
-    monkeypatch.setattr("ertis_numba.simulation.plan.make_plan", lambda _: pytest.fail("a plan was made"))
+    monkeypatch.setattr("ertis_numba.simulation.effect_plan.make_plan", lambda _: pytest.fail("a plan was made"))
     began_s = time.monotonic()
     refused = simulate(path, "--count", 10**9)
     assert time.monotonic() - began_s < 20
@@ -150,7 +150,7 @@ def test_scene_exceeding_the_memory_is_refused(scene, message):
 
 
 def test_measurement_exceeding_the_memory_is_refused(monkeypatch):
-    monkeypatch.setattr("ertis_numba.simulation.bounds.MAX_AMPLITUDES", 100)
+    monkeypatch.setattr("ertis_numba.simulation.scene_size_limits.MAX_AMPLITUDES", 100)
     message = (
         r"scene has 1 sound paths to 3 microphones at \d+ frequencies, in total \d+ amplitudes; the limit is 100\."
     )

@@ -13,7 +13,7 @@ from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import load_layout, microphones, unit_vectors
 from ertis_numba.settings import Array, Call, Recording
 from ertis_numba.simulation import Electronics, Emitter, Point, Scene, Sensor
-from ertis_numba.simulation.plan import make_plan
+from ertis_numba.simulation.effect_plan import make_plan
 from ertis_numba.simulation.render import Simulator, render
 from ertis_numba.waveform import call_at
 from tests.scenes import (

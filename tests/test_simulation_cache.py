@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from ertis_numba.settings import Processing
-from ertis_numba.simulation import Point, Scene, Sensor, Wall, plan
+from ertis_numba.simulation import Point, Scene, Sensor, Wall, effect_plan
 from ertis_numba.simulation.cache import Cache
-from ertis_numba.simulation.plan import make_plan
+from ertis_numba.simulation.effect_plan import make_plan
 
 _BEAMS_BYTES = 1000 * 32 * 16  # of the phases for 1000 directions and 32 microphones
 _WALL = Wall(position_m=(0.0, 1.5, 0.0), facing_deg=(-90.0, 0.0))
@@ -24,8 +24,8 @@ def test_cache_counts_the_memory_of_all_kept_results(monkeypatch):
     moving = Point(waypoints=((0.0, 1.0, 0.3, 0.0), (0.3, 1.1, 0.3, 0.0)))
     scene = Scene(sensors=sensors, points=(moving, Point(range_m=2.0)), walls=(_WALL,), count=3)
     caches = []
-    monkeypatch.setattr(plan, "Cache", lambda: caches.append(Cache()) or caches[-1])
-    monkeypatch.setattr(plan, "_ab_render_of", lambda _: lambda *_: 0.0)
+    monkeypatch.setattr(effect_plan, "Cache", lambda: caches.append(Cache()) or caches[-1])
+    monkeypatch.setattr(effect_plan, "_ab_render_of", lambda _: lambda *_: 0.0)
     make_plan(scene)
     caches.clear()
     gc.collect()

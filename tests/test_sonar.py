@@ -20,10 +20,10 @@ from serial.tools.list_ports_common import ListPortInfo
 
 from ertis_numba.devices.blocks import encode_block
 from ertis_numba.devices.commands import encode_answer
+from ertis_numba.devices.driver import SonarDriver
 from ertis_numba.devices.emulator import Emulator, Quirks, SyncChain
 from ertis_numba.devices.line import SerialLine
 from ertis_numba.devices.setup import Setup, call_hash
-from ertis_numba.devices.sonar import SonarDriver
 from ertis_numba.errors import ArgumentError, SonarDisconnectedError, SonarError
 from ertis_numba.settings import Call, Recording, Settings
 from tests.emulated import N_SAMPLES, TIMEOUT_S, WORDS, Log
@@ -523,7 +523,7 @@ def test_listening_with_another_record_length_is_reported(device):
 
 def test_pause_within_a_measurement_drops_it(monkeypatch):
     """The driver discards the partial measurement and receives the next one completely."""
-    monkeypatch.setattr("ertis_numba.devices.sonar._MARGIN_S", 0.1)
+    monkeypatch.setattr("ertis_numba.devices.driver._MARGIN_S", 0.1)
 
     def stalling(line, write):
         answer_correctly(line, write)

@@ -12,7 +12,7 @@ import pytest
 from ertis_numba.errors import ArgumentError, DataError, NetworkError
 from ertis_numba.journal import LOST, Journal, JournalEntry
 from ertis_numba.journal._database import PAGE_BYTES
-from ertis_numba.network.sensor_node import _disk as disk, _runs as runs
+from ertis_numba.network.sensor_node import _disk_spool as disk, _outgoing_sessions as runs
 from ertis_numba.storage import open_recording
 from ertis_numba.storage.sealing import seal
 from tests.journals import ENVIRONMENT, EPOCH, TINY, create, entries

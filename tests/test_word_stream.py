@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import ertis_numba as ertis
+from ertis_numba.devices.block_receiver import BlockReceiver
 from ertis_numba.devices.blocks import Instant, encode_block
-from ertis_numba.devices.protocol import BlockReceiver
 from ertis_numba.errors import ArgumentError
 from ertis_numba.settings import Processing, Recording
 from tests.pages import python_in

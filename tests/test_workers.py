@@ -16,8 +16,8 @@ import pytest
 from ertis_numba.errors import ArgumentError
 from ertis_numba.journal import Journal, JournalEntry
 from ertis_numba.network.processing import ProcessingOptions
-from ertis_numba.network.processing.choice import Choice, Load, Mode
 from ertis_numba.network.processing.dead_letter_queue import DeadLetterQueue
+from ertis_numba.network.processing.parallelism import Choice, Load, Mode
 from ertis_numba.network.processing.pipe_messages import Release
 from ertis_numba.network.processing.runner import JobKind, Lost
 from ertis_numba.network.processing.sensors import Sensors

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from ertis_numba.devices.block_receiver import Instant
 from ertis_numba.devices.blocks import FRAME_BYTES, encode_block
-from ertis_numba.devices.protocol import Instant
 
 N_SAMPLES = 5
 N_BYTES = 4 * N_SAMPLES + FRAME_BYTES

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.geometry import direction_grid, microphones, unit_vectors
 from ertis_numba.settings import Processing, Settings
-from ertis_numba.stages.accuracy import decibels
 from ertis_numba.stages.beam_grid import Aperture, BeamGrid
-from ertis_numba.stages.fitting import one_thread
+from ertis_numba.stages.error_model import decibels
+from ertis_numba.stages.interpolation_fit import one_thread
 from ertis_numba.stages.plan_elements import spectrum_of
 
 __all__ = ["CASES", "run"]

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from ertis_bench.markdown import table
 from ertis_numba.settings import Settings
-from ertis_numba.stages.accuracy import decibels
-from ertis_numba.stages.fitting import DelayFit, Spectrum
+from ertis_numba.stages.error_model import decibels
+from ertis_numba.stages.interpolation_fit import DelayFit, Spectrum
 from ertis_numba.stages.plan_elements import spectrum_of
 
 __all__ = ["TEXTBOOK", "fitted_error", "form", "run", "textbook_error"]

@@ -14,7 +14,7 @@ from ertis_bench import checks, input_measurements, instruction_sets, machine, t
 from ertis_numba.errors import DataError
 from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.pipeline import Pipeline
-from ertis_numba.stages.fitting import one_thread
+from ertis_numba.stages.interpolation_fit import one_thread
 
 __all__ = ["BACKENDS", "DIRECTIONS", "PUBLISHED_MS", "RESTRICTED", "run"]
 

@@ -14,7 +14,7 @@ from ertis_bench import h200, input_measurements
 from ertis_bench.instructions import kinds, parse
 from ertis_bench.paper import DIRECTIONS, RANGE_M
 from ertis_numba.kernels import KernelSet
-from ertis_numba.kernels._cuda import compiling
+from ertis_numba.kernels._cuda import offline_compilation
 from ertis_numba.settings import Settings
 from ertis_numba.stages import planner
 from ertis_numba.stages.fast import FastChain
@@ -39,7 +39,7 @@ def run(*, say: Callable[[str], None]) -> dict[str, Any]:
     DeviceError
         numba-cuda or one of NVIDIA's programs is missing, or the kernels are simulated in this process.
     """
-    compiling.require_compilers()
+    offline_compilation.require_compilers()
     plans = []
     for plan, directions in [*(("default", n) for n in DIRECTIONS), ("own beams", DIRECTIONS[-1])]:
         say(f"{directions} directions, {plan}")
@@ -89,7 +89,7 @@ def _plan(settings: Settings) -> dict[str, Any]:
         )
         chain.process(words.reshape(len(words), -1), image)
 
-    launches = compiling.recorded(steps)
+    launches = offline_compilation.recorded(steps)
     rows = [_row(launch) for launch in launches]
     fold = next(launch for launch in launches if launch.file == "multiply_and_fold").arguments
     signals = next(launch for launch in launches if launch.file == "demodulate_words").arguments["out"]
@@ -100,9 +100,9 @@ def _plan(settings: Settings) -> dict[str, Any]:
     return {**sizes, "launches": rows, "transforms": transforms, **_totals(launches, rows, transforms, sizes)}
 
 
-def _row(launch: compiling.Launch) -> dict[str, Any]:
-    code = compiling.code_of(launch, h200.CC)
-    instructions = parse(compiling.disassembled(code))
+def _row(launch: offline_compilation.Launch) -> dict[str, Any]:
+    code = offline_compilation.code_of(launch, h200.CC)
+    instructions = parse(offline_compilation.disassembled(code))
     warps_per_block = -(-int(np.prod(launch.block)) // 32)
     parts_us = h200.predicted_us(
         launch.name,
@@ -156,7 +156,7 @@ def _loop(loop: h200.Loop, counts: dict[str, int]) -> dict[str, Any]:
 
 
 def _totals(
-    launches: list[compiling.Launch],
+    launches: list[offline_compilation.Launch],
     rows: list[dict[str, Any]],
     transforms: list[dict[str, Any]],
     sizes: dict[str, Any],
@@ -191,7 +191,7 @@ def _totals(
     }
 
 
-def _launching_us(launch: compiling.Launch) -> float:
+def _launching_us(launch: offline_compilation.Launch) -> float:
     n_arrays = sum(isinstance(each, np.ndarray) for each in launch.arguments.values())
     return h200.ASSUMED["launch_us"] + n_arrays * h200.ASSUMED["launch_array_us"]
 

@@ -23,10 +23,10 @@ from ertis_numba.simulation import (
     Wall,
 )
 from ertis_numba.simulation.ab_render import image_change_db
+from ertis_numba.simulation.effect_plan import EffectPlan, make_plan
 from ertis_numba.simulation.effects import ASKED_FOR, EFFECTS
-from ertis_numba.simulation.plan import EffectPlan, make_plan
+from ertis_numba.simulation.image_estimate import Sight
 from ertis_numba.simulation.render import Simulator
-from ertis_numba.simulation.sight import Sight
 from ertis_numba.simulation.snapshot import snapshot
 
 __all__ = ["free_field", "run"]

@@ -15,10 +15,10 @@ from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Accuracy, Settings
 from ertis_numba.simulation import Scene, Sensor
 from ertis_numba.simulation.ab_render import image_change_db
+from ertis_numba.simulation.effect_plan import EffectPlan, make_plan
+from ertis_numba.simulation.image_estimate import SAME_RANGE_M, Sight
 from ertis_numba.simulation.loudness import LOUD
-from ertis_numba.simulation.plan import EffectPlan, make_plan
 from ertis_numba.simulation.render import Simulator
-from ertis_numba.simulation.sight import SAME_RANGE_M, Sight
 from ertis_numba.simulation.snapshot import Snapshot, snapshot
 from ertis_numba.stages.fast import FastChain
 

@@ -22,7 +22,7 @@ def _run() -> str | int | None:
     gc.set_threshold(50_000)  # imports create many permanent objects; scanning them takes 60 ms
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)  # until the handlers are installed, after some imports
-    from ertis_cli._signals import interruption, leave, obey_signals
+    from ertis_cli._stop_signals import interruption, leave, obey_signals
 
     obey_signals()
     code: str | int | None = 0

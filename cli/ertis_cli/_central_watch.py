@@ -15,7 +15,7 @@ import click
 from ertis_cli import options
 from ertis_cli._lines import JsonLines
 from ertis_cli._progress import StatusLine
-from ertis_cli._signals import stopped_by_signals
+from ertis_cli._stop_signals import stopped_by_signals
 
 if TYPE_CHECKING:
     from types import TracebackType

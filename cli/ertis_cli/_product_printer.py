@@ -12,7 +12,7 @@ import click
 from ertis_cli import options
 
 if TYPE_CHECKING:
-    from ertis_numba.analysis.finder import PointFinder
+    from ertis_numba.analysis.point_finder import PointFinder
     from ertis_numba.frames import Measurement, PointCloud
     from ertis_numba.network.messages import Group
     from ertis_numba.network.products import Arrival
@@ -141,7 +141,7 @@ class MicrophoneTable:
     @functools.cached_property
     def find(self) -> "PointFinder":
         """Finder of points in energyscapes."""
-        from ertis_numba.analysis.finder import PointFinder
+        from ertis_numba.analysis.point_finder import PointFinder
 
         return PointFinder()
 

@@ -14,7 +14,7 @@ from typing import Any, Final, NamedTuple, NoReturn
 
 import click
 
-from ertis_cli._signals import is_detached
+from ertis_cli._stop_signals import is_detached
 
 __all__ = ["Life", "allow", "end_with", "supervised"]
 

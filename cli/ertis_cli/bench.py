@@ -293,7 +293,7 @@ def many(**given: Any) -> None:
 
     Compares all output files.
     """
-    from ertis_bench import many as benchmark
+    from ertis_bench import campaign_scaling as benchmark
 
     _run("many", benchmark, **given)
 
@@ -381,7 +381,7 @@ def network(*, only: tuple[str, ...], **given: Any) -> None:
 
     Uses keys, and checks every sample and image.
     """
-    from ertis_bench.network import figures as benchmark
+    from ertis_bench.network import performance as benchmark
 
     from ertis_numba import checks
 

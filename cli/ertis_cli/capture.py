@@ -14,7 +14,7 @@ import click
 from ertis_cli import _mountings, _network, options
 from ertis_cli._saving import withdrawn
 from ertis_cli._sending import Sending
-from ertis_cli._signals import Signals, stopped_by_signals
+from ertis_cli._stop_signals import Signals, stopped_by_signals
 from ertis_cli._watch import Watch, report
 
 if TYPE_CHECKING:
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
     from ertis_numba.capture import CaptureSession
     from ertis_numba.devices.bits import BitCheck
+    from ertis_numba.devices.driver import SonarDriver
     from ertis_numba.devices.setup import Setup
-    from ertis_numba.devices.sonar import SonarDriver
     from ertis_numba.settings import Settings
 
 __all__ = ["capture"]
@@ -328,7 +328,7 @@ def _interruptible(signals: Signals) -> "Iterator[Callable[[], bool]]":
 
 
 def _opened(ports: "Sequence[str]", signals: Signals, stack: ExitStack, *, listen_only: bool) -> "list[SonarDriver]":
-    from ertis_numba.devices.sonar import SonarDriver
+    from ertis_numba.devices.driver import SonarDriver
 
     with _interruptible(signals) as asked:
         return [stack.enter_context(SonarDriver.open(port, listen_only=listen_only, stop=asked)) for port in ports]

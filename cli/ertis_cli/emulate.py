@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ertis_cli import options
-from ertis_cli._signals import broken_off_by_signals, stopped_by_signals
+from ertis_cli._stop_signals import broken_off_by_signals, stopped_by_signals
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -195,15 +195,15 @@ def _renderer(
 ) -> "SceneRenderer":
     """Return the scene, ready to be rendered; the first run compiles kernels."""
     from ertis_cli._emulation import SceneRenderer
-    from ertis_numba.simulation import limits, load_scene
+    from ertis_numba.simulation import load_scene, target_validity
     from ertis_numba.simulation.snapshot import snapshot
 
     changes = {"count": count, "seed": seed}
     scene = load_scene(path).replace(**{name: value for name, value in changes.items() if value is not None})
     for name in names:
         shot = snapshot(scene, scene.sensor(name), 0.0)
-        limits.require_clear(shot)
-        for note in limits.notes(shot):
+        target_validity.require_clear(shot)
+        for note in target_validity.notes(shot):
             options.say(f"note: {note}", quiet=quiet)
     with options.note_when_slow(options.PREPARING, quiet=quiet):
         from ertis_numba.simulation.render import compile_kernels

@@ -198,7 +198,7 @@ def _report_obstacle(settings: "Settings", *, quiet: bool) -> None:
     """Print a note if the recording cannot be processed with its own settings."""
     from ertis_numba.errors import ArgumentError
     from ertis_numba.geometry import direction_grid
-    from ertis_numba.stages.window import time_window
+    from ertis_numba.stages.time_window import time_window
 
     try:
         direction_grid(settings.processing)

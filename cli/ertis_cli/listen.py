@@ -13,7 +13,7 @@ import click
 from ertis_cli import _network, options
 from ertis_cli._product_printer import PRINTERS, MicrophoneTable
 from ertis_cli._saving import PRODUCTS as FILED, saving
-from ertis_cli._signals import stopped_by_signals
+from ertis_cli._stop_signals import stopped_by_signals
 
 if TYPE_CHECKING:
     from ertis_cli._saving import Write

@@ -10,7 +10,7 @@ from typing import Any, NoReturn, cast
 import click
 
 from ertis_cli import _config, _naming, _supervisor
-from ertis_cli._signals import interruption, obey_signals
+from ertis_cli._stop_signals import interruption, obey_signals
 
 __all__ = ["COMMANDS", "cli", "main"]
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     from ertis_numba.frames import Measurement, Reflector
     from ertis_numba.simulation import Scene
-    from ertis_numba.simulation.plan import EffectPlan
+    from ertis_numba.simulation.effect_plan import EffectPlan
     from ertis_numba.simulation.render import Simulator
     from ertis_numba.storage import GroundTruthLog
 
@@ -77,7 +77,7 @@ def simulate(
     names = [scene.sensor(sensor).name] if sensor else [each.name for each in scene.sensors]
     _require_room(target, scene, names)
     with options.note_when_slow(options.PREPARING, quiet=quiet):
-        from ertis_numba.simulation.plan import make_plan
+        from ertis_numba.simulation.effect_plan import make_plan
         from ertis_numba.simulation.render import Simulator, compile_kernels
 
         compile_kernels()

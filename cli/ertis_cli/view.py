@@ -17,7 +17,7 @@ import click
 from click.core import ParameterSource
 
 from ertis_cli import _mountings, _network, options
-from ertis_cli._signals import Signals, stopped_by_signals
+from ertis_cli._stop_signals import Signals, stopped_by_signals
 
 if TYPE_CHECKING:
     from ertis_numba.viewer import Live, Playback, Viewer

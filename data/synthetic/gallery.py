@@ -17,7 +17,7 @@ from PIL import Image
 import ertis_numba as ertis
 from ertis_numba.analysis.compare import errors_of
 from ertis_numba.simulation import Scene
-from ertis_numba.simulation.plan import EffectPlan, make_plan
+from ertis_numba.simulation.effect_plan import EffectPlan, make_plan
 
 ROOT = Path(__file__).parents[2]
 SCENES = Path(__file__).parent / "scenes"

@@ -13,7 +13,7 @@ from ertis_numba.analysis.noise import noise_of
 from ertis_numba.frames import Energyscape
 from ertis_numba.geometry import array_weights, effective_count, microphones, unit_vectors
 from ertis_numba.settings import Settings
-from ertis_numba.stages.accuracy import SignalModel
+from ertis_numba.stages.error_model import SignalModel
 from ertis_numba.stages.planner import Planner
 from ertis_numba.waveform import matched_noise_spectrum
 

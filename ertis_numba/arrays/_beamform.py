@@ -17,9 +17,9 @@ from ertis_numba.settings import Air
 from ertis_numba.stages.beam_grid import Aperture
 from ertis_numba.stages.beamform import BeamformFloat32
 from ertis_numba.stages.delays import DelayTable, Zone
-from ertis_numba.stages.fitting import WAVES, DelayFit, Spectrum, one_thread
 from ertis_numba.stages.focal_zones import NEAREST_M, zone_edges
-from ertis_numba.stages.window import TimeWindow
+from ertis_numba.stages.interpolation_fit import WAVES, DelayFit, Spectrum, one_thread
+from ertis_numba.stages.time_window import TimeWindow
 
 __all__ = ["beamform"]
 

@@ -11,7 +11,7 @@ from ertis_numba.arrays._device import on_device
 from ertis_numba.constants import MAX_MICROPHONES
 from ertis_numba.errors import ArgumentError
 from ertis_numba.stages.demodulate import Demodulate, DemodulatePdm, FilterPcm
-from ertis_numba.stages.window import TimeWindow
+from ertis_numba.stages.time_window import TimeWindow
 from ertis_numba.waveform import decimation_taps, integer_taps
 
 __all__ = ["demodulate"]

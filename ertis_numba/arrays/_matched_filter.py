@@ -13,7 +13,7 @@ from ertis_numba.arrays._device import on_device
 from ertis_numba.errors import ArgumentError
 from ertis_numba.settings import Call, Processing, Recording, Settings
 from ertis_numba.stages.matched_filter import MatchedFilter
-from ertis_numba.stages.window import TimeWindow
+from ertis_numba.stages.time_window import TimeWindow
 from ertis_numba.waveform import integer_taps, matched_guard_s
 
 __all__ = ["matched_filter"]

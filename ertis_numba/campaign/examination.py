@@ -10,7 +10,7 @@ from ertis_numba.frames import Measurement
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.prediction import planner_of
 from ertis_numba.settings import Settings
-from ertis_numba.stages.accuracy import PARTS, ErrorModel, decibels
+from ertis_numba.stages.error_model import PARTS, ErrorModel, decibels
 from ertis_numba.stages.planner import Planner
 from ertis_numba.stages.stream_recipe import uses_streams
 from ertis_numba.stages.wavefronts import plane_wave_error_db

@@ -7,7 +7,7 @@ import time
 from dataclasses import dataclass
 
 from ertis_numba.devices.blocks import COUNTERS, Block
-from ertis_numba.devices.sonar import SonarDriver
+from ertis_numba.devices.driver import SonarDriver
 from ertis_numba.errors import SonarDisconnectedError, SonarError
 
 __all__ = [

@@ -23,7 +23,7 @@ from ertis_numba.capture.readers import (
     TriggerClock,
 )
 from ertis_numba.capture.sync_counts import PulseAligner
-from ertis_numba.devices.sonar import SonarDriver
+from ertis_numba.devices.driver import SonarDriver
 from ertis_numba.errors import ArgumentError, SonarError
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.journal import JournalEntry

@@ -15,10 +15,10 @@ from matplotlib.figure import Figure
 from ertis_numba import checks
 from ertis_numba.analysis.side_lobes import without_side_lobes
 from ertis_numba.errors import ArgumentError
-from ertis_numba.figures import _array, _front, _images, _signals, _slices, _words
+from ertis_numba.figures import _array, _captions, _images, _pareto_front, _signals, _slices
 from ertis_numba.figures._canvas import Canvas
-from ertis_numba.figures._front import Rated
 from ertis_numba.figures._page import compose
+from ertis_numba.figures._pareto_front import Rated
 from ertis_numba.figures.style import StyleOptions, parameters, style_of
 from ertis_numba.frames import Energyscape, Measurement, Peak
 from ertis_numba.settings import Array, Settings
@@ -129,7 +129,7 @@ def plot(
         shown, hidden = _seen(image, side_lobes=side_lobes)
         panels = [draw(canvas, shown, hidden=hidden) for draw in (_images.direction_map, _images.sector)]
     if ax is None:
-        return compose(canvas, _words.of_image(image), panels, width_pt=720.0 if len(panels) == 1 else 1008.0)
+        return compose(canvas, _captions.of_image(image), panels, width_pt=720.0 if len(panels) == 1 else 1008.0)
     panels[0].draw_on(ax, canvas.style)
     return ax
 
@@ -148,7 +148,7 @@ def polar(
     """
     canvas = _canvas_of(image, dynamic_range_db, look, peaks)
     shown, hidden = _seen(image, side_lobes=side_lobes)
-    return compose(canvas, _words.of_image(image), [_images.sector(canvas, shown, hidden=hidden)])
+    return compose(canvas, _captions.of_image(image), [_images.sector(canvas, shown, hidden=hidden)])
 
 
 def projection(
@@ -162,7 +162,7 @@ def projection(
     """Draw the maximum over range as a map of azimuth and elevation; arguments are those of `plot`."""
     canvas = _canvas_of(image, dynamic_range_db, look, peaks)
     shown, hidden = _seen(image, side_lobes=side_lobes)
-    return compose(canvas, _words.of_image(image), [_images.direction_map(canvas, shown, hidden=hidden)])
+    return compose(canvas, _captions.of_image(image), [_images.direction_map(canvas, shown, hidden=hidden)])
 
 
 def slices(
@@ -303,7 +303,7 @@ def front(points: Sequence[Rated], *, title: str, note: str = "", **look: Unpack
     ArgumentError
         The theme is unknown.
     """
-    return _front.draw(style_of(**look), points, title=title, note=note)
+    return _pareto_front.draw(style_of(**look), points, title=title, note=note)
 
 
 def save(figure: Figure, target: str | Path | IO[bytes], *, format: str | None = None) -> None:  # noqa: A002 - as savefig

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ertis_numba import checks
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError
-from ertis_numba.figures import _words
+from ertis_numba.figures import _captions
 from ertis_numba.figures._canvas import Canvas
 from ertis_numba.figures._marks import name_points
 from ertis_numba.figures._page import Panel, compose
@@ -52,7 +52,7 @@ def draw(
     layout, lines = microphones(settings.array), _lines(settings, frequencies_hz)
     low_m, high_m = (edge(layout.enabled_positions_m, axis=0) for edge in (np.min, np.max))
     size_mm = 1e3 * (high_m - low_m)
-    deep_mm, wide_mm, tall_mm = map(_words.number, np.round(size_mm, 6))
+    deep_mm, wide_mm, tall_mm = map(_captions.number, np.round(size_mm, 6))
     spread = f"aperture {wide_mm} × {tall_mm} mm" + (f", {deep_mm} mm deep" if size_mm[0] > 1e-6 else "")
     beam_deg = {"azimuth": azimuth_deg, "elevation": elevation_deg}
     reported = {axis: f"{axis} {angle(at_deg)}" for axis, at_deg in beam_deg.items()}
@@ -63,7 +63,7 @@ def draw(
         for number, line in enumerate(lines):
             level_db = pattern_db(settings, line.frequencies_hz, to_deg["azimuth"], to_deg["elevation"], **steering_deg)
             width = width_deg(sweep_deg, level_db, beam_deg[axis])
-            label = f"{line.name}: " + ("none" if width is None else f"{_words.number(width)}°")
+            label = f"{line.name}: " + ("none" if width is None else f"{_captions.number(width)}°")
             style: dict[str, Any] = {"linestyle": LINES[number % len(LINES)], "linewidth": 1.2 * canvas.style.line_pt}
             axes.plot(sweep_deg, level_db, label=label, **style)
         axes.set_xlabel(f"{axis} (°)")
@@ -84,7 +84,7 @@ def draw(
         Panel(lambda axes: paint_cut(axes, "azimuth", "elevation"), height),
         Panel(lambda axes: paint_cut(axes, "elevation", "azimuth"), height),
     ]
-    heading = _words.of_array(settings, spread, "steered to " + ", ".join(reported.values()))
+    heading = _captions.of_array(settings, spread, "steered to " + ", ".join(reported.values()))
     return compose(canvas, heading, panels, width_pt=1080.0)
 
 
@@ -144,16 +144,16 @@ def _lines(settings: Settings, frequencies_hz: Sequence[float] | None) -> list[C
     """
     if frequencies_hz is None:
         low_hz, high_hz = settings.call.low_frequency_hz, settings.call.high_frequency_hz
-        band = f"{_words.khz(low_hz)}–{_words.khz(high_hz)} kHz"
+        band = f"{_captions.khz(low_hz)}–{_captions.khz(high_hz)} kHz"
         waves_hz = tuple(np.linspace(low_hz, high_hz, _BAND_WAVES).tolist())
-        ends = [Cut(f"{_words.khz(frequency_hz)} kHz", (frequency_hz,)) for frequency_hz in (low_hz, high_hz)]
+        ends = [Cut(f"{_captions.khz(frequency_hz)} kHz", (frequency_hz,)) for frequency_hz in (low_hz, high_hz)]
         return [*ends, Cut(f"{band}, mean power", waves_hz)]
     if isinstance(frequencies_hz, int | float | str):
         raise ArgumentError(f"frequencies_hz is {frequencies_hz!r}; give a list, of one as [40e3]")
     if not 1 <= len(frequencies_hz) <= _MAX_LINES:
         raise ArgumentError(f"frequencies_hz holds {len(frequencies_hz)} frequencies; give 1 to {_MAX_LINES}")
     return [
-        Cut(f"{_words.khz(checks.positive('frequencies_hz', frequency_hz))} kHz", (float(frequency_hz),))
+        Cut(f"{_captions.khz(checks.positive('frequencies_hz', frequency_hz))} kHz", (float(frequency_hz),))
         for frequency_hz in frequencies_hz
     ]
 

@@ -8,9 +8,9 @@ from matplotlib.image import AxesImage
 from matplotlib.ticker import FuncFormatter, MultipleLocator
 
 from ertis_numba.figures._canvas import Canvas
+from ertis_numba.figures._captions import highest_over
 from ertis_numba.figures._page import Panel
 from ertis_numba.figures._sampling import PIXELS, centres, join_ranges, polar_raster, sphere_raster, thickened
-from ertis_numba.figures._words import highest_over
 from ertis_numba.figures.sector_grid import draw_grid, part_names
 from ertis_numba.figures.style import minus
 from ertis_numba.frames import Energyscape, Peak

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
 from ertis_numba.figures._canvas import Canvas
-from ertis_numba.figures._words import Heading
+from ertis_numba.figures._captions import Heading
 from ertis_numba.figures.style import MONOSPACE, Style, text_width_pt
 
 __all__ = ["Panel", "compose"]

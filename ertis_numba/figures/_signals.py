@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError
-from ertis_numba.figures import _words
+from ertis_numba.figures import _captions
 from ertis_numba.figures._canvas import Canvas
-from ertis_numba.figures._hearing import MicrophoneTraces, echoes, signals
+from ertis_numba.figures._microphone_traces import MicrophoneTraces, echoes, signals
 from ertis_numba.figures._page import Panel, compose
 from ertis_numba.figures._sampling import join_ranges
 from ertis_numba.frames import Measurement
@@ -41,12 +41,12 @@ def draw(canvas: Canvas, measurement: Measurement, *, microphone: int | None) ->
     heard = MicrophoneTraces(heard.values[::step], heard.axis, heard.channels[::step])
     rows = len(heard.values)
     some_ms, all_ms = 1e3 * len(heard.axis) / settings.signal_rate_hz, 1e3 * settings.recording.duration_s
-    some_in_words, all_in_words = _words.number(some_ms, 4), _words.number(all_ms, 4)
-    heading = _words.of_measurement(
+    some_in_words, all_in_words = _captions.number(some_ms, 4), _captions.number(all_ms, 4)
+    heading = _captions.of_measurement(
         "Microphone signals",
         settings,
         measurement.stamp,
-        f"{_words.number(settings.signal_rate_hz / 1e3, 4)} kHz sample rate",
+        f"{_captions.number(settings.signal_rate_hz / 1e3, 4)} kHz sample rate",
         f"{all_in_words} ms" if some_ms > 0.999 * all_ms else f"the first {some_in_words} of {all_in_words} ms",
         values=heard.values,
     )
@@ -56,7 +56,7 @@ def draw(canvas: Canvas, measurement: Measurement, *, microphone: int | None) ->
         lambda axes: _traces(canvas, axes, heard, loudest),
         lambda width_pt: min(0.84 * width_pt, (8 + 1.1 * rows) * em_pt),
         lambda axes: _row_ticks(axes, heard.channels, em_pt=em_pt),
-        f"a row is ±{_words.number(loudest, 2)} of full scale, compressed",
+        f"a row is ±{_captions.number(loudest, 2)} of full scale, compressed",
     )
     spectra = Panel(
         lambda axes: _spectrogram(canvas, axes, heard, settings),
@@ -70,10 +70,10 @@ def draw_echoes(canvas: Canvas, measurement: Measurement, *, microphone: int | N
     """Draw the mean level over range, and below it a row for each microphone."""
     em_pt, heard = canvas.style.em_pt, _chosen(echoes(measurement), microphone)
     range_m, count = heard.axis, len(heard.values)
-    every = f" every {_words.number(1e3 * (range_m[1] - range_m[0]), 2)} mm" if len(range_m) > 1 else ""
-    axis = f"{_words.span(range_m)} m{every}"
+    every = f" every {_captions.number(1e3 * (range_m[1] - range_m[0]), 2)} mm" if len(range_m) > 1 else ""
+    axis = f"{_captions.span(range_m)} m{every}"
     title = "Matched-filter output"
-    heading = _words.of_measurement(title, measurement.settings, measurement.stamp, axis, values=heard.values)
+    heading = _captions.of_measurement(title, measurement.settings, measurement.stamp, axis, values=heard.values)
     # A mean is below the strongest, as microphones differ: both parts of the picture have the same 0 dB.
     upper = Panel(
         lambda axes: _curve(canvas, axes, heard),

@@ -9,7 +9,7 @@ from matplotlib.image import AxesImage
 from numpy.typing import NDArray
 
 from ertis_numba.errors import ArgumentError
-from ertis_numba.figures import _words
+from ertis_numba.figures import _captions
 from ertis_numba.figures._canvas import Canvas
 from ertis_numba.figures._page import Panel, compose
 from ertis_numba.figures._sampling import centres, join_ranges, thickened, volume_raster
@@ -45,7 +45,7 @@ def draw(canvas: Canvas, image: Energyscape, *, height_m: float, left_m: float |
     drawn = tuple(peak for peak in canvas.peaks if any(cut.place(peak) for cut in cuts))
     canvas = replace(canvas, peaks=drawn)  # the list has the reflectors in the planes only
     panels = [cut.panel(canvas, raster) for cut, raster in zip(cuts, rasters, strict=True)]
-    return compose(canvas, _words.of_image(image), panels, width_pt=720.0 if len(cuts) == 1 else 1008.0)
+    return compose(canvas, _captions.of_image(image), panels, width_pt=720.0 if len(cuts) == 1 else 1008.0)
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,8 +19,8 @@ from ertis_numba.geometry.layouts import (
 )
 from ertis_numba.geometry.mountings import mounting
 from ertis_numba.geometry.neighbours import azimuth_columns, spacing_rad
-from ertis_numba.geometry.received import received_settings
 from ertis_numba.geometry.sector import Fan, plan_m, round_step
+from ertis_numba.geometry.untrusted_settings import received_settings
 from ertis_numba.geometry.weights import array_weights, effective_count
 
 __all__ = [

@@ -2,7 +2,7 @@
 
 from ertis_numba.interop._export import FORMATS, TOPICS, choose_format, export, output_files
 from ertis_numba.interop.pcm import PcmReader, open_pcm
-from ertis_numba.interop.rtis import RawReader, open_raw
+from ertis_numba.interop.raw_pdm import RawReader, open_raw
 from ertis_numba.interop.rtis_folder import open_rtis_folder
 
 __all__ = [

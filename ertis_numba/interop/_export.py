@@ -231,7 +231,7 @@ def _write_points(
     *,
     text: bool,
 ) -> None:
-    from ertis_numba.analysis.finder import PointFinder  # noqa: PLC0415
+    from ertis_numba.analysis.point_finder import PointFinder  # noqa: PLC0415
     from ertis_numba.interop import _mcap, _point_files  # noqa: PLC0415
     from ertis_numba.interop._points import PointTable  # noqa: PLC0415
 

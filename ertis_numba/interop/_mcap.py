@@ -14,7 +14,7 @@ import numpy as np
 
 from ertis_numba import checks
 from ertis_numba.air import sound_speed_m_s
-from ertis_numba.analysis.finder import same_directions
+from ertis_numba.analysis.point_finder import same_directions
 from ertis_numba.errors import ArgumentError
 from ertis_numba.extras import extra
 from ertis_numba.frames import Energyscape, Stamp

@@ -8,7 +8,7 @@ from typing import Any
 
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError, DataError
-from ertis_numba.interop.rtis import RawReader
+from ertis_numba.interop.raw_pdm import RawReader
 from ertis_numba.settings import Air, Array, Call, Processing, Recording, Settings, fit_ranges
 
 __all__ = ["open_rtis_folder"]

@@ -4,9 +4,9 @@
 ``_cpu``, ``_cuda`` and ``_numpy`` contain the twins under the same names.
 """
 
-from ertis_numba.kernels._compiling import on_compiling
+from ertis_numba.kernels._compile_notice import on_compiling
+from ertis_numba.kernels._device_protocols import Lane, Memory
 from ertis_numba.kernels._dispatch import DEVICES, load, usable
 from ertis_numba.kernels._kernel_set import KernelSet
-from ertis_numba.kernels._memory import Lane, Memory
 
 __all__ = ["DEVICES", "KernelSet", "Lane", "Memory", "load", "on_compiling", "usable"]

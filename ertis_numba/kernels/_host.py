@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from ertis_numba.errors import ArgumentError
+from ertis_numba.kernels._device_protocols import Array
 from ertis_numba.kernels._images import ImagePool
-from ertis_numba.kernels._memory import Array
 
 __all__ = ["HostMemory"]
 

@@ -7,7 +7,7 @@ from typing import Any, Final, Self
 
 from ertis_numba.kernels import _contract
 from ertis_numba.kernels._contract.adaptive import AdaptiveKernels
-from ertis_numba.kernels._memory import NewMemory, Threads
+from ertis_numba.kernels._device_protocols import NewMemory, Threads
 
 __all__ = ["CONTRACTS", "KERNEL_NAMES", "KernelSet", "twins_in"]
 

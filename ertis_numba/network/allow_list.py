@@ -10,9 +10,9 @@ import msgspec
 from ertis_numba import checks
 from ertis_numba.documents import TomlTable
 from ertis_numba.errors import ArgumentError
-from ertis_numba.network.checked import Checked
+from ertis_numba.network.checksummed_toml import Checked
 from ertis_numba.network.keys import require_key, require_name
-from ertis_numba.network.own_files import locked, require_own, write
+from ertis_numba.network.private_files import locked, require_own, write
 
 __all__ = ["ALLOW_LIST", "ROLES", "AllowList", "Permission", "Role"]
 

@@ -11,8 +11,8 @@ import zmq
 from zmq.utils import z85
 
 from ertis_numba.errors import ArgumentError, SettingsError
-from ertis_numba.network.checked import Checked
-from ertis_numba.network.own_files import OTHERS, mode_of, private_folder, require_own, write
+from ertis_numba.network.checksummed_toml import Checked
+from ertis_numba.network.private_files import OTHERS, mode_of, private_folder, require_own, write
 
 __all__ = ["ClientKeys", "KeyPair", "ServerKeys", "default_folder", "public_key", "require_key", "require_name"]
 

@@ -19,7 +19,7 @@ from zmq.utils import z85
 from ertis_numba.errors import ArgumentError, NetworkError, SettingsError
 from ertis_numba.network.allow_list import AllowList, Permission
 from ertis_numba.network.keys import ServerKeys
-from ertis_numba.network.own_files import require_own
+from ertis_numba.network.private_files import require_own
 from ertis_numba.network.sockets import DOMAIN, HandshakeMonitor, is_readable, monitor_event, was_chosen
 
 __all__ = ["EVERYBODY", "ZapAuthenticator"]

@@ -6,13 +6,13 @@ measurement; ``Settings.from_preset`` returns the settings of an RTIS recording 
 
 from ertis_numba.settings.accuracy import ERROR_PRESETS_DB, MAX_FOCAL_ZONES, Accuracy
 from ertis_numba.settings.array import Array
+from ertis_numba.settings.array_windows import ArrayWindow, parse_window
 from ertis_numba.settings.call import MAX_CALL_SAMPLES, Call
 from ertis_numba.settings.processing import Processing
 from ertis_numba.settings.ranges import fit_ranges
 from ertis_numba.settings.recording import ENCODINGS, Air, Recording
 from ertis_numba.settings.settings import PRESETS, Settings
 from ertis_numba.settings.waveform import MAX_WAVEFORM_SAMPLES
-from ertis_numba.settings.windows import ArrayWindow, parse_window
 
 __all__ = [
     "ENCODINGS",

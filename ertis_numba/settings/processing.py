@@ -8,7 +8,7 @@ from ertis_numba.beamformers import BEAMFORMERS, WEIGHTINGS, BeamformerName, Wei
 from ertis_numba.constants import MAX_MICROPHONES, MAX_NAME_LENGTH
 from ertis_numba.documents import TomlTable
 from ertis_numba.errors import ArgumentError
-from ertis_numba.settings.windows import parse_window
+from ertis_numba.settings.array_windows import parse_window
 
 __all__ = ["MAX_LISTED_DIRECTIONS", "Processing"]
 

@@ -13,9 +13,9 @@ from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import direction_grid
 from ertis_numba.settings import Settings
 from ertis_numba.simulation.engine import Engine
+from ertis_numba.simulation.image_estimate import SAME_RANGE_M, Sight
 from ertis_numba.simulation.loudness import LOUD
 from ertis_numba.simulation.scene import Scene
-from ertis_numba.simulation.sight import SAME_RANGE_M, Sight
 from ertis_numba.simulation.snapshot import snapshot
 from ertis_numba.stages import planner
 from ertis_numba.stages.fast import FastChain

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.settings import Call
-from ertis_numba.simulation.bounds import require_few_amplitudes
 from ertis_numba.simulation.effects import acting
 from ertis_numba.simulation.mirrors import Views, images
 from ertis_numba.simulation.paths import Paths, by_targets, pairs, without_target
+from ertis_numba.simulation.scene_size_limits import require_few_amplitudes
 from ertis_numba.simulation.sensors import Emitter
 from ertis_numba.simulation.snapshot import Snapshot, Transmitters
 from ertis_numba.simulation.stopwatch import CostStopwatch

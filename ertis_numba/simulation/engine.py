@@ -16,12 +16,12 @@ from ertis_numba.simulation import synthesis
 from ertis_numba.simulation.arrivals import arrivals, gains
 from ertis_numba.simulation.converter import Converter
 from ertis_numba.simulation.effects import acting
-from ertis_numba.simulation.limits import require_clear
 from ertis_numba.simulation.modulator import Modulator
 from ertis_numba.simulation.scene import Scene
 from ertis_numba.simulation.sensors import Sensor
 from ertis_numba.simulation.snapshot import Snapshot, snapshot
 from ertis_numba.simulation.stopwatch import CostStopwatch
+from ertis_numba.simulation.target_validity import require_clear
 from ertis_numba.simulation.truth import reflectors
 
 __all__ = ["Engine"]

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.simulation.echoes import Echoes
-from ertis_numba.simulation.sight import Sight
+from ertis_numba.simulation.image_estimate import Sight
 from ertis_numba.simulation.surroundings import change_db, greatest
 
 __all__ = ["Estimate", "filtered", "ghosts", "noise", "unequal"]

@@ -8,7 +8,7 @@ from typing import Any, Generic, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.simulation.bounds import require_few_mirrors
+from ertis_numba.simulation.scene_size_limits import require_few_mirrors
 from ertis_numba.simulation.snapshot import Mirrors, Receivers, Transmitters
 
 __all__ = ["Seen", "Views", "blocked", "images"]

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.simulation.bounds import require_few_paths
 from ertis_numba.simulation.mirrors import Seen
+from ertis_numba.simulation.scene_size_limits import require_few_paths
 from ertis_numba.simulation.snapshot import Receivers, Targets, Transmitters
 
 __all__ = ["Paths", "by_targets", "pairs", "turning", "unit", "without_target"]

@@ -3,8 +3,8 @@
 from ertis_numba import checks
 from ertis_numba.frames import Measurement
 from ertis_numba.settings import Array, Recording
+from ertis_numba.simulation.effect_plan import EffectPlan, make_plan
 from ertis_numba.simulation.engine import Engine
-from ertis_numba.simulation.plan import EffectPlan, make_plan
 from ertis_numba.simulation.scene import Scene
 from ertis_numba.simulation.sensors import Sensor
 from ertis_numba.simulation.targets import Point

@@ -14,10 +14,10 @@ from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import written_out
 from ertis_numba.settings import Array
 from ertis_numba.simulation.effects import EFFECTS, INDISPENSABLE
-from ertis_numba.simulation.placed import Placed
 from ertis_numba.simulation.sensors import Sensor
 from ertis_numba.simulation.sources import Ambient, Noise, Sonar, Tone
 from ertis_numba.simulation.targets import Box, Point, Sphere, Wall
+from ertis_numba.simulation.trajectory import Placed
 
 __all__ = ["Scene", "load_scene"]
 

@@ -12,7 +12,7 @@ from ertis_numba.documents import TomlTable
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import microphones
 from ertis_numba.settings import Settings
-from ertis_numba.simulation.placed import Placed, Vector, check_vector
+from ertis_numba.simulation.trajectory import Placed, Vector, check_vector
 
 __all__ = ["Electronics", "Emitter", "Sensor"]
 

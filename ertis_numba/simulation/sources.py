@@ -4,7 +4,7 @@ from ertis_numba import checks
 from ertis_numba.documents import TomlTable
 from ertis_numba.errors import ArgumentError
 from ertis_numba.settings import Call
-from ertis_numba.simulation.placed import Placed
+from ertis_numba.simulation.trajectory import Placed
 
 __all__ = ["Ambient", "Noise", "Sonar", "Tone"]
 

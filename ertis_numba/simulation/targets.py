@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError
-from ertis_numba.simulation.placed import Placed
+from ertis_numba.simulation.trajectory import Placed
 
 __all__ = ["Box", "Point", "Sphere", "Wall"]
 

@@ -5,8 +5,8 @@ from numpy.typing import NDArray
 
 from ertis_numba.frames import Reflector
 from ertis_numba.simulation.arrivals import echoes, emitted, responses
+from ertis_numba.simulation.image_estimate import Sight
 from ertis_numba.simulation.paths import Paths, unit
-from ertis_numba.simulation.sight import Sight
 from ertis_numba.simulation.snapshot import Snapshot
 from ertis_numba.simulation.stopwatch import CostStopwatch
 

@@ -21,7 +21,7 @@ from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
 from ertis_numba.errors import ArgumentError
-from ertis_numba.stages.fitting import Spectrum, fit, gain_of, weights_of
+from ertis_numba.stages.interpolation_fit import Spectrum, fit, gain_of, weights_of
 
 __all__ = ["FEWEST_RANGES", "Aperture", "BeamGrid", "estimated_mics", "require_beam_grid"]
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ertis_numba.kernels import KernelSet, Memory
 from ertis_numba.stages.beam_grid import FEWEST_RANGES, BeamGrid
 from ertis_numba.stages.delays import DelayTable, Zone
-from ertis_numba.stages.window import TimeWindow
+from ertis_numba.stages.time_window import TimeWindow
 
 __all__ = [
     "Beamform",

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.errors import ArgumentError
-from ertis_numba.stages.fitting import DelayFit
+from ertis_numba.stages.interpolation_fit import DelayFit
 
 __all__ = ["DelayTable", "Zone"]
 

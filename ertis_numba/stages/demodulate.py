@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from ertis_numba.geometry import Layout
 from ertis_numba.kernels import KernelSet, Memory
 from ertis_numba.settings import Settings
-from ertis_numba.stages.window import TimeWindow
+from ertis_numba.stages.time_window import TimeWindow
 
 __all__ = ["Demodulate", "DemodulatePdm", "FilterPcm", "demodulation"]
 

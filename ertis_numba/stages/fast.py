@@ -18,7 +18,7 @@ from ertis_numba.stages.beamform import beamform
 from ertis_numba.stages.buffer_pool import MeasurementBuffers
 from ertis_numba.stages.delays import DelayTable, Zone
 from ertis_numba.stages.demodulate import FilterPcm, demodulation
-from ertis_numba.stages.fitting import Spectrum
+from ertis_numba.stages.interpolation_fit import Spectrum
 from ertis_numba.stages.kernel_chain import KernelChain
 from ertis_numba.stages.matched_filter import MatchedFilter
 from ertis_numba.stages.plan_elements import (
@@ -35,7 +35,7 @@ from ertis_numba.stages.plan_elements import (
 from ertis_numba.stages.stream_beamform import StreamBeamform, StreamTables, amplitudes_of_stream
 from ertis_numba.stages.stream_plan import StreamPlanner
 from ertis_numba.stages.stream_recipe import LINEAR, recipe_of, uses_streams
-from ertis_numba.stages.window import time_window
+from ertis_numba.stages.time_window import time_window
 
 __all__ = ["FastChain"]
 

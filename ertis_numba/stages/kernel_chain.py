@@ -18,7 +18,7 @@ from ertis_numba.settings import Settings
 from ertis_numba.stages.beamform import Beamform
 from ertis_numba.stages.buffer_pool import BufferPool, MeasurementBuffers
 from ertis_numba.stages.demodulate import Demodulate, DemodulatePdm
-from ertis_numba.stages.fitting import one_thread
+from ertis_numba.stages.interpolation_fit import one_thread
 from ertis_numba.stages.word_stream import StreamedImage, WordStream, foreign_stream
 
 __all__ = ["Compress", "KernelChain"]

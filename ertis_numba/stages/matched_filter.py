@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ertis_numba.fft import Transforms
 from ertis_numba.kernels import KernelSet, Memory
 from ertis_numba.settings import Settings
-from ertis_numba.stages.window import TimeWindow
+from ertis_numba.stages.time_window import TimeWindow
 from ertis_numba.waveform import filter_response, matched_filter_spectrum
 
 __all__ = ["Gain", "MatchedFilter", "flat_spectrum"]

@@ -6,7 +6,7 @@ from typing import Final
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import direction_grid, grid_count, microphones
 from ertis_numba.settings import Settings
-from ertis_numba.stages.window import time_window
+from ertis_numba.stages.time_window import time_window
 
 __all__ = ["available_bytes", "predicted_bytes", "require_memory"]
 

@@ -23,7 +23,7 @@ from ertis_numba.stages.kernel_chain import KernelChain
 from ertis_numba.stages.matched_filter import flat_spectrum
 from ertis_numba.stages.paper_scipy import range_axis
 from ertis_numba.stages.plan_elements import chain_taps
-from ertis_numba.stages.window import TimeWindow
+from ertis_numba.stages.time_window import TimeWindow
 from ertis_numba.waveform import matched_guard_s
 
 __all__ = ["PaperChain"]

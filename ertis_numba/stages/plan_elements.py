@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.settings import Processing, Recording, Settings
 from ertis_numba.stages.beam_grid import Aperture, BeamGrid
-from ertis_numba.stages.fitting import WAVES, DelayFit, Spectrum
 from ertis_numba.stages.focal_zones import NEAREST_M, zone_edges
-from ertis_numba.stages.window import time_window
+from ertis_numba.stages.interpolation_fit import WAVES, DelayFit, Spectrum
+from ertis_numba.stages.time_window import time_window
 from ertis_numba.waveform import decimation_taps, integer_taps, matched_band_hz, matched_noise_spectrum
 
 __all__ = [

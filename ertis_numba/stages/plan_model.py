@@ -13,18 +13,18 @@ from ertis_numba.beamformers import BEAMFORMERS, WEIGHTINGS
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import array_weights, direction_grid, effective_count, microphones, unit_vectors
 from ertis_numba.settings import Accuracy, Settings
-from ertis_numba.stages.accuracy import PARTS, ErrorModel, SignalModel
 from ertis_numba.stages.beam_grid import FEWEST_RANGES, Aperture, BeamGrid, require_beam_grid
 from ertis_numba.stages.beamform import whole_limits
 from ertis_numba.stages.costs import Work
-from ertis_numba.stages.fitting import DelayFit, Spectrum
+from ertis_numba.stages.error_model import PARTS, ErrorModel, SignalModel
 from ertis_numba.stages.focal_zones import squared_curvature
+from ertis_numba.stages.interpolation_fit import DelayFit, Spectrum
 from ertis_numba.stages.plan_elements import chain_taps, few_delays, nearest_m_of, spectrum_of, zones_of
 from ertis_numba.stages.planned_streams import PlannedStreams
 from ertis_numba.stages.sensitivity import Sensitivity
 from ertis_numba.stages.stream_plan import StreamPlanner
 from ertis_numba.stages.stream_recipe import recipe_of, uses_streams
-from ertis_numba.stages.window import time_window
+from ertis_numba.stages.time_window import time_window
 from ertis_numba.waveform import matched_band_hz
 
 __all__ = ["MIN_STOPBAND_ATTENUATION_DB", "TABLE_BYTES", "Delays", "ImagePlan", "Nodes", "PlanModel", "plan_of"]

@@ -11,7 +11,7 @@ from ertis_numba.air import sound_speed_m_s
 from ertis_numba.geometry import array_weights, microphones
 from ertis_numba.settings import Settings
 from ertis_numba.stages.beam_grid import Aperture, BeamGrid
-from ertis_numba.stages.fitting import one_thread
+from ertis_numba.stages.interpolation_fit import one_thread
 from ertis_numba.stages.plan_elements import ahead_of, beam_grid_of, delay_fit, spectrum_of
 
 __all__ = ["Deviation", "deviation_of"]

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from ertis_numba.beamformers import SignalStream
-from ertis_numba.stages.fitting import DelayFit
+from ertis_numba.stages.interpolation_fit import DelayFit
 from ertis_numba.stages.stream_spectrum import StreamSpectrum
 
 __all__ = ["ErrorShares", "ImageErrors", "PlannedStream", "PlannedStreams", "StreamGrid"]

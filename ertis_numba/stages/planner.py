@@ -11,9 +11,9 @@ from ertis_numba.beamformers import BEAMFORMERS
 from ertis_numba.errors import ArgumentError
 from ertis_numba.kernels import KernelSet
 from ertis_numba.settings import Accuracy, Settings
-from ertis_numba.stages.accuracy import PARTS, ErrorModel, SignalModel, decibels
 from ertis_numba.stages.costs import PLAN_COSTS, Costs, PlanCosts, cache_file, measured_costs, nominal_costs
-from ertis_numba.stages.fitting import one_thread
+from ertis_numba.stages.error_model import PARTS, ErrorModel, SignalModel, decibels
+from ertis_numba.stages.interpolation_fit import one_thread
 from ertis_numba.stages.memory import available_bytes
 from ertis_numba.stages.plan_model import ImagePlan, PlanModel, plan_of
 from ertis_numba.stages.plan_search import open_plans

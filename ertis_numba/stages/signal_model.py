@@ -12,10 +12,10 @@ from ertis_numba.geometry import array_weights, microphones
 from ertis_numba.kernels import KernelSet
 from ertis_numba.sample_format import sample_format
 from ertis_numba.settings import Accuracy, Settings
-from ertis_numba.stages.accuracy import SignalModel
 from ertis_numba.stages.beam_grid import estimated_mics
+from ertis_numba.stages.error_model import SignalModel
 from ertis_numba.stages.fast import FastChain
-from ertis_numba.stages.fitting import WAVES
+from ertis_numba.stages.interpolation_fit import WAVES
 from ertis_numba.waveform import matched_band_hz, matched_filter_spectrum, matched_noise_spectrum
 
 __all__ = ["ROUGH_DELAY_TAPS", "ROUGH_ZONES", "signal_model_of"]

@@ -12,7 +12,7 @@ from ertis_numba.sample_format import sample_format
 from ertis_numba.settings import Settings
 from ertis_numba.stages.demodulate import demodulation
 from ertis_numba.stages.plan_elements import chain_taps
-from ertis_numba.stages.window import TimeWindow
+from ertis_numba.stages.time_window import TimeWindow
 from ertis_numba.waveform import matched_filter_spectrum, matched_guard_s
 
 __all__ = ["matched", "signals_of"]

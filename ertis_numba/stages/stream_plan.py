@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from ertis_numba.beamformers import SignalStream
 from ertis_numba.settings import Settings
 from ertis_numba.stages.beam_grid import Aperture, BeamGrid
-from ertis_numba.stages.fitting import DelayFit, Spectrum
+from ertis_numba.stages.interpolation_fit import DelayFit, Spectrum
 from ertis_numba.stages.planned_streams import ErrorShares, ImageErrors, PlannedStream, PlannedStreams, StreamGrid
 from ertis_numba.stages.stream_recipe import LINEAR, Recipe
 from ertis_numba.stages.stream_spectrum import StreamSpectrum, highest_hz, pulse_errors, spectrum_of_stream

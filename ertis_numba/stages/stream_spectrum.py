@@ -9,7 +9,7 @@ import scipy
 from numpy.typing import NDArray
 
 from ertis_numba.beamformers import SignalStream
-from ertis_numba.stages.fitting import WAVES, DelayFit, Spectrum
+from ertis_numba.stages.interpolation_fit import WAVES, DelayFit, Spectrum
 
 __all__ = ["StreamSpectrum", "highest_hz", "pulse_errors", "spectrum_of_stream"]
 

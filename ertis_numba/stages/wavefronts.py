@@ -4,8 +4,8 @@ from ertis_numba.air import sound_speed_m_s
 from ertis_numba.beamformers import BEAMFORMERS
 from ertis_numba.geometry import direction_grid, microphones, unit_vectors
 from ertis_numba.settings import Settings
-from ertis_numba.stages.accuracy import ErrorModel, decibels
 from ertis_numba.stages.beam_grid import Aperture
+from ertis_numba.stages.error_model import ErrorModel, decibels
 
 __all__ = ["plane_wave_error_db", "with_wavefront"]
 

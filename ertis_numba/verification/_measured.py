@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ertis_numba.analysis.detect import find_peaks
 from ertis_numba.errors import DataError
 from ertis_numba.frames import Energyscape, Measurement
-from ertis_numba.stages.fitting import one_thread
+from ertis_numba.stages.interpolation_fit import one_thread
 from ertis_numba.verification._exact import ExactImage
 from ertis_numba.verification._peaks import PEAKS, PeakErrors, peak_errors
 

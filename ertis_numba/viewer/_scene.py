@@ -8,8 +8,8 @@ from typing import Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.analysis.finder import PointFinder, same_directions
 from ertis_numba.analysis.levels import below_strongest_db
+from ertis_numba.analysis.point_finder import PointFinder, same_directions
 from ertis_numba.analysis.side_lobes import without_side_lobes
 from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.geometry import unit_vectors

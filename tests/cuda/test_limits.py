@@ -7,7 +7,7 @@ import pytest
 from numba import cuda
 
 from ertis_numba.errors import DeviceError
-from ertis_numba.kernels._cuda import lane, terms
+from ertis_numba.kernels._cuda import beam_sums, lane
 
 
 @cuda.jit
@@ -24,6 +24,6 @@ def test_launch_of_too_many_blocks_is_refused(grid):
 def test_arrays_beyond_32_bit_indices_are_refused():
     too_many = types.SimpleNamespace(size=2**32)
     with pytest.raises(DeviceError, match=r"would have to index 4,294,967,296 numbers; the limit is 4,294,967,295\."):
-        terms.indexed(too_many)
+        beam_sums.indexed(too_many)
     enough = types.SimpleNamespace(size=2**32 - 1)
-    assert terms.indexed(enough) is enough
+    assert beam_sums.indexed(enough) is enough

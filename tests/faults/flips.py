@@ -30,7 +30,7 @@ from ertis_numba.network.allow_list import AllowList, Permission
 from ertis_numba.network.central_node._ledger import Ledger
 from ertis_numba.network.central_node._received_items import SensorSession
 from ertis_numba.network.keys import KeyPair, public_key
-from ertis_numba.network.sensor_node._disk import DiskSpool
+from ertis_numba.network.sensor_node._disk_spool import DiskSpool
 from ertis_numba.settings import Recording, Settings
 
 __all__ = ["flips"]

@@ -9,9 +9,9 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.devices.block_receiver import Block, BlockReceiver, Instant
 from ertis_numba.devices.blocks import COUNTERS, encode_block
 from ertis_numba.devices.emulator.faults import Faults, Spoilt, Stall, Unplug
-from ertis_numba.devices.protocol import Block, BlockReceiver, Instant
 
 __all__ = ["KINDS", "BlockReport", "Wire", "send"]
 

@@ -5,8 +5,8 @@ import numpy as np
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Processing, Recording
 from ertis_numba.simulation import Electronics, Emitter
+from ertis_numba.simulation.effect_plan import make_plan
 from ertis_numba.simulation.effects import EFFECTS
-from ertis_numba.simulation.plan import make_plan
 from ertis_numba.simulation.render import Simulator
 from tests.scenes import SENSOR, line_array, only
 

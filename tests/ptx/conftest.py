@@ -5,7 +5,7 @@ import os
 import pytest
 
 from ertis_numba.errors import DeviceError
-from ertis_numba.kernels._cuda import compiling
+from ertis_numba.kernels._cuda import offline_compilation
 from tests.ptx import launches
 
 
@@ -13,7 +13,7 @@ from tests.ptx import launches
 def _compilers():
     """Skip all tests without compilers, but fail in continuous integration."""
     try:
-        compiling.require_compilers()
+        offline_compilation.require_compilers()
     except DeviceError as error:
         if os.environ.get("CI") == "true":
             raise

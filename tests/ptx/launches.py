@@ -5,7 +5,7 @@ import functools
 import numpy as np
 
 from ertis_numba.beamformers import ADAPTIVE_COMBINATIONS
-from ertis_numba.kernels._cuda import compiling
+from ertis_numba.kernels._cuda import offline_compilation
 from ertis_numba.settings import Accuracy, Processing, Settings
 from ertis_numba.stages import planner
 from ertis_numba.stages.fast import FastChain
@@ -44,7 +44,7 @@ def by_contract():
     """Return all launches by the name of the kernel in the contract."""
     found = {}
     for steps in [*(functools.partial(_chain, *plan) for plan in PLANS.values()), _each]:
-        for launch in compiling.recorded(steps):
+        for launch in offline_compilation.recorded(steps):
             found.setdefault(launch.file, []).append(launch)
     return found
 

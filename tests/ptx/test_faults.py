@@ -9,7 +9,7 @@ from cuda import pathfinder
 from numba import cuda
 
 from ertis_numba.errors import DeviceError
-from ertis_numba.kernels._cuda import compiling
+from ertis_numba.kernels._cuda import offline_compilation
 from ertis_numba.kernels._cuda.lane import launch
 from tests.ptx.faults import contracts, faults
 
@@ -57,13 +57,15 @@ def contracted(x, out):
 
 
 def recorded(kernel, *, grid=(1,), block=(32,), dtype=np.float32):
-    (one,) = compiling.recorded(lambda _: launch(kernel, grid, block, np.zeros(100, dtype), np.zeros(100, dtype)))
+    (one,) = offline_compilation.recorded(
+        lambda _: launch(kernel, grid, block, np.zeros(100, dtype), np.zeros(100, dtype))
+    )
     return one
 
 
 def found(kernel, **given):
     one = recorded(kernel, **given)
-    return faults(one, compiling.code_of(one, CC))
+    return faults(one, offline_compilation.code_of(one, CC))
 
 
 def test_correct_kernel_has_no_faults():
@@ -98,24 +100,24 @@ def test_register_spills_are_detected():
 )
 def test_launches_beyond_bounds_are_detected(grid, block, fault):
     one = dataclasses.replace(recorded(good), grid=grid, block=block)  # `launch` itself refuses some of these
-    assert faults(one, compiling.code_of(one, CC)) == [fault]
+    assert faults(one, offline_compilation.code_of(one, CC)) == [fault]
 
 
 def test_excess_registers_and_shared_memory_are_detected():
     one = recorded(good, block=(1024,))
-    code = compiling.code_of(one, CC)
+    code = offline_compilation.code_of(one, CC)
     assert faults(one, dataclasses.replace(code, registers=64)) == []
     assert faults(one, dataclasses.replace(code, registers=65)) == ["has 72 registers in 1024 threads"]
     assert faults(one, dataclasses.replace(code, shared_bytes=49_153)) == ["shares 49153 bytes"]
 
 
 def test_fused_multiply_add_in_double_precision_is_detected():
-    code = compiling.code_of(recorded(contracted, dtype=np.float64), CC)
+    code = offline_compilation.code_of(recorded(contracted, dtype=np.float64), CC)
     assert contracts(code.ptx)
-    assert contracts(compiling.disassembled(code))
-    single = compiling.code_of(recorded(contracted), CC)
+    assert contracts(offline_compilation.disassembled(code))
+    single = offline_compilation.code_of(recorded(contracted), CC)
     assert not contracts(single.ptx)
-    assert not contracts(compiling.disassembled(single))
+    assert not contracts(offline_compilation.disassembled(single))
 
 
 def test_shared_memory_is_reported():
@@ -126,41 +128,41 @@ def test_shared_memory_is_reported():
         cuda.syncthreads()
         out[cuda.threadIdx.x] = shared[255 - cuda.threadIdx.x]
 
-    assert compiling.code_of(recorded(sharing), CC).shared_bytes == 1024
+    assert offline_compilation.code_of(recorded(sharing), CC).shared_bytes == 1024
 
 
 def test_recorded_launch_has_types_of_gpu_arrays():
     x = np.zeros(100, np.float32)
     x.flags.writeable = False
-    (one,) = compiling.recorded(lambda _: launch(good, (1,), (32,), x, x))
+    (one,) = offline_compilation.recorded(lambda _: launch(good, (1,), (32,), x, x))
     assert [str(kind) for kind in one.types] == ["array(float32, 1d, C)"] * 2
     assert one.arguments["x"] is x
 
 
 def test_kernel_is_compiled_once(monkeypatch):
     one, other = recorded(good), recorded(good, grid=(7,))
-    code = compiling.code_of(one, CC)
-    monkeypatch.setattr(compiling.cuda, "compile_ptx", None)
-    assert compiling.code_of(other, CC) is code
+    code = offline_compilation.code_of(one, CC)
+    monkeypatch.setattr(offline_compilation.cuda, "compile_ptx", None)
+    assert offline_compilation.code_of(other, CC) is code
 
 
 def test_ptx_checks_refuse_the_simulator(monkeypatch):
-    monkeypatch.setattr(compiling, "SIMULATED", True)
+    monkeypatch.setattr(offline_compilation, "SIMULATED", True)
     with pytest.raises(DeviceError, match=r"^kernels are not compiled if the GPU is simulated; unset NUMBA_ENABLE_"):
-        compiling.recorded(print)
+        offline_compilation.recorded(print)
 
 
 def test_missing_compiler_is_named(monkeypatch):
     monkeypatch.setattr(pathfinder, "find_nvidia_binary_utility", lambda _: None)
     monkeypatch.setenv("PATH", "")
     with pytest.raises(DeviceError, match=r"needs numba-cuda, ptxas and nvdisasm, but ptxas is missing; install them"):
-        compiling.require_compilers()
-    monkeypatch.setattr(compiling, "cuda", types.SimpleNamespace(__file__="numba/cuda/__init__.py"))
+        offline_compilation.require_compilers()
+    monkeypatch.setattr(offline_compilation, "cuda", types.SimpleNamespace(__file__="numba/cuda/__init__.py"))
     with pytest.raises(DeviceError, match=r"but numba-cuda is missing; install them with pip install 'ertis-numba\["):
-        compiling.require_compilers()
+        offline_compilation.require_compilers()
 
 
 def test_compiler_error_is_reported():
-    code = compiling.code_of(recorded(good), (6, 0))
+    code = offline_compilation.code_of(recorded(good), (6, 0))
     with pytest.raises(DeviceError, match=r'^nvdisasm fails \(.*"SM60" is deprecated.*\); install'):
-        compiling.disassembled(code)
+        offline_compilation.disassembled(code)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ertis_numba.kernels._cuda import compiling
+from ertis_numba.kernels._cuda import offline_compilation
 from ertis_numba.kernels._kernel_set import KERNEL_NAMES
 from tests.ptx import faults
 
@@ -19,15 +19,17 @@ def test_every_kernel_contract_is_launched(launched):
 @pytest.mark.parametrize("cc", CCS, ids=lambda cc: f"sm_{cc[0]}{cc[1]}")
 @pytest.mark.parametrize("name", CONTRACTS)
 def test_kernel_compiles_without_faults(launched, name, cc):
-    found = {(launch.name, *faults.faults(launch, compiling.code_of(launch, cc))) for launch in launched[name]}
+    found = {
+        (launch.name, *faults.faults(launch, offline_compilation.code_of(launch, cc))) for launch in launched[name]
+    }
     assert {one for one in found if len(one) > 1} == set()
 
 
 def test_allowed_faults_are_present(launched):
     for name in faults.DOUBLE:
-        assert any(".f64" in compiling.code_of(launch, (9, 0)).ptx for launch in launched[name])
+        assert any(".f64" in offline_compilation.code_of(launch, (9, 0)).ptx for launch in launched[name])
     for name in faults.LIBRARY_CALLS:
-        assert any(compiling.code_of(launch, (9, 0)).stack_bytes for launch in launched[name])
+        assert any(offline_compilation.code_of(launch, (9, 0)).stack_bytes for launch in launched[name])
 
 
 def test_capon_computes_in_the_precision_of_its_weights(launched):
@@ -35,7 +37,7 @@ def test_capon_computes_in_the_precision_of_its_weights(launched):
     for launch in launched["combine_capon"]:
         if "beams" in launch.arguments:
             single = launch.arguments["beams"].dtype == np.float32
-            assert single == (".f64" not in compiling.code_of(launch, (9, 0)).ptx)
+            assert single == (".f64" not in offline_compilation.code_of(launch, (9, 0)).ptx)
             precisions.add((launch.name, single))
     assert len(precisions) == 4  # sums and equations, both in single and in double precision
 
@@ -43,10 +45,10 @@ def test_capon_computes_in_the_precision_of_its_weights(launched):
 @pytest.mark.parametrize("cc", CCS[1:], ids=lambda cc: f"sm_{cc[0]}{cc[1]}")
 def test_modulator_rounds_every_product(launched, cc):
     (loop,) = [launch for launch in launched["modulate_pdm"] if launch.name == "modulate_pdm.modulate"]
-    code = compiling.code_of(loop, cc)
+    code = offline_compilation.code_of(loop, cc)
     assert not faults.contracts(code.ptx)
-    assert "DMUL" in compiling.disassembled(code)
-    assert not faults.contracts(compiling.disassembled(code))
+    assert "DMUL" in offline_compilation.disassembled(code)
+    assert not faults.contracts(offline_compilation.disassembled(code))
 
 
 def test_all_word_sizes_and_tap_types_are_launched(launched):

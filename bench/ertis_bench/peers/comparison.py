@@ -19,7 +19,7 @@ from ertis_numba import verification
 from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Settings
-from ertis_numba.stages.fitting import one_thread
+from ertis_numba.stages.interpolation_fit import one_thread
 
 __all__ = ["DIRECTIONS", "OURS", "PAPER", "PEERS", "Peer", "run"]
 

@@ -25,7 +25,7 @@ from ertis_numba.analysis.health.limits import (
     MIN_LEVEL_DB,
     MIN_SAMPLES,
 )
-from ertis_numba.analysis.health.numbers import by_numbers, scaled, swapped_bytes
+from ertis_numba.analysis.health.pcm_samples import by_numbers, scaled, swapped_bytes
 from ertis_numba.analysis.health.repeats import duplicates, hum, repeated_blocks, stuck_at_times
 from ertis_numba.analysis.health.report import ChannelHealth, Finding, Health
 from ertis_numba.analysis.health.spectra import by_spectra

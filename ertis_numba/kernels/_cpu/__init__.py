@@ -16,7 +16,7 @@ from numba.core import event
 
 from ertis_numba import checks
 from ertis_numba.errors import DeviceError
-from ertis_numba.kernels import _compiling
+from ertis_numba.kernels import _compile_notice
 from ertis_numba.kernels._cpu.dot16 import RANGES
 from ertis_numba.kernels._cpu.features import INSTRUCTION_SET
 from ertis_numba.kernels._cpu.loading import load_without_compiler
@@ -36,7 +36,7 @@ class _CompilationListener(event.Listener):  # type: ignore[misc]  # Numba has n
 
     def on_start(self, event: object) -> None:  # noqa: ARG002  Numba passes it by name
         """Report that a compilation has begun."""
-        _compiling.begun()
+        _compile_notice.begun()
 
     def on_end(self, event: object) -> None:
         """Ignore the end of a compilation."""

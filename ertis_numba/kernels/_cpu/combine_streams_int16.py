@@ -12,7 +12,7 @@ from numba.extending import intrinsic
 
 from ertis_numba.kernels._cpu.amplitudes import amplitudes_of
 from ertis_numba.kernels._cpu.dot16 import INT32, RANGES, Dot16
-from ertis_numba.kernels._cpu.nodes16 import fill_pairs, new_pairs
+from ertis_numba.kernels._cpu.grid_beams16 import fill_pairs, new_pairs
 from ertis_numba.kernels._cpu.spans import node_span
 
 __all__ = ["combine_streams_int16"]

@@ -12,7 +12,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from ertis_numba.kernels._cpu.dot16 import INT32, RANGES, Dot16
-from ertis_numba.kernels._cpu.nodes16 import fill_pairs, new_pairs
+from ertis_numba.kernels._cpu.grid_beams16 import fill_pairs, new_pairs
 from ertis_numba.kernels._cpu.spans import node_span, prefetch_row, same_places
 
 __all__ = ["interpolated_beams_envelope_int16"]

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from ertis_numba import checks
 from ertis_numba.kernels._cuda.delay_and_sum_envelope_int16 import TILE_RANGES
 from ertis_numba.kernels._cuda.lane import SIMULATED
+from ertis_numba.kernels._device_protocols import NewMemory
 from ertis_numba.kernels._kernel_set import KernelSet, twins_in
-from ertis_numba.kernels._memory import NewMemory
 
 __all__ = ["kernel_set"]
 

@@ -11,8 +11,8 @@ import math
 import numpy as np
 from numba import cuda
 
+from ertis_numba.kernels._cuda.beam_sums import complexes
 from ertis_numba.kernels._cuda.lane import launch, workspace
-from ertis_numba.kernels._cuda.terms import complexes
 from ertis_numba.kernels._scalar import imag_of, real_of
 
 __all__ = ["combine_capon"]

@@ -10,8 +10,8 @@ import functools
 import numpy as np
 from numba import cuda
 
+from ertis_numba.kernels._cuda.beam_sums import BLOCK, DIRECTIONS, WARP, complexes
 from ertis_numba.kernels._cuda.lane import launch, workspace
-from ertis_numba.kernels._cuda.terms import BLOCK, DIRECTIONS, WARP, complexes
 from ertis_numba.kernels._scalar import imag_of, magnitude, real_of, root_of, sample_of
 
 __all__ = ["combine_dmas"]

@@ -11,10 +11,10 @@ import math
 import numpy as np
 from numba import cuda
 
+from ertis_numba.kernels._cuda.beam_sums import BLOCK, DIRECTIONS, WARP, WARPS_1, WARPS_2, indexed
 from ertis_numba.kernels._cuda.delay_and_sum_envelope_int16 import TILE_RANGES, sum_short_terms
 from ertis_numba.kernels._cuda.interpolated_beams_envelope_int16 import fill_nodes, sum_short_nodes
 from ertis_numba.kernels._cuda.lane import launch, workspace
-from ertis_numba.kernels._cuda.terms import BLOCK, DIRECTIONS, WARP, WARPS_1, WARPS_2, indexed
 from ertis_numba.kernels._scalar import imag_of, power, real_of, sample_of
 
 __all__ = ["combine_streams_int16"]

@@ -3,8 +3,8 @@
 import numpy as np
 from numba import cuda
 
+from ertis_numba.kernels._cuda.beam_sums import BLOCK, beam_grid, complexes, fill_beams
 from ertis_numba.kernels._cuda.lane import launch
-from ertis_numba.kernels._cuda.terms import BLOCK, beam_grid, complexes, fill_beams
 from ertis_numba.kernels._scalar import sample_of
 
 __all__ = ["beams_from", "delay_and_sum"]

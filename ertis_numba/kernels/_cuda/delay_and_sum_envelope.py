@@ -2,8 +2,8 @@
 
 from numba import cuda
 
+from ertis_numba.kernels._cuda.beam_sums import BLOCK, beam_grid, complexes, fill_beams
 from ertis_numba.kernels._cuda.lane import launch
-from ertis_numba.kernels._cuda.terms import BLOCK, beam_grid, complexes, fill_beams
 from ertis_numba.kernels._scalar import magnitude
 
 __all__ = ["delay_and_sum_envelope"]

@@ -3,8 +3,8 @@
 import numpy as np
 from numba import cuda
 
+from ertis_numba.kernels._cuda.beam_sums import BLOCK, DIRECTIONS, ONE, WARP, WARPS_1, WARPS_2, indexed
 from ertis_numba.kernels._cuda.lane import launch
-from ertis_numba.kernels._cuda.terms import BLOCK, DIRECTIONS, ONE, WARP, WARPS_1, WARPS_2, indexed
 from ertis_numba.kernels._scalar import magnitude, short_imag_of, short_real_of
 
 __all__ = ["TILE_RANGES", "delay_and_sum_envelope_int16", "store_tile", "sum_short_terms"]

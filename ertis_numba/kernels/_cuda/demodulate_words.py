@@ -7,8 +7,8 @@ load of the tap.
 import numpy as np
 from numba import cuda
 
+from ertis_numba.kernels._cuda.beam_sums import indexed
 from ertis_numba.kernels._cuda.lane import launch
-from ertis_numba.kernels._cuda.terms import indexed
 
 __all__ = ["demodulate_words"]
 

@@ -3,9 +3,9 @@
 import numpy as np
 from numba import cuda
 
+from ertis_numba.kernels._cuda.beam_sums import BLOCK, DIRECTIONS, ONE, TILE, WARPS_1, WARPS_2, WARPS_3, beam_grid
 from ertis_numba.kernels._cuda.delay_and_sum import beams_from
 from ertis_numba.kernels._cuda.lane import launch, workspace
-from ertis_numba.kernels._cuda.terms import BLOCK, DIRECTIONS, ONE, TILE, WARPS_1, WARPS_2, WARPS_3, beam_grid
 from ertis_numba.kernels._scalar import imag_of, magnitude, real_of
 
 __all__ = ["interpolated_beams_envelope"]

@@ -3,9 +3,9 @@
 import numpy as np
 from numba import cuda
 
+from ertis_numba.kernels._cuda.beam_sums import BLOCK, DIRECTIONS, ONE, WARPS_1, WARPS_2, indexed
 from ertis_numba.kernels._cuda.delay_and_sum_envelope_int16 import TILE_RANGES, store_tile, sum_short_terms
 from ertis_numba.kernels._cuda.lane import launch, workspace
-from ertis_numba.kernels._cuda.terms import BLOCK, DIRECTIONS, ONE, WARPS_1, WARPS_2, indexed
 from ertis_numba.kernels._scalar import short_imag_of, short_real_of, upper_halves
 
 __all__ = ["fill_nodes", "interpolated_beams_envelope_int16", "sum_short_nodes"]

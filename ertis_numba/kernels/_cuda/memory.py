@@ -10,8 +10,8 @@ from numpy.typing import DTypeLike, NDArray
 
 from ertis_numba.errors import DeviceError
 from ertis_numba.kernels._cuda.lane import SIMULATED, Lane
+from ertis_numba.kernels._device_protocols import Array
 from ertis_numba.kernels._images import ImagePool
-from ertis_numba.kernels._memory import Array
 
 __all__ = ["CudaMemory"]
 

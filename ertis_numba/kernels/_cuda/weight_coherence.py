@@ -4,8 +4,8 @@
 import numpy as np
 from numba import cuda
 
+from ertis_numba.kernels._cuda.beam_sums import BLOCK, DIRECTIONS, TILE, WARP, beam_grid, complexes
 from ertis_numba.kernels._cuda.lane import launch
-from ertis_numba.kernels._cuda.terms import BLOCK, DIRECTIONS, TILE, WARP, beam_grid, complexes
 from ertis_numba.kernels._scalar import coherence_factor, imag_of, power, real_of
 
 __all__ = ["weight_coherence"]

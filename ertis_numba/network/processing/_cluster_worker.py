@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from ertis_numba.cluster import current_worker
 from ertis_numba.errors import ArgumentError, DataError, DeviceError
-from ertis_numba.network.processing.slots import POINTS_BYTES
+from ertis_numba.network.processing.shared_slots import POINTS_BYTES
 
 if TYPE_CHECKING:
-    from ertis_numba.network.processing.chain import SharedPipeline
     from ertis_numba.network.processing.pipe_messages import Prepared
+    from ertis_numba.network.processing.shared_pipeline import SharedPipeline
     from ertis_numba.stages.costs import PlanCosts
 
 __all__ = ["ClusterResult", "prepare", "process"]
@@ -80,7 +80,7 @@ def process(
 
 
 def _chain(settings: str, device: str, plan: "PlanCosts") -> "SharedPipeline":
-    from ertis_numba.network.processing.chain import SharedPipeline  # noqa: PLC0415  in processes of the cluster alone
+    from ertis_numba.network.processing.shared_pipeline import SharedPipeline  # noqa: PLC0415  in processes of the cluster alone
 
     key = (settings, device, plan)
     with _turn:

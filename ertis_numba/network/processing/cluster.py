@@ -12,8 +12,8 @@ import numpy as np
 
 from ertis_numba.cluster import RemoteError, WorkerActors, connect
 from ertis_numba.network.processing import _cluster_worker as there
-from ertis_numba.network.processing.choice import Load
 from ertis_numba.network.processing.options import ProcessingOptions
+from ertis_numba.network.processing.parallelism import Load
 from ertis_numba.network.processing.pipe_messages import Prepared
 from ertis_numba.network.processing.runner import (
     Event,
@@ -25,7 +25,7 @@ from ertis_numba.network.processing.runner import (
     Lost,
     bytes_of,
 )
-from ertis_numba.network.processing.slots import Slot
+from ertis_numba.network.processing.shared_slots import Slot
 from ertis_numba.network.status import WorkerStatus
 from ertis_numba.network.wakeup_socket import WakeupSocket
 

@@ -16,7 +16,7 @@ from ertis_numba.network.status import Status, SubscriberStatus
 from ertis_numba.processes import SupervisedProcess
 
 if TYPE_CHECKING:
-    from ertis_numba.network.processing.slots import Slot
+    from ertis_numba.network.processing.shared_slots import Slot
 
 __all__ = ["Publisher"]
 

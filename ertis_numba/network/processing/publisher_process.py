@@ -30,7 +30,7 @@ from ertis_numba.network.messages import (
 )
 from ertis_numba.network.processing import pipe_messages
 from ertis_numba.network.processing.pipe_messages import ToPublisher
-from ertis_numba.network.processing.slots import SlotView
+from ertis_numba.network.processing.shared_slots import SlotView
 from ertis_numba.network.processing.subscribers import QueuedProduct, Subscribers
 from ertis_numba.network.trace import mark
 from ertis_numba.network.zap_authenticator import ZapAuthenticator

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.network.messages import Data
-from ertis_numba.network.processing.choice import Load
+from ertis_numba.network.processing.parallelism import Load
 from ertis_numba.network.processing.pipe_messages import Prepared
-from ertis_numba.network.processing.slots import Slot
+from ertis_numba.network.processing.shared_slots import Slot
 from ertis_numba.network.status import WorkerStatus
 
 __all__ = ["Event", "FinishedJob", "Job", "JobKind", "KindFailed", "KindReady", "Lost", "Runner", "bytes_of"]

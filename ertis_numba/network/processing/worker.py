@@ -3,11 +3,11 @@
 from typing import TYPE_CHECKING, Final, Literal
 
 from ertis_numba.network.processing.pipe_messages import FromWorker, SlotMemory
-from ertis_numba.network.processing.slots import Slot
+from ertis_numba.network.processing.shared_slots import Slot
 from ertis_numba.processes import SupervisedProcess
 
 if TYPE_CHECKING:
-    from ertis_numba.network.processing.choice import Mode
+    from ertis_numba.network.processing.parallelism import Mode
     from ertis_numba.network.processing.runner import Job, JobKind
 
 __all__ = ["SLOTS", "Worker"]

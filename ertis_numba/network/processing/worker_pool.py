@@ -7,8 +7,8 @@ import numpy as np
 
 from ertis_numba.cpu_cores import usable_cores
 from ertis_numba.network.log import EventLog
-from ertis_numba.network.processing.choice import Choice, Load
 from ertis_numba.network.processing.options import ProcessingOptions
+from ertis_numba.network.processing.parallelism import Choice, Load
 from ertis_numba.network.processing.pipe_messages import (
     FromWorker,
     JobFailed,
@@ -32,7 +32,7 @@ from ertis_numba.network.processing.runner import (
     Lost,
     bytes_of,
 )
-from ertis_numba.network.processing.slots import Slot
+from ertis_numba.network.processing.shared_slots import Slot
 from ertis_numba.network.processing.worker import SLOTS, Worker
 from ertis_numba.network.status import WorkerStatus
 from ertis_numba.network.trace import mark

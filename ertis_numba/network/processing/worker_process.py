@@ -25,13 +25,13 @@ from ertis_numba.network.processing.pipe_messages import (
     ToWorker,
     Unusable,
 )
-from ertis_numba.network.processing.slots import POINTS_BYTES, SlotView
+from ertis_numba.network.processing.shared_slots import POINTS_BYTES, SlotView
 from ertis_numba.processes import connect
 
 __all__ = ["end_after"]
 
 if TYPE_CHECKING:
-    from ertis_numba.network.processing.chain import SharedPipeline
+    from ertis_numba.network.processing.shared_pipeline import SharedPipeline
     from ertis_numba.processes import Pipe
 
 _DRAIN_S: Final = 0.1
@@ -50,7 +50,7 @@ class _ImageWorker:
         # In this process alone, and before it is ready, so that the first sensor does not wait for imports.
         from ertis_numba import kernels  # noqa: PLC0415
         from ertis_numba.fft import _scipy  # noqa: F401, PLC0415
-        from ertis_numba.network.processing import chain  # noqa: F401, PLC0415
+        from ertis_numba.network.processing import shared_pipeline  # noqa: F401, PLC0415
 
         try:
             loaded: kernels.KernelSet | None = kernels.load(self._given.device)
@@ -81,7 +81,7 @@ class _ImageWorker:
                 self._pipe.send(self._processed(order))
 
     def _prepared(self, order: Prepare) -> FromWorker:
-        from ertis_numba.network.processing.chain import SharedPipeline  # noqa: PLC0415  in this process alone
+        from ertis_numba.network.processing.shared_pipeline import SharedPipeline  # noqa: PLC0415  in this process alone
 
         try:
             chain = SharedPipeline(order.settings, self._given.device, self._given.plan)

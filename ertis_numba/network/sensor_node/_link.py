@@ -13,8 +13,8 @@ from ertis_numba.network import messages
 from ertis_numba.network.connection import Connection
 from ertis_numba.network.keys import ClientKeys
 from ertis_numba.network.messages import SILENCE_LIMIT_S
-from ertis_numba.network.sensor_node._runs import OutgoingSession
-from ertis_numba.network.sensor_node._spool import Spool
+from ertis_numba.network.sensor_node._memory_spool import Spool
+from ertis_numba.network.sensor_node._outgoing_sessions import OutgoingSession
 from ertis_numba.network.sensor_node._wire import Acknowledged, frames_of, greeting
 from ertis_numba.network.trace import mark
 from ertis_numba.network.wakeup_socket import WakeupSocket

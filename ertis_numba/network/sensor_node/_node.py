@@ -13,9 +13,9 @@ from ertis_numba.network import addresses
 from ertis_numba.network.keys import ClientKeys
 from ertis_numba.network.log import logger
 from ertis_numba.network.messages import MAX_SEQUENCE
-from ertis_numba.network.sensor_node._disk import DiskSpool
+from ertis_numba.network.sensor_node._disk_spool import DiskSpool
 from ertis_numba.network.sensor_node._link import Central, Link
-from ertis_numba.network.sensor_node._spool import SensorCounts, Spool
+from ertis_numba.network.sensor_node._memory_spool import SensorCounts, Spool
 from ertis_numba.network.sensor_node._wire import Acknowledged
 from ertis_numba.network.trace import mark
 from ertis_numba.settings import Settings

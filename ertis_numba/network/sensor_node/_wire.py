@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias, cast
 
 from ertis_numba.journal import JournalEntry
 from ertis_numba.network import messages
-from ertis_numba.network.sensor_node._runs import OutgoingSession, UnackedItem
+from ertis_numba.network.sensor_node._outgoing_sessions import OutgoingSession, UnackedItem
 
 if TYPE_CHECKING:
     from ertis_numba.network.fields import Position, Quaternion

@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from ertis_numba.air import absorption_db_m
 from ertis_numba.simulation.estimates import Estimate, filtered
+from ertis_numba.simulation.image_estimate import Sight
 from ertis_numba.simulation.paths import Paths
 from ertis_numba.simulation.sensors import Emitter
-from ertis_numba.simulation.sight import Sight
 from ertis_numba.simulation.snapshot import Snapshot
 
 __all__ = ["estimate", "gain"]

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from ertis_numba.simulation.effects._frames import FRAME, OverlappingFrames, band_bins, drawn, window
+from ertis_numba.simulation.effects._overlapping_noise import FRAME, OverlappingFrames, band_bins, drawn, window
 from ertis_numba.simulation.estimates import Estimate, noise
-from ertis_numba.simulation.sight import Sight
+from ertis_numba.simulation.image_estimate import Sight
 from ertis_numba.simulation.snapshot import Snapshot
 
 __all__ = ["estimate", "loudness", "sounds"]

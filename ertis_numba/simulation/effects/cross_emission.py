@@ -3,7 +3,7 @@
 import numpy as np
 
 from ertis_numba.simulation.estimates import Estimate, ghosts
-from ertis_numba.simulation.sight import Sight
+from ertis_numba.simulation.image_estimate import Sight
 from ertis_numba.simulation.snapshot import Snapshot
 
 __all__ = ["estimate", "other_emitters"]

@@ -6,8 +6,8 @@ from collections.abc import Set as AbstractSet
 from ertis_numba.simulation.arrivals import Arrivals, arrived, gains, transmitter_of
 from ertis_numba.simulation.effects.spreading import spreading
 from ertis_numba.simulation.estimates import Estimate
+from ertis_numba.simulation.image_estimate import Sight
 from ertis_numba.simulation.paths import Paths, without_target
-from ertis_numba.simulation.sight import Sight
 from ertis_numba.simulation.snapshot import Snapshot
 from ertis_numba.simulation.surroundings import change_db
 

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.simulation.estimates import Estimate
+from ertis_numba.simulation.image_estimate import Sight
 from ertis_numba.simulation.paths import Paths
-from ertis_numba.simulation.sight import Sight
 from ertis_numba.simulation.snapshot import Receivers, Snapshot, Transmitters
 
 __all__ = ["estimate", "times"]

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from ertis_numba.simulation.estimates import Estimate, filtered
-from ertis_numba.simulation.sight import Sight
+from ertis_numba.simulation.image_estimate import Sight
 from ertis_numba.simulation.snapshot import Snapshot, Transmitters
 
 __all__ = ["estimate", "transmitter"]

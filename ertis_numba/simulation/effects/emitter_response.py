@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.simulation.estimates import Estimate, filtered
+from ertis_numba.simulation.image_estimate import Sight
 from ertis_numba.simulation.sensors import Emitter
-from ertis_numba.simulation.sight import Sight
 
 __all__ = ["call_filter", "estimate"]
 

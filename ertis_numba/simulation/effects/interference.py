@@ -9,15 +9,15 @@ import scipy
 from numpy.typing import NDArray
 
 from ertis_numba.simulation.arrivals import Arrivals, gains, rounded_s
-from ertis_numba.simulation.effects._frames import FRAME, OverlappingFrames, band_bins, drawn, window
+from ertis_numba.simulation.effects._overlapping_noise import FRAME, OverlappingFrames, band_bins, drawn, window
 from ertis_numba.simulation.effects.spreading import spreading
 from ertis_numba.simulation.estimates import Estimate
+from ertis_numba.simulation.image_estimate import Sight
 from ertis_numba.simulation.paths import Paths, without_target
-from ertis_numba.simulation.placed import Placed
-from ertis_numba.simulation.sight import Sight
 from ertis_numba.simulation.snapshot import Snapshot, Transmitters
 from ertis_numba.simulation.sources import Noise, Sonar, Tone
 from ertis_numba.simulation.surroundings import change_db
+from ertis_numba.simulation.trajectory import Placed
 
 __all__ = ["arrivals", "estimate", "loudness", "sounds"]
 

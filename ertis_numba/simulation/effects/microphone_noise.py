@@ -1,8 +1,8 @@
 """White noise of each microphone."""
 
 from ertis_numba.simulation.estimates import Estimate, noise
+from ertis_numba.simulation.image_estimate import Sight
 from ertis_numba.simulation.sensors import Sensor
-from ertis_numba.simulation.sight import Sight
 from ertis_numba.simulation.snapshot import Snapshot
 
 __all__ = ["estimate", "loudness", "noise_rms"]

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.simulation.estimates import Estimate, unequal
-from ertis_numba.simulation.sight import Sight
+from ertis_numba.simulation.image_estimate import Sight
 from ertis_numba.simulation.snapshot import Snapshot
 
 __all__ = ["estimate", "microphones"]

@@ -5,8 +5,8 @@ import math
 import numpy as np
 
 from ertis_numba.simulation.estimates import Estimate
+from ertis_numba.simulation.image_estimate import Sight
 from ertis_numba.simulation.mirrors import End, Seen, Views, blocked
-from ertis_numba.simulation.sight import Sight
 from ertis_numba.simulation.snapshot import Mirrors, Snapshot
 from ertis_numba.simulation.surroundings import greatest
 

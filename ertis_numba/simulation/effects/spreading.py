@@ -4,9 +4,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.simulation.estimates import Estimate, filtered
+from ertis_numba.simulation.image_estimate import Sight
 from ertis_numba.simulation.paths import Paths
 from ertis_numba.simulation.sensors import Emitter
-from ertis_numba.simulation.sight import Sight
 from ertis_numba.simulation.snapshot import Snapshot
 
 __all__ = ["NEAREST_M", "estimate", "gain", "spreading"]

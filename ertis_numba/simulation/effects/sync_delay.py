@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ertis_numba.constants import SYNC_STEP_S
 from ertis_numba.simulation.effects.cross_emission import other_emitters
 from ertis_numba.simulation.estimates import Estimate
-from ertis_numba.simulation.sight import Sight
+from ertis_numba.simulation.image_estimate import Sight
 from ertis_numba.simulation.snapshot import Snapshot
 
 __all__ = ["clock_times", "estimate"]

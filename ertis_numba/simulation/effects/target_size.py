@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from ertis_numba.simulation.effects._piston import piston
 from ertis_numba.simulation.effects.spreading import NEAREST_M
 from ertis_numba.simulation.estimates import Estimate, filtered
+from ertis_numba.simulation.image_estimate import Sight
 from ertis_numba.simulation.mirrors import Seen
 from ertis_numba.simulation.paths import Paths, by_targets, turning, unit
 from ertis_numba.simulation.sensors import Emitter
-from ertis_numba.simulation.sight import Sight
 from ertis_numba.simulation.snapshot import Receivers, Snapshot, Targets, Transmitters
 
 __all__ = ["estimate", "gain", "turns"]

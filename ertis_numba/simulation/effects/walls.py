@@ -3,8 +3,8 @@
 import numpy as np
 
 from ertis_numba.simulation.estimates import Estimate, ghosts
+from ertis_numba.simulation.image_estimate import Sight
 from ertis_numba.simulation.mirrors import Views, images
-from ertis_numba.simulation.sight import Sight
 from ertis_numba.simulation.snapshot import Snapshot
 
 __all__ = ["estimate", "views"]

@@ -19,8 +19,8 @@ from ertis_bench.network.processes import ERTIS, JsonLinesProcess, central, free
 from ertis_bench.network.sender import SenderJob
 
 from ertis_numba.errors import DataError
+from tests.faults.network.self_kill import in_trap
 from tests.faults.network.sender_thread import SenderThread
-from tests.faults.network.trap import in_trap
 
 __all__ = ["RestartedRecorder", "centrals", "nodes", "sealings"]
 

@@ -14,7 +14,7 @@ from ertis_numba.journal import SUFFIX
 from ertis_numba.network.central_node._journal_store import JournalStore
 from ertis_numba.network.central_node._ledger import Ledger
 from ertis_numba.network.central_node._received_items import SensorSession
-from ertis_numba.network.sensor_node._disk import DiskSpool
+from ertis_numba.network.sensor_node._disk_spool import DiskSpool
 from ertis_numba.storage.sealing import seal
 
 __all__ = ["Found", "recover_archive", "recover_capture", "recover_spool"]

@@ -7,7 +7,7 @@ from hypothesis import given, settings, strategies as st
 from numpy.testing import assert_allclose
 
 from ertis_numba.settings import Call, Settings
-from ertis_numba.stages.fitting import DelayFit, Spectrum, fit, weights_of
+from ertis_numba.stages.interpolation_fit import DelayFit, Spectrum, fit, weights_of
 from ertis_numba.waveform import matched_noise_spectrum
 
 RATE_HZ = 45_000.0  # of the default ranges

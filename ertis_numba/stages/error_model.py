@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 from ertis_numba.geometry import array_weights, effective_count
 from ertis_numba.settings import Settings
 from ertis_numba.stages.beam_grid import Aperture, BeamGrid
-from ertis_numba.stages.fitting import WAVES, DelayFit
 from ertis_numba.stages.focal_zones import NEAREST_M
+from ertis_numba.stages.interpolation_fit import WAVES, DelayFit
 from ertis_numba.waveform import matched_band_hz, matched_noise_spectrum
 
 __all__ = ["PARTS", "ErrorModel", "SignalModel", "decibels"]

@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ertis_numba.simulation import limits
+from ertis_numba.simulation import target_validity
 from ertis_numba.simulation.cache import Cache
 from ertis_numba.simulation.effects import ASKED_FOR, EFFECTS, INDISPENSABLE, module
 from ertis_numba.simulation.estimates import Estimate
+from ertis_numba.simulation.image_estimate import Sight
 from ertis_numba.simulation.loudness import LOUD, may_be_loud, peak_bound
 from ertis_numba.simulation.scene import Scene
-from ertis_numba.simulation.sight import Sight
 from ertis_numba.simulation.snapshot import Snapshot, snapshot
 
 __all__ = ["EffectPlan", "Verdict", "make_plan"]
@@ -117,7 +117,7 @@ def make_plan(scene: Scene) -> EffectPlan:
     Examples
     --------
     >>> from ertis_numba.simulation import Point, Scene
-    >>> from ertis_numba.simulation.plan import make_plan
+    >>> from ertis_numba.simulation.effect_plan import make_plan
     >>> "spreading" in make_plan(Scene(points=(Point(range_m=2.0),))).active
     True
     """
@@ -127,8 +127,8 @@ def make_plan(scene: Scene) -> EffectPlan:
         (index, snapshot(scene, sensor, index / scene.rate_hz, cache)) for index in indices for sensor in scene.sensors
     ]
     for _, shot in shots:
-        limits.require_clear(shot)
-    notes = tuple(dict.fromkeys(note for _, shot in shots for note in limits.notes(shot)))
+        target_validity.require_clear(shot)
+    notes = tuple(dict.fromkeys(note for _, shot in shots for note in target_validity.notes(shot)))
     verdicts: dict[str, Verdict] = {}
     render_ab = functools.cache(lambda: _ab_render_of(scene))
     # The first round renders nothing, because its images would lack the effects that are not decided yet. Decisions

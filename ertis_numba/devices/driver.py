@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks
+from ertis_numba.devices.block_receiver import Block, BlockReceiver
 from ertis_numba.devices.blocks import COUNTERS, FRAME_BYTES
 from ertis_numba.devices.commands import Command, firmware_version
 from ertis_numba.devices.dialogue import Dialogue
 from ertis_numba.devices.line import closed_error
 from ertis_numba.devices.ports import Port, find_again, resolve
-from ertis_numba.devices.protocol import Block, BlockReceiver
 from ertis_numba.devices.setup import Setup
 from ertis_numba.errors import ArgumentError, SonarDisconnectedError, SonarError
 

@@ -1,4 +1,4 @@
-"""Node that kills itself before a line of its own code: ``python -m tests.faults.network.trap LINES MODULE …``.
+"""Node that kills itself before a line of its own code: ``python -m tests.faults.network.self_kill LINES MODULE …``.
 
 A node spends most of its time inside few calls. A kill at a random time therefore rarely comes between two lines.
 """
@@ -25,7 +25,9 @@ _OURS: Final = tuple(str(_PACKAGE / name) for name in ("network", "journal", "at
 def in_trap(max_lines: int | None, command: Sequence[str]) -> list[str]:
     """Return a command ``python -m MODULE …`` that kills itself after ``max_lines`` lines, unless it is None."""
     python, _, *rest = command
-    return list(command) if max_lines is None else [python, "-m", "tests.faults.network.trap", str(max_lines), *rest]
+    return (
+        list(command) if max_lines is None else [python, "-m", "tests.faults.network.self_kill", str(max_lines), *rest]
+    )
 
 
 def _set_trap(max_lines: int) -> None:

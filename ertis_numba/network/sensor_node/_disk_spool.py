@@ -15,8 +15,8 @@ from ertis_numba.errors import DamagedError, DataError, JournalInUseError, Netwo
 from ertis_numba.frames import SequenceGap
 from ertis_numba.journal import LOST, SUFFIX, Journal, JournalEntry
 from ertis_numba.network.messages import MAX_SEQUENCE
-from ertis_numba.network.sensor_node._runs import OutgoingSession, UnackedItem
-from ertis_numba.network.sensor_node._spool import SensorCounts, Spool
+from ertis_numba.network.sensor_node._memory_spool import SensorCounts, Spool
+from ertis_numba.network.sensor_node._outgoing_sessions import OutgoingSession, UnackedItem
 
 __all__ = ["DAMAGED", "SPOOL_FULL", "DiskSpool"]
 

@@ -12,7 +12,7 @@ from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import SequenceGap, Stamp
 from ertis_numba.journal import JournalEntry, JournalSensor, require_same_settings
 from ertis_numba.network.messages import MAX_SEQUENCE
-from ertis_numba.network.sensor_node._runs import OutgoingSession, UnackedItem
+from ertis_numba.network.sensor_node._outgoing_sessions import OutgoingSession, UnackedItem
 
 if TYPE_CHECKING:
     from ertis_numba.settings import Settings

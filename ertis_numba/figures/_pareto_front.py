@@ -12,8 +12,8 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from ertis_numba.figures._canvas import Canvas
+from ertis_numba.figures._captions import Heading
 from ertis_numba.figures._page import Panel, compose
-from ertis_numba.figures._words import Heading
 from ertis_numba.figures.style import Style
 
 __all__ = ["Rated", "draw"]

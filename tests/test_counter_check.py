@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ertis_numba.devices.protocol import BlockReceiver
+from ertis_numba.devices.block_receiver import BlockReceiver
 from tests.wire import N_BYTES, N_SAMPLES, at, block_of, counters
 
 SHORTEST_S = 0.04

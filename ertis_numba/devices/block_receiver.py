@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.devices.blocks import COUNTERS, FOOTER, FRAME_BYTES, HEADER, Block, Instant
-from ertis_numba.devices.counting import BURST, CounterCheck
+from ertis_numba.devices.counter_check import BURST, CounterCheck
 
 __all__ = ["Block", "BlockParser", "BlockReceiver", "Instant"]
 

@@ -28,9 +28,9 @@ from numpy.typing import NDArray
 from ertis_numba.errors import DeviceError
 from ertis_numba.kernels._cuda import kernel_set
 from ertis_numba.kernels._cuda.lane import SIMULATED, Lane
+from ertis_numba.kernels._device_protocols import Array
 from ertis_numba.kernels._host import HostMemory
 from ertis_numba.kernels._kernel_set import KernelSet
-from ertis_numba.kernels._memory import Array
 
 __all__ = ["Code", "Launch", "code_of", "disassembled", "recorded", "require_compilers"]
 

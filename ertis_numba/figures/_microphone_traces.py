@@ -12,7 +12,7 @@ from ertis_numba.settings import Accuracy, Processing, Settings
 from ertis_numba.stages.matched_filter import MatchedFilter
 from ertis_numba.stages.plan_elements import chain_taps
 from ertis_numba.stages.signals import signals_of
-from ertis_numba.stages.window import time_window
+from ertis_numba.stages.time_window import time_window
 
 __all__ = ["MicrophoneTraces", "echoes", "signals"]
 
