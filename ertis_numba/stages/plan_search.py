@@ -79,7 +79,8 @@ def _open_streams(model: PlanModel, budget: float) -> list[ImagePlan]:
                 ]
             if error <= _NEEDLESS * budget:
                 break
-    return found
+    # The last candidate has the smallest error, which the planner then reports.
+    return found or [direct._replace(beam_taps=given.beam_taps or 0)]
 
 
 def _stream_grids(model: PlanModel, budget: float, direct: ImagePlan) -> list[tuple[int, float]]:
