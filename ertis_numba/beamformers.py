@@ -68,8 +68,8 @@ class Beamformer:
     sensitivity : callable
         Returns the coefficients of `Sensitivity` from the number of microphones; 1 and 0 by default.
     streams : callable
-        Returns the streams whose sums over the microphones determine the amplitude, see `kernels`. Without streams,
-        the default, only ``kernel`` can compute the beamformer.
+        Returns the streams whose sums over the microphones are the power sums of an elementary symmetric polynomial,
+        the amplitude. Without streams, the default, only ``kernel`` can compute the beamformer.
     cost : callable
         Returns the time of ``kernel`` relative to delay-and-sum in single precision.
     single_precision : callable
@@ -104,7 +104,8 @@ class Weighting:
     sensitivity : float
         Increase of the relative error of the image by the weighting, in units of that of delay-and-sum beams.
     streams : tuple of SignalStream
-        Streams whose sums determine the factor.
+        Streams of a coherence factor: that of the beam, and that of the total power. Without streams, the default,
+        only ``kernel`` can compute the factor.
     cost : float
         Time of ``kernel`` relative to delay-and-sum in single precision.
     """

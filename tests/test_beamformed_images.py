@@ -181,7 +181,10 @@ def test_dmas_of_too_few_microphones_is_refused(case, order, many):
 
 def test_process_command_selects_a_beamformer(tmp_path):
     recording, target = write_recording(tmp_path / "rec.h5", noise(count=1)), tmp_path / "img.h5"
-    done = CliRunner().invoke(cli, ["process", str(recording), "-o", str(target), "--beamformer", "capon"])
+    done = CliRunner().invoke(
+        cli, ["process", str(recording), "-o", str(target), "--beamformer", "capon", "--weighting", "coherence_factor"]
+    )
     assert done.exit_code == 0, done.stderr
     with open_energyscapes(target) as images:
-        assert images[0].settings.processing.beamformer == "capon"
+        processing = images[0].settings.processing
+    assert (processing.beamformer, processing.weighting) == ("capon", "coherence_factor")

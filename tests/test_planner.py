@@ -185,6 +185,17 @@ def test_adaptive_beamformers_get_usable_plans(beamformer, weighting):
     assert (exact.precision, exact.delay_taps, exact.beam_taps) == ("float32", 1, 0)
 
 
+def test_spherical_wavefronts_of_adaptive_beamformers_need_16_bits():
+    settings = SMALL.replace(
+        processing=SMALL.processing.replace(weighting="coherence_factor", wavefront="spherical"),
+        accuracy=Accuracy(precision="float32"),
+    )
+    with pytest.raises(
+        ArgumentError, match=r"'coherence_factor' needs 16-bit streams .*give processing.wavefront 'pla"
+    ):
+        Planner(settings, CPU, threads=1).choose()
+
+
 @pytest.mark.parametrize(("beamformer", "weighting"), ADAPTIVE_COMBINATIONS)
 def test_plans_of_former_files_keep_their_kernels(beamformer, weighting):
     """A complete plan of one sample per microphone, without a precision, is that of all microphones at once."""

@@ -100,7 +100,7 @@ def _conditions(report: dict[str, Any]) -> str:
         "`scipy` runs on one thread, like its filters and sums, and processes the whole record, as the paper does. "
         "`paper` takes the same steps with compiled kernels on all cores, and sums only the samples in the window. "
         "`numpy` and `cpu` process the part of the record that the image needs, `cpu` on all cores, `numpy` on one. "
-        "Rows with an older instruction set were measured on the same machine, in turns with the others. ARM has no "
+        "Rows limited to an instruction set were measured on the same machine, in turns with the others. ARM has no "
         "row, because no such machine was available. The paper does not state the length of its records."
     )
 

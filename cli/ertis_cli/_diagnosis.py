@@ -46,7 +46,7 @@ _INSTRUCTION_SETS: Final = {
     "AVX-512 VNNI": "the fastest instructions of the kernels",
     "AVX-512": "slightly slower images than with AVX-512 VNNI",
     "AVX2": "images take about 1.4 times as long as with AVX-512 VNNI",
-    "SSE2": "images take about 3 times as long as with AVX-512 VNNI",
+    "SSE2": "images take about 2.5 times as long as with AVX-512 VNNI",
     "NEON": "not measured; sums in float32 are the fastest, so default plans use them",
     "generic": "not measured",
 }

@@ -34,7 +34,7 @@ __all__ = [
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 _TICK_S = 1e-12
-_AT_ONCE = 2**15  # paths × microphones whose filters are computed at a time
+_AT_ONCE = 2**13  # paths × microphones whose filters are computed at a time
 _LONGEST_STRETCH = 2.0  # of a call; speeds are limited to a third of the speed of sound
 
 

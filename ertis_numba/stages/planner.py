@@ -214,7 +214,8 @@ class Planner:
     def keeps_budget_of_images(self, accuracy: Accuracy) -> bool:
         """Return False if a complete plan of an adaptive beamformer meets the budget for delay-and-sum beams only.
 
-        The answer holds for any sound: it depends neither on the signal model nor on the sensitivity of this planner.
+        The answer holds for any sound, or with streams for echoes in noise. It depends neither on the signal model nor
+        on the sensitivity of this planner.
         """
         if not self.settings.processing.is_adaptive:
             return True
@@ -258,9 +259,9 @@ def _worst(chosen: Chosen) -> str:
 
 
 def _no_plan(settings: Settings) -> str:
-    """Return the reason why no plan exists: the device or the settings exclude streams, and wavefronts need them."""
+    """Return the reason why no plan exists: the settings exclude streams, and spherical wavefronts need them."""
     return (
         f"processing.beamformer {settings.processing.beamformer!r} with weighting {settings.processing.weighting!r} "
-        "needs 16-bit streams for these settings, but accuracy.precision or the processor excludes them; give "
-        "processing.wavefront 'plane', or accuracy.precision 'auto' on a processor with AVX-512 VNNI or AVX-VNNI"
+        "needs 16-bit streams for spherical wavefronts, but the accuracy settings exclude them; give "
+        "processing.wavefront 'plane', or leave accuracy.precision, delay_taps and beam_taps out"
     )

@@ -34,9 +34,10 @@ def recipe_of(processing: Processing) -> Recipe | None:
     """Return the streams of processing settings; None if only a kernel for all microphones can compute them."""
     beamformer = BEAMFORMERS[processing.beamformer]
     streams = beamformer.streams(*beamformer.values(processing))
-    if not streams:
+    weighting = WEIGHTINGS[processing.weighting]
+    if not streams or (weighting.kernel and not weighting.streams):
         return None
-    added = WEIGHTINGS[processing.weighting].streams
+    added = weighting.streams
     whole = streams + tuple(stream for stream in added if stream not in streams)
     beam, total = (whole.index(stream) for stream in added) if added else (-1, -1)
     return Recipe(whole, len(streams), beam, total)

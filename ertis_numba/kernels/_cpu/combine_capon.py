@@ -29,6 +29,7 @@ __all__ = ["combine_capon"]
 
 _ROWS = 64  # ranges of a tile: the signals of so few stay in the L2 cache
 _GROUP = 4  # lags whose sums stay in registers
+_FEW = 16  # directions per block at least, because each block reads the signals of a tile again
 _BLOCK = 256  # directions whose delays and weights (98 kB at 32 microphones) share the cache with the signals of a tile
 _BEYOND = (
     64  # samples that are read beyond a tile, at most: lags up to those of the last group, and the rest of a vector
@@ -190,36 +191,39 @@ def _combine(planes, offsets, table, n_snapshots, loading, unit, out):
     n_windows, middle = n_ranges - n_snapshots + 1, n_snapshots // 2
     n_groups = max(1, (n_snapshots + _GROUP - 2) // _GROUP)
     tile = _ROWS - n_snapshots + 1
-    block = min(_BLOCK, max(1, n_directions // 16))
+    n_tiles = (n_windows + tile - 1) // tile
+    # Small images get smaller blocks, so that every thread gets some.
+    block = min(_BLOCK, max(_FEW, n_directions * n_tiles // 64))
+    n_blocks = (n_directions + block - 1) // block
     lanes = _PAIR * REGISTER_BYTES // planes.itemsize
     width = _ROWS + lanes + _GROUP * n_groups
-    for part in prange((n_directions + block - 1) // block):
+    for part in prange(n_tiles * n_blocks):
+        first, begin = part // n_blocks * tile, part % n_blocks * block
+        count = min(tile, n_windows - first)
         beams, power = np.zeros(2 * width, planes.dtype), np.zeros(width, planes.dtype)
         lags = np.zeros((1 + _GROUP * n_groups) * 2 * width, planes.dtype)
         matrix = np.empty((n_snapshots + 2) * n_snapshots * 2 * lanes, planes.dtype)
         levels = np.empty(2 * width, planes.dtype)
-        for first in range(0, n_windows, tile):
-            count = min(tile, n_windows - first)
-            for direction in range(part * block, min((part + 1) * block, n_directions)):
-                row = out[direction]
-                for group in range(n_groups):
-                    _sum_products(planes, offsets[direction], table[direction], first, width, group, beams, lags)
-                _subtract_mean(beams, n_mics, n_snapshots, width, power, lags)
-                if n_snapshots == _USUAL:
-                    _solve_usual(beams, power, lags, width, count, loading, levels)
-                else:
-                    _solve(beams, power, lags, width, 0, count, middle, n_snapshots, loading, matrix, levels)
-                _write(levels, width, count, unit, row[first + middle :])
-                # The outermost windows also yield the ranges towards the ends.
-                if first == 0:
-                    for k in range(middle):
-                        _solve(beams, power, lags, width, 0, 1, k, n_snapshots, loading, matrix, levels)
-                        _write(levels, width, 1, unit, row[k:])
-                if first + count == n_windows:
-                    for k in range(middle + 1, n_snapshots):
-                        last = count - 1
-                        _solve(beams, power, lags, width, last, count, k, n_snapshots, loading, matrix, levels)
-                        _write(levels, width, 1, unit, row[first + last + k :])
+        for direction in range(begin, min(begin + block, n_directions)):
+            row = out[direction]
+            for group in range(n_groups):
+                _sum_products(planes, offsets[direction], table[direction], first, width, group, beams, lags)
+            _subtract_mean(beams, n_mics, n_snapshots, width, power, lags)
+            if n_snapshots == _USUAL:
+                _solve_usual(beams, power, lags, width, count, loading, levels)
+            else:
+                _solve(beams, power, lags, width, 0, count, middle, n_snapshots, loading, matrix, levels)
+            _write(levels, width, count, unit, row[first + middle :])
+            # The outermost windows also yield the ranges towards the ends.
+            if first == 0:
+                for k in range(middle):
+                    _solve(beams, power, lags, width, 0, 1, k, n_snapshots, loading, matrix, levels)
+                    _write(levels, width, 1, unit, row[k:])
+            if first + count == n_windows:
+                for k in range(middle + 1, n_snapshots):
+                    last = count - 1
+                    _solve(beams, power, lags, width, last, count, k, n_snapshots, loading, matrix, levels)
+                    _write(levels, width, 1, unit, row[first + last + k :])
 
 
 def combine_capon(signals, offsets, weights, n_snapshots, loading, out):
