@@ -80,8 +80,8 @@ def pulse_errors(fit: DelayFit, spectrum: Spectrum, stream: SignalStream) -> tup
         wrong /= np.maximum(1.0, np.abs(wrong) / np.maximum(level, _FAINT * level.max()))
     shared = float(np.sum(np.abs(wrong.mean(axis=0)) ** 2))
     whole = float(np.mean(np.sum(np.abs(wrong) ** 2, axis=1)))
-    energy = float(np.sum(level**2))
-    return (whole - shared) / energy, shared / energy
+    total = float(np.sum(level**2))
+    return (whole - shared) / total, shared / total
 
 
 def _whole(spectrum: Spectrum, stream: SignalStream, stretch: float) -> Spectrum:
