@@ -134,7 +134,7 @@ class Clock:
 
 @pytest.mark.parametrize(
     ("word_s", "image_s", "is_early"),
-    [(1e-6, 1e-3, True), (1e-6, 2e-3, False), (1e-7, 1e-3, False), (0.0, 1e-3, False)],
+    [(1e-6, 1e-3, True), (1e-6, 2.2e-3, False), (1e-7, 1e-3, False), (0.0, 1e-3, False)],
 )
 def test_image_of_near_ranges_is_finished_early_if_the_last_words_take_longer(near, word_s, image_s, is_early):
     pipeline, images, clock = near

@@ -18,7 +18,10 @@ __all__ = ["StreamedImage", "WordStream", "foreign_stream"]
 _STEP = 512  # Signal samples per call of the kernel: 5120 words by default, which arrive in about a millisecond.
 # Share of the time until the last word that an image may take on one thread. `StreamedImage.add` runs in the thread
 # that reads words, so a longer image would delay them, and other threads could not help with it.
-_SHARE: Final = 0.5
+_SHARE: Final = 0.75
+_TIMED: Final = 2  # The first image also touches new memory.
+_TIMED_AT_MOST: Final = 20
+_TIMED_S: Final = 0.05
 
 
 class WordStream:
@@ -128,10 +131,10 @@ class StreamedImage:
         return (perf_counter() - self._begun_s) * (len(self._words) - self._n_words) / n_timed
 
     def _time_s(self) -> float:
-        """Return the time of an image on one thread: the shorter of two, as the first one also touches new memory."""
-        times_s = []
+        """Return the time of an image on one thread: the shortest of several, because other programs interrupt it."""
+        times_s: list[float] = []
         with self._kernels.threads(1):
-            for _ in range(2):
+            while len(times_s) < _TIMED or (len(times_s) < _TIMED_AT_MOST and sum(times_s) < _TIMED_S):
                 begun_s = perf_counter()
                 self._image(self._buffers, self._amplitude, 1)
                 times_s.append(perf_counter() - begun_s)
