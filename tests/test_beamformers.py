@@ -131,7 +131,8 @@ def test_every_beamformer_equals_its_definition(kernel_set, beamformer, weightin
 
 @pytest.mark.parametrize("name", BEAMFORMERS)
 def test_page_lists_every_beamformer_with_its_options(name):
-    (row,) = re.findall(rf"^\| `{name}` \|([^|]*)\|[^|]+\|[^|]+\|$", page("beamformers"), re.MULTILINE)
+    first_table = page("beamformers").partition("| weighting |")[0]
+    (row,) = re.findall(rf"^\| `{name}` \|([^|]*)\|[^|]+\|[^|]+\|$", first_table, re.MULTILINE)
     options = {option.name for option in BEAMFORMERS[name].options}
     assert set(re.findall(r"`(\w+)`", row)) - {"array_weights"} == options
 
