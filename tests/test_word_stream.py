@@ -191,7 +191,7 @@ def test_words_may_be_added_while_another_thread_processes(pipeline):
 def test_stream_of_another_pipeline_is_refused(pipeline):
     with (
         ertis.Pipeline(SETTINGS, "cpu", predict=False) as other,
-        pytest.raises(ArgumentError, match="another pipeline; create it with the method stream"),
+        pytest.raises(ArgumentError, match="another pipeline; create one with stream"),
     ):
         image_of(pipeline, words_of(1), other.stream())
 
@@ -200,7 +200,7 @@ def test_stream_is_refused_by_a_pipeline_that_has_none(pipeline):
     settings = SETTINGS.replace(processing=SETTINGS.processing.replace(method="paper"))
     with ertis.Pipeline(settings, "numpy", predict=False) as other:
         words = words_of(1)
-        with pytest.raises(ArgumentError, match="another pipeline; create it with the method stream"):
+        with pytest.raises(ArgumentError, match="another pipeline; create one with stream"):
             image_of(other, words, pipeline.stream())
         np.testing.assert_array_equal(image_of(other, words, other.stream()), image_of(other, words))
 

@@ -47,7 +47,7 @@ _INSTRUCTION_SETS: Final = {
     "AVX-512": "slightly slower images than with AVX-512 VNNI",
     "AVX2": "images take about 1.4 times as long as with AVX-512 VNNI",
     "SSE2": "images take about 2.5 times as long as with AVX-512 VNNI",
-    "NEON": "not measured; sums in float32 are the fastest, so default plans use them",
+    "NEON": "not timed; by instruction counts, float32 sums are faster, so default plans use float32",
     "generic": "not measured",
 }
 """Meaning of each instruction set for the time of an image of 3000 directions; `ertis bench paper` measures it."""

@@ -2,7 +2,7 @@
 
 The aperture limits the rate at which a beam changes with its direction: the outermost microphones turn their phase
 fastest. Beams at the points of a grid are therefore sufficient if the grid is slightly finer than the resolution of
-the aperture. Any other beam is a weighted sum of the beams around it, with the weights of `fitting`. With 32
+the aperture. Any other beam is a weighted sum of the beams around it, with the weights of `interpolation_fit`. With 32
 microphones and 3000 directions, there are ten times fewer grid points than directions. The weighted sum then has 16
 real terms, instead of 32 or more complex terms for a separate beam.
 

@@ -4,9 +4,9 @@ The error is ``‖image − exact‖ / ‖exact‖`` over all directions and ran
 `tests/reference.py`: float64, no decimation, delays as exact phase shifts.
 
 Most steps cause errors of complex beams. These errors add up like noise, both between microphones and between steps,
-because `fitting` leaves hardly any error that microphones share. Let ε be the error power of a step, relative to the
-power of a microphone's signal after the matched filter. Let ``gain`` be the mean power of the image, relative to the
-image of uncorrelated microphones. The step then contributes the error power
+because `interpolation_fit` leaves hardly any error that microphones share. Let ε be the error power of a step, relative
+to the power of a microphone's signal after the matched filter. Let ``gain`` be the mean power of the image, relative to
+the image of uncorrelated microphones. The step then contributes the error power
 
     s ε / gain ,   s = ½ for gain ≤ 1,   s = 1 − ½ / gain beyond.
 

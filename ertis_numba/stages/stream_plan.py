@@ -18,7 +18,7 @@ image of delay-and-sum, and much less in the images here. Images of noise only, 
 may have larger errors.
 
 The matched filter can apply the gains of delay and beam interpolation to a stream of the signals themselves, see
-`fitting`. Other streams are nonlinear, so the signals for them have no gain.
+`interpolation_fit`. Other streams are nonlinear, so the signals for them have no gain.
 """
 
 import functools

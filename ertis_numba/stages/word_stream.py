@@ -63,7 +63,7 @@ class WordStream:
 
 def foreign_stream() -> ArgumentError:
     """Return the error of a stream that was given to another pipeline."""
-    return ArgumentError("stream is of another pipeline; create it with the method stream() of this one")
+    return ArgumentError("stream belongs to another pipeline; create one with stream() of this pipeline")
 
 
 class StreamedImage:
