@@ -22,7 +22,7 @@ from ertis_numba.settings import ERROR_PRESETS_DB, Array, Settings
 from ertis_numba.stages import paper, paper_scipy, planner
 from ertis_numba.stages.chain_protocol import Chain
 from ertis_numba.stages.costs import PLAN_COSTS, PlanCosts
-from ertis_numba.stages.fast import FastChain
+from ertis_numba.stages.fast_chain import FastChain
 from ertis_numba.stages.kernel_chain import KernelChain
 from ertis_numba.stages.memory import require_memory
 from ertis_numba.stages.word_stream import WordStream, foreign_stream

@@ -3,8 +3,8 @@
 from collections import deque
 
 from ertis_numba.campaign import Campaign, RecordingEnded, find_recordings
+from ertis_numba.campaign.task_actions import run_task
 from ertis_numba.campaign.tasks import TaskUpdate
-from ertis_numba.campaign.work import run_task
 from ertis_numba.settings import Air
 from ertis_numba.storage import write_recording
 from tests.files import SMALL, noise

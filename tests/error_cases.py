@@ -9,7 +9,7 @@ from ertis_numba.geometry import microphones
 from ertis_numba.settings import Accuracy, Array, Call, Processing, Recording
 from ertis_numba.simulation import Electronics, Emitter, Point, Scene, Sensor
 from ertis_numba.simulation.render import Simulator
-from ertis_numba.stages.fast import FastChain
+from ertis_numba.stages.fast_chain import FastChain
 from ertis_numba.stages.planner import Planner
 from ertis_numba.stages.signal_model import signal_model_of
 from tests import reference

@@ -16,7 +16,7 @@ from ertis_numba.simulation import Point
 from ertis_numba.simulation.render import Simulator
 from ertis_numba.stages import planner
 from ertis_numba.stages.adaptive import AdaptiveBeamform
-from ertis_numba.stages.fast import FastChain
+from ertis_numba.stages.fast_chain import FastChain
 from ertis_numba.storage import open_energyscapes, write_recording
 from tests import cases
 from tests.files import noise

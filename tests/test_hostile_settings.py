@@ -19,7 +19,7 @@ from ertis_numba.network.processing.shared_pipeline import SharedPipeline
 from ertis_numba.settings import MAX_CALL_SAMPLES, Array, Call, Processing, Recording, Settings
 from ertis_numba.stages.memory import predicted_bytes
 from tests.central import Node, running, stored
-from tests.faults.network import hostile, run as faults, table
+from tests.faults.network import all_trials as faults, hostile, table
 from tests.faults.network.hostile_hellos import hostile_texts
 from tests.journals import TINY, entries
 

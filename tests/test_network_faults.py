@@ -21,7 +21,7 @@ from ertis_numba.network.messages import Group
 from ertis_numba.network.status import SensorStatus, Status
 from ertis_numba.storage import RecordingWriter, open_recording
 from tests.faults import reliability
-from tests.faults.network import keys, kills, links, peers, processing, run as faults, table, wire, zmtp
+from tests.faults.network import all_trials as faults, keys, kills, links, peers, processing, table, wire, zmtp
 from tests.faults.network.keyed_node import KeyedNode
 from tests.faults.network.sender_thread import SenderThread
 from tests.files import noise

@@ -17,7 +17,7 @@ from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Air, Array, Call, Processing, Recording, Settings
 from ertis_numba.simulation import Point, Scene, Sensor
 from ertis_numba.stages import planner
-from ertis_numba.stages.fast import FastChain
+from ertis_numba.stages.fast_chain import FastChain
 from tests.cases import noise as words_of_noise
 from tests.parabolas import interpolated
 from tests.scenes import heard

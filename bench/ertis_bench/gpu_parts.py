@@ -28,7 +28,7 @@ from ertis_numba.frames import Measurement
 from ertis_numba.kernels._cuda import ceilings
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Settings
-from ertis_numba.stages.fast import FastChain
+from ertis_numba.stages.fast_chain import FastChain
 
 __all__ = ["FULL", "PARTS", "Scale", "ceilings_of", "machine", "paper", "side_by_side"]
 

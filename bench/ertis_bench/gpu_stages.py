@@ -15,7 +15,7 @@ from ertis_numba.kernels import KernelSet, Lane, Memory
 from ertis_numba.kernels._cuda.ceilings import occupy
 from ertis_numba.kernels._cuda.stopwatch import Stopwatch
 from ertis_numba.settings import Settings
-from ertis_numba.stages.fast import FastChain
+from ertis_numba.stages.fast_chain import FastChain
 
 __all__ = ["STAGES", "TRANSFERS", "stages"]
 

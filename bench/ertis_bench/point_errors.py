@@ -21,7 +21,7 @@ from ertis_numba.frames import Energyscape
 from ertis_numba.geometry import direction_grid, microphones, unit_vectors
 from ertis_numba.settings import Accuracy, Processing, Recording, Settings
 from ertis_numba.stages import planner
-from ertis_numba.stages.fast import FastChain
+from ertis_numba.stages.fast_chain import FastChain
 from ertis_numba.waveform import call_at
 
 __all__ = ["BUDGETS_DB", "GRIDS", "RATIOS", "Trials", "form", "run"]

@@ -17,7 +17,7 @@ from ertis_numba.kernels import KernelSet
 from ertis_numba.kernels._cuda import offline_compilation
 from ertis_numba.settings import Settings
 from ertis_numba.stages import planner
-from ertis_numba.stages.fast import FastChain
+from ertis_numba.stages.fast_chain import FastChain
 
 __all__ = ["GOALS", "run"]
 

@@ -23,7 +23,7 @@ from ertis_numba.frames import Measurement
 from ertis_numba.geometry import direction_grid, microphones, unit_vectors
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Settings
-from ertis_numba.stages.fast import FastChain
+from ertis_numba.stages.fast_chain import FastChain
 from ertis_numba.stages.plan_elements import spectrum_of
 
 __all__ = ["problem", "race", "settings_for"]

@@ -21,7 +21,7 @@ from ertis_numba.errors import DataError
 from ertis_numba.frames import Measurement
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Settings
-from ertis_numba.stages.fast import FastChain
+from ertis_numba.stages.fast_chain import FastChain
 
 __all__ = ["LIBRARIES", "ArrayChain", "Library", "Tables", "is_installed", "numpy_library", "race", "tables_of"]
 

@@ -8,9 +8,9 @@ from ertis_bench.accuracy import PAPER, TURN
 from ertis_bench.beamformers import form as beamformers
 from ertis_bench.budgets import form as budgets
 from ertis_bench.campaign_scaling import many
+from ertis_bench.delay_interpolation import form as interpolation
 from ertis_bench.gpu_tables import gpu, gpu_short
 from ertis_bench.health_trials.table import health
-from ertis_bench.interpolation import form as interpolation
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table as _table
 from ertis_bench.network.latency import latency

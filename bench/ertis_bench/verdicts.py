@@ -20,7 +20,7 @@ from ertis_numba.simulation.image_estimate import SAME_RANGE_M, Sight
 from ertis_numba.simulation.loudness import LOUD
 from ertis_numba.simulation.render import Simulator
 from ertis_numba.simulation.snapshot import Snapshot, snapshot
-from ertis_numba.stages.fast import FastChain
+from ertis_numba.stages.fast_chain import FastChain
 
 __all__ = ["Trial", "run", "with_one"]
 

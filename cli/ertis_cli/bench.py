@@ -321,7 +321,7 @@ def interpolation(**given: Any) -> None:
 
     Nothing is timed.
     """
-    from ertis_bench import interpolation as benchmark
+    from ertis_bench import delay_interpolation as benchmark
 
     _run("interpolation", benchmark, **given)
 

@@ -106,7 +106,7 @@ class Task:
     action : {"look", "plan", "make", "check"}
         Action.
     arguments : dict
-        Arguments of the action, see `ertis_numba.campaign.work`.
+        Arguments of the action, see `ertis_numba.campaign.task_actions`.
     """
 
     number: int

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Final
 
 from ertis_numba.campaign.folder import clear_parts
+from ertis_numba.campaign.task_actions import run_task
 from ertis_numba.campaign.tasks import RunTask, TaskReport, WorkerReady
-from ertis_numba.campaign.work import run_task
 from ertis_numba.processes import connect
 
 __all__: list[str] = []

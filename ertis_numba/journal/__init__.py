@@ -1,7 +1,7 @@
 """Journals, which store measurements durably before any other use; the only package that imports sqlite3."""
 
+from ertis_numba.journal._entries import JournalEntry, JournalKey, JournalSensor, require_same_settings
 from ertis_numba.journal._journal import SUFFIX, Journal
-from ertis_numba.journal._records import JournalEntry, JournalKey, JournalSensor, require_same_settings
 from ertis_numba.journal._recovery import LOST
 from ertis_numba.journal._tables import TABLES, VERSION, Column
 from ertis_numba.journal._tally import TALLY

@@ -11,7 +11,7 @@ from typing import Final, Self
 from ertis_numba.errors import ArgumentError, DamagedError, DataError
 from ertis_numba.frames import SequenceGap
 from ertis_numba.journal._database import Database
-from ertis_numba.journal._records import JournalEntry, JournalKey, JournalSensor, verified_values
+from ertis_numba.journal._entries import JournalEntry, JournalKey, JournalSensor, verified_values
 from ertis_numba.journal._tables import COMPLETE_VERSION, select_statement
 
 __all__ = ["SUFFIX", "ReadableJournal"]

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, Final
 from ertis_numba.errors import ArgumentError, DamagedError, DataError
 from ertis_numba.frames import SequenceGap
 from ertis_numba.journal._database import Database
+from ertis_numba.journal._entries import JournalEntry, JournalSensor, verified_values
 from ertis_numba.journal._files import keep_damaged_log
 from ertis_numba.journal._log import WriteAheadLog
-from ertis_numba.journal._records import JournalEntry, JournalSensor, verified_values
 from ertis_numba.journal._tables import select_statement
 
 if TYPE_CHECKING:

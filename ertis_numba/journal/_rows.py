@@ -10,8 +10,8 @@ from ertis_numba.frames import SequenceGap
 from ertis_numba.journal import _free_space
 from ertis_numba.journal._contents import ReadableJournal
 from ertis_numba.journal._database import LOG_BYTES, Database
+from ertis_numba.journal._entries import JournalEntry, JournalSensor, require_same_settings
 from ertis_numba.journal._files import disk_errors
-from ertis_numba.journal._records import JournalEntry, JournalSensor, require_same_settings
 from ertis_numba.journal._tables import VERSION, insert_statement, row_crc32
 from ertis_numba.journal._tally import Tally
 from ertis_numba.settings import Settings

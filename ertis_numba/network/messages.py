@@ -14,7 +14,7 @@ import msgspec
 from msgspec import Meta
 
 from ertis_numba.errors import DataError, FormatVersionError
-from ertis_numba.network.fields import (
+from ertis_numba.network.message_fields import (
     MAX_SEQUENCE,
     AckedThrough,
     Count,

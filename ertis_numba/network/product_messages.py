@@ -4,7 +4,17 @@ from typing import Annotated, Final, Literal, TypeAlias, get_args
 
 from msgspec import Meta
 
-from ertis_numba.network.fields import Count, Int64, Message, Name, Number, OfMeasurement, Position, Quaternion, Uint32
+from ertis_numba.network.message_fields import (
+    Count,
+    Int64,
+    Message,
+    Name,
+    Number,
+    OfMeasurement,
+    Position,
+    Quaternion,
+    Uint32,
+)
 
 __all__ = ["PRODUCTS", "Description", "Group", "Image", "Points", "Product", "Raw", "Report", "Subscribe"]
 

@@ -18,7 +18,7 @@ from ertis_numba.simulation.loudness import LOUD
 from ertis_numba.simulation.scene import Scene
 from ertis_numba.simulation.snapshot import snapshot
 from ertis_numba.stages import planner
-from ertis_numba.stages.fast import FastChain
+from ertis_numba.stages.fast_chain import FastChain
 
 __all__ = ["ABRender", "image_change_db"]
 

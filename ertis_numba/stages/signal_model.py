@@ -14,7 +14,7 @@ from ertis_numba.sample_format import sample_format
 from ertis_numba.settings import Accuracy, Settings
 from ertis_numba.stages.beam_grid import estimated_mics
 from ertis_numba.stages.error_model import SignalModel
-from ertis_numba.stages.fast import FastChain
+from ertis_numba.stages.fast_chain import FastChain
 from ertis_numba.stages.interpolation_fit import WAVES
 from ertis_numba.waveform import matched_band_hz, matched_filter_spectrum, matched_noise_spectrum
 

@@ -12,7 +12,7 @@ from ertis_cli import options
 from ertis_numba import checks
 from ertis_numba.errors import ErtisError
 from tests.faults import reliability as reliability_trials, reliability_table
-from tests.faults.network import run as network_trials, table as network_table
+from tests.faults.network import all_trials as network_trials, table as network_table
 
 PROGRAM = "python -m tests.faults"
 

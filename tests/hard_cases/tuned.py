@@ -2,7 +2,7 @@
 
 from ertis_numba import kernels
 from ertis_numba.pipeline import Pipeline
-from ertis_numba.stages.fast import FastChain
+from ertis_numba.stages.fast_chain import FastChain
 
 
 def tuned(settings, **changes):

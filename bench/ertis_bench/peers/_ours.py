@@ -13,7 +13,7 @@ from ertis_numba import kernels
 from ertis_numba.frames import Measurement
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Settings
-from ertis_numba.stages.fast import FastChain
+from ertis_numba.stages.fast_chain import FastChain
 
 __all__ = ["paper", "this_package"]
 

@@ -16,7 +16,7 @@ from ertis_numba.network.allow_list import Permission
 from ertis_numba.network.central_node._received_items import SensorSession
 from ertis_numba.network.central_node._streams import PeerConnection, SensorTrack, Stream, source_of
 from ertis_numba.network.central_node._volumes import same
-from ertis_numba.network.fields import as_line
+from ertis_numba.network.message_fields import as_line
 from ertis_numba.network.messages import MESSAGES, AskStatus, Data, Gap, Hello, Message, Refused, Subscribe
 from ertis_numba.settings import Settings
 

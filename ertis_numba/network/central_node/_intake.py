@@ -13,7 +13,7 @@ from ertis_numba.network.central_node._archive import Archive
 from ertis_numba.network.central_node._images import Guarded
 from ertis_numba.network.central_node._received_items import ReceivedItem, SensorSession, Stored, StoredDuplicate
 from ertis_numba.network.central_node._streams import Acks, PeerConnection, SensorTrack, Sharing, Stream
-from ertis_numba.network.fields import as_line
+from ertis_numba.network.message_fields import as_line
 from ertis_numba.network.messages import PING_INTERVAL_S, SILENCE_LIMIT_S, Data, Gap, Hello, Message, Refused
 from ertis_numba.network.trace import mark
 

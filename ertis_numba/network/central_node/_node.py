@@ -30,8 +30,8 @@ from ertis_numba.network.central_node._received_items import (
 from ertis_numba.network.central_node._reporting import Condition, EventReporter, text_of
 from ertis_numba.network.central_node._server_socket import ServerSocket
 from ertis_numba.network.central_node._validation import Greeting, Greetings
-from ertis_numba.network.fields import State, as_line
 from ertis_numba.network.keys import ServerKeys
+from ertis_numba.network.message_fields import State, as_line
 from ertis_numba.network.messages import (
     AskStatus,
     Bye,

@@ -16,7 +16,7 @@ from ertis_numba.network.central_node._images import Guarded
 from ertis_numba.network.central_node._intake import Intake
 from ertis_numba.network.central_node._received_items import ReceivedItem
 from ertis_numba.network.central_node._server_socket import ServerSocket
-from ertis_numba.network.fields import State
+from ertis_numba.network.message_fields import State
 from ertis_numba.network.status import Status
 
 __all__ = ["Condition", "EventReporter", "text_of"]

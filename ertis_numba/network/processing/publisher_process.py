@@ -10,8 +10,8 @@ import zmq
 
 from ertis_numba.errors import DataError, ErtisError, FormatVersionError
 from ertis_numba.network import sockets
-from ertis_numba.network.fields import as_line
 from ertis_numba.network.keys import KeyPair, ServerKeys
+from ertis_numba.network.message_fields import as_line
 from ertis_numba.network.messages import (
     AskStatus,
     Bye,

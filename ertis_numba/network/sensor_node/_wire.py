@@ -9,7 +9,7 @@ from ertis_numba.network import messages
 from ertis_numba.network.sensor_node._outgoing_sessions import OutgoingSession, UnackedItem
 
 if TYPE_CHECKING:
-    from ertis_numba.network.fields import Position, Quaternion
+    from ertis_numba.network.message_fields import Position, Quaternion
 
 __all__ = ["Acknowledged", "Frames", "frames_of", "greeting"]
 
