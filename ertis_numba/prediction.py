@@ -98,7 +98,7 @@ class Prediction:
         elif self.budget_applies_to == "echoes":
             scope = (
                 f"; the plan keeps the budget of {self.beamformer} for separate echoes only, not for noise or dense "
-                "echoes. Give a lower accuracy.max_error_db"
+                "echoes"
             )
         return (
             f"images may exceed the error budget: predicted {self.predicted_error_db:.1f} dB "

@@ -7,6 +7,7 @@ import pytest
 
 from ertis_numba import kernels, verification
 from ertis_numba.air import sound_speed_m_s
+from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones
 from ertis_numba.pipeline import Pipeline
@@ -25,7 +26,6 @@ COMBINATIONS = {name: each for name, each in PLAIN.items() if each} | {
 }
 ECHOES = {"one echo in noise": (1, 0.01), "200 echoes": (200, 0.0)}
 DENSE = {"noise": (0, 0.01), "3000 echoes": (3_000, 0.0)}
-pytestmark = pytest.mark.skipif(not CPU.tile_ranges, reason="this processor has no 16-bit dot product")
 
 
 @functools.cache
@@ -75,8 +75,15 @@ def test_nominal_plans_keep_their_budget_for_dense_sound_or_exclude_it_and_warn(
         assert "not for noise or dense echoes" in prediction.warning
 
 
-@pytest.mark.parametrize("budget_db", [-35.0, -60.0])
-@pytest.mark.parametrize("combination", ["delay_and_sum with coherence factor", "dmas 2"])
+@pytest.mark.parametrize(
+    ("combination", "budget_db"),
+    [
+        ("delay_and_sum with coherence factor", -35.0),
+        ("delay_and_sum with coherence factor", -45.0),
+        ("dmas 2", -35.0),
+        ("dmas 2", -60.0),
+    ],
+)
 def test_budgets_are_kept_with_calibrated_gains(combination, budget_db):
     positions_m = np.zeros((16, 3))
     positions_m[:, 1:] = np.random.default_rng(1).uniform(-0.03, 0.03, (16, 2))
@@ -85,3 +92,11 @@ def test_budgets_are_kept_with_calibrated_gains(combination, budget_db):
     image, _, error_db = imaged(COMBINATIONS[combination], (30, 0.0), budget_db=budget_db, array=array, predict=False)
     assert uses_streams(image.settings.processing, image.settings.accuracy) or budget_db < -35.0
     assert error_db <= budget_db
+
+
+def test_coherence_factor_is_refused_below_the_error_of_its_streams():
+    """No finer plan would reduce this error, so the error names the smallest possible one."""
+    settings = Settings(processing=Processing(directions="90", weighting="coherence_factor"))
+    Pipeline(settings.replace(accuracy=Accuracy(max_error_db=-45.0)), predict=False)
+    with pytest.raises(ArgumentError, match=r"the smallest error of these settings is -4\d\.\d"):
+        Pipeline(settings.replace(accuracy=Accuracy(max_error_db=-50.0)), predict=False)
