@@ -335,7 +335,7 @@ def test_signal_ends_import_and_removes_partial_file(tmp_path, number, code):
 def test_signal_in_a_weakref_callback_ends_the_process(number, code):
     """Python prints and then ignores an exception raised in the callback of a weak reference."""
     program = (
-        "import signal, sys, weakref; from ertis_cli import _signals; _signals.obey_signals()\n"
+        "import signal, sys, weakref; from ertis_cli import _stop_signals; _stop_signals.obey_signals()\n"
         "class Dropped: pass\n"
         "item = Dropped()\n"
         f"reference = weakref.ref(item, lambda _: signal.raise_signal({number.value}))\n"
@@ -347,7 +347,7 @@ def test_signal_in_a_weakref_callback_ends_the_process(number, code):
 
 
 SWALLOWED = (
-    "import click, ctypes, signal; from ertis_cli import _signals, main; _signals.obey_signals()\n"
+    "import click, ctypes, signal; from ertis_cli import _stop_signals, main; _stop_signals.obey_signals()\n"
     "@click.command\n"
     "def compile():\n"
     "    ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal({}))()\n"

@@ -26,7 +26,7 @@ def test_signals_end_commands_while_they_start(tmp_path):
 
 
 def run(program):
-    text = "from ertis_cli import _signals; _signals.obey_signals()\nimport signal, sys, time\n" + textwrap.dedent(
+    text = "from ertis_cli import _stop_signals; _stop_signals.obey_signals()\nimport signal, sys, time\n" + textwrap.dedent(
         program
     )
     return subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=False, timeout=30)
@@ -56,7 +56,7 @@ def test_signal_is_not_repeated_during_cleanup():
                 time.sleep(0.3)  # longer than a few intervals after which the signal would come again
                 print("cleared up")
         finally:
-            _signals.interruption.end()
+            _stop_signals.interruption.end()
         """)
     assert (done.returncode, done.stdout, done.stderr) == (143, "cleared up\n", "")
 
@@ -151,12 +151,12 @@ def test_signal_that_is_ignored_from_the_start_stays_ignored():
     """`nohup` starts commands with SIGHUP ignored."""
     program = """
         signal.raise_signal(signal.SIGHUP)
-        with _signals.stopped_by_signals() as asked:
+        with _stop_signals.stopped_by_signals() as asked:
             signal.raise_signal(signal.SIGHUP)
-        print(asked.came, _signals.interruption.asked)
-        with _signals.stopped_by_signals() as asked:
+        print(asked.came, _stop_signals.interruption.asked)
+        with _stop_signals.stopped_by_signals() as asked:
             signal.raise_signal(signal.SIGTERM)
-        print(asked.came == [signal.SIGTERM], _signals.interruption.asked)
+        print(asked.came == [signal.SIGTERM], _stop_signals.interruption.asked)
         """
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
