@@ -20,7 +20,7 @@ from ertis_numba.campaign import (
     campaign,
     existing_output,
     find_recordings,
-    work,
+    task_actions,
 )
 from ertis_numba.settings import Air
 from ertis_numba.storage import open_energyscapes, write_recording
@@ -270,11 +270,11 @@ def test_faulty_microphones_are_reported_or_refused(tmp_path, out, monkeypatch):
 
 def test_memory_and_tasks_are_independent_of_the_number_of_recordings(tmp_path, out, monkeypatch):
     most_kept, most_in_hand = [], []
-    follow = work.run_task
+    follow = task_actions.run_task
 
     def watched(*arguments):
         result = follow(*arguments)
-        most_kept.append(len(vars(work)["_idle_pipelines"]))
+        most_kept.append(len(vars(task_actions)["_idle_pipelines"]))
         return result
 
     monkeypatch.setattr("tests.campaigns.run_task", watched)
@@ -296,7 +296,7 @@ def test_temporary_planning_failure_is_repeated(runs, out, monkeypatch):
     chances = [{"error": "no memory", "by_chance": True}]
 
     def short_of_memory(do, *arguments):
-        return chances.pop() if do == "plan" and chances else work.run_task(do, *arguments)
+        return chances.pop() if do == "plan" and chances else task_actions.run_task(do, *arguments)
 
     monkeypatch.setattr("tests.campaigns.run_task", short_of_memory)
     found, _ = run_here(
@@ -311,8 +311,8 @@ def test_temporary_errors_are_marked(runs, monkeypatch, error):
     def fails(*_, **__):
         raise error
 
-    monkeypatch.setattr(work, "sensor_names", fails)
-    reported = work.run_task("look", {"path": str(runs / "a.h5"), "named": True, "sensor": None})
+    monkeypatch.setattr(task_actions, "sensor_names", fails)
+    reported = task_actions.run_task("look", {"path": str(runs / "a.h5"), "named": True, "sensor": None})
     assert reported == {"error": str(error) or "MemoryError", "by_chance": True}
 
 
@@ -322,7 +322,7 @@ def test_leftovers_are_searched_only_after_a_worker_died(runs, out, monkeypatch)
     def died_of_c(do, about, *more):
         if do == "make" and about["path"].endswith("c.h5"):
             return {"error": "ended by SIGKILL", "by_chance": True}
-        return work.run_task(do, about, *more)
+        return task_actions.run_task(do, about, *more)
 
     monkeypatch.setattr("tests.campaigns.run_task", died_of_c)
     monkeypatch.setattr(campaign, "clear_parts", lambda _, names: searched.append(set(names)))
@@ -343,9 +343,9 @@ def test_duplicate_pipeline_of_another_thread_is_closed(monkeypatch):
         def close(self):
             self.closed += 1
 
-    monkeypatch.setattr(work, "Pipeline", Counted)
-    monkeypatch.setattr(work, "_idle_pipelines", {})
-    borrow = vars(work)["_pipelines"]
+    monkeypatch.setattr(task_actions, "Pipeline", Counted)
+    monkeypatch.setattr(task_actions, "_idle_pipelines", {})
+    borrow = vars(task_actions)["_pipelines"]
     with borrow([SMALL], "cpu", 1) as (first,), borrow([SMALL], "cpu", 1) as (second,):
         assert first is not second
     with borrow([SMALL], "cpu", 1) as (again,):
@@ -375,7 +375,9 @@ def test_gpu_runs_one_task_at_a_time(tmp_path, out, monkeypatch, workers, larges
     """Once a worker reports a GPU, the campaign submits no task until fewer are in progress than the limit."""
 
     def on_a_gpu(*arguments):
-        return {name: "cuda" if name == "device" else value for name, value in work.run_task(*arguments).items()}
+        return {
+            name: "cuda" if name == "device" else value for name, value in task_actions.run_task(*arguments).items()
+        }
 
     pool = Watched(3)
     write_recordings(tmp_path / "many", "abcdef", count=1, settings=FEW_MICS)
@@ -423,8 +425,8 @@ def test_unwritable_folder_is_reported_with_a_remedy(monkeypatch, tmp_path):
     def refused(*_):
         raise OSError(errno.EROFS, "Read-only file system", str(tmp_path / "a.energy.h5.0123abcd.part"))
 
-    monkeypatch.setitem(vars(work)["_ACTIONS"], "make", refused)
-    reported = work.run_task("make", {})
+    monkeypatch.setitem(vars(task_actions)["_ACTIONS"], "make", refused)
+    reported = task_actions.run_task("make", {})
     assert (
         reported["error"]
         == f"{tmp_path / 'a.energy.h5'}: Read-only file system; check the permissions of the file and its "

@@ -26,8 +26,9 @@ def test_signals_end_commands_while_they_start(tmp_path):
 
 
 def run(program):
-    text = "from ertis_cli import _stop_signals; _stop_signals.obey_signals()\nimport signal, sys, time\n" + textwrap.dedent(
-        program
+    text = (
+        "from ertis_cli import _stop_signals; _stop_signals.obey_signals()\nimport signal, sys, time\n"
+        + textwrap.dedent(program)
     )
     return subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=False, timeout=30)
 
