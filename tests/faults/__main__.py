@@ -26,6 +26,12 @@ def _trials(command: Callable[..., None]) -> Callable[..., None]:
     """Add the options of all trials."""
     for option in (
         click.option("--long", is_flag=True, help="Run for hours instead of minutes."),
+        click.option(
+            "--fraction",
+            type=click.FloatRange(min=0, max=1, min_open=True),
+            default=1.0,
+            help="With --long: fraction of its numbers and durations.",
+        ),
         click.option("--seed", type=click.IntRange(min=0), metavar="S", help="Seed of the faults; random by default."),
         click.option("--only", multiple=True, metavar="PART", help="Run only this part; repeatable."),
         click.option(
@@ -66,12 +72,16 @@ def _run(
     only: tuple[str, ...],
     quiet: bool,
     as_json: bool,
+    long: bool,
+    fraction: float,
     **given: Any,
 ) -> None:
     for part in only:
         checks.choice("--only", part, trials.PARTS)
     markers = [(target, markdown.place(target, PROGRAM, [name], only)[1]) for target in targets]
-    report = trials.run(say=lambda text: options.say(text, quiet=quiet), only=only, **given)
+    report = trials.run(
+        say=lambda text: options.say(text, quiet=quiet), only=only, fraction=fraction if long else 0.0, **given
+    )
     for target, marker in markers:
         markdown.update(target, marker, form(report))
     if as_json:

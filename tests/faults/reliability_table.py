@@ -5,6 +5,8 @@ from typing import Any
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table
 
+from tests.faults.trials import command
+
 __all__ = ["reliability"]
 
 _ONE = (
@@ -97,10 +99,8 @@ _ROWS = (
 def reliability(report: dict[str, Any]) -> str:
     """Return the trials and their results, with the seed that repeats them."""
     rows = [_row(texts, report[name]) for name, texts in _ROWS if name in report]
-    options = [*(["--long"] if report["long"] else []), *(f"--only {name}" for name in report["only"])]
-    made = " ".join(["python -m tests.faults reliability", *options, f"--seed {report['seed']}"])
     cells = table(("trial", "required", "result"), rows, numbers=False)
-    return f"{cells}\n\nCommand: `{made}`. {sentence(report['machine'])}"
+    return f"{cells}\n\nCommand: `{command('reliability', report)}`. {sentence(report['machine'])}"
 
 
 def _row(texts: tuple[str, str, str], found: dict[str, Any] | None) -> tuple[str, str, str]:

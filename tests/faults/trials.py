@@ -4,13 +4,13 @@ import json
 import secrets
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 from ertis_bench import machine
 
-__all__ = ["Parts", "try_parts"]
+__all__ = ["Parts", "command", "try_parts"]
 
 Extent = TypeVar("Extent")
 Parts = Mapping[str, tuple[str, Callable[[Extent, Path, int], Any]]]
@@ -19,35 +19,34 @@ Parts = Mapping[str, tuple[str, Callable[[Extent, Path, int], Any]]]
 
 def try_parts(
     parts: "Parts[Any]",
-    extent: Any,
+    short: Any,
+    long: Any,
     *,
     say: Callable[[str], None],
-    long: bool,
+    fraction: float,
     seed: int | None,
     only: Sequence[str],
-    say_found: bool = False,
 ) -> dict[str, Any]:
     """Run all trials, or only some of them, and return the report.
 
     Parameters
     ----------
     parts : mapping of str to (str, callable)
-    extent : dataclass
-        Extent of the trials. Progress messages may refer to its fields.
+    short, long : dataclass
+        Extents of the short and the long form. Progress messages may refer to their fields.
     say : callable
         Called with a line of progress.
-    long : bool
-        Stored in the report.
+    fraction : float
+        Numbers and durations as a fraction of those of the long form; 0 for the short form.
     seed : int, optional
         Random by default.
     only : sequence of str
         Names of trials; all trials if empty.
-    say_found : bool
-        If True, log the result of each trial at once, so that it survives if the program ends hours later.
     """
     seed = secrets.randbits(31) if seed is None else seed
     say(f"seed {seed}")
-    report: dict[str, Any] = {"machine": machine.describe(), "seed": seed, "long": long, "only": list(only)}
+    extent = _scaled(long, fraction) if fraction else short
+    report: dict[str, Any] = {"machine": machine.describe(), "seed": seed, "long": fraction, "only": list(only)}
     for name, (about, part) in parts.items():
         if only and name not in only:
             continue
@@ -55,6 +54,22 @@ def try_parts(
         # An error while removing the folder must not hide an error of the trial.
         with tempfile.TemporaryDirectory(prefix="ertis-", ignore_cleanup_errors=True) as folder:
             report[name] = part(extent, Path(folder), seed)
-        if say_found:
-            say(f"  {json.dumps(report[name])}")
+        say(f"  {json.dumps(report[name], default=str)}")  # survives if the program ends hours later
     return report
+
+
+def command(name: str, report: dict[str, Any]) -> str:
+    """Return the command that repeats the trials of a report."""
+    long = (
+        [] if not report["long"] else ["--long"] if report["long"] == 1 else [f"--long --fraction {report['long']:g}"]
+    )
+    only = [f"--only {part}" for part in report["only"]]
+    return " ".join(["python -m tests.faults", name, *long, *only, f"--seed {report['seed']}"])
+
+
+def _scaled(extent: Any, fraction: float) -> Any:
+    """Return an extent with smaller numbers and durations, but with the same rates."""
+    values = asdict(extent)
+    numbers = {name: max(1, round(value * fraction)) for name, value in values.items() if name.startswith("n_")}
+    durations = {name: value * fraction for name, value in values.items() if name.endswith("_s")}
+    return replace(extent, **numbers, **durations)

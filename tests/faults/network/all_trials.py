@@ -83,10 +83,10 @@ LONG = NetworkFaultCounts(
 
 
 def run(
-    *, say: Callable[[str], None], long: bool = False, seed: int | None = None, only: Sequence[str] = ()
+    *, say: Callable[[str], None], fraction: float = 0.0, seed: int | None = None, only: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Run all trials, or only some of `PARTS`, and return the report."""
-    return try_parts(PARTS, LONG if long else SHORT, say=say, long=long, seed=seed, only=only, say_found=True)
+    """Run all trials, or only some of `PARTS`, to a fraction of the long form, and return the report."""
+    return try_parts(PARTS, SHORT, LONG, say=say, fraction=fraction, seed=seed, only=only)
 
 
 def _disk_full(_: NetworkFaultCounts, folder: Path, seed: int) -> dict[str, Any] | None:

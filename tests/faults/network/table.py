@@ -7,6 +7,8 @@ from ertis_bench.machine import sentence
 from ertis_bench.markdown import table
 from ertis_bench.network.table import as_list
 
+from tests.faults.trials import command
+
 __all__ = ["ROWS", "network", "row"]
 
 _STORED: Final = "{stored:,} stored, {lost} lost, {twice} twice, {wrong} wrong, {silent} unexplained"
@@ -151,10 +153,8 @@ ROWS: Final[dict[str, tuple[str, str, str]]] = {
 def network(report: dict[str, Any]) -> str:
     """Return the trials and their results, with the seed that repeats them."""
     rows = [row(name, report[name]) for name in ROWS if name in report]
-    options = [*(["--long"] if report["long"] else []), *(f"--only {name}" for name in report["only"])]
-    made = " ".join(["python -m tests.faults network", *options, f"--seed {report['seed']}"])
     cells = table(("fault", "required", "result"), rows, numbers=False)
-    return f"{cells}\n\nCommand: `{made}`. {sentence(report['machine'])}"
+    return f"{cells}\n\nCommand: `{command('network', report)}`. {sentence(report['machine'])}"
 
 
 def row(name: str, found: Mapping[str, Any] | None) -> tuple[str, str, str]:
