@@ -3,7 +3,7 @@
 import difflib
 import math
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import TypeVar
 
 import numpy as np
@@ -25,6 +25,7 @@ __all__ = [
     "reason_unreadable",
     "sensor_name",
     "shape",
+    "unknown_choice",
 ]
 
 _ItemType = TypeVar("_ItemType")
@@ -84,11 +85,15 @@ def length(name: str, value: str, largest: int) -> None:
 def choice(name: str, value: object, known: Iterable[object]) -> None:
     """Refuse a ``value`` that is not among ``known``; the error names the most similar one."""
     names = [str(item) for item in known]
-    if str(value) in names:
-        return
-    near = difflib.get_close_matches(str(value), names, n=1)
+    if str(value) not in names:
+        raise ArgumentError(unknown_choice(name, str(value), names))
+
+
+def unknown_choice(name: str, value: str, known: Sequence[str]) -> str:
+    """Return the message of an error about a ``value`` that is not among ``known``; it names the most similar one."""
+    near = difflib.get_close_matches(value, known, n=1)
     hint = f" (did you mean {near[0]!r}?)" if near else ""
-    raise ArgumentError(f"{name} {str(value)!r} is unknown{hint}; known are {', '.join(names)}")
+    return f"{name} {value!r} is unknown{hint}; known are {', '.join(known)}"
 
 
 def finite_array(name: str, values: NDArray[np.floating]) -> None:

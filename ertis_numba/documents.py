@@ -35,6 +35,7 @@ _NAME = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _LONG_KEY = re.compile(rf"(?<![\w-]){_NAME}(?:[ \t]*+\.[ \t]*+{_NAME}){{{MAX_KEY_PARTS}}}")
 _PATH_PART = re.compile(r"\.(\w+)|\[(\d+)\]")
 _EXPECTED = re.compile(r"Expected `([^`]*)`(?: of length (\d+), got (\d+))?")
+_CHOICE = re.compile(r"Invalid enum value '(.*)'")
 _TOML_TYPES: Final = (dt.datetime, dt.date, dt.time)
 _TYPE_NAMES = {
     "array": "a list",
@@ -343,12 +344,29 @@ def _without_none(value: Any) -> Any:
 def _document_error(kind: type[TomlDocument], source: str | None, error: msgspec.MsgspecError, line: str = "") -> str:
     """Return the message of an error: place, problem and remedy."""
     reason, _, path = str(error).partition(" - at `$")
+    choice = _CHOICE.fullmatch(reason)
+    if choice is not None:
+        reason = checks.unknown_choice("value", choice[1], list(_choices(kind, re.findall(r"[a-z]\w*", path))))
     path = f", {path.strip('.`')}" if path.strip(".`") else ""
     reason = reason.replace("Object contains unknown field", "unknown key")
     if reason.startswith("Object missing required field "):
         reason = f"{reason.removeprefix('Object missing required field ')} is missing; give it"
     remedy = "" if ";" in reason else "; correct it or remove it"
     return f"{source or kind.__name__.lower()}{line}{path}: {reason}{remedy}"
+
+
+def _choices(kind: Any, keys: list[str]) -> Iterator[str]:
+    """Yield the texts that a key accepts."""
+    if not keys:
+        if get_origin(kind) is Literal:
+            yield from get_args(kind)
+        for part in get_args(kind):
+            yield from _choices(part, keys)
+        return
+    for table in _tables(kind):
+        types = {field.name: field.type for field in msgspec.structs.fields(table)}
+        if keys[0] in types:
+            yield from _choices(types[keys[0]], keys[1:])
 
 
 def _line_of_error(kind: type[TomlDocument], text: str, error: msgspec.ValidationError) -> int:

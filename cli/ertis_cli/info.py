@@ -149,11 +149,14 @@ def _recording(reader: "RecordingReader") -> dict[str, Any]:
 
 
 def _energyscapes(reader: "EnergyscapeReader") -> dict[str, Any]:
+    processing = reader.settings.processing
     return {
         "directions": len(reader.azimuth_rad),
         "ranges": len(reader.range_m),
         "range_m": [round(float(reader.range_m[index]), 4) for index in (0, -1)],
-        "method": reader.settings.processing.method,
+        "method": processing.method,
+        "beamformer": processing.beamformer,
+        "weighting": processing.weighting,
         **_mounting(reader),
         **_error(reader),
         **({"call_warning": reader.call_warning} if reader.call_warning else {}),
