@@ -29,7 +29,7 @@ __all__ = ["chain", "disk_full", "emulated", "kills", "platform", "sent_by_emula
 
 _ERTIS = (sys.executable, "-m", "ertis_cli")
 _WAIT_S = 120.0  # for any step that must end without help
-_SEALED_S = 900.0  # for sealing a long capture
+_CAPTURE_S = 1_800.0  # for the longest capture and its sealing
 Line = dict[str, Any]
 
 
@@ -217,7 +217,7 @@ def _ports(ports: list[str]) -> list[str]:
 
 def _capture(ports: list[str], target: Path, *options: str) -> list[Line]:
     """Run a capture until it ends, and return all lines that it printed."""
-    done = ask("capture", *_ports(ports), "-o", str(target), "--json", "--quiet", *options)
+    done = ask("capture", *_ports(ports), "-o", str(target), "--json", "--quiet", *options, timeout_s=_CAPTURE_S)
     if done.returncode:
         raise DataError(f"ertis capture ended with {done.returncode}: {done.stderr.strip()}")
     return [json.loads(line) for line in done.stdout.splitlines()]

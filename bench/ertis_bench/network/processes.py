@@ -224,10 +224,10 @@ def free_address() -> str:
         return f"tcp://127.0.0.1:{server.getsockname()[1]}"
 
 
-def ask(*arguments: str) -> "subprocess.CompletedProcess[str]":
+def ask(*arguments: str, timeout_s: float = 600.0) -> "subprocess.CompletedProcess[str]":
     """Run an ``ertis`` command until it ends."""
     command = [*ERTIS, *arguments]
-    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=600.0)  # noqa: S603
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=timeout_s)  # noqa: S603
 
 
 def survivors(mark: str) -> dict[int, str]:
