@@ -37,11 +37,12 @@ class SignalStream(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class BeamformerOption:
-    """Setting of a beamformer: a key of `Processing` and its limits. Limits of integers are of type int."""
+    """Key of `Processing` for a beamformer, with its limits, and help in one line. Limits of integers are of type int."""
 
     name: str
     low: float
     high: float
+    help: str
 
 
 def _amplitudes(weights: "NDArray[np.complex64]", *_: float) -> "NDArray[np.complex64]":
@@ -156,7 +157,7 @@ BEAMFORMERS: Final[Mapping[BeamformerName, Beamformer]] = MappingProxyType(
         "delay_and_sum": Beamformer(kernel="", streams=lambda: (_BEAM,)),
         "dmas": Beamformer(
             kernel="combine_dmas",
-            options=(BeamformerOption("dmas_order", 2, 8),),
+            options=(BeamformerOption("dmas_order", 2, 8, "Microphone signals that dmas multiplies at a time"),),
             weights=_dmas_roots,
             sensitivity=lambda _, order: (float(order), 0.0),  # error powers of the factors add up
             # Power sums, from which Newton's identities give the sum of the products.
@@ -166,7 +167,10 @@ BEAMFORMERS: Final[Mapping[BeamformerName, Beamformer]] = MappingProxyType(
         ),
         "capon": Beamformer(
             kernel="combine_capon",
-            options=(BeamformerOption("snapshots", 1, 32), BeamformerOption("diagonal_loading", 1e-6, 1e6)),
+            options=(
+                BeamformerOption("snapshots", 1, 32, "Ranges from which capon estimates its covariance matrix"),
+                BeamformerOption("diagonal_loading", 1e-6, 1e6, "Loading of capon, relative to the mean power"),
+            ),
             sensitivity=_capon_sensitivity,
             single_precision=_capon_single_precision,
         ),

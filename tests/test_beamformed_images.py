@@ -188,3 +188,27 @@ def test_process_command_selects_a_beamformer(tmp_path):
     with open_energyscapes(target) as images:
         processing = images[0].settings.processing
     assert (processing.beamformer, processing.weighting) == ("capon", "coherence_factor")
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ("--beamformer dmas --dmas-order 3", {"dmas_order": 3}),
+        ("--beamformer capon --snapshots 7 --diagonal-loading 0.5", {"snapshots": 7, "diagonal_loading": 0.5}),
+    ],
+)
+def test_process_command_takes_the_options_of_a_beamformer(tmp_path, options, expected):
+    recording, target = write_recording(tmp_path / "rec.h5", noise(count=1)), tmp_path / "img.h5"
+    done = CliRunner().invoke(cli, ["process", str(recording), "-o", str(target), *options.split()])
+    assert done.exit_code == 0, done.stderr
+    with open_energyscapes(target) as images:
+        processing = images[0].settings.processing
+    assert {name: getattr(processing, name) for name in expected} == expected
+
+
+def test_process_command_refuses_the_option_of_another_beamformer(tmp_path):
+    recording, target = write_recording(tmp_path / "rec.h5", noise(count=1)), tmp_path / "img.h5"
+    done = CliRunner().invoke(cli, ["process", str(recording), "-o", str(target), "--dmas-order", "3"])
+    assert done.exit_code == 2
+    assert "--dmas-order is an option of dmas, but the beamformer is delay_and_sum; add" in done.stderr
+    assert not target.exists()

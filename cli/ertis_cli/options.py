@@ -12,6 +12,7 @@ import click
 from click.shell_completion import CompletionItem
 
 from ertis_cli import _progress
+from ertis_numba.beamformers import BEAMFORMERS, WEIGHTINGS, BeamformerOption
 
 if TYPE_CHECKING:
     from ertis_numba.analysis.compare import Comparison
@@ -150,6 +151,43 @@ quiet: Decorator = click.option(
 threads: Decorator = click.option("--threads", type=int, metavar="N", help="Number of threads; all cores by default.")
 
 
+def _number(option: BeamformerOption) -> click.IntRange | click.FloatRange:
+    """Return the type of the option of a beamformer, with its limits."""
+    if isinstance(option.low, int):
+        return click.IntRange(option.low, int(option.high))
+    return click.FloatRange(option.low, option.high)
+
+
+def beamforming(default: str) -> Decorator:
+    """Return the options of all registered beamformers and weightings, named like the fields of `Processing`.
+
+    The command receives them by those names, and None where an option is not given.
+    """
+    declared = (option for beamformer in BEAMFORMERS.values() for option in beamformer.options)
+    added = [
+        click.option("--beamformer", type=click.Choice(list(BEAMFORMERS)), help=f"Beamformer; {default} by default."),
+        click.option(
+            "--weighting", type=click.Choice(list(WEIGHTINGS)), help=f"Weighting of amplitudes; {default} by default."
+        ),
+        *(
+            click.option(
+                "--" + option.name.replace("_", "-"),
+                type=_number(option),
+                metavar="N" if isinstance(option.low, int) else "X",
+                help=f"{option.help}; {default} by default.",
+            )
+            for option in declared
+        ),
+    ]
+
+    def add(command: Any) -> Any:
+        for option in reversed(added):
+            command = option(command)
+        return command
+
+    return add
+
+
 def input_file(metavar: str) -> Decorator:
     """Return the argument for the input file."""
     return click.argument("path", metavar=metavar, type=_FILE)
@@ -248,9 +286,22 @@ def settings_with(
             ctx=click.get_current_context(),
         )
     settings = settings.replace(processing=settings.processing.replace(**given))
+    _require_own_options(settings.processing.beamformer, given)
     if max_error_db is None:
         return settings
     return settings.replace(accuracy=settings.accuracy.replace(max_error_db=max_error_db))
+
+
+def _require_own_options(beamformer: str, given: Iterable[str]) -> None:
+    """Raise UsageError for an option of another beamformer, which would have no effect."""
+    for name, other in BEAMFORMERS.items():
+        unused = {option.name for option in other.options}.intersection(given) if name != beamformer else ()
+        for option in sorted(unused):
+            raise click.UsageError(
+                f"--{option.replace('_', '-')} is an option of {name}, but the beamformer is {beamformer}; "
+                f"add --beamformer {name}, or omit the option",
+                ctx=click.get_current_context(),
+            )
 
 
 def pipeline(

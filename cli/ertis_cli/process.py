@@ -9,7 +9,6 @@ import click
 
 from ertis_cli import _mountings, _plans, _process_many, options
 from ertis_cli._config import typed
-from ertis_numba.beamformers import BEAMFORMERS, WEIGHTINGS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -46,16 +45,7 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
 @click.option(
     "--method", type=click.Choice(["fast", "paper"]), help="Processing method; the recording's own by default."
 )
-@click.option(
-    "--beamformer",
-    type=click.Choice(list(BEAMFORMERS)),
-    help="Beamformer; the recording's own by default.",
-)
-@click.option(
-    "--weighting",
-    type=click.Choice(list(WEIGHTINGS)),
-    help="Weighting of amplitudes; the recording's own by default.",
-)
+@options.beamforming("the recording's own")
 @click.option(
     "--array-weights",
     metavar="WINDOW",
@@ -132,8 +122,6 @@ def process(
     elevation: tuple[float, float] | None,
     range_m: tuple[float, float] | None,
     method: str | None,
-    beamformer: str | None,
-    weighting: str | None,
     array_weights: str | None,
     wavefront: str | None,
     max_error_db: float | None,
@@ -152,6 +140,7 @@ def process(
     force: bool,
     quiet: bool,
     as_json: bool,
+    **beamforming: Any,
 ) -> None:
     """Process recordings into energyscapes.
 
@@ -177,8 +166,7 @@ def process(
             elevation_limits_deg=elevation,
             range_m=range_m,
             method=method,
-            beamformer=beamformer,
-            weighting=weighting,
+            **beamforming,
             array_weights=array_weights,
             wavefront=wavefront,
             max_error_db=max_error_db,

@@ -7,7 +7,6 @@ import click
 
 from ertis_cli import _central_watch, _network, _supervisor, options
 from ertis_cli._saving import withdrawn
-from ertis_numba.beamformers import BEAMFORMERS, WEIGHTINGS
 
 __all__ = ["serve"]
 
@@ -29,16 +28,7 @@ _FOLDER = click.Path(path_type=Path)
 @click.option("--directions", metavar="GRID", help="90, 1850, 3000, 2d:N or 3d:N; the sensor's own grid by default.")
 @click.option("--range", "range_m", type=options.INTERVAL, help="First and last range in m.")
 @click.option("--method", type=click.Choice(["fast", "paper"]), help="Processing method; the sensor's own by default.")
-@click.option(
-    "--beamformer",
-    type=click.Choice(list(BEAMFORMERS)),
-    help="Beamformer; the sensor's own by default.",
-)
-@click.option(
-    "--weighting",
-    type=click.Choice(list(WEIGHTINGS)),
-    help="Weighting of amplitudes; the sensor's own by default.",
-)
+@options.beamforming("the sensor's own")
 @click.option(
     "--max-error",
     "max_error_db",
@@ -88,8 +78,6 @@ def serve(
     directions: str | None,
     range_m: tuple[float, float] | None,
     method: str | None,
-    beamformer: str | None,
-    weighting: str | None,
     max_error_db: float | None,
     plan: Literal["nominal", "measured"],
     device: str,
@@ -104,6 +92,7 @@ def serve(
     every: bool,
     quiet: bool,
     as_json: bool,
+    **beamforming: Any,
 ) -> None:
     """Run a central node that computes and publishes images.
 
@@ -125,8 +114,7 @@ def serve(
         "directions": directions,
         "range_m": range_m,
         "method": method,
-        "beamformer": beamformer,
-        "weighting": weighting,
+        **beamforming,
     }
     keys = _network.server_keys(key, allow)
     with withdrawn(folder, quarantine) as made:
