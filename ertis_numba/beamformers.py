@@ -37,7 +37,7 @@ class SignalStream(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class BeamformerOption:
-    """Key of `Processing` for a beamformer, with its limits, and help in one line. Limits of integers are of type int."""
+    """Key of `Processing` for a beamformer, its limits, and help in one line. Limits of integers are of type int."""
 
     name: str
     low: float
