@@ -207,3 +207,9 @@ def test_beam_grid_is_used_for_many_directions_only():
         counts[directions] = chosen.settings.accuracy.beam_taps
     assert counts["3d:60"] == 0
     assert counts["3d:3000"] > 0
+
+
+def test_one_enabled_microphone_beside_the_origin_uses_no_beam_grid():
+    array = Array(layout="eRTIS_v3D1", disabled=tuple(range(1, 32)))
+    settings = Settings(array=array, processing=Processing(directions="2d:181"))
+    assert Pipeline(settings, device="numpy").settings.accuracy.beam_taps == 0

@@ -71,6 +71,14 @@ class Aperture:
         """Number of axes in which the array extends, 0 to 3."""
         return int(self.positions_m.shape[1])
 
+    @property
+    def supports_grid(self) -> bool:
+        """Whether the array is a line or a plane with an extent along each axis, as interpolation of beams needs.
+
+        A single microphone beside the origin has an axis, but no extent along it.
+        """
+        return self.n_axes in {1, 2} and bool(np.all(np.ptp(self.positions_m, axis=0) > _FLAT_M))
+
     def delays_s(
         self, points: NDArray[np.float64], *, sound_speed_m_s: float, range_m: float = math.inf
     ) -> NDArray[np.float64]:
@@ -120,8 +128,8 @@ def require_beam_grid(aperture: Aperture, n_ranges: int) -> None:
     ArgumentError
         The array is neither a line nor a plane, or the image has fewer than `FEWEST_RANGES` ranges.
     """
-    if aperture.n_axes not in {1, 2}:
-        extent = "has no extent" if aperture.n_axes == 0 else "is neither a line nor a plane"
+    if not aperture.supports_grid:
+        extent = "is neither a line nor a plane" if aperture.n_axes == 3 else "has no extent along an axis"
         raise ArgumentError(
             f"accuracy.beam_taps is above 0, but the array {extent}. Beam interpolation needs a line or a plane array; "
             "give 0 or omit accuracy.beam_taps"

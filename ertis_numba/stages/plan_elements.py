@@ -50,7 +50,7 @@ def _spectrum_of(settings: Settings) -> Spectrum:
 def beam_grid_of(settings: Settings, aperture: Aperture, spectrum: Spectrum) -> BeamGrid | None:
     """Return the beam grid of a complete plan; None if every direction has its own beam."""
     plan = settings.accuracy
-    if not plan.beam_taps or aperture.n_axes not in {1, 2}:
+    if not plan.beam_taps or not aperture.supports_grid:
         return None
     return BeamGrid(
         aperture,

@@ -87,7 +87,7 @@ def _stream_grids(model: PlanModel, budget: float, direct: ImagePlan) -> list[tu
     """Return the candidates for the beam grids of streams; 0 taps stand for one beam per direction."""
     given = model.settings.accuracy
     found: list[tuple[int, float]] = [] if given.beam_taps else [(0, direct.density)]
-    flat = model.aperture.n_axes in {1, 2} and len(model.window.range_m) >= FEWEST_RANGES
+    flat = model.aperture.supports_grid and len(model.window.range_m) >= FEWEST_RANGES
     if given.beam_taps == 0 or not (flat or given.beam_taps):
         return found
     for beam_taps in [given.beam_taps] if given.beam_taps else GRID_DENSITIES:
@@ -123,7 +123,7 @@ def _open_delays(model: PlanModel, budget: float, *, adaptive: bool) -> list[tup
 def _open_nodes(model: PlanModel, budget: float, *, adaptive: bool) -> list[tuple[int, float]]:
     """Return the candidates for beam taps and density of the beam grid; 0 taps stand for one beam per direction."""
     given = model.settings.accuracy
-    flat = model.aperture.n_axes in {1, 2} and len(model.window.range_m) >= FEWEST_RANGES
+    flat = model.aperture.supports_grid and len(model.window.range_m) >= FEWEST_RANGES
     if adaptive or given.beam_taps == 0 or not (flat or given.beam_taps):
         return [(0, given.beam_density or 2.0)]
     found: list[tuple[int, float]] = [] if given.beam_taps else [(0, given.beam_density or 2.0)]

@@ -118,7 +118,7 @@ class StreamPlanner:
             high_hz = highest_hz(self._call.low_frequency_hz, self._call.high_frequency_hz, stream)
             spectrum, shares = self._spectrum_of(stream), self._shares(place)
             grid = None
-            if beam_taps and self._aperture.n_axes in {1, 2}:
+            if beam_taps and self._aperture.supports_grid:
                 limit = math.inf if place == 0 else _SMALL * (first.echoes + first_grid)
                 grid = self._grid(
                     *(spectrum, shares, beam_taps, density, high_hz, limit),
