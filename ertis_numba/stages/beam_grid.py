@@ -73,7 +73,7 @@ class Aperture:
 
     @property
     def supports_grid(self) -> bool:
-        """Whether the array is a line or a plane with an extent along each axis, as interpolation of beams needs.
+        """True if beams can be interpolated: for a line or a plane with an extent along each axis.
 
         A single microphone beside the origin has an axis, but no extent along it.
         """
