@@ -165,3 +165,14 @@ def test_signal_that_is_ignored_from_the_start_stays_ignored():
     finally:
         signal.signal(signal.SIGHUP, before)
     assert (done.returncode, done.stdout) == (0, "[] False\nTrue True\n")
+
+
+def test_signal_in_the_code_of_imports_waits_for_its_end():
+    """An exception there would keep import locks, and a command that waits for a thread's import would never end."""
+    done = run("""
+        text = "def find():\\n    signal.raise_signal(signal.SIGTERM)\\n    return 'found'"
+        exec(compile(text, "<frozen importlib._bootstrap>", "exec"))
+        print(find(), flush=True)
+        time.sleep(20)
+        """)
+    assert (done.returncode, done.stdout, done.stderr) == (143, "found\n", "")

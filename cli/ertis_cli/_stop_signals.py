@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from types import FrameType
 from typing import Any, Final, NoReturn
 
 __all__ = [
@@ -35,6 +36,9 @@ class Interruption:
     bare ``except`` clause may catch it and continue. A thread therefore checks that the main thread is still unwinding,
     and sends the signal again otherwise.
 
+    The handler raises nothing in Python's own code for imports, which would keep its locks, so that an import in
+    another thread would wait forever. The signal is sent again a moment later.
+
     Attributes
     ----------
     asked : bool
@@ -47,7 +51,7 @@ class Interruption:
         self._over = threading.Event()
         self._threads: list[threading.Thread] = []
 
-    def __call__(self, number: int, _: object) -> None:
+    def __call__(self, number: int, frame: FrameType | None) -> None:
         if self._over.is_set():
             return
         self.asked = True
@@ -56,7 +60,8 @@ class Interruption:
         thread = threading.Thread(target=self._insist, args=(error, number), name="ertis-signal", daemon=True)
         self._threads.append(thread)
         thread.start()
-        raise error
+        if frame is None or not frame.f_code.co_filename.startswith("<frozen importlib"):
+            raise error
 
     @property
     def code(self) -> int | None:
