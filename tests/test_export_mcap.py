@@ -4,17 +4,19 @@ import sys
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosReliability
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from ertis_numba.air import sound_speed_m_s
+from ertis_numba.analysis.nearest_echo import nearest_echo
 from ertis_numba.analysis.points import PointExtractor
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Stamp
 from ertis_numba.geometry import Grid, direction_grid, unit_vectors
 from ertis_numba.interop import TOPICS, export
-from ertis_numba.interop._messages import DEFINITIONS, schema
+from ertis_numba.interop.ros_definitions import DEFINITIONS, schema
 from ertis_numba.settings import Processing, Settings
 from tests.files import SMALL, image
 
@@ -39,6 +41,7 @@ GIVEN = [
 ]
 KINDS = {
     "points": "sensor_msgs/msg/PointCloud2",
+    "scan": "sensor_msgs/msg/LaserScan",
     "image": "sensor_msgs/msg/Image",
     "sonar_image": "marine_acoustic_msgs/msg/ProjectedSonarImage",
 }
@@ -82,9 +85,15 @@ def header(given, frame):
 def test_mcap_has_the_documented_topics(bag):
     messages, profiles, kinds = bag
     assert tuple(KINDS) == TOPICS
-    wanted = {f"{base}/{topic}": kind for base in FRAMES.values() for topic, kind in KINDS.items()}
+    planar = {each.stamp.sensor for each in GIVEN if each.is_planar}  # The other images have no scans.
+    topics = {sensor: [each for each in TOPICS if each != "scan" or sensor in planar] for sensor in FRAMES}
+    wanted = {f"{base}/{topic}": KINDS[topic] for sensor, base in FRAMES.items() for topic in topics[sensor]}
     assert kinds == wanted | {"/tf_static": "tf2_msgs/msg/TFMessage"}
-    times = {(f"{FRAMES[each.stamp.sensor]}/{topic}", each.stamp.timestamp_ns) for each in GIVEN for topic in TOPICS}
+    times = {
+        (f"{FRAMES[each.stamp.sensor]}/{topic}", each.stamp.timestamp_ns)
+        for each in GIVEN
+        for topic in topics[each.stamp.sensor]
+    }
     assert set(messages) == times | {("/tf_static", TIME_NS)}
     for topic, (profile,) in profiles.items():
         static = topic == "/tf_static"
@@ -102,21 +111,35 @@ def test_mcap_points_come_back(bag, given):
     grid = Grid(given.azimuth_rad, given.elevation_rad)
     cloud = PointExtractor(given.settings, grid, top=40, min_level_db=-60.0)(given)
     assert len(cloud) > 1
-    rows = np.column_stack([cloud.position_m, cloud.amplitude])
+    rows = np.column_stack([cloud.position_m, 20 * np.log10(cloud.amplitude), cloud.uncertainty_m])
     assert reported(message) == {
         "header": header(given, sensor),
         "height": 1,
         "width": len(cloud),
         "fields": [
             {"name": name, "offset": 4 * number, "datatype": 7, "count": 1}
-            for number, name in enumerate(["x", "y", "z", "intensity"])
+            for number, name in enumerate(["x", "y", "z", "intensity", "uncertainty_range", "uncertainty_across"])
         ],
         "is_bigendian": False,
-        "point_step": 16,
-        "row_step": 16 * len(cloud),
+        "point_step": 24,
+        "row_step": 24 * len(cloud),
         "data": list(rows.astype("<f4").tobytes()),
         "is_dense": True,
     }
+
+
+@pytest.mark.parametrize("given", GIVEN[:2], ids=["first", "second"])
+def test_mcap_scan_has_the_nearest_echo_of_each_azimuth(bag, given):
+    sensor = given.stamp.sensor
+    scan = bag[0][f"{FRAMES[sensor]}/scan", given.stamp.timestamp_ns]
+    order = np.argsort(given.azimuth_rad)
+    angles = scan.angle_min + scan.angle_increment * np.arange(len(scan.ranges))
+    assert_allclose(angles, given.azimuth_rad[order], atol=1e-6)  # The angles of this grid are evenly spaced.
+    range_m, level_dbfs = nearest_echo(given)
+    assert np.isfinite(range_m).any()
+    assert np.array_equal(scan.ranges, range_m[order].astype(np.float32))
+    assert np.array_equal(scan.intensities, level_dbfs[order])
+    assert (scan.range_min, scan.range_max) == (np.float32(given.range_m[0]), np.float32(given.range_m[-1]))
 
 
 @pytest.mark.parametrize("given", GIVEN, ids=["first", "second", "spatial"])
@@ -236,7 +259,8 @@ def test_mcap_has_static_transforms(bag):
 def test_message_definitions_equal_those_of_ros():
     """Hashes of REP 2016 confirm them; the marine messages are compared by their fields."""
     own, theirs = get_typestore(Stores.EMPTY), get_typestore(Stores.ROS2_JAZZY)
-    for name in ("tf2_msgs/msg/TFMessage", *KINDS.values()):
+    others = ("tf2_msgs/msg/TFMessage", "diagnostic_msgs/msg/DiagnosticArray", "rosgraph_msgs/msg/Clock")
+    for name in (*others, *KINDS.values()):
         own.register(get_types_from_msg(schema(name), name))
     assert set(own.fielddefs) >= set(DEFINITIONS)
     compared = [name for name in DEFINITIONS if name in theirs.fielddefs]
@@ -273,7 +297,7 @@ def test_mcap_export_refuses_invalid_input(tmp_path, monkeypatch):
     given = GIVEN[0]
     for items, options, message in (
         ([], {}, "no energyscape is given"),
-        ([given], {"topics": ["cloud"]}, "topic 'cloud' is unknown; known are points, image, sonar_image"),
+        ([given], {"topics": ["cloud"]}, "topic 'cloud' is unknown; known are points, scan, image, sonar_image"),
         ([given.replace(stamp=Stamp(timestamp_ns=2**62))], {}, "outside 1970 to 2038"),
         (
             [given.replace(stamp=Stamp(sensor="a b"))],

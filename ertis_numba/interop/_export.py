@@ -15,7 +15,7 @@ from ertis_numba.interop._mountings import Mountings, validated
 
 __all__ = ["FORMATS", "TOPICS", "ExportFormat", "choose_format", "export", "output_files"]
 
-TOPICS: Final = ("points", "image", "sonar_image")
+TOPICS: Final = ("points", "scan", "image", "sonar_image")
 """Products of a sensor in MCAP."""
 _POINTS = (
     *("x", "y", "z", "intensity", "uncertainty_range", "uncertainty_across"),

@@ -1,15 +1,16 @@
 """Definitions of ROS 2 messages, and their encoder.
 
 Fields, types and constants are those of ``common_interfaces`` and ``geometry2`` (both the same from Humble on),
-``rcl_interfaces``, and of ``marine_msgs`` 2.1.0 of the Applied Physics Laboratory, University of Washington. They are
-included here because a file contains the definitions of its messages. Neither writer nor file needs ROS.
+``rcl_interfaces``, ``rosgraph_msgs``, and of ``marine_msgs`` 2.1.0 of the Applied Physics Laboratory, University of
+Washington. They are included here because a file contains the definitions of its messages. Neither writer nor file
+needs ROS.
 """
 
 import functools
 from collections.abc import Callable
 from typing import Any, Final
 
-__all__ = ["DEFINITIONS", "encoder", "schema"]
+__all__ = ["DEFINITIONS", "encoder", "fields", "schema"]
 
 DEFINITIONS: Final = {
     "builtin_interfaces/msg/Time": """
@@ -77,6 +78,40 @@ uint8 is_bigendian
 uint32 step
 uint8[] data
 """,
+    "sensor_msgs/msg/LaserScan": """
+std_msgs/Header header
+float32 angle_min
+float32 angle_max
+float32 angle_increment
+float32 time_increment
+float32 scan_time
+float32 range_min
+float32 range_max
+float32[] ranges
+float32[] intensities
+""",
+    "diagnostic_msgs/msg/KeyValue": """
+string key
+string value
+""",
+    "diagnostic_msgs/msg/DiagnosticStatus": """
+byte OK=0
+byte WARN=1
+byte ERROR=2
+byte STALE=3
+byte level
+string name
+string message
+string hardware_id
+diagnostic_msgs/KeyValue[] values
+""",
+    "diagnostic_msgs/msg/DiagnosticArray": """
+std_msgs/Header header
+diagnostic_msgs/DiagnosticStatus[] status
+""",
+    "rosgraph_msgs/msg/Clock": """
+builtin_interfaces/Time clock
+""",
     "marine_acoustic_msgs/msg/PingInfo": """
 float32 frequency
 float32 sound_speed
@@ -117,6 +152,12 @@ def schema(name: str) -> str:
     parts = [DEFINITIONS[first].lstrip()]
     parts += [f"MSG: {other.replace('/msg/', '/')}{DEFINITIONS[other]}" for other in others]
     return f"{_RULE}\n".join(parts)
+
+
+def fields(name: str) -> dict[str, str]:
+    """Return the type of each field of a message, without constants and default values."""
+    lines = (line.split() for line in DEFINITIONS[name].strip().split("\n"))
+    return {words[1]: words[0] for words in lines if "=" not in words[1]}
 
 
 def _with_dependencies(name: str) -> list[str]:

@@ -1,0 +1,216 @@
+"""Frames of this package as ROS 2 messages, each a dict of the fields in `ros_definitions`.
+
+Coordinate frames follow REP 103 (x forward, y left, z up, in metres and radians) and REP 105 (``base_link`` for the
+platform). Ranges of scans follow REP 117: infinity if there is no echo.
+"""
+
+import math
+import re
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+
+from ertis_numba import checks
+from ertis_numba.air import sound_speed_m_s
+from ertis_numba.analysis.nearest_echo import nearest_echo
+from ertis_numba.analysis.point_finder import same_directions
+from ertis_numba.errors import ArgumentError
+from ertis_numba.frames import Energyscape, PointCloud, Stamp
+from ertis_numba.geometry import unit_vectors, unrolled_rad
+from ertis_numba.interop._grey_image import GreyImage
+from ertis_numba.interop._mountings import PLATFORM, Mounting
+from ertis_numba.interop._points import ros_time
+
+__all__ = [
+    "MESSAGES",
+    "ImageMessages",
+    "TopicNames",
+    "header",
+    "mounting_message",
+    "points_message",
+    "scan_message",
+    "sonar_frame_message",
+    "sonar_image_message",
+]
+
+MESSAGES: Final[Mapping[str, str]] = {
+    "points": "sensor_msgs/msg/PointCloud2",
+    "scan": "sensor_msgs/msg/LaserScan",
+    "image": "sensor_msgs/msg/Image",
+    "sonar_image": "marine_acoustic_msgs/msg/ProjectedSonarImage",
+}
+"""Topics of a sensor, and their messages."""
+_SONAR_SUFFIX = "_sonar"
+_SQRT_HALF = math.sqrt(0.5)
+_SONAR_TURN = (_SQRT_HALF, 0.0, _SQRT_HALF, 0.0)
+"""Frame of marine_acoustic_msgs relative to that of the sensor: z forward, x up, y right.
+
+The rotation is 180° about the bisector of the x and z axes.
+"""
+_FLOAT32, _DTYPE_FLOAT32 = 7, 8  # Constants of PointField and of SonarImageData.
+_POINT_FIELDS = ("x", "y", "z", "intensity", "uncertainty_range", "uncertainty_across")
+_INVALID_CHARACTERS = re.compile(r"[^A-Za-z0-9]+")
+
+
+class TopicNames(dict[str, str]):
+    """Name of each sensor in topics, by sensor. Characters that ROS does not allow become ``_``.
+
+    Raises
+    ------
+    ArgumentError
+        The name of a sensor is invalid, or two sensors would share their topics.
+    """
+
+    def __missing__(self, sensor: str) -> str:
+        name = _INVALID_CHARACTERS.sub("_", checks.sensor_name(sensor)).strip("_")
+        name = f"sensor_{name}" if not name[:1].isalpha() else name
+        for other, taken in self.items():
+            if taken == name:
+                raise ArgumentError(f"sensors {other} and {sensor} would share topics /{name}; choose one (--sensor)")
+        self[sensor] = name
+        return name
+
+
+def header(stamp: Stamp, *, frame: str | None = None) -> dict[str, Any]:
+    """Return the header of a message: the time of the emission, and the frame of the sensor or another one.
+
+    Raises
+    ------
+    ArgumentError
+        The time is before 1970 or after 2038.
+    """
+    sec, nanosec = ros_time(stamp)
+    return {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": frame or stamp.sensor}
+
+
+def points_message(cloud: PointCloud) -> dict[str, Any]:
+    """Return points in the sensor frame, as sensor_msgs/msg/PointCloud2.
+
+    The fields are x, y, z in metres, intensity in dBFS, and the standard deviations of the position along range and
+    across it in metres, all FLOAT32. Unknown standard deviations are NaN.
+    """
+    rows = np.full((len(cloud), len(_POINT_FIELDS)), np.nan, dtype="<f4")
+    rows[:, :3] = cloud.position_m
+    with np.errstate(divide="ignore"):
+        rows[:, 3] = 20 * np.log10(cloud.amplitude)
+    if cloud.uncertainty_m is not None:
+        rows[:, 4:] = cloud.uncertainty_m
+    step = rows.itemsize * len(_POINT_FIELDS)
+    return {
+        "header": header(cloud.stamp),
+        "height": 1,
+        "width": len(cloud),
+        "fields": [
+            {"name": name, "offset": rows.itemsize * number, "datatype": _FLOAT32, "count": 1}
+            for number, name in enumerate(_POINT_FIELDS)
+        ],
+        "is_bigendian": False,
+        "point_step": step,
+        "row_step": step * len(cloud),
+        "data": rows.tobytes(),
+        "is_dense": cloud.uncertainty_m is not None,
+    }
+
+
+def scan_message(
+    image: Energyscape, *, min_level_db: float = -20.0, floor_dbfs: float = -math.inf
+) -> dict[str, Any] | None:
+    """Return the nearest echo of each azimuth, as sensor_msgs/msg/LaserScan; None for images that are not planar.
+
+    The angles of a scan are evenly spaced. Each has the echo of the nearest direction of the image, or infinity. The
+    intensities are levels in dBFS. `ertis_numba.analysis.nearest_echo` describes both limits.
+    """
+    if not image.is_planar or len(image.azimuth_rad) < 2 or len(image.range_m) < 3:
+        return None
+    azimuth_rad = unrolled_rad(image.azimuth_rad)
+    order = np.argsort(azimuth_rad, kind="stable")
+    ascending = azimuth_rad[order]
+    angle_rad = np.linspace(ascending[0], ascending[-1], len(ascending))
+    nearest = order[np.searchsorted((ascending[:-1] + ascending[1:]) / 2, angle_rad)]
+    range_m, level_dbfs = nearest_echo(image, min_level_db=min_level_db, floor_dbfs=floor_dbfs)
+    return {
+        "header": header(image.stamp),
+        "angle_min": float(angle_rad[0]),
+        "angle_max": float(angle_rad[-1]),
+        "angle_increment": float(angle_rad[1] - angle_rad[0]),
+        "time_increment": 0.0,  # One call serves all angles.
+        "scan_time": 0.0,
+        "range_min": float(image.range_m[0]),
+        "range_max": float(image.range_m[-1]),
+        "ranges": range_m[nearest].tolist(),
+        "intensities": level_dbfs[nearest].tolist(),
+    }
+
+
+class ImageMessages:
+    """Converter of images to grey pictures for display, as sensor_msgs/msg/Image (mono8).
+
+    The tables of a sensor are computed once for its directions.
+    """
+
+    def __init__(self) -> None:
+        self._pictures: dict[str, tuple[Energyscape, GreyImage]] = {}
+
+    def __call__(self, image: Energyscape) -> dict[str, Any]:
+        """Return the picture of an image; 255 is the strongest level, and 0 is 40 dB below it."""
+        sensor = image.stamp.sensor
+        known = self._pictures.get(sensor)
+        if known is None or not same_directions(known[0], image):
+            known = self._pictures[sensor] = image, GreyImage(image)
+        pixels = known[1](image.amplitude)
+        height, width = pixels.shape
+        return {
+            "header": header(image.stamp),
+            "height": height,
+            "width": width,
+            "encoding": "mono8",
+            "is_bigendian": 0,
+            "step": width,
+            "data": pixels.tobytes(),
+        }
+
+
+def sonar_image_message(image: Energyscape) -> dict[str, Any]:
+    """Return all amplitudes of an image, as marine_acoustic_msgs/msg/ProjectedSonarImage."""
+    call = image.settings.call
+    forward, left, up = unit_vectors(image.azimuth_rad, image.elevation_rad).T.tolist()
+    return {
+        "header": header(image.stamp, frame=image.stamp.sensor + _SONAR_SUFFIX),
+        "ping_info": {
+            "frequency": (call.low_frequency_hz + call.high_frequency_hz) / 2,
+            "sound_speed": sound_speed_m_s(image.settings.air),
+            "tx_beamwidths": [],
+            "rx_beamwidths": [],
+        },
+        "beam_directions": [{"x": x, "y": -y, "z": z} for z, y, x in zip(forward, left, up, strict=True)],
+        "ranges": image.range_m.tolist(),
+        "image": {
+            "is_bigendian": False,
+            "dtype": _DTYPE_FLOAT32,
+            "beam_count": len(image.azimuth_rad),
+            "data": np.ascontiguousarray(image.amplitude.T, dtype="<f4").tobytes(),
+        },
+    }
+
+
+def mounting_message(stamp: Stamp, place: Mounting) -> dict[str, Any]:
+    """Return the pose of a sensor on its platform, as geometry_msgs/msg/TransformStamped."""
+    return _transform(header(stamp, frame=PLATFORM), stamp.sensor, place)
+
+
+def sonar_frame_message(stamp: Stamp) -> dict[str, Any]:
+    """Return the pose of the frame of sonar images relative to the sensor, as geometry_msgs/msg/TransformStamped."""
+    return _transform(header(stamp), stamp.sensor + _SONAR_SUFFIX, ((0.0, 0.0, 0.0), _SONAR_TURN))
+
+
+def _transform(parent: dict[str, Any], child: str, place: Mounting) -> dict[str, Any]:
+    translation_m, rotation_xyzw = place
+    return {
+        "header": parent,
+        "child_frame_id": child,
+        "transform": {
+            "translation": dict(zip("xyz", translation_m, strict=True)),
+            "rotation": dict(zip("xyzw", rotation_xyzw, strict=True)),
+        },
+    }
