@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 __all__ = ["export"]
 
 FORMATS = ("mcap", "ply", "pcd", "csv", "npz", "acoular")
-TOPICS = ("points", "image", "sonar_image")
+TOPICS = ("points", "scan", "image", "sonar_image")
 
 
 class _Places(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4 only
