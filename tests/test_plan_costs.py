@@ -172,6 +172,35 @@ def test_costs_command_measures_and_updates_the_table(tmp_path, monkeypatch):
     assert "costs.py is not nominal_costs.py" in done.stderr.replace("\n", " ")
 
 
+def test_costs_of_some_units_are_scaled_to_the_machine_of_the_others(tmp_path, monkeypatch):
+    own, reference = f"cpu {CPU.instruction_set}", "sum_float32_few"
+    nominal, asked = nominal_costs.NOMINAL_COSTS[own], []
+
+    def measured(_kernels, _threads, units):
+        asked.append(set(units))
+        return costs.Costs({name: 3e-9 if name == reference else 6e-9 for name in units})
+
+    monkeypatch.setattr(bench_costs, "measure", measured)
+    monkeypatch.setattr(bench_costs.instruction_sets, "lesser", list)
+    path = tmp_path / "nominal_costs.py"
+    path.write_text("")
+    options = ["bench", "costs", "--count", "1", "--unit", "shift", "--quiet"]
+    done = CliRunner().invoke(cli, [*options, "--json", "--update", str(path)])
+    assert done.exit_code == 0, done.output
+    found = json.loads(done.stdout)["costs"][own]
+    assert found == {"shift": pytest.approx(2 * nominal[reference], rel=5e-3)}
+    assert {frozenset(units) for units in asked} == {frozenset({"shift", reference})}
+    made = {}
+    exec(path.read_text("utf-8"), made)
+    assert made["NOMINAL_COSTS"][own] == nominal | found
+    table = CliRunner().invoke(cli, options).stdout
+    assert "| shift |" in table
+    assert "| level |" not in table
+    done = CliRunner().invoke(cli, ["bench", "costs", "--unit", "shifts"])
+    assert done.exit_code == 2
+    assert "unit 'shifts' is unknown; known are call, " in done.stderr.replace("\n", " ")
+
+
 def test_documented_costs_are_the_nominal_ones():
     table = bench_costs.nominal_as_markdown(nominal_costs.NOMINAL_COSTS)
     assert table in path_of("accuracy").read_text("utf-8")

@@ -183,7 +183,7 @@ def test_settings_are_immutable():
         ),
         ("[accuracy]\noversampling = 65", r"accuracy\.oversampling is 65; give a whole number from 1 to 64"),
         ("[accuracy]\ninterpolation = 'linear'", r"s, line 2, accuracy: unknown key `interpolation`"),
-        ("[accuracy]\ndelay_taps = 9", r"accuracy\.delay_taps is 9; give a whole number from 1 to 8"),
+        ("[accuracy]\ndelay_taps = 9", r"accuracy\.delay_taps is 9; give a whole number from 0 to 8"),
         ("[accuracy]\nbeam_taps = 3", r"accuracy\.beam_taps '3' is unknown.*known are 0, 2, 4, 6"),
         ("[accuracy]\nbeam_density = 1", r"accuracy\.beam_density is 1; give a number from 1\.1 to 8"),
         ("[accuracy]\nstop_band_db = 30", r"accuracy\.stopband_attenuation_db is 30; give a number from 40 to 140"),

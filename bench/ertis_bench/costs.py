@@ -3,7 +3,7 @@
 import json
 import statistics
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,9 +12,10 @@ from ertis_numba import kernels
 from ertis_numba.stages.costs import UNITS, measure
 from ertis_numba.stages.nominal_costs import NOMINAL_COSTS
 
-__all__ = ["MARKER", "as_markdown", "as_python", "nominal_as_markdown", "run", "update"]
+__all__ = ["MARKER", "UNITS", "as_markdown", "as_python", "nominal_as_markdown", "run", "update"]
 
 MARKER: Final = "ertis bench costs"
+_REFERENCE: Final = "sum_float32_few"  # unit by which the speeds of two machines are compared
 _CLOCK_HZ = 2.4e9  # of a Raspberry Pi 5
 _STARTED_PER_CYCLE: Final = {"float32": 2, "int16": 1}
 """``fmla`` and ``smlal`` of four lanes: Arm, Cortex-A76 Software Optimization Guide, section 3."""
@@ -35,7 +36,7 @@ NOMINAL_COSTS: Final[dict[str, dict[str, float]]] = {
 '''
 
 
-def run(*, count: int, say: Callable[[str], None]) -> dict[str, Any]:
+def run(*, count: int, say: Callable[[str], None], units: Collection[str] = UNITS) -> dict[str, Any]:
     """Measure the costs of each device several times, and return the medians of the fastest third.
 
     The CPU is also measured with each older instruction set. Costs of NEON are derived from those of SSE2.
@@ -46,32 +47,46 @@ def run(*, count: int, say: Callable[[str], None]) -> dict[str, Any]:
         Measurements per device.
     say : callable
         Called with a line of progress.
+    units : collection of str
+        Units to measure; all by default. If they are not all, their costs are scaled to the machine of the nominal
+        costs, by the cost of a sum here and there.
     """
+    is_whole = set(units) == set(UNITS)
+    measured = units if is_whole else (*units, _REFERENCE)
     found: dict[str, dict[str, float]] = {}
     for device in kernels.usable():
         kernel_set = kernels.load(device)
         if kernel_set.simulated:
             continue
         say(f"device {device}: measuring {count} times")
-        found[f"{device} {kernel_set.instruction_set}".strip()] = _medians(device, count)
+        found[f"{device} {kernel_set.instruction_set}".strip()] = _medians(device, count, measured)
     for name in instruction_sets.lesser():
         say(f"device cpu, {name}: measuring {count} times")
-        with instruction_sets.start(name, ["-m", "ertis_bench.costs", str(count)]) as child:
+        with instruction_sets.start(name, ["-m", "ertis_bench.costs", str(count), *measured]) as child:
             found[f"cpu {name}"] = json.loads(child.communicate()[0])
+    if not is_whole:
+        found = {device: _scaled(device, costs, units) for device, costs in found.items()}
     if "cpu SSE2" in found:
-        found["cpu NEON"] = _of_neon(found["cpu SSE2"])
+        derived = _of_neon(NOMINAL_COSTS["cpu SSE2"] | found["cpu SSE2"])
+        found["cpu NEON"] = {name: derived[name] for name in found["cpu SSE2"]}
     return {"machine": machine.describe(), "count": count, "costs": found}
 
 
-def _medians(device: str, count: int) -> dict[str, float]:
+def _medians(device: str, count: int, units: Collection[str]) -> dict[str, float]:
     """Return the median costs of the fastest third of ``count`` measurements of a device.
 
     One thread is used, because only ratios count, and other processes disturb two threads more.
     """
     kernel_set = kernels.load(device)
-    rounds = [measure(kernel_set, 1).seconds for _ in range(count)]
+    rounds = [measure(kernel_set, 1, units).seconds for _ in range(count)]
     best = sorted(rounds, key=_geometric_mean)[: max(1, count // 3)]  # Slower rounds may have shared the processor.
-    return {name: _rounded(statistics.median(each[name] for each in best)) for name in UNITS}
+    return {name: _rounded(statistics.median(each[name] for each in best)) for name in best[0]}
+
+
+def _scaled(device: str, measured: Mapping[str, float], units: Collection[str]) -> dict[str, float]:
+    """Return the costs of some units, scaled to the machine of the nominal costs of a device."""
+    factor = NOMINAL_COSTS[device][_REFERENCE] / measured[_REFERENCE]
+    return {name: _rounded(factor * measured[name]) for name in UNITS if name in units}
 
 
 def _rounded(cost_s: float) -> float:
@@ -83,8 +98,8 @@ def _of_neon(sse2: Mapping[str, float]) -> dict[str, float]:
 
     Sums are limited by the multiply-adds of a Cortex-A76: a range of a term, or of a pair of grid
     points, takes four products in one instruction. Two ``fmla`` start per cycle, but only one ``smlal``. With more
-    phases, the cost grows as with SSE2, which also has 128 bits. The other costs are those of SSE2 times a factor for
-    fewer units and a lower clock.
+    phases, and for phase shifts, the cost grows as with SSE2, which also has 128 bits. The other costs are those of
+    SSE2 times a factor for fewer units and a lower clock.
     """
     found = {name: _SLOWER * cost for name, cost in sse2.items()}
     for precision, per_cycle in _STARTED_PER_CYCLE.items():
@@ -93,6 +108,7 @@ def _of_neon(sse2: Mapping[str, float]) -> dict[str, float]:
         for phases in ("few", "many", "most"):
             growth = sse2[f"sum_{precision}_{phases}"] / sse2[f"sum_{precision}_few"]
             found[f"sum_{precision}_{phases}"] = instruction * growth
+    found["shift"] = found["sum_float32_few"] * sse2["shift"] / sse2["sum_float32_few"]
     return {name: _rounded(found[name]) for name in UNITS}
 
 
@@ -121,6 +137,7 @@ def as_markdown(report: Mapping[str, Any]) -> str:
     rows = [
         [name, *(_nanoseconds(each[device][name]) for device in measured for each in (measured, NOMINAL_COSTS))]
         for name in UNITS
+        if all(name in measured[device] for device in measured)
     ]
     return markdown.table(head, rows)
 
@@ -139,9 +156,9 @@ def nominal_as_markdown(costs: Mapping[str, Mapping[str, float]]) -> str:
 def update(path: Path, report: Mapping[str, Any]) -> None:
     """Write the measured costs into the module of nominal costs, or into the table of a Markdown file.
 
-    Devices without a measurement keep their costs.
+    Devices and units without a measurement keep their costs.
     """
-    costs = {**NOMINAL_COSTS, **report["costs"]}
+    costs = NOMINAL_COSTS | {name: NOMINAL_COSTS.get(name, {}) | found for name, found in report["costs"].items()}
     if path.suffix == ".py":
         path.write_text(as_python(costs), "utf-8")
     else:
@@ -149,4 +166,4 @@ def update(path: Path, report: Mapping[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    sys.stdout.write(json.dumps(_medians("cpu", int(sys.argv[1]))))
+    sys.stdout.write(json.dumps(_medians("cpu", int(sys.argv[1]), sys.argv[2:])))

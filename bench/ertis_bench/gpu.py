@@ -55,11 +55,14 @@ _ROOT = Path(__file__).parents[2]
 _TESTED = (
     "tests/test_kernels.py",
     "tests/test_interpolated_beams.py",
+    "tests/test_phase_shifts.py",
     "tests/test_beamformers.py",
     "tests/test_modulator.py",
     "tests/cuda",
 )
-_SANITIZED_TESTS = "cuda and (demodulate or fold or delay_and_sum or quantise or interpolated)"  # selects tests by name
+_SANITIZED_TESTS = (
+    "cuda and (demodulate or fold or delay_and_sum or quantise or interpolated or spectra)"  # selects tests by name
+)
 _SUMMARIES = {
     "memcheck": r"ERROR SUMMARY: (\d+) error",
     "racecheck": r"RACECHECK SUMMARY: (\d+) hazard",
@@ -201,7 +204,7 @@ def sanitized(tool: str) -> dict[str, Any]:
     sanitizer = _sanitizer()
     if sanitizer is None:
         return {"status": "not available: no compute-sanitizer on PATH or in CUDA_HOME"}
-    command = [sanitizer, "--tool", tool, "--error-exitcode", "9", *_PYTEST, *_TESTED[:2], "-k", _SANITIZED_TESTS]
+    command = [sanitizer, "--tool", tool, "--error-exitcode", "9", *_PYTEST, *_TESTED[:3], "-k", _SANITIZED_TESTS]
     done = execute(command, BUDGETS_S[tool])
     found = re.search(_SUMMARIES[tool], done.text)
     passed = re.search(r"(\d+) passed", done.text)

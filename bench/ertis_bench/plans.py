@@ -52,7 +52,8 @@ their density, or None without a beam grid.
 def in_words(accuracy: Accuracy) -> str:
     """Return the name of a complete plan, such as ``int16, 2 samples of 2 per range, beam grid 4 × 1.75, 60 dB``."""
     n_phases, n_taps = accuracy.oversampling, accuracy.delay_taps
-    parts = [accuracy.precision, f"{n_taps} {'sample' if n_taps == 1 else 'samples'} of {n_phases} per range"]
+    delays = f"{n_taps} {'sample' if n_taps == 1 else 'samples'} of {n_phases} per range" if n_taps else "phase shifts"
+    parts = [accuracy.precision, delays]
     if accuracy.beam_taps:
         parts.append(f"beam grid {accuracy.beam_taps} × {accuracy.beam_density:g}")
     parts.append(f"{accuracy.stopband_attenuation_db:g} dB")

@@ -8,7 +8,7 @@ import click
 from ertis_cli import options
 
 if TYPE_CHECKING:
-    from ertis_numba.settings import Settings
+    from ertis_numba.settings import Accuracy, Settings
 
 __all__ = ["report_lines", "require_plan", "wavefront_note"]
 
@@ -56,8 +56,6 @@ def _explained(sensor: str, plan: dict[str, Any]) -> Iterator[str]:
     from ertis_numba.settings import Accuracy
 
     accuracy = Accuracy(**plan["accuracy"])
-    taps = accuracy.delay_taps or 1
-    interpolated = "one weighted sample" if taps == 1 else f"a weighted sum of {taps} samples"
     yield f"plan of {sensor} for an error budget of {accuracy.max_error_db:g} dB:"
     if plan["budget_applies_to"] == "beams":
         yield (
@@ -67,8 +65,7 @@ def _explained(sensor: str, plan: dict[str, Any]) -> Iterator[str]:
     elif plan["budget_applies_to"] == "echoes":
         yield "  images of noise, or of many overlapping echoes, may exceed this budget; --verify measures the error"
     precision = "16 bits" if accuracy.precision == "int16" else "single precision"
-    kept = options.counted(accuracy.oversampling or 1, "sample")
-    yield f"  {precision}, {kept} kept per range; a delayed sample is {interpolated}"
+    yield f"  {precision}, {_delays_in_words(accuracy)}"
     if plan["streams"]:
         yield "  adaptive amplitudes from delay-and-sums of streams, some with fewer taps and coarser beam grids"
     if accuracy.beam_taps:
@@ -100,6 +97,15 @@ def _explained(sensor: str, plan: dict[str, Any]) -> Iterator[str]:
             f"  warning: this recording is quieter than planned for, and the error of its images may exceed "
             f"{accuracy.max_error_db:g} dB; give a lower --max-error"
         )
+
+
+def _delays_in_words(accuracy: "Accuracy") -> str:
+    """Return a description of how signals are delayed."""
+    if accuracy.delay_taps == 0:
+        return "exact delays, as phase shifts of spectra"
+    taps = accuracy.delay_taps or 1
+    interpolated = "one weighted sample" if taps == 1 else f"a weighted sum of {taps} samples"
+    return f"{options.counted(accuracy.oversampling or 1, 'sample')} kept per range; a delayed sample is {interpolated}"
 
 
 def _checked(sensor: str, verified: dict[str, Any]) -> Iterator[str]:

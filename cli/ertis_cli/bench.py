@@ -130,15 +130,27 @@ def accuracy(*, picture: Path | None, **given: Any) -> None:
     help="Write the costs into this file of nominal costs, by which plans are chosen, or into the table of a Markdown "
     "file; repeatable. New costs change images.",
 )
+@click.option(
+    "--unit",
+    "units",
+    multiple=True,
+    metavar="NAME",
+    help="Measure only this unit of work, relative to the other nominal costs; repeatable. All by default.",
+)
 @options.quiet
 @options.as_json
-def costs(*, count: int, targets: tuple[Path, ...], quiet: bool, as_json: bool) -> None:
+def costs(*, count: int, targets: tuple[Path, ...], units: tuple[str, ...], quiet: bool, as_json: bool) -> None:
     """Measure the kernel costs that the planner uses.
 
     Covers every instruction set of this machine. The table also has the nominal costs.
     """
     from ertis_bench import costs as benchmark, markdown
 
+    for unit in units:
+        if unit not in benchmark.UNITS:
+            raise click.BadParameter(
+                f"unit {unit!r} is unknown; known are {', '.join(benchmark.UNITS)}", param_hint="--unit"
+            )
     for target in targets:
         if target.suffix == ".md":
             markdown.around(target, benchmark.MARKER)
@@ -147,7 +159,7 @@ def costs(*, count: int, targets: tuple[Path, ...], quiet: bool, as_json: bool) 
                 f"{target} is not nominal_costs.py; give that of ertis_numba/stages, or a Markdown file",
                 param_hint="--update",
             )
-    report = benchmark.run(count=count, say=lambda text: options.say(text, quiet=quiet))
+    report = benchmark.run(count=count, say=lambda text: options.say(text, quiet=quiet), units=units or benchmark.UNITS)
     for target in targets:
         benchmark.update(target, report)
     if as_json:

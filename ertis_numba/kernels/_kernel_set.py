@@ -56,6 +56,8 @@ class KernelSet(AdaptiveKernels):
     demodulate_words: _contract.DemodulateWords
     multiply_spectra: _contract.MultiplySpectra
     multiply_and_fold: _contract.MultiplyAndFold
+    sum_spectra: _contract.SumSpectra
+    envelope_rows: _contract.EnvelopeRows
     delay_and_sum: _contract.DelayAndSum
     envelope: _contract.Envelope
     delay_and_sum_envelope: _contract.DelayAndSumEnvelope

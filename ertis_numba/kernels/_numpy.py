@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks
-from ertis_numba.kernels._contract import Complex, ComplexOrDouble, Index, Pcm, Real, Short, Taps, Words
+from ertis_numba.kernels._contract import Complex, ComplexOrDouble, Index, Pcm, Real, Short, Taps, Turns, Words
 from ertis_numba.kernels._host import HostMemory
 from ertis_numba.kernels._kernel_set import KernelSet
 
@@ -122,6 +122,23 @@ def multiply_and_fold(spectra: Complex, responses: Complex, first_bin: int, out:
         part = spectra[:, None, first_bin + done : first_bin + done + run]
         out[:, :, place : place + run] += part * responses[:, :, done : done + run]
         done += run
+
+
+def sum_spectra(spectra: Complex, starts: Turns, steps: Turns, first_bin: int, n_bins: int, out: Complex) -> None:
+    """Delay spectra by phase shifts, and sum them over the microphones: one matrix-vector product per bin."""
+    bins = np.arange(n_bins, dtype=np.uint32)
+    heard = spectra[:, 0, (first_bin + np.arange(n_bins)) % spectra.shape[2]]
+    places = (first_bin + np.arange(n_bins)) % out.shape[2]
+    out[:] = 0
+    for direction, (start, step) in enumerate(zip(starts, steps, strict=True)):
+        turns = (start[:, None] + step[:, None] * bins).view(np.int32)
+        shifts = np.exp(np.float32(2 * np.pi / 2**32) * turns * np.complex64(1j))
+        np.add.at(out[direction, 0], places, np.einsum("mb,mb->b", heard, shifts))
+
+
+def envelope_rows(beams: Complex, lead: int, first: int, stop: int, out: Real) -> None:
+    """Compute the magnitude of successive samples: ``out[row, range] = |beams[row, 0, lead + range]|``."""
+    np.abs(beams[: len(out), 0, lead + first : lead + stop], out=out[:, first:stop])
 
 
 def delay_and_sum(signals: Complex, offsets: Index, weights: Complex, out: Complex) -> None:

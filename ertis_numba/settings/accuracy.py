@@ -4,6 +4,7 @@ from typing import Literal
 
 from ertis_numba import checks
 from ertis_numba.documents import TomlTable
+from ertis_numba.errors import ArgumentError
 
 __all__ = ["ERROR_PRESETS_DB", "MAX_FOCAL_ZONES", "Accuracy"]
 
@@ -32,6 +33,8 @@ class Accuracy(TomlTable, frozen=True, kw_only=True):
         Samples kept per range of the energyscape, 1 to 64.
     delay_taps : int, optional, default None
         Samples from which a delayed sample is interpolated, 1 to 8. The weights minimise the error in the call's band.
+        With 0, delays are exact, as phase shifts of spectra. This needs ``precision`` ``float32``, an ``oversampling``
+        of 1 and no beam grid, and is for ``delay_and_sum`` without a weighting.
     beam_taps : int, optional, default None
         Beam-grid points along each axis of the array from which a beam is interpolated: 2, 4 or 6. With 0, the beam of
         every direction is summed itself.
@@ -59,7 +62,7 @@ class Accuracy(TomlTable, frozen=True, kw_only=True):
         super().__post_init__()
         checks.between("accuracy.max_error_db", self.max_error_db, -200.0, 0.0)
         checks.choice("accuracy.precision", self.precision, ("auto", "float32", "int16"))
-        for name, low, high in (("oversampling", 1, 64), ("delay_taps", 1, 8), ("focal_zones", 1, MAX_FOCAL_ZONES)):
+        for name, low, high in (("oversampling", 1, 64), ("delay_taps", 0, 8), ("focal_zones", 1, MAX_FOCAL_ZONES)):
             if getattr(self, name) is not None:
                 checks.integer(f"accuracy.{name}", getattr(self, name), low, high)
         if self.beam_taps is not None:
@@ -67,3 +70,19 @@ class Accuracy(TomlTable, frozen=True, kw_only=True):
         for name, smallest, largest in (("beam_density", 1.1, 8.0), ("stopband_attenuation_db", 40.0, 140.0)):
             if getattr(self, name) is not None:
                 checks.between(f"accuracy.{name}", getattr(self, name), smallest, largest)
+        if self.delay_taps == 0:
+            self._check_phase_shifts()
+
+    def _check_phase_shifts(self) -> None:
+        """Refuse parts of a plan that phase shifts of spectra do not support."""
+        for name, accepted in (
+            ("precision", ("auto", "float32")),
+            ("oversampling", (None, 1)),
+            ("beam_taps", (None, 0)),
+        ):
+            value = getattr(self, name)
+            if value not in accepted:
+                raise ArgumentError(
+                    f"accuracy.{name} is {value!r}, but accuracy.delay_taps 0 (phase shifts of spectra) supports only "
+                    f"{accepted[1]!r}; leave {name} out, or give delay_taps 1 to 8"
+                )

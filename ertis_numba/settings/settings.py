@@ -131,8 +131,14 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
             )
 
     def _check_adaptive(self) -> None:
-        """Refuse plans that a beamformer without streams does not support."""
+        """Refuse plans that an adaptive beamformer does not support."""
         processing, accuracy = self.processing, self.accuracy
+        if processing.is_adaptive and accuracy.delay_taps == 0:
+            raise ArgumentError(
+                f"accuracy.delay_taps is 0 (phase shifts of spectra), which processing.beamformer "
+                f"{processing.beamformer!r} with weighting {processing.weighting!r} does not support; leave it out or "
+                "give 1"
+            )
         beamformer = BEAMFORMERS[processing.beamformer]
         if beamformer.streams(*beamformer.values(processing)):
             return

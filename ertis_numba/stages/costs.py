@@ -10,7 +10,7 @@ import platform
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
@@ -53,24 +53,11 @@ _STREAM = 1.5  # Time of computing and rounding a sample of a stream, relative t
 _PAIR = 2.0  # Time of a pair of beam-grid points of several streams, which exceed the L2 cache, relative to one grid.
 _COMBINE = 1.0  # Time of adding a stream to an amplitude, relative to the magnitude of a beam.
 _UNKNOWN: Final = "cpu NEON"  # costs of instruction sets without nominal costs; the sums of both have the same form
-UNITS: Final = (
-    "call",
-    "demodulate_16",
-    "demodulate_32",
-    "forward",
-    "fold",
-    "inverse",
-    "quantise",
-    "sum_float32_few",
-    "sum_float32_many",
-    "sum_float32_most",
-    "sum_int16_few",
-    "sum_int16_many",
-    "sum_int16_most",
-    "pair_float32",
-    "pair_int16",
-    "image",
-)
+_FRONT_UNITS: Final = ("call", "demodulate_16", "demodulate_32", "forward", "fold", "inverse")
+_SUM_UNITS: Final = ("quantise", *(f"sum_{number}_{phases}" for number in ("float32", "int16") for phases in _PHASES))
+_PAIR_UNITS: Final = ("pair_float32", "pair_int16", "image")
+_SHIFT_UNITS: Final = ("shift", "level")
+UNITS: Final = (*_FRONT_UNITS, *_SUM_UNITS, *_PAIR_UNITS, *_SHIFT_UNITS)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,6 +77,8 @@ class Work:
     n_beams, n_terms, n_pairs : int
         Beams that are summed, terms of each, and pairs of beam-grid points per direction; 0 without a beam grid.
     precision : {"float32", "int16"}
+    n_shifted : int
+        Beams that are summed as spectra, one for each direction and focal zone; 0 (the default) if there are none.
     n_streams : int
         Streams of an adaptive beamformer; 0 (the default) if it has none.
     term_cost : float
@@ -112,6 +101,7 @@ class Work:
     n_terms: int
     n_pairs: int
     precision: str
+    n_shifted: int = 0
     n_streams: int = 0
     term_cost: float = 1.0
 
@@ -145,15 +135,16 @@ class Costs:
             "demodulate": unit[f"demodulate_{work.tap_bits}"] * work.n_samples * work.n_taps * work.n_words,
             "matched filter": unit["forward"] * work.n_mics * _transform(work.n_fft)
             + unit["fold"] * rows * work.n_bins
-            + unit["inverse"] * rows * _transform(work.n_outputs),
+            + unit["inverse"] * (work.n_shifted or rows) * _transform(work.n_outputs),
             "16 bits": unit["quantise"] * quantised * (1 + _STREAM * work.n_streams),
-            "sums": work.term_cost * term * work.n_beams * work.n_terms * work.n_computed,
+            "sums": work.term_cost * term * work.n_beams * work.n_terms * work.n_computed
+            + unit["shift"] * work.n_shifted * work.n_mics * work.n_bins,
             "interpolation": unit[f"pair_{work.precision}"]
             * work.n_directions
             * work.n_computed
             * work.n_pairs
             * (_PAIR if work.n_streams else 1.0),
-            "image": unit["image"] * points * (1 + _COMBINE * work.n_streams),
+            "image": unit["level" if work.n_shifted else "image"] * points * (1 + _COMBINE * work.n_streams),
             "calls": 6 * unit["call"],
         }
         return {name: 1000 * value for name, value in seconds.items()}
@@ -253,17 +244,29 @@ def _first_of(costs: Costs, part: Path, path: Path) -> Costs:
     return costs
 
 
-def measure(kernels: KernelSet, threads: int) -> Costs:
-    """Measure the costs of a device and return them; it takes some tenths of a second."""
+def measure(kernels: KernelSet, threads: int, units: Collection[str] = UNITS) -> Costs:
+    """Measure costs of a device and return them; it takes some tenths of a second.
+
+    Parameters
+    ----------
+    kernels : KernelSet
+    threads : int
+    units : collection of str
+        Units to measure; all by default.
+    """
     random = np.random.default_rng(1)
     small = 8 if kernels.device == "numpy" else 1
+    seconds: dict[str, float] = {}
     with _Bench(kernels, threads) as bench:
-        seconds = {
-            **_front(bench, random),
-            **_sums(bench, random, 256 // small),
-            **_pairs(bench, random, 1024 // small),
-        }
-    return Costs({name: seconds[name] for name in UNITS})
+        for names, measured in (
+            (_FRONT_UNITS, _front),
+            (_SUM_UNITS, functools.partial(_sums, n_beams=256 // small)),
+            (_PAIR_UNITS, functools.partial(_pairs, n_directions=1024 // small)),
+            (_SHIFT_UNITS, functools.partial(_shifts, n_directions=256 // small)),
+        ):
+            if not set(names).isdisjoint(units):
+                seconds.update(measured(bench, random))
+    return Costs({name: seconds[name] for name in UNITS if name in units})
 
 
 class _Bench:
@@ -405,6 +408,17 @@ def _pairs(bench: _Bench, random: np.random.Generator, n_directions: int) -> dic
         image = max(few_s - _FEW_PAIRS * pair, 1e-3 * few_s)
         found["image"] = min(image, found.get("image", math.inf))
     return found
+
+
+def _shifts(bench: _Bench, random: np.random.Generator, n_directions: int) -> dict[str, float]:
+    """Return the cost of a microphone's bin in a sum of spectra, and of one point of the image from beams."""
+    n_bins, n_out = 960, 1200
+    kernels = bench.kernels
+    spectra, beams = _complex_noise(random, (_MICS, 1, n_out)), _complex_noise(random, (n_directions, 1, n_out))
+    starts, steps = random.integers(0, 2**32, (2, n_directions, _MICS), dtype=np.uint32)
+    level_s = bench.best(kernels.envelope_rows, beams, 10, 0, _RANGES, np.empty((n_directions, _RANGES), np.float32))
+    shift_s = bench.best(kernels.sum_spectra, spectra, starts, steps, 300, n_bins, beams)
+    return {"shift": shift_s / (n_directions * _MICS * n_bins), "level": level_s / (n_directions * _RANGES)}
 
 
 def _tiles(

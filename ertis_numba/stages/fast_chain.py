@@ -21,6 +21,7 @@ from ertis_numba.stages.demodulate import FilterPcm, demodulation
 from ertis_numba.stages.interpolation_fit import Spectrum
 from ertis_numba.stages.kernel_chain import KernelChain
 from ertis_numba.stages.matched_filter import MatchedFilter
+from ertis_numba.stages.phase_shifts import PhaseShifts
 from ertis_numba.stages.plan_elements import (
     ahead_of,
     beam_grid_of,
@@ -63,7 +64,9 @@ class FastChain(KernelChain):
         points = streams.points if streams else [aperture.directions if nodes is None else nodes.points]
         own_s = layout.delay_s[layout.enabled]
         array_weight = array_weights(settings)
-        ahead_s = ahead_of(array_weight, step_s)
+        amplitudes = array_weight / (layout.gain[layout.enabled] * len(own_s))
+        has_shifts = plan.delay_taps == 0
+        ahead_s = np.zeros(len(own_s)) if has_shifts else ahead_of(array_weight, step_s)
         edges = zones_of(settings)
         largest_s = max(
             float(np.max(np.abs(own_s + aperture.delays_s(some, sound_speed_m_s=speed_m_s, range_m=range_m))))
@@ -102,31 +105,28 @@ class FastChain(KernelChain):
                 )
             )
 
-        self._matched_filter = advanced(
-            streams.plain_gains
-            if streams
-            else lambda frequency_hz: fit.gain(frequency_hz) * (1 if nodes is None else nodes.gain(frequency_hz))
-        )
+        def plan_gains(frequency_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
+            if has_shifts:
+                return np.repeat(amplitudes[:, None], len(frequency_hz), axis=1).astype(np.complex128)
+            return np.asarray(fit.gain(frequency_hz) * (1 if nodes is None else nodes.gain(frequency_hz)))
+
+        self._matched_filter = advanced(streams.plain_gains if streams else plan_gains)
         self._linear_filter = None if streams is None or streams.linear is None else advanced(streams.linear_gains)
         self._adaptive = None
         if streams is not None:
             taken_s = own_s - ahead_s
             self._beamform = streams.beamform(kernels, memory, taken_s, edges, n_phases=n_phases, lead=window.lead)
             return
-        amplitudes = array_weight / (layout.gain[layout.enabled] * len(own_s))
-        zones = [
-            Zone(
-                first,
-                stop,
-                DelayTable.of(
-                    own_s - ahead_s + aperture.delays_s(points[0], sound_speed_m_s=speed_m_s, range_m=range_m),
-                    amplitudes,
-                    fit,
-                    n_phases=n_phases,
-                    lead=window.lead,
-                ),
-            )
+        delayed = (
+            (first, stop, own_s - ahead_s + aperture.delays_s(points[0], sound_speed_m_s=speed_m_s, range_m=range_m))
             for first, stop, range_m in edges
+        )
+        if has_shifts:
+            self._beamform = PhaseShifts(kernels, memory, window, self._matched_filter, len(self.grid), delayed)
+            return
+        zones = [
+            Zone(first, stop, DelayTable.of(delays_s, amplitudes, fit, n_phases=n_phases, lead=window.lead))
+            for first, stop, delays_s in delayed
         ]
         self._beamform = beamform(
             plan.precision, kernels, memory, window, zones, nodes, n_phases=n_phases, threads=threads

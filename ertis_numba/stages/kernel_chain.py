@@ -19,6 +19,7 @@ from ertis_numba.stages.beamform import Beamform
 from ertis_numba.stages.buffer_pool import BufferPool, MeasurementBuffers
 from ertis_numba.stages.demodulate import Demodulate, DemodulatePdm
 from ertis_numba.stages.interpolation_fit import one_thread
+from ertis_numba.stages.phase_shifts import PhaseShifts
 from ertis_numba.stages.word_stream import StreamedImage, WordStream, foreign_stream
 
 __all__ = ["Compress", "KernelChain"]
@@ -71,7 +72,7 @@ class KernelChain(ABC):
     range_m: NDArray[np.float64]
     _demodulate: Demodulate
     _matched_filter: Compress
-    _beamform: Beamform
+    _beamform: Beamform | PhaseShifts
 
     def __init__(self, settings: Settings, kernels: KernelSet, *, threads: int, graphs: bool = False) -> None:
         self._memory = kernels.memory(graphs=graphs)
@@ -195,8 +196,11 @@ class KernelChain(ABC):
             self._pool.release(buffers)
 
     def _image(self, buffers: MeasurementBuffers, out: NDArray[np.float32], threads: int) -> None:
-        self._matched_filter(buffers.transforms, buffers.analytic, threads=threads)
-        self._beamform(buffers.analytic, buffers.beamform, out)
+        if isinstance(self._beamform, PhaseShifts):
+            self._beamform(buffers.transforms, buffers.analytic, buffers.beamform, out, threads=threads)
+        else:
+            self._matched_filter(buffers.transforms, buffers.analytic, threads=threads)
+            self._beamform(buffers.analytic, buffers.beamform, out)
 
     @contextmanager
     def _taken(self, threads: int) -> Iterator[MeasurementBuffers]:
@@ -212,7 +216,8 @@ class KernelChain(ABC):
     def _new_buffers(self) -> MeasurementBuffers:
         memory, lane = self._memory, self._memory.lane()
         signals = memory.zeros(self._demodulate.shape, np.float32)
-        analytic = memory.zeros(self._matched_filter.shape, np.complex64)
+        shape = self._beamform.shape if isinstance(self._beamform, PhaseShifts) else self._matched_filter.shape
+        analytic = memory.zeros(shape, np.complex64)
         transforms = fft.plan(self._kernels.transforms, signals, analytic, zeros=memory.zeros, stream=lane.stream)
         return MeasurementBuffers(
             lane, self._demodulate.new_room(), signals, analytic, transforms, self._beamform.new_buffers()

@@ -42,6 +42,10 @@ class MatchedFilter:
     ----------
     shape : (mic, phase, sample)
         Shape of the analytic signals.
+    first_bin : int
+        First bin of the band.
+    frequency_hz : (bin,) float64
+        Frequencies of the band in hertz.
     """
 
     def __init__(
@@ -56,22 +60,24 @@ class MatchedFilter:
         gain: Gain,
     ) -> None:
         rate_hz = settings.signal_rate_hz
-        first_bin, frequency_hz, flat = flat_spectrum(settings, taps, n_fft=window.n_fft)
+        self.first_bin, self.frequency_hz, flat = flat_spectrum(settings, taps, n_fft=window.n_fft)
         n_phases = settings.accuracy.oversampling or 1
         phase_s = np.arange(n_phases)[:, None] / (n_phases * settings.output_rate_hz)
         lag_s = window.start_s - window.first_sample / rate_hz + phase_s
         # Neither transform divides by its length. This division by the forward length supplies the missing factor.
-        shifted = flat / window.n_fft * np.exp(2j * math.pi * frequency_hz * lag_s)
-        self._responses = memory.table((gain(frequency_hz)[:, None, :] * shifted).astype(np.complex64))
-        self._first_bin = first_bin
+        shifted = flat / window.n_fft * np.exp(2j * math.pi * self.frequency_hz * lag_s)
+        self._responses = memory.table((gain(self.frequency_hz)[:, None, :] * shifted).astype(np.complex64))
         self._kernel = kernels.multiply_and_fold
         self.shape = (n_mics, n_phases, window.n_outputs)
 
     def __call__(self, transforms: Transforms, out: NDArray[np.complex64], *, threads: int) -> None:
         """Fill ``out``, (mic, phase, sample) complex64, with ``transforms`` that were planned for this array."""
-        spectra = transforms.forward(threads=threads)
-        self._kernel(spectra, self._responses, self._first_bin, out)
+        self.fill_spectra(transforms, out, threads=threads)
         transforms.inverse(threads=threads)
+
+    def fill_spectra(self, transforms: Transforms, out: NDArray[np.complex64], *, threads: int) -> None:
+        """Fill ``out``, (mic, phase, k) complex64, with the filtered spectra, as `MultiplyAndFold` folds them."""
+        self._kernel(transforms.forward(threads=threads), self._responses, self.first_bin, out)
 
 
 def flat_spectrum(

@@ -27,6 +27,8 @@ NOMINAL_COSTS: Final[dict[str, dict[str, float]]] = {
         "pair_float32": 1.09e-10,
         "pair_int16": 5.08e-11,
         "image": 1.11e-10,
+        "shift": 1.88e-10,
+        "level": 2.07e-10,
     },
     "cpu AVX-512 VNNI": {
         "call": 1.15e-06,
@@ -45,6 +47,8 @@ NOMINAL_COSTS: Final[dict[str, dict[str, float]]] = {
         "pair_float32": 1.08e-10,
         "pair_int16": 4.44e-11,
         "image": 1.21e-10,
+        "shift": 1.81e-10,
+        "level": 2.2e-10,
     },
     "cpu AVX2": {
         "call": 1.18e-06,
@@ -63,6 +67,8 @@ NOMINAL_COSTS: Final[dict[str, dict[str, float]]] = {
         "pair_float32": 1.59e-10,
         "pair_int16": 7.31e-11,
         "image": 6.88e-11,
+        "shift": 2.24e-10,
+        "level": 2.13e-10,
     },
     "cpu NEON": {
         "call": 3.48e-06,
@@ -81,6 +87,8 @@ NOMINAL_COSTS: Final[dict[str, dict[str, float]]] = {
         "pair_float32": 2.08e-10,
         "pair_int16": 4.17e-10,
         "image": 7.53e-10,
+        "shift": 5.23e-10,
+        "level": 4.89e-09,
     },
     "cpu SSE2": {
         "call": 1.16e-06,
@@ -99,6 +107,8 @@ NOMINAL_COSTS: Final[dict[str, dict[str, float]]] = {
         "pair_float32": 3.22e-10,
         "pair_int16": 1.36e-10,
         "image": 2.51e-10,
+        "shift": 6.01e-10,
+        "level": 1.63e-09,
     },
     "cuda": {
         "call": 1e-05,
@@ -117,6 +127,8 @@ NOMINAL_COSTS: Final[dict[str, dict[str, float]]] = {
         "pair_float32": 1e-12,
         "pair_int16": 2e-12,
         "image": 1e-12,
+        "shift": 2.5e-12,
+        "level": 1e-12,
     },
     "numpy": {
         "call": 4.11e-07,
@@ -135,5 +147,7 @@ NOMINAL_COSTS: Final[dict[str, dict[str, float]]] = {
         "pair_float32": 4.6e-10,
         "pair_int16": 5.2e-10,
         "image": 5.94e-08,
+        "shift": 2.96e-08,
+        "level": 5.84e-10,
     },
 }

@@ -19,6 +19,7 @@ from ertis_numba.stages.costs import Work
 from ertis_numba.stages.error_model import PARTS, ErrorModel, SignalModel
 from ertis_numba.stages.focal_zones import squared_curvature
 from ertis_numba.stages.interpolation_fit import DelayFit, Spectrum
+from ertis_numba.stages.phase_shifts import SHIFT_BYTES, SHIFT_TABLE_BYTES, rows_at_a_time
 from ertis_numba.stages.plan_elements import chain_taps, few_delays, nearest_m_of, spectrum_of, zones_of
 from ertis_numba.stages.planned_streams import PlannedStreams
 from ertis_numba.stages.sensitivity import Sensitivity
@@ -161,17 +162,19 @@ class PlanModel:
         """
         if self.uses_streams(plan):
             return self._stream_parts(plan, noise_only=noise_only)
-        delays = self.delays(plan.n_phases, plan.delay_taps)
-        nodes = self.nodes(plan.beam_taps, plan.density) if plan.beam_taps else None
         _, filter_error = self.filter(plan.stopband_attenuation_db)
         parts = dict.fromkeys(PARTS, 0.0)
-        parts["delays"], parts["filter"] = delays.error, filter_error
-        parts["arithmetic"] = self.errors.arithmetic()
+        parts["filter"], parts["arithmetic"] = filter_error, self.errors.arithmetic()
+        if self.settings.processing.wavefront == "spherical":
+            parts["zones"] = self.zone_error(plan.focal_zones)
+        if not plan.delay_taps:
+            return parts
+        delays = self.delays(plan.n_phases, plan.delay_taps)
+        nodes = self.nodes(plan.beam_taps, plan.density) if plan.beam_taps else None
+        parts["delays"] = delays.error
         if nodes is not None:
             parts["beams"] = nodes.error
             parts["delays"] = self._delays_between(nodes, plan, delays.error)
-        if self.settings.processing.wavefront == "spherical":
-            parts["zones"] = self.zone_error(plan.focal_zones)
         if plan.precision == "int16":
             parts["samples"] = self._spread * self._whole_numbers(delays, None if nodes is None else nodes.squares)
         return parts
@@ -262,6 +265,7 @@ class PlanModel:
             n_terms=n_terms,
             n_pairs=n_pairs,
             precision=plan.precision,
+            n_shifted=0 if plan.delay_taps else self.n_directions * len(self._zones(plan.focal_zones)),
             n_streams=len(self.streams(plan).streams) if streamed else 0,
             term_cost=1.0 if streamed else self._kernel_cost(),
         )
@@ -280,6 +284,11 @@ class PlanModel:
             terms = sum((each.grid.n_points if each.grid else self.n_directions) * each.fit.n_taps for each in streams)
             n_zones = len(self._zones(plan.focal_zones))
             return TABLE_BYTES * terms * self.n_mics * n_zones + signals * (2 + len(streams)) // 2
+        if not plan.delay_taps:
+            n_delays = self.n_directions * self.n_mics
+            n_rows = rows_at_a_time(self.n_directions, self.window.n_outputs) + self.n_mics
+            n_zones = len(self._zones(plan.focal_zones))
+            return n_delays * (SHIFT_TABLE_BYTES + SHIFT_BYTES * n_zones) + 8 * n_rows * self.window.n_outputs
         nodes = self.nodes(plan.beam_taps, plan.density) if plan.beam_taps else None
         n_beams = self.n_directions if nodes is None else nodes.count
         table = TABLE_BYTES * n_beams * self.n_mics * plan.delay_taps * len(self._zones(plan.focal_zones))
@@ -381,7 +390,7 @@ def plan_of(accuracy: Accuracy) -> ImagePlan:
     return ImagePlan(
         accuracy.precision,
         accuracy.oversampling or 1,
-        accuracy.delay_taps or 1,
+        1 if accuracy.delay_taps is None else accuracy.delay_taps,
         accuracy.beam_taps or 0,
         accuracy.beam_density or 2.0,
         accuracy.stopband_attenuation_db or 60.0,

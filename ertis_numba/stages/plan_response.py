@@ -54,7 +54,8 @@ def deviation_of(settings: Settings, directions: NDArray[np.float64]) -> Deviati
         Unit vectors of the whole grid.
     """
     plan = settings.accuracy
-    if settings.processing.method != "fast" or None in {plan.oversampling, plan.delay_taps, plan.beam_taps}:
+    unknown = None in {plan.oversampling, plan.delay_taps, plan.beam_taps}
+    if settings.processing.method != "fast" or unknown or plan.delay_taps == 0:
         return None
     return _deviation_of(settings, np.ascontiguousarray(directions, np.float64).tobytes())
 

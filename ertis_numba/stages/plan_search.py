@@ -38,7 +38,7 @@ def open_plans(model: PlanModel, budget: float) -> list[ImagePlan]:
     zones = _zone_count(model, budget)
     plans = (
         []
-        if adaptive and not _may_be_plain(given)
+        if given.delay_taps == 0 or (adaptive and not _may_be_plain(given))
         else [
             ImagePlan(precision, n_phases, n_taps, beam_taps, density, stopband_attenuation_db, zones)
             for precision, (n_phases, n_taps), (beam_taps, density), stopband_attenuation_db in itertools.product(
@@ -49,7 +49,18 @@ def open_plans(model: PlanModel, budget: float) -> list[ImagePlan]:
             )
         ]
     )
-    return plans + _open_streams(model, budget) if adaptive else plans
+    if adaptive:
+        return plans + _open_streams(model, budget)
+    return plans + [
+        ImagePlan("float32", 1, 0, 0, given.beam_density or 2.0, stopband_attenuation_db, zones)
+        for stopband_attenuation_db in (_stop_bands_db(model, budget) if _may_be_shifted(given) else ())
+    ]
+
+
+def _may_be_shifted(given: Accuracy) -> bool:
+    """Return True if phase shifts of spectra can keep the given parts of a plan."""
+    is_direct = given.precision != "int16" and given.oversampling in {None, 1} and not given.beam_taps
+    return is_direct and given.delay_taps == 0
 
 
 def _may_be_plain(given: Accuracy) -> bool:

@@ -35,6 +35,14 @@ PLANS = {
         ),
         -120,
     ),
+    "phase shifts": (TINY.replace(accuracy=DIRECT.replace(oversampling=1, delay_taps=0)), -110),
+    "phase shifts, two zones": (
+        TINY.replace(
+            processing=TINY.processing.replace(wavefront="spherical", directions="2d:3"),
+            accuracy=DIRECT.replace(oversampling=1, delay_taps=0, focal_zones=2),
+        ),
+        -110,
+    ),
     "array weights": (
         TINY.replace(
             processing=TINY.processing.replace(directions="2d:3", array_weights=(1.0, 0.25)),

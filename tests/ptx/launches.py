@@ -20,6 +20,7 @@ PLANS = {
     "deep stop band": ({"stopband_attenuation_db": 100.0, "precision": "float32"}, {}),  # taps of 32 bits
     "int16": ({"precision": "int16", "beam_taps": 0, "delay_taps": 2}, {}),
     "int16, nodes": ({"precision": "int16", "beam_taps": 4}, {}),
+    "phase shifts": ({"delay_taps": 0}, {}),
     "near": ({}, {"range_m": (0.3, 1.0)}),  # several focal zones
     **{
         f"{beamformer}, {weighting}": (

@@ -5,7 +5,7 @@ nothing: stages check shapes and bounds when they are created. Arrays are C-cont
 phase, sample; direction, range.
 """
 
-from ertis_numba.kernels._contract.arrays import Complex, ComplexOrDouble, Index, Pcm, Real, Short, Taps, Words
+from ertis_numba.kernels._contract.arrays import Complex, ComplexOrDouble, Index, Pcm, Real, Short, Taps, Turns, Words
 from ertis_numba.kernels._contract.beams import (
     DelayAndSum,
     DelayAndSumEnvelope,
@@ -19,9 +19,11 @@ from ertis_numba.kernels._contract.scenes import AddPaths, ModulatePdm
 from ertis_numba.kernels._contract.signals import (
     Decimate,
     DemodulateWords,
+    EnvelopeRows,
     MultiplyAndFold,
     MultiplySpectra,
     RemoveGroupDelay,
+    SumSpectra,
     UnpackBits,
     UnpackPcm,
 )
@@ -38,6 +40,7 @@ __all__ = [
     "DelayAndSumEnvelopeInt16",
     "DemodulateWords",
     "Envelope",
+    "EnvelopeRows",
     "Index",
     "InterpolatedBeamsEnvelope",
     "InterpolatedBeamsEnvelopeInt16",
@@ -50,7 +53,9 @@ __all__ = [
     "Real",
     "RemoveGroupDelay",
     "Short",
+    "SumSpectra",
     "Taps",
+    "Turns",
     "UnpackBits",
     "UnpackPcm",
     "Words",

@@ -1,17 +1,19 @@
-"""Contracts of the front end: raw samples to analytic signals."""
+"""Contracts of the front end: raw samples to analytic signals, or to beams by phase shifts of spectra."""
 
 from typing import Protocol
 
 import numpy as np
 
-from ertis_numba.kernels._contract.arrays import Complex, Index, Pcm, Real, Taps, Words
+from ertis_numba.kernels._contract.arrays import Complex, Index, Pcm, Real, Taps, Turns, Words
 
 __all__ = [
     "Decimate",
     "DemodulateWords",
+    "EnvelopeRows",
     "MultiplyAndFold",
     "MultiplySpectra",
     "RemoveGroupDelay",
+    "SumSpectra",
     "UnpackBits",
     "UnpackPcm",
 ]
@@ -150,3 +152,43 @@ class MultiplyAndFold(Protocol):
     """
 
     def __call__(self, spectra: Complex, responses: Complex, first_bin: int, out: Complex) -> None: ...
+
+
+class SumSpectra(Protocol):
+    """Delay spectra by phase shifts, and sum them over the microphones: one matrix-vector product per bin.
+
+    ``out[direction, 0, (first_bin + b) mod n_out] = Σ_mic spectra[mic, 0, (first_bin + b) mod n_in] · exp(2πi φ)`` with
+    ``φ = (starts[direction, mic] + b · steps[direction, mic]) / 2³²``, for b below ``n_bins``. Bins that share a place
+    of ``out`` are added, and places without a bin become 0. Integer phases wrap around, as turns do.
+
+    Parameters
+    ----------
+    spectra : (mic, 1, k) complex64
+        Result of `MultiplyAndFold` with as many places as ``out`` or a multiple, and at least ``n_bins``. Places
+        without a bin hold 0.
+    starts, steps : (direction, mic) uint32
+        Phase at the first bin, and its change from bin to bin, in 2⁻³² of a turn.
+    first_bin, n_bins : int
+    out : (direction, 1, k) complex64
+    """
+
+    def __call__(
+        self, spectra: Complex, starts: Turns, steps: Turns, first_bin: int, n_bins: int, out: Complex
+    ) -> None: ...
+
+
+class EnvelopeRows(Protocol):
+    """Compute the magnitude of successive samples: ``out[row, range] = |beams[row, 0, lead + range]|``.
+
+    Parameters
+    ----------
+    beams : (row, 1, sample) complex64
+        At least as many rows as ``out``.
+    lead : int
+        Sample at the first range.
+    first, stop : int
+        Ranges to fill.
+    out : (row, range) float32
+    """
+
+    def __call__(self, beams: Complex, lead: int, first: int, stop: int, out: Real) -> None: ...
