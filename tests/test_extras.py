@@ -21,11 +21,14 @@ NEEDED_BY = {
     "cu12": ["process a.h5 -o a.energy.h5 --device cuda"],
     "cu13": ["process a.h5 -o a.energy.h5 --device cuda"],
     "metrics": ["serve --listen tcp://127.0.0.1:0 --publish tcp://127.0.0.1:0 --metrics 127.0.0.1:0"],
-    "ros": ["export a.h5 -o a.mcap"],
+    "ros": ["export a.h5 -o a.mcap", "ros a.h5"],
     "xarray": ["{root}/tests/xarray_script.py"],
     "view": ["view a.h5 --no-open --port 0", "view a.h5 --save-html a.html", "view tcp://127.0.0.1:1 --no-open"],
 }
 """Commands that use what an extra brings; the script of an extra that no command uses."""
+
+NEEDED_ALONE = {"cyclonedds": "ros a.h5"}
+"""Commands that use a distribution, where the first one of its extra does not."""
 
 WITHOUT = """
 import runpy, sys
@@ -89,10 +92,11 @@ def modules_of(name):
 def cases():
     """Each package of each extra is missing once, and then all packages of the extra together."""
     for name, distributions in extras().items():
-        missing = [found for each in distributions if (found := modules_of(each))]
-        every = [module for each in missing for module in each]
+        missing = {each: found for each in distributions if (found := modules_of(each))}
+        every = [module for each in missing.values() for module in each]
         lines = [(every, line) for line in NEEDED_BY[name]]
-        lines += [(each, NEEDED_BY[name][0]) for each in missing if len(missing) > 1]
+        if len(missing) > 1:
+            lines += [(found, NEEDED_ALONE.get(each, NEEDED_BY[name][0])) for each, found in missing.items()]
         for blocked, line in lines:
             yield pytest.param(name, blocked, line, id=f"{name}-{'+'.join(blocked)}-{line.split()[0]}")
 

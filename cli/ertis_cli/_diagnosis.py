@@ -26,7 +26,7 @@ _EXTRAS: Final = {
     "browser": ("playwright",),
     "cluster": ("distributed",),
     "metrics": ("prometheus_client",),
-    "ros": ("mcap", "mcap_ros2"),
+    "ros": ("cyclonedds", "mcap", "mcap_ros2"),
     "view": ("viser", "websockets"),
     "xarray": ("xarray",),
 }

@@ -57,6 +57,7 @@ COMMANDS: Final[dict[str, Sequence[str]]] = {
     "process": ("{recording}", "-o", "{out}/images.h5"),
     "record": ("--listen", "tcp://127.0.0.1:0", "-o", "{out}/recordings"),
     "recover": ("{out}/crashed",),
+    "ros": ("{recording}", "--duration", "2"),
     "serve": ("--listen", "tcp://127.0.0.1:0", "--publish", "tcp://127.0.0.1:0", "--record", "{out}/recordings"),
     "settings": ("scene",),
     "simulate": ("{scene}", "-o", "{out}/simulated.h5"),

@@ -1,0 +1,148 @@
+"""Sources of ``ertis ros``: the products of a central node, and the measurements of a file at their original speed."""
+
+import time
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from ertis_cli._stop_signals import Signals
+
+if TYPE_CHECKING:
+    from ertis_numba.network.keys import ClientKeys
+    from ertis_numba.ros import RosPublisher
+
+__all__ = ["publish_file", "publish_node"]
+
+_POLL_INTERVAL_S: Final = 0.1
+_CLOCK_INTERVAL_S: Final = 0.02
+_UNTIMED_S: Final = 0.1
+"""Interval between measurements without timestamps."""
+
+
+def publish_node(
+    address: str,
+    ros: "RosPublisher",
+    *,
+    topics: Collection[str],
+    sensors: Sequence[str],
+    keys: "ClientKeys | None",
+    is_over: Callable[[], bool],
+    on_note: Callable[[str], None],
+    on_published: Callable[[], None],
+    on_ready: Callable[[], None],
+    signals: Signals,
+) -> None:
+    """Publish the products of a central node, until the program is to end.
+
+    Points alone need no images, which are larger.
+    """
+    from ertis_numba.network.status import Status
+    from ertis_numba.network.subscriber import Subscriber
+
+    products: tuple[Any, ...] = ("points" if set(topics) == {"points"} else "energyscape", "status")
+    with Subscriber(address, products=products, sensors=sensors or None, keys=keys, on_note=on_note) as subscriber:
+        signals.obey(subscriber.close)
+        on_ready()
+        while not is_over():
+            item = subscriber.receive(_POLL_INTERVAL_S)
+            arrival = subscriber.latest
+            if item is None or arrival is None:
+                continue
+            if isinstance(item, Status):
+                ros.publish_status(item)
+                continue
+            place = None
+            if arrival.translation_m is not None and arrival.rotation_xyzw is not None:
+                place = arrival.translation_m, arrival.rotation_xyzw
+            ros.publish(item, place)
+            on_published()
+
+
+def publish_file(
+    path: Path,
+    ros: "RosPublisher",
+    *,
+    sensors: Sequence[str],
+    device: Any,
+    rate: float,
+    loop: bool,
+    sim_time: bool,
+    is_over: Callable[[], bool],
+    on_published: Callable[[], None],
+    on_ready: Callable[[], None],
+    signals: Signals,
+) -> None:
+    """Publish the images of a file at ``rate`` times the speed of the recording.
+
+    With ``sim_time``, the stamps are those of the file, and ``/clock`` has the same time; otherwise the stamps are the
+    present.
+    """
+    from dataclasses import replace
+
+    from ertis_numba.pipeline import Pipeline
+    from ertis_numba.storage import file_kind, open_energyscapes, open_recording, sensor_names
+
+    with ExitStack() as stack:
+        opened: Any = open_energyscapes if file_kind(path) == "energyscape" else open_recording
+        readers = {name: stack.enter_context(opened(path, sensor=name)) for name in (sensors or sensor_names(path))}
+        order = _in_order({name: reader.stamps() for name, reader in readers.items()})
+        pipelines: dict[str, Pipeline] = {}
+        signals.obey(lambda: None)
+        on_ready()
+        clock = _Clock(ros, rate=rate, sim_time=sim_time, is_over=is_over)
+        again = True
+        while again and not is_over():
+            clock.start(order[0][0])
+            for time_ns, name, index in order:
+                item = readers[name][index]
+                if not hasattr(item, "range_m"):
+                    if name not in pipelines:
+                        pipelines[name] = stack.enter_context(Pipeline(item.settings, device=device))
+                        clock.start(time_ns)  # Compilation takes seconds, and the file waits for it.
+                    item = pipelines[name].process(item)
+                if not clock.wait_until(time_ns):
+                    return
+                stamp_ns = time_ns if sim_time else time.time_ns()
+                item = item.replace(stamp=replace(item.stamp, timestamp_ns=stamp_ns))
+                reader = readers[name]
+                known = reader.translation_m is not None and reader.rotation_xyzw is not None
+                ros.publish(item, (reader.translation_m, reader.rotation_xyzw) if known else None)
+                on_published()
+            again = loop and clock.wait_until(order[-1][0] + round(1e9 * _UNTIMED_S))
+
+
+def _in_order(stamps: Mapping[str, Sequence[Any]]) -> list[tuple[int, str, int]]:
+    """Return time, sensor and index of all measurements of a file, in the order of their times."""
+    found = []
+    for name, each in stamps.items():
+        for index, stamp in enumerate(each):
+            time_ns = stamp.timestamp_ns if stamp.is_timed else round(1e9 * (1 + index * _UNTIMED_S))
+            found.append((time_ns, name, index))
+    return sorted(found)
+
+
+class _Clock:
+    """Clock of a file: it waits for the times of measurements, and publishes ``/clock`` meanwhile."""
+
+    def __init__(self, ros: "RosPublisher", *, rate: float, sim_time: bool, is_over: Callable[[], bool]) -> None:
+        self._ros, self._rate, self._sim_time, self._is_over = ros, rate, sim_time, is_over
+        self._file_ns, self._begun_s = 0, 0.0
+
+    def start(self, time_ns: int) -> None:
+        """Let the time of the file be ``time_ns`` now."""
+        self._file_ns, self._begun_s = time_ns, time.monotonic()
+
+    def wait_until(self, time_ns: int) -> bool:
+        """Wait for a time of the file; return False if the program is to end before."""
+        while not self._is_over():
+            left_s = (time_ns - self._now_ns()) / 1e9 / self._rate
+            if self._sim_time:
+                self._ros.publish_clock(min(time_ns, self._now_ns()))
+            if left_s <= 0:
+                return True
+            time.sleep(min(left_s, _CLOCK_INTERVAL_S))
+        return False
+
+    def _now_ns(self) -> int:
+        return self._file_ns + round((time.monotonic() - self._begun_s) * 1e9 * self._rate)

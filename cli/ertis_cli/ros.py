@@ -1,0 +1,245 @@
+"""``ertis ros``: images and points as live ROS 2 topics."""
+
+import math
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import click
+
+from ertis_cli import _mountings, _network, _ros_sources, options
+from ertis_cli._stop_signals import stopped_by_signals
+
+__all__ = ["ros"]
+
+_TOPICS = ("points", "scan", "image", "sonar_image")
+
+
+class _MaxRate(click.ParamType[Any]):
+    """Option TOPIC=HZ."""
+
+    name = "topic=hz"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, float]:
+        topic, _, rate = str(value).partition("=")
+        try:
+            rate_hz = float(rate)
+        except ValueError:
+            rate_hz = math.nan
+        if topic not in _TOPICS or not rate_hz > 0:
+            self.fail(f"{value!r} is not TOPIC=HZ, as in image=5; topics are {', '.join(_TOPICS)}", param, ctx)
+        return topic, rate_hz
+
+
+@click.command()
+@click.argument("source", metavar="ADDRESS|REC.h5|IMG.h5")
+@click.option(
+    "--sensor",
+    "sensors",
+    multiple=True,
+    metavar="NAME",
+    help="Publish this sensor only; repeatable; all sensors by default.",
+)
+@click.option(
+    "--topic",
+    "topics",
+    type=click.Choice(_TOPICS),
+    multiple=True,
+    help="Topic of each sensor; repeatable; points and scan by default.",
+)
+@click.option("--namespace", default="", metavar="NAME", help="Prefix of the topics of sensors, such as robot1.")
+@click.option(
+    "--domain",
+    type=int,
+    metavar="N",
+    help="Domain id, 0 to 232; that of ROS_DOMAIN_ID by default, otherwise 0.",
+)
+@click.option(
+    "--interface",
+    default="lo",
+    show_default=True,
+    metavar="NAME",
+    help="Network interface. Everyone on its network can read the topics; lo serves this machine only.",
+)
+@click.option(
+    "--reliability",
+    type=click.Choice(["reliable", "best_effort"]),
+    default="reliable",
+    show_default=True,
+    help="Reliability of the topics of sensors.",
+)
+@click.option(
+    "--max-rate",
+    "max_rates",
+    type=_MaxRate(),
+    multiple=True,
+    metavar="TOPIC=HZ",
+    help="Largest rate of a topic of each sensor, as in image=5; repeatable.",
+)
+@click.option(
+    "--min-level",
+    type=float,
+    default=-20.0,
+    show_default=True,
+    metavar="DB",
+    help="Lowest level of points and echoes, relative to the strongest of the image.",
+)
+@click.option(
+    "--floor",
+    "floor_dbfs",
+    type=float,
+    metavar="DBFS",
+    help="Lowest absolute level of echoes in scans, so that a scene without echoes gives an empty scan.",
+)
+@click.option("--use-sim-time", "sim_time", is_flag=True, help="Keep the times of a file, and publish them on /clock.")
+@click.option(
+    "--rate",
+    type=click.FloatRange(0.01, 100),
+    default=1.0,
+    show_default=True,
+    metavar="X",
+    help="Speed of a file relative to the recording.",
+)
+@click.option("--loop", is_flag=True, help="Restart a file at its end.")
+@click.option("--duration", type=float, metavar="S", help="Duration in seconds; until Ctrl-C by default.")
+@_mountings.mounting
+@_network.key
+@_network.server_key
+@options.device
+@options.quiet
+@options.as_json_of("one object per line for each event; the last one is a summary")
+def ros(
+    *,
+    source: str,
+    sensors: tuple[str, ...],
+    topics: tuple[str, ...],
+    namespace: str,
+    domain: int | None,
+    interface: str,
+    reliability: Any,
+    max_rates: tuple[tuple[str, float], ...],
+    min_level: float,
+    floor_dbfs: float | None,
+    sim_time: bool,
+    rate: float,
+    loop: bool,
+    duration: float | None,
+    mounting: Path | None,
+    key: str | None,
+    server_key: str | None,
+    device: Any,
+    quiet: bool,
+    as_json: bool,
+) -> None:
+    """Publish images and points as live ROS 2 topics.
+
+    ROS need not be installed. ADDRESS is the address at which a central node publishes. A recording is processed with
+    its own settings, at its original speed. The command needs the extra 'ros'. DDS has no passwords: by default, only
+    this machine can read the topics; --interface opens them to a network. With --json, there is one line per event.
+    """
+    live = "://" in source
+    for name, is_given in (("--use-sim-time", sim_time), ("--loop", loop), ("--rate", rate != 1.0)):
+        if live and is_given:
+            raise click.UsageError(f"{name} is for files; remove it with an address", click.get_current_context())
+    _network.require_duration(duration)
+    from ertis_numba.ros import Participant, RosPublisher
+
+    chosen = topics or ("points", "scan")
+    end_s = math.inf if duration is None else time.monotonic() + duration
+    with (
+        stopped_by_signals() as signals,
+        Participant(domain=domain, interface=interface, reliability=reliability) as participant,
+    ):
+        given = _mountings.mountings(mounting, sensors or None) or {}
+        publisher = RosPublisher(
+            participant,
+            topics=chosen,
+            namespace=namespace,
+            mounting=given,
+            min_level_db=min_level,
+            floor_dbfs=-math.inf if floor_dbfs is None else floor_dbfs,
+            max_rate_hz=dict(max_rates),
+        )
+        report = _RosReport(publisher, quiet=quiet, as_json=as_json)
+        common: dict[str, Any] = {
+            "sensors": sensors,
+            "is_over": lambda: bool(signals.came) or time.monotonic() >= end_s,
+            "on_ready": lambda: report.start(source, participant),
+            "on_published": report.published,
+            "signals": signals,
+        }
+        if live:
+            keys = _network.client_keys(key, server_key)
+            _ros_sources.publish_node(source, publisher, topics=chosen, keys=keys, on_note=report.note, **common)
+        else:
+            _ros_sources.publish_file(
+                Path(source),
+                publisher,
+                device=device,
+                rate=rate,
+                loop=loop,
+                sim_time=sim_time,
+                **common,
+            )
+        report.end()
+        if signals.came and not live and not loop:
+            sys.exit(128 + signals.came[0])
+
+
+class _RosReport:
+    """Lines about the progress of the command."""
+
+    def __init__(self, publisher: Any, *, quiet: bool, as_json: bool) -> None:
+        self._publisher, self._quiet, self._as_json = publisher, quiet, as_json
+        self._n_items = 0
+        self._listed: set[str] = set()
+
+    def start(self, source: str, participant: Any) -> None:
+        """Report the domain and the interface."""
+        text = f"publishing {source} in domain {participant.domain} on interface {participant.interface}"
+        options.say(f"{text}; Ctrl-C ends", quiet=self._quiet)
+        if self._as_json:
+            options.print_json(
+                {
+                    "event": "publishing",
+                    "source": source,
+                    "domain": participant.domain,
+                    "interface": participant.interface,
+                }
+            )
+
+    def note(self, text: str) -> None:
+        """Report an event of the connection."""
+        options.say(text, quiet=self._quiet)
+        if self._as_json:
+            options.print_json({"event": "note", "text": text})
+
+    def published(self) -> None:
+        """Count a measurement, and report new topics."""
+        self._n_items += 1
+        for name, topic in self._publisher.topics.items():
+            if name not in self._listed:
+                self._listed.add(name)
+                options.say(f"  {name}  {topic.message}", quiet=self._quiet)
+                if self._as_json:
+                    options.print_json({"event": "topic", "topic": name, "message": topic.message})
+
+    def end(self) -> None:
+        """Report the counts."""
+        dropped, left_out = self._publisher.dropped, self._publisher.left_out
+        text = f"{options.counted(self._n_items, 'measurement')} published"
+        text += f", {options.counted(dropped, 'message')} dropped for slow subscribers" if dropped else ""
+        text += f", {left_out} left out by --max-rate" if left_out else ""
+        options.say(text, quiet=self._quiet)
+        if self._as_json:
+            counts = {name: topic.published for name, topic in self._publisher.topics.items()}
+            options.print_json(
+                {
+                    "event": "end",
+                    "measurements": self._n_items,
+                    "messages": counts,
+                    "dropped": dropped,
+                    "left_out": left_out,
+                }
+            )

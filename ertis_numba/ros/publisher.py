@@ -1,0 +1,212 @@
+"""Publisher of images, points and status as ROS 2 topics."""
+
+import time
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Final
+
+from ertis_numba import checks
+from ertis_numba.analysis.point_finder import PointFinder
+from ertis_numba.errors import ArgumentError
+from ertis_numba.frames import Energyscape, PointCloud, Stamp
+from ertis_numba.interop._mountings import Mounting, validated
+from ertis_numba.interop.ros_messages import (
+    MESSAGES,
+    ImageMessages,
+    TopicNames,
+    mounting_message,
+    points_message,
+    scan_message,
+    sonar_frame_message,
+    sonar_image_message,
+)
+from ertis_numba.network.status import Status
+from ertis_numba.ros.diagnostics import diagnostics_message
+from ertis_numba.ros.participant import Participant, Topic
+
+__all__ = ["RosPublisher"]
+
+_TRANSFORMS: Final = ("/tf_static", "tf2_msgs/msg/TFMessage")
+_DIAGNOSTICS: Final = ("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
+_CLOCK: Final = ("/clock", "rosgraph_msgs/msg/Clock")
+
+
+class RosPublisher:
+    """Publisher of the topics of all sensors.
+
+    The topics of a sensor lie in ``NAMESPACE/SENSOR/``; their frame is the sensor's name. ``docs/how-to/ros.md`` lists
+    the topics and their messages.
+
+    Parameters
+    ----------
+    participant : Participant
+    topics : sequence of str
+        Topics of each sensor, of `ertis_numba.interop.ros_messages.MESSAGES`; ``points`` and ``scan`` by default.
+    namespace : str
+        Prefix of the topics of sensors, such as ``robot1``.
+    mounting : mapping of str to (translation_m, rotation_xyzw), optional
+        Poses of sensors on their platform, in place of those of the images.
+    top : int
+        Largest number of points per image.
+    min_level_db : float
+        Lowest level of points and of echoes in scans, relative to the strongest point of the image, in dB.
+    floor_dbfs : float
+        Lowest level of echoes in scans in dBFS.
+    max_rate_hz : mapping of str to float, optional
+        Largest rate of a topic of each sensor. Messages above it are left out.
+
+    Attributes
+    ----------
+    topics : dict of str to Topic
+        Topics in use, by name.
+    left_out : int
+        Number of messages left out because of ``max_rate_hz``.
+
+    Raises
+    ------
+    ArgumentError
+        A topic, the namespace, a mounting or a limit is invalid.
+
+    Examples
+    --------
+    Publish the points and the scans of a recording, on this machine only::
+
+        from ertis_numba.ros import Participant, RosPublisher
+
+        with ertis.open_recording("reflectors.h5") as recording, Participant() as participant:
+            pipeline, ros = ertis.Pipeline(recording.settings), RosPublisher(participant)
+            for measurement in recording:
+                ros.publish(pipeline.process(measurement))
+    """
+
+    def __init__(
+        self,
+        participant: Participant,
+        *,
+        topics: Collection[str] = ("points", "scan"),
+        namespace: str = "",
+        mounting: Mapping[str, tuple[Sequence[float], Sequence[float]]] | None = None,
+        top: int = 256,
+        min_level_db: float = -20.0,
+        floor_dbfs: float = float("-inf"),
+        max_rate_hz: Mapping[str, float] | None = None,
+    ) -> None:
+        for topic in topics:
+            checks.choice("topic", topic, MESSAGES)
+        for topic, rate_hz in (max_rate_hz or {}).items():
+            checks.choice("topic", topic, MESSAGES)
+            checks.between("max_rate_hz", rate_hz, 1e-3, 1e4)
+        self.topics: dict[str, Topic] = {}
+        self.left_out = 0
+        self._wanted = [topic for topic in MESSAGES if topic in topics]
+        self._base = _namespace(namespace)
+        self._participant, self._given, self._max_rate_hz = participant, validated(mounting), dict(max_rate_hz or {})
+        self._find = PointFinder(top=top, min_level_db=min_level_db)
+        self._scan_limits = {"min_level_db": min_level_db, "floor_dbfs": floor_dbfs}
+        self._image = ImageMessages()
+        self._names = TopicNames()
+        self._frames: dict[str, Mounting | None] = {}
+        self._due_ns: dict[tuple[str, str], int] = {}
+        self._announced: list[dict[str, Any]] = []
+
+    @property
+    def dropped(self) -> int:
+        """Number of messages dropped because a reliable subscriber did not keep up."""
+        return sum(topic.dropped for topic in self.topics.values())
+
+    def publish(self, item: Energyscape | PointCloud, mounting: Mounting | None = None) -> None:
+        """Publish the topics that follow from an image, or the points of one.
+
+        The time of all messages is that of the emission, or the present if the clock of the sensor was never set.
+
+        Parameters
+        ----------
+        item : Energyscape or PointCloud
+        mounting : (translation_m, rotation_xyzw), optional
+            Pose of the sensor on its platform.
+
+        Raises
+        ------
+        ArgumentError
+            Two sensors would share topics, or the time is outside the range of ROS 2.
+        """
+        if not item.stamp.is_timed:
+            item = item.replace(stamp=replace(item.stamp, timestamp_ns=time.time_ns()))
+        stamp = item.stamp
+        self._announce(stamp, mounting)
+        for topic in self._wanted:
+            if isinstance(item, PointCloud) != (topic == "points") and isinstance(item, PointCloud):
+                continue
+            if not self._is_due(topic, stamp):
+                self.left_out += 1
+                continue
+            message = self._message(topic, item)
+            if message is not None:
+                self._topic(f"{self._base}/{self._names[stamp.sensor]}/{topic}", MESSAGES[topic]).publish(message)
+
+    def publish_status(self, status: Status) -> None:
+        """Publish the status of a central node and its sensors on ``/diagnostics``."""
+        self._topic(*_DIAGNOSTICS).publish(diagnostics_message(status))
+
+    def publish_clock(self, time_ns: int) -> None:
+        """Publish a time in nanoseconds since 1970 on ``/clock``, for nodes with ``use_sim_time``."""
+        sec, nanosec = divmod(time_ns, 1_000_000_000)
+        self._topic(*_CLOCK).publish({"clock": {"sec": sec, "nanosec": nanosec}})
+
+    def _message(self, topic: str, item: Energyscape | PointCloud) -> dict[str, Any] | None:
+        if isinstance(item, PointCloud):
+            return points_message(item)
+        if topic == "points":
+            return points_message(self._find(item))
+        if topic == "scan":
+            return scan_message(item, **self._scan_limits)
+        return self._image(item) if topic == "image" else sonar_image_message(item)
+
+    def _is_due(self, topic: str, stamp: Stamp) -> bool:
+        """Return False if a message would exceed the rate of its topic."""
+        rate_hz = self._max_rate_hz.get(topic)
+        if rate_hz is None:
+            return True
+        key, interval_ns = (stamp.sensor, topic), round(1e9 / rate_hz)
+        due_ns = self._due_ns.get(key, stamp.timestamp_ns)
+        # Steady messages at a higher rate give the exact rate on average; after a pause, or a clock that was set, the
+        # count starts again.
+        if not -interval_ns <= stamp.timestamp_ns - due_ns <= interval_ns:
+            due_ns = stamp.timestamp_ns
+        if stamp.timestamp_ns < due_ns:
+            return False
+        self._due_ns[key] = due_ns + interval_ns
+        return True
+
+    def _announce(self, stamp: Stamp, mounting: Mounting | None) -> None:
+        """Publish the transforms of all sensors, if the sensor is new or was moved."""
+        place = self._given.get(stamp.sensor, mounting)
+        if stamp.sensor in self._frames and self._frames[stamp.sensor] == place:
+            return
+        self._frames[stamp.sensor] = place
+        transforms = []
+        for sensor, known in self._frames.items():
+            own = replace(stamp, sensor=sensor)
+            if known is not None:
+                transforms.append(mounting_message(own, known))
+            if "sonar_image" in self._wanted:
+                transforms.append(sonar_frame_message(own))
+        if transforms:
+            self._topic(*_TRANSFORMS, latched=True).publish({"transforms": transforms})
+
+    def _topic(self, name: str, message: str, *, latched: bool = False) -> Topic:
+        if name not in self.topics:
+            self.topics[name] = self._participant.topic(name, message, latched=latched)
+        return self.topics[name]
+
+
+def _namespace(given: str) -> str:
+    """Return a namespace with its leading slash, or an empty one."""
+    parts = given.strip("/").split("/") if given.strip("/") else []
+    for part in parts:
+        if not part.isidentifier() or not part.isascii() or "__" in part:
+            raise ArgumentError(
+                f"namespace {given!r} is not allowed in ROS; give names of letters, digits and single underscores that "
+                "do not begin with a digit, separated by /"
+            )
+    return "".join(f"/{part}" for part in parts)

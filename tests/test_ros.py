@@ -1,0 +1,268 @@
+"""Live topics arrive in rclpy, which runs in another process, byte for byte."""
+
+import base64
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import contextmanager
+
+import pytest
+from click.testing import CliRunner
+from ertis_cli.main import cli
+
+from ertis_numba.analysis.point_finder import PointFinder
+from ertis_numba.errors import ArgumentError
+from ertis_numba.frames import Stamp
+from ertis_numba.interop.ros_definitions import encoder
+from ertis_numba.interop.ros_messages import MESSAGES, ImageMessages, points_message, scan_message
+from ertis_numba.network.status import SensorStatus, Status
+from ertis_numba.ros import Participant, RosPublisher, interfaces
+from ertis_numba.ros.diagnostics import diagnostics_message
+from ertis_numba.storage import write_energyscapes
+from tests.files import image
+from tests.journals import ENVIRONMENT
+
+pytest.importorskip("rclpy.serialization")  # Wheels exist for some versions of Python only.
+pytest.importorskip("cyclonedds")
+
+TIME_NS = 1_700_000_000_123_456_789
+DOMAIN = 1 + os.getpid() % 200  # Tests that run at the same time have their own domains.
+PLACE = ((1.0, 2.0, 0.5), (0.0, 0.0, 0.6, 0.8))
+WAIT_S = 30.0
+
+
+def stamped(seed, sensor="front", sequence=0):
+    return image(seed=seed).replace(stamp=Stamp(sensor=sensor, sequence=sequence, timestamp_ns=TIME_NS + sequence))
+
+
+class Subscriber:
+    """Subscriber of rclpy; its messages arrive as (topic, bytes)."""
+
+    def __init__(self, process):
+        self._process = process
+
+    def pause(self):
+        """Stop the process, as a debugger does."""
+        self._process.send_signal(signal.SIGSTOP)
+
+    def take(self, count):
+        """Next messages, as a dict of topic to a list of their bytes."""
+        taken = {}
+        for _ in range(count):
+            line = json.loads(self._process.stdout.readline())
+            taken.setdefault(line["topic"], []).append(base64.b64decode(line["cdr"]))
+        return taken
+
+
+@contextmanager
+def subscribed(topics, *, domain=DOMAIN):
+    command = [sys.executable, "-m", "tests.ros_subscriber", *(f"{name}={kind}" for name, kind in topics.items())]
+    environment = ENVIRONMENT | {"ROS_DOMAIN_ID": str(domain), "ROS_LOG_DIR": tempfile.gettempdir()}
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
+    ) as process:
+        try:
+            assert json.loads(process.stdout.readline()) == {"ready": True}
+            yield Subscriber(process)
+        finally:
+            process.kill()
+
+
+def await_subscribers(topics, count=1):
+    """Wait until each topic has subscribers."""
+    end_s = time.monotonic() + WAIT_S
+    while any(topic.n_subscribers < count for topic in topics):
+        assert time.monotonic() < end_s
+        time.sleep(0.01)
+
+
+def equal(received, message, kind):
+    """True if received bytes are the encoded message; rclpy may add bytes that fill up the last word."""
+    encoded = encoder(kind)(message)
+    return received[: len(encoded)] == encoded and len(received) - len(encoded) < 4
+
+
+def test_topics_arrive_in_rclpy():
+    given = [stamped(seed, sequence=seed) for seed in range(20)]
+    names = {topic: f"/robot1/front/{topic}" for topic in ("points", "scan", "image")}
+    find, picture = PointFinder(), ImageMessages()
+    expected = {
+        "points": [points_message(find(each)) for each in given],
+        "scan": [scan_message(each) for each in given],
+        "image": [picture(each) for each in given],
+    }
+    kinds = {names[topic]: MESSAGES[topic] for topic in names}
+    with subscribed(kinds) as subscriber, Participant(domain=DOMAIN) as participant:
+        ros = RosPublisher(participant, topics=names, namespace="robot1")
+        ros.publish(given[0], PLACE)  # creates the topics
+        await_subscribers([ros.topics[name] for name in kinds])
+        for each in given:
+            ros.publish(each, PLACE)
+        taken = subscriber.take(3 * len(given))
+    assert ros.dropped == 0
+    for topic, name in names.items():
+        assert len(taken[name]) == len(given)
+        assert all(equal(*pair, MESSAGES[topic]) for pair in zip(taken[name], expected[topic], strict=True))
+
+
+def test_points_without_an_image_are_published_alone():
+    cloud = PointFinder()(stamped(1))
+    with subscribed({"/front/points": MESSAGES["points"]}) as subscriber, Participant(domain=DOMAIN) as participant:
+        ros = RosPublisher(participant)
+        ros.publish(cloud)
+        await_subscribers([ros.topics["/front/points"]])
+        ros.publish(cloud)
+        (received,) = subscriber.take(1)["/front/points"]
+    assert equal(received, points_message(cloud), MESSAGES["points"])
+    assert list(ros.topics) == ["/front/points"]
+
+
+def test_status_and_clock_arrive_in_rclpy():
+    sensors = {
+        "front": SensorStatus(connected=True, rate_hz=10.0),
+        "left": SensorStatus(connected=False),
+        "right": SensorStatus(connected=True, missing={"unplugged": 3}),
+    }
+    status = Status(
+        version="1", pid=1, host="h", address="tcp://a:1", state="processing", sensors=sensors, time_ns=TIME_NS
+    )
+    kinds = {"/diagnostics": "diagnostic_msgs/msg/DiagnosticArray", "/clock": "rosgraph_msgs/msg/Clock"}
+    with subscribed(kinds) as subscriber, Participant(domain=DOMAIN) as participant:
+        ros = RosPublisher(participant)
+        ros.publish_status(status)
+        ros.publish_clock(TIME_NS)
+        await_subscribers(ros.topics.values())
+        ros.publish_status(status)
+        ros.publish_clock(TIME_NS)
+        taken = subscriber.take(2)
+    message = diagnostics_message(status)
+    assert equal(taken["/diagnostics"][0], message, kinds["/diagnostics"])
+    clock = {"clock": {"sec": TIME_NS // 10**9, "nanosec": TIME_NS % 10**9}}
+    assert equal(taken["/clock"][0], clock, kinds["/clock"])
+    levels = {row["hardware_id"]: (row["level"], row["message"]) for row in message["status"]}
+    assert levels == {
+        "h": (0, "processing"),
+        "front": (0, "10.0 Hz"),
+        "left": (3, "not connected"),
+        "right": (1, "3 measurements are missing"),
+    }
+
+
+def test_other_domains_receive_nothing():
+    with (
+        subscribed({"/clock": "rosgraph_msgs/msg/Clock"}, domain=DOMAIN + 1),
+        subscribed({"/clock": "rosgraph_msgs/msg/Clock"}),
+        Participant(domain=DOMAIN) as participant,
+    ):
+        ros = RosPublisher(participant)
+        ros.publish_clock(1)
+        await_subscribers(ros.topics.values())
+        assert ros.topics["/clock"].n_subscribers == 1
+
+
+def test_subscriber_that_was_stopped_does_not_block_the_publisher():
+    kinds = {"/front/points": MESSAGES["points"]}
+    with subscribed(kinds) as good, subscribed(kinds) as stopped, Participant(domain=DOMAIN) as participant:
+        ros = RosPublisher(participant)
+        ros.publish(stamped(1))
+        await_subscribers([ros.topics["/front/points"]], 2)
+        stopped.pause()
+        for seed in range(100):
+            ros.publish(stamped(seed, sequence=seed))
+        assert len(good.take(100)["/front/points"]) == 100
+        assert ros.dropped == 0
+
+
+def test_rate_of_a_topic_is_limited():
+    with Participant(domain=DOMAIN) as participant:
+        ros = RosPublisher(participant, max_rate_hz={"points": 4.0})
+        for number in range(41):  # 20 Hz for 2 s
+            stamp = Stamp(sensor="front", sequence=number, timestamp_ns=TIME_NS + number * 50_000_000)
+            ros.publish(image().replace(stamp=stamp))
+        counts = {name: topic.published for name, topic in ros.topics.items()}
+    assert counts == {"/front/points": 9, "/front/scan": 41}
+    assert ros.left_out == 32
+
+
+def test_transforms_are_published_when_they_change():
+    with Participant(domain=DOMAIN) as participant:
+        ros = RosPublisher(participant)
+        ros.publish(stamped(1))
+        assert "/tf_static" not in ros.topics
+        for place in (PLACE, PLACE, ((0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0))):
+            ros.publish(stamped(1), place)
+        assert ros.topics["/tf_static"].published == 2
+
+
+def test_command_publishes_a_file(tmp_path):
+    path = tmp_path / "images.h5"
+    write_energyscapes(path, [stamped(seed, sequence=50_000_000 * seed) for seed in range(5)])
+    kinds = {"/front/points": MESSAGES["points"], "/front/scan": MESSAGES["scan"]}
+    with subscribed(kinds) as subscriber:
+        done = CliRunner().invoke(
+            cli, ["ros", str(path), "--domain", str(DOMAIN), "--loop", "--duration", "4", "--use-sim-time", "--json"]
+        )
+        taken = subscriber.take(4)
+    assert done.exit_code == 0, done.stderr
+    lines = [json.loads(line) for line in done.stdout.splitlines()]
+    assert lines[0]["event"] == "publishing"
+    assert {line["topic"] for line in lines if line["event"] == "topic"} == {"/clock", *kinds}
+    assert lines[-1]["event"] == "end"
+    assert lines[-1]["messages"]["/front/points"] == lines[-1]["measurements"] > 5
+    assert sum(map(len, taken.values())) == 4
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"domain": 233}, "domain is 233; give a whole number from 0 to 232"),
+        ({"domain": -1}, "domain is -1"),
+        ({"interface": "nothing0"}, r"interface 'nothing0' is unknown.*known are lo"),
+        ({"reliability": "both"}, "reliability 'both' is unknown"),
+        ({"depth": 0}, "depth is 0"),
+    ],
+)
+def test_participant_refuses_invalid_arguments(options, message):
+    with pytest.raises(ArgumentError, match=message):
+        Participant(**options)
+
+
+def test_domain_comes_from_the_environment(monkeypatch):
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(DOMAIN))
+    with Participant() as participant:
+        assert participant.domain == DOMAIN
+    monkeypatch.setenv("ROS_DOMAIN_ID", "x")
+    with pytest.raises(ArgumentError, match="ROS_DOMAIN_ID is 'x'; give a number from 0 to 232"):
+        Participant()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"topics": ["cloud"]}, "topic 'cloud' is unknown"),
+        ({"namespace": "9a"}, "namespace '9a' is not allowed in ROS; give names"),
+        ({"namespace": "a//b"}, "namespace 'a//b' is not allowed"),
+        ({"max_rate_hz": {"points": 0.0}}, "max_rate_hz is 0"),
+    ],
+)
+def test_publisher_refuses_invalid_arguments(options, message):
+    with Participant(domain=DOMAIN) as participant, pytest.raises(ArgumentError, match=message):
+        RosPublisher(participant, **options)
+
+
+def test_sensors_with_the_same_topics_are_refused():
+    with Participant(domain=DOMAIN) as participant:
+        ros = RosPublisher(participant)
+        ros.publish(stamped(1, "a.b"))
+        with pytest.raises(ArgumentError, match=r"sensors a\.b and a-b would share topics /a_b"):
+            ros.publish(stamped(1, "a-b"))
+
+
+def test_loopback_is_the_default():
+    assert "lo" in interfaces()
+    with Participant(domain=DOMAIN) as participant:
+        assert participant.interface == "lo"
