@@ -21,7 +21,20 @@ SIMULATION = page("simulation")
 DEVICES = page("devices")
 NETWORK = next(block for block in README.split("```") if "ertis serve" in block)
 ELSEWHERE = {
-    *("completion", "demo", "doctor", "keys", "layout", "listen", "record", "serve", "settings", "status", "view")
+    *(
+        "completion",
+        "demo",
+        "doctor",
+        "keys",
+        "layout",
+        "listen",
+        "record",
+        "ros",
+        "serve",
+        "settings",
+        "status",
+        "view",
+    )
 }
 """Commands with tests or pages of their own."""
 
