@@ -1,6 +1,7 @@
 """Every kernel of every device against its float64 reference, over one table of cases."""
 
 import inspect
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -348,3 +349,39 @@ def test_add_paths_equals_its_reference(kernel_set, one_call, n_paths, n_mics, n
     kernel_set.add_paths(call, turns, amplitude, first_bin, 0.1, out)
     add_paths_plainly(call, turns, amplitude, first_bin, 0.1, wanted)
     np.testing.assert_allclose(out, wanted, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("coherent", [0, 1])
+@pytest.mark.parametrize("order", [1, 2, 3, 4, 5])
+@pytest.mark.parametrize("n_samples", sized([5, 130], [64, 127, 128, 1000]))
+def test_combine_delayed_equals_its_reference(kernel_set, n_samples, order, coherent):
+    n_directions, n_mics, first = 3, 7, 4
+    delays = np.random.default_rng(1).integers(0, 9, (n_directions, n_mics)).astype(np.int32)
+    signals = real_noise(n_mics, n_samples + 20)
+    signals[:, :20] = 0  # Some samples are 0 in all microphones.
+    roots = (np.sign(signals) * np.abs(signals) ** (1 / order)).astype(np.float32)
+    out, expected = filled(n_directions, n_samples), np.empty((n_directions, n_samples))
+    kernel_set.combine_delayed(signals, roots, delays, order, coherent, first, out)
+    for direction, delay in enumerate(delays):
+        x, root = (
+            np.stack([row[first + d : first + d + n_samples] for row, d in zip(each.astype(float), delay, strict=True)])
+            for each in (signals, roots)
+        )
+        value = sum(np.prod(chosen, axis=0) for chosen in itertools.combinations(x if order == 1 else root, order))
+        if coherent:
+            power = n_mics * (x**2).sum(axis=0)
+            value = value * np.divide(x.sum(axis=0) ** 2, power, out=np.zeros(n_samples), where=power > 0)
+        expected[direction] = value
+    assert np.abs(out - expected).max() <= FLOAT32 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize(
+    ("n_taps", "factor", "first", "n_ranges"), sized([(8, 3, 2, 6)], [(512, 10, 0, 450), (1, 1, 0, 9)])
+)
+def test_rectify_and_decimate_equals_its_reference(kernel_set, n_taps, factor, first, n_ranges):
+    beams, taps = real_noise(3, first + (n_ranges - 1) * factor + n_taps), real_noise(n_taps, seed=2)
+    out = filled(3, n_ranges)
+    kernel_set.rectify_and_decimate(beams, taps, factor, first, out)
+    magnitude = np.abs(beams.astype(float))
+    expected = [[row[first + r * factor :][:n_taps] @ taps for r in range(n_ranges)] for row in magnitude]
+    assert np.abs(out - expected).max() <= FLOAT32 * np.abs(expected).max()

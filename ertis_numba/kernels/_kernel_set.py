@@ -58,6 +58,8 @@ class KernelSet(AdaptiveKernels):
     multiply_and_fold: _contract.MultiplyAndFold
     sum_spectra: _contract.SumSpectra
     envelope_rows: _contract.EnvelopeRows
+    combine_delayed: _contract.CombineDelayed
+    rectify_and_decimate: _contract.RectifyAndDecimate
     delay_and_sum: _contract.DelayAndSum
     envelope: _contract.Envelope
     delay_and_sum_envelope: _contract.DelayAndSumEnvelope

@@ -141,6 +141,42 @@ def envelope_rows(beams: Complex, lead: int, first: int, stop: int, out: Real) -
     np.abs(beams[: len(out), 0, lead + first : lead + stop], out=out[:, first:stop])
 
 
+def combine_delayed(
+    signals: Real,
+    roots: Real,
+    delays: Index,
+    order: int,
+    coherent: int,
+    first: int,
+    out: Real,
+) -> None:
+    """Combine the delayed real signals of all microphones for every direction and sample."""
+    mics = np.arange(len(signals))[:, None]
+    for direction, delay in enumerate(delays):
+        places = first + delay[:, None] + np.arange(out.shape[1])
+        delayed = signals[mics, places].astype(np.float64)
+        if order == 1:
+            combined = delayed.sum(axis=0)
+        else:
+            sums = np.zeros((order + 1, out.shape[1]))
+            sums[0] = 1
+            for root in roots[mics, places].astype(np.float64):
+                for k in range(order, 0, -1):
+                    sums[k] += sums[k - 1] * root
+            combined = sums[order]
+        if coherent:
+            total = len(signals) * (delayed**2).sum(axis=0)
+            agreement = delayed.sum(axis=0) ** 2
+            combined *= np.divide(agreement, total, out=np.zeros_like(agreement), where=total != 0)
+        out[direction] = combined
+
+
+def rectify_and_decimate(beams: Real, taps: Real, factor: int, first: int, out: Real) -> None:
+    """Rectify real beams, filter them, and keep every factor-th sample."""
+    windows = np.lib.stride_tricks.sliding_window_view(np.abs(beams[:, first:]), len(taps), axis=1)
+    out[:] = windows[: len(out), : (out.shape[1] - 1) * factor + 1 : factor] @ taps
+
+
 def delay_and_sum(signals: Complex, offsets: Index, weights: Complex, out: Complex) -> None:
     """Sum the delayed and weighted signals of all microphones for every direction and range."""
     flat = signals.reshape(-1)

@@ -78,6 +78,9 @@ def _each(kernels):
     offsets, weights = np.zeros((90, 8), np.int32), np.zeros((90, 8), np.complex64)
     kernels.delay_and_sum(np.zeros((8, 2, 500), np.complex64), offsets, weights, beams)
     kernels.envelope(beams, 10, np.zeros((90, 40), np.float32))
+    sums = np.zeros((90, 400), np.float32)
+    kernels.combine_delayed(signals, signals, offsets, 5, 1, 0, sums)
+    kernels.rectify_and_decimate(sums, np.zeros(61, np.float32), 10, 0, np.zeros((90, 30), np.float32))
     double, octets = np.zeros((32, 500)), np.arange(32, dtype=np.int32).reshape(4, 8)
     kernels.add_paths(
         np.zeros((1, 251), np.complex128),

@@ -7,6 +7,7 @@ phase, sample; direction, range.
 
 from ertis_numba.kernels._contract.arrays import Complex, ComplexOrDouble, Index, Pcm, Real, Short, Taps, Turns, Words
 from ertis_numba.kernels._contract.beams import (
+    CombineDelayed,
     DelayAndSum,
     DelayAndSumEnvelope,
     DelayAndSumEnvelopeInt16,
@@ -14,6 +15,7 @@ from ertis_numba.kernels._contract.beams import (
     InterpolatedBeamsEnvelope,
     InterpolatedBeamsEnvelopeInt16,
     QuantiseTiles,
+    RectifyAndDecimate,
 )
 from ertis_numba.kernels._contract.scenes import AddPaths, ModulatePdm
 from ertis_numba.kernels._contract.signals import (
@@ -31,6 +33,7 @@ from ertis_numba.kernels._contract.streams import CombineStreamsInt16, QuantiseS
 
 __all__ = [
     "AddPaths",
+    "CombineDelayed",
     "CombineStreamsInt16",
     "Complex",
     "ComplexOrDouble",
@@ -51,6 +54,7 @@ __all__ = [
     "QuantiseStreams",
     "QuantiseTiles",
     "Real",
+    "RectifyAndDecimate",
     "RemoveGroupDelay",
     "Short",
     "SumSpectra",

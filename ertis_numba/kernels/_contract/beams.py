@@ -7,6 +7,7 @@ import numpy as np
 from ertis_numba.kernels._contract.arrays import Complex, Index, Real, Short
 
 __all__ = [
+    "CombineDelayed",
     "DelayAndSum",
     "DelayAndSumEnvelope",
     "DelayAndSumEnvelopeInt16",
@@ -14,6 +15,7 @@ __all__ = [
     "InterpolatedBeamsEnvelope",
     "InterpolatedBeamsEnvelopeInt16",
     "QuantiseTiles",
+    "RectifyAndDecimate",
 ]
 
 
@@ -199,3 +201,45 @@ class InterpolatedBeamsEnvelopeInt16(Protocol):
         n_blocks: int,
         out: Real,
     ) -> None: ...
+
+
+class CombineDelayed(Protocol):
+    """Combine the delayed real signals of all microphones for every direction and sample.
+
+    For order 1, ``out[direction, n] = Σ x`` over the microphones, with
+    ``x = signals[mic, first + n + delays[direction, mic]]``. For a higher order, it is the sum of the products of all
+    combinations of ``order`` values of ``roots``, delayed alike. With ``coherent``, the result is multiplied by
+    ``(Σ x)² / (n_mics Σ x²)``, or by 0 where all x are 0.
+
+    Parameters
+    ----------
+    signals, roots : (mic, sample) float32
+        Roots are used above order 1 only.
+    delays : (direction, mic) int32
+        At least 0.
+    order : int
+        1 to 5.
+    coherent : {0, 1}
+    first : int
+    out : (direction, n) float32
+    """
+
+    def __call__(
+        self, signals: Real, roots: Real, delays: Index, order: int, coherent: int, first: int, out: Real
+    ) -> None: ...
+
+
+class RectifyAndDecimate(Protocol):
+    """Rectify real beams, filter them, and keep every factor-th sample.
+
+    ``out[direction, r] = Σ_t taps[t] · |beams[direction, first + r · factor + t]|``.
+
+    Parameters
+    ----------
+    beams : (direction, sample) float32
+    taps : (tap,) float32
+    factor, first : int
+    out : (direction, r) float32
+    """
+
+    def __call__(self, beams: Real, taps: Real, factor: int, first: int, out: Real) -> None: ...
