@@ -37,7 +37,7 @@ from .frames import (
     Reflector as Reflector,
     Stamp as Stamp,
 )
-from .geometry import load_layout as load_layout
+from .geometry import layout_names as layout_names, load_layout as load_layout
 from .interop import export as export, open_pcm as open_pcm, open_raw as open_raw, open_rtis_folder as open_rtis_folder
 from .journal import JournalEntry as JournalEntry
 from .network.allow_list import AllowList as AllowList, Permission as Permission
@@ -45,7 +45,7 @@ from .network.keys import ClientKeys as ClientKeys, KeyPair as KeyPair, ServerKe
 from .network.sensor_node import SensorNode as SensorNode
 from .network.subscriber import Subscriber as Subscriber
 from .pipeline import Pipeline as Pipeline
-from .settings import Settings as Settings
+from .settings import Settings as Settings, presets as presets
 from .simulation.render import Simulator as Simulator, render as render
 from .simulation.scene import Scene as Scene, load_scene as load_scene
 from .storage import (

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal
 
 import click
 
-from ertis_cli import _mountings, _network, options
+from ertis_cli import _mountings, _network, _presets, options
 from ertis_cli._saving import withdrawn
 from ertis_cli._sending import Sending
 from ertis_cli._stop_signals import Signals, stopped_by_signals
@@ -102,7 +102,7 @@ _POLL_INTERVAL_S = 0.1  # interval between searches for ports
 @click.option(
     "--preset",
     metavar="NAME",
-    shell_complete=options.complete_presets,
+    shell_complete=_presets.completion("recording"),
     help="Record length (short_, default_, long_) and band (20_80, 25_50); default_25_50 by default.",
 )
 @click.option(

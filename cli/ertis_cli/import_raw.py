@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ertis_cli import options
+from ertis_cli import _presets, options
 from ertis_cli._config import typed
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ _PCM = {".wav", ".h5", ".hdf5", ".hdf"}
 @click.option(
     "--preset",
     metavar="NAME",
-    shell_complete=options.complete_presets,
+    shell_complete=_presets.completion("recording"),
     help="Record length (short_, default_, long_) and band (20_80, 25_50); not needed if a folder contains settings.",
 )
 @click.option(

@@ -31,10 +31,11 @@ COMMANDS = {
     "import": ("ertis_cli.import_raw:import_raw", "Import raw eRTIS data or PCM into a recording."),
     "info": ("ertis_cli.info:info", "Show the contents of a recording or an energyscape file."),
     "keys": ("ertis_cli.keys:keys", "Create keys and manage the list of allowed keys."),
-    "layout": ("ertis_cli.layout:layout", "List the shipped layouts, or print one as TOML."),
+    "layouts": ("ertis_cli.layouts:layouts", "List the shipped layouts, or print one as TOML."),
     "listen": ("ertis_cli.listen:listen", "Show or save the products that a central node publishes."),
     "peaks": ("ertis_cli.peaks:peaks", "List the reflectors in an energyscape file."),
     "plot": ("ertis_cli.plot:plot", "Plot a measurement or an array."),
+    "presets": ("ertis_cli.presets:presets", "List the shipped presets, or print one as TOML."),
     "process": ("ertis_cli.process:process", "Process recordings into energyscapes."),
     "record": ("ertis_cli.record:record", "Run a central node that stores measurements."),
     "recover": ("ertis_cli.recover:recover", "Recover recordings from journals left by a crash."),
@@ -48,6 +49,7 @@ COMMANDS = {
 }
 """Module and summary of each command. A command is imported only when it runs."""
 
+_FORMER_NAMES = {"layout": "layouts"}
 _FAILED, _USAGE, _INTERRUPTED = 1, 2, 130
 
 
@@ -56,6 +58,7 @@ class _Commands(click.Group):
         return sorted(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002
+        cmd_name = _FORMER_NAMES.get(cmd_name, cmd_name)
         if cmd_name not in COMMANDS:
             return None
         module, _, attribute = COMMANDS[cmd_name][0].partition(":")
@@ -67,7 +70,7 @@ class _Commands(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        name = args[0]
+        name = _FORMER_NAMES.get(args[0], args[0])
         if not name.startswith("-") and name not in COMMANDS and not ctx.resilient_parsing:
             ctx.fail(f"No such command {name!r} ({_config.instead(name, COMMANDS)})")
         return super().resolve_command(ctx, args)

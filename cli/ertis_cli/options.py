@@ -32,7 +32,6 @@ __all__ = [
     "as_json_of",
     "comparisons",
     "complete_layouts",
-    "complete_presets",
     "counted",
     "device",
     "force",
@@ -253,16 +252,22 @@ def settings_with(
     recorded: "Settings",
     *,
     settings_file: Path | None = None,
+    preset: str | None = None,
     max_error_db: float | None = None,
     without: tuple[int, ...] | None = None,
     **options: Any,
 ) -> "Settings":
-    """Return the settings of a recording, updated from a settings file and then from options.
+    """Return the settings of a recording, updated from a settings file, a processing preset and then from options.
 
     A settings file changes the keys that it contains; a layout or positions replace the whole array. ``without``
     disables further channels. Other options are named like the fields of `Processing`; None changes nothing.
     """
+    from ertis_numba.settings import preset_tables
+
     settings = recorded if settings_file is None else recorded.updated_from_file(settings_file)
+    if preset is not None:
+        keys = preset_tables(preset, "processing")["processing"]
+        settings = settings.replace(processing=settings.processing.replace(**keys))
     if without is not None:
         disabled = tuple(sorted({*(settings.array.disabled or ()), *without}))
         settings = settings.replace(array=settings.array.replace(disabled=disabled))
@@ -317,13 +322,6 @@ def pipeline(
         from ertis_numba.pipeline import Pipeline
 
         return Pipeline(settings, device=device, threads=threads, predict=False, plan=plan)
-
-
-def complete_presets(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:  # noqa: ARG001
-    """Return the preset names that complete a text in a shell."""
-    from ertis_numba.settings import PRESETS
-
-    return [name for name in PRESETS if name.startswith(incomplete)]
 
 
 def complete_layouts(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:  # noqa: ARG001

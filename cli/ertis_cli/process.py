@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from ertis_cli import _mountings, _plans, _process_many, options
+from ertis_cli import _mountings, _plans, _presets, _process_many, options
 from ertis_cli._config import typed
 
 if TYPE_CHECKING:
@@ -38,6 +38,7 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
     type=options.CHANNELS,
     help="Channels to exclude, such as those of faulty microphones, counted from 0, as in 5,12.",
 )
+@_presets.processing_preset
 @click.option("--directions", metavar="GRID", help="90, 1850, 3000, 2d:N, 3d:N, or a CSV of azimuth, elevation in °.")
 @click.option("--azimuth", type=options.INTERVAL, help="Azimuth limits of 2d:N and 3d:N in °.")
 @click.option("--elevation", type=options.INTERVAL, help="Elevation limits of 3d:N in °.")
@@ -117,6 +118,7 @@ def process(
     target: str | None,
     sensor: str | None,
     without: tuple[int, ...] | None,
+    preset: str | None,
     directions: str | None,
     azimuth: tuple[float, float] | None,
     elevation: tuple[float, float] | None,
@@ -144,9 +146,9 @@ def process(
 ) -> None:
     """Process recordings into energyscapes.
 
-    The settings file overrides the settings of the recording, and options override both. The same recording gives the
-    same amplitudes, bit by bit, for any number of threads and any batch. All sensors of a recording go into one file,
-    each with its own settings.
+    The settings file overrides the settings of the recording, the preset overrides both, and other options override
+    all of them. The same recording gives the same amplitudes, bit by bit, for any number of threads and any batch. All
+    sensors of a recording go into one file, each with its own settings.
 
     Several recordings, a pattern in quotes or a folder are processed on all cores into the folder given with -o, one
     file per recording. Existing results of the same recording and settings are kept. A failed recording does not stop
@@ -160,6 +162,7 @@ def process(
         settings = options.settings_with(
             recorded,
             settings_file=settings_file,
+            preset=preset,
             without=without,
             directions=directions,
             azimuth_limits_deg=azimuth,

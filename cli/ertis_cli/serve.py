@@ -5,7 +5,7 @@ from typing import Any, Literal
 
 import click
 
-from ertis_cli import _central_watch, _network, _supervisor, options
+from ertis_cli import _central_watch, _network, _presets, _supervisor, options
 from ertis_cli._saving import withdrawn
 
 __all__ = ["serve"]
@@ -25,6 +25,7 @@ _FOLDER = click.Path(path_type=Path)
     "--workers", type=click.IntRange(1, 256), metavar="N", help="Number of worker processes; one per core by default."
 )
 @options.threads
+@_presets.processing_preset
 @click.option("--directions", metavar="GRID", help="90, 1850, 3000, 2d:N or 3d:N; the sensor's own grid by default.")
 @click.option("--range", "range_m", type=options.INTERVAL, help="First and last range in m.")
 @click.option("--method", type=click.Choice(["fast", "paper"]), help="Processing method; the sensor's own by default.")
@@ -75,6 +76,7 @@ def serve(
     max_bytes: int,
     workers: int | None,
     threads: int | None,
+    preset: str | None,
     directions: str | None,
     range_m: tuple[float, float] | None,
     method: str | None,
@@ -105,7 +107,7 @@ def serve(
     from ertis_numba.network.addresses import DEFAULT_LISTEN, DEFAULT_PUBLISH, at_port
     from ertis_numba.network.central_node import CentralNode
     from ertis_numba.network.processing import ImageProcessing, ProcessingOptions
-    from ertis_numba.settings import Settings
+    from ertis_numba.settings import Settings, preset_tables
 
     _network.require_duration(duration)
     served = _network.metrics(metrics, lambda: node.latest)
@@ -116,6 +118,7 @@ def serve(
         "method": method,
         **beamforming,
     }
+    chosen = {} if preset is None else preset_tables(preset, "processing")["processing"]
     keys = _network.server_keys(key, allow)
     with withdrawn(folder, quarantine) as made:
         if quarantine is not None:
@@ -124,7 +127,7 @@ def serve(
             ProcessingOptions(
                 publish=publish,
                 keys=keys,
-                processing={option: value for option, value in changes.items() if value is not None},
+                processing=chosen | {option: value for option, value in changes.items() if value is not None},
                 max_error_db=max_error_db,
                 plan=plan,
                 device=device,

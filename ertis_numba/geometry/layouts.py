@@ -118,7 +118,14 @@ class Layout:
 
 @functools.cache
 def layout_names() -> tuple[str, ...]:
-    """Return the names of the shipped layouts in alphabetical order."""
+    """Return the names of the shipped layouts in alphabetical order.
+
+    Examples
+    --------
+    >>> import ertis_numba as ertis
+    >>> ertis.layout_names()[:3]
+    ('eRTIS_v2', 'eRTIS_v2REC', 'eRTIS_v3D1')
+    """
     return tuple(sorted(item.name.removesuffix(".toml") for item in _shipped() if item.name.endswith(".toml")))
 
 

@@ -1,17 +1,19 @@
 """Settings of a sensor, as frozen structures that are read from TOML and written to it.
 
 A structure checks its values when it is created and refuses unknown keys. ``Settings()`` describes the default eRTIS
-measurement; ``Settings.from_preset`` returns the settings of an RTIS recording preset.
+measurement; ``Settings.from_preset`` returns the settings of an RTIS recording preset, and ``Processing.from_preset``
+those of a processing preset.
 """
 
 from ertis_numba.settings.accuracy import ERROR_PRESETS_DB, MAX_FOCAL_ZONES, Accuracy
 from ertis_numba.settings.array import Array
 from ertis_numba.settings.array_windows import ArrayWindow, parse_window
 from ertis_numba.settings.call import MAX_CALL_SAMPLES, Call
+from ertis_numba.settings.presets import PRESETS, PresetKind, preset_tables, preset_text, presets
 from ertis_numba.settings.processing import Processing
 from ertis_numba.settings.ranges import fit_ranges
 from ertis_numba.settings.recording import ENCODINGS, Air, Recording
-from ertis_numba.settings.settings import PRESETS, Settings
+from ertis_numba.settings.settings import Settings
 from ertis_numba.settings.waveform import MAX_WAVEFORM_SAMPLES
 
 __all__ = [
@@ -26,9 +28,13 @@ __all__ = [
     "Array",
     "ArrayWindow",
     "Call",
+    "PresetKind",
     "Processing",
     "Recording",
     "Settings",
     "fit_ranges",
     "parse_window",
+    "preset_tables",
+    "preset_text",
+    "presets",
 ]

@@ -1,7 +1,7 @@
 """Processing of a measurement into an energyscape."""
 
 import math
-from typing import Final, Literal
+from typing import Final, Literal, Self
 
 from ertis_numba import checks
 from ertis_numba.beamformers import BEAMFORMERS, WEIGHTINGS, BeamformerName, WeightingName
@@ -9,6 +9,7 @@ from ertis_numba.constants import MAX_MICROPHONES, MAX_NAME_LENGTH
 from ertis_numba.documents import TomlTable
 from ertis_numba.errors import ArgumentError
 from ertis_numba.settings.array_windows import parse_window
+from ertis_numba.settings.presets import preset_tables
 
 __all__ = ["MAX_LISTED_DIRECTIONS", "Processing"]
 
@@ -82,6 +83,33 @@ class Processing(TomlTable, frozen=True, kw_only=True):
     snapshots: int = 5
     diagonal_loading: float = 1.0
     array_weights: str | tuple[float, ...] = "uniform"
+
+    @classmethod
+    def from_preset(cls, name: str) -> Self:
+        """Return the directions and ranges of a processing preset; all else has its default.
+
+        Parameters
+        ----------
+        name : str
+            One of ``ertis.presets("processing")``, such as ``2d_181_5m`` for 181 directions in the horizontal plane and
+            ranges from 0.5 to 5 m. Names of RTIS Dev, such as ``2D_5m_181``, are accepted, too.
+
+        Returns
+        -------
+        Processing
+
+        Raises
+        ------
+        ArgumentError
+            The preset is unknown, or a recording preset.
+
+        Examples
+        --------
+        >>> from ertis_numba.settings import Processing
+        >>> Processing.from_preset("2d_181_5m").directions
+        '2d:181'
+        """
+        return cls(**preset_tables(name, "processing")["processing"])
 
     @property
     def is_adaptive(self) -> bool:

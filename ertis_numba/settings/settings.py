@@ -3,27 +3,22 @@
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
-from ertis_numba import checks
 from ertis_numba.beamformers import BEAMFORMERS
 from ertis_numba.documents import TomlDocument
 from ertis_numba.errors import ArgumentError, SettingsError
 from ertis_numba.settings.accuracy import Accuracy
 from ertis_numba.settings.array import Array
 from ertis_numba.settings.call import Call
+from ertis_numba.settings.presets import preset_tables
 from ertis_numba.settings.processing import Processing
 from ertis_numba.settings.ranges import fit_ranges, max_decimation
-from ertis_numba.settings.recording import DEFAULT_SAMPLES, Air, Recording
+from ertis_numba.settings.recording import Air, Recording
 
-__all__ = ["PRESETS", "Settings"]
+__all__ = ["Settings"]
 
-_PRESET_SAMPLES = {"short": 65_536, "default": DEFAULT_SAMPLES, "long": 294_912}
-_BANDS_HZ = {"20_80": (20_000.0, 80_000.0), "25_50": (25_000.0, 50_000.0)}
 _MAX_OVERSAMPLING = 8  # A signal rate of more than 8 times the necessary one is probably a mistake.
 _MAX_BAND_EDGE_RATIO = 4  # relative to the highest frequency of the call
 _MIN_BANDWIDTH_HZ = 100.0  # A narrower band-pass filter would ring for seconds.
-
-PRESETS = tuple(f"{length}_{band}" for length in _PRESET_SAMPLES for band in _BANDS_HZ)
-"""Names of the RTIS recording presets: length of the record, and band of the call in kHz."""
 
 
 class Settings(TomlDocument, frozen=True, kw_only=True):
@@ -248,8 +243,9 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
         name : {"short_20_80", "short_25_50", "default_20_80", "default_25_50", "long_20_80", "long_25_50"}
             Length of the record, and band of the call in kHz.
         **sections
-            Sections to replace as a whole, such as ``air=Air(temperature_c=25)``. Unless ``processing`` is among them,
-            its ranges suit record and call; see `fit_ranges`.
+            Sections to replace as a whole, such as ``air=Air(temperature_c=25)`` or
+            ``processing=Processing.from_preset("2d_181_5m")``. Unless ``processing`` is among them, its ranges suit
+            record and call; see `fit_ranges`.
 
         Returns
         -------
@@ -258,7 +254,7 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
         Raises
         ------
         ArgumentError
-            The preset is unknown.
+            The preset is unknown, or a processing preset.
 
         Examples
         --------
@@ -266,11 +262,8 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
         >>> Settings.from_preset("short_20_80").recording.n_samples
         65536
         """
-        checks.choice("preset", name, PRESETS)
-        length, _, band = name.partition("_")
-        low_hz, high_hz = _BANDS_HZ[band]
-        call = Call(start_frequency_hz=high_hz, stop_frequency_hz=low_hz)
-        recording = Recording(n_samples=_PRESET_SAMPLES[length])
+        tables = preset_tables(name, "recording")
+        call, recording = Call(**tables["call"]), Recording(**tables["recording"])
         processing = fit_ranges(Processing(), recording, call)
         return cls(call=call, recording=recording, processing=processing).replace(**sections)
 

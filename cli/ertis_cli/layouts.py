@@ -1,16 +1,16 @@
-"""``ertis layout``: shipped array layouts."""
+"""``ertis layouts``: shipped array layouts."""
 
 import click
 
 from ertis_cli import _tables, options
 
-__all__ = ["layout"]
+__all__ = ["layouts"]
 
 
 @click.command()
 @click.argument("name", required=False, shell_complete=options.complete_layouts)
 @options.as_json
-def layout(*, name: str | None, as_json: bool) -> None:
+def layouts(*, name: str | None, as_json: bool) -> None:
     """List the shipped layouts, or print one as TOML.
 
     Save the output to a file and edit it. Then use that file as array.layout in settings or scenes, or as --layout.
