@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ertis_numba import checks, kernels
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.call_match import call_match
+from ertis_numba.analysis.range_cleaning import clean_in_place
 from ertis_numba.errors import ArgumentError, CallMismatchWarning, DataError, DeviceError, ErrorBudgetWarning
 from ertis_numba.frames import Energyscape, Measurement, MicrophoneSignals
 from ertis_numba.geometry import Grid, microphones
@@ -139,6 +140,7 @@ class Pipeline:
             settings = settings.replace(accuracy=settings.accuracy.replace(max_error_db=float(max_error_db)))
         settings = planner.complete(settings, kernel_set, threads=threads, max_bytes=left_bytes, plan=plan)
         self.settings = settings
+        self._uncleaned_settings = _without_cleaning(settings)
         self.device = kernel_set.device
         self._accepted_settings = settings
         self._format = sample_format(settings)
@@ -160,6 +162,7 @@ class Pipeline:
         *,
         threads: int | None = None,
         stream: WordStream | None = None,
+        clean: bool = True,
     ) -> Energyscape:
         """Return the energyscape of one measurement.
 
@@ -173,6 +176,9 @@ class Pipeline:
         stream : WordStream, optional
             Stream to which the words of the measurement were added as they arrived; see `stream`. The image has the
             same bits as without it.
+        clean : bool, default True
+            False to omit the cleaning that ``settings.processing`` may request. The settings of the image then request
+            none.
 
         Returns
         -------
@@ -202,10 +208,7 @@ class Pipeline:
             self._chain.process(words, amplitude, threads=threads)
         else:
             raise foreign_stream()
-        image = self._energyscape(_rescaled(amplitude, exponent), measurement)
-        self._check_call(measurement)
-        self._check_budget(image, measurement)
-        return image
+        return self._checked_image(_rescaled(amplitude, exponent), measurement, clean=clean)
 
     def stream(self) -> WordStream:
         """Return a stream that demodulates words while they arrive from a sensor; it has buffers of its own.
@@ -259,14 +262,10 @@ class Pipeline:
         words = [self._words_of(measurement) for measurement in batch]
         amplitudes = [self._chain.new_image() for _ in batch]
         self._chain.process_batch([each for each, _ in words], amplitudes)
-        images = [
-            self._energyscape(_rescaled(amplitude, exponent), measurement)
+        return [
+            self._checked_image(_rescaled(amplitude, exponent), measurement, clean=True)
             for amplitude, (_, exponent), measurement in zip(amplitudes, words, batch, strict=True)
         ]
-        for image, measurement in zip(images, batch, strict=True):
-            self._check_call(measurement)
-            self._check_budget(image, measurement)
-        return images
 
     def process_many(
         self, measurements: Iterable[Measurement], *, batch_size: int | None = None
@@ -396,7 +395,7 @@ class Pipeline:
         if match is not None:
             self._remaining_call_checks = 0
             if match.warning:
-                warnings.warn(match.warning, CallMismatchWarning, stacklevel=3)
+                warnings.warn(match.warning, CallMismatchWarning, stacklevel=4)
 
     def _check_budget(self, image: Energyscape, measurement: Measurement) -> None:
         """Predict the error of an image if it needs a prediction, and issue the warning once."""
@@ -409,7 +408,7 @@ class Pipeline:
             text = f"the error of images cannot be predicted: {error}"
         if text:
             self._warned = True
-            warnings.warn(text, ErrorBudgetWarning, stacklevel=3)
+            warnings.warn(text, ErrorBudgetWarning, stacklevel=4)
 
     def _build_chain(self, kernel_set: kernels.KernelSet, threads: int, *, graphs: bool) -> Chain:
         """Return the chain with compiled kernels and allocated buffers."""
@@ -428,15 +427,23 @@ class Pipeline:
         if self._closed:
             raise ArgumentError("the pipeline is closed; create another one")
 
-    def _energyscape(self, amplitude: NDArray[np.float32], measurement: Measurement) -> Energyscape:
-        return Energyscape(
+    def _checked_image(self, amplitude: NDArray[np.float32], measurement: Measurement, *, clean: bool) -> Energyscape:
+        """Return an image, cleaned after all checks, because predictions need all amplitudes."""
+        image = Energyscape(
             amplitude=amplitude,
             azimuth_rad=self.grid.azimuth_rad,
             elevation_rad=self.grid.elevation_rad,
             range_m=self.range_m,
-            settings=self.settings,
+            settings=self._uncleaned_settings,
             stamp=measurement.stamp,
         )
+        self._check_call(measurement)
+        self._check_budget(image, measurement)
+        processing = self.settings.processing
+        if not clean or not processing.is_cleaned:
+            return image
+        clean_in_place(amplitude, within_db=processing.clean_within_db, above_mean_db=processing.clean_above_mean_db)
+        return image.replace(settings=self.settings)
 
     def _words_of(self, measurement: Measurement) -> tuple[NDArray[Any], int]:
         """Return the words, scaled into the range of single precision, and the exponent n of the divisor 2^n."""
@@ -492,6 +499,13 @@ def _rescaled(amplitude: NDArray[np.float32], exponent: int) -> NDArray[np.float
                 "divide the samples by their full scale"
             )
     return amplitude
+
+
+def _without_cleaning(settings: Settings) -> Settings:
+    """Return the same settings if they request no cleaning."""
+    if not settings.processing.is_cleaned:
+        return settings
+    return settings.replace(**{"processing.clean_within_db": None, "processing.clean_above_mean_db": None})
 
 
 def _same_layout(array: Array, other: Array) -> bool:

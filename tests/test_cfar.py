@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 import scipy.special
 
-from ertis_numba.analysis.cfar import METHODS, _reference, cfar, cfar_peaks, clean, threshold_factor
+from ertis_numba.analysis.cfar import METHODS, _reference, cfar, cfar_peaks, threshold_factor
 from ertis_numba.analysis.detect import find_peaks
+from ertis_numba.analysis.range_cleaning import clean
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Energyscape
 from ertis_numba.pipeline import Pipeline

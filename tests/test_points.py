@@ -5,10 +5,10 @@ import pytest
 
 from ertis_numba import kernels
 from ertis_numba.analysis import point_finder
-from ertis_numba.analysis.cfar import clean
 from ertis_numba.analysis.detect import find_peaks, neighbours_of
 from ertis_numba.analysis.point_finder import PointFinder
 from ertis_numba.analysis.points import PointExtractor
+from ertis_numba.analysis.range_cleaning import clean
 from ertis_numba.beamformers import ADAPTIVE_COMBINATIONS
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Energyscape, PointCloud, Stamp

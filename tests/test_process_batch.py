@@ -27,9 +27,9 @@ def sizes(monkeypatch):
     calls = {"sizes": [], "closed": 0}
     one, many, close = Pipeline.process, Pipeline.process_batch, Pipeline.close
 
-    def count_one(self, measurement):
+    def count_one(self, measurement, **options):
         calls["sizes"].append(1)
-        return one(self, measurement)
+        return one(self, measurement, **options)
 
     def count_many(self, measurements):
         calls["sizes"].append(len(measurements))

@@ -30,6 +30,7 @@ __all__ = [
     "PREPARING",
     "as_json",
     "as_json_of",
+    "cleaning",
     "comparisons",
     "complete_layouts",
     "counted",
@@ -185,6 +186,25 @@ def beamforming(default: str) -> Decorator:
         return command
 
     return add
+
+
+def cleaning(default: str) -> Decorator:
+    """Return the options of range-wise cleaning, named like the fields of `Processing`."""
+    within = click.option(
+        "--clean-within",
+        "clean_within_db",
+        type=click.FloatRange(0, 1000),
+        metavar="DB",
+        help=f"Keep amplitudes within DB of the strongest direction of each range; {default} by default.",
+    )
+    above_mean = click.option(
+        "--clean-above-mean",
+        "clean_above_mean_db",
+        type=click.FloatRange(0, 1000),
+        metavar="DB",
+        help=f"Keep amplitudes at least DB above the mean of each range; {default} by default.",
+    )
+    return lambda command: within(above_mean(command))
 
 
 def input_file(metavar: str) -> Decorator:

@@ -47,6 +47,7 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
     "--method", type=click.Choice(["fast", "paper"]), help="Processing method; the recording's own by default."
 )
 @options.beamforming("the recording's own")
+@options.cleaning("the recording's own")
 @click.option(
     "--array-weights",
     metavar="WINDOW",
@@ -142,7 +143,7 @@ def process(
     force: bool,
     quiet: bool,
     as_json: bool,
-    **beamforming: Any,
+    **other: Any,
 ) -> None:
     """Process recordings into energyscapes.
 
@@ -169,7 +170,7 @@ def process(
             elevation_limits_deg=elevation,
             range_m=range_m,
             method=method,
-            **beamforming,
+            **other,
             array_weights=array_weights,
             wavefront=wavefront,
             max_error_db=max_error_db,

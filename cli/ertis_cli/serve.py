@@ -30,6 +30,7 @@ _FOLDER = click.Path(path_type=Path)
 @click.option("--range", "range_m", type=options.INTERVAL, help="First and last range in m.")
 @click.option("--method", type=click.Choice(["fast", "paper"]), help="Processing method; the sensor's own by default.")
 @options.beamforming("the sensor's own")
+@options.cleaning("the sensor's own")
 @click.option(
     "--max-error",
     "max_error_db",
@@ -94,7 +95,7 @@ def serve(
     every: bool,
     quiet: bool,
     as_json: bool,
-    **beamforming: Any,
+    **other: Any,
 ) -> None:
     """Run a central node that computes and publishes images.
 
@@ -116,7 +117,7 @@ def serve(
         "directions": directions,
         "range_m": range_m,
         "method": method,
-        **beamforming,
+        **other,
     }
     chosen = {} if preset is None else preset_tables(preset, "processing")["processing"]
     keys = _network.server_keys(key, allow)

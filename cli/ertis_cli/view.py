@@ -87,6 +87,7 @@ _ONLY = {
     "--decay", type=float, default=0.0, show_default=True, metavar="S", help="Time for which points stay visible."
 )
 @click.option("--colours", type=click.Choice(_COLOURS), default="inferno", show_default=True, help="Colour map.")
+@options.cleaning("no further cleaning")
 @click.option("--loop", is_flag=True, help="Restart a file at its end.")
 @click.option("--duration", type=float, metavar="S", help="Duration in seconds; until Ctrl-C by default.")
 @click.option(
@@ -116,6 +117,8 @@ def view(
     range_m: tuple[float, float] | None,
     decay: float,
     colours: str,
+    clean_within_db: float | None,
+    clean_above_mean_db: float | None,
     loop: bool,
     duration: float | None,
     html: Path | None,
@@ -159,6 +162,8 @@ def view(
             host="127.0.0.1" if at_once else host,  # no other machine may connect while the page is written
             port=0 if at_once else port,
             choices=choices,
+            clean_within_db=clean_within_db,
+            clean_above_mean_db=clean_above_mean_db,
             on_note=lambda text: options.say(text, quiet=quiet),
         ) as shown,
     ):

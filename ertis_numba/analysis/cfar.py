@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 from ertis_numba import checks
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.detect import find_peaks
+from ertis_numba.analysis.range_cleaning import clean
 from ertis_numba.analysis.side_lobes import SIDE_LOBE_DB
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Energyscape, Peak
 from ertis_numba.settings import Settings
 
-__all__ = ["METHODS", "Method", "cfar", "cfar_peaks", "clean", "threshold_factor"]
+__all__ = ["METHODS", "Method", "cfar", "cfar_peaks", "threshold_factor"]
 
 Method = Literal["ordered_statistic", "cell_averaging", "greatest_of"]
 METHODS: tuple[Method, ...] = ("ordered_statistic", "cell_averaging", "greatest_of")
@@ -63,9 +64,14 @@ def cfar(
     Raises
     ------
     ArgumentError
-        An argument is invalid, or the image has too few ranges.
+        An argument is invalid, the image has too few ranges, or it is cleaned.
     """
     checks.instance("image", image, Energyscape, "Pipeline.process returns")
+    if image.settings.processing.is_cleaned:
+        raise ArgumentError(
+            "image is cleaned by processing.clean_within_db or clean_above_mean_db, so its noise is unknown; "
+            "process the recording without them"
+        )
     factor = threshold_factor(method, n_reference, false_alarm)
     places = _reference(image, n_reference)
     amplitude = image.amplitude
@@ -179,42 +185,6 @@ def _resolution_m(settings: Settings) -> float:
     return sound_speed_m_s(settings.air) / (2 * bandwidth_hz)
 
 
-def clean(image: Energyscape, *, within_db: float = 6.0, above_mean_db: float | None = None) -> Energyscape:
-    """Return an image that keeps only the strongest directions of each range; all other bins become 0.
-
-    This removes side lobes, and weaker reflectors at the same range as well. The software of the authors of eRTIS keeps
-    bins above half of the strongest amplitude and above twice the mean of the range. That corresponds to
-    ``within_db=6, above_mean_db=6`` (rtisdev 2.16.0, ``maxEnergyRangeThresholdMultiplier`` and
-    ``meanEnergyRangeMultiplier``).
-
-    Parameters
-    ----------
-    image : Energyscape
-    within_db : float
-        Largest level below the strongest direction of the same range, 0 to 1000 dB; 6 by default.
-    above_mean_db : float, optional
-        Smallest level above the mean amplitude of the range, 0 to 1000 dB; no such limit by default. With this limit,
-        an image of one direction keeps no bin.
-
-    Returns
-    -------
-    Energyscape
-
-    Raises
-    ------
-    ArgumentError
-        A level is out of range.
-    """
-    checks.instance("image", image, Energyscape, "Pipeline.process returns")
-    amplitude = image.amplitude
-    checks.between("within_db", within_db, 0.0, 1000.0)
-    smallest = amplitude.max(axis=0, initial=0.0) * np.float32(10 ** (-within_db / 20))
-    if above_mean_db is not None:
-        checks.between("above_mean_db", above_mean_db, 0.0, 1000.0)
-        smallest = np.maximum(smallest, amplitude.mean(axis=0) * np.float32(10 ** (above_mean_db / 20)))
-    return image.replace(amplitude=np.where(amplitude >= smallest, amplitude, np.float32(0)))
-
-
 def cfar_peaks(
     image: Energyscape,
     *,
@@ -250,7 +220,7 @@ def cfar_peaks(
     Raises
     ------
     ArgumentError
-        An argument is invalid, or the image has too few ranges.
+        An argument is invalid, the image has too few ranges, or it is cleaned.
 
     Examples
     --------

@@ -45,8 +45,8 @@ def find_peaks(
         True for bins that may be the maximum of a reflector; all bins by default.
     false_alarm : float, optional
         Probability that noise alone yields a reflector anywhere in the image. Weaker maxima are discarded, except for
-        beamformers whose noise is unknown: see `ertis_numba.analysis.noise.threshold_of`. By default, maxima of noise
-        count as reflectors.
+        beamformers whose noise is unknown, and for cleaned images: see `ertis_numba.analysis.noise.threshold_of`. By
+        default, maxima of noise count as reflectors.
 
     Returns
     -------

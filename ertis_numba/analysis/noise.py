@@ -19,9 +19,10 @@ def noise_of(image: Energyscape) -> float:
     """Return the root mean square of the noise of an image; 0 if it is unknown.
 
     The result is the lower tercile of estimates from the medians of blocks of ranges. The noise of beamformers other
-    than delay-and-sum is unknown, because it is not Rayleigh-distributed.
+    than delay-and-sum is unknown, because it is not Rayleigh-distributed. That of cleaned images is unknown, too.
     """
-    if image.settings.processing.is_adaptive or not image.amplitude.size:
+    processing = image.settings.processing
+    if processing.is_adaptive or processing.is_cleaned or not image.amplitude.size:
         return 0.0
     some = image.amplitude[:: max(1, image.amplitude.size // _SAMPLE)]
     blocks = np.array_split(some, min(_BLOCKS, some.shape[1]), axis=1)

@@ -66,7 +66,7 @@ def examine(
     planners = {
         # Measured costs give the times on this machine.
         "safe": Planner(settings, kernel_set, threads=n_threads, plan="measured"),
-        "signal_model": heard or planner_of(pipeline.process(first), first, kernel_set, threads=n_threads),
+        "signal_model": heard or planner_of(pipeline.process(first, clean=False), first, kernel_set, threads=n_threads),
     }
     if explain:
         yield "plan", _plan(planners, settings)
@@ -120,7 +120,7 @@ def _plane_waves(model: ErrorModel, settings: Settings) -> list[dict[str, float]
 def _verified(pipeline: Pipeline, first: Measurement, planners: dict[str, Planner]) -> dict[str, Any]:
     """Return the true error of a measurement, with the predicted errors."""
     accuracy = pipeline.settings.accuracy
-    measured = verification.measure(pipeline.process(first), first)
+    measured = verification.measure(pipeline.process(first, clean=False), first)
     return {
         "sequence": first.stamp.sequence,
         "directions": measured.n_directions,

@@ -228,7 +228,7 @@ def _check_sensor(
     if run.pipeline.settings.processing.method != "paper":
         kernel_set = kernels.load(run.pipeline.device)
         threads = kernel_set.max_threads if options.threads is None else options.threads
-        heard = planner_of(run.pipeline.process(first), first, kernel_set, threads=threads)
+        heard = planner_of(run.pipeline.process(first, clean=False), first, kernel_set, threads=threads)
         run.prediction = predict(heard)
         run.reported |= _wavefront(heard, recording, show)
         if run.prediction.warning:

@@ -77,7 +77,7 @@ def preset_tables(name: str, kind: PresetKind | None = None) -> dict[str, dict[s
     ArgumentError
         The preset is unknown or of the other kind.
     """
-    of_rtisdev = {tables.get("rtisdev"): own for own, tables in _shipped().items()}
+    of_rtisdev = {tables["rtisdev"]: own for own, tables in _shipped().items() if "rtisdev" in tables}
     own = of_rtisdev.get(name, name)
     if own not in _shipped():
         checks.choice("preset", own, presets(kind))

@@ -63,6 +63,12 @@ class Processing(TomlTable, frozen=True, kw_only=True):
         array, ``cosine``, ``hann``, ``hamming``, ``blackman``, ``taylor:DB`` (20 to 80 dB, 30 by default) or
         ``kaiser:BETA`` (0 to 20, 6 by default); or one number per channel, not below 0. For delay_and_sum only; see
         ``docs/explanation/beamformers.md``.
+    clean_within_db : float, optional, default None
+        Largest level below the strongest direction of the same range, 0 to 1000 dB; weaker amplitudes become 0. Half of
+        the strongest amplitude is 6.02 dB. No such limit by default; see ``docs/how-to/plots.md``.
+    clean_above_mean_db : float, optional, default None
+        Smallest level above the mean amplitude over the directions of a range, 0 to 1000 dB; weaker amplitudes become
+        0. Twice the mean is 6.02 dB. No such limit by default.
     diagonal_loading : float, default 1
         Diagonal loading of ``capon`` relative to the mean power of a microphone, 1e-6 to 1e6. Larger values approach
         delay-and-sum.
@@ -83,6 +89,8 @@ class Processing(TomlTable, frozen=True, kw_only=True):
     snapshots: int = 5
     diagonal_loading: float = 1.0
     array_weights: str | tuple[float, ...] = "uniform"
+    clean_within_db: float | None = None
+    clean_above_mean_db: float | None = None
 
     @classmethod
     def from_preset(cls, name: str) -> Self:
@@ -115,6 +123,11 @@ class Processing(TomlTable, frozen=True, kw_only=True):
     def is_adaptive(self) -> bool:
         """True if amplitudes depend on the agreement of the microphones: all except unweighted delay-and-sum."""
         return self.beamformer != "delay_and_sum" or self.weighting != "none"
+
+    @property
+    def is_cleaned(self) -> bool:
+        """True if weak amplitudes of each range become 0."""
+        return self.clean_within_db is not None or self.clean_above_mean_db is not None
 
     @property
     def azimuth_limits_rad(self) -> tuple[float, float]:
@@ -163,6 +176,9 @@ class Processing(TomlTable, frozen=True, kw_only=True):
             )
         self._check_beamformer()
         self._check_array_weights()
+        for name in ("clean_within_db", "clean_above_mean_db"):
+            if (level_db := getattr(self, name)) is not None:
+                checks.between(f"processing.{name}", level_db, 0.0, 1000.0)
 
     def _check_directions(self) -> None:
         given = self.directions

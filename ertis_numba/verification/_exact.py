@@ -15,6 +15,7 @@ import scipy
 from numpy.typing import NDArray
 
 from ertis_numba.air import sound_speed_m_s
+from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.geometry import array_weights, far_field_delays, microphones, unit_vectors
 from ertis_numba.sample_format import sample_format
@@ -46,10 +47,17 @@ class ExactImage:
     ------
     DataError
         The samples do not match the settings.
+    ArgumentError
+        The image is cleaned, so that the exact image is not its counterpart.
     """
 
     def __init__(self, image: Energyscape, measurement: Measurement) -> None:
         settings = self._settings = image.settings
+        if settings.processing.is_cleaned:
+            raise ArgumentError(
+                "image is cleaned by processing.clean_within_db or clean_above_mean_db, which the exact image is not; "
+                "give that of Pipeline.process(measurement, clean=False)"
+            )
         layout = microphones(settings.array)
         self._positions_m = layout.enabled_positions_m
         self._directions = unit_vectors(image.azimuth_rad, image.elevation_rad)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.analysis.levels import below_strongest_db
 from ertis_numba.analysis.point_finder import PointFinder, same_directions
+from ertis_numba.analysis.range_cleaning import clean
 from ertis_numba.analysis.side_lobes import without_side_lobes
 from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.geometry import unit_vectors
@@ -73,10 +74,19 @@ class ViewedScene:
     ----------
     width_px : int
         Width of the pictures.
+    clean_within_db, clean_above_mean_db : float, optional
+        Levels by which images are cleaned, as for `ertis_numba.analysis.range_cleaning.clean`; not cleaned by default.
     """
 
-    def __init__(self, *, width_px: int = 520) -> None:
+    def __init__(
+        self,
+        *,
+        width_px: int = 520,
+        clean_within_db: float | None = None,
+        clean_above_mean_db: float | None = None,
+    ) -> None:
         self._width_px = width_px
+        self._clean_db = clean_within_db, clean_above_mean_db
         self._find = PointFinder(top=_MAX_POINTS, min_level_db=LOWEST_THRESHOLD_DB)
         self._sensors: dict[str, _SensorImages] = {}
         self._fusion: tuple[list[tuple[Polar, Pose]], Fusion] | None = None
@@ -100,6 +110,9 @@ class ViewedScene:
 
     def take(self, taken: ReceivedImage) -> None:
         """Add an image to draw next; points of later times are discarded, as after a restart of the playback."""
+        if self._clean_db != (None, None):
+            within_db, above_mean_db = self._clean_db
+            taken = replace(taken, image=clean(taken.image, within_db=within_db, above_mean_db=above_mean_db))
         name = taken.image.stamp.sensor
         kept = self._sensors.get(name)
         if kept is None or not _same_axes(kept.latest.image, taken.image):

@@ -47,6 +47,8 @@ class Viewer:
         0 selects a free one.
     choices : Choices, optional
         Initial choices.
+    clean_within_db, clean_above_mean_db : float, optional
+        Levels by which images are cleaned, as for `ertis_numba.analysis.range_cleaning.clean`.
     on_note : callable, optional
         Called with a line for each event of the source.
 
@@ -70,13 +72,15 @@ class Viewer:
         host: str = "127.0.0.1",
         port: int = 8080,
         choices: Choices | None = None,
+        clean_within_db: float | None = None,
+        clean_above_mean_db: float | None = None,
         on_note: Callable[[str], None] | None = None,
     ) -> None:
         self.choices = choices or Choices()
         self._source, self._on_note = source, on_note
         self._playback: Playback | None = source if source.is_playback is True else None
         self._orders: queue.SimpleQueue[ControlRequest | None] = queue.SimpleQueue()
-        self._scene = ViewedScene()
+        self._scene = ViewedScene(clean_within_db=clean_within_db, clean_above_mean_db=clean_above_mean_db)
         self._frame: DrawnFrame | None = None
         self.is_local = is_loopback(host)
         self._page = ViewerPage(

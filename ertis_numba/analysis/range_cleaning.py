@@ -1,0 +1,77 @@
+"""Range-wise cleaning of images: only the strongest directions of each range remain."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba import checks
+from ertis_numba.frames import Energyscape
+
+__all__ = ["clean", "clean_in_place"]
+
+
+def clean(image: Energyscape, *, within_db: float | None = 6.0, above_mean_db: float | None = None) -> Energyscape:
+    """Return an image that keeps only the strongest directions of each range; all other bins become 0.
+
+    This removes side lobes, and weaker reflectors at the same range as well. An amplitude ``A(d, r)`` remains if::
+
+        A(d, r) >= 10^(-within_db / 20) · max over d of A(d, r)
+        A(d, r) >= 10^(above_mean_db / 20) · mean over d of A(d, r)
+
+    The software of the authors of eRTIS keeps bins above half of the strongest amplitude and above twice the mean of
+    the range. That corresponds to ``within_db=6.02, above_mean_db=6.02`` (rtisdev 2.16.0,
+    ``maxEnergyRangeThresholdMultiplier`` and ``meanEnergyRangeMultiplier``). With ``processing.clean_within_db`` and
+    ``processing.clean_above_mean_db``, a pipeline cleans its images itself.
+
+    Parameters
+    ----------
+    image : Energyscape
+    within_db : float, optional
+        Largest level below the strongest direction of the same range, 0 to 1000 dB; 6 by default, None for no limit.
+    above_mean_db : float, optional
+        Smallest level above the mean amplitude of the range, 0 to 1000 dB; no such limit by default. With this limit,
+        an image of one direction keeps no bin.
+
+    Returns
+    -------
+    Energyscape
+
+    Raises
+    ------
+    ArgumentError
+        A level is out of range.
+
+    Examples
+    --------
+    >>> import ertis_numba as ertis
+    >>> from ertis_numba.analysis.range_cleaning import clean
+    >>> with ertis.open_recording("reflectors.h5") as recording:
+    ...     image = ertis.Pipeline(recording.settings).process(recording[0])
+    >>> cleaned = clean(image, within_db=10)
+    >>> bool(cleaned.amplitude.max() == image.amplitude.max()), bool((cleaned.amplitude == 0).mean() > 0.5)
+    (True, True)
+    """
+    checks.instance("image", image, Energyscape, "Pipeline.process returns")
+    for name, value in (("within_db", within_db), ("above_mean_db", above_mean_db)):
+        if value is not None:
+            checks.between(name, value, 0.0, 1000.0)
+    amplitude = image.amplitude.copy()
+    clean_in_place(amplitude, within_db=within_db, above_mean_db=above_mean_db)
+    return image.replace(amplitude=amplitude)
+
+
+def clean_in_place(amplitude: NDArray[np.float32], *, within_db: float | None, above_mean_db: float | None) -> None:
+    """Set the amplitudes to 0 that `clean` removes.
+
+    Parameters
+    ----------
+    amplitude : (direction, range) float32
+        Amplitudes of an image, which are changed.
+    within_db, above_mean_db : float, optional
+        Levels, as for `clean`; None for no limit.
+    """
+    smallest = np.zeros(amplitude.shape[1], dtype=np.float32)
+    if within_db is not None:
+        np.maximum(smallest, amplitude.max(axis=0, initial=0.0) * np.float32(10 ** (-within_db / 20)), out=smallest)
+    if above_mean_db is not None:
+        np.maximum(smallest, amplitude.mean(axis=0) * np.float32(10 ** (above_mean_db / 20)), out=smallest)
+    amplitude *= amplitude >= smallest
