@@ -106,7 +106,22 @@ CASES = {
     "elevation of a plane": (
         "process rec.h5 -o out.h5 --directions 2d:9 --elevation 20:50",
         2,
-        "directions 2d:9 lie at elevation 0; give --directions 3d:N with --elevation; see",
+        "directions 2d:9 lie at one elevation; give it as --elevation E, or give --directions 3d:N; see",
+    ),
+    "one elevation of a solid angle": (
+        "process rec.h5 -o out.h5 --directions 3d:9 --elevation 20",
+        2,
+        "directions 3d:9 lie between two elevations; give --elevation A:B, or give --directions 2d:N; see",
+    ),
+    "elevation of a paper grid": (
+        "process rec.h5 -o out.h5 --directions 90 --elevation 20",
+        2,
+        "directions 90 have fixed limits; give --directions 2d:N or 3d:N with limits; see",
+    ),
+    "elevation above the zenith": (
+        "process rec.h5 -o out.h5 --directions 2d:9 --elevation 91",
+        1,
+        "processing.elevation_deg is 91; give a number",
     ),
     "unknown device": (
         "process rec.h5 -o out.h5 --device tpu",

@@ -193,6 +193,17 @@ def test_planar_grids_include_both_limits():
     assert_allclose(np.degrees(single.azimuth_rad), [20])
 
 
+def test_planar_grid_at_an_elevation_is_a_cone():
+    grid = direction_grid(Processing(directions="2d:5", elevation_deg=-30.0))
+    assert_allclose(grid.azimuth_deg, [-90, -45, 0, 45, 90], atol=1e-12)
+    assert_allclose(grid.elevation_deg, [-30] * 5)
+    for name in ("90", "3d:50"):  # whose elevations are fixed, or have limits
+        own, other = (direction_grid(Processing(directions=name, elevation_deg=each)) for each in (0.0, 20.0))
+        assert own.elevation_rad.tobytes() == other.elevation_rad.tobytes()
+    with pytest.raises(ArgumentError, match=r"processing.elevation_deg is 91; give a number from -90 to 90"):
+        Processing(directions="2d:5", elevation_deg=91.0)
+
+
 @settings(max_examples=100, deadline=None)
 @given(count=st.integers(1, 1000), azimuth_deg=limits(-180, 180), elevation_deg=limits(-90, 90))
 def test_solid_grids_have_their_count_and_limits(count, azimuth_deg, elevation_deg):

@@ -34,7 +34,7 @@ def words(number, count=1):
 
 def folder_of(tmp_path, *, names=("m_0.bin", "m_1.bin"), recording=SHORT, processing=PLANAR, more=None):
     folder = tmp_path / "run.1"
-    folder.mkdir()
+    folder.mkdir(parents=True)
     for number, name in enumerate(names):
         (folder / name).write_bytes(words(number).tobytes())
     given = {"recording.json": recording, "processing.json": processing, **(more or {})}
@@ -112,6 +112,20 @@ def test_combined_settings_file_is_accepted(tmp_path, planar):
     assert np.allclose(processing.azimuth_limits_deg, (-60, 60) if planar else (-90, 90))
 
 
+def test_planar_directions_keep_their_elevation(tmp_path):
+    processing = PLANAR | {"elevation2DAngle": 12.5}
+    settings = open_rtis_folder(folder_of(tmp_path / "file", processing=processing)).settings
+    assert (settings.processing.directions, settings.processing.elevation_deg) == ("2d:91", 12.5)
+    angles = {"directionsAzimuth": [-1.0, 0.0, 1.0], "directionsElevation": [0.2] * 3}
+    dumped = {**SHORT, **PLANAR, "directions": 3, **angles}
+    folder = folder_of(tmp_path / "dict", recording=None, processing=None, more={"settings.json": dumped})
+    processing = open_rtis_folder(folder).settings.processing
+    assert processing.directions == "2d:3"
+    assert processing.elevation_deg == pytest.approx(math.degrees(0.2))
+    processing = PLANAR | {"2D": 0, "elevation2DAngle": 12.5}
+    assert not open_rtis_folder(folder_of(tmp_path / "solid", processing=processing)).settings.processing.elevation_deg
+
+
 def test_other_calls_and_clocks_are_imported(tmp_path):
     recording = SHORT | {"microphoneSampleFrequency": 1_125_000, "callDuration": 3.1, "callMaximumFrequency": 30_000}
     folder = folder_of(tmp_path, recording=recording, processing={"microphoneLayout": "uRTIS_v1"})
@@ -174,7 +188,6 @@ def test_file_of_many_measurements_is_imported(tmp_path):
         ),
         ({"processing": PLANAR | {"rangesCustom": "r.csv"}}, "rangesCustom is the file 'r.csv', .*give --range when"),
         ({"processing": PLANAR | {"directionsCustom": "d.csv"}}, "directionsCustom is the file"),
-        ({"processing": PLANAR | {"elevation2DAngle": 20}}, "elevation2DAngle is 20, but only 0 is supported"),
         ({"more": {"z.json": {"callDuration": 3}}}, r"z.json: callDuration is 3, but 2.5 in recording.json; keep one"),
     ],
 )
@@ -190,6 +203,7 @@ def test_folder_import_refuses_invalid_folders(tmp_path, made, message):
         (SHORT | {"microphoneSamples": 0.5}, PLANAR, "microphoneSamples is 0.5; give a whole number"),
         (SHORT | {"callMinimumFrequency": 50_000}, PLANAR, "call.stop_frequency_hz are both 50000"),
         (SHORT, PLANAR | {"microphoneLayout": "eRTIS_v9"}, "layout 'eRTIS_v9' is unknown"),
+        (SHORT, PLANAR | {"elevation2DAngle": 91}, "run.1: elevation2DAngle is 91; give a number from -90 to 90"),
         (SHORT, PLANAR | {"directions": 1.5}, "directions is 1.5; give a whole number"),
         (SHORT, PLANAR | {"microphoneLayout": 5}, "run.1: microphoneLayout is 5; give the name of an array"),
         (SHORT, PLANAR | {"microphoneLayout": ["a"]}, r"run.1: microphoneLayout is \['a'\]; give the name of an array"),

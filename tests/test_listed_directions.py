@@ -28,13 +28,16 @@ def test_directions_may_be_any_kind_of_list(kind):
     np.testing.assert_allclose(np.degrees(grid.elevation_rad), ANGLES_DEG[:, 1])
 
 
+@pytest.mark.parametrize("elevation_deg", [0.0, 25.0])
 @pytest.mark.parametrize("method", ["fast", "paper"])
-def test_image_of_listed_directions_is_that_of_the_same_grid(method):
-    grid = np.column_stack([np.linspace(-90, 90, 7), np.zeros(7)])
+def test_image_of_listed_directions_is_that_of_the_same_grid(method, elevation_deg):
+    grid = np.column_stack([np.linspace(-90, 90, 7), np.full(7, elevation_deg)])
+    named = SHORT.replace("processing.elevation_deg", elevation_deg)
     images = [
         Pipeline(each.replace(processing=each.processing.replace(method=method)), predict=False).process(noise(each))
-        for each in (SHORT, listed(grid))
+        for each in (named, listed(grid))
     ]
+    assert images[0].is_planar == (elevation_deg == 0)
     np.testing.assert_allclose(images[1].azimuth_rad, images[0].azimuth_rad)
     np.testing.assert_array_equal(images[1].amplitude, images[0].amplitude)
 

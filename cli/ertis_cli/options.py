@@ -24,6 +24,7 @@ __all__ = [
     "CHANNELS",
     "COMPILING",
     "DIRECTION",
+    "ELEVATION",
     "ERROR_BUDGET",
     "FALSE_ALARM",
     "INTERVAL",
@@ -72,6 +73,15 @@ class _Interval(click.ParamType):  # type: ignore[type-arg]  # generic since cli
         return self.fail(f"{value!r} is not an interval; give two numbers, as in 0.5:5", param, ctx)
 
 
+class _Elevation(_Interval):
+    name = "A:B|E"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        with suppress(ValueError):
+            return float(value)
+        return super().convert(value, param, ctx)
+
+
 class _Channels(click.ParamType):  # type: ignore[type-arg]  # as above
     name = "N,..."
 
@@ -112,6 +122,7 @@ class _ErrorBudget(click.ParamType):  # type: ignore[type-arg]  # as above
 
 CHANNELS = _Channels()
 DIRECTION = _Direction()
+ELEVATION = _Elevation()
 ERROR_BUDGET = _ErrorBudget()
 INTERVAL = _Interval()
 FALSE_ALARM = 1e-3
@@ -275,12 +286,14 @@ def settings_with(
     preset: str | None = None,
     max_error_db: float | None = None,
     without: tuple[int, ...] | None = None,
+    elevation: tuple[float, float] | float | None = None,
     **options: Any,
 ) -> "Settings":
     """Return the settings of a recording, updated from a settings file, a processing preset and then from options.
 
     A settings file changes the keys that it contains; a layout or positions replace the whole array. ``without``
-    disables further channels. Other options are named like the fields of `Processing`; None changes nothing.
+    disables further channels. ``elevation`` is that of a grid of one elevation, or limits. Other options are named like
+    the fields of `Processing`; None changes nothing.
     """
     from ertis_numba.settings import preset_tables
 
@@ -292,8 +305,10 @@ def settings_with(
         disabled = tuple(sorted({*(settings.array.disabled or ()), *without}))
         settings = settings.replace(array=settings.array.replace(disabled=disabled))
     given = {name: value for name, value in options.items() if value is not None}
+    if elevation is not None:
+        given["elevation_deg" if isinstance(elevation, float) else "elevation_limits_deg"] = elevation
     directions = given.get("directions", settings.processing.directions)
-    limits = {"azimuth_limits_deg", "elevation_limits_deg"} & given.keys()
+    limits = {"azimuth_limits_deg", "elevation_limits_deg", "elevation_deg"} & given.keys()
     if limits and not isinstance(directions, str):
         raise click.UsageError(
             f"limits need a grid, but directions is a list of {len(directions)}; add --directions 2d:N or 3d:N",
@@ -302,7 +317,12 @@ def settings_with(
     kind = str(directions).partition(":")[0]
     if kind == "2d" and "elevation_limits_deg" in limits:
         raise click.UsageError(
-            f"directions {directions} lie at elevation 0; give --directions 3d:N with --elevation",
+            f"directions {directions} lie at one elevation; give it as --elevation E, or give --directions 3d:N",
+            ctx=click.get_current_context(),
+        )
+    if kind == "3d" and "elevation_deg" in limits:
+        raise click.UsageError(
+            f"directions {directions} lie between two elevations; give --elevation A:B, or give --directions 2d:N",
             ctx=click.get_current_context(),
         )
     if limits and kind not in {"2d", "3d"}:

@@ -41,7 +41,7 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
 @_presets.processing_preset
 @click.option("--directions", metavar="GRID", help="90, 1850, 3000, 2d:N, 3d:N, or a CSV of azimuth, elevation in °.")
 @click.option("--azimuth", type=options.INTERVAL, help="Azimuth limits of 2d:N and 3d:N in °.")
-@click.option("--elevation", type=options.INTERVAL, help="Elevation limits of 3d:N in °.")
+@click.option("--elevation", type=options.ELEVATION, help="Elevation limits A:B of 3d:N, or elevation E of 2d:N, in °.")
 @click.option("--range", "range_m", type=options.INTERVAL, help="First and last range in m.")
 @click.option(
     "--method", type=click.Choice(["fast", "paper"]), help="Processing method; the recording's own by default."
@@ -122,7 +122,7 @@ def process(
     preset: str | None,
     directions: str | None,
     azimuth: tuple[float, float] | None,
-    elevation: tuple[float, float] | None,
+    elevation: tuple[float, float] | float | None,
     range_m: tuple[float, float] | None,
     method: str | None,
     array_weights: str | None,
@@ -167,7 +167,7 @@ def process(
             without=without,
             directions=directions,
             azimuth_limits_deg=azimuth,
-            elevation_limits_deg=elevation,
+            elevation=elevation,
             range_m=range_m,
             method=method,
             **other,

@@ -78,9 +78,9 @@ def grid_count(name: str | tuple[tuple[float, float], ...]) -> int | None:
 def direction_grid(processing: Processing) -> Grid:
     """Return the directions that ``processing.directions`` names or lists.
 
-    ``90``, ``1850`` and ``3000`` are the paper's grids. ``2d:N`` is N azimuths in the horizontal plane, including both
-    limits. ``3d:N`` is N cells of equal area between the limits, in rows of equal elevation. Any other name is the path
-    of a CSV file of azimuth, elevation in degrees.
+    ``90``, ``1850`` and ``3000`` are the paper's grids. ``2d:N`` is N azimuths at one elevation, including both limits.
+    ``3d:N`` is N cells of equal area between the limits, in rows of equal elevation. Any other name is the path of a
+    CSV file of azimuth, elevation in degrees.
 
     Parameters
     ----------
@@ -113,14 +113,16 @@ def direction_grid(processing: Processing) -> Grid:
     if n_directions is None:
         return _csv_grid(name)
     if kind.startswith("2d:"):
-        return _planar_grid(n_directions, azimuth_deg)
+        return _level_grid(n_directions, azimuth_deg, 0.0 if name in PAPER_GRIDS else processing.elevation_deg)
     return _equal_area_grid(n_directions, azimuth_deg, elevation_deg)
 
 
-def _planar_grid(n_directions: int, limits_deg: tuple[float, float]) -> Grid:
+def _level_grid(n_directions: int, limits_deg: tuple[float, float], elevation_deg: float) -> Grid:
+    """Return directions of one elevation."""
     if n_directions == 1:
         limits_deg = (sum(limits_deg) / 2,) * 2
-    return Grid(np.radians(np.linspace(*limits_deg, n_directions)), np.zeros(n_directions))
+    azimuth_rad = np.radians(np.linspace(*limits_deg, n_directions))
+    return Grid(azimuth_rad, np.full(n_directions, math.radians(elevation_deg)))
 
 
 def _equal_area_grid(

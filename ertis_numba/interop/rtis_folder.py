@@ -33,6 +33,7 @@ _PROCESSING = (
     "azimuthHighLimit",
     "elevationLowLimit",
     "elevationHighLimit",
+    "elevation2DAngle",
 )
 _KEYS_OF_DICT = {"dacSampleFrequency": "callSampleFrequency", "nDirections": "directions"}
 """Names in settings files, by the name in ``dict(RTISSettings)``, which users also write to JSON."""
@@ -44,7 +45,7 @@ _UNSUPPORTED_KEYS = {
     "rangesCustom": "remove it, and give --range when processing",
 }
 """Keys that name other files, with the remedy."""
-_KNOWN = {*_RECORDING, *_PROCESSING, *_KEYS_OF_DICT, *_UNSUPPORTED_KEYS, "elevation2DAngle", _AZIMUTHS, _ELEVATIONS}
+_KNOWN = {*_RECORDING, *_PROCESSING, *_KEYS_OF_DICT, *_UNSUPPORTED_KEYS, _AZIMUTHS, _ELEVATIONS}
 
 
 def open_rtis_folder(
@@ -189,11 +190,6 @@ def _processing_settings(folder: Path, reported: dict[str, Any], standard: Proce
     def number(name: str, otherwise: float) -> float:
         return checks.finite(f"{folder}: {name}", reported.get(name, otherwise))
 
-    if number("elevation2DAngle", 0.0):
-        raise DataError(
-            f"{folder}: elevation2DAngle is {reported['elevation2DAngle']:g}, but only 0 is supported; remove it, and "
-            "give a CSV of --directions when processing"
-        )
     range_m = (number("minRange", standard.range_m[0]), number("maxRange", standard.range_m[1]))
     processing = standard.replace(range_m=range_m)
     if "directions" not in reported:
@@ -202,17 +198,21 @@ def _processing_settings(folder: Path, reported: dict[str, Any], standard: Proce
     is_flat = reported.get("2D", True)
     if not isinstance(is_flat, bool):
         is_flat = bool(number("2D", 1))
-    planar = not any(_angles_rad(folder, reported, _ELEVATIONS)) if _ELEVATIONS in reported else is_flat
+    elevation_deg = checks.between(f"{folder}: elevation2DAngle", number("elevation2DAngle", 0.0), -90.0, 90.0)
+    if _ELEVATIONS in reported:
+        elevation_rad = _angles_rad(folder, reported, _ELEVATIONS)
+        is_flat, elevation_deg = min(elevation_rad) == max(elevation_rad), math.degrees(elevation_rad[0])
     azimuth_rad = [-math.pi / 2, math.pi / 2]
-    if planar and _AZIMUTHS in reported:
+    if is_flat and _AZIMUTHS in reported:
         azimuth_rad = _angles_rad(folder, reported, _AZIMUTHS)
     return processing.replace(
-        directions=f"{2 if planar else 3}d:{count}",
+        directions=f"{2 if is_flat else 3}d:{count}",
         azimuth_limits_deg=(
             number("azimuthLowLimit", math.degrees(min(azimuth_rad))),
             number("azimuthHighLimit", math.degrees(max(azimuth_rad))),
         ),
         elevation_limits_deg=(number("elevationLowLimit", -90.0), number("elevationHighLimit", 90.0)),
+        elevation_deg=elevation_deg if is_flat else 0.0,
     )
 
 

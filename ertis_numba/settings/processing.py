@@ -32,6 +32,8 @@ class Processing(TomlTable, frozen=True, kw_only=True):
         directions in degrees; in Python also as an array of shape (n, 2).
     azimuth_limits_deg, elevation_limits_deg : (low, high), default (-90, 90)
         Limits of grids with a count (``2d:N`` and ``3d:N``) in degrees.
+    elevation_deg : float, default 0
+        Elevation of all directions of ``2d:N``, -90 to 90 degrees.
     range_m : (first, last), default (0.5, 5)
         First and last range in metres.
     range_decimation : int, default 100
@@ -78,6 +80,7 @@ class Processing(TomlTable, frozen=True, kw_only=True):
     directions: str | tuple[tuple[float, float], ...] = "90"
     azimuth_limits_deg: tuple[float, float] = (-90.0, 90.0)
     elevation_limits_deg: tuple[float, float] = (-90.0, 90.0)
+    elevation_deg: float = 0.0
     range_m: tuple[float, float] = (0.5, 5.0)
     range_decimation: int = 100
     band_edges_hz: tuple[float, float] | None = None
@@ -152,6 +155,7 @@ class Processing(TomlTable, frozen=True, kw_only=True):
         self._check_directions()
         checks.interval("processing.azimuth_limits_deg", self.azimuth_limits_deg, -180.0, 180.0)
         checks.interval("processing.elevation_limits_deg", self.elevation_limits_deg, -90.0, 90.0)
+        checks.between("processing.elevation_deg", self.elevation_deg, -90.0, 90.0)
         checks.interval("processing.range_m", self.range_m, 0.0, 10_000.0)
         checks.integer("processing.range_decimation", self.range_decimation, 1, 10_000)
         if self.band_edges_hz is not None:
