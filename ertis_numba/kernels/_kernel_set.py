@@ -59,6 +59,7 @@ class KernelSet(AdaptiveKernels):
     sum_spectra: _contract.SumSpectra
     envelope_rows: _contract.EnvelopeRows
     combine_delayed: _contract.CombineDelayed
+    sum_delayed_int16: _contract.SumDelayedInt16
     rectify_and_decimate: _contract.RectifyAndDecimate
     delay_and_sum: _contract.DelayAndSum
     envelope: _contract.Envelope

@@ -171,10 +171,19 @@ def combine_delayed(
         out[direction] = combined
 
 
-def rectify_and_decimate(beams: Real, taps: Real, factor: int, first: int, out: Real) -> None:
+def sum_delayed_int16(signals: Short, delays: Index, first: int, out: Short) -> None:
+    """Sum the delayed 16-bit signals of all microphones for every direction and sample."""
+    mics = np.arange(len(signals))[:, None]
+    for direction, delay in enumerate(delays):
+        np.sum(
+            signals[mics, first + delay[:, None] + np.arange(out.shape[1])], axis=0, dtype=np.int16, out=out[direction]
+        )
+
+
+def rectify_and_decimate(beams: Real | Short, taps: Short, scale: float, factor: int, first: int, out: Real) -> None:
     """Rectify real beams, filter them, and keep every factor-th sample."""
     windows = np.lib.stride_tricks.sliding_window_view(np.abs(beams[:, first:]), len(taps), axis=1)
-    out[:] = windows[: len(out), : (out.shape[1] - 1) * factor + 1 : factor] @ taps
+    out[:] = scale * (windows[: len(out), : (out.shape[1] - 1) * factor + 1 : factor] @ taps.astype(np.float64))
 
 
 def delay_and_sum(signals: Complex, offsets: Index, weights: Complex, out: Complex) -> None:

@@ -16,6 +16,7 @@ from ertis_numba.kernels._contract.beams import (
     InterpolatedBeamsEnvelopeInt16,
     QuantiseTiles,
     RectifyAndDecimate,
+    SumDelayedInt16,
 )
 from ertis_numba.kernels._contract.scenes import AddPaths, ModulatePdm
 from ertis_numba.kernels._contract.signals import (
@@ -57,6 +58,7 @@ __all__ = [
     "RectifyAndDecimate",
     "RemoveGroupDelay",
     "Short",
+    "SumDelayedInt16",
     "SumSpectra",
     "Taps",
     "Turns",

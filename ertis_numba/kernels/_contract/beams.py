@@ -16,6 +16,7 @@ __all__ = [
     "InterpolatedBeamsEnvelopeInt16",
     "QuantiseTiles",
     "RectifyAndDecimate",
+    "SumDelayedInt16",
 ]
 
 
@@ -229,17 +230,37 @@ class CombineDelayed(Protocol):
     ) -> None: ...
 
 
-class RectifyAndDecimate(Protocol):
-    """Rectify real beams, filter them, and keep every factor-th sample.
+class SumDelayedInt16(Protocol):
+    """Sum the delayed 16-bit signals of all microphones for every direction and sample.
 
-    ``out[direction, r] = Σ_t taps[t] · |beams[direction, first + r · factor + t]|``.
+    ``out[direction, n] = Σ_mic signals[mic, first + delays[direction, mic] + n]``. The sums fit into 16 bits.
 
     Parameters
     ----------
-    beams : (direction, sample) float32
-    taps : (tap,) float32
+    signals : (mic, sample) int16
+    delays : (direction, mic) int32
+    first : int
+    out : (direction, n) int16
+    """
+
+    def __call__(self, signals: Short, delays: Index, first: int, out: Short) -> None: ...
+
+
+class RectifyAndDecimate(Protocol):
+    """Rectify real beams, filter them, and keep every factor-th sample.
+
+    ``out[direction, r] = scale · Σ_t taps[t] · |beams[direction, first + r · factor + t]|``. The CPU rounds magnitudes
+    of float32 to 15 bits of the largest one in 8192 samples.
+
+    Parameters
+    ----------
+    beams : (direction, sample) float32 or int16
+        No number is -32,768.
+    taps : (tap,) int16
+        The sum of their magnitudes is at most 65,535, so that sums of products fit into 32 bits.
+    scale : float
     factor, first : int
     out : (direction, r) float32
     """
 
-    def __call__(self, beams: Real, taps: Real, factor: int, first: int, out: Real) -> None: ...
+    def __call__(self, beams: Real, taps: Short, scale: float, factor: int, first: int, out: Real) -> None: ...

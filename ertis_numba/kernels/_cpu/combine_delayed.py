@@ -14,6 +14,8 @@ __all__ = ["combine_delayed"]
 _SUMMED, _MULTIPLIED = 4, 2  # registers at a time: enough chains of additions, and no more registers than there are
 _LANES = REGISTER_BYTES // 4
 _MAX_ORDER = 5
+_DIRECTIONS = 16  # directions per block
+_TILE_NUMBERS = 8_192  # samples of all microphones in a tile, which fits into an L1 cache
 
 
 @njit(nogil=True, cache=True)
@@ -75,36 +77,62 @@ def _combine_short(signals, roots, starts, order, coherent, out):
             out[n] *= total * total / (np.float32(len(starts)) * power) if power > 0 else np.float32(0)
 
 
+@njit(nogil=True, cache=True)
+def _combine_tile(signals, roots, starts, order, low, high, out, direction):
+    """Write the samples from ``low`` to ``high`` of a direction.
+
+    The last vector overlaps the one before it, and computes some samples again.
+    """
+    n_samples = out.shape[1]
+    width = (_SUMMED if order == 1 else _MULTIPLIED) * _LANES
+    row = direction * n_samples
+    for begin in range(low, high, width):
+        place = min(begin, n_samples - width)
+        if order == 1:
+            _sum(signals, starts, place, out, row + place)
+        else:
+            _sum_products(roots, starts, place, order, out, row + place)
+
+
+@njit(nogil=True, cache=True)
+def _weight_row(signals, starts, out, direction):
+    """Multiply all samples of a direction by the coherence factor."""
+    n_mics, n_samples = len(starts), out.shape[1]
+    width = _MULTIPLIED * _LANES
+    n_whole = n_samples // width * width
+    for place in range(0, n_whole, width):
+        _weight(signals, starts, place, out, direction * n_samples + place)
+    for n in range(n_whole, n_samples):
+        total = power = np.float32(0)
+        for mic in range(n_mics):
+            x = signals.flat[starts[mic] + n]
+            total += x
+            power += x * x
+        out[direction, n] *= total * total / (np.float32(n_mics) * power) if power > 0 else np.float32(0)
+
+
 @njit(parallel=True, nogil=True, cache=True)
 def combine_delayed(signals, roots, delays, order, coherent, first, out):
     """Combine the delayed real signals of all microphones for every direction and sample."""
     n_directions, n_mics = delays.shape
     n_samples, stride = out.shape[1], signals.shape[1]
-    for direction in prange(n_directions):
-        starts = np.empty(n_mics, np.int64)
-        for mic in range(n_mics):
-            starts[mic] = mic * stride + first + delays[direction, mic]
-        row = direction * n_samples
+    width = (_SUMMED if order == 1 else _MULTIPLIED) * _LANES
+    tile = max(width, _TILE_NUMBERS // n_mics // width * width)
+    for block in prange((n_directions + _DIRECTIONS - 1) // _DIRECTIONS):
+        begin, end = block * _DIRECTIONS, min((block + 1) * _DIRECTIONS, n_directions)
+        starts = np.empty((end - begin, n_mics), np.int64)
+        for direction in range(begin, end):
+            for mic in range(n_mics):
+                starts[direction - begin, mic] = mic * stride + first + delays[direction, mic]
         if n_samples < _SUMMED * _LANES:
-            _combine_short(signals, roots, starts, order, coherent, out[direction])
+            for direction in range(begin, end):
+                _combine_short(signals, roots, starts[direction - begin], order, coherent, out[direction])
             continue
-        # The last vector overlaps the one before it, and computes some samples again.
-        width = (_SUMMED if order == 1 else _MULTIPLIED) * _LANES
-        for begin in range(0, n_samples, width):
-            place = min(begin, n_samples - width)
-            if order == 1:
-                _sum(signals, starts, place, out, row + place)
-            else:
-                _sum_products(roots, starts, place, order, out, row + place)
+        # All directions of a block use one tile of the signals, which the cache holds, before the next.
+        for low in range(0, n_samples, tile):
+            high = min(low + tile, n_samples)
+            for direction in range(begin, end):
+                _combine_tile(signals, roots, starts[direction - begin], order, low, high, out, direction)
         if coherent:
-            width = _MULTIPLIED * _LANES
-            n_whole = n_samples // width * width
-            for place in range(0, n_whole, width):
-                _weight(signals, starts, place, out, row + place)
-            for n in range(n_whole, n_samples):
-                total = power = np.float32(0)
-                for mic in range(n_mics):
-                    x = signals.flat[starts[mic] + n]
-                    total += x
-                    power += x * x
-                out[direction, n] *= total * total / (np.float32(n_mics) * power) if power > 0 else np.float32(0)
+            for direction in range(begin, end):
+                _weight_row(signals, starts[direction - begin], out, direction)

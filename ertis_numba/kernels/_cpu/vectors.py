@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""CPU vectors of one register, with one lane per sample: float32 or float64.
+"""CPU vectors of one register, with one lane per sample: float32, float64, or int16, which only adds.
 
 Compiled code computes with them as with numbers. They stay in registers during loops, also where LLVM does not
 vectorise a loop because its sums depend on each other. Products are fused with sums if the processor can.
@@ -27,11 +27,12 @@ __all__ = [
     "where_zero",
 ]
 
+_LANE_TYPES = {types.float32: ir.FloatType(), types.float64: ir.DoubleType(), types.int16: ir.IntType(16)}
 REGISTER_BYTES = 64 if "avx512f" in target_features() else 32
 
 
 class Vector(types.Type):
-    """Registers of float32 or float64."""
+    """Registers of float32, float64 or int16."""
 
     def __init__(self, dtype, n_registers):
         self.dtype, self.count = dtype, 8 * n_registers * REGISTER_BYTES // dtype.bitwidth
@@ -40,7 +41,7 @@ class Vector(types.Type):
 
 def ir_type(vector):
     """Return the LLVM type of a `Vector`."""
-    return ir.VectorType(ir.FloatType() if vector.dtype == types.float32 else ir.DoubleType(), vector.count)
+    return ir.VectorType(_LANE_TYPES[vector.dtype], vector.count)
 
 
 @register_model(Vector)
@@ -55,13 +56,13 @@ def _add_operator(function, instruction):
     @intrinsic
     def apply(typing_context, a, b):
         def codegen(context, builder, signature, arguments):
-            return getattr(builder, instruction)(*arguments)
+            return getattr(builder, "add" if a.dtype == types.int16 else instruction)(*arguments)
 
         return a(a, b), codegen
 
     @overload(function)
     def choose(a, b):
-        if isinstance(a, Vector) and a == b:
+        if isinstance(a, Vector) and a == b and (a.dtype != types.int16 or function is operator.add):
             return lambda a, b: apply(a, b)  # noqa: PLW0108 - Numba compiles only Python functions
         return None
 

@@ -12,7 +12,7 @@ _BLOCK = 128
 
 
 @cuda.jit(cache=True)
-def _filter(beams, taps, factor, first, out):
+def _filter(beams, taps, scale, factor, first, out):
     direction = np.uint64(cuda.blockIdx.x)
     r = np.uint64(cuda.blockIdx.y * _BLOCK + cuda.threadIdx.x)
     if r >= np.uint64(out.shape[1]):
@@ -21,10 +21,10 @@ def _filter(beams, taps, factor, first, out):
     total = np.float32(0)
     for number in range(taps.size):
         tap = np.uint64(number)
-        total += taps[tap] * abs(beams[direction, start + tap])
-    out[direction, r] = total
+        total += np.float32(taps[tap]) * abs(beams[direction, start + tap])
+    out[direction, r] = np.float32(scale) * total
 
 
-def rectify_and_decimate(beams, taps, factor, first, out):
+def rectify_and_decimate(beams, taps, scale, factor, first, out):
     """Rectify real beams, filter them, and keep every factor-th sample."""
-    launch(_filter, (out.shape[0], -(-out.shape[1] // _BLOCK)), (_BLOCK,), beams, taps, factor, first, out)
+    launch(_filter, (out.shape[0], -(-out.shape[1] // _BLOCK)), (_BLOCK,), beams, taps, scale, factor, first, out)
