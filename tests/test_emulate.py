@@ -16,7 +16,7 @@ from ertis_cli.emulate import _get_ready
 from ertis_cli.main import cli
 
 from ertis_numba.devices.driver import SonarDriver
-from ertis_numba.devices.setup import Setup
+from ertis_numba.devices.setup import Setup, call_codes, call_from_codes
 from ertis_numba.errors import ArgumentError, SonarError
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.settings import Call, Processing, Recording, Settings
@@ -207,9 +207,8 @@ def captured(port, settings):
         return sonar.measure().data
 
 
-def rejected(process, port, settings, message):
+def rejected(process, port, other, settings, message):
     """Check that a device rejects a call twice, although it keeps the call for the second attempt."""
-    other = Call(start_frequency_hz=settings.call.stop_frequency_hz, stop_frequency_hz=settings.call.start_frequency_hz)
     for _ in range(2):
         with pytest.raises(SonarError, match="'ertis emulate' prints the reason"):
             captured(port, settings.replace(call=other))
@@ -217,7 +216,7 @@ def rejected(process, port, settings, message):
 
 
 def test_emulate_renders_a_scene_for_the_configured_call(emulate, tmp_path):
-    """The device renders the call of its scene and the calls of presets, and rejects others."""
+    """The device renders the call of its scene, calls of presets and other calls, and rejects unusable ones."""
     (tmp_path / "scene.toml").write_text(SCENE)
     process = emulate(tmp_path / "scene.toml", "--seed", 4, "--quiet")
     path = process.stdout.readline().rstrip()
@@ -235,8 +234,14 @@ def test_emulate_renders_a_scene_for_the_configured_call(emulate, tmp_path):
     sensor = sensor.replace(call=settings.call, recording=settings.recording, processing=settings.processing)
     engine = Engine(scene.replace(sensors=(sensor,)), sensor, frozenset(EFFECTS))
     assert np.array_equal(captured(path, settings), engine.render().data)
-    message = "only received a call that is neither a preset's nor its scene's (50 to 25 kHz in 2.5 ms)"
-    rejected(process, path, SHORT, message)
+    settings = settings.replace(call=Call(start_frequency_hz=35_000.0, stop_frequency_hz=60_000.0))
+    loaded = call_from_codes(call_codes(settings.call), settings.call.sample_rate_hz)
+    engine = Engine(
+        scene.replace(sensors=(sensor.replace(call=loaded),)), sensor.replace(call=loaded), frozenset(EFFECTS)
+    )
+    assert np.array_equal(captured(path, settings), engine.render().data)
+    long = SHORT.call.replace(duration_s=10e-3)
+    rejected(process, path, long, SHORT, "only received a call that cannot be rendered")
     assert len(captured(path, SHORT)) == N_SAMPLES
     assert ended(process, signal.SIGTERM) == (143, "", "")
 
@@ -245,7 +250,7 @@ def test_emulate_rejects_a_call_without_measurements(emulate, recording):
     process = emulate(recording, "--sensor", "left", "--quiet")
     port = process.stdout.readline().rstrip()
     message = "left was recorded with a call of 50 to 25 kHz in 2.5 ms and 32768 samples at 4.5 MHz"
-    rejected(process, port, SHORT, message)
+    rejected(process, port, Call(start_frequency_hz=25_000.0, stop_frequency_hz=50_000.0), SHORT, message)
     assert len(captured(port, SHORT)) == N_SAMPLES
     assert ended(process, signal.SIGTERM) == (143, "", "")
 

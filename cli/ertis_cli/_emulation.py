@@ -44,16 +44,16 @@ class SceneRenderer:
 
     def refusal(self, name: str, config: "DeviceConfig") -> str:
         """Render for this configuration from now on; return the reason if that is impossible, or an empty text."""
+        from ertis_numba.errors import ArgumentError
         from ertis_numba.settings import PRESETS, Settings
 
         sensor = self._scene.sensor(name)
         calls = [sensor.call, *(Settings.from_preset(preset).call for preset in PRESETS)]
         call = next((each for each in calls if config.holds(each)), None)
-        if call is None:
-            return (
-                f"{name} received a call that is neither a preset's nor its scene's ({_described(sensor.call)}). It "
-                "does not measure; give 'ertis capture' a --preset, or --settings with the scene's call"
-            )
+        try:
+            call = call or config.call()
+        except ArgumentError as error:
+            return f"{name} received a call that cannot be rendered, and does not measure: {error}"
         recording = sensor.recording.replace(n_samples=config.n_samples, sample_rate_hz=config.pdm_rate_hz)
         with self._turn:
             if self._configs[name] != (wanted := _SensorConfig(call, recording)):

@@ -108,10 +108,9 @@ def emulate(
     until Ctrl-C ends the command.
     For measurements without emission, the scene is simulated with all sensors silent.
 
-    A scene is rendered for the call that 'ertis capture' uploads: the scene's own or that of a preset. Without
-    --sync-rate, all measurements with the scene's call are rendered in advance. With --sync-rate, each is rendered at
-    its pulse, and the first pulses are slower. A recording supports only its own call; with any other call, the sensor
-    does not measure.
+    A scene is rendered for the call that was uploaded. Without --sync-rate, all measurements with the scene's call are
+    rendered in advance. With --sync-rate, each is rendered at its pulse, and the first pulses are slower. A recording
+    supports only its own call; with any other call, the sensor does not measure.
 
     'ertis capture' can read the mounting of the sensors from the same file: --mounting SCENE.toml|REC.h5.
     """

@@ -15,6 +15,7 @@ from ertis_numba.devices.blocks import Instant
 from ertis_numba.errors import SonarDisconnectedError, SonarError
 
 try:
+    import fcntl
     import termios
 
     _CANNOT_OPEN: tuple[type[Exception], ...] = (OSError, termios.error)
@@ -148,6 +149,10 @@ class SerialLine:
             except OSError as error:
                 _log.debug("%s: %r was not sent: %s", self.path, last, error)
             finally:
+                if os.name == "posix" and self._port.is_open:
+                    # Children that were forked meanwhile keep their copy of the descriptor, and with it the lock.
+                    with suppress(OSError):
+                        fcntl.flock(self._port.fileno(), fcntl.LOCK_UN)
                 self._port.close()
 
     def _read(self, size: int) -> bytes:

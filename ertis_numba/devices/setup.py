@@ -24,12 +24,24 @@ from ertis_numba.geometry import microphones
 from ertis_numba.settings import Array, Call, Settings
 from ertis_numba.waveform import call_samples
 
-__all__ = ["Setup", "call_codes", "call_hash"]
+__all__ = ["Setup", "call_codes", "call_from_codes", "call_hash"]
 
 
 def call_codes(call: Call) -> NDArray[np.uint16]:
     """Return a call as the codes of the 12-bit converter, ``floor(2047 s + 2048)``: (sample,) uint16."""
     return np.floor(2047 * call_samples(call) + 2048).astype(np.uint16)
+
+
+def call_from_codes(codes: NDArray[np.uint16], rate_hz: float) -> Call:
+    """Return the call of codes of the converter as a custom waveform with a peak of 1.
+
+    Raises
+    ------
+    ArgumentError
+        There are too many samples, or they have no usable band.
+    """
+    samples = (codes + 0.5 - 2048) / 2047  # Codes were rounded down.
+    return Call(waveform=tuple(samples.tolist()), sample_rate_hz=rate_hz)
 
 
 def call_hash(codes: NDArray[np.uint16]) -> int:

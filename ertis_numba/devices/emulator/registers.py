@@ -17,7 +17,7 @@ from ertis_numba.devices.commands import (
     PINS,
     Command,
 )
-from ertis_numba.devices.setup import call_codes
+from ertis_numba.devices.setup import call_codes, call_from_codes
 from ertis_numba.settings import Call
 
 __all__ = ["FIRMWARE", "DeviceConfig", "Registers"]
@@ -61,6 +61,16 @@ class DeviceConfig:
         if not self.codes.any():
             return True
         return self.dac_rate_hz == call.sample_rate_hz and np.array_equal(self.codes, call_codes(call))
+
+    def call(self) -> Call:
+        """Return the loaded call as a custom waveform.
+
+        Raises
+        ------
+        ArgumentError
+            The samples are too many, or have no usable band.
+        """
+        return call_from_codes(self.codes, float(self.dac_rate_hz))
 
 
 class Registers:
