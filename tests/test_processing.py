@@ -232,13 +232,16 @@ def test_image_is_independent_of_the_number_of_threads():
         assert np.array_equal(pipeline.process(MEASUREMENT).amplitude, wanted.amplitude)
 
 
-def test_missed_error_budget_is_logged_once_per_sensor(cpu_loop):
+@pytest.mark.parametrize("changes", [{}, {"clean_within_db": 1.0, "weighting": "coherence_factor"}])
+def test_missed_error_budget_is_logged_once_per_sensor(cpu_loop, changes):
+    """Cleaning does not change the prediction, which is that of the whole image."""
     loop = cpu_loop.fresh()
-    words = cases.noise(cases.SHORT).data
+    settings = cases.SHORT.replace(processing=cases.SHORT.processing.replace(**changes))
+    words = cases.noise(settings).data
     silence = np.zeros_like(words)
     silence[::2] = ~silence[::2]
     for sensor in ("loud", "quiet"):
-        loop.processing.register(hello(sensor, cases.SHORT), cases.SHORT)
+        loop.processing.register(hello(sensor, settings), settings)
     for _ in range(3):
         loop.offer("loud", words)
         loop.offer("quiet", silence)

@@ -112,7 +112,11 @@ class _ImageWorker:
         image = chain.image(words, place if self._given.dtype == "float32" else None, threads=order.threads)
         if order.predict_for:
             measurement = Measurement(chain.format.from_bytes(bytes(words)), image.settings)
-            self._predictions.add(order.predict_for, image.replace(amplitude=image.amplitude.copy()), measurement)
+            if image.settings.processing.is_cleaned:  # A prediction needs all amplitudes.
+                whole = chain.pipeline.process(measurement, clean=False, threads=order.threads)
+            else:
+                whole = image.replace(amplitude=image.amplitude.copy())
+            self._predictions.add(order.predict_for, whole, measurement)
         if self._given.dtype != "float32":
             np.copyto(place, image.amplitude, casting="same_kind")
         if not order.points:
