@@ -29,6 +29,7 @@ from .errors import (
 )
 from .figures import plot as plot
 from .frames import (
+    Beams as Beams,
     Energyscape as Energyscape,
     Measurement as Measurement,
     MicrophoneSignals as MicrophoneSignals,

@@ -1,5 +1,6 @@
 """Signal chain from measurements to energyscapes."""
 
+import functools
 import itertools
 import warnings
 from collections.abc import Iterable, Iterator
@@ -15,7 +16,7 @@ from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.call_match import call_match
 from ertis_numba.analysis.range_cleaning import clean_in_place
 from ertis_numba.errors import ArgumentError, CallMismatchWarning, DataError, DeviceError, ErrorBudgetWarning
-from ertis_numba.frames import Energyscape, Measurement, MicrophoneSignals
+from ertis_numba.frames import Beams, Energyscape, Measurement, MicrophoneSignals
 from ertis_numba.geometry import Grid, microphones
 from ertis_numba.prediction import BudgetMonitor
 from ertis_numba.sample_format import sample_format
@@ -200,6 +201,7 @@ class Pipeline:
         True
         """
         checks.instance("measurement", measurement, Measurement, "a recording holds")
+        self.settings.processing.require_image()
         words, exponent = self._words_of(measurement)
         amplitude = self._chain.new_image() if out is None else self._checked_out(out)
         if stream is not None and isinstance(self._chain, KernelChain):
@@ -258,6 +260,7 @@ class Pipeline:
         0
         """
         self._require_open()
+        self.settings.processing.require_image()
         batch = list(checks.items("measurements", measurements, Measurement, "a recording holds"))
         words = [self._words_of(measurement) for measurement in batch]
         amplitudes = [self._chain.new_image() for _ in batch]
@@ -306,6 +309,7 @@ class Pipeline:
         True
         """
         self._require_open()
+        self.settings.processing.require_image()
         size = self._batch_size() if batch_size is None else checks.integer("batch_size", batch_size, 1)
         return self._batches(checks.items("measurements", measurements, Measurement, "a recording holds"), size)
 
@@ -368,6 +372,84 @@ class Pipeline:
             stamp=measurement.stamp,
         )
 
+    def beams(self, measurement: Measurement) -> Beams:
+        """Return the beams of a measurement: the sums of the delayed microphone signals, before their envelope.
+
+        Delays are exact, as with ``accuracy.delay_taps = 0``. The processor computes beams, for any device.
+
+        Parameters
+        ----------
+        measurement : Measurement
+
+        Returns
+        -------
+        Beams
+
+        Raises
+        ------
+        DataError
+            The measurement's array, call, record or air, or its data, are not those of the pipeline's settings.
+        ArgumentError
+            The method is ``paper``, or the beamformer is not ``delay_and_sum``.
+
+        Examples
+        --------
+        >>> import ertis_numba as ertis
+        >>> with ertis.open_recording("reflectors.h5") as recording:
+        ...     beams = ertis.Pipeline(recording.settings).beams(recording[0])
+        >>> str(beams.beam.dtype)
+        'complex64'
+        """
+        self.settings.processing.require_beams("beams are needed")
+        checks.instance("measurement", measurement, Measurement, "a recording holds")
+        words, exponent = self._words_of(measurement)
+        settings, chain = self._beam_chain
+        beam: NDArray[Any] = chain.new_image()
+        chain.process(words, beam)
+        _rescaled(beam.view(np.float32), exponent)
+        return Beams(beam, self.grid.azimuth_rad, self.grid.elevation_rad, self.range_m, settings, measurement.stamp)
+
+    @functools.cached_property
+    def _beam_chain(self) -> tuple[Settings, Chain]:
+        from ertis_numba.stages.beam_chain import BeamChain, beam_settings  # noqa: PLC0415  few want them
+
+        host = kernels.load("numpy" if self.device == "numpy" else "cpu")
+        threads = min(self._threads, host.max_threads)
+        settings = beam_settings(self._uncleaned_settings, host, threads=threads)
+        return settings, BeamChain(settings, host, threads=threads)
+
+    def result(self, measurement: Measurement) -> MicrophoneSignals | Beams | Energyscape:
+        """Return the result of the last stage of processing, ``settings.processing.last_stage``.
+
+        Parameters
+        ----------
+        measurement : Measurement
+
+        Returns
+        -------
+        MicrophoneSignals, Beams or Energyscape
+            That of `signals` for ``demodulation`` and ``matched_filter``, of `beams` for ``beams``, and of `process`
+            for ``envelope``.
+
+        Raises
+        ------
+        DataError
+            The measurement's array, call, record or air, or its data, are not those of the pipeline's settings.
+
+        Examples
+        --------
+        >>> import ertis_numba as ertis
+        >>> with ertis.open_recording("reflectors.h5") as recording:
+        ...     settings = recording.settings.replace("processing.last_stage", "beams")
+        ...     result = ertis.Pipeline(settings).result(recording[0])
+        >>> type(result).__name__
+        'Beams'
+        """
+        stage = self.settings.processing.last_stage
+        if stage == "envelope":
+            return self.process(measurement)
+        return self.beams(measurement) if stage == "beams" else self.signals(measurement)
+
     @property
     def prediction(self) -> "Prediction | None":
         """Latest predicted error and its budget; None before the first image with sound."""
@@ -378,6 +460,7 @@ class Pipeline:
         if not self._closed:
             self._closed = True
             self._chain.close()
+            self.__dict__.pop("_beam_chain", (None, self._chain))[1].close()
 
     def __enter__(self) -> Self:
         self._require_open()

@@ -2,6 +2,7 @@
 
 import re
 
+import numpy as np
 import pytest
 
 from ertis_numba.analysis.compare import compare
@@ -20,12 +21,12 @@ def place(tmp_path):
 
 
 def test_page_has_short_examples():
-    assert len(EXAMPLES) == 4
+    assert len(EXAMPLES) == 5
     assert max(len(example.splitlines()) for example in EXAMPLES) <= 12
     assert max(map(len, "".join(EXAMPLES).splitlines())) <= 120
 
 
-@pytest.mark.parametrize("number", range(4))
+@pytest.mark.parametrize("number", range(5))
 def test_page_examples_run(place, number):
     code = "import matplotlib; matplotlib.use('Agg')\n" + EXAMPLES[number]
     shown = run_code_here(place, code)
@@ -34,6 +35,9 @@ def test_page_examples_run(place, number):
     if number == 2:
         with open_recording(RECORDING) as recording:
             assert len(re.findall(r"measurement \d+: -?\d+\.\d dBFS", shown)) == len(recording)
+    if number == 4:
+        with open_recording(RECORDING) as recording, np.load(place / "beams.npz", allow_pickle=False) as data:
+            assert data["beam"].shape == (len(recording), len(data["azimuth_rad"]), len(data["range_m"]))
 
 
 def test_own_beamformer_finds_the_reflectors(place):

@@ -13,8 +13,10 @@ from ertis_cli._config import typed
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
-    from ertis_numba.frames import Energyscape, Measurement
+    from ertis_numba.frames import Beams, Energyscape, Measurement, MicrophoneSignals
     from ertis_numba.storage import EnergyscapeReader, RecordingReader
+
+    _Exported = Energyscape | Measurement | Beams | MicrophoneSignals
 
 __all__ = ["export"]
 
@@ -172,21 +174,21 @@ class _Items:
     def __len__(self) -> int:
         return sum(len(chosen) for _, chosen in self._chosen)
 
-    def __iter__(self) -> "Iterator[Energyscape | Measurement]":
+    def __iter__(self) -> "Iterator[_Exported]":
         with options.progress(self._each(), length=len(self), label="exporting", quiet=self._quiet) as shown:
             yield from shown
 
-    def _each(self) -> "Iterator[Energyscape | Measurement]":
+    def _each(self) -> "Iterator[_Exported]":
         for reader, chosen in self._chosen:
             read = (reader[index] for index in chosen)
             yield from self._processed(read) if self._process else read
 
-    def _processed(self, measurements: "Iterable[Any]") -> "Iterator[Energyscape]":
-        """Yield images; each change of the air needs a new pipeline."""
+    def _processed(self, measurements: "Iterable[Any]") -> "Iterator[_Exported]":
+        """Yield results; each change of the air needs a new pipeline."""
         for settings, group in itertools.groupby(measurements, lambda measurement: measurement.settings):
             with options.pipeline(settings, quiet=self._quiet) as pipeline:
                 for measurement in group:
-                    yield pipeline.process(measurement)
+                    yield pipeline.result(measurement)
 
 
 def _between(places: tuple[int, int] | None, count: int) -> range:

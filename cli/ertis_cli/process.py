@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from ertis_cli import _mountings, _plans, _presets, _process_many, options
+from ertis_cli import _mountings, _plans, _presets, _process_many, _results, options
 from ertis_cli._config import typed
 
 if TYPE_CHECKING:
@@ -30,7 +30,8 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
     "target",
     type=click.Path(),
     metavar="FILE|DIR",
-    help="Energyscape file to write, REC.energy.h5 beside the recording by default; a folder for several recordings.",
+    help="Energyscape file to write, REC.energy.h5 beside the recording by default; a folder for several recordings; "
+    "FILE.npz for signals or beams.",
 )
 @options.sensor("Process this sensor only; all sensors by default.")
 @click.option(
@@ -48,6 +49,11 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
 )
 @options.beamforming("the recording's own")
 @options.cleaning("the recording's own")
+@click.option(
+    "--last-stage",
+    type=click.Choice(["demodulation", "matched_filter", "beams", "envelope"]),
+    help="Last step of processing; all but envelope need -o FILE.npz; the recording's own by default.",
+)
 @click.option(
     "--array-weights",
     metavar="WINDOW",
@@ -175,6 +181,8 @@ def process(
             wavefront=wavefront,
             max_error_db=max_error_db,
         )
+        if not _results.is_results_file(target):
+            _results.require_image(settings)
         _plans.require_plan(settings, explain=explain, verify=verify, max_error_db=max_error_db)
         return settings
 
@@ -206,6 +214,20 @@ def process(
                 click.get_current_context(),
             )
     path = Path(paths[0])
+    if target is not None and _results.is_results_file(target):
+        _results.write_results(
+            path,
+            Path(target),
+            changed,
+            sensor=sensor,
+            force=force,
+            quiet=quiet,
+            as_json=as_json,
+            device=device,
+            threads=threads,
+            plan=plan,
+        )
+        return
     if target is not None and Path(target).suffix.lower() in _PICTURES:
         raise click.UsageError(
             f"-o {target} is a picture, but process writes energyscapes; give a .h5 file and plot it with 'ertis plot'",

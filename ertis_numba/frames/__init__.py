@@ -1,5 +1,6 @@
-"""Data that flow through the system: measurements, gaps, signals, energyscapes, reflectors, peaks and point clouds."""
+"""Data that flow through the system, such as measurements, signals, beams, energyscapes and point clouds."""
 
+from ertis_numba.frames._beams import Beams
 from ertis_numba.frames._energyscape import Energyscape
 from ertis_numba.frames._gap import SequenceGap
 from ertis_numba.frames._measurement import Measurement, MicrophoneSignals
@@ -8,6 +9,7 @@ from ertis_numba.frames._reflectors import Peak, Reflector
 from ertis_numba.frames._stamp import Stamp
 
 __all__ = [
+    "Beams",
     "Energyscape",
     "Measurement",
     "MicrophoneSignals",

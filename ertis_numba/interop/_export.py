@@ -1,22 +1,24 @@
-"""Energyscapes and microphone signals in the formats of other programs."""
+"""Energyscapes, beams and microphone signals in the formats of other programs."""
 
 import itertools
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence, Sized
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 
 from ertis_numba import checks
 from ertis_numba.atomic_files import atomic_write, check_target, remedy
 from ertis_numba.errors import ArgumentError, DataError, ErtisError
-from ertis_numba.frames import Energyscape, Measurement
+from ertis_numba.frames import Beams, Energyscape, Measurement, MicrophoneSignals
 from ertis_numba.interop._mountings import Mountings, validated
 
 __all__ = ["FORMATS", "TOPICS", "ExportFormat", "choose_format", "export", "output_files"]
 
 TOPICS: Final = ("points", "scan", "image", "sonar_image")
 """Products of a sensor in MCAP."""
+Exported: TypeAlias = Energyscape | Measurement | Beams | MicrophoneSignals
+"""Items that some format supports."""
 _POINTS = (
     *("x", "y", "z", "intensity", "uncertainty_range", "uncertainty_across"),
     *("sensor", "sequence", "sec", "nanosec"),
@@ -102,7 +104,7 @@ def output_files(path: str | Path, name: str) -> tuple[Path, ...]:
 
 def export(
     path: str | Path,
-    items: Iterable[Energyscape | Measurement],
+    items: Iterable[Exported],
     *,
     file_format: str | None = None,
     mounting: Mapping[str, tuple[Sequence[float], Sequence[float]]] | None = None,
@@ -120,10 +122,11 @@ def export(
     ----------
     path : str or Path
         Path of the file.
-    items : iterable of Energyscape or of Measurement
-        One measurement for ``acoular``, otherwise energyscapes. All formats except ``npz`` can contain several sensors.
-        ``mcap`` is written one image at a time, and so is ``npz`` if ``items`` has a length. Other formats collect all
-        points first.
+    items : iterable of Energyscape, of Measurement, or of Beams or MicrophoneSignals
+        One measurement for ``acoular``, otherwise energyscapes. ``npz`` can also contain beams, or microphone signals:
+        demodulated ones if that is the last stage of their settings, and matched-filtered ones otherwise. All formats
+        except ``npz`` can contain several sensors. ``mcap`` is written one image at a time, and so is ``npz`` if
+        ``items`` has a length. Other formats collect all points first.
     file_format : {"mcap", "ply", "pcd", "csv", "npz", "acoular"}, optional
         Name of the format; by default that of the suffix of ``path``.
     mounting : mapping of str to (translation_m, rotation_xyzw), optional
@@ -202,7 +205,7 @@ def _require_options(name: str, given: Mapping[str, object]) -> None:
 # Writers are imported when they are needed: they import scipy.spatial, and one of them needs an extra.
 
 
-def _write_signals(path: Path, geometry: Path, items: Iterable[Energyscape | Measurement]) -> None:
+def _write_signals(path: Path, geometry: Path, items: Iterable[Exported]) -> None:
     from ertis_numba.interop._acoular import write_acoular  # noqa: PLC0415
 
     several = list(itertools.islice(items, 2))
@@ -214,11 +217,11 @@ def _write_signals(path: Path, geometry: Path, items: Iterable[Energyscape | Mea
     write_acoular(path, geometry, several[0])
 
 
-def _write_npz(path: Path, items: Iterable[Energyscape | Measurement]) -> None:
+def _write_npz(path: Path, items: Iterable[Exported]) -> None:
     from ertis_numba.interop._npz import write_npz  # noqa: PLC0415
 
     count = len(items) if isinstance(items, Sized) else None
-    write_npz(path, _energyscapes(items), count)
+    write_npz(path, _results(items), count)
 
 
 def _write_points(
@@ -248,11 +251,21 @@ def _write_points(
         _point_files.write_pcd(path, table, text=text)
 
 
-def _energyscapes(items: Iterable[Energyscape | Measurement]) -> Iterator[Energyscape]:
-    """Yield energyscapes; refuse measurements, and an empty sequence."""
+def _energyscapes(items: Iterable[Exported]) -> Iterator[Energyscape]:
+    """Yield energyscapes; refuse other results."""
+    for item in _results(items):
+        if not isinstance(item, Energyscape):
+            raise ArgumentError(
+                f"{type(item).__name__} is given, but this format holds images; write npz, or call Pipeline.process"
+            )
+        yield item
+
+
+def _results(items: Iterable[Exported]) -> Iterator[Energyscape | Beams | MicrophoneSignals]:
+    """Yield results of processing; refuse measurements, and an empty sequence."""
     count = 0
     for count, item in enumerate(items, 1):  # noqa: B007  it is used below
-        if not isinstance(item, Energyscape):
+        if not isinstance(item, Energyscape | Beams | MicrophoneSignals):
             raise ArgumentError(
                 "a measurement is given, but energyscapes are needed; process it first (Pipeline.process)"
             )

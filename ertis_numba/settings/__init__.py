@@ -10,7 +10,7 @@ from ertis_numba.settings.array import Array
 from ertis_numba.settings.array_windows import ArrayWindow, parse_window
 from ertis_numba.settings.call import MAX_CALL_SAMPLES, Call
 from ertis_numba.settings.presets import PRESETS, PresetKind, preset_tables, preset_text, presets
-from ertis_numba.settings.processing import Processing
+from ertis_numba.settings.processing import STAGES, Processing
 from ertis_numba.settings.ranges import fit_ranges
 from ertis_numba.settings.recording import ENCODINGS, Air, Recording
 from ertis_numba.settings.settings import Settings
@@ -23,6 +23,7 @@ __all__ = [
     "MAX_FOCAL_ZONES",
     "MAX_WAVEFORM_SAMPLES",
     "PRESETS",
+    "STAGES",
     "Accuracy",
     "Air",
     "Array",

@@ -11,10 +11,13 @@ from ertis_numba.errors import ArgumentError
 from ertis_numba.settings.array_windows import parse_window
 from ertis_numba.settings.presets import preset_tables
 
-__all__ = ["MAX_LISTED_DIRECTIONS", "Processing"]
+__all__ = ["MAX_LISTED_DIRECTIONS", "STAGES", "Processing"]
 
 MAX_LISTED_DIRECTIONS: Final = 1000
 """Limit on the directions that settings list; recordings and messages hold settings as text."""
+
+STAGES: Final = ("demodulation", "matched_filter", "beams", "envelope")
+"""Steps of processing after which it may end."""
 
 
 class Processing(TomlTable, frozen=True, kw_only=True):
@@ -71,6 +74,9 @@ class Processing(TomlTable, frozen=True, kw_only=True):
     clean_above_mean_db : float, optional, default None
         Smallest level above the mean amplitude over the directions of a range, 0 to 1000 dB; weaker amplitudes become
         0. Twice the mean is 6.02 dB. No such limit by default.
+    last_stage : {"demodulation", "matched_filter", "beams", "envelope"}, default "envelope"
+        Last step of processing. Each stage but ``envelope``, which yields images, yields signals: see
+        `Pipeline.result` and ``docs/how-to/numpy.md``. ``beams`` needs the fast method and delay_and_sum.
     diagonal_loading : float, default 1
         Diagonal loading of ``capon`` relative to the mean power of a microphone, 1e-6 to 1e6. Larger values approach
         delay-and-sum.
@@ -94,6 +100,7 @@ class Processing(TomlTable, frozen=True, kw_only=True):
     array_weights: str | tuple[float, ...] = "uniform"
     clean_within_db: float | None = None
     clean_above_mean_db: float | None = None
+    last_stage: Literal["demodulation", "matched_filter", "beams", "envelope"] = "envelope"
 
     @classmethod
     def from_preset(cls, name: str) -> Self:
@@ -180,6 +187,9 @@ class Processing(TomlTable, frozen=True, kw_only=True):
             )
         self._check_beamformer()
         self._check_array_weights()
+        checks.choice("processing.last_stage", self.last_stage, STAGES)
+        if self.last_stage == "beams":
+            self.require_beams("processing.last_stage is 'beams'")
         for name in ("clean_within_db", "clean_above_mean_db"):
             if (level_db := getattr(self, name)) is not None:
                 checks.between(f"processing.{name}", level_db, 0.0, 1000.0)
@@ -240,6 +250,41 @@ class Processing(TomlTable, frozen=True, kw_only=True):
             raise ArgumentError(
                 f"processing.wavefront is 'spherical', which processing.beamformer {self.beamformer!r} does not "
                 "support; give 'plane', or another processing.beamformer"
+            )
+
+    def require_image(self) -> None:
+        """Refuse a last stage that yields no image.
+
+        Raises
+        ------
+        ArgumentError
+            The last stage is not ``envelope``.
+        """
+        if self.last_stage != "envelope":
+            raise ArgumentError(
+                f"processing.last_stage is {self.last_stage!r}, which yields no image; give 'envelope', or call "
+                "Pipeline.result for the result of that stage"
+            )
+
+    def require_beams(self, wanted: str) -> None:
+        """Refuse a method or beamformer without beams.
+
+        Parameters
+        ----------
+        wanted : str
+            Reason for which beams are needed, as the start of the error.
+
+        Raises
+        ------
+        ArgumentError
+            The method is ``paper``, or amplitudes are adaptive.
+        """
+        if self.method == "paper":
+            raise ArgumentError(f"{wanted}, but processing.method 'paper' returns none; give method 'fast'")
+        if self.is_adaptive:
+            raise ArgumentError(
+                f"{wanted}, but {self._adaptive_part} combines signals to amplitudes without a phase; give "
+                "processing.beamformer 'delay_and_sum' and weighting 'none'"
             )
 
     @property

@@ -4,7 +4,7 @@ The spectra of all microphones are delayed and summed within the band of the cal
 transform per direction then gives the beam at the output rate. No delay is rounded or interpolated.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Final
 
 import numpy as np
@@ -110,6 +110,26 @@ class PhaseShifts:
         out : (direction, range) float32
         threads : int
         """
+        for part, (first, stop), rows in self._parts(transforms, beams, buffers, threads=threads):
+            self._kernels.envelope_rows(part, self._lead, first, stop, out[rows])
+
+    def fill_beams(
+        self,
+        transforms: Transforms,
+        beams: NDArray[np.complex64],
+        buffers: Buffers,
+        out: NDArray[np.complex64],
+        *,
+        threads: int,
+    ) -> None:
+        """Fill ``out``, (direction, range) complex64, on a processor; other parameters as for `__call__`."""
+        for part, (first, stop), rows in self._parts(transforms, beams, buffers, threads=threads):
+            out[rows, first:stop] = part[:, 0, self._lead + first : self._lead + stop]
+
+    def _parts(
+        self, transforms: Transforms, beams: NDArray[np.complex64], buffers: Buffers, *, threads: int
+    ) -> Iterator[tuple[NDArray[np.complex64], tuple[int, int], slice]]:
+        """Yield the beams of each block of directions, with the ranges and the directions for which they are."""
         kernels, matched_filter = self._kernels, self._matched_filter
         (spectra,) = buffers
         matched_filter.fill_spectra(transforms, spectra, threads=threads)
@@ -117,10 +137,9 @@ class PhaseShifts:
         for first, stop, tables in self._zones:
             for block, (starts, steps) in enumerate(tables):
                 begin = block * self.shape[0]
-                rows = slice(begin, begin + len(starts))
                 kernels.sum_spectra(spectra, starts, steps, first_bin, n_bins, beams[: len(starts)])
                 transforms.inverse(threads=threads)
-                kernels.envelope_rows(beams[: len(starts)], self._lead, first, stop, out[rows])
+                yield beams[: len(starts)], (first, stop), slice(begin, begin + len(starts))
 
 
 def _phases(turns: NDArray[np.float64]) -> NDArray[np.uint32]:

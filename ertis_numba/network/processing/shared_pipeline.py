@@ -46,6 +46,7 @@ class SharedPipeline:
 
     def __init__(self, settings: str, device: str, plan: PlanCosts = "nominal") -> None:
         stated = Settings.from_toml(settings, "settings of a sensor", find_line=False)
+        stated.processing.require_image()
         self.pipeline = Pipeline(stated, device=device, max_bytes=MAX_BYTES, predict=False, plan=plan)
         self.shape = (len(self.pipeline.grid), len(self.pipeline.range_m))
         self.format = sample_format(self.pipeline.settings)
