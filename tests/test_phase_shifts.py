@@ -1,19 +1,26 @@
-"""Phase shifts of spectra: kernels equal their references, and images with exact delays are exact."""
+"""Phase shifts of spectra: kernels equal references, images are exact, and strict budgets choose them."""
+
+import dataclasses
 
 import numpy as np
 import pytest
 
 from ertis_numba.errors import ArgumentError
+from ertis_numba.frames import Measurement
 from ertis_numba.geometry import unit_vectors
 from ertis_numba.kernels._scalar import cosine_and_sine
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Accuracy, Array, Processing, Settings
 from ertis_numba.stages import phase_shifts
 from ertis_numba.stages.plan_response import deviation_of
+from ertis_numba.stages.planner import Planner
+from ertis_numba.stages.signal_model import signal_model_of
 from tests import reference
 from tests.cases import CASES, LINE_8, SHORT, noise
+from tests.error_cases import CPU, random_measurement
 from tests.hard_cases.tuned import tuned
 from tests.on_device import KERNELS, sized
+from tests.test_real import RAW
 
 GARBAGE = 12_345.0
 SHAPES = {
@@ -33,6 +40,7 @@ SHAPE_NAMES = sized(
     ["many bins", "eRTIS", "thousand microphones"],
 )
 SHIFTED = {"delay_taps": 0, "stopband_attenuation_db": 100.0, "max_error_db": 0.0}
+PUBLISHED = Settings(processing=Processing(directions="3d:3000", range_m=(0.5, 5.0)))
 
 
 @pytest.fixture(params=KERNELS)
@@ -98,6 +106,12 @@ def test_nan_affects_only_its_own_bin():
     assert np.flatnonzero(np.isnan(out[:, 0]).any(axis=0)).tolist() == [(73 + 4) % 40]
 
 
+def real_settings(directions, range_m):
+    """Return settings for the real measurement."""
+    settings = Settings.from_preset("default_25_50")
+    return settings.replace(processing=settings.processing.replace(directions=directions, range_m=range_m))
+
+
 # ---- images --------------------------------------------------------------------------------------------
 
 
@@ -149,6 +163,97 @@ def test_phase_shifts_give_the_same_bits_on_any_number_of_threads():
 def test_beams_of_phase_shifts_have_no_deviation():
     settings = Pipeline(tuned(SHORT, **SHIFTED), predict=False).settings
     assert deviation_of(settings, np.eye(3)[:1]) is None
+
+
+# ---- plans ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("instruction_set", ["AVX-512 VNNI", "AVX-512", "AVX2", "SSE2"])
+@pytest.mark.parametrize(
+    ("max_error_db", "is_shifted"),
+    [(-20.0, False), (-35.0, False), (-60.0, False), (-90.0, True), (-100.0, True), (-110.0, True)],
+)
+def test_strict_budgets_choose_phase_shifts(max_error_db, is_shifted, instruction_set):
+    """The grid is the published one: 3000 directions, from 0.5 m to 5 m."""
+    kernel_set = dataclasses.replace(CPU, instruction_set=instruction_set)
+    settings = tuned(PUBLISHED, max_error_db=max_error_db)
+    chosen = Planner(settings, kernel_set, threads=1).choose()
+    assert (chosen.settings.accuracy.delay_taps == 0) == is_shifted
+    assert chosen.error_db <= max_error_db
+    if not is_shifted:
+        shifted = Planner(tuned(settings, delay_taps=0), kernel_set, threads=1).choose()
+        assert shifted.time_ms > chosen.time_ms
+
+
+@pytest.mark.parametrize("changes", [{"precision": "int16"}, {"oversampling": 16}, {"beam_taps": 6}, {"delay_taps": 4}])
+def test_other_given_parts_of_a_plan_exclude_phase_shifts(changes):
+    settings = tuned(PUBLISHED, max_error_db=-60.0, **changes)
+    accuracy = Planner(settings, CPU, threads=1).choose().settings.accuracy
+    assert accuracy.delay_taps > 0
+    assert {name: getattr(accuracy, name) for name in changes} == changes
+
+
+def test_spherical_wavefronts_take_phase_shifts_only_if_asked():
+    processing = PUBLISHED.processing.replace(wavefront="spherical")
+    settings = tuned(PUBLISHED.replace(processing=processing), max_error_db=-60.0)
+    assert Planner(settings, CPU, threads=1).choose().settings.accuracy.delay_taps > 0
+    asked = Planner(tuned(settings, delay_taps=0), CPU, threads=1).choose()
+    assert asked.settings.accuracy.focal_zones > 1
+    assert asked.error_db <= -60
+
+
+@pytest.mark.parametrize("max_error_db", [-90.0, -100.0, -110.0])
+def test_true_error_of_the_chosen_plan_keeps_strict_budgets(max_error_db):
+    settings = real_settings("2d:61", (0.8, 5.0))
+    with Pipeline(settings, "cpu", max_error_db=max_error_db, predict=False) as pipeline:
+        assert pipeline.settings.accuracy.delay_taps == 0
+        assert error_db(pipeline, Measurement(np.fromfile(RAW, dtype="<u4"), settings)) < max_error_db
+
+
+# ---- predictions ---------------------------------------------------------------------------------------
+
+
+def differences_db(measurement, settings):
+    """Return predicted and true errors of phase shifts for three decimation filters."""
+    settings = settings.replace(processing=settings.processing.replace(wavefront="plane"))
+    signal_model = signal_model_of(measurement, settings, CPU)
+    found = []
+    for attenuation_db in (80.0, 100.0, 140.0):
+        with Pipeline(tuned(settings, **SHIFTED | {"stopband_attenuation_db": attenuation_db}), predict=False) as made:
+            planner = Planner(made.settings, CPU, threads=1, signal_model=signal_model)
+            found.append((planner.error_db(made.settings.accuracy), error_db(made, measurement)))
+    return np.array(found)
+
+
+def assert_predicted(pairs):
+    """Predictions agree within 2 dB; where rounding is all that is left, they may be more pessimistic."""
+    predicted_db, true_db = pairs.T
+    assert (predicted_db > true_db - 2).all(), pairs
+    audible = true_db > -118
+    assert audible.any()
+    assert (predicted_db < true_db + 2)[audible].all(), pairs
+
+
+@pytest.mark.parametrize(
+    ("directions", "range_m"),
+    [("2d:31", (0.8, 5.0)), ("2d:31", (0.1, 1.0)), ("2d:31", (3.0, 5.0)), ("3d:60", (0.5, 5.0))],
+)
+def test_predicted_error_of_phase_shifts_matches_the_real_measurement(directions, range_m):
+    settings = real_settings(directions, range_m)
+    assert_predicted(differences_db(Measurement(np.fromfile(RAW, dtype="<u4"), settings), settings))
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_predicted_error_of_phase_shifts_matches_random_scenes(seed):
+    assert_predicted(differences_db(*random_measurement(seed)))
+
+
+@pytest.mark.parametrize("name", ["default", "wide band", "solid angle", "line of 8"])
+def test_predicted_error_of_phase_shifts_matches_noise(name):
+    assert_predicted(differences_db(noise(CASES[name]), CASES[name]))
+
+
+# ---- settings ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

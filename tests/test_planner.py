@@ -141,14 +141,23 @@ def test_equal_costs_give_equal_plans():
     assert len(plans) == 2
 
 
-def test_costs_select_the_plan(monkeypatch):
-    """If only sums take time, beams are interpolated; if interpolation is expensive, they are not."""
+@pytest.mark.parametrize(
+    ("dear", "n_taps", "has_grid"),
+    [
+        (("sum", "shift"), {1, 2, 3, 4, 5, 6}, True),
+        (("pair", "shift"), {1, 2, 3, 4, 5, 6}, False),
+        (("sum", "pair"), {0}, False),
+    ],
+)
+def test_costs_select_the_plan(monkeypatch, dear, n_taps, has_grid):
+    """Beams are interpolated if only sums take time, and summed as spectra if only phase shifts take none."""
     usual = planner.nominal_costs(CPU)
     many = SMALL.replace(processing=SMALL.processing.replace(directions="3d:2000"))
-    for dear, wanted in (("sum", True), ("pair", False)):
-        seconds = {name: 1e-9 if name.startswith(dear) else 1e-15 for name in usual.seconds}
-        monkeypatch.setattr(planner, "nominal_costs", lambda _kernels, seconds=seconds: type(usual)(seconds))
-        assert bool(chosen_for(many).settings.accuracy.beam_taps) == wanted
+    seconds = {name: 1e-9 if name.startswith(dear) else 1e-15 for name in usual.seconds}
+    monkeypatch.setattr(planner, "nominal_costs", lambda _kernels: type(usual)(seconds))
+    found = chosen_for(many).settings.accuracy
+    assert found.delay_taps in n_taps
+    assert bool(found.beam_taps) == has_grid
 
 
 def test_complete_plans_are_kept():

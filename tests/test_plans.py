@@ -63,7 +63,7 @@ def test_explain_prints_the_plan_as_json(recording, tmp_path):
 
 
 def test_explain_prints_the_plan_as_text(recording, tmp_path):
-    plain = run(recording, "-o", tmp_path / "a.h5", "--explain")
+    plain = run(recording, "-o", tmp_path / "a.h5", "--explain", "--directions", "2d:91")
     assert plain.stdout == ""
     lines = plain.stderr.splitlines()
     lines = [
@@ -87,6 +87,10 @@ def test_explain_names_the_given_parts_of_a_plan(recording, tmp_path):
     assert "single precision" in reported
     assert "a delayed sample is a weighted sum of 2 samples" in reported
     assert "the beam of every direction is summed directly" in reported
+    wishes.write_text("[accuracy]\ndelay_taps = 0\n", "utf-8")
+    reported = run(recording, "-o", tmp_path / "b.h5", "--explain", "--settings", wishes).stderr
+    assert "single precision, exact delays, as phase shifts of spectra" in reported
+    assert "interpolation of delayed samples" not in reported
 
 
 @pytest.mark.parametrize("wavefront", ["plane", "spherical"])

@@ -134,7 +134,7 @@ class Costs:
         seconds = {
             "demodulate": unit[f"demodulate_{work.tap_bits}"] * work.n_samples * work.n_taps * work.n_words,
             "matched filter": unit["forward"] * work.n_mics * _transform(work.n_fft)
-            + unit["fold"] * rows * work.n_bins
+            + unit["fold"] * rows * work.n_bins * (2 if work.n_shifted else 1)
             + unit["inverse"] * (work.n_shifted or rows) * _transform(work.n_outputs),
             "16 bits": unit["quantise"] * quantised * (1 + _STREAM * work.n_streams),
             "sums": work.term_cost * term * work.n_beams * work.n_terms * work.n_computed
@@ -145,7 +145,7 @@ class Costs:
             * work.n_pairs
             * (_PAIR if work.n_streams else 1.0),
             "image": unit["level" if work.n_shifted else "image"] * points * (1 + _COMBINE * work.n_streams),
-            "calls": 6 * unit["call"],
+            "calls": (8 if work.n_shifted else 6) * unit["call"],
         }
         return {name: 1000 * value for name, value in seconds.items()}
 

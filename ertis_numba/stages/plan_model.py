@@ -20,12 +20,19 @@ from ertis_numba.stages.error_model import PARTS, ErrorModel, SignalModel
 from ertis_numba.stages.focal_zones import squared_curvature
 from ertis_numba.stages.interpolation_fit import DelayFit, Spectrum
 from ertis_numba.stages.phase_shifts import SHIFT_BYTES, SHIFT_TABLE_BYTES, rows_at_a_time
-from ertis_numba.stages.plan_elements import chain_taps, few_delays, nearest_m_of, spectrum_of, zones_of
+from ertis_numba.stages.plan_elements import (
+    chain_taps,
+    few_delays,
+    nearest_m_of,
+    ringing_db,
+    spectrum_of,
+    zones_of,
+)
 from ertis_numba.stages.planned_streams import PlannedStreams
 from ertis_numba.stages.sensitivity import Sensitivity
 from ertis_numba.stages.stream_plan import StreamPlanner
 from ertis_numba.stages.stream_recipe import recipe_of, uses_streams
-from ertis_numba.stages.time_window import time_window
+from ertis_numba.stages.time_window import TimeWindow, time_window
 from ertis_numba.waveform import matched_band_hz
 
 __all__ = ["MIN_STOPBAND_ATTENUATION_DB", "TABLE_BYTES", "Delays", "ImagePlan", "Nodes", "PlanModel", "plan_of"]
@@ -138,6 +145,7 @@ class PlanModel:
         self._zones = functools.cache(self._made_zones)
         self.nodes = functools.cache(self._made_nodes)
         self.filter = functools.cache(self._made_filter)
+        self._windows = functools.cache(self._made_window)
         self.streams = functools.cache(self._made_streams)
         recipe = recipe_of(settings.processing)
         self.has_streams = settings.processing.is_adaptive and recipe is not None
@@ -168,6 +176,7 @@ class PlanModel:
         if self.settings.processing.wavefront == "spherical":
             parts["zones"] = self.zone_error(plan.focal_zones)
         if not plan.delay_taps:
+            parts["arithmetic"] += self.errors.phases(self._n_bins(self._windows(plan.stopband_attenuation_db)))
             return parts
         delays = self.delays(plan.n_phases, plan.delay_taps)
         nodes = self.nodes(plan.beam_taps, plan.density) if plan.beam_taps else None
@@ -247,17 +256,19 @@ class PlanModel:
             )
             n_pairs = sum(each.grid.n_pairs for each in streams if each.grid)
         taps, _ = self.filter(plan.stopband_attenuation_db)
+        # Phase shifts take a transform per direction, so that its length matters.
+        window = self.window if plan.delay_taps else self._windows(plan.stopband_attenuation_db)
         tile = self._tile_ranges if plan.precision == "int16" else FEWEST_RANGES
         return Work(
             n_mics=self.n_mics,
             n_words=self._n_words,
-            n_samples=self.window.n_samples,
+            n_samples=window.n_samples,
             n_taps=len(taps),
             tap_bits=8 * taps.dtype.itemsize,
-            n_fft=self.window.n_fft,
-            n_bins=self._n_bins,
+            n_fft=window.n_fft,
+            n_bins=self._n_bins(window),
             n_phases=plan.n_phases,
-            n_outputs=self.window.n_outputs,
+            n_outputs=window.n_outputs,
             n_directions=self.n_directions,
             n_ranges=len(self.window.range_m),
             n_computed=tile * sum(-(-(stop - first) // tile) for first, stop, _ in self._zones(plan.focal_zones)),
@@ -368,10 +379,15 @@ class PlanModel:
             )
         return error
 
-    @functools.cached_property
-    def _n_bins(self) -> int:
+    def _n_bins(self, window: TimeWindow) -> int:
         low_hz, high_hz = matched_band_hz(self.settings)
-        return math.ceil((high_hz - low_hz) * self.window.n_fft / self.settings.signal_rate_hz)
+        return math.ceil((high_hz - low_hz) * window.n_fft / self.settings.signal_rate_hz)
+
+    def _made_window(self, stopband_attenuation_db: float) -> TimeWindow:
+        """Return the window of a plan, whose ringing depends on its stopband attenuation."""
+        accuracy = self.settings.accuracy.replace(stopband_attenuation_db=stopband_attenuation_db)
+        ringing = ringing_db(self.settings.replace(accuracy=accuracy))
+        return time_window(self.settings, largest_delay_s=self._reach_s(), n_taps=1, ringing_db=ringing)
 
     def _reach_s(self) -> float:
         positions_m = self.aperture.square_m2

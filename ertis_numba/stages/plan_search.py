@@ -3,7 +3,7 @@
 import itertools
 import math
 
-from ertis_numba.settings import MAX_FOCAL_ZONES, Accuracy
+from ertis_numba.settings import MAX_FOCAL_ZONES, Accuracy, Settings
 from ertis_numba.stages.beam_grid import FEWEST_RANGES
 from ertis_numba.stages.plan_model import MIN_STOPBAND_ATTENUATION_DB, ImagePlan, PlanModel
 from ertis_numba.stages.stream_plan import GRID_DENSITIES
@@ -53,14 +53,20 @@ def open_plans(model: PlanModel, budget: float) -> list[ImagePlan]:
         return plans + _open_streams(model, budget)
     return plans + [
         ImagePlan("float32", 1, 0, 0, given.beam_density or 2.0, stopband_attenuation_db, zones)
-        for stopband_attenuation_db in (_stop_bands_db(model, budget) if _may_be_shifted(given) else ())
+        for stopband_attenuation_db in (_stop_bands_db(model, budget) if _may_be_shifted(model.settings) else ())
     ]
 
 
-def _may_be_shifted(given: Accuracy) -> bool:
-    """Return True if phase shifts of spectra can keep the given parts of a plan."""
+def _may_be_shifted(settings: Settings) -> bool:
+    """Return True if phase shifts of spectra can keep the given parts of a plan, and may be the fastest.
+
+    With spherical wavefronts they are not, because each focal zone takes its own transforms.
+    """
+    given = settings.accuracy
+    if given.delay_taps is None and settings.processing.wavefront == "spherical":
+        return False
     is_direct = given.precision != "int16" and given.oversampling in {None, 1} and not given.beam_taps
-    return is_direct and given.delay_taps == 0
+    return is_direct and given.delay_taps in {None, 0}
 
 
 def _may_be_plain(given: Accuracy) -> bool:

@@ -101,6 +101,8 @@ def signal_model_of(
     covariance = _covariance(series, settings, n_phases * settings.output_rate_hz)
     noise = _noise(words, settings, kernels)
     level = max(undivided / _white_power(settings), 1e-30)
+    band_hz, shares = matched_noise_spectrum(settings, n_waves=WAVES)
+    bins_hz = np.linspace(0, settings.recording.sample_rate_hz / 2, len(noise))
     decimated = noise[: max(1, math.ceil(len(noise) / settings.decimation))]
     return SignalModel(
         shares=_shares(series, settings, n_phases * settings.output_rate_hz),
@@ -109,6 +111,7 @@ def signal_model_of(
         noise=noise,
         level=level,
         loudness=float(np.mean(decimated)) / level,
+        record_level=float(np.interp(band_hz, bins_hz, noise) @ shares) / level,
         covariance=covariance,
         places=np.square(np.quantile(_some(image), _QUANTILES), dtype=np.float64) / (image_power or 1.0),
     )

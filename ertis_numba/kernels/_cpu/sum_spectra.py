@@ -15,9 +15,23 @@ from ertis_numba.kernels._scalar import cosine_and_sine
 __all__ = ["sum_spectra"]
 
 _LANES = REGISTER_BYTES // 4
-_TURNED = 24  # vectors from one cosine to the next
+_TURNED = 48  # vectors from one cosine to the next; phases drift from the middle of them
 _MICS = 4  # microphones at a time
-_DIRECTIONS = 8  # directions per block, which share the work arrays
+_DIRECTIONS = 8  # directions per block, which share the work arrays; fewer in small images, so that all threads work
+
+
+@njit(nogil=True, cache=True)
+def _unfold(spectrum, first_bin, n_bins, parts):
+    """Fill the real and the imaginary parts of the bins of a folded spectrum, (k,) complex64."""
+    done = 0
+    while done < n_bins:
+        # This run of bins does not wrap around, so that the inner loop needs no modulo operation.
+        place = (first_bin + done) % len(spectrum)
+        run = min(n_bins - done, len(spectrum) - place)
+        real, imag, source = parts[0, done : done + run], parts[1, done : done + run], spectrum[place : place + run]
+        for b in range(run):
+            real[b], imag[b] = source[b].real, source[b].imag
+        done += run
 
 
 @njit(inline="always", cache=True)
@@ -46,25 +60,31 @@ def _begin(starts, steps, ahead, real, imag):
 
 
 @njit(nogil=True, cache=True)
-def _sum_bins(planes, phases, turns, first, stop, sums):
-    """Add all microphones to the bins of the vectors from ``first`` to ``stop``.
+def _sum_bins(planes, phases, turns, middle, count, step, sums):
+    """Add all microphones to the bins of ``count`` vectors, from ``middle`` on with a step of 1, or before it with −1.
 
-    ``planes`` is (mic, part, bin) and ``sums`` is (part, bin). ``phases``, (part, mic, lane), are those of the first
-    vector, and ``turns``, (part, mic), their change from vector to vector.
+    ``planes`` is (mic, part, bin) and ``sums`` is (part, bin). ``phases``, (part, mic, lane), are those of the vector
+    ``middle``, and ``turns``, (part, mic), their change to the next vector.
     """
     n_mics, _, width = planes.shape
-    lanes, stride = _LANES, 2 * width
+    lanes, stride, sign = _LANES, 2 * width, np.float32(step)
     for mic in range(0, n_mics, _MICS):
         place, other = mic * lanes, (n_mics + mic) * lanes
         a, b = load(phases, place, 1), load(phases, other, 1)
         c, d = load(phases, place + lanes, 1), load(phases, other + lanes, 1)
         e, f = load(phases, place + 2 * lanes, 1), load(phases, other + 2 * lanes, 1)
         g, h = load(phases, place + 3 * lanes, 1), load(phases, other + 3 * lanes, 1)
-        a_turn, b_turn = splat(planes, turns[0, mic], 1), splat(planes, turns[1, mic], 1)
-        c_turn, d_turn = splat(planes, turns[0, mic + 1], 1), splat(planes, turns[1, mic + 1], 1)
-        e_turn, f_turn = splat(planes, turns[0, mic + 2], 1), splat(planes, turns[1, mic + 2], 1)
-        g_turn, h_turn = splat(planes, turns[0, mic + 3], 1), splat(planes, turns[1, mic + 3], 1)
-        for vector in range(first, stop):
+        a_turn, b_turn = splat(planes, turns[0, mic], 1), splat(planes, sign * turns[1, mic], 1)
+        c_turn, d_turn = splat(planes, turns[0, mic + 1], 1), splat(planes, sign * turns[1, mic + 1], 1)
+        e_turn, f_turn = splat(planes, turns[0, mic + 2], 1), splat(planes, sign * turns[1, mic + 2], 1)
+        g_turn, h_turn = splat(planes, turns[0, mic + 3], 1), splat(planes, sign * turns[1, mic + 3], 1)
+        if step < 0:
+            a, b = _turned(a, b, a_turn, b_turn)
+            c, d = _turned(c, d, c_turn, d_turn)
+            e, f = _turned(e, f, e_turn, f_turn)
+            g, h = _turned(g, h, g_turn, h_turn)
+        for k in range(count):
+            vector = middle + k if step > 0 else middle - 1 - k
             at = vector * lanes
             x, y = load(sums, at, 1), load(sums, width + at, 1)
             at += mic * stride
@@ -86,7 +106,6 @@ def _fold(sums, first_bin, n_bins, out):
     out[:] = np.complex64(0)
     done = 0
     while done < n_bins:
-        # This run of bins does not wrap around, so that the inner loop needs no modulo operation.
         place = (first_bin + done) % len(out)
         run = min(n_bins - done, len(out) - place)
         real, imag, target = sums[0, done : done + run], sums[1, done : done + run], out[place : place + run]
@@ -102,21 +121,22 @@ def sum_spectra(spectra, starts, steps, first_bin, n_bins, out):
     n_vectors = (n_bins + _LANES - 1) // _LANES
     planes = np.zeros(((n_mics + _MICS - 1) // _MICS * _MICS, 2, n_vectors * _LANES), np.float32)
     for mic in prange(n_mics):
-        place = first_bin % spectra.shape[2]
-        for b in range(n_bins):
-            planes[mic, 0, b], planes[mic, 1, b] = spectra[mic, 0, place].real, spectra[mic, 0, place].imag
-            place = place + 1 if place + 1 < spectra.shape[2] else 0
-    for block in prange((n_directions + _DIRECTIONS - 1) // _DIRECTIONS):
+        _unfold(spectra[mic, 0], first_bin, n_bins, planes[mic])
+    at_a_time = min(_DIRECTIONS, max(1, n_directions // 16))
+    for block in prange((n_directions + at_a_time - 1) // at_a_time):
         # Microphones that only fill a group of four keep a spectrum and phases of 0.
         phases = np.zeros((2, planes.shape[0], _LANES), np.float32)
         turns = np.zeros((2, planes.shape[0]), np.float32)
         sums = np.empty(planes.shape[1:], np.float32)
-        for direction in range(block * _DIRECTIONS, min((block + 1) * _DIRECTIONS, n_directions)):
+        for direction in range(block * at_a_time, min((block + 1) * at_a_time, n_directions)):
             for mic in range(n_mics):
                 turn = np.uint64(steps[direction, mic]) * np.uint64(_LANES)
                 turns[0, mic], turns[1, mic] = cosine_and_sine(turn)
             sums[:] = np.float32(0)
             for first in range(0, n_vectors, _TURNED):
-                _begin(starts[direction], steps[direction], first * _LANES, phases[0], phases[1])
-                _sum_bins(planes, phases, turns, first, min(first + _TURNED, n_vectors), sums)
+                stop = min(first + _TURNED, n_vectors)
+                middle = (first + stop) // 2
+                _begin(starts[direction], steps[direction], middle * _LANES, phases[0], phases[1])
+                _sum_bins(planes, phases, turns, middle, stop - middle, 1, sums)
+                _sum_bins(planes, phases, turns, middle, middle - first, -1, sums)
             _fold(sums, first_bin, n_bins, out[direction, 0])
