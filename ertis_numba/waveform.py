@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.errors import ArgumentError
 from ertis_numba.settings import Call, Settings
+from ertis_numba.settings.fir_filters import FirFilters
 
 __all__ = [
     "MatchedFilterSpectrum",
@@ -140,12 +141,15 @@ class MatchedFilterSpectrum:
     first_bin : int
         Bin of the first value.
     values : (bin,) complex128
+    echo_power : (bin,) float64
+        Spectrum of the filtered call without its phase, in any unit.
     centre_hz : float
         Mean frequency of the filtered call, weighted by its power.
     """
 
     first_bin: int
     values: NDArray[np.complex128]
+    echo_power: NDArray[np.float64]
     centre_hz: float
 
 
@@ -162,19 +166,22 @@ def matched_guard_s(settings: Settings, *, down_db: float = 60.0) -> float:
     """Return the time in seconds that the matched filter rings, until its level has fallen by ``down_db``.
 
     It rings before and after the call. The edges of its band are raised cosines, whose transform falls with the third
-    power of time.
+    power of time. Own filters extend it by half of their length.
     """
     low_hz, high_hz = matched_band_hz(settings)
     narrowest_hz = min(settings.call.low_frequency_hz - low_hz, high_hz - settings.call.high_frequency_hz)
-    return 2 / narrowest_hz * max(1.0, 10 ** ((down_db - 60.0) / 60.0))
+    filters = settings.processing.filters(settings.signal_rate_hz)
+    own_s = 0.0 if filters is None else filters.half_length_s
+    return own_s + 2 / narrowest_hz * max(1.0, 10 ** ((down_db - 60.0) / 60.0))
 
 
 def matched_filter_spectrum(settings: Settings, *, n_fft: int, decimation: int | None = None) -> MatchedFilterSpectrum:
-    """Return the matched filter for spectra of ``n_fft`` points of decimated signals.
+    """Return the matched filter, with own filters, for spectra of ``n_fft`` points of decimated signals.
 
-    ``H(f) = g conj(S(f)) W(f)`` for positive frequencies and 0 for others, with S the spectrum of the call, W a
-    window that is 1 over the call's band and falls to 0 outside it as a raised cosine, and g such
-    that the call itself gives an analytic signal with an envelope of 1 at its peak.
+    ``H(f) = g conj(S(f)) W(f) F(f)`` for positive frequencies and 0 for others, with S the spectrum of the call, W a
+    window that is 1 over the call's band and falls to 0 outside it as a raised cosine, F the gain of own filters, and g
+    such that the call itself gives an analytic signal with an envelope of 1 at its peak, unless F distorts phases:
+    ``g Σ |S|² W |F| = n_fft``.
 
     Parameters
     ----------
@@ -192,12 +199,19 @@ def matched_filter_spectrum(settings: Settings, *, n_fft: int, decimation: int |
     """
     decimation = settings.decimation if decimation is None else decimation
     band_hz = matched_band_hz(settings)
-    return _matched_filter_spectrum(settings.call, settings.recording.sample_rate_hz, band_hz, n_fft, decimation)
+    rate_hz = settings.recording.sample_rate_hz
+    filters = settings.processing.filters(settings.signal_rate_hz)
+    return _matched_filter_spectrum(settings.call, rate_hz, band_hz, n_fft, decimation, filters)
 
 
 @functools.lru_cache(maxsize=_MAX_SPECTRA)
 def _matched_filter_spectrum(
-    call: Call, sample_rate_hz: float, band_hz: tuple[float, float], n_fft: int, decimation: int
+    call: Call,
+    sample_rate_hz: float,
+    band_hz: tuple[float, float],
+    n_fft: int,
+    decimation: int,
+    filters: FirFilters | None,
 ) -> MatchedFilterSpectrum:
     """Compute the matched filter. Spectra are cached, because a plan needs each several times."""
     spacing_hz = sample_rate_hz / decimation / n_fft
@@ -214,11 +228,19 @@ def _matched_filter_spectrum(
     )
     window = np.cos(math.pi / 2 * np.clip(outside, 0.0, 1.0)) ** 2
     power = np.abs(spectrum) ** 2 * window
-    values = np.conj(spectrum) * window * (n_fft / np.sum(power))
-    values.flags.writeable = False
+    if filters is None:
+        values = np.conj(spectrum) * window * (n_fft / np.sum(power))
+        echo_power = np.abs(values) ** 2
+    else:
+        own = filters.response(frequency_hz)
+        power *= np.abs(own)
+        values = np.conj(spectrum) * window * own * (n_fft / np.sum(power))
+        echo_power = np.abs(spectrum * window) ** 2 * np.abs(own)
+    values.flags.writeable = echo_power.flags.writeable = False
     return MatchedFilterSpectrum(
         first_bin=int(bins[0]),
         values=values,
+        echo_power=echo_power,
         centre_hz=float(np.sum(frequency_hz * power) / np.sum(power)),
     )
 

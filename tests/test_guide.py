@@ -131,7 +131,9 @@ def test_quickstart_page_runs(place):
 def test_own_array_page_runs(place):
     text = page("own-array")
     files = re.findall(r"`([\w.]+)`:\n\n```\w+\n(.*?)```", text, re.DOTALL)
-    assert [name for name, _ in files] == ["ring.csv", "ring8.toml", "mine.toml", "scene.toml", "pcm.toml", "call.toml"]
+    assert [name for name, _ in files] == [
+        *("ring.csv", "ring8.toml", "mine.toml", "filter.toml", "scene.toml", "pcm.toml", "call.toml")
+    ]
     for name, content in files:
         (place / name).write_text(content)
     numbers = np.random.default_rng(1).integers(-300, 300, (3_192, 8), dtype=np.int16)
@@ -143,7 +145,12 @@ def test_own_array_page_runs(place):
     assert len(open_recording(place / "words.h5")) == 2
     assert ertis_numba.load_layout(place / "ring8.toml").word_bits == 8
     assert (open_recording(place / "echoes.h5")[0].data == numbers[192:]).all()
-    (code,) = python_in(text)
+    filtering, code = python_in(text)
+    run_code_here(place, filtering)
+    taps = ertis_numba.Settings.load(place / "filter.toml").processing.pre_filter
+    gain = np.abs(np.fft.rfft(taps, 4500))  # in steps of 100 Hz
+    assert gain[390:411].max() < 0.01
+    assert gain[[300, 360, 440, 500]] == pytest.approx(1, abs=0.01)
     run_code_here(place, code)
     assert open_recording(place / "mine.h5")[0].data.dtype == "u4"
 

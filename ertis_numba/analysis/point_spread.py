@@ -55,7 +55,7 @@ class PointSpread:
         thinned = slice(None, None, max(1, math.floor(spacing_hz * n_fft / rate_hz)))
         bins = (matched.first_bin + np.arange(len(matched.values)))[thinned]
         wave_1_m = 2 * math.pi * bins * rate_hz / n_fft / self._speed_m_s
-        power = np.abs(matched.values[thinned]) ** 2
+        power = matched.echo_power[thinned]
         self._carrier_1_m = float(wave_1_m[len(wave_1_m) // 2])
         # Wave numbers are evenly spaced, so the sum is a Fourier transform, with a period of six times ``reach_m``.
         period_m = 2 * math.pi / float(wave_1_m[1] - wave_1_m[0]) if len(wave_1_m) > 1 else 8 * self.reach_m

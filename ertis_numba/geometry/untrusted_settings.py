@@ -45,10 +45,7 @@ def received_settings(text: bytes | str, source: str, *, are_applied: bool = Fal
             f"{source}: array.layout is {layout[:80]!r}, the name of a file; send its positions instead, or name one "
             f"of {', '.join(layout_names())}"
         )
-    if isinstance(settings.call.waveform, str):
-        raise SettingsError(
-            f"{source}: call.waveform is {settings.call.waveform[:80]!r}, the name of a file; send its samples instead"
-        )
+    _require_numbers(settings, source)
     try:
         count = None if are_applied else grid_count(directions)
     except ArgumentError as error:
@@ -59,3 +56,15 @@ def received_settings(text: bytes | str, source: str, *, are_applied: bool = Fal
             "2d:181"
         )
     return settings
+
+
+def _require_numbers(settings: Settings, source: str) -> None:
+    """Refuse names of files in place of samples and taps."""
+    processing = settings.processing
+    for name, value, wanted in (
+        ("call.waveform", settings.call.waveform, "samples"),
+        ("processing.pre_filter", processing.pre_filter, "taps"),
+        ("processing.post_filter", processing.post_filter, "taps"),
+    ):
+        if isinstance(value, str):
+            raise SettingsError(f"{source}: {name} is {value[:80]!r}, the name of a file; send its {wanted} instead")

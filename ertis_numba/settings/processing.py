@@ -1,15 +1,18 @@
 """Processing of a measurement into an energyscape."""
 
 import math
-from typing import Final, Literal, Self
+from pathlib import Path
+from typing import Any, Final, Literal, Self
 
 from ertis_numba import checks
 from ertis_numba.beamformers import BEAMFORMERS, WEIGHTINGS, BeamformerName, WeightingName
 from ertis_numba.constants import MAX_MICROPHONES, MAX_NAME_LENGTH
 from ertis_numba.documents import TomlTable
-from ertis_numba.errors import ArgumentError
+from ertis_numba.errors import ArgumentError, SettingsError
 from ertis_numba.settings.array_windows import parse_window
+from ertis_numba.settings.fir_filters import FirFilters, check_taps
 from ertis_numba.settings.presets import preset_tables
+from ertis_numba.settings.waveform import read_waveform
 
 __all__ = ["MAX_LISTED_DIRECTIONS", "STAGES", "Processing"]
 
@@ -74,6 +77,14 @@ class Processing(TomlTable, frozen=True, kw_only=True):
     clean_above_mean_db : float, optional, default None
         Smallest level above the mean amplitude over the directions of a range, 0 to 1000 dB; weaker amplitudes become
         0. Twice the mean is 6.02 dB. No such limit by default.
+    pre_filter, post_filter : str or list of float, default []
+        Taps of own FIR filters, 1 to 1024, or the name of a CSV or NPY file with them. ``pre_filter`` filters the
+        signals of the microphones, ``post_filter`` the beams, which only delay_and_sum has. Both are combined with the
+        matched filter and cost no time. Their delay of half of their length and their gain are compensated: the
+        amplitude of an echo stays the same unless they distort phases. They need the fast method.
+    filter_rate_hz : float, optional, default None
+        Sample rate for which the taps of both filters are designed, more than twice the call's highest frequency; by
+        default that of the signals, `Settings.signal_rate_hz`.
     last_stage : {"demodulation", "matched_filter", "beams", "envelope"}, default "envelope"
         Last step of processing. Each stage but ``envelope``, which yields images, yields signals: see
         `Pipeline.result` and ``docs/how-to/numpy.md``. ``beams`` needs the fast method and delay_and_sum.
@@ -100,6 +111,9 @@ class Processing(TomlTable, frozen=True, kw_only=True):
     array_weights: str | tuple[float, ...] = "uniform"
     clean_within_db: float | None = None
     clean_above_mean_db: float | None = None
+    pre_filter: str | tuple[float, ...] = ()
+    post_filter: str | tuple[float, ...] = ()
+    filter_rate_hz: float | None = None
     last_stage: Literal["demodulation", "matched_filter", "beams", "envelope"] = "envelope"
 
     @classmethod
@@ -187,6 +201,7 @@ class Processing(TomlTable, frozen=True, kw_only=True):
             )
         self._check_beamformer()
         self._check_array_weights()
+        self._check_filters()
         checks.choice("processing.last_stage", self.last_stage, STAGES)
         if self.last_stage == "beams":
             self.require_beams("processing.last_stage is 'beams'")
@@ -251,6 +266,68 @@ class Processing(TomlTable, frozen=True, kw_only=True):
                 f"processing.wavefront is 'spherical', which processing.beamformer {self.beamformer!r} does not "
                 "support; give 'plane', or another processing.beamformer"
             )
+
+    def _check_filters(self) -> None:
+        """Refuse filters that cannot be used, by themselves or with the method and the beamformer."""
+        if self.filter_rate_hz is not None:
+            checks.between("processing.filter_rate_hz", self.filter_rate_hz, 1.0, 1e9)
+        for name in ("pre_filter", "post_filter"):
+            taps = getattr(self, name)
+            if isinstance(taps, tuple):
+                check_taps(f"processing.{name}", taps)
+            if taps and self.method == "paper":
+                raise ArgumentError(
+                    f"processing.{name} is not supported by processing.method 'paper'; leave it out, or give method "
+                    "'fast'"
+                )
+        if self.post_filter and self.is_adaptive:
+            raise ArgumentError(
+                f"processing.post_filter filters beams, but {self._adaptive_part} combines signals to amplitudes; "
+                "leave it out, or give processing.beamformer 'delay_and_sum' and weighting 'none'"
+            )
+
+    def filters(self, signal_rate_hz: float) -> FirFilters | None:
+        """Return the own filters; None without any.
+
+        Parameters
+        ----------
+        signal_rate_hz : float
+            Rate of the taps unless ``filter_rate_hz`` is given.
+
+        Raises
+        ------
+        ArgumentError
+            The file of a filter has not been read.
+        """
+        taps: list[tuple[float, ...]] = []
+        for name in ("pre_filter", "post_filter"):
+            given = getattr(self, name)
+            if isinstance(given, str):
+                raise ArgumentError(
+                    f"processing.{name} is the file {given!r}, which has not been read; give its taps, or read the "
+                    "settings by Settings.load"
+                )
+            taps += [given] if given else []
+        return FirFilters(self.filter_rate_hz or signal_rate_hz, tuple(taps)) if taps else None
+
+    def resolve_paths(self, folder: Path) -> Self:
+        """Return processing whose directions are relative to a folder, with the taps of filters in files there.
+
+        Raises
+        ------
+        SettingsError
+            A file cannot be read, or its taps cannot be used.
+        """
+        changes: dict[str, Any] = {}
+        if isinstance(self.directions, str) and Path(self.directions).suffix.lower() == ".csv":
+            changes["directions"] = str(folder / self.directions)
+        for name in ("pre_filter", "post_filter"):
+            if isinstance(given := getattr(self, name), str):
+                changes[name], _ = read_waveform(folder / given, key=f"processing.{name}")
+        try:
+            return self.replace(**changes)
+        except ArgumentError as error:
+            raise SettingsError(f"{folder}: {error}") from error
 
     def require_image(self) -> None:
         """Refuse a last stage that yields no image.

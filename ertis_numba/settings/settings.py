@@ -1,7 +1,10 @@
 """Settings of one sensor: the content of a settings file."""
 
+import math
 from pathlib import Path
 from typing import Any, ClassVar, Self
+
+import numpy as np
 
 from ertis_numba.beamformers import BEAMFORMERS
 from ertis_numba.documents import TomlDocument
@@ -18,6 +21,8 @@ __all__ = ["Settings"]
 
 _MAX_OVERSAMPLING = 8  # A signal rate of more than 8 times the necessary one is probably a mistake.
 _MAX_BAND_EDGE_RATIO = 4  # relative to the highest frequency of the call
+_MIN_FILTER_GAIN = 1e-4  # Largest gain in the band, relative to the largest possible one: -80 dB.
+_BAND_STEPS = 256
 _MIN_BANDWIDTH_HZ = 100.0  # A narrower band-pass filter would ring for seconds.
 
 
@@ -92,6 +97,7 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
             )
         self._check_band()
         self._check_adaptive()
+        self._check_filters()
         step = self.processing.range_decimation
         if self.processing.decimation is None and self.decimation * _MAX_OVERSAMPLING < min(step, self._max_decimation):
             raise ArgumentError(
@@ -125,6 +131,27 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
                 f"only {nyquist_hz:g} Hz; give a lower edge or a smaller processing.decimation"
             )
 
+    def _check_filters(self) -> None:
+        """Refuse own filters whose rate is too low for the call, or that remove it."""
+        processing, high_hz = self.processing, self.call.high_frequency_hz
+        if isinstance(processing.pre_filter, str) or isinstance(processing.post_filter, str):
+            return  # Files are checked when they are read.
+        filters = processing.filters(self.signal_rate_hz)
+        if filters is None:
+            return
+        if filters.rate_hz <= 2 * high_hz:
+            raise ArgumentError(
+                f"processing.filter_rate_hz is {filters.rate_hz:g}; give more than twice the call's {high_hz:g} Hz"
+            )
+        gain = np.abs(filters.response(np.linspace(self.call.low_frequency_hz, high_hz, _BAND_STEPS)))
+        largest = math.prod(sum(map(abs, taps)) for taps in filters.taps)
+        if gain.max() < _MIN_FILTER_GAIN * largest:
+            raise ArgumentError(
+                "processing.pre_filter and post_filter remove the band of the call, "
+                f"{self.call.low_frequency_hz:g} to {high_hz:g} Hz; give filters that pass it, or another "
+                "processing.filter_rate_hz"
+            )
+
     def _check_adaptive(self) -> None:
         """Refuse plans that an adaptive beamformer does not support."""
         processing, accuracy = self.processing, self.accuracy
@@ -155,7 +182,8 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
         Parameters
         ----------
         path : str or Path
-            TOML file. Names of files in it, of layouts, waveforms and directions, are relative to its folder.
+            TOML file. Names of files in it, of layouts, waveforms, filters and directions, are relative to its
+            folder.
 
         Returns
         -------
@@ -222,17 +250,16 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
             raise SettingsError(f"{path}: {error}") from error
 
     def resolve_paths(self, folder: Path) -> Self:
-        """Return settings whose files, of layout, directions and waveform, are relative to a folder.
+        """Return settings whose files, of layout, directions, waveform and filters, are relative to a folder.
 
-        The waveform is read, because other settings depend on its band.
+        Waveform and filters are read, because other settings depend on them.
         """
         array, processing = self.array, self.processing
         if array.positions_m is None and Path(array.layout).suffix.lower() in {".csv", ".toml"}:
             array = array.replace(layout=str(folder / array.layout))
-        directions = processing.directions
-        if isinstance(directions, str) and Path(directions).suffix.lower() == ".csv":
-            processing = processing.replace(directions=str(folder / directions))
-        return self.replace(array=array, processing=processing, call=self.call.resolve_paths(folder))
+        return self.replace(
+            array=array, processing=processing.resolve_paths(folder), call=self.call.resolve_paths(folder)
+        )
 
     @classmethod
     def from_preset(cls, name: str, **sections: Any) -> Self:

@@ -24,13 +24,15 @@ _BAND_THRESHOLD = 0.1  # relative to the maximum of the spectrum
 _BAND_STEP_HZ = 100.0  # step of the edges, so that they do not depend on rounding in the transform
 
 
-def read_waveform(path: Path) -> tuple[tuple[float, ...], float | None]:
+def read_waveform(path: Path, *, key: str = "call.waveform") -> tuple[tuple[float, ...], float | None]:
     """Return the samples in a file, and their rate if the file contains it.
 
     Parameters
     ----------
     path : Path
         WAV of one channel, CSV with one number per line or cell, or NPY with a one-dimensional array.
+    key : str
+        Name of the setting in errors.
 
     Raises
     ------
@@ -39,25 +41,25 @@ def read_waveform(path: Path) -> tuple[tuple[float, ...], float | None]:
     """
     suffix = path.suffix.lower()
     if suffix not in WAVEFORM_FILES:
-        raise SettingsError(f"call.waveform is {str(path)!r}; give a .wav, .csv or .npy file, or a list of samples")
+        raise SettingsError(f"{key} is {str(path)!r}; give a .wav, .csv or .npy file, or a list of samples")
     try:
         if not path.is_file():
-            raise SettingsError(f"call.waveform {path}: no such file; give the name of a .wav, .csv or .npy file")
+            raise SettingsError(f"{key} {path}: no such file; give the name of a .wav, .csv or .npy file")
         n_bytes = path.stat().st_size
         if n_bytes > _MAX_FILE_BYTES:
-            raise SettingsError(f"call.waveform {path} has {n_bytes} bytes; the limit is {_MAX_FILE_BYTES}")
+            raise SettingsError(f"{key} {path} has {n_bytes} bytes; the limit is {_MAX_FILE_BYTES}")
         rate_hz, values = read_wav(path) if suffix == ".wav" else (None, _read_numbers(path, suffix))
     except (OSError, ValueError, DataError) as error:
         if isinstance(error, SettingsError):
             raise
-        raise SettingsError(f"call.waveform {path} cannot be read ({error}); save it again") from error
+        raise SettingsError(f"{key} {path} cannot be read ({error}); save it again") from error
     if values.ndim > 1 and suffix == ".csv" and 1 in values.shape:
         values = values.reshape(-1)
     if values.ndim > 1 and values.shape[1] == 1:
         values = values[:, 0]
     if values.ndim != 1 or values.dtype.kind not in "iuf":
         raise SettingsError(
-            f"call.waveform {path} contains {values.dtype} of shape {values.shape}; give one channel of real numbers"
+            f"{key} {path} contains {values.dtype} of shape {values.shape}; give one channel of real numbers"
         )
     # Unsigned bytes are the only WAV samples whose silence is not 0.
     middle = 128.0 if suffix == ".wav" and values.dtype == np.uint8 else 0.0

@@ -72,5 +72,5 @@ def band(settings: Settings) -> tuple[Floats, Floats]:
     frequency_hz = (mine.first_bin + np.arange(len(mine.values))) * rate_hz / n_fft
     edges = np.linspace(*matched_band_hz(settings), N_NODES + 1)
     # The image sums S H; between the edges of its window H is conj(S).
-    power, _ = np.histogram(frequency_hz, edges, weights=np.abs(mine.values) ** 2)
+    power, _ = np.histogram(frequency_hz, edges, weights=mine.echo_power)
     return (edges[:-1] + edges[1:]) / 2, power / power.sum()

@@ -36,8 +36,15 @@ _SHORT_TAPS_DB = 65.0  # Rounding taps to 16 bits limits the stopband attenuatio
 
 def spectrum_of(settings: Settings) -> Spectrum:
     """Return the power spectrum of the matched filter's output for white input."""
-    step, edges_hz = settings.decimation, settings.processing.band_edges_hz
-    processing = Processing(range_decimation=step, decimation=step, band_edges_hz=edges_hz)
+    step, given = settings.decimation, settings.processing
+    processing = Processing(
+        range_decimation=step,
+        decimation=step,
+        band_edges_hz=given.band_edges_hz,
+        pre_filter=given.pre_filter,
+        post_filter=given.post_filter,
+        filter_rate_hz=given.filter_rate_hz,
+    )
     recording = Recording(sample_rate_hz=settings.recording.sample_rate_hz)
     return _spectrum_of(Settings(call=settings.call, recording=recording, processing=processing))
 

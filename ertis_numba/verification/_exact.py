@@ -158,7 +158,9 @@ def _transform_length(settings: Settings) -> int:
     call, (low_hz, high_hz) = settings.call, matched_band_hz(settings)
     edge_hz = min(call.low_frequency_hz - low_hz, high_hz - call.high_frequency_hz)
     rate_hz, step = settings.recording.sample_rate_hz, settings.processing.range_decimation
-    needed = settings.recording.n_samples + math.ceil((call.duration_s + _RINGING / edge_hz) * rate_hz)
+    processing = settings.processing
+    own_s = (len(processing.pre_filter) + len(processing.post_filter)) / call.high_frequency_hz
+    needed = settings.recording.n_samples + math.ceil((call.duration_s + _RINGING / edge_hz + own_s) * rate_hz)
     return step * int(scipy.fft.next_fast_len(-(-needed // step)))
 
 
@@ -173,7 +175,20 @@ def _matched_response(settings: Settings, n_fft: int) -> tuple[NDArray[np.int64]
     bins = np.flatnonzero(window)
     emitted = scipy.fft.rfft(call_samples(call, rate_hz=rate_hz), n_fft)[bins]
     response = np.conj(emitted) * window[bins]
-    return bins, response / np.sum(emitted * response).real
+    own = _own_response(settings, frequency_hz[bins])
+    return bins, response * own / np.sum(np.abs(emitted * response * own))
+
+
+def _own_response(settings: Settings, frequency_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
+    """Return the gain of own filters without their delay of half of their length: (bin,) complex128."""
+    processing = settings.processing
+    rate_hz = processing.filter_rate_hz or settings.signal_rate_hz
+    gain: NDArray[np.complex128] = np.ones(len(frequency_hz), dtype=np.complex128)
+    for taps in (processing.pre_filter, processing.post_filter):
+        if taps:
+            gain *= scipy.signal.freqz(taps, worN=frequency_hz, fs=rate_hz)[1]
+            gain *= np.exp(1j * math.pi * frequency_hz * (len(taps) - 1) / rate_hz)
+    return gain
 
 
 def _signal(words: NDArray[Any], channel: int, settings: Settings) -> NDArray[np.float64]:
