@@ -31,6 +31,7 @@ ELSEWHERE = {
         "presets",
         "record",
         "ros",
+        "rtisdev",
         "serve",
         "settings",
         "status",

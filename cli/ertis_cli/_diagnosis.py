@@ -27,6 +27,7 @@ _EXTRAS: Final = {
     "cluster": ("distributed",),
     "metrics": ("prometheus_client",),
     "ros": ("cyclonedds", "mcap", "mcap_ros2"),
+    "rtisdev": ("rtisdev",),
     "view": ("viser", "websockets"),
     "xarray": ("xarray",),
 }

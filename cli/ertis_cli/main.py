@@ -40,6 +40,7 @@ COMMANDS = {
     "record": ("ertis_cli.record:record", "Run a central node that stores measurements."),
     "recover": ("ertis_cli.recover:recover", "Recover recordings from journals left by a crash."),
     "ros": ("ertis_cli.ros:ros", "Publish images and points as live ROS 2 topics."),
+    "rtisdev": ("ertis_cli.rtisdev:rtisdev", "Run a script for RTIS Dev."),
     "serve": ("ertis_cli.serve:serve", "Run a central node that computes and publishes images."),
     "settings": ("ertis_cli.settings:settings", "Print every key of a settings, scene, layout or mounting file."),
     "simulate": ("ertis_cli.simulate:simulate", "Simulate a scene and write a recording."),

@@ -171,16 +171,15 @@ def combine_delayed(
         out[direction] = combined
 
 
-def sum_delayed_int16(signals: Short, delays: Index, first: int, out: Short) -> None:
+def sum_delayed_int16(tiles: Short, units: Real, delays: Index, out: Real) -> None:
     """Sum the delayed 16-bit signals of all microphones for every direction and sample."""
-    mics = np.arange(len(signals))[:, None]
+    mics, size = np.arange(tiles.shape[1])[:, None], out.shape[1] // len(tiles)
     for direction, delay in enumerate(delays):
-        np.sum(
-            signals[mics, first + delay[:, None] + np.arange(out.shape[1])], axis=0, dtype=np.int16, out=out[direction]
-        )
+        delayed = tiles[:, mics, delay[:, None] + np.arange(size)]
+        out[direction] = (units[:, None] * delayed.sum(axis=1)).reshape(-1)
 
 
-def rectify_and_decimate(beams: Real | Short, taps: Short, scale: float, factor: int, first: int, out: Real) -> None:
+def rectify_and_decimate(beams: Real, taps: Short, scale: float, factor: int, first: int, out: Real) -> None:
     """Rectify real beams, filter them, and keep every factor-th sample."""
     windows = np.lib.stride_tricks.sliding_window_view(np.abs(beams[:, first:]), len(taps), axis=1)
     out[:] = scale * (windows[: len(out), : (out.shape[1] - 1) * factor + 1 : factor] @ taps.astype(np.float64))

@@ -34,6 +34,7 @@ _MAX_TRIES = 10  # Tries per signal. Only signals that reach a running process c
 _UNDISTURBED_S = 4.0
 _TIMEOUT_S = 30.0
 _FAULTS = ("late", "codes", "tracebacks")
+_WAITING = {"status"}  # Commands that wait for an answer, and fail after some seconds without one.
 _UNCAUGHT = re.compile(r"Traceback|Error:|Exception|Fatal|Assertion")
 
 COMMANDS: Final[dict[str, Sequence[str]]] = {
@@ -59,6 +60,7 @@ COMMANDS: Final[dict[str, Sequence[str]]] = {
     "record": ("--listen", "tcp://127.0.0.1:0", "-o", "{out}/recordings"),
     "recover": ("{out}/crashed",),
     "ros": ("{recording}", "--duration", "2"),
+    "rtisdev": ("{script}",),
     "serve": ("--listen", "tcp://127.0.0.1:0", "--publish", "tcp://127.0.0.1:0", "--record", "{out}/recordings"),
     "settings": ("scene",),
     "simulate": ("{scene}", "-o", "{out}/simulated.h5"),
@@ -120,6 +122,8 @@ def _default_signals() -> Iterator[None]:
 def _files(folder: Path, source: Path) -> dict[str, str]:
     """Create the files that commands read, and return the names by which `COMMANDS` refers to them."""
     raw, images, crashed = folder / "raw.bin", folder / "images.h5", folder / "crashed"
+    script = folder / "script.py"
+    script.write_text("import rtisdev\nrtisdev.open_connection('/dev/no-such-port', allowDebugMode=True)\n")
     with open_recording(source) as recording:
         measurement = recording[0]
         raw.write_bytes(measurement.data.tobytes())
@@ -130,20 +134,23 @@ def _files(folder: Path, source: Path) -> dict[str, str]:
             journal.append([JournalEntry(measurement, monotonic_ns=0)])
             shutil.copytree(made, crashed)  # The copy equals the files of a killed process.
         with Pipeline(measurement.settings) as pipeline:
-            write_energyscapes(images, [pipeline.process(measurement)])
+            write_energyscapes(images, [pipeline.process(measurement)], recording=recording)
     return {
         "recording": str(source),
         "scene": str(_SCENE),
         "raw": str(raw),
         "images": str(images),
         "crashed": str(crashed),
+        "script": str(script),
     }
 
 
 def _to_command(
     command: str, paths: dict[str, str], out: Path, rng: random.Random, count: int, begins_s: float
 ) -> dict[str, Any]:
-    lasts_s, _, _, _ = _run_command(command, paths, out, None, _UNDISTURBED_S)
+    lasts_s, killed_s, code, errors = _run_command(command, paths, out, None, _UNDISTURBED_S)
+    if not killed_s and code and command not in _WAITING:
+        raise RuntimeError(f"'ertis {command}' fails by itself, so that no signal can interrupt it: {errors.strip()}")
     found: dict[str, Any] = {"signals": 0, **dict.fromkeys(_FAULTS, 0), "slowest_s": 0.0}
     examples: Counter[str] = Counter()
     for _ in range(_MAX_TRIES * count):

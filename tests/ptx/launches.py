@@ -81,9 +81,7 @@ def _each(kernels):
     sums = np.zeros((90, 400), np.float32)
     kernels.combine_delayed(signals, signals, offsets, 5, 1, 0, sums)
     kernels.rectify_and_decimate(sums, np.zeros(61, np.int16), 0.5, 10, 0, np.zeros((90, 30), np.float32))
-    short_sums = np.zeros(sums.shape, np.int16)
-    kernels.sum_delayed_int16(np.zeros(signals.shape, np.int16), offsets, 0, short_sums)
-    kernels.rectify_and_decimate(short_sums, np.zeros(61, np.int16), 0.5, 10, 0, np.zeros((90, 30), np.float32))
+    kernels.sum_delayed_int16(np.zeros((4, 8, 200), np.int16), np.zeros(4, np.float32), offsets, sums)
     double, octets = np.zeros((32, 500)), np.arange(32, dtype=np.int32).reshape(4, 8)
     kernels.add_paths(
         np.zeros((1, 251), np.complex128),

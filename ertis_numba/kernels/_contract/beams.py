@@ -233,31 +233,34 @@ class CombineDelayed(Protocol):
 class SumDelayedInt16(Protocol):
     """Sum the delayed 16-bit signals of all microphones for every direction and sample.
 
-    ``out[direction, n] = Σ_mic signals[mic, first + delays[direction, mic] + n]``. The sums fit into 16 bits.
+    ``out[direction, tile · size + n] = units[tile] · Σ_mic tiles[tile, mic, delays[direction, mic] + n]`` for n below
+    ``size``, the number of samples of a tile: that of ``out``, divided by the number of tiles. The sums fit into 16
+    bits.
 
     Parameters
     ----------
-    signals : (mic, sample) int16
+    tiles : (tile, mic, sample) int16
+        A tile has more samples than ``size``, because signals are delayed.
+    units : (tile,) float32
     delays : (direction, mic) int32
-    first : int
-    out : (direction, n) int16
+    out : (direction, sample) float32
     """
 
-    def __call__(self, signals: Short, delays: Index, first: int, out: Short) -> None: ...
+    def __call__(self, tiles: Short, units: Real, delays: Index, out: Real) -> None: ...
 
 
 class RectifyAndDecimate(Protocol):
     """Rectify real beams, filter them, and keep every factor-th sample.
 
     ``out[direction, r] = scale · Σ_t taps[t] · |beams[direction, first + r · factor + t]|``. The CPU rounds magnitudes
-    of float32 to 15 bits of the largest one in 8192 samples.
+    to 15 bits of the largest one in 2048 samples.
 
     Parameters
     ----------
-    beams : (direction, sample) float32 or int16
-        No number is -32,768.
+    beams : (direction, sample) float32
     taps : (tap,) int16
-        The sum of their magnitudes is at most 65,535, so that sums of products fit into 32 bits.
+        Their pairs have four classes: the number of a pair modulo 4. In each, the sum of the magnitudes is at most
+        65,535, so that sums of products fit into 32 bits on every processor.
     scale : float
     factor, first : int
     out : (direction, r) float32

@@ -12,7 +12,7 @@ from numba.core import cgutils
 
 from ertis_numba.kernels._cpu.features import INSTRUCTION_SET, passes, vectors_per_pass
 
-__all__ = ["FLOATS", "INT32", "LANES", "PAIRS", "RANGES", "SHORTS", "SUMS", "TOTALS", "Dot16", "add_products"]
+__all__ = ["FLOAT", "FLOATS", "INT32", "LANES", "PAIRS", "RANGES", "SHORTS", "SUMS", "TOTALS", "Dot16", "add_products"]
 
 RANGES = 96  # of one tile, on every processor and device, because the samples of a tile share a scale
 LANES = INSTRUCTION_SET.lanes  # pairs in a vector

@@ -1,0 +1,55 @@
+"""``ertis rtisdev``: run an unchanged script for RTIS Dev."""
+
+import os
+import runpy
+import signal
+import sys
+from pathlib import Path
+
+import click
+
+from ertis_cli import options
+
+__all__ = ["rtisdev"]
+
+
+@click.command(context_settings={"ignore_unknown_options": True, "allow_interspersed_args": False})
+@click.option(
+    "--port",
+    metavar="NAME",
+    help="Port to open instead of the one in the script, such as an emulated sensor.",
+)
+@options.device
+@click.argument("script", type=click.Path(path_type=Path, exists=True, dir_okay=False), metavar="SCRIPT.py")
+@click.argument("arguments", nargs=-1, type=click.UNPROCESSED, metavar="ARGS...")
+def rtisdev(*, port: str | None, device: str, script: Path, arguments: tuple[str, ...]) -> None:
+    """Run a script for RTIS Dev.
+
+    The script runs unchanged. The functions of the closed modules rtisserial and rtiscuda are those of
+    ertis_numba.rtisdev, which need no GPU. The command needs the extra 'rtisdev'.
+    """
+    from ertis_numba.extras import extra
+
+    if port is not None:
+        os.environ["ERTIS_RTISDEV_PORT"] = port
+    os.environ["ERTIS_RTISDEV_DEVICE"] = device
+    with extra("rtisdev", "scripts for RTIS Dev need rtisdev"):
+        _require("rtisdev")
+    import ertis_numba.rtisdev  # noqa: F401  puts our modules in the place of the closed ones
+
+    # The script may handle signals itself, or catch KeyboardInterrupt and continue.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    for name in ("SIGTERM", "SIGHUP"):
+        if hasattr(signal, name) and signal.getsignal(getattr(signal, name)) is not signal.SIG_IGN:
+            signal.signal(getattr(signal, name), signal.SIG_DFL)
+    sys.argv = [str(script), *arguments]
+    sys.path.insert(0, str(script.resolve().parent))
+    runpy.run_path(str(script), run_name="__main__")
+
+
+def _require(module: str) -> None:
+    """Raise ImportError if a module is not installed; it is not imported."""
+    import importlib.util
+
+    if importlib.util.find_spec(module) is None:
+        raise ImportError(f"No module named {module!r}", name=module)

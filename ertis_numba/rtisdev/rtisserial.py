@@ -1,0 +1,136 @@
+"""Serial port of an eRTIS, with the functions of the closed module ``rtisserial``.
+
+There is one connection per process, as in the original.
+"""
+
+import errno
+import logging
+import os
+import time
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.devices.line import SerialLine
+from ertis_numba.devices.ports import resolve
+from ertis_numba.errors import SonarError
+
+__all__ = ["close", "command", "connect", "flush", "getdata"]
+
+_ANSWER_BYTES: Final = 4
+_ANSWER_S: Final = 2.0
+
+_log = logging.getLogger("ertis_numba")
+_line: SerialLine | None = None
+
+
+def connect(port: str, baud: int) -> None:  # noqa: ARG001  USB ignores the rate
+    """Open a serial port, and close the one that was open.
+
+    Parameters
+    ----------
+    port : str
+        Path, link, serial number, or name of an emulated device; the variable ERTIS_RTISDEV_PORT overrides it.
+    baud : int
+        Ignored, because USB has no rate.
+
+    Raises
+    ------
+    ConnectionRefusedError
+        Another program uses the port.
+    ConnectionError
+        The port does not exist, or may not be used.
+    """
+    global _line  # noqa: PLW0603  one connection per process
+    if _line is not None:
+        close()
+    name = os.environ.get("ERTIS_RTISDEV_PORT") or port
+    try:
+        _line = SerialLine(resolve(name).path, stop=lambda: False)
+    except SonarError as error:
+        _log.error("%s", error)
+        kind = ConnectionRefusedError if error.errno == errno.EBUSY else ConnectionError
+        raise kind(str(error)) from error
+
+
+def command(text: str, wants_answer: bool) -> int | None:  # noqa: FBT001  as the original has it
+    """Send a command, which ends with a new line, and return its answer, a number, or None if none is wanted.
+
+    Raises
+    ------
+    ConnectionRefusedError
+        No port is open.
+    TimeoutError
+        No answer came.
+    """
+    line = _connected()
+    line.send(text.encode())
+    if not wants_answer:
+        return None
+    return int.from_bytes(_received(line, _ANSWER_BYTES, within_s=_ANSWER_S, what=repr(text)), "little")
+
+
+def getdata(n_bytes: int) -> NDArray[np.uint8]:
+    """Return ``n_bytes`` bytes as soon as they have arrived, (byte,) uint8.
+
+    Raises
+    ------
+    ConnectionRefusedError
+        No port is open.
+    ConnectionError
+        The device was unplugged.
+    """
+    return np.frombuffer(_received(_connected(), n_bytes, within_s=None, what="a measurement"), np.uint8)
+
+
+def flush() -> None:
+    """Drop received bytes.
+
+    Raises
+    ------
+    ConnectionRefusedError
+        No port is open.
+    ConnectionError
+        The device was unplugged.
+    """
+    line = _connected()
+    try:
+        while waiting := line.waiting:
+            line.receive(waiting)
+    except SonarError as error:
+        raise ConnectionError(str(error)) from error
+
+
+def close() -> None:
+    """Close the port.
+
+    Raises
+    ------
+    ConnectionRefusedError
+        No port is open.
+    """
+    global _line  # noqa: PLW0603  one connection per process
+    _connected().close()
+    _line = None
+
+
+def _connected() -> SerialLine:
+    if _line is None:
+        text = "no sensor is connected; call rtisdev.open_connection first"
+        _log.error("%s", text)
+        raise ConnectionRefusedError(text)
+    return _line
+
+
+def _received(line: SerialLine, n_bytes: int, *, within_s: float | None, what: str) -> bytes:
+    """Return bytes; raise TimeoutError if they do not arrive in time."""
+    data, latest_s = bytearray(), None if within_s is None else time.monotonic() + within_s
+    try:
+        while len(data) < n_bytes:
+            data += line.receive(n_bytes - len(data))[0]
+            if latest_s is not None and time.monotonic() > latest_s and len(data) < n_bytes:
+                raise TimeoutError(f"{line.path} did not answer {what} within {within_s:g} s; is it an eRTIS?")
+    except SonarError as error:
+        raise ConnectionError(str(error)) from error
+    return bytes(data)

@@ -1,0 +1,384 @@
+"""RTIS Dev with our modules in the place of its closed ones: its own tests, its presets, and its errors."""
+
+import copy
+import logging
+import os
+import re
+import subprocess
+import sys
+import threading
+from contextlib import contextmanager
+from importlib.metadata import distribution
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from ertis_cli.main import cli
+from scipy.ndimage import maximum_filter1d
+
+import ertis_numba.rtisdev
+from ertis_numba.errors import ArgumentError
+from ertis_numba.rtisdev import rtiscuda, rtisserial
+from ertis_numba.simulation import Point, Scene
+from ertis_numba.simulation.render import render
+from tests import rtisdev_reference
+from tests.journals import ENVIRONMENT
+
+rtisdev = pytest.importorskip("rtisdev")
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
+
+ROOT = Path(__file__).parents[1]
+SCENE = ROOT / "data" / "synthetic" / "scenes" / "two_facing_sensors.toml"
+TIMEOUT_S = 200.0
+WIDE = ["3D_5m_1000", "3D_5m_3000", "3D_5m_4000", "3D_10m_3000"]
+MAX_ERROR_DB = -60
+N_COMBINED = 26  # ranges before and after a range whose sound contributes to it, half of 512 taps
+
+
+def own_tests():
+    """Folder with the tests of the package."""
+    return Path(distribution("rtisdev").locate_file("tests"))
+
+
+@pytest.fixture(autouse=True)
+def without_a_sensor():
+    """Let the package use its stored measurement, and forget all settings after the test."""
+    quiet = logging.getLogger("quiet")
+    quiet.setLevel(logging.CRITICAL + 1)
+    rtisdev.set_custom_logger(quiet)
+    rtisdev.open_connection("/dev/no-such-port", allowDebugMode=True)
+    yield
+    rtisdev.clear_current_settings()
+    rtiscuda.unloadall()
+
+
+def prepared(name="test", *, recording="default_25_50", **processing):
+    """Settings of the package under a name."""
+    rtisdev.set_recording_settings(premade=recording, configName=name)
+    rtisdev.set_processing_settings(configName=name, **processing)
+    return rtisdev.get_current_settings(configName=name)
+
+
+def measured(settings):
+    """Raw measurement of the length that the settings say."""
+    measurement = rtisdev.get_raw_measurement(behaviour=False, configName=settings.configName)
+    measurement.rawData = np.resize(measurement.rawData, settings.microphoneSamples)
+    return measurement
+
+
+def error_db(got, wanted):
+    assert got.dtype == np.float32
+    assert got.shape == wanted.shape
+    return 10 * np.log10(np.mean((got - wanted) ** 2) / np.mean(wanted**2))
+
+
+def compare(settings):
+    """Compare the result of a measurement with that of the reference.
+
+    Cleaning may decide either way for amplitudes that differ from their limit by less than -60 dB of the loudest sound
+    at the ranges that the envelope's filter combines.
+    """
+    measurement = measured(settings)
+    got = rtisdev.process_measurement(measurement, configName=settings.configName).processedData
+    uncleaned = copy.copy(settings)
+    uncleaned.cleanEnable = False
+    wanted = rtisdev_reference.processed(uncleaned, measurement.rawData)
+    if settings.cleanEnable:
+        limit = rtisdev_reference.limits(settings, wanted)
+        loudest = maximum_filter1d(wanted.max(axis=0), 2 * N_COMBINED + 1)
+        certain = np.abs(wanted - limit) > 10 ** (MAX_ERROR_DB / 20) * loudest
+        assert np.mean(certain) > 0.95
+        kept = wanted > limit
+        # The fifth root of a sample near 0 turns an error of 1e-7 into one of 4 %, which is rare.
+        rare = 1e-4 if settings.dmasOrder > 1 else 0.0
+        assert np.mean((got[certain] != 0) != kept[certain]) <= rare
+        wanted = np.where(got != 0, wanted, 0.0)
+    assert error_db(got, wanted) <= MAX_ERROR_DB
+    assert np.argmax(np.abs(got)) == np.argmax(np.abs(wanted))
+
+
+def test_all_presets_are_tested():
+    """Presets with many directions are compared without cleaning, and in some directions only."""
+    presets = set(rtisdev.get_premade_processing_settings_list())
+    assert presets == {"2D_5m_91", "2D_5m_181", "3D_5m_500", "custom_example_2D_5m_91", *WIDE}
+
+
+@pytest.mark.parametrize("preset", ["2D_5m_91", "2D_5m_181", "3D_5m_500"])
+def test_presets_equal_the_reference(preset):
+    compare(prepared(premade=preset))
+
+
+def test_preset_with_its_own_delays_and_ranges_equals_the_reference():
+    folder = Path(rtisdev.__file__).parent / "config" / "premadeSettings" / "processing"
+    compare(prepared(jsonPath=str(folder / "custom_example_2D_5m_91.json")))
+    compare(prepared(customPath=str(folder)))
+
+
+@pytest.mark.parametrize("preset", WIDE)
+def test_wide_presets_equal_the_reference(preset):
+    settings = prepared(
+        recording="long_25_50" if "10m" in preset else "default_25_50", premade=preset, cleanEnable=False
+    )
+    measurement = measured(settings)
+    got = rtisdev.process_measurement(measurement, configName="test").processedData
+    assert got.shape == (settings.nDirections, settings.nspses)
+    some = np.arange(3, settings.nDirections, settings.nDirections // 40)
+    settings.delayMatrix, settings.nDirections = settings.delayMatrix[:, some], len(some)
+    wanted = rtisdev_reference.processed(settings, measurement.rawData)
+    assert error_db(got[some], wanted) <= MAX_ERROR_DB
+    assert np.array_equal(got[some].argmax(axis=1), wanted.argmax(axis=1))
+
+
+@pytest.mark.parametrize("coherent", [False, True])
+@pytest.mark.parametrize("order", range(6))
+def test_beamformers_equal_the_reference(order, coherent):
+    compare(prepared(directions=91, dmasOrder=order, cfEnable=coherent))
+
+
+BANDS = {
+    "preFilter": np.hanning(65).astype(np.float32) / 32,
+    "postFilter": (np.hanning(64) * np.cos(0.5 * np.arange(64))).astype(np.float32) / 16,
+}
+
+
+@pytest.mark.parametrize(
+    "stages",
+    [
+        {"matchedFilterEnable": False, "beamformingEnable": False, "enveloppeEnable": False, "cleanEnable": False},
+        {"beamformingEnable": False, "enveloppeEnable": False, "cleanEnable": False},
+        {"enveloppeEnable": False, "cleanEnable": False},
+        {"matchedFilterEnable": False},
+        {"microphoneLayout": "eRTIS_v3D1REC"},
+        {"preFilter": BANDS["preFilter"], "preFilterEnable": True},
+        {"postFilter": BANDS["postFilter"], "postFilterEnable": True},
+        {**BANDS, "preFilterEnable": True, "postFilterEnable": True, "dmasOrder": 3},
+    ],
+    ids="-".join,
+)
+def test_stages_equal_the_reference(stages):
+    compare(prepared(directions=31, **stages))
+
+
+def test_earlier_results_are_processed_further():
+    """Signals, or beams, of an earlier call give the same image as all stages at once."""
+    off = {"beamformingEnable": False, "enveloppeEnable": False, "cleanEnable": False}
+    whole, signals = prepared("whole", directions=31), prepared("signals", directions=31, **off)
+    rest = prepared("rest", directions=31, pdmEnable=False, matchedFilterEnable=False)
+    raw = measured(whole)
+    wanted = rtiscuda.processing(raw.rawData, 1, 31, whole.nspses, "whole")
+    half = rtiscuda.processing(raw.rawData, 1, 32, signals.nspsls, "signals")
+    assert np.allclose(rtiscuda.processing(half, 0, 31, rest.nspses, "rest"), wanted, rtol=1e-3)
+    before = half.copy()
+    rtiscuda.processing(half, 0, 31, rest.nspses, "rest")
+    assert np.array_equal(half, before)
+
+
+def test_reflectors_are_found_where_they_are():
+    """This tests the delays, the matched filter and the ranges against the simulator, not against the reference."""
+    places = [(1.0, -40.0), (2.0, 10.0), (3.5, 50.0)]
+    scene = Scene(points=tuple(Point(range_m=range_m, azimuth_deg=angle) for range_m, angle in places))
+    settings = prepared(premade="2D_5m_181")
+    measurement = render(scene)
+    mine = rtisdev.get_raw_measurement(behaviour=False, configName="test")
+    mine.rawData = measurement.data.reshape(-1)
+    image = rtisdev.process_measurement(mine, configName="test").processedData
+    for range_m, azimuth_deg in places:
+        near = np.abs(settings.ranges - range_m) < 0.15
+        direction, at = np.unravel_index(np.argmax(image[:, near]), image[:, near].shape)
+        assert abs(np.degrees(settings.directions[direction, 0]) - azimuth_deg) <= 1.5
+        assert abs(settings.ranges[near][at] - range_m) <= 0.02
+
+
+def test_simulated_device_gives_the_same_results(monkeypatch):
+    monkeypatch.setenv("ERTIS_RTISDEV_DEVICE", "numpy")
+    settings = prepared(directions=5, minRange=1.0, maxRange=1.3)
+    compare(settings)
+    monkeypatch.setenv("ERTIS_RTISDEV_DEVICE", "gpu")
+    with pytest.raises(ArgumentError, match="gpu"):
+        prepared(directions=5)
+
+
+def test_threads_use_several_configurations():
+    settings = [prepared(name, directions=count) for name, count in (("small", 31), ("large", 91))]
+    raw = measured(settings[0]).rawData
+    shapes = {each.configName: (each.nDirections, each.nspses) for each in settings}
+    wanted = {name: rtiscuda.processing(raw, 1, *shape, name) for name, shape in shapes.items()}
+    failed = []
+
+    def work(name):
+        got = [rtiscuda.processing(raw, 1, *shapes[name], name) for _ in range(5)]
+        failed.extend(name for each in got if not np.array_equal(each, wanted[name]))
+
+    workers = [threading.Thread(target=work, args=(name,)) for name in ["small", "large"] * 2]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join()
+    assert not failed
+
+
+def test_forked_workers_of_a_process_that_has_processed_use_numpy(tmp_path):
+    """OpenMP would end such a worker, and the pool would start it again for ever."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        """
+import multiprocessing
+import numpy as np
+import ertis_numba.rtisdev
+import rtisdev
+from ertis_numba.rtisdev import rtiscuda
+
+def work(raw):
+    return rtiscuda.processing(raw, 1, 5, settings.nspses, "test")
+
+if __name__ == "__main__":
+    rtisdev.open_connection("/dev/no-such-port", allowDebugMode=True)
+    rtisdev.set_recording_settings(premade="default_25_50", configName="test")
+    rtisdev.set_processing_settings(directions=5, minRange=1.0, maxRange=1.3, configName="test")
+    settings = rtisdev.get_current_settings(configName="test")
+    raw = rtisdev.get_raw_measurement(behaviour=False, configName="test").rawData
+    wanted = work(raw)
+    with multiprocessing.get_context("fork").Pool(2) as pool:
+        for got in pool.map(work, [raw, raw]):
+            print(np.abs(got - wanted).max() / wanted.max() < 1e-3)
+"""
+    )
+    done = subprocess.run(
+        [sys.executable, script], env=ENVIRONMENT, capture_output=True, text=True, timeout=TIMEOUT_S, check=False
+    )
+    assert (done.returncode, done.stdout) == (0, "True\nTrue\n"), done.stderr
+    assert "create workers before the first measurement" in done.stderr
+
+
+@contextmanager
+def emulated(folder):
+    """An emulated sensor, and the name of its port."""
+    link = folder / "sensor"
+    command = [sys.executable, "-m", "ertis_cli", "emulate", SCENE, "--sensor", "west", "--link", link]
+    environment = ENVIRONMENT | {"ERTIS_EMULATED_DIR": str(folder)}
+    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout.readline().startswith("/dev/")
+            yield link
+        finally:
+            process.terminate()
+
+
+def run_script(script, *arguments):
+    """Run ``ertis rtisdev`` in the folder of the package's tests, as these need it."""
+    return subprocess.run(
+        [sys.executable, "-m", "ertis_cli", "rtisdev", *arguments, script],
+        cwd=own_tests(),
+        env=ENVIRONMENT | {"MPLBACKEND": "agg"},
+        capture_output=True,
+        text=True,
+        timeout=TIMEOUT_S,
+        check=False,
+    )
+
+
+def test_own_tests_of_the_package_pass_with_an_emulated_sensor(tmp_path):
+    with emulated(tmp_path) as port:
+        done = run_script("test_rtisdev.py", "--port", str(port))
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert re.search(r"Ran 24 tests in .*\n\nOK\n", done.stderr)
+    assert "disabled debug mode" in done.stdout + done.stderr
+
+
+def test_own_comparison_of_beamformers_runs():
+    done = run_script("test_dmas.py")
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert len(re.findall(r"^D\w*AS.*: .*ms$", done.stdout, re.MULTILINE)) == 11
+
+
+def test_unknown_names_and_wrong_shapes_are_refused(caplog):
+    settings = prepared(directions=31)
+    raw = measured(settings).rawData
+    shape = settings.nDirections, settings.nspses
+    for arguments, message in (
+        ((raw, 1, *shape, "other"), r"configuration 'other' is not preloaded; .* \(preloaded are: 'test'\)"),
+        ((raw[:-1], 1, *shape, "test"), "the measurement has 163839 words; give 163840"),
+        ((raw, 1, 31, 7, "test"), r"configuration 'test' gives 31 × \d+ numbers, but 31 × 7 are wanted"),
+        ((np.zeros((3, 7), np.float32), 0, *shape, "test"), r"the data has shape \(3, 7\); give 32 rows"),
+        ((np.zeros((32, 7), np.float32), 0, *shape, "test"), "signals have 7 samples; give 16384"),
+    ):
+        caplog.clear()
+        with pytest.raises(ArgumentError, match=message):
+            rtiscuda.processing(*arguments)
+        assert re.search(message, caplog.text)
+    caplog.clear()
+    rtiscuda.unloadone("other")
+    assert "nothing to unload" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"delay_matrix": np.zeros((31, 32), int)}, r"the delay matrix has shape \(31, 32\); give \(32, 31\)"),
+        ({"delay_matrix": np.full((32, 31), -1)}, "the delay matrix holds -1"),
+        ({"matched_filter_real": np.zeros((32, 7))}, r"the matched filter has shape \(32, 7\); give \(32, 8193\)"),
+        ({"dmas_order": 6}, "dmasOrder is 6; give 0 to 5"),
+        ({"last_range": 10}, "the image has ranges 131 to 10"),
+        ({"disabled_microphones": np.arange(32)}, "all 32 microphones are disabled"),
+    ],
+)
+def test_arguments_that_do_not_fit_together_are_refused(changes, message):
+    arguments = dict(
+        zip(
+            rtiscuda.preload.__code__.co_varnames,
+            (
+                *(np.ones(8), 0, np.ones(8), 0, np.ones((32, 8193)), 0, np.zeros((32, 31), int), 32, 31, 163_840),
+                *(10, 512, 10, 131, 200, 2.0, 0.5, "bad", 1, 0, 1, 1, 0, 1, 1, np.array([64]), 1, 0),
+            ),
+            strict=False,
+        )
+    )
+    if "matched_filter_real" in changes:
+        changes = changes | {"matched_filter_imag": changes["matched_filter_real"]}
+    else:
+        arguments["matched_filter_imag"] = np.ones((32, 8193))
+    with pytest.raises(ArgumentError, match=message):
+        rtiscuda.preload(**(arguments | changes))
+    with pytest.raises(ArgumentError, match="'bad' is not preloaded"):
+        rtiscuda.processing(np.zeros(163_840, np.uint32), 1, 31, 69, "bad")
+
+
+def test_serial_errors_are_those_that_callers_expect(monkeypatch):
+    with pytest.raises(ConnectionError, match="does not exist"):
+        rtisserial.connect("/dev/no-such-port", 115_200)
+    for call in (rtisserial.close, rtisserial.flush, lambda: rtisserial.command("!Y,0,0,0\n", wants_answer=True)):
+        with pytest.raises(ConnectionRefusedError, match=r"call rtisdev\.open_connection first"):
+            call()
+    parent, child = os.openpty()
+    try:
+        monkeypatch.setattr(rtisserial, "_ANSWER_S", 0.05)
+        rtisserial.connect(os.ttyname(child), 115_200)
+        with pytest.raises(TimeoutError, match="did not answer '!Y,0,0,0"):
+            rtisserial.command("!Y,0,0,0\n", wants_answer=True)
+        os.write(parent, b"left over")
+        rtisserial.flush()
+        os.write(parent, b"\x01\x02\x03\x00")
+        assert rtisserial.command("!Y,0,0,0\n", wants_answer=True) == 0x030201
+        monkeypatch.setattr(rtisserial, "_line", None)  # as another program sees it
+        with pytest.raises(ConnectionRefusedError, match="in use by another program"):
+            rtisserial.connect(os.ttyname(child), 115_200)
+    finally:
+        os.close(parent)
+        os.close(child)
+
+
+def test_modules_of_a_foreign_name_appear_only_on_request():
+    code = "import sys, ertis_numba; print({'rtisserial', 'rtiscuda'} & set(sys.modules)); import ertis_numba.rtisdev"
+    code += "; import rtisserial, rtiscuda; print(rtiscuda.__name__)"
+    done = subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True, check=True)
+    assert done.stdout == "set()\nertis_numba.rtisdev.rtiscuda\n"
+    assert ertis_numba.rtisdev.rtiscuda is sys.modules["rtiscuda"]
+
+
+def test_rtisdev_command_needs_the_package(monkeypatch, tmp_path):
+    (tmp_path / "script.py").write_text("print('ran')")
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
+    refused = CliRunner().invoke(cli, ["rtisdev", str(tmp_path / "script.py")])
+    assert refused.exit_code == 1
+    assert "rtisdev" in refused.stderr
