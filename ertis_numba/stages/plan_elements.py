@@ -29,7 +29,7 @@ __all__ = [
 _MANY_FRACTIONS = 16  # Microphones times delay range in steps, above which the delays spread evenly over a step.
 _PCM_RANGE_DB = 125.0  # Dynamic range within which sound outside the window does not affect an image of PCM.
 _MAX_RINGING_DB = 160.0  # Below this level, rounding of single precision exceeds the ringing.
-_MAX_PDM_RINGING_DB = 132.0  # The same for PDM, where sound outside the image exceeds it by less.
+_MAX_PDM_RINGING_DB = 138.0  # The same for PDM, where sound outside the image exceeds it by less.
 _MAX_PASS_BAND = 0.45  # relative to the signal rate; the filter becomes long beyond it
 _SHORT_TAPS_DB = 65.0  # Rounding taps to 16 bits limits the stopband attenuation to this value.
 
