@@ -5,6 +5,7 @@ to the centroid of the enabled microphones.
 """
 
 from ertis_numba.geometry.azimuths import ALONE_RAD, FAR, is_closed, reach_rad, unrolled_rad
+from ertis_numba.geometry.delay_matrix import delay_matrix, plane_delays
 from ertis_numba.geometry.delays import far_field_delays, spherical_delays, unit_vectors
 from ertis_numba.geometry.grids import MAX_DIRECTIONS, PAPER_GRIDS, Grid, direction_grid, grid_count
 from ertis_numba.geometry.layouts import (
@@ -33,6 +34,7 @@ __all__ = [
     "Layout",
     "array_weights",
     "azimuth_columns",
+    "delay_matrix",
     "direction_grid",
     "effective_count",
     "far_field_delays",
@@ -44,6 +46,7 @@ __all__ = [
     "microphones",
     "mounting",
     "plan_m",
+    "plane_delays",
     "reach_rad",
     "received_settings",
     "round_step",

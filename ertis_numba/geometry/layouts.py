@@ -349,11 +349,16 @@ def storable(settings: Settings) -> Settings:
     Raises
     ------
     ArgumentError
-        The directions are in a file, or the layout cannot be used.
+        Directions or delays are in a file, or the layout cannot be used.
     """
     if grid_count(settings.processing.directions) is None:
         raise ArgumentError(
             f"processing.directions is the file {settings.processing.directions}, but a recording cannot contain "
             "directions; name a grid, and give the file when processing"
+        )
+    if isinstance(delays := settings.processing.delay_matrix, str):
+        raise ArgumentError(
+            f"processing.delay_matrix is the file {delays}, but a recording cannot contain files; give the file when "
+            "processing"
         )
     return self_contained(settings)

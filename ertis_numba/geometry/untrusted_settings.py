@@ -18,7 +18,8 @@ def received_settings(text: bytes | str, source: str, *, are_applied: bool = Fal
     source : str
         Name of the settings in errors.
     are_applied : bool
-        True to accept any name as ``processing.directions``, because the directions themselves accompany the settings.
+        True to accept any name as ``processing.directions`` and ``delay_matrix``, because the directions themselves
+        accompany the settings, and their images exist.
 
     Returns
     -------
@@ -45,7 +46,7 @@ def received_settings(text: bytes | str, source: str, *, are_applied: bool = Fal
             f"{source}: array.layout is {layout[:80]!r}, the name of a file; send its positions instead, or name one "
             f"of {', '.join(layout_names())}"
         )
-    _require_numbers(settings, source)
+    _require_numbers(settings, source, are_applied=are_applied)
     try:
         count = None if are_applied else grid_count(directions)
     except ArgumentError as error:
@@ -58,11 +59,12 @@ def received_settings(text: bytes | str, source: str, *, are_applied: bool = Fal
     return settings
 
 
-def _require_numbers(settings: Settings, source: str) -> None:
-    """Refuse names of files in place of samples and taps."""
+def _require_numbers(settings: Settings, source: str, *, are_applied: bool) -> None:
+    """Refuse names of files in place of samples, taps and, unless they are applied already, delays."""
     processing = settings.processing
     for name, value, wanted in (
         ("call.waveform", settings.call.waveform, "samples"),
+        ("processing.delay_matrix", () if are_applied else processing.delay_matrix, "delays"),
         ("processing.pre_filter", processing.pre_filter, "taps"),
         ("processing.post_filter", processing.post_filter, "taps"),
     ):

@@ -10,6 +10,7 @@ from ertis_numba.constants import MAX_MICROPHONES, MAX_NAME_LENGTH
 from ertis_numba.documents import TomlTable
 from ertis_numba.errors import ArgumentError, SettingsError
 from ertis_numba.settings.array_windows import parse_window
+from ertis_numba.settings.delay_lists import check_delays
 from ertis_numba.settings.fir_filters import FirFilters, check_taps
 from ertis_numba.settings.presets import preset_tables
 from ertis_numba.settings.waveform import read_waveform
@@ -85,6 +86,13 @@ class Processing(TomlTable, frozen=True, kw_only=True):
     filter_rate_hz : float, optional, default None
         Sample rate for which the taps of both filters are designed, more than twice the call's highest frequency; by
         default that of the signals, `Settings.signal_rate_hz`.
+    delay_matrix : str or list of list of float, default []
+        Delays of sound in samples of ``delay_rate_hz``, in place of those of plane waves: a row for each direction with
+        a number for each channel, or the name of a CSV or NPY file with them. Only differences between microphones
+        matter. Up to 20000 numbers in settings; any number in a file. For delay_and_sum and plane wavefronts only; see
+        ``docs/how-to/own-array.md``.
+    delay_rate_hz : float, optional, default None
+        Sample rate of ``delay_matrix``; by default that of the signals, `Settings.signal_rate_hz`.
     last_stage : {"demodulation", "matched_filter", "beams", "envelope"}, default "envelope"
         Last step of processing. Each stage but ``envelope``, which yields images, yields signals: see
         `Pipeline.result` and ``docs/how-to/numpy.md``. ``beams`` needs the fast method and delay_and_sum.
@@ -114,6 +122,8 @@ class Processing(TomlTable, frozen=True, kw_only=True):
     pre_filter: str | tuple[float, ...] = ()
     post_filter: str | tuple[float, ...] = ()
     filter_rate_hz: float | None = None
+    delay_matrix: str | tuple[tuple[float, ...], ...] = ()
+    delay_rate_hz: float | None = None
     last_stage: Literal["demodulation", "matched_filter", "beams", "envelope"] = "envelope"
 
     @classmethod
@@ -202,6 +212,7 @@ class Processing(TomlTable, frozen=True, kw_only=True):
         self._check_beamformer()
         self._check_array_weights()
         self._check_filters()
+        self._check_delays()
         checks.choice("processing.last_stage", self.last_stage, STAGES)
         if self.last_stage == "beams":
             self.require_beams("processing.last_stage is 'beams'")
@@ -286,6 +297,22 @@ class Processing(TomlTable, frozen=True, kw_only=True):
                 "leave it out, or give processing.beamformer 'delay_and_sum' and weighting 'none'"
             )
 
+    def _check_delays(self) -> None:
+        """Refuse delays that settings cannot hold, and those that method, beamformer or wavefront do not support."""
+        if self.delay_rate_hz is not None:
+            checks.between("processing.delay_rate_hz", self.delay_rate_hz, 1.0, 1e9)
+        given = self.delay_matrix
+        if not given:
+            return
+        if not isinstance(given, str):
+            check_delays(given)
+        if self.is_adaptive or self.wavefront != "plane":
+            part = self._adaptive_part if self.is_adaptive else f"processing.wavefront {self.wavefront!r}"
+            raise ArgumentError(
+                f"processing.delay_matrix is given, which {part} does not support; leave it out, or give beamformer "
+                "'delay_and_sum', weighting 'none' and wavefront 'plane'"
+            )
+
     def filters(self, signal_rate_hz: float) -> FirFilters | None:
         """Return the own filters; None without any.
 
@@ -311,7 +338,7 @@ class Processing(TomlTable, frozen=True, kw_only=True):
         return FirFilters(self.filter_rate_hz or signal_rate_hz, tuple(taps)) if taps else None
 
     def resolve_paths(self, folder: Path) -> Self:
-        """Return processing whose directions are relative to a folder, with the taps of filters in files there.
+        """Return processing whose directions and delays are relative to a folder, with the taps of filters there.
 
         Raises
         ------
@@ -321,6 +348,8 @@ class Processing(TomlTable, frozen=True, kw_only=True):
         changes: dict[str, Any] = {}
         if isinstance(self.directions, str) and Path(self.directions).suffix.lower() == ".csv":
             changes["directions"] = str(folder / self.directions)
+        if self.delay_matrix and isinstance(self.delay_matrix, str):
+            changes["delay_matrix"] = str(folder / self.delay_matrix)
         for name in ("pre_filter", "post_filter"):
             if isinstance(given := getattr(self, name), str):
                 changes[name], _ = read_waveform(folder / given, key=f"processing.{name}")

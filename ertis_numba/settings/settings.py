@@ -155,6 +155,11 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
     def _check_adaptive(self) -> None:
         """Refuse plans that an adaptive beamformer does not support."""
         processing, accuracy = self.processing, self.accuracy
+        if processing.delay_matrix and processing.method == "fast" and accuracy.delay_taps not in {None, 0}:
+            raise ArgumentError(
+                f"accuracy.delay_taps is {accuracy.delay_taps}, but processing.delay_matrix needs exact delays; leave "
+                "delay_taps out or give 0"
+            )
         if processing.is_adaptive and accuracy.delay_taps == 0:
             raise ArgumentError(
                 f"accuracy.delay_taps is 0 (phase shifts of spectra), which processing.beamformer "
@@ -250,7 +255,7 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
             raise SettingsError(f"{path}: {error}") from error
 
     def resolve_paths(self, folder: Path) -> Self:
-        """Return settings whose files, of layout, directions, waveform and filters, are relative to a folder.
+        """Return settings whose files, of layout, directions, delays, waveform and filters, are relative to a folder.
 
         Waveform and filters are read, because other settings depend on them.
         """

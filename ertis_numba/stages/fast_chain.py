@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.air import sound_speed_m_s
-from ertis_numba.geometry import Grid, array_weights, direction_grid, microphones, unit_vectors
+from ertis_numba.geometry import Grid, array_weights, delay_matrix, direction_grid, microphones, unit_vectors
 from ertis_numba.kernels import KernelSet, Memory
 from ertis_numba.settings import Settings
 from ertis_numba.stages.adaptive import AdaptiveBeamform
@@ -68,10 +68,11 @@ class FastChain(KernelChain):
         has_shifts = plan.delay_taps == 0
         ahead_s = np.zeros(len(own_s)) if has_shifts else ahead_of(array_weight, step_s)
         edges = zones_of(settings)
+        waves_s = functools.partial(
+            _delays_s, delay_matrix(settings, n_directions=len(self.grid)), aperture, sound_speed_m_s=speed_m_s
+        )
         largest_s = max(
-            float(np.max(np.abs(own_s + aperture.delays_s(some, sound_speed_m_s=speed_m_s, range_m=range_m))))
-            for _, _, range_m in edges
-            for some in points
+            float(np.max(np.abs(own_s + waves_s(some, range_m=range_m)))) for _, _, range_m in edges for some in points
         )
         taps = chain_taps(settings)
         window = time_window(
@@ -118,8 +119,7 @@ class FastChain(KernelChain):
             self._beamform = streams.beamform(kernels, memory, taken_s, edges, n_phases=n_phases, lead=window.lead)
             return
         delayed = (
-            (first, stop, own_s - ahead_s + aperture.delays_s(points[0], sound_speed_m_s=speed_m_s, range_m=range_m))
-            for first, stop, range_m in edges
+            (first, stop, own_s - ahead_s + waves_s(points[0], range_m=range_m)) for first, stop, range_m in edges
         )
         if has_shifts:
             self._beamform = PhaseShifts(kernels, memory, window, self._matched_filter, len(self.grid), delayed)
@@ -180,6 +180,20 @@ class FastChain(KernelChain):
         else:
             self._matched_filter(buffers.transforms, buffers.analytic, threads=threads)
             self._adaptive(buffers.analytic, out)
+
+
+def _delays_s(
+    given_s: NDArray[np.float64] | None,
+    aperture: Aperture,
+    points: NDArray[np.float64],
+    *,
+    sound_speed_m_s: float,
+    range_m: float,
+) -> NDArray[np.float64]:
+    """Return the given delays, or those of waves from points at a range: (point, mic) float64."""
+    if given_s is not None:
+        return given_s
+    return aperture.delays_s(points, sound_speed_m_s=sound_speed_m_s, range_m=range_m)
 
 
 class _Streams:

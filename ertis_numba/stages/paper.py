@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ertis_numba import fft
 from ertis_numba.air import sound_speed_m_s
-from ertis_numba.geometry import array_weights, direction_grid, far_field_delays, microphones, unit_vectors
+from ertis_numba.geometry import array_weights, direction_grid, microphones, plane_delays
 from ertis_numba.kernels import KernelSet, Memory
 from ertis_numba.settings import Settings
 from ertis_numba.stages.beamform import Buffers
@@ -47,11 +47,8 @@ class PaperChain(KernelChain):
         self.grid = direction_grid(settings.processing)
         n_samples = -(-settings.recording.n_samples // settings.decimation)
         self.range_m, outputs = range_axis(settings, n_samples)
-        delays_s = layout.delay_s[layout.enabled] + far_field_delays(
-            layout.enabled_positions_m,
-            unit_vectors(self.grid.azimuth_rad, self.grid.elevation_rad),
-            sound_speed_m_s=sound_speed_m_s(settings.air),
-        )
+        waves_s = plane_delays(settings, self.grid, sound_speed_m_s=sound_speed_m_s(settings.air))
+        delays_s = layout.delay_s[layout.enabled] + waves_s
         delays = np.rint(delays_s * settings.signal_rate_hz).astype(np.int64)
         lead = int(np.max(np.abs(delays)))
         taps, channels = chain_taps(settings), np.flatnonzero(layout.enabled).astype(np.int32)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError
-from ertis_numba.geometry import Grid, array_weights, direction_grid, far_field_delays, microphones, unit_vectors
+from ertis_numba.geometry import Grid, array_weights, direction_grid, microphones, plane_delays
 from ertis_numba.settings import Settings
 from ertis_numba.waveform import call_at
 
@@ -54,11 +54,8 @@ class ScipyPaperChain:
         self.grid: Grid = direction_grid(settings.processing)
         self._n_samples = -(-settings.recording.n_samples // settings.decimation)
         self.range_m, self._window = range_axis(settings, self._n_samples)
-        delays_s = layout.delay_s[layout.enabled] + far_field_delays(
-            layout.enabled_positions_m,
-            unit_vectors(self.grid.azimuth_rad, self.grid.elevation_rad),
-            sound_speed_m_s=sound_speed_m_s(settings.air),
-        )
+        waves_s = plane_delays(settings, self.grid, sound_speed_m_s=sound_speed_m_s(settings.air))
+        delays_s = layout.delay_s[layout.enabled] + waves_s
         delays = np.rint(delays_s * settings.signal_rate_hz).astype(int)
         lead = int(np.max(np.abs(delays)))
         self._starts: list[list[int]] = (delays + lead).tolist()

@@ -78,6 +78,8 @@ def complete(
     """
     if settings.processing.method == "paper":
         return settings
+    if settings.processing.delay_matrix:  # Only exact delays need no model of the distribution of delays.
+        settings = settings.replace(accuracy=settings.accuracy.replace(delay_taps=0))
 
     def chosen(wanted: Settings) -> Settings:
         return Planner(wanted, kernels, threads=threads, max_bytes=max_bytes, plan=plan).choose().settings

@@ -60,7 +60,7 @@ def signal_model_of(
         The samples do not match the settings.
     """
     low_hz, high_hz = matched_band_hz(settings)
-    processing = settings.processing.replace(beamformer="delay_and_sum", weighting="none")
+    processing = settings.processing.replace(beamformer="delay_and_sum", weighting="none", delay_matrix=())
     if amplitude is not None:
         processing = processing.replace(directions=_FEW_DIRECTIONS)
     rough = settings.replace(

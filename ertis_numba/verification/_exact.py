@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Energyscape, Measurement
-from ertis_numba.geometry import array_weights, far_field_delays, microphones, unit_vectors
+from ertis_numba.geometry import array_weights, delay_matrix, far_field_delays, microphones, unit_vectors
 from ertis_numba.sample_format import sample_format
 from ertis_numba.settings import Settings
 from ertis_numba.verification._beamformers import combine
@@ -61,6 +61,7 @@ class ExactImage:
         layout = microphones(settings.array)
         self._positions_m = layout.enabled_positions_m
         self._directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
+        self._given_s = delay_matrix(settings, n_directions=len(self._directions))
         self._range_m = image.range_m
         self._speed_m_s = sound_speed_m_s(settings.air)
         self._step = settings.processing.range_decimation
@@ -110,9 +111,11 @@ class ExactImage:
         The spacing of the ranges is an integer number of samples, so one inverse transform of the folded bins computes
         all ranges.
         """
-        delay_s = far_field_delays(
-            self._positions_m, self._directions[direction : direction + 1], sound_speed_m_s=self._speed_m_s
-        )[0]
+        if self._given_s is not None:
+            delay_s = self._given_s[direction]
+        else:
+            towards = self._directions[direction : direction + 1]
+            delay_s = far_field_delays(self._positions_m, towards, sound_speed_m_s=self._speed_m_s)[0]
         at_s = delay_s + 2 * self._range_m[0] / self._speed_m_s
         turned = self._spectra * _powers(at_s, self._wave_rad_s)
         n_outputs = self._n_fft // self._step
