@@ -3,6 +3,7 @@
 import importlib.metadata
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +13,10 @@ from ertis_cli.main import cli
 
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.interop import open_rtis_folder
-from ertis_numba.settings import PRESETS, Air, Array, Settings
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.settings import PRESETS, Air, Array, Processing, Settings
 from ertis_numba.storage import open_recording
+from ertis_numba.verification import error_db
 
 SHORT = {
     "microphoneSamples": 65_536,
@@ -84,6 +87,63 @@ def test_processing_settings_of_rtisdev_are_accepted(tmp_path, name):
     processing = open_rtis_folder(folder_of(tmp_path, processing=given)).settings.processing
     assert processing.range_m == (given["minRange"], given["maxRange"])
     assert processing.directions == f"{2 if given['2D'] else 3}d:{given['directions']}"
+
+
+CUSTOM = {"directionsCustom": "directions.csv", "delayMatrixCustom": "delaymatrix.csv", "rangesCustom": "ranges.csv"}
+
+
+def custom_folder(tmp_path, **content):
+    """A folder with a measurement of default length, and the files of the custom example of rtisdev or others."""
+    processing = {"microphoneLayout": "eRTIS_v3D1"} | CUSTOM
+    folder = folder_of(tmp_path, names=(), recording={"microphoneSamples": 163_840}, processing=processing)
+    np.random.default_rng(1).integers(0, 2**32, 163_840, dtype="<u4").tofile(folder / "0.bin")
+    shipped_in = Path(
+        importlib.metadata.distribution("rtisdev").locate_file("rtisdev/config/premadeSettings/processing")
+    )
+    for name in CUSTOM.values():
+        text = content.get(name.partition(".")[0])
+        (folder / name).write_text((shipped_in / name).read_text() if text is None else text)
+    return folder
+
+
+def test_custom_files_of_rtisdev_are_imported(tmp_path):
+    (measurement,) = open_rtis_folder(custom_folder(tmp_path))
+    processing = measurement.settings.processing
+    assert processing.range_m == (0.5, 5.0)
+    assert processing.range_decimation == 100
+    assert processing.delay_rate_hz == 450e3
+    np.testing.assert_allclose(np.array(processing.directions)[:, 0], np.linspace(-90, 90, 91), atol=1e-9)
+    settings = measurement.settings
+    named = settings.replace(processing=Processing(directions="2d:91"))
+    with Pipeline(settings, "cpu", predict=False) as own, Pipeline(named, "cpu", predict=False) as plane:
+        found, wanted = own.process(measurement), plane.process(replace(measurement, settings=named))
+    assert len(found.range_m) == pytest.approx(1181, abs=3)
+    # The file holds whole samples, which are up to 0.6 samples from the delays of plane waves.
+    assert error_db(found.amplitude, wanted.amplitude.astype(float)) < -15
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (
+            {"ranges": "0.5,0.6,0.8"},
+            "rangesCustom is the file 'ranges.csv', which has ranges 0.1 to 0.2 m apart, not ev",
+        ),
+        (
+            {"ranges": "0.6,0.5"},
+            "does not have two or more ascending ranges; correct it, or remove it and give --range",
+        ),
+        ({"ranges": "a,b"}, r"rangesCustom is the file 'ranges.csv', which cannot be read \("),
+        ({"directions": "0,1,2"}, "does not have two numbers in every row; correct it, or remove it and give --direct"),
+        (
+            {"delaymatrix": "1,nan"},
+            "does not contain finite numbers only; correct it, or remove it and process with the",
+        ),
+    ],
+)
+def test_custom_files_with_other_content_are_refused(tmp_path, content, message):
+    with pytest.raises(DataError, match=message):
+        open_rtis_folder(custom_folder(tmp_path, **content))
 
 
 def test_missing_keys_have_the_defaults_of_rtisdev(tmp_path):

@@ -9,6 +9,7 @@ from typing import Any
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.interop.raw_pdm import RawReader
+from ertis_numba.interop.rtis_custom import CUSTOM_KEYS, with_custom_files
 from ertis_numba.settings import Air, Array, Call, Processing, Recording, Settings, fit_ranges
 
 __all__ = ["open_rtis_folder"]
@@ -38,14 +39,7 @@ _PROCESSING = (
 _KEYS_OF_DICT = {"dacSampleFrequency": "callSampleFrequency", "nDirections": "directions"}
 """Names in settings files, by the name in ``dict(RTISSettings)``, which users also write to JSON."""
 _AZIMUTHS, _ELEVATIONS = "directionsAzimuth", "directionsElevation"  # Radians, in dict(RTISSettings).
-_UNSUPPORTED_KEYS = {
-    "callCustom": "give --preset to process it as a sweep",
-    "directionsCustom": "remove it, and give --directions when processing",
-    "delayMatrixCustom": "remove it",
-    "rangesCustom": "remove it, and give --range when processing",
-}
-"""Keys that name other files, with the remedy."""
-_KNOWN = {*_RECORDING, *_PROCESSING, *_KEYS_OF_DICT, *_UNSUPPORTED_KEYS, _AZIMUTHS, _ELEVATIONS}
+_KNOWN = {*_RECORDING, *_PROCESSING, *_KEYS_OF_DICT, *CUSTOM_KEYS, "callCustom", _AZIMUTHS, _ELEVATIONS}
 
 
 def open_rtis_folder(
@@ -117,6 +111,7 @@ def open_rtis_folder(
         raise DataError(f"{folder} contains no recording settings of RTIS Dev (.json); give --preset")
     processing = _processing_settings(folder, reported, settings.processing)
     settings = settings.replace(array=Array(layout=layout), air=air or Air(), processing=processing)
+    settings = with_custom_files(folder, reported, settings)
     return RawReader(paths, settings, sensor=sensor, first=first)
 
 
@@ -163,7 +158,11 @@ def _settings_in(folder: Path) -> dict[str, Any]:
 
 def _recording_settings(folder: Path, reported: dict[str, Any]) -> Settings:
     """Return call and length of a measurement."""
-    _refuse_external(folder, reported, "callCustom")
+    if "callCustom" in reported:
+        raise DataError(
+            f"{folder}: callCustom is the file {reported['callCustom']!r}, which a recording cannot contain; give "
+            "--preset to process it as a sweep"
+        )
     number = {
         name: checks.finite(f"{folder}: {name}", reported.get(name, standard)) for name, standard in _RECORDING.items()
     }
@@ -185,7 +184,6 @@ def _recording_settings(folder: Path, reported: dict[str, Any]) -> Settings:
 
 def _processing_settings(folder: Path, reported: dict[str, Any], standard: Processing) -> Processing:
     """Return ranges and directions."""
-    _refuse_external(folder, reported, "directionsCustom", "delayMatrixCustom", "rangesCustom")
 
     def number(name: str, otherwise: float) -> float:
         return checks.finite(f"{folder}: {name}", reported.get(name, otherwise))
@@ -222,13 +220,3 @@ def _angles_rad(folder: Path, reported: dict[str, Any], name: str) -> list[float
     if not isinstance(angles, list) or not angles:
         raise ArgumentError(f"{folder}: {name} is {angles!r}; give an angle for each direction, or remove it")
     return [checks.finite(f"{folder}: {name}", angle_rad) for angle_rad in angles]
-
-
-def _refuse_external(folder: Path, reported: dict[str, Any], *names: str) -> None:
-    """Refuse settings that are stored in other files."""
-    for name in names:
-        if name in reported:
-            raise DataError(
-                f"{folder}: {name} is the file {reported[name]!r}, which a recording cannot contain; "
-                f"{_UNSUPPORTED_KEYS[name]}"
-            )
