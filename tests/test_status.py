@@ -146,6 +146,17 @@ def test_refused_status_client_gets_the_reason_at_once(keys):
             node.ask(PATIENCE_S)
 
 
+def test_interrupted_status_client_does_not_wait_for_its_socket(monkeypatch):
+    """A signal may arrive between the opening of a socket and its assignment, as it once did in ``ertis demo``."""
+
+    def interrupted(socket):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("ertis_numba.network.sockets.Monitor", interrupted)
+    with pytest.raises(KeyboardInterrupt), Asking("tcp://127.0.0.1:1") as node:
+        node.ask(PATIENCE_S)
+
+
 def test_missing_central_node_is_reported_with_the_remedy():
     with Asking("tcp://127.0.0.1:1") as node, pytest.raises(NetworkError, match=r"within 0\.1 s; start"):
         node.ask(0.1)

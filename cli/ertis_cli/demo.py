@@ -139,6 +139,7 @@ class _DemoRun:
 
     def __init__(self, environment: Mapping[str, str], *, quiet: bool) -> None:
         self._environment, self._quiet = environment, quiet
+        self._nodes: list[subprocess.Popen[bytes]] = []
         # No node outlives this process, even if it is killed.
         ends = functools.partial(_supervisor.end_with, os.getpid(), signal.SIGTERM)
         self._bind = ends if sys.platform == "linux" else None
@@ -175,6 +176,7 @@ class _DemoRun:
                 stdout=file,
                 preexec_fn=self._bind,  # noqa: PLW1509
             )
+        self._nodes.append(process)
         try:
             while not (text := output.read_text("utf-8")).endswith("\n"):
                 if process.poll() is not None:
@@ -183,6 +185,10 @@ class _DemoRun:
                     )
                 time.sleep(_LOOK_INTERVAL_S)
             yield json.loads(text.partition("\n")[0])
+        except (KeyboardInterrupt, SystemExit):
+            for each in self._nodes:  # All end at the same time, because the user waits.
+                each.terminate()
+            raise
         finally:
             process.terminate()
             try:

@@ -51,7 +51,7 @@ class Asking:
     ) -> None:
         self._hang_up()
         if self._context is not None:
-            self._context.term()
+            self._context.destroy(linger=0)
         self._context = None
 
     def ask(self, patience_s: float = 3.0) -> Status:

@@ -94,7 +94,7 @@ class Link(threading.Thread):
         if self.ident is not None:
             self.join()
         self._disconnect(linger_s=_TURN_S)
-        self._context.term()
+        self._context.destroy(linger=0)
         self._wakeup_socket.close()
 
     def run(self) -> None:
