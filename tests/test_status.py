@@ -149,7 +149,7 @@ def test_refused_status_client_gets_the_reason_at_once(keys):
 def test_interrupted_status_client_does_not_wait_for_its_socket(monkeypatch):
     """A signal may arrive between the opening of a socket and its assignment, as it once did in ``ertis demo``."""
 
-    def interrupted(socket):
+    def interrupted(_):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("ertis_numba.network.sockets.Monitor", interrupted)
