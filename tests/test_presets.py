@@ -1,6 +1,7 @@
 """Shipped presets, by our names and those of RTIS Dev."""
 
 import json
+import re
 import tomllib
 from importlib import metadata
 from pathlib import Path
@@ -15,6 +16,7 @@ from ertis_numba.geometry import direction_grid
 from ertis_numba.settings import Processing, Settings, preset_tables, preset_text
 from ertis_numba.storage import open_energyscapes, write_recording
 from tests.files import noise
+from tests.pages import page
 
 
 def run(*arguments, code=0):
@@ -124,6 +126,22 @@ def test_options_override_the_preset_which_overrides_the_settings_file(recording
 def test_serve_refuses_an_unknown_preset_before_it_listens():
     done = run("serve", "--listen", "tcp://127.0.0.1:0", "--preset", "2d_18_5m", code=1)
     assert "preset '2d_18_5m' is unknown" in done.stderr
+
+
+def test_settings_of_rtisdev_have_keys_of_the_same_meaning():
+    """The table names arguments of rtisdev and keys of processing; its values are the defaults of rtisdev."""
+    text = page("settings").partition("## Settings of RTIS Dev")[2].partition("\n## ")[0]
+    rows = [row.strip("| ").split(" | ") for row in text.splitlines() if row.startswith("| `")]
+    keys = {key for _, here in rows for key in re.findall(r"`([a-z_]+)(?: =[^`]*)?`", here)}
+    assert keys <= set(Processing.__struct_fields__)
+    assert len(rows) >= 15
+    assigned = dict(re.findall(r"`([a-z_]+) = ([\d.]+)`", text))
+    assert {"clean_within_db", "clean_above_mean_db", "filter_rate_hz", "delay_rate_hz"} == assigned.keys()
+    Processing(**{name: float(value) for name, value in assigned.items()})
+    source = Path(str(metadata.distribution("rtisdev").locate_file("rtisdev/RTISDev.py"))).read_text("utf-8")
+    for theirs, _ in rows:
+        for name in re.findall(r"`(\w+)(?: = [^`]*)?`", theirs):
+            assert name in source, name
 
 
 def test_former_name_of_the_layouts_command_works():

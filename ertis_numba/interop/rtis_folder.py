@@ -56,7 +56,7 @@ def open_rtis_folder(
     becomes the sequence number, so that a missing file is a gap. Settings are read from JSON files beside them, as
     rtisdev 2.16.0 (PyPI) reads and returns them: recording settings (``microphoneSamples``, ``callMinimumFrequency``
     and others), processing settings (``microphoneLayout``, ``maxRange`` and others), or all of ``dict(RTISSettings)``
-    in one. Filters, cleaning and beamforming are not used.
+    in one. Filters, cleaning and beamforming are not used. Directions, delays and ranges in CSV files are used.
 
     Parameters
     ----------

@@ -43,6 +43,28 @@ PLANS = {
         ),
         -110,
     ),
+    "delay matrix": (
+        TINY.replace(
+            processing=TINY.processing.replace(
+                directions="2d:3", delay_matrix=((0.0, 5.5), (1.0, 1.0), (4.0, -2.25)), delay_rate_hz=450e3
+            ),
+            accuracy=DIRECT.replace(oversampling=1, delay_taps=0),
+        ),
+        -110,
+    ),
+    "own filter": (
+        TINY.replace(
+            processing=TINY.processing.replace(directions="2d:3", pre_filter=(0.25, 0.5, 0.25)), accuracy=DIRECT
+        ),
+        -120,
+    ),
+    "cleaned": (
+        TINY.replace(
+            processing=TINY.processing.replace(directions="2d:5", clean_within_db=1.0, clean_above_mean_db=0.5),
+            accuracy=DIRECT,
+        ),
+        -120,
+    ),
     "array weights": (
         TINY.replace(
             processing=TINY.processing.replace(directions="2d:3", array_weights=(1.0, 0.25)),
