@@ -98,10 +98,10 @@ class MicrophoneSignals:
     Attributes
     ----------
     demodulated : (mic, sample) float32
-        Low-passed and decimated signals, divided by the calibrated gains; full scale is 1.
+        Low-passed and decimated signals, divided by the calibrated gains; full scale is 1. Own filters are not applied.
     matched : (mic, sample) complex64
-        Analytic signals after the call's matched filter. An echo has its peak at the sample at which it begins; a
-        full-scale echo has an envelope of 1.
+        Analytic signals after the call's matched filter and own filters. An echo has its peak at the sample at which it
+        begins; a full-scale echo has an envelope of 1.
     time_s : (sample,) float64
         Time since the start of the emission in seconds.
     sample_rate_hz : float

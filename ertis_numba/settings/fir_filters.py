@@ -1,7 +1,8 @@
 """Own FIR filters of the signals, which processing combines with the matched filter."""
 
 import math
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Final, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +10,10 @@ from numpy.typing import NDArray
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError
 
-__all__ = ["MAX_FILTER_TAPS", "FirFilters", "check_taps"]
+__all__ = ["FILTERS", "MAX_FILTER_TAPS", "FirFilters", "check_taps"]
+
+FILTERS: Final = ("pre_filter", "post_filter")
+"""Keys of own filters in the order in which they apply."""
 
 MAX_FILTER_TAPS = 1024
 """Limit on the taps of a filter."""
@@ -29,6 +33,25 @@ class FirFilters(NamedTuple):
 
     rate_hz: float
     taps: tuple[tuple[float, ...], ...]
+
+    @classmethod
+    def of(cls, given: Mapping[str, str | tuple[float, ...]], *, rate_hz: float) -> Self | None:
+        """Return the filters of some keys; None if all are empty.
+
+        Raises
+        ------
+        ArgumentError
+            The file of a filter has not been read.
+        """
+        taps: list[tuple[float, ...]] = []
+        for name, value in given.items():
+            if isinstance(value, str):
+                raise ArgumentError(
+                    f"processing.{name} is the file {value!r}, which has not been read; give its taps, or read the "
+                    "settings by Settings.load"
+                )
+            taps += [value] if value else []
+        return cls(rate_hz, tuple(taps)) if taps else None
 
     @property
     def half_length_s(self) -> float:

@@ -11,7 +11,7 @@ from ertis_numba.documents import TomlTable
 from ertis_numba.errors import ArgumentError, SettingsError
 from ertis_numba.settings.array_windows import parse_window
 from ertis_numba.settings.delay_lists import check_delays
-from ertis_numba.settings.fir_filters import FirFilters, check_taps
+from ertis_numba.settings.fir_filters import FILTERS, FirFilters, check_taps
 from ertis_numba.settings.presets import preset_tables
 from ertis_numba.settings.waveform import read_waveform
 
@@ -282,7 +282,7 @@ class Processing(TomlTable, frozen=True, kw_only=True):
         """Refuse filters that cannot be used, by themselves or with the method and the beamformer."""
         if self.filter_rate_hz is not None:
             checks.between("processing.filter_rate_hz", self.filter_rate_hz, 1.0, 1e9)
-        for name in ("pre_filter", "post_filter"):
+        for name in FILTERS:
             taps = getattr(self, name)
             if isinstance(taps, tuple):
                 check_taps(f"processing.{name}", taps)
@@ -326,16 +326,8 @@ class Processing(TomlTable, frozen=True, kw_only=True):
         ArgumentError
             The file of a filter has not been read.
         """
-        taps: list[tuple[float, ...]] = []
-        for name in ("pre_filter", "post_filter"):
-            given = getattr(self, name)
-            if isinstance(given, str):
-                raise ArgumentError(
-                    f"processing.{name} is the file {given!r}, which has not been read; give its taps, or read the "
-                    "settings by Settings.load"
-                )
-            taps += [given] if given else []
-        return FirFilters(self.filter_rate_hz or signal_rate_hz, tuple(taps)) if taps else None
+        rate_hz = self.filter_rate_hz or signal_rate_hz
+        return FirFilters.of({name: getattr(self, name) for name in FILTERS}, rate_hz=rate_hz)
 
     def resolve_paths(self, folder: Path) -> Self:
         """Return processing whose directions and delays are relative to a folder, with the taps of filters there.
@@ -350,7 +342,7 @@ class Processing(TomlTable, frozen=True, kw_only=True):
             changes["directions"] = str(folder / self.directions)
         if self.delay_matrix and isinstance(self.delay_matrix, str):
             changes["delay_matrix"] = str(folder / self.delay_matrix)
-        for name in ("pre_filter", "post_filter"):
+        for name in FILTERS:
             if isinstance(given := getattr(self, name), str):
                 changes[name], _ = read_waveform(folder / given, key=f"processing.{name}")
         try:
