@@ -10,6 +10,7 @@ import threading
 from contextlib import contextmanager
 from importlib.metadata import distribution
 from pathlib import Path
+from types import FunctionType
 
 import numpy as np
 import pytest
@@ -290,6 +291,37 @@ def test_own_comparison_of_beamformers_runs():
     done = run_script("test_dmas.py")
     assert done.returncode == 0, done.stderr[-3000:]
     assert len(re.findall(r"^D\w*AS.*: .*ms$", done.stdout, re.MULTILINE)) == 11
+
+
+def replacements():
+    """Rows of the tables of functions and classes in docs/how-to/from-rtisdev.md."""
+    text = (ROOT / "docs" / "how-to" / "from-rtisdev.md").read_text("utf-8")
+    return re.findall(r"^\| `(\w+)` \| `([^`]+)`", text.partition("## Arguments")[0], re.MULTILINE), text
+
+
+def test_each_function_and_class_has_a_replacement():
+    names = {
+        name
+        for name, each in vars(rtisdev).items()
+        if getattr(each, "__module__", "") == "rtisdev.RTISDev"
+        and (isinstance(each, FunctionType) or name.startswith("RTIS"))
+        and not (isinstance(each, type) and issubclass(each, Exception))
+        and not name.startswith("_")
+    }
+    rows, _ = replacements()
+    assert {name for name, _ in rows} == names
+    assert len(rows) == len(names) == 33
+
+
+def test_replacements_run(tmp_path):
+    rows, text = replacements()
+    names = {}
+    exec(re.search(r"```python\n(.*?)```", text, re.DOTALL)[1], names)
+    with emulated(tmp_path) as port:
+        for _, code in rows:
+            exec(code.replace("/dev/ttyACM0", str(port)), names)
+    assert len(names["images"]) == 2
+    assert names["image"].amplitudes.shape[0] == 181
 
 
 def test_unknown_names_and_wrong_shapes_are_refused(caplog):

@@ -1,0 +1,87 @@
+"""The ROS 2 example stops a simulated robot in front of a simulated wall."""
+
+import itertools
+import os
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import pytest
+
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.ros import Participant, RosPublisher
+from ertis_numba.settings import Processing, Settings
+from ertis_numba.simulation import Scene, Sensor, Wall
+from ertis_numba.simulation.render import render
+from tests.journals import ENVIRONMENT
+from tests.test_ros import await_subscribers, subscribed
+
+pytest.importorskip("rclpy.serialization")  # Wheels exist for some versions of Python only.
+pytest.importorskip("cyclonedds")
+
+EXAMPLE = Path(__file__).parents[1] / "examples" / "6_stop_in_ros.py"
+DOMAIN = 1 + (os.getpid() + 100) % 200
+START_M, STOP_M, STEP_S = 2.0, 0.8, 0.4
+MAX_STEPS = 40
+
+
+def image_at(distance_m, pipeline):
+    """Image of a wall at a distance ahead."""
+    wall = Wall(position_m=(distance_m, 0.0, 0.0), facing_deg=(180.0, 0.0), size_m=(2.0, 2.0))
+    sensor = Sensor(name="front", processing=pipeline.settings.processing)
+    return pipeline.process(render(Scene(walls=(wall,), sensors=(sensor,))))
+
+
+def test_robot_stops_in_front_of_a_wall():
+    """The robot moves by what the node publishes. Then the scans end, and it still stands."""
+    settings = Settings().replace(processing=Processing(directions="2d:91", range_m=(0.3, 3.0)))
+    environment = ENVIRONMENT | {"ROS_DOMAIN_ID": str(DOMAIN), "ROS_LOG_DIR": tempfile.gettempdir()}
+    distances_m = [START_M]
+    with (
+        Pipeline(settings) as pipeline,
+        Participant(domain=DOMAIN) as participant,
+        subscribed({"/cmd_vel": "geometry_msgs/msg/Twist"}, domain=DOMAIN) as subscriber,
+        subprocess.Popen([sys.executable, EXAMPLE, "/front/scan"], env=environment) as node,
+    ):
+        try:
+            ros = RosPublisher(participant, topics=["scan"])
+            ros.publish(image_at(START_M, pipeline))
+            await_subscribers([ros.topics["/front/scan"]])
+            for _ in range(MAX_STEPS):
+                ros.publish(image_at(distances_m[-1], pipeline))
+                speed_m_s = velocities(subscriber, until_s=time.monotonic() + 0.2)[-1]
+                distances_m.append(distances_m[-1] - speed_m_s * STEP_S)
+                if speed_m_s == 0 and len(distances_m) > 3:
+                    break
+            afterwards = velocities(subscriber, until_s=time.monotonic() + 1.0)
+        finally:
+            node.terminate()
+    assert STOP_M - 0.5 * STEP_S - 0.05 <= distances_m[-1] <= STOP_M + 0.02
+    assert all(before >= after for before, after in itertools.pairwise(distances_m))
+    assert afterwards[-1] == 0
+
+
+def velocities(subscriber, *, until_s):
+    """Forward speeds of the messages until a time."""
+    received = []
+    while not received or time.monotonic() < until_s:
+        (data,) = subscriber.take(1)["/cmd_vel"]
+        received.append(struct.unpack_from("<d", data, 4)[0])
+    return received
+
+
+def test_scan_without_echoes_in_the_way_is_clear():
+    import importlib.util
+
+    from sensor_msgs.msg import LaserScan
+
+    spec = importlib.util.spec_from_file_location("example", EXAMPLE)
+    example = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(example)
+    scan = LaserScan(angle_min=-1.5, angle_increment=1.5, ranges=[0.4, float("inf"), 0.4])
+    assert example.distance_ahead_m(scan) == float("inf")
+    scan.ranges[1] = 1.25
+    assert example.distance_ahead_m(scan) == 1.25
