@@ -22,6 +22,7 @@ DEVICES = page("devices")
 NETWORK = next(block for block in README.split("```") if "ertis serve" in block)
 ELSEWHERE = {
     *(
+        "command",
         "completion",
         "demo",
         "doctor",
@@ -30,6 +31,7 @@ ELSEWHERE = {
         "listen",
         "presets",
         "record",
+        "reset",
         "ros",
         "rtisdev",
         "serve",

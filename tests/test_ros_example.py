@@ -1,5 +1,6 @@
 """The ROS 2 example stops a simulated robot in front of a simulated wall."""
 
+import importlib.util
 import itertools
 import os
 import struct
@@ -74,14 +75,11 @@ def velocities(subscriber, *, until_s):
 
 
 def test_scan_without_echoes_in_the_way_is_clear():
-    import importlib.util
-
-    from sensor_msgs.msg import LaserScan
-
+    messages = importlib.import_module("sensor_msgs.msg")
     spec = importlib.util.spec_from_file_location("example", EXAMPLE)
     example = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(example)
-    scan = LaserScan(angle_min=-1.5, angle_increment=1.5, ranges=[0.4, float("inf"), 0.4])
+    scan = messages.LaserScan(angle_min=-1.5, angle_increment=1.5, ranges=[0.4, float("inf"), 0.4])
     assert example.distance_ahead_m(scan) == float("inf")
     scan.ranges[1] = 1.25
     assert example.distance_ahead_m(scan) == 1.25

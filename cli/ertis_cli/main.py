@@ -17,6 +17,7 @@ __all__ = ["COMMANDS", "cli", "main"]
 COMMANDS = {
     "bench": ("ertis_cli.bench:bench", "Run benchmarks of speed and accuracy."),
     "capture": ("ertis_cli.capture:capture", "Record measurements, or send them to a central node."),
+    "command": ("ertis_cli.command:command", "Send commands to a sensor and print its answers."),
     "compare": ("ertis_cli.compare:compare", "Compare an energyscape file with the scene's ground truth."),
     "completion": ("ertis_cli.completion:completion", "Print a script that completes commands and options in a shell."),
     "demo": ("ertis_cli.demo:demo", "Run four emulated sensors, a central node and an application."),
@@ -39,6 +40,7 @@ COMMANDS = {
     "process": ("ertis_cli.process:process", "Process recordings into energyscapes."),
     "record": ("ertis_cli.record:record", "Run a central node that stores measurements."),
     "recover": ("ertis_cli.recover:recover", "Recover recordings from journals left by a crash."),
+    "reset": ("ertis_cli.reset:reset", "Reset a sensor and wait until it answers again."),
     "ros": ("ertis_cli.ros:ros", "Publish images and points as live ROS 2 topics."),
     "rtisdev": ("ertis_cli.rtisdev:rtisdev", "Run a script for RTIS Dev."),
     "serve": ("ertis_cli.serve:serve", "Run a central node that computes and publishes images."),

@@ -9,7 +9,7 @@ from typing import Final, Self
 
 from ertis_numba import checks
 from ertis_numba.constants import ERTIS_PDM_RATE_HZ
-from ertis_numba.errors import DataError
+from ertis_numba.errors import ArgumentError, DataError
 
 __all__ = [
     "CODES",
@@ -22,6 +22,7 @@ __all__ = [
     "PDM_RATES_HZ",
     "PINS",
     "Command",
+    "CustomCommand",
     "decode_answer",
     "encode_answer",
     "firmware_version",
@@ -134,6 +135,47 @@ class Command:
     def answers(self) -> bool:
         """True if a number answers it; a block follows `A` instead."""
         return self.code != "A"
+
+
+@dataclass(frozen=True, slots=True)
+class CustomCommand:
+    """One command as text, which may have a code that only some firmware knows.
+
+    Attributes
+    ----------
+    text : str
+        Such as ``!Y,0,0,0``.
+
+    Raises
+    ------
+    ArgumentError
+        It is not of the form ``!X,i,j,k``, or it measures.
+    """
+
+    text: str
+
+    def __post_init__(self) -> None:
+        match = _LINE.fullmatch(self.text.encode())
+        if match is None or "\n" in self.text:
+            raise ArgumentError(
+                f"command is {self.text!r}; give '!X,i,j,k' with a letter X and whole numbers, such as '!Y,0,0,0'"
+            )
+        if match[1] == b"A":
+            raise ArgumentError("command A measures, and no answer follows; call measure(), or use 'ertis capture'")
+
+    @property
+    def about(self) -> str:
+        """Description of the command."""
+        return self.text
+
+    @property
+    def changes_settings(self) -> bool:
+        """True if the command may change the settings of a sensor: all except queries."""
+        return self.text[1] not in "YL"
+
+    def encode(self) -> bytes:
+        """Return the line with its line end."""
+        return self.text.encode() + b"\n"
 
 
 def encode_answer(value: int) -> bytes:

@@ -5,7 +5,7 @@ import logging
 import time
 from collections.abc import Callable, Sequence
 
-from ertis_numba.devices.commands import Command, decode_answer
+from ertis_numba.devices.commands import Command, CustomCommand, decode_answer
 from ertis_numba.devices.line import SerialLine, sonar_error
 from ertis_numba.devices.setup import Setup, call_hash
 from ertis_numba.errors import SonarError
@@ -81,7 +81,7 @@ class Dialogue(SerialLine):
         count = self.drain(within_s=max(within_s, 4 * _QUIET_S), repeat=command)
         self.dropped = before + max(0, count - _ANSWER_BYTES)
 
-    def ask(self, command: Command, *, alone: bool = True) -> int:
+    def ask(self, command: Command | CustomCommand, *, alone: bool = True) -> int:
         """Send a command and return its answer.
 
         Earlier bytes are dropped. If more than an answer arrives, it belonged to something else, and the command is
@@ -89,7 +89,7 @@ class Dialogue(SerialLine):
 
         Parameters
         ----------
-        command : Command
+        command : Command or CustomCommand
         alone : bool
             False where measurements may follow the answer.
 
@@ -180,7 +180,7 @@ class Dialogue(SerialLine):
                 data, latest = data + piece, time.monotonic()
         return data
 
-    def _no_answer(self, command: Command, data: bytes) -> SonarError:
+    def _no_answer(self, command: Command | CustomCommand, data: bytes) -> SonarError:
         instead = f", but sends {data!r}" if data else ""
         return sonar_error(
             f"{self.path} does not answer {command.about!r} within {self._timeout_s:g} s{instead}; is it an "

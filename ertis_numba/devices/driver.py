@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from ertis_numba import checks
 from ertis_numba.devices.block_receiver import Block, BlockReceiver
 from ertis_numba.devices.blocks import COUNTERS, FRAME_BYTES
-from ertis_numba.devices.commands import Command, firmware_version
+from ertis_numba.devices.commands import Command, CustomCommand, firmware_version
 from ertis_numba.devices.dialogue import Dialogue
 from ertis_numba.devices.line import closed_error
 from ertis_numba.devices.ports import Port, find_again, resolve
+from ertis_numba.devices.reset_pin import pulse_reset_pin
 from ertis_numba.devices.setup import Setup
 from ertis_numba.errors import ArgumentError, SonarDisconnectedError, SonarError
 
@@ -342,6 +343,59 @@ class SonarDriver:
         if self._closing.is_set():
             self._hang_up()  # close() has not seen this line.
         return not abandoned()
+
+    def command(self, text: str) -> int:
+        """Send a command as text, and return the answer.
+
+        Unless it is a query, `configure` the sensor afterwards: the command may have changed its settings.
+
+        Parameters
+        ----------
+        text : str
+            ``!X,i,j,k``, such as ``!Y,0,0,0``; the firmware may know other codes than `Command`.
+
+        Raises
+        ------
+        ArgumentError
+            The text is not of this form, or it is the command to measure.
+        SonarError
+            The sensor does not answer.
+
+        Examples
+        --------
+        >>> with SonarDriver.open("/dev/ttyACM0") as sonar:  # doctest: +SKIP
+        ...     version = sonar.command("!Y,0,0,0")
+        """
+        command = CustomCommand(text)
+        self._speak()
+        if self._is_armed:
+            self.disarm()
+        if command.changes_settings:
+            self._configured = None
+        return self._line.ask(command)
+
+    def reset(self, pulse: Callable[[], None] = pulse_reset_pin, *, within_s: float = 60.0) -> None:
+        """Reset the sensor, and wait until it answers again; `configure` it afterwards.
+
+        Parameters
+        ----------
+        pulse : callable
+            Resets the hardware. By default, it sets pin 7 of a Jetson to 0 for a second, where an eRTIS has its reset
+            line.
+        within_s : float
+            Longest time until the sensor answers.
+
+        Raises
+        ------
+        SonarError
+            ``pulse`` cannot reset the hardware.
+        SonarDisconnectedError
+            The sensor does not answer within this time.
+        """
+        self._speak()
+        self._configured, self._is_armed = None, False
+        pulse()
+        self.reconnect(within_s=within_s)
 
     def close(self) -> None:
         """Switch the trigger off if it is on, and close the port; a `listen` in another thread ends."""

@@ -40,6 +40,7 @@ _UNCAUGHT = re.compile(r"Traceback|Error:|Exception|Fatal|Assertion")
 COMMANDS: Final[dict[str, Sequence[str]]] = {
     "bench": ("scaling", "--count", "1", "--quiet"),
     "capture": ("--port", "{port}", "-o", "{out}/captured.h5"),
+    "command": ("--port", "{port}", "!Y,0,0,0"),
     "compare": ("{images}",),
     "completion": ("bash",),
     "demo": ("-o", "{out}/demo"),
@@ -60,6 +61,7 @@ COMMANDS: Final[dict[str, Sequence[str]]] = {
     "record": ("--listen", "tcp://127.0.0.1:0", "-o", "{out}/recordings"),
     "recover": ("{out}/crashed",),
     "ros": ("{recording}", "--duration", "2"),
+    "reset": ("--port", "{port}", "--hook", "true"),
     "rtisdev": ("{script}",),
     "serve": ("--listen", "tcp://127.0.0.1:0", "--publish", "tcp://127.0.0.1:0", "--record", "{out}/recordings"),
     "settings": ("scene",),

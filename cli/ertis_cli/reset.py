@@ -1,0 +1,54 @@
+"""``ertis reset``: reset the hardware of a sensor."""
+
+import shlex
+import subprocess
+from collections.abc import Callable
+from functools import partial
+
+import click
+
+from ertis_cli import options
+
+__all__ = ["reset"]
+
+
+@click.command()
+@click.option("--port", "-p", required=True, metavar="PORT", help="Path, serial number or name of the sensor.")
+@click.option("--pin", type=click.IntRange(1, 40), metavar="N", help="Pin of the board; 7 by default.")
+@click.option("--hook", metavar="COMMAND", help="Program that resets the sensor instead of a pin, with its arguments.")
+@click.option(
+    "--within",
+    "within_s",
+    type=click.FloatRange(min=0, min_open=True),
+    default=60.0,
+    show_default=True,
+    metavar="S",
+    help="Longest time in seconds until the sensor answers again.",
+)
+@options.quiet
+def reset(*, port: str, pin: int | None, hook: str | None, within_s: float, quiet: bool) -> None:
+    """Reset a sensor and wait until it answers again.
+
+    By default, the reset line is on a pin of an NVIDIA Jetson, which needs the package Jetson.GPIO.
+    """
+    from ertis_numba.devices.driver import SonarDriver
+    from ertis_numba.devices.reset_pin import RESET_PIN, pulse_reset_pin
+
+    if hook is not None and pin is not None:
+        raise click.UsageError("--hook and --pin are both given; give one of them")
+    pulse = partial(pulse_reset_pin, pin or RESET_PIN) if hook is None else _runner(hook)
+    with SonarDriver.open(port) as sonar:
+        sonar.reset(pulse, within_s=within_s)
+        options.say(f"{sonar.port} answers again: firmware {sonar.firmware}", quiet=quiet)
+
+
+def _runner(hook: str) -> Callable[[], None]:
+    """Return a function that runs a program, and fails if the program does."""
+
+    def run() -> None:
+        try:
+            subprocess.run(shlex.split(hook), check=True)  # noqa: S603  the user names the program
+        except (OSError, ValueError, subprocess.CalledProcessError) as error:
+            raise click.ClickException(f"--hook {hook!r} has failed ({error}); correct the command") from error
+
+    return run

@@ -1,0 +1,137 @@
+"""Commands as text, and resets, with an emulated sensor on a real pseudo terminal."""
+
+import json
+import sys
+import types
+
+import pytest
+from click.testing import CliRunner
+from ertis_cli.main import cli
+
+from ertis_numba.devices.driver import SonarDriver
+from ertis_numba.devices.emulator import Emulator
+from ertis_numba.devices.reset_pin import pulse_reset_pin
+from ertis_numba.devices.setup import Setup
+from ertis_numba.errors import ArgumentError, SonarDisconnectedError, SonarError
+from tests.emulated import N_SAMPLES, WORDS
+from tests.test_emulate import SHORT
+
+
+@pytest.fixture
+def device(tmp_path, monkeypatch):
+    monkeypatch.setenv("ERTIS_EMULATED_DIR", str(tmp_path))
+    with Emulator(WORDS, link=tmp_path / "mine") as device:
+        yield device
+
+
+def test_commands_are_answered_as_text(device):
+    with SonarDriver.open("mine") as sonar:
+        assert sonar.command("!Y,0,0,0") == 0x010000
+        sonar.configure(Setup.of(SHORT))
+        assert sonar.command("!L,0,0,0") == sonar.call_hash()
+        assert len(sonar.measure().data) == N_SAMPLES
+        assert sonar.command("!B,7,0,0") == 1
+        assert device.registers.counter == 7
+        with pytest.raises(SonarError, match=r"is not configured; call configure\(\) first"):
+            sonar.measure()
+        sonar.configure(Setup.of(SHORT))
+        assert len(sonar.measure().data) == N_SAMPLES
+
+
+def test_command_of_unknown_firmware_is_sent(device):
+    with SonarDriver.open("mine") as sonar:
+        assert sonar.command("!Z,1,2,3") == 0
+    assert device.refused == 1
+
+
+def test_command_disarms_the_sensor(device):
+    with SonarDriver.open("mine") as sonar:
+        sonar.configure(Setup.of(SHORT))
+        sonar.arm()
+        assert device.registers.armed == 1
+        sonar.command("!Y,0,0,0")
+        assert device.registers.armed == 0
+
+
+@pytest.mark.parametrize("text", ["", "Y", "!Y,0,0", "!Y,0,0,0\n", "!y,0,0,0", "!Y,-1,0,0", "!Y,0,0,0;", "!Ü,0,0,0"])
+def test_text_that_is_no_command_is_refused(device, text):
+    with SonarDriver.open("mine") as sonar, pytest.raises(ArgumentError, match="give '!X,i,j,k' with a letter X"):
+        sonar.command(text)
+    assert device.refused == 0
+
+
+@pytest.mark.usefixtures("device")
+def test_command_that_measures_is_refused():
+    with SonarDriver.open("mine") as sonar, pytest.raises(ArgumentError, match=r"command A measures.*call measure"):
+        sonar.command("!A,1,0,0")
+
+
+@pytest.mark.usefixtures("device")
+def test_listening_driver_sends_no_command():
+    with SonarDriver.open("mine", listen_only=True) as sonar:
+        for send in (lambda: sonar.command("!Y,0,0,0"), sonar.reset):
+            with pytest.raises(SonarError, match="listen_only"):
+                send()
+
+
+def test_reset_waits_for_the_sensor(device):
+    with SonarDriver.open("mine") as sonar:
+        sonar.configure(Setup.of(SHORT))
+        sonar.reset(lambda: device.unplug(0.2))
+        assert sonar.firmware == "1.0.0"
+        with pytest.raises(SonarError, match="is not configured"):
+            sonar.measure()
+        sonar.configure(Setup.of(SHORT))
+        assert len(sonar.measure().data) == N_SAMPLES
+        with pytest.raises(SonarDisconnectedError, match=r"did not return within 0\.2 s"):
+            sonar.reset(device.unplug, within_s=0.2)
+
+
+def test_reset_pin_is_pulsed(monkeypatch):
+    steps = []
+    pins = types.SimpleNamespace(
+        BOARD="board", OUT="out", LOW=0, HIGH=1, setmode=steps.append, output=lambda *given: steps.append(given)
+    )
+    pins.setup = lambda pin, mode, initial: steps.append((pin, mode, initial))
+    monkeypatch.setitem(sys.modules, "Jetson", types.SimpleNamespace(GPIO=pins))
+    monkeypatch.setitem(sys.modules, "Jetson.GPIO", pins)
+    monkeypatch.setattr("ertis_numba.devices.reset_pin._PULSE_S", 0.0)
+    pulse_reset_pin()
+    assert steps == ["board", (7, "out", 1), (7, 0), (7, 1)]
+
+
+def test_reset_pin_of_another_computer_is_reported():
+    with pytest.raises(SonarError, match=r"pin 7 cannot be pulsed \(No module named 'Jetson'\).*--hook"):
+        pulse_reset_pin()
+
+
+def run(*arguments):
+    return CliRunner().invoke(cli, [str(argument) for argument in arguments])
+
+
+def test_command_line_sends_commands(device):
+    done = run("command", "--port", "mine", "!Y,0,0,0", "!K,0,0,0")
+    assert (done.exit_code, done.stdout) == (0, "65536\n1\n")
+    done = run("command", "--port", "mine", "!Y,0,0,0", "--json")
+    assert json.loads(done.stdout) == {"command": "!Y,0,0,0", "answer": 65536}
+    refused = run("command", "--port", "mine", "!K,1,0,0", "nonsense")
+    assert (refused.exit_code, device.registers.amplifier) == (1, 0)
+    assert "give '!X,i,j,k'" in refused.stderr
+
+
+@pytest.mark.usefixtures("device")
+def test_command_line_resets_a_sensor(tmp_path):
+    done = run("reset", "--port", "mine", "--hook", f"touch '{tmp_path}/pulled'")
+    assert (done.exit_code, (tmp_path / "pulled").exists()) == (0, True)
+    assert "answers again: firmware 1.0.0" in done.stderr
+    for arguments, message in (
+        (["--hook", "false"], "--hook 'false' has failed"),
+        (["--hook", "no-such-program"], "--hook 'no-such-program' has failed"),
+        (["--hook", "'"], "has failed"),
+        ([], "pin 7 cannot be pulsed"),
+        (["--pin", 9], "pin 9 cannot be pulsed"),
+    ):
+        refused = run("reset", "--port", "mine", *arguments)
+        assert refused.exit_code == 1
+        assert message in refused.stderr
+    assert run("reset", "--port", "mine", "--pin", 9, "--hook", "true").exit_code == 2
