@@ -1,6 +1,7 @@
 """``ertis info``: contents of a file."""
 
 import re
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
@@ -85,13 +86,15 @@ def _label(name: str) -> tuple[str, str]:
 
 
 def _readable(value: Any) -> str:
-    """Format a value for display: lists without brackets, times in UTC to the millisecond."""
+    """Format a value for display: lists without brackets, counts of names, times in UTC to the millisecond."""
     if value is None:
         return "unknown"
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, list):
         return ", ".join(map(_readable, value))
+    if isinstance(value, dict):
+        return ", ".join(f"{count} {name}" for name, count in value.items())
     time = _TIME.fullmatch(value) if isinstance(value, str) else None
     return f"{time[1]} {time[2]}{(time[3] or '')[:4]} UTC" if time else str(value)
 
@@ -142,6 +145,7 @@ def _recording(reader: "RecordingReader") -> dict[str, Any]:
         "duration_ms": round(1000 * recording.duration_s, 3),
         "first": stamps[0].iso,
         "last": stamps[-1].iso,
+        "behaviour": dict(Counter(stamp.behaviour for stamp in stamps)),
         "missing": sum(gap.n_missing for gap in reader.gaps),
         **({"firmware": reader.firmware} if reader.firmware else {}),
         **_mounting(reader),

@@ -20,6 +20,7 @@ from ertis_numba.devices.ports import Port, find_again, resolve
 from ertis_numba.devices.reset_pin import pulse_reset_pin
 from ertis_numba.devices.setup import Setup
 from ertis_numba.errors import ArgumentError, SonarDisconnectedError, SonarError
+from ertis_numba.frames import Behaviour
 
 __all__ = ["SonarDriver"]
 
@@ -112,6 +113,13 @@ class SonarDriver:
     def listen_only(self) -> bool:
         """True if nothing is ever sent to it."""
         return self._listen_only
+
+    @property
+    def behaviour(self) -> Behaviour:
+        """Behaviour of measurements by default: that of the setup; unknown without one, or with ``listen_only``."""
+        if self._configured is None or self._listen_only:
+            return "unknown"
+        return "active" if self._configured[0].active else "passive"
 
     @property
     def receiver(self) -> BlockReceiver:

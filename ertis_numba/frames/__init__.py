@@ -6,10 +6,12 @@ from ertis_numba.frames._gap import SequenceGap
 from ertis_numba.frames._measurement import Measurement, MicrophoneSignals
 from ertis_numba.frames._point_cloud import PointCloud
 from ertis_numba.frames._reflectors import Peak, Reflector
-from ertis_numba.frames._stamp import Stamp
+from ertis_numba.frames._stamp import BEHAVIOURS, Behaviour, Stamp
 
 __all__ = [
+    "BEHAVIOURS",
     "Beams",
+    "Behaviour",
     "Energyscape",
     "Measurement",
     "MicrophoneSignals",

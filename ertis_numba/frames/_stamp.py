@@ -2,9 +2,14 @@
 
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Final
+from typing import Final, Literal, TypeAlias
 
-__all__ = ["Stamp"]
+__all__ = ["BEHAVIOURS", "Behaviour", "Stamp"]
+
+Behaviour: TypeAlias = Literal["active", "passive", "unknown"]
+"""Statement whether a measurement has emitted its call."""
+
+BEHAVIOURS: Final[tuple[Behaviour, ...]] = ("active", "passive", "unknown")
 
 _MIN_CLOCK_NS: Final = 946_684_800 * 10**9  # the year 2000; a clock with an earlier time was never set
 
@@ -27,6 +32,8 @@ class Stamp:
         Uncertainty of the time in nanoseconds.
     session_id : int, default 0
         Number of the sensor's session. The triple (sensor, session_id, sequence) is unique.
+    behaviour : {"active", "passive", "unknown"}, default "unknown"
+        ``active`` if the call was emitted, ``passive`` if not.
 
     Examples
     --------
@@ -41,6 +48,7 @@ class Stamp:
     timestamp_ns: int = 0
     timestamp_uncertainty_ns: int = 0
     session_id: int = 0
+    behaviour: Behaviour = "unknown"
 
     @property
     def is_timed(self) -> bool:

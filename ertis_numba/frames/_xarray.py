@@ -61,6 +61,7 @@ def data_array(
         "sync_count": stamp.sync_count,
         "session_id": stamp.session_id,
         "timestamp_uncertainty_ns": stamp.timestamp_uncertainty_ns,
+        "behaviour": stamp.behaviour,
         "settings": settings.to_toml(),
     }
     return xr.DataArray(values, coords=labels, dims=dims, name=name, attrs=attributes)

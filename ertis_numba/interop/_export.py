@@ -62,7 +62,7 @@ FORMATS: Final = {
         fields=(
             *("amplitude", "azimuth_rad", "elevation_rad", "range_m"),
             *("session_id", "sequence", "sync_count", "timestamp_ns", "timestamp_uncertainty_ns"),
-            *("sensor", "settings"),
+            *("behaviour", "sensor", "settings"),
         ),
     ),
     "acoular": ExportFormat(suffix=".h5", fields=("time_data", "metadata")),

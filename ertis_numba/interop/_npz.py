@@ -48,6 +48,7 @@ def write_npz(path: Path, results: Iterable[Result], count: int | None) -> None:
             stamps = _write_samples(member, itertools.chain([first], rest), first, count)
         arrays: dict[str, Any] = {axis: getattr(first, axis) for axis in axes}
         arrays |= {field: np.array([getattr(stamp, field) for stamp in stamps], dtype=np.int64) for field in _STAMPS}
+        arrays["behaviour"] = np.array([stamp.behaviour for stamp in stamps])
         arrays["sensor"] = np.array(first.stamp.sensor)
         arrays["settings"] = np.array(self_contained(first.settings).to_toml())
         for field, array in arrays.items():

@@ -12,7 +12,14 @@ from urllib.parse import quote
 from ertis_numba.atomic_files import fsync
 from ertis_numba.errors import DamagedError, DataError, FormatVersionError, JournalInUseError
 from ertis_numba.journal._files import companion
-from ertis_numba.journal._tables import APPLICATION_ID, TABLES, VERSION, create_statements
+from ertis_numba.journal._tables import (
+    APPLICATION_ID,
+    COMPLETE_VERSION,
+    TABLES,
+    VERSION,
+    create_statements,
+    upgrade_statements,
+)
 
 __all__ = ["LOG_BYTES", "PAGE_BYTES", "Database"]
 
@@ -109,6 +116,9 @@ class Database:
             )
         for statement in _SETUP:
             self.execute(statement)
+        if 0 < version < COMPLETE_VERSION:
+            for statement in upgrade_statements(version):
+                self.execute(statement)
         if is_new:  # After locking_mode, the log's index is in memory, and no -shm file is created.
             self.execute("PRAGMA journal_mode = WAL")
         return is_new

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError, DamagedError, DataError, SettingsError
-from ertis_numba.frames import Measurement, Stamp
+from ertis_numba.frames import BEHAVIOURS, Measurement, Stamp
 from ertis_numba.geometry import mounting, received_settings, self_contained, storable
 from ertis_numba.journal._tables import row_crc32
 from ertis_numba.sample_format import sample_format
@@ -151,6 +151,7 @@ class JournalSensor:
         """
         stamp, air = entry.measurement.stamp, entry.measurement.settings.air
         words = self._sample_data(entry.measurement.data)
+        checks.choice("behaviour", stamp.behaviour, BEHAVIOURS)
         if entry.crc32 is None:
             entry.crc32 = zlib.crc32(words.data)
         return (
@@ -163,6 +164,7 @@ class JournalSensor:
             float(air.temperature_c),
             float(air.humidity_percent),
             float(air.pressure_pa),
+            stamp.behaviour,
             checks.integer("crc32", entry.crc32, 0, 2**32 - 1),
             words,
         )
@@ -183,8 +185,8 @@ class JournalSensor:
         """
         *values, words = row
         record = f"measurement {row[3]} of sensor {self.name}"
-        _, session_id, sequence, sync_count, time_ns, uncertainty_ns, monotonic_ns, *air, crc32 = verified_values(
-            path, record, values
+        _, session_id, sequence, sync_count, time_ns, uncertainty_ns, monotonic_ns, *air, behaviour, crc32 = (
+            verified_values(path, record, values)
         )
         if not isinstance(words, bytes):  # The recorded type is damaged.
             words = b""
@@ -204,6 +206,7 @@ class JournalSensor:
             timestamp_ns=time_ns,
             timestamp_uncertainty_ns=uncertainty_ns,
             session_id=session_id,
+            behaviour=behaviour or "unknown",
         )
         array = np.frombuffer(words, dtype=self.dtype).reshape(self.shape)
         return JournalEntry(Measurement(array, settings, stamp), monotonic_ns, crc32)
@@ -212,7 +215,7 @@ class JournalSensor:
 def verified_values(path: Path, name: str, row: Sequence[Any]) -> list[Any]:
     """Check the CRC-32 of a row, and return its values without number and CRC-32."""
     _, *values, wanted = row
-    got = row_crc32(values)
+    got = row_crc32(value for value in values if value is not None)  # columns that a former version lacked
     if got != wanted:
         raise DamagedError(
             f"{path}: the record of {name} has CRC-32 {got}, but should have {wanted!r}: the journal is damaged; "

@@ -16,15 +16,19 @@ __all__ = [
     "insert_statement",
     "row_crc32",
     "select_statement",
+    "upgrade_statements",
 ]
 
 APPLICATION_ID: Final = 0x6552544A
 """``eRTJ``, stored by SQLite in the header of the file, beside the version."""
 
-VERSION: Final = 2
-"""Highest version of a journal: 1 until measurements are discarded from it, 2 afterwards."""
+VERSION: Final = 4
+"""Highest version of a journal: 3 until measurements are discarded from it, 4 afterwards.
 
-COMPLETE_VERSION: Final = 1
+Versions 1 and 2 have no column ``behaviour``. Opening adds it without values.
+"""
+
+COMPLETE_VERSION: Final = 3
 """Version of a journal whose row numbers have no holes, except at the front."""
 
 
@@ -93,6 +97,7 @@ TABLES: Final[Mapping[str, tuple[Column, ...]]] = {
         Column("temperature_c", "REAL", "air temperature", "degree_Celsius"),
         Column("humidity_percent", "REAL", "relative humidity", "percent"),
         Column("pressure_pa", "REAL", "air pressure", "Pa"),
+        Column("behaviour", "TEXT", "active if the call was emitted, passive if not, or unknown"),
         Column("crc32", "INTEGER", "CRC-32 of words"),
         _CHECK,
         Column("words", "BLOB", "PDM words, little-endian, as they lie in a recording"),
@@ -119,6 +124,14 @@ def create_statements() -> Iterable[str]:
     yield "CREATE UNIQUE INDEX key ON measurements (sensor, epoch, sequence)"
     yield f"PRAGMA application_id = {APPLICATION_ID}"
     yield f"PRAGMA user_version = {COMPLETE_VERSION}"
+
+
+def upgrade_statements(version: int) -> Iterable[str]:
+    """Yield the statements that bring the tables of an earlier version to the present one."""
+    yield "BEGIN"
+    yield "ALTER TABLE measurements ADD COLUMN behaviour TEXT"
+    yield f"PRAGMA user_version = {version + COMPLETE_VERSION - 1}"
+    yield "COMMIT"
 
 
 def insert_statement(table: str) -> str:

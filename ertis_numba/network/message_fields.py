@@ -5,7 +5,7 @@ from typing import Annotated, ClassVar, Final, Literal
 import msgspec
 from msgspec import Meta
 
-from ertis_numba.frames import Stamp
+from ertis_numba.frames import Behaviour, Stamp
 
 __all__ = [
     "MAX_SEQUENCE",
@@ -86,6 +86,8 @@ class OfMeasurement(Message, frozen=True, kw_only=True):
         Start of the emission, since 1970-01-01 UTC by the sensor node's clock.
     monotonic_ns : int
         Complete arrival at the sensor node, by its monotonic clock.
+    behaviour : {"active", "passive", "unknown"}
+        As in `ertis_numba.frames.Stamp`.
     """
 
     sensor: Name
@@ -95,6 +97,7 @@ class OfMeasurement(Message, frozen=True, kw_only=True):
     timestamp_ns: Int64
     uncertainty_ns: Uint32
     monotonic_ns: Int64
+    behaviour: Behaviour = "unknown"
 
     @property
     def stamp(self) -> Stamp:
@@ -106,4 +109,5 @@ class OfMeasurement(Message, frozen=True, kw_only=True):
             timestamp_ns=self.timestamp_ns,
             timestamp_uncertainty_ns=self.uncertainty_ns,
             session_id=self.session_id,
+            behaviour=self.behaviour,
         )

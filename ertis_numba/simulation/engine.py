@@ -203,6 +203,7 @@ class Engine:
             sequence=index,
             sync_count=index,
             timestamp_ns=round(index * 1e9 / self.scene.rate_hz) + later_ns,
+            behaviour="passive" if self.sensor.emitter.silent else "active",
         )
 
 

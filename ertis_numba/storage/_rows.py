@@ -2,7 +2,7 @@
 
 import zlib
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import h5py
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ertis_numba import checks
 from ertis_numba.atomic_files import require_free_space
 from ertis_numba.errors import ArgumentError, DamagedError
-from ertis_numba.frames import Stamp
+from ertis_numba.frames import BEHAVIOURS, Behaviour, Stamp
 from ertis_numba.storage._gaps import SensorSequences
 from ertis_numba.storage.schema import CHUNK_ROWS
 
@@ -24,6 +24,8 @@ _STAMP_FIELDS = {
     "sync_count": "sync_count",
     "session_id": "session_id",
 }
+_BEHAVIOUR_CODES: Final[dict[Behaviour, int]] = {"active": 1, "passive": 0, "unknown": -1}
+_BEHAVIOURS: Final = {code: behaviour for behaviour, code in _BEHAVIOUR_CODES.items()}
 _COUNT = (0, 2**63 - 1)
 _INT64 = (-(2**63), 2**63 - 1)
 _LIMITS = {
@@ -67,6 +69,8 @@ class RowWriter:
         stamps = {
             name: checks.integer(field, getattr(stamp, field), *_LIMITS[field]) for name, field in _STAMP_FIELDS.items()
         }
+        checks.choice("behaviour", stamp.behaviour, BEHAVIOURS)
+        stamps["behaviour"] = _BEHAVIOUR_CODES[stamp.behaviour]
         self._require_new(stamps["sequence"], stamps["session_id"])
         require_free_space(self._folder, stored.nbytes)
         self._data.resize(self._n_rows + 1, axis=0)
@@ -131,14 +135,21 @@ class RowReader:
 
     def stamp(self, index: int, sensor: str) -> Stamp:
         """Return the stamp of one measurement."""
-        return Stamp(sensor=sensor, **{field: self.column(name, index) for name, field in _STAMP_FIELDS.items()})
+        fields = {field: self.column(name, index) for name, field in _STAMP_FIELDS.items()}
+        code = self.column("behaviour", index) if "behaviour" in self._group else -1
+        return Stamp(sensor=sensor, behaviour=_BEHAVIOURS.get(code, "unknown"), **fields)
 
     def stamps(self, sensor: str) -> list[Stamp]:
         """Return the stamps of all measurements."""
         columns = (self._group[name][:].tolist() for name in _STAMP_FIELDS)
+        codes = self._group["behaviour"][:].tolist() if "behaviour" in self._group else [-1] * len(self)
         return [
-            Stamp(sensor=sensor, **dict(zip(_STAMP_FIELDS.values(), row, strict=True)))
-            for row in zip(*columns, strict=True)
+            Stamp(
+                sensor=sensor,
+                behaviour=_BEHAVIOURS.get(code, "unknown"),
+                **dict(zip(_STAMP_FIELDS.values(), row, strict=True)),
+            )
+            for code, *row in zip(codes, *columns, strict=True)
         ]
 
     def column(self, name: str, index: int) -> Any:

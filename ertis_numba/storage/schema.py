@@ -88,6 +88,7 @@ STAMPS: Final = (
     Variable("sequence", ("time",), "<i8", "number given at capture; a gap is a loss"),
     Variable("sync_count", ("time",), "<i8", "pulse of the SYNC chain, equal for sensors that emitted together"),
     Variable("session_id", ("time",), "<i8", "identifier of the session that gave the sequence numbers"),
+    Variable("behaviour", ("time",), "|i1", "1 if the call was emitted, 0 if not, -1 if unknown", optional=True),
     Variable("crc32", ("time",), "<u4", "CRC-32 of the row of pdm, pcm or amplitude, as its bytes lie in the file"),
 )
 

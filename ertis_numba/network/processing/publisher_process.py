@@ -148,7 +148,10 @@ class _Publisher:
         mark("image fetched", sensor, note.data.sequence)
         common: dict[str, Any] = {
             name: getattr(note.data, name)
-            for name in ("session_id", "sequence", "sync_count", "timestamp_ns", "uncertainty_ns", "monotonic_ns")
+            for name in (
+                *("session_id", "sequence", "sync_count", "timestamp_ns", "uncertainty_ns", "monotonic_ns"),
+                "behaviour",
+            )
         } | {"sensor": sensor, "number": 0, "dropped": 0}
         times: dict[str, Any] = {"received_ns": note.received_ns, "published_ns": 0}
         about = self._subscribers.description(sensor, note.description)

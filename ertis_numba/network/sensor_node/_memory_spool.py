@@ -132,7 +132,9 @@ class Spool:
                 require_same_settings(sensor, settings)
                 self._accepted[sensor.name] = settings
             # The encoder requires contiguous little-endian data and Python integers.
-            session_id, number, sync_count, time_ns, uncertainty_ns, *rest, crc32, words = sensor.entry_values(entry)
+            session_id, number, sync_count, time_ns, uncertainty_ns, *rest, behaviour, crc32, words = (
+                sensor.entry_values(entry)
+            )
             checks.integer("sequence", number, 0, MAX_SEQUENCE)
             stamp = Stamp(
                 sensor=sensor.name,
@@ -141,6 +143,7 @@ class Spool:
                 timestamp_ns=time_ns,
                 timestamp_uncertainty_ns=uncertainty_ns,
                 session_id=session_id,
+                behaviour=behaviour,
             )
             entry.measurement = type(entry.measurement)(words, settings, stamp)
             entry.monotonic_ns, entry.crc32 = rest[0], crc32

@@ -77,5 +77,6 @@ def frames_of(run: OutgoingSession, item: UnackedItem, entry: JournalEntry | Non
         humidity_percent=float(air.humidity_percent),
         pressure_pa=float(air.pressure_pa),
         crc32=entry.crc32 or 0,
+        behaviour=stamp.behaviour,
     )
     return [messages.encode(data), entry.measurement.data.data.cast("B")], stamp.sequence

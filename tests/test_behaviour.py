@@ -1,0 +1,98 @@
+"""Whether a call was emitted is kept from the sensor to files, the network and exports."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from ertis_cli.main import cli
+
+from ertis_numba.errors import ArgumentError
+from ertis_numba.frames import Measurement, Stamp
+from ertis_numba.interop import export
+from ertis_numba.journal import Journal, JournalEntry
+from ertis_numba.network.central_node import Archive
+from ertis_numba.network.sensor_node import SensorNode
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.simulation import Emitter, Scene, Sensor
+from ertis_numba.simulation.render import render
+from ertis_numba.storage import open_energyscapes, open_recording, write_energyscapes, write_recording
+from ertis_numba.storage.sealing import seal
+from tests.central import running
+from tests.emulated import WORDS
+from tests.test_device_commands import device  # noqa: F401  a fixture
+from tests.test_emulate import SHORT
+
+GIVEN = ["active", "passive", "unknown"]
+
+
+@pytest.fixture
+def measurements():
+    return [
+        Measurement(words, SHORT, Stamp(sensor="mine", sequence=number, behaviour=behaviour))
+        for number, (words, behaviour) in enumerate(zip(WORDS, GIVEN, strict=True))
+    ]
+
+
+def behaviours(path, opened=open_recording):
+    with opened(path) as reader:
+        assert [stamp.behaviour for stamp in reader.stamps()] == [each.stamp.behaviour for each in reader]
+        return [stamp.behaviour for stamp in reader.stamps()]
+
+
+def test_files_keep_the_behaviour(measurements, tmp_path):
+    assert behaviours(write_recording(tmp_path / "rec.h5", measurements)) == GIVEN
+    with Pipeline(SHORT) as pipeline:
+        images = [pipeline.process(each) for each in measurements]
+    assert behaviours(write_energyscapes(tmp_path / "img.h5", images), open_energyscapes) == GIVEN
+    export(tmp_path / "images.npz", images)
+    with np.load(tmp_path / "images.npz") as stored:
+        assert stored["behaviour"].tolist() == GIVEN
+    assert images[1].to_xarray().attrs["behaviour"] == "passive"
+
+
+def test_unknown_behaviour_is_refused(measurements, tmp_path):
+    wrong = replace(measurements[0], stamp=Stamp(sensor="mine", behaviour="loud"))
+    with pytest.raises(ArgumentError, match="behaviour 'loud' is unknown"):
+        write_recording(tmp_path / "rec.h5", [wrong])
+
+
+def test_journal_keeps_the_behaviour(measurements, tmp_path):
+    path = tmp_path / "rec.h5.journal"
+    with Journal.create(path, target="rec.h5", source="test") as journal:
+        journal.add_sensor("mine", SHORT)
+        journal.append([JournalEntry(each, monotonic_ns=0) for each in measurements])
+    seal(path)
+    assert behaviours(tmp_path / "rec.h5") == GIVEN
+
+
+def test_network_keeps_the_behaviour(measurements, tmp_path):
+    with running(archive=Archive(tmp_path)) as central, SensorNode(central.address) as node:
+        node.add_sensor("mine", SHORT)
+        node.append([JournalEntry(each, monotonic_ns=0) for each in measurements])
+        assert node.flush(30.0)
+    (path,) = tmp_path.glob("*.h5")
+    assert behaviours(path) == GIVEN
+
+
+@pytest.mark.usefixtures("device")
+@pytest.mark.parametrize(("options", "behaviour"), [([], "active"), (["--passive"], "passive")])
+def test_capture_stores_the_behaviour(tmp_path, options, behaviour):
+    (tmp_path / "settings.toml").write_text(SHORT.to_toml())
+    path = tmp_path / "rec.h5"
+    command = ["capture", "--port", "mine", "--settings", tmp_path / "settings.toml", "-n", 2, "-o", path, *options]
+    command += ["--no-check-bits"]
+    done = CliRunner().invoke(cli, [str(each) for each in command])
+    assert done.exit_code == 0, done.stderr
+    assert behaviours(path) == [behaviour, behaviour]
+    shown = CliRunner().invoke(cli, ["info", str(path)])
+    assert f"2 {behaviour}" in shown.stdout
+    report = json.loads(CliRunner().invoke(cli, ["info", "--json", str(path)]).stdout)
+    assert report["behaviour"] == {behaviour: 2}
+
+
+def test_simulated_measurements_state_their_behaviour():
+    assert render(Scene()).stamp.behaviour == "active"
+    silent = Scene(sensors=(Sensor(emitter=Emitter(silent=True)),))
+    assert render(silent).stamp.behaviour == "passive"
