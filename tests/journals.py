@@ -64,7 +64,7 @@ def crashed(folder, given=None, *, moment="log", **options):
             execute("UPDATE measurements SET crc32 = 0")
             execute("INSERT INTO gaps SELECT NULL, 1, 1, 1, 1, 'x', 0 FROM measurements, sensors")
             for number in range(60):
-                execute(insert_statement("measurements"), (1, EPOCH, 100 + number, *[0] * 9, bytes(4096)))
+                execute(insert_statement("measurements"), (1, EPOCH, 100 + number, *[0] * 10, bytes(4096)))
         for path in (folder / "running").iterdir():
             shutil.copy(path, folder)
     shutil.rmtree(folder / "running")

@@ -4,6 +4,7 @@ import json
 import sys
 import types
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
@@ -13,6 +14,8 @@ from ertis_numba.devices.emulator import Emulator
 from ertis_numba.devices.reset_pin import pulse_reset_pin
 from ertis_numba.devices.setup import Setup
 from ertis_numba.errors import ArgumentError, SonarDisconnectedError, SonarError
+from ertis_numba.settings import Call
+from ertis_numba.storage import open_recording
 from tests.emulated import N_SAMPLES, WORDS
 from tests.test_emulate import SHORT
 
@@ -135,3 +138,30 @@ def test_command_line_resets_a_sensor(tmp_path):
         assert refused.exit_code == 1
         assert message in refused.stderr
     assert run("reset", "--port", "mine", "--pin", 9, "--hook", "true").exit_code == 2
+
+
+def test_emissions_have_a_period():
+    setup = Setup.of(SHORT, emissions=3, emission_period_s=5e-3)
+    assert (setup.emissions, len(setup.codes)) == (3, 2250)
+    n_call = len(Setup.of(SHORT).codes)
+    assert np.array_equal(setup.codes[:n_call], Setup.of(SHORT).codes)
+    assert set(setup.codes[n_call:]) == {2048}
+    with pytest.raises(ArgumentError, match=r"emission period is 0\.001 s, but the call lasts 0\.0025 s"):
+        Setup.of(SHORT, emission_period_s=1e-3)
+
+
+def test_capture_emits_a_waveform_from_a_file(device, tmp_path):
+    call = np.sin(2 * np.pi * 40e3 * np.arange(200) / 450e3) * np.hanning(200)
+    np.savetxt(tmp_path / "call.csv", np.append(call, np.zeros(300)))
+    (tmp_path / "settings.toml").write_text(SHORT.to_toml())
+    files = ["--settings", tmp_path / "settings.toml", "--call", tmp_path / "call.csv", "-o", tmp_path / "rec.h5"]
+    options = ["-n", 1, "--emissions", 2, "--emission-period", 0.002, "--no-check-bits"]
+    done = run("capture", "--port", "mine", *files, *options)
+    assert done.exit_code == 0, done.stderr
+    registers = device.registers
+    assert (registers.emissions, registers.n_codes) == (2, 900)  # 2 ms at 450 kHz
+    assert np.abs(registers.codes[:200] - (2047 * call / np.abs(call).max() + 2048)).max() <= 1
+    with open_recording(tmp_path / "rec.h5") as recording:
+        assert recording.settings.call.waveform == Call.from_file(tmp_path / "call.csv").waveform
+    refused = run("capture", "--port", "mine", "--call", tmp_path / "none.csv", "-o", tmp_path / "b.h5")
+    assert (refused.exit_code, "no such file" in refused.stderr) == (1, True)

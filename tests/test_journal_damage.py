@@ -39,7 +39,7 @@ DAMAGED = {
     "time": (
         "UPDATE measurements SET timestamp_ns = 7 WHERE id = 2",
         (
-            "the record of measurement 11 of sensor left has CRC-32 1844115737, but should have 32022344: "
+            "the record of measurement 11 of sensor left has CRC-32 4077814677, but should have 1377004288: "
             "the journal is damaged"
         ),
     ),
@@ -344,8 +344,8 @@ def test_journal_sealed_meanwhile_by_another_process(tmp_path, monkeypatch, agai
 
 def test_newer_journal_version_is_refused(tmp_path):
     create(tmp_path).close()
-    spoil(tmp_path / "rec.h5.journal", "PRAGMA user_version = 3")
-    with pytest.raises(FormatVersionError, match="has format version 3, but this package reads up to 2; update"):
+    spoil(tmp_path / "rec.h5.journal", "PRAGMA user_version = 5")
+    with pytest.raises(FormatVersionError, match="has format version 5, but this package reads up to 4; update"):
         Journal.open(tmp_path / "rec.h5.journal")
 
 

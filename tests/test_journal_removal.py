@@ -48,10 +48,10 @@ def test_acknowledged_measurements_can_be_discarded(tmp_path):
         assert [entry.measurement.stamp.sequence for entry in journal.entries()] == [100]
 
 
-def test_journal_without_discards_has_version_1(tmp_path):
+def test_journal_without_discards_has_version_3(tmp_path):
     with create(tmp_path) as journal:
-        assert version(journal.path) in (0, 1)
-    assert version(journal.path) == 1
+        assert version(journal.path) in (0, 3)
+    assert version(journal.path) == 3
 
 
 def test_remaining_measurements_are_sealed(tmp_path):

@@ -20,8 +20,10 @@ from ertis_cli.main import cli
 from scipy.ndimage import maximum_filter1d
 
 import ertis_numba.rtisdev
+from ertis_numba.devices.setup import Setup
 from ertis_numba.errors import ArgumentError
 from ertis_numba.rtisdev import rtiscuda, rtisserial
+from ertis_numba.settings import Call, Settings
 from ertis_numba.simulation import Point, Scene
 from ertis_numba.simulation.render import render
 from tests import rtisdev_reference
@@ -138,6 +140,9 @@ def test_beamformers_equal_the_reference(order, coherent):
     compare(prepared(directions=91, dmasOrder=order, cfEnable=coherent))
 
 
+OFF = dict.fromkeys(
+    ["pdmEnable", "matchedFilterEnable", "beamformingEnable", "cleanEnable", "enveloppeEnable", "preloadToggle"], False
+)
 BANDS = {
     "preFilter": np.hanning(65).astype(np.float32) / 32,
     "postFilter": (np.hanning(64) * np.cos(0.5 * np.arange(64))).astype(np.float32) / 16,
@@ -323,6 +328,18 @@ def test_replacements_run(tmp_path):
             exec(code.replace("/dev/ttyACM0", str(port)), names)
     assert len(names["images"]) == 2
     assert len(names["image"].amplitude) == 181
+
+
+def test_flutter_call_is_that_of_the_package():
+    """The options of our page upload the samples that the preset uploads."""
+    folder = Path(rtisdev.__file__).parent / "config" / "premadeSettings" / "recording"
+    theirs = rtisdev.get_settings(recordingJsonPath=str(folder / "flutter.json"), **OFF)
+    call = Call.from_file(folder / "flutter.csv")
+    setup = Setup.of(Settings().replace(call=call), emissions=186, emission_period_s=0.02)
+    codes = np.floor(2047 * theirs.dacSignal + 2048)
+    assert len(setup.codes) == theirs.dacSamples == 9000
+    assert np.abs(setup.codes - codes).max() <= 1  # Our samples have a peak of 1, theirs of 0.99999.
+    assert setup.emissions == theirs.callEmissions
 
 
 def test_unknown_names_and_wrong_shapes_are_refused(caplog):

@@ -100,6 +100,20 @@ _POLL_INTERVAL_S = 0.1  # interval between searches for ports
 )
 @click.option("--emissions", type=int, default=1, show_default=True, metavar="N", help="Emissions per measurement.")
 @click.option(
+    "--emission-period",
+    "emission_period_s",
+    type=float,
+    metavar="S",
+    help="Interval between the emissions of a measurement in seconds; without a pause by default.",
+)
+@click.option(
+    "--call",
+    "call_file",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Waveform of the call: .wav, or .csv or .npy with samples at 450 kHz.",
+)
+@click.option(
     "--preset",
     metavar="NAME",
     shell_complete=_presets.completion("recording"),
@@ -150,6 +164,8 @@ def capture(
     passive: bool,
     listen_only: bool,
     emissions: int,
+    emission_period_s: float | None,
+    call_file: Path | None,
     preset: str | None,
     layout: str | None,
     settings_file: Path | None,
@@ -175,9 +191,9 @@ def capture(
     """
     from ertis_numba.devices.setup import Setup
 
-    settings = _settings(preset, layout, settings_file, temperature)
+    settings = _settings(preset, layout, settings_file, temperature, call_file)
     trigger = "sync" if listen_only else trigger
-    setup = Setup.of(settings, active=not passive, pin=pin, emissions=emissions)
+    setup = Setup.of(settings, active=not passive, pin=pin, emissions=emissions, emission_period_s=emission_period_s)
     if dry_run:
         _print_commands(setup, as_json=as_json)
         return
@@ -383,10 +399,14 @@ def _require_one_each(ports: tuple[str, ...], names: tuple[str, ...]) -> None:
 
 
 def _settings(
-    preset: str | None, layout: str | None, settings_file: Path | None, temperature: float | None
+    preset: str | None,
+    layout: str | None,
+    settings_file: Path | None,
+    temperature: float | None,
+    call_file: Path | None,
 ) -> "Settings":
-    """Return settings from a preset or a file, with the given layout and air temperature."""
-    from ertis_numba.settings import Air, Array, Settings
+    """Return settings from a preset or a file, with the given layout, air temperature and call."""
+    from ertis_numba.settings import Air, Array, Call, Settings
 
     if settings_file is not None and preset is not None:
         raise click.UsageError("--preset and --settings exclude each other; give one of them")
@@ -396,6 +416,8 @@ def _settings(
     if temperature is not None:
         air = Air() if settings_file is None else settings.air
         settings = settings.replace(air=air.replace(temperature_c=temperature))
+    if call_file is not None:
+        settings = settings.replace(call=Call.from_file(call_file))
     return settings
 
 

@@ -33,14 +33,15 @@ def call_codes(call: Call) -> NDArray[np.uint16]:
 
 
 def call_from_codes(codes: NDArray[np.uint16], rate_hz: float) -> Call:
-    """Return the call of codes of the converter as a custom waveform with a peak of 1.
+    """Return the call of codes of the converter as a custom waveform with a peak of 1, without silence at the end.
 
     Raises
     ------
     ArgumentError
         There are too many samples, or they have no usable band.
     """
-    samples = (codes + 0.5 - 2048) / 2047  # Codes were rounded down.
+    loud = np.flatnonzero(np.abs(codes - 2047.5) > 0.5)  # Silence is 2048, or 2047 if its samples are negative.
+    samples = (codes[: loud.max(initial=-1) + 2] + 0.5 - 2048) / 2047  # Codes were rounded down.
     return Call(waveform=tuple(samples.tolist()), sample_rate_hz=rate_hz)
 
 
@@ -110,8 +111,19 @@ class Setup:
             )
 
     @classmethod
-    def of(cls, settings: Settings, *, active: bool = True, pin: int = 1, emissions: int = 1) -> Self:
+    def of(
+        cls,
+        settings: Settings,
+        *,
+        active: bool = True,
+        pin: int = 1,
+        emissions: int = 1,
+        emission_period_s: float | None = None,
+    ) -> Self:
         """Return the configuration for ``settings``.
+
+        Several emissions follow each other without a pause, or at an interval of ``emission_period_s``. The call then
+        ends with silence.
 
         For passive measurements the amplifier is off, too, although a call is loaded: ``dataclasses.replace(setup,
         amplifier=True)`` allows single measurements to be active.
@@ -128,7 +140,7 @@ class Setup:
         return cls(
             n_samples=recording.n_samples,
             pdm_rate_hz=recording.sample_rate_hz,
-            codes=call_codes(call),
+            codes=_with_silence(call_codes(call), call.sample_rate_hz, emission_period_s),
             dac_rate_hz=_dac_rate_hz(call.sample_rate_hz),
             emissions=emissions,
             active=active,
@@ -158,6 +170,18 @@ class Setup:
     def after_call(self) -> list[Command]:
         """Return the last commands; afterwards the counter may be set and the trigger switched on."""
         return [Command("I", self.emissions), Command("K", int(self.amplifier)), Command("H", int(self.active))]
+
+
+def _with_silence(codes: NDArray[np.uint16], rate_hz: float, period_s: float | None) -> NDArray[np.uint16]:
+    """Return codes with silence up to a period."""
+    if period_s is None:
+        return codes
+    n_samples = round(checks.positive("emission period", period_s) * rate_hz)
+    if n_samples < len(codes):
+        raise ArgumentError(
+            f"emission period is {period_s:g} s, but the call lasts {len(codes) / rate_hz:.3g} s; give at least that"
+        )
+    return np.pad(codes, (0, n_samples - len(codes)), constant_values=2048)
 
 
 def _check_length(n_samples: int) -> None:

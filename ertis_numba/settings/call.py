@@ -36,8 +36,9 @@ class Call(TomlTable, frozen=True, kw_only=True):
         echoes of hyperbolic sweeps without blurring them; eRTIS uses these.
     waveform : str or tuple of float, optional, default None
         Custom waveform instead of a sweep: 17 to 4096 samples at ``sample_rate_hz``, or the name of a file with
-        samples, relative to the folder of the settings. A WAV file has its own rate. Samples are scaled to a peak of 1.
-        The other keys follow from the samples: the frequencies are the edges of their band at -20 dB.
+        samples, relative to the folder of the settings. Zeros at the end of a longer waveform do not count. A WAV file
+        has its own rate. Samples are scaled to a peak of 1. The other keys follow from the samples: the frequencies are
+        the edges of their band at -20 dB.
 
     Examples
     --------

@@ -74,7 +74,7 @@ def _read_numbers(path: Path, suffix: str) -> NDArray[Any]:
 
 
 def normalise(samples: tuple[float, ...], rate_hz: float) -> tuple[float, ...]:
-    """Return samples scaled to a peak of 1, with seven decimals.
+    """Return samples scaled to a peak of 1, with seven decimals. Many samples lose the zeros at their end.
 
     Raises
     ------
@@ -82,6 +82,8 @@ def normalise(samples: tuple[float, ...], rate_hz: float) -> tuple[float, ...]:
         The samples are too few or too many, one is not finite, or all are 0.
     """
     smallest = 17  # the duration of a call is at least 16 samples
+    if len(samples) > MAX_WAVEFORM_SAMPLES:
+        samples = samples[: max((number + 1 for number, sample in enumerate(samples) if sample), default=len(samples))]
     if not smallest <= len(samples) <= MAX_WAVEFORM_SAMPLES:
         raise ArgumentError(
             f"call.waveform has {len(samples)} samples; give {smallest} to {MAX_WAVEFORM_SAMPLES}, at "

@@ -306,7 +306,7 @@ def _begin_another_commit(journal: Journal) -> None:
     execute("BEGIN")
     execute("UPDATE measurements SET crc32 = 0 WHERE id % 9 = 1")
     for number in range(60):
-        execute(insert_statement("measurements"), (1, _SESSION_ID, 10_000 + number, *[0] * 9, bytes(8192)))
+        execute(insert_statement("measurements"), (1, _SESSION_ID, 10_000 + number, *[0] * 10, bytes(8192)))
 
 
 def _make_files(state: str, folder: Path) -> None:

@@ -22,9 +22,10 @@ def _filter(beams, taps, scale, factor, first, out):
     for number in range(taps.size):
         tap = np.uint64(number)
         total += np.float32(taps[tap]) * abs(beams[direction, start + tap])
-    out[direction, r] = np.float32(scale) * total
+    out[direction, r] = scale * total
 
 
 def rectify_and_decimate(beams, taps, scale, factor, first, out):
     """Rectify real beams, filter them, and keep every factor-th sample."""
-    launch(_filter, (out.shape[0], -(-out.shape[1] // _BLOCK)), (_BLOCK,), beams, taps, scale, factor, first, out)
+    grid = (out.shape[0], -(-out.shape[1] // _BLOCK))
+    launch(_filter, grid, (_BLOCK,), beams, taps, np.float32(scale), factor, first, out)
