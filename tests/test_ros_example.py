@@ -18,7 +18,7 @@ from ertis_numba.settings import Processing, Settings
 from ertis_numba.simulation import Scene, Sensor, Wall
 from ertis_numba.simulation.render import render
 from tests.journals import ENVIRONMENT
-from tests.test_ros import await_subscribers, subscribed
+from tests.ros_topics import await_subscribers, subscribed
 
 pytest.importorskip("rclpy.serialization")  # Wheels exist for some versions of Python only.
 pytest.importorskip("cyclonedds")

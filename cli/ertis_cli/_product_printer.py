@@ -24,7 +24,10 @@ __all__ = ["PRINTERS", "MicrophoneTable"]
 _HEAD = f"{'sensor':12}  {'sequence':>8}  {'age':>8}  {'made in':>8}  {'dropped':>7}  what"
 _SOON_S = 3.0
 _SILENT_S = 5.0
-_STAMP = ("sensor", "session_id", "sequence", "sync_count", "timestamp_ns", "uncertainty_ns", "monotonic_ns")
+_STAMP = (
+    *("sensor", "session_id", "sequence", "sync_count", "timestamp_ns", "uncertainty_ns", "monotonic_ns"),
+    "behaviour",
+)
 _ROW = "{sensor:12}  {sequence:8d}  {age:>8}  {made_in:>8}  {dropped:7d}  {text}"
 
 

@@ -76,6 +76,7 @@ class Watch:
                         "sync_count": stamp.sync_count,
                         "timestamp_ns": stamp.timestamp_ns,
                         "uncertainty_ns": stamp.timestamp_uncertainty_ns,
+                        "behaviour": stamp.behaviour,
                         "crc32": entry.crc32,
                     }
                 )
