@@ -1,6 +1,7 @@
 """Whether a call was emitted is kept from the sensor to files, the network and exports."""
 
 import json
+import subprocess
 from dataclasses import replace
 
 import numpy as np
@@ -8,10 +9,13 @@ import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
-from ertis_numba.errors import ArgumentError
+from ertis_numba.devices.driver import SonarDriver
+from ertis_numba.devices.setup import Setup
+from ertis_numba.errors import ArgumentError, DamagedError
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.interop import export
 from ertis_numba.journal import Journal, JournalEntry
+from ertis_numba.journal._tables import row_crc32
 from ertis_numba.network.central_node import Archive
 from ertis_numba.network.sensor_node import SensorNode
 from ertis_numba.pipeline import Pipeline
@@ -20,7 +24,8 @@ from ertis_numba.simulation.render import render
 from ertis_numba.storage import open_energyscapes, open_recording, write_energyscapes, write_recording
 from ertis_numba.storage.sealing import seal
 from tests.central import running
-from tests.emulated import WORDS
+from tests.emulated import TIMEOUT_S, WORDS
+from tests.test_capture import ERTIS
 from tests.test_device_commands import device  # noqa: F401  a fixture
 from tests.test_emulate import SHORT
 
@@ -67,6 +72,18 @@ def test_journal_keeps_the_behaviour(measurements, tmp_path):
     assert behaviours(tmp_path / "rec.h5") == GIVEN
 
 
+def test_journal_with_an_unknown_behaviour_is_damaged(measurements, tmp_path):
+    with Journal.create(tmp_path / "rec.h5.journal", target="rec.h5", source="test") as journal:
+        journal.add_sensor("mine", SHORT)
+        journal.append([JournalEntry(measurements[0], monotonic_ns=0)])
+        execute = journal._database.execute  # noqa: SLF001  no public access
+        execute("UPDATE measurements SET behaviour = 'loud'")
+        ((*values, _, _),) = execute("SELECT * FROM measurements")
+        execute("UPDATE measurements SET row_crc32 = ?", (row_crc32(values[1:]),))
+        with pytest.raises(DamagedError, match="has behaviour 'loud', wanted one of active, passive, unknown; copy"):
+            next(journal.entries())
+
+
 def test_network_keeps_the_behaviour(measurements, tmp_path):
     with running(archive=Archive(tmp_path)) as central, SensorNode(central.address) as node:
         node.add_sensor("mine", SHORT)
@@ -90,6 +107,51 @@ def test_capture_stores_the_behaviour(tmp_path, options, behaviour):
     assert f"2 {behaviour}" in shown.stdout
     report = json.loads(CliRunner().invoke(cli, ["info", "--json", str(path)]).stdout)
     assert report["behaviour"] == {behaviour: 2}
+
+
+@pytest.mark.parametrize("active", [True, False])
+def test_measurement_has_the_behaviour_of_its_command(device, active):  # noqa: F811  a fixture
+    with SonarDriver.open("mine") as sonar:
+        sonar.configure(replace(Setup.of(SHORT, active=not active), amplifier=True))
+        assert sonar.measure(active=active).behaviour == ("active" if active else "passive")
+        assert sonar.measure().behaviour == ("passive" if active else "active")
+    assert device.registers.amplifier == 1
+
+
+@pytest.mark.parametrize("active", [True, False])
+def test_triggered_measurements_have_the_behaviour_of_the_setup(device, active):  # noqa: F811  a fixture
+    with SonarDriver.open("mine") as sonar:
+        sonar.configure(Setup.of(SHORT, active=active))
+        sonar.arm()
+        assert device.trigger()
+        block = next(sonar.listen(stop=lambda: False, timeout_s=TIMEOUT_S))
+    assert block.behaviour == ("active" if active else "passive")
+
+
+def test_measurements_of_another_programs_sensor_have_unknown_behaviour(device):  # noqa: F811  a fixture
+    with SonarDriver.open("mine") as first:
+        first.configure(Setup.of(SHORT))
+        first.arm()
+        first._is_armed = False  # noqa: SLF001  so that it leaves the sensor armed
+    with SonarDriver.open("mine", listen_only=True) as sonar:
+        sonar.configure(Setup.of(SHORT))
+        assert device.trigger()
+        assert next(sonar.listen(stop=lambda: False, timeout_s=TIMEOUT_S)).behaviour == "unknown"
+
+
+@pytest.mark.usefixtures("device")
+def test_behaviour_survives_a_killed_capture(tmp_path):
+    (tmp_path / "settings.toml").write_text(SHORT.to_toml())
+    command = [*ERTIS, "capture", "--port", "mine", "--settings", "settings.toml", "-o", "rec.h5", "--passive"]
+    command += ["--json", "--quiet", "--no-check-bits"]
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, text=True) as process:
+        assert all(process.stdout.readline() for _ in range(3))
+        process.kill()
+    done = CliRunner().invoke(cli, ["recover", str(tmp_path)])
+    assert done.exit_code == 0, done.stderr
+    found = behaviours(tmp_path / "rec.h5")
+    assert len(found) >= 3
+    assert set(found) == {"passive"}
 
 
 def test_simulated_measurements_state_their_behaviour():

@@ -199,14 +199,14 @@ def test_malformed_messages_are_counted_and_other_peers_served(tmp_path):
             header = bytearray(generator.choice(known))
             header[generator.randrange(len(header))] ^= 1 << generator.randrange(8)
             stranger.socket.send_multipart([bytes(header), *[b"1234"] * generator.randrange(8)])
-        stranger.socket.send_multipart([b"eRTN\x02more"])
+        stranger.socket.send_multipart([b"eRTN\x01more"])
         stranger.socket.send_multipart([b""])
         node.measure(*given)
         node.hear_settled(12)
         reported = ""
-        while "has protocol version 2, " not in reported:  # flipping one bit never turns version 1 into 2
+        while "has protocol version 1, " not in reported:  # flipping one bit never turns version 2 into 1
             if not stranger.socket.poll(500):  # a peer that does not read its socket loses answers
-                stranger.socket.send_multipart([b"eRTN\x02more"])
+                stranger.socket.send_multipart([b"eRTN\x01more"])
             reported = stranger.hear(Refused).reason
     assert stored(tmp_path)[0] == wanted(given)
     refused = central.latest.refused

@@ -289,6 +289,7 @@ def test_mcap_metadata_contains_the_settings(tmp_path):
     assert (record.name, record.metadata["sensor"]) == ("ertis_numba/eRTIS-7", "eRTIS-7")
     settings = Settings.from_toml(record.metadata["settings"])
     assert settings.replace(array=SMALL.array) == SMALL
+    assert [record.metadata[f"n_{name}"] for name in ("active", "passive", "unknown")] == ["0", "0", "1"]
     assert set(read(path)[2]) == {"/eRTIS_7/points", "/tf_static"}  # and no transform, as nobody knows one
     assert read(path)[0]["/tf_static", TIME_NS].transforms == []
 

@@ -116,7 +116,7 @@ def test_encoded_messages_are_decoded(message):
 
 
 def test_encoded_header_has_the_documented_bytes():
-    assert encode(Ping()) == b"eRTN\x01\x81\xa4kind\xa4ping"
+    assert encode(Ping()) == b"eRTN\x02\x81\xa4kind\xa4ping"
 
 
 @pytest.mark.parametrize(
@@ -126,13 +126,13 @@ def test_encoded_header_has_the_documented_bytes():
         (b"eRT", "begins with b'eRT'"),
         (b"GET / HTTP/1.1", "begins with b'GET '"),
         (b"eRTN", "this node speaks|begins with|cannot be read|version"),
-        (b"eRTN\x01", "cannot be decoded"),
-        (b"eRTN\x01\xc1", "cannot be decoded"),
-        (b"eRTN\x01\x81\xa4kind\xa4pong", "missing required field `state`"),
-        (b"eRTN\x01\x82\xa4kind\xa4ping\xa1x\x01", "unknown field `x`"),
-        (b"eRTN\x01\x81\xa4kind\xa4exec", "cannot be decoded"),
-        (b"eRTN\x01" + b"\x91" * 4000, "cannot be decoded"),
-        (b"eRTN\x01" + bytes(HEADER_BYTES), r"4101 bytes; the limit is 4096"),
+        (b"eRTN\x02", "cannot be decoded"),
+        (b"eRTN\x02\xc1", "cannot be decoded"),
+        (b"eRTN\x02\x81\xa4kind\xa4pong", "missing required field `state`"),
+        (b"eRTN\x02\x82\xa4kind\xa4ping\xa1x\x01", "unknown field `x`"),
+        (b"eRTN\x02\x81\xa4kind\xa4exec", "cannot be decoded"),
+        (b"eRTN\x02" + b"\x91" * 4000, "cannot be decoded"),
+        (b"eRTN\x02" + bytes(HEADER_BYTES), r"4101 bytes; the limit is 4096"),
         (encode(Ping()) + b"\0", "cannot be decoded"),
     ],
 )
@@ -143,9 +143,9 @@ def test_invalid_header_is_refused_in_one_line(header, reported):
     assert len(str(caught.value).splitlines()) == 1
 
 
-@pytest.mark.parametrize("version", [0, 2, 255])
+@pytest.mark.parametrize("version", [0, 1, 255])
 def test_other_version_is_distinguished_from_garbage(version):
-    with pytest.raises(FormatVersionError, match=f"has protocol version {version}, but this node uses 1; use"):
+    with pytest.raises(FormatVersionError, match=f"has protocol version {version}, but this node uses 2; use"):
         decode(MAGIC + bytes([version]) + b"anything")
 
 

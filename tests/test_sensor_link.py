@@ -131,7 +131,7 @@ def test_other_protocol_version_is_reported():
     with StandIn() as central, Node(central.address) as node:
         central.version = 9
         node.append(entries(1))
-        assert "a header has protocol version 9, but this node uses 1" in node.notes.get(timeout=SOON_S)
+        assert "a header has protocol version 9, but this node uses 2" in node.notes.get(timeout=SOON_S)
         central.version = messages.VERSION
         assert node.flush(SOON_S)
 

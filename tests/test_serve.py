@@ -79,7 +79,14 @@ class Sensors:
     def measure(self):
         number, now_ns = next(self.numbers), time.time_ns()
         stamps = [
-            Stamp(sensor=name, sequence=number, sync_count=number, session_id=11, timestamp_ns=now_ns)
+            Stamp(
+                sensor=name,
+                sequence=number,
+                sync_count=number,
+                session_id=11,
+                timestamp_ns=now_ns,
+                behaviour="passive",
+            )
             for name in self.names
         ]
         self.node.append(
@@ -154,6 +161,7 @@ def test_serve_publishes_images_and_stores_measurements(tmp_path):
     assert {(image.stamp.sensor, image.stamp.sequence) for image in images} == set(
         itertools.product(("left", "right"), range(4))
     )
+    assert [image.stamp.behaviour for image in [*images, image_of_pcm]] == ["passive"] * 8 + ["unknown"]
     assert [(group.sensors, group.flags) for group in groups] == [(("left", "right"), ())] * 4
     (recording,) = reported["recordings"]
     assert Path(recording).name.startswith("tour_")
@@ -163,6 +171,7 @@ def test_serve_publishes_images_and_stores_measurements(tmp_path):
         sensor = reported["sensors"][name]
         assert (sensor["received"], sensor["published"], sensor["stored"], sensor["dropped"]) == (4, 4, 4, {})
         with open_recording(recording, sensor=name) as stored:
+            assert {stamp.behaviour for stamp in stored.stamps()} == {"passive"}
             assert [measurement.stamp.sequence for measurement in stored] == [0, 1, 2, 3]
 
 

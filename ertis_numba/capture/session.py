@@ -355,7 +355,7 @@ class CaptureSession:
             session_id=self._session_id,
             timestamp_ns=block.arrived.realtime_ns - self._record_ns,  # A block arrives when all of it is recorded.
             timestamp_uncertainty_ns=min(block.arrived.uncertainty_ns, 2**32 - 1),
-            behaviour=self._sonars[event.sensor].behaviour,
+            behaviour=block.behaviour,
         )
         measurement = Measurement(block.data, self._settings, stamp)
         return JournalEntry(measurement=measurement, monotonic_ns=block.arrived.monotonic_ns)

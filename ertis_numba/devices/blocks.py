@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError
+from ertis_numba.frames import Behaviour
 
 __all__ = ["CHANNELS", "COUNTERS", "FOOTER", "FRAME_BYTES", "HEADER", "Block", "Instant", "encode_block"]
 
@@ -61,11 +62,15 @@ class Block:
         PDM words in separate, read-only memory.
     arrived : Instant
         Arrival of its first byte.
+    behaviour : {"active", "passive", "unknown"}, default "unknown"
+        ``active`` if the sensor was told to emit its call, ``passive`` if not. A block does not contain it, so
+        `SonarDriver` sets it.
     """
 
     counter: int
     data: NDArray[np.uint32]
     arrived: Instant
+    behaviour: Behaviour = "unknown"
 
 
 def encode_block(counter: int, words: NDArray[np.uint32]) -> bytes:

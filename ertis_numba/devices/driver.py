@@ -4,6 +4,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from types import TracebackType
 from typing import Self
 
@@ -113,13 +114,6 @@ class SonarDriver:
     def listen_only(self) -> bool:
         """True if nothing is ever sent to it."""
         return self._listen_only
-
-    @property
-    def behaviour(self) -> Behaviour:
-        """Behaviour of measurements by default: that of the setup; unknown without one, or with ``listen_only``."""
-        if self._configured is None or self._listen_only:
-            return "unknown"
-        return "active" if self._configured[0].active else "passive"
 
     @property
     def receiver(self) -> BlockReceiver:
@@ -237,7 +231,7 @@ class SonarDriver:
             if data and not (blocks or receiver.missing):
                 blocks = receiver.finish()  # No other block will decide.
             if blocks:
-                return self._counted(blocks[-1])
+                return self._counted(blocks[-1], _behaviour(active))
         receiver.expire()
         raise SonarError(
             f"{self.port}: no complete measurement within {deadline_s:.2f} s; {read} of "
@@ -280,6 +274,8 @@ class SonarDriver:
         (setup, receiver), deadline_s = self._state(), self.deadline_s
         self._require_armed()
         timeout_s = max(timeout_s, deadline_s)
+        # Another program has set up a sensor that is only listened to.
+        behaviour: Behaviour = "unknown" if self._listen_only else _behaviour(setup.active)
         latest_ns = latest_byte_ns = time.monotonic_ns()
         read = 0
         try:
@@ -293,17 +289,17 @@ class SonarDriver:
                 elif (receiver.missing or receiver.held) and now_ns - latest_byte_ns > 1e9 * deadline_s:
                     blocks = receiver.expire()
                 if blocks:
-                    yield from map(self._counted, blocks)
+                    yield from (self._counted(block, behaviour) for block in blocks)
                     latest_ns, read = time.monotonic_ns(), 0
                 elif now_ns - latest_ns > 1e9 * timeout_s:
                     raise self._nothing_whole(read, setup, timeout_s)
         except SonarDisconnectedError:
-            yield from map(self._counted, receiver.finish())
+            yield from (self._counted(block, behaviour) for block in receiver.finish())
             raise
         except SonarError:
             if not self._closing.is_set():
                 raise
-        yield from map(self._counted, receiver.finish())
+        yield from (self._counted(block, behaviour) for block in receiver.finish())
 
     def reconnect(self, *, within_s: float, stop: Callable[[], bool] = lambda: False) -> bool:
         """Wait for an unplugged sensor, and configure it again as before.
@@ -456,10 +452,10 @@ class SonarDriver:
             raise SonarError(f"{self.port} is not configured; call configure() first")
         return self._configured
 
-    def _counted(self, block: Block) -> Block:
-        """Return a block after advancing the next number."""
+    def _counted(self, block: Block, behaviour: Behaviour) -> Block:
+        """Return a block with its behaviour, after advancing the next number."""
         self._next, self._is_late = (block.counter + 1) % COUNTERS, False
-        return block
+        return replace(block, behaviour=behaviour)
 
     def _nothing_whole(self, read: int, setup: Setup, timeout_s: float) -> SonarError:
         if not read:
@@ -468,3 +464,7 @@ class SonarDriver:
             f"{self.port}: {read} bytes arrived within {timeout_s:g} s, but no complete measurement of "
             f"{setup.n_samples} samples; give the length that the sensor is set to"
         )
+
+
+def _behaviour(active: bool) -> Behaviour:  # noqa: FBT001  the number of command A or H
+    return "active" if active else "passive"

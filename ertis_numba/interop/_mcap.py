@@ -1,12 +1,13 @@
 """Energyscapes as an MCAP file of ROS 2 messages, after the MCAP specification and registry (profile ``ros2``)."""
 
+from collections import Counter
 from collections.abc import Collection, Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from ertis_numba.extras import extra
-from ertis_numba.frames import Energyscape, Stamp
+from ertis_numba.frames import BEHAVIOURS, Behaviour, Energyscape, Stamp
 from ertis_numba.geometry import self_contained
 from ertis_numba.interop._mountings import Mountings
 from ertis_numba.interop._points import FindPoints
@@ -72,21 +73,27 @@ class _McapWriter:
         self._image = ImageMessages()
 
     def write(self, images: Iterable[Energyscape]) -> None:
-        """Write all messages; the transforms come last, because only then are all sensors known."""
+        """Write all messages; transforms and metadata come last, because only then are all sensors known."""
         earliest: Stamp | None = None
+        behaviours: dict[str, Counter[Behaviour]] = {}
+        metadata: dict[str, dict[str, str]] = {}
         for image in images:
             stamp, sensor = image.stamp, image.stamp.sensor
             if earliest is None or stamp.timestamp_ns < earliest.timestamp_ns:
                 earliest = stamp
-            if sensor not in self._names:
-                settings = self_contained(image.settings).to_toml()
-                self._writer.add_metadata(f"ertis_numba/{sensor}", {"sensor": sensor, "settings": settings})
+            if sensor not in metadata:
+                metadata[sensor] = {"sensor": sensor, "settings": self_contained(image.settings).to_toml()}
+                behaviours[sensor] = Counter()
+            behaviours[sensor][stamp.behaviour] += 1
             for topic in self._topics:
                 message = self._message(topic, image)
                 if message is not None:
                     self._add(f"/{self._names[sensor]}/{topic}", MESSAGES[topic], message, stamp)
         if earliest is not None:
             self._add(_STATIC, _STATIC_TYPE, {"transforms": self._transforms(earliest)}, earliest)
+        for sensor, counts in behaviours.items():
+            numbers = {f"n_{behaviour}": str(counts[behaviour]) for behaviour in BEHAVIOURS}
+            self._writer.add_metadata(f"ertis_numba/{sensor}", metadata[sensor] | numbers)
 
     def _message(self, topic: str, image: Energyscape) -> dict[str, Any] | None:
         if topic == "points":

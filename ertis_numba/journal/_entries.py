@@ -188,6 +188,12 @@ class JournalSensor:
         _, session_id, sequence, sync_count, time_ns, uncertainty_ns, monotonic_ns, *air, behaviour, crc32 = (
             verified_values(path, record, values)
         )
+        behaviour = "unknown" if behaviour is None else behaviour  # The row is from an earlier version.
+        if behaviour not in BEHAVIOURS:
+            raise DamagedError(
+                f"{path}: {record} has behaviour {str(behaviour)[:40]!r}, wanted one of {', '.join(BEHAVIOURS)}; "
+                "copy it again if you can"
+            )
         if not isinstance(words, bytes):  # The recorded type is damaged.
             words = b""
         got = zlib.crc32(words)
@@ -206,7 +212,7 @@ class JournalSensor:
             timestamp_ns=time_ns,
             timestamp_uncertainty_ns=uncertainty_ns,
             session_id=session_id,
-            behaviour=behaviour or "unknown",
+            behaviour=behaviour,
         )
         array = np.frombuffer(words, dtype=self.dtype).reshape(self.shape)
         return JournalEntry(Measurement(array, settings, stamp), monotonic_ns, crc32)

@@ -173,8 +173,8 @@ class WritableJournal(ReadableJournal):
     def discard(self, sensor: str, session_id: int, up_to: int) -> int:
         """Delete measurements of a sensor's session that another node has stored, and gaps; durably, all or none.
 
-        After the first call, row numbers have holes, because rows of several sensors are interleaved. Readers then
-        count rows instead, and earlier versions of this package refuse the journal (format version 2).
+        After the first call, row numbers have holes, because rows of several sensors are interleaved. The journal then
+        has version `VERSION`, and readers count rows instead.
 
         Parameters
         ----------

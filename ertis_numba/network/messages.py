@@ -75,7 +75,7 @@ __all__ = [
 ]
 
 MAGIC: Final = b"eRTN"
-VERSION: Final = 1
+VERSION: Final = 2
 HEADER_BYTES: Final = 4096
 PING_INTERVAL_S: Final = 1.0
 """Interval between signs of life of a node: the `Ping` of a sensor node, the `Subscribe` of an application."""

@@ -45,7 +45,7 @@ __all__ = [
 ]
 
 CONVENTIONS: Final = "CF-1.11 ertis-1.0"
-FORMAT_VERSION: Final = 2  # Version 1 used the names in FORMER_NAMES.
+FORMAT_VERSION: Final = 3  # Version 1 used the names in FORMER_NAMES; version 2 had no behaviour.
 CHUNK_ROWS: Final = 512  # Applies to columns with one number per measurement.
 _TIME_CHUNK_ROWS: Final = 4096  # Applies to the axis, which programs read as a whole.
 _COLUMN_TEXT_BYTES: Final = 64

@@ -82,7 +82,7 @@ _ODD_HEADERS: Final = (
     _MAGIC,
     _MAGIC + b"\xc1",
     _MAGIC + b"\x80",
-    b"eRTN\x02" + VALID["ping"][5:],
+    MAGIC + bytes([VERSION + 1]) + VALID["ping"][5:],
     b"eRTN\x00" + VALID["ping"][5:],
     _MAGIC + b"\xdf\xff\xff\xff\xff",
     _MAGIC + b"\xdd\xff\xff\xff\xff",

@@ -10,11 +10,12 @@ from typing import Any, Final
 
 import msgspec
 
+from ertis_numba.network.messages import MAGIC, VERSION
 from ertis_numba.settings import Processing, Recording, Settings
 
 __all__ = ["HostileHello", "hello_header", "hostile_hellos", "hostile_texts"]
 
-_MAGIC: Final = b"eRTN\x01"
+_MAGIC: Final = MAGIC + bytes([VERSION])
 _GOOD: Final = Settings(
     recording=Recording(n_samples=32_768), processing=Processing(directions="2d:9", range_m=(0.3, 1.0))
 )
