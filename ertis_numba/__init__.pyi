@@ -42,6 +42,7 @@ from .geometry import layout_names as layout_names, load_layout as load_layout
 from .interop import export as export, open_pcm as open_pcm, open_raw as open_raw, open_rtis_folder as open_rtis_folder
 from .journal import JournalEntry as JournalEntry
 from .network.allow_list import AllowList as AllowList, Permission as Permission
+from .network.central_client import CentralClient as CentralClient
 from .network.keys import ClientKeys as ClientKeys, KeyPair as KeyPair, ServerKeys as ServerKeys
 from .network.sensor_node import SensorNode as SensorNode
 from .network.subscriber import Subscriber as Subscriber

@@ -304,8 +304,8 @@ def test_sensor_nodes_are_warned_of_a_shared_sensor_name(tmp_path):
     ("arguments", "message", "code"),
     [
         (["--to", "tcp://127.0.0.1:9", "-o", "a.h5"], "--to and --output exclude each other; give one", 2),
-        (["--spool", "spool"], "--ring, --key and --server-key need a central node; add --to", 2),
-        (["--ring", "1"], "--ring, --key and --server-key need a central node; add --to", 2),
+        (["--spool", "spool"], "--ring, --fixed-settings, --key and --server-key need a central node; add --to", 2),
+        (["--ring", "1"], "--ring, --fixed-settings, --key and --server-key need a central node; add --to", 2),
         (["--to", "tcp://127.0.0.1:9", "--spool-size", "1"], "--spool-size is given without --spool; add --spool", 2),
         (["--to", "here"], "address 'here' cannot be used; give tcp://HOST:PORT", 1),
         (["--to", "tcp://10.1.1.1:5601"], "can be reached from other machines, but there are no keys", 1),

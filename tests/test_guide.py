@@ -211,7 +211,7 @@ def test_code_of_the_formats_page_runs(place):
 
 
 def test_code_of_the_network_page_runs(place):
-    (code,) = python_in(page("network"))
+    code, _ = python_in(page("network"))  # The other block is run by tests/test_configure.py.
     with Publisher() as publisher, publisher.playing([cloud(number) for number in range(3)]):
         code = code.replace("tcp://127.0.0.1:5602", publisher.address)
         words = [sys.executable, "-u", "-W", "error", "-c", code]

@@ -24,6 +24,7 @@ ELSEWHERE = {
     *(
         "command",
         "completion",
+        "configure",
         "demo",
         "doctor",
         "keys",

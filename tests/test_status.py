@@ -16,6 +16,7 @@ from ertis_cli.status import _drawn
 
 from ertis_numba.errors import ArgumentError, NetworkError, RefusedError
 from ertis_numba.network.allow_list import AllowList, Permission
+from ertis_numba.network.central_client import CentralClient
 from ertis_numba.network.central_node import Archive, CentralNode
 from ertis_numba.network.keys import ClientKeys, KeyPair, ServerKeys
 from ertis_numba.network.status import (
@@ -27,7 +28,6 @@ from ertis_numba.network.status import (
     SubscriberStatus,
     WorkerStatus,
 )
-from ertis_numba.network.status_client import Asking
 
 CENTRAL, ROBOT, VIEWER = (KeyPair.new(name) for name in ("central", "robot", "viewer"))
 PATIENCE_S = 10.0
@@ -110,8 +110,8 @@ def keys(tmp_path):
 
 
 def test_status_client_receives_repeated_statuses():
-    with central_node() as address, Asking(address) as node:
-        first, second = node.ask(PATIENCE_S), node.ask(PATIENCE_S)
+    with central_node() as address, CentralClient(address) as node:
+        first, second = node.status(PATIENCE_S), node.status(PATIENCE_S)
     assert first.address == second.address == address
     assert (first.state, first.keys, first.sensors) == ("storage", False, {})
     assert second.uptime_s >= first.uptime_s > 0
@@ -119,13 +119,13 @@ def test_status_client_receives_repeated_statuses():
 
 def test_application_may_request_the_status_and_sensor_node_may_not(keys):
     with central_node(keys) as address:
-        with Asking(address, keys=ClientKeys(VIEWER, CENTRAL.public)) as node:
-            status = node.ask(PATIENCE_S)
+        with CentralClient(address, keys=ClientKeys(VIEWER, CENTRAL.public)) as node:
+            status = node.status(PATIENCE_S)
         with (
-            Asking(address, keys=ClientKeys(ROBOT, CENTRAL.public)) as node,
+            CentralClient(address, keys=ClientKeys(ROBOT, CENTRAL.public)) as node,
             pytest.raises(RefusedError, match="may not request the status"),
         ):
-            node.ask(PATIENCE_S)
+            node.status(PATIENCE_S)
     assert status.keys is True
     assert not any(status.refused.values())
 
@@ -133,17 +133,17 @@ def test_application_may_request_the_status_and_sensor_node_may_not(keys):
 def test_refused_status_client_gets_the_reason_at_once(keys):
     with central_node(keys) as address:
         with (
-            Asking(address, keys=ClientKeys(KeyPair.new("x"), CENTRAL.public)) as node,
+            CentralClient(address, keys=ClientKeys(KeyPair.new("x"), CENTRAL.public)) as node,
             pytest.raises(RefusedError, match="the central node does not know this key"),
         ):
-            node.ask(PATIENCE_S)
+            node.status(PATIENCE_S)
         with (
-            Asking(address, keys=ClientKeys(VIEWER, ROBOT.public)) as node,
+            CentralClient(address, keys=ClientKeys(VIEWER, ROBOT.public)) as node,
             pytest.raises(RefusedError, match="its key differs from --server-key"),
         ):
-            node.ask(0.5)
-        with Asking(address) as node, pytest.raises(RefusedError, match="give --key and --server-key"):
-            node.ask(PATIENCE_S)
+            node.status(0.5)
+        with CentralClient(address) as node, pytest.raises(RefusedError, match="give --key and --server-key"):
+            node.status(PATIENCE_S)
 
 
 def test_interrupted_status_client_does_not_wait_for_its_socket(monkeypatch):
@@ -153,20 +153,20 @@ def test_interrupted_status_client_does_not_wait_for_its_socket(monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("ertis_numba.network.sockets.Monitor", interrupted)
-    with pytest.raises(KeyboardInterrupt), Asking("tcp://127.0.0.1:1") as node:
-        node.ask(PATIENCE_S)
+    with pytest.raises(KeyboardInterrupt), CentralClient("tcp://127.0.0.1:1") as node:
+        node.status(PATIENCE_S)
 
 
 def test_missing_central_node_is_reported_with_the_remedy():
-    with Asking("tcp://127.0.0.1:1") as node, pytest.raises(NetworkError, match=r"within 0\.1 s; start"):
-        node.ask(0.1)
+    with CentralClient("tcp://127.0.0.1:1") as node, pytest.raises(NetworkError, match=r"within 0\.1 s; start"):
+        node.status(0.1)
     with pytest.raises(NetworkError, match="use it in a with statement"):
-        node.ask(0.1)
+        node.status(0.1)
 
 
 def test_status_of_another_machine_needs_keys():
     with pytest.raises(ArgumentError, match="there are no keys"):
-        Asking("tcp://192.0.2.1:5601")
+        CentralClient("tcp://192.0.2.1:5601")
 
 
 def test_command_prints_one_table_without_a_terminal():
@@ -216,7 +216,7 @@ class _Asked:
     def __exit__(self, *_):
         pass
 
-    def ask(self, _):
+    def status(self, _):
         answer = self._answers.pop(0)
         if isinstance(answer, BaseException):
             raise answer
@@ -225,7 +225,7 @@ class _Asked:
 
 @pytest.mark.parametrize("as_json", [False, True])
 def test_command_waits_for_a_central_node_that_disappears(monkeypatch, as_json):
-    monkeypatch.setattr("ertis_numba.network.status_client.Asking", lambda *_, **__: _Asked())
+    monkeypatch.setattr("ertis_numba.network.central_client.CentralClient", lambda *_, **__: _Asked())
     monkeypatch.setattr("ertis_cli.status._REFRESH_S", 0.0)
     result = CliRunner().invoke(cli, ["status", BUSY.address, "--watch", *(["--json"] if as_json else [])])
     if as_json:

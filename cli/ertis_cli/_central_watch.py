@@ -59,7 +59,7 @@ max_bytes: Decorator = click.option(
 )
 
 _REFRESH_S = 0.5
-_EXPECTED = {"listening", "joined", "left", "resumed", "sealed"}
+_EXPECTED = {"listening", "joined", "left", "configure", "resumed", "sealed"}
 
 
 class CentralWatch:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from ertis_numba.capture import CaptureSession
     from ertis_numba.devices.bits import BitCheck
     from ertis_numba.network.keys import ClientKeys
-    from ertis_numba.network.sensor_node import Acknowledged, SensorNode
+    from ertis_numba.network.sensor_node import Acknowledged, SensorNode, SettingsRequest
     from ertis_numba.settings import Settings
 
 __all__ = ["Sending"]
@@ -63,8 +63,10 @@ class Sending:
     address : str
     settings : Settings
     spool : Path or None
-    spool_mb, ring_mb : float or None
-        Limits in MB; None for the defaults of `SensorNode`.
+    limits_mb : tuple of (float or None)
+        Limits of the spool and of the memory, in MB; None for the defaults of `SensorNode`.
+    is_fixed : bool
+        True to refuse new settings from admins.
     quiet, as_json : bool
 
     Attributes
@@ -88,18 +90,20 @@ class Sending:
         settings: "Settings",
         *,
         spool: Path | None,
-        spool_mb: float | None,
-        ring_mb: float | None,
+        limits_mb: tuple[float | None, float | None],
+        is_fixed: bool,
         quiet: bool,
         as_json: bool,
     ) -> None:
-        for option, size_mb in (("--spool-size", spool_mb), ("--ring", ring_mb)):
+        for option, size_mb in zip(("--spool-size", "--ring"), limits_mb, strict=True):
             if size_mb is not None:
                 _require_room(option, size_mb, settings)
-        sizes_mb = {"spool_bytes": spool_mb, "ring_bytes": ring_mb}
+        sizes_mb = dict(zip(("spool_bytes", "ring_bytes"), limits_mb, strict=True))
         self.address, self._spool, self._quiet = address, spool, quiet
         self._sizes = {name: round(1e6 * size_mb) for name, size_mb in sizes_mb.items() if size_mb is not None}
         self.watch = _Watch(quiet=quiet, as_json=as_json)
+        self._is_fixed = is_fixed
+        self._session: CaptureSession | None = None
         self.report: dict[str, Any] = {}
         self.n_lost = 0
 
@@ -113,6 +117,7 @@ class Sending:
             spool=self._spool,
             on_acked=self.watch.acked_through,
             on_note=self.watch.linked,
+            on_settings=None if self._is_fixed else self._change,
             **self._sizes,
         )
         return self._node
@@ -126,6 +131,7 @@ class Sending:
             if self._spool
             else "measurements that the central node has not acknowledged are lost"
         )
+        self._session = session
         failure = self.watch.run(session, self._node, checks, where=where)
         if self._spool and self._node.central == "away":  # the spooled measurements can be sent later
             patience_s = min(patience_s, _SAFE_S)
@@ -140,6 +146,34 @@ class Sending:
         if lost and failure is not None:
             click.echo(f"ertis: error: {lost}", err=True)
         return failure or (NetworkError(lost) if lost else None)
+
+    def _change(self, request: "SettingsRequest") -> None:
+        """Change the settings of all sensors at the request of an admin."""
+        from ertis_numba.capture import SettingsChange
+        from ertis_numba.errors import SonarError
+
+        session = self._session
+        if session is None:
+            request.refuse("the capture has not begun; try again")
+            return
+        if request.sensor not in session.counts:
+            request.refuse(f"this capture has no sensor {request.sensor}, only {', '.join(session.counts)}")
+            return
+
+        def answer(error: Exception | None) -> None:
+            sensors = list(session.counts)
+            if error is not None:
+                request.refuse(str(error))
+                self.watch.note(request.sensor, f"new settings were refused: {error}")
+                return
+            request.accept(sensors)
+            for sensor in sensors:
+                self.watch.note(sensor, "new settings, requested by an admin")
+
+        try:
+            session.change(SettingsChange(request.settings, answer))
+        except SonarError as error:
+            request.refuse(str(error))
 
     def _account(self) -> str:
         """Summarise all measurements, and return an error message if some are lost."""

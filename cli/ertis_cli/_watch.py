@@ -13,8 +13,7 @@ from ertis_cli import options
 from ertis_cli._progress import StatusLine
 
 if TYPE_CHECKING:
-    from ertis_numba.capture import CaptureSession
-    from ertis_numba.capture.session import MeasurementSink
+    from ertis_numba.capture import CaptureSession, MeasurementSink
     from ertis_numba.devices.bits import BitCheck
     from ertis_numba.journal import JournalEntry
 

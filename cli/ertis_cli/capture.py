@@ -6,12 +6,14 @@ import sys
 import time
 from contextlib import ExitStack, contextmanager
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from ertis_cli import _mountings, _network, _presets, options
+from ertis_cli import _mountings, _network, options
+from ertis_cli._recording_settings import recording_settings, settings_from
 from ertis_cli._saving import withdrawn
 from ertis_cli._sending import Sending
 from ertis_cli._stop_signals import Signals, stopped_by_signals
@@ -62,6 +64,7 @@ _POLL_INTERVAL_S = 0.1  # interval between searches for ports
     metavar="MB",
     help="With --to: memory for measurements; 64 by default. When full without --spool, the oldest are overwritten.",
 )
+@click.option("--fixed-settings", is_flag=True, help="With --to: refuse new settings from admins ('ertis configure').")
 @_network.key
 @_network.server_key
 @_mountings.mounting
@@ -106,29 +109,7 @@ _POLL_INTERVAL_S = 0.1  # interval between searches for ports
     metavar="S",
     help="Interval between the emissions of a measurement in seconds; without a pause by default.",
 )
-@click.option(
-    "--call",
-    "call_file",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Waveform of the call: .wav, or .csv or .npy with samples at 450 kHz.",
-)
-@click.option(
-    "--preset",
-    metavar="NAME",
-    shell_complete=_presets.completion("recording"),
-    help="Record length (short_, default_, long_) and band (20_80, 25_50); default_25_50 by default.",
-)
-@click.option(
-    "--layout",
-    metavar="NAME",
-    shell_complete=options.complete_layouts,
-    help="Name of a shipped layout, or a .toml or .csv file; eRTIS_v3D1 by default.",
-)
-@click.option(
-    "--settings", "settings_file", type=click.Path(path_type=Path), metavar="FILE", help="Settings file (TOML)."
-)
-@click.option("--temperature", type=float, metavar="C", help="Air temperature in °C; 20 by default.")
+@recording_settings
 @click.option("--name", "names", multiple=True, metavar="NAME", help="Name of a sensor; repeat in the order of --port.")
 @click.option(
     "--patience",
@@ -152,6 +133,7 @@ def capture(
     spool: Path | None,
     spool_mb: float | None,
     ring_mb: float | None,
+    fixed_settings: bool,
     key: str | None,
     server_key: str | None,
     mounting: Path | None,
@@ -165,11 +147,6 @@ def capture(
     listen_only: bool,
     emissions: int,
     emission_period_s: float | None,
-    call_file: Path | None,
-    preset: str | None,
-    layout: str | None,
-    settings_file: Path | None,
-    temperature: float | None,
     names: tuple[str, ...],
     patience: float,
     check_bits: bool,
@@ -178,6 +155,7 @@ def capture(
     force: bool,
     quiet: bool,
     as_json: bool,
+    **given: Any,
 ) -> None:
     """Record measurements, or send them to a central node.
 
@@ -191,16 +169,16 @@ def capture(
     """
     from ertis_numba.devices.setup import Setup
 
-    settings = _settings(preset, layout, settings_file, temperature, call_file)
+    settings = settings_from(**given)
     trigger = "sync" if listen_only else trigger
-    setup = Setup.of(settings, active=not passive, pin=pin, emissions=emissions, emission_period_s=emission_period_s)
+    setup_of = partial(Setup.of, active=not passive, pin=pin, emissions=emissions, emission_period_s=emission_period_s)
+    setup = setup_of(settings)
     if dry_run:
         _print_commands(setup, as_json=as_json)
         return
     _require_one_each(ports, names)
-    _require_one_place(address, target, for_address=(spool, spool_mb, ring_mb, key, server_key))
-    if spool_mb is not None and spool is None:
-        raise click.UsageError("--spool-size is given without --spool; add --spool with its folder")
+    _require_one_place(address, target, for_address=(spool, spool_mb, ring_mb, fixed_settings, key, server_key))
+    _require_spool(spool, spool_mb)
     _network.require_duration(duration)
     from ertis_numba.atomic_files import check_target
     from ertis_numba.capture import CaptureSession
@@ -208,9 +186,11 @@ def capture(
     if target is not None:
         check_target(target, overwrite=force)
     reported = {"quiet": quiet, "as_json": as_json}
+    is_fixed = fixed_settings or listen_only
     send = None
     if address is not None:
-        send = Sending(address, settings, spool=spool, spool_mb=spool_mb, ring_mb=ring_mb, **reported)
+        limits = (spool_mb, ring_mb)
+        send = Sending(address, settings, spool=spool, limits_mb=limits, is_fixed=is_fixed, **reported)
     watch = Watch(**reported) if send is None else send.watch
     with stopped_by_signals() as signals, ExitStack() as stack:
         made = stack.enter_context(withdrawn(spool))
@@ -221,6 +201,7 @@ def capture(
         target = target or Path(_default_name(list(sonars)))
         if send is None:
             check_target(target, overwrite=force)
+        sensors = _Sensors(sonars, setup_of, check_bits=check_bits, splices=refuse_splices)
         session = CaptureSession(
             sonars,
             settings,
@@ -234,15 +215,16 @@ def capture(
             on_note=watch.note,
             on_back=watch.back,
             on_tick=watch.tick,
+            configure=None if is_fixed else sensors.configure,
         )
-        checks = _configured(sonars, setup, settings, signals, check_bits=check_bits, splices=refuse_splices)
+        sensors.configure_all(settings, signals)
         _note_mounting(mounting, list(sonars), quiet=quiet)
         signals.obey(session.stop)
         made.clear()
         if send is None:
-            failure = _record(session, watch, checks, target, signals=signals, stack=stack, overwrite=force)
+            failure = _record(session, watch, sensors.checks, target, signals=signals, stack=stack, overwrite=force)
         else:
-            failure = send.run(session, checks, patience_s=patience)
+            failure = send.run(session, sensors.checks, patience_s=patience)
         asked_to_end = list(signals.came)
     sent, n_lost = (None, 0) if send is None else (send.report, send.n_lost)
     report(address or target, session, watch.took, more=sent, n_lost=n_lost, **reported)
@@ -350,40 +332,65 @@ def _opened(ports: "Sequence[str]", signals: Signals, stack: ExitStack, *, liste
         return [stack.enter_context(SonarDriver.open(port, listen_only=listen_only, stop=asked)) for port in ports]
 
 
-def _configured(
-    sonars: "dict[str, SonarDriver]",
-    setup: "Setup",
-    settings: "Settings",
-    signals: Signals,
-    *,
-    check_bits: bool,
-    splices: bool,
-) -> "dict[str, BitCheck]":
-    """Configure the sensors, and return the check of each sensor's bits."""
-    import numpy as np
+class _Sensors:
+    """Sensors of a capture, which can be configured again.
 
-    from ertis_numba.devices.bits import BitCheck
-    from ertis_numba.geometry import microphones
+    Attributes
+    ----------
+    checks : dict of str to BitCheck
+        Check of each sensor's bits; empty if they are not checked.
+    """
 
-    checks: dict[str, BitCheck] = {}
-    if check_bits:
+    def __init__(
+        self,
+        sonars: "dict[str, SonarDriver]",
+        setup_of: "Callable[[Settings], Setup]",
+        *,
+        check_bits: bool,
+        splices: bool,
+    ) -> None:
+        self._sonars, self._setup_of = sonars, setup_of
+        self._check_bits, self._splices = check_bits, splices
+        self.checks: dict[str, BitCheck] = {}
+
+    def configure(self, name: str, settings: "Settings", stop: "Callable[[], bool]" = lambda: False) -> None:
+        """Configure one sensor."""
+        setup, check = self._setup_of(settings), None
+        if self._check_bits:
+            self.checks[name] = self._check(settings)
+            check = self.checks[name].check
+        self._sonars[name].configure(setup, bits=check, stop=stop)
+
+    def configure_all(self, settings: "Settings", signals: Signals) -> None:
+        """Configure all sensors; a signal ends the command."""
+        with _interruptible(signals) as asked:
+            for name in self._sonars:
+                self.configure(name, settings, stop=asked)
+
+    def _check(self, settings: "Settings") -> "BitCheck":
+        import numpy as np
+
+        from ertis_numba.devices.bits import BitCheck
+        from ertis_numba.geometry import microphones
+
         recording, given = settings.recording, microphones(settings.array).enabled
         enabled = np.zeros(32, dtype=bool)
         enabled[: len(given)] = given
-        checks = {
-            name: BitCheck(recording.n_samples, recording.sample_rate_hz, enabled, splices=splices) for name in sonars
-        }
-    with _interruptible(signals) as asked:
-        for name, sonar in sonars.items():
-            sonar.configure(setup, bits=checks[name].check if check_bits else None, stop=asked)
-    return checks
+        return BitCheck(recording.n_samples, recording.sample_rate_hz, enabled, splices=self._splices)
 
 
 def _require_one_place(address: str | None, target: Path | None, *, for_address: tuple[object, ...]) -> None:
     if address is None and any(for_address):
-        raise click.UsageError("--spool, --spool-size, --ring, --key and --server-key need a central node; add --to")
+        raise click.UsageError(
+            "--spool, --spool-size, --ring, --fixed-settings, --key and --server-key need a central node; add --to"
+        )
     if address is not None and target is not None:
         raise click.UsageError("--to and --output exclude each other; give one of them")
+
+
+def _require_spool(spool: Path | None, spool_mb: float | None) -> None:
+    if spool_mb is not None and spool is None:
+        raise click.UsageError("--spool-size is given without --spool; add --spool with its folder")
 
 
 def _require_one_each(ports: tuple[str, ...], names: tuple[str, ...]) -> None:
@@ -396,29 +403,6 @@ def _require_one_each(ports: tuple[str, ...], names: tuple[str, ...]) -> None:
 
     for name in names:
         checks.sensor_name(name)
-
-
-def _settings(
-    preset: str | None,
-    layout: str | None,
-    settings_file: Path | None,
-    temperature: float | None,
-    call_file: Path | None,
-) -> "Settings":
-    """Return settings from a preset or a file, with the given layout, air temperature and call."""
-    from ertis_numba.settings import Air, Array, Call, Settings
-
-    if settings_file is not None and preset is not None:
-        raise click.UsageError("--preset and --settings exclude each other; give one of them")
-    settings = Settings.load(settings_file) if settings_file else Settings.from_preset(preset or "default_25_50")
-    if layout is not None:
-        settings = settings.replace(array=Array(layout=layout))
-    if temperature is not None:
-        air = Air() if settings_file is None else settings.air
-        settings = settings.replace(air=air.replace(temperature_c=temperature))
-    if call_file is not None:
-        settings = settings.replace(call=Call.from_file(call_file))
-    return settings
 
 
 def _print_commands(setup: "Setup", *, as_json: bool) -> None:

@@ -124,11 +124,11 @@ def _make(folder: Path, *, force: bool) -> None:
 
 def _await_worker(address: str) -> None:
     """Wait until the central node can process measurements."""
-    from ertis_numba.network.status_client import Asking
+    from ertis_numba.network.central_client import CentralClient
 
-    with Asking(address) as node:
+    with CentralClient(address) as node:
         while True:
-            processing = node.ask(_STATUS_TIMEOUT_S).processing
+            processing = node.status(_STATUS_TIMEOUT_S).processing
             if processing is not None and any(worker.state == "idle" for worker in processing.workers):
                 return
             time.sleep(_STATUS_INTERVAL_S)

@@ -20,6 +20,7 @@ COMMANDS = {
     "command": ("ertis_cli.command:command", "Send commands to a sensor and print its answers."),
     "compare": ("ertis_cli.compare:compare", "Compare an energyscape file with the scene's ground truth."),
     "completion": ("ertis_cli.completion:completion", "Print a script that completes commands and options in a shell."),
+    "configure": ("ertis_cli.configure:configure", "Change the settings of a sensor that sends to a central node."),
     "demo": ("ertis_cli.demo:demo", "Run four emulated sensors, a central node and an application."),
     "devices": ("ertis_cli.devices:devices", "List plugged-in and emulated eRTIS devices."),
     "doctor": ("ertis_cli.doctor:doctor", "Check this installation and suggest fixes."),

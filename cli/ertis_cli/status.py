@@ -14,8 +14,8 @@ from ertis_cli._central_watch import size
 if TYPE_CHECKING:
     from rich.console import Group
 
+    from ertis_numba.network.central_client import CentralClient
     from ertis_numba.network.status import ArchiveStatus, Percentiles, Status
-    from ertis_numba.network.status_client import Asking
 
 __all__ = ["status"]
 
@@ -52,12 +52,12 @@ def status(
     the node disappears, the command waits for it.
     """
     from ertis_numba import checks
-    from ertis_numba.network.status_client import Asking
+    from ertis_numba.network.central_client import CentralClient
 
     if once and watch:
         raise click.UsageError("--once and --watch exclude each other; give one of them")
     checks.positive("--patience", patience)
-    with Asking(address, keys=_network.client_keys(key, server_key)) as node:
+    with CentralClient(address, keys=_network.client_keys(key, server_key)) as node:
         if as_json or once or not _progress.is_drawn_on(sys.stdout):
             for now, away in _looks(node, patience, again=watch):
                 _print(now, away, as_json=as_json)
@@ -67,16 +67,16 @@ def status(
                 show(_drawn(now, away))
 
 
-def _looks(node: "Asking", patience_s: float, *, again: bool) -> "Iterator[tuple[Status, str]]":
+def _looks(node: "CentralClient", patience_s: float, *, again: bool) -> "Iterator[tuple[Status, str]]":
     """Yield the current status, or the last one and the reason for a missing answer; the first must be answered."""
     from ertis_numba.errors import NetworkError
 
-    now = node.ask(patience_s)
+    now = node.status(patience_s)
     yield now, ""
     while again:
         time.sleep(_REFRESH_S)
         try:
-            now, away = node.ask(patience_s), ""
+            now, away = node.status(patience_s), ""
         except NetworkError as error:  # the node may restart
             away = str(error)
         yield now, away

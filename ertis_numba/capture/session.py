@@ -4,12 +4,13 @@ import queue
 import secrets
 import threading
 import time
-from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Protocol
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import partial
 
 from ertis_numba import checks
+from ertis_numba.capture.counts import CaptureCounts
 from ertis_numba.capture.gap_reasons import gap_reason
 from ertis_numba.capture.readers import (
     BlockArrived,
@@ -22,76 +23,36 @@ from ertis_numba.capture.readers import (
     SensorReconnected,
     TriggerClock,
 )
+from ertis_numba.capture.sink import MeasurementSink
 from ertis_numba.capture.sync_counts import PulseAligner
 from ertis_numba.devices.driver import SonarDriver
-from ertis_numba.errors import ArgumentError, SonarError
+from ertis_numba.errors import ArgumentError, SonarDisconnectedError, SonarError
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.journal import JournalEntry
 from ertis_numba.settings import Settings
 
-__all__ = ["CaptureCounts", "CaptureSession", "MeasurementSink"]
+__all__ = ["CaptureSession", "SettingsChange"]
 
 _WAITING_BYTES = 40_000_000  # Limit on blocks that wait for the disk; sensors wait beyond it.
-_RECENT_S = 3.0  # Interval of the reported rate.
 _DISK_FULL = "there was no room for it"
+_ENDED = "the capture has ended; start it again"
 _MAX_OPEN_GROUPS = 16  # Limit on open groups: sensors deliver simultaneous measurements at different times.
 
 
-class MeasurementSink(Protocol):
-    """Destination of measurements: a `Journal`, or a buffer that keeps them until another node has stored them."""
-
-    def add_sensor(
-        self,
-        name: str,
-        settings: Settings,
-        *,
-        firmware: str = "",
-        translation_m: Sequence[float] | None = ...,
-        rotation_xyzw: Sequence[float] | None = ...,
-    ) -> None:
-        """Register a sensor before its first measurement."""
-
-    def append(self, entries: Sequence[JournalEntry]) -> Sequence[JournalEntry] | None:
-        """Store measurements; None means that all of them are stored, otherwise return the stored ones."""
-
-    def note_gap(self, sensor: str, first: int, last: int, reason: str, *, session_id: int) -> None:
-        """Store why numbers of a sensor are missing, ``first`` and ``last`` included."""
-
-
-@dataclass(slots=True)
-class CaptureCounts:
-    """Counts of one sensor's measurements.
+@dataclass(frozen=True, slots=True)
+class SettingsChange:
+    """Change of the settings of all sensors, between two measurements.
 
     Attributes
     ----------
-    stored : int
-        Number of stored measurements.
-    missing : Counter of str
-        Number of missing measurements, by reason.
-    unplugged : int
-        Number of times that the sensor was unplugged.
-    skipped : int
-        Number of commands that were skipped because the sensor was still busy.
+    settings : Settings
+    on_done : callable
+        Called with None once the sensors are configured, or with the error because of which all of them keep their
+        former settings.
     """
 
-    stored: int = 0
-    missing: Counter[str] = field(default_factory=Counter)
-    unplugged: int = 0
-    skipped: int = 0
-    times_s: deque[float] = field(default_factory=lambda: deque(maxlen=64))
-    """Times of the latest stored measurements by `time.monotonic`, in seconds."""
-
-    @property
-    def lost(self) -> int:
-        """Number of all missing measurements."""
-        return sum(self.missing.values())
-
-    @property
-    def rate_hz(self) -> float:
-        """Recent rate of stored measurements, in Hz."""
-        now_s = time.monotonic()
-        recent_s = [time_s for time_s in self.times_s if now_s - time_s < _RECENT_S]
-        return (len(recent_s) - 1) / max(recent_s[-1] - recent_s[0], 1e-9) if len(recent_s) > 1 else 0.0
+    settings: Settings
+    on_done: Callable[[Exception | None], None] = lambda _: None
 
 
 @dataclass(slots=True)
@@ -140,6 +101,8 @@ class CaptureSession:
         Called with the sensor's name and the seconds that it was unplugged.
     on_tick : callable, optional
         Called about ten times a second.
+    configure : callable, optional
+        Called with the name of a sensor and new settings; configures its driver. Required by `change`.
 
     Attributes
     ----------
@@ -165,6 +128,7 @@ class CaptureSession:
         on_note: Callable[[str, str], None] = lambda _sensor, _text: None,
         on_back: Callable[[str, float], None] = lambda _sensor, _away_s: None,
         on_tick: Callable[[], None] = lambda: None,
+        configure: Callable[[str, Settings], None] | None = None,
     ) -> None:
         checks.choice("trigger", trigger, ("command", "sync"))
         if not sonars:
@@ -176,20 +140,49 @@ class CaptureSession:
         self._duration_s = None if duration_s is None else checks.positive("duration", duration_s)
         self._patience_s = checks.positive("patience", patience_s)
         self._on_stored, self._on_note, self._on_back, self._on_tick = on_stored, on_note, on_back, on_tick
-        self._session_id = (
-            secrets.randbits(62) if session_id is None else checks.integer("session_id", session_id, 0, 2**63 - 1)
-        )
-        self._record_ns = round(1e9 * settings.recording.duration_s)
+        self._configure = configure
+        self._has_ended = False
         self._stop = threading.Event()
+        self._changes: queue.SimpleQueue[SettingsChange] = queue.SimpleQueue()
         self._errors: dict[str, Exception] = {}
-        self._sequence_states = {sensor: _SequenceState() for sensor in sonars}
-        self._pulses: PulseAligner[BlockArrived] = PulseAligner(list(sonars), shortest_s=settings.recording.duration_s)
         self._waiting: list[JournalEntry] = []  # Entries to store together.
-        self._groups: dict[int, int] = {}
-        self._closed = -(2**63)  # Latest closed group.
-        self._ended: set[str] = set()
+        self._reset(
+            settings,
+            secrets.randbits(62) if session_id is None else checks.integer("session_id", session_id, 0, 2**63 - 1),
+        )
         self.counts = {sensor: CaptureCounts() for sensor in sonars}
         self.complete = self.incomplete = 0
+
+    def _reset(self, settings: Settings, session_id: int) -> None:
+        """Begin to count measurements with these settings."""
+        self._settings, self._session_id = settings, session_id
+        self._record_ns = round(1e9 * settings.recording.duration_s)
+        self._sequence_states = {sensor: _SequenceState() for sensor in self._sonars}
+        self._pulses: PulseAligner[BlockArrived] = PulseAligner(
+            list(self._sonars), shortest_s=settings.recording.duration_s
+        )
+        self._groups: dict[int, int] = {}
+        self._closed = -(2**63)  # Latest closed group.
+        self._ended: set[str] = set(self._errors)
+
+    def change(self, change: SettingsChange) -> None:
+        """Request other settings for all sensors; any thread may call this.
+
+        The sensors are configured after the current measurements. The following ones belong to a new session, whose
+        numbers start at 0.
+
+        Raises
+        ------
+        ArgumentError
+            The session was created without ``configure``.
+        SonarError
+            The session has ended.
+        """
+        if self._configure is None:
+            raise ArgumentError("this session cannot change settings; create it with configure")
+        if self._has_ended:
+            raise SonarError(_ENDED)
+        self._changes.put(change)
 
     def stop(self) -> None:
         """End after the current measurement; a signal handler or another thread may call this."""
@@ -205,19 +198,90 @@ class CaptureSession:
         DataError
             Further measurements cannot be stored; reported measurements are durable.
         """
+        end_s = None if self._duration_s is None else time.monotonic() + self._duration_s
+        for sensor in self._sonars:
+            self._register(sink, sensor, self._settings)
+        if self._synced:
+            for sonar in self._sonars.values():
+                if not sonar.listen_only:
+                    sonar.arm()
+        try:
+            while True:
+                self._measure(sink, end_s)
+                if self._changes.empty() or self._is_over(end_s) or len(self._errors) == len(self._sonars):
+                    break
+                self._apply(self._changes.get(), sink)
+        finally:
+            self._has_ended = True
+            while not self._changes.empty():
+                self._changes.get().on_done(SonarError(_ENDED))
+        self._raise_errors()
+
+    def _is_over(self, end_s: float | None) -> bool:
+        return self._stop.is_set() or self._done() or (end_s is not None and time.monotonic() >= end_s)
+
+    def _measure(self, sink: MeasurementSink, end_s: float | None) -> None:
+        """Capture until the session ends, or a change of settings is requested."""
         n_bytes = 4 * self._settings.recording.n_samples
         events: queue.Queue[Event] = queue.Queue(max(2, _WAITING_BYTES // n_bytes))
-        readers: list[SensorReader] = []
+        clock = TriggerClock(start_s=time.monotonic(), rate_hz=self._rate_hz, n=None)
+        readers = []
+        for sensor in (each for each in self._sonars if each not in self._errors):
+            pace = None if self._synced else replace(clock, n=self._n_left(sensor))
+            readers.append(
+                SensorReader(sensor, self._sonars[sensor], pace=pace, patience_s=self._patience_s, events=events)
+            )
         try:
-            self._begin(sink, readers, events)
-            self._process_events(sink, readers, events)
+            for reader in readers:
+                reader.start()
+            self._process_events(sink, readers, events, end_s)
         finally:
             for reader in readers:
                 reader.abandon()
             for reader in readers:
                 if reader.ident is not None:
                     reader.join()
-        self._raise_errors()
+
+    def _n_left(self, sensor: str) -> int | None:
+        """Return the number of measurements that a sensor has still to make; None if it is unlimited."""
+        counts = self.counts[sensor]
+        return None if self._n is None else self._n - counts.stored - counts.missing[_DISK_FULL]
+
+    def _apply(self, change: SettingsChange, sink: MeasurementSink) -> None:
+        """Configure all sensors, or keep the former settings of all of them."""
+        former, failure = self._settings, None
+        pulses = [
+            state.first_pulse + 1 + (-1 if state.sequence is None else state.sequence)
+            for state in self._sequence_states.values()
+            if state.first_pulse is not None
+        ]
+        registered = []
+        try:
+            for sensor in self._sonars:
+                for step in self._set_up_steps(sensor, change.settings):
+                    step()
+            for sensor in self._sonars:
+                self._register(sink, sensor, change.settings)
+                registered.append(sensor)
+        except (ArgumentError, SonarError) as error:
+            failure = error
+            for sensor in self._sonars:
+                for step in self._set_up_steps(sensor, former):
+                    with suppress(SonarDisconnectedError):  # Its reader configures it again.
+                        step()
+            for sensor in registered:
+                self._register(sink, sensor, former)
+        self._reset(change.settings if failure is None else former, secrets.randbits(62))
+        if self._synced and self._n is not None:
+            self._n = max(0, self._n - max(pulses, default=0))
+        change.on_done(failure)
+
+    def _set_up_steps(self, sensor: str, settings: Settings) -> list[Callable[[], None]]:
+        sonar, configure = self._sonars[sensor], self._configure
+        if configure is None:
+            return []
+        steps: list[Callable[[], None]] = [partial(configure, sensor, settings)]
+        return [sonar.disarm, *steps, sonar.arm] if self._synced else steps
 
     def _raise_errors(self) -> None:
         for error in self._errors.values():
@@ -226,30 +290,17 @@ class CaptureSession:
         if self._errors:
             raise SonarError("; ".join(f"{sensor}: {error}" for sensor, error in self._errors.items()))
 
-    def _begin(self, sink: MeasurementSink, readers: list[SensorReader], events: "queue.Queue[Event]") -> None:
-        for sensor, sonar in self._sonars.items():
-            translation_m, rotation_xyzw = self._mounting.get(sensor, (None, None))
-            sink.add_sensor(
-                sensor,
-                self._settings,
-                firmware=sonar.firmware,
-                translation_m=translation_m,
-                rotation_xyzw=rotation_xyzw,
-            )
-        if self._synced:
-            for sonar in self._sonars.values():
-                if not sonar.listen_only:
-                    sonar.arm()
-        pace = None if self._synced else TriggerClock(start_s=time.monotonic(), rate_hz=self._rate_hz, n=self._n)
-        for sensor, sonar in self._sonars.items():
-            readers.append(SensorReader(sensor, sonar, pace=pace, patience_s=self._patience_s, events=events))
-        for reader in readers:
-            reader.start()
+    def _register(self, sink: MeasurementSink, sensor: str, settings: Settings) -> None:
+        firmware = self._sonars[sensor].firmware
+        translation_m, rotation_xyzw = self._mounting.get(sensor, (None, None))
+        sink.add_sensor(sensor, settings, firmware=firmware, translation_m=translation_m, rotation_xyzw=rotation_xyzw)
 
-    def _process_events(self, sink: MeasurementSink, readers: list[SensorReader], events: "queue.Queue[Event]") -> None:
-        end_s = None if self._duration_s is None else time.monotonic() + self._duration_s
-        while len(self._ended) < len(readers):
-            if self._stop.is_set() or self._done() or (end_s is not None and time.monotonic() >= end_s):
+    def _process_events(
+        self, sink: MeasurementSink, readers: list[SensorReader], events: "queue.Queue[Event]", end_s: float | None
+    ) -> None:
+        n_readers = len(readers) + len(self._errors)
+        while len(self._ended) < n_readers:
+            if not self._changes.empty() or self._is_over(end_s):
                 for reader in readers:
                     reader.stop()
             self._handle(sink, _drain(events))
@@ -262,7 +313,9 @@ class CaptureSession:
         """Return True if every remaining sensor has delivered the last pulse, or a later one."""
         if self._n is None or not self._synced:
             return False
-        return all(self._sequence_states[sensor].passed for sensor in self._sonars if sensor not in self._ended)
+        if self._n == 0:
+            return True
+        return all(self._sequence_states[sensor].passed for sensor in self._sonars if sensor not in self._errors)
 
     def _handle(self, sink: MeasurementSink, events: Iterable[Event]) -> None:
         ready: list[tuple[BlockArrived, int]] = []

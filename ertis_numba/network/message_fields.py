@@ -37,7 +37,7 @@ AckedThrough = Annotated[int, Meta(ge=-1, le=MAX_SEQUENCE)]
 Int64 = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 Uint32 = Annotated[int, Meta(ge=0, le=2**32 - 1)]
 State = Literal["storage", "processing", "fault", "closing"]
-Party = Literal["sensor", "application", "central", "publisher"]
+Party = Literal["sensor", "application", "admin", "central", "publisher"]
 Position = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 

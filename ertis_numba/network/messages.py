@@ -54,6 +54,8 @@ __all__ = [
     "Ack",
     "AskStatus",
     "Bye",
+    "Configure",
+    "Configured",
     "Data",
     "Description",
     "Gap",
@@ -226,8 +228,9 @@ class Refused(Message, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    code : {"version", "message", "role", "serial", "hello", "settings", "size"}
-        Reason, for programs. ``hello``: the session is unknown; the node should send `Hello` again.
+    code : {"version", "message", "role", "serial", "hello", "settings", "size", "sensor"}
+        Reason, for programs. ``hello``: the session is unknown; the node should send `Hello` again. ``sensor``: no
+        sensor node sends the sensor that the message is for.
     reason : str
         Reason, for people: what was got, what is accepted, the remedy.
     sensor : str
@@ -237,10 +240,52 @@ class Refused(Message, frozen=True, kw_only=True):
 
     routes = (("central", "sensor"), ("central", "application"), ("publisher", "application"))
 
-    code: Literal["version", "message", "role", "serial", "hello", "settings", "size"]
+    code: Literal["version", "message", "role", "serial", "hello", "settings", "size", "sensor"]
     reason: Line
     sensor: Annotated[str, Meta(max_length=64)] = ""
     session_id: Count = 0
+
+
+class Configure(Message, frozen=True, kw_only=True):
+    """Request for new settings of a sensor, which the central node forwards. Payload: the settings as TOML.
+
+    Attributes
+    ----------
+    sensor : str
+    request_id : int
+        Random number, by which the answer is recognised.
+    max_bytes : int
+        Size of the largest measurement that the central node accepts, which fills it in; 0 from an admin.
+    """
+
+    routes = (("admin", "central"), ("central", "sensor"))
+    payload = "settings (TOML)"
+
+    sensor: Name
+    request_id: Count
+    max_bytes: Count = 0
+
+
+class Configured(Message, frozen=True, kw_only=True):
+    """Answer to a `Configure`.
+
+    Attributes
+    ----------
+    sensor : str
+        As in the request.
+    request_id : int
+    sensors : tuple of str
+        Sensors with the new settings: those of the sensor node, at most 32. Empty if there are none.
+    error : str
+        Reason why the former settings are still in use; otherwise empty.
+    """
+
+    routes = (("sensor", "central"), ("central", "admin"))
+
+    sensor: Name
+    request_id: Count
+    sensors: Annotated[tuple[Name, ...], Meta(max_length=32)] = ()
+    error: Line = ""
 
 
 class AskStatus(Message, frozen=True, kw_only=True):
@@ -250,8 +295,8 @@ class AskStatus(Message, frozen=True, kw_only=True):
 
 
 MESSAGES: Final[tuple[type[Message], ...]] = (
-    Hello, Welcome, Data, Gap, Ack, Ping, Pong, Bye, Refused, Subscribe, Description, Image, Points, Raw, Group,
-    AskStatus, Report,
+    Hello, Welcome, Data, Gap, Ack, Ping, Pong, Bye, Refused, Configure, Configured, Subscribe, Description, Image,
+    Points, Raw, Group, AskStatus, Report,
 )  # fmt: skip
 """All messages of the network."""
 

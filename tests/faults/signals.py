@@ -34,7 +34,7 @@ _MAX_TRIES = 10  # Tries per signal. Only signals that reach a running process c
 _UNDISTURBED_S = 4.0
 _TIMEOUT_S = 30.0
 _FAULTS = ("late", "codes", "tracebacks")
-_WAITING = {"status"}  # Commands that wait for an answer, and fail after some seconds without one.
+_WAITING = {"configure", "status"}  # Commands that wait for an answer, and fail after some seconds without one.
 _UNCAUGHT = re.compile(r"Traceback|Error:|Exception|Fatal|Assertion")
 
 COMMANDS: Final[dict[str, Sequence[str]]] = {
@@ -43,6 +43,7 @@ COMMANDS: Final[dict[str, Sequence[str]]] = {
     "command": ("--port", "{port}", "!Y,0,0,0"),
     "compare": ("{images}",),
     "completion": ("bash",),
+    "configure": ("tcp://127.0.0.1:1", "front"),
     "demo": ("-o", "{out}/demo"),
     "devices": (),
     "doctor": (),

@@ -270,6 +270,11 @@ class Intake:
         """Return a remark for a node, one line; empty if there is none."""
         return self._sharing.remark(self.peers.get(peer_id))
 
+    def nodes_of(self, sensor: str) -> list[bytes]:
+        """Return the nodes that send a sensor."""
+        track = self.tracks.get(sensor)
+        return [] if track is None else [peer_id for peer_id in track.peers if peer_id in self.peers]
+
     def bye(self, peer_id: bytes) -> None:
         """Remove a node."""
         peer = self.peers.pop(peer_id, None)

@@ -29,12 +29,15 @@ from ertis_numba.network.central_node._received_items import (
 )
 from ertis_numba.network.central_node._reporting import Condition, EventReporter, text_of
 from ertis_numba.network.central_node._server_socket import ServerSocket
+from ertis_numba.network.central_node._settings_requests import SettingsRequests
 from ertis_numba.network.central_node._validation import Greeting, Greetings
 from ertis_numba.network.keys import ServerKeys
 from ertis_numba.network.message_fields import State, as_line
 from ertis_numba.network.messages import (
     AskStatus,
     Bye,
+    Configure,
+    Configured,
     Data,
     Gap,
     Hello,
@@ -79,8 +82,8 @@ class CentralNode:
         Limit on unacknowledged measurements of a session.
     on_event : callable, optional
         Called with each event, a dict with the key ``event``: listening, joined, left, fault, resumed, sealed,
-        unsealed, conflict, refused, shared (two nodes send one sensor), keys (state of the allow list), internal (an
-        internal error).
+        unsealed, conflict, configure (an admin changes settings), refused, shared (two nodes send one sensor), keys
+        (state of the allow list), internal (an internal error).
     on_stored : callable, optional
         Called with stored measurements: sensor, session_id, sequence and CRC-32 of each.
 
@@ -123,6 +126,7 @@ class CentralNode:
         self._condition = Condition(
             listen, self._server, self._intake, archive=archive, images=self._images, keys=keys is not None
         )
+        self._settings_requests = SettingsRequests(self._server.send, self._intake.nodes_of, max_bytes=max_bytes)
         self._handlers = handlers_of(self)
         self._greetings = Greetings(self._intake.read)
         self._archive_fd = self._greetings_fd = -1
@@ -342,6 +346,14 @@ class CentralNode:
     def _on_bye(self, _: Bye, received: ReceivedMessage) -> None:
         self._greetings.forget(received.sender)
         self._intake.bye(received.sender)
+
+    def _on_configure(self, request: Configure, received: ReceivedMessage) -> None:
+        self._settings_requests.forward(received.sender, request, [frame.bytes for frame in received.payload])
+        name = received.who.name
+        self._event_reporter.notify("configure", sensor=request.sensor, text=f"new settings requested by key {name}")
+
+    def _on_configured(self, answer: Configured, _: ReceivedMessage) -> None:
+        self._settings_requests.answer(answer)
 
     def _on_askstatus(self, _: AskStatus, received: ReceivedMessage) -> None:
         self._server.send(received.sender, Report(), self._condition.report())

@@ -3,6 +3,7 @@
 from ertis_numba.network.sensor_node._link import Central
 from ertis_numba.network.sensor_node._memory_spool import SensorCounts
 from ertis_numba.network.sensor_node._node import SensorNode
+from ertis_numba.network.sensor_node._settings_requests import SettingsRequest
 from ertis_numba.network.sensor_node._wire import Acknowledged
 
-__all__ = ["Acknowledged", "Central", "SensorCounts", "SensorNode"]
+__all__ = ["Acknowledged", "Central", "SensorCounts", "SensorNode", "SettingsRequest"]

@@ -15,6 +15,7 @@ from ertis_numba.network.keys import ClientKeys
 from ertis_numba.network.messages import SILENCE_LIMIT_S
 from ertis_numba.network.sensor_node._memory_spool import Spool
 from ertis_numba.network.sensor_node._outgoing_sessions import OutgoingSession
+from ertis_numba.network.sensor_node._settings_requests import RequestQueue, SettingsRequest
 from ertis_numba.network.sensor_node._wire import Acknowledged, frames_of, greeting
 from ertis_numba.network.trace import mark
 from ertis_numba.network.wakeup_socket import WakeupSocket
@@ -31,7 +32,7 @@ _UNDER_WAY_BYTES = 32_000_000
 _AT_ONCE = 32  # Limit on messages before other work has its turn.
 _LINE_CHARACTERS = 400
 _MAX_REPORTED = 256
-_WANTED: Final = (messages.Welcome, messages.Ack, messages.Pong, messages.Refused)
+_WANTED: Final = (messages.Welcome, messages.Ack, messages.Pong, messages.Refused, messages.Configure)
 
 
 class Link(threading.Thread):
@@ -44,6 +45,8 @@ class Link(threading.Thread):
     spool : Spool
     on_acked, on_note : callable
         Called from this thread; they must not raise.
+    on_settings : callable or None
+        Likewise; None to refuse requests for new settings.
 
     Attributes
     ----------
@@ -61,6 +64,7 @@ class Link(threading.Thread):
         spool: Spool,
         on_acked: Callable[[Acknowledged], None],
         on_note: Callable[[str], None],
+        on_settings: Callable[[SettingsRequest], None] | None = None,
     ) -> None:
         super().__init__(name=f"link to {address}", daemon=True)
         self._address, self._keys, self._spool = address, keys, spool
@@ -68,6 +72,7 @@ class Link(threading.Thread):
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._connection: Connection | None = None
         self._wakeup_socket = WakeupSocket()
+        self._requests = RequestQueue(on_settings, self.wake)
         self._stopping = threading.Event()
         self._was_there = False
         self._reported: set[tuple[str, str]] = set()  # Subject and sensor.
@@ -142,6 +147,7 @@ class Link(threading.Thread):
             self._lose()
             return
         connection.ping(now_s)
+        self._requests.send(connection.send)
         self._send_pending(connection, now_s)
 
     def _lose(self) -> None:
@@ -171,26 +177,18 @@ class Link(threading.Thread):
                 self._note(f"a message from the central node cannot be decoded: {error}", "message")
             else:
                 connection.heard_s = time.monotonic()
-                self._take(message)
+                self._take(message, frames[1:])
 
-    def _take(self, message: messages.Message) -> None:
+    def _take(self, message: messages.Message, payload: list[memoryview]) -> None:
         match message:
             case messages.Refused():
                 self._take_refusal(message)
+            case messages.Configure():
+                self._requests.take(message, payload)
             case messages.Pong():
                 self._see(message.state, message.text)
             case messages.Welcome():
-                with self._spool.turn:
-                    run = self._spool.runs.get((message.sensor, message.session_id))
-                    if run is None or run.stage != "asked":
-                        return
-                    for refused in ("", message.sensor):
-                        self._refusals.pop(refused, None)
-                    done = run.welcome(message.acked_through, message.window, time.monotonic())
-                    self._spool.settle(run, done, message.acks)
-                self._see(message.state)
-                if done:
-                    self._on_acked(Acknowledged(*run.key, run.acked_through, message.acks))
+                self._take_welcome(message)
             case messages.Ack():
                 with self._spool.turn:
                     run = self._spool.runs.get((message.sensor, message.session_id))
@@ -202,6 +200,19 @@ class Link(threading.Thread):
                 if done or dropped:
                     mark("acknowledged", run.sensor.name, run.acked_through)
                     self._on_acked(Acknowledged(*run.key, run.acked_through, message.status, dropped))
+
+    def _take_welcome(self, message: messages.Welcome) -> None:
+        with self._spool.turn:
+            run = self._spool.runs.get((message.sensor, message.session_id))
+            if run is None or run.stage != "asked":
+                return
+            for refused in ("", message.sensor):
+                self._refusals.pop(refused, None)
+            done = run.welcome(message.acked_through, message.window, time.monotonic())
+            self._spool.settle(run, done, message.acks)
+        self._see(message.state)
+        if done:
+            self._on_acked(Acknowledged(*run.key, run.acked_through, message.acks))
 
     def _see(self, state: Literal["storage", "processing", "fault", "closing"], text: str | None = None) -> None:
         """Update the state of the central node, with its reason if given."""

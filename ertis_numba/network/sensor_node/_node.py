@@ -16,6 +16,7 @@ from ertis_numba.network.messages import MAX_SEQUENCE
 from ertis_numba.network.sensor_node._disk_spool import DiskSpool
 from ertis_numba.network.sensor_node._link import Central, Link
 from ertis_numba.network.sensor_node._memory_spool import SensorCounts, Spool
+from ertis_numba.network.sensor_node._settings_requests import SettingsRequest
 from ertis_numba.network.sensor_node._wire import Acknowledged
 from ertis_numba.network.trace import mark
 from ertis_numba.settings import Settings
@@ -67,6 +68,9 @@ class SensorNode:
         Called with an `Acknowledged` for each acknowledgement, from another thread. An exception is logged.
     on_note : callable, optional
         Called with a line for each event of interest to users, from another thread. An exception is logged.
+    on_settings : callable, optional
+        Called with a `SettingsRequest` when an admin requests new settings for a sensor, from another thread. Such
+        requests are refused by default.
 
     Raises
     ------
@@ -91,10 +95,12 @@ class SensorNode:
         spool_bytes: int | None = None,
         on_acked: Callable[[Acknowledged], None] = lambda _: None,
         on_note: Callable[[str], None] = lambda _: None,
+        on_settings: Callable[[SettingsRequest], None] | None = None,
     ) -> None:
         self._address, self._keys = addresses.endpoint(address), keys
         addresses.require_keys(self._address, keys=keys)
         self._on_acked, self._on_note = _UserCallback("on_acked", on_acked), _UserCallback("on_note", on_note)
+        self._on_settings = None if on_settings is None else _UserCallback("on_settings", on_settings)
         if spool_bytes is not None and spool is None:
             raise ArgumentError("spool_bytes is given without a spool; give its folder with spool")
         checks.integer("ring_bytes", ring_bytes, 1)
@@ -108,7 +114,12 @@ class SensorNode:
     def __enter__(self) -> Self:
         self._spool.open()
         self._link = Link(
-            self._address, keys=self._keys, spool=self._spool, on_acked=self._on_acked, on_note=self._on_note
+            self._address,
+            keys=self._keys,
+            spool=self._spool,
+            on_acked=self._on_acked,
+            on_note=self._on_note,
+            on_settings=self._on_settings,
         )
         self._link.start()
         return self

@@ -18,8 +18,8 @@ from ertis_bench.network.processes import until
 from ertis_bench.network.sender import SenderJob
 
 from ertis_numba.errors import DataError, ErtisError
+from ertis_numba.network.central_client import CentralClient
 from ertis_numba.network.keys import ClientKeys
-from ertis_numba.network.status_client import Asking
 from ertis_numba.network.subscriber import Subscriber
 from tests.faults.network.busy import BUSY_ERTIS, BUSY_S
 from tests.faults.network.keyed_node import KeyedNode
@@ -138,9 +138,9 @@ def _watch(address: str, keys: ClientKeys, ended: threading.Event) -> None:
 
 def _ask(address: str, keys: ClientKeys, ended: threading.Event) -> None:
     """Request the status."""
-    with Asking(address, keys=keys) as asking:
+    with CentralClient(address, keys=keys) as client:
         while not ended.wait(0.02):
-            asking.ask(patience_s=0.5)
+            client.status(patience_s=0.5)
 
 
 def _tcp_sockets(pid: int) -> int:

@@ -1,0 +1,56 @@
+"""``ertis configure``: change the settings of a sensor in a network."""
+
+from typing import Any
+
+import click
+
+from ertis_cli import _network, options
+from ertis_cli._recording_settings import recording_settings, settings_from
+
+__all__ = ["configure"]
+
+
+@click.command()
+@click.argument("address", metavar="ADDRESS")
+@click.argument("sensor", metavar="SENSOR")
+@_network.key
+@_network.server_key
+@recording_settings
+@click.option(
+    "--patience",
+    "patience_s",
+    type=float,
+    default=30.0,
+    show_default=True,
+    metavar="S",
+    help="Time to wait for an answer.",
+)
+@options.as_json
+def configure(
+    *,
+    address: str,
+    sensor: str,
+    key: str | None,
+    server_key: str | None,
+    patience_s: float,
+    as_json: bool,
+    **given: Any,
+) -> None:
+    """Change the settings of a sensor that sends to a central node.
+
+    ADDRESS is the address that sensors send to. 'ertis capture --to' configures all its sensors between two
+    measurements. If one of them cannot have the settings, all keep their former ones. If the central node uses keys,
+    give the key of an admin.
+    """
+    from ertis_numba import checks
+    from ertis_numba.network.central_client import CentralClient
+
+    checks.positive("--patience", patience_s)
+    checks.sensor_name(sensor)
+    settings = settings_from(**given)
+    with CentralClient(address, keys=_network.client_keys(key, server_key)) as central:
+        sensors = central.configure(sensor, settings, patience_s)
+    if as_json:
+        options.print_json({"configured": list(sensors)})
+    else:
+        click.echo(f"configured: {' '.join(sensors)}")

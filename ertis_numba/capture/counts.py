@@ -1,0 +1,45 @@
+"""Counts of a capture session."""
+
+import time
+from collections import Counter, deque
+from dataclasses import dataclass, field
+
+__all__ = ["CaptureCounts"]
+
+_RECENT_S = 3.0  # Interval of the reported rate.
+
+
+@dataclass(slots=True)
+class CaptureCounts:
+    """Counts of one sensor's measurements.
+
+    Attributes
+    ----------
+    stored : int
+        Number of stored measurements.
+    missing : Counter of str
+        Number of missing measurements, by reason.
+    unplugged : int
+        Number of times that the sensor was unplugged.
+    skipped : int
+        Number of commands that were skipped because the sensor was still busy.
+    """
+
+    stored: int = 0
+    missing: Counter[str] = field(default_factory=Counter)
+    unplugged: int = 0
+    skipped: int = 0
+    times_s: deque[float] = field(default_factory=lambda: deque(maxlen=64))
+    """Times of the latest stored measurements by `time.monotonic`, in seconds."""
+
+    @property
+    def lost(self) -> int:
+        """Number of all missing measurements."""
+        return sum(self.missing.values())
+
+    @property
+    def rate_hz(self) -> float:
+        """Recent rate of stored measurements, in Hz."""
+        now_s = time.monotonic()
+        recent_s = [time_s for time_s in self.times_s if now_s - time_s < _RECENT_S]
+        return (len(recent_s) - 1) / max(recent_s[-1] - recent_s[0], 1e-9) if len(recent_s) > 1 else 0.0
