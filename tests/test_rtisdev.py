@@ -134,6 +134,71 @@ def test_wide_presets_equal_the_reference(preset):
     assert np.array_equal(got[some].argmax(axis=1), wanted.argmax(axis=1))
 
 
+FAST_DB = -30
+"""Largest difference of the fast method; it removes what the low pass of rectified beams leaves of twice the
+frequency."""
+
+
+@pytest.fixture
+def fast(monkeypatch, caplog):
+    monkeypatch.setenv("ERTIS_RTISDEV_METHOD", "fast")
+    return caplog
+
+
+@pytest.mark.parametrize("preset", ["2D_5m_91", "2D_5m_181", "3D_5m_500"])
+def test_fast_method_predicts_its_difference_from_the_exact_one(fast, preset):
+    settings = prepared(premade=preset, cleanEnable=False)
+    (predicted,) = re.findall(r"uses the fast method; its images differ by about (-\d+) dB", fast.text)
+    measurement = measured(settings)
+    got = rtisdev.process_measurement(measurement, configName="test").processedData
+    wanted = rtisdev_reference.processed(settings, measurement.rawData)
+    found_db = error_db(got, wanted)
+    assert found_db < FAST_DB
+    assert abs(found_db - int(predicted)) < 4
+    direction, sample = np.unravel_index(np.argmax(got), got.shape)
+    wanted_direction, wanted_sample = np.unravel_index(np.argmax(wanted), wanted.shape)
+    assert (direction, abs(sample - wanted_sample) <= 1) == (wanted_direction, True)
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"dmasOrder": 2}, "without DMAS"),
+        ({"cfEnable": True}, "without DMAS and coherence factor"),
+        ({"enveloppeEnable": False, "cleanEnable": False}, "images of PDM words only"),
+        ({"postFilterEnable": True, "postFilter": np.ones(5)}, "no filters before or after"),
+    ],
+    ids=["DMAS", "coherence factor", "beams", "filter"],
+)
+def test_fast_method_is_refused_with_the_reason_where_it_cannot(fast, changes, reason):
+    settings = prepared(directions=91, **changes)
+    assert "'test' uses the exact method, because the fast one cannot" in fast.text
+    assert reason in fast.text
+    compare(settings)
+
+
+def test_fast_method_cleans_images_and_leaves_out_microphones(fast, monkeypatch):
+    preload = rtiscuda.preload
+    monkeypatch.setattr(rtiscuda, "preload", lambda *given: preload(*given[:-3], np.array([3, 17]), *given[-2:]))
+    settings = prepared(premade="2D_5m_91")
+    assert settings.cleanEnable
+    settings.disableList = np.array([3, 17])
+    assert "uses the fast method" in fast.text
+    measurement = measured(settings)
+    got = rtisdev.process_measurement(measurement, configName="test").processedData
+    wanted = rtisdev_reference.processed(settings, measurement.rawData)
+    assert np.mean((got == 0) & (wanted == 0)) > 0
+    assert np.mean((got == 0) != (wanted == 0)) < 0.05
+    both = (got != 0) & (wanted != 0)
+    assert np.linalg.norm((got - wanted)[both]) < 10 ** (FAST_DB / 20) * np.linalg.norm(wanted[both])
+
+
+def test_unknown_method_is_refused(monkeypatch):
+    monkeypatch.setenv("ERTIS_RTISDEV_METHOD", "quick")
+    with pytest.raises(ArgumentError, match=r"METHOD 'quick' is unknown; known are exact, fast"):
+        prepared(directions=91)
+
+
 @pytest.mark.parametrize("coherent", [False, True])
 @pytest.mark.parametrize("order", range(6))
 def test_beamformers_equal_the_reference(order, coherent):

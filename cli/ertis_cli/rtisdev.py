@@ -20,9 +20,14 @@ __all__ = ["rtisdev"]
     help="Port to open instead of the one in the script, such as an emulated sensor.",
 )
 @options.device
+@click.option(
+    "--method",
+    type=click.Choice(["exact", "fast"]),
+    help="exact: the script's filters as they are. fast: this package's chain, where it can, with a small difference.",
+)
 @click.argument("script", type=click.Path(path_type=Path, exists=True, dir_okay=False), metavar="SCRIPT.py")
 @click.argument("arguments", nargs=-1, type=click.UNPROCESSED, metavar="ARGS...")
-def rtisdev(*, port: str | None, device: str, script: Path, arguments: tuple[str, ...]) -> None:
+def rtisdev(*, port: str | None, device: str, method: str | None, script: Path, arguments: tuple[str, ...]) -> None:
     """Run a script for RTIS Dev.
 
     The script runs unchanged. The functions of the closed modules rtisserial and rtiscuda are those of
@@ -33,6 +38,8 @@ def rtisdev(*, port: str | None, device: str, script: Path, arguments: tuple[str
     if port is not None:
         os.environ["ERTIS_RTISDEV_PORT"] = port
     os.environ["ERTIS_RTISDEV_DEVICE"] = device
+    if method is not None:
+        os.environ["ERTIS_RTISDEV_METHOD"] = method
     with extra("rtisdev", "scripts for RTIS Dev need rtisdev"):
         _require("rtisdev")
     import ertis_numba.rtisdev  # noqa: F401  puts our modules in the place of the closed ones

@@ -7,6 +7,7 @@ environment selects the behaviour, because scripts have no arguments for it:
 =====================  ==================================================================================
 ERTIS_RTISDEV_PORT     port to open instead of the one that the script names, such as an emulated sensor
 ERTIS_RTISDEV_DEVICE   device for processing: auto, cpu, cuda or numpy; auto by default
+ERTIS_RTISDEV_METHOD   exact, or fast for the chain of this package where it can do what the script says
 =====================  ==================================================================================
 """
 

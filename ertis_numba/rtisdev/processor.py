@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ertis_numba import kernels
 from ertis_numba.errors import ArgumentError
 
-__all__ = ["Configuration", "Processor"]
+__all__ = ["Configuration", "Processor", "cleaned", "rounded"]
 
 _DIRECTIONS_AT_A_TIME: Final = 64  # whose beams remain in the cache
 _MAX_ORDER: Final = 5
@@ -148,13 +148,23 @@ class Processor:
         # The kernels correlate, and filters convolve.
         taps = np.rint(configuration.pdm_filter[::-1] / np.float64(self._scale)).astype(np.int32)
         self._taps = taps if len(taps) % 2 else np.append(taps, np.int32(0))
-        self._envelope_taps, self._envelope_unit = _rounded(configuration.envelope_filter[::-1])
+        self._envelope_taps, self._envelope_unit = rounded(configuration.envelope_filter[::-1])
         delays = configuration.delays
         self._delays = None if delays is None else np.ascontiguousarray(delays[:, self._enabled])
 
     @property
     def _kernels(self) -> kernels.KernelSet:
         return _without_threads() if _threads_are_lost else self._loaded
+
+    @property
+    def configuration(self) -> Configuration:
+        """Arguments of the configuration."""
+        return self._given
+
+    @property
+    def has_lost_threads(self) -> bool:
+        """True in a process that was forked after its parent had run kernels; compiled kernels cannot run in it."""
+        return _threads_are_lost
 
     def process(self, data: NDArray[Any], *, pdm: bool) -> Real:
         """Return the result of the last stage that is on: signals, beams or an image, (row, sample) float32.
@@ -164,6 +174,10 @@ class Processor:
         ArgumentError
             The shape of ``data`` does not match the configuration.
         """
+        return cleaned(self.uncleaned(data, pdm=pdm), self._given.clean_multipliers)
+
+    def uncleaned(self, data: NDArray[Any], *, pdm: bool) -> Real:
+        """Return the result of the last stage before cleaning, as `process` does."""
         given = self._given
         if given.delays is None and (given.has_envelope or given.post_filter is not None or given.clean_multipliers):
             return self._finish(self._rows(data, given.n_directions))
@@ -178,7 +192,7 @@ class Processor:
             return np.ascontiguousarray(signals, dtype=np.float32)
         self._require_length(signals)
         if given.has_envelope and given.post_filter is None:
-            return self._cleaned(self._image(signals, self._delays))
+            return self._image(signals, self._delays)
         return self._finish(self._beams(signals, self._delays))
 
     def _finish(self, beams: Real) -> Real:
@@ -193,16 +207,27 @@ class Processor:
             image = np.empty((len(beams), given.last_range - given.first_range), np.float32)
             self._envelope(padded, image)
             beams = image
-        return self._cleaned(beams)
+        return beams
+
+    def words(self, data: NDArray[Any]) -> NDArray[np.uint32]:
+        """Return the PDM words of a measurement: (sample, 1) uint32.
+
+        Raises
+        ------
+        ArgumentError
+            Their number does not match the configuration.
+        """
+        words = np.ascontiguousarray(data).view(np.uint32).reshape(-1, 1) if data.dtype.itemsize <= 4 else data
+        if words.shape != (self._given.n_samples, 1):
+            raise ArgumentError(f"the measurement has {words.size} words; give {self._given.n_samples}")
+        return words
 
     def _demodulated(self, data: NDArray[Any]) -> Real:
         given = self._given
-        words = np.ascontiguousarray(data).view(np.uint32).reshape(-1, 1) if data.dtype.itemsize <= 4 else data
-        if words.shape != (given.n_samples, 1):
-            raise ArgumentError(f"the measurement has {words.size} words; give {given.n_samples}")
+        words = self.words(data)
         signals = np.empty((given.n_mics, given.n_signal), np.float32)
         arguments = (self._channels, self._taps, self._scale, given.pdm_factor, 0, given.n_signal)
-        self._run("demodulate_words", words, *arguments, out=signals)
+        self.run("demodulate_words", words, *arguments, out=signals)
         return signals
 
     def _beams(self, signals: Real, delays: NDArray[np.int32]) -> Real:
@@ -237,21 +262,21 @@ class Processor:
 
     def _sum(self, tiles: NDArray[np.int16], units: Real) -> Combine:
         """Return a function that sums 16-bit signals."""
-        return lambda delays, out: self._run("sum_delayed_int16", tiles, units, delays, out=out)
+        return lambda delays, out: self.run("sum_delayed_int16", tiles, units, delays, out=out)
 
     def _combination(self, signals: Real) -> Combine:
         """Return a function that combines signals as the configuration says."""
         order, coherent = self._given.dmas_order, int(self._given.coherent)
         roots = signals if order == 1 else np.sign(signals) * np.abs(signals) ** np.float32(1 / order)
-        return lambda delays, out: self._run("combine_delayed", signals, roots, delays, order, coherent, 0, out=out)
+        return lambda delays, out: self.run("combine_delayed", signals, roots, delays, order, coherent, 0, out=out)
 
     def _envelope(self, beams: Real, image: Real) -> None:
         """Fill ``image`` with the envelope of beams."""
         factor = self._given.envelope_factor
-        self._run("rectify_and_decimate", beams, self._envelope_taps, self._envelope_unit, factor, 0, out=image)
+        self.run("rectify_and_decimate", beams, self._envelope_taps, self._envelope_unit, factor, 0, out=image)
 
-    def _run(self, name: str, *arguments: Any, out: Real) -> None:
-        """Run a kernel with arrays of the host."""
+    def run(self, name: str, *arguments: Any, out: Real) -> None:
+        """Run a kernel with arrays of the host, and fill ``out``."""
         global _has_run  # noqa: PLW0603  true of the whole process
         _has_run = True
         kernel_set = self._kernels
@@ -270,15 +295,6 @@ class Processor:
         first = given.first_range * given.envelope_factor - n_taps // 2
         return first, (given.last_range - given.first_range - 1) * given.envelope_factor + n_taps
 
-    def _cleaned(self, image: Real) -> Real:
-        """Set the amplitudes of each range to 0 that are below its limits."""
-        if self._given.clean_multipliers is None:
-            return image
-        mean_multiplier, max_multiplier = self._given.clean_multipliers
-        limit = np.maximum(image.mean(axis=0) * mean_multiplier, image.max(axis=0, initial=0.0) * max_multiplier)
-        np.multiply(image, image >= limit, out=image)  # A tenth of the time that np.where takes.
-        return image
-
     def _rows(self, data: NDArray[Any], n_rows: int) -> Real:
         """Return a copy of the result of an earlier stage as float32; check its shape."""
         rows = np.array(data, dtype=np.float32, order="C")
@@ -289,6 +305,16 @@ class Processor:
     def _require_length(self, signals: Real) -> None:
         if signals.shape[1] != self._given.n_signal:
             raise ArgumentError(f"signals have {signals.shape[1]} samples; give {self._given.n_signal}")
+
+
+def cleaned(image: Real, multipliers: tuple[float, float] | None) -> Real:
+    """Set the amplitudes of each range to 0 that are below its limits, in place, and return the image."""
+    if multipliers is None:
+        return image
+    mean_multiplier, max_multiplier = multipliers
+    limit = np.maximum(image.mean(axis=0) * mean_multiplier, image.max(axis=0, initial=0.0) * max_multiplier)
+    np.multiply(image, image >= limit, out=image)  # A tenth of the time that np.where takes.
+    return image
 
 
 def _after_fork() -> None:
@@ -311,7 +337,7 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_after_fork)
 
 
-def _rounded(taps: Real) -> tuple[NDArray[np.int16], float]:
+def rounded(taps: NDArray[np.floating[Any]]) -> tuple[NDArray[np.int16], float]:
     """Return taps as 16-bit numbers with the largest sums that `RectifyAndDecimate` permits, and their unit."""
     exact = np.pad(taps.astype(np.float64), (0, -len(taps) % 8))
     sums = np.abs(exact).reshape(-1, 4, 2).sum(axis=(0, 2))

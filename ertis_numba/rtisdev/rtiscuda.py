@@ -10,13 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ertis_numba import checks
 from ertis_numba.errors import ArgumentError, ErtisError
+from ertis_numba.rtisdev.fast import FastProcessor
 from ertis_numba.rtisdev.processor import Configuration, Processor
 
 __all__ = ["preload", "processing", "unloadall", "unloadone"]
 
 _log = logging.getLogger("ertis_numba")
-_processors: dict[str, Processor] = {}
+_processors: dict[str, Processor | FastProcessor] = {}
 _turn = threading.Lock()
 
 
@@ -84,7 +86,7 @@ def preload(  # noqa: PLR0913, PLR0917  as the original has it
             dmas_order=max(1, int(dmas_order)),  # 0 is an earlier kernel of delay-and-sum.
             coherent=bool(coherence_factor_enable),
         )
-        processor = Processor(configuration, device=os.environ.get("ERTIS_RTISDEV_DEVICE") or "auto")
+        processor = _processor(name, configuration)
     with _turn:
         _processors[name] = processor
 
@@ -139,6 +141,27 @@ def unloadall() -> None:
     """Free all configurations."""
     with _turn:
         _processors.clear()
+
+
+def _processor(name: str, configuration: Configuration) -> Processor | FastProcessor:
+    """Return the processor that the environment asks for."""
+    device = os.environ.get("ERTIS_RTISDEV_DEVICE") or "auto"
+    method = os.environ.get("ERTIS_RTISDEV_METHOD") or "exact"
+    checks.choice("ERTIS_RTISDEV_METHOD", method, ("exact", "fast"))
+    exact = Processor(configuration, device=device)
+    if method == "exact":
+        return exact
+    try:
+        fast = FastProcessor(exact, device=device)
+    except ArgumentError as error:
+        _log.warning("configuration %r uses the exact method, because the fast one cannot: %s", name, error)
+        return exact
+    _log.warning(
+        "configuration %r uses the fast method; its images differ by about %.0f dB from those of the exact one",
+        name,
+        fast.difference_db,
+    )
+    return fast
 
 
 @contextmanager
