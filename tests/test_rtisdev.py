@@ -459,7 +459,26 @@ def test_arguments_that_do_not_fit_together_are_refused(changes, message):
         rtiscuda.processing(np.zeros(163_840, np.uint32), 1, 31, 69, "bad")
 
 
-def test_serial_errors_are_those_that_callers_expect(monkeypatch):
+def test_unplugged_sensor_is_a_connection_error(caplog):
+    parent, child = os.openpty()
+    rtisserial.connect(os.ttyname(child), 115_200)
+    os.close(child)
+    os.close(parent)
+    try:
+        for call in (
+            lambda: rtisserial.command("!A,1,0,0\n", wants_answer=False),
+            lambda: rtisserial.getdata(4),
+            rtisserial.flush,
+        ):
+            caplog.clear()
+            with pytest.raises(ConnectionError, match="was unplugged; plug it in again"):
+                call()
+            assert "was unplugged" in caplog.text
+    finally:
+        rtisserial.close()
+
+
+def test_serial_errors_are_those_that_callers_expect(monkeypatch, caplog):
     with pytest.raises(ConnectionError, match="does not exist"):
         rtisserial.connect("/dev/no-such-port", 115_200)
     for call in (rtisserial.close, rtisserial.flush, lambda: rtisserial.command("!Y,0,0,0\n", wants_answer=True)):
@@ -471,6 +490,7 @@ def test_serial_errors_are_those_that_callers_expect(monkeypatch):
         rtisserial.connect(os.ttyname(child), 115_200)
         with pytest.raises(TimeoutError, match="did not answer '!Y,0,0,0"):
             rtisserial.command("!Y,0,0,0\n", wants_answer=True)
+        assert "did not answer" in caplog.text
         os.write(parent, b"left over")
         while vars(rtisserial)["_line"].waiting < 9:
             time.sleep(0.001)

@@ -7,6 +7,8 @@ import errno
 import logging
 import os
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Final
 
 import numpy as np
@@ -61,11 +63,14 @@ def command(text: str, wants_answer: bool) -> int | None:  # noqa: FBT001  as th
     ------
     ConnectionRefusedError
         No port is open.
+    ConnectionError
+        The device was unplugged.
     TimeoutError
         No answer came.
     """
     line = _connected()
-    line.send(text.encode())
+    with _errors_translated():
+        line.send(text.encode())
     if not wants_answer:
         return None
     return int.from_bytes(_received(line, _ANSWER_BYTES, within_s=_ANSWER_S, what=repr(text)), "little")
@@ -95,11 +100,9 @@ def flush() -> None:
         The device was unplugged.
     """
     line = _connected()
-    try:
+    with _errors_translated():
         while waiting := line.waiting:
             line.receive(waiting)
-    except SonarError as error:
-        raise ConnectionError(str(error)) from error
 
 
 def close() -> None:
@@ -126,11 +129,21 @@ def _connected() -> SerialLine:
 def _received(line: SerialLine, n_bytes: int, *, within_s: float | None, what: str) -> bytes:
     """Return bytes; raise TimeoutError if they do not arrive in time."""
     data, latest_s = bytearray(), None if within_s is None else time.monotonic() + within_s
-    try:
+    with _errors_translated():
         while len(data) < n_bytes:
             data += line.receive(n_bytes - len(data))[0]
             if latest_s is not None and time.monotonic() > latest_s and len(data) < n_bytes:
-                raise TimeoutError(f"{line.path} did not answer {what} within {within_s:g} s; is it an eRTIS?")
-    except SonarError as error:
-        raise ConnectionError(str(error)) from error
+                reported = f"{line.path} did not answer {what} within {within_s:g} s; is it an eRTIS?"
+                _log.error("%s", reported)
+                raise TimeoutError(reported)
     return bytes(data)
+
+
+@contextmanager
+def _errors_translated() -> Iterator[None]:
+    """Log errors of the line, and raise them as the original does."""
+    try:
+        yield
+    except SonarError as error:
+        _log.error("%s", error)
+        raise ConnectionError(str(error)) from error
