@@ -165,7 +165,7 @@ def test_fast_method_predicts_its_difference_from_the_exact_one(fast, preset):
     [
         ({"dmasOrder": 2}, "without DMAS"),
         ({"cfEnable": True}, "without DMAS and coherence factor"),
-        ({"enveloppeEnable": False, "cleanEnable": False}, "images of PDM words only"),
+        ({"enveloppeEnable": False, "cleanEnable": False}, "it requires a matched filter, beamforming and an envelope"),
         ({"postFilterEnable": True, "postFilter": np.ones(5)}, "no filters before or after"),
     ],
     ids=["DMAS", "coherence factor", "beams", "filter"],
@@ -413,7 +413,9 @@ def test_unknown_names_and_wrong_shapes_are_refused(caplog):
     shape = settings.nDirections, settings.nspses
     for arguments, message in (
         ((raw, 1, *shape, "other"), r"configuration 'other' is not preloaded; .* \(preloaded are: 'test'\)"),
-        ((raw[:-1], 1, *shape, "test"), "the measurement has 163839 words; give 163840"),
+        ((raw[:-1], 1, *shape, "test"), r"is uint32 of shape \(163839,\); give 163840 words of uint32"),
+        ((raw.astype(np.int64), 1, *shape, "test"), r"is int64 of shape \(163840,\); give 163840 words of uint32"),
+        ((raw.astype(np.float32), 1, *shape, "test"), "the measurement is float32"),
         ((raw, 1, 31, 7, "test"), r"configuration 'test' gives 31 × \d+ numbers, but 31 × 7 are wanted"),
         ((np.zeros((3, 7), np.float32), 0, *shape, "test"), r"the data has shape \(3, 7\); give 32 rows"),
         ((np.zeros((32, 7), np.float32), 0, *shape, "test"), "signals have 7 samples; give 16384"),

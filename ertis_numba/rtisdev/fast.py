@@ -1,4 +1,4 @@
-"""Images of RTIS Dev by the fast chain of this package, where it can do what the arguments say.
+"""Fast chain for the images of RTIS Dev, if it supports the arguments.
 
 The fast chain computes the exact envelope of band-pass signals. RTIS Dev's low pass for rectified beams then smooths
 this envelope, at the rate of the image. The result differs a little from that of `Processor`, and a simulated
@@ -139,8 +139,8 @@ class FastProcessor:
 
 def _require_supported(given: Configuration) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
     """Return the delays and the samples of the call."""
-    if given.delays is None or given.matched_filter is None or not (given.has_pdm and given.has_envelope):
-        raise ArgumentError("it computes images of PDM words only, with matched filter, beamforming and envelope")
+    if given.delays is None or given.matched_filter is None or not given.has_envelope:
+        raise ArgumentError("it requires a matched filter, beamforming and an envelope")
     if given.dmas_order > 1 or given.coherent:
         raise ArgumentError("with delays of their own, images are sums: without DMAS and coherence factor")
     if given.pre_filter is not None or given.post_filter is not None:

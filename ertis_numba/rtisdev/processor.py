@@ -215,12 +215,14 @@ class Processor:
         Raises
         ------
         ArgumentError
-            Their number does not match the configuration.
+            Their type or number does not match the configuration.
         """
-        words = np.ascontiguousarray(data).view(np.uint32).reshape(-1, 1) if data.dtype.itemsize <= 4 else data
-        if words.shape != (self._given.n_samples, 1):
-            raise ArgumentError(f"the measurement has {words.size} words; give {self._given.n_samples}")
-        return words
+        n_samples = self._given.n_samples
+        if data.dtype.kind not in "iu" or data.dtype.itemsize > 4 or data.nbytes != 4 * n_samples:
+            raise ArgumentError(
+                f"the measurement is {data.dtype} of shape {data.shape}; give {n_samples} words of uint32"
+            )
+        return np.ascontiguousarray(data).reshape(-1).view(np.uint32).reshape(-1, 1)
 
     def _demodulated(self, data: NDArray[Any]) -> Real:
         given = self._given
