@@ -62,8 +62,8 @@ class Configuration:
     clean_multipliers : (float, float) or None
         Amplitudes of a range become 0 below the first number times the mean of the range, and below the second
         number times its maximum.
-    has_envelope, has_pdm : bool
-        The envelope is computed, and measurements are PDM words.
+    has_envelope : bool
+        The envelope is computed.
     disabled : tuple of int
         Microphones to exclude.
     dmas_order : int
@@ -88,7 +88,6 @@ class Configuration:
     last_range: int
     clean_multipliers: tuple[float, float] | None
     has_envelope: bool
-    has_pdm: bool
     disabled: tuple[int, ...]
     dmas_order: int
     coherent: bool

@@ -41,7 +41,7 @@ def preload(  # noqa: PLR0913, PLR0917  as the original has it
     mean_multiplier: float,
     max_multiplier: float,
     name: str,
-    pdm_enable: int,
+    pdm_enable: int,  # noqa: ARG001  `processing` states it
     pre_filter_enable: int,
     matched_filter_enable: int,
     beamforming_enable: int,
@@ -81,7 +81,6 @@ def preload(  # noqa: PLR0913, PLR0917  as the original has it
             last_range=int(last_range),
             clean_multipliers=(float(mean_multiplier), float(max_multiplier)) if clean_enable else None,
             has_envelope=bool(envelope_enable),
-            has_pdm=bool(pdm_enable),
             disabled=tuple(int(mic) for mic in np.ravel(disabled_microphones) if mic < n_microphones),
             dmas_order=max(1, int(dmas_order)),  # 0 is an earlier kernel of delay-and-sum.
             coherent=bool(coherence_factor_enable),
