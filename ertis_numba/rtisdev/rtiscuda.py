@@ -116,9 +116,9 @@ def processing(data: NDArray[Any], pdm: int, dim1: int, dim2: int, name: str) ->
     """
     with _errors_logged():
         with _turn:
-            processor = _processors.get(name)
+            processor, names = _processors.get(name), list(_processors)
         if processor is None:
-            known = ", ".join(map(repr, _processors)) or "none"
+            known = ", ".join(map(repr, names)) or "none"
             raise ArgumentError(f"configuration {name!r} is not preloaded; preload it first (preloaded are: {known})")
         result = processor.process(data, pdm=bool(pdm))
         if result.shape != (dim1, dim2):
