@@ -1,8 +1,9 @@
 """Modules in the place of the closed companions of RTIS Dev, so that its scripts run unchanged.
 
 The package ``rtisdev`` (2.16) imports ``rtisserial`` and ``rtiscuda``, which are not on PyPI. After
-``import ertis_numba.rtisdev``, both names mean the modules of this package, in this process and in its children. The
-environment selects the behaviour, because scripts have no arguments for it:
+``import ertis_numba.rtisdev``, both names mean the modules of this package, in this process and in children that it
+forks. Spawned children do not inherit them, and need the import again. The environment selects the behaviour, because
+scripts have no arguments for it:
 
 =====================  ==================================================================================
 ERTIS_RTISDEV_PORT     port to open instead of the one that the script names, such as an emulated sensor
