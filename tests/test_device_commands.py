@@ -137,7 +137,10 @@ def test_command_line_resets_a_sensor(tmp_path):
         refused = run("reset", "--port", "mine", *arguments)
         assert refused.exit_code == 1
         assert message in refused.stderr
-    assert run("reset", "--port", "mine", "--pin", 9, "--hook", "true").exit_code == 2
+    for arguments, message in ((["--pin", 9, "--hook", "true"], "give one of them"), (["--hook", " "], "is empty")):
+        refused = run("reset", "--port", "mine", *arguments)
+        assert refused.exit_code == 2
+        assert message in refused.stderr
 
 
 def test_emissions_have_a_period():

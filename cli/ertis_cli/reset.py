@@ -36,6 +36,8 @@ def reset(*, port: str, pin: int | None, hook: str | None, within_s: float, quie
 
     if hook is not None and pin is not None:
         raise click.UsageError("--hook and --pin are both given; give one of them")
+    if hook is not None and not hook.strip():
+        raise click.UsageError("--hook is empty; name a program")
     pulse = partial(pulse_reset_pin, pin or RESET_PIN) if hook is None else _runner(hook)
     with SonarDriver.open(port) as sonar:
         sonar.reset(pulse, within_s=within_s)
