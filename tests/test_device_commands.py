@@ -90,6 +90,16 @@ def test_reset_waits_for_the_sensor(device):
             sonar.reset(device.unplug, within_s=0.2)
 
 
+def test_sensor_that_was_not_reset_is_still_disarmed(device):
+    with SonarDriver.open("mine") as sonar:
+        sonar.configure(Setup.of(SHORT))
+        sonar.arm()
+        with pytest.raises(SonarError, match="pin 7 cannot be pulsed"):
+            sonar.reset()
+        sonar.command("!Y,0,0,0")
+        assert device.registers.armed == 0
+
+
 def test_reset_pin_is_pulsed(monkeypatch):
     steps = []
     pins = types.SimpleNamespace(

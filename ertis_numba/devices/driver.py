@@ -397,8 +397,8 @@ class SonarDriver:
             The sensor does not answer within this time.
         """
         self._speak()
+        pulse()  # If it fails, an armed sensor is still armed, and `close` must disarm it.
         self._configured, self._is_armed = None, False
-        pulse()
         self.reconnect(within_s=within_s)
 
     def close(self) -> None:
