@@ -111,6 +111,15 @@ def test_reset_pin_is_pulsed(monkeypatch):
     monkeypatch.setattr("ertis_numba.devices.reset_pin._PULSE_S", 0.0)
     pulse_reset_pin()
     assert steps == ["board", (7, "out", 1), (7, 0), (7, 1)]
+    monkeypatch.setattr("ertis_numba.devices.reset_pin.time", types.SimpleNamespace(sleep=interrupt))
+    steps.clear()
+    with pytest.raises(KeyboardInterrupt):
+        pulse_reset_pin(9)
+    assert steps[-1] == (9, 1)
+
+
+def interrupt(_):
+    raise KeyboardInterrupt
 
 
 def test_reset_pin_of_another_computer_is_reported():

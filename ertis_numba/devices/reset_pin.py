@@ -31,9 +31,11 @@ def pulse_reset_pin(pin: int = RESET_PIN) -> None:
         pins = importlib.import_module("Jetson.GPIO")
         pins.setmode(pins.BOARD)
         pins.setup(pin, pins.OUT, initial=pins.HIGH)
-        pins.output(pin, pins.LOW)
-        time.sleep(_PULSE_S)
-        pins.output(pin, pins.HIGH)
+        try:
+            pins.output(pin, pins.LOW)
+            time.sleep(_PULSE_S)
+        finally:  # Ctrl-C must not leave the sensor in its reset.
+            pins.output(pin, pins.HIGH)
     except Exception as error:  # The library raises plain exceptions, also on other computers.
         raise SonarError(
             f"pin {pin} cannot be pulsed ({error}); on a Jetson, install Jetson.GPIO; elsewhere, name a program that "
