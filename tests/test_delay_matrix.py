@@ -193,6 +193,7 @@ def test_unreadable_files_are_refused(tmp_path):
         ("text.csv", "1,2\n3,x", "could not convert string to float: 'x'"),
         ("rows.csv", "1,2\n3", "has rows of different lengths"),
         ("text.npy", "no array", "cannot be read"),
+        ("empty.npy", "", "cannot be read"),
     ):
         (tmp_path / name).write_text(content)
         with pytest.raises(ArgumentError, match=message):

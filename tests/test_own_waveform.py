@@ -185,6 +185,7 @@ def test_call_refuses_invalid_waveforms(changes, message):
         ("own.wav", lambda path: wavfile.write(path, 192_000, np.ones((300, 2), np.int16)), "give one channel"),
         ("own.wav", lambda path: path.write_bytes(b"RIFF"), "is not a WAV file"),
         ("own.npy", lambda path: path.write_bytes(b"\x80\x04N."), "cannot be read"),
+        ("own.npy", lambda path: path.write_bytes(b""), "cannot be read"),
         ("own.csv", lambda path: path.write_text("a,b"), "cannot be read"),
         ("own.npy", lambda path: np.save(path, np.zeros(2**20)), "the limit is 4194304"),
         ("own.wav", lambda path: path.mkdir(), "no such file"),

@@ -49,7 +49,7 @@ def read_waveform(path: Path, *, key: str = "call.waveform") -> tuple[tuple[floa
         if n_bytes > _MAX_FILE_BYTES:
             raise SettingsError(f"{key} {path} has {n_bytes} bytes; the limit is {_MAX_FILE_BYTES}")
         rate_hz, values = read_wav(path) if suffix == ".wav" else (None, _read_numbers(path, suffix))
-    except (OSError, ValueError, DataError) as error:
+    except (OSError, ValueError, EOFError, DataError) as error:  # np.load raises EOFError for empty files.
         if isinstance(error, SettingsError):
             raise
         raise SettingsError(f"{key} {path} cannot be read ({error}); save it again") from error
