@@ -262,7 +262,7 @@ def test_reflectors_are_found_where_they_are():
         assert abs(settings.ranges[near][at] - range_m) <= 0.02
 
 
-def test_simulated_device_gives_the_same_results(monkeypatch):
+def test_environment_selects_the_device(monkeypatch):
     monkeypatch.setenv("ERTIS_RTISDEV_DEVICE", "numpy")
     settings = prepared(directions=5, minRange=1.0, maxRange=1.3)
     compare(settings)
