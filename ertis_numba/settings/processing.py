@@ -298,7 +298,7 @@ class Processing(TomlTable, frozen=True, kw_only=True):
             )
 
     def _check_delays(self) -> None:
-        """Refuse delays that settings cannot hold, and those that method, beamformer or wavefront do not support."""
+        """Refuse delays that settings cannot hold, and those that beamformer or wavefront do not support."""
         if self.delay_rate_hz is not None:
             checks.between("processing.delay_rate_hz", self.delay_rate_hz, 1.0, 1e9)
         given = self.delay_matrix

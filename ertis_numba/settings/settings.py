@@ -96,7 +96,7 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
                 f"give {_MIN_BANDWIDTH_HZ:g} Hz or more, or method 'fast'"
             )
         self._check_band()
-        self._check_adaptive()
+        self._check_plan()
         self._check_filters()
         step = self.processing.range_decimation
         if self.processing.decimation is None and self.decimation * _MAX_OVERSAMPLING < min(step, self._max_decimation):
@@ -152,8 +152,8 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
                 "processing.filter_rate_hz"
             )
 
-    def _check_adaptive(self) -> None:
-        """Refuse plans that an adaptive beamformer does not support."""
+    def _check_plan(self) -> None:
+        """Refuse plans that a delay matrix or an adaptive beamformer does not support."""
         processing, accuracy = self.processing, self.accuracy
         if processing.delay_matrix and processing.method == "fast" and accuracy.delay_taps not in {None, 0}:
             raise ArgumentError(
