@@ -28,8 +28,8 @@ def clean(image: Energyscape, *, within_db: float | None = 6.0, above_mean_db: f
     within_db : float, optional
         Largest level below the strongest direction of the same range, 0 to 1000 dB; 6 by default, None for no limit.
     above_mean_db : float, optional
-        Smallest level above the mean amplitude of the range, 0 to 1000 dB; no such limit by default. With this limit,
-        an image of one direction keeps no bin.
+        Smallest level above the mean amplitude of the range, 0 to 1000 dB; no such limit by default. Above 0 dB, an
+        image of one direction keeps no bin.
 
     Returns
     -------
