@@ -1,15 +1,18 @@
 """Drive a ROS 2 robot forwards, and stop it in front of a wall that the sonar sees.
 
 The node reads the laser scan of a sensor, and publishes velocities. It stops if an echo within the width of the robot
-is nearer than `STOP_M`, and if no scan has arrived for half a second. It needs rclpy, and no other part of ROS::
+is nearer than `STOP_M`, and if no scan has arrived for half a second. It then waits for a farther echo: the sensor does
+not see a wall that is nearer than its first range, so that a scan without echoes may mean that the wall is very near.
+For the same reason, begin with the way ahead free. It needs rclpy, and no other part of ROS::
 
     ertis serve &
-    ertis capture --port front --to tcp://127.0.0.1:5601 &
+    ertis capture --port front --settings NEAR.toml --to tcp://127.0.0.1:5601 &   # range_m = [0.3, 5.0]
     ertis ros tcp://127.0.0.1:5602 --floor -60 &
     python examples/6_stop_in_ros.py /front/scan
 """
 
 import math
+import signal
 import sys
 import time
 
@@ -17,6 +20,7 @@ import rclpy
 from geometry_msgs.msg import Twist
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import LaserScan
 
 STOP_M = 0.8
@@ -47,7 +51,11 @@ class StopBeforeWalls(Node):
         self.create_timer(PERIOD_S, self._drive)
 
     def _see(self, scan: LaserScan) -> None:
-        self._distance_m, self._seen_s = distance_ahead_m(scan), time.monotonic()
+        distance_m = distance_ahead_m(scan)
+        self._seen_s = time.monotonic()
+        if math.isinf(distance_m) and 0 < self._distance_m <= STOP_M:
+            return  # The wall has come too near to be seen.
+        self._distance_m = distance_m if scan.range_min < STOP_M else 0.0
 
     def _drive(self) -> None:
         message = Twist()
@@ -55,15 +63,23 @@ class StopBeforeWalls(Node):
             message.linear.x = SPEED_M_S
         self._velocity.publish(message)
 
+    def stop(self) -> None:
+        """Publish a velocity of 0: robots keep the last velocity that they received."""
+        self._velocity.publish(Twist())
+
 
 def main(topic: str) -> None:
     """Drive until the program is interrupted."""
-    rclpy.init()
+    # By default, signals end rclpy before the robot can be stopped.
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    node = StopBeforeWalls(topic)
     try:
-        rclpy.spin(StopBeforeWalls(topic))
+        rclpy.spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:
+        node.stop()
         rclpy.try_shutdown()
 
 

@@ -1,6 +1,8 @@
 """Commands as text, and resets, with an emulated sensor on a real pseudo terminal."""
 
+import contextlib
 import json
+import os
 import sys
 import types
 
@@ -11,6 +13,7 @@ from ertis_cli.main import cli
 
 from ertis_numba.devices.driver import SonarDriver
 from ertis_numba.devices.emulator import Emulator
+from ertis_numba.devices.reset import reset_sensor
 from ertis_numba.devices.reset_pin import pulse_reset_pin
 from ertis_numba.devices.setup import Setup
 from ertis_numba.errors import ArgumentError, SonarDisconnectedError, SonarError
@@ -80,7 +83,7 @@ def test_listening_driver_sends_no_command():
 def test_reset_waits_for_the_sensor(device):
     with SonarDriver.open("mine") as sonar:
         sonar.configure(Setup.of(SHORT))
-        sonar.reset(lambda: device.unplug(0.2))
+        assert sonar.reset(lambda: device.unplug(0.2))
         assert sonar.firmware == "1.0.0"
         with pytest.raises(SonarError, match="is not configured"):
             sonar.measure()
@@ -88,6 +91,40 @@ def test_reset_waits_for_the_sensor(device):
         assert len(sonar.measure().data) == N_SAMPLES
         with pytest.raises(SonarDisconnectedError, match=r"did not return within 0\.2 s"):
             sonar.reset(device.unplug, within_s=0.2)
+
+
+@pytest.mark.parametrize("has_call", [False, True])
+@pytest.mark.usefixtures("device")
+def test_reset_that_has_not_reached_the_sensor_is_noticed(has_call):
+    with SonarDriver.open("mine") as sonar:
+        if has_call:
+            sonar.configure(Setup.of(SHORT))
+        assert not sonar.reset(lambda: None)
+
+
+def test_sensor_with_a_missing_port_is_reset(device):
+    device.unplug()
+    with pytest.raises(SonarError, match="mine"), reset_sensor("mine", lambda: None, within_s=0.2):
+        pass
+    with reset_sensor("mine", device.replug) as (sonar, is_certain):
+        assert (sonar.firmware, is_certain) == ("1.0.0", True)
+
+
+def test_silent_sensor_is_reset(tmp_path):
+    """A pseudo terminal without a device is silent, and the reset puts a device in its place."""
+    first, second = os.openpty()
+    link = tmp_path / "silent"
+    link.symlink_to(os.ttyname(second))
+    with contextlib.ExitStack() as stack:
+        for each in (first, second):
+            stack.callback(os.close, each)
+
+        def begin():
+            link.unlink()
+            stack.enter_context(Emulator(WORDS, link=link))
+
+        with reset_sensor(str(link), begin) as (sonar, is_certain):
+            assert (sonar.firmware, is_certain) == ("1.0.0", True)
 
 
 def test_sensor_that_was_not_reset_is_still_disarmed(device):
@@ -146,6 +183,7 @@ def test_command_line_resets_a_sensor(tmp_path):
     done = run("reset", "--port", "mine", "--hook", f"touch '{tmp_path}/pulled'")
     assert (done.exit_code, (tmp_path / "pulled").exists()) == (0, True)
     assert "answers again: firmware 1.0.0" in done.stderr
+    assert "still has its call, so the reset has probably not reached it; check the pin" in done.stderr
     for arguments, message in (
         (["--hook", "false"], "--hook 'false' has failed"),
         (["--hook", "no-such-program"], "--hook 'no-such-program' has failed"),

@@ -3,6 +3,7 @@
 import importlib.util
 import itertools
 import os
+import signal
 import struct
 import subprocess
 import sys
@@ -37,18 +38,18 @@ def image_at(distance_m, pipeline):
 
 
 def test_robot_stops_in_front_of_a_wall():
-    """The robot moves by what the node publishes. Then the scans end, and it still stands."""
+    """The robot stops. It also stands if the wall is too near, if scans end, and at the end of the node."""
     settings = Settings().replace(processing=Processing(directions="2d:91", range_m=(0.3, 3.0)))
     environment = ENVIRONMENT | {"ROS_DOMAIN_ID": str(DOMAIN), "ROS_LOG_DIR": tempfile.gettempdir()}
     distances_m = [START_M]
     with (
-        Pipeline(settings) as pipeline,
+        Pipeline(settings, predict=False) as pipeline,
         Participant(domain=DOMAIN) as participant,
         subscribed({"/cmd_vel": "geometry_msgs/msg/Twist"}, domain=DOMAIN) as subscriber,
         subprocess.Popen([sys.executable, EXAMPLE, "/front/scan"], env=environment) as node,
     ):
         try:
-            ros = RosPublisher(participant, topics=["scan"])
+            ros = RosPublisher(participant, topics=["scan"], floor_dbfs=-60.0)
             ros.publish(image_at(START_M, pipeline))
             await_subscribers([ros.topics["/front/scan"]])
             for _ in range(MAX_STEPS):
@@ -57,12 +58,25 @@ def test_robot_stops_in_front_of_a_wall():
                 distances_m.append(distances_m[-1] - speed_m_s * STEP_S)
                 if speed_m_s == 0 and len(distances_m) > 3:
                     break
-            afterwards = velocities(subscriber, until_s=time.monotonic() + 1.0)
+            for _ in range(2):  # A wall that is too near gives no echo.
+                ros.publish(image_at(3.5, pipeline))
+                near = velocities(subscriber, until_s=time.monotonic() + 0.2)
+            ros.publish(image_at(2.0, pipeline))
+            free = velocities(subscriber, until_s=time.monotonic() + 0.2)
+            silent = velocities(subscriber, until_s=time.monotonic() + 1.0)
+            ros.publish(image_at(2.0, pipeline))
+            assert velocities(subscriber, until_s=time.monotonic() + 0.2)[-1] > 0
+            node.send_signal(signal.SIGINT)
+            while velocities(subscriber, until_s=0.0)[-1] > 0:  # The last velocity is 0.
+                pass
+            assert node.wait(10) == 0
         finally:
             node.terminate()
     assert STOP_M - 0.5 * STEP_S - 0.05 <= distances_m[-1] <= STOP_M + 0.02
     assert all(before >= after for before, after in itertools.pairwise(distances_m))
-    assert afterwards[-1] == 0
+    assert near[-1] == 0
+    assert free[-1] > 0
+    assert silent[-1] == 0
 
 
 def velocities(subscriber, *, until_s):

@@ -29,9 +29,10 @@ __all__ = ["reset"]
 def reset(*, port: str, pin: int | None, hook: str | None, within_s: float, quiet: bool) -> None:
     """Reset a sensor and wait until it answers again.
 
-    By default, the reset line is on a pin of an NVIDIA Jetson, which needs the package Jetson.GPIO.
+    By default, the reset line is on a pin of an NVIDIA Jetson, which needs the package Jetson.GPIO. The sensor may be
+    silent, or its port missing, before the reset.
     """
-    from ertis_numba.devices.driver import SonarDriver
+    from ertis_numba.devices.reset import reset_sensor
     from ertis_numba.devices.reset_pin import RESET_PIN, pulse_reset_pin
 
     if hook is not None and pin is not None:
@@ -39,9 +40,14 @@ def reset(*, port: str, pin: int | None, hook: str | None, within_s: float, quie
     if hook is not None and not hook.strip():
         raise click.UsageError("--hook is empty; name a program")
     pulse = partial(pulse_reset_pin, pin or RESET_PIN) if hook is None else _runner(hook)
-    with SonarDriver.open(port) as sonar:
-        sonar.reset(pulse, within_s=within_s)
+    with reset_sensor(port, pulse, within_s=within_s) as (sonar, is_certain):
         options.say(f"{sonar.port} answers again: firmware {sonar.firmware}", quiet=quiet)
+    if not is_certain:
+        click.echo(
+            f"ertis: warning: {sonar.port} still has its call, so the reset has probably not reached it; check the pin "
+            "(--pin) or the program (--hook)",
+            err=True,
+        )
 
 
 def _runner(hook: str) -> Callable[[], None]:

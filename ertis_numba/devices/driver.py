@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ertis_numba import checks
 from ertis_numba.devices.block_receiver import Block, BlockReceiver
 from ertis_numba.devices.blocks import COUNTERS, FRAME_BYTES
-from ertis_numba.devices.commands import Command, CustomCommand, firmware_version
+from ertis_numba.devices.commands import DAC_SAMPLES, Command, CustomCommand, firmware_version
 from ertis_numba.devices.dialogue import Dialogue
 from ertis_numba.devices.line import closed_error
 from ertis_numba.devices.ports import Port, find_again, resolve
@@ -378,8 +378,10 @@ class SonarDriver:
             self._configured = None
         return self._line.ask(command)
 
-    def reset(self, pulse: Callable[[], None] = pulse_reset_pin, *, within_s: float = 60.0) -> None:
+    def reset(self, pulse: Callable[[], None] = pulse_reset_pin, *, within_s: float = 60.0) -> bool:
         """Reset the sensor, and wait until it answers again; `configure` it afterwards.
+
+        It may be silent before. A sensor without a call gets a sample of one, because a reset erases the call.
 
         Parameters
         ----------
@@ -389,6 +391,11 @@ class SonarDriver:
         within_s : float
             Longest time until the sensor answers.
 
+        Returns
+        -------
+        bool
+            False if the sensor still has its call, so that it was probably not reset.
+
         Raises
         ------
         SonarError
@@ -397,9 +404,22 @@ class SonarDriver:
             The sensor does not answer within this time.
         """
         self._speak()
-        pulse()  # If it fails, an armed sensor is still armed, and `close` must disarm it.
+        held = self._call_before_reset()
+        pulse()  # If it fails, a sensor that could not be disarmed is still armed, and `close` must disarm it.
         self._configured, self._is_armed = None, False
-        self.reconnect(within_s=within_s)
+        return not self.reconnect(within_s=within_s) or held is None or self._line.ask(Command("L")) != held
+
+    def _call_before_reset(self) -> int | None:
+        """Return the hash of the sensor's call, which is not 0; None if it does not answer."""
+        try:
+            if self._is_armed:
+                self.disarm()
+            if self._line.ask(Command("L")) == 0:
+                self._line.ask(Command("E", DAC_SAMPLES[0]))
+                self._line.ask(Command("C", 0, 1))
+            return self._line.ask(Command("L"))
+        except SonarError:
+            return None
 
     def close(self) -> None:
         """Switch the trigger off if it is on, and close the port; a `listen` in another thread ends."""
