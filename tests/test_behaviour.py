@@ -4,6 +4,7 @@ import json
 import subprocess
 from dataclasses import replace
 
+import h5py
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -82,6 +83,18 @@ def test_journal_with_an_unknown_behaviour_is_damaged(measurements, tmp_path):
         execute("UPDATE measurements SET row_crc32 = ?", (row_crc32(values[1:]),))
         with pytest.raises(DamagedError, match="has behaviour 'loud', wanted one of active, passive, unknown; copy"):
             next(journal.entries())
+
+
+def test_file_with_an_unknown_behaviour_is_damaged(measurements, tmp_path, monkeypatch):
+    """A program that writes such a file computes its checksum, too."""
+    monkeypatch.setattr("ertis_numba.storage._reader.FileReader._require_content", lambda _: None)
+    path = write_recording(tmp_path / "rec.h5", measurements)
+    with h5py.File(path, "r+") as file:
+        file["sensors/mine/behaviour"][1] = 7
+    with open_recording(path) as recording:
+        for read in (recording.stamps, lambda: recording[1]):
+            with pytest.raises(DamagedError, match=r"measurement 1 has behaviour 7, but the format knows 1 \(active\)"):
+                read()
 
 
 def test_network_keeps_the_behaviour(measurements, tmp_path):

@@ -1,5 +1,7 @@
 """Delay matrices of your own: images, storage and refusals."""
 
+import re
+
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -203,8 +205,11 @@ def test_unreadable_files_are_refused(tmp_path):
         delay_matrix(given(str(tmp_path / "flat.npy")), n_directions=3)
 
 
-def test_interpolated_delays_are_refused_with_a_matrix():
-    with pytest.raises(
-        ArgumentError, match=r"accuracy.delay_taps is 2, but processing.delay_matrix needs exact delays"
-    ):
-        given(random_samples(SHORT)).replace("accuracy.delay_taps", 2)
+@pytest.mark.parametrize(
+    ("key", "value", "accepted"),
+    [("delay_taps", 2, "0"), ("precision", "int16", "'float32'"), ("oversampling", 2, "1"), ("beam_taps", 2, "0")],
+)
+def test_plans_with_other_delays_are_refused_with_a_matrix(key, value, accepted):
+    message = f"accuracy.{key} is {value!r}, but processing.delay_matrix needs exact delays; leave {key} out or give "
+    with pytest.raises(ArgumentError, match=re.escape(message + accepted)):
+        given(random_samples(SHORT)).replace(f"accuracy.{key}", value)

@@ -176,6 +176,9 @@ def test_command_line_sends_commands(device):
     refused = run("command", "--port", "mine", "!K,1,0,0", "nonsense")
     assert (refused.exit_code, device.registers.amplifier) == (1, 0)
     assert "give '!X,i,j,k'" in refused.stderr
+    refused = run("command", "--port", "mine", f"!B,{2**32},0,0")
+    assert (refused.exit_code, device.registers.counter) == (1, 0)
+    assert "whole numbers up to 4294967295" in refused.stderr
 
 
 @pytest.mark.usefixtures("device")
@@ -198,6 +201,11 @@ def test_command_line_resets_a_sensor(tmp_path):
         refused = run("reset", "--port", "mine", *arguments)
         assert refused.exit_code == 2
         assert message in refused.stderr
+
+
+def test_period_of_emissions_is_limited():
+    with pytest.raises(ArgumentError, match=r"emission period is 1 s, .* at most 65535 samples; give at most 0\.146 s"):
+        Setup.of(SHORT, emissions=2, emission_period_s=1.0)
 
 
 def test_emissions_have_a_period():

@@ -480,6 +480,12 @@ def test_unplugged_sensor_is_a_connection_error(caplog):
         rtisserial.close()
 
 
+def test_words_without_beamforming_are_refused_with_the_remedy():
+    settings = prepared(directions=31, beamformingEnable=False)
+    with pytest.raises(ArgumentError, match=r"no beamforming, and therefore processes beams, not PDM words; enable"):
+        rtiscuda.processing(measured(settings).rawData, 1, settings.nDirections, settings.nspses, "test")
+
+
 def test_serial_errors_are_those_that_callers_expect(monkeypatch, caplog):
     with pytest.raises(ConnectionError, match="does not exist"):
         rtisserial.connect("/dev/no-such-port", 115_200)

@@ -139,6 +139,8 @@ class Processor:
     def __init__(self, configuration: Configuration, *, device: str = "auto") -> None:
         self._given = configuration
         self._loaded = kernels.load(device)
+        if self._loaded.device == "cuda":  # Forked processes inherit no context of a GPU.
+            _note_run()
         self._enabled = np.array([mic for mic in range(configuration.n_mics) if mic not in configuration.disabled])
         self._channels = np.arange(configuration.n_mics, dtype=np.int32)
         # With integers, all devices give the same bits, and sums of the magnitudes do not overflow.
@@ -179,6 +181,11 @@ class Processor:
         """Return the result of the last stage before cleaning, as `process` does."""
         given = self._given
         if given.delays is None and (given.has_envelope or given.post_filter is not None or given.clean_multipliers):
+            if pdm:
+                raise ArgumentError(
+                    "the configuration has no beamforming, and therefore processes beams, not PDM words; enable "
+                    "beamforming, or disable envelope, post filter and cleaning"
+                )
             return self._finish(self._rows(data, given.n_directions))
         signals = self._demodulated(data) if pdm else self._rows(data, given.n_mics)
         if given.pre_filter is not None:
@@ -278,8 +285,7 @@ class Processor:
 
     def run(self, name: str, *arguments: Any, out: Real) -> None:
         """Run a kernel with arrays of the host, and fill ``out``."""
-        global _has_run  # noqa: PLW0603  true of the whole process
-        _has_run = True
+        _note_run()
         kernel_set = self._kernels
         lane = kernel_set.memory().lane()
         with kernel_set.threads(kernel_set.max_threads), lane.entered():
@@ -316,6 +322,12 @@ def cleaned(image: Real, multipliers: tuple[float, float] | None) -> Real:
     limit = np.maximum(image.mean(axis=0) * mean_multiplier, image.max(axis=0, initial=0.0) * max_multiplier)
     np.multiply(image, image >= limit, out=image)  # A tenth of the time that np.where takes.
     return image
+
+
+def _note_run() -> None:
+    """Remember that this process has run kernels."""
+    global _has_run  # noqa: PLW0603  true of the whole process
+    _has_run = True
 
 
 def _after_fork() -> None:

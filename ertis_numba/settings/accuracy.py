@@ -14,6 +14,9 @@ ERROR_PRESETS_DB = {"draft": -20.0, "standard": -35.0, "fine": -60.0, "exact": -
 MAX_FOCAL_ZONES = 1_000_000
 """Limit on the number of focal zones; more than an image has ranges, even near the array."""
 
+_EXACT_DELAYS = (("precision", ("auto", "float32")), ("oversampling", (None, 1)), ("beam_taps", (None, 0)))
+"""Values that exact delays support; the last one is what they use."""
+
 
 class Accuracy(TomlTable, frozen=True, kw_only=True):
     """Error budget of the image, and parts of the plan that the planner shall not choose.
@@ -73,13 +76,25 @@ class Accuracy(TomlTable, frozen=True, kw_only=True):
         if self.delay_taps == 0:
             self._check_phase_shifts()
 
+    def require_exact_delays(self) -> None:
+        """Refuse a plan with other delays than those that a delay matrix needs.
+
+        Raises
+        ------
+        ArgumentError
+            A key names another plan.
+        """
+        for name, accepted in (("delay_taps", (None, 0)), *_EXACT_DELAYS):
+            value = getattr(self, name)
+            if value not in accepted:
+                raise ArgumentError(
+                    f"accuracy.{name} is {value!r}, but processing.delay_matrix needs exact delays; leave {name} out "
+                    f"or give {accepted[1]!r}"
+                )
+
     def _check_phase_shifts(self) -> None:
         """Refuse parts of a plan that phase shifts of spectra do not support."""
-        for name, accepted in (
-            ("precision", ("auto", "float32")),
-            ("oversampling", (None, 1)),
-            ("beam_taps", (None, 0)),
-        ):
+        for name, accepted in _EXACT_DELAYS:
             value = getattr(self, name)
             if value not in accepted:
                 raise ArgumentError(

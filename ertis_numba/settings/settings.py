@@ -155,11 +155,8 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
     def _check_plan(self) -> None:
         """Refuse plans that a delay matrix or an adaptive beamformer does not support."""
         processing, accuracy = self.processing, self.accuracy
-        if processing.delay_matrix and processing.method == "fast" and accuracy.delay_taps not in {None, 0}:
-            raise ArgumentError(
-                f"accuracy.delay_taps is {accuracy.delay_taps}, but processing.delay_matrix needs exact delays; leave "
-                "delay_taps out or give 0"
-            )
+        if processing.delay_matrix and processing.method == "fast":
+            accuracy.require_exact_delays()
         if processing.is_adaptive and accuracy.delay_taps == 0:
             raise ArgumentError(
                 f"accuracy.delay_taps is 0 (phase shifts of spectra), which processing.beamformer "

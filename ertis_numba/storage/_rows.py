@@ -137,7 +137,7 @@ class RowReader:
         """Return the stamp of one measurement."""
         fields = {field: self.column(name, index) for name, field in _STAMP_FIELDS.items()}
         code = self.column("behaviour", index) if "behaviour" in self._group else -1
-        return Stamp(sensor=sensor, behaviour=_BEHAVIOURS.get(code, "unknown"), **fields)
+        return Stamp(sensor=sensor, behaviour=_behaviour(code, index), **fields)
 
     def stamps(self, sensor: str) -> list[Stamp]:
         """Return the stamps of all measurements."""
@@ -146,10 +146,10 @@ class RowReader:
         return [
             Stamp(
                 sensor=sensor,
-                behaviour=_BEHAVIOURS.get(code, "unknown"),
+                behaviour=_behaviour(code, index),
                 **dict(zip(_STAMP_FIELDS.values(), row, strict=True)),
             )
-            for code, *row in zip(codes, *columns, strict=True)
+            for index, (code, *row) in enumerate(zip(codes, *columns, strict=True))
         ]
 
     def column(self, name: str, index: int) -> Any:
@@ -157,3 +157,14 @@ class RowReader:
         if name not in self._columns:
             self._columns[name] = self._group[name]
         return self._columns[name][index].item()
+
+
+def _behaviour(code: int, index: int) -> Behaviour:
+    """Return the behaviour of a measurement by its code in the file."""
+    if code not in _BEHAVIOURS:
+        known = ", ".join(f"{number} ({name})" for number, name in _BEHAVIOURS.items())
+        raise DamagedError(
+            f"measurement {index} has behaviour {code}, but the format knows {known}: the file is damaged; copy it "
+            "again"
+        )
+    return _BEHAVIOURS[code]
