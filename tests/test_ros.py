@@ -1,12 +1,14 @@
 """Live topics arrive in rclpy, which runs in another process, byte for byte."""
 
 import json
+from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
 from ertis_numba.analysis.point_finder import PointFinder
+from ertis_numba.devices.emulator import Emulator
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Stamp
 from ertis_numba.interop.ros_definitions import encoder
@@ -14,13 +16,14 @@ from ertis_numba.interop.ros_messages import MESSAGES, ImageMessages, points_mes
 from ertis_numba.network.status import SensorStatus, Status
 from ertis_numba.ros import Participant, RosPublisher, interfaces
 from ertis_numba.ros.diagnostics import diagnostics_message
-from ertis_numba.storage import write_energyscapes
+from ertis_numba.storage import open_recording, write_energyscapes
 from tests.files import image
 from tests.ros_topics import DOMAIN, await_subscribers, subscribed
 
 pytest.importorskip("rclpy.serialization")  # Wheels exist for some versions of Python only.
 pytest.importorskip("cyclonedds")
 
+ROOT = Path(__file__).parents[1]
 TIME_NS = 1_700_000_000_123_456_789
 PLACE = ((1.0, 2.0, 0.5), (0.0, 0.0, 0.6, 0.8))
 
@@ -163,6 +166,47 @@ def test_command_publishes_a_file(tmp_path):
     assert lines[-1]["event"] == "end"
     assert lines[-1]["messages"]["/front/points"] == lines[-1]["measurements"] > 5
     assert sum(map(len, taken.values())) == 4
+
+
+def test_command_publishes_the_images_of_sensors(tmp_path, monkeypatch):
+    monkeypatch.setenv("ERTIS_EMULATED_DIR", str(tmp_path))
+    kinds = {f"/{name}/points": MESSAGES["points"] for name in ("one", "two")}
+    with open_recording(ROOT / "data" / "synthetic" / "reflectors.h5") as recording:
+        words, settings = recording[0].data, recording.settings
+    (tmp_path / "settings.toml").write_text(settings.to_toml())
+    with (
+        Emulator([words], name="one", link=tmp_path / "one"),
+        Emulator([words], name="two", link=tmp_path / "two"),
+        subscribed(kinds) as subscriber,
+    ):
+        command = ["ros", "one", "two", "--settings", str(tmp_path / "settings.toml"), "--domain", str(DOMAIN)]
+        done = CliRunner().invoke(cli, [*command, "--trigger-rate", "20", "--duration", "4", "--json"])
+        taken = subscriber.take(10)
+    assert done.exit_code == 0, done.stderr
+    end = json.loads(done.stdout.splitlines()[-1])
+    assert end["messages"]["/one/points"] > 5
+    assert end["measurements"] == sum(end["messages"][name] for name in kinds)
+    assert sum(map(len, taken.values())) == 10
+    frame, n_points = taken["/one/points"][0][16:19], len(taken["/one/points"][0])
+    assert (frame, n_points > 200) == (b"one", True)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["missing.h5"], "file missing.h5 does not exist; give an existing file, an address, or ports"),
+        (["one", "tcp://127.0.0.1:1"], "several sources must all be ports"),
+        (["one", "one"], "port one is given 2 times"),
+        (["one", "--loop"], "--loop is for files; remove it with ports"),
+        (["tcp://127.0.0.1:1", "--trigger", "sync"], "--trigger is for ports; remove it with an address"),
+        (["tcp://127.0.0.1:1", "--preset", "short_25_50"], "--preset is for ports; remove it with an address"),
+        (["one", "--sensor", "one"], "--sensor selects sensors of a file or an address"),
+    ],
+)
+def test_sources_that_do_not_go_together_are_refused(arguments, message):
+    done = CliRunner().invoke(cli, ["ros", *arguments])
+    assert done.exit_code == 2
+    assert message in done.stderr
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Sources of ``ertis ros``: the products of a central node, and the measurements of a file at their original speed."""
+"""Sources of ``ertis ros``: the products of a central node, the measurements of a file at their speed, and sensors."""
 
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -6,13 +6,16 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from ertis_cli._sensors import ConfiguredSensors, named_sensors, opened_sensors, require_one_each
 from ertis_cli._stop_signals import Signals
 
 if TYPE_CHECKING:
+    from ertis_numba.journal import JournalEntry
     from ertis_numba.network.keys import ClientKeys
     from ertis_numba.ros import RosPublisher
+    from ertis_numba.settings import Settings
 
-__all__ = ["publish_file", "publish_node"]
+__all__ = ["publish_file", "publish_node", "publish_ports"]
 
 _POLL_INTERVAL_S: Final = 0.1
 _CLOCK_INTERVAL_S: Final = 0.02
@@ -110,6 +113,82 @@ def publish_file(
                 ros.publish(item, (reader.translation_m, reader.rotation_xyzw) if known else None)
                 on_published()
             again = loop and clock.wait_until(order[-1][0] + round(1e9 * _UNTIMED_S))
+
+
+def publish_ports(
+    ports: tuple[str, ...],
+    ros: "RosPublisher",
+    *,
+    settings: "Settings",
+    trigger: str,
+    rate_hz: float,
+    device: Any,
+    quiet: bool,
+    is_over: Callable[[], bool],
+    on_note: Callable[[str], None],
+    on_published: Callable[[], None],
+    on_ready: Callable[[], None],
+    signals: Signals,
+) -> None:
+    """Measure with the sensors on some ports, and publish their images, until the program is to end."""
+    from ertis_cli import options
+    from ertis_numba.capture import CaptureSession
+    from ertis_numba.devices.setup import Setup
+
+    with ExitStack() as stack:
+        require_one_each(ports, ())
+        sonars = named_sensors(ports, (), opened_sensors(ports, signals, stack, listen_only=False))
+        sensors = ConfiguredSensors(sonars, Setup.of, check_bits=True, splices=False)
+        sensors.configure_all(settings, signals)
+
+        def tick() -> None:
+            if is_over():
+                session.stop()
+
+        session = CaptureSession(
+            sonars,
+            settings,
+            trigger=trigger,
+            rate_hz=rate_hz,
+            on_note=lambda sensor, text: on_note(f"{sensor}: {text}"),
+            on_tick=tick,
+        )
+        with options.note_when_slow(options.PREPARING, quiet=quiet):
+            sink = _ImageSink(ros, settings, device=device, on_published=on_published, stack=stack)
+        signals.obey(session.stop)
+        on_ready()
+        session.run(sink)
+
+
+class _ImageSink:
+    """Destination of measurements that publishes their images, of each sensor the newest."""
+
+    def __init__(
+        self,
+        ros: "RosPublisher",
+        settings: "Settings",
+        *,
+        device: Any,
+        on_published: Callable[[], None],
+        stack: ExitStack,
+    ) -> None:
+        from ertis_numba.pipeline import Pipeline
+
+        self._ros, self._on_published = ros, on_published
+        self._pipeline: Pipeline = stack.enter_context(Pipeline(settings, device=device, predict=False))
+
+    def add_sensor(self, name: str, settings: "Settings", **_: Any) -> None:
+        """Accept a sensor; all have the same settings."""
+
+    def append(self, entries: "Sequence[JournalEntry]") -> None:
+        """Publish the image of the newest measurement of each sensor, so that images never lag behind."""
+        newest = {entry.measurement.stamp.sensor: entry.measurement for entry in entries}
+        for measurement in newest.values():
+            self._ros.publish(self._pipeline.process(measurement))
+            self._on_published()
+
+    def note_gap(self, sensor: str, first: int, last: int, reason: str, *, session_id: int) -> None:
+        """Ignore missing measurements, which the session reports."""
 
 
 def _in_order(stamps: Mapping[str, Sequence[Any]]) -> list[tuple[int, str, int]]:

@@ -1,10 +1,7 @@
 """``ertis capture``: record measurements from sensors."""
 
-import errno
-import re
 import sys
-import time
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -16,21 +13,18 @@ from ertis_cli import _mountings, _network, options
 from ertis_cli._recording_settings import recording_settings, settings_from
 from ertis_cli._saving import withdrawn
 from ertis_cli._sending import Sending
+from ertis_cli._sensors import ConfiguredSensors, named_sensors, opened_sensors, require_one_each, wait_for
 from ertis_cli._stop_signals import Signals, stopped_by_signals
 from ertis_cli._watch import Watch, report
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Sequence
 
     from ertis_numba.capture import CaptureSession
     from ertis_numba.devices.bits import BitCheck
-    from ertis_numba.devices.driver import SonarDriver
     from ertis_numba.devices.setup import Setup
-    from ertis_numba.settings import Settings
 
 __all__ = ["capture"]
-
-_POLL_INTERVAL_S = 0.1  # interval between searches for ports
 
 
 @click.command()
@@ -176,7 +170,7 @@ def capture(
     if dry_run:
         _print_commands(setup, as_json=as_json)
         return
-    _require_one_each(ports, names)
+    require_one_each(ports, names)
     _require_one_place(address, target, for_address=(spool, spool_mb, ring_mb, fixed_settings, key, server_key))
     _require_spool(spool, spool_mb)
     _network.require_duration(duration)
@@ -196,12 +190,12 @@ def capture(
         made = stack.enter_context(withdrawn(spool))
         if send is not None:
             stack.enter_context(send.node(_network.client_keys(key, server_key)))
-        _wait_for(ports, wait_s, signals, quiet=quiet)
-        sonars = _named(ports, names, _opened(ports, signals, stack, listen_only=listen_only))
+        wait_for(ports, wait_s, signals, quiet=quiet)
+        sonars = named_sensors(ports, names, opened_sensors(ports, signals, stack, listen_only=listen_only))
         target = target or Path(_default_name(list(sonars)))
         if send is None:
             check_target(target, overwrite=force)
-        sensors = _Sensors(sonars, setup_of, check_bits=check_bits, splices=refuse_splices)
+        sensors = ConfiguredSensors(sonars, setup_of, check_bits=check_bits, splices=refuse_splices)
         session = CaptureSession(
             sonars,
             settings,
@@ -292,93 +286,6 @@ def _note_mounting(path: Path | None, sensors: "Sequence[str]", *, quiet: bool) 
     _mountings.note_unknown(sensors if path is None else [], remedy, quiet=quiet)
 
 
-def _wait_for(ports: tuple[str, ...], wait_s: float, signals: Signals, *, quiet: bool) -> None:
-    """Wait until all ports exist; raise an error for the first port that is missing after ``wait_s``."""
-    from ertis_numba.devices.ports import resolve
-    from ertis_numba.errors import SonarError
-
-    end_s = time.monotonic() + wait_s
-    with options.note_when_slow(f"waiting for {', '.join(ports)} ...", quiet=quiet):
-        for port in ports:
-            while True:
-                if signals.came:
-                    signals.end()
-                try:
-                    resolve(port)
-                    break
-                except SonarError as error:
-                    if error.errno != errno.ENOENT or time.monotonic() >= end_s:
-                        raise
-                time.sleep(_POLL_INTERVAL_S)
-
-
-@contextmanager
-def _interruptible(signals: Signals) -> "Iterator[Callable[[], bool]]":
-    """Yield a function that returns True once a signal has arrived; a failed dialogue then ends the command."""
-    from ertis_numba.errors import SonarError
-
-    try:
-        yield lambda: bool(signals.came)
-    except SonarError:
-        if signals.came:
-            signals.end()
-        raise
-
-
-def _opened(ports: "Sequence[str]", signals: Signals, stack: ExitStack, *, listen_only: bool) -> "list[SonarDriver]":
-    from ertis_numba.devices.driver import SonarDriver
-
-    with _interruptible(signals) as asked:
-        return [stack.enter_context(SonarDriver.open(port, listen_only=listen_only, stop=asked)) for port in ports]
-
-
-class _Sensors:
-    """Sensors of a capture, which can be configured again.
-
-    Attributes
-    ----------
-    checks : dict of str to BitCheck
-        Check of each sensor's bits; empty if they are not checked.
-    """
-
-    def __init__(
-        self,
-        sonars: "dict[str, SonarDriver]",
-        setup_of: "Callable[[Settings], Setup]",
-        *,
-        check_bits: bool,
-        splices: bool,
-    ) -> None:
-        self._sonars, self._setup_of = sonars, setup_of
-        self._check_bits, self._splices = check_bits, splices
-        self.checks: dict[str, BitCheck] = {}
-
-    def configure(self, name: str, settings: "Settings", stop: "Callable[[], bool]" = lambda: False) -> None:
-        """Configure one sensor."""
-        setup, check = self._setup_of(settings), None
-        if self._check_bits:
-            self.checks[name] = self._check(settings)
-            check = self.checks[name].check
-        self._sonars[name].configure(setup, bits=check, stop=stop)
-
-    def configure_all(self, settings: "Settings", signals: Signals) -> None:
-        """Configure all sensors; a signal ends the command."""
-        with _interruptible(signals) as asked:
-            for name in self._sonars:
-                self.configure(name, settings, stop=asked)
-
-    def _check(self, settings: "Settings") -> "BitCheck":
-        import numpy as np
-
-        from ertis_numba.devices.bits import BitCheck
-        from ertis_numba.geometry import microphones
-
-        recording, given = settings.recording, microphones(settings.array).enabled
-        enabled = np.zeros(32, dtype=bool)
-        enabled[: len(given)] = given
-        return BitCheck(recording.n_samples, recording.sample_rate_hz, enabled, splices=self._splices)
-
-
 def _require_one_place(address: str | None, target: Path | None, *, for_address: tuple[object, ...]) -> None:
     if address is None and any(for_address):
         raise click.UsageError(
@@ -393,18 +300,6 @@ def _require_spool(spool: Path | None, spool_mb: float | None) -> None:
         raise click.UsageError("--spool-size is given without --spool; add --spool with its folder")
 
 
-def _require_one_each(ports: tuple[str, ...], names: tuple[str, ...]) -> None:
-    for port in ports:
-        if ports.count(port) > 1:
-            raise click.UsageError(f"port {port} is given {ports.count(port)} times; give each sensor once")
-    if names and len(names) != len(ports):
-        raise click.UsageError(f"{len(names)} names are given for {len(ports)} ports; give one --name per --port")
-    from ertis_numba import checks
-
-    for name in names:
-        checks.sensor_name(name)
-
-
 def _print_commands(setup: "Setup", *, as_json: bool) -> None:
     """Print the commands for a sensor, with all samples of the call in one line."""
     before, call, after = setup.before_call(), setup.call(), setup.after_call()
@@ -417,16 +312,6 @@ def _print_commands(setup: "Setup", *, as_json: bool) -> None:
     rows += [(command.encode().decode().strip(), command.about) for command in after]
     for line, about in rows:
         click.echo(f"{line:20}  {about}")
-
-
-def _named(ports: tuple[str, ...], names: tuple[str, ...], opened: "list[SonarDriver]") -> "dict[str, SonarDriver]":
-    """Return sensors by name: the given names, or else their serial numbers or the names of their ports."""
-    known = [sonar.serial_number or Path(port).name for port, sonar in zip(ports, opened, strict=True)]
-    chosen = list(names) or [re.sub(r"[^A-Za-z0-9_.@+-]", "_", name) for name in known]
-    for name in chosen:
-        if chosen.count(name) > 1:
-            raise click.UsageError(f"{chosen.count(name)} sensors are named {name!r}; give each a different --name")
-    return dict(zip(chosen, opened, strict=True))
 
 
 def _default_name(sensors: list[str]) -> str:

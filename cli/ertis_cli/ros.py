@@ -9,11 +9,14 @@ from typing import Any
 import click
 
 from ertis_cli import _mountings, _network, _ros_sources, options
+from ertis_cli._recording_settings import recording_settings, settings_from
 from ertis_cli._stop_signals import stopped_by_signals
 
 __all__ = ["ros"]
 
 _TOPICS = ("points", "scan", "image", "sonar_image")
+_KINDS = {"address": "an address", "file": "a file", "port": "ports"}
+_TRIGGER_RATE_HZ = 10.0
 
 
 class _MaxRate(click.ParamType[Any]):
@@ -33,7 +36,7 @@ class _MaxRate(click.ParamType[Any]):
 
 
 @click.command()
-@click.argument("source", metavar="ADDRESS|REC.h5|IMG.h5")
+@click.argument("sources", nargs=-1, required=True, metavar="ADDRESS|REC.h5|IMG.h5|PORT...")
 @click.option(
     "--sensor",
     "sensors",
@@ -102,6 +105,19 @@ class _MaxRate(click.ParamType[Any]):
     help="Speed of a file relative to the recording.",
 )
 @click.option("--loop", is_flag=True, help="Restart a file at its end.")
+@click.option(
+    "--trigger",
+    type=click.Choice(["command", "sync"]),
+    help="With ports: source of the trigger, a command of this program, or a pulse of the SYNC chain.",
+)
+@click.option(
+    "--trigger-rate",
+    "trigger_rate_hz",
+    type=click.FloatRange(0.1, 100),
+    metavar="HZ",
+    help="With ports: rate of trigger commands; 10 by default.",
+)
+@recording_settings
 @click.option("--duration", type=float, metavar="S", help="Duration in seconds; until Ctrl-C by default.")
 @_mountings.mounting
 @_network.key
@@ -111,7 +127,7 @@ class _MaxRate(click.ParamType[Any]):
 @options.as_json_of("one object per line for each event; the last one is a summary")
 def ros(
     *,
-    source: str,
+    sources: tuple[str, ...],
     sensors: tuple[str, ...],
     topics: tuple[str, ...],
     namespace: str,
@@ -124,6 +140,8 @@ def ros(
     sim_time: bool,
     rate: float,
     loop: bool,
+    trigger: str | None,
+    trigger_rate_hz: float | None,
     duration: float | None,
     mounting: Path | None,
     key: str | None,
@@ -131,18 +149,28 @@ def ros(
     device: Any,
     quiet: bool,
     as_json: bool,
+    **given_settings: Any,
 ) -> None:
     """Publish images and points as live ROS 2 topics.
 
     ROS need not be installed. ADDRESS is the address at which a central node publishes. A recording is processed with
-    its own settings, at its original speed. The command needs the extra 'ros'. DDS has no passwords: by default, only
-    this machine can read the topics; --interface opens them to a network. With --json, there is one line per event.
+    its own settings, at its original speed. The sensors on PORTS measure as with 'ertis capture', and nothing is
+    stored. The command needs the extra 'ros'. DDS has no passwords: by default, only this machine can read the topics;
+    --interface opens them to a network. With --json, there is one line per event.
     """
-    live = "://" in source
-    for name, is_given in (("--use-sim-time", sim_time), ("--loop", loop), ("--rate", rate != 1.0)):
-        if live and is_given:
-            raise click.UsageError(f"{name} is for files; remove it with an address", click.get_current_context())
+    kind = _kind(sources)
+    source = " ".join(sources)
+    of_files = {"--use-sim-time": sim_time, "--loop": loop, "--rate": rate != 1.0}
+    of_ports = {"--trigger": trigger, "--trigger-rate": trigger_rate_hz}
+    of_ports |= {f"--{name.removesuffix('_file')}": value for name, value in given_settings.items()}
+    for wanted, options_of in (("file", of_files), ("port", of_ports)):
+        for name, value in options_of.items():
+            if kind != wanted and value not in {None, False}:
+                raise click.UsageError(f"{name} is for {wanted}s; remove it with {_KINDS[kind]}")
+    if kind == "port" and sensors:
+        raise click.UsageError("--sensor selects sensors of a file or an address; give only the ports of the sensors")
     _network.require_duration(duration)
+    settings = settings_from(**given_settings) if kind == "port" else None
     from ertis_numba.ros import Participant, RosPublisher
 
     chosen = topics or ("points", "scan")
@@ -169,7 +197,19 @@ def ros(
             "on_published": report.published,
             "signals": signals,
         }
-        if live:
+        if settings is not None:
+            _ros_sources.publish_ports(
+                sources,
+                publisher,
+                settings=settings,
+                trigger=trigger or "command",
+                rate_hz=trigger_rate_hz or _TRIGGER_RATE_HZ,
+                device=device,
+                quiet=quiet,
+                on_note=report.note,
+                **{name: value for name, value in common.items() if name != "sensors"},
+            )
+        elif kind == "address":
             keys = _network.client_keys(key, server_key)
             _ros_sources.publish_node(source, publisher, topics=chosen, keys=keys, on_note=report.note, **common)
         else:
@@ -183,8 +223,19 @@ def ros(
                 **common,
             )
         report.end()
-        if signals.came and not live and not loop:
+        if signals.came and kind == "file" and not loop:
             sys.exit(128 + signals.came[0])
+
+
+def _kind(sources: tuple[str, ...]) -> str:
+    """Return the kind of the sources: address, file or port."""
+    kinds = {"address" if "://" in each else "file" if Path(each).is_file() else "port" for each in sources}
+    kind = kinds.pop()
+    if kinds or (kind != "port" and len(sources) > 1):
+        raise click.UsageError("several sources must all be ports; give one address, one file, or ports")
+    if kind == "port" and any(Path(each).suffix == ".h5" for each in sources):
+        raise click.UsageError(f"file {sources[0]} does not exist; give an existing file, an address, or ports")
+    return kind
 
 
 class _RosReport:

@@ -22,20 +22,23 @@ from ertis_numba.interop.ros_messages import (
 )
 from ertis_numba.network.status import Status
 from ertis_numba.ros.diagnostics import diagnostics_message
+from ertis_numba.ros.fused_points import FusedPoints
 from ertis_numba.ros.participant import Participant, Topic
 
 __all__ = ["RosPublisher"]
 
 _TRANSFORMS: Final = ("/tf_static", "tf2_msgs/msg/TFMessage")
 _DIAGNOSTICS: Final = ("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
+_ALL_SENSORS: Final = "of all mounted sensors"  # No sensor can have this name.
 _CLOCK: Final = ("/clock", "rosgraph_msgs/msg/Clock")
 
 
 class RosPublisher:
     """Publisher of the topics of all sensors.
 
-    The topics of a sensor lie in ``NAMESPACE/SENSOR/``; their frame is the sensor's name. ``docs/how-to/ros.md`` lists
-    the topics and their messages.
+    The topics of a sensor lie in ``NAMESPACE/SENSOR/``; their frame is the sensor's name. ``NAMESPACE/fused/points``
+    holds the points of all sensors of a SYNC pulse, if the mounting of two or more is known. ``docs/how-to/ros.md``
+    lists the topics and their messages.
 
     Parameters
     ----------
@@ -104,8 +107,9 @@ class RosPublisher:
         self._find = PointFinder(top=top, min_level_db=min_level_db)
         self._scan_limits = {"min_level_db": min_level_db, "floor_dbfs": floor_dbfs}
         self._image = ImageMessages()
-        self._names = TopicNames()
+        self._names = TopicNames({_ALL_SENSORS: "fused"})
         self._frames: dict[str, Mounting | None] = {}
+        self._fused = FusedPoints()
         self._due_ns: dict[tuple[str, str], int] = {}
         self._announced: list[dict[str, Any]] = []
 
@@ -135,14 +139,29 @@ class RosPublisher:
         stamp = item.stamp
         self._announce(stamp, mounting)
         for topic in self._wanted:
-            if isinstance(item, PointCloud) != (topic == "points") and isinstance(item, PointCloud):
+            if isinstance(item, PointCloud) and topic != "points":
                 continue
             if not self._is_due(topic, stamp):
                 self.left_out += 1
-                continue
-            message = self._message(topic, item)
-            if message is not None:
-                self._topic(f"{self._base}/{self._names[stamp.sensor]}/{topic}", MESSAGES[topic]).publish(message)
+            elif isinstance(item, PointCloud):
+                self._publish_points(item)
+            elif topic == "points":
+                self._publish_points(self._find(item))
+            else:
+                message = self._message(topic, item)
+                if message is not None:
+                    self._topic(f"{self._base}/{self._names[stamp.sensor]}/{topic}", MESSAGES[topic]).publish(message)
+
+    def _publish_points(self, cloud: PointCloud) -> None:
+        """Publish the points of a sensor, and those of all sensors of its pulse, once they are complete."""
+        sensor = cloud.stamp.sensor
+        self._topic(f"{self._base}/{self._names[sensor]}/points", MESSAGES["points"]).publish(points_message(cloud))
+        place = self._frames[sensor]
+        if place is None:
+            return
+        for group in self._fused.add(cloud.replace(translation_m=place[0], rotation_xyzw=place[1])):
+            if sum(each is not None for each in self._frames.values()) > 1:
+                self._topic(f"{self._base}/fused/points", MESSAGES["points"]).publish(points_message(group))
 
     def publish_status(self, status: Status) -> None:
         """Publish the status of a central node and its sensors on ``/diagnostics``."""
@@ -153,11 +172,7 @@ class RosPublisher:
         sec, nanosec = divmod(time_ns, 1_000_000_000)
         self._topic(*_CLOCK).publish({"clock": {"sec": sec, "nanosec": nanosec}})
 
-    def _message(self, topic: str, item: Energyscape | PointCloud) -> dict[str, Any] | None:
-        if isinstance(item, PointCloud):
-            return points_message(item)
-        if topic == "points":
-            return points_message(self._find(item))
+    def _message(self, topic: str, item: Energyscape) -> dict[str, Any] | None:
         if topic == "scan":
             return scan_message(item, **self._scan_limits)
         return self._image(item) if topic == "image" else sonar_image_message(item)

@@ -1,0 +1,113 @@
+"""Points of several sensors, fused in the frame of their platform."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ertis_numba.analysis.point_finder import PointFinder
+from ertis_numba.errors import ArgumentError
+from ertis_numba.frames import PointCloud, Stamp
+from ertis_numba.interop.ros_messages import MESSAGES, points_message
+from ertis_numba.ros import Participant, RosPublisher
+from ertis_numba.ros.fused_points import FusedPoints, joined
+from ertis_numba.settings import Settings
+from tests.ros_topics import DOMAIN, await_subscribers, subscribed
+from tests.test_ros import equal, stamped
+
+TIME_NS = 1_700_000_000_000_000_000
+PERIOD_NS = 50_000_000
+AHEAD = ((1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+LEFT = ((0.0, 0.5, 0.2), (0.0, 0.0, 0.5**0.5, 0.5**0.5))
+"""Mounting of a sensor that looks to the left."""
+
+
+def cloud(sensor, count, *, place=AHEAD, n_points=2, later_ns=0):
+    position_m = np.arange(3 * n_points, dtype=np.float32).reshape(n_points, 3) + 1
+    return PointCloud(
+        position_m=position_m,
+        amplitude=np.linspace(1.0, 0.5, n_points, dtype=np.float32),
+        settings=Settings(),
+        stamp=Stamp(sensor=sensor, sync_count=count, timestamp_ns=TIME_NS + count * PERIOD_NS + later_ns),
+        translation_m=place[0],
+        rotation_xyzw=place[1],
+    )
+
+
+def counts(groups):
+    """SYNC count and number of points of each group."""
+    return [(group.stamp.sync_count, len(group)) for group in groups]
+
+
+def test_points_are_joined_in_the_frame_of_the_platform():
+    front, left = cloud("front", 3, later_ns=4_000), cloud("left", 3, place=LEFT, n_points=1)
+    left = left.replace(uncertainty_m=np.full((1, 2), 0.01, np.float32))
+    both = joined({"front": front, "left": left})
+    np.testing.assert_allclose(both.position_m, [[2, 2, 3], [5, 5, 6], [-2, 1.5, 3.2]], rtol=1e-6)
+    assert both.on_platform_m() == pytest.approx(both.position_m)
+    assert both.stamp == replace(left.stamp, sensor="base_link")
+    assert np.isnan(both.uncertainty_m[:2]).all()
+    assert both.uncertainty_m[2] == pytest.approx([0.01, 0.01])
+    assert both.amplitude.tolist() == [1.0, 0.5, 1.0]
+
+
+def test_group_is_returned_once_all_expected_sensors_are_there():
+    fused = FusedPoints()
+    assert counts(fused.add(cloud("front", 0))) == [(0, 2)]  # Nobody else is known.
+    assert counts(fused.add(cloud("left", 0))) == []  # Its group was returned; from now on it is expected.
+    for count in range(1, 4):
+        assert fused.add(cloud("front", count)) == []
+        assert counts(fused.add(cloud("left", count))) == [(count, 4)]
+
+
+def test_missing_sensor_delays_one_group_only():
+    fused = FusedPoints()
+    fused.add(cloud("front", 0)), fused.add(cloud("left", 0))
+    assert fused.add(cloud("front", 1)) == []
+    assert counts(fused.add(cloud("front", 2))) == [(1, 2), (2, 2)]
+    assert counts(fused.add(cloud("front", 3))) == [(3, 2)]
+    assert fused.add(cloud("left", 3)) == []
+    assert fused.add(cloud("front", 4)) == []
+    assert counts(fused.add(cloud("left", 4))) == [(4, 4)]
+
+
+def test_equal_counts_of_different_times_are_different_pulses():
+    fused = FusedPoints()
+    fused.add(cloud("front", 0)), fused.add(cloud("left", 0))
+    assert fused.add(cloud("front", 7)) == []
+    (alone,) = fused.add(cloud("left", 7, later_ns=10**9))
+    assert (alone.stamp.timestamp_ns, len(alone)) == (TIME_NS + 7 * PERIOD_NS, 2)
+    (other,) = fused.add(cloud("front", 8, later_ns=10**9))
+    assert (other.stamp.timestamp_ns, len(other)) == (TIME_NS + 7 * PERIOD_NS + 10**9, 2)
+
+
+def test_fused_points_arrive_in_rclpy():
+    find, images = PointFinder(), {"front": stamped(1, "front"), "left": stamped(2, "left")}
+    places = {"front": AHEAD, "left": LEFT}
+    kinds = {"/robot1/fused/points": MESSAGES["points"]}
+    clouds = {
+        name: find(each).replace(translation_m=places[name][0], rotation_xyzw=places[name][1])
+        for name, each in images.items()
+    }
+    with subscribed(kinds) as subscriber, Participant(domain=DOMAIN) as participant:
+        publisher = RosPublisher(participant, topics=["points"], namespace="robot1")
+        for sequence in range(2):
+            for name, each in images.items():
+                publisher.publish(each.replace(stamp=replace(each.stamp, sync_count=sequence)), places[name])
+        await_subscribers([publisher.topics[name] for name in kinds])
+        for name, each in images.items():
+            publisher.publish(each.replace(stamp=replace(each.stamp, sync_count=2)), places[name])
+        (received,) = subscriber.take(1)["/robot1/fused/points"]
+        with pytest.raises(ArgumentError, match="fused would share topics"):
+            publisher.publish(stamped(3, "fused"))
+    wanted = joined(clouds)
+    assert equal(received, points_message(wanted), MESSAGES["points"])
+
+
+def test_sensors_without_mounting_are_not_fused():
+    with Participant(domain=DOMAIN) as participant:
+        publisher = RosPublisher(participant, topics=["points"])
+        for count in range(3):
+            publisher.publish(stamped(1, "front", count), AHEAD)
+            publisher.publish(stamped(2, "left", count))
+        assert "/fused/points" not in publisher.topics
