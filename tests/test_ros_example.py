@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from ertis_numba.pipeline import Pipeline
-from ertis_numba.ros import Participant, RosPublisher
+from ertis_numba.ros import Participant, PublishingSettings, RosPublisher
 from ertis_numba.settings import Processing, Settings
 from ertis_numba.simulation import Scene, Sensor, Wall
 from ertis_numba.simulation.render import render
@@ -49,7 +49,7 @@ def test_robot_stops_in_front_of_a_wall():
         subprocess.Popen([sys.executable, EXAMPLE, "/front/scan"], env=environment) as node,
     ):
         try:
-            ros = RosPublisher(participant, topics=["scan"], floor_dbfs=-60.0)
+            ros = RosPublisher(participant, topics=["scan"], settings=PublishingSettings(floor_dbfs=-60.0))
             ros.publish(image_at(START_M, pipeline))
             await_subscribers([ros.topics["/front/scan"]])
             for _ in range(MAX_STEPS):

@@ -68,7 +68,6 @@ def publish_file(
     *,
     sensors: Sequence[str],
     device: Any,
-    rate: float,
     loop: bool,
     sim_time: bool,
     is_over: Callable[[], bool],
@@ -76,7 +75,7 @@ def publish_file(
     on_ready: Callable[[], None],
     signals: Signals,
 ) -> None:
-    """Publish the images of a file at ``rate`` times the speed of the recording.
+    """Publish the images of a file at the speed of the publisher's settings.
 
     With ``sim_time``, the stamps are those of the file, and ``/clock`` has the same time; otherwise the stamps are the
     present.
@@ -93,7 +92,7 @@ def publish_file(
         pipelines: dict[str, Pipeline] = {}
         signals.obey(lambda: None)
         on_ready()
-        clock = _Clock(ros, rate=rate, sim_time=sim_time, is_over=is_over)
+        clock = _Clock(ros, sim_time=sim_time, is_over=is_over)
         again = True
         while again and not is_over():
             clock.start(order[0][0])
@@ -204,24 +203,30 @@ def _in_order(stamps: Mapping[str, Sequence[Any]]) -> list[tuple[int, str, int]]
 class _Clock:
     """Clock of a file: it waits for the times of measurements, and publishes ``/clock`` meanwhile."""
 
-    def __init__(self, ros: "RosPublisher", *, rate: float, sim_time: bool, is_over: Callable[[], bool]) -> None:
-        self._ros, self._rate, self._sim_time, self._is_over = ros, rate, sim_time, is_over
-        self._file_ns, self._begun_s = 0, 0.0
+    def __init__(self, ros: "RosPublisher", *, sim_time: bool, is_over: Callable[[], bool]) -> None:
+        self._ros, self._sim_time, self._is_over = ros, sim_time, is_over
+        self._file_ns, self._latest_s = 0.0, 0.0
 
     def start(self, time_ns: int) -> None:
         """Let the time of the file be ``time_ns`` now."""
-        self._file_ns, self._begun_s = time_ns, time.monotonic()
+        self._file_ns, self._latest_s = float(time_ns), time.monotonic()
 
     def wait_until(self, time_ns: int) -> bool:
         """Wait for a time of the file; return False if the program is to end before."""
         while not self._is_over():
-            left_s = (time_ns - self._now_ns()) / 1e9 / self._rate
+            self._advance()
             if self._sim_time:
-                self._ros.publish_clock(min(time_ns, self._now_ns()))
-            if left_s <= 0:
+                self._ros.publish_clock(min(time_ns, round(self._file_ns)))
+            settings = self._ros.settings
+            left_s = (time_ns - self._file_ns) / 1e9 / settings.speed
+            if left_s <= 0 and not settings.paused:
                 return True
-            time.sleep(min(left_s, _CLOCK_INTERVAL_S))
+            time.sleep(_CLOCK_INTERVAL_S if settings.paused else min(left_s, _CLOCK_INTERVAL_S))
         return False
 
-    def _now_ns(self) -> int:
-        return self._file_ns + round((time.monotonic() - self._begun_s) * 1e9 * self._rate)
+    def _advance(self) -> None:
+        """Let time pass at the present speed, unless it is paused."""
+        settings, now_s = self._ros.settings, time.monotonic()
+        if not settings.paused:
+            self._file_ns += (now_s - self._latest_s) * 1e9 * settings.speed
+        self._latest_s = now_s

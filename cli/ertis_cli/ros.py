@@ -4,19 +4,27 @@ import math
 import sys
 import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
 from ertis_cli import _mountings, _network, _ros_sources, options
 from ertis_cli._recording_settings import recording_settings, settings_from
 from ertis_cli._stop_signals import stopped_by_signals
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from ertis_numba.ros import RosPublisher
+    from ertis_numba.ros.publishing_settings import PublishingSettings, WatchedSettings
 
 __all__ = ["ros"]
 
 _TOPICS = ("points", "scan", "image", "sonar_image")
 _KINDS = {"address": "an address", "file": "a file", "port": "ports"}
 _TRIGGER_RATE_HZ = 10.0
+_CONTROL_INTERVAL_S = 0.1
 
 
 class _MaxRate(click.ParamType[Any]):
@@ -104,6 +112,12 @@ class _MaxRate(click.ParamType[Any]):
     metavar="X",
     help="Speed of a file relative to the recording.",
 )
+@click.option(
+    "--control",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Settings of levels, ranges, rates and pauses (TOML), read again when the file changes.",
+)
 @click.option("--loop", is_flag=True, help="Restart a file at its end.")
 @click.option(
     "--trigger",
@@ -139,6 +153,7 @@ def ros(
     floor_dbfs: float | None,
     sim_time: bool,
     rate: float,
+    control: Path | None,
     loop: bool,
     trigger: str | None,
     trigger_rate_hz: float | None,
@@ -171,6 +186,9 @@ def ros(
         raise click.UsageError("--sensor selects sensors of a file or an address; give only the ports of the sensors")
     _network.require_duration(duration)
     settings = settings_from(**given_settings) if kind == "port" else None
+    watched, publishing = _publishing(
+        control, min_level_db=min_level, floor_dbfs=floor_dbfs, max_rate_hz=dict(max_rates), speed=rate
+    )
     from ertis_numba.ros import Participant, RosPublisher
 
     chosen = topics or ("points", "scan")
@@ -185,14 +203,18 @@ def ros(
             topics=chosen,
             namespace=namespace,
             mounting=given,
-            min_level_db=min_level,
-            floor_dbfs=-math.inf if floor_dbfs is None else floor_dbfs,
-            max_rate_hz=dict(max_rates),
+            settings=publishing,
         )
         report = _RosReport(publisher, quiet=quiet, as_json=as_json)
+
+        def is_over() -> bool:
+            if watched is not None:
+                watched.poll(publisher, report.note)
+            return bool(signals.came) or time.monotonic() >= end_s
+
         common: dict[str, Any] = {
             "sensors": sensors,
-            "is_over": lambda: bool(signals.came) or time.monotonic() >= end_s,
+            "is_over": is_over,
             "on_ready": lambda: report.start(source, participant),
             "on_published": report.published,
             "signals": signals,
@@ -217,7 +239,6 @@ def ros(
                 Path(source),
                 publisher,
                 device=device,
-                rate=rate,
                 loop=loop,
                 sim_time=sim_time,
                 **common,
@@ -225,6 +246,45 @@ def ros(
         report.end()
         if signals.came and kind == "file" and not loop:
             sys.exit(128 + signals.came[0])
+
+
+class _Control:
+    """Control file that is looked at now and then."""
+
+    def __init__(self, watched: "WatchedSettings") -> None:
+        self._watched, self._next_s = watched, 0.0
+
+    def poll(self, publisher: "RosPublisher", note: "Callable[[str], None]") -> None:
+        """Use new settings, or report why they cannot be used."""
+        from ertis_numba.errors import SettingsError
+
+        now_s = time.monotonic()
+        if now_s < self._next_s:
+            return
+        self._next_s = now_s + _CONTROL_INTERVAL_S
+        try:
+            changed = self._watched.changed()
+        except SettingsError as error:
+            note(f"{error}; the former settings stay in use")
+            return
+        if changed is not None:
+            publisher.settings = changed
+            note("new settings are in use")
+
+
+def _publishing(control: Path | None, **given: Any) -> "tuple[_Control | None, PublishingSettings]":
+    """Return the control file and its settings, or those of the options."""
+    from ertis_numba.ros.publishing_settings import PublishingSettings, WatchedSettings
+
+    if control is None:
+        return None, PublishingSettings(**given)
+    context = click.get_current_context()
+    for name in ("min_level", "floor_dbfs", "max_rates", "rate"):
+        if context.get_parameter_source(name) not in {ParameterSource.DEFAULT, None}:
+            option = next(each for each in context.command.params if each.name == name).opts[0]
+            raise click.UsageError(f"{option} and --control exclude each other; give it in the file")
+    watched = WatchedSettings(control)
+    return _Control(watched), watched.settings
 
 
 def _kind(sources: tuple[str, ...]) -> str:
@@ -281,7 +341,7 @@ class _RosReport:
         dropped, left_out = self._publisher.dropped, self._publisher.left_out
         text = f"{options.counted(self._n_items, 'measurement')} published"
         text += f", {options.counted(dropped, 'message')} dropped for slow subscribers" if dropped else ""
-        text += f", {left_out} left out by --max-rate" if left_out else ""
+        text += f", {left_out} left out by rates or pauses" if left_out else ""
         options.say(text, quiet=self._quiet)
         if self._as_json:
             counts = {name: topic.published for name, topic in self._publisher.topics.items()}

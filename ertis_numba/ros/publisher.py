@@ -1,9 +1,13 @@
 """Publisher of images, points and status as ROS 2 topics."""
 
+import math
 import time
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ertis_numba import checks
 from ertis_numba.analysis.point_finder import PointFinder
@@ -24,6 +28,7 @@ from ertis_numba.network.status import Status
 from ertis_numba.ros.diagnostics import diagnostics_message
 from ertis_numba.ros.fused_points import FusedPoints
 from ertis_numba.ros.participant import Participant, Topic
+from ertis_numba.ros.publishing_settings import PublishingSettings
 
 __all__ = ["RosPublisher"]
 
@@ -51,19 +56,17 @@ class RosPublisher:
         Poses of sensors on their platform, in place of those of the images.
     top : int
         Largest number of points per image.
-    min_level_db : float
-        Lowest level of points and of echoes in scans, relative to the strongest point of the image, in dB.
-    floor_dbfs : float
-        Lowest level of echoes in scans in dBFS.
-    max_rate_hz : mapping of str to float, optional
-        Largest rate of a topic of each sensor. Messages above it are left out.
+    settings : PublishingSettings
+        Limits of points and echoes, and rates.
 
     Attributes
     ----------
+    settings : PublishingSettings
+        They may be replaced at any time.
     topics : dict of str to Topic
         Topics in use, by name.
     left_out : int
-        Number of messages left out because of ``max_rate_hz``.
+        Number of messages left out because of ``max_rate_hz``, or because publishing was paused.
 
     Raises
     ------
@@ -90,28 +93,32 @@ class RosPublisher:
         namespace: str = "",
         mounting: Mapping[str, tuple[Sequence[float], Sequence[float]]] | None = None,
         top: int = 256,
-        min_level_db: float = -20.0,
-        floor_dbfs: float = float("-inf"),
-        max_rate_hz: Mapping[str, float] | None = None,
+        settings: PublishingSettings = PublishingSettings(),  # noqa: B008  it cannot change
     ) -> None:
         for topic in topics:
             checks.choice("topic", topic, MESSAGES)
-        for topic, rate_hz in (max_rate_hz or {}).items():
-            checks.choice("topic", topic, MESSAGES)
-            checks.between("max_rate_hz", rate_hz, 1e-3, 1e4)
         self.topics: dict[str, Topic] = {}
         self.left_out = 0
         self._wanted = [topic for topic in MESSAGES if topic in topics]
         self._base = _namespace(namespace)
-        self._participant, self._given, self._max_rate_hz = participant, validated(mounting), dict(max_rate_hz or {})
-        self._find = PointFinder(top=top, min_level_db=min_level_db)
-        self._scan_limits = {"min_level_db": min_level_db, "floor_dbfs": floor_dbfs}
+        self._participant, self._given, self._top = participant, validated(mounting), top
+        self.settings = settings
         self._image = ImageMessages()
         self._names = TopicNames({_ALL_SENSORS: "fused"})
         self._frames: dict[str, Mounting | None] = {}
         self._fused = FusedPoints()
         self._due_ns: dict[tuple[str, str], int] = {}
         self._announced: list[dict[str, Any]] = []
+
+    @property
+    def settings(self) -> PublishingSettings:
+        """Limits of points and echoes, and rates."""
+        return self._settings
+
+    @settings.setter
+    def settings(self, settings: PublishingSettings) -> None:
+        self._settings = settings
+        self._find = PointFinder(top=self._top, min_level_db=settings.min_level_db)
 
     @property
     def dropped(self) -> int:
@@ -141,7 +148,7 @@ class RosPublisher:
         for topic in self._wanted:
             if isinstance(item, PointCloud) and topic != "points":
                 continue
-            if not self._is_due(topic, stamp):
+            if self._settings.paused or not self._is_due(topic, stamp):
                 self.left_out += 1
             elif isinstance(item, PointCloud):
                 self._publish_points(item)
@@ -154,7 +161,10 @@ class RosPublisher:
 
     def _publish_points(self, cloud: PointCloud) -> None:
         """Publish the points of a sensor, and those of all sensors of its pulse, once they are complete."""
-        sensor = cloud.stamp.sensor
+        sensor, limits_m = cloud.stamp.sensor, self._settings.range_m
+        if limits_m is not None:
+            within = (cloud.range_m >= limits_m[0]) & (cloud.range_m <= limits_m[1])
+            cloud = _selected(cloud, within)
         self._topic(f"{self._base}/{self._names[sensor]}/points", MESSAGES["points"]).publish(points_message(cloud))
         place = self._frames[sensor]
         if place is None:
@@ -174,12 +184,22 @@ class RosPublisher:
 
     def _message(self, topic: str, item: Energyscape) -> dict[str, Any] | None:
         if topic == "scan":
-            return scan_message(item, **self._scan_limits)
+            return self._scan(item)
         return self._image(item) if topic == "image" else sonar_image_message(item)
+
+    def _scan(self, item: Energyscape) -> dict[str, Any] | None:
+        settings = self._settings
+        floor_dbfs = -math.inf if settings.floor_dbfs is None else settings.floor_dbfs
+        if settings.range_m is not None:
+            try:
+                item = item.select(range_m=settings.range_m)
+            except ArgumentError:  # No range is within the limits.
+                return None
+        return scan_message(item, min_level_db=settings.min_level_db, floor_dbfs=floor_dbfs)
 
     def _is_due(self, topic: str, stamp: Stamp) -> bool:
         """Return False if a message would exceed the rate of its topic."""
-        rate_hz = self._max_rate_hz.get(topic)
+        rate_hz = self._settings.max_rate_hz.get(topic)
         if rate_hz is None:
             return True
         key, interval_ns = (stamp.sensor, topic), round(1e9 / rate_hz)
@@ -213,6 +233,14 @@ class RosPublisher:
         if name not in self.topics:
             self.topics[name] = self._participant.topic(name, message, latched=latched)
         return self.topics[name]
+
+
+def _selected(cloud: PointCloud, within: NDArray[np.bool_]) -> PointCloud:
+    """Return some points of a cloud."""
+    uncertainty_m = None if cloud.uncertainty_m is None else cloud.uncertainty_m[within]
+    return cloud.replace(
+        position_m=cloud.position_m[within], amplitude=cloud.amplitude[within], uncertainty_m=uncertainty_m
+    )
 
 
 def _namespace(given: str) -> str:
