@@ -61,5 +61,5 @@ def test_wheel_is_small_and_contains_no_recording_and_no_test(wheel):
     with zipfile.ZipFile(wheel) as archive:
         names = [name for name in archive.namelist() if ".dist-info/" not in name]
     assert {name.partition("/")[0] for name in names} == {"ertis_bench", "ertis_cli", "ertis_examples", "ertis_numba"}
-    assert {Path(name).suffix for name in names} <= {".json", ".py", ".pyi", ".toml", ".typed", ""}
+    assert {Path(name).suffix for name in names} <= {".json", ".py", ".pyi", ".rviz", ".toml", ".typed", ""}
     assert wheel.stat().st_size <= 1.5e6

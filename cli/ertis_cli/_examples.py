@@ -1,4 +1,4 @@
-"""Scenes and scripts of the package, and recordings simulated from its scenes: names, descriptions and content."""
+"""Examples of the package, and recordings simulated from its scenes: names, descriptions and content."""
 
 import ast
 import hashlib
@@ -18,7 +18,7 @@ _RECORDINGS: Final = "ertis_examples.synthetic"
 _FOLDERS: Final = (("ertis_examples", ()), (_RECORDINGS, ()), (_RECORDINGS, ("scenes",)))
 """Packages, and folders in them, with examples."""
 
-_SUFFIXES: Final = {".toml", ".py"}
+_SUFFIXES: Final = {".toml", ".py", ".rviz"}
 _TOOLS: Final = {"__init__.py", "build.py", "gallery.py"}
 """Files of these packages that are not examples."""
 

@@ -22,22 +22,33 @@ _COLUMNS: dict[str, _tables.Side] = dict.fromkeys(("", "check", "found", "remedy
     metavar="DIR",
     help="Folder for recordings; the speed of its disk is measured. The current folder by default.",
 )
+@click.option("--ros", is_flag=True, help="Check only why ROS 2 programs may receive nothing from 'ertis ros'.")
+@click.option("--domain", type=int, metavar="N", help="With --ros: domain id; that of ROS_DOMAIN_ID by default.")
+@click.option("--interface", metavar="NAME", help="With --ros: network interface; lo by default.")
 @click.pass_context
 @options.as_json
-def doctor(ctx: click.Context, *, folder: Path, as_json: bool) -> None:
+def doctor(
+    ctx: click.Context, *, folder: Path, ros: bool, domain: int | None, interface: str | None, as_json: bool
+) -> None:
     """Check this installation and suggest fixes.
 
     The command checks versions, cores and threads, the GPU, serial ports and their permissions, disk speed and free
-    space, and keys. The exit code is 1 if something does not work. Missing optional parts are only notes.
+    space, and keys. With --ros, it lists the ROS 2 programs and subscribers that it finds. The exit code is 1 if
+    something does not work. Missing optional parts are only notes.
     """
     from ertis_cli._diagnosis import CHECKS, InstallationFinding
+    from ertis_cli._ros_diagnosis import ros_findings
     from ertis_numba.errors import ArgumentError
+
+    if not ros and (domain is not None or interface is not None):
+        raise click.UsageError("--domain and --interface are for --ros; add it")
+    checks = {"ROS": lambda _: ros_findings(domain, interface or "lo")} if ros else CHECKS
 
     if not folder.is_dir():
         raise ArgumentError(f"--folder {folder} is not a folder; give an existing folder")
     found: list[InstallationFinding] = []
     with options.note_when_slow("checking ...", quiet=False):
-        for name, look in CHECKS.items():
+        for name, look in checks.items():
             try:
                 found += look(folder)
             except Exception as error:  # noqa: BLE001  one broken check must not hide the others

@@ -96,6 +96,11 @@ class Participant:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    @property
+    def domain_participant(self) -> Any:
+        """Participant of Cyclone DDS."""
+        return self._participant
+
     def topic(self, name: str, message: str, *, latched: bool = False) -> "Topic":
         """Return a topic to publish on.
 
