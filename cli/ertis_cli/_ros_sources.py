@@ -156,11 +156,22 @@ def publish_ports(
             sink = _ImageSink(ros, settings, device=device, on_published=on_published, stack=stack)
         signals.obey(session.stop)
         on_ready()
-        session.run(sink)
+        try:
+            session.run(sink)
+        finally:
+            if sink.superseded:
+                count = options.counted(sink.superseded, "measurement")
+                on_note(f"{count} not published, because newer ones had arrived; give a lower --trigger-rate")
 
 
 class _ImageSink:
-    """Destination of measurements that publishes their images, of each sensor the newest."""
+    """Destination of measurements that publishes their images, of each sensor the newest.
+
+    Attributes
+    ----------
+    superseded : int
+        Number of measurements without an image, because newer ones had arrived.
+    """
 
     def __init__(
         self,
@@ -174,6 +185,7 @@ class _ImageSink:
         from ertis_numba.pipeline import Pipeline
 
         self._ros, self._on_published = ros, on_published
+        self.superseded = 0
         self._pipeline: Pipeline = stack.enter_context(Pipeline(settings, device=device, predict=False))
 
     def add_sensor(self, name: str, settings: "Settings", **_: Any) -> None:
@@ -182,6 +194,7 @@ class _ImageSink:
     def append(self, entries: "Sequence[JournalEntry]") -> None:
         """Publish the image of the newest measurement of each sensor, so that images never lag behind."""
         newest = {entry.measurement.stamp.sensor: entry.measurement for entry in entries}
+        self.superseded += len(entries) - len(newest)
         for measurement in newest.values():
             self._ros.publish(self._pipeline.process(measurement))
             self._on_published()

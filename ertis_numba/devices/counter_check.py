@@ -133,7 +133,10 @@ class CounterCheck:
             self._settle([before], entry)
             self._accept(entry)
         elif self._as_triggered(last, entry) or agreeing:
-            self._settle([] if self._as_triggered(last, entry) else agreeing, entry)
+            if self._as_triggered(last, entry):
+                # A stall may have split a burst, so that a held block seems too early; the clock is certain.
+                agreeing = [each for each in agreeing if self._is_timed_between(last, each, entry)]
+            self._settle(agreeing, entry)
             self._accept(entry)
         elif len(held) > 1 and _ahead(held[-2], before) == 1 == _ahead(before, entry):
             self._settle(held[-2:], entry)
@@ -203,6 +206,11 @@ class CounterCheck:
         passed = _elapsed_ns(first, second) / typical_ns
         count = round(passed)
         return count if 1 <= count <= _FAR and abs(passed - count) <= _NEAR else None
+
+    def _is_timed_between(self, first: _Entry, second: _Entry, third: _Entry) -> bool:
+        """Return True if a number lies between two correct ones, and the clock confirms its distance from the later."""
+        ahead = _ahead(second, third)
+        return ahead < _ahead(first, third) and self._by_clock(second, third) == ahead
 
     def _is_between(self, first: _Entry, second: _Entry, third: _Entry) -> bool:
         """Return True if a number lies between two correct ones, so that a missing one is plausible."""

@@ -34,7 +34,8 @@ _MAX_TRIES = 10  # Tries per signal. Only signals that reach a running process c
 _UNDISTURBED_S = 4.0
 _TIMEOUT_S = 30.0
 _FAULTS = ("late", "codes", "tracebacks")
-_WAITING = {"configure", "status"}  # Commands that wait for an answer, and fail after some seconds without one.
+_WAITING_S: Final = {"configure": 2.5, "status": 2.5}
+"""Time in which a command waits for an answer; it fails some time later without one."""
 _UNCAUGHT = re.compile(r"Traceback|Error:|Exception|Fatal|Assertion")
 
 COMMANDS: Final[dict[str, Sequence[str]]] = {
@@ -152,8 +153,9 @@ def _to_command(
     command: str, paths: dict[str, str], out: Path, rng: random.Random, count: int, begins_s: float
 ) -> dict[str, Any]:
     lasts_s, killed_s, code, errors = _run_command(command, paths, out, None, _UNDISTURBED_S)
-    if not killed_s and code and command not in _WAITING:
+    if not killed_s and code and command not in _WAITING_S:
         raise RuntimeError(f"'ertis {command}' fails by itself, so that no signal can interrupt it: {errors.strip()}")
+    lasts_s = min(lasts_s, _WAITING_S.get(command, lasts_s))
     found: dict[str, Any] = {"signals": 0, **dict.fromkeys(_FAULTS, 0), "slowest_s": 0.0}
     examples: Counter[str] = Counter()
     for _ in range(_MAX_TRIES * count):
