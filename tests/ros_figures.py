@@ -15,10 +15,9 @@ from pathlib import Path
 
 import click
 import numpy as np
-from ertis_bench.system import system_line
+from ertis_bench import machine
 
 from ertis_numba.frames import Energyscape, PointCloud, Stamp
-from ertis_numba.interop.ros_messages import MESSAGES
 from ertis_numba.ros import Participant, RosPublisher
 from ertis_numba.settings import Settings
 from tests.journals import ENVIRONMENT
@@ -50,10 +49,10 @@ for topic in sys.argv[1:]:
     kind = PointCloud2 if topic.endswith("points") else LaserScan
     node.create_subscription(kind, topic, lambda data, topic=topic: note(topic, data), QoSProfile(depth=10), raw=True)
 print("ready", flush=True)
-try:
-    rclpy.spin(node)
-except KeyboardInterrupt:
-    pass
+signal.signal(signal.SIGINT, lambda *_: ended.append(True))
+ended = []
+while not ended:
+    rclpy.spin_once(node, timeout_sec=0.1)
 print(json.dumps(found))
 """
 
@@ -159,23 +158,21 @@ def planar_image():
 def main(duration_s, n_sensors, rate_hz, preset):
     """Measure times from sensors to callbacks of rclpy, and times of publish calls."""
     lines, lost, late_ms = latencies(duration_s, n_sensors, rate_hz, preset)
-    every = np.concatenate([*late_ms.values()])
-    p50, p99, most = np.percentile(every, [50, 99, 100])
+    p50, p99, most = np.percentile(np.concatenate([*late_ms.values()]), [50, 99, 100])
     for line in lines:
         if line["event"] == "note":
-            print(line["text"])
-    print(
-        f"{n_sensors} sensors at {rate_hz:g} Hz, {duration_s:g} s, {preset}: {sum(lines[-1]['messages'].values())} messages, "
-        f"{sum(lost.values())} lost, {lines[-1]['dropped']} dropped; callback p50 {p50:.1f} ms, p99 {p99:.1f} ms, "
-        f"slowest {most:.1f} ms after the measurement had arrived"
-    )
+            click.echo(line["text"])
+    n_messages = sum(lines[-1]["messages"].values())
+    click.echo(f"{n_sensors} sensors at {rate_hz:g} Hz, {duration_s:g} s, {preset}: {n_messages} messages")
+    click.echo(f"{sum(lost.values())} lost, {lines[-1]['dropped']} dropped")
+    click.echo(f"from arrival to callback: p50 {p50:.1f} ms, p99 {p99:.1f} ms, slowest {most:.1f} ms")
     for label, topic, item in (
         ("points, 256 points", "points", cloud()),
         ("image, 181 × 1178, 8 bits", "image", planar_image()),
     ):
         p50, p99 = publish_ms(topic, item)
-        print(f"publish call, {label}: p50 {p50:.2f} ms, p99 {p99:.2f} ms")
-    print(system_line())
+        click.echo(f"publish call, {label}: p50 {p50:.2f} ms, p99 {p99:.2f} ms")
+    click.echo(machine.sentence(machine.describe()))
 
 
 if __name__ == "__main__":

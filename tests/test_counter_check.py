@@ -307,8 +307,8 @@ def test_receiver_accepts_a_block_that_a_split_burst_makes_seem_early():
     """The clock confirms number 13: it is two intervals before number 15."""
     stream = stream_of(REGULAR)
     stream[10] = (0.52, stream[10][1])  # It is late, so that the clock cannot count from it.
-    damaged = block_of(FIRST + 11)[:-40]
-    stream[11:13] = [(0.55, damaged[:100]), (0.58, damaged[100:]), (0.612, block_of(FIRST + 12)[:-40])]
+    damaged = block_of(FIRST + 11)[:-8]
+    stream[11:13] = [(0.55, damaged[:10]), (0.58, damaged[10:]), (0.612, block_of(FIRST + 12)[:-8])]
     del stream[15]  # Number 14 leaves no trace.
     found, receiver = receive_all(stream)
     assert found == [index for index in range(40) if index not in {11, 12, 14}]

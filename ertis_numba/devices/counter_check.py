@@ -167,7 +167,7 @@ class CounterCheck:
         last, self._last = self._last, entry
         if entry.block is not None:
             self._decided.append((entry.block, True))
-        if last is None or not self._has_room(last, entry):
+        if last is None or not self._is_advance(last, entry):
             return
         ahead = _ahead(last, entry)
         if last.block is None:  # A sensor that is set to n may count from n or from n + 1.
@@ -232,11 +232,16 @@ class CounterCheck:
 
     def _has_room(self, first: _Entry, second: _Entry) -> bool:
         """Return True if that many triggers fit between two blocks, assuming that all bursts were received."""
-        bursts = max(1, second.burst - first.burst)
+        has_traces = first.block is None or second.burst - first.burst <= _ahead(first, second)
+        return has_traces and self._is_advance(first, second)
+
+    def _is_advance(self, first: _Entry, second: _Entry) -> bool:
+        """Return True unless numbers advance by more triggers than the time has room for."""
         if first.block is None:
-            return 1 <= _ahead(first, second) <= _AHEAD + bursts
-        time = _elapsed_ns(first, second) / self._shortest_ns
-        return bursts <= _ahead(first, second) <= _AHEAD + max(time, second.rejected - first.rejected)
+            most = float(max(1, second.burst - first.burst))
+        else:
+            most = max(_elapsed_ns(first, second) / self._shortest_ns, second.rejected - first.rejected)
+        return 1 <= _ahead(first, second) <= _AHEAD + most
 
 
 def _directly(first: _Entry, second: _Entry) -> bool:
