@@ -1,7 +1,8 @@
 """Figures of ``ertis ros``: times from sensors to callbacks of rclpy, and times of publish calls.
 
 Four emulated sensors measure, and ``ertis ros`` publishes their points and scans. A program with rclpy subscribes to
-all topics, and takes the time of each callback. Times count from the arrival of the complete measurement.
+all topics, and takes the time of each callback. Times count from the arrival of the first byte of a measurement, so that
+they include its transfer over a pseudo terminal.
 """
 
 import contextlib
@@ -15,7 +16,7 @@ from pathlib import Path
 
 import click
 import numpy as np
-from ertis_bench import machine
+from ertis_bench import machine, markdown
 
 from ertis_numba.frames import Energyscape, PointCloud, Stamp
 from ertis_numba.ros import Participant, RosPublisher
@@ -25,6 +26,8 @@ from tests.journals import ENVIRONMENT
 ERTIS = (sys.executable, "-m", "ertis_cli")
 RECORDING = Path(__file__).parents[1] / "data" / "synthetic" / "reflectors.h5"
 DOMAIN = 101
+ROS = ENVIRONMENT | {"ROS_DOMAIN_ID": str(DOMAIN), "ROS_LOG_DIR": tempfile.gettempdir()}
+MARKER = "python -m tests.ros_figures"
 WARM_UP_S = 10.0  # The first images compile kernels, and subscribers have to be found.
 """Time at the beginning that is left out."""
 
@@ -40,14 +43,17 @@ import signal
 rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
 node, found = Node("figures"), {}
 
-def note(topic, data):
-    now_ns = time.time_ns()
-    seconds, nanoseconds = struct.unpack_from("<iI", data, 4)
-    found.setdefault(topic, []).append((seconds * 10**9 + nanoseconds, now_ns))
+def noting(topic):
+    def note(data, info):
+        now_ns = time.time_ns()
+        seconds, nanoseconds = struct.unpack_from("<iI", data, 4)
+        number = info["publication_sequence_number"]
+        found.setdefault(topic, []).append((seconds * 10**9 + nanoseconds, now_ns, number))
+    return note
 
 for topic in sys.argv[1:]:
     kind = PointCloud2 if topic.endswith("points") else LaserScan
-    node.create_subscription(kind, topic, lambda data, topic=topic: note(topic, data), QoSProfile(depth=10), raw=True)
+    node.create_subscription(kind, topic, noting(topic), QoSProfile(depth=10), raw=True)
 print("ready", flush=True)
 signal.signal(signal.SIGINT, lambda *_: ended.append(True))
 ended = []
@@ -60,7 +66,7 @@ print(json.dumps(found))
 @contextlib.contextmanager
 def ended(command, how=signal.SIGINT, **options):
     """Run a process, and interrupt it at the end."""
-    with subprocess.Popen(command, env=ENVIRONMENT, text=True, **options) as process:
+    with subprocess.Popen(command, env=ROS, text=True, **options) as process:
         try:
             yield process
         finally:
@@ -92,10 +98,13 @@ def latencies(duration_s, n_sensors, rate_hz, preset):
     record_ns = round(1e9 * Settings.from_preset(preset).recording.duration_s)
     first_ns = min(times[0][1] for times in found.values()) + round(1e9 * WARM_UP_S)
     late_ms = {
-        topic: [(came_ns - stamp_ns - record_ns) / 1e6 for stamp_ns, came_ns in times if came_ns >= first_ns]
+        topic: [(came_ns - stamp_ns - record_ns) / 1e6 for stamp_ns, came_ns, _ in times if came_ns >= first_ns]
         for topic, times in found.items()
     }
-    lost = {topic: end["messages"][topic] - len(found.get(topic, ())) for topic in topics}
+    # Messages before the subscription was found are not lost.
+    lost = {topic: times[-1][2] - times[0][2] + 1 - len(times) for topic, times in found.items()}
+    assert lost.keys() == set(topics)
+    assert all(times[-1][2] == end["messages"][topic] for topic, times in found.items()), "the last one is missing"
     return lines, lost, late_ms
 
 
@@ -155,24 +164,33 @@ def planar_image():
 @click.option("--sensors", "n_sensors", default=4, show_default=True)
 @click.option("--rate", "rate_hz", default=20.0, show_default=True, help="Measurements of each sensor per second.")
 @click.option("--preset", default="short_25_50", show_default=True)
-def main(duration_s, n_sensors, rate_hz, preset):
+@click.option("--update", "targets", multiple=True, type=click.Path(path_type=Path, exists=True), metavar="FILE")
+def main(duration_s, n_sensors, rate_hz, preset, targets):
     """Measure times from sensors to callbacks of rclpy, and times of publish calls."""
+    for target in targets:
+        markdown.around(target, MARKER)
     lines, lost, late_ms = latencies(duration_s, n_sensors, rate_hz, preset)
     p50, p99, most = np.percentile(np.concatenate([*late_ms.values()]), [50, 99, 100])
-    for line in lines:
-        if line["event"] == "note":
-            click.echo(line["text"])
-    n_messages = sum(lines[-1]["messages"].values())
-    click.echo(f"{n_sensors} sensors at {rate_hz:g} Hz, {duration_s:g} s, {preset}: {n_messages} messages")
-    click.echo(f"{sum(lost.values())} lost, {lines[-1]['dropped']} dropped")
-    click.echo(f"from arrival to callback: p50 {p50:.1f} ms, p99 {p99:.1f} ms, slowest {most:.1f} ms")
+    messages, n_images = lines[-1]["messages"], lines[-1]["measurements"]
+    load = f"{n_sensors} sensors at {rate_hz:g} Hz for {duration_s:g} s"
+    rows = [
+        (f"{load}: messages", f"{sum(messages.values()):,} of {n_images:,} images, {sum(lost.values())} lost"),
+        ("first byte of a measurement to callback", f"p50 {p50:.1f} ms, p99 {p99:.1f} ms, slowest {most:.1f} ms"),
+    ]
     for label, topic, item in (
-        ("points, 256 points", "points", cloud()),
-        ("image, 181 × 1178, 8 bits", "image", planar_image()),
+        ("256 points", "points", cloud()),
+        ("image of 181 × 1178 in 8 bits", "image", planar_image()),
     ):
         p50, p99 = publish_ms(topic, item)
-        click.echo(f"publish call, {label}: p50 {p50:.2f} ms, p99 {p99:.2f} ms")
-    click.echo(machine.sentence(machine.describe()))
+        rows.append((f"publish call, {label}", f"p50 {p50:.2f} ms, p99 {p99:.2f} ms"))
+    notes = "; ".join(line["text"] for line in lines if line["event"] == "note")
+    options = f"--duration {duration_s:g} --sensors {n_sensors} --rate {rate_hz:g} --preset {preset}"
+    text = markdown.table(("figure", "measured"), rows)
+    text += f"\n\nCommand: `python -m tests.ros_figures {options}`. {notes and notes + '. '}"
+    text += machine.sentence(machine.describe())
+    click.echo(text)
+    for target in targets:
+        markdown.update(target, MARKER, text)
 
 
 if __name__ == "__main__":
