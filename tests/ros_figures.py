@@ -1,8 +1,8 @@
 """Figures of ``ertis ros``: times from sensors to callbacks of rclpy, and times of publish calls.
 
 Four emulated sensors measure, and ``ertis ros`` publishes their points and scans. A program with rclpy subscribes to
-all topics, and takes the time of each callback. Times count from the arrival of the first byte of a measurement, so that
-they include its transfer over a pseudo terminal.
+all topics, and takes the time of each callback. Times count from the arrival of the first byte of a measurement, so
+that they include its transfer over a pseudo terminal.
 """
 
 import contextlib
