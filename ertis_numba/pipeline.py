@@ -2,9 +2,7 @@
 
 import functools
 import itertools
-import warnings
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
 
@@ -12,15 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks, kernels
+from ertis_numba.accepted_words import AcceptedWords, rescaled
 from ertis_numba.air import sound_speed_m_s
-from ertis_numba.analysis.call_match import call_match
 from ertis_numba.analysis.range_cleaning import clean_in_place
-from ertis_numba.errors import ArgumentError, CallMismatchWarning, DataError, DeviceError, ErrorBudgetWarning
+from ertis_numba.errors import ArgumentError, DeviceError
 from ertis_numba.frames import Beams, Energyscape, Measurement, MicrophoneSignals
 from ertis_numba.geometry import Grid, microphones
-from ertis_numba.prediction import BudgetMonitor
-from ertis_numba.sample_format import sample_format
-from ertis_numba.settings import ERROR_PRESETS_DB, Array, Settings
+from ertis_numba.image_checks import ImageChecks
+from ertis_numba.settings import ERROR_PRESETS_DB, Settings
 from ertis_numba.stages import paper, paper_scipy, planner
 from ertis_numba.stages.chain_protocol import Chain
 from ertis_numba.stages.costs import PLAN_COSTS, PlanCosts
@@ -34,7 +31,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Pipeline"]
 
-_CALL_CHECKS: Final = 8
 _GPU_BATCH: Final = 16  # measurements; several times as many as a GPU has lanes
 _MAX_BATCH_BYTES: Final = 2**30
 
@@ -143,15 +139,10 @@ class Pipeline:
         self.settings = settings
         self._uncleaned_settings = _without_cleaning(settings)
         self.device = kernel_set.device
-        self._accepted_settings = settings
-        self._format = sample_format(settings)
+        self._accepted_words = AcceptedWords(settings)
         self._closed = False
         self._threads = threads
-        self._monitor = (
-            _budget_monitor(kernel_set, threads) if predict and settings.processing.method == "fast" else None
-        )
-        self._warned = False
-        self._remaining_call_checks = _CALL_CHECKS if predict and not kernel_set.simulated else 0
+        self._image_checks = ImageChecks(settings, kernel_set, threads=threads) if predict else None
         self._chain = self._build_chain(kernel_set, threads, graphs=graphs)
         self.grid: Grid = self._chain.grid
         self.range_m: NDArray[np.float64] = self._chain.range_m
@@ -210,7 +201,7 @@ class Pipeline:
             self._chain.process(words, amplitude, threads=threads)
         else:
             raise foreign_stream()
-        return self._checked_image(_rescaled(amplitude, exponent), measurement, clean=clean)
+        return self._checked_image(rescaled(amplitude, exponent), measurement, clean=clean)
 
     def stream(self) -> WordStream:
         """Return a stream that demodulates words while they arrive from a sensor; it has buffers of its own.
@@ -229,7 +220,7 @@ class Pipeline:
         self._require_open()
         if not isinstance(self._chain, KernelChain):
             return WordStream()
-        return self._chain.stream(np.zeros(self._format.shape_2d, self._format.dtype))
+        return self._chain.stream(np.zeros(self._accepted_words.format.shape_2d, self._accepted_words.format.dtype))
 
     def process_batch(self, measurements: Iterable[Measurement]) -> list[Energyscape]:
         """Return the energyscapes of several measurements, in their order, with the same bits as from `process`.
@@ -266,7 +257,7 @@ class Pipeline:
         amplitudes = [self._chain.new_image() for _ in batch]
         self._chain.process_batch([each for each, _ in words], amplitudes)
         return [
-            self._checked_image(_rescaled(amplitude, exponent), measurement, clean=True)
+            self._checked_image(rescaled(amplitude, exponent), measurement, clean=True)
             for amplitude, (_, exponent), measurement in zip(amplitudes, words, batch, strict=True)
         ]
 
@@ -322,7 +313,7 @@ class Pipeline:
                 yield images.pop()
 
     def _batch_size(self) -> int:
-        each_bytes = 4 * len(self.grid) * len(self.range_m) + self._format.n_bytes
+        each_bytes = 4 * len(self.grid) * len(self.range_m) + self._accepted_words.format.n_bytes
         count = _GPU_BATCH if self.device == "cuda" else self._threads
         return max(1, min(count, _MAX_BATCH_BYTES // each_bytes))
 
@@ -357,7 +348,7 @@ class Pipeline:
 
         self._require_open()
         checks.instance("measurement", measurement, Measurement, "a recording holds")
-        self._require_same_sensor(measurement.settings)
+        self._accepted_words.require_sensor(measurement.settings)
         layout, rate_hz = microphones(self.settings.array), self.settings.signal_rate_hz
         demodulated = signals_of(measurement, settings=self.settings)
         return MicrophoneSignals(
@@ -406,7 +397,7 @@ class Pipeline:
         settings, chain = self._beam_chain
         beam: NDArray[Any] = chain.new_image()
         chain.process(words, beam)
-        _rescaled(beam.view(np.float32), exponent)
+        rescaled(beam.view(np.float32), exponent)
         return Beams(beam, self.grid.azimuth_rad, self.grid.elevation_rad, self.range_m, settings, measurement.stamp)
 
     @functools.cached_property
@@ -453,7 +444,7 @@ class Pipeline:
     @property
     def prediction(self) -> "Prediction | None":
         """Latest predicted error and its budget; None before the first image with sound."""
-        return None if self._monitor is None else self._monitor.prediction
+        return None if self._image_checks is None else self._image_checks.prediction
 
     def close(self) -> None:
         """Free the memory of the device once running calls have ended. Images stay valid."""
@@ -469,36 +460,12 @@ class Pipeline:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _check_call(self, measurement: Measurement) -> None:
-        """Compare echoes with the call in the first measurements, until one has sound above the noise."""
-        if self._remaining_call_checks <= 0:
-            return
-        self._remaining_call_checks -= 1
-        match = call_match(replace(measurement, settings=self.settings))
-        if match is not None:
-            self._remaining_call_checks = 0
-            if match.warning:
-                warnings.warn(match.warning, CallMismatchWarning, stacklevel=4)
-
-    def _check_budget(self, image: Energyscape, measurement: Measurement) -> None:
-        """Predict the error of an image if it needs a prediction, and issue the warning once."""
-        if self._monitor is None or self._warned:
-            return
-        try:
-            prediction = self._monitor.check(image, measurement)
-            text = prediction.warning if prediction else ""
-        except DeviceError as error:
-            text = f"the error of images cannot be predicted: {error}"
-        if text:
-            self._warned = True
-            warnings.warn(text, ErrorBudgetWarning, stacklevel=4)
-
     def _build_chain(self, kernel_set: kernels.KernelSet, threads: int, *, graphs: bool) -> Chain:
         """Return the chain with compiled kernels and allocated buffers."""
         try:
             chain = _chain(self.settings, kernel_set, threads, graphs=graphs)
             if not kernel_set.simulated:
-                chain.warm_up(np.zeros(self._format.shape_2d, self._format.dtype))
+                chain.warm_up(np.zeros(self._accepted_words.format.shape_2d, self._accepted_words.format.dtype))
         except DeviceError as error:
             failed = str(error)
         else:
@@ -520,8 +487,8 @@ class Pipeline:
             settings=self._uncleaned_settings,
             stamp=measurement.stamp,
         )
-        self._check_call(measurement)
-        self._check_budget(image, measurement)
+        if self._image_checks is not None:
+            self._image_checks.check(image, measurement)
         processing = self.settings.processing
         if not clean or not processing.is_cleaned:
             return image
@@ -531,25 +498,7 @@ class Pipeline:
     def _words_of(self, measurement: Measurement) -> tuple[NDArray[Any], int]:
         """Return the words, scaled into the range of single precision, and the exponent n of the divisor 2^n."""
         self._require_open()
-        self._require_same_sensor(measurement.settings)
-        return self._format.normalised(self._format.validated(measurement.data))
-
-    def _require_same_sensor(self, settings: Settings) -> None:
-        """Refuse measurements of another sensor; only ``processing`` and ``accuracy`` may differ."""
-        if settings is self._accepted_settings:
-            return
-        for name in ("call", "recording", "air"):
-            came, wanted = getattr(settings, name), getattr(self.settings, name)
-            if came != wanted:
-                raise DataError(
-                    f"measurement has {came}, but the pipeline has {wanted}; create a pipeline from its settings"
-                )
-        if settings.array != self.settings.array and not _same_layout(settings.array, self.settings.array):
-            raise DataError(
-                f"measurement has array {settings.array.layout!r}, but the pipeline has another, "
-                f"{self.settings.array.layout!r}; create a pipeline from its settings"
-            )
-        self._accepted_settings = settings
+        return self._accepted_words.read(measurement)
 
     def _checked_out(self, out: NDArray[np.float32]) -> NDArray[np.float32]:
         wanted = (len(self.grid), len(self.range_m))
@@ -558,46 +507,11 @@ class Pipeline:
         return out
 
 
-def _budget_monitor(kernel_set: kernels.KernelSet, threads: int) -> BudgetMonitor | None:
-    """Return a monitor of the budget; None for simulated kernels, which would take minutes for a prediction."""
-    if kernel_set.simulated:
-        return None
-    return BudgetMonitor(kernel_set, threads)
-
-
-def _rescaled(amplitude: NDArray[np.float32], exponent: int) -> NDArray[np.float32]:
-    """Return an image multiplied by a power of two, in place.
-
-    Raises
-    ------
-    DataError
-        The image exceeds single precision.
-    """
-    if exponent:
-        with np.errstate(over="ignore"):
-            np.ldexp(amplitude, exponent, out=amplitude)
-        if not np.isfinite(amplitude).all():
-            raise DataError(
-                f"the measurement's samples reach 2^{exponent}, so its image exceeds the largest float32, 3.4e38; "
-                "divide the samples by their full scale"
-            )
-    return amplitude
-
-
 def _without_cleaning(settings: Settings) -> Settings:
     """Return the same settings if they request no cleaning."""
     if not settings.processing.is_cleaned:
         return settings
     return settings.replace(**{"processing.clean_within_db": None, "processing.clean_above_mean_db": None})
-
-
-def _same_layout(array: Array, other: Array) -> bool:
-    """Return True if two arrays have the same microphones, even if only one is given by its name."""
-    came, wanted = microphones(array), microphones(other)
-    return came.word_bits == wanted.word_bits and all(
-        np.array_equal(getattr(came, name), getattr(wanted, name))
-        for name in ("positions_m", "enabled", "gain", "delay_s")
-    )
 
 
 def _chain(settings: Settings, kernel_set: kernels.KernelSet, threads: int, *, graphs: bool) -> Chain:

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from ertis_numba import checks
 from ertis_numba.frames import Energyscape
 
-__all__ = ["clean", "clean_in_place"]
+__all__ = ["clean", "clean_in_place", "keep_strongest"]
 
 
 def clean(image: Energyscape, *, within_db: float | None = 6.0, above_mean_db: float | None = None) -> Energyscape:
@@ -69,9 +69,24 @@ def clean_in_place(amplitude: NDArray[np.float32], *, within_db: float | None, a
     within_db, above_mean_db : float, optional
         Levels, as for `clean`; None for no limit.
     """
+    of_max = None if within_db is None else 10 ** (-within_db / 20)
+    of_mean = None if above_mean_db is None else 10 ** (above_mean_db / 20)
+    keep_strongest(amplitude, of_max=of_max, of_mean=of_mean)
+
+
+def keep_strongest(amplitude: NDArray[np.float32], *, of_max: float | None, of_mean: float | None) -> None:
+    """Set amplitudes to 0 that are below a limit of their range.
+
+    Parameters
+    ----------
+    amplitude : (direction, range) float32
+        Amplitudes of an image, which are changed.
+    of_max, of_mean : float, optional
+        Limits relative to the strongest amplitude of the range, and to the mean; None for no limit.
+    """
     smallest = np.zeros(amplitude.shape[1], dtype=np.float32)
-    if within_db is not None:
-        np.maximum(smallest, amplitude.max(axis=0, initial=0.0) * np.float32(10 ** (-within_db / 20)), out=smallest)
-    if above_mean_db is not None:
-        np.maximum(smallest, amplitude.mean(axis=0) * np.float32(10 ** (above_mean_db / 20)), out=smallest)
-    amplitude *= amplitude >= smallest
+    if of_max is not None:
+        np.maximum(smallest, amplitude.max(axis=0, initial=0.0) * np.float32(of_max), out=smallest)
+    if of_mean is not None:
+        np.maximum(smallest, amplitude.mean(axis=0) * np.float32(of_mean), out=smallest)
+    amplitude *= amplitude >= smallest  # A tenth of the time that np.where takes.

@@ -45,7 +45,7 @@ class Dialogue(SerialLine):
         self._timeout_s = timeout_s
 
     def drain(self, *, within_s: float, repeat: Command | None = None) -> int:
-        """Drop bytes until none arrive, and return their number.
+        """Drop bytes until none arrive, and return their number without the answers to ``repeat``.
 
         Parameters
         ----------
@@ -58,7 +58,7 @@ class Dialogue(SerialLine):
         SonarError
             There is no end to it.
         """
-        count = 0
+        count = n_answers = 0
         began = last = reported = time.monotonic()
         while True:
             data, arrived = self.receive(_MAX_BYTES)
@@ -66,13 +66,14 @@ class Dialogue(SerialLine):
             if data:
                 count, last = count + len(data), now
             elif now - last >= _QUIET_S:
+                count = max(0, count - _ANSWER_BYTES * n_answers)
                 self.dropped += count
                 return count
             if now - began > within_s:
                 raise sonar_error(f"{self.path} keeps sending after a stop command; is it an eRTIS?", errno.ETIMEDOUT)
             if repeat is not None and now - reported > 2 * _QUIET_S:
                 self.send(repeat.encode())
-                reported = now
+                reported, n_answers = now, n_answers + 1
 
     def quieten(self, command: Command, *, within_s: float) -> None:
         """Send the command that ends a stream, and drop all bytes that still arrive, including its answer."""
