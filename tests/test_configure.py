@@ -320,6 +320,12 @@ def test_code_of_the_network_page_configures_a_sensor(tmp_path):
         ended(process)
 
 
+def test_command_without_settings_is_refused(tmp_path):
+    done = configure(tmp_path, "tcp://127.0.0.1:1", "one", "--temperature", "25")
+    assert done.exit_code == 2
+    assert "all settings of the sensor are replaced; give them with --preset or --settings" in done.stderr
+
+
 def test_only_admins_may_change_settings(tmp_path):
     pairs = {name: KeyPair.new(name) for name in ("central", "robot", "viewer", "admin")}
     AllowList(
@@ -450,7 +456,7 @@ def test_payload_of_new_settings_contains_no_file_names(tmp_path):
         request.accept(["front"])
 
     with answering(tmp_path, accept) as client:
-        done = configure(tmp_path, client.address, "front", "--layout", "own.csv")
+        done = configure(tmp_path, client.address, "front", "--preset", "short_25_50", "--layout", "own.csv")
     assert done.exit_code == 0, done.output
     assert done.stdout == "configured: front\n"
     assert len(requests[0].settings.array.positions_m) == 32

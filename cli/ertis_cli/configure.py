@@ -38,15 +38,17 @@ def configure(
 ) -> None:
     """Change the settings of a sensor that sends to a central node.
 
-    ADDRESS is the address that sensors send to. 'ertis capture --to' configures all its sensors between two
-    measurements. If one of them cannot have the settings, all keep their former ones. If the central node uses keys,
-    give the key of an admin.
+    ADDRESS is the address that sensors send to. --preset or --settings gives the new settings, which replace all
+    former ones. 'ertis capture --to' configures all its sensors between two measurements. If one of them cannot have
+    the settings, all keep their former ones. If the central node uses keys, give the key of an admin.
     """
     from ertis_numba import checks
     from ertis_numba.network.central_client import CentralClient
 
     checks.positive("--patience", patience_s)
     checks.sensor_name(sensor)
+    if given["preset"] is None and given["settings_file"] is None:
+        raise click.UsageError("all settings of the sensor are replaced; give them with --preset or --settings")
     settings = settings_from(**given)
     with CentralClient(address, keys=_network.client_keys(key, server_key)) as central:
         sensors = central.configure(sensor, settings, patience_s)

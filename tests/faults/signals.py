@@ -44,7 +44,7 @@ COMMANDS: Final[dict[str, Sequence[str]]] = {
     "command": ("--port", "{port}", "!Y,0,0,0"),
     "compare": ("{images}",),
     "completion": ("bash",),
-    "configure": ("tcp://127.0.0.1:1", "front"),
+    "configure": ("tcp://127.0.0.1:1", "front", "--preset", "short_25_50"),
     "demo": ("-o", "{out}/demo"),
     "devices": (),
     "doctor": (),
