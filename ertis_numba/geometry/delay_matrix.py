@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks
+from ertis_numba.csv_numbers import csv_rows
 from ertis_numba.errors import ArgumentError
-from ertis_numba.geometry._csv import csv_rows
 from ertis_numba.geometry.delays import far_field_delays, unit_vectors
 from ertis_numba.geometry.grids import Grid
 from ertis_numba.geometry.layouts import microphones

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks
+from ertis_numba.csv_numbers import csv_rows
 from ertis_numba.documents import TomlDocument
 from ertis_numba.errors import ArgumentError
-from ertis_numba.geometry._csv import csv_rows
 from ertis_numba.geometry.grids import grid_count
 from ertis_numba.settings import Array, Settings
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks
+from ertis_numba.csv_numbers import csv_rows
 from ertis_numba.errors import ArgumentError, DataError, SettingsError
 from ertis_numba.wav import read_wav
 
@@ -69,8 +70,7 @@ def read_waveform(path: Path, *, key: str = "call.waveform") -> tuple[tuple[floa
 def _read_numbers(path: Path, suffix: str) -> NDArray[Any]:
     if suffix == ".npy":
         return np.asarray(np.load(path, allow_pickle=False))
-    lines = (line.split("#", 1)[0].strip() for line in path.read_text("utf-8-sig").splitlines())
-    return np.array([[float(cell) for cell in line.split(",")] for line in lines if line], dtype=np.float64)
+    return np.array(csv_rows(path.name, path.read_text("utf-8-sig")), dtype=np.float64)
 
 
 def normalise(samples: tuple[float, ...], rate_hz: float) -> tuple[float, ...]:

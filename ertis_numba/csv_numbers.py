@@ -8,6 +8,8 @@ __all__ = ["csv_rows"]
 def csv_rows(source: str, text: str) -> list[list[float]]:
     """Return rows of comma-separated numbers; ``source`` is their name in errors.
 
+    A row may be empty, and a comment follows #.
+
     Raises
     ------
     ArgumentError
