@@ -23,7 +23,7 @@ __all__ = ["configure"]
     default=30.0,
     show_default=True,
     metavar="S",
-    help="Time to wait for an answer.",
+    help="Longest time in seconds to wait for an answer.",
 )
 @options.as_json
 def configure(
@@ -38,9 +38,10 @@ def configure(
 ) -> None:
     """Change the settings of a sensor that sends to a central node.
 
-    ADDRESS is the address that sensors send to. --preset or --settings gives the new settings, which replace all
-    former ones. 'ertis capture --to' configures all its sensors between two measurements. If one of them cannot have
-    the settings, all keep their former ones. If the central node uses keys, give the key of an admin.
+    ADDRESS is the address that sensors send to. Give the new settings with --preset or --settings; they replace all
+    former ones. The capture of this sensor ('ertis capture --to') configures all its sensors between two measurements.
+    If one of them cannot use the settings, all keep their former ones. If the central node uses keys, give the key of
+    an admin.
     """
     from ertis_numba import checks
     from ertis_numba.network.central_client import CentralClient

@@ -22,8 +22,8 @@ _COLUMNS: dict[str, _tables.Side] = dict.fromkeys(("", "check", "found", "remedy
     metavar="DIR",
     help="Folder for recordings; the speed of its disk is measured. The current folder by default.",
 )
-@click.option("--ros", is_flag=True, help="Check only why ROS 2 programs may receive nothing from 'ertis ros'.")
-@click.option("--domain", type=int, metavar="N", help="With --ros: domain id; that of ROS_DOMAIN_ID by default.")
+@click.option("--ros", is_flag=True, help="Check only for reasons why ROS 2 programs receive nothing from 'ertis ros'.")
+@click.option("--domain", type=int, metavar="N", help="With --ros: DDS domain; the value of ROS_DOMAIN_ID by default.")
 @click.option("--interface", metavar="NAME", help="With --ros: network interface; lo by default.")
 @click.pass_context
 @options.as_json
@@ -34,7 +34,7 @@ def doctor(
 
     The command checks versions, cores and threads, the GPU, serial ports and their permissions, disk speed and free
     space, and keys. With --ros, it lists the ROS 2 programs and subscribers that it finds. The exit code is 1 if
-    something does not work. Missing optional parts are only notes.
+    something does not work. A missing optional part is a note, and does not change the exit code.
     """
     from ertis_cli._diagnosis import CHECKS, InstallationFinding
     from ertis_cli._ros_diagnosis import ros_findings

@@ -13,7 +13,8 @@ __all__ = ["layouts"]
 def layouts(*, name: str | None, as_json: bool) -> None:
     """List the shipped layouts, or print one as TOML.
 
-    Save the output to a file and edit it. Then use that file as array.layout in settings or scenes, or as --layout.
+    To make your own layout, save the output to a file and edit it. Then give the file with --layout, or as array.layout
+    in settings and scenes.
     """
     from ertis_numba.geometry import layout_names, layout_text, load_layout
 

@@ -14,8 +14,8 @@ __all__ = ["reset"]
 
 @click.command()
 @click.option("--port", "-p", required=True, metavar="PORT", help="Path, serial number or name of the sensor.")
-@click.option("--pin", type=click.IntRange(1, 40), metavar="N", help="Pin of the board; 7 by default.")
-@click.option("--hook", metavar="COMMAND", help="Program that resets the sensor instead of a pin, with its arguments.")
+@click.option("--pin", type=click.IntRange(1, 40), metavar="N", help="Number of the pin on the board; 7 by default.")
+@click.option("--hook", metavar="COMMAND", help="Program, with arguments, that resets the sensor instead of a pin.")
 @click.option(
     "--within",
     "within_s",
@@ -23,14 +23,14 @@ __all__ = ["reset"]
     default=60.0,
     show_default=True,
     metavar="S",
-    help="Longest time in seconds until the sensor answers again.",
+    help="Longest time in seconds to wait for the sensor.",
 )
 @options.quiet
 def reset(*, port: str, pin: int | None, hook: str | None, within_s: float, quiet: bool) -> None:
     """Reset a sensor and wait until it answers again.
 
-    By default, the reset line is on a pin of an NVIDIA Jetson, which needs the package Jetson.GPIO. The sensor may be
-    silent, or its port missing, before the reset.
+    By default, the command pulses the pin of an NVIDIA Jetson that is wired to the sensor's reset line. This needs the
+    package Jetson.GPIO. The command also works if the sensor does not answer, or if its port is missing.
     """
     from ertis_numba.devices.reset import reset_sensor
     from ertis_numba.devices.reset_pin import RESET_PIN, pulse_reset_pin

@@ -57,14 +57,14 @@ class _MaxRate(click.ParamType[Any]):
     "topics",
     type=click.Choice(_TOPICS),
     multiple=True,
-    help="Topic of each sensor; repeatable; points and scan by default.",
+    help="Topic to publish for each sensor; repeatable; points and scan by default.",
 )
 @click.option("--namespace", default="", metavar="NAME", help="Prefix of the topics of sensors, such as robot1.")
 @click.option(
     "--domain",
     type=int,
     metavar="N",
-    help="Domain id, 0 to 232; that of ROS_DOMAIN_ID by default, otherwise 0.",
+    help="DDS domain, 0 to 232; the value of ROS_DOMAIN_ID by default, or 0 without it.",
 )
 @click.option(
     "--interface",
@@ -78,7 +78,7 @@ class _MaxRate(click.ParamType[Any]):
     type=click.Choice(["reliable", "best_effort"]),
     default="reliable",
     show_default=True,
-    help="Reliability of the topics of sensors.",
+    help="Reliability of the topics of sensors; best_effort never sends a lost message again.",
 )
 @click.option(
     "--max-rate",
@@ -101,7 +101,7 @@ class _MaxRate(click.ParamType[Any]):
     "floor_dbfs",
     type=float,
     metavar="DBFS",
-    help="Lowest absolute level of echoes in scans, so that a scene without echoes gives an empty scan.",
+    help="Lowest absolute level of echoes in scans; without it, noise counts as echoes if there are no echoes.",
 )
 @click.option("--use-sim-time", "sim_time", is_flag=True, help="Keep the times of a file, and publish them on /clock.")
 @click.option(
@@ -116,13 +116,13 @@ class _MaxRate(click.ParamType[Any]):
     "--control",
     type=click.Path(path_type=Path),
     metavar="FILE",
-    help="Settings of levels, ranges, rates and pauses (TOML), read again when the file changes.",
+    help="TOML file of levels, ranges, rates, speed and pauses; read again whenever it changes.",
 )
 @click.option("--loop", is_flag=True, help="Restart a file at its end.")
 @click.option(
     "--trigger",
     type=click.Choice(["command", "sync"]),
-    help="With ports: source of the trigger, a command of this program, or a pulse of the SYNC chain.",
+    help="With ports: trigger by commands of this program (the default), or by pulses of the SYNC chain.",
 )
 @click.option(
     "--trigger-rate",
@@ -169,9 +169,9 @@ def ros(
     """Publish images and points as live ROS 2 topics.
 
     ROS need not be installed. ADDRESS is the address at which a central node publishes. A recording is processed with
-    its own settings, at its original speed. The sensors on PORTS measure as with 'ertis capture', and nothing is
-    stored. The command needs the extra 'ros'. DDS has no passwords: by default, only this machine can read the topics;
-    --interface opens them to a network. With --json, there is one line per event.
+    its own settings and published at its original speed. Sensors at each PORT measure as with 'ertis capture', but
+    nothing is stored. The command needs the extra 'ros'. DDS, the middleware of ROS 2, has no passwords: by default,
+    only this machine can read the topics; --interface opens them to a network.
     """
     kind = _kind(sources)
     source = " ".join(sources)
@@ -249,7 +249,7 @@ def ros(
 
 
 class _Control:
-    """Control file that is looked at now and then."""
+    """Control file that is checked for changes at regular intervals."""
 
     def __init__(self, watched: "WatchedSettings") -> None:
         self._watched, self._next_s = watched, 0.0

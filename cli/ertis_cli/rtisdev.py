@@ -23,15 +23,15 @@ __all__ = ["rtisdev"]
 @click.option(
     "--method",
     type=click.Choice(["exact", "fast"]),
-    help="exact: the script's filters as they are. fast: this package's chain, where it can, with a small difference.",
+    help="exact, the default: the script's filters. fast: this package's chain where possible; images differ slightly.",
 )
 @click.argument("script", type=click.Path(path_type=Path, exists=True, dir_okay=False), metavar="SCRIPT.py")
 @click.argument("arguments", nargs=-1, type=click.UNPROCESSED, metavar="ARGS...")
 def rtisdev(*, port: str | None, device: str, method: str | None, script: Path, arguments: tuple[str, ...]) -> None:
     """Run a script for RTIS Dev.
 
-    The script runs unchanged. The functions of the closed modules rtisserial and rtiscuda are those of
-    ertis_numba.rtisdev, which need no GPU. The command needs the extra 'rtisdev'.
+    The script runs unchanged. ertis_numba.rtisdev replaces the closed-source modules rtisserial and rtiscuda, and needs
+    no GPU. The command needs the extra 'rtisdev'.
     """
     from ertis_numba.extras import extra
 
