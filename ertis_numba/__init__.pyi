@@ -6,6 +6,7 @@ from .analysis.detect import find_peaks as find_peaks
 from .analysis.health import health as health
 from .analysis.points import PointExtractor as PointExtractor
 from .arrays import beamform as beamform, demodulate as demodulate, matched_filter as matched_filter
+from .calibration import Calibration as Calibration, calibrate as calibrate
 from .devices.driver import SonarDriver as SonarDriver
 from .devices.emulator import Emulator as Emulator
 from .devices.setup import Setup as Setup

@@ -24,7 +24,8 @@ class Array(TomlTable, frozen=True, kw_only=True):
     enabled : tuple of bool, optional, default None
         Channels that carry a microphone; all by default.
     gain : tuple of float, optional, default None
-        Calibrated sensitivity of each channel, 0.001 to 1000; 1 by default. Signals are divided by it.
+        Calibrated sensitivity of each channel, 0.001 to 1000; 1 by default. Signals are divided by it. A negative
+        value, -1000 to -0.001, corrects inverted polarity.
     delay_s : tuple of float, optional, default None
         Calibrated delay of each channel in seconds, -0.001 to 0.001; 0 by default. Images correct it.
     disabled : tuple of int, optional, default None
@@ -62,7 +63,9 @@ class Array(TomlTable, frozen=True, kw_only=True):
             checks.shape("array.enabled", (len(self.enabled),), (n_channels,))
             if not any(self.enabled):
                 raise ArgumentError("array.enabled is false for all channels; enable at least one")
-        self._check_per_channel("gain", 1e-3, 1e3)
+        self._check_per_channel("gain", -1e3, 1e3)
+        for channel, gain in enumerate(self.gain or ()):
+            checks.between(f"magnitude of array.gain[{channel}]", abs(gain), 1e-3, 1e3)
         self._check_per_channel("delay_s", -1e-3, 1e-3)
 
     def _check_per_channel(self, name: str, low: float, high: float) -> None:

@@ -1,0 +1,6 @@
+"""Calibration of arrays: gains, delays, polarities and positions of microphones, and poses of sensors."""
+
+from ertis_numba.calibration.array_calibration import calibrate
+from ertis_numba.calibration.result import Calibration, Residuals
+
+__all__ = ["Calibration", "Residuals", "calibrate"]

@@ -1,0 +1,296 @@
+"""Calibration of an array by recordings of one sound each."""
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba import checks
+from ertis_numba.air import absorption_db_m
+from ertis_numba.calibration.advice import how_to_record, not_observable, require_directions
+from ertis_numba.calibration.array_fit import ArrayFit, Observations, Tolerances, fit_array, fit_gains
+from ertis_numba.calibration.channel_order import find_swaps
+from ertis_numba.calibration.contrast import image_contrast_db
+from ertis_numba.calibration.result import Calibration, Residuals
+from ertis_numba.calibration.usable_sounds import (
+    MIN_COHERENCE,
+    Heard,
+    Microphones,
+    hear_all,
+    ordered,
+    require_sounds,
+    silent_channels,
+    unclear_channels,
+)
+from ertis_numba.calibration.wavefronts import TARGETS, Target, locate_source, travel_times
+from ertis_numba.errors import DataError
+from ertis_numba.frames import Measurement
+from ertis_numba.geometry import Layout
+
+__all__ = ["calibrate"]
+
+_NEPER_DB: Final = 20 / math.log(10)
+_MIN_MICROPHONES: Final = 8
+_NEAR: Final = 3.0  # A sound that is more expected deviations from its expected time is another one.
+_SCALE_S: Final = 5e-6
+_INVERTED_SHARE: Final = 0.8  # Share of the recordings in which an inverted channel is inverted.
+_MIN_EVIDENCE: Final = 100.0  # Sum over the recordings of the logarithm of the likelihood of an inverted polarity.
+_BAD_RECORD: Final = 6.0  # Residual of a bad recording relative to that of the median one.
+_MIN_BAD_S: Final = 1e-6
+
+
+def calibrate(
+    recordings: Iterable[Measurement] | Iterable[Iterable[Measurement]],
+    layout: Layout | str | Path | None = None,
+    *,
+    target: Target = "reflector",
+    gain_tolerance_db: float = 3.0,
+    delay_tolerance_s: float = 5e-6,
+    position_tolerance_m: float = 1e-3,
+    on_progress: Callable[[int], None] | None = None,
+) -> Calibration:
+    """Estimate gain, delay, polarity and position of each microphone from recordings.
+
+    Each measurement should contain one strong sound: the echo of a small reflector, at a different place in each
+    recording, or of a flat wall, the direct sound of the sensor's own emitter, or the call of another sensor of the
+    SYNC chain. Swapped, inverted, silent and duplicate channels are found first. `fit_array` and `fit_gains` describe
+    the fits that follow.
+
+    Parameters
+    ----------
+    recordings : iterable of Measurement, or of recordings
+    layout : Layout, str or Path, optional
+        Layout in use; that of the first measurement by default.
+    target : {"reflector", "wall", "direct", "beacon"}
+        Origin of the strongest sound.
+    gain_tolerance_db, delay_tolerance_s : float
+        Standard deviations of gains and delays that are expected before the calibration.
+    position_tolerance_m : float
+        The same of positions along each axis. 0 keeps the positions of the layout. Direct sound always keeps them.
+    on_progress : callable, optional
+        Function that is called with the number of measurements so far.
+
+    Returns
+    -------
+    Calibration
+
+    Raises
+    ------
+    ArgumentError
+        There are no measurements, or the layout does not suit them.
+    DataError
+        No sound stands out, the signals are saturated, the layout does not fit them, or all recordings are from one
+        direction.
+
+    Examples
+    --------
+    Calibrate an array with a reflector at twenty places::
+
+        recordings = [ertis.open_recording(path) for path in sorted(Path("reflector").glob("*.h5"))]
+        calibration = ertis.calibrate(recordings)
+        print(calibration.findings, calibration.residuals.before_s, calibration.residuals.after_s)
+    """
+    checks.choice("target", target, TARGETS)
+    checks.between("gain_tolerance_db", gain_tolerance_db, 0.01, 60.0)
+    checks.between("delay_tolerance_s", delay_tolerance_s, 1e-9, 1e-3)
+    checks.between("position_tolerance_m", position_tolerance_m, 0.0, 0.1)
+    expected = Tolerances(gain_tolerance_db, delay_tolerance_s, 0.0 if target == "direct" else position_tolerance_m)
+    heard = hear_all(recordings, layout, target, on_progress)
+    enabled = np.flatnonzero(heard.former.enabled)
+    is_silent = silent_channels(heard.sounds)
+    used = ~is_silent & ~unclear_channels(heard.sounds) & ~np.isin(enabled, list(heard.copies))
+    if used.sum() < _MIN_MICROPHONES:
+        raise DataError(
+            f"{int(used.sum())} of {len(enabled)} channels contain the same sound, but a calibration needs "
+            f"{_MIN_MICROPHONES}; {how_to_record(target)}"
+        )
+    every = Microphones(enabled, heard.former.positions_m[enabled], heard.former.delay_s[enabled])
+    every, source_m, order = ordered(heard, every, used, target)
+    if expected.position_m:
+        require_directions(source_m, target)
+    kept = every.part(used)
+    speed_m_s = np.array([sound.speed_m_s for sound in heard.sounds.values()])
+    time_s = np.stack([sound.arrival.time_s for sound in heard.sounds.values()])[:, used] - kept.delay_s
+    found = find_swaps(time_s, kept.positions_m, source_m, speed_m_s, target)
+    kept = replace(kept, positions_m=kept.positions_m[found.place])
+    swaps = tuple(tuple(kept.channels[list(cycle)].tolist()) for cycle in found.cycles())
+    silent = tuple(enabled[is_silent].tolist())
+    return _fitted(heard, every, kept, used, source_m, target, expected, swaps, order, silent)
+
+
+def _fitted(
+    heard: Heard,
+    every: Microphones,
+    kept: Microphones,
+    used: NDArray[np.bool_],
+    source_m: NDArray[np.float64],
+    target: Target,
+    expected: Tolerances,
+    swaps: tuple[tuple[int, ...], ...],
+    order: str,
+    silent: tuple[int, ...],
+) -> Calibration:
+    """Return the calibration, with the order of the channels known."""
+    seen, inverted = _observed(heard, used, source_m, kept, target, expected)
+    speed_m_s = np.array([sound.speed_m_s for sound in heard.sounds.values()])
+    fit = fit_array(seen, kept.delay_s, kept.positions_m, source_m, speed_m_s, target, expected)
+    bad = _bad_records(fit.residual_s)
+    if bad.any():
+        _reject(heard, bad, fit.residual_s)
+        require_sounds(heard, target)
+        seen, speed_m_s = _rows(seen, ~bad), speed_m_s[~bad]
+        fit = fit_array(seen, kept.delay_s, kept.positions_m, source_m[~bad], speed_m_s, target, expected)
+    return _assembled(heard, every, kept, seen, fit, speed_m_s, target, expected, swaps, order, silent, inverted)
+
+
+def _observed(
+    heard: Heard,
+    used: NDArray[np.bool_],
+    source_m: NDArray[np.float64],
+    kept: Microphones,
+    target: Target,
+    expected: Tolerances,
+) -> tuple[Observations, NDArray[np.bool_]]:
+    """Measure all sounds again, with gates around their times; also return which microphones are inverted."""
+    rows, evidence = [], []
+    for sound, place_m in zip(heard.sounds.values(), source_m, strict=True):
+        expected_s = travel_times(place_m[None], kept.positions_m, sound.speed_m_s, target).time_s[0] + kept.delay_s
+        own_s = sound.arrival.time_s[used]
+        near_s = _NEAR * (expected.delay_s + expected.position_m / sound.speed_m_s)
+        is_near = np.abs(own_s - expected_s) < near_s
+        at_s, of_pulse = sound.arrival.time_s.copy(), used.copy()
+        # Where another echo is stronger, the sound in question is weaker, but it is there.
+        at_s[used] = np.where(is_near, own_s, expected_s)
+        of_pulse[used] = is_near
+        again = sound.measure(at_s, of_pulse)
+        evidence.append(again.evidence[used])
+        valid = (again.coherence[used] >= MIN_COHERENCE) & (np.abs(again.time_s[used] - expected_s) < near_s)
+        rows.append(
+            (
+                again.time_s[used],
+                np.where(valid, again.time_sd_s[used], np.inf),
+                again.level[used],
+                np.where(valid, again.level_sd[used], np.inf),
+            )
+        )
+    inverted = _inverted(np.array(evidence), np.sign(heard.former.gain[kept.channels]))
+    return Observations(*(np.array(column) for column in zip(*rows, strict=True))), inverted
+
+
+def _rows(seen: Observations, chosen: NDArray[np.bool_]) -> Observations:
+    return Observations(seen.time_s[chosen], seen.time_sd_s[chosen], seen.level[chosen], seen.level_sd[chosen])
+
+
+def _bad_records(residual_s: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return True for recordings that fit much worse than the others: (record,) bool."""
+    typical_s = np.nan_to_num(np.nanmedian(np.abs(residual_s), axis=1), nan=np.inf)
+    return np.asarray(typical_s > np.maximum(_MIN_BAD_S, _BAD_RECORD * np.median(typical_s)))
+
+
+def _reject(heard: Heard, bad: NDArray[np.bool_], residual_s: NDArray[np.float64]) -> None:
+    numbers = list(heard.sounds)
+    for index in np.flatnonzero(bad).tolist():
+        rms_us = 1e6 * float(np.sqrt(np.nanmean(residual_s[index] ** 2)))
+        heard.rejected[numbers[index]] = f"it does not agree with the others: residuals of {rms_us:.1f} µs"
+        del heard.sounds[numbers[index]]
+
+
+def _assembled(
+    heard: Heard,
+    every: Microphones,
+    kept: Microphones,
+    seen: Observations,
+    fit: ArrayFit,
+    speed_m_s: NDArray[np.float64],
+    target: Target,
+    expected: Tolerances,
+    swaps: tuple[tuple[int, ...], ...],
+    order: str,
+    silent: tuple[int, ...],
+    inverted: NDArray[np.bool_],
+) -> Calibration:
+    """Return the result: the new layout, changes, residuals and findings."""
+    former, n_mics = heard.former, len(kept.channels)
+    settings = next(iter(heard.sounds.values())).settings
+    centre_hz = (settings.call.low_frequency_hz + settings.call.high_frequency_hz) / 2
+    absorption = float(absorption_db_m(settings.air, np.array([centre_hz]))[0]) / _NEPER_DB
+    former_gain = former.gain[kept.channels]
+    change_np, gain_covariance, level_rest = fit_gains(
+        seen, np.log(np.abs(former_gain)), fit.distance_m, absorption, expected
+    )
+    change_db = _NEPER_DB * change_np
+    covariance = np.zeros((n_mics, 5, n_mics, 5))
+    covariance[:, 0, :, 0] = _NEPER_DB**2 * gain_covariance
+    covariance[:, 1:, :, 1:] = fit.covariance.reshape(n_mics, 4, n_mics, 4)
+    levels = _NEPER_DB * level_rest
+    residuals = Residuals(
+        before_time_s=_before(heard, kept, seen, fit, speed_m_s, target),
+        after_time_s=fit.residual_s,
+        before_level_db=levels + change_db - np.mean(change_db),
+        after_level_db=levels,
+    )
+    enabled = former.enabled.copy()
+    enabled[[*silent, *heard.copies]] = False
+    gain, delay_s, positions_m = former.gain.copy(), former.delay_s.copy(), former.positions_m.copy()
+    positions_m[every.channels] = every.positions_m
+    gain[kept.channels] = former_gain * np.exp(change_np) * np.where(inverted, -1.0, 1.0)
+    delay_s[kept.channels] = fit.delay_s
+    positions_m[kept.channels] = fit.positions_m
+    layout = replace(former, enabled=enabled, gain=gain, delay_s=delay_s, positions_m=positions_m)
+    sounds = list(heard.sounds.values())
+    unclear = tuple(np.setdiff1d(np.flatnonzero(enabled), kept.channels).tolist())
+    made = Calibration(
+        layout=layout,
+        former=former,
+        channels=tuple(kept.channels.tolist()),
+        gain_db=change_db,
+        delay_s=fit.delay_s - kept.delay_s,
+        moved_m=fit.positions_m - kept.positions_m,
+        covariance=covariance,
+        expected_sd=np.array([expected.gain_db, 1e6 * expected.delay_s, *(3 * [1e3 * expected.position_m])]),
+        residuals=residuals,
+        source_m=fit.source_m,
+        swaps=swaps,
+        inverted=tuple(kept.channels[inverted].tolist()),
+        silent=silent,
+        unclear=unclear,
+        duplicates=heard.copies,
+        order=order,
+        not_observable=(),
+        contrast_db=tuple(image_contrast_db(sounds, every.channels, each) for each in (former, layout)),
+        rejected=dict(sorted(heard.rejected.items())),
+    )
+    positions = expected.position_m > 0
+    return replace(made, not_observable=not_observable(made.is_observed, target, positions=positions))
+
+
+def _inverted(evidence: NDArray[np.float64], sign: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return True for microphones whose polarity certainly differs from that of most microphones: (mic,) bool."""
+    relative = evidence * sign
+    relative = relative * np.where(np.median(relative, axis=1, keepdims=True) < 0, -1, 1)
+    is_negative = np.mean(relative < 0, axis=0) > _INVERTED_SHARE
+    return np.asarray(is_negative & (relative.sum(axis=0) < -_MIN_EVIDENCE))
+
+
+def _before(
+    heard: Heard,
+    kept: Microphones,
+    seen: Observations,
+    fit: ArrayFit,
+    speed_m_s: NDArray[np.float64],
+    target: Target,
+) -> NDArray[np.float64]:
+    """Return the residuals of the layout in use, with sources that fit it best: (record, mic) float64."""
+    positions_m = heard.former.positions_m[kept.channels]
+    rest_s = np.full_like(seen.time_s, np.nan)
+    for record, start_m in enumerate(fit.source_m):
+        valid = np.isfinite(seen.time_sd_s[record])
+        time_s = (seen.time_s[record] - kept.delay_s)[valid]
+        speed = float(speed_m_s[record])
+        source_m = locate_source(time_s, positions_m[valid], start_m, speed, target, scale_s=_SCALE_S)
+        rest_s[record, valid] = time_s - travel_times(source_m[None], positions_m[valid], speed, target).time_s[0]
+    return rest_s
