@@ -7,6 +7,7 @@ from ertis_bench import timing
 from ertis_bench.accuracy import PAPER, TURN
 from ertis_bench.beamformers import form as beamformers
 from ertis_bench.budgets import form as budgets
+from ertis_bench.calibration import form as calibration
 from ertis_bench.campaign_scaling import many
 from ertis_bench.delay_interpolation import form as interpolation
 from ertis_bench.gpu_tables import gpu, gpu_short
@@ -26,6 +27,7 @@ __all__ = [
     "FORMS",
     "accuracy",
     "accuracy_front",
+    "calibration",
     "factorisation",
     "gpu",
     "gpu_short",
@@ -301,5 +303,6 @@ FORMS: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
     "verification": {"verification": verification},
     "budgets": {"budgets": budgets},
     "points": {"points": points},
+    "calibration": {"calibration": calibration},
 }
 """Forms of the table of each command, by the name in the markers. The markers of a file select the form."""

@@ -235,6 +235,24 @@ def points(**given: Any) -> None:
 
 
 @bench.command()
+@click.option(
+    "--count", type=click.IntRange(min=1), default=30, show_default=True, metavar="N", help="Arrays with faults."
+)
+@click.option(
+    "--healthy", type=click.IntRange(min=0), default=200, show_default=True, metavar="N", help="Arrays without faults."
+)
+@_seed("Seed of the first array.")
+@_update
+@options.quiet
+@options.as_json
+def calibration(**given: Any) -> None:
+    """Calibrate arrays with random errors and faults, and count what is found."""
+    from ertis_bench import calibration as benchmark
+
+    _run("calibration", benchmark, **given)
+
+
+@bench.command()
 @_count(30)
 @_update
 @options.quiet

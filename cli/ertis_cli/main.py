@@ -16,6 +16,7 @@ __all__ = ["COMMANDS", "cli", "main"]
 
 COMMANDS = {
     "bench": ("ertis_cli.bench:bench", "Run benchmarks of speed and accuracy."),
+    "calibrate": ("ertis_cli.calibrate:calibrate", "Calibrate the microphones of an array from recordings."),
     "capture": ("ertis_cli.capture:capture", "Record measurements, or send them to a central node."),
     "command": ("ertis_cli.command:command", "Send commands to a sensor and print its answers."),
     "compare": ("ertis_cli.compare:compare", "Compare an energyscape file with the scene's ground truth."),

@@ -2,5 +2,6 @@
 
 from ertis_numba.calibration.array_calibration import calibrate
 from ertis_numba.calibration.result import Calibration, Residuals
+from ertis_numba.calibration.wavefronts import Target
 
-__all__ = ["Calibration", "Residuals", "calibrate"]
+__all__ = ["Calibration", "Residuals", "Target", "calibrate"]

@@ -118,12 +118,16 @@ class Calibration:
     rejected: dict[int, str]
 
     @property
+    def changes(self) -> NDArray[np.float64]:
+        """Changes of gain in dB, delay in µs, and x, y and z in mm: (mic, quantity) float64."""
+        return np.column_stack([self.gain_db, 1e6 * self.delay_s, 1e3 * self.moved_m])
+
+    @property
     def sd(self) -> NDArray[np.float64]:
         """Standard deviations of gain in dB, delay in µs, and x, y and z in mm: (mic, quantity) float64."""
-        n_mics = len(self.channels)
-        return np.asarray(
-            np.sqrt(np.diag(self.covariance.reshape(5 * n_mics, 5 * n_mics)).reshape(n_mics, 5).clip(min=0))
-        )
+        size = 5 * len(self.channels)
+        variance = np.diag(self.covariance.reshape(size, size)).clip(min=0)
+        return np.asarray(np.sqrt(variance).reshape(-1, 5))
 
     @property
     def gain_sd_db(self) -> NDArray[np.float64]:

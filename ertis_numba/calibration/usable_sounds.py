@@ -33,6 +33,7 @@ class Microphones:
     delay_s: NDArray[np.float64]
 
     def part(self, chosen: NDArray[np.bool_]) -> "Microphones":
+        """Return some of the microphones."""
         return Microphones(self.channels[chosen], self.positions_m[chosen], self.delay_s[chosen])
 
 
@@ -90,6 +91,7 @@ def _measurements(recordings: Iterable[Any]) -> Iterable[Measurement]:
 
 
 def require_sounds(heard: Heard, target: Target) -> None:
+    """Raise a `DataError` with advice if no recording is left."""
     if not heard.sounds:
         number, reason = next(iter(heard.rejected.items()))
         others = f", and {len(heard.rejected) - 1} more" if len(heard.rejected) > 1 else ""

@@ -10,6 +10,7 @@ from ertis_numba.geometry.delays import far_field_delays, spherical_delays, unit
 from ertis_numba.geometry.grids import MAX_DIRECTIONS, PAPER_GRIDS, Grid, direction_grid, grid_count
 from ertis_numba.geometry.layouts import (
     Layout,
+    layout_file,
     layout_names,
     layout_text,
     load_layout,
@@ -40,6 +41,7 @@ __all__ = [
     "far_field_delays",
     "grid_count",
     "is_closed",
+    "layout_file",
     "layout_names",
     "layout_text",
     "load_layout",

@@ -20,6 +20,7 @@ from ertis_numba.settings import Array, Settings
 __all__ = [
     "Layout",
     "LayoutFile",
+    "layout_file",
     "layout_names",
     "layout_text",
     "load_layout",
@@ -148,6 +149,34 @@ def layout_text(name: str) -> str:
     """
     checks.choice("layout", name, layout_names())
     return resources.files("ertis_numba").joinpath("layouts", f"{name}.toml").read_text("utf-8")
+
+
+def layout_file(layout: Layout, *, name: str, source: str = "") -> LayoutFile:
+    """Return the content of a layout file with the microphones of a layout, to 0.1 µm, 1 ps and six digits of gain.
+
+    Parameters
+    ----------
+    layout : Layout
+    name : str
+        Name of the layout.
+    source : str
+        Origin of the numbers; empty by default.
+
+    Examples
+    --------
+    >>> from ertis_numba.geometry import layout_file, load_layout
+    >>> text = layout_file(load_layout("eRTIS_v2"), name="mine").to_toml()
+    >>> text.splitlines()[-1]
+    """
+    return LayoutFile(
+        name=name,
+        source=source,
+        word_bits=layout.word_bits,
+        positions_mm=np.round(1e3 * layout.positions_m, 4).tolist(),
+        disabled=tuple(np.flatnonzero(~layout.enabled).tolist()),
+        gain=tuple(np.round(layout.gain, 6).tolist()),
+        delay_s=tuple(np.round(layout.delay_s, 12).tolist()),
+    )
 
 
 def load_layout(name: str | Path) -> Layout:
