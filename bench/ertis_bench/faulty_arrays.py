@@ -1,5 +1,6 @@
 """Arrays with random errors, their recordings of one reflector, and errors of their calibration."""
 
+import gc
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -106,6 +107,7 @@ def record(array: FaultyArray, seed: int, count: int, *, noise_dbfs: float = -50
         electronics=Electronics(noise_dbfs=noise_dbfs, dead_channels=array.dead),
     )
     made = []
+    gc.collect()  # The renderers of former arrays refer to themselves, and hold 40 MB each.
     for number in range(count):
         reflector = Point(
             azimuth_deg=float(rng.uniform(-_AZIMUTH_DEG, _AZIMUTH_DEG)),

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
     from matplotlib.figure import Figure
 
+    from ertis_numba.calibration import Calibration
     from ertis_numba.frames import Energyscape, Measurement, Peak
     from ertis_numba.settings import Settings
 
@@ -27,11 +28,12 @@ _KINDS = {
     "signals": "microphone signals and their spectrogram",
     "matched-filter": "output of the matched filter for each microphone",
     "array": "array layout and beam pattern",
+    "calibration": "residuals and beam pattern before and after a calibration with all measurements of a reflector",
 }
 _OF_IMAGES = ("image", "polar", "projection", "slices")
 _OF_RECORDINGS = ("signals", "matched-filter")
 _ONLY = {
-    "sensor": (*_OF_IMAGES, *_OF_RECORDINGS, "array"),
+    "sensor": (*_OF_IMAGES, *_OF_RECORDINGS, "array", "calibration"),
     "measurement": (*_OF_IMAGES, *_OF_RECORDINGS),
     "peaks": _OF_IMAGES,
     "side-lobes": ("image", "polar", "projection"),
@@ -39,7 +41,7 @@ _ONLY = {
     "left": ("slices",),
     "microphone": _OF_RECORDINGS,
     "frequency": ("array",),
-    "steer": ("array",),
+    "steer": ("array", "calibration"),
 }
 """Kinds that support each of these options."""
 
@@ -169,6 +171,11 @@ def plot(
             **look,
         )
         reported = f"array of {path}"
+    elif kind == "calibration":
+        azimuth_deg, elevation_deg = steer or (0.0, 0.0)
+        made, settings = _calibrated(path, sensor)
+        figure = figures.calibration(made, settings, azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, **look)
+        reported = f"calibration with {path}"
     else:
         index = measurement or 0
         if kind in _OF_RECORDINGS:
@@ -187,6 +194,14 @@ def plot(
     options.say(f"{target}: {reported}", quiet=quiet)
     if as_json:
         options.print_json(report)
+
+
+def _calibrated(path: Path, sensor: str | None) -> "tuple[Calibration, Settings]":
+    from ertis_numba.calibration import calibrate
+    from ertis_numba.storage import open_recording
+
+    with open_recording(path, sensor=sensor) as recording:
+        return calibrate(recording), recording.settings
 
 
 def _drawn(kind: str, image: "Energyscape", peaks: "list[Peak] | None", look: dict[str, Any]) -> "Figure":

@@ -14,8 +14,9 @@ from matplotlib.figure import Figure
 
 from ertis_numba import checks
 from ertis_numba.analysis.side_lobes import without_side_lobes
+from ertis_numba.calibration import Calibration
 from ertis_numba.errors import ArgumentError
-from ertis_numba.figures import _array, _captions, _images, _pareto_front, _signals, _slices
+from ertis_numba.figures import _array, _calibration, _captions, _images, _pareto_front, _signals, _slices
 from ertis_numba.figures._canvas import Canvas
 from ertis_numba.figures._page import compose
 from ertis_numba.figures._pareto_front import Rated
@@ -27,6 +28,7 @@ __all__ = [
     "Rated",
     "StyleOptions",
     "array",
+    "calibration",
     "front",
     "matched_filter",
     "plot",
@@ -278,6 +280,46 @@ def array(
         Canvas(style_of(**look), dynamic_range_db),
         settings,
         frequencies_hz=frequencies_hz,
+        azimuth_deg=checks.between("azimuth_deg", azimuth_deg, -90.0, 90.0),
+        elevation_deg=checks.between("elevation_deg", elevation_deg, -90.0, 90.0),
+    )
+
+
+def calibration(
+    made: Calibration,
+    settings: Settings,
+    *,
+    azimuth_deg: float = 0.0,
+    elevation_deg: float = 0.0,
+    dynamic_range_db: float = 40.0,
+    **look: Unpack[StyleOptions],
+) -> Figure:
+    """Draw the residuals of a calibration, and the beam pattern along azimuth, before and after.
+
+    Patterns show plane waves that the calibrated array receives, with beams of the former and of the new layout.
+
+    Parameters
+    ----------
+    made : Calibration
+    settings : Settings
+        Settings of the recordings, for the call and the air.
+    azimuth_deg, elevation_deg : float
+        Steering direction in degrees, -90 to 90.
+    dynamic_range_db, **look
+        As for `plot`.
+
+    Raises
+    ------
+    ArgumentError
+        An argument is invalid.
+    """
+    checks.positive("dynamic_range_db", dynamic_range_db)
+    checks.instance("made", made, Calibration, "calibrate returns")
+    checks.instance("settings", settings, Settings, "a measurement holds")
+    return _calibration.draw(
+        Canvas(style_of(**look), dynamic_range_db),
+        made,
+        settings,
         azimuth_deg=checks.between("azimuth_deg", azimuth_deg, -90.0, 90.0),
         elevation_deg=checks.between("elevation_deg", elevation_deg, -90.0, 90.0),
     )
