@@ -1,6 +1,6 @@
 """``ertis calibrate``: calibration of an array."""
 
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +22,21 @@ _COLUMNS: dict[str, _tables.Side] = dict.fromkeys(
 _DIGITS = (3, 3, 4, 4, 4)  # of gain in dB, delay in µs, and x, y and z in mm
 _INTERVAL = 1.96  # half of a 95 % interval in standard deviations
 _MAX_LOSS_DB = 0.02  # of contrast, which rounding may cause
+
+
+class _Place(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4 only
+    name = "AZ:EL:M"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[float, float, float]:
+        with suppress(ValueError):
+            azimuth, elevation, range_m = (float(part) for part in str(value).split(":"))
+            return azimuth, elevation, range_m
+        return self.fail(f"{value!r} is not a place; give azimuth, elevation and range, as in 30:15:1.2", param, ctx)
+
+
+_PLACE = _Place()
 
 
 @click.command()
@@ -70,6 +85,13 @@ _MAX_LOSS_DB = 0.02  # of contrast, which rounding may cause
     metavar="MM",
     help="Standard deviation of positions along each axis, in mm; 0 keeps the positions of the layout.",
 )
+@click.option(
+    "--first-place",
+    type=_PLACE,
+    metavar="AZ:EL:M",
+    help="Place of the reflector in the first recording: azimuth and elevation in °, range in m. It reveals a mirrored "
+    "layout and gives the speed of sound.",
+)
 @options.force
 @options.quiet
 @options.as_json
@@ -83,6 +105,7 @@ def calibrate(
     gain_db: float,
     delay_us: float,
     position_mm: float,
+    first_place: tuple[float, float, float] | None,
     force: bool,
     quiet: bool,
     as_json: bool,
@@ -119,6 +142,7 @@ def calibrate(
             gain_tolerance_db=gain_db,
             delay_tolerance_s=1e-6 * delay_us,
             position_tolerance_m=1e-3 * position_mm,
+            first_place=first_place,
         )
     before_db, after_db = made.contrast_db
     is_better = after_db > before_db - _MAX_LOSS_DB
@@ -184,6 +208,7 @@ def _report(made: "Calibration", places: list[str], written: Path | None) -> dic
                 ("after_db", residuals.after_db),
             )
         },
+        "sound_speed_m_s": None if made.sound_speed is None else [round(value, 3) for value in made.sound_speed],
         "contrast_db": [round(value, 3) for value in made.contrast_db],
         "sources_m": [[round(float(value), 5) for value in row] for row in made.source_m],
         "not_observable": list(made.not_observable),
@@ -207,6 +232,9 @@ def _print(made: "Calibration", places: list[str], *, quiet: bool) -> None:
         f"{residuals.before_db:.3f} dB before, {1e6 * residuals.after_s:.3f} µs and {residuals.after_db:.3f} dB after"
     )
     click.echo(f"contrast of images: {before_db:.2f} dB before, {after_db:.2f} dB after")
+    if made.sound_speed is not None:
+        speed_m_s, sd_m_s = made.sound_speed
+        click.echo(f"speed of sound: {speed_m_s:.1f} ± {_INTERVAL * sd_m_s:.1f} m/s")
     for line in made.not_observable:
         options.say(f"not observable: {line}", quiet=quiet)
     for number, reason in made.rejected.items():

@@ -70,7 +70,7 @@ def not_observable(observed: NDArray[np.bool_], target: Target, *, positions: bo
     """
     lines = [
         "a common gain, delay or polarity of all microphones: their means are unchanged",
-        "a rotation, shift or mirror image of the whole array: compare the image of a reflector at a known place",
+        "a rotation or shift of the whole array, or a mirrored layout if the place of no reflector is given",
     ]
     if not positions:
         why = "sound from one place cannot" if target == "direct" else "the tolerance is 0, so the recordings do not"

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -15,6 +15,13 @@ from ertis_numba.calibration.advice import how_to_record, not_observable, requir
 from ertis_numba.calibration.array_fit import ArrayFit, Observations, Tolerances, fit_array, fit_gains
 from ertis_numba.calibration.channel_order import find_swaps
 from ertis_numba.calibration.contrast import image_contrast_db
+from ertis_numba.calibration.reference_place import (
+    Place,
+    flipped,
+    mirror_of,
+    speed_from_distance,
+    speed_from_spread,
+)
 from ertis_numba.calibration.result import Calibration, Residuals
 from ertis_numba.calibration.usable_sounds import (
     MIN_COHERENCE,
@@ -43,6 +50,26 @@ _BAD_RECORD: Final = 6.0  # Residual of a bad recording relative to that of the 
 _MIN_BAD_S: Final = 1e-6
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Prepared:
+    """Sounds and microphones of a calibration, with the order of the channels known."""
+
+    heard: Heard
+    every: Microphones
+    used: NDArray[np.bool_]
+    kept: Microphones
+    source_m: NDArray[np.float64]
+    target: Target
+    expected: Tolerances
+    order: str
+    swaps: tuple[tuple[int, ...], ...]
+    silent: tuple[int, ...]
+
+    def speed_m_s(self) -> NDArray[np.float64]:
+        """Return the speed of sound of each recording: (record,) float64."""
+        return np.array([sound.speed_m_s for sound in self.heard.sounds.values()])
+
+
 def calibrate(
     recordings: Iterable[Measurement] | Iterable[Iterable[Measurement]],
     layout: Layout | str | Path | None = None,
@@ -51,6 +78,7 @@ def calibrate(
     gain_tolerance_db: float = 3.0,
     delay_tolerance_s: float = 5e-6,
     position_tolerance_m: float = 1e-3,
+    first_place: tuple[float, float, float] | None = None,
     on_progress: Callable[[int], None] | None = None,
 ) -> Calibration:
     """Estimate gain, delay, polarity and position of each microphone from recordings.
@@ -71,6 +99,9 @@ def calibrate(
         Standard deviations of gains and delays that are expected before the calibration.
     position_tolerance_m : float
         The same of positions along each axis. 0 keeps the positions of the layout. Direct sound always keeps them.
+    first_place : (azimuth_deg, elevation_deg, range_m), optional
+        Place of the reflector in the first recording. The direction, which may be rough, reveals a mirrored layout, and
+        the range gives the speed of sound.
     on_progress : callable, optional
         Function that is called with the number of measurements so far.
 
@@ -116,49 +147,41 @@ def calibrate(
     speed_m_s = np.array([sound.speed_m_s for sound in heard.sounds.values()])
     time_s = np.stack([sound.arrival.time_s for sound in heard.sounds.values()])[:, used] - kept.delay_s
     found = find_swaps(time_s, kept.positions_m, source_m, speed_m_s, target)
-    kept = replace(kept, positions_m=kept.positions_m[found.place])
-    swaps = tuple(tuple(kept.channels[list(cycle)].tolist()) for cycle in found.cycles())
-    silent = tuple(enabled[is_silent].tolist())
-    return _fitted(heard, every, kept, used, source_m, target, expected, swaps, order, silent)
+    prepared = _Prepared(
+        heard=heard,
+        every=every,
+        used=used,
+        kept=replace(kept, positions_m=kept.positions_m[found.place]),
+        source_m=source_m,
+        target=target,
+        expected=expected,
+        order=order,
+        swaps=tuple(tuple(kept.channels[list(cycle)].tolist()) for cycle in found.cycles()),
+        silent=tuple(enabled[is_silent].tolist()),
+    )
+    return _with_place(_fitted(prepared), prepared, None if first_place is None else Place(*first_place).checked())
 
 
-def _fitted(
-    heard: Heard,
-    every: Microphones,
-    kept: Microphones,
-    used: NDArray[np.bool_],
-    source_m: NDArray[np.float64],
-    target: Target,
-    expected: Tolerances,
-    swaps: tuple[tuple[int, ...], ...],
-    order: str,
-    silent: tuple[int, ...],
-) -> Calibration:
-    """Return the calibration, with the order of the channels known."""
-    seen, inverted = _observed(heard, used, source_m, kept, target, expected)
-    speed_m_s = np.array([sound.speed_m_s for sound in heard.sounds.values()])
-    fit = fit_array(seen, kept.delay_s, kept.positions_m, source_m, speed_m_s, target, expected)
+def _fitted(job: _Prepared) -> Calibration:
+    """Return the calibration, after leaving out recordings that do not agree with the others."""
+    seen, inverted = _observed(job)
+    kept, source_m, speed_m_s = job.kept, job.source_m, job.speed_m_s()
+    fit = fit_array(seen, kept.delay_s, kept.positions_m, source_m, speed_m_s, job.target, job.expected)
     bad = _bad_records(fit.residual_s)
     if bad.any():
-        _reject(heard, bad, fit.residual_s)
-        require_sounds(heard, target)
-        seen, speed_m_s = _rows(seen, ~bad), speed_m_s[~bad]
-        fit = fit_array(seen, kept.delay_s, kept.positions_m, source_m[~bad], speed_m_s, target, expected)
-    return _assembled(heard, every, kept, seen, fit, speed_m_s, target, expected, swaps, order, silent, inverted)
+        _reject(job.heard, bad, fit.residual_s)
+        require_sounds(job.heard, job.target)
+        seen = _rows(seen, ~bad)
+        fit = fit_array(seen, kept.delay_s, kept.positions_m, source_m[~bad], job.speed_m_s(), job.target, job.expected)
+    return _assembled(job, seen, fit, inverted)
 
 
-def _observed(
-    heard: Heard,
-    used: NDArray[np.bool_],
-    source_m: NDArray[np.float64],
-    kept: Microphones,
-    target: Target,
-    expected: Tolerances,
-) -> tuple[Observations, NDArray[np.bool_]]:
+def _observed(job: _Prepared) -> tuple[Observations, NDArray[np.bool_]]:
     """Measure all sounds again, with gates around their times; also return which microphones are inverted."""
+    heard, used, kept, expected = job.heard, job.used, job.kept, job.expected
     rows, evidence = [], []
-    for sound, place_m in zip(heard.sounds.values(), source_m, strict=True):
-        expected_s = travel_times(place_m[None], kept.positions_m, sound.speed_m_s, target).time_s[0] + kept.delay_s
+    for sound, place_m in zip(heard.sounds.values(), job.source_m, strict=True):
+        expected_s = travel_times(place_m[None], kept.positions_m, sound.speed_m_s, job.target).time_s[0] + kept.delay_s
         own_s = sound.arrival.time_s[used]
         near_s = _NEAR * (expected.delay_s + expected.position_m / sound.speed_m_s)
         is_near = np.abs(own_s - expected_s) < near_s
@@ -199,21 +222,9 @@ def _reject(heard: Heard, bad: NDArray[np.bool_], residual_s: NDArray[np.float64
         del heard.sounds[numbers[index]]
 
 
-def _assembled(
-    heard: Heard,
-    every: Microphones,
-    kept: Microphones,
-    seen: Observations,
-    fit: ArrayFit,
-    speed_m_s: NDArray[np.float64],
-    target: Target,
-    expected: Tolerances,
-    swaps: tuple[tuple[int, ...], ...],
-    order: str,
-    silent: tuple[int, ...],
-    inverted: NDArray[np.bool_],
-) -> Calibration:
+def _assembled(job: _Prepared, seen: Observations, fit: ArrayFit, inverted: NDArray[np.bool_]) -> Calibration:
     """Return the result: the new layout, changes, residuals and findings."""
+    heard, every, kept, expected = job.heard, job.every, job.kept, job.expected
     former, n_mics = heard.former, len(kept.channels)
     settings = next(iter(heard.sounds.values())).settings
     centre_hz = (settings.call.low_frequency_hz + settings.call.high_frequency_hz) / 2
@@ -228,13 +239,13 @@ def _assembled(
     covariance[:, 1:, :, 1:] = fit.covariance.reshape(n_mics, 4, n_mics, 4)
     levels = _NEPER_DB * level_rest
     residuals = Residuals(
-        before_time_s=_before(heard, kept, seen, fit, speed_m_s, target),
+        before_time_s=_before(job, seen, fit),
         after_time_s=fit.residual_s,
         before_level_db=levels + change_db - np.mean(change_db),
         after_level_db=levels,
     )
     enabled = former.enabled.copy()
-    enabled[[*silent, *heard.copies]] = False
+    enabled[[*job.silent, *heard.copies]] = False
     gain, delay_s, positions_m = former.gain.copy(), former.delay_s.copy(), former.positions_m.copy()
     positions_m[every.channels] = every.positions_m
     gain[kept.channels] = former_gain * np.exp(change_np) * np.where(inverted, -1.0, 1.0)
@@ -254,18 +265,20 @@ def _assembled(
         expected_sd=np.array([expected.gain_db, 1e6 * expected.delay_s, *(3 * [1e3 * expected.position_m])]),
         residuals=residuals,
         source_m=fit.source_m,
-        swaps=swaps,
+        swaps=job.swaps,
         inverted=tuple(kept.channels[inverted].tolist()),
-        silent=silent,
+        silent=job.silent,
         unclear=unclear,
         duplicates=heard.copies,
-        order=order,
+        order=job.order,
+        mirrored="",
+        sound_speed=None,
         not_observable=(),
         contrast_db=tuple(image_contrast_db(sounds, every.channels, each) for each in (former, layout)),
         rejected=dict(sorted(heard.rejected.items())),
     )
     positions = expected.position_m > 0
-    return replace(made, not_observable=not_observable(made.is_observed, target, positions=positions))
+    return replace(made, not_observable=not_observable(made.is_observed, job.target, positions=positions))
 
 
 def _inverted(evidence: NDArray[np.float64], sign: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -276,15 +289,9 @@ def _inverted(evidence: NDArray[np.float64], sign: NDArray[np.float64]) -> NDArr
     return np.asarray(is_negative & (relative.sum(axis=0) < -_MIN_EVIDENCE))
 
 
-def _before(
-    heard: Heard,
-    kept: Microphones,
-    seen: Observations,
-    fit: ArrayFit,
-    speed_m_s: NDArray[np.float64],
-    target: Target,
-) -> NDArray[np.float64]:
+def _before(job: _Prepared, seen: Observations, fit: ArrayFit) -> NDArray[np.float64]:
     """Return the residuals of the layout in use, with sources that fit it best: (record, mic) float64."""
+    heard, kept, target, speed_m_s = job.heard, job.kept, job.target, job.speed_m_s()
     positions_m = heard.former.positions_m[kept.channels]
     rest_s = np.full_like(seen.time_s, np.nan)
     for record, start_m in enumerate(fit.source_m):
@@ -294,3 +301,36 @@ def _before(
         source_m = locate_source(time_s, positions_m[valid], start_m, speed, target, scale_s=_SCALE_S)
         rest_s[record, valid] = time_s - travel_times(source_m[None], positions_m[valid], speed, target).time_s[0]
     return rest_s
+
+
+def _with_place(made: Calibration, job: _Prepared, place: Place | None) -> Calibration:
+    """Return the calibration with what the place of the first reflector, or direct sound, says in addition."""
+    first = next(iter(job.heard.sounds))
+    speed_m_s = job.heard.sounds[first].speed_m_s
+    if job.target == "direct":
+        sound = job.heard.sounds[first]
+        sd_s = np.hypot(sound.arrival.time_sd_s, job.expected.delay_s)[job.used]
+        time_s = sound.arrival.time_s[job.used] - job.kept.delay_s
+        speed = speed_from_spread(time_s, sd_s, job.kept.positions_m, made.source_m[0], speed_m_s, job.target)
+        return replace(made, sound_speed=speed)
+    if place is None:
+        return made
+    if first != 0:
+        raise DataError(
+            f"the first recording, whose place is given, cannot be used: {job.heard.rejected[0]}; make it again, or "
+            "give the place of another one and name that recording first"
+        )
+    name = mirror_of(made.source_m[0], place)
+    speed = speed_from_distance(made.source_m[0], place, speed_m_s)
+    if not name:
+        return replace(made, sound_speed=speed)
+    flip = flipped(name)
+    layout = replace(made.layout, positions_m=made.layout.positions_m * flip)
+    return replace(
+        made,
+        layout=layout,
+        moved_m=made.moved_m * flip,
+        source_m=made.source_m * flip,
+        mirrored=name,
+        sound_speed=speed,
+    )

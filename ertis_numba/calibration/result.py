@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.calibration.reference_place import SoundSpeed
 from ertis_numba.geometry import Layout
 
 __all__ = ["Calibration", "Residuals"]
@@ -89,6 +90,10 @@ class Calibration:
         Channels with the samples of another channel, and that channel.
     order : str
         Name of the order in which the channels are; empty if it is that of the layout.
+    mirrored : str
+        How the layout is mirrored; empty if it is not, or if no place of a reflector is known.
+    sound_speed : SoundSpeed, optional
+        Measured speed of sound, from the distance of a reflector or from direct sound.
     not_observable : tuple of str
         Quantities that these recordings cannot determine, with what to do about it.
     contrast_db : tuple of float
@@ -113,6 +118,8 @@ class Calibration:
     unclear: tuple[int, ...]
     duplicates: dict[int, int]
     order: str
+    mirrored: str
+    sound_speed: SoundSpeed | None
     not_observable: tuple[str, ...]
     contrast_db: tuple[float, ...]
     rejected: dict[int, str]
@@ -153,6 +160,7 @@ class Calibration:
     def findings(self) -> tuple[str, ...]:
         """Faults of the array, one line each."""
         lines = [f"channels are in {self.order}"] if self.order else []
+        lines += [f"the layout is {self.mirrored}"] if self.mirrored else []
         for cycle in self.swaps:
             if len(cycle) == 2:
                 lines.append(f"channels {cycle[0]} and {cycle[1]} are swapped")

@@ -1,0 +1,163 @@
+"""Use of a reflector at a known place: mirrored layouts, and the speed of sound."""
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba import checks
+from ertis_numba.calibration.wavefronts import Target, travel_times
+from ertis_numba.errors import DataError
+from ertis_numba.geometry import unit_vectors
+
+__all__ = ["Place", "SoundSpeed", "flipped", "mirror_of", "speed_from_distance", "speed_from_spread"]
+
+_FLIPS: Final[dict[str, tuple[float, float, float]]] = {
+    "mirrored left to right": (1.0, -1.0, 1.0),
+    "mirrored upside down": (1.0, 1.0, -1.0),
+    "turned by 180° about its axis": (1.0, -1.0, -1.0),
+}
+_MAX_APART_DEG: Final = 20.0  # A place that is given roughly may differ so far from the measured one.
+_MIN_ASIDE_DEG: Final = 10.0
+_ROUNDS: Final = 20
+_DISTANCE_SD_M: Final = 2e-3  # of a tape measure
+
+
+class Place(NamedTuple):
+    """Place of a reflector, as seen from the sensor.
+
+    Attributes
+    ----------
+    azimuth_deg, elevation_deg : float
+    range_m : float
+    """
+
+    azimuth_deg: float
+    elevation_deg: float
+    range_m: float
+
+    def checked(self) -> "Place":
+        """Return the place if its numbers are possible.
+
+        Raises
+        ------
+        ArgumentError
+            An angle or the range is out of its limits.
+        """
+        checks.between("azimuth of the place", self.azimuth_deg, -90.0, 90.0)
+        checks.between("elevation of the place", self.elevation_deg, -90.0, 90.0)
+        checks.between("range of the place", self.range_m, 0.05, 100.0)
+        return self
+
+
+class SoundSpeed(NamedTuple):
+    """Measured speed of sound.
+
+    Attributes
+    ----------
+    speed_m_s, sd_m_s : float
+        Speed and its standard deviation.
+    """
+
+    speed_m_s: float
+    sd_m_s: float
+
+
+def mirror_of(source_m: NDArray[np.float64], place: Place) -> str:
+    """Return how the layout is mirrored, judged by a reflector at a known place; empty if it is not.
+
+    Parameters
+    ----------
+    source_m : (axis,) float64
+        Measured position of the reflector.
+    place : Place
+        True position, whose direction may be rough. Azimuth and elevation of 10° or more reveal mirrored axes.
+
+    Raises
+    ------
+    DataError
+        The directions differ, and no mirror image explains it.
+    """
+    known = unit_vectors(np.radians(place.azimuth_deg), np.radians(place.elevation_deg)).ravel()
+    found = source_m / np.linalg.norm(source_m)
+    # A mirror image of a direction near the plane of symmetry differs too little to judge.
+    sides = (True, abs(place.azimuth_deg) >= _MIN_ASIDE_DEG, abs(place.elevation_deg) >= _MIN_ASIDE_DEG)
+    tried = {"": (1.0, 1.0, 1.0)} | {
+        name: flip
+        for name, flip in _FLIPS.items()
+        if all(side or factor > 0 for side, factor in zip(sides, flip, strict=True))
+    }
+    apart_deg = {name: _apart_deg(found * np.array(flip), known) for name, flip in tried.items()}
+    best = min(apart_deg, key=lambda name: apart_deg[name])
+    if apart_deg[best] < _MAX_APART_DEG:
+        return best
+    azimuth_deg = math.degrees(math.atan2(found[1], found[0]))
+    raise DataError(
+        f"the reflector of the first recording appears at azimuth {azimuth_deg:.0f}°, elevation "
+        f"{math.degrees(math.asin(found[2])):.0f}°, but the given place is {place.azimuth_deg:g}°, "
+        f"{place.elevation_deg:g}°, which no mirrored layout explains; correct the place, or turn the sensor"
+    )
+
+
+def flipped(name: str) -> NDArray[np.float64]:
+    """Return the factors of x, y and z that undo a mirror image: (3,) float64."""
+    return np.array(_FLIPS[name])
+
+
+def _apart_deg(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+    return math.degrees(math.acos(float(np.clip(one @ other, -1.0, 1.0))))
+
+
+def speed_from_distance(source_m: NDArray[np.float64], place: Place, speed_m_s: float) -> SoundSpeed:
+    """Return the speed of sound from a reflector at a known distance.
+
+    A wrong speed c scales the measured range r, so that the true speed is ``c r₀ / r`` at the known distance r₀. The
+    standard deviation is that of a distance measured to 2 mm.
+
+    Parameters
+    ----------
+    source_m : (axis,) float64
+        Measured position of the reflector.
+    place : Place
+        True position.
+    speed_m_s : float
+        Speed that the measured position was computed with.
+    """
+    found = float(speed_m_s * place.range_m / np.linalg.norm(source_m))
+    return SoundSpeed(found, found * _DISTANCE_SD_M / place.range_m)
+
+
+def speed_from_spread(
+    time_s: NDArray[np.float64],
+    time_sd_s: NDArray[np.float64],
+    positions_m: NDArray[np.float64],
+    source_m: NDArray[np.float64],
+    speed_m_s: float,
+    target: Target,
+) -> SoundSpeed:
+    """Return the speed of sound from the spread of the times at which direct sound arrives.
+
+    Least squares with the emitter's position and the pace 1 / c as unknowns; the uncertainty is the Cramér-Rao bound.
+
+    Parameters
+    ----------
+    time_s, time_sd_s : (mic,) float64
+        Times of arrival, and standard deviations that include those of the delays.
+    positions_m : (mic, axis) float64
+    source_m : (axis,) float64
+        First approximation of the emitter.
+    speed_m_s : float
+        First approximation of the speed.
+    target : {"direct"}
+    """
+    unknown = np.append(source_m, 1 / speed_m_s)
+    for _ in range(_ROUNDS):
+        model = travel_times(unknown[None, :3], positions_m, 1 / unknown[3], target)
+        slopes = np.column_stack([model.by_source[0], model.time_s[0] / unknown[3]]) / time_sd_s[:, None]
+        scale = np.linalg.norm(slopes, axis=0)
+        step, *_ = np.linalg.lstsq(slopes / scale, (time_s - model.time_s[0]) / time_sd_s, rcond=None)
+        unknown = unknown + step / scale
+    inverse = np.linalg.inv((slopes / scale).T @ (slopes / scale)) / np.outer(scale, scale)
+    found = 1 / float(unknown[3])
+    return SoundSpeed(found, found**2 * math.sqrt(float(inverse[3, 3])))
