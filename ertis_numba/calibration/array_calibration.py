@@ -46,6 +46,7 @@ _NEAR: Final = 3.0  # A sound that is more expected deviations from its expected
 _SCALE_S: Final = 5e-6
 _INVERTED_SHARE: Final = 0.8  # Share of the recordings in which an inverted channel is inverted.
 _MIN_EVIDENCE: Final = 100.0  # Sum over the recordings of the logarithm of the likelihood of an inverted polarity.
+_FEW: Final = 4  # Number of recordings from which on residuals reveal errors of the model.
 _BAD_RECORD: Final = 6.0  # Residual of a bad recording relative to that of the median one.
 _MIN_BAD_S: Final = 1e-6
 
@@ -191,13 +192,15 @@ def _observed(job: _Prepared) -> tuple[Observations, NDArray[np.bool_]]:
         of_pulse[used] = is_near
         again = sound.measure(at_s, of_pulse)
         evidence.append(again.evidence[used])
+        # Many recordings reveal other sound by their residuals, but few agree with any calibration.
+        other_s, other = again.other_sound if len(heard.sounds) < _FEW else (0.0, 0.0)
         valid = (again.coherence[used] >= MIN_COHERENCE) & (np.abs(again.time_s[used] - expected_s) < near_s)
         rows.append(
             (
                 again.time_s[used],
-                np.where(valid, again.time_sd_s[used], np.inf),
+                np.where(valid, np.hypot(again.time_sd_s[used], other_s), np.inf),
                 again.level[used],
-                np.where(valid, again.level_sd[used], np.inf),
+                np.where(valid, np.hypot(again.level_sd[used], other), np.inf),
             )
         )
     inverted = _inverted(np.array(evidence), np.sign(heard.former.gain[kept.channels]))

@@ -43,6 +43,9 @@ class Arrival:
         Share of the power in the gate that the common pulse explains.
     power : (mic,) float64
         Power in the gate, in units that are equal for all microphones of a recording.
+    other_sound : (float, float)
+        Standard deviations of times in seconds and of relative levels because of other sound, such as other echoes.
+        Motion of the reflector causes them, too.
     evidence : (mic,) float64
         Logarithm of the likelihood of normal polarity relative to inverted polarity, at the best delays of both.
     """
@@ -53,6 +56,7 @@ class Arrival:
     level_sd: NDArray[np.float64]
     coherence: NDArray[np.float64]
     power: NDArray[np.float64]
+    other_sound: tuple[float, float]
     evidence: NDArray[np.float64]
 
 
@@ -111,14 +115,14 @@ def _estimate(bins: NDArray[np.complex128], frequency_hz: NDArray[np.float64], u
     own = float(np.sum(turn**2 * np.abs(pulse) ** 2))
     safe = np.maximum(np.abs(amplitude), 1e-300)
     time_sd_s, level_sd = np.sqrt(noise / (2 * own)) / safe, np.sqrt(noise / 2) / safe
-    more_s, more = _between_halves(aligned, amplitude, pulse, turn, used, time_sd_s, level_sd)
     return Arrival(
         time_s=delay_s,
-        time_sd_s=np.hypot(time_sd_s, more_s),
+        time_sd_s=time_sd_s,
         level=amplitude,
-        level_sd=np.hypot(level_sd, more),
+        level_sd=level_sd,
         coherence=1 - rest / np.maximum(power, 1e-300),
         power=power,
+        other_sound=_between_halves(aligned, amplitude, pulse, turn, used, time_sd_s, level_sd),
         evidence=(np.maximum(amplitude, 0.0) ** 2 - np.maximum(opposite, 0.0) ** 2) / noise,
     )
 

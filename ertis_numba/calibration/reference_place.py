@@ -4,6 +4,7 @@ import math
 from typing import Final, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from ertis_numba import checks
@@ -20,7 +21,7 @@ _FLIPS: Final[dict[str, tuple[float, float, float]]] = {
 }
 _MAX_APART_DEG: Final = 20.0  # A place that is given roughly may differ so far from the measured one.
 _MIN_ASIDE_DEG: Final = 10.0
-_ROUNDS: Final = 20
+_PACE_SD: Final = 0.05  # Relative deviation of the speed of sound between 0 and 60 °C.
 _DISTANCE_SD_M: Final = 2e-3  # of a tape measure
 
 
@@ -138,7 +139,8 @@ def speed_from_spread(
 ) -> SoundSpeed:
     """Return the speed of sound from the spread of the times at which direct sound arrives.
 
-    Least squares with the emitter's position and the pace 1 / c as unknowns; the uncertainty is the Cramér-Rao bound.
+    Least squares with the emitter's position and the pace 1 / c as unknowns, and a normal prior of 5 % for the pace.
+    The uncertainty is the Cramér-Rao bound.
 
     Parameters
     ----------
@@ -151,13 +153,18 @@ def speed_from_spread(
         First approximation of the speed.
     target : {"direct"}
     """
-    unknown = np.append(source_m, 1 / speed_m_s)
-    for _ in range(_ROUNDS):
-        model = travel_times(unknown[None, :3], positions_m, 1 / unknown[3], target)
-        slopes = np.column_stack([model.by_source[0], model.time_s[0] / unknown[3]]) / time_sd_s[:, None]
-        scale = np.linalg.norm(slopes, axis=0)
-        step, *_ = np.linalg.lstsq(slopes / scale, (time_s - model.time_s[0]) / time_sd_s, rcond=None)
-        unknown = unknown + step / scale
-    inverse = np.linalg.inv((slopes / scale).T @ (slopes / scale)) / np.outer(scale, scale)
-    found = 1 / float(unknown[3])
-    return SoundSpeed(found, found**2 * math.sqrt(float(inverse[3, 3])))
+
+    def residuals(unknown: NDArray[np.float64]) -> NDArray[np.float64]:
+        model = travel_times(unknown[None, :3], positions_m, speed_m_s / (1 + unknown[3]), target)
+        return np.append((time_s - model.time_s[0]) / time_sd_s, unknown[3] / _PACE_SD)
+
+    def jacobian(unknown: NDArray[np.float64]) -> NDArray[np.float64]:
+        model = travel_times(unknown[None, :3], positions_m, speed_m_s / (1 + unknown[3]), target)
+        slopes = np.column_stack([model.by_source[0], model.time_s[0] / (1 + unknown[3])])
+        return np.vstack([-slopes / time_sd_s[:, None], [0, 0, 0, 1 / _PACE_SD]])
+
+    found = scipy.optimize.least_squares(residuals, np.append(source_m, 0.0), jac=jacobian, x_scale="jac")
+    slopes = jacobian(found.x)
+    sd = math.sqrt(float(np.linalg.pinv(slopes.T @ slopes, hermitian=True)[3, 3]))
+    speed = speed_m_s / (1 + float(found.x[3]))
+    return SoundSpeed(speed, speed * sd)

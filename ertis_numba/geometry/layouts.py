@@ -1,6 +1,7 @@
 """Microphone layouts from settings, files and the package itself."""
 
 import functools
+import re
 from dataclasses import dataclass, replace
 from importlib import resources
 from importlib.resources.abc import Traversable
@@ -31,6 +32,7 @@ __all__ = [
 ]
 
 _SMALLEST_M = 1e-3  # minimum size of an array: metres given instead of millimetres are below it
+_SPLIT_ROW = re.compile(r"\[\s+((?:[-\d.e]+,\s+)+)\]")  # numbers of a list on lines of their own
 _CENTRED_M = 1e-12  # rounding error in the mean of centred positions
 
 
@@ -62,6 +64,10 @@ class LayoutFile(TomlDocument, frozen=True, kw_only=True):
     disabled: tuple[int, ...] = ()
     gain: tuple[float, ...] | None = None
     delay_s: tuple[float, ...] | None = None
+
+    def to_toml(self) -> str:
+        """Return TOML text with one position per line."""
+        return _SPLIT_ROW.sub(lambda found: f"[{' '.join(found.group(1).split()).rstrip(',')}]", super().to_toml())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -166,7 +172,8 @@ def layout_file(layout: Layout, *, name: str, source: str = "") -> LayoutFile:
     --------
     >>> from ertis_numba.geometry import layout_file, load_layout
     >>> text = layout_file(load_layout("eRTIS_v2"), name="mine").to_toml()
-    >>> text.splitlines()[-1]
+    >>> text.splitlines()[1]
+    '    [0.0, 22.0556, -14.2258],'
     """
     return LayoutFile(
         name=name,

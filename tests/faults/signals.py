@@ -40,6 +40,7 @@ _UNCAUGHT = re.compile(r"Traceback|Error:|Exception|Fatal|Assertion")
 
 COMMANDS: Final[dict[str, Sequence[str]]] = {
     "bench": ("scaling", "--count", "1", "--quiet"),
+    "calibrate": ("{recording}",),
     "capture": ("--port", "{port}", "-o", "{out}/captured.h5"),
     "command": ("--port", "{port}", "!Y,0,0,0"),
     "compare": ("{images}",),

@@ -1,0 +1,343 @@
+"""Calibration of arrays: faults, errors and intervals, refusals, and the models behind them."""
+
+import dataclasses
+import functools
+import importlib.metadata
+
+import numpy as np
+import pytest
+from ertis_bench.faulty_arrays import FaultyArray, calibration_errors, faulty_array, image_losses, record
+
+from ertis_numba.calibration import calibrate
+from ertis_numba.calibration.array_fit import Observations, Tolerances, _Problem
+from ertis_numba.calibration.channel_order import find_swaps
+from ertis_numba.calibration.wavefronts import TARGETS, travel_times
+from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.frames import Measurement
+from ertis_numba.geometry import load_layout
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.settings import Array, Recording, Settings
+from ertis_numba.simulation import Electronics, Emitter, Point, Scene, Sensor, Wall
+from ertis_numba.simulation.render import Simulator
+
+LAYOUT = load_layout("eRTIS_v3D1")
+SENSOR = Sensor(emitter=Emitter(level_db=-6.0), electronics=Electronics(noise_dbfs=-55.0))
+
+
+@functools.cache
+def faulty(seed=3000, count=20):
+    array = faulty_array(seed)
+    measurements = record(array, seed, count)
+    return array, measurements, calibrate(measurements)
+
+
+def rendered(sensor=SENSOR, **scene):
+    return Simulator(Scene(sensors=(sensor,), **scene)).render(0)
+
+
+def echo(azimuth_deg=20.0, range_m=1.0, **more):
+    return rendered(points=(Point(azimuth_deg=azimuth_deg, range_m=range_m, strength_db=-10.0, **more),))
+
+
+# ---- figures ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", [3000, 3001])
+def test_faults_are_found_and_errors_are_small(seed):
+    array, _, made = faulty(seed)
+    assert {channel for cycle in made.swaps for channel in cycle} == set(array.displaced)
+    assert made.silent == array.dead
+    assert made.inverted == array.inverted
+    assert not made.rejected
+    rms = np.sqrt(np.mean(calibration_errors(array, made) ** 2, axis=0))
+    assert rms[0] <= 0.01
+    assert rms[1] <= 0.2
+    assert np.all(rms[2:] <= 0.1)
+
+
+def test_errors_agree_with_their_intervals():
+    """One mode of the delays dominates each array, so arrays count, not microphones."""
+    array, _, made = faulty()
+    relative = calibration_errors(array, made) / made.sd
+    assert np.all(np.sqrt(np.mean(relative**2, axis=0)) < 3)
+    assert np.mean(np.abs(relative[:, [0, 2]]) < 1.96) > 0.85
+
+
+def test_beams_are_those_of_the_perfect_array():
+    array, _, made = faulty()
+    loss_db, side_lobes_db = image_losses(array, made)
+    assert loss_db <= 0.05
+    assert side_lobes_db <= 0.5
+    assert image_losses(array, made, calibrated=False)[0] > 1.0
+    assert made.contrast_db[1] > made.contrast_db[0] + 1
+
+
+@pytest.mark.parametrize("seed", range(3100, 3104))
+def test_healthy_arrays_have_no_findings(seed):
+    assert not calibrate(record(faulty_array(seed, healthy=True), seed, 6)).findings
+
+
+def test_residuals_decrease_to_the_noise():
+    _, _, made = faulty()
+    assert made.residuals.before_s > 2e-6
+    assert made.residuals.after_s < 20e-9
+    assert made.residuals.before_db > 1.0
+    assert made.residuals.after_db < 0.05
+
+
+# ---- faults -----------------------------------------------------------------------------------------
+
+
+@functools.cache
+def plain():
+    """Recordings of an array without any error."""
+    none = np.zeros(32)
+    return record(FaultyArray(none, none, LAYOUT.positions_m, np.arange(32), (), ()), 7, 6)
+
+
+def reordered(measurements, order):
+    """Measurements whose channel i holds the bits of channel ``order[i]``."""
+    made = []
+    for item in measurements:
+        bits = (item.data[:, None] >> np.arange(32, dtype=np.uint32)) & np.uint32(1)
+        words = np.sum(bits[:, order] << np.arange(32, dtype=np.uint32), axis=1, dtype=np.uint32)
+        made.append(dataclasses.replace(item, data=words))
+    return made
+
+
+@pytest.mark.parametrize(
+    ("order", "name"),
+    [
+        (np.arange(32)[::-1], "the reversed order"),
+        (np.arange(32) ^ 7, "the order of reversed bits in each byte"),
+        (np.arange(32).reshape(4, 8)[::-1].ravel(), "the order of reversed bytes"),
+    ],
+)
+def test_other_orders_are_named(order, name):
+    made = calibrate(reordered(plain(), order))
+    assert made.findings == (f"channels are in {name}",)
+    assert np.allclose(made.layout.positions_m, LAYOUT.positions_m[order], atol=4e-4)
+
+
+def test_longer_cycles_are_named():
+    order = np.arange(32)
+    order[[3, 9, 20]] = order[[9, 20, 3]]
+    (finding,) = calibrate(reordered(plain(), order)).findings
+    assert finding == "channels 3, 9 and 20 are at each other's positions, in a cycle"
+
+
+def test_duplicate_channels_are_named_and_disabled():
+    order = np.arange(32)
+    order[9] = 8
+    made = calibrate(reordered(plain(), order))
+    assert made.findings == ("channel 9 repeats channel 8",)
+    assert not made.layout.enabled[9]
+    assert made.layout.enabled[8]
+
+
+@pytest.mark.parametrize(
+    ("flip", "name"),
+    [
+        ((1, -1, 1), "mirrored left to right"),
+        ((1, 1, -1), "mirrored upside down"),
+        ((1, -1, -1), "turned by 180° about its axis"),
+    ],
+)
+def test_mirrored_layout_is_named_by_the_place_of_a_reflector(flip, name):
+    first = rendered(points=(Point(azimuth_deg=25.0, elevation_deg=-15.0, range_m=0.9, strength_db=-10.0),))
+    mirrored = dataclasses.replace(LAYOUT, positions_m=LAYOUT.positions_m * np.array(flip))
+    made = calibrate([first, *plain()], mirrored, first_place=(30.0, -20.0, 0.9))
+    assert made.findings == (f"the layout is {name}",)
+    assert np.allclose(made.layout.positions_m, LAYOUT.positions_m, atol=4e-4)
+    assert abs(made.sound_speed.speed_m_s - 343.8) < 0.5
+
+
+def test_inverted_channel_gets_a_negative_gain_that_mends_the_image():
+    item = echo()
+    flipped = dataclasses.replace(item, data=item.data ^ np.uint32(1 << 4))
+    gain = np.ones(32)
+    gain[4] = -1.0
+    array = dataclasses.replace(LAYOUT, gain=gain).to_array()
+    right = Pipeline(item.settings).process(item)
+    settings = item.settings.replace(array=array)
+    mended = Pipeline(settings).process(dataclasses.replace(flipped, settings=settings))
+    scale = float(right.amplitude.max())
+    assert np.allclose(mended.amplitude, right.amplitude, atol=2e-3 * scale)
+
+
+# ---- recordings -------------------------------------------------------------------------------------
+
+
+def test_bad_recordings_are_left_out():
+    silence = rendered(SENSOR.replace(emitter=Emitter(silent=True)))
+    strange = reordered([plain()[0]], np.random.default_rng(0).permutation(32))[0]
+    made = calibrate([*plain(), silence, strange])
+    assert set(made.rejected) == {6, 7}
+    assert not made.findings
+
+
+def test_pcm_is_calibrated_too():
+    sensor = SENSOR.replace(recording=Recording(encoding="int16", sample_rate_hz=450_000.0, n_samples=16_384))
+    places = [(30, 20, 0.9), (-30, 10, 1.0), (10, -30, 0.8), (-20, -20, 1.2), (40, 0, 1.1), (0, 30, 0.9)]
+    gain = np.ones(32)
+    gain[3] = 1.2
+    real = sensor.replace(array=dataclasses.replace(LAYOUT, gain=gain).to_array())
+    heard = [
+        rendered(real, points=(Point(azimuth_deg=az, elevation_deg=el, range_m=r, strength_db=-10.0),))
+        for az, el, r in places
+    ]
+    made = calibrate(heard, LAYOUT)
+    assert abs(made.gain_db[3] - made.gain_db.mean() - 20 * np.log10(1.2)) < 0.1
+    assert not made.findings
+
+
+def test_direct_sound_calibrates_gains_and_delays():
+    rng = np.random.default_rng(5)
+    gain, delay_s = 10 ** (rng.uniform(-2, 2, 32) / 20), rng.uniform(-4e-6, 4e-6, 32)
+    emitter = Emitter(level_db=-30.0, direct_sound_db=-50.0, position_m=(0.0, 0.0, -0.06))
+    sensor = SENSOR.replace(array=dataclasses.replace(LAYOUT, gain=gain, delay_s=delay_s).to_array(), emitter=emitter)
+    made = calibrate([rendered(sensor)], LAYOUT, target="direct")
+    wanted = 20 * np.log10(gain)
+    assert np.sqrt(np.mean((made.gain_db - wanted + wanted.mean()) ** 2)) < 0.3
+    assert made.residuals.after_s < 0.2 * made.residuals.before_s
+    assert "positions" in made.not_observable[-1]
+    assert abs(made.sound_speed.speed_m_s - 343.8) < 3 * made.sound_speed.sd_m_s
+
+
+def test_walls_calibrate_delays():
+    delay_s = np.zeros(32)
+    delay_s[6] = 4e-6
+    sensor = SENSOR.replace(array=dataclasses.replace(LAYOUT, delay_s=delay_s).to_array())
+    angles = [(20, 0), (-20, 10), (0, -25), (10, 25), (-30, -10), (30, 15)]
+    heard = [
+        rendered(
+            sensor,
+            walls=(
+                Wall(azimuth_deg=az, elevation_deg=el, range_m=0.9, facing_deg=(az - 180 if az > 0 else az + 180, -el)),
+            ),
+        )
+        for az, el in angles
+    ]
+    made = calibrate(heard, LAYOUT, target="wall")
+    assert abs(made.delay_s[6] - 4e-6) < 1e-6
+    assert not made.findings
+
+
+def test_real_recording_is_reported_and_says_that_it_does_not_suffice():
+    path = importlib.metadata.distribution("rtisdev").locate_file("rtisdev/simulate.bin")
+    real = Measurement(np.fromfile(path, dtype="<u4"), Settings.from_preset("default_25_50"))
+    made = calibrate([real], target="direct")
+    assert not made.findings
+    assert made.residuals.before_s > made.residuals.after_s
+    assert made.contrast_db[1] < made.contrast_db[0]  # therefore `ertis calibrate` writes no layout
+    with pytest.raises(DataError, match="not a single echo"):
+        calibrate([real])
+
+
+# ---- refusals ---------------------------------------------------------------------------------------
+
+
+def test_unusable_recordings_are_refused_with_advice():
+    silence = rendered(SENSOR.replace(emitter=Emitter(silent=True)))
+    loud = rendered(SENSOR.replace(emitter=Emitter(level_db=30.0)), points=(Point(range_m=0.6, strength_db=0.0),))
+    cases = {
+        "no sound stands out.*place one small": [silence],
+        "saturated.*lower the emission level": [loud],
+        "cannot tell positions from delays.*at least 4": plain()[:3],
+        "from one direction.*move the reflector": [echo(range_m=r) for r in (0.7, 0.8, 0.9, 1.0)],
+    }
+    for text, measurements in cases.items():
+        with pytest.raises(DataError, match=text):
+            calibrate(measurements)
+
+
+def test_fixed_positions_need_no_other_direction():
+    made = calibrate([echo(range_m=r) for r in (0.7, 0.9)], position_tolerance_m=0.0)
+    assert np.all(made.moved_m == 0)
+    assert not made.findings
+
+
+def test_wrong_layout_is_refused_and_the_right_one_is_named():
+    with pytest.raises(DataError, match="eRTIS_v3D1 does; give it with --layout eRTIS_v3D1"):
+        calibrate(plain(), "eRTIS_v2")
+    strange = reordered(plain(), np.random.default_rng(1).permutation(32))
+    with pytest.raises(DataError, match=r"does not fit the recordings.*give the layout of this sensor"):
+        calibrate(strange)
+    with pytest.raises(ArgumentError, match="32 channels, but layout"):
+        calibrate(plain(), dataclasses.replace(LAYOUT, enabled=np.ones(8, bool)))
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"target": "moon"}, "reflector, wall, direct, beacon"),
+        ({"delay_tolerance_s": 5.0}, "delay_tolerance_s"),
+        ({"position_tolerance_m": -1.0}, "position_tolerance_m"),
+        ({"first_place": (0.0, 100.0, 1.0)}, "elevation of the place"),
+    ],
+)
+def test_foolish_arguments_are_refused(options, text):
+    with pytest.raises(ArgumentError, match=text):
+        calibrate(plain(), **options)
+    with pytest.raises(ArgumentError, match="at least one recording"):
+        calibrate([])
+
+
+def test_wrong_place_is_refused():
+    with pytest.raises(DataError, match="no mirrored layout explains"):
+        calibrate(plain(), first_place=(-80.0, -60.0, 1.0))
+
+
+# ---- models -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_derivatives_of_travel_times(target):
+    rng = np.random.default_rng(2)
+    source_m, places_m = rng.uniform(0.3, 1.0, (3, 3)), rng.uniform(-0.05, 0.05, (4, 3))
+    model = travel_times(source_m, places_m, 343.0, target)
+    for axis in range(3):
+        step = np.zeros(3)
+        step[axis] = 1e-6
+        by_source = travel_times(source_m + step, places_m, 343.0, target).time_s - model.time_s
+        by_place = travel_times(source_m, places_m + step, 343.0, target).time_s - model.time_s
+        assert np.allclose(by_source / 1e-6, model.by_source[..., axis], atol=1e-7)
+        assert np.allclose(by_place / 1e-6, model.by_microphone[..., axis], atol=1e-7)
+
+
+@pytest.mark.parametrize("position_m", [0.0, 1e-3])
+def test_jacobian_of_the_fit(position_m):
+    rng = np.random.default_rng(3)
+    sd_s = np.full((2, 5), 1e-8)
+    sd_s[1, 3] = np.inf
+    seen = Observations(rng.uniform(0.005, 0.006, (2, 5)), sd_s, np.ones((2, 5)), sd_s)
+    problem = _Problem(
+        seen,
+        rng.normal(size=5) * 1e-6,
+        rng.uniform(-0.05, 0.05, (5, 3)),
+        rng.uniform(0.5, 1.0, (2, 3)),
+        np.array([343.0, 344.0]),
+        "reflector",
+        Tolerances(3.0, 5e-6, position_m),
+    )
+    at = problem.start() + 0.1 * rng.normal(size=len(problem.start()))
+    slopes = problem.jacobian(at)
+    for index in range(len(at)):
+        step = np.zeros(len(at))
+        step[index] = 1e-4
+        numeric = (problem.residuals(at + step) - problem.residuals(at - step)) / 2e-4
+        assert np.allclose(numeric, slopes[:, index], rtol=1e-5, atol=1e-3)
+
+
+def test_swaps_of_one_or_two_recordings_are_not_judged():
+    source_m = np.array([[1.0, 0.1, 0.0]])
+    time_s = travel_times(source_m, LAYOUT.positions_m[::-1], 343.0, "reflector").time_s
+    found = find_swaps(time_s, LAYOUT.positions_m, source_m, np.array([343.0]), "reflector")
+    assert not found.cycles()
+
+
+def test_calibrated_array_is_a_valid_setting():
+    _, _, made = faulty()
+    array = made.layout.to_array()
+    assert isinstance(array, Array)
+    assert min(array.gain) < 0 or not made.inverted
