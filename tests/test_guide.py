@@ -37,6 +37,8 @@ RUN_BY = {
     ("applications", "$"): ["test_applications_page::test_application_commands_of_the_page_run"],
     ("applications", "python"): ["test_applications_page::test_application_loop_of_the_page_runs"],
     ("beamformers", "$"): ["test_guide::test_commands_of_the_guide_run"],
+    ("calibrate", "$"): ["test_calibrate_command::test_commands_and_code_of_the_page_run"],
+    ("calibrate", "python"): ["test_calibrate_command::test_commands_and_code_of_the_page_run"],
     ("command-line", "$"): ["test_config::test_command_line_page_runs", "test_config::test_completion_for_each_shell"],
     ("concepts", "python"): ["test_guide::test_code_of_the_concepts_page_runs"],
     ("cuda", "$"): ["test_guide::test_commands_of_the_gpu_page_run"],

@@ -22,6 +22,7 @@ DEVICES = page("devices")
 NETWORK = next(block for block in README.split("```") if "ertis serve" in block)
 ELSEWHERE = {
     *(
+        "calibrate",
         "command",
         "completion",
         "configure",

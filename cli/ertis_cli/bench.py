@@ -246,7 +246,7 @@ def points(**given: Any) -> None:
 @options.quiet
 @options.as_json
 def calibration(**given: Any) -> None:
-    """Calibrate arrays with random errors and faults, and count what is found."""
+    """Calibrate arrays with random errors, and count the faults found."""
     from ertis_bench import calibration as benchmark
 
     _run("calibration", benchmark, **given)

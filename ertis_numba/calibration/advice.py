@@ -1,4 +1,4 @@
-"""Quantities that recordings cannot determine, and what to do about it."""
+"""Quantities that recordings cannot determine, and advice on better recordings."""
 
 import math
 from typing import Final
@@ -58,7 +58,7 @@ def require_directions(source_m: NDArray[np.float64], target: Target) -> None:
 
 
 def not_observable(observed: NDArray[np.bool_], target: Target, *, positions: bool) -> tuple[str, ...]:
-    """Return what the recordings cannot determine, one line each.
+    """Return the quantities that the recordings cannot determine, one line each.
 
     Parameters
     ----------

@@ -16,7 +16,7 @@ from ertis_numba.calibration.array_fit import ArrayFit, Observations, Tolerances
 from ertis_numba.calibration.channel_order import find_swaps
 from ertis_numba.calibration.contrast import image_contrast_db
 from ertis_numba.calibration.reference_place import (
-    Place,
+    ReflectorPlace,
     flipped,
     mirror_of,
     speed_from_distance,
@@ -160,7 +160,9 @@ def calibrate(
         swaps=tuple(tuple(kept.channels[list(cycle)].tolist()) for cycle in found.cycles()),
         silent=tuple(enabled[is_silent].tolist()),
     )
-    return _with_place(_fitted(prepared), prepared, None if first_place is None else Place(*first_place).checked())
+    return _with_place(
+        _fitted(prepared), prepared, None if first_place is None else ReflectorPlace(*first_place).checked()
+    )
 
 
 def _fitted(job: _Prepared) -> Calibration:
@@ -306,8 +308,8 @@ def _before(job: _Prepared, seen: Observations, fit: ArrayFit) -> NDArray[np.flo
     return rest_s
 
 
-def _with_place(made: Calibration, job: _Prepared, place: Place | None) -> Calibration:
-    """Return the calibration with what the place of the first reflector, or direct sound, says in addition."""
+def _with_place(made: Calibration, job: _Prepared, place: ReflectorPlace | None) -> Calibration:
+    """Return the calibration with the findings from the place of the first reflector, or from direct sound."""
     first = next(iter(job.heard.sounds))
     speed_m_s = job.heard.sounds[first].speed_m_s
     if job.target == "direct":

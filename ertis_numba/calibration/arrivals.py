@@ -11,7 +11,7 @@ from ertis_numba.analysis.health.arrival import Compressed
 from ertis_numba.settings import Call
 from ertis_numba.waveform import call_samples
 
-__all__ = ["Arrival", "measure_arrival"]
+__all__ = ["SoundArrival", "measure_arrival"]
 
 _GATE_S = 250e-6  # Half of the gate around an arrival. Echoes that are 4 cm farther away lie outside.
 _TAPER = 0.3  # Share of the gate over which it fades.
@@ -26,7 +26,7 @@ _LEAST_SPECTRUM = 0.05  # Magnitude of the call's spectrum, relative to its maxi
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Arrival:
+class SoundArrival:
     """One sound at each microphone.
 
     Attributes
@@ -60,7 +60,7 @@ class Arrival:
     evidence: NDArray[np.float64]
 
 
-def measure_arrival(pulses: Compressed, call: Call, at_s: NDArray[np.float64], used: NDArray[np.bool_]) -> Arrival:
+def measure_arrival(pulses: Compressed, call: Call, at_s: NDArray[np.float64], used: NDArray[np.bool_]) -> SoundArrival:
     """Measure the sound around the given times by maximum likelihood.
 
     All microphones receive the same unknown pulse R with real amplitudes a and delays d, in white noise of the same
@@ -87,7 +87,7 @@ def measure_arrival(pulses: Compressed, call: Call, at_s: NDArray[np.float64], u
     return replace(made, time_s=made.time_s + at_s, level=made.level * sign, evidence=made.evidence * sign)
 
 
-def _estimate(bins: NDArray[np.complex128], frequency_hz: NDArray[np.float64], used: NDArray[np.bool_]) -> Arrival:
+def _estimate(bins: NDArray[np.complex128], frequency_hz: NDArray[np.float64], used: NDArray[np.bool_]) -> SoundArrival:
     """Return the estimates for positive amplitudes; times are relative to the centre of the gate."""
     turn = 2 * np.pi * frequency_hz
     steering = np.exp(1j * turn[:, None] * _LAGS_S)
@@ -115,7 +115,7 @@ def _estimate(bins: NDArray[np.complex128], frequency_hz: NDArray[np.float64], u
     own = float(np.sum(turn**2 * np.abs(pulse) ** 2))
     safe = np.maximum(np.abs(amplitude), 1e-300)
     time_sd_s, level_sd = np.sqrt(noise / (2 * own)) / safe, np.sqrt(noise / 2) / safe
-    return Arrival(
+    return SoundArrival(
         time_s=delay_s,
         time_sd_s=time_sd_s,
         level=amplitude,
@@ -145,9 +145,9 @@ def _between_halves(
     late_s, level = [], []
     for half in (slice(None, middle), slice(middle, None)):
         product = aligned[:, half] * np.conj(pulse[half])
-        energy = np.abs(pulse[half]) ** 2
-        late_s.append(-product.imag @ turn[half] / (amplitude * np.sum(turn[half] ** 2 * energy)))
-        level.append(product.real.sum(axis=1) / (amplitude * np.sum(energy)))
+        pulse_power = np.abs(pulse[half]) ** 2
+        late_s.append(-product.imag @ turn[half] / (amplitude * np.sum(turn[half] ** 2 * pulse_power)))
+        level.append(product.real.sum(axis=1) / (amplitude * np.sum(pulse_power)))
     more = []
     for (lower, upper), sd in ((late_s, time_sd_s), (level, level_sd)):
         ratio = float(np.median(((lower - upper)[used] / sd[used]) ** 2)) / _MEDIAN_OF_SQUARE

@@ -12,7 +12,7 @@ from ertis_numba.calibration.wavefronts import Target, travel_times
 from ertis_numba.errors import DataError
 from ertis_numba.geometry import unit_vectors
 
-__all__ = ["Place", "SoundSpeed", "flipped", "mirror_of", "speed_from_distance", "speed_from_spread"]
+__all__ = ["ReflectorPlace", "SoundSpeed", "flipped", "mirror_of", "speed_from_distance", "speed_from_spread"]
 
 _FLIPS: Final[dict[str, tuple[float, float, float]]] = {
     "mirrored left to right": (1.0, -1.0, 1.0),
@@ -25,8 +25,8 @@ _PACE_SD: Final = 0.05  # Relative deviation of the speed of sound between 0 and
 _DISTANCE_SD_M: Final = 2e-3  # of a tape measure
 
 
-class Place(NamedTuple):
-    """Place of a reflector, as seen from the sensor.
+class ReflectorPlace(NamedTuple):
+    """ReflectorPlace of a reflector, as seen from the sensor.
 
     Attributes
     ----------
@@ -38,7 +38,7 @@ class Place(NamedTuple):
     elevation_deg: float
     range_m: float
 
-    def checked(self) -> "Place":
+    def checked(self) -> "ReflectorPlace":
         """Return the place if its numbers are possible.
 
         Raises
@@ -65,14 +65,14 @@ class SoundSpeed(NamedTuple):
     sd_m_s: float
 
 
-def mirror_of(source_m: NDArray[np.float64], place: Place) -> str:
+def mirror_of(source_m: NDArray[np.float64], place: ReflectorPlace) -> str:
     """Return how the layout is mirrored, judged by a reflector at a known place; empty if it is not.
 
     Parameters
     ----------
     source_m : (axis,) float64
         Measured position of the reflector.
-    place : Place
+    place : ReflectorPlace
         True position, whose direction may be rough. Azimuth and elevation of 10° or more reveal mirrored axes.
 
     Raises
@@ -110,7 +110,7 @@ def _apart_deg(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
     return math.degrees(math.acos(float(np.clip(one @ other, -1.0, 1.0))))
 
 
-def speed_from_distance(source_m: NDArray[np.float64], place: Place, speed_m_s: float) -> SoundSpeed:
+def speed_from_distance(source_m: NDArray[np.float64], place: ReflectorPlace, speed_m_s: float) -> SoundSpeed:
     """Return the speed of sound from a reflector at a known distance.
 
     A wrong speed c scales the measured range r, so that the true speed is ``c r₀ / r`` at the known distance r₀. The
@@ -120,7 +120,7 @@ def speed_from_distance(source_m: NDArray[np.float64], place: Place, speed_m_s: 
     ----------
     source_m : (axis,) float64
         Measured position of the reflector.
-    place : Place
+    place : ReflectorPlace
         True position.
     speed_m_s : float
         Speed that the measured position was computed with.

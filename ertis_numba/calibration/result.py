@@ -100,6 +100,14 @@ class Calibration:
         Contrast of images before and after the calibration, in decibels; see `image_contrast_db`.
     rejected : dict of int to str
         Index of each recording that was left out, and the reason.
+
+    Examples
+    --------
+    Process with the calibrated layout::
+
+        calibration = ertis.calibrate(recordings)
+        settings = recordings[0].settings.replace(array=calibration.layout.to_array())
+        print(calibration.gain_db, "±", 1.96 * calibration.gain_sd_db)
     """
 
     layout: Layout

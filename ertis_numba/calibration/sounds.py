@@ -15,7 +15,7 @@ from ertis_numba.analysis.health.arrival import Compressed, Fit, compress, fit_d
 from ertis_numba.analysis.health.bits import by_bits
 from ertis_numba.analysis.health.limits import MAX_DELAY_S
 from ertis_numba.analysis.health.pcm_samples import by_numbers, scaled
-from ertis_numba.calibration.arrivals import Arrival, measure_arrival
+from ertis_numba.calibration.arrivals import SoundArrival, measure_arrival
 from ertis_numba.calibration.wavefronts import Target, locate_source, travel_times
 from ertis_numba.errors import DataError
 from ertis_numba.frames import Measurement
@@ -60,7 +60,7 @@ class Sound:
     settings : Settings
     pulses : Compressed
         Signals after the matched filter, without their envelopes.
-    arrival : Arrival
+    arrival : SoundArrival
         Times and levels at the highest envelope of each microphone.
     middle_s : float
         Middle of the times, in seconds.
@@ -70,11 +70,11 @@ class Sound:
 
     settings: Settings
     pulses: Compressed
-    arrival: Arrival
+    arrival: SoundArrival
     middle_s: float
     speed_m_s: float
 
-    def measure(self, at_s: NDArray[np.float64], used: NDArray[np.bool_]) -> Arrival:
+    def measure(self, at_s: NDArray[np.float64], used: NDArray[np.bool_]) -> SoundArrival:
         """Measure the sound at other times; see `measure_arrival`."""
         return measure_arrival(self.pulses, self.settings.call, at_s, used)
 
