@@ -66,7 +66,7 @@ def by_spectra(
     quiet = np.argsort(np.median(power, axis=0), kind="stable")[: max(few, 2)]
     density = np.stack([lines[quiet, _FIRST_LINE:].mean(axis=0, dtype=np.float64) for lines in spectra])
     floor_db = _bits.decibels(np.quantile(density, _FLOOR_QUANTILE, axis=1)) + 10 * math.log10(size / 2)
-    sensitivity = microphones(settings.array).gain[[item.channel for item in found]]
+    sensitivity = np.abs(microphones(settings.array).gain[[item.channel for item in found]])
     sound_db = _bits.decibels(np.maximum(loud - noise, _MIN_SOUND * loud)) - 20 * np.log10(sensitivity)
     level_db = sound_db - np.median(sound_db)
     is_deaf = _deaf(power[:, order], noise, 20 * np.log10(sensitivity), few)
