@@ -18,6 +18,7 @@ COMMANDS = {
     "bench": ("ertis_cli.bench:bench", "Run benchmarks of speed and accuracy."),
     "calibrate": ("ertis_cli.calibrate:calibrate", "Calibrate the microphones of an array from recordings."),
     "capture": ("ertis_cli.capture:capture", "Record measurements, or send them to a central node."),
+    "check": ("ertis_cli.check:check", "Check whether sensors are fit for use."),
     "command": ("ertis_cli.command:command", "Send commands to a sensor and print its answers."),
     "compare": ("ertis_cli.compare:compare", "Compare an energyscape file with the scene's ground truth."),
     "completion": ("ertis_cli.completion:completion", "Print a script that completes commands and options in a shell."),

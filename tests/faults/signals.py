@@ -42,6 +42,7 @@ COMMANDS: Final[dict[str, Sequence[str]]] = {
     "bench": ("scaling", "--count", "1", "--quiet"),
     "calibrate": ("{recording}",),
     "capture": ("--port", "{port}", "-o", "{out}/captured.h5"),
+    "check": ("{recording}", "--report", "{out}/report.html"),
     "command": ("--port", "{port}", "!Y,0,0,0"),
     "compare": ("{images}",),
     "completion": ("bash",),

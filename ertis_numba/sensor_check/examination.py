@@ -1,0 +1,166 @@
+"""Check of a recording: every check of every sensor, and the faults."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+from ertis_numba import checks
+from ertis_numba.analysis.call_match import first_call_match
+from ertis_numba.analysis.health import health, merge
+from ertis_numba.errors import DataError
+from ertis_numba.frames import Measurement
+from ertis_numba.geometry import microphones
+from ertis_numba.sensor_check import items
+from ertis_numba.sensor_check.clock import check_clock
+from ertis_numba.sensor_check.residuals import CalibrationResiduals, calibration_residuals
+from ertis_numba.sensor_check.result import CheckFault, CheckItem, RecordingCheck, SensorCheck
+from ertis_numba.settings import Settings
+from ertis_numba.storage import file_kind, open_recording, sensor_names
+from ertis_numba.storage.verify import SensorReport, verify
+
+__all__ = ["check_recording"]
+
+_MAX_EXAMINED: Final = 8
+
+
+def check_recording(
+    path: str | Path,
+    *,
+    settings: Callable[[Settings], Settings] | None = None,
+    nominal_rate_hz: float | None = None,
+    on_progress: Callable[[int], None] | None = None,
+) -> RecordingCheck:
+    """Check whether the sensors of a recording are fit for use.
+
+    At most 8 intact measurements of each sensor, evenly spaced, are examined for faulty microphones, noise, the call
+    and the calibration. Checksums, sequence numbers and time stamps of all measurements are checked.
+
+    Parameters
+    ----------
+    path : str or Path
+        Path of the recording.
+    settings : callable, optional
+        Function that takes the settings of a sensor and returns those in use, such as with another layout; by default
+        the settings in the recording.
+    nominal_rate_hz : float, optional
+        Nominal rate of pulses or measurements, in hertz; the drift of the clock is not known without it.
+    on_progress : callable, optional
+        Called with the number of sensors checked so far.
+
+    Returns
+    -------
+    RecordingCheck
+
+    Raises
+    ------
+    DataError
+        The file cannot be read at all, or is not a recording.
+    ArgumentError
+        The rate is invalid.
+    SettingsError
+        ``settings`` refuses the settings of a sensor.
+
+    Examples
+    --------
+    Print the verdict and the result of each check::
+
+        checked = check_recording("data/synthetic/line.h5")
+        print(checked.verdict)
+        for item in checked.sensors[0].items:
+            print(item.check, item.result, item.detail)
+    """
+    path = Path(path)
+    if nominal_rate_hz is not None:
+        checks.between("nominal_rate_hz", nominal_rate_hz, 1e-6, 1e6)
+    kind = file_kind(path)
+    if kind != "recording":
+        raise DataError(f"{path} is an energyscape file, wanted a recording; give the recording it was made from")
+    names = sensor_names(path)
+    try:
+        stored = {report.sensor: report for report in verify(path)}
+    except DataError as error:  # No sensor can be read.
+        return RecordingCheck(path=path, sensors=(), unreadable=(_unreadable(path, str(error)),))
+    sensors, unreadable = [], []
+    for number, name in enumerate(names):
+        if stored[name].fault:
+            unreadable.append(_unreadable(path, stored[name].fault))
+        else:
+            sensors.append(_check_sensor(path, stored[name], settings, nominal_rate_hz))
+        if on_progress is not None:
+            on_progress(number + 1)
+    return RecordingCheck(path=path, sensors=tuple(sensors), unreadable=tuple(unreadable))
+
+
+def _unreadable(path: Path, reason: str) -> CheckFault:
+    """Return the fault of a file or sensor that cannot be read; errors name the file and end with a remedy."""
+    text, _, remedy = reason.rpartition("; ")
+    text = text or reason
+    if text.startswith(f"{path}: "):
+        text = text.removeprefix(f"{path}: ")
+    elif text.startswith(f"{path} "):
+        text = f"the file {text.removeprefix(f'{path} ')}"
+    return CheckFault(check=items.MEASUREMENTS, text=text, remedy=remedy if _ else items.COPY)
+
+
+def _check_sensor(
+    path: Path,
+    stored: SensorReport,
+    settings: Callable[[Settings], Settings] | None,
+    nominal_rate_hz: float | None,
+) -> SensorCheck:
+    with open_recording(path, sensor=stored.sensor) as recording:
+        used = recording.settings if settings is None else settings(recording.settings)
+        damaged = {item.index for item in stored.damaged}
+        intact = [index for index in range(len(recording)) if index not in damaged]
+        examined = _spread(intact)
+        heard = [_with_settings(recording[index], used) for index in examined]
+        clock = check_clock(recording.stamps(), used.recording.duration_s, nominal_rate_hz)
+    report = merge([health(measurement) for measurement in heard]) if heard else None
+    match = first_call_match(heard)
+    residuals, why = _calibration_residuals(heard)
+    layout = microphones(used.array)
+    found: dict[str, items.CheckResult] = {
+        items.MICROPHONES: items.of_microphones(report),
+        items.NOISE: items.of_noise(report, used),
+        items.SAMPLES: items.of_samples(report),
+        items.MEASUREMENTS: items.of_storage(stored),
+        items.TIMING: items.of_timing(clock),
+        items.DRIFT: items.of_drift(clock),
+        items.CALL: items.of_call(match),
+        items.CALIBRATION: items.of_calibration(residuals, why, report),
+    }
+    return SensorCheck(
+        sensor=stored.sensor,
+        layout=used.array.layout,
+        n_microphones=int(layout.enabled.sum()),
+        items=tuple(CheckItem(check=name, result=each.result, detail=each.detail) for name, each in found.items()),
+        faults=tuple(fault for each in found.values() for fault in each.faults),
+        examined=tuple(examined),
+        stored=stored,
+        health=report,
+        clock=clock,
+        call=match,
+        calibration=residuals,
+    )
+
+
+def _spread(indices: Sequence[int]) -> list[int]:
+    """Return at most 8 of the indices, evenly spaced and including the first and the last one."""
+    last = len(indices) - 1
+    places = sorted({round(last * step / (_MAX_EXAMINED - 1)) for step in range(_MAX_EXAMINED)})
+    return [indices[place] for place in places] if indices else []
+
+
+def _with_settings(measurement: Measurement, used: Settings) -> Measurement:
+    """Return a measurement with the settings in use, and the air in which it was recorded."""
+    return replace(measurement, settings=used.replace(air=measurement.settings.air))
+
+
+def _calibration_residuals(heard: Sequence[Measurement]) -> tuple[CalibrationResiduals | None, str]:
+    """Return the deviations from the layout, or the reason why they are not known."""
+    try:
+        found = calibration_residuals(heard)
+    except DataError as error:
+        return None, str(error)
+    return found, "" if found else "the deviations from the layout were not measured"

@@ -1,0 +1,199 @@
+"""Results of single checks: measured values, faults and remedies."""
+
+import math
+from collections.abc import Sequence
+from typing import Final, Literal, NamedTuple
+
+from ertis_numba.analysis.call_match import CallMatch
+from ertis_numba.analysis.health import Health
+from ertis_numba.analysis.health.limits import MAX_DELAY_S, MAX_GAIN_DB, MAX_WHITE_DB
+from ertis_numba.sensor_check.clock import ClockCheck
+from ertis_numba.sensor_check.microphone_faults import (
+    MICROPHONES,
+    SAMPLES,
+    channels_in_words,
+    microphone_faults,
+    record_faults,
+)
+from ertis_numba.sensor_check.residuals import CalibrationResiduals
+from ertis_numba.sensor_check.result import CheckFault
+from ertis_numba.settings import Settings
+from ertis_numba.storage.verify import SensorReport
+
+__all__ = [
+    "CALIBRATION",
+    "CALL",
+    "COPY",
+    "DRIFT",
+    "MEASUREMENTS",
+    "MICROPHONES",
+    "NOISE",
+    "SAMPLES",
+    "TIMING",
+    "CheckResult",
+    "of_calibration",
+    "of_call",
+    "of_drift",
+    "of_microphones",
+    "of_noise",
+    "of_samples",
+    "of_storage",
+    "of_timing",
+]
+
+NOISE: Final = "noise floor"
+MEASUREMENTS: Final = "measurements"
+TIMING: Final = "timing"
+DRIFT: Final = "clock drift"
+CALL: Final = "call"
+CALIBRATION: Final = "calibration"
+COPY: Final = "copy the file again, or record again"
+"""Remedy for damaged files."""
+
+_DEVIATIONS: Final = 4.0
+_CALIBRATE: Final = "calibrate the array, or give its own layout (--settings)"
+
+
+class CheckResult(NamedTuple):
+    """Result of one check: ``ok``, ``fault`` or ``not known``, a detail, and faults."""
+
+    result: Literal["ok", "fault", "not known"]
+    detail: str
+    faults: tuple[CheckFault, ...] = ()
+
+
+_NOTHING: Final = CheckResult("not known", "no measurement is intact")
+
+
+def _result_of(faults: Sequence[CheckFault], detail: str) -> CheckResult:
+    texts = "; ".join(fault.text for fault in faults)
+    return CheckResult("fault" if faults else "ok", texts or detail, tuple(faults))
+
+
+def of_microphones(report: Health | None) -> CheckResult:
+    """Return the result for the microphones; it is a fault if dead microphones cannot be detected."""
+    if report is None:
+        return _NOTHING
+    count = len(report.channels)
+    faults = microphone_faults(report)
+    if report.unknown and not faults:
+        if count == 1:
+            return CheckResult("not known", report.unknown[0])
+        text = f"faulty microphones cannot be detected ({report.unknown[0]})"
+        faults = (CheckFault(check=MICROPHONES, text=text, remedy="record a whole emission and its echoes"),)
+    detail = f"{count} of {count} without a fault"
+    if report.not_observable:
+        detail += f"; not observable: {report.not_observable[0].partition(':')[0]}"
+    return _result_of(faults, detail)
+
+
+def of_noise(report: Health | None, used: Settings) -> CheckResult:
+    """Return the noise and the dynamic range; noise as that of random bits is a fault."""
+    if report is None:
+        return _NOTHING
+    if report.noise_dbfs is None or report.dynamic_range_db is None:
+        return CheckResult("not known", "no microphone without a fault has a measurable noise")
+    detail = f"{report.noise_dbfs:.1f} dBFS in the call's band, dynamic range {report.dynamic_range_db:.1f} dB"
+    band_hz = used.call.high_frequency_hz - used.call.low_frequency_hz
+    white_dbfs = 10 * math.log10(2 * band_hz / used.recording.sample_rate_hz)
+    if not used.recording.is_pdm or report.noise_dbfs <= white_dbfs + MAX_WHITE_DB:
+        return CheckResult("ok", detail)
+    text = f"the noise of {report.noise_dbfs:.1f} dBFS is that of random bits"
+    remedy = "check that the array is connected, and that its clock runs"
+    return _result_of([CheckFault(check=NOISE, text=text, remedy=remedy)], detail)
+
+
+def of_samples(report: Health | None) -> CheckResult:
+    """Return the faults of whole records: repeated blocks, a shift, and the order of channels or bytes."""
+    if report is None:
+        return _NOTHING
+    return _result_of(record_faults(report), "no repeated block, no shift, no fault of order")
+
+
+def of_storage(stored: SensorReport) -> CheckResult:
+    """Return missing and damaged measurements."""
+    faults = []
+
+    def add(text: str, remedy: str) -> None:
+        faults.append(CheckFault(check=MEASUREMENTS, text=text, remedy=remedy))
+
+    if stored.gaps:
+        reasons = ", ".join(dict.fromkeys(gap.reason for gap in stored.gaps))
+        numbered = stored.missing + stored.measurements
+        add(f"{stored.missing} of {numbered} measurements are missing ({reasons})", "check cable, hub and disk")
+    if stored.damaged:
+        count = len(stored.damaged)
+        add(f"{count} of {stored.measurements} measurements {'is' if count == 1 else 'are'} damaged", COPY)
+    if stored.out_of_order:
+        add(f"{len(stored.out_of_order)} measurements are out of order", "record again")
+    if stored.remark:
+        add(stored.remark, COPY)
+    return _result_of(faults, f"{stored.measurements} stored, none missing or damaged")
+
+
+def of_timing(clock: ClockCheck) -> CheckResult:
+    """Return the rate of the measurements, and contradictions of counters and times."""
+    remedy = "check the trigger, and recording.sample_rate_hz and recording.n_samples of the settings"
+    faults = [CheckFault(check=TIMING, text=text, remedy=remedy) for text in clock.faults]
+    if clock.timing_unknown and not faults:
+        return CheckResult("not known", clock.timing_unknown)
+    detail = f"{clock.rate_hz:.6g} Hz" if clock.rate_hz is not None else ""
+    if clock.jitter_s is not None:
+        detail += f", jitter {1e3 * clock.jitter_s:.3g} ms"
+    return _result_of(faults, detail)
+
+
+def of_drift(clock: ClockCheck) -> CheckResult:
+    """Return the drift of the clock."""
+    if clock.drift_unknown:
+        return CheckResult("not known", clock.drift_unknown)
+    if clock.drift_fault:
+        remedy = "check the clocks of host and sensor, and give the true rate of the samples in the settings"
+        return _result_of([CheckFault(check=DRIFT, text=clock.drift_fault, remedy=remedy)], "")
+    return _result_of((), f"{clock.drift_ppm or 0.0:+.0f} ± {clock.rate_sd_ppm or 0.0:.0f} ppm relative to the host")
+
+
+def of_call(match: CallMatch | None) -> CheckResult:
+    """Return the match of the call."""
+    if match is None:
+        return CheckResult("not known", "no sound is above the noise")
+    if match.matches:
+        return _result_of((), "echoes match the call of the settings")
+    text, _, rest = match.warning.partition(". ")
+    return _result_of([CheckFault(check=CALL, text=text, remedy=rest.partition("; ")[2])], "")
+
+
+def of_calibration(residuals: CalibrationResiduals | None, why: str, report: Health | None) -> CheckResult:
+    """Return the deviations from the layout; faults that the health of the microphones names are left out."""
+    if residuals is None:
+        return CheckResult("not known", why)
+    reported = {channel.channel for channel in report.channels if channel.faults} if report else set()
+    faults = [
+        CheckFault(check=CALIBRATION, text=text, remedy=_CALIBRATE)
+        for text, channels in residuals.findings
+        if not channels or not set(channels) <= reported
+    ]
+    every = range(len(residuals.channels))
+    beyond = [
+        place
+        for place in every
+        if residuals.channels[place] not in reported
+        and (
+            abs(residuals.delay_s[place]) - _DEVIATIONS * residuals.delay_sd_s[place] > MAX_DELAY_S
+            or abs(residuals.gain_db[place]) - _DEVIATIONS * residuals.gain_sd_db[place] > MAX_GAIN_DB
+        )
+    ]
+    if beyond:
+        verb = "deviates" if len(beyond) == 1 else "deviate"
+        channels = channels_in_words([residuals.channels[place] for place in beyond])
+        text = f"{channels} {verb} from the layout by {_worst(residuals, beyond)}"
+        faults.append(CheckFault(check=CALIBRATION, text=text, remedy=_CALIBRATE))
+    rms = f"{1e6 * residuals.rms_s:.2g} µs RMS from the layout"
+    return _result_of(faults, f"{rms}; {_worst(residuals, every)}")
+
+
+def _worst(residuals: CalibrationResiduals, places: Sequence[int]) -> str:
+    """Return the largest deviations of some channels, as text."""
+    delay_s = max((abs(residuals.delay_s[place]) for place in places), default=0.0)
+    gain_db = max((abs(residuals.gain_db[place]) for place in places), default=0.0)
+    return f"up to {1e6 * delay_s:.2g} µs and {gain_db:.2g} dB"
