@@ -75,7 +75,8 @@ def check(
     found: list[RecordingCheck] = []
     for path in paths:
         try:
-            found.append(check_recording(path, settings=used, nominal_rate_hz=nominal_rate_hz))
+            with options.note_when_slow(f"checking {path} ...", quiet=quiet):
+                found.append(check_recording(path, settings=used, nominal_rate_hz=nominal_rate_hz))
         except (ErtisError, OSError) as error:
             click.echo(f"ertis: error: {error}", err=True)
             if as_json:
@@ -129,6 +130,8 @@ def _sensor(checked: "SensorCheck") -> dict[str, Any]:
         "examined": checked.examined,
         "missing": stored.missing,
         "damaged": [item.index for item in stored.damaged],
+        "implausible_words": checked.words.reasons,
+        "not_observable": () if health is None else health.not_observable,
         "checks": [asdict(item) for item in checked.items],
         "faulty_channels": {} if health is None else health.faults,
         "noise_dbfs": None if health is None else health.noise_dbfs,

@@ -8,6 +8,7 @@ from ertis_numba.analysis.call_match import CallMatch
 from ertis_numba.analysis.health import Health
 from ertis_numba.analysis.health.limits import MAX_DELAY_S, MAX_GAIN_DB, MAX_WHITE_DB
 from ertis_numba.sensor_check.clock import ClockCheck
+from ertis_numba.sensor_check.lost_words import LostWords
 from ertis_numba.sensor_check.microphone_faults import (
     MICROPHONES,
     SAMPLES,
@@ -47,6 +48,13 @@ TIMING: Final = "timing"
 DRIFT: Final = "clock drift"
 CALL: Final = "call"
 CALIBRATION: Final = "calibration"
+_BITS: Final = {
+    "splice": "lost or misplaced words",
+    "noise": "random bits",
+    "constant bits": "constant bits",
+    "density": "bits of no modulator",
+}
+"""Faults by the reasons of `BitCheck`."""
 COPY: Final = "copy the file again, or record again"
 """Remedy for damaged files."""
 
@@ -103,11 +111,25 @@ def of_noise(report: Health | None, used: Settings) -> CheckResult:
     return _result_of([CheckFault(check=NOISE, text=text, remedy=remedy)], detail)
 
 
-def of_samples(report: Health | None) -> CheckResult:
-    """Return the faults of whole records: repeated blocks, a shift, and the order of channels or bytes."""
+def of_samples(report: Health | None, words: LostWords) -> CheckResult:
+    """Return lost words, and the faults of whole records: repeated blocks, a shift, and another order."""
     if report is None:
         return _NOTHING
-    return _result_of(record_faults(report), "no repeated block, no shift, no fault of order")
+    faults = list(record_faults(report))
+    by_reason: dict[str, list[int]] = {}
+    for index, reason in words.reasons.items():
+        by_reason.setdefault(reason, []).append(index)
+    for reason, indices in by_reason.items():
+        count = f"{len(indices)} of {words.n_examined} examined measurements"
+        verb = "has" if len(indices) == 1 else "have"
+        text = f"{count} {verb} {_BITS[reason]}, the first at {indices[0]}"
+        faults.append(CheckFault(check=SAMPLES, text=text, remedy="check the link to the sensor, and record again"))
+    lost = f"lost words are not observable ({words.unknown})"
+    return _result_of(faults, lost if words.unknown else _none_lost(words))
+
+
+def _none_lost(words: LostWords) -> str:
+    return f"no lost word found in {words.n_examined} measurement{'s' * (words.n_examined != 1)}"
 
 
 def of_storage(stored: SensorReport) -> CheckResult:
@@ -148,7 +170,7 @@ def of_drift(clock: ClockCheck) -> CheckResult:
     if clock.drift_unknown:
         return CheckResult("not known", clock.drift_unknown)
     if clock.drift_fault:
-        remedy = "check the clocks of host and sensor, and give the true rate of the samples in the settings"
+        remedy = "check that the clock of the host is synchronised, then the clock that triggers"
         return _result_of([CheckFault(check=DRIFT, text=clock.drift_fault, remedy=remedy)], "")
     return _result_of((), f"{clock.drift_ppm or 0.0:+.0f} ± {clock.rate_sd_ppm or 0.0:.0f} ppm relative to the host")
 
@@ -167,11 +189,13 @@ def of_calibration(residuals: CalibrationResiduals | None, why: str, report: Hea
     """Return the deviations from the layout; faults that the health of the microphones names are left out."""
     if residuals is None:
         return CheckResult("not known", why)
-    reported = {channel.channel for channel in report.channels if channel.faults} if report else set()
+    enabled = {channel.channel for channel in report.channels} if report else set()
+    faulty = report.faults.values() if report else ()
+    reported = {channel for channels in faulty for channel in channels}
     faults = [
-        CheckFault(check=CALIBRATION, text=text, remedy=_CALIBRATE)
-        for text, channels in residuals.findings
-        if not channels or not set(channels) <= reported
+        CheckFault(check=CALIBRATION, text=finding.text, remedy=_CALIBRATE)
+        for finding in residuals.findings
+        if not reported.issuperset(finding.channels or enabled)
     ]
     every = range(len(residuals.channels))
     beyond = [

@@ -13,23 +13,17 @@ __all__ = ["MICROPHONES", "SAMPLES", "channels_in_words", "microphone_faults", "
 MICROPHONES: Final = "microphones"
 SAMPLES: Final = "samples"
 
-_PREDICATES: Final = {
-    "dead": "dead",
-    "saturated": "saturated",
-    "noisy": "noisy",
-    "late": "late",
-    "offset": "with an offset",
-    "low-frequency hum": "with low-frequency hum",
-    "idle tone": "with an idle tone",
-    "gain": "of another gain",
-    "white bits": "without a microphone (white bits)",
-    "flipped bits": "with flipped bits",
-    "inverted polarity": "inverted",
-    "swapped": "swapped",
-    "duplicate": "identical",
+_POSSESSED: Final = {
+    "offset": "an offset",
+    "low-frequency hum": "low-frequency hum",
+    "idle tone": "an idle tone",
+    "gain": "another gain",
+    "white bits": "white bits, as without a microphone",
+    "flipped bits": "flipped bits",
 }
-"""Predicates of faults after ``is`` or ``are``; the names of all other faults are predicates themselves."""
+"""Faults that a channel has; the names of all other faults are adjectives."""
 
+_ADJECTIVES: Final = {"inverted polarity": "inverted", "duplicate": "identical"}
 _IN_PAIRS: Final = ("swapped", "duplicate")
 _RECORDS: Final = {
     "order of channels": "channels are not in the order of the layout",
@@ -50,7 +44,9 @@ def channels_in_words(channels: Sequence[int]) -> str:
 def microphone_faults(report: Health) -> tuple[CheckFault, ...]:
     """Return the faults of single microphones; microphones with the same faults are one fault."""
     faults = [
-        CheckFault(check=MICROPHONES, text=f"{channels_in_words(pair)} are {_PREDICATES[name]}", remedy=remedy)
+        CheckFault(
+            check=MICROPHONES, text=f"{channels_in_words(pair)} are {_ADJECTIVES.get(name, name)}", remedy=remedy
+        )
         for name in _IN_PAIRS
         for pair, remedy in _groups(report.findings, name).items()
     ]
@@ -60,13 +56,20 @@ def microphone_faults(report: Health) -> tuple[CheckFault, ...]:
         if names:
             alike.setdefault(names, []).append(channel.channel)
     for names, channels in alike.items():
-        predicate = " and ".join(_PREDICATES.get(name, name) for name in names)
         every = len(channels) == len(report.channels) > 1
-        who = "every channel is" if every else f"{channels_in_words(channels)} {'is' if len(channels) == 1 else 'are'}"
-        faults.append(
-            CheckFault(check=MICROPHONES, text=f"{who} {predicate}", remedy=_remedy(names[0], channels, every=every))
-        )
+        who = "every channel" if every else channels_in_words(channels)
+        text = f"{who} {_predicate(names, is_one=every or len(channels) == 1)}"
+        faults.append(CheckFault(check=MICROPHONES, text=text, remedy=_remedy(names[0], channels, every=every)))
     return tuple(sorted(faults, key=lambda fault: [int(number) for number in re.findall(r"\d+", fault.text)]))
+
+
+def _predicate(names: Sequence[str], *, is_one: bool) -> str:
+    """Return a predicate for some faults, such as ``is dead and has an idle tone``."""
+    adjectives = [_ADJECTIVES.get(name, name) for name in names if name not in _POSSESSED]
+    possessed = [_POSSESSED[name] for name in names if name in _POSSESSED]
+    parts = [f"{'is' if is_one else 'are'} {' and '.join(adjectives)}"] if adjectives else []
+    parts += [f"{'has' if is_one else 'have'} {' and '.join(possessed)}"] if possessed else []
+    return " and ".join(parts)
 
 
 def _groups(findings: Sequence[Finding], name: str) -> dict[tuple[int, ...], str]:

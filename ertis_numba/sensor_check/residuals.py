@@ -3,9 +3,18 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from ertis_numba.calibration import Calibration, calibrate
 from ertis_numba.frames import Measurement
 
-__all__ = ["CalibrationResiduals", "calibration_residuals"]
+__all__ = ["ArrayFinding", "CalibrationResiduals", "calibration_residuals"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ArrayFinding:
+    """Fault of an array, as a clause, and its channels; none for a fault of all channels."""
+
+    text: str
+    channels: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -22,8 +31,8 @@ class CalibrationResiduals:
         Standard deviations of these values.
     rms_s : float
         Root mean square deviation of the times of arrival, in seconds.
-    findings : tuple of (str, tuple of int)
-        Faults of the array, such as ``channels 5 and 12 are swapped``, with their channels.
+    findings : tuple of ArrayFinding
+        Faults of the array, such as swapped channels.
     """
 
     channels: tuple[int, ...]
@@ -32,9 +41,34 @@ class CalibrationResiduals:
     delay_sd_s: tuple[float, ...]
     gain_sd_db: tuple[float, ...]
     rms_s: float
-    findings: tuple[tuple[str, tuple[int, ...]], ...] = ()
+    findings: tuple[ArrayFinding, ...] = ()
 
 
-def calibration_residuals(measurements: Sequence[Measurement]) -> CalibrationResiduals | None:  # noqa: ARG001
-    """Return the deviations from the layout; None if they cannot be measured."""
-    return None
+def calibration_residuals(measurements: Sequence[Measurement]) -> CalibrationResiduals:
+    """Return the deviations from the layout, by the echo of a reflector; positions are those of the layout.
+
+    Raises
+    ------
+    ArgumentError
+        There are no measurements.
+    DataError
+        No echo is strong and simple enough, or too few microphones receive it.
+    """
+    found = calibrate(measurements, target="reflector", position_tolerance_m=0.0)
+    return CalibrationResiduals(
+        channels=tuple(int(channel) for channel in found.channels),
+        delay_s=tuple(found.delay_s.tolist()),
+        gain_db=tuple(found.gain_db.tolist()),
+        delay_sd_s=tuple(found.delay_sd_s.tolist()),
+        gain_sd_db=tuple(found.gain_sd_db.tolist()),
+        rms_s=found.residuals.before_s,
+        findings=_findings(found),
+    )
+
+
+def _findings(found: Calibration) -> tuple[ArrayFinding, ...]:
+    """Return the findings with their channels, which follow in the order of `Calibration.findings`."""
+    channels: list[tuple[int, ...]] = [()] if found.order else []
+    channels += [*found.swaps, *((each,) for each in found.inverted)]
+    channels += [*found.duplicates.items(), *((each,) for each in found.silent)]
+    return tuple(ArrayFinding(text=text, channels=which) for text, which in zip(found.findings, channels, strict=True))

@@ -7,6 +7,7 @@ from typing import Literal
 from ertis_numba.analysis.call_match import CallMatch
 from ertis_numba.analysis.health import Health
 from ertis_numba.sensor_check.clock import ClockCheck
+from ertis_numba.sensor_check.lost_words import LostWords
 from ertis_numba.sensor_check.residuals import CalibrationResiduals
 from ertis_numba.storage.verify import SensorReport
 
@@ -73,6 +74,8 @@ class SensorCheck:
         Missing and damaged measurements.
     health : Health or None
         Health of the microphones; None if no measurement can be read.
+    words : LostWords
+        Measurements with missing, misplaced or random words.
     clock : ClockCheck
         Timing of the measurements.
     call : CallMatch or None
@@ -89,6 +92,7 @@ class SensorCheck:
     examined: tuple[int, ...]
     stored: SensorReport
     health: Health | None
+    words: LostWords
     clock: ClockCheck
     call: CallMatch | None
     calibration: CalibrationResiduals | None
