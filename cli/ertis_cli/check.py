@@ -105,7 +105,7 @@ def _print(checked: "RecordingCheck", *, quiet: bool) -> None:
 def _about(sensor: "SensorCheck") -> str:
     microphones = options.counted(sensor.n_microphones, "microphone")
     measurements = options.counted(sensor.stored.measurements, "measurement")
-    return f"layout {sensor.layout}, {microphones}, {measurements}, {len(sensor.examined)} examined"
+    return f"layout {sensor.settings.array.layout}, {microphones}, {measurements}, {len(sensor.examined)} examined"
 
 
 def _report(checked: "RecordingCheck") -> dict[str, Any]:
@@ -124,7 +124,7 @@ def _sensor(checked: "SensorCheck") -> dict[str, Any]:
     health, stored, calibration = checked.health, checked.stored, checked.calibration
     return {
         "sensor": checked.sensor,
-        "layout": checked.layout,
+        "layout": checked.settings.array.layout,
         "microphones": checked.n_microphones,
         "measurements": stored.measurements,
         "examined": checked.examined,

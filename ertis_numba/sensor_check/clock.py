@@ -22,6 +22,10 @@ _COMPUTED_NS: Final = 2.0  # Jitter of times that were computed from a counter a
 _OVERLAP: Final = 0.999
 _DEVIATIONS: Final = 4.0
 _OUTLIER: Final = 5.0  # Limit of a deviation relative to the median deviation.
+_FALL_REMEDY: Final = "synchronise the clock of the host before recording again"
+_COUNT_REMEDY: Final = "check the SYNC cable and the supply of the sensor, and record again"
+_RATE_REMEDY: Final = "correct recording.sample_rate_hz or recording.n_samples in the settings"
+_NOMINAL_REMEDY: Final = "give the rate of this recording as --rate, or check the trigger"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,8 +42,8 @@ class ClockCheck:
         Root mean square deviation of the time stamps from that rate, in seconds.
     drift_ppm : float or None
         Deviation of the rate from the nominal one in parts per million; a positive value runs fast.
-    faults : tuple of str
-        Contradictions between counter, time stamps and settings, as clauses.
+    faults : tuple of (str, str)
+        Contradictions between counter, time stamps and settings, as clauses, and their remedies.
     drift_fault : str
         Drift beyond its limit, as a clause; empty by default.
     timing_unknown, drift_unknown : str
@@ -50,7 +54,7 @@ class ClockCheck:
     rate_sd_ppm: float | None = None
     jitter_s: float | None = None
     drift_ppm: float | None = None
-    faults: tuple[str, ...] = ()
+    faults: tuple[tuple[str, str], ...] = ()
     drift_fault: str = ""
     timing_unknown: str = ""
     drift_unknown: str = ""
@@ -92,7 +96,7 @@ def check_clock(stamps: Sequence[Stamp], duration_s: float, nominal_rate_hz: flo
         return _unknown(f"{n_usable} measurements with rising counters are fewer than {_MIN_MEASUREMENTS}")
     falls = [run.index[place] for run in runs for place in np.flatnonzero(np.diff(run.time_ns) < 0) + 1]
     if falls:
-        found = ClockCheck(faults=(f"time stamps fall at measurement {falls[0]}",))
+        found = ClockCheck(faults=((f"time stamps fall at measurement {falls[0]}", _FALL_REMEDY),))
         return replace(found, drift_unknown="the time stamps are not in order")
     uncertainty_ns = float(np.mean([stamp.timestamp_uncertainty_ns for stamp in stamps]))
     return _with_drift(_by_times(runs, uncertainty_ns, duration_s), nominal_rate_hz)
@@ -112,10 +116,8 @@ def _by_times(runs: Sequence[_Run], uncertainty_ns: float, duration_s: float) ->
     period_ns, jitter_ns, period_sd_ns = _fit(runs, period_ns, uncertainty_ns)
     shortest_s = 1e-9 * period_ns * float(step.min())
     if shortest_s < _OVERLAP * duration_s:
-        faults.append(
-            f"measurements begin every {1e3 * shortest_s:.4g} ms, but last {1e3 * duration_s:.4g} ms according to the "
-            "settings"
-        )
+        begin = f"measurements begin every {1e3 * shortest_s:.4g} ms"
+        faults.append((f"{begin}, but last {1e3 * duration_s:.4g} ms according to the settings", _RATE_REMEDY))
     found = ClockCheck(rate_hz=1e9 / period_ns, faults=tuple(faults))
     if jitter_ns < _COMPUTED_NS:
         return replace(found, drift_unknown="the time stamps were computed from the counter")
@@ -148,7 +150,7 @@ def _runs(stamps: Sequence[Stamp]) -> list[_Run]:
     return found
 
 
-def _miscounts(extra: NDArray[np.float64], at: NDArray[np.int64]) -> list[str]:
+def _miscounts(extra: NDArray[np.float64], at: NDArray[np.int64]) -> list[tuple[str, str]]:
     """Return a fault for the first interval that differs from its count by whole periods, and stays so.
 
     A late time stamp makes one interval longer and the next one shorter, which is not a fault.
@@ -159,10 +161,9 @@ def _miscounts(extra: NDArray[np.float64], at: NDArray[np.int64]) -> list[str]:
         around = extra[max(0, place - 1) : place + 2].sum()
         if abs(round(float(around))) >= 1:
             count = int(whole[place])
-            more = f"{abs(count)} {'pulse' if abs(count) == 1 else 'pulses'}"
-            return [
-                f"the counter has {more} {'fewer' if count > 0 else 'more'} than the time at measurement {at[place]}"
-            ]
+            pulses = f"{abs(count)} {'pulse' if abs(count) == 1 else 'pulses'}"
+            side = "fewer" if count > 0 else "more"
+            return [(f"the counter has {pulses} {side} than the time at measurement {at[place]}", _COUNT_REMEDY)]
     return []
 
 
@@ -200,7 +201,9 @@ def _with_drift(found: ClockCheck, nominal_rate_hz: float | None) -> ClockCheck:
     drift_ppm = 1e6 * (found.rate_hz / nominal_rate_hz - 1)
     if abs(drift_ppm) > 1e6 * _MAX_DEVIATION:
         text = f"measurements have a rate of {found.rate_hz:.4g} Hz, but the nominal rate is {nominal_rate_hz:g} Hz"
-        return replace(found, faults=(*found.faults, text), drift_unknown="the rate is not the nominal one")
+        return replace(
+            found, faults=(*found.faults, (text, _NOMINAL_REMEDY)), drift_unknown="the rate is not the nominal one"
+        )
     margin_ppm = _DEVIATIONS * found.rate_sd_ppm
     if abs(drift_ppm) - margin_ppm > MAX_DRIFT_PPM:
         side = "fast" if drift_ppm > 0 else "slow"

@@ -7,7 +7,7 @@ from typing import Final
 
 from ertis_numba import checks
 from ertis_numba.analysis.call_match import first_call_match
-from ertis_numba.analysis.health import health, merge
+from ertis_numba.analysis.health import Health, health, merge
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones
@@ -23,6 +23,8 @@ from ertis_numba.storage.verify import SensorReport, verify
 __all__ = ["check_recording"]
 
 _MAX_EXAMINED: Final = 8
+_CALIBRATED: Final = frozenset({"gain", "inverted polarity", "late", "swapped"})
+"""Faults with which the sound of a channel can still be compared with the others."""
 _MAX_BITS_EXAMINED: Final = 64  # Takes 7 ms for each measurement of 163,840 words.
 
 
@@ -121,7 +123,7 @@ def _check_sensor(
         clock = check_clock(recording.stamps(), used.recording.duration_s, nominal_rate_hz)
     report = merge([health(measurement) for measurement in heard]) if heard else None
     match = first_call_match(heard)
-    residuals, why = _calibration_residuals(heard)
+    residuals, why = _calibration_residuals(heard, report)
     layout = microphones(used.array)
     found: dict[str, items.CheckResult] = {
         items.MICROPHONES: items.of_microphones(report),
@@ -135,7 +137,7 @@ def _check_sensor(
     }
     return SensorCheck(
         sensor=stored.sensor,
-        layout=used.array.layout,
+        settings=used,
         n_microphones=int(layout.enabled.sum()),
         items=tuple(CheckItem(check=name, result=each.result, detail=each.detail) for name, each in found.items()),
         faults=tuple(fault for each in found.values() for fault in each.faults),
@@ -161,9 +163,16 @@ def _with_settings(measurement: Measurement, used: Settings) -> Measurement:
     return replace(measurement, settings=used.replace(air=measurement.settings.air))
 
 
-def _calibration_residuals(heard: Sequence[Measurement]) -> tuple[CalibrationResiduals | None, str]:
+def _calibration_residuals(
+    heard: Sequence[Measurement], report: Health | None
+) -> tuple[CalibrationResiduals | None, str]:
     """Return the deviations from the layout, or the reason why they are not known."""
+    if report is None:
+        return None, "no measurement is intact"
+    faulty = [channel.channel for channel in report.channels if not _CALIBRATED.issuperset(channel.faults)]
+    if len(faulty) == len(report.channels):
+        return None, "every channel is faulty"
     try:
-        return calibration_residuals(heard), ""
+        return calibration_residuals(heard, faulty), ""
     except (ArgumentError, DataError) as error:
         return None, str(error)

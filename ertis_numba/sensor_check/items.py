@@ -139,6 +139,8 @@ def of_storage(stored: SensorReport) -> CheckResult:
     def add(text: str, remedy: str) -> None:
         faults.append(CheckFault(check=MEASUREMENTS, text=text, remedy=remedy))
 
+    if not stored.measurements:
+        add("there are no measurements", "record again")
     if stored.gaps:
         reasons = ", ".join(dict.fromkeys(gap.reason for gap in stored.gaps))
         numbered = stored.missing + stored.measurements
@@ -155,8 +157,7 @@ def of_storage(stored: SensorReport) -> CheckResult:
 
 def of_timing(clock: ClockCheck) -> CheckResult:
     """Return the rate of the measurements, and contradictions of counters and times."""
-    remedy = "check the trigger, and recording.sample_rate_hz and recording.n_samples of the settings"
-    faults = [CheckFault(check=TIMING, text=text, remedy=remedy) for text in clock.faults]
+    faults = [CheckFault(check=TIMING, text=text, remedy=remedy) for text, remedy in clock.faults]
     if clock.timing_unknown and not faults:
         return CheckResult("not known", clock.timing_unknown)
     detail = f"{clock.rate_hz:.6g} Hz" if clock.rate_hz is not None else ""

@@ -4,6 +4,7 @@ import base64
 import html
 import io
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -97,8 +98,10 @@ def _of_recording(checked: RecordingCheck) -> str:
 
 
 def _of_sensor(path: Path, checked: SensorCheck) -> str:
-    count = f"{len(checked.examined)} of {checked.stored.measurements} measurements examined"
-    about = f"{checked.layout}, {checked.n_microphones} microphones; {count}"
+    about = (
+        f"Layout {checked.settings.array.layout}, microphones: {checked.n_microphones}, measurements: "
+        f"{checked.stored.measurements}, examined: {len(checked.examined)}"
+    )
     rows = [
         [(_text(item.check), ""), (_text(item.result), f"result {_CLASSES[item.result]}"), (_text(item.detail), "")]
         for item in checked.items
@@ -144,7 +147,7 @@ def _pictures(path: Path, checked: SensorCheck) -> list[str]:
         return []
     index = checked.examined[0]
     with open_recording(path, sensor=checked.sensor) as recording:
-        measurement = recording[index]
+        measurement = replace(recording[index], settings=checked.settings)
     return [_picture(name, measurement, index) for name in _PLOTS]
 
 
@@ -173,4 +176,4 @@ def _text(text: str) -> str:
 
 
 def _number(value: float | None) -> str:
-    return "–" if value is None else f"{value:.1f}"
+    return "–" if value is None else f"{round(value, 1) + 0.0:.1f}"  # Adding 0.0 turns -0.0 into 0.0.

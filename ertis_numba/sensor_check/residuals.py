@@ -1,7 +1,7 @@
 """Deviations of the microphones from the layout in use, from the strongest echo."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 
 from ertis_numba.calibration import Calibration, calibrate
 from ertis_numba.frames import Measurement
@@ -44,8 +44,14 @@ class CalibrationResiduals:
     findings: tuple[ArrayFinding, ...] = ()
 
 
-def calibration_residuals(measurements: Sequence[Measurement]) -> CalibrationResiduals:
+def calibration_residuals(measurements: Sequence[Measurement], faulty: Collection[int]) -> CalibrationResiduals:
     """Return the deviations from the layout, by the echo of a reflector; positions are those of the layout.
+
+    Parameters
+    ----------
+    measurements : sequence of Measurement
+    faulty : collection of int
+        Channels without usable sound, which are left out.
 
     Raises
     ------
@@ -54,7 +60,7 @@ def calibration_residuals(measurements: Sequence[Measurement]) -> CalibrationRes
     DataError
         No echo is strong and simple enough, or too few microphones receive it.
     """
-    found = calibrate(measurements, target="reflector", position_tolerance_m=0.0)
+    found = calibrate([_without(each, faulty) for each in measurements], target="reflector", position_tolerance_m=0.0)
     return CalibrationResiduals(
         channels=tuple(int(channel) for channel in found.channels),
         delay_s=tuple(found.delay_s.tolist()),
@@ -64,6 +70,13 @@ def calibration_residuals(measurements: Sequence[Measurement]) -> CalibrationRes
         rms_s=found.residuals.before_s,
         findings=_findings(found),
     )
+
+
+def _without(measurement: Measurement, channels: Collection[int]) -> Measurement:
+    """Return a measurement with further channels disabled."""
+    array = measurement.settings.array
+    disabled = tuple(sorted({*(array.disabled or ()), *channels}))
+    return replace(measurement, settings=measurement.settings.replace(array=array.replace(disabled=disabled)))
 
 
 def _findings(found: Calibration) -> tuple[ArrayFinding, ...]:

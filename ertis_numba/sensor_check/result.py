@@ -9,6 +9,7 @@ from ertis_numba.analysis.health import Health
 from ertis_numba.sensor_check.clock import ClockCheck
 from ertis_numba.sensor_check.lost_words import LostWords
 from ertis_numba.sensor_check.residuals import CalibrationResiduals
+from ertis_numba.settings import Settings
 from ertis_numba.storage.verify import SensorReport
 
 __all__ = ["CheckFault", "CheckItem", "RecordingCheck", "SensorCheck"]
@@ -60,8 +61,8 @@ class SensorCheck:
     ----------
     sensor : str
         Name of the sensor.
-    layout : str
-        Name of the layout in use.
+    settings : Settings
+        Settings in use.
     n_microphones : int
         Number of enabled microphones.
     items : tuple of CheckItem
@@ -85,7 +86,7 @@ class SensorCheck:
     """
 
     sensor: str
-    layout: str
+    settings: Settings
     n_microphones: int
     items: tuple[CheckItem, ...]
     faults: tuple[CheckFault, ...]

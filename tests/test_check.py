@@ -1,0 +1,422 @@
+"""``ertis check``: verdict on recordings of healthy and faulty sensors, JSON, exit codes and the HTML page."""
+
+import dataclasses
+import functools
+import html.parser
+import json
+import re
+
+import h5py
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from ertis_cli.main import cli
+
+from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.frames import Measurement, Stamp
+from ertis_numba.geometry import load_layout
+from ertis_numba.sensor_check import check_recording, write_page
+from ertis_numba.sensor_check.clock import check_clock
+from ertis_numba.settings import Array, Recording
+from ertis_numba.simulation import Electronics, Point
+from ertis_numba.storage import write_energyscapes, write_recording
+from tests import files
+from tests.health_recordings import BY_HAND, DATA, REAL, real, rendered, sound, with_bits
+from tests.scenes import SENSOR
+
+START_NS = 1_700_000_000_000_000_000
+JITTER_NS = np.random.default_rng(8).normal(0, 1e5, 200)
+
+
+def run(*arguments, code=0):
+    done = CliRunner().invoke(cli, ["check", *(str(argument) for argument in arguments)])
+    assert done.exit_code == code, (done.stdout, done.stderr, done.exception)
+    return done
+
+
+def stamp(number, *, count=None, time_s=None, late_ns=0, session_id=1):
+    """A stamp of 10 Hz with the jitter of a host."""
+    time_s = number / 10 if time_s is None else time_s
+    time_ns = START_NS + round(time_s * 1e9) + round(JITTER_NS[number]) + late_ns
+    count = number if count is None else count
+    return Stamp(sequence=number, sync_count=count, timestamp_ns=time_ns, session_id=session_id)
+
+
+def stored(path, *measurements, **options):
+    """Write measurements with regular stamps."""
+    given = [dataclasses.replace(each, stamp=stamp(number)) for number, each in enumerate(measurements)]
+    return write_recording(path, given, **options)
+
+
+def verdict_of(path):
+    """Last line of the command, without the folder; the exit code must agree."""
+    done = CliRunner().invoke(cli, ["check", str(path)])
+    verdict = done.stdout.splitlines()[-1].replace(f"{path.parent}/", "")
+    assert done.exit_code == (0 if ": fit for use" in verdict else 1), (done.stderr, done.exception)
+    return verdict
+
+
+def results(checked, sensor=0):
+    return {item.check: item.result for item in checked.sensors[sensor].items}
+
+
+@functools.cache
+def plane_array():
+    """A measurement of an array of 32 microphones, with one echo from the side."""
+    sensor = SENSOR.replace(
+        array=Array(), recording=Recording(n_samples=65_536), electronics=Electronics(noise_dbfs=-45.0)
+    )
+    return rendered(sensor, Point(azimuth_deg=25, elevation_deg=10, range_m=0.9, strength_db=-5))
+
+
+# Verdicts on recordings.
+
+
+def test_healthy_recordings_are_fit_for_use(tmp_path):
+    for name in ("reflectors", "line"):
+        checked = check_recording(DATA / f"{name}.h5")
+        assert checked.is_fit
+        assert "fault" not in results(checked).values()
+    checked = check_recording(stored(tmp_path / "a.h5", real(), real(), real()))
+    assert checked.verdict == f"{tmp_path / 'a.h5'}: fit for use; not known: clock drift, calibration"
+    assert results(checked) == {
+        "microphones": "ok",
+        "noise floor": "ok",
+        "samples": "ok",
+        "measurements": "ok",
+        "timing": "ok",
+        "clock drift": "not known",
+        "call": "ok",
+        "calibration": "not known",
+    }
+
+
+@pytest.mark.parametrize(
+    ("name", "fault"),
+    [
+        ("dead", "channel 3 is dead and has white bits, as without a microphone"),
+        ("saturated", "channel 3 is saturated and dead"),
+        ("stuck at 1", "channel 3 is stuck at 1"),
+        ("offset", "channel 3 is dead and noisy and has an offset and an idle tone"),
+    ],
+)
+def test_faulty_channel_is_named_with_its_remedy(tmp_path, name, fault):
+    path = stored(tmp_path / "a.h5", BY_HAND[name]())
+    assert verdict_of(path) == f"a.h5: 1 fault: {fault}. Remedy: exclude channel 3 (--without 3)"
+    assert run(path, "--without", "3").stdout.splitlines()[-1].startswith(f"{path}: fit for use")
+
+
+def test_channels_with_equal_faults_are_one_fault(tmp_path):
+    silent = with_bits(with_bits(BY_HAND["stuck at 0"](), 5, np.zeros(65_536)), 6, np.ones(65_536))
+    path = stored(tmp_path / "a.h5", silent)
+    assert verdict_of(path) == (
+        "a.h5: 2 faults: channels 3 and 5 are stuck at 0; channel 6 is stuck at 1. "
+        "Remedy: exclude channels 3 and 5 (--without 3,5); exclude channel 6 (--without 6)"
+    )
+
+
+def test_saturated_array_asks_for_less_level(tmp_path):
+    loud = dataclasses.replace(sound(), data=np.where(np.arange(65_536) // 400 % 2, 255, 0).astype("u1"))
+    verdict = verdict_of(stored(tmp_path / "a.h5", loud))
+    assert "every channel is saturated" in verdict
+    assert "emit less, or move the array away from near objects, and record again" in verdict
+
+
+def swapped(measurement, first, second):
+    words = measurement.data
+    differ = ((words >> first) ^ (words >> second)) & 1
+    return dataclasses.replace(measurement, data=words ^ ((differ << first) | (differ << second)))
+
+
+def test_dead_and_swapped_channels_are_reported_together(tmp_path):
+    array = plane_array()
+    silent = with_bits(swapped(array, 5, 12), 7, np.zeros(65_536))
+    path = stored(tmp_path / "a.h5", silent)
+    assert verdict_of(path).startswith(
+        "a.h5: 2 faults: channels 5 and 12 are swapped; channel 7 is stuck at 0. Remedy: "
+    )
+
+
+def test_silence_is_not_fit_for_use(tmp_path):
+    noise = np.random.default_rng(1).integers(0, 2**32, 163_840, dtype="u4")
+    verdict = verdict_of(stored(tmp_path / "a.h5", Measurement(noise, REAL, Stamp())))
+    assert verdict.startswith(
+        "a.h5: 3 faults: faulty microphones cannot be detected (dead microphones: no sound exceeds"
+    )
+    assert re.search(r"the noise of -19\.\d dBFS is that of random bits; 1 of 1 examined .* has random bits", verdict)
+    quiet = rendered(SENSOR.replace(array=Array(), recording=Recording(n_samples=65_536)), Point(range_m=5.9))
+    assert "faulty microphones cannot be detected (" in verdict_of(stored(tmp_path / "b.h5", quiet))
+
+
+def test_lost_words_are_found(tmp_path):
+    words = real().data.copy()
+    words[60_000:-5] = words[60_005:]
+    cut = Measurement(words, REAL, Stamp())
+    checked = check_recording(stored(tmp_path / "a.h5", real(), cut))
+    assert checked.sensors[0].words.reasons == {1: "splice"}
+    assert checked.verdict.endswith(
+        "a.h5: 1 fault: 1 of 2 examined measurements has lost or misplaced words, the first at 1. "
+        "Remedy: check the link to the sensor, and record again"
+    )
+
+
+def test_missing_measurements_are_a_fault(tmp_path):
+    given = [dataclasses.replace(sound(), stamp=stamp(number)) for number in (0, 1, 4, 5)]
+    path = write_recording(tmp_path / "a.h5", given)
+    assert verdict_of(path).startswith(
+        "a.h5: 1 fault: 2 of 6 measurements are missing (not among the measurements given). Remedy: check"
+    )
+
+
+def test_damaged_measurements_are_a_fault_and_the_others_are_examined(tmp_path):
+    path = stored(tmp_path / "a.h5", sound(), sound(), sound())
+    with h5py.File(path, "r+") as file:
+        file["sensors/sensor/pdm"][0, 5] ^= 1
+    checked = check_recording(path)
+    assert checked.sensors[0].examined == (1, 2)
+    assert checked.verdict.endswith(
+        "a.h5: 1 fault: 1 of 3 measurements is damaged. Remedy: copy the file again, or record again"
+    )
+
+
+def test_recording_with_damaged_content_is_not_fit(tmp_path):
+    path = stored(tmp_path / "a.h5", sound())
+    with h5py.File(path, "r+") as file:
+        file["sensors/sensor/sequence"][0] = 5
+    assert re.fullmatch(
+        r"a.h5: 1 fault: the content of sensor sensor has SHA-256 .*the file is damaged\. Remedy: copy it again",
+        verdict_of(path),
+    )
+
+
+def test_files_that_cannot_be_read_are_errors(tmp_path):
+    whole = stored(tmp_path / "a.h5", sound())
+    cut = tmp_path / "cut.h5"
+    cut.write_bytes(whole.read_bytes()[:9000])
+    image = write_energyscapes(tmp_path / "image.h5", [files.image()])
+    absent = tmp_path / "absent.h5"
+    done = run(cut, image, absent, whole, "--quiet", code=1)
+    errors = done.stderr.splitlines()
+    assert [line.split(": ", 2)[:2] for line in errors] == [["ertis", "error"]] * 3
+    assert "cut short or damaged" in errors[0]
+    assert f"{image} is an energyscape file, wanted a recording; give the recording it was made from" in errors[1]
+    assert f"{absent}: No such file or directory" in errors[2]
+    assert done.stdout == ""
+    objects = [json.loads(line) for line in run(cut, whole, "--json", code=1).stdout.splitlines()]
+    assert [each["fit"] for each in objects] == [False, True]
+    with pytest.raises(DataError, match="is an energyscape file"):
+        check_recording(image)
+
+
+def test_sensors_of_a_file_are_named(tmp_path):
+    named = [
+        dataclasses.replace(each, stamp=dataclasses.replace(stamp(number), sensor=name))
+        for name, each in (("left", sound()), ("right", BY_HAND["stuck at 0"]()))
+        for number in range(2)
+    ]
+    path = write_recording(tmp_path / "a.h5", named)
+    assert verdict_of(path).startswith("a.h5: 1 fault: sensor right: channel 3 is stuck at 0. Remedy: ")
+
+
+def test_echoes_of_another_call_are_a_fault(tmp_path):
+    call = real().settings.call
+    other = call.replace(start_frequency_hz=call.stop_frequency_hz, stop_frequency_hz=call.start_frequency_hz)
+    (tmp_path / "s.toml").write_text(
+        f"[call]\nstart_frequency_hz = {other.start_frequency_hz}\nstop_frequency_hz = {other.stop_frequency_hz}\n"
+    )
+    path = stored(tmp_path / "a.h5", real())
+    last = run(path, "--settings", tmp_path / "s.toml", code=1).stdout.splitlines()[-1]
+    assert "echoes do not match the call of the settings" in last
+    assert last.endswith("give the emitted call as [call] in a settings file")
+
+
+def test_another_layout_deviates(tmp_path):
+    path = stored(tmp_path / "a.h5", plane_array())
+    assert results(check_recording(path))["calibration"] == "ok"
+    places_m = tuple(map(tuple, load_layout("eRTIS_v3D1").positions_m.tolist()))
+    late = Array(positions_m=places_m, delay_s=tuple(30e-6 * (channel == 9) for channel in range(32)))
+    checked = check_recording(path, settings=lambda settings: settings.replace(array=late))
+    assert [fault.text.split(" by")[0] for fault in checked.faults] == ["channel 9 is late"]
+
+
+# Timing.
+
+
+def timed(*numbers, **changes):
+    return [stamp(number, **changes) for number in numbers]
+
+
+def test_rate_jitter_and_drift_are_measured():
+    stamps = [stamp(number, time_s=number * 0.1 * (1 + 30e-6)) for number in range(200)]
+    clock = check_clock(stamps, 0.04, 10.0)
+    assert clock.rate_hz == pytest.approx(10, rel=40e-6)
+    assert clock.jitter_s == pytest.approx(1e-4, rel=0.2)
+    assert clock.drift_ppm == pytest.approx(-30, abs=4 * clock.rate_sd_ppm)
+    assert (clock.faults, clock.drift_fault, clock.drift_unknown) == ((), "", "")
+    assert check_clock(stamps, 0.04).drift_unknown == "the nominal rate is not known; give it as --rate"
+
+
+def test_fast_clock_is_a_fault():
+    stamps = [stamp(number, time_s=number * 0.1 * (1 - 300e-6)) for number in range(200)]
+    assert re.match(
+        r"the clock runs (29\d|30\d) ppm fast relative to the host", check_clock(stamps, 0.04, 10).drift_fault
+    )
+
+
+def test_short_recording_does_not_show_the_drift():
+    assert "is not precise enough; record for a longer time" in check_clock(timed(*range(5)), 0.04, 10.0).drift_unknown
+
+
+def test_late_time_stamps_are_no_fault():
+    stamps = [stamp(number, late_ns=95_000_000 * (number in {20, 90})) for number in range(150)]
+    clock = check_clock(stamps, 0.04, 10.0)
+    assert clock.faults == ()
+    assert clock.jitter_s < 2e-4
+    assert clock.drift_fault == ""
+
+
+def test_uncounted_pulses_are_a_fault():
+    stamps = [stamp(number, time_s=(number + 3 * (number >= 50)) / 10) for number in range(100)]
+    ((text, remedy),) = check_clock(stamps, 0.04).faults
+    assert text == "the counter has 3 pulses fewer than the time at measurement 50"
+    assert remedy.startswith("check the SYNC cable")
+
+
+def test_measurements_that_overlap_are_a_fault():
+    ((text, _),) = check_clock(timed(*range(30)), 0.11).faults
+    assert re.fullmatch(r"measurements begin every (99\.99|100) ms, but last 110 ms according to the settings", text)
+
+
+def test_falling_time_stamps_are_a_fault():
+    stamps = [stamp(number, late_ns=-(10**10) * (number >= 20)) for number in range(40)]
+    assert check_clock(stamps, 0.04).faults[0][0] == "time stamps fall at measurement 20"
+
+
+def test_rate_far_from_the_nominal_one_is_a_fault():
+    clock = check_clock(timed(*range(40)), 0.04, 12.0)
+    assert clock.faults[0][0] == "measurements have a rate of 10 Hz, but the nominal rate is 12 Hz"
+
+
+@pytest.mark.parametrize(
+    ("stamps", "why"),
+    [
+        ([Stamp(sequence=n, sync_count=n, timestamp_ns=n) for n in range(9)], "not from a clock"),
+        (timed(0, 1), "2 measurements with rising counters are fewer than 3"),
+        (timed(*range(9), count=4), "0 measurements with rising counters"),
+        ([stamp(n, time_s=n**2 / 10) for n in range(30)], "no constant rate"),
+    ],
+)
+def test_timing_may_be_unknown(stamps, why):
+    clock = check_clock(stamps, 0.04)
+    assert why in clock.timing_unknown
+    assert clock.faults == ()
+
+
+def test_sessions_have_their_own_counters():
+    stamps = [*timed(*range(50)), *(stamp(n, time_s=100 + n / 10, count=n - 50, session_id=2) for n in range(50, 150))]
+    clock = check_clock(stamps, 0.04)
+    assert clock.faults == ()
+    assert clock.rate_hz == pytest.approx(10, rel=1e-4)
+
+
+def test_rate_is_validated(tmp_path):
+    path = stored(tmp_path / "a.h5", sound())
+    with pytest.raises(ArgumentError, match="nominal_rate_hz is nan; give a"):
+        check_recording(path, nominal_rate_hz=float("nan"))
+
+
+# Output.
+
+
+def test_json_has_one_object_for_each_file(tmp_path):
+    healthy, silent = stored(tmp_path / "a.h5", real()), stored(tmp_path / "b.h5", BY_HAND["stuck at 0"]())
+    done = run(healthy, silent, "--json", code=1)
+    first, second = (json.loads(line) for line in done.stdout.splitlines())
+    assert (first["file"], first["fit"], first["faults"]) == (str(healthy), True, [])
+    assert first["sensors"][0]["dynamic_range_db"] == pytest.approx(84, abs=3)
+    assert [item["check"] for item in first["sensors"][0]["checks"]][:2] == ["microphones", "noise floor"]
+    assert second["fit"] is False
+    assert second["faults"] == [
+        {
+            "check": "microphones",
+            "text": "channel 3 is stuck at 0",
+            "remedy": "exclude channel 3 (--without 3)",
+        }
+    ]
+    assert second["sensors"][0]["faulty_channels"] == {"stuck at 0": [3]}
+
+
+def test_quiet_prints_only_faults(tmp_path):
+    healthy, silent = stored(tmp_path / "a.h5", sound()), stored(tmp_path / "b.h5", BY_HAND["stuck at 0"]())
+    assert run(healthy, silent, "--quiet", code=1).stdout.startswith(f"{silent}: 1 fault: channel 3 is stuck at 0. ")
+
+
+class Page(html.parser.HTMLParser):
+    """Tags and attributes of a page."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.open, self.text = [], [], ""
+        self.feed(text)
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        if tag not in {"meta", "img"}:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text += data
+
+
+def test_page_has_all_results_and_no_external_resource(tmp_path):
+    healthy, silent = stored(tmp_path / "a.h5", sound()), stored(tmp_path / "b.h5", BY_HAND["stuck at 0"]())
+    done = run(healthy, silent, "--report", tmp_path / "r.html", code=1)
+    assert done.stderr.endswith("r.html: report of 2 files\n")
+    page = Page((tmp_path / "r.html").read_text("utf-8"))
+    pictures = [attributes["src"] for tag, attributes in page.tags if tag == "img"]
+    assert len(pictures) == 4
+    assert all(picture.startswith("data:image/png;base64,iVBOR") for picture in pictures)
+    assert {tag for tag, _ in page.tags} <= {
+        *("html", "head", "meta", "title", "style", "body", "h1", "h2", "h3", "section"),
+        *("p", "div", "table", "tr", "th", "td", "ul", "li", "img"),
+    }
+    assert not [attributes for tag, attributes in page.tags if "href" in attributes or "srcset" in attributes]
+    for checked in map(check_recording, (healthy, silent)):
+        assert checked.verdict in page.text
+        assert all(item.detail in page.text for item in checked.sensors[0].items)
+    assert ("meta", {"name": "viewport", "content": "width=device-width, initial-scale=1"}) in page.tags
+
+
+def test_page_escapes_texts_of_files(tmp_path):
+    name = "<img src=x onerror=alert(1)>'\".h5"
+    layout = dataclasses.replace(
+        sound(), settings=sound().settings.replace(array=sound().settings.array.replace(layout="<b>&'"))
+    )
+    path = stored(tmp_path / name, layout)
+    target = write_page(tmp_path / "r.html", [check_recording(path)])
+    page = Page(target.read_text("utf-8"))
+    assert name in page.text
+    assert "Layout <b>&'" in page.text
+    assert not [attributes for _, attributes in page.tags if "onerror" in attributes]
+
+
+def test_page_is_not_overwritten_without_force(tmp_path):
+    path = stored(tmp_path / "a.h5", sound())
+    target = tmp_path / "r.html"
+    target.write_text("mine")
+    done = run(path, "--report", target, code=1)
+    assert done.stderr == (
+        f"ertis: error: output {target} exists; give another name, or ask to overwrite it (--force)\n"
+    )
+    assert done.stdout == ""
+    assert target.read_text() == "mine"
+    assert "is the input itself" in run(path, "--report", path, "--force", code=1).stderr
+    before = path.read_bytes()
+    run(path, "--report", target, "--force", "--quiet")
+    assert path.read_bytes() == before
+    assert target.read_text("utf-8").startswith("<!DOCTYPE html>")
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["a.h5", "r.html"]
