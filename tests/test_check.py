@@ -12,16 +12,18 @@ import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
+from ertis_numba.analysis.health import limits
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.geometry import load_layout
 from ertis_numba.sensor_check import check_recording, write_page
-from ertis_numba.sensor_check.clock import check_clock
+from ertis_numba.sensor_check.clock import MAX_DRIFT_PPM, check_clock
 from ertis_numba.settings import Array, Recording
 from ertis_numba.simulation import Electronics, Point
 from ertis_numba.storage import write_energyscapes, write_recording
 from tests import files
 from tests.health_recordings import BY_HAND, DATA, REAL, real, rendered, sound, with_bits
+from tests.pages import path_of, python_in, run_code_here
 from tests.scenes import SENSOR
 
 START_NS = 1_700_000_000_000_000_000
@@ -111,7 +113,7 @@ def test_channels_with_equal_faults_are_one_fault(tmp_path):
     path = stored(tmp_path / "a.h5", silent)
     assert verdict_of(path) == (
         "a.h5: 2 faults: channels 3 and 5 are stuck at 0; channel 6 is stuck at 1. "
-        "Remedy: exclude channels 3 and 5 (--without 3,5); exclude channel 6 (--without 6)"
+        "Remedy: exclude channels 3, 5 and 6 (--without 3,5,6)"
     )
 
 
@@ -420,3 +422,23 @@ def test_page_is_not_overwritten_without_force(tmp_path):
     assert path.read_bytes() == before
     assert target.read_text("utf-8").startswith("<!DOCTYPE html>")
     assert sorted(each.name for each in tmp_path.iterdir()) == ["a.h5", "r.html"]
+
+
+def test_check_page_shows_the_printed_output(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    page = path_of("check").read_text("utf-8")
+    for block in re.findall(r"```\n(.*?)```", page, re.DOTALL):
+        for part in block.split("$ ertis ")[1:]:
+            command, shown = part.split("\n", 1)
+            done = CliRunner().invoke(cli, command.split())
+            assert not shown or done.stdout == shown, command
+            assert done.exit_code == int("fault:" in shown or "faults:" in shown), command
+    (code,) = python_in(page)
+    run_code_here(tmp_path, code)
+    assert Page((tmp_path / "REPORT.html").read_text("utf-8")).text.count("fit for use") == 1
+
+
+def test_page_of_limits_has_the_limits():
+    page = " ".join(path_of("health-checks").read_text("utf-8").split())
+    assert f"more than {MAX_DRIFT_PPM:g} ppm" in page
+    assert f"{1e6 * limits.MAX_DELAY_S:g} µs or {limits.MAX_GAIN_DB:g} dB" in page

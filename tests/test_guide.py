@@ -39,6 +39,8 @@ RUN_BY = {
     ("beamformers", "$"): ["test_guide::test_commands_of_the_guide_run"],
     ("calibrate", "$"): ["test_calibrate_command::test_commands_and_code_of_the_page_run"],
     ("calibrate", "python"): ["test_calibrate_command::test_commands_and_code_of_the_page_run"],
+    ("check", "$"): ["test_check::test_check_page_shows_the_printed_output"],
+    ("check", "python"): ["test_check::test_check_page_shows_the_printed_output"],
     ("command-line", "$"): ["test_config::test_command_line_page_runs", "test_config::test_completion_for_each_shell"],
     ("concepts", "python"): ["test_guide::test_code_of_the_concepts_page_runs"],
     ("cuda", "$"): ["test_guide::test_commands_of_the_gpu_page_run"],

@@ -59,7 +59,8 @@ COPY: Final = "copy the file again, or record again"
 """Remedy for damaged files."""
 
 _DEVIATIONS: Final = 4.0
-_CALIBRATE: Final = "calibrate the array, or give its own layout (--settings)"
+_WORTH_S: Final = 1e-6  # 18 degrees of a period at 50 kHz.
+_CALIBRATE: Final = "calibrate the array (ertis calibrate), or give its own layout (--settings)"
 
 
 class CheckResult(NamedTuple):
@@ -213,8 +214,10 @@ def of_calibration(residuals: CalibrationResiduals | None, why: str, report: Hea
         channels = channels_in_words([residuals.channels[place] for place in beyond])
         text = f"{channels} {verb} from the layout by {_worst(residuals, beyond)}"
         faults.append(CheckFault(check=CALIBRATION, text=text, remedy=_CALIBRATE))
-    rms = f"{1e6 * residuals.rms_s:.2g} µs RMS from the layout"
-    return _result_of(faults, f"{rms}; {_worst(residuals, every)}")
+    detail = f"{1e6 * residuals.rms_s:.2g} µs RMS from the layout; {_worst(residuals, every)}"
+    if residuals.rms_s > _WORTH_S:
+        detail += "; 'ertis calibrate' reduces this"
+    return _result_of(faults, detail)
 
 
 def _worst(residuals: CalibrationResiduals, places: Sequence[int]) -> str:

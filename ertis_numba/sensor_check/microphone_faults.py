@@ -55,11 +55,12 @@ def microphone_faults(report: Health) -> tuple[CheckFault, ...]:
         names = tuple(name for name in channel.faults if name not in _IN_PAIRS)
         if names:
             alike.setdefault(names, []).append(channel.channel)
+    excluded = sorted({each for names, group in alike.items() if kind_of(names[0]).remedy == DISABLE for each in group})
     for names, channels in alike.items():
         every = len(channels) == len(report.channels) > 1
         who = "every channel" if every else channels_in_words(channels)
         text = f"{who} {_predicate(names, is_one=every or len(channels) == 1)}"
-        faults.append(CheckFault(check=MICROPHONES, text=text, remedy=_remedy(names[0], channels, every=every)))
+        faults.append(CheckFault(check=MICROPHONES, text=text, remedy=_remedy(names[0], excluded, every=every)))
     return tuple(sorted(faults, key=lambda fault: [int(number) for number in re.findall(r"\d+", fault.text)]))
 
 
@@ -82,12 +83,13 @@ def _groups(findings: Sequence[Finding], name: str) -> dict[tuple[int, ...], str
     return groups
 
 
-def _remedy(name: str, channels: Sequence[int], *, every: bool) -> str:
+def _remedy(name: str, excluded: Sequence[int], *, every: bool) -> str:
+    """Return the remedy of a fault; channels to exclude are those of all faults, for a single option."""
     if every:
         return _SATURATED_REMEDY if name == "saturated" else _EVERY_REMEDY
     remedy = kind_of(name).remedy
     if remedy == DISABLE:
-        return f"exclude {channels_in_words(channels)} (--without {','.join(map(str, channels))})"
+        return f"exclude {channels_in_words(excluded)} (--without {','.join(map(str, excluded))})"
     return remedy
 
 
