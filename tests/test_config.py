@@ -107,7 +107,7 @@ def test_variables_that_are_not_options_cause_no_warning(images):
     ("line", "message"),
     [
         ("proces a.h5", "No such command 'proces' (did you mean 'process'?); see 'ertis --help'"),
-        ("xyz", "No such command 'xyz' (choose one of bench, calibrate, capture, "),
+        ("xyz", "No such command 'xyz' (choose one of bench, calibrate, capture, check, "),
     ],
 )
 def test_unknown_command_suggests_known_ones(tmp_path, line, message):
