@@ -18,6 +18,7 @@ from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.geometry import load_layout
 from ertis_numba.sensor_check import check_recording, write_page
 from ertis_numba.sensor_check.clock import MAX_DRIFT_PPM, check_clock
+from ertis_numba.sensor_check.microphone_faults import channels_in_words
 from ertis_numba.settings import Array, Recording
 from ertis_numba.simulation import Electronics, Point
 from ertis_numba.storage import write_energyscapes, write_recording
@@ -115,6 +116,19 @@ def test_channels_with_equal_faults_are_one_fault(tmp_path):
         "a.h5: 2 faults: channels 3 and 5 are stuck at 0; channel 6 is stuck at 1. "
         "Remedy: exclude channels 3, 5 and 6 (--without 3,5,6)"
     )
+
+
+@pytest.mark.parametrize(
+    ("channels", "text"),
+    [
+        ((4,), "channel 4"),
+        ((4, 5), "channels 4 and 5"),
+        ((0, 1, 2, 3, 7, 9, 10), "channels 0 to 3, 7, 9 and 10"),
+        ((3, 5, 6, 7), "channels 3 and 5 to 7"),
+    ],
+)
+def test_channels_are_listed_with_ranges(channels, text):
+    assert channels_in_words(channels) == text
 
 
 def test_saturated_array_asks_for_less_level(tmp_path):

@@ -5,6 +5,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+
 from ertis_numba import checks
 from ertis_numba.analysis.call_match import first_call_match
 from ertis_numba.analysis.health import Health, health, merge
@@ -169,10 +171,14 @@ def _calibration_residuals(
     """Return the deviations from the layout, or the reason why they are not known."""
     if report is None:
         return None, "no measurement is intact"
+    if report.unknown:  # Noise can look like faults of channels.
+        return None, report.unknown[0]
     faulty = [channel.channel for channel in report.channels if not _CALIBRATED.issuperset(channel.faults)]
     if len(faulty) == len(report.channels):
         return None, "every channel is faulty"
     try:
         return calibration_residuals(heard, faulty), ""
+    except np.linalg.LinAlgError:  # Sounds from several places at once can leave the fit without a solution.
+        return None, "no single echo fits the layout"
     except (ArgumentError, DataError) as error:
         return None, str(error)

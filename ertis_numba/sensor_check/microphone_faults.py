@@ -17,7 +17,7 @@ _POSSESSED: Final = {
     "offset": "an offset",
     "low-frequency hum": "low-frequency hum",
     "idle tone": "an idle tone",
-    "gain": "another gain",
+    "gain": "a deviating gain",
     "white bits": "white bits, as without a microphone",
     "flipped bits": "flipped bits",
 }
@@ -36,9 +36,17 @@ _SATURATED_REMEDY: Final = "emit less, or move the array away from near objects,
 
 
 def channels_in_words(channels: Sequence[int]) -> str:
-    """Return a text with the channels, such as ``channels 3, 7 and 12``."""
-    *first, last = (str(channel) for channel in channels)
-    return f"channels {', '.join(first)} and {last}" if first else f"channel {last}"
+    """Return a text with rising channels, such as ``channels 0 to 4, 7 and 12``."""
+    runs: list[list[int]] = []
+    for channel in channels:
+        if runs and channel == runs[-1][-1] + 1:
+            runs[-1].append(channel)
+        else:
+            runs.append([channel])
+    long = [[f"{run[0]} to {run[-1]}"] if len(run) > 2 else list(map(str, run)) for run in runs]
+    *first, last = (part for parts in long for part in parts)
+    text = f"{', '.join(first)} and {last}" if first else last
+    return f"channel{'s' * (len(channels) > 1)} {text}"
 
 
 def microphone_faults(report: Health) -> tuple[CheckFault, ...]:
