@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from ertis_numba import checks
-from ertis_numba.analysis.call_match import first_call_match
+from ertis_numba.analysis.call_match import CallMatch, first_call_match
 from ertis_numba.analysis.health import Health, health, merge
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement
@@ -124,7 +124,7 @@ def _check_sensor(
         heard = [_with_settings(recording[index], used) for index in examined]
         clock = check_clock(recording.stamps(), used.recording.duration_s, nominal_rate_hz)
     report = merge([health(measurement) for measurement in heard]) if heard else None
-    match = first_call_match(heard)
+    match = _best_call_match(heard)
     residuals, why = _calibration_residuals(heard, report)
     layout = microphones(used.array)
     found: dict[str, items.CheckResult] = {
@@ -163,6 +163,17 @@ def _spread(indices: Sequence[int], largest: int) -> list[int]:
 def _with_settings(measurement: Measurement, used: Settings) -> Measurement:
     """Return a measurement with the settings in use, and the air in which it was recorded."""
     return replace(measurement, settings=used.replace(air=measurement.settings.air))
+
+
+def _best_call_match(heard: Sequence[Measurement]) -> CallMatch | None:
+    """Return the first match of the call, otherwise the first mismatch: another sonar may be louder at times."""
+    mismatch = None
+    for measurement in heard:
+        match = first_call_match([measurement])
+        if match is not None and match.matches:
+            return match
+        mismatch = mismatch or match
+    return mismatch
 
 
 def _calibration_residuals(
