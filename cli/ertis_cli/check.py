@@ -64,7 +64,7 @@ def check(
     "not known" if the recording does not show its result; this is not a fault.
     """
     from ertis_numba.atomic_files import check_target
-    from ertis_numba.errors import ErtisError
+    from ertis_numba.errors import DataError
     from ertis_numba.sensor_check import check_recording, write_page
 
     if page is not None:
@@ -77,7 +77,7 @@ def check(
         try:
             with options.note_when_slow(f"checking {path} ...", quiet=quiet):
                 found.append(check_recording(path, settings=used, nominal_rate_hz=nominal_rate_hz))
-        except (ErtisError, OSError) as error:
+        except (DataError, OSError) as error:
             click.echo(f"ertis: error: {error}", err=True)
             if as_json:
                 options.print_json({"file": str(path), "fit": False, "error": str(error)})
