@@ -42,7 +42,7 @@ def ros_findings(domain: int | None, interface: str) -> Iterator[InstallationFin
         f"{options.counted(n_others, 'other participant')} in domain {number} on {interface}",
         ""
         if n_others
-        else "start one; compare ROS_DOMAIN_ID and the interface; let a firewall pass UDP ports "
+        else "start one; compare ROS_DOMAIN_ID and the interface; in the firewall, allow UDP ports "
         f"{first} to {first + 249} and multicast to 239.255.0.1",
     )
     for each in subscribers:
@@ -69,12 +69,12 @@ def _environment() -> Iterator[InstallationFinding]:
             "ROS discovery",
             "bad",
             f"ROS_DISCOVERY_SERVER is {server}; programs then find only those that use this server",
-            "unset it for the programs that shall receive",
+            "unset it for the programs that receive topics",
         )
     reach = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper()
     if reach == "OFF":
         yield InstallationFinding(
-            "ROS discovery", "bad", "ROS_AUTOMATIC_DISCOVERY_RANGE is OFF", "give LOCALHOST or SUBNET"
+            "ROS discovery", "bad", "ROS_AUTOMATIC_DISCOVERY_RANGE is OFF", "set it to LOCALHOST or SUBNET"
         )
 
 
@@ -96,6 +96,6 @@ def _interface(name: str) -> Iterator[InstallationFinding]:
         yield InstallationFinding(
             "ROS interface",
             "bad",
-            f"{name} has no multicast, by which programs find each other",
+            f"{name} has no multicast, which programs need to find each other",
             f"run 'ip link set {name} multicast on', or use another",
         )

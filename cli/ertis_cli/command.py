@@ -14,9 +14,9 @@ __all__ = ["command"]
 def command(*, port: str, texts: tuple[str, ...], as_json: bool) -> None:
     """Send commands to a sensor and print its answers.
 
-    A command is a line such as '!Y,0,0,0'. The documentation of the serial protocol lists the known ones. The command
-    to measure is refused; use 'ertis capture' instead. 'ertis capture' configures the sensor again, and replaces
-    settings that were changed by commands.
+    A command is a line such as '!Y,0,0,0'. The documentation of the serial protocol lists the known commands. The
+    command that starts a measurement is refused; use 'ertis capture' instead. 'ertis capture' configures the sensor
+    again, so it replaces settings that you changed with 'ertis command'.
     """
     from ertis_numba.devices.commands import CustomCommand
     from ertis_numba.devices.driver import SonarDriver

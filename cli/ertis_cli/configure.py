@@ -39,9 +39,8 @@ def configure(
     """Change the settings of a sensor that sends to a central node.
 
     ADDRESS is the address that sensors send to. Give the new settings with --preset or --settings; they replace all
-    former ones. The capture of this sensor ('ertis capture --to') configures all its sensors between two measurements.
-    If one of them cannot use the settings, all keep their former ones. If the central node uses keys, give the key of
-    an admin.
+    former ones. The settings apply to all sensors of the same 'ertis capture --to', between two measurements. If one
+    sensor cannot use them, all keep their former settings. If the central node uses keys, give the key of an admin.
     """
     from ertis_numba import checks
     from ertis_numba.network.central_client import CentralClient

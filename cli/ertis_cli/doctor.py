@@ -22,7 +22,7 @@ _COLUMNS: dict[str, _tables.Side] = dict.fromkeys(("", "check", "found", "remedy
     metavar="DIR",
     help="Folder for recordings; the speed of its disk is measured. The current folder by default.",
 )
-@click.option("--ros", is_flag=True, help="Check only for reasons why ROS 2 programs receive nothing from 'ertis ros'.")
+@click.option("--ros", is_flag=True, help="Only check for reasons why ROS 2 programs receive nothing from 'ertis ros'.")
 @click.option("--domain", type=int, metavar="N", help="With --ros: DDS domain; the value of ROS_DOMAIN_ID by default.")
 @click.option("--interface", metavar="NAME", help="With --ros: network interface; lo by default.")
 @click.pass_context
@@ -33,8 +33,9 @@ def doctor(
     """Check this installation and suggest fixes.
 
     The command checks versions, cores and threads, the GPU, serial ports and their permissions, disk speed and free
-    space, and keys. With --ros, it lists the ROS 2 programs and subscribers that it finds. The exit code is 1 if
-    something does not work. A missing optional part is a note, and does not change the exit code.
+    space, and keys. With --ros, it checks only the environment and the network that ROS 2 topics need, and lists the
+    subscribers that it finds. The exit code is 1 if something does not work. A missing optional part is a note, and
+    does not change the exit code.
     """
     from ertis_cli._diagnosis import CHECKS, InstallationFinding
     from ertis_cli._ros_diagnosis import ros_findings

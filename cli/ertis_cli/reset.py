@@ -15,7 +15,7 @@ __all__ = ["reset"]
 @click.command()
 @click.option("--port", "-p", required=True, metavar="PORT", help="Path, serial number or name of the sensor.")
 @click.option("--pin", type=click.IntRange(1, 40), metavar="N", help="Number of the pin on the board; 7 by default.")
-@click.option("--hook", metavar="COMMAND", help="Program, with arguments, that resets the sensor instead of a pin.")
+@click.option("--hook", metavar="COMMAND", help="Program, with arguments, that resets the sensor; no pin is used.")
 @click.option(
     "--within",
     "within_s",

@@ -101,7 +101,7 @@ class _MaxRate(click.ParamType[Any]):
     "floor_dbfs",
     type=float,
     metavar="DBFS",
-    help="Lowest absolute level of echoes in scans; without it, noise counts as echoes if there are no echoes.",
+    help="Lowest absolute level of echoes in scans; without it, noise counts as an echo in images without echoes.",
 )
 @click.option("--use-sim-time", "sim_time", is_flag=True, help="Keep the times of a file, and publish them on /clock.")
 @click.option(
@@ -116,7 +116,7 @@ class _MaxRate(click.ParamType[Any]):
     "--control",
     type=click.Path(path_type=Path),
     metavar="FILE",
-    help="TOML file of levels, ranges, rates, speed and pauses; read again whenever it changes.",
+    help="TOML file that sets levels, ranges, rates and speed, or pauses; read again whenever it changes.",
 )
 @click.option("--loop", is_flag=True, help="Restart a file at its end.")
 @click.option(
@@ -168,10 +168,10 @@ def ros(
 ) -> None:
     """Publish images and points as live ROS 2 topics.
 
-    ROS need not be installed. ADDRESS is the address at which a central node publishes. A recording is processed with
-    its own settings and published at its original speed. Sensors at each PORT measure as with 'ertis capture', but
-    nothing is stored. The command needs the extra 'ros'. DDS, the middleware of ROS 2, has no passwords: by default,
-    only this machine can read the topics; --interface opens them to a network.
+    ROS need not be installed, but the command needs the extra 'ros'. ADDRESS is the address at which a central node
+    publishes. Files are published at their original speed; a recording is processed with its own settings. The sensor
+    at each PORT measures as with 'ertis capture', but no measurement is stored. DDS, the middleware of ROS 2, has no
+    passwords. By default, only this machine can read the topics; --interface opens them to a network.
     """
     kind = _kind(sources)
     source = " ".join(sources)

@@ -30,8 +30,9 @@ __all__ = ["rtisdev"]
 def rtisdev(*, port: str | None, device: str, method: str | None, script: Path, arguments: tuple[str, ...]) -> None:
     """Run a script for RTIS Dev.
 
-    The script runs unchanged. ertis_numba.rtisdev replaces the closed-source modules rtisserial and rtiscuda, and needs
-    no GPU. The command needs the extra 'rtisdev'.
+    RTIS Dev is the package of the University of Antwerp for eRTIS sensors. Its scripts run unchanged and without a GPU,
+    because ertis_numba.rtisdev replaces the closed-source modules rtisserial and rtiscuda. The command needs the extra
+    'rtisdev'.
     """
     from ertis_numba.extras import extra
 
