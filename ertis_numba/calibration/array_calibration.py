@@ -42,6 +42,7 @@ __all__ = ["calibrate"]
 
 _NEPER_DB: Final = 20 / math.log(10)
 _MIN_MICROPHONES: Final = 8
+_MAX_LEVEL: Final = 4.0  # Largest plausible level of a microphone in expected deviations.
 _NEAR: Final = 3.0  # A sound that is more expected deviations from its expected time is another one.
 _SCALE_S: Final = 5e-6
 _INVERTED_SHARE: Final = 0.8  # Share of the recordings in which an inverted channel is inverted.
@@ -134,7 +135,11 @@ def calibrate(
     heard = hear_all(recordings, layout, target, on_progress)
     enabled = np.flatnonzero(heard.former.enabled)
     is_silent = silent_channels(heard.sounds)
-    used = ~is_silent & ~unclear_channels(heard.sounds) & ~np.isin(enabled, list(heard.copies))
+    used = (
+        ~is_silent
+        & ~unclear_channels(heard.sounds, _MAX_LEVEL * gain_tolerance_db)
+        & ~np.isin(enabled, list(heard.copies))
+    )
     if used.sum() < _MIN_MICROPHONES:
         raise DataError(
             f"{int(used.sum())} of {len(enabled)} channels contain the same sound, but a calibration needs "
@@ -168,15 +173,41 @@ def calibrate(
 def _fitted(job: _Prepared) -> Calibration:
     """Return the calibration, after leaving out recordings that do not agree with the others."""
     seen, inverted = _observed(job)
-    kept, source_m, speed_m_s = job.kept, job.source_m, job.speed_m_s()
-    fit = fit_array(seen, kept.delay_s, kept.positions_m, source_m, speed_m_s, job.target, job.expected)
-    bad = _bad_records(fit.residual_s)
-    if bad.any():
-        _reject(job.heard, bad, fit.residual_s)
-        require_sounds(job.heard, job.target)
-        seen = _rows(seen, ~bad)
-        fit = fit_array(seen, kept.delay_s, kept.positions_m, source_m[~bad], job.speed_m_s(), job.target, job.expected)
+    source_m = job.source_m
+    n_valid = np.isfinite(seen.time_sd_s).sum(axis=1)
+    few = {i: f"{n} microphones receive the same sound" for i, n in enumerate(n_valid) if n < _MIN_MICROPHONES}
+    seen, source_m = _left_out(job, few, seen, source_m)
+    fit = _fit(job, seen, source_m)
+    bad = {
+        int(i): f"it does not agree with the others: residuals of {1e6 * _rms(fit.residual_s[i]):.1f} µs"
+        for i in np.flatnonzero(_bad_records(fit.residual_s))
+    }
+    if bad:
+        seen, source_m = _left_out(job, bad, seen, source_m)
+        fit = _fit(job, seen, source_m)
     return _assembled(job, seen, fit, inverted)
+
+
+def _fit(job: _Prepared, seen: Observations, source_m: NDArray[np.float64]) -> ArrayFit:
+    kept = job.kept
+    return fit_array(seen, kept.delay_s, kept.positions_m, source_m, job.speed_m_s(), job.target, job.expected)
+
+
+def _left_out(
+    job: _Prepared, reasons: dict[int, str], seen: Observations, source_m: NDArray[np.float64]
+) -> tuple[Observations, NDArray[np.float64]]:
+    """Leave out recordings by their places among the usable ones, with reasons; return the rest."""
+    numbers = list(job.heard.sounds)
+    for index, reason in reasons.items():
+        job.heard.rejected[numbers[index]] = reason
+        del job.heard.sounds[numbers[index]]
+    require_sounds(job.heard, job.target)
+    chosen = np.array([index not in reasons for index in range(len(numbers))])
+    return _rows(seen, chosen), source_m[chosen]
+
+
+def _rms(values: NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.nanmean(values**2)))
 
 
 def _observed(job: _Prepared) -> tuple[Observations, NDArray[np.bool_]]:
@@ -217,14 +248,6 @@ def _bad_records(residual_s: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return True for recordings that fit much worse than the others: (record,) bool."""
     typical_s = np.nan_to_num(np.nanmedian(np.abs(residual_s), axis=1), nan=np.inf)
     return np.asarray(typical_s > np.maximum(_MIN_BAD_S, _BAD_RECORD * np.median(typical_s)))
-
-
-def _reject(heard: Heard, bad: NDArray[np.bool_], residual_s: NDArray[np.float64]) -> None:
-    numbers = list(heard.sounds)
-    for index in np.flatnonzero(bad).tolist():
-        rms_us = 1e6 * float(np.sqrt(np.nanmean(residual_s[index] ** 2)))
-        heard.rejected[numbers[index]] = f"it does not agree with the others: residuals of {rms_us:.1f} µs"
-        del heard.sounds[numbers[index]]
 
 
 def _assembled(job: _Prepared, seen: Observations, fit: ArrayFit, inverted: NDArray[np.bool_]) -> Calibration:

@@ -223,20 +223,22 @@ class _Problem:
         self.n_own = 4 if expected.position_m > 0 else 1
         self.n_times = self.n_records * self.n_mics
         self.n_seen = int(np.isfinite(seen.time_sd_s).sum())
-        self.n_priors = self.n_mics * self.n_own
-        self.n_unknown = self.n_priors + 3 * self.n_records
+        self.n_of_mics = self.n_mics * self.n_own
+        self.n_unknown = self.n_of_mics + 3 * self.n_records
         self._precision_us = np.where(np.isfinite(seen.time_sd_s), _US / seen.time_sd_s, 0.0)
         sizes = [expected.delay_s / _US, *(3 * [expected.position_m / _MM])][: self.n_own]
-        self._prior = np.tile(1 / np.array(sizes), self.n_mics)
+        # A line of microphones does not determine the angle around it, so sources have a prior, though a weak one.
+        around = np.repeat(np.linalg.norm(source_m, axis=1) / _MM, 3)
+        self._prior = 1 / np.concatenate([np.tile(sizes, self.n_mics), around])
 
     def start(self) -> NDArray[np.float64]:
-        return np.concatenate([np.zeros(self.n_priors), self._source_m.ravel() / _MM])
+        return np.concatenate([np.zeros(self.n_of_mics), self._source_m.ravel() / _MM])
 
     def split(self, unknown: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
         """Return the changes of delays in µs and of positions in mm, and the sources in metres."""
-        own = unknown[: self.n_priors].reshape(self.n_mics, self.n_own)
+        own = unknown[: self.n_of_mics].reshape(self.n_mics, self.n_own)
         moved_mm = own[:, 1:] if self.n_own == 4 else np.zeros((self.n_mics, 3))
-        source_m = _MM * unknown[self.n_priors :].reshape(-1, 3)
+        source_m = _MM * unknown[self.n_of_mics :].reshape(-1, 3)
         return own[:, 0], moved_mm, source_m
 
     def rest_s(self, unknown: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -246,7 +248,7 @@ class _Problem:
 
     def residuals(self, unknown: NDArray[np.float64]) -> NDArray[np.float64]:
         rest = np.nan_to_num(self.rest_s(unknown) / _US) * self._precision_us
-        return np.concatenate([rest.ravel(), unknown[: self.n_priors] * self._prior])
+        return np.concatenate([rest.ravel(), (unknown - self.start()) * self._prior])
 
     def jacobian(self, unknown: NDArray[np.float64]) -> NDArray[np.float64]:
         _, moved_mm, source_m = self.split(unknown)
@@ -257,12 +259,10 @@ class _Problem:
         for index in range(self.n_own):
             slopes[:, mics, mics * self.n_own + index] = -own[:, :, index]
         for record in range(self.n_records):
-            first = self.n_priors + 3 * record
+            first = self.n_of_mics + 3 * record
             slopes[record, :, first : first + 3] = -model.by_source[record] * (_MM / _US)
         slopes *= self._precision_us[..., None]
-        priors = np.zeros((self.n_priors, self.n_unknown))
-        priors[np.arange(self.n_priors), np.arange(self.n_priors)] = self._prior
-        return np.concatenate([slopes.reshape(-1, self.n_unknown), priors])
+        return np.concatenate([slopes.reshape(-1, self.n_unknown), np.diag(self._prior)])
 
 
 def fit_gains(

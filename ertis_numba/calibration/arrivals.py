@@ -142,6 +142,7 @@ def _between_halves(
     four times its variance in the whole band. A larger difference counts, and its share in the whole band is a quarter.
     """
     middle = len(turn) // 2
+    amplitude = np.where(amplitude == 0, 1e-300, amplitude)  # of a channel that is constant
     late_s, level = [], []
     for half in (slice(None, middle), slice(middle, None)):
         product = aligned[:, half] * np.conj(pulse[half])

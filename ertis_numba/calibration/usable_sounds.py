@@ -8,6 +8,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba import checks
 from ertis_numba.calibration.advice import how_to_record
 from ertis_numba.calibration.channel_order import find_order
 from ertis_numba.calibration.sounds import Sound, Source, find_source, hear, identical_channels
@@ -59,6 +60,7 @@ def hear_all(
     rejected: dict[int, str] = {}
     copies: dict[int, int] = {}
     for number, measurement in enumerate(_measurements(recordings)):
+        checks.instance("recordings", measurement, Measurement, "a recording holds")
         own = microphones(measurement.settings.array)
         if former is None:
             former = own if layout is None else load_layout(str(layout))
@@ -84,10 +86,10 @@ def hear_all(
 
 def _measurements(recordings: Iterable[Any]) -> Iterable[Measurement]:
     for item in [recordings] if isinstance(recordings, Measurement) else recordings:
-        if isinstance(item, Measurement):
-            yield item
-        else:
+        if isinstance(item, Iterable) and not isinstance(item, str):
             yield from item
+        else:
+            yield item
 
 
 def require_sounds(heard: Heard, target: Target) -> None:
@@ -105,10 +107,19 @@ def silent_channels(sounds: dict[int, Sound]) -> NDArray[np.bool_]:
     return np.asarray(np.median(power, axis=0) < _MAX_SILENT_POWER)
 
 
-def unclear_channels(sounds: dict[int, Sound]) -> NDArray[np.bool_]:
-    """Return True for microphones whose sound differs from the common one in most recordings: (mic,) bool."""
+def unclear_channels(sounds: dict[int, Sound], max_level_db: float) -> NDArray[np.bool_]:
+    """Return True for microphones whose sound differs from the common one in most recordings: (mic,) bool.
+
+    Parameters
+    ----------
+    sounds : dict of int to Sound
+    max_level_db : float
+        Largest plausible level relative to the median microphone.
+    """
     coherence = np.stack([sound.arrival.coherence for sound in sounds.values()])
-    return np.asarray(np.median(coherence, axis=0) < MIN_COHERENCE)
+    power = np.stack([sound.arrival.power / np.median(sound.arrival.power) for sound in sounds.values()])
+    is_too_loud = np.median(power, axis=0) > 10 ** (max_level_db / 10)
+    return np.asarray((np.median(coherence, axis=0) < MIN_COHERENCE) | is_too_loud)
 
 
 def _sources(heard: Heard, every: Microphones, used: NDArray[np.bool_], target: Target) -> dict[int, Source]:
