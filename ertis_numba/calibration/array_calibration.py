@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from ertis_numba import checks
 from ertis_numba.air import absorption_db_m
 from ertis_numba.calibration.advice import how_to_record, not_observable, require_directions
-from ertis_numba.calibration.array_fit import ArrayFit, Observations, Tolerances, fit_array, fit_gains
+from ertis_numba.calibration.array_fit import ArrayFit, fit_array, fit_gains
 from ertis_numba.calibration.channel_order import find_swaps
 from ertis_numba.calibration.contrast import image_contrast_db
+from ertis_numba.calibration.observations import Observations, Tolerances
 from ertis_numba.calibration.reference_place import (
     ReflectorPlace,
     flipped,

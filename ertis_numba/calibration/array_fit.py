@@ -2,57 +2,21 @@
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from ertis_numba.calibration.observations import Observations, Tolerances
+from ertis_numba.calibration.separable_problem import MM, US, SeparableProblem
 from ertis_numba.calibration.wavefronts import Target, travel_times
 
-__all__ = ["ArrayFit", "Observations", "Tolerances", "fit_array", "fit_gains"]
+__all__ = ["ArrayFit", "fit_array", "fit_gains"]
 
 _NEPER_IN_DB = math.log(10) / 20
-_US, _MM = 1e-6, 1e-3  # The unknowns are in microseconds and millimetres, so that their sizes are alike.
-
-
-class Tolerances(NamedTuple):
-    """Standard deviations that are expected before the calibration.
-
-    Attributes
-    ----------
-    gain_db : float
-        Of gains, in decibels.
-    delay_s : float
-        Of delays, in seconds.
-    position_m : float
-        Of positions along each axis, in metres; 0 if the positions of the layout are exact.
-    """
-
-    gain_db: float
-    delay_s: float
-    position_m: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Observations:
-    """Times of arrival in some recordings.
-
-    Attributes
-    ----------
-    time_s : (record, mic) float64
-    time_sd_s : (record, mic) float64
-        Standard deviations; infinite for values that are left out.
-    level : (record, mic) float64
-        Amplitudes; only their ratios within a recording matter.
-    level_sd : (record, mic) float64
-        Relative standard deviations of the amplitudes; infinite for values that are left out.
-    """
-
-    time_s: NDArray[np.float64]
-    time_sd_s: NDArray[np.float64]
-    level: NDArray[np.float64]
-    level_sd: NDArray[np.float64]
+_ROBUST_ROUNDS = 3
+_ROBUST_FROM = 3.0  # Standard deviations from which on residuals lose weight.
+_MEDIAN_OF_NORMAL = 0.6745  # of the magnitude, in standard deviations
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,7 +57,7 @@ def fit_array(
 
     The fit minimises ``Σ ρ((t − τ − T(s, x)) / σ)`` with the travel times T of `travel_times`, plus the squared changes
     of τ and x relative to the expected deviations. It is the maximum of the posterior density with normal priors. ρ is
-    quadratic for small residuals and linear for large ones (``soft_l1`` of `scipy.optimize.least_squares`).
+    quadratic for small residuals and linear for large ones, by repeated weighting of the least squares.
 
     The covariance is the inverse of the Fisher information, including that of the priors, for delays and positions
     after removing what no recording can observe: the common delay, a translation and a rotation of the array.
@@ -111,72 +75,48 @@ def fit_array(
     target : {"reflector", "wall", "direct", "beacon"}
     expected : Tolerances
     """
-    problem = _Problem(seen, delay_s, positions_m, source_m, speed_m_s, target, expected)
-    unknown = problem.start()
-    # Residuals of the start exceed the noise a thousandfold, where the robust loss would hardly converge.
-    for loss in ("linear", "soft_l1"):
+    problem = SeparableProblem(seen, delay_s, positions_m, source_m, speed_m_s, target, expected)
+    source_mm = problem.start_mm
+    for _ in range(_ROBUST_ROUNDS):
+        # Residuals of the start exceed the noise a thousandfold, so the first round has equal weights.
         found = scipy.optimize.least_squares(
-            problem.residuals,
-            unknown,
-            jac=problem.jacobian,
-            loss=loss,
-            f_scale=3.0,
-            x_scale="jac",
-            xtol=1e-10,
-            ftol=1e-6,
-            gtol=1e-10,
-            max_nfev=50,
+            problem.residuals, source_mm, jac=problem.jacobian, x_scale="jac", xtol=1e-10, ftol=1e-8, gtol=1e-10
         )
-        unknown = found.x
-    later_us, moved_mm, source = problem.split(found.x)
-    slopes = problem.jacobian(found.x)
-    rest = problem.residuals(found.x)[: problem.n_times]
-    inverse = _inverse(slopes)
+        source_mm = found.x
+        standard = problem.solution(source_mm).residual_s / seen.time_sd_s
+        size = (
+            max(1.0, float(np.nanmedian(np.abs(standard))) / _MEDIAN_OF_NORMAL) if np.isfinite(standard).any() else 1.0
+        )
+        problem.reweigh((1 + (np.nan_to_num(standard) / (_ROBUST_FROM * size)) ** 2) ** -0.25)
+    own, source, residual_s = problem.solution(source_mm)
     # Residuals beyond the noise, such as those of overlapping echoes, widen the intervals.
-    freedom = max(
-        1.0, problem.n_seen - float(np.sum(inverse * (slopes[: problem.n_times].T @ slopes[: problem.n_times])))
-    )
-    factor = max(1.0, _mean_square(rest, freedom))
-    slopes[: problem.n_times] /= math.sqrt(factor)
-    inverse = _inverse(slopes)
-    n_mics = len(delay_s)
+    _, n_determined = problem.covariance(source_mm, 1.0)
+    factor = max(1.0, _mean_square(standard[np.isfinite(standard)], np.isfinite(standard).sum() - n_determined))
+    fitted, _ = problem.covariance(source_mm, factor)
+    n_mics, n_own = own.shape
     of_mics = np.zeros((n_mics, 4, n_mics, 4))
-    n_own = n_mics * problem.n_own
-    of_mics[:, : problem.n_own, :, : problem.n_own] = inverse[:n_own, :n_own].reshape(
-        n_mics, problem.n_own, n_mics, problem.n_own
-    )
-    changed_m = positions_m + _MM * moved_mm
+    of_mics[:, :n_own, :, :n_own] = fitted
+    changed_m = positions_m + (MM * own[:, 1:] if n_own > 1 else 0.0)
     distance_m = travel_times(source, changed_m, speed_m_s, target).distance_m
-    if problem.n_own > 1:
+    if n_own > 1:
         changed_m, turn = _turned_onto(changed_m, positions_m)
         source = source @ turn.T
-    projector = _without_gauge(changed_m, turns=problem.n_own > 1)
-    covariance = projector @ of_mics.reshape(4 * n_mics, 4 * n_mics) @ projector.T
     return ArrayFit(
-        delay_s=delay_s + _US * (later_us - later_us.mean()),
+        delay_s=delay_s + US * (own[:, 0] - own[:, 0].mean()),
         positions_m=changed_m,
         source_m=source,
         distance_m=distance_m,
-        residual_s=np.where(np.isfinite(seen.time_sd_s), problem.rest_s(found.x), np.nan),
-        covariance=covariance,
+        residual_s=residual_s,
+        covariance=_without_gauge(of_mics.reshape(4 * n_mics, 4 * n_mics), changed_m, turns=n_own > 1),
     )
 
 
-def _inverse(slopes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the inverse of the Fisher information."""
-    information = slopes.T @ slopes
-    # Columns of equal length keep the inverse exact; the priors make it exist.
-    length = np.sqrt(np.diag(information))
-    return np.asarray(np.linalg.inv(information / np.outer(length, length)) / np.outer(length, length))
-
-
 def _mean_square(rest: NDArray[np.float64], freedom: float) -> float:
-    """Return the robust mean square of residuals, of which many may be 0 because they are left out."""
-    found = rest[rest != 0]
-    if not len(found):
+    """Return the mean square of residuals without the effect of outliers."""
+    if not len(rest):
         return 1.0
-    clipped = np.minimum(np.abs(found), 6 * np.median(np.abs(found)))
-    return float(np.sum(clipped**2)) / freedom
+    clipped = np.minimum(np.abs(rest), 6 * np.median(np.abs(rest)))
+    return float(np.sum(clipped**2)) / max(1.0, freedom)
 
 
 def _turned_onto(
@@ -189,8 +129,10 @@ def _turned_onto(
     return rotation.apply(centred_m) + centre_m, rotation.as_matrix()
 
 
-def _without_gauge(positions_m: NDArray[np.float64], *, turns: bool) -> NDArray[np.float64]:
-    """Return the projection that removes a common delay, and translations and rotations: (4 mic, 4 mic) float64."""
+def _without_gauge(
+    covariance: NDArray[np.float64], positions_m: NDArray[np.float64], *, turns: bool
+) -> NDArray[np.float64]:
+    """Return the covariance without a common delay, and without translations and rotations: (4 mic, 4 mic) float64."""
     n_mics = len(positions_m)
     directions = np.zeros((n_mics, 4, 7))
     directions[:, 0, 0] = 1.0
@@ -198,71 +140,11 @@ def _without_gauge(positions_m: NDArray[np.float64], *, turns: bool) -> NDArray[
         centred_m = positions_m - positions_m.mean(axis=0)
         for axis, about in enumerate(np.eye(3)):
             directions[:, 1 + axis, 1 + axis] = 1.0
-            directions[:, 1:, 4 + axis] = np.cross(about, centred_m) / _MM
+            directions[:, 1:, 4 + axis] = np.cross(about, centred_m) / MM
     basis, size, _ = np.linalg.svd(directions.reshape(4 * n_mics, 7), full_matrices=False)
     basis = basis[:, size > 1e-9 * size.max()]
-    return np.asarray(np.eye(4 * n_mics) - basis @ basis.T)
-
-
-class _Problem:
-    """Residuals and Jacobian of the fit; the unknowns are delay and position of each microphone, then the sources."""
-
-    def __init__(
-        self,
-        seen: Observations,
-        delay_s: NDArray[np.float64],
-        positions_m: NDArray[np.float64],
-        source_m: NDArray[np.float64],
-        speed_m_s: NDArray[np.float64],
-        target: Target,
-        expected: Tolerances,
-    ) -> None:
-        self._seen, self._delay_s, self._positions_m = seen, delay_s, positions_m
-        self._source_m, self._speed_m_s, self._target = source_m, speed_m_s, target
-        self.n_records, self.n_mics = seen.time_s.shape
-        self.n_own = 4 if expected.position_m > 0 else 1
-        self.n_times = self.n_records * self.n_mics
-        self.n_seen = int(np.isfinite(seen.time_sd_s).sum())
-        self.n_of_mics = self.n_mics * self.n_own
-        self.n_unknown = self.n_of_mics + 3 * self.n_records
-        self._precision_us = np.where(np.isfinite(seen.time_sd_s), _US / seen.time_sd_s, 0.0)
-        sizes = [expected.delay_s / _US, *(3 * [expected.position_m / _MM])][: self.n_own]
-        # A line of microphones does not determine the angle around it, so sources have a prior, though a weak one.
-        around = np.repeat(np.linalg.norm(source_m, axis=1) / _MM, 3)
-        self._prior = 1 / np.concatenate([np.tile(sizes, self.n_mics), around])
-
-    def start(self) -> NDArray[np.float64]:
-        return np.concatenate([np.zeros(self.n_of_mics), self._source_m.ravel() / _MM])
-
-    def split(self, unknown: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-        """Return the changes of delays in µs and of positions in mm, and the sources in metres."""
-        own = unknown[: self.n_of_mics].reshape(self.n_mics, self.n_own)
-        moved_mm = own[:, 1:] if self.n_own == 4 else np.zeros((self.n_mics, 3))
-        source_m = _MM * unknown[self.n_of_mics :].reshape(-1, 3)
-        return own[:, 0], moved_mm, source_m
-
-    def rest_s(self, unknown: NDArray[np.float64]) -> NDArray[np.float64]:
-        later_us, moved_mm, source_m = self.split(unknown)
-        model = travel_times(source_m, self._positions_m + _MM * moved_mm, self._speed_m_s, self._target)
-        return np.asarray(self._seen.time_s - model.time_s - self._delay_s - _US * later_us)
-
-    def residuals(self, unknown: NDArray[np.float64]) -> NDArray[np.float64]:
-        rest = np.nan_to_num(self.rest_s(unknown) / _US) * self._precision_us
-        return np.concatenate([rest.ravel(), (unknown - self.start()) * self._prior])
-
-    def jacobian(self, unknown: NDArray[np.float64]) -> NDArray[np.float64]:
-        _, moved_mm, source_m = self.split(unknown)
-        model = travel_times(source_m, self._positions_m + _MM * moved_mm, self._speed_m_s, self._target)
-        own = np.concatenate([np.ones((self.n_records, self.n_mics, 1)), model.by_microphone * (_MM / _US)], axis=2)
-        slopes = np.zeros((self.n_records, self.n_mics, self.n_unknown))
-        mics = np.arange(self.n_mics)
-        for index in range(self.n_own):
-            slopes[:, mics, mics * self.n_own + index] = -own[:, :, index]
-        for record in range(self.n_records):
-            first = self.n_of_mics + 3 * record
-            slopes[record, :, first : first + 3] = -model.by_source[record] * (_MM / _US)
-        slopes *= self._precision_us[..., None]
-        return np.concatenate([slopes.reshape(-1, self.n_unknown), np.diag(self._prior)])
+    within = covariance @ basis
+    return np.asarray(covariance - within @ basis.T - basis @ within.T + basis @ (basis.T @ within) @ basis.T)
 
 
 def fit_gains(

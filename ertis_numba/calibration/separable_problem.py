@@ -1,0 +1,192 @@
+"""Least-squares problem of times of arrival, in which each microphone is solved by itself for given sources."""
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.calibration.observations import Observations, Tolerances
+from ertis_numba.calibration.wavefronts import Target, TravelTimes, travel_times
+
+__all__ = ["MM", "US", "SeparableProblem", "Solution"]
+
+US: Final = 1e-6
+MM: Final = 1e-3
+"""The unknowns are in microseconds and millimetres, so that their sizes are alike."""
+_INNER_ROUNDS: Final = 3  # Travel times are almost linear in the positions of microphones.
+
+
+class Solution(NamedTuple):
+    """Microphones and sources.
+
+    Attributes
+    ----------
+    own : (mic, quantity) float64
+        Change of the delay in µs and, if positions are fitted, of x, y and z in mm.
+    source_m : (record, axis) float64
+    residual_s : (record, mic) float64
+        Measured minus fitted times.
+    """
+
+    own: NDArray[np.float64]
+    source_m: NDArray[np.float64]
+    residual_s: NDArray[np.float64]
+
+
+class SeparableProblem:
+    """Residuals and Jacobian as functions of the sources alone.
+
+    For given sources, delay and position of each microphone follow from its own times by linear least squares, because
+    travel times are almost linear in its position. The remaining problem has three unknowns per recording (variable
+    projection: G. H. Golub and V. Pereyra, SIAM J. Numer. Anal. 10, 1973). Its Jacobian omits the derivative of the
+    projection, as L. Kaufman, BIT 15, 1975, proposes.
+
+    Parameters
+    ----------
+    seen : Observations
+    delay_s : (mic,) float64
+        Delays of the layout.
+    positions_m : (mic, axis) float64
+        Positions of the layout.
+    source_m : (record, axis) float64
+        First approximation of the sources.
+    speed_m_s : (record,) float64
+    target : {"reflector", "wall", "direct", "beacon"}
+    expected : Tolerances
+    """
+
+    def __init__(
+        self,
+        seen: Observations,
+        delay_s: NDArray[np.float64],
+        positions_m: NDArray[np.float64],
+        source_m: NDArray[np.float64],
+        speed_m_s: NDArray[np.float64],
+        target: Target,
+        expected: Tolerances,
+    ) -> None:
+        self._seen, self._delay_s, self._positions_m = seen, delay_s, positions_m
+        self._start_mm = source_m.ravel() / MM
+        self._speed_m_s, self._target = speed_m_s, target
+        self.n_records, self.n_mics = seen.time_s.shape
+        self.n_own = 4 if expected.position_m > 0 else 1
+        self._precision_us = np.where(np.isfinite(seen.time_sd_s), US / seen.time_sd_s, 0.0)
+        self._weight = np.ones((self.n_records, self.n_mics))
+        self._prior = 1 / np.array([expected.delay_s / US, *(3 * [expected.position_m / MM])][: self.n_own])
+        # A line of microphones does not determine the angle around it, so sources have a prior, though a weak one.
+        self._source_prior = 1 / np.repeat(np.linalg.norm(source_m, axis=1) / MM, 3)
+        self._own = np.zeros((self.n_mics, self.n_own))
+
+    @property
+    def start_mm(self) -> NDArray[np.float64]:
+        """First approximation of the sources in mm: (3 record,) float64."""
+        return self._start_mm
+
+    def reweigh(self, weight: NDArray[np.float64]) -> None:
+        """Set factors of the precision of each time: (record, mic) float64."""
+        self._weight = weight
+
+    def residuals(self, source_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the residuals of each microphone's times and priors, then those of the sources' priors."""
+        own = self._solved(source_mm)
+        rest = self._rest_us(own, source_mm) * self._precision
+        of_mics = np.concatenate([rest.T, own * self._prior], axis=1)
+        return np.append(of_mics.ravel(), (source_mm - self._start_mm) * self._source_prior)
+
+    def jacobian(self, source_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the derivatives of the residuals by the sources: (residual, 3 record) float64."""
+        projected, *_ = self._projected(self._solved(source_mm), source_mm)
+        return np.concatenate([projected.reshape(-1, 3 * self.n_records), np.diag(self._source_prior)])
+
+    def solution(self, source_mm: NDArray[np.float64]) -> Solution:
+        """Return the microphones and sources for the solution of the remaining problem."""
+        own = self._solved(source_mm)
+        rest_s = US * self._rest_us(own, source_mm)
+        return Solution(own, MM * source_mm.reshape(-1, 3), np.where(self._precision_us > 0, rest_s, np.nan))
+
+    def covariance(self, source_mm: NDArray[np.float64], factor: float) -> tuple[NDArray[np.float64], float]:
+        """Return the covariance of the microphones, and the number of unknowns that the times determine.
+
+        The inverse of the Fisher information follows from the blocks of the microphones and the Schur complement of
+        the sources.
+
+        Parameters
+        ----------
+        source_mm : (3 record,) float64
+        factor : float
+            Variance of the times relative to the expected one.
+
+        Returns
+        -------
+        covariance : (mic, quantity, mic, quantity) float64
+        n_determined : float
+        """
+        projected, inverse, gain = self._projected(self._solved(source_mm), source_mm, factor)
+        rows = projected.reshape(-1, 3 * self.n_records)
+        of_sources = np.linalg.inv(rows.T @ rows + np.diag(self._source_prior**2))
+        flat = gain.reshape(-1, 3 * self.n_records)
+        size = self.n_mics, self.n_own
+        covariance = (flat @ of_sources @ flat.T).reshape(*size, *size)
+        mics = np.arange(self.n_mics)
+        covariance[mics, :, mics, :] += inverse
+        variances = np.einsum("mimi->mi", covariance)
+        by_priors = float(np.sum(variances * self._prior**2) + np.diag(of_sources) @ self._source_prior**2)
+        return covariance, self.n_mics * self.n_own + 3 * self.n_records - by_priors
+
+    @property
+    def _precision(self) -> NDArray[np.float64]:
+        return self._precision_us * self._weight
+
+    def _model(self, own: NDArray[np.float64], source_mm: NDArray[np.float64]) -> TravelTimes:
+        moved_m = MM * own[:, 1:] if self.n_own > 1 else 0.0
+        return travel_times(MM * source_mm.reshape(-1, 3), self._positions_m + moved_m, self._speed_m_s, self._target)
+
+    def _rest_us(self, own: NDArray[np.float64], source_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the measured minus the expected times, 0 for values that are left out: (record, mic) float64."""
+        rest_us = (self._seen.time_s - self._model(own, source_mm).time_s - self._delay_s) / US - own[:, 0]
+        return np.where(self._precision_us > 0, rest_us, 0.0)
+
+    def _slopes(self, own: NDArray[np.float64], source_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the derivatives of each microphone's residuals by its own unknowns: (mic, row, quantity) float64."""
+        model = self._model(own, source_mm)
+        by_own = np.concatenate([np.ones((self.n_records, self.n_mics, 1)), model.by_microphone * (MM / US)], axis=2)
+        times = -(by_own[..., : self.n_own] * self._precision[..., None]).transpose(1, 0, 2)
+        priors = np.broadcast_to(np.diag(self._prior), (self.n_mics, self.n_own, self.n_own))
+        return np.concatenate([times, priors], axis=1)
+
+    def _solved(self, source_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the unknowns of all microphones for given sources: (mic, quantity) float64."""
+        own = self._own
+        for _ in range(_INNER_ROUNDS):
+            slopes = self._slopes(own, source_mm)
+            rest = np.concatenate([(self._rest_us(own, source_mm) * self._precision).T, own * self._prior], axis=1)
+            normal = np.einsum("mki,mkj->mij", slopes, slopes)
+            own = own - np.linalg.solve(normal, np.einsum("mki,mk->mi", slopes, rest)[..., None])[..., 0]
+        self._own = own
+        return own
+
+    def _projected(
+        self, own: NDArray[np.float64], source_mm: NDArray[np.float64], factor: float = 1.0
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return the projected derivatives by the sources, and two parts of the covariance.
+
+        Returns
+        -------
+        projected : (mic, row, 3 record) float64
+        inverse : (mic, quantity, quantity) float64
+            Covariance of each microphone for known sources.
+        gain : (mic, quantity, 3 record) float64
+            Change of the microphones by changes of the sources, with a negative sign.
+        """
+        scale = 1 / np.sqrt(factor)
+        slopes = self._slopes(own, source_mm)
+        slopes[:, : self.n_records] *= scale
+        by_source = -self._model(own, source_mm).by_source * (MM / US) * (scale * self._precision)[..., None]
+        inverse = np.linalg.inv(np.einsum("mki,mkj->mij", slopes, slopes))
+        records = np.arange(self.n_records)
+        crossed = np.einsum("mki,kma->mika", slopes[:, : self.n_records], by_source)
+        gain = np.einsum("mij,mjka->mika", inverse, crossed).reshape(self.n_mics, self.n_own, -1)
+        projected = -slopes @ gain
+        blocks = projected.reshape(self.n_mics, -1, self.n_records, 3)
+        blocks[:, records, records] += by_source.transpose(1, 0, 2)
+        return blocks.reshape(self.n_mics, -1, 3 * self.n_records), inverse, gain
