@@ -70,14 +70,6 @@ def test_healthy_arrays_have_no_findings(seed):
     assert not calibrate(record(faulty_array(seed, healthy=True), seed, 6)).findings
 
 
-def test_residuals_decrease_to_the_noise():
-    _, _, made = faulty()
-    assert made.residuals.before_s > 2e-6
-    assert made.residuals.after_s < 20e-9
-    assert made.residuals.before_db > 1.0
-    assert made.residuals.after_db < 0.05
-
-
 # ---- faults -----------------------------------------------------------------------------------------
 
 
