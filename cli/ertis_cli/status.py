@@ -33,7 +33,14 @@ _ALARMING = ("away: ", "fault: ")
     is_flag=True,
     help="Show the status repeatedly, even without a terminal; with --json, one line each time.",
 )
-@click.option("--patience", type=float, default=3.0, show_default=True, metavar="S", help="Time to wait for an answer.")
+@click.option(
+    "--patience",
+    type=float,
+    default=3.0,
+    show_default=True,
+    metavar="S",
+    help="Longest time in seconds to wait for an answer.",
+)
 @options.as_json_of("one object; with --watch one per line for each refresh")
 def status(
     *,

@@ -92,7 +92,7 @@ class CentralClient:
     def configure(self, sensor: str, settings: Settings, patience_s: float = 30.0) -> tuple[str, ...]:
         """Change the settings of a sensor, and return once it measures with them.
 
-        The sensor node configures all its sensors between two measurements. If one cannot have the settings, all keep
+        The sensor node configures all its sensors between two measurements. If one cannot use the settings, all keep
         their former ones. The measurements that follow belong to a new session.
 
         Parameters
