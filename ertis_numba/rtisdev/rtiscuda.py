@@ -156,7 +156,7 @@ def _processor(name: str, configuration: Configuration) -> Processor | FastProce
         _log.warning("configuration %r uses the exact method, because the fast one cannot: %s", name, error)
         return exact
     _log.warning(
-        "configuration %r uses the fast method; its images differ by about %.0f dB from those of the exact one",
+        "configuration %r uses the fast method; before cleaning, its images differ by about %.0f dB from exact ones",
         name,
         fast.difference_db,
     )
