@@ -190,6 +190,37 @@ def test_sensor_that_is_unplugged_during_a_change_keeps_its_settings(sessions):
     assert run.session.counts["one"].unplugged == 1
 
 
+@pytest.mark.parametrize("trigger", ["command", "sync"])
+def test_change_while_a_sensor_is_unplugged_is_refused_and_the_others_go_on(sessions, trigger):
+    run = sessions(names=("one", "two"), trigger=trigger)
+    with contextlib.ExitStack() as stack:
+        if trigger == "sync":
+            stack.enter_context(SyncChain(run.emulators, rate_hz=10.0))
+        stack.enter_context(run)
+        run.wait_for(lambda stored: len(stored) >= 4)
+        run.emulators[1].unplug()
+        count = len(run.stored)
+        run.wait_for(lambda stored: len(stored) >= count + 4)  # Its reader waits for it meanwhile.
+        assert "unplugged" in str(run.change(WARM))
+        count = len(run.stored)
+        run.wait_for(lambda stored: len(stored) >= count + 2)
+        run.emulators[1].replug()
+        run.wait_for(lambda stored: any(entry.measurement.stamp.sensor == "two" for entry in stored[count:]))
+    assert {entry.measurement.settings for entry in run.stored} == {SETTINGS}
+    assert run.error is None
+
+
+def test_sensor_that_does_not_answer_is_configured_again_later(sessions):
+    with sessions(names=("one", "two")) as run:
+        run.wait_for(lambda stored: len(stored) >= 4)
+        run.fails = ["two", "two"]  # also when the former settings are restored
+        assert "two does not answer" in str(run.change(WARM))
+        count = len(run.stored)
+        run.wait_for(lambda stored: any(entry.measurement.stamp.sensor == "two" for entry in stored[count:]))
+    assert {entry.measurement.settings for entry in run.stored} == {SETTINGS}
+    assert run.error is None
+
+
 def test_change_of_an_ended_session_is_refused(sessions):
     with sessions(n=1) as run:
         run.thread.join(SOON_S)

@@ -5,7 +5,6 @@ import secrets
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -248,8 +247,9 @@ class CaptureSession:
         return None if self._n is None else self._n - counts.stored - counts.missing[_DISK_FULL]
 
     def _apply(self, change: SettingsChange, sink: MeasurementSink) -> None:
-        """Configure all sensors, or keep the former settings of all of them."""
+        """Configure all sensors that have not failed, or keep the former settings of all of them."""
         former, failure = self._settings, None
+        working = [sensor for sensor in self._sonars if sensor not in self._errors]
         pulses = [
             state.first_pulse + 1 + (-1 if state.sequence is None else state.sequence)
             for state in self._sequence_states.values()
@@ -257,24 +257,32 @@ class CaptureSession:
         ]
         registered = []
         try:
-            for sensor in self._sonars:
+            for sensor in working:
                 for step in self._set_up_steps(sensor, change.settings):
                     step()
-            for sensor in self._sonars:
+            for sensor in working:
                 self._register(sink, sensor, change.settings)
                 registered.append(sensor)
         except (ArgumentError, SonarError) as error:
             failure = error
-            for sensor in self._sonars:
-                for step in self._set_up_steps(sensor, former):
-                    with suppress(SonarDisconnectedError):  # Its reader configures it again.
-                        step()
+            for sensor in working:
+                self._set_up_again(sensor, former)
             for sensor in registered:
                 self._register(sink, sensor, former)
         self._reset(change.settings if failure is None else former, secrets.randbits(62))
         if self._synced and self._n is not None:
             self._n = max(0, self._n - max(pulses, default=0))
         change.on_done(failure)
+
+    def _set_up_again(self, sensor: str, settings: Settings) -> None:
+        """Configure a sensor as before; its reader does so later if it is absent or does not answer."""
+        for step in self._set_up_steps(sensor, settings):
+            try:
+                step()
+            except SonarDisconnectedError:
+                pass
+            except SonarError:
+                self._sonars[sensor].hang_up()
 
     def _set_up_steps(self, sensor: str, settings: Settings) -> list[Callable[[], None]]:
         sonar, configure = self._sonars[sensor], self._configure

@@ -242,10 +242,10 @@ class SonarDriver:
         """Let SYNC pulses trigger measurements from now on; `listen` yields them."""
         self._speak()
         setup, receiver = self._state()
+        self._is_armed = True  # even if this fails, so that `reconnect` repeats it, and `close` undoes it
         if self._line.waiting:
             self._line.drain(within_s=self.deadline_s)
         receiver.expect(self._next)
-        self._is_armed = True
         self._line.ask(Command("J", 1, setup.pin), alone=False)
 
     def disarm(self) -> None:
@@ -328,7 +328,7 @@ class SonarDriver:
         def abandoned() -> bool:
             return self._closing.is_set() or stop()
 
-        self._hang_up()
+        self.hang_up()
         while not abandoned():
             if time.monotonic() - began > within_s:
                 raise SonarDisconnectedError(f"{self.port} did not return within {within_s:g} s: {last}")
@@ -338,14 +338,14 @@ class SonarDriver:
                 self._go_on()
             except SonarError as error:
                 last = error
-                self._hang_up()
+                self.hang_up()
                 self._closing.wait(_RETRY_S)
             else:
                 self._line.stop = self._closing.is_set
                 _log.info("%s is back after %.2f s", self._port, time.monotonic() - began)
                 break
         if self._closing.is_set():
-            self._hang_up()  # close() has not seen this line.
+            self.hang_up()  # close() has not seen this line.
         return not abandoned()
 
     def command(self, text: str) -> int:
@@ -421,6 +421,12 @@ class SonarDriver:
         except SonarError:
             return None
 
+    def hang_up(self) -> None:
+        """Give up a sensor that does not answer; use it again after `reconnect`, which configures it as before."""
+        self._line.hang_up()
+        self._dropped += self._line.dropped
+        self._line.dropped = 0
+
     def close(self) -> None:
         """Switch the trigger off if it is on, and close the port; a `listen` in another thread ends."""
         self._closing.set()
@@ -439,11 +445,6 @@ class SonarDriver:
             raise
         _log.info("%s: eRTIS, firmware %s", port, self.firmware)
         return line
-
-    def _hang_up(self) -> None:
-        self._line.close()
-        self._dropped += self._line.dropped
-        self._line.dropped = 0
 
     def _go_on(self) -> None:
         """Configure a sensor again after a power loss."""

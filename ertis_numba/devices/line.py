@@ -76,6 +76,7 @@ class SerialLine:
         self._port = _opened(path)
         self._buffer = memoryview(bytearray(_PIECE))
         self._empty_ns = time.monotonic_ns()  # Last time without waiting bytes.
+        self._is_hung_up = False
 
     @property
     def waiting(self) -> int:
@@ -155,6 +156,11 @@ class SerialLine:
                         fcntl.flock(self._port.fileno(), fcntl.LOCK_UN)
                 self._port.close()
 
+    def hang_up(self) -> None:
+        """Close the port of an absent device; later uses raise `SonarDisconnectedError`."""
+        self._is_hung_up = True
+        self.close()
+
     def _read(self, size: int) -> bytes:
         """Return up to ``size`` bytes that arrive without a pause.
 
@@ -188,7 +194,11 @@ class SerialLine:
                 rest = rest[os.write(here, rest) :]
 
     def _check(self) -> None:
-        if self.stop() or not self._port.is_open:
+        if self.stop():
+            raise closed_error(self.path)
+        if self._is_hung_up:
+            raise self._gone()
+        if not self._port.is_open:
             raise closed_error(self.path)
 
     def _gone(self) -> SonarDisconnectedError:
