@@ -20,6 +20,7 @@ from ertis_cli.main import cli
 from scipy.ndimage import maximum_filter1d
 
 import ertis_numba.rtisdev
+from ertis_numba.devices.emulator import Emulator
 from ertis_numba.devices.setup import Setup
 from ertis_numba.errors import ArgumentError
 from ertis_numba.rtisdev import rtiscuda, rtisserial
@@ -484,6 +485,40 @@ def test_words_without_beamforming_are_refused_with_the_remedy():
     settings = prepared(directions=31, beamformingEnable=False)
     with pytest.raises(ArgumentError, match=r"no beamforming, and therefore processes beams, not PDM words; enable"):
         rtiscuda.processing(measured(settings).rawData, 1, settings.nDirections, settings.nspses, "test")
+
+
+def test_connection_drops_answers_for_a_former_program(tmp_path):
+    words = np.zeros((1, 16_384), np.uint32)
+    with Emulator(words, name="left", link=tmp_path / "left"):
+        rtisserial.connect(str(tmp_path / "left"), 115_200)
+        firmware = rtisserial.command("!Y,0,0,0\n", wants_answer=True)
+        for text in ("!G,65536,0,0\n", "!L,0,0,0\n", "!A,1,0,0\n"):  # a script that is interrupted here
+            rtisserial.command(text, wants_answer=False)
+        rtisserial.close()
+        rtisserial.connect(str(tmp_path / "left"), 115_200)
+        try:
+            assert rtisserial.command("!Y,0,0,0\n", wants_answer=True) == firmware
+        finally:
+            rtisserial.close()
+
+
+def test_measurement_that_does_not_arrive_is_an_error_unless_triggers_are_awaited(monkeypatch):
+    parent, child = os.openpty()
+    try:
+        monkeypatch.setattr(rtisserial, "_ANSWER_S", 0.05)
+        monkeypatch.setattr(rtisserial, "_MEASUREMENT_S", 0.05)
+        rtisserial.connect(os.ttyname(child), 115_200)
+        with pytest.raises(TimeoutError, match="did not answer a measurement within"):
+            rtisserial.getdata(4)
+        rtisserial.command("!J,1,0,0\n", wants_answer=False)
+        sender = threading.Timer(0.2, os.write, (parent, b"data"))
+        sender.start()
+        assert bytes(rtisserial.getdata(4)) == b"data"
+        sender.join()
+    finally:
+        rtisserial.close()
+        os.close(parent)
+        os.close(child)
 
 
 def test_serial_errors_are_those_that_callers_expect(monkeypatch, caplog):

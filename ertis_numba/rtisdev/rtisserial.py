@@ -14,6 +14,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.devices.commands import Command
+from ertis_numba.devices.dialogue import Dialogue
 from ertis_numba.devices.line import SerialLine
 from ertis_numba.devices.ports import resolve
 from ertis_numba.errors import SonarError
@@ -22,13 +24,18 @@ __all__ = ["close", "command", "connect", "flush", "getdata"]
 
 _ANSWER_BYTES: Final = 4
 _ANSWER_S: Final = 2.0
+_MEASUREMENT_S: Final = 5.0  # Longest time from a command to the first byte of a measurement.
+_MIN_BYTES_S: Final = 2e5  # Slowest USB connection; an eRTIS sends 1e6 bytes per second.
 
 _log = logging.getLogger("ertis_numba")
 _line: SerialLine | None = None
+_awaits_triggers = False  # after the command that switches external triggers on
 
 
 def connect(port: str, baud: int) -> None:  # noqa: ARG001  USB ignores the rate
     """Open a serial port, and close the one that was open.
+
+    Bytes that still arrive for a former program are dropped.
 
     Parameters
     ----------
@@ -49,11 +56,25 @@ def connect(port: str, baud: int) -> None:  # noqa: ARG001  USB ignores the rate
         close()
     name = os.environ.get("ERTIS_RTISDEV_PORT") or port
     try:
-        _line = SerialLine(resolve(name).path, stop=lambda: False)
+        _line = _quiet(resolve(name).path)
     except SonarError as error:
         _log.error("%s", error)
         kind = ConnectionRefusedError if error.errno == errno.EBUSY else ConnectionError
         raise kind(str(error)) from error
+
+
+def _quiet(path: str) -> Dialogue:
+    """Return the line to a sensor after it has ended the answers and measurements for a former program."""
+    global _awaits_triggers  # noqa: PLW0603  one connection per process
+    line = Dialogue(path, timeout_s=_ANSWER_S, stop=lambda: False)
+    _awaits_triggers = False
+    try:
+        line.quieten(Command("J", 0, 1), within_s=_ANSWER_S)
+        line.ask_twice(Command("Y"))
+    except SonarError as error:
+        # Opening succeeds as in the original; the next command fails if the sensor is still silent.
+        _log.warning("%s", error)
+    return line
 
 
 def command(text: str, wants_answer: bool) -> int | None:  # noqa: FBT001  as the original has it
@@ -68,7 +89,10 @@ def command(text: str, wants_answer: bool) -> int | None:  # noqa: FBT001  as th
     TimeoutError
         No answer came.
     """
+    global _awaits_triggers  # noqa: PLW0603  one connection per process
     line = _connected()
+    if text.startswith("!J,"):
+        _awaits_triggers = text.startswith("!J,1")
     with _errors_translated():
         line.send(text.encode())
     if not wants_answer:
@@ -79,14 +103,19 @@ def command(text: str, wants_answer: bool) -> int | None:  # noqa: FBT001  as th
 def getdata(n_bytes: int) -> NDArray[np.uint8]:
     """Return ``n_bytes`` bytes as soon as they have arrived, (byte,) uint8.
 
+    There is no limit of time while external triggers are on.
+
     Raises
     ------
     ConnectionRefusedError
         No port is open.
     ConnectionError
         The device was unplugged.
+    TimeoutError
+        The measurement did not arrive.
     """
-    return np.frombuffer(_received(_connected(), n_bytes, within_s=None, what="a measurement"), np.uint8)
+    within_s = None if _awaits_triggers else _MEASUREMENT_S + n_bytes / _MIN_BYTES_S
+    return np.frombuffer(_received(_connected(), n_bytes, within_s=within_s, what="a measurement"), np.uint8)
 
 
 def flush() -> None:
@@ -133,7 +162,7 @@ def _received(line: SerialLine, n_bytes: int, *, within_s: float | None, what: s
         while len(data) < n_bytes:
             data += line.receive(n_bytes - len(data))[0]
             if latest_s is not None and time.monotonic() > latest_s and len(data) < n_bytes:
-                reported = f"{line.path} did not answer {what} within {within_s:g} s; is it an eRTIS?"
+                reported = f"{line.path} did not answer {what} within {within_s:.3g} s; is it an eRTIS?"
                 _log.error("%s", reported)
                 raise TimeoutError(reported)
     return bytes(data)
