@@ -1,0 +1,274 @@
+"""First approximation of poses: rigid transforms between sensors that heard the same reflectors."""
+
+from collections.abc import Mapping, Sequence
+from itertools import combinations
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.calibration.wave_finder import Wave
+from ertis_numba.errors import DataError
+
+__all__ = ["MIN_REFLECTORS", "Link", "WavesOfSensor", "echo_points", "link_sensors", "place_sensors", "unit_direction"]
+
+WavesOfSensor = Mapping[tuple[int, int], Sequence[Wave]]
+"""Waves of one sensor by SYNC pulse: its number, and a count of measurements with this number."""
+
+MIN_REFLECTORS: Final = 4
+"""Different places that two sensors must have in common; three would also agree by chance."""
+_MIN_SHARE: Final = 0.25  # Share of the common measurements whose reflectors must agree.
+_TOLERANCE_M: Final = 0.015
+_SAME_M: Final = 0.02  # Places within this distance are one.
+_APART_M: Final = 0.1  # Smallest distance of two reflectors that determine a rotation.
+_TRIALS: Final = 400
+_MAX_PLATFORM_M: Final = 2.0  # Longest path of a call from sensor to sensor.
+_MIN_ECHO_M: Final = 0.3
+_SIGMAS: Final = 4.0
+_LOOSE: Final = 0.3  # Additional relative error of a curvature, such as that of a reflector that is not a point.
+_PATH_TOLERANCE_M: Final = 8e-3
+_SAME_COSINE: Final = 0.03
+
+
+class Link(NamedTuple):
+    """Rigid transform from the frame of one sensor to that of another, ``x = R y + t``.
+
+    Attributes
+    ----------
+    rotation : (axis, axis) float64
+    translation_m : (axis,) float64
+    n_places : int
+        Number of different places that agree.
+    n_agreeing : int
+        Number of measurements whose reflectors agree.
+    n_common : int
+        Number of measurements in which both sensors heard echoes.
+    """
+
+    rotation: NDArray[np.float64]
+    translation_m: NDArray[np.float64]
+    n_places: int
+    n_agreeing: int
+    n_common: int
+
+    @property
+    def is_valid(self) -> bool:
+        """True if the agreement is not by chance."""
+        return self.n_places >= MIN_REFLECTORS and self.n_agreeing >= _MIN_SHARE * self.n_common
+
+
+class _Pairs(NamedTuple):
+    """Points of two sensors that may be the same place."""
+
+    first_m: NDArray[np.float64]
+    second_m: NDArray[np.float64]
+    weight: NDArray[np.float64]
+    pulse: NDArray[np.intp]
+    n_common: int
+
+
+def unit_direction(wave: Wave) -> NDArray[np.float64]:
+    """Return the direction to the source as a unit vector: (axis,) float64.
+
+    A flat array cannot distinguish front from back; the source is assumed to be in front.
+    """
+    direction = wave.parameters[1:4].copy()
+    if wave.information[1, 1] < 1:
+        across = float(direction[1] ** 2 + direction[2] ** 2)
+        direction[0] = np.sqrt(max(0.0, 1 - across))
+    return np.asarray(direction / max(float(np.linalg.norm(direction)), 1e-9))
+
+
+def echo_points(waves: Sequence[Wave]) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+    """Return the places of reflectors if each wave is an echo of the sensor's own call, and the numbers of the waves.
+
+    Waves whose curvature excludes a reflector at half of the path are left out.
+    """
+    points, numbers = [], []
+    for number, wave in enumerate(waves):
+        expected = 2 / max(wave.path_m, 1e-3)
+        if wave.path_m > _MIN_ECHO_M and _fits(wave, expected):
+            points.append(unit_direction(wave) * wave.path_m / 2)
+            numbers.append(number)
+    return np.array(points).reshape(-1, 3), np.array(numbers, dtype=np.intp)
+
+
+def _fits(wave: Wave, curvature_1_m: float) -> bool:
+    within = _SIGMAS * wave.curvature_sd_1_m + _LOOSE * curvature_1_m
+    return abs(float(wave.parameters[4]) - curvature_1_m) < within
+
+
+def _emitter_points(waves: Sequence[Wave]) -> list[NDArray[np.float64]]:
+    """Return the places of other emitters if waves are their direct calls, in front of and behind the array."""
+    found = []
+    for wave in waves:
+        if wave.path_m < _MAX_PLATFORM_M and _fits(wave, 1 / max(wave.path_m, 1e-3)):
+            place_m = unit_direction(wave) * wave.path_m
+            found += [place_m, place_m * np.array([-1, 1, 1])] if wave.information[1, 1] < 1 else [place_m]
+    return found
+
+
+def link_sensors(waves: Mapping[str, WavesOfSensor], seed: int = 0) -> dict[tuple[str, str], Link]:
+    """Return the transforms between all pairs of sensors whose reflectors agree.
+
+    Echoes of one measurement in two sensors may be the same reflector. Three such pairs with equal distances yield a
+    transform (W. Kabsch, Acta Cryst. A 32, 1976, 922), and the transform that most pairs agree with wins (M. A.
+    Fischler and R. C. Bolles, Comm. ACM 24, 1981, 381).
+
+    Parameters
+    ----------
+    waves : mapping of str to WavesOfSensor
+    seed : int
+        Seed of the random choice of pairs.
+    """
+    links = {}
+    for first, second in combinations(waves, 2):
+        pairs = _pairs(waves[first], waves[second])
+        link = _link(pairs, np.random.default_rng(seed))
+        if link is not None and link.is_valid:
+            links[first, second] = link
+    return links
+
+
+def _pairs(first: WavesOfSensor, second: WavesOfSensor) -> _Pairs:
+    rows: list[tuple[NDArray[np.float64], NDArray[np.float64], float, int]] = []
+    n_common = 0
+    for number, pulse in enumerate(sorted(first.keys() & second.keys())):
+        (points, indices), (others, other_indices) = echo_points(first[pulse]), echo_points(second[pulse])
+        n_common += bool(len(points) and len(others))
+        for point, index in zip(points, indices, strict=True):
+            for other, other_index in zip(others, other_indices, strict=True):
+                own, distant = first[pulse][index], second[pulse][other_index]
+                common_m = (own.path_m + distant.path_m) / 2
+                agree = _hears(first[pulse], own, common_m) + _hears(second[pulse], distant, common_m)
+                rows.append((point, other, 1.0 + agree, number))
+        # Another sensor's call comes from the origin of that sensor.
+        rows += [(place, np.zeros(3), 1.0, -1) for place in _emitter_points(first[pulse])]
+        rows += [(np.zeros(3), place, 1.0, -1) for place in _emitter_points(second[pulse])]
+    if not rows:
+        return _Pairs(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.intp), n_common)
+    first_m, second_m = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
+    both = np.concatenate([first_m, second_m], axis=1)
+    # Reflectors at rest appear in each measurement, but count once.
+    alike = (np.abs(both[:, None] - both).max(axis=2) < _SAME_M).sum(axis=1)
+    weight = np.array([row[2] for row in rows]) / alike
+    return _Pairs(first_m, second_m, weight, np.array([row[3] for row in rows]), n_common)
+
+
+def _hears(waves: Sequence[Wave], own: Wave, path_m: float) -> bool:
+    """Return True if a wave from the same direction has the path from the other sensor over the reflector."""
+    return any(
+        abs(wave.path_m - path_m) < _PATH_TOLERANCE_M
+        and np.abs(wave.parameters[2:4] - own.parameters[2:4]).max() < _SAME_COSINE
+        for wave in waves
+    )
+
+
+def _link(pairs: _Pairs, rng: np.random.Generator) -> Link | None:
+    """Return the transform that most pairs agree with; None if there is none."""
+    triples = _triples(pairs, rng)
+    if not len(triples):
+        return None
+    rotation, shift_m = _kabsch(pairs.first_m[triples], pairs.second_m[triples], np.ones(triples.shape))
+    rest_m = np.linalg.norm(
+        np.einsum("tij,nj->tni", rotation, pairs.second_m) + shift_m[:, None] - pairs.first_m, axis=2
+    )
+    score = np.maximum(0.0, 1 - (rest_m / _TOLERANCE_M) ** 2) @ pairs.weight
+    best = int(np.argmax(score))
+    turn, move_m = rotation[best], shift_m[best]
+    for _ in range(4):
+        rest = np.linalg.norm(pairs.second_m @ turn.T + move_m - pairs.first_m, axis=1) / _TOLERANCE_M
+        weight = pairs.weight * np.maximum(0.0, 1 - rest**2)
+        if np.count_nonzero(weight) < 3:
+            break
+        turns, moves_m = _kabsch(pairs.first_m[None], pairs.second_m[None], weight[None])
+        turn, move_m = turns[0], moves_m[0]
+    inside = np.linalg.norm(pairs.second_m @ turn.T + move_m - pairs.first_m, axis=1) < _TOLERANCE_M
+    n_agreeing = len(np.unique(pairs.pulse[inside & (pairs.pulse >= 0)]))
+    return Link(turn, move_m, _n_places(pairs.first_m[inside]), n_agreeing, pairs.n_common)
+
+
+def _triples(pairs: _Pairs, rng: np.random.Generator) -> NDArray[np.intp]:
+    """Return triples of pairs whose distances agree: (trial, 3) intp."""
+    n_pairs = len(pairs.weight)
+    if n_pairs < 3:
+        return np.zeros((0, 3), np.intp)
+    distance_m = np.linalg.norm(pairs.first_m[:, None] - pairs.first_m, axis=2)
+    other_m = np.linalg.norm(pairs.second_m[:, None] - pairs.second_m, axis=2)
+    agree = (np.abs(distance_m - other_m) < _TOLERANCE_M) & (distance_m > _APART_M)
+    preference = pairs.weight * (agree @ pairs.weight) ** 2
+    if not preference.any():
+        return np.zeros((0, 3), np.intp)
+    found = []
+    for start in rng.choice(n_pairs, _TRIALS, p=preference / preference.sum()):
+        near = np.where(agree[start], preference, 0.0)
+        second = rng.choice(n_pairs, p=near / near.sum())
+        both = np.where(agree[second], near, 0.0)
+        if both.any():
+            found.append((start, second, rng.choice(n_pairs, p=both / both.sum())))
+    return np.array(found, dtype=np.intp).reshape(-1, 3)
+
+
+def _kabsch(
+    first_m: NDArray[np.float64], second_m: NDArray[np.float64], weight: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return rotations and translations that move second points onto first ones: (trial, 3, 3) and (trial, 3)."""
+    share = (weight / weight.sum(axis=1, keepdims=True))[..., None]
+    first, second = np.sum(share * first_m, axis=1), np.sum(share * second_m, axis=1)
+    product = np.einsum("tni,tnj->tij", share * (first_m - first[:, None]), second_m - second[:, None])
+    left, _, right = np.linalg.svd(product)
+    mirrored = np.sign(np.linalg.det(left @ right))
+    left[:, :, 2] *= np.where(mirrored == 0, 1.0, mirrored)[:, None]
+    rotation = left @ right
+    return rotation, first - np.einsum("tij,tj->ti", rotation, second)
+
+
+def _n_places(points_m: NDArray[np.float64]) -> int:
+    kept: list[NDArray[np.float64]] = []
+    for point in points_m:
+        if all(np.linalg.norm(point - other) > 2 * _SAME_M for other in kept):
+            kept.append(point)
+    return len(kept)
+
+
+def place_sensors(
+    sensors: Sequence[str], links: Mapping[tuple[str, str], Link], reference: str
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return rotations and positions relative to the reference, along the strongest links.
+
+    Parameters
+    ----------
+    sensors : sequence of str
+    links : mapping of (str, str) to Link
+    reference : str
+
+    Returns
+    -------
+    rotation : (sensor, axis, axis) float64
+    translation_m : (sensor, axis) float64
+
+    Raises
+    ------
+    DataError
+        A sensor has too few reflectors in common with the others.
+    """
+    placed = {reference: (np.eye(3), np.zeros(3))}
+    while len(placed) < len(sensors):
+        usable = [
+            (link.n_places, pair, link) for pair, link in links.items() if (pair[0] in placed) != (pair[1] in placed)
+        ]
+        if not usable:
+            lone = [name for name in sensors if name not in placed]
+            raise DataError(
+                f"sensor {lone[0]} has fewer than {MIN_REFLECTORS} reflectors in common with "
+                f"{' and '.join(placed)}; place one small reflector where both hear it, at 10 to 20 different places"
+            )
+        _, (first, second), link = max(usable, key=lambda item: item[0])
+        if first in placed:
+            rotation, shift_m = placed[first]
+            placed[second] = rotation @ link.rotation, rotation @ link.translation_m + shift_m
+        else:
+            rotation, shift_m = placed[second]
+            turn = rotation @ link.rotation.T
+            placed[first] = turn, shift_m - turn @ link.translation_m
+    return np.array([placed[name][0] for name in sensors]), np.array([placed[name][1] for name in sensors])

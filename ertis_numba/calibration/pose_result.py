@@ -1,0 +1,105 @@
+"""Result of a calibration of poses."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["PoseCalibration", "SensorPose"]
+
+_INTERVAL = 1.96  # half of a 95 % interval in standard deviations
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SensorPose:
+    """Pose of a sensor relative to the reference sensor.
+
+    Attributes
+    ----------
+    translation_m : (axis,) float64
+        Position x, y, z in the frame of the reference, in metres.
+    rotation_xyzw : (4,) float64
+        Unit quaternion that rotates the frame of the sensor into that of the reference.
+    covariance : (6, 6) float64
+        Covariance of x, y and z in metres, and of a small rotation about the x, y and z axes of the sensor in radians;
+        0 for the reference.
+    residual_m : float
+        Root mean square of measured minus fitted paths of the waves that the sensor heard, in metres.
+    n_reflectors : int
+        Number of reflectors that the sensor has in common with others.
+    n_waves : int
+        Number of waves that the sensor heard, including calls of other sensors.
+    """
+
+    translation_m: NDArray[np.float64]
+    rotation_xyzw: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    residual_m: float
+    n_reflectors: int
+    n_waves: int
+
+    @property
+    def translation_interval_m(self) -> NDArray[np.float64]:
+        """Half of the 95 % intervals of x, y and z, in metres: (axis,) float64."""
+        return np.asarray(_INTERVAL * np.sqrt(np.diag(self.covariance)[:3]))
+
+    @property
+    def rotation_interval_deg(self) -> NDArray[np.float64]:
+        """Half of the 95 % intervals of rotations about the axes of the sensor, in degrees: (axis,) float64."""
+        return np.asarray(np.degrees(_INTERVAL * np.sqrt(np.diag(self.covariance)[3:])))
+
+    @property
+    def rotation(self) -> NDArray[np.float64]:
+        """Rotation matrix from the frame of the sensor to that of the reference: (3, 3) float64."""
+        x, y, z, w = self.rotation_xyzw
+        return np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+
+    @property
+    def yaw_pitch_roll_deg(self) -> tuple[float, float, float]:
+        """Rotation to the left, then nose up, then clockwise as seen from behind, in degrees."""
+        matrix = self.rotation
+        pitch = np.arcsin(np.clip(matrix[2, 0], -1, 1))
+        if np.hypot(matrix[0, 0], matrix[1, 0]) < 1e-9:  # Straight up or down, only yaw and roll together are defined.
+            yaw, roll = np.arctan2(-matrix[0, 1], matrix[1, 1]), 0.0
+        else:
+            yaw, roll = np.arctan2(matrix[1, 0], matrix[0, 0]), np.arctan2(matrix[2, 1], matrix[2, 2])
+        return float(np.degrees(yaw)), float(np.degrees(pitch)), float(np.degrees(roll))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseCalibration:
+    """Poses of several sensors on one platform, as measured by the sensors.
+
+    Attributes
+    ----------
+    reference : str
+        Sensor whose frame the poses refer to.
+    poses : dict of str to SensorPose
+        Poses of all sensors.
+    reflectors_m : (reflector, axis) float64
+        Reflectors that several sensors heard, in the frame of the reference, in metres.
+    n_measurements : int
+        Number of SYNC pulses with measurements of more than one sensor.
+    unused : tuple of int
+        Numbers of the SYNC pulses in which no new reflector was found.
+    not_observable : tuple of str
+        Quantities that these recordings cannot determine, with what to do about it.
+    """
+
+    reference: str
+    poses: dict[str, SensorPose]
+    reflectors_m: NDArray[np.float64]
+    n_measurements: int
+    unused: tuple[int, ...]
+    not_observable: tuple[str, ...]
+
+    @property
+    def mounting(self) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
+        """Position and quaternion of each sensor, as `write_recording` accepts them."""
+        return {name: (pose.translation_m, pose.rotation_xyzw) for name, pose in self.poses.items()}
