@@ -8,14 +8,15 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ertis_numba.air import sound_speed_m_s
+from ertis_numba.air import absorption_db_m, sound_speed_m_s
 from ertis_numba.analysis.health.arrival import Compressed, compress
 from ertis_numba.calibration.sounds import _signals
 from ertis_numba.calibration.spherical_waves import N_PARAMETERS, fit_wave, wave_lags, wave_slopes
 from ertis_numba.errors import DataError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones
-from ertis_numba.settings import Array
+from ertis_numba.settings import Air, Array, Call
+from ertis_numba.waveform import call_samples
 
 __all__ = ["Wave", "find_waves"]
 
@@ -23,16 +24,20 @@ _MIN_MICROPHONES: Final = 6
 _MAX_WAVES: Final = 28
 _OVERSAMPLING: Final = 4
 _PROMINENCE: Final = 7.0  # Smallest peak of an envelope relative to its median over time.
+_DYNAMIC_RANGE: Final = 0.005  # Amplitude of the weakest wave relative to the strongest peak.
 _DIRECTION_STEP: Final = 0.045  # Of direction cosines; 8 cm from the centre, this is half of the width of a pulse.
-_N_SEARCHED: Final = 16  # Microphones of the first search.
+_N_SEARCHED: Final = 10  # Microphones of the first search.
 _PULSE_WIDTHS: Final = 2.0  # Half of the time around an arrival, in units of 1 / bandwidth.
 _MIN_COHERENCE: Final = 0.5  # Power of the common pulse relative to that of all microphones.
 _SEARCH_WIDTHS: Final = 1.2  # Distance of a microphone's peak from the expected time, in the same units.
 _FLAT_M: Final = 1e-3
+_REGULARISATION: Final = 0.03  # Power of the call below which its spectrum is not flattened, relative to the maximum.
+_FINER: Final = 16
+_ABSORPTION_STEP_M: Final = 0.25
 _NEAR_M: Final = 0.4  # Path up to which sources may be other sensors beside the array.
 _NEAREST_M: Final = 0.03
 _CURVATURES: Final = np.geomspace(0.1, 1 / _NEAREST_M, 24)
-_MAX_MISSES: Final = 24  # Peaks in succession that belong to no wave, after which the rest is noise.
+_MAX_MISSES: Final = 12  # Peaks in succession that belong to no wave, after which the rest is noise.
 _GHOST: Final = 0.15  # Amplitude of a side lobe relative to its pulse.
 _GHOST_WIDTHS: Final = 3.5  # Distance of side lobes from a pulse, in units of 1 / bandwidth.
 _GHOST_COSINE: Final = 0.03
@@ -40,7 +45,7 @@ _MIN_CONTRAST: Final = 0.5  # Level of the sum of envelopes, relative to the pea
 
 # Errors that noise does not explain, such as those of the positions of the microphones.
 _MODEL_SD: Final = np.array([0.3e-3, 1e-3, 1e-3, 1e-3, 0.03])
-_OVERLAP_SD_M: Final = 4e-3  # Error of the path for a pulse that has nothing in common with that of one echo.
+_OVERLAP_SD_M: Final = 12e-3  # Error of the path for a pulse that has nothing in common with that of one echo.
 
 
 class Wave(NamedTuple):
@@ -80,19 +85,42 @@ class _Receivers:
     positions_m: NDArray[np.float64]
     delay_s: NDArray[np.float64]
     gain: NDArray[np.float64]
-    lags_m: dict[float, NDArray[np.float64]] = field(default_factory=dict)
+    lags_m: dict[float, NDArray[np.float32]] = field(default_factory=dict)
 
     def directions(self) -> NDArray[np.float64]:
         """Return the directions to search: (direction, axis) float64."""
         return _directions(is_flat=bool(np.ptp(self.positions_m[:, 0]) < _FLAT_M))
 
-    def lags_of(self, curvature_1_m: float) -> NDArray[np.float64]:
-        """Return the lags of all microphones for all directions: (direction, mic) float64."""
+    def lags_of(self, curvature_1_m: float) -> NDArray[np.float32]:
+        """Return the lags of all microphones for all directions: (direction, mic) float32."""
         if curvature_1_m not in self.lags_m:
             directions = self.directions()
             curvatures = np.full(len(directions), curvature_1_m)
-            self.lags_m[curvature_1_m] = wave_lags(directions, curvatures, self.positions_m)
+            lags_m = wave_lags(directions, curvatures, self.positions_m)
+            self.lags_m[curvature_1_m] = lags_m.astype(np.float32)
         return self.lags_m[curvature_1_m]
+
+
+@dataclass(slots=True, eq=False)
+class _Pulses:
+    """Pulses of single echoes, by the length of their path."""
+
+    filter: NDArray[np.float64]
+    spectrum: NDArray[np.float64]
+    absorption_1_m: NDArray[np.float64]
+    middle: int
+    n_steps: int
+    made: dict[int, NDArray[np.complex128]] = field(default_factory=dict)
+
+    def after(self, path_m: float) -> NDArray[np.complex128]:
+        """Return the pulse, at steps that are shorter by `_FINER`: (step,) complex128."""
+        number = round(path_m / _ABSORPTION_STEP_M)
+        if number not in self.made:
+            bins = self.spectrum * np.exp(-self.absorption_1_m * number * _ABSORPTION_STEP_M)
+            padded = np.zeros(_FINER * self.n_steps, np.complex128)
+            padded[: len(bins)] = bins
+            self.made[number] = scipy.fft.ifft(np.roll(padded, -self.middle)) * _FINER
+        return self.made[number]
 
 
 @dataclass(slots=True, eq=False)
@@ -105,6 +133,7 @@ class _Record:
     start_s: float
     centre_hz: float
     bandwidth_hz: float
+    pulses: _Pulses
 
 
 def find_waves(measurement: Measurement) -> list[Wave]:
@@ -126,7 +155,7 @@ def find_waves(measurement: Measurement) -> list[Wave]:
     """
     record, receivers = _record(measurement, _receivers(measurement.settings.array))
     speed_m_s = sound_speed_m_s(measurement.settings.air)
-    floor = _PROMINENCE * np.median(record.envelope)
+    floor = max(_PROMINENCE * float(np.median(record.envelope)), _DYNAMIC_RANGE * float(record.envelope.max()))
     found: list[Wave] = []
     misses = 0
     while len(found) < _MAX_WAVES and misses < _MAX_MISSES:
@@ -137,7 +166,7 @@ def find_waves(measurement: Measurement) -> list[Wave]:
         wave = _wave_at(record, receivers, int(mic), int(step), speed_m_s)
         if wave is None:
             # The peak belongs to no wave, for example where two echoes overlap at one microphone.
-            reach = round(0.5 / record.bandwidth_hz / record.step_s)
+            reach = round(1.0 / record.bandwidth_hz / record.step_s)
             is_near = (record.start_s + step * record.step_s) * speed_m_s < _NEAR_M
             # Remains of loud direct sound are at all microphones.
             rows = slice(None) if is_near else slice(mic, mic + 1)
@@ -185,21 +214,19 @@ def _record(measurement: Measurement, receivers: _Receivers) -> tuple[_Record, _
     pulses = compress(
         signals, receivers.channels.tolist(), settings.call, rate_hz=rate_hz, first=0, last=n_samples
     )
-    return _at_baseband(pulses, receivers.gain), receivers
+    return _at_baseband(measurement, pulses, receivers.gain), receivers
 
 
-def _at_baseband(pulses: Compressed, gain: NDArray[np.float64]) -> _Record:
+def _at_baseband(measurement: Measurement, pulses: Compressed, gain: NDArray[np.float64]) -> _Record:
     n_bins = pulses.bins.shape[1]
     n_steps = 1 << (_OVERSAMPLING * n_bins - 1).bit_length()
-    width_s = pulses.envelope.shape[1] * pulses.step_s
-    step_s = width_s / n_steps
-    # Without the window, side lobes of loud direct sound would hide echoes.
-    windowed = pulses.bins * (scipy.signal.windows.hann(n_bins + 2)[1:-1] / gain[:, None])
-    middle = n_bins // 2
-    windowed = np.roll(np.pad(windowed, ((0, 0), (0, n_steps - n_bins))), -middle, axis=1)
-    # Microphones of negative gain have inverted polarity, which the division by the gain has removed.
+    step_s = pulses.envelope.shape[1] * pulses.step_s / n_steps
+    settings = measurement.settings
+    pulse = _pulses(settings.call, settings.air, *pulses.frequency_hz[[0, -1]].tolist(), n_bins, n_steps)
+    middle = pulse.middle
+    windowed = np.pad(pulses.bins * (pulse.filter / gain[:, None]), ((0, 0), (0, n_steps - n_bins)))
     first = round((pulses.origin_s - pulses.start_s) / step_s)
-    signals = np.roll(scipy.fft.ifft(windowed, axis=1), first, axis=1)
+    signals = np.roll(scipy.fft.ifft(np.roll(windowed, -middle, axis=1), axis=1), first, axis=1)
     band_hz = float(pulses.frequency_hz[-1] - pulses.frequency_hz[0])
     return _Record(
         signals,
@@ -208,7 +235,25 @@ def _at_baseband(pulses: Compressed, gain: NDArray[np.float64]) -> _Record:
         pulses.origin_s - first * step_s,
         float(pulses.frequency_hz[middle]),
         band_hz,
+        pulse,
     )
+
+
+@functools.lru_cache(maxsize=16)
+def _pulses(call: Call, air: Air, low_hz: float, high_hz: float, n_bins: int, n_steps: int) -> _Pulses:
+    """Return the filter of the signals, and the pulses after it."""
+    frequency_hz = np.linspace(low_hz, high_hz, n_bins)
+    rate_hz = call.sample_rate_hz
+    replica = call_samples(call, rate_hz=rate_hz)
+    n_fft = scipy.fft.next_fast_len(8 * len(replica), real=True)
+    power = np.abs(scipy.fft.rfft(replica, n_fft)) ** 2
+    power = np.interp(frequency_hz, np.fft.rfftfreq(n_fft, 1 / rate_hz), power)
+    # A flat spectrum makes pulses short, and the window lowers side lobes, which would hide echoes.
+    shape = np.hanning(n_bins + 2)[1:-1] / (power / power.max() + _REGULARISATION)
+    spectrum = power * shape
+    middle = int(np.searchsorted(np.cumsum(spectrum), spectrum.sum() / 2))
+    absorption_1_m = absorption_db_m(air, frequency_hz) * (np.log(10) / 20)
+    return _Pulses(shape, spectrum, absorption_1_m, middle, n_steps)
 
 
 def _wave_at(record: _Record, receivers: _Receivers, mic: int, step: int, speed_m_s: float) -> Wave | None:
@@ -234,7 +279,7 @@ def _wave_at(record: _Record, receivers: _Receivers, mic: int, step: int, speed_
     pulse, _, share = _common(aligned, weight, record.centre_hz)
     if share < _MIN_COHERENCE or wave[0] <= 0 or not 0.5 < np.linalg.norm(wave[1:4]) < 1.5:
         return None
-    shift_s, overlap = _shape(pulse, record)
+    shift_s, overlap = _shape(pulse, record, float(wave[0]))
     level = (aligned @ np.conj(pulse)).real / float(np.sum(np.abs(pulse) ** 2))
     _subtract(record, time_s, pulse, level)
     wave[0] += shift_s * speed_m_s
@@ -251,15 +296,17 @@ def _searched(
     directions = receivers.directions()
     chosen = np.unique(np.append(np.linspace(0, len(receivers.channels) - 1, _N_SEARCHED).astype(int), mic))
     seed = int(np.searchsorted(chosen, mic))
+    later = receivers.delay_s / record.step_s
+    step_m = speed_m_s * record.step_s
     best, best_sum = None, 0.0
     for curvature in _curvatures(path_m):
         lags_m = receivers.lags_of(curvature)[:, chosen]
         here_m = lags_m[:, [seed]]
-        time_s = (lags_m - here_m) / speed_m_s + at_s + receivers.delay_s[chosen]
-        steps = np.rint((time_s - record.start_s) / record.step_s).astype(np.intp)
-        # Nearby sources are louder at the nearest microphones.
-        spreading = (1 + curvature * lags_m) / (1 + curvature * here_m)
-        heights = record.envelope[chosen, np.clip(steps, 0, record.envelope.shape[1] - 1)] * spreading
+        steps = np.rint((lags_m - here_m) / step_m + (step + later[chosen] - later[mic])).astype(np.intp)
+        # Steps beyond the record are those of another microphone, which is as good as noise.
+        heights = record.envelope.ravel().take(steps + chosen * record.envelope.shape[1], mode="clip")
+        if path_m < _NEAR_M:  # Nearby sources are louder at the nearest microphones.
+            heights = heights * ((1 + curvature * lags_m) / (1 + curvature * here_m))
         sums = heights.mean(axis=1)
         highest = int(np.argmax(sums))
         if sums[highest] > best_sum:
@@ -343,20 +390,18 @@ def _common(
     return pulse, -np.angle(product) / (2 * np.pi * centre_hz), float(common.sum()) / max(power, 1e-300)
 
 
-def _shape(pulse: NDArray[np.complex128], record: _Record) -> tuple[float, float]:
+def _shape(pulse: NDArray[np.complex128], record: _Record, path_m: float) -> tuple[float, float]:
     """Return the time of the highest correlation with an ideal pulse, and the share of amplitude that differs."""
     half = len(pulse) // 2
-    steps = np.arange(-half, half + 1)
-    fine = np.linspace(-1, 1, 81) * 0.5 / record.bandwidth_hz
-    ideal = _ideal_pulse((steps * record.step_s - fine[:, None]) * record.bandwidth_hz)
-    product = np.abs(ideal @ pulse) / np.linalg.norm(ideal, axis=1) / max(float(np.linalg.norm(pulse)), 1e-300)
+    reach = round(0.5 * _FINER / record.bandwidth_hz / record.step_s)
+    shifts = np.arange(-reach, reach + 1)
+    ideal = record.pulses.after(path_m)
+    shifted = ideal[(_FINER * np.arange(-half, half + 1) - shifts[:, None]) % len(ideal)]
+    product = np.abs(np.conj(shifted) @ pulse) / np.linalg.norm(shifted, axis=1)
+    product /= max(float(np.linalg.norm(pulse)), 1e-300)
     best = int(np.argmax(product))
-    return float(fine[best]), float(np.sqrt(max(0.0, 1 - min(1.0, float(product[best])) ** 2)))
-
-
-def _ideal_pulse(place: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the transform of the Hann window: ``sinc(t) / (1 − t²)``, with the time in units of 1 / bandwidth."""
-    return np.asarray(np.sinc(place) + 0.5 * (np.sinc(place - 1) + np.sinc(place + 1)))
+    different = float(np.sqrt(max(0.0, 1 - min(1.0, float(product[best])) ** 2)))
+    return float(shifts[best]) * record.step_s / _FINER, different
 
 
 def _subtract(
