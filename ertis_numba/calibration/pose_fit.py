@@ -250,7 +250,7 @@ def fit_poses(problem: PoseProblem, *, max_steps: int = 30) -> PoseFit:
     weight = 1 / np.sqrt(1 + (rest / _F_SCALE) ** 2)
     inverse = _inverse((slopes.T * weight) @ slopes)
     # Waves at flat arrays have fewer than five residuals, the others are 0.
-    factor = _mean_square(rest[np.abs(slopes).max(axis=1) > 0], problem.n_unknown)
+    factor = max(1.0, _mean_square(rest[np.abs(slopes).max(axis=1) > 0], problem.n_unknown))
     covariance = np.zeros((len(rotation), 6, 6))
     for place, sensor in enumerate(problem.moving):
         own = slice(6 * place, 6 * place + 6)

@@ -1,27 +1,24 @@
-"""First approximation of poses: rigid transforms between sensors that heard the same reflectors."""
+"""Rigid transforms between two sensors that heard the same reflectors."""
 
 from collections.abc import Mapping, Sequence
-from itertools import combinations
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.calibration.wave_finder import Wave
-from ertis_numba.errors import DataError
 
-__all__ = ["MIN_REFLECTORS", "Link", "WavesOfSensor", "echo_points", "link_sensors", "place_sensors", "unit_direction"]
+__all__ = ["Link", "WavesOfSensor", "candidate_links", "echo_points", "unit_direction"]
 
 WavesOfSensor = Mapping[tuple[int, int], Sequence[Wave]]
 """Waves of one sensor by SYNC pulse: its number, and a count of measurements with this number."""
 
-MIN_REFLECTORS: Final = 4
-"""Different places that two sensors must have in common; three would also agree by chance."""
-_MIN_SHARE: Final = 0.25  # Share of the common measurements whose reflectors must agree.
 _TOLERANCE_M: Final = 0.015
 _SAME_M: Final = 0.02  # Places within this distance are one.
 _APART_M: Final = 0.1  # Smallest distance of two reflectors that determine a rotation.
 _TRIALS: Final = 400
+_MAX_LINKS: Final = 6
+_SAME_TRACE: Final = 2.98  # Trace of a rotation by 8 degrees.
 _MAX_PLATFORM_M: Final = 2.0  # Longest path of a call from sensor to sensor.
 _MIN_ECHO_M: Final = 0.3
 _SIGMAS: Final = 4.0
@@ -37,24 +34,10 @@ class Link(NamedTuple):
     ----------
     rotation : (axis, axis) float64
     translation_m : (axis,) float64
-    n_places : int
-        Number of different places that agree.
-    n_agreeing : int
-        Number of measurements whose reflectors agree.
-    n_common : int
-        Number of measurements in which both sensors heard echoes.
     """
 
     rotation: NDArray[np.float64]
     translation_m: NDArray[np.float64]
-    n_places: int
-    n_agreeing: int
-    n_common: int
-
-    @property
-    def is_valid(self) -> bool:
-        """True if the agreement is not by chance."""
-        return self.n_places >= MIN_REFLECTORS and self.n_agreeing >= _MIN_SHARE * self.n_common
 
 
 class _Pairs(NamedTuple):
@@ -63,8 +46,6 @@ class _Pairs(NamedTuple):
     first_m: NDArray[np.float64]
     second_m: NDArray[np.float64]
     weight: NDArray[np.float64]
-    pulse: NDArray[np.intp]
-    n_common: int
 
 
 def unit_direction(wave: Wave) -> NDArray[np.float64]:
@@ -108,51 +89,77 @@ def _emitter_points(waves: Sequence[Wave]) -> list[NDArray[np.float64]]:
     return found
 
 
-def link_sensors(waves: Mapping[str, WavesOfSensor], seed: int = 0) -> dict[tuple[str, str], Link]:
-    """Return the transforms between all pairs of sensors whose reflectors agree.
+def candidate_links(first: WavesOfSensor, second: WavesOfSensor, seed: int = 0) -> list[Link]:
+    """Return transforms from the second sensor to the first for which many reflectors agree, the best first.
 
     Echoes of one measurement in two sensors may be the same reflector. Three such pairs with equal distances yield a
-    transform (W. Kabsch, Acta Cryst. A 32, 1976, 922), and the transform that most pairs agree with wins (M. A.
+    transform (W. Kabsch, Acta Cryst. A 32, 1976, 922), and transforms that most pairs agree with are returned (M. A.
     Fischler and R. C. Bolles, Comm. ACM 24, 1981, 381).
 
     Parameters
     ----------
-    waves : mapping of str to WavesOfSensor
+    first, second : WavesOfSensor
     seed : int
         Seed of the random choice of pairs.
     """
-    links = {}
-    for first, second in combinations(waves, 2):
-        pairs = _pairs(waves[first], waves[second])
-        link = _link(pairs, np.random.default_rng(seed))
-        if link is not None and link.is_valid:
-            links[first, second] = link
-    return links
+    pairs = _pairs(first, second)
+    triples = _triples(pairs, np.random.default_rng(seed))
+    if not len(triples):
+        return []
+    rotation, shift_m = _kabsch(pairs.first_m[triples], pairs.second_m[triples], np.ones(triples.shape))
+    rest_m = np.linalg.norm(
+        np.einsum("tij,nj->tni", rotation, pairs.second_m) + shift_m[:, None] - pairs.first_m, axis=2
+    )
+    score = np.maximum(0.0, 1 - (rest_m / _TOLERANCE_M) ** 2) @ pairs.weight
+    found: list[Link] = []
+    for best in np.argsort(-score):
+        if all(_differ(Link(rotation[best], shift_m[best]), other) for other in found):
+            found.append(_refined(Link(rotation[best], shift_m[best]), pairs))
+        if len(found) == _MAX_LINKS:
+            break
+    return found
+
+
+def _differ(link: Link, other: Link) -> bool:
+    """Return True if transforms differ by more than their errors."""
+    turned = float(np.trace(link.rotation.T @ other.rotation))
+    return turned < _SAME_TRACE or bool(np.linalg.norm(link.translation_m - other.translation_m) > _APART_M)
+
+
+def _refined(link: Link, pairs: _Pairs) -> Link:
+    """Return the transform after a fit to all pairs that agree."""
+    for _ in range(4):
+        moved_m = pairs.second_m @ link.rotation.T + link.translation_m
+        rest = np.linalg.norm(moved_m - pairs.first_m, axis=1) / _TOLERANCE_M
+        weight = pairs.weight * np.maximum(0.0, 1 - rest**2)
+        if np.count_nonzero(weight) < 3:
+            break
+        rotation, shift_m = _kabsch(pairs.first_m[None], pairs.second_m[None], weight[None])
+        link = Link(rotation[0], shift_m[0])
+    return link
 
 
 def _pairs(first: WavesOfSensor, second: WavesOfSensor) -> _Pairs:
-    rows: list[tuple[NDArray[np.float64], NDArray[np.float64], float, int]] = []
-    n_common = 0
-    for number, pulse in enumerate(sorted(first.keys() & second.keys())):
+    rows: list[tuple[NDArray[np.float64], NDArray[np.float64], float]] = []
+    for pulse in sorted(first.keys() & second.keys()):
         (points, indices), (others, other_indices) = echo_points(first[pulse]), echo_points(second[pulse])
-        n_common += bool(len(points) and len(others))
         for point, index in zip(points, indices, strict=True):
             for other, other_index in zip(others, other_indices, strict=True):
                 own, distant = first[pulse][index], second[pulse][other_index]
                 common_m = (own.path_m + distant.path_m) / 2
                 agree = _hears(first[pulse], own, common_m) + _hears(second[pulse], distant, common_m)
-                rows.append((point, other, 1.0 + agree, number))
+                rows.append((point, other, 1.0 + agree))
         # Another sensor's call comes from the origin of that sensor.
-        rows += [(place, np.zeros(3), 1.0, -1) for place in _emitter_points(first[pulse])]
-        rows += [(np.zeros(3), place, 1.0, -1) for place in _emitter_points(second[pulse])]
+        rows += [(place, np.zeros(3), 1.0) for place in _emitter_points(first[pulse])]
+        rows += [(np.zeros(3), place, 1.0) for place in _emitter_points(second[pulse])]
     if not rows:
-        return _Pairs(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.intp), n_common)
+        return _Pairs(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
     first_m, second_m = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
     both = np.concatenate([first_m, second_m], axis=1)
     # Reflectors at rest appear in each measurement, but count once.
     alike = (np.abs(both[:, None] - both).max(axis=2) < _SAME_M).sum(axis=1)
     weight = np.array([row[2] for row in rows]) / alike
-    return _Pairs(first_m, second_m, weight, np.array([row[3] for row in rows]), n_common)
+    return _Pairs(first_m, second_m, weight)
 
 
 def _hears(waves: Sequence[Wave], own: Wave, path_m: float) -> bool:
@@ -162,30 +169,6 @@ def _hears(waves: Sequence[Wave], own: Wave, path_m: float) -> bool:
         and np.abs(wave.parameters[2:4] - own.parameters[2:4]).max() < _SAME_COSINE
         for wave in waves
     )
-
-
-def _link(pairs: _Pairs, rng: np.random.Generator) -> Link | None:
-    """Return the transform that most pairs agree with; None if there is none."""
-    triples = _triples(pairs, rng)
-    if not len(triples):
-        return None
-    rotation, shift_m = _kabsch(pairs.first_m[triples], pairs.second_m[triples], np.ones(triples.shape))
-    rest_m = np.linalg.norm(
-        np.einsum("tij,nj->tni", rotation, pairs.second_m) + shift_m[:, None] - pairs.first_m, axis=2
-    )
-    score = np.maximum(0.0, 1 - (rest_m / _TOLERANCE_M) ** 2) @ pairs.weight
-    best = int(np.argmax(score))
-    turn, move_m = rotation[best], shift_m[best]
-    for _ in range(4):
-        rest = np.linalg.norm(pairs.second_m @ turn.T + move_m - pairs.first_m, axis=1) / _TOLERANCE_M
-        weight = pairs.weight * np.maximum(0.0, 1 - rest**2)
-        if np.count_nonzero(weight) < 3:
-            break
-        turns, moves_m = _kabsch(pairs.first_m[None], pairs.second_m[None], weight[None])
-        turn, move_m = turns[0], moves_m[0]
-    inside = np.linalg.norm(pairs.second_m @ turn.T + move_m - pairs.first_m, axis=1) < _TOLERANCE_M
-    n_agreeing = len(np.unique(pairs.pulse[inside & (pairs.pulse >= 0)]))
-    return Link(turn, move_m, _n_places(pairs.first_m[inside]), n_agreeing, pairs.n_common)
 
 
 def _triples(pairs: _Pairs, rng: np.random.Generator) -> NDArray[np.intp]:
@@ -221,54 +204,3 @@ def _kabsch(
     left[:, :, 2] *= np.where(mirrored == 0, 1.0, mirrored)[:, None]
     rotation = left @ right
     return rotation, first - np.einsum("tij,tj->ti", rotation, second)
-
-
-def _n_places(points_m: NDArray[np.float64]) -> int:
-    kept: list[NDArray[np.float64]] = []
-    for point in points_m:
-        if all(np.linalg.norm(point - other) > 2 * _SAME_M for other in kept):
-            kept.append(point)
-    return len(kept)
-
-
-def place_sensors(
-    sensors: Sequence[str], links: Mapping[tuple[str, str], Link], reference: str
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return rotations and positions relative to the reference, along the strongest links.
-
-    Parameters
-    ----------
-    sensors : sequence of str
-    links : mapping of (str, str) to Link
-    reference : str
-
-    Returns
-    -------
-    rotation : (sensor, axis, axis) float64
-    translation_m : (sensor, axis) float64
-
-    Raises
-    ------
-    DataError
-        A sensor has too few reflectors in common with the others.
-    """
-    placed = {reference: (np.eye(3), np.zeros(3))}
-    while len(placed) < len(sensors):
-        usable = [
-            (link.n_places, pair, link) for pair, link in links.items() if (pair[0] in placed) != (pair[1] in placed)
-        ]
-        if not usable:
-            lone = [name for name in sensors if name not in placed]
-            raise DataError(
-                f"sensor {lone[0]} has fewer than {MIN_REFLECTORS} reflectors in common with "
-                f"{' and '.join(placed)}; place one small reflector where both hear it, at 10 to 20 different places"
-            )
-        _, (first, second), link = max(usable, key=lambda item: item[0])
-        if first in placed:
-            rotation, shift_m = placed[first]
-            placed[second] = rotation @ link.rotation, rotation @ link.translation_m + shift_m
-        else:
-            rotation, shift_m = placed[second]
-            turn = rotation @ link.rotation.T
-            placed[first] = turn, shift_m - turn @ link.translation_m
-    return np.array([placed[name][0] for name in sensors]), np.array([placed[name][1] for name in sensors])

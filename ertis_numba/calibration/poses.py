@@ -6,14 +6,16 @@ from typing import Final
 
 import numpy as np
 import scipy
+import threadpoolctl
 from numpy.typing import NDArray
 
 from ertis_numba import checks
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.calibration.pose_fit import PoseFit, PoseProblem, fit_poses
-from ertis_numba.calibration.pose_links import echo_points, link_sensors, place_sensors
+from ertis_numba.calibration.pose_links import echo_points
 from ertis_numba.calibration.pose_matching import Gates, Matched, match_waves
 from ertis_numba.calibration.pose_result import PoseCalibration, SensorPose
+from ertis_numba.calibration.pose_start import MIN_REFLECTORS, place_sensors, too_few
 from ertis_numba.calibration.wave_finder import Wave, find_waves
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement
@@ -22,8 +24,8 @@ __all__ = ["calibrate_poses"]
 
 _GATES: Final = (Gates(0.03, 0.05), Gates(0.012, 0.03), Gates(0.008, 0.02))
 """Gates of successive rounds; the first one allows for the errors of the first approximation."""
-_MAX_ROTATION_SD_DEG: Final = 1.0  # Beyond this, a rotation counts as not observable.
-_MAX_POSITION_SD_M: Final = 0.02
+_MAX_ROTATION_SD_DEG: Final = 0.5  # Beyond this, a rotation counts as not observable.
+_MAX_POSITION_SD_M: Final = 0.01
 _LINE: Final = 0.12  # Extent of reflectors across a line relative to that along it.
 
 _Heard = dict[str, dict[tuple[int, int], list[Wave]]]
@@ -42,7 +44,7 @@ def calibrate_poses(
     Not every sensor must hear each place: front and back may be linked by a third sensor. Further reflectors at rest do
     no harm.
 
-    Waves are found in each measurement (`find_waves`), sensors are linked by common reflectors (`link_sensors`), waves
+    Waves are found in each measurement (`find_waves`), sensors are placed by common reflectors (`place_sensors`), waves
     are matched to reflectors and emitters (`match_waves`), and poses and reflectors are fitted together (`fit_poses`).
 
     Parameters
@@ -64,7 +66,7 @@ def calibrate_poses(
     ArgumentError
         There are fewer than two sensors, the reference is not among them, or they do not share SYNC pulses.
     DataError
-        A sensor hears no echoes, or has fewer than 4 reflectors in common with the others.
+        A sensor hears no echoes, or has fewer than 3 reflectors in common with the others.
 
     Notes
     -----
@@ -85,10 +87,21 @@ def calibrate_poses(
             f"poses of {len(measurements)} sensor{'s' * (len(measurements) != 1)} are asked for; give at least two"
         )
     names = list(measurements)
-    reference = names[0] if reference is None else checks.choice("reference", reference, names)
+    reference = names[0] if reference is None else reference
+    checks.choice("reference", reference, names)
+    # Only now is SciPy's BLAS loaded. On busy cores, its threads wait for each other; the matrices are small.
+    _ = scipy.optimize.least_squares
+    with threadpoolctl.threadpool_limits(1, user_api="blas"):
+        return _calibrated(measurements, reference, on_progress)
+
+
+def _calibrated(
+    measurements: Mapping[str, Iterable[Measurement]], reference: str, on_progress: Callable[[int], None] | None
+) -> PoseCalibration:
+    names = list(measurements)
     heard, speed_m_s = _heard(measurements, on_progress)
     common = _common_pulses(heard)
-    rotation, translation_m = place_sensors(names, link_sensors(heard), reference)
+    rotation, translation_m = place_sensors(heard, reference, speed_m_s)
     for gates in _GATES:
         matched = match_waves(heard, rotation, translation_m, speed_m_s, gates)
         problem = PoseProblem(
@@ -97,6 +110,9 @@ def calibrate_poses(
         fit = fit_poses(problem)
         rotation, translation_m = fit.rotation, fit.translation_m
     n_reflectors = _counts(matched, len(names))
+    for name, count in zip(names, n_reflectors, strict=True):
+        if count < MIN_REFLECTORS:
+            raise too_few(name, [other for other in names if other != name])
     poses = {
         name: _pose(matched, fit, number, int(n_reflectors[number])) for number, name in enumerate(names)
     }

@@ -1,0 +1,96 @@
+"""First approximation of the poses of all sensors."""
+
+from collections.abc import Mapping
+from itertools import combinations
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.calibration.pose_links import Link, WavesOfSensor, candidate_links
+from ertis_numba.calibration.pose_matching import Gates, match_waves
+from ertis_numba.errors import DataError
+
+__all__ = ["MIN_REFLECTORS", "place_sensors", "too_few"]
+
+MIN_REFLECTORS: Final = 3
+"""Different places that a sensor must have in common with others."""
+_GATES: Final = Gates(0.03, 0.05)
+
+
+class _Confirmed(NamedTuple):
+    """Transform between two sensors, and the reflectors and waves that confirm it."""
+
+    n_reflectors: int
+    n_waves: int
+    link: Link
+
+
+def place_sensors(
+    waves: Mapping[str, WavesOfSensor], reference: str, speed_m_s: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return rotations and positions relative to the reference.
+
+    A link between two sensors is confirmed by reflectors whose echoes of both calls arrive when they should. Sensors
+    are placed one after the other by the link with most reflectors to one that has its place.
+
+    Parameters
+    ----------
+    waves : mapping of str to WavesOfSensor
+    reference : str
+    speed_m_s : float
+
+    Returns
+    -------
+    rotation : (sensor, axis, axis) float64
+    translation_m : (sensor, axis) float64
+
+    Raises
+    ------
+    DataError
+        A sensor has too few reflectors in common with the others.
+    """
+    links = {}
+    for first, second in combinations(waves, 2):
+        link = _confirmed({first: waves[first], second: waves[second]}, speed_m_s)
+        if link is not None:
+            links[first, second] = link
+    placed = {reference: (np.eye(3), np.zeros(3))}
+    while len(placed) < len(waves):
+        usable = [(link, pair) for pair, link in links.items() if (pair[0] in placed) != (pair[1] in placed)]
+        if not usable:
+            raise too_few(next(name for name in waves if name not in placed), list(placed))
+        (_, _, link), (first, second) = max(usable, key=lambda item: item[0][:2])
+        if first in placed:
+            rotation, shift_m = placed[first]
+            placed[second] = rotation @ link.rotation, rotation @ link.translation_m + shift_m
+        else:
+            rotation, shift_m = placed[second]
+            turn = rotation @ link.rotation.T
+            placed[first] = turn, shift_m - turn @ link.translation_m
+    return np.array([placed[name][0] for name in waves]), np.array([placed[name][1] for name in waves])
+
+
+def too_few(sensor: str, others: list[str]) -> DataError:
+    """Return the error for a sensor without enough common reflectors."""
+    return DataError(
+        f"sensor {sensor} has fewer than {MIN_REFLECTORS} reflectors in common with {' and '.join(others)}; place one "
+        "small reflector where both hear it, at 10 to 20 different places"
+    )
+
+
+def _confirmed(waves: Mapping[str, WavesOfSensor], speed_m_s: float) -> _Confirmed | None:
+    """Return the transform between two sensors that most reflectors confirm; None if there are too few."""
+    first, second = waves.values()
+    n_common = len(first.keys() & second.keys())
+    best = None
+    for link in candidate_links(first, second):
+        rotation = np.stack([np.eye(3), link.rotation])
+        translation_m = np.stack([np.zeros(3), link.translation_m])
+        matched = match_waves(waves, rotation, translation_m, speed_m_s, _GATES)
+        found = _Confirmed(len(matched.reflectors_m), len(matched.waves.receiver), link)
+        if found.n_reflectors >= MIN_REFLECTORS and (best is None or found[:2] > best[:2]):
+            best = found
+        if best is not None and best.n_reflectors >= n_common / 2:
+            break
+    return best
