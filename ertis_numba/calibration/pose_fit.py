@@ -149,7 +149,7 @@ class PoseProblem:
         """Return ``W (measured − predicted)``, one wave after the other: (wave × parameter,) float64."""
         rotation, translation_m, reflectors_m = self.split(unknown)
         rest = self._waves.parameters - self._model(rotation, translation_m, reflectors_m)
-        return np.einsum("wij,wj->wi", self._waves.root, rest).ravel()
+        return np.asarray(np.einsum("wij,wj->wi", self._waves.root, rest).ravel())
 
     def path_residuals_m(self, unknown: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return measured minus predicted paths: (wave,) float64."""
@@ -212,7 +212,7 @@ class PoseProblem:
         for axis in range(3):
             column = self.n_poses + 3 * waves.reflector[rows] + axis
             slopes[rows, :, column] = by_source[rows, :, axis]
-        return -np.einsum("wij,wjk->wik", waves.root, slopes).reshape(-1, self.n_unknown)
+        return np.asarray(-np.einsum("wij,wjk->wik", waves.root, slopes).reshape(-1, self.n_unknown))
 
     def _sources(self, translation_m: NDArray[np.float64], reflectors_m: NDArray[np.float64]) -> NDArray[np.float64]:
         source_m = translation_m[self._waves.emitter].copy()

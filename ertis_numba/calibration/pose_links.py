@@ -13,7 +13,7 @@ __all__ = ["Link", "WavesOfSensor", "candidate_links", "echo_points", "unit_dire
 WavesOfSensor = Mapping[tuple[int, int], Sequence[Wave]]
 """Waves of one sensor by SYNC pulse: its number, and a count of measurements with this number."""
 
-_TOLERANCE_M: Final = 0.015
+_TOLERANCE_M: Final = 0.02
 _SAME_M: Final = 0.02  # Places within this distance are one.
 _APART_M: Final = 0.1  # Smallest distance of two reflectors that determine a rotation.
 _TRIALS: Final = 400

@@ -11,7 +11,7 @@ from ertis_numba.calibration.pose_links import WavesOfSensor, echo_points
 from ertis_numba.calibration.wave_finder import Wave
 from ertis_numba.constants import SYNC_STEP_S
 
-__all__ = ["Gates", "Matched", "match_waves"]
+__all__ = ["Gates", "Matched", "match_waves", "without_outliers"]
 
 _MAX_REFLECTORS: Final = 8  # in one measurement
 _MIN_WAVES: Final = 3
@@ -106,6 +106,39 @@ def match_waves(
     return Matched(_table(rows, speed_m_s), places_m, tuple(reflector.pulse for reflector in kept))
 
 
+def without_outliers(
+    matched: Matched, reflectors_m: NDArray[np.float64], residual_m: NDArray[np.float64], limit_m: float
+) -> Matched:
+    """Return the waves that fit, without reflectors that lose too many of theirs.
+
+    Parameters
+    ----------
+    matched : Matched
+    reflectors_m : (reflector, axis) float64
+        Reflectors after the fit.
+    residual_m : (wave,) float64
+        Measured minus fitted paths.
+    limit_m : float
+        Largest residual.
+    """
+    fits = np.abs(residual_m) < limit_m
+    reflector = matched.waves.reflector
+    counts = np.bincount(reflector[fits & (reflector >= 0)], minlength=len(reflectors_m))
+    stays = counts >= _MIN_WAVES
+    kept = fits & ((reflector < 0) | stays[reflector])
+    numbers = np.append(np.cumsum(stays) - 1, -1)  # The last one is for direct calls, whose number is −1.
+    pulse = tuple(each for each, stay in zip(matched.pulse, stays, strict=True) if stay)
+    waves = WaveTable(
+        receiver=matched.waves.receiver[kept],
+        emitter=matched.waves.emitter[kept],
+        reflector=numbers[reflector[kept]],
+        parameters=matched.waves.parameters[kept],
+        root=matched.waves.root[kept],
+        sync_m=matched.waves.sync_m[kept],
+    )
+    return Matched(waves, reflectors_m[stays], pulse)
+
+
 def _table(rows: Sequence[tuple[int, int, int, Wave]], speed_m_s: float) -> WaveTable:
     receiver, emitter, reflector = (np.array([row[place] for row in rows], dtype=np.intp) for place in range(3))
     return WaveTable(
@@ -134,7 +167,7 @@ def _reflectors(
 ) -> list[_Reflector]:
     """Return the reflectors of one measurement, and note the waves that they explain."""
     places_m = _places_to_try(heard, poses)
-    found = []
+    found: list[_Reflector] = []
     while len(found) < _MAX_REFLECTORS and len(places_m):
         tried = [_explained(place, heard, used, poses, gates, pulse) for place in places_m]
         # A place that explains too little now explains even less later.
@@ -156,9 +189,7 @@ def _places_to_try(heard: Sequence[Sequence[Wave]], poses: _Poses) -> NDArray[np
     found: list[NDArray[np.float64]] = []
     for sensor, waves in enumerate(heard):
         points_m = echo_points(waves)[0] @ poses.rotation[sensor].T + poses.translation_m[sensor]
-        found += [
-            point for point in points_m if all(np.abs(point - other).max() > _MERGED_M for other in found)
-        ]
+        found += [point for point in points_m if all(np.abs(point - other).max() > _MERGED_M for other in found)]
     return np.array(found).reshape(-1, 3)
 
 

@@ -1,5 +1,6 @@
 """Result of a calibration of poses."""
 
+import json
 from dataclasses import dataclass
 
 import numpy as np
@@ -71,6 +72,14 @@ class SensorPose:
             yaw, roll = np.arctan2(matrix[1, 0], matrix[0, 0]), np.arctan2(matrix[2, 1], matrix[2, 2])
         return float(np.degrees(yaw)), float(np.degrees(pitch)), float(np.degrees(roll))
 
+    @property
+    def yaw_pitch_roll_interval_deg(self) -> NDArray[np.float64]:
+        """Half of the 95 % intervals of yaw, pitch and roll, in degrees: (angle,) float64."""
+        _, pitch, roll = np.radians(self.yaw_pitch_roll_deg)
+        across = np.array([0.0, np.sin(roll), np.cos(roll)]) / max(float(np.cos(pitch)), 1e-6)
+        slopes = np.array([across, [0.0, -np.cos(roll), np.sin(roll)], [1.0, 0.0, 0.0] - np.sin(pitch) * across])
+        return np.asarray(np.degrees(_INTERVAL * np.sqrt(np.diag(slopes @ self.covariance[3:, 3:] @ slopes.T))))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseCalibration:
@@ -103,3 +112,19 @@ class PoseCalibration:
     def mounting(self) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
         """Position and quaternion of each sensor, as `write_recording` accepts them."""
         return {name: (pose.translation_m, pose.rotation_xyzw) for name, pose in self.poses.items()}
+
+    def to_toml(self) -> str:
+        """Return the poses as the ``[[sensors]]`` of a scene, which ``ertis capture --mounting`` reads."""
+        found = f"from {len(self.reflectors_m)} reflectors; ± is half of a 95 % interval."
+        lines = [f"# Mountings of sensors relative to {self.reference}, by 'ertis calibrate --poses',", f"# {found}"]
+        for name, pose in self.poses.items():
+            angles = zip(("yaw", "pitch", "roll"), pose.yaw_pitch_roll_deg, strict=True)
+            places = ", ".join(f"{value:.6f}" for value in pose.translation_m)
+            moved = ", ".join(f"{1e3 * value:.2f}" for value in pose.translation_interval_m)
+            turned = [f"{value:.3f}" for value in pose.yaw_pitch_roll_interval_deg]
+            lines += ["", "[[sensors]]", f"name = {json.dumps(name)}", f"position_m = [{places}]  # ± {moved} mm"]
+            lines += [
+                f"{angle}_deg = {value:.5f}  # ± {interval}"
+                for (angle, value), interval in zip(angles, turned, strict=True)
+            ]
+        return "\n".join(lines) + "\n"

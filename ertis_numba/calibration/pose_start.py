@@ -7,6 +7,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.calibration.pose_fit import PoseProblem, fit_poses
 from ertis_numba.calibration.pose_links import Link, WavesOfSensor, candidate_links
 from ertis_numba.calibration.pose_matching import Gates, match_waves
 from ertis_numba.errors import DataError
@@ -15,14 +16,15 @@ __all__ = ["MIN_REFLECTORS", "place_sensors", "too_few"]
 
 MIN_REFLECTORS: Final = 3
 """Different places that a sensor must have in common with others."""
-_GATES: Final = Gates(0.03, 0.05)
+_GATES: Final = (Gates(0.03, 0.05), Gates(0.006, 0.03))
+_CERTAIN: Final = 3.2  # Waves per measurement beyond which a link is certain; a reflector yields four.
 
 
 class _Confirmed(NamedTuple):
     """Transform between two sensors, and the reflectors and waves that confirm it."""
 
-    n_reflectors: int
     n_waves: int
+    n_reflectors: int
     link: Link
 
 
@@ -32,7 +34,7 @@ def place_sensors(
     """Return rotations and positions relative to the reference.
 
     A link between two sensors is confirmed by reflectors whose echoes of both calls arrive when they should. Sensors
-    are placed one after the other by the link with most reflectors to one that has its place.
+    are placed one after the other by the link with most such echoes to one that has its place.
 
     Parameters
     ----------
@@ -50,14 +52,14 @@ def place_sensors(
     DataError
         A sensor has too few reflectors in common with the others.
     """
-    links = {}
+    links: dict[tuple[str, str], _Confirmed] = {}
     for first, second in combinations(waves, 2):
-        link = _confirmed({first: waves[first], second: waves[second]}, speed_m_s)
-        if link is not None:
-            links[first, second] = link
+        confirmed = _confirmed({first: waves[first], second: waves[second]}, speed_m_s)
+        if confirmed is not None:
+            links[first, second] = confirmed
     placed = {reference: (np.eye(3), np.zeros(3))}
     while len(placed) < len(waves):
-        usable = [(link, pair) for pair, link in links.items() if (pair[0] in placed) != (pair[1] in placed)]
+        usable = [(each, pair) for pair, each in links.items() if (pair[0] in placed) != (pair[1] in placed)]
         if not usable:
             raise too_few(next(name for name in waves if name not in placed), list(placed))
         (_, _, link), (first, second) = max(usable, key=lambda item: item[0][:2])
@@ -83,14 +85,24 @@ def _confirmed(waves: Mapping[str, WavesOfSensor], speed_m_s: float) -> _Confirm
     """Return the transform between two sensors that most reflectors confirm; None if there are too few."""
     first, second = waves.values()
     n_common = len(first.keys() & second.keys())
-    best = None
+    best: _Confirmed | None = None
     for link in candidate_links(first, second):
-        rotation = np.stack([np.eye(3), link.rotation])
-        translation_m = np.stack([np.zeros(3), link.translation_m])
-        matched = match_waves(waves, rotation, translation_m, speed_m_s, _GATES)
-        found = _Confirmed(len(matched.reflectors_m), len(matched.waves.receiver), link)
+        found = _refined(waves, link, speed_m_s)
         if found.n_reflectors >= MIN_REFLECTORS and (best is None or found[:2] > best[:2]):
             best = found
-        if best is not None and best.n_reflectors >= n_common / 2:
+        if best is not None and best.n_waves > _CERTAIN * n_common:
             break
     return best
+
+
+def _refined(waves: Mapping[str, WavesOfSensor], link: Link, speed_m_s: float) -> _Confirmed:
+    """Return a transform after a fit, and what confirms it within narrow gates, in which few waves are by chance."""
+    rotation = np.stack([np.eye(3), link.rotation])
+    translation_m = np.stack([np.zeros(3), link.translation_m])
+    matched = match_waves(waves, rotation, translation_m, speed_m_s, _GATES[0])
+    if len(matched.reflectors_m) < MIN_REFLECTORS:
+        return _Confirmed(0, 0, link)
+    fit = fit_poses(PoseProblem(matched.waves, rotation, translation_m, matched.reflectors_m, 0), max_steps=10)
+    again = match_waves(waves, fit.rotation, fit.translation_m, speed_m_s, _GATES[1])
+    refined = Link(fit.rotation[1], fit.translation_m[1])
+    return _Confirmed(len(again.waves.receiver), len(again.reflectors_m), refined)

@@ -13,7 +13,7 @@ from ertis_numba import checks
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.calibration.pose_fit import PoseFit, PoseProblem, fit_poses
 from ertis_numba.calibration.pose_links import echo_points
-from ertis_numba.calibration.pose_matching import Gates, Matched, match_waves
+from ertis_numba.calibration.pose_matching import Gates, Matched, match_waves, without_outliers
 from ertis_numba.calibration.pose_result import PoseCalibration, SensorPose
 from ertis_numba.calibration.pose_start import MIN_REFLECTORS, place_sensors, too_few
 from ertis_numba.calibration.wave_finder import Wave, find_waves
@@ -104,18 +104,14 @@ def _calibrated(
     rotation, translation_m = place_sensors(heard, reference, speed_m_s)
     for gates in _GATES:
         matched = match_waves(heard, rotation, translation_m, speed_m_s, gates)
-        problem = PoseProblem(
-            matched.waves, rotation, translation_m, matched.reflectors_m, names.index(reference)
-        )
+        _require_reflectors(matched, names)
+        problem = PoseProblem(matched.waves, rotation, translation_m, matched.reflectors_m, names.index(reference))
         fit = fit_poses(problem)
         rotation, translation_m = fit.rotation, fit.translation_m
-    n_reflectors = _counts(matched, len(names))
-    for name, count in zip(names, n_reflectors, strict=True):
-        if count < MIN_REFLECTORS:
-            raise too_few(name, [other for other in names if other != name])
-    poses = {
-        name: _pose(matched, fit, number, int(n_reflectors[number])) for number, name in enumerate(names)
-    }
+    matched = without_outliers(matched, fit.reflectors_m, fit.path_residual_m, _GATES[-1].path_m)
+    n_reflectors = _require_reflectors(matched, names)
+    fit = fit_poses(PoseProblem(matched.waves, rotation, translation_m, matched.reflectors_m, names.index(reference)))
+    poses = {name: _pose(matched, fit, number, int(n_reflectors[number])) for number, name in enumerate(names)}
     found = {pulse for pulse, _ in matched.pulse}
     return PoseCalibration(
         reference,
@@ -169,15 +165,19 @@ def _common_pulses(heard: _Heard) -> list[tuple[int, int]]:
     return common
 
 
-def _counts(matched: Matched, n_sensors: int) -> NDArray[np.intp]:
-    """Return the number of reflectors of each sensor."""
+def _require_reflectors(matched: Matched, names: list[str]) -> NDArray[np.intp]:
+    """Return the number of reflectors of each sensor; raise an error if one has too few."""
     waves = matched.waves
     pairs = {
         (receiver, reflector)
         for receiver, reflector in zip(waves.receiver.tolist(), waves.reflector.tolist(), strict=True)
         if reflector >= 0
     }
-    return np.bincount([receiver for receiver, _ in pairs], minlength=n_sensors)
+    counts = np.bincount([receiver for receiver, _ in pairs], minlength=len(names))
+    for name, count in zip(names, counts, strict=True):
+        if count < MIN_REFLECTORS:
+            raise too_few(name, [other for other in names if other != name])
+    return counts
 
 
 def _pose(matched: Matched, fit: PoseFit, number: int, n_reflectors: int) -> SensorPose:
@@ -211,7 +211,7 @@ def _not_observable(
             why = (
                 f"a rotation of {name} about the line on which its {len(places_m)} reflectors are"
                 if on_line
-                else f"the pose of {name}, with {len(places_m)} reflectors to within {2 * np.degrees(deviation):.1f}° and "
-                f"{200 * position_m:.1f} cm"
+                else f"the pose of {name}, from {len(places_m)} reflectors, to within "
+                f"{2 * np.degrees(deviation):.1f}° and {200 * position_m:.1f} cm"
             )
             yield f"{why}: {remedy}"
