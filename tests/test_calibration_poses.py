@@ -5,10 +5,10 @@ import json
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
-
 from ertis_cli._calibrate_poses import write_poses
 from ertis_cli._mountings import mountings
+from scipy.spatial.transform import Rotation
+
 from ertis_numba.calibration.pose_fit import PoseProblem, WaveTable
 from ertis_numba.calibration.pose_result import PoseCalibration, SensorPose
 from ertis_numba.calibration.poses import calibrate_poses
@@ -176,7 +176,7 @@ def test_too_few_sensors_are_refused(two):
 
 
 def test_unknown_reference_is_refused(two):
-    with pytest.raises(ArgumentError, match=r"reference is 'back'"):
+    with pytest.raises(ArgumentError, match=r"reference 'back' is unknown; known are front, top"):
         calibrate_poses(two, reference="back")
 
 
@@ -199,7 +199,7 @@ def test_recordings_without_echoes_are_refused():
 
 
 def test_saturated_recordings_are_refused():
-    with pytest.raises(DataError, match=r"sensor front: \d+ of 32 channels are saturated; lower the emission level"):
+    with pytest.raises(DataError, match=r"sensor (front|top): \d+ of 32 channels are saturated; lower the emission level"):
         calibrate_poses(pair(1, level_db=10.0))
 
 
