@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.calibration.wave_finder import Wave
 
-__all__ = ["Link", "WavesOfSensor", "candidate_links", "echo_points", "unit_direction"]
+__all__ = ["RigidLink", "WavesOfSensor", "candidate_links", "echo_points", "unit_direction"]
 
 WavesOfSensor = Mapping[tuple[int, int], Sequence[Wave]]
 """Waves of one sensor by SYNC pulse: its number, and a count of measurements with this number."""
@@ -27,7 +27,7 @@ _PATH_TOLERANCE_M: Final = 8e-3
 _SAME_COSINE: Final = 0.03
 
 
-class Link(NamedTuple):
+class RigidLink(NamedTuple):
     """Rigid transform from the frame of one sensor to that of another, ``x = R y + t``.
 
     Attributes
@@ -89,7 +89,7 @@ def _emitter_points(waves: Sequence[Wave]) -> list[NDArray[np.float64]]:
     return found
 
 
-def candidate_links(first: WavesOfSensor, second: WavesOfSensor, seed: int = 0) -> list[Link]:
+def candidate_links(first: WavesOfSensor, second: WavesOfSensor, seed: int = 0) -> list[RigidLink]:
     """Return transforms from the second sensor to the first for which many reflectors agree, the best first.
 
     Echoes of one measurement in two sensors may be the same reflector. Three such pairs with equal distances yield a
@@ -111,22 +111,22 @@ def candidate_links(first: WavesOfSensor, second: WavesOfSensor, seed: int = 0) 
         np.einsum("tij,nj->tni", rotation, pairs.second_m) + shift_m[:, None] - pairs.first_m, axis=2
     )
     score = np.maximum(0.0, 1 - (rest_m / _TOLERANCE_M) ** 2) @ pairs.weight
-    found: list[Link] = []
+    found: list[RigidLink] = []
     for best in np.argsort(-score):
-        if all(_differ(Link(rotation[best], shift_m[best]), other) for other in found):
-            found.append(_refined(Link(rotation[best], shift_m[best]), pairs))
+        if all(_differ(RigidLink(rotation[best], shift_m[best]), other) for other in found):
+            found.append(_refined(RigidLink(rotation[best], shift_m[best]), pairs))
         if len(found) == _MAX_LINKS:
             break
     return found
 
 
-def _differ(link: Link, other: Link) -> bool:
+def _differ(link: RigidLink, other: RigidLink) -> bool:
     """Return True if transforms differ by more than their errors."""
     turned = float(np.trace(link.rotation.T @ other.rotation))
     return turned < _SAME_TRACE or bool(np.linalg.norm(link.translation_m - other.translation_m) > _APART_M)
 
 
-def _refined(link: Link, pairs: _Pairs) -> Link:
+def _refined(link: RigidLink, pairs: _Pairs) -> RigidLink:
     """Return the transform after a fit to all pairs that agree."""
     for _ in range(4):
         moved_m = pairs.second_m @ link.rotation.T + link.translation_m
@@ -135,7 +135,7 @@ def _refined(link: Link, pairs: _Pairs) -> Link:
         if np.count_nonzero(weight) < 3:
             break
         rotation, shift_m = _kabsch(pairs.first_m[None], pairs.second_m[None], weight[None])
-        link = Link(rotation[0], shift_m[0])
+        link = RigidLink(rotation[0], shift_m[0])
     return link
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.calibration.pose_fit import PoseProblem, fit_poses
-from ertis_numba.calibration.pose_links import Link, WavesOfSensor, candidate_links
+from ertis_numba.calibration.pose_links import RigidLink, WavesOfSensor, candidate_links
 from ertis_numba.calibration.pose_matching import Gates, match_waves
 from ertis_numba.errors import DataError
 
@@ -25,7 +25,7 @@ class _Confirmed(NamedTuple):
 
     n_waves: int
     n_reflectors: int
-    link: Link
+    link: RigidLink
 
 
 def place_sensors(
@@ -95,8 +95,8 @@ def _confirmed(waves: Mapping[str, WavesOfSensor], speed_m_s: float) -> _Confirm
     return best
 
 
-def _refined(waves: Mapping[str, WavesOfSensor], link: Link, speed_m_s: float) -> _Confirmed:
-    """Return a transform after a fit, and what confirms it within narrow gates, in which few waves are by chance."""
+def _refined(waves: Mapping[str, WavesOfSensor], link: RigidLink, speed_m_s: float) -> _Confirmed:
+    """Return a transform after a fit, with the waves that confirm it within narrow gates, where few match by chance."""
     rotation = np.stack([np.eye(3), link.rotation])
     translation_m = np.stack([np.zeros(3), link.translation_m])
     matched = match_waves(waves, rotation, translation_m, speed_m_s, _GATES[0])
@@ -104,5 +104,5 @@ def _refined(waves: Mapping[str, WavesOfSensor], link: Link, speed_m_s: float) -
         return _Confirmed(0, 0, link)
     fit = fit_poses(PoseProblem(matched.waves, rotation, translation_m, matched.reflectors_m, 0), max_steps=10)
     again = match_waves(waves, fit.rotation, fit.translation_m, speed_m_s, _GATES[1])
-    refined = Link(fit.rotation[1], fit.translation_m[1])
+    refined = RigidLink(fit.rotation[1], fit.translation_m[1])
     return _Confirmed(len(again.waves.receiver), len(again.reflectors_m), refined)

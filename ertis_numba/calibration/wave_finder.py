@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.calibration.spherical_waves import N_PARAMETERS, fit_wave, wave_lags, wave_slopes
-from ertis_numba.calibration.wave_records import FINER, Receivers, WaveRecord, wave_record
+from ertis_numba.calibration.wave_records import FINER, WaveRecord, WorkingMicrophones, wave_record
 from ertis_numba.frames import Measurement
 
 __all__ = ["Wave", "find_waves"]
@@ -122,7 +122,7 @@ def _without_ghosts(found: list[Wave], width_m: float) -> list[Wave]:
     return kept
 
 
-def _wave_at(record: WaveRecord, receivers: Receivers, mic: int, step: int, speed_m_s: float) -> Wave | None:
+def _wave_at(record: WaveRecord, receivers: WorkingMicrophones, mic: int, step: int, speed_m_s: float) -> Wave | None:
     """Return the wave with a peak at one microphone and time, and subtract it; None if there is none."""
     start = _searched(record, receivers, mic, step, speed_m_s)
     if start is None:
@@ -156,7 +156,7 @@ def _wave_at(record: WaveRecord, receivers: Receivers, mic: int, step: int, spee
 
 
 def _searched(
-    record: WaveRecord, receivers: Receivers, mic: int, step: int, speed_m_s: float
+    record: WaveRecord, receivers: WorkingMicrophones, mic: int, step: int, speed_m_s: float
 ) -> NDArray[np.float64] | None:
     """Return the wave of the grid of directions and curvatures whose envelopes add up best."""
     at_s = record.start_s + step * record.step_s - receivers.delay_s[mic]
@@ -193,7 +193,7 @@ def _curvatures(path_m: float) -> tuple[float, ...]:
     return tuple(sorted({float(_CURVATURES[np.argmin(np.abs(np.log(_CURVATURES / each)))]) for each in wanted}))
 
 
-def _times(wave: NDArray[np.float64], receivers: Receivers, speed_m_s: float) -> NDArray[np.float64]:
+def _times(wave: NDArray[np.float64], receivers: WorkingMicrophones, speed_m_s: float) -> NDArray[np.float64]:
     path_m = wave[0] + wave_lags(wave[1:4], wave[4], receivers.positions_m)
     return np.asarray(path_m / speed_m_s + receivers.delay_s)
 

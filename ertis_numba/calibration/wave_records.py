@@ -18,7 +18,7 @@ from ertis_numba.geometry import microphones
 from ertis_numba.settings import Air, Array, Call
 from ertis_numba.waveform import call_samples
 
-__all__ = ["FINER", "Receivers", "WaveRecord", "wave_record"]
+__all__ = ["FINER", "EchoPulses", "WaveRecord", "WorkingMicrophones", "wave_record"]
 
 _MIN_MICROPHONES: Final = 6
 _OVERSAMPLING: Final = 4
@@ -31,7 +31,7 @@ _ABSORPTION_STEP_M: Final = 0.25
 
 
 @dataclass(slots=True, eq=False)
-class Receivers:
+class WorkingMicrophones:
     """Microphones of a sensor, and their lags for the waves of the search."""
 
     channels: NDArray[np.intp]
@@ -90,13 +90,13 @@ class WaveRecord:
 
 
 @functools.lru_cache(maxsize=64)
-def _receivers(array: Array, faulty: tuple[int, ...] = ()) -> Receivers:
+def _receivers(array: Array, faulty: tuple[int, ...] = ()) -> WorkingMicrophones:
     layout = microphones(array)
     channels = np.setdiff1d(np.flatnonzero(layout.enabled), faulty)
-    return Receivers(channels, layout.positions_m[channels], layout.delay_s[channels], layout.gain[channels])
+    return WorkingMicrophones(channels, layout.positions_m[channels], layout.delay_s[channels], layout.gain[channels])
 
 
-def wave_record(measurement: Measurement) -> tuple[WaveRecord, Receivers]:
+def wave_record(measurement: Measurement) -> tuple[WaveRecord, WorkingMicrophones]:
     """Return the signals of one measurement, and the microphones that work.
 
     Parameters
