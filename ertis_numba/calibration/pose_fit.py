@@ -14,6 +14,7 @@ __all__ = ["PoseFit", "PoseProblem", "WaveTable", "fit_poses", "predicted_waves"
 _F_SCALE: Final = 2.0  # Residual in standard deviations from which the loss is linear.
 _MEDIAN_OF_NORMAL: Final = 0.6745
 _CLIPPED: Final = 4.0
+_MIN_FACTOR: Final = 0.15  # Errors that waves share, as those of overlapping echoes, are larger than residuals show.
 
 
 class WaveTable(NamedTuple):
@@ -250,7 +251,7 @@ def fit_poses(problem: PoseProblem, *, max_steps: int = 30) -> PoseFit:
     weight = 1 / np.sqrt(1 + (rest / _F_SCALE) ** 2)
     inverse = _inverse((slopes.T * weight) @ slopes)
     # Waves at flat arrays have fewer than five residuals, the others are 0.
-    factor = max(1.0, _mean_square(rest[np.abs(slopes).max(axis=1) > 0], problem.n_unknown))
+    factor = max(_MIN_FACTOR, _mean_square(rest[np.abs(slopes).max(axis=1) > 0], problem.n_unknown))
     covariance = np.zeros((len(rotation), 6, 6))
     for place, sensor in enumerate(problem.moving):
         own = slice(6 * place, 6 * place + 6)

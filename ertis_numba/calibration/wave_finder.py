@@ -13,8 +13,8 @@ from ertis_numba.frames import Measurement
 __all__ = ["Wave", "find_waves"]
 
 _MAX_WAVES: Final = 28
-_PROMINENCE: Final = 7.0  # Smallest peak of an envelope relative to its median over time.
-_DYNAMIC_RANGE: Final = 0.005  # Amplitude of the weakest wave relative to the strongest peak.
+_PROMINENCE: Final = 4.5  # Smallest peak of an envelope relative to its median over time.
+_DYNAMIC_RANGE: Final = 0.01  # Amplitude of the weakest echo or direct sound relative to the strongest one.
 _N_SEARCHED: Final = 10  # Microphones of the first search.
 _PULSE_WIDTHS: Final = 2.0  # Half of the time around an arrival, in units of 1 / bandwidth.
 _MIN_COHERENCE: Final = 0.5  # Power of the common pulse relative to that of all microphones.
@@ -82,14 +82,14 @@ def find_waves(measurement: Measurement) -> list[Wave]:
     """
     record, receivers = wave_record(measurement)
     speed_m_s = sound_speed_m_s(measurement.settings.air)
-    floor = max(_PROMINENCE * float(np.median(record.envelope)), _DYNAMIC_RANGE * float(record.envelope.max()))
     reach = round(1.0 / record.bandwidth_hz / record.step_s)
     found: list[Wave] = []
     misses, near_misses = 0, 0
     near_step = round((_NEAR_M / speed_m_s - record.start_s) / record.step_s)
+    floor = _floor(record.envelope, near_step)
     while len(found) < _MAX_WAVES and misses < _MAX_MISSES:
-        mic, step = (int(place) for place in np.unravel_index(np.argmax(record.envelope), record.envelope.shape))
-        if record.envelope[mic, step] < floor:
+        mic, step = (int(place) for place in np.unravel_index(np.argmax(record.envelope / floor), record.envelope.shape))
+        if record.envelope[mic, step] < floor[step]:
             break
         wave = _wave_at(record, receivers, mic, step, speed_m_s)
         if wave is not None:
@@ -105,6 +105,17 @@ def find_waves(measurement: Measurement) -> list[Wave]:
             misses += 1
             record.envelope[mic, max(0, step - reach) : step + reach + 1] = 0
     return _without_ghosts(found, _GHOST_WIDTHS * speed_m_s / record.bandwidth_hz)
+
+
+def _floor(envelope: NDArray[np.float64], near_step: int) -> NDArray[np.float64]:
+    """Return the smallest peak that can be a wave: (step,) float64.
+
+    Echoes may be much weaker than direct sound, which ends before them.
+    """
+    floor = np.full(envelope.shape[1], _PROMINENCE * float(np.median(envelope)))
+    for part in (slice(None, near_step), slice(near_step, None)):
+        floor[part] = np.maximum(floor[part], _DYNAMIC_RANGE * envelope[:, part].max(initial=0.0))
+    return floor
 
 
 def _without_ghosts(found: list[Wave], width_m: float) -> list[Wave]:
