@@ -71,8 +71,8 @@ def calibrate_poses(
     Notes
     -----
     An error of the speed of sound scales all distances: 1 °C changes them by 0.17 %. Emitters are assumed to be at the
-    origins of the sensors, and reflectors to be points: in simulations, balls with a radius of 4 cm cause errors of 4 mm
-    and 0.4°. Delays of microphones that are not calibrated cause errors of the orientation, so calibrate arrays first.
+    origins of the sensors, and reflectors to be points: in simulations, balls with a radius of 4 cm cause errors of 4
+    mm and 0.4°. Delays of microphones that are not calibrated turn directions, so calibrate arrays first.
 
     Examples
     --------

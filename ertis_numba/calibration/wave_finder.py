@@ -88,7 +88,7 @@ def find_waves(measurement: Measurement) -> list[Wave]:
     near_step = round((_NEAR_M / speed_m_s - record.start_s) / record.step_s)
     floor = _floor(record.envelope, near_step)
     while len(found) < _MAX_WAVES and misses < _MAX_MISSES:
-        mic, step = (int(place) for place in np.unravel_index(np.argmax(record.envelope / floor), record.envelope.shape))
+        mic, step = divmod(int(np.argmax(record.envelope / floor)), len(floor))
         if record.envelope[mic, step] < floor[step]:
             break
         wave = _wave_at(record, receivers, mic, step, speed_m_s)
