@@ -14,6 +14,7 @@ from ertis_cli.main import cli
 from ertis_numba.geometry import layout_file, load_layout
 from ertis_numba.geometry.layouts import LayoutFile
 from ertis_numba.settings import Settings
+from ertis_numba.simulation.scene import load_scene
 from ertis_numba.storage import open_energyscapes, write_recording
 from tests.pages import commands_in, page, python_in, run_code_here, run_here
 
@@ -91,6 +92,9 @@ def test_nothing_is_written_if_images_get_worse(tmp_path):
         (["{all}", "--sensor", "nobody"], "nobody"),
         (["{all}", "--first-place", "12:13"], "as in 30:15:1.2"),
         (["{folder}/absent.h5"], "absent.h5"),
+        (["{all}", "--poses", "--target", "wall"], "--target is not for --poses"),
+        (["{all}", "--poses"], "at least two"),
+        (["{all}", "--sensors", "front"], "--sensors is for --poses"),
     ],
 )
 def test_errors_write_nothing(recordings, tmp_path, arguments, text):
@@ -133,6 +137,9 @@ def test_commands_and_code_of_the_page_run(tmp_path):
         assert any(words == re.sub(r"[\d.]+", "#", other) for output in printed for other in str(output).splitlines())
     with open_energyscapes(tmp_path / "calibrated.h5") as images:
         assert not microphone_five(images.settings)
+    left = load_scene(tmp_path / "mounting.toml").sensor("left")
+    assert np.allclose(left.position_m, (-0.1, 0.2, 0.05), atol=2e-3)
+    assert abs(left.yaw_deg - 40) < 0.2
     (code,) = python_in(text)
     assert "channel 5 is silent" in run_code_here(tmp_path, code)
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ertis_cli import _tables, options
+from ertis_cli import _calibrate_poses, _tables, options
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -41,7 +41,7 @@ _PLACE = _Place()
 
 @click.command()
 @click.argument("paths", metavar="REC.h5...", nargs=-1, required=True, type=click.Path(path_type=Path))
-@options.output("Layout file (TOML) to write; without it, the calibration is only printed.")
+@options.output("Layout or mounting file (TOML) to write; without it, the calibration is only printed.")
 @click.option(
     "--target",
     "source",
@@ -92,10 +92,22 @@ _PLACE = _Place()
     help="Place of the reflector in the first recording: azimuth and elevation in °, range in m. It reveals a mirrored "
     "layout and gives the speed of sound.",
 )
+@click.option(
+    "--poses",
+    is_flag=True,
+    help="Calibrate positions and orientations of several sensors instead of microphones, and write a mounting file.",
+)
+@click.option(
+    "--sensors",
+    type=options.NAMES,
+    help="Sensors for --poses in the order of the SYNC chain, as in front,left; all sensors by default.",
+)
 @options.force
 @options.quiet
 @options.as_json
+@click.pass_context
 def calibrate(
+    ctx: click.Context,
     *,
     paths: tuple[Path, ...],
     target: Path | None,
@@ -106,6 +118,8 @@ def calibrate(
     delay_us: float,
     position_mm: float,
     first_place: tuple[float, float, float] | None,
+    poses: bool,
+    sensors: tuple[str, ...] | None,
     force: bool,
     quiet: bool,
     as_json: bool,
@@ -118,12 +132,21 @@ def calibrate(
 
     The new layout is for array.layout in settings files. It is not written if it lowers the contrast of images of these
     recordings, which happens if other sound overlaps the one that is measured.
+
+    With --poses, the recordings contain several sensors of one SYNC chain, and one small reflector at 10 to 20 places
+    that they see together. The mounting file is for --mounting of 'ertis capture' and other commands.
     """
     from ertis_numba.atomic_files import atomic_write, check_target
     from ertis_numba.calibration import calibrate as calibrated
     from ertis_numba.errors import ArgumentError
     from ertis_numba.geometry import layout_file
 
+    if poses:
+        _require_no_other_options(ctx)
+        _calibrate_poses.write_poses(paths, sensors, target, force=force, quiet=quiet, as_json=as_json)
+        return
+    if sensors is not None:
+        raise click.UsageError("--sensors is for --poses; add it, or choose one sensor with --sensor", ctx)
     if target is not None:
         if target.suffix.lower() != ".toml":
             raise ArgumentError(
@@ -163,6 +186,15 @@ def calibrate(
         )
     if target is not None:
         options.say(f"wrote {target}; use it as array.layout in a settings file", quiet=quiet)
+
+
+def _require_no_other_options(ctx: click.Context) -> None:
+    """Raise an error for options that have no meaning with ``--poses``."""
+    kept = {"paths", "target", "poses", "sensors", "force", "quiet", "as_json"}
+    for parameter in ctx.command.params:
+        name = parameter.name or ""
+        if name not in kept and ctx.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE:
+            raise click.UsageError(f"{parameter.opts[0]} is not for --poses; remove one of them", ctx)
 
 
 def _opened(paths: tuple[Path, ...], sensor: str | None, stack: ExitStack) -> "tuple[list[str], Iterator[Measurement]]":

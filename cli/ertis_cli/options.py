@@ -28,6 +28,7 @@ __all__ = [
     "ERROR_BUDGET",
     "FALSE_ALARM",
     "INTERVAL",
+    "NAMES",
     "PREPARING",
     "as_json",
     "as_json_of",
@@ -91,6 +92,16 @@ class _Channels(click.ParamType):  # type: ignore[type-arg]  # as above
         return self.fail(f"{value!r} is not a list of channels; give integers, as in 5,12", param, ctx)
 
 
+class _Names(click.ParamType):  # type: ignore[type-arg]  # as above
+    name = "NAME,..."
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, ...]:
+        names = tuple(str(value).split(","))
+        if all(names):
+            return names
+        return self.fail(f"{value!r} is not a list of names; give them as in front,left", param, ctx)
+
+
 class _Direction(click.ParamType):  # type: ignore[type-arg]  # as above
     name = "AZ:EL"
 
@@ -125,6 +136,7 @@ DIRECTION = _Direction()
 ELEVATION = _Elevation()
 ERROR_BUDGET = _ErrorBudget()
 INTERVAL = _Interval()
+NAMES = _Names()
 FALSE_ALARM = 1e-3
 """Probability that noise alone causes a reflector in one image."""
 PREPARING = "preparing ..."
