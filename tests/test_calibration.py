@@ -20,6 +20,7 @@ from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Array, Recording, Settings
 from ertis_numba.simulation import Electronics, Emitter, Point, Scene, Sensor, Wall
 from ertis_numba.simulation.render import Simulator
+from tests.scenes import line_array
 
 LAYOUT = load_layout("eRTIS_v3D1")
 SENSOR = Sensor(emitter=Emitter(level_db=-6.0), electronics=Electronics(noise_dbfs=-55.0))
@@ -40,7 +41,7 @@ def echo(azimuth_deg=20.0, range_m=1.0, **more):
 def test_faults_are_found_and_errors_are_small(seed):
     """`ertis bench calibration` measures the intervals, which need many arrays."""
     array = faulty_array(seed)
-    made = calibrate(record(array, seed, 20))
+    made = calibrate(record(array, seed, 20), ideal=True)
     assert {channel for cycle in made.swaps for channel in cycle} == set(array.displaced)
     assert made.silent == array.dead
     assert made.inverted == array.inverted
@@ -268,6 +269,31 @@ def test_foolish_arguments_are_refused(options, text):
         calibrate([])
 
 
+def test_wrong_target_is_refused_and_the_right_one_is_named():
+    with pytest.raises(DataError, match="fit a reflector better than a wall.*give --target reflector"):
+        calibrate(plain(), target="wall")
+
+
+def test_place_at_another_distance_is_refused():
+    first = rendered(points=(Point(azimuth_deg=25.0, elevation_deg=-15.0, range_m=0.9, strength_db=-10.0),))
+    with pytest.raises(DataError, match=r"range 3 m of the first place does not agree with the echo at 0\.90 m"):
+        calibrate([first, *plain()], first_place=(25.0, -15.0, 3.0))
+    made = calibrate([first, *plain()], first_place=(25.0, -5.0, 0.9))
+    assert "mirrored layout, because the azimuth or elevation" in made.not_observable[-1]
+
+
+def test_line_of_microphones_keeps_its_positions():
+    places = [(30, 20, 0.9), (-30, 10, 1.0), (10, -30, 0.8), (-20, -20, 1.2)]
+    sensor = SENSOR.replace(array=line_array(12, 0.005))
+    made = calibrate(
+        rendered(sensor, points=(Point(azimuth_deg=az, elevation_deg=el, range_m=r, strength_db=-10.0),))
+        for az, el, r in places
+    )
+    assert not made.findings
+    assert np.all(made.moved_m == 0)
+    assert np.all(np.abs(made.delay_s) < 0.5e-6)
+
+
 def test_wrong_place_is_refused():
     with pytest.raises(DataError, match="no mirrored layout explains"):
         calibrate(plain(), first_place=(-80.0, -60.0, 1.0))
@@ -299,7 +325,7 @@ def test_jacobian_of_the_fit(position_m):
     sd_s = np.full((6, 9), 1e-8)
     sd_s[1, 3] = np.inf
     time_s = travel_times(source_m, places_m, speed_m_s, "reflector").time_s
-    seen = Observations(time_s, sd_s, np.ones((6, 9)), sd_s)
+    seen = Observations(time_s, sd_s, np.full(6, 1e-8), np.ones((6, 9)), sd_s)
     problem = SeparableProblem(
         seen, np.zeros(9), places_m, source_m, speed_m_s, "reflector", Tolerances(3.0, 5e-6, position_m)
     )
@@ -319,7 +345,7 @@ def test_covariance_is_the_inverse_of_the_whole_information():
     places_m, source_m = rng.uniform(-0.05, 0.05, (5, 3)), rng.uniform(0.5, 1.0, (7, 3))
     speed_m_s, sd_s = np.full(7, 343.0), rng.uniform(1e-8, 3e-8, (7, 5))
     model = travel_times(source_m, places_m, 343.0, "wall")
-    seen = Observations(model.time_s, sd_s, np.ones((7, 5)), sd_s)
+    seen = Observations(model.time_s, sd_s, np.full(7, 1e-8), np.ones((7, 5)), sd_s)
     problem = SeparableProblem(seen, np.zeros(5), places_m, source_m, speed_m_s, "wall", Tolerances(3.0, 5e-6, 1e-3))
     found, n_determined = problem.covariance(problem.start_mm, 1.0)
     rows = np.zeros((7, 5, 41))

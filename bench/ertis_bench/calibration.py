@@ -42,7 +42,7 @@ def run(*, count: int, healthy: int, seed: int, say: Callable[[str], None]) -> d
         array = faulty_array(number)
         measurements = record(array, number, _RECORDINGS)
         begin_s = time.perf_counter()
-        made = calibrate(measurements)
+        made = calibrate(measurements, ideal=True)
         seconds.append(time.perf_counter() - begin_s)
         is_found = (
             {channel for cycle in made.swaps for channel in cycle} == set(array.displaced)
@@ -58,7 +58,7 @@ def run(*, count: int, healthy: int, seed: int, say: Callable[[str], None]) -> d
     false = 0
     for number in range(seed, seed + healthy):
         array = faulty_array(number, healthy=True)
-        false += bool(calibrate(record(array, number, _HEALTHY_RECORDINGS)).findings)
+        false += bool(calibrate(record(array, number, _HEALTHY_RECORDINGS), ideal=True).findings)
         say(f"healthy array {number}: {false} false findings so far")
     error, deviation = np.concatenate(errors), np.concatenate(deviations)
     rms, bound = np.sqrt(np.mean(error**2, axis=0)), np.sqrt(np.mean(deviation**2, axis=0))

@@ -93,6 +93,11 @@ _PLACE = _Place()
     "layout and gives the speed of sound.",
 )
 @click.option(
+    "--ideal",
+    is_flag=True,
+    help="Assume that air, emitter and reflector are exactly as the settings say, as in simulations.",
+)
+@click.option(
     "--poses",
     is_flag=True,
     help="Calibrate positions and orientations of several sensors instead of microphones, and write a mounting file.",
@@ -118,6 +123,7 @@ def calibrate(
     delay_us: float,
     position_mm: float,
     first_place: tuple[float, float, float] | None,
+    ideal: bool,
     poses: bool,
     sensors: tuple[str, ...] | None,
     force: bool,
@@ -166,6 +172,7 @@ def calibrate(
             delay_tolerance_s=1e-6 * delay_us,
             position_tolerance_m=1e-3 * position_mm,
             first_place=first_place,
+            ideal=ideal,
         )
     before_db, after_db = made.contrast_db
     is_better = after_db > before_db - _MAX_LOSS_DB

@@ -57,7 +57,7 @@ def require_directions(source_m: NDArray[np.float64], target: Target) -> None:
         )
 
 
-def not_observable(observed: NDArray[np.bool_], target: Target, *, positions: bool) -> tuple[str, ...]:
+def not_observable(observed: NDArray[np.bool_], target: Target, *, positions: bool, is_line: bool) -> tuple[str, ...]:
     """Return the quantities that the recordings cannot determine, one line each.
 
     Parameters
@@ -67,14 +67,18 @@ def not_observable(observed: NDArray[np.bool_], target: Target, *, positions: bo
     target : {"reflector", "wall", "direct", "beacon"}
     positions : bool
         True if positions were fitted.
+    is_line : bool
+        True if the microphones lie on a line.
     """
     lines = [
         "a common gain, delay or polarity of all microphones: their means are unchanged",
         "a rotation or shift of the whole array, or a mirrored layout if the place of no reflector is given",
     ]
     if not positions:
-        why = "sound from one place cannot" if target == "direct" else "the tolerance is 0, so the recordings do not"
-        lines.append(f"positions: {why} tell them from delays, which hold for these directions only")
+        if target == "direct" or is_line:
+            lines.append("positions: direct sound and lines of microphones do not tell them from delays")
+        else:
+            lines.append("positions: with a tolerance of 0, delays take up their errors, for these directions only")
         return tuple(lines)
     for axis, name in enumerate(_AXES):
         missing = int(np.sum(~observed[:, 2 + axis]))

@@ -24,6 +24,7 @@ from ertis_numba.calibration.reference_place import (
     speed_from_spread,
 )
 from ertis_numba.calibration.result import Calibration, Residuals
+from ertis_numba.calibration.sounds import is_line
 from ertis_numba.calibration.usable_sounds import (
     MIN_COHERENCE,
     Heard,
@@ -49,8 +50,12 @@ _SCALE_S: Final = 5e-6
 _INVERTED_SHARE: Final = 0.8  # Share of the recordings in which an inverted channel is inverted.
 _MIN_EVIDENCE: Final = 100.0  # Sum over the recordings of the logarithm of the likelihood of an inverted polarity.
 _FEW: Final = 4  # Number of recordings from which on residuals reveal errors of the model.
+_MODEL_S, _MODEL_DB = 1e-7, 0.05  # Errors of the model with real sound; 100 ns of sound are 0.03 mm.
+_MISFIT: Final = 3.0  # Residuals relative to the noise, above which another target is tried.
+_MAX_CHANGE: Final = 3.0  # Root-mean-square change relative to the tolerance, above which the layout is wrong.
+_MAX_SPEED: Final = 0.1  # Relative difference of a measured speed of sound.
 _BAD_RECORD: Final = 6.0  # Residual of a bad recording relative to that of the median one.
-_MIN_BAD_S: Final = 1e-6
+_MIN_BAD_S: Final = 1e-7
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,6 +87,7 @@ def calibrate(
     delay_tolerance_s: float = 5e-6,
     position_tolerance_m: float = 1e-3,
     first_place: tuple[float, float, float] | None = None,
+    ideal: bool = False,
     on_progress: Callable[[int], None] | None = None,
 ) -> Calibration:
     """Estimate gain, delay, polarity and position of each microphone from recordings.
@@ -104,7 +110,10 @@ def calibrate(
         The same of positions along each axis. 0 keeps the positions of the layout. Direct sound always keeps them.
     first_place : (azimuth_deg, elevation_deg, range_m), optional
         Place of the reflector in the first recording. The direction, which may be rough, reveals a mirrored layout, and
-        the range gives the speed of sound.
+        the range gives the speed of sound, which the fit then uses.
+    ideal : bool
+        True if air, emitter and reflector are exactly as the settings say, as in simulations; False, the default, adds
+        model errors of 100 ns and 0.05 dB, so that positions and intervals do not depend on them.
     on_progress : callable, optional
         Function that is called with the number of measurements so far.
 
@@ -132,9 +141,17 @@ def calibrate(
     checks.between("gain_tolerance_db", gain_tolerance_db, 0.01, 60.0)
     checks.between("delay_tolerance_s", delay_tolerance_s, 1e-9, 1e-3)
     checks.between("position_tolerance_m", position_tolerance_m, 0.0, 0.1)
-    expected = Tolerances(gain_tolerance_db, delay_tolerance_s, 0.0 if target == "direct" else position_tolerance_m)
+    place = None if first_place is None else ReflectorPlace(*first_place).checked()
     heard = hear_all(recordings, layout, target, on_progress)
     enabled = np.flatnonzero(heard.former.enabled)
+    keeps = target == "direct" or is_line(heard.former.positions_m[enabled])
+    expected = Tolerances(
+        gain_db=gain_tolerance_db,
+        delay_s=delay_tolerance_s,
+        position_m=0.0 if keeps else position_tolerance_m,
+        model_s=0.0 if ideal else _MODEL_S,
+        model_db=0.0 if ideal else _MODEL_DB,
+    )
     is_silent = silent_channels(heard.sounds)
     used = (
         ~is_silent
@@ -166,9 +183,7 @@ def calibrate(
         swaps=tuple(tuple(kept.channels[list(cycle)].tolist()) for cycle in found.cycles()),
         silent=tuple(enabled[is_silent].tolist()),
     )
-    return _with_place(
-        _fitted(prepared), prepared, None if first_place is None else ReflectorPlace(*first_place).checked()
-    )
+    return _with_place(_fitted(prepared), prepared, place)
 
 
 def _fitted(job: _Prepared) -> Calibration:
@@ -183,15 +198,72 @@ def _fitted(job: _Prepared) -> Calibration:
         int(i): f"it does not agree with the others: residuals of {1e6 * _rms(fit.residual_s[i]):.1f} µs"
         for i in np.flatnonzero(_bad_records(fit.residual_s))
     }
+    if not bad:
+        bad = _of_other_targets(job, seen, fit)
     if bad:
         seen, source_m = _left_out(job, bad, seen, source_m)
         fit = _fit(job, seen, source_m)
+    _require_plausible(job, fit)
     return _assembled(job, seen, fit, inverted)
 
 
 def _fit(job: _Prepared, seen: Observations, source_m: NDArray[np.float64]) -> ArrayFit:
     kept = job.kept
     return fit_array(seen, kept.delay_s, kept.positions_m, source_m, job.speed_m_s(), job.target, job.expected)
+
+
+def _of_other_targets(job: _Prepared, seen: Observations, fit: ArrayFit) -> dict[int, str]:
+    """Return the recordings whose sound comes from another kind of target, with the reason.
+
+    Raises
+    ------
+    DataError
+        That is the case for all recordings.
+    """
+    if job.target == "direct":
+        return {}
+    other: Target = "wall" if job.target == "reflector" else "reflector"
+    scale = 2.0 if job.target == "reflector" else 0.5
+    misfit = _misfit(fit.residual_s, seen)
+    if np.median(misfit) > _MISFIT:
+        kept = job.kept
+        speed_m_s = job.speed_m_s()
+        start_m = scale * job.source_m[: len(speed_m_s)]
+        tried = fit_array(seen, kept.delay_s, kept.positions_m, start_m, speed_m_s, other, job.expected)
+        if np.median(_misfit(tried.residual_s, seen)) < np.median(misfit) / 2:
+            raise DataError(
+                f"the times fit a {other} better than a {job.target}, by a factor of "
+                f"{np.median(misfit) / np.median(_misfit(tried.residual_s, seen)):.0f}; give --target {other}"
+            )
+    found = {}
+    for record in np.flatnonzero(misfit > _MISFIT).tolist():
+        valid = np.isfinite(seen.time_sd_s[record])
+        time_s, places_m = (seen.time_s[record] - fit.delay_s)[valid], fit.positions_m[valid]
+        speed = float(job.speed_m_s()[record])
+        start_m = scale * fit.source_m[record]
+        source_m = locate_source(time_s, places_m, start_m, speed, other, scale_s=_SCALE_S)
+        rest_s = time_s - travel_times(source_m[None], places_m, speed, other).time_s[0]
+        if np.median(np.abs(rest_s)) / seen.noise_s[record] < misfit[record] / 2:
+            found[record] = f"its sound fits a {other} better than a {job.target}"
+    return found
+
+
+def _misfit(residual_s: NDArray[np.float64], seen: Observations) -> NDArray[np.float64]:
+    """Return the median residual of each recording relative to its noise: (record,) float64."""
+    return np.asarray(np.nanmedian(np.abs(residual_s), axis=1) / seen.noise_s)
+
+
+def _require_plausible(job: _Prepared, fit: ArrayFit) -> None:
+    """Refuse changes that are far larger than their tolerances."""
+    later = _rms(fit.delay_s - job.kept.delay_s)
+    moved = _rms(fit.positions_m - job.kept.positions_m)
+    expected = job.expected
+    if later > _MAX_CHANGE * expected.delay_s or (expected.position_m and moved > _MAX_CHANGE * expected.position_m):
+        raise DataError(
+            f"microphones would move by {1e3 * moved:.1f} mm and be delayed by {1e6 * later:.1f} µs (RMS), over "
+            f"{_MAX_CHANGE:g} times the tolerances, so layout {job.heard.former.name} is probably not that of this "
+            "sensor; give its layout, or larger tolerances"
+        )
 
 
 def _left_out(
@@ -232,9 +304,12 @@ def _observed(job: _Prepared) -> tuple[Observations, NDArray[np.bool_]]:
         rows.append(
             (
                 again.time_s[used],
-                np.where(valid, np.hypot(again.time_sd_s[used], other_s), np.inf),
+                np.where(valid, np.hypot(again.time_sd_s[used], math.hypot(other_s, expected.model_s)), np.inf),
+                float(np.median(again.time_sd_s[used])),
                 again.level[used],
-                np.where(valid, np.hypot(again.level_sd[used], other), np.inf),
+                np.where(
+                    valid, np.hypot(again.level_sd[used], math.hypot(other, expected.model_db / _NEPER_DB)), np.inf
+                ),
             )
         )
     inverted = _inverted(np.array(evidence), np.sign(heard.former.gain[kept.channels]))
@@ -242,7 +317,8 @@ def _observed(job: _Prepared) -> tuple[Observations, NDArray[np.bool_]]:
 
 
 def _rows(seen: Observations, chosen: NDArray[np.bool_]) -> Observations:
-    return Observations(seen.time_s[chosen], seen.time_sd_s[chosen], seen.level[chosen], seen.level_sd[chosen])
+    columns = (seen.time_s, seen.time_sd_s, seen.noise_s, seen.level, seen.level_sd)
+    return Observations(*(column[chosen] for column in columns))
 
 
 def _bad_records(residual_s: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -307,7 +383,12 @@ def _assembled(job: _Prepared, seen: Observations, fit: ArrayFit, inverted: NDAr
         rejected=dict(sorted(heard.rejected.items())),
     )
     positions = expected.position_m > 0
-    return replace(made, not_observable=not_observable(made.is_observed, job.target, positions=positions))
+    return replace(
+        made,
+        not_observable=not_observable(
+            made.is_observed, job.target, positions=positions, is_line=is_line(every.positions_m)
+        ),
+    )
 
 
 def _inverted(evidence: NDArray[np.float64], sign: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -349,10 +430,19 @@ def _with_place(made: Calibration, job: _Prepared, place: ReflectorPlace | None)
             f"the first recording, whose place is given, cannot be used: {job.heard.rejected[0]}; make it again, or "
             "give the place of another one and name that recording first"
         )
+    speed = speed_from_distance(made.source_m[0], place, speed_m_s, job.target)
+    if abs(speed.speed_m_s / speed_m_s - 1) > _MAX_SPEED:
+        raise DataError(
+            f"the range {place.range_m:g} m of the first place does not agree with the echo at "
+            f"{place.range_m * speed_m_s / speed.speed_m_s:.2f} m; correct the place"
+        )
+    made = replace(_fitted(_at_speed(job, made, speed.speed_m_s / speed_m_s)), sound_speed=speed)
+    if is_line(job.every.positions_m) or not place.shows_mirroring:
+        line = "a mirrored layout, because the azimuth or elevation of the place is below 10°, or the array is a line"
+        return replace(made, not_observable=(*made.not_observable, line))
     name = mirror_of(made.source_m[0], place)
-    speed = speed_from_distance(made.source_m[0], place, speed_m_s)
     if not name:
-        return replace(made, sound_speed=speed)
+        return made
     flip = flipped(name)
     layout = replace(made.layout, positions_m=made.layout.positions_m * flip)
     return replace(
@@ -361,5 +451,10 @@ def _with_place(made: Calibration, job: _Prepared, place: ReflectorPlace | None)
         moved_m=made.moved_m * flip,
         source_m=made.source_m * flip,
         mirrored=name,
-        sound_speed=speed,
     )
+
+
+def _at_speed(job: _Prepared, made: Calibration, ratio: float) -> _Prepared:
+    """Return the calibration to repeat with another speed of sound."""
+    sounds = {number: replace(sound, speed_m_s=ratio * sound.speed_m_s) for number, sound in job.heard.sounds.items()}
+    return replace(job, heard=replace(job.heard, sounds=sounds), source_m=ratio * made.source_m)

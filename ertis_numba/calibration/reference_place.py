@@ -26,7 +26,7 @@ _DISTANCE_SD_M: Final = 2e-3  # of a tape measure
 
 
 class ReflectorPlace(NamedTuple):
-    """ReflectorPlace of a reflector, as seen from the sensor.
+    """Place of a reflector, as seen from the sensor.
 
     Attributes
     ----------
@@ -37,6 +37,11 @@ class ReflectorPlace(NamedTuple):
     azimuth_deg: float
     elevation_deg: float
     range_m: float
+
+    @property
+    def shows_mirroring(self) -> bool:
+        """True if mirror images of the direction differ enough to be told apart."""
+        return min(abs(self.azimuth_deg), abs(self.elevation_deg)) >= _MIN_ASIDE_DEG
 
     def checked(self) -> "ReflectorPlace":
         """Return the place if its numbers are possible.
@@ -73,7 +78,7 @@ def mirror_of(source_m: NDArray[np.float64], place: ReflectorPlace) -> str:
     source_m : (axis,) float64
         Measured position of the reflector.
     place : ReflectorPlace
-        True position, whose direction may be rough. Azimuth and elevation of 10° or more reveal mirrored axes.
+        True position, whose direction may be rough, and for which ``shows_mirroring`` is True.
 
     Raises
     ------
@@ -82,13 +87,7 @@ def mirror_of(source_m: NDArray[np.float64], place: ReflectorPlace) -> str:
     """
     known = unit_vectors(np.radians(place.azimuth_deg), np.radians(place.elevation_deg)).ravel()
     found = source_m / np.linalg.norm(source_m)
-    # A mirror image of a direction near the plane of symmetry differs too little to judge.
-    sides = (True, abs(place.azimuth_deg) >= _MIN_ASIDE_DEG, abs(place.elevation_deg) >= _MIN_ASIDE_DEG)
-    tried = {"": (1.0, 1.0, 1.0)} | {
-        name: flip
-        for name, flip in _FLIPS.items()
-        if all(side or factor > 0 for side, factor in zip(sides, flip, strict=True))
-    }
+    tried = {"": (1.0, 1.0, 1.0), **_FLIPS}
     apart_deg = {name: _apart_deg(found * np.array(flip), known) for name, flip in tried.items()}
     best = min(apart_deg, key=lambda name: apart_deg[name])
     if apart_deg[best] < _MAX_APART_DEG:
@@ -110,7 +109,9 @@ def _apart_deg(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
     return math.degrees(math.acos(float(np.clip(one @ other, -1.0, 1.0))))
 
 
-def speed_from_distance(source_m: NDArray[np.float64], place: ReflectorPlace, speed_m_s: float) -> SoundSpeed:
+def speed_from_distance(
+    source_m: NDArray[np.float64], place: ReflectorPlace, speed_m_s: float, target: Target
+) -> SoundSpeed:
     """Return the speed of sound from a reflector at a known distance.
 
     A wrong speed c scales the measured range r, so that the true speed is ``c r₀ / r`` at the known distance r₀. The
@@ -124,8 +125,11 @@ def speed_from_distance(source_m: NDArray[np.float64], place: ReflectorPlace, sp
         True position.
     speed_m_s : float
         Speed that the measured position was computed with.
+    target : {"reflector", "wall", "beacon"}
+        The mirror image of the emitter in a wall is twice as far away as the wall.
     """
-    found = float(speed_m_s * place.range_m / np.linalg.norm(source_m))
+    paths = 2.0 if target == "wall" else 1.0
+    found = float(speed_m_s * paths * place.range_m / np.linalg.norm(source_m))
     return SoundSpeed(found, found * _DISTANCE_SD_M / place.range_m)
 
 

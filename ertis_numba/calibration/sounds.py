@@ -22,7 +22,7 @@ from ertis_numba.frames import Measurement
 from ertis_numba.sample_format import sample_format
 from ertis_numba.settings import Settings
 
-__all__ = ["MAX_DIRECT_PATH_M", "Sound", "Source", "find_source", "hear", "identical_channels"]
+__all__ = ["MAX_DIRECT_PATH_M", "Sound", "Source", "find_source", "hear", "identical_channels", "is_line"]
 
 _MAX_SATURATED: Final = 0.25  # Share of the channels.
 _MIN_COMMON: Final = 0.8  # Coherence of the median channel; a single echo has 0.99.
@@ -199,6 +199,12 @@ def find_source(
     return best
 
 
+def is_line(positions_m: NDArray[np.float64]) -> bool:
+    """Return True if microphones lie on a line, which does not determine their positions across it."""
+    extent_m = np.linalg.svd(positions_m - positions_m.mean(axis=0), compute_uv=False)
+    return bool(np.sum(extent_m > _FLAT_M * math.sqrt(len(positions_m))) < 2)
+
+
 def _in_front(fit: Fit, positions_m: NDArray[np.float64], speed_m_s: float, target: Target) -> NDArray[np.float64]:
     """Return the approximate source of a wavefront; of two sources at both sides of a flat array, the one in front."""
     centred_m = positions_m - positions_m.mean(axis=0)
@@ -209,8 +215,10 @@ def _in_front(fit: Fit, positions_m: NDArray[np.float64], speed_m_s: float, targ
     # Errors can make a direction along the array longer than a unit vector.
     direction = axes[wide].T @ (along / max(1.0, float(np.linalg.norm(along)) / 0.999))
     if not wide.all():
-        across = axes[~wide][0]
-        across = across * (1.0 if across[0] >= 0 else -1.0)
+        # Of all directions across the array, that nearest to x, which is ahead.
+        across = axes[~wide].T @ axes[~wide][:, 0]
+        length = float(np.linalg.norm(across))
+        across = across / length if length > 1e-6 else axes[~wide][0]
         direction = direction + across * np.sqrt(max(0.0, 1 - float(direction @ direction)))
     range_m = max(fit.emission_s * speed_m_s, 0.1) / (2 if target == "reflector" else 1)
     return np.asarray(range_m * direction / max(float(np.linalg.norm(direction)), 1e-9))

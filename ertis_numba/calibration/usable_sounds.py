@@ -21,6 +21,7 @@ __all__ = ["Heard", "Microphones", "hear_all", "ordered", "require_sounds", "sil
 
 MIN_COHERENCE: Final = 0.6
 """Lower for channels that receive other sound, such as overlapping echoes."""
+_GOOD_SHARE: Final = 0.85  # Share below which other orders and layouts are tried.
 _MIN_SHARE: Final = 0.6  # Share of the microphones that one wavefront must fit.
 _MAX_SILENT_POWER: Final = 0.1  # Power of a silent channel around the sound, relative to the median channel.
 
@@ -145,8 +146,8 @@ def ordered(
     order = ""
     sources = _sources(heard, every, used, target)
     usual = float(np.median([source.share for source in sources.values()]))
-    if usual < _MIN_SHARE:
-        found = find_order(typical, heard.former)
+    found = find_order(typical, heard.former) if usual < _GOOD_SHARE else None
+    if usual < _MIN_SHARE or found is not None:
         if found is None:
             raise DataError(
                 f"layout {heard.former.name} does not fit the recordings: one wavefront fits {usual:.0%} of the "
