@@ -270,7 +270,7 @@ def test_foolish_arguments_are_refused(options, text):
 
 
 def test_wrong_target_is_refused_and_the_right_one_is_named():
-    with pytest.raises(DataError, match="fit a reflector better than a wall.*give --target reflector"):
+    with pytest.raises(DataError, match=r"fit a reflector better than a wall.*give --target reflector"):
         calibrate(plain(), target="wall")
 
 
