@@ -1,0 +1,381 @@
+"""Fusion of the images of sensors that emit together."""
+
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba import checks
+from ertis_numba.air import sound_speed_m_s
+from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.frames import Energyscape, PointCloud
+from ertis_numba.fusion.attribution import Attribution, Shares, mean_reflectivity
+from ertis_numba.fusion.pairs import Hypothesis, Pair, hypothesis, pair_of
+from ertis_numba.fusion.points import PointFuser, joined
+from ertis_numba.fusion.polar_grid import PolarGrid
+from ertis_numba.fusion.receivers import CoarseImage, Receiver
+from ertis_numba.fusion.rig import Emitters, Mountings, SensorPose, sensor_poses
+from ertis_numba.settings import Settings
+
+__all__ = ["PLATFORM", "Fused", "Fuser", "fuse"]
+
+PLATFORM: Final = "base_link"
+"""Name of the platform's frame in REP 105, and of the sensor of fused images."""
+
+EMITTER_DIAMETER_M: Final = 0.012
+_SPACING_DEG: Final = 1.0, 4.0  # of planar and of three-dimensional images
+_STEP_M: Final = 0.015, 0.03
+_DIRECT_SOUND_M: Final = 0.1  # Range before and after direct sound in which it hides echoes.
+_SAME_PULSE_NS: Final = 500_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fused:
+    """Fused image and points of a group of sensors.
+
+    Attributes
+    ----------
+    image : Energyscape
+        Image around the platform. Amplitudes are those of echoes at 1 m from reflectors of the same strength. The stamp
+        is that of the earliest image, with the sensor ``base_link``.
+    points : PointCloud
+        Reflectors in the frame of the platform, with uncertainties.
+    sensors : tuple of str
+        Sensors whose images were fused.
+    missing : tuple of str
+        Sensors with a mounting, but without an image.
+    """
+
+    image: Energyscape
+    points: PointCloud
+    sensors: tuple[str, ...]
+    missing: tuple[str, ...]
+
+
+class Fuser:
+    """Fusion of the images of sensors on one platform, with tables computed once.
+
+    Sensors that emit together hear each other's calls. Such a foreign echo has travelled from one sensor over the
+    reflector to another one, so the reflector lies on an ellipse around both. Each pair of emitter and receiver has its
+    own range axis, and each part of an image is attributed to the pair whose reflectors explain it. Foreign echoes thus
+    do not appear as ghosts, and confirm reflectors instead.
+
+    Parameters
+    ----------
+    mountings : mapping of str to (translation_m, rotation_xyzw)
+        Mountings of all sensors: position x, y, z in metres, and the unit quaternion x, y, z, w that rotates the sensor
+        frame into the platform frame. Sensors without an image still emit.
+    emitter_diameter_m : float, default 0.012
+        Diameter of the emitters as pistons, which determines their directivity; 0 for omnidirectional ones.
+    spacing_deg : float, optional
+        Spacing of directions; 1° for planar images, and 4° for others by default.
+    range_step_m : float, optional
+        Spacing of ranges; 1.5 cm for planar images, and 3 cm for others by default.
+    silent : collection of str
+        Sensors that do not emit.
+    emission_s : mapping of str to float, optional
+        Start of each sensor's emission after the start of the record, in seconds; 0 by default.
+
+    Raises
+    ------
+    ArgumentError
+        A mounting is missing or invalid, or an option names an unknown sensor or is out of range.
+
+    Examples
+    --------
+    >>> import ertis_numba as ertis
+    >>> mountings = {"front": ((0.2, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)), "back": ((-0.2, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))}
+    >>> fuser = ertis.Fuser(mountings)
+    >>> fuser.sensors
+    ('front', 'back')
+    """
+
+    def __init__(
+        self,
+        mountings: Mountings,
+        *,
+        emitter_diameter_m: float = EMITTER_DIAMETER_M,
+        spacing_deg: float | None = None,
+        range_step_m: float | None = None,
+        silent: Collection[str] = (),
+        emission_s: Mapping[str, float] | None = None,
+    ) -> None:
+        self._poses = sensor_poses(mountings)
+        self._numbers = {pose.name: number for number, pose in enumerate(self._poses)}
+        self._diameter_m = checks.between("emitter_diameter_m", emitter_diameter_m, 0.0, 0.2)
+        self._spacing_deg, self._step_m = spacing_deg, range_step_m
+        for name, given in (("silent", silent), ("emission_s", emission_s or {})):
+            for sensor in given:
+                self._number(sensor, name)
+        self._emitting = [number for number, pose in enumerate(self._poses) if pose.name not in silent]
+        self._emission_s = {
+            self._numbers[sensor]: checks.between(f"emission_s of sensor {sensor}", start_s, 0.0, 10.0)
+            for sensor, start_s in (emission_s or {}).items()
+        }
+        self._tables: _Tables | None = None
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Names of the sensors, in the order of the mountings."""
+        return tuple(self._numbers)
+
+    def __call__(self, images: Iterable[Energyscape]) -> Fused:
+        """Return the fusion of the images of one SYNC pulse.
+
+        Parameters
+        ----------
+        images : iterable of Energyscape
+            At most one image of each sensor. Sensors may be missing.
+
+        Returns
+        -------
+        Fused
+
+        Raises
+        ------
+        ArgumentError
+            There is no image, two images of the same sensor, an image without a mounting, or a mixture of planar and
+            other images.
+        DataError
+            The images are not from the same pulse, or have other directions or ranges than before.
+        """
+        group = self._group(images)
+        if self._tables is None:
+            self._tables = self._new_tables(group)
+        tables = self._tables
+        coarse = {number: tables.coarse(number, image) for number, image in group.items()}
+        attribution = tables.attribution(group)
+        shares, bound = attribution(coarse)
+        reflectivity = np.minimum(
+            mean_reflectivity(tables.pairs(group), coarse, shares, tables.grid.n_cells), bound
+        )
+        image = tables.image(reflectivity, group)
+        points = tables.points(group, shares, image)
+        return Fused(
+            image=image,
+            points=points,
+            sensors=tuple(self._poses[number].name for number in group),
+            missing=tuple(pose.name for number, pose in enumerate(self._poses) if number not in group),
+        )
+
+    def _group(self, images: Iterable[Energyscape]) -> dict[int, Energyscape]:
+        """Return checked images by number of the sensor, in the order of the mountings."""
+        found: dict[int, Energyscape] = {}
+        for image in checks.items("images", images, Energyscape, "Pipeline.process returns"):
+            number = self._number(image.stamp.sensor, "images")
+            if number in found:
+                raise ArgumentError(f"images has two of sensor {image.stamp.sensor!r}; give one image of each sensor")
+            found[number] = image
+        if not found:
+            raise ArgumentError("images is empty; give the images of one SYNC pulse")
+        group = dict(sorted(found.items()))
+        first, *others = group.values()
+        for other in others:
+            apart_ns = abs(other.stamp.timestamp_ns - first.stamp.timestamp_ns)
+            if other.stamp.sync_count != first.stamp.sync_count or apart_ns > _SAME_PULSE_NS:
+                raise DataError(
+                    f"images of sensors {first.stamp.sensor!r} and {other.stamp.sensor!r} are not from the same pulse: "
+                    f"SYNC counts {first.stamp.sync_count} and {other.stamp.sync_count}, {apart_ns / 1e9:.3g} s apart; "
+                    "give images of equal count"
+                )
+            if other.is_planar != first.is_planar:
+                raise ArgumentError(
+                    f"the image of sensor {first.stamp.sensor!r} is {'' if first.is_planar else 'not '}planar, unlike "
+                    f"that of {other.stamp.sensor!r}; process both with the same kind of directions"
+                )
+        return group
+
+    def _number(self, sensor: str, name: str) -> int:
+        if sensor not in self._numbers:
+            raise ArgumentError(
+                f"{name} has sensor {sensor!r}, but its mounting is unknown; give mountings for it, or one of "
+                f"{', '.join(self._numbers)}"
+            )
+        return self._numbers[sensor]
+
+    def _new_tables(self, group: Mapping[int, Energyscape]) -> "_Tables":
+        kind = 0 if next(iter(group.values())).is_planar else 1
+        spacing_m = max(float(np.diff(image.range_m).max(initial=0.0)) for image in group.values())
+        step_m = max(_STEP_M[kind], spacing_m) if self._step_m is None else self._step_m
+        if step_m < spacing_m:
+            raise ArgumentError(f"range_step_m is {step_m:g}, but ranges are {spacing_m:.3g} m apart; give at least that")
+        last_m = max(
+            float(np.linalg.norm(self._poses[number].translation_m[:2]) + image.range_m[-1])
+            for number, image in group.items()
+        )
+        grid = PolarGrid.around(
+            _SPACING_DEG[kind] if self._spacing_deg is None else self._spacing_deg,
+            step_m,
+            last_m,
+            is_planar=kind == 0,
+            height_m=float(np.mean([pose.translation_m[2] for pose in self._poses])),
+        )
+        return _Tables(grid, self._poses, self._emitting, self._emission_s, self._diameter_m)
+
+
+class _Tables:
+    """Tables of all receivers, computed when the first image of each one arrives."""
+
+    def __init__(
+        self,
+        grid: PolarGrid,
+        poses: tuple[SensorPose, ...],
+        emitting: list[int],
+        emission_s: Mapping[int, float],
+        diameter_m: float,
+    ) -> None:
+        self.grid = grid
+        self._poses, self._emitting, self._emission_s, self._diameter_m = poses, emitting, emission_s, diameter_m
+        self._positions_m = grid.positions_m
+        self._receivers: dict[int, Receiver] = {}
+        self._deaf: dict[int, NDArray[np.bool_]] = {}
+        self._pairs: dict[int, list[Pair]] = {}
+        self._hypotheses: dict[int, list[Hypothesis]] = {}
+        self._settings: dict[int, Settings] = {}
+        self._late_m: dict[int, float] = {}
+        self._known: dict[tuple[int, ...], tuple[Attribution, list[Pair]]] = {}
+        self._points: dict[int, PointFuser] = {}
+
+    def coarse(self, number: int, image: Energyscape) -> CoarseImage:
+        """Return the powers of an image of a receiver."""
+        if number not in self._receivers:
+            self._add(number, image)
+        receiver = self._receivers[number]
+        receiver.require_same(image)
+        return receiver.coarse(image, self._deaf[number])
+
+    def attribution(self, group: Mapping[int, Energyscape]) -> Attribution:
+        """Return the attribution of echoes in the images of a group."""
+        return self._of_group(group)[0]
+
+    def pairs(self, group: Mapping[int, Energyscape]) -> list[Pair]:
+        """Return the pairs of emitters and of the receivers of a group, whose calls are equal."""
+        return self._of_group(group)[1]
+
+    def image(self, reflectivity: NDArray[np.float32], group: Mapping[int, Energyscape]) -> Energyscape:
+        """Return the fused image."""
+        first = min(group.values(), key=lambda image: image.stamp.timestamp_ns)
+        return Energyscape(
+            amplitude=np.sqrt(reflectivity).reshape(self.grid.n_directions, self.grid.n_ranges),
+            azimuth_rad=self.grid.azimuth_rad,
+            elevation_rad=self.grid.elevations_rad,
+            range_m=self.grid.range_m,
+            settings=self._fused_settings(first.settings),
+            stamp=replace(first.stamp, sensor=PLATFORM),
+        )
+
+    def points(self, group: Mapping[int, Energyscape], shares: Shares, image: Energyscape) -> PointCloud:
+        """Return the points of a group."""
+        found = []
+        for number, each in group.items():
+            emitters = [pair.emitter for pair in self._pairs_of(number)]
+            found += self._points[number].observations(each, shares, emitters, self._late_m)
+        return joined(found, self._poses, image, self.grid)
+
+    def _of_group(self, group: Mapping[int, Energyscape]) -> tuple[Attribution, list[Pair]]:
+        key = tuple(group)
+        if key not in self._known:
+            pairs = [pair for number in group for pair in self._pairs_of(number)]
+            hypotheses = {
+                number: [each for each in self._hypotheses[number] if self._same_call(each.emitter, number)]
+                for number in group
+            }
+            self._known[key] = Attribution(self.grid, pairs, hypotheses, self._receivers), pairs
+        return self._known[key]
+
+    def _pairs_of(self, number: int) -> list[Pair]:
+        return [pair for pair in self._pairs[number] if self._same_call(pair.emitter, number)]
+
+    def _same_call(self, emitter: int, number: int) -> bool:
+        """Return True unless the calls are known to differ, so that the matched filter suppresses the foreign one."""
+        return emitter not in self._settings or self._settings[emitter].call == self._settings[number].call
+
+    def _add(self, number: int, image: Energyscape) -> None:
+        self._known.clear()
+        settings = self._settings[number] = image.settings
+        speed_m_s = sound_speed_m_s(settings.air)
+        receiver = self._receivers[number] = Receiver(self._poses[number], image, self.grid.step_m)
+        late_m = {emitter: self._emission_s.get(emitter, 0.0) * speed_m_s for emitter in self._emitting}
+        self._late_m |= late_m
+        deaf = self._deaf[number] = self._direct_sound(number, receiver, late_m)
+        emitters = Emitters(settings, self._diameter_m)
+        common = self._poses, emitters, receiver
+        self._pairs[number] = [
+            pair_of(
+                self.grid,
+                self._positions_m,
+                *common,
+                emitter=emitter,
+                number=number,
+                late_m=late_m[emitter],
+                deaf=deaf,
+            )
+            for emitter in self._emitting
+        ]
+        self._hypotheses[number] = [
+            hypothesis(self.grid, *common, emitter=emitter, late_m=late_m[emitter], is_mirrored=is_mirrored)
+            for emitter in self._emitting
+            for is_mirrored in ((False, True) if receiver.is_flat else (False,))
+        ]
+        self._points[number] = PointFuser(number, self._poses, receiver, image)
+
+    def _direct_sound(self, number: int, receiver: Receiver, late_m: Mapping[int, float]) -> NDArray[np.bool_]:
+        range_m = (np.arange(receiver.n_steps) + 0.5) * receiver.step_m
+        deaf = np.zeros(receiver.n_steps, dtype=np.bool_)
+        for emitter, delay_m in late_m.items():
+            apart_m = np.linalg.norm(self._poses[emitter].translation_m - self._poses[number].translation_m)
+            deaf |= np.abs(range_m - (apart_m + delay_m) / 2) <= _DIRECT_SOUND_M
+        return np.asarray(deaf)
+
+    def _fused_settings(self, settings: Settings) -> Settings:
+        limit_deg = 180.0 - 180.0 / self.grid.n_azimuths
+        limits = {
+            "azimuth_limits_deg": (-limit_deg, limit_deg),
+            "range_m": (float(self.grid.range_m[0]), float(self.grid.range_m[-1])),
+        }
+        if self.grid.is_planar:
+            return settings.replace(
+                processing=settings.processing.replace(directions=f"2d:{self.grid.n_azimuths}", **limits)
+            )
+        pairs = np.degrees(np.stack([self.grid.azimuth_rad, self.grid.elevations_rad], axis=1))
+        return settings.replace(
+            processing=settings.processing.replace(directions=tuple(map(tuple, pairs.tolist())), **limits)
+        )
+
+
+def fuse(images: Iterable[Energyscape], mountings: Mountings, *, emitter_diameter_m: float = EMITTER_DIAMETER_M) -> Fused:
+    """Return the fusion of the images of sensors that emitted together; use `Fuser` for several groups.
+
+    Parameters
+    ----------
+    images : iterable of Energyscape
+        Images of one SYNC pulse, at most one of each sensor.
+    mountings : mapping of str to (translation_m, rotation_xyzw)
+        Mountings of the sensors, as for `Fuser`.
+    emitter_diameter_m : float, default 0.012
+        Diameter of the emitters in metres; 0 for omnidirectional ones.
+
+    Returns
+    -------
+    Fused
+
+    Raises
+    ------
+    ArgumentError
+        A mounting is missing or invalid, or the images do not fit together.
+    DataError
+        The images are not from the same pulse.
+
+    Examples
+    --------
+    >>> import ertis_numba as ertis
+    >>> scene = ertis.load_scene("platform.toml")
+    >>> images = [ertis.Pipeline(each.settings()).process(ertis.render(scene, sensor=each.name)) for each in scene.sensors]
+    >>> mountings = {each.name: (each.position_m, each.quaternion()) for each in scene.sensors}
+    >>> fused = ertis.fuse(images, mountings)
+    >>> fused.missing, fused.image.amplitude.shape[0]
+    ((), 360)
+    """
+    return Fuser(mountings, emitter_diameter_m=emitter_diameter_m)(images)

@@ -1,0 +1,210 @@
+"""Pairs of emitter and receiver: echoes of each cell, and cells that can cause each pixel."""
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+
+from ertis_numba.fusion.polar_grid import PolarGrid
+from ertis_numba.fusion.receivers import CoarseImage, Receiver
+from ertis_numba.fusion.rig import Emitters, SensorPose
+
+__all__ = ["Hypothesis", "Pair", "hypothesis", "pair_of"]
+
+Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
+Places = NDArray[np.int64]
+
+_LIT_DB: Final = (-16.0, -10.0)  # Radiated power below which a cell is not imaged, and above which it is fully.
+_LIFT_DB: Final = -8.0  # Radiated power below which images are not amplified further, since side lobes would grow.
+_BOUND_DB: Final = -6.0  # Radiated power above which a missing echo shows that a cell is empty.
+_BOUND_COSINE: Final = math.cos(math.radians(60.0))
+_CONFIRM_DB: Final = -13.0
+_CONFIRM_COSINE: Final = math.cos(math.radians(70.0))
+_NEAREST_M: Final = 0.05
+# A pixel covers paths of one step. Where emitter and receiver face each other, they lead to cells far apart.
+_PARTS_OF_STEP: Final = (-0.5, 0.0, 0.5)
+_LEAST_GAIN: Final = 1e-12
+
+
+class Pair(NamedTuple):
+    """Echoes of one emitter at one receiver, for the cells that both can see.
+
+    Attributes
+    ----------
+    emitter, receiver : int
+    cell : (entry,) int64
+        Cells that are seen.
+    step : (entry,) int64
+        Step of the receiver's range axis.
+    first, second : (entry,) int64
+        Pixels of two neighbouring directions, in a flat image.
+    share : (entry,) float32
+        Weight of the second pixel.
+    gain : (entry,) float32
+        Power of the echo of a point reflector relative to that at 1 m ahead.
+    lifted : (entry,) float32
+        The same with the limited correction of the emitter's directivity.
+    weight : (entry,) float32
+        Weight in fused images, which fades towards the limits of what the pair can see.
+    bounds, confirms : (entry,) bool
+        True where a missing echo shows that a cell is empty, and where an echo confirms a reflector.
+    """
+
+    emitter: int
+    receiver: int
+    cell: Places
+    step: Places
+    first: Places
+    second: Places
+    share: Singles
+    gain: Singles
+    lifted: Singles
+    weight: Singles
+    bounds: NDArray[np.bool_]
+    confirms: NDArray[np.bool_]
+
+    def values(self, image: Singles) -> Singles:
+        """Return the values of an image at the cells: (entry,) float32."""
+        flat = image.reshape(-1)
+        low = flat.take(self.first)
+        return np.asarray(low + self.share * (flat.take(self.second) - low))
+
+
+class Hypothesis(NamedTuple):
+    """Cells in which a reflector would cause an echo in each pixel of a receiver.
+
+    Attributes
+    ----------
+    emitter : int
+    is_mirrored : bool
+        True for reflectors behind a flat array, which the array cannot distinguish from those in front.
+    parts : tuple of csr_matrix
+        Matrices (pixel, cell) of the gain of echoes, for the parts of a step.
+    cell : (pixel,) int64
+        Cell of the middle of each pixel, or -1.
+    """
+
+    emitter: int
+    is_mirrored: bool
+    parts: "tuple[scipy.sparse.csr_matrix, ...]"
+    cell: Places
+
+    def predicted(self, reflectivity: Singles) -> Singles:
+        """Return the power that reflectors would cause: (pixel,) float32."""
+        found = self.parts[0] @ reflectivity
+        for part in self.parts[1:]:
+            np.maximum(found, part @ reflectivity, out=found)
+        return np.asarray(found)
+
+
+def pair_of(
+    grid: PolarGrid,
+    positions_m: Floats,
+    poses: tuple[SensorPose, ...],
+    emitters: Emitters,
+    receiver: Receiver,
+    *,
+    emitter: int,
+    number: int,
+    late_m: float,
+    deaf: NDArray[np.bool_],
+) -> Pair:
+    """Return the echoes of one emitter at one receiver.
+
+    Parameters
+    ----------
+    grid : PolarGrid
+    positions_m : (cell, axis) float64
+        Centres of the cells.
+    poses : tuple of SensorPose
+    emitters : Emitters
+    receiver : Receiver
+    emitter, number : int
+        Indices of the emitting and of the receiving sensor in ``poses``.
+    late_m : float
+        Path of sound between the start of the record and the emission.
+    deaf : (step,) bool
+        Steps at which direct sound hides echoes.
+    """
+    sent, heard = poses[emitter].local_m(positions_m), poses[number].local_m(positions_m)
+    from_m, to_m = np.linalg.norm(sent, axis=1), np.linalg.norm(heard, axis=1)
+    radiated = emitters.power(sent[:, 0] / np.maximum(from_m, _NEAREST_M))
+    cosine = heard[:, 0] / np.maximum(to_m, _NEAREST_M)
+    step = ((from_m + to_m + late_m) / 2 / receiver.step_m).astype(np.int64)
+    beam = receiver.beam(heard)
+    lit = ((10 * np.log10(radiated) - _LIT_DB[0]) / (_LIT_DB[1] - _LIT_DB[0])).clip(0, 1)
+    weight = lit * cosine
+    audible = receiver.has_range & ~deaf
+    seen = beam.inside & (step < receiver.n_steps) & (weight > 0) & (to_m > _NEAREST_M) & (from_m > _NEAREST_M)
+    seen &= audible[step.clip(0, receiver.n_steps - 1)]
+    cell = np.flatnonzero(seen)
+    spreading = emitters.spreading(from_m, to_m)
+    radiated, cosine, step = radiated[cell], cosine[cell], step[cell]
+    return Pair(
+        emitter,
+        number,
+        cell,
+        step,
+        beam.first[cell] * receiver.n_steps + step,
+        beam.second[cell] * receiver.n_steps + step,
+        beam.share[cell],
+        (radiated * spreading[cell]).astype(np.float32),
+        (np.maximum(radiated, 10 ** (_LIFT_DB / 10)) * spreading[cell]).astype(np.float32),
+        weight[cell].astype(np.float32),
+        (radiated > 10 ** (_BOUND_DB / 10)) & (cosine > _BOUND_COSINE),
+        (radiated > 10 ** (_CONFIRM_DB / 10)) & (cosine > _CONFIRM_COSINE),
+    )
+
+
+def hypothesis(
+    grid: PolarGrid,
+    poses: tuple[SensorPose, ...],
+    emitters: Emitters,
+    receiver: Receiver,
+    *,
+    emitter: int,
+    late_m: float,
+    is_mirrored: bool,
+) -> Hypothesis:
+    """Return the cells whose reflectors cause echoes of an emitter in the pixels of a receiver.
+
+    Sound of path L that arrives from the direction u has met a reflector at ``s u``, where ``s + |s u − d| = L`` and d
+    is the emitter, as seen from the receiver. Hence ``s = (L² − |d|²) / (2 (L − u·d))``.
+
+    Parameters
+    ----------
+    grid, poses, emitters, receiver, emitter, late_m
+        As in `pair_of`.
+    is_mirrored : bool
+        Look for reflectors behind the array.
+    """
+    pose = receiver.pose
+    toward = receiver.directions * np.array([-1.0 if is_mirrored else 1.0, 1.0, 1.0])
+    directions = toward @ pose.rotation.T
+    offset_m = poses[emitter].translation_m - pose.translation_m
+    apart_m = float(np.linalg.norm(offset_m))
+    n_pixels = len(directions) * receiver.n_steps
+    parts, middle = [], np.full(n_pixels, -1)
+    for part in _PARTS_OF_STEP:
+        path_m = 2 * (np.arange(receiver.n_steps) + 0.5 + part) * receiver.step_m - late_m
+        beyond = path_m**2 - apart_m**2
+        to_m = beyond / np.maximum(2 * (path_m - (directions @ offset_m)[:, None]), 1e-6)
+        place_m = pose.translation_m + to_m[..., None] * directions[:, None]
+        sent_m = (place_m - poses[emitter].translation_m) @ poses[emitter].rotation
+        from_m = np.linalg.norm(sent_m, axis=-1)
+        radiated = emitters.power(sent_m[..., 0] / np.maximum(from_m, _NEAREST_M))
+        cell = np.where((beyond > 0) & (to_m > _NEAREST_M), grid.cell_of(place_m), -1).reshape(-1)
+        gain = (radiated * emitters.spreading(from_m, to_m)).reshape(-1)
+        pixel = np.flatnonzero((cell >= 0) & (gain > _LEAST_GAIN))
+        entries = gain[pixel].astype(np.float32), (pixel, cell[pixel])
+        parts.append(scipy.sparse.csr_matrix(entries, shape=(n_pixels, grid.n_cells)))
+        middle = cell if part == 0 else middle
+    return Hypothesis(emitter, is_mirrored, tuple(parts), middle)
+
+
+def floor_at(pair: Pair, image: CoarseImage) -> Singles:
+    """Return the power that noise and side lobes may reach at the cells of a pair: (entry,) float32."""
+    return image.floor.take(pair.step)

@@ -1,0 +1,180 @@
+"""Images of one sensor on a coarse range axis, and their values at points of the platform."""
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.errors import DataError
+from ertis_numba.frames import Energyscape
+from ertis_numba.fusion.polar_grid import close_directions
+from ertis_numba.fusion.rig import SensorPose
+from ertis_numba.geometry import microphones, unit_vectors
+
+__all__ = ["Beam", "CoarseImage", "Receiver"]
+
+Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
+Places = NDArray[np.int64]
+
+_NOISE_FACTOR: Final = 10 ** (9.0 / 10)  # Power of a pixel that noise hardly reaches, relative to its mean.
+_SIDE_LOBES: Final = 10 ** (-13.0 / 10)  # Power of side lobes relative to the strongest direction at a range.
+_LEAST_POWER: Final = 1e-20
+_BEAM_RAD: Final = math.radians(5.0)  # Half of the width of the main lobe near its top.
+_CLOSE_RAD: Final = math.radians(3.0)  # Error of a direction in a search for a confirming echo.
+_FLAT_M: Final = 1e-3
+
+
+class CoarseImage(NamedTuple):
+    """Powers of an image at the steps of a coarse range axis.
+
+    Attributes
+    ----------
+    power : (direction, step) float32
+        Highest power within each step, without noise and side lobes.
+    highest : (direction, step) float32
+        Highest power of the neighbourhood, with noise and side lobes.
+    floor : (step,) float32
+        Power that noise and side lobes may reach.
+    """
+
+    power: Singles
+    highest: Singles
+    floor: Singles
+
+
+class Beam(NamedTuple):
+    """Interpolation between two directions of an image, for points.
+
+    Attributes
+    ----------
+    first, second : (point,) int64
+        Indices of directions.
+    share : (point,) float32
+        Weight of the second one.
+    inside : (point,) bool
+        True for points in front of the sensor and within the limits of its directions.
+    """
+
+    first: Places
+    second: Places
+    share: Singles
+    inside: NDArray[np.bool_]
+
+
+class Receiver:
+    """Geometry of the images of one sensor.
+
+    Parameters
+    ----------
+    pose : SensorPose
+    image : Energyscape
+        Any image of the sensor; others must have the same directions and ranges.
+    step_m : float
+        Spacing of the coarse range axis.
+    """
+
+    def __init__(self, pose: SensorPose, image: Energyscape, step_m: float) -> None:
+        self.pose, self.step_m = pose, step_m
+        self._azimuth_rad, self._elevation_rad, self._range_m = image.azimuth_rad, image.elevation_rad, image.range_m
+        self.directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
+        positions_m = microphones(image.settings.array).enabled_positions_m
+        self.is_flat = bool(np.ptp(positions_m[:, 0]) < _FLAT_M)
+        """True if the array cannot distinguish front and back."""
+        self.n_steps = int(image.range_m[-1] / step_m) + 1
+        steps = (image.range_m / step_m).astype(np.int64)
+        self.has_range = np.isin(np.arange(self.n_steps), steps)
+        self._first = np.flatnonzero(np.diff(steps, prepend=-1))
+        self._lobe = close_directions(self.directions, _BEAM_RAD)
+        self._close = close_directions(self.directions, _CLOSE_RAD)
+        # The planar grid is interpolated; directions all over a sphere are dense enough for the nearest one.
+        self._order = np.argsort(image.azimuth_rad) if image.is_planar else None
+
+    def require_same(self, image: Energyscape) -> None:
+        """Raise an error for an image with other directions or ranges.
+
+        Raises
+        ------
+        DataError
+            The image has other directions or ranges.
+        """
+        same = (
+            np.array_equal(image.azimuth_rad, self._azimuth_rad)
+            and np.array_equal(image.elevation_rad, self._elevation_rad)
+            and np.array_equal(image.range_m, self._range_m)
+        )
+        if not same:
+            raise DataError(
+                f"the image of sensor {self.pose.name!r} has other directions or ranges than before; "
+                "create another Fuser for it"
+            )
+
+    def coarse(self, image: Energyscape, deaf: NDArray[np.bool_]) -> CoarseImage:
+        """Return the powers of an image.
+
+        Parameters
+        ----------
+        image : Energyscape
+        deaf : (step,) bool
+            Steps at which direct sound hides echoes.
+        """
+        amplitude = np.zeros((len(self.directions), self.n_steps), dtype=np.float32)
+        amplitude[:, self.has_range] = np.maximum.reduceat(image.amplitude, self._first, axis=1)
+        amplitude[:, deaf] = 0
+        power = amplitude * amplitude
+        noise = float(np.median(image.amplitude)) ** 2 / math.log(2)
+        floor = np.maximum(_SIDE_LOBES * power.max(axis=0), max(_NOISE_FACTOR * noise, _LEAST_POWER))
+        return CoarseImage(
+            np.maximum(power - floor, 0),
+            _highest(_along_range(power), self._close),
+            floor.astype(np.float32),
+        )
+
+    def over_lobe(self, power: Singles) -> Singles:
+        """Return the highest power within a main lobe around each direction: (direction, step) float32."""
+        return _highest(power, self._lobe)
+
+    def beam(self, local_m: Floats) -> Beam:
+        """Return the directions of points in the sensor frame.
+
+        Parameters
+        ----------
+        local_m : (point, axis) float64
+        """
+        ahead = local_m[:, 0] > 0
+        if self._order is None:
+            # Importing SciPy's trees takes a tenth of a second, and planar images do not need them.
+            from scipy.spatial import KDTree  # noqa: PLC0415
+
+            tree = KDTree(self.directions)
+            distance = np.linalg.norm(local_m, axis=1)
+            off, nearest = tree.query(local_m / np.maximum(distance, 1e-9)[:, None])
+            spacing = float(np.median(tree.query(self.directions, k=min(2, len(self.directions)))[0][:, -1]))
+            return Beam(nearest, nearest, np.zeros(len(nearest), np.float32), ahead & (off < 1.5 * spacing))
+        azimuths_rad = self._azimuth_rad[self._order]
+        azimuth_rad = np.arctan2(local_m[:, 1], local_m[:, 0])
+        inside = ahead & (azimuth_rad >= azimuths_rad[0]) & (azimuth_rad <= azimuths_rad[-1])
+        if len(azimuths_rad) == 1:
+            only = np.zeros(len(local_m), np.int64)
+            return Beam(only, only, np.zeros(len(local_m), np.float32), inside)
+        place = np.searchsorted(azimuths_rad, azimuth_rad).clip(1, len(azimuths_rad) - 1)
+        gap_rad = np.maximum(azimuths_rad[place] - azimuths_rad[place - 1], 1e-12)
+        share = ((azimuth_rad - azimuths_rad[place - 1]) / gap_rad).clip(0, 1)
+        return Beam(self._order[place - 1], self._order[place], share.astype(np.float32), inside)
+
+
+def _highest(values: Singles, near: Places) -> Singles:
+    """Return the highest value of neighbouring directions: (direction, step) float32."""
+    found = values.copy()
+    for column in near.T:
+        np.maximum(found, values[column], out=found)
+    return found
+
+
+def _along_range(values: Singles) -> Singles:
+    """Return the highest value of each step and its two neighbours."""
+    found = values.copy()
+    np.maximum(found[:, 1:], values[:, :-1], out=found[:, 1:])
+    np.maximum(found[:, :-1], values[:, 1:], out=found[:, :-1])
+    return found

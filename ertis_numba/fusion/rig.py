@@ -1,0 +1,109 @@
+"""Sensors of a platform: places, orientations and emissions."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from ertis_numba.air import absorption_db_m, sound_speed_m_s
+from ertis_numba.errors import ArgumentError
+from ertis_numba.geometry import mounting
+from ertis_numba.settings import Settings
+
+__all__ = ["Emitters", "Mountings", "SensorPose", "sensor_poses"]
+
+Floats = NDArray[np.float64]
+Mountings = Mapping[str, tuple[Sequence[float], Sequence[float]]]
+"""Position x, y, z in m, and unit quaternion x, y, z, w from the sensor frame to the platform frame, by sensor."""
+
+_N_FREQUENCIES = 12  # of the band, over which the power of an emitter is averaged
+_NEAREST_M = 0.05  # Distance below which spreading does not increase.
+_STRAY_DB = -20.0  # Power that an emitter radiates at least to its front, which no piston model predicts.
+_BEHIND_DB = -30.0
+
+
+class SensorPose(NamedTuple):
+    """Position and orientation of a sensor on its platform.
+
+    Attributes
+    ----------
+    name : str
+    translation_m : (axis,) float64
+    rotation : (axis, axis) float64
+        Rotation from the sensor frame to the platform frame.
+    """
+
+    name: str
+    translation_m: Floats
+    rotation: Floats
+
+    def local_m(self, position_m: Floats) -> Floats:
+        """Return positions in the sensor frame: (point, axis) float64."""
+        return np.asarray((position_m - self.translation_m) @ self.rotation)
+
+
+def sensor_poses(mountings: Mountings) -> tuple[SensorPose, ...]:
+    """Return the poses of sensors, in the order of their mountings.
+
+    Raises
+    ------
+    ArgumentError
+        No mounting is given, or one is invalid.
+    """
+    if not mountings:
+        raise ArgumentError("mountings is empty; give the mounting of each sensor on the platform")
+    poses = []
+    for name, (translation_m, rotation_xyzw) in mountings.items():
+        place = mounting(name, translation_m, rotation_xyzw)
+        poses.append(SensorPose(name, place["translation_m"], Rotation.from_quat(place["rotation_xyzw"]).as_matrix()))
+    return tuple(poses)
+
+
+class Emitters:
+    """Model of the sound that emitters radiate: circular pistons in a baffle.
+
+    Parameters
+    ----------
+    settings : Settings
+        Settings with the call and the air.
+    diameter_m : float
+        Diameter of each piston; 0 radiates equally in all directions.
+    """
+
+    def __init__(self, settings: Settings, diameter_m: float) -> None:
+        call = settings.call
+        low_hz, high_hz = sorted((call.start_frequency_hz, call.stop_frequency_hz))
+        frequency_hz = np.linspace(low_hz, high_hz, _N_FREQUENCIES)
+        self._diameter_m = diameter_m
+        self._absorption_db_m = float(absorption_db_m(settings.air, np.array([(low_hz + high_hz) / 2]))[0])
+        # The pattern is tabulated over the cosine, because a Bessel function of each cell takes long.
+        self._cosine = np.linspace(-1.0, 1.0, 2049)
+        sine = np.sqrt(1 - self._cosine**2)
+        speed_m_s = sound_speed_m_s(settings.air)
+        argument = np.maximum(1e-9, math.pi * diameter_m / speed_m_s * sine[:, None] * frequency_hz)
+        power = np.mean((2 * scipy.special.j1(argument) / argument) ** 2, axis=1)
+        if diameter_m:
+            power = np.where(
+                self._cosine > 0, np.maximum(power, 10 ** (_STRAY_DB / 10)), 10 ** (_BEHIND_DB / 10)
+            )
+        self._power = power
+
+    def power(self, cosine: Floats) -> Floats:
+        """Return the radiated power relative to that ahead.
+
+        Parameters
+        ----------
+        cosine : ndarray of float64
+            Cosine of the angle to the emitter's axis.
+        """
+        return np.asarray(np.interp(cosine, self._cosine, self._power))
+
+    def spreading(self, to_point_m: Floats, from_point_m: Floats) -> Floats:
+        """Return the power of an echo relative to that at 1 m: spherical spreading of both paths, and absorption."""
+        there, back = np.maximum(to_point_m, _NEAREST_M), np.maximum(from_point_m, _NEAREST_M)
+        lost_db = self._absorption_db_m * (there + back - 2.0)
+        return np.asarray(10 ** (-lost_db / 10) / (there * back) ** 2)
