@@ -39,6 +39,7 @@ from .frames import (
     Reflector as Reflector,
     Stamp as Stamp,
 )
+from .fusion import Fused as Fused, Fuser as Fuser, fuse as fuse
 from .geometry import layout_names as layout_names, load_layout as load_layout
 from .interop import export as export, open_pcm as open_pcm, open_raw as open_raw, open_rtis_folder as open_rtis_folder
 from .journal import JournalEntry as JournalEntry

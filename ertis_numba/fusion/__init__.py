@@ -1,5 +1,6 @@
 """Fusion of the images of several sensors on one platform, with foreign echoes attributed to their emitters."""
 
-from ertis_numba.fusion.fuser import PLATFORM, Fused, Fuser, fuse
+from ertis_numba.fusion.fuser import Fused, Fuser, fuse
+from ertis_numba.fusion.tables import PLATFORM
 
 __all__ = ["PLATFORM", "Fused", "Fuser", "fuse"]

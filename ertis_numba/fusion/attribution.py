@@ -1,16 +1,16 @@
 """Attribution of echoes to the emitters whose calls they are."""
 
 from collections.abc import Mapping, Sequence
-from typing import Final, TypeAlias
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.fusion.pairs import Hypothesis, Pair, floor_at
+from ertis_numba.fusion.pairs import Hypothesis, Pair
 from ertis_numba.fusion.polar_grid import Places, PolarGrid
 from ertis_numba.fusion.receivers import CoarseImage, Receiver
 
-__all__ = ["Attribution", "Shares", "mean_reflectivity"]
+__all__ = ["Attributed", "Attribution", "Shares"]
 
 Singles = NDArray[np.float32]
 Shares: TypeAlias = Mapping[tuple[int, int], Singles]
@@ -24,6 +24,40 @@ _VISIBLE: Final = 2.0  # Power of an expected echo relative to noise and side lo
 _BOUND: Final = 2.0  # Reflectivity relative to the least that any pair shows.
 _REACH: Final = 2  # Neighbouring azimuths whose reflectors cause echoes in the same pixel.
 _TINY: Final = np.float32(1e-30)
+
+
+class Attributed(NamedTuple):
+    """Result of an attribution.
+
+    Attributes
+    ----------
+    reflectivity : (cell,) float32
+        Power of the echo of each cell's reflector at 1 m.
+    shares : Shares
+    """
+
+    reflectivity: Singles
+    shares: Shares
+
+
+class _Evidence(NamedTuple):
+    """Echoes of a pair in the images of one group.
+
+    Attributes
+    ----------
+    pair : Pair
+    floor : (entry,) float32
+        Power that noise and side lobes may reach.
+    highest : (entry,) float32
+        Highest power near each cell, with noise and side lobes.
+    weight : (entry,) float32
+        Weight in means over pairs.
+    """
+
+    pair: Pair
+    floor: Singles
+    highest: Singles
+    weight: Singles
 
 
 class Attribution:
@@ -50,52 +84,65 @@ class Attribution:
         receivers: Mapping[int, Receiver],
     ) -> None:
         self._grid, self._pairs, self._hypotheses, self._receivers = grid, pairs, hypotheses, receivers
-        self._own = [pair for pair in pairs if pair.emitter == pair.receiver]
+        self._own_gain = {pair.receiver: self._own_gain_of(pair) for pair in pairs if pair.emitter == pair.receiver}
 
-    def __call__(self, images: Mapping[int, CoarseImage]) -> tuple[Shares, Singles]:
-        """Return the share of each pair in the pixels, and an upper bound of the reflectivity of each cell.
+    def __call__(self, images: Mapping[int, CoarseImage]) -> Attributed:
+        """Return the reflectivity of each cell, and the share of each pair in the pixels.
 
         Parameters
         ----------
         images : mapping of int to CoarseImage
             Image of each receiver.
         """
-        bound = self._bound(images)
-        alone = mean_reflectivity(self._own, images, None, self._grid.n_cells)
-        confirmed = {number: self._confirmed(images, alone, number) for number in images}
+        evidence = [_evidence(pair, images[pair.receiver]) for pair in self._pairs]
+        own = [each for each in evidence if each.pair.emitter == each.pair.receiver]
+        bound = self._bound(evidence)
+        alone = self._mean(own, images, None)
+        confirmed = self._confirmed(evidence, alone)
         reflectivity = np.minimum(alone, bound)
         shares: dict[tuple[int, int], Singles] = {}
         for suppression in _SUPPRESSION:
             around = self._around(reflectivity)
             for number, image in images.items():
-                shares |= self._shares(number, image, around, confirmed[number], suppression)
-            reflectivity = np.minimum(mean_reflectivity(self._own, images, shares, self._grid.n_cells), bound)
-        return shares, bound
+                shares |= self._shares(number, image, around, confirmed.get(number), suppression)
+            reflectivity = np.minimum(self._mean(own, images, shares), bound)
+        return Attributed(np.minimum(self._mean(evidence, images, shares), bound), shares)
 
-    def _bound(self, images: Mapping[int, CoarseImage]) -> Singles:
+    def single(self, images: Mapping[int, CoarseImage]) -> Singles:
+        """Return the mean reflectivity if each sensor takes all echoes for its own: (cell,) float32.
+
+        Parameters
+        ----------
+        images : mapping of int to CoarseImage
+        """
+        own = [pair for pair in self._pairs if pair.emitter == pair.receiver]
+        return self._mean([_evidence(pair, images[pair.receiver]) for pair in own], images, None)
+
+    def _bound(self, evidence: Sequence[_Evidence]) -> Singles:
         """Return the least reflectivity that any pair shows, with a margin: (cell,) float32."""
         bound = np.full(self._grid.n_cells, np.inf, dtype=np.float32)
-        for pair in self._pairs:
-            if pair.receiver not in images:
-                continue
-            image = images[pair.receiver]
-            shown = _BOUND * (pair.values(image.highest) + floor_at(pair, image)) / pair.gain
+        for each in evidence:
+            pair = each.pair
+            shown = np.float32(_BOUND) * (each.highest + each.floor) / pair.gain
             cell = pair.cell[pair.bounds]
             bound[cell] = np.minimum(bound[cell], shown[pair.bounds])
         return bound
 
-    def _confirmed(self, images: Mapping[int, CoarseImage], alone: Singles, number: int) -> Singles:
-        """Return the reflectivity that all other pairs confirm: (cell,) float32, 0 where none can see the cell."""
-        least = np.full(self._grid.n_cells, np.inf, dtype=np.float32)
-        for pair in self._pairs:
-            if pair.receiver not in images or pair.emitter == pair.receiver == number:
-                continue
-            image = images[pair.receiver]
-            expected = pair.gain * alone.take(pair.cell)
-            sees = pair.confirms & (expected > _VISIBLE * floor_at(pair, image))
-            cell = pair.cell[sees]
-            least[cell] = np.minimum(least[cell], (pair.values(image.highest) / pair.gain)[sees])
-        return np.where(np.isfinite(least), least, np.float32(0))
+    def _confirmed(self, evidence: Sequence[_Evidence], alone: Singles) -> dict[int, Singles]:
+        """Return the reflectivity that all pairs but a sensor's own confirm, by sensor: (cell,) float32.
+
+        It is 0 where no other pair can see the cell.
+        """
+        numbers = [*self._own_gain]
+        least = {number: np.full(self._grid.n_cells, np.inf, dtype=np.float32) for number in numbers}
+        for each in evidence:
+            pair = each.pair
+            sees = pair.confirms & (pair.gain * alone.take(pair.cell) > np.float32(_VISIBLE) * each.floor)
+            cell, shown = pair.cell[sees], each.highest[sees] / pair.gain[sees]
+            for number in numbers:
+                if not pair.emitter == pair.receiver == number:
+                    least[number][cell] = np.minimum(least[number][cell], shown)
+        return {number: np.where(np.isfinite(values), values, np.float32(0)) for number, values in least.items()}
 
     def _around(self, reflectivity: Singles) -> Singles:
         """Return the highest reflectivity of each cell and its neighbours: (cell,) float32."""
@@ -110,67 +157,62 @@ class Attribution:
         return wide.reshape(-1)
 
     def _shares(
-        self, number: int, image: CoarseImage, around: Singles, confirmed: Singles, suppression: float
+        self, number: int, image: CoarseImage, around: Singles, confirmed: Singles | None, suppression: float
     ) -> dict[tuple[int, int], Singles]:
         receiver, shape = self._receivers[number], image.power.shape
-        predicted = [
-            receiver.over_lobe(each.predicted(around).reshape(shape)).reshape(-1) for each in self._hypotheses[number]
-        ]
+        hypotheses = self._hypotheses[number]
+        predicted = [receiver.over_lobe(each.predicted(around).reshape(shape)).reshape(-1) for each in hypotheses]
         total = np.sum(predicted, axis=0, dtype=np.float32) + _TINY
         power = image.power.reshape(-1) + _TINY
         found = {}
-        for each, alone in zip(self._hypotheses[number], predicted, strict=True):
+        for each, alone in zip(hypotheses, predicted, strict=True):
             if each.is_mirrored:
                 continue
             share = (1 - np.float32(suppression) * (total - alone) / power).clip(0, 1)
-            if each.emitter == number:
-                own = self._own_gain(number, each.cell)
-                is_confirmed = _at(confirmed, each.cell) * own > _CONFIRMED * power
+            if each.emitter == number and confirmed is not None:
+                is_confirmed = _at(confirmed, each.cell) * self._own_gain[number] > np.float32(_CONFIRMED) * power
                 share = np.maximum(share, is_confirmed * (alone / total) ** 3)
             found[each.emitter, number] = share
         return found
 
-    def _own_gain(self, number: int, cell: Places) -> Singles:
+    def _own_gain_of(self, pair: Pair) -> Singles:
         """Return the gain of the receiver's own call for a reflector in each pixel: (pixel,) float32."""
-        pair = next(each for each in self._own if each.receiver == number)
         gain = np.zeros(self._grid.n_cells, dtype=np.float32)
         gain[pair.cell] = pair.gain
-        return _at(gain, cell)
+        own = next(
+            each for each in self._hypotheses[pair.receiver] if each.emitter == pair.receiver and not each.is_mirrored
+        )
+        return _at(gain, own.cell)
+
+    def _mean(self, evidence: Sequence[_Evidence], images: Mapping[int, CoarseImage], shares: Shares | None) -> Singles:
+        """Return the mean over pairs of the reflectivity of each cell, as power at 1 m: (cell,) float32.
+
+        Shares are also weights for pairs of different sensors: what belongs to another pair says nothing about them.
+        """
+        total = np.zeros(self._grid.n_cells, dtype=np.float32)
+        weights = np.full(self._grid.n_cells, _TINY)
+        for each in evidence:
+            pair, weight = each.pair, each.weight
+            power = images[pair.receiver].power.reshape(-1)
+            if shares is not None:
+                share = shares[pair.emitter, pair.receiver]
+                power = power * share
+                if pair.emitter != pair.receiver:
+                    weight = weight * pair.values(share)
+            total[pair.cell] += weight * pair.values(power) / pair.lifted
+            weights[pair.cell] += weight
+        return total / weights
 
 
-def mean_reflectivity(
-    pairs: Sequence[Pair], images: Mapping[int, CoarseImage], shares: Shares | None, n_cells: int
-) -> Singles:
-    """Return the mean over pairs of the reflectivity of each cell, as power at 1 m: (cell,) float32.
+def _evidence(pair: Pair, image: CoarseImage) -> _Evidence:
+    """Return the evidence of a pair.
 
     Weights are the squares of gain relative to noise and side lobes, which is the least variance. They fade towards
     the limits of what a pair can see, so that images have no seams.
-
-    Parameters
-    ----------
-    pairs : sequence of Pair
-    images : mapping of int to CoarseImage
-        Image of each receiver.
-    shares : Shares or None
-        Shares of the pixels, for pairs of different sensors also as weights; all if None.
-    n_cells : int
     """
-    total = np.zeros(n_cells, dtype=np.float64)
-    weights = np.zeros(n_cells, dtype=np.float64)
-    for pair in pairs:
-        if pair.receiver not in images:
-            continue
-        image = images[pair.receiver]
-        power = image.power.reshape(-1)
-        weight = pair.weight * (pair.lifted.astype(np.float64) / floor_at(pair, image)) ** 2
-        if shares is not None:
-            share = shares[pair.emitter, pair.receiver]
-            power = power * share
-            if pair.emitter != pair.receiver:
-                weight = weight * pair.values(share)
-        total[pair.cell] += weight * pair.values(power) / pair.lifted
-        weights[pair.cell] += weight
-    return np.divide(total, weights, out=np.zeros_like(total), where=weights > 0).astype(np.float32)
+    floor = image.floor.take(pair.step)
+    signal_to_floor = pair.lifted / floor
+    return _Evidence(pair, floor, pair.values(image.highest), pair.weight * signal_to_floor**2)
 
 
 def _at(values: Singles, cell: Places) -> Singles:

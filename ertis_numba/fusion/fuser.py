@@ -1,33 +1,23 @@
 """Fusion of the images of sensors that emit together."""
 
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ertis_numba import checks
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Energyscape, PointCloud
-from ertis_numba.fusion.attribution import Attribution, Shares, mean_reflectivity
-from ertis_numba.fusion.pairs import Hypothesis, Pair, hypothesis, pair_of
-from ertis_numba.fusion.points import PointFuser, joined
 from ertis_numba.fusion.polar_grid import PolarGrid
-from ertis_numba.fusion.receivers import CoarseImage, Receiver
-from ertis_numba.fusion.rig import Emitters, Mountings, SensorPose, sensor_poses
-from ertis_numba.settings import Settings
+from ertis_numba.fusion.rig import Mountings, sensor_poses
+from ertis_numba.fusion.tables import Tables
 
-__all__ = ["PLATFORM", "Fused", "Fuser", "fuse"]
-
-PLATFORM: Final = "base_link"
-"""Name of the platform's frame in REP 105, and of the sensor of fused images."""
+__all__ = ["Fused", "Fuser", "fuse"]
 
 EMITTER_DIAMETER_M: Final = 0.012
 _SPACING_DEG: Final = 1.0, 4.0  # of planar and of three-dimensional images
 _STEP_M: Final = 0.015, 0.03
-_DIRECT_SOUND_M: Final = 0.1  # Range before and after direct sound in which it hides echoes.
 _SAME_PULSE_NS: Final = 500_000_000
 
 
@@ -114,7 +104,7 @@ class Fuser:
             self._numbers[sensor]: checks.between(f"emission_s of sensor {sensor}", start_s, 0.0, 10.0)
             for sensor, start_s in (emission_s or {}).items()
         }
-        self._tables: _Tables | None = None
+        self._tables: Tables | None = None
 
     @property
     def sensors(self) -> tuple[str, ...]:
@@ -146,11 +136,7 @@ class Fuser:
             self._tables = self._new_tables(group)
         tables = self._tables
         coarse = {number: tables.coarse(number, image) for number, image in group.items()}
-        attribution = tables.attribution(group)
-        shares, bound = attribution(coarse)
-        reflectivity = np.minimum(
-            mean_reflectivity(tables.pairs(group), coarse, shares, tables.grid.n_cells), bound
-        )
+        reflectivity, shares = tables.attribution(group)(coarse)
         image = tables.image(reflectivity, group)
         points = tables.points(group, shares, image)
         return Fused(
@@ -195,12 +181,14 @@ class Fuser:
             )
         return self._numbers[sensor]
 
-    def _new_tables(self, group: Mapping[int, Energyscape]) -> "_Tables":
+    def _new_tables(self, group: Mapping[int, Energyscape]) -> "Tables":
         kind = 0 if next(iter(group.values())).is_planar else 1
         spacing_m = max(float(np.diff(image.range_m).max(initial=0.0)) for image in group.values())
         step_m = max(_STEP_M[kind], spacing_m) if self._step_m is None else self._step_m
         if step_m < spacing_m:
-            raise ArgumentError(f"range_step_m is {step_m:g}, but ranges are {spacing_m:.3g} m apart; give at least that")
+            raise ArgumentError(
+                f"range_step_m is {step_m:g}, but ranges are {spacing_m:.3g} m apart; give at least that"
+            )
         last_m = max(
             float(np.linalg.norm(self._poses[number].translation_m[:2]) + image.range_m[-1])
             for number, image in group.items()
@@ -212,140 +200,12 @@ class Fuser:
             is_planar=kind == 0,
             height_m=float(np.mean([pose.translation_m[2] for pose in self._poses])),
         )
-        return _Tables(grid, self._poses, self._emitting, self._emission_s, self._diameter_m)
+        return Tables(grid, self._poses, self._emitting, self._emission_s, self._diameter_m)
 
 
-class _Tables:
-    """Tables of all receivers, computed when the first image of each one arrives."""
-
-    def __init__(
-        self,
-        grid: PolarGrid,
-        poses: tuple[SensorPose, ...],
-        emitting: list[int],
-        emission_s: Mapping[int, float],
-        diameter_m: float,
-    ) -> None:
-        self.grid = grid
-        self._poses, self._emitting, self._emission_s, self._diameter_m = poses, emitting, emission_s, diameter_m
-        self._positions_m = grid.positions_m
-        self._receivers: dict[int, Receiver] = {}
-        self._deaf: dict[int, NDArray[np.bool_]] = {}
-        self._pairs: dict[int, list[Pair]] = {}
-        self._hypotheses: dict[int, list[Hypothesis]] = {}
-        self._settings: dict[int, Settings] = {}
-        self._late_m: dict[int, float] = {}
-        self._known: dict[tuple[int, ...], tuple[Attribution, list[Pair]]] = {}
-        self._points: dict[int, PointFuser] = {}
-
-    def coarse(self, number: int, image: Energyscape) -> CoarseImage:
-        """Return the powers of an image of a receiver."""
-        if number not in self._receivers:
-            self._add(number, image)
-        receiver = self._receivers[number]
-        receiver.require_same(image)
-        return receiver.coarse(image, self._deaf[number])
-
-    def attribution(self, group: Mapping[int, Energyscape]) -> Attribution:
-        """Return the attribution of echoes in the images of a group."""
-        return self._of_group(group)[0]
-
-    def pairs(self, group: Mapping[int, Energyscape]) -> list[Pair]:
-        """Return the pairs of emitters and of the receivers of a group, whose calls are equal."""
-        return self._of_group(group)[1]
-
-    def image(self, reflectivity: NDArray[np.float32], group: Mapping[int, Energyscape]) -> Energyscape:
-        """Return the fused image."""
-        first = min(group.values(), key=lambda image: image.stamp.timestamp_ns)
-        return Energyscape(
-            amplitude=np.sqrt(reflectivity).reshape(self.grid.n_directions, self.grid.n_ranges),
-            azimuth_rad=self.grid.azimuth_rad,
-            elevation_rad=self.grid.elevations_rad,
-            range_m=self.grid.range_m,
-            settings=self._fused_settings(first.settings),
-            stamp=replace(first.stamp, sensor=PLATFORM),
-        )
-
-    def points(self, group: Mapping[int, Energyscape], shares: Shares, image: Energyscape) -> PointCloud:
-        """Return the points of a group."""
-        found = []
-        for number, each in group.items():
-            emitters = [pair.emitter for pair in self._pairs_of(number)]
-            found += self._points[number].observations(each, shares, emitters, self._late_m)
-        return joined(found, self._poses, image, self.grid)
-
-    def _of_group(self, group: Mapping[int, Energyscape]) -> tuple[Attribution, list[Pair]]:
-        key = tuple(group)
-        if key not in self._known:
-            pairs = [pair for number in group for pair in self._pairs_of(number)]
-            hypotheses = {
-                number: [each for each in self._hypotheses[number] if self._same_call(each.emitter, number)]
-                for number in group
-            }
-            self._known[key] = Attribution(self.grid, pairs, hypotheses, self._receivers), pairs
-        return self._known[key]
-
-    def _pairs_of(self, number: int) -> list[Pair]:
-        return [pair for pair in self._pairs[number] if self._same_call(pair.emitter, number)]
-
-    def _same_call(self, emitter: int, number: int) -> bool:
-        """Return True unless the calls are known to differ, so that the matched filter suppresses the foreign one."""
-        return emitter not in self._settings or self._settings[emitter].call == self._settings[number].call
-
-    def _add(self, number: int, image: Energyscape) -> None:
-        self._known.clear()
-        settings = self._settings[number] = image.settings
-        speed_m_s = sound_speed_m_s(settings.air)
-        receiver = self._receivers[number] = Receiver(self._poses[number], image, self.grid.step_m)
-        late_m = {emitter: self._emission_s.get(emitter, 0.0) * speed_m_s for emitter in self._emitting}
-        self._late_m |= late_m
-        deaf = self._deaf[number] = self._direct_sound(number, receiver, late_m)
-        emitters = Emitters(settings, self._diameter_m)
-        common = self._poses, emitters, receiver
-        self._pairs[number] = [
-            pair_of(
-                self.grid,
-                self._positions_m,
-                *common,
-                emitter=emitter,
-                number=number,
-                late_m=late_m[emitter],
-                deaf=deaf,
-            )
-            for emitter in self._emitting
-        ]
-        self._hypotheses[number] = [
-            hypothesis(self.grid, *common, emitter=emitter, late_m=late_m[emitter], is_mirrored=is_mirrored)
-            for emitter in self._emitting
-            for is_mirrored in ((False, True) if receiver.is_flat else (False,))
-        ]
-        self._points[number] = PointFuser(number, self._poses, receiver, image)
-
-    def _direct_sound(self, number: int, receiver: Receiver, late_m: Mapping[int, float]) -> NDArray[np.bool_]:
-        range_m = (np.arange(receiver.n_steps) + 0.5) * receiver.step_m
-        deaf = np.zeros(receiver.n_steps, dtype=np.bool_)
-        for emitter, delay_m in late_m.items():
-            apart_m = np.linalg.norm(self._poses[emitter].translation_m - self._poses[number].translation_m)
-            deaf |= np.abs(range_m - (apart_m + delay_m) / 2) <= _DIRECT_SOUND_M
-        return np.asarray(deaf)
-
-    def _fused_settings(self, settings: Settings) -> Settings:
-        limit_deg = 180.0 - 180.0 / self.grid.n_azimuths
-        limits = {
-            "azimuth_limits_deg": (-limit_deg, limit_deg),
-            "range_m": (float(self.grid.range_m[0]), float(self.grid.range_m[-1])),
-        }
-        if self.grid.is_planar:
-            return settings.replace(
-                processing=settings.processing.replace(directions=f"2d:{self.grid.n_azimuths}", **limits)
-            )
-        pairs = np.degrees(np.stack([self.grid.azimuth_rad, self.grid.elevations_rad], axis=1))
-        return settings.replace(
-            processing=settings.processing.replace(directions=tuple(map(tuple, pairs.tolist())), **limits)
-        )
-
-
-def fuse(images: Iterable[Energyscape], mountings: Mountings, *, emitter_diameter_m: float = EMITTER_DIAMETER_M) -> Fused:
+def fuse(
+    images: Iterable[Energyscape], mountings: Mountings, *, emitter_diameter_m: float = EMITTER_DIAMETER_M
+) -> Fused:
     """Return the fusion of the images of sensors that emitted together; use `Fuser` for several groups.
 
     Parameters
@@ -372,7 +232,9 @@ def fuse(images: Iterable[Energyscape], mountings: Mountings, *, emitter_diamete
     --------
     >>> import ertis_numba as ertis
     >>> scene = ertis.load_scene("platform.toml")
-    >>> images = [ertis.Pipeline(each.settings()).process(ertis.render(scene, sensor=each.name)) for each in scene.sensors]
+    >>> images = [
+    ...     ertis.Pipeline(each.settings()).process(ertis.render(scene, sensor=each.name)) for each in scene.sensors
+    ... ]
     >>> mountings = {each.name: (each.position_m, each.quaternion()) for each in scene.sensors}
     >>> fused = ertis.fuse(images, mountings)
     >>> fused.missing, fused.image.amplitude.shape[0]

@@ -8,7 +8,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from ertis_numba.fusion.polar_grid import PolarGrid
-from ertis_numba.fusion.receivers import CoarseImage, Receiver
+from ertis_numba.fusion.receivers import Receiver
 from ertis_numba.fusion.rig import Emitters, SensorPose
 
 __all__ = ["Hypothesis", "Pair", "hypothesis", "pair_of"]
@@ -26,7 +26,7 @@ _CONFIRM_COSINE: Final = math.cos(math.radians(70.0))
 _NEAREST_M: Final = 0.05
 # A pixel covers paths of one step. Where emitter and receiver face each other, they lead to cells far apart.
 _PARTS_OF_STEP: Final = (-0.5, 0.0, 0.5)
-_LEAST_GAIN: Final = 1e-12
+_AUDIBLE: Final = 10 ** (-25.0 / 10)  # Radiated power that causes audible echoes.
 
 
 class Pair(NamedTuple):
@@ -101,7 +101,6 @@ class Hypothesis(NamedTuple):
 
 
 def pair_of(
-    grid: PolarGrid,
     positions_m: Floats,
     poses: tuple[SensorPose, ...],
     emitters: Emitters,
@@ -116,7 +115,6 @@ def pair_of(
 
     Parameters
     ----------
-    grid : PolarGrid
     positions_m : (cell, axis) float64
         Centres of the cells.
     poses : tuple of SensorPose
@@ -176,7 +174,8 @@ def hypothesis(
 
     Parameters
     ----------
-    grid, poses, emitters, receiver, emitter, late_m
+    grid : PolarGrid
+    poses, emitters, receiver, emitter, late_m
         As in `pair_of`.
     is_mirrored : bool
         Look for reflectors behind the array.
@@ -198,13 +197,8 @@ def hypothesis(
         radiated = emitters.power(sent_m[..., 0] / np.maximum(from_m, _NEAREST_M))
         cell = np.where((beyond > 0) & (to_m > _NEAREST_M), grid.cell_of(place_m), -1).reshape(-1)
         gain = (radiated * emitters.spreading(from_m, to_m)).reshape(-1)
-        pixel = np.flatnonzero((cell >= 0) & (gain > _LEAST_GAIN))
+        pixel = np.flatnonzero((cell >= 0) & (radiated > _AUDIBLE).reshape(-1))
         entries = gain[pixel].astype(np.float32), (pixel, cell[pixel])
         parts.append(scipy.sparse.csr_matrix(entries, shape=(n_pixels, grid.n_cells)))
         middle = cell if part == 0 else middle
     return Hypothesis(emitter, is_mirrored, tuple(parts), middle)
-
-
-def floor_at(pair: Pair, image: CoarseImage) -> Singles:
-    """Return the power that noise and side lobes may reach at the cells of a pair: (entry,) float32."""
-    return image.floor.take(pair.step)

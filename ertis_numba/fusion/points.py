@@ -30,6 +30,7 @@ _SAME_M: Final = 0.015  # Distance of two observations of the same reflector, in
 _GATE: Final = 16.0  # Squared Mahalanobis distance; four standard deviations along one axis.
 _ROUNDS: Final = 4
 _NEAREST_M: Final = 0.05
+_VERTICAL: Final = 1e-6
 
 
 class Observation(NamedTuple):
@@ -60,12 +61,12 @@ class Observation(NamedTuple):
 
     def rows(self, position_m: Floats, poses: Sequence[SensorPose]) -> tuple[Floats, Floats]:
         """Return residuals and their derivatives, in standard deviations: (row,) and (row, axis) float64."""
-        away_m, back_m = (
-            position_m - poses[number].translation_m for number in (self.emitter, self.receiver)
-        )
+        away_m, back_m = (position_m - poses[number].translation_m for number in (self.emitter, self.receiver))
         from_m, to_m = (max(_NEAREST_M, float(np.linalg.norm(each))) for each in (away_m, back_m))
         across = _tangents(self.direction)
-        residual = np.append((self.path_m - from_m - to_m) / self.path_sd_m, -(across @ back_m) / to_m / self.angle_sd_rad)
+        residual = np.append(
+            (self.path_m - from_m - to_m) / self.path_sd_m, -(across @ back_m) / to_m / self.angle_sd_rad
+        )
         slopes = np.vstack([(away_m / from_m + back_m / to_m) / self.path_sd_m, across / to_m / self.angle_sd_rad])
         return residual, slopes
 
@@ -225,10 +226,12 @@ def _covariance(seen: Observation, poses: Sequence[SensorPose]) -> Floats:
 
 def _tangents(direction: Floats) -> Floats:
     """Return two unit vectors across a direction: (2, axis) float64."""
-    up = np.array([0.0, 0.0, 1.0]) if abs(direction[2]) < 0.9 else np.array([1.0, 0.0, 0.0])
-    first = np.cross(up, direction)
-    first /= np.linalg.norm(first)
-    return np.stack([first, np.cross(direction, first)])
+    x, y, z = direction.tolist()
+    level = math.hypot(x, y)
+    # Straight up, any horizontal direction will do.
+    left = np.array([-y / level, x / level, 0.0]) if level > _VERTICAL else np.array([0.0, 1.0, 0.0])
+    up = np.array([-z * left[1], z * left[0], x * left[1] - y * left[0]])
+    return np.stack([left, up])
 
 
 def _uncertainties(cloud: PointCloud) -> Floats:

@@ -20,10 +20,11 @@ Places = NDArray[np.int64]
 
 _NOISE_FACTOR: Final = 10 ** (9.0 / 10)  # Power of a pixel that noise hardly reaches, relative to its mean.
 _SIDE_LOBES: Final = 10 ** (-13.0 / 10)  # Power of side lobes relative to the strongest direction at a range.
-_LEAST_POWER: Final = 1e-20
+_LEAST_POWER: Final = 1e-16  # Keeps squares of ratios within single precision.
 _BEAM_RAD: Final = math.radians(5.0)  # Half of the width of the main lobe near its top.
 _CLOSE_RAD: Final = math.radians(3.0)  # Error of a direction in a search for a confirming echo.
 _FLAT_M: Final = 1e-3
+_THINNED: Final = 4  # One of so many ranges serves to estimate the noise.
 
 
 class CoarseImage(NamedTuple):
@@ -123,7 +124,7 @@ class Receiver:
         amplitude[:, self.has_range] = np.maximum.reduceat(image.amplitude, self._first, axis=1)
         amplitude[:, deaf] = 0
         power = amplitude * amplitude
-        noise = float(np.median(image.amplitude)) ** 2 / math.log(2)
+        noise = float(np.median(image.amplitude[:, ::_THINNED])) ** 2 / math.log(2)
         floor = np.maximum(_SIDE_LOBES * power.max(axis=0), max(_NOISE_FACTOR * noise, _LEAST_POWER))
         return CoarseImage(
             np.maximum(power - floor, 0),

@@ -87,9 +87,7 @@ class Emitters:
         argument = np.maximum(1e-9, math.pi * diameter_m / speed_m_s * sine[:, None] * frequency_hz)
         power = np.mean((2 * scipy.special.j1(argument) / argument) ** 2, axis=1)
         if diameter_m:
-            power = np.where(
-                self._cosine > 0, np.maximum(power, 10 ** (_STRAY_DB / 10)), 10 ** (_BEHIND_DB / 10)
-            )
+            power = np.where(self._cosine > 0, np.maximum(power, 10 ** (_STRAY_DB / 10)), 10 ** (_BEHIND_DB / 10))
         self._power = power
 
     def power(self, cosine: Floats) -> Floats:

@@ -1,0 +1,165 @@
+"""Tables of fusion: receivers, pairs and hypotheses of all sensors of a platform."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.air import sound_speed_m_s
+from ertis_numba.frames import Energyscape, PointCloud
+from ertis_numba.fusion.attribution import Attribution, Shares
+from ertis_numba.fusion.pairs import Hypothesis, Pair, hypothesis, pair_of
+from ertis_numba.fusion.points import PointFuser, joined
+from ertis_numba.fusion.polar_grid import PolarGrid
+from ertis_numba.fusion.receivers import CoarseImage, Receiver
+from ertis_numba.fusion.rig import Emitters, SensorPose
+from ertis_numba.settings import Settings
+
+__all__ = ["PLATFORM", "Tables"]
+
+PLATFORM: Final = "base_link"
+"""Name of the platform's frame in REP 105, and of the sensor of fused images."""
+
+_DIRECT_SOUND_M: Final = 0.1  # Range before and after direct sound in which it hides echoes.
+
+
+class Tables:
+    """Tables of all receivers, computed when the first image of each one arrives.
+
+    Parameters
+    ----------
+    grid : PolarGrid
+        Cells of fused images.
+    poses : tuple of SensorPose
+    emitting : list of int
+        Indices of the sensors that emit.
+    emission_s : mapping of int to float
+        Start of emissions after the start of the record; 0 for others.
+    diameter_m : float
+        Diameter of the emitters.
+    """
+
+    def __init__(
+        self,
+        grid: PolarGrid,
+        poses: tuple[SensorPose, ...],
+        emitting: list[int],
+        emission_s: Mapping[int, float],
+        diameter_m: float,
+    ) -> None:
+        self.grid = grid
+        self._poses, self._emitting, self._emission_s, self._diameter_m = poses, emitting, emission_s, diameter_m
+        self._positions_m = grid.positions_m
+        self._receivers: dict[int, Receiver] = {}
+        self._deaf: dict[int, NDArray[np.bool_]] = {}
+        self._pairs: dict[int, list[Pair]] = {}
+        self._hypotheses: dict[int, list[Hypothesis]] = {}
+        self._settings: dict[int, Settings] = {}
+        self._late_m: dict[int, float] = {}
+        self._known: dict[tuple[int, ...], Attribution] = {}
+        self._points: dict[int, PointFuser] = {}
+
+    def coarse(self, number: int, image: Energyscape) -> CoarseImage:
+        """Return the powers of an image of a receiver."""
+        if number not in self._receivers:
+            self._add(number, image)
+        receiver = self._receivers[number]
+        receiver.require_same(image)
+        return receiver.coarse(image, self._deaf[number])
+
+    def attribution(self, group: Mapping[int, Energyscape]) -> Attribution:
+        """Return the attribution of echoes in the images of a group, for pairs with equal calls."""
+        key = tuple(group)
+        if key not in self._known:
+            pairs = [pair for number in group for pair in self._pairs_of(number)]
+            hypotheses = {
+                number: [each for each in self._hypotheses[number] if self._same_call(each.emitter, number)]
+                for number in group
+            }
+            self._known[key] = Attribution(self.grid, pairs, hypotheses, self._receivers)
+        return self._known[key]
+
+    def image(self, reflectivity: NDArray[np.float32], group: Mapping[int, Energyscape]) -> Energyscape:
+        """Return the fused image."""
+        first = min(group.values(), key=lambda image: image.stamp.timestamp_ns)
+        return Energyscape(
+            amplitude=np.sqrt(reflectivity).reshape(self.grid.n_directions, self.grid.n_ranges),
+            azimuth_rad=self.grid.azimuth_rad,
+            elevation_rad=self.grid.elevations_rad,
+            range_m=self.grid.range_m,
+            settings=self._fused_settings(first.settings),
+            stamp=replace(first.stamp, sensor=PLATFORM),
+        )
+
+    def points(self, group: Mapping[int, Energyscape], shares: Shares, image: Energyscape) -> PointCloud:
+        """Return the points of a group."""
+        found = []
+        for number, each in group.items():
+            emitters = [pair.emitter for pair in self._pairs_of(number)]
+            found += self._points[number].observations(each, shares, emitters, self._late_m)
+        return joined(found, self._poses, image, self.grid)
+
+    def _pairs_of(self, number: int) -> list[Pair]:
+        return [pair for pair in self._pairs[number] if self._same_call(pair.emitter, number)]
+
+    def _same_call(self, emitter: int, number: int) -> bool:
+        """Return True unless the calls are known to differ, so that the matched filter suppresses the foreign one."""
+        return emitter not in self._settings or self._settings[emitter].call == self._settings[number].call
+
+    def _add(self, number: int, image: Energyscape) -> None:
+        self._known.clear()
+        settings = self._settings[number] = image.settings
+        speed_m_s = sound_speed_m_s(settings.air)
+        receiver = self._receivers[number] = Receiver(self._poses[number], image, self.grid.step_m)
+        late_m = {emitter: self._emission_s.get(emitter, 0.0) * speed_m_s for emitter in self._emitting}
+        self._late_m |= late_m
+        deaf = self._deaf[number] = self._direct_sound(number, receiver, late_m)
+        emitters = Emitters(settings, self._diameter_m)
+        common = self._poses, emitters, receiver
+        pairs = [
+            pair_of(
+                self._positions_m,
+                *common,
+                emitter=emitter,
+                number=number,
+                late_m=late_m[emitter],
+                deaf=deaf,
+            )
+            for emitter in self._emitting
+        ]
+        self._pairs[number] = [pair for pair in pairs if len(pair.cell)]
+        hypotheses = [
+            hypothesis(self.grid, *common, emitter=emitter, late_m=late_m[emitter], is_mirrored=is_mirrored)
+            for emitter in self._emitting
+            for is_mirrored in ((False, True) if receiver.is_flat else (False,))
+        ]
+        seen = {pair.emitter for pair in self._pairs[number]}
+        self._hypotheses[number] = [
+            each for each in hypotheses if each.parts[0].nnz or (each.emitter in seen and not each.is_mirrored)
+        ]
+        self._points[number] = PointFuser(number, self._poses, receiver, image)
+
+    def _direct_sound(self, number: int, receiver: Receiver, late_m: Mapping[int, float]) -> NDArray[np.bool_]:
+        range_m = (np.arange(receiver.n_steps) + 0.5) * receiver.step_m
+        deaf = np.zeros(receiver.n_steps, dtype=np.bool_)
+        for emitter, delay_m in late_m.items():
+            apart_m = np.linalg.norm(self._poses[emitter].translation_m - self._poses[number].translation_m)
+            deaf |= np.abs(range_m - (apart_m + delay_m) / 2) <= _DIRECT_SOUND_M
+        return np.asarray(deaf)
+
+    def _fused_settings(self, settings: Settings) -> Settings:
+        limit_deg = 180.0 - 180.0 / self.grid.n_azimuths
+        limits = {
+            "azimuth_limits_deg": (-limit_deg, limit_deg),
+            "range_m": (float(self.grid.range_m[0]), float(self.grid.range_m[-1])),
+        }
+        if self.grid.is_planar:
+            return settings.replace(
+                processing=settings.processing.replace(directions=f"2d:{self.grid.n_azimuths}", **limits)
+            )
+        pairs = np.degrees(np.stack([self.grid.azimuth_rad, self.grid.elevations_rad], axis=1))
+        return settings.replace(
+            processing=settings.processing.replace(directions=tuple(map(tuple, pairs.tolist())), **limits)
+        )
