@@ -52,6 +52,8 @@ RUN_BY = {
     ("first-hour", "$"): ["test_first_hour::test_first_hour_page_runs"],
     ("formats", "python"): ["test_guide::test_code_of_the_formats_page_runs"],
     ("from-rtisdev", "python"): ["test_rtisdev::test_replacements_run"],
+    ("fusion", "$"): ["test_fusion::test_commands_and_code_of_the_page_run"],
+    ("fusion", "python"): ["test_fusion::test_commands_and_code_of_the_page_run"],
     ("gallery", "$"): ["test_readme::test_gallery_starts_like_the_readme"],
     ("gpu", "$"): ["test_guide::test_commands_of_the_gpu_page_run"],
     ("health", "$"): ["test_health_commands::test_health_page_shows_the_printed_output"],

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from ertis_cli import _mountings, _plans, _presets, _process_many, _results, options
+from ertis_cli import _fuse, _mountings, _plans, _presets, _process_many, _results, options
 from ertis_cli._config import typed
 
 if TYPE_CHECKING:
@@ -93,6 +93,20 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
     help="Data type of images. float16 halves the file; it keeps three digits down to -84 dBFS and fewer below, and "
     "netCDF programs cannot read it.",
 )
+@click.option(
+    "--fuse",
+    is_flag=True,
+    help="Fuse the images of all sensors of the recordings; write REC.fused.h5 by default.",
+)
+@click.option(
+    "--emitter-diameter",
+    "emitter_diameter_m",
+    type=click.FloatRange(0.0, 0.2),
+    default=0.012,
+    show_default=True,
+    metavar="M",
+    help="Diameter of emitters for --fuse, in m, which determines their directivity; 0 is omnidirectional.",
+)
 @click.option("--strict", is_flag=True, help="Refuse recordings with faulty microphones instead of warning.")
 @options.device
 @options.threads
@@ -139,6 +153,8 @@ def process(
     verify: bool,
     settings_file: Path | None,
     dtype: Literal["float32", "float16"],
+    fuse: bool,
+    emitter_diameter_m: float,
     strict: bool,
     device: str,
     threads: int | None,
@@ -152,6 +168,9 @@ def process(
     **other: Any,
 ) -> None:
     """Process recordings into energyscapes.
+
+    With --fuse, all sensors of the recordings belong to one platform, and there is one image around it per SYNC pulse.
+    Echoes of a sensor's call that another sensor received appear where their reflector is.
 
     The settings file overrides the settings of the recording, the preset overrides both, and other options override
     all of them. The same recording gives the same amplitudes, bit by bit, for any number of threads and any batch. All
@@ -186,6 +205,22 @@ def process(
         _plans.require_plan(settings, explain=explain, verify=verify, max_error_db=max_error_db)
         return settings
 
+    _require_options_of(fuse=fuse, target=target)
+    if fuse:
+        _fuse.write_fused(
+            [Path(each) for each in paths],
+            Path(target) if target else Path(paths[0]).with_suffix(".fused.h5"),
+            changed,
+            mounting=_mountings.mountings(mounting, None),
+            emitter_diameter_m=emitter_diameter_m,
+            force=force,
+            quiet=quiet,
+            as_json=as_json,
+            device=device,
+            threads=threads,
+            plan=plan,
+        )
+        return
     from ertis_numba.campaign import CampaignOptions
 
     wanted = CampaignOptions(
@@ -207,12 +242,7 @@ def process(
             paths, target, wanted, workers=workers, scheduler=scheduler, quiet=quiet, as_json=as_json
         )
         return
-    for name in ("workers", "scheduler"):
-        if typed(name):
-            raise click.UsageError(
-                f"--{name} applies to several recordings; give more, a folder or a pattern, or an -o that ends in /",
-                click.get_current_context(),
-            )
+    _require_options_of_one(target)
     path = Path(paths[0])
     if target is not None and _results.is_results_file(target):
         _results.write_results(
@@ -228,11 +258,6 @@ def process(
             plan=plan,
         )
         return
-    if target is not None and Path(target).suffix.lower() in _PICTURES:
-        raise click.UsageError(
-            f"-o {target} is a picture, but process writes energyscapes; give a .h5 file and plot it with 'ertis plot'",
-            click.get_current_context(),
-        )
     target_file = Path(target) if target else path.with_suffix(".energy.h5")
     report = _process_one(path, target_file, wanted, quiet=quiet, as_json=as_json)
     _note_mountings(target_file, quiet=quiet)
@@ -240,6 +265,34 @@ def process(
         options.say(line, quiet=quiet)
     if as_json:
         options.print_json(report)
+
+
+def _require_options_of(*, fuse: bool, target: str | None) -> None:
+    """Refuse options that apply only with or only without --fuse."""
+    context = click.get_current_context()
+    for name in ("sensor", "dtype", "verify", "explain", "workers", "scheduler") if fuse else ():
+        if typed(name):
+            raise click.UsageError(f"--{name} does not apply to --fuse; leave it out", context)
+    if not fuse and typed("emitter_diameter_m"):
+        raise click.UsageError("--emitter-diameter applies to --fuse only; add it", context)
+    if fuse and target is not None and (_results.is_results_file(target) or Path(target).suffix in _PICTURES):
+        raise click.UsageError(f"-o {target} is not an energyscape file; give a .h5 file for --fuse", context)
+
+
+def _require_options_of_one(target: str | None) -> None:
+    """Refuse options for several recordings, and pictures."""
+    context = click.get_current_context()
+    for name in ("workers", "scheduler"):
+        if typed(name):
+            raise click.UsageError(
+                f"--{name} applies to several recordings; give more, a folder or a pattern, or an -o that ends in /",
+                context,
+            )
+    if target is not None and Path(target).suffix.lower() in _PICTURES:
+        raise click.UsageError(
+            f"-o {target} is a picture, but process writes energyscapes; give a .h5 file and plot it with 'ertis plot'",
+            context,
+        )
 
 
 def _note_mountings(path: Path, *, quiet: bool) -> None:

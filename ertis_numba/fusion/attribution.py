@@ -23,6 +23,7 @@ _CONFIRMED: Final = 0.25  # Reflectivity in the images of other pairs, relative 
 _VISIBLE: Final = 2.0  # Power of an expected echo relative to noise and side lobes.
 _BOUND: Final = 2.0  # Reflectivity relative to the least that any pair shows.
 _REACH: Final = 2  # Neighbouring azimuths whose reflectors cause echoes in the same pixel.
+_SAME_STEPS: Final = 2.0  # Distance, in steps, within which the reflectors of two hypotheses are one.
 _TINY: Final = np.float32(1e-30)
 
 
@@ -60,6 +61,23 @@ class _Evidence(NamedTuple):
     weight: Singles
 
 
+class _Rivalry(NamedTuple):
+    """Hypotheses of a receiver relative to one of them.
+
+    Where several of them lead to the same place, they are no rivals: its reflector causes all of their echoes.
+
+    Attributes
+    ----------
+    is_rival : tuple of (pixel,) bool
+        True where another hypothesis leads to another place.
+    part : (pixel,) float32
+        Power of the echo relative to that of all hypotheses with the same place.
+    """
+
+    is_rival: tuple[NDArray[np.bool_], ...]
+    part: Singles
+
+
 class Attribution:
     """Separator of own and foreign echoes by consistency over all pairs.
 
@@ -84,6 +102,7 @@ class Attribution:
         receivers: Mapping[int, Receiver],
     ) -> None:
         self._grid, self._pairs, self._hypotheses, self._receivers = grid, pairs, hypotheses, receivers
+        self._rivalries = {number: _rivalries(each, _SAME_STEPS * grid.step_m) for number, each in hypotheses.items()}
         self._own_gain = {pair.receiver: self._own_gain_of(pair) for pair in pairs if pair.emitter == pair.receiver}
 
     def __call__(self, images: Mapping[int, CoarseImage]) -> Attributed:
@@ -162,17 +181,19 @@ class Attribution:
         receiver, shape = self._receivers[number], image.power.shape
         hypotheses = self._hypotheses[number]
         predicted = [receiver.over_lobe(each.predicted(around).reshape(shape)).reshape(-1) for each in hypotheses]
-        total = np.sum(predicted, axis=0, dtype=np.float32) + _TINY
         power = image.power.reshape(-1) + _TINY
         found = {}
-        for each, alone in zip(hypotheses, predicted, strict=True):
+        for each, alone, rivalry in zip(hypotheses, predicted, self._rivalries[number], strict=True):
             if each.is_mirrored:
                 continue
-            share = (1 - np.float32(suppression) * (total - alone) / power).clip(0, 1)
+            rivals = np.zeros_like(power)
+            for other, is_rival in zip(predicted, rivalry.is_rival, strict=True):
+                rivals += other * is_rival
+            share = (1 - np.float32(suppression) * rivals / power).clip(0, 1)
             if each.emitter == number and confirmed is not None:
                 is_confirmed = _at(confirmed, each.cell) * self._own_gain[number] > np.float32(_CONFIRMED) * power
-                share = np.maximum(share, is_confirmed * (alone / total) ** 3)
-            found[each.emitter, number] = share
+                share = np.maximum(share, is_confirmed * (alone / (alone + rivals + _TINY)) ** 3)
+            found[each.emitter, number] = share * rivalry.part
         return found
 
     def _own_gain_of(self, pair: Pair) -> Singles:
@@ -204,6 +225,20 @@ class Attribution:
         return total / weights
 
 
+def _rivalries(hypotheses: Sequence[Hypothesis], same_m: float) -> list[_Rivalry]:
+    found = []
+    for each in hypotheses:
+        is_rival = []
+        gain = np.zeros_like(each.gain)
+        for other in hypotheses:
+            offset_m = other.place_m - each.place_m
+            same = np.einsum("px,px->p", offset_m, offset_m) < same_m**2
+            gain += other.gain * same
+            is_rival.append(~same)
+        found.append(_Rivalry(tuple(is_rival), np.divide(each.gain, gain, out=np.ones_like(gain), where=gain > 0)))
+    return found
+
+
 def _evidence(pair: Pair, image: CoarseImage) -> _Evidence:
     """Return the evidence of a pair.
 
@@ -211,7 +246,7 @@ def _evidence(pair: Pair, image: CoarseImage) -> _Evidence:
     the limits of what a pair can see, so that images have no seams.
     """
     floor = image.floor.take(pair.step)
-    signal_to_floor = pair.lifted / floor
+    signal_to_floor = pair.gain / floor
     return _Evidence(pair, floor, pair.values(image.highest), pair.weight * signal_to_floor**2)
 
 

@@ -10,15 +10,15 @@ from ertis_numba import checks
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.fusion.polar_grid import PolarGrid
+from ertis_numba.fusion.pulses import is_same_pulse
 from ertis_numba.fusion.rig import Mountings, sensor_poses
-from ertis_numba.fusion.tables import Tables
+from ertis_numba.fusion.tables import FusionTables
 
 __all__ = ["Fused", "Fuser", "fuse"]
 
 EMITTER_DIAMETER_M: Final = 0.012
 _SPACING_DEG: Final = 1.0, 4.0  # of planar and of three-dimensional images
 _STEP_M: Final = 0.015, 0.03
-_SAME_PULSE_NS: Final = 500_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,6 +36,17 @@ class Fused:
         Sensors whose images were fused.
     missing : tuple of str
         Sensors with a mounting, but without an image.
+
+    Examples
+    --------
+    >>> import ertis_numba as ertis
+    >>> with ertis.open_recording("reflectors.h5") as recording:
+    ...     image = ertis.Pipeline(recording.settings).process(recording[0])
+    >>> unturned = (0.0, 0.0, 0.0, 1.0)
+    >>> mountings = {image.stamp.sensor: ((0.1, 0.0, 0.0), unturned), "left": ((0.0, 0.1, 0.0), unturned)}
+    >>> fused = ertis.fuse([image], mountings)
+    >>> fused.sensors, fused.missing
+    (('sensor',), ('left',))
     """
 
     image: Energyscape
@@ -45,7 +56,7 @@ class Fused:
 
 
 class Fuser:
-    """Fusion of the images of sensors on one platform, with tables computed once.
+    """Fusion of the images of sensors on one platform, with tables for the directions and ranges of their images.
 
     Sensors that emit together hear each other's calls. Such a foreign echo has travelled from one sensor over the
     reflector to another one, so the reflector lies on an ellipse around both. Each pair of emitter and receiver has its
@@ -76,8 +87,8 @@ class Fuser:
     Examples
     --------
     >>> import ertis_numba as ertis
-    >>> mountings = {"front": ((0.2, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)), "back": ((-0.2, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))}
-    >>> fuser = ertis.Fuser(mountings)
+    >>> ahead, behind = (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 1.0, 0.0)
+    >>> fuser = ertis.Fuser({"front": ((0.2, 0.0, 0.0), ahead), "back": ((-0.2, 0.0, 0.0), behind)})
     >>> fuser.sensors
     ('front', 'back')
     """
@@ -104,7 +115,7 @@ class Fuser:
             self._numbers[sensor]: checks.between(f"emission_s of sensor {sensor}", start_s, 0.0, 10.0)
             for sensor, start_s in (emission_s or {}).items()
         }
-        self._tables: Tables | None = None
+        self._tables: FusionTables | None = None
 
     @property
     def sensors(self) -> tuple[str, ...]:
@@ -129,10 +140,10 @@ class Fuser:
             There is no image, two images of the same sensor, an image without a mounting, or a mixture of planar and
             other images.
         DataError
-            The images are not from the same pulse, or have other directions or ranges than before.
+            The images are not from the same pulse.
         """
         group = self._group(images)
-        if self._tables is None:
+        if self._tables is None or not self._tables.fit(group):
             self._tables = self._new_tables(group)
         tables = self._tables
         coarse = {number: tables.coarse(number, image) for number, image in group.items()}
@@ -160,7 +171,7 @@ class Fuser:
         first, *others = group.values()
         for other in others:
             apart_ns = abs(other.stamp.timestamp_ns - first.stamp.timestamp_ns)
-            if other.stamp.sync_count != first.stamp.sync_count or apart_ns > _SAME_PULSE_NS:
+            if not is_same_pulse(other.stamp, first.stamp):
                 raise DataError(
                     f"images of sensors {first.stamp.sensor!r} and {other.stamp.sensor!r} are not from the same pulse: "
                     f"SYNC counts {first.stamp.sync_count} and {other.stamp.sync_count}, {apart_ns / 1e9:.3g} s apart; "
@@ -181,7 +192,7 @@ class Fuser:
             )
         return self._numbers[sensor]
 
-    def _new_tables(self, group: Mapping[int, Energyscape]) -> "Tables":
+    def _new_tables(self, group: Mapping[int, Energyscape]) -> "FusionTables":
         kind = 0 if next(iter(group.values())).is_planar else 1
         spacing_m = max(float(np.diff(image.range_m).max(initial=0.0)) for image in group.values())
         step_m = max(_STEP_M[kind], spacing_m) if self._step_m is None else self._step_m
@@ -200,7 +211,7 @@ class Fuser:
             is_planar=kind == 0,
             height_m=float(np.mean([pose.translation_m[2] for pose in self._poses])),
         )
-        return Tables(grid, self._poses, self._emitting, self._emission_s, self._diameter_m)
+        return FusionTables(grid, self._poses, self._emitting, self._emission_s, self._diameter_m)
 
 
 def fuse(
@@ -231,13 +242,10 @@ def fuse(
     Examples
     --------
     >>> import ertis_numba as ertis
-    >>> scene = ertis.load_scene("platform.toml")
-    >>> images = [
-    ...     ertis.Pipeline(each.settings()).process(ertis.render(scene, sensor=each.name)) for each in scene.sensors
-    ... ]
-    >>> mountings = {each.name: (each.position_m, each.quaternion()) for each in scene.sensors}
-    >>> fused = ertis.fuse(images, mountings)
-    >>> fused.missing, fused.image.amplitude.shape[0]
-    ((), 360)
+    >>> with ertis.open_recording("reflectors.h5") as recording:
+    ...     image = ertis.Pipeline(recording.settings).process(recording[0])
+    >>> fused = ertis.fuse([image], {image.stamp.sensor: ((0.1, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))})
+    >>> fused.image.amplitude.shape[0], len(fused.points)
+    (360, 5)
     """
     return Fuser(mountings, emitter_diameter_m=emitter_diameter_m)(images)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.fusion.polar_grid import PolarGrid
 from ertis_numba.fusion.receivers import Receiver
-from ertis_numba.fusion.rig import Emitters, SensorPose
+from ertis_numba.fusion.rig import Emitters, MountedSensor
 
 __all__ = ["Hypothesis", "Pair", "hypothesis", "pair_of"]
 
@@ -85,12 +85,18 @@ class Hypothesis(NamedTuple):
         Matrices (pixel, cell) of the gain of echoes, for the parts of a step.
     cell : (pixel,) int64
         Cell of the middle of each pixel, or -1.
+    place_m : (pixel, axis) float32
+        Position of the middle of each pixel.
+    gain : (pixel,) float32
+        Gain of a reflector there, 0 if none is possible.
     """
 
     emitter: int
     is_mirrored: bool
     parts: "tuple[scipy.sparse.csr_matrix, ...]"
     cell: Places
+    place_m: Singles
+    gain: Singles
 
     def predicted(self, reflectivity: Singles) -> Singles:
         """Return the power that reflectors would cause: (pixel,) float32."""
@@ -102,7 +108,7 @@ class Hypothesis(NamedTuple):
 
 def pair_of(
     positions_m: Floats,
-    poses: tuple[SensorPose, ...],
+    poses: tuple[MountedSensor, ...],
     emitters: Emitters,
     receiver: Receiver,
     *,
@@ -117,7 +123,7 @@ def pair_of(
     ----------
     positions_m : (cell, axis) float64
         Centres of the cells.
-    poses : tuple of SensorPose
+    poses : tuple of MountedSensor
     emitters : Emitters
     receiver : Receiver
     emitter, number : int
@@ -159,7 +165,7 @@ def pair_of(
 
 def hypothesis(
     grid: PolarGrid,
-    poses: tuple[SensorPose, ...],
+    poses: tuple[MountedSensor, ...],
     emitters: Emitters,
     receiver: Receiver,
     *,
@@ -186,7 +192,7 @@ def hypothesis(
     offset_m = poses[emitter].translation_m - pose.translation_m
     apart_m = float(np.linalg.norm(offset_m))
     n_pixels = len(directions) * receiver.n_steps
-    parts, middle = [], np.full(n_pixels, -1)
+    parts = []
     for part in _PARTS_OF_STEP:
         path_m = 2 * (np.arange(receiver.n_steps) + 0.5 + part) * receiver.step_m - late_m
         beyond = path_m**2 - apart_m**2
@@ -200,5 +206,8 @@ def hypothesis(
         pixel = np.flatnonzero((cell >= 0) & (radiated > _AUDIBLE).reshape(-1))
         entries = gain[pixel].astype(np.float32), (pixel, cell[pixel])
         parts.append(scipy.sparse.csr_matrix(entries, shape=(n_pixels, grid.n_cells)))
-        middle = cell if part == 0 else middle
-    return Hypothesis(emitter, is_mirrored, tuple(parts), middle)
+        if part == 0:
+            audible = np.zeros(n_pixels, dtype=np.float32)
+            audible[pixel] = gain[pixel]
+            middle = cell, place_m.reshape(-1, 3).astype(np.float32), audible
+    return Hypothesis(emitter, is_mirrored, tuple(parts), *middle)

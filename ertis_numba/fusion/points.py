@@ -13,7 +13,7 @@ from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.fusion.attribution import Shares
 from ertis_numba.fusion.polar_grid import PolarGrid
 from ertis_numba.fusion.receivers import Receiver
-from ertis_numba.fusion.rig import SensorPose
+from ertis_numba.fusion.rig import MountedSensor
 from ertis_numba.geometry import Grid
 
 __all__ = ["Observation", "PointFuser", "joined"]
@@ -59,7 +59,7 @@ class Observation(NamedTuple):
     position_m: Floats
     amplitude: float
 
-    def rows(self, position_m: Floats, poses: Sequence[SensorPose]) -> tuple[Floats, Floats]:
+    def rows(self, position_m: Floats, poses: Sequence[MountedSensor]) -> tuple[Floats, Floats]:
         """Return residuals and their derivatives, in standard deviations: (row,) and (row, axis) float64."""
         away_m, back_m = (position_m - poses[number].translation_m for number in (self.emitter, self.receiver))
         from_m, to_m = (max(_NEAREST_M, float(np.linalg.norm(each))) for each in (away_m, back_m))
@@ -78,13 +78,13 @@ class PointFuser:
     ----------
     number : int
         Index of the sensor in ``poses``.
-    poses : tuple of SensorPose
+    poses : tuple of MountedSensor
     receiver : Receiver
     image : Energyscape
         Any image of the sensor.
     """
 
-    def __init__(self, number: int, poses: tuple[SensorPose, ...], receiver: Receiver, image: Energyscape) -> None:
+    def __init__(self, number: int, poses: tuple[MountedSensor, ...], receiver: Receiver, image: Energyscape) -> None:
         self._number, self._poses, self._receiver = number, poses, receiver
         self._extract = PointExtractor(image.settings, Grid(image.azimuth_rad, image.elevation_rad), top=_TOP)
 
@@ -117,14 +117,13 @@ class PointFuser:
         return found
 
     def _emitter(self, direction: Floats, range_m: float, shares: Shares, emitters: Sequence[int]) -> int | None:
-        """Return the emitter that explains an echo, or None if none or several do."""
+        """Return the emitter that explains an echo best, or None if reflectors elsewhere explain it."""
         receiver = self._receiver
         step = int(range_m / receiver.step_m)
         row = int(np.argmax(receiver.directions @ direction)) * receiver.n_steps
         near = slice(row + max(0, step - 1), row + min(receiver.n_steps, step + 2))
         share = [float(shares[emitter, self._number][near].max(initial=0.0)) for emitter in emitters]
-        best = int(np.argmax(share)) if share else -1
-        return emitters[best] if share and share[best] > _MIN_SHARE else None
+        return emitters[int(np.argmax(share))] if sum(share) > _MIN_SHARE else None
 
     def _observation(
         self, place_m: Floats, range_m: float, emitter: int, path_m: float, uncertainty_m: Floats, amplitude: float
@@ -149,14 +148,14 @@ class PointFuser:
 
 
 def joined(
-    observations: Sequence[Observation], poses: Sequence[SensorPose], image: Energyscape, grid: PolarGrid
+    observations: Sequence[Observation], poses: Sequence[MountedSensor], image: Energyscape, grid: PolarGrid
 ) -> PointCloud:
     """Return one point for each reflector, in the frame of the platform, strongest first.
 
     Parameters
     ----------
     observations : sequence of Observation
-    poses : sequence of SensorPose
+    poses : sequence of MountedSensor
     image : Energyscape
         Fused image, which yields amplitudes.
     grid : PolarGrid
@@ -184,8 +183,8 @@ def joined(
     )
 
 
-def _clusters(observations: Sequence[Observation], poses: Sequence[SensorPose]) -> list[list[Observation]]:
-    """Return the observations of each reflector; each pair of emitter and receiver sees it at most once."""
+def _clusters(observations: Sequence[Observation], poses: Sequence[MountedSensor]) -> list[list[Observation]]:
+    """Return the observations of each reflector."""
     found: list[list[Observation]] = []
     means: list[tuple[Floats, Floats]] = []
     for each in observations:
@@ -194,9 +193,11 @@ def _clusters(observations: Sequence[Observation], poses: Sequence[SensorPose]) 
         for number, (mean, spread) in enumerate(means):
             offset = each.position_m - mean
             distance = float(offset @ np.linalg.solve(covariance + spread + _SAME_M**2 * np.eye(3), offset))
-            taken = any((each.emitter, each.receiver) == (other.emitter, other.receiver) for other in found[number])
-            if distance < least and not taken:
+            if distance < least:
                 best, least = number, distance
+        pairs = [(other.emitter, other.receiver) for other in found[best]] if best >= 0 else []
+        if (each.emitter, each.receiver) in pairs:
+            continue  # A pair sees a reflector once; this is a shoulder of the same echo.
         if best < 0:
             found.append([each])
             means.append((each.position_m, covariance))
@@ -206,7 +207,7 @@ def _clusters(observations: Sequence[Observation], poses: Sequence[SensorPose]) 
     return found
 
 
-def _located(cluster: Sequence[Observation], poses: Sequence[SensorPose]) -> tuple[Floats, Floats]:
+def _located(cluster: Sequence[Observation], poses: Sequence[MountedSensor]) -> tuple[Floats, Floats]:
     """Return the position of a reflector and its covariance, by least squares: (axis,) and (axis, axis) float64."""
     position_m = cluster[0].position_m
     covariance = _covariance(cluster[0], poses)
@@ -219,7 +220,7 @@ def _located(cluster: Sequence[Observation], poses: Sequence[SensorPose]) -> tup
     return position_m, covariance
 
 
-def _covariance(seen: Observation, poses: Sequence[SensorPose]) -> Floats:
+def _covariance(seen: Observation, poses: Sequence[MountedSensor]) -> Floats:
     _, slopes = seen.rows(seen.position_m, poses)
     return np.asarray(np.linalg.inv(slopes.T @ slopes))
 

@@ -6,10 +6,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.errors import DataError
 from ertis_numba.frames import Energyscape
 from ertis_numba.fusion.polar_grid import close_directions
-from ertis_numba.fusion.rig import SensorPose
+from ertis_numba.fusion.rig import MountedSensor
 from ertis_numba.geometry import microphones, unit_vectors
 
 __all__ = ["Beam", "CoarseImage", "Receiver"]
@@ -69,14 +68,14 @@ class Receiver:
 
     Parameters
     ----------
-    pose : SensorPose
+    pose : MountedSensor
     image : Energyscape
         Any image of the sensor; others must have the same directions and ranges.
     step_m : float
         Spacing of the coarse range axis.
     """
 
-    def __init__(self, pose: SensorPose, image: Energyscape, step_m: float) -> None:
+    def __init__(self, pose: MountedSensor, image: Energyscape, step_m: float) -> None:
         self.pose, self.step_m = pose, step_m
         self._azimuth_rad, self._elevation_rad, self._range_m = image.azimuth_rad, image.elevation_rad, image.range_m
         self.directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
@@ -92,24 +91,13 @@ class Receiver:
         # The planar grid is interpolated; directions all over a sphere are dense enough for the nearest one.
         self._order = np.argsort(image.azimuth_rad) if image.is_planar else None
 
-    def require_same(self, image: Energyscape) -> None:
-        """Raise an error for an image with other directions or ranges.
-
-        Raises
-        ------
-        DataError
-            The image has other directions or ranges.
-        """
-        same = (
+    def fits(self, image: Energyscape) -> bool:
+        """Return True for an image with the same directions and ranges."""
+        return (
             np.array_equal(image.azimuth_rad, self._azimuth_rad)
             and np.array_equal(image.elevation_rad, self._elevation_rad)
             and np.array_equal(image.range_m, self._range_m)
         )
-        if not same:
-            raise DataError(
-                f"the image of sensor {self.pose.name!r} has other directions or ranges than before; "
-                "create another Fuser for it"
-            )
 
     def coarse(self, image: Energyscape, deaf: NDArray[np.bool_]) -> CoarseImage:
         """Return the powers of an image.

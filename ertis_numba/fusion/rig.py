@@ -14,7 +14,7 @@ from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import mounting
 from ertis_numba.settings import Settings
 
-__all__ = ["Emitters", "Mountings", "SensorPose", "sensor_poses"]
+__all__ = ["Emitters", "Mountings", "MountedSensor", "sensor_poses"]
 
 Floats = NDArray[np.float64]
 Mountings = Mapping[str, tuple[Sequence[float], Sequence[float]]]
@@ -26,7 +26,7 @@ _STRAY_DB = -20.0  # Power that an emitter radiates at least to its front, which
 _BEHIND_DB = -30.0
 
 
-class SensorPose(NamedTuple):
+class MountedSensor(NamedTuple):
     """Position and orientation of a sensor on its platform.
 
     Attributes
@@ -46,7 +46,7 @@ class SensorPose(NamedTuple):
         return np.asarray((position_m - self.translation_m) @ self.rotation)
 
 
-def sensor_poses(mountings: Mountings) -> tuple[SensorPose, ...]:
+def sensor_poses(mountings: Mountings) -> tuple[MountedSensor, ...]:
     """Return the poses of sensors, in the order of their mountings.
 
     Raises
@@ -59,7 +59,9 @@ def sensor_poses(mountings: Mountings) -> tuple[SensorPose, ...]:
     poses = []
     for name, (translation_m, rotation_xyzw) in mountings.items():
         place = mounting(name, translation_m, rotation_xyzw)
-        poses.append(SensorPose(name, place["translation_m"], Rotation.from_quat(place["rotation_xyzw"]).as_matrix()))
+        poses.append(
+            MountedSensor(name, place["translation_m"], Rotation.from_quat(place["rotation_xyzw"]).as_matrix())
+        )
     return tuple(poses)
 
 

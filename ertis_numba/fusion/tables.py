@@ -14,10 +14,10 @@ from ertis_numba.fusion.pairs import Hypothesis, Pair, hypothesis, pair_of
 from ertis_numba.fusion.points import PointFuser, joined
 from ertis_numba.fusion.polar_grid import PolarGrid
 from ertis_numba.fusion.receivers import CoarseImage, Receiver
-from ertis_numba.fusion.rig import Emitters, SensorPose
+from ertis_numba.fusion.rig import Emitters, MountedSensor
 from ertis_numba.settings import Settings
 
-__all__ = ["PLATFORM", "Tables"]
+__all__ = ["PLATFORM", "FusionTables"]
 
 PLATFORM: Final = "base_link"
 """Name of the platform's frame in REP 105, and of the sensor of fused images."""
@@ -25,14 +25,14 @@ PLATFORM: Final = "base_link"
 _DIRECT_SOUND_M: Final = 0.1  # Range before and after direct sound in which it hides echoes.
 
 
-class Tables:
+class FusionTables:
     """Tables of all receivers, computed when the first image of each one arrives.
 
     Parameters
     ----------
     grid : PolarGrid
         Cells of fused images.
-    poses : tuple of SensorPose
+    poses : tuple of MountedSensor
     emitting : list of int
         Indices of the sensors that emit.
     emission_s : mapping of int to float
@@ -44,7 +44,7 @@ class Tables:
     def __init__(
         self,
         grid: PolarGrid,
-        poses: tuple[SensorPose, ...],
+        poses: tuple[MountedSensor, ...],
         emitting: list[int],
         emission_s: Mapping[int, float],
         diameter_m: float,
@@ -61,13 +61,19 @@ class Tables:
         self._known: dict[tuple[int, ...], Attribution] = {}
         self._points: dict[int, PointFuser] = {}
 
+    def fit(self, group: Mapping[int, Energyscape]) -> bool:
+        """Return True if images have the same directions, ranges and calls as earlier ones of their sensors."""
+        return all(
+            number not in self._receivers
+            or (self._receivers[number].fits(image) and image.settings.call == self._settings[number].call)
+            for number, image in group.items()
+        )
+
     def coarse(self, number: int, image: Energyscape) -> CoarseImage:
         """Return the powers of an image of a receiver."""
         if number not in self._receivers:
             self._add(number, image)
-        receiver = self._receivers[number]
-        receiver.require_same(image)
-        return receiver.coarse(image, self._deaf[number])
+        return self._receivers[number].coarse(image, self._deaf[number])
 
     def attribution(self, group: Mapping[int, Energyscape]) -> Attribution:
         """Return the attribution of echoes in the images of a group, for pairs with equal calls."""
@@ -155,11 +161,7 @@ class Tables:
             "azimuth_limits_deg": (-limit_deg, limit_deg),
             "range_m": (float(self.grid.range_m[0]), float(self.grid.range_m[-1])),
         }
-        if self.grid.is_planar:
-            return settings.replace(
-                processing=settings.processing.replace(directions=f"2d:{self.grid.n_azimuths}", **limits)
-            )
-        pairs = np.degrees(np.stack([self.grid.azimuth_rad, self.grid.elevations_rad], axis=1))
-        return settings.replace(
-            processing=settings.processing.replace(directions=tuple(map(tuple, pairs.tolist())), **limits)
-        )
+        # Settings hold at most 1000 directions, so those of a three-dimensional image are named by their count only.
+        kind = "2d" if self.grid.is_planar else "3d"
+        directions = f"{kind}:{self.grid.n_directions}"
+        return settings.replace(processing=settings.processing.replace(directions=directions, **limits))

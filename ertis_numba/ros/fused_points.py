@@ -1,61 +1,31 @@
 """Points of all sensors that emitted together, in the frame of their platform."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
-from ertis_numba.frames import PointCloud, Stamp
+from ertis_numba.frames import PointCloud
+from ertis_numba.fusion.pulses import PulseGroups
 
 __all__ = ["FusedPoints", "joined"]
 
 PLATFORM_FRAME: Final = "base_link"
-_SAME_PULSE_NS: Final = 500_000_000  # Counts of different captures may be equal by accident.
 
 
-@dataclass(slots=True)
 class FusedPoints:
-    """Collector of the points of each SYNC pulse.
+    """Collector of the points of each SYNC pulse, joined in the frame of the platform."""
 
-    A group is complete once it has points of all sensors of the group before, and of sensors that have come since. Of
-    a sensor that is missing, the next group shows that no more will come.
-    """
-
-    _expected: set[str] = field(default_factory=set)
-    _group: dict[str, PointCloud] = field(default_factory=dict)
-    _closed: Stamp | None = None  # Stamp of the group that was returned last.
+    def __init__(self) -> None:
+        self._groups: PulseGroups[PointCloud] = PulseGroups()
 
     def add(self, cloud: PointCloud) -> list[PointCloud]:
         """Add the points of a sensor with a known mounting, and return the groups that are complete now, joined.
 
         Points that come after their group was returned are left out.
         """
-        done = []
-        if self._group and not self._belongs(cloud):
-            done.append(self._close())
-        sensor = cloud.stamp.sensor
-        is_late = self._closed is not None and _is_same_pulse(cloud.stamp, self._closed) and not self._group
-        self._expected.add(sensor)
-        if not is_late:
-            self._group[sensor] = cloud
-            if self._group.keys() >= self._expected:
-                done.append(self._close())
-        return done
-
-    def _belongs(self, cloud: PointCloud) -> bool:
-        other = next(iter(self._group.values())).stamp
-        return cloud.stamp.sensor not in self._group and _is_same_pulse(cloud.stamp, other)
-
-    def _close(self) -> PointCloud:
-        group, self._group = self._group, {}
-        self._expected = set(group)
-        self._closed = next(iter(group.values())).stamp
-        return joined(group)
-
-
-def _is_same_pulse(one: Stamp, other: Stamp) -> bool:
-    return one.sync_count == other.sync_count and abs(one.timestamp_ns - other.timestamp_ns) < _SAME_PULSE_NS
+        return [joined(group) for group in self._groups.add(cloud)]
 
 
 def joined(clouds: Mapping[str, PointCloud]) -> PointCloud:

@@ -1,0 +1,348 @@
+"""Fusion of images of several sensors: foreign echoes, positions, geometry and bad input."""
+
+import functools
+import math
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from ertis_cli.main import cli
+
+import ertis_numba as ertis
+from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.fusion.pairs import hypothesis, pair_of
+from ertis_numba.fusion.polar_grid import PolarGrid, close_directions
+from ertis_numba.fusion.receivers import Receiver
+from ertis_numba.fusion.rig import Emitters, sensor_poses
+from ertis_numba.settings import Processing
+from ertis_numba.simulation import Electronics, Emitter, Point, Scene, Sensor
+from ertis_numba.storage import open_energyscapes, write_recording
+from tests.pages import commands_in, page, python_in, run_code_here, run_here
+
+YAWS = {"front": 0.0, "left": 90.0, "back": 180.0, "right": -90.0}
+PLACES_M = ((1.5, 0.3), (1.1, 1.0), (-0.4, 1.6), (-1.7, -0.9), (0.5, -1.2))
+
+
+@functools.cache
+def scene(*, diameter_m=0.012):
+    sensors = tuple(
+        Sensor(
+            name=name,
+            position_m=(0.2 * math.cos(math.radians(yaw)), 0.2 * math.sin(math.radians(yaw)), 0.4),
+            yaw_deg=yaw,
+            processing=Processing(range_m=(0.3, 2.5), directions="90"),
+            emitter=Emitter(level_db=-24.0, diameter_m=diameter_m),
+            electronics=Electronics(noise_dbfs=-60.0),
+        )
+        for name, yaw in YAWS.items()
+    )
+    points = tuple(Point(position_m=(x, y, 0.4), strength_db=-6.0) for x, y in PLACES_M)
+    return Scene(seed=5, sensors=sensors, points=points)
+
+
+@functools.cache
+def images():
+    found = {}
+    for sensor in scene().sensors:
+        with ertis.Pipeline(sensor.settings(), predict=False) as pipeline:
+            found[sensor.name] = pipeline.process(ertis.render(scene(), sensor=sensor.name))
+    return found
+
+
+def mountings():
+    return {sensor.name: (sensor.position_m, sensor.quaternion()) for sensor in scene().sensors}
+
+
+@functools.cache
+def fused():
+    return ertis.fuse(images().values(), mountings())
+
+
+def highest(image, x, y, within_m=0.06):
+    """Return the highest amplitude near a place on the platform."""
+    place = image.range_m[:, None] * np.exp(1j * image.azimuth_rad)
+    return float(image.amplitude.T[np.abs(place - complex(x, y)) < within_m].max())
+
+
+def foreign_places():
+    """Return the places at which single images show foreign echoes, far from all reflectors."""
+    found = []
+    for sensor in scene().sensors:
+        for echo in ertis.Simulator(scene(), sensor=sensor.name).reflectors():
+            # A flat array shows sound from behind in front.
+            azimuth_deg = echo.azimuth_deg if abs(echo.azimuth_deg) <= 90 else 180 - echo.azimuth_deg
+            turn = math.radians(azimuth_deg + sensor.yaw_deg)
+            x = sensor.position_m[0] + echo.range_m * math.cos(turn)
+            y = sensor.position_m[1] + echo.range_m * math.sin(turn)
+            is_apart = all(
+                abs(math.hypot(x, y) - math.hypot(*place)) > 0.12
+                or abs(np.angle(complex(x, y) / complex(*place))) > math.radians(25)
+                for place in PLACES_M
+            )
+            if echo.emitter and echo.level_db > -12 and 0.4 < echo.range_m < 2.4 and is_apart:
+                found.append((sensor, azimuth_deg, echo.range_m, x, y))
+    return found
+
+
+def test_fused_image_suppresses_foreign_echoes():
+    places = foreign_places()
+    assert len(places) >= 4
+    reference = max(highest(fused().image, *place) for place in PLACES_M)
+    shown = []
+    for sensor, azimuth_deg, range_m, x, y in places:
+        single = images()[sensor.name].select(
+            azimuth_deg=(azimuth_deg - 4, azimuth_deg + 4), range_m=(range_m - 0.05, range_m + 0.05)
+        )
+        # The same echo at 1 m, if it were the sensor's own.
+        shown.append((highest(fused().image, x, y), float(single.amplitude.max()) * range_m**2))
+    levels = np.array(shown)
+    assert np.all(levels[:, 0] < 10 ** (-15 / 20) * reference)
+    assert np.sum(levels[:, 0] ** 2) < 10 ** (-20 / 10) * np.sum(levels[:, 1] ** 2)
+
+
+def test_fused_points_are_the_reflectors():
+    positions_m = fused().points.position_m
+    for place in PLACES_M:
+        offset_m = np.hypot(*(positions_m[:, :2] - place).T)
+        nearest = int(np.argmin(offset_m))
+        assert offset_m[nearest] < 0.02
+        assert abs(positions_m[nearest, 2] - 0.4) < 0.05
+    assert len(positions_m) == len(PLACES_M)
+
+
+def test_points_seen_by_two_sensors_are_more_precise():
+    """The point at 42° lies between two sensors, and its distance from both determines its direction."""
+    cloud = fused().points
+    both = int(np.argmin(np.hypot(*(cloud.position_m[:, :2] - PLACES_M[1]).T)))
+    one = int(np.argmin(np.hypot(*(cloud.position_m[:, :2] - PLACES_M[3]).T)))
+    across_rad = cloud.uncertainty_m[:, 1] / np.linalg.norm(cloud.position_m[:, :2], axis=1)
+    assert across_rad[both] < across_rad[one]
+
+
+def test_amplitude_does_not_depend_on_the_number_of_sensors():
+    levels_db = 20 * np.log10([highest(fused().image, *place) for place in PLACES_M])
+    between = 1  # The second reflector lies between two sensors, whose echoes of both calls interfere.
+    assert np.ptp(np.delete(levels_db, between)) < 1.0  # All strengths are equal.
+    assert abs(levels_db[between] - np.median(levels_db)) < 6.0
+
+
+def test_missing_sensor_is_reported_and_still_emits():
+    three = [image for name, image in images().items() if name != "left"]
+    result = ertis.fuse(three, mountings())
+    assert (result.sensors, result.missing) == (("front", "back", "right"), ("left",))
+    assert 20 * math.log10(highest(result.image, *PLACES_M[0]) / highest(fused().image, *PLACES_M[0])) > -3
+
+
+def test_order_of_images_does_not_matter():
+    other = ertis.fuse(reversed(list(images().values())), mountings())
+    np.testing.assert_array_equal(other.image.amplitude, fused().image.amplitude)
+
+
+def test_fuser_repeats_its_result():
+    fuser = ertis.Fuser(mountings())
+    first, second = fuser(images().values()), fuser(images().values())
+    np.testing.assert_array_equal(first.image.amplitude, second.image.amplitude)
+
+
+def test_silent_sensors_only_listen():
+    fuser = ertis.Fuser(mountings(), silent=["front", "left", "back", "right"])
+    assert not fuser(images().values()).image.amplitude.any()
+
+
+def test_calls_that_differ_are_not_mixed_up():
+    group = dict(images())
+    other = group["left"].settings
+    group["left"] = group["left"].replace(
+        settings=other.replace(call=other.call.replace(start_frequency_hz=25e3, stop_frequency_hz=50e3))
+    )
+    fuser = ertis.Fuser(mountings())
+    result = fuser(group.values())
+    assert result.sensors == ("front", "left", "back", "right")
+    assert highest(result.image, *PLACES_M[2]) > 0
+
+
+def render_with(settings, sensor):
+    measurement = ertis.render(scene(), sensor=sensor)
+    return ertis.Measurement(measurement.data, settings, measurement.stamp)
+
+
+def test_images_in_three_dimensions_are_fused():
+    group = []
+    for sensor in scene().sensors[:2]:
+        settings = sensor.settings().replace(
+            processing=Processing(range_m=(0.3, 2.5), directions="3d:400", elevation_limits_deg=(-40.0, 40.0))
+        )
+        with ertis.Pipeline(settings, predict=False) as pipeline:
+            group.append(pipeline.process(render_with(settings, sensor.name)))
+    result = ertis.Fuser(mountings(), spacing_deg=6.0, range_step_m=0.04)(group)
+    assert not result.image.is_planar
+    best = np.unravel_index(np.argmax(result.image.amplitude), result.image.amplitude.shape)
+    assert abs(result.image.elevation_deg[best[0]]) < 10
+    assert result.missing == ("back", "right")
+
+
+@pytest.mark.parametrize("emitter", [0, 1, 2])
+@pytest.mark.parametrize("seed", range(3))
+def test_pixels_of_a_reflector_lead_back_to_its_cell(emitter, seed):
+    """Positions to pixels, and pixels to positions, are inverse to each other."""
+    poses = sensor_poses(mountings())
+    image = images()["front"]
+    receiver = Receiver(poses[0], image, 0.015)
+    emitters = Emitters(image.settings, 0.0)
+    grid = PolarGrid.around(1.0, 0.015, 2.9, is_planar=True, height_m=0.4)
+    draws = np.random.default_rng(seed)
+    azimuth_rad = draws.uniform(-1.2, 1.2, 50)
+    places_m = np.stack([np.cos(azimuth_rad), np.sin(azimuth_rad), np.zeros(50)], axis=1)
+    places_m = places_m * draws.uniform(0.8, 2.0, (50, 1)) + poses[0].translation_m
+    deaf = np.zeros(receiver.n_steps, dtype=bool)
+    pair = pair_of(places_m, poses, emitters, receiver, emitter=emitter, number=0, late_m=0.0, deaf=deaf)
+    back = hypothesis(grid, poses, emitters, receiver, emitter=emitter, late_m=0.0, is_mirrored=False)
+    nearest = np.where(pair.share > 0.5, pair.second, pair.first)
+    cells_m = grid.positions_m[back.cell[nearest]]
+    assert len(pair.cell) == 50
+    assert np.max(np.linalg.norm(cells_m - places_m[pair.cell], axis=1)) < 0.09  # half a direction at 2 m, and a step
+
+
+def test_cell_of_is_the_inverse_of_positions():
+    for is_planar in (True, False):
+        grid = PolarGrid.around(5.0, 0.1, 2.0, is_planar=is_planar, height_m=0.3)
+        np.testing.assert_array_equal(grid.cell_of(grid.positions_m), np.arange(grid.n_cells))
+
+
+def test_close_directions_contain_the_direction_itself():
+    directions = np.eye(3)
+    np.testing.assert_array_equal(close_directions(directions, 0.1), [[0], [1], [2]])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda _: [], "images is empty"),
+        (lambda group: [group[0], group[0]], "two of sensor 'front'"),
+        (
+            lambda group: [group[0].replace(stamp=ertis.Stamp(sensor="roof"))],
+            "images has sensor 'roof', but its mounting is unknown",
+        ),
+        (
+            lambda group: [group[0], group[1].replace(stamp=ertis.Stamp(sensor="left", sync_count=7))],
+            "not from the same pulse: SYNC counts 0 and 7",
+        ),
+        (
+            lambda group: [
+                group[0],
+                group[1].replace(stamp=ertis.Stamp(sensor="left", timestamp_ns=10**12)),
+            ],
+            "1e.03 s apart",
+        ),
+        (
+            lambda group: [group[0], group[1].replace(elevation_rad=group[1].elevation_rad + 0.1)],
+            "is planar, unlike that of",
+        ),
+        (lambda _: [3], "images"),
+    ],
+)
+def test_fuser_refuses_images_that_do_not_fit(change, message):
+    with pytest.raises((ArgumentError, DataError), match=message):
+        ertis.fuse(change(list(images().values())), mountings())
+
+
+def test_fuser_adapts_to_other_ranges():
+    fuser = ertis.Fuser(mountings())
+    fuser(images().values())
+    near = [image.select(range_m=(0.5, 1.5)) for image in images().values()]
+    result = fuser(near)
+    assert result.image.range_m[-1] < 1.8
+    np.testing.assert_array_equal(result.image.amplitude, ertis.fuse(near, mountings()).image.amplitude)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"silent": ["roof"]}, "silent has sensor 'roof'"),
+        ({"emission_s": {"roof": 0.1}}, "emission_s has sensor 'roof'"),
+        ({"emission_s": {"left": -1.0}}, "emission_s of sensor left"),
+        ({"emitter_diameter_m": -1.0}, "emitter_diameter_m"),
+    ],
+)
+def test_fuser_refuses_impossible_options(options, message):
+    with pytest.raises(ArgumentError, match=message):
+        ertis.Fuser(mountings(), **options)
+
+
+def test_fuser_needs_mountings():
+    with pytest.raises(ArgumentError, match="mountings is empty"):
+        ertis.Fuser({})
+
+
+@pytest.mark.parametrize(("name", "value"), [("spacing_deg", 0.0), ("range_step_m", 1e-3), ("spacing_deg", math.nan)])
+def test_fuser_refuses_grids_that_are_too_fine(name, value):
+    with pytest.raises(ArgumentError, match=name):
+        ertis.Fuser(mountings(), **{name: value})(images().values())
+
+
+# ---- command and page ------------------------------------------------------------------------------
+
+
+def run(*arguments):
+    result = CliRunner().invoke(cli, [str(each) for each in arguments])
+    return result.exit_code, result.output
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory):
+    """Recordings of one measurement: one of each sensor, and one of all sensors."""
+    folder = tmp_path_factory.mktemp("fusion")
+    measurements = [ertis.render(scene(), sensor=sensor.name) for sensor in scene().sensors]
+    for measurement in measurements:
+        name = measurement.stamp.sensor
+        write_recording(folder / f"{name}.h5", [measurement], mounting={name: mountings()[name]})
+    write_recording(folder / "all.h5", measurements, mounting=mountings())
+    write_recording(folder / "unmounted.h5", measurements)
+    return folder
+
+
+def test_process_fuses_all_sensors(recordings):
+    code, output = run("process", recordings / "all.h5", "--fuse", "--json", "-q")
+    assert code == 0
+    assert '"pulses": 1' in output
+    with open_energyscapes(recordings / "all.fused.h5") as stored:
+        np.testing.assert_array_equal(stored[0].amplitude, fused().image.amplitude)
+        assert (stored.sensor, stored.translation_m.tolist()) == ("base_link", [0.0, 0.0, 0.0])
+
+
+def test_process_fuses_several_recordings(recordings):
+    paths = [recordings / f"{name}.h5" for name in YAWS]
+    code, output = run("process", *paths, "--fuse", "-o", recordings / "several.h5")
+    assert code == 0, output
+    with open_energyscapes(recordings / "several.h5") as stored:
+        np.testing.assert_array_equal(stored[0].amplitude, fused().image.amplitude)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "message"),
+    [
+        (["front.h5", "--fuse"], 2, "--fuse needs at least two sensors, but there is only front"),
+        (["front.h5", "all.h5", "--fuse"], 2, "have the same sensor 'front'"),
+        (["unmounted.h5", "--fuse"], 1, "the mounting of sensor 'front' is unknown; give --mounting"),
+        (["all.h5", "--fuse", "--sensor", "left"], 2, "--sensor does not apply to --fuse"),
+        (["all.h5", "--fuse", "-o", "all.png"], 2, "all.png is not an energyscape file"),
+        (["all.h5", "--emitter-diameter", "0.01"], 2, "--emitter-diameter applies to --fuse only"),
+        (["all.h5", "--fuse", "--emitter-diameter", "9"], 2, "0.0<=x<=0.2"),
+    ],
+)
+def test_process_explains_what_cannot_be_fused(recordings, monkeypatch, arguments, status, message):
+    monkeypatch.chdir(recordings)
+    code, output = run("process", *arguments)
+    assert (code, message in output) == (status, True), output
+
+
+def test_commands_and_code_of_the_page_run(tmp_path):
+    text = page("fusion")
+    for command in commands_in(text):
+        run_here(tmp_path, command)
+        if command == "example platform":
+            scene_file = tmp_path / "platform.toml"
+            scene_file.write_text(scene_file.read_text("utf-8").replace("count = 30", "count = 2"), "utf-8")
+    assert (tmp_path / "platform.fused.png").stat().st_size > 10_000
+    (code,) = python_in(text)
+    assert run_code_here(tmp_path, code).strip().endswith("()")
