@@ -266,6 +266,7 @@ def test_rate_is_validated(tmp_path):
         check_recording(path, nominal_rate_hz=float("nan"))
     assert run(path, "--rate", "nan", code=1).stderr.startswith("ertis: error: --rate is nan; give a finite number")
     assert "-1.0 is not in the range x>0" in run(path, "--rate", "-1", code=2).stderr
+    assert run(path, "--rate", "1e9", code=1).stderr == "ertis: error: --rate is 1e+09; give a number from 1e-06 to 1e+06\n"
 
 
 # Output.
@@ -332,6 +333,51 @@ def test_page_has_all_results_and_no_external_resource(tmp_path):
         assert checked.verdict in page.text
         assert all(item.detail in page.text for item in checked.sensors[0].items)
     assert ("meta", {"name": "viewport", "content": "width=device-width, initial-scale=1"}) in page.tags
+
+
+def test_page_has_an_entry_for_each_file_that_cannot_be_read(tmp_path):
+    whole, target = stored(tmp_path / "a.h5", sound()), tmp_path / "r.html"
+    cut, empty, absent = (tmp_path / f"{name}.h5" for name in ("cut", "empty", "absent"))
+    cut.write_bytes(whole.read_bytes()[:9000])
+    empty.touch()
+    done = run(cut, whole, empty, absent, tmp_path, "--report", target, code=1)
+    assert done.stderr.endswith("r.html: report of 5 files\n")
+    page = Page(target.read_text("utf-8"))
+    assert [attributes["class"] for _, attributes in page.tags if "verdict" in attributes.get("class", "")] == [
+        f"verdict {state}" for state in ("fault", "ok", "fault", "fault", "fault")
+    ]
+    for text in ("the file is cut short or damaged", "the file is empty", "No such file", "the file is a folder"):
+        assert text in page.text
+
+
+def test_page_of_an_earlier_check_does_not_survive(tmp_path):
+    target, absent = tmp_path / "r.html", tmp_path / "absent.h5"
+    run(stored(tmp_path / "a.h5", sound()), "--report", target)
+    assert "fit for use" in target.read_text("utf-8")
+    run(absent, "--report", target, "--force", code=1)
+    assert "fit for use" not in target.read_text("utf-8")
+    assert "No such file" in target.read_text("utf-8")
+    target.write_text("fit for use")
+    run(tmp_path / "a.h5", "--report", target, "--force", "--settings", tmp_path / "absent.toml", code=1)
+    assert "fit for use" not in target.read_text("utf-8")
+
+
+def test_settings_that_do_not_suit_a_file_are_its_fault(tmp_path):
+    first, second = stored(tmp_path / "a.h5", plane_array()), stored(tmp_path / "b.h5", sound())
+    done = run(second, first, "--without", "20", "--json", code=1)
+    reports = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [each["fit"] for each in reports] == [False, True]
+    assert reports[0]["faults"][0]["text"].startswith("array.disabled is 20")
+    assert reports[0].keys() - {"error"} == reports[1].keys()
+
+
+def test_page_without_plots_if_the_file_has_vanished(tmp_path):
+    path = stored(tmp_path / "a.h5", sound())
+    checked = check_recording(path)
+    path.unlink()
+    text = write_page(tmp_path / "r.html", [checked]).read_text("utf-8")
+    assert "No plots" in text
+    assert "No such file" in text
 
 
 def test_page_escapes_texts_of_files(tmp_path):

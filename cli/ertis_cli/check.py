@@ -60,15 +60,19 @@ def check(
     calibration. At most 8 measurements of each sensor, evenly spaced, are examined. The last line for each file has the
     verdict, all faults and their remedies.
 
-    The exit code is 0 if all sensors are fit for use, and 1 if a fault was found or a file cannot be read. A check is
-    "not known" if the recording does not show its result; this is not a fault.
+    The exit code is 0 if all sensors are fit for use, and 1 if a fault was found or a file cannot be read. The page of
+    --report lists every file. A check is "not known" if the recording does not show its result; this is not a fault.
     """
+    from ertis_numba import checks
     from ertis_numba.atomic_files import check_target
-    from ertis_numba.errors import DataError
-    from ertis_numba.sensor_check import check_recording, write_page
+    from ertis_numba.errors import ErtisError
+    from ertis_numba.sensor_check import check_recording, uncheckable_recording, write_page
 
+    if nominal_rate_hz is not None:
+        checks.between("--rate", nominal_rate_hz, 1e-6, 1e6)
     if page is not None:
         check_target(page, overwrite=force, sources=paths)
+        page.unlink(missing_ok=True)  # If this command fails, the verdict of an earlier one must not remain.
     used = None
     if settings_file is not None or without is not None:
         used = functools.partial(options.settings_with, settings_file=settings_file, without=without)
@@ -77,19 +81,20 @@ def check(
         try:
             with options.note_when_slow(f"checking {path} ...", quiet=quiet):
                 found.append(check_recording(path, settings=used, nominal_rate_hz=nominal_rate_hz))
-        except (DataError, OSError) as error:
+        except (ErtisError, OSError) as error:
+            found.append(uncheckable_recording(path, error))
             click.echo(f"ertis: error: {error}", err=True)
             if as_json:
-                options.print_json({"file": str(path), "fit": False, "error": str(error)})
+                options.print_json(_report(found[-1]) | {"error": str(error)})
             continue
         if as_json:
             options.print_json(_report(found[-1]))
         else:
             _print(found[-1], quiet=quiet)
-    if page is not None and found:
+    if page is not None:
         write_page(page, found, overwrite=force)
         options.say(f"{page}: report of {options.counted(len(found), 'file')}", quiet=quiet)
-    ctx.exit(0 if len(found) == len(paths) and all(each.is_fit for each in found) else _UNFIT)
+    ctx.exit(0 if all(each.is_fit for each in found) else _UNFIT)
 
 
 def _print(checked: "RecordingCheck", *, quiet: bool) -> None:

@@ -1,7 +1,7 @@
 """Check of a sensor by its recordings: microphones, noise, clock, losses, call and calibration, with a verdict."""
 
 from ertis_numba.sensor_check.clock import ClockCheck
-from ertis_numba.sensor_check.examination import check_recording
+from ertis_numba.sensor_check.examination import check_recording, uncheckable_recording
 from ertis_numba.sensor_check.lost_words import LostWords
 from ertis_numba.sensor_check.page import write_page
 from ertis_numba.sensor_check.residuals import ArrayFinding, CalibrationResiduals
@@ -17,5 +17,6 @@ __all__ = [
     "RecordingCheck",
     "SensorCheck",
     "check_recording",
+    "uncheckable_recording",
     "write_page",
 ]

@@ -10,7 +10,8 @@ import numpy as np
 from ertis_numba import checks
 from ertis_numba.analysis.call_match import CallMatch, first_call_match
 from ertis_numba.analysis.health import Health, health, merge
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.atomic_files import remedy
+from ertis_numba.errors import ArgumentError, DataError, ErtisError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones
 from ertis_numba.sensor_check import items
@@ -22,7 +23,7 @@ from ertis_numba.settings import Settings
 from ertis_numba.storage import file_kind, open_recording, sensor_names
 from ertis_numba.storage.verify import SensorReport, verify
 
-__all__ = ["check_recording"]
+__all__ = ["check_recording", "uncheckable_recording"]
 
 _MAX_EXAMINED: Final = 8
 _CALIBRATED: Final = frozenset({"gain", "inverted polarity", "late", "swapped"})
@@ -98,15 +99,46 @@ def check_recording(
     return RecordingCheck(path=path, sensors=tuple(sensors), unreadable=tuple(unreadable))
 
 
+def uncheckable_recording(path: str | Path, error: Exception) -> RecordingCheck:
+    """Return the result for a recording that cannot be checked, with the error as its fault.
+
+    Parameters
+    ----------
+    path : str or Path
+        Path of the recording.
+    error : Exception
+        Error that `check_recording` raised.
+
+    Returns
+    -------
+    RecordingCheck
+        A result without sensors, which is not fit for use.
+
+    Examples
+    --------
+    >>> from ertis_numba.errors import DataError
+    >>> from ertis_numba.sensor_check import uncheckable_recording
+    >>> uncheckable_recording("a.h5", DataError("a.h5 is empty; give a recording")).verdict
+    'a.h5: 1 fault: the file is empty. Remedy: give a recording'
+    """
+    return RecordingCheck(path=Path(path), sensors=(), unreadable=(_unreadable(Path(path), _reason(error)),))
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, OSError) and not isinstance(error, ErtisError) and error.strerror:
+        return f"{error.strerror}; {remedy(error)}"
+    return str(error) or type(error).__name__
+
+
 def _unreadable(path: Path, reason: str) -> CheckFault:
     """Return the fault of a file or sensor that cannot be read; errors name the file and end with a remedy."""
-    text, _, remedy = reason.rpartition("; ")
+    text, semicolon, action = reason.rpartition("; ")
     text = text or reason
     if text.startswith(f"{path}: "):
         text = text.removeprefix(f"{path}: ")
     elif text.startswith(f"{path} "):
         text = f"the file {text.removeprefix(f'{path} ')}"
-    return CheckFault(check=items.MEASUREMENTS, text=text, remedy=remedy if _ else items.COPY)
+    return CheckFault(check=items.MEASUREMENTS, text=text, remedy=action if semicolon else items.COPY)
 
 
 def _check_sensor(

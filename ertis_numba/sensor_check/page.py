@@ -10,7 +10,7 @@ from typing import Final
 
 from ertis_numba import figures
 from ertis_numba.atomic_files import atomic_write
-from ertis_numba.errors import ErtisError
+from ertis_numba.errors import DataError, ErtisError
 from ertis_numba.frames import Measurement
 from ertis_numba.sensor_check.result import RecordingCheck, SensorCheck
 from ertis_numba.storage import open_recording
@@ -50,7 +50,7 @@ def write_page(target: str | Path, checked: Iterable[RecordingCheck], *, overwri
     target : str or Path
         Path of the page.
     checked : iterable of RecordingCheck
-        Results of `check_recording`. The recordings are read again for the plots.
+        Results of `check_recording` and `uncheckable_recording`. The recordings are read again for the plots.
     overwrite : bool
         Replace an existing file.
 
@@ -146,8 +146,11 @@ def _pictures(path: Path, checked: SensorCheck) -> list[str]:
     if not checked.examined:
         return []
     index = checked.examined[0]
-    with open_recording(path, sensor=checked.sensor) as recording:
-        measurement = replace(recording[index], settings=checked.settings)
+    try:
+        with open_recording(path, sensor=checked.sensor) as recording:
+            measurement = replace(recording[index], settings=checked.settings)
+    except (DataError, OSError) as error:  # The file may have changed since the check.
+        return [f"<p>No plots: {_text(str(error))}</p>"]
     return [_picture(name, measurement, index) for name in _PLOTS]
 
 
