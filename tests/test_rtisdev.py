@@ -1,6 +1,7 @@
 """RTIS Dev with our modules in the place of its closed ones: its own tests, its presets, and its errors."""
 
 import copy
+import inspect
 import logging
 import os
 import re
@@ -430,36 +431,113 @@ def test_unknown_names_and_wrong_shapes_are_refused(caplog):
     assert "nothing to unload" in caplog.text
 
 
+def test_words_keep_their_value_in_any_order_of_bytes():
+    settings = prepared(directions=5, minRange=1.0, maxRange=1.3)
+    raw = measured(settings).rawData
+    shape = settings.nDirections, settings.nspses
+    wanted = rtiscuda.processing(raw, 1, *shape, "test")
+    for same in (raw.astype(">u4"), raw.view(np.int32), raw.view(np.uint8), raw.view("<u2").astype(">u2")):
+        assert np.array_equal(rtiscuda.processing(same, 1, *shape, "test"), wanted), same.dtype
+
+
+def test_data_of_earlier_stages_that_are_no_finite_numbers_are_refused():
+    off = {"pdmEnable": False, "matchedFilterEnable": False}
+    settings = prepared(directions=5, minRange=1.0, maxRange=1.3, **off)
+    signals = np.zeros((32, 16_384))
+    for bad, message in (
+        (np.where(np.arange(16_384) == 7, np.nan, signals), r"the data holds nan at \[0, 7\]; give finite numbers"),
+        (signals + 1e39, r"the data holds inf at \[0, 0\]"),
+        (signals * 1j, "the data is of complex128; give an array of real numbers"),
+        (None, "the data is of type NoneType; give an array of real numbers"),
+        ([[1, 2], [3]], "the data is not an array; give rows of equal length"),
+        (signals[0], r"the data has shape \(16384,\); give 32 rows"),
+        (signals[:, :0], r"the data has shape \(32, 0\); give 32 rows"),
+    ):
+        with pytest.raises(ArgumentError, match=message):
+            rtiscuda.processing(bad, 0, settings.nDirections, settings.nspses, "test")
+    for name in (None, ["test"], 3):
+        with pytest.raises(ArgumentError, match=r"name is of type .*; give a text"):
+            rtiscuda.processing(signals, 0, 5, settings.nspses, name)
+        with pytest.raises(ArgumentError, match=r"name is of type .*; give a text"):
+            rtiscuda.unloadone(name)
+
+
+def arguments_of_preload():
+    """A valid call, by names."""
+    given = (
+        *(np.ones(8), 0, np.ones(8), 0, np.ones((32, 8193)), np.ones((32, 8193)), np.zeros((32, 31), int), 32, 31),
+        *(163_840, 10, 512, 10, 131, 200, 2.0, 0.5, "bad", 1, 0, 1, 1, 0, 1, 1, np.array([64]), 1, 0),
+    )
+    return dict(zip(inspect.signature(rtiscuda.preload).parameters, given, strict=True))
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"delay_matrix": np.zeros((31, 32), int)}, r"the delay matrix has shape \(31, 32\); give \(32, 31\)"),
         ({"delay_matrix": np.full((32, 31), -1)}, "the delay matrix holds -1"),
-        ({"matched_filter_real": np.zeros((32, 7))}, r"the matched filter has shape \(32, 7\); give \(32, 8193\)"),
+        ({"delay_matrix": np.full((32, 31), np.nan)}, "delay_matrix holds nan"),
+        ({"delay_matrix": np.full((32, 31), 1.5)}, "delay_matrix holds fractions; give whole numbers"),
+        ({"delay_matrix": np.full((32, 31), 1e12)}, r"delay_matrix holds 1e\+12; give numbers of samples within"),
+        ({"delay_matrix": np.full((32, 31), 20_000)}, "matrix holds 20000, but signals have 16384 samples; give"),
+        ({"delay_matrix": None}, "delay_matrix is of type NoneType; give an array of real numbers"),
+        (
+            {"matched_filter_real": np.zeros((32, 7)), "matched_filter_imag": np.zeros((32, 7))},
+            r"the matched filter has shape \(32, 7\); give \(32, 8193\)",
+        ),
+        ({"matched_filter_real": np.zeros((32, 7))}, r"matched_filter_real has shape \(32, 7\), but .*; give equal"),
+        ({"matched_filter_imag": np.full((32, 8193), np.nan)}, r"matched_filter_imag holds nan at \[0, 0\]"),
+        ({"pdm_filter": [1.0, np.nan]}, r"pdm_filter holds nan at \[1\]; give finite numbers"),
+        ({"pdm_filter": []}, r"pdm_filter has shape \(0,\); give a row of taps"),
+        ({"pdm_filter": "low"}, "pdm_filter is of <U3; give an array of real numbers"),
+        ({"envelope_filter": np.ones((2, 2))}, r"envelope_filter has shape \(2, 2\); give a row of taps"),
+        ({"envelope_filter": [np.inf]}, "envelope_filter holds inf"),
+        ({"pre_filter": [np.nan], "pre_filter_enable": 1}, "pre_filter holds nan"),
+        ({"post_filter": [[1.0], [2.0, 3.0]], "post_filter_enable": 1}, "post_filter is not an array; give rows"),
         ({"dmas_order": 6}, "dmasOrder is 6; give 0 to 5"),
+        ({"dmas_order": -1}, "dmasOrder is -1; give a whole number of at least 0"),
         ({"last_range": 10}, "the image has ranges 131 to 10"),
+        ({"last_range": 2000}, "the image ends at range 2000, but the record has 1639; give a smaller last_range"),
+        ({"n_microphones": 33}, "n_microphones is 33; give a whole number from 1 to 32"),
+        ({"n_microphones": "32"}, "n_microphones is of <U2; give an array of real numbers"),
+        ({"n_samples": 163_840.5}, "n_samples is 163840.5; give a whole number"),
+        ({"n_samples": [1, 2]}, r"n_samples has shape \(2,\); give one whole number"),
+        ({"n_samples": 5}, "5 words give no signal after decimation by 10; give more words"),
+        ({"pdm_subsample_factor": 0}, "pdm_subsample_factor is 0; give a whole number of at least 1"),
+        ({"beamforming_drop": 20_000}, "beamforming_drop is 20000; give a whole number from 0 to 16383"),
+        ({"mean_multiplier": np.nan}, "mean_multiplier is nan; give a finite number"),
+        ({"max_multiplier": "half"}, "max_multiplier is 'half'; give a number"),
         ({"disabled_microphones": np.arange(32)}, "all 32 microphones are disabled"),
+        ({"disabled_microphones": [-1]}, "disabled_microphones is -1; give a whole number of at least 0"),
     ],
 )
 def test_arguments_that_do_not_fit_together_are_refused(changes, message):
-    arguments = dict(
-        zip(
-            rtiscuda.preload.__code__.co_varnames,
-            (
-                *(np.ones(8), 0, np.ones(8), 0, np.ones((32, 8193)), 0, np.zeros((32, 31), int), 32, 31, 163_840),
-                *(10, 512, 10, 131, 200, 2.0, 0.5, "bad", 1, 0, 1, 1, 0, 1, 1, np.array([64]), 1, 0),
-            ),
-            strict=False,
-        )
-    )
-    if "matched_filter_real" in changes:
-        changes = changes | {"matched_filter_imag": changes["matched_filter_real"]}
-    else:
-        arguments["matched_filter_imag"] = np.ones((32, 8193))
     with pytest.raises(ArgumentError, match=message):
-        rtiscuda.preload(**(arguments | changes))
+        rtiscuda.preload(**(arguments_of_preload() | changes))
     with pytest.raises(ArgumentError, match="'bad' is not preloaded"):
         rtiscuda.processing(np.zeros(163_840, np.uint32), 1, 31, 69, "bad")
+
+
+def test_names_of_configurations_are_texts():
+    with pytest.raises(ArgumentError, match="name is of type list; give a text"):
+        rtiscuda.preload(**(arguments_of_preload() | {"name": ["a"]}))
+
+
+def test_serial_arguments_of_wrong_types_are_refused(caplog):
+    with pytest.raises(ArgumentError, match="port is of type NoneType; give a text"):
+        rtisserial.connect(None, 115_200)
+    parent, child = os.openpty()
+    rtisserial.connect(os.ttyname(child), 115_200)
+    try:
+        with pytest.raises(ArgumentError, match="command is of type bytes; give a text"):
+            rtisserial.command(b"!Y,0,0,0\n", wants_answer=True)
+        with pytest.raises(ArgumentError, match="n_bytes is -1; give a whole number of at least 0"):
+            rtisserial.getdata(-1)
+    finally:
+        rtisserial.close()
+        os.close(parent)
+        os.close(child)
+    assert "n_bytes is -1" in caplog.text
 
 
 def test_unplugged_sensor_is_a_connection_error(caplog):

@@ -16,9 +16,10 @@ import scipy.fft
 import scipy.signal
 from numpy.typing import NDArray
 
-from ertis_numba import kernels
+from ertis_numba import checks, kernels
 from ertis_numba.analysis.range_cleaning import keep_strongest
 from ertis_numba.errors import ArgumentError
+from ertis_numba.rtisdev import arguments
 
 __all__ = ["Configuration", "Processor", "cleaned", "rounded"]
 
@@ -94,6 +95,11 @@ class Configuration:
     coherent: bool
 
     def __post_init__(self) -> None:
+        if self.n_signal < 1:
+            raise ArgumentError(
+                f"{self.n_samples} words give no signal after decimation by {self.pdm_factor}; give more words"
+            )
+        checks.integer("beamforming_drop", self.beamforming_drop, 0, self.n_signal - 1)
         n_bins = self.n_signal // 2 + 1
         if self.matched_filter is not None and self.matched_filter.shape != (self.n_mics, n_bins):
             raise ArgumentError(
@@ -106,6 +112,11 @@ class Configuration:
             )
         if self.delays is not None and self.delays.size and self.delays.min() < 0:
             raise ArgumentError(f"the delay matrix holds {self.delays.min()}; give numbers of at least 0")
+        if self.delays is not None and self.delays.size and self.delays.max() > self.n_signal:
+            raise ArgumentError(
+                f"the delay matrix holds {self.delays.max()}, but signals have {self.n_signal} samples; give smaller "
+                "delays"
+            )
         if not 1 <= self.dmas_order <= _MAX_ORDER:
             raise ArgumentError(f"dmasOrder is {self.dmas_order}; give 0 to {_MAX_ORDER}")
         if len(self.disabled) >= self.n_mics:
@@ -114,6 +125,11 @@ class Configuration:
             raise ArgumentError(
                 f"the image has ranges {self.first_range} to {self.last_range}; give a first one of at least 0, and a "
                 "later last one"
+            )
+        n_ranges = -(-self.n_signal // self.envelope_factor)
+        if self.has_envelope and self.last_range > n_ranges:
+            raise ArgumentError(
+                f"the image ends at range {self.last_range}, but the record has {n_ranges}; give a smaller last_range"
             )
 
     @property
@@ -187,8 +203,8 @@ class Processor:
                     "the configuration has no beamforming, and therefore processes beams, not PDM words; enable "
                     "beamforming, or disable envelope, post filter and cleaning"
                 )
-            return self._finish(self._rows(data, given.n_directions))
-        signals = self._demodulated(data) if pdm else self._rows(data, given.n_mics)
+            return self._finish(arguments.rows(data, given.n_directions))
+        signals = self._demodulated(data) if pdm else arguments.rows(data, given.n_mics)
         if given.pre_filter is not None:
             signals = _filtered(signals, given.pre_filter)
         if given.matched_filter is not None:
@@ -224,19 +240,14 @@ class Processor:
         ArgumentError
             Their type or number does not match the configuration.
         """
-        n_samples = self._given.n_samples
-        if data.dtype.kind not in "iu" or data.dtype.itemsize > 4 or data.nbytes != 4 * n_samples:
-            raise ArgumentError(
-                f"the measurement is {data.dtype} of shape {data.shape}; give {n_samples} words of uint32"
-            )
-        return np.ascontiguousarray(data).reshape(-1).view(np.uint32).reshape(-1, 1)
+        return arguments.words(data, self._given.n_samples)
 
     def _demodulated(self, data: NDArray[Any]) -> Real:
         given = self._given
         words = self.words(data)
         signals = np.empty((given.n_mics, given.n_signal), np.float32)
-        arguments = (self._channels, self._taps, self._scale, given.pdm_factor, 0, given.n_signal)
-        self.run("demodulate_words", words, *arguments, out=signals)
+        filtering = (self._channels, self._taps, self._scale, given.pdm_factor, 0, given.n_signal)
+        self.run("demodulate_words", words, *filtering, out=signals)
         return signals
 
     def _beams(self, signals: Real, delays: NDArray[np.int32]) -> Real:
@@ -302,13 +313,6 @@ class Processor:
         n_taps = len(given.envelope_filter)
         first = given.first_range * given.envelope_factor - n_taps // 2
         return first, (given.last_range - given.first_range - 1) * given.envelope_factor + n_taps
-
-    def _rows(self, data: NDArray[Any], n_rows: int) -> Real:
-        """Return a copy of the result of an earlier stage as float32; check its shape."""
-        rows = np.array(data, dtype=np.float32, order="C")
-        if rows.ndim != 2 or len(rows) != n_rows:
-            raise ArgumentError(f"the data has shape {rows.shape}; give {n_rows} rows of samples")
-        return rows
 
     def _require_length(self, signals: Real) -> None:
         if signals.shape[1] != self._given.n_signal:

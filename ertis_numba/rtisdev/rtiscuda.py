@@ -5,18 +5,20 @@ import os
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError, ErtisError
+from ertis_numba.rtisdev import arguments
 from ertis_numba.rtisdev.fast import FastProcessor
 from ertis_numba.rtisdev.processor import Configuration, Processor
 
 __all__ = ["preload", "processing", "unloadall", "unloadone"]
 
+_MAX_MICROPHONES: Final = 32  # A PDM word has a bit for each.
 _log = logging.getLogger("ertis_numba")
 _processors: dict[str, Processor | FastProcessor] = {}
 _turn = threading.Lock()
@@ -59,30 +61,39 @@ def preload(  # noqa: PLR0913, PLR0917  as the original has it
     Raises
     ------
     ArgumentError
-        Shapes or values do not fit together.
+        A type, shape or value is wrong, or they do not fit together.
     DeviceError
         The device of ERTIS_RTISDEV_DEVICE does not exist.
     """
     with _errors_logged():
+        name = arguments.text("name", name)
+        n_mics = arguments.whole("n_microphones", n_microphones, 1, _MAX_MICROPHONES)
         configuration = Configuration(
-            pdm_filter=_taps(pdm_filter),
-            pre_filter=_taps(pre_filter) if pre_filter_enable else None,
-            envelope_filter=_taps(envelope_filter),
-            post_filter=_taps(post_filter) if post_filter_enable else None,
-            matched_filter=_complex(matched_filter_real, matched_filter_imag) if matched_filter_enable else None,
-            delays=np.ascontiguousarray(np.asarray(delay_matrix).T, dtype=np.int32) if beamforming_enable else None,
-            n_mics=int(n_microphones),
-            n_directions=int(n_directions),
-            n_samples=int(n_samples),
-            pdm_factor=int(pdm_subsample_factor),
-            beamforming_drop=int(beamforming_drop),
-            envelope_factor=int(envelope_subsample_factor),
-            first_range=int(first_range),
-            last_range=int(last_range),
-            clean_multipliers=(float(mean_multiplier), float(max_multiplier)) if clean_enable else None,
+            pdm_filter=arguments.filter_taps("pdm_filter", pdm_filter),
+            pre_filter=arguments.filter_taps("pre_filter", pre_filter) if pre_filter_enable else None,
+            envelope_filter=arguments.filter_taps("envelope_filter", envelope_filter),
+            post_filter=arguments.filter_taps("post_filter", post_filter) if post_filter_enable else None,
+            matched_filter=(
+                arguments.spectra(matched_filter_real, matched_filter_imag) if matched_filter_enable else None
+            ),
+            delays=arguments.delay_matrix(delay_matrix) if beamforming_enable else None,
+            n_mics=n_mics,
+            n_directions=arguments.whole("n_directions", n_directions, 1),
+            n_samples=arguments.whole("n_samples", n_samples, 1),
+            pdm_factor=arguments.whole("pdm_subsample_factor", pdm_subsample_factor, 1),
+            beamforming_drop=arguments.whole("beamforming_drop", beamforming_drop, 0),
+            envelope_factor=arguments.whole("envelope_subsample_factor", envelope_subsample_factor, 1),
+            first_range=arguments.whole("first_range", first_range, 0),
+            last_range=arguments.whole("last_range", last_range, 0),
+            clean_multipliers=(
+                (checks.finite("mean_multiplier", mean_multiplier), checks.finite("max_multiplier", max_multiplier))
+                if clean_enable
+                else None
+            ),
             has_envelope=bool(envelope_enable),
-            disabled=tuple(int(mic) for mic in np.ravel(disabled_microphones) if mic < n_microphones),
-            dmas_order=max(1, int(dmas_order)),  # 0 is an earlier kernel of delay-and-sum.
+            disabled=arguments.disabled(disabled_microphones, n_mics),
+            # 0 is an earlier kernel of delay-and-sum.
+            dmas_order=max(1, arguments.whole("dmasOrder", dmas_order, 0)),
             coherent=bool(coherence_factor_enable),
         )
         processor = _processor(name, configuration)
@@ -112,9 +123,10 @@ def processing(data: NDArray[Any], pdm: int, dim1: int, dim2: int, name: str) ->
     Raises
     ------
     ArgumentError
-        Nothing is preloaded under this name, or a shape does not match the configuration.
+        Nothing is preloaded under this name, a shape does not match the configuration, or data are NaN or infinite.
     """
     with _errors_logged():
+        name = arguments.text("name", name)
         with _turn:
             processor, names = _processors.get(name), list(_processors)
         if processor is None:
@@ -130,7 +142,15 @@ def processing(data: NDArray[Any], pdm: int, dim1: int, dim2: int, name: str) ->
 
 
 def unloadone(name: str) -> None:
-    """Free a configuration; a name that was never preloaded is only reported."""
+    """Free a configuration; a name that was never preloaded is only reported.
+
+    Raises
+    ------
+    ArgumentError
+        The name is not a text.
+    """
+    with _errors_logged():
+        name = arguments.text("name", name)
     with _turn:
         if _processors.pop(name, None) is None:
             _log.warning("configuration %r is not preloaded, so there is nothing to unload", name)
@@ -171,12 +191,3 @@ def _errors_logged() -> Iterator[None]:
     except ErtisError as error:
         _log.error("%s", error)
         raise
-
-
-def _taps(given: ArrayLike) -> NDArray[np.float32]:
-    return np.ascontiguousarray(np.ravel(given), dtype=np.float32)
-
-
-def _complex(real: ArrayLike, imag: ArrayLike) -> NDArray[np.complex64]:
-    made = np.asarray(real, dtype=np.float32) + 1j * np.asarray(imag, dtype=np.float32)
-    return np.ascontiguousarray(made, dtype=np.complex64)

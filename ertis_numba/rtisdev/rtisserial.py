@@ -18,7 +18,8 @@ from ertis_numba.devices.commands import Command
 from ertis_numba.devices.dialogue import Dialogue
 from ertis_numba.devices.line import SerialLine
 from ertis_numba.devices.ports import resolve
-from ertis_numba.errors import SonarError
+from ertis_numba.errors import ArgumentError, SonarError
+from ertis_numba.rtisdev import arguments
 
 __all__ = ["close", "command", "connect", "flush", "getdata"]
 
@@ -46,12 +47,16 @@ def connect(port: str, baud: int) -> None:  # noqa: ARG001  USB ignores the rate
 
     Raises
     ------
+    ArgumentError
+        The port is not a text.
     ConnectionRefusedError
         Another program uses the port.
     ConnectionError
         The port does not exist, or may not be used.
     """
     global _line  # noqa: PLW0603  one connection per process
+    with _errors_translated():
+        arguments.text("port", port)
     if _line is not None:
         close()
     name = os.environ.get("ERTIS_RTISDEV_PORT") or port
@@ -82,6 +87,8 @@ def command(text: str, wants_answer: bool) -> int | None:  # noqa: FBT001  as th
 
     Raises
     ------
+    ArgumentError
+        The command is not a text.
     ConnectionRefusedError
         No port is open.
     ConnectionError
@@ -91,6 +98,8 @@ def command(text: str, wants_answer: bool) -> int | None:  # noqa: FBT001  as th
     """
     global _awaits_triggers  # noqa: PLW0603  one connection per process
     line = _connected()
+    with _errors_translated():
+        arguments.text("command", text)
     if text.startswith("!J,"):
         _awaits_triggers = text.startswith("!J,1")
     with _errors_translated():
@@ -107,6 +116,8 @@ def getdata(n_bytes: int) -> NDArray[np.uint8]:
 
     Raises
     ------
+    ArgumentError
+        The number is negative or not whole.
     ConnectionRefusedError
         No port is open.
     ConnectionError
@@ -114,6 +125,8 @@ def getdata(n_bytes: int) -> NDArray[np.uint8]:
     TimeoutError
         The measurement did not arrive.
     """
+    with _errors_translated():
+        n_bytes = arguments.whole("n_bytes", n_bytes, 0)
     within_s = None if _awaits_triggers else _MEASUREMENT_S + n_bytes / _MIN_BYTES_S
     return np.frombuffer(_received(_connected(), n_bytes, within_s=within_s, what="a measurement"), np.uint8)
 
@@ -170,9 +183,12 @@ def _received(line: SerialLine, n_bytes: int, *, within_s: float | None, what: s
 
 @contextmanager
 def _errors_translated() -> Iterator[None]:
-    """Log errors of the line, and raise them as the original does."""
+    """Log errors of arguments and of the line, and raise those of the line as the original does."""
     try:
         yield
+    except ArgumentError as error:
+        _log.error("%s", error)
+        raise
     except SonarError as error:
         _log.error("%s", error)
         raise ConnectionError(str(error)) from error
