@@ -14,7 +14,7 @@ from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import mounting
 from ertis_numba.settings import Settings
 
-__all__ = ["Emitters", "Mountings", "MountedSensor", "sensor_poses"]
+__all__ = ["Emitters", "MountedSensor", "Mountings", "sensor_poses"]
 
 Floats = NDArray[np.float64]
 Mountings = Mapping[str, tuple[Sequence[float], Sequence[float]]]
