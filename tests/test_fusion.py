@@ -1,5 +1,6 @@
 """Fusion of images of several sensors: foreign echoes, positions, geometry and bad input."""
 
+import dataclasses
 import functools
 import math
 
@@ -147,6 +148,37 @@ def test_fuser_repeats_its_result():
 def test_silent_sensors_only_listen():
     fuser = ertis.Fuser(mountings(), silent=["front", "left", "back", "right"])
     assert not fuser(images().values()).image.amplitude.any()
+
+
+def test_passive_measurement_is_no_emission():
+    """The image of a sensor that did not emit shows foreign echoes only."""
+    group = [
+        image.replace(stamp=dataclasses.replace(image.stamp, behaviour="passive" if name == "left" else "active"))
+        for name, image in images().items()
+    ]
+    result = ertis.fuse(group, mountings())
+    silent = ertis.Fuser(mountings(), silent=["left"])(images().values())
+    np.testing.assert_array_equal(result.image.amplitude, silent.image.amplitude)
+
+
+def test_emitter_that_nobody_hears_hides_no_reflector():
+    """Missing echoes of a broken emitter must not show that its surroundings are empty."""
+    whole = scene(diameter_m=0.0)
+    without = whole.replace(
+        sensors=tuple(
+            sensor.replace(emitter=sensor.emitter.replace(silent=sensor.name == "front")) for sensor in whole.sensors
+        )
+    )
+    broken = []
+    for name, image in images().items():
+        with ertis.Pipeline(image.settings, predict=False) as pipeline:
+            image = pipeline.process(ertis.render(without, sensor=name))
+        broken.append(image.replace(stamp=dataclasses.replace(image.stamp, behaviour="active")))  # as it believes
+    result = ertis.fuse(broken, mountings(), emitter_diameter_m=0.0)
+    assert result.unheard == ("front",)
+    assert fused().unheard == ()
+    beside = 1  # The reflector between front and left.
+    assert 20 * math.log10(highest(result.image, *PLACES_M[beside]) / highest(fused().image, *PLACES_M[beside])) > -6
 
 
 def test_calls_that_differ_are_not_mixed_up():

@@ -22,6 +22,8 @@ _SUPPRESSION: Final = (1.0, 2.0, 4.0)
 _CONFIRMED: Final = 0.25  # Reflectivity in the images of other pairs, relative to that of the pixel.
 _VISIBLE: Final = 2.0  # Power of an expected echo relative to noise and side lobes.
 _BOUND: Final = 2.0  # Reflectivity relative to the least that any pair shows.
+_HEARD: Final = 0.2  # Power of foreign echoes relative to the expected one, below which no foreign call is heard.
+_STRONG: Final = 0.1  # Reflectivity relative to the highest, from which missing echoes matter.
 _REACH: Final = 2  # Neighbouring azimuths whose reflectors cause echoes in the same pixel.
 _SAME_STEPS: Final = 2.0  # Distance, in steps, within which the reflectors of two hypotheses are one.
 _TINY: Final = np.float32(1e-30)
@@ -35,10 +37,13 @@ class Attributed(NamedTuple):
     reflectivity : (cell,) float32
         Power of the echo of each cell's reflector at 1 m.
     shares : Shares
+    unheard : frozenset of int
+        Emitters whose calls no other sensor hears, although it should.
     """
 
     reflectivity: Singles
     shares: Shares
+    unheard: frozenset[int]
 
 
 class _Evidence(NamedTuple):
@@ -92,6 +97,8 @@ class Attribution:
     hypotheses : mapping of int to sequence of Hypothesis
         Hypotheses of each receiver.
     receivers : mapping of int to Receiver
+    unheard : frozenset of int
+        Emitters whose calls only they themselves receive. Their missing echoes show nothing.
     """
 
     def __init__(
@@ -100,10 +107,21 @@ class Attribution:
         pairs: Sequence[Pair],
         hypotheses: Mapping[int, Sequence[Hypothesis]],
         receivers: Mapping[int, Receiver],
+        unheard: frozenset[int] = frozenset(),
     ) -> None:
-        self._grid, self._pairs, self._hypotheses, self._receivers = grid, pairs, hypotheses, receivers
-        self._rivalries = {number: _rivalries(each, _SAME_STEPS * grid.step_m) for number, each in hypotheses.items()}
-        self._own_gain = {pair.receiver: self._own_gain_of(pair) for pair in pairs if pair.emitter == pair.receiver}
+        self._grid, self._receivers, self._unheard = grid, receivers, unheard
+        self._pairs = [pair for pair in pairs if pair.emitter == pair.receiver or pair.emitter not in unheard]
+        self._hypotheses = {
+            number: [each for each in several if each.emitter == number or each.emitter not in unheard]
+            for number, several in hypotheses.items()
+        }
+        self._reduced: dict[frozenset[int], Attribution] = {}
+        self._rivalries = {
+            number: _rivalries(each, _SAME_STEPS * grid.step_m) for number, each in self._hypotheses.items()
+        }
+        self._own_gain = {
+            pair.receiver: self._own_gain_of(pair) for pair in self._pairs if pair.emitter == pair.receiver
+        }
 
     def __call__(self, images: Mapping[int, CoarseImage]) -> Attributed:
         """Return the reflectivity of each cell, and the share of each pair in the pixels.
@@ -115,17 +133,22 @@ class Attribution:
         """
         evidence = [_evidence(pair, images[pair.receiver]) for pair in self._pairs]
         own = [each for each in evidence if each.pair.emitter == each.pair.receiver]
-        bound = self._bound(evidence)
         alone = self._mean(own, images, None)
+        bound = self._bound(evidence)
         confirmed = self._confirmed(evidence, alone)
-        reflectivity = np.minimum(alone, bound)
+        reflectivity = alone
         shares: dict[tuple[int, int], Singles] = {}
         for suppression in _SUPPRESSION:
+            if suppression == _SUPPRESSION[-1]:
+                unheard = self._unheard | self._not_heard(evidence, reflectivity)
+                if unheard > self._unheard:
+                    return self._without(unheard)(images)
+                reflectivity = np.minimum(reflectivity, bound)
             around = self._around(reflectivity)
             for number, image in images.items():
                 shares |= self._shares(number, image, around, confirmed.get(number), suppression)
-            reflectivity = np.minimum(self._mean(own, images, shares), bound)
-        return Attributed(np.minimum(self._mean(evidence, images, shares), bound), shares)
+            reflectivity = self._mean(own, images, shares)
+        return Attributed(np.minimum(self._mean(evidence, images, shares), bound), shares, self._unheard)
 
     def single(self, images: Mapping[int, CoarseImage]) -> Singles:
         """Return the mean reflectivity if each sensor takes all echoes for its own: (cell,) float32.
@@ -137,11 +160,37 @@ class Attribution:
         own = [pair for pair in self._pairs if pair.emitter == pair.receiver]
         return self._mean([_evidence(pair, images[pair.receiver]) for pair in own], images, None)
 
+    def _without(self, unheard: frozenset[int]) -> "Attribution":
+        """Return an attribution that expects no echoes of some emitters at other sensors."""
+        if unheard not in self._reduced:
+            self._reduced[unheard] = Attribution(self._grid, self._pairs, self._hypotheses, self._receivers, unheard)
+        return self._reduced[unheard]
+
+    def _not_heard(self, evidence: Sequence[_Evidence], reflectivity: Singles) -> frozenset[int]:
+        """Return emitters whose calls other sensors do not hear, where the reflectors of all images lead to expect it.
+
+        An emitter may be broken, covered, or not on the same SYNC chain.
+        """
+        shown: dict[int, list[float]] = {}
+        strong = np.float32(_STRONG) * reflectivity.max()
+        for each in evidence:
+            pair = each.pair
+            if pair.emitter == pair.receiver:
+                continue
+            expected = reflectivity.take(pair.cell)
+            sees = pair.confirms & (expected > strong) & (pair.gain * expected > np.float32(2 * _VISIBLE) * each.floor)
+            sums = shown.setdefault(pair.emitter, [0.0, 0.0])
+            sums[0] += float(np.minimum(each.highest[sees] / pair.gain[sees], expected[sees]).sum())
+            sums[1] += float(expected[sees].sum())
+        return frozenset(emitter for emitter, (found, wanted) in shown.items() if found < _HEARD * wanted)
+
     def _bound(self, evidence: Sequence[_Evidence]) -> Singles:
         """Return the least reflectivity that any pair shows, with a margin: (cell,) float32."""
         bound = np.full(self._grid.n_cells, np.inf, dtype=np.float32)
         for each in evidence:
             pair = each.pair
+            if pair.emitter in self._unheard:
+                continue
             shown = np.float32(_BOUND) * (each.highest + each.floor) / pair.gain
             cell = pair.cell[pair.bounds]
             bound[cell] = np.minimum(bound[cell], shown[pair.bounds])
@@ -156,6 +205,8 @@ class Attribution:
         least = {number: np.full(self._grid.n_cells, np.inf, dtype=np.float32) for number in numbers}
         for each in evidence:
             pair = each.pair
+            if pair.emitter in self._unheard:
+                continue
             sees = pair.confirms & (pair.gain * alone.take(pair.cell) > np.float32(_VISIBLE) * each.floor)
             cell, shown = pair.cell[sees], each.highest[sees] / pair.gain[sees]
             for number in numbers:

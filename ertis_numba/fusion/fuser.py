@@ -36,6 +36,9 @@ class Fused:
         Sensors whose images were fused.
     missing : tuple of str
         Sensors with a mounting, but without an image.
+    unheard : tuple of str
+        Sensors whose calls no other sensor hears, although it should. Their emitters may be broken, or they are not on
+        the same SYNC chain. They are fused without foreign echoes.
 
     Examples
     --------
@@ -53,6 +56,7 @@ class Fused:
     points: PointCloud
     sensors: tuple[str, ...]
     missing: tuple[str, ...]
+    unheard: tuple[str, ...] = ()
 
 
 class Fuser:
@@ -147,14 +151,15 @@ class Fuser:
             self._tables = self._new_tables(group)
         tables = self._tables
         coarse = {number: tables.coarse(number, image) for number, image in group.items()}
-        reflectivity, shares = tables.attribution(group)(coarse)
-        image = tables.image(reflectivity, group)
-        points = tables.points(group, shares, image)
+        found = tables.attribution(group)(coarse)
+        image = tables.image(found.reflectivity, group)
+        points = tables.points(group, found.shares, image)
         return Fused(
             image=image,
             points=points,
             sensors=tuple(self._poses[number].name for number in group),
             missing=tuple(pose.name for number, pose in enumerate(self._poses) if number not in group),
+            unheard=tuple(self._poses[number].name for number in sorted(found.unheard)),
         )
 
     def _group(self, images: Iterable[Energyscape]) -> dict[int, Energyscape]:

@@ -23,6 +23,7 @@ _BOUND_DB: Final = -6.0  # Radiated power above which a missing echo shows that 
 _BOUND_COSINE: Final = math.cos(math.radians(60.0))
 _CONFIRM_DB: Final = -13.0
 _CONFIRM_COSINE: Final = math.cos(math.radians(70.0))
+_APART_STEPS: Final = 6.0  # Difference of paths that separates two echoes, and a margin for errors of directions.
 _NEAREST_M: Final = 0.05
 # A pixel covers paths of one step. Where emitter and receiver face each other, they lead to cells far apart.
 _PARTS_OF_STEP: Final = (-0.5, 0.0, 0.5)
@@ -145,6 +146,8 @@ def pair_of(
     seen = beam.inside & (step < receiver.n_steps) & (weight > 0) & (to_m > _NEAREST_M) & (from_m > _NEAREST_M)
     seen &= audible[step.clip(0, receiver.n_steps - 1)]
     cell = np.flatnonzero(seen)
+    # An echo at the range of the receiver's own echo cannot be distinguished from it, and confirms nothing.
+    is_apart = (emitter == number) | (np.abs(from_m - to_m)[cell] > _APART_STEPS * receiver.step_m)
     spreading = emitters.spreading(from_m, to_m)
     radiated, cosine, step = radiated[cell], cosine[cell], step[cell]
     return Pair(
@@ -159,7 +162,7 @@ def pair_of(
         (np.maximum(radiated, 10 ** (_LIFT_DB / 10)) * spreading[cell]).astype(np.float32),
         weight[cell].astype(np.float32),
         (radiated > 10 ** (_BOUND_DB / 10)) & (cosine > _BOUND_COSINE),
-        (radiated > 10 ** (_CONFIRM_DB / 10)) & (cosine > _CONFIRM_COSINE),
+        (radiated > 10 ** (_CONFIRM_DB / 10)) & (cosine > _CONFIRM_COSINE) & is_apart,
     )
 
 

@@ -88,17 +88,13 @@ class PointFuser:
         self._number, self._poses, self._receiver = number, poses, receiver
         self._extract = PointExtractor(image.settings, Grid(image.azimuth_rad, image.elevation_rad), top=_TOP)
 
-    def observations(
-        self, image: Energyscape, shares: Shares, emitters: Sequence[int], late_m: Mapping[int, float]
-    ) -> list[Observation]:
+    def observations(self, image: Energyscape, shares: Shares, late_m: Mapping[int, float]) -> list[Observation]:
         """Return the echoes of an image, strongest first.
 
         Parameters
         ----------
         image : Energyscape
         shares : Shares
-        emitters : sequence of int
-            Sensors whose calls the image shows.
         late_m : mapping of int to float
             Path of sound between the start of the record and the emission of each sensor.
         """
@@ -108,7 +104,7 @@ class PointFuser:
             cloud.position_m.astype(np.float64), cloud.amplitude.tolist(), _uncertainties(cloud), strict=True
         ):
             range_m = float(np.linalg.norm(place_m))
-            emitter = self._emitter(place_m / range_m, range_m, shares, emitters)
+            emitter = self._emitter(place_m / range_m, range_m, shares)
             if emitter is None:
                 continue
             seen = self._observation(place_m, range_m, emitter, 2 * range_m - late_m[emitter], uncertainty_m, amplitude)
@@ -116,12 +112,13 @@ class PointFuser:
                 found.append(seen)
         return found
 
-    def _emitter(self, direction: Floats, range_m: float, shares: Shares, emitters: Sequence[int]) -> int | None:
+    def _emitter(self, direction: Floats, range_m: float, shares: Shares) -> int | None:
         """Return the emitter that explains an echo best, or None if reflectors elsewhere explain it."""
         receiver = self._receiver
         step = int(range_m / receiver.step_m)
         row = int(np.argmax(receiver.directions @ direction)) * receiver.n_steps
         near = slice(row + max(0, step - 1), row + min(receiver.n_steps, step + 2))
+        emitters = [emitter for emitter, number in shares if number == self._number]
         share = [float(shares[emitter, self._number][near].max(initial=0.0)) for emitter in emitters]
         return emitters[int(np.argmax(share))] if sum(share) > _MIN_SHARE else None
 

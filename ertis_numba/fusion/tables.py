@@ -58,7 +58,7 @@ class FusionTables:
         self._hypotheses: dict[int, list[Hypothesis]] = {}
         self._settings: dict[int, Settings] = {}
         self._late_m: dict[int, float] = {}
-        self._known: dict[tuple[int, ...], Attribution] = {}
+        self._known: dict[tuple[tuple[int, ...], frozenset[int]], Attribution] = {}
         self._points: dict[int, PointFuser] = {}
 
     def fit(self, group: Mapping[int, Energyscape]) -> bool:
@@ -76,12 +76,22 @@ class FusionTables:
         return self._receivers[number].coarse(image, self._deaf[number])
 
     def attribution(self, group: Mapping[int, Energyscape]) -> Attribution:
-        """Return the attribution of echoes in the images of a group, for pairs with equal calls."""
-        key = tuple(group)
+        """Return the attribution of echoes in the images of a group, for pairs with equal calls that were emitted."""
+        passive = frozenset(number for number, image in group.items() if image.stamp.behaviour == "passive")
+        key = tuple(group), passive
         if key not in self._known:
-            pairs = [pair for number in group for pair in self._pairs_of(number)]
+            pairs = [
+                pair
+                for number in group
+                for pair in self._pairs[number]
+                if pair.emitter not in passive and self._same_call(pair.emitter, number)
+            ]
             hypotheses = {
-                number: [each for each in self._hypotheses[number] if self._same_call(each.emitter, number)]
+                number: [
+                    each
+                    for each in self._hypotheses[number]
+                    if each.emitter not in passive and self._same_call(each.emitter, number)
+                ]
                 for number in group
             }
             self._known[key] = Attribution(self.grid, pairs, hypotheses, self._receivers)
@@ -103,12 +113,8 @@ class FusionTables:
         """Return the points of a group."""
         found = []
         for number, each in group.items():
-            emitters = [pair.emitter for pair in self._pairs_of(number)]
-            found += self._points[number].observations(each, shares, emitters, self._late_m)
+            found += self._points[number].observations(each, shares, self._late_m)
         return joined(found, self._poses, image, self.grid)
-
-    def _pairs_of(self, number: int) -> list[Pair]:
-        return [pair for pair in self._pairs[number] if self._same_call(pair.emitter, number)]
 
     def _same_call(self, emitter: int, number: int) -> bool:
         """Return True unless the calls are known to differ, so that the matched filter suppresses the foreign one."""

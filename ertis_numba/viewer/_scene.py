@@ -15,7 +15,7 @@ from ertis_numba.analysis.side_lobes import without_side_lobes
 from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.geometry import unit_vectors
 from ertis_numba.viewer._choices import LOWEST_THRESHOLD_DB, Choices, colour_table
-from ertis_numba.viewer._fusion import Fusion, is_level
+from ertis_numba.viewer._fused_plan import FusedPlan, is_level
 from ertis_numba.viewer._polar import Polar, cropped, is_within
 from ertis_numba.viewer._shapes import UNTURNED, Dome, Drawn, DrawnFrame, Pose, ReceivedImage, Sector
 
@@ -89,8 +89,7 @@ class ViewedScene:
         self._clean_db = clean_within_db, clean_above_mean_db
         self._find = PointFinder(top=_MAX_POINTS, min_level_db=LOWEST_THRESHOLD_DB)
         self._sensors: dict[str, _SensorImages] = {}
-        self._fusion: tuple[list[tuple[Polar, Pose]], Fusion] | None = None
-        self._plan: tuple[list[object], Sector] | None = None
+        self._plan = FusedPlan(width_px)
 
     @property
     def farthest_m(self) -> float:
@@ -138,8 +137,8 @@ class ViewedScene:
         timely = [each for each in kept.values() if now_s < each.latest.due_s]
         for each in kept.values():
             self._prepare(each, choices)
-        joined = [each for each in timely if not each.outside]
-        fused = len(joined) > 1 and all(_is_level(each.latest) for each in joined)
+        joined = {name: each.latest for name, each in kept.items() if each in timely and not each.outside}
+        fused = len(joined) > 1 and all(_is_level(taken) for taken in joined.values())
         sensors = {}
         for name, each in kept.items():
             overdue = now_s >= each.latest.due_s
@@ -153,8 +152,8 @@ class ViewedScene:
         )
         if not fused:
             return frame
-        fusion = self._fusion_of(joined)
-        return replace(frame, fused=self._plan_of(fusion, joined, choices), height_m=fusion.height_m)
+        height_m = min(taken.pose.translation_m[2] for taken in joined.values() if taken.pose is not None)
+        return replace(frame, fused=self._plan(joined, choices), height_m=height_m)
 
     def _prepare(self, kept: _SensorImages, choices: Choices) -> None:
         """Update the levels of a sensor's image after a new image or choice."""
@@ -168,20 +167,6 @@ class ViewedScene:
             kept.polar_for = polar_for
         if kept.levels_for != (kept.latest, kept.polar):
             kept.levels, kept.levels_for = kept.polar.levels(_echoes(image).amplitude), (kept.latest, kept.polar)
-
-    def _fusion_of(self, several: list[_SensorImages]) -> Fusion:
-        """Return the fusion of several sensors, renewed after a change of pose or axes."""
-        pairs = [(kept.polar, kept.latest.pose) for kept in several if kept.polar is not None and kept.latest.pose]
-        if self._fusion is None or self._fusion[0] != pairs:
-            self._fusion = pairs, Fusion(pairs)
-        return self._fusion[1]
-
-    def _plan_of(self, fusion: Fusion, several: list[_SensorImages], choices: Choices) -> Sector:
-        """Return the fused image of several sensors, the same one while their images are unchanged."""
-        made_for = [fusion, choices.colours, *(kept.levels_for for kept in several)]
-        if self._plan is None or self._plan[0] != made_for:
-            self._plan = made_for, fusion([kept.levels for kept in several], colour_table(choices.colours))
-        return self._plan[1]
 
 
 def _same_axes(image: Energyscape, other: Energyscape) -> bool:
