@@ -266,7 +266,10 @@ def test_rate_is_validated(tmp_path):
         check_recording(path, nominal_rate_hz=float("nan"))
     assert run(path, "--rate", "nan", code=1).stderr.startswith("ertis: error: --rate is nan; give a finite number")
     assert "-1.0 is not in the range x>0" in run(path, "--rate", "-1", code=2).stderr
-    assert run(path, "--rate", "1e9", code=1).stderr == "ertis: error: --rate is 1e+09; give a number from 1e-06 to 1e+06\n"
+    assert (
+        run(path, "--rate", "1e9", code=1).stderr
+        == "ertis: error: --rate is 1e+09; give a number from 1e-06 to 1e+06\n"
+    )
 
 
 # Output.

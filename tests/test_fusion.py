@@ -164,18 +164,18 @@ def test_passive_measurement_is_no_emission():
 def test_emitter_that_nobody_hears_hides_no_reflector():
     """Missing echoes of a broken emitter must not show that its surroundings are empty."""
     whole = scene(diameter_m=0.0)
-    without = whole.replace(
+    broken = whole.replace(
         sensors=tuple(
-            sensor.replace(emitter=sensor.emitter.replace(silent=sensor.name == "front")) for sensor in whole.sensors
+            sensor.replace(emitter=sensor.emitter.replace(silent=sensor.name == "left")) for sensor in whole.sensors
         )
     )
-    broken = []
-    for name, image in images().items():
-        with ertis.Pipeline(image.settings, predict=False) as pipeline:
-            image = pipeline.process(ertis.render(without, sensor=name))
-        broken.append(image.replace(stamp=dataclasses.replace(image.stamp, behaviour="active")))  # as it believes
-    result = ertis.fuse(broken, mountings(), emitter_diameter_m=0.0)
-    assert result.unheard == ("front",)
+    group = []
+    for sensor in broken.sensors:
+        with ertis.Pipeline(sensor.settings(), predict=False) as pipeline:
+            image = pipeline.process(ertis.render(broken, sensor=sensor.name))
+        group.append(image.replace(stamp=dataclasses.replace(image.stamp, behaviour="active")))  # as it believes
+    result = ertis.fuse(group, mountings(), emitter_diameter_m=0.0)
+    assert result.unheard == ("left",)
     assert fused().unheard == ()
     beside = 1  # The reflector between front and left.
     assert 20 * math.log10(highest(result.image, *PLACES_M[beside]) / highest(fused().image, *PLACES_M[beside])) > -6
