@@ -1,8 +1,8 @@
 """Fast chain for the images of RTIS Dev, if it supports the arguments.
 
 The fast chain computes the exact envelope of band-pass signals. RTIS Dev's low pass for rectified beams then smooths
-this envelope, at the rate of the image. The result differs a little from that of `Processor`, and a simulated
-measurement tells by how much.
+this envelope, at the rate of the image. The result differs a little from that of `Processor`. Simulated measurements of
+loud and of weak echoes show this difference.
 """
 
 import tempfile
@@ -32,7 +32,9 @@ _MAX_DIFFERENCE_DB: Final = -15.0
 _STAMP: Final = Stamp(sensor="rtisdev")
 _N_ECHOES: Final = 24
 _FADE: Final = 1.5  # Decades over which echoes differ.
-_PEAK: Final = 0.4  # Relative to full scale, where modulators are still linear.
+_LOUD: Final = 0.4  # Relative to full scale, where modulators are still linear.
+_WEAK: Final = _LOUD / 1000  # Quantisation noise, which both methods filter differently, is not negligible.
+_MAX_ERROR_DB: Final = -60.0  # A loose budget would raise the noise of the fast chain above that of the exact one.
 Real = NDArray[np.float32]
 
 
@@ -42,18 +44,20 @@ class FastProcessor:
     Parameters
     ----------
     exact : Processor
-        Computes whatever the fast chain does not, and tells how much the images differ.
+        Computes whatever the fast chain does not, and the images to compare with.
     device : {"auto", "cpu", "cuda", "numpy"}
 
     Attributes
     ----------
     difference_db : float
-        RMS of the difference of both images of a simulated measurement with some echoes, relative to the exact image.
+        RMS of the difference of both images of a simulated measurement with loud echoes, relative to the exact image.
+    weak_difference_db : float
+        The same for echoes that are 60 dB weaker. Images of noise alone differ more.
 
     Raises
     ------
     ArgumentError
-        The fast chain cannot do what the arguments say, or differs by more than -15 dB.
+        The fast chain cannot do what the arguments say, or differs by more than -15 dB for loud or weak echoes.
     DeviceError
         The device does not exist.
     """
@@ -75,15 +79,16 @@ class FastProcessor:
         self._last = given.last_range + int(columns.max())
         self._pipeline = _pipeline(given, delays[self._order], call, device, self._first, self._last)
         self._scale = 1.0
-        words = _simulated(given, delays, call)
-        wanted = exact.uncleaned(words, pdm=True)
-        found = self._image(words)
+        words = _simulated(given, delays, call, _LOUD)
+        wanted, found = exact.uncleaned(words, pdm=True), self._image(words)
         self._scale = float(np.vdot(found, wanted) / max(float(np.vdot(found, found)), 1e-30))
-        difference = np.linalg.norm(self._scale * found - wanted) / np.linalg.norm(wanted)
-        self.difference_db = 20 * float(np.log10(max(float(difference), 1e-30)))
-        if self.difference_db > _MAX_DIFFERENCE_DB:
+        self.difference_db = _difference_db(self._scale * found, wanted)
+        words = _simulated(given, delays, call, _WEAK)
+        self.weak_difference_db = _difference_db(self._image(words), exact.uncleaned(words, pdm=True))
+        worst_db = max(self.difference_db, self.weak_difference_db)
+        if worst_db > _MAX_DIFFERENCE_DB:
             raise ArgumentError(
-                f"its images would differ by {self.difference_db:.1f} dB, and {_MAX_DIFFERENCE_DB:g} dB is the limit"
+                f"its images would differ by {worst_db:.1f} dB, and {_MAX_DIFFERENCE_DB:g} dB is the limit"
             )
 
     @property
@@ -184,7 +189,7 @@ def _pipeline(
             recording=Recording(n_samples=given.n_samples, sample_rate_hz=_RATE_HZ),
             processing=processing,
         )
-        return Pipeline(settings, device, predict=False)
+        return Pipeline(settings, device, max_error_db=_MAX_ERROR_DB, predict=False)
 
 
 def _array(n_mics: int) -> Array:
@@ -194,8 +199,16 @@ def _array(n_mics: int) -> Array:
     return Array(layout="rtisdev", positions_m=positions_m)
 
 
-def _simulated(given: Configuration, delays: NDArray[np.int32], call: NDArray[np.float64]) -> NDArray[np.uint32]:
-    """Return the PDM words of some echoes from random directions."""
+def _difference_db(found: Real, wanted: Real) -> float:
+    """Return the RMS of the difference of two images relative to the second one."""
+    difference = float(np.linalg.norm(found - wanted)) / max(float(np.linalg.norm(wanted)), 1e-30)
+    return 20 * float(np.log10(max(difference, 1e-30)))
+
+
+def _simulated(
+    given: Configuration, delays: NDArray[np.int32], call: NDArray[np.float64], peak: float
+) -> NDArray[np.uint32]:
+    """Return the PDM words of some echoes from random directions, with a peak relative to full scale."""
     rng = np.random.default_rng(1)
     signals = np.zeros((given.n_mics, given.n_signal))
     for _ in range(_N_ECHOES):
@@ -205,7 +218,7 @@ def _simulated(given: Configuration, delays: NDArray[np.int32], call: NDArray[np
         for signal, delay in zip(signals, delays[direction], strict=True):
             echo = signal[arrival + delay : arrival + delay + len(call)]
             echo += amplitude * call[: len(echo)]
-    signals *= _PEAK / np.abs(signals).max()
+    signals *= peak / np.abs(signals).max()
     fine = scipy.fft.irfft(scipy.fft.rfft(signals, axis=1) * given.pdm_factor, given.n_samples, axis=1)
     layout = microphones(_array(given.n_mics))
     keys, silence = np.arange(given.n_mics, dtype=np.uint64), np.zeros(given.n_mics)
