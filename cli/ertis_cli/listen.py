@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ertis_cli import _network, options
+from ertis_cli import _listen_fused, _mountings, _network, options
+from ertis_cli._config import typed
 from ertis_cli._product_printer import PRINTERS, MicrophoneTable
 from ertis_cli._saving import PRODUCTS as FILED, saving
 from ertis_cli._stop_signals import stopped_by_signals
@@ -51,6 +52,8 @@ _POLL_INTERVAL_S = 0.1
     metavar="FILE.h5",
     help="Energyscape file or, with --product raw, recording to write.",
 )
+@click.option("--fuse", is_flag=True, help="Fuse the images of all sensors, and print one line per SYNC pulse.")
+@_mountings.mounting
 @_network.key
 @_network.server_key
 @options.force
@@ -64,6 +67,8 @@ def listen(
     n: int | None,
     duration: float | None,
     target: Path | None,
+    fuse: bool,
+    mounting: Path | None,
     key: str | None,
     server_key: str | None,
     force: bool,
@@ -77,10 +82,26 @@ def listen(
     counts products that this command receives too slowly. With --save, the energyscapes, or with --product raw the
     measurements, are saved to a file that appears complete at the end. If the central node disappears, the command
     waits for it. With --json, there is one line per event; the first one reports the connection.
+
+    With --fuse, this command fuses the images of all sensors. Their mountings are those that 'ertis capture' has sent,
+    or those of --mounting.
     """
+    _require_options_of(fuse=fuse)
+    if fuse:
+        _network.require_duration(duration)
+        _listen_fused.listen_fused(
+            address,
+            sensors=sensors,
+            mountings=_mountings.mountings(mounting, None),
+            keys=_network.client_keys(key, server_key),
+            n=n,
+            duration=duration,
+            quiet=quiet,
+            as_json=as_json,
+        )
+        return
     products = tuple(dict.fromkeys(products)) or ("energyscape",)
-    if target is not None and (len(products) > 1 or products[0] not in FILED):
-        raise click.UsageError(f"--save writes one product; give only --product {' or '.join(FILED)}")
+    _require_one_product(target, products)
     _network.require_duration(duration)
     from ertis_numba.network.subscriber import Subscriber
 
@@ -119,6 +140,20 @@ def listen(
         raise click.ClickException(
             f"received {subscriber.counts.received} of {n} products in {duration:g} s; give a longer --duration"
         )
+
+
+def _require_one_product(target: Path | None, products: tuple[str, ...]) -> None:
+    if target is not None and (len(products) > 1 or products[0] not in FILED):
+        raise click.UsageError(f"--save writes one product; give only --product {' or '.join(FILED)}")
+
+
+def _require_options_of(*, fuse: bool) -> None:
+    """Refuse options that apply only with or only without --fuse."""
+    for name, option in (("products", "--product"), ("target", "--save")) if fuse else (("mounting", "--mounting"),):
+        if typed(name):
+            raise click.UsageError(
+                f"{option} applies only {'without' if fuse else 'with'} --fuse", click.get_current_context()
+            )
 
 
 def _saved(save: "Write", arrival: "Arrival") -> Exception | None:

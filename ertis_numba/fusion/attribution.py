@@ -73,13 +73,13 @@ class _Rivalry(NamedTuple):
 
     Attributes
     ----------
-    is_rival : tuple of (pixel,) bool
-        True where another hypothesis leads to another place.
+    same : tuple of (int, (entry,) int64)
+        Other hypotheses with the pixels in which they lead to the same place.
     part : (pixel,) float32
         Power of the echo relative to that of all hypotheses with the same place.
     """
 
-    is_rival: tuple[NDArray[np.bool_], ...]
+    same: tuple[tuple[int, Places], ...]
     part: Singles
 
 
@@ -232,14 +232,16 @@ class Attribution:
         receiver, shape = self._receivers[number], image.power.shape
         hypotheses = self._hypotheses[number]
         predicted = [receiver.over_lobe(each.predicted(around).reshape(shape)).reshape(-1) for each in hypotheses]
+        total = np.sum(predicted, axis=0, dtype=np.float32)
         power = image.power.reshape(-1) + _TINY
         found = {}
         for each, alone, rivalry in zip(hypotheses, predicted, self._rivalries[number], strict=True):
             if each.is_mirrored:
                 continue
-            rivals = np.zeros_like(power)
-            for other, is_rival in zip(predicted, rivalry.is_rival, strict=True):
-                rivals += other * is_rival
+            rivals = total - alone
+            for other, pixel in rivalry.same:
+                rivals[pixel] -= predicted[other][pixel]
+            np.maximum(rivals, 0, out=rivals)  # Differences of rounding may be negative.
             share = (1 - np.float32(suppression) * rivals / power).clip(0, 1)
             if each.emitter == number and confirmed is not None:
                 is_confirmed = _at(confirmed, each.cell) * self._own_gain[number] > np.float32(_CONFIRMED) * power
@@ -279,14 +281,15 @@ class Attribution:
 def _rivalries(hypotheses: Sequence[Hypothesis], same_m: float) -> list[_Rivalry]:
     found = []
     for each in hypotheses:
-        is_rival = []
-        gain = np.zeros_like(each.gain)
-        for other in hypotheses:
+        gain, same = each.gain.copy(), []
+        for number, other in enumerate(hypotheses):
             offset_m = other.place_m - each.place_m
-            same = np.einsum("px,px->p", offset_m, offset_m) < same_m**2
-            gain += other.gain * same
-            is_rival.append(~same)
-        found.append(_Rivalry(tuple(is_rival), np.divide(each.gain, gain, out=np.ones_like(gain), where=gain > 0)))
+            pixel = np.flatnonzero(np.einsum("px,px->p", offset_m, offset_m) < same_m**2)
+            if other is not each and len(pixel):
+                gain[pixel] += other.gain[pixel]
+                same.append((number, pixel))
+        part = np.divide(each.gain, gain, out=np.ones_like(gain), where=gain > 0)
+        found.append(_Rivalry(tuple(same), part))
     return found
 
 

@@ -1,0 +1,101 @@
+"""Output of ``ertis listen --fuse``: one line per SYNC pulse."""
+
+import math
+import sys
+import time
+from collections import deque
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import click
+
+from ertis_cli import options
+from ertis_cli._stop_signals import stopped_by_signals
+
+if TYPE_CHECKING:
+    from ertis_cli._mountings import Mounting
+    from ertis_numba.network.fused_subscriber import FusedArrival
+    from ertis_numba.network.keys import ClientKeys
+
+__all__ = ["listen_fused"]
+
+_POLL_INTERVAL_S = 0.1
+_HEAD = f"{'SYNC':>8}  {'age':>8}  {'points':>6}  {'nearest':24}  sensors"
+
+
+def listen_fused(
+    address: str,
+    *,
+    sensors: Sequence[str],
+    mountings: "dict[str, Mounting] | None",
+    keys: "ClientKeys | None",
+    n: int | None,
+    duration: float | None,
+    quiet: bool,
+    as_json: bool,
+) -> None:
+    """Print one line per fused pulse until a signal, a count or a duration ends it."""
+    from ertis_numba.network.fused_subscriber import FusedSubscriber
+
+    notes: deque[str] = deque()
+    begun_s, received = time.monotonic(), 0
+    end_s = math.inf if duration is None else begun_s + duration
+    with (
+        stopped_by_signals() as signals,
+        FusedSubscriber(
+            address, mountings=mountings, sensors=sensors or None, keys=keys, on_note=notes.append
+        ) as subscriber,
+    ):
+        signals.obey(subscriber.close)
+        if not as_json:
+            click.echo(_HEAD)
+        while received != n and not signals.came and time.monotonic() < end_s:
+            arrival = subscriber.receive(_POLL_INTERVAL_S)
+            while notes:
+                options.say(notes.popleft(), quiet=quiet)
+            if arrival is not None:
+                received += 1
+                _show(arrival, as_json=as_json)
+        dropped, skipped = subscriber.counts.dropped, subscriber.n_skipped
+    if as_json:
+        options.print_json({"event": "listened", "received": received, "dropped": dropped, "skipped": skipped})
+    options.say(f"{options.counted(received, 'pulse')}, {dropped} images dropped, {skipped} skipped", quiet=quiet)
+    if signals.came:
+        sys.exit(0 if n is None and duration is None else 128 + signals.came[0])
+    if n is not None and received < n:
+        raise click.ClickException(f"received {received} of {n} pulses in {duration:g} s; give a longer --duration")
+
+
+def _show(arrival: "FusedArrival", *, as_json: bool) -> None:
+    import numpy as np
+
+    fused = arrival.fused
+    range_m = np.linalg.norm(fused.points.position_m, axis=1)
+    nearest = int(np.argmin(range_m)) if len(range_m) else None
+    age_ms = None if arrival.age_s is None else round(1e3 * arrival.age_s, 3)
+    if as_json:
+        position_m = None if nearest is None else [round(each, 4) for each in fused.points.position_m[nearest].tolist()]
+        options.print_json(
+            {
+                "event": "fused",
+                "sync_count": fused.image.stamp.sync_count,
+                "timestamp_ns": fused.image.stamp.timestamp_ns,
+                "age_ms": age_ms,
+                "n_points": len(range_m),
+                "nearest_m": position_m,
+                "sensors": list(fused.sensors),
+                "missing": list(fused.missing),
+                "unheard": list(fused.unheard),
+            }
+        )
+        return
+    place = "no reflector"
+    if nearest is not None:
+        x, y, _ = fused.points.position_m[nearest].tolist()
+        place = f"{range_m[nearest]:.3f} m at {math.degrees(math.atan2(y, x)):+.1f}°"
+    absent = f", without {' '.join(fused.missing)}" if fused.missing else ""
+    age = "-" if age_ms is None else f"{age_ms:.1f} ms"
+    row = (
+        f"{fused.image.stamp.sync_count:8d}  {age:>8}  {len(range_m):6d}  {place:24}  {' '.join(fused.sensors)}{absent}"
+    )
+    click.echo(row)

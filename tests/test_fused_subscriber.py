@@ -1,0 +1,116 @@
+"""Fused images of a central node, as an application receives them."""
+
+import json
+
+import pytest
+from click.testing import CliRunner
+from ertis_cli.main import cli
+
+from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.network.fused_subscriber import FusedSubscriber
+from tests.publishing import Publisher, image
+
+AHEAD, BEHIND = (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 1.0, 0.0)
+MOUNTINGS = {"front": ((0.2, 0.0, 0.0), AHEAD), "back": ((-0.2, 0.0, 0.0), BEHIND)}
+
+
+def pulses(*, count=3, absent=()):
+    """Images of two sensors that look in opposite directions, each with a reflector."""
+    return [
+        image(number, sensor=sensor, reflectors=[(20.0, range_m, 0.1)])
+        for number in range(count)
+        for sensor, range_m in (("front", 1.5), ("back", 1.0))
+        if (number, sensor) not in absent
+    ]
+
+
+def test_each_pulse_is_fused_once():
+    with (
+        Publisher() as publisher,
+        publisher.playing(pulses()),
+        FusedSubscriber(publisher.address, mountings=MOUNTINGS) as subscriber,
+    ):
+        arrivals = [subscriber.receive(20.0) for _ in range(2)]
+    counts = [arrival.fused.image.stamp.sync_count for arrival in arrivals]
+    assert counts == sorted(set(counts))
+    last = arrivals[-1].fused
+    assert (last.sensors, last.missing) == (("front", "back"), ())
+    assert sorted(round(float(x), 1) for x in last.points.position_m[:, 0]) == [-1.1, 1.6]
+
+
+def test_pulse_without_all_images_is_fused_by_the_next_one():
+    sent = pulses(count=4, absent={(2, "back")})
+    with (
+        Publisher() as publisher,
+        publisher.playing(sent),
+        FusedSubscriber(publisher.address, mountings=MOUNTINGS) as subscriber,
+    ):
+        found = {}
+        while 3 not in found:
+            fused = subscriber.receive(20.0).fused
+            found[fused.image.stamp.sync_count] = fused.sensors, fused.missing
+    assert found.get(2, (("front",), ("back",))) == (("front",), ("back",))
+    assert found[3] == (("front", "back"), ())
+
+
+def test_mountings_of_the_central_node_are_used():
+    with (
+        Publisher() as publisher,
+        publisher.playing(pulses(count=1)),
+        FusedSubscriber(publisher.address) as subscriber,
+    ):
+        fused = subscriber.receive(20.0).fused
+    x, y, z = fused.points.position_m[0].tolist()
+    assert (x < 1.0, y < 2.0, round(z, 2)) == (True, True, 3.0)  # Both sensors are at (1, 2, 3) and look back.
+
+
+def test_unknown_mounting_is_an_error():
+    with Publisher() as publisher:
+        publisher.translation_m = publisher.rotation_xyzw = None
+        with (
+            publisher.playing(pulses(count=1)),
+            FusedSubscriber(publisher.address) as subscriber,
+            pytest.raises(DataError, match="the mounting of sensor 'front' is unknown; give its mounting here"),
+        ):
+            subscriber.receive(20.0)
+
+
+def test_closed_subscriber_ends_the_loop():
+    with Publisher() as publisher, publisher.playing([]), FusedSubscriber(publisher.address) as subscriber:
+        assert subscriber.receive(0.05) is None
+        subscriber.close()
+        assert list(subscriber) == []
+
+
+def test_invalid_address_is_refused():
+    with pytest.raises(ArgumentError, match="nowhere"):
+        FusedSubscriber("nowhere")
+
+
+def test_listen_prints_fused_pulses(tmp_path):
+    mounting = tmp_path / "mounting.toml"
+    mounting.write_text(
+        '[[sensors]]\nname = "front"\nposition_m = [0.2, 0.0, 0.0]\n\n'
+        '[[sensors]]\nname = "back"\nposition_m = [-0.2, 0.0, 0.0]\nyaw_deg = 180.0\n'
+    )
+    arguments = ["--fuse", "--mounting", str(mounting), "-n", "1", "--duration", "30", "-q"]
+    with Publisher() as publisher, publisher.playing(pulses(count=6)):
+        shown = CliRunner().invoke(cli, ["listen", publisher.address, *arguments, "--json"])
+    assert shown.exit_code == 0, shown.output
+    fused, summary = map(json.loads, shown.stdout.splitlines())
+    assert fused["sensors"] == ["front", "back"]
+    assert fused["nearest_m"][0] == pytest.approx(-1.14, abs=0.02)
+    assert (summary["received"], summary["dropped"]) == (1, 0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--fuse", "--product", "points"], "--product applies only without --fuse"),
+        (["--fuse", "--save", "a.h5"], "--save applies only without --fuse"),
+        (["--mounting", "a.toml"], "--mounting applies only with --fuse"),
+    ],
+)
+def test_listen_refuses_options_that_do_not_fit(arguments, message):
+    shown = CliRunner().invoke(cli, ["listen", "tcp://127.0.0.1:5602", *arguments])
+    assert (shown.exit_code, message in shown.output) == (2, True), shown.output
