@@ -28,18 +28,19 @@ def is_same_pulse(one: Stamp, other: Stamp) -> bool:
 class PulseGroups(Generic[Item]):
     """Collector of one item per sensor for each SYNC pulse.
 
-    A group is complete once it has items of all sensors of the group before, and of sensors that have come since. Of a
-    sensor that is missing, the next group shows that no more will come.
+    A group is complete once it has items of all sensors of the two groups before, and of sensors that have come since.
+    Of a sensor that is missing, the next group shows that no more will come.
     """
 
     _expected: set[str] = field(default_factory=set)
+    _previous: set[str] = field(default_factory=set)
     _group: dict[str, Item] = field(default_factory=dict)
     _closed: Stamp | None = None  # Stamp of the group that was returned last.
 
     @classmethod
     def of(cls, sensors: Iterable[str]) -> "PulseGroups[Item]":
         """Return a collector that waits for these sensors at first."""
-        return cls(set(sensors))
+        return cls(set(sensors), set(sensors))
 
     def add(self, item: Item) -> list[dict[str, Item]]:
         """Add an item, and return the groups that are complete now, by sensor.
@@ -62,7 +63,7 @@ class PulseGroups(Generic[Item]):
         """Return the open group, complete or not; empty if there is none."""
         group, self._group = self._group, {}
         if group:
-            self._expected = set(group)
+            self._expected, self._previous = self._previous | group.keys(), set(group)
             self._closed = next(iter(group.values())).stamp
         return group
 

@@ -129,7 +129,7 @@ class FusedSubscriber:
         )
         self.counts: SubscriberCounts = self._subscriber.counts
         self.n_skipped = 0
-        self._groups: PulseGroups[_Received] = PulseGroups()
+        self._groups: PulseGroups[_Received] = PulseGroups.of(self._given)
         self._changed = threading.Condition()
         self._waiting: deque[dict[str, _Received]] = deque()
         self._failure: Exception | None = None
