@@ -6,6 +6,7 @@ import json
 import signal
 import subprocess
 import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -24,12 +25,15 @@ from ertis_numba.network.central_client import CentralClient
 from ertis_numba.network.keys import ClientKeys, KeyPair, ServerKeys
 from ertis_numba.network.sensor_node import SensorNode
 from ertis_numba.settings import Air, Processing, Recording, Settings
+from ertis_numba.stages.memory import require_images
 from ertis_numba.storage import open_recording
 from tests.central import Node, running
 from tests.emulated import N_SAMPLES, WORDS
 from tests.journals import ENVIRONMENT, TINY, entries
 from tests.pages import page, python_in
+from tests.sending import until
 from tests.test_capture_to import ERTIS, command
+from tests.test_central_images import Images
 
 SETTINGS = Settings(recording=Recording(n_samples=N_SAMPLES), processing=Processing(range_m=(0.1, 0.5)))
 WARM = SETTINGS.replace(air=Air(temperature_c=31.5))
@@ -424,10 +428,116 @@ def test_request_without_an_answer_ends_with_its_timeout(tmp_path):
     requests = []
     with (
         answering(tmp_path, requests.append) as client,
-        pytest.raises(NetworkError, match=r"within 1 s.*the sensor may still apply the settings"),
+        pytest.raises(NetworkError, match=r"sensor node of front did not answer within 1 s, and may"),
     ):
         client.configure("front", WARM, 1.0)
     assert len(requests) == 1
+
+
+class RequiringImages(Images):
+    """A stand-in for image processing that requires what a real one does."""
+
+    def require_usable(self, settings):
+        require_images(settings)
+
+
+FAR = SETTINGS.replace(processing=Processing(range_m=(0.1, 50.0)))
+LARGE = SETTINGS.replace(processing=Processing(range_m=(0.1, 0.5), directions="3d:1000000"))
+
+
+@pytest.mark.parametrize(
+    ("settings", "reason"),
+    [(FAR, "range_m ends at 50 m, but the record"), (LARGE, "images of 3d:1000000 over")],
+    ids=["beyond the record", "too large"],
+)
+def test_settings_without_an_image_are_refused_by_a_central_node_that_computes_images(tmp_path, settings, reason):
+    requests = []
+
+    def accept(request):
+        requests.append(request)
+        request.accept(["front"])
+
+    with answering(tmp_path, accept, processing=RequiringImages()) as client:
+        expected = (
+            f"sensor front keeps its settings: no image could be computed from measurements with them: .*{reason}"
+        )
+        with pytest.raises(RefusedError, match=expected):
+            client.configure("front", settings, SOON_S)
+        assert not requests
+        assert client.configure("front", WARM, SOON_S) == ("front",)
+
+
+def test_settings_without_an_image_are_possible_for_recordings_with_a_warning(tmp_path):
+    (tmp_path / "far.toml").write_text(FAR.to_toml())
+    with answering(tmp_path, lambda request: request.accept(["front"])) as client:
+        done = configure(tmp_path, client.address, "front", "--settings", "far.toml")
+    assert (done.exit_code, done.stdout) == (0, "configured: front\n")
+    assert done.stderr.startswith(
+        "ertis: warning: images of these measurements need other settings: processing.range_m ends at 50 m"
+    )
+
+
+def test_dry_run_warns_of_settings_without_an_image(tmp_path):
+    (tmp_path / "far.toml").write_text(FAR.to_toml())
+    done = CliRunner().invoke(cli, ["capture", "--port", "x", "--dry-run", "--settings", str(tmp_path / "far.toml")])
+    assert done.exit_code == 0, done.output
+    assert "warning: images of these measurements need other settings: processing.range_m ends at 50 m" in done.stderr
+
+
+@pytest.mark.parametrize("says_bye", [True, False])
+def test_request_ends_at_once_if_the_sensor_node_leaves(tmp_path, says_bye):
+    (tmp_path / "archive").mkdir()
+    with running(tmp_path / "archive") as central, CentralClient(central.address) as client:
+        with Node(central.address) as node:
+            node.hello("front")
+            answer = ThreadPoolExecutor(1).submit(client.configure, "front", TINY, SOON_S)
+            node.hear(messages.Configure)
+            if says_bye:
+                node.send(messages.Bye())
+                error = answer.exception(3.0)
+        if not says_bye:  # The connection has ended without a message.
+            error = answer.exception(3.0)
+    assert isinstance(error, RefusedError)
+    assert str(error).startswith("sensor front keeps its settings: its sensor node has left before it answered; start")
+
+
+def test_arguments_of_configure_are_validated(tmp_path):
+    with answering(tmp_path, None) as client:
+        for arguments, message in (
+            ((3, SETTINGS), "sensor is of type int; give the name of a sensor"),
+            (("front", "short_25_50"), "settings is of type str; give Settings, which"),
+            (("front", None), "settings is of type NoneType"),
+            (("front", SETTINGS, float("nan")), "patience_s is nan; give a finite number"),
+            (("front", SETTINGS, "long"), "patience_s is 'long'; give a number"),
+        ):
+            with pytest.raises(ArgumentError, match=message):
+                client.configure(*arguments)
+        with pytest.raises(ArgumentError, match="patience_s is 0; give a number above 0"):
+            client.status(0)
+    with pytest.raises(ArgumentError, match="keys is of type str; give ClientKeys"):
+        CentralClient("tcp://127.0.0.1:5601", keys="mine")
+    with pytest.raises(ArgumentError, match="address 5601 cannot be used"):
+        CentralClient(5601)
+
+
+def test_threads_share_a_client(tmp_path):
+    def configured(number):
+        if number % 2:
+            return client.status(SOON_S).sensors["front"].received
+        return client.configure("front", WARM, SOON_S)
+
+    with answering(tmp_path, lambda request: request.accept(["front"])) as client, ThreadPoolExecutor(8) as threads:
+        answers = list(threads.map(configured, range(60)))
+    assert answers == [("front",), 1] * 30
+
+
+def test_client_that_is_closed_ends_the_request_of_another_thread(tmp_path):
+    requests = []
+    with answering(tmp_path, requests.append) as client, ThreadPoolExecutor(1) as thread:
+        answer = thread.submit(client.configure, "front", WARM, SOON_S)
+        until(lambda: requests)
+        client.__exit__(None, None, None)
+        assert "is not open" in str(answer.exception(2.0))
 
 
 @pytest.mark.parametrize(

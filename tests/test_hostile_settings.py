@@ -14,9 +14,9 @@ from ertis_numba.network.central_node import _validation
 from ertis_numba.network.central_node._admission import Unwanted
 from ertis_numba.network.central_node._validation import Greeting, Greetings
 from ertis_numba.network.messages import Ack, Hello, Refused, Welcome
-from ertis_numba.network.processing import shared_pipeline
 from ertis_numba.network.processing.shared_pipeline import SharedPipeline
 from ertis_numba.settings import MAX_CALL_SAMPLES, Array, Call, Processing, Recording, Settings
+from ertis_numba.stages import memory
 from ertis_numba.stages.memory import predicted_bytes
 from tests.central import Node, running, stored
 from tests.faults.network import all_trials as faults, hostile, table
@@ -135,11 +135,11 @@ def test_workers_refuse_settings_that_need_too_much_memory(changes, megabytes):
     assert predicted_bytes(settings) / 1e6 == pytest.approx(megabytes, rel=0.02)
     with pytest.raises(ArgumentError, match=r"needs about \d+ MB; the limit is 1000 MB. Give fewer directions"):
         SharedPipeline(settings.to_toml(), "cpu")
-    assert predicted_bytes(Settings()) < shared_pipeline.MAX_BYTES / 100
+    assert predicted_bytes(Settings()) < memory.MAX_BYTES / 100
 
 
 def test_pipeline_limits_the_tables_of_its_plan(monkeypatch):
-    monkeypatch.setattr(shared_pipeline, "MAX_BYTES", predicted_bytes(Settings()) + 1000)
+    monkeypatch.setattr(memory, "MAX_BYTES", predicted_bytes(Settings()) + 1000)
     with pytest.raises(ArgumentError, match="no plan fits into memory"):
         SharedPipeline(Settings().to_toml(), "numpy")
 

@@ -11,7 +11,7 @@ from ertis_cli import _presets, options
 if TYPE_CHECKING:
     from ertis_numba.settings import Settings
 
-__all__ = ["recording_settings", "settings_from"]
+__all__ = ["recording_settings", "settings_from", "warn_without_images"]
 
 _OPTIONS = (
     click.option(
@@ -70,3 +70,14 @@ def settings_from(
     if call_file is not None:
         settings = settings.replace(call=Call.from_file(call_file))
     return settings
+
+
+def warn_without_images(settings: "Settings") -> None:
+    """Print a warning if no image can be computed from measurements with these settings."""
+    from ertis_numba.errors import ArgumentError
+    from ertis_numba.stages.memory import require_images
+
+    try:
+        require_images(settings)
+    except ArgumentError as error:
+        click.echo(f"ertis: warning: images of these measurements need other settings: {error}", err=True)

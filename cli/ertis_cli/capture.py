@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 from ertis_cli import _mountings, _network, options
-from ertis_cli._recording_settings import recording_settings, settings_from
+from ertis_cli._recording_settings import recording_settings, settings_from, warn_without_images
 from ertis_cli._saving import withdrawn
 from ertis_cli._sending import Sending
 from ertis_cli._sensors import ConfiguredSensors, named_sensors, opened_sensors, require_one_each, wait_for
@@ -167,6 +167,7 @@ def capture(
     trigger = "sync" if listen_only else trigger
     setup_of = partial(Setup.of, active=not passive, pin=pin, emissions=emissions, emission_period_s=emission_period_s)
     setup = setup_of(settings)
+    warn_without_images(settings)
     if dry_run:
         _print_commands(setup, as_json=as_json)
         return

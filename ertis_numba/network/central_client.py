@@ -1,6 +1,7 @@
 """Client of a central node: requests its status, and changes the settings of sensors."""
 
 import secrets
+import threading
 import time
 from collections.abc import Callable, Sequence
 from types import TracebackType
@@ -8,7 +9,8 @@ from typing import Final, Self, TypeVar
 
 import zmq
 
-from ertis_numba.errors import NetworkError, RefusedError
+from ertis_numba import checks
+from ertis_numba.errors import ArgumentError, NetworkError, RefusedError
 from ertis_numba.journal import JournalSensor
 from ertis_numba.network import addresses, messages
 from ertis_numba.network.connection import Connection
@@ -28,6 +30,8 @@ Answer = TypeVar("Answer")
 
 class CentralClient:
     """Client of a central node; use it in a ``with`` statement.
+
+    Several threads may use one client. Their requests take turns; give each thread its own client to avoid waiting.
 
     Parameters
     ----------
@@ -49,22 +53,29 @@ class CentralClient:
     """
 
     def __init__(self, address: str, *, keys: ClientKeys | None = None) -> None:
+        if keys is not None:
+            checks.instance("keys", keys, ClientKeys, "ertis_numba.network.keys defines")
         self._address, self._keys = addresses.endpoint(address), keys
         addresses.require_keys(self._address, keys=keys)
+        self._turn = threading.Lock()
+        self._closing = threading.Event()
         self._context: zmq.Context[zmq.Socket[bytes]] | None = None
         self._connection: Connection | None = None
 
     def __enter__(self) -> Self:
+        self._closing.clear()
         self._context = zmq.Context()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._hang_up()
-        if self._context is not None:
-            self._context.destroy(linger=0)
-        self._context = None
+        self._closing.set()
+        with self._turn:
+            self._hang_up()
+            if self._context is not None:
+                self._context.destroy(linger=0)
+            self._context = None
 
     def status(self, patience_s: float = 3.0) -> Status:
         """Return the status.
@@ -76,6 +87,8 @@ class CentralClient:
 
         Raises
         ------
+        ArgumentError
+            The timeout is not above zero.
         NetworkError
             There was no answer within the timeout.
         RefusedError
@@ -83,6 +96,7 @@ class CentralClient:
         DataError
             The answer is not of this protocol.
         """
+        checks.positive("patience_s", patience_s)
 
         def status_of(message: Message, payload: Sequence[memoryview]) -> Status | None:
             return Status.decode(b"".join(payload)) if isinstance(message, Report) else None
@@ -111,13 +125,17 @@ class CentralClient:
         Raises
         ------
         ArgumentError
-            The settings cannot belong to a recording.
+            The settings cannot belong to a recording, or an argument has a wrong type.
         NetworkError
             There was no answer within the timeout.
         RefusedError
-            The central node refuses this node, no sensor node sends the sensor, or the sensor node refuses the
-            settings.
+            The central node refuses this node, no sensor node sends the sensor, the sensor node leaves, or one of both
+            nodes refuses the settings. A central node that computes images refuses settings without an image.
         """
+        if not isinstance(sensor, str):
+            raise ArgumentError(f"sensor is of type {type(sensor).__name__}; give the name of a sensor")
+        checks.instance("settings", settings, Settings, "Settings.load returns")
+        checks.positive("patience_s", patience_s)
         request_id = secrets.randbits(62)
         text = JournalSensor.from_settings(sensor, settings).settings.to_toml().encode()
 
@@ -129,7 +147,11 @@ class CentralClient:
             return message.sensors
 
         frames = [messages.encode(Configure(sensor=sensor, request_id=request_id)), text]
-        return self._exchange(frames, sensors_of, patience_s, remark="; the sensor may still apply the settings")
+        silent = (
+            f"the sensor node of {sensor} did not answer within {patience_s:g} s, and may still apply the settings; "
+            "check with 'ertis status' that it still sends, or allow more time"
+        )
+        return self._exchange(frames, sensors_of, patience_s, silent=silent)
 
     def _exchange(
         self,
@@ -138,12 +160,24 @@ class CentralClient:
         patience_s: float,
         *,
         again_s: float | None = None,
-        remark: str = "",
+        silent: str = "",
     ) -> Answer:
-        """Send a request until it is answered, and return the answer.
+        """Send a request until it is answered, and return the answer; threads take turns.
 
-        It is sent once if ``again_s`` is None. ``remark`` ends the error about a sent request without an answer.
+        It is sent once if ``again_s`` is None. ``silent`` is the error about a sent request without an answer.
         """
+        with self._turn:
+            return self._exchange_alone(frames, answer_in, patience_s, again_s=again_s, silent=silent)
+
+    def _exchange_alone(
+        self,
+        frames: list[bytes],
+        answer_in: Callable[[Message, Sequence[memoryview]], Answer | None],
+        patience_s: float,
+        *,
+        again_s: float | None,
+        silent: str,
+    ) -> Answer:
         end_s, sent_s, why = time.monotonic() + patience_s, -float("inf"), ""
         while time.monotonic() < end_s:
             connection = self._opened()
@@ -164,13 +198,15 @@ class CentralClient:
         self._hang_up()
         if why:
             raise RefusedError(f"{self._address}: {why}")
+        if silent and sent_s > 0:
+            raise NetworkError(silent)
         raise NetworkError(
             f"no answer from {self._address} within {patience_s:g} s; start a central node there with 'ertis "
-            f"record' or 'ertis serve', or correct the address{remark if sent_s > 0 else ''}"
+            "record' or 'ertis serve', or correct the address"
         )
 
     def _opened(self) -> Connection:
-        if self._context is None:
+        if self._context is None or self._closing.is_set():
             raise NetworkError("this client is not open; use it in a with statement")
         if self._connection is None:
             self._connection = Connection(self._context, self._address, keys=self._keys, max_bytes=_REPORT_BYTES)

@@ -3,12 +3,18 @@
 from pathlib import Path
 from typing import Final
 
+from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import direction_grid, grid_count, microphones
 from ertis_numba.settings import Settings
 from ertis_numba.stages.time_window import time_window
 
-__all__ = ["available_bytes", "predicted_bytes", "require_memory"]
+__all__ = ["MAX_BYTES", "available_bytes", "predicted_bytes", "require_image_size", "require_images", "require_memory"]
+
+MAX_BYTES: Final = 1_000_000_000
+"""Limit on the memory of one pipeline of a central node; a sensor's settings determine its size."""
+
+_MAX_IMAGE_BYTES: Final = 256_000_000  # Limit on an image of a central node as float32.
 
 _CGROUP: Final = Path("/sys/fs/cgroup")
 _CGROUP_FILES: Final = (
@@ -81,3 +87,40 @@ def require_memory(settings: Settings, max_bytes: int) -> int:
             "Give fewer directions, a shorter processing.range_m, a shorter call or a lower sample rate"
         )
     return max_bytes - n_bytes
+
+
+def require_image_size(settings: Settings) -> None:
+    """Refuse images that are too large for a central node, before anything is allocated.
+
+    Raises
+    ------
+    ArgumentError
+        An image would have more than 256 MB.
+    """
+    processing = settings.processing
+    count = grid_count(processing.directions)
+    if count is None:  # A list of directions is only as long as its text.
+        return
+    step_m = sound_speed_m_s(settings.air) / (2 * settings.output_rate_hz)
+    grid = processing.directions if isinstance(processing.directions, str) else f"{count} directions"
+    n_bytes = 4 * count * (processing.range_m[1] - processing.range_m[0]) / step_m
+    if n_bytes > _MAX_IMAGE_BYTES:
+        raise ArgumentError(
+            f"images of {grid} over {processing.range_m[0]:g} to {processing.range_m[1]:g} m have "
+            f"{n_bytes / 1e6:.0f} MB, but the limit is {_MAX_IMAGE_BYTES // 1_000_000} MB; give fewer directions or "
+            "ranges"
+        )
+
+
+def require_images(settings: Settings) -> None:
+    """Refuse settings from which a central node computes no image; this takes milliseconds and little memory.
+
+    Raises
+    ------
+    ArgumentError
+        An image or its pipeline would be too large, the ranges lie outside the record, the array cannot be used, or the
+        last stage yields no image.
+    """
+    settings.processing.require_image()
+    require_image_size(settings)
+    require_memory(settings, MAX_BYTES)

@@ -43,6 +43,10 @@ class Guarded:
         """Start; raise the errors of `ImageProcessing.start`."""
         self._images.start(stopping)
 
+    def require_usable(self, settings: Settings) -> None:
+        """Raise an ArgumentError if no image can be computed with the settings; any thread may call this."""
+        self._images.require_usable(settings)
+
     def register(self, hello: Hello, settings: Settings) -> None:
         """Register a sensor."""
         self._try(lambda: self._images.register(hello, settings), None)

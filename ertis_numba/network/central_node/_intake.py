@@ -56,7 +56,7 @@ class Intake:
         *,
         store: Archive | None,
         viewer: Guarded | None,
-        send: Callable[[bytes, Message], None],
+        send: Callable[[bytes, Message], object],
         notify: Callable[..., None],
         on_stored: Callable[[list[ReceivedItem]], None] | None,
         max_bytes: int,

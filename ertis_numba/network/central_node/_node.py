@@ -126,10 +126,15 @@ class CentralNode:
         self._condition = Condition(
             listen, self._server, self._intake, archive=archive, images=self._images, keys=keys is not None
         )
-        self._settings_requests = SettingsRequests(self._server.send, self._intake.nodes_of, max_bytes=max_bytes)
+        self._settings_requests = SettingsRequests(
+            self._server.send,
+            self._intake.nodes_of,
+            max_bytes=max_bytes,
+            require=None if self._images is None else self._images.require_usable,
+        )
         self._handlers = handlers_of(self)
         self._greetings = Greetings(self._intake.read)
-        self._archive_fd = self._greetings_fd = -1
+        self._archive_fd = self._greetings_fd = self._requests_fd = -1
         self._poller = zmq.Poller()
         self._polled: set[int] = set()  # Descriptors of image processing, which change as its processes do.
         self._stopping = threading.Event()
@@ -154,12 +159,14 @@ class CentralNode:
             self._images.start(self._stopping.is_set)
             if self._stopping.is_set():
                 return
-        self._greetings_fd = self._greetings.open()
+        self._greetings_fd, self._requests_fd = self._greetings.open(), self._settings_requests.open()
         self._server.open(self._listen, max_bytes=self._max_bytes)
         self._server.register(self._poller)
         if self._archive is not None:
             self._poller.register(self._archive_fd, zmq.POLLIN)
-        self._poller.register(self._greetings_fd, zmq.POLLIN)
+        for fd in (self._greetings_fd, self._requests_fd):
+            if fd >= 0:
+                self._poller.register(fd, zmq.POLLIN)
         self._event_reporter.notify("listening", address=self._condition.address, pid=os.getpid())
 
     def __exit__(
@@ -180,6 +187,7 @@ class CentralNode:
             if self._images is not None:
                 stack.callback(self._images.close, _FINISH_S)
             stack.callback(self._greetings.close)
+            stack.callback(self._settings_requests.close)
             stack.callback(self._server.close)
             self._event_reporter.refused(self._server.refused)
 
@@ -225,6 +233,8 @@ class CentralNode:
         if self._greetings_fd in ready:
             for greeting in self._greetings.take():
                 self._answer_greeting(greeting)
+        if self._requests_fd in ready:
+            self._settings_requests.take()
         if self._images is not None:
             for fd in ready.keys() & self._polled:
                 self._images.ready(fd)
@@ -336,7 +346,10 @@ class CentralNode:
     def _on_ping(self, _: Ping, received: ReceivedMessage) -> None:
         self._intake.ping(received.sender)
         text = self._condition.trouble or self._intake.remark(received.sender)
-        self._server.send(received.sender, Pong(state=self.state, text=as_line(text)))
+        self._server.send(received.sender, self._sign_of_life(text))
+
+    def _sign_of_life(self, text: str) -> Pong:
+        return Pong(state=self.state, text=as_line(text))
 
     def _on_hello(self, hello: Hello, received: ReceivedMessage) -> None:
         key = "" if self._keys is None else received.who.public
@@ -387,6 +400,7 @@ class CentralNode:
         for peer_id in self._server.tick(self._intake.peers.keys()):
             self._intake.bye(peer_id)
         self._intake.tick(now_s)
+        self._settings_requests.tick(self._intake.peers, self._sign_of_life(self._condition.trouble))
         if self._images is not None:
             self._images.tick(now_s)
         self._event_reporter.fault(self._condition.trouble)

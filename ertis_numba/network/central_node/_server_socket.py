@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Mapping, Set as AbstractSet
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from typing import Any, Final
 
 import zmq
@@ -121,15 +121,27 @@ class ServerSocket:
             return []
         return [peer_id for peer_id, frames in self._badges.items() if gate.who(frames) is None]
 
-    def send(self, peer_id: bytes, message: Message, *payload: bytes) -> None:
-        """Send a message if possible without blocking; important messages are repeated."""
+    def send(self, peer_id: bytes, message: Message, *payload: bytes) -> bool:
+        """Send a message if possible without blocking; important messages are repeated.
+
+        Returns
+        -------
+        bool
+            False if the peer is gone.
+        """
         if self._socket is None:
-            return
+            return True
         parts = [peer_id, messages.encode(message), *payload]
-        with suppress(zmq.ZMQError):  # The peer is gone, or does not read.
+        try:
             try:
                 self._socket.send_multipart(parts, zmq.NOBLOCK)
             except zmq.Again:
                 # Otherwise the socket notices only milliseconds later which messages the peer has read.
                 self._socket.getsockopt(zmq.EVENTS)
                 self._socket.send_multipart(parts, zmq.NOBLOCK)
+        except zmq.Again:  # The peer does not read.
+            return True
+        except zmq.ZMQError as error:
+            return error.errno != zmq.EHOSTUNREACH
+        else:
+            return True

@@ -1,18 +1,23 @@
 """Requests of admins for new settings of a sensor, from the admin to the sensor node and back."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from dataclasses import dataclass
 from typing import Final
 
 from ertis_numba.network.central_node._admission import Unwanted
-from ertis_numba.network.messages import Configure, Configured
+from ertis_numba.network.central_node._settings_check import SettingsCheck
+from ertis_numba.network.message_fields import as_line
+from ertis_numba.network.messages import Configure, Configured, Pong
 from ertis_numba.settings import Settings
 
 __all__ = ["SettingsRequests"]
 
 _MAX_OPEN: Final = 64
 _PATIENCE_S: Final = 120.0  # An answer that comes later is discarded.
+_LEFT: Final = (
+    "its sensor node has left before it answered; start 'ertis capture --to' again, which uses its own settings"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,29 +25,49 @@ class _OpenRequest:
     """Forwarded request that has no answer yet."""
 
     admin_id: bytes
+    node_id: bytes
     sensor: str
-    forwarded_s: float
+    asked_s: float
 
 
 class SettingsRequests:
-    """Forwards requests and their answers.
+    """Checks and forwards requests, and forwards their answers.
 
     Parameters
     ----------
     send : callable
-        Called with a peer, a message to it and its payload.
+        Called with a peer, a message to it and its payload; returns False if the peer is gone.
     nodes_of : callable
         Returns the sensor nodes that send a sensor.
     max_bytes : int
         Size of the largest accepted measurement.
+    require : callable, optional
+        Called with requested settings in another thread; raises an ArgumentError if they cannot be used.
     """
 
-    def __init__(self, send: Callable[..., None], nodes_of: Callable[[str], list[bytes]], *, max_bytes: int) -> None:
+    def __init__(
+        self,
+        send: Callable[..., bool],
+        nodes_of: Callable[[str], list[bytes]],
+        *,
+        max_bytes: int,
+        require: Callable[[Settings], None] | None = None,
+    ) -> None:
         self._send, self._nodes_of, self._max_bytes = send, nodes_of, max_bytes
+        self._check = None if require is None else SettingsCheck(require)
         self._open: dict[int, _OpenRequest] = {}
 
+    def open(self) -> int:
+        """Start checking, and return a descriptor to poll; -1 if nothing is checked."""
+        return -1 if self._check is None else self._check.open()
+
+    def close(self) -> None:
+        """Stop checking; closing twice does no harm."""
+        if self._check is not None:
+            self._check.close()
+
     def forward(self, admin_id: bytes, request: Configure, payload: list[bytes]) -> None:
-        """Forward a request to the sensor node.
+        """Forward a request to the sensor node, once it is checked.
 
         Raises
         ------
@@ -63,9 +88,19 @@ class SettingsRequests:
             raise Unwanted("sensor", f"{count} sensor {request.sensor}; {remedy}", "message")
         if len(self._open) >= _MAX_OPEN:
             raise Unwanted("size", f"{_MAX_OPEN} requests for settings have no answer yet; wait for them", "too many")
-        self._open[request.request_id] = _OpenRequest(admin_id, request.sensor, time.monotonic())
-        forwarded = Configure(sensor=request.sensor, request_id=request.request_id, max_bytes=self._max_bytes)
-        self._send(nodes[0], forwarded, payload[0])
+        self._open[request.request_id] = _OpenRequest(admin_id, nodes[0], request.sensor, time.monotonic())
+        if self._check is None:
+            self._pass_on(request.request_id, payload[0])
+        else:
+            self._check.offer(request.request_id, request.sensor, payload[0])
+
+    def take(self) -> None:
+        """Forward requests that were checked, and refuse those with a fault."""
+        for request_id, text, fault in () if self._check is None else self._check.take():
+            if fault:
+                self._refuse(request_id, fault)
+            else:
+                self._pass_on(request_id, text)
 
     def answer(self, answer: Configured) -> None:
         """Forward an answer to the admin; one without a request has come too late."""
@@ -74,6 +109,31 @@ class SettingsRequests:
             del self._open[answer.request_id]
             self._send(found.admin_id, answer)
 
+    def tick(self, nodes: Container[bytes], sign_of_life: Pong) -> None:
+        """Answer requests whose sensor node is gone.
+
+        Parameters
+        ----------
+        nodes : container of bytes
+            Sensor nodes that are registered.
+        sign_of_life : Pong
+            Message to sensor nodes with a request. It shows that a connection has ended before the node is missed.
+        """
+        for request_id, request in list(self._open.items()):
+            if request.node_id not in nodes or not self._send(request.node_id, sign_of_life):
+                self._refuse(request_id, _LEFT)
+
+    def _pass_on(self, request_id: int, text: bytes) -> None:
+        found = self._open.get(request_id)
+        if found is not None:
+            forwarded = Configure(sensor=found.sensor, request_id=request_id, max_bytes=self._max_bytes)
+            self._send(found.node_id, forwarded, text)
+
+    def _refuse(self, request_id: int, reason: str) -> None:
+        found = self._open.pop(request_id, None)
+        if found is not None:
+            self._send(found.admin_id, Configured(sensor=found.sensor, request_id=request_id, error=as_line(reason)))
+
     def _forget_old(self) -> None:
         oldest_s = time.monotonic() - _PATIENCE_S
-        self._open = {number: each for number, each in self._open.items() if each.forwarded_s >= oldest_s}
+        self._open = {number: each for number, each in self._open.items() if each.asked_s >= oldest_s}

@@ -221,7 +221,7 @@ class Acks:
         Time from the arrival of a measurement to its ack.
     """
 
-    def __init__(self, send: Callable[[bytes, Message], None], status: Literal["stored", "accepted"]) -> None:
+    def __init__(self, send: Callable[[bytes, Message], object], status: Literal["stored", "accepted"]) -> None:
         self._send: Final = send
         self._status: Final = status
         self._due: dict[tuple[str, int], Stream] = {}  # By sensor and session.

@@ -24,6 +24,7 @@ from ertis_numba.network.processing.worker_pool import LocalWorkerPool
 from ertis_numba.network.status import Latencies, ProcessingStatus, Status
 from ertis_numba.network.trace import mark
 from ertis_numba.settings import Settings
+from ertis_numba.stages.memory import require_images
 
 __all__ = ["ImageProcessing"]
 
@@ -109,6 +110,16 @@ class ImageProcessing:
         except BaseException:
             self.close(0.0)
             raise
+
+    def require_usable(self, settings: Settings) -> None:
+        """Refuse settings from which no image can be computed; any thread may call this.
+
+        Raises
+        ------
+        ArgumentError
+            The image would be too large, the ranges lie outside the record, or the last stage yields no image.
+        """
+        require_images(self._options.applied(settings))
 
     def register(self, hello: Hello, settings: Settings) -> None:
         """Register a sensor before its first measurement, and after each change."""

@@ -5,9 +5,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError
-from ertis_numba.geometry import grid_count, self_contained
+from ertis_numba.geometry import self_contained
 from ertis_numba.network.log import EventLog
 from ertis_numba.network.messages import Data, Description, Hello
 from ertis_numba.network.processing.options import ProcessingOptions
@@ -15,11 +14,11 @@ from ertis_numba.network.processing.pipe_messages import Prepared
 from ertis_numba.network.processing.runner import JobKind
 from ertis_numba.sample_format import sample_format
 from ertis_numba.settings import Air, Settings
+from ertis_numba.stages.memory import require_image_size
 
 __all__ = ["RegisteredSensor", "Sensors"]
 
 _AIR_STEPS: Final = {"temperature_c": 0.5, "humidity_percent": 5.0, "pressure_pa": 1000.0}
-_MAX_BYTES: Final = 256_000_000  # Limit on an image as float32.
 _AGAIN_S: Final = 60.0  # Delay before a pipeline that failed is tried again …
 _GREETED_S: Final = 10.0  # … and after a Hello of its sensor.
 
@@ -170,7 +169,7 @@ class Sensors:
         try:
             applied = self_contained(self._options.applied(settings)).to_toml()
             n_bytes = sample_format(settings).n_bytes
-            _require_size(self._options.applied(settings))
+            require_image_size(self._options.applied(settings))
         except ArgumentError as error:
             self._log.warning("unusable", sensor=sensor, text=str(error))
             return None
@@ -212,22 +211,6 @@ def _about(came: Air, used: Air) -> Air:
         if abs(value - getattr(used, name)) >= step:
             changes[name] = step * round(value / step)
     return used.replace(**changes) if changes else used
-
-
-def _require_size(settings: Settings) -> None:
-    """Refuse images that exceed the memory, before anything is allocated."""
-    processing = settings.processing
-    count = grid_count(processing.directions)
-    if count is None:  # A list of directions is only as long as its text.
-        return
-    step_m = sound_speed_m_s(settings.air) / (2 * settings.output_rate_hz)
-    grid = processing.directions if isinstance(processing.directions, str) else f"{count} directions"
-    n_bytes = 4 * count * (processing.range_m[1] - processing.range_m[0]) / step_m
-    if n_bytes > _MAX_BYTES:
-        raise ArgumentError(
-            f"images of {grid} over {processing.range_m[0]:g} to {processing.range_m[1]:g} m have "
-            f"{n_bytes / 1e6:.0f} MB, but the limit is {_MAX_BYTES // 1_000_000} MB; give fewer directions or ranges"
-        )
 
 
 def _place(hello: Hello) -> tuple[object, ...]:

@@ -15,12 +15,10 @@ from ertis_numba.network.processing.pipe_messages import Prepared
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.sample_format import sample_format
 from ertis_numba.settings import Settings
+from ertis_numba.stages import memory
 from ertis_numba.stages.costs import PlanCosts
 
 __all__ = ["SharedPipeline"]
-
-MAX_BYTES: Final = 1_000_000_000
-"""Limit on the memory of one pipeline; a sensor's settings determine its size."""
 
 _TIMED: Final = 5  # Number of measurements, of which the median counts.
 
@@ -47,7 +45,7 @@ class SharedPipeline:
     def __init__(self, settings: str, device: str, plan: PlanCosts = "nominal") -> None:
         stated = Settings.from_toml(settings, "settings of a sensor", find_line=False)
         stated.processing.require_image()
-        self.pipeline = Pipeline(stated, device=device, max_bytes=MAX_BYTES, predict=False, plan=plan)
+        self.pipeline = Pipeline(stated, device=device, max_bytes=memory.MAX_BYTES, predict=False, plan=plan)
         self.shape = (len(self.pipeline.grid), len(self.pipeline.range_m))
         self.format = sample_format(self.pipeline.settings)
         self._extractor = PointExtractor(self.pipeline.settings)
