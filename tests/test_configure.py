@@ -15,7 +15,7 @@ from ertis_cli.main import cli
 
 from ertis_numba.capture import CaptureSession, SettingsChange
 from ertis_numba.devices.driver import SonarDriver
-from ertis_numba.devices.emulator import Emulator, SyncChain
+from ertis_numba.devices.emulator import Emulator, Quirks, SyncChain
 from ertis_numba.devices.setup import Setup
 from ertis_numba.errors import ArgumentError, NetworkError, RefusedError, SonarError
 from ertis_numba.journal import Journal
@@ -223,6 +223,26 @@ def test_sensor_that_does_not_answer_is_configured_again_later(sessions):
         run.wait_for(lambda stored: any(entry.measurement.stamp.sensor == "two" for entry in stored[count:]))
     assert {entry.measurement.settings for entry in run.stored} == {SETTINGS}
     assert run.error is None
+
+
+def test_failed_change_names_its_sensor_and_reason_also_when_repeated(sessions):
+    with sessions(names=("one", "two")) as run:
+        run.wait_for(lambda stored: len(stored) >= 4)
+        run.fails = ["two"] * 20  # also while the former settings are restored
+        for _ in range(2):
+            error = run.change(WARM)
+            assert str(error) == "sensor two: two does not answer"
+
+
+def test_silent_sensor_is_not_reported_as_unplugged(sessions):
+    with sessions(names=("one", "two")) as run:
+        run.wait_for(lambda stored: len(stored) >= 4)
+        run.emulators[1].quirks = Quirks(silent=True)
+        for _ in range(2):
+            error = str(run.change(WARM))
+            assert error.startswith("sensor two: /dev/")
+            assert "unplugged" not in error
+            assert "answer" in error
 
 
 def test_change_of_an_ended_session_is_refused(sessions):

@@ -258,8 +258,7 @@ class CaptureSession:
         registered = []
         try:
             for sensor in working:
-                for step in self._set_up_steps(sensor, change.settings):
-                    step()
+                self._set_up(sensor, change.settings)
             for sensor in working:
                 self._register(sink, sensor, change.settings)
                 registered.append(sensor)
@@ -274,6 +273,14 @@ class CaptureSession:
             self._n = max(0, self._n - max(pulses, default=0))
         change.on_done(failure)
 
+    def _set_up(self, sensor: str, settings: Settings) -> None:
+        """Configure a sensor; errors name it, because the port that they name may be unknown to their reader."""
+        try:
+            for step in self._set_up_steps(sensor, settings):
+                step()
+        except SonarError as error:
+            raise type(error)(f"sensor {sensor}: {error}") from error
+
     def _set_up_again(self, sensor: str, settings: Settings) -> None:
         """Configure a sensor as before; its reader does so later if it is absent or does not answer."""
         for step in self._set_up_steps(sensor, settings):
@@ -281,8 +288,8 @@ class CaptureSession:
                 step()
             except SonarDisconnectedError:
                 pass
-            except SonarError:
-                self._sonars[sensor].hang_up()
+            except SonarError as error:
+                self._sonars[sensor].hang_up(str(error))
 
     def _set_up_steps(self, sensor: str, settings: Settings) -> list[Callable[[], None]]:
         sonar, configure = self._sonars[sensor], self._configure

@@ -1,5 +1,6 @@
 """Driver of a sensor on a serial port."""
 
+import errno
 import logging
 import threading
 import time
@@ -338,7 +339,7 @@ class SonarDriver:
                 self._go_on()
             except SonarError as error:
                 last = error
-                self.hang_up()
+                self.hang_up(_why_absent(error))
                 self._closing.wait(_RETRY_S)
             else:
                 self._line.stop = self._closing.is_set
@@ -421,9 +422,15 @@ class SonarDriver:
         except SonarError:
             return None
 
-    def hang_up(self) -> None:
-        """Give up a sensor that does not answer; use it again after `reconnect`, which configures it as before."""
-        self._line.hang_up()
+    def hang_up(self, why: str | None = None) -> None:
+        """Give up a sensor that does not answer; use it again after `reconnect`, which configures it as before.
+
+        Parameters
+        ----------
+        why : str, optional
+            Message of the errors until then, as in `ertis_numba.devices.line.SerialLine.hang_up`.
+        """
+        self._line.hang_up(why)
         self._dropped += self._line.dropped
         self._line.dropped = 0
 
@@ -485,6 +492,13 @@ class SonarDriver:
             f"{self.port}: {read} bytes arrived within {timeout_s:g} s, but no complete measurement of "
             f"{setup.n_samples} samples; give the length that the sensor is set to"
         )
+
+
+def _why_absent(error: SonarError) -> str | None:
+    """Return the message about a silent sensor, an empty text for an unplugged one, and None if it is not known."""
+    if error.errno == errno.ETIMEDOUT:
+        return str(error)
+    return "" if error.errno == errno.ENOENT or isinstance(error, SonarDisconnectedError) else None
 
 
 def _behaviour(active: bool) -> Behaviour:  # noqa: FBT001  the number of command A or H

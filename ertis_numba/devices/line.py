@@ -77,6 +77,7 @@ class SerialLine:
         self._buffer = memoryview(bytearray(_PIECE))
         self._empty_ns = time.monotonic_ns()  # Last time without waiting bytes.
         self._is_hung_up = False
+        self._why_hung_up = ""
 
     @property
     def waiting(self) -> int:
@@ -156,9 +157,16 @@ class SerialLine:
                         fcntl.flock(self._port.fileno(), fcntl.LOCK_UN)
                 self._port.close()
 
-    def hang_up(self) -> None:
-        """Close the port of an absent device; later uses raise `SonarDisconnectedError`."""
+    def hang_up(self, why: str | None = None) -> None:
+        """Close the port of an absent or silent device; later uses raise `SonarDisconnectedError`.
+
+        Parameters
+        ----------
+        why : str, optional
+            Message of this error; an empty one if the device was unplugged. That of an earlier call by default.
+        """
         self._is_hung_up = True
+        self._why_hung_up = self._why_hung_up if why is None else why
         self.close()
 
     def _read(self, size: int) -> bytes:
@@ -197,7 +205,7 @@ class SerialLine:
         if self.stop():
             raise closed_error(self.path)
         if self._is_hung_up:
-            raise self._gone()
+            raise SonarDisconnectedError(self._why_hung_up) if self._why_hung_up else self._gone()
         if not self._port.is_open:
             raise closed_error(self.path)
 
