@@ -17,15 +17,18 @@ from ertis_numba.capture import CaptureSession
 from ertis_numba.devices.driver import SonarDriver
 from ertis_numba.devices.emulator import Emulator
 from ertis_numba.devices.setup import Setup
+from ertis_numba.errors import RefusedError
+from ertis_numba.network import messages
 from ertis_numba.network.allow_list import AllowList, Permission
+from ertis_numba.network.central_client import CentralClient
 from ertis_numba.network.keys import KeyPair, ServerKeys
 from ertis_numba.network.log import logger
 from ertis_numba.network.processing import ProcessingOptions
 from ertis_numba.network.processing.publisher import Publisher
 from ertis_numba.network.sensor_node import SensorNode
-from ertis_numba.settings import Processing, Recording, Settings
+from ertis_numba.settings import Call, Processing, Recording, Settings
 from ertis_numba.storage import open_recording, sensor_names
-from tests.central import running
+from tests.central import Node, running
 from tests.emulated import N_SAMPLES
 from tests.journals import ENVIRONMENT, TINY, entries
 from tests.stand_in import StandIn
@@ -269,6 +272,29 @@ def test_capture_to_requires_allowed_keys(tmp_path):
                                              "'ertis keys allow'")  # fmt: skip
 
 
+FOR_APPLICATIONS = (
+    "this address is for applications; for sensor nodes and 'ertis configure', give the first address that 'ertis "
+    "serve' prints"
+)
+
+
+def test_image_address_refuses_long_settings_and_admins_with_the_other_address():
+    long = TINY.replace(call=Call(waveform=tuple(np.sin(np.arange(1500)).tolist())))
+    text = long.to_toml().encode()
+    assert len(text) > 20_000
+    publisher = Publisher(ProcessingOptions(publish="tcp://127.0.0.1:0"), logger("test"))
+    publisher.start()
+    try:
+        with Node(publisher.address) as node:
+            node.send(messages.Hello(sensor="a", session_id=1, next_sequence=0, settings_crc32=zlib.crc32(text)), text)
+            assert node.hear(messages.Refused).reason == FOR_APPLICATIONS
+        with CentralClient(publisher.address) as client, pytest.raises(RefusedError) as refused:
+            client.configure("a", TINY, SOON_S)
+        assert str(refused.value) == FOR_APPLICATIONS
+    finally:
+        publisher.close()
+
+
 @pytest.mark.usefixtures("sensors")
 def test_capture_to_image_address_suggests_the_other_address(tmp_path):
     publisher = Publisher(ProcessingOptions(publish="tcp://127.0.0.1:0"), logger("test"))
@@ -277,7 +303,7 @@ def test_capture_to_image_address_suggests_the_other_address(tmp_path):
         code, events, err = run(tmp_path, "--to", publisher.address, "-n", 1, "--patience", "1")
     finally:
         publisher.close()
-    remedy = "this address publishes images; sensor nodes use the first address that 'ertis serve' prints"
+    remedy = FOR_APPLICATIONS
     assert any(remedy in each.get("text", "") for each in events)
     assert code == 1
     assert err.splitlines()[-1].endswith(f"not acknowledged by the central node at {publisher.address}: {remedy}")

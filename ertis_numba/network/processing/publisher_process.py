@@ -15,6 +15,9 @@ from ertis_numba.network.message_fields import as_line
 from ertis_numba.network.messages import (
     AskStatus,
     Bye,
+    Configure,
+    Data,
+    Gap,
     Hello,
     Image,
     Message,
@@ -35,6 +38,7 @@ from ertis_numba.network.processing.subscribers import QueuedProduct, Subscriber
 from ertis_numba.network.trace import mark
 from ertis_numba.network.zap_authenticator import ZapAuthenticator
 from ertis_numba.processes import connect
+from ertis_numba.settings import Settings
 
 if TYPE_CHECKING:
     from ertis_numba.processes import Pipe
@@ -43,9 +47,12 @@ _PIECE_BYTES: Final = 512 * 1024  # CURVE needs three times as long for the same
 _AT_ONCE: Final = 64
 _TICK_MS: Final = 200
 _REPORT_INTERVAL_S: Final = 1.0
-_HEARD_BYTES: Final = 16_384  # Enough for applications; sensor nodes at the wrong address send settings of 4.4 kB.
+# Enough for applications. A larger message would end the connection without an answer, and sensor nodes at the wrong
+# address send settings.
+_HEARD_BYTES: Final = Settings.max_bytes
 _SENSORS_ELSEWHERE: Final = (
-    "this address publishes images; sensor nodes use the first address that 'ertis serve' prints"
+    "this address is for applications; for sensor nodes and 'ertis configure', give the first address that 'ertis "
+    "serve' prints"
 )
 
 
@@ -186,13 +193,15 @@ class _Publisher:
             return
         if not permission.may_receive:
             reason = (
-                f"this address publishes images, but {permission.name} has the role {permission.role}; use the "
+                f"this address is for applications, but {permission.name} has the role {permission.role}; use the "
                 "address that 'ertis serve' prints first, or allow the key as application"
             )
             self._refuse(frames, Refused(code="role", reason=reason), "role")
             return
         if len(frames) != 2:
-            text = _SENSORS_ELSEWHERE if _is_greeting(frames) else f"a message has {len(frames) - 1} frames; send one"
+            text = (
+                _SENSORS_ELSEWHERE if _is_for_sensors(frames) else f"a message has {len(frames) - 1} frames; send one"
+            )
             self._refuse(frames, Refused(code="message", reason=text), "message")
             return
         try:
@@ -228,10 +237,10 @@ class _Publisher:
             return
 
 
-def _is_greeting(frames: list[zmq.Frame]) -> bool:
-    """Return True for the first message of a sensor node."""
+def _is_for_sensors(frames: list[zmq.Frame]) -> bool:
+    """Return True for a message of a sensor node or an admin, which belongs to the other address."""
     try:
-        return len(frames) > 1 and isinstance(decode(frames[1].bytes), Hello)
+        return len(frames) > 1 and isinstance(decode(frames[1].bytes), Hello | Configure | Data | Gap)
     except DataError:
         return False
 
