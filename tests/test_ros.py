@@ -258,3 +258,25 @@ def test_loopback_is_the_default():
     assert "lo" in interfaces()
     with Participant(domain=DOMAIN) as participant:
         assert participant.interface == "lo"
+
+
+def test_command_reports_that_no_central_node_answers(monkeypatch):
+    monkeypatch.setattr("ertis_cli._ros_sources._UNANSWERED_S", 0.3)
+    address = "tcp://127.0.0.1:9"
+    done = CliRunner().invoke(cli, ["ros", address, "--domain", str(DOMAIN), "--duration", "1"])
+    assert done.exit_code == 1
+    assert f"waiting for {address}: no answer; is 'ertis serve' running?\n" in done.stderr
+    assert done.stderr.endswith(
+        f"error: nothing arrived from {address}; start 'ertis serve', and give the address at which it publishes\n"
+    )
+
+
+def test_left_out_measurements_are_not_counted_as_published(tmp_path):
+    path = tmp_path / "images.h5"
+    write_energyscapes(path, [stamped(seed, sequence=50_000_000 * seed) for seed in range(9)])
+    command = ["ros", str(path), "--domain", str(DOMAIN), "--max-rate", "points=5", "--max-rate", "scan=5", "--json"]
+    done = CliRunner().invoke(cli, [*command, "--use-sim-time"])
+    assert done.exit_code == 0, done.output
+    last = json.loads(done.stdout.splitlines()[-1])
+    assert (last["measurements"], last["left_out"], last["messages"]["/front/points"]) == (3, 12, 3)
+    assert "3 measurements published, 12 messages left out by rates or pauses" in done.stderr

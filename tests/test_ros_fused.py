@@ -9,7 +9,7 @@ from ertis_numba.analysis.point_finder import PointFinder
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import PointCloud, Stamp
 from ertis_numba.interop.ros_messages import MESSAGES, points_message
-from ertis_numba.ros import Participant, RosPublisher
+from ertis_numba.ros import Participant, PublishingSettings, RosPublisher
 from ertis_numba.ros.fused_points import FusedPoints, joined
 from ertis_numba.settings import Settings
 from tests.ros_topics import DOMAIN, await_subscribers, subscribed
@@ -111,3 +111,43 @@ def test_sensors_without_mounting_are_not_fused():
             publisher.publish(stamped(1, "front", count), AHEAD)
             publisher.publish(stamped(2, "left", count))
         assert "/fused/points" not in publisher.topics
+
+
+class RecordedTopic:
+    """A topic that keeps its messages."""
+
+    def __init__(self):
+        self.messages = []
+        self.publish = self.messages.append
+
+
+class Recorded:
+    """A participant whose topics keep their messages."""
+
+    def __init__(self):
+        self.topics = {}
+
+    def topic(self, name, _message, *, latched):
+        return self.topics.setdefault(name, RecordedTopic()) if not latched else RecordedTopic()
+
+
+def test_rates_are_limited_after_fusing():
+    """A limit before fusing would leave out other pulses of one sensor than of the other."""
+    participant = Recorded()
+    publisher = RosPublisher(
+        participant, topics=["points"], settings=PublishingSettings(max_rate_hz={"points": 5.0}), namespace="robot1"
+    )
+    given = [("front", AHEAD, count) for count in range(41)]
+    given += [("left", LEFT, count) for count in range(1, 41)]  # begins one pulse later
+    for name, place, count in sorted(given, key=lambda each: each[2]):
+        publisher.publish(cloud(name, count, place=place), place)
+    messages = {name.removeprefix("/robot1/"): topic.messages for name, topic in participant.topics.items()}
+    # 20 Hz for two seconds, at 5 Hz.
+    assert {name: len(each) for name, each in messages.items()} == {
+        "front/points": 11,
+        "left/points": 10,
+        "fused/points": 10,
+    }
+    assert {message["width"] for message in messages["fused/points"][1:]} == {4}
+    assert publisher.left_out == 30 + 30 + 30
+    assert publisher.published == 11 + 10 + 1  # One fused message is sent when no message of a sensor is due.

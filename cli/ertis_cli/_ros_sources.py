@@ -19,6 +19,8 @@ __all__ = ["publish_file", "publish_node", "publish_ports"]
 
 _POLL_INTERVAL_S: Final = 0.1
 _CLOCK_INTERVAL_S: Final = 0.02
+_UNANSWERED_S: Final = 3.0
+"""Time without an answer after which this is reported."""
 _UNTIMED_S: Final = 0.1
 """Interval between measurements without timestamps."""
 
@@ -38,8 +40,10 @@ def publish_node(
 ) -> None:
     """Publish the products of a central node, until the program is to end.
 
-    Points alone need no images, which are larger.
+    Points alone need no images, which are larger. A central node sends its status each second, also without sensors.
+    If nothing arrives, a NetworkError is raised at the end.
     """
+    from ertis_numba.errors import NetworkError
     from ertis_numba.network.status import Status
     from ertis_numba.network.subscriber import Subscriber
 
@@ -47,10 +51,14 @@ def publish_node(
     with Subscriber(address, products=products, sensors=sensors or None, keys=keys, on_note=on_note) as subscriber:
         signals.obey(subscriber.close)
         on_ready()
+        unanswered_s = time.monotonic() + _UNANSWERED_S
         while not is_over():
             item = subscriber.receive(_POLL_INTERVAL_S)
             arrival = subscriber.latest
             if item is None or arrival is None:
+                if arrival is None and time.monotonic() > unanswered_s:
+                    unanswered_s = float("inf")
+                    on_note(f"waiting for {address}: no answer; is 'ertis serve' running?")
                 continue
             if isinstance(item, Status):
                 ros.publish_status(item)
@@ -60,6 +68,10 @@ def publish_node(
                 place = arrival.translation_m, arrival.rotation_xyzw
             ros.publish(item, place)
             on_published()
+    if subscriber.latest is None:
+        raise NetworkError(
+            f"nothing arrived from {address}; start 'ertis serve', and give the address at which it publishes"
+        )
 
 
 def publish_file(

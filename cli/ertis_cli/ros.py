@@ -303,7 +303,6 @@ class _RosReport:
 
     def __init__(self, publisher: Any, *, quiet: bool, as_json: bool) -> None:
         self._publisher, self._quiet, self._as_json = publisher, quiet, as_json
-        self._n_items = 0
         self._listed: set[str] = set()
 
     def start(self, source: str, participant: Any) -> None:
@@ -327,8 +326,7 @@ class _RosReport:
             options.print_json({"event": "note", "text": text})
 
     def published(self) -> None:
-        """Count a measurement, and report new topics."""
-        self._n_items += 1
+        """Report new topics."""
         for name, topic in self._publisher.topics.items():
             if name not in self._listed:
                 self._listed.add(name)
@@ -339,16 +337,17 @@ class _RosReport:
     def end(self) -> None:
         """Report the counts."""
         dropped, left_out = self._publisher.dropped, self._publisher.left_out
-        text = f"{options.counted(self._n_items, 'measurement')} published"
+        n_published = self._publisher.published
+        text = f"{options.counted(n_published, 'measurement')} published"
         text += f", {options.counted(dropped, 'message')} dropped for slow subscribers" if dropped else ""
-        text += f", {left_out} left out by rates or pauses" if left_out else ""
+        text += f", {options.counted(left_out, 'message')} left out by rates or pauses" if left_out else ""
         options.say(text, quiet=self._quiet)
         if self._as_json:
             counts = {name: topic.published for name, topic in self._publisher.topics.items()}
             options.print_json(
                 {
                     "event": "end",
-                    "measurements": self._n_items,
+                    "measurements": n_published,
                     "messages": counts,
                     "dropped": dropped,
                     "left_out": left_out,

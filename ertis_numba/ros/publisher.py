@@ -65,6 +65,8 @@ class RosPublisher:
         They may be replaced at any time.
     topics : dict of str to Topic
         Topics in use, by name.
+    published : int
+        Number of images and clouds of which at least one message was published.
     left_out : int
         Number of messages left out because of ``max_rate_hz``, or because publishing was paused.
 
@@ -98,7 +100,7 @@ class RosPublisher:
         for topic in topics:
             checks.choice("topic", topic, MESSAGES)
         self.topics: dict[str, Topic] = {}
-        self.left_out = 0
+        self.published = self.left_out = 0
         self._wanted = [topic for topic in MESSAGES if topic in topics]
         self._base = _namespace(namespace)
         self._participant, self._given, self._top = participant, validated(mounting), top
@@ -107,7 +109,7 @@ class RosPublisher:
         self._names = TopicNames({_ALL_SENSORS: "fused"})
         self._frames: dict[str, Mounting | None] = {}
         self._fused = FusedPoints()
-        self._due_ns: dict[tuple[str, str], int] = {}
+        self._due_ns: dict[tuple[str, str], int] = {}  # By sensor and topic.
         self._announced: list[dict[str, Any]] = []
 
     @property
@@ -145,33 +147,55 @@ class RosPublisher:
             item = item.replace(stamp=replace(item.stamp, timestamp_ns=time.time_ns()))
         stamp = item.stamp
         self._announce(stamp, mounting)
-        for topic in self._wanted:
-            if isinstance(item, PointCloud) and topic != "points":
-                continue
-            if self._settings.paused or not self._is_due(topic, stamp):
-                self.left_out += 1
-            elif isinstance(item, PointCloud):
-                self._publish_points(item)
-            elif topic == "points":
-                self._publish_points(self._find(item))
-            else:
-                message = self._message(topic, item)
-                if message is not None:
-                    self._topic(f"{self._base}/{self._names[stamp.sensor]}/{topic}", MESSAGES[topic]).publish(message)
-
-    def _publish_points(self, cloud: PointCloud) -> None:
-        """Publish the points of a sensor, and those of all sensors of its pulse, once they are complete."""
-        sensor, limits_m = cloud.stamp.sensor, self._settings.range_m
-        if limits_m is not None:
-            within = (cloud.range_m >= limits_m[0]) & (cloud.range_m <= limits_m[1])
-            cloud = _selected(cloud, within)
-        self._topic(f"{self._base}/{self._names[sensor]}/points", MESSAGES["points"]).publish(points_message(cloud))
-        place = self._frames[sensor]
-        if place is None:
+        wanted = [topic for topic in self._wanted if topic == "points" or isinstance(item, Energyscape)]
+        if self._settings.paused:
+            self.left_out += len(wanted)
             return
-        for group in self._fused.add(cloud.replace(translation_m=place[0], rotation_xyzw=place[1])):
-            if sum(each is not None for each in self._frames.values()) > 1:
+        counts = [
+            self._publish_points(item) if topic == "points" else self._publish_topic(topic, item) for topic in wanted
+        ]
+        self.published += any(counts)
+
+    def _publish_topic(self, topic: str, item: Any) -> int:
+        """Publish a topic of an image; return the number of published messages."""
+        stamp = item.stamp
+        if not self._is_due(topic, stamp.sensor, stamp.timestamp_ns):
+            return 0
+        message = self._message(topic, item)
+        if message is None:
+            return 0
+        self._topic(f"{self._base}/{self._names[stamp.sensor]}/{topic}", MESSAGES[topic]).publish(message)
+        return 1
+
+    def _publish_points(self, item: Energyscape | PointCloud) -> int:
+        """Publish the points of a sensor, and those of all sensors of its pulse, once they are complete.
+
+        The rate of fused points is limited after fusing, because messages that are left out of the topics of sensors
+        need not be of the same pulses. The number of published messages is returned.
+        """
+        stamp, place = item.stamp, self._frames[item.stamp.sensor]
+        is_due = self._is_due("points", stamp.sensor, stamp.timestamp_ns)
+        is_fused = place is not None and sum(each is not None for each in self._frames.values()) > 1
+        if not (is_due or is_fused):
+            return 0
+        cloud = self._within_limits(item if isinstance(item, PointCloud) else self._find(item))
+        if is_due:
+            self._topic(f"{self._base}/{self._names[stamp.sensor]}/points", MESSAGES["points"]).publish(
+                points_message(cloud)
+            )
+        n_published = int(is_due)
+        groups = [] if place is None else self._fused.add(cloud.replace(translation_m=place[0], rotation_xyzw=place[1]))
+        for group in groups if is_fused else ():
+            if self._is_due("points", _ALL_SENSORS, group.stamp.timestamp_ns):
                 self._topic(f"{self._base}/fused/points", MESSAGES["points"]).publish(points_message(group))
+                n_published += 1
+        return n_published
+
+    def _within_limits(self, cloud: PointCloud) -> PointCloud:
+        limits_m = self._settings.range_m
+        if limits_m is None:
+            return cloud
+        return _selected(cloud, (cloud.range_m >= limits_m[0]) & (cloud.range_m <= limits_m[1]))
 
     def publish_status(self, status: Status) -> None:
         """Publish the status of a central node and its sensors on ``/diagnostics``."""
@@ -197,18 +221,19 @@ class RosPublisher:
                 return None
         return scan_message(item, min_level_db=settings.min_level_db, floor_dbfs=floor_dbfs)
 
-    def _is_due(self, topic: str, stamp: Stamp) -> bool:
-        """Return False if a message would exceed the rate of its topic."""
+    def _is_due(self, topic: str, sensor: str, time_ns: int) -> bool:
+        """Return False, and count the message as left out, if it would exceed the rate of its topic."""
         rate_hz = self._settings.max_rate_hz.get(topic)
         if rate_hz is None:
             return True
-        key, interval_ns = (stamp.sensor, topic), round(1e9 / rate_hz)
-        due_ns = self._due_ns.get(key, stamp.timestamp_ns)
+        key, interval_ns = (sensor, topic), round(1e9 / rate_hz)
+        due_ns = self._due_ns.get(key, time_ns)
         # Steady messages at a higher rate give the exact rate on average; after a pause, or a clock that was set, the
         # count starts again.
-        if not -interval_ns <= stamp.timestamp_ns - due_ns <= interval_ns:
-            due_ns = stamp.timestamp_ns
-        if stamp.timestamp_ns < due_ns:
+        if not -interval_ns <= time_ns - due_ns <= interval_ns:
+            due_ns = time_ns
+        if time_ns < due_ns:
+            self.left_out += 1
             return False
         self._due_ns[key] = due_ns + interval_ns
         return True
