@@ -10,6 +10,7 @@ from ertis_numba.network.central_node import _admission, _intake
 from ertis_numba.network.central_node._admission import Unwanted
 from ertis_numba.network.central_node._intake import Intake
 from ertis_numba.network.central_node._received_items import Forgotten, SensorSession, Stored
+from ertis_numba.network.central_node._streams import SensorTrack
 from ertis_numba.network.messages import Ack, Gap, Hello, Refused
 from ertis_numba.settings import Air
 from tests.central import data_of
@@ -198,3 +199,32 @@ def test_number_of_peers_per_key_is_limited(monkeypatch):
     taken.greet(b"c", session_id=7, key="another")
     for peer in (b"d", b"e", b"f"):  # where there are no keys
         taken.greet(peer, session_id=peer[0])
+
+
+def rate_hz(*times, session_ids=None, now_s=100.0):
+    """Rate of measurements with times of arrival and of measurement, as the status reports it."""
+    track = SensorTrack()
+    for (arrived_s, measured_s), session_id in zip(times, session_ids or [1] * len(times), strict=True):
+        track.took(4, session_id, arrived_s=arrived_s, measured_s=measured_s)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(time, "monotonic", lambda: now_s)
+        return track.status().rate_hz
+
+
+def test_rate_of_kept_measurements_is_that_of_measuring():
+    steady = [(98.0 + 0.1 * number, 5.0 + 0.1 * number) for number in range(20)]
+    assert rate_hz(*steady) == pytest.approx(10)
+    after_pause = [(99.0 + 0.001 * number, 5.0 + 0.1 * number) for number in range(20)]
+    assert rate_hz(*after_pause) == pytest.approx(10)
+    two_after_pause = [(99.0, 5.0), (99.0005, 5.1)]
+    assert rate_hz(*two_after_pause) == pytest.approx(10)
+
+
+def test_rate_without_recent_measurements_is_zero():
+    assert rate_hz() == rate_hz((99.0, 5.0)) == rate_hz((90.0, 5.0), (90.1, 5.1)) == 0
+
+
+def test_rate_is_that_of_the_latest_session():
+    """The clock of another computer has other times."""
+    times = [(98.0, 5e6), (98.1, 5e6 + 0.1), (98.5, 7.0), (98.7, 7.2), (98.9, 7.4)]
+    assert rate_hz(*times, session_ids=[1, 1, 2, 2, 2]) == pytest.approx(5)

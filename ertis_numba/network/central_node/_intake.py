@@ -182,7 +182,12 @@ class Intake:
             self._take(stream, item)
             if data.sequence > stream.shown:  # A repeated transmission is not a new measurement.
                 stream.shown = data.sequence
-                stream.track.took(source.n_bytes, item.arrived_s)
+                stream.track.took(
+                    source.n_bytes,
+                    stream.run.session_id,
+                    arrived_s=item.arrived_s,
+                    measured_s=1e-9 * data.monotonic_ns,
+                )
                 if self._viewer is not None:
                     self._viewer.offer(data, entry.measurement.data, arrived_ns)
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import count
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
 
 from ertis_numba.errors import ArgumentError, SettingsError
 from ertis_numba.geometry import received_settings
@@ -68,6 +68,14 @@ def _source(
     return source
 
 
+class _Times(NamedTuple):
+    """Times of a measurement, in seconds: its arrival by this node's clock, and itself by that of its sensor node."""
+
+    session_id: int
+    arrived_s: float
+    measured_s: float
+
+
 @dataclass(slots=True)
 class SensorTrack:
     """Counts of one sensor's measurements."""
@@ -82,7 +90,7 @@ class SensorTrack:
     waiting: int = 0
     missing: Counter[str] = field(default_factory=Counter)
     peers: set[bytes] = field(default_factory=set)
-    times_s: deque[float] = field(default_factory=lambda: deque(maxlen=128))
+    times: deque[_Times] = field(default_factory=lambda: deque(maxlen=128))
     shared_s: float = 0.0  # Time since several peers send it; 0 if none do, or once it was reported.
 
     def miss(self, reason: str, n_missing: int) -> None:
@@ -90,22 +98,19 @@ class SensorTrack:
         known = reason in self.missing or len(self.missing) < _REASONS
         self.missing[reason if known else "another reason"] += n_missing
 
-    def took(self, n_bytes: int, arrived_s: float) -> None:
-        """Count a new measurement."""
+    def took(self, n_bytes: int, session_id: int, *, arrived_s: float, measured_s: float) -> None:
+        """Count a new measurement, and note the times by the clocks of this node and of the sensor node."""
         self.received += 1
         self.received_bytes += n_bytes
-        self.times_s.append(arrived_s)
+        self.times.append(_Times(session_id, arrived_s, measured_s))
 
     def status(self) -> SensorStatus:
         """Return the counts."""
-        now_s = time.monotonic()
-        recent_s = [time_s for time_s in self.times_s if now_s - time_s < _RECENT_S]
-        span_s = recent_s[-1] - recent_s[0] if len(recent_s) > 1 else 0.0
         return SensorStatus(
             connected=bool(self.peers),
             session_id=self.session_id,
             acked_through=self.acked_through,
-            rate_hz=round((len(recent_s) - 1) / span_s, 3) if span_s else 0.0,
+            rate_hz=round(self._rate_hz(), 3),
             received=self.received,
             received_bytes=self.received_bytes,
             stored=self.stored,
@@ -114,6 +119,20 @@ class SensorTrack:
             conflicts=self.conflicts,
             queue=self.waiting,
         )
+
+    def _rate_hz(self) -> float:
+        """Return the rate of recent measurements of the latest session, 0 if there are fewer than two.
+
+        After a pause, kept measurements arrive much faster than they were made.
+        """
+        now_s = time.monotonic()
+        recent = [each for each in self.times if now_s - each.arrived_s < _RECENT_S]
+        recent = [each for each in recent if each.session_id == recent[-1].session_id]
+        if len(recent) <= 1:
+            return 0.0
+        measured_s = [each.measured_s for each in recent]
+        span_s = max(recent[-1].arrived_s - recent[0].arrived_s, max(measured_s) - min(measured_s))
+        return (len(recent) - 1) / span_s if span_s else 0.0
 
 
 @dataclass(slots=True, eq=False)
