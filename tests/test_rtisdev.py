@@ -524,6 +524,8 @@ def arguments_of_preload():
         ({"n_samples": [1, 2]}, r"n_samples has shape \(2,\); give one whole number"),
         ({"n_samples": 5}, "5 words give no signal after decimation by 10; give more words"),
         ({"pdm_subsample_factor": 0}, "pdm_subsample_factor is 0; give a whole number of at least 1"),
+        ({"n_directions": 0}, "n_directions is 0; give a whole number of at least 1"),
+        ({"envelope_subsample_factor": 0}, "envelope_subsample_factor is 0; give a whole number of at least 1"),
         ({"beamforming_drop": 20_000}, "beamforming_drop is 20000; give a whole number from 0 to 16383"),
         ({"mean_multiplier": np.nan}, "mean_multiplier is nan; give a finite number"),
         ({"max_multiplier": "half"}, "max_multiplier is 'half'; give a number"),
@@ -536,6 +538,18 @@ def test_arguments_that_do_not_fit_together_are_refused(changes, message):
         rtiscuda.preload(**(arguments_of_preload() | changes))
     with pytest.raises(ArgumentError, match="'bad' is not preloaded"):
         rtiscuda.processing(np.zeros(163_840, np.uint32), 1, 31, 69, "bad")
+
+
+def test_arguments_of_stages_that_are_off_are_not_used():
+    off = dict.fromkeys(("beamforming_enable", "envelope_enable", "clean_enable", "matched_filter_enable"), 0)
+    unused = {
+        **dict.fromkeys(("n_directions", "envelope_subsample_factor", "last_range"), 0),
+        **dict.fromkeys(("mean_multiplier", "pre_filter", "post_filter", "matched_filter_real"), np.nan),
+        "delay_matrix": np.zeros((1, 1)),
+        "beamforming_drop": 10**6,
+    }
+    rtiscuda.preload(**(arguments_of_preload() | off | unused))
+    assert rtiscuda.processing(np.zeros(163_840, np.uint32), 1, 32, 16_384, "bad").shape == (32, 16_384)
 
 
 def test_names_of_configurations_are_texts():
@@ -660,3 +674,32 @@ def test_rtisdev_command_needs_the_package(monkeypatch, tmp_path):
     refused = CliRunner().invoke(cli, ["rtisdev", str(tmp_path / "script.py")])
     assert refused.exit_code == 1
     assert "rtisdev" in refused.stderr
+
+
+@pytest.mark.parametrize(
+    ("text", "n_frames", "last"),
+    [
+        ("def f():\n    raise KeyError('x')\nf()\n", 2, "KeyError: 'x'"),
+        ("open('none.bin')\n", 1, "FileNotFoundError: [Errno 2] No such file or directory: 'none.bin'"),
+        ("import rtiscuda\nrtiscuda.unloadone(3)\n", 2, "ertis_numba.errors.ArgumentError: name is of type int; give"),
+        ("x = (\n", 1, "SyntaxError: '(' was never closed"),
+    ],
+    ids=["own", "system", "package", "syntax"],
+)
+def test_error_of_a_script_is_reported_without_frames_of_the_command(tmp_path, text, n_frames, last):
+    script = tmp_path / "script.py"
+    script.write_text(text)
+    done = run_script(script)
+    assert done.returncode == 1
+    lines = done.stderr.splitlines()
+    frames = [line for line in lines if line.startswith("  File ")]
+    assert frames[0].startswith(f'  File "{script}", line ')
+    assert not [line for line in frames if "ertis_cli" in line or "click" in line or "runpy" in line]
+    assert len(frames) >= n_frames
+    assert lines[-1].startswith(last)
+
+
+def test_script_chooses_the_exit_code(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text("raise SystemExit(7)")
+    assert run_script(script).returncode == 7

@@ -5,6 +5,7 @@ import runpy
 import signal
 import sys
 from pathlib import Path
+from types import TracebackType
 
 import click
 
@@ -52,7 +53,19 @@ def rtisdev(*, port: str | None, device: str, method: str | None, script: Path, 
             signal.signal(getattr(signal, name), signal.SIG_DFL)
     sys.argv = [str(script), *arguments]
     sys.path.insert(0, str(script.resolve().parent))
-    runpy.run_path(str(script), run_name="__main__")
+    try:
+        runpy.run_path(str(script), run_name="__main__")
+    except Exception as error:  # noqa: BLE001  reported as Python reports it
+        error = error.with_traceback(_of_script(error.__traceback__, str(script)))
+        sys.excepthook(type(error), error, error.__traceback__)
+        sys.exit(1)
+
+
+def _of_script(traceback: TracebackType | None, script: str) -> TracebackType | None:
+    """Return a traceback from its first frame in the script on; None if the script has not begun."""
+    while traceback is not None and traceback.tb_frame.f_code.co_filename != script:
+        traceback = traceback.tb_next
+    return traceback
 
 
 def _require(module: str) -> None:

@@ -99,24 +99,14 @@ class Configuration:
             raise ArgumentError(
                 f"{self.n_samples} words give no signal after decimation by {self.pdm_factor}; give more words"
             )
-        checks.integer("beamforming_drop", self.beamforming_drop, 0, self.n_signal - 1)
         n_bins = self.n_signal // 2 + 1
         if self.matched_filter is not None and self.matched_filter.shape != (self.n_mics, n_bins):
             raise ArgumentError(
                 f"the matched filter has shape {self.matched_filter.shape}; give ({self.n_mics}, {n_bins}) for "
                 f"{self.n_mics} microphones and {self.n_samples} words"
             )
-        if self.delays is not None and self.delays.shape != (self.n_directions, self.n_mics):
-            raise ArgumentError(
-                f"the delay matrix has shape {self.delays.shape[::-1]}; give ({self.n_mics}, {self.n_directions})"
-            )
-        if self.delays is not None and self.delays.size and self.delays.min() < 0:
-            raise ArgumentError(f"the delay matrix holds {self.delays.min()}; give numbers of at least 0")
-        if self.delays is not None and self.delays.size and self.delays.max() > self.n_signal:
-            raise ArgumentError(
-                f"the delay matrix holds {self.delays.max()}, but signals have {self.n_signal} samples; give smaller "
-                "delays"
-            )
+        if self.delays is not None:
+            self._require_delays(self.delays)
         if not 1 <= self.dmas_order <= _MAX_ORDER:
             raise ArgumentError(f"dmasOrder is {self.dmas_order}; give 0 to {_MAX_ORDER}")
         if len(self.disabled) >= self.n_mics:
@@ -126,10 +116,22 @@ class Configuration:
                 f"the image has ranges {self.first_range} to {self.last_range}; give a first one of at least 0, and a "
                 "later last one"
             )
-        n_ranges = -(-self.n_signal // self.envelope_factor)
-        if self.has_envelope and self.last_range > n_ranges:
+        if self.has_envelope and self.last_range > (n_ranges := -(-self.n_signal // self.envelope_factor)):
             raise ArgumentError(
                 f"the image ends at range {self.last_range}, but the record has {n_ranges}; give a smaller last_range"
+            )
+
+    def _require_delays(self, delays: NDArray[np.int32]) -> None:
+        checks.integer("beamforming_drop", self.beamforming_drop, 0, self.n_signal - 1)
+        if delays.shape != (self.n_directions, self.n_mics):
+            raise ArgumentError(
+                f"the delay matrix has shape {delays.shape[::-1]}; give ({self.n_mics}, {self.n_directions})"
+            )
+        if delays.min() < 0:
+            raise ArgumentError(f"the delay matrix holds {delays.min()}; give numbers of at least 0")
+        if delays.max() > self.n_signal:
+            raise ArgumentError(
+                f"the delay matrix holds {delays.max()}, but signals have {self.n_signal} samples; give smaller delays"
             )
 
     @property

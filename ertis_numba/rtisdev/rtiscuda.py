@@ -78,11 +78,13 @@ def preload(  # noqa: PLR0913, PLR0917  as the original has it
             ),
             delays=arguments.delay_matrix(delay_matrix) if beamforming_enable else None,
             n_mics=n_mics,
-            n_directions=arguments.whole("n_directions", n_directions, 1),
+            n_directions=arguments.whole("n_directions", n_directions, int(bool(beamforming_enable))),
             n_samples=arguments.whole("n_samples", n_samples, 1),
             pdm_factor=arguments.whole("pdm_subsample_factor", pdm_subsample_factor, 1),
             beamforming_drop=arguments.whole("beamforming_drop", beamforming_drop, 0),
-            envelope_factor=arguments.whole("envelope_subsample_factor", envelope_subsample_factor, 1),
+            envelope_factor=arguments.whole(
+                "envelope_subsample_factor", envelope_subsample_factor, int(bool(envelope_enable))
+            ),
             first_range=arguments.whole("first_range", first_range, 0),
             last_range=arguments.whole("last_range", last_range, 0),
             clean_multipliers=(
