@@ -10,6 +10,7 @@ from ertis_bench.budgets import form as budgets
 from ertis_bench.calibration import form as calibration
 from ertis_bench.campaign_scaling import many
 from ertis_bench.delay_interpolation import form as interpolation
+from ertis_bench.fusion import form as fusion
 from ertis_bench.gpu_tables import gpu, gpu_short
 from ertis_bench.health_trials.table import health
 from ertis_bench.machine import sentence
@@ -29,6 +30,7 @@ __all__ = [
     "accuracy_front",
     "calibration",
     "factorisation",
+    "fusion",
     "gpu",
     "gpu_short",
     "health",
@@ -304,5 +306,6 @@ FORMS: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
     "budgets": {"budgets": budgets},
     "points": {"points": points},
     "calibration": {"calibration": calibration},
+    "fusion": {"fusion": fusion},
 }
 """Forms of the table of each command, by the name in the markers. The markers of a file select the form."""

@@ -253,6 +253,20 @@ def calibration(**given: Any) -> None:
 
 
 @bench.command()
+@click.option("--count", type=click.IntRange(min=1), default=12, show_default=True, metavar="N", help="Scenes.")
+@click.option("--rooms", type=click.IntRange(min=0), default=4, show_default=True, metavar="N", help="Rooms.")
+@_seed("Seed of the first scene.")
+@_update
+@options.quiet
+@options.as_json
+def fusion(**given: Any) -> None:
+    """Measure ghosts and positions in fused images of four sensors."""
+    from ertis_bench import fusion as benchmark
+
+    _run("fusion", benchmark, **given)
+
+
+@bench.command()
 @_count(30)
 @_update
 @options.quiet

@@ -22,7 +22,7 @@ _LIFT_DB: Final = -8.0  # Radiated power below which images are not amplified fu
 _BOUND_DB: Final = -6.0  # Radiated power above which a missing echo shows that a cell is empty.
 _BOUND_COSINE: Final = math.cos(math.radians(60.0))
 _CONFIRM_DB: Final = -13.0
-_CONFIRM_COSINE: Final = math.cos(math.radians(70.0))
+_CONFIRM_COSINE: Final = math.cos(math.radians(80.0))
 _APART_STEPS: Final = 6.0  # Difference of paths that separates two echoes, and a margin for errors of directions.
 _NEAREST_M: Final = 0.05
 # A pixel covers paths of one step. Where emitter and receiver face each other, they lead to cells far apart.

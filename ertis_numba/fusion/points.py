@@ -22,15 +22,18 @@ Floats = NDArray[np.float64]
 
 _TOP: Final = 128  # Points per image.
 _MIN_SHARE: Final = 0.5
-_RANGE_SD_M: Final = 2e-3  # Errors that noise does not explain, such as those of mountings and of the air.
+_RANGE_SD_M: Final = 1e-3  # Errors that noise does not explain, such as those of mountings and of the air.
 _ANGLE_SD_RAD: Final = math.radians(0.25)
 _UNKNOWN_RANGE_SD_M: Final = 5e-3
 _UNKNOWN_ANGLE_SD_RAD: Final = math.radians(1.0)
 _SAME_M: Final = 0.015  # Distance of two observations of the same reflector, in addition to their uncertainties.
 _GATE: Final = 16.0  # Squared Mahalanobis distance; four standard deviations along one axis.
-_ROUNDS: Final = 4
+_ROUNDS: Final = 8
+_OUTLIER: Final = 2.0  # Residual, in standard deviations, that has half of the weight.
 _NEAREST_M: Final = 0.05
 _VERTICAL: Final = 1e-6
+# Between emitter and receiver, the path does not depend on the position, which may then be anywhere within 10 m.
+_LEAST_INFORMATION: Final = np.eye(3) / 10.0**2
 
 
 class Observation(NamedTuple):
@@ -158,12 +161,7 @@ def joined(
     grid : PolarGrid
         Cells of the fused image.
     """
-    located = [
-        _located(cluster, poses)
-        for cluster in _clusters(sorted(observations, key=lambda each: -each.amplitude), poses)
-        # An echo of a foreign call alone has two explanations, and nothing confirms this one.
-        if any(each.emitter == each.receiver for each in cluster)
-    ]
+    located = [_located(cluster, poses) for cluster in _clusters(sorted(observations, key=_order), poses)]
     position_m = np.array([place for place, _ in located]).reshape(-1, 3)
     cell = grid.cell_of(position_m)
     amplitude = np.where(cell >= 0, _around(image.amplitude).reshape(-1).take(cell.clip(0)), np.float32(0))
@@ -180,8 +178,16 @@ def joined(
     )
 
 
+def _order(seen: Observation) -> tuple[bool, float]:
+    """Return the place of an observation: own echoes first, each kind from the strongest one."""
+    return seen.emitter != seen.receiver, -seen.amplitude
+
+
 def _clusters(observations: Sequence[Observation], poses: Sequence[MountedSensor]) -> list[list[Observation]]:
-    """Return the observations of each reflector."""
+    """Return the observations of each reflector.
+
+    An echo of a foreign call alone has two explanations, and nothing confirms this one, so it is left out.
+    """
     found: list[list[Observation]] = []
     means: list[tuple[Floats, Floats]] = []
     for each in observations:
@@ -195,31 +201,36 @@ def _clusters(observations: Sequence[Observation], poses: Sequence[MountedSensor
         pairs = [(other.emitter, other.receiver) for other in found[best]] if best >= 0 else []
         if (each.emitter, each.receiver) in pairs:
             continue  # A pair sees a reflector once; this is a shoulder of the same echo.
-        if best < 0:
+        if best < 0 and each.emitter == each.receiver:
             found.append([each])
             means.append((each.position_m, covariance))
-        else:
+        elif best >= 0:
             found[best].append(each)
             means[best] = _located(found[best], poses)
     return found
 
 
 def _located(cluster: Sequence[Observation], poses: Sequence[MountedSensor]) -> tuple[Floats, Floats]:
-    """Return the position of a reflector and its covariance, by least squares: (axis,) and (axis, axis) float64."""
-    position_m = cluster[0].position_m
+    """Return the position of a reflector and its covariance: (axis,) and (axis, axis) float64.
+
+    Least squares with the weights of a Cauchy distribution (P. J. Huber, E. M. Ronchetti, Robust Statistics, 2009).
+    """
+    position_m = np.median([each.position_m for each in cluster], axis=0)
     covariance = _covariance(cluster[0], poses)
     for _ in range(_ROUNDS if len(cluster) > 1 else 0):
         rows = [each.rows(position_m, poses) for each in cluster]
         residual = np.concatenate([row for row, _ in rows])
         slopes = np.concatenate([slope for _, slope in rows])
-        covariance = np.linalg.inv(slopes.T @ slopes)
-        position_m = position_m + covariance @ slopes.T @ residual
+        # Echoes that overlap at one sensor shift its direction or range by far more than noise does.
+        weighted = slopes / (1 + (residual / _OUTLIER) ** 2)[:, None]
+        covariance = np.linalg.inv(weighted.T @ slopes + _LEAST_INFORMATION)
+        position_m = position_m + covariance @ weighted.T @ residual
     return position_m, covariance
 
 
 def _covariance(seen: Observation, poses: Sequence[MountedSensor]) -> Floats:
     _, slopes = seen.rows(seen.position_m, poses)
-    return np.asarray(np.linalg.inv(slopes.T @ slopes))
+    return np.asarray(np.linalg.inv(slopes.T @ slopes + _LEAST_INFORMATION))
 
 
 def _tangents(direction: Floats) -> Floats:
