@@ -1,7 +1,8 @@
 """Fusion of the images of sensors that emit together."""
 
-from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass
+import functools
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -21,7 +22,7 @@ _SPACING_DEG: Final = 1.0, 4.0  # of planar and of three-dimensional images
 _STEP_M: Final = 0.015, 0.03
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Fused:
     """Fused image and points of a group of sensors.
 
@@ -31,7 +32,8 @@ class Fused:
         Image around the platform. Amplitudes are those of echoes at 1 m from reflectors of the same strength. The stamp
         is that of the earliest image, with the sensor ``base_link``.
     points : PointCloud
-        Reflectors in the frame of the platform, with uncertainties.
+        Reflectors in the frame of the platform, with uncertainties. They are computed at the first access, which takes
+        about as long as the image.
     sensors : tuple of str
         Sensors whose images were fused.
     missing : tuple of str
@@ -53,10 +55,15 @@ class Fused:
     """
 
     image: Energyscape
-    points: PointCloud
     sensors: tuple[str, ...]
     missing: tuple[str, ...]
-    unheard: tuple[str, ...] = ()
+    unheard: tuple[str, ...]
+    _locate: Callable[[], PointCloud] = field(repr=False)
+
+    @functools.cached_property
+    def points(self) -> PointCloud:
+        """Reflectors in the frame of the platform."""
+        return self._locate()
 
 
 class Fuser:
@@ -153,13 +160,12 @@ class Fuser:
         coarse = {number: tables.coarse(number, image) for number, image in group.items()}
         found = tables.attribution(group)(coarse)
         image = tables.image(found.reflectivity, group)
-        points = tables.points(group, found.shares, image)
         return Fused(
             image=image,
-            points=points,
             sensors=tuple(self._poses[number].name for number in group),
             missing=tuple(pose.name for number, pose in enumerate(self._poses) if number not in group),
             unheard=tuple(self._poses[number].name for number in sorted(found.unheard)),
+            _locate=lambda: tables.points(group, found.shares, image),
         )
 
     def _group(self, images: Iterable[Energyscape]) -> dict[int, Energyscape]:

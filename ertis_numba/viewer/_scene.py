@@ -89,7 +89,7 @@ class ViewedScene:
         self._clean_db = clean_within_db, clean_above_mean_db
         self._find = PointFinder(top=_MAX_POINTS, min_level_db=LOWEST_THRESHOLD_DB)
         self._sensors: dict[str, _SensorImages] = {}
-        self._plan = FusedPlan(width_px)
+        self._plan = FusedPlan(2 * width_px)  # A circle has less room than a sector.
 
     @property
     def farthest_m(self) -> float:
