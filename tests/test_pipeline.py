@@ -5,6 +5,7 @@ simulator.
 """
 
 import concurrent.futures
+import gc
 import multiprocessing
 import os
 import subprocess
@@ -276,3 +277,24 @@ def test_read_only_samples_cause_no_compilation():
     image = pipeline.process(Measurement(words, SHORT))
     assert image.amplitude.tobytes() == pipeline.process(noise(SHORT)).amplitude.tobytes()
     assert len(kernels.load("cpu").demodulate_words.signatures) == before
+
+
+@pytest.mark.parametrize("changes", [{}, {"beamformer": "dmas"}, {"method": "paper"}], ids=["default", "DMAS", "paper"])
+def test_pipeline_is_freed_without_the_garbage_collector(changes):
+    """Tables of plans have up to 40 MB."""
+    settings = SHORT.replace(processing=SHORT.processing.replace(**changes))
+    Pipeline(settings, "numpy", predict=False).close()  # fills the caches of the package
+    gc.collect()
+    gc.disable()
+    try:
+        with Pipeline(settings, "numpy", predict=False) as pipeline:
+            pipeline.process(noise(settings))
+        del pipeline
+        gc.set_debug(gc.DEBUG_SAVEALL)
+        gc.collect()
+        own = [type(each).__name__ for each in gc.garbage if type(each).__module__.startswith("ertis_numba")]
+    finally:
+        gc.set_debug(0)
+        gc.garbage.clear()
+        gc.enable()
+    assert own == []

@@ -18,6 +18,7 @@ from ertis_numba.stages.beamform import whole_limits
 from ertis_numba.stages.costs import Work
 from ertis_numba.stages.error_model import PARTS, ErrorModel, SignalModel
 from ertis_numba.stages.focal_zones import squared_curvature
+from ertis_numba.stages.instance_cache import cached_in_instance
 from ertis_numba.stages.interpolation_fit import DelayFit, Spectrum
 from ertis_numba.stages.phase_shifts import SHIFT_BYTES, SHIFT_TABLE_BYTES, rows_at_a_time
 from ertis_numba.stages.plan_elements import (
@@ -116,8 +117,6 @@ class PlanModel:
     aperture : Aperture
     window : TimeWindow
     n_mics, n_directions : int
-    delays, nodes, filter : callable
-        Cached predictions for a delay interpolation, a beam grid and a stopband attenuation.
     """
 
     def __init__(self, settings: Settings, signal_model: SignalModel | None, *, tile_ranges: int) -> None:
@@ -141,12 +140,6 @@ class PlanModel:
         self.window = time_window(settings, largest_delay_s=self._reach_s(), n_taps=1)
         if settings.accuracy.beam_taps:
             require_beam_grid(self.aperture, len(self.window.range_m))
-        self.delays = functools.cache(self._made_delays)
-        self._zones = functools.cache(self._made_zones)
-        self.nodes = functools.cache(self._made_nodes)
-        self.filter = functools.cache(self._made_filter)
-        self._windows = functools.cache(self._made_window)
-        self.streams = functools.cache(self._made_streams)
         recipe = recipe_of(settings.processing)
         self.has_streams = settings.processing.is_adaptive and recipe is not None
         self._stream_planner = (
@@ -223,7 +216,9 @@ class PlanModel:
             parts["samples"] += _COHERENCE_ERROR / linear
         return parts
 
-    def _made_streams(self, plan: ImagePlan) -> PlannedStreams:
+    @cached_in_instance
+    def streams(self, plan: ImagePlan) -> PlannedStreams:
+        """Return the streams of a plan."""
         assert self._stream_planner is not None  # noqa: S101
         delays_s = self._few_delays(1 / (self.settings.output_rate_hz * plan.n_phases))
         return self._stream_planner.plan(plan.n_phases, plan.delay_taps, plan.beam_taps, plan.density, delays_s)
@@ -310,14 +305,17 @@ class PlanModel:
         curvature_2 = squared_curvature(self.window.range_m, self._zones(count))
         return self._zone_scale * curvature_2
 
-    def _made_zones(self, count: int) -> list[tuple[int, int, float]]:
+    @cached_in_instance
+    def _zones(self, count: int) -> list[tuple[int, int, float]]:
         return zones_of(self.settings.replace(accuracy=self.settings.accuracy.replace(focal_zones=count)))
 
     @functools.cached_property
     def _zone_scale(self) -> float:
         return self.errors.zones(self.aperture, 1.0, sound_speed_m_s=self._speed_m_s)
 
-    def _made_delays(self, n_phases: int, n_taps: int) -> Delays:
+    @cached_in_instance
+    def delays(self, n_phases: int, n_taps: int) -> Delays:
+        """Return the prediction for an interpolation of delays."""
         step_s = 1 / (self.settings.output_rate_hz * n_phases)
         fit, weights = _fitted(self._spectrum, n_taps, step_s)
         delays_s = self._few_delays(step_s)
@@ -340,7 +338,9 @@ class PlanModel:
         high_hz = self.settings.call.high_frequency_hz
         return _Beams(self.aperture, self._spectrum, n_taps, density, high_hz, self._speed_m_s, self._nearest_m)
 
-    def _made_nodes(self, n_taps: int, density: float) -> Nodes:
+    @cached_in_instance
+    def nodes(self, n_taps: int, density: float) -> Nodes:
+        """Return the prediction for a beam grid."""
         require_beam_grid(self.aperture, len(self.window.range_m))
         beams = self._beams(n_taps, density)
         if self.errors.needs_steering and math.isinf(self._nearest_m):
@@ -353,7 +353,9 @@ class PlanModel:
         n_pairs = n_taps**self.aperture.n_axes // 2
         return Nodes(self.count_grid_points(n_taps, density), n_pairs, error, squares, grid)
 
-    def _made_filter(self, stopband_attenuation_db: float) -> tuple[NDArray[Any], float]:
+    @cached_in_instance
+    def filter(self, stopband_attenuation_db: float) -> tuple[NDArray[Any], float]:
+        """Return the taps of a decimation filter, and their error."""
         try:
             taps = chain_taps(self.settings.replace(accuracy=Accuracy(stopband_attenuation_db=stopband_attenuation_db)))
         except ArgumentError:
@@ -383,7 +385,8 @@ class PlanModel:
         low_hz, high_hz = matched_band_hz(self.settings)
         return math.ceil((high_hz - low_hz) * window.n_fft / self.settings.signal_rate_hz)
 
-    def _made_window(self, stopband_attenuation_db: float) -> TimeWindow:
+    @cached_in_instance
+    def _windows(self, stopband_attenuation_db: float) -> TimeWindow:
         """Return the window of a plan, whose ringing depends on its stopband attenuation."""
         accuracy = self.settings.accuracy.replace(stopband_attenuation_db=stopband_attenuation_db)
         ringing = ringing_db(self.settings.replace(accuracy=accuracy))
