@@ -264,12 +264,9 @@ def test_rate_is_validated(tmp_path):
     path = stored(tmp_path / "a.h5", sound())
     with pytest.raises(ArgumentError, match="nominal_rate_hz is nan; give a"):
         check_recording(path, nominal_rate_hz=float("nan"))
-    assert run(path, "--rate", "nan", code=1).stderr.startswith("ertis: error: --rate is nan; give a finite number")
+    assert run(path, "--rate", "nan", code=2).stderr.startswith("ertis: error: --rate is nan; give a finite number")
     assert "-1.0 is not in the range x>0" in run(path, "--rate", "-1", code=2).stderr
-    assert (
-        run(path, "--rate", "1e9", code=1).stderr
-        == "ertis: error: --rate is 1e+09; give a number from 1e-06 to 1e+06\n"
-    )
+    assert "--rate is 1e+09; give a number from 1e-06 to 1e+06; see" in run(path, "--rate", "1e9", code=2).stderr
 
 
 # Output.

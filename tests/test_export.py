@@ -144,7 +144,7 @@ CASES = {
         "option --top is given, but format 'npz' does not have it; leave it out, or write mcap, ply, pcd or csv",
     ),
     "levels of signals": ("rec.h5 -o a.h5 -m 0 --min-level -9", 1, "option --min-level is given, but format"),
-    "no points": ("img.h5 -o a.csv --top 0", 1, "top is 0; give a whole number of at least 1"),
+    "no points": ("img.h5 -o a.csv --top 0", 2, "--top is 0; give a whole number of at least 1"),
     "over the input": ("rec.h5 -o rec.h5 --force -m 0", 1, "output rec.h5 is the input itself; give another name"),
     "exists": ("img.h5 -o both.h5 --format csv", 1, "output both.h5 exists; give another name, or ask to overwrite"),
     "no folder": (

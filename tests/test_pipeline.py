@@ -281,7 +281,7 @@ def test_read_only_samples_cause_no_compilation():
 
 @pytest.mark.parametrize("changes", [{}, {"beamformer": "dmas"}, {"method": "paper"}], ids=["default", "DMAS", "paper"])
 def test_pipeline_is_freed_without_the_garbage_collector(changes):
-    """Tables of plans have up to 40 MB."""
+    """Plans had references to themselves, which kept their tables."""
     settings = SHORT.replace(processing=SHORT.processing.replace(**changes))
     Pipeline(settings, "numpy", predict=False).close()  # fills the caches of the package
     gc.collect()

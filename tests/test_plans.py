@@ -146,9 +146,7 @@ def test_verify_writes_no_image_beyond_the_budget(recording, tmp_path, monkeypat
 
 def test_unreachable_budget_is_refused(recording, tmp_path):
     done = run(recording, "-o", tmp_path / "a.h5", "--max-error", -150, code=1)
-    assert done.stderr.splitlines()[-1].startswith(
-        "ertis: error: accuracy.max_error_db is -150, but the smallest error"
-    )
+    assert done.stderr.splitlines()[-1].startswith("ertis: error: --max-error is -150, but the smallest error")
     assert [item.name for item in tmp_path.iterdir()] == ["rec.h5"]
 
 

@@ -124,7 +124,7 @@ def test_options_override_the_preset_which_overrides_the_settings_file(recording
 
 
 def test_serve_refuses_an_unknown_preset_before_it_listens():
-    done = run("serve", "--listen", "tcp://127.0.0.1:0", "--preset", "2d_18_5m", code=1)
+    done = run("serve", "--listen", "tcp://127.0.0.1:0", "--preset", "2d_18_5m", code=2)
     assert "preset '2d_18_5m' is unknown" in done.stderr
 
 

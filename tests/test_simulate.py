@@ -139,7 +139,7 @@ def test_tolerance_selects_the_effects(scene_file):
         ("sede = 1", (), 1, r"scene\.toml.*unknown key `sede`; correct it or remove it"),
         ("[[sensors]]\narray.layout = 'eRTIS'", (), 1, "layout 'eRTIS' is unknown"),
         ("", ("--sensor", "left"), 1, "sensor 'left' is unknown; known are sensor"),
-        ("", ("--tolerance-db", "-1"), 1, "--tolerance-db is -1; give a number from 0 to 60"),
+        ("", ("--tolerance-db", "-1"), 2, "--tolerance-db is -1; give a number from 0 to 60"),
         ("", ("--count", "0"), 2, "--count"),
         ("", ("--seed", "-1"), 2, "--seed"),
     ],

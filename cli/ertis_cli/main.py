@@ -175,6 +175,7 @@ def cli(ctx: click.Context) -> None:
     """Process in-air imaging sonar, from one-bit microphones to energyscapes.
 
     Results go to stdout, everything else to stderr. Exit codes: 0 success, 1 failure, 2 wrong usage, 130 interrupted.
+    An option value that no file could suit is wrong usage.
     Options on the command line override environment variables such as ERTIS_PROCESS_MAX_ERROR. Variables override
     the file given with --config.
     """
