@@ -43,6 +43,12 @@ from .fusion import Fused as Fused, Fuser as Fuser, fuse as fuse
 from .geometry import layout_names as layout_names, load_layout as load_layout
 from .interop import export as export, open_pcm as open_pcm, open_raw as open_raw, open_rtis_folder as open_rtis_folder
 from .journal import JournalEntry as JournalEntry
+from .motion import (
+    EgoVelocity as EgoVelocity,
+    Odometry as Odometry,
+    PlanarPose as PlanarPose,
+    ego_velocity as ego_velocity,
+)
 from .network.allow_list import AllowList as AllowList, Permission as Permission
 from .network.central_client import CentralClient as CentralClient
 from .network.keys import ClientKeys as ClientKeys, KeyPair as KeyPair, ServerKeys as ServerKeys

@@ -15,6 +15,7 @@ from ertis_bench.gpu_tables import gpu, gpu_short
 from ertis_bench.health_trials.table import health
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table as _table
+from ertis_bench.motion import form as motion
 from ertis_bench.network.latency import latency
 from ertis_bench.network.table import network
 from ertis_bench.paper import DIRECTIONS, PUBLISHED_MS, RESTRICTED
@@ -36,6 +37,7 @@ __all__ = [
     "health",
     "latency",
     "many",
+    "motion",
     "network",
     "paper",
     "peers",
@@ -307,5 +309,6 @@ FORMS: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
     "points": {"points": points},
     "calibration": {"calibration": calibration},
     "fusion": {"fusion": fusion},
+    "motion": {"motion": motion},
 }
 """Forms of the table of each command, by the name in the markers. The markers of a file select the form."""

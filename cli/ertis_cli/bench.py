@@ -267,6 +267,28 @@ def fusion(**given: Any) -> None:
 
 
 @bench.command()
+@click.option("--count", type=click.IntRange(min=1), default=20, show_default=True, metavar="N", help="Rooms.")
+@click.option(
+    "--length",
+    "length_m",
+    type=click.FloatRange(min=0.0),
+    default=0.0,
+    show_default=True,
+    metavar="M",
+    help="Length of a path through a hall; 0 leaves out the hall.",
+)
+@_seed("Seed of the first room.")
+@_update
+@options.quiet
+@options.as_json
+def motion(**given: Any) -> None:
+    """Measure errors of ego-velocity and odometry."""
+    from ertis_bench import motion as benchmark
+
+    _run("motion", benchmark, **given)
+
+
+@bench.command()
 @_count(30)
 @_update
 @options.quiet

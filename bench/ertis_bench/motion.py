@@ -1,0 +1,117 @@
+"""Errors of ego-velocity in furnished rooms, and of odometry along the walls of a hall.
+
+Images are simulated through PDM. Nothing is timed except the estimates themselves.
+"""
+
+import math
+import time
+from collections.abc import Callable
+from typing import Any, Final
+
+import numpy as np
+
+import ertis_numba as ertis
+from ertis_bench import machine
+from ertis_bench.furnished_rooms import PlatformImager, drive, mountings, random_hall, random_motion, random_room
+from ertis_bench.machine import sentence
+from ertis_bench.markdown import table
+
+__all__ = ["form", "run"]
+
+_TIME_S: Final = 0.1
+_TO_SHOWN: Final = np.array([1.0, 1.0, math.degrees(1.0)])
+
+
+def run(*, count: int, length_m: float, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
+    """Estimate velocities in random rooms, and the path through a hall.
+
+    Parameters
+    ----------
+    count : int
+        Number of rooms.
+    length_m : float
+        Length of the path; 0 leaves out the hall.
+    seed : int
+        Seed of the first room, and of the hall.
+    say : callable
+        Function that reports progress.
+    """
+    errors, deviations, seconds = [], [], []
+    for number in range(seed, seed + count):
+        motion = random_motion(number)
+        imager = PlatformImager(random_room(number), number)
+        before, after = imager(motion, 0, 0.0), imager(motion.after(_TIME_S), 1, _TIME_S)
+        imager.close()
+        begin_s = time.perf_counter()
+        found = ertis.ego_velocity(before, after, mountings())
+        seconds.append(time.perf_counter() - begin_s)
+        estimate = np.array([*found.velocity_m_s, found.yaw_rate_rad_s])
+        errors.append((estimate - [motion.forward_m_s, motion.left_m_s, motion.yaw_rate_rad_s]) * _TO_SHOWN)
+        deviations.append(found.sd * _TO_SHOWN)
+        say(f"room {number}: errors {errors[-1].round(4).tolist()}")
+    error, deviation = np.array(errors), np.array(deviations)
+    return {
+        "machine": machine.describe(),
+        "count": count,
+        "seed": seed,
+        "rms": np.sqrt(np.mean(error**2, axis=0)).tolist(),
+        "predicted": np.sqrt(np.mean(deviation**2, axis=0)).tolist(),
+        "largest": np.max(np.abs(error), axis=0).tolist(),
+        "median_s": float(np.median(seconds)),
+        "hall": _hall(seed, length_m, say) if length_m else None,
+    }
+
+
+def _hall(seed: int, length_m: float, say: Callable[[str], None]) -> dict[str, Any]:
+    """Return errors of odometry along a closed path through a hall."""
+    imager = PlatformImager(random_hall(seed), seed)
+    odometry = ertis.Odometry(mountings())
+    motions = drive(length_m, _TIME_S)
+    start = motions[0]
+    c, s = math.cos(start.yaw_rad), math.sin(start.yaw_rad)
+    errors_m, unmeasured = [], 0
+    for number, motion in enumerate(motions):
+        odometry.add(imager(motion, number, number * _TIME_S))
+        pose = odometry.poses[-1]
+        x, y = motion.x_m - start.x_m, motion.y_m - start.y_m
+        errors_m.append(math.hypot(pose.x_m - c * x - s * y, pose.y_m + s * x - c * y))
+        unmeasured += not pose.is_measured
+        if number % 20 == 0:
+            say(f"group {number} of {len(motions)}: {errors_m[-1]:.3f} m off after {odometry.length_m:.1f} m")
+    imager.close()
+    yaw_error_rad = math.remainder(odometry.poses[-1].yaw_rad - motions[-1].yaw_rad + start.yaw_rad, 2 * math.pi)
+    return {
+        "length_m": length_m,
+        "n_groups": len(motions),
+        "unmeasured": unmeasured,
+        "end_m": errors_m[-1],
+        "largest_m": max(errors_m),
+        "yaw_deg": math.degrees(yaw_error_rad),
+        "predicted_m": float(np.sqrt(np.trace(odometry.poses[-1].covariance[:2, :2]))),
+    }
+
+
+def form(report: dict[str, Any]) -> str:
+    """Return the report as Markdown."""
+    names = ("forward (m/s)", "left (m/s)", "yaw rate (°/s)")
+    rows = [
+        [name, f"{rms:.4f}", f"{predicted:.4f}", f"{rms / predicted:.2f}", f"{largest:.4f}"]
+        for name, rms, predicted, largest in zip(
+            names, report["rms"], report["predicted"], report["largest"], strict=True
+        )
+    ]
+    text = (
+        f"{table(['quantity', 'RMS error', 'predicted', 'ratio', 'largest error'], rows)}\n\n"
+        f"{report['count']} furnished rooms from seed {report['seed']}, with four sensors that emit together, at up to "
+        f"1.5 m/s and 90°/s, from two groups of images {_TIME_S:g} s apart. An estimate takes "
+        f"{1e3 * report['median_s']:.0f} ms (median)."
+    )
+    hall = report["hall"]
+    if hall:
+        text += (
+            f" Odometry over {hall['length_m']:.0f} m of a hall, {hall['n_groups']} groups: {hall['end_m']:.2f} m off "
+            f"at the end, {hall['end_m'] / hall['length_m']:.1%} of the path (predicted {hall['predicted_m']:.2f} m), "
+            f"and {hall['largest_m']:.2f} m at most. Yaw is {abs(hall['yaw_deg']):.1f}° off at the end, and "
+            f"{hall['unmeasured']} groups have too few matches."
+        )
+    return f"{text} {sentence(report['machine'])}"

@@ -1,0 +1,134 @@
+"""Echoes of the sensors of a platform: places, uncertainties and instants."""
+
+import math
+from collections.abc import Mapping
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.air import sound_speed_m_s
+from ertis_numba.analysis.points import PointExtractor
+from ertis_numba.errors import ArgumentError
+from ertis_numba.frames import Energyscape, PointCloud
+from ertis_numba.fusion.rig import MountedSensor
+from ertis_numba.geometry import Grid
+from ertis_numba.settings import Call
+
+__all__ = ["EchoExtractor", "GroupEchoes"]
+
+Floats = NDArray[np.float64]
+
+_TOP: Final = 96  # Points per image.
+_MIN_LEVEL_DB: Final = -25.0
+# Errors that noise does not explain: echoes of neighbouring reflectors overlap, and differently so in each image.
+_RANGE_SD_M: Final = 1.5e-3
+_ANGLE_SD_RAD: Final = math.radians(0.25)
+# A flat array hardly resolves directions along its plane, and maxima at the edge of a grid move with the sensor.
+_MAX_OFF_AXIS_RAD: Final = math.radians(55.0)
+_NEAREST_M: Final = 0.05
+
+
+class GroupEchoes(NamedTuple):
+    """Echoes of all sensors in one group of images, as arrays of equal length.
+
+    Attributes
+    ----------
+    sensor : (echo,) int64
+        Index of the sensor.
+    position_m : (echo, axis) float64
+        Position in the frame of the platform.
+    range_m, azimuth_rad : (echo,) float64
+        Distance and azimuth from the sensor, both along the axes of the platform.
+    range_sd_m, azimuth_sd_rad : (echo,) float64
+    level : (echo,) float64
+        Natural logarithm of the amplitude.
+    delay_s : (echo,) float64
+        Time after the start of the emission at which the platform was where the range applies.
+    """
+
+    sensor: NDArray[np.int64]
+    position_m: Floats
+    range_m: Floats
+    azimuth_rad: Floats
+    range_sd_m: Floats
+    azimuth_sd_rad: Floats
+    level: Floats
+    delay_s: Floats
+
+
+class EchoExtractor:
+    """Extractor of the echoes of images or point clouds, with tables computed once for each sensor.
+
+    Parameters
+    ----------
+    poses : tuple of MountedSensor
+        Sensors of the platform.
+    """
+
+    def __init__(self, poses: tuple[MountedSensor, ...]) -> None:
+        self._poses = {pose.name: (number, pose) for number, pose in enumerate(poses)}
+        self._extractors: dict[str, tuple[tuple[int, ...], PointExtractor]] = {}
+
+    def __call__(self, group: Mapping[str, Energyscape | PointCloud]) -> GroupEchoes:
+        """Return the echoes of a group of images or point clouds, by sensor."""
+        parts = [self._echoes(item) for item in group.values()]
+        return GroupEchoes(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+    def _echoes(self, item: Energyscape | PointCloud) -> GroupEchoes:
+        cloud = self._cloud(item) if isinstance(item, Energyscape) else item
+        if item.stamp.sensor not in self._poses:
+            raise ArgumentError(
+                f"sensor {item.stamp.sensor!r} has no mounting; give its mounting, or one of {', '.join(self._poses)}"
+            )
+        number, pose = self._poses[item.stamp.sensor]
+        local_m = cloud.position_m.astype(np.float64)
+        off_axis = np.arctan2(np.hypot(local_m[:, 1], local_m[:, 2]), local_m[:, 0])
+        is_sharp = off_axis < _MAX_OFF_AXIS_RAD
+        cloud = cloud.replace(
+            position_m=cloud.position_m[is_sharp],
+            amplitude=cloud.amplitude[is_sharp],
+            uncertainty_m=None if cloud.uncertainty_m is None else cloud.uncertainty_m[is_sharp],
+        )
+        local_m, off_axis = local_m[is_sharp], off_axis[is_sharp]
+        range_m = np.maximum(_NEAREST_M, np.linalg.norm(local_m, axis=1))
+        from_sensor_m = local_m @ pose.rotation.T
+        range_sd_m, across_sd_m = _deviations(cloud).T
+        speed_m_s = sound_speed_m_s(cloud.settings.air)
+        return GroupEchoes(
+            np.full(len(cloud), number),
+            from_sensor_m + pose.translation_m,
+            range_m,
+            np.arctan2(from_sensor_m[:, 1], from_sensor_m[:, 0]),
+            np.hypot(range_sd_m, _RANGE_SD_M),
+            np.hypot(across_sd_m / range_m, _ANGLE_SD_RAD / np.cos(off_axis)),
+            np.log(np.maximum(cloud.amplitude.astype(np.float64), np.finfo(np.float32).tiny)),
+            range_m / speed_m_s - _sweep_delay_s(cloud.settings.call),
+        )
+
+    def _cloud(self, image: Energyscape) -> PointCloud:
+        known = self._extractors.get(image.stamp.sensor)
+        if known is None or known[0] != image.amplitude.shape:
+            grid = Grid(image.azimuth_rad, image.elevation_rad)
+            made = PointExtractor(image.settings, grid, top=_TOP, min_level_db=_MIN_LEVEL_DB)
+            known = self._extractors[image.stamp.sensor] = image.amplitude.shape, made
+        return known[1](image)
+
+
+def _deviations(cloud: PointCloud) -> Floats:
+    """Return standard deviations along and across the range, 0 where they are unknown: (point, 2) float64."""
+    if cloud.uncertainty_m is None:
+        return np.zeros((len(cloud), 2))
+    given_m = cloud.uncertainty_m.astype(np.float64)
+    return np.asarray(np.where(np.isfinite(given_m), given_m, 0.0))
+
+
+def _sweep_delay_s(call: Call) -> float:
+    """Return how much earlier than at the emission the measured range applies.
+
+    A hyperbolic sweep that is stretched by motion is the same sweep at another time, so its echo from a reflector that
+    approaches at speed v appears ``v T / (f_start / f_stop - 1)`` too far: where the reflector was that time ago.
+    """
+    if call.modulation != "hyperbolic" or call.start_frequency_hz == call.stop_frequency_hz:
+        return 0.0
+    return call.duration_s / (call.start_frequency_hz / call.stop_frequency_hz - 1)

@@ -1,0 +1,267 @@
+"""Robust fit of the motion of a platform to the flow of echoes."""
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.fusion.rig import MountedSensor
+from ertis_numba.motion.echoes import GroupEchoes
+
+__all__ = ["FlowFit", "fit_flow", "twist_of"]
+
+Floats = NDArray[np.float64]
+
+MAX_SPEED_M_S: Final = 2.0
+MAX_YAW_RATE_RAD_S: Final = math.radians(120.0)
+_N_STEPS: Final = 17, 17, 17  # of the search over x, y and yaw
+_SEARCH_SD: Final = 0.02, math.radians(2.0)
+_SCALES: Final = 8.0, 5.0, 3.0, 2.0, 1.4, 1.0
+_N_STARTS: Final = 4
+_STRONGEST: Final = 40  # Number of echoes per sensor that the search uses.
+_ROUNDS: Final = 8
+_MAX_LEVEL_CHANGE: Final = math.log(4.0)  # of amplitudes, 12 dB
+_OUTLIER: Final = math.exp(-0.5 * 9.0)  # Likelihood of an echo without a partner: three standard deviations.
+_GATE: Final = 9.0
+_STEP: Final = 1e-6
+# Errors of neighbouring echoes are correlated, so residuals underestimate those of the motion by these factors. They
+# were measured in simulated rooms other than those of `ertis bench motion`.
+_INFLATION: Final = np.diag([1.25, 1.25, 1.6])
+
+
+class FlowFit(NamedTuple):
+    """Displacement of a platform between two groups of echoes.
+
+    Attributes
+    ----------
+    displacement : (3,) float64
+        x and y in metres and yaw in radians, in the frame of the platform at the first group.
+    covariance : (3, 3) float64
+    n_matches : int
+        Number of echoes that the displacement explains.
+    share : float
+        Share of echoes that the displacement explains.
+    """
+
+    displacement: Floats
+    covariance: Floats
+    n_matches: int
+    share: float
+
+
+class _EchoPairs(NamedTuple):
+    """Echoes of both groups that may come from the same reflector."""
+
+    before: NDArray[np.int64]
+    after: NDArray[np.int64]
+
+
+def twist_of(displacement: Floats, time_s: float) -> Floats:
+    """Return the constant velocity in the frame of the platform that causes a displacement: x, y and yaw per second."""
+    x, y, yaw = displacement.tolist()
+    half = yaw / 2
+    # Inverse of the chord of an arc, turned back by half of the angle.
+    grow = 1 / float(np.sinc(half / math.pi))
+    c, s = math.cos(half) * grow, math.sin(half) * grow
+    return np.array([c * x + s * y, c * y - s * x, yaw]) / time_s
+
+
+def _predicted(
+    displacement: Floats,
+    before: GroupEchoes,
+    poses: tuple[MountedSensor, ...],
+    first_m_s: Floats,
+    velocity_m_s: Floats,
+) -> tuple[Floats, Floats]:
+    """Return range and azimuth of echoes after a displacement: two (echo,) float64.
+
+    An echo shows its reflector from where the platform is when sound meets it, rather than at the emission.
+    """
+    flat_m = before.position_m[:, :2] + before.delay_s[:, None] * first_m_s - displacement[:2]
+    c, s = math.cos(displacement[2]), math.sin(displacement[2])
+    x_m, y_m = flat_m @ np.array([c, s]), flat_m @ np.array([-s, c])
+    offset_m = np.array([pose.translation_m for pose in poses])[before.sensor]
+    x_m, y_m, z_m = x_m - offset_m[:, 0], y_m - offset_m[:, 1], before.position_m[:, 2] - offset_m[:, 2]
+    # The second range applies at its own instant, which the first one approximates within a millisecond.
+    x_m, y_m = x_m - before.delay_s * velocity_m_s[0], y_m - before.delay_s * velocity_m_s[1]
+    range_m = np.sqrt(x_m**2 + y_m**2 + z_m**2)
+    change_s = (range_m - before.range_m) * (before.delay_s / before.range_m)
+    x_m, y_m = x_m - change_s * velocity_m_s[0], y_m - change_s * velocity_m_s[1]
+    return np.sqrt(x_m**2 + y_m**2 + z_m**2), np.arctan2(y_m, x_m)
+
+
+class _Flow:
+    """Residuals of pairs of echoes, in standard deviations."""
+
+    def __init__(
+        self,
+        before: GroupEchoes,
+        after: GroupEchoes,
+        poses: tuple[MountedSensor, ...],
+        time_s: float,
+        velocities_m_s: tuple[Floats, Floats] | None,
+    ) -> None:
+        self.before, self.after, self._poses, self._time_s = before, after, poses, time_s
+        self._velocities_m_s = velocities_m_s
+
+    def pairs(self, reach_m: float, reach_rad: float) -> _EchoPairs:
+        """Return the pairs of the same sensor whose range, azimuth and level differ little."""
+        before, after = self.before, self.after
+        near = before.sensor[:, None] == after.sensor
+        near &= np.abs(before.range_m[:, None] - after.range_m) < reach_m
+        near &= np.abs(_turn(before.azimuth_rad[:, None] - after.azimuth_rad)) < reach_rad
+        near &= np.abs(before.level[:, None] - after.level) < _MAX_LEVEL_CHANGE
+        return _EchoPairs(*np.nonzero(near))
+
+    def residual(self, displacement: Floats, pairs: _EchoPairs) -> Floats:
+        """Return observed minus predicted range and azimuth: (2, pair) float64, in metres and radians."""
+        constant_m_s = twist_of(displacement, self._time_s)[:2]
+        velocities_m_s = self._velocities_m_s or (constant_m_s, constant_m_s)
+        range_m, azimuth_rad = _predicted(displacement, self.before, self._poses, *velocities_m_s)
+        return np.stack(
+            [
+                self.after.range_m[pairs.after] - range_m[pairs.before],
+                _turn(self.after.azimuth_rad[pairs.after] - azimuth_rad[pairs.before]),
+            ]
+        )
+
+    def slopes(self, displacement: Floats, pairs: _EchoPairs) -> Floats:
+        """Return derivatives of the predictions: (2, pair, 3) float64."""
+        columns = []
+        for number in range(3):
+            step = np.zeros(3)
+            step[number] = _STEP
+            change = self.residual(displacement - step, pairs) - self.residual(displacement + step, pairs)
+            columns.append(change / (2 * _STEP))
+        return np.stack(columns, axis=2)
+
+    def deviations(self, pairs: _EchoPairs) -> Floats:
+        """Return the standard deviations of residuals: (2, pair) float64."""
+        before, after = self.before, self.after
+        return np.stack(
+            [
+                np.hypot(before.range_sd_m[pairs.before], after.range_sd_m[pairs.after]),
+                np.hypot(before.azimuth_sd_rad[pairs.before], after.azimuth_sd_rad[pairs.after]),
+            ]
+        )
+
+
+def fit_flow(
+    before: GroupEchoes,
+    after: GroupEchoes,
+    poses: tuple[MountedSensor, ...],
+    time_s: float,
+    *,
+    start: Floats | None = None,
+    reach: Floats | None = None,
+    velocities_m_s: tuple[Floats, Floats] | None = None,
+) -> FlowFit | None:
+    """Return the displacement that explains most echoes, or None if there are too few.
+
+    Parameters
+    ----------
+    before, after : GroupEchoes
+    poses : tuple of MountedSensor
+    time_s : float
+        Time between both groups.
+    start, reach : (3,) float64, optional
+        Expected displacement, and the largest difference from it.
+    velocities_m_s : two (2,) float64, optional
+        Velocities at both groups, each in the frame of the platform; by default, constant between them.
+    """
+    flow = _Flow(before, after, poses, time_s, velocities_m_s)
+    centre = np.zeros(3) if start is None else start
+    limit = np.array([MAX_SPEED_M_S, MAX_SPEED_M_S, MAX_YAW_RATE_RAD_S]) * time_s if reach is None else reach
+    reach_m = float(np.hypot(*np.abs(centre[:2]))) + float(np.hypot(*limit[:2])) + 0.05
+    reach_rad = float(abs(centre[2]) + limit[2]) + math.radians(15)
+    pairs = flow.pairs(reach_m, reach_rad)
+    if len(pairs.before) < 4:
+        return None
+    best = max(
+        (_annealed(flow, pairs, each) for each in _starts(flow, pairs, centre, limit)), key=lambda found: found[1]
+    )
+    return _final(flow, pairs, best[0])
+
+
+def _starts(flow: _Flow, pairs: _EchoPairs, centre: Floats, limit: Floats) -> Floats:
+    """Return the most likely displacements of a grid: (start, 3) float64."""
+    axes = [c + most * np.linspace(-1, 1, n) for c, most, n in zip(centre, limit, _N_STEPS, strict=True)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    strong = (_rank(flow.before)[pairs.before] < _STRONGEST) & (_rank(flow.after)[pairs.after] < _STRONGEST)
+    pairs = _EchoPairs(pairs.before[strong], pairs.after[strong])
+    sd = np.array(_SEARCH_SD)[:, None]
+    residual = flow.residual(centre, pairs) / sd
+    slopes = flow.slopes(centre, pairs) / sd[:, :, None]
+    score = np.empty(len(grid))
+    for part in np.array_split(np.arange(len(grid)), max(1, len(grid) * len(pairs.before) // 500_000)):
+        offset = grid[part] - centre
+        square = sum((residual[axis][:, None] - slopes[axis] @ offset.T) ** 2 for axis in (0, 1))
+        score[part] = np.sum(np.maximum(0.0, 1 - square / _GATE) ** 2, axis=0)
+    found: list[Floats] = []
+    step = np.array([2 * most / (n - 1) for most, n in zip(limit, _N_STEPS, strict=True)])
+    for place in np.argsort(-score):
+        if all(np.any(np.abs(grid[place] - other) > 2.5 * step) for other in found):
+            found.append(grid[place])
+            if len(found) == _N_STARTS:
+                break
+    return np.array(found)
+
+
+def _rank(echoes: GroupEchoes) -> NDArray[np.int64]:
+    """Return the number of stronger echoes of the same sensor: (echo,) int64."""
+    order = np.lexsort((-echoes.level, echoes.sensor))
+    sensor = echoes.sensor[order]
+    rank = np.empty(len(order), dtype=np.int64)
+    rank[order] = np.arange(len(order)) - np.searchsorted(sensor, sensor)
+    return rank
+
+
+def _weights(square: Floats, pairs: _EchoPairs, n_before: int, n_after: int) -> Floats:
+    """Return the probability of each pair, in which each echo has at most one partner."""
+    likelihood = np.exp(-0.5 * np.minimum(square, 200.0))
+    of_before = np.bincount(pairs.before, likelihood, n_before)[pairs.before]
+    of_after = np.bincount(pairs.after, likelihood, n_after)[pairs.after]
+    return likelihood / (np.maximum(of_before, of_after) + _OUTLIER)
+
+
+def _annealed(flow: _Flow, pairs: _EchoPairs, displacement: Floats) -> tuple[Floats, float]:
+    """Return the displacement after a fit with decreasing tolerance, and its likelihood."""
+    sd = flow.deviations(pairs)
+    weight = np.zeros(len(pairs.before))
+    for scale in (*_SCALES, *([1.0] * _ROUNDS)):
+        residual = flow.residual(displacement, pairs) / sd
+        weight = _weights(np.sum(residual**2, axis=0) / scale**2, pairs, len(flow.before.level), len(flow.after.level))
+        slopes = flow.slopes(displacement, pairs) / sd[:, :, None]
+        step = _solved(slopes, residual, weight)
+        displacement = displacement + step
+    return displacement, float(np.sum(weight))
+
+
+def _solved(slopes: Floats, residual: Floats, weight: Floats) -> Floats:
+    normal = np.einsum("apx,p,apy->xy", slopes, weight, slopes)
+    right = np.einsum("apx,p,ap->x", slopes, weight, residual)
+    ridge = 1e-9 * np.trace(normal) * np.eye(3) + 1e-12 * np.eye(3)
+    return np.asarray(np.linalg.solve(normal + ridge, right))
+
+
+def _final(flow: _Flow, pairs: _EchoPairs, displacement: Floats) -> FlowFit | None:
+    """Return the fit to the pairs that remain, with its covariance from their residuals."""
+    sd = flow.deviations(pairs)
+    residual = flow.residual(displacement, pairs) / sd
+    n_before, n_after = len(flow.before.level), len(flow.after.level)
+    weight = _weights(np.sum(residual**2, axis=0), pairs, n_before, n_after)
+    slopes = flow.slopes(displacement, pairs) / sd[:, :, None]
+    normal = np.einsum("apx,p,apy->xy", slopes, weight, slopes)
+    n_matches = int(np.sum(weight > 0.5))
+    if n_matches < 3 or np.linalg.matrix_rank(normal, hermitian=True) < 3:
+        return None
+    spread = np.einsum("apx,p,ap,apy->xy", slopes, weight**2, residual**2, slopes)
+    inverse = np.linalg.inv(normal)
+    covariance = _INFLATION @ inverse @ spread @ inverse @ _INFLATION
+    return FlowFit(displacement, covariance, n_matches, n_matches / max(1, min(n_before, n_after)))
+
+
+def _turn(angle_rad: Floats) -> Floats:
+    """Return angles between -π and π."""
+    return np.asarray((angle_rad + math.pi) % (2 * math.pi) - math.pi)

@@ -1,0 +1,229 @@
+"""Odometry: path of a platform by integrating its motion between groups of images."""
+
+import math
+from collections.abc import Iterable
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.errors import DataError
+from ertis_numba.fusion.rig import Mountings, sensor_poses
+from ertis_numba.motion.echoes import GroupEchoes, EchoExtractor
+from ertis_numba.motion.flow import FlowFit, fit_flow, twist_of
+from ertis_numba.motion.velocity import MAX_TIME_S, EgoVelocity, Item, grouped, stamp_of, velocity_of
+
+__all__ = ["Odometry", "PlanarPose"]
+
+Floats = NDArray[np.float64]
+
+# Changes of speed and yaw rate between two groups that the search covers.
+_MAX_CHANGE: Final = np.array([0.6, 0.6, math.radians(60.0)])
+_KEYFRAME_REACH: Final = np.array([0.02, 0.02, math.radians(2.0)])
+_KEYFRAME_M: Final = 0.3
+_KEYFRAME_RAD: Final = math.radians(15.0)
+_KEYFRAME_SHARE: Final = 0.5  # Share of the matches of the last two groups that a keyframe still has.
+_UNKNOWN_VARIANCE: Final = np.diag([0.5, 0.5, 1.0]) ** 2  # per second of a gap, of constant velocity
+
+
+class PlanarPose(NamedTuple):
+    """Pose of a platform in the plane, relative to its pose at the first group.
+
+    Attributes
+    ----------
+    timestamp_ns : int
+    x_m, y_m, yaw_rad : float
+    covariance : (3, 3) float64
+        Covariance of x, y and yaw since the start, in metres and radians.
+    is_measured : bool
+        False if too few echoes matched, so that the pose assumes that the last velocity continued.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import ertis_numba as ertis
+    >>> pose = ertis.PlanarPose(0, 0.0, 0.0, np.pi / 2, np.zeros((3, 3)))
+    >>> moved = pose.moved(np.array([1.0, 0.0, 0.0]), np.zeros((3, 3)), 100_000_000, is_measured=True)
+    >>> round(moved.x_m, 3), round(moved.y_m, 3)
+    (0.0, 1.0)
+    """
+
+    timestamp_ns: int
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    covariance: Floats
+    is_measured: bool = True
+
+    def moved(self, displacement: Floats, covariance: Floats, timestamp_ns: int, *, is_measured: bool) -> "PlanarPose":
+        """Return the pose after a displacement in the frame of this pose."""
+        c, s = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
+        x, y, turn = displacement.tolist()
+        turned = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        carried = np.array([[1.0, 0.0, -s * x - c * y], [0.0, 1.0, c * x - s * y], [0.0, 0.0, 1.0]])
+        return PlanarPose(
+            timestamp_ns,
+            self.x_m + c * x - s * y,
+            self.y_m + s * x + c * y,
+            math.remainder(self.yaw_rad + turn, 2 * math.pi),
+            carried @ self.covariance @ carried.T + turned @ covariance @ turned.T,
+            is_measured,
+        )
+
+
+class _Keyframe(NamedTuple):
+    """Group of echoes that later ones are compared with."""
+
+    echoes: GroupEchoes
+    pose: PlanarPose
+    velocity_m_s: Floats
+
+
+class Odometry:
+    """Integration of the motion between successive groups of images.
+
+    Each group is compared with the one before, which yields the velocity, and with a keyframe up to 0.3 m back, which
+    yields the pose. Errors of the pose thus grow with the number of keyframes rather than of groups.
+
+    Parameters
+    ----------
+    mountings : mapping of str to (translation_m, rotation_xyzw)
+        Mountings of the sensors, as for `Fuser`.
+
+    Raises
+    ------
+    ArgumentError
+        A mounting is missing or invalid.
+
+    Examples
+    --------
+    >>> import ertis_numba as ertis
+    >>> odometry = ertis.Odometry({"sensor": ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))})
+    >>> with ertis.open_recording("reflectors.h5") as recording:
+    ...     velocity = odometry.add([ertis.Pipeline(recording.settings).process(recording[0])])
+    >>> velocity is None, len(odometry.poses)
+    (True, 1)
+    """
+
+    def __init__(self, mountings: Mountings) -> None:
+        self._poses = sensor_poses(mountings)
+        self._extract = EchoExtractor(self._poses)
+        self._last: GroupEchoes | None = None
+        self._keyframe: _Keyframe | None = None
+        self._twist = np.zeros(3)
+        self._is_moving_known = False
+        self._path: list[PlanarPose] = []
+
+    @property
+    def poses(self) -> tuple[PlanarPose, ...]:
+        """Poses at all groups; the first one is the origin."""
+        return tuple(self._path)
+
+    @property
+    def length_m(self) -> float:
+        """Length of the path in metres."""
+        places = np.array([(pose.x_m, pose.y_m) for pose in self._path]).reshape(-1, 2)
+        return float(np.sum(np.hypot(*np.diff(places, axis=0).T)))
+
+    def add(self, group: Iterable[Item]) -> EgoVelocity | None:
+        """Add the images of a SYNC pulse, and return the velocity since the one before.
+
+        Parameters
+        ----------
+        group : iterable of Energyscape or PointCloud
+            At most one item of each sensor. Sensors may be missing.
+
+        Returns
+        -------
+        EgoVelocity or None
+            None for the first group, after more than a second without images, and if too few echoes match. The pose
+            then assumes that the last velocity continued.
+
+        Raises
+        ------
+        ArgumentError
+            The group is empty, has two items of a sensor, or one without mounting.
+        DataError
+            The group is not later than the one before, or its items are not of the same pulse.
+        """
+        items = grouped(group, "group")
+        timestamp_ns = stamp_of(items).timestamp_ns
+        if self._path and timestamp_ns <= self._path[-1].timestamp_ns:
+            raise DataError(
+                f"group is {(self._path[-1].timestamp_ns - timestamp_ns) / 1e9:.3g} s before the last one; add groups "
+                "in order of time"
+            )
+        echoes = self._extract(items)
+        if not self._path:
+            self._path.append(PlanarPose(timestamp_ns, 0.0, 0.0, 0.0, np.zeros((3, 3))))
+            self._begin(echoes)
+            return None
+        time_s = (timestamp_ns - self._path[-1].timestamp_ns) / 1e9
+        found = self._since_last(echoes, time_s) if time_s <= MAX_TIME_S else None
+        if found is None:
+            unknown = _UNKNOWN_VARIANCE * time_s**2
+            self._path.append(
+                self._path[-1].moved(_displacement(self._twist, time_s), unknown, timestamp_ns, is_measured=False)
+            )
+            self._is_moving_known = False
+            self._begin(echoes)
+            return None
+        velocity = velocity_of(found, timestamp_ns, time_s)
+        self._twist = twist_of(found.displacement, time_s)
+        self._path.append(self._located(echoes, found, timestamp_ns))
+        self._is_moving_known = True
+        self._last = echoes
+        return velocity
+
+    def _begin(self, echoes: GroupEchoes) -> None:
+        self._last, self._keyframe = echoes, None
+
+    def _since_last(self, echoes: GroupEchoes, time_s: float) -> FlowFit | None:
+        assert self._last is not None  # noqa: S101  a first group sets it
+        if self._is_moving_known:
+            expected = _displacement(self._twist, time_s)
+            found = fit_flow(self._last, echoes, self._poses, time_s, start=expected, reach=_MAX_CHANGE * time_s)
+        else:
+            found = fit_flow(self._last, echoes, self._poses, time_s)
+        return found
+
+    def _located(self, echoes: GroupEchoes, found: FlowFit, timestamp_ns: int) -> PlanarPose:
+        """Return the pose relative to the keyframe, or to the last group if the keyframe is out of reach."""
+        last = self._path[-1]
+        step = last.moved(found.displacement, found.covariance, timestamp_ns, is_measured=True)
+        if self._keyframe is None:
+            assert self._last is not None  # noqa: S101  a first group sets it
+            self._keyframe = _Keyframe(self._last, last, self._twist[:2])
+            return step
+        expected = _relative(self._keyframe.pose, step)
+        if math.hypot(*expected[:2]) < _KEYFRAME_M and abs(expected[2]) < _KEYFRAME_RAD:
+            time_s = (timestamp_ns - self._keyframe.pose.timestamp_ns) / 1e9
+            fit = fit_flow(
+                self._keyframe.echoes,
+                echoes,
+                self._poses,
+                time_s,
+                start=expected,
+                reach=_KEYFRAME_REACH,
+                velocities_m_s=(self._keyframe.velocity_m_s, self._twist[:2]),
+            )
+            if fit is not None and fit.n_matches > _KEYFRAME_SHARE * found.n_matches:
+                return self._keyframe.pose.moved(fit.displacement, fit.covariance, timestamp_ns, is_measured=True)
+        assert self._last is not None  # noqa: S101  a first group sets it
+        self._keyframe = _Keyframe(self._last, last, self._twist[:2])
+        return step
+
+
+def _displacement(twist: Floats, time_s: float) -> Floats:
+    """Return the displacement by a constant velocity in the frame of the platform: (3,) float64."""
+    x, y, turn = (twist * time_s).tolist()
+    shrink = float(np.sinc(turn / 2 / math.pi))
+    c, s = math.cos(turn / 2) * shrink, math.sin(turn / 2) * shrink
+    return np.array([c * x - s * y, s * x + c * y, turn])
+
+
+def _relative(origin: PlanarPose, pose: PlanarPose) -> Floats:
+    """Return a pose in the frame of another one: (3,) float64."""
+    c, s = math.cos(origin.yaw_rad), math.sin(origin.yaw_rad)
+    x, y = pose.x_m - origin.x_m, pose.y_m - origin.y_m
+    return np.array([c * x + s * y, c * y - s * x, math.remainder(pose.yaw_rad - origin.yaw_rad, 2 * math.pi)])

@@ -1,0 +1,175 @@
+"""Velocity of a platform from two groups of images."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.frames import Energyscape, PointCloud, Stamp
+from ertis_numba.fusion.pulses import is_same_pulse
+from ertis_numba.fusion.rig import Mountings, sensor_poses
+from ertis_numba.motion.echoes import EchoExtractor
+from ertis_numba.motion.flow import FlowFit, fit_flow, twist_of
+
+__all__ = ["EgoVelocity", "Item", "ego_velocity", "grouped", "stamp_of", "velocity_of"]
+
+Item: TypeAlias = Energyscape | PointCloud
+Floats = NDArray[np.float64]
+
+MAX_TIME_S = 1.0
+"""Longest time between two groups; reflectors are out of sight or moved after longer ones."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EgoVelocity:
+    """Velocity of a platform in its own frame, in the horizontal plane.
+
+    Attributes
+    ----------
+    velocity_m_s : (2,) float64
+        Velocity forward and to the left in metres per second: the mean between both groups.
+    yaw_rate_rad_s : float
+        Rate of the turn to the left in radians per second.
+    covariance : (3, 3) float64
+        Covariance of forward velocity, velocity to the left, and yaw rate, in SI units.
+    timestamp_ns : int
+        Time of the second group.
+    time_s : float
+        Time between both groups in seconds.
+    n_matches : int
+        Number of echoes that both groups show.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import ertis_numba as ertis
+    >>> velocity = ertis.EgoVelocity(np.array([0.5, 0.0]), 0.1, np.diag([1e-4, 1e-4, 1e-4]), 0, 0.1, 40)
+    >>> velocity.sd.round(3).tolist()
+    [0.01, 0.01, 0.01]
+    """
+
+    velocity_m_s: Floats
+    yaw_rate_rad_s: float
+    covariance: Floats
+    timestamp_ns: int
+    time_s: float
+    n_matches: int
+
+    @property
+    def sd(self) -> Floats:
+        """Standard deviations of forward velocity, velocity to the left, and yaw rate: (3,) float64."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+
+def ego_velocity(before: Iterable[Item], after: Iterable[Item], mountings: Mountings) -> EgoVelocity:
+    """Return the velocity of a platform from the images of two SYNC pulses; use `Odometry` for several.
+
+    GroupEchoes of reflectors at rest shift in range and azimuth as the platform moves. The velocity is that which explains
+    the shifts of most echoes. Other echoes, such as those of moving people, are ignored.
+
+    Parameters
+    ----------
+    before, after : iterable of Energyscape or PointCloud
+        Images or point clouds of two successive SYNC pulses, at most one of each sensor.
+    mountings : mapping of str to (translation_m, rotation_xyzw)
+        Mountings of the sensors, as for `Fuser`.
+
+    Returns
+    -------
+    EgoVelocity
+
+    Raises
+    ------
+    ArgumentError
+        A group is empty or has two images of a sensor, or a mounting is missing or invalid.
+    DataError
+        Times do not increase, the groups share no sensor, or too few echoes match.
+
+    Examples
+    --------
+    Here, the point clouds are 5 cm apart:
+
+    >>> import numpy as np
+    >>> import ertis_numba as ertis
+    >>> draws = np.random.default_rng(1)
+    >>> place_m = np.column_stack([draws.uniform(1, 3, 30), draws.uniform(-1.5, 1.5, 30), np.zeros(30)])
+    >>> clouds = [
+    ...     ertis.PointCloud(
+    ...         (place_m - [0.05 * pulse, 0, 0]).astype(np.float32),
+    ...         np.ones(30, np.float32),
+    ...         ertis.Settings(),
+    ...         ertis.Stamp(sync_count=pulse, timestamp_ns=100_000_000 * pulse),
+    ...     )
+    ...     for pulse in (0, 1)
+    ... ]
+    >>> mountings = {"sensor": ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))}
+    >>> ertis.ego_velocity([clouds[0]], [clouds[1]], mountings).velocity_m_s.round(2)
+    array([ 0.5, -0. ])
+    """
+    poses = sensor_poses(mountings)
+    groups = [grouped(before, "before"), grouped(after, "after")]
+    first, second = (stamp_of(group) for group in groups)
+    time_s = (second.timestamp_ns - first.timestamp_ns) / 1e9
+    if not 0 < time_s <= MAX_TIME_S:
+        raise DataError(
+            f"after is {time_s:.3g} s later than before; give groups in order of time, at most {MAX_TIME_S:g} s apart"
+        )
+    if not groups[0].keys() & groups[1].keys():
+        raise DataError(
+            f"before has sensors {', '.join(groups[0])}, and after has {', '.join(groups[1])}; give images of the same "
+            "sensors"
+        )
+    extract = EchoExtractor(poses)
+    found = fit_flow(extract(groups[0]), extract(groups[1]), poses, time_s)
+    if found is None:
+        raise DataError(
+            "too few echoes of before and after match; give images that show more reflectors, or images closer in time"
+        )
+    return velocity_of(found, second.timestamp_ns, time_s)
+
+
+def velocity_of(found: FlowFit, timestamp_ns: int, time_s: float) -> EgoVelocity:
+    """Return the velocity that causes a displacement within some time."""
+    twist = twist_of(found.displacement, time_s)
+    return EgoVelocity(twist[:2], float(twist[2]), found.covariance / time_s**2, timestamp_ns, time_s, found.n_matches)
+
+
+def grouped(items: Iterable[Item], name: str) -> Mapping[str, Item]:
+    """Return the checked items of a SYNC pulse, by sensor.
+
+    Raises
+    ------
+    ArgumentError
+        There is no item, one of another type, or two of the same sensor.
+    DataError
+        The items are not of the same pulse.
+    """
+    group: dict[str, Item] = {}
+    for item in items:
+        if not isinstance(item, Energyscape | PointCloud):
+            raise ArgumentError(f"{name} has a {type(item).__name__}; give images of Pipeline.process, or point clouds")
+        sensor = item.stamp.sensor
+        if sensor in group:
+            raise ArgumentError(f"{name} has two items of sensor {sensor!r}; give one of each sensor")
+        group[sensor] = item
+    if not group:
+        raise ArgumentError(f"{name} is empty; give the images or point clouds of one SYNC pulse")
+    first, *others = group.values()
+    for other in others:
+        if not is_same_pulse(other.stamp, first.stamp):
+            raise DataError(
+                f"sensors {first.stamp.sensor!r} and {other.stamp.sensor!r} in {name} are not from the same pulse: "
+                f"SYNC counts {first.stamp.sync_count} and {other.stamp.sync_count}, "
+                f"{abs(other.stamp.timestamp_ns - first.stamp.timestamp_ns) / 1e9:.3g} s apart; give items of equal "
+                "count"
+            )
+    return group
+
+
+def stamp_of(group: Mapping[str, Item]) -> Stamp:
+    """Return the stamp with the median time of a group."""
+    stamps = sorted((item.stamp for item in group.values()), key=lambda stamp: stamp.timestamp_ns)
+    return stamps[len(stamps) // 2]

@@ -1,0 +1,106 @@
+"""Velocity of a platform from two groups of images, and odometry."""
+
+import math
+
+import numpy as np
+import pytest
+from ertis_bench.furnished_rooms import PlatformImager, mountings, random_motion, random_room
+
+import ertis_numba as ertis
+from ertis_numba.errors import ArgumentError, DataError
+
+MOUNTINGS = {"sensor": ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))}
+TIME_NS = 100_000_000
+
+
+def places_m(seed=1, count=40):
+    draws = np.random.default_rng(seed)
+    return np.column_stack([draws.uniform(0.8, 3, count), draws.uniform(-1.5, 1.5, count), np.zeros(count)])
+
+
+def seen_from(pose, places, pulse, **stamp):
+    """Return the point cloud of reflectors at rest, seen from a pose of the platform: x, y and yaw."""
+    x, y, yaw_rad = pose
+    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+    position_m = (places - [x, y, 0.0]) @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return ertis.PointCloud(
+        position_m.astype(np.float32),
+        np.ones(len(places), np.float32),
+        ertis.Settings(),
+        ertis.Stamp(**{"sync_count": pulse, "timestamp_ns": pulse * TIME_NS} | stamp),
+    )
+
+
+@pytest.mark.parametrize(("x", "y", "yaw_deg"), [(0.1, 0.0, 0.0), (0.0, -0.08, 0.0), (0.05, 0.05, 5.0), (0, 0, -9.0)])
+def test_ego_velocity_is_that_of_the_displacement(x, y, yaw_deg):
+    turn_rad = math.radians(yaw_deg)
+    clouds = [seen_from((0, 0, 0), places_m(), 0), seen_from((x, y, turn_rad), places_m(), 1)]
+    found = ertis.ego_velocity(clouds[:1], clouds[1:], MOUNTINGS)
+    # On an arc, the mean velocity in the turning frame is the displacement, turned back by half of the turn.
+    half = turn_rad / 2
+    along = np.array([math.cos(half) * x + math.sin(half) * y, math.cos(half) * y - math.sin(half) * x])
+    along /= np.sinc(half / math.pi)
+    assert found.velocity_m_s == pytest.approx(along / 0.1, abs=5e-3)
+    assert found.yaw_rate_rad_s == pytest.approx(turn_rad / 0.1, abs=5e-3)
+    assert found.n_matches > 30
+
+
+def test_moving_reflectors_are_ignored():
+    places = places_m()
+    walked = places.copy()
+    walked[:12] += [0.0, 0.12, 0.0]
+    found = ertis.ego_velocity([seen_from((0, 0, 0), places, 0)], [seen_from((0.1, 0, 0), walked, 1)], MOUNTINGS)
+    assert found.velocity_m_s == pytest.approx([1.0, 0.0], abs=0.01)
+
+
+def test_ego_velocity_in_a_furnished_room():
+    """`ertis bench motion` measures the errors of many rooms."""
+    motion = random_motion(3)
+    imager = PlatformImager(random_room(3), 3)
+    before, after = imager(motion, 0, 0.0), imager(motion.after(0.1), 1, 0.1)
+    imager.close()
+    found = ertis.ego_velocity(before, after, mountings())
+    assert found.velocity_m_s == pytest.approx([motion.forward_m_s, motion.left_m_s], abs=0.03)
+    assert found.yaw_rate_rad_s == pytest.approx(motion.yaw_rate_rad_s, abs=math.radians(4))
+    assert np.all((found.sd > 0) & (found.sd < 0.05))
+
+
+def test_odometry_integrates_a_circle():
+    odometry = ertis.Odometry(MOUNTINGS)
+    places = np.concatenate([places_m(seed, 60) @ np.diag([side, 1.0, 1.0]) for seed, side in ((1, 1.0), (2, -1.0))])
+    turn_rad = math.radians(4.0)
+    for pulse in range(20):
+        yaw_rad = pulse * turn_rad
+        x, y = 0.3 * math.sin(yaw_rad), 0.3 * (1 - math.cos(yaw_rad))
+        velocity = odometry.add([seen_from((x, y, yaw_rad), places, pulse)])
+        assert (velocity is None) == (pulse == 0)
+    pose = odometry.poses[-1]
+    assert (pose.x_m, pose.y_m, pose.yaw_rad) == pytest.approx((x, y, yaw_rad), abs=0.01)
+    assert odometry.length_m == pytest.approx(0.3 * 19 * turn_rad, rel=0.02)
+    assert all(each.is_measured for each in odometry.poses)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "message"),
+    [
+        ([], [1], "before is empty"),
+        ([0], [], "after is empty"),
+        ([1], [0], "after is -0.1 s later than before"),
+        ([0, 0], [1], "before has two items of sensor 'sensor'"),
+        ([0], [20], "after is 2 s later"),
+    ],
+)
+def test_ego_velocity_explains_groups_that_do_not_fit(before, after, message):
+    groups = [[seen_from((0, 0, 0), places_m(), pulse) for pulse in pulses] for pulses in (before, after)]
+    with pytest.raises((ArgumentError, DataError), match=message):
+        ertis.ego_velocity(*groups, MOUNTINGS)
+
+
+def test_ego_velocity_needs_echoes_and_mountings():
+    clouds = [seen_from((0, 0, 0), places_m(count=1), pulse) for pulse in (0, 1)]
+    with pytest.raises(DataError, match="too few echoes"):
+        ertis.ego_velocity(clouds[:1], clouds[1:], MOUNTINGS)
+    with pytest.raises(ArgumentError, match="mountings is empty"):
+        ertis.ego_velocity(clouds[:1], clouds[1:], {})
+    with pytest.raises(ArgumentError, match="before has a int"):
+        ertis.ego_velocity([3], clouds[1:], MOUNTINGS)
