@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.errors import DataError
 from ertis_numba.fusion.rig import Mountings, sensor_poses
-from ertis_numba.motion.echoes import GroupEchoes, EchoExtractor
+from ertis_numba.motion.echoes import EchoExtractor, GroupEchoes
 from ertis_numba.motion.flow import FlowFit, fit_flow, twist_of
 from ertis_numba.motion.velocity import MAX_TIME_S, EgoVelocity, Item, grouped, stamp_of, velocity_of
 

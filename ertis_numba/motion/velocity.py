@@ -67,7 +67,7 @@ class EgoVelocity:
 def ego_velocity(before: Iterable[Item], after: Iterable[Item], mountings: Mountings) -> EgoVelocity:
     """Return the velocity of a platform from the images of two SYNC pulses; use `Odometry` for several.
 
-    GroupEchoes of reflectors at rest shift in range and azimuth as the platform moves. The velocity is that which explains
+    Echoes of reflectors at rest shift in range and azimuth as the platform moves. The velocity is that which explains
     the shifts of most echoes. Other echoes, such as those of moving people, are ignored.
 
     Parameters
