@@ -38,6 +38,7 @@ from .frames import (
     PointCloud as PointCloud,
     Reflector as Reflector,
     Stamp as Stamp,
+    Trajectory as Trajectory,
 )
 from .fusion import Fused as Fused, Fuser as Fuser, fuse as fuse
 from .geometry import layout_names as layout_names, load_layout as load_layout

@@ -56,6 +56,7 @@ DOCUMENTED = [
     ertis.PointCloud.to_structured,
     ertis.Peak,
     ertis.Reflector,
+    ertis.Trajectory,
 ]
 
 

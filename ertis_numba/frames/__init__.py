@@ -7,6 +7,7 @@ from ertis_numba.frames._measurement import Measurement, MicrophoneSignals
 from ertis_numba.frames._point_cloud import PointCloud
 from ertis_numba.frames._reflectors import Peak, Reflector
 from ertis_numba.frames._stamp import BEHAVIOURS, Behaviour, Stamp
+from ertis_numba.frames._trajectory import Trajectory
 
 __all__ = [
     "BEHAVIOURS",
@@ -20,4 +21,5 @@ __all__ = [
     "Reflector",
     "SequenceGap",
     "Stamp",
+    "Trajectory",
 ]

@@ -1,0 +1,228 @@
+"""Trajectories: poses of a platform at increasing times."""
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ertis_numba import checks
+from ertis_numba.errors import ArgumentError
+from ertis_numba.frames._replacing import replaced
+
+__all__ = ["Trajectory"]
+
+_NS_PER_S: Final = 1e9
+_MAX_NORM_ERROR: Final = 1e-3  # Text files have few digits; a larger error is no rounding.
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectory:
+    """Poses of a platform in the world frame at increasing times.
+
+    Attributes
+    ----------
+    time_ns : (pose,) int64
+        Times in nanoseconds since 1970-01-01 UTC, on the clock of `Stamp.timestamp_ns`, strictly increasing.
+    position_m : (pose, 3) float64
+        Position of the platform's origin in the world frame, in metres.
+    rotation_xyzw : (pose, 4) float64
+        Unit quaternions that rotate the platform frame into the world frame. The constructor normalises them.
+    covariance : (pose, 6, 6) float64, or None, default None
+        Covariance of x, y, z and of the rotation about the world's x, y, z, in square metres and square radians, as in
+        PoseWithCovariance of ROS. None if it is unknown.
+    source : str, default ""
+        Origin of the poses, such as "scene", "file", "application" or "odometry".
+
+    Raises
+    ------
+    ArgumentError
+        The shapes do not match, a number is not finite, the times do not increase, or a quaternion is not of unit
+        length.
+
+    Examples
+    --------
+    >>> from ertis_numba import Trajectory
+    >>> identity = [0.0, 0.0, 0.0, 1.0]
+    >>> path = Trajectory([0, 2_000_000_000], [[0, 0, 0], [1, 0, 0]], [identity, identity], source="file")
+    >>> path.at([500_000_000]).position_m.tolist()
+    [[0.25, 0.0, 0.0]]
+    """
+
+    time_ns: NDArray[np.int64]
+    position_m: NDArray[np.float64]
+    rotation_xyzw: NDArray[np.float64]
+    covariance: NDArray[np.float64] | None = None
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        time_ns = _times("time_ns", self.time_ns)
+        if not len(time_ns):
+            raise ArgumentError("time_ns has no time; give at least one pose")
+        n_poses = len(time_ns)
+        late = np.flatnonzero(np.diff(time_ns) <= 0)
+        if late.size:
+            first = late[0]
+            raise ArgumentError(
+                f"time_ns does not increase: {time_ns[first + 1]} at [{first + 1}] follows {time_ns[first]}; "
+                "sort the poses by time, and give one for each time"
+            )
+        rotation = _numbers("rotation_xyzw", self.rotation_xyzw, (n_poses, 4))
+        norms = np.linalg.norm(rotation, axis=1)
+        wrong = np.flatnonzero(np.abs(norms - 1) > _MAX_NORM_ERROR)
+        if wrong.size:
+            raise ArgumentError(
+                f"rotation_xyzw has length {norms[wrong[0]]:g} at [{wrong[0]}]; give unit quaternions x, y, z, w"
+            )
+        covariance = self.covariance
+        if covariance is not None:
+            covariance = _numbers("covariance", covariance, (n_poses, 6, 6))
+        object.__setattr__(self, "time_ns", time_ns)
+        object.__setattr__(self, "position_m", _numbers("position_m", self.position_m, (n_poses, 3)))
+        object.__setattr__(self, "rotation_xyzw", rotation / norms[:, None])
+        object.__setattr__(self, "covariance", covariance)
+
+    def __len__(self) -> int:
+        return len(self.time_ns)
+
+    def replace(self, **changes: Any) -> "Trajectory":
+        """Return a copy with some fields changed.
+
+        Parameters
+        ----------
+        **changes
+            New values of fields, by name.
+
+        Returns
+        -------
+        Trajectory
+
+        Raises
+        ------
+        ArgumentError
+            There is no such field, or a value cannot be used.
+        """
+        return replaced("Trajectory", self, changes)
+
+    def at(self, time_ns: ArrayLike) -> "Trajectory":
+        """Return the poses interpolated at other times.
+
+        Positions and covariances are interpolated linearly, rotations along the shortest arc.
+
+        Parameters
+        ----------
+        time_ns : (n,) int64
+            Strictly increasing times within the trajectory, in nanoseconds since 1970-01-01 UTC.
+
+        Returns
+        -------
+        Trajectory
+
+        Raises
+        ------
+        ArgumentError
+            A time lies outside the trajectory, or the times do not increase.
+        """
+        wanted = _times("time_ns", time_ns)
+        self._require_covered(wanted)
+        index, fraction = self._brackets(wanted)
+        covariance = None if self.covariance is None else _linear(self.covariance, index, fraction)
+        return Trajectory(
+            wanted, _linear(self.position_m, index, fraction), self._rotations(index, fraction), covariance, self.source
+        )
+
+    def velocity_at(self, time_ns: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return linear and angular velocities by central differences between poses.
+
+        At a pose, the difference spans the poses before and after it; between poses, velocities are interpolated
+        linearly. At both ends, the difference is one-sided.
+
+        Parameters
+        ----------
+        time_ns : (n,) int64
+            Times within the trajectory, in nanoseconds since 1970-01-01 UTC, in any order.
+
+        Returns
+        -------
+        linear_m_s : (n, 3) float64
+            Velocity in the world frame, in metres per second.
+        angular_rad_s : (n, 3) float64
+            Rotation vector per second, in the world frame, in radians per second.
+
+        Raises
+        ------
+        ArgumentError
+            A time lies outside the trajectory, or the trajectory has a single pose.
+        """
+        from scipy.spatial.transform import Rotation  # noqa: PLC0415  importing it takes longer than this package
+
+        if len(self) == 1:
+            raise ArgumentError("the trajectory has a single pose; a velocity needs at least 2")
+        wanted = _times("time_ns", time_ns)
+        self._require_covered(wanted)
+        poses = np.arange(len(self))
+        before, after = np.maximum(poses - 1, 0), np.minimum(poses + 1, len(self) - 1)
+        duration_s = ((self.time_ns[after] - self.time_ns[before]) / _NS_PER_S)[:, None]
+        linear_m_s = (self.position_m[after] - self.position_m[before]) / duration_s
+        turns = Rotation.from_quat(self.rotation_xyzw[after]) * Rotation.from_quat(self.rotation_xyzw[before]).inv()
+        index, fraction = self._brackets(wanted)
+        return _linear(linear_m_s, index, fraction), _linear(turns.as_rotvec() / duration_s, index, fraction)
+
+    def _require_covered(self, wanted: NDArray[np.int64]) -> None:
+        first, last = self.time_ns[0], self.time_ns[-1]
+        outside = int(np.count_nonzero((wanted < first) | (wanted > last)))
+        if outside:
+            raise ArgumentError(
+                f"{outside} of {len(wanted)} times from {_seconds(wanted.min())} to {_seconds(wanted.max())} lie "
+                f"outside the trajectory, which covers {_seconds(first)} to {_seconds(last)}; "
+                "give times within it, or correct the clock offset"
+            )
+
+    def _brackets(self, wanted: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+        """Return the index of the pose before each time, and the fraction of the way to the next one."""
+        if len(self) == 1:
+            return np.zeros(len(wanted), np.intp), np.zeros(len(wanted))
+        index = np.clip(np.searchsorted(self.time_ns, wanted, side="right") - 1, 0, len(self) - 2)
+        # Differences of integers come first, since float64 resolves only 256 ns of the time since 1970.
+        return index, (wanted - self.time_ns[index]) / (self.time_ns[index + 1] - self.time_ns[index])
+
+    def _rotations(self, index: NDArray[np.intp], fraction: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return quaternions between poses: the rotation to the next pose, scaled by the fraction of the way."""
+        from scipy.spatial.transform import Rotation  # noqa: PLC0415  importing it takes longer than this package
+
+        start = Rotation.from_quat(self.rotation_xyzw[index])
+        end = Rotation.from_quat(self.rotation_xyzw[np.minimum(index + 1, len(self) - 1)])
+        turn = Rotation.from_rotvec((start.inv() * end).as_rotvec() * fraction[:, None])
+        rotation: NDArray[np.float64] = (start * turn).as_quat()
+        return rotation
+
+
+def _times(name: str, values: ArrayLike) -> NDArray[np.int64]:
+    times = np.asarray(values)
+    if times.ndim != 1 or (times.size and times.dtype.kind not in "iu"):
+        raise ArgumentError(
+            f"{name} has shape {times.shape} and type {times.dtype}; give one dimension of whole nanoseconds"
+        )
+    return times.astype(np.int64)
+
+
+def _numbers(name: str, values: ArrayLike, wanted: tuple[int, ...]) -> NDArray[np.float64]:
+    try:
+        numbers = np.array(values, np.float64)
+    except (TypeError, ValueError) as error:
+        raise ArgumentError(f"{name} is not an array of numbers ({error}); give shape {wanted}") from error
+    checks.shape(name, numbers.shape, wanted)
+    checks.finite_array(name, numbers)
+    return numbers
+
+
+def _linear(values: NDArray[np.float64], index: NDArray[np.intp], fraction: NDArray[np.float64]) -> NDArray[np.float64]:
+    weight = fraction.reshape(-1, *[1] * (values.ndim - 1))
+    following = np.minimum(index + 1, len(values) - 1)
+    linear: NDArray[np.float64] = values[index] * (1 - weight) + values[following] * weight
+    return linear
+
+
+def _seconds(time_ns: np.int64) -> str:
+    whole, rest = divmod(int(time_ns), 10**9)
+    return f"{whole}.{rest // 10**6:03d} s"

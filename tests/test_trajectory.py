@@ -1,0 +1,102 @@
+"""Trajectories: interpolation and velocities of poses, and arguments that are refused."""
+
+import numpy as np
+import pytest
+from hypothesis import given, strategies as st
+from scipy.spatial.transform import Rotation, Slerp
+
+import ertis_numba as ertis
+
+START_NS = 1_700_000_000_000_000_000  # A present-day time, at which float64 resolves only 256 ns.
+IDENTITY = [0.0, 0.0, 0.0, 1.0]
+
+
+def steady(velocity_m_s, rate_rad_s, *, n_poses=21, step_ns=100_000_000):
+    """A platform with constant velocity and constant rotation rate in the world frame."""
+    time_ns = START_NS + step_ns * np.arange(n_poses)
+    elapsed_s = (time_ns - START_NS)[:, None] / 1e9
+    rotation = Rotation.from_rotvec(elapsed_s * rate_rad_s).as_quat()
+    return ertis.Trajectory(time_ns, elapsed_s * velocity_m_s, rotation)
+
+
+numbers = st.lists(st.floats(-2, 2), min_size=3, max_size=3).map(np.array)
+offsets_ns = st.lists(st.integers(0, 2_000_000_000), min_size=1, max_size=20, unique=True).map(
+    lambda values: np.sort(np.array(values, np.int64))
+)
+
+
+@given(numbers, numbers, offsets_ns)
+def test_at_is_exact_for_constant_velocity_and_rotation_rate(velocity_m_s, rate_rad_s, offset_ns):
+    poses = steady(velocity_m_s, rate_rad_s).at(START_NS + offset_ns)
+    np.testing.assert_allclose(poses.position_m, offset_ns[:, None] / 1e9 * velocity_m_s, atol=1e-12)
+    expected = Rotation.from_rotvec(offset_ns[:, None] / 1e9 * rate_rad_s)
+    assert np.max((Rotation.from_quat(poses.rotation_xyzw).inv() * expected).magnitude()) < 1e-7
+
+
+@given(numbers, numbers, offsets_ns)
+def test_velocity_at_is_exact_for_constant_velocity_and_rotation_rate(velocity_m_s, rate_rad_s, offset_ns):
+    linear_m_s, angular_rad_s = steady(velocity_m_s, rate_rad_s).velocity_at(START_NS + offset_ns)
+    np.testing.assert_allclose(linear_m_s, np.broadcast_to(velocity_m_s, linear_m_s.shape), atol=1e-9)
+    np.testing.assert_allclose(angular_rad_s, np.broadcast_to(rate_rad_s, angular_rad_s.shape), atol=1e-6)
+
+
+def test_at_interpolates_rotations_as_scipy_does():
+    rotation = Rotation.random(4, random_state=1)
+    time_ns = START_NS + np.array([0, 7, 11, 20]) * 10**8
+    trajectory = ertis.Trajectory(time_ns, np.zeros((4, 3)), rotation.as_quat())
+    offset_ns = np.linspace(0, 2e9, 33).astype(np.int64)
+    wanted = Slerp((time_ns - START_NS) / 1e9, rotation)(offset_ns / 1e9)
+    poses = Rotation.from_quat(trajectory.at(START_NS + offset_ns).rotation_xyzw)
+    assert np.max((poses.inv() * wanted).magnitude()) < 1e-7
+
+
+def test_at_interpolates_covariances_linearly_and_keeps_the_source():
+    covariance = np.stack([np.eye(6), 3 * np.eye(6)])
+    trajectory = ertis.Trajectory([0, 100], np.zeros((2, 3)), [IDENTITY] * 2, covariance, "odometry")
+    pose = trajectory.at([50])
+    np.testing.assert_array_equal(pose.covariance[0], 2 * np.eye(6))
+    assert (len(pose), pose.source) == (1, "odometry")
+
+
+def test_at_returns_the_pose_of_a_trajectory_with_one():
+    trajectory = ertis.Trajectory([5], [[1, 2, 3]], [IDENTITY])
+    assert trajectory.at([5]).position_m.tolist() == [[1, 2, 3]]
+
+
+def test_constructor_normalises_quaternions_with_few_digits():
+    assert np.linalg.norm(ertis.Trajectory([0], np.zeros((1, 3)), [[0, 0, 0.7071, 0.7071]]).rotation_xyzw) == 1.0
+
+
+def test_replace_changes_a_field():
+    assert steady(np.zeros(3), np.zeros(3)).replace(source="file").source == "file"
+
+
+REFUSED = {
+    "no pose": ({"time_ns": []}, "time_ns has no time"),
+    "times": ({"time_ns": [0, 0]}, "time_ns does not increase: 0 at "),
+    "seconds": ({"time_ns": [0.5, 1.5]}, "give one dimension of whole nanoseconds"),
+    "shape": ({"position_m": np.zeros((2, 2))}, "position_m has shape"),
+    "text": ({"position_m": [["x"] * 3] * 2}, "position_m is not an array of numbers"),
+    "nan": ({"position_m": np.full((2, 3), np.nan)}, "position_m holds nan at "),
+    "length": ({"rotation_xyzw": np.ones((2, 4))}, "rotation_xyzw has length 2 at "),
+    "covariance": ({"covariance": np.zeros((2, 3, 3))}, "covariance has shape"),
+    "typo": ({"postion_m": 1}, "Trajectory has no field 'postion_m'"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_trajectory_refuses_fields_that_cannot_be_used(case):
+    changes, message = REFUSED[case]
+    with pytest.raises(ertis.ArgumentError, match=message):
+        ertis.Trajectory([0, 10], np.zeros((2, 3)), [IDENTITY] * 2).replace(**changes)
+
+
+def test_at_names_both_intervals_if_times_lie_outside():
+    trajectory = ertis.Trajectory([10**9, 2 * 10**9], np.zeros((2, 3)), [IDENTITY] * 2)
+    with pytest.raises(ertis.ArgumentError, match=r"2 of 3 times from 0\.500 s to 3\.000 s .* covers 1\.000 s to 2\.0"):
+        trajectory.at([5 * 10**8, 10**9, 3 * 10**9])
+
+
+def test_velocity_at_refuses_a_single_pose():
+    with pytest.raises(ertis.ArgumentError, match="single pose; a velocity needs at least 2"):
+        ertis.Trajectory([0], np.zeros((1, 3)), [IDENTITY]).velocity_at([0])
