@@ -1,21 +1,20 @@
 """Fused images of all sensors of one or several recordings."""
 
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from ertis_cli import options
+from ertis_cli import _pulses, options
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from ertis_cli._mountings import Mounting
-    from ertis_numba.frames import Energyscape, Measurement, Stamp
+    from ertis_numba.frames import Energyscape
     from ertis_numba.fusion import Fused
-    from ertis_numba.pipeline import Pipeline
     from ertis_numba.settings import Settings
     from ertis_numba.storage import RecordingReader
 
@@ -58,11 +57,12 @@ def write_fused(
 
     check_target(target, overwrite=force, sources=paths)
     with ExitStack() as stack:
-        readers = _readers(paths, stack)
-        mountings = {reader.sensor: _mounting(reader, mounting) for reader in readers}
+        readers = _pulses.open_sensors(paths, stack)
+        _require_several(readers)
+        mountings = _pulses.mountings_of(readers, mounting)
         fuser = Fuser(mountings, emitter_diameter_m=emitter_diameter_m)
-        pipelines = _Pipelines(changed, stack, quiet=quiet, **device)
-        groups = list(_groups(readers))
+        pipelines = _pulses.PipelinesBySensor(changed, stack, quiet=quiet, **device)
+        groups = list(_pulses.pulse_groups(readers))
         incomplete = 0
         writer = stack.enter_context(
             EnergyscapeWriter(target, overwrite=force, mounting={PLATFORM: ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))})
@@ -82,77 +82,13 @@ def write_fused(
         options.print_json(report)
 
 
-def _readers(paths: "Sequence[Path]", stack: ExitStack) -> "list[RecordingReader]":
-    from ertis_numba.storage import open_recording, sensor_names
-
-    found: dict[str, RecordingReader] = {}
-    for path in paths:
-        for name in sensor_names(path):
-            if name in found:
-                raise click.UsageError(
-                    f"{path} and {found[name].path} have the same sensor {name!r}; give recordings of other sensors",
-                    click.get_current_context(),
-                )
-            found[name] = stack.enter_context(open_recording(path, sensor=name))
-    if len(found) < 2:
+def _require_several(readers: "Sequence[RecordingReader]") -> None:
+    if len(readers) < 2:
         raise click.UsageError(
-            f"--fuse needs at least two sensors, but there is only {', '.join(found)}; give more recordings, or leave "
-            "out --fuse",
+            f"--fuse needs at least two sensors, but there is only {', '.join(each.sensor for each in readers)}; give "
+            "more recordings, or leave out --fuse",
             click.get_current_context(),
         )
-    return list(found.values())
-
-
-def _mounting(reader: "RecordingReader", given: "Mapping[str, Mounting] | None") -> "Mounting":
-    from ertis_numba.errors import ArgumentError
-
-    if given is not None and reader.sensor in given:
-        return given[reader.sensor]
-    if reader.translation_m is None or reader.rotation_xyzw is None:
-        raise ArgumentError(
-            f"{reader.path}: the mounting of sensor {reader.sensor!r} is unknown; give --mounting FILE with it"
-        )
-    return reader.translation_m.tolist(), reader.rotation_xyzw.tolist()
-
-
-@dataclass(frozen=True)
-class _StampedIndex:
-    """Index of a measurement in the recording of its sensor, and its stamp."""
-
-    index: int
-    stamp: "Stamp"
-
-
-def _groups(readers: "Sequence[RecordingReader]") -> "Iterator[dict[str, _StampedIndex]]":
-    """Yield the measurements of each pulse, by sensor."""
-    from ertis_numba.fusion.pulses import PulseGroups
-
-    places = [_StampedIndex(index, stamp) for reader in readers for index, stamp in enumerate(reader.stamps())]
-    groups: PulseGroups[_StampedIndex] = PulseGroups.of(reader.sensor for reader in readers)
-    for place in sorted(places, key=lambda place: (place.stamp.timestamp_ns, place.stamp.sync_count)):
-        yield from groups.add(place)
-    rest = groups.close()
-    if rest:
-        yield rest
-
-
-class _Pipelines:
-    """Pipelines by sensor, for the air of each measurement."""
-
-    def __init__(
-        self, changed: "Callable[[Settings], Settings]", stack: ExitStack, *, quiet: bool, **device: Any
-    ) -> None:
-        self._changed, self._stack, self._quiet, self._device = changed, stack, quiet, device
-        self._made: dict[str, tuple[Settings, Pipeline]] = {}
-
-    def image(self, measurement: "Measurement") -> "Energyscape":
-        """Return the image of a measurement."""
-        sensor, settings = measurement.stamp.sensor, measurement.settings
-        if sensor not in self._made or self._made[sensor][0] != settings:
-            pipeline = options.pipeline(self._changed(settings), quiet=self._quiet, **self._device)
-            self._made[sensor] = settings, self._stack.enter_context(pipeline)
-        pipeline = self._made[sensor][1]
-        return pipeline.process(replace(measurement, settings=pipeline.settings))
 
 
 def _numbered(fused: "Fused", number: int) -> "Energyscape":

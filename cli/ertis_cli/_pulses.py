@@ -1,0 +1,100 @@
+"""Measurements of the sensors of one platform, grouped by SYNC pulse."""
+
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ertis_cli import options
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from pathlib import Path
+
+    from ertis_cli._mountings import Mounting
+    from ertis_numba.frames import Energyscape, Measurement, Stamp
+    from ertis_numba.pipeline import Pipeline
+    from ertis_numba.settings import Settings
+    from ertis_numba.storage import RecordingReader
+
+__all__ = ["PipelinesBySensor", "StampedIndex", "mountings_of", "open_sensors", "pulse_groups"]
+
+
+def open_sensors(paths: "Sequence[Path]", stack: ExitStack) -> "list[RecordingReader]":
+    """Open the recordings of all sensors until a stack closes; raise UsageError if a sensor occurs twice."""
+    from ertis_numba.storage import open_recording, sensor_names
+
+    found: dict[str, RecordingReader] = {}
+    for path in paths:
+        for name in sensor_names(path):
+            if name in found:
+                raise click.UsageError(
+                    f"{path} and {found[name].path} have the same sensor {name!r}; give recordings of other sensors",
+                    click.get_current_context(),
+                )
+            found[name] = stack.enter_context(open_recording(path, sensor=name))
+    return list(found.values())
+
+
+def mountings_of(readers: "Sequence[RecordingReader]", given: "Mapping[str, Mounting] | None") -> "dict[str, Mounting]":
+    """Return the mountings of sensors, given with --mounting or else those of their recordings.
+
+    Raises
+    ------
+    ArgumentError
+        A mounting is unknown.
+    """
+    return {reader.sensor: _mounting(reader, given) for reader in readers}
+
+
+def _mounting(reader: "RecordingReader", given: "Mapping[str, Mounting] | None") -> "Mounting":
+    from ertis_numba.errors import ArgumentError
+
+    if given is not None and reader.sensor in given:
+        return given[reader.sensor]
+    if reader.translation_m is None or reader.rotation_xyzw is None:
+        raise ArgumentError(
+            f"{reader.path}: the mounting of sensor {reader.sensor!r} is unknown; give --mounting FILE with it"
+        )
+    return reader.translation_m.tolist(), reader.rotation_xyzw.tolist()
+
+
+@dataclass(frozen=True)
+class StampedIndex:
+    """Index of a measurement in the recording of its sensor, and its stamp."""
+
+    index: int
+    stamp: "Stamp"
+
+
+def pulse_groups(readers: "Sequence[RecordingReader]") -> "Iterator[dict[str, StampedIndex]]":
+    """Yield the measurements of each pulse, by sensor."""
+    from ertis_numba.fusion.pulses import PulseGroups
+
+    places = [StampedIndex(index, stamp) for reader in readers for index, stamp in enumerate(reader.stamps())]
+    groups: PulseGroups[StampedIndex] = PulseGroups.of(reader.sensor for reader in readers)
+    for place in sorted(places, key=lambda place: (place.stamp.timestamp_ns, place.stamp.sync_count)):
+        yield from groups.add(place)
+    rest = groups.close()
+    if rest:
+        yield rest
+
+
+class PipelinesBySensor:
+    """Pipelines by sensor, for the air of each measurement."""
+
+    def __init__(
+        self, changed: "Callable[[Settings], Settings]", stack: ExitStack, *, quiet: bool, **device: Any
+    ) -> None:
+        self._changed, self._stack, self._quiet, self._device = changed, stack, quiet, device
+        self._made: dict[str, tuple[Settings, Pipeline]] = {}
+
+    def image(self, measurement: "Measurement") -> "Energyscape":
+        """Return the image of a measurement."""
+        sensor, settings = measurement.stamp.sensor, measurement.settings
+        if sensor not in self._made or self._made[sensor][0] != settings:
+            pipeline = options.pipeline(self._changed(settings), quiet=self._quiet, **self._device)
+            self._made[sensor] = settings, self._stack.enter_context(pipeline)
+        pipeline = self._made[sensor][1]
+        return pipeline.process(replace(measurement, settings=pipeline.settings))
