@@ -78,6 +78,20 @@ def test_odometry_integrates_a_circle():
     assert (pose.x_m, pose.y_m, pose.yaw_rad) == pytest.approx((x, y, yaw_rad), abs=0.01)
     assert odometry.length_m == pytest.approx(0.3 * 19 * turn_rad, rel=0.02)
     assert all(each.is_measured for each in odometry.poses)
+    path = odometry.trajectory
+    assert path.source == "odometry"
+    assert path.time_ns.tolist() == [pulse * TIME_NS for pulse in range(20)]
+    assert path.position_m[-1] == pytest.approx([pose.x_m, pose.y_m, 0.0])
+    assert 2 * np.arctan2(path.rotation_xyzw[:, 2], path.rotation_xyzw[:, 3]) == pytest.approx(
+        [each.yaw_rad for each in odometry.poses]
+    )
+    assert path.covariance[-1][np.ix_([0, 1, 5], [0, 1, 5])] == pytest.approx(pose.covariance)
+    assert not path.covariance[:, 2:5].any()
+
+
+def test_odometry_without_groups_has_no_trajectory():
+    with pytest.raises(DataError, match="there is no pose yet; add the images"):
+        ertis.Odometry(MOUNTINGS).trajectory  # noqa: B018  it raises
 
 
 @pytest.mark.parametrize(

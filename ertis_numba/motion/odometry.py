@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.errors import DataError
+from ertis_numba.frames import Trajectory
 from ertis_numba.fusion.rig import Mountings, sensor_poses
 from ertis_numba.motion.echoes import EchoExtractor, GroupEchoes
 from ertis_numba.motion.flow import FlowFit, fit_flow, twist_of
@@ -23,6 +24,7 @@ _KEYFRAME_REACH: Final = np.array([0.02, 0.02, math.radians(2.0)])
 _KEYFRAME_M: Final = 0.3
 _KEYFRAME_RAD: Final = math.radians(15.0)
 _KEYFRAME_SHARE: Final = 0.5  # Share of the matches of the last two groups that a keyframe still has.
+_PLANAR: Final = 0, 1, 5  # of x, y, z, and the rotations about them
 _UNKNOWN_VARIANCE: Final = np.diag([0.5, 0.5, 1.0]) ** 2  # per second of a gap, of constant velocity
 
 
@@ -103,6 +105,8 @@ class Odometry:
     ...     velocity = odometry.add([ertis.Pipeline(recording.settings).process(recording[0])])
     >>> velocity is None, len(odometry.poses)
     (True, 1)
+    >>> odometry.trajectory.position_m.tolist()
+    [[0.0, 0.0, 0.0]]
     """
 
     def __init__(self, mountings: Mountings) -> None:
@@ -118,6 +122,30 @@ class Odometry:
     def poses(self) -> tuple[PlanarPose, ...]:
         """Poses at all groups; the first one is the origin."""
         return tuple(self._path)
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """Poses at all groups, in the frame of the platform at the first group.
+
+        They lie in the plane: z is 0, rotations are about z, and other covariances are 0.
+
+        Raises
+        ------
+        DataError
+            No group has been added.
+        """
+        if not self._path:
+            raise DataError("there is no pose yet; add the images of at least one pulse")
+        yaw_rad = np.array([pose.yaw_rad for pose in self._path])
+        covariance = np.zeros((len(self._path), 6, 6))
+        covariance[np.ix_(range(len(self._path)), _PLANAR, _PLANAR)] = [pose.covariance for pose in self._path]
+        return Trajectory(
+            np.array([pose.timestamp_ns for pose in self._path]),
+            np.array([(pose.x_m, pose.y_m, 0.0) for pose in self._path]),
+            np.outer(np.sin(yaw_rad / 2), [0, 0, 1, 0]) + np.outer(np.cos(yaw_rad / 2), [0, 0, 0, 1]),
+            covariance,
+            "odometry",
+        )
 
     @property
     def length_m(self) -> float:
