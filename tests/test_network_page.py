@@ -153,7 +153,7 @@ def test_network_page_on_several_machines_runs(place, ports, monkeypatch):
     lines = lines_of(PAGE, "(?:central|sensor)")
     assert [line.split()[0] for line in lines] == ["keys", "keys", "keys", "serve", "capture"]
     # Two measurements of a sensor wait while the central node plans its images, and a third would drop the first.
-    monkeypatch.setenv("ERTIS_CAPTURE_RATE", "2")
+    monkeypatch.setenv("ERTIS_CAPTURE_RATE", "0.5")
     with Shell(place, ports) as shell:
         for line in [*lines[:-1], f"{lines[-1]} --json"]:
             local = line.replace("HOST", "127.0.0.1").replace("0.0.0.0", "127.0.0.1")

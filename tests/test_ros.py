@@ -48,13 +48,14 @@ def test_topics_arrive_in_rclpy():
         "image": [picture(each) for each in given],
     }
     kinds = {names[topic]: MESSAGES[topic] for topic in names}
-    with subscribed(kinds) as subscriber, Participant(domain=DOMAIN) as participant:
+    with Participant(domain=DOMAIN) as participant:
         ros = RosPublisher(participant, topics=names, namespace="robot1")
-        ros.publish(given[0], PLACE)  # creates the topics
-        await_subscribers([ros.topics[name] for name in kinds])
-        for each in given:
-            ros.publish(each, PLACE)
-        taken = subscriber.take(3 * len(given))
+        ros.publish(given[0], PLACE)  # creates the topics, before there are subscribers that could receive this image
+        with subscribed(kinds) as subscriber:
+            await_subscribers([ros.topics[name] for name in kinds])
+            for each in given:
+                ros.publish(each, PLACE)
+            taken = subscriber.take(3 * len(given))
     assert ros.dropped == 0
     for topic, name in names.items():
         assert len(taken[name]) == len(given)

@@ -79,19 +79,20 @@ def test_ranges_and_levels_limit_points_and_echoes():
     middle_m = float(np.median(cloud.range_m))
     limits = PublishingSettings(range_m=(middle_m, 100.0), min_level_db=-40.0)
     kinds = {f"/front/{topic}": MESSAGES[topic] for topic in ("points", "scan")}
-    with subscribed(kinds) as subscriber, Participant(domain=DOMAIN) as participant:
+    with Participant(domain=DOMAIN) as participant:
         ros = RosPublisher(participant)
-        ros.publish(given)
-        await_subscribers([ros.topics[name] for name in kinds])
-        ros.settings = PublishingSettings(paused=True)
-        ros.publish(given)
-        assert ros.left_out == 2
-        ros.settings = limits
-        ros.publish(given)
-        taken = subscriber.take(2)
-        ros.settings = PublishingSettings(range_m=(90.0, 100.0))
-        ros.publish(given)
-        (empty,) = subscriber.take(1)["/front/points"]  # There is no scan without ranges.
+        ros.publish(given)  # creates the topics, before there are subscribers that could receive this image
+        with subscribed(kinds) as subscriber:
+            await_subscribers([ros.topics[name] for name in kinds])
+            ros.settings = PublishingSettings(paused=True)
+            ros.publish(given)
+            assert ros.left_out == 2
+            ros.settings = limits
+            ros.publish(given)
+            taken = subscriber.take(2)
+            ros.settings = PublishingSettings(range_m=(90.0, 100.0))
+            ros.publish(given)
+            (empty,) = subscriber.take(1)["/front/points"]  # There is no scan without ranges.
     far = np.asarray(cloud.range_m) >= middle_m
     assert 0 < far.sum() < len(cloud)
     far_cloud = cloud.replace(

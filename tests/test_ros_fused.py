@@ -89,17 +89,18 @@ def test_fused_points_arrive_in_rclpy():
         name: find(each).replace(translation_m=places[name][0], rotation_xyzw=places[name][1])
         for name, each in images.items()
     }
-    with subscribed(kinds) as subscriber, Participant(domain=DOMAIN) as participant:
+    with Participant(domain=DOMAIN) as participant:
         publisher = RosPublisher(participant, topics=["points"], namespace="robot1")
         for sequence in range(2):
             for name, each in images.items():
                 publisher.publish(each.replace(stamp=replace(each.stamp, sync_count=sequence)), places[name])
-        await_subscribers([publisher.topics[name] for name in kinds])
-        for name, each in images.items():
-            publisher.publish(each.replace(stamp=replace(each.stamp, sync_count=2)), places[name])
-        (received,) = subscriber.take(1)["/robot1/fused/points"]
-        with pytest.raises(ArgumentError, match="fused would share topics"):
-            publisher.publish(stamped(3, "fused"))
+        with subscribed(kinds) as subscriber:
+            await_subscribers([publisher.topics[name] for name in kinds])
+            for name, each in images.items():
+                publisher.publish(each.replace(stamp=replace(each.stamp, sync_count=2)), places[name])
+            (received,) = subscriber.take(1)["/robot1/fused/points"]
+            with pytest.raises(ArgumentError, match="fused would share topics"):
+                publisher.publish(stamped(3, "fused"))
     wanted = joined(clouds)
     assert equal(received, points_message(wanted), MESSAGES["points"])
 
