@@ -1,6 +1,9 @@
 """Live topics arrive in rclpy, which runs in another process, byte for byte."""
 
 import json
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -18,6 +21,7 @@ from ertis_numba.ros import Participant, PublishingSettings, RosPublisher, inter
 from ertis_numba.ros.diagnostics import diagnostics_message
 from ertis_numba.storage import open_recording, write_energyscapes
 from tests.files import image
+from tests.journals import ENVIRONMENT
 from tests.ros_topics import DOMAIN, await_subscribers, subscribed
 
 pytest.importorskip("rclpy.serialization")  # Wheels exist for some versions of Python only.
@@ -151,17 +155,25 @@ def test_transforms_are_published_when_they_change():
         assert ros.topics["/tf_static"].published == 2
 
 
+def published(subscriber, count, *arguments):
+    """Return messages that reach a subscriber while the command runs, and the events that it reports."""
+    command = [sys.executable, "-m", "ertis_cli", "ros", *map(str, arguments), "--domain", str(DOMAIN), "--json"]
+    with subprocess.Popen(
+        command, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        taken = subscriber.take(count)
+        process.send_signal(signal.SIGINT)
+        stdout, stderr = process.communicate()
+    assert process.returncode == 0, stderr
+    return taken, [json.loads(line) for line in stdout.splitlines()]
+
+
 def test_command_publishes_a_file(tmp_path):
     path = tmp_path / "images.h5"
     write_energyscapes(path, [stamped(seed, sequence=50_000_000 * seed) for seed in range(5)])
     kinds = {"/front/points": MESSAGES["points"], "/front/scan": MESSAGES["scan"]}
     with subscribed(kinds) as subscriber:
-        done = CliRunner().invoke(
-            cli, ["ros", str(path), "--domain", str(DOMAIN), "--loop", "--duration", "4", "--use-sim-time", "--json"]
-        )
-        taken = subscriber.take(4)
-    assert done.exit_code == 0, done.stderr
-    lines = [json.loads(line) for line in done.stdout.splitlines()]
+        taken, lines = published(subscriber, 4, path, "--loop", "--use-sim-time")
     assert lines[0]["event"] == "publishing"
     assert {line["topic"] for line in lines if line["event"] == "topic"} == {"/clock", *kinds}
     assert lines[-1]["event"] == "end"
@@ -170,7 +182,7 @@ def test_command_publishes_a_file(tmp_path):
 
 
 def test_command_publishes_the_images_of_sensors(tmp_path, monkeypatch):
-    monkeypatch.setenv("ERTIS_EMULATED_DIR", str(tmp_path))
+    monkeypatch.setitem(ENVIRONMENT, "ERTIS_EMULATED_DIR", str(tmp_path))
     kinds = {f"/{name}/points": MESSAGES["points"] for name in ("one", "two")}
     with open_recording(ROOT / "data" / "synthetic" / "reflectors.h5") as recording:
         words, settings = recording[0].data, recording.settings
@@ -180,12 +192,10 @@ def test_command_publishes_the_images_of_sensors(tmp_path, monkeypatch):
         Emulator([words], name="two", link=tmp_path / "two"),
         subscribed(kinds) as subscriber,
     ):
-        command = ["ros", "one", "two", "--settings", str(tmp_path / "settings.toml"), "--domain", str(DOMAIN)]
-        done = CliRunner().invoke(cli, [*command, "--trigger-rate", "20", "--duration", "4", "--json"])
-        taken = subscriber.take(10)
-    assert done.exit_code == 0, done.stderr
-    end = json.loads(done.stdout.splitlines()[-1])
-    assert end["messages"]["/one/points"] > 5
+        settings = ["--settings", tmp_path / "settings.toml"]
+        taken, lines = published(subscriber, 10, "one", "two", *settings, "--trigger-rate", "20")
+    end = lines[-1]
+    assert end["messages"]["/one/points"] >= len(taken["/one/points"])
     assert end["measurements"] == sum(end["messages"][name] for name in kinds)
     assert sum(map(len, taken.values())) == 10
     frame, n_points = taken["/one/points"][0][16:19], len(taken["/one/points"][0])
