@@ -60,6 +60,7 @@ from .settings import Settings as Settings, presets as presets
 from .simulation.render import Simulator as Simulator, render as render
 from .simulation.scene import Scene as Scene, load_scene as load_scene
 from .storage import (
+    add_poses as add_poses,
     open_energyscapes as open_energyscapes,
     open_recording as open_recording,
     write_energyscapes as write_energyscapes,

@@ -10,10 +10,12 @@ from ertis_numba.storage.schema import (
     CONVENTIONS,
     ENERGYSCAPE,
     FORMAT_VERSION,
+    POSES,
     RECORDING,
     RECORDING_OF_PCM,
     STAMPS,
     TRUTH,
+    VERSION_WITHOUT_POSES,
 )
 from tests.pages import page
 
@@ -36,6 +38,7 @@ def rows(first):
     [
         ("time", SHARED),
         ("temperature", [variable for variable in EITHER if variable not in SHARED]),
+        ("pose_position", POSES),
         ("scene", TRUTH),
         ("amplitude", [variable for variable in ENERGYSCAPE if variable not in SHARED]),
     ],
@@ -54,6 +57,7 @@ def test_format_tables_match_the_code(first, table):
 def test_format_names_and_versions_match_the_code():
     assert f"`{CONVENTIONS}`" in PAGE
     assert f"`ertis_format_version` ({FORMAT_VERSION})" in PAGE
+    assert f"Files without poses have version {VERSION_WITHOUT_POSES}." in PAGE
 
 
 def test_format_presets_match_the_code():

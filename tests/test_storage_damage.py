@@ -129,8 +129,8 @@ def test_file_of_a_killed_writer_is_not_reported_as_damaged(path):
 
 def test_newer_format_version_is_refused(path):
     with h5py.File(path, "r+") as file:
-        file.attrs["ertis_format_version"] = 4
-    with pytest.raises(FormatVersionError, match="has format version 4, but this package reads up to 3; update"):
+        file.attrs["ertis_format_version"] = 5
+    with pytest.raises(FormatVersionError, match="has format version 5, but this package reads up to 4; update"):
         open_recording(path)
 
 

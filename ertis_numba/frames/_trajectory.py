@@ -14,6 +14,7 @@ __all__ = ["Trajectory"]
 
 _NS_PER_S: Final = 1e9
 _MAX_NORM_ERROR: Final = 1e-3  # Text files have few digits; a larger error is no rounding.
+_MAX_ROUNDING: Final = 1e-14  # Error in the length of a quaternion that was normalised before.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,6 +75,7 @@ class Trajectory:
             raise ArgumentError(
                 f"rotation_xyzw has length {norms[wrong[0]]:g} at [{wrong[0]}]; give unit quaternions x, y, z, w"
             )
+        norms[np.abs(norms - 1) < _MAX_ROUNDING] = 1.0  # A copy has the same bits.
         covariance = self.covariance
         if covariance is not None:
             covariance = _numbers("covariance", covariance, (n_poses, 6, 6))
@@ -194,6 +196,8 @@ class Trajectory:
         end = Rotation.from_quat(self.rotation_xyzw[np.minimum(index + 1, len(self) - 1)])
         turn = Rotation.from_rotvec((start.inv() * end).as_rotvec() * fraction[:, None])
         rotation: NDArray[np.float64] = (start * turn).as_quat()
+        for given, place in ((fraction == 0, index), (fraction == 1, index + 1)):  # These keep their bits.
+            rotation[given] = self.rotation_xyzw[place[given]]
         return rotation
 
 

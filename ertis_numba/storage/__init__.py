@@ -8,6 +8,7 @@ from ertis_numba.storage.energyscape import (
     open_energyscapes,
     write_energyscapes,
 )
+from ertis_numba.storage.poses import add_poses, recorded_trajectory
 from ertis_numba.storage.recording import (
     RecordingReader,
     RecordingWriter,
@@ -23,11 +24,13 @@ __all__ = [
     "GroundTruthLog",
     "RecordingReader",
     "RecordingWriter",
+    "add_poses",
     "atomic_write",
     "check_target",
     "file_kind",
     "open_energyscapes",
     "open_recording",
+    "recorded_trajectory",
     "sensor_names",
     "write_energyscapes",
     "write_recording",

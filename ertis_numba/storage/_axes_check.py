@@ -6,13 +6,13 @@ from typing import Any, Final
 import h5py
 
 from ertis_numba.errors import DamagedError, ForeignDataError
-from ertis_numba.storage.schema import RECORDING, RECORDING_OF_PCM
+from ertis_numba.storage.schema import POSES, RECORDING, RECORDING_OF_PCM
 from ertis_numba.storage.structure import require_attributes, stored_bytes
 
 __all__ = ["find_damage"]
 
 _MAX_BYTES: Final = 16 * 2**20  # Limit for a dataset that no table names.
-_DIMS: Final = {variable.name: variable.dims for variable in (*RECORDING, *RECORDING_OF_PCM)}
+_DIMS: Final = {variable.name: variable.dims for variable in (*RECORDING, *RECORDING_OF_PCM, *POSES)}
 # Errors of h5py for damaged files.
 _UNREADABLE: Final = (OSError, RuntimeError, LookupError, AttributeError, TypeError, ValueError)
 

@@ -19,7 +19,7 @@ from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.storage._rows import RowReader, RowWriter
 from ertis_numba.storage.schema import (
     CONVENTIONS,
-    FORMAT_VERSION,
+    VERSION_WITHOUT_POSES,
     Variable,
     content_sha256,
     content_uuid,
@@ -60,6 +60,7 @@ class FileWriter(ABC, Generic[Item]):
         self._attributes = dict(attributes)
         self._truth = truth or {}
         self._part: Path
+        self._format_version = VERSION_WITHOUT_POSES
         self._file: h5py.File | None = None
         self._rows: dict[str, RowWriter] = {}
         check_target(self.path, overwrite=overwrite)
@@ -148,7 +149,7 @@ class FileWriter(ABC, Generic[Item]):
             {
                 "Conventions": CONVENTIONS,
                 "ertis_format": self._kind,
-                "ertis_format_version": FORMAT_VERSION,
+                "ertis_format_version": self._format_version,
                 "date_created": date_created(),
                 "uuid": content_uuid(contents),
                 **self._attributes,

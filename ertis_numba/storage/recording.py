@@ -11,15 +11,26 @@ from numpy.typing import NDArray
 
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError, DamagedError, DataError
-from ertis_numba.frames import Measurement, SequenceGap
+from ertis_numba.frames import Measurement, SequenceGap, Trajectory
 from ertis_numba.geometry import Layout, microphones, mounting as mounted, self_contained, storable
 from ertis_numba.sample_format import SampleFormat, sample_format
 from ertis_numba.settings import Air, Settings
 from ertis_numba.storage._mounting import read_mounting, write_mounting
+from ertis_numba.storage._poses import (
+    POSE_SIZES,
+    Poses,
+    checked_poses,
+    poses_of,
+    read_poses,
+    require_times,
+    write_poses,
+)
 from ertis_numba.storage._reader import FileReader
 from ertis_numba.storage._rows import RowWriter
 from ertis_numba.storage._writer import FileWriter
 from ertis_numba.storage.schema import (
+    FORMAT_VERSION,
+    POSES,
     RECORDING,
     RECORDING_OF_PCM,
     Variable,
@@ -71,11 +82,14 @@ class RecordingWriter(FileWriter[Measurement]):
         rotates the sensor frame into the platform frame. Unknown by default.
     firmware : mapping of str to str, optional
         Version of each sensor's firmware, by name.
+    poses : Trajectory, or mapping of str to Trajectory, optional
+        Trajectory of the platform, or of each sensor's platform, by name of the sensor. The recording stores the pose
+        at each measurement, which the trajectory must cover. Unknown by default.
     """
 
     _kind: ClassVar[str] = "recording"
     _data: ClassVar[str] = "pdm"
-    _table: ClassVar[tuple[Variable, ...]] = RECORDING
+    _table: ClassVar[tuple[Variable, ...]] = (*RECORDING, *POSES)
     _numbered: ClassVar[bool] = True
 
     def __init__(
@@ -88,6 +102,7 @@ class RecordingWriter(FileWriter[Measurement]):
         truth: Mapping[str, GroundTruth | GroundTruthLog] | None = None,
         mounting: Mapping[str, Mounting] | None = None,
         firmware: Mapping[str, str] | None = None,
+        poses: Poses | None = None,
     ) -> None:
         super().__init__(path, overwrite=overwrite, attributes={"source": source, "history": ""}, truth=truth)
         self._given = settings
@@ -97,6 +112,7 @@ class RecordingWriter(FileWriter[Measurement]):
         self._mounting = {sensor: mounted(sensor, *given) for sensor, given in (mounting or {}).items()}
         self._firmware = firmware or {}
         self._noted: dict[str, list[SequenceGap]] = {}
+        self._poses = checked_poses(poses)
 
     def note_gap(self, sensor: str, first: int, last: int, reason: str, session_id: int = 0) -> None:
         """Store why sequence numbers are missing, ``first`` and ``last`` included; in any order, at any time.
@@ -132,6 +148,9 @@ class RecordingWriter(FileWriter[Measurement]):
     def _row(self, item: Measurement) -> tuple[NDArray[Any], dict[str, float]]:
         self._require_same(item.stamp.sensor, item.settings)
         self._require_samples(item)
+        trajectory = poses_of(self._poses, item.stamp.sensor)
+        if trajectory is not None:  # The error comes before the rest of a long recording.
+            require_times(trajectory, np.array([item.stamp.timestamp_ns]), item.stamp.sensor)
         air = item.settings.air
         return item.data, {name: getattr(air, field) for name, field in _AIR.items()}
 
@@ -160,7 +179,9 @@ class RecordingWriter(FileWriter[Measurement]):
 
     def _finish(self, file: h5py.File) -> None:
         super()._finish(file)
-        for name, given in (("mounting", self._mounting), ("firmware", self._firmware), ("a gap", self._noted)):
+        poses = self._poses if isinstance(self._poses, Mapping) else {}
+        data = {"mounting": self._mounting, "firmware": self._firmware, "a gap": self._noted, "poses": poses}
+        for name, given in data.items():
             self._require_sensors(name, given)
 
     def _data_of(self, group: h5py.Group) -> str:
@@ -183,6 +204,10 @@ class RecordingWriter(FileWriter[Measurement]):
             if len(column):
                 variable[:] = column
                 variable.flush()  # As for rows: see `RowWriter.flush`.
+        trajectory = poses_of(self._poses, sensor)
+        if trajectory is not None:
+            write_poses(group, trajectory)
+            self._format_version = FORMAT_VERSION
 
 
 def create_sensor_variables(
@@ -266,6 +291,8 @@ class RecordingReader(FileReader[Measurement]):
         Position of the sensor on its platform, in metres; None if the mounting is unknown.
     rotation_xyzw : (4,) float64, or None
         Unit quaternion that rotates the sensor frame into the platform frame; None if the mounting is unknown.
+    trajectory : Trajectory or None
+        Poses of the platform at the times of the measurements; None if they are unknown.
     """
 
     _kind: ClassVar[str] = "recording"
@@ -274,9 +301,11 @@ class RecordingReader(FileReader[Measurement]):
     firmware: str
     translation_m: NDArray[np.float64] | None
     rotation_xyzw: NDArray[np.float64] | None
+    trajectory: Trajectory | None
 
     def _select_table(self) -> None:
-        self._data, self._table = _data_and_table(pdm="pcm" not in self._group)
+        self._data, table = _data_and_table(pdm="pcm" not in self._group)
+        self._table = (*table, *POSES)
 
     def _load(self) -> None:
         self._require_agreement()
@@ -294,6 +323,7 @@ class RecordingReader(FileReader[Measurement]):
             raise DamagedError(f"a gap of sensor {self.sensor} is damaged ({problem}); copy it again") from error
         self.firmware = str(to_python(self._group.attrs["firmware"]))
         self.translation_m, self.rotation_xyzw = read_mounting(self._group, self.path)
+        self.trajectory = read_poses(self._group, self.path)
 
     def _item(self, index: int) -> Measurement:
         air = Air(**{field: self._rows.column(name, index) for name, field in _AIR.items()})
@@ -301,7 +331,7 @@ class RecordingReader(FileReader[Measurement]):
         return Measurement(self._rows.row(index), settings, self._rows.stamp(index, self.sensor))
 
     def _sizes(self) -> dict[str, int]:
-        return _sizes(self.settings)
+        return {**_sizes(self.settings), **POSE_SIZES}
 
     def _require_agreement(self) -> None:
         """Refuse a file whose arrays contradict its settings, which processing uses."""
@@ -364,6 +394,7 @@ def write_recording(
     source: str = "",
     truth: Mapping[str, GroundTruth | GroundTruthLog] | None = None,
     mounting: Mapping[str, Mounting] | None = None,
+    poses: Poses | None = None,
 ) -> Path:
     """Write a recording.
 
@@ -375,6 +406,8 @@ def write_recording(
         Measurements of one or several sensors. It is read one measurement at a time.
     settings, overwrite, source, truth, mounting
         See `RecordingWriter`.
+    poses : Trajectory, or mapping of str to Trajectory, optional
+        See `RecordingWriter`; by default those of ``measurements`` if it is a `RecordingReader`.
 
     Returns
     -------
@@ -395,8 +428,10 @@ def write_recording(
     >>> with ertis.open_recording("reflectors.h5") as recording:
     ...     path = ertis.write_recording("copy.h5", recording, overwrite=True)
     """
+    if poses is None and isinstance(measurements, RecordingReader):
+        poses = measurements.trajectory
     with RecordingWriter(
-        path, settings=settings, overwrite=overwrite, source=source, truth=truth, mounting=mounting
+        path, settings=settings, overwrite=overwrite, source=source, truth=truth, mounting=mounting, poses=poses
     ) as writer:
         for measurement in checks.items("measurements", measurements, Measurement, "a recording holds"):
             writer.write(measurement)

@@ -27,10 +27,12 @@ __all__ = [
     "ENERGYSCAPE",
     "FORMAT_VERSION",
     "FORMER_NAMES",
+    "POSES",
     "RECORDING",
     "RECORDING_OF_PCM",
     "STAMPS",
     "TRUTH",
+    "VERSION_WITHOUT_POSES",
     "SensorGroup",
     "Variable",
     "content_sha256",
@@ -45,9 +47,11 @@ __all__ = [
 ]
 
 CONVENTIONS: Final = "CF-1.11 ertis-1.0"
-FORMAT_VERSION: Final = 3  # Version 1 used the names in FORMER_NAMES; version 2 had no behaviour.
+FORMAT_VERSION: Final = 4  # Version 1 used the names in FORMER_NAMES; version 2 had no behaviour; 3 had no poses.
+VERSION_WITHOUT_POSES: Final = 3  # Earlier versions of this package read files without poses.
 CHUNK_ROWS: Final = 512  # Applies to columns with one number per measurement.
 _TIME_CHUNK_ROWS: Final = 4096  # Applies to the axis, which programs read as a whole.
+_MATRIX_CHUNK_ROWS: Final = 64  # Applies to columns with one matrix per measurement.
 _COLUMN_TEXT_BYTES: Final = 64
 _MAX_CHUNK_BYTES: Final = 2**32 - 1
 _DIGEST_ITEMS: Final = 2**20
@@ -120,6 +124,28 @@ RECORDING_OF_PCM: Final = tuple(
     for variable in RECORDING
 )
 """Variables of a recording with PCM microphones."""
+
+POSES: Final = (
+    Variable(
+        "pose_position", ("time", "axis"), "<f8", "x, y, z of the platform in the world frame", "m", optional=True
+    ),
+    Variable(
+        "pose_rotation",
+        ("time", "quaternion"),
+        "<f8",
+        "unit quaternion x, y, z, w that rotates the platform frame into the world frame",
+        optional=True,
+    ),
+    Variable(
+        "pose_covariance",
+        ("time", "pose_row", "pose_column"),
+        "<f8",
+        "covariance of x, y, z in m² and of the rotation about the world's x, y, z in rad²",
+        optional=True,
+    ),
+    Variable("pose_source", (), "str", "origin of the poses", optional=True),
+)
+"""Variables of a recording with poses of its platform, which follow those of a recording."""
 
 ENERGYSCAPE: Final = (
     *STAMPS,
@@ -216,7 +242,7 @@ def create_variables(
         Variables to create.
     sizes : mapping of str to int
         Length of each axis. An axis without a length is omitted, unless it grows with the file. If the rows along time
-        are arrays, each row is a chunk.
+        are samples or images, each row is a chunk. Axes that the group has are used.
     dtypes : mapping of str to str or dtype, optional
         Types by name of the variable, in place of those in the table.
     texts : mapping of str to str, optional
@@ -241,7 +267,8 @@ def create_variables(
             continue
         for axis, dim in enumerate(dims):
             if dim not in scales:
-                scales[dim] = _scale_without_values(group, dim, sizes.get(dim, 0))
+                exists = dim in group
+                scales[dim] = group[dim] if exists else _scale_without_values(group, dim, sizes.get(dim, 0))
             dataset.dims[axis].attach_scale(scales[dim])
 
 
@@ -256,12 +283,20 @@ def _dataset(
     shape = tuple(sizes.get(dim, 0) for dim in dims)
     if dims[0] not in _UNLIMITED:
         return group.create_dataset(name, shape, kind)
-    rows = _TIME_CHUNK_ROWS if name == "time" else CHUNK_ROWS
-    chunks = (rows,) if len(dims) == 1 else (1, *shape[1:])
+    chunks = (_chunk_rows(name, dims), *shape[1:])
     if math.prod(chunks) * np.dtype(kind).itemsize > _MAX_CHUNK_BYTES:
         wanted = " × ".join(f"{size} {dim}s" for dim, size in zip(dims[1:], shape[1:], strict=True))
         raise ArgumentError(f"{name} of {wanted} exceeds the 4 GiB limit of HDF5 for one chunk; give fewer")
     return group.create_dataset(name, (0, *shape[1:]), kind, maxshape=(None, *shape[1:]), chunks=chunks)
+
+
+def _chunk_rows(name: str, dims: tuple[str, ...]) -> int:
+    """Return the number of measurements in a chunk."""
+    if name.startswith("pose_"):
+        return CHUNK_ROWS if len(dims) == 2 else _MATRIX_CHUNK_ROWS
+    if len(dims) > 1:  # A row of samples or an image is large.
+        return 1
+    return _TIME_CHUNK_ROWS if name == "time" else CHUNK_ROWS
 
 
 def _scale_without_values(group: h5py.Group, dim: str, size: int) -> h5py.Dataset:

@@ -1,0 +1,225 @@
+"""Poses of recordings: add a trajectory to a recording, and read the trajectory of its platform."""
+
+import filecmp
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final
+
+import h5py
+import numpy as np
+
+from ertis_numba.atomic_files import atomic_write, check_target, remedy, require_free_space
+from ertis_numba.errors import ArgumentError, DataError, ErtisError
+from ertis_numba.frames import Trajectory
+from ertis_numba.storage._poses import checked_poses, remove_poses, require_times, write_poses
+from ertis_numba.storage._reader import sensor_names
+from ertis_numba.storage.recording import RecordingReader, open_recording
+from ertis_numba.storage.schema import (
+    FORMAT_VERSION,
+    POSES,
+    RECORDING,
+    SensorGroup,
+    content_sha256,
+    content_uuid,
+    sensor_path,
+    set_attributes,
+    to_python,
+)
+
+__all__ = ["add_poses", "recorded_trajectory"]
+
+_BYTES_PER_POSE: Final = 8 * (3 + 4 + 36)
+_BYTES_PER_SENSOR: Final = 200_000  # Chunks that are not full, and tables.
+_MAX_HISTORY: Final = 16_000  # Characters; an attribute of HDF5 is limited to 65,536 bytes.
+_MAX_DIFFERENCE: Final = 1e-6  # m, or of a unit quaternion; poses of equal times differ by rounding only.
+
+
+def add_poses(
+    path: str | Path,
+    trajectory: Trajectory,
+    *,
+    output: str | Path | None = None,
+    overwrite: bool = False,
+    replace: bool = False,
+) -> Path:
+    """Add the poses of a platform to a recording.
+
+    The trajectory is interpolated at the times of the measurements of all sensors. Everything else in the recording
+    stays the same, except its `uuid` and history. The file is replaced as a whole when the new one is complete.
+
+    Parameters
+    ----------
+    path : str or Path
+        Path of the recording.
+    trajectory : Trajectory
+        Poses of the platform, which cover all measurements.
+    output : str or Path, optional
+        Path of the recording with poses. By default, it replaces the given recording.
+    overwrite : bool
+        Replace an existing ``output``.
+    replace : bool
+        Replace the poses of a recording that has poses already.
+
+    Returns
+    -------
+    Path
+        Path of the recording with poses.
+
+    Raises
+    ------
+    ArgumentError
+        The trajectory does not cover the recording, the recording has poses already, or the output exists.
+    DataError
+        The recording cannot be read, or the output cannot be written.
+
+    Examples
+    --------
+    >>> import ertis_numba as ertis
+    >>> with ertis.open_recording("reflectors.h5") as recording:
+    ...     times_ns = [stamp.timestamp_ns for stamp in recording.stamps()]
+    >>> identity = [0.0, 0.0, 0.0, 1.0]
+    >>> drive = ertis.Trajectory(
+    ...     [min(times_ns) - 1, max(times_ns) + 1], [[0, 0, 0], [1, 0, 0]], [identity, identity], source="application"
+    ... )
+    >>> path = ertis.add_poses("reflectors.h5", drive, output="moving.h5", overwrite=True)
+    >>> with ertis.open_recording(path) as recording:
+    ...     recording.trajectory.source
+    'application'
+    """
+    source = Path(path)
+    if not isinstance(trajectory, Trajectory):
+        raise ArgumentError(f"trajectory is of type {type(trajectory).__name__}; give a Trajectory")
+    checked_poses(trajectory)
+    target = source if output is None else Path(output)
+    if output is None:
+        check_target(source, overwrite=True)
+    else:
+        check_target(target, overwrite=overwrite, sources=[source])
+    n_poses = sum(_require_fitting(source, sensor, trajectory, replace=replace) for sensor in sensor_names(source))
+    with _errors_with_path(target), atomic_write(target, overwrite=overwrite or output is None) as part:
+        _copy(source, part, n_poses * _BYTES_PER_POSE)
+        with h5py.File(part, "r+", libver=("v110", "v110")) as file:
+            _add(file, trajectory)
+        _verify(part, target)
+    return target
+
+
+def recorded_trajectory(path: str | Path, *, sensor: str | None = None) -> Trajectory | None:
+    """Return the trajectory of the platform from the poses at the measurements of all sensors.
+
+    Parameters
+    ----------
+    path : str or Path
+        Path of a recording.
+    sensor : str, optional
+        Name of the sensor; all sensors by default.
+
+    Returns
+    -------
+    Trajectory or None
+        One pose for each time at which a sensor has measured; None if the recording has no poses.
+
+    Raises
+    ------
+    ArgumentError
+        Sensors have different poses at the same time, or the file does not contain the sensor.
+    DataError
+        The recording cannot be read.
+    """
+    found: dict[str, Trajectory] = {}
+    for name in sensor_names(path) if sensor is None else (sensor,):
+        with open_recording(path, sensor=name) as recording:
+            if recording.trajectory is not None:
+                found[name] = recording.trajectory
+    if len(found) < 2:
+        return next(iter(found.values()), None)
+    return _merged(Path(path), found)
+
+
+def _merged(path: Path, found: dict[str, Trajectory]) -> Trajectory:
+    """Return the poses of all sensors by time."""
+    several = [*found.values()]
+    rows = np.concatenate([np.column_stack([each.position_m, each.rotation_xyzw]) for each in several])
+    sensors = np.repeat(np.arange(len(several)), [len(each) for each in several])
+    all_ns = np.concatenate([each.time_ns for each in several])
+    time_ns, first, inverse = np.unique(all_ns, return_index=True, return_inverse=True)
+    kept = rows[first][inverse]
+    turned = np.sign(np.sum(rows[:, 3:] * kept[:, 3:], axis=1, keepdims=True))  # q and -q are the same rotation.
+    difference = np.abs(np.column_stack([rows[:, :3] - kept[:, :3], turned * rows[:, 3:] - kept[:, 3:]])).max(axis=1)
+    if difference.max() > _MAX_DIFFERENCE:
+        worst = int(difference.argmax())
+        names = [[*found][sensors[index]] for index in (first[inverse[worst]], worst)]
+        raise ArgumentError(
+            f"{path}: sensors {' and '.join(names)} have different poses at {all_ns[worst]} ns; choose one sensor"
+        )
+    covariances = [each.covariance for each in several]
+    known = [each for each in covariances if each is not None]
+    covariance = np.concatenate(known)[first] if len(known) == len(covariances) else None
+    return Trajectory(time_ns, rows[first, :3], rows[first, 3:], covariance, several[0].source)
+
+
+def _require_fitting(path: Path, sensor: str, trajectory: Trajectory, *, replace: bool) -> int:
+    """Return the number of measurements of a sensor; refuse a sensor that cannot have these poses."""
+    with open_recording(path, sensor=sensor) as recording:
+        if recording.trajectory is not None and not replace:
+            origin = f" (source {recording.trajectory.source!r})" if recording.trajectory.source else ""
+            raise ArgumentError(f"{path} has poses already{origin}; keep them, or ask to replace them (--force)")
+        time_ns = np.array([stamp.timestamp_ns for stamp in recording.stamps()], np.int64)
+    if len(time_ns):
+        try:
+            require_times(trajectory, time_ns, sensor)
+        except ArgumentError as error:
+            raise ArgumentError(f"{path}: {error} (--offset-s)") from error
+    return len(time_ns)
+
+
+def _copy(source: Path, part: Path, n_bytes: int) -> None:
+    """Copy a recording, and compare the copy."""
+    with h5py.File(source, "r") as file:
+        n_sensors = len(file["sensors"])
+    require_free_space(part.parent, source.stat().st_size + n_bytes + n_sensors * _BYTES_PER_SENSOR)
+    shutil.copyfile(source, part)
+    if not filecmp.cmp(source, part, shallow=False):
+        raise DataError(f"{source} reads back with other content than was copied; check the disk")
+
+
+def _add(file: h5py.File, trajectory: Trajectory) -> None:
+    """Add poses to all sensors of an open recording, and update the attributes of its content."""
+    contents: dict[str, str] = {}
+    for sensor in file["sensors"]:
+        group = SensorGroup(file[sensor_path(sensor)])
+        remove_poses(group)
+        write_poses(group, trajectory)
+        contents[sensor] = content_sha256(group, (*RECORDING, *POSES))
+        set_attributes(group, {"content_sha256": contents[sensor]})
+    history = str(to_python(file.attrs.get("history", b"")))
+    added = f"poses added (source {trajectory.source!r})"
+    set_attributes(
+        file,
+        {
+            "ertis_format_version": FORMAT_VERSION,
+            "uuid": content_uuid(contents),
+            "history": "; ".join(filter(None, (history, added)))[:_MAX_HISTORY],
+        },
+    )
+
+
+def _verify(part: Path, target: Path) -> None:
+    """Read the parts of the new recording that changed."""
+    for sensor in sensor_names(part):
+        with RecordingReader(part, sensor=sensor) as recording:
+            if recording.trajectory is None:
+                raise DataError(f"{target} reads back without poses; check the disk")
+
+
+@contextmanager
+def _errors_with_path(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except ErtisError:
+        raise
+    except (OSError, RuntimeError) as error:  # h5py raises both when the disk fails.
+        reason = str(error).partition("\n")[0]
+        raise DataError(f"{path} cannot be written ({reason}); {remedy(error)}") from error
