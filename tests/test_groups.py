@@ -12,7 +12,7 @@ HOUR_NS = 3_600_000_000_000
 LATENCY_NS = 3_000_000
 
 
-class Platform:
+class CountedPlatform:
     """Sensors on one SYNC chain, with a monotonic clock per session and a wall clock that may be set."""
 
     def __init__(self, *runs):
@@ -51,13 +51,13 @@ class Platform:
 
 @pytest.fixture
 def four():
-    made = Platform(*((name, 1) for name in "abcd"))
+    made = CountedPlatform(*((name, 1) for name in "abcd"))
     made.register()
     return made
 
 
 def test_group_stays_open_while_sensors_still_arrive():
-    platform = Platform(("a", 1))
+    platform = CountedPlatform(("a", 1))
     platform.register(0)
     platform.pulse(0)
     platform.runs["b"] = 1
@@ -104,7 +104,7 @@ def test_clock_step_flags_the_group_and_shifts_nothing(four):
 
 
 def test_counts_of_several_sessions_are_aligned_by_time():
-    platform = Platform(("a", 1), ("b", 2))
+    platform = CountedPlatform(("a", 1), ("b", 2))
     platform.register()
     platform.shift["b"] = -7  # it was armed seven pulses later
     for number in range(20):
@@ -115,7 +115,7 @@ def test_counts_of_several_sessions_are_aligned_by_time():
 
 @pytest.mark.parametrize("shift", [-1, 1])
 def test_lost_or_double_pulse_flags_its_groups_only(shift):
-    platform = Platform(("a", 1), ("b", 2), ("c", 3))
+    platform = CountedPlatform(("a", 1), ("b", 2), ("c", 3))
     platform.register()
     for number in range(60):
         platform.shift["b"] = shift if number >= 20 else 0
@@ -136,7 +136,7 @@ def test_lost_or_double_pulse_flags_its_groups_only(shift):
 
 
 def test_clock_step_of_a_single_session_shifts_nothing():
-    platform = Platform(("a", 1), ("b", 2))
+    platform = CountedPlatform(("a", 1), ("b", 2))
     platform.register()
     for number in range(30):
         platform.ahead["b"] = HOUR_NS if number >= 15 else 0
@@ -147,7 +147,7 @@ def test_clock_step_of_a_single_session_shifts_nothing():
 
 
 def test_fast_clock_does_not_separate_its_sensor():
-    platform = Platform(("a", 1), ("b", 2))
+    platform = CountedPlatform(("a", 1), ("b", 2))
     platform.register()
     for number in range(10):
         platform.pulse(number, without=("b",))
@@ -177,7 +177,7 @@ def test_ended_sessions_are_forgotten(four):
 
 def test_slow_clock_is_distinguished_from_old_measurements():
     """A computer without a battery starts in the past, but its measurements are as new as those of others."""
-    platform = Platform(("a", 1), ("b", 2))
+    platform = CountedPlatform(("a", 1), ("b", 2))
     platform.register()
     for number in range(10):
         platform.pulse(number, without=("b",))
@@ -190,7 +190,7 @@ def test_slow_clock_is_distinguished_from_old_measurements():
 
 
 def test_node_that_catches_up_keeps_its_times():
-    platform = Platform(("a", 1), ("b", 2))
+    platform = CountedPlatform(("a", 1), ("b", 2))
     platform.register()
     for number in range(40):
         platform.pulse(number, without=("b",))
@@ -214,7 +214,7 @@ def test_node_that_catches_up_keeps_its_times():
     ids=["timestamp", "count", "far", "away", "clock", "fast"],
 )
 def test_faulty_sensor_does_not_change_groups_of_others(wrong):
-    platform = Platform(("a", 1), ("b", 2))
+    platform = CountedPlatform(("a", 1), ("b", 2))
     platform.register()
     values = {"timestamp_ns": 10**18, "monotonic_ns": 0, "sync_count": 0}
     for number in range(600):
@@ -232,7 +232,7 @@ def test_faulty_sensor_does_not_change_groups_of_others(wrong):
 
 
 def test_sessions_after_a_faulty_sensor_are_grouped():
-    platform = Platform(("evil", 9))
+    platform = CountedPlatform(("evil", 9))
     platform.register()
     for number in range(300):
         platform.shift["evil"] = number * 10**6

@@ -4,6 +4,7 @@ Import `render` and `Simulator` from ``ertis_numba.simulation.render``. That mod
 the description of a scene does not need them.
 """
 
+from ertis_numba.simulation.platform import Platform
 from ertis_numba.simulation.scene import Scene, load_scene
 from ertis_numba.simulation.sensors import Electronics, Emitter, Sensor
 from ertis_numba.simulation.sources import Ambient, Noise, Sonar, Tone
@@ -15,6 +16,7 @@ __all__ = [
     "Electronics",
     "Emitter",
     "Noise",
+    "Platform",
     "Point",
     "Scene",
     "Sensor",

@@ -223,6 +223,7 @@ def _reflected_once(ends: End, mirrors: Mirrors, number: Indices) -> End:
         positions_m=_mirrored(ends.positions_m, points_m[:, None], normal[:, None]),
         centre_m=_mirrored(ends.centre_m, points_m, normal),
         velocity_m_s=velocity_m_s,
+        spin_rad_s=-_turned(ends.spin_rad_s, normal),  # a mirror image turns the other way about its normal
         axes=_turned(ends.axes, normal[:, None]),
         sways_m_s=sways_m_s,
         walls=tuple(map(operator.add, names, ends.walls)),

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import ClassVar, Self
 
 import msgspec
+import numpy as np
 
 from ertis_numba import checks
 from ertis_numba.documents import TomlDocument
@@ -14,6 +15,7 @@ from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import written_out
 from ertis_numba.settings import Array
 from ertis_numba.simulation.effects import EFFECTS, INDISPENSABLE
+from ertis_numba.simulation.platform import Platform, SensorPose
 from ertis_numba.simulation.sensors import Sensor
 from ertis_numba.simulation.sources import Ambient, Noise, Sonar, Tone
 from ertis_numba.simulation.targets import Box, Point, Sphere, Wall
@@ -45,6 +47,8 @@ class Scene(TomlDocument, frozen=True, kw_only=True):
         Maximum number of walls on a sound path, 0 to 4; 2 by default.
     effects : dict of str to bool
         Effects to switch on or off by name, regardless of the tolerance; none by default.
+    platform : Platform, optional
+        Platform that carries all sensors; their positions and rotations are then those in its frame. None by default.
     sensors : tuple of Sensor
         Sensors, which emit together; one eRTIS at the origin by default.
     points, spheres, walls, boxes
@@ -70,6 +74,7 @@ class Scene(TomlDocument, frozen=True, kw_only=True):
     tolerance_db: float = 0.1
     max_reflections: int = 2
     effects: dict[str, bool] = msgspec.field(default_factory=dict)
+    platform: Platform | None = None
     sensors: tuple[Sensor, ...] = (Sensor(),)
     points: tuple[Point, ...] = ()
     spheres: tuple[Sphere, ...] = ()
@@ -100,11 +105,25 @@ class Scene(TomlDocument, frozen=True, kw_only=True):
         for name in names:
             if names.count(name) > 1:
                 raise ArgumentError(f"the scene has {names.count(name)} sensors named {name!r}; name each differently")
+        for sensor in self.sensors:
+            if self.platform is not None and (sensor.waypoints or any(sensor.velocity_m_s)):
+                raise ArgumentError(
+                    f"sensor {sensor.name!r} moves by itself, but the scene has a platform, which carries all sensors; "
+                    "remove velocity_m_s and waypoints of the sensor, or the platform"
+                )
 
     @property
     def moves(self) -> bool:
-        """True if any object changes its position."""
-        return any(thing.moves for thing in self.things())
+        """True if any object changes its position or rotation."""
+        carried = self.platform is not None and self.platform.moves
+        return carried or any(thing.moves for thing in self.things())
+
+    def pose_of(self, sensor: Sensor, time_s: float) -> SensorPose:
+        """Return the pose and the motion of a sensor in the world frame at a time in seconds."""
+        place, rotation = sensor.path(), sensor.rotation()
+        if self.platform is not None:
+            return self.platform.pose_at(time_s).at(place.position_at(time_s), rotation)
+        return SensorPose(place.position_at(time_s), place.velocity_at(time_s), rotation, np.zeros(3))
 
     def things(self) -> tuple[Placed, ...]:
         """Return all objects that have a position, including the sensors."""

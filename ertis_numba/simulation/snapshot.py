@@ -61,6 +61,9 @@ class Receivers:
     ----------
     positions_m : (image, mic, axis) float64
     centre_m, velocity_m_s : (image, axis) float64
+        Centre of the microphones, and its velocity.
+    spin_rad_s : (image, axis) float64
+        Angular velocity about the centre.
     axes : (image, 3, axis) float64
         The sensor's x, y and z as unit vectors. An odd number of reflections makes them left-handed.
     sways_m_s : (wall, image, axis) float64
@@ -75,6 +78,7 @@ class Receivers:
     positions_m: Floats
     centre_m: Floats
     velocity_m_s: Floats
+    spin_rad_s: Floats
     axes: Floats
     sways_m_s: Floats = field(default_factory=lambda: np.zeros((0, 1, 3)))
     walls: tuple[tuple[str, ...], ...] = ((),)
@@ -218,8 +222,8 @@ class Snapshot:
 def snapshot(scene: Scene, sensor: Sensor, time_s: float, cache: Cache | None = None) -> Snapshot:
     """Return the scene at a time in seconds, for one receiving sensor; it may share a cache with others."""
     layout = microphones(sensor.array)
-    place, rotation = sensor.path(), sensor.rotation()
-    centre_m = place.position_at(time_s)
+    pose = scene.pose_of(sensor, time_s)
+    emitters = [scene.pose_of(other, time_s) for other in scene.sensors]
     return Snapshot(
         scene=scene,
         sensor=sensor,
@@ -227,18 +231,19 @@ def snapshot(scene: Scene, sensor: Sensor, time_s: float, cache: Cache | None = 
         layout=layout,
         channels=np.flatnonzero(layout.enabled),
         receiver=Receivers(
-            positions_m=(centre_m + layout.enabled_positions_m @ rotation.T)[None],
-            centre_m=centre_m[None],
-            velocity_m_s=place.velocity_at(time_s)[None],
-            axes=rotation.T[None],
+            positions_m=(pose.position_m + layout.enabled_positions_m @ pose.rotation.T)[None],
+            centre_m=pose.position_m[None],
+            velocity_m_s=pose.velocity_m_s[None],
+            spin_rad_s=pose.spin_rad_s[None],
+            axes=pose.rotation.T[None],
         ),
         transmitters=tuple(
             Transmitters(
-                position_m=other.path().position_at(time_s)[None],
-                velocity_m_s=other.path().velocity_at(time_s)[None],
-                facing=other.rotation()[:, 0][None],
+                position_m=each.position_m[None],
+                velocity_m_s=each.velocity_m_s[None],
+                facing=each.rotation[:, 0][None],
             )
-            for other in scene.sensors
+            for each in emitters
         ),
         targets=_targets(scene, time_s),
         mirrors=_mirrors(scene, time_s),

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from ertis_numba.simulation.estimates import Estimate
 from ertis_numba.simulation.image_estimate import Sight
 from ertis_numba.simulation.paths import Paths
+from ertis_numba.simulation.scene import Scene
 from ertis_numba.simulation.snapshot import Receivers, Snapshot, Transmitters
 
 __all__ = ["estimate", "times"]
@@ -28,7 +29,8 @@ def _moved(paths: Paths, speed_m_s: float) -> tuple[Floats, Floats]:
     """Return the arrival time of the call's beginning, and its stretch: both (path, mic) float64.
 
     All velocities are constant. Sound that leaves at t₀ meets the moving target at t₁ and the moving microphone at t₂:
-    ``c (t₁ - t₀) = |p + v t₁ - s(t₀)|``, and similarly for t₂. The position of a wall is that at the time of
+    ``c (t₁ - t₀) = |p + v t₁ - s(t₀)|``, and similarly for t₂. A microphone at r from the centre of a turning array
+    moves at ``v + ω × r``. The position of a wall is that at the time of
     reflection, accurate to first order in v / c for oblique incidence. Amplitudes are those of objects at rest.
 
     The stretch is dt₂/dt₀ at the beginning of the call. It equals the product of the Doppler factors of all moving
@@ -45,6 +47,8 @@ def _arrival_s(paths: Paths, start_s: float, speed_m_s: float) -> Floats:
     target_m = transmitter.position_m[:, None] + paths.first_m[..., None] * paths.leaving
     met_s = start_s + paths.first_m / speed_m_s
     arrival_s = met_s + paths.second_m / speed_m_s
+    arms_m = receiver.positions_m - receiver.centre_m[:, None]
+    mics_m_s = _own_m_s(receiver)[:, None] + np.cross(receiver.spin_rad_s[:, None], arms_m)
     transmitter_sways, receiver_sways = (bool(np.any(end.sways_m_s)) for end in (transmitter, receiver))
     for _ in range(_ROUNDS):
         before_s, from_m = arrival_s, sent_m
@@ -56,7 +60,7 @@ def _arrival_s(paths: Paths, start_s: float, speed_m_s: float) -> Floats:
         if len(paths.targets):
             met_m = target_m + met_s[..., None] * paths.targets.velocities_m_s[:, None, :]
             met_s = start_s + _length(met_m - from_m) / speed_m_s
-        receiver_m = receiver.positions_m + arrival_s[..., None] * _own_m_s(receiver)[:, None]
+        receiver_m = receiver.positions_m + arrival_s[..., None] * mics_m_s
         if receiver_sways:
             back = _mean(arrival_s - met_s, paths.second_m)
             receiver_m = receiver_m + _swayed_m(receiver, np.mean(arrival_s, axis=1) - paths.receiver_corners_m * back)
@@ -97,8 +101,7 @@ def estimate(sight: Sight) -> Estimate | None:
     """
     shot = sight.shot
     scene = shot.scene
-    moving = [*scene.points, *scene.spheres, *scene.walls, *scene.boxes, *(sensor.path() for sensor in scene.sensors)]
-    if not (len(sight.heard) and any(thing.moves for thing in moving)):
+    if not (len(sight.heard) and _echoes_move(scene)):
         return None
     shifts_s, turns_s, stretches, asides = [], [], [], []
     for number in sight.emitters(sight.active):
@@ -132,6 +135,11 @@ def estimate(sight: Sight) -> Estimate | None:
     )
 
 
+def _echoes_move(scene: Scene) -> bool:
+    moving = [*scene.points, *scene.spheres, *scene.walls, *scene.boxes, *(sensor.path() for sensor in scene.sensors)]
+    return any(thing.moves for thing in moving) or (scene.platform is not None and scene.platform.moves)
+
+
 def _reported_m_s(stretch: float, speed_m_s: float) -> str:
     """Return the velocity of a reflector that causes a stretch of the call, as text."""
     away_m_s = speed_m_s * (stretch - 1) / (stretch + 1)
@@ -139,10 +147,15 @@ def _reported_m_s(stretch: float, speed_m_s: float) -> str:
 
 
 def _aside_rad(paths: Paths, speed_m_s: float) -> NDArray[np.float64]:
-    """Return the angle that targets move across the line of sight until the sound meets them: (path,) float64."""
+    """Return the angle by which directions change until the sound arrives: (path,) float64.
+
+    Targets move across the line of sight until the sound meets them, and the microphones turn until it arrives.
+    """
+    turned_rad = np.linalg.norm(paths.receiver.spin_rad_s, axis=-1) * paths.length_m[:, 0] / speed_m_s
     if not len(paths.targets):
-        return np.zeros(len(paths))
+        return np.asarray(turned_rad)
     way = paths.arriving[:, 0]
     across_m_s = paths.targets.velocities_m_s - paths.receiver.velocity_m_s
     across_m_s = across_m_s - np.sum(across_m_s * way, axis=-1, keepdims=True) * way
-    return np.asarray(np.linalg.norm(across_m_s, axis=-1) * paths.first_m[:, 0] / speed_m_s / paths.second_m[:, 0])
+    moved_m = np.linalg.norm(across_m_s, axis=-1) * paths.first_m[:, 0] / speed_m_s
+    return np.asarray(turned_rad + moved_m / paths.second_m[:, 0])

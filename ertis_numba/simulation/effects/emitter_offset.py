@@ -18,9 +18,8 @@ def transmitter(shot: Snapshot, number: int, transmitter: Transmitters) -> Trans
     bistatic: its length is ``|x - (o + R p)| + |x - m|`` for a target x and a microphone m.
     """
     sensor = shot.scene.sensors[number]
-    return replace(
-        transmitter, position_m=transmitter.position_m + sensor.rotation() @ np.array(sensor.emitter.position_m)
-    )
+    pose = shot.scene.pose_of(sensor, shot.time_s).at(np.array(sensor.emitter.position_m), np.eye(3))
+    return replace(transmitter, position_m=pose.position_m[None], velocity_m_s=pose.velocity_m_s[None])
 
 
 def estimate(sight: Sight) -> Estimate | None:
