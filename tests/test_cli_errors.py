@@ -67,7 +67,7 @@ CASES = {
     "energyscapes instead": ("process img.h5 -o out.h5", 1, "img.h5 is an energyscape file, wanted a recording; give"),
     "recording instead": ("peaks rec.h5", 1, "rec.h5 is a recording, wanted an energyscape file; process it first"),
     "cut short": ("process cut.h5 -o out.h5", 1, "cut.h5 is cut short or damaged: it has"),
-    "newer": ("process newer.h5 -o out.h5", 1, "newer.h5 has format version 9, but this package reads up to 3; update"),
+    "newer": ("process newer.h5 -o out.h5", 1, "newer.h5 has format version 9, but this package reads up to 4; update"),
     "damaged words": ("process damaged.h5 -o out.h5", 1, "damaged.h5: measurement 1 has CRC-32"),
     "NaN in calibration": (
         "process nan.h5 -o out.h5",

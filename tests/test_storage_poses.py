@@ -1,10 +1,13 @@
 """Poses of the platform in recordings: round trips, interpolation, errors, and files without poses."""
 
+import json
 from dataclasses import replace
 
 import h5py
 import numpy as np
 import pytest
+from click.testing import CliRunner
+from ertis_cli.main import cli
 from scipy.spatial.transform import Rotation
 
 import ertis_numba as ertis
@@ -325,3 +328,19 @@ def test_poses_with_too_few_rows_are_refused(tmp_path):
         file["sensors/eRTIS-7/pose_position"].resize(2, axis=0)
     with pytest.raises(DamagedError):
         open_recording(path)
+
+
+def test_info_command_reports_poses(plain):
+    def reported(*options):
+        done = CliRunner().invoke(cli, ["info", str(plain), *options])
+        assert done.exit_code == 0, done.exception
+        return done.stdout
+
+    assert ["poses", "0"] in [line.split() for line in reported().splitlines()]
+    ertis.add_poses(plain, drive())
+    (left, _) = json.loads(reported("--json"))["sensors"]
+    assert (left["poses"], left["poses_source"]) == (3, "file")
+    assert left["path_length_m"] == pytest.approx(drive().at(TIMES_NS).length_m, abs=1e-3)
+    lines = [line.split() for line in reported().splitlines()]
+    assert ["poses", "source", "file"] in lines
+    assert ["path", "length", str(left["path_length_m"]), "m"] in lines

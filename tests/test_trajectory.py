@@ -19,6 +19,19 @@ def steady(velocity_m_s, rate_rad_s, *, n_poses=21, step_ns=100_000_000):
     return ertis.Trajectory(time_ns, elapsed_s * velocity_m_s, rotation)
 
 
+def test_length_is_that_of_the_path_from_pose_to_pose():
+    positions_m = [[0, 0, 0], [3, 4, 0], [3, 4, 2], [3, 4, 1]]
+    assert ertis.Trajectory(range(4), positions_m, [IDENTITY] * 4).length_m == 8.0
+    assert ertis.Trajectory([5], [[1, 2, 3]], [IDENTITY]).length_m == 0.0
+
+
+def test_at_returns_given_poses_unchanged():
+    rotation = Rotation.random(40, random_state=2).as_quat()
+    given = ertis.Trajectory(np.arange(40) * 100, np.ones((40, 3)), -rotation)
+    assert np.array_equal(given.at(given.time_ns).rotation_xyzw, given.rotation_xyzw)
+    assert np.array_equal(given.replace(source="copy").rotation_xyzw, given.rotation_xyzw)
+
+
 numbers = st.lists(st.floats(-2, 2), min_size=3, max_size=3).map(np.array)
 offsets_ns = st.lists(st.integers(0, 2_000_000_000), min_size=1, max_size=20, unique=True).map(
     lambda values: np.sort(np.array(values, np.int64))

@@ -149,6 +149,7 @@ def _recording(reader: "RecordingReader") -> dict[str, Any]:
         "missing": sum(gap.n_missing for gap in reader.gaps),
         **({"firmware": reader.firmware} if reader.firmware else {}),
         **_mounting(reader),
+        **_poses(reader),
     }
 
 
@@ -171,6 +172,16 @@ def _mounting(reader: "RecordingReader | EnergyscapeReader") -> dict[str, Any]:
     if reader.translation_m is None or reader.rotation_xyzw is None:
         return {"mounting": "unknown"}
     return {"translation_m": reader.translation_m.tolist(), "rotation_xyzw": reader.rotation_xyzw.tolist()}
+
+
+def _poses(reader: "RecordingReader") -> dict[str, Any]:
+    if reader.trajectory is None:
+        return {"poses": 0}
+    return {
+        "poses": len(reader.trajectory),
+        "poses_source": reader.trajectory.source or "unknown",
+        "path_length_m": round(reader.trajectory.length_m, 3),
+    }
 
 
 def _error(reader: "EnergyscapeReader") -> dict[str, Any]:

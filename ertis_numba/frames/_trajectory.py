@@ -87,6 +87,11 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.time_ns)
 
+    @property
+    def length_m(self) -> float:
+        """Length of the path from pose to pose, in metres."""
+        return float(np.sum(np.linalg.norm(np.diff(self.position_m, axis=0), axis=1)))
+
     def replace(self, **changes: Any) -> "Trajectory":
         """Return a copy with some fields changed.
 

@@ -8,7 +8,7 @@ from ertis_numba.storage.energyscape import (
     open_energyscapes,
     write_energyscapes,
 )
-from ertis_numba.storage.poses import add_poses, recorded_trajectory
+from ertis_numba.storage.poses import add_poses, recorded_trajectory, require_fitting_poses
 from ertis_numba.storage.recording import (
     RecordingReader,
     RecordingWriter,
@@ -31,6 +31,7 @@ __all__ = [
     "open_energyscapes",
     "open_recording",
     "recorded_trajectory",
+    "require_fitting_poses",
     "sensor_names",
     "write_energyscapes",
     "write_recording",

@@ -71,6 +71,8 @@ def require_times(trajectory: Trajectory, time_ns: NDArray[np.int64], sensor: st
     ArgumentError
         The trajectory does not cover all measurements.
     """
+    if not len(time_ns):
+        return
     first_ns, last_ns = int(trajectory.time_ns[0]), int(trajectory.time_ns[-1])
     begin_ns, end_ns = int(time_ns.min()), int(time_ns.max())
     if begin_ns < first_ns or end_ns > last_ns:
@@ -83,6 +85,8 @@ def require_times(trajectory: Trajectory, time_ns: NDArray[np.int64], sensor: st
 def write_poses(group: h5py.Group, trajectory: Trajectory) -> None:
     """Store the pose at each measurement of a sensor; the group has its rows, but no poses.
 
+    A sensor without measurements has no poses.
+
     Raises
     ------
     ArgumentError
@@ -90,6 +94,8 @@ def write_poses(group: h5py.Group, trajectory: Trajectory) -> None:
     """
     time_ns = np.asarray(group["time"][:], np.int64)
     require_times(trajectory, time_ns, group.name.rpartition("/")[2])
+    if not len(time_ns):
+        return
     times, rows = np.unique(time_ns, return_inverse=True)  # Measurements may be out of order, or share a time.
     stored = trajectory.at(times)
     columns = {"pose_position": stored.position_m, "pose_rotation": stored.rotation_xyzw}

@@ -28,7 +28,7 @@ from ertis_numba.storage.schema import (
     to_python,
 )
 
-__all__ = ["add_poses", "recorded_trajectory"]
+__all__ = ["add_poses", "recorded_trajectory", "require_fitting_poses"]
 
 _BYTES_PER_POSE: Final = 8 * (3 + 4 + 36)
 _BYTES_PER_SENSOR: Final = 200_000  # Chunks that are not full, and tables.
@@ -97,13 +97,52 @@ def add_poses(
         check_target(source, overwrite=True)
     else:
         check_target(target, overwrite=overwrite, sources=[source])
-    n_poses = sum(_require_fitting(source, sensor, trajectory, replace=replace) for sensor in sensor_names(source))
+    n_poses = require_fitting_poses(source, trajectory, replace=replace)
     with _errors_with_path(target), atomic_write(target, overwrite=overwrite or output is None) as part:
         _copy(source, part, n_poses * _BYTES_PER_POSE)
         with h5py.File(part, "r+", libver=("v110", "v110")) as file:
             _add(file, trajectory)
         _verify(part, target)
     return target
+
+
+def require_fitting_poses(path: str | Path, trajectory: Trajectory, *, replace: bool = False) -> int:
+    """Refuse a recording to which poses cannot be added, and return the number of its measurements.
+
+    Parameters
+    ----------
+    path : str or Path
+        Path of the recording.
+    trajectory : Trajectory
+        Poses of the platform.
+    replace : bool
+        Accept a recording that has poses already.
+
+    Returns
+    -------
+    int
+        Number of measurements of all sensors.
+
+    Raises
+    ------
+    ArgumentError
+        The trajectory does not cover the recording, or the recording has poses already.
+    DataError
+        The recording cannot be read.
+    """
+    n_measurements = 0
+    for sensor in sensor_names(path):
+        with open_recording(path, sensor=sensor) as recording:
+            if recording.trajectory is not None and not replace:
+                origin = f" (source {recording.trajectory.source!r})" if recording.trajectory.source else ""
+                raise ArgumentError(f"{path} has poses already{origin}; keep them, or ask to replace them (--force)")
+            time_ns = np.array([stamp.timestamp_ns for stamp in recording.stamps()], np.int64)
+        n_measurements += len(time_ns)
+        try:
+            require_times(trajectory, time_ns, sensor)
+        except ArgumentError as error:
+            raise ArgumentError(f"{path}: {error} (--offset-s)") from error
+    return n_measurements
 
 
 def recorded_trajectory(path: str | Path, *, sensor: str | None = None) -> Trajectory | None:
@@ -160,21 +199,6 @@ def _merged(path: Path, found: dict[str, Trajectory]) -> Trajectory:
     return Trajectory(time_ns, rows[first, :3], rows[first, 3:], covariance, several[0].source)
 
 
-def _require_fitting(path: Path, sensor: str, trajectory: Trajectory, *, replace: bool) -> int:
-    """Return the number of measurements of a sensor; refuse a sensor that cannot have these poses."""
-    with open_recording(path, sensor=sensor) as recording:
-        if recording.trajectory is not None and not replace:
-            origin = f" (source {recording.trajectory.source!r})" if recording.trajectory.source else ""
-            raise ArgumentError(f"{path} has poses already{origin}; keep them, or ask to replace them (--force)")
-        time_ns = np.array([stamp.timestamp_ns for stamp in recording.stamps()], np.int64)
-    if len(time_ns):
-        try:
-            require_times(trajectory, time_ns, sensor)
-        except ArgumentError as error:
-            raise ArgumentError(f"{path}: {error} (--offset-s)") from error
-    return len(time_ns)
-
-
 def _copy(source: Path, part: Path, n_bytes: int) -> None:
     """Copy a recording, and compare the copy."""
     with h5py.File(source, "r") as file:
@@ -210,7 +234,7 @@ def _verify(part: Path, target: Path) -> None:
     """Read the parts of the new recording that changed."""
     for sensor in sensor_names(part):
         with RecordingReader(part, sensor=sensor) as recording:
-            if recording.trajectory is None:
+            if recording.trajectory is None and len(recording):
                 raise DataError(f"{target} reads back without poses; check the disk")
 
 
