@@ -42,7 +42,14 @@ from .frames import (
 )
 from .fusion import Fused as Fused, Fuser as Fuser, fuse as fuse
 from .geometry import layout_names as layout_names, load_layout as load_layout
-from .interop import export as export, open_pcm as open_pcm, open_raw as open_raw, open_rtis_folder as open_rtis_folder
+from .interop import (
+    export as export,
+    open_pcm as open_pcm,
+    open_raw as open_raw,
+    open_rtis_folder as open_rtis_folder,
+    read_trajectory as read_trajectory,
+    write_tum as write_tum,
+)
 from .journal import JournalEntry as JournalEntry
 from .motion import (
     EgoVelocity as EgoVelocity,

@@ -4,6 +4,7 @@ from ertis_numba.interop._export import FORMATS, TOPICS, choose_format, export, 
 from ertis_numba.interop.pcm import PcmReader, open_pcm
 from ertis_numba.interop.raw_pdm import RawReader, open_raw
 from ertis_numba.interop.rtis_folder import open_rtis_folder
+from ertis_numba.interop.trajectory_files import read_trajectory, write_tum
 
 __all__ = [
     "FORMATS",
@@ -16,4 +17,6 @@ __all__ = [
     "open_raw",
     "open_rtis_folder",
     "output_files",
+    "read_trajectory",
+    "write_tum",
 ]
