@@ -101,10 +101,11 @@ def write_tum(path: str | Path, trajectory: Trajectory, *, overwrite: bool = Fal
 
     Examples
     --------
+    >>> from pathlib import Path
     >>> import ertis_numba as ertis
     >>> path = ertis.Trajectory([1_700_000_000_123_456_789], [[1, 2, 0]], [[0, 0, 0, 1]])
     >>> ertis.write_tum("written.tum", path)
-    >>> print(open("written.tum").read(), end="")
+    >>> print(Path("written.tum").read_text(), end="")
     # timestamp tx ty tz qx qy qz qw
     1700000000.123456789 1 2 0 0 0 0 1
     """
@@ -211,7 +212,7 @@ def _lines(text: str) -> Iterator[tuple[int, str]]:
 
 
 def _some(found: Iterable[Found]) -> list[Found]:
-    """Return a list of what was found.
+    """Return the items as a list.
 
     Raises
     ------

@@ -13,7 +13,7 @@ from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Trajectory
 from ertis_numba.simulation.trajectory import FARTHEST_M, FASTEST_M_S, check_vector
 
-__all__ = ["Platform", "SensorPose"]
+__all__ = ["MovingPose", "Platform"]
 
 Floats = NDArray[np.float64]
 _FASTEST_DEG_S = 3600.0
@@ -21,7 +21,7 @@ _MAX_TURNS = 1e6
 _NS_PER_S = 10**9
 
 
-class SensorPose(NamedTuple):
+class MovingPose(NamedTuple):
     """Pose and motion in the world frame at one instant.
 
     Attributes
@@ -38,7 +38,7 @@ class SensorPose(NamedTuple):
     rotation: Floats
     spin_rad_s: Floats
 
-    def at(self, offset_m: Floats, rotation: Floats) -> "SensorPose":
+    def at(self, offset_m: Floats, rotation: Floats) -> "MovingPose":
         """Return the pose of an object that is fixed to this one.
 
         ``p' = p + R o`` and ``v' = v + ω × R o`` for an offset o.
@@ -51,7 +51,7 @@ class SensorPose(NamedTuple):
             Rotation from the frame of the other object to the frame of this one.
         """
         arm_m = self.rotation @ offset_m
-        return SensorPose(
+        return MovingPose(
             self.position_m + arm_m,
             self.velocity_m_s + np.cross(self.spin_rad_s, arm_m),
             self.rotation @ rotation,
@@ -76,8 +76,8 @@ class Platform(TomlTable, frozen=True, kw_only=True):
     >>> from ertis_numba.simulation import Platform
     >>> platform = Platform(waypoints=((0.0, 0.0, 0.0, 0.0, 0.0), (2.0, 1.0, 0.0, 0.0, 90.0)))
     >>> pose = platform.pose_at(1.0)
-    >>> pose.position_m.tolist(), pose.velocity_m_s.tolist(), round(pose.spin_rad_s[2], 3)
-    ([0.5, 0.0, 0.0], [0.5, 0.0, 0.0], 0.785)
+    >>> pose.position_m.tolist(), pose.velocity_m_s.tolist(), pose.spin_rad_s.round(3).tolist()
+    ([0.5, 0.0, 0.0], [0.5, 0.0, 0.0], [0.0, 0.0, 0.785])
     """
 
     waypoints: tuple[tuple[float, float, float, float, float], ...]
@@ -106,7 +106,7 @@ class Platform(TomlTable, frozen=True, kw_only=True):
         """True if the platform ever moves or turns."""
         return any(before[1:] != after[1:] for before, after in itertools.pairwise(self.waypoints))
 
-    def pose_at(self, time_s: float) -> SensorPose:
+    def pose_at(self, time_s: float) -> MovingPose:
         """Return the pose and the motion at a time of the scene."""
         ways = np.array(self.waypoints)
         next_one = int(np.searchsorted(ways[:, 0], time_s, side="right"))
@@ -118,7 +118,7 @@ class Platform(TomlTable, frozen=True, kw_only=True):
             place = start[1:] + (time_s - start[0]) * rates
         yaw_rad = math.radians(place[3])
         c, s = math.cos(yaw_rad), math.sin(yaw_rad)
-        return SensorPose(
+        return MovingPose(
             place[:3],
             rates[:3],
             np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]),

@@ -15,7 +15,7 @@ from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import written_out
 from ertis_numba.settings import Array
 from ertis_numba.simulation.effects import EFFECTS, INDISPENSABLE
-from ertis_numba.simulation.platform import Platform, SensorPose
+from ertis_numba.simulation.platform import MovingPose, Platform
 from ertis_numba.simulation.sensors import Sensor
 from ertis_numba.simulation.sources import Ambient, Noise, Sonar, Tone
 from ertis_numba.simulation.targets import Box, Point, Sphere, Wall
@@ -118,12 +118,12 @@ class Scene(TomlDocument, frozen=True, kw_only=True):
         carried = self.platform is not None and self.platform.moves
         return carried or any(thing.moves for thing in self.things())
 
-    def pose_of(self, sensor: Sensor, time_s: float) -> SensorPose:
+    def pose_of(self, sensor: Sensor, time_s: float) -> MovingPose:
         """Return the pose and the motion of a sensor in the world frame at a time in seconds."""
         place, rotation = sensor.path(), sensor.rotation()
         if self.platform is not None:
             return self.platform.pose_at(time_s).at(place.position_at(time_s), rotation)
-        return SensorPose(place.position_at(time_s), place.velocity_at(time_s), rotation, np.zeros(3))
+        return MovingPose(place.position_at(time_s), place.velocity_at(time_s), rotation, np.zeros(3))
 
     def things(self) -> tuple[Placed, ...]:
         """Return all objects that have a position, including the sensors."""
