@@ -76,8 +76,7 @@ def pulse_groups(readers: "Sequence[RecordingReader]") -> "Iterator[dict[str, St
     groups: PulseGroups[StampedIndex] = PulseGroups.of(reader.sensor for reader in readers)
     for place in sorted(places, key=lambda place: (place.stamp.timestamp_ns, place.stamp.sync_count)):
         yield from groups.add(place)
-    rest = groups.close()
-    if rest:
+    while rest := groups.close():
         yield rest
 
 

@@ -1,0 +1,81 @@
+"""Groups of images of the same SYNC pulse, in whatever order they arrive."""
+
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from ertis_numba.frames import Stamp
+from ertis_numba.fusion.pulses import PulseGroups
+
+PERIOD_NS = 100_000_000
+SENSORS = "front", "left", "back"
+
+
+class StampedItem(NamedTuple):
+    """An item with a stamp only."""
+
+    stamp: Stamp
+
+
+def item(sensor, count, *, later_ns=0):
+    return StampedItem(Stamp(sensor=sensor, sync_count=count, timestamp_ns=10**18 + count * PERIOD_NS + later_ns))
+
+
+def summary(groups):
+    """SYNC count and sensors of each group."""
+    return [(next(iter(group.values())).stamp.sync_count, *sorted(group)) for group in groups]
+
+
+def test_images_that_overtake_those_of_another_sensor_wait_for_them():
+    groups = PulseGroups.of(SENSORS)
+    order = [("front", 0), ("left", 0), ("front", 1), ("back", 0), ("left", 1), ("back", 1)]
+    found = [summary(groups.add(item(*each))) for each in order]
+    assert found == [[], [], [], [(0, "back", "front", "left")], [], [(1, "back", "front", "left")]]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_groups_are_complete_and_in_order_if_each_sensor_is(seed):
+    draws = np.random.default_rng(seed)
+    # Each sensor's images keep their order, and are late by up to two periods.
+    arrivals = [
+        (time, item(sensor, count, later_ns=shift_ns))
+        for sensor, shift_ns in zip(SENSORS, (0, 180_000_000, -40_000_000), strict=True)
+        for count, time in enumerate(np.maximum.accumulate(np.arange(40) + draws.uniform(0, 2, 40)))
+    ]
+    groups = PulseGroups.of(SENSORS)
+    found = [groups.add(each) for _, each in sorted(arrivals, key=lambda arrival: arrival[0])]
+    assert summary(itertools.chain(*found)) == [(count, *sorted(SENSORS)) for count in range(40)]
+
+
+def test_pulse_ends_once_a_missing_sensor_has_an_image_of_the_next_one():
+    groups = PulseGroups.of(SENSORS)
+    order = [("front", 0), ("left", 0), ("front", 1), ("left", 1), ("back", 1)]
+    found = [summary(groups.add(item(*each))) for each in order]
+    assert found == [[], [], [], [], [(0, "front", "left"), (1, "back", "front", "left")]]
+
+
+def test_sensor_that_stops_delays_some_pulses_only():
+    groups = PulseGroups.of(SENSORS)
+    for count, sensor in itertools.product(range(2), SENSORS):
+        groups.add(item(sensor, count))
+    found = [summary(groups.add(item(sensor, count))) for count in range(2, 8) for sensor in ("front", "left")]
+    assert [count for group in found for count, *_ in group] == [*range(2, 8)]
+    assert found[-3:] == [[(6, "front", "left")], [], [(7, "front", "left")]]
+
+
+def test_late_and_repeated_images_are_left_out():
+    groups = PulseGroups.of(["front"])
+    assert summary(groups.add(item("front", 5))) == [(5, "front")]
+    assert groups.add(item("front", 5)) == []
+    assert groups.add(item("left", 4)) == []
+    assert groups.close() == {}
+
+
+def test_close_returns_open_groups_from_the_earliest():
+    groups = PulseGroups.of(SENSORS)
+    for each in (("left", 4), ("front", 3)):
+        groups.add(item(*each))
+    assert summary([groups.close(), groups.close()]) == [(3, "front"), (4, "left")]
+    assert groups.close() == {}
