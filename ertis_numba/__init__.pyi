@@ -34,6 +34,7 @@ from .frames import (
     Energyscape as Energyscape,
     Measurement as Measurement,
     MicrophoneSignals as MicrophoneSignals,
+    OccupancyMap as OccupancyMap,
     Peak as Peak,
     PointCloud as PointCloud,
     Reflector as Reflector,
@@ -48,9 +49,11 @@ from .interop import (
     open_raw as open_raw,
     open_rtis_folder as open_rtis_folder,
     read_trajectory as read_trajectory,
+    write_map as write_map,
     write_tum as write_tum,
 )
 from .journal import JournalEntry as JournalEntry
+from .mapping import Mapper as Mapper
 from .motion import (
     EgoVelocity as EgoVelocity,
     Odometry as Odometry,
@@ -70,6 +73,7 @@ from .storage import (
     add_poses as add_poses,
     open_energyscapes as open_energyscapes,
     open_recording as open_recording,
+    read_map as read_map,
     write_energyscapes as write_energyscapes,
     write_recording as write_recording,
 )

@@ -57,6 +57,9 @@ DOCUMENTED = [
     ertis.Peak,
     ertis.Reflector,
     ertis.Trajectory,
+    ertis.OccupancyMap,
+    ertis.read_map,
+    ertis.write_map,
 ]
 
 

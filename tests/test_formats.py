@@ -10,6 +10,7 @@ from ertis_numba.storage.schema import (
     CONVENTIONS,
     ENERGYSCAPE,
     FORMAT_VERSION,
+    OCCUPANCY_MAP,
     POSES,
     RECORDING,
     RECORDING_OF_PCM,
@@ -40,6 +41,7 @@ def rows(first):
         ("temperature", [variable for variable in EITHER if variable not in SHARED]),
         ("pose_position", POSES),
         ("scene", TRUTH),
+        ("log_odds", OCCUPANCY_MAP),
         ("amplitude", [variable for variable in ENERGYSCAPE if variable not in SHARED]),
     ],
 )

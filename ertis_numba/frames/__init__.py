@@ -4,6 +4,7 @@ from ertis_numba.frames._beams import Beams
 from ertis_numba.frames._energyscape import Energyscape
 from ertis_numba.frames._gap import SequenceGap
 from ertis_numba.frames._measurement import Measurement, MicrophoneSignals
+from ertis_numba.frames._occupancy_map import FREE_BELOW, MAX_CELLS, OCCUPIED_ABOVE, OccupancyMap
 from ertis_numba.frames._point_cloud import PointCloud
 from ertis_numba.frames._reflectors import Peak, Reflector
 from ertis_numba.frames._stamp import BEHAVIOURS, Behaviour, Stamp
@@ -11,11 +12,15 @@ from ertis_numba.frames._trajectory import Trajectory
 
 __all__ = [
     "BEHAVIOURS",
+    "FREE_BELOW",
+    "MAX_CELLS",
+    "OCCUPIED_ABOVE",
     "Beams",
     "Behaviour",
     "Energyscape",
     "Measurement",
     "MicrophoneSignals",
+    "OccupancyMap",
     "Peak",
     "PointCloud",
     "Reflector",

@@ -1,6 +1,7 @@
 """Readers and writers of foreign formats."""
 
 from ertis_numba.interop._export import FORMATS, TOPICS, choose_format, export, output_files
+from ertis_numba.interop._map_files import MAP_SUFFIXES, map_files, write_map
 from ertis_numba.interop.pcm import PcmReader, open_pcm
 from ertis_numba.interop.raw_pdm import RawReader, open_raw
 from ertis_numba.interop.rtis_folder import open_rtis_folder
@@ -8,15 +9,18 @@ from ertis_numba.interop.trajectory_files import read_trajectory, write_tum
 
 __all__ = [
     "FORMATS",
+    "MAP_SUFFIXES",
     "TOPICS",
     "PcmReader",
     "RawReader",
     "choose_format",
     "export",
+    "map_files",
     "open_pcm",
     "open_raw",
     "open_rtis_folder",
     "output_files",
     "read_trajectory",
+    "write_map",
     "write_tum",
 ]

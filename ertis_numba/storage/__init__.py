@@ -1,4 +1,4 @@
-"""Files of recordings and energyscapes; the only package that imports h5py."""
+"""Files of recordings, energyscapes and occupancy maps; the only package that imports h5py."""
 
 from ertis_numba.atomic_files import atomic_write, check_target
 from ertis_numba.storage._reader import file_kind, sensor_names
@@ -8,6 +8,7 @@ from ertis_numba.storage.energyscape import (
     open_energyscapes,
     write_energyscapes,
 )
+from ertis_numba.storage.maps import read_map, write_map_file
 from ertis_numba.storage.poses import add_poses, recorded_trajectory, require_fitting_poses
 from ertis_numba.storage.recording import (
     RecordingReader,
@@ -30,9 +31,11 @@ __all__ = [
     "file_kind",
     "open_energyscapes",
     "open_recording",
+    "read_map",
     "recorded_trajectory",
     "require_fitting_poses",
     "sensor_names",
     "write_energyscapes",
+    "write_map_file",
     "write_recording",
 ]

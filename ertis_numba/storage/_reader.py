@@ -21,7 +21,7 @@ from ertis_numba.storage.schema import FORMAT_VERSION, SensorGroup, Variable, co
 from ertis_numba.storage.structure import local_member, require_attributes, require_variables, sensors_of
 from ertis_numba.storage.truth import GroundTruth, read_truth
 
-__all__ = ["FileReader", "file_kind", "sensor_names"]
+__all__ = ["FileReader", "file_kind", "open_file", "reading", "sensor_names"]
 
 Item = TypeVar("Item")
 # Errors of h5py for damaged files.
@@ -34,6 +34,7 @@ _OPTIONAL_DIMS = {"word"}  # The axis is left out if its length is one.
 _MAX_NAMES = 64  # Limit on sensors in an error.
 _STORED_END = re.compile(r"stored_eof = (\d+)")
 _KIND_NAMES = {"recording": "a recording", "energyscape": "an energyscape file"}
+_WANTED = "a recording or an energyscape file"
 
 
 def file_kind(path: str | Path) -> str:
@@ -44,8 +45,8 @@ def file_kind(path: str | Path) -> str:
     DataError
         The file cannot be read, or is neither.
     """
-    with _open(Path(path)) as file:
-        return _kind(file, Path(path), "a recording or an energyscape file")
+    with open_file(Path(path)) as file:
+        return _kind(file, Path(path), _WANTED)
 
 
 def sensor_names(path: str | Path) -> tuple[str, ...]:
@@ -56,8 +57,8 @@ def sensor_names(path: str | Path) -> tuple[str, ...]:
     DataError
         The file cannot be read, or is neither.
     """
-    with _open(Path(path)) as file, _reading(file, Path(path)):
-        _kind(file, Path(path), "a recording or an energyscape file")
+    with open_file(Path(path)) as file, reading(file, Path(path)):
+        _kind(file, Path(path), _WANTED)
         return sensors_of(file)
 
 
@@ -88,7 +89,7 @@ class FileReader(Sequence[Item]):
 
     def __init__(self, path: str | Path, *, sensor: str | None = None) -> None:
         self.path = Path(path)
-        self._file = _open(self.path)
+        self._file = open_file(self.path)
         try:
             with self._reading():
                 self._require_kind()
@@ -174,7 +175,7 @@ class FileReader(Sequence[Item]):
         self._file.close()
 
     def _reading(self) -> AbstractContextManager[None]:
-        return _reading(self._file, self.path)
+        return reading(self._file, self.path)
 
     def _require_kind(self) -> None:
         kind = _kind(self._file, self.path, _KIND_NAMES[self._kind])
@@ -221,7 +222,7 @@ class FileReader(Sequence[Item]):
 
 
 @contextmanager
-def _reading(file: h5py.File, path: Path) -> Iterator[None]:
+def reading(file: h5py.File, path: Path) -> Iterator[None]:
     """Name the file in errors, and report errors of h5py as damage."""
     try:
         yield
@@ -241,20 +242,20 @@ def _reading(file: h5py.File, path: Path) -> Iterator[None]:
         raise DamagedError(f"{path} is damaged or cut short ({_reason(error)}); copy it again") from error
 
 
-def _open(path: Path) -> h5py.File:
+def open_file(path: Path, wanted: str = _WANTED) -> h5py.File:
+    """Open an HDF5 file for reading; errors name the kind of file that is wanted."""
     if path.is_dir():
-        raise DataError(f"{path} is a folder; give a recording or an energyscape file")
+        raise DataError(f"{path} is a folder; give {wanted}")
     try:
         with path.open("rb") as file:
             n_bytes = file.seek(0, 2)
     except OSError as error:
-        raise DataError(f"{path}: {error.strerror}; give a recording or an energyscape file") from error
+        raise DataError(f"{path}: {error.strerror}; give {wanted}") from error
     if n_bytes == 0:
-        raise DataError(f"{path} is empty; give a recording or an energyscape file")
+        raise DataError(f"{path} is empty; give {wanted}")
     if not h5py.is_hdf5(path):
-        raise DataError(
-            f"{path} is not an HDF5 file; give a recording or an energyscape file, or import raw words first"
-        )
+        remedy = f"give {wanted}, or import raw words first" if wanted == _WANTED else f"give {wanted}"
+        raise DataError(f"{path} is not an HDF5 file; {remedy}")
     try:
         return h5py.File(path, "r")
     except BlockingIOError as error:
@@ -265,16 +266,18 @@ def _open(path: Path) -> h5py.File:
                 f"{path} is open for writing in another program, or that program was killed; close it there, or "
                 "copy the file"
             ) from error
-        wanted = _STORED_END.search(str(error))
-        amount = f" of {wanted[1]}" if wanted else ""
+        stored = _STORED_END.search(str(error))
+        amount = f" of {stored[1]}" if stored else ""
         raise DataError(f"{path} is cut short or damaged: it has {n_bytes}{amount} bytes; copy it again") from error
 
 
 def _kind(file: h5py.File, path: Path, wanted: str) -> str:
-    with _reading(file, path):
+    with reading(file, path):
         require_attributes(file)
     kind = to_python(file.attrs.get("ertis_format", ""))
     version = to_python(file.attrs.get("ertis_format_version", 0))
+    if kind == "occupancy_map":
+        raise DataError(f"{path} is an occupancy map; give {wanted}")
     if not isinstance(kind, str) or kind not in _KIND_NAMES or not isinstance(version, int):
         raise DataError(f"{path} is HDF5, but not of this package; give {wanted}")
     if version > FORMAT_VERSION:

@@ -27,6 +27,7 @@ __all__ = [
     "ENERGYSCAPE",
     "FORMAT_VERSION",
     "FORMER_NAMES",
+    "OCCUPANCY_MAP",
     "POSES",
     "RECORDING",
     "RECORDING_OF_PCM",
@@ -160,6 +161,13 @@ ENERGYSCAPE: Final = (
     Variable("range", ("range",), "<f8", "half of the sound path", "m"),
     _SETTINGS,
 )
+
+OCCUPANCY_MAP: Final = (
+    Variable("log_odds", ("y", "x"), "<f4", "logarithm of p / (1 - p) of the probability p that a cell is occupied"),
+    Variable("x", ("x",), "<f8", "centres of the cells in the world frame", "m"),
+    Variable("y", ("y",), "<f8", "centres of the cells in the world frame", "m"),
+)
+"""Variables of an occupancy map, in the root of its file."""
 
 TRUTH: Final = (
     Variable("scene", (), "str", "scene as TOML"),

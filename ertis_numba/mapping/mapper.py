@@ -1,0 +1,180 @@
+"""Occupancy mapping from the images of a platform at known poses."""
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from ertis_numba import checks
+from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.frames import Energyscape, OccupancyMap, PointCloud, Trajectory
+from ertis_numba.fusion import Fuser
+from ertis_numba.fusion.fuser import EMITTER_DIAMETER_M
+from ertis_numba.fusion.rig import Mountings, sensor_poses
+from ertis_numba.geometry import mounting
+from ertis_numba.mapping.cell_grid import CellGrid
+from ertis_numba.mapping.sensor_model import Coverage, LocatedEchoes, UsualAmplitude, add_evidence, echoes_of
+
+__all__ = ["Mapper", "Pose"]
+
+Floats = NDArray[np.float64]
+Pose = tuple[Sequence[float], Sequence[float]] | Trajectory
+"""Position x, y, z in m and unit quaternion x, y, z, w from the platform frame to the world frame, or a trajectory."""
+
+_MAX_LOG_ODDS: Final = 4.0  # A clamp keeps the map able to change (K. M. Wurm et al., OctoMap, 2010).
+_NS_PER_S: Final = 1e9
+
+
+class Mapper:
+    """Occupancy map that grows with the images of a platform at known poses.
+
+    Echoes are fused (`Fuser`) and located. Each point adds evidence to the cells of its uncertainty ellipse. Cells in
+    front of the first clear echo of a direction become free, the less the farther away they are. A smooth wall that
+    the sound meets obliquely returns no echo, so silence alone shows free space near the platform only.
+
+    Parameters
+    ----------
+    mountings : mapping of str to (translation_m, rotation_xyzw)
+        Mountings of all sensors, as for `Fuser`.
+    cell_m : float, default 0.05
+        Side of the square cells in metres.
+    half_life_s : float, optional
+        Time in which log-odds decay to one half, for places where things move; None keeps them.
+    height_m : (float, float), optional
+        Lowest and highest height of points in the world frame, in metres, to leave out floor and ceiling; all by
+        default.
+    emitter_diameter_m : float, default 0.012
+        Diameter of the emitters as pistons; 0 for omnidirectional ones.
+
+    Raises
+    ------
+    ArgumentError
+        A mounting is missing or invalid, or an option is out of range.
+
+    Examples
+    --------
+    >>> import ertis_numba as ertis
+    >>> unturned = (0.0, 0.0, 0.0, 1.0)
+    >>> mapper = ertis.Mapper({"sensor": ((0.0, 0.0, 0.0), unturned)})
+    >>> with ertis.open_recording("reflectors.h5") as recording:
+    ...     mapper.add([ertis.Pipeline(recording.settings).process(recording[0])], ((1.0, 2.0, 0.0), unturned))
+    >>> mapper.map.n_groups, bool(mapper.map.log_odds_at((1.6, 2.0)) < 0)
+    (1, True)
+    """
+
+    def __init__(
+        self,
+        mountings: Mountings,
+        *,
+        cell_m: float = 0.05,
+        half_life_s: float | None = None,
+        height_m: tuple[float, float] | None = None,
+        emitter_diameter_m: float = EMITTER_DIAMETER_M,
+    ) -> None:
+        self._fuser = Fuser(mountings, emitter_diameter_m=emitter_diameter_m)
+        self._poses = {pose.name: pose for pose in sensor_poses(mountings)}
+        self._diameter_m = emitter_diameter_m
+        self._cell_m = checks.between("cell_m", cell_m, 0.005, 1.0)
+        self._half_life_s = None if half_life_s is None else checks.positive("half_life_s", half_life_s)
+        self._height_m = (-math.inf, math.inf)
+        if height_m is not None:
+            checks.interval("height_m", height_m, -1e4, 1e4)
+            self._height_m = height_m
+        self._near_m = max(float(np.hypot(*pose.translation_m[:2])) for pose in self._poses.values())
+        self._grid = CellGrid(self._cell_m)
+        self._usual = UsualAmplitude()
+        self._coverages: dict[tuple[tuple[str, float, float], ...], Coverage] = {}
+        self._n_groups, self._time_ns = 0, 0
+
+    @property
+    def map(self) -> OccupancyMap:
+        """Map of all groups so far, as a copy."""
+        log_odds, origin_m = self._grid.used()
+        return OccupancyMap(log_odds, origin_m, self._cell_m, self._n_groups, self._time_ns)
+
+    def add(self, images: Iterable[Energyscape], pose: Pose) -> None:
+        """Add the images of one SYNC pulse.
+
+        Parameters
+        ----------
+        images : iterable of Energyscape
+            At most one image of each sensor. Sensors may be missing.
+        pose : (translation_m, rotation_xyzw) or Trajectory
+            Pose of the platform in the world frame: position x, y, z in metres, and the unit quaternion x, y, z, w that
+            rotates the platform frame into the world frame. A trajectory is interpolated at the time of the pulse.
+
+        Raises
+        ------
+        ArgumentError
+            The pose is invalid, the trajectory does not cover the time of the pulse, the images do not fit together, or
+            the map would have too many cells.
+        DataError
+            The images are not from the same pulse, or with a half-life, their time is before that of earlier ones.
+        """
+        group = tuple(checks.items("images", images, Energyscape, "Pipeline.process returns"))
+        fused = self._fuser(group)
+        time_ns = fused.image.stamp.timestamp_ns
+        translation_m, rotation = _pose(pose, time_ns)
+        coverage = self._coverage(group)
+        reach_m = coverage.weight.shape[1] * coverage.step_m
+        place_m = translation_m[:2]
+        window = self._grid.window(place_m, reach_m)
+        self._decay(time_ns)
+        heading_rad = math.atan2(rotation[1, 0], rotation[0, 0])
+        echoes = self._echoes(fused.points, translation_m, rotation, heading_rad)
+        add_evidence(window, place_m, heading_rad, echoes, coverage, near_m=self._near_m)
+        np.clip(window.log_odds, -_MAX_LOG_ODDS, _MAX_LOG_ODDS, out=window.log_odds)
+        self._n_groups += 1
+        self._time_ns = max(time_ns, self._time_ns)
+
+    def _decay(self, time_ns: int) -> None:
+        """Let the log-odds decay since the last group."""
+        if self._half_life_s is None or not self._n_groups:
+            return
+        after_s = (time_ns - self._time_ns) / _NS_PER_S
+        if after_s < 0:
+            raise DataError(
+                f"the images are from {-after_s:.3g} s before those added last; add groups in the order of their "
+                "times, or leave out half_life_s"
+            )
+        self._grid.log_odds *= np.float32(0.5 ** (after_s / self._half_life_s))
+
+    def _coverage(self, group: Sequence[Energyscape]) -> Coverage:
+        """Return the coverage of the sensors of a group that emitted."""
+        emitted = [image for image in group if image.stamp.behaviour != "passive"]
+        if not emitted:
+            raise DataError("no sensor emitted, so the images show no free space; leave out passive measurements")
+        limits_m = [(float(image.range_m[0]), float(image.range_m[-1])) for image in emitted]
+        names = [image.stamp.sensor for image in emitted]
+        key = tuple((name, *limits) for name, limits in zip(names, limits_m, strict=True))
+        if key not in self._coverages:
+            poses = [self._poses[name] for name in names]
+            self._coverages[key] = Coverage.of(poses, limits_m, emitted[0].settings, self._diameter_m, self._cell_m / 2)
+        return self._coverages[key]
+
+    def _echoes(self, points: PointCloud, translation_m: Floats, rotation: Floats, heading_rad: float) -> LocatedEchoes:
+        """Return the points within the limits of height, in the frame of the heading."""
+        offset_m = points.position_m.astype(np.float64) @ rotation.T
+        height_m = offset_m[:, 2] + translation_m[2]
+        kept = (height_m >= self._height_m[0]) & (height_m <= self._height_m[1])
+        c, s = math.cos(heading_rad), math.sin(heading_rad)
+        level_m = offset_m[kept, :2] @ np.array([[c, -s], [s, c]])
+        uncertainty_m = np.zeros((len(points), 2)) if points.uncertainty_m is None else points.uncertainty_m
+        strength = self._usual.strength(points.amplitude[kept])
+        return echoes_of(level_m, np.asarray(uncertainty_m, np.float64)[kept], strength)
+
+
+def _pose(pose: Pose, time_ns: int) -> tuple[Floats, Floats]:
+    """Return position and rotation matrix of a pose at a time: (3,) and (3, 3) float64."""
+    if isinstance(pose, Trajectory):
+        now = pose.at([time_ns])
+        return now.position_m[0], Rotation.from_quat(now.rotation_xyzw[0]).as_matrix()
+    try:
+        translation_m, rotation_xyzw = pose
+    except (TypeError, ValueError) as error:
+        raise ArgumentError(f"pose is {pose!r}; give a position and a unit quaternion, or a Trajectory") from error
+    found = mounting("platform", translation_m, rotation_xyzw)
+    return found["translation_m"], Rotation.from_quat(found["rotation_xyzw"]).as_matrix()

@@ -1,0 +1,219 @@
+"""Inverse sensor model of a sonar: evidence for free and for occupied space from the points of one pulse."""
+
+import math
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.fusion.rig import Emitters, MountedSensor
+from ertis_numba.mapping.cell_grid import Window
+from ertis_numba.settings import Settings
+
+__all__ = ["Coverage", "LocatedEchoes", "UsualAmplitude", "add_evidence", "echoes_of"]
+
+Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
+
+N_AZIMUTHS: Final = 360
+"""Directions for free space, of 1°."""
+_OCCUPIED: Final = 1.6  # Log-odds of a cell that certainly contains a clear echo.
+_FREE: Final = 0.4  # Log-odds of a cell in front of the first clear echo, near the platform.
+_FREE_M: Final = 1.0  # Free range in directions without any clear echo.
+_IN_FRONT_M: Final = 0.08  # Space in front of an echo that is not free yet.
+_BEHIND_M: Final = 0.3  # Distance behind the first clear echo of a direction from which others are doubtful.
+_BEHIND: Final = 0.1  # Weight of doubtful echoes, which may have travelled over several reflectors.
+_CLEAR: Final = 0.35  # Amplitude of a clear echo, relative to the usual one of the place.
+_HALF_BEAM: Final = 5  # Directions beside an echo in which it may hide others.
+_USUAL: Final = 70.0  # Percentile of the amplitudes of a pulse that is the usual one.
+_SMOOTHING: Final = 0.1  # Weight of a new pulse in the usual amplitude.
+# Errors of positions that noise does not explain: overlapping echoes of rough walls, mountings and poses.
+_RANGE_SD_M: Final = 0.01
+_ANGLE_SD_RAD: Final = math.radians(0.7)
+_REACH_SD: Final = 3.0  # Standard deviations within which an echo counts.
+_TOUCHED: Final = 0.02  # Probability of an echo in a cell from which the cell is not free.
+_WEAKEST_DB: Final = -15.0  # Emitted power, relative to ahead, below which silence shows nothing.
+
+
+class LocatedEchoes(NamedTuple):
+    """Points of one pulse around the platform.
+
+    Attributes
+    ----------
+    azimuth_rad, range_m : (point,) float64
+        In the plane, in the frame of the platform's heading.
+    sd_m : (point, 2) float64
+        Standard deviations along and across the direction.
+    strength : (point,) float64
+        Amplitude relative to the usual one, at most 1.
+    """
+
+    azimuth_rad: Floats
+    range_m: Floats
+    sd_m: Floats
+    strength: Floats
+
+
+class UsualAmplitude:
+    """Running amplitude of a clear echo, which depends on the walls of a place."""
+
+    def __init__(self) -> None:
+        self._usual: float | None = None
+
+    def strength(self, amplitude: Singles) -> Floats:
+        """Return amplitudes of the points of a pulse relative to the usual one, at most 1: (point,) float64."""
+        if not len(amplitude):
+            return np.zeros(0)
+        now = float(np.percentile(amplitude, _USUAL))
+        self._usual = now if self._usual is None else (1 - _SMOOTHING) * self._usual + _SMOOTHING * now
+        return np.minimum(1.0, amplitude.astype(np.float64) / max(self._usual, 1e-30))
+
+
+def echoes_of(offset_m: Floats, uncertainty_m: Floats, strength: Floats) -> LocatedEchoes:
+    """Return points as echoes.
+
+    Parameters
+    ----------
+    offset_m : (point, 2) float64
+        Positions in the frame of the platform's heading.
+    uncertainty_m : (point, 2) float64
+        Standard deviations along and across the direction.
+    strength : (point,) float64
+    """
+    range_m = np.hypot(offset_m[:, 0], offset_m[:, 1])
+    sd_m = np.hypot(uncertainty_m, np.stack([np.full(len(range_m), _RANGE_SD_M), _ANGLE_SD_RAD * range_m], axis=1))
+    return LocatedEchoes(np.arctan2(offset_m[:, 1], offset_m[:, 0]), range_m, sd_m, strength)
+
+
+class Coverage(NamedTuple):
+    """Part of the surroundings in which a clear echo would be heard.
+
+    Attributes
+    ----------
+    weight : (azimuth, range) float64
+        0 where no sensor emits or listens, up to 1 ahead of a sensor.
+    step_m : float
+        Spacing of the ranges, which begin at 0.
+    """
+
+    weight: Floats
+    step_m: float
+
+    @classmethod
+    def of(
+        cls,
+        poses: Sequence[MountedSensor],
+        limits_m: Sequence[tuple[float, float]],
+        settings: Settings,
+        diameter_m: float,
+        step_m: float,
+    ) -> "Coverage":
+        """Return the coverage of sensors that emit.
+
+        Parameters
+        ----------
+        poses : sequence of MountedSensor
+        limits_m : sequence of (first, last)
+            Ranges of their images.
+        settings : Settings
+            Settings with the call and the air.
+        diameter_m : float
+            Diameter of the emitters.
+        step_m : float
+        """
+        emitters = Emitters(settings, diameter_m)
+        reach_m = max(
+            float(np.hypot(*pose.translation_m[:2])) + last for pose, (_, last) in zip(poses, limits_m, strict=True)
+        )
+        range_m = (np.arange(math.ceil(reach_m / step_m)) + 0.5) * step_m
+        azimuth_rad = (np.arange(N_AZIMUTHS) + 0.5) * (2 * math.pi / N_AZIMUTHS)
+        unit = np.stack([np.cos(azimuth_rad), np.sin(azimuth_rad), np.zeros(N_AZIMUTHS)], axis=1)
+        weight = np.zeros((N_AZIMUTHS, len(range_m)))
+        for pose, (first_m, last_m) in zip(poses, limits_m, strict=True):
+            place_m = unit[:, None] * range_m[:, None] + [0.0, 0.0, pose.translation_m[2]]
+            local_m = pose.local_m(place_m)
+            distance_m = np.linalg.norm(local_m, axis=-1)
+            power_db = 10 * np.log10(emitters.power(local_m[..., 0] / np.maximum(distance_m, 1e-6)))
+            heard = np.clip(1 - power_db / _WEAKEST_DB, 0.0, 1.0) * (local_m[..., 0] > 0)
+            # Silence means less at long ranges, because spreading and oblique walls make echoes weak.
+            heard *= (distance_m >= first_m) * np.clip(1 - distance_m / last_m, 0.0, 1.0)
+            np.maximum(weight, heard, out=weight)
+        return cls(weight, step_m)
+
+
+def add_evidence(
+    window: Window, place_m: Floats, heading_rad: float, echoes: LocatedEchoes, coverage: Coverage, *, near_m: float
+) -> None:
+    """Add the evidence of one pulse to a map.
+
+    Parameters
+    ----------
+    window : Window
+        Part of the map around the platform, which changes.
+    place_m : (2,) float64
+        Position of the platform in the world.
+    heading_rad : float
+        Heading of the platform in the world.
+    echoes : LocatedEchoes
+    coverage : Coverage
+    near_m : float
+        Radius of the platform, whose own place is free.
+    """
+    first_m = _first_clear_m(echoes)
+    occupied = _occupied(window, place_m, heading_rad, echoes, first_m)
+    free = _free(window, place_m, heading_rad, first_m, coverage, near_m=near_m)
+    free[occupied > _TOUCHED] = 0.0
+    window.log_odds[:] += _OCCUPIED * occupied - _FREE * free
+
+
+def _direction(azimuth_rad: Floats) -> NDArray[np.int64]:
+    """Return the direction of azimuths, counted from that of the heading."""
+    return np.floor(azimuth_rad * (N_AZIMUTHS / (2 * math.pi))).astype(np.int64) % N_AZIMUTHS
+
+
+def _first_clear_m(echoes: LocatedEchoes) -> Floats:
+    """Return the range of the first clear echo in each direction, infinite without one: (azimuth,) float64."""
+    first_m = np.full(N_AZIMUTHS, np.inf)
+    is_clear = echoes.strength > _CLEAR
+    beam = np.arange(-_HALF_BEAM, _HALF_BEAM + 1)
+    around = (_direction(echoes.azimuth_rad[is_clear])[:, None] + beam) % N_AZIMUTHS
+    np.minimum.at(first_m, around, echoes.range_m[is_clear][:, None])
+    return first_m
+
+
+def _free(
+    window: Window, place_m: Floats, heading_rad: float, first_m: Floats, coverage: Coverage, *, near_m: float
+) -> Singles:
+    """Return the weight of free space in each cell: (row, column) float32, 0 to 1."""
+    n_ranges = coverage.weight.shape[1]
+    range_m = (np.arange(n_ranges) + 0.5) * coverage.step_m
+    end_m = np.where(np.isfinite(first_m), first_m - _IN_FRONT_M, _FREE_M)
+    polar = np.where(range_m < end_m[:, None], coverage.weight, 0.0).astype(np.float32)
+    dx_m, dy_m = (window.x_m - place_m[0])[None, :], (window.y_m - place_m[1])[:, None]
+    distance_m = np.hypot(dx_m, dy_m)
+    step = np.minimum((distance_m / coverage.step_m).astype(np.int64), n_ranges - 1)
+    free = polar[_direction(np.arctan2(dy_m, dx_m) - heading_rad), step]
+    free[distance_m < near_m] = 1.0
+    return np.asarray(free)
+
+
+def _occupied(window: Window, place_m: Floats, heading_rad: float, echoes: LocatedEchoes, first_m: Floats) -> Singles:
+    """Return the expected number of echoes in each cell: (row, column) float32."""
+    occupied = window._replace(log_odds=np.zeros_like(window.log_odds))
+    cell_m = float(window.x_m[1] - window.x_m[0])
+    behind = echoes.range_m > first_m[_direction(echoes.azimuth_rad)] + _BEHIND_M
+    weight = echoes.strength * np.where(behind, _BEHIND, 1.0)
+    azimuth_rad = echoes.azimuth_rad + heading_rad
+    unit = np.stack([np.cos(azimuth_rad), np.sin(azimuth_rad)], axis=1)
+    centre_m = place_m + unit * echoes.range_m[:, None]
+    variance_m2 = echoes.sd_m**2 + cell_m**2 / 12
+    reach_m = _REACH_SD * echoes.sd_m.max(axis=1, initial=0.0) + cell_m
+    peak = weight * cell_m**2 / (2 * math.pi * np.sqrt(variance_m2.prod(axis=1)))
+    for number, (ahead, left) in enumerate(unit.tolist()):
+        part = occupied.around(centre_m[number], float(reach_m[number]))
+        dx_m, dy_m = (part.x_m - centre_m[number, 0])[None, :], (part.y_m - centre_m[number, 1])[:, None]
+        along, across = (ahead * dx_m + left * dy_m) ** 2, (ahead * dy_m - left * dx_m) ** 2
+        squared = along / variance_m2[number, 0] + across / variance_m2[number, 1]
+        part.log_odds[:] += (peak[number] * np.exp(-squared / 2)).astype(np.float32)
+    return occupied.log_odds

@@ -1,0 +1,149 @@
+"""Files of occupancy maps."""
+
+from pathlib import Path
+from typing import Final
+
+import h5py
+import numpy as np
+
+from ertis_numba import checks
+from ertis_numba.atomic_files import atomic_write, remedy
+from ertis_numba.errors import ArgumentError, DamagedError, DataError, FormatVersionError
+from ertis_numba.frames import OccupancyMap
+from ertis_numba.storage._reader import open_file, reading
+from ertis_numba.storage.schema import (
+    CONVENTIONS,
+    FORMAT_VERSION,
+    OCCUPANCY_MAP,
+    content_sha256,
+    content_uuid,
+    create_variables,
+    date_created,
+    set_attributes,
+    software_versions,
+    to_python,
+)
+from ertis_numba.storage.structure import require_attributes, require_variables
+
+__all__ = ["read_map", "write_map_file"]
+
+_KIND: Final = "occupancy_map"
+_NAME: Final = "an occupancy map"
+_NUMBERS: Final = ("cell_m", "origin_x_m", "origin_y_m")
+
+
+def write_map_file(path: str | Path, occupancy: OccupancyMap, *, overwrite: bool = False) -> Path:
+    """Write an occupancy map as HDF5.
+
+    Parameters
+    ----------
+    path : str or Path
+    occupancy : OccupancyMap
+    overwrite : bool
+        Replace an existing file.
+
+    Returns
+    -------
+    Path
+        The path.
+
+    Raises
+    ------
+    ArgumentError
+        The file exists.
+    DataError
+        The disk is full or cannot be written.
+    """
+    checks.instance("occupancy", occupancy, OccupancyMap, "Mapper.map returns")
+    n_rows, n_columns = occupancy.log_odds.shape
+    try:
+        with (
+            atomic_write(Path(path), overwrite=overwrite) as part,
+            h5py.File(part, "w", track_order=True, libver=("v110", "v110")) as file,
+        ):
+            create_variables(file, OCCUPANCY_MAP, sizes={"x": n_columns, "y": n_rows})
+            for name, edge_m, count in zip(("x", "y"), occupancy.origin_m, (n_columns, n_rows), strict=True):
+                file[name][:] = edge_m + (np.arange(count) + 0.5) * occupancy.cell_m
+            file["log_odds"][:] = occupancy.log_odds
+            content = content_sha256(file, OCCUPANCY_MAP)
+            set_attributes(
+                file,
+                {
+                    "Conventions": CONVENTIONS,
+                    "ertis_format": _KIND,
+                    "ertis_format_version": FORMAT_VERSION,
+                    "date_created": date_created(),
+                    "uuid": content_uuid({"": content}),
+                    "content_sha256": content,
+                    "cell_m": occupancy.cell_m,
+                    "origin_x_m": occupancy.origin_m[0],
+                    "origin_y_m": occupancy.origin_m[1],
+                    "n_groups": occupancy.n_groups,
+                    "time_ns": occupancy.time_ns,
+                    **{f"{name.replace('-', '_')}_version": version for name, version in software_versions().items()},
+                },
+            )
+    except (OSError, RuntimeError) as error:  # h5py raises both when the disk fails.
+        if isinstance(error, ArgumentError | DataError):
+            raise
+        raise DataError(f"{path} cannot be written ({error}); {remedy(error)}") from error
+    return Path(path)
+
+
+def read_map(path: str | Path) -> OccupancyMap:
+    """Read an occupancy map from HDF5.
+
+    Parameters
+    ----------
+    path : str or Path
+
+    Returns
+    -------
+    OccupancyMap
+
+    Raises
+    ------
+    DataError
+        The file is not an occupancy map, is damaged or truncated.
+    FormatVersionError
+        A newer version wrote the file.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import ertis_numba as ertis
+    >>> written = ertis.OccupancyMap(np.ones((2, 3)), (0.0, 0.0), 0.05)
+    >>> ertis.write_map("place.h5", written, overwrite=True)[0].name
+    'place.h5'
+    >>> ertis.read_map("place.h5").log_odds.shape
+    (2, 3)
+    """
+    path = Path(path)
+    with open_file(path, _NAME) as file, reading(file, path):
+        require_attributes(file)
+        _require_kind(file, path)
+        require_variables(file, OCCUPANCY_MAP)
+        stated = content_sha256(file, OCCUPANCY_MAP)
+        if stated != to_python(file.attrs["content_sha256"]):
+            raise DamagedError(f"{path}: the SHA-256 of the content differs from the stated one; copy it again")
+        cell_m, *origin_m = (float(file.attrs[name]) for name in _NUMBERS)
+        try:
+            return OccupancyMap(
+                np.asarray(file["log_odds"][:]),
+                (origin_m[0], origin_m[1]),
+                cell_m,
+                int(file.attrs["n_groups"]),
+                int(file.attrs["time_ns"]),
+            )
+        except ArgumentError as error:
+            raise DamagedError(f"{path}: {error}") from error
+
+
+def _require_kind(file: h5py.File, path: Path) -> None:
+    kind, version = (to_python(file.attrs.get(name, "")) for name in ("ertis_format", "ertis_format_version"))
+    if kind != _KIND:
+        raise DataError(f"{path} is HDF5, but not an occupancy map; give one, as from 'ertis map'")
+    if not isinstance(version, int) or version > FORMAT_VERSION:
+        raise FormatVersionError(
+            f"{path} has format version {version}, but this package reads up to {FORMAT_VERSION}; update ertis-numba"
+        )

@@ -1,0 +1,326 @@
+"""Occupancy maps: evidence of echoes and of free space, decay, growth, files, and arguments that are refused."""
+
+import dataclasses
+import functools
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ertis_bench.furnished_rooms import Motion, PlatformImager, mountings
+from plyfile import PlyData
+
+import ertis_numba as ertis
+from ertis_numba.errors import ArgumentError, DamagedError, DataError
+from ertis_numba.fusion.rig import sensor_poses
+from ertis_numba.mapping.cell_grid import CellGrid
+from ertis_numba.mapping.sensor_model import Coverage, add_evidence, echoes_of
+from ertis_numba.simulation import Point
+
+UNTURNED = (0.0, 0.0, 0.0, 1.0)
+AHEAD = {"sensor": ((0.0, 0.0, 0.0), UNTURNED)}
+POSTS_M = ((1.5, 0.2), (-0.3, 1.4), (-1.6, -0.5), (0.4, -1.7))
+HEIGHT_M = 0.4
+REFLECTORS = Path(__file__).parents[1] / "data" / "synthetic" / "reflectors.h5"
+START_NS = 1_700_000_000_000_000_000
+
+
+def turned(yaw_deg):
+    half_rad = math.radians(yaw_deg) / 2
+    return (0.0, 0.0, math.sin(half_rad), math.cos(half_rad))
+
+
+@functools.cache
+def views():
+    """Images of four posts from three poses of a platform with four sensors, and the poses."""
+    posts = tuple(Point(position_m=(*place, HEIGHT_M), strength_db=-6.0) for place in POSTS_M)
+    imager = PlatformImager((posts, ()), 4, max_range_m=2.5)
+    found = []
+    for number, (x_m, y_m, yaw_deg) in enumerate([(0.0, 0.0, 0.0), (0.2, -0.1, 50.0), (-0.1, 0.2, 190.0)]):
+        motion = Motion(x_m, y_m, math.radians(yaw_deg), 0.0, 0.0, 0.0)
+        found.append((imager(motion, number, number / 10), ((x_m, y_m, 0.0), turned(yaw_deg))))
+    imager.close()
+    return found
+
+
+@functools.cache
+def room_map():
+    mapper = ertis.Mapper(mountings())
+    for images, pose in views():
+        mapper.add(images, pose)
+    return mapper.map
+
+
+def test_map_shows_reflectors_and_free_space_at_their_place():
+    found = room_map()
+    assert found.n_groups == 3
+    for place in POSTS_M:
+        assert np.hypot(*(found.occupied_m - place).T).min() < 0.05
+    # Every occupied cell is near a post.
+    away_m = np.hypot(*(found.occupied_m[:, None] - np.array(POSTS_M)).transpose(2, 0, 1)).min(axis=1)
+    assert away_m.max() < 0.08
+    for azimuth_deg in range(0, 360, 15):
+        near = 0.75 * np.array([math.cos(math.radians(azimuth_deg)), math.sin(math.radians(azimuth_deg))])
+        assert found.log_odds_at(near) < 0
+
+
+def test_cells_behind_a_reflector_stay_unknown():
+    found = room_map()
+    for place in np.array(POSTS_M):
+        behind = place * (1 + 0.3 / np.linalg.norm(place))
+        assert abs(found.log_odds_at(behind)) < 0.3
+
+
+def test_silence_shows_no_free_space_far_away():
+    """Oblique walls return no echo, so cells without echoes beyond 1 m stay unknown."""
+    found = room_map()
+    assert found.log_odds_at((-1.3, 1.5)) == 0
+    assert found.log_odds_at((1.5, 1.5)) == 0
+
+
+def test_trajectory_is_interpolated_at_the_time_of_the_images():
+    images, (translation_m, rotation) = views()[1]
+    time_ns = images[0].stamp.timestamp_ns
+    offset_m = np.array([0.3, 0.0, 0.0])
+    path = ertis.Trajectory(
+        [time_ns - 100, time_ns + 100], [translation_m - offset_m, translation_m + offset_m], [rotation, rotation]
+    )
+    by_pose, by_path = ertis.Mapper(mountings()), ertis.Mapper(mountings())
+    by_pose.add(images, (translation_m, rotation))
+    by_path.add(images, path)
+    np.testing.assert_allclose(by_path.map.log_odds, by_pose.map.log_odds, atol=1e-5)
+    assert by_path.map.origin_m == by_pose.map.origin_m
+    with pytest.raises(ArgumentError, match="outside the trajectory"):
+        by_path.add(images, path.replace(time_ns=path.time_ns + 10**9))
+
+
+def test_map_is_the_same_for_a_world_frame_moved_by_whole_cells():
+    moved = ertis.Mapper(mountings())
+    for images, ((x_m, y_m, z_m), rotation) in views():
+        moved.add(images, ((x_m + 400.0, y_m - 100.0, z_m), rotation))
+    # Rounding moves single cells over the edge of a direction.
+    np.testing.assert_allclose(moved.map.log_odds, room_map().log_odds, atol=0.02)
+    np.testing.assert_allclose(np.subtract(moved.map.origin_m, room_map().origin_m), [400.0, -100.0], atol=1e-9)
+
+
+def test_evidence_decays_with_the_half_life():
+    images, pose = views()[0]
+    mapper = ertis.Mapper(mountings(), half_life_s=1.0)
+    mapper.add(images, pose)
+    before = mapper.map
+    far = ((50.0, 0.0, 0.0), UNTURNED)
+    mapper.add(delayed(images, 2.0), far)
+    place = POSTS_M[0]
+    assert mapper.map.log_odds_at(place) == pytest.approx(float(before.log_odds_at(place)) / 4, rel=1e-5)
+    with pytest.raises(DataError, match="2 s before those added last; add groups in the order of their times"):
+        mapper.add(images, pose)
+
+
+def delayed(images, time_s):
+    return [
+        image.replace(
+            stamp=dataclasses.replace(image.stamp, timestamp_ns=image.stamp.timestamp_ns + round(time_s * 1e9))
+        )
+        for image in images
+    ]
+
+
+def test_height_limits_leave_out_floor_and_ceiling():
+    images, pose = views()[0]
+    mapper = ertis.Mapper(mountings(), height_m=(1.0, 2.0))
+    mapper.add(images, pose)
+    assert not mapper.map.is_occupied.any()
+
+
+def test_passive_measurements_are_refused():
+    images, pose = views()[0]
+    passive = [image.replace(stamp=dataclasses.replace(image.stamp, behaviour="passive")) for image in images]
+    with pytest.raises(DataError, match="no sensor emitted"):
+        ertis.Mapper(mountings()).add(passive, pose)
+
+
+def test_evidence_of_a_point_is_that_of_its_ellipse():
+    """The sum over all cells is that of one echo, and its spread that of the point's uncertainty."""
+    grid = CellGrid(0.02)
+    place_m = np.zeros(2)
+    echoes = echoes_of(np.array([[2.0, 0.0]]), np.array([[0.05, 0.2]]), np.ones(1))
+    coverage = Coverage(np.zeros((360, 300)), 0.01)
+    window = grid.window(place_m, 3.0)
+    add_evidence(window, place_m, 0.0, echoes, coverage, near_m=0.0)
+    total = float(window.log_odds.sum())
+    assert total == pytest.approx(1.6, rel=0.02)
+    spread = [
+        math.sqrt(float((window.log_odds * offset**2).sum()) / total)
+        for offset in ((window.x_m - 2.0)[None, :], window.y_m[:, None])
+    ]
+    assert spread == pytest.approx(echoes.sd_m[0].tolist(), rel=0.05)
+
+
+def test_doubtful_echoes_behind_a_clear_one_weigh_less():
+    grid = CellGrid(0.05)
+    echoes = echoes_of(np.array([[1.0, 0.0], [2.0, 0.0]]), np.full((2, 2), 0.01), np.ones(2))
+    window = grid.window(np.zeros(2), 3.0)
+    add_evidence(window, np.zeros(2), 0.0, echoes, Coverage(np.zeros((360, 60)), 0.05), near_m=0.0)
+    near, far = (window.around(np.array([x_m, 0.0]), 0.3).log_odds.sum() for x_m in (1.0, 2.0))
+    assert far == pytest.approx(0.1 * near, rel=0.1)
+
+
+def test_coverage_is_that_of_the_emitters_beam_and_of_the_ranges():
+    coverage = Coverage.of(sensor_poses(AHEAD), [(0.4, 4.0)], ertis.Settings(), 0.012, 0.05)
+    ahead, beside, behind = (coverage.weight[azimuth_deg] for azimuth_deg in (0, 80, 180))
+    assert ahead[4] == 0  # at 0.2 m, before the first range
+    assert ahead[12] > 0.8 > ahead[40] > ahead[70] > 0
+    assert beside.max() < 0.3
+    assert behind.max() == 0
+
+
+def test_grid_keeps_values_as_it_grows_in_all_directions():
+    grid = CellGrid(0.1)
+    grid.window(np.array([0.05, 0.05]), 0.04).log_odds[:] = 3.0
+    for centre_m in ((20.0, 0.0), (-20.0, 5.0), (0.0, 30.0), (0.0, -30.0)):
+        grid.window(np.array(centre_m), 1.0)
+    log_odds, origin_m = grid.used()
+    assert log_odds.tolist() == [[3.0]]
+    assert origin_m == pytest.approx((0.0, 0.0))
+    with pytest.raises(ArgumentError, match="give a larger cell_m"):
+        grid.window(np.array([1e5, 0.0]), 1.0)
+
+
+def test_map_without_evidence_has_one_unknown_cell():
+    assert ertis.Mapper(AHEAD).map.log_odds.tolist() == [[0.0]]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"cell_m": 0.0}, "cell_m is 0; give a number from 0.005 to 1"),
+        ({"half_life_s": 0.0}, "half_life_s is 0; give a number above 0"),
+        ({"height_m": (2.0, 1.0)}, "height_m runs from 2 to 1"),
+        ({"emitter_diameter_m": 1.0}, "emitter_diameter_m is 1"),
+    ],
+)
+def test_mapper_refuses_invalid_options(options, message):
+    with pytest.raises(ArgumentError, match=message):
+        ertis.Mapper(AHEAD, **options)
+
+
+@pytest.mark.parametrize(
+    ("pose", "message"),
+    [
+        (3.0, "pose is 3.0; give a position and a unit quaternion, or a Trajectory"),
+        (((0.0, 0.0), UNTURNED), "translation_m of sensor platform"),
+        (((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 2.0)), "platform"),
+    ],
+)
+def test_mapper_refuses_invalid_poses(pose, message):
+    with pytest.raises(ArgumentError, match=message):
+        ertis.Mapper(mountings()).add(views()[0][0], pose)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"log_odds": np.zeros(3)}, r"log_odds has shape \(3,\)"),
+        ({"log_odds": np.zeros((0, 3))}, r"log_odds has shape \(0, 3\)"),
+        ({"log_odds": np.array([[np.nan]])}, "log_odds holds nan"),
+        ({"origin_m": (0.0,)}, "origin_m has shape"),
+        ({"origin_m": (0.0, math.inf)}, "origin_m is inf"),
+        ({"cell_m": 0.0}, "cell_m is 0"),
+        ({"n_groups": -1}, "n_groups is -1"),
+        ({"size": 3}, "an occupancy map has no field 'size'"),
+    ],
+)
+def test_occupancy_map_refuses_invalid_fields(changes, message):
+    with pytest.raises(ArgumentError, match=message):
+        small().replace(**changes)
+
+
+def small():
+    log_odds = np.array([[-3.0, 0.0, 0.5], [2.0, -1.0, 4.0]])
+    return ertis.OccupancyMap(log_odds, (-1.0, 2.0), 0.5, n_groups=7, time_ns=START_NS)
+
+
+def test_occupancy_map_places_its_cells_in_the_world():
+    found = small()
+    assert found.occupied_m.tolist() == [[-0.75, 2.75], [0.25, 2.75]]
+    assert found.is_free.tolist() == [[True, False, False], [False, False, False]]
+    assert found.limits_m == ((-1.0, 0.5), (2.0, 3.0))
+    assert found.log_odds_at([[-0.9, 2.1], [0.4, 2.9], [0.6, 2.9], [-1.1, 2.1]]).tolist() == [-3.0, 4.0, 0.0, 0.0]
+    with pytest.raises(ArgumentError, match="give x and y along the last axis"):
+        found.log_odds_at([1.0, 2.0, 3.0])
+
+
+def test_map_file_round_trip(tmp_path):
+    assert ertis.write_map(tmp_path / "m.h5", small()) == (tmp_path / "m.h5",)
+    read = ertis.read_map(tmp_path / "m.h5")
+    assert np.array_equal(read.log_odds, small().log_odds)
+    assert (read.origin_m, read.cell_m, read.n_groups, read.time_ns) == ((-1.0, 2.0), 0.5, 7, START_NS)
+    with pytest.raises(ArgumentError, match="exists"):
+        ertis.write_map(tmp_path / "m.h5", small())
+    ertis.write_map(tmp_path / "m.h5", small(), overwrite=True)
+
+
+def test_map_file_is_a_netcdf_file_with_axes(tmp_path):
+    xarray = pytest.importorskip("xarray")
+    ertis.write_map(tmp_path / "m.h5", small())
+    with xarray.open_dataset(tmp_path / "m.h5", engine="h5netcdf") as found:
+        assert found["log_odds"].dims == ("y", "x")
+        assert found["x"].values.tolist() == [-0.75, -0.25, 0.25]
+        assert float(found["log_odds"].sel(x=0.25, y=2.75)) == 4.0
+
+
+def test_damaged_map_file_is_refused(tmp_path):
+    path = tmp_path / "m.h5"
+    ertis.write_map(path, small())
+    content = bytearray(path.read_bytes())
+    place = content.index(np.float32(4.0).tobytes())
+    content[place + 3] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(DamagedError, match="SHA-256"):
+        ertis.read_map(path)
+
+
+def test_map_and_recording_are_told_apart(tmp_path):
+    ertis.write_map(tmp_path / "m.h5", small())
+    with pytest.raises(DataError, match=r"m.h5 is an occupancy map; give a recording"):
+        ertis.open_recording(tmp_path / "m.h5")
+    with pytest.raises(DataError, match="not an occupancy map; give one, as from 'ertis map'"):
+        ertis.read_map(REFLECTORS)
+    with pytest.raises(DataError, match="give an occupancy map"):
+        ertis.read_map(tmp_path / "none.h5")
+
+
+def test_picture_for_ros_has_the_levels_and_the_place_of_the_cells(tmp_path):
+    files = ertis.write_map(tmp_path / "m.pgm", small())
+    assert files == (tmp_path / "m.pgm", tmp_path / "m.yaml")
+    probability, occupied, free, origin = loaded_by_map_server(files[1])
+    assert origin == [-1.0, 2.0, 0.0]
+    assert occupied.tolist() == small().is_occupied.tolist()
+    assert free.tolist() == small().is_free.tolist()
+    assert probability[0, 1] == pytest.approx(50 / 255)
+
+
+def loaded_by_map_server(path):
+    """Read a map as map_server of ROS 2 does in the mode trinary: rows from below."""
+    stated = dict(line.split(": ", 1) for line in path.read_text("utf-8").splitlines())
+    assert (stated["mode"], stated["negate"], stated["resolution"]) == ("trinary", "0", "0.5")
+    head, size, highest, pixels = (path.parent / stated["image"].strip('"')).read_bytes().split(b"\n", 3)
+    assert (head, highest) == (b"P5", b"255")
+    n_columns, n_rows = map(int, size.split())
+    grey = np.frombuffer(pixels, np.uint8).reshape(n_rows, n_columns)[::-1]
+    probability = (255 - grey.astype(float)) / 255
+    occupied, free = probability > float(stated["occupied_thresh"]), probability < float(stated["free_thresh"])
+    return probability, occupied, free, [float(each) for each in stated["origin"].strip("[]").split(",")]
+
+
+def test_ply_holds_the_occupied_cells(tmp_path):
+    ertis.write_map(tmp_path / "m.ply", small())
+    vertices = PlyData.read(str(tmp_path / "m.ply"))["vertex"]
+    assert np.stack([vertices["x"], vertices["y"]], axis=1).tolist() == small().occupied_m.tolist()
+    assert vertices["z"].tolist() == [0.0, 0.0]
+    assert vertices["probability"] == pytest.approx(small().probability[small().is_occupied])
+
+
+def test_unknown_format_of_a_map_is_refused(tmp_path):
+    with pytest.raises(ArgumentError, match=r"ending of the map '.png' is unknown"):
+        ertis.write_map(tmp_path / "m.png", small())
