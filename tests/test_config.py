@@ -96,6 +96,7 @@ def test_variables_that_are_not_options_cause_no_warning(images):
     given = {
         "ERTIS_PROCESS_MAX_ERROR": "-40",
         "ERTIS_SERVE_ALLOW": "x",
+        "ERTIS_IMPORT_POSES_OFFSET_S": "1",
         "ERTIS_KEYS_NEW_DIR": path,
         "ERTIS_THREADS": "1",
     }

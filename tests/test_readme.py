@@ -28,6 +28,7 @@ ELSEWHERE = {
         "configure",
         "demo",
         "doctor",
+        "import-poses",
         "keys",
         "layouts",
         "listen",

@@ -68,14 +68,20 @@ def unknown_variables(group: click.Group, ctx: click.Context) -> Iterator[str]:
     for name in sorted(os.environ):
         if not name.startswith("ERTIS_") or name in general | _NO_OPTIONS:
             continue
-        prefix = "_".join(name.split("_")[:2]) + "_"
-        near = difflib.get_close_matches(prefix, commands, n=1)
-        command = group.get_command(ctx, commands[near[0]]) if near else None
+        near = _near(name, commands)
+        command = group.get_command(ctx, commands[near]) if near else None
         known = general | _NO_OPTIONS | set(_variables(command) if command else ())
         if name not in known:
             close = difflib.get_close_matches(name, sorted(known), n=1, cutoff=0.8)
             meant = f"did you mean {close[0]!r}?" if close else "unset it if no other program needs it"
             yield f"no command reads the variable {name}; {meant}"
+
+
+def _near(name: str, prefixes: Iterable[str]) -> str:
+    """Return the longest prefix of a variable, or else one that resembles its first two words, or an empty text."""
+    exact = max((each for each in prefixes if name.startswith(each)), key=len, default="")
+    close = difflib.get_close_matches("_".join(name.split("_")[:2]) + "_", [*prefixes], n=1)
+    return exact or "".join(close)
 
 
 def _variables(command: click.Command) -> Iterator[str]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ertis_cli import _mountings, options
+from ertis_cli import _export_poses, _mountings, options
 from ertis_cli._config import typed
 
 if TYPE_CHECKING:
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 __all__ = ["export"]
 
 FORMATS = ("mcap", "ply", "pcd", "csv", "npz", "acoular")
+FORMATS_OF_POSES = ("tum",)
 TOPICS = ("points", "scan", "image", "sonar_image")
 
 
@@ -43,10 +44,13 @@ class _Places(click.ParamType):  # type: ignore[type-arg]  # generic since click
     type=click.Path(path_type=Path),
     metavar="OUT",
     required=True,
-    help="File to write: .mcap, .ply, .pcd, .csv, .npz, or .h5 for Acoular, with an .xml beside it.",
+    help="File to write: .mcap, .ply, .pcd, .csv, .npz, .tum, or .h5 for Acoular, with an .xml beside it.",
 )
 @click.option(
-    "--format", "file_format", type=click.Choice(FORMATS), help="Output format; chosen by the suffix of OUT by default."
+    "--format",
+    "file_format",
+    type=click.Choice((*FORMATS, *FORMATS_OF_POSES)),
+    help="Output format; chosen by the suffix of OUT by default.",
 )
 @options.sensor("Export this sensor only; all sensors by default.")
 @click.option(
@@ -96,9 +100,12 @@ def export(
     """Export images or signals for other programs.
 
     MCAP contains ROS 2 messages. PLY, PCD and CSV contain the points of images, and NPZ the images of one sensor. The
-    files for Acoular contain the microphone signals of one measurement. Except for Acoular, a recording is first
-    processed with its own settings.
+    files for Acoular contain the microphone signals of one measurement. TUM files contain the poses of a recording.
+    Except for Acoular and TUM, a recording is first processed with its own settings.
     """
+    if _export_poses.is_chosen(target, file_format):
+        _export_poses.export_poses(path, target, sensor, force=force, quiet=quiet, as_json=as_json)
+        return
     from ertis_numba import interop
     from ertis_numba.storage import check_target, file_kind, open_energyscapes, open_recording
 

@@ -54,6 +54,7 @@ COMMANDS: Final[dict[str, Sequence[str]]] = {
     "example": ("reflectors", "-o", "{out}", "--force"),
     "export": ("{images}", "-o", "{out}/cloud.ply"),
     "import": ("{raw}", "-o", "{out}/imported.h5", "--layout", "eRTIS_v3D1", "--preset", "default_25_50"),
+    "import-poses": ("{recording}", "{trajectory}", "-o", "{out}/posed.h5", "--force"),
     "info": ("--health", "{recording}"),
     "keys": ("new", "fresh", "--dir", "{out}/keys"),
     "layouts": ("eRTIS_v3D1",),
@@ -128,11 +129,13 @@ def _default_signals() -> Iterator[None]:
 def _files(folder: Path, source: Path) -> dict[str, str]:
     """Create the files that commands read, and return the names by which `COMMANDS` refers to them."""
     raw, images, crashed = folder / "raw.bin", folder / "images.h5", folder / "crashed"
-    script = folder / "script.py"
+    script, trajectory = folder / "script.py", folder / "trajectory.tum"
     script.write_text("import rtisdev\nrtisdev.open_connection('/dev/no-such-port', allowDebugMode=True)\n")
     with open_recording(source) as recording:
         measurement = recording[0]
         raw.write_bytes(measurement.data.tobytes())
+        times_s = [stamp.timestamp_ns // 10**9 + later for stamp in recording.stamps() for later in (0, 1)]
+        trajectory.write_text("".join(f"{time_s} 0 0 0 0 0 0 1\n" for time_s in sorted({*times_s})))
         made = folder / "journal"
         made.mkdir()
         with Journal.create(made / f"rec.h5{SUFFIX}", target="rec.h5", source="signals") as journal:
@@ -148,6 +151,7 @@ def _files(folder: Path, source: Path) -> dict[str, str]:
         "images": str(images),
         "crashed": str(crashed),
         "script": str(script),
+        "trajectory": str(trajectory),
     }
 
 

@@ -1,0 +1,52 @@
+"""Export of the poses in a recording, for ``ertis export --format tum``."""
+
+from pathlib import Path
+
+import click
+
+from ertis_cli import options
+from ertis_cli._config import typed
+
+__all__ = ["export_poses", "is_chosen"]
+
+_OF_IMAGES = {
+    "places": "--measurement",
+    "topics": "--topic",
+    "top": "--top",
+    "min_level_db": "--min-level",
+    "mounting": "--mounting",
+    "text": "--ascii",
+}
+"""Options of the export that apply to images only."""
+
+
+def is_chosen(target: Path, file_format: str | None) -> bool:
+    """Return True if the output holds poses, by its format or else by its suffix."""
+    return file_format == "tum" or (file_format is None and target.suffix.lower() == ".tum")
+
+
+def export_poses(path: Path, target: Path, sensor: str | None, *, force: bool, quiet: bool, as_json: bool) -> None:
+    """Write the poses of a recording in the TUM format."""
+    from ertis_numba import write_tum
+    from ertis_numba.atomic_files import check_target
+    from ertis_numba.errors import DataError
+    from ertis_numba.storage import recorded_trajectory, sensor_names
+
+    for parameter, option in _OF_IMAGES.items():
+        if typed(parameter):
+            raise click.UsageError(f"{option} is not for poses; remove it", click.get_current_context())
+    check_target(target, overwrite=force, sources=[path])
+    poses = recorded_trajectory(path, sensor=sensor)
+    if poses is None:
+        raise DataError(f"{path} has no poses; add them with 'ertis import-poses {path} TRAJ.tum'")
+    write_tum(target, poses, overwrite=force)
+    options.say(f"{target}: {options.counted(len(poses), 'pose')}, {poses.length_m:.2f} m", quiet=quiet)
+    if as_json:
+        report = {
+            "output": str(target),
+            "format": "tum",
+            "files": [str(target)],
+            "sensors": list(sensor_names(path) if sensor is None else [sensor]),
+            "poses": len(poses),
+        }
+        options.print_json(report)

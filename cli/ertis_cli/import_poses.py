@@ -1,0 +1,104 @@
+"""``ertis import-poses``: add the poses of a platform to recordings."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import click
+
+from ertis_cli import options
+
+if TYPE_CHECKING:
+    from ertis_numba.frames import Trajectory
+
+__all__ = ["import_poses"]
+
+_NS_PER_S = 1e9
+_MAX_OFFSET_S = 1e9
+
+
+@click.command("import-poses")
+@options.input_file("REC.h5|FOLDER")
+@click.argument("trajectory_file", metavar="TRAJ", type=click.Path(path_type=Path))
+@click.option(
+    "--offset-s",
+    "offset_s",
+    type=click.FloatRange(-_MAX_OFFSET_S, _MAX_OFFSET_S),
+    default=0.0,
+    show_default=True,
+    metavar="S",
+    help="Seconds to add to the times of the trajectory, if its clock differs from that of the recording.",
+)
+@click.option("--topic", metavar="NAME", help="Topic of an MCAP file; the only one with poses by default.")
+@click.option(
+    "--output",
+    "-o",
+    "target",
+    type=click.Path(path_type=Path),
+    metavar="OUT",
+    help="Recording to write, or folder for the recordings of a folder; by default, each recording is replaced.",
+)
+@click.option("--force", is_flag=True, help="Replace poses that a recording has, and overwrite existing output.")
+@options.quiet
+@options.as_json
+def import_poses(
+    *,
+    path: Path,
+    trajectory_file: Path,
+    offset_s: float,
+    topic: str | None,
+    target: Path | None,
+    force: bool,
+    quiet: bool,
+    as_json: bool,
+) -> None:
+    """Add the poses of a platform to recordings.
+
+    TRAJ is a text file of TUM (.tum, .txt), a table (.csv), or messages of ROS 2 (.mcap). The trajectory is
+    interpolated at the times of the measurements of all sensors, and must cover them. A folder stands for its
+    recordings (*.h5). A recording is replaced only when the new one is complete.
+    """
+    from ertis_numba import read_trajectory
+    from ertis_numba.atomic_files import make_folder
+    from ertis_numba.storage import add_poses, check_target, recorded_trajectory, require_fitting_poses
+
+    given = read_trajectory(trajectory_file, topic=topic)
+    shifted: Trajectory = given.replace(time_ns=given.time_ns + round(offset_s * _NS_PER_S))
+    recordings = _recordings(path)
+    outputs = _outputs(recordings, target, is_folder=path.is_dir())
+    for recording, output in zip(recordings, outputs, strict=True):  # Either all receive poses, or none.
+        require_fitting_poses(recording, shifted, replace=force)
+        if output is not None and output.parent.is_dir():
+            check_target(output, overwrite=force, sources=[recording])
+    if target is not None and path.is_dir():
+        make_folder(target)
+    reports: list[dict[str, Any]] = []
+    for recording, output in zip(recordings, outputs, strict=True):
+        written = add_poses(recording, shifted, output=output, overwrite=force, replace=force)
+        poses = cast("Trajectory", recorded_trajectory(written))
+        count = options.counted(len(poses), "pose")
+        options.say(f"{written}: {count}, {poses.length_m:.2f} m", quiet=quiet)
+        reports.append({"output": str(written), "poses": len(poses), "path_length_m": round(poses.length_m, 6)})
+    if as_json:
+        for report in reports:
+            options.print_json(report)
+
+
+def _recordings(path: Path) -> list[Path]:
+    """Return the recordings of a folder, or the recording itself."""
+    from ertis_numba.campaign import find_recordings
+    from ertis_numba.errors import DataError
+    from ertis_numba.storage import file_kind
+
+    if not path.is_dir():
+        return [path]
+    recordings = [each.path for each in find_recordings([path]) if file_kind(each.path) == "recording"]
+    if not recordings:
+        raise DataError(f"folder {path} contains energyscape files only; give a folder with recordings")
+    return recordings
+
+
+def _outputs(recordings: list[Path], target: Path | None, *, is_folder: bool) -> list[Path | None]:
+    """Return the output of each recording; None if the recording is replaced."""
+    if target is None:
+        return [None] * len(recordings)
+    return [target / recording.name for recording in recordings] if is_folder else [target]
