@@ -57,6 +57,8 @@ RUN_BY = {
     ("gallery", "$"): ["test_readme::test_gallery_starts_like_the_readme"],
     ("gpu", "$"): ["test_guide::test_commands_of_the_gpu_page_run"],
     ("health", "$"): ["test_health_commands::test_health_page_shows_the_printed_output"],
+    ("mapping", "$"): ["test_map_command::test_commands_and_code_of_the_page_run"],
+    ("mapping", "python"): ["test_map_command::test_commands_and_code_of_the_page_run"],
     ("many", "$"): [
         "test_many_docs::test_commands_of_the_page_run_in_order",
         "test_many_cluster::test_cluster_command_of_the_page_runs",

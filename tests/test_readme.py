@@ -32,6 +32,7 @@ ELSEWHERE = {
         "keys",
         "layouts",
         "listen",
+        "map",
         "presets",
         "record",
         "reset",

@@ -59,6 +59,7 @@ COMMANDS: Final[dict[str, Sequence[str]]] = {
     "keys": ("new", "fresh", "--dir", "{out}/keys"),
     "layouts": ("eRTIS_v3D1",),
     "listen": ("tcp://127.0.0.1:1",),
+    "map": ("{recording}", "--poses", "{trajectory}", "--mounting", "{mounting}", "-o", "{out}/place.pgm"),
     "peaks": ("{images}",),
     "plot": ("{recording}", "-o", "{out}/picture.png"),
     "presets": ("2d_181_5m",),
@@ -130,9 +131,11 @@ def _files(folder: Path, source: Path) -> dict[str, str]:
     """Create the files that commands read, and return the names by which `COMMANDS` refers to them."""
     raw, images, crashed = folder / "raw.bin", folder / "images.h5", folder / "crashed"
     script, trajectory = folder / "script.py", folder / "trajectory.tum"
+    mounting = folder / "mounting.toml"
     script.write_text("import rtisdev\nrtisdev.open_connection('/dev/no-such-port', allowDebugMode=True)\n")
     with open_recording(source) as recording:
         measurement = recording[0]
+        mounting.write_text(f'[[sensors]]\nname = "{recording.sensor}"\nposition_m = [0.0, 0.0, 0.0]\n')
         raw.write_bytes(measurement.data.tobytes())
         times_s = [stamp.timestamp_ns // 10**9 + later for stamp in recording.stamps() for later in (0, 1)]
         trajectory.write_text("".join(f"{time_s} 0 0 0 0 0 0 1\n" for time_s in sorted({*times_s})))
@@ -152,6 +155,7 @@ def _files(folder: Path, source: Path) -> dict[str, str]:
         "crashed": str(crashed),
         "script": str(script),
         "trajectory": str(trajectory),
+        "mounting": str(mounting),
     }
 
 

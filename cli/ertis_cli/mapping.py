@@ -1,0 +1,208 @@
+"""``ertis map``: occupancy maps from recordings and the poses of their platform."""
+
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ertis_cli import _mountings, _presets, _pulses, _results, options
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from ertis_cli._pulses import StampedIndex
+    from ertis_numba.frames import OccupancyMap, Trajectory
+    from ertis_numba.settings import Settings
+    from ertis_numba.storage import RecordingReader
+
+__all__ = ["mapping"]
+
+
+@click.command("map")
+@click.argument("paths", metavar="REC.h5...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option(
+    "--poses",
+    "poses_file",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Poses of the platform in the world frame, .tum, .csv or .mcap; those of the recordings by default.",
+)
+@options.output("Map to write: .h5, .pgm with a .yaml for ROS, or .ply; REC.map.h5 by default.")
+@click.option(
+    "--cell",
+    "cell_m",
+    type=click.FloatRange(0.005, 1.0),
+    default=0.05,
+    show_default=True,
+    metavar="M",
+    help="Side of the square cells in m.",
+)
+@click.option(
+    "--half-life",
+    "half_life_s",
+    type=click.FloatRange(0.0, min_open=True),
+    metavar="S",
+    help="Time in which evidence decays to one half, for places where things move; none by default.",
+)
+@click.option(
+    "--height",
+    "height_m",
+    type=options.INTERVAL,
+    help="Lowest and highest height of echoes in the world frame in m, to leave out floor and ceiling; all by default.",
+)
+@click.option(
+    "--emitter-diameter",
+    "emitter_diameter_m",
+    type=click.FloatRange(0.0, 0.2),
+    default=0.012,
+    show_default=True,
+    metavar="M",
+    help="Diameter of emitters in m, which determines their directivity; 0 is omnidirectional.",
+)
+@_presets.processing_preset
+@click.option(
+    "--settings",
+    "settings_file",
+    metavar="FILE.toml",
+    type=click.Path(path_type=Path),
+    help="Settings file (TOML) whose keys override those of the recordings.",
+)
+@options.device
+@options.threads
+@options.plan
+@_mountings.mounting
+@options.force
+@options.quiet
+@options.as_json
+def mapping(
+    *,
+    paths: tuple[Path, ...],
+    poses_file: Path | None,
+    target: Path | None,
+    cell_m: float,
+    half_life_s: float | None,
+    height_m: tuple[float, float] | None,
+    emitter_diameter_m: float,
+    preset: str | None,
+    settings_file: Path | None,
+    device: str,
+    threads: int | None,
+    plan: str,
+    mounting: Path | None,
+    force: bool,
+    quiet: bool,
+    as_json: bool,
+) -> None:
+    """Compute an occupancy map from recordings and the poses of the platform.
+
+    All sensors of the recordings belong to one platform. Their measurements are grouped by SYNC pulse and fused, as by
+    'ertis process --fuse'. Cells with echoes become occupied, and cells in front of the first clear echo of a direction
+    become free. Pulses outside of the time of the poses are left out.
+    """
+    from ertis_numba.interop import map_files, write_map
+    from ertis_numba.mapping import Mapper
+    from ertis_numba.storage import check_target
+
+    target = target or paths[0].with_suffix(".map.h5")
+    for each in map_files(target):
+        check_target(each, overwrite=force, sources=paths)
+
+    def changed(recorded: "Settings") -> "Settings":
+        settings = options.settings_with(recorded, settings_file=settings_file, preset=preset)
+        _results.require_image(settings)
+        return settings
+
+    with ExitStack() as stack:
+        readers = _pulses.open_sensors(paths, stack)
+        trajectory = _trajectory(poses_file, paths)
+        pipelines = _pulses.PipelinesBySensor(changed, stack, quiet=quiet, device=device, threads=threads, plan=plan)
+        mapper = Mapper(
+            _pulses.mountings_of(readers, _mountings.mountings(mounting, None)),
+            cell_m=cell_m,
+            half_life_s=half_life_s,
+            height_m=height_m,
+            emitter_diameter_m=emitter_diameter_m,
+        )
+        groups = list(_pulses.pulse_groups(readers))
+        located = _located(groups, trajectory)
+        by_name = {reader.sensor: reader for reader in readers}
+        with options.progress(located, length=len(located), label="mapping", quiet=quiet) as shown:
+            for group in shown:
+                mapper.add([pipelines.image(by_name[name][place.index]) for name, place in group.items()], trajectory)
+    occupancy = mapper.map
+    written = write_map(target, occupancy, overwrite=force)
+    if len(located) < len(groups):
+        left_out = options.counted(len(groups) - len(located), "pulse")
+        options.say(f"note: {left_out} of {len(groups)} outside of the time of the poses left out", quiet=quiet)
+    report = _report(written, readers, occupancy) | {"left_out": len(groups) - len(located)}
+    size = " × ".join(f"{side_m:.2f}" for side_m in report["size_m"])
+    options.say(
+        f"{target}: {options.counted(len(located), 'pulse')}, {size} m, {report['occupied']} cells occupied, "
+        f"{report['free']} free",
+        quiet=quiet,
+    )
+    if as_json:
+        options.print_json(report)
+
+
+def _trajectory(poses_file: Path | None, paths: "Sequence[Path]") -> "Trajectory":
+    """Return the poses of a file, or else those of a recording.
+
+    Raises
+    ------
+    UsageError
+        There are none.
+    """
+    from ertis_numba.storage import recorded_trajectory
+
+    if poses_file is not None:
+        from ertis_numba import read_trajectory
+
+        return read_trajectory(poses_file)
+    for path in paths:
+        found = recorded_trajectory(path)
+        if found is not None:
+            return found
+    raise click.UsageError(
+        f"{paths[0]} contains no poses of the platform; give --poses FILE, or add them to the recording",
+        click.get_current_context(),
+    )
+
+
+def _located(groups: "Sequence[dict[str, StampedIndex]]", trajectory: "Trajectory") -> "list[dict[str, StampedIndex]]":
+    """Return the groups within the time of a trajectory.
+
+    Raises
+    ------
+    DataError
+        There is none.
+    """
+    from ertis_numba.errors import DataError
+
+    first_ns, last_ns = trajectory.time_ns[[0, -1]].tolist()
+    times_ns = [min(place.stamp.timestamp_ns for place in group.values()) for group in groups]
+    located = [group for group, time_ns in zip(groups, times_ns, strict=True) if first_ns <= time_ns <= last_ns]
+    if not located:
+        raise DataError(
+            f"all pulses lie outside of the time of the poses: pulses from {min(times_ns) / 1e9:.3f} s to "
+            f"{max(times_ns) / 1e9:.3f} s, poses from {first_ns / 1e9:.3f} s to {last_ns / 1e9:.3f} s; give poses of "
+            "these recordings, with times in seconds since 1970-01-01 UTC"
+        )
+    return located
+
+
+def _report(
+    written: "Sequence[Path]", readers: "Sequence[RecordingReader]", occupancy: "OccupancyMap"
+) -> dict[str, Any]:
+    return {
+        "output": str(written[0]),
+        "files": [str(path) for path in written],
+        "sensors": [reader.sensor for reader in readers],
+        "pulses": occupancy.n_groups,
+        "cell_m": occupancy.cell_m,
+        "origin_m": [round(edge_m, 6) for edge_m in occupancy.origin_m],
+        "size_m": [round(high_m - low_m, 6) for low_m, high_m in occupancy.limits_m],
+        "occupied": int(occupancy.is_occupied.sum()),
+        "free": int(occupancy.is_free.sum()),
+    }

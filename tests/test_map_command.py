@@ -1,0 +1,136 @@
+"""`ertis map`: maps of a simulated platform, poses from a file or a recording, and input that is refused."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from ertis_cli.main import cli
+
+import ertis_numba as ertis
+from ertis_numba.settings import Processing
+from ertis_numba.simulation import Electronics, Emitter, Point, Scene, Sensor
+from ertis_numba.storage import add_poses, write_recording
+from tests.pages import commands_in, page, python_in, run_code_here, run_here
+
+POST_M = (1.4, 0.3)
+UNTURNED = (0.0, 0.0, 0.0, 1.0)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A recording of two sensors in front of a post, one recording per sensor, and poses."""
+    made = tmp_path_factory.mktemp("map")
+    sensors = tuple(
+        Sensor(
+            name=name,
+            position_m=(0.1, left_m, 0.4),
+            processing=Processing(range_m=(0.4, 2.2), directions="90"),
+            emitter=Emitter(level_db=-24.0, diameter_m=0.012),
+            electronics=Electronics(noise_dbfs=-60.0),
+        )
+        for name, left_m in (("left", 0.15), ("right", -0.15))
+    )
+    scene = Scene(
+        seed=6, rate_hz=10.0, count=3, sensors=sensors, points=(Point(position_m=(*POST_M, 0.4), strength_db=0.0),)
+    )
+    mounting = {sensor.name: (sensor.position_m, sensor.quaternion().tolist()) for sensor in sensors}
+    recorded = {
+        sensor.name: [ertis.render(scene, number, sensor=sensor.name) for number in range(3)] for sensor in sensors
+    }
+    write_recording(made / "both.h5", [each for several in recorded.values() for each in several], mounting=mounting)
+    for name, several in recorded.items():
+        write_recording(made / f"{name}.h5", several, mounting={name: mounting[name]})
+    ertis.write_tum(made / "poses.tum", poses())
+    return made
+
+
+def poses(*, start_ns=0, x_m=10.0):
+    return ertis.Trajectory(start_ns + np.array([0, 10**9]), [[x_m, 0.0, 0.0]] * 2, [UNTURNED] * 2)
+
+
+def run(folder, line, *, code=0):
+    arguments = [str(folder / each) if re.search(r"\.(h5|tum|pgm|ply)$", each) else each for each in line.split()]
+    done = CliRunner().invoke(cli, ["map", *arguments])
+    assert done.exit_code == code, done.output
+    return done
+
+
+def test_map_of_a_recording_shows_the_post_in_the_world(folder):
+    done = run(folder, "both.h5 --poses poses.tum --json -o first.h5")
+    report = json.loads(done.stdout)
+    assert (report["pulses"], report["left_out"], report["sensors"]) == (3, 0, ["left", "right"])
+    assert "first.h5: 3 pulses" in done.stderr
+    found = ertis.read_map(folder / "first.h5")
+    assert report["occupied"] == found.is_occupied.sum() == len(found.occupied_m) > 0
+    assert np.hypot(*(found.occupied_m - [POST_M[0] + 10.0, POST_M[1]]).T).max() < 0.1
+    assert found.log_odds_at((10.8, 0.1)) < 0
+
+
+def test_maps_of_one_or_several_recordings_are_equal(folder):
+    run(folder, "both.h5 --poses poses.tum -q -o one.h5")
+    run(folder, "left.h5 right.h5 --poses poses.tum -q -o several.h5")
+    one, several = (ertis.read_map(folder / name) for name in ("one.h5", "several.h5"))
+    assert np.array_equal(one.log_odds, several.log_odds)
+
+
+def test_map_uses_the_poses_of_the_recording(folder):
+    add_poses(folder / "both.h5", poses(x_m=-5.0), output=folder / "posed.h5")
+    run(folder, "posed.h5 -q")
+    found = ertis.read_map(folder / "posed.map.h5")
+    assert np.hypot(*(found.occupied_m - [POST_M[0] - 5.0, POST_M[1]]).T).max() < 0.1
+    run(folder, "posed.h5 --poses poses.tum -q -o given.h5")
+    assert ertis.read_map(folder / "given.h5").limits_m[0][0] > 9
+
+
+def test_map_writes_pictures_for_ros_and_points(folder):
+    report = json.loads(run(folder, "both.h5 --poses poses.tum -q --json --cell 0.1 -o place.pgm").stdout)
+    assert report["files"] == [str(folder / "place.pgm"), str(folder / "place.yaml")]
+    assert "resolution: 0.1\n" in (folder / "place.yaml").read_text("utf-8")
+    run(folder, "both.h5 --poses poses.tum -q -o place.ply")
+    assert (folder / "place.ply").read_bytes().startswith(b"ply\n")
+
+
+def test_map_leaves_out_pulses_outside_of_the_poses(folder):
+    ertis.write_tum(folder / "late.tum", poses(start_ns=50_000_000))
+    done = run(folder, "both.h5 --poses late.tum --json -o late.h5")
+    assert "note: 1 pulse of 3 outside of the time of the poses left out" in done.stderr
+    assert json.loads(done.stdout)["left_out"] == 1
+
+
+def test_map_refuses_poses_at_other_times(folder):
+    ertis.write_tum(folder / "other.tum", poses(start_ns=10**12))
+    done = run(folder, "both.h5 --poses other.tum -o other.h5", code=1)
+    assert "all pulses lie outside of the time of the poses: pulses from 0.000 s to 0.200 s, poses from" in done.stderr
+    assert not (folder / "other.h5").exists()
+
+
+@pytest.mark.parametrize(
+    ("line", "code", "message"),
+    [
+        ("both.h5", 2, "contains no poses of the platform; give --poses FILE"),
+        ("both.h5 left.h5 --poses poses.tum", 2, "have the same sensor 'left'"),
+        ("both.h5 --poses poses.tum -o place.tif", 1, "ending of the map '.tif' is unknown; known are .h5, .pgm, .ply"),
+        ("both.h5 --poses none.tum", 1, "none.tum"),
+        ("both.h5 --poses poses.tum --cell 0", 2, "--cell"),
+        ("both.h5 --poses poses.tum -o both.h5", 1, "both.h5"),
+    ],
+)
+def test_map_refuses_input_that_does_not_fit(folder, line, code, message):
+    assert message in run(folder, line, code=code).stderr
+
+
+def test_commands_and_code_of_the_page_run(tmp_path):
+    text = page("mapping")
+    (poses_file,) = re.findall(r"```text\n(.*?)```", text, re.DOTALL)
+    (tmp_path / "poses.tum").write_text(poses_file, "utf-8")
+    for command in commands_in(text):
+        run_here(tmp_path, command)
+        if command == "example platform":
+            scene_file = tmp_path / "platform.toml"
+            scene_file.write_text(scene_file.read_text("utf-8").replace("count = 30", "count = 2"), "utf-8")
+    assert ertis.read_map(tmp_path / "platform.map.h5").n_groups == 2
+    assert 'image: "place.pgm"' in (tmp_path / "place.yaml").read_text("utf-8")
+    (code,) = python_in(text)
+    assert "[" in run_code_here(tmp_path, code)
