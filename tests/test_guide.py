@@ -64,6 +64,7 @@ RUN_BY = {
         "test_many_cluster::test_cluster_command_of_the_page_runs",
     ],
     ("many", "python"): ["test_many_docs::test_code_of_the_page_runs"],
+    ("motion", "$"): ["test_odometry::test_commands_of_the_motion_page_run"],
     ("network", "$"): [
         "test_network_page::test_network_page_on_one_machine_runs",
         "test_network_page::test_network_page_on_several_machines_runs",

@@ -33,6 +33,7 @@ ELSEWHERE = {
         "layouts",
         "listen",
         "map",
+        "odometry",
         "presets",
         "record",
         "reset",

@@ -39,6 +39,7 @@ COMMANDS = {
     "layouts": ("ertis_cli.layouts:layouts", "List the shipped layouts, or print one as TOML."),
     "listen": ("ertis_cli.listen:listen", "Show or save the products that a central node publishes."),
     "map": ("ertis_cli.mapping:mapping", "Compute an occupancy map from recordings and poses."),
+    "odometry": ("ertis_cli.odometry:odometry", "Compute the trajectory of a platform from its echoes."),
     "peaks": ("ertis_cli.peaks:peaks", "List the reflectors in an energyscape file."),
     "plot": ("ertis_cli.plot:plot", "Plot a measurement or an array."),
     "presets": ("ertis_cli.presets:presets", "List the shipped presets, or print one as TOML."),

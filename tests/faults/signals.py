@@ -14,12 +14,13 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
 from ertis_numba.journal import SUFFIX, Journal, JournalEntry
 from ertis_numba.pipeline import Pipeline
-from ertis_numba.storage import open_recording, write_energyscapes
+from ertis_numba.storage import open_recording, write_energyscapes, write_recording
 from tests.faults import captures
 
 __all__ = ["COMMANDS", "MAX_END_S", "send"]
@@ -60,6 +61,7 @@ COMMANDS: Final[dict[str, Sequence[str]]] = {
     "layouts": ("eRTIS_v3D1",),
     "listen": ("tcp://127.0.0.1:1",),
     "map": ("{recording}", "--poses", "{trajectory}", "--mounting", "{mounting}", "-o", "{out}/place.pgm"),
+    "odometry": ("{drive}", "-o", "{out}/path.tum"),
     "peaks": ("{images}",),
     "plot": ("{recording}", "-o", "{out}/picture.png"),
     "presets": ("2d_181_5m",),
@@ -130,12 +132,18 @@ def _default_signals() -> Iterator[None]:
 def _files(folder: Path, source: Path) -> dict[str, str]:
     """Create the files that commands read, and return the names by which `COMMANDS` refers to them."""
     raw, images, crashed = folder / "raw.bin", folder / "images.h5", folder / "crashed"
-    script, trajectory = folder / "script.py", folder / "trajectory.tum"
+    script, trajectory, drive = folder / "script.py", folder / "trajectory.tum", folder / "drive.h5"
     mounting = folder / "mounting.toml"
     script.write_text("import rtisdev\nrtisdev.open_connection('/dev/no-such-port', allowDebugMode=True)\n")
     with open_recording(source) as recording:
         measurement = recording[0]
         mounting.write_text(f'[[sensors]]\nname = "{recording.sensor}"\nposition_m = [0.0, 0.0, 0.0]\n')
+        later = replace(measurement.stamp, timestamp_ns=measurement.stamp.timestamp_ns + 10**8)
+        write_recording(
+            drive,
+            [measurement, replace(measurement, stamp=replace(later, sequence=1, sync_count=1))],
+            mounting={later.sensor: ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))},
+        )
         raw.write_bytes(measurement.data.tobytes())
         times_s = [stamp.timestamp_ns // 10**9 + later for stamp in recording.stamps() for later in (0, 1)]
         trajectory.write_text("".join(f"{time_s} 0 0 0 0 0 0 1\n" for time_s in sorted({*times_s})))
@@ -149,6 +157,7 @@ def _files(folder: Path, source: Path) -> dict[str, str]:
             write_energyscapes(images, [pipeline.process(measurement)], recording=recording)
     return {
         "recording": str(source),
+        "drive": str(drive),
         "scene": str(_SCENE),
         "raw": str(raw),
         "images": str(images),

@@ -1,0 +1,175 @@
+"""``ertis odometry``: compute the trajectory of a platform from recordings."""
+
+from contextlib import ExitStack
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from ertis_cli import _mountings, _presets, _pulses, _results, options
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from ertis_cli._mountings import Mounting
+    from ertis_cli._pulses import StampedIndex
+    from ertis_numba.motion import Odometry
+    from ertis_numba.settings import Settings
+    from ertis_numba.storage import RecordingReader
+
+    _Group = dict[str, StampedIndex]
+
+__all__ = ["odometry", "odometry_of"]
+
+_NS_PER_S = 1e9
+
+
+@click.command()
+@click.argument("paths", metavar="REC.h5...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option(
+    "--output",
+    "-o",
+    "target",
+    type=click.Path(path_type=Path),
+    metavar="TRAJ.tum",
+    help="Trajectory to write in the TUM format; REC.odometry.tum beside the first recording by default.",
+)
+@_presets.processing_preset
+@click.option(
+    "--settings",
+    "settings_file",
+    metavar="FILE.toml",
+    type=click.Path(path_type=Path),
+    help="Settings file (TOML) whose keys override those of the recordings.",
+)
+@options.device
+@options.threads
+@options.plan
+@_mountings.mounting
+@options.force
+@options.quiet
+@options.as_json
+def odometry(
+    *,
+    paths: tuple[Path, ...],
+    target: Path | None,
+    preset: str | None,
+    settings_file: Path | None,
+    device: str,
+    threads: int | None,
+    plan: str,
+    mounting: Path | None,
+    force: bool,
+    quiet: bool,
+    as_json: bool,
+) -> None:
+    """Compute the trajectory of a platform from its echoes.
+
+    All sensors of the recordings belong to one platform. Their measurements are grouped by SYNC pulse, and each group
+    is compared with the one before. The trajectory starts at the origin and lies in the plane. Where too few echoes
+    match, the last velocity is assumed to continue. Pulses may be at most a second apart.
+    """
+    from ertis_numba import write_tum
+    from ertis_numba.storage import check_target
+
+    file = target or paths[0].with_suffix(".odometry.tum")
+    check_target(file, overwrite=force, sources=paths)
+
+    def changed(recorded: "Settings") -> "Settings":
+        settings = options.settings_with(recorded, settings_file=settings_file, preset=preset)
+        _results.require_image(settings)
+        return settings
+
+    with ExitStack() as stack:
+        readers = _pulses.open_sensors(paths, stack)
+        pipelines = _pulses.PipelinesBySensor(changed, stack, quiet=quiet, device=device, threads=threads, plan=plan)
+        found = odometry_of(readers, pipelines, mounting=_mountings.mountings(mounting, None), quiet=quiet)
+    write_tum(file, found.trajectory, overwrite=force)
+    measured = sum(pose.is_measured for pose in found.poses[1:]) / (len(found.poses) - 1)
+    duration_s = (found.poses[-1].timestamp_ns - found.poses[0].timestamp_ns) / _NS_PER_S
+    poses = options.counted(len(found.poses), "pose")
+    options.say(f"{file}: {poses}, {found.length_m:.2f} m in {duration_s:.1f} s, {measured:.0%} measured", quiet=quiet)
+    if as_json:
+        report = {
+            "output": str(file),
+            "sensors": [reader.sensor for reader in readers],
+            "poses": len(found.poses),
+            "length_m": round(found.length_m, 6),
+            "duration_s": round(duration_s, 6),
+            "measured": round(measured, 6),
+        }
+        options.print_json(report)
+
+
+def odometry_of(
+    readers: "Sequence[RecordingReader]",
+    pipelines: "_pulses.PipelinesBySensor",
+    *,
+    mounting: "dict[str, Mounting] | None",
+    quiet: bool,
+) -> "Odometry":
+    """Return the odometry of all pulses of recordings.
+
+    Parameters
+    ----------
+    readers : sequence of RecordingReader
+        Recordings of all sensors of the platform.
+    pipelines : PipelinesBySensor
+    mounting : mapping of str to Mounting, or None
+        Mountings by sensor instead of those of the recordings.
+    quiet : bool
+
+    Raises
+    ------
+    ArgumentError
+        A mounting is unknown.
+    DataError
+        Clocks of the recordings cannot be used, or no motion could be measured.
+    """
+    from ertis_numba.errors import DataError
+    from ertis_numba.motion import Odometry
+
+    found = Odometry(_pulses.mountings_of(readers, mounting))
+    groups = list(_pulses.pulse_groups(readers))
+    _require_times(readers, groups)
+    by_name = {reader.sensor: reader for reader in readers}
+    with options.progress(groups, length=len(groups), label="odometry", quiet=quiet) as shown:
+        for group in shown:
+            found.add([pipelines.image(by_name[name][place.index]) for name, place in group.items()])
+    unmeasured = sum(not pose.is_measured for pose in found.poses)
+    if unmeasured == len(groups) - 1:
+        raise DataError(
+            f"{readers[0].path}: no two successive pulses have enough echoes in common, at most a second apart; record "
+            "more pulses per second, or a place with more reflectors"
+        )
+    if unmeasured:
+        steps = options.counted(len(groups) - 1, "step")
+        options.say(f"note: {unmeasured} of {steps} assume that the last velocity continued", quiet=quiet)
+    return found
+
+
+def _require_times(readers: "Sequence[RecordingReader]", groups: "Sequence[_Group]") -> None:
+    """Raise DataError if the times of pulses do not increase, or if sensors share no pulse."""
+    from ertis_numba.errors import DataError
+
+    if len(groups) < 2:
+        raise DataError(f"{readers[0].path} has only one pulse; give recordings of at least 2, on a moving platform")
+    times_ns = [next(iter(group.values())).stamp.timestamp_ns for group in groups]
+    if any(later <= earlier for earlier, later in pairwise(times_ns)):
+        raise DataError(
+            f"{readers[0].path} has different pulses at the same time; give recordings whose timestamps increase"
+        )
+    if len(readers) > 1 and all(len(group) == 1 for group in groups):
+        spans = ", ".join(_span(reader) for reader in readers)
+        raise DataError(
+            f"no pulse has measurements of two sensors: {spans}; give recordings of the same SYNC pulses, whose clocks "
+            "agree within half a second"
+        )
+
+
+def _span(reader: "RecordingReader") -> str:
+    stamps = list(reader.stamps())
+    counts = f"{stamps[0].sync_count} to {stamps[-1].sync_count}"
+    first_s, last_s = (stamp.timestamp_ns / _NS_PER_S for stamp in (stamps[0], stamps[-1]))
+    return f"{reader.sensor} has pulses {counts} from {first_s:.3f} s to {last_s:.3f} s"

@@ -1,0 +1,161 @@
+"""``ertis odometry``: trajectories from recordings of one or several sensors, and bad input."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from ertis_cli.main import cli
+
+import ertis_numba as ertis
+from ertis_numba.settings import Processing
+from ertis_numba.simulation import Electronics, Emitter, Platform, Point, Scene, Sensor
+from ertis_numba.storage import open_recording, write_recording
+from tests.pages import commands_in, page, run_here
+
+PLATFORM = Platform(waypoints=((0.0, 0.0, 0.0, 0.0, 0.0), (0.2, 0.12, 0.04, 0.0, 6.0)))
+COUNT = 3
+
+
+def moving_scene():
+    """Return a scene in which a platform with two sensors passes reflectors all around it."""
+    draws = np.random.default_rng(5)
+    angle_rad, range_m = draws.uniform(-math.pi, math.pi, 28), draws.uniform(1.0, 2.2, 28)
+    points = tuple(
+        Point(position_m=(r * math.cos(angle), r * math.sin(angle), 0.4), strength_db=strength)
+        for angle, r, strength in zip(
+            angle_rad.tolist(), range_m.tolist(), draws.uniform(-12, -4, 28).tolist(), strict=True
+        )
+    )
+    sensors = tuple(
+        Sensor(
+            name=name,
+            position_m=(x_m, 0.0, 0.4),
+            yaw_deg=yaw_deg,
+            processing=Processing(range_m=(0.4, 2.5), directions="90"),
+            emitter=Emitter(level_db=-24.0, diameter_m=0.012),
+            electronics=Electronics(noise_dbfs=-60.0),
+        )
+        for name, x_m, yaw_deg in (("front", 0.2, 0.0), ("back", -0.2, 180.0))
+    )
+    return Scene(seed=3, platform=PLATFORM, sensors=sensors, points=points, rate_hz=10.0, count=COUNT)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Recordings of a moving platform: of both sensors, of each one, and with faults."""
+    place = tmp_path_factory.mktemp("odometry")
+    scene = moving_scene()
+    mountings = {sensor.name: (sensor.position_m, sensor.quaternion()) for sensor in scene.sensors}
+    measurements = []
+    for sensor in scene.sensors:
+        simulator = ertis.Simulator(scene, sensor=sensor.name)
+        measurements += [simulator.render(index) for index in range(COUNT)]
+    write_recording(place / "both.h5", measurements, mounting=mountings)
+    write_recording(place / "unmounted.h5", measurements)
+    for name, start in (("front", 0), ("back", COUNT)):
+        write_recording(place / f"{name}.h5", measurements[start : start + COUNT], mounting={name: mountings[name]})
+    late = [
+        replace(each, stamp=replace(each.stamp, timestamp_ns=each.stamp.timestamp_ns + 10**10))
+        for each in measurements[COUNT:]
+    ]
+    write_recording(place / "late.h5", late, mounting={"back": mountings["back"]})
+    write_recording(place / "single.h5", measurements[:1], mounting={"front": mountings["front"]})
+    timeless = [replace(each, stamp=replace(each.stamp, timestamp_ns=0)) for each in measurements[:COUNT]]
+    write_recording(place / "timeless.h5", timeless, mounting={"front": mountings["front"]})
+    slow = [
+        replace(each, stamp=replace(each.stamp, timestamp_ns=each.stamp.timestamp_ns * 20))
+        for each in measurements[:COUNT]
+    ]
+    write_recording(place / "slow.h5", slow, mounting={"front": mountings["front"]})
+    return place
+
+
+def run(*arguments):
+    done = CliRunner().invoke(cli, ["odometry", *(str(each) for each in arguments)])
+    return done.exit_code, done.stdout, done.stderr
+
+
+@pytest.mark.parametrize("names", [["both.h5"], ["front.h5", "back.h5"]], ids=["one file", "two files"])
+def test_odometry_command_writes_the_trajectory_of_the_platform(folder, tmp_path, names):
+    target = tmp_path / "path.tum"
+    code, stdout, stderr = run(*(folder / name for name in names), "-o", target, "--json")
+    assert code == 0, stderr
+    report = json.loads(stdout)
+    assert report.pop("length_m") == pytest.approx(math.hypot(0.12, 0.04), abs=2e-3)
+    assert report.pop("duration_s") == pytest.approx(0.2, abs=1e-5)
+    assert report == {"output": str(target), "sensors": ["front", "back"], "poses": COUNT, "measured": 1.0}
+    assert f"{target}: 3 poses, 0.13 m in 0.2 s, 100% measured" in stderr
+    path = ertis.read_trajectory(target)
+    true = PLATFORM.trajectory(np.arange(COUNT) / 10)
+    np.testing.assert_allclose(path.position_m, true.position_m, atol=2e-3)
+    np.testing.assert_allclose(path.rotation_xyzw, true.rotation_xyzw, atol=3e-3)
+    with open_recording(folder / "both.h5", sensor="front") as recording:
+        stamps_ns = [stamp.timestamp_ns for stamp in recording.stamps()]
+    np.testing.assert_allclose(path.time_ns, stamps_ns, atol=1000)
+
+
+def test_odometry_command_names_its_output_after_the_recording(folder, tmp_path):
+    recording = tmp_path / "both.h5"
+    recording.symlink_to(folder / "both.h5")
+    code, stdout, stderr = run(recording, "--quiet")
+    assert (code, stdout, stderr) == (0, "", "")
+    code, _, stderr = run(recording)
+    assert (code, "both.odometry.tum exists; give another name" in stderr) == (1, True), stderr
+
+
+def test_odometry_command_takes_mountings_from_a_file(folder, tmp_path):
+    unmounted = folder / "unmounted.h5"
+    arguments = (unmounted, "--mounting", folder / "both.h5", "-o", tmp_path / "path.tum", "--json")
+    code, stdout, stderr = run(*arguments)
+    assert code == 0, stderr
+    assert json.loads(stdout)["measured"] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("names", "status", "message"),
+    [
+        (["unmounted.h5"], 1, "the mounting of sensor 'front' is unknown; give --mounting FILE"),
+        (["single.h5"], 1, "single.h5 has only one pulse; give recordings of at least 2"),
+        (["front.h5", "both.h5"], 2, "have the same sensor 'front'"),
+        (["timeless.h5"], 1, "timeless.h5 has different pulses at the same time"),
+        (["front.h5", "late.h5"], 1, "no pulse has measurements of two sensors: front has pulses 0 to 2 from 0.000 s"),
+        (["slow.h5"], 1, "slow.h5: no two successive pulses have enough echoes in common, at most a second apart"),
+        (["both.h5", "--preset", "none"], 2, "preset 'none' is unknown"),
+    ],
+)
+def test_odometry_command_explains_what_it_cannot_use(folder, tmp_path, names, status, message):
+    target = tmp_path / "path.tum"
+    arguments = [folder / name if name.endswith(".h5") else name for name in names]
+    code, _, stderr = run(*arguments, "-o", target)
+    assert (code, message in stderr) == (status, True), stderr
+    assert len([line for line in stderr.splitlines() if line.startswith("ertis: error")]) == 1
+    assert not target.exists()
+
+
+def test_odometry_command_notes_steps_without_matches(folder, tmp_path):
+    """The platform stands for two seconds without pulses before it drives on."""
+    with open_recording(folder / "front.h5") as recording:
+        given = [recording[index] for index in range(COUNT)]
+        mounting = {"front": (recording.translation_m.tolist(), recording.rotation_xyzw.tolist())}
+    stamp = replace(given[-1].stamp, timestamp_ns=given[-1].stamp.timestamp_ns + 2 * 10**9)
+    write_recording(tmp_path / "rec.h5", [*given[:-1], replace(given[-1], stamp=stamp)], mounting=mounting)
+    code, stdout, stderr = run(tmp_path / "rec.h5", "--json")
+    assert code == 0, stderr
+    assert "note: 1 of 2 steps assume that the last velocity continued" in stderr
+    assert json.loads(stdout)["measured"] == 0.5
+
+
+def test_commands_of_the_motion_page_run(tmp_path):
+    for command in commands_in(page("motion")):
+        if command.startswith("example"):
+            run_here(tmp_path, command)
+            scene = tmp_path / "platform.toml"
+            scene.write_text(scene.read_text("utf-8").replace("count = 30", "count = 2"), "utf-8")
+        else:
+            run_here(tmp_path, command)
+    path = ertis.read_trajectory(tmp_path / "PATH.tum")
+    assert len(path) == 2
+    assert np.linalg.norm(path.position_m[1]) < 0.02
