@@ -11,7 +11,7 @@ from ertis_cli.main import cli
 from scipy.spatial.transform import Rotation
 
 import ertis_numba as ertis
-from ertis_numba.errors import ArgumentError, DamagedError
+from ertis_numba.errors import ArgumentError, DamagedError, ForeignDataError
 from ertis_numba.storage import RecordingWriter, open_recording, recorded_trajectory, write_recording
 from ertis_numba.storage.schema import POSES, RECORDING, content_sha256
 from ertis_numba.storage.verify import verify
@@ -213,6 +213,32 @@ def test_uncovered_measurements_are_refused_with_both_spans(plain):
     with pytest.raises(ArgumentError, match=spans.format("eRTIS-7") + r"1700000000\.123 to 1700000000\.123 s"), writer:
         writer.write(noise()[0])
     assert [path.name for path in plain.parent.iterdir()] == ["plain.h5"]
+
+
+def test_measurements_without_times_cannot_have_poses(tmp_path):
+    path = write_recording(tmp_path / "rec.h5", [restamped(noise()[0], timestamp_ns=0)])
+    with pytest.raises(ArgumentError, match="the times of the measurements of sensor eRTIS-7 are unknown; poses need"):
+        ertis.add_poses(path, drive())
+
+
+def test_broken_link_in_the_place_of_an_axis_is_replaced(plain):
+    with h5py.File(plain, "r+") as file:
+        file["sensors/left/quaternion"] = h5py.SoftLink("/nowhere")
+    ertis.add_poses(plain, drive())
+    assert recorded_trajectory(plain, sensor="left") is not None
+
+
+def test_links_in_the_place_of_poses_and_axes_are_refused(plain, tmp_path):
+    other = write_recording(tmp_path / "other.h5", noise(), poses=drive())
+    with h5py.File(plain, "r+") as file:
+        file["sensors/left/pose_position"] = h5py.ExternalLink(str(other), "/sensors/eRTIS-7/pose_position")
+    with pytest.raises(ForeignDataError, match="pose_position is a link into the file"):
+        ertis.add_poses(plain, drive())
+    with h5py.File(plain, "r+") as file:
+        del file["sensors/left/pose_position"], file["sensors/left/axis"]
+        file["sensors/left/axis"] = h5py.ExternalLink(str(other), "/sensors/eRTIS-7/axis")
+    with pytest.raises(ForeignDataError, match="axis is a link into the file"):
+        ertis.add_poses(plain, drive())
 
 
 WRONG = {

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ertis_numba.errors import ArgumentError, DamagedError
 from ertis_numba.frames import Trajectory
 from ertis_numba.storage.schema import POSES, create_variables
-from ertis_numba.storage.structure import MAX_TEXT_BYTES
+from ertis_numba.storage.structure import MAX_TEXT_BYTES, local_member
 
 __all__ = [
     "POSE_SIZES",
@@ -75,11 +75,16 @@ def require_times(trajectory: Trajectory, time_ns: NDArray[np.int64], sensor: st
         return
     first_ns, last_ns = int(trajectory.time_ns[0]), int(trajectory.time_ns[-1])
     begin_ns, end_ns = int(time_ns.min()), int(time_ns.max())
-    if begin_ns < first_ns or end_ns > last_ns:
+    if begin_ns >= first_ns and end_ns <= last_ns:
+        return
+    if not np.any(time_ns):
         raise ArgumentError(
-            f"the poses cover {_span(first_ns, last_ns)}, but the measurements of sensor {sensor} cover "
-            f"{_span(begin_ns, end_ns)}; give poses for this time, or correct the clock offset"
+            f"the times of the measurements of sensor {sensor} are unknown; poses need measurements with times"
         )
+    raise ArgumentError(
+        f"the poses cover {_span(first_ns, last_ns)}, but the measurements of sensor {sensor} cover "
+        f"{_span(begin_ns, end_ns)}; give poses for this time, or correct the clock offset (--offset-s)"
+    )
 
 
 def write_poses(group: h5py.Group, trajectory: Trajectory) -> None:
@@ -91,11 +96,14 @@ def write_poses(group: h5py.Group, trajectory: Trajectory) -> None:
     ------
     ArgumentError
         The trajectory does not cover all measurements.
+    ForeignDataError
+        The axes of the group are links.
     """
     time_ns = np.asarray(group["time"][:], np.int64)
     require_times(trajectory, time_ns, group.name.rpartition("/")[2])
     if not len(time_ns):
         return
+    local_member(group, "axis", h5py.Dataset)
     times, rows = np.unique(time_ns, return_inverse=True)  # Measurements may be out of order, or share a time.
     stored = trajectory.at(times)
     columns = {"pose_position": stored.position_m, "pose_rotation": stored.rotation_xyzw}
@@ -138,15 +146,14 @@ def read_poses(group: h5py.Group, path: Path) -> Trajectory | None:
 
 def remove_poses(group: h5py.Group) -> None:
     """Remove the poses of a sensor, and the axes that only they have."""
-    for name in (variable.name for variable in POSES):
+    poses = [variable.name for variable in POSES]
+    for name in poses:
         if name in group:
             for axis in group[name].dims:
                 for scale in axis.values():
                     axis.detach_scale(scale)
-            del group[name]
-    for name in _AXES_OF_POSES:
-        if name in group:
-            del group[name]
+    for name in {*poses, *_AXES_OF_POSES}.intersection(group):  # This includes broken links.
+        del group[name]
 
 
 def _span(first_ns: int, last_ns: int) -> str:

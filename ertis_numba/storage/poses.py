@@ -1,9 +1,10 @@
 """Poses of recordings: add a trajectory to a recording, and read the trajectory of its platform."""
 
 import filecmp
+import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final
 
@@ -100,8 +101,7 @@ def add_poses(
     n_poses = require_fitting_poses(source, trajectory, replace=replace)
     with _errors_with_path(target), atomic_write(target, overwrite=overwrite or output is None) as part:
         _copy(source, part, n_poses * _BYTES_PER_POSE)
-        with h5py.File(part, "r+", libver=("v110", "v110")) as file:
-            _add(file, trajectory)
+        _add(part, trajectory)
         _verify(part, target)
     return target
 
@@ -141,7 +141,7 @@ def require_fitting_poses(path: str | Path, trajectory: Trajectory, *, replace: 
         try:
             require_times(trajectory, time_ns, sensor)
         except ArgumentError as error:
-            raise ArgumentError(f"{path}: {error} (--offset-s)") from error
+            raise ArgumentError(f"{path}: {error}") from error
     return n_measurements
 
 
@@ -209,8 +209,23 @@ def _copy(source: Path, part: Path, n_bytes: int) -> None:
         raise DataError(f"{source} reads back with other content than was copied; check the disk")
 
 
-def _add(file: h5py.File, trajectory: Trajectory) -> None:
-    """Add poses to all sensors of an open recording, and update the attributes of its content."""
+def _add(part: Path, trajectory: Trajectory) -> None:
+    """Add poses to a copy of a recording."""
+    file = h5py.File(part, "r+", libver=("v110", "v110"))
+    try:
+        _add_to_sensors(file, trajectory)
+        file.close()
+    except BaseException:
+        # Closing writes buffered data, and HDF5 crashes the process if that fails (h5py issue 914). An empty file frees
+        # the necessary space.
+        with suppress(OSError, RuntimeError):  # The first error is the one to report.
+            os.truncate(part, 0)
+            file.close()
+        raise
+
+
+def _add_to_sensors(file: h5py.File, trajectory: Trajectory) -> None:
+    """Add poses to all sensors, and update the attributes that depend on the content."""
     contents: dict[str, str] = {}
     for sensor in file["sensors"]:
         group = SensorGroup(file[sensor_path(sensor)])
@@ -244,6 +259,6 @@ def _errors_with_path(path: Path) -> Iterator[None]:
         yield
     except ErtisError:
         raise
-    except (OSError, RuntimeError) as error:  # h5py raises both when the disk fails.
+    except (OSError, RuntimeError, ValueError, LookupError) as error:  # Errors of h5py for disks and foreign files.
         reason = str(error).partition("\n")[0]
         raise DataError(f"{path} cannot be written ({reason}); {remedy(error)}") from error
