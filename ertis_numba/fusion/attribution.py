@@ -6,13 +6,15 @@ from typing import Final, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba import kernels
 from ertis_numba.fusion.pairs import Hypothesis, Pair
-from ertis_numba.fusion.polar_grid import Places, PolarGrid
+from ertis_numba.fusion.polar_grid import PolarGrid
 from ertis_numba.fusion.receivers import CoarseImage, Receiver
 
 __all__ = ["Attributed", "Attribution", "Shares"]
 
 Singles = NDArray[np.float32]
+Places = NDArray[np.uint32]
 Shares: TypeAlias = Mapping[tuple[int, int], Singles]
 """Share of each pixel that belongs to a pair of emitter and receiver: (pixel,) float32, 0 to 1."""
 
@@ -27,6 +29,7 @@ _STRONG: Final = 0.1  # Reflectivity relative to the highest, from which missing
 _REACH: Final = 2  # Neighbouring azimuths whose reflectors cause echoes in the same pixel.
 _SAME_STEPS: Final = 2.0  # Distance, in steps, within which the reflectors of two hypotheses are one.
 _TINY: Final = np.float32(1e-30)
+_NONE: Final = np.empty(0, dtype=np.float32)
 
 
 class Attributed(NamedTuple):
@@ -52,18 +55,13 @@ class _Evidence(NamedTuple):
     Attributes
     ----------
     pair : Pair
-    floor : (entry,) float32
-        Power that noise and side lobes may reach.
-    highest : (entry,) float32
-        Highest power near each cell, with noise and side lobes.
-    weight : (entry,) float32
-        Weight in means over pairs.
+    values : (3, entry) float32
+        Power that noise and side lobes may reach; highest power near each cell, with noise and side lobes; weight in
+        means over pairs.
     """
 
     pair: Pair
-    floor: Singles
-    highest: Singles
-    weight: Singles
+    values: Singles
 
 
 class _Rivalry(NamedTuple):
@@ -73,13 +71,14 @@ class _Rivalry(NamedTuple):
 
     Attributes
     ----------
-    same : tuple of (int, (entry,) int64)
-        Other hypotheses with the pixels in which they lead to the same place.
+    same_pixel, same_hypothesis : (entry,) uint32
+        Pixels in which other hypotheses lead to the same place, and these hypotheses.
     part : (pixel,) float32
         Power of the echo relative to that of all hypotheses with the same place.
     """
 
-    same: tuple[tuple[int, Places], ...]
+    same_pixel: Places
+    same_hypothesis: Places
     part: Singles
 
 
@@ -110,6 +109,7 @@ class Attribution:
         unheard: frozenset[int] = frozenset(),
     ) -> None:
         self._grid, self._receivers, self._unheard = grid, receivers, unheard
+        self._kernels = kernels.load_fusion()
         self._pairs = [pair for pair in pairs if pair.emitter == pair.receiver or pair.emitter not in unheard]
         self._hypotheses = {
             number: [each for each in several if each.emitter == number or each.emitter not in unheard]
@@ -119,9 +119,7 @@ class Attribution:
         self._rivalries = {
             number: _rivalries(each, _SAME_STEPS * grid.step_m) for number, each in self._hypotheses.items()
         }
-        self._own_gain = {
-            pair.receiver: self._own_gain_of(pair) for pair in self._pairs if pair.emitter == pair.receiver
-        }
+        self._own = {pair.receiver: self._own_of(pair) for pair in self._pairs if pair.emitter == pair.receiver}
 
     def __call__(self, images: Mapping[int, CoarseImage]) -> Attributed:
         """Return the reflectivity of each cell, and the share of each pair in the pixels.
@@ -131,7 +129,7 @@ class Attribution:
         images : mapping of int to CoarseImage
             Image of each receiver.
         """
-        evidence = [_evidence(pair, images[pair.receiver]) for pair in self._pairs]
+        evidence = [self._evidence(pair, images[pair.receiver]) for pair in self._pairs]
         own = [each for each in evidence if each.pair.emitter == each.pair.receiver]
         alone = self._mean(own, images, None)
         bound = self._bound(evidence)
@@ -158,7 +156,7 @@ class Attribution:
         images : mapping of int to CoarseImage
         """
         own = [pair for pair in self._pairs if pair.emitter == pair.receiver]
-        return self._mean([_evidence(pair, images[pair.receiver]) for pair in own], images, None)
+        return self._mean([self._evidence(pair, images[pair.receiver]) for pair in own], images, None)
 
     def _without(self, unheard: frozenset[int]) -> "Attribution":
         """Return an attribution that expects no echoes of some emitters at other sensors."""
@@ -171,17 +169,16 @@ class Attribution:
 
         An emitter may be broken, covered, or not on the same SYNC chain.
         """
-        shown: dict[int, list[float]] = {}
+        shown: dict[int, NDArray[np.float64]] = {}
         strong = np.float32(_STRONG) * reflectivity.max()
         for each in evidence:
             pair = each.pair
             if pair.emitter == pair.receiver:
                 continue
-            expected = reflectivity.take(pair.cell)
-            sees = pair.confirms & (expected > strong) & (pair.gain * expected > np.float32(2 * _VISIBLE) * each.floor)
-            sums = shown.setdefault(pair.emitter, [0.0, 0.0])
-            sums[0] += float(np.minimum(each.highest[sees] / pair.gain[sees], expected[sees]).sum())
-            sums[1] += float(expected[sees].sum())
+            sums = shown.setdefault(pair.emitter, np.zeros(2))
+            self._kernels.compare_echoes(
+                pair.cell, pair.confirms, pair.gain, each.values, reflectivity, np.float32(2 * _VISIBLE), strong, sums
+            )
         return frozenset(emitter for emitter, (found, wanted) in shown.items() if found < _HEARD * wanted)
 
     def _bound(self, evidence: Sequence[_Evidence]) -> Singles:
@@ -191,9 +188,7 @@ class Attribution:
             pair = each.pair
             if pair.emitter in self._unheard:
                 continue
-            shown = np.float32(_BOUND) * (each.highest + each.floor) / pair.gain
-            cell = pair.cell[pair.bounds]
-            bound[cell] = np.minimum(bound[cell], shown[pair.bounds])
+            self._kernels.limit_cells(pair.cell, pair.bounds, pair.gain, each.values, np.float32(_BOUND), bound)
         return bound
 
     def _confirmed(self, evidence: Sequence[_Evidence], alone: Singles) -> dict[int, Singles]:
@@ -201,109 +196,132 @@ class Attribution:
 
         It is 0 where no other pair can see the cell.
         """
-        numbers = [*self._own_gain]
-        least = {number: np.full(self._grid.n_cells, np.inf, dtype=np.float32) for number in numbers}
+        numbers = [*self._own]
+        least = np.full((len(numbers), self._grid.n_cells), np.inf, dtype=np.float32)
         for each in evidence:
             pair = each.pair
             if pair.emitter in self._unheard:
                 continue
-            sees = pair.confirms & (pair.gain * alone.take(pair.cell) > np.float32(_VISIBLE) * each.floor)
-            cell, shown = pair.cell[sees], each.highest[sees] / pair.gain[sees]
-            for number in numbers:
-                if not pair.emitter == pair.receiver == number:
-                    least[number][cell] = np.minimum(least[number][cell], shown)
-        return {number: np.where(np.isfinite(values), values, np.float32(0)) for number, values in least.items()}
+            own = numbers.index(pair.receiver) if pair.emitter == pair.receiver else -1
+            self._kernels.confirm_cells(
+                pair.cell, pair.confirms, pair.gain, each.values, alone, np.float32(_VISIBLE), own, least
+            )
+        least[~np.isfinite(least)] = 0
+        return dict(zip(numbers, least, strict=True))
 
     def _around(self, reflectivity: Singles) -> Singles:
         """Return the highest reflectivity of each cell and its neighbours: (cell,) float32."""
         cells = reflectivity.reshape(-1, self._grid.n_azimuths, self._grid.n_ranges)
-        found = cells.copy()
-        for shift in range(1, (_REACH if self._grid.is_planar else 1) + 1):
-            np.maximum(found, np.roll(cells, shift, axis=1), out=found)
-            np.maximum(found, np.roll(cells, -shift, axis=1), out=found)
-        wide = found.copy()
-        np.maximum(wide[..., 1:], found[..., :-1], out=wide[..., 1:])
-        np.maximum(wide[..., :-1], found[..., 1:], out=wide[..., :-1])
-        return wide.reshape(-1)
+        found = np.empty_like(cells)
+        self._kernels.spread_cells(cells, _REACH if self._grid.is_planar else 1, found)
+        return found.reshape(-1)
 
     def _shares(
         self, number: int, image: CoarseImage, around: Singles, confirmed: Singles | None, suppression: float
     ) -> dict[tuple[int, int], Singles]:
-        receiver, shape = self._receivers[number], image.power.shape
-        hypotheses = self._hypotheses[number]
-        predicted = [receiver.over_lobe(each.predicted(around).reshape(shape)).reshape(-1) for each in hypotheses]
-        total = np.sum(predicted, axis=0, dtype=np.float32)
-        power = image.power.reshape(-1) + _TINY
+        lobe, hypotheses = self._receivers[number].lobe, self._hypotheses[number]
+        power = image.power.reshape(-1)
+        predicted = np.empty((len(hypotheses), *image.power.shape), dtype=np.float32)
+        for each, out in zip(hypotheses, predicted, strict=True):
+            self._kernels.predict_echoes(each.pixel, each.part_cell, each.part_gain, around, lobe, out)
+        predicted = predicted.reshape(len(hypotheses), len(power))
+        total = predicted.sum(axis=0)
         found = {}
-        for each, alone, rivalry in zip(hypotheses, predicted, self._rivalries[number], strict=True):
+        for index, (each, rivalry) in enumerate(zip(hypotheses, self._rivalries[number], strict=True)):
             if each.is_mirrored:
                 continue
-            rivals = total - alone
-            for other, pixel in rivalry.same:
-                rivals[pixel] -= predicted[other][pixel]
-            np.maximum(rivals, 0, out=rivals)  # Differences of rounding may be negative.
-            share = (1 - np.float32(suppression) * rivals / power).clip(0, 1)
+            expected = _NONE
             if each.emitter == number and confirmed is not None:
-                is_confirmed = _at(confirmed, each.cell) * self._own_gain[number] > np.float32(_CONFIRMED) * power
-                share = np.maximum(share, is_confirmed * (alone / (alone + rivals + _TINY)) ** 3)
-            found[each.emitter, number] = share * rivalry.part
+                cell, gain = self._own[number]
+                expected = confirmed[cell] * gain
+            share = found[each.emitter, number] = np.empty_like(power)
+            self._kernels.share_echoes(
+                predicted,
+                total,
+                rivalry.same_pixel,
+                rivalry.same_hypothesis,
+                power,
+                rivalry.part,
+                expected,
+                index,
+                np.float32(suppression),
+                np.float32(_CONFIRMED),
+                share,
+            )
         return found
 
-    def _own_gain_of(self, pair: Pair) -> Singles:
-        """Return the gain of the receiver's own call for a reflector in each pixel: (pixel,) float32."""
+    def _own_of(self, pair: Pair) -> tuple[Places, Singles]:
+        """Return the cell of each pixel, and the gain of the receiver's own call there: (pixel,) uint32 and float32.
+
+        The gain is 0 outside of the grid.
+        """
         gain = np.zeros(self._grid.n_cells, dtype=np.float32)
         gain[pair.cell] = pair.gain
         own = next(
             each for each in self._hypotheses[pair.receiver] if each.emitter == pair.receiver and not each.is_mirrored
         )
-        return _at(gain, own.cell)
+        inside = own.cell.clip(0)
+        return inside.astype(np.uint32), np.where(own.cell >= 0, gain.take(inside), np.float32(0))
 
     def _mean(self, evidence: Sequence[_Evidence], images: Mapping[int, CoarseImage], shares: Shares | None) -> Singles:
         """Return the mean over pairs of the reflectivity of each cell, as power at 1 m: (cell,) float32.
 
         Shares are also weights for pairs of different sensors: what belongs to another pair says nothing about them.
         """
-        total = np.zeros(self._grid.n_cells, dtype=np.float32)
-        weights = np.full(self._grid.n_cells, _TINY)
+        sums = np.zeros((2, self._grid.n_cells), dtype=np.float32)
+        sums[1] = _TINY
         for each in evidence:
-            pair, weight = each.pair, each.weight
-            power = images[pair.receiver].power.reshape(-1)
-            if shares is not None:
-                share = shares[pair.emitter, pair.receiver]
-                power = power * share
-                if pair.emitter != pair.receiver:
-                    weight = weight * pair.values(share)
-            total[pair.cell] += weight * pair.values(power) / pair.lifted
-            weights[pair.cell] += weight
-        return total / weights
+            pair = each.pair
+            self._kernels.add_echoes(
+                pair.cell,
+                pair.first,
+                pair.second,
+                pair.share,
+                each.values[2],
+                pair.lifted,
+                images[pair.receiver].power.reshape(-1),
+                _NONE if shares is None else shares[pair.emitter, pair.receiver],
+                pair.emitter != pair.receiver,
+                sums,
+            )
+        return np.asarray(sums[0] / sums[1])
+
+    def _evidence(self, pair: Pair, image: CoarseImage) -> _Evidence:
+        """Return the evidence of a pair.
+
+        Weights are the squares of gain relative to noise and side lobes, which is the least variance. They fade towards
+        the limits of what a pair can see, so that images have no seams.
+        """
+        values = np.empty((3, len(pair.cell)), dtype=np.float32)
+        self._kernels.gather_evidence(
+            pair.first,
+            pair.second,
+            pair.share,
+            pair.step,
+            pair.gain,
+            pair.weight,
+            image.highest.reshape(-1),
+            image.floor,
+            values,
+        )
+        return _Evidence(pair, values)
 
 
 def _rivalries(hypotheses: Sequence[Hypothesis], same_m: float) -> list[_Rivalry]:
     found = []
     for each in hypotheses:
-        gain, same = each.gain.copy(), []
+        gain, pixels, others = each.gain.copy(), [], []
         for number, other in enumerate(hypotheses):
             offset_m = other.place_m - each.place_m
             pixel = np.flatnonzero(np.einsum("px,px->p", offset_m, offset_m) < same_m**2)
-            if other is not each and len(pixel):
+            if other is not each:
                 gain[pixel] += other.gain[pixel]
-                same.append((number, pixel))
+                pixels.append(pixel)
+                others.append(np.full(len(pixel), number))
         part = np.divide(each.gain, gain, out=np.ones_like(gain), where=gain > 0)
-        found.append(_Rivalry(tuple(same), part))
+        found.append(_Rivalry(_joined(pixels), _joined(others), part))
     return found
 
 
-def _evidence(pair: Pair, image: CoarseImage) -> _Evidence:
-    """Return the evidence of a pair.
-
-    Weights are the squares of gain relative to noise and side lobes, which is the least variance. They fade towards
-    the limits of what a pair can see, so that images have no seams.
-    """
-    floor = image.floor.take(pair.step)
-    signal_to_floor = pair.gain / floor
-    return _Evidence(pair, floor, pair.values(image.highest), pair.weight * signal_to_floor**2)
-
-
-def _at(values: Singles, cell: Places) -> Singles:
-    """Return the values of cells: (pixel,) float32, 0 outside of the grid."""
-    return np.where(cell >= 0, values.take(cell.clip(0)), np.float32(0))
+def _joined(places: Sequence[NDArray[np.int64]]) -> Places:
+    return np.concatenate([np.empty(0, np.int64), *places]).astype(np.uint32)

@@ -4,7 +4,6 @@ import math
 from typing import Final, NamedTuple
 
 import numpy as np
-import scipy.sparse
 from numpy.typing import NDArray
 
 from ertis_numba.fusion.polar_grid import PolarGrid
@@ -15,7 +14,7 @@ __all__ = ["Hypothesis", "Pair", "hypothesis", "pair_of"]
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
-Places = NDArray[np.int64]
+Places = NDArray[np.uint32]
 
 _LIT_DB: Final = (-16.0, -10.0)  # Radiated power below which a cell is not imaged, and above which it is fully.
 _LIFT_DB: Final = -8.0  # Radiated power below which images are not amplified further, since side lobes would grow.
@@ -36,11 +35,11 @@ class Pair(NamedTuple):
     Attributes
     ----------
     emitter, receiver : int
-    cell : (entry,) int64
+    cell : (entry,) uint32
         Cells that are seen.
-    step : (entry,) int64
+    step : (entry,) uint32
         Step of the receiver's range axis.
-    first, second : (entry,) int64
+    first, second : (entry,) uint32
         Pixels of two neighbouring directions, in a flat image.
     share : (entry,) float32
         Weight of the second pixel.
@@ -67,12 +66,6 @@ class Pair(NamedTuple):
     bounds: NDArray[np.bool_]
     confirms: NDArray[np.bool_]
 
-    def values(self, image: Singles) -> Singles:
-        """Return the values of an image at the cells: (entry,) float32."""
-        flat = image.reshape(-1)
-        low = flat.take(self.first)
-        return np.asarray(low + self.share * (flat.take(self.second) - low))
-
 
 class Hypothesis(NamedTuple):
     """Cells in which a reflector would cause an echo in each pixel of a receiver.
@@ -82,8 +75,12 @@ class Hypothesis(NamedTuple):
     emitter : int
     is_mirrored : bool
         True for reflectors behind a flat array, which the array cannot distinguish from those in front.
-    parts : tuple of csr_matrix
-        Matrices (pixel, cell) of the gain of echoes, for the parts of a step.
+    pixel : (entry,) uint32
+        Pixels with possible echoes.
+    part_cell : (part, entry) uint32
+        Cells that the parts of a step lead to.
+    part_gain : (part, entry) float32
+        Gain of echoes from there; 0 if none is possible.
     cell : (pixel,) int64
         Cell of the middle of each pixel, or -1.
     place_m : (pixel, axis) float32
@@ -94,17 +91,12 @@ class Hypothesis(NamedTuple):
 
     emitter: int
     is_mirrored: bool
-    parts: "tuple[scipy.sparse.csr_matrix, ...]"
-    cell: Places
+    pixel: Places
+    part_cell: Places
+    part_gain: Singles
+    cell: NDArray[np.int64]
     place_m: Singles
     gain: Singles
-
-    def predicted(self, reflectivity: Singles) -> Singles:
-        """Return the power that reflectors would cause: (pixel,) float32."""
-        found = self.parts[0] @ reflectivity
-        for part in self.parts[1:]:
-            np.maximum(found, part @ reflectivity, out=found)
-        return np.asarray(found)
 
 
 def pair_of(
@@ -153,10 +145,10 @@ def pair_of(
     return Pair(
         emitter,
         number,
-        cell,
-        step,
-        beam.first[cell] * receiver.n_steps + step,
-        beam.second[cell] * receiver.n_steps + step,
+        cell.astype(np.uint32),
+        step.astype(np.uint32),
+        (beam.first[cell] * receiver.n_steps + step).astype(np.uint32),
+        (beam.second[cell] * receiver.n_steps + step).astype(np.uint32),
         beam.share[cell],
         (radiated * spreading[cell]).astype(np.float32),
         (np.maximum(radiated, 10 ** (_LIFT_DB / 10)) * spreading[cell]).astype(np.float32),
@@ -194,8 +186,8 @@ def hypothesis(
     directions = toward @ pose.rotation.T
     offset_m = poses[emitter].translation_m - pose.translation_m
     apart_m = float(np.linalg.norm(offset_m))
-    n_pixels = len(directions) * receiver.n_steps
-    parts = []
+    cells: list[NDArray[np.int64]] = []
+    gains: list[Singles] = []
     for part in _PARTS_OF_STEP:
         path_m = 2 * (np.arange(receiver.n_steps) + 0.5 + part) * receiver.step_m - late_m
         beyond = path_m**2 - apart_m**2
@@ -204,13 +196,20 @@ def hypothesis(
         sent_m = (place_m - poses[emitter].translation_m) @ poses[emitter].rotation
         from_m = np.linalg.norm(sent_m, axis=-1)
         radiated = emitters.power(sent_m[..., 0] / np.maximum(from_m, _NEAREST_M))
-        cell = np.where((beyond > 0) & (to_m > _NEAREST_M), grid.cell_of(place_m), -1).reshape(-1)
-        gain = (radiated * emitters.spreading(from_m, to_m)).reshape(-1)
-        pixel = np.flatnonzero((cell >= 0) & (radiated > _AUDIBLE).reshape(-1))
-        entries = gain[pixel].astype(np.float32), (pixel, cell[pixel])
-        parts.append(scipy.sparse.csr_matrix(entries, shape=(n_pixels, grid.n_cells)))
+        cell = np.where((beyond > 0) & (to_m > _NEAREST_M), grid.cell_of(place_m), -1)
+        gain = np.where((cell >= 0) & (radiated > _AUDIBLE), radiated * emitters.spreading(from_m, to_m), 0.0)
+        cells.append(cell.reshape(-1))
+        gains.append(gain.astype(np.float32).reshape(-1))
         if part == 0:
-            audible = np.zeros(n_pixels, dtype=np.float32)
-            audible[pixel] = gain[pixel]
-            middle = cell, place_m.reshape(-1, 3).astype(np.float32), audible
-    return Hypothesis(emitter, is_mirrored, tuple(parts), *middle)
+            middle = cells[-1], place_m.reshape(-1, 3).astype(np.float32), gains[-1]
+    part_gain = np.stack(gains)
+    part_cell = np.where(part_gain > 0, np.stack(cells), 0).astype(np.uint32)
+    pixel = np.flatnonzero(part_gain.any(axis=0))
+    return Hypothesis(
+        emitter,
+        is_mirrored,
+        pixel.astype(np.uint32),
+        np.ascontiguousarray(part_cell[:, pixel]),
+        np.ascontiguousarray(part_gain[:, pixel]),
+        *middle,
+    )

@@ -6,6 +6,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba import kernels
 from ertis_numba.frames import Energyscape
 from ertis_numba.fusion.polar_grid import close_directions
 from ertis_numba.fusion.rig import MountedSensor
@@ -85,9 +86,10 @@ class Receiver:
         self.n_steps = int(image.range_m[-1] / step_m) + 1
         steps = (image.range_m / step_m).astype(np.int64)
         self.has_range = np.isin(np.arange(self.n_steps), steps)
-        self._first = np.flatnonzero(np.diff(steps, prepend=-1))
-        self._lobe = close_directions(self.directions, _BEAM_RAD)
-        self._close = close_directions(self.directions, _CLOSE_RAD)
+        self._first = np.searchsorted(steps, np.arange(self.n_steps + 1)).astype(np.uint32)
+        self.lobe = close_directions(self.directions, _BEAM_RAD).astype(np.uint32)
+        """Directions within the main lobe of each direction: (direction, neighbour) uint32."""
+        self._close = close_directions(self.directions, _CLOSE_RAD).astype(np.uint32)
         # The planar grid is interpolated; directions all over a sphere are dense enough for the nearest one.
         self._order = np.argsort(image.azimuth_rad) if image.is_planar else None
 
@@ -108,21 +110,16 @@ class Receiver:
         deaf : (step,) bool
             Steps at which direct sound hides echoes.
         """
-        amplitude = np.zeros((len(self.directions), self.n_steps), dtype=np.float32)
-        amplitude[:, self.has_range] = np.maximum.reduceat(image.amplitude, self._first, axis=1)
-        amplitude[:, deaf] = 0
-        power = amplitude * amplitude
-        noise = float(np.median(image.amplitude[:, ::_THINNED])) ** 2 / math.log(2)
-        floor = np.maximum(_SIDE_LOBES * power.max(axis=0), max(_NOISE_FACTOR * noise, _LEAST_POWER))
-        return CoarseImage(
-            np.maximum(power - floor, 0),
-            _highest(_along_range(power), self._close),
-            floor.astype(np.float32),
+        amplitude = np.ascontiguousarray(image.amplitude, dtype=np.float32)
+        noise = float(np.median(amplitude[:, ::_THINNED])) ** 2 / math.log(2)
+        least = np.float32(max(_NOISE_FACTOR * noise, _LEAST_POWER))
+        shape = len(self.directions), self.n_steps
+        power, highest = np.empty(shape, np.float32), np.empty(shape, np.float32)
+        floor = np.empty(self.n_steps, np.float32)
+        kernels.load_fusion().coarsen_image(
+            amplitude, self._first, deaf, self._close, np.float32(_SIDE_LOBES), least, floor, highest, power
         )
-
-    def over_lobe(self, power: Singles) -> Singles:
-        """Return the highest power within a main lobe around each direction: (direction, step) float32."""
-        return _highest(power, self._lobe)
+        return CoarseImage(power, highest, floor)
 
     def beam(self, local_m: Floats) -> Beam:
         """Return the directions of points in the sensor frame.
@@ -151,19 +148,3 @@ class Receiver:
         gap_rad = np.maximum(azimuths_rad[place] - azimuths_rad[place - 1], 1e-12)
         share = ((azimuth_rad - azimuths_rad[place - 1]) / gap_rad).clip(0, 1)
         return Beam(self._order[place - 1], self._order[place], share.astype(np.float32), inside)
-
-
-def _highest(values: Singles, near: Places) -> Singles:
-    """Return the highest value of neighbouring directions: (direction, step) float32."""
-    found = values.copy()
-    for column in near.T:
-        np.maximum(found, values[column], out=found)
-    return found
-
-
-def _along_range(values: Singles) -> Singles:
-    """Return the highest value of each step and its two neighbours."""
-    found = values.copy()
-    np.maximum(found[:, 1:], values[:, :-1], out=found[:, 1:])
-    np.maximum(found[:, :-1], values[:, 1:], out=found[:, :-1])
-    return found

@@ -149,7 +149,7 @@ class FusionTables:
         ]
         seen = {pair.emitter for pair in self._pairs[number]}
         self._hypotheses[number] = [
-            each for each in hypotheses if each.parts[0].nnz or (each.emitter in seen and not each.is_mirrored)
+            each for each in hypotheses if len(each.pixel) or (each.emitter in seen and not each.is_mirrored)
         ]
         self._points[number] = PointFuser(number, self._poses, receiver, image)
 

@@ -5,8 +5,19 @@
 """
 
 from ertis_numba.kernels._compile_notice import on_compiling
+from ertis_numba.kernels._contract.fusion import FusionKernels
 from ertis_numba.kernels._device_protocols import Lane, Memory
-from ertis_numba.kernels._dispatch import DEVICES, load, usable
+from ertis_numba.kernels._dispatch import DEVICES, load, load_fusion, usable
 from ertis_numba.kernels._kernel_set import KernelSet
 
-__all__ = ["DEVICES", "KernelSet", "Lane", "Memory", "load", "on_compiling", "usable"]
+__all__ = [
+    "DEVICES",
+    "FusionKernels",
+    "KernelSet",
+    "Lane",
+    "Memory",
+    "load",
+    "load_fusion",
+    "on_compiling",
+    "usable",
+]

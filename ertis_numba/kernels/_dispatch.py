@@ -8,9 +8,10 @@ from typing import Final
 
 from ertis_numba import checks
 from ertis_numba.errors import DeviceError
+from ertis_numba.kernels._contract.fusion import FusionKernels
 from ertis_numba.kernels._kernel_set import KernelSet
 
-__all__ = ["DEVICES", "load", "usable"]
+__all__ = ["DEVICES", "load", "load_fusion", "usable"]
 
 _LOG = logging.getLogger("ertis_numba")
 
@@ -69,6 +70,30 @@ def load(device: str = "auto") -> KernelSet:
         raise DeviceError(
             f"device {device!r} cannot be set up ({error}); set NUMBA_CACHE_DIR to a writable folder"
         ) from error
+    return kernels
+
+
+@functools.cache
+def load_fusion() -> FusionKernels:
+    """Return the kernels of fusion: compiled ones, or those of NumPy if none can be compiled on this machine.
+
+    Returns
+    -------
+    FusionKernels
+
+    Examples
+    --------
+    >>> from ertis_numba import kernels
+    >>> kernels.load_fusion().spread_cells.__name__
+    'spread_cells'
+    """
+    try:
+        load("cpu")
+        name = "ertis_numba.kernels._cpu.fusion"
+    except DeviceError as error:
+        _LOG.info("fusion uses NumPy: %s", error)
+        name = "ertis_numba.kernels._numpy_fusion"
+    kernels: FusionKernels = importlib.import_module(name).KERNELS
     return kernels
 
 

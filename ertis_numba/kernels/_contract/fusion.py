@@ -1,0 +1,283 @@
+"""Contracts of the kernels of fusion: powers of images to reflectivities of cells, for one thread.
+
+Pixels are (direction, step) of one receiver, flattened; cells are those of the fused image. Entries are the cells or
+pixels of one pair of emitter and receiver. Cells and pixels are different within one set of entries.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.kernels._contract.arrays import Real, Turns
+
+__all__ = ["FusionKernels"]
+
+Truths = NDArray[np.bool_]
+
+
+class CoarsenImage(Protocol):
+    """Reduce an image to the highest power of each coarse step, and separate noise and side lobes.
+
+    Parameters
+    ----------
+    amplitude : (direction, range) float32
+    first : (step + 1,) uint32
+        First range of each step; equal ones for a step without ranges.
+    is_deaf : (step,) bool
+        Steps without audible echoes, whose power is 0.
+    close : (direction, neighbour) uint32
+        Directions within the error of a direction.
+    side_lobes : float32
+        Power of side lobes relative to the strongest direction of a step.
+    least : float32
+        Least floor.
+    floor : (step,) float32
+        Output: power that noise and side lobes may reach.
+    highest : (direction, step) float32
+        Output: highest power of the close directions at a step and beside it.
+    out : (direction, step) float32
+        Power above the floor, 0 below it.
+    """
+
+    def __call__(
+        self,
+        amplitude: Real,
+        first: Turns,
+        is_deaf: Truths,
+        close: Turns,
+        side_lobes: np.float32,
+        least: np.float32,
+        floor: Real,
+        highest: Real,
+        out: Real,
+    ) -> None: ...
+
+
+class SpreadCells(Protocol):
+    """Return the highest value of each cell and its neighbours.
+
+    Parameters
+    ----------
+    values : (row, azimuth, range) float32
+    reach : int
+        Number of neighbouring azimuths on each side, which are cyclic; ranges have one.
+    out : (row, azimuth, range) float32
+    """
+
+    def __call__(self, values: Real, reach: int, out: Real) -> None: ...
+
+
+class PredictEchoes(Protocol):
+    """Predict the power of the echoes of reflectors, within a main lobe around each direction.
+
+    Parameters
+    ----------
+    pixel : (entry,) uint32
+    cell : (part, entry) uint32
+        Cells that cause an echo in the pixel.
+    gain : (part, entry) float32
+        Gain of each cell's echo; 0 for none. The highest echo counts.
+    reflectivity : (cell,) float32
+    lobe : (direction, neighbour) uint32
+        Directions within the main lobe of each direction.
+    out : (direction, step) float32
+    """
+
+    def __call__(self, pixel: Turns, cell: Turns, gain: Real, reflectivity: Real, lobe: Turns, out: Real) -> None: ...
+
+
+class ShareEchoes(Protocol):
+    """Compute the share of each pixel's power that belongs to one hypothesis.
+
+    With the rivals' predicted power R, the share is ``1 − suppression · R / power``, limited to 0 to 1. An echo of
+    power P whose reflector other pairs confirm has at least ``(P / (P + R))³``.
+
+    Parameters
+    ----------
+    predicted : (hypothesis, pixel) float32
+    total : (pixel,) float32
+        Sum over hypotheses.
+    same_pixel, same_hypothesis : (entry,) uint32
+        Hypotheses that lead to the same place in a pixel, and are no rivals there.
+    power : (pixel,) float32
+    part : (pixel,) float32
+        Factor of the result.
+    confirmed : (pixel,) float32
+        Power of echoes that other pairs confirm; empty if unknown.
+    number : int
+        Index of the hypothesis.
+    suppression, least_confirmed : float32
+        Factor of rivals, and confirmed power relative to a pixel from which its reflector is confirmed.
+    out : (pixel,) float32
+    """
+
+    def __call__(
+        self,
+        predicted: Real,
+        total: Real,
+        same_pixel: Turns,
+        same_hypothesis: Turns,
+        power: Real,
+        part: Real,
+        confirmed: Real,
+        number: int,
+        suppression: np.float32,
+        least_confirmed: np.float32,
+        out: Real,
+    ) -> None: ...
+
+
+class GatherEvidence(Protocol):
+    """Gather the floor, the highest power and the weight of the echoes of a pair.
+
+    Parameters
+    ----------
+    first, second : (entry,) uint32
+        Pixels of two neighbouring directions.
+    between : (entry,) float32
+        Weight of the second pixel.
+    step : (entry,) uint32
+    gain, weight : (entry,) float32
+        Gain of the echo, and weight of the pair. The weight of an echo is ``weight · (gain / floor)²``.
+    highest : (pixel,) float32
+    floor : (step,) float32
+    out : (3, entry) float32
+    """
+
+    def __call__(
+        self,
+        first: Turns,
+        second: Turns,
+        between: Real,
+        step: Turns,
+        gain: Real,
+        weight: Real,
+        highest: Real,
+        floor: Real,
+        out: Real,
+    ) -> None: ...
+
+
+class AddEchoes(Protocol):
+    """Add the weighted reflectivities that a pair shows, and the weights.
+
+    Parameters
+    ----------
+    cell, first, second : (entry,) uint32
+    between : (entry,) float32
+    weight, lifted : (entry,) float32
+        Weight and gain of each echo.
+    power : (pixel,) float32
+    share : (pixel,) float32
+        Share of the power that belongs to the pair; empty for all of it.
+    is_foreign : bool
+        True if shares are also factors of the weights.
+    out : (2, cell) float32
+        Sums of weighted reflectivities and of weights, to which the kernel adds.
+    """
+
+    def __call__(
+        self,
+        cell: Turns,
+        first: Turns,
+        second: Turns,
+        between: Real,
+        weight: Real,
+        lifted: Real,
+        power: Real,
+        share: Real,
+        is_foreign: bool,  # noqa: FBT001  kernels take no keywords
+        out: Real,
+    ) -> None: ...
+
+
+class LimitCells(Protocol):
+    """Limit cells to the reflectivity that a pair shows.
+
+    Parameters
+    ----------
+    cell : (entry,) uint32
+    is_used : (entry,) bool
+    gain : (entry,) float32
+    evidence : (3, entry) float32
+        Result of `GatherEvidence`.
+    margin : float32
+        Factor of the highest power and the floor.
+    out : (cell,) float32
+    """
+
+    def __call__(
+        self, cell: Turns, is_used: Truths, gain: Real, evidence: Real, margin: np.float32, out: Real
+    ) -> None: ...
+
+
+class ConfirmCells(Protocol):
+    """Limit cells to the reflectivity that a pair confirms, where its echo must be visible.
+
+    Parameters
+    ----------
+    cell, is_used, gain, evidence
+        As in `LimitCells`.
+    reflectivity : (cell,) float32
+        Expected reflectivity.
+    visible : float32
+        Power of a visible echo relative to the floor.
+    skipped : int
+        Row that the pair does not limit; −1 for none.
+    out : (row, cell) float32
+    """
+
+    def __call__(
+        self,
+        cell: Turns,
+        is_used: Truths,
+        gain: Real,
+        evidence: Real,
+        reflectivity: Real,
+        visible: np.float32,
+        skipped: int,
+        out: Real,
+    ) -> None: ...
+
+
+class CompareEchoes(Protocol):
+    """Add the reflectivity that a pair shows, and the expected one, over the cells with visible echoes.
+
+    Parameters
+    ----------
+    cell, is_used, gain, evidence, reflectivity, visible
+        As in `ConfirmCells`.
+    strong : float32
+        Expected reflectivity above which a cell counts.
+    out : (2,) float64
+        Sums, to which the kernel adds.
+    """
+
+    def __call__(
+        self,
+        cell: Turns,
+        is_used: Truths,
+        gain: Real,
+        evidence: Real,
+        reflectivity: Real,
+        visible: np.float32,
+        strong: np.float32,
+        out: NDArray[np.float64],
+    ) -> None: ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FusionKernels:
+    """Kernels of fusion of one device, all for one thread."""
+
+    coarsen_image: CoarsenImage
+    spread_cells: SpreadCells
+    predict_echoes: PredictEchoes
+    share_echoes: ShareEchoes
+    gather_evidence: GatherEvidence
+    add_echoes: AddEchoes
+    limit_cells: LimitCells
+    confirm_cells: ConfirmCells
+    compare_echoes: CompareEchoes

@@ -1,0 +1,183 @@
+"""Kernels of fusion in plain NumPy, as a reference for the compiled ones, and where none can be compiled.
+
+They compute in the type of ``out``, so that float64 arrays give an exact reference.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.kernels._contract.arrays import Real, Turns
+from ertis_numba.kernels._contract.fusion import FusionKernels, Truths
+
+__all__ = ["KERNELS"]
+
+_TINY = np.float32(1e-30)
+
+
+def coarsen_image(
+    amplitude: Real,
+    first: Turns,
+    is_deaf: Truths,
+    close: Turns,
+    side_lobes: np.float32,
+    least: np.float32,
+    floor: Real,
+    highest: Real,
+    out: Real,
+) -> None:
+    """Reduce an image to the highest power of each coarse step, and separate noise and side lobes."""
+    power = np.zeros_like(out)
+    filled = np.flatnonzero(np.diff(first.astype(np.int64)) > 0)
+    power[:, filled] = np.maximum.reduceat(amplitude, first[filled].astype(np.int64), axis=1).astype(out.dtype) ** 2
+    power[:, is_deaf] = 0
+    floor[:] = np.maximum(side_lobes * power.max(axis=0), least)
+    np.maximum(power - floor, 0, out=out)
+    wide = power.copy()
+    np.maximum(wide[:, 1:], power[:, :-1], out=wide[:, 1:])
+    np.maximum(wide[:, :-1], power[:, 1:], out=wide[:, :-1])
+    _highest(wide, close, highest)
+
+
+def spread_cells(values: Real, reach: int, out: Real) -> None:
+    """Return the highest value of each cell and its neighbours."""
+    found = np.max([np.roll(values, shift, axis=1) for shift in range(-reach, reach + 1)], axis=0)
+    out[:] = found
+    np.maximum(out[..., 1:], found[..., :-1], out=out[..., 1:])
+    np.maximum(out[..., :-1], found[..., 1:], out=out[..., :-1])
+
+
+def predict_echoes(pixel: Turns, cell: Turns, gain: Real, reflectivity: Real, lobe: Turns, out: Real) -> None:
+    """Predict the power of the echoes of reflectors, within a main lobe around each direction."""
+    raw = np.zeros_like(out)
+    raw.reshape(-1)[pixel] = np.max(gain * reflectivity[cell], axis=0, initial=0)
+    _highest(raw, lobe, out)
+
+
+def share_echoes(
+    predicted: Real,
+    total: Real,
+    same_pixel: Turns,
+    same_hypothesis: Turns,
+    power: Real,
+    part: Real,
+    confirmed: Real,
+    number: int,
+    suppression: np.float32,
+    least_confirmed: np.float32,
+    out: Real,
+) -> None:
+    """Compute the share of each pixel's power that belongs to one hypothesis."""
+    alone = predicted[number]
+    rivals = total - alone
+    np.subtract.at(rivals, same_pixel, predicted[same_hypothesis, same_pixel])
+    np.maximum(rivals, 0, out=rivals)  # Differences of rounding may be negative.
+    out[:] = (1 - suppression * rivals / (power + _TINY)).clip(0, 1)
+    if len(confirmed):
+        is_confirmed = confirmed > least_confirmed * (power + _TINY)
+        np.maximum(out, is_confirmed * (alone / (alone + rivals + _TINY)) ** 3, out=out)
+    out *= part
+
+
+def gather_evidence(
+    first: Turns,
+    second: Turns,
+    between: Real,
+    step: Turns,
+    gain: Real,
+    weight: Real,
+    highest: Real,
+    floor: Real,
+    out: Real,
+) -> None:
+    """Gather the floor, the highest power and the weight of the echoes of a pair."""
+    out[0] = floor[step]
+    out[1] = _between(highest, first, second, between)
+    out[2] = weight * (gain / out[0]) ** 2
+
+
+def add_echoes(
+    cell: Turns,
+    first: Turns,
+    second: Turns,
+    between: Real,
+    weight: Real,
+    lifted: Real,
+    power: Real,
+    share: Real,
+    is_foreign: bool,  # noqa: FBT001  as in the contract
+    out: Real,
+) -> None:
+    """Add the weighted reflectivities that a pair shows, and the weights."""
+    if len(share):
+        power = power * share
+        if is_foreign:
+            weight = weight * _between(share, first, second, between)
+    out[0, cell] += weight * _between(power, first, second, between) / lifted
+    out[1, cell] += weight
+
+
+def limit_cells(cell: Turns, is_used: Truths, gain: Real, evidence: Real, margin: np.float32, out: Real) -> None:
+    """Limit cells to the reflectivity that a pair shows."""
+    shown = (margin * (evidence[1] + evidence[0]) / gain)[is_used]
+    out[cell[is_used]] = np.minimum(out[cell[is_used]], shown)
+
+
+def confirm_cells(
+    cell: Turns,
+    is_used: Truths,
+    gain: Real,
+    evidence: Real,
+    reflectivity: Real,
+    visible: np.float32,
+    skipped: int,
+    out: Real,
+) -> None:
+    """Limit cells to the reflectivity that a pair confirms, where its echo must be visible."""
+    sees = is_used & (gain * reflectivity[cell] > visible * evidence[0])
+    for row in range(len(out)):
+        if row != skipped:
+            out[row, cell[sees]] = np.minimum(out[row, cell[sees]], evidence[1, sees] / gain[sees])
+
+
+def compare_echoes(
+    cell: Turns,
+    is_used: Truths,
+    gain: Real,
+    evidence: Real,
+    reflectivity: Real,
+    visible: np.float32,
+    strong: np.float32,
+    out: NDArray[np.float64],
+) -> None:
+    """Add the reflectivity that a pair shows, and the expected one, over the cells with visible echoes."""
+    expected = reflectivity[cell]
+    sees = is_used & (expected > strong) & (gain * expected > visible * evidence[0])
+    out[0] += np.minimum(evidence[1, sees] / gain[sees], expected[sees]).sum(dtype=np.float64)
+    out[1] += expected[sees].sum(dtype=np.float64)
+
+
+def _highest(values: NDArray[Any], near: Turns, out: NDArray[Any]) -> None:
+    out[:] = values[near[:, 0]]
+    for column in near.T[1:]:
+        np.maximum(out, values[column], out=out)
+
+
+def _between(values: NDArray[Any], first: Turns, second: Turns, between: Real) -> NDArray[Any]:
+    """Return values between two pixels: (entry,)."""
+    low = values[first]
+    return np.asarray(low + between * (values[second] - low))
+
+
+KERNELS = FusionKernels(
+    coarsen_image=coarsen_image,
+    spread_cells=spread_cells,
+    predict_echoes=predict_echoes,
+    share_echoes=share_echoes,
+    gather_evidence=gather_evidence,
+    add_echoes=add_echoes,
+    limit_cells=limit_cells,
+    confirm_cells=confirm_cells,
+    compare_echoes=compare_echoes,
+)

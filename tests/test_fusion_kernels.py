@@ -1,0 +1,133 @@
+"""Compiled kernels of fusion against NumPy in double precision."""
+
+import dataclasses
+import functools
+
+import numpy as np
+import pytest
+
+import ertis_numba as ertis
+from ertis_numba import kernels
+from ertis_numba.errors import DeviceError
+from ertis_numba.kernels import _dispatch, _numpy_fusion
+from ertis_numba.kernels._contract.fusion import FusionKernels
+from tests.test_fusion import images, mountings
+
+N_DIRECTIONS, N_STEPS, N_RANGES, N_ENTRIES = 12, 31, 90, 200
+N_PIXELS = N_DIRECTIONS * N_STEPS
+CELLS = 1, 20, 25
+N_CELLS = 500
+NAMES = [field.name for field in dataclasses.fields(FusionKernels)]
+
+
+@functools.cache
+def arguments(seed=3):
+    """Arguments of each kernel except the outputs, and the shapes and first values of the outputs."""
+    draws = np.random.default_rng(seed)
+
+    def real(*shape):
+        return (draws.random(shape) + 0.01).astype(np.float32)
+
+    def places(count, below):
+        return draws.permutation(below)[:count].astype(np.uint32)
+
+    def some(*shape, below):
+        return draws.integers(0, below, shape).astype(np.uint32)
+
+    near = np.concatenate([np.arange(N_DIRECTIONS)[:, None], some(N_DIRECTIONS, 3, below=N_DIRECTIONS)], axis=1)
+    near = near.astype(np.uint32)
+    first = np.r_[0, 0, np.sort(draws.permutation(np.arange(1, N_RANGES))[: N_STEPS - 2]), N_RANGES].astype(np.uint32)
+    truths = draws.random(N_ENTRIES) < 0.7
+    cell, pixel = places(N_ENTRIES, N_CELLS), places(N_ENTRIES, N_PIXELS)
+    pixels = some(N_ENTRIES, below=N_PIXELS), some(N_ENTRIES, below=N_PIXELS), real(N_ENTRIES)
+    seen = cell, truths, real(N_ENTRIES), real(3, N_ENTRIES)
+    predicted = real(4, N_PIXELS)
+    image = N_DIRECTIONS, N_STEPS
+    half, one = np.float32(0.5), np.float32(1.2)
+    return {
+        "coarsen_image": (
+            (real(N_DIRECTIONS, N_RANGES), first, draws.random(N_STEPS) < 0.2, near, np.float32(0.3), np.float32(0.2)),
+            [(N_STEPS,), image, image],
+        ),
+        "spread_cells": ((real(*CELLS), 2), [CELLS]),
+        "predict_echoes": (
+            (pixel, some(3, N_ENTRIES, below=N_CELLS), real(3, N_ENTRIES), real(N_CELLS), near),
+            [image],
+        ),
+        "share_echoes": (
+            (
+                predicted,
+                predicted.sum(axis=0),
+                pixel,
+                np.full(N_ENTRIES, 2, np.uint32),
+                8 * real(N_PIXELS),
+                real(N_PIXELS),
+                4 * real(N_PIXELS),
+                1,
+                one,
+                half,
+            ),
+            [(N_PIXELS,)],
+        ),
+        "gather_evidence": (
+            (*pixels, some(N_ENTRIES, below=N_STEPS), real(N_ENTRIES), real(N_ENTRIES), real(N_PIXELS), real(N_STEPS)),
+            [(3, N_ENTRIES)],
+        ),
+        "add_echoes": (
+            (cell, *pixels, real(N_ENTRIES), real(N_ENTRIES), real(N_PIXELS), real(N_PIXELS), True),
+            [(2, N_CELLS)],
+        ),
+        "limit_cells": ((*seen, half), [(N_CELLS,)]),
+        "confirm_cells": ((*seen, real(N_CELLS), half, 1), [(3, N_CELLS)]),
+        "compare_echoes": ((*seen, real(N_CELLS), half, half), [(2,)]),
+    }
+
+
+def outputs(kernel_set, name, change=lambda values: values, dtype=np.float32):
+    """Results of a kernel, with changed arguments of type float32."""
+    given, shapes = arguments()[name]
+    found = [np.ones(shape, np.float64 if name == "compare_echoes" else dtype) for shape in shapes]
+    getattr(kernel_set, name)(*map(change, given), *found)
+    return found
+
+
+def doubled(values):
+    return values.astype(np.float64) if getattr(values, "dtype", None) == np.float32 else values
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_fusion_kernels_equal_numpy_in_double_precision(name):
+    found = outputs(kernels.load_fusion(), name)
+    wanted = outputs(_numpy_fusion.KERNELS, name, doubled, np.float64)
+    for one, other in zip(found, wanted, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-6)
+        assert np.ptp(other) > 0
+
+
+@pytest.mark.parametrize("name", ["share_echoes", "add_echoes"])
+def test_fusion_kernels_accept_unknown_shares_and_confirmations(name):
+    place = {"share_echoes": 6, "add_echoes": 7}[name]
+    given, shapes = arguments()[name]
+    given = (*given[:place], np.empty(0, np.float32), *given[place + 1 :])
+    found = []
+    for each in (kernels.load_fusion(), _numpy_fusion.KERNELS):
+        found.append(np.ones(shapes[0], np.float32))
+        getattr(each, name)(*given, found[-1])
+    np.testing.assert_allclose(*found, rtol=1e-5, atol=1e-6)
+
+
+def test_fusion_without_compiled_kernels_gives_the_same_image(monkeypatch):
+    def refuse(device="auto"):
+        raise DeviceError(f"device {device!r} cannot be set up")
+
+    compiled = ertis.fuse(images().values(), mountings())
+    monkeypatch.setattr(_dispatch, "load", refuse)
+    kernels.load_fusion.cache_clear()
+    try:
+        plain = ertis.fuse(images().values(), mountings())
+        assert kernels.load_fusion() is _numpy_fusion.KERNELS
+    finally:
+        kernels.load_fusion.cache_clear()
+    highest = plain.image.amplitude.max()
+    np.testing.assert_allclose(compiled.image.amplitude, plain.image.amplitude, rtol=1e-4, atol=1e-4 * highest)
+    np.testing.assert_allclose(compiled.points.position_m, plain.points.position_m, atol=1e-4)
