@@ -81,6 +81,12 @@ def test_import_poses_shifts_the_clock_of_the_trajectory(recording, trajectory, 
         assert np.array_equal(a.trajectory.position_m, b.trajectory.position_m)
 
 
+@pytest.mark.parametrize(("offset_s", "remedy"), [("nan", "give a finite number"), ("1e30", "give a number from -4e")])
+def test_import_poses_refuses_offsets_of_no_clock(recording, trajectory, offset_s, remedy):
+    done = run("import-poses", recording, trajectory, "--offset-s", offset_s, code=2)
+    assert done.stderr.startswith(f"ertis: error: --offset-s is {float(offset_s):g}; {remedy}")
+
+
 def test_import_poses_reports_both_spans_and_changes_nothing(recording, tmp_path):
     before = recording.read_bytes()
     late = write_text(tmp_path / "late.tum", drive(), offset_s=100)

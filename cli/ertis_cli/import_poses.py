@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 __all__ = ["import_poses"]
 
 _NS_PER_S = 1e9
-_MAX_OFFSET_S = 1e9
+_MAX_OFFSET_S = 4e9  # Covers clocks that count from another year; times remain within 64 bits.
 
 
 @click.command("import-poses")
@@ -22,7 +22,7 @@ _MAX_OFFSET_S = 1e9
 @click.option(
     "--offset-s",
     "offset_s",
-    type=click.FloatRange(-_MAX_OFFSET_S, _MAX_OFFSET_S),
+    type=float,
     default=0.0,
     show_default=True,
     metavar="S",
@@ -57,10 +57,11 @@ def import_poses(
     interpolated at the times of the measurements of all sensors, and must cover them. A folder stands for its
     recordings (*.h5). A recording is replaced only when the new one is complete.
     """
-    from ertis_numba import read_trajectory
+    from ertis_numba import checks, read_trajectory
     from ertis_numba.atomic_files import make_folder
     from ertis_numba.storage import add_poses, check_target, recorded_trajectory, require_fitting_poses
 
+    checks.between("offset_s", offset_s, -_MAX_OFFSET_S, _MAX_OFFSET_S)
     given = read_trajectory(trajectory_file, topic=topic)
     shifted: Trajectory = given.replace(time_ns=given.time_ns + round(offset_s * _NS_PER_S))
     recordings = _recordings(path)
