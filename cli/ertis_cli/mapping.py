@@ -94,7 +94,7 @@ def mapping(
     quiet: bool,
     as_json: bool,
 ) -> None:
-    """Compute an occupancy map from recordings and the poses of the platform.
+    """Compute an occupancy map from recordings and poses.
 
     All sensors of the recordings belong to one platform. Their measurements are grouped by SYNC pulse and fused, as by
     'ertis process --fuse'. Cells with echoes become occupied, and cells in front of the first clear echo of a direction
