@@ -9,7 +9,7 @@ from click.testing import CliRunner
 from ertis_cli.main import cli
 
 import ertis_numba as ertis
-from ertis_numba.analysis.noise import noise_of, threshold_of
+from ertis_numba.analysis.noise import medians_of, noise_of, threshold_of
 from ertis_numba.simulation import Point
 from ertis_numba.simulation.render import Simulator
 from tests.hard_cases.forced import EIGHT
@@ -77,6 +77,13 @@ def test_find_peaks_with_false_alarm_rejects_noise_only():
     assert [round(peak.range_m, 2) for peak in peaks] == [0.5, 0.7]
     assert peaks[0].level_dbfs == pytest.approx(20 * np.log10(shown.amplitude.max()), abs=1)
     assert peaks[1].level_dbfs - peaks[0].level_dbfs == pytest.approx(peaks[1].level_db)
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 100])
+def test_medians_equal_those_of_numpy(count):
+    rows = np.random.default_rng(count).rayleigh(size=(9, count)).astype(np.float32)
+    rows[3, 0] = np.nan
+    np.testing.assert_array_equal(medians_of(rows), np.median(rows, axis=1))
 
 
 def test_noise_of_image_is_its_root_mean_square():

@@ -17,7 +17,20 @@ N_DIRECTIONS, N_STEPS, N_RANGES, N_ENTRIES = 12, 31, 90, 200
 N_PIXELS = N_DIRECTIONS * N_STEPS
 CELLS = 1, 20, 25
 N_CELLS = 500
+DOUBLE = "compare_echoes", "locate_reflector"
 NAMES = [field.name for field in dataclasses.fields(FusionKernels)]
+
+
+def echoes(draws, count=5):
+    """Emitters, receivers, paths, axes and deviations of the echoes of a reflector at (1.1, 0.9, 1.0)."""
+    emitter_m, receiver_m = draws.normal(scale=0.2, size=(2, count, 3))
+    to_m = np.array([1.1, 0.9, 1.0]) - receiver_m
+    range_m = np.linalg.norm(to_m, axis=1)
+    path_m = range_m + np.linalg.norm(np.array([1.1, 0.9, 1.0]) - emitter_m, axis=1)
+    path_m += [0.0, 0.001, -0.001, 0.0, 0.05]  # The last echo is an outlier.
+    axes = np.stack([np.linalg.qr(np.column_stack([each, np.eye(3)[:, :2]]))[0].T for each in to_m])
+    deviation = np.tile([0.002, 0.005], (count, 1))
+    return emitter_m, receiver_m, path_m, axes, deviation
 
 
 @functools.cache
@@ -80,13 +93,14 @@ def arguments(seed=3):
         "limit_cells": ((*seen, half), [(N_CELLS,)]),
         "confirm_cells": ((*seen, real(N_CELLS), half, 1), [(3, N_CELLS)]),
         "compare_echoes": ((*seen, real(N_CELLS), half, half), [(2,)]),
+        "locate_reflector": ((*echoes(draws), 0.01, 0.05, 2.0, 8), [(3,), (3, 3)]),
     }
 
 
 def outputs(kernel_set, name, change=lambda values: values, dtype=np.float32):
     """Results of a kernel, with changed arguments of type float32."""
     given, shapes = arguments()[name]
-    found = [np.ones(shape, np.float64 if name == "compare_echoes" else dtype) for shape in shapes]
+    found = [np.ones(shape, np.float64 if name in DOUBLE else dtype) for shape in shapes]
     getattr(kernel_set, name)(*map(change, given), *found)
     return found
 
@@ -114,6 +128,11 @@ def test_fusion_kernels_accept_unknown_shares_and_confirmations(name):
         found.append(np.ones(shapes[0], np.float32))
         getattr(each, name)(*given, found[-1])
     np.testing.assert_allclose(*found, rtol=1e-5, atol=1e-6)
+
+
+def test_located_reflector_ignores_an_outlier():
+    (position_m, _) = outputs(kernels.load_fusion(), "locate_reflector")
+    np.testing.assert_allclose(position_m, [1.1, 0.9, 1.0], atol=0.004)
 
 
 def test_fusion_without_compiled_kernels_gives_the_same_image(monkeypatch):

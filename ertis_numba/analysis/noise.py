@@ -3,11 +3,12 @@
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ertis_numba import checks
 from ertis_numba.frames import Energyscape
 
-__all__ = ["noise_of", "threshold_of"]
+__all__ = ["medians_of", "noise_of", "threshold_of"]
 
 _ROUNDING = 10 ** (-140 / 20)  # For one-bit microphones: their noise is at least 40 dB above, arithmetic 10 dB below.
 _SAMPLE = 32_768  # Number of bins from which the noise is estimated, with an accuracy of 1 %.
@@ -25,9 +26,40 @@ def noise_of(image: Energyscape) -> float:
     if processing.is_adaptive or processing.is_cleaned or not image.amplitude.size:
         return 0.0
     some = image.amplitude[:: max(1, image.amplitude.size // _SAMPLE)]
-    blocks = np.array_split(some, min(_BLOCKS, some.shape[1]), axis=1)
-    level = float(np.quantile([np.median(block) for block in blocks], _QUIET))
+    level = float(np.quantile(_medians_of_blocks(some, min(_BLOCKS, some.shape[1])), _QUIET))
     return level / math.sqrt(math.log(2))
+
+
+def medians_of(rows: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the median of each row; NaN for rows with NaN.
+
+    `numpy.median` takes nine times as long, because it partitions at several places, without vector instructions.
+
+    Parameters
+    ----------
+    rows : (row, sample) float32
+        At least one sample.
+    """
+    half = rows.shape[1] // 2
+    sorted_half = np.partition(rows, half, axis=1)
+    median = sorted_half[:, half]
+    if rows.shape[1] % 2 == 0:
+        median = (sorted_half[:, :half].max(axis=1) + median) / 2
+    return np.where(np.isnan(sorted_half[:, half:].max(axis=1)), np.float32(np.nan), median)
+
+
+def _medians_of_blocks(amplitude: NDArray[np.float32], n_blocks: int) -> NDArray[np.float32]:
+    """Return the median of each block of ranges, of which the first ones may be longer by one: (block,) float32."""
+    width, n_longer = divmod(amplitude.shape[1], n_blocks)
+    split = n_longer * (width + 1)
+    parts = (amplitude[:, :split], width + 1), (amplitude[:, split:], width)
+    return np.concatenate(
+        [
+            medians_of(part.reshape(len(part), -1, columns).swapaxes(0, 1).reshape(-1, len(part) * columns))
+            for part, columns in parts
+            if part.size
+        ]
+    )
 
 
 def threshold_of(image: Energyscape, false_alarm: float) -> float:

@@ -8,6 +8,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba import kernels
 from ertis_numba.analysis.points import PointExtractor
 from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.fusion.attribution import Shares
@@ -33,7 +34,7 @@ _OUTLIER: Final = 2.0  # Residual, in standard deviations, that has half of the 
 _NEAREST_M: Final = 0.05
 _VERTICAL: Final = 1e-6
 # Between emitter and receiver, the path does not depend on the position, which may then be anywhere within 10 m.
-_LEAST_INFORMATION: Final = np.eye(3) / 10.0**2
+_LEAST_INFORMATION_1_M2: Final = 1 / 10.0**2
 
 
 class Observation(NamedTuple):
@@ -61,17 +62,6 @@ class Observation(NamedTuple):
     angle_sd_rad: float
     position_m: Floats
     amplitude: float
-
-    def rows(self, position_m: Floats, poses: Sequence[MountedSensor]) -> tuple[Floats, Floats]:
-        """Return residuals and their derivatives, in standard deviations: (row,) and (row, axis) float64."""
-        away_m, back_m = (position_m - poses[number].translation_m for number in (self.emitter, self.receiver))
-        from_m, to_m = (max(_NEAREST_M, float(np.linalg.norm(each))) for each in (away_m, back_m))
-        across = _tangents(self.direction)
-        residual = np.append(
-            (self.path_m - from_m - to_m) / self.path_sd_m, -(across @ back_m) / to_m / self.angle_sd_rad
-        )
-        slopes = np.vstack([(away_m / from_m + back_m / to_m) / self.path_sd_m, across / to_m / self.angle_sd_rad])
-        return residual, slopes
 
 
 class PointFuser:
@@ -161,12 +151,14 @@ def joined(
     grid : PolarGrid
         Cells of the fused image.
     """
-    located = [_located(cluster, poses) for cluster in _clusters(sorted(observations, key=_order), poses)]
-    position_m = np.array([place for place, _ in located]).reshape(-1, 3)
+    reflectors = _Reflectors(sorted(observations, key=_order), poses)
+    position_m = reflectors.position_m
     cell = grid.cell_of(position_m)
     amplitude = np.where(cell >= 0, _around(image.amplitude).reshape(-1).take(cell.clip(0)), np.float32(0))
     order = np.argsort(-amplitude, kind="stable")
-    uncertainty_m = np.array([_along_and_across(place, covariance) for place, covariance in located]).reshape(-1, 2)
+    uncertainty_m = np.array(
+        [_along_and_across(*each) for each in zip(position_m, reflectors.covariance_m2, strict=True)]
+    ).reshape(-1, 2)
     return PointCloud(
         position_m[order].astype(np.float32),
         amplitude[order],
@@ -183,54 +175,85 @@ def _order(seen: Observation) -> tuple[bool, float]:
     return seen.emitter != seen.receiver, -seen.amplitude
 
 
-def _clusters(observations: Sequence[Observation], poses: Sequence[MountedSensor]) -> list[list[Observation]]:
-    """Return the observations of each reflector.
+class _Reflectors:
+    """Reflectors that cause observations, each at the position that fits all of its echoes best.
 
     An echo of a foreign call alone has two explanations, and nothing confirms this one, so it is left out.
+
+    Parameters
+    ----------
+    observations : sequence of Observation
+        Own echoes first, each kind from the strongest one.
+    poses : sequence of MountedSensor
+
+    Attributes
+    ----------
+    position_m : (reflector, axis) float64
+    covariance_m2 : (reflector, axis, axis) float64
     """
-    found: list[list[Observation]] = []
-    means: list[tuple[Floats, Floats]] = []
-    for each in observations:
-        covariance = _covariance(each, poses)
-        best, least = -1, _GATE
-        for number, (mean, spread) in enumerate(means):
-            offset = each.position_m - mean
-            distance = float(offset @ np.linalg.solve(covariance + spread + _SAME_M**2 * np.eye(3), offset))
-            if distance < least:
-                best, least = number, distance
-        pairs = [(other.emitter, other.receiver) for other in found[best]] if best >= 0 else []
-        if (each.emitter, each.receiver) in pairs:
-            continue  # A pair sees a reflector once; this is a shoulder of the same echo.
-        if best < 0 and each.emitter == each.receiver:
-            found.append([each])
-            means.append((each.position_m, covariance))
-        elif best >= 0:
-            found[best].append(each)
-            means[best] = _located(found[best], poses)
-    return found
 
+    def __init__(self, observations: Sequence[Observation], poses: Sequence[MountedSensor]) -> None:
+        self._locate = kernels.load_fusion().locate_reflector
+        self._emitter_m = np.array([poses[each.emitter].translation_m for each in observations]).reshape(-1, 3)
+        self._receiver_m = np.array([poses[each.receiver].translation_m for each in observations]).reshape(-1, 3)
+        self._path_m = np.array([each.path_m for each in observations])
+        self._axes = np.array([[each.direction, *_tangents(each.direction)] for each in observations])
+        self._deviation = np.array([(each.path_sd_m, each.angle_sd_rad) for each in observations])
+        self._place_m = np.array([each.position_m for each in observations]).reshape(-1, 3)
+        self._members: list[list[int]] = []
+        self._pairs: list[set[tuple[int, int]]] = []
+        self._mean_m, self._spread_m2 = np.empty_like(self._place_m), np.empty((len(observations), 3, 3))
+        for index, each in enumerate(observations):
+            self._add(index, (each.emitter, each.receiver))
+        self.position_m, self.covariance_m2 = (
+            values[: len(self._members)] for values in (self._mean_m, self._spread_m2)
+        )
 
-def _located(cluster: Sequence[Observation], poses: Sequence[MountedSensor]) -> tuple[Floats, Floats]:
-    """Return the position of a reflector and its covariance: (axis,) and (axis, axis) float64.
+    def _add(self, index: int, pair: tuple[int, int]) -> None:
+        """Add an observation to the nearest reflector, or to none, or let it be a new one."""
+        position_m, covariance_m2 = self._located([index])
+        nearest = self._nearest(position_m, covariance_m2)
+        if nearest is None:
+            if pair[0] == pair[1]:
+                self._mean_m[len(self._members)], self._spread_m2[len(self._members)] = position_m, covariance_m2
+                self._members.append([index])
+                self._pairs.append({pair})
+        elif pair not in self._pairs[nearest]:  # A pair sees a reflector once; another echo is a shoulder of the first.
+            self._members[nearest].append(index)
+            self._pairs[nearest].add(pair)
+            self._mean_m[nearest], self._spread_m2[nearest] = self._located(self._members[nearest])
 
-    Least squares with the weights of a Cauchy distribution (P. J. Huber, E. M. Ronchetti, Robust Statistics, 2009).
-    """
-    position_m = np.median([each.position_m for each in cluster], axis=0)
-    covariance = _covariance(cluster[0], poses)
-    for _ in range(_ROUNDS if len(cluster) > 1 else 0):
-        rows = [each.rows(position_m, poses) for each in cluster]
-        residual = np.concatenate([row for row, _ in rows])
-        slopes = np.concatenate([slope for _, slope in rows])
-        # Echoes that overlap at one sensor shift its direction or range by far more than noise does.
-        weighted = slopes / (1 + (residual / _OUTLIER) ** 2)[:, None]
-        covariance = np.linalg.inv(weighted.T @ slopes + _LEAST_INFORMATION)
-        position_m = position_m + covariance @ weighted.T @ residual
-    return position_m, covariance
+    def _nearest(self, position_m: Floats, covariance_m2: Floats) -> int | None:
+        """Return the reflector with the least Mahalanobis distance, or None if all are too far away."""
+        count = len(self._members)
+        if not count:
+            return None
+        offset_m = position_m - self._mean_m[:count]
+        spread_m2 = self._spread_m2[:count] + covariance_m2 + _SAME_M**2 * np.eye(3)
+        distance = np.einsum("ri,ri->r", offset_m, np.linalg.solve(spread_m2, offset_m[..., None])[..., 0])
+        nearest = int(np.argmin(distance))
+        return nearest if distance[nearest] < _GATE else None
 
-
-def _covariance(seen: Observation, poses: Sequence[MountedSensor]) -> Floats:
-    _, slopes = seen.rows(seen.position_m, poses)
-    return np.asarray(np.linalg.inv(slopes.T @ slopes + _LEAST_INFORMATION))
+    def _located(self, members: list[int]) -> tuple[Floats, Floats]:
+        """Return the position of a reflector and its covariance: (axis,) and (axis, axis) float64."""
+        places_m = np.sort(self._place_m[members], axis=0)
+        median_m = (places_m[(len(members) - 1) // 2] + places_m[len(members) // 2]) / 2
+        position_m, covariance_m2 = median_m.copy(), np.empty((3, 3))
+        is_alone = len(members) == 1
+        self._locate(
+            self._emitter_m[members],
+            self._receiver_m[members],
+            self._path_m[members],
+            self._axes[members],
+            self._deviation[members],
+            _LEAST_INFORMATION_1_M2,
+            _NEAREST_M,
+            math.inf if is_alone else _OUTLIER,
+            1 if is_alone else _ROUNDS,
+            position_m,
+            covariance_m2,
+        )
+        return median_m if is_alone else position_m, covariance_m2
 
 
 def _tangents(direction: Floats) -> Floats:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import kernels
+from ertis_numba.analysis.noise import medians_of
 from ertis_numba.frames import Energyscape
 from ertis_numba.fusion.polar_grid import close_directions
 from ertis_numba.fusion.rig import MountedSensor
@@ -111,7 +112,7 @@ class Receiver:
             Steps at which direct sound hides echoes.
         """
         amplitude = np.ascontiguousarray(image.amplitude, dtype=np.float32)
-        noise = float(np.median(amplitude[:, ::_THINNED])) ** 2 / math.log(2)
+        noise = float(medians_of(amplitude[:, ::_THINNED].reshape(1, -1))[0]) ** 2 / math.log(2)
         least = np.float32(max(_NOISE_FACTOR * noise, _LEAST_POWER))
         shape = len(self.directions), self.n_steps
         power, highest = np.empty(shape, np.float32), np.empty(shape, np.float32)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.kernels._contract.arrays import Real, Turns
-from ertis_numba.kernels._contract.fusion import FusionKernels, Truths
+from ertis_numba.kernels._contract.fusion import Doubles, FusionKernels, Truths
 
 __all__ = ["KERNELS"]
 
@@ -149,13 +149,40 @@ def compare_echoes(
     reflectivity: Real,
     visible: np.float32,
     strong: np.float32,
-    out: NDArray[np.float64],
+    out: Doubles,
 ) -> None:
     """Add the reflectivity that a pair shows, and the expected one, over the cells with visible echoes."""
     expected = reflectivity[cell]
     sees = is_used & (expected > strong) & (gain * expected > visible * evidence[0])
     out[0] += np.minimum(evidence[1, sees] / gain[sees], expected[sees]).sum(dtype=np.float64)
     out[1] += expected[sees].sum(dtype=np.float64)
+
+
+def locate_reflector(
+    emitter_m: Doubles,
+    receiver_m: Doubles,
+    path_m: Doubles,
+    axes: Doubles,
+    deviation: Doubles,
+    information: float,
+    nearest_m: float,
+    outlier: float,
+    n_rounds: int,
+    position_m: Doubles,
+    out: Doubles,
+) -> None:
+    """Locate a reflector by the paths and directions of its echoes."""
+    for _ in range(n_rounds):
+        away_m, back_m = position_m - emitter_m, position_m - receiver_m
+        from_m, to_m = (np.maximum(nearest_m, np.linalg.norm(each, axis=1))[:, None] for each in (away_m, back_m))
+        along = (away_m / from_m + back_m / to_m) / deviation[:, :1]
+        across = axes[:, 1:] / (to_m * deviation[:, 1:])[:, None]
+        slopes = np.concatenate([along, across.reshape(-1, 3)])
+        late = (path_m[:, None] - from_m - to_m) / deviation[:, :1]
+        residual = np.concatenate([late[:, 0], -np.einsum("eti,ei->et", across, back_m).ravel()])
+        weighted = slopes / (1 + (residual / outlier) ** 2)[:, None]
+        out[:] = np.linalg.inv(weighted.T @ slopes + information * np.eye(3))
+        position_m += out @ weighted.T @ residual
 
 
 def _highest(values: NDArray[Any], near: Turns, out: NDArray[Any]) -> None:
@@ -180,4 +207,5 @@ KERNELS = FusionKernels(
     limit_cells=limit_cells,
     confirm_cells=confirm_cells,
     compare_echoes=compare_echoes,
+    locate_reflector=locate_reflector,
 )

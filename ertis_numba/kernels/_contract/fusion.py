@@ -15,6 +15,7 @@ from ertis_numba.kernels._contract.arrays import Real, Turns
 __all__ = ["FusionKernels"]
 
 Truths = NDArray[np.bool_]
+Doubles = NDArray[np.float64]
 
 
 class CoarsenImage(Protocol):
@@ -264,7 +265,52 @@ class CompareEchoes(Protocol):
         reflectivity: Real,
         visible: np.float32,
         strong: np.float32,
-        out: NDArray[np.float64],
+        out: Doubles,
+    ) -> None: ...
+
+
+class LocateReflector(Protocol):
+    """Locate a reflector by the paths and directions of its echoes.
+
+    Least squares with the weights of a Cauchy distribution (P. J. Huber, E. M. Ronchetti, Robust Statistics, 2009),
+    because echoes that overlap at one sensor shift its direction or range by far more than noise does.
+
+    Parameters
+    ----------
+    emitter_m, receiver_m : (echo, axis) float64
+    path_m : (echo,) float64
+        Path of the sound.
+    axes : (echo, 3, axis) float64
+        Direction from the receiver, and two unit vectors across.
+    deviation : (echo, 2) float64
+        Standard deviations of the path in metres and of the direction in radians.
+    information : float
+        Information about each coordinate in 1/m² that is known beforehand.
+    nearest_m : float
+        Least distance from emitters and receivers.
+    outlier : float
+        Residual, in standard deviations, that has half of the weight; infinite for plain least squares.
+    n_rounds : int
+        Iterations; at least 1.
+    position_m : (axis,) float64
+        Position, from a first estimate.
+    out : (axis, axis) float64
+        Covariance at the position of the last iteration but one.
+    """
+
+    def __call__(
+        self,
+        emitter_m: Doubles,
+        receiver_m: Doubles,
+        path_m: Doubles,
+        axes: Doubles,
+        deviation: Doubles,
+        information: float,
+        nearest_m: float,
+        outlier: float,
+        n_rounds: int,
+        position_m: Doubles,
+        out: Doubles,
     ) -> None: ...
 
 
@@ -281,3 +327,4 @@ class FusionKernels:
     limit_cells: LimitCells
     confirm_cells: ConfirmCells
     compare_echoes: CompareEchoes
+    locate_reflector: LocateReflector

@@ -161,6 +161,69 @@ def compare_echoes(cell, is_used, gain, evidence, reflectivity, visible, strong,
             out[1] += expected
 
 
+@njit(nogil=True, cache=True, error_model="numpy")
+def locate_reflector(
+    emitter_m, receiver_m, path_m, axes, deviation, information, nearest_m, outlier, n_rounds, position_m, out
+):
+    """Locate a reflector by the paths and directions of its echoes."""
+    normal, right = np.empty((3, 3)), np.empty(3)
+    for _ in range(n_rounds):
+        normal[:] = 0.0
+        right[:] = 0.0
+        for i in range(3):
+            normal[i, i] = information
+        for echo in range(len(path_m)):
+            away_m, back_m = position_m - emitter_m[echo], position_m - receiver_m[echo]
+            from_m, to_m = max(nearest_m, _length(away_m)), max(nearest_m, _length(back_m))
+            late = (path_m[echo] - from_m - to_m) / deviation[echo, 0]
+            _add_equation((away_m / from_m + back_m / to_m) / deviation[echo, 0], late, outlier, normal, right)
+            for axis in range(1, 3):
+                across = axes[echo, axis] / (to_m * deviation[echo, 1])
+                _add_equation(across, -_product(across, back_m), outlier, normal, right)
+        _invert(normal, out)
+        for i in range(3):
+            position_m[i] += _product(out[i], right)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _add_equation(row, residual, outlier, normal, right):
+    """Add an equation to the normal equations, with less weight for larger residuals."""
+    weight = 1.0 / (1.0 + (residual / outlier) ** 2)
+    for i in range(3):
+        right[i] += weight * row[i] * residual
+        for j in range(3):
+            normal[i, j] += weight * row[i] * row[j]
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _product(one, other):
+    return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _length(vector):
+    return np.sqrt(_product(vector, vector))
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _invert(a, out):
+    """Invert a symmetric positive definite matrix by its Cholesky factor, whose errors are small."""
+    l00 = np.sqrt(a[0, 0])
+    l10, l20 = a[1, 0] / l00, a[2, 0] / l00
+    l11 = np.sqrt(a[1, 1] - l10 * l10)
+    l21 = (a[2, 1] - l20 * l10) / l11
+    l22 = np.sqrt(a[2, 2] - l20 * l20 - l21 * l21)
+    i00, i11, i22 = 1.0 / l00, 1.0 / l11, 1.0 / l22
+    i10, i21 = -l10 * i00 * i11, -l21 * i11 * i22
+    i20 = -(l20 * i00 + l21 * i10) * i22
+    out[0, 0] = i00 * i00 + i10 * i10 + i20 * i20
+    out[1, 1] = i11 * i11 + i21 * i21
+    out[2, 2] = i22 * i22
+    out[0, 1] = out[1, 0] = i10 * i11 + i20 * i21
+    out[0, 2] = out[2, 0] = i20 * i22
+    out[1, 2] = out[2, 1] = i21 * i22
+
+
 KERNELS = FusionKernels(
     coarsen_image=coarsen_image,
     spread_cells=spread_cells,
@@ -171,4 +234,5 @@ KERNELS = FusionKernels(
     limit_cells=limit_cells,
     confirm_cells=confirm_cells,
     compare_echoes=compare_echoes,
+    locate_reflector=locate_reflector,
 )
