@@ -44,6 +44,7 @@ from .frames import (
 from .fusion import Fused as Fused, Fuser as Fuser, fuse as fuse
 from .geometry import layout_names as layout_names, load_layout as load_layout
 from .interop import (
+    Drive as Drive,
     export as export,
     open_pcm as open_pcm,
     open_raw as open_raw,

@@ -15,7 +15,7 @@ import ertis_numba as ertis
 from ertis_numba.analysis.point_finder import PointFinder
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement, Stamp
-from ertis_numba.interop import FORMATS, TOPICS, choose_format, export, output_files
+from ertis_numba.interop import FORMATS, TOPICS, Drive, choose_format, export, output_files
 from ertis_numba.settings import Air
 from ertis_numba.storage import write_energyscapes, write_recording
 from tests.files import SMALL, image, noise
@@ -168,7 +168,20 @@ def test_invalid_export_prints_one_line_and_writes_nothing(files, monkeypatch, n
     assert {path: path.stat().st_mtime_ns for path in files.iterdir()} == before
 
 
-GIVEN = {"mounting": MOUNTED, "topics": TOPICS, "top": 5, "min_level_db": -9.0, "text": True}
+DRIVE = Drive(
+    poses=ertis.Trajectory([0, 2 * 10**18], [[0, 0, 0], [1, 0, 0]], [[0, 0, 0, 1]] * 2),
+    odometry=ertis.Trajectory([0, 2 * 10**18], [[0, 0, 0], [1, 0, 0]], [[0, 0, 0, 1]] * 2),
+)
+
+
+def valid(kind):
+    """Return the items and the options that an export of this format needs."""
+    if kind == "batslam":
+        return noise(count=2), {"drive": DRIVE}
+    return ([noise(count=1)[0]] if kind == "acoular" else [image()]), {}
+
+
+GIVEN = {"drive": DRIVE, "mounting": MOUNTED, "topics": TOPICS, "top": 5, "min_level_db": -9.0, "text": True}
 
 
 @pytest.mark.parametrize("option", GIVEN)
@@ -176,12 +189,12 @@ GIVEN = {"mounting": MOUNTED, "topics": TOPICS, "top": 5, "min_level_db": -9.0, 
 def test_export_accepts_only_options_of_the_format(tmp_path, kind, option):
     """Options that a format lacks are rejected rather than ignored."""
     target = tmp_path / f"a{FORMATS[kind].suffix}"
-    items = [noise(count=1)[0]] if kind == "acoular" else [image()]
+    items, needed = valid(kind)
     if option in FORMATS[kind].options:
-        export(target, items, **{option: GIVEN[option]})
+        export(target, items, **needed | {option: GIVEN[option]})
         return
     with pytest.raises(ArgumentError, match=f"option {option!r} is given, but format {kind!r} does not have it; leave"):
-        export(target, items, **{option: GIVEN[option]})
+        export(target, items, **needed | {option: GIVEN[option]})
     assert list(tmp_path.iterdir()) == []
 
 
@@ -191,12 +204,14 @@ def test_failed_export_keeps_the_existing_file(tmp_path, kind):
     for path in (target, *others):
         path.write_text("mine")
 
+    items, needed = valid(kind)
+
     def broken():
-        yield from [noise(count=1)[0]] if kind == "acoular" else [image(), image(seed=2)]
+        yield from items if kind in {"acoular", "batslam"} else [image(), image(seed=2)]
         raise DataError("the source broke off; copy it again")
 
     with pytest.raises(DataError, match="broke off"):
-        export(target, broken(), overwrite=True)
+        export(target, broken(), overwrite=True, **needed)
     assert {path.read_text() for path in tmp_path.iterdir()} == {"mine"}
     assert len(list(tmp_path.iterdir())) == 1 + len(others)
 
@@ -210,7 +225,7 @@ def test_export_writers_raise_on_a_full_disk(tmp_path, kind):
         def open(self, *arguments, **options):
             return Path("/dev/full").open(*arguments, **options)
 
-    from ertis_numba.interop import _mcap, _npz, _point_files, _points  # noqa: PLC0415  loads optional libraries
+    from ertis_numba.interop import _batslam, _mcap, _npz, _point_files, _points  # noqa: PLC0415  loads optional libraries
 
     part = Full(tmp_path / "a.part")
     find = PointFinder(top=256, min_level_db=-60.0)
@@ -218,6 +233,7 @@ def test_export_writers_raise_on_a_full_disk(tmp_path, kind):
     table = _points.PointTable.from_images(images, find, {})
     write = {
         "mcap": lambda: _mcap.write_mcap(part, images, find, {}, topics=TOPICS),
+        "batslam": lambda: _batslam.write_batslam(part, noise(count=2), DRIVE, {}),
         "npz": lambda: _npz.write_npz(Path("/dev/full"), images, None),
         "csv": lambda: _point_files.write_csv(part, table),
         "ply": lambda: _point_files.write_ply(part, table, text=True),

@@ -36,6 +36,8 @@ RUN_BY = {
     ("accuracy", "$"): ["test_guide::test_commands_of_the_guide_run"],
     ("applications", "$"): ["test_applications_page::test_application_commands_of_the_page_run"],
     ("applications", "python"): ["test_applications_page::test_application_loop_of_the_page_runs"],
+    ("batslam-format", "$"): ["test_batslam::test_commands_and_code_of_the_format_page_run"],
+    ("batslam-format", "python"): ["test_batslam::test_commands_and_code_of_the_format_page_run"],
     ("beamformers", "$"): ["test_guide::test_commands_of_the_guide_run"],
     ("calibrate", "$"): ["test_calibrate_command::test_commands_and_code_of_the_page_run"],
     ("calibrate", "python"): ["test_calibrate_command::test_commands_and_code_of_the_page_run"],

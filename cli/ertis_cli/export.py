@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ertis_cli import _export_poses, _mountings, options
+from ertis_cli import _export_drive, _export_poses, _mountings, options
 from ertis_cli._config import typed
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = ["export"]
 
-FORMATS = ("mcap", "ply", "pcd", "csv", "npz", "acoular")
+FORMATS = ("mcap", "ply", "pcd", "csv", "npz", "acoular", "batslam")
 FORMATS_OF_POSES = ("tum",)
 TOPICS = ("points", "scan", "image", "sonar_image")
 
@@ -36,7 +36,7 @@ class _Places(click.ParamType):  # type: ignore[type-arg]  # generic since click
 
 
 @click.command()
-@options.input_file("REC.h5|IMG.h5")
+@click.argument("paths", metavar="REC.h5|IMG.h5...", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option(
     "--output",
     "-o",
@@ -44,7 +44,7 @@ class _Places(click.ParamType):  # type: ignore[type-arg]  # generic since click
     type=click.Path(path_type=Path),
     metavar="OUT",
     required=True,
-    help="File to write: .mcap, .ply, .pcd, .csv, .npz, .tum, or .h5 for Acoular, with an .xml beside it.",
+    help="File to write: .mcap, .ply, .pcd, .csv, .npz, .tum, .mat for BatSLAM, or .h5 and .xml for Acoular.",
 )
 @click.option(
     "--format",
@@ -78,12 +78,13 @@ class _Places(click.ParamType):  # type: ignore[type-arg]  # generic since click
 )
 @_mountings.mounting
 @click.option("--ascii", "text", is_flag=True, help="Write PLY and PCD as text.")
+@_export_drive.drive_options
 @options.force
 @options.quiet
 @options.as_json
 def export(
     *,
-    path: Path,
+    paths: tuple[Path, ...],
     target: Path,
     file_format: str | None,
     sensor: str | None,
@@ -96,35 +97,41 @@ def export(
     force: bool,
     quiet: bool,
     as_json: bool,
+    **drive: Any,
 ) -> None:
     """Export images or signals for other programs.
 
     MCAP contains ROS 2 messages. PLY, PCD and CSV contain the points of images, and NPZ the images of one sensor. The
     files for Acoular contain the microphone signals of one measurement. TUM files contain the poses of a recording.
-    Except for Acoular and TUM, a recording is first processed with its own settings.
+    BatSLAM 2.0 reads the echoes at two virtual ears, true poses and odometry; several recordings then belong to one
+    platform. Except for Acoular, TUM and BatSLAM, a recording is first processed with its own settings.
     """
     if _export_poses.is_chosen(target, file_format):
-        _export_poses.export_poses(path, target, sensor, force=force, quiet=quiet, as_json=as_json)
+        _export_drive.require_fitting("tum", paths)
+        _export_poses.export_poses(paths[0], target, sensor, force=force, quiet=quiet, as_json=as_json)
         return
     from ertis_numba import interop
-    from ertis_numba.storage import check_target, file_kind, open_energyscapes, open_recording
+    from ertis_numba.storage import check_target, file_kind
 
     name = interop.choose_format(target, file_format)
     for file in interop.output_files(target, name):
-        check_target(file, overwrite=force, sources=[path])
+        check_target(file, overwrite=force, sources=paths)
+    _export_drive.require_fitting(name, paths)
+    given = {"topics": topics or None, "top": top, "min_level_db": min_level_db, "text": text}
+    fitting = interop.FORMATS[name].options
+    chosen: dict[str, Any] = {key: value for key, value in given.items() if key in fitting or typed(key)}
+    if "mounting" not in fitting and mounting is not None:
+        raise click.UsageError(
+            f"--mounting is for formats with points, not for {name}; remove it", click.get_current_context()
+        )
     with ExitStack() as stack:
-        recorded = name == "acoular" or file_kind(path) == "recording"
-        open_file: Callable[..., Any] = open_recording if recorded else open_energyscapes
-        readers = [stack.enter_context(open_file(path, sensor=each)) for each in options.sensors_of(path, sensor)]
-        fitting = interop.FORMATS[name].options
-        given = {"topics": topics or None, "top": top, "min_level_db": min_level_db, "text": text}
-        chosen: dict[str, Any] = {key: value for key, value in given.items() if key in fitting or typed(key)}
-        known = _known(readers, mounting) if "mounting" in fitting else None
-        if known is None and mounting is not None:
-            raise click.UsageError(
-                f"--mounting is for formats with points, not for {name}; remove it", click.get_current_context()
-            )
-        items = _Items(readers, places, process=recorded and name != "acoular", quiet=quiet)
+        every, readers = _readers(name, paths, sensor, stack)
+        known = _known(every, mounting) if "mounting" in fitting else None
+        is_image = name not in {"acoular", "batslam"}
+        items = _Items(readers, places, process=is_image and file_kind(paths[0]) == "recording", quiet=quiet)
+        if name == "batslam":
+            (ears,), (indices,) = readers, items.indices
+            chosen["drive"] = _export_drive.drive_of(every, ears, indices, known or {}, **drive, quiet=quiet)
         written = interop.export(
             target,
             items,
@@ -149,6 +156,23 @@ def export(
                 "measurements": len(items),
             }
         )
+
+
+def _readers(
+    name: str, paths: tuple[Path, ...], sensor: str | None, stack: ExitStack
+) -> "tuple[Sequence[Any], Sequence[Any]]":
+    """Open files; return the readers of all sensors of the platform, and of those to export."""
+    from ertis_numba.storage import file_kind, open_energyscapes, open_recording
+
+    if name == "batslam":
+        every, ears = _export_drive.open_ears(paths, sensor, stack)
+        return every, [ears]
+    path = paths[0]
+    open_file: Callable[..., Any] = (
+        open_recording if name == "acoular" or file_kind(path) == "recording" else open_energyscapes
+    )
+    readers = [stack.enter_context(open_file(path, sensor=each)) for each in options.sensors_of(path, sensor)]
+    return readers, readers
 
 
 def _known(
@@ -177,6 +201,11 @@ class _Items:
     ) -> None:
         self._chosen = [(reader, _between(places, len(reader))) for reader in readers]
         self._process, self._quiet = process, quiet
+
+    @property
+    def indices(self) -> tuple[range, ...]:
+        """Indices of the chosen measurements of each sensor."""
+        return tuple(chosen for _, chosen in self._chosen)
 
     def __len__(self) -> int:
         return sum(len(chosen) for _, chosen in self._chosen)

@@ -10,15 +10,13 @@ import click
 from ertis_cli import _mountings, _presets, _pulses, _results, options
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from ertis_cli._mountings import Mounting
     from ertis_cli._pulses import StampedIndex
     from ertis_numba.motion import Odometry
     from ertis_numba.settings import Settings
     from ertis_numba.storage import RecordingReader
-
-    _Group = dict[str, StampedIndex]
 
 __all__ = ["odometry", "odometry_of"]
 
@@ -83,8 +81,9 @@ def odometry(
 
     with ExitStack() as stack:
         readers = _pulses.open_sensors(paths, stack)
+        mountings = _pulses.mountings_of(readers, _mountings.mountings(mounting, None))
         pipelines = _pulses.PipelinesBySensor(changed, stack, quiet=quiet, device=device, threads=threads, plan=plan)
-        found = odometry_of(readers, pipelines, mounting=_mountings.mountings(mounting, None), quiet=quiet)
+        found = odometry_of(readers, list(_pulses.pulse_groups(readers)), pipelines, mountings, quiet=quiet)
     write_tum(file, found.trajectory, overwrite=force)
     measured = sum(pose.is_measured for pose in found.poses[1:]) / (len(found.poses) - 1)
     duration_s = (found.poses[-1].timestamp_ns - found.poses[0].timestamp_ns) / _NS_PER_S
@@ -104,35 +103,35 @@ def odometry(
 
 def odometry_of(
     readers: "Sequence[RecordingReader]",
+    groups: "Sequence[Mapping[str, StampedIndex]]",
     pipelines: "_pulses.PipelinesBySensor",
+    mountings: "Mapping[str, Mounting]",
     *,
-    mounting: "dict[str, Mounting] | None",
     quiet: bool,
 ) -> "Odometry":
-    """Return the odometry of all pulses of recordings.
+    """Return the odometry of pulses, under a progress bar.
 
     Parameters
     ----------
     readers : sequence of RecordingReader
         Recordings of all sensors of the platform.
+    groups : sequence of mapping of str to StampedIndex
+        Measurements of each pulse, by sensor.
     pipelines : PipelinesBySensor
-    mounting : mapping of str to Mounting, or None
-        Mountings by sensor instead of those of the recordings.
+    mountings : mapping of str to Mounting
+        Mountings of all sensors.
     quiet : bool
 
     Raises
     ------
-    ArgumentError
-        A mounting is unknown.
     DataError
         Clocks of the recordings cannot be used, or no motion could be measured.
     """
     from ertis_numba.errors import DataError
     from ertis_numba.motion import Odometry
 
-    found = Odometry(_pulses.mountings_of(readers, mounting))
-    groups = list(_pulses.pulse_groups(readers))
     _require_times(readers, groups)
+    found = Odometry(mountings)
     by_name = {reader.sensor: reader for reader in readers}
     with options.progress(groups, length=len(groups), label="odometry", quiet=quiet) as shown:
         for group in shown:
@@ -149,7 +148,7 @@ def odometry_of(
     return found
 
 
-def _require_times(readers: "Sequence[RecordingReader]", groups: "Sequence[_Group]") -> None:
+def _require_times(readers: "Sequence[RecordingReader]", groups: "Sequence[Mapping[str, StampedIndex]]") -> None:
     """Raise DataError if the times of pulses do not increase, or if sensors share no pulse."""
     from ertis_numba.errors import DataError
 

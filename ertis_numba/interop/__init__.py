@@ -1,5 +1,6 @@
 """Readers and writers of foreign formats."""
 
+from ertis_numba.interop._drive import Drive
 from ertis_numba.interop._export import FORMATS, TOPICS, choose_format, export, output_files
 from ertis_numba.interop._map_files import MAP_SUFFIXES, map_files, write_map
 from ertis_numba.interop.pcm import PcmReader, open_pcm
@@ -11,6 +12,7 @@ __all__ = [
     "FORMATS",
     "MAP_SUFFIXES",
     "TOPICS",
+    "Drive",
     "PcmReader",
     "RawReader",
     "choose_format",

@@ -11,6 +11,7 @@ from ertis_numba import checks
 from ertis_numba.atomic_files import atomic_write, check_target, remedy
 from ertis_numba.errors import ArgumentError, DataError, ErtisError
 from ertis_numba.frames import Beams, Energyscape, Measurement, MicrophoneSignals
+from ertis_numba.interop._drive import Drive
 from ertis_numba.interop._mountings import Mountings, validated
 
 __all__ = ["FORMATS", "TOPICS", "ExportFormat", "choose_format", "export", "output_files"]
@@ -66,6 +67,14 @@ FORMATS: Final = {
         ),
     ),
     "acoular": ExportFormat(suffix=".h5", fields=("time_data", "metadata")),
+    "batslam": ExportFormat(
+        suffix=".mat",
+        fields=(
+            *("gt_pose", "gt_delta", "odom_delta", "t", "lap"),
+            *("echo_left", "echo_right", "echo_scale", "meta", "reflectors"),
+        ),
+        options=("mounting", "drive"),
+    ),
 }
 """Formats by name; the how-to guide on exports states the content of each."""
 
@@ -112,9 +121,10 @@ def export(
     top: int | None = None,
     min_level_db: float | None = None,
     text: bool = False,
+    drive: Drive | None = None,
     overwrite: bool = False,
 ) -> tuple[Path, ...]:
-    """Write energyscapes, or the signals of a measurement, for other programs.
+    """Write energyscapes, or the signals of measurements, for other programs.
 
     A file appears complete, or not at all. ``docs/how-to/export.md`` describes the formats and their fields.
 
@@ -123,15 +133,17 @@ def export(
     path : str or Path
         Path of the file.
     items : iterable of Energyscape, of Measurement, or of Beams or MicrophoneSignals
-        One measurement for ``acoular``, otherwise energyscapes. ``npz`` can also contain beams, or microphone signals:
-        demodulated ones if that is the last stage of their settings, and matched-filtered ones otherwise. All formats
-        except ``npz`` can contain several sensors. ``mcap`` is written one image at a time, and so is ``npz`` if
-        ``items`` has a length. Other formats collect all points first.
-    file_format : {"mcap", "ply", "pcd", "csv", "npz", "acoular"}, optional
+        One measurement for ``acoular``, measurements of one sensor for ``batslam``, otherwise energyscapes. ``npz`` can
+        also contain beams, or microphone signals: demodulated ones if that is the last stage of their settings, and
+        matched-filtered ones otherwise; it holds one sensor. Other formats can contain several sensors. ``mcap`` is
+        written one image at a time, and so is ``npz`` if ``items`` has a length. Other formats collect all points or
+        signals first.
+    file_format : {"mcap", "ply", "pcd", "csv", "npz", "acoular", "batslam"}, optional
         Name of the format; by default that of the suffix of ``path``.
     mounting : mapping of str to (translation_m, rotation_xyzw), optional
         Mounting of each sensor on its platform, by name, as for `RecordingWriter`. Points of ``ply``, ``pcd`` and
-        ``csv`` are then in the platform frame, otherwise in the sensor frame.
+        ``csv`` are then in the platform frame, otherwise in the sensor frame. ``batslam`` contains the
+        poses of the sensor, not of the platform.
     topics : collection of {"points", "image", "sonar_image"}, optional
         Topics of each sensor in ``mcap``; all by default.
     top : int, optional
@@ -140,6 +152,8 @@ def export(
         Minimum level relative to the strongest point of the image; -20 dB by default.
     text : bool
         Write ``ply`` and ``pcd`` as text.
+    drive : Drive, optional
+        Poses and odometry of the platform for ``batslam``, which needs them.
     overwrite : bool
         Replace existing files.
 
@@ -151,7 +165,8 @@ def export(
     Raises
     ------
     ArgumentError
-        There is nothing to write, the format does not support the items or an option, or a file exists.
+        There is nothing to write, the format does not support the items or an option, an option is missing, or a file
+        exists.
     DataError
         The disk is full or cannot be written.
 
@@ -168,7 +183,7 @@ def export(
         raise ArgumentError(f"items is of type {type(items).__name__}; give a list of Energyscape")
     name = choose_format(path, file_format)
     finding = {"top": top, "min_level_db": min_level_db}
-    _require_options(name, {"mounting": mounting, "topics": topics, "text": text or None, **finding})
+    _require_options(name, {"mounting": mounting, "topics": topics, "text": text or None, **finding, "drive": drive})
     chosen = TOPICS if topics is None else topics
     for topic in chosen:
         checks.choice("topic", topic, TOPICS)
@@ -182,6 +197,8 @@ def export(
                 _write_signals(parts[0], parts[1], items)
             elif name == "npz":
                 _write_npz(parts[0], items)
+            elif name == "batslam":
+                _write_drive(parts[0], items, validated(mounting), drive)
             else:
                 _write_points(name, parts[0], _energyscapes(items), validated(mounting), chosen, finding, text=text)
     except OSError as error:
@@ -215,6 +232,14 @@ def _write_signals(path: Path, geometry: Path, items: Iterable[Exported]) -> Non
             f"format 'acoular' contains signals of one measurement, but {came} was given; give one (--measurement)"
         )
     write_acoular(path, geometry, several[0])
+
+
+def _write_drive(path: Path, items: Iterable[Any], mountings: Mountings, drive: Drive | None) -> None:
+    from ertis_numba.interop._batslam import write_batslam  # noqa: PLC0415
+
+    if drive is None:
+        raise ArgumentError("format 'batslam' needs poses and odometry; give drive=Drive(poses=…, odometry=…)")
+    write_batslam(path, items, drive, mountings)
 
 
 def _write_npz(path: Path, items: Iterable[Exported]) -> None:

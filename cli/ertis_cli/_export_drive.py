@@ -1,0 +1,176 @@
+"""Drives for ``ertis export --format batslam``: the sensor with virtual ears, true poses and odometry."""
+
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ertis_cli import _pulses, _results
+from ertis_cli._config import typed
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from ertis_cli._mountings import Mounting
+    from ertis_numba.frames import Trajectory
+    from ertis_numba.interop import Drive
+    from ertis_numba.settings import Settings
+    from ertis_numba.storage import RecordingReader
+
+__all__ = ["drive_of", "drive_options", "open_ears", "require_fitting"]
+
+_FILE = click.Path(path_type=Path)
+_OPTIONS = {"poses": "poses", "odometry": "odometry", "scene": "scene", "beam_azimuth_deg": "beam-azimuth"}
+_IDENTITY: "Mounting" = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+
+
+def drive_options(command: Any) -> Any:
+    """Add the options of format batslam, named like the fields of `Drive`."""
+    for option in (
+        click.option(
+            "--beam-azimuth",
+            "beam_azimuth_deg",
+            type=click.FloatRange(-90.0, 90.0),
+            default=30.0,
+            show_default=True,
+            metavar="DEG",
+            help="Azimuth of the virtual ears for BatSLAM in °, each to its own side; 0 is the front.",
+        ),
+        click.option("--scene", type=_FILE, metavar="SCENE.toml", help="Scene with the reflectors for BatSLAM."),
+        click.option(
+            "--odometry",
+            type=_FILE,
+            metavar="TRAJ",
+            help="Odometry of the platform for BatSLAM; computed from the echoes of all sensors by default.",
+        ),
+        click.option(
+            "--poses",
+            type=_FILE,
+            metavar="TRAJ",
+            help="True poses of the platform for BatSLAM, such as a TUM file; those of the recording by default.",
+        ),
+    ):
+        command = option(command)
+    return command
+
+
+def require_fitting(name: str, paths: "Sequence[Path]") -> None:
+    """Raise UsageError for options of format batslam, or several files, with another format."""
+    context = click.get_current_context()
+    if name == "batslam":
+        return
+    for option, spelling in _OPTIONS.items():
+        if typed(option):
+            raise click.UsageError(f"--{spelling} is for format batslam, not for {name}; leave it out", context)
+    if len(paths) > 1:
+        raise click.UsageError(f"format {name} holds one file, but {len(paths)} are given; give one", context)
+
+
+def open_ears(
+    paths: "Sequence[Path]", sensor: str | None, stack: ExitStack
+) -> "tuple[list[RecordingReader], RecordingReader]":
+    """Open the recordings of all sensors; return them, and that of the sensor with ears."""
+    readers = _pulses.open_sensors(paths, stack)
+    names = [reader.sensor for reader in readers]
+    if sensor is None and len(readers) > 1:
+        raise click.UsageError(
+            f"format batslam holds the echoes of one sensor, but there are {', '.join(names)}; choose one (--sensor)",
+            click.get_current_context(),
+        )
+    if sensor is not None and sensor not in names:
+        raise click.UsageError(
+            f"no recording has sensor {sensor!r}; choose one of {', '.join(names)}", click.get_current_context()
+        )
+    return readers, readers[0 if sensor is None else names.index(sensor)]
+
+
+def drive_of(
+    readers: "Sequence[RecordingReader]",
+    ears: "RecordingReader",
+    chosen: range,
+    known: "Mapping[str, Mounting]",
+    *,
+    poses: Path | None,
+    odometry: Path | None,
+    scene: Path | None,
+    beam_azimuth_deg: float,
+    quiet: bool,
+) -> "Drive":
+    """Return the poses, the odometry and the scene of a drive.
+
+    Parameters
+    ----------
+    readers : sequence of RecordingReader
+        Recordings of all sensors of the platform.
+    ears : RecordingReader
+        Recording of the sensor with ears.
+    chosen : range
+        Indices of its measurements.
+    known : mapping of str to Mounting
+        Mountings of sensors, as far as they are known.
+    poses, odometry, scene : Path or None
+        Files given as options.
+    beam_azimuth_deg : float
+    quiet : bool
+
+    Raises
+    ------
+    ArgumentError
+        There are no true poses, or a mounting is needed but unknown.
+    DataError
+        A file cannot be read, or no motion could be measured.
+    """
+    from ertis_numba import load_scene, read_trajectory
+    from ertis_numba.errors import ArgumentError
+    from ertis_numba.interop import Drive
+
+    true = ears.trajectory if poses is None else read_trajectory(poses)
+    if true is None:
+        raise ArgumentError(
+            f"{ears.path} has no poses; give true ones with --poses TRAJ, or without ground truth the output of "
+            "'ertis odometry'"
+        )
+    return Drive(
+        poses=true,
+        odometry=_measured(readers, ears, chosen, known, quiet=quiet)
+        if odometry is None
+        else read_trajectory(odometry),
+        scene=None if scene is None else load_scene(scene),
+        beam_azimuth_deg=beam_azimuth_deg,
+    )
+
+
+def _measured(
+    readers: "Sequence[RecordingReader]",
+    ears: "RecordingReader",
+    chosen: range,
+    known: "Mapping[str, Mounting]",
+    *,
+    quiet: bool,
+) -> "Trajectory":
+    """Return the odometry of all sensors at the chosen measurements of the sensor with ears."""
+    import numpy as np
+
+    from ertis_cli.odometry import odometry_of
+    from ertis_numba.frames import Trajectory
+
+    if len(readers) == 1 and ears.sensor not in known:
+        known = {ears.sensor: _IDENTITY}
+    groups = list(_pulses.pulse_groups(readers))
+    wanted = [
+        number for number, group in enumerate(groups) if ears.sensor in group and group[ears.sensor].index in chosen
+    ]
+    groups = groups[wanted[0] : wanted[-1] + 1]
+    with ExitStack() as stack:
+        pipelines = _pulses.PipelinesBySensor(_as_recorded, stack, quiet=quiet)
+        found = odometry_of(readers, groups, pipelines, _pulses.mountings_of(readers, known), quiet=quiet).trajectory
+    # Clocks of sensors may differ, so each pose gets the time of the sensor with ears.
+    indices = [number - wanted[0] for number in wanted]
+    times_ns = np.array([groups[index][ears.sensor].stamp.timestamp_ns for index in indices])
+    return Trajectory(times_ns, found.position_m[indices], found.rotation_xyzw[indices], None, source=found.source)
+
+
+def _as_recorded(settings: "Settings") -> "Settings":
+    _results.require_image(settings)
+    return settings
