@@ -14,7 +14,17 @@ from ertis_numba.simulation import Box, Electronics, Emitter, Point, Scene, Sens
 from ertis_numba.simulation.effect_plan import EffectPlan, Verdict
 from ertis_numba.simulation.effects import EFFECTS
 
-__all__ = ["Motion", "PlatformImager", "drive", "mountings", "random_hall", "random_motion", "random_room"]
+__all__ = [
+    "HALL_M",
+    "Motion",
+    "PlatformImager",
+    "drive",
+    "half_size_of_room_m",
+    "mountings",
+    "random_hall",
+    "random_motion",
+    "random_room",
+]
 
 HEIGHT_M: Final = 0.4
 _YAWS_DEG: Final = {"front": 0.0, "left": 90.0, "back": 180.0, "right": -90.0}
@@ -23,7 +33,7 @@ _MAX_SPEED_M_S: Final = 1.5
 _MAX_YAW_RATE_RAD_S: Final = math.radians(90.0)
 _WALL_SPACING_M: Final = 0.15  # Mean spacing of the scatterers of a rough wall.
 _CLEARANCE_M: Final = 0.8
-_HALL_M: Final = 16.0, 10.0
+HALL_M: Final = 16.0, 10.0
 _TO_WALL_M: Final = 2.5  # Distance of the path from the walls.
 _CORNER_M: Final = 1.0  # Radius of the path at corners, so that the platform turns at 86°/s.
 _N_POSTS: Final = 24
@@ -72,14 +82,13 @@ class Motion(NamedTuple):
         )
 
 
-def random_room(seed: int) -> tuple[tuple[Point, ...], tuple[Box, ...]]:
+def random_room(seed: int, wall_spacing_m: float = _WALL_SPACING_M) -> tuple[tuple[Point, ...], tuple[Box, ...]]:
     """Return the scatterers and boxes of a furnished room with rough walls, around the origin.
 
     Walls are rows of scatterers with random strengths. Posts and boxes stand in the room, away from its middle.
     """
-    random = np.random.default_rng([seed, 24])
-    half_x_m, half_y_m = random.uniform(2.2, 3.2), random.uniform(1.8, 2.6)
-    points = _walls(random, half_x_m, half_y_m)
+    random, half_x_m, half_y_m = _room(seed)
+    points = _walls(random, half_x_m, half_y_m, wall_spacing_m)
     for x, y in _places(random, 6, half_x_m, half_y_m):
         points.append(Point(position_m=(x, y, HEIGHT_M), strength_db=random.uniform(-12.0, -4.0)))
     boxes = tuple(
@@ -94,11 +103,21 @@ def random_room(seed: int) -> tuple[tuple[Point, ...], tuple[Box, ...]]:
     return tuple(points), boxes
 
 
-def _walls(random: np.random.Generator, half_x_m: float, half_y_m: float) -> list[Point]:
+def half_size_of_room_m(seed: int) -> tuple[float, float]:
+    """Return the distances of the walls of `random_room` from the origin, along x and y."""
+    return _room(seed)[1:]
+
+
+def _room(seed: int) -> tuple[np.random.Generator, float, float]:
+    random = np.random.default_rng([seed, 24])
+    return random, random.uniform(2.2, 3.2), random.uniform(1.8, 2.6)
+
+
+def _walls(random: np.random.Generator, half_x_m: float, half_y_m: float, spacing_m: float) -> list[Point]:
     points = []
     for is_x, side in ((True, 1), (True, -1), (False, 1), (False, -1)):
         away_m, reach_m = (half_x_m, half_y_m) if is_x else (half_y_m, half_x_m)
-        n_points = round(2 * reach_m / _WALL_SPACING_M)
+        n_points = round(2 * reach_m / spacing_m)
         along_m = random.uniform(-reach_m, reach_m, n_points)
         depth_m = side * away_m + random.normal(0.0, 0.01, n_points)
         strength_db = -14.0 + 20 * np.log10(random.rayleigh(0.8, n_points))
@@ -116,11 +135,11 @@ def _places(random: np.random.Generator, count: int, half_x_m: float, half_y_m: 
     return found
 
 
-def random_hall(seed: int) -> tuple[tuple[Point, ...], tuple[Box, ...]]:
+def random_hall(seed: int, wall_spacing_m: float = _WALL_SPACING_M) -> tuple[tuple[Point, ...], tuple[Box, ...]]:
     """Return the scatterers of a hall of 16 m by 10 m with rough walls and posts, around the origin."""
     random = np.random.default_rng([seed, 26])
-    half_x_m, half_y_m = _HALL_M[0] / 2, _HALL_M[1] / 2
-    points = _walls(random, half_x_m, half_y_m)
+    half_x_m, half_y_m = HALL_M[0] / 2, HALL_M[1] / 2
+    points = _walls(random, half_x_m, half_y_m, wall_spacing_m)
     for _ in range(_N_POSTS):
         # Posts stand on both sides of the path, which is 2.5 m from the walls.
         x, y = random.uniform(-half_x_m, half_x_m), random.uniform(-half_y_m, half_y_m)
@@ -141,7 +160,7 @@ def drive(length_m: float, time_s: float, *, speed_m_s: float = 1.5) -> list[Mot
     speed_m_s : float, default 1.5
         Speed along the path.
     """
-    half_x_m, half_y_m = _HALL_M[0] / 2 - _TO_WALL_M, _HALL_M[1] / 2 - _TO_WALL_M
+    half_x_m, half_y_m = HALL_M[0] / 2 - _TO_WALL_M, HALL_M[1] / 2 - _TO_WALL_M
     motion = Motion(0.0, -half_y_m, 0.0, speed_m_s, 0.0, 0.0)
     corner_s = _CORNER_M * math.pi / 2 / speed_m_s
     straights_s = [2 * (half_m - _CORNER_M) / speed_m_s for half_m in (half_y_m, half_x_m, half_y_m, half_x_m)]

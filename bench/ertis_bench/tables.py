@@ -14,6 +14,7 @@ from ertis_bench.fusion import form as fusion
 from ertis_bench.gpu_tables import gpu, gpu_short
 from ertis_bench.health_trials.table import health
 from ertis_bench.machine import sentence
+from ertis_bench.mapping import form as mapping
 from ertis_bench.markdown import table as _table
 from ertis_bench.motion import form as motion
 from ertis_bench.network.latency import latency
@@ -37,6 +38,7 @@ __all__ = [
     "health",
     "latency",
     "many",
+    "mapping",
     "motion",
     "network",
     "paper",
@@ -310,5 +312,6 @@ FORMS: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
     "calibration": {"calibration": calibration},
     "fusion": {"fusion": fusion},
     "motion": {"motion": motion},
+    "map": {"map": mapping},
 }
 """Forms of the table of each command, by the name in the markers. The markers of a file select the form."""

@@ -288,6 +288,31 @@ def motion(**given: Any) -> None:
     _run("motion", benchmark, **given)
 
 
+@bench.command("map")
+@click.option("--count", type=click.IntRange(min=0), default=3, show_default=True, metavar="N", help="Rooms.")
+@click.option(
+    "--poses", type=click.IntRange(min=1), default=40, show_default=True, metavar="N", help="Poses in each room."
+)
+@click.option(
+    "--length",
+    "length_m",
+    type=click.FloatRange(0.0, 500.0),
+    default=44.0,
+    show_default=True,
+    metavar="M",
+    help="Length of the path through a hall; 0 leaves out the hall.",
+)
+@_seed("Seed of the first room, and of the hall.", default=1)
+@_update
+@options.quiet
+@options.as_json
+def mapping(**given: Any) -> None:
+    """Measure errors of occupancy maps."""
+    from ertis_bench import mapping as benchmark
+
+    _run("map", benchmark, **given)
+
+
 @bench.command()
 @_count(30)
 @_update

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Energyscape, OccupancyMap, PointCloud, Trajectory
-from ertis_numba.fusion import Fuser
+from ertis_numba.fusion import Fused, Fuser
 from ertis_numba.fusion.fuser import EMITTER_DIAMETER_M
 from ertis_numba.fusion.rig import Mountings, sensor_poses
 from ertis_numba.geometry import mounting
@@ -95,7 +95,7 @@ class Mapper:
         log_odds, origin_m = self._grid.used()
         return OccupancyMap(log_odds, origin_m, self._cell_m, self._n_groups, self._time_ns)
 
-    def add(self, images: Iterable[Energyscape], pose: Pose) -> None:
+    def add(self, images: Iterable[Energyscape], pose: Pose, *, fused: Fused | None = None) -> None:
         """Add the images of one SYNC pulse.
 
         Parameters
@@ -105,6 +105,8 @@ class Mapper:
         pose : (translation_m, rotation_xyzw) or Trajectory
             Pose of the platform in the world frame: position x, y, z in metres, and the unit quaternion x, y, z, w that
             rotates the platform frame into the world frame. A trajectory is interpolated at the time of the pulse.
+        fused : Fused, optional
+            Result of a `Fuser` with the same mountings for these images, if it is available; computed by default.
 
         Raises
         ------
@@ -115,7 +117,7 @@ class Mapper:
             The images are not from the same pulse, or with a half-life, their time is before that of earlier ones.
         """
         group = tuple(checks.items("images", images, Energyscape, "Pipeline.process returns"))
-        fused = self._fuser(group)
+        fused = self._fuser(group) if fused is None else fused
         time_ns = fused.image.stamp.timestamp_ns
         translation_m, rotation = _pose(pose, time_ns)
         coverage = self._coverage(group)

@@ -18,19 +18,20 @@ Singles = NDArray[np.float32]
 
 N_AZIMUTHS: Final = 360
 """Directions for free space, of 1°."""
-_OCCUPIED: Final = 1.6  # Log-odds of a cell that certainly contains a clear echo.
-_FREE: Final = 0.4  # Log-odds of a cell in front of the first clear echo, near the platform.
+_OCCUPIED: Final = 1.4  # Log-odds of a cell that certainly contains a clear echo.
+_FREE: Final = 0.6  # Log-odds of a cell in front of the first clear echo, near the platform.
 _FREE_M: Final = 1.0  # Free range in directions without any clear echo.
-_IN_FRONT_M: Final = 0.08  # Space in front of an echo that is not free yet.
+_IN_FRONT_M: Final = 0.05  # Space in front of an echo that is not free yet.
 _BEHIND_M: Final = 0.3  # Distance behind the first clear echo of a direction from which others are doubtful.
+_WALL: Final = 1.5  # Log-odds from which a cell hides those behind it.
 _BEHIND: Final = 0.1  # Weight of doubtful echoes, which may have travelled over several reflectors.
-_CLEAR: Final = 0.35  # Amplitude of a clear echo, relative to the usual one of the place.
+_CLEAR: Final = 0.6  # Weight of a clear echo.
 _HALF_BEAM: Final = 5  # Directions beside an echo in which it may hide others.
-_USUAL: Final = 70.0  # Percentile of the amplitudes of a pulse that is the usual one.
+_USUAL: Final = 50.0  # Percentile of the amplitudes of a pulse that is the usual one.
 _SMOOTHING: Final = 0.1  # Weight of a new pulse in the usual amplitude.
 # Errors of positions that noise does not explain: overlapping echoes of rough walls, mountings and poses.
 _RANGE_SD_M: Final = 0.01
-_ANGLE_SD_RAD: Final = math.radians(0.7)
+_ANGLE_SD_RAD: Final = math.radians(0.5)
 _REACH_SD: Final = 3.0  # Standard deviations within which an echo counts.
 _TOUCHED: Final = 0.02  # Probability of an echo in a cell from which the cell is not free.
 _WEAKEST_DB: Final = -15.0  # Emitted power, relative to ahead, below which silence shows nothing.
@@ -46,7 +47,7 @@ class LocatedEchoes(NamedTuple):
     sd_m : (point, 2) float64
         Standard deviations along and across the direction.
     strength : (point,) float64
-        Amplitude relative to the usual one, at most 1.
+        Weight, at most 1, which grows with the amplitude.
     """
 
     azimuth_rad: Floats
@@ -62,12 +63,15 @@ class UsualAmplitude:
         self._usual: float | None = None
 
     def strength(self, amplitude: Singles) -> Floats:
-        """Return amplitudes of the points of a pulse relative to the usual one, at most 1: (point,) float64."""
+        """Return the weight of the points of a pulse: (point,) float64, 1 from the usual amplitude.
+
+        It is the square root of the relative amplitude: weak points are more often ghosts, but also parts of walls.
+        """
         if not len(amplitude):
             return np.zeros(0)
         now = float(np.percentile(amplitude, _USUAL))
         self._usual = now if self._usual is None else (1 - _SMOOTHING) * self._usual + _SMOOTHING * now
-        return np.minimum(1.0, amplitude.astype(np.float64) / max(self._usual, 1e-30))
+        return np.sqrt(np.minimum(1.0, amplitude.astype(np.float64) / max(self._usual, 1e-30)))
 
 
 def echoes_of(offset_m: Floats, uncertainty_m: Floats, strength: Floats) -> LocatedEchoes:
@@ -160,9 +164,10 @@ def add_evidence(
     near_m : float
         Radius of the platform, whose own place is free.
     """
-    first_m = _first_clear_m(echoes)
-    occupied = _occupied(window, place_m, heading_rad, echoes, first_m)
-    free = _free(window, place_m, heading_rad, first_m, coverage, near_m=near_m)
+    first_m, wall_m = _first_clear_m(echoes), _wall_m(window, place_m, heading_rad, coverage)
+    occupied = _occupied(window, place_m, heading_rad, echoes, np.minimum(first_m, wall_m))
+    end_m = np.where(np.isfinite(first_m), first_m - _IN_FRONT_M, _FREE_M)
+    free = _free(window, place_m, heading_rad, np.minimum(end_m, wall_m), coverage, near_m=near_m)
     free[occupied > _TOUCHED] = 0.0
     window.log_odds[:] += _OCCUPIED * occupied - _FREE * free
 
@@ -182,13 +187,30 @@ def _first_clear_m(echoes: LocatedEchoes) -> Floats:
     return first_m
 
 
+def _wall_m(window: Window, place_m: Floats, heading_rad: float, coverage: Coverage) -> Floats:
+    """Return the range behind the first cell that earlier pulses have found occupied: (azimuth,) float64."""
+    n_rows, n_columns = window.log_odds.shape
+    cell_m = float(window.x_m[1] - window.x_m[0])
+    range_m = (np.arange(coverage.weight.shape[1]) + 0.5) * coverage.step_m
+    azimuth_rad = (np.arange(N_AZIMUTHS) + 0.5) * (2 * math.pi / N_AZIMUTHS) + heading_rad
+    row, column = (
+        np.rint((place_m[axis] - centre_m[0] + unit[:, None] * range_m) / cell_m).astype(np.int64).clip(0, count - 1)
+        for axis, centre_m, unit, count in (
+            (1, window.y_m, np.sin(azimuth_rad), n_rows),
+            (0, window.x_m, np.cos(azimuth_rad), n_columns),
+        )
+    )
+    is_wall = window.log_odds[row, column] > _WALL
+    first_m = range_m[is_wall.argmax(axis=1)] + cell_m
+    return np.asarray(np.where(is_wall.any(axis=1), first_m, np.inf))
+
+
 def _free(
-    window: Window, place_m: Floats, heading_rad: float, first_m: Floats, coverage: Coverage, *, near_m: float
+    window: Window, place_m: Floats, heading_rad: float, end_m: Floats, coverage: Coverage, *, near_m: float
 ) -> Singles:
     """Return the weight of free space in each cell: (row, column) float32, 0 to 1."""
     n_ranges = coverage.weight.shape[1]
     range_m = (np.arange(n_ranges) + 0.5) * coverage.step_m
-    end_m = np.where(np.isfinite(first_m), first_m - _IN_FRONT_M, _FREE_M)
     polar = np.where(range_m < end_m[:, None], coverage.weight, 0.0).astype(np.float32)
     dx_m, dy_m = (window.x_m - place_m[0])[None, :], (window.y_m - place_m[1])[:, None]
     distance_m = np.hypot(dx_m, dy_m)
@@ -202,10 +224,10 @@ def _occupied(window: Window, place_m: Floats, heading_rad: float, echoes: Locat
     """Return the expected number of echoes in each cell: (row, column) float32."""
     occupied = window._replace(log_odds=np.zeros_like(window.log_odds))
     cell_m = float(window.x_m[1] - window.x_m[0])
-    behind = echoes.range_m > first_m[_direction(echoes.azimuth_rad)] + _BEHIND_M
-    weight = echoes.strength * np.where(behind, _BEHIND, 1.0)
     azimuth_rad = echoes.azimuth_rad + heading_rad
     unit = np.stack([np.cos(azimuth_rad), np.sin(azimuth_rad)], axis=1)
+    behind = echoes.range_m > first_m[_direction(echoes.azimuth_rad)] + _BEHIND_M
+    weight = echoes.strength * np.where(behind, _BEHIND, 1.0)
     centre_m = place_m + unit * echoes.range_m[:, None]
     variance_m2 = echoes.sd_m**2 + cell_m**2 / 12
     reach_m = _REACH_SD * echoes.sd_m.max(axis=1, initial=0.0) + cell_m

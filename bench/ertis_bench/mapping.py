@@ -1,0 +1,240 @@
+"""Share of walls that occupancy maps show, and of occupied cells that show nothing, in rooms and in a hall.
+
+Images are simulated through PDM, and poses are exact. Nothing is timed except the maps themselves.
+"""
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+import ertis_numba as ertis
+from ertis_bench import machine
+from ertis_bench.furnished_rooms import (
+    HALL_M,
+    Motion,
+    PlatformImager,
+    drive,
+    half_size_of_room_m,
+    mountings,
+    random_hall,
+    random_room,
+)
+from ertis_bench.machine import sentence
+from ertis_bench.markdown import table
+from ertis_numba.frames import OccupancyMap
+from ertis_numba.simulation import Box, Point
+
+__all__ = ["MappedPlace", "form", "rated", "run"]
+
+Floats = NDArray[np.float64]
+
+_SPACING_M: Final = 0.05  # of the scatterers of walls
+_RANGE_M: Final = 4.0
+_IN_VIEW_M: Final = 3.7  # Distance of the platform up to which a sensor's image shows a wall.
+_TIME_S: Final = 0.4
+_ELLIPSE_M: Final = 1.0, 0.7  # Half axes of the path through a room.
+_ON_WALL_M: Final = 0.1  # Distance from a wall within which a scatterer belongs to it.
+_FOUND_M: Final = 0.05
+_FALSE_M: Final = 0.075
+_ROUNDING_M: Final = 1e-6
+
+
+class MappedPlace(NamedTuple):
+    """Room or hall with its true outlines.
+
+    Attributes
+    ----------
+    points : tuple of Point
+    boxes : tuple of Box
+    half_m : (x, y)
+        Distances of the walls from the origin.
+    """
+
+    points: tuple[Point, ...]
+    boxes: tuple[Box, ...]
+    half_m: tuple[float, float]
+
+    @property
+    def wall_points_m(self) -> Floats:
+        """Scatterers of the walls: (point, 2) float64."""
+        places_m = self._points_m
+        return places_m[self._from_walls_m(places_m) < _ON_WALL_M]
+
+    @property
+    def _points_m(self) -> Floats:
+        return np.array([point.position_m for point in self.points], np.float64)[:, :2]
+
+    def away_m(self, places_m: Floats) -> Floats:
+        """Return the distance of places from the nearest wall, post or outline of a box: (place,) float64."""
+        away_m = np.minimum(self._from_walls_m(places_m), KDTree(self._points_m).query(places_m)[0])
+        for box in self.boxes:
+            beyond_m = np.abs(_in_box(box, places_m)) - np.array(box.size_m[:2]) / 2
+            outside_m = np.hypot(*np.maximum(beyond_m, 0.0).T)
+            away_m = np.minimum(away_m, np.abs(outside_m + np.minimum(beyond_m.max(axis=1), 0.0)))
+        return np.asarray(away_m)
+
+    def sees(self, viewer_m: Floats, places_m: Floats) -> NDArray[np.bool_]:
+        """Return True for places near the viewer that no box hides: (place,) bool."""
+        seen = np.hypot(*(places_m - viewer_m).T) < _IN_VIEW_M
+        for box in self.boxes:
+            half_m = np.array(box.size_m[:2]) / 2
+            start, end = _in_box(box, viewer_m[None]), _in_box(box, places_m)
+            way = np.where(np.abs(end - start) < 1e-9, 1e-9, end - start)
+            entries, exits = (-half_m - start) / way, (half_m - start) / way
+            first, last = np.minimum(entries, exits).max(axis=1), np.maximum(entries, exits).min(axis=1)
+            seen &= ~((first < last) & (last > 0) & (first < 1))
+        return np.asarray(seen)
+
+    def _from_walls_m(self, places_m: Floats) -> Floats:
+        beyond_m = np.abs(places_m) - np.array(self.half_m)
+        outside_m = np.hypot(*np.maximum(beyond_m, 0.0).T)
+        return np.asarray(np.abs(outside_m + np.minimum(beyond_m.max(axis=1), 0.0)))
+
+
+def _in_box(box: Box, places_m: Floats) -> Floats:
+    """Return places in the frame of a box: (place, 2) float64."""
+    if box.position_m is None:
+        raise ValueError("a box of a place needs position_m")
+    yaw_rad = math.radians(box.yaw_deg)
+    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+    return np.asarray((places_m - np.array(box.position_m[:2])) @ np.array([[c, -s], [s, c]]))
+
+
+def rated(found: OccupancyMap, place: MappedPlace, path_m: Floats) -> dict[str, float]:
+    """Return the shares of walls that are found, and of occupied cells that are false.
+
+    Parameters
+    ----------
+    found : OccupancyMap
+    place : MappedPlace
+    path_m : (pose, 2) float64
+        Positions of the platform.
+
+    Returns
+    -------
+    dict
+        ``walls`` is the number of cells that contain scatterers of walls and were in view. ``found`` is the share of
+        them with the centre of an occupied cell within 5 cm of their own, and ``near`` that within 7.5 cm. ``false`` is
+        the share of occupied cells whose centre is more than 7.5 cm away from all walls, posts and boxes, so that no
+        part of them is within 5 cm; ``off`` is the share beyond 5 cm.
+    """
+    cells = np.unique(np.floor(place.wall_points_m / found.cell_m).astype(np.int64), axis=0)
+    walls_m = np.asarray((cells + 0.5) * found.cell_m, np.float64)
+    walls_m = walls_m[np.any([place.sees(viewer_m, walls_m) for viewer_m in path_m], axis=0)]
+    nearest_m = KDTree(found.occupied_m).query(walls_m)[0]
+    away_m = place.away_m(found.occupied_m)
+    return {
+        "walls": len(walls_m),
+        "found": float(np.mean(nearest_m < _FOUND_M + _ROUNDING_M)),
+        "near": float(np.mean(nearest_m < _FALSE_M + _ROUNDING_M)),
+        "occupied": len(away_m),
+        "false": float(np.mean(away_m > _FALSE_M)),
+        "off": float(np.mean(away_m > _FOUND_M)),
+    }
+
+
+def run(*, count: int, poses: int, length_m: float, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
+    """Map random rooms and a hall.
+
+    Parameters
+    ----------
+    count : int
+        Number of rooms.
+    poses : int
+        Number of poses in each room.
+    length_m : float
+        Length of the path through the hall; 0 leaves out the hall.
+    seed : int
+        Seed of the first room, and of the hall.
+    say : callable
+        Function that reports progress.
+    """
+    rows = []
+    for number in range(seed, seed + count):
+        place = MappedPlace(*random_room(number, _SPACING_M), half_size_of_room_m(number))
+        rows.append(_mapped(f"room {number}", place, _round(poses), number, say))
+    if length_m:
+        place = MappedPlace(*random_hall(seed, _SPACING_M), (HALL_M[0] / 2, HALL_M[1] / 2))
+        rows.append(_mapped(f"hall {seed}", place, drive(length_m, _TIME_S, speed_m_s=1.0), seed, say))
+    return {"machine": machine.describe(), "seed": seed, "length_m": length_m, "rows": rows}
+
+
+def form(report: dict[str, Any]) -> str:
+    """Return the report as Markdown."""
+    head = [
+        "place",
+        "pulses",
+        "wall cells in view",
+        "found (within 7.5 cm)",
+        "occupied cells",
+        "false (beyond 5 cm)",
+        "time",
+    ]
+    rows = [
+        [
+            row["name"],
+            str(row["pulses"]),
+            str(row["walls"]),
+            f"{row['found']:.1%} ({row['near']:.1%})",
+            str(row["occupied"]),
+            f"{row['false']:.1%} ({row['off']:.1%})",
+            f"{1e3 * row['median_s']:.0f} ms ({1e3 * row['fused_s']:.0f} ms)",
+        ]
+        for row in report["rows"]
+    ]
+    return (
+        f"{table(head, rows)}\n\nFurnished rooms and a hall of {HALL_M[0]:g} × {HALL_M[1]:g} m, with rough walls of "
+        f"scatterers {100 * _SPACING_M:g} cm apart on average, whose strengths are Rayleigh distributed. A platform "
+        "with four sensors stands at poses on an ellipse in a room, or drives at 1 m/s through the hall. Poses are "
+        "exact, and cells have 5 cm. A wall cell contains a scatterer, is at most "
+        f"{_IN_VIEW_M:g} m from a pose, and is not hidden by a box. It is found if the centre of an occupied cell is "
+        "within 5 cm of its own. An occupied cell is false if its centre is more than 7.5 cm away from all walls, "
+        "posts and boxes, so that no part of it is within 5 cm; the share beyond 5 cm is in brackets. Times are "
+        f"medians for each pulse, without and (in brackets) with fusion. {sentence(report['machine'])}"
+    )
+
+
+def _round(count: int) -> list[Motion]:
+    """Return poses on an ellipse, at rest and in the direction of the path."""
+    turns_rad = np.arange(count) * (2 * math.pi / count)
+    along_m, across_m = _ELLIPSE_M
+    return [
+        Motion(along_m * math.cos(turn), across_m * math.sin(turn), turn + math.pi / 2, 0.0, 0.0, 0.0)
+        for turn in turns_rad.tolist()
+    ]
+
+
+def _mapped(
+    name: str, place: MappedPlace, motions: Sequence[Motion], seed: int, say: Callable[[str], None]
+) -> dict[str, Any]:
+    """Return the shares and times of the map of a place."""
+    imager = PlatformImager((place.points, place.boxes), seed, max_range_m=_RANGE_M)
+    mapper, fuser = ertis.Mapper(mountings()), ertis.Fuser(mountings())
+    taken_s, fused_s = [], []
+    for number, motion in enumerate(motions):
+        images = imager(motion, number, number * _TIME_S)
+        begin_s = time.perf_counter()
+        fused = fuser(images)
+        _ = fused.points
+        after_s = time.perf_counter()
+        mapper.add(images, _pose(motion), fused=fused)
+        end_s = time.perf_counter()
+        taken_s.append(end_s - after_s)
+        fused_s.append(end_s - begin_s)
+        if number % 20 == 0:
+            say(f"{name}: pulse {number} of {len(motions)}")
+    imager.close()
+    shares = rated(mapper.map, place, np.array([[motion.x_m, motion.y_m] for motion in motions]))
+    say(f"{name}: {shares}")
+    times = {"median_s": float(np.median(taken_s)), "fused_s": float(np.median(fused_s))}
+    return {"name": name, "pulses": len(motions), **shares, **times}
+
+
+def _pose(motion: Motion) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    half_rad = motion.yaw_rad / 2
+    return (motion.x_m, motion.y_m, 0.0), (0.0, 0.0, math.sin(half_rad), math.cos(half_rad))
