@@ -50,6 +50,8 @@ def arguments(seed=3):
     near = np.concatenate([np.arange(N_DIRECTIONS)[:, None], some(N_DIRECTIONS, 3, below=N_DIRECTIONS)], axis=1)
     near = near.astype(np.uint32)
     first = np.r_[0, 0, np.sort(draws.permutation(np.arange(1, N_RANGES))[: N_STEPS - 2]), N_RANGES].astype(np.uint32)
+    count = draws.integers(0, N_STEPS, N_DIRECTIONS)
+    begin, bounds = some(N_DIRECTIONS, below=N_STEPS + 1), np.r_[0, np.cumsum(count)].astype(np.uint32)
     truths = draws.random(N_ENTRIES) < 0.7
     cell, pixel = places(N_ENTRIES, N_CELLS), places(N_ENTRIES, N_PIXELS)
     pixels = some(N_ENTRIES, below=N_PIXELS), some(N_ENTRIES, below=N_PIXELS), real(N_ENTRIES)
@@ -64,7 +66,7 @@ def arguments(seed=3):
         ),
         "spread_cells": ((real(*CELLS), 2), [CELLS]),
         "predict_echoes": (
-            (pixel, some(3, N_ENTRIES, below=N_CELLS), real(3, N_ENTRIES), real(N_CELLS), near),
+            (begin, bounds, some(bounds[-1], below=N_CELLS), real(bounds[-1]), real(N_CELLS), near),
             [image],
         ),
         "share_echoes": (

@@ -223,7 +223,7 @@ class Attribution:
         power = image.power.reshape(-1)
         predicted = np.empty((len(hypotheses), *image.power.shape), dtype=np.float32)
         for each, out in zip(hypotheses, predicted, strict=True):
-            self._kernels.predict_echoes(each.pixel, each.part_cell, each.part_gain, around, lobe, out)
+            self._kernels.predict_echoes(each.begin, each.bounds, each.half_cell, each.half_gain, around, lobe, out)
         predicted = predicted.reshape(len(hypotheses), len(power))
         total = predicted.sum(axis=0)
         found = {}

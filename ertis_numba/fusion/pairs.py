@@ -24,8 +24,6 @@ _CONFIRM_DB: Final = -13.0
 _CONFIRM_COSINE: Final = math.cos(math.radians(80.0))
 _APART_STEPS: Final = 6.0  # Difference of paths that separates two echoes, and a margin for errors of directions.
 _NEAREST_M: Final = 0.05
-# A pixel covers paths of one step. Where emitter and receiver face each other, they lead to cells far apart.
-_PARTS_OF_STEP: Final = (-0.5, 0.0, 0.5)
 _AUDIBLE: Final = 10 ** (-25.0 / 10)  # Radiated power that causes audible echoes.
 
 
@@ -75,12 +73,14 @@ class Hypothesis(NamedTuple):
     emitter : int
     is_mirrored : bool
         True for reflectors behind a flat array, which the array cannot distinguish from those in front.
-    pixel : (entry,) uint32
-        Pixels with possible echoes.
-    part_cell : (part, entry) uint32
-        Cells that the parts of a step lead to.
-    part_gain : (part, entry) float32
-        Gain of echoes from there; 0 if none is possible.
+    begin : (direction,) uint32
+        First half-step of each direction at which an echo is possible.
+    bounds : (direction + 1,) uint32
+        Bounds of the entries of each direction, one for each half-step.
+    half_cell : (entry,) uint32
+        Cell that a half-step leads to.
+    half_gain : (entry,) float32
+        Gain of an echo from there; 0 if none is possible.
     cell : (pixel,) int64
         Cell of the middle of each pixel, or -1.
     place_m : (pixel, axis) float32
@@ -91,9 +91,10 @@ class Hypothesis(NamedTuple):
 
     emitter: int
     is_mirrored: bool
-    pixel: Places
-    part_cell: Places
-    part_gain: Singles
+    begin: Places
+    bounds: Places
+    half_cell: Places
+    half_gain: Singles
     cell: NDArray[np.int64]
     place_m: Singles
     gain: Singles
@@ -170,6 +171,9 @@ def hypothesis(
 ) -> Hypothesis:
     """Return the cells whose reflectors cause echoes of an emitter in the pixels of a receiver.
 
+    A pixel covers paths of one step. Where emitter and receiver face each other, its begin, middle and end lead to
+    cells far apart, so there are entries for all half-steps.
+
     Sound of path L that arrives from the direction u has met a reflector at ``s u``, where ``s + |s u − d| = L`` and d
     is the emitter, as seen from the receiver. Hence ``s = (L² − |d|²) / (2 (L − u·d))``.
 
@@ -186,30 +190,28 @@ def hypothesis(
     directions = toward @ pose.rotation.T
     offset_m = poses[emitter].translation_m - pose.translation_m
     apart_m = float(np.linalg.norm(offset_m))
-    cells: list[NDArray[np.int64]] = []
-    gains: list[Singles] = []
-    for part in _PARTS_OF_STEP:
-        path_m = 2 * (np.arange(receiver.n_steps) + 0.5 + part) * receiver.step_m - late_m
-        beyond = path_m**2 - apart_m**2
-        to_m = beyond / np.maximum(2 * (path_m - (directions @ offset_m)[:, None]), 1e-6)
-        place_m = pose.translation_m + to_m[..., None] * directions[:, None]
-        sent_m = (place_m - poses[emitter].translation_m) @ poses[emitter].rotation
-        from_m = np.linalg.norm(sent_m, axis=-1)
-        radiated = emitters.power(sent_m[..., 0] / np.maximum(from_m, _NEAREST_M))
-        cell = np.where((beyond > 0) & (to_m > _NEAREST_M), grid.cell_of(place_m), -1)
-        gain = np.where((cell >= 0) & (radiated > _AUDIBLE), radiated * emitters.spreading(from_m, to_m), 0.0)
-        cells.append(cell.reshape(-1))
-        gains.append(gain.astype(np.float32).reshape(-1))
-        if part == 0:
-            middle = cells[-1], place_m.reshape(-1, 3).astype(np.float32), gains[-1]
-    part_gain = np.stack(gains)
-    part_cell = np.where(part_gain > 0, np.stack(cells), 0).astype(np.uint32)
-    pixel = np.flatnonzero(part_gain.any(axis=0))
+    path_m = np.arange(2 * receiver.n_steps + 1) * receiver.step_m - late_m
+    beyond = path_m**2 - apart_m**2
+    to_m = beyond / np.maximum(2 * (path_m - (directions @ offset_m)[:, None]), 1e-6)
+    place_m = pose.translation_m + to_m[..., None] * directions[:, None]
+    sent_m = (place_m - poses[emitter].translation_m) @ poses[emitter].rotation
+    from_m = np.linalg.norm(sent_m, axis=-1)
+    radiated = emitters.power(sent_m[..., 0] / np.maximum(from_m, _NEAREST_M))
+    cell = np.where((beyond > 0) & (to_m > _NEAREST_M), grid.cell_of(place_m), -1)
+    is_audible = (cell >= 0) & (radiated > _AUDIBLE)
+    gain = np.where(is_audible, radiated * emitters.spreading(from_m, to_m), 0.0).astype(np.float32)
+    begin, end = is_audible.argmax(axis=1), gain.shape[1] - is_audible[:, ::-1].argmax(axis=1)
+    count = np.where(is_audible.any(axis=1), end - begin, 0)
+    half = np.arange(gain.shape[1])
+    chosen = (half >= begin[:, None]) & (half < (begin + count)[:, None])
     return Hypothesis(
         emitter,
         is_mirrored,
-        pixel.astype(np.uint32),
-        np.ascontiguousarray(part_cell[:, pixel]),
-        np.ascontiguousarray(part_gain[:, pixel]),
-        *middle,
+        begin.astype(np.uint32),
+        np.concatenate([[0], np.cumsum(count)]).astype(np.uint32),
+        cell[chosen].clip(0).astype(np.uint32),
+        gain[chosen],
+        cell[:, 1::2].reshape(-1),
+        place_m[:, 1::2].reshape(-1, 3).astype(np.float32),
+        gain[:, 1::2].reshape(-1),
     )

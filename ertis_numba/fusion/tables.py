@@ -60,6 +60,7 @@ class FusionTables:
         self._late_m: dict[int, float] = {}
         self._known: dict[tuple[tuple[int, ...], frozenset[int]], Attribution] = {}
         self._points: dict[int, PointFuser] = {}
+        self._converted: tuple[Settings, Settings] | None = None  # The checks of settings take long.
 
     def fit(self, group: Mapping[int, Energyscape]) -> bool:
         """Return True if images have the same directions, ranges and calls as earlier ones of their sensors."""
@@ -149,7 +150,7 @@ class FusionTables:
         ]
         seen = {pair.emitter for pair in self._pairs[number]}
         self._hypotheses[number] = [
-            each for each in hypotheses if len(each.pixel) or (each.emitter in seen and not each.is_mirrored)
+            each for each in hypotheses if len(each.half_cell) or (each.emitter in seen and not each.is_mirrored)
         ]
         self._points[number] = PointFuser(number, self._poses, receiver, image)
 
@@ -162,6 +163,11 @@ class FusionTables:
         return np.asarray(deaf)
 
     def _fused_settings(self, settings: Settings) -> Settings:
+        if self._converted is None or self._converted[0] != settings:
+            self._converted = settings, self._convert(settings)
+        return self._converted[1]
+
+    def _convert(self, settings: Settings) -> Settings:
         limit_deg = 180.0 - 180.0 / self.grid.n_azimuths
         limits = {
             "azimuth_limits_deg": (-limit_deg, limit_deg),

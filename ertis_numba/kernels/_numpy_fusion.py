@@ -48,11 +48,14 @@ def spread_cells(values: Real, reach: int, out: Real) -> None:
     np.maximum(out[..., :-1], found[..., 1:], out=out[..., :-1])
 
 
-def predict_echoes(pixel: Turns, cell: Turns, gain: Real, reflectivity: Real, lobe: Turns, out: Real) -> None:
+def predict_echoes(
+    begin: Turns, bounds: Turns, cell: Turns, gain: Real, reflectivity: Real, lobe: Turns, out: Real
+) -> None:
     """Predict the power of the echoes of reflectors, within a main lobe around each direction."""
-    raw = np.zeros_like(out)
-    raw.reshape(-1)[pixel] = np.max(gain * reflectivity[cell], axis=0, initial=0)
-    _highest(raw, lobe, out)
+    halves = np.zeros((len(out), 2 * out.shape[1] + 1), out.dtype)
+    direction = np.repeat(np.arange(len(out)), np.diff(bounds))
+    halves[direction, begin[direction] + np.arange(len(cell)) - bounds[direction]] = gain * reflectivity[cell]
+    _highest(np.max([halves[:, :-1:2], halves[:, 1::2], halves[:, 2::2]], axis=0), lobe, out)
 
 
 def share_echoes(

@@ -85,7 +85,7 @@ class FusedSubscriber:
     on_note : callable, optional
         Called by a thread with a line for each change of the connection.
     emitter_diameter_m, spacing_deg, range_step_m : float
-        As for `Fuser`; a planar pulse of four sensors takes some 50 ms with the default spacings.
+        As for `Fuser`; a planar pulse of four sensors takes some 25 ms with the default spacings.
 
     Attributes
     ----------

@@ -75,18 +75,24 @@ class PredictEchoes(Protocol):
 
     Parameters
     ----------
-    pixel : (entry,) uint32
-    cell : (part, entry) uint32
-        Cells that cause an echo in the pixel.
-    gain : (part, entry) float32
-        Gain of each cell's echo; 0 for none. The highest echo counts.
+    begin : (direction,) uint32
+        First half-step of each direction with an entry. A step has three: its begin, its middle and its end, which is
+        the begin of the next one. The highest echo counts.
+    bounds : (direction + 1,) uint32
+        Bounds of the entries of each direction, one for each half-step.
+    cell : (entry,) uint32
+        Cell that causes an echo.
+    gain : (entry,) float32
+        Gain of this echo; 0 for none.
     reflectivity : (cell,) float32
     lobe : (direction, neighbour) uint32
         Directions within the main lobe of each direction.
     out : (direction, step) float32
     """
 
-    def __call__(self, pixel: Turns, cell: Turns, gain: Real, reflectivity: Real, lobe: Turns, out: Real) -> None: ...
+    def __call__(
+        self, begin: Turns, bounds: Turns, cell: Turns, gain: Real, reflectivity: Real, lobe: Turns, out: Real
+    ) -> None: ...
 
 
 class ShareEchoes(Protocol):

@@ -71,16 +71,21 @@ def spread_cells(values, reach, out):
 
 
 @njit(nogil=True, cache=True, error_model="numpy", fastmath={"nnan"})
-def predict_echoes(pixel, cell, gain, reflectivity, lobe, out):
+def predict_echoes(begin, bounds, cell, gain, reflectivity, lobe, out):
     """Predict the power of the echoes of reflectors, within a main lobe around each direction."""
-    top = np.zeros(len(pixel), np.float32)
-    for part in range(cell.shape[0]):
-        for entry in range(len(pixel)):
-            top[entry] = max(top[entry], gain[part, entry] * reflectivity[cell[part, entry]])
-    raw = np.zeros(out.shape, np.float32)
-    flat = raw.reshape(-1)
-    for entry in range(len(pixel)):
-        flat[pixel[entry]] = top[entry]
+    n_directions, n_steps = out.shape
+    raw = np.empty((n_directions, n_steps), np.float32)
+    half = np.empty(2 * n_steps + 1, np.float32)
+    for d in range(n_directions):
+        for h in range(2 * n_steps + 1):
+            half[h] = _ZERO
+        first, last = bounds[d], bounds[d + 1]
+        # LLVM vectorises loops over views, but not over sums of indices.
+        run, run_cell, run_gain = half[begin[d] :], cell[first:last], gain[first:last]
+        for entry in range(len(run_cell)):
+            run[entry] = run_gain[entry] * reflectivity[run_cell[entry]]
+        for s in range(n_steps):
+            raw[d, s] = max(half[2 * s], half[2 * s + 1], half[2 * s + 2])
     _highest(raw, lobe, out)
 
 
