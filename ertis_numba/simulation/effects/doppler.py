@@ -15,7 +15,7 @@ from ertis_numba.simulation.snapshot import Receivers, Snapshot, Transmitters
 __all__ = ["estimate", "times"]
 
 Floats = NDArray[np.float64]
-_ROUNDS = 60  # each iteration reduces the error by the factor v / c, so that few are needed
+_ROUNDS = 60  # of moving walls; each reduces the error by the factor v / c, so that few are needed
 _ENOUGH_S = 1e-16
 _STEP_S = 1e-5
 
@@ -44,30 +44,59 @@ def _arrival_s(paths: Paths, start_s: float, speed_m_s: float) -> Floats:
     """Return the arrival time of sound emitted at a given time: (path, mic) float64."""
     transmitter, receiver = paths.transmitter, paths.receiver
     sent_m = (transmitter.position_m + start_s * _own_m_s(transmitter))[:, None]
-    target_m = transmitter.position_m[:, None] + paths.first_m[..., None] * paths.leaving
-    met_s = start_s + paths.first_m / speed_m_s
-    arrival_s = met_s + paths.second_m / speed_m_s
+    first_m, leaving = _per_path(paths.first_m), _per_path(paths.leaving)
+    target_m = transmitter.position_m[:, None] + first_m[..., None] * leaving
     arms_m = receiver.positions_m - receiver.centre_m[:, None]
     mics_m_s = _own_m_s(receiver)[:, None] + np.cross(receiver.spin_rad_s[:, None], arms_m)
-    transmitter_sways, receiver_sways = (bool(np.any(end.sways_m_s)) for end in (transmitter, receiver))
-    for _ in range(_ROUNDS):
-        before_s, from_m = arrival_s, sent_m
-        if transmitter_sways:  # the sound meets a wall after the same fraction of the path as without motion
+    met_s = start_s + first_m / speed_m_s
+    arrival_s = met_s + paths.second_m / speed_m_s
+    sways = bool(np.any(transmitter.sways_m_s)), bool(np.any(receiver.sways_m_s))
+    for _ in range(_ROUNDS if any(sways) else 1):
+        before_s, from_m, receiver_m = arrival_s, sent_m, receiver.positions_m
+        if sways[0]:  # the sound meets a wall after the same fraction of the path as without motion
             done = (met_s if len(paths.targets) else arrival_s) - start_s
-            whole_m = paths.first_m if len(paths.targets) else paths.second_m
+            whole_m = first_m if len(paths.targets) else paths.second_m
             from_m = sent_m + _swayed_m(transmitter, start_s + paths.transmitter_corners_m * _mean(done, whole_m))
-        met_m = from_m
+        met_m, left_s = from_m, np.full((1, 1), start_s)
         if len(paths.targets):
-            met_m = target_m + met_s[..., None] * paths.targets.velocities_m_s[:, None, :]
-            met_s = start_s + _length(met_m - from_m) / speed_m_s
-        receiver_m = receiver.positions_m + arrival_s[..., None] * mics_m_s
-        if receiver_sways:
+            targets_m_s = paths.targets.velocities_m_s[:, None, :]
+            met_s = left_s = _met_s(from_m, left_s, target_m, targets_m_s, speed_m_s)
+            met_m = target_m + met_s[..., None] * targets_m_s
+        if sways[1]:
             back = _mean(arrival_s - met_s, paths.second_m)
             receiver_m = receiver_m + _swayed_m(receiver, np.mean(arrival_s, axis=1) - paths.receiver_corners_m * back)
-        arrival_s = (met_s if len(paths.targets) else start_s) + _length(receiver_m - met_m) / speed_m_s
+        arrival_s = _met_s(met_m, left_s, receiver_m, mics_m_s, speed_m_s)
         if np.abs(arrival_s - before_s).max() < _ENOUGH_S:
             break
     return arrival_s
+
+
+def _met_s(from_m: Floats, left_s: Floats, place_m: Floats, velocity_m_s: Floats, speed_m_s: float) -> Floats:
+    """Return the times at which sound meets objects in uniform motion: (path, mic) float64.
+
+    Sound that leaves ``a`` at t₀ meets ``p + v t`` at ``t = t₀ + u``. With ``d = p + v t₀ - a``, u is the positive root
+    of ``(c² - v²) u² - 2 (d·v) u - d² = 0``.
+
+    Parameters
+    ----------
+    from_m : (path, mic, axis) float64
+        Place that the sound leaves.
+    left_s : (path, mic) float64
+        Time at which it leaves.
+    place_m, velocity_m_s : (path, mic, axis) float64
+        Place of the object at time 0, and its velocity.
+    speed_m_s : float
+        Speed of sound.
+    """
+    apart_m = place_m + velocity_m_s * left_s[..., None] - from_m
+    along = np.sum(apart_m * velocity_m_s, axis=-1)
+    rest = speed_m_s**2 - np.sum(velocity_m_s**2, axis=-1)
+    return np.asarray(left_s + (along + np.sqrt(along**2 + rest * np.sum(apart_m**2, axis=-1))) / rest)
+
+
+def _per_path(values: Floats) -> Floats:
+    """Return one value per path where all microphones share it: (path, 1 or mic, ...)."""
+    return values[:, :1] if values.strides[1] == 0 else values
 
 
 def _own_m_s(end: Transmitters | Receivers) -> Floats:
@@ -87,10 +116,6 @@ def _mean(time_s: Floats, length_m: Floats) -> Floats:
     """Return the mean travel time per length of each path: (path,) float64."""
     total_m = np.sum(length_m, axis=1)
     return np.asarray(np.divide(np.sum(time_s, axis=1), total_m, out=np.zeros_like(total_m), where=total_m > 0))
-
-
-def _length(vectors: Floats) -> Floats:
-    return np.asarray(np.sqrt(np.sum(vectors**2, axis=-1)))
 
 
 def estimate(sight: Sight) -> Estimate | None:
