@@ -10,18 +10,18 @@ import ertis_numba as ertis
 from ertis_numba.frames import Energyscape, Stamp
 from ertis_numba.fusion.rig import Mountings
 from ertis_numba.settings import Processing
-from ertis_numba.simulation import Box, Electronics, Emitter, Point, Scene, Sensor
+from ertis_numba.simulation import Box, Electronics, Emitter, Platform, Point, Scene, Sensor
 from ertis_numba.simulation.effect_plan import EffectPlan, Verdict
 from ertis_numba.simulation.effects import EFFECTS
 
 __all__ = [
     "HALL_M",
+    "N_PULSES",
     "Motion",
     "PlatformImager",
-    "drive",
     "half_size_of_room_m",
+    "hall",
     "mountings",
-    "random_hall",
     "random_motion",
     "random_room",
 ]
@@ -34,8 +34,14 @@ _MAX_YAW_RATE_RAD_S: Final = math.radians(90.0)
 _WALL_SPACING_M: Final = 0.15  # Mean spacing of the scatterers of a rough wall.
 _CLEARANCE_M: Final = 0.8
 HALL_M: Final = 16.0, 10.0
+"""Length and width of the hall, whose centre is the origin."""
+N_PULSES: Final = 1268
+"""Pulses of the drive through the hall."""
+_PULSE_HZ: Final = 14.0
+_SPEED_M_S: Final = 1.0
 _TO_WALL_M: Final = 2.5  # Distance of the path from the walls.
-_CORNER_M: Final = 1.0  # Radius of the path at corners, so that the platform turns at 86°/s.
+_CORNER_M: Final = 1.0  # Radius of the path at corners, so that the platform turns at 57°/s.
+_N_CHORDS: Final = 8  # Straight parts of a corner, whose middle is 5 mm from the arc.
 _N_POSTS: Final = 24
 # The simulator would decide again for each instant which effects matter, and this takes longer than the rest.
 _ABSENT: Final = {
@@ -67,6 +73,15 @@ class Motion(NamedTuple):
     forward_m_s: float
     left_m_s: float
     yaw_rate_rad_s: float
+
+    @classmethod
+    def of(cls, platform: Platform, time_s: float) -> "Motion":
+        """Return the motion of a platform of a scene at one instant."""
+        pose = platform.pose_at(time_s)
+        forward_m_s, left_m_s, _ = (pose.rotation.T @ pose.velocity_m_s).tolist()
+        x_m, y_m, _ = pose.position_m.tolist()
+        yaw_rad = math.atan2(pose.rotation[1, 0], pose.rotation[0, 0])
+        return cls(x_m, y_m, yaw_rad, forward_m_s, left_m_s, float(pose.spin_rad_s[2]))
 
     def after(self, time_s: float) -> "Motion":
         """Return the motion after some time at the same velocity in the frame of the platform."""
@@ -135,50 +150,65 @@ def _places(random: np.random.Generator, count: int, half_x_m: float, half_y_m: 
     return found
 
 
-def random_hall(seed: int, wall_spacing_m: float = _WALL_SPACING_M) -> tuple[tuple[Point, ...], tuple[Box, ...]]:
-    """Return the scatterers of a hall of 16 m by 10 m with rough walls and posts, around the origin."""
+def hall(
+    seed: int, wall_spacing_m: float = _WALL_SPACING_M, names: Sequence[str] = tuple(_YAWS_DEG)
+) -> Scene:
+    """Return a hall of 16 m by 10 m, and a platform that drives round it for 90 m with 1,268 pulses.
+
+    Walls are rough: rows of scatterers with random strengths. Posts stand on both sides of the path.
+
+    Parameters
+    ----------
+    seed : int
+        Seed of the scatterers.
+    wall_spacing_m : float, default 0.15
+        Mean spacing of the scatterers of a wall.
+    names : sequence of str
+        Sensors on the platform.
+    """
     random = np.random.default_rng([seed, 26])
     half_x_m, half_y_m = HALL_M[0] / 2, HALL_M[1] / 2
     points = _walls(random, half_x_m, half_y_m, wall_spacing_m)
     for _ in range(_N_POSTS):
-        # Posts stand on both sides of the path, which is 2.5 m from the walls.
+        # Posts keep clear of the path, which is 2.5 m from the walls.
         x, y = random.uniform(-half_x_m, half_x_m), random.uniform(-half_y_m, half_y_m)
         if abs(max(abs(x) - half_x_m, abs(y) - half_y_m) + _TO_WALL_M) > _CLEARANCE_M:
             points.append(Point(position_m=(x, y, HEIGHT_M), strength_db=random.uniform(-14.0, -6.0)))
-    return tuple(points), ()
+    return Scene(
+        seed=seed,
+        rate_hz=_PULSE_HZ,
+        count=N_PULSES,
+        platform=Platform(waypoints=tuple(_round_hall(N_PULSES / _PULSE_HZ))),
+        sensors=tuple(_sensor(name, max_range_m=5.0) for name in names),
+        points=tuple(_rounded(point) for point in points),
+    )
 
 
-def drive(length_m: float, time_s: float, *, speed_m_s: float = 1.5) -> list[Motion]:
-    """Return the motions of a platform that drives round the hall, with rounded corners.
-
-    Parameters
-    ----------
-    length_m : float
-        Length of the path; one round has about 28 m.
-    time_s : float
-        Time between two motions.
-    speed_m_s : float, default 1.5
-        Speed along the path.
-    """
+def _round_hall(duration_s: float) -> list[tuple[float, float, float, float, float]]:
+    """Return way points of a drive at 1 m/s round the hall, to the left, with rounded corners."""
     half_x_m, half_y_m = HALL_M[0] / 2 - _TO_WALL_M, HALL_M[1] / 2 - _TO_WALL_M
-    motion = Motion(0.0, -half_y_m, 0.0, speed_m_s, 0.0, 0.0)
-    corner_s = _CORNER_M * math.pi / 2 / speed_m_s
-    straights_s = [2 * (half_m - _CORNER_M) / speed_m_s for half_m in (half_y_m, half_x_m, half_y_m, half_x_m)]
-    legs = [((half_x_m - _CORNER_M) / speed_m_s, 0.0)]
-    while sum(duration_s for duration_s, _ in legs) * speed_m_s < length_m:
-        legs += [(corner_s, speed_m_s / _CORNER_M), (straights_s[len(legs) // 2 % 4], 0.0)]
-    motions, leg, left_s = [motion], 0, legs[0][0]
-    for _ in range(round(length_m / speed_m_s / time_s)):
-        step_s = time_s
-        while step_s > left_s:
-            motion = motion._replace(yaw_rate_rad_s=legs[leg][1]).after(left_s)
-            step_s -= left_s
-            leg += 1
-            left_s = legs[leg][0]
-        motion = motion._replace(yaw_rate_rad_s=legs[leg][1]).after(step_s)
-        left_s -= step_s
-        motions.append(motion)
-    return motions
+    x, y, yaw_deg, time_s = 0.0, -half_y_m, 0.0, 0.0
+    found = [(time_s, x, y, 0.0, yaw_deg)]
+    straights_m = [2 * (half_m - _CORNER_M) for half_m in (half_y_m, half_x_m)]
+    legs = [(half_x_m - _CORNER_M, 0.0)]
+    # A chord of the arc and the turn on it.
+    chord_m, turn_deg = 2 * _CORNER_M * math.sin(math.radians(45.0 / _N_CHORDS)), 90.0 / _N_CHORDS
+    while time_s < duration_s:
+        if not legs:
+            n_corners = round(yaw_deg / 90.0)
+            legs = [*[(chord_m, turn_deg)] * _N_CHORDS, (straights_m[n_corners % 2], 0.0)]
+        way_m, turn_deg_here = legs.pop(0)
+        heading_rad = math.radians(yaw_deg + turn_deg_here / 2)
+        x, y = x + way_m * math.cos(heading_rad), y + way_m * math.sin(heading_rad)
+        time_s, yaw_deg = time_s + way_m / _SPEED_M_S, yaw_deg + turn_deg_here
+        found.append((round(time_s, 4), round(x, 4), round(y, 4), 0.0, yaw_deg))
+    return found
+
+
+def _rounded(point: Point) -> Point:
+    """Return a point whose numbers have few digits, for short scene files."""
+    x, y, z = point.position_m or (0.0, 0.0, 0.0)
+    return Point(position_m=(round(x, 3), round(y, 3), z), strength_db=round(point.strength_db, 1))
 
 
 def random_motion(seed: int) -> Motion:
@@ -210,8 +240,7 @@ def mountings(names: Sequence[str] = tuple(_YAWS_DEG)) -> Mountings:
 class PlatformImager:
     """Simulator of the images of a moving platform, through PDM.
 
-    Each instant is a scene of its own, because the sensors of a scene do not turn. Sensors keep their orientation
-    during a measurement, and move with the velocity of their mounting.
+    Each instant is a scene of its own, with the reflectors that are near.
 
     Parameters
     ----------
@@ -246,7 +275,8 @@ class PlatformImager:
         )
         scene = Scene(
             seed=self._seed * 1000 + number,
-            sensors=tuple(self._sensor(name, motion) for name in self._names),
+            platform=Platform(waypoints=_way(motion)),
+            sensors=tuple(_sensor(name, self._max_range_m) for name in self._names),
             points=near,
             boxes=boxes,
         )
@@ -267,21 +297,27 @@ class PlatformImager:
         for pipeline in self._pipelines.values():
             pipeline.close()
 
-    def _sensor(self, name: str, motion: Motion) -> Sensor:
-        place = motion.yaw_rad + math.radians(_YAWS_DEG[name])
-        dx, dy = _OFFSET_M * math.cos(place), _OFFSET_M * math.sin(place)
-        c, s = math.cos(motion.yaw_rad), math.sin(motion.yaw_rad)
-        rate = motion.yaw_rate_rad_s
-        return Sensor(
-            name=name,
-            position_m=(motion.x_m + dx, motion.y_m + dy, HEIGHT_M),
-            velocity_m_s=(
-                c * motion.forward_m_s - s * motion.left_m_s - rate * dy,
-                s * motion.forward_m_s + c * motion.left_m_s + rate * dx,
-                0.0,
-            ),
-            yaw_deg=math.degrees(math.remainder(place, 2 * math.pi)),
-            processing=Processing(range_m=(0.4, self._max_range_m), directions="90"),
-            emitter=Emitter(level_db=-24.0, diameter_m=0.012),
-            electronics=Electronics(noise_dbfs=-60.0),
-        )
+
+def _way(motion: Motion) -> tuple[tuple[float, float, float, float, float], ...]:
+    """Return way points from a motion, at its present velocity for a second."""
+    c, s = math.cos(motion.yaw_rad), math.sin(motion.yaw_rad)
+    later_m = (
+        motion.x_m + c * motion.forward_m_s - s * motion.left_m_s,
+        motion.y_m + s * motion.forward_m_s + c * motion.left_m_s,
+    )
+    yaws_deg = math.degrees(motion.yaw_rad), math.degrees(motion.yaw_rad + motion.yaw_rate_rad_s)
+    return (0.0, motion.x_m, motion.y_m, 0.0, yaws_deg[0]), (1.0, *later_m, 0.0, yaws_deg[1])
+
+
+def _sensor(name: str, max_range_m: float) -> Sensor:
+    """Return a sensor of the platform, in its frame."""
+    translation_m, _ = mountings([name])[name]
+    x, y, z = (round(each, 6) for each in translation_m)
+    return Sensor(
+        name=name,
+        position_m=(x, y, z),
+        yaw_deg=_YAWS_DEG[name],
+        processing=Processing(range_m=(0.4, max_range_m), directions="90"),
+        emitter=Emitter(level_db=-24.0, diameter_m=0.012),
+        electronics=Electronics(noise_dbfs=-60.0),
+    )

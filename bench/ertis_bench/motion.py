@@ -12,7 +12,7 @@ import numpy as np
 
 import ertis_numba as ertis
 from ertis_bench import machine
-from ertis_bench.furnished_rooms import PlatformImager, drive, mountings, random_hall, random_motion, random_room
+from ertis_bench.furnished_rooms import Motion, PlatformImager, hall, mountings, random_motion, random_room
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table
 
@@ -30,7 +30,7 @@ def run(*, count: int, length_m: float, seed: int, say: Callable[[str], None]) -
     count : int
         Number of rooms.
     length_m : float
-        Length of the path; 0 leaves out the hall.
+        Length of the path, up to 90 m; 0 leaves out the hall.
     seed : int
         Seed of the first room, and of the hall.
     say : callable
@@ -64,14 +64,17 @@ def run(*, count: int, length_m: float, seed: int, say: Callable[[str], None]) -
 
 def _hall(seed: int, length_m: float, say: Callable[[str], None]) -> dict[str, Any]:
     """Return errors of odometry along a closed path through a hall."""
-    imager = PlatformImager(random_hall(seed), seed)
+    scene = hall(seed)
+    assert scene.platform is not None  # noqa: S101  halls have one
+    times_s = [number / scene.rate_hz for number in range(min(scene.count, round(length_m * scene.rate_hz)))]
+    motions = [Motion.of(scene.platform, time_s) for time_s in times_s]
+    imager = PlatformImager((scene.points, ()), seed, max_range_m=5.0)
     odometry = ertis.Odometry(mountings())
-    motions = drive(length_m, _TIME_S)
     start = motions[0]
     c, s = math.cos(start.yaw_rad), math.sin(start.yaw_rad)
     errors_m, unmeasured = [], 0
-    for number, motion in enumerate(motions):
-        odometry.add(imager(motion, number, number * _TIME_S))
+    for number, (motion, time_s) in enumerate(zip(motions, times_s, strict=True)):
+        odometry.add(imager(motion, number, time_s))
         pose = odometry.poses[-1]
         x, y = motion.x_m - start.x_m, motion.y_m - start.y_m
         errors_m.append(math.hypot(pose.x_m - c * x - s * y, pose.y_m + s * x - c * y))
@@ -81,7 +84,7 @@ def _hall(seed: int, length_m: float, say: Callable[[str], None]) -> dict[str, A
     imager.close()
     yaw_error_rad = math.remainder(odometry.poses[-1].yaw_rad - motions[-1].yaw_rad + start.yaw_rad, 2 * math.pi)
     return {
-        "length_m": length_m,
+        "length_m": len(motions) / scene.rate_hz,  # at 1 m/s
         "n_groups": len(motions),
         "unmeasured": unmeasured,
         "end_m": errors_m[-1],

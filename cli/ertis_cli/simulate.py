@@ -11,7 +11,7 @@ from ertis_cli import options
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from ertis_numba.frames import Measurement, Reflector
+    from ertis_numba.frames import Measurement, Reflector, Trajectory
     from ertis_numba.simulation import Scene
     from ertis_numba.simulation.effect_plan import EffectPlan
     from ertis_numba.simulation.render import Simulator
@@ -107,6 +107,7 @@ def simulate(
             source=path.name,
             truth=logs,
             mounting={simulator.sensor.name: _mounting(simulator) for simulator in simulators},
+            poses=_poses(scene),
         )
         n_reflectors = max(log.n_own_targets for log in logs.values())
     options.say(_summary(target, scene, n_sensors=len(names), n_reflectors=n_reflectors), quiet=quiet)
@@ -168,6 +169,13 @@ def _log(scene: "Scene", plan: "EffectPlan", folder: Path) -> "GroundTruthLog":
 def _mounting(simulator: "Simulator") -> Any:
     """Return the position and the rotation of a sensor at the start of the first measurement."""
     return simulator.sensor.path().position_at(0.0), simulator.sensor.quaternion()
+
+
+def _poses(scene: "Scene") -> "Trajectory | None":
+    """Return the poses of the scene's platform at all pulses, and one more, since sensors follow each other by SYNC."""
+    import numpy as np
+
+    return None if scene.platform is None else scene.platform.trajectory(np.arange(scene.count + 1) / scene.rate_hz)
 
 
 def _effects(plan: "EffectPlan", simulators: "Sequence[Simulator]") -> list[dict[str, Any]]:
