@@ -57,6 +57,7 @@ docs: $(VENV)/ready-to-test  ## build the documentation; open site/index.html
 
 data: $(VENV)/ready  ## rebuild data/synthetic from its scenes, and the gallery
 	$(BIN)/python data/synthetic/build.py
+	$(BIN)/python data/synthetic/hall.py
 	$(BIN)/python data/synthetic/gallery.py
 
 pictures: $(VENV)/ready  ## redraw the pictures of the README; the viewer needs Chromium

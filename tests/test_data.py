@@ -110,6 +110,8 @@ PAGE = page("gallery")
 CALLED_FOR = {
     "corridor": {"walls", "occlusion", "doppler", "emitter_directivity"},
     "faulty_array": {"microphone_noise", "microphone_spread", "microphone_faults"},
+    "hall": {"cross_emission", "doppler", "emitter_directivity", "microphone_noise"},
+    "moving_platform": {"cross_emission", "doppler", "emitter_directivity", "microphone_noise", "walls"},
     "moving_person": {"doppler", "target_size", "interference", "ambient_noise", "microphone_noise"},
     "shelf_of_bottles": {"walls", "target_size", "emitter_directivity"},
     "two_facing_sensors": {"cross_emission", "sync_delay", "emitter_directivity"},
@@ -138,6 +140,10 @@ def test_gallery_update_rejects_page_without_markers():
     assert reported == "a <!-- scene x -->\nnew\n<!-- /scene x --> b"
     with pytest.raises(SystemExit, match="the page has no markers for 'scene y'; add <!-- scene y --> and"):
         gallery.replaced(reported, "scene y", "new")
+
+
+def test_hall_is_written_by_its_script():
+    assert script("hall").text() == (FOLDER / "scenes" / "hall.toml").read_text()
 
 
 @functools.cache

@@ -26,6 +26,7 @@ PICTURES = ROOT / "docs" / "pictures" / "gallery"
 Takes = dict[str, list[tuple[ertis.Energyscape, list[ertis.Reflector]]]]
 _MIN_LEVELS_DB = (-10.0, -30.0)
 _MAX_MARKS = 8
+_MAX_TAKEN = 6  # measurements of each sensor
 _MAX_BYTES = 150_000  # size limit of a picture
 _SHEET = (1.0, 92)  # share of a figure's width that is shown, and dots per inch
 _FRAME = (0.745, 84)  # the same for figures side by side: without colour bar and list
@@ -57,6 +58,8 @@ SHOWN = {
     "moving_person": Shown(frames=(("door", 0), ("door", 2), ("door", 4))),
     "two_facing_sensors": Shown(frames=(("west", 0), ("east", 0)), dynamic_range_db=40.0),
     "faulty_array": Shown(frames=(("worn", 0),), healthy=True),
+    "moving_platform": Shown(frames=(("front", 0), ("front", 3), ("front", 5))),
+    "hall": Shown(frames=(("front", 0), ("right", 0))),
 }
 """Pictures of the gallery, in their order on the page."""
 
@@ -82,12 +85,13 @@ def main() -> None:
 
 
 def take(scene: Scene, plan: EffectPlan) -> Takes:
-    """Return the images and the ground truth of all measurements, by sensor."""
+    """Return the images and the ground truth of the first measurements, by sensor."""
     takes = {}
     for sensor in scene.sensors:
         simulator, pipeline = ertis.Simulator(scene, sensor=sensor.name, plan=plan), ertis.Pipeline(sensor.settings())
         takes[sensor.name] = [
-            (pipeline.process(simulator.render(index)), simulator.reflectors(index)) for index in range(scene.count)
+            (pipeline.process(simulator.render(index)), simulator.reflectors(index))
+            for index in range(min(scene.count, _MAX_TAKEN))
         ]
     return takes
 
