@@ -59,6 +59,7 @@ from .motion import (
     EgoVelocity as EgoVelocity,
     Odometry as Odometry,
     PlanarPose as PlanarPose,
+    compensate_motion as compensate_motion,
     ego_velocity as ego_velocity,
 )
 from .network.allow_list import AllowList as AllowList, Permission as Permission

@@ -18,10 +18,9 @@ from ertis_bench.furnished_rooms import (
     HALL_M,
     Motion,
     PlatformImager,
-    drive,
     half_size_of_room_m,
+    hall,
     mountings,
-    random_hall,
     random_room,
 )
 from ertis_bench.machine import sentence
@@ -159,8 +158,11 @@ def run(*, count: int, poses: int, length_m: float, seed: int, say: Callable[[st
         place = MappedPlace(*random_room(number, _SPACING_M), half_size_of_room_m(number))
         rows.append(_mapped(f"room {number}", place, _round(poses), number, say))
     if length_m:
-        place = MappedPlace(*random_hall(seed, _SPACING_M), (HALL_M[0] / 2, HALL_M[1] / 2))
-        rows.append(_mapped(f"hall {seed}", place, drive(length_m, _TIME_S, speed_m_s=1.0), seed, say))
+        scene = hall(seed, _SPACING_M)
+        assert scene.platform is not None  # noqa: S101  halls have one
+        place = MappedPlace(scene.points, (), (HALL_M[0] / 2, HALL_M[1] / 2))
+        motions = [Motion.of(scene.platform, time_s) for time_s in np.arange(0.0, length_m, _TIME_S)]  # at 1 m/s
+        rows.append(_mapped(f"hall {seed}", place, motions, seed, say))
     return {"machine": machine.describe(), "seed": seed, "length_m": length_m, "rows": rows}
 
 

@@ -1,6 +1,7 @@
 """Motion of a platform from the images of its sensors: velocity and odometry."""
 
+from ertis_numba.motion.compensation import compensate_motion
 from ertis_numba.motion.odometry import Odometry, PlanarPose
 from ertis_numba.motion.velocity import EgoVelocity, ego_velocity
 
-__all__ = ["EgoVelocity", "Odometry", "PlanarPose", "ego_velocity"]
+__all__ = ["EgoVelocity", "Odometry", "PlanarPose", "compensate_motion", "ego_velocity"]

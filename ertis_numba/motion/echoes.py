@@ -15,7 +15,7 @@ from ertis_numba.fusion.rig import MountedSensor
 from ertis_numba.geometry import Grid
 from ertis_numba.settings import Call
 
-__all__ = ["EchoExtractor", "GroupEchoes"]
+__all__ = ["EchoExtractor", "GroupEchoes", "sweep_delay_s"]
 
 Floats = NDArray[np.float64]
 
@@ -103,7 +103,7 @@ class EchoExtractor:
             np.hypot(range_sd_m, _RANGE_SD_M),
             np.hypot(across_sd_m / range_m, _ANGLE_SD_RAD / np.cos(off_axis)),
             np.log(np.maximum(cloud.amplitude.astype(np.float64), np.finfo(np.float32).tiny)),
-            range_m / speed_m_s - _sweep_delay_s(cloud.settings.call),
+            range_m / speed_m_s - sweep_delay_s(cloud.settings.call),
         )
 
     def _cloud(self, image: Energyscape) -> PointCloud:
@@ -123,7 +123,7 @@ def _deviations(cloud: PointCloud) -> Floats:
     return np.asarray(np.where(np.isfinite(given_m), given_m, 0.0))
 
 
-def _sweep_delay_s(call: Call) -> float:
+def sweep_delay_s(call: Call) -> float:
     """Return how much earlier than at the emission the measured range applies.
 
     A hyperbolic sweep that is stretched by motion is the same sweep at another time, so its echo from a reflector that
