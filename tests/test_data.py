@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ertis_bench.furnished_rooms import hall
 from numpy.testing import assert_allclose, assert_array_equal
 
 from ertis_numba.analysis.compare import compare
@@ -143,7 +144,9 @@ def test_gallery_update_rejects_page_without_markers():
 
 
 def test_hall_is_written_by_its_script():
-    assert script("hall").text() == (FOLDER / "scenes" / "hall.toml").read_text()
+    path = FOLDER / "scenes" / "hall.toml"
+    assert script("hall").text() == path.read_text()
+    assert load_scene(path) == hall(1)
 
 
 @functools.cache

@@ -150,9 +150,7 @@ def _places(random: np.random.Generator, count: int, half_x_m: float, half_y_m: 
     return found
 
 
-def hall(
-    seed: int, wall_spacing_m: float = _WALL_SPACING_M, names: Sequence[str] = tuple(_YAWS_DEG)
-) -> Scene:
+def hall(seed: int, wall_spacing_m: float = _WALL_SPACING_M, names: Sequence[str] = tuple(_YAWS_DEG)) -> Scene:
     """Return a hall of 16 m by 10 m, and a platform that drives round it for 90 m with 1,268 pulses.
 
     Walls are rough: rows of scatterers with random strengths. Posts stand on both sides of the path.

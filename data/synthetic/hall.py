@@ -4,8 +4,6 @@ from pathlib import Path
 
 from ertis_bench.furnished_rooms import hall
 
-from ertis_numba.simulation import Scene
-
 PATH = Path(__file__).parent / "scenes" / "hall.toml"
 HEAD = """\
 # A robot with four sensors drives three times round a hall of 16 m by 10 m, at 1 m/s and with 14 pulses per second.
@@ -18,13 +16,19 @@ _SEED = 1
 def text() -> str:
     """Return the scene as TOML, with one line for each sensor, reflector and way point."""
     scene = hall(_SEED)
-    assert scene.platform is not None
+    waypoints = scene.platform.waypoints if scene.platform else ()
     lines = [HEAD, f"seed = {scene.seed}", f"rate_hz = {scene.rate_hz}", f"count = {scene.count}", "points = ["]
     for point in scene.points:
         x, y, z = point.position_m or (0.0, 0.0, 0.0)
         lines.append(f"  {{position_m = [{x:g}, {y:g}, {z:g}], strength_db = {point.strength_db}}},")
-    lines += ["]", "", "# Each way point has a time (s), x, y, z (m) and a yaw (degrees).", "[platform]", "waypoints = ["]
-    lines += [f"  [{', '.join(f'{number:g}' for number in waypoint)}]," for waypoint in scene.platform.waypoints]
+    lines += [
+        "]",
+        "",
+        "# Each way point has a time (s), x, y, z (m) and a yaw (degrees).",
+        "[platform]",
+        "waypoints = [",
+    ]
+    lines += [f"  [{', '.join(f'{number:g}' for number in waypoint)}]," for waypoint in waypoints]
     lines += ["]"]
     for sensor in scene.sensors:
         x, y, z = sensor.position_m or (0.0, 0.0, 0.0)
@@ -39,9 +43,7 @@ def text() -> str:
             f"emitter = {{level_db = {emitter.level_db}, diameter_m = {emitter.diameter_m}}}",
             f"electronics = {{noise_dbfs = {sensor.electronics.noise_dbfs}}}",
         ]
-    written = "\n".join(lines) + "\n"
-    assert Scene.from_toml(written) == scene
-    return written
+    return "\n".join(lines) + "\n"
 
 
 if __name__ == "__main__":
