@@ -89,6 +89,30 @@ def test_odometry_integrates_a_circle():
     assert not path.covariance[:, 2:5].any()
 
 
+AHEAD = (0.0, 0.0, 0.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("changed", "is_measured"),
+    [
+        ({"sensor": ((0.0, 0.0, 0.0), AHEAD), "other": ((0.0, 0.3, 0.0), AHEAD)}, True),
+        ({"sensor": ((0.1, 0.0, 0.0), AHEAD)}, False),
+        ({"other": ((0.0, 0.3, 0.0), AHEAD), "sensor": ((0.0, 0.0, 0.0), AHEAD)}, False),
+    ],
+    ids=["added", "moved", "reordered"],
+)
+def test_remounted_odometry_continues_its_path(changed, is_measured):
+    odometry = ertis.Odometry(MOUNTINGS)
+    for pulse in range(2):
+        odometry.add([seen_from((0.05 * pulse, 0, 0), places_m(), pulse)])
+    odometry.remount(changed)
+    odometry.add([seen_from((0.1, 0, 0), places_m(), 2)])
+    velocity = odometry.add([seen_from((0.15, 0, 0), places_m(), 3)])
+    assert [pose.is_measured for pose in odometry.poses] == [True, True, is_measured, True]
+    assert odometry.poses[-1].x_m == pytest.approx(0.15, abs=5e-3)
+    assert velocity.velocity_m_s == pytest.approx([0.5, 0.0], abs=0.01)
+
+
 def test_odometry_without_groups_has_no_trajectory():
     with pytest.raises(DataError, match="there is no pose yet; add the images"):
         ertis.Odometry(MOUNTINGS).trajectory  # noqa: B018  it raises

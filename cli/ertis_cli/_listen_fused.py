@@ -1,16 +1,14 @@
 """Output of ``ertis listen --fuse``: one line per SYNC pulse."""
 
 import math
-import sys
-import time
-from collections import deque
 from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 import click
 
 from ertis_cli import options
-from ertis_cli._stop_signals import stopped_by_signals
+from ertis_cli._listen_pulses import listen_pulses
 
 if TYPE_CHECKING:
     from ertis_cli._mountings import Mounting
@@ -19,7 +17,6 @@ if TYPE_CHECKING:
 
 __all__ = ["listen_fused"]
 
-_POLL_INTERVAL_S = 0.1
 _HEAD = f"{'SYNC':>8}  {'age':>8}  {'points':>6}  {'nearest':24}  sensors"
 
 
@@ -37,33 +34,18 @@ def listen_fused(
     """Print one line per fused pulse until a signal, a count or a duration ends it."""
     from ertis_numba.network.fused_subscriber import FusedSubscriber
 
-    notes: deque[str] = deque()
-    begun_s, received = time.monotonic(), 0
-    end_s = math.inf if duration is None else begun_s + duration
-    with (
-        stopped_by_signals() as signals,
-        FusedSubscriber(
-            address, mountings=mountings, sensors=sensors or None, keys=keys, on_note=notes.append
-        ) as subscriber,
-    ):
-        signals.obey(subscriber.close)
-        if not as_json:
-            click.echo(_HEAD)
-        while received != n and not signals.came and time.monotonic() < end_s:
-            arrival = subscriber.receive(_POLL_INTERVAL_S)
-            while notes:
-                options.say(notes.popleft(), quiet=quiet)
-            if arrival is not None:
-                received += 1
-                _show(arrival, as_json=as_json)
-        dropped, skipped = subscriber.counts.dropped, subscriber.n_skipped
-    if as_json:
-        options.print_json({"event": "listened", "received": received, "dropped": dropped, "skipped": skipped})
-    options.say(f"{options.counted(received, 'pulse')}, {dropped} images dropped, {skipped} skipped", quiet=quiet)
-    if signals.came:
-        sys.exit(0 if n is None and duration is None else 128 + signals.came[0])
-    if n is not None and received < n:
-        raise click.ClickException(f"received {received} of {n} pulses in {duration:g} s; give a longer --duration")
+    listen_pulses(
+        address,
+        lambda on_note: FusedSubscriber(
+            address, mountings=mountings, sensors=sensors or None, keys=keys, on_note=on_note
+        ),
+        partial(_show, as_json=as_json),
+        head=_HEAD,
+        n=n,
+        duration=duration,
+        quiet=quiet,
+        as_json=as_json,
+    )
 
 
 def _show(arrival: "FusedArrival", *, as_json: bool) -> None:

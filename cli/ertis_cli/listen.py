@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ertis_cli import _listen_fused, _mountings, _network, options
+from ertis_cli import _listen_fused, _listen_odometry, _mountings, _network, options
 from ertis_cli._config import typed
 from ertis_cli._product_printer import PRINTERS, MicrophoneTable
 from ertis_cli._saving import PRODUCTS as FILED, saving
@@ -53,6 +53,17 @@ _POLL_INTERVAL_S = 0.1
     help="Energyscape file or, with --product raw, recording to write.",
 )
 @click.option("--fuse", is_flag=True, help="Fuse the images of all sensors, and print one line per SYNC pulse.")
+@click.option(
+    "--odometry", is_flag=True, help="Print the pose and the velocity of the platform, one line per SYNC pulse."
+)
+@click.option(
+    "--output",
+    "-o",
+    "trajectory",
+    type=click.Path(path_type=Path),
+    metavar="TRAJ.tum",
+    help="With --odometry: trajectory to write in the TUM format at the end.",
+)
 @_mountings.mounting
 @_network.key
 @_network.server_key
@@ -68,6 +79,8 @@ def listen(
     duration: float | None,
     target: Path | None,
     fuse: bool,
+    odometry: bool,
+    trajectory: Path | None,
     mounting: Path | None,
     key: str | None,
     server_key: str | None,
@@ -83,14 +96,17 @@ def listen(
     measurements, are saved to a file that appears complete at the end. If the central node disappears, the command
     waits for it. With --json, there is one line per event; the first one reports the connection.
 
-    With --fuse, this command fuses the images of all sensors. Their mountings are those that 'ertis capture' has sent,
-    or those of --mounting.
+    With --fuse, this command fuses the images of all sensors. With --odometry, it computes the path of their platform,
+    which starts at the origin and lies in the plane; -o writes the path when the command ends, also by Ctrl-C. The
+    mountings are those that 'ertis capture' has sent, or those of --mounting.
     """
-    _require_options_of(fuse=fuse)
-    if fuse:
-        _network.require_duration(duration)
-        _listen_fused.listen_fused(
+    _require_options_of(fuse=fuse, odometry=odometry)
+    if fuse or odometry:
+        _listen_by_pulse(
             address,
+            odometry=odometry,
+            target=trajectory,
+            force=force,
             sensors=sensors,
             mountings=_mountings.mountings(mounting, None),
             keys=_network.client_keys(key, server_key),
@@ -142,18 +158,32 @@ def listen(
         )
 
 
+def _listen_by_pulse(address: str, *, odometry: bool, target: Path | None, force: bool, **common: Any) -> None:
+    _network.require_duration(common["duration"])
+    if odometry:
+        _listen_odometry.listen_odometry(address, target=target, force=force, **common)
+    else:
+        _listen_fused.listen_fused(address, **common)
+
+
 def _require_one_product(target: Path | None, products: tuple[str, ...]) -> None:
     if target is not None and (len(products) > 1 or products[0] not in FILED):
         raise click.UsageError(f"--save writes one product; give only --product {' or '.join(FILED)}")
 
 
-def _require_options_of(*, fuse: bool) -> None:
-    """Refuse options that apply only with or only without --fuse."""
-    for name, option in (("products", "--product"), ("target", "--save")) if fuse else (("mounting", "--mounting"),):
+def _require_options_of(*, fuse: bool, odometry: bool) -> None:
+    """Refuse options that do not apply to the requested output."""
+    context = click.get_current_context()
+    if fuse and odometry:
+        raise click.UsageError("--fuse and --odometry exclude each other; run the command twice", context)
+    both = "--fuse and --odometry" if not (fuse or odometry) else "--fuse" if fuse else "--odometry"
+    for name, option in (("products", "--product"), ("target", "--save")) if fuse or odometry else ():
         if typed(name):
-            raise click.UsageError(
-                f"{option} applies only {'without' if fuse else 'with'} --fuse", click.get_current_context()
-            )
+            raise click.UsageError(f"{option} applies only without {both}", context)
+    if typed("mounting") and not (fuse or odometry):
+        raise click.UsageError("--mounting applies only with --fuse or --odometry", context)
+    if typed("trajectory") and not odometry:
+        raise click.UsageError("-o applies only with --odometry; --save FILE.h5 saves products", context)
 
 
 def _saved(save: "Write", arrival: "Arrival") -> Exception | None:

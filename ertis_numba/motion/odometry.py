@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.errors import DataError
 from ertis_numba.frames import Trajectory
-from ertis_numba.fusion.rig import Mountings, sensor_poses
+from ertis_numba.fusion.rig import MountedSensor, Mountings, sensor_poses
 from ertis_numba.motion.echoes import EchoExtractor, GroupEchoes
 from ertis_numba.motion.flow import FlowFit, fit_flow, twist_of
 from ertis_numba.motion.velocity import MAX_TIME_S, EgoVelocity, Item, grouped, stamp_of, velocity_of
@@ -153,6 +153,34 @@ class Odometry:
         places = np.array([(pose.x_m, pose.y_m) for pose in self._path]).reshape(-1, 2)
         return float(np.sum(np.hypot(*np.diff(places, axis=0).T)))
 
+    def remount(self, mountings: Mountings) -> None:
+        """Use other mountings for the groups to come, for example after a sensor was added.
+
+        Mountings that only append sensors keep the echoes of earlier groups. Otherwise, the next group is compared with
+        no earlier one.
+
+        Parameters
+        ----------
+        mountings : mapping of str to (translation_m, rotation_xyzw)
+
+        Raises
+        ------
+        ArgumentError
+            A mounting is missing or invalid.
+
+        Examples
+        --------
+        >>> import ertis_numba as ertis
+        >>> front, back = ((0.2, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)), ((-0.2, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
+        >>> odometry = ertis.Odometry({"front": front})
+        >>> odometry.remount({"front": front, "back": back})
+        """
+        poses = sensor_poses(mountings)
+        if not _begins_with(poses, self._poses):
+            self._begin(None)
+            self._is_moving_known = False
+        self._poses, self._extract = poses, EchoExtractor(poses)
+
     def add(self, group: Iterable[Item]) -> EgoVelocity | None:
         """Add the images of a SYNC pulse, and return the velocity since the one before.
 
@@ -203,11 +231,12 @@ class Odometry:
         self._last = echoes
         return velocity
 
-    def _begin(self, echoes: GroupEchoes) -> None:
+    def _begin(self, echoes: GroupEchoes | None) -> None:
         self._last, self._keyframe = echoes, None
 
     def _since_last(self, echoes: GroupEchoes, time_s: float) -> FlowFit | None:
-        assert self._last is not None  # noqa: S101  a first group sets it
+        if self._last is None:
+            return None
         if self._is_moving_known:
             expected = _displacement(self._twist, time_s)
             found = fit_flow(self._last, echoes, self._poses, time_s, start=expected, reach=_MAX_CHANGE * time_s)
@@ -240,6 +269,16 @@ class Odometry:
         assert self._last is not None  # noqa: S101  a first group sets it
         self._keyframe = _Keyframe(self._last, last, self._twist[:2])
         return step
+
+
+def _begins_with(poses: tuple[MountedSensor, ...], others: tuple[MountedSensor, ...]) -> bool:
+    """Return True if the first poses are those of others."""
+    return len(poses) >= len(others) and all(
+        one.name == other.name
+        and np.array_equal(one.translation_m, other.translation_m)
+        and np.array_equal(one.rotation, other.rotation)
+        for one, other in zip(poses, others, strict=False)
+    )
 
 
 def _displacement(twist: Floats, time_s: float) -> Floats:

@@ -1,0 +1,96 @@
+"""Loop of ``ertis listen`` over SYNC pulses: one line per pulse."""
+
+import math
+import sys
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any, Protocol, Self, TypeVar
+
+import click
+
+from ertis_cli import options
+from ertis_cli._product_printer import MicrophoneTable
+from ertis_cli._stop_signals import stopped_by_signals
+
+__all__ = ["Connect", "listen_pulses"]
+
+_POLL_INTERVAL_S = 0.1
+
+Arrival_co = TypeVar("Arrival_co", covariant=True)
+Arrival = TypeVar("Arrival")
+
+
+class _PulseSubscriber(Protocol[Arrival_co]):
+    counts: Any
+
+    def __enter__(self) -> Self: ...
+    def __exit__(self, *_: object) -> None: ...
+    @property
+    def connected(self) -> bool: ...
+    @property
+    def n_skipped(self) -> int: ...
+    def receive(self, timeout_s: float | None = None) -> Arrival_co | None: ...
+    def close(self) -> None: ...
+
+
+Connect = Callable[[Callable[[str], None]], _PulseSubscriber[Arrival]]
+"""Function that gets the receiver of notes, and returns a subscriber."""
+
+
+def listen_pulses(
+    address: str,
+    connect: Connect[Arrival],
+    show: Callable[[Arrival], None],
+    *,
+    head: str,
+    at_end: Callable[[Any], None] = lambda _: None,
+    n: int | None,
+    duration: float | None,
+    quiet: bool,
+    as_json: bool,
+) -> None:
+    """Show each pulse until a signal, a count or a duration ends the command.
+
+    Parameters
+    ----------
+    address : str
+    connect : callable
+    show : callable
+        Prints what arrived of a pulse.
+    head : str
+        Line above the lines of pulses; omitted with ``as_json``.
+    at_end : callable
+        Called with the subscriber at the end, also after an error.
+    n : int or None
+    duration : float or None
+    quiet, as_json : bool
+    """
+    notes: deque[str] = deque()
+    begun_s, received = time.monotonic(), 0
+    end_s = math.inf if duration is None else begun_s + duration
+    heard = MicrophoneTable(as_json=as_json, quiet=quiet)
+    with stopped_by_signals() as signals, connect(notes.append) as subscriber:
+        signals.obey(subscriber.close)
+        if not as_json:
+            click.echo(head)
+        try:
+            while received != n and not signals.came and time.monotonic() < end_s:
+                arrival = subscriber.receive(_POLL_INTERVAL_S)
+                if not subscriber.connected:
+                    heard.unanswered(address, time.monotonic() - begun_s)
+                while notes:
+                    heard.note(notes.popleft())
+                if arrival is not None:
+                    received += 1
+                    show(arrival)
+        finally:
+            at_end(subscriber)
+        dropped, skipped = subscriber.counts.dropped, subscriber.n_skipped
+    if as_json:
+        options.print_json({"event": "listened", "received": received, "dropped": dropped, "skipped": skipped})
+    options.say(f"{options.counted(received, 'pulse')}, {dropped} images dropped, {skipped} skipped", quiet=quiet)
+    if signals.came:
+        sys.exit(0 if n is None and duration is None else 128 + signals.came[0])
+    if n is not None and received < n:
+        raise click.ClickException(f"received {received} of {n} pulses in {duration:g} s; give a longer --duration")

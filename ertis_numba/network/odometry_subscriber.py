@@ -1,0 +1,205 @@
+"""Application node that computes the pose and velocity of a platform from images as they arrive."""
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Self
+
+from ertis_numba.frames import Stamp, Trajectory
+from ertis_numba.fusion.rig import Mountings
+from ertis_numba.motion import EgoVelocity, Odometry, PlanarPose
+from ertis_numba.motion.velocity import stamp_of
+from ertis_numba.network.keys import ClientKeys
+from ertis_numba.network.pulse_receiver import PulseReceiver, ReceivedPulse
+
+__all__ = ["OdometryArrival", "OdometrySubscriber"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OdometryArrival:
+    """Pose and velocity of a platform at a SYNC pulse.
+
+    Attributes
+    ----------
+    pose : PlanarPose
+        Pose relative to the first pulse.
+    velocity : EgoVelocity or None
+        Mean velocity since the pulse before; None at the first pulse, and if too few echoes match.
+    sync_count : int
+    sensors, missing : tuple of str
+        Sensors whose images were used, and other mounted sensors, which sent no image of this pulse.
+    n_lost : int
+        Pulses since the one before of which no image was used: none came, or the application was too slow.
+    ready_utc_ns : int
+        End of the computation, by the system clock of this machine.
+    is_timed : bool
+        True if the time of the pulse is a date; clocks that were never set begin at 1970.
+    """
+
+    pose: PlanarPose
+    velocity: EgoVelocity | None
+    sync_count: int
+    sensors: tuple[str, ...]
+    missing: tuple[str, ...]
+    n_lost: int
+    ready_utc_ns: int
+    is_timed: bool
+
+    @property
+    def age_s(self) -> float | None:
+        """Time in s from the emission to the end of the computation, if the clocks of both machines agree."""
+        return (self.ready_utc_ns - self.pose.timestamp_ns) / 1e9 if self.is_timed else None
+
+
+class OdometrySubscriber:
+    """Receiver of the images of a central node that computes a pose and a velocity for each SYNC pulse.
+
+    Use it in a ``with`` statement and a loop. All sensors belong to one platform. Images are grouped as by
+    `FusedSubscriber`: if a sensor sends no image of a pulse, the others determine the motion. If the application is too
+    slow, or pulses are lost, the next pulse is compared with the last one that was used. Pulses more than a second
+    apart have no velocity.
+
+    Parameters
+    ----------
+    address : str
+        Address at which the central node publishes, ``tcp://HOST:PORT``.
+    mountings : mapping of str to (translation_m, rotation_xyzw), optional
+        Mountings by sensor instead of those that the central node sends.
+    sensors : sequence of str, optional
+        All by default.
+    keys : ClientKeys, optional
+        None on loopback only.
+    on_note : callable, optional
+        Called with a line for each change of the connection, by a thread, and for each pulse that cannot be used.
+
+    Attributes
+    ----------
+    counts : SubscriberCounts
+        Counts of the images.
+
+    Raises
+    ------
+    ArgumentError
+        The address or a sensor cannot be used, or the address requires keys.
+
+    Examples
+    --------
+    >>> with OdometrySubscriber("tcp://127.0.0.1:5602") as subscriber:  # doctest: +SKIP
+    ...     for arrival in subscriber:
+    ...         print(arrival.pose.x_m, arrival.pose.y_m, arrival.velocity)
+    """
+
+    def __init__(
+        self,
+        address: str,
+        *,
+        mountings: Mountings | None = None,
+        sensors: Sequence[str] | None = None,
+        keys: ClientKeys | None = None,
+        on_note: Callable[[str], None] | None = None,
+    ) -> None:
+        self._note = on_note or (lambda _: None)
+        self._receiver = PulseReceiver(address, mountings=mountings, sensors=sensors, keys=keys, on_note=on_note)
+        self.counts = self._receiver.counts
+        self._mountings: Mountings = {}
+        self._odometry: Odometry | None = None
+        self._stamps: dict[str, Stamp] = {}  # of the last pulse, by sensor
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __iter__(self) -> Iterator[OdometryArrival]:
+        while (arrival := self.receive()) is not None:
+            yield arrival
+
+    @property
+    def connected(self) -> bool:
+        """True if a central node answers."""
+        return self._receiver.connected
+
+    @property
+    def n_skipped(self) -> int:
+        """Pulses that were not used, because the application was too slow."""
+        return self._receiver.n_skipped
+
+    @property
+    def trajectory(self) -> Trajectory | None:
+        """Poses at all pulses so far, as those of `Odometry.trajectory`; None before the first pulse."""
+        return self._odometry.trajectory if self._odometry is not None and self._odometry.poses else None
+
+    def receive(self, timeout_s: float | None = None) -> OdometryArrival | None:
+        """Return the pose and velocity at the next pulse; None after ``timeout_s``, or once the subscriber is closed.
+
+        A pulse that is not later than the one before, because a clock was set back, is noted and left out.
+
+        Parameters
+        ----------
+        timeout_s : float, optional
+            Time to wait; unlimited by default.
+
+        Raises
+        ------
+        RefusedError
+            The central node has refused this application from the start.
+        DataError
+            The mounting of a sensor is unknown.
+        """
+        end_s = None if timeout_s is None else time.monotonic() + timeout_s
+        while (
+            pulse := self._receiver.receive(None if end_s is None else max(0.0, end_s - time.monotonic()))
+        ) is not None:
+            arrival = self._added(pulse)
+            if arrival is not None:
+                return arrival
+        return None
+
+    def close(self) -> None:
+        """End the loop."""
+        self._receiver.close()
+
+    def _added(self, pulse: ReceivedPulse) -> OdometryArrival | None:
+        """Return the pose at a pulse; None if it is not later than the one before."""
+        odometry = self._odometry_with(pulse.mountings)
+        before_ns = odometry.poses[-1].timestamp_ns if odometry.poses else None
+        after_ns = stamp_of(pulse.images).timestamp_ns
+        if before_ns is not None and after_ns <= before_ns:
+            self._note(
+                f"SYNC pulse {next(iter(pulse.images.values())).stamp.sync_count} is left out: it is "
+                f"{(before_ns - after_ns) / 1e9:.3g} s before the last one; was a clock set back?"
+            )
+            return None
+        velocity = odometry.add(pulse.images.values())
+        stamps = {name: image.stamp for name, image in pulse.images.items()}
+        n_lost, self._stamps = _lost_between(self._stamps, stamps), stamps
+        first = next(iter(stamps.values()))
+        return OdometryArrival(
+            odometry.poses[-1],
+            velocity,
+            first.sync_count,
+            tuple(name for name in pulse.mountings if name in stamps),
+            pulse.missing,
+            n_lost,
+            time.time_ns(),
+            first.is_timed,
+        )
+
+    def _odometry_with(self, mountings: Mountings) -> Odometry:
+        if self._odometry is None:
+            self._odometry = Odometry(mountings)
+        elif mountings != self._mountings:
+            self._odometry.remount(mountings)
+        self._mountings = mountings
+        return self._odometry
+
+
+def _lost_between(before: dict[str, Stamp], after: dict[str, Stamp]) -> int:
+    """Return the number of pulses between two; 0 if no sensor has counted them in the same session."""
+    counted = [
+        after[name].sync_count - stamp.sync_count - 1
+        for name, stamp in before.items()
+        if name in after and after[name].session_id == stamp.session_id
+    ]
+    return max(0, *counted) if counted else 0

@@ -1,0 +1,206 @@
+"""Receiver of the images of all sensors of a platform, one group for each SYNC pulse."""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final, TypeAlias
+
+from ertis_numba.errors import DataError
+from ertis_numba.frames import Energyscape, Stamp
+from ertis_numba.fusion.pulses import PulseGroups
+from ertis_numba.fusion.rig import Mountings
+from ertis_numba.network.keys import ClientKeys
+from ertis_numba.network.subscriber import Subscriber, SubscriberCounts
+
+__all__ = ["PulseReceiver", "ReceivedPulse"]
+
+_Place: TypeAlias = tuple[tuple[float, float, float], tuple[float, float, float, float]]
+
+_POLL_S: Final = 0.05
+_PATIENCE_S: Final = 0.25  # Time after which a pulse is returned without the images that are missing.
+_MAX_WAITING: Final = 2  # Pulses that wait here; a slow application gets the latest ones.
+_CREDIT: Final = 16  # Images under way: those of two pulses of eight sensors.
+_STOP_S: Final = 5.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReceivedPulse:
+    """Images of a SYNC pulse, and the mountings of all sensors so far.
+
+    Attributes
+    ----------
+    images : mapping of str to Energyscape
+        Images by sensor.
+    mountings : mapping of str to (translation_m, rotation_xyzw)
+        Mountings by sensor, in the order in which they became known.
+    first_ns : int
+        Emission, by the monotonic clock of the sensor node.
+    """
+
+    images: Mapping[str, Energyscape]
+    mountings: Mountings
+    first_ns: int
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """Sensors whose mounting is known, but not their image."""
+        return tuple(name for name in self.mountings if name not in self.images)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Received:
+    image: Energyscape
+    mounting: _Place
+    emitted_ns: int
+
+    @property
+    def stamp(self) -> Stamp:
+        return self.image.stamp
+
+
+class PulseReceiver:
+    """Receiver that groups the images of a central node by SYNC pulse, in a thread.
+
+    A pulse is complete when all sensors of the pulse before have sent their image. After 0.25 s, it is returned without
+    the missing ones. An application that is too slow gets the latest pulses.
+
+    Parameters
+    ----------
+    address : str
+        Address at which the central node publishes, ``tcp://HOST:PORT``.
+    mountings : mapping of str to (translation_m, rotation_xyzw), optional
+        Mountings by sensor instead of those that the central node sends.
+    sensors : sequence of str, optional
+        All by default.
+    keys : ClientKeys, optional
+        None on loopback only.
+    on_note : callable, optional
+        Called by a thread with a line for each change of the connection.
+
+    Attributes
+    ----------
+    counts : SubscriberCounts
+        Counts of the images.
+    n_skipped : int
+        Pulses that were not returned, because the application was too slow.
+
+    Raises
+    ------
+    ArgumentError
+        The address or a sensor cannot be used, or the address requires keys.
+    """
+
+    def __init__(
+        self,
+        address: str,
+        *,
+        mountings: Mountings | None = None,
+        sensors: Sequence[str] | None = None,
+        keys: ClientKeys | None = None,
+        on_note: Callable[[str], None] | None = None,
+    ) -> None:
+        wanted = {sensors} if isinstance(sensors, str) else sensors
+        self._given = {
+            name: _as_tuples(*place) for name, place in (mountings or {}).items() if wanted is None or name in wanted
+        }
+        self._subscriber: Subscriber[Energyscape] = Subscriber(
+            address, products=("energyscape",), sensors=sensors, keys=keys, on_note=on_note, credit=_CREDIT
+        )
+        self.counts: SubscriberCounts = self._subscriber.counts
+        self.n_skipped = 0
+        self._groups: PulseGroups[_Received] = PulseGroups.of(self._given)
+        self._changed = threading.Condition()
+        self._waiting: deque[dict[str, _Received]] = deque()
+        self._failure: Exception | None = None
+        self._mountings: dict[str, _Place] = dict(self._given)
+        self._thread = threading.Thread(target=self._run, name="ertis-pulse-receiver", daemon=True)
+        self._thread.start()
+
+    @property
+    def connected(self) -> bool:
+        """True if a central node answers."""
+        return self._subscriber.connected
+
+    def receive(self, timeout_s: float | None = None) -> ReceivedPulse | None:
+        """Return the images of the next pulse; None after ``timeout_s``, or once the receiver is closed.
+
+        Parameters
+        ----------
+        timeout_s : float, optional
+            Time to wait; unlimited by default.
+
+        Raises
+        ------
+        RefusedError
+            The central node has refused this application from the start.
+        DataError
+            The mounting of a sensor is unknown.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: self._waiting or self._failure or self._subscriber.closed, timeout_s)
+            if self._failure is not None:
+                raise self._failure
+            if not self._waiting or self._subscriber.closed:
+                return None
+            group = self._waiting.popleft()
+        self._mountings = self._mountings | {name: each.mounting for name, each in group.items()}
+        return ReceivedPulse(
+            {name: each.image for name, each in group.items()},
+            self._mountings,
+            min(each.emitted_ns for each in group.values()),
+        )
+
+    def close(self) -> None:
+        """End waiting calls of `receive`."""
+        self._subscriber.close()
+        with self._changed:
+            self._changed.notify_all()
+        if threading.current_thread() is not self._thread:
+            self._thread.join(_STOP_S)
+
+    def _run(self) -> None:
+        """Form groups until `close`."""
+        latest_s = time.monotonic()
+        try:
+            while not self._subscriber.closed:
+                image = self._subscriber.receive(_POLL_S)
+                if image is not None:
+                    latest_s = time.monotonic()
+                    for group in self._groups.add(self._received(image)):
+                        self._put(group)
+                elif time.monotonic() - latest_s > _PATIENCE_S and (group := self._groups.close()):
+                    self._put(group)
+        except Exception as error:  # noqa: BLE001  whatever it is, who waits must not do so for ever
+            with self._changed:
+                self._failure = error
+                self._changed.notify_all()
+
+    def _received(self, image: Energyscape) -> _Received:
+        arrival = self._subscriber.latest
+        assert arrival is not None  # noqa: S101  it belongs to the image
+        sensor = image.stamp.sensor
+        mounting = self._given.get(sensor)
+        if mounting is None and arrival.translation_m is not None and arrival.rotation_xyzw is not None:
+            mounting = arrival.translation_m, arrival.rotation_xyzw
+        if mounting is None:
+            raise DataError(
+                f"the mounting of sensor {sensor!r} is unknown; give its mounting here, or start 'ertis capture' with "
+                "--mounting"
+            )
+        return _Received(image, mounting, arrival.header.monotonic_ns)  # type: ignore[union-attr]  # of an image
+
+    def _put(self, group: dict[str, _Received]) -> None:
+        with self._changed:
+            self._waiting.append(group)
+            while len(self._waiting) > _MAX_WAITING:
+                self._waiting.popleft()
+                self.n_skipped += 1
+            self._changed.notify_all()
+
+
+def _as_tuples(translation_m: Sequence[float], rotation_xyzw: Sequence[float]) -> _Place:
+    x, y, z = map(float, translation_m)
+    i, j, k, w = map(float, rotation_xyzw)
+    return (x, y, z), (i, j, k, w)

@@ -1,0 +1,300 @@
+"""Poses and velocities of a platform from the images of a central node, as an application receives them."""
+
+import json
+import math
+import re
+import signal
+import subprocess
+import sys
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from ertis_cli.main import cli
+
+import ertis_numba as ertis
+from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.network.odometry_subscriber import OdometrySubscriber
+from tests.pages import environment
+from tests.publishing import Publisher, image
+
+AHEAD, BEHIND = (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 1.0, 0.0)
+MOUNTINGS = {"front": ((0.2, 0.0, 0.0), AHEAD), "back": ((-0.2, 0.0, 0.0), BEHIND)}
+STEP_M, STEP_RAD = np.array([0.05, 0.01]), math.radians(1.0)
+MOUNTING_FILE = (
+    '[[sensors]]\nname = "front"\nposition_m = [0.2, 0.0, 0.0]\n\n'
+    '[[sensors]]\nname = "back"\nposition_m = [-0.2, 0.0, 0.0]\nyaw_deg = 180.0\n'
+)
+
+
+def places_m():
+    """Reflectors around the path, at most one in each direction from a sensor."""
+    draws = np.random.default_rng(4)
+    angle_rad = np.radians(np.concatenate([np.arange(-40, 41, 16), 180 + np.arange(-40, 41, 16)]))
+    range_m = draws.uniform(1.2, 2.4, len(angle_rad))
+    return np.column_stack([range_m * np.cos(angle_rad), range_m * np.sin(angle_rad)])
+
+
+def seen(pulse, sensor, **stamp):
+    """The image of a sensor of the platform, which moves by a constant step at each pulse."""
+    yaw_rad, position_m = pulse * STEP_RAD, pulse * STEP_M
+    facing_rad = yaw_rad + (math.pi if sensor == "back" else 0.0)
+    x_m = MOUNTINGS[sensor][0][0]
+    relative_m = places_m() - position_m - x_m * np.array([math.cos(yaw_rad), math.sin(yaw_rad)])
+    azimuth_deg = np.degrees(np.arctan2(relative_m[:, 1], relative_m[:, 0]) - facing_rad)
+    azimuth_deg = (azimuth_deg + 180) % 360 - 180
+    reflectors = [
+        (float(azimuth), float(range_m), 0.5)
+        for azimuth, range_m in zip(azimuth_deg, np.hypot(*relative_m.T), strict=True)
+        if abs(azimuth) < 60
+    ]
+    return image(pulse, sensor=sensor, reflectors=reflectors, **stamp)
+
+
+def pulses(*numbers, absent=()):
+    return [[seen(number, sensor) for sensor in MOUNTINGS if (number, sensor) not in absent] for number in numbers]
+
+
+def images(*numbers, **options):
+    return [each for pulse in pulses(*numbers, **options) for each in pulse]
+
+
+class MountedPublisher(Publisher):
+    """Publisher that sends the mounting of each sensor."""
+
+    def _describe(self, item, key, peer):
+        self.translation_m, self.rotation_xyzw = MOUNTINGS[item.stamp.sensor]
+        return super()._describe(item, key, peer)
+
+
+def received(sent, last, *, publisher_type=Publisher, notes=None, **options):
+    """Return arrivals until that of a SYNC pulse, by count, and the trajectory; each pulse waits for the one before."""
+    found, used = {}, threading.Semaphore(0)
+
+    def one_by_one():
+        for pulse in sent:
+            yield from pulse
+            assert used.acquire(timeout=20.0)
+
+    def note(text):
+        if notes is not None and text.startswith("SYNC pulse"):
+            notes.append(text)
+            used.release()
+
+    with (
+        publisher_type() as publisher,
+        publisher.playing(one_by_one()),
+        OdometrySubscriber(publisher.address, **{"mountings": MOUNTINGS, "on_note": note} | options) as subscriber,
+    ):
+        while last not in found:
+            arrival = subscriber.receive(20.0)
+            assert arrival is not None
+            found[arrival.sync_count] = arrival
+            used.release()
+        return found, subscriber.trajectory
+
+
+def assert_at_step(pose, number):
+    assert (pose.x_m, pose.y_m) == pytest.approx(tuple(number * STEP_M), abs=1e-3)
+    assert pose.yaw_rad == pytest.approx(number * STEP_RAD, abs=2e-3)
+
+
+def test_poses_and_velocities_are_those_of_the_platform():
+    found, trajectory = received(pulses(*range(4)), 3)
+    last = found[3]
+    assert_at_step(last.pose, 3)
+    assert math.hypot(*last.velocity.velocity_m_s) == pytest.approx(np.hypot(*STEP_M) / 0.1, abs=0.02)
+    assert last.velocity.yaw_rate_rad_s == pytest.approx(STEP_RAD / 0.1, abs=0.02)
+    assert (last.sensors, last.missing, last.age_s > 0) == (("front", "back"), (), True)
+    assert (list(found), found[0].velocity) == ([0, 1, 2, 3], None)
+    assert trajectory.time_ns.tolist() == [arrival.pose.timestamp_ns for arrival in found.values()]
+    np.testing.assert_allclose(trajectory.position_m[-1], [*(3 * STEP_M), 0.0], atol=1e-3)
+
+
+def test_missing_sensor_is_named_and_the_others_determine_the_motion():
+    found, _ = received(pulses(0, 1, 2, 3, absent={(number, "back") for number in (1, 2, 3)}), 3)
+    assert (found[3].sensors, found[3].missing) == (("front",), ("back",))
+    assert found[3].pose.is_measured
+    assert_at_step(found[3].pose, 3)
+
+
+def test_lost_pulses_are_counted_and_bridged():
+    found, _ = received(pulses(0, 1, 4), 4)
+    assert [arrival.n_lost for arrival in found.values()] == [0, 0, 2]
+    assert found[4].pose.is_measured
+    assert_at_step(found[4].pose, 4)
+
+
+def test_pulses_of_another_session_are_not_lost():
+    restarted = [each.replace(stamp=replace(each.stamp, session_id=8, sync_count=50)) for each in images(2)]
+    found, _ = received([*pulses(0, 1), restarted], 50)
+    assert found[50].n_lost == 0
+    assert_at_step(found[50].pose, 2)
+
+
+def test_pulse_after_a_long_gap_has_no_velocity():
+    found, _ = received(pulses(0, 1, 20), 20)
+    assert (found[20].velocity, found[20].pose.is_measured) == (None, False)
+
+
+def test_sensor_that_joins_with_a_mounting_of_the_central_node_is_used():
+    sent = pulses(*range(6), absent={(0, "back"), (1, "back")})
+    found, _ = received(sent, 5, publisher_type=MountedPublisher, mountings=None)
+    assert set(found[5].sensors) == {"front", "back"}
+    assert [arrival.sensors for arrival in found.values()][:2] == [("front",), ("front",)]
+    assert found[5].velocity.n_matches > 8  # The front sensor has six reflectors.
+    assert_at_step(found[5].pose, 5)
+
+
+def test_pulse_of_a_clock_that_was_set_back_is_left_out_and_noted():
+    early = seen(1, "front").stamp.timestamp_ns - 250_000_000
+    notes = []
+    sent = [*pulses(0, 1), [seen(2, sensor, timestamp_ns=early) for sensor in MOUNTINGS], *pulses(3)]
+    found, _ = received(sent, 3, notes=notes)
+    assert notes == ["SYNC pulse 2 is left out: it is 0.25 s before the last one; was a clock set back?"]
+    assert (list(found), found[3].n_lost) == ([0, 1, 3], 1)
+    assert_at_step(found[3].pose, 3)
+
+
+def test_unknown_mounting_of_a_sensor_is_an_error():
+    with Publisher() as publisher:
+        publisher.translation_m = publisher.rotation_xyzw = None
+        with (
+            publisher.playing(images(0)),
+            OdometrySubscriber(publisher.address) as subscriber,
+            pytest.raises(DataError, match="the mounting of sensor 'front' is unknown; give its mounting here"),
+        ):
+            subscriber.receive(20.0)
+        assert subscriber.trajectory is None
+
+
+def test_closed_odometry_subscriber_ends_the_loop():
+    with Publisher() as publisher, publisher.playing([]), OdometrySubscriber(publisher.address) as subscriber:
+        assert subscriber.receive(0.05) is None
+        subscriber.close()
+        assert list(subscriber) == []
+
+
+def test_invalid_address_is_refused():
+    with pytest.raises(ArgumentError, match="nowhere"):
+        OdometrySubscriber("nowhere")
+
+
+@pytest.fixture
+def mounting(tmp_path):
+    path = tmp_path / "mounting.toml"
+    path.write_text(MOUNTING_FILE)
+    return path
+
+
+def test_listen_prints_poses_and_writes_the_trajectory(tmp_path, mounting):
+    target = tmp_path / "path.tum"
+    arguments = ["--odometry", "--mounting", str(mounting), "-n", "2", "--duration", "30", "-o", str(target)]
+    with Publisher() as publisher, publisher.playing(images(*range(6))):
+        shown = CliRunner().invoke(cli, ["listen", publisher.address, *arguments, "--json"])
+    assert shown.exit_code == 0, shown.output
+    first, second, summary = map(json.loads, shown.stdout.splitlines())
+    assert (first["event"], first["x_m"], first["velocity_m_s"], first["measured"]) == ("odometry", 0.0, None, True)
+    assert math.hypot(*second["velocity_m_s"]) == pytest.approx(np.hypot(*STEP_M) / 0.1, abs=0.02)
+    assert second["yaw_rate_deg_s"] == pytest.approx(10.0, abs=1.0)
+    assert (second["sensors"], second["missing"], np.shape(second["covariance"])) == (["front", "back"], [], (3, 3))
+    assert second["lost"] == second["sync_count"] - first["sync_count"] - 1
+    assert (summary["received"], summary["dropped"]) == (2, 0)
+    assert f"{target}: 2 poses" in shown.stderr
+    path = ertis.read_trajectory(target)
+    assert path.time_ns.tolist() == [first["timestamp_ns"], second["timestamp_ns"]]
+    assert path.position_m[1].tolist() == pytest.approx([second["x_m"], second["y_m"], 0.0], abs=1e-5)
+
+
+def test_listen_prints_a_line_per_pose(mounting):
+    sent = images(0, 1, 2, 20, absent={(20, "back")})
+    arguments = ["--odometry", "--mounting", str(mounting), "--duration", "3"]
+    with Publisher() as publisher, publisher.playing(sent):
+        shown = CliRunner().invoke(cli, ["listen", publisher.address, *arguments])
+    assert shown.exit_code == 0, shown.output
+    head, *_, last = shown.stdout.splitlines()
+    assert head.split() == ["SYNC", "age", "x", "y", "yaw", "speed", "yaw", "rate", "sensors"]
+    assert re.search(r" -   +-  front, without back, \d+ pulses lost, last velocity assumed$", last)
+
+
+def test_ctrl_c_ends_listen_and_writes_the_trajectory(tmp_path, mounting):
+    target = tmp_path / "path.tum"
+    command = [sys.executable, "-m", "ertis_cli.main", "listen"]
+    with Publisher() as publisher, publisher.playing(images(0, 1)):
+        arguments = [publisher.address, "--odometry", "--mounting", str(mounting), "--json", "-o", str(target)]
+        with subprocess.Popen(
+            [*command, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment(tmp_path)
+        ) as process:
+            first = json.loads(process.stdout.readline())
+            process.send_signal(signal.SIGINT)
+            rest, errors = process.communicate()
+    assert process.returncode == 0, errors
+    assert json.loads(rest.splitlines()[-1])["event"] == "listened"
+    assert ertis.read_trajectory(target).time_ns[0] == first["timestamp_ns"]
+
+
+def test_failure_of_listen_keeps_earlier_poses(tmp_path):
+    """The mounting of the second sensor is unknown."""
+    (tmp_path / "front.toml").write_text('[[sensors]]\nname = "front"\nposition_m = [0.2, 0.0, 0.0]\n')
+    target = tmp_path / "path.tum"
+    arguments = ["--odometry", "--mounting", str(tmp_path / "front.toml"), "--json", "-o", str(target)]
+    command = [sys.executable, "-m", "ertis_cli.main", "listen"]
+    came = threading.Event()
+
+    def items():
+        yield seen(0, "front")
+        assert came.wait(60.0)
+        yield seen(1, "back")
+
+    with Publisher() as publisher:
+        publisher.translation_m = publisher.rotation_xyzw = None
+        with (
+            publisher.playing(items()),
+            subprocess.Popen(
+                [*command, publisher.address, *arguments],
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+                env=environment(tmp_path),
+            ) as process,
+        ):
+            process.stdout.readline()
+            came.set()
+            _, errors = process.communicate()
+    assert (process.returncode, "the mounting of sensor 'back' is unknown" in errors) == (1, True), errors
+    assert len(ertis.read_trajectory(target).time_ns) == 1
+
+
+def test_listen_without_pulses_writes_no_trajectory(tmp_path):
+    target = tmp_path / "path.tum"
+    with Publisher() as publisher, publisher.playing([]):
+        arguments = ["--odometry", "-o", str(target), "--duration", "0.3"]
+        shown = CliRunner().invoke(cli, ["listen", publisher.address, *arguments])
+    assert shown.exit_code == 0, shown.output
+    assert f"{target} is not written, because no pulse was received" in shown.stderr
+    assert not target.exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--odometry", "--fuse"], "--fuse and --odometry exclude each other"),
+        (["--odometry", "--product", "points"], "--product applies only without --odometry"),
+        (["--odometry", "--save", "a.h5"], "--save applies only without --odometry"),
+        (["--fuse", "-o", "a.tum"], "-o applies only with --odometry; --save FILE.h5 saves products"),
+        (["-o", "a.tum"], "-o applies only with --odometry"),
+    ],
+)
+def test_listen_refuses_options_that_do_not_fit_odometry(arguments, message):
+    shown = CliRunner().invoke(cli, ["listen", "tcp://127.0.0.1:5602", *arguments])
+    assert (shown.exit_code, message in shown.output) == (2, True), shown.output
+
+
+def test_listen_refuses_an_existing_trajectory_at_once(tmp_path):
+    target = tmp_path / "path.tum"
+    target.write_text("mine")
+    shown = CliRunner().invoke(cli, ["listen", "tcp://127.0.0.1:1", "--odometry", "-o", str(target)])
+    assert (shown.exit_code, target.read_text()) == (1, "mine"), shown.output
+    assert "path.tum exists; give another name" in str(shown.exception) + shown.output
