@@ -17,6 +17,7 @@ from ertis_numba.fusion.rig import Mountings, sensor_poses
 from ertis_numba.geometry import mounting
 from ertis_numba.mapping.cell_grid import CellGrid
 from ertis_numba.mapping.sensor_model import Coverage, LocatedEchoes, UsualAmplitude, add_evidence, echoes_of
+from ertis_numba.motion import compensate_motion
 
 __all__ = ["Mapper", "Pose"]
 
@@ -104,7 +105,8 @@ class Mapper:
             At most one image of each sensor. Sensors may be missing.
         pose : (translation_m, rotation_xyzw) or Trajectory
             Pose of the platform in the world frame: position x, y, z in metres, and the unit quaternion x, y, z, w that
-            rotates the platform frame into the world frame. A trajectory is interpolated at the time of the pulse.
+            rotates the platform frame into the world frame. A trajectory is interpolated at the time of the pulse, and
+            its velocity compensates the motion during the measurement (`compensate_motion`).
         fused : Fused, optional
             Result of a `Fuser` with the same mountings for these images, if it is available; computed by default.
 
@@ -126,7 +128,8 @@ class Mapper:
         window = self._grid.window(place_m, reach_m)
         self._decay(time_ns)
         heading_rad = math.atan2(rotation[1, 0], rotation[0, 0])
-        echoes = self._echoes(fused.points, translation_m, rotation, heading_rad)
+        points = _at_rest(fused.points, pose, rotation) if isinstance(pose, Trajectory) else fused.points
+        echoes = self._echoes(points, translation_m, rotation, heading_rad)
         add_evidence(window, place_m, heading_rad, echoes, coverage, near_m=self._near_m)
         np.clip(window.log_odds, -_MAX_LOG_ODDS, _MAX_LOG_ODDS, out=window.log_odds)
         self._n_groups += 1
@@ -167,6 +170,14 @@ class Mapper:
         uncertainty_m = np.zeros((len(points), 2)) if points.uncertainty_m is None else points.uncertainty_m
         strength = self._usual.strength(points.amplitude[kept])
         return echoes_of(level_m, np.asarray(uncertainty_m, np.float64)[kept], strength)
+
+
+def _at_rest(points: PointCloud, trajectory: Trajectory, rotation: Floats) -> PointCloud:
+    """Return points compensated for the velocity of a trajectory."""
+    if len(trajectory) == 1:
+        return points
+    linear_m_s, angular_rad_s = (each[0] @ rotation for each in trajectory.velocity_at([points.stamp.timestamp_ns]))
+    return compensate_motion(points, linear_m_s.tolist(), float(angular_rad_s[2]))
 
 
 def _pose(pose: Pose, time_ns: int) -> tuple[Floats, Floats]:
