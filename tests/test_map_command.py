@@ -92,6 +92,19 @@ def test_map_writes_pictures_for_ros_and_points(folder):
     assert (folder / "place.ply").read_bytes().startswith(b"ply\n")
 
 
+def test_plot_draws_a_map(folder):
+    run(folder, "both.h5 --poses poses.tum -q -o drawn.h5")
+    for line in (f"plot {folder / 'drawn.h5'}", f"plot {folder / 'drawn.h5'} --kind map -o {folder / 'again.png'}"):
+        done = CliRunner().invoke(cli, line.split())
+        assert done.exit_code == 0, done.output
+        assert "map of" in done.stderr
+    assert (folder / "drawn.png").read_bytes() == (folder / "again.png").read_bytes()
+    done = CliRunner().invoke(cli, ["plot", str(folder / "drawn.h5"), "--kind", "slices", "--force"])
+    assert "is an occupancy map; give a recording or an energyscape file" in done.stderr
+    done = CliRunner().invoke(cli, ["plot", str(folder / "both.h5"), "--kind", "map", "--force"])
+    assert "is HDF5, but not an occupancy map" in done.stderr
+
+
 def test_map_leaves_out_pulses_outside_of_the_poses(folder):
     ertis.write_tum(folder / "late.tum", poses(start_ns=50_000_000))
     done = run(folder, "both.h5 --poses late.tum --json -o late.h5")

@@ -14,6 +14,7 @@ from plyfile import PlyData
 import ertis_numba as ertis
 from ertis_numba.errors import ArgumentError, DamagedError, DataError
 from ertis_numba.fusion.rig import sensor_poses
+from ertis_numba.mapping import sensor_model
 from ertis_numba.mapping.cell_grid import CellGrid
 from ertis_numba.mapping.sensor_model import Coverage, add_evidence, echoes_of
 from ertis_numba.simulation import Box, Point
@@ -167,16 +168,17 @@ def test_passive_measurements_are_refused():
         ertis.Mapper(mountings()).add(passive, pose)
 
 
-def test_evidence_of_a_point_is_that_of_its_ellipse():
+def test_evidence_of_a_point_is_that_of_its_ellipse(monkeypatch):
     """The sum over all cells is that of one echo, and its spread that of the point's uncertainty."""
+    monkeypatch.setattr(sensor_model, "_FREE", 0.0)
     grid = CellGrid(0.02)
     place_m = np.zeros(2)
     echoes = echoes_of(np.array([[2.0, 0.0]]), np.array([[0.05, 0.2]]), np.ones(1))
-    coverage = Coverage(np.zeros((360, 300)), 0.01)
+    coverage = Coverage(np.ones((360, 300)), 0.01)
     window = grid.window(place_m, 3.0)
     add_evidence(window, place_m, 0.0, echoes, coverage, near_m=0.0)
     total = float(window.log_odds.sum())
-    assert total == pytest.approx(1.4, rel=0.02)
+    assert total == pytest.approx(2.4, rel=0.02)
     spread = [
         math.sqrt(float((window.log_odds * offset**2).sum()) / total)
         for offset in ((window.x_m - 2.0)[None, :], window.y_m[:, None])
@@ -184,11 +186,12 @@ def test_evidence_of_a_point_is_that_of_its_ellipse():
     assert spread == pytest.approx(echoes.sd_m[0].tolist(), rel=0.05)
 
 
-def test_doubtful_echoes_behind_a_clear_one_weigh_less():
+def test_doubtful_echoes_behind_a_clear_one_weigh_less(monkeypatch):
+    monkeypatch.setattr(sensor_model, "_FREE", 0.0)
     grid = CellGrid(0.05)
     echoes = echoes_of(np.array([[1.0, 0.0], [2.0, 0.0]]), np.full((2, 2), 0.01), np.ones(2))
     window = grid.window(np.zeros(2), 3.0)
-    add_evidence(window, np.zeros(2), 0.0, echoes, Coverage(np.zeros((360, 60)), 0.05), near_m=0.0)
+    add_evidence(window, np.zeros(2), 0.0, echoes, Coverage(np.ones((360, 60)), 0.05), near_m=0.0)
     near, far = (window.around(np.array([x_m, 0.0]), 0.3).log_odds.sum() for x_m in (1.0, 2.0))
     assert far == pytest.approx(0.1 * near, rel=0.1)
 

@@ -289,7 +289,7 @@ def motion(**given: Any) -> None:
 
 
 @bench.command("map")
-@click.option("--count", type=click.IntRange(min=0), default=3, show_default=True, metavar="N", help="Rooms.")
+@click.option("--count", type=click.IntRange(min=0), default=1, show_default=True, metavar="N", help="Rooms.")
 @click.option(
     "--poses", type=click.IntRange(min=1), default=40, show_default=True, metavar="N", help="Poses in each room."
 )

@@ -28,6 +28,7 @@ _KINDS = {
     "signals": "microphone signals and their spectrogram",
     "matched-filter": "output of the matched filter for each microphone",
     "array": "array layout and beam pattern",
+    "map": "an occupancy map from above, chosen for its file",
     "calibration": "residuals and beam pattern before and after a calibration with all measurements of a reflector",
 }
 _OF_IMAGES = ("image", "polar", "projection", "slices")
@@ -47,7 +48,7 @@ _ONLY = {
 
 
 @click.command(epilog="Kinds: " + "; ".join(f"{name}: {about}" for name, about in _KINDS.items()) + ".")
-@options.input_file("IMG.h5|REC.h5|SETTINGS.toml|LAYOUT")
+@options.input_file("IMG.h5|REC.h5|MAP.h5|SETTINGS.toml|LAYOUT")
 @click.option(
     "--kind",
     type=click.Choice(list(_KINDS)),
@@ -130,7 +131,7 @@ def plot(
     """
     from ertis_numba import checks, figures
     from ertis_numba.errors import DataError
-    from ertis_numba.storage import atomic_write, check_target
+    from ertis_numba.storage import atomic_write, check_target, is_map, read_map
 
     given: dict[str, object] = {
         "sensor": sensor,
@@ -147,6 +148,7 @@ def plot(
                 f"--{name} is for --kind {', '.join(_ONLY[name])}; remove it with {kind}",
                 click.get_current_context(),
             )
+    kind = "map" if kind == "image" and is_map(path) else kind
     if kind != "array":
         _require_no_array(path)
     if not path.name:  # "." and "/" give no name for the picture
@@ -176,6 +178,9 @@ def plot(
         made, settings = _calibrated(path, sensor)
         figure = figures.calibration(made, settings, azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, **look)
         reported = f"calibration with {path}"
+    elif kind == "map":
+        del look["dynamic_range_db"]
+        figure, reported = figures.occupancy(read_map(path), **look), f"map of {path}"
     else:
         index = measurement or 0
         if kind in _OF_RECORDINGS:

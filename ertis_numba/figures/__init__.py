@@ -16,12 +16,12 @@ from ertis_numba import checks
 from ertis_numba.analysis.side_lobes import without_side_lobes
 from ertis_numba.calibration import Calibration
 from ertis_numba.errors import ArgumentError
-from ertis_numba.figures import _array, _calibration, _captions, _images, _pareto_front, _signals, _slices
+from ertis_numba.figures import _array, _calibration, _captions, _images, _map, _pareto_front, _signals, _slices
 from ertis_numba.figures._canvas import Canvas
 from ertis_numba.figures._page import compose
 from ertis_numba.figures._pareto_front import Rated
 from ertis_numba.figures.style import StyleOptions, parameters, style_of
-from ertis_numba.frames import Energyscape, Measurement, Peak
+from ertis_numba.frames import Energyscape, Measurement, OccupancyMap, Peak
 from ertis_numba.settings import Array, Settings
 
 __all__ = [
@@ -31,6 +31,7 @@ __all__ = [
     "calibration",
     "front",
     "matched_filter",
+    "occupancy",
     "plot",
     "polar",
     "projection",
@@ -346,6 +347,28 @@ def front(points: Sequence[Rated], *, title: str, note: str = "", **look: Unpack
         The theme is unknown.
     """
     return _pareto_front.draw(style_of(**look), points, title=title, note=note)
+
+
+def occupancy(found: OccupancyMap, **look: Unpack[StyleOptions]) -> Figure:
+    """Draw an occupancy map from above: white for free, grey for unknown, and black for occupied cells.
+
+    Parameters
+    ----------
+    found : OccupancyMap
+    **look
+        As for `plot`.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    ArgumentError
+        An argument is invalid.
+    """
+    checks.instance("found", found, OccupancyMap, "Mapper.map returns")
+    return _map.draw(style_of(**look), found)
 
 
 def save(figure: Figure, target: str | Path | IO[bytes], *, format: str | None = None) -> None:  # noqa: A002 - as savefig

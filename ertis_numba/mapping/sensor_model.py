@@ -18,7 +18,7 @@ Singles = NDArray[np.float32]
 
 N_AZIMUTHS: Final = 360
 """Directions for free space, of 1°."""
-_OCCUPIED: Final = 1.4  # Log-odds of a cell that certainly contains a clear echo.
+_OCCUPIED: Final = 2.4  # Log-odds of a cell that certainly contains a clear echo.
 _FREE: Final = 0.6  # Log-odds of a cell in front of the first clear echo, near the platform.
 _FREE_M: Final = 1.0  # Free range in directions without any clear echo.
 _IN_FRONT_M: Final = 0.05  # Space in front of an echo that is not free yet.
@@ -28,6 +28,7 @@ _BEHIND: Final = 0.1  # Weight of doubtful echoes, which may have travelled over
 _CLEAR: Final = 0.6  # Weight of a clear echo.
 _HALF_BEAM: Final = 5  # Directions beside an echo in which it may hide others.
 _USUAL: Final = 50.0  # Percentile of the amplitudes of a pulse that is the usual one.
+_DISTRUST: Final = 0.25  # Exponent of the coverage in the weight of echoes, of which more are ghosts at the edges.
 _SMOOTHING: Final = 0.1  # Weight of a new pulse in the usual amplitude.
 # Errors of positions that noise does not explain: overlapping echoes of rough walls, mountings and poses.
 _RANGE_SD_M: Final = 0.01
@@ -104,6 +105,13 @@ class Coverage(NamedTuple):
     weight: Floats
     step_m: float
 
+    def at(self, azimuth_rad: Floats, range_m: Floats) -> Floats:
+        """Return the weights of directions and ranges, 0 beyond the last range: (point,) float64."""
+        step = (range_m / self.step_m).astype(np.int64)
+        n_ranges = self.weight.shape[1]
+        found = self.weight[_direction(azimuth_rad), np.minimum(step, n_ranges - 1)]
+        return np.where(step < n_ranges, found, 0.0)
+
     @classmethod
     def of(
         cls,
@@ -165,7 +173,9 @@ def add_evidence(
         Radius of the platform, whose own place is free.
     """
     first_m, wall_m = _first_clear_m(echoes), _wall_m(window, place_m, heading_rad, coverage)
-    occupied = _occupied(window, place_m, heading_rad, echoes, np.minimum(first_m, wall_m))
+    trusted = echoes.strength * coverage.at(echoes.azimuth_rad, echoes.range_m) ** _DISTRUST
+    located = echoes._replace(strength=trusted)
+    occupied = _occupied(window, place_m, heading_rad, located, np.minimum(first_m, wall_m))
     end_m = np.where(np.isfinite(first_m), first_m - _IN_FRONT_M, _FREE_M)
     free = _free(window, place_m, heading_rad, np.minimum(end_m, wall_m), coverage, near_m=near_m)
     free[occupied > _TOUCHED] = 0.0

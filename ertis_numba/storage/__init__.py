@@ -8,7 +8,7 @@ from ertis_numba.storage.energyscape import (
     open_energyscapes,
     write_energyscapes,
 )
-from ertis_numba.storage.maps import read_map, write_map_file
+from ertis_numba.storage.maps import is_map, read_map, write_map_file
 from ertis_numba.storage.poses import add_poses, recorded_trajectory, require_fitting_poses
 from ertis_numba.storage.recording import (
     RecordingReader,
@@ -29,6 +29,7 @@ __all__ = [
     "atomic_write",
     "check_target",
     "file_kind",
+    "is_map",
     "open_energyscapes",
     "open_recording",
     "read_map",

@@ -25,7 +25,7 @@ from ertis_numba.storage.schema import (
 )
 from ertis_numba.storage.structure import require_attributes, require_variables
 
-__all__ = ["read_map", "write_map_file"]
+__all__ = ["is_map", "read_map", "write_map_file"]
 
 _KIND: Final = "occupancy_map"
 _NAME: Final = "an occupancy map"
@@ -88,6 +88,15 @@ def write_map_file(path: str | Path, occupancy: OccupancyMap, *, overwrite: bool
             raise
         raise DataError(f"{path} cannot be written ({error}); {remedy(error)}") from error
     return Path(path)
+
+
+def is_map(path: str | Path) -> bool:
+    """Return True for the file of an occupancy map; False for other files, also for missing or damaged ones."""
+    try:
+        with h5py.File(path, "r") as file:
+            return bool(to_python(file.attrs.get("ertis_format", "")) == _KIND)
+    except (OSError, RuntimeError, LookupError, TypeError, ValueError):
+        return False
 
 
 def read_map(path: str | Path) -> OccupancyMap:
