@@ -259,7 +259,12 @@ def test_mcap_has_static_transforms(bag):
 def test_message_definitions_equal_those_of_ros():
     """Hashes of REP 2016 confirm them; the marine messages are compared by their fields."""
     own, theirs = get_typestore(Stores.EMPTY), get_typestore(Stores.ROS2_JAZZY)
-    others = ("tf2_msgs/msg/TFMessage", "diagnostic_msgs/msg/DiagnosticArray", "rosgraph_msgs/msg/Clock")
+    others = (
+        "tf2_msgs/msg/TFMessage",
+        "diagnostic_msgs/msg/DiagnosticArray",
+        "nav_msgs/msg/OccupancyGrid",
+        "rosgraph_msgs/msg/Clock",
+    )
     for name in (*others, *KINDS.values()):
         own.register(get_types_from_msg(schema(name), name))
     assert set(own.fielddefs) >= set(DEFINITIONS)

@@ -352,6 +352,24 @@ def test_ply_holds_the_occupied_cells(tmp_path):
     assert vertices["probability"] == pytest.approx(small().probability[small().is_occupied])
 
 
+def test_mcap_holds_an_occupancy_grid(tmp_path):
+    reader = pytest.importorskip("mcap_ros2.reader")
+    found = small().replace(time_ns=START_NS)
+    ertis.write_map(tmp_path / "m.mcap", found)
+    (message,) = reader.read_ros2_messages(tmp_path / "m.mcap")
+    assert message.channel.topic == "/map"
+    grid = message.ros_msg
+    assert grid.header.frame_id == "map"
+    assert grid.header.stamp.sec == START_NS // 10**9
+    assert (grid.info.height, grid.info.width) == found.log_odds.shape
+    assert grid.info.resolution == pytest.approx(found.cell_m)
+    assert (grid.info.origin.position.x, grid.info.origin.position.y) == found.origin_m
+    percent = np.array(grid.data).reshape(found.log_odds.shape)
+    known = found.log_odds != 0
+    assert (percent[~known] == -1).all()
+    assert np.abs(percent[known] - 100 * found.probability[known]).max() <= 0.5
+
+
 def test_unknown_format_of_a_map_is_refused(tmp_path):
     with pytest.raises(ArgumentError, match=r"ending of the map '.png' is unknown"):
         ertis.write_map(tmp_path / "m.png", small())

@@ -28,7 +28,7 @@ __all__ = ["mapping"]
     metavar="FILE",
     help="Poses of the platform in the world frame, .tum, .csv or .mcap; those of the recordings by default.",
 )
-@options.output("Map to write: .h5, .pgm with a .yaml for ROS, or .ply; REC.map.h5 by default.")
+@options.output("Map to write: .h5, .pgm with a .yaml for ROS, .mcap or .ply; REC.map.h5 by default.")
 @click.option(
     "--cell",
     "cell_m",

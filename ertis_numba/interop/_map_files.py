@@ -13,11 +13,12 @@ from ertis_numba import checks
 from ertis_numba.atomic_files import atomic_write, check_target, remedy
 from ertis_numba.errors import DataError, ErtisError
 from ertis_numba.frames import FREE_BELOW, OCCUPIED_ABOVE, OccupancyMap
+from ertis_numba.interop._mcap import map_mcap
 from ertis_numba.storage import write_map_file
 
 __all__ = ["MAP_SUFFIXES", "map_files", "write_map"]
 
-MAP_SUFFIXES: Final = (".h5", ".pgm", ".ply")
+MAP_SUFFIXES: Final = (".h5", ".mcap", ".pgm", ".ply")
 """Suffixes of the formats of occupancy maps."""
 # Grey levels of map_saver of ROS. The probability of a level is (255 - level) / 255.
 _FREE, _UNKNOWN, _OCCUPIED = 254, 205, 0
@@ -40,7 +41,8 @@ def write_map(path: str | Path, occupancy: OccupancyMap, *, overwrite: bool = Fa
     """Write an occupancy map; the suffix of the path chooses the format.
 
     ``.h5`` stores the log-odds, and `read_map` reads them. ``.pgm`` is a picture for map_server of ROS, with a
-    ``.yaml`` beside it. ``.ply`` contains the centres of the occupied cells, at height 0, with their probability.
+    ``.yaml`` beside it. ``.mcap`` holds the map as a message of ROS 2, nav_msgs/OccupancyGrid. ``.ply`` contains the
+    centres of the occupied cells, at height 0, with their probability.
 
     Parameters
     ----------
@@ -73,13 +75,11 @@ def write_map(path: str | Path, occupancy: OccupancyMap, *, overwrite: bool = Fa
     paths = map_files(path)
     for each in paths:
         check_target(each, overwrite=overwrite)
-    suffix = paths[0].suffix.lower()
-    if suffix == ".h5":
+    if paths[0].suffix.lower() == ".h5":
         write_map_file(paths[0], occupancy, overwrite=overwrite)
         return paths
-    contents = (_ply(occupancy),) if suffix == ".ply" else (_pgm(occupancy), _yaml(paths[0].name, occupancy))
     try:
-        for each, content in zip(paths, contents, strict=True):
+        for each, content in zip(paths, _contents(paths[0], occupancy), strict=True):
             with atomic_write(each, overwrite=overwrite) as part:
                 part.write_bytes(content)
     except OSError as error:
@@ -87,6 +87,14 @@ def write_map(path: str | Path, occupancy: OccupancyMap, *, overwrite: bool = Fa
             raise
         raise DataError(f"{path} cannot be written ({error.strerror or error}); {remedy(error)}") from error
     return paths
+
+
+def _contents(path: Path, occupancy: OccupancyMap) -> tuple[bytes, ...]:
+    """Return the content of each file of a map."""
+    suffix = path.suffix.lower()
+    if suffix == ".mcap":
+        return (map_mcap(occupancy),)
+    return (_ply(occupancy),) if suffix == ".ply" else (_pgm(occupancy), _yaml(path.name, occupancy))
 
 
 def _pgm(occupancy: OccupancyMap) -> bytes:

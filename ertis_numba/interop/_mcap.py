@@ -1,29 +1,33 @@
-"""Energyscapes as an MCAP file of ROS 2 messages, after the MCAP specification and registry (profile ``ros2``)."""
+"""Energyscapes and maps as MCAP files of ROS 2 messages, after the specification of MCAP (profile ``ros2``)."""
 
+import io
 from collections import Counter
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from ertis_numba.extras import extra
-from ertis_numba.frames import BEHAVIOURS, Behaviour, Energyscape, Stamp
+from ertis_numba.frames import BEHAVIOURS, Behaviour, Energyscape, OccupancyMap, Stamp
 from ertis_numba.geometry import self_contained
 from ertis_numba.interop._mountings import Mountings
 from ertis_numba.interop._points import FindPoints
 from ertis_numba.interop.ros_definitions import encoder, schema
 from ertis_numba.interop.ros_messages import (
+    MAP_TYPE,
     MESSAGES,
     ImageMessages,
     TopicNames,
     mounting_message,
+    occupancy_message,
     points_message,
     scan_message,
     sonar_frame_message,
     sonar_image_message,
 )
 
-__all__ = ["write_mcap"]
+__all__ = ["map_mcap", "write_mcap"]
 
 _STATIC, _STATIC_TYPE = "/tf_static", "tf2_msgs/msg/TFMessage"
 _PROFILE = """- history: 1
@@ -51,14 +55,71 @@ def write_mcap(
         The packages for MCAP are not installed, two sensors would share a topic, the name of a sensor is invalid, or a
         time is outside the range of ROS 2.
     """
+    with path.open("wb") as file, _started(file) as writer:
+        _McapWriter(writer, find, mountings, topics).write(images)
+
+
+def map_mcap(occupancy: OccupancyMap) -> bytes:
+    """Return a file that holds a map as one latched message of type nav_msgs/OccupancyGrid on the topic /map.
+
+    Raises
+    ------
+    ArgumentError
+        The packages for MCAP are not installed, or the time is outside the range of ROS 2.
+    """
+    file = io.BytesIO()
+    with _started(file) as writer:
+        message = occupancy_message(occupancy)
+        _McapTopics(writer).add("/map", MAP_TYPE, message, occupancy.time_ns, is_latched=True)
+    return file.getvalue()
+
+
+@contextmanager
+def _started(file: IO[bytes]) -> Iterator[Any]:
+    """Yield the writer of a file, and finish the file."""
     with extra("ros", "format 'mcap' needs mcap and mcap-ros2-support"):
         from mcap.writer import Writer  # noqa: PLC0415  an extra
         from mcap_ros2 import _dynamic  # noqa: F401, PLC0415  an extra
-    with path.open("wb") as file:
-        writer: Any = Writer(file)  # The annotations of mcap are partial.
-        writer.start(profile="ros2", library="ertis-numba")
-        _McapWriter(writer, find, mountings, topics).write(images)
-        writer.finish()
+    writer: Any = Writer(file)  # The annotations of mcap are partial.
+    writer.start(profile="ros2", library="ertis-numba")
+    yield writer
+    writer.finish()
+
+
+class _McapTopics:
+    """Topics of a file in progress."""
+
+    def __init__(self, writer: Any) -> None:
+        self._writer = writer
+        self._channels: dict[str, int] = {}
+        self._schemas: dict[str, int] = {}
+
+    def add(
+        self,
+        topic: str,
+        kind: str,
+        message: dict[str, Any],
+        time_ns: int,
+        sequence: int = 0,
+        *,
+        is_latched: bool = False,
+    ) -> None:
+        """Add a message; late subscribers of a latched topic receive its last one (transient local)."""
+        if kind not in self._schemas:
+            self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", schema(kind).encode())
+        if topic not in self._channels:
+            depth, durability = (1, _TRANSIENT_LOCAL) if is_latched else (10, _VOLATILE)
+            profile = _PROFILE.format(depth=depth, durability=durability, forever=_FOREVER)
+            self._channels[topic] = self._writer.register_channel(
+                topic, "cdr", self._schemas[kind], {"offered_qos_profiles": profile}
+            )
+        self._writer.add_message(
+            self._channels[topic],
+            log_time=time_ns,
+            publish_time=time_ns,
+            sequence=sequence % 2**32,
+            data=encoder(kind)(message),
+        )
 
 
 class _McapWriter:
@@ -67,8 +128,7 @@ class _McapWriter:
     def __init__(self, writer: Any, find: FindPoints, mountings: Mountings, topics: Collection[str]) -> None:
         self._writer, self._find, self._mountings = writer, find, mountings
         self._topics = [topic for topic in MESSAGES if topic in topics]
-        self._channels: dict[str, int] = {}
-        self._schemas: dict[str, int] = {}
+        self._added = _McapTopics(writer)
         self._names = TopicNames()
         self._image = ImageMessages()
 
@@ -88,9 +148,13 @@ class _McapWriter:
             for topic in self._topics:
                 message = self._message(topic, image)
                 if message is not None:
-                    self._add(f"/{self._names[sensor]}/{topic}", MESSAGES[topic], message, stamp)
+                    name = f"/{self._names[sensor]}/{topic}"
+                    self._added.add(name, MESSAGES[topic], message, stamp.timestamp_ns, stamp.sequence)
         if earliest is not None:
-            self._add(_STATIC, _STATIC_TYPE, {"transforms": self._transforms(earliest)}, earliest)
+            transforms = {"transforms": self._transforms(earliest)}
+            self._added.add(
+                _STATIC, _STATIC_TYPE, transforms, earliest.timestamp_ns, earliest.sequence, is_latched=True
+            )
         for sensor, counts in behaviours.items():
             numbers = {f"n_{behaviour}": str(counts[behaviour]) for behaviour in BEHAVIOURS}
             self._writer.add_metadata(f"ertis_numba/{sensor}", metadata[sensor] | numbers)
@@ -101,24 +165,6 @@ class _McapWriter:
         if topic == "scan":
             return scan_message(image)
         return self._image(image) if topic == "image" else sonar_image_message(image)
-
-    def _add(self, topic: str, kind: str, message: dict[str, Any], stamp: Stamp) -> None:
-        if kind not in self._schemas:
-            self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", schema(kind).encode())
-        if topic not in self._channels:
-            # Late subscribers of /tf_static need messages that the player keeps (transient local).
-            depth, durability = (1, _TRANSIENT_LOCAL) if topic == _STATIC else (10, _VOLATILE)
-            profile = _PROFILE.format(depth=depth, durability=durability, forever=_FOREVER)
-            self._channels[topic] = self._writer.register_channel(
-                topic, "cdr", self._schemas[kind], {"offered_qos_profiles": profile}
-            )
-        self._writer.add_message(
-            self._channels[topic],
-            log_time=stamp.timestamp_ns,
-            publish_time=stamp.timestamp_ns,
-            sequence=stamp.sequence % 2**32,
-            data=encoder(kind)(message),
-        )
 
     def _transforms(self, stamp: Stamp) -> list[dict[str, Any]]:
         found = []

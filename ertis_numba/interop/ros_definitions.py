@@ -26,11 +26,20 @@ float64 x
 float64 y
 float64 z
 """,
+    "geometry_msgs/msg/Point": """
+float64 x
+float64 y
+float64 z
+""",
     "geometry_msgs/msg/Quaternion": """
 float64 x 0
 float64 y 0
 float64 z 0
 float64 w 1
+""",
+    "geometry_msgs/msg/Pose": """
+geometry_msgs/Point position
+geometry_msgs/Quaternion orientation
 """,
     "geometry_msgs/msg/Transform": """
 geometry_msgs/Vector3 translation
@@ -108,6 +117,18 @@ diagnostic_msgs/KeyValue[] values
     "diagnostic_msgs/msg/DiagnosticArray": """
 std_msgs/Header header
 diagnostic_msgs/DiagnosticStatus[] status
+""",
+    "nav_msgs/msg/MapMetaData": """
+builtin_interfaces/Time map_load_time
+float32 resolution
+uint32 width
+uint32 height
+geometry_msgs/Pose origin
+""",
+    "nav_msgs/msg/OccupancyGrid": """
+std_msgs/Header header
+nav_msgs/MapMetaData info
+int8[] data
 """,
     "rosgraph_msgs/msg/Clock": """
 builtin_interfaces/Time clock

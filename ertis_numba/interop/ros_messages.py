@@ -16,18 +16,20 @@ from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.nearest_echo import nearest_echo
 from ertis_numba.analysis.point_finder import same_directions
 from ertis_numba.errors import ArgumentError
-from ertis_numba.frames import Energyscape, PointCloud, Stamp
+from ertis_numba.frames import Energyscape, OccupancyMap, PointCloud, Stamp
 from ertis_numba.geometry import unit_vectors, unrolled_rad
 from ertis_numba.interop._grey_image import GreyImage
 from ertis_numba.interop._mountings import PLATFORM, Mounting
 from ertis_numba.interop._points import ros_time
 
 __all__ = [
+    "MAP_TYPE",
     "MESSAGES",
     "ImageMessages",
     "TopicNames",
     "header",
     "mounting_message",
+    "occupancy_message",
     "points_message",
     "scan_message",
     "sonar_frame_message",
@@ -41,6 +43,8 @@ MESSAGES: Final[Mapping[str, str]] = {
     "sonar_image": "marine_acoustic_msgs/msg/ProjectedSonarImage",
 }
 """Topics of a sensor, and their messages."""
+MAP_TYPE: Final = "nav_msgs/msg/OccupancyGrid"
+_MAP_FRAME = "map"
 _SONAR_SUFFIX = "_sonar"
 _SQRT_HALF = math.sqrt(0.5)
 _SONAR_TURN = (_SQRT_HALF, 0.0, _SQRT_HALF, 0.0)
@@ -191,6 +195,33 @@ def sonar_image_message(image: Energyscape) -> dict[str, Any]:
             "beam_count": len(image.azimuth_rad),
             "data": np.ascontiguousarray(image.amplitude.T, dtype="<f4").tobytes(),
         },
+    }
+
+
+def occupancy_message(occupancy: OccupancyMap) -> dict[str, Any]:
+    """Return a map in the frame ``map``, as nav_msgs/msg/OccupancyGrid.
+
+    Cells hold the probability of occupation in percent, and −1 where nothing is known.
+    """
+    stamp = Stamp(timestamp_ns=occupancy.time_ns)
+    percent = np.rint(100 * occupancy.probability).astype(np.int8)
+    percent[occupancy.log_odds == 0] = -1
+    n_rows, n_columns = percent.shape
+    x_m, y_m = occupancy.origin_m
+    named = header(stamp, frame=_MAP_FRAME)
+    return {
+        "header": named,
+        "info": {
+            "map_load_time": named["stamp"],
+            "resolution": occupancy.cell_m,
+            "width": n_columns,
+            "height": n_rows,
+            "origin": {
+                "position": {"x": x_m, "y": y_m, "z": 0.0},
+                "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
+            },
+        },
+        "data": percent.ravel().tolist(),
     }
 
 
