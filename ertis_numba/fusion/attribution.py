@@ -11,7 +11,7 @@ from ertis_numba.fusion.pairs import Hypothesis, Pair
 from ertis_numba.fusion.polar_grid import PolarGrid
 from ertis_numba.fusion.receivers import CoarseImage, Receiver
 
-__all__ = ["Attributed", "Attribution", "Shares"]
+__all__ = ["Attributed", "Attribution", "Rivalries", "Shares"]
 
 Singles = NDArray[np.float32]
 Places = NDArray[np.uint32]
@@ -82,6 +82,10 @@ class _Rivalry(NamedTuple):
     part: Singles
 
 
+Rivalries: TypeAlias = dict[tuple[int, tuple[tuple[int, bool], ...]], list[_Rivalry]]
+"""Rivalries by receiver, and by emitter and side of each hypothesis."""
+
+
 class Attribution:
     """Separator of own and foreign echoes by consistency over all pairs.
 
@@ -98,6 +102,8 @@ class Attribution:
     receivers : mapping of int to Receiver
     unheard : frozenset of int
         Emitters whose calls only they themselves receive. Their missing echoes show nothing.
+    rivalries : dict, optional
+        Rivalries that other attributions with the same receivers have computed, to which this one adds.
     """
 
     def __init__(
@@ -107,6 +113,7 @@ class Attribution:
         hypotheses: Mapping[int, Sequence[Hypothesis]],
         receivers: Mapping[int, Receiver],
         unheard: frozenset[int] = frozenset(),
+        rivalries: Rivalries | None = None,
     ) -> None:
         self._grid, self._receivers, self._unheard = grid, receivers, unheard
         self._kernels = kernels.load_fusion()
@@ -116,9 +123,8 @@ class Attribution:
             for number, several in hypotheses.items()
         }
         self._reduced: dict[frozenset[int], Attribution] = {}
-        self._rivalries = {
-            number: _rivalries(each, _SAME_STEPS * grid.step_m) for number, each in self._hypotheses.items()
-        }
+        self._known = {} if rivalries is None else rivalries
+        self._rivalries = {number: self._rivalries_of(number, each) for number, each in self._hypotheses.items()}
         self._own = {pair.receiver: self._own_of(pair) for pair in self._pairs if pair.emitter == pair.receiver}
 
     def __call__(self, images: Mapping[int, CoarseImage]) -> Attributed:
@@ -161,8 +167,17 @@ class Attribution:
     def _without(self, unheard: frozenset[int]) -> "Attribution":
         """Return an attribution that expects no echoes of some emitters at other sensors."""
         if unheard not in self._reduced:
-            self._reduced[unheard] = Attribution(self._grid, self._pairs, self._hypotheses, self._receivers, unheard)
+            self._reduced[unheard] = Attribution(
+                self._grid, self._pairs, self._hypotheses, self._receivers, unheard, self._known
+            )
         return self._reduced[unheard]
+
+    def _rivalries_of(self, number: int, hypotheses: Sequence[Hypothesis]) -> list[_Rivalry]:
+        """Return the rivalries of a receiver's hypotheses, which take long to compute."""
+        key = number, tuple((each.emitter, each.is_mirrored) for each in hypotheses)
+        if key not in self._known:
+            self._known[key] = _rivalries(hypotheses, _SAME_STEPS * self._grid.step_m)
+        return self._known[key]
 
     def _not_heard(self, evidence: Sequence[_Evidence], reflectivity: Singles) -> frozenset[int]:
         """Return emitters whose calls other sensors do not hear, where the reflectors of all images lead to expect it.

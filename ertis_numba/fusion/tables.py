@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.frames import Energyscape, PointCloud
-from ertis_numba.fusion.attribution import Attribution, Shares
+from ertis_numba.fusion.attribution import Attribution, Rivalries, Shares
 from ertis_numba.fusion.pairs import Hypothesis, Pair, hypothesis, pair_of
 from ertis_numba.fusion.points import PointFuser, joined
 from ertis_numba.fusion.polar_grid import PolarGrid
@@ -59,8 +59,9 @@ class FusionTables:
         self._settings: dict[int, Settings] = {}
         self._late_m: dict[int, float] = {}
         self._known: dict[tuple[tuple[int, ...], frozenset[int]], Attribution] = {}
+        self._rivalries: Rivalries = {}
         self._points: dict[int, PointFuser] = {}
-        self._converted: tuple[Settings, Settings] | None = None  # The checks of settings take long.
+        self._converted: dict[str, tuple[Settings, Settings]] = {}  # The checks of settings take long.
 
     def fit(self, group: Mapping[int, Energyscape]) -> bool:
         """Return True if images have the same directions, ranges and calls as earlier ones of their sensors."""
@@ -95,18 +96,21 @@ class FusionTables:
                 ]
                 for number in group
             }
-            self._known[key] = Attribution(self.grid, pairs, hypotheses, self._receivers)
+            self._known[key] = Attribution(self.grid, pairs, hypotheses, self._receivers, rivalries=self._rivalries)
         return self._known[key]
 
     def image(self, reflectivity: NDArray[np.float32], group: Mapping[int, Energyscape]) -> Energyscape:
         """Return the fused image."""
         first = min(group.values(), key=lambda image: image.stamp.timestamp_ns)
+        known = self._converted.get(first.stamp.sensor)
+        if known is None or known[0] != first.settings:
+            known = self._converted[first.stamp.sensor] = first.settings, self._fused_settings(first.settings)
         return Energyscape(
             amplitude=np.sqrt(reflectivity).reshape(self.grid.n_directions, self.grid.n_ranges),
             azimuth_rad=self.grid.azimuth_rad,
             elevation_rad=self.grid.elevations_rad,
             range_m=self.grid.range_m,
-            settings=self._fused_settings(first.settings),
+            settings=known[1],
             stamp=replace(first.stamp, sensor=PLATFORM),
         )
 
@@ -163,11 +167,6 @@ class FusionTables:
         return np.asarray(deaf)
 
     def _fused_settings(self, settings: Settings) -> Settings:
-        if self._converted is None or self._converted[0] != settings:
-            self._converted = settings, self._convert(settings)
-        return self._converted[1]
-
-    def _convert(self, settings: Settings) -> Settings:
         limit_deg = 180.0 - 180.0 / self.grid.n_azimuths
         limits = {
             "azimuth_limits_deg": (-limit_deg, limit_deg),
