@@ -264,6 +264,7 @@ def test_message_definitions_equal_those_of_ros():
         "diagnostic_msgs/msg/DiagnosticArray",
         "nav_msgs/msg/OccupancyGrid",
         "rosgraph_msgs/msg/Clock",
+        "nav_msgs/msg/Odometry",
     )
     for name in (*others, *KINDS.values()):
         own.register(get_types_from_msg(schema(name), name))

@@ -1,11 +1,9 @@
 """Messages that rclpy decodes have the values that were encoded, for any values of the fields."""
 
-import importlib
-
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from ertis_numba.interop.ros_definitions import DEFINITIONS, encoder, fields
+from ertis_numba.interop.ros_definitions import DEFINITIONS, encoder, fields, schema
 
 pytest.importorskip("rclpy.serialization")  # Wheels exist for some versions of Python only.
 
@@ -30,6 +28,8 @@ def values(kind):
     """Values of a field of this type."""
     if kind in PLAIN:
         return PLAIN[kind]
+    if kind == "float64[36]":
+        return st.lists(PLAIN["float64"], min_size=36, max_size=36)
     if kind.endswith("[]"):
         return st.lists(values(kind.removesuffix("[]")), max_size=3)
     package, _, name = kind.partition("/")
@@ -42,7 +42,7 @@ def message(name):
 
 def ros_class(name):
     package, _, kind = name.split("/")
-    return getattr(importlib.import_module(f"{package}.msg"), kind)
+    return getattr(pytest.importorskip(f"{package}.msg"), kind)
 
 
 def ros_message(name, content):
@@ -66,6 +66,8 @@ def test_rclpy_decodes_what_was_encoded(name, data):
 
     content = data.draw(message(name))
     encoded, expected = encoder(name)(content), ros_message(name, content)
-    assert deserialize_message(encoded, ros_class(name)) == expected
+    decoded = deserialize_message(encoded, ros_class(name))
+    # Messages of rclpy with NumPy arrays cannot be compared as a whole.
+    assert repr(decoded) == repr(expected) if "float64[36]" in schema(name) else decoded == expected
     # The bytes themselves cannot be compared, because Fast CDR leaves those between fields undefined.
     assert 0 <= len(serialize_message(expected)) - len(encoded) < 4

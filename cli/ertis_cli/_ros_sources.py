@@ -1,7 +1,7 @@
 """Sources of ``ertis ros``: the products of a central node, the measurements of a file at their speed, and sensors."""
 
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -29,7 +29,7 @@ def publish_node(
     address: str,
     ros: "RosPublisher",
     *,
-    topics: Collection[str],
+    images: bool,
     sensors: Sequence[str],
     keys: "ClientKeys | None",
     is_over: Callable[[], bool],
@@ -40,14 +40,14 @@ def publish_node(
 ) -> None:
     """Publish the products of a central node, until the program is to end.
 
-    Points alone need no images, which are larger. A central node sends its status each second, also without sensors.
-    If nothing arrives, a NetworkError is raised at the end.
+    Without ``images``, points are received, which are smaller. A central node sends its status each second, also
+    without sensors. If nothing arrives, a NetworkError is raised at the end.
     """
     from ertis_numba.errors import NetworkError
     from ertis_numba.network.status import Status
     from ertis_numba.network.subscriber import Subscriber
 
-    products: tuple[Any, ...] = ("points" if set(topics) == {"points"} else "energyscape", "status")
+    products: tuple[Any, ...] = ("energyscape" if images else "points", "status")
     with Subscriber(address, products=products, sensors=sensors or None, keys=keys, on_note=on_note) as subscriber:
         signals.obey(subscriber.close)
         on_ready()

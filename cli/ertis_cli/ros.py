@@ -3,6 +3,7 @@
 import math
 import sys
 import time
+from collections import deque
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -58,6 +59,11 @@ class _MaxRate(click.ParamType[Any]):
     type=click.Choice(_TOPICS),
     multiple=True,
     help="Topic to publish for each sensor; repeatable; points and scan by default.",
+)
+@click.option(
+    "--odometry",
+    is_flag=True,
+    help="Publish the pose and velocity of the platform on odom, and its transform on /tf.",
 )
 @click.option("--namespace", default="", metavar="NAME", help="Prefix of the topics of sensors, such as robot1.")
 @click.option(
@@ -144,6 +150,7 @@ def ros(
     sources: tuple[str, ...],
     sensors: tuple[str, ...],
     topics: tuple[str, ...],
+    odometry: bool,
     namespace: str,
     domain: int | None,
     interface: str,
@@ -172,6 +179,9 @@ def ros(
     publishes. Files are published at their original speed; a recording is processed with its own settings. The sensor
     at each PORT measures as with 'ertis capture', but no measurement is stored. DDS, the middleware of ROS 2, has no
     passwords. By default, only this machine can read the topics; --interface opens them to a network.
+
+    With --odometry, all sensors with a known mounting belong to one platform. Its path starts at the origin of the
+    frame odom.
     """
     kind = _kind(sources)
     source = " ".join(sources)
@@ -193,21 +203,26 @@ def ros(
 
     chosen = topics or ("points", "scan")
     end_s = math.inf if duration is None else time.monotonic() + duration
+    given = _mountings.mountings(mounting, sensors or None) or {}
+    images = odometry or set(chosen) != {"points"}
+    notes: deque[str] = deque()
     with (
         stopped_by_signals() as signals,
         Participant(domain=domain, interface=interface, reliability=reliability) as participant,
-    ):
-        given = _mountings.mountings(mounting, sensors or None) or {}
-        publisher = RosPublisher(
+        RosPublisher(
             participant,
             topics=chosen,
             namespace=namespace,
             mounting=given,
             settings=publishing,
-        )
-        report = _RosReport(publisher, quiet=quiet, as_json=as_json)
+            odometry=odometry,
+            on_note=notes.append,
+        ) as publisher,
+    ):
+        report = _RosReport(publisher, notes, quiet=quiet, as_json=as_json)
 
         def is_over() -> bool:
+            report.show_notes()
             if watched is not None:
                 watched.poll(publisher, report.note)
             return bool(signals.came) or time.monotonic() >= end_s
@@ -233,7 +248,7 @@ def ros(
             )
         elif kind == "address":
             keys = _network.client_keys(key, server_key)
-            _ros_sources.publish_node(source, publisher, topics=chosen, keys=keys, on_note=report.note, **common)
+            _ros_sources.publish_node(source, publisher, images=images, keys=keys, on_note=report.note, **common)
         else:
             _ros_sources.publish_file(
                 Path(source),
@@ -243,6 +258,7 @@ def ros(
                 sim_time=sim_time,
                 **common,
             )
+        publisher.close()
         report.end()
         if signals.came and kind == "file" and not loop:
             sys.exit(128 + signals.came[0])
@@ -301,8 +317,8 @@ def _kind(sources: tuple[str, ...]) -> str:
 class _RosReport:
     """Lines about the progress of the command."""
 
-    def __init__(self, publisher: Any, *, quiet: bool, as_json: bool) -> None:
-        self._publisher, self._quiet, self._as_json = publisher, quiet, as_json
+    def __init__(self, publisher: Any, notes: deque[str], *, quiet: bool, as_json: bool) -> None:
+        self._publisher, self._notes, self._quiet, self._as_json = publisher, notes, quiet, as_json
         self._listed: set[str] = set()
 
     def start(self, source: str, participant: Any) -> None:
@@ -325,6 +341,11 @@ class _RosReport:
         if self._as_json:
             options.print_json({"event": "note", "text": text})
 
+    def show_notes(self) -> None:
+        """Report the notes of other threads."""
+        while self._notes:
+            self.note(self._notes.popleft())
+
     def published(self) -> None:
         """Report new topics."""
         for name, topic in self._publisher.topics.items():
@@ -336,11 +357,13 @@ class _RosReport:
 
     def end(self) -> None:
         """Report the counts."""
-        dropped, left_out = self._publisher.dropped, self._publisher.left_out
+        self.show_notes()
+        dropped, left_out, skipped = self._publisher.dropped, self._publisher.left_out, self._publisher.skipped
         n_published = self._publisher.published
         text = f"{options.counted(n_published, 'measurement')} published"
         text += f", {options.counted(dropped, 'message')} dropped for slow subscribers" if dropped else ""
         text += f", {options.counted(left_out, 'message')} left out by rates or pauses" if left_out else ""
+        text += f", {options.counted(skipped, 'pulse')} without odometry, which was too slow" if skipped else ""
         options.say(text, quiet=self._quiet)
         if self._as_json:
             counts = {name: topic.published for name, topic in self._publisher.topics.items()}
@@ -351,5 +374,6 @@ class _RosReport:
                     "messages": counts,
                     "dropped": dropped,
                     "left_out": left_out,
+                    "skipped": skipped,
                 }
             )

@@ -50,6 +50,24 @@ std_msgs/Header header
 string child_frame_id
 geometry_msgs/Transform transform
 """,
+    "geometry_msgs/msg/PoseWithCovariance": """
+geometry_msgs/Pose pose
+float64[36] covariance
+""",
+    "geometry_msgs/msg/Twist": """
+geometry_msgs/Vector3 linear
+geometry_msgs/Vector3 angular
+""",
+    "geometry_msgs/msg/TwistWithCovariance": """
+geometry_msgs/Twist twist
+float64[36] covariance
+""",
+    "nav_msgs/msg/Odometry": """
+std_msgs/Header header
+string child_frame_id
+geometry_msgs/PoseWithCovariance pose
+geometry_msgs/TwistWithCovariance twist
+""",
     "tf2_msgs/msg/TFMessage": """
 geometry_msgs/TransformStamped[] transforms
 """,

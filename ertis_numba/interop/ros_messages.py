@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ertis_numba import checks
 from ertis_numba.air import sound_speed_m_s
@@ -21,6 +22,9 @@ from ertis_numba.geometry import unit_vectors, unrolled_rad
 from ertis_numba.interop._grey_image import GreyImage
 from ertis_numba.interop._mountings import PLATFORM, Mounting
 from ertis_numba.interop._points import ros_time
+from ertis_numba.motion.flow import MAX_SPEED_M_S, MAX_YAW_RATE_RAD_S
+from ertis_numba.motion.odometry import PlanarPose
+from ertis_numba.motion.velocity import EgoVelocity
 
 __all__ = [
     "MAP_TYPE",
@@ -30,6 +34,8 @@ __all__ = [
     "header",
     "mounting_message",
     "occupancy_message",
+    "odometry_message",
+    "odometry_transform",
     "points_message",
     "scan_message",
     "sonar_frame_message",
@@ -45,6 +51,11 @@ MESSAGES: Final[Mapping[str, str]] = {
 """Topics of a sensor, and their messages."""
 MAP_TYPE: Final = "nav_msgs/msg/OccupancyGrid"
 _MAP_FRAME = "map"
+_ODOM: Final = "odom"
+"""Frame in which the pose of the platform is continuous, by REP 105."""
+_PLANAR: Final = np.ix_((0, 1, 5), (0, 1, 5))
+"""Rows and columns of x, y and yaw in a covariance of x, y, z, and the rotations about them."""
+_UNKNOWN_TWIST: Final = np.diag([MAX_SPEED_M_S, MAX_SPEED_M_S, MAX_YAW_RATE_RAD_S]) ** 2
 _SONAR_SUFFIX = "_sonar"
 _SQRT_HALF = math.sqrt(0.5)
 _SONAR_TURN = (_SQRT_HALF, 0.0, _SQRT_HALF, 0.0)
@@ -233,6 +244,51 @@ def mounting_message(stamp: Stamp, place: Mounting) -> dict[str, Any]:
 def sonar_frame_message(stamp: Stamp) -> dict[str, Any]:
     """Return the pose of the frame of sonar images relative to the sensor, as geometry_msgs/msg/TransformStamped."""
     return _transform(header(stamp), stamp.sensor + _SONAR_SUFFIX, ((0.0, 0.0, 0.0), _SONAR_TURN))
+
+
+def odometry_message(pose: PlanarPose, velocity: EgoVelocity | None) -> dict[str, Any]:
+    """Return the pose in the frame ``odom`` and the velocity in that of the platform, as nav_msgs/msg/Odometry.
+
+    Height, roll and pitch are 0, and so are their covariances. An unknown velocity is 0, with the largest measurable
+    speeds as standard deviations.
+    """
+    speed_m_s, yaw_rate_rad_s, covariance = (0.0, 0.0), 0.0, _UNKNOWN_TWIST
+    if velocity is not None:
+        speed_m_s, yaw_rate_rad_s = velocity.velocity_m_s.tolist(), velocity.yaw_rate_rad_s
+        covariance = velocity.covariance
+    transform = odometry_transform(pose)
+    return {
+        "header": transform["header"],
+        "child_frame_id": PLATFORM,
+        "pose": {
+            "pose": {
+                "position": transform["transform"]["translation"],
+                "orientation": transform["transform"]["rotation"],
+            },
+            "covariance": _spatial(pose.covariance),
+        },
+        "twist": {
+            "twist": {
+                "linear": {"x": speed_m_s[0], "y": speed_m_s[1], "z": 0.0},
+                "angular": {"x": 0.0, "y": 0.0, "z": yaw_rate_rad_s},
+            },
+            "covariance": _spatial(covariance),
+        },
+    }
+
+
+def odometry_transform(pose: PlanarPose) -> dict[str, Any]:
+    """Return the pose of the platform in the frame ``odom``, as geometry_msgs/msg/TransformStamped."""
+    stamp = Stamp(timestamp_ns=pose.timestamp_ns)
+    rotation_xyzw = (0.0, 0.0, math.sin(pose.yaw_rad / 2), math.cos(pose.yaw_rad / 2))
+    return _transform(header(stamp, frame=_ODOM), PLATFORM, ((pose.x_m, pose.y_m, 0.0), rotation_xyzw))
+
+
+def _spatial(covariance: NDArray[np.float64]) -> list[float]:
+    """Return a covariance of x, y and yaw as the 36 numbers of one in space."""
+    found = np.zeros((6, 6))
+    found[_PLANAR] = covariance
+    return [*map(float, found.flat)]
 
 
 def _transform(parent: dict[str, Any], child: str, place: Mounting) -> dict[str, Any]:

@@ -7,8 +7,8 @@ from typing import Self
 
 from ertis_numba.frames import Stamp, Trajectory
 from ertis_numba.fusion.rig import Mountings
-from ertis_numba.motion import EgoVelocity, Odometry, PlanarPose
-from ertis_numba.motion.velocity import stamp_of
+from ertis_numba.motion import EgoVelocity, PlanarPose
+from ertis_numba.motion.live import LiveOdometry
 from ertis_numba.network.keys import ClientKeys
 from ertis_numba.network.pulse_receiver import PulseReceiver, ReceivedPulse
 
@@ -98,11 +98,9 @@ class OdometrySubscriber:
         keys: ClientKeys | None = None,
         on_note: Callable[[str], None] | None = None,
     ) -> None:
-        self._note = on_note or (lambda _: None)
         self._receiver = PulseReceiver(address, mountings=mountings, sensors=sensors, keys=keys, on_note=on_note)
         self.counts = self._receiver.counts
-        self._mountings: Mountings = {}
-        self._odometry: Odometry | None = None
+        self._odometry = LiveOdometry(on_note or (lambda _: None))
         self._stamps: dict[str, Stamp] = {}  # of the last pulse, by sensor
 
     def __enter__(self) -> Self:
@@ -128,7 +126,7 @@ class OdometrySubscriber:
     @property
     def trajectory(self) -> Trajectory | None:
         """Poses at all pulses so far, as those of `Odometry.trajectory`; None before the first pulse."""
-        return self._odometry.trajectory if self._odometry is not None and self._odometry.poses else None
+        return self._odometry.trajectory
 
     def receive(self, timeout_s: float | None = None) -> OdometryArrival | None:
         """Return the pose and velocity at the next pulse; None after ``timeout_s``, or once the subscriber is closed.
@@ -162,22 +160,14 @@ class OdometrySubscriber:
 
     def _added(self, pulse: ReceivedPulse) -> OdometryArrival | None:
         """Return the pose at a pulse; None if it is not later than the one before."""
-        odometry = self._odometry_with(pulse.mountings)
-        before_ns = odometry.poses[-1].timestamp_ns if odometry.poses else None
-        after_ns = stamp_of(pulse.images).timestamp_ns
-        if before_ns is not None and after_ns <= before_ns:
-            self._note(
-                f"SYNC pulse {next(iter(pulse.images.values())).stamp.sync_count} is left out: it is "
-                f"{(before_ns - after_ns) / 1e9:.3g} s before the last one; was a clock set back?"
-            )
+        found = self._odometry.add(pulse.images, pulse.mountings)
+        if found is None:
             return None
-        velocity = odometry.add(pulse.images.values())
         stamps = {name: image.stamp for name, image in pulse.images.items()}
         n_lost, self._stamps = _lost_between(self._stamps, stamps), stamps
         first = next(iter(stamps.values()))
         return OdometryArrival(
-            odometry.poses[-1],
-            velocity,
+            *found,
             first.sync_count,
             tuple(name for name in pulse.mountings if name in stamps),
             pulse.missing,
@@ -185,14 +175,6 @@ class OdometrySubscriber:
             time.time_ns(),
             first.is_timed,
         )
-
-    def _odometry_with(self, mountings: Mountings) -> Odometry:
-        if self._odometry is None:
-            self._odometry = Odometry(mountings)
-        elif mountings != self._mountings:
-            self._odometry.remount(mountings)
-        self._mountings = mountings
-        return self._odometry
 
 
 def _lost_between(before: dict[str, Stamp], after: dict[str, Stamp]) -> int:

@@ -212,14 +212,17 @@ def _type(message: str) -> Any:
     from cyclonedds.idl import make_idl_struct, types  # noqa: PLC0415  an extra
 
     made: dict[str, Any] = {}
-    sequence: Any = types.sequence  # Its annotations do not show that it is generic.
+    sequence: Any = types.sequence  # Their annotations do not show that they are generic.
+    array: Any = types.array
     for name, kind in fields(message).items():
-        element = kind.removesuffix("[]")
+        element, _, size = kind.removesuffix("]").partition("[")
         if "/" in element:
             package, _, nested = element.partition("/")
             value: Any = _type(f"{package}/msg/{nested}")
         else:
             value = {"bool": bool, "string": str}.get(element) or getattr(types, _RENAMED.get(element, element))
+        if size:
+            value = array[value, int(size)]
         made[name] = sequence[value] if kind.endswith("[]") else value
     package, _, name = message.split("/")
     struct: Any = make_idl_struct(name, f"{package}.msg.dds_.{name}_", made)

@@ -2,9 +2,9 @@
 
 import math
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,12 +27,14 @@ from ertis_numba.interop.ros_messages import (
 from ertis_numba.network.status import Status
 from ertis_numba.ros.diagnostics import diagnostics_message
 from ertis_numba.ros.fused_points import FusedPoints
+from ertis_numba.ros.odometry_publisher import OdometryPublisher
 from ertis_numba.ros.participant import Participant, Topic
 from ertis_numba.ros.publishing_settings import PublishingSettings
 
 __all__ = ["RosPublisher"]
 
 _TRANSFORMS: Final = ("/tf_static", "tf2_msgs/msg/TFMessage")
+_ODOMETRY: Final = "nav_msgs/msg/Odometry"
 _DIAGNOSTICS: Final = ("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
 _ALL_SENSORS: Final = "of all mounted sensors"  # No sensor can have this name.
 _CLOCK: Final = ("/clock", "rosgraph_msgs/msg/Clock")
@@ -43,7 +45,7 @@ class RosPublisher:
 
     The topics of a sensor lie in ``NAMESPACE/SENSOR/``; their frame is the sensor's name. ``NAMESPACE/fused/points``
     holds the points of all sensors of a SYNC pulse, if the mounting of two or more is known. ``docs/how-to/ros.md``
-    lists the topics and their messages.
+    lists the topics and their messages. With ``odometry``, use the publisher in a ``with`` statement, or close it.
 
     Parameters
     ----------
@@ -58,6 +60,11 @@ class RosPublisher:
         Largest number of points per image.
     settings : PublishingSettings
         Limits of points and echoes, and rates.
+    odometry : bool
+        Publish the pose and velocity of the platform on ``NAMESPACE/odom``, and the transform from ``odom`` to
+        ``base_link`` on ``/tf``. A thread computes them from the images of all sensors with a known mounting.
+    on_note : callable, optional
+        Called with a line for each sensor or pulse that the odometry leaves out.
 
     Attributes
     ----------
@@ -96,6 +103,8 @@ class RosPublisher:
         mounting: Mapping[str, tuple[Sequence[float], Sequence[float]]] | None = None,
         top: int = 256,
         settings: PublishingSettings = PublishingSettings(),  # noqa: B008  it cannot change
+        odometry: bool = False,
+        on_note: Callable[[str], None] | None = None,
     ) -> None:
         for topic in topics:
             checks.choice("topic", topic, MESSAGES)
@@ -110,7 +119,36 @@ class RosPublisher:
         self._frames: dict[str, Mounting | None] = {}
         self._fused = FusedPoints()
         self._due_ns: dict[tuple[str, str], int] = {}  # By sensor and topic.
-        self._announced: list[dict[str, Any]] = []
+        self._odometry: OdometryPublisher | None = None
+        if odometry:
+            self._odometry = OdometryPublisher(
+                self._topic(f"{self._base}/odom", _ODOMETRY),
+                self._topic("/tf", _TRANSFORMS[1]),
+                on_note=on_note or (lambda _: None),
+                is_paused=lambda: self._settings.paused,
+            )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Publish the poses of all images, if there is odometry; publish nothing afterwards.
+
+        Raises
+        ------
+        ErtisError
+            The odometry has failed.
+        """
+        if self._odometry is not None:
+            self._odometry.close()
+
+    @property
+    def skipped(self) -> int:
+        """Number of pulses without odometry, because the computer was too slow."""
+        return self._odometry.n_skipped if self._odometry is not None else 0
 
     @property
     def settings(self) -> PublishingSettings:
@@ -147,6 +185,8 @@ class RosPublisher:
             item = item.replace(stamp=replace(item.stamp, timestamp_ns=time.time_ns()))
         stamp = item.stamp
         self._announce(stamp, mounting)
+        if self._odometry is not None:
+            self._odometry.add(item, self._frames[stamp.sensor])
         wanted = [topic for topic in self._wanted if topic == "points" or isinstance(item, Energyscape)]
         if self._settings.paused:
             self.left_out += len(wanted)

@@ -1,0 +1,56 @@
+"""Odometry of groups of images that arrive live: mountings may change, and clocks may be set."""
+
+from collections.abc import Callable, Mapping
+
+from ertis_numba.frames import Trajectory
+from ertis_numba.fusion.rig import Mountings
+from ertis_numba.motion.odometry import Odometry, PlanarPose
+from ertis_numba.motion.velocity import EgoVelocity, Item, stamp_of
+
+__all__ = ["LiveOdometry"]
+
+
+class LiveOdometry:
+    """Odometry that continues where recordings would be refused.
+
+    Parameters
+    ----------
+    on_note : callable
+        Called with a line for each group that cannot be used.
+    """
+
+    def __init__(self, on_note: Callable[[str], None]) -> None:
+        self._note = on_note
+        self._mountings: Mountings = {}
+        self._odometry: Odometry | None = None
+
+    @property
+    def trajectory(self) -> Trajectory | None:
+        """Poses at all groups so far; None before the first group."""
+        return self._odometry.trajectory if self._odometry is not None and self._odometry.poses else None
+
+    def add(self, group: Mapping[str, Item], mountings: Mountings) -> tuple[PlanarPose, EgoVelocity | None] | None:
+        """Return the pose and velocity at a group, as `Odometry.add` does; None if it is not later than the last one.
+
+        Parameters
+        ----------
+        group : mapping of str to Energyscape or PointCloud
+            Images or point clouds of a SYNC pulse, by sensor.
+        mountings : mapping of str to (translation_m, rotation_xyzw)
+            Mountings of these and other sensors.
+        """
+        if self._odometry is None:
+            self._odometry = Odometry(mountings)
+        elif mountings != self._mountings:
+            self._odometry.remount(mountings)
+        self._mountings = dict(mountings)
+        stamp, poses = stamp_of(group), self._odometry.poses
+        if poses and stamp.timestamp_ns <= poses[-1].timestamp_ns:
+            early_s = (poses[-1].timestamp_ns - stamp.timestamp_ns) / 1e9
+            self._note(
+                f"SYNC pulse {stamp.sync_count} is left out: it is {early_s:.3g} s before the last one; was a clock "
+                "set back?"
+            )
+            return None
+        velocity = self._odometry.add(group.values())
+        return self._odometry.poses[-1], velocity
