@@ -124,7 +124,11 @@ def test_map_refuses_poses_at_other_times(folder):
     [
         ("both.h5", 2, "contains no poses of the platform; give --poses FILE"),
         ("both.h5 left.h5 --poses poses.tum", 2, "have the same sensor 'left'"),
-        ("both.h5 --poses poses.tum -o place.tif", 1, "ending of the map '.tif' is unknown; known are .h5, .pgm, .ply"),
+        (
+            "both.h5 --poses poses.tum -o place.tif",
+            1,
+            "ending of the map '.tif' is unknown; known are .h5, .mcap, .pgm, .ply",
+        ),
         ("both.h5 --poses none.tum", 1, "none.tum"),
         ("both.h5 --poses poses.tum --cell 0", 2, "--cell"),
         ("both.h5 --poses poses.tum -o both.h5", 1, "both.h5"),

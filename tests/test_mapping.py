@@ -178,7 +178,7 @@ def test_evidence_of_a_point_is_that_of_its_ellipse(monkeypatch):
     window = grid.window(place_m, 3.0)
     add_evidence(window, place_m, 0.0, echoes, coverage, near_m=0.0)
     total = float(window.log_odds.sum())
-    assert total == pytest.approx(2.4, rel=0.02)
+    assert total == pytest.approx(3.5, rel=0.02)
     spread = [
         math.sqrt(float((window.log_odds * offset**2).sum()) / total)
         for offset in ((window.x_m - 2.0)[None, :], window.y_m[:, None])
@@ -186,8 +186,20 @@ def test_evidence_of_a_point_is_that_of_its_ellipse(monkeypatch):
     assert spread == pytest.approx(echoes.sd_m[0].tolist(), rel=0.05)
 
 
+def test_two_pulses_make_a_cell_occupied_but_not_one():
+    grid, place_m = CellGrid(0.05), np.zeros(2)
+    echoes = echoes_of(np.array([[2.0, 0.0]]), np.zeros((1, 2)), np.ones(1))
+    found = []
+    for _ in range(2):
+        window = grid.window(place_m, 3.0)
+        add_evidence(window, place_m, 0.0, echoes, Coverage(np.ones((360, 60)), 0.05), near_m=0.0)
+        found.append(ertis.OccupancyMap(window.log_odds, (0.0, 0.0), 0.05).is_occupied.any())
+    assert found == [False, True]
+
+
 def test_doubtful_echoes_behind_a_clear_one_weigh_less(monkeypatch):
     monkeypatch.setattr(sensor_model, "_FREE", 0.0)
+    monkeypatch.setattr(sensor_model, "_MOST", math.inf)
     grid = CellGrid(0.05)
     echoes = echoes_of(np.array([[1.0, 0.0], [2.0, 0.0]]), np.full((2, 2), 0.01), np.ones(2))
     window = grid.window(np.zeros(2), 3.0)

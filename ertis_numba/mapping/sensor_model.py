@@ -18,8 +18,9 @@ Singles = NDArray[np.float32]
 
 N_AZIMUTHS: Final = 360
 """Directions for free space, of 1°."""
-_OCCUPIED: Final = 2.4  # Log-odds of a cell that certainly contains a clear echo.
-_FREE: Final = 0.6  # Log-odds of a cell in front of the first clear echo, near the platform.
+_OCCUPIED: Final = 3.5  # Log-odds of a clear echo, shared among the cells that may contain it.
+_MOST: Final = 0.55  # Log-odds of a cell from one pulse; ghosts seldom repeat, so that a single one is not enough.
+_FREE: Final = 0.4  # Log-odds of a cell in front of the first clear echo, near the platform.
 _FREE_M: Final = 1.0  # Free range in directions without any clear echo.
 _IN_FRONT_M: Final = 0.05  # Space in front of an echo that is not free yet.
 _BEHIND_M: Final = 0.3  # Distance behind the first clear echo of a direction from which others are doubtful.
@@ -32,7 +33,7 @@ _DISTRUST: Final = 0.25  # Exponent of the coverage in the weight of echoes, of 
 _SMOOTHING: Final = 0.1  # Weight of a new pulse in the usual amplitude.
 # Errors of positions that noise does not explain: overlapping echoes of rough walls, mountings and poses.
 _RANGE_SD_M: Final = 0.01
-_ANGLE_SD_RAD: Final = math.radians(0.5)
+_ANGLE_SD_RAD: Final = math.radians(0.3)
 _REACH_SD: Final = 3.0  # Standard deviations within which an echo counts.
 _TOUCHED: Final = 0.02  # Probability of an echo in a cell from which the cell is not free.
 _WEAKEST_DB: Final = -15.0  # Emitted power, relative to ahead, below which silence shows nothing.
@@ -179,7 +180,7 @@ def add_evidence(
     end_m = np.where(np.isfinite(first_m), first_m - _IN_FRONT_M, _FREE_M)
     free = _free(window, place_m, heading_rad, np.minimum(end_m, wall_m), coverage, near_m=near_m)
     free[occupied > _TOUCHED] = 0.0
-    window.log_odds[:] += _OCCUPIED * occupied - _FREE * free
+    window.log_odds[:] += np.minimum(_OCCUPIED * occupied, _MOST) - _FREE * free
 
 
 def _direction(azimuth_rad: Floats) -> NDArray[np.int64]:
