@@ -140,14 +140,12 @@ def test_map_refuses_input_that_does_not_fit(folder, line, code, message):
 
 def test_commands_and_code_of_the_page_run(tmp_path):
     text = page("mapping")
-    (poses_file,) = re.findall(r"```text\n(.*?)```", text, re.DOTALL)
-    (tmp_path / "poses.tum").write_text(poses_file, "utf-8")
     for command in commands_in(text):
         run_here(tmp_path, command)
-        if command == "example platform":
-            scene_file = tmp_path / "platform.toml"
-            scene_file.write_text(scene_file.read_text("utf-8").replace("count = 30", "count = 2"), "utf-8")
-    assert ertis.read_map(tmp_path / "platform.map.h5").n_groups == 2
+        if command == "example moving_platform":
+            scene_file = tmp_path / "moving_platform.toml"
+            scene_file.write_text(scene_file.read_text("utf-8").replace("count = 6", "count = 2"), "utf-8")
+    assert ertis.read_map(tmp_path / "moving_platform.map.h5").n_groups == 2
     assert 'image: "place.pgm"' in (tmp_path / "place.yaml").read_text("utf-8")
     (code,) = python_in(text)
     assert "[" in run_code_here(tmp_path, code)

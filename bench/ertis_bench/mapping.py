@@ -25,7 +25,7 @@ from ertis_bench.furnished_rooms import (
 )
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table
-from ertis_numba.frames import OccupancyMap
+from ertis_numba.frames import OccupancyMap, Trajectory
 from ertis_numba.simulation import Box, Point
 
 __all__ = ["MappedPlace", "form", "rated", "run"]
@@ -36,6 +36,7 @@ _SPACING_M: Final = 0.05  # of the scatterers of walls
 _RANGE_M: Final = 4.0
 _IN_VIEW_M: Final = 3.7  # Distance of the platform up to which a sensor's image shows a wall.
 _TIME_S: Final = 0.4
+_STEP_S: Final = 0.05  # between the poses that state the velocity.
 _ELLIPSE_M: Final = 1.0, 0.7  # Half axes of the path through a room.
 _ON_WALL_M: Final = 0.1  # Distance from a wall within which a scatterer belongs to it.
 _FOUND_M: Final = 0.05
@@ -192,8 +193,8 @@ def form(report: dict[str, Any]) -> str:
     return (
         f"{table(head, rows)}\n\nFurnished rooms and a hall of {HALL_M[0]:g} × {HALL_M[1]:g} m, with rough walls of "
         f"scatterers {100 * _SPACING_M:g} cm apart on average, whose strengths are Rayleigh distributed. A platform "
-        "with four sensors stands at poses on an ellipse in a room, or drives at 1 m/s through the hall. Poses are "
-        "exact, and cells have 5 cm. A wall cell contains a scatterer, is at most "
+        "with four sensors stands at poses on an ellipse in a room, or drives at 1 m/s through the hall. Poses and "
+        "velocities are exact, and cells have 5 cm. A wall cell contains a scatterer, is at most "
         f"{_IN_VIEW_M:g} m from a pose, and is not hidden by a box. It is found if the centre of an occupied cell is "
         "within 5 cm of its own. An occupied cell is false if its centre is more than 7.5 cm away from all walls, "
         "posts and boxes, so that no part of it is within 5 cm; the share beyond 5 cm is in brackets. Times are "
@@ -224,7 +225,7 @@ def _mapped(
         fused = fuser(images)
         _ = fused.points
         after_s = time.perf_counter()
-        mapper.add(images, _pose(motion), fused=fused)
+        mapper.add(images, _around(motion, fused.image.stamp.timestamp_ns), fused=fused)
         end_s = time.perf_counter()
         taken_s.append(end_s - after_s)
         fused_s.append(end_s - begin_s)
@@ -237,6 +238,13 @@ def _mapped(
     return {"name": name, "pulses": len(motions), **shares, **times}
 
 
-def _pose(motion: Motion) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    half_rad = motion.yaw_rad / 2
-    return (motion.x_m, motion.y_m, 0.0), (0.0, 0.0, math.sin(half_rad), math.cos(half_rad))
+def _around(motion: Motion, time_ns: int) -> Trajectory:
+    """Return poses shortly before and after a motion, which also have its velocity."""
+    poses = [motion.after(time_s) for time_s in (-_STEP_S, 0.0, _STEP_S)]
+    yaw_rad = np.array([pose.yaw_rad for pose in poses]) / 2
+    zeros = np.zeros(len(poses))
+    return Trajectory(
+        time_ns + np.rint(np.array([-_STEP_S, 0.0, _STEP_S]) * 1e9).astype(np.int64),
+        np.stack([[pose.x_m for pose in poses], [pose.y_m for pose in poses], zeros], axis=1),
+        np.stack([zeros, zeros, np.sin(yaw_rad), np.cos(yaw_rad)], axis=1),
+    )
