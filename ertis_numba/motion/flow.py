@@ -15,7 +15,8 @@ Floats = NDArray[np.float64]
 
 MAX_SPEED_M_S: Final = 2.0
 MAX_YAW_RATE_RAD_S: Final = math.radians(120.0)
-_N_STEPS: Final = 17, 17, 17  # of the search over x, y and yaw
+_SEARCH_STEP: Final = np.array([0.0125, 0.0125, math.radians(1.25)])  # of x, y and yaw, below _SEARCH_SD
+_MAX_STEPS: Final = 17  # per axis; larger reaches have larger steps.
 _SEARCH_SD: Final = 0.02, math.radians(2.0)
 _SCALES: Final = 8.0, 5.0, 3.0, 2.0, 1.4, 1.0
 _N_STARTS: Final = 4
@@ -25,6 +26,7 @@ _MAX_LEVEL_CHANGE: Final = math.log(4.0)  # of amplitudes, 12 dB
 _OUTLIER: Final = math.exp(-0.5 * 9.0)  # Likelihood of an echo without a partner: three standard deviations.
 _GATE: Final = 9.0
 _STEP: Final = 1e-6
+_TRIALS: Final = _STEP * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
 # Errors of neighbouring echoes are correlated, so residuals underestimate those of the motion by these factors. They
 # were measured in simulated rooms other than those of `ertis bench motion`.
 _INFLATION: Final = np.diag([1.25, 1.25, 1.6])
@@ -58,37 +60,55 @@ class _EchoPairs(NamedTuple):
 
 
 def twist_of(displacement: Floats, time_s: float) -> Floats:
-    """Return the constant velocity in the frame of the platform that causes a displacement: x, y and yaw per second."""
-    x, y, yaw = displacement.tolist()
+    """Return the constant velocities in the frame of the platform that cause displacements.
+
+    Parameters
+    ----------
+    displacement : (..., 3) float64
+        x, y and yaw.
+    time_s : float
+
+    Returns
+    -------
+    (..., 3) float64
+        x, y and yaw per second.
+    """
+    x, y, yaw = np.moveaxis(displacement, -1, 0)
     half = yaw / 2
     # Inverse of the chord of an arc, turned back by half of the angle.
-    grow = 1 / float(np.sinc(half / math.pi))
-    c, s = math.cos(half) * grow, math.sin(half) * grow
-    return np.array([c * x + s * y, c * y - s * x, yaw]) / time_s
+    grow = 1 / np.sinc(half / math.pi)
+    c, s = np.cos(half) * grow, np.sin(half) * grow
+    return np.stack([c * x + s * y, c * y - s * x, yaw], axis=-1) / time_s
 
 
 def _predicted(
-    displacement: Floats,
-    before: GroupEchoes,
-    poses: tuple[MountedSensor, ...],
-    first_m_s: Floats,
-    velocity_m_s: Floats,
+    displacement: Floats, before: GroupEchoes, offset_m: Floats, first_m_s: Floats, velocity_m_s: Floats
 ) -> tuple[Floats, Floats]:
-    """Return range and azimuth of echoes after a displacement: two (echo,) float64.
+    """Return range and azimuth of echoes after trial displacements: two (trial, echo) float64.
 
     An echo shows its reflector from where the platform is when sound meets it, rather than at the emission.
+
+    Parameters
+    ----------
+    displacement : (trial, 3) float64
+    before : GroupEchoes
+    offset_m : (echo, axis) float64
+        Positions of the sensors on the platform.
+    first_m_s, velocity_m_s : (trial, 2) or (1, 2) float64
+        Velocities at both groups.
     """
-    flat_m = before.position_m[:, :2] + before.delay_s[:, None] * first_m_s - displacement[:2]
-    c, s = math.cos(displacement[2]), math.sin(displacement[2])
-    x_m, y_m = flat_m @ np.array([c, s]), flat_m @ np.array([-s, c])
-    offset_m = np.array([pose.translation_m for pose in poses])[before.sensor]
-    x_m, y_m, z_m = x_m - offset_m[:, 0], y_m - offset_m[:, 1], before.position_m[:, 2] - offset_m[:, 2]
+    x_m = before.position_m[:, 0] + before.delay_s * first_m_s[:, :1] - displacement[:, :1]
+    y_m = before.position_m[:, 1] + before.delay_s * first_m_s[:, 1:] - displacement[:, 1:2]
+    c, s = np.cos(displacement[:, 2:]), np.sin(displacement[:, 2:])
+    x_m, y_m = c * x_m + s * y_m - offset_m[:, 0], c * y_m - s * x_m - offset_m[:, 1]
+    square_z_m2 = (before.position_m[:, 2] - offset_m[:, 2]) ** 2
     # The second range applies at its own instant, which the first one approximates within a millisecond.
-    x_m, y_m = x_m - before.delay_s * velocity_m_s[0], y_m - before.delay_s * velocity_m_s[1]
-    range_m = np.sqrt(x_m**2 + y_m**2 + z_m**2)
+    speed_x_m_s, speed_y_m_s = velocity_m_s[:, :1], velocity_m_s[:, 1:]
+    x_m, y_m = x_m - before.delay_s * speed_x_m_s, y_m - before.delay_s * speed_y_m_s
+    range_m = np.sqrt(x_m**2 + y_m**2 + square_z_m2)
     change_s = (range_m - before.range_m) * (before.delay_s / before.range_m)
-    x_m, y_m = x_m - change_s * velocity_m_s[0], y_m - change_s * velocity_m_s[1]
-    return np.sqrt(x_m**2 + y_m**2 + z_m**2), np.arctan2(y_m, x_m)
+    x_m, y_m = x_m - change_s * speed_x_m_s, y_m - change_s * speed_y_m_s
+    return np.sqrt(x_m**2 + y_m**2 + square_z_m2), np.arctan2(y_m, x_m)
 
 
 class _Flow:
@@ -102,8 +122,9 @@ class _Flow:
         time_s: float,
         velocities_m_s: tuple[Floats, Floats] | None,
     ) -> None:
-        self.before, self.after, self._poses, self._time_s = before, after, poses, time_s
-        self._velocities_m_s = velocities_m_s
+        self.before, self.after, self._time_s = before, after, time_s
+        self._offset_m = np.array([pose.translation_m for pose in poses])[before.sensor]
+        self._velocities_m_s = None if velocities_m_s is None else tuple(each[None] for each in velocities_m_s)
 
     def pairs(self, reach_m: float, reach_rad: float) -> _EchoPairs:
         """Return the pairs of the same sensor whose range, azimuth and level differ little."""
@@ -114,27 +135,31 @@ class _Flow:
         near &= np.abs(before.level[:, None] - after.level) < _MAX_LEVEL_CHANGE
         return _EchoPairs(*np.nonzero(near))
 
-    def residual(self, displacement: Floats, pairs: _EchoPairs) -> Floats:
-        """Return observed minus predicted range and azimuth: (2, pair) float64, in metres and radians."""
-        constant_m_s = twist_of(displacement, self._time_s)[:2]
-        velocities_m_s = self._velocities_m_s or (constant_m_s, constant_m_s)
-        range_m, azimuth_rad = _predicted(displacement, self.before, self._poses, *velocities_m_s)
-        return np.stack(
+    def linear(self, displacement: Floats, pairs: _EchoPairs) -> tuple[Floats, Floats]:
+        """Return residuals, and derivatives of the predictions.
+
+        Returns
+        -------
+        residual : (2, pair) float64
+            Observed minus predicted range and azimuth, in metres and radians.
+        slopes : (2, pair, 3) float64
+        """
+        range_m, azimuth_rad = self._predicted(displacement + _TRIALS)
+        residual = np.stack(
             [
-                self.after.range_m[pairs.after] - range_m[pairs.before],
-                _turn(self.after.azimuth_rad[pairs.after] - azimuth_rad[pairs.before]),
+                self.after.range_m[pairs.after] - range_m[0, pairs.before],
+                _turn(self.after.azimuth_rad[pairs.after] - azimuth_rad[0, pairs.before]),
             ]
         )
+        slopes = np.stack([range_m[1:4] - range_m[4:], _turn(azimuth_rad[1:4] - azimuth_rad[4:])]) / (2 * _STEP)
+        return residual, np.ascontiguousarray(slopes.transpose(0, 2, 1)[:, pairs.before])
 
-    def slopes(self, displacement: Floats, pairs: _EchoPairs) -> Floats:
-        """Return derivatives of the predictions: (2, pair, 3) float64."""
-        columns = []
-        for number in range(3):
-            step = np.zeros(3)
-            step[number] = _STEP
-            change = self.residual(displacement - step, pairs) - self.residual(displacement + step, pairs)
-            columns.append(change / (2 * _STEP))
-        return np.stack(columns, axis=2)
+    def _predicted(self, displacement: Floats) -> tuple[Floats, Floats]:
+        velocities_m_s = self._velocities_m_s
+        if velocities_m_s is None:
+            constant_m_s = twist_of(displacement, self._time_s)[:, :2]
+            velocities_m_s = constant_m_s, constant_m_s
+        return _predicted(displacement, self.before, self._offset_m, *velocities_m_s)
 
     def deviations(self, pairs: _EchoPairs) -> Floats:
         """Return the standard deviations of residuals: (2, pair) float64."""
@@ -186,20 +211,21 @@ def fit_flow(
 
 def _starts(flow: _Flow, pairs: _EchoPairs, centre: Floats, limit: Floats) -> Floats:
     """Return the most likely displacements of a grid: (start, 3) float64."""
-    axes = [c + most * np.linspace(-1, 1, n) for c, most, n in zip(centre, limit, _N_STEPS, strict=True)]
+    counts = np.clip(2 * np.ceil(limit / _SEARCH_STEP).astype(int) + 1, 3, _MAX_STEPS)
+    axes = [c + most * np.linspace(-1, 1, n) for c, most, n in zip(centre, limit, counts, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     strong = (_rank(flow.before)[pairs.before] < _STRONGEST) & (_rank(flow.after)[pairs.after] < _STRONGEST)
     pairs = _EchoPairs(pairs.before[strong], pairs.after[strong])
     sd = np.array(_SEARCH_SD)[:, None]
-    residual = flow.residual(centre, pairs) / sd
-    slopes = flow.slopes(centre, pairs) / sd[:, :, None]
+    residual, slopes = flow.linear(centre, pairs)
+    residual, slopes = residual / sd, slopes / sd[:, :, None]
     score = np.empty(len(grid))
     for part in np.array_split(np.arange(len(grid)), max(1, len(grid) * len(pairs.before) // 500_000)):
         offset = grid[part] - centre
         square = sum((residual[axis][:, None] - slopes[axis] @ offset.T) ** 2 for axis in (0, 1))
         score[part] = np.sum(np.maximum(0.0, 1 - square / _GATE) ** 2, axis=0)
     found: list[Floats] = []
-    step = np.array([2 * most / (n - 1) for most, n in zip(limit, _N_STEPS, strict=True)])
+    step = np.array([2 * most / (n - 1) for most, n in zip(limit, counts, strict=True)])
     for place in np.argsort(-score):
         if all(np.any(np.abs(grid[place] - other) > 2.5 * step) for other in found):
             found.append(grid[place])
@@ -230,9 +256,9 @@ def _annealed(flow: _Flow, pairs: _EchoPairs, displacement: Floats) -> tuple[Flo
     sd = flow.deviations(pairs)
     weight = np.zeros(len(pairs.before))
     for scale in (*_SCALES, *([1.0] * _ROUNDS)):
-        residual = flow.residual(displacement, pairs) / sd
+        residual, slopes = flow.linear(displacement, pairs)
+        residual, slopes = residual / sd, slopes / sd[:, :, None]
         weight = _weights(np.sum(residual**2, axis=0) / scale**2, pairs, len(flow.before.level), len(flow.after.level))
-        slopes = flow.slopes(displacement, pairs) / sd[:, :, None]
         step = _solved(slopes, residual, weight)
         displacement = displacement + step
     return displacement, float(np.sum(weight))
@@ -248,10 +274,10 @@ def _solved(slopes: Floats, residual: Floats, weight: Floats) -> Floats:
 def _final(flow: _Flow, pairs: _EchoPairs, displacement: Floats) -> FlowFit | None:
     """Return the fit to the pairs that remain, with its covariance from their residuals."""
     sd = flow.deviations(pairs)
-    residual = flow.residual(displacement, pairs) / sd
+    residual, slopes = flow.linear(displacement, pairs)
+    residual, slopes = residual / sd, slopes / sd[:, :, None]
     n_before, n_after = len(flow.before.level), len(flow.after.level)
     weight = _weights(np.sum(residual**2, axis=0), pairs, n_before, n_after)
-    slopes = flow.slopes(displacement, pairs) / sd[:, :, None]
     normal = np.einsum("apx,p,apy->xy", slopes, weight, slopes)
     n_matches = int(np.sum(weight > 0.5))
     if n_matches < 3 or np.linalg.matrix_rank(normal, hermitian=True) < 3:
