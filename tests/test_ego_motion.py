@@ -89,6 +89,16 @@ def test_odometry_integrates_a_circle():
     assert not path.covariance[:, 2:5].any()
 
 
+def test_velocity_is_assumed_to_continue_for_at_most_a_second():
+    odometry = ertis.Odometry(MOUNTINGS)
+    for pulse in (0, 1, 600):
+        velocity = odometry.add([seen_from((0.05 * min(pulse, 1), 0, 0), places_m(), pulse)])
+    pose = odometry.poses[-1]
+    assert (velocity, pose.is_measured) == (None, False)
+    assert pose.x_m == pytest.approx(0.05 + 0.5, abs=0.01)
+    assert np.sqrt(pose.covariance[0, 0]) > 0.5 * 59.9
+
+
 AHEAD = (0.0, 0.0, 0.0, 1.0)
 
 

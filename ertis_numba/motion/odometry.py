@@ -193,7 +193,7 @@ class Odometry:
         -------
         EgoVelocity or None
             None for the first group, after more than a second without images, and if too few echoes match. The pose
-            then assumes that the last velocity continued.
+            then assumes that the last velocity continued for at most a second.
 
         Raises
         ------
@@ -218,9 +218,8 @@ class Odometry:
         found = self._since_last(echoes, time_s) if time_s <= MAX_TIME_S else None
         if found is None:
             unknown = _UNKNOWN_VARIANCE * time_s**2
-            self._path.append(
-                self._path[-1].moved(_displacement(self._twist, time_s), unknown, timestamp_ns, is_measured=False)
-            )
+            assumed = _displacement(self._twist, min(time_s, MAX_TIME_S))
+            self._path.append(self._path[-1].moved(assumed, unknown, timestamp_ns, is_measured=False))
             self._is_moving_known = False
             self._begin(echoes)
             return None
