@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -132,6 +133,21 @@ def test_pulses_of_another_session_are_not_lost():
     found, _ = received([*pulses(0, 1), restarted], 50)
     assert found[50].n_lost == 0
     assert_at_step(found[50].pose, 2)
+
+
+def test_slow_application_gets_the_latest_pulses():
+    end_s = time.monotonic() + 20.0
+    with (
+        Publisher() as publisher,
+        publisher.playing(images(*range(6))),
+        OdometrySubscriber(publisher.address, mountings=MOUNTINGS) as subscriber,
+    ):
+        while subscriber.n_skipped < 4:
+            assert time.monotonic() < end_s
+            time.sleep(0.01)
+        arrivals = [subscriber.receive(20.0) for _ in range(2)]
+    assert [(arrival.sync_count, arrival.n_lost) for arrival in arrivals] == [(4, 0), (5, 0)]
+    assert (subscriber.n_skipped, arrivals[1].pose.is_measured) == (4, True)
 
 
 def test_pulse_after_a_long_gap_has_no_velocity():
