@@ -16,8 +16,9 @@ from ertis_numba.motion.live import LiveOdometry
 from ertis_numba.ros import Participant, PublishingSettings, RosPublisher
 from ertis_numba.settings import Settings
 from ertis_numba.storage import write_energyscapes
+from tests.publishing import Publisher
 from tests.ros_topics import DOMAIN, await_subscribers, subscribed
-from tests.test_odometry_subscriber import images
+from tests.test_odometry_subscriber import MOUNTING_FILE, images
 
 pytest.importorskip("rclpy.serialization")  # Wheels exist for some versions of Python only.
 pytest.importorskip("cyclonedds")
@@ -120,13 +121,16 @@ def test_failure_of_odometry_is_noted_and_raised_at_the_end(monkeypatch):
     assert notes == ["odometry has ended: no luck"]
 
 
-def test_command_publishes_the_odometry_of_a_file(tmp_path):
-    path, mounting = tmp_path / "images.h5", tmp_path / "mounting.toml"
+@pytest.fixture
+def mounting(tmp_path):
+    path = tmp_path / "mounting.toml"
+    path.write_text(MOUNTING_FILE)
+    return path
+
+
+def test_command_publishes_the_odometry_of_a_file(tmp_path, mounting):
+    path = tmp_path / "images.h5"
     write_energyscapes(path, images(*range(5)))
-    mounting.write_text(
-        '[[sensors]]\nname = "front"\nposition_m = [0.2, 0.0, 0.0]\n\n'
-        '[[sensors]]\nname = "back"\nposition_m = [-0.2, 0.0, 0.0]\nyaw_deg = 180.0\n'
-    )
     arguments = ["--odometry", "--mounting", str(mounting), "--domain", str(DOMAIN), "--use-sim-time", "--json"]
     done = CliRunner().invoke(cli, ["ros", str(path), *arguments])
     assert done.exit_code == 0, done.output
@@ -134,3 +138,13 @@ def test_command_publishes_the_odometry_of_a_file(tmp_path):
     assert {"event": "topic", "topic": "/odom", "message": ODOMETRY} in lines
     end = lines[-1]
     assert end["messages"]["/odom"] == end["messages"]["/tf"] == 5 - end["skipped"]
+
+
+def test_command_publishes_the_odometry_of_a_central_node(mounting):
+    arguments = ["--odometry", "--topic", "points", "--domain", str(DOMAIN), "--duration", "4", "--json"]
+    with Publisher() as publisher, publisher.playing(images(*range(4))):
+        done = CliRunner().invoke(cli, ["ros", publisher.address, "--mounting", str(mounting), *arguments])
+    assert done.exit_code == 0, done.output
+    end = json.loads(done.stdout.splitlines()[-1])
+    assert end["messages"]["/front/points"] > 0
+    assert 1 <= end["messages"]["/odom"] == end["messages"]["/tf"] <= 4
