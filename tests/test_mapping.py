@@ -178,7 +178,7 @@ def test_evidence_of_a_point_is_that_of_its_ellipse(monkeypatch):
     window = grid.window(place_m, 3.0)
     add_evidence(window, place_m, 0.0, echoes, coverage, near_m=0.0)
     total = float(window.log_odds.sum())
-    assert total == pytest.approx(3.5, rel=0.02)
+    assert total == pytest.approx(5.0, rel=0.02)
     spread = [
         math.sqrt(float((window.log_odds * offset**2).sum()) / total)
         for offset in ((window.x_m - 2.0)[None, :], window.y_m[:, None])

@@ -297,7 +297,7 @@ def motion(**given: Any) -> None:
     "--length",
     "length_m",
     type=click.FloatRange(0.0, 500.0),
-    default=24.0,
+    default=32.0,
     show_default=True,
     metavar="M",
     help="Length of the path through a hall; 0 leaves out the hall.",

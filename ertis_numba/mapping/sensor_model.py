@@ -18,8 +18,8 @@ Singles = NDArray[np.float32]
 
 N_AZIMUTHS: Final = 360
 """Directions for free space, of 1°."""
-_OCCUPIED: Final = 3.5  # Log-odds of a clear echo, shared among the cells that may contain it.
-_MOST: Final = 0.55  # Log-odds of a cell from one pulse; ghosts seldom repeat, so that a single one is not enough.
+_OCCUPIED: Final = 5.0  # Log-odds of a clear echo, shared among the cells that may contain it.
+_MOST: Final = 0.6  # Log-odds of a cell from one pulse; ghosts seldom repeat, so that a single one is not enough.
 _FREE: Final = 0.4  # Log-odds of a cell in front of the first clear echo, near the platform.
 _FREE_M: Final = 1.0  # Free range in directions without any clear echo.
 _IN_FRONT_M: Final = 0.05  # Space in front of an echo that is not free yet.
