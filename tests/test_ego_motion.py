@@ -18,28 +18,38 @@ def places_m(seed=1, count=40):
     return np.column_stack([draws.uniform(0.8, 3, count), draws.uniform(-1.5, 1.5, count), np.zeros(count)])
 
 
-def seen_from(pose, places, pulse, **stamp):
-    """Return the point cloud of reflectors at rest, seen from a pose of the platform: x, y and yaw."""
+def seen_from(pose, places, pulse, twist=(0.0, 0.0, 0.0), **stamp):
+    """Return the point cloud of reflectors at rest, seen from a pose of the platform: x, y and yaw.
+
+    The twist is the velocity forward, to the left and of the yaw, at which the platform moves meanwhile.
+    """
     x, y, yaw_rad = pose
     c, s = math.cos(yaw_rad), math.sin(yaw_rad)
     position_m = (places - [x, y, 0.0]) @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    return ertis.PointCloud(
+    cloud = ertis.PointCloud(
         position_m.astype(np.float32),
         np.ones(len(places), np.float32),
         ertis.Settings(),
         ertis.Stamp(**{"sync_count": pulse, "timestamp_ns": pulse * TIME_NS} | stamp),
     )
+    forward_m_s, left_m_s, yaw_rate_rad_s = twist
+    seen = cloud
+    for _ in range(8):  # Points that compensation returns to their places, by iteration.
+        at_rest = ertis.compensate_motion(seen, (forward_m_s, left_m_s, 0.0), yaw_rate_rad_s)
+        seen = cloud.replace(position_m=seen.position_m + cloud.position_m - at_rest.position_m)
+    return seen
 
 
 @pytest.mark.parametrize(("x", "y", "yaw_deg"), [(0.1, 0.0, 0.0), (0.0, -0.08, 0.0), (0.05, 0.05, 5.0), (0, 0, -9.0)])
 def test_ego_velocity_is_that_of_the_displacement(x, y, yaw_deg):
     turn_rad = math.radians(yaw_deg)
-    clouds = [seen_from((0, 0, 0), places_m(), 0), seen_from((x, y, turn_rad), places_m(), 1)]
-    found = ertis.ego_velocity(clouds[:1], clouds[1:], MOUNTINGS)
     # On an arc, the mean velocity in the turning frame is the displacement, turned back by half of the turn.
     half = turn_rad / 2
     along = np.array([math.cos(half) * x + math.sin(half) * y, math.cos(half) * y - math.sin(half) * x])
     along /= np.sinc(half / math.pi)
+    twist = (*(along / 0.1).tolist(), turn_rad / 0.1)
+    clouds = [seen_from((0, 0, 0), places_m(), 0, twist), seen_from((x, y, turn_rad), places_m(), 1, twist)]
+    found = ertis.ego_velocity(clouds[:1], clouds[1:], MOUNTINGS)
     assert found.velocity_m_s == pytest.approx(along / 0.1, abs=5e-3)
     assert found.yaw_rate_rad_s == pytest.approx(turn_rad / 0.1, abs=5e-3)
     assert found.n_matches > 30
@@ -49,7 +59,9 @@ def test_moving_reflectors_are_ignored():
     places = places_m()
     walked = places.copy()
     walked[:12] += [0.0, 0.12, 0.0]
-    found = ertis.ego_velocity([seen_from((0, 0, 0), places, 0)], [seen_from((0.1, 0, 0), walked, 1)], MOUNTINGS)
+    twist = (1.0, 0.0, 0.0)
+    before, after = seen_from((0, 0, 0), places, 0, twist), seen_from((0.1, 0, 0), walked, 1, twist)
+    found = ertis.ego_velocity([before], [after], MOUNTINGS)
     assert found.velocity_m_s == pytest.approx([1.0, 0.0], abs=0.01)
 
 
@@ -72,7 +84,8 @@ def test_odometry_integrates_a_circle():
     for pulse in range(20):
         yaw_rad = pulse * turn_rad
         x, y = 0.3 * math.sin(yaw_rad), 0.3 * (1 - math.cos(yaw_rad))
-        velocity = odometry.add([seen_from((x, y, yaw_rad), places, pulse)])
+        twist = 0.3 * turn_rad / 0.1, 0.0, turn_rad / 0.1
+        velocity = odometry.add([seen_from((x, y, yaw_rad), places, pulse, twist)])
         assert (velocity is None) == (pulse == 0)
     pose = odometry.poses[-1]
     assert (pose.x_m, pose.y_m, pose.yaw_rad) == pytest.approx((x, y, yaw_rad), abs=0.01)

@@ -43,8 +43,9 @@ class GroupEchoes(NamedTuple):
     range_sd_m, azimuth_sd_rad : (echo,) float64
     level : (echo,) float64
         Natural logarithm of the amplitude.
-    delay_s : (echo,) float64
-        Time after the start of the emission at which the platform was where the range applies.
+    delay_s, arrival_s : (echo,) float64
+        Times after the start of the emission at which the platform was where the range and the azimuth apply.
+    sound_speed_m_s : (echo,) float64
     """
 
     sensor: NDArray[np.int64]
@@ -55,6 +56,8 @@ class GroupEchoes(NamedTuple):
     azimuth_sd_rad: Floats
     level: Floats
     delay_s: Floats
+    arrival_s: Floats
+    sound_speed_m_s: Floats
 
 
 class EchoExtractor:
@@ -104,6 +107,8 @@ class EchoExtractor:
             np.hypot(across_sd_m / range_m, _ANGLE_SD_RAD / np.cos(off_axis)),
             np.log(np.maximum(cloud.amplitude.astype(np.float64), np.finfo(np.float32).tiny)),
             range_m / speed_m_s - sweep_delay_s(cloud.settings.call),
+            2 * range_m / speed_m_s + cloud.settings.call.duration_s / 2,
+            np.full(len(cloud), speed_m_s),
         )
 
     def _cloud(self, image: Energyscape) -> PointCloud:

@@ -82,11 +82,12 @@ def twist_of(displacement: Floats, time_s: float) -> Floats:
 
 
 def _predicted(
-    displacement: Floats, before: GroupEchoes, offset_m: Floats, first_m_s: Floats, velocity_m_s: Floats
+    displacement: Floats, before: GroupEchoes, offset_m: Floats, first: Floats, second: Floats
 ) -> tuple[Floats, Floats]:
     """Return range and azimuth of echoes after trial displacements: two (trial, echo) float64.
 
-    An echo shows its reflector from where the platform is when sound meets it, rather than at the emission.
+    Echoes are placed where they were at the first emission, and then where they appear after the second one, as
+    `compensate_motion` describes.
 
     Parameters
     ----------
@@ -94,21 +95,36 @@ def _predicted(
     before : GroupEchoes
     offset_m : (echo, axis) float64
         Positions of the sensors on the platform.
-    first_m_s, velocity_m_s : (trial, 2) or (1, 2) float64
-        Velocities at both groups.
+    first, second : (trial, 3) or (1, 3) float64
+        Twists at both groups.
     """
-    x_m = before.position_m[:, 0] + before.delay_s * first_m_s[:, :1] - displacement[:, :1]
-    y_m = before.position_m[:, 1] + before.delay_s * first_m_s[:, 1:] - displacement[:, 1:2]
-    c, s = np.cos(displacement[:, 2:]), np.sin(displacement[:, 2:])
-    x_m, y_m = c * x_m + s * y_m - offset_m[:, 0], c * y_m - s * x_m - offset_m[:, 1]
-    square_z_m2 = (before.position_m[:, 2] - offset_m[:, 2]) ** 2
-    # The second range applies at its own instant, which the first one approximates within a millisecond.
-    speed_x_m_s, speed_y_m_s = velocity_m_s[:, :1], velocity_m_s[:, 1:]
-    x_m, y_m = x_m - before.delay_s * speed_x_m_s, y_m - before.delay_s * speed_y_m_s
+    from_sensor_m = before.position_m - offset_m
+    x_m, y_m = _turned(from_sensor_m[:, 0], from_sensor_m[:, 1], first[:, 2:] * before.arrival_s)
+    way_x_m, way_y_m = _way_m(x_m, y_m, first, offset_m, before.range_m, before.delay_s, before.arrival_s)
+    x_m, y_m = x_m + way_x_m + offset_m[:, 0], y_m + way_y_m + offset_m[:, 1]
+    x_m, y_m = _turned(x_m - displacement[:, :1], y_m - displacement[:, 1:2], -displacement[:, 2:])
+    x_m, y_m = x_m - offset_m[:, 0], y_m - offset_m[:, 1]
+    square_z_m2 = from_sensor_m[:, 2] ** 2
     range_m = np.sqrt(x_m**2 + y_m**2 + square_z_m2)
-    change_s = (range_m - before.range_m) * (before.delay_s / before.range_m)
-    x_m, y_m = x_m - change_s * speed_x_m_s, y_m - change_s * speed_y_m_s
-    return np.sqrt(x_m**2 + y_m**2 + square_z_m2), np.arctan2(y_m, x_m)
+    later_s = (range_m - before.range_m) / before.sound_speed_m_s
+    delay_s, arrival_s = before.delay_s + later_s, before.arrival_s + 2 * later_s
+    way_x_m, way_y_m = _way_m(x_m, y_m, second, offset_m, range_m, delay_s, arrival_s)
+    x_m, y_m = x_m - way_x_m, y_m - way_y_m
+    return np.sqrt(x_m**2 + y_m**2 + square_z_m2), np.arctan2(y_m, x_m) - second[:, 2:] * arrival_s
+
+
+def _way_m(
+    x_m: Floats, y_m: Floats, twist: Floats, offset_m: Floats, range_m: Floats, delay_s: Floats, arrival_s: Floats
+) -> tuple[Floats, Floats]:
+    """Return the way of the sensors until the range and the direction of each echo apply: two (trial, echo) float64."""
+    x_m_s, y_m_s = twist[:, :1] - twist[:, 2:] * offset_m[:, 1], twist[:, 1:2] + twist[:, 2:] * offset_m[:, 0]
+    along = (x_m * x_m_s + y_m * y_m_s) / range_m**2 * (delay_s - arrival_s)
+    return arrival_s * x_m_s + along * x_m, arrival_s * y_m_s + along * y_m
+
+
+def _turned(x_m: Floats, y_m: Floats, angle_rad: Floats) -> tuple[Floats, Floats]:
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    return c * x_m - s * y_m, s * x_m + c * y_m
 
 
 class _Flow:
@@ -120,11 +136,11 @@ class _Flow:
         after: GroupEchoes,
         poses: tuple[MountedSensor, ...],
         time_s: float,
-        velocities_m_s: tuple[Floats, Floats] | None,
+        twists: tuple[Floats | None, Floats | None],
     ) -> None:
         self.before, self.after, self._time_s = before, after, time_s
         self._offset_m = np.array([pose.translation_m for pose in poses])[before.sensor]
-        self._velocities_m_s = None if velocities_m_s is None else tuple(each[None] for each in velocities_m_s)
+        self._twists = [None if twist is None else twist[None] for twist in twists]
 
     def pairs(self, reach_m: float, reach_rad: float) -> _EchoPairs:
         """Return the pairs of the same sensor whose range, azimuth and level differ little."""
@@ -155,11 +171,9 @@ class _Flow:
         return residual, np.ascontiguousarray(slopes.transpose(0, 2, 1)[:, pairs.before])
 
     def _predicted(self, displacement: Floats) -> tuple[Floats, Floats]:
-        velocities_m_s = self._velocities_m_s
-        if velocities_m_s is None:
-            constant_m_s = twist_of(displacement, self._time_s)[:, :2]
-            velocities_m_s = constant_m_s, constant_m_s
-        return _predicted(displacement, self.before, self._offset_m, *velocities_m_s)
+        constant = twist_of(displacement, self._time_s)
+        first, second = (constant if twist is None else twist for twist in self._twists)
+        return _predicted(displacement, self.before, self._offset_m, first, second)
 
     def deviations(self, pairs: _EchoPairs) -> Floats:
         """Return the standard deviations of residuals: (2, pair) float64."""
@@ -180,7 +194,8 @@ def fit_flow(
     *,
     start: Floats | None = None,
     reach: Floats | None = None,
-    velocities_m_s: tuple[Floats, Floats] | None = None,
+    first_twist: Floats | None = None,
+    second_twist: Floats | None = None,
 ) -> FlowFit | None:
     """Return the displacement that explains most echoes, or None if there are too few.
 
@@ -192,10 +207,11 @@ def fit_flow(
         Time between both groups.
     start, reach : (3,) float64, optional
         Expected displacement, and the largest difference from it.
-    velocities_m_s : two (2,) float64, optional
-        Velocities at both groups, each in the frame of the platform; by default, constant between them.
+    first_twist, second_twist : (3,) float64, optional
+        Velocities at both groups, x, y and yaw per second, each in the frame of the platform; by default, those of the
+        displacement.
     """
-    flow = _Flow(before, after, poses, time_s, velocities_m_s)
+    flow = _Flow(before, after, poses, time_s, (first_twist, second_twist))
     centre = np.zeros(3) if start is None else start
     limit = np.array([MAX_SPEED_M_S, MAX_SPEED_M_S, MAX_YAW_RATE_RAD_S]) * time_s if reach is None else reach
     reach_m = float(np.hypot(*np.abs(centre[:2]))) + float(np.hypot(*limit[:2])) + 0.05

@@ -73,12 +73,12 @@ class PlanarPose(NamedTuple):
         )
 
 
-class _Keyframe(NamedTuple):
-    """Group of echoes that later ones are compared with."""
+class _View(NamedTuple):
+    """Echoes of a group, and the pose and twist of the platform; None if the twist is unknown."""
 
     echoes: GroupEchoes
     pose: PlanarPose
-    velocity_m_s: Floats
+    twist: Floats | None
 
 
 class Odometry:
@@ -112,10 +112,9 @@ class Odometry:
     def __init__(self, mountings: Mountings) -> None:
         self._poses = sensor_poses(mountings)
         self._extract = EchoExtractor(self._poses)
-        self._last: GroupEchoes | None = None
-        self._keyframe: _Keyframe | None = None
+        self._last: _View | None = None
+        self._keyframe: _View | None = None
         self._twist = np.zeros(3)
-        self._is_moving_known = False
         self._path: list[PlanarPose] = []
 
     @property
@@ -178,7 +177,6 @@ class Odometry:
         poses = sensor_poses(mountings)
         if not _begins_with(poses, self._poses):
             self._begin(None)
-            self._is_moving_known = False
         self._poses, self._extract = poses, EchoExtractor(poses)
 
     def add(self, group: Iterable[Item]) -> EgoVelocity | None:
@@ -220,53 +218,55 @@ class Odometry:
             unknown = _UNKNOWN_VARIANCE * time_s**2
             assumed = _displacement(self._twist, min(time_s, MAX_TIME_S))
             self._path.append(self._path[-1].moved(assumed, unknown, timestamp_ns, is_measured=False))
-            self._is_moving_known = False
             self._begin(echoes)
             return None
         velocity = velocity_of(found, timestamp_ns, time_s)
         self._twist = twist_of(found.displacement, time_s)
-        self._path.append(self._located(echoes, found, timestamp_ns))
-        self._is_moving_known = True
-        self._last = echoes
+        self._path.append(self._located(echoes, found, self._twist, timestamp_ns))
+        self._last = _View(echoes, self._path[-1], self._twist)
         return velocity
 
     def _begin(self, echoes: GroupEchoes | None) -> None:
-        self._last, self._keyframe = echoes, None
+        self._last = None if echoes is None else _View(echoes, self._path[-1], None)
+        self._keyframe = None
 
     def _since_last(self, echoes: GroupEchoes, time_s: float) -> FlowFit | None:
-        if self._last is None:
+        last = self._last
+        if last is None:
             return None
-        if self._is_moving_known:
-            expected = _displacement(self._twist, time_s)
-            found = fit_flow(self._last, echoes, self._poses, time_s, start=expected, reach=_MAX_CHANGE * time_s)
-        else:
-            found = fit_flow(self._last, echoes, self._poses, time_s)
-        return found
+        if last.twist is None:
+            return fit_flow(last.echoes, echoes, self._poses, time_s)
+        return fit_flow(
+            last.echoes,
+            echoes,
+            self._poses,
+            time_s,
+            start=_displacement(last.twist, time_s),
+            reach=_MAX_CHANGE * time_s,
+            first_twist=last.twist,
+        )
 
-    def _located(self, echoes: GroupEchoes, found: FlowFit, timestamp_ns: int) -> PlanarPose:
+    def _located(self, echoes: GroupEchoes, found: FlowFit, twist: Floats, timestamp_ns: int) -> PlanarPose:
         """Return the pose relative to the keyframe, or to the last group if the keyframe is out of reach."""
-        last = self._path[-1]
-        step = last.moved(found.displacement, found.covariance, timestamp_ns, is_measured=True)
-        if self._keyframe is None:
-            assert self._last is not None  # noqa: S101  a first group sets it
-            self._keyframe = _Keyframe(self._last, last, self._twist[:2])
-            return step
-        expected = _relative(self._keyframe.pose, step)
-        if math.hypot(*expected[:2]) < _KEYFRAME_M and abs(expected[2]) < _KEYFRAME_RAD:
-            time_s = (timestamp_ns - self._keyframe.pose.timestamp_ns) / 1e9
-            fit = fit_flow(
-                self._keyframe.echoes,
-                echoes,
-                self._poses,
-                time_s,
-                start=expected,
-                reach=_KEYFRAME_REACH,
-                velocities_m_s=(self._keyframe.velocity_m_s, self._twist[:2]),
-            )
-            if fit is not None and fit.n_matches > _KEYFRAME_SHARE * found.n_matches:
-                return self._keyframe.pose.moved(fit.displacement, fit.covariance, timestamp_ns, is_measured=True)
-        assert self._last is not None  # noqa: S101  a first group sets it
-        self._keyframe = _Keyframe(self._last, last, self._twist[:2])
+        step = self._path[-1].moved(found.displacement, found.covariance, timestamp_ns, is_measured=True)
+        keyframe = self._keyframe
+        if keyframe is not None:
+            expected = _relative(keyframe.pose, step)
+            if math.hypot(*expected[:2]) < _KEYFRAME_M and abs(expected[2]) < _KEYFRAME_RAD:
+                # A view keeps the twist that it had when it was located, so that errors of twists add up to nothing.
+                fit = fit_flow(
+                    keyframe.echoes,
+                    echoes,
+                    self._poses,
+                    (timestamp_ns - keyframe.pose.timestamp_ns) / 1e9,
+                    start=expected,
+                    reach=_KEYFRAME_REACH,
+                    first_twist=twist if keyframe.twist is None else keyframe.twist,
+                    second_twist=twist,
+                )
+                if fit is not None and fit.n_matches > _KEYFRAME_SHARE * found.n_matches:
+                    return keyframe.pose.moved(fit.displacement, fit.covariance, timestamp_ns, is_measured=True)
+        self._keyframe = self._last
         return step
 
 
