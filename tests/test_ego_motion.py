@@ -65,6 +65,25 @@ def test_moving_reflectors_are_ignored():
     assert found.velocity_m_s == pytest.approx([1.0, 0.0], abs=0.01)
 
 
+def test_weak_echoes_from_behind_do_not_reverse_the_turn():
+    """A flat array hears calls of neighbours from behind, mirrored, so that they turn the other way."""
+    turn_rad = math.radians(6.0)
+    twist = (0.0, 0.0, turn_rad / 0.1)
+    ahead, behind = places_m(1, 10), places_m(2, 14)
+
+    def cloud(yaw_rad, pulse):
+        seen = seen_from((0, 0, yaw_rad), ahead, pulse, twist)
+        mirrored = seen_from((0, 0, -yaw_rad), behind, pulse, (0.0, 0.0, -twist[2]))
+        return seen.replace(
+            position_m=np.concatenate([seen.position_m, mirrored.position_m]),
+            amplitude=np.repeat(np.float32([1.0, 0.1]), [10, 14]),
+        )
+
+    found = ertis.ego_velocity([cloud(0.0, 0)], [cloud(turn_rad, 1)], MOUNTINGS)
+    assert found.yaw_rate_rad_s == pytest.approx(twist[2], abs=0.02)
+    assert found.velocity_m_s == pytest.approx([0.0, 0.0], abs=0.02)
+
+
 def test_ego_velocity_in_a_furnished_room():
     """`ertis bench motion` measures the errors of many rooms."""
     motion = random_motion(3)

@@ -44,12 +44,15 @@ class FlowFit(NamedTuple):
         Number of echoes that the displacement explains.
     share : float
         Share of echoes that the displacement explains.
+    likelihood : float
+        Sum of the strengths of these echoes, with which fits to the same groups can be compared.
     """
 
     displacement: Floats
     covariance: Floats
     n_matches: int
     share: float
+    likelihood: float
 
 
 class _EchoPairs(NamedTuple):
@@ -175,6 +178,15 @@ class _Flow:
         first, second = (constant if twist is None else twist for twist in self._twists)
         return _predicted(displacement, self.before, self._offset_m, first, second)
 
+    def strengths(self, pairs: _EchoPairs) -> Floats:
+        """Return the weights of pairs in a comparison of displacements: (pair,) float64.
+
+        Flat arrays hear the calls of neighbours from behind as if they came from ahead, and such echoes turn the other
+        way. They are as many as others, but weaker, so strong echoes count more: the root of their amplitude.
+        """
+        levels = [echoes.level - echoes.level.max() for echoes in (self.before, self.after)]
+        return np.asarray(np.exp((levels[0][pairs.before] + levels[1][pairs.after]) / 4))
+
     def deviations(self, pairs: _EchoPairs) -> Floats:
         """Return the standard deviations of residuals: (2, pair) float64."""
         before, after = self.before, self.after
@@ -235,11 +247,12 @@ def _starts(flow: _Flow, pairs: _EchoPairs, centre: Floats, limit: Floats) -> Fl
     sd = np.array(_SEARCH_SD)[:, None]
     residual, slopes = flow.linear(centre, pairs)
     residual, slopes = residual / sd, slopes / sd[:, :, None]
+    strength = flow.strengths(pairs)
     score = np.empty(len(grid))
     for part in np.array_split(np.arange(len(grid)), max(1, len(grid) * len(pairs.before) // 500_000)):
         offset = grid[part] - centre
         square = sum((residual[axis][:, None] - slopes[axis] @ offset.T) ** 2 for axis in (0, 1))
-        score[part] = np.sum(np.maximum(0.0, 1 - square / _GATE) ** 2, axis=0)
+        score[part] = strength @ np.maximum(0.0, 1 - square / _GATE) ** 2
     found: list[Floats] = []
     step = np.array([2 * most / (n - 1) for most, n in zip(limit, counts, strict=True)])
     for place in np.argsort(-score):
@@ -277,7 +290,7 @@ def _annealed(flow: _Flow, pairs: _EchoPairs, displacement: Floats) -> tuple[Flo
         weight = _weights(np.sum(residual**2, axis=0) / scale**2, pairs, len(flow.before.level), len(flow.after.level))
         step = _solved(slopes, residual, weight)
         displacement = displacement + step
-    return displacement, float(np.sum(weight))
+    return displacement, float(weight @ flow.strengths(pairs))
 
 
 def _solved(slopes: Floats, residual: Floats, weight: Floats) -> Floats:
@@ -301,7 +314,8 @@ def _final(flow: _Flow, pairs: _EchoPairs, displacement: Floats) -> FlowFit | No
     spread = np.einsum("apx,p,ap,apy->xy", slopes, weight**2, residual**2, slopes)
     inverse = np.linalg.inv(normal)
     covariance = _INFLATION @ inverse @ spread @ inverse @ _INFLATION
-    return FlowFit(displacement, covariance, n_matches, n_matches / max(1, min(n_before, n_after)))
+    share = n_matches / max(1, min(n_before, n_after))
+    return FlowFit(displacement, covariance, n_matches, share, float(weight @ flow.strengths(pairs)))
 
 
 def _turn(angle_rad: Floats) -> Floats:

@@ -23,6 +23,9 @@ _MAX_CHANGE: Final = np.array([0.6, 0.6, math.radians(60.0)])
 _KEYFRAME_REACH: Final = np.array([0.02, 0.02, math.radians(2.0)])
 _KEYFRAME_M: Final = 0.3
 _KEYFRAME_RAD: Final = math.radians(15.0)
+# Matched echoes, and their share, below which a motion need not be near the last one.
+_FEW_MATCHES: Final = 12
+_DOUBTFUL_SHARE: Final = 0.25
 _KEYFRAME_SHARE: Final = 0.5  # Share of the matches of the last two groups that a keyframe still has.
 _PLANAR: Final = 0, 1, 5  # of x, y, z, and the rotations about them
 _UNKNOWN_VARIANCE: Final = np.diag([0.5, 0.5, 1.0]) ** 2  # per second of a gap, of constant velocity
@@ -236,15 +239,22 @@ class Odometry:
             return None
         if last.twist is None:
             return fit_flow(last.echoes, echoes, self._poses, time_s)
-        return fit_flow(
+        start = _displacement(last.twist, time_s)
+        found = fit_flow(
             last.echoes,
             echoes,
             self._poses,
             time_s,
-            start=_displacement(last.twist, time_s),
+            start=start,
             reach=_MAX_CHANGE * time_s,
             first_twist=last.twist,
         )
+        if found is not None and found.n_matches > _FEW_MATCHES and found.share > _DOUBTFUL_SHARE:
+            return found
+        # The expectation may be wrong, so that all displacements are compared.
+        other = fit_flow(last.echoes, echoes, self._poses, time_s)
+        fits = [each for each in (found, other) if each is not None]
+        return max(fits, key=lambda each: each.likelihood, default=None)
 
     def _located(self, echoes: GroupEchoes, found: FlowFit, twist: Floats, timestamp_ns: int) -> PlanarPose:
         """Return the pose relative to the keyframe, or to the last group if the keyframe is out of reach."""
@@ -264,10 +274,16 @@ class Odometry:
                     first_twist=twist if keyframe.twist is None else keyframe.twist,
                     second_twist=twist,
                 )
-                if fit is not None and fit.n_matches > _KEYFRAME_SHARE * found.n_matches:
+                if fit is not None and _confirms(fit, found, expected):
                     return keyframe.pose.moved(fit.displacement, fit.covariance, timestamp_ns, is_measured=True)
         self._keyframe = self._last
         return step
+
+
+def _confirms(fit: FlowFit, found: FlowFit, expected: Floats) -> bool:
+    """Return True if the fit since a keyframe agrees with that since the last group, and has enough matches."""
+    is_near = bool(np.all(np.abs(fit.displacement - expected) < _KEYFRAME_REACH))
+    return is_near and fit.n_matches > _KEYFRAME_SHARE * found.n_matches
 
 
 def _begins_with(poses: tuple[MountedSensor, ...], others: tuple[MountedSensor, ...]) -> bool:
