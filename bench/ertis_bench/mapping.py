@@ -133,8 +133,8 @@ def rated(found: OccupancyMap, place: MappedPlace, path_m: Floats) -> dict[str, 
         "found": float(np.mean(nearest_m < _FOUND_M + _ROUNDING_M)),
         "near": float(np.mean(nearest_m < _FALSE_M + _ROUNDING_M)),
         "occupied": len(away_m),
-        "false": float(np.mean(away_m > _FALSE_M)),
-        "off": float(np.mean(away_m > _FOUND_M)),
+        "false": float(np.mean(away_m > _FALSE_M + _ROUNDING_M)),
+        "off": float(np.mean(away_m > _FOUND_M + _ROUNDING_M)),
     }
 
 
