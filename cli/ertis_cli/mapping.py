@@ -180,10 +180,10 @@ def _located(groups: "Sequence[dict[str, StampedIndex]]", trajectory: "Trajector
     """
     from ertis_numba.errors import DataError
 
-    first_ns, last_ns = trajectory.time_ns[[0, -1]].tolist()
     times_ns = [min(place.stamp.timestamp_ns for place in group.values()) for group in groups]
-    located = [group for group, time_ns in zip(groups, times_ns, strict=True) if first_ns <= time_ns <= last_ns]
+    located = [group for group, is_covered in zip(groups, trajectory.covers(times_ns), strict=True) if is_covered]
     if not located:
+        first_ns, last_ns = trajectory.time_ns[[0, -1]].tolist()
         raise DataError(
             f"all pulses lie outside of the time of the poses: pulses from {min(times_ns) / 1e9:.3f} s to "
             f"{max(times_ns) / 1e9:.3f} s, poses from {first_ns / 1e9:.3f} s to {last_ns / 1e9:.3f} s; give poses of "

@@ -13,6 +13,7 @@ from ertis_numba.frames._replacing import replaced
 __all__ = ["Trajectory"]
 
 _NS_PER_S: Final = 1e9
+_MARGIN_NS: Final = 1_000_000
 _MAX_NORM_ERROR: Final = 1e-3  # Text files have few digits; a larger error is no rounding.
 _MAX_ROUNDING: Final = 1e-14  # Error in the length of a quaternion that was normalised before.
 
@@ -114,7 +115,8 @@ class Trajectory:
     def at(self, time_ns: ArrayLike) -> "Trajectory":
         """Return the poses interpolated at other times.
 
-        Positions and covariances are interpolated linearly, rotations along the shortest arc.
+        Positions and covariances are interpolated linearly, rotations along the shortest arc. Up to 1 ms before the
+        first pose and after the last one, that pose applies, because the sensors of a pulse measure in succession.
 
         Parameters
         ----------
@@ -175,9 +177,19 @@ class Trajectory:
         index, fraction = self._brackets(wanted)
         return _linear(linear_m_s, index, fraction), _linear(turns.as_rotvec() / duration_s, index, fraction)
 
+    def covers(self, time_ns: ArrayLike) -> NDArray[np.bool_]:
+        """Return True for times at which `at` returns a pose: (n,) bool.
+
+        Parameters
+        ----------
+        time_ns : (n,) int64
+        """
+        wanted = _times("time_ns", time_ns)
+        return np.asarray((wanted >= self.time_ns[0] - _MARGIN_NS) & (wanted <= self.time_ns[-1] + _MARGIN_NS))
+
     def _require_covered(self, wanted: NDArray[np.int64]) -> None:
         first, last = self.time_ns[0], self.time_ns[-1]
-        outside = int(np.count_nonzero((wanted < first) | (wanted > last)))
+        outside = int(np.count_nonzero(~self.covers(wanted)))
         if outside:
             raise ArgumentError(
                 f"{outside} of {len(wanted)} times from {_seconds(wanted.min())} to {_seconds(wanted.max())} lie "
@@ -191,7 +203,8 @@ class Trajectory:
             return np.zeros(len(wanted), np.intp), np.zeros(len(wanted))
         index = np.clip(np.searchsorted(self.time_ns, wanted, side="right") - 1, 0, len(self) - 2)
         # Differences of integers come first, since float64 resolves only 256 ns of the time since 1970.
-        return index, (wanted - self.time_ns[index]) / (self.time_ns[index + 1] - self.time_ns[index])
+        fraction = (wanted - self.time_ns[index]) / (self.time_ns[index + 1] - self.time_ns[index])
+        return index, np.clip(fraction, 0.0, 1.0)
 
     def _rotations(self, index: NDArray[np.intp], fraction: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return quaternions between poses: the rotation to the next pose, scaled by the fraction of the way."""

@@ -27,7 +27,6 @@ Floats = NDArray[np.float64]
 
 _FULL_SCALE: Final = 32767
 _MAX_BYTES: Final = 2**31 - 1  # per variable of a MATLAB v7 file
-_MAX_OUTSIDE_NS: Final = 1_000_000  # Clocks of sensors, and rounding in files, may differ by as much.
 _NS_PER_S: Final = 1e9
 _UPRIGHT: Final = 0.7  # Largest vertical component of the normal of a wall in a plan.
 
@@ -170,12 +169,9 @@ def _require_order(time_ns: NDArray[np.int64]) -> None:
 
 
 def _at(trajectory: Trajectory, time_ns: NDArray[np.int64], name: str) -> Trajectory:
-    """Return the poses at the measurements; times just outside the trajectory get its end."""
-    first, last = trajectory.time_ns[0], trajectory.time_ns[-1]
-    near = (time_ns >= first - _MAX_OUTSIDE_NS) & (time_ns <= last + _MAX_OUTSIDE_NS)
-    asked = np.where(near, np.clip(time_ns, first, last), time_ns)
+    """Return the poses at the measurements."""
     try:
-        return trajectory.at(asked)
+        return trajectory.at(time_ns)
     except ArgumentError as error:
         raise ArgumentError(f"{name}: {error}") from error
 

@@ -106,8 +106,8 @@ def ego_velocity(before: Iterable[Item], after: Iterable[Item], mountings: Mount
     ...     for pulse in (0, 1)
     ... ]
     >>> mountings = {"sensor": ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))}
-    >>> ertis.ego_velocity([clouds[0]], [clouds[1]], mountings).velocity_m_s.round(2)
-    array([ 0.5, -0. ])
+    >>> ertis.ego_velocity([clouds[0]], [clouds[1]], mountings).velocity_m_s.round(2).tolist()
+    [0.5, 0.0]
     """
     poses = sensor_poses(mountings)
     groups = [grouped(before, "before"), grouped(after, "after")]
@@ -170,6 +170,5 @@ def grouped(items: Iterable[Item], name: str) -> Mapping[str, Item]:
 
 
 def stamp_of(group: Mapping[str, Item]) -> Stamp:
-    """Return the stamp with the median time of a group."""
-    stamps = sorted((item.stamp for item in group.values()), key=lambda stamp: stamp.timestamp_ns)
-    return stamps[len(stamps) // 2]
+    """Return the earliest stamp of a group, which is the time of its pulse, as in `Fuser`."""
+    return min((item.stamp for item in group.values()), key=lambda stamp: stamp.timestamp_ns)

@@ -75,7 +75,7 @@ def require_times(trajectory: Trajectory, time_ns: NDArray[np.int64], sensor: st
         return
     first_ns, last_ns = int(trajectory.time_ns[0]), int(trajectory.time_ns[-1])
     begin_ns, end_ns = int(time_ns.min()), int(time_ns.max())
-    if begin_ns >= first_ns and end_ns <= last_ns:
+    if trajectory.covers(time_ns).all():
         return
     if not np.any(time_ns):
         raise ArgumentError(
