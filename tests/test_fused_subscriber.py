@@ -70,7 +70,7 @@ def test_unknown_mounting_is_an_error():
         with (
             publisher.playing(pulses(count=1)),
             FusedSubscriber(publisher.address) as subscriber,
-            pytest.raises(DataError, match="the mounting of sensor 'front' is unknown; give its mounting here"),
+            pytest.raises(DataError, match="the mounting of sensor 'front' is unknown; pass mountings"),
         ):
             subscriber.receive(20.0)
 

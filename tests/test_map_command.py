@@ -127,7 +127,7 @@ def test_map_refuses_poses_at_other_times(folder):
         (
             "both.h5 --poses poses.tum -o place.tif",
             1,
-            "ending of the map '.tif' is unknown; known are .h5, .mcap, .pgm, .ply",
+            "suffix of the map '.tif' is unknown; known are .h5, .mcap, .pgm, .ply",
         ),
         ("both.h5 --poses none.tum", 1, "none.tum"),
         ("both.h5 --poses poses.tum --cell 0", 2, "--cell"),

@@ -383,7 +383,7 @@ def test_mcap_holds_an_occupancy_grid(tmp_path):
 
 
 def test_unknown_format_of_a_map_is_refused(tmp_path):
-    with pytest.raises(ArgumentError, match=r"ending of the map '.png' is unknown"):
+    with pytest.raises(ArgumentError, match=r"suffix of the map '.png' is unknown"):
         ertis.write_map(tmp_path / "m.png", small())
 
 

@@ -7,20 +7,26 @@ import pytest
 
 import ertis_numba as ertis
 from ertis_numba.errors import ArgumentError
-from ertis_numba.settings import Processing
+from ertis_numba.settings import Call, Processing
 from ertis_numba.simulation import Platform, Point, Scene, Sensor
 from ertis_numba.simulation.render import Simulator
 
 
 @pytest.mark.parametrize(
-    ("velocity_m_s", "yaw_rate_deg_s", "range_m", "azimuth_deg"),
-    [((1.4, 0.0), 0.0, 3.0, 0.0), ((0.1, -0.6), -80.0, 2.5, 15.0), ((-1.3, -1.3), 90.0, 2.0, -8.0)],
+    ("velocity_m_s", "yaw_rate_deg_s", "range_m", "azimuth_deg", "call"),
+    [
+        ((1.4, 0.0), 0.0, 3.0, 0.0, Call()),
+        ((0.1, -0.6), -80.0, 2.5, 15.0, Call()),
+        ((-1.3, -1.3), 90.0, 2.0, -8.0, Call()),
+        ((1.4, 0.0), 0.0, 3.0, 0.0, Call(start_frequency_hz=25e3, stop_frequency_hz=50e3)),
+        ((1.4, 0.0), 0.0, 3.0, 0.0, Call(modulation="linear")),
+    ],
 )
-def test_point_of_a_moving_sensor_returns_to_its_place(velocity_m_s, yaw_rate_deg_s, range_m, azimuth_deg):
+def test_point_of_a_moving_sensor_returns_to_its_place(velocity_m_s, yaw_rate_deg_s, range_m, azimuth_deg, call):
     platform = Platform(waypoints=((0.0, 0.0, 0.0, 0.0, 0.0), (1.0, *velocity_m_s, 0.0, yaw_rate_deg_s)))
     azimuth_rad = math.radians(azimuth_deg)
     place_m = range_m * math.cos(azimuth_rad), range_m * math.sin(azimuth_rad)
-    sensor = Sensor(processing=Processing(range_m=(0.3, 3.5), directions="2d:181"))
+    sensor = Sensor(call=call, processing=Processing(range_m=(0.3, 3.5), directions="2d:181"))
     simulator = Simulator(Scene(platform=platform, sensors=(sensor,), points=(Point(position_m=(*place_m, 0.0)),)))
     image = ertis.Pipeline(sensor.settings(), predict=False).process(simulator.render())
     points = ertis.PointExtractor(image.settings, top=1)(image)

@@ -180,7 +180,7 @@ def test_unknown_mounting_of_a_sensor_is_an_error():
         with (
             publisher.playing(images(0)),
             OdometrySubscriber(publisher.address) as subscriber,
-            pytest.raises(DataError, match="the mounting of sensor 'front' is unknown; give its mounting here"),
+            pytest.raises(DataError, match="the mounting of sensor 'front' is unknown; pass mountings"),
         ):
             subscriber.receive(20.0)
         assert subscriber.trajectory is None

@@ -28,7 +28,7 @@ SHORT = Processing(range_m=(0.3, 1.5), directions="2d:31")
 
 
 def position_m(scene, sensor, offset_m, time_s):
-    """World position of a place in the frame of a sensor, from the way points alone."""
+    """World position of a place in the frame of a sensor, from the waypoints alone."""
     (start_s, *start), (stop_s, *stop) = scene.platform.waypoints
     x, y, z, yaw_deg = np.array(start) + (time_s - start_s) / (stop_s - start_s) * (np.array(stop) - np.array(start))
     angles_deg = [sensor.yaw_deg, -sensor.pitch_deg, sensor.roll_deg]

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, strategies as st
+from hypothesis import given, settings, strategies as st
 
 from ertis_numba import Trajectory, read_trajectory, write_tum
 from ertis_numba.errors import ArgumentError, DataError
@@ -27,6 +27,7 @@ def same(one, other):
     np.testing.assert_allclose(one.rotation_xyzw, other.rotation_xyzw, atol=1e-11)
 
 
+@settings(deadline=None)  # files take long on a busy disk
 @given(seed=st.integers(0, 1000), n_poses=st.integers(1, 20))
 def test_tum_file_holds_the_trajectory(tmp_path_factory, seed, n_poses):
     path = tmp_path_factory.mktemp("tum") / "path.tum"

@@ -183,7 +183,7 @@ def hall(seed: int, wall_spacing_m: float = _WALL_SPACING_M, names: Sequence[str
 
 
 def _round_hall(duration_s: float) -> list[tuple[float, float, float, float, float]]:
-    """Return way points of a drive at 1 m/s round the hall, to the left, with rounded corners."""
+    """Return waypoints of a drive at 1 m/s round the hall, to the left, with rounded corners."""
     half_x_m, half_y_m = HALL_M[0] / 2 - _TO_WALL_M, HALL_M[1] / 2 - _TO_WALL_M
     x, y, yaw_deg, time_s = 0.0, -half_y_m, 0.0, 0.0
     found = [(time_s, x, y, 0.0, yaw_deg)]
@@ -297,7 +297,7 @@ class PlatformImager:
 
 
 def _way(motion: Motion) -> tuple[tuple[float, float, float, float, float], ...]:
-    """Return way points from a motion, at its present velocity for a second."""
+    """Return waypoints from a motion, at its present velocity for a second."""
     c, s = math.cos(motion.yaw_rad), math.sin(motion.yaw_rad)
     later_m = (
         motion.x_m + c * motion.forward_m_s - s * motion.left_m_s,

@@ -64,7 +64,7 @@ def require_fitting(name: str, paths: "Sequence[Path]") -> None:
         if typed(option):
             raise click.UsageError(f"--{spelling} is for format batslam, not for {name}; leave it out", context)
     if len(paths) > 1:
-        raise click.UsageError(f"format {name} holds one file, but {len(paths)} are given; give one", context)
+        raise click.UsageError(f"format {name} exports one recording, but {len(paths)} are given; give one", context)
 
 
 def open_ears(

@@ -14,7 +14,7 @@ _SEED = 1
 
 
 def text() -> str:
-    """Return the scene as TOML, with one line for each sensor, reflector and way point."""
+    """Return the scene as TOML, with one line for each sensor, reflector and waypoint."""
     scene = hall(_SEED)
     waypoints = scene.platform.waypoints if scene.platform else ()
     lines = [HEAD, f"seed = {scene.seed}", f"rate_hz = {scene.rate_hz}", f"count = {scene.count}", "points = ["]
@@ -24,7 +24,7 @@ def text() -> str:
     lines += [
         "]",
         "",
-        "# Each way point has a time (s), x, y, z (m) and a yaw (degrees).",
+        "# Each waypoint has a time (s), x, y, z (m) and a yaw (degrees).",
         "[platform]",
         "waypoints = [",
     ]

@@ -38,7 +38,8 @@ class PulseGroups(Generic[Item]):
 
     A group is complete once it has items of all sensors of the two groups before, and of sensors that have come since.
     Images of different sensors may overtake each other, so a group stays open while the next one begins. It ends
-    without a sensor that has an item of a later pulse, or that was missing from the two groups before.
+    without a sensor that has an item of a later pulse, or that was missing from the two groups before, and at the
+    latest when three later groups have begun.
     """
 
     _expected: set[str] = field(default_factory=set)

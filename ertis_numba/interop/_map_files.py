@@ -33,7 +33,7 @@ def map_files(path: str | Path) -> tuple[Path, ...]:
         The suffix is unknown.
     """
     path = Path(path)
-    checks.choice("ending of the map", path.suffix.lower(), MAP_SUFFIXES)
+    checks.choice("suffix of the map", path.suffix.lower(), MAP_SUFFIXES)
     return (path, path.with_suffix(".yaml")) if path.suffix.lower() == ".pgm" else (path,)
 
 

@@ -196,7 +196,9 @@ def _topic(topics: dict[str, str], wanted: str | None) -> str:
     if wanted is None and len(topics) == 1:
         return next(iter(topics))
     if wanted is None:
-        remedy = "choose one of them as topic" if topics else f"record a topic of type {', '.join(_POSES)}"
+        remedy = (
+            "choose one of them (import-poses --topic)" if topics else f"record a topic of type {', '.join(_POSES)}"
+        )
         raise ArgumentError(f"topics with poses: {listed}; {remedy}")
     if wanted not in topics:
         raise ArgumentError(f"topic {wanted!r} does not exist or has no poses; topics with poses: {listed}")

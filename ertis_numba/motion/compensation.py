@@ -23,7 +23,7 @@ def compensate_motion(points: PointCloud, velocity_m_s: Sequence[float], yaw_rat
     A point appears at the range at which it is when the sound meets it, and in the direction in which it is when the
     middle of the call returns. A sensor that moves at 1 m/s sees a point at 5 m about 12 mm too near; one that turns at
     90°/s sees it 2.7° aside. Ranges are also shifted by the Doppler coupling of the sweep, which is
-    ``T = D / (f_start / f_stop - 1)`` for a hyperbolic sweep of the duration D. For a point that appears at p, at the
+    ``T = D / (f_start / f_stop - 1)`` for a sweep of the duration D. For a point that appears at p, at the
     range r, from a sensor with the velocity v and the yaw rate ω:
 
     ``q = R(ω t) p + (r / c - T) v₁ + t v₂``, with ``t = 2 r / c + D / 2``

@@ -129,11 +129,12 @@ def _deviations(cloud: PointCloud) -> Floats:
 
 
 def sweep_delay_s(call: Call) -> float:
-    """Return how much earlier than at the emission the measured range applies.
+    """Return the Doppler coupling of a sweep: how long before the sound meets a reflector the measured range applies.
 
-    A hyperbolic sweep that is stretched by motion is the same sweep at another time, so its echo from a reflector that
-    approaches at speed v appears ``v T / (f_start / f_stop - 1)`` too far: where the reflector was that time ago.
+    It is ``D / (f_start / f_stop - 1)`` for the duration D. A hyperbolic sweep that motion stretches is the same sweep
+    at another time. For a linear sweep, this holds in the mean over its frequencies. The coupling of own waveforms is
+    unknown, and counts as 0.
     """
-    if call.modulation != "hyperbolic" or call.start_frequency_hz == call.stop_frequency_hz:
+    if call.waveform is not None or call.start_frequency_hz == call.stop_frequency_hz:
         return 0.0
     return call.duration_s / (call.start_frequency_hz / call.stop_frequency_hz - 1)

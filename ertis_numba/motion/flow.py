@@ -44,15 +44,16 @@ class FlowFit(NamedTuple):
         Number of echoes that the displacement explains.
     share : float
         Share of echoes that the displacement explains.
-    likelihood : float
-        Sum of the strengths of these echoes, with which fits to the same groups can be compared.
+    score : float
+        Number of matches, weighted by the strengths of their echoes; the larger one of two fits to the same groups is
+        more likely.
     """
 
     displacement: Floats
     covariance: Floats
     n_matches: int
     share: float
-    likelihood: float
+    score: float
 
 
 class _EchoPairs(NamedTuple):
@@ -63,7 +64,7 @@ class _EchoPairs(NamedTuple):
 
 
 def twist_of(displacement: Floats, time_s: float) -> Floats:
-    """Return the constant velocities in the frame of the platform that cause displacements.
+    """Return the constant twists, forward, left and yaw per second, that produce displacements.
 
     Parameters
     ----------
@@ -281,7 +282,7 @@ def _weights(square: Floats, pairs: _EchoPairs, n_before: int, n_after: int) -> 
 
 
 def _annealed(flow: _Flow, pairs: _EchoPairs, displacement: Floats) -> tuple[Floats, float]:
-    """Return the displacement after a fit with decreasing tolerance, and its likelihood."""
+    """Return the displacement after a fit with decreasing tolerance, and its score."""
     sd = flow.deviations(pairs)
     weight = np.zeros(len(pairs.before))
     for scale in (*_SCALES, *([1.0] * _ROUNDS)):

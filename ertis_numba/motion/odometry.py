@@ -28,7 +28,7 @@ _FEW_MATCHES: Final = 12
 _DOUBTFUL_SHARE: Final = 0.25
 _KEYFRAME_SHARE: Final = 0.5  # Share of the matches of the last two groups that a keyframe still has.
 _PLANAR: Final = 0, 1, 5  # of x, y, z, and the rotations about them
-_UNKNOWN_VARIANCE: Final = np.diag([0.5, 0.5, 1.0]) ** 2  # per second of a gap, of constant velocity
+_UNKNOWN_VARIANCE: Final = np.diag([0.5, 0.5, 1.0]) ** 2  # of the assumed velocity; times time² for the pose
 
 
 class PlanarPose(NamedTuple):
@@ -254,7 +254,7 @@ class Odometry:
         # The expectation may be wrong, so that all displacements are compared.
         other = fit_flow(last.echoes, echoes, self._poses, time_s)
         fits = [each for each in (found, other) if each is not None]
-        return max(fits, key=lambda each: each.likelihood, default=None)
+        return max(fits, key=lambda each: each.score, default=None)
 
     def _located(self, echoes: GroupEchoes, found: FlowFit, twist: Floats, timestamp_ns: int) -> PlanarPose:
         """Return the pose relative to the keyframe, or to the last group if the keyframe is out of reach."""

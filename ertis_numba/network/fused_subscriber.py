@@ -44,8 +44,8 @@ class FusedSubscriber:
     """Receiver of the images of a central node, fused for each SYNC pulse; use it in a ``with`` statement and a loop.
 
     Images are fused here, not at the central node, which therefore needs no more time. A pulse is complete when all
-    sensors of the pulse before have sent their image. After 0.25 s, those that are here are fused. An application that
-    is too slow gets the latest pulses.
+    sensors of the two pulses before have sent their image. A missing sensor delays it until up to three later pulses
+    have begun, or until no image has come for 0.25 s. An application that is too slow gets the latest pulses.
 
     Parameters
     ----------

@@ -63,8 +63,9 @@ class _Received:
 class PulseReceiver:
     """Receiver that groups the images of a central node by SYNC pulse, in a thread.
 
-    A pulse is complete when all sensors of the pulse before have sent their image. After 0.25 s, it is returned without
-    the missing ones. An application that is too slow gets the latest pulses.
+    A pulse is complete when all sensors of the two pulses before have sent their image. A missing sensor delays it
+    until up to three later pulses have begun, or until no image has come for 0.25 s. An application that is too slow
+    gets the latest pulses.
 
     Parameters
     ----------
@@ -186,8 +187,8 @@ class PulseReceiver:
             mounting = arrival.translation_m, arrival.rotation_xyzw
         if mounting is None:
             raise DataError(
-                f"the mounting of sensor {sensor!r} is unknown; give its mounting here, or start 'ertis capture' with "
-                "--mounting"
+                f"the mounting of sensor {sensor!r} is unknown; pass mountings (--mounting FILE), or start 'ertis "
+                "capture' with --mounting"
             )
         return _Received(image, mounting, arrival.header.monotonic_ns)  # type: ignore[union-attr]  # of an image
 

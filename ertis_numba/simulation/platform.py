@@ -11,12 +11,12 @@ from ertis_numba import checks
 from ertis_numba.documents import TomlTable
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Trajectory
-from ertis_numba.simulation.trajectory import FARTHEST_M, FASTEST_M_S, check_vector
+from ertis_numba.simulation.trajectory import MAX_DISTANCE_M, MAX_SPEED_M_S, check_vector
 
 __all__ = ["MovingPose", "Platform"]
 
 Floats = NDArray[np.float64]
-_FASTEST_DEG_S = 3600.0
+_MAX_YAW_RATE_DEG_S = 3600.0
 _MAX_TURNS = 1e6
 _NS_PER_S = 10**9
 
@@ -60,9 +60,9 @@ class MovingPose(NamedTuple):
 
 
 class Platform(TomlTable, frozen=True, kw_only=True):
-    """Platform that carries all sensors of a scene along a way.
+    """Platform that moves all sensors of a scene along waypoints.
 
-    The positions and rotations of sensors are then those in the frame of the platform: x forward, y left, z up.
+    Positions and rotations of sensors are relative to the platform: x forward, y left, z up.
 
     Attributes
     ----------
@@ -88,7 +88,7 @@ class Platform(TomlTable, frozen=True, kw_only=True):
             raise ArgumentError("platform has no waypoints; give at least one (time_s, x, y, z, yaw_deg)")
         for number, (time_s, x, y, z, yaw_deg) in enumerate(self.waypoints):
             checks.finite(f"platform.waypoints[{number}] time", time_s)
-            check_vector(f"platform.waypoints[{number}]", (x, y, z), FARTHEST_M)
+            check_vector(f"platform.waypoints[{number}]", (x, y, z), MAX_DISTANCE_M)
             checks.between(f"platform.waypoints[{number}] yaw_deg", yaw_deg, -360.0 * _MAX_TURNS, 360.0 * _MAX_TURNS)
         for (before_s, *a, start_deg), (after_s, *b, stop_deg) in itertools.pairwise(self.waypoints):
             if after_s <= before_s:
@@ -96,9 +96,12 @@ class Platform(TomlTable, frozen=True, kw_only=True):
                     f"platform.waypoints go from {before_s:g} s to {after_s:g} s; give strictly increasing times"
                 )
             took_s = after_s - before_s
-            checks.between("platform.waypoints speed", math.dist(a, b) / took_s, 0.0, FASTEST_M_S)
+            checks.between("platform.waypoints speed", math.dist(a, b) / took_s, 0.0, MAX_SPEED_M_S)
             checks.between(
-                "platform.waypoints yaw rate", (stop_deg - start_deg) / took_s, -_FASTEST_DEG_S, _FASTEST_DEG_S
+                "platform.waypoints yaw rate",
+                (stop_deg - start_deg) / took_s,
+                -_MAX_YAW_RATE_DEG_S,
+                _MAX_YAW_RATE_DEG_S,
             )
 
     @property

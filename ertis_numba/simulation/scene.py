@@ -48,7 +48,7 @@ class Scene(TomlDocument, frozen=True, kw_only=True):
     effects : dict of str to bool
         Effects to switch on or off by name, regardless of the tolerance; none by default.
     platform : Platform, optional
-        Platform that carries all sensors; their positions and rotations are then those in its frame. None by default.
+        Platform that moves all sensors; their positions and rotations are then relative to it. None by default.
     sensors : tuple of Sensor
         Sensors, which emit together; one eRTIS at the origin by default.
     points, spheres, walls, boxes

@@ -12,11 +12,11 @@ from ertis_numba.documents import TomlTable
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import unit_vectors
 
-__all__ = ["FARTHEST_M", "FASTEST_M_S", "Placed", "Vector", "check_vector"]
+__all__ = ["MAX_DISTANCE_M", "MAX_SPEED_M_S", "Placed", "Vector", "check_vector"]
 
 Vector = tuple[float, float, float]
-FARTHEST_M: Final = 1e4
-FASTEST_M_S: Final = 100.0  # a third of the speed of sound; beyond, air flow around the object would matter
+MAX_DISTANCE_M: Final = 1e4
+MAX_SPEED_M_S: Final = 100.0  # a third of the speed of sound; beyond, air flow around the object would matter
 _STILL: Vector = (0.0, 0.0, 0.0)
 
 
@@ -55,23 +55,23 @@ class Placed(TomlTable, frozen=True, kw_only=True):
         if polar:
             if self.range_m is None:
                 raise ArgumentError(f"{name} has a direction but no range_m; give range_m as well")
-            checks.between(f"{name}.range_m", self.range_m, 1e-3, FARTHEST_M)
+            checks.between(f"{name}.range_m", self.range_m, 1e-3, MAX_DISTANCE_M)
             checks.between(f"{name}.azimuth_deg", self.azimuth_deg or 0.0, -180.0, 180.0)
             checks.between(f"{name}.elevation_deg", self.elevation_deg or 0.0, -90.0, 90.0)
         if self.position_m is not None:
-            check_vector(f"{name}.position_m", self.position_m, FARTHEST_M)
-        check_vector(f"{name}.velocity_m_s", self.velocity_m_s, FASTEST_M_S)
+            check_vector(f"{name}.position_m", self.position_m, MAX_DISTANCE_M)
+        check_vector(f"{name}.velocity_m_s", self.velocity_m_s, MAX_SPEED_M_S)
         if self.waypoints and self.velocity_m_s != _STILL:
             raise ArgumentError(f"{name} has both waypoints and velocity_m_s; give only one of them")
         for number, (time_s, *place) in enumerate(self.waypoints):
             checks.finite(f"{name}.waypoints[{number}] time", time_s)
-            check_vector(f"{name}.waypoints[{number}]", (place[0], place[1], place[2]), FARTHEST_M)
+            check_vector(f"{name}.waypoints[{number}]", (place[0], place[1], place[2]), MAX_DISTANCE_M)
         for (before_s, *a), (after_s, *b) in itertools.pairwise(self.waypoints):
             if after_s <= before_s:
                 raise ArgumentError(
                     f"{name}.waypoints go from {before_s:g} s to {after_s:g} s; give strictly increasing times"
                 )
-            checks.between(f"{name}.waypoints speed", math.dist(a, b) / (after_s - before_s), 0.0, FASTEST_M_S)
+            checks.between(f"{name}.waypoints speed", math.dist(a, b) / (after_s - before_s), 0.0, MAX_SPEED_M_S)
 
     @property
     def moves(self) -> bool:

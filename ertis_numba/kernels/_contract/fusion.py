@@ -1,7 +1,8 @@
 """Contracts of the kernels of fusion: powers of images to reflectivities of cells, for one thread.
 
 Pixels are (direction, step) of one receiver, flattened; cells are those of the fused image. Entries are the cells or
-pixels of one pair of emitter and receiver. Cells and pixels are different within one set of entries.
+pixels of one pair of emitter and receiver. ``cell`` of `AddEchoes`, `LimitCells` and `ConfirmCells` holds no cell
+twice. Other indices may repeat.
 """
 
 from dataclasses import dataclass
@@ -76,8 +77,8 @@ class PredictEchoes(Protocol):
     Parameters
     ----------
     begin : (direction,) uint32
-        First half-step of each direction with an entry. A step has three: its begin, its middle and its end, which is
-        the begin of the next one. The highest echo counts.
+        First half-step of each direction with an entry. A step has three: its start, its middle and its end, which is
+        the start of the next one. The highest echo counts.
     bounds : (direction + 1,) uint32
         Bounds of the entries of each direction, one for each half-step.
     cell : (entry,) uint32
@@ -98,8 +99,9 @@ class PredictEchoes(Protocol):
 class ShareEchoes(Protocol):
     """Compute the share of each pixel's power that belongs to one hypothesis.
 
-    With the rivals' predicted power R, the share is ``1 − suppression · R / power``, limited to 0 to 1. An echo of
-    power P whose reflector other pairs confirm has at least ``(P / (P + R))³``.
+    With the rivals' predicted power R, the share is ``1 − suppression · R / power``, limited to 0 to 1. With the
+    predicted own power P, a pixel whose reflector other pairs confirm has a share of at least ``(P / (P + R))³``. The
+    share is multiplied by ``part``.
 
     Parameters
     ----------
@@ -301,7 +303,7 @@ class LocateReflector(Protocol):
     position_m : (axis,) float64
         Position, from a first estimate.
     out : (axis, axis) float64
-        Covariance at the position of the last iteration but one.
+        Covariance before the last update: the inverse of the weighted normal matrix.
     """
 
     def __call__(

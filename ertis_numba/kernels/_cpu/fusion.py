@@ -1,9 +1,9 @@
 # mypy: ignore-errors
 """Fusion of images: reflectivities of cells from powers of pixels, and back.
 
-Tables and images of a platform fit into the L2 cache, so each kernel is a single pass without temporary arrays. One
-thread suffices, because a central node and its sensors use the other cores. Indices are unsigned: Numba then needs no
-code for negative ones.
+Much of the time is memory traffic, so each kernel reads its tables once, and temporary arrays hold one image at most.
+One thread suffices, because a central node and its sensors use the other cores. Indices are unsigned: Numba then needs
+no code for negative ones.
 """
 
 import numpy as np
