@@ -457,7 +457,7 @@ REFUSED = {
     "poses of images": ("left.h5 -o x.csv --poses way.tum", 2, "--poses is for format batslam, not for csv; leave"),
     "ears of images": ("left.h5 -o x.csv --beam-azimuth 3", 2, "--beam-azimuth is for format batslam, not for csv"),
     "ears behind": ("left.h5 -o x.mat --beam-azimuth 95", 2, "-90.0<=x<=90.0"),
-    "several files": ("left.h5 right.h5 -o x.csv", 2, "format csv holds one file, but 2 are given; give one"),
+    "several files": ("left.h5 right.h5 -o x.csv", 2, "format csv exports one recording, but 2 are given; give one"),
     "points": (
         "left.h5 -o x.mat --top 3 --poses way.tum --odometry way.tum",
         1,

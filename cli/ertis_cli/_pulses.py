@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ertis_cli import options
+from ertis_cli import _results, options
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from ertis_numba.settings import Settings
     from ertis_numba.storage import RecordingReader
 
-__all__ = ["PipelinesBySensor", "StampedIndex", "mountings_of", "open_sensors", "pulse_groups"]
+__all__ = ["PipelinesBySensor", "StampedIndex", "image_settings", "mountings_of", "open_sensors", "pulse_groups"]
 
 
 def open_sensors(paths: "Sequence[Path]", stack: ExitStack) -> "list[RecordingReader]":
@@ -78,6 +78,17 @@ def pulse_groups(readers: "Sequence[RecordingReader]") -> "Iterator[dict[str, St
         yield from groups.add(place)
     while rest := groups.close():
         yield rest
+
+
+def image_settings(settings_file: "Path | None", preset: str | None) -> "Callable[[Settings], Settings]":
+    """Return a function that updates the settings of a recording, and refuses those without an image."""
+
+    def changed(recorded: "Settings") -> "Settings":
+        settings = options.settings_with(recorded, settings_file=settings_file, preset=preset)
+        _results.require_image(settings)
+        return settings
+
+    return changed
 
 
 class PipelinesBySensor:

@@ -66,7 +66,7 @@ def import_poses(
     shifted: Trajectory = given.replace(time_ns=given.time_ns + round(offset_s * _NS_PER_S))
     recordings = _recordings(path)
     outputs = _outputs(recordings, target, is_folder=path.is_dir())
-    for recording, output in zip(recordings, outputs, strict=True):  # Either all receive poses, or none.
+    for recording, output in zip(recordings, outputs, strict=True):  # All are checked before the first is written.
         require_fitting_poses(recording, shifted, replace=force)
         if output is not None and output.parent.is_dir():
             check_target(output, overwrite=force, sources=[recording])

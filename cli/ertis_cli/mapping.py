@@ -6,14 +6,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ertis_cli import _mountings, _presets, _pulses, _results, options
+from ertis_cli import _mountings, _presets, _pulses, options
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from ertis_cli._pulses import StampedIndex
     from ertis_numba.frames import OccupancyMap, Trajectory
-    from ertis_numba.settings import Settings
     from ertis_numba.storage import RecordingReader
 
 __all__ = ["mapping"]
@@ -108,15 +107,12 @@ def mapping(
     for each in map_files(target):
         check_target(each, overwrite=force, sources=paths)
 
-    def changed(recorded: "Settings") -> "Settings":
-        settings = options.settings_with(recorded, settings_file=settings_file, preset=preset)
-        _results.require_image(settings)
-        return settings
-
     with ExitStack() as stack:
         readers = _pulses.open_sensors(paths, stack)
         trajectory = _trajectory(poses_file, paths)
-        pipelines = _pulses.PipelinesBySensor(changed, stack, quiet=quiet, device=device, threads=threads, plan=plan)
+        pipelines = _pulses.PipelinesBySensor(
+            _pulses.image_settings(settings_file, preset), stack, quiet=quiet, device=device, threads=threads, plan=plan
+        )
         mapper = Mapper(
             _pulses.mountings_of(readers, _mountings.mountings(mounting, None)),
             cell_m=cell_m,

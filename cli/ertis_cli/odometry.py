@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ertis_cli import _mountings, _presets, _pulses, _results, options
+from ertis_cli import _mountings, _presets, _pulses, options
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from ertis_cli._mountings import Mounting
     from ertis_cli._pulses import StampedIndex
     from ertis_numba.motion import Odometry
-    from ertis_numba.settings import Settings
     from ertis_numba.storage import RecordingReader
 
 __all__ = ["odometry", "odometry_of"]
@@ -74,15 +73,12 @@ def odometry(
     file = target or paths[0].with_suffix(".odometry.tum")
     check_target(file, overwrite=force, sources=paths)
 
-    def changed(recorded: "Settings") -> "Settings":
-        settings = options.settings_with(recorded, settings_file=settings_file, preset=preset)
-        _results.require_image(settings)
-        return settings
-
     with ExitStack() as stack:
         readers = _pulses.open_sensors(paths, stack)
         mountings = _pulses.mountings_of(readers, _mountings.mountings(mounting, None))
-        pipelines = _pulses.PipelinesBySensor(changed, stack, quiet=quiet, device=device, threads=threads, plan=plan)
+        pipelines = _pulses.PipelinesBySensor(
+            _pulses.image_settings(settings_file, preset), stack, quiet=quiet, device=device, threads=threads, plan=plan
+        )
         found = odometry_of(readers, list(_pulses.pulse_groups(readers)), pipelines, mountings, quiet=quiet)
     write_tum(file, found.trajectory, overwrite=force)
     measured = sum(pose.is_measured for pose in found.poses[1:]) / (len(found.poses) - 1)

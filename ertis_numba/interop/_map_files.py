@@ -59,7 +59,7 @@ def write_map(path: str | Path, occupancy: OccupancyMap, *, overwrite: bool = Fa
     Raises
     ------
     ArgumentError
-        The suffix is unknown, or a file exists.
+        The suffix is unknown, a file exists, or the packages for MCAP are not installed.
     DataError
         The disk is full or cannot be written.
 

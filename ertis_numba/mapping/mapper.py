@@ -116,7 +116,8 @@ class Mapper:
             The pose is invalid, the trajectory does not cover the time of the pulse, the images do not fit together, or
             the map would have too many cells.
         DataError
-            The images are not from the same pulse, or with a half-life, their time is before that of earlier ones.
+            The images are not from the same pulse, no sensor emitted, or with a half-life, their time is before that of
+            earlier ones.
         """
         group = tuple(checks.items("images", images, Energyscape, "Pipeline.process returns"))
         fused = self._fuser(group) if fused is None else fused
