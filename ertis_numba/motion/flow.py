@@ -20,6 +20,9 @@ _MAX_STEPS: Final = 17  # per axis; larger reaches have larger steps.
 _SEARCH_SD: Final = 0.02, math.radians(2.0)
 _SCALES: Final = 8.0, 5.0, 3.0, 2.0, 1.4, 1.0
 _N_STARTS: Final = 4
+_ELSEWHERE: Final = np.array([0.02, 0.02, math.radians(2.0)])  # Differences of displacements that are not the same.
+# With four sensors, correct displacements had ambiguities of at most 0.5, and unrelated groups 0.68 or more in 9 of 10.
+_MAX_AMBIGUITY: Final = 0.6
 _STRONGEST: Final = 40  # Number of echoes per sensor that the search uses.
 _ROUNDS: Final = 8
 _MAX_LEVEL_CHANGE: Final = math.log(4.0)  # of amplitudes, 12 dB
@@ -47,6 +50,8 @@ class FlowFit(NamedTuple):
     score : float
         Number of matches, weighted by the strengths of their echoes; the larger one of two fits to the same groups is
         more likely.
+    ambiguity : float
+        Score of the best displacement elsewhere, relative to this one. Unrelated groups have 0.7 to 1.
     """
 
     displacement: Floats
@@ -54,6 +59,12 @@ class FlowFit(NamedTuple):
     n_matches: int
     share: float
     score: float
+    ambiguity: float = 0.0
+
+    @property
+    def is_certain(self) -> bool:
+        """True if no other displacement explains the echoes almost as well."""
+        return self.ambiguity < _MAX_AMBIGUITY
 
 
 class _EchoPairs(NamedTuple):
@@ -232,10 +243,20 @@ def fit_flow(
     pairs = flow.pairs(reach_m, reach_rad)
     if len(pairs.before) < 4:
         return None
-    best = max(
-        (_annealed(flow, pairs, each) for each in _starts(flow, pairs, centre, limit)), key=lambda found: found[1]
-    )
-    return _final(flow, pairs, best[0])
+    found = [_annealed(flow, pairs, each) for each in _starts(flow, pairs, centre, limit)]
+    best, score = max(found, key=lambda each: each[1])
+    elsewhere = [each for each in found if np.any(np.abs(each[0] - best) > _ELSEWHERE)]
+    other, second = max(elsewhere, key=lambda each: each[1], default=(best, 0.0))
+    fit = _final(flow, pairs, best)
+    return None if fit is None else _with_other(fit, other - best, second / max(score, 1e-30))
+
+
+def _with_other(fit: FlowFit, offset: Floats, ambiguity: float) -> FlowFit:
+    """Return a fit whose covariance includes another displacement, if that is almost as likely."""
+    fit = fit._replace(ambiguity=ambiguity)
+    if fit.is_certain:
+        return fit
+    return fit._replace(covariance=fit.covariance + ambiguity / (1 + ambiguity) * np.outer(offset, offset))
 
 
 def _starts(flow: _Flow, pairs: _EchoPairs, centre: Floats, limit: Floats) -> Floats:

@@ -249,7 +249,7 @@ class Odometry:
             reach=_MAX_CHANGE * time_s,
             first_twist=last.twist,
         )
-        if found is not None and found.n_matches > _FEW_MATCHES and found.share > _DOUBTFUL_SHARE:
+        if found is not None and found.is_certain and found.n_matches > _FEW_MATCHES and found.share > _DOUBTFUL_SHARE:
             return found
         # The expectation may be wrong, so that all displacements are compared.
         other = fit_flow(last.echoes, echoes, self._poses, time_s)

@@ -68,7 +68,8 @@ def ego_velocity(before: Iterable[Item], after: Iterable[Item], mountings: Mount
     """Return the velocity of a platform from the images of two SYNC pulses; use `Odometry` for several.
 
     Echoes of reflectors at rest shift in range and azimuth as the platform moves. The velocity is that which explains
-    the shifts of most echoes. Other echoes, such as those of moving people, are ignored.
+    the shifts of most echoes. Other echoes, such as those of moving people, are ignored. If another velocity explains
+    almost as many, the covariance includes it.
 
     Parameters
     ----------
