@@ -90,6 +90,8 @@ def reference(document: str) -> tuple[TableReference, ...]:
     examples = _read(f"every_{document}_key.toml")
     if document == "settings":  # A call has an own waveform or the other keys, so no file holds all of them.
         examples["call"] = _read("own_waveform.toml")["call"] | examples["call"]
+    if document == "scene":  # Its sensors move by themselves, or a platform moves them.
+        examples["platform"] = _read("scenes/moving_platform.toml", "ertis_examples.synthetic")["platform"]
     sections = [section for section in _ReferenceBuilder(examples).sections(DOCUMENTS[document]) if section.keys]
     if document != "mounting":
         return tuple(sections)
@@ -97,8 +99,8 @@ def reference(document: str) -> tuple[TableReference, ...]:
     return (TableReference(poses.header, poses.about, tuple(key for key in poses.keys if key.name in _POSE_KEYS)),)
 
 
-def _read(name: str) -> dict[str, Any]:
-    return tomllib.loads(resources.files("ertis_examples").joinpath(name).read_text("utf-8"))
+def _read(name: str, package: str = "ertis_examples") -> dict[str, Any]:
+    return tomllib.loads(resources.files(package).joinpath(name).read_text("utf-8"))
 
 
 class _ReferenceBuilder:

@@ -184,3 +184,9 @@ def test_ego_velocity_needs_echoes_and_mountings():
         ertis.ego_velocity(clouds[:1], clouds[1:], {})
     with pytest.raises(ArgumentError, match="before has a int"):
         ertis.ego_velocity([3], clouds[1:], MOUNTINGS)
+
+
+def test_covariance_of_unrelated_echoes_is_large():
+    places = [places_m(1, 25), places_m(8, 25)]
+    found = ertis.ego_velocity([seen_from((0, 0, 0), places[0], 0)], [seen_from((0, 0, 0), places[1], 1)], MOUNTINGS)
+    assert found.sd.max() > 0.3

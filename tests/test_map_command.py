@@ -2,6 +2,8 @@
 
 import json
 import re
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from click.testing import CliRunner
 from ertis_cli.main import cli
 
 import ertis_numba as ertis
+from ertis_numba.campaign import find_recordings
 from ertis_numba.settings import Processing
 from ertis_numba.simulation import Electronics, Emitter, Point, Scene, Sensor
 from ertis_numba.storage import add_poses, write_recording
@@ -149,3 +152,9 @@ def test_commands_and_code_of_the_page_run(tmp_path):
     assert 'image: "place.pgm"' in (tmp_path / "place.yaml").read_text("utf-8")
     (code,) = python_in(text)
     assert "[" in run_code_here(tmp_path, code)
+
+
+def test_map_beside_its_recording_is_no_recording(tmp_path):
+    shutil.copy(Path(__file__).parents[1] / "data" / "synthetic" / "reflectors.h5", tmp_path / "rec.h5")
+    ertis.write_map(tmp_path / "rec.map.h5", ertis.OccupancyMap(np.array([[0.0, 2.0]]), (0.0, 0.0), 0.1))
+    assert [each.path.name for each in find_recordings([tmp_path])] == ["rec.h5"]

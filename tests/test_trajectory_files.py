@@ -38,6 +38,11 @@ def test_tum_file_holds_the_trajectory(tmp_path_factory, seed, n_poses):
     assert read.source == "file"
 
 
+def test_tum_file_has_no_suffix_of_another_format(tmp_path):
+    with pytest.raises(ArgumentError, match=r"ends in \.csv, but the file is text of TUM; give a name in \.tum"):
+        write_tum(tmp_path / "path.csv", some_trajectory(1, 2))
+
+
 def test_tum_file_is_not_replaced_unless_asked(tmp_path):
     path = tmp_path / "path.tum"
     write_tum(path, some_trajectory(1, 2))
@@ -51,6 +56,7 @@ def test_tum_file_is_not_replaced_unless_asked(tmp_path):
     ("text", "position_m", "rotation_xyzw"),
     [
         ("time_s,x_m,y_m,yaw_deg\n# start\n1.5,1,2,90\n", (1, 2, 0), (0, 0, np.sqrt(0.5), np.sqrt(0.5))),
+        ('"time_s","x_m","y_m","yaw_deg"\n1.5,1,2,180\n', (1, 2, 0), (0, 0, 1, 0)),
         ("x_m, y_m, z_m, time_ns, qx, qy, qz, qw, note\n1,2,3,1500000000,0,0,1,0,5\n", (1, 2, 3), (0, 0, 1, 0)),
     ],
 )
@@ -128,6 +134,10 @@ def test_mcap_with_several_topics_needs_a_choice(tmp_path):
         ("a.tum", "1 0 0 z 0 0 0 1\n", "line 1: could not convert string to float: 'z'"),
         ("a.tum", "1 0 0 inf 0 0 0 1\n", "position_m"),
         ("a.tum", "1e30 0 0 0 0 0 0 1\n", "beyond the year 2262"),
+        ("a.tum", "1e999999 0 0 0 0 0 0 1\n", "line 1: time '1e999999' is not a number"),
+        ("a.tum", "1 1e300 0 0 0 0 0 1\n", "position_m reaches 1e+300 m; give metres within"),
+        ("a.csv", "time_s,x_m,x_m,y_m,yaw_deg\n1,2,2,3,4\n", "give each once, and one time"),
+        ("a.csv", "time_s,time_ns,x_m,y_m,yaw_deg\n1,1,2,3,4\n", "give each once, and one time"),
         ("a.tum", "2 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "time_ns does not increase"),
         ("a.tum", "1 0 0 0 0 0 0 2\n", "rotation_xyzw has length 2"),
         ("a.csv", "", "the first line names the columns none; give time_ns or time_s"),
@@ -151,6 +161,8 @@ def test_unusable_files_are_refused(tmp_path, name, text, message):
 def test_missing_and_binary_files_are_refused(tmp_path):
     with pytest.raises(DataError, match="does not exist"):
         read_trajectory(tmp_path / "a.tum")
+    with pytest.raises(DataError, match="is a folder"):
+        read_trajectory(tmp_path)
     (tmp_path / "b.tum").write_bytes(b"\xff\xfe\x80")
     with pytest.raises(DataError, match="is not a text file"):
         read_trajectory(tmp_path / "b.tum")

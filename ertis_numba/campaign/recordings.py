@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.storage import is_map
 
 __all__ = ["SUFFIX", "RecordingFile", "find_recordings", "output_paths"]
 
@@ -75,8 +76,8 @@ def _expand(text: str) -> Sequence[RecordingFile]:
 
 
 def _is_candidate(path: Path) -> bool:
-    """Return True for a file, or a broken link to one."""
-    return path.is_file() or not path.exists()
+    """Return True for a file, or a broken link to one. Maps are left out: `ertis map` writes them beside recordings."""
+    return (path.is_file() and not is_map(path)) or not path.exists()
 
 
 def output_paths(recordings: Sequence[RecordingFile], folder: Path) -> list[Path]:

@@ -13,6 +13,7 @@ from ertis_numba.frames._replacing import replaced
 __all__ = ["Trajectory"]
 
 _NS_PER_S: Final = 1e9
+_MAX_POSITION_M: Final = 1e8  # Beyond, float64 does not resolve nanometres.
 _MARGIN_NS: Final = 1_000_000
 _MAX_NORM_ERROR: Final = 1e-3  # Text files have few digits; a larger error is no rounding.
 _MAX_ROUNDING: Final = 1e-14  # Error in the length of a quaternion that was normalised before.
@@ -81,7 +82,13 @@ class Trajectory:
         if covariance is not None:
             covariance = _numbers("covariance", covariance, (n_poses, 6, 6))
         object.__setattr__(self, "time_ns", time_ns)
-        object.__setattr__(self, "position_m", _numbers("position_m", self.position_m, (n_poses, 3)))
+        position_m = _numbers("position_m", self.position_m, (n_poses, 3))
+        farthest_m = float(np.max(np.abs(position_m)))
+        if farthest_m > _MAX_POSITION_M:
+            raise ArgumentError(
+                f"position_m reaches {farthest_m:g} m; give metres within ±{_MAX_POSITION_M:g} m of the world's origin"
+            )
+        object.__setattr__(self, "position_m", position_m)
         object.__setattr__(self, "rotation_xyzw", rotation / norms[:, None])
         object.__setattr__(self, "covariance", covariance)
 

@@ -1,7 +1,7 @@
 """Trajectories in text files of TUM, tables in CSV, and messages in MCAP."""
 
 from collections.abc import Iterable, Iterator
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -23,6 +23,7 @@ _NS_PER_UNIT: Final = {"time_ns": 1, "time_s": 10**9}
 _POSITIONS: Final = ("x_m", "y_m", "z_m")
 _QUATERNION: Final = ("qx", "qy", "qz", "qw")
 _YAW: Final = "yaw_deg"
+_OTHER_SUFFIXES: Final = (".csv", ".h5", ".mcap", ".mat", ".ply")
 _COLUMNS: Final = "time_ns or time_s, x_m, y_m, z_m (optional), and either qx, qy, qz, qw or yaw_deg"
 _POSES: Final = (
     "nav_msgs/msg/Odometry",
@@ -67,7 +68,8 @@ def read_trajectory(path: str | Path, *, topic: str | None = None) -> Trajectory
     """
     path = Path(path)
     if not path.is_file():
-        raise DataError(f"trajectory {path} does not exist; give a .tum, .txt, .csv or .mcap file")
+        fault = "is a folder" if path.is_dir() else "does not exist"
+        raise DataError(f"trajectory {path} {fault}; give a .tum, .txt, .csv or .mcap file")
     suffix = path.suffix.lower()
     if topic is not None and suffix != ".mcap":
         raise ArgumentError(f"topic is {topic!r}, but {path} is not an .mcap file; leave out the topic")
@@ -97,7 +99,7 @@ def write_tum(path: str | Path, trajectory: Trajectory, *, overwrite: bool = Fal
     Raises
     ------
     ArgumentError
-        The file exists, or its folder does not exist.
+        The file exists, its folder does not exist, or its suffix is that of another format.
 
     Examples
     --------
@@ -109,6 +111,9 @@ def write_tum(path: str | Path, trajectory: Trajectory, *, overwrite: bool = Fal
     # timestamp tx ty tz qx qy qz qw
     1700000000.123456789 1 2 0 0 0 0 1
     """
+    suffix = Path(path).suffix.lower()
+    if suffix in _OTHER_SUFFIXES:
+        raise ArgumentError(f"output {path} ends in {suffix}, but the file is text of TUM; give a name in .tum or .txt")
     with atomic_write(Path(path), overwrite=overwrite) as part, part.open("w", encoding="utf-8") as file:
         file.write(f"# {' '.join(_TUM)}\n")
         for time_ns, position, rotation in zip(
@@ -130,12 +135,14 @@ def _read_tum(text: str) -> Trajectory:
 
 
 def _read_csv(text: str) -> Trajectory:
-    lines = [(number, [cell.strip() for cell in row.split(",")]) for number, row in _lines(text)]
+    lines = [(number, [cell.strip().strip('"') for cell in row.split(",")]) for number, row in _lines(text)]
     _, header = lines[0] if lines else (0, [])
     unit = next((name for name in _NS_PER_UNIT if name in header), None)
     by_yaw = _YAW in header
     wanted = [*_POSITIONS[:2], *((_YAW,) if by_yaw else _QUATERNION)]
     missing = [name for name in wanted if name not in header]
+    if len(set(header)) < len(header) or set(_NS_PER_UNIT) <= set(header):
+        raise DataError(f"the first line names the columns {', '.join(header)}; give each once, and one time")
     if unit is None or missing:
         raise DataError(f"the first line names the columns {', '.join(header) or 'none'}; give {_COLUMNS}")
     rows = _some(lines[1:])
@@ -232,7 +239,7 @@ def _times_ns(cells: Iterable[tuple[int, str]], ns_per_unit: int) -> list[int]:
     for number, cell in cells:
         try:
             times_ns.append(int((Decimal(cell) * ns_per_unit).to_integral_value()))
-        except (InvalidOperation, ValueError, OverflowError):
+        except (ArithmeticError, ValueError):
             raise DataError(f"line {number}: time {cell!r} is not a number; give a decimal number") from None
     return times_ns
 

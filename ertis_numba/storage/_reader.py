@@ -276,7 +276,7 @@ def _kind(file: h5py.File, path: Path, wanted: str) -> str:
         require_attributes(file)
     kind = to_python(file.attrs.get("ertis_format", ""))
     version = to_python(file.attrs.get("ertis_format_version", 0))
-    if kind == "occupancy_map":
+    if isinstance(kind, str) and kind == "occupancy_map":
         raise DataError(f"{path} is an occupancy map; give {wanted}")
     if not isinstance(kind, str) or kind not in _KIND_NAMES or not isinstance(version, int):
         raise DataError(f"{path} is HDF5, but not of this package; give {wanted}")

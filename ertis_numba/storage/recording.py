@@ -428,8 +428,11 @@ def write_recording(
     >>> with ertis.open_recording("reflectors.h5") as recording:
     ...     path = ertis.write_recording("copy.h5", recording, overwrite=True)
     """
-    if poses is None and isinstance(measurements, RecordingReader):
-        poses = measurements.trajectory
+    if isinstance(measurements, RecordingReader):
+        poses = measurements.trajectory if poses is None else poses
+        if mounting is None and measurements.translation_m is not None and measurements.rotation_xyzw is not None:
+            place = measurements.translation_m.tolist(), measurements.rotation_xyzw.tolist()
+            mounting = {measurements.sensor: place}
     with RecordingWriter(
         path, settings=settings, overwrite=overwrite, source=source, truth=truth, mounting=mounting, poses=poses
     ) as writer:
