@@ -183,4 +183,5 @@ def _aside_rad(paths: Paths, speed_m_s: float) -> NDArray[np.float64]:
     across_m_s = paths.targets.velocities_m_s - paths.receiver.velocity_m_s
     across_m_s = across_m_s - np.sum(across_m_s * way, axis=-1, keepdims=True) * way
     moved_m = np.linalg.norm(across_m_s, axis=-1) * paths.first_m[:, 0] / speed_m_s
-    return np.asarray(turned_rad + moved_m / paths.second_m[:, 0])
+    away_m = paths.second_m[:, 0]
+    return np.asarray(turned_rad + np.divide(moved_m, away_m, out=np.zeros_like(moved_m), where=away_m > 0))
