@@ -1,14 +1,13 @@
 """Application node that fuses the images of all sensors as they arrive."""
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Self
 
 from ertis_numba.fusion import Fused, Fuser
 from ertis_numba.fusion.rig import Mountings
 from ertis_numba.network.keys import ClientKeys
-from ertis_numba.network.pulse_receiver import PulseReceiver
+from ertis_numba.network.pulse_receiver import PulseReceiver, PulseSubscriber
 
 __all__ = ["FusedArrival", "FusedSubscriber"]
 
@@ -40,7 +39,7 @@ class FusedArrival:
         return (self.ready_utc_ns - stamp.timestamp_ns) / 1e9 if stamp.is_timed else None
 
 
-class FusedSubscriber:
+class FusedSubscriber(PulseSubscriber[FusedArrival]):
     """Receiver of the images of a central node, fused for each SYNC pulse; use it in a ``with`` statement and a loop.
 
     Images are fused here, not at the central node, which therefore needs no more time. A pulse is complete when all
@@ -96,30 +95,9 @@ class FusedSubscriber:
             "spacing_deg": spacing_deg,
             "range_step_m": range_step_m,
         }
-        self._receiver = PulseReceiver(address, mountings=mountings, sensors=sensors, keys=keys, on_note=on_note)
-        self.counts = self._receiver.counts
+        super().__init__(PulseReceiver(address, mountings=mountings, sensors=sensors, keys=keys, on_note=on_note))
         self._mountings: Mountings = {}
         self._fuser: Fuser | None = None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def __iter__(self) -> Iterator[FusedArrival]:
-        while (arrival := self.receive()) is not None:
-            yield arrival
-
-    @property
-    def connected(self) -> bool:
-        """True if a central node answers."""
-        return self._receiver.connected
-
-    @property
-    def n_skipped(self) -> int:
-        """Pulses that were not fused, because the application was too slow."""
-        return self._receiver.n_skipped
 
     def receive(self, timeout_s: float | None = None) -> FusedArrival | None:
         """Return the next fused pulse; None after ``timeout_s``, or once the subscriber is closed.
@@ -144,7 +122,3 @@ class FusedSubscriber:
             self._fuser = Fuser(pulse.mountings, **self._options)  # type: ignore[arg-type]  # all are numbers
         fused = self._fuser(pulse.images.values())
         return FusedArrival(fused, pulse.first_ns, time.monotonic_ns(), time.time_ns())
-
-    def close(self) -> None:
-        """End the loop."""
-        self._receiver.close()

@@ -1,16 +1,15 @@
 """Application node that computes the pose and velocity of a platform from images as they arrive."""
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Self
 
 from ertis_numba.frames import Stamp, Trajectory
 from ertis_numba.fusion.rig import Mountings
 from ertis_numba.motion import EgoVelocity, PlanarPose
 from ertis_numba.motion.live import LiveOdometry
 from ertis_numba.network.keys import ClientKeys
-from ertis_numba.network.pulse_receiver import PulseReceiver, ReceivedPulse
+from ertis_numba.network.pulse_receiver import PulseReceiver, PulseSubscriber, ReceivedPulse
 
 __all__ = ["OdometryArrival", "OdometrySubscriber"]
 
@@ -52,7 +51,7 @@ class OdometryArrival:
         return (self.ready_utc_ns - self.pose.timestamp_ns) / 1e9 if self.is_timed else None
 
 
-class OdometrySubscriber:
+class OdometrySubscriber(PulseSubscriber[OdometryArrival]):
     """Receiver of the images of a central node that computes a pose and a velocity for each SYNC pulse.
 
     Use it in a ``with`` statement and a loop. All sensors belong to one platform. Images are grouped as by
@@ -99,30 +98,9 @@ class OdometrySubscriber:
         keys: ClientKeys | None = None,
         on_note: Callable[[str], None] | None = None,
     ) -> None:
-        self._receiver = PulseReceiver(address, mountings=mountings, sensors=sensors, keys=keys, on_note=on_note)
-        self.counts = self._receiver.counts
+        super().__init__(PulseReceiver(address, mountings=mountings, sensors=sensors, keys=keys, on_note=on_note))
         self._odometry = LiveOdometry(on_note or (lambda _: None))
         self._stamps: dict[str, Stamp] = {}  # of the last pulse, by sensor
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def __iter__(self) -> Iterator[OdometryArrival]:
-        while (arrival := self.receive()) is not None:
-            yield arrival
-
-    @property
-    def connected(self) -> bool:
-        """True if a central node answers."""
-        return self._receiver.connected
-
-    @property
-    def n_skipped(self) -> int:
-        """Pulses that were not used, because the application was too slow."""
-        return self._receiver.n_skipped
 
     @property
     def trajectory(self) -> Trajectory | None:
@@ -154,10 +132,6 @@ class OdometrySubscriber:
             if arrival is not None:
                 return arrival
         return None
-
-    def close(self) -> None:
-        """End the loop."""
-        self._receiver.close()
 
     def _added(self, pulse: ReceivedPulse) -> OdometryArrival | None:
         """Return the pose at a pulse; None if it is not later than the one before."""

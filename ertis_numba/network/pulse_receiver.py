@@ -2,10 +2,11 @@
 
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, TypeAlias
+from typing import Final, Generic, Self, TypeAlias, TypeVar
 
 from ertis_numba.errors import DataError
 from ertis_numba.frames import Energyscape, Stamp
@@ -14,7 +15,9 @@ from ertis_numba.fusion.rig import Mountings
 from ertis_numba.network.keys import ClientKeys
 from ertis_numba.network.subscriber import Subscriber, SubscriberCounts
 
-__all__ = ["PulseReceiver", "ReceivedPulse"]
+__all__ = ["PulseReceiver", "PulseSubscriber", "ReceivedPulse"]
+
+Arrival = TypeVar("Arrival")
 
 _Place: TypeAlias = tuple[tuple[float, float, float], tuple[float, float, float, float]]
 
@@ -199,6 +202,47 @@ class PulseReceiver:
                 self._waiting.popleft()
                 self.n_skipped += 1
             self._changed.notify_all()
+
+
+class PulseSubscriber(ABC, Generic[Arrival]):
+    """Application node that computes something from each pulse of a receiver.
+
+    Parameters
+    ----------
+    receiver : PulseReceiver
+    """
+
+    def __init__(self, receiver: PulseReceiver) -> None:
+        self._receiver = receiver
+        self.counts = receiver.counts
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __iter__(self) -> Iterator[Arrival]:
+        while (arrival := self.receive()) is not None:
+            yield arrival
+
+    @property
+    def connected(self) -> bool:
+        """True if a central node answers."""
+        return self._receiver.connected
+
+    @property
+    def n_skipped(self) -> int:
+        """Pulses that were not used, because the application was too slow."""
+        return self._receiver.n_skipped
+
+    @abstractmethod
+    def receive(self, timeout_s: float | None = None) -> Arrival | None:
+        """Return the next result; None after ``timeout_s``, or once the subscriber is closed."""
+
+    def close(self) -> None:
+        """End the loop."""
+        self._receiver.close()
 
 
 def _as_tuples(translation_m: Sequence[float], rotation_xyzw: Sequence[float]) -> _Place:
