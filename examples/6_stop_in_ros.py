@@ -18,6 +18,7 @@ import time
 
 import rclpy
 from geometry_msgs.msg import Twist
+from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -28,6 +29,7 @@ SPEED_M_S = 0.5
 HALF_WIDTH_M = 0.3
 SILENCE_S = 0.5
 PERIOD_S = 0.05
+ARRIVAL_S = 1.0
 
 
 def distance_ahead_m(scan: LaserScan) -> float:
@@ -64,8 +66,9 @@ class StopBeforeWalls(Node):
         self._velocity.publish(message)
 
     def stop(self) -> None:
-        """Publish a velocity of 0: robots keep the last velocity that they received."""
+        """Publish a velocity of 0, and wait until it has arrived: robots keep the last velocity that they received."""
         self._velocity.publish(Twist())
+        self._velocity.wait_for_all_acked(Duration(seconds=ARRIVAL_S))  # Messages under way would end with the node.
 
 
 def main(topic: str) -> None:
