@@ -40,7 +40,6 @@ class _SenderJob:
     words: str
     count: int
     rate_hz: float
-    start_s: float
 
 
 def measure(*, duration_s: float, seed: int, rate_hz: float = 10.0, directions: str = "90") -> dict[str, Any]:
@@ -52,7 +51,7 @@ def measure(*, duration_s: float, seed: int, rate_hz: float = 10.0, directions: 
         path = some_words(settings, Path(place) / "words.npy", seed=seed)
         measurements = [Measurement(words, settings) for words in np.load(path)]
         expected = [pipeline.process(each).amplitude for each in measurements]
-        job = _SenderJob(str(path), count, rate_hz, time.monotonic() + 2.0)
+        job = _SenderJob(str(path), count, rate_hz)
         command = [sys.executable, "-m", "ertis_bench.serial_stream", json.dumps(asdict(job))]
         with JsonLinesProcess(command, stated=Path(place) / "sender.txt") as sender:
             port = sender.wait_for("ready")["port"]
@@ -91,12 +90,16 @@ def _received(pipeline: Pipeline, settings: Settings, port: str, expected: list[
 
 
 def _send(job: _SenderJob) -> None:
-    """Send blocks at the rate of the line, and print the time of the last byte of each."""
+    """Send blocks at the rate of the line, and print the time of the last byte of each.
+
+    The first block is sent a second after the terminal exists, so that the receiver has opened it.
+    """
     words, terminal = np.load(job.words), Terminal()
     _emit_event(event="ready", port=terminal.port)
+    start_s = time.monotonic() + 1.0
     for counter in range(job.count):
         block = memoryview(encode_block(counter, words[counter % len(words)]))
-        begin_s = job.start_s + counter / job.rate_hz
+        begin_s = start_s + counter / job.rate_hz
         time.sleep(max(0.0, begin_s - time.monotonic()))
         begin_s, n_sent = time.monotonic(), 0
         while n_sent < len(block):
