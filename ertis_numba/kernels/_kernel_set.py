@@ -72,6 +72,8 @@ class KernelSet(AdaptiveKernels):
     combine_streams_int16: _contract.CombineStreamsInt16
     add_paths: _contract.AddPaths
     modulate_pdm: _contract.ModulatePdm
+    cross_spectra: _contract.CrossSpectra
+    steer_power: _contract.SteerPower
 
     @classmethod
     def of(cls, twins: Mapping[str, Any], **facts: Any) -> Self:

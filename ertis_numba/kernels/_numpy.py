@@ -495,6 +495,20 @@ def _noise_and_dither(
     return noise, dither
 
 
+def cross_spectra(spectra: Complex, first: int, out: Complex) -> None:
+    """Sum the products of the spectra of each two microphones over blocks of samples."""
+    heard = spectra[:, :, first : first + len(out)].transpose(2, 0, 1)
+    np.matmul(heard, heard.conj().transpose(0, 2, 1), out=out)
+
+
+def steer_power(matrices: Complex, steps: Turns, bins: Turns, out: Real) -> None:
+    """Compute the power that Hermitian matrices have for the wave from each direction."""
+    for matrix, number, power in zip(matrices, bins, out, strict=True):
+        lags = np.exp(np.float32(-2 * np.pi / 2**32) * (steps * number).view(np.int32) * np.complex64(1j))
+        upper = np.triu(matrix, 1)
+        power[:] = 2 * (lags.conj() * (upper @ lags)).real.sum(axis=0) + np.trace(matrix).real
+
+
 KERNELS = KernelSet.of(
     vars(),
     device="numpy",

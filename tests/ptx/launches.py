@@ -83,6 +83,10 @@ def _each(kernels):
     kernels.rectify_and_decimate(sums, np.zeros(61, np.int16), 0.5, 10, 0, np.zeros((90, 30), np.float32))
     kernels.sum_delayed_int16(np.zeros((4, 8, 200), np.int16), np.zeros(4, np.float32), offsets, sums)
     double, octets = np.zeros((32, 500)), np.arange(32, dtype=np.int32).reshape(4, 8)
+    blocks, matrices = np.zeros((8, 6, 129), np.complex64), np.zeros((20, 8, 8), np.complex64)
+    kernels.cross_spectra(blocks, 5, matrices)
+    steps, bins = np.zeros((8, 90), np.uint32), np.arange(20, dtype=np.uint32)
+    kernels.steer_power(matrices, steps, bins, np.zeros((20, 90), np.float32))
     kernels.add_paths(
         np.zeros((1, 251), np.complex128),
         np.zeros((5, 8)),

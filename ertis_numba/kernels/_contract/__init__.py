@@ -18,6 +18,7 @@ from ertis_numba.kernels._contract.beams import (
     RectifyAndDecimate,
     SumDelayedInt16,
 )
+from ertis_numba.kernels._contract.passive import CrossSpectra, SteerPower
 from ertis_numba.kernels._contract.scenes import AddPaths, ModulatePdm
 from ertis_numba.kernels._contract.signals import (
     Decimate,
@@ -38,6 +39,7 @@ __all__ = [
     "CombineStreamsInt16",
     "Complex",
     "ComplexOrDouble",
+    "CrossSpectra",
     "Decimate",
     "DelayAndSum",
     "DelayAndSumEnvelope",
@@ -58,6 +60,7 @@ __all__ = [
     "RectifyAndDecimate",
     "RemoveGroupDelay",
     "Short",
+    "SteerPower",
     "SumDelayedInt16",
     "SumSpectra",
     "Taps",
