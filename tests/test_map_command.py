@@ -108,6 +108,40 @@ def test_plot_draws_a_map(folder):
     assert "is HDF5, but not an occupancy map" in done.stderr
 
 
+@pytest.mark.parametrize("option", ["--sensor left", "--measurement 1", "--peaks 3", "--dynamic-range 20"])
+def test_plot_refuses_options_that_a_map_does_not_have(tmp_path, option):
+    ertis.write_map(tmp_path / "m.h5", ertis.OccupancyMap(np.array([[0.0, 2.0]]), (0.0, 0.0), 0.1))
+    done = CliRunner().invoke(cli, ["plot", str(tmp_path / "m.h5"), *option.split()])
+    assert done.exit_code == 2
+    assert f"{option.split()[0]} is for --kind image, " in done.stderr
+    assert "remove it with map" in done.stderr
+    assert not (tmp_path / "m.png").exists()
+
+
+def test_info_shows_a_map(tmp_path):
+    cells = np.array([[-2.0, 0.0, 2.0], [-2.0, 2.0, 2.0]])
+    ertis.write_map(tmp_path / "m.h5", ertis.OccupancyMap(cells, (1.0, -2.0), 0.1, 7, 1_700_000_000_000_000_000))
+    report = json.loads(CliRunner().invoke(cli, ["info", str(tmp_path / "m.h5"), "--json"]).stdout)
+    assert report["kind"] == "occupancy_map"
+    assert (report["pulses"], report["cells"], report["occupied"], report["free"]) == (7, [3, 2], 3, 2)
+    assert (report["origin_m"], report["size_m"], report["cell_m"]) == ([1.0, -2.0], [0.3, 0.2], 0.1)
+    shown = CliRunner().invoke(cli, ["info", str(tmp_path / "m.h5")]).stdout
+    assert re.search(r"^last +2023-11-14 22:13:20\.000 UTC$", shown, re.MULTILINE)
+
+
+def test_order_of_recordings_does_not_change_the_map(folder, tmp_path):
+    for name, x_m in (("left", 3.0), ("right", 3.0)):
+        add_poses(folder / f"{name}.h5", poses(x_m=x_m), output=tmp_path / f"{name}.h5")
+    run(tmp_path, "left.h5 right.h5 -q -o one.h5")
+    run(tmp_path, "right.h5 left.h5 -q -o other.h5")
+    one, other = (ertis.read_map(tmp_path / name) for name in ("one.h5", "other.h5"))
+    assert one.limits_m == other.limits_m
+    np.testing.assert_allclose(one.log_odds, other.log_odds, atol=1e-5)
+    add_poses(folder / "right.h5", poses(x_m=4.0), output=tmp_path / "right.h5", overwrite=True)
+    done = run(tmp_path, "right.h5 left.h5 -q -o third.h5", code=1)
+    assert re.search(r"have different poses at \d+ ns; give one trajectory, such as --poses FILE", done.stderr)
+
+
 def test_map_leaves_out_pulses_outside_of_the_poses(folder):
     ertis.write_tum(folder / "late.tum", poses(start_ns=50_000_000))
     done = run(folder, "both.h5 --poses late.tum --json -o late.h5")

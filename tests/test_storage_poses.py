@@ -12,7 +12,13 @@ from scipy.spatial.transform import Rotation
 
 import ertis_numba as ertis
 from ertis_numba.errors import ArgumentError, DamagedError, ForeignDataError
-from ertis_numba.storage import RecordingWriter, open_recording, recorded_trajectory, write_recording
+from ertis_numba.storage import (
+    RecordingWriter,
+    open_recording,
+    platform_trajectory,
+    recorded_trajectory,
+    write_recording,
+)
 from ertis_numba.storage.schema import POSES, RECORDING, content_sha256
 from ertis_numba.storage.verify import verify
 from tests.files import SMALL, noise, open_dataset
@@ -370,3 +376,26 @@ def test_info_command_reports_poses(plain):
     lines = [line.split() for line in reported().splitlines()]
     assert ["poses", "source", "file"] in lines
     assert ["path", "length", str(left["path_length_m"]), "m"] in lines
+
+
+def test_trajectory_of_a_platform_does_not_depend_on_the_order_of_its_recordings(tmp_path):
+    by_name = {"front": sensors("front"), "left": sensors("right", "left", delay_ns=10_000_000)[len(TIMES_NS) :]}
+    files = [write_recording(tmp_path / f"{name}.h5", several) for name, several in by_name.items()]
+    for path in files:
+        ertis.add_poses(path, drive())
+    files.append(write_recording(tmp_path / "back.h5", sensors("back")))
+    found = platform_trajectory(files)
+    assert found.time_ns.tolist() == sorted([*TIMES_NS, *(time_ns + 10_000_000 for time_ns in TIMES_NS)])
+    same_poses(platform_trajectory(files[::-1]), found)
+    assert platform_trajectory(files[2:]) is None
+
+
+def test_trajectory_of_a_platform_refuses_recordings_of_different_drives(tmp_path):
+    files = [write_recording(tmp_path / f"{name}.h5", sensors(name)) for name in ("front", "left")]
+    ertis.add_poses(files[0], drive())
+    ertis.add_poses(files[1], drive(source="other"))
+    with pytest.raises(ArgumentError, match=r"front.h5 from 'file' and .*left.h5 from 'other'; give one trajectory"):
+        platform_trajectory(files)
+    ertis.add_poses(files[1], drive().replace(position_m=drive().position_m + 1), replace=True)
+    with pytest.raises(ArgumentError, match=r"front.h5 and .*left.h5 have different poses at \d+ ns; give one traj"):
+        platform_trajectory(files)

@@ -38,7 +38,7 @@ _COLUMNS = {  # name: digits in the report, and in the table
 )
 @options.as_json
 def info(*, path: Path, of_health: bool, as_json: bool) -> None:
-    """Show the contents of a recording or an energyscape file.
+    """Show the contents of a recording, an image file or a map.
 
     In JSON, "sensors" lists the properties of each sensor. If there is only one sensor, the top level repeats its
     properties.
@@ -49,6 +49,24 @@ def info(*, path: Path, of_health: bool, as_json: bool) -> None:
     if of_health:
         _report_health(path, as_json=as_json)
         return
+    from ertis_numba.storage import is_map
+
+    about, sections = (_map(path), []) if is_map(path) else _by_sensor(path)
+    flat = [{**about, **sections[0]}] if len(sections) == 1 else [about, *sections]
+    if as_json:
+        options.print_json({**flat[0], "sensors": sections})
+        return
+    width = max(len(_label(name)[0]) for section in flat for name in section)
+    for index, section in enumerate(flat):
+        if index:
+            click.echo()
+        for name, value in section.items():
+            label, unit = _label(name)
+            click.echo(f"{label:{width}}  {_readable(value)}{unit}")
+
+
+def _by_sensor(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Return the properties of a recording or an energyscape file, and those of each sensor."""
     from ertis_numba.storage import file_kind, open_energyscapes, open_recording
 
     kind = file_kind(path)
@@ -64,17 +82,28 @@ def info(*, path: Path, of_health: bool, as_json: bool) -> None:
             with open_energyscapes(path, sensor=name) as reader:
                 about = {**_file(reader), **_origin(reader)}
                 sections.append({**_sensor(reader), **_energyscapes(reader)})
-    flat = [{**about, **sections[0]}] if len(sections) == 1 else [about, *sections]
-    if as_json:
-        options.print_json({**flat[0], "sensors": sections})
-        return
-    width = max(len(_label(name)[0]) for section in flat for name in section)
-    for index, section in enumerate(flat):
-        if index:
-            click.echo()
-        for name, value in section.items():
-            label, unit = _label(name)
-            click.echo(f"{label:{width}}  {_readable(value)}{unit}")
+    return about, sections
+
+
+def _map(path: Path) -> dict[str, Any]:
+    """Return the properties of an occupancy map."""
+    from ertis_numba.frames import Stamp
+    from ertis_numba.storage import read_map
+
+    found = read_map(path)
+    return {
+        "file": str(path),
+        "kind": "occupancy_map",
+        "bytes": path.stat().st_size,
+        "pulses": found.n_groups,
+        "last": Stamp(timestamp_ns=found.time_ns).iso,
+        "cell_m": found.cell_m,
+        "cells": list(found.log_odds.shape[::-1]),
+        "origin_m": [round(edge_m, 6) for edge_m in found.origin_m],
+        "size_m": [round(high_m - low_m, 6) for low_m, high_m in found.limits_m],
+        "occupied": int(found.is_occupied.sum()),
+        "free": int(found.is_free.sum()),
+    }
 
 
 def _label(name: str) -> tuple[str, str]:

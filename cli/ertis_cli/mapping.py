@@ -148,23 +148,22 @@ def _is_active(group: "dict[str, StampedIndex]") -> bool:
 
 
 def _trajectory(poses_file: Path | None, paths: "Sequence[Path]") -> "Trajectory":
-    """Return the poses of a file, or else those of a recording.
+    """Return the poses of a file, or else those of the recordings.
 
     Raises
     ------
     UsageError
         There are none.
     """
-    from ertis_numba.storage import recorded_trajectory
+    from ertis_numba.storage import platform_trajectory
 
     if poses_file is not None:
         from ertis_numba import read_trajectory
 
         return read_trajectory(poses_file)
-    for path in paths:
-        found = recorded_trajectory(path)
-        if found is not None:
-            return found
+    found = platform_trajectory(paths)
+    if found is not None:
+        return found
     raise click.UsageError(
         f"{paths[0]} contains no poses of the platform; give --poses FILE, or add them to the recording",
         click.get_current_context(),

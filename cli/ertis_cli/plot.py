@@ -9,7 +9,7 @@ import click
 from ertis_cli import options
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from matplotlib.figure import Figure
 
@@ -43,6 +43,7 @@ _ONLY = {
     "microphone": _OF_RECORDINGS,
     "frequency": ("array",),
     "steer": ("array", "calibration"),
+    "dynamic-range": tuple(kind for kind in _KINDS if kind != "map"),
 }
 """Kinds that support each of these options."""
 
@@ -142,13 +143,10 @@ def plot(
         "left": left,
     }
     given |= {"microphone": microphone, "frequency": frequencies or None, "steer": steer}
-    for name, value in given.items():
-        if value is not None and kind not in _ONLY[name]:
-            raise click.UsageError(
-                f"--{name} is for --kind {', '.join(_ONLY[name])}; remove it with {kind}",
-                click.get_current_context(),
-            )
+    source = click.get_current_context().get_parameter_source("dynamic_range")
+    given["dynamic-range"] = dynamic_range if source is click.core.ParameterSource.COMMANDLINE else None
     kind = "map" if kind == "image" and is_map(path) else kind
+    _require_supported(kind, given)
     if kind != "array":
         _require_no_array(path)
     if not path.name:  # "." and "/" give no name for the picture
@@ -199,6 +197,16 @@ def plot(
     options.say(f"{target}: {reported}", quiet=quiet)
     if as_json:
         options.print_json(report)
+
+
+def _require_supported(kind: str, given: "Mapping[str, object]") -> None:
+    """Raise an error for a given option that a kind of plot does not support."""
+    for name, value in given.items():
+        if value is not None and kind not in _ONLY[name]:
+            raise click.UsageError(
+                f"--{name} is for --kind {', '.join(_ONLY[name])}; remove it with {kind}",
+                click.get_current_context(),
+            )
 
 
 def _calibrated(path: Path, sensor: str | None) -> "tuple[Calibration, Settings]":

@@ -9,7 +9,7 @@ from ertis_numba.storage.energyscape import (
     write_energyscapes,
 )
 from ertis_numba.storage.maps import is_map, read_map, write_map_file
-from ertis_numba.storage.poses import add_poses, recorded_trajectory, require_fitting_poses
+from ertis_numba.storage.poses import add_poses, platform_trajectory, recorded_trajectory, require_fitting_poses
 from ertis_numba.storage.recording import (
     RecordingReader,
     RecordingWriter,
@@ -32,6 +32,7 @@ __all__ = [
     "is_map",
     "open_energyscapes",
     "open_recording",
+    "platform_trajectory",
     "read_map",
     "recorded_trajectory",
     "require_fitting_poses",

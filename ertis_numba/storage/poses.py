@@ -3,7 +3,7 @@
 import filecmp
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final
@@ -29,12 +29,13 @@ from ertis_numba.storage.schema import (
     to_python,
 )
 
-__all__ = ["add_poses", "recorded_trajectory", "require_fitting_poses"]
+__all__ = ["add_poses", "platform_trajectory", "recorded_trajectory", "require_fitting_poses"]
 
 _BYTES_PER_POSE: Final = 8 * (3 + 4 + 36)
 _BYTES_PER_SENSOR: Final = 200_000  # Chunks that are not full, and tables.
 _MAX_HISTORY: Final = 16_000  # Characters; an attribute of HDF5 is limited to 65,536 bytes.
 _MAX_DIFFERENCE: Final = 1e-6  # m, or of a unit quaternion; poses of equal times differ by rounding only.
+_MAX_RATE_1_S: Final = 100.0  # Change of a pose in a second, in the same units.
 
 
 def add_poses(
@@ -172,27 +173,62 @@ def recorded_trajectory(path: str | Path, *, sensor: str | None = None) -> Traje
         with open_recording(path, sensor=name) as recording:
             if recording.trajectory is not None:
                 found[name] = recording.trajectory
+    return _merged(found, f"{path}: sensors", "choose one sensor")
+
+
+def platform_trajectory(paths: Iterable[str | Path]) -> Trajectory | None:
+    """Return the trajectory of a platform whose sensors have recordings of their own.
+
+    Parameters
+    ----------
+    paths : iterable of str or Path
+        Paths of recordings; their order does not matter.
+
+    Returns
+    -------
+    Trajectory or None
+        One pose for each time at which a sensor has measured; None if no recording has poses.
+
+    Raises
+    ------
+    ArgumentError
+        Sensors have different poses at the same time, or recordings have poses of different sources.
+    DataError
+        A recording cannot be read.
+    """
+    found: dict[str, Trajectory] = {}
+    for path in sorted(map(str, paths)):
+        trajectory = recorded_trajectory(path)
+        if trajectory is not None:
+            found[path] = trajectory
+    sources = {trajectory.source: path for path, trajectory in found.items()}
+    if len(sources) > 1:
+        named = " and ".join(f"{path} from {source or 'an unknown source'!r}" for source, path in sources.items())
+        raise ArgumentError(
+            f"poses have different sources: those of {named}; give one trajectory, such as --poses FILE"
+        )
+    return _merged(found, "recordings", "give one trajectory, such as --poses FILE")
+
+
+def _merged(found: dict[str, Trajectory], kind: str, advice: str) -> Trajectory | None:
+    """Return the poses of all sensors or recordings by time; None without any."""
     if len(found) < 2:
         return next(iter(found.values()), None)
-    return _merged(Path(path), found)
-
-
-def _merged(path: Path, found: dict[str, Trajectory]) -> Trajectory:
-    """Return the poses of all sensors by time."""
     several = [*found.values()]
     rows = np.concatenate([np.column_stack([each.position_m, each.rotation_xyzw]) for each in several])
-    sensors = np.repeat(np.arange(len(several)), [len(each) for each in several])
+    owners = np.repeat(np.arange(len(several)), [len(each) for each in several])
     all_ns = np.concatenate([each.time_ns for each in several])
-    time_ns, first, inverse = np.unique(all_ns, return_index=True, return_inverse=True)
-    kept = rows[first][inverse]
-    turned = np.sign(np.sum(rows[:, 3:] * kept[:, 3:], axis=1, keepdims=True))  # q and -q are the same rotation.
-    difference = np.abs(np.column_stack([rows[:, :3] - kept[:, :3], turned * rows[:, 3:] - kept[:, 3:]])).max(axis=1)
-    if difference.max() > _MAX_DIFFERENCE:
-        worst = int(difference.argmax())
-        names = [[*found][sensors[index]] for index in (first[inverse[worst]], worst)]
-        raise ArgumentError(
-            f"{path}: sensors {' and '.join(names)} have different poses at {all_ns[worst]} ns; choose one sensor"
-        )
+    order = np.argsort(all_ns, kind="stable")
+    pairs = np.stack([order[:-1], order[1:]], axis=1)[owners[order[:-1]] != owners[order[1:]]]
+    before, after = rows[pairs[:, 0]], rows[pairs[:, 1]]
+    turned = np.sign(np.sum(before[:, 3:] * after[:, 3:], axis=1, keepdims=True))  # q and -q are the same rotation.
+    difference = np.abs(np.column_stack([after[:, :3] - before[:, :3], turned * after[:, 3:] - before[:, 3:]]))
+    beyond = difference.max(axis=1) - _MAX_RATE_1_S * 1e-9 * np.diff(all_ns[pairs], axis=1)[:, 0]
+    if beyond.max(initial=0.0) > _MAX_DIFFERENCE:
+        worst = pairs[beyond.argmax()]
+        names = " and ".join([*found][owner] for owner in owners[worst])
+        raise ArgumentError(f"{kind} {names} have different poses at {all_ns[worst[1]]} ns; {advice}")
+    time_ns, first = np.unique(all_ns, return_index=True)
     covariances = [each.covariance for each in several]
     known = [each for each in covariances if each is not None]
     covariance = np.concatenate(known)[first] if len(known) == len(covariances) else None
