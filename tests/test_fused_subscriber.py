@@ -2,11 +2,14 @@
 
 import json
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
+from ertis_bench.network.processes import until
 from ertis_cli.main import cli
 
 from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.fusion import Fuser
 from ertis_numba.network.fused_subscriber import FusedSubscriber
 from tests.publishing import Publisher, image
 
@@ -36,6 +39,38 @@ def test_each_pulse_is_fused_once():
     last = arrivals[-1].fused
     assert (last.sensors, last.missing) == (("front", "back"), ())
     assert sorted(round(float(x), 1) for x in last.points.position_m[:, 0]) == [-1.1, 1.6]
+
+
+def test_pulses_that_arrive_while_tables_are_computed_are_fused_later(monkeypatch):
+    fuse = Fuser.__call__
+
+    def slowly(fuser, images):
+        """Fuse, and the first time return only once all further pulses have arrived."""
+        fused = fuse(fuser, images)
+        if fused.image.stamp.sync_count == 0:
+            assert until(lambda: subscriber.counts.received == 16)
+        return fused
+
+    with (
+        Publisher() as publisher,
+        FusedSubscriber(publisher.address, mountings=MOUNTINGS) as subscriber,
+        publisher.playing(pulses(count=8)),
+    ):
+        monkeypatch.setattr(Fuser, "__call__", slowly)
+        counts = [subscriber.receive(20.0).fused.image.stamp.sync_count for _ in range(8)]
+        assert (counts, subscriber.n_skipped) == ([*range(8)], 0)
+
+
+def test_images_of_an_arrival_are_those_that_were_fused():
+    with (
+        Publisher() as publisher,
+        publisher.playing(pulses(count=1)),
+        FusedSubscriber(publisher.address, mountings=MOUNTINGS) as subscriber,
+    ):
+        arrival = subscriber.receive(20.0)
+    again = Fuser(MOUNTINGS, spacing_deg=2.0, range_step_m=0.02)(arrival.images.values())
+    assert sorted(arrival.images) == ["back", "front"]
+    np.testing.assert_array_equal(arrival.fused.image.amplitude, again.image.amplitude)
 
 
 def test_pulse_without_all_images_is_fused_by_the_next_one():

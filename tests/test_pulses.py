@@ -79,3 +79,10 @@ def test_close_returns_open_groups_from_the_earliest():
         groups.add(item(*each))
     assert summary([groups.close(), groups.close()]) == [(3, "front"), (4, "left")]
     assert groups.close() == {}
+
+
+def test_first_pulse_of_unknown_sensors_ends_when_the_second_begins():
+    groups = PulseGroups.of([])
+    order = [("front", 0), ("left", 0), ("back", 0), ("front", 1), ("left", 1), ("back", 1)]
+    found = [summary(groups.add(item(*each))) for each in order]
+    assert found == [[], [], [], [(0, "back", "front", "left")], [], [(1, "back", "front", "left")]]

@@ -168,6 +168,26 @@ class Fuser:
             _locate=lambda: tables.points(group, found.shares, image),
         )
 
+    def has_tables(self, images: Iterable[Energyscape]) -> bool:
+        """Return True if the tables for images exist, so that their fusion does not take longer than later ones.
+
+        Parameters
+        ----------
+        images : iterable of Energyscape
+            As for a call.
+
+        Returns
+        -------
+        bool
+
+        Raises
+        ------
+        ArgumentError, DataError
+            As for a call.
+        """
+        group = self._group(images)
+        return self._tables is not None and self._tables.cover(group)
+
     def _group(self, images: Iterable[Energyscape]) -> dict[int, Energyscape]:
         """Return checked images by number of the sensor, in the order of the mountings."""
         found: dict[int, Energyscape] = {}

@@ -45,12 +45,16 @@ class PulseGroups(Generic[Item]):
     _expected: set[str] = field(default_factory=set)
     _recent: deque[set[str]] = field(default_factory=lambda: deque(maxlen=2))  # Sensors of the groups returned last.
     _open: list[dict[str, Item]] = field(default_factory=list)
+    _waits: bool = False  # Until the second pulse begins.
     _closed: Stamp | None = None  # Stamp of the group that was returned last.
 
     @classmethod
     def of(cls, sensors: Iterable[str]) -> "PulseGroups[Item]":
-        """Return a collector that waits for these sensors at first."""
+        """Return a collector that waits for these sensors at first; without any, until the second pulse begins."""
         found = cls(set(sensors))
+        if not found._expected:
+            found._waits = True
+            return found
         found._recent.append(set(found._expected))
         return found
 
@@ -98,6 +102,8 @@ class PulseGroups(Generic[Item]):
         if later:
             seen, active = set().union(*later), set().union(*self._recent)
             missing = (missing & active) - seen
+        elif self._waits and not self._recent:
+            return False
         return not missing or len(later) == _MAX_LATER
 
 

@@ -71,6 +71,10 @@ class FusionTables:
             for number, image in group.items()
         )
 
+    def cover(self, group: Mapping[int, Energyscape]) -> bool:
+        """Return True if all tables for a group exist."""
+        return self.fit(group) and group.keys() <= self._receivers.keys() and _key(group) in self._known
+
     def coarse(self, number: int, image: Energyscape) -> CoarseImage:
         """Return the powers of an image of a receiver."""
         if number not in self._receivers:
@@ -79,8 +83,7 @@ class FusionTables:
 
     def attribution(self, group: Mapping[int, Energyscape]) -> Attribution:
         """Return the attribution of echoes in the images of a group, for pairs with equal calls that were emitted."""
-        passive = frozenset(number for number, image in group.items() if image.stamp.behaviour == "passive")
-        key = tuple(group), passive
+        key = _, passive = _key(group)
         if key not in self._known:
             pairs = [
                 pair
@@ -176,3 +179,8 @@ class FusionTables:
         kind = "2d" if self.grid.is_planar else "3d"
         directions = f"{kind}:{self.grid.n_directions}"
         return settings.replace(processing=settings.processing.replace(directions=directions, **limits))
+
+
+def _key(group: Mapping[int, Energyscape]) -> tuple[tuple[int, ...], frozenset[int]]:
+    """Return the sensors of a group, and those that did not emit."""
+    return tuple(group), frozenset(number for number, image in group.items() if image.stamp.behaviour == "passive")

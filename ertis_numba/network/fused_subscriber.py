@@ -1,10 +1,13 @@
 """Application node that fuses the images of all sensors as they arrive."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 
+from ertis_numba.frames import Energyscape
 from ertis_numba.fusion import Fused, Fuser
+from ertis_numba.fusion.loading import load_kernels
 from ertis_numba.fusion.rig import Mountings
 from ertis_numba.network.keys import ClientKeys
 from ertis_numba.network.pulse_receiver import PulseReceiver, PulseSubscriber
@@ -19,6 +22,8 @@ class FusedArrival:
     Attributes
     ----------
     fused : Fused
+    images : mapping of str to Energyscape
+        Images that were fused, by sensor.
     first_ns : int
         Emission, by the monotonic clock of the sensor node; that of this machine if the node runs on it.
     ready_ns : int
@@ -28,6 +33,7 @@ class FusedArrival:
     """
 
     fused: Fused
+    images: Mapping[str, Energyscape]
     first_ns: int
     ready_ns: int
     ready_utc_ns: int
@@ -45,6 +51,10 @@ class FusedSubscriber(PulseSubscriber[FusedArrival]):
     Images are fused here, not at the central node, which therefore needs no more time. A pulse is complete when all
     sensors of the two pulses before have sent their image. A missing sensor delays it until up to three later pulses
     have begun, or until no image has come for 0.25 s. An application that is too slow gets the latest pulses.
+
+    Kernels are loaded, or compiled on a new installation, before the connection is made. The first pulse, and the first
+    one after a change of settings or mountings, needs tables. Pulses that arrive meanwhile wait, and the subscriber
+    catches up.
 
     Parameters
     ----------
@@ -95,6 +105,7 @@ class FusedSubscriber(PulseSubscriber[FusedArrival]):
             "spacing_deg": spacing_deg,
             "range_step_m": range_step_m,
         }
+        load_kernels()
         super().__init__(PulseReceiver(address, mountings=mountings, sensors=sensors, keys=keys, on_note=on_note))
         self._mountings: Mountings = {}
         self._fuser: Fuser | None = None
@@ -120,5 +131,7 @@ class FusedSubscriber(PulseSubscriber[FusedArrival]):
         if self._fuser is None or pulse.mountings != self._mountings:
             self._mountings = pulse.mountings
             self._fuser = Fuser(pulse.mountings, **self._options)  # type: ignore[arg-type]  # all are numbers
-        fused = self._fuser(pulse.images.values())
-        return FusedArrival(fused, pulse.first_ns, time.monotonic_ns(), time.time_ns())
+        images = pulse.images.values()
+        with nullcontext() if self._fuser.has_tables(images) else self._receiver.queue.keeping():
+            fused = self._fuser(images)
+        return FusedArrival(fused, pulse.images, pulse.first_ns, time.monotonic_ns(), time.time_ns())

@@ -3,7 +3,6 @@
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Generic, Self, TypeAlias, TypeVar
@@ -13,6 +12,7 @@ from ertis_numba.frames import Energyscape, Stamp
 from ertis_numba.fusion.pulses import PulseGroups
 from ertis_numba.fusion.rig import Mountings
 from ertis_numba.network.keys import ClientKeys
+from ertis_numba.network.pulse_queue import PulseQueue
 from ertis_numba.network.subscriber import Subscriber, SubscriberCounts
 
 __all__ = ["PulseReceiver", "PulseSubscriber", "ReceivedPulse"]
@@ -23,7 +23,6 @@ _Place: TypeAlias = tuple[tuple[float, float, float], tuple[float, float, float,
 
 _POLL_S: Final = 0.05
 _PATIENCE_S: Final = 0.25  # Time after which a pulse is returned without the images that are missing.
-_MAX_WAITING: Final = 2  # Pulses that wait here; a slow application gets the latest ones.
 _CREDIT: Final = 16  # Images under way: those of two pulses of eight sensors.
 _STOP_S: Final = 5.0
 
@@ -87,8 +86,8 @@ class PulseReceiver:
     ----------
     counts : SubscriberCounts
         Counts of the images.
-    n_skipped : int
-        Pulses that were not returned, because the application was too slow.
+    queue : PulseQueue
+        Pulses that wait for `receive`.
 
     Raises
     ------
@@ -113,11 +112,8 @@ class PulseReceiver:
             address, products=("energyscape",), sensors=sensors, keys=keys, on_note=on_note, credit=_CREDIT
         )
         self.counts: SubscriberCounts = self._subscriber.counts
-        self.n_skipped = 0
         self._groups: PulseGroups[_Received] = PulseGroups.of(self._given)
-        self._changed = threading.Condition()
-        self._waiting: deque[dict[str, _Received]] = deque()
-        self._failure: Exception | None = None
+        self.queue: PulseQueue[dict[str, _Received]] = PulseQueue()
         self._mountings: dict[str, _Place] = dict(self._given)
         self._thread = threading.Thread(target=self._run, name="ertis-pulse-receiver", daemon=True)
         self._thread.start()
@@ -142,13 +138,9 @@ class PulseReceiver:
         DataError
             The mounting of a sensor is unknown.
         """
-        with self._changed:
-            self._changed.wait_for(lambda: self._waiting or self._failure or self._subscriber.closed, timeout_s)
-            if self._failure is not None:
-                raise self._failure
-            if not self._waiting or self._subscriber.closed:
-                return None
-            group = self._waiting.popleft()
+        group = self.queue.take(timeout_s)
+        if group is None:
+            return None
         self._mountings = self._mountings | {name: each.mounting for name, each in group.items()}
         return ReceivedPulse(
             {name: each.image for name, each in group.items()},
@@ -159,8 +151,7 @@ class PulseReceiver:
     def close(self) -> None:
         """End waiting calls of `receive`."""
         self._subscriber.close()
-        with self._changed:
-            self._changed.notify_all()
+        self.queue.close()
         if threading.current_thread() is not self._thread:
             self._thread.join(_STOP_S)
 
@@ -177,9 +168,7 @@ class PulseReceiver:
                 elif time.monotonic() - latest_s > _PATIENCE_S and (group := self._groups.close()):
                     self._put(group)
         except Exception as error:  # noqa: BLE001  whatever it is, who waits must not do so for ever
-            with self._changed:
-                self._failure = error
-                self._changed.notify_all()
+            self.queue.fail(error)
 
     def _received(self, image: Energyscape) -> _Received:
         arrival = self._subscriber.latest
@@ -196,12 +185,7 @@ class PulseReceiver:
         return _Received(image, mounting, arrival.header.monotonic_ns)  # type: ignore[union-attr]  # of an image
 
     def _put(self, group: dict[str, _Received]) -> None:
-        with self._changed:
-            self._waiting.append(group)
-            while len(self._waiting) > _MAX_WAITING:
-                self._waiting.popleft()
-                self.n_skipped += 1
-            self._changed.notify_all()
+        self.queue.put(group, sum(each.image.amplitude.nbytes for each in group.values()))
 
 
 class PulseSubscriber(ABC, Generic[Arrival]):
@@ -234,7 +218,7 @@ class PulseSubscriber(ABC, Generic[Arrival]):
     @property
     def n_skipped(self) -> int:
         """Pulses that were not used, because the application was too slow."""
-        return self._receiver.n_skipped
+        return self._receiver.queue.n_skipped
 
     @abstractmethod
     def receive(self, timeout_s: float | None = None) -> Arrival | None:
