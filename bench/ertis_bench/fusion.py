@@ -22,11 +22,12 @@ from ertis_numba.settings import Processing
 from ertis_numba.simulation import Electronics, Emitter, Point, Scene, Sensor
 from ertis_numba.simulation.render import Simulator
 
-__all__ = ["form", "platform_scene", "run"]
+__all__ = ["EMITTERS_M", "form", "platform_scene", "random_reflectors", "run"]
 
 Floats = NDArray[np.float64]
 
-_EMITTERS_M = 0.012, 0.0
+EMITTERS_M = 0.012, 0.0
+"""Diameters of the emitters: as pistons, and omnidirectional."""
 _YAWS_DEG = {"front": 0.0, "left": 90.0, "back": 180.0, "right": -90.0}
 _RADIUS_M = 0.2
 _N_REFLECTORS = 10
@@ -90,10 +91,10 @@ def run(*, count: int, rooms: int, seed: int, say: Callable[[str], None]) -> dic
         Function that reports progress.
     """
     rows, times = [], []
-    for diameter_m in _EMITTERS_M:
+    for diameter_m in EMITTERS_M:
         ghosts, positions, lost = [], [], 0
         for number in range(seed, seed + count):
-            shot = _shot(platform_scene(number, _reflectors(number), diameter_m), diameter_m)
+            shot = _shot(platform_scene(number, random_reflectors(number), diameter_m), diameter_m)
             ghosts.append(_ghosts(shot))
             errors, n_lost = _position_errors_m(shot)
             positions += errors
@@ -153,7 +154,8 @@ def form(report: dict[str, Any]) -> str:
     )
 
 
-def _reflectors(seed: int) -> tuple[Point, ...]:
+def random_reflectors(seed: int) -> tuple[Point, ...]:
+    """Return reflectors at random places around a platform."""
     draws = np.random.default_rng(seed)
     found: list[Point] = []
     places: list[complex] = []
@@ -255,7 +257,7 @@ def _wall_errors_m(seed: int, say: Callable[[str], None]) -> Floats:
         Point(position_m=(x, y, 0.4), strength_db=level)
         for (x, y), level in zip(place_m.tolist(), strength_db.tolist(), strict=True)
     )
-    image = _shot(platform_scene(seed, points, _EMITTERS_M[0], -20.0), _EMITTERS_M[0]).fused.image
+    image = _shot(platform_scene(seed, points, EMITTERS_M[0], -20.0), EMITTERS_M[0]).fused.image
     strongest_m = image.range_m[image.amplitude.argmax(axis=1)]
     shown_m = strongest_m[:, None] * np.stack([np.cos(image.azimuth_rad), np.sin(image.azimuth_rad)], axis=1) - centre
     error_m = np.abs(np.abs(shown_m) - half).min(axis=1)

@@ -10,16 +10,15 @@ from typing import Any, Final
 import numpy as np
 
 from ertis_bench import machine
+from ertis_bench.network import live_fusion
 from ertis_bench.network.oracle import judged, read_diaries
 from ertis_bench.network.processes import central, survivors, until
 from ertis_bench.network.processor_time import ProcessorTime
 from ertis_bench.network.receiver import ReceiverJob, read_received
 from ertis_bench.network.sender import SETTINGS, SenderJob
-from ertis_bench.network.serving import Serve, accounts, expected_of, percentile, some_words
+from ertis_bench.network.serving import Serve, accounts, create_keys, expected_of, percentile, some_words
 from ertis_numba import cluster
 from ertis_numba.errors import DataError
-from ertis_numba.network.allow_list import AllowList, Permission
-from ertis_numba.network.keys import ClientKeys, KeyPair
 from ertis_numba.settings import Settings
 
 __all__ = ["PARTS", "processing", "run", "storage"]
@@ -32,7 +31,6 @@ _CLUSTER_WORKERS: Final = 2
 _SENDERS: Final = 2  # Sensor-node processes, among which the sensors are divided.
 _BYTES: Final = 4 * SETTINGS.recording.n_samples
 Found = dict[str, Any]
-Keys = tuple[str, str]
 
 
 def run(
@@ -67,20 +65,6 @@ def run(
     return {"machine": machine.describe(), "seed": seed, "only": list(only), "rows": rows}
 
 
-def _keys(folder: Path, sensors: Sequence[str]) -> tuple[list[str], Keys, ClientKeys]:
-    """Create keys. Return options of a central node, the keys of a sensor or an application, and those of an admin."""
-    pairs = {name: KeyPair.new(name) for name in ("central", "node", "boss")}
-    secret = {name: pair.save(folder / "keys")[0] for name, pair in pairs.items()}
-    allowed = (
-        Permission(name="node", public=pairs["node"].public, role="sensor", serials=tuple(sensors)),
-        Permission(name="boss", public=pairs["boss"].public, role="admin"),
-    )
-    AllowList(keys=allowed).save(folder / "allow.toml")
-    options = ["--key", str(secret["central"]), "--allow", str(folder / "allow.toml")]
-    server = pairs["central"].public
-    return options, (str(secret["node"]), server), ClientKeys(pair=pairs["boss"], server=server)
-
-
 def _shared(sensors: Sequence[str], n_senders: int) -> list[tuple[str, ...]]:
     return [tuple(sensors[first::n_senders]) for first in range(min(n_senders, len(sensors)))]
 
@@ -90,7 +74,7 @@ def storage(
 ) -> Found:
     """Store the measurements of sensors, and read them all again."""
     sensors = [f"sensor-{number + 1}" for number in range(n_sensors)]
-    options, given, _ = _keys(folder, sensors)
+    options, given, _ = create_keys(folder, sensors)
     archive, mark = folder / "recordings", f"storage{time.monotonic_ns()}"
     archive.mkdir()
     count, start_s = round(duration_s * rate_hz), time.monotonic() + 3.0
@@ -160,7 +144,7 @@ def processing(
     With ``archive``, the central node also stores the measurements in this folder.
     """
     sensors = [f"sensor-{number + 1}" for number in range(n_sensors)]
-    options, given, boss = _keys(folder, sensors)
+    options, given, boss = create_keys(folder, sensors)
     if scheduler is not None:
         options += ["--scheduler", scheduler]
     if archive is not None:
@@ -192,7 +176,7 @@ def processing(
             job.replace(diary=str(diary), rate_hz=rate_hz, count=round(duration_s * rate_hz)).start()
         )
         sender.wait_for("begun")
-        load = ProcessorTime(_processes(serve) | {"sensor nodes": [sender.pid], "application": [receiver.pid]})
+        load = ProcessorTime(serve.processes() | {"sensor nodes": [sender.pid], "application": [receiver.pid]})
         n_before = len(read_received(images).numbers)
         end_s = time.monotonic() + duration_s - 1.0
         while time.monotonic() < end_s:
@@ -227,14 +211,6 @@ def processing(
         "cpu_ms": cpu_ms,
         "cpu_total_ms": sum(time_ms for *_, time_ms in cpu_ms),
     }
-
-
-def _processes(serve: Serve) -> dict[str, list[int]]:
-    """Return the processes of a central node."""
-    others = {pid: line for pid, line in survivors(serve.mark).items() if pid != serve.node.node_pid}
-    publisher = [pid for pid, line in others.items() if "publisher_process" in line]
-    workers = [pid for pid in others if pid not in publisher]
-    return {"central node": [serve.node.node_pid], "workers": workers, "publisher": publisher}
 
 
 def _since(begun: Found, found: Found) -> Found:
@@ -310,6 +286,7 @@ PARTS: dict[str, tuple[str, Callable[[Path, float, int], Found]]] = {
             folder, duration_s, seed, directions="3000", n_sensors=1, rate_hz=20.0, goal="0 dropped (the paper: 10 Hz)"
         ),
     ),
+    "fusion": ("fused image of 4 sensors × 10 Hz, 90 directions each", live_fusion.measure),
     "overload": ("twice the capacity", _overload),
     "cluster": ("90 directions, 4 sensors × 10 Hz, with own workers and on a dask cluster", _cluster),
 }

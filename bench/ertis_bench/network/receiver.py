@@ -20,13 +20,13 @@ from ertis_numba.network.keys import ClientKeys, KeyPair
 from ertis_numba.network.messages import Product
 from ertis_numba.network.subscriber import Subscriber
 
-__all__ = ["STEP", "Received", "ReceiverJob", "read_received", "receive", "subscriber_of"]
+__all__ = ["STEP", "TOLERANCE", "Received", "ReceiverJob", "read_received", "receive", "subscriber_of"]
 
 STEP: Final = 61
 """Distance of compared values. One value in 61 is compared, so that all rows and columns are covered in turn."""
 
 # Relative to the largest value. Each process chooses its own plan, and images of other measurements differ far more.
-_TOLERANCE: Final = 0.1
+TOLERANCE: Final = 0.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -126,7 +126,7 @@ class _Expected:
         number = image.stamp.sequence % len(self.values)
         wanted = self.values[number]
         came = image.amplitude.reshape(-1)[number % STEP :: STEP][: len(wanted)]
-        return bool(np.abs(came - wanted).max() > _TOLERANCE * np.abs(wanted).max())
+        return bool(np.abs(came - wanted).max() > TOLERANCE * np.abs(wanted).max())
 
 
 def main(look: ReceiverJob) -> None:

@@ -62,7 +62,10 @@ class SenderJob:
     patience_s : float
         Time limit for the last acknowledgements.
     words : str, optional
-        File with the words of some measurements, which are sent in turn. By default, each measurement has new noise.
+        File with the words of some measurements, which are sent in turn: (measurement, sample), or (sensor,
+        measurement, sample) if those of sensors differ. By default, each measurement has new noise.
+    mountings : dict of str to (translation_m, rotation_xyzw), optional
+        Mountings by sensor.
     first_pulse, begins_ns : int, optional
         SYNC count and timestamp of the first measurement.
     lost_pulse, double_pulse : int, optional
@@ -87,6 +90,7 @@ class SenderJob:
     keys: tuple[str, str] | None = None
     patience_s: float = 30.0
     words: str | None = None
+    mountings: dict[str, tuple[Sequence[float], Sequence[float]]] = field(default_factory=dict)
     first_pulse: int = _SYNC_OF_FIRST
     begins_ns: int | None = None
     lost_pulse: int | None = None
@@ -184,7 +188,8 @@ class Sender:
         """Send the measurements, and return the number of pulses."""
         job = self.job
         for sensor in job.sensors:
-            node.add_sensor(sensor, self._settings, firmware="bench")
+            place = dict(zip(("translation_m", "rotation_xyzw"), job.mountings.get(sensor, ()), strict=False))
+            node.add_sensor(sensor, self._settings, firmware="bench", **place)
         self.emit(event="begun", session_id=self._session_id, pid=os.getpid())
         rng = np.random.default_rng(job.seed)
         n_samples = self._settings.recording.n_samples
@@ -207,11 +212,11 @@ class Sender:
                 Measurement(
                     words_of(bases[sensor], self._session_id, sequence)
                     if given is None
-                    else given[sequence % len(given)],
+                    else (given[number] if given.ndim == 3 else given)[sequence % given.shape[-2]],
                     self._settings,
                     replace(stamp, sensor=sensor),
                 )
-                for sensor in job.sensors
+                for number, sensor in enumerate(job.sensors)
             ]
             for entry in node.append(self._entries(measurements)):
                 self._diary.kept(_key(entry))

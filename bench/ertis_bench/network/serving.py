@@ -12,20 +12,36 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_bench.network.oracle import Sent
-from ertis_bench.network.processes import JsonLinesProcess, central
+from ertis_bench.network.processes import JsonLinesProcess, central, survivors
 from ertis_bench.network.receiver import STEP, Received
 from ertis_numba.frames import Measurement
-from ertis_numba.network.keys import ClientKeys
+from ertis_numba.network.allow_list import AllowList, Permission
+from ertis_numba.network.keys import ClientKeys, KeyPair
 from ertis_numba.network.status import Status
 from ertis_numba.network.subscriber import Subscriber
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Settings
 
-__all__ = ["Serve", "accounts", "expected_of", "percentile", "some_words"]
+__all__ = ["Serve", "accounts", "create_keys", "expected_of", "percentile", "some_words"]
 
 _N_MEASUREMENTS: Final = 5  # number of different measurements
 
 Found = dict[str, Any]
+Keys = tuple[str, str]
+
+
+def create_keys(folder: Path, sensors: Sequence[str]) -> tuple[list[str], Keys, ClientKeys]:
+    """Create keys. Return options of a central node, the keys of a sensor or an application, and those of an admin."""
+    pairs = {name: KeyPair.new(name) for name in ("central", "node", "boss")}
+    secret = {name: pair.save(folder / "keys")[0] for name, pair in pairs.items()}
+    allowed = (
+        Permission(name="node", public=pairs["node"].public, role="sensor", serials=tuple(sensors)),
+        Permission(name="boss", public=pairs["boss"].public, role="admin"),
+    )
+    AllowList(keys=allowed).save(folder / "allow.toml")
+    options = ["--key", str(secret["central"]), "--allow", str(folder / "allow.toml")]
+    server = pairs["central"].public
+    return options, (str(secret["node"]), server), ClientKeys(pair=pairs["boss"], server=server)
 
 
 def some_words(settings: Settings, path: Path, *, seed: int) -> Path:
@@ -104,6 +120,13 @@ class Serve:
             if sum(each.received for each in sensors) >= n_sent and not any(each.in_flight for each in sensors):
                 return True
         return False
+
+    def processes(self) -> dict[str, list[int]]:
+        """Return the processes of the central node."""
+        others = {pid: line for pid, line in survivors(self.mark).items() if pid != self.node.node_pid}
+        publisher = [pid for pid, line in others.items() if "publisher_process" in line]
+        workers = [pid for pid in others if pid not in publisher]
+        return {"central node": [self.node.node_pid], "workers": workers, "publisher": publisher}
 
 
 def accounts(serve: Serve, sent: Sent, received: Received) -> Found:

@@ -1,6 +1,6 @@
 """Markdown report of `figures`."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from ertis_bench.machine import sentence
@@ -8,13 +8,20 @@ from ertis_bench.markdown import table
 
 __all__ = ["as_list", "network"]
 
+_COMMON: Final = "CURVE encryption over loopback; sensor nodes, central node and application share the cores."
 _CONDITIONS: Final = (
-    "CURVE encryption over loopback; sensor nodes, central node and application share the cores. Sensor-node "
-    "processes send measurements of 655 kB without sensors: words of noise, from all sensors at the same time. "
-    "Every stored word was read again and compared. One value in 61 of every image was compared with a separate "
-    "computation. Times start when the whole measurement is at the sensor node. They end when its ack arrives "
-    "there, or when its image is in the application. They exclude sensors, USB, other hosts, and the first seconds,"
-    " in which pipelines are created."
+    "Sensor-node processes send measurements of 655 kB without sensors: words of noise, from all sensors at the same "
+    "time. Every stored word was read again and compared. One value in 61 of every image was compared with a separate "
+    "computation. Times start when the whole measurement is at the sensor node. They end when its ack arrives there, "
+    "or when its image is in the application. They exclude sensors, USB, other hosts, and the first seconds, in which "
+    "pipelines are created."
+)
+_FUSED: Final = (
+    "The fused row uses words that were simulated for ten reflectors around the platform. The application starts while "
+    "the central node serves, and computes tables when the first pulse arrives; pulses that arrive meanwhile wait. One "
+    "fused pulse in ten was compared bit by bit with `Fuser` on the same images, and these images with a separate "
+    "computation. Times start when the whole measurements are at the sensor node, so they exclude emission, recording "
+    "and USB."
 )
 
 
@@ -32,9 +39,14 @@ def network(report: dict[str, Any]) -> str:
         [
             table(("", "goal", "measured"), rows, numbers=False),
             f"Measured on {sentence(report['machine'])}",
-            _CONDITIONS,
+            " ".join([_COMMON, *_conditions(report["rows"])]),
         ]
     )
+
+
+def _conditions(rows: Sequence[dict[str, Any]]) -> list[str]:
+    are_fused = [row["part"] == "fused image" for row in rows]
+    return [text for text, applies in ((_CONDITIONS, not all(are_fused)), (_FUSED, any(are_fused))) if applies]
 
 
 def _figure(row: dict[str, Any]) -> dict[str, str]:
@@ -50,6 +62,8 @@ def _figure(row: dict[str, Any]) -> dict[str, str]:
             f"{row['wrong']} wrong, {row['twice']} twice; ack p50 {row['p50_ms']:.1f} ms, p99 {row['p99_ms']:.1f} ms, "
             f"slowest {row['slowest_ms']:.0f} ms; {row['rate_reached_hz']:.1f} Hz reached"
         )
+    elif row["part"] == "fused image":
+        what, goal, found = _fused(row), row["goal"], _fused_result(row)
     else:
         what = (
             f"{row['part']}, {row['directions']} directions, {row['sensors']} × {row['rate_hz']:g} Hz for "
@@ -69,3 +83,21 @@ def _figure(row: dict[str, Any]) -> dict[str, str]:
         )
         cpu += "; the cluster's scheduler and workers are not counted"
     return {"what": what, "goal": goal, "found": f"{found}. Processor time in % of one core: {cpu}"}
+
+
+def _fused(row: dict[str, Any]) -> str:
+    return (
+        f"fused image of {row['sensors']} sensors × {row['rate_hz']:g} Hz, {row['directions']} directions each, for "
+        f"{row['duration_s']:g} s"
+    )
+
+
+def _fused_result(row: dict[str, Any]) -> str:
+    return (
+        f"{row['pulses']:,} pulses sent, {row['fused']:,} fused, {row['skipped']} skipped, {row['incomplete']} "
+        f"incomplete; {as_list(row['dropped'])} measurements and {row['images_dropped']} images dropped; "
+        f"{row['checked']} pulses checked, {row['wrong']} wrong; last byte to fused image p50 {row['p50_ms']:.1f} ms, "
+        f"p99 {row['p99_ms']:.1f} ms, slowest {row['slowest_ms']:.0f} ms; to its points p50 "
+        f"{row['points_p50_ms']:.1f} ms, p99 {row['points_p99_ms']:.1f} ms. In the first {row['start_s']:g} s, which "
+        f"these times exclude, the slowest image took {row['start_slowest_ms']:.0f} ms"
+    )
