@@ -4,10 +4,14 @@ import math
 
 import numpy as np
 import pytest
+import scipy.stats
 from ertis_bench.furnished_rooms import PlatformImager, mountings, random_motion, random_room
 
 import ertis_numba as ertis
 from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.fusion.rig import sensor_poses
+from ertis_numba.motion.echoes import EchoExtractor
+from ertis_numba.motion.flow import fit_flow
 
 MOUNTINGS = {"sensor": ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))}
 TIME_NS = 100_000_000
@@ -186,7 +190,80 @@ def test_ego_velocity_needs_echoes_and_mountings():
         ertis.ego_velocity([3], clouds[1:], MOUNTINGS)
 
 
-def test_covariance_of_unrelated_echoes_is_large():
-    places = [places_m(1, 25), places_m(8, 25)]
-    found = ertis.ego_velocity([seen_from((0, 0, 0), places[0], 0)], [seen_from((0, 0, 0), places[1], 1)], MOUNTINGS)
-    assert found.sd.max() > 0.3
+def unrelated(seed, pulse, count):
+    """Return a point cloud of random echoes, as images of noise have them."""
+    draws = np.random.default_rng([seed, pulse])
+    range_m, azimuth_rad = draws.uniform(0.4, 4, count), draws.uniform(-0.9, 0.9, count)
+    return ertis.PointCloud(
+        np.column_stack([range_m * np.cos(azimuth_rad), range_m * np.sin(azimuth_rad), 0 * range_m]).astype(np.float32),
+        np.exp(draws.normal(0, 0.5, count)).astype(np.float32),
+        ertis.Settings(),
+        ertis.Stamp(sync_count=pulse, timestamp_ns=pulse * TIME_NS),
+    )
+
+
+@pytest.mark.parametrize("count", [40, 75])
+def test_noise_is_not_a_measured_motion(count):
+    """The expected number of false alarms exceeds their rate, so that the limit holds for any number of echoes."""
+    poses = sensor_poses(MOUNTINGS)
+    extract = EchoExtractor(poses)
+    seeds, found = range(60), []
+    for seed in seeds:
+        groups = [extract({"sensor": unrelated(seed, pulse, count)}) for pulse in (0, 1)]
+        fit = fit_flow(*groups, poses, 0.1)
+        if fit is not None:
+            found.append(fit)
+    assert len(found) > 30
+    assert not any(fit.is_significant for fit in found)
+    for n_expected in (0.02, 0.1, 0.5):
+        n_allowed = scipy.stats.binom.ppf(0.999, len(seeds), n_expected)
+        assert sum(fit.n_false_alarms < n_expected for fit in found) <= n_allowed
+
+
+def test_ego_velocity_refuses_noise():
+    with pytest.raises(DataError, match="echoes of before and after match, as many as echoes of noise; give images"):
+        ertis.ego_velocity([unrelated(1, 0, 90)], [unrelated(1, 1, 90)], MOUNTINGS)
+
+
+def test_odometry_does_not_measure_noise():
+    odometry = ertis.Odometry(MOUNTINGS)
+    for pulse in range(2):
+        odometry.add([seen_from((0.05 * pulse, 0, 0), places_m(), pulse)])
+    for pulse in range(2, 6):
+        assert odometry.add([unrelated(2, pulse, 60)]) is None
+    assert [pose.is_measured for pose in odometry.poses] == [True, True, *[False] * 4]
+
+
+def test_ambiguous_motion_is_not_measured():
+    """A turn by the spacing of equal posts around the sensor changes almost nothing."""
+    angle_rad = np.radians(np.arange(0, 360, 5))
+    ring = np.column_stack([2 * np.cos(angle_rad), 2 * np.sin(angle_rad), np.zeros(len(angle_rad))])
+    ring = ring[np.abs(np.arctan2(ring[:, 1], ring[:, 0])) < 0.9]
+    odometry = ertis.Odometry(MOUNTINGS)
+    for pulse in range(2):
+        velocity = odometry.add([seen_from((0, 0, 0), ring, pulse)])
+    assert velocity is None
+    assert not odometry.poses[-1].is_measured
+    found = ertis.ego_velocity([seen_from((0, 0, 0), ring, 0)], [seen_from((0, 0, 0), ring, 1)], MOUNTINGS)
+    assert found.sd[2] > math.radians(20)
+
+
+def test_few_reflectors_measure_the_motion_or_do_not_claim_it():
+    """Errors of up to 1 m were once accepted as measured."""
+    errors_m, n_steps = [], 0
+    for seed in range(20):
+        places = places_m(seed, 3 + seed % 6)
+        odometry = ertis.Odometry(MOUNTINGS)
+        for pulse in range(3):
+            x = 0.1 * pulse
+            clutter = unrelated(seed, pulse, 20).position_m
+            cloud = seen_from((x, 0, 0), places, pulse, (1.0, 0.0, 0.0))
+            cloud = cloud.replace(
+                position_m=np.concatenate([cloud.position_m, clutter]), amplitude=np.ones(len(places) + 20, np.float32)
+            )
+            velocity = odometry.add([cloud])
+            n_steps += pulse > 0
+            if velocity is not None:
+                errors_m.append(np.hypot(*(velocity.velocity_m_s - [1.0, 0.0])) * velocity.time_s)
+    assert 0.3 * n_steps < len(errors_m) < n_steps
+    assert max(errors_m) < 0.02

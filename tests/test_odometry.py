@@ -139,11 +139,14 @@ def test_odometry_command_explains_what_it_cannot_use(folder, tmp_path, names, s
 
 def test_odometry_command_notes_steps_without_matches(folder, tmp_path):
     """The platform stands for two seconds without pulses before it drives on."""
-    with open_recording(folder / "front.h5") as recording:
-        given = [recording[index] for index in range(COUNT)]
-        mounting = {"front": (recording.translation_m.tolist(), recording.rotation_xyzw.tolist())}
-    stamp = replace(given[-1].stamp, timestamp_ns=given[-1].stamp.timestamp_ns + 2 * 10**9)
-    write_recording(tmp_path / "rec.h5", [*given[:-1], replace(given[-1], stamp=stamp)], mounting=mounting)
+    given, mounting = [], {}
+    for name in ("front", "back"):
+        with open_recording(folder / f"{name}.h5") as recording:
+            given += [recording[index] for index in range(COUNT)]
+            mounting[name] = recording.translation_m.tolist(), recording.rotation_xyzw.tolist()
+        stamp = replace(given[-1].stamp, timestamp_ns=given[-1].stamp.timestamp_ns + 2 * 10**9)
+        given[-1] = replace(given[-1], stamp=stamp)
+    write_recording(tmp_path / "rec.h5", given, mounting=mounting)
     code, stdout, stderr = run(tmp_path / "rec.h5", "--json")
     assert code == 0, stderr
     assert "note: 1 of 2 steps assume that the last velocity continued" in stderr

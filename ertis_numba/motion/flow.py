@@ -4,6 +4,7 @@ import math
 from typing import Final, NamedTuple
 
 import numpy as np
+import scipy.special
 from numpy.typing import NDArray
 
 from ertis_numba.fusion.rig import MountedSensor
@@ -21,8 +22,11 @@ _SEARCH_SD: Final = 0.02, math.radians(2.0)
 _SCALES: Final = 8.0, 5.0, 3.0, 2.0, 1.4, 1.0
 _N_STARTS: Final = 4
 _ELSEWHERE: Final = np.array([0.02, 0.02, math.radians(2.0)])  # Differences of displacements that are not the same.
-# With four sensors, correct displacements had ambiguities of at most 0.5, and unrelated groups 0.68 or more in 9 of 10.
-_MAX_AMBIGUITY: Final = 0.6
+# In simulated rooms, correct displacements had ambiguities of at most 0.65. Wrong ones, by the spacing of equal posts,
+# had at least 0.75, as one post of four without a partner.
+_MAX_AMBIGUITY: Final = 0.7
+# Expected number of motions by which unrelated groups match as well; an upper limit of the rate of false alarms.
+_MAX_FALSE_ALARMS: Final = 1e-3
 _STRONGEST: Final = 40  # Number of echoes per sensor that the search uses.
 _ROUNDS: Final = 8
 _MAX_LEVEL_CHANGE: Final = math.log(4.0)  # of amplitudes, 12 dB
@@ -51,7 +55,9 @@ class FlowFit(NamedTuple):
         Number of matches, weighted by the strengths of their echoes; the larger one of two fits to the same groups is
         more likely.
     ambiguity : float
-        Score of the best displacement elsewhere, relative to this one. Unrelated groups have 0.7 to 1.
+        Score of the best displacement elsewhere, relative to this one.
+    n_false_alarms : float
+        Expected number of displacements that explain as many echoes of unrelated groups, by accident.
     """
 
     displacement: Floats
@@ -60,6 +66,12 @@ class FlowFit(NamedTuple):
     share: float
     score: float
     ambiguity: float = 0.0
+    n_false_alarms: float = 0.0
+
+    @property
+    def is_significant(self) -> bool:
+        """True if unrelated groups do not match as well by accident."""
+        return self.n_false_alarms < _MAX_FALSE_ALARMS
 
     @property
     def is_certain(self) -> bool:
@@ -248,7 +260,27 @@ def fit_flow(
     elsewhere = [each for each in found if np.any(np.abs(each[0] - best) > _ELSEWHERE)]
     other, second = max(elsewhere, key=lambda each: each[1], default=(best, 0.0))
     fit = _final(flow, pairs, best)
-    return None if fit is None else _with_other(fit, other - best, second / max(score, 1e-30))
+    if fit is None:
+        return None
+    by_accident = np.sum(_gate_areas(flow, pairs)) / (4 * reach_m * reach_rad)
+    fit = fit._replace(n_false_alarms=_n_false_alarms(fit.n_matches, float(by_accident), limit))
+    return _with_other(fit, other - best, second / max(score, 1e-30))
+
+
+def _gate_areas(flow: _Flow, pairs: _EchoPairs) -> Floats:
+    """Return the areas of differences of range and azimuth within which pairs match, in m rad: (pair,) float64."""
+    return np.asarray(math.pi * _GATE * np.prod(flow.deviations(pairs), axis=0))
+
+
+def _n_false_alarms(n_matches: int, by_accident: float, limit: Floats) -> float:
+    """Return the expected number of displacements that explain as many unrelated echoes.
+
+    Accidental matches of one displacement have a Poisson distribution. The probability of at least ``n_matches`` is
+    multiplied by the number of displacements that the search tells apart, as in Moisan and Stival, "A probabilistic
+    criterion to detect rigid point matches between two images", Int. J. Computer Vision 57 (2004), 201-218.
+    """
+    n_displacements = float(np.prod(np.maximum(1.0, 2 * limit / _SEARCH_STEP)))
+    return n_displacements * float(scipy.special.gammainc(n_matches, by_accident))
 
 
 def _with_other(fit: FlowFit, offset: Floats, ambiguity: float) -> FlowFit:

@@ -41,7 +41,8 @@ class PlanarPose(NamedTuple):
     covariance : (3, 3) float64
         Covariance of x, y and yaw since the start, in metres and radians.
     is_measured : bool
-        False if too few echoes matched, so that the pose assumes that the last velocity continued.
+        False if too few echoes matched, or if they fit another motion almost as well. The pose then assumes that the
+        last velocity continued.
 
     Examples
     --------
@@ -193,8 +194,9 @@ class Odometry:
         Returns
         -------
         EgoVelocity or None
-            None for the first group, after more than a second without images, and if too few echoes match. The pose
-            then assumes that the last velocity continued for at most a second.
+            None for the first group, after more than a second without images, if no more echoes match than those of
+            noise, and if another motion explains almost as many. The pose then assumes that the last velocity continued
+            for at most a second.
 
         Raises
         ------
@@ -238,9 +240,9 @@ class Odometry:
         if last is None:
             return None
         if last.twist is None:
-            return fit_flow(last.echoes, echoes, self._poses, time_s)
+            return _trusted(fit_flow(last.echoes, echoes, self._poses, time_s))
         start = _displacement(last.twist, time_s)
-        found = fit_flow(
+        near = fit_flow(
             last.echoes,
             echoes,
             self._poses,
@@ -249,12 +251,13 @@ class Odometry:
             reach=_MAX_CHANGE * time_s,
             first_twist=last.twist,
         )
-        if found is not None and found.is_certain and found.n_matches > _FEW_MATCHES and found.share > _DOUBTFUL_SHARE:
+        found = _trusted(near)
+        if found is not None and found.n_matches > _FEW_MATCHES and found.share > _DOUBTFUL_SHARE:
             return found
         # The expectation may be wrong, so that all displacements are compared.
         other = fit_flow(last.echoes, echoes, self._poses, time_s)
-        fits = [each for each in (found, other) if each is not None]
-        return max(fits, key=lambda each: each.score, default=None)
+        fits = [each for each in (near, other) if each is not None]
+        return _trusted(max(fits, key=lambda each: each.score, default=None))
 
     def _located(self, echoes: GroupEchoes, found: FlowFit, twist: Floats, timestamp_ns: int) -> PlanarPose:
         """Return the pose relative to the keyframe, or to the last group if the keyframe is out of reach."""
@@ -278,6 +281,11 @@ class Odometry:
                     return keyframe.pose.moved(fit.displacement, fit.covariance, timestamp_ns, is_measured=True)
         self._keyframe = self._last
         return step
+
+
+def _trusted(fit: FlowFit | None) -> FlowFit | None:
+    """Return a fit if neither accident nor another displacement explains the echoes almost as well."""
+    return fit if fit is not None and fit.is_significant and fit.is_certain else None
 
 
 def _confirms(fit: FlowFit, found: FlowFit, expected: Floats) -> bool:

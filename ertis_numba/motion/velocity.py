@@ -87,7 +87,7 @@ def ego_velocity(before: Iterable[Item], after: Iterable[Item], mountings: Mount
     ArgumentError
         A group is empty or has two images of a sensor, or a mounting is missing or invalid.
     DataError
-        Times do not increase, the groups share no sensor, or too few echoes match.
+        Times do not increase, the groups share no sensor, or no more echoes match than those of noise.
 
     Examples
     --------
@@ -128,6 +128,11 @@ def ego_velocity(before: Iterable[Item], after: Iterable[Item], mountings: Mount
     if found is None:
         raise DataError(
             "too few echoes of before and after match; give images that show more reflectors, or images closer in time"
+        )
+    if not found.is_significant:
+        raise DataError(
+            f"only {found.n_matches} echoes of before and after match, as many as echoes of noise; give images that "
+            "show more reflectors, or images closer in time"
         )
     return velocity_of(found, second.timestamp_ns, time_s)
 
