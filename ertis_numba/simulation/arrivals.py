@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ertis_numba.settings import Call
 from ertis_numba.simulation.effects import acting
 from ertis_numba.simulation.mirrors import Views, images
+from ertis_numba.simulation.noise_frames import NoiseFrame
 from ertis_numba.simulation.paths import Paths, by_targets, pairs, without_target
 from ertis_numba.simulation.scene_size_limits import require_few_amplitudes
 from ertis_numba.simulation.sensors import Emitter
@@ -29,6 +30,8 @@ __all__ = [
     "responses",
     "rounded_s",
     "transmitter_of",
+    "travelled",
+    "views_of",
 ]
 
 Floats = NDArray[np.float64]
@@ -53,11 +56,11 @@ class CallFilter(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Arrivals:
-    """Copies of one call at the microphones.
+    """Copies of one call, or of one frame of noise, at the microphones.
 
     Attributes
     ----------
-    call : Call
+    call : Call or NoiseFrame
     delay_s : (path, mic) float64
         Delay from the start of the record, including the microphone's own delay.
     amplitude : (path, mic, frequency) float64 or complex128
@@ -68,7 +71,7 @@ class Arrivals:
         Filters of the call by its emitter.
     """
 
-    call: Call
+    call: Call | NoiseFrame
     delay_s: Floats
     amplitude: Floats | Complexes
     stretch: Floats | None = None
@@ -114,15 +117,33 @@ def arrivals(shot: Snapshot, active: AbstractSet[str], frequency_hz: Floats, clo
         own = "propagation" if number == shot.number else "cross_emission"
         for paths in echoes(shot, active, number, clock, n_frequencies=len(frequency_hz)):
             amplitude = level * responses(shot, active, paths, sensor.emitter, frequency_hz, clock)
-            times: tuple[Floats, Floats | None] = np.zeros(paths.second_m.shape), None
-            for name, act in acting("times", active):
-                with clock(own if name == "propagation" else name):
-                    times = act(shot, paths, times)
+            times = travelled(shot, active, paths, 0.0, clock, propagation=own)
             found.append(arrived(shot, active, number, times[0], gain[:, None] * amplitude, times[1]))
     for name, act in acting("arrivals", active):
         with clock(name):
-            found = act(shot, active, found)
+            found = act(shot, active, frequency_hz, found)
     return found
+
+
+def travelled(
+    shot: Snapshot,
+    active: AbstractSet[str],
+    paths: Paths,
+    sent_s: float,
+    clock: CostStopwatch,
+    *,
+    propagation: str = "propagation",
+) -> tuple[Floats, Floats | None]:
+    """Return the arrival time of sound that leaves at ``sent_s``, and its stretch: both (path, mic) float64.
+
+    The stretch is None if motion is not simulated. Times are relative to the snapshot. The cost of propagation is
+    attributed to the effect named ``propagation``.
+    """
+    times: tuple[Floats, Floats | None] = np.full(paths.second_m.shape, sent_s), None
+    for name, act in acting("times", active):
+        with clock(propagation if name == "propagation" else name):
+            times = act(shot, paths, sent_s, times)
+    return times
 
 
 def emitters(shot: Snapshot, active: AbstractSet[str]) -> list[int]:
@@ -162,16 +183,7 @@ def echoes(
     ArgumentError
         There are too many paths or amplitudes.
     """
-    transmitter, centre_m = transmitter_of(shot, active, number), shot.receiver.centre_m
-    views: Views = (
-        images(transmitter, shot.targets.positions_m, shot.mirrors, 0),
-        images(shot.receiver, shot.targets.positions_m, shot.mirrors, 0),
-        images(transmitter, centre_m, shot.mirrors, 0),
-    )
-    for name, act in acting("views", active):
-        with clock(name):
-            views = act(shot, number, views)
-    firsts, seconds, specular = views
+    firsts, seconds, specular = views_of(shot, active, number, transmitter_of(shot, active, number), clock)
     over = by_targets
     for _, act in acting("turns", active):
         over = act
@@ -187,6 +199,33 @@ def echoes(
     if len(specular):
         found.append(without_target(specular.images, shot.receiver, shot.targets, specular.to_corners_m()))
     return found
+
+
+def views_of(
+    shot: Snapshot, active: AbstractSet[str], number: int, transmitter: Transmitters, clock: CostStopwatch
+) -> Views:
+    """Return the emitter and the microphones as seen from the targets, and the emitter from the microphones.
+
+    Parameters
+    ----------
+    shot : Snapshot
+    active : set of str
+        The effects that are simulated.
+    number : int
+        Number of the emitter, different for each of the snapshot.
+    transmitter : Transmitters
+        The emitter without mirror images.
+    clock : CostStopwatch
+    """
+    views: Views = (
+        images(transmitter, shot.targets.positions_m, shot.mirrors, 0),
+        images(shot.receiver, shot.targets.positions_m, shot.mirrors, 0),
+        images(transmitter, shot.receiver.centre_m, shot.mirrors, 0),
+    )
+    for name, act in acting("views", active):
+        with clock(name):
+            views = act(shot, number, views)
+    return views
 
 
 def responses(

@@ -15,6 +15,7 @@ from ertis_numba.simulation.image_estimate import Sight
 from ertis_numba.simulation.loudness import LOUD, may_be_loud, peak_bound
 from ertis_numba.simulation.scene import Scene
 from ertis_numba.simulation.snapshot import Snapshot, snapshot
+from ertis_numba.simulation.source_estimate import change_of_sources
 
 __all__ = ["EffectPlan", "Verdict", "make_plan"]
 
@@ -96,6 +97,7 @@ def make_plan(scene: Scene) -> EffectPlan:
     The other effects are estimated for all sensors at the beginning, at the end, in between and at waypoints. The
     greatest change counts. Effects are estimated one after the other, each given those before it: geometry first, then
     filters of echoes, then additional sound. Estimation repeats, given all other effects, until no decision changes.
+    An effect that changes the recorded sound of a source by more than the tolerance is on, even if no image shows it.
 
     If an estimate is not certain enough, A/B renders measure the change. They render and process the measurements with
     the greatest estimates, with and without the effect. They also use the loudest measurement, because estimates do not
@@ -188,12 +190,15 @@ def _decided(
     given = scene.effects.get(name)
     forced = True if given is None and (name in ASKED_FOR or not scene.tolerance_db) else given
     estimates = _estimates(name, others, shots)
-    if not estimates:
+    of_sources = _of_sources(name, others, shots)
+    if not estimates and of_sources is None:
         reason = f"it applies to nothing in the scene: {EFFECTS[name].summary}"
         return Verdict(name=name, on=bool(given), reason=reason, forced=given is not None)
-    worst, _ = estimates[0]
+    worst = _greatest(of_sources, estimates)
     if forced is not None:
         return Verdict(name=name, on=forced, reason=worst.reason, estimate_db=worst.change_db, forced=True)
+    if of_sources is not None and of_sources.change_db > scene.tolerance_db:
+        return Verdict(name=name, on=True, reason=worst.reason, estimate_db=worst.change_db)
     measured_db, moves = None, scene.moves and scene.count > 1
     if render_ab is not None and worst.change_db / min(worst.sure, _MAX_TOO_HIGH) < scene.tolerance_db:
         unsure = [shot for estimate, shot in estimates if estimate.change_db * estimate.sure > scene.tolerance_db]
@@ -219,6 +224,19 @@ def _estimates(name: str, active: frozenset[str], shots: Shots) -> list[tuple[Es
     return sorted(
         ((estimate, shot) for estimate, shot in found if estimate is not None), key=lambda each: -each[0].change_db
     )
+
+
+def _of_sources(name: str, active: frozenset[str], shots: Shots) -> Estimate | None:
+    """Return the greatest change of the sound of a source in any snapshot."""
+    found = [change_of_sources(name, shot, active) for _, shot in shots]
+    return max((each for each in found if each is not None), key=lambda each: each.change_db, default=None)
+
+
+def _greatest(of_sources: Estimate | None, estimates: list[tuple[Estimate, tuple[int, Snapshot]]]) -> Estimate:
+    """Return the estimate of the greatest change of an image, or of a source if that changes more."""
+    of_images = [estimates[0][0]] if estimates else []
+    of_both = of_images if of_sources is None else [*of_images, of_sources]
+    return max(of_both, key=lambda each: each.change_db)
 
 
 def _loudest(name: str, active: frozenset[str], shots: Shots) -> list[int]:

@@ -12,7 +12,7 @@ from ertis_numba.constants import SYNC_STEP_S
 from ertis_numba.frames import Measurement, Reflector, Stamp
 from ertis_numba.geometry import Layout, microphones
 from ertis_numba.sample_format import sample_format
-from ertis_numba.simulation import synthesis
+from ertis_numba.simulation import noise_frames, synthesis
 from ertis_numba.simulation.arrivals import arrivals, gains
 from ertis_numba.simulation.converter import Converter
 from ertis_numba.simulation.effects import acting
@@ -67,7 +67,9 @@ class Engine:
         self._threads = kernels.load("cpu").max_threads if threads is None else threads
         rate_hz = self.sensor.recording.sample_rate_hz
         calls = [*(other.call for other in scene.sensors), *(sonar.call for sonar in scene.sonars)]
-        self._node_hz = synthesis.node_frequencies(max(synthesis.highest_hz(call, rate_hz) for call in calls))
+        tops_hz = [synthesis.highest_hz(call, rate_hz) for call in calls]
+        tops_hz += [min(noise_frames.top_hz(noise), rate_hz / 2) for noise in scene.noises]
+        self._node_hz = synthesis.node_frequencies(max(tops_hz))
 
     def render(self, index: int = 0) -> Measurement:
         """Return measurement ``index``; scene, sensor and index determine every bit.
@@ -166,6 +168,9 @@ class Engine:
     def _signals(self, shot: Snapshot, index: int) -> Iterator[NDArray[np.float64]]:
         active, recording = self.active, self.sensor.recording
         arrived = arrivals(shot, active, self._node_hz, self.clock)
+        for name, act in acting("frames", active):
+            with self.clock(name):
+                arrived += act(shot, active, self._node_hz)
         blocks = synthesis.signals(
             arrived,
             n_samples=recording.n_samples,
@@ -177,7 +182,7 @@ class Engine:
         gain, _ = gains(shot, active, self.clock)
         seed = self.scene.seed, index, self.scene.sensors.index(self.sensor)
         # The order determines the last digits of the sum. Recordings hold them, so the last registered stays first.
-        sounds = [(name, sound) for name, act in acting("sounds", active)[::-1] for sound in act(shot, seed)]
+        sounds = [(name, sound) for name, act in acting("sounds", active)[::-1] for sound in act(shot, active, seed)]
         for first, block in zip(_begins(recording.n_samples), blocks, strict=True):
             if sounds:
                 more = np.zeros((len(block), min(synthesis.BLOCK, recording.n_samples - first)))

@@ -236,26 +236,26 @@ class Sight:
         return self.shot.cache.once(("directions", self.settings.processing), found)
 
     def of_white_noise(
-        self, dbfs: float, *, coherent: bool = False, band_hz: tuple[float, float] | None = None
+        self, dbfs: float, *, coherent: bool = False, band: tuple[Floats, Floats] | None = None
     ) -> float:
-        """Return the highest amplitude that white noise reaches in the image.
+        """Return the highest amplitude that white noise, or noise with a spectrum, reaches in the image.
 
         Parameters
         ----------
         dbfs : float
-            RMS of the noise in dBFS, over the whole band or ``band_hz``.
+            RMS of the noise in dBFS, over the whole band up to half of the sample rate or over ``band``.
         coherent : bool
             True if the noise comes from one place; a beam then does not reduce it.
-        band_hz : (low, high), optional
-            Band of the noise; the whole band by default.
+        band : (frequency_hz, power), optional
+            Equally spaced frequencies, and the power at each on an arbitrary scale; white noise by default.
         """
         matched, rate_hz, n_fft = pulse.match(self.settings)
         heard_hz = (matched.first_bin + np.arange(len(matched.values))) * rate_hz / n_fft
-        low_hz, high_hz = band_hz or (0.0, self.settings.recording.sample_rate_hz / 2)
-        across_hz = np.linspace(low_hz, high_hz, _ACROSS)
+        half_hz = self.settings.recording.sample_rate_hz / 2
+        across_hz, density = band or (np.linspace(0.0, half_hz, _ACROSS), np.ones(_ACROSS))
         response = np.interp(across_hz, heard_hz, np.abs(matched.values), left=0.0, right=0.0)
         # One-sided density σ² / B after the filter, and as the modulus of the analytic signal.
-        power = float(np.mean(response**2)) / 2
+        power = float(np.average(response**2, weights=density)) / 2 if density.any() else 0.0
         mics = 1 if coherent else len(self.shot.channels)
         return float(_PEAK * 10 ** (dbfs / 20) * math.sqrt(power / mics))
 

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.simulation.arrivals import Arrivals, arrivals
 from ertis_numba.simulation.effects import EFFECTS, acting
+from ertis_numba.simulation.noise_frames import CREST
 from ertis_numba.simulation.snapshot import Snapshot
 from ertis_numba.simulation.stopwatch import CostStopwatch
 
@@ -19,7 +20,6 @@ LOUD = 0.5
 _STRENGTHENING = frozenset(each.name for each in EFFECTS.values() if not each.weakens)
 _RIPPLE = 1.5  # largest factor by which spheres, or emitters away from the centre of their array, raise an echo
 _NODES = 5  # frequencies at which filters are evaluated
-_CREST = 4.5  # highest of some hundred thousand Gaussian numbers, relative to their RMS
 
 
 def may_be_loud(shot: Snapshot, active: frozenset[str]) -> bool:
@@ -57,5 +57,5 @@ def _changes(entry: Arrivals) -> Floats:
 
 def _steady(shot: Snapshot, active: frozenset[str]) -> float:
     """Return the peak amplitude of tones and noise."""
-    bounds: list[tuple[float, float]] = [act(shot) for _, act in acting("loudness", active)]
-    return sum(peak for peak, _ in bounds) + _CREST * math.sqrt(sum(power for _, power in bounds))
+    bounds: list[tuple[float, float]] = [act(shot, active) for _, act in acting("loudness", active)]
+    return sum(peak for peak, _ in bounds) + CREST * math.sqrt(sum(power for _, power in bounds))

@@ -213,6 +213,10 @@ class Snapshot:
         receiver = replace(self.receiver, positions_m=self.receiver.positions_m[:, mics])
         return replace(self, receiver=receiver, channels=self.channels[mics], token=(self.token, mics.start, mics.stop))
 
+    def without_targets(self) -> Self:
+        """Return a copy without points, discs and spheres."""
+        return replace(self, targets=self.targets.chosen(np.arange(0)), token=(self.token, "without targets"))
+
     def at_centre(self) -> Self:
         """Return a copy with one microphone at the centre of the array."""
         receiver = replace(self.receiver, positions_m=self.receiver.centre_m[:, None])

@@ -1,18 +1,66 @@
 """Sound sources other than echoes: tones, noise, other sonars and ambient noise."""
 
+import itertools
+import math
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
 from ertis_numba import checks
 from ertis_numba.documents import TomlTable
 from ertis_numba.errors import ArgumentError
 from ertis_numba.settings import Call
-from ertis_numba.simulation.trajectory import Placed
+from ertis_numba.simulation.trajectory import Placed, direction
 
-__all__ = ["Ambient", "Noise", "Sonar", "Tone"]
+__all__ = ["Ambient", "Noise", "Sonar", "SoundSource", "Tone"]
 
+Floats = NDArray[np.float64]
 _HIGHEST_HZ = 1e6
+_LARGEST_M = 0.2  # diameter of a source, as of an emitter
+_MAX_HARMONICS = 64
+_MAX_LEVELS = 1000  # of a spectrum
+_ORIFICES_M = 1e-5, 0.1
+_STROUHAL: Final = 0.2
+"""Frequency of the strongest noise of a jet, multiplied by its diameter and divided by its speed."""
+_SONIC_JET_M_S: Final = 313.0
+"""Speed of air in an orifice from 0.9 bar above ambient pressure: sonic, ``c √(2 / (γ + 1))`` for air at 20 °C."""
 
 
-class Tone(Placed, frozen=True, kw_only=True):
-    """Steady tone, for example of a switching power supply or a leaking valve.
+class SoundSource(Placed, frozen=True, kw_only=True):
+    """Object that emits sound, equally in all directions or as a circular piston.
+
+    Attributes
+    ----------
+    diameter_m : float
+        Diameter of the source as a circular piston, in metres. 0, the default, emits equally in all directions.
+    facing_deg : (azimuth, elevation), optional
+        Direction of the piston's axis in the world frame, in degrees; towards the origin of the world by default.
+    """
+
+    diameter_m: float = 0.0
+    facing_deg: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        name = self.label()
+        checks.between(f"{name}.diameter_m", self.diameter_m, 0.0, _LARGEST_M)
+        if self.facing_deg is not None:
+            checks.between(f"{name}.facing_deg azimuth", self.facing_deg[0], -180.0, 180.0)
+            checks.between(f"{name}.facing_deg elevation", self.facing_deg[1], -90.0, 90.0)
+            if not self.diameter_m:
+                raise ArgumentError(
+                    f"{name}.facing_deg is given, but a source without a diameter emits equally in all directions; "
+                    f"give {name}.diameter_m, or leave out facing_deg"
+                )
+
+    def axis_at(self, time_s: float) -> Floats:
+        """Return the unit vector along the axis of the piston at a time of the scene: (axis,) float64."""
+        return direction(*self.facing_deg) if self.facing_deg is not None else self.towards_origin(time_s)
+
+
+class Tone(SoundSource, frozen=True, kw_only=True):
+    """Steady tone with harmonics, for example of a power supply, a fan or a bearing.
 
     Attributes
     ----------
@@ -20,24 +68,62 @@ class Tone(Placed, frozen=True, kw_only=True):
         Frequency in hertz.
     level_db : float
         Amplitude at 1 m in decibels relative to full scale; −60 by default.
+    harmonics_db : tuple of float
+        Levels of the harmonics at 2, 3, … times the frequency, in decibels relative to the tone; none by default.
+    modulation_hz : float, optional
+        Rate at which the amplitude of the tone and its harmonics varies, such as the rate at which the balls of a
+        bearing pass a defect; steady by default.
+    modulation_depth : float
+        Variation of the amplitude relative to its mean, 0 to 1; 1 by default.
 
     Examples
     --------
     >>> from ertis_numba.simulation import Tone
-    >>> Tone(frequency_hz=40e3, range_m=2.0).level_db
-    -60.0
+    >>> Tone(frequency_hz=20e3, range_m=2.0, harmonics_db=(-6.0,)).partials()[0].tolist()
+    [20000.0, 40000.0]
     """
 
     frequency_hz: float
     level_db: float = -60.0
+    harmonics_db: tuple[float, ...] = ()
+    modulation_hz: float | None = None
+    modulation_depth: float = 1.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
         checks.between("tone.frequency_hz", self.frequency_hz, 1.0, _HIGHEST_HZ)
         checks.between("tone.level_db", self.level_db, -300.0, 60.0)
+        checks.integer("number of tone.harmonics_db", len(self.harmonics_db), 0, _MAX_HARMONICS)
+        for level_db in self.harmonics_db:
+            checks.between("tone.harmonics_db", level_db, -300.0, 60.0)
+        checks.between("tone.modulation_depth", self.modulation_depth, 0.0, 1.0)
+        if self.modulation_hz is not None:
+            checks.between("tone.modulation_hz", self.modulation_hz, 1e-3, self.frequency_hz)
+        elif self.modulation_depth != 1.0:
+            raise ArgumentError(
+                f"tone.modulation_depth is {self.modulation_depth:g}, but the tone is steady; give tone.modulation_hz, "
+                "or leave out modulation_depth"
+            )
+
+    def partials(self) -> tuple[Floats, NDArray[np.complex128]]:
+        """Return the frequencies of the tone, and their amplitudes at 1 m: (partial,) float64 and complex128.
+
+        The sound at the source is ``Im Σ a exp(2πi f t)``. A modulated tone ``(1 + m sin 2πgt) sin 2πft`` has two more
+        partials at ``f ± g``, with the amplitudes ``∓ i m / 2``.
+        """
+        order = np.arange(1, 2 + len(self.harmonics_db))
+        frequency_hz = self.frequency_hz * order.astype(np.float64)
+        amplitude = (10 ** ((self.level_db + np.array([0.0, *self.harmonics_db])) / 20)).astype(np.complex128)
+        if self.modulation_hz is None:
+            return frequency_hz, amplitude
+        beside = np.asarray(0.5j * self.modulation_depth * amplitude, np.complex128)
+        return (
+            np.concatenate([frequency_hz, frequency_hz - self.modulation_hz, frequency_hz + self.modulation_hz]),
+            np.concatenate([amplitude, beside, -beside]),
+        )
 
 
-class Noise(Placed, frozen=True, kw_only=True):
+class Noise(SoundSource, frozen=True, kw_only=True):
     """Source of broadband noise, for example of compressed air.
 
     Attributes
@@ -46,25 +132,73 @@ class Noise(Placed, frozen=True, kw_only=True):
         Band of the noise in hertz; 20 to 80 kHz by default.
     level_db : float
         RMS in the band at 1 m, in decibels relative to full scale; −60 by default.
+    spectrum : {"white", "leak"} or tuple of (frequency_hz, level_db)
+        Shape of the power density within the band: constant, that of a leak of compressed air, or levels in decibels
+        at increasing frequencies, between which it is interpolated. ``white`` by default.
+    orifice_m : float, optional
+        Diameter of the hole of a leak in metres, 1e-5 to 0.1; required for a leak.
 
     Examples
     --------
     >>> from ertis_numba.simulation import Noise
     >>> Noise(range_m=2.0).band_hz
     (20000.0, 80000.0)
+    >>> Noise(range_m=2.0, spectrum="leak", orifice_m=1e-3).peak_hz
+    62600.0
     """
 
     band_hz: tuple[float, float] = (20_000.0, 80_000.0)
     level_db: float = -60.0
+    spectrum: Literal["white", "leak"] | tuple[tuple[float, float], ...] = "white"
+    orifice_m: float | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
         _check_band("noise.band_hz", self.band_hz)
         checks.between("noise.level_db", self.level_db, -300.0, 60.0)
+        if self.orifice_m is not None:
+            checks.between("noise.orifice_m", self.orifice_m, *_ORIFICES_M)
+        if (self.orifice_m is not None) != (self.spectrum == "leak"):
+            raise ArgumentError(
+                f"noise.spectrum is {self.spectrum!r} and noise.orifice_m is {self.orifice_m}; give noise.orifice_m "
+                'with spectrum = "leak", and only with it'
+            )
+        if not isinstance(self.spectrum, str):
+            self._check_levels(self.spectrum)
+
+    def _check_levels(self, levels: tuple[tuple[float, float], ...]) -> None:
+        checks.integer("number of levels of noise.spectrum", len(levels), 1, _MAX_LEVELS)
+        frequency_hz = [each_hz for each_hz, _ in levels]
+        for each_hz, level_db in levels:
+            checks.between("frequency of noise.spectrum", each_hz, 1.0, _HIGHEST_HZ)
+            checks.between("level of noise.spectrum", level_db, -300.0, 60.0)
+        if any(after <= before for before, after in itertools.pairwise(frequency_hz)):
+            raise ArgumentError("noise.spectrum has frequencies that do not increase; give them in increasing order")
+
+    @property
+    def peak_hz(self) -> float:
+        """Frequency of the highest power density of a leak, ``0.2 U / d``; NaN for other noise."""
+        return math.nan if self.orifice_m is None else _STROUHAL * _SONIC_JET_M_S / self.orifice_m
+
+    def density(self, frequency_hz: Floats) -> Floats:
+        """Return the power density at frequencies within the band, on an arbitrary scale: (frequency,) float64.
+
+        The noise of a turbulent jet is ``x² / (1 + x²)²`` with ``x = f d / (0.2 U)``: the density rises with the square
+        of the frequency and falls with it (A. Powell, Similarity and turbulent jet noise, JASA 31, 1959), and is
+        highest at a Strouhal number f d / U of 0.2 (H. K. Tanna, An experimental study of jet noise, J. Sound Vib. 50,
+        1977). The jet of a leak has sonic speed U for pressures of 0.9 bar or more above the ambient pressure.
+        """
+        if isinstance(self.spectrum, str):
+            if self.spectrum == "white":
+                return np.ones(len(frequency_hz))
+            square = (frequency_hz / self.peak_hz) ** 2
+            return np.asarray(square / (1 + square) ** 2)
+        given_hz, level_db = np.array(self.spectrum).T
+        return np.asarray(10 ** ((np.interp(frequency_hz, given_hz, level_db) - level_db.max()) / 10))
 
 
-class Sonar(Placed, frozen=True, kw_only=True):
-    """Another sonar, not synchronised with the sensors of the scene.
+class Sonar(SoundSource, frozen=True, kw_only=True):
+    """Another sonar or a bat, not synchronised with the sensors of the scene.
 
     Attributes
     ----------

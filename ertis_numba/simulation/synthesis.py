@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 from ertis_numba import kernels
 from ertis_numba.settings import Call
+from ertis_numba.simulation import noise_frames
 from ertis_numba.simulation.arrivals import Arrivals
+from ertis_numba.simulation.noise_frames import NoiseFrame
 from ertis_numba.simulation.stopwatch import CostStopwatch
 from ertis_numba.waveform import call_at
 
@@ -36,9 +38,18 @@ def node_frequencies(top_hz: float) -> Floats:
     return np.asarray(np.arange(math.ceil(top_hz / NODE_HZ) + 1) * NODE_HZ, dtype=np.float64)
 
 
+def highest_hz(call: Call | NoiseFrame, rate_hz: float) -> float:
+    """Return the upper end of the spectrum of a call or a frame, 90 dB below its maximum.
+
+    It is at most half of the sample rate.
+    """
+    if isinstance(call, NoiseFrame):
+        return min(noise_frames.top_hz(call.noise), rate_hz / 2)
+    return _highest_hz(call, rate_hz)
+
+
 @functools.cache
-def highest_hz(call: Call, rate_hz: float) -> float:
-    """Return the upper end of a call's spectrum, 90 dB below its maximum, at most half of the sample rate."""
+def _highest_hz(call: Call, rate_hz: float) -> float:
     n_fft = scipy.fft.next_fast_len(4 * math.ceil(call.duration_s * rate_hz), real=True)
     spectrum = np.abs(np.fft.rfft(call_at(call, np.arange(n_fft) / rate_hz)))
     return float(np.flatnonzero(spectrum > _DEAF * spectrum.max())[-1] * rate_hz / n_fft)
@@ -113,7 +124,7 @@ def _length(arrived: Sequence[Arrivals], delay_samples: Sequence[Floats], rate_h
     return step * int(scipy.fft.next_fast_len(-(-n_fft // step), real=True))
 
 
-def _step(call: Call, rate_hz: float) -> int:
+def _step(call: Call | NoiseFrame, rate_hz: float) -> int:
     """Return the factor by which a call can be undersampled: a power of two, so that calls share a common multiple."""
     return int(2 ** math.floor(math.log2(max(1.0, rate_hz / (2.2 * highest_hz(call, rate_hz))))))
 
@@ -152,7 +163,10 @@ def _add(
                 call = call * each.response(np.outer(stretch[path], np.arange(n_bins) * rate_hz / n_fft))
             add(call, np.array([path]))
     if still.any():
-        call = _spectrum(entry.call, rate_hz, n_fft)[None, :n_bins]
+        form = entry.call
+        # Frames are used once. They would displace the calls from the cache.
+        whole = _framed(form, rate_hz, n_fft) if isinstance(form, NoiseFrame) else _spectrum(form, rate_hz, n_fft)
+        call = whole[None, :n_bins]
         for each in entry.filters:
             call = call * each.response(np.arange(n_bins) * rate_hz / n_fft)
         add(call, np.flatnonzero(still))
@@ -165,7 +179,14 @@ def _spectrum(call: Call, rate_hz: float, n_fft: int) -> NDArray[np.complex128]:
     return np.asarray(scipy.fft.rfft(call_at(call, np.arange(n_fft) / rate_hz)))
 
 
-def _stretched(call: Call, stretch: Floats, rate_hz: float, n_fft: int, n_bins: int) -> NDArray[np.complex128]:
+def _framed(frame: NoiseFrame, rate_hz: float, n_fft: int) -> NDArray[np.complex128]:
+    time_s = np.arange(math.ceil(frame.duration_s * rate_hz) + 1) / rate_hz
+    return np.asarray(scipy.fft.rfft(frame.at(time_s), n_fft))
+
+
+def _stretched(
+    call: Call | NoiseFrame, stretch: Floats, rate_hz: float, n_fft: int, n_bins: int
+) -> NDArray[np.complex128]:
     """Return the spectra of a stretched call: (mic, bin) complex128.
 
     The stretch is almost the same at all microphones. If the final phases of their calls lie within 1.2 rad, four
@@ -185,12 +206,15 @@ def _stretched(call: Call, stretch: Floats, rate_hz: float, n_fft: int, n_bins: 
     return np.asarray((weights @ known.view(np.float64)).view(np.complex128))
 
 
-def _spectra(call: Call, stretch: Floats, rate_hz: float, n_fft: int, n_bins: int) -> NDArray[np.complex128]:
+def _spectra(
+    call: Call | NoiseFrame, stretch: Floats, rate_hz: float, n_fft: int, n_bins: int
+) -> NDArray[np.complex128]:
     """Return the spectrum of the call for each stretch, computed at the lowest sample rate that its band allows."""
     step = _step(call, rate_hz)
     n_samples = math.ceil(call.duration_s * stretch.max() * rate_hz / step) + 1
     time_s = np.arange(n_samples) * (step / rate_hz) / stretch[:, None]
-    spectra = scipy.fft.rfft(call_at(call, time_s), n_fft // step)
+    values = call.at(time_s) if isinstance(call, NoiseFrame) else call_at(call, time_s)
+    spectra = scipy.fft.rfft(values, n_fft // step)
     wide = np.zeros((len(stretch), n_bins), dtype=np.complex128)
     kept = min(n_bins, spectra.shape[1])
     wide[:, :kept] = step * spectra[:, :kept]

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError
-from ertis_numba.simulation.trajectory import Placed
+from ertis_numba.simulation.trajectory import Placed, direction
 
 __all__ = ["Box", "Point", "Sphere", "Wall"]
 
@@ -53,11 +53,7 @@ class Point(Placed, frozen=True, kw_only=True):
 
     def normal_at(self, time_s: float) -> NDArray[np.float64]:
         """Return the unit normal of a disc at a time of the scene: (axis,) float64."""
-        if self.facing_deg is not None:
-            return _direction(*self.facing_deg)
-        place = -self.position_at(time_s)
-        length = float(np.linalg.norm(place))
-        return place / length if length else np.array([1.0, 0.0, 0.0])
+        return direction(*self.facing_deg) if self.facing_deg is not None else self.towards_origin(time_s)
 
 
 class Sphere(Placed, frozen=True, kw_only=True):
@@ -121,7 +117,7 @@ class Wall(Placed, frozen=True, kw_only=True):
     def axes(self) -> NDArray[np.float64]:
         """Return the unit vectors of normal, width and height: (3, axis) float64."""
         azimuth_rad = math.radians(self.facing_deg[0])
-        normal = _direction(*self.facing_deg)
+        normal = direction(*self.facing_deg)
         width = np.array([-math.sin(azimuth_rad), math.cos(azimuth_rad), 0.0])
         return np.stack([normal, width, np.cross(normal, width)])
 
@@ -186,12 +182,6 @@ class Box(Placed, frozen=True, kw_only=True):
                 )
             )
         return tuple(walls)
-
-
-def _direction(azimuth_deg: float, elevation_deg: float) -> NDArray[np.float64]:
-    azimuth_rad, elevation_rad = math.radians(azimuth_deg), math.radians(elevation_deg)
-    level = math.cos(elevation_rad)
-    return np.array([level * math.cos(azimuth_rad), level * math.sin(azimuth_rad), math.sin(elevation_rad)])
 
 
 def _wrapped_deg(angle_deg: float) -> float:

@@ -12,7 +12,7 @@ from ertis_numba.documents import TomlTable
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import unit_vectors
 
-__all__ = ["MAX_DISTANCE_M", "MAX_SPEED_M_S", "Placed", "Vector", "check_vector"]
+__all__ = ["MAX_DISTANCE_M", "MAX_SPEED_M_S", "Placed", "Vector", "check_vector", "direction"]
 
 Vector = tuple[float, float, float]
 MAX_DISTANCE_M: Final = 1e4
@@ -92,6 +92,12 @@ class Placed(TomlTable, frozen=True, kw_only=True):
                 return np.asarray((np.array(b) - np.array(a)) / (after_s - before_s))
         return np.array(_STILL if self.waypoints else self.velocity_m_s)
 
+    def towards_origin(self, time_s: float) -> NDArray[np.float64]:
+        """Return the unit vector towards the origin of the world at a time of the scene: (axis,) float64."""
+        place = -self.position_at(time_s)
+        length = float(np.linalg.norm(place))
+        return place / length if length else np.array([1.0, 0.0, 0.0])
+
     def _start_m(self) -> NDArray[np.float64]:
         if self.position_m is not None:
             return np.array(self.position_m)
@@ -103,3 +109,10 @@ def check_vector(name: str, vector: Vector, largest: float) -> None:
     """Raise an error for a vector with a component beyond ±``largest``."""
     for part in vector:
         checks.between(name, part, -largest, largest)
+
+
+def direction(azimuth_deg: float, elevation_deg: float) -> NDArray[np.float64]:
+    """Return the unit vector of a direction in the world frame: (axis,) float64."""
+    azimuth_rad, elevation_rad = math.radians(azimuth_deg), math.radians(elevation_deg)
+    level = math.cos(elevation_rad)
+    return np.array([level * math.cos(azimuth_rad), level * math.sin(azimuth_rad), math.sin(elevation_rad)])

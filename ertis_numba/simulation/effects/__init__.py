@@ -16,14 +16,16 @@ place               arguments                                             result
 ``views``           shot, number, views                                   ends of paths, and their mirror images
 ``turns``           first, second, targets                                paths over targets, instead of `by_targets`
 ``gain``            shot, paths, emitter, frequency_hz                    factor, broadcast to (path, mic, frequency)
-``times``           shot, paths, times                                    delay and stretch of each path
+``times``           shot, paths, sent_s, times                            delay and stretch of each path
+``emission``        shot, paths, received_s                               times at which received sound left its source
 ``clock_times``     shot, number, delay_s, stretch                        the same on the receiver's clock
 ``call_filter``     emitter                                               `CallFilter` of the call, or None
-``arrivals``        shot, active, found                                   all copies of calls: those found, and more
+``arrivals``        shot, active, frequency_hz, found                     all copies of calls: those found, and more
+``frames``          shot, active, frequency_hz                            copies of frames of noise
 ``microphones``     shot, gain, delay_s                                   sensitivity and delay of each microphone
-``sounds``          shot, seed                                            sounds with ``add_to(signals, first)``
+``sounds``          shot, active, seed                                    sounds with ``add_to(signals, first)``
 ``noise_rms``       sensor                                                RMS of white noise in each microphone
-``loudness``        shot                                                  bounds on amplitude and noise power
+``loudness``        shot, active                                          bounds on amplitude and noise power
 ``samples``         samples, sensor                                       None; it changes recorded samples in place
 ==================  ====================================================  =============================================
 """
@@ -46,9 +48,11 @@ Place = Literal[
     "turns",
     "gain",
     "times",
+    "emission",
     "clock_times",
     "call_filter",
     "arrivals",
+    "frames",
     "microphones",
     "sounds",
     "noise_rms",
@@ -205,9 +209,9 @@ EFFECTS: Final = {
         ),
         Effect(
             name="emitter_directivity",
-            summary="directivity of the emitter as a circular piston",
+            summary="directivity of emitters and sources as circular pistons",
             places=("gain",),
-            keys=("sensors.emitter.diameter_m",),
+            keys=("sensors.emitter.diameter_m", "tones.diameter_m", "noises.diameter_m", "sonars.diameter_m"),
             requested=True,
             weakens=True,
             example=_ASIDE + "sensors = [{emitter = {diameter_m = 0.02}}]\n",
@@ -223,11 +227,12 @@ EFFECTS: Final = {
         ),
         Effect(
             name="doppler",
-            summary="shift and stretch of the call due to motion",
-            places=("times",),
+            summary="shift and stretch of sound due to motion",
+            places=("times", "emission"),
             keys=("*.velocity_m_s", "*.waypoints"),
             weakens=True,
-            example="points = [{range_m = 0.5, velocity_m_s = [-3.0, 0.0, 0.0]}]\n",
+            example="points = [{range_m = 0.5, velocity_m_s = [-3.0, 0.0, 0.0]}]\n"
+            "tones = [{range_m = 1.0, velocity_m_s = [-3.0, 0.0, 0.0], frequency_hz = 30e3, level_db = -40.0}]\n",
         ),
         Effect(
             name="direct_sound",
@@ -240,10 +245,11 @@ EFFECTS: Final = {
         Effect(
             name="interference",
             summary="tones, noise and other sonars",
-            places=("arrivals", "sounds", "loudness"),
+            places=("arrivals", "frames", "sounds", "loudness"),
             keys=("tones", "noises", "sonars"),
             requested=True,
             example="tones = [{position_m = [1.0, 0.0, 0.0], frequency_hz = 40e3, level_db = -40.0}]\n"
+            "noises = [{position_m = [0.0, 1.0, 0.0], level_db = -40.0}]\n"
             "sonars = [{position_m = [1.0, 0.0, 0.0], level_db = -40.0}]\n",
         ),
         Effect(

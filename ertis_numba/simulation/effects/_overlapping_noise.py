@@ -26,22 +26,18 @@ class OverlappingFrames:
         Seed of the noise, combined with the number of the frame.
     make : function
         Returns the signals of one frame at the microphones, (mic, sample) float64, from a random generator.
-    margin : int
-        Number of samples by which these signals begin earlier and end later than the frame.
     """
 
-    def __init__(
-        self, seed: tuple[int, ...], make: Callable[[np.random.Generator], Floats], *, margin: int = 0
-    ) -> None:
-        self._seed, self._make, self._margin = seed, make, margin
+    def __init__(self, seed: tuple[int, ...], make: Callable[[np.random.Generator], Floats]) -> None:
+        self._seed, self._make = seed, make
         self._frames: dict[int, Floats] = {}
 
     def add_to(self, signals: Floats, first: int) -> None:
         """Add the noise to ``signals``, which start at sample ``first``, in place: (mic, sample) float64."""
         hop, stop = FRAME // 2, first + signals.shape[1]
-        for number in range((first - self._margin) // hop - 1, -(-(stop + self._margin) // hop)):
-            begin = number * hop - self._margin
-            low, high = max(begin, first), min(begin + FRAME + 2 * self._margin, stop)
+        for number in range(first // hop - 1, -(-stop // hop)):
+            begin = number * hop
+            low, high = max(begin, first), min(begin + FRAME, stop)
             if low < high:
                 signals[:, low - first : high - first] += self._frame(number)[:, low - begin : high - begin]
 

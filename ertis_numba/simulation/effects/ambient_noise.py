@@ -1,5 +1,7 @@
 """Diffuse noise from all directions."""
 
+from collections.abc import Set as AbstractSet
+
 import numpy as np
 
 from ertis_numba.simulation.effects._overlapping_noise import FRAME, OverlappingFrames, band_bins, drawn, window
@@ -10,10 +12,11 @@ from ertis_numba.simulation.snapshot import Snapshot
 __all__ = ["estimate", "loudness", "sounds"]
 
 _OWN = 1e-6  # uncorrelated power of each microphone: without it the matrix is singular below some kilohertz
+_ACROSS = 8192  # frequencies at which the noise is summed
 _NODE_HZ = 2000.0  # frequency step: the coherence of microphones 15 cm apart changes by a few hundredths per step
 
 
-def sounds(shot: Snapshot, seed: tuple[int, ...]) -> list[OverlappingFrames]:
+def sounds(shot: Snapshot, active: AbstractSet[str], seed: tuple[int, ...]) -> list[OverlappingFrames]:
     """Return a diffuse sound field: independent plane waves of equal level from all directions.
 
     The coherence of two microphones at a distance d is ``sin(k d) / (k d)`` (R. K. Cook et al., Measurement of
@@ -37,7 +40,7 @@ def sounds(shot: Snapshot, seed: tuple[int, ...]) -> list[OverlappingFrames]:
     return [OverlappingFrames((*seed, 0), lambda random: level * drawn(random, bins, mix[nodes]) * window())]
 
 
-def loudness(shot: Snapshot) -> tuple[float, float]:
+def loudness(shot: Snapshot, active: AbstractSet[str]) -> tuple[float, float]:
     """Return no peak, and the power of the noise."""
     ambient = shot.scene.ambient
     return 0.0, 0.0 if ambient is None else 10 ** (ambient.level_dbfs / 10)
@@ -48,5 +51,6 @@ def estimate(sight: Sight) -> Estimate | None:
     ambient = sight.shot.scene.ambient
     if ambient is None:
         return None
-    level = sight.of_white_noise(ambient.level_dbfs, band_hz=ambient.band_hz)
+    across_hz = np.linspace(*ambient.band_hz, _ACROSS)
+    level = sight.of_white_noise(ambient.level_dbfs, band=(across_hz, np.ones(_ACROSS)))
     return noise(sight, level, f"{ambient.level_dbfs:g} dBFS at each microphone")

@@ -3,6 +3,9 @@
 import math
 from collections.abc import Set as AbstractSet
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ertis_numba.simulation.arrivals import Arrivals, arrived, gains, transmitter_of
 from ertis_numba.simulation.effects.spreading import spreading
 from ertis_numba.simulation.estimates import Estimate
@@ -14,7 +17,9 @@ from ertis_numba.simulation.surroundings import change_db
 __all__ = ["arrivals", "estimate"]
 
 
-def arrivals(shot: Snapshot, active: AbstractSet[str], found: list[Arrivals]) -> list[Arrivals]:
+def arrivals(
+    shot: Snapshot, active: AbstractSet[str], frequency_hz: NDArray[np.float64], found: list[Arrivals]
+) -> list[Arrivals]:
     """Return the arrivals, and the direct sound of the sensor's own emitter.
 
     Its level is a separate setting, ``direct_sound_db``. The sound travels along the housing, so the emitter's

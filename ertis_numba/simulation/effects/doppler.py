@@ -1,4 +1,4 @@
-"""Shift and stretch of the call due to motion."""
+"""Shift and stretch of calls and of other sound due to motion."""
 
 import math
 from dataclasses import replace
@@ -12,7 +12,7 @@ from ertis_numba.simulation.paths import Paths
 from ertis_numba.simulation.scene import Scene
 from ertis_numba.simulation.snapshot import Receivers, Snapshot, Transmitters
 
-__all__ = ["estimate", "times"]
+__all__ = ["emission", "estimate", "times"]
 
 Floats = NDArray[np.float64]
 _ROUNDS = 60  # of moving walls; each reduces the error by the factor v / c, so that few are needed
@@ -20,13 +20,51 @@ _ENOUGH_S = 1e-16
 _STEP_S = 1e-5
 
 
-def times(shot: Snapshot, paths: Paths, times: tuple[Floats, Floats | None]) -> tuple[Floats, Floats | None]:
+def times(
+    shot: Snapshot, paths: Paths, sent_s: float, times: tuple[Floats, Floats | None]
+) -> tuple[Floats, Floats | None]:
     """Return delays and stretches due to motion, instead of those at rest: both (path, mic) float64."""
-    return _moved(paths, shot.speed_m_s)
+    return _moved(paths, shot.speed_m_s, sent_s)
 
 
-def _moved(paths: Paths, speed_m_s: float) -> tuple[Floats, Floats]:
-    """Return the arrival time of the call's beginning, and its stretch: both (path, mic) float64.
+def emission(shot: Snapshot, paths: Paths, received_s: Floats) -> Floats:
+    """Return the times at which sound that arrives at given times left its source: (path, mic, time) float64.
+
+    The source is at ``s(t)`` and a microphone at ``m(t)``, both with constant velocity. Sound that arrives at t left u
+    earlier, with ``|m(t) - s(t - u)| = c u``. With ``d = m(t) - s(t)`` and the velocity v of the source, u is the
+    positive root of ``(c² - v²) u² - 2 (d·v) u - d² = 0``. The sound meets a moving wall
+    after the same fraction of the path as without motion, which is accurate to first order in v / c.
+
+    Parameters
+    ----------
+    shot : Snapshot
+    paths : Paths
+        Paths without targets.
+    received_s : (mic, time) float64
+        Times relative to the snapshot.
+    """
+    source, receiver, speed_m_s = paths.transmitter, paths.receiver, shot.speed_m_s
+    # A wall moves the image from t - u until the time of reflection, so only a part of its velocity counts in v.
+    done = paths.transmitter_corners_m / np.mean(paths.second_m, axis=1)
+    source_m_s = (source.velocity_m_s - np.sum(done[..., None] * source.sways_m_s, axis=0))[:, None]
+    apart_m = receiver.positions_m - source.position_m[:, None]
+    apart_m_s = _mics_m_s(receiver) - source.velocity_m_s[:, None]
+    # d grows linearly with time, so that its products are polynomials.
+    along = _dot(apart_m, source_m_s) + _dot(apart_m_s, source_m_s) * received_s
+    square = _dot(apart_m, apart_m) + (2 * _dot(apart_m, apart_m_s) + _dot(apart_m_s, apart_m_s) * received_s) * (
+        received_s
+    )
+    rest = speed_m_s**2 - _dot(source_m_s, source_m_s)
+    return np.asarray(received_s - (along + np.sqrt(along**2 + rest * square)) / rest)
+
+
+def _dot(one: Floats, other: Floats) -> Floats:
+    """Return the products of vectors, with an axis for times: (path, mic, 1) float64."""
+    return np.asarray(np.sum(one * other, axis=-1)[..., None])
+
+
+def _moved(paths: Paths, speed_m_s: float, sent_s: float = 0.0) -> tuple[Floats, Floats]:
+    """Return the arrival time of sound that leaves at ``sent_s``, and its stretch: both (path, mic) float64.
 
     All velocities are constant. Sound that leaves at t₀ meets the moving target at t₁ and the moving microphone at t₂:
     ``c (t₁ - t₀) = |p + v t₁ - s(t₀)|``, and similarly for t₂. A microphone at r from the centre of a turning array
@@ -36,7 +74,9 @@ def _moved(paths: Paths, speed_m_s: float) -> tuple[Floats, Floats]:
     The stretch is dt₂/dt₀ at the beginning of the call. It equals the product of the Doppler factors of all moving
     objects (P. M. Morse, K. U. Ingard, Theoretical Acoustics, 1968, chapter 11).
     """
-    earlier_s, arrival_s, later_s = (_arrival_s(paths, start_s, speed_m_s) for start_s in (-_STEP_S, 0.0, _STEP_S))
+    earlier_s, arrival_s, later_s = (
+        _arrival_s(paths, sent_s + step_s, speed_m_s) for step_s in (-_STEP_S, 0.0, _STEP_S)
+    )
     return arrival_s, (later_s - earlier_s) / (2 * _STEP_S)
 
 
@@ -46,8 +86,7 @@ def _arrival_s(paths: Paths, start_s: float, speed_m_s: float) -> Floats:
     sent_m = (transmitter.position_m + start_s * _own_m_s(transmitter))[:, None]
     first_m, leaving = _per_path(paths.first_m), _per_path(paths.leaving)
     target_m = transmitter.position_m[:, None] + first_m[..., None] * leaving
-    arms_m = receiver.positions_m - receiver.centre_m[:, None]
-    mics_m_s = _own_m_s(receiver)[:, None] + np.cross(receiver.spin_rad_s[:, None], arms_m)
+    mics_m_s = _mics_m_s(receiver)
     met_s = start_s + first_m / speed_m_s
     arrival_s = met_s + paths.second_m / speed_m_s
     sways = bool(np.any(transmitter.sways_m_s)), bool(np.any(receiver.sways_m_s))
@@ -97,6 +136,12 @@ def _met_s(from_m: Floats, left_s: Floats, place_m: Floats, velocity_m_s: Floats
 def _per_path(values: Floats) -> Floats:
     """Return one value per path where all microphones share it: (path, 1 or mic, ...)."""
     return values[:, :1] if values.strides[1] == 0 else values
+
+
+def _mics_m_s(receiver: Receivers) -> Floats:
+    """Return the velocity of each microphone without the contribution of moving walls: (path, mic, axis) float64."""
+    arms_m = receiver.positions_m - receiver.centre_m[:, None]
+    return np.asarray(_own_m_s(receiver)[:, None] + np.cross(receiver.spin_rad_s[:, None], arms_m))
 
 
 def _own_m_s(end: Transmitters | Receivers) -> Floats:

@@ -5,148 +5,236 @@ from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
+from ertis_numba.settings import Call
 from ertis_numba.simulation.arrivals import Arrivals, gains, rounded_s
-from ertis_numba.simulation.effects._overlapping_noise import FRAME, OverlappingFrames, band_bins, drawn, window
-from ertis_numba.simulation.effects.spreading import spreading
+from ertis_numba.simulation.effects import acting
 from ertis_numba.simulation.estimates import Estimate
 from ertis_numba.simulation.image_estimate import Sight
-from ertis_numba.simulation.paths import Paths, without_target
-from ertis_numba.simulation.snapshot import Snapshot, Transmitters
+from ertis_numba.simulation.noise_frames import FRAME_S, NoiseFrame, frame_of, frames_between
+from ertis_numba.simulation.snapshot import Snapshot
+from ertis_numba.simulation.source_paths import AnySource, SourceInScene, all_sources, sources_of
 from ertis_numba.simulation.sources import Noise, Sonar, Tone
 from ertis_numba.simulation.surroundings import change_db
-from ertis_numba.simulation.trajectory import Placed
 
-__all__ = ["arrivals", "estimate", "loudness", "sounds"]
+__all__ = ["arrivals", "estimate", "frames", "loudness", "sounds"]
+
+Floats = NDArray[np.float64]
+_EARLIER = 1.5  # longest way of sound from a moving source, relative to its way at the start of the measurement
+_AT_ONCE = 2**22  # paths × microphones × samples whose times of emission are computed at a time
 
 
-def arrivals(shot: Snapshot, active: AbstractSet[str], found: list[Arrivals]) -> list[Arrivals]:
+def arrivals(shot: Snapshot, active: AbstractSet[str], frequency_hz: Floats, found: list[Arrivals]) -> list[Arrivals]:
     """Return the arrivals, and the calls of other sonars. Clock drift does not apply to them."""
-    gain, late_s = gains(shot, active)
-    found = [*found]
-    for sonar in shot.scene.sonars:
-        paths, starts_s = _way_from(shot, sonar), _calls_of(shot, sonar)
-        if len(starts_s):
-            amplitude = gain * (10 ** (sonar.level_db / 20) * spreading(paths))
-            delay_s = paths.length_m / shot.speed_m_s + starts_s[:, None] + late_s
-            amplitude = np.repeat(amplitude[..., None], len(starts_s), axis=0)
-            found.append(Arrivals(sonar.call, rounded_s(delay_s), amplitude))
+    for sonar in sources_of(shot, active, Sonar):
+        starts_s = _calls_of(sonar, sonar.source)
+        if len(starts_s) and len(sonar.paths):
+            response = _level(sonar) * sonar.response(frequency_hz)
+            parts = [_received(sonar, sonar.source.call, start_s, 0.0, response) for start_s in starts_s]
+            found = [*found, *_joined(sonar.source.call, [part for part in parts if len(part.delay_s)])]
     return found
 
 
-def sounds(shot: Snapshot, seed: tuple[int, ...]) -> "list[OverlappingFrames | _ToneAtMicrophones]":
-    """Return the noises and the tones of the scene at the microphones."""
-    noises = [_noise_of(shot, noise, (*seed, 1 + number)) for number, noise in enumerate(shot.scene.noises)]
-    return [*noises, *(_ToneAtMicrophones(shot, tone) for tone in shot.scene.tones)]
+def frames(shot: Snapshot, active: AbstractSet[str], frequency_hz: Floats) -> list[Arrivals]:
+    """Return the frames of all noises that arrive during the record.
+
+    A frame travels like a call, with the velocities at its centre. All sensors receive the same frames.
+    """
+    found = []
+    for noise in sources_of(shot, active, Noise):
+        if not len(noise.paths):
+            continue
+        response = _level(noise) * noise.response(frequency_hz)
+        first_s, last_s = _sent_s(noise)
+        seed = shot.scene.seed, *b"interference", noise.number
+        for number in frames_between(shot.time_s + first_s, shot.time_s + last_s):
+            frame, start_s = frame_of(noise.source, seed, number), number * FRAME_S / 2 - shot.time_s
+            found.append(_received(noise, frame, start_s, FRAME_S / 2, response))
+    return [each for each in found if len(each.delay_s)]
 
 
-def loudness(shot: Snapshot) -> tuple[float, float]:
-    """Return the amplitude of the tones, and the power of the noises, at the nearest microphone."""
-
-    def near(source: Noise | Tone) -> float:
-        return float(10 ** (source.level_db / 20) * np.max(spreading(_way_from(shot, source))))
-
-    return sum(near(tone) for tone in shot.scene.tones), sum(near(noise) ** 2 for noise in shot.scene.noises)
+def sounds(shot: Snapshot, active: AbstractSet[str], seed: tuple[int, ...]) -> "list[_ToneAtMicrophones]":
+    """Return the tones of the scene at the microphones."""
+    return [_ToneAtMicrophones(tone) for tone in sources_of(shot, active, Tone) if len(tone.paths)]
 
 
-def _way_from(shot: Snapshot, source: Placed) -> Paths:
-    """Return the direct path from an omnidirectional source to the microphones."""
-    transmitter = Transmitters(
-        position_m=source.position_at(shot.time_s)[None],
-        velocity_m_s=source.velocity_at(shot.time_s)[None],
-        facing=np.zeros((1, 3)),
+def loudness(shot: Snapshot, active: AbstractSet[str]) -> tuple[float, float]:
+    """Return bounds on the amplitude of the tones and on the power of the noises, at the nearest microphone."""
+
+    def power(source: SourceInScene[Tone] | SourceInScene[Noise]) -> Floats:
+        frequency_hz, power = source.spectrum
+        return np.asarray(power * np.sum(np.max(source.response(frequency_hz), axis=1, initial=0.0), axis=0) ** 2)
+
+    tones, noises = sources_of(shot, active, Tone), sources_of(shot, active, Noise)
+    return (
+        sum(float(np.sum(np.sqrt(2 * power(tone)))) for tone in tones),
+        sum(float(np.sum(power(noise))) for noise in noises),
     )
-    return without_target(transmitter, shot.receiver, shot.targets)
+
+
+def _level(source: SourceInScene[Noise] | SourceInScene[Sonar]) -> float:
+    return float(10 ** (source.source.level_db / 20))
+
+
+def _received(
+    source: SourceInScene[Noise] | SourceInScene[Sonar],
+    sound: Call | NoiseFrame,
+    start_s: float,
+    centre_s: float,
+    response: Floats,
+) -> Arrivals:
+    """Return the copies of a call or a frame that arrive during the record.
+
+    Parameters
+    ----------
+    source : SourceInScene
+    sound : Call or NoiseFrame
+    start_s : float
+        Time at which its beginning leaves the source, relative to the snapshot.
+    centre_s : float
+        Time after its beginning at which the Doppler factor is evaluated.
+    response : (path, mic, frequency) float64
+    """
+    gain, late_s = gains(source.shot, source.active)
+    delay_s, stretch = source.arrival(start_s + centre_s)
+    delay_s = delay_s - centre_s * (1.0 if stretch is None else stretch) + late_s
+    lasts_s = sound.duration_s * (1.0 if stretch is None else float(stretch.max(initial=1.0)))
+    heard = (delay_s.max(axis=1) > -lasts_s) & (delay_s.min(axis=1) < source.shot.sensor.recording.duration_s)
+    amplitude = gain[:, None] * response[heard]
+    return Arrivals(sound, rounded_s(delay_s[heard]), amplitude, None if stretch is None else stretch[heard])
+
+
+def _joined(call: Call, parts: list[Arrivals]) -> list[Arrivals]:
+    """Return the copies of several calls as one entry, if there are any."""
+    if not parts:
+        return []
+    stretches = [part.stretch for part in parts if part.stretch is not None]
+    return [
+        Arrivals(
+            call,
+            np.concatenate([part.delay_s for part in parts]),
+            np.concatenate([part.amplitude for part in parts]),
+            np.concatenate(stretches) if stretches else None,
+        )
+    ]
+
+
+def _sent_s(source: SourceInScene[Noise] | SourceInScene[Sonar] | SourceInScene[AnySource]) -> tuple[float, float]:
+    """Return the first and the last time at which sound leaves that may arrive in the record, after the snapshot."""
+    shot, length_m = source.shot, source.paths.length_m
+    return -_EARLIER * float(length_m.max()) / shot.speed_m_s, shot.sensor.recording.duration_s
+
+
+def _calls_of(source: SourceInScene[Sonar] | SourceInScene[AnySource], sonar: Sonar) -> Floats:
+    """Return the start times of another sonar's calls that may arrive during the record: (call,) float64.
+
+    Times are relative to the snapshot, and often negative. Echoes of these calls from targets are far weaker than the
+    direct sound, and are not modelled.
+    """
+    if not len(source.paths):
+        return np.zeros(0)
+    time_s = source.shot.time_s
+    first_s, last_s = _sent_s(source)
+    first_s -= 2 * sonar.call.duration_s
+    earliest, latest = ((time_s + each_s - sonar.offset_s) / sonar.period_s for each_s in (first_s, last_s))
+    numbers = np.arange(max(0, math.ceil(earliest)), math.floor(latest) + 1)
+    return np.asarray(sonar.offset_s + numbers * sonar.period_s - time_s)
 
 
 @dataclass(frozen=True)
 class _ToneAtMicrophones:
-    """Tone ``a / r · sin(2π f (t - r / c))`` at the microphones; t is the time of the scene."""
+    """Tone ``Im Σ a exp(2πi f tₑ)`` at the microphones, summed over paths and partials.
 
-    shot: Snapshot
-    tone: Tone
+    The sound left its source at the time tₑ of the scene: ``t - r / c`` at rest.
+    """
 
-    def add_to(self, signals: NDArray[np.float64], first: int) -> None:
+    tone: SourceInScene[Tone]
+
+    def add_to(self, signals: Floats, first: int) -> None:
         """Add the tone to ``signals``, which start at sample ``first``, in place: (mic, sample) float64."""
-        shot, tone = self.shot, self.tone
-        way, rate_hz = _way_from(shot, tone), shot.sensor.recording.sample_rate_hz
-        amplitude = 10 ** (tone.level_db / 20) * spreading(way)[0]
-        # Whole periods of a long time are removed before they cost precision.
-        turns = (tone.frequency_hz * (shot.time_s - way.length_m[0] / shot.speed_m_s)) % 1.0
-        swing_rad = 2 * math.pi * tone.frequency_hz / rate_hz * np.arange(first, first + signals.shape[1])
-        start_rad = 2 * math.pi * turns
-        signals += np.outer(amplitude * np.cos(start_rad), np.sin(swing_rad))
-        signals += np.outer(amplitude * np.sin(start_rad), np.cos(swing_rad))
+        rate_hz = self.tone.shot.sensor.recording.sample_rate_hz
+        emission = [act for _, act in acting("emission", self.tone.active)]
+        if not emission or not _moves(self.tone):
+            self._add_at_rest(signals, np.arange(first, first + signals.shape[1]) / rate_hz)
+            return
+        paths, shot = self.tone.paths, self.tone.shot
+        step = max(1, _AT_ONCE // (len(paths) * len(signals)))
+        frequency_hz, amplitude, response = self._partials()
+        _, late_s = gains(shot, self.tone.active)
+        for begin in range(0, signals.shape[1], step):
+            part = signals[:, begin : begin + step]
+            received_s = np.arange(first + begin, first + begin + part.shape[1]) / rate_hz - late_s[:, None]
+            for act in emission:
+                sent_s = act(shot, paths, received_s)
+            for partial, each_hz in enumerate(frequency_hz):
+                turn = 2 * math.pi * (each_hz * shot.time_s % 1.0 + each_hz * sent_s) + np.angle(amplitude[partial])
+                part += abs(amplitude[partial]) * np.einsum("pm,pmt->mt", response[..., partial], np.sin(turn))
+
+    def _add_at_rest(self, signals: Floats, time_s: Floats) -> None:
+        """Add the tone of a source at rest: each partial has one amplitude and phase per microphone."""
+        shot = self.tone.shot
+        delay_s = self.tone.paths.length_m / shot.speed_m_s + gains(shot, self.tone.active)[1]
+        frequency_hz, amplitude, response = self._partials()
+        for partial, each_hz in enumerate(frequency_hz):
+            # Whole periods of a long time are removed before they cost precision.
+            turns = (each_hz * (shot.time_s - delay_s)) % 1.0
+            heard = amplitude[partial] * np.sum(response[..., partial] * np.exp(2j * math.pi * turns), axis=0)
+            swing_rad = 2 * math.pi * each_hz * time_s
+            signals += np.outer(heard.real, np.sin(swing_rad)) + np.outer(heard.imag, np.cos(swing_rad))
+
+    def _partials(self) -> tuple[Floats, NDArray[np.complex128], Floats]:
+        """Return frequencies and amplitudes at 1 m of the partials, and the response of the paths to each."""
+        frequency_hz, amplitude = self.tone.source.partials()
+        return frequency_hz, amplitude, self.tone.response(frequency_hz)
 
 
-def _noise_of(shot: Snapshot, noise: Noise, seed: tuple[int, ...]) -> OverlappingFrames:
-    """Return the noise of one source, equal at all microphones except for delay and ``1 / r``.
-
-    Each frame is delayed together with its window, so that distant microphones receive the same noise.
-    """
-    way, rate_hz = _way_from(shot, noise), shot.sensor.recording.sample_rate_hz
-    apart_m = way.length_m[0] - np.linalg.norm(way.transmitter.position_m - shot.receiver.centre_m)
-    late_samples = apart_m / shot.speed_m_s * rate_hz
-    amplitude = 10 ** (noise.level_db / 20) * spreading(way)[0]
-    margin = math.ceil(np.abs(late_samples).max()) + 1
-    n_fft = int(scipy.fft.next_fast_len(FRAME + 2 * margin, real=True))
-    bins = band_bins(noise.band_hz, rate_hz)
-    alone = np.ones((len(bins), 1, 1))
-    turned = np.exp(-2j * math.pi / n_fft * (late_samples[:, None] + margin) * np.arange(n_fft // 2 + 1))
-
-    def heard(random: np.random.Generator) -> NDArray[np.float64]:
-        spectrum = scipy.fft.rfft(drawn(random, bins, alone)[0] * window(), n_fft)
-        return np.asarray(amplitude[:, None] * scipy.fft.irfft(spectrum * turned, n_fft))
-
-    return OverlappingFrames(seed, heard, margin=margin)
-
-
-def _calls_of(shot: Snapshot, sonar: Sonar) -> NDArray[np.float64]:
-    """Return the start times of another sonar's calls that arrive during the record: (call,) float64.
-
-    Times are in seconds after the start of the record, and often negative. Only the direct sound of these calls is
-    modelled, because their echoes are far weaker.
-    """
-    way_s = float(np.mean(_way_from(shot, sonar).length_m)) / shot.speed_m_s
-    earliest_s = shot.time_s - way_s - sonar.call.duration_s - sonar.offset_s
-    latest_s = shot.time_s - way_s + shot.sensor.recording.duration_s - sonar.offset_s
-    numbers = np.arange(max(0, math.ceil(earliest_s / sonar.period_s)), math.floor(latest_s / sonar.period_s) + 1)
-    return np.asarray(sonar.offset_s + numbers * sonar.period_s - shot.time_s)
+def _moves(source: SourceInScene[Tone]) -> bool:
+    """Return True if a source, its mirror images or the microphones move."""
+    ends = source.paths.transmitter, source.paths.receiver
+    return any(np.any(end.velocity_m_s) for end in ends) or bool(np.any(ends[1].spin_rad_s))
 
 
 def estimate(sight: Sight) -> Estimate | None:
     """Find the loudest of tones, noises and other sonars."""
-    scene, shot = sight.shot.scene, sight.shot
-    if not (scene.tones or scene.noises or scene.sonars):
+    middle = sight.shot.at_centre()
+    sources = all_sources(middle, sight.active)
+    if not sources:
         return None
     total, loudest, reason = 0.0, 0.0, "no source reaches the band"
-    for kind in ("tones", "noises", "sonars"):
-        for number, source in enumerate(getattr(scene, kind)):
-            paths = _way_from(shot, source)
-            amplitude = float(10 ** (source.level_db / 20) * np.mean(spreading(paths)))
-            direction = -np.mean(paths.arriving, axis=1) @ paths.receiver.axes[0].T
-            level = float(sight.coverage(direction)[0])
-            if kind == "tones":
-                level *= sight.of_tone(amplitude, source.frequency_hz)
-            elif kind == "noises":
-                level *= sight.of_white_noise(20 * math.log10(amplitude), coherent=True, band_hz=source.band_hz)
-            else:
-                level *= amplitude * sight.likeness(source.call) * _part_in_window(sight, source)
-            total += level
-            if level > loudest:
-                loudest = level
-                level_db = 20 * math.log10(loudest / sight.floor)
-                reason = f"{kind}[{number}] reaches {level_db:+.1f} dB relative to the weakest reflector"
+    for source in sources:
+        level = _level_in_image(sight, source)
+        total += level
+        if level > loudest:
+            loudest = level
+            level_db = 20 * math.log10(loudest / sight.floor)
+            reason = f"{source.name} reaches {level_db:+.1f} dB relative to the weakest reflector"
     return Estimate(change_db=change_db(np.array([total]), np.array([sight.quietest])), reason=reason)
 
 
-def _part_in_window(sight: Sight, sonar: Sonar) -> float:
+def _level_in_image(sight: Sight, source: SourceInScene[AnySource]) -> float:
+    """Return the highest amplitude of a source in the image."""
+    paths = source.paths
+    if not len(paths):
+        return 0.0
+    frequency_hz, power = source.spectrum
+    power = power * source.response(frequency_hz)[:, 0] ** 2  # (path, frequency)
+    if isinstance(source.source, Tone):
+        parts = np.sqrt(2 * np.sum(power, axis=0))
+        level = sum(sight.of_tone(float(part), float(each)) for part, each in zip(parts, frequency_hz, strict=True))
+    elif isinstance(source.source, Noise):
+        dbfs = 10 * math.log10(max(float(power.sum()), 1e-40))
+        level = sight.of_white_noise(dbfs, coherent=True, band=(frequency_hz, np.sum(power, axis=0)))
+    else:
+        amplitude = math.sqrt(2 * float(power.sum()))
+        level = amplitude * sight.likeness(source.source.call) * _part_in_window(sight, source, source.source)
+    direction = np.einsum("pkx,px->pk", paths.receiver.axes, -paths.arriving[:, 0])
+    return level * float(np.max(sight.coverage(direction)))
+
+
+def _part_in_window(sight: Sight, source: SourceInScene[AnySource], sonar: Sonar) -> float:
     """Return the largest fraction of another sonar's call that reaches into the image of any measurement."""
-    scene, shot = sight.shot.scene, sight.shot
-    if scene.count > 1:
+    if sight.shot.scene.count > 1:
         return 1.0  # its calls are not synchronised, so at least one measurement contains one
-    way = _way_from(shot, sonar)
-    calls_s = _calls_of(shot, sonar) + np.mean(way.length_m) / shot.speed_m_s
-    return float(np.max(sight.reach(calls_s), initial=0.0))
+    delays_s = [source.arrival(start_s)[0].mean() for start_s in _calls_of(source, sonar)]
+    return float(np.max(sight.reach(np.array(delays_s)), initial=0.0))

@@ -1,5 +1,7 @@
 """White noise of each microphone."""
 
+from collections.abc import Set as AbstractSet
+
 from ertis_numba.simulation.estimates import Estimate, noise
 from ertis_numba.simulation.image_estimate import Sight
 from ertis_numba.simulation.sensors import Sensor
@@ -17,7 +19,7 @@ def noise_rms(sensor: Sensor) -> float:
     return 0.0 if dbfs is None else float(10 ** (dbfs / 20))
 
 
-def loudness(shot: Snapshot) -> tuple[float, float]:
+def loudness(shot: Snapshot, active: AbstractSet[str]) -> tuple[float, float]:
     """Return no peak, and the power of the noise."""
     dbfs = shot.sensor.electronics.noise_dbfs
     return 0.0, 0.0 if dbfs is None else 10 ** (dbfs / 10)

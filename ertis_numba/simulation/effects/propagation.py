@@ -11,7 +11,9 @@ __all__ = ["times"]
 Floats = NDArray[np.float64]
 
 
-def times(shot: Snapshot, paths: Paths, times: tuple[Floats, Floats | None]) -> tuple[Floats, Floats | None]:
+def times(
+    shot: Snapshot, paths: Paths, sent_s: float, times: tuple[Floats, Floats | None]
+) -> tuple[Floats, Floats | None]:
     """Return delays later by those of the paths, ``(r₁ + r₂) / c``: (path, mic) float64, in seconds.
 
     Delays are not rounded to samples. The factor ``exp(-2πi f τ)`` in the spectrum delays the call by any fraction of a
