@@ -30,6 +30,7 @@ from .errors import (
 )
 from .figures import plot as plot
 from .frames import (
+    AcousticMap as AcousticMap,
     Beams as Beams,
     Energyscape as Energyscape,
     Measurement as Measurement,
@@ -67,6 +68,7 @@ from .network.central_client import CentralClient as CentralClient
 from .network.keys import ClientKeys as ClientKeys, KeyPair as KeyPair, ServerKeys as ServerKeys
 from .network.sensor_node import SensorNode as SensorNode
 from .network.subscriber import Subscriber as Subscriber
+from .passive import AcousticCamera as AcousticCamera
 from .pipeline import Pipeline as Pipeline
 from .settings import Settings as Settings, presets as presets
 from .simulation.render import Simulator as Simulator, render as render

@@ -1,5 +1,6 @@
 """Data that flow through the system, such as measurements, signals, beams, energyscapes and point clouds."""
 
+from ertis_numba.frames._acoustic_map import AcousticMap, Loudest
 from ertis_numba.frames._beams import Beams
 from ertis_numba.frames._energyscape import Energyscape
 from ertis_numba.frames._gap import SequenceGap
@@ -15,9 +16,11 @@ __all__ = [
     "FREE_BELOW",
     "MAX_CELLS",
     "OCCUPIED_ABOVE",
+    "AcousticMap",
     "Beams",
     "Behaviour",
     "Energyscape",
+    "Loudest",
     "Measurement",
     "MicrophoneSignals",
     "OccupancyMap",

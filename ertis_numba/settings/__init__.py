@@ -9,6 +9,7 @@ from ertis_numba.settings.accuracy import ERROR_PRESETS_DB, MAX_FOCAL_ZONES, Acc
 from ertis_numba.settings.array import Array
 from ertis_numba.settings.array_windows import ArrayWindow, parse_window
 from ertis_numba.settings.call import MAX_CALL_SAMPLES, Call
+from ertis_numba.settings.passive import MAP_METHODS, MAX_BANDS, MapMethod, Passive
 from ertis_numba.settings.presets import PRESETS, PresetKind, preset_tables, preset_text, presets
 from ertis_numba.settings.processing import STAGES, Processing
 from ertis_numba.settings.ranges import fit_ranges
@@ -19,6 +20,8 @@ from ertis_numba.settings.waveform import MAX_WAVEFORM_SAMPLES
 __all__ = [
     "ENCODINGS",
     "ERROR_PRESETS_DB",
+    "MAP_METHODS",
+    "MAX_BANDS",
     "MAX_CALL_SAMPLES",
     "MAX_FOCAL_ZONES",
     "MAX_WAVEFORM_SAMPLES",
@@ -29,6 +32,8 @@ __all__ = [
     "Array",
     "ArrayWindow",
     "Call",
+    "MapMethod",
+    "Passive",
     "PresetKind",
     "Processing",
     "Recording",

@@ -31,6 +31,9 @@ class Processing(TomlTable, frozen=True, kw_only=True):
 
     Attributes
     ----------
+    mode : {"auto", "active", "passive"}, default "auto"
+        ``active`` makes images of echoes, and ``passive`` acoustic maps of other sound. ``auto`` makes acoustic maps of
+        measurements without a call only.
     method : {"fast", "paper"}, default "fast"
         ``fast`` uses analytic signals and computes beams at the output ranges only. ``paper`` is the algorithm of the
         2019 paper, for comparison.
@@ -101,6 +104,7 @@ class Processing(TomlTable, frozen=True, kw_only=True):
         delay-and-sum.
     """
 
+    mode: Literal["auto", "active", "passive"] = "auto"
     method: Literal["fast", "paper"] = "fast"
     directions: str | tuple[tuple[float, float], ...] = "90"
     azimuth_limits_deg: tuple[float, float] = (-90.0, 90.0)
@@ -182,6 +186,7 @@ class Processing(TomlTable, frozen=True, kw_only=True):
                 f"processing.directions has shape {shape}; give azimuth and elevation in degrees, of shape (n, 2)"
             )
         super().__post_init__()
+        checks.choice("processing.mode", self.mode, ("auto", "active", "passive"))
         checks.choice("processing.method", self.method, ("fast", "paper"))
         self._check_directions()
         checks.interval("processing.azimuth_limits_deg", self.azimuth_limits_deg, -180.0, 180.0)

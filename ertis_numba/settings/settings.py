@@ -12,6 +12,7 @@ from ertis_numba.errors import ArgumentError, SettingsError
 from ertis_numba.settings.accuracy import Accuracy
 from ertis_numba.settings.array import Array
 from ertis_numba.settings.call import Call
+from ertis_numba.settings.passive import Passive
 from ertis_numba.settings.presets import preset_tables
 from ertis_numba.settings.processing import Processing
 from ertis_numba.settings.ranges import fit_ranges, max_decimation
@@ -43,6 +44,8 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
         Processing of a measurement into an image; 90 azimuths and ranges from 0.5 to 5 m by default.
     accuracy : Accuracy
         Error budget of the image, -35 dB by default, and parts of the plan that the planner shall not choose.
+    passive : Passive
+        Maps of sound that the sensor did not emit; third octaves from 10 to 80 kHz by default.
 
     Raises
     ------
@@ -65,6 +68,7 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
     air: Air = Air()
     processing: Processing = Processing()
     accuracy: Accuracy = Accuracy()
+    passive: Passive = Passive()
 
     max_bytes: ClassVar[int] = 262_144  # An array of 1024 microphones needs 170,000 bytes …
     max_items: ClassVar[int] = 30_000  # … and 16,500 items.

@@ -47,10 +47,14 @@ def demodulation(
     memory: Memory,
     *,
     taps: NDArray[np.int16] | NDArray[np.int32],
+    factor: int | None = None,
 ) -> Demodulate:
-    """Return the demodulation stage for the encoding of the recording, PDM or PCM."""
+    """Return the demodulation stage for the encoding of the recording, PDM or PCM.
+
+    ``factor`` is the number of recorded samples per signal sample, by default ``settings.decimation``.
+    """
     channels = np.flatnonzero(layout.enabled).astype(np.int32)
-    recording, factor = settings.recording, settings.decimation
+    recording, factor = settings.recording, factor or settings.decimation
     if recording.is_pdm:
         return DemodulatePdm(channels, window, kernels, memory, taps=taps, factor=factor)
     return FilterPcm(channels, window, kernels, memory, taps=taps, factor=factor, full_scale=recording.full_scale)

@@ -1,0 +1,173 @@
+"""Acoustic maps: sound power over direction and frequency band."""
+
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba import checks
+from ertis_numba.angles import DegreesFromRadians
+from ertis_numba.errors import ArgumentError
+from ertis_numba.frames._replacing import replaced
+from ertis_numba.frames._stamp import Stamp
+from ertis_numba.settings import Settings
+
+__all__ = ["AcousticMap", "Loudest"]
+
+
+class Loudest(NamedTuple):
+    """Loudest direction of a band.
+
+    Attributes
+    ----------
+    band_hz : (low, high)
+        Edges of the band in hertz.
+    azimuth_rad, elevation_rad : float
+        Direction in the sensor frame.
+    level_dbfs : float
+        Level at the array in dBFS.
+    """
+
+    band_hz: tuple[float, float]
+    azimuth_rad: float
+    elevation_rad: float
+    level_dbfs: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AcousticMap(DegreesFromRadians):
+    """Sound power from each direction, in bands of frequencies.
+
+    The properties ``azimuth_deg`` and ``elevation_deg`` are the angles in degrees.
+
+    Attributes
+    ----------
+    power : (direction, band) float32
+        Mean square of the sound from a direction at the array; full scale is 1, so that a full-scale tone has ½. For
+        the method ``music``, a number without a level.
+    azimuth_rad, elevation_rad : (direction,) float64
+        Directions in the sensor frame: x is forward, azimuth counts towards y, elevation towards z.
+    band_hz : (band, 2) float64
+        Lower and upper edge of each band in hertz.
+    settings : Settings
+        Settings of the map; those of its method are in ``settings.passive``.
+    stamp : Stamp
+        Origin of the last measurement.
+    n_measurements : int, default 1
+        Measurements whose powers were averaged.
+    n_blocks : int, default 1
+        Blocks of samples whose powers were averaged.
+    masked_s : float, default 0
+        Time at the start of each measurement that was left out, because the sensor emitted its call.
+
+    Raises
+    ------
+    ArgumentError
+        An attribute has another type, or the shapes do not agree.
+
+    Examples
+    --------
+    >>> import ertis_numba as ertis
+    >>> with ertis.open_recording("reflectors.h5") as recording:
+    ...     found = ertis.AcousticCamera(recording.settings).process(recording[0])
+    >>> found.power.shape == (len(found.azimuth_rad), len(found.band_hz))
+    True
+    """
+
+    power: NDArray[np.float32]
+    azimuth_rad: NDArray[np.float64]
+    elevation_rad: NDArray[np.float64]
+    band_hz: NDArray[np.float64]
+    settings: Settings
+    stamp: Stamp = Stamp()
+    n_measurements: int = 1
+    n_blocks: int = 1
+    masked_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("power", "azimuth_rad", "elevation_rad", "band_hz"):
+            checks.instance(name, getattr(self, name), np.ndarray, "numpy.asarray makes")
+        checks.instance("settings", self.settings, Settings, "a recording holds, or Settings.from_preset returns")
+        checks.shape("elevation_rad", self.elevation_rad.shape, self.azimuth_rad.shape)
+        checks.shape("band_hz", self.band_hz.shape, (len(self.band_hz), 2))
+        checks.shape("power", self.power.shape, (*self.azimuth_rad.shape, len(self.band_hz)))
+        checks.integer("n_measurements", self.n_measurements, 1)
+        checks.integer("n_blocks", self.n_blocks, 1)
+        checks.between("masked_s", self.masked_s, 0.0, math.inf)
+
+    @property
+    def level_dbfs(self) -> NDArray[np.float32]:
+        """Level at the array in dBFS: (direction, band) float32. A full-scale tone has -3; silence has -inf."""
+        with np.errstate(divide="ignore"):
+            return np.asarray(10 * np.log10(self.power), np.float32)
+
+    @property
+    def has_level(self) -> bool:
+        """True unless the method is ``music``, whose numbers find directions only."""
+        return self.settings.passive.method != "music"
+
+    def in_band(self, low_hz: float, high_hz: float) -> NDArray[np.float32]:
+        """Return the power from each direction in the bands within limits.
+
+        Parameters
+        ----------
+        low_hz, high_hz : float
+            Limits of the bands' centres, in hertz.
+
+        Returns
+        -------
+        (direction,) float32
+
+        Raises
+        ------
+        ArgumentError
+            No band lies within the limits.
+        """
+        centre_hz = np.sqrt(self.band_hz.prod(axis=1))
+        chosen = (centre_hz >= low_hz) & (centre_hz <= high_hz)
+        if not chosen.any():
+            raise ArgumentError(
+                f"no band lies within {low_hz:g} to {high_hz:g} Hz; the map has bands from {self.band_hz.min():g} to "
+                f"{self.band_hz.max():g} Hz"
+            )
+        return np.asarray(self.power[:, chosen].sum(axis=1), np.float32)
+
+    def loudest(self) -> list[Loudest]:
+        """Return the loudest direction of each band.
+
+        Returns
+        -------
+        list of Loudest
+        """
+        level_dbfs = self.level_dbfs
+        places = np.argmax(self.power, axis=0)
+        return [
+            Loudest(
+                (float(low_hz), float(high_hz)),
+                float(self.azimuth_rad[place]),
+                float(self.elevation_rad[place]),
+                float(level_dbfs[place, band]),
+            )
+            for band, (place, (low_hz, high_hz)) in enumerate(zip(places, self.band_hz, strict=True))
+        ]
+
+    def replace(self, **changes: Any) -> Self:
+        """Return a copy with some fields changed.
+
+        Parameters
+        ----------
+        **changes
+            New values of fields, by name.
+
+        Returns
+        -------
+        AcousticMap
+
+        Raises
+        ------
+        ArgumentError
+            There is no such field, or the shapes do not agree.
+        """
+        return replaced("an acoustic map", self, changes)

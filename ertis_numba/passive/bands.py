@@ -1,0 +1,96 @@
+"""Bands of frequencies, and the bins of a spectrum that belong to them."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.errors import ArgumentError
+from ertis_numba.settings import Passive
+
+__all__ = ["band_edges", "bin_shares", "octave_bands"]
+
+_ROUNDING = 1e-6  # relative, so that limits include the bands whose edges they name
+
+
+def octave_bands(low_hz: float, high_hz: float, *, fraction: int = 3) -> NDArray[np.float64]:
+    """Return the octaves, or fractions of them, that lie between two frequencies.
+
+    Exact centres are ``1000 · G^(k / fraction)`` with ``G = 10^0.3``, and edges lie half of a band away (IEC
+    61260-1:2014, equations 2 and 4).
+
+    Parameters
+    ----------
+    low_hz, high_hz : float
+        Limits in hertz.
+    fraction : {1, 3}
+        Bands of an octave.
+
+    Returns
+    -------
+    (band, 2) float64
+        Edges in hertz.
+
+    Examples
+    --------
+    >>> from ertis_numba.passive import octave_bands
+    >>> octave_bands(30e3, 50e3).round().tolist()
+    [[35481.0, 44668.0]]
+    """
+    step = 0.3 / fraction
+    lowest = math.ceil((math.log10(low_hz / 1e3) - _ROUNDING) / step + 0.5)
+    highest = math.floor((math.log10(high_hz / 1e3) + _ROUNDING) / step - 0.5)
+    centres = 1e3 * 10.0 ** (step * np.arange(lowest, highest + 1))
+    return np.stack([centres * 10 ** (-step / 2), centres * 10 ** (step / 2)], axis=1)
+
+
+def band_edges(passive: Passive, *, highest_hz: float) -> NDArray[np.float64]:
+    """Return the edges of the bands that settings describe.
+
+    Parameters
+    ----------
+    passive : Passive
+    highest_hz : float
+        Highest frequency of the record, in hertz. Named bands above it are left out.
+
+    Returns
+    -------
+    (band, 2) float64
+
+    Raises
+    ------
+    ArgumentError
+        A listed band reaches beyond the highest frequency, or no named band remains.
+    """
+    given = passive.bands_hz
+    if isinstance(given, str):
+        low_hz, high_hz = passive.limits_hz
+        bands = octave_bands(low_hz, min(high_hz, highest_hz), fraction=1 if given == "octaves" else 3)
+        if not len(bands):
+            raise ArgumentError(
+                f"passive.limits_hz {low_hz:g} to {high_hz:g} contains none of the {given.replace('_', ' ')} up to "
+                f"{highest_hz:g} Hz, the highest frequency of the record; give wider limits, or your own bands_hz"
+            )
+        return bands
+    for number, (_, high_hz) in enumerate(given):
+        if high_hz > highest_hz:
+            raise ArgumentError(
+                f"passive.bands_hz[{number}] ends at {high_hz:g} Hz, but the record reaches only {highest_hz:g} Hz; "
+                "give a lower edge"
+            )
+    return np.array(given, np.float64)
+
+
+def bin_shares(bands_hz: NDArray[np.float64], frequency_hz: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return the share of each bin that lies within each band: (band, bin) float32.
+
+    Parameters
+    ----------
+    bands_hz : (band, 2) float64
+    frequency_hz : (bin,) float64
+        Centres of bins with equal spacing, two or more.
+    """
+    spacing_hz = frequency_hz[1] - frequency_hz[0]
+    low_hz, high_hz = bands_hz[:, :1], bands_hz[:, 1:]
+    inside = np.minimum(high_hz, frequency_hz + spacing_hz / 2) - np.maximum(low_hz, frequency_hz - spacing_hz / 2)
+    return np.asarray(np.clip(inside / spacing_hz, 0, 1), np.float32)

@@ -1,0 +1,298 @@
+"""Acoustic camera: maps of sound power over direction and frequency, from passive measurements."""
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any, Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba import checks, kernels
+from ertis_numba.air import sound_speed_m_s
+from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.frames import AcousticMap, Measurement, Stamp
+from ertis_numba.geometry import (
+    Grid,
+    direction_grid,
+    far_field_delays,
+    microphones,
+    spherical_delays,
+    unit_vectors,
+)
+from ertis_numba.passive.bands import bin_shares
+from ertis_numba.passive.block_spectra import BlockSpectra
+from ertis_numba.passive.cross_spectrum import CrossSpectrum
+from ertis_numba.passive.methods import METHODS, Waves
+from ertis_numba.settings import Settings
+
+__all__ = ["AcousticCamera", "is_passive"]
+
+_TURN: Final = 2.0**32
+
+
+def is_passive(settings: Settings, stamp: Stamp) -> bool:
+    """Return True if a measurement shall become an acoustic map, and False if an image of echoes.
+
+    Parameters
+    ----------
+    settings : Settings
+        Their ``processing.mode`` decides.
+    stamp : Stamp
+        Says whether the sensor emitted its call, for the mode ``auto``.
+
+    Examples
+    --------
+    >>> from ertis_numba import Settings, Stamp
+    >>> from ertis_numba.passive import is_passive
+    >>> is_passive(Settings(), Stamp(behaviour="passive")), is_passive(Settings(), Stamp())
+    (True, False)
+    """
+    mode = settings.processing.mode
+    return mode == "passive" or (mode == "auto" and stamp.behaviour == "passive")
+
+
+class AcousticCamera:
+    """Maker of acoustic maps from the measurements of one sensor.
+
+    Signals are cut into blocks that overlap by half. Their spectra, under a Hann window, give the cross-spectral matrix
+    of the microphones, which is averaged over blocks and measurements. A map is the power of this matrix for the wave
+    from each direction. Measurements with a call are accepted; the time of the call is left out. Objects are for one
+    thread.
+
+    Parameters
+    ----------
+    settings : Settings or str or Path
+        Settings, or the path of a TOML file with them. Directions are those of ``processing``, and all else that
+        concerns maps is in ``passive``.
+    device : {"auto", "cpu", "cuda", "numpy"}
+        Compute device, as for `Pipeline`.
+    threads : int, optional
+        Number of threads; all cores by default.
+
+    Attributes
+    ----------
+    settings : Settings
+    device : str
+        Compute device in use.
+    grid : Grid
+        Directions of the maps.
+    band_hz : (band, 2) float64
+        Edges of the bands in hertz.
+    frequency_hz : (bin,) float64
+        Frequencies at which powers are computed, in hertz.
+    n_measurements : int
+        Measurements since the last `reset`.
+
+    Raises
+    ------
+    ArgumentError
+        The bands exceed the record, or settings cannot be used.
+    DeviceError
+        The device is not available.
+
+    Examples
+    --------
+    >>> import ertis_numba as ertis
+    >>> with ertis.open_recording("reflectors.h5") as recording:
+    ...     camera = ertis.AcousticCamera(recording.settings)
+    ...     found = camera.process(recording[0])
+    >>> found.power.shape == (len(camera.grid), len(camera.band_hz))
+    True
+    """
+
+    def __init__(self, settings: Settings | str | Path, device: str = "auto", threads: int | None = None) -> None:
+        if isinstance(settings, str | Path):
+            settings = Settings.load(settings)
+        checks.instance("settings", settings, Settings, "a recording holds, or Settings.from_preset returns")
+        kernel_set = kernels.load(device)
+        self._threads = kernel_set.max_threads if threads is None else threads
+        with kernel_set.threads(self._threads):  # refuses an impossible number
+            pass
+        self._kernels, self.settings, self.device = kernel_set, settings, kernel_set.device
+        self._require_sources()
+        self.grid: Grid = direction_grid(settings.processing)
+        self._blocks = BlockSpectra(settings, kernel_set, threads=self._threads)
+        self.band_hz: NDArray[np.float64] = self._blocks.bands_hz
+        self.frequency_hz: NDArray[np.float64] = self._blocks.frequency_hz
+        self._shares = bin_shares(self.band_hz, self.frequency_hz)
+        delay_s = self._delays().T.copy()
+        steps = np.rint(delay_s * self._blocks.spacing_hz * _TURN).astype(np.int64).astype(np.uint32)
+        self._memory = kernel_set.memory()
+        self._lane = self._memory.lane()
+        self._steps = self._memory.table(np.ascontiguousarray(steps))
+        self._bins = self._memory.table(self._blocks.bins)
+        self._powers = self._memory.zeros((len(self._blocks.bins), len(self.grid)), np.float32)
+        self._waves = Waves(delay_s, self._steer)
+        self._masked_s = 0.0
+        self.reset()
+
+    def add(self, measurement: Measurement) -> None:
+        """Add a measurement to the mean.
+
+        Parameters
+        ----------
+        measurement : Measurement
+
+        Raises
+        ------
+        DataError
+            Its array, call, record or air are not those of the settings, or no sound is left without its call.
+        """
+        checks.instance("measurement", measurement, Measurement, "a recording holds")
+        masked = measurement.stamp.behaviour == "active"
+        products, n_blocks = self._blocks.products(measurement, masked=masked)
+        self._sums += products
+        self._n_blocks += n_blocks
+        self._masked_s = max(self._masked_s, self._blocks.masked_s if masked else 0.0)
+        self._stamp = measurement.stamp
+        self.n_measurements += 1
+
+    def cross_spectrum(self) -> CrossSpectrum:
+        """Return the cross-spectral matrix of the measurements since the last `reset`.
+
+        Returns
+        -------
+        CrossSpectrum
+
+        Raises
+        ------
+        DataError
+            There is no measurement.
+        """
+        if not self.n_measurements:
+            raise DataError("the acoustic camera has no measurement; call add first")
+        matrix = (self._sums / self._n_blocks).astype(np.complex64)
+        return CrossSpectrum(matrix, self.frequency_hz, self._n_blocks)
+
+    def powers(self) -> NDArray[np.float32]:
+        """Return the power from each direction in each bin: (bin, direction) float32.
+
+        Raises
+        ------
+        DataError
+            There is no measurement, or too few blocks for the method.
+        """
+        passive = self.settings.passive
+        return METHODS[passive.method](self.cross_spectrum(), self._waves, passive)
+
+    def map(self) -> AcousticMap:
+        """Return the map of the measurements since the last `reset`.
+
+        Returns
+        -------
+        AcousticMap
+
+        Raises
+        ------
+        DataError
+            There is no measurement, or too few blocks for the method.
+        """
+        power = (self._shares @ self.powers()).T
+        return AcousticMap(
+            np.ascontiguousarray(power),
+            self.grid.azimuth_rad,
+            self.grid.elevation_rad,
+            self.band_hz,
+            self.settings,
+            self._stamp,
+            self.n_measurements,
+            self._n_blocks,
+            self._masked_s,
+        )
+
+    def reset(self) -> None:
+        """Forget all measurements."""
+        n_mics = self._waves.delay_s.shape[0]
+        self._sums: NDArray[Any] = np.zeros((len(self.frequency_hz), n_mics, n_mics), np.complex128)
+        self._n_blocks = self.n_measurements = 0
+        self._masked_s = 0.0
+        self._stamp = Stamp()
+
+    def process(self, measurement: Measurement) -> AcousticMap:
+        """Return the map of one measurement; those added before are forgotten.
+
+        Parameters
+        ----------
+        measurement : Measurement
+
+        Returns
+        -------
+        AcousticMap
+
+        Raises
+        ------
+        DataError
+            As for `add` and `map`.
+        """
+        self.reset()
+        self.add(measurement)
+        return self.map()
+
+    def process_many(self, measurements: Iterable[Measurement]) -> Iterator[AcousticMap]:
+        """Return an iterator over maps, each of ``passive.averages`` measurements; the last may have fewer.
+
+        Parameters
+        ----------
+        measurements : iterable of Measurement
+
+        Returns
+        -------
+        iterator of AcousticMap
+
+        Raises
+        ------
+        DataError
+            As for `add` and `map`.
+        """
+        self.reset()
+        for measurement in measurements:
+            self.add(measurement)
+            if self.n_measurements == self.settings.passive.averages:
+                yield self.map()
+                self.reset()
+        if self.n_measurements:
+            yield self.map()
+
+    def close(self) -> None:
+        """Free the memory of the device."""
+        self._blocks.close()
+        self._memory.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _steer(self, matrices: NDArray[np.complex64]) -> NDArray[np.float32]:
+        """Return the quadratic form of matrices for the wave from each direction: (bin, direction) float32."""
+        out = np.empty((len(matrices), len(self.grid)), np.float32)
+        with self._kernels.threads(self._threads), self._lane.entered():
+            here = self._lane.send(np.ascontiguousarray(matrices))
+            self._kernels.steer_power(here, self._steps, self._bins, self._powers)
+            self._lane.fetch(self._powers, out)
+            self._lane.wait()
+        return out
+
+    def _delays(self) -> NDArray[np.float64]:
+        """Return the delays of the sound from each direction, with those of the calibration: (direction, mic)."""
+        settings = self.settings
+        layout = microphones(settings.array)
+        directions = unit_vectors(self.grid.azimuth_rad, self.grid.elevation_rad)
+        speed_m_s, focus_m = sound_speed_m_s(settings.air), settings.passive.focus_m
+        if focus_m is None:
+            delay_s = far_field_delays(layout.enabled_positions_m, directions, sound_speed_m_s=speed_m_s)
+        else:
+            delay_s = spherical_delays(
+                layout.enabled_positions_m, directions, range_m=focus_m, sound_speed_m_s=speed_m_s
+            )
+        return delay_s + layout.delay_s[layout.enabled]
+
+    def _require_sources(self) -> None:
+        """Refuse as many sources as microphones."""
+        passive, n_mics = self.settings.passive, int(microphones(self.settings.array).enabled.sum())
+        if passive.method == "music" and passive.n_sources >= n_mics:
+            raise ArgumentError(
+                f"passive.n_sources is {passive.n_sources}, but the array has {n_mics} microphones; give less than "
+                f"{n_mics}"
+            )

@@ -1,0 +1,124 @@
+"""Methods of acoustic maps: power from each direction, from cross-spectral matrices.
+
+``v`` is the wave from a direction, whose M elements have a magnitude of 1, and ``C`` the cross-spectral matrix of a
+bin. Each method but CLEAN-SC is the quadratic form of a transformed matrix, followed by a scalar function.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.errors import DataError
+from ertis_numba.passive.clean_sc import clean_sc
+from ertis_numba.passive.cross_spectrum import CrossSpectrum
+from ertis_numba.settings import MapMethod, Passive
+
+__all__ = ["METHODS", "Waves"]
+
+Matrices = NDArray[np.complex64]
+Powers = NDArray[np.float32]
+
+_LEAST: Final = np.float32(1e-30)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Waves:
+    """Waves from each direction at the frequencies of a spectrum.
+
+    Attributes
+    ----------
+    delay_s : (mic, direction) float64
+    steer : callable
+        Returns the quadratic form of matrices, ``v^H C v``: (bin, direction) float32.
+    """
+
+    delay_s: NDArray[np.float64]
+    steer: Callable[[Matrices], Powers]
+
+    def at(self, frequency_hz: float) -> NDArray[np.complex64]:
+        """Return the waves at a frequency: (mic, direction) complex64."""
+        return np.asarray(np.exp(-2j * np.pi * frequency_hz * self.delay_s), np.complex64)
+
+
+Method = Callable[[CrossSpectrum, Waves, Passive], Powers]
+
+
+def delay_and_sum(spectrum: CrossSpectrum, waves: Waves, passive: Passive) -> Powers:
+    """Return ``v^H C v / M²``, or without the diagonal of C ``v^H C v / (M² − M)``, at least 0."""
+    n_mics = spectrum.matrix.shape[1]
+    if not passive.diagonal_removal:
+        return np.asarray(waves.steer(spectrum.matrix) / n_mics**2, np.float32)
+    powers = np.maximum(waves.steer(_hollow(spectrum.matrix)), 0)
+    return np.asarray(powers / max(n_mics**2 - n_mics, 1), np.float32)
+
+
+def functional(spectrum: CrossSpectrum, waves: Waves, passive: Passive) -> Powers:
+    """Return ``(v^H C^(1/ν) v / M)^ν / M`` for the order ν (R. P. Dougherty, 2014)."""
+    values, vectors = _eigen(spectrum)
+    order, n_mics = passive.functional_order, spectrum.matrix.shape[1]
+    powers = waves.steer(_matrices(np.maximum(values, 0) ** (1 / order), vectors))
+    return np.asarray(np.maximum(powers / n_mics, 0) ** order / n_mics, np.float32)
+
+
+def capon(spectrum: CrossSpectrum, waves: Waves, passive: Passive) -> Powers:
+    """Return ``1 / (v^H (C + loading · mean power)^−1 v)`` (J. Capon, 1969)."""
+    values, vectors = _eigen(spectrum)
+    mean = np.maximum(values.mean(axis=1, keepdims=True), _LEAST)
+    loaded = np.maximum(values, 0) + passive.diagonal_loading * mean
+    powers = waves.steer(_matrices(mean / loaded, vectors))
+    return np.asarray(mean / np.maximum(powers, _LEAST), np.float32)
+
+
+def music(spectrum: CrossSpectrum, waves: Waves, passive: Passive) -> Powers:
+    """Return ``M / (v^H N N^H v)``, where N holds the eigenvectors beyond those of the sources (R. Schmidt, 1986)."""
+    n_mics, n_sources = spectrum.matrix.shape[1], passive.n_sources
+    if spectrum.n_blocks <= n_sources:
+        raise DataError(
+            f"passive.method is 'music' with {n_sources} sources, which needs more than {n_sources} blocks of samples, "
+            f"but there are {spectrum.n_blocks}; give a larger passive.averages, or wider bands"
+        )
+    _, vectors = _eigen(spectrum)
+    is_noise = np.arange(n_mics) < n_mics - n_sources
+    powers = waves.steer(_matrices(np.broadcast_to(is_noise, vectors.shape[:2]).astype(float), vectors))
+    return np.asarray(n_mics / np.maximum(powers, 1e-6 * n_mics), np.float32)
+
+
+def clean(spectrum: CrossSpectrum, waves: Waves, passive: Passive) -> Powers:
+    """Return the powers of the sources that CLEAN-SC finds; see `clean_sc`."""
+    powers = delay_and_sum(spectrum, waves, passive)
+    for number, frequency_hz in enumerate(spectrum.frequency_hz):
+        wave = waves.at(float(frequency_hz))
+        powers[number] = clean_sc(spectrum.matrix[number], wave, powers[number], hollow=passive.diagonal_removal)
+    return powers
+
+
+def _hollow(matrices: Matrices) -> Matrices:
+    out = matrices.copy()
+    places = np.arange(matrices.shape[1])
+    out[:, places, places] = 0
+    return out
+
+
+def _eigen(spectrum: CrossSpectrum) -> tuple[NDArray[np.float64], NDArray[np.complex128]]:
+    """Return eigenvalues in ascending order, (bin, mic), and eigenvectors, (bin, mic, number)."""
+    values, vectors = np.linalg.eigh(spectrum.matrix.astype(np.complex128))
+    return values, vectors
+
+
+def _matrices(values: NDArray[np.float64], vectors: NDArray[np.complex128]) -> Matrices:
+    """Return the matrices with given eigenvalues and eigenvectors."""
+    product: NDArray[Any] = (vectors * values[:, None, :]) @ vectors.conj().transpose(0, 2, 1)
+    return product.astype(np.complex64)
+
+
+METHODS: Final[dict[MapMethod, Method]] = {
+    "delay_and_sum": delay_and_sum,
+    "functional": functional,
+    "capon": capon,
+    "music": music,
+    "clean_sc": clean,
+}
+"""Function of each method of `Passive`."""

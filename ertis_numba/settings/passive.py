@@ -1,0 +1,87 @@
+"""Passive listening: maps of sound that the sensor did not emit."""
+
+from typing import Final, Literal
+
+from ertis_numba import checks
+from ertis_numba.documents import TomlTable
+from ertis_numba.errors import ArgumentError
+
+__all__ = ["MAP_METHODS", "MAX_BANDS", "MapMethod", "Passive"]
+
+MapMethod = Literal["delay_and_sum", "functional", "capon", "music", "clean_sc"]
+
+MAP_METHODS: Final[tuple[MapMethod, ...]] = ("delay_and_sum", "functional", "capon", "music", "clean_sc")
+"""Methods of acoustic maps; ``docs/explanation/acoustic-maps.md`` has their equations."""
+
+MAX_BANDS: Final = 100
+
+_WITHOUT_DIAGONAL: Final = ("delay_and_sum", "clean_sc")
+
+
+class Passive(TomlTable, frozen=True, kw_only=True):
+    """Passive listening: maps of the level from each direction, in bands of frequencies.
+
+    Attributes
+    ----------
+    bands_hz : "third_octaves", "octaves" or list of (low, high), default "third_octaves"
+        Bands in hertz, up to 100: those of IEC 61260-1 within ``limits_hz``, or your own.
+    limits_hz : (low, high), default (8900, 89500)
+        Limits of third octaves and octaves, in hertz; the default has those from 10 to 80 kHz.
+    method : {"delay_and_sum", "functional", "capon", "music", "clean_sc"}, default "delay_and_sum"
+        Estimate of the power from each direction. ``music`` finds directions, and has no level.
+    diagonal_removal : bool, default false
+        Leave out the power of each microphone itself, which contains its noise; for ``delay_and_sum`` and
+        ``clean_sc``.
+    functional_order : float, default 8
+        Order of ``functional``, 1 to 100; 1 is delay-and-sum, and higher ones have narrower lobes.
+    n_sources : int, default 1
+        Number of sources that ``music`` expects in a band, from 1 to the number of microphones less one.
+    diagonal_loading : float, default 0.01
+        Diagonal loading of ``capon`` relative to the mean power of a microphone, 1e-6 to 1e6.
+    resolution_hz : float, optional, default None
+        Largest spacing of frequencies in hertz. By default a third of the narrowest band, and at most 1 kHz.
+    averages : int, default 1
+        Measurements of a map, 1 to 100000, over which powers are averaged.
+    focus_m : float, optional, default None
+        Distance of the sources in metres, from 0.01. By default, waves are plane.
+    """
+
+    bands_hz: str | tuple[tuple[float, float], ...] = "third_octaves"
+    limits_hz: tuple[float, float] = (8_900.0, 89_500.0)
+    method: MapMethod = "delay_and_sum"
+    diagonal_removal: bool = False
+    functional_order: float = 8.0
+    n_sources: int = 1
+    diagonal_loading: float = 0.01
+    resolution_hz: float | None = None
+    averages: int = 1
+    focus_m: float | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.choice("passive.method", self.method, MAP_METHODS)
+        self._check_bands()
+        checks.interval("passive.limits_hz", self.limits_hz, 1.0, 1e9)
+        checks.between("passive.functional_order", self.functional_order, 1.0, 100.0)
+        checks.integer("passive.n_sources", self.n_sources, 1)
+        checks.between("passive.diagonal_loading", self.diagonal_loading, 1e-6, 1e6)
+        if self.resolution_hz is not None:
+            checks.between("passive.resolution_hz", self.resolution_hz, 0.1, 1e8)
+        checks.integer("passive.averages", self.averages, 1, 100_000)
+        if self.focus_m is not None:
+            checks.between("passive.focus_m", self.focus_m, 0.01, 10_000.0)
+        if self.diagonal_removal and self.method not in _WITHOUT_DIAGONAL:
+            raise ArgumentError(
+                f"passive.diagonal_removal is true, which passive.method {self.method!r} does not support; leave it "
+                f"out, or give {' or '.join(_WITHOUT_DIAGONAL)}"
+            )
+
+    def _check_bands(self) -> None:
+        given = self.bands_hz
+        if isinstance(given, str):
+            checks.choice("passive.bands_hz", given, ("third_octaves", "octaves"))
+            return
+        if not 1 <= len(given) <= MAX_BANDS:
+            raise ArgumentError(f"passive.bands_hz lists {len(given)} bands; give 1 to {MAX_BANDS}")
+        for number, band in enumerate(given):
+            checks.interval(f"passive.bands_hz[{number}]", band, 1.0, 1e9)
