@@ -1,8 +1,12 @@
 """Sound of sources on its way to the microphones, compared with its equations in float64."""
 
+import json
+
 import numpy as np
 import pytest
 import scipy
+from click.testing import CliRunner
+from ertis_cli.main import cli
 from numpy.testing import assert_allclose, assert_array_equal
 
 from ertis_numba.air import absorption_db_m
@@ -12,7 +16,9 @@ from ertis_numba.settings import Call, Recording
 from ertis_numba.simulation import Emitter, Noise, Platform, Scene, Sonar, Tone, Wall
 from ertis_numba.simulation.effect_plan import make_plan
 from ertis_numba.simulation.noise_frames import FRAME_S, frame_of, frames_between
-from tests.scenes import EAR, RATE_HZ, SENSOR, SPEED_M_S, error_db, heard, scene_of, ways
+from ertis_numba.simulation.render import Simulator
+from ertis_numba.storage import open_recording
+from tests.scenes import EAR, RATE_HZ, SENSOR, SPEED_M_S, error_db, heard, only, scene_of, ways
 
 LISTENS = SENSOR.replace(emitter=Emitter(silent=True))
 ALONE = EAR.replace(emitter=Emitter(silent=True))
@@ -252,6 +258,42 @@ def test_blocked_sources_are_silent_and_render():
     scene = scene_of(sensor=LISTENS, tones=(Tone(range_m=1.0, frequency_hz=40e3),), walls=(wall,))
     assert "occlusion" in make_plan(scene).active
     assert_array_equal(heard(scene, *make_plan(scene).active), 0.0)
+
+
+def test_truth_names_sources_with_place_and_recorded_level():
+    """Levels are those of the rendered signals; positions follow the motion, directions are in the sensor frame."""
+    sensor = LISTENS.replace(position_m=(0.0, 0.0, 0.5), yaw_deg=90.0, recording=LONG.recording)
+    wall = Wall(position_m=(0.0, -1.0, 0.0), facing_deg=(90.0, 0.0))
+    fan = Tone(position_m=(0.0, 1.0, 0.5), frequency_hz=40e3, harmonics_db=(-6.0,), level_db=-20.0)
+    leak = Noise(position_m=(1.0, 1.0, 0.5), velocity_m_s=(-2.0, 0.0, 0.0), spectrum="leak", orifice_m=2e-3)
+    scene = Scene(seed=3, sensors=(sensor,), tones=(fan,), noises=(leak,), walls=(wall,), rate_hz=4.0, count=3)
+    plan = make_plan(scene)
+    for index in (0, 2):
+        of_fan, of_leak = Simulator(scene, plan=plan).sources(index)
+        for found, kind, changes in ((of_fan, "tone", {"noises": ()}), (of_leak, "noise", {"tones": ()})):
+            signals = Simulator(scene.replace(**changes), plan=plan).signals(index)
+            assert_allclose(found.level_dbfs, 10 * np.log10(np.mean(signals**2)), atol=0.5 if kind == "noise" else 0.01)
+            assert found.kind == kind
+        assert_allclose((of_fan.azimuth_deg, of_fan.elevation_deg, of_fan.range_m), (0.0, 0.0, 1.0), atol=1e-9)
+        assert (of_fan.band_hz, of_leak.band_hz) == ((40e3, 80e3), (20e3, 80e3))
+        assert_allclose(of_leak.position_m, (1.0 - 0.5 * index, 1.0, 0.5), atol=1e-12)
+    assert_allclose(of_leak.azimuth_deg, 0.0, atol=1e-9)
+    without = plan.active - {"interference"}
+    assert Simulator(scene, plan=only(*without)).sources() == []
+
+
+def test_simulated_recording_holds_the_sources_of_its_scene(tmp_path):
+    path = tmp_path / "scene.toml"
+    bat = Sonar(waypoints=((0.0, 2.0, 0.0, 0.0), (0.2, 1.0, 1.0, 0.0)), level_db=-20.0)
+    path.write_text(scene_of(sensor=LISTENS, sonars=(bat,), count=3, rate_hz=10.0).to_toml(), encoding="utf-8")
+    done = CliRunner().invoke(cli, ["simulate", str(path), "--json"])
+    assert done.exit_code == 0, done.output
+    [reported] = json.loads(done.stdout)["sensors"]
+    with open_recording(path.with_suffix(".h5")) as recording:
+        sources = [row[0] for row in recording.truth.sources]
+    assert reported["sources"][0]["name"] == sources[0].name == "sonars[0]"
+    assert_allclose([each.position_m for each in sources], [(2, 0, 0), (1.5, 0.5, 0), (1, 1, 0)], atol=1e-9)
+    assert_allclose([each.azimuth_deg for each in sources], np.degrees(np.arctan2([0, 0.5, 1], [2, 1.5, 1])))
 
 
 @pytest.mark.parametrize(

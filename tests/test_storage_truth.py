@@ -7,8 +7,15 @@ import numpy as np
 import pytest
 
 from ertis_numba.errors import ArgumentError, DataError
-from ertis_numba.frames import Reflector
-from ertis_numba.storage import GroundTruth, open_energyscapes, open_recording, write_energyscapes, write_recording
+from ertis_numba.frames import Reflector, TrueSource
+from ertis_numba.storage import (
+    GroundTruth,
+    GroundTruthLog,
+    open_energyscapes,
+    open_recording,
+    write_energyscapes,
+    write_recording,
+)
 from ertis_numba.storage.schema import TRUTH
 from tests.files import image, noise, open_dataset
 
@@ -28,8 +35,16 @@ ROWS = (
 )
 
 
-def truth(reflectors=ROWS):
-    return GroundTruth(scene='name = "two"\n', seed=7, reflectors=reflectors)
+def truth(reflectors=ROWS, **changes):
+    return GroundTruth(scene='name = "two"\n', seed=7, reflectors=reflectors, **changes)
+
+
+def source(name="noises[0]", **changes):
+    given = {"azimuth_deg": 45.0, "elevation_deg": -30.0, "range_m": 2.5, "position_m": (1.0, 2.0, -0.5)}
+    return TrueSource(name=name, kind="noise", band_hz=(2e4, 8e4), **{**given, "level_dbfs": -61.5, **changes})
+
+
+SOURCES = tuple((source(range_m=1.0 + row), source("noises[1]", level_dbfs=-300.0)) for row in range(3))
 
 
 def same(one, other):
@@ -53,6 +68,50 @@ def test_truth_is_kept(path):
     with open_recording(path) as recording:
         assert (recording.truth.scene, recording.truth.seed) == (truth().scene, 7)
         same(recording.truth.reflectors, ROWS)
+
+
+def test_sources_of_sound_are_kept(tmp_path):
+    given = truth(sources=SOURCES)
+    path = write_recording(tmp_path / "rec.h5", noise(), truth={SENSOR: given})
+    with open_recording(path) as recording:
+        assert [len(row) for row in recording.truth.sources] == [2, 2, 2]
+        for came, wanted in zip(sum(recording.truth.sources, ()), sum(SOURCES, ()), strict=True):
+            for name, value in asdict(wanted).items():
+                assert getattr(came, name) == (value if isinstance(value, str) else pytest.approx(value, abs=1e-12))
+        same(recording.truth.reflectors, ROWS)
+        made = images_of(recording)
+        write_energyscapes(tmp_path / "img.h5", [made[2], made[0]], recording=recording)
+    with open_energyscapes(tmp_path / "img.h5") as images:
+        assert [row[0].range_m for row in images.truth.sources] == [3.0, 1.0]
+    with open_dataset(path, group=f"/{GROUP}", engine="netcdf4") as data:
+        assert data["source_position"].dims == ("measurement", "source", "axis")
+        assert data["source_band"].values.tolist() == [[2e4, 8e4]] * 2
+
+
+def test_sources_without_reflectors_are_kept_in_blocks(tmp_path, monkeypatch):
+    monkeypatch.setattr("ertis_numba.storage.truth._BLOCK_ROWS", 2)
+    with GroundTruthLog("", 5, folder=tmp_path) as log:
+        for row in SOURCES:
+            log.append((), row)
+        path = write_recording(tmp_path / "rec.h5", noise(), truth={SENSOR: log})
+    with open_recording(path) as recording:
+        assert [row[0].range_m for row in recording.truth.sources] == [1.0, 2.0, 3.0]
+        assert recording.truth.reflectors == ((), (), ())
+
+
+def test_changed_sources_are_refused(tmp_path):
+    path = write_recording(tmp_path / "rec.h5", noise(), truth={SENSOR: truth(sources=SOURCES)})
+    with h5py.File(path, "r+") as file:
+        file[f"{GROUP}/source_level"][0, 0] = -10.0
+    with pytest.raises(DataError, match="the content of sensor eRTIS-7 has SHA-256"):
+        open_recording(path)
+
+
+def test_other_sources_in_a_later_measurement_are_refused(tmp_path):
+    with GroundTruthLog("", 5, folder=tmp_path) as log:
+        log.append((), SOURCES[0])
+        with pytest.raises(ArgumentError, match=r"measurement 1 has the sources \['noises\[0\]'\]; give \['noises\[0"):
+            log.append((), SOURCES[1][:1])
 
 
 def test_recording_without_truth_has_none(tmp_path):
@@ -166,6 +225,7 @@ def test_truth_of_an_absent_sensor_is_refused(tmp_path):
             {"reflectors": ((reflector(), reflector(level_db=-np.inf)),)},
             r"level_db of the true reflectors holds -inf at \[1\]; give finite numbers",
         ),
+        ({"sources": SOURCES}, "the truth has sources of 3 measurements, but reflectors of 0; give both of each"),
     ],
 )
 def test_invalid_truth_is_refused(changes, message):

@@ -11,11 +11,13 @@ from ertis_cli import options
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from ertis_numba.frames import Measurement, Reflector, Trajectory
+    from ertis_numba.frames import Measurement, Reflector, Trajectory, TrueSource
     from ertis_numba.simulation import Scene
     from ertis_numba.simulation.effect_plan import EffectPlan
     from ertis_numba.simulation.render import Simulator
     from ertis_numba.storage import GroundTruthLog
+
+    Truths = dict[str, tuple[list[Reflector], list[TrueSource]]]
 
 __all__ = ["simulate"]
 
@@ -88,8 +90,8 @@ def simulate(
             for simulator in simulators:
                 simulator.render(0)
                 simulator.clock.cost_ms.clear()
-    firsts = {simulator.sensor.name: simulator.reflectors(0) for simulator in simulators}
-    _require_room(target, scene, names, n_reflectors=sum(map(len, firsts.values())))
+    firsts = {each.sensor.name: (each.reflectors(0), each.sources(0)) for each in simulators}
+    _require_room(target, scene, names, n_reflectors=sum(len(row) for both in firsts.values() for row in both))
     with ExitStack() as stack:
         logs = {name: stack.enter_context(_log(scene, plan, target.parent)) for name in names}
         shown = stack.enter_context(
@@ -147,14 +149,15 @@ def _require_room(target: Path, scene: "Scene", names: "Sequence[str]", n_reflec
 
 
 def _measurements(
-    simulators: "Sequence[Simulator]", firsts: "dict[str, list[Reflector]]", logs: "dict[str, GroundTruthLog]"
+    simulators: "Sequence[Simulator]", firsts: "Truths", logs: "dict[str, GroundTruthLog]"
 ) -> "Iterator[Measurement]":
     """Yield simultaneous measurements, one sensor after the other, and log their ground truth."""
     scene = simulators[0].scene
     for index in range(scene.count):
         for simulator in simulators:
             name = simulator.sensor.name
-            logs[name].append(simulator.reflectors(index) if index and scene.moves else firsts[name])
+            anew = index and scene.moves
+            logs[name].append(*((simulator.reflectors(index), simulator.sources(index)) if anew else firsts[name]))
             yield simulator.render(index)
 
 
@@ -219,21 +222,22 @@ def _summary(target: Path, scene: "Scene", *, n_sensors: int, n_reflectors: int)
     return f"{target}: {measurements}{several}, {options.counted(n_reflectors, 'reflector')}"
 
 
-def _report(target: Path, scene: "Scene", plan: "EffectPlan", firsts: "dict[str, list[Reflector]]") -> dict[str, Any]:
+def _report(target: Path, scene: "Scene", plan: "EffectPlan", firsts: "Truths") -> dict[str, Any]:
     return {
         "output": str(target),
         "measurements": scene.count,
         "seed": scene.seed,
         "left_out": list(plan.left_out),
         "sensors": [
-            {"sensor": name, "reflectors": [_row(reflector) for reflector in reflectors]}
-            for name, reflectors in firsts.items()
+            {"sensor": name, "reflectors": [_row(each) for each in reflectors]}
+            | ({"sources": [_row(each) for each in sources]} if sources else {})
+            for name, (reflectors, sources) in firsts.items()
         ],
     }
 
 
-def _row(reflector: "Reflector") -> dict[str, Any]:
-    row = {name: getattr(reflector, name) for name in reflector.__slots__}
-    if not reflector.emitter:  # usual case: an echo of the sensor's own call
+def _row(true: "Reflector | TrueSource") -> dict[str, Any]:
+    row = {name: getattr(true, name) for name in true.__slots__}
+    if row.get("emitter") == "":  # usual case: an echo of the sensor's own call
         del row["emitter"]
     return {name: round(value, 6) if isinstance(value, float) else value for name, value in row.items()}

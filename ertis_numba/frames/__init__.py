@@ -10,6 +10,7 @@ from ertis_numba.frames._point_cloud import PointCloud
 from ertis_numba.frames._reflectors import Peak, Reflector
 from ertis_numba.frames._stamp import BEHAVIOURS, Behaviour, Stamp
 from ertis_numba.frames._trajectory import Trajectory
+from ertis_numba.frames._true_source import TrueSource
 
 __all__ = [
     "BEHAVIOURS",
@@ -30,4 +31,5 @@ __all__ = [
     "SequenceGap",
     "Stamp",
     "Trajectory",
+    "TrueSource",
 ]

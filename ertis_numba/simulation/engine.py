@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ertis_numba import checks, kernels
 from ertis_numba.constants import SYNC_STEP_S
-from ertis_numba.frames import Measurement, Reflector, Stamp
+from ertis_numba.frames import Measurement, Reflector, Stamp, TrueSource
 from ertis_numba.geometry import Layout, microphones
 from ertis_numba.sample_format import sample_format
 from ertis_numba.simulation import noise_frames, synthesis
@@ -22,7 +22,7 @@ from ertis_numba.simulation.sensors import Sensor
 from ertis_numba.simulation.snapshot import Snapshot, snapshot
 from ertis_numba.simulation.stopwatch import CostStopwatch
 from ertis_numba.simulation.target_validity import require_clear
-from ertis_numba.simulation.truth import reflectors
+from ertis_numba.simulation.truth import reflectors, true_sources
 
 __all__ = ["Engine"]
 
@@ -99,6 +99,10 @@ class Engine:
     def reflectors(self, index: int = 0) -> list[Reflector]:
         """Return the reflectors that an image of measurement ``index`` should show, strongest first."""
         return reflectors(self._shot(index), self.active)
+
+    def sources(self, index: int = 0) -> list[TrueSource]:
+        """Return the sources of sound during measurement ``index``, in the order of tones, noises and sonars."""
+        return true_sources(self._shot(index), self.active)
 
     def _shot(self, index: int) -> Snapshot:
         checks.integer("index", index, 0)

@@ -3,17 +3,20 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.frames import Reflector
+from ertis_numba.frames import Reflector, TrueSource
 from ertis_numba.simulation.arrivals import echoes, emitted, responses
 from ertis_numba.simulation.image_estimate import Sight
 from ertis_numba.simulation.paths import Paths, unit
 from ertis_numba.simulation.snapshot import Snapshot
+from ertis_numba.simulation.source_paths import AnySource, SourceInScene, all_sources
+from ertis_numba.simulation.sources import Tone
 from ertis_numba.simulation.stopwatch import CostStopwatch
 
-__all__ = ["reflectors"]
+__all__ = ["reflectors", "true_sources"]
 
 Floats = NDArray[np.float64]
 _SILENT = 1e-9  # of the strongest
+_LOWEST = 1e-30  # mean square of −300 dBFS
 
 
 def reflectors(shot: Snapshot, active: frozenset[str]) -> list[Reflector]:
@@ -90,3 +93,57 @@ def _velocity_m_s(paths: Paths) -> Floats:
         direct = [not (before or after) for before, after in zip(transmitter.walls, receiver.walls, strict=True)]
         velocity_m_s[direct] = (targets.velocities_m_s - receiver.velocity_m_s)[direct]
     return np.asarray(np.einsum("pkx,px->pk", receiver.axes, velocity_m_s))
+
+
+def true_sources(shot: Snapshot, active: frozenset[str]) -> list[TrueSource]:
+    """Return the sources of sound, in the order of tones, noises and sonars.
+
+    Parameters
+    ----------
+    shot : Snapshot
+    active : frozenset of str
+        The effects that are simulated.
+
+    Returns
+    -------
+    list of TrueSource
+        Empty if interference is not simulated.
+    """
+    if "interference" not in active:
+        return []
+    return [_true_source(shot, each) for each in all_sources(shot, active)]
+
+
+def _true_source(shot: Snapshot, source: SourceInScene[AnySource]) -> TrueSource:
+    place = source.source.position_at(shot.time_s)
+    apart_m = shot.receiver.axes[0] @ (place - shot.receiver.centre_m[0])
+    range_m = float(np.linalg.norm(apart_m))
+    frequency_hz, _ = source.spectrum
+    return TrueSource(
+        name=source.name,
+        kind=source.source.label(),
+        position_m=(float(place[0]), float(place[1]), float(place[2])),
+        azimuth_deg=float(np.degrees(np.arctan2(apart_m[1], apart_m[0]))),
+        elevation_deg=float(np.degrees(np.arcsin(apart_m[2] / range_m))) if range_m else 0.0,
+        range_m=range_m,
+        band_hz=(float(frequency_hz.min()), float(frequency_hz.max())),
+        level_dbfs=float(10 * np.log10(max(_mean_square(source), _LOWEST))),
+    )
+
+
+def _mean_square(source: SourceInScene[AnySource]) -> float:
+    """Return the mean square of a source's sound at the microphones.
+
+    The paths of a tone interfere. Powers of other sounds are added, because their paths interfere constructively at
+    some frequencies and destructively at others.
+    """
+    if not len(source.paths):
+        return 0.0
+    frequency_hz, power = source.spectrum
+    response = source.response(frequency_hz)
+    if isinstance(source.source, Tone):
+        delay_s = source.paths.length_m / source.shot.speed_m_s
+        heard = np.abs(np.sum(response * np.exp(-2j * np.pi * delay_s[..., None] * frequency_hz), axis=0)) ** 2
+    else:
+        heard = np.sum(response**2, axis=0)
+    return float(np.mean(heard @ power))

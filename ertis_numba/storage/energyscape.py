@@ -194,7 +194,12 @@ class EnergyscapeWriter(FileWriter[Energyscape]):
                     "recording, but its ground truth needs exactly 1; give the right recording, or truth"
                 )
         places = {stamp: index for index, stamp in enumerate(recorded)}
-        return replace(truth, reflectors=tuple(truth.reflectors[places[stamp]] for stamp in written))
+        rows = [places[stamp] for stamp in written]
+        return replace(
+            truth,
+            reflectors=tuple(truth.reflectors[row] for row in rows),
+            sources=tuple(truth.sources[row] for row in rows if truth.sources),
+        )
 
 
 def _provenance(readers: Sequence[RecordingReader]) -> dict[str, str]:

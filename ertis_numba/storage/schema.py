@@ -196,6 +196,37 @@ TRUTH: Final = (
         "sensor whose call the reflector returns, if not its own",
         optional=True,
     ),
+    Variable("source_name", ("source",), "str", "names of the sources of sound in the scene", optional=True),
+    Variable("source_kind", ("source",), "str", "tone, noise or sonar", optional=True),
+    Variable(
+        "source_band", ("source", "edge"), "<f8", "lowest and highest frequency of the sound", "Hz", optional=True
+    ),
+    Variable(
+        "source_position",
+        ("measurement", "source", "axis"),
+        "<f8",
+        "x, y, z in the world frame",
+        "m",
+        optional=True,
+    ),
+    Variable("source_azimuth", ("measurement", "source"), "<f8", "azimuth of the sources", "radian", optional=True),
+    Variable("source_elevation", ("measurement", "source"), "<f8", "elevation of the sources", "radian", optional=True),
+    Variable(
+        "source_range",
+        ("measurement", "source"),
+        "<f8",
+        "distance of the sources from the sensor's origin",
+        "m",
+        optional=True,
+    ),
+    Variable(
+        "source_level",
+        ("measurement", "source"),
+        "<f8",
+        "RMS of the sound at the microphones, relative to full scale",
+        "dB",
+        optional=True,
+    ),
 )
 """Variables of the group ``truth`` of a sensor."""
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ertis_numba import checks
 from ertis_numba.atomic_files import remedy
 from ertis_numba.errors import ArgumentError, DataError
-from ertis_numba.frames import Reflector
+from ertis_numba.frames import Reflector, TrueSource
 from ertis_numba.storage.schema import TRUTH, create_variables, set_attributes, text_type, to_python
 
 __all__ = ["GroundTruth", "GroundTruthLog", "read_truth", "write_truth"]
@@ -34,6 +34,11 @@ _RECORD = np.dtype(
     [("row", "<i8"), ("target", "<i4"), *((name, "<i4") for name in _TEXTS)]
     + [(name, "<f8", 3 if name == "velocity" else ()) for name in _FIELDS]
 )
+_PLACES = ("position", "azimuth", "elevation", "range", "level")
+_SOURCE_TEXTS = ("name", "kind")
+_SOURCE_RECORD = np.dtype([(name, "<f8", 3 if name == "position" else ()) for name in _PLACES])
+_OF_SOURCES = "source_"  # First part of the names of variables.
+_SOURCE_VARIABLES = {f"{_OF_SOURCES}{name}" for name in (*_SOURCE_TEXTS, "band", *_PLACES)}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,17 +55,25 @@ class GroundTruth:
         Reflectors of each measurement, the strongest first.
     left_out : tuple of str
         Effects that were not simulated although they change the image slightly; none by default.
+    sources : tuple of tuple of TrueSource
+        Sources of sound during each measurement, in the order of the scene; empty, the default, if there are none.
     """
 
     scene: str
     seed: int
     reflectors: tuple[tuple[Reflector, ...], ...]
     left_out: tuple[str, ...] = ()
+    sources: tuple[tuple[TrueSource, ...], ...] = ()
 
     def __post_init__(self) -> None:
         checks.integer("seed", self.seed, 0, _MAX_SEED)
         for name, values in _columns(self.reflectors).items():
             checks.finite_array(f"{_FIELDS[name]} of the true reflectors", values)
+        if self.sources and len(self.sources) != len(self.reflectors):
+            raise ArgumentError(
+                f"the truth has sources of {len(self.sources)} measurements, but reflectors of "
+                f"{len(self.reflectors)}; give both of each"
+            )
 
 
 class GroundTruthLog:
@@ -77,6 +90,11 @@ class GroundTruthLog:
     folder : Path, optional
         Folder of the temporary file, by default that of the system. The file has no name, and is removed with the
         process.
+
+    Attributes
+    ----------
+    sources : tuple of TrueSource
+        Sources of sound during the first measurement.
     """
 
     def __init__(self, scene: str, seed: int, *, left_out: tuple[str, ...] = (), folder: Path | None = None) -> None:
@@ -89,6 +107,9 @@ class GroundTruthLog:
         self._max_own = 0
         self._last: tuple[Sequence[Reflector], NDArray[Any]] = ((), np.zeros(0, _RECORD))
         self._waiting: list[NDArray[Any]] = []
+        self._waiting_sources: list[NDArray[Any]] = []
+        self._last_sources: tuple[Sequence[TrueSource], NDArray[Any]] = ((), np.zeros(0, _SOURCE_RECORD))
+        self.sources: tuple[TrueSource, ...] = ()
         self._block_sizes: list[int] = []
         self._folder = folder or Path(tempfile.gettempdir())
         with self._errors_with_folder():
@@ -118,8 +139,24 @@ class GroundTruthLog:
         """Return the values of a text field of reflectors, by their number in the records."""
         return [text.encode() for text in self._texts[field]]
 
-    def append(self, reflectors: Sequence[Reflector]) -> None:
-        """Add the reflectors of the next measurement, the strongest first."""
+    def append(self, reflectors: Sequence[Reflector], sources: Sequence[TrueSource] = ()) -> None:
+        """Add the reflectors of the next measurement, the strongest first, and the sources of sound.
+
+        All measurements have the same sources, at any positions.
+
+        Raises
+        ------
+        ArgumentError
+            The sources have other names than those of the first measurement.
+        """
+        if not self._rows:
+            self.sources = tuple(sources)
+        names, wanted = [each.name for each in sources], [each.name for each in self.sources]
+        if names != wanted:
+            raise ArgumentError(f"measurement {self._rows} has the sources {names}; give {wanted}, as in the first")
+        if sources is not self._last_sources[0]:
+            self._last_sources = sources, _places(sources)
+        self._waiting_sources.append(self._last_sources[1])
         if reflectors is not self._last[0]:  # A static scene repeats the same reflectors.
             self._last = reflectors, self._encoded(reflectors)
         records = self._last[1].copy()
@@ -147,9 +184,11 @@ class GroundTruthLog:
             records = np.concatenate(self._waiting)
             with self._errors_with_folder():
                 self._file.write(records.tobytes())
+                self._file.write(np.concatenate(self._waiting_sources).tobytes())
                 self._file.flush()
             self._block_sizes.append(records.nbytes)
             self._waiting.clear()
+            self._waiting_sources.clear()
 
     @contextmanager
     def _errors_with_folder(self) -> Iterator[None]:
@@ -160,14 +199,17 @@ class GroundTruthLog:
                 f"{self._folder}: a temporary file cannot be written ({error.strerror}); {remedy(error)}"
             ) from error
 
-    def blocks(self) -> Iterator[tuple[slice, NDArray[Any]]]:
-        """Yield the rows of each block of measurements, and the records of their reflectors."""
+    def blocks(self) -> Iterator[tuple[slice, NDArray[Any], NDArray[Any]]]:
+        """Yield the rows of each block of measurements, and the records of their reflectors and of their sources."""
         self._flush()
         self._file.seek(0)
         for number, n_bytes in enumerate(self._block_sizes):
             first = number * _BLOCK_ROWS
+            rows = slice(first, min(first + _BLOCK_ROWS, self._rows))
             records = np.frombuffer(self._file.read(n_bytes), _RECORD)
-            yield slice(first, min(first + _BLOCK_ROWS, self._rows)), records
+            shape = rows.stop - rows.start, len(self.sources)
+            sources = self._file.read(shape[0] * shape[1] * _SOURCE_RECORD.itemsize)
+            yield rows, records, np.frombuffer(sources, _SOURCE_RECORD).reshape(shape)
 
 
 def write_truth(group: h5py.Group, truth: GroundTruth | GroundTruthLog, n_measurements: int) -> None:
@@ -180,8 +222,8 @@ def write_truth(group: h5py.Group, truth: GroundTruth | GroundTruthLog, n_measur
     """
     if isinstance(truth, GroundTruth):
         with GroundTruthLog(truth.scene, truth.seed, left_out=truth.left_out) as log:
-            for reflectors in truth.reflectors:
-                log.append(reflectors)
+            for row, reflectors in enumerate(truth.reflectors):
+                log.append(reflectors, truth.sources[row] if truth.sources else ())
             write_truth(group, log, n_measurements)
         return
     if len(truth) != n_measurements:
@@ -193,15 +235,20 @@ def write_truth(group: h5py.Group, truth: GroundTruth | GroundTruthLog, n_measur
     if not any(texts["emitter"]):  # Files of a single sensor stay as in earlier versions.
         del texts["emitter"]
     kinds: dict[str, Any] = {field: text_type(max(map(len, column), default=0)) for field, column in texts.items()}
+    kinds |= _source_kinds(truth.sources)
     sizes = {"measurement": n_measurements, "target": truth.n_targets, "axis": 3}
+    if truth.sources:
+        sizes |= {"source": len(truth.sources), "edge": 2}
     made = group.create_group("truth", track_order=True)
-    table = [variable for variable in TRUTH if not variable.optional or variable.name in texts]
+    written = texts.keys() | (_SOURCE_VARIABLES if truth.sources else set())
+    table = [variable for variable in TRUTH if not variable.optional or variable.name in written]
     create_variables(made, table, sizes=sizes, dtypes=kinds, texts={"scene": truth.scene})
     set_attributes(made, {"seed": truth.seed, "effects_left_out": " ".join(truth.left_out)})
-    if not truth.n_targets:  # There is no data to write.
-        return
     columns = {field: np.array(column, dtype=kinds[field]) for field, column in texts.items()}
-    for rows, records in truth.blocks():
+    for rows, records, sources in truth.blocks():
+        _write_sources(made, truth.sources, rows, sources)
+        if not truth.n_targets:  # There is no data to write.
+            continue
         place = records["row"] - rows.start, records["target"]
         for name in (*columns, *_FIELDS):
             dataset = made[name]
@@ -209,6 +256,23 @@ def write_truth(group: h5py.Group, truth: GroundTruth | GroundTruthLog, n_measur
             whole = np.full((rows.stop - rows.start, *dataset.shape[1:]), missing, dtype=dataset.dtype)
             whole[place] = columns[name][records[name]] if name in columns else records[name]
             dataset[rows] = whole
+
+
+def _source_kinds(sources: Sequence[TrueSource]) -> dict[str, Any]:
+    """Return the types of the texts of sources."""
+    longest = {field: max((len(_encoded(each, field)) for each in sources), default=0) for field in _SOURCE_TEXTS}
+    return {f"{_OF_SOURCES}{field}": text_type(n_bytes) for field, n_bytes in longest.items()}
+
+
+def _write_sources(group: h5py.Group, sources: Sequence[TrueSource], rows: slice, records: NDArray[Any]) -> None:
+    """Write the sources of some measurements."""
+    if not sources:
+        return
+    for field in _SOURCE_TEXTS:
+        group[f"{_OF_SOURCES}{field}"][:] = [_encoded(each, field) for each in sources]
+    group[f"{_OF_SOURCES}band"][:] = [each.band_hz for each in sources]
+    for name in _PLACES:
+        group[f"{_OF_SOURCES}{name}"][rows] = records[name]
 
 
 def read_truth(group: h5py.Group) -> GroundTruth | None:
@@ -241,7 +305,47 @@ def read_truth(group: h5py.Group) -> GroundTruth | None:
         seed=int(group.attrs["seed"]),
         reflectors=tuple(rows),
         left_out=tuple(left_out.split()),
+        sources=_read_sources(group) if f"{_OF_SOURCES}name" in group else (),
     )
+
+
+def _read_sources(group: h5py.Group) -> tuple[tuple[TrueSource, ...], ...]:
+    """Return the sources of each measurement."""
+    names, kinds = ([text.decode() for text in group[f"{_OF_SOURCES}{field}"][:]] for field in ("name", "kind"))
+    bands_hz = group[f"{_OF_SOURCES}band"][:].tolist()
+    places = {name: group[f"{_OF_SOURCES}{name}"][:] for name in _PLACES}
+    places |= {name: np.degrees(places[name]) for name in _ANGLES}
+    return tuple(
+        tuple(
+            TrueSource(
+                name=name,
+                kind=kinds[source],
+                position_m=tuple(places["position"][row, source].tolist()),
+                azimuth_deg=float(places["azimuth"][row, source]),
+                elevation_deg=float(places["elevation"][row, source]),
+                range_m=float(places["range"][row, source]),
+                band_hz=tuple(bands_hz[source]),
+                level_dbfs=float(places["level"][row, source]),
+            )
+            for source, name in enumerate(names)
+        )
+        for row in range(len(places["range"]))
+    )
+
+
+def _places(sources: Sequence[TrueSource]) -> NDArray[Any]:
+    """Return the records of the sources of one measurement: (source,)."""
+    records = np.zeros(len(sources), _SOURCE_RECORD)
+    for name in _PLACES:
+        field = _FIELDS.get(name, "position_m") if name != "level" else "level_dbfs"
+        values = np.array([getattr(each, field) for each in sources], np.float64).reshape(records[name].shape)
+        checks.finite_array(f"{field} of the true sources", values)
+        records[name] = np.radians(values) if name in _ANGLES else values
+    return records
+
+
+def _encoded(source: TrueSource, field: str) -> bytes:
+    return str(getattr(source, field)).encode()
 
 
 def _columns(reflectors: Sequence[Sequence[Reflector]]) -> dict[str, NDArray[np.float64]]:
