@@ -39,7 +39,7 @@ _MAX_ROUNDING_ERROR_DB = (
 
 
 def call_samples(call: Call, *, rate_hz: float | None = None) -> NDArray[np.float64]:
-    """Return the emitted call: (sample,) float64, amplitude 1 between its ramps.
+    """Return the emitted call: (sample,) float64, amplitude 1 between its ramps, after the silence before it.
 
     Hyperbolic sweeps have the frequency ``f(t) = 1 / (1/f₀ + t (1/f₁ − 1/f₀) / T)`` and the phase
     ``2π T / (1/f₁ − 1/f₀) · ln(f₀ / f(t))``, from t = 0 to T inclusive (J. J. Kroszczynski, Pulse compression by means
@@ -55,18 +55,18 @@ def call_samples(call: Call, *, rate_hz: float | None = None) -> NDArray[np.floa
     rate_hz = call.sample_rate_hz if rate_hz is None else rate_hz
     call.require_samples()
     if call.waveform is not None and rate_hz == call.sample_rate_hz:
-        return np.array(call.waveform, dtype=np.float64)
-    time_s = np.arange(math.floor(call.duration_s * rate_hz * (1 + 1e-12)) + 1) / rate_hz
+        return np.concatenate([np.zeros(call.n_silent), np.array(call.waveform, dtype=np.float64)])
+    time_s = np.arange(math.floor(call.end_s * rate_hz * (1 + 1e-12)) + 1) / rate_hz
     return call_at(call, time_s)
 
 
 def call_at(call: Call, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the call at any times; it is 0 outside ``[0, duration_s]``.
+    """Return the call at any times after the start of the record; it is 0 outside ``[start_s, end_s]``.
 
     A custom waveform is oversampled 16 times by its Fourier series, and then interpolated by cubic splines. Their error
     is -100 dB at half of the sample rate, and less at lower frequencies.
     """
-    time_s = np.asarray(time_s)
+    time_s = np.asarray(time_s) - call.start_s
     inside = (time_s >= 0.0) & (time_s <= call.duration_s)
     values = np.zeros(time_s.shape)
     values[inside] = _inside(call, time_s[inside])
@@ -74,7 +74,7 @@ def call_at(call: Call, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _inside(call: Call, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the call at times within ``[0, duration_s]``."""
+    """Return the call at times within ``[0, duration_s]`` after its start."""
     if call.waveform is not None:
         return _interpolator(call)(time_s)
     edge_s = np.minimum(time_s, call.duration_s - time_s)
@@ -88,7 +88,7 @@ def _interpolator(call: Call) -> Callable[[NDArray[np.float64]], NDArray[np.floa
     """Return a custom waveform as a function of time."""
     from scipy.interpolate import CubicSpline  # noqa: PLC0415  takes long to import, and few need it
 
-    samples = call_samples(call)
+    samples = np.array(call.waveform)
     n_fft = 2 ** math.ceil(math.log2(2 * len(samples)))  # zero padding against circular wrap-around
     dense = np.fft.irfft(np.fft.rfft(samples, n_fft), n_fft * _WAVEFORM_OVERSAMPLING) * _WAVEFORM_OVERSAMPLING
     time_s = np.arange((len(samples) - 1) * _WAVEFORM_OVERSAMPLING + 2) / (call.sample_rate_hz * _WAVEFORM_OVERSAMPLING)
@@ -251,7 +251,7 @@ def matched_noise_spectrum(settings: Settings, *, n_waves: int) -> tuple[NDArray
     The shares add up to 1. The band of an echo, which is weighted by its own spectrum as well, is slightly narrower.
     """
     rate_hz, fine_hz = settings.signal_rate_hz, 4 * settings.call.high_frequency_hz
-    n_fft = round(max(8 * math.ceil(settings.call.duration_s * fine_hz), 1024) * rate_hz / fine_hz)
+    n_fft = round(max(8 * math.ceil(settings.call.end_s * fine_hz), 1024) * rate_hz / fine_hz)
     matched = matched_filter_spectrum(settings, n_fft=n_fft)
     frequency_hz = (matched.first_bin + np.arange(len(matched.values))) * rate_hz / n_fft
     power = np.abs(matched.values) ** 2

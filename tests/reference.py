@@ -91,7 +91,7 @@ def paper(words, settings: Settings, directions):
         signals_of(words, np.flatnonzero(layout.enabled), settings.recording) / layout.gain[layout.enabled][:, None]
     )
     signals = signals * array_weights(settings)[:, None]
-    padded_s = settings.call.duration_s + 40 / (settings.call.high_frequency_hz - settings.call.low_frequency_hz)
+    padded_s = settings.call.end_s + 40 / (settings.call.high_frequency_hz - settings.call.low_frequency_hz)
     emitted = call_at(
         settings.call, np.arange(int(padded_s * settings.recording.sample_rate_hz)) / settings.recording.sample_rate_hz
     )

@@ -24,6 +24,7 @@ from ertis_numba.simulation import Scene
 from ertis_numba.simulation.effects import EFFECTS
 from ertis_numba.simulation.engine import Engine
 from ertis_numba.storage import open_recording, write_recording
+from ertis_numba.waveform import call_samples
 from tests.emulated import N_SAMPLES, TIMEOUT_S, WORDS, ask, block, is_block
 from tests.files import noise
 
@@ -244,6 +245,18 @@ def test_emulate_renders_a_scene_for_the_configured_call(emulate, tmp_path):
     rejected(process, path, long, SHORT, "only received a call that cannot be rendered")
     assert len(captured(path, SHORT)) == N_SAMPLES
     assert ended(process, signal.SIGTERM) == (143, "", "")
+
+
+def test_delayed_call_is_found_in_the_codes_of_a_sensor():
+    call = Call(delay_s=12e-3)
+    codes = call_codes(call)
+    assert (codes[:5400] == 2048).all()
+    found = call_from_codes(codes, call.sample_rate_hz)
+    assert found.start_s > 11.9e-3
+    assert np.abs(call_samples(found)[:6500] - call_samples(call)[:6500]).max() < 2e-3
+    assert Setup.of(Settings(call=call)).codes.tolist() == codes.tolist()
+    with pytest.raises(ArgumentError, match=r"call has 68626 samples, .* call.delay_s and call.duration_s that add up"):
+        Setup.of(Settings(call=Call(delay_s=0.15)))
 
 
 def test_emulate_rejects_a_call_without_measurements(emulate, recording):

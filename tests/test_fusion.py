@@ -15,7 +15,7 @@ from ertis_numba.fusion.pairs import hypothesis, pair_of
 from ertis_numba.fusion.polar_grid import PolarGrid, close_directions
 from ertis_numba.fusion.receivers import Receiver
 from ertis_numba.fusion.rig import Emitters, sensor_poses
-from ertis_numba.settings import Processing
+from ertis_numba.settings import Call, Processing
 from ertis_numba.simulation import Electronics, Emitter, Point, Scene, Sensor
 from ertis_numba.storage import open_energyscapes, write_recording
 from tests.pages import commands_in, page, python_in, run_code_here, run_here
@@ -109,6 +109,81 @@ def test_fused_points_are_the_reflectors():
         assert offset_m[nearest] < 0.02
         assert abs(positions_m[nearest, 2] - 0.4) < 0.05
     assert len(positions_m) == len(PLACES_M)
+
+
+DELAYS_S = {"front": 0.0, "left": 3e-3, "back": 6e-3, "right": 9e-3}
+
+
+@functools.cache
+def sequence():
+    """A scene whose sensors emit in sequence, and their images."""
+    sensors = tuple(each.replace(call=each.call.replace(delay_s=DELAYS_S[each.name])) for each in scene().sensors)
+    made, found = scene().replace(sensors=sensors), {}
+    for sensor in sensors:
+        with ertis.Pipeline(sensor.settings(), predict=False) as pipeline:
+            found[sensor.name] = pipeline.process(ertis.render(made, sensor=sensor.name))
+    return made, found
+
+
+def test_echoes_of_calls_in_sequence_have_the_ranges_of_the_truth():
+    sensors = tuple(
+        Sensor(
+            name=name,
+            position_m=(0.0, y, 0.0),
+            call=Call(delay_s=delay_s),
+            processing=Processing(range_m=(0.4, 2.5), directions="90"),
+            emitter=Emitter(level_db=-24.0),
+        )
+        for name, y, delay_s in (("first", 0.15, 0.0), ("second", -0.15, 3e-3))
+    )
+    made = Scene(sensors=sensors, points=(Point(position_m=(1.3, 0.1, 0.0)),))
+    for sensor, way in zip(sensors, (1, -1), strict=True):
+        with ertis.Pipeline(sensor.settings(), predict=False) as pipeline:
+            image = pipeline.process(ertis.render(made, sensor=sensor.name))
+        echoes = [each for each in ertis.Simulator(made, sensor=sensor.name).reflectors() if "points" in each.name]
+        own, foreign = echoes
+        assert foreign.range_m - own.range_m == pytest.approx(way * 3e-3 * 343.4 / 2, abs=0.02)
+        for echo in (own, foreign):
+            along = image.select(azimuth_deg=(echo.azimuth_deg - 3, echo.azimuth_deg + 3)).amplitude.max(axis=0)
+            near = np.abs(image.range_m - echo.range_m) < 0.05
+            assert image.range_m[near][along[near].argmax()] == pytest.approx(echo.range_m, abs=0.004)
+
+
+def test_calls_in_sequence_are_fused_by_their_delays_in_the_settings():
+    _, found = sequence()
+    fuser = ertis.Fuser(mountings())
+    result = fuser(found.values())
+    for place in PLACES_M:
+        assert np.hypot(*(result.points.position_m[:, :2] - place).T).min() < 0.02
+    assert len(result.points) == len(PLACES_M)
+    assert result.unheard == ()
+    assert ghosts(result.image) < 0.1 * ghosts(fuser(without_delays(found)).image)
+    assert np.array_equal(fuser(found.values()).image.amplitude, result.image.amplitude)
+
+
+def test_delay_of_a_sensor_that_appears_later_is_used():
+    _, found = sequence()
+    fuser = ertis.Fuser(mountings())
+    fuser([found["front"], found["left"]])
+    result = fuser(found.values())
+    whole = ertis.fuse(found.values(), mountings())
+    np.testing.assert_array_equal(result.image.amplitude, whole.image.amplitude)
+
+
+def without_delays(found):
+    for image in found.values():
+        yield image.replace(settings=image.settings.replace(call=image.settings.call.replace(delay_s=0.0)))
+
+
+def ghosts(image):
+    """Return the power of a fused image apart from the reflectors, relative to that near them."""
+    place = image.range_m * np.exp(1j * image.azimuth_rad)[:, None]
+    is_near = np.zeros(place.shape, bool)
+    for x, y in PLACES_M:
+        apart = np.abs(np.angle(place / complex(x, y))) < math.radians(25)
+        is_near |= apart & (np.abs(np.abs(place) - math.hypot(x, y)) < 0.12)
+    power = image.amplitude.astype(np.float64) ** 2
+    return power[~is_near].sum() / power[is_near].sum()
 
 
 def test_points_seen_by_two_sensors_are_more_precise():
@@ -291,8 +366,6 @@ def test_fuser_adapts_to_other_ranges():
     ("options", "message"),
     [
         ({"silent": ["roof"]}, "silent has sensor 'roof'"),
-        ({"emission_s": {"roof": 0.1}}, "emission_s has sensor 'roof'"),
-        ({"emission_s": {"left": -1.0}}, "emission_s of sensor left"),
         ({"emitter_diameter_m": -1.0}, "emitter_diameter_m"),
     ],
 )

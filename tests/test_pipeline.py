@@ -70,6 +70,29 @@ def test_window_omits_unneeded_samples():
     assert reference.error_db(part.process(measurement).amplitude, expected) < SHORT.accuracy.max_error_db
 
 
+@pytest.mark.parametrize(
+    ("device", "method"), [("cpu", "fast"), ("numpy", "fast"), ("cpu", "paper"), ("numpy", "paper")]
+)
+def test_record_of_a_delayed_call_is_imaged_like_that_of_an_immediate_one(device, method):
+    settings = SHORT.replace(processing=SHORT.processing.replace(method=method))
+    measurement, n_late = noise(settings), 4500
+    words = np.concatenate([noise(settings, seed=3).data[:n_late], measurement.data])[: len(measurement.data)]
+    late = settings.replace(call=settings.call.replace(delay_s=n_late / settings.recording.sample_rate_hz))
+    image = Pipeline(settings, device=device, predict=False).process(measurement)
+    pipeline = Pipeline(late, device=device, predict=False)
+    found = pipeline.process(Measurement(words, late))
+    np.testing.assert_allclose(found.range_m, image.range_m)
+    assert reference.error_db(found.amplitude, image.amplitude) < settings.accuracy.max_error_db
+    if method == "fast":
+        expected = exact(pipeline, Measurement(words, late))
+        assert reference.error_db(found.amplitude, expected) < settings.accuracy.max_error_db
+
+
+def test_record_that_ends_before_the_echoes_of_a_delayed_call_is_refused():
+    with pytest.raises(ArgumentError, match=r"processing\.range_m ends at .* m, but the record .* shorten"):
+        Pipeline(SHORT.replace(call=SHORT.call.replace(delay_s=SHORT.recording.duration_s - 3e-3)), predict=False)
+
+
 @pytest.mark.parametrize("method", ["fast", "paper"])
 def test_each_image_owns_its_axes(method):
     settings = SHORT.replace(processing=SHORT.processing.replace(method=method))

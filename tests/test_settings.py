@@ -429,6 +429,6 @@ def test_range_window_ends_where_the_whole_echo_fits():
     assert window_m(2_810, range_m=(0.2, 9.0)) == (0.2, 9.0)
     with pytest.raises(
         ArgumentError,
-        match=r"recording.n_samples gives a record of 2\.5 ms, but the call lasts 2\.5 ms; give more samples",
+        match=r"recording.n_samples gives a record of 2\.5 ms, but the call ends after 2\.5 ms; give more samples",
     ):
         window_m(2_500)

@@ -272,3 +272,51 @@ def test_instantaneous_frequency_follows_the_modulation(modulation, start_hz, st
     middle = slice(len(share) // 8, -len(share) // 8)
     assert np.median(np.abs(found_hz[middle] / wanted_hz[middle] - 1)) < 0.005
     assert np.abs(np.mean(found_hz[middle] - wanted_hz[middle])) < 100
+
+
+@pytest.mark.parametrize(
+    "call", [LOW, Call(waveform=tuple(np.hanning(64) * np.sin(np.arange(64))))], ids=["sweep", "own"]
+)
+def test_delay_is_silence_before_the_call(call):
+    late = call.replace(delay_s=1.0005e-3)
+    assert (late.n_silent, late.start_s, late.end_s) == (450, 1e-3, 1e-3 + call.duration_s)
+    samples = call_samples(late)
+    assert not samples[:450].any()
+    assert_allclose(samples[450:], call_samples(call), atol=1e-12)
+    time_s = np.arange(3000) / 1e6
+    assert_allclose(call_at(late, time_s + 1e-3), call_at(call, time_s), atol=1e-9)
+    assert late.sounds_like(call)
+    assert not late.sounds_like(HIGH)
+
+
+def test_delay_does_not_change_ranges():
+    """An echo of a delayed call is found at the time after its emission."""
+    settings = settings_of(LOW.replace(delay_s=2e-3))
+    n_fft = 8192
+    signal = np.zeros(n_fft)
+    echo = call_samples(settings.call)
+    signal[1000 : 1000 + len(echo)] = echo
+    spectrum = matched_filter_spectrum(settings, n_fft=n_fft)
+    bins = slice(spectrum.first_bin, spectrum.first_bin + len(spectrum.values))
+    compressed_spectrum = np.zeros(n_fft, complex)
+    compressed_spectrum[bins] = np.fft.rfft(signal)[bins] * spectrum.values
+    envelope = np.abs(np.fft.ifft(compressed_spectrum))
+    assert (envelope.argmax(), round(envelope.max(), 6)) == (1000, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("delay_s", "message"),
+    [
+        (-1e-3, r"call\.delay_s is -0\.001; give a number from 0 to 1"),
+        (1.5, r"call\.delay_s is 1\.5; give a number from 0 to 1"),
+        (float("nan"), r"call\.delay_s is nan"),
+    ],
+)
+def test_impossible_delay_is_refused(delay_s, message):
+    with pytest.raises(ArgumentError, match=message):
+        Call(delay_s=delay_s)
+
+
+def test_delay_counts_among_the_samples_of_a_call():
+    with pytest.raises(ArgumentError, match=r"call has 1600000 samples .* Shorten call\.duration_s or call\.delay_s"):
+        Call(delay_s=0.6, duration_s=0.2, sample_rate_hz=2e6)

@@ -91,7 +91,7 @@ def _matched_spectra(
     width_hz = min(5_000.0, call.low_frequency_hz / 2)
     low_hz, high_hz = edges_hz or (call.low_frequency_hz - width_hz, call.high_frequency_hz + width_hz)
     ringing_s = 100 / min(call.low_frequency_hz - low_hz, high_hz - call.high_frequency_hz)
-    n_fft = scipy.fft.next_fast_len(2 * signals.shape[1] + int((ringing_s + call.duration_s) * rate_hz))
+    n_fft = scipy.fft.next_fast_len(2 * signals.shape[1] + int((ringing_s + call.end_s) * rate_hz))
     frequency_hz = np.arange(n_fft // 2 + 1) * rate_hz / n_fft
     inside = (frequency_hz > low_hz) & (frequency_hz < high_hz)
     frequency_hz = frequency_hz[inside]
@@ -100,7 +100,7 @@ def _matched_spectra(
         (frequency_hz - call.high_frequency_hz) / (high_hz - call.high_frequency_hz),
     )
     window = np.where(outside > 0, 0.5 + 0.5 * np.cos(np.pi * outside), 1.0)
-    emitted = call_at(call, np.arange(int(call.duration_s * rate_hz) + 2) / rate_hz)
+    emitted = call_at(call, np.arange(int(call.end_s * rate_hz) + 2) / rate_hz)
     response = np.conj(scipy.fft.rfft(emitted, n_fft)[inside]) * window
     response /= np.sum(np.abs(response) ** 2 / np.where(window > 0, window, 1.0))
     return np.asarray(scipy.fft.rfft(signals, n_fft)[:, inside] * response), frequency_hz

@@ -214,7 +214,7 @@ class _Lobe:
     def __init__(self, settings: Settings) -> None:
         positions_m = microphones(settings.array).enabled_positions_m
         rate_hz = settings.signal_rate_hz
-        n_fft = math.ceil(settings.call.duration_s * rate_hz) + 1
+        n_fft = math.ceil(settings.call.end_s * rate_hz) + 1
         centre_hz = matched_filter_spectrum(settings, n_fft=n_fft).centre_hz
         wave_1_m = 2 * math.pi * centre_hz / sound_speed_m_s(settings.air)
         scale = wave_1_m / _HALF_AMPLITUDE / math.sqrt(len(positions_m))

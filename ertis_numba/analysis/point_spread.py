@@ -50,7 +50,7 @@ class PointSpread:
         self.reach_m = float(np.max(np.linalg.norm(self._positions_m, axis=1))) + PULSE_M
         # The sum over bins has a period of speed / spacing. Paths differ by at most four times ``reach_m``.
         spacing_hz = self._speed_m_s / (6 * self.reach_m)
-        n_fft = math.ceil(max(settings.call.duration_s * rate_hz + 1, rate_hz / spacing_hz))
+        n_fft = math.ceil(max(settings.call.end_s * rate_hz + 1, rate_hz / spacing_hz))
         matched = matched_filter_spectrum(settings, n_fft=n_fft)
         thinned = slice(None, None, max(1, math.floor(spacing_hz * n_fft / rate_hz)))
         bins = (matched.first_bin + np.arange(len(matched.values)))[thinned]

@@ -86,7 +86,7 @@ def matched_filter(
     settings = _call_settings(_call(call, rate_hz), rate_hz, decimation, band_edges_hz)
     rows = given.reshape(-1, given.shape[-1])
     n_samples = rows.shape[1]
-    guard_s = settings.call.duration_s + 2 * matched_guard_s(settings)
+    guard_s = settings.call.end_s + 2 * matched_guard_s(settings)
     n_fft = int(scipy.fft.next_fast_len(n_samples + math.ceil(guard_s * rate_hz) + 1))
     window = TimeWindow.from_start(n_samples, n_fft=n_fft, n_outputs=n_fft)
     padded = np.zeros((len(rows), n_fft), dtype=np.float32)

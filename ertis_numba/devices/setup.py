@@ -22,6 +22,7 @@ from ertis_numba.devices.commands import (
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import microphones
 from ertis_numba.settings import Array, Call, Settings
+from ertis_numba.settings.waveform import MAX_WAVEFORM_SAMPLES
 from ertis_numba.waveform import call_samples
 
 __all__ = ["Setup", "call_codes", "call_from_codes", "call_hash"]
@@ -35,6 +36,8 @@ def call_codes(call: Call) -> NDArray[np.uint16]:
 def call_from_codes(codes: NDArray[np.uint16], rate_hz: float) -> Call:
     """Return the call of codes of the converter as a custom waveform with a peak of 1, without silence at the end.
 
+    If the waveform would be too long for settings, silence at its start becomes the delay of the call.
+
     Raises
     ------
     ArgumentError
@@ -42,7 +45,8 @@ def call_from_codes(codes: NDArray[np.uint16], rate_hz: float) -> Call:
     """
     loud = np.flatnonzero(np.abs(codes - 2047.5) > 0.5)  # Silence is 2048, or 2047 if its samples are negative.
     samples = (codes[: loud.max(initial=-1) + 2] + 0.5 - 2048) / 2047  # Codes were rounded down.
-    return Call(waveform=tuple(samples.tolist()), sample_rate_hz=rate_hz)
+    n_silent = max(0, int(loud[0]) - 1) if len(samples) > MAX_WAVEFORM_SAMPLES else 0
+    return Call(waveform=tuple(samples[n_silent:].tolist()), sample_rate_hz=rate_hz, delay_s=n_silent / rate_hz)
 
 
 def call_hash(codes: NDArray[np.uint16]) -> int:
@@ -227,8 +231,8 @@ def _check_codes(codes: NDArray[np.uint16], rate_hz: int) -> None:
     fewest, largest = DAC_SAMPLES
     if not fewest <= len(codes) <= largest:
         raise ArgumentError(
-            f"call has {len(codes)} samples, but a sensor plays {fewest} to {largest}; give a call.duration_s "
-            f"from {(fewest - 1) / rate_hz:.3g} to {(largest - 1) / rate_hz:.3g}"
+            f"call has {len(codes)} samples, but a sensor plays {fewest} to {largest}; give call.delay_s and "
+            f"call.duration_s that add up to {(fewest - 1) / rate_hz:.3g} to {(largest - 1) / rate_hz:.3g}"
         )
     if codes.max() > DAC_CODE_MAX:
         raise ArgumentError(

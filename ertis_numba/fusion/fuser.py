@@ -72,7 +72,8 @@ class Fuser:
     Sensors that emit together hear each other's calls. Such a foreign echo has travelled from one sensor over the
     reflector to another one, so the reflector lies on an ellipse around both. Each pair of emitter and receiver has its
     own range axis, and each part of an image is attributed to the pair whose reflectors explain it. Foreign echoes thus
-    do not appear as ghosts, and confirm reflectors instead.
+    do not appear as ghosts, and confirm reflectors instead. The settings of the images contain the delay of each
+    sensor's call. A sensor without an image so far is assumed to emit together with the first one that has an image.
 
     Parameters
     ----------
@@ -87,8 +88,6 @@ class Fuser:
         Spacing of ranges; 1.5 cm for planar images, and 3 cm for others by default.
     silent : collection of str
         Sensors that do not emit.
-    emission_s : mapping of str to float, optional
-        Start of each sensor's emission after the start of the record, in seconds; 0 by default.
 
     Raises
     ------
@@ -112,20 +111,15 @@ class Fuser:
         spacing_deg: float | None = None,
         range_step_m: float | None = None,
         silent: Collection[str] = (),
-        emission_s: Mapping[str, float] | None = None,
     ) -> None:
         self._poses = sensor_poses(mountings)
         self._numbers = {pose.name: number for number, pose in enumerate(self._poses)}
         self._diameter_m = checks.between("emitter_diameter_m", emitter_diameter_m, 0.0, 0.2)
         self._spacing_deg, self._step_m = spacing_deg, range_step_m
-        for name, given in (("silent", silent), ("emission_s", emission_s or {})):
-            for sensor in given:
-                self._number(sensor, name)
+        for sensor in silent:
+            self._number(sensor, "silent")
         self._emitting = [number for number, pose in enumerate(self._poses) if pose.name not in silent]
-        self._emission_s = {
-            self._numbers[sensor]: checks.between(f"emission_s of sensor {sensor}", start_s, 0.0, 10.0)
-            for sensor, start_s in (emission_s or {}).items()
-        }
+        self._start_s: dict[int, float] = {}  # of the calls of all sensors so far
         self._tables: FusionTables | None = None
 
     @property
@@ -154,6 +148,7 @@ class Fuser:
             The images are not from the same pulse.
         """
         group = self._group(images)
+        self._start_s |= {number: image.settings.call.start_s for number, image in group.items()}
         if self._tables is None or not self._tables.fit(group):
             self._tables = self._new_tables(group)
         tables = self._tables
@@ -242,7 +237,9 @@ class Fuser:
             is_planar=kind == 0,
             height_m=float(np.mean([pose.translation_m[2] for pose in self._poses])),
         )
-        return FusionTables(grid, self._poses, self._emitting, self._emission_s, self._diameter_m)
+        first = next(iter(group.values())).settings.call.start_s
+        start_s = [self._start_s.get(number, first) for number in range(len(self._poses))]
+        return FusionTables(grid, self._poses, self._emitting, start_s, self._diameter_m)
 
 
 def fuse(

@@ -123,7 +123,7 @@ def pair_of(
     emitter, number : int
         Indices of the emitting and of the receiving sensor in ``poses``.
     late_m : float
-        Path of sound between the start of the record and the emission.
+        Path of sound between the emission of the receiver and that of the emitter; negative if the latter is earlier.
     deaf : (step,) bool
         Steps at which direct sound hides echoes.
     """
@@ -131,12 +131,19 @@ def pair_of(
     from_m, to_m = np.linalg.norm(sent, axis=1), np.linalg.norm(heard, axis=1)
     radiated = emitters.power(sent[:, 0] / np.maximum(from_m, _NEAREST_M))
     cosine = heard[:, 0] / np.maximum(to_m, _NEAREST_M)
-    step = ((from_m + to_m + late_m) / 2 / receiver.step_m).astype(np.int64)
+    step = np.floor((from_m + to_m + late_m) / 2 / receiver.step_m).astype(np.int64)
     beam = receiver.beam(heard)
     lit = ((10 * np.log10(radiated) - _LIT_DB[0]) / (_LIT_DB[1] - _LIT_DB[0])).clip(0, 1)
     weight = lit * cosine
     audible = receiver.has_range & ~deaf
-    seen = beam.inside & (step < receiver.n_steps) & (weight > 0) & (to_m > _NEAREST_M) & (from_m > _NEAREST_M)
+    seen = (
+        beam.inside
+        & (step >= 0)
+        & (step < receiver.n_steps)
+        & (weight > 0)
+        & (to_m > _NEAREST_M)
+        & (from_m > _NEAREST_M)
+    )
     seen &= audible[step.clip(0, receiver.n_steps - 1)]
     cell = np.flatnonzero(seen)
     # An echo at the range of the receiver's own echo cannot be distinguished from it, and confirms nothing.

@@ -75,10 +75,20 @@ class PointFuser:
     receiver : Receiver
     image : Energyscape
         Any image of the sensor.
+    deaf : (step,) bool
+        Steps at which direct sound hides echoes.
     """
 
-    def __init__(self, number: int, poses: tuple[MountedSensor, ...], receiver: Receiver, image: Energyscape) -> None:
+    def __init__(
+        self,
+        number: int,
+        poses: tuple[MountedSensor, ...],
+        receiver: Receiver,
+        image: Energyscape,
+        deaf: NDArray[np.bool_],
+    ) -> None:
         self._number, self._poses, self._receiver = number, poses, receiver
+        self._is_deaf = deaf[(image.range_m / receiver.step_m).astype(np.int64)]
         self._extract = PointExtractor(image.settings, Grid(image.azimuth_rad, image.elevation_rad), top=_TOP)
 
     def observations(self, image: Energyscape, shares: Shares, late_m: Mapping[int, float]) -> list[Observation]:
@@ -89,8 +99,10 @@ class PointFuser:
         image : Energyscape
         shares : Shares
         late_m : mapping of int to float
-            Path of sound between the start of the record and the emission of each sensor.
+            Path of sound between the emission of this sensor and that of each emitter.
         """
+        if self._is_deaf.any():  # Points are found relative to the strongest one, which direct sound would be.
+            image = image.replace(amplitude=np.where(self._is_deaf, np.float32(0), image.amplitude))
         cloud = self._extract(image)
         found = []
         for place_m, amplitude, uncertainty_m in zip(

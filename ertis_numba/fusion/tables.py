@@ -1,6 +1,6 @@
 """Tables of fusion: receivers, pairs and hypotheses of all sensors of a platform."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Final
 
@@ -35,8 +35,8 @@ class FusionTables:
     poses : tuple of MountedSensor
     emitting : list of int
         Indices of the sensors that emit.
-    emission_s : mapping of int to float
-        Start of emissions after the start of the record; 0 for others.
+    start_s : sequence of float
+        Start of each sensor's call after the start of the record.
     diameter_m : float
         Diameter of the emitters.
     """
@@ -46,18 +46,18 @@ class FusionTables:
         grid: PolarGrid,
         poses: tuple[MountedSensor, ...],
         emitting: list[int],
-        emission_s: Mapping[int, float],
+        start_s: Sequence[float],
         diameter_m: float,
     ) -> None:
         self.grid = grid
-        self._poses, self._emitting, self._emission_s, self._diameter_m = poses, emitting, emission_s, diameter_m
+        self._poses, self._emitting, self._start_s, self._diameter_m = poses, emitting, start_s, diameter_m
         self._positions_m = grid.positions_m
         self._receivers: dict[int, Receiver] = {}
         self._deaf: dict[int, NDArray[np.bool_]] = {}
         self._pairs: dict[int, list[Pair]] = {}
         self._hypotheses: dict[int, list[Hypothesis]] = {}
         self._settings: dict[int, Settings] = {}
-        self._late_m: dict[int, float] = {}
+        self._late_m: dict[int, dict[int, float]] = {}  # by receiver and emitter
         self._known: dict[tuple[tuple[int, ...], frozenset[int]], Attribution] = {}
         self._rivalries: Rivalries = {}
         self._points: dict[int, PointFuser] = {}
@@ -66,8 +66,9 @@ class FusionTables:
     def fit(self, group: Mapping[int, Energyscape]) -> bool:
         """Return True if images have the same directions, ranges and calls as earlier ones of their sensors."""
         return all(
-            number not in self._receivers
-            or (self._receivers[number].fits(image) and image.settings.call == self._settings[number].call)
+            image.settings.call.start_s == self._start_s[number]
+            if number not in self._receivers
+            else self._receivers[number].fits(image) and image.settings.call == self._settings[number].call
             for number, image in group.items()
         )
 
@@ -121,20 +122,21 @@ class FusionTables:
         """Return the points of a group."""
         found = []
         for number, each in group.items():
-            found += self._points[number].observations(each, shares, self._late_m)
+            found += self._points[number].observations(each, shares, self._late_m[number])
         return joined(found, self._poses, image, self.grid)
 
     def _same_call(self, emitter: int, number: int) -> bool:
         """Return True unless the calls are known to differ, so that the matched filter suppresses the foreign one."""
-        return emitter not in self._settings or self._settings[emitter].call == self._settings[number].call
+        return emitter not in self._settings or self._settings[emitter].call.sounds_like(self._settings[number].call)
 
     def _add(self, number: int, image: Energyscape) -> None:
         self._known.clear()
         settings = self._settings[number] = image.settings
         speed_m_s = sound_speed_m_s(settings.air)
         receiver = self._receivers[number] = Receiver(self._poses[number], image, self.grid.step_m)
-        late_m = {emitter: self._emission_s.get(emitter, 0.0) * speed_m_s for emitter in self._emitting}
-        self._late_m |= late_m
+        late_m = self._late_m[number] = {
+            emitter: (self._start_s[emitter] - self._start_s[number]) * speed_m_s for emitter in self._emitting
+        }
         deaf = self._deaf[number] = self._direct_sound(number, receiver, late_m)
         emitters = Emitters(settings, self._diameter_m)
         common = self._poses, emitters, receiver
@@ -159,7 +161,7 @@ class FusionTables:
         self._hypotheses[number] = [
             each for each in hypotheses if len(each.half_cell) or (each.emitter in seen and not each.is_mirrored)
         ]
-        self._points[number] = PointFuser(number, self._poses, receiver, image)
+        self._points[number] = PointFuser(number, self._poses, receiver, image, deaf)
 
     def _direct_sound(self, number: int, receiver: Receiver, late_m: Mapping[int, float]) -> NDArray[np.bool_]:
         range_m = (np.arange(receiver.n_steps) + 0.5) * receiver.step_m

@@ -82,7 +82,7 @@ class VirtualEars:
         self.rate_hz = settings.signal_rate_hz
         self._speed_m_s = sound_speed_m_s(settings.air)
         self.call = call_samples(settings.call, rate_hz=self.rate_hz)
-        record_m = self._speed_m_s * (settings.recording.duration_s - settings.call.duration_s) / 2
+        record_m = self._speed_m_s * (settings.recording.duration_s - settings.call.end_s) / 2
         self.max_range_m = min(settings.processing.range_m[1], record_m)
         layout = microphones(settings.array)
         self._position_m, self._own_s = layout.enabled_positions_m, layout.delay_s[layout.enabled]
@@ -95,7 +95,7 @@ class VirtualEars:
             )
         self._halves = self._half(left, azimuth_deg), self._half(right, -azimuth_deg)
         largest_s = max(float(np.max(np.abs(half.delays_s))) for half in self._halves)
-        longest_s = 2 * self.max_range_m / self._speed_m_s + settings.call.duration_s
+        longest_s = 2 * self.max_range_m / self._speed_m_s + settings.call.end_s
         self.n_samples = min(
             math.ceil((longest_s + largest_s) * self.rate_hz) + 1,
             -(-settings.recording.n_samples // settings.decimation),

@@ -246,10 +246,10 @@ def _fitted(settings: Settings, recording: Recording, first: _PcmFile) -> Settin
             f"{first.path} has a sample rate of {recording.sample_rate_hz:g} Hz, too low for a call up to "
             f"{call.high_frequency_hz:g} Hz; give the emitted call, or record at more than twice its frequency"
         )
-    if recording.duration_s <= call.duration_s:
+    if recording.duration_s <= call.end_s:
         raise DataError(
             f"a measurement of {first.path} has {1e3 * recording.duration_s:.4g} ms, but the call alone lasts "
-            f"{1e3 * call.duration_s:.4g} ms; give a longer --length, or skip less (--skip)"
+            f"{1e3 * call.end_s:.4g} ms; give a longer --length, or skip less (--skip)"
         )
     return settings.replace(recording=recording, processing=fit_ranges(settings.processing, recording, call))
 

@@ -69,10 +69,10 @@ def compensate_motion(points: PointCloud, velocity_m_s: Sequence[float], yaw_rat
     range_m = np.linalg.norm(position_m, axis=1)
     one_way_s = range_m / sound_speed_m_s(points.settings.air)
     call = points.settings.call
-    middle_s = 2 * one_way_s + call.duration_s / 2
+    middle_s = call.start_s + 2 * one_way_s + call.duration_s / 2
     turned_m = Rotation.from_rotvec(np.outer(yaw_rate_rad_s * middle_s, (0.0, 0.0, 1.0))).apply(position_m)
     ahead = np.divide(turned_m, range_m[:, None], out=np.zeros_like(turned_m), where=range_m[:, None] > 0)
     along_m_s = (ahead @ velocity)[:, None] * ahead
-    early_s = one_way_s - sweep_delay_s(call)
+    early_s = call.start_s + one_way_s - sweep_delay_s(call)
     at_rest_m = turned_m + early_s[:, None] * along_m_s + middle_s[:, None] * (velocity - along_m_s)
     return points.replace(position_m=at_rest_m.astype(points.position_m.dtype))

@@ -97,7 +97,7 @@ class EchoExtractor:
         range_m = np.maximum(_NEAREST_M, np.linalg.norm(local_m, axis=1))
         from_sensor_m = local_m @ pose.rotation.T
         range_sd_m, across_sd_m = _deviations(cloud).T
-        speed_m_s = sound_speed_m_s(cloud.settings.air)
+        speed_m_s, start_s = sound_speed_m_s(cloud.settings.air), cloud.settings.call.start_s
         return GroupEchoes(
             np.full(len(cloud), number),
             from_sensor_m + pose.translation_m,
@@ -106,8 +106,8 @@ class EchoExtractor:
             np.hypot(range_sd_m, _RANGE_SD_M),
             np.hypot(across_sd_m / range_m, _ANGLE_SD_RAD / np.cos(off_axis)),
             np.log(np.maximum(cloud.amplitude.astype(np.float64), np.finfo(np.float32).tiny)),
-            range_m / speed_m_s - sweep_delay_s(cloud.settings.call),
-            2 * range_m / speed_m_s + cloud.settings.call.duration_s / 2,
+            start_s + range_m / speed_m_s - sweep_delay_s(cloud.settings.call),
+            start_s + 2 * range_m / speed_m_s + cloud.settings.call.duration_s / 2,
             np.full(len(cloud), speed_m_s),
         )
 

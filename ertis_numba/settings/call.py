@@ -34,6 +34,9 @@ class Call(TomlTable, frozen=True, kw_only=True):
     modulation : {"hyperbolic", "linear"}, default "hyperbolic"
         ``hyperbolic`` sweeps change their period at a constant rate, ``linear`` ones their frequency. Motion shifts the
         echoes of hyperbolic sweeps without blurring them; eRTIS uses these.
+    delay_s : float, default 0
+        Silence before the call in seconds, 0 to 1, rounded to samples at ``sample_rate_hz``. Sensors with different
+        delays emit in sequence. Ranges count from the emission.
     waveform : str or tuple of float, optional, default None
         Custom waveform instead of a sweep: 17 to 4096 samples at ``sample_rate_hz``, or the name of a file with
         samples, relative to the folder of the settings. Zeros at the end of a longer waveform do not count. A WAV file
@@ -53,6 +56,7 @@ class Call(TomlTable, frozen=True, kw_only=True):
     sample_rate_hz: float = 450_000.0
     ramp_fraction: float = 0.1
     modulation: Literal["hyperbolic", "linear"] = "hyperbolic"
+    delay_s: float = 0.0
     waveform: str | tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
@@ -75,11 +79,12 @@ class Call(TomlTable, frozen=True, kw_only=True):
                 "different frequencies"
             )
         checks.between("call.duration_s", self.duration_s, 16 / self.sample_rate_hz, 1.0)
-        if self.duration_s * self.sample_rate_hz > MAX_CALL_SAMPLES:
+        checks.between("call.delay_s", self.delay_s, 0.0, 1.0)
+        if self.end_s * self.sample_rate_hz > MAX_CALL_SAMPLES:
             raise ArgumentError(
-                f"call has {self.duration_s * self.sample_rate_hz:.0f} samples ({self.duration_s:g} s at "
-                f"{self.sample_rate_hz:g} Hz); the limit is {MAX_CALL_SAMPLES}. Shorten call.duration_s or lower "
-                "call.sample_rate_hz"
+                f"call has {self.end_s * self.sample_rate_hz:.0f} samples ({self.end_s:g} s at "
+                f"{self.sample_rate_hz:g} Hz); the limit is {MAX_CALL_SAMPLES}. Shorten call.duration_s or "
+                "call.delay_s, or lower call.sample_rate_hz"
             )
         if self.duration_s * self.low_frequency_hz < 1:
             raise ArgumentError(
@@ -167,6 +172,25 @@ class Call(TomlTable, frozen=True, kw_only=True):
                 f"call.waveform is the file {self.waveform!r}, which has not been read; give Call.from_file("
                 f"{self.waveform!r}), or read the settings by Settings.load"
             )
+
+    @property
+    def n_silent(self) -> int:
+        """Samples of silence before the call, at its sample rate."""
+        return round(self.delay_s * self.sample_rate_hz)
+
+    @property
+    def start_s(self) -> float:
+        """Start of the call after the start of the record, in seconds."""
+        return self.n_silent / self.sample_rate_hz
+
+    @property
+    def end_s(self) -> float:
+        """End of the call after the start of the record, in seconds."""
+        return self.start_s + self.duration_s
+
+    def sounds_like(self, other: Self) -> bool:
+        """Return True if two calls are the same sound, perhaps with different delays."""
+        return self == other or self.replace(delay_s=0.0) == other.replace(delay_s=0.0)
 
     @property
     def low_frequency_hz(self) -> float:

@@ -49,15 +49,15 @@ def fit_ranges(processing: Processing, recording: Recording, call: Call) -> Proc
     >>> fit_ranges(Processing(), Recording(n_samples=65_536), Call()).range_m
     (0.5, 1.8)
     """
-    if recording.duration_s <= call.duration_s:
+    if recording.duration_s <= call.end_s:
         raise ArgumentError(
-            f"recording.n_samples gives a record of {1e3 * recording.duration_s:.4g} ms, but the call lasts "
-            f"{1e3 * call.duration_s:.4g} ms; give more samples"
+            f"recording.n_samples gives a record of {1e3 * recording.duration_s:.4g} ms, but the call ends after "
+            f"{1e3 * call.end_s:.4g} ms; give more samples"
         )
     changes: dict[str, Any] = {}
     first_m, last_m = Processing().range_m
     if processing.range_m == (first_m, last_m):
-        echo_m = (recording.duration_s - call.duration_s) * _MIN_SOUND_SPEED_M_S / 2
+        echo_m = (recording.duration_s - call.end_s) * _MIN_SOUND_SPEED_M_S / 2
         last_m = min(last_m, math.floor(10 * echo_m) / 10 or math.floor(1000 * echo_m) / 1000)
         changes["range_m"] = (first_m if first_m < last_m else 0.0, last_m)
     min_hz = _MIN_RATE_PER_BANDWIDTH * (call.high_frequency_hz - call.low_frequency_hz)

@@ -81,7 +81,7 @@ class Arrivals:
     def lasts_s(self) -> float:
         """Longest duration of a copy, with ringing."""
         stretch = 1.0 if self.stretch is None else float(self.stretch.max(initial=1.0))
-        return stretch * self.call.duration_s + self.rings_s
+        return stretch * self.call.end_s + self.rings_s
 
     @property
     def rings_s(self) -> float:
@@ -322,7 +322,7 @@ def arrived(
     for _, act in acting("clock_times", active):
         delay_s, stretch = act(shot, number, delay_s, stretch)
     filters = call_filters(active, sensor.emitter)
-    lasts_s = sensor.call.duration_s + sum(each.rings_s for each in filters)
+    lasts_s = sensor.call.end_s + sum(each.rings_s for each in filters)
     delay_s = delay_s + gains(shot, active)[1]
     heard = np.max(delay_s, axis=1) > -_LONGEST_STRETCH * lasts_s
     if not heard.all():

@@ -132,7 +132,9 @@ class Sight:
             for paths in ways.paths
         ]
         gain = level * np.concatenate([np.broadcast_to(part, (len(part), pulse.N_NODES)) for part in parts] or [gain])
-        return Echoes(ways.names, gain, ways.delay_s, ways.direction, ways.coverage, self.power)
+        # Delays are relative to the emission of the receiving sensor, as ranges are.
+        delay_s = ways.delay_s + (other.call.start_s - self.settings.call.start_s)
+        return Echoes(ways.names, gain, delay_s, ways.direction, ways.coverage, self.power)
 
     def paths(self, number: int, active: frozenset[str]) -> list[Paths]:
         """Return the paths of an emitter's call to the centre of the array."""
@@ -273,7 +275,7 @@ class Sight:
 
         It is relative to the sensor's own call.
         """
-        if call == self.settings.call:
+        if call.sounds_like(self.settings.call):
             return 1.0
         return float(np.abs(pulse.matched(self.settings, call)).max())
 

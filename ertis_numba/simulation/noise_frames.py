@@ -40,8 +40,8 @@ class NoiseFrame:
     seed: tuple[int, ...]
 
     @property
-    def duration_s(self) -> float:
-        """Duration in seconds."""
+    def end_s(self) -> float:
+        """End after the start of the frame, in seconds."""
         return FRAME_S
 
     @property

@@ -22,7 +22,7 @@ N_NODES = 65
 def match(settings: Settings) -> tuple[MatchedFilterSpectrum, float, int]:
     """Return the matched filter of the sensor's own call, its sample rate and the length of its transform."""
     rate_hz = settings.signal_rate_hz
-    n_fft = 2 ** math.ceil(math.log2(2 * settings.call.duration_s * rate_hz))
+    n_fft = 2 ** math.ceil(math.log2(2 * settings.call.end_s * rate_hz))
     return matched_filter_spectrum(settings, n_fft=n_fft), rate_hz, n_fft
 
 
@@ -33,7 +33,7 @@ def matched(settings: Settings, call: Call, filters: tuple[CallFilter, ...] = ()
     """
     rate_hz = settings.signal_rate_hz
     rings_s = sum(each.rings_s for each in filters)
-    n_fft = 2 ** math.ceil(math.log2(4 * (call.duration_s + settings.call.duration_s + rings_s) * rate_hz))
+    n_fft = 2 ** math.ceil(math.log2(4 * (call.end_s + settings.call.end_s + rings_s) * rate_hz))
     mine = matched_filter_spectrum(settings, n_fft=n_fft)
     bins = slice(mine.first_bin, mine.first_bin + len(mine.values))
     spectrum = np.zeros(n_fft, dtype=np.complex128)

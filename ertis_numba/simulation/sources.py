@@ -226,7 +226,7 @@ class Sonar(SoundSource, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         super().__post_init__()
         checks.between("sonar.level_db", self.level_db, -300.0, 60.0)
-        checks.between("sonar.period_s", self.period_s, self.call.duration_s, 1e3)
+        checks.between("sonar.period_s", self.period_s, self.call.end_s, 1e3)
         checks.between("sonar.offset_s", self.offset_s, 0.0, 1e3)
 
 

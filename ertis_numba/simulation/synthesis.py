@@ -50,7 +50,7 @@ def highest_hz(call: Call | NoiseFrame, rate_hz: float) -> float:
 
 @functools.cache
 def _highest_hz(call: Call, rate_hz: float) -> float:
-    n_fft = scipy.fft.next_fast_len(4 * math.ceil(call.duration_s * rate_hz), real=True)
+    n_fft = scipy.fft.next_fast_len(4 * math.ceil(call.end_s * rate_hz), real=True)
     spectrum = np.abs(np.fft.rfft(call_at(call, np.arange(n_fft) / rate_hz)))
     return float(np.flatnonzero(spectrum > _DEAF * spectrum.max())[-1] * rate_hz / n_fft)
 
@@ -116,7 +116,7 @@ def _length(arrived: Sequence[Arrivals], delay_samples: Sequence[Floats], rate_h
     step = 1
     for entry, delay in zip(arrived, delay_samples, strict=True):
         stretch = 1.0 if entry.stretch is None else float(entry.stretch.max(initial=1.0))
-        call = max(call, math.ceil(stretch * (entry.call.duration_s + entry.rings_s) * rate_hz))
+        call = max(call, math.ceil(stretch * (entry.call.end_s + entry.rings_s) * rate_hz))
         spread = max(spread, math.ceil(np.ptp(delay, axis=1).max(initial=0.0)))
         if entry.stretch is not None:
             step = math.lcm(step, _step(entry.call, rate_hz))
@@ -180,7 +180,7 @@ def _spectrum(call: Call, rate_hz: float, n_fft: int) -> NDArray[np.complex128]:
 
 
 def _framed(frame: NoiseFrame, rate_hz: float, n_fft: int) -> NDArray[np.complex128]:
-    time_s = np.arange(math.ceil(frame.duration_s * rate_hz) + 1) / rate_hz
+    time_s = np.arange(math.ceil(frame.end_s * rate_hz) + 1) / rate_hz
     return np.asarray(scipy.fft.rfft(frame.at(time_s), n_fft))
 
 
@@ -193,7 +193,7 @@ def _stretched(
     spectra suffice. Lagrange interpolation through Chebyshev nodes yields all others with an error of −100 dB.
     """
     middle, half = (stretch.max() + stretch.min()) / 2, np.ptp(stretch) / 2
-    apart_rad = 2 * math.pi * call.high_frequency_hz * call.duration_s * half
+    apart_rad = 2 * math.pi * call.high_frequency_hz * call.end_s * half
     if len(stretch) <= _NODES or apart_rad > _FAR_APART_RAD:
         return _spectra(call, stretch, rate_hz, n_fft, n_bins)
     nodes = np.cos(math.pi * (np.arange(_NODES) + 0.5) / _NODES)
@@ -211,7 +211,7 @@ def _spectra(
 ) -> NDArray[np.complex128]:
     """Return the spectrum of the call for each stretch, computed at the lowest sample rate that its band allows."""
     step = _step(call, rate_hz)
-    n_samples = math.ceil(call.duration_s * stretch.max() * rate_hz / step) + 1
+    n_samples = math.ceil(call.end_s * stretch.max() * rate_hz / step) + 1
     time_s = np.arange(n_samples) * (step / rate_hz) / stretch[:, None]
     values = call.at(time_s) if isinstance(call, NoiseFrame) else call_at(call, time_s)
     spectra = scipy.fft.rfft(values, n_fft // step)

@@ -52,7 +52,7 @@ class PaperChain(KernelChain):
         delays = np.rint(delays_s * settings.signal_rate_hz).astype(np.int64)
         lead = int(np.max(np.abs(delays)))
         taps, channels = chain_taps(settings), np.flatnonzero(layout.enabled).astype(np.int32)
-        guard_s = settings.call.duration_s + 2 * matched_guard_s(settings)
+        guard_s = settings.call.end_s + 2 * matched_guard_s(settings)
         n_fft = n_samples + 2 * lead + math.ceil(guard_s * settings.signal_rate_hz) + 1
         n_fft += n_fft % 2
         window, factor = TimeWindow.from_start(n_samples, n_fft=n_fft), settings.decimation

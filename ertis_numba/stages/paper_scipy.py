@@ -193,7 +193,7 @@ def _filtered_call(settings: Settings, demodulate: _Demodulate) -> NDArray[np.fl
     """Return the filtered call as recorded by a microphone of amplitude ±½: (sample,) float64 at the signal rate."""
     call, rate_hz = settings.call, settings.recording.sample_rate_hz
     narrowest_hz = min(call.high_frequency_hz - call.low_frequency_hz, call.low_frequency_hz)
-    length_s = call.duration_s + _RINGING / narrowest_hz
+    length_s = call.end_s + _RINGING / narrowest_hz
     time_s = np.arange(math.ceil(length_s * rate_hz)) / rate_hz
     return np.asarray(demodulate(0.5 * call_at(call, time_s)))
 

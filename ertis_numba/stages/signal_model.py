@@ -162,7 +162,7 @@ def _covariance(series: NDArray[np.complex64], settings: Settings, rate_hz: floa
 
 def _white_power(settings: Settings) -> float:
     """Return the power of white bits after the matched filter."""
-    n_fft = 2 ** math.ceil(math.log2(2 * settings.call.duration_s * settings.signal_rate_hz + 256))
+    n_fft = 2 ** math.ceil(math.log2(2 * settings.call.end_s * settings.signal_rate_hz + 256))
     matched = matched_filter_spectrum(settings, n_fft=n_fft)
     return float(np.sum(np.abs(matched.values) ** 2) / n_fft / settings.decimation)
 

@@ -80,7 +80,7 @@ def matched(signals: NDArray[np.float32], settings: Settings) -> NDArray[np.comp
     """
     count = signals.shape[1]
     # The filter rings for the call's duration and a guard on either side; the padding keeps its ends apart.
-    guard_s = settings.call.duration_s + 2 * matched_guard_s(settings)
+    guard_s = settings.call.end_s + 2 * matched_guard_s(settings)
     n_fft = count + math.ceil(guard_s * settings.signal_rate_hz) + 1
     spectrum = matched_filter_spectrum(settings, n_fft=n_fft)
     occupied = slice(spectrum.first_bin, spectrum.first_bin + len(spectrum.values))

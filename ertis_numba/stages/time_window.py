@@ -82,7 +82,7 @@ def time_window(settings: Settings, *, largest_delay_s: float, n_taps: int, ring
     """
     speed_m_s = sound_speed_m_s(settings.air)
     first_m, last_m = settings.processing.range_m
-    record_m = speed_m_s * settings.recording.duration_s / 2
+    record_m = speed_m_s * (settings.recording.duration_s - settings.call.start_s) / 2
     if last_m > record_m:
         raise ArgumentError(
             f"processing.range_m ends at {last_m:g} m, but the record of "
@@ -96,7 +96,7 @@ def time_window(settings: Settings, *, largest_delay_s: float, n_taps: int, ring
     guard_s = matched_guard_s(settings, down_db=ringing_db)
     start_s = 2 * first_m / speed_m_s - lead / output_rate_hz
     stop_s = start_s + (n_ranges + 2 * lead) / output_rate_hz
-    spanned_s = stop_s - start_s + settings.call.duration_s + 2 * guard_s
+    spanned_s = stop_s - start_s + settings.call.end_s + 2 * guard_s
     n_outputs = scipy.fft.next_fast_len(math.ceil(spanned_s * output_rate_hz))
     n_fft = n_outputs * settings.output_decimation
     rate_hz = settings.signal_rate_hz
@@ -104,7 +104,7 @@ def time_window(settings: Settings, *, largest_delay_s: float, n_taps: int, ring
     before = n_taps // 2 // decimation
     after = (settings.recording.n_samples - 1 + n_taps // 2) // decimation
     first_sample = max(-before, math.floor((start_s - guard_s) * rate_hz))
-    last_sample = min(after, math.ceil((stop_s + settings.call.duration_s + guard_s) * rate_hz))
+    last_sample = min(after, math.ceil((stop_s + settings.call.end_s + guard_s) * rate_hz))
     return TimeWindow(
         range_m=first_m + step_m * np.arange(n_ranges, dtype=np.float64),
         first_sample=first_sample,

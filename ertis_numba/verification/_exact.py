@@ -163,7 +163,7 @@ def _transform_length(settings: Settings) -> int:
     rate_hz, step = settings.recording.sample_rate_hz, settings.processing.range_decimation
     processing = settings.processing
     own_s = (len(processing.pre_filter) + len(processing.post_filter)) / call.high_frequency_hz
-    needed = settings.recording.n_samples + math.ceil((call.duration_s + _RINGING / edge_hz + own_s) * rate_hz)
+    needed = settings.recording.n_samples + math.ceil((call.end_s + _RINGING / edge_hz + own_s) * rate_hz)
     return step * int(scipy.fft.next_fast_len(-(-needed // step)))
 
 

@@ -116,7 +116,7 @@ def _loudest(
     few = list(channels)[:: max(1, len(channels) // _PILOTS)]
     pilot = compress(signals, few, call, rate_hz=rate_hz, first=0, last=n_samples)
     middle_s = pilot.start_s + int(np.argmax(np.median(pilot.envelope, axis=0))) * pilot.step_s
-    middle = round(middle_s * rate_hz)
+    middle = round((middle_s + call.start_s) * rate_hz)
     return max(0, middle - length), min(n_samples, middle + 2 * length)
 
 

@@ -99,7 +99,7 @@ def _received(
     gain, late_s = gains(source.shot, source.active)
     delay_s, stretch = source.arrival(start_s + centre_s)
     delay_s = delay_s - centre_s * (1.0 if stretch is None else stretch) + late_s
-    lasts_s = sound.duration_s * (1.0 if stretch is None else float(stretch.max(initial=1.0)))
+    lasts_s = sound.end_s * (1.0 if stretch is None else float(stretch.max(initial=1.0)))
     heard = (delay_s.max(axis=1) > -lasts_s) & (delay_s.min(axis=1) < source.shot.sensor.recording.duration_s)
     amplitude = gain[:, None] * response[heard]
     return Arrivals(sound, rounded_s(delay_s[heard]), amplitude, None if stretch is None else stretch[heard])
@@ -136,7 +136,7 @@ def _calls_of(source: SourceInScene[Sonar] | SourceInScene[AnySource], sonar: So
         return np.zeros(0)
     time_s = source.shot.time_s
     first_s, last_s = _sent_s(source)
-    first_s -= 2 * sonar.call.duration_s
+    first_s -= 2 * sonar.call.end_s
     earliest, latest = ((time_s + each_s - sonar.offset_s) / sonar.period_s for each_s in (first_s, last_s))
     numbers = np.arange(max(0, math.ceil(earliest)), math.floor(latest) + 1)
     return np.asarray(sonar.offset_s + numbers * sonar.period_s - time_s)
