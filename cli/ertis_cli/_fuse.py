@@ -14,11 +14,13 @@ if TYPE_CHECKING:
 
     from ertis_cli._mountings import Mounting
     from ertis_numba.frames import Energyscape
-    from ertis_numba.fusion import Fused
+    from ertis_numba.fusion import DirectSoundCheck, Fused
     from ertis_numba.settings import Settings
     from ertis_numba.storage import RecordingReader
 
 __all__ = ["write_fused"]
+
+_CHECKED_PULSES = 8
 
 
 def write_fused(
@@ -63,11 +65,14 @@ def write_fused(
         fuser = Fuser(mountings, emitter_diameter_m=emitter_diameter_m)
         pipelines = _pulses.PipelinesBySensor(changed, stack, quiet=quiet, **device)
         groups = list(_pulses.pulse_groups(readers))
+        by_name = {reader.sensor: reader for reader in readers}
+        clocks = _clock_check(mountings, groups, by_name)
+        for text in clocks.warnings():
+            click.echo(f"ertis: warning: {text}", err=True)
         incomplete = 0
         writer = stack.enter_context(
             EnergyscapeWriter(target, overwrite=force, mounting={PLATFORM: ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))})
         )
-        by_name = {reader.sensor: reader for reader in readers}
         with options.progress(groups, length=len(groups), label="fusing", quiet=quiet) as shown:
             for number, group in enumerate(shown):
                 fused = fuser(pipelines.image(by_name[name][place.index]) for name, place in group.items())
@@ -79,7 +84,37 @@ def write_fused(
     options.say(f"{target}: {pulses} of {', '.join(by_name)}, fused", quiet=quiet)
     if as_json:
         report = {"output": str(target), "sensors": list(by_name), "pulses": len(groups), "incomplete": incomplete}
-        options.print_json(report)
+        options.print_json(report | _direct_sound(clocks))
+
+
+def _clock_check(
+    mountings: "Mapping[str, Mounting]",
+    groups: "Sequence[Mapping[str, _pulses.StampedIndex]]",
+    readers: "Mapping[str, RecordingReader]",
+) -> "DirectSoundCheck":
+    """Return the direct sound between sensors in a few pulses, which are spread over the recordings."""
+    from ertis_numba.fusion import DirectSoundCheck
+
+    check = DirectSoundCheck(mountings)
+    for group in groups[:: max(1, -(-len(groups) // _CHECKED_PULSES))]:
+        check.add(readers[name][place.index] for name, place in group.items())
+    return check
+
+
+def _direct_sound(check: "DirectSoundCheck") -> dict[str, Any]:
+    """Return the fields of a clock check in the JSON report."""
+    return {
+        "direct_sound": [
+            {
+                "emitter": each.emitter,
+                "receiver": each.receiver,
+                "difference_us": round(1e6 * each.difference_s, 3),
+                "uncertainty_us": round(1e6 * each.uncertainty_s, 3),
+            }
+            for each in check.sounds
+        ],
+        "warnings": list(check.warnings()),
+    }
 
 
 def _require_several(readers: "Sequence[RecordingReader]") -> None:

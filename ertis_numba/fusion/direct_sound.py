@@ -1,0 +1,299 @@
+"""Direct sound between the sensors of a platform, which shows errors of clocks and mountings."""
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba import checks
+from ertis_numba.air import sound_speed_m_s
+from ertis_numba.constants import SYNC_STEP_S
+from ertis_numba.errors import ArgumentError
+from ertis_numba.frames import Measurement
+from ertis_numba.fusion.rig import MountedSensor, Mountings, sensor_poses
+from ertis_numba.geometry import microphones
+from ertis_numba.settings import Settings
+from ertis_numba.stages.signals import matched, signals_of
+from ertis_numba.waveform import matched_filter_spectrum, matched_guard_s
+
+__all__ = ["DirectSound", "DirectSoundCheck"]
+
+Floats = NDArray[np.float64]
+
+_GATE_S: Final = 500e-6  # Largest error of an arrival that is found, …
+_MIN_GATE_S: Final = 250e-6  # … unless the sensor's own direct sound is near; pairs with less than this are left out.
+_PULSE_S: Final = 120e-6  # Half of the width of a pulse, outside which the background is measured.
+_AUDIBLE: Final = 4.0  # Amplitude relative to the background.
+_OVERSAMPLING: Final = 8
+_MOUNTING_SD_M: Final = 1e-3  # of the position of a sensor along the way to another one
+_SIGMAS: Final = 3.0
+_NEAREST_M: Final = 0.05
+
+
+class DirectSound(NamedTuple):
+    """Arrival of the direct sound of a neighbour.
+
+    Attributes
+    ----------
+    emitter, receiver : str
+    difference_s : float
+        Measured minus predicted arrival, as a median over pulses.
+    noise_s : float
+        Standard deviation of the measured arrival.
+    uncertainty_s : float
+        Standard deviation of the difference, with that of the mountings and of the SYNC chain.
+    """
+
+    emitter: str
+    receiver: str
+    difference_s: float
+    noise_s: float
+    uncertainty_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Arrival:
+    difference_s: float
+    noise_s: float
+
+
+class DirectSoundCheck:
+    """Comparison of the direct sound between sensors with the prediction of their mountings.
+
+    Sound from sensor a to sensor b arrives early or late if their clocks differ, and late if they are farther apart
+    than their mountings state. The way back tells both apart: a difference of clocks has the opposite sign there.
+    Emitters are assumed to be at the origins of the sensors, as in images.
+
+    Parameters
+    ----------
+    mountings : mapping of str to (translation_m, rotation_xyzw)
+        As for `Fuser`.
+
+    Raises
+    ------
+    ArgumentError
+        A mounting is missing or invalid.
+
+    Examples
+    --------
+    >>> import ertis_numba as ertis
+    >>> from ertis_numba.fusion import DirectSoundCheck
+    >>> ahead = (0.0, 0.0, 0.0, 1.0)
+    >>> check = DirectSoundCheck({"left": ((0.0, 0.1, 0.0), ahead), "right": ((0.0, -0.1, 0.0), ahead)})
+    >>> check.sounds, check.warnings()
+    ((), ())
+    """
+
+    def __init__(self, mountings: Mountings) -> None:
+        self._poses = {pose.name: pose for pose in sensor_poses(mountings)}
+        self._found: dict[tuple[str, str], list[_Arrival]] = {}
+        self._sample_s = 0.0
+        self._speed_m_s = 0.0
+
+    def add(self, measurements: Iterable[Measurement]) -> None:
+        """Add the measurements of one SYNC pulse, at most one of each sensor.
+
+        Parameters
+        ----------
+        measurements : iterable of Measurement
+
+        Raises
+        ------
+        ArgumentError
+            A sensor has no mounting.
+        DataError
+            The samples do not match the settings.
+        """
+        group = {}
+        for each in checks.items("measurements", measurements, Measurement, "a recording holds"):
+            if each.stamp.sensor not in self._poses:
+                raise ArgumentError(
+                    f"measurements has sensor {each.stamp.sensor!r}, but its mounting is unknown; give mountings for "
+                    f"it, or one of {', '.join(self._poses)}"
+                )
+            group[each.stamp.sensor] = each
+        for name, each in group.items():
+            call = each.settings.call
+            starts_s = {
+                other: heard.settings.call.start_s
+                for other, heard in group.items()
+                if other != name
+                and heard.stamp.behaviour != "passive"
+                and heard.settings.call.sounds_like(call)
+                and self._distance_m(name, other) > _NEAREST_M
+            }
+            for other, arrival in _arrivals(each, self._poses, starts_s).items():
+                self._found.setdefault((other, name), []).append(arrival)
+            self._sample_s = max(self._sample_s, 1 / each.settings.signal_rate_hz)
+            self._speed_m_s = sound_speed_m_s(each.settings.air)
+
+    @property
+    def sounds(self) -> tuple[DirectSound, ...]:
+        """Direct sound of each pair of emitter and receiver, where it is audible."""
+        chain_s = SYNC_STEP_S * (len(self._poses) - 1)
+        found = []
+        for (emitter, receiver), arrivals in self._found.items():
+            difference_s = float(np.median([each.difference_s for each in arrivals]))
+            noise_s = float(np.median([each.noise_s for each in arrivals]))
+            mounting_s = math.sqrt(2) * _MOUNTING_SD_M / self._speed_m_s
+            found.append(
+                DirectSound(emitter, receiver, difference_s, noise_s, math.hypot(noise_s, mounting_s, chain_s))
+            )
+        return tuple(found)
+
+    def warnings(self) -> tuple[str, ...]:
+        """Return one line for each clock and each distance that differs by more than its uncertainty allows.
+
+        The limit is three standard deviations and one sample of the signals.
+        """
+        sounds = {(each.emitter, each.receiver): each for each in self.sounds}
+        clocks_s, distances_s = _both_ways(sounds, SYNC_STEP_S * (len(self._poses) - 1))
+        found = [*self._of_clocks(clocks_s)]
+        for (one, other), (late_s, sd_s) in distances_s.items():
+            if self._is_wrong(late_s, sd_s):
+                found.append(
+                    f"{one} and {other} are {self._millimetres(late_s)} than their mountings state, "
+                    f"± {1e3 * sd_s * self._speed_m_s:.1f} mm; measure the mountings again"
+                )
+        for (emitter, receiver), each in sounds.items():
+            is_single = (receiver, emitter) not in sounds
+            if is_single and self._is_wrong(each.difference_s, each.uncertainty_s):
+                found.append(
+                    f"direct sound of {emitter} arrives at {receiver} {_microseconds(each.difference_s)} than "
+                    f"predicted, ± {1e6 * each.uncertainty_s:.1f} µs; check the SYNC line and the mountings"
+                )
+        return tuple(found)
+
+    def _of_clocks(self, clocks_s: Mapping[tuple[str, str], tuple[float, float]]) -> Iterable[str]:
+        """Yield a line for each sensor whose clock differs from most others, or for two that differ."""
+        names = dict.fromkeys(name for pair in clocks_s for name in pair)
+        if len(names) == 2:
+            for (one, other), (late_s, sd_s) in clocks_s.items():
+                if self._is_wrong(late_s, sd_s):
+                    yield (
+                        f"{one} emits and records {_microseconds(late_s)} than {other}, ± {1e6 * sd_s:.1f} µs; check "
+                        "the SYNC line"
+                    )
+            return
+        for name in names:
+            offsets = [
+                (late_s if name == one else -late_s, sd_s)
+                for (one, other), (late_s, sd_s) in clocks_s.items()
+                if name in (one, other)
+            ]
+            late_s = float(np.median([0.0, *(each for each, _ in offsets)]))
+            sd_s = float(np.median([sd for _, sd in offsets]))
+            if self._is_wrong(late_s, sd_s):
+                yield (
+                    f"{name} emits and records {_microseconds(late_s)} than the other sensors, ± {1e6 * sd_s:.1f} µs; "
+                    "check its SYNC line"
+                )
+
+    def _is_wrong(self, difference_s: float, sd_s: float) -> bool:
+        return abs(difference_s) > max(_SIGMAS * sd_s, self._sample_s)
+
+    def _distance_m(self, one: str, other: str) -> float:
+        return float(np.linalg.norm(self._poses[one].translation_m - self._poses[other].translation_m))
+
+    def _millimetres(self, late_s: float) -> str:
+        return f"{1e3 * abs(late_s) * self._speed_m_s:.1f} mm {'farther apart' if late_s > 0 else 'closer together'}"
+
+
+def _both_ways(
+    sounds: Mapping[tuple[str, str], DirectSound], chain_s: float
+) -> tuple[dict[tuple[str, str], tuple[float, float]], dict[tuple[str, str], tuple[float, float]]]:
+    """Return differences of clocks and of distances of pairs whose sound is heard both ways, each with its deviation.
+
+    The first sensor of a pair is late by the first value. The second value is the excess of the distance as a time.
+    """
+    clocks_s, distances_s = {}, {}
+    names = dict.fromkeys(name for pair in sounds for name in pair)
+    for one, other in combinations(names, 2):
+        if (one, other) in sounds and (other, one) in sounds:
+            there, back = sounds[one, other], sounds[other, one]
+            noise_s = math.hypot(there.noise_s, back.noise_s) / 2
+            clocks_s[one, other] = (there.difference_s - back.difference_s) / 2, math.hypot(noise_s, chain_s)
+            mounting_s = math.sqrt(max(0.0, there.uncertainty_s**2 - there.noise_s**2 - chain_s**2))
+            distances_s[one, other] = (there.difference_s + back.difference_s) / 2, math.hypot(noise_s, mounting_s)
+    return clocks_s, distances_s
+
+
+def _arrivals(
+    measurement: Measurement, poses: Mapping[str, MountedSensor], starts_s: Mapping[str, float]
+) -> dict[str, _Arrival]:
+    """Return the arrivals of direct sound at a sensor, by emitter."""
+    settings = measurement.settings
+    # Without its own delay, the matched filter yields times since the start of the record.
+    settings = settings.replace(call=settings.call.replace(delay_s=0.0))
+    layout, pose, speed_m_s = (
+        microphones(settings.array),
+        poses[measurement.stamp.sensor],
+        sound_speed_m_s(settings.air),
+    )
+    places_m = pose.translation_m + layout.enabled_positions_m @ pose.rotation.T
+    late_s = {
+        name: start_s
+        + np.linalg.norm(places_m - poses[name].translation_m, axis=1) / speed_m_s
+        + layout.delay_s[layout.enabled]
+        for name, start_s in starts_s.items()
+    }
+    if not late_s:
+        return {}
+    last_s = max(float(each.max()) for each in late_s.values()) + 2 * _GATE_S
+    needed = math.ceil(
+        (last_s + settings.call.end_s + 2 * matched_guard_s(settings)) * settings.recording.sample_rate_hz
+    )
+    signals = matched(signals_of(measurement, settings=settings, max_samples=needed), settings)
+    spectra = np.fft.fft(signals.astype(np.complex128), axis=1)
+    frequency_hz = np.fft.fftfreq(signals.shape[1], 1 / settings.signal_rate_hz)
+    # Direct sound from the sensor itself is far louder, and hides that of neighbours.
+    own_s = measurement.settings.call.start_s
+    own_end_s = own_s + float(np.linalg.norm(layout.enabled_positions_m, axis=1).max()) / speed_m_s + _PULSE_S / 2
+    found = {}
+    for name, each in late_s.items():
+        middle_s = float(each.mean())
+        gate_s = min(_GATE_S, max(own_s - _PULSE_S / 2 - middle_s, middle_s - own_end_s))
+        if gate_s < _MIN_GATE_S:
+            continue
+        beam = np.mean(spectra * np.exp(2j * math.pi * frequency_hz * each[:, None]), axis=0)
+        arrival = _strongest(beam, settings, gate_s)
+        if arrival is not None:
+            found[name] = arrival
+    return found
+
+
+def _strongest(spectrum: NDArray[np.complex128], settings: Settings, gate_s: float) -> _Arrival | None:
+    """Return the time of the strongest pulse within a gate around time 0 of a beam, or None if it is not audible."""
+    count = len(spectrum)
+    padded = np.zeros(_OVERSAMPLING * count, dtype=np.complex128)
+    padded[: count // 2], padded[-(count - count // 2) :] = spectrum[: count // 2], spectrum[count // 2 :]
+    amplitude = np.abs(np.fft.ifft(padded)) * _OVERSAMPLING
+    step_s = 1 / (_OVERSAMPLING * settings.signal_rate_hz)
+    half = round(gate_s / step_s)
+    level = np.concatenate([amplitude[-half:], amplitude[: half + 1]])
+    peak = int(level.argmax())
+    is_pulse = np.abs(np.arange(len(level)) - peak) * step_s < _PULSE_S
+    background = float(np.sqrt(np.mean(level[~is_pulse] ** 2)))
+    if not 0 < peak < len(level) - 1 or level[peak] < _AUDIBLE * max(background, 1e-30):
+        return None
+    before, here, after = level[peak - 1 : peak + 2].tolist()
+    offset = 0.5 * (before - after) / (before - 2 * here + after)
+    noise_s = background / (here * math.sqrt(2) * 2 * math.pi * _bandwidth_hz(settings))
+    return _Arrival((peak - half + offset) * step_s, noise_s)
+
+
+def _bandwidth_hz(settings: Settings) -> float:
+    """Return the RMS bandwidth of the matched call, which determines the error of its time."""
+    n_fft = 2 ** math.ceil(math.log2(4 * settings.call.end_s * settings.signal_rate_hz))
+    power = matched_filter_spectrum(settings, n_fft=n_fft).echo_power
+    frequency_hz = np.arange(len(power)) * settings.signal_rate_hz / n_fft
+    centre_hz = np.average(frequency_hz, weights=power)
+    return float(np.sqrt(np.average((frequency_hz - centre_hz) ** 2, weights=power)))
+
+
+def _microseconds(late_s: float) -> str:
+    return f"{1e6 * abs(late_s):.1f} µs {'later' if late_s > 0 else 'earlier'}"

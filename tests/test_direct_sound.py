@@ -1,0 +1,157 @@
+"""Direct sound between sensors shows wrong clocks and mountings, and accuses no others."""
+
+import functools
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from ertis_cli.main import cli
+
+import ertis_numba as ertis
+from ertis_numba.constants import SYNC_STEP_S
+from ertis_numba.errors import ArgumentError
+from ertis_numba.fusion import DirectSoundCheck
+from ertis_numba.settings import Call, Processing, Recording
+from ertis_numba.simulation import Emitter, Point, Scene
+from ertis_numba.storage import write_recording
+from tests import test_fusion
+
+SENSORS = tuple(test_fusion.YAWS)
+LATE = 20  # Number of the measurement one second after a SYNC pulse.
+
+
+@functools.cache
+def scene(drifting="", drift_ppm=0.0, names=SENSORS, **emitter):
+    """A platform whose sensors hear each other; the SYNC pulses come every two seconds."""
+    base = test_fusion.scene(diameter_m=0.0)
+    sensors = tuple(
+        each.replace(
+            electronics=each.electronics.replace(clock_drift_ppm=drift_ppm if each.name == drifting else 0.0),
+            emitter=each.emitter.replace(**emitter),
+            recording=Recording(n_samples=32_768),
+            processing=Processing(range_m=(0.3, 0.6), directions="90"),
+        )
+        for each in base.sensors
+        if each.name in names
+    )
+    return base.replace(sensors=sensors, rate_hz=20.0, sync_every=40)
+
+
+def heard(made, index=0):
+    return [ertis.render(made, index, sensor=each.name) for each in made.sensors]
+
+
+def mountings(made, **moved_m):
+    return {
+        each.name: (np.add(each.position_m, moved_m.get(each.name, 0.0)).tolist(), each.quaternion())
+        for each in made.sensors
+    }
+
+
+def checked(made, index=0, **moved_m):
+    check = DirectSoundCheck(mountings(made, **moved_m))
+    check.add(heard(made, index))
+    return check
+
+
+def test_direct_sound_of_right_clocks_shows_the_sync_chain_only():
+    check = checked(scene())
+    assert {(each.emitter, each.receiver) for each in check.sounds} == {
+        (one, other) for one in SENSORS for other in SENSORS if one != other
+    }
+    for each in check.sounds:
+        later = (SENSORS.index(each.emitter) - SENSORS.index(each.receiver)) * SYNC_STEP_S
+        assert abs(each.difference_s - later) < 3 * each.noise_s
+        assert each.uncertainty_s < 10e-6
+    assert check.warnings() == ()
+
+
+@pytest.mark.parametrize("drift_ppm", [20.0, -300.0])
+def test_wrong_clock_is_found(drift_ppm):
+    check = checked(scene("left", drift_ppm), LATE)
+    (warning,) = check.warnings()
+    way = "earlier" if drift_ppm > 0 else "later"
+    assert warning.startswith("left emits and records ")
+    assert f" µs {way} than the other sensors, ± " in warning
+    late_us = float(warning.split()[4])
+    assert late_us == pytest.approx(abs(drift_ppm), abs=2.0)
+
+
+def test_clock_is_right_at_the_sync_pulse():
+    assert checked(scene("left", -300.0), 0).warnings() == ()
+
+
+def test_two_sensors_are_named_together():
+    made = scene("left", 100.0, ("front", "left"))
+    (warning,) = checked(made, LATE).warnings()
+    assert warning.startswith(("left emits and records ", "front emits and records "))
+    assert " than front, ± " in warning or " than left, ± " in warning
+
+
+def test_wrong_mounting_is_found_and_clocks_are_not_accused():
+    warnings = checked(scene(), left=(0.0, 0.01, 0.0)).warnings()
+    assert len(warnings) == 3
+    assert all("left" in each and "closer together than their mountings state" in each for each in warnings)
+
+
+def test_errors_within_the_uncertainty_of_mountings_are_not_accused():
+    assert checked(scene(), left=(0.0, 0.002, 0.0)).warnings() == ()
+
+
+def test_own_direct_sound_and_delayed_calls_do_not_matter():
+    made = scene(direct_sound_db=-30.0)
+    delays = dict(zip(SENSORS, (1e-3, 0.0, 2e-3, 0.0), strict=True))
+    sensors = tuple(each.replace(call=Call(delay_s=delays[each.name])) for each in made.sensors)
+    check = checked(made)
+    assert (len(check.sounds), check.warnings()) == (12, ())
+    check = checked(made.replace(sensors=sensors))
+    heard_by_front = {each.emitter for each in check.sounds if each.receiver == "front"}
+    assert heard_by_front == {"back"}  # Sound of the others arrives together with the sensor's own.
+    assert len(check.sounds) >= 8
+    assert check.warnings() == ()
+
+
+def test_inaudible_sound_is_not_reported():
+    assert checked(scene(silent=True)).sounds == ()
+    assert checked(scene(diameter_m=0.012)).sounds == ()
+
+
+def test_sound_that_is_heard_one_way_is_reported():
+    made = scene("left", 100.0, ("front", "left"))
+    sensors = tuple(each.replace(emitter=Emitter(silent=each.name == "front")) for each in made.sensors)
+    check = checked(made.replace(sensors=sensors), LATE)
+    (warning,) = check.warnings()
+    assert warning.startswith("direct sound of left arrives at front ")
+    assert " earlier than predicted, ± " in warning
+
+
+def test_measurement_without_a_mounting_is_refused():
+    made = scene()
+    check = DirectSoundCheck({"front": mountings(made)["front"]})
+    with pytest.raises(ArgumentError, match="measurements has sensor 'left', but its mounting is unknown"):
+        check.add(heard(made))
+
+
+def test_process_reports_direct_sound_and_warns(tmp_path):
+    made = scene("left", 100.0, ("front", "left"))
+    paths = []
+    for each in made.sensors:
+        paths.append(tmp_path / f"{each.name}.h5")
+        mounting = {each.name: (each.position_m, each.quaternion())}
+        write_recording(paths[-1], [ertis.render(made, LATE, sensor=each.name)], mounting=mounting)
+    done = CliRunner().invoke(cli, ["process", *map(str, paths), "--fuse", "-o", str(tmp_path / "f.h5"), "--json"])
+    assert done.exit_code == 0, done.output
+    report = json.loads(done.stdout.splitlines()[-1])
+    assert {(each["emitter"], each["receiver"]) for each in report["direct_sound"]} == {
+        ("front", "left"),
+        ("left", "front"),
+    }
+    assert all(90 < abs(each["difference_us"]) < 110 for each in report["direct_sound"])
+    (warning,) = report["warnings"]
+    assert f"ertis: warning: {warning}" in done.stderr
+
+
+def test_scene_of_nothing_but_sensors_suffices():
+    made = Scene(sensors=scene().sensors, points=(Point(position_m=(3.0, 0.0, 0.4)),))
+    assert checked(made).warnings() == ()
