@@ -61,6 +61,8 @@ def between(name: str, value: float, low: float, high: float) -> float:
 
 def interval(name: str, value: tuple[float, float], low: float, high: float) -> None:
     """Refuse an interval that is not ``low <= first <= last <= high``."""
+    if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != 2:
+        raise ArgumentError(f"{name} is {value!r:.80}; give two numbers, the smaller one first")
     first, last = (between(name, edge, low, high) for edge in value)
     if first > last:
         raise ArgumentError(f"{name} runs from {first:g} to {last:g}; give the smaller number first")

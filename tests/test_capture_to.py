@@ -352,7 +352,11 @@ def test_sensor_nodes_are_warned_of_a_shared_sensor_name(tmp_path):
             1,
         ),
         (["--mounting", "none.toml"], "none.toml", 1),
-        (["--mounting", "empty.toml"], "does not contain sensor 'one'; add it, or choose one of sensor with --name", 1),
+        (
+            ["--mounting", "empty.toml"],
+            "does not contain sensor 'one'; add its mounting, or use sensors of this file: sensor",
+            1,
+        ),
     ],
 )
 def test_capture_to_reports_errors_in_one_line(tmp_path, arguments, message, code):

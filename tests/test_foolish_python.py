@@ -14,6 +14,7 @@ import ertis_numba as ertis
 from ertis_numba.storage import open_recording
 
 RECORDING = Path(__file__).parents[1] / "data" / "synthetic" / "reflectors.h5"
+PLACES = {"sensor": ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))}
 TIMEOUT_S = 10.0
 MAX_LENGTH = 500
 
@@ -49,6 +50,28 @@ def given(tmp_path_factory):
 
 
 CALLS = {
+    "Odometry(3)": lambda given: ertis.Odometry(3),
+    "Odometry(mounting 3)": lambda given: ertis.Odometry({"front": 3}),
+    "Odometry(mounting of text)": lambda given: ertis.Odometry({"front": (("a", 0, 0), (0, 0, 0, 1))}),
+    "Odometry.add(3)": lambda given: ertis.Odometry(PLACES).add(3),
+    "Odometry.add(image)": lambda given: ertis.Odometry(PLACES).add(given.image),
+    "Odometry.add(texts)": lambda given: ertis.Odometry(PLACES).add("front"),
+    "Odometry.remount(None)": lambda given: ertis.Odometry(PLACES).remount(None),
+    "ego_velocity(3)": lambda given: ertis.ego_velocity(3, [given.image], PLACES),
+    "ego_velocity(mountings list)": lambda given: ertis.ego_velocity([given.image], [given.image], [1]),
+    "compensate_motion(image)": lambda given: ertis.compensate_motion(given.image, (1, 0, 0)),
+    "compensate_motion(text)": lambda given: ertis.compensate_motion(given.cloud, "fast"),
+    "compensate_motion(yaw text)": lambda given: ertis.compensate_motion(given.cloud, (1, 0, 0), "fast"),
+    "Mapper(3)": lambda given: ertis.Mapper(3),
+    "Mapper(height 3)": lambda given: ertis.Mapper(PLACES, height_m=3),
+    "Mapper.add(pose text)": lambda given: ertis.Mapper(PLACES).add([given.image], (("a", 0, 0), (0, 0, 0, 1))),
+    "Mapper.add(pose 3)": lambda given: ertis.Mapper(PLACES).add([given.image], 3),
+    "Trajectory(None)": lambda given: ertis.Trajectory(None, None, None),
+    "Trajectory(ragged)": lambda given: ertis.Trajectory([[1, 2], [3]], [[0, 0, 0]], [[0, 0, 0, 1]]),
+    "Trajectory(source 3)": lambda given: ertis.Trajectory([1], [[0, 0, 0]], [[0, 0, 0, 1]], source=3),
+    "Trajectory.at(text)": lambda given: ertis.Trajectory([1], [[0, 0, 0]], [[0, 0, 0, 1]]).at("now"),
+    "write_tum(3)": lambda given: ertis.write_tum(given.folder / "t.tum", 3),
+    "add_poses(3)": lambda given: ertis.add_poses(RECORDING, 3, output=given.folder / "p.h5"),
     "Pipeline(None)": lambda given: ertis.Pipeline(None),
     "Pipeline(3)": lambda given: ertis.Pipeline(3),
     "Pipeline('nope')": lambda given: ertis.Pipeline("nope"),

@@ -120,6 +120,7 @@ def test_odometry_command_takes_mountings_from_a_file(folder, tmp_path):
     ("names", "status", "message"),
     [
         (["unmounted.h5"], 1, "the mounting of sensor 'front' is unknown; give --mounting FILE"),
+        (["both.h5", "--mounting", "front.h5"], 1, "front.h5 does not contain sensor 'back'; add its mounting, or"),
         (["single.h5"], 1, "single.h5 has only one pulse; give recordings of at least 2"),
         (["front.h5", "both.h5"], 2, "have the same sensor 'front'"),
         (["timeless.h5"], 1, "timeless.h5 has different pulses at the same time"),

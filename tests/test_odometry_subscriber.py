@@ -1,5 +1,6 @@
 """Poses and velocities of a platform from the images of a central node, as an application receives them."""
 
+import contextlib
 import json
 import math
 import re
@@ -9,10 +10,12 @@ import sys
 import threading
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from ertis_cli._listen_pulses import listen_pulses
 from ertis_cli.main import cli
 
 import ertis_numba as ertis
@@ -174,6 +177,30 @@ def test_pulse_of_a_clock_that_was_set_back_is_left_out_and_noted():
     assert_at_step(found[3].pose, 3)
 
 
+def test_path_begins_with_the_first_pulse_of_all_sensors():
+    """An application that connects during a pulse misses the images that were sent before."""
+    sent = [[seen(0, "back")], *pulses(1, 2)]
+    found, trajectory = received(sent, 2)
+    assert [found[count].sensors for count in (0, 1)] == [("back",), ("front", "back")]
+    assert len(trajectory) == 2
+    assert found[2].pose.is_measured
+    assert math.hypot(found[2].pose.x_m, found[2].pose.y_m) == pytest.approx(np.hypot(*STEP_M), abs=1e-3)
+
+
+def test_sensor_that_given_mountings_lack_is_noted():
+    notes = []
+    with (
+        MountedPublisher() as publisher,
+        publisher.playing(images(0)),
+        OdometrySubscriber(
+            publisher.address, mountings={"front": MOUNTINGS["front"]}, on_note=notes.append
+        ) as subscriber,
+    ):
+        while subscriber.receive(20.0).missing:
+            pass
+    assert "the given mountings lack sensor back; that of the central node applies" in notes
+
+
 def test_unknown_mounting_of_a_sensor_is_an_error():
     with Publisher() as publisher:
         publisher.translation_m = publisher.rotation_xyzw = None
@@ -306,6 +333,36 @@ def test_listen_without_pulses_writes_no_trajectory(tmp_path):
 def test_listen_refuses_options_that_do_not_fit_odometry(arguments, message):
     shown = CliRunner().invoke(cli, ["listen", "tcp://127.0.0.1:5602", *arguments])
     assert (shown.exit_code, message in shown.output) == (2, True), shown.output
+
+
+class _Silent(contextlib.nullcontext):
+    """Stand-in for a connected subscriber that receives nothing at first."""
+
+    connected, n_skipped, counts = True, 0, SimpleNamespace(dropped=0)
+
+    def __init__(self):
+        super().__init__(self)
+        self._items = iter([None, "pulse"])
+
+    def receive(self, _):
+        return next(self._items)
+
+    def close(self):
+        pass
+
+
+def test_listen_notes_that_no_image_of_a_sensor_comes(monkeypatch, capsys):
+    monkeypatch.setattr("ertis_cli._product_printer._SILENT_S", 0.0)
+    options = {"head": "", "n": 1, "duration": None, "quiet": False, "as_json": False}
+    listen_pulses("tcp://here", ["nope"], lambda _: _Silent(), lambda _: None, **options)
+    assert "no energyscape of nope received from tcp://here yet; is 'ertis capture --to'" in capsys.readouterr().err
+
+
+def test_listen_refuses_mountings_without_the_sensor(mounting):
+    arguments = ["--odometry", "--sensor", "nope", "--mounting", str(mounting)]
+    shown = CliRunner().invoke(cli, ["listen", "tcp://127.0.0.1:1", *arguments])
+    assert shown.exit_code == 1
+    assert "does not contain sensor 'nope'; add its mounting, or use sensors of this file: front" in shown.output
 
 
 def test_listen_refuses_an_existing_trajectory_at_once(tmp_path):

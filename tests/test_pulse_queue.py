@@ -14,6 +14,13 @@ def test_slow_application_gets_the_latest_pulses():
     assert queue.n_skipped == 3
 
 
+def test_ended_queue_returns_the_pulses_that_wait():
+    queue = PulseQueue()
+    queue.put(1, 1)
+    queue.end()
+    assert (queue.take(), queue.take()) == (1, None)
+
+
 def test_pulses_are_kept_within_the_limit_and_as_long_again(monkeypatch):
     now_s = 100.0
     monkeypatch.setattr(pulse_queue.time, "monotonic", lambda: now_s)

@@ -113,3 +113,31 @@ def test_at_names_both_intervals_if_times_lie_outside():
 def test_velocity_at_refuses_a_single_pose():
     with pytest.raises(ertis.ArgumentError, match="single pose; a velocity needs at least 2"):
         ertis.Trajectory([0], np.zeros((1, 3)), [IDENTITY]).velocity_at([0])
+
+
+def test_arrays_of_a_trajectory_are_read_only_copies():
+    time_ns, covariance = np.array([1, 2]), np.stack([np.eye(6)] * 2)
+    path = ertis.Trajectory(time_ns, np.zeros((2, 3)), [IDENTITY] * 2, covariance)
+    for values in (path.time_ns, path.position_m, path.rotation_xyzw, path.covariance):
+        with pytest.raises(ValueError, match="read-only"):
+            values[0] = 0
+    time_ns[0], covariance[0] = 0, 0
+    assert path.time_ns[0] == path.covariance[0, 0, 0] == 1
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (np.eye(6) + np.eye(6, k=1) * 0.1, r"covariance is not symmetric at \[1\]; give"),
+        (np.diag([1.0, 1, 1, 1, 1, -0.1]), r"covariance has a negative eigenvalue at \[1\]; give positive"),
+    ],
+)
+def test_covariances_must_be_symmetric_and_positive_semidefinite(wrong, message):
+    with pytest.raises(ertis.ArgumentError, match=message):
+        ertis.Trajectory([1, 2], np.zeros((2, 3)), [IDENTITY] * 2, [np.eye(6), wrong])
+
+
+def test_covariances_may_be_singular_and_rounded():
+    draws = np.random.default_rng(1).normal(size=(6, 3))
+    rounded = (draws @ draws.T).astype(np.float32)
+    assert ertis.Trajectory([1], [[0, 0, 0]], [IDENTITY], [rounded]).covariance.shape == (1, 6, 6)

@@ -164,7 +164,9 @@ def _measured(
     groups = groups[wanted[0] : wanted[-1] + 1]
     with ExitStack() as stack:
         pipelines = _pulses.PipelinesBySensor(_as_recorded, stack, quiet=quiet)
-        found = odometry_of(readers, groups, pipelines, _pulses.mountings_of(readers, known), quiet=quiet).trajectory
+        if any(reader.sensor not in known for reader in readers):
+            known = _pulses.mountings_of(readers, None)
+        found = odometry_of(readers, groups, pipelines, known, quiet=quiet).trajectory
     # Clocks of sensors may differ, so each pose gets the time of the sensor with ears.
     indices = [number - wanted[0] for number in wanted]
     times_ns = np.array([groups[index][ears.sensor].stamp.timestamp_ns for index in indices])

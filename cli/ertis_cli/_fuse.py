@@ -28,7 +28,7 @@ def write_fused(
     target: Path,
     changed: "Callable[[Settings], Settings]",
     *,
-    mounting: "Mapping[str, Mounting] | None",
+    mounting: "Path | None",
     emitter_diameter_m: float,
     force: bool,
     quiet: bool,
@@ -45,8 +45,8 @@ def write_fused(
         Energyscape file to write.
     changed : callable
         Function that returns the settings to use from those of the recording.
-    mounting : mapping of str to Mounting, or None
-        Mountings by sensor instead of those of the recordings.
+    mounting : Path or None
+        File with the mountings of all sensors, instead of those of the recordings.
     emitter_diameter_m : float
         Diameter of the emitters.
     force, quiet, as_json : bool

@@ -36,6 +36,7 @@ def listen_fused(
 
     listen_pulses(
         address,
+        sensors,
         lambda on_note: FusedSubscriber(
             address, mountings=mountings, sensors=sensors or None, keys=keys, on_note=on_note
         ),

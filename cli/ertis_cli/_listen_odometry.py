@@ -43,6 +43,7 @@ def listen_odometry(
         check_target(target, overwrite=force)
     listen_pulses(
         address,
+        sensors,
         lambda on_note: OdometrySubscriber(
             address, mountings=mountings, sensors=sensors or None, keys=keys, on_note=on_note
         ),

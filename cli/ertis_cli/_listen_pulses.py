@@ -4,7 +4,7 @@ import math
 import sys
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol, Self, TypeVar
 
 import click
@@ -16,6 +16,7 @@ from ertis_cli._stop_signals import stopped_by_signals
 __all__ = ["Connect", "listen_pulses"]
 
 _POLL_INTERVAL_S = 0.1
+_PRODUCTS = ("energyscape",)
 
 Arrival_co = TypeVar("Arrival_co", covariant=True)
 Arrival = TypeVar("Arrival")
@@ -40,6 +41,7 @@ Connect = Callable[[Callable[[str], None]], _PulseSubscriber[Arrival]]
 
 def listen_pulses(
     address: str,
+    sensors: Sequence[str],
     connect: Connect[Arrival],
     show: Callable[[Arrival], None],
     *,
@@ -55,6 +57,8 @@ def listen_pulses(
     Parameters
     ----------
     address : str
+    sensors : sequence of str
+        Requested sensors; empty for all.
     connect : callable
     show : callable
         Prints what arrived of a pulse.
@@ -77,7 +81,10 @@ def listen_pulses(
         try:
             while received != n and not signals.came and time.monotonic() < end_s:
                 arrival = subscriber.receive(_POLL_INTERVAL_S)
-                if not subscriber.connected:
+                if subscriber.connected:
+                    heard.connected(sensors)
+                    heard.silent(address, _PRODUCTS, received)
+                else:
                     heard.unanswered(address, time.monotonic() - begun_s)
                 while notes:
                     heard.note(notes.popleft())

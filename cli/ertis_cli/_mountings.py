@@ -42,7 +42,8 @@ def mountings(path: Path | None, sensors: Iterable[str] | None) -> dict[str, Mou
     for name in wanted:
         if name not in known:
             raise ArgumentError(
-                f"{path} does not contain sensor {name!r}; add it, or choose one of {', '.join(known)} with --name"
+                f"{path} does not contain sensor {name!r}; add its mounting, or use sensors of this file: "
+                f"{', '.join(known)}"
             )
     return {name: known[name] for name in wanted}
 

@@ -3,7 +3,7 @@
 import functools
 import time
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -37,6 +37,7 @@ class MicrophoneTable:
     def __init__(self, *, as_json: bool, quiet: bool) -> None:
         self._as_json, self._quiet = as_json, quiet
         self._reported_names = self._noted = False
+        self._of_sensors = ""
         self._subscribed_s: float | None = (
             None  # None once a product has arrived, or the absence of products was reported
         )
@@ -57,8 +58,12 @@ class MicrophoneTable:
                     "products": list(products),
                 }
             )
+        self.connected(sensors)
+
+    def connected(self, sensors: Sequence[str]) -> None:
+        """Note the first answer of a publisher, and the requested sensors, for `silent`."""
         if not self._reported_names:
-            self._subscribed_s = time.monotonic()
+            self._subscribed_s, self._of_sensors = time.monotonic(), f" of {', '.join(sensors)}" if sensors else ""
         self._reported_names = True
 
     def silent(self, address: str, products: tuple[str, ...], n_received: int) -> None:
@@ -69,8 +74,8 @@ class MicrophoneTable:
         if n_received:
             return
         text = (
-            f"no {' and no '.join(products)} received from {address} yet; is 'ertis capture --to' running? "
-            "Check with 'ertis status'"
+            f"no {' and no '.join(products)}{self._of_sensors} received from {address} yet; is 'ertis capture --to' "
+            "running? Check with 'ertis status'"
         )
         if self._as_json:
             options.print_json({"event": "waiting", "address": address, "text": text})

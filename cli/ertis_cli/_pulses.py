@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ertis_cli import _results, options
+from ertis_cli import _mountings, _presets, _results, options
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
     from ertis_cli._mountings import Mounting
@@ -18,7 +18,29 @@ if TYPE_CHECKING:
     from ertis_numba.settings import Settings
     from ertis_numba.storage import RecordingReader
 
-__all__ = ["PipelinesBySensor", "StampedIndex", "image_settings", "mountings_of", "open_sensors", "pulse_groups"]
+__all__ = [
+    "PipelinesBySensor",
+    "StampedIndex",
+    "image_settings",
+    "mountings_of",
+    "open_sensors",
+    "processing",
+    "pulse_groups",
+]
+
+
+def processing(command: "Callable[..., Any]") -> "Callable[..., Any]":
+    """Add the options for images of all sensors: preset, settings, device, threads, plan and mountings."""
+    for option in (
+        _mountings.mounting,
+        options.plan,
+        options.threads,
+        options.device,
+        options.settings_file,
+        _presets.processing_preset,
+    ):
+        command = option(command)
+    return command
 
 
 def open_sensors(paths: "Sequence[Path]", stack: ExitStack) -> "list[RecordingReader]":
@@ -37,22 +59,21 @@ def open_sensors(paths: "Sequence[Path]", stack: ExitStack) -> "list[RecordingRe
     return list(found.values())
 
 
-def mountings_of(readers: "Sequence[RecordingReader]", given: "Mapping[str, Mounting] | None") -> "dict[str, Mounting]":
-    """Return the mountings of sensors, given with --mounting or else those of their recordings.
+def mountings_of(readers: "Sequence[RecordingReader]", file: "Path | None") -> "dict[str, Mounting]":
+    """Return the mountings of sensors from the file given with --mounting, or else from their recordings.
 
     Raises
     ------
     ArgumentError
         A mounting is unknown.
     """
-    return {reader.sensor: _mounting(reader, given) for reader in readers}
+    given = _mountings.mountings(file, [reader.sensor for reader in readers])
+    return {reader.sensor: _mounting(reader) for reader in readers} if given is None else given
 
 
-def _mounting(reader: "RecordingReader", given: "Mapping[str, Mounting] | None") -> "Mounting":
+def _mounting(reader: "RecordingReader") -> "Mounting":
     from ertis_numba.errors import ArgumentError
 
-    if given is not None and reader.sensor in given:
-        return given[reader.sensor]
     if reader.translation_m is None or reader.rotation_xyzw is None:
         raise ArgumentError(
             f"{reader.path}: the mounting of sensor {reader.sensor!r} is unknown; give --mounting FILE with it"

@@ -108,7 +108,7 @@ def listen(
             target=trajectory,
             force=force,
             sensors=sensors,
-            mountings=_mountings.mountings(mounting, None),
+            mountings=_mountings.mountings(mounting, sensors or None),
             keys=_network.client_keys(key, server_key),
             n=n,
             duration=duration,

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ertis_cli import _mountings, _presets, _pulses, options
+from ertis_cli import _pulses, options
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -50,27 +50,8 @@ __all__ = ["mapping"]
     type=options.INTERVAL,
     help="Lowest and highest height of echoes in the world frame in m, to leave out floor and ceiling; all by default.",
 )
-@click.option(
-    "--emitter-diameter",
-    "emitter_diameter_m",
-    type=click.FloatRange(0.0, 0.2),
-    default=0.012,
-    show_default=True,
-    metavar="M",
-    help="Diameter of emitters in m, which determines their directivity; 0 is omnidirectional.",
-)
-@_presets.processing_preset
-@click.option(
-    "--settings",
-    "settings_file",
-    metavar="FILE.toml",
-    type=click.Path(path_type=Path),
-    help="Settings file (TOML) whose keys override those of the recordings.",
-)
-@options.device
-@options.threads
-@options.plan
-@_mountings.mounting
+@options.emitter_diameter("Diameter of emitters")
+@_pulses.processing
 @options.force
 @options.quiet
 @options.as_json
@@ -114,7 +95,7 @@ def mapping(
             _pulses.image_settings(settings_file, preset), stack, quiet=quiet, device=device, threads=threads, plan=plan
         )
         mapper = Mapper(
-            _pulses.mountings_of(readers, _mountings.mountings(mounting, None)),
+            _pulses.mountings_of(readers, mounting),
             cell_m=cell_m,
             half_life_s=half_life_s,
             height_m=height_m,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ertis_cli import _mountings, _presets, _pulses, options
+from ertis_cli import _pulses, options
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -32,18 +32,7 @@ _NS_PER_S = 1e9
     metavar="TRAJ.tum",
     help="Trajectory to write in the TUM format; REC.odometry.tum beside the first recording by default.",
 )
-@_presets.processing_preset
-@click.option(
-    "--settings",
-    "settings_file",
-    metavar="FILE.toml",
-    type=click.Path(path_type=Path),
-    help="Settings file (TOML) whose keys override those of the recordings.",
-)
-@options.device
-@options.threads
-@options.plan
-@_mountings.mounting
+@_pulses.processing
 @options.force
 @options.quiet
 @options.as_json
@@ -75,7 +64,7 @@ def odometry(
 
     with ExitStack() as stack:
         readers = _pulses.open_sensors(paths, stack)
-        mountings = _pulses.mountings_of(readers, _mountings.mountings(mounting, None))
+        mountings = _pulses.mountings_of(readers, mounting)
         pipelines = _pulses.PipelinesBySensor(
             _pulses.image_settings(settings_file, preset), stack, quiet=quiet, device=device, threads=threads, plan=plan
         )

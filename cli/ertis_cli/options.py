@@ -37,6 +37,7 @@ __all__ = [
     "complete_layouts",
     "counted",
     "device",
+    "emitter_diameter",
     "force",
     "input_file",
     "measurement",
@@ -54,6 +55,7 @@ __all__ = [
     "say",
     "sensor",
     "sensors_of",
+    "settings_file",
     "settings_with",
     "threads",
 ]
@@ -174,6 +176,15 @@ quiet: Decorator = click.option(
 threads: Decorator = click.option("--threads", type=int, metavar="N", help="Number of threads; all cores by default.")
 
 
+settings_file: Decorator = click.option(
+    "--settings",
+    "settings_file",
+    metavar="FILE.toml",
+    type=click.Path(path_type=Path),
+    help="Settings file (TOML) whose keys override those of the recording.",
+)
+
+
 def _number(option: BeamformerOption) -> click.IntRange | click.FloatRange:
     """Return the type of the option of a beamformer, with its limits."""
     if isinstance(option.low, int):
@@ -228,6 +239,19 @@ def cleaning(default: str) -> Decorator:
         help=f"Keep amplitudes at least DB above the mean of each range; {default} by default.",
     )
     return lambda command: within(above_mean(command))
+
+
+def emitter_diameter(text: str) -> Decorator:
+    """Return the option for the diameter of emitters; ``text`` is the beginning of its help."""
+    return click.option(
+        "--emitter-diameter",
+        "emitter_diameter_m",
+        type=click.FloatRange(0.0, 0.2),
+        default=0.012,
+        show_default=True,
+        metavar="M",
+        help=f"{text} in m, which determines their directivity; 0 is omnidirectional.",
+    )
 
 
 def input_file(metavar: str) -> Decorator:

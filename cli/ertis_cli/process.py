@@ -78,13 +78,7 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
     is_flag=True,
     help="Measure the error of each sensor's first measurement; write nothing if it exceeds --max-error.",
 )
-@click.option(
-    "--settings",
-    "settings_file",
-    metavar="FILE.toml",
-    type=click.Path(path_type=Path),
-    help="Settings file (TOML) whose keys override those of the recording.",
-)
+@options.settings_file
 @click.option(
     "--dtype",
     type=click.Choice(["float32", "float16"]),
@@ -98,15 +92,7 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
     is_flag=True,
     help="Fuse the images of all sensors of the recordings; write REC.fused.h5 by default.",
 )
-@click.option(
-    "--emitter-diameter",
-    "emitter_diameter_m",
-    type=click.FloatRange(0.0, 0.2),
-    default=0.012,
-    show_default=True,
-    metavar="M",
-    help="Diameter of emitters for --fuse, in m, which determines their directivity; 0 is omnidirectional.",
-)
+@options.emitter_diameter("Diameter of emitters for --fuse,")
 @click.option("--strict", is_flag=True, help="Refuse recordings with faulty microphones instead of warning.")
 @options.device
 @options.threads
@@ -211,7 +197,7 @@ def process(
             [Path(each) for each in paths],
             Path(target) if target else Path(paths[0]).with_suffix(".fused.h5"),
             changed,
-            mounting=_mountings.mountings(mounting, None),
+            mounting=mounting,
             emitter_diameter_m=emitter_diameter_m,
             force=force,
             quiet=quiet,

@@ -16,12 +16,15 @@ _NS_PER_S: Final = 1e9
 _MAX_POSITION_M: Final = 1e8  # Beyond, float64 does not resolve nanometres.
 _MARGIN_NS: Final = 1_000_000
 _MAX_NORM_ERROR: Final = 1e-3  # Text files have few digits; a larger error is no rounding.
+_MAX_ASYMMETRY: Final = 1e-6  # Relative to the largest element; single precision rounds less.
 _MAX_ROUNDING: Final = 1e-14  # Error in the length of a quaternion that was normalised before.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
     """Poses of a platform in the world frame at increasing times.
+
+    The arrays are read-only copies.
 
     Attributes
     ----------
@@ -41,7 +44,7 @@ class Trajectory:
     ------
     ArgumentError
         The shapes do not match, a number is not finite, the times do not increase, or a quaternion is not of unit
-        length.
+        length, or a covariance is not symmetric and positive semidefinite.
 
     Examples
     --------
@@ -80,17 +83,22 @@ class Trajectory:
         norms[np.abs(norms - 1) < _MAX_ROUNDING] = 1.0  # A copy has the same bits.
         covariance = self.covariance
         if covariance is not None:
-            covariance = _numbers("covariance", covariance, (n_poses, 6, 6))
-        object.__setattr__(self, "time_ns", time_ns)
+            covariance = _covariances(covariance, n_poses)
+        checks.instance("source", self.source, str, "names the origin of the poses")
         position_m = _numbers("position_m", self.position_m, (n_poses, 3))
         farthest_m = float(np.max(np.abs(position_m)))
         if farthest_m > _MAX_POSITION_M:
             raise ArgumentError(
                 f"position_m reaches {farthest_m:g} m; give metres within ±{_MAX_POSITION_M:g} m of the world's origin"
             )
-        object.__setattr__(self, "position_m", position_m)
-        object.__setattr__(self, "rotation_xyzw", rotation / norms[:, None])
-        object.__setattr__(self, "covariance", covariance)
+        rotation = rotation / norms[:, None]
+        fields = {
+            "time_ns": time_ns, "position_m": position_m, "rotation_xyzw": rotation, "covariance": covariance
+        }  # fmt: skip
+        for name, values in fields.items():
+            if values is not None:
+                values.setflags(write=False)
+            object.__setattr__(self, name, values)
 
     def __len__(self) -> int:
         return len(self.time_ns)
@@ -227,7 +235,10 @@ class Trajectory:
 
 
 def _times(name: str, values: ArrayLike) -> NDArray[np.int64]:
-    times = np.asarray(values)
+    try:
+        times = np.array(values)
+    except ValueError as error:
+        raise ArgumentError(f"{name} is not an array ({error}); give one dimension of whole nanoseconds") from error
     if times.ndim != 1 or (times.size and times.dtype.kind not in "iu"):
         raise ArgumentError(
             f"{name} has shape {times.shape} and type {times.dtype}; give one dimension of whole nanoseconds"
@@ -243,6 +254,21 @@ def _numbers(name: str, values: ArrayLike, wanted: tuple[int, ...]) -> NDArray[n
     checks.shape(name, numbers.shape, wanted)
     checks.finite_array(name, numbers)
     return numbers
+
+
+def _covariances(values: ArrayLike, n_poses: int) -> NDArray[np.float64]:
+    """Return checked covariances: (pose, 6, 6) float64."""
+    covariance = _numbers("covariance", values, (n_poses, 6, 6))
+    tolerance = _MAX_ASYMMETRY * np.max(np.abs(covariance), axis=(1, 2))
+    uneven = np.max(np.abs(covariance - covariance.transpose(0, 2, 1)), axis=(1, 2)) > tolerance
+    if uneven.any():
+        raise ArgumentError(f"covariance is not symmetric at [{np.argmax(uneven)}]; give covariances of pose errors")
+    negative = np.linalg.eigvalsh(covariance)[:, 0] < -tolerance
+    if negative.any():
+        raise ArgumentError(
+            f"covariance has a negative eigenvalue at [{np.argmax(negative)}]; give positive semidefinite matrices"
+        )
+    return covariance
 
 
 def _linear(values: NDArray[np.float64], index: NDArray[np.intp], fraction: NDArray[np.float64]) -> NDArray[np.float64]:

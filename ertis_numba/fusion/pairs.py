@@ -102,7 +102,7 @@ class Hypothesis(NamedTuple):
 
 def pair_of(
     positions_m: Floats,
-    poses: tuple[MountedSensor, ...],
+    sensors: tuple[MountedSensor, ...],
     emitters: Emitters,
     receiver: Receiver,
     *,
@@ -117,17 +117,17 @@ def pair_of(
     ----------
     positions_m : (cell, axis) float64
         Centres of the cells.
-    poses : tuple of MountedSensor
+    sensors : tuple of MountedSensor
     emitters : Emitters
     receiver : Receiver
     emitter, number : int
-        Indices of the emitting and of the receiving sensor in ``poses``.
+        Indices of the emitting and of the receiving sensor in ``sensors``.
     late_m : float
         Path of sound between the emission of the receiver and that of the emitter; negative if the latter is earlier.
     deaf : (step,) bool
         Steps at which direct sound hides echoes.
     """
-    sent, heard = poses[emitter].local_m(positions_m), poses[number].local_m(positions_m)
+    sent, heard = sensors[emitter].local_m(positions_m), sensors[number].local_m(positions_m)
     from_m, to_m = np.linalg.norm(sent, axis=1), np.linalg.norm(heard, axis=1)
     radiated = emitters.power(sent[:, 0] / np.maximum(from_m, _NEAREST_M))
     cosine = heard[:, 0] / np.maximum(to_m, _NEAREST_M)
@@ -168,7 +168,7 @@ def pair_of(
 
 def hypothesis(
     grid: PolarGrid,
-    poses: tuple[MountedSensor, ...],
+    sensors: tuple[MountedSensor, ...],
     emitters: Emitters,
     receiver: Receiver,
     *,
@@ -187,7 +187,7 @@ def hypothesis(
     Parameters
     ----------
     grid : PolarGrid
-    poses, emitters, receiver, emitter, late_m
+    sensors, emitters, receiver, emitter, late_m
         As in `pair_of`.
     is_mirrored : bool
         Look for reflectors behind the array.
@@ -195,13 +195,13 @@ def hypothesis(
     pose = receiver.pose
     toward = receiver.directions * np.array([-1.0 if is_mirrored else 1.0, 1.0, 1.0])
     directions = toward @ pose.rotation.T
-    offset_m = poses[emitter].translation_m - pose.translation_m
+    offset_m = sensors[emitter].translation_m - pose.translation_m
     apart_m = float(np.linalg.norm(offset_m))
     path_m = np.arange(2 * receiver.n_steps + 1) * receiver.step_m - late_m
     beyond = path_m**2 - apart_m**2
     to_m = beyond / np.maximum(2 * (path_m - (directions @ offset_m)[:, None]), 1e-6)
     place_m = pose.translation_m + to_m[..., None] * directions[:, None]
-    sent_m = (place_m - poses[emitter].translation_m) @ poses[emitter].rotation
+    sent_m = (place_m - sensors[emitter].translation_m) @ sensors[emitter].rotation
     from_m = np.linalg.norm(sent_m, axis=-1)
     radiated = emitters.power(sent_m[..., 0] / np.maximum(from_m, _NEAREST_M))
     cell = np.where((beyond > 0) & (to_m > _NEAREST_M), grid.cell_of(place_m), -1)

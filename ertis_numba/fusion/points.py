@@ -70,8 +70,8 @@ class PointFuser:
     Parameters
     ----------
     number : int
-        Index of the sensor in ``poses``.
-    poses : tuple of MountedSensor
+        Index of the sensor in ``sensors``.
+    sensors : tuple of MountedSensor
     receiver : Receiver
     image : Energyscape
         Any image of the sensor.
@@ -82,12 +82,12 @@ class PointFuser:
     def __init__(
         self,
         number: int,
-        poses: tuple[MountedSensor, ...],
+        sensors: tuple[MountedSensor, ...],
         receiver: Receiver,
         image: Energyscape,
         deaf: NDArray[np.bool_],
     ) -> None:
-        self._number, self._poses, self._receiver = number, poses, receiver
+        self._number, self._sensors, self._receiver = number, sensors, receiver
         self._is_deaf = deaf[(image.range_m / receiver.step_m).astype(np.int64)]
         self._extract = PointExtractor(image.settings, Grid(image.azimuth_rad, image.elevation_rad), top=_TOP)
 
@@ -130,9 +130,9 @@ class PointFuser:
     def _observation(
         self, place_m: Floats, range_m: float, emitter: int, path_m: float, uncertainty_m: Floats, amplitude: float
     ) -> Observation | None:
-        pose = self._poses[self._number]
+        pose = self._sensors[self._number]
         direction = pose.rotation @ (place_m / range_m)
-        offset_m = self._poses[emitter].translation_m - pose.translation_m
+        offset_m = self._sensors[emitter].translation_m - pose.translation_m
         beyond = path_m**2 - float(offset_m @ offset_m)
         if beyond <= 0:
             return None
@@ -150,20 +150,20 @@ class PointFuser:
 
 
 def joined(
-    observations: Sequence[Observation], poses: Sequence[MountedSensor], image: Energyscape, grid: PolarGrid
+    observations: Sequence[Observation], sensors: Sequence[MountedSensor], image: Energyscape, grid: PolarGrid
 ) -> PointCloud:
     """Return one point for each reflector, in the frame of the platform, strongest first.
 
     Parameters
     ----------
     observations : sequence of Observation
-    poses : sequence of MountedSensor
+    sensors : sequence of MountedSensor
     image : Energyscape
         Fused image, which yields amplitudes.
     grid : PolarGrid
         Cells of the fused image.
     """
-    reflectors = _Reflectors(sorted(observations, key=_order), poses)
+    reflectors = _Reflectors(sorted(observations, key=_order), sensors)
     position_m = reflectors.position_m
     cell = grid.cell_of(position_m)
     amplitude = np.where(cell >= 0, _around(image.amplitude).reshape(-1).take(cell.clip(0)), np.float32(0))
@@ -196,7 +196,7 @@ class _Reflectors:
     ----------
     observations : sequence of Observation
         Own echoes first, each kind from the strongest one.
-    poses : sequence of MountedSensor
+    sensors : sequence of MountedSensor
 
     Attributes
     ----------
@@ -204,10 +204,10 @@ class _Reflectors:
     covariance_m2 : (reflector, axis, axis) float64
     """
 
-    def __init__(self, observations: Sequence[Observation], poses: Sequence[MountedSensor]) -> None:
+    def __init__(self, observations: Sequence[Observation], sensors: Sequence[MountedSensor]) -> None:
         self._locate = kernels.load_fusion().locate_reflector
-        self._emitter_m = np.array([poses[each.emitter].translation_m for each in observations]).reshape(-1, 3)
-        self._receiver_m = np.array([poses[each.receiver].translation_m for each in observations]).reshape(-1, 3)
+        self._emitter_m = np.array([sensors[each.emitter].translation_m for each in observations]).reshape(-1, 3)
+        self._receiver_m = np.array([sensors[each.receiver].translation_m for each in observations]).reshape(-1, 3)
         self._path_m = np.array([each.path_m for each in observations])
         self._axes = np.array([[each.direction, *_tangents(each.direction)] for each in observations])
         self._deviation = np.array([(each.path_sd_m, each.angle_sd_rad) for each in observations])

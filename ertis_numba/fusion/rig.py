@@ -54,15 +54,22 @@ def sensor_poses(mountings: Mountings) -> tuple[MountedSensor, ...]:
     ArgumentError
         No mounting is given, or one is invalid.
     """
+    if not isinstance(mountings, Mapping):
+        raise ArgumentError(
+            f"mountings is of type {type(mountings).__name__}; give a dictionary of (translation_m, rotation_xyzw) by "
+            "sensor"
+        )
     if not mountings:
         raise ArgumentError("mountings is empty; give the mounting of each sensor on the platform")
-    poses = []
-    for name, (translation_m, rotation_xyzw) in mountings.items():
-        place = mounting(name, translation_m, rotation_xyzw)
-        poses.append(
+    sensors = []
+    for name, given in mountings.items():
+        if not isinstance(given, Sequence) or len(given) != 2:
+            raise ArgumentError(f"mounting of sensor {name!r} is {given!r:.80}; give (translation_m, rotation_xyzw)")
+        place = mounting(name, *given)
+        sensors.append(
             MountedSensor(name, place["translation_m"], Rotation.from_quat(place["rotation_xyzw"]).as_matrix())
         )
-    return tuple(poses)
+    return tuple(sensors)
 
 
 class Emitters:

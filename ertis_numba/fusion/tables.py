@@ -32,7 +32,7 @@ class FusionTables:
     ----------
     grid : PolarGrid
         Cells of fused images.
-    poses : tuple of MountedSensor
+    sensors : tuple of MountedSensor
     emitting : list of int
         Indices of the sensors that emit.
     start_s : sequence of float
@@ -44,13 +44,13 @@ class FusionTables:
     def __init__(
         self,
         grid: PolarGrid,
-        poses: tuple[MountedSensor, ...],
+        sensors: tuple[MountedSensor, ...],
         emitting: list[int],
         start_s: Sequence[float],
         diameter_m: float,
     ) -> None:
         self.grid = grid
-        self._poses, self._emitting, self._start_s, self._diameter_m = poses, emitting, start_s, diameter_m
+        self._sensors, self._emitting, self._start_s, self._diameter_m = sensors, emitting, start_s, diameter_m
         self._positions_m = grid.positions_m
         self._receivers: dict[int, Receiver] = {}
         self._deaf: dict[int, NDArray[np.bool_]] = {}
@@ -123,7 +123,7 @@ class FusionTables:
         found = []
         for number, each in group.items():
             found += self._points[number].observations(each, shares, self._late_m[number])
-        return joined(found, self._poses, image, self.grid)
+        return joined(found, self._sensors, image, self.grid)
 
     def _same_call(self, emitter: int, number: int) -> bool:
         """Return True unless the calls are known to differ, so that the matched filter suppresses the foreign one."""
@@ -133,13 +133,13 @@ class FusionTables:
         self._known.clear()
         settings = self._settings[number] = image.settings
         speed_m_s = sound_speed_m_s(settings.air)
-        receiver = self._receivers[number] = Receiver(self._poses[number], image, self.grid.step_m)
+        receiver = self._receivers[number] = Receiver(self._sensors[number], image, self.grid.step_m)
         late_m = self._late_m[number] = {
             emitter: (self._start_s[emitter] - self._start_s[number]) * speed_m_s for emitter in self._emitting
         }
         deaf = self._deaf[number] = self._direct_sound(number, receiver, late_m)
         emitters = Emitters(settings, self._diameter_m)
-        common = self._poses, emitters, receiver
+        common = self._sensors, emitters, receiver
         pairs = [
             pair_of(
                 self._positions_m,
@@ -161,13 +161,13 @@ class FusionTables:
         self._hypotheses[number] = [
             each for each in hypotheses if len(each.half_cell) or (each.emitter in seen and not each.is_mirrored)
         ]
-        self._points[number] = PointFuser(number, self._poses, receiver, image, deaf)
+        self._points[number] = PointFuser(number, self._sensors, receiver, image, deaf)
 
     def _direct_sound(self, number: int, receiver: Receiver, late_m: Mapping[int, float]) -> NDArray[np.bool_]:
         range_m = (np.arange(receiver.n_steps) + 0.5) * receiver.step_m
         deaf = np.zeros(receiver.n_steps, dtype=np.bool_)
         for emitter, delay_m in late_m.items():
-            apart_m = np.linalg.norm(self._poses[emitter].translation_m - self._poses[number].translation_m)
+            apart_m = np.linalg.norm(self._sensors[emitter].translation_m - self._sensors[number].translation_m)
             deaf |= np.abs(range_m - (apart_m + delay_m) / 2) <= _DIRECT_SOUND_M
         return np.asarray(deaf)
 

@@ -49,10 +49,16 @@ def mounting(
     """
     if translation_m is None and rotation_xyzw is None:
         return {}
-    made = {
-        "translation_m": np.asarray(_ORIGIN if translation_m is None else translation_m, dtype=np.float64),
-        "rotation_xyzw": np.asarray(_UNTURNED if rotation_xyzw is None else rotation_xyzw, dtype=np.float64),
-    }
+    try:
+        made = {
+            "translation_m": np.asarray(_ORIGIN if translation_m is None else translation_m, dtype=np.float64),
+            "rotation_xyzw": np.asarray(_UNTURNED if rotation_xyzw is None else rotation_xyzw, dtype=np.float64),
+        }
+    except (TypeError, ValueError) as error:
+        raise ArgumentError(
+            f"mounting of sensor {sensor} is not made of numbers ({error}); give x, y, z in metres, and a unit "
+            "quaternion x, y, z, w"
+        ) from error
     for (name, values), size in zip(made.items(), (3, 4), strict=True):
         checks.shape(f"{name} of sensor {sensor}", values.shape, (size,))
         checks.finite_array(f"{name} of sensor {sensor}", values)

@@ -8,6 +8,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba import checks
 from ertis_numba.atomic_files import atomic_write
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.extras import extra
@@ -111,6 +112,7 @@ def write_tum(path: str | Path, trajectory: Trajectory, *, overwrite: bool = Fal
     # timestamp tx ty tz qx qy qz qw
     1700000000.123456789 1 2 0 0 0 0 1
     """
+    checks.instance("trajectory", trajectory, Trajectory, "Odometry.trajectory and read_trajectory return")
     suffix = Path(path).suffix.lower()
     if suffix in _OTHER_SUFFIXES:
         raise ArgumentError(f"output {path} ends in {suffix}, but the file is text of TUM; give a name in .tum or .txt")

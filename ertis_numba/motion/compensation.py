@@ -47,7 +47,7 @@ def compensate_motion(points: PointCloud, velocity_m_s: Sequence[float], yaw_rat
     Raises
     ------
     ArgumentError
-        A velocity is not finite or out of range.
+        The points are no point cloud, or a velocity is not finite or out of range.
 
     Examples
     --------
@@ -59,7 +59,11 @@ def compensate_motion(points: PointCloud, velocity_m_s: Sequence[float], yaw_rat
     >>> at_rest.position_m.shape == points.position_m.shape
     True
     """
-    velocity = np.asarray(velocity_m_s, np.float64)
+    checks.instance("points", points, PointCloud, "PointExtractor returns")
+    try:
+        velocity = np.asarray(velocity_m_s, np.float64)
+    except (TypeError, ValueError) as error:
+        raise ArgumentError(f"velocity_m_s is {velocity_m_s!r:.80}; give x, y, z in metres per second") from error
     if velocity.shape != (3,):
         raise ArgumentError(f"velocity_m_s has shape {velocity.shape}; give x, y, z in metres per second")
     for part in velocity.tolist():

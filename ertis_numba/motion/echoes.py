@@ -65,12 +65,12 @@ class EchoExtractor:
 
     Parameters
     ----------
-    poses : tuple of MountedSensor
+    sensors : tuple of MountedSensor
         Sensors of the platform.
     """
 
-    def __init__(self, poses: tuple[MountedSensor, ...]) -> None:
-        self._poses = {pose.name: (number, pose) for number, pose in enumerate(poses)}
+    def __init__(self, sensors: tuple[MountedSensor, ...]) -> None:
+        self._sensors = {sensor.name: (number, sensor) for number, sensor in enumerate(sensors)}
         self._extractors: dict[str, tuple[tuple[int, ...], PointExtractor]] = {}
 
     def __call__(self, group: Mapping[str, Energyscape | PointCloud]) -> GroupEchoes:
@@ -80,11 +80,11 @@ class EchoExtractor:
 
     def _echoes(self, item: Energyscape | PointCloud) -> GroupEchoes:
         cloud = self._cloud(item) if isinstance(item, Energyscape) else item
-        if item.stamp.sensor not in self._poses:
+        if item.stamp.sensor not in self._sensors:
             raise ArgumentError(
-                f"sensor {item.stamp.sensor!r} has no mounting; give its mounting, or one of {', '.join(self._poses)}"
+                f"sensor {item.stamp.sensor!r} has no mounting; give its mounting, or one of {', '.join(self._sensors)}"
             )
-        number, pose = self._poses[item.stamp.sensor]
+        number, mounted = self._sensors[item.stamp.sensor]
         local_m = cloud.position_m.astype(np.float64)
         off_axis = np.arctan2(np.hypot(local_m[:, 1], local_m[:, 2]), local_m[:, 0])
         is_sharp = off_axis < _MAX_OFF_AXIS_RAD
@@ -95,12 +95,12 @@ class EchoExtractor:
         )
         local_m, off_axis = local_m[is_sharp], off_axis[is_sharp]
         range_m = np.maximum(_NEAREST_M, np.linalg.norm(local_m, axis=1))
-        from_sensor_m = local_m @ pose.rotation.T
+        from_sensor_m = local_m @ mounted.rotation.T
         range_sd_m, across_sd_m = _deviations(cloud).T
         speed_m_s, start_s = sound_speed_m_s(cloud.settings.air), cloud.settings.call.start_s
         return GroupEchoes(
             np.full(len(cloud), number),
-            from_sensor_m + pose.translation_m,
+            from_sensor_m + mounted.translation_m,
             range_m,
             np.arctan2(from_sensor_m[:, 1], from_sensor_m[:, 0]),
             np.hypot(range_sd_m, _RANGE_SD_M),

@@ -161,12 +161,12 @@ class _Flow:
         self,
         before: GroupEchoes,
         after: GroupEchoes,
-        poses: tuple[MountedSensor, ...],
+        sensors: tuple[MountedSensor, ...],
         time_s: float,
         twists: tuple[Floats | None, Floats | None],
     ) -> None:
         self.before, self.after, self._time_s = before, after, time_s
-        self._offset_m = np.array([pose.translation_m for pose in poses])[before.sensor]
+        self._offset_m = np.array([sensor.translation_m for sensor in sensors])[before.sensor]
         self._twists = [None if twist is None else twist[None] for twist in twists]
 
     def pairs(self, reach_m: float, reach_rad: float) -> _EchoPairs:
@@ -225,7 +225,7 @@ class _Flow:
 def fit_flow(
     before: GroupEchoes,
     after: GroupEchoes,
-    poses: tuple[MountedSensor, ...],
+    sensors: tuple[MountedSensor, ...],
     time_s: float,
     *,
     start: Floats | None = None,
@@ -238,7 +238,7 @@ def fit_flow(
     Parameters
     ----------
     before, after : GroupEchoes
-    poses : tuple of MountedSensor
+    sensors : tuple of MountedSensor
     time_s : float
         Time between both groups.
     start, reach : (3,) float64, optional
@@ -247,7 +247,7 @@ def fit_flow(
         Velocities at both groups, x, y and yaw per second, each in the frame of the platform; by default, those of the
         displacement.
     """
-    flow = _Flow(before, after, poses, time_s, (first_twist, second_twist))
+    flow = _Flow(before, after, sensors, time_s, (first_twist, second_twist))
     centre = np.zeros(3) if start is None else start
     limit = np.array([MAX_SPEED_M_S, MAX_SPEED_M_S, MAX_YAW_RATE_RAD_S]) * time_s if reach is None else reach
     reach_m = float(np.hypot(*np.abs(centre[:2]))) + float(np.hypot(*limit[:2])) + 0.05

@@ -22,6 +22,7 @@ class LiveOdometry:
     def __init__(self, on_note: Callable[[str], None]) -> None:
         self._note = on_note
         self._mountings: Mountings = {}
+        self._first: frozenset[str] = frozenset()  # Sensors of the first group.
         self._odometry: Odometry | None = None
 
     @property
@@ -32,6 +33,9 @@ class LiveOdometry:
     def add(self, group: Mapping[str, Item], mountings: Mountings) -> tuple[PlanarPose, EgoVelocity | None] | None:
         """Return the pose and velocity at a group, as `Odometry.add` does; None if it is not later than the last one.
 
+        An application that connects during a pulse misses images of it. If the second group has sensors that the first
+        one lacks, the path therefore begins with the second.
+
         Parameters
         ----------
         group : mapping of str to Energyscape or PointCloud
@@ -39,8 +43,9 @@ class LiveOdometry:
         mountings : mapping of str to (translation_m, rotation_xyzw)
             Mountings of these and other sensors.
         """
-        if self._odometry is None:
-            self._odometry = Odometry(mountings)
+        is_second = self._odometry is not None and len(self._odometry.poses) == 1
+        if self._odometry is None or (is_second and group.keys() - self._first):
+            self._odometry, self._first = Odometry(mountings), frozenset(group)
         elif mountings != self._mountings:
             self._odometry.remount(mountings)
         self._mountings = dict(mountings)

@@ -114,8 +114,8 @@ class Odometry:
     """
 
     def __init__(self, mountings: Mountings) -> None:
-        self._poses = sensor_poses(mountings)
-        self._extract = EchoExtractor(self._poses)
+        self._sensors = sensor_poses(mountings)
+        self._extract = EchoExtractor(self._sensors)
         self._last: _View | None = None
         self._keyframe: _View | None = None
         self._twist = np.zeros(3)
@@ -178,10 +178,10 @@ class Odometry:
         >>> odometry = ertis.Odometry({"front": front})
         >>> odometry.remount({"front": front, "back": back})
         """
-        poses = sensor_poses(mountings)
-        if not _begins_with(poses, self._poses):
+        sensors = sensor_poses(mountings)
+        if not _begins_with(sensors, self._sensors):
             self._begin(None)
-        self._poses, self._extract = poses, EchoExtractor(poses)
+        self._sensors, self._extract = sensors, EchoExtractor(sensors)
 
     def add(self, group: Iterable[Item]) -> EgoVelocity | None:
         """Add the images of a SYNC pulse, and return the velocity since the one before.
@@ -240,12 +240,12 @@ class Odometry:
         if last is None:
             return None
         if last.twist is None:
-            return _trusted(fit_flow(last.echoes, echoes, self._poses, time_s))
+            return _trusted(fit_flow(last.echoes, echoes, self._sensors, time_s))
         start = _displacement(last.twist, time_s)
         near = fit_flow(
             last.echoes,
             echoes,
-            self._poses,
+            self._sensors,
             time_s,
             start=start,
             reach=_MAX_CHANGE * time_s,
@@ -255,7 +255,7 @@ class Odometry:
         if found is not None and found.n_matches > _FEW_MATCHES and found.share > _DOUBTFUL_SHARE:
             return found
         # The expectation may be wrong, so that all displacements are compared.
-        other = fit_flow(last.echoes, echoes, self._poses, time_s)
+        other = fit_flow(last.echoes, echoes, self._sensors, time_s)
         fits = [each for each in (near, other) if each is not None]
         return _trusted(max(fits, key=lambda each: each.score, default=None))
 
@@ -270,7 +270,7 @@ class Odometry:
                 fit = fit_flow(
                     keyframe.echoes,
                     echoes,
-                    self._poses,
+                    self._sensors,
                     (timestamp_ns - keyframe.pose.timestamp_ns) / 1e9,
                     start=expected,
                     reach=_KEYFRAME_REACH,
@@ -294,13 +294,13 @@ def _confirms(fit: FlowFit, found: FlowFit, expected: Floats) -> bool:
     return is_near and fit.n_matches > _KEYFRAME_SHARE * found.n_matches
 
 
-def _begins_with(poses: tuple[MountedSensor, ...], others: tuple[MountedSensor, ...]) -> bool:
-    """Return True if the first poses are those of others."""
-    return len(poses) >= len(others) and all(
+def _begins_with(sensors: tuple[MountedSensor, ...], others: tuple[MountedSensor, ...]) -> bool:
+    """Return True if the first sensors are those of others."""
+    return len(sensors) >= len(others) and all(
         one.name == other.name
         and np.array_equal(one.translation_m, other.translation_m)
         and np.array_equal(one.rotation, other.rotation)
-        for one, other in zip(poses, others, strict=False)
+        for one, other in zip(sensors, others, strict=False)
     )
 
 

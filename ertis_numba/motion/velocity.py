@@ -110,7 +110,7 @@ def ego_velocity(before: Iterable[Item], after: Iterable[Item], mountings: Mount
     >>> ertis.ego_velocity([clouds[0]], [clouds[1]], mountings).velocity_m_s.round(2).tolist()
     [0.5, 0.0]
     """
-    poses = sensor_poses(mountings)
+    sensors = sensor_poses(mountings)
     groups = [grouped(before, "before"), grouped(after, "after")]
     first, second = (stamp_of(group) for group in groups)
     time_s = (second.timestamp_ns - first.timestamp_ns) / 1e9
@@ -123,8 +123,8 @@ def ego_velocity(before: Iterable[Item], after: Iterable[Item], mountings: Mount
             f"before has sensors {', '.join(groups[0])}, and after has {', '.join(groups[1])}; give images of the same "
             "sensors"
         )
-    extract = EchoExtractor(poses)
-    found = fit_flow(extract(groups[0]), extract(groups[1]), poses, time_s)
+    extract = EchoExtractor(sensors)
+    found = fit_flow(extract(groups[0]), extract(groups[1]), sensors, time_s)
     if found is None:
         raise DataError(
             "too few echoes of before and after match; give images that show more reflectors, or images closer in time"
@@ -153,6 +153,8 @@ def grouped(items: Iterable[Item], name: str) -> Mapping[str, Item]:
     DataError
         The items are not of the same pulse.
     """
+    if not isinstance(items, Iterable):
+        raise ArgumentError(f"{name} is a {type(items).__name__}; give a list of images or point clouds")
     group: dict[str, Item] = {}
     for item in items:
         if not isinstance(item, Energyscape | PointCloud):

@@ -32,7 +32,7 @@ class PulseQueue(Generic[Pulse]):
         self._waiting: deque[tuple[Pulse, int]] = deque()
         self._kept_until_s = -math.inf
         self._failure: Exception | None = None
-        self._closed = False
+        self._closed = self._ended = False
         self.n_skipped = 0
 
     def put(self, pulse: Pulse, n_bytes: int) -> None:
@@ -45,7 +45,7 @@ class PulseQueue(Generic[Pulse]):
             self._changed.notify_all()
 
     def take(self, timeout_s: float | None = None) -> Pulse | None:
-        """Return the next pulse; None after ``timeout_s``, or once the queue is closed.
+        """Return the next pulse; None after ``timeout_s``, once the queue is closed, or after the last one.
 
         Raises
         ------
@@ -53,7 +53,7 @@ class PulseQueue(Generic[Pulse]):
             That of `fail`.
         """
         with self._changed:
-            self._changed.wait_for(lambda: self._waiting or self._failure or self._closed, timeout_s)
+            self._changed.wait_for(lambda: self._waiting or self._failure or self._closed or self._ended, timeout_s)
             if self._failure is not None:
                 raise self._failure
             return self._waiting.popleft()[0] if self._waiting and not self._closed else None
@@ -62,6 +62,12 @@ class PulseQueue(Generic[Pulse]):
         """Raise an exception in calls of `take`."""
         with self._changed:
             self._failure = failure
+            self._changed.notify_all()
+
+    def end(self) -> None:
+        """Add no more pulses; `take` returns those that wait, and then None."""
+        with self._changed:
+            self._ended = True
             self._changed.notify_all()
 
     def close(self) -> None:

@@ -111,6 +111,7 @@ class PulseReceiver:
         self._subscriber: Subscriber[Energyscape] = Subscriber(
             address, products=("energyscape",), sensors=sensors, keys=keys, on_note=on_note, credit=_CREDIT
         )
+        self._note = on_note or (lambda _: None)
         self.counts: SubscriberCounts = self._subscriber.counts
         self._groups: PulseGroups[_Received] = PulseGroups.of(self._given)
         self.queue: PulseQueue[dict[str, _Received]] = PulseQueue()
@@ -175,6 +176,8 @@ class PulseReceiver:
         assert arrival is not None  # noqa: S101  it belongs to the image
         sensor = image.stamp.sensor
         mounting = self._given.get(sensor)
+        if self._given and mounting is None and sensor not in self._mountings:
+            self._note(f"the given mountings lack sensor {sensor}; that of the central node applies")
         if mounting is None and arrival.translation_m is not None and arrival.rotation_xyzw is not None:
             mounting = arrival.translation_m, arrival.rotation_xyzw
         if mounting is None:

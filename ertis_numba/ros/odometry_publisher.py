@@ -1,20 +1,18 @@
 """Publisher of the pose and velocity of a platform, computed in a thread so that no other topic waits."""
 
 import threading
-from collections import deque
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Any
 
 from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.fusion.pulses import PulseGroups
 from ertis_numba.interop._mountings import Mounting
 from ertis_numba.interop.ros_messages import odometry_message, odometry_transform
 from ertis_numba.motion.live import LiveOdometry
+from ertis_numba.network.pulse_queue import PulseQueue
 from ertis_numba.ros.participant import Topic
 
 __all__ = ["OdometryPublisher"]
-
-_MAX_WAITING: Final = 2  # Pulses that wait; if the computer is too slow, the latest ones are used.
 
 _Item = Energyscape | PointCloud
 _Group = dict[str, _Item]
@@ -31,28 +29,26 @@ class OdometryPublisher:
     is_paused : callable
         Returns True while nothing is to be published; the pose is still computed.
 
-    Attributes
-    ----------
-    n_skipped : int
-        Pulses that were not used, because the computer was too slow.
     """
 
     def __init__(
         self, odometry: Topic, transforms: Topic, *, on_note: Callable[[str], None], is_paused: Callable[[], bool]
     ) -> None:
-        self.n_skipped = 0
         self._odometry, self._transforms = odometry, transforms
         self._note, self._is_paused = on_note, is_paused
         self._live = LiveOdometry(on_note)
         self._groups: PulseGroups[_Item] = PulseGroups()
         self._mountings: dict[str, Mounting] = {}
         self._left_out: set[str] = set()
-        self._changed = threading.Condition()
-        self._waiting: deque[tuple[_Group, dict[str, Mounting]]] = deque()
-        self._closed = False
+        self._queue: PulseQueue[tuple[_Group, dict[str, Mounting]]] = PulseQueue()
         self._failure: Exception | None = None
         self._thread = threading.Thread(target=self._run, name="ertis-ros-odometry", daemon=True)
         self._thread.start()
+
+    @property
+    def n_skipped(self) -> int:
+        """Pulses that were not used, because the computer was too slow."""
+        return self._queue.n_skipped
 
     def add(self, item: _Item, mounting: Mounting | None) -> None:
         """Add the image or the points of a sensor; return at once."""
@@ -78,34 +74,22 @@ class OdometryPublisher:
         """
         while group := self._groups.close():
             self._put(group)
-        with self._changed:
-            self._closed = True
-            self._changed.notify_all()
+        self._queue.end()
         self._thread.join()
         failure, self._failure = self._failure, None
         if failure is not None:
             raise failure
 
     def _put(self, group: _Group) -> None:
-        with self._changed:
-            self._waiting.append((group, dict(self._mountings)))
-            while len(self._waiting) > _MAX_WAITING:
-                self._waiting.popleft()
-                self.n_skipped += 1
-            self._changed.notify_all()
+        self._queue.put((group, dict(self._mountings)), sum(_n_bytes(item) for item in group.values()))
 
     def _run(self) -> None:
         try:
-            while (waiting := self._next()) is not None:
+            while (waiting := self._queue.take()) is not None:
                 self._publish(*waiting)
         except Exception as error:  # noqa: BLE001  `close` raises it in the thread of the application
             self._failure = error
             self._note(f"odometry has ended: {error}")
-
-    def _next(self) -> tuple[_Group, dict[str, Mounting]] | None:
-        with self._changed:
-            self._changed.wait_for(lambda: self._waiting or self._closed)
-            return self._waiting.popleft() if self._waiting else None
 
     def _publish(self, group: _Group, mountings: dict[str, Mounting]) -> None:
         found = self._live.add(group, mountings)
@@ -114,3 +98,7 @@ class OdometryPublisher:
         message: dict[str, Any] = odometry_message(*found)
         self._odometry.publish(message)
         self._transforms.publish({"transforms": [odometry_transform(found[0])]})
+
+
+def _n_bytes(item: _Item) -> int:
+    return (item.amplitude if isinstance(item, Energyscape) else item.position_m).nbytes
