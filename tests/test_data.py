@@ -5,6 +5,7 @@ import functools
 import hashlib
 import importlib.util
 import json
+import math
 import re
 from pathlib import Path
 
@@ -13,12 +14,17 @@ import pytest
 from ertis_bench.furnished_rooms import hall
 from numpy.testing import assert_allclose, assert_array_equal
 
+from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.compare import compare
 from ertis_numba.analysis.detect import find_peaks
+from ertis_numba.passive import AcousticCamera
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.simulation import Scene, load_scene
+from ertis_numba.simulation.arrivals import arrivals
 from ertis_numba.simulation.effect_plan import make_plan
 from ertis_numba.simulation.render import Simulator
+from ertis_numba.simulation.snapshot import snapshot
+from ertis_numba.simulation.stopwatch import CostStopwatch
 from ertis_numba.storage import open_recording
 from tests.pages import page
 
@@ -118,6 +124,11 @@ CALLED_FOR = {
     "two_facing_sensors": {"cross_emission", "sync_delay", "emitter_directivity"},
 }
 SCENES = sorted(CALLED_FOR)
+SOUNDS = {
+    "bats": {"spreading", "absorption", "emitter_directivity", "doppler", "interference", "ambient_noise"},
+    "leak": {"spreading", "absorption", "interference", "ambient_noise"},
+}
+"""Scenes without echoes, whose images show nothing, and effects that they need."""
 
 
 def page_text_of(name):
@@ -126,7 +137,8 @@ def page_text_of(name):
 
 
 def test_gallery_shows_all_scenes():
-    assert {path.stem for path in (FOLDER / "scenes").glob("*.toml")} == set(SCENES)
+    assert {path.stem for path in (FOLDER / "scenes").glob("*.toml")} == {*SCENES, *SOUNDS}
+    assert all(f"[{name}.toml](../../data/synthetic/scenes/{name}.toml)" in PAGE for name in (*SCENES, *SOUNDS))
     assert sorted(re.findall(r"^<!-- scene (\w+) -->$", PAGE, re.MULTILINE)) == SCENES
     pictures = set(re.findall(r"\]\(\.\./(pictures/gallery/\w+\.png)\)", PAGE))
     folder = ROOT / "docs" / "pictures" / "gallery"
@@ -177,3 +189,47 @@ def test_image_of_gallery_scene_shows_most_reflectors(name):
         assert np.isfinite(image.amplitude).all()
         found = compare(image, simulator.reflectors(), min_level_db=-6.0)
         assert len(found.matched) > len(found.missed)
+
+
+@pytest.mark.parametrize("name", SOUNDS)
+def test_scene_of_sources_needs_the_effects_on_its_sound(name):
+    scene, plan = scene_and_plan(name)
+    assert not scene.effects
+    assert all(sensor.emitter.silent for sensor in scene.sensors)
+    assert SOUNDS[name] <= plan.active
+    for sensor in scene.sensors:
+        simulator = Simulator(scene, sensor=sensor.name, plan=plan)
+        signals = simulator.signals(0)
+        assert 1e-3 < np.abs(signals).max() < 0.5
+        assert {each.kind for each in simulator.sources()} <= {"noise", "sonar"}
+        assert len(simulator.sources()) == 2
+
+
+def test_acoustic_map_of_the_leak_is_loudest_in_its_direction():
+    """The leak exceeds the machine above 20 kHz; 3000 directions are 2.6 degrees apart."""
+    scene, plan = scene_and_plan("leak")
+    simulator = Simulator(scene, plan=plan)
+    leak, machine = simulator.sources()
+    bands_hz = ((10e3, 14e3), (35e3, 55e3))
+    settings = scene.sensor().settings().replace("passive.bands_hz", bands_hz)
+    camera = AcousticCamera(settings)
+    for index in range(2):
+        camera.add(dataclasses.replace(simulator.render(index), settings=settings))
+    for found, true in zip(camera.map().loudest(), (machine, leak), strict=True):
+        assert abs(math.degrees(found.azimuth_rad) - true.azimuth_deg) < 3.0
+        assert abs(math.degrees(found.elevation_rad) - true.elevation_deg) < 3.0
+
+
+def test_calls_of_both_bats_arrive_with_their_doppler_factors():
+    scene, plan = scene_and_plan("bats")
+    speed_m_s = sound_speed_m_s(scene.sensor().air)
+    received = {sonar.call: 0 for sonar in scene.sonars}
+    for index in range(scene.count):
+        shot = snapshot(scene, scene.sensor(), index / scene.rate_hz)
+        for entry in arrivals(shot, plan.active, np.array([30e3]), CostStopwatch()):
+            place = next(sonar for sonar in scene.sonars if sonar.call == entry.call)
+            away_m_s = place.velocity_at(shot.time_s) @ place.position_at(shot.time_s)
+            away_m_s /= np.linalg.norm(place.position_at(shot.time_s))
+            assert_allclose((entry.stretch - 1) * speed_m_s, away_m_s, atol=1.0)  # the bat turns while calls travel
+            received[entry.call] += len(entry.delay_s)
+    assert min(received.values()) > 5
