@@ -20,7 +20,7 @@ from ertis_numba.settings import Processing, Settings
 SETTINGS = Settings(processing=Processing(directions="2d:31", range_m=(0.5, 3.0)))
 RANGE_M = np.arange(0.5, 3.0, 0.01)
 ALL = ("energyscape", "points", "raw", "group", "status")
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 PART = 5_000  # bytes per frame: images take several frames
 
 
@@ -171,6 +171,7 @@ class Publisher:
             "timestamp_ns": stamp.timestamp_ns,
             "uncertainty_ns": stamp.timestamp_uncertainty_ns,
             "monotonic_ns": 5,
+            "behaviour": stamp.behaviour,
         }
         if isinstance(item, Measurement):
             air, words = item.settings.air, item.data.tobytes()
@@ -197,7 +198,7 @@ class Publisher:
             axes = [b"", b"", b""]
             if isinstance(item, Energyscape):
                 axes = [item.azimuth_rad.tobytes(), item.elevation_rad.tobytes(), item.range_m.tobytes()]
-            self.notify(key, described, SETTINGS.to_toml().encode(), *axes)
+            self.notify(key, described, item.settings.replace(air=SETTINGS.air).to_toml().encode(), *axes)
         return peer.described[about]
 
     @contextlib.contextmanager

@@ -1,0 +1,147 @@
+"""Application node that makes acoustic maps from measurements as they arrive."""
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, Self
+
+from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.frames import AcousticMap, Measurement
+from ertis_numba.network.keys import ClientKeys
+from ertis_numba.network.subscriber import Subscriber
+from ertis_numba.passive import AcousticCamera, is_passive
+from ertis_numba.settings import Settings
+
+__all__ = ["AcousticMapSubscriber"]
+
+
+class AcousticMapSubscriber:
+    """Receiver of measurements that makes acoustic maps; use it in a ``with`` statement and a loop.
+
+    Maps are made here, not at the central node, which sends the measurements as they are: a measurement of 36 ms of an
+    eRTIS has 0.65 MB. An application that is too slow gets the latest measurements.
+
+    Parameters
+    ----------
+    address : str
+        Address at which the central node publishes, ``tcp://HOST:PORT``.
+    sensors : sequence of str, optional
+        All by default.
+    changes : mapping of str to value, optional
+        Changes of the settings of each sensor, such as ``{"passive.averages": 10, "processing.directions": "3000"}``.
+    device : {"auto", "cpu", "cuda", "numpy"}
+    threads : int, optional
+        As for `AcousticCamera`.
+    keys : ClientKeys, optional
+        None on loopback only.
+    on_note : callable, optional
+        Called by a thread with a line for each change of the connection.
+
+    Attributes
+    ----------
+    counts : SubscriberCounts
+        Counts of the measurements.
+    n_active : int
+        Measurements with a call, which become no map unless ``processing.mode`` is ``passive``.
+
+    Raises
+    ------
+    ArgumentError
+        The address, a sensor or a change cannot be used, or the address requires keys.
+
+    Examples
+    --------
+    >>> with AcousticMapSubscriber("tcp://127.0.0.1:5602") as subscriber:  # doctest: +SKIP
+    ...     for found in subscriber:
+    ...         print(found.stamp.sensor, found.loudest()[-1])
+    """
+
+    def __init__(
+        self,
+        address: str,
+        *,
+        sensors: Sequence[str] | None = None,
+        changes: Mapping[str, Any] | None = None,
+        device: str = "auto",
+        threads: int | None = None,
+        keys: ClientKeys | None = None,
+        on_note: Callable[[str], None] | None = None,
+    ) -> None:
+        self._changes, self._device, self._threads = dict(changes or {}), device, threads
+        AcousticCamera(Settings().replace(**self._changes), device, threads).close()  # refuses changes, loads kernels
+        self._cameras: dict[str, tuple[Settings, AcousticCamera]] = {}
+        self.n_active = 0
+        self._subscriber = Subscriber(address, sensors=sensors, products=["raw"], keys=keys, on_note=on_note, credit=8)
+        self.counts = self._subscriber.counts
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __iter__(self) -> Iterator[AcousticMap]:
+        while (found := self.receive()) is not None:
+            yield found
+
+    @property
+    def connected(self) -> bool:
+        """True if a central node answers."""
+        return self._subscriber.connected
+
+    def receive(self, timeout_s: float | None = None) -> AcousticMap | None:
+        """Return the next map; None after ``timeout_s``, or once the subscriber is closed.
+
+        Parameters
+        ----------
+        timeout_s : float, optional
+            Time to wait; unlimited by default.
+
+        Raises
+        ------
+        RefusedError
+            The central node has refused this application from the start.
+        DataError
+            The settings of a sensor cannot be used for maps.
+        """
+        end_s = None if timeout_s is None else time.monotonic() + timeout_s
+        while (
+            measurement := self._subscriber.receive(None if end_s is None else max(0.0, end_s - time.monotonic()))
+        ) is not None:
+            found = self._added(measurement)
+            if found is not None:
+                return found
+        return None
+
+    def close(self) -> None:
+        """End the loop; waiting measurements are lost."""
+        self._subscriber.close()
+        while self._cameras:
+            self._cameras.popitem()[1][1].close()
+
+    def _added(self, measurement: Measurement) -> AcousticMap | None:
+        """Return the map that a measurement completes; None if it completes none."""
+        camera = self._camera_of(measurement)
+        if not is_passive(camera.settings, measurement.stamp):
+            self.n_active += 1
+            return None
+        # The air of each measurement may be measured; the delays of a map are those of the first one.
+        camera.add(Measurement(measurement.data, camera.settings, measurement.stamp))
+        if camera.n_measurements < camera.settings.passive.averages:
+            return None
+        found = camera.map()
+        camera.reset()
+        return found
+
+    def _camera_of(self, measurement: Measurement) -> AcousticCamera:
+        sensor, settings = measurement.stamp.sensor, measurement.settings
+        known = self._cameras.get(sensor)
+        if known is not None and known[0] == settings.replace(air=known[0].air):
+            return known[1]
+        try:
+            camera = AcousticCamera(settings.replace(**self._changes), self._device, self._threads)
+        except ArgumentError as error:
+            raise DataError(f"settings of sensor {sensor!r} cannot be used for acoustic maps ({error})") from error
+        if known is not None:
+            known[1].close()
+        self._cameras[sensor] = settings, camera
+        return camera

@@ -1,0 +1,95 @@
+"""Acoustic maps of a central node's measurements, as an application makes them."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.frames import Measurement
+from ertis_numba.network.acoustic_map_subscriber import AcousticMapSubscriber
+from ertis_numba.passive import AcousticCamera
+from tests.publishing import Publisher, measurement
+
+
+def passive(number, *, behaviour="passive", **changes):
+    made = measurement(number, **changes)
+    return Measurement(made.data, made.settings, dataclasses.replace(made.stamp, behaviour=behaviour))
+
+
+def test_maps_are_those_of_the_camera():
+    sent = [passive(number, sensor=sensor) for number in range(2) for sensor in ("front", "back")]
+    with (
+        Publisher() as publisher,
+        publisher.playing(sent),
+        AcousticMapSubscriber(publisher.address, device="cpu") as subscriber,
+    ):
+        found = [subscriber.receive(20.0) for _ in range(2)]
+    with AcousticCamera(sent[0].settings, "cpu") as camera:
+        for each in found:
+            (original,) = (
+                one
+                for one in sent
+                if (one.stamp.sensor, one.stamp.sequence) == (each.stamp.sensor, each.stamp.sequence)
+            )
+            np.testing.assert_array_equal(each.power, camera.process(original).power)
+
+
+def test_measurements_are_averaged_by_sensor():
+    sent = [passive(number, temperature_c=20.0 + number) for number in range(4)]
+    with (
+        Publisher() as publisher,
+        AcousticMapSubscriber(publisher.address, changes={"passive.averages": 2}, device="cpu") as subscriber,
+        publisher.playing(sent),
+    ):
+        found = subscriber.receive(20.0)
+    assert found.n_measurements == 2
+
+
+def test_measurements_with_a_call_become_no_map_unless_asked():
+    sent = [passive(number, behaviour="active") for number in range(2)]
+    with (
+        Publisher() as publisher,
+        AcousticMapSubscriber(publisher.address, changes={"processing.mode": "passive"}, device="cpu") as subscriber,
+        publisher.playing(sent),
+    ):
+        found = subscriber.receive(20.0)
+        assert found.masked_s > found.settings.call.duration_s
+    with (
+        Publisher() as publisher,
+        AcousticMapSubscriber(publisher.address, device="cpu") as subscriber,
+        publisher.playing([*sent, passive(2)]),
+    ):
+        assert subscriber.receive(20.0).stamp.sequence == 2
+        assert subscriber.n_active <= 2  # the central node may drop some for a slow application
+
+
+def test_changes_that_cannot_be_used_are_refused():
+    with pytest.raises(ArgumentError, match="passive"):
+        AcousticMapSubscriber("tcp://127.0.0.1:5602", changes={"passive.method": "loudest"})
+    with pytest.raises(ArgumentError, match="nowhere"):
+        AcousticMapSubscriber("nowhere")
+
+
+def test_settings_that_cannot_be_used_are_an_error():
+    changes = {"passive.resolution_hz": 29.0}  # longer than the short record of the sensor
+    with (
+        Publisher() as publisher,
+        AcousticMapSubscriber(publisher.address, changes=changes, device="cpu") as subscriber,
+        publisher.playing([short()]),
+        pytest.raises(DataError, match="cannot be used for acoustic maps"),
+    ):
+        subscriber.receive(20.0)
+
+
+def test_closed_subscriber_ends_the_loop():
+    with Publisher() as publisher, publisher.playing([]), AcousticMapSubscriber(publisher.address) as subscriber:
+        assert subscriber.receive(0.05) is None
+        subscriber.close()
+        assert list(subscriber) == []
+
+
+def short():
+    made = passive(0)
+    settings = made.settings.replace("recording.n_samples", 81_920)
+    return Measurement(made.data[:81_920], settings, made.stamp)
