@@ -17,6 +17,7 @@ from ertis_numba.geometry import (
     direction_grid,
     far_field_delays,
     is_closed,
+    layout_file,
     layout_names,
     load_layout,
     microphones,
@@ -25,8 +26,10 @@ from ertis_numba.geometry import (
     spacing_rad,
     spherical_delays,
     unit_vectors,
+    written_out,
 )
 from ertis_numba.settings import Array, Processing
+from ertis_numba.units import sound_pressure_level_db
 
 NAMES = ("eRTIS_v2", "eRTIS_v2REC", "eRTIS_v3D1", "eRTIS_v3D1REC", "uRTIS_v1", "xRTIS_v1")
 
@@ -103,6 +106,27 @@ def test_layout_files_are_read(tmp_path):
     flat = load_layout(tmp_path / "mine.csv")
     assert flat.name == "mine"
     assert_allclose(flat.positions_m, [[0, -0.002, -0.001], [0, 0.002, 0.001]])
+
+
+def test_sensitivity_of_a_layout_is_kept_unless_the_settings_state_another(tmp_path):
+    path = tmp_path / "mems.toml"
+    path.write_text("sensitivity_dbfs = -26.0\npositions_mm = [[0, 0], [4, 2]]")
+    named = Array(layout=str(path))
+    assert load_layout(path).sensitivity_dbfs == microphones(named).sensitivity_dbfs == -26.0
+    assert microphones(named.replace(sensitivity_dbfs=-29.5)).sensitivity_dbfs == -29.5
+    assert written_out(named).sensitivity_dbfs == written_out(written_out(named)).sensitivity_dbfs == -26.0
+    assert layout_file(load_layout(path), name="mine").sensitivity_dbfs == -26.0
+    assert microphones(Array()).sensitivity_dbfs is None
+    with pytest.raises(ArgumentError, match=r"array.sensitivity_dbfs is 94; give a number from -120 to 20"):
+        Array(sensitivity_dbfs=94.0)
+
+
+def test_sound_pressure_level_follows_from_the_sensitivity_of_a_data_sheet():
+    """A sine of 1 Pa at −26 dBFS has an amplitude of 10^(−26/20); its RMS in this package is 3 dB lower."""
+    sine = 10 ** (-26 / 20) * np.sin(2 * np.pi * np.arange(1000) / 10)
+    dbfs = 20 * np.log10(np.sqrt(np.mean(sine**2)))
+    assert_allclose(sound_pressure_level_db(dbfs, -26.0), 20 * np.log10(1 / 20e-6))
+    assert_allclose(sound_pressure_level_db(dbfs - 40.0, -26.0), 20 * np.log10(0.01 / 20e-6))
 
 
 @pytest.mark.parametrize(

@@ -55,6 +55,9 @@ class LayoutFile(TomlDocument, frozen=True, kw_only=True):
         Calibrated sensitivity of each channel, 1 by default. Processing divides the signal by it.
     delay_s : tuple of float, optional
         Calibrated delay of each channel in seconds, 0 by default. Processing compensates for it.
+    sensitivity_dbfs : float, optional
+        Sensitivity of the microphones as in their data sheet: level of a sine of 94 dB, 1 Pa RMS, relative to a
+        full-scale sine, -120 to 20 dBFS; unknown by default.
     """
 
     positions_mm: list[list[float]]
@@ -64,6 +67,7 @@ class LayoutFile(TomlDocument, frozen=True, kw_only=True):
     disabled: tuple[int, ...] = ()
     gain: tuple[float, ...] | None = None
     delay_s: tuple[float, ...] | None = None
+    sensitivity_dbfs: float | None = None
 
     def to_toml(self) -> str:
         """Return TOML text with one position per line."""
@@ -87,6 +91,8 @@ class Layout:
         Calibrated delay in seconds.
     word_bits : int
         Bits of one PDM word.
+    sensitivity_dbfs : float, optional
+        Level of a sine of 94 dB relative to a full-scale sine; None, the default, if it is unknown.
     """
 
     name: str
@@ -95,6 +101,7 @@ class Layout:
     gain: NDArray[np.float64]
     delay_s: NDArray[np.float64]
     word_bits: int
+    sensitivity_dbfs: float | None = None
 
     @property
     def n_words(self) -> int:
@@ -120,6 +127,7 @@ class Layout:
             gain=tuple(self.gain.tolist()),
             delay_s=tuple(self.delay_s.tolist()),
             word_bits=self.word_bits,
+            sensitivity_dbfs=self.sensitivity_dbfs,
         )
 
 
@@ -183,6 +191,7 @@ def layout_file(layout: Layout, *, name: str, source: str = "") -> LayoutFile:
         disabled=tuple(np.flatnonzero(~layout.enabled).tolist()),
         gain=tuple(np.round(layout.gain, 6).tolist()),
         delay_s=tuple(np.round(layout.delay_s, 12).tolist()),
+        sensitivity_dbfs=layout.sensitivity_dbfs,
     )
 
 
@@ -257,6 +266,7 @@ def _placed(source: str, file: LayoutFile) -> Array:
             gain=file.gain,
             delay_s=file.delay_s,
             word_bits=file.word_bits,
+            sensitivity_dbfs=file.sensitivity_dbfs,
         )
     except ArgumentError as error:
         raise ArgumentError(f"layout {source}: {error}") from error
@@ -321,7 +331,10 @@ def microphones(array: Array) -> Layout:
 def _fitted(array: Array) -> Layout:
     """Return all microphones of an array, including the disabled ones."""
     if array.positions_m is None:
-        return load_layout(array.layout)
+        named = load_layout(array.layout)
+        if array.sensitivity_dbfs is None:
+            return named
+        return replace(named, sensitivity_dbfs=array.sensitivity_dbfs)
     positions_m = np.asarray(array.positions_m, dtype=np.float64)
     enabled = np.ones(len(positions_m), dtype=np.bool_) if array.enabled is None else np.asarray(array.enabled)
     centre_m = positions_m[enabled].mean(axis=0)
@@ -336,6 +349,7 @@ def _fitted(array: Array) -> Layout:
         gain=np.ones(len(enabled)) if array.gain is None else np.asarray(array.gain, dtype=np.float64),
         delay_s=np.zeros(len(enabled)) if array.delay_s is None else np.asarray(array.delay_s, dtype=np.float64),
         word_bits=array.word_bits,
+        sensitivity_dbfs=array.sensitivity_dbfs,
     )
 
 

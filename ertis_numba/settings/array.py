@@ -9,6 +9,7 @@ from ertis_numba.errors import ArgumentError
 
 __all__ = ["Array"]
 
+_SENSITIVITIES_DBFS = -120.0, 20.0
 _MAX_COORDINATE_M = 10.0  # A larger coordinate is probably in millimetres.
 
 
@@ -33,6 +34,9 @@ class Array(TomlTable, frozen=True, kw_only=True):
         origin of images stays the centre of the whole array.
     word_bits : {8, 16, 32, 64}, default 32
         Bits of one PDM word. An array with more channels has several words per sample.
+    sensitivity_dbfs : float, optional, default None
+        Sensitivity of the microphones as in their data sheet: level of a sine of 94 dB, 1 Pa RMS, relative to a
+        full-scale sine, -120 to 20 dBFS. That of the layout by default; sound pressures are unknown without it.
     """
 
     layout: str = "eRTIS_v3D1"
@@ -42,11 +46,14 @@ class Array(TomlTable, frozen=True, kw_only=True):
     delay_s: tuple[float, ...] | None = None
     disabled: tuple[int, ...] | None = None
     word_bits: int = 32
+    sensitivity_dbfs: float | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
         checks.length("array.layout", self.layout, MAX_NAME_LENGTH)
         checks.choice("array.word_bits", checks.integer("array.word_bits", self.word_bits, 1), WORD_BITS)
+        if self.sensitivity_dbfs is not None:
+            checks.between("array.sensitivity_dbfs", self.sensitivity_dbfs, *_SENSITIVITIES_DBFS)
         for channel in self.disabled or ():
             checks.integer("array.disabled", channel, 0, MAX_MICROPHONES - 1)
         if self.positions_m is None:
@@ -54,11 +61,8 @@ class Array(TomlTable, frozen=True, kw_only=True):
                 if getattr(self, name) is not None:
                     raise ArgumentError(f"array.{name} is given without array.positions_m; give both or neither")
             return
-        n_channels = checks.integer("number of array.positions_m", len(self.positions_m), 1, MAX_MICROPHONES)
-        checks.finite_array("array.positions_m", np.asarray(self.positions_m, dtype=np.float64))
-        for channel, position in enumerate(self.positions_m):
-            for coordinate_m in position:
-                checks.between(f"array.positions_m[{channel}]", coordinate_m, -_MAX_COORDINATE_M, _MAX_COORDINATE_M)
+        self._check_positions(self.positions_m)
+        n_channels = len(self.positions_m)
         if self.enabled is not None:
             checks.shape("array.enabled", (len(self.enabled),), (n_channels,))
             if not any(self.enabled):
@@ -67,6 +71,13 @@ class Array(TomlTable, frozen=True, kw_only=True):
         for channel, gain in enumerate(self.gain or ()):
             checks.between(f"magnitude of array.gain[{channel}]", abs(gain), 1e-3, 1e3)
         self._check_per_channel("delay_s", -1e-3, 1e-3)
+
+    def _check_positions(self, positions_m: tuple[tuple[float, float, float], ...]) -> None:
+        checks.integer("number of array.positions_m", len(positions_m), 1, MAX_MICROPHONES)
+        checks.finite_array("array.positions_m", np.asarray(positions_m, dtype=np.float64))
+        for channel, position in enumerate(positions_m):
+            for coordinate_m in position:
+                checks.between(f"array.positions_m[{channel}]", coordinate_m, -_MAX_COORDINATE_M, _MAX_COORDINATE_M)
 
     def _check_per_channel(self, name: str, low: float, high: float) -> None:
         """Refuse a list without exactly one number in ``[low, high]`` for each channel."""
