@@ -180,6 +180,17 @@ def test_calibrated_delays_and_gains_are_removed():
     assert found.power == pytest.approx(expected.power, rel=0.02, abs=1e-3 * float(expected.power.max()))
 
 
+def test_levels_are_those_of_sound_pressure_if_the_sensitivity_is_known():
+    plain = settings_of()
+    known = plain.replace("array.sensitivity_dbfs", -26.0)
+    found = []
+    for settings in (plain, known):
+        with AcousticCamera(settings, "cpu") as camera:
+            found.append(camera.process(sound(settings, [(20, 0.1)])))
+    assert found[0].level_db is None
+    assert found[1].level_db == pytest.approx(found[1].level_dbfs + 94 + 26 + 3, abs=0.1)
+
+
 def test_time_of_the_call_is_left_out():
     settings = settings_of()
     measurement = sound(settings, [(20, 0.01)])

@@ -13,6 +13,7 @@ from ertis_numba.errors import ArgumentError
 from ertis_numba.frames._replacing import replaced
 from ertis_numba.frames._stamp import Stamp
 from ertis_numba.settings import Settings
+from ertis_numba.units import sound_pressure_level_db
 
 __all__ = ["AcousticMap", "Loudest"]
 
@@ -102,6 +103,17 @@ class AcousticMap(DegreesFromRadians):
         """Level at the array in dBFS: (direction, band) float32. A full-scale tone has -3; silence has -inf."""
         with np.errstate(divide="ignore"):
             return np.asarray(10 * np.log10(self.power), np.float32)
+
+    @property
+    def level_db(self) -> NDArray[np.float32] | None:
+        """Sound pressure level at the array in dB re 20 µPa: (direction, band) float32.
+
+        None if the settings do not state the sensitivity of the microphones.
+        """
+        sensitivity_dbfs = self.settings.array.sensitivity_dbfs
+        if sensitivity_dbfs is None:
+            return None
+        return self.level_dbfs + np.float32(sound_pressure_level_db(0.0, sensitivity_dbfs))
 
     @property
     def has_level(self) -> bool:

@@ -108,6 +108,8 @@ class AcousticCamera:
         self._threads = kernel_set.max_threads if threads is None else threads
         with kernel_set.threads(self._threads):  # refuses an impossible number
             pass
+        sensitivity_dbfs = microphones(settings.array).sensitivity_dbfs  # of the layout, for the levels of maps
+        settings = settings.replace("array.sensitivity_dbfs", sensitivity_dbfs)
         self._kernels, self.settings, self.device = kernel_set, settings, kernel_set.device
         self._require_sources()
         self.grid: Grid = direction_grid(settings.processing)
