@@ -208,7 +208,7 @@ def test_time_of_the_call_is_left_out():
 
 def test_focus_is_that_of_a_near_source():
     scene = ertis.Scene.from_toml(
-        "sensors = [{emitter.silent = true}]\n"
+        "sensors = [{emitter.silent = true}]\neffects = {absorption = false}\n"
         "noises = [{position_m = [0.25, 0.02, 0.0], band_hz = [30000, 50000], level_db = -40}]"
     )
     measurement = ertis.render(scene)
