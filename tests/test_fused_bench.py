@@ -1,10 +1,11 @@
-"""``ertis bench network --only fusion``, with a short measurement, fills its table."""
+"""Benchmarks of fusion, with short measurements, fill their tables."""
 
 import json
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from ertis_bench import differing_calls
 from ertis_bench.network import fused_receiver, live_fusion
 from ertis_bench.network.fused_receiver import FusedReceiverJob
 from ertis_cli.main import cli
@@ -46,3 +47,21 @@ def test_fused_bench_finds_wrong_images(tmp_path, gain, share, wrong):
     job = FusedReceiverJob(address="", diary="", keys=("", ""), expected=str(expected), mountings=MOUNTINGS)
     found = fused_receiver.checked(job, [FusedArrival(fused, images, 0, 0, 0)])
     assert found == {"checked": 1, "wrong": wrong}
+
+
+def test_calls_bench_compares_equal_and_different_calls(tmp_path, monkeypatch):
+    monkeypatch.setattr(differing_calls, "EMITTERS_M", (0.0,))
+    target = tmp_path / "page.md"
+    marker = "ertis bench fusion --only calls"
+    target.write_text(f"<!-- {marker} -->\nold\n<!-- /{marker} -->\n", "utf-8")
+    options = ["--only", "calls", "--count", "1", "--seed", "1000", "--json", "--quiet", "--update", str(target)]
+    done = CliRunner().invoke(cli, ["bench", "fusion", *options])
+    assert done.exit_code == 0, (done.stderr, done.exception)
+    report = json.loads(done.stdout)
+    equal, different, pairs = report["calls"]
+    assert (equal["n_images"], different["n_images"], pairs["n_images"]) == (4, 4, 16)
+    assert equal["spurious"] < different["spurious"]
+    assert all(0 < each["located"] <= each["reflectors"] == 10 for each in report["calls"])
+    low_db, high_db = report["suppression_db"]
+    assert 0 < low_db < high_db
+    assert "| omnidirectional | different, an image for each pair | 16 |" in target.read_text("utf-8")

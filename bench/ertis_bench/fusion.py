@@ -5,33 +5,27 @@ Four sensors on a platform face in four directions and emit together. Nothing is
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_bench import machine
+from ertis_bench import differing_calls, machine
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table
+from ertis_bench.platform_scenes import EMITTERS_M, N_REFLECTORS, platform_scene, random_reflectors
 from ertis_numba.analysis.points import PointExtractor
 from ertis_numba.frames import Energyscape
 from ertis_numba.fusion import Fused, Fuser
 from ertis_numba.pipeline import Pipeline
-from ertis_numba.settings import Processing
-from ertis_numba.simulation import Electronics, Emitter, Point, Scene, Sensor
+from ertis_numba.simulation import Point, Scene, Sensor
 from ertis_numba.simulation.render import Simulator
 
-__all__ = ["EMITTERS_M", "form", "platform_scene", "random_reflectors", "run"]
+__all__ = ["form", "run"]
 
 Floats = NDArray[np.float64]
 
-EMITTERS_M = 0.012, 0.0
-"""Diameters of the emitters: as pistons, and omnidirectional."""
-_YAWS_DEG = {"front": 0.0, "left": 90.0, "back": 180.0, "right": -90.0}
-_RADIUS_M = 0.2
-_N_REFLECTORS = 10
-_APART_M = 0.4
 _LOUD_DB = -25.0  # Level of foreign echoes that count, relative to the strongest own echo.
 _BEAM_RAD, _PULSE_M = math.radians(25.0), 0.12  # Distance of ghosts from all reflectors.
 _NEAR_M = 0.06
@@ -50,33 +44,7 @@ class _Shot(NamedTuple):
     took_s: float
 
 
-def platform_scene(seed: int, points: tuple[Point, ...], diameter_m: float, level_db: float = -24.0) -> Scene:
-    """Return a scene of four sensors on a platform.
-
-    Parameters
-    ----------
-    seed : int
-    points : tuple of Point
-    diameter_m : float
-        Diameter of the emitters.
-    level_db : float
-        Level of the emitters.
-    """
-    sensors = tuple(
-        Sensor(
-            name=name,
-            position_m=(_RADIUS_M * math.cos(math.radians(yaw)), _RADIUS_M * math.sin(math.radians(yaw)), 0.4),
-            yaw_deg=yaw,
-            processing=Processing(range_m=(0.3, 4.0), directions="90"),
-            emitter=Emitter(level_db=level_db, diameter_m=diameter_m),
-            electronics=Electronics(noise_dbfs=-60.0),
-        )
-        for name, yaw in _YAWS_DEG.items()
-    )
-    return Scene(seed=seed, sensors=sensors, points=points)
-
-
-def run(*, count: int, rooms: int, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
+def run(*, count: int, rooms: int, seed: int, say: Callable[[str], None], only: Sequence[str] = ()) -> dict[str, Any]:
     """Fuse images of random reflectors, and of rooms with rough walls.
 
     Parameters
@@ -89,7 +57,11 @@ def run(*, count: int, rooms: int, seed: int, say: Callable[[str], None]) -> dic
         Seed of the first scene.
     say : callable
         Function that reports progress.
+    only : sequence of str
+        ``calls`` to compare equal calls with different ones instead.
     """
+    if only:
+        return differing_calls.run(count=count, seed=seed, say=say)
     rows, times = [], []
     for diameter_m in EMITTERS_M:
         ghosts, positions, lost = [], [], 0
@@ -119,6 +91,8 @@ def run(*, count: int, rooms: int, seed: int, say: Callable[[str], None]) -> dic
 
 def form(report: dict[str, Any]) -> str:
     """Return the report as Markdown."""
+    if "calls" in report:
+        return differing_calls.form(report)
     head = [
         "emitters",
         "ghosts, fused / single (median)",
@@ -134,7 +108,7 @@ def form(report: dict[str, Any]) -> str:
             f"{row['within_20_db']} of {row['scenes']}",
             f"{row['strongest_db']:.1f} dB ({row['strongest_single_db']:.1f} dB)",
             f"{1000 * row['rms_m']:.1f} mm ({1000 * row['single_rms_m']:.1f} mm), {row['n_positions']} reflectors",
-            f"{row['lost']} of {_N_REFLECTORS * report['count']}",
+            f"{row['lost']} of {N_REFLECTORS * report['count']}",
         ]
         for row in report["rows"]
     ]
@@ -146,27 +120,12 @@ def form(report: dict[str, Any]) -> str:
             f"distance of {100 * report['wall_rms_m']:.1f} cm, from a single SYNC pulse."
         )
     return (
-        f"{table(head, rows)}\n\n{report['count']} scenes of {_N_REFLECTORS} reflectors from seed {report['seed']}, "
+        f"{table(head, rows)}\n\n{report['count']} scenes of {N_REFLECTORS} reflectors from seed {report['seed']}, "
         f"four sensors. Ghosts are foreign echoes far from all reflectors, above {_LOUD_DB:g} dB; levels are relative "
         f"to the strongest reflector. Positions are those of reflectors that two sensors locate; "
         f"the better sensor faces it more directly.{walls} "
         f"A fusion takes {1000 * report['median_s']:.0f} ms (median). {sentence(report['machine'])}"
     )
-
-
-def random_reflectors(seed: int) -> tuple[Point, ...]:
-    """Return reflectors at random places around a platform."""
-    draws = np.random.default_rng(seed)
-    found: list[Point] = []
-    places: list[complex] = []
-    while len(found) < _N_REFLECTORS:
-        range_m = draws.uniform(0.9, 3.2)
-        place = range_m * np.exp(1j * draws.uniform(-np.pi, np.pi))
-        if all(abs(place - other) > _APART_M for other in places):
-            places.append(place)
-            strength_db = float(draws.uniform(-8, 0) + 6 * np.log2(range_m))
-            found.append(Point(position_m=(float(place.real), float(place.imag), 0.4), strength_db=strength_db))
-    return tuple(found)
 
 
 def _shot(scene: Scene, diameter_m: float, **processing: Any) -> _Shot:

@@ -256,6 +256,13 @@ def calibration(**given: Any) -> None:
 @click.option("--count", type=click.IntRange(min=1), default=12, show_default=True, metavar="N", help="Scenes.")
 @click.option("--rooms", type=click.IntRange(min=0), default=4, show_default=True, metavar="N", help="Rooms.")
 @_seed("Seed of the first scene.")
+@click.option(
+    "--only",
+    multiple=True,
+    type=click.Choice(["calls"]),
+    metavar="PART",
+    help="Run only this part: calls compares sensors with equal and with different calls.",
+)
 @_update
 @options.quiet
 @options.as_json
