@@ -161,6 +161,21 @@ def test_calls_in_sequence_are_fused_by_their_delays_in_the_settings():
     assert np.array_equal(fuser(found.values()).image.amplitude, result.image.amplitude)
 
 
+def test_process_fuses_calls_in_sequence_like_python(tmp_path):
+    made, found = sequence()
+    names = "front", "left"
+    places = {name: mountings()[name] for name in names}
+    measurements = [ertis.render(made, sensor=name) for name in names]
+    write_recording(tmp_path / "two.h5", measurements, mounting=places)
+    arguments = ["process", str(tmp_path / "two.h5"), "--fuse", "-o", str(tmp_path / "fused.h5"), "-q"]
+    done = CliRunner().invoke(cli, arguments)
+    assert done.exit_code == 0, done.output
+    with open_energyscapes(tmp_path / "fused.h5") as reader:
+        amplitude = reader[0].amplitude
+    expected = ertis.fuse([found[name] for name in names], places).image.amplitude
+    np.testing.assert_allclose(amplitude, expected, rtol=1e-5)
+
+
 def test_delay_of_a_sensor_that_appears_later_is_used():
     _, found = sequence()
     fuser = ertis.Fuser(mountings())
