@@ -155,6 +155,20 @@ def test_clean_sc_leaves_the_powers_of_two_sources():
     assert power[~near[0] & ~near[1]].sum() < 0.1 * power.sum()
 
 
+@pytest.mark.parametrize("diagonal_removal", [False, True])
+def test_clean_sc_has_no_power_beside_a_source_in_a_direction_of_the_grid(diagonal_removal):
+    """Sidelobes of a map without the diagonal are negative in part, and must cancel all the same.
+
+    Delays of up to a tenth of a block leave about 0.5 % of the sound incoherent.
+    """
+    settings = settings_of(passive__method="clean_sc", passive__diagonal_removal=diagonal_removal)
+    with AcousticCamera(settings, "cpu") as camera:
+        found = camera.process(sound(settings, [(21, 0.1)]))
+    place = int(np.argmin(np.abs(np.degrees(found.azimuth_rad) - 21)))
+    beside = np.delete(found.power, place, axis=0)
+    assert 10 * np.log10(beside.sum(axis=0) / found.power[place]).max() < -20
+
+
 def test_diagonal_removal_suppresses_the_noise_of_microphones():
     levels = {}
     for removed in (False, True):

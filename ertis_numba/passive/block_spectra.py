@@ -78,6 +78,8 @@ class BlockSpectra:
         self._memory = kernels.memory()
         self._lane = self._memory.lane()
         taps = decimation_taps(sample_rate_hz=recording.sample_rate_hz, decimation=factor, pass_hz=highest_hz)
+        if factor == 1 and not recording.is_pdm:
+            taps = taps[len(taps) // 2 :][:1]  # The other taps are 0.
         window = TimeWindow.from_start(n_samples, n_fft=n_samples)
         self._demodulate = demodulation(
             settings, layout, window, kernels, self._memory, taps=integer_taps(taps), factor=factor

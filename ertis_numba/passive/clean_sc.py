@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 __all__ = ["clean_sc"]
 
 _LOOP_GAIN: Final = 0.6
-_MAX_ROUNDS: Final = 100
-_WORSE_ROUNDS: Final = 3
+_ROUNDS_PER_MICROPHONE: Final = 2
+_GROWTH: Final = 3  # Rounds over which the peak may not grow.
 _HOLLOW_ROUNDS: Final = 12  # The component of a source converges within a few.
 
 
@@ -18,8 +18,9 @@ def clean_sc(
 ) -> NDArray[np.float32]:
     """Return the power of the sources of one bin (P. Sijtsma, CLEAN based on spatial source coherence, 2007).
 
-    Each round takes the loudest direction, and subtracts 0.6 of all sound that is coherent with it. It ends when the
-    rest grows.
+    Each round takes the loudest direction, and subtracts 0.6 of all sound that is coherent with it. The rounds end when
+    the loudest power exceeds that of three rounds before, or after twice as many rounds as microphones. Both are the
+    rules of Acoular.
 
     Parameters
     ----------
@@ -28,7 +29,7 @@ def clean_sc(
     waves : (mic, direction) complex64
         Waves from each direction, of magnitude 1.
     power : (direction,) float32
-        Map of delay-and-sum, with or without the diagonal.
+        Map of delay-and-sum, with or without the diagonal; negative powers must remain.
     hollow : bool
         Leave out the diagonal of the matrix.
 
@@ -43,11 +44,15 @@ def clean_sc(
         np.fill_diagonal(rest, 0)
     found = np.zeros_like(left)
     conjugate = np.ascontiguousarray(waves.conj().T)
-    remaining, n_worse = float(np.abs(rest).sum()), 0
-    for _ in range(_MAX_ROUNDS):
+    peaks: list[np.float32] = []
+    for number in range(_ROUNDS_PER_MICROPHONE * n_mics):
         loudest = int(left.argmax())
         peak = left[loudest]
         if peak <= 0:
+            break
+        found[loudest] += np.float32(_LOOP_GAIN) * peak
+        peaks.append(peak)
+        if number > _GROWTH and peak > peaks[number - _GROWTH]:
             break
         component = _component(rest, waves[:, loudest], peak, norm, hollow=hollow)
         share = np.float32(_LOOP_GAIN) * peak
@@ -59,12 +64,6 @@ def clean_sc(
         if hollow:
             np.fill_diagonal(rest, 0)
         left -= share / norm * coherent
-        found[loudest] += share
-        now = float(np.abs(rest).sum())
-        n_worse = n_worse + 1 if now >= remaining else 0
-        if n_worse >= _WORSE_ROUNDS:
-            break
-        remaining = now
     return found
 
 

@@ -48,11 +48,15 @@ Method = Callable[[CrossSpectrum, Waves, Passive], Powers]
 
 def delay_and_sum(spectrum: CrossSpectrum, waves: Waves, passive: Passive) -> Powers:
     """Return ``v^H C v / M²``, or without the diagonal of C ``v^H C v / (M² − M)``, at least 0."""
+    return np.maximum(_steered(spectrum, waves, passive), 0)
+
+
+def _steered(spectrum: CrossSpectrum, waves: Waves, passive: Passive) -> Powers:
+    """Return the map of delay-and-sum, which is negative at some directions if the diagonal is left out."""
     n_mics = spectrum.matrix.shape[1]
     if not passive.diagonal_removal:
         return np.asarray(waves.steer(spectrum.matrix) / n_mics**2, np.float32)
-    powers = np.maximum(waves.steer(_hollow(spectrum.matrix)), 0)
-    return np.asarray(powers / max(n_mics**2 - n_mics, 1), np.float32)
+    return np.asarray(waves.steer(_hollow(spectrum.matrix)) / max(n_mics**2 - n_mics, 1), np.float32)
 
 
 def functional(spectrum: CrossSpectrum, waves: Waves, passive: Passive) -> Powers:
@@ -88,7 +92,7 @@ def music(spectrum: CrossSpectrum, waves: Waves, passive: Passive) -> Powers:
 
 def clean(spectrum: CrossSpectrum, waves: Waves, passive: Passive) -> Powers:
     """Return the powers of the sources that CLEAN-SC finds; see `clean_sc`."""
-    powers = delay_and_sum(spectrum, waves, passive)
+    powers = _steered(spectrum, waves, passive)
     for number, frequency_hz in enumerate(spectrum.frequency_hz):
         wave = waves.at(float(frequency_hz))
         powers[number] = clean_sc(spectrum.matrix[number], wave, powers[number], hollow=passive.diagonal_removal)
