@@ -88,6 +88,7 @@ bench: $(VENV)/ready  ## run the benchmarks and update the tables in the documen
 peers: $(VENV)/ready  ## compare with Acoular, PyTorch and JAX; on Linux, PyTorch from PyPI brings CUDA libraries
 	$(BIN)/python -m pip install --quiet --editable '.[peers]'
 	$(BIN)/ertis bench peers --update docs/reference/benchmarks.md
+	$(BIN)/ertis bench passive --update docs/explanation/acoustic-maps.md
 
 soak: $(VENV)/ready-to-test  ## test faults, kills, full disks and random scenes for hours; SEED=N repeats a run
 	$(BIN)/python -m tests.faults reliability --long $(if $(SEED),--seed $(SEED)) --update docs/explanation/reliability.md

@@ -20,6 +20,7 @@ from ertis_bench.motion import form as motion
 from ertis_bench.network.latency import latency
 from ertis_bench.network.table import network
 from ertis_bench.paper import DIRECTIONS, PUBLISHED_MS, RESTRICTED
+from ertis_bench.passive import form as passive
 from ertis_bench.peers.table import peers
 from ertis_bench.point_errors import form as points
 from ertis_bench.ptx_tables import ptx
@@ -42,6 +43,7 @@ __all__ = [
     "motion",
     "network",
     "paper",
+    "passive",
     "peers",
     "points",
     "ptx",
@@ -313,5 +315,6 @@ FORMS: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
     "fusion": {"fusion": fusion},
     "motion": {"motion": motion},
     "map": {"map": mapping},
+    "passive": {"passive": passive},
 }
 """Forms of the table of each command, by the name in the markers. The markers of a file select the form."""

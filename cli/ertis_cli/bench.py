@@ -321,6 +321,24 @@ def mapping(**given: Any) -> None:
 
 
 @bench.command()
+@click.option(
+    "--count", type=click.IntRange(min=1), default=3, show_default=True, metavar="N", help="Maps of each by Acoular."
+)
+@_seed("Seed of the signals.")
+@_update
+@options.quiet
+@options.as_json
+def passive(**given: Any) -> None:
+    """Compare acoustic maps with those of Acoular.
+
+    Differences and times are left out if Acoular is not installed: pip install 'ertis-numba[peers]'.
+    """
+    from ertis_bench import passive as benchmark
+
+    _run("passive", benchmark, **given)
+
+
+@bench.command()
 @_count(30)
 @_update
 @options.quiet

@@ -1,0 +1,66 @@
+"""``ertis bench passive`` compares acoustic maps with those of Acoular.
+
+Acoular runs in a process of its own, because its import changes threads and warns.
+"""
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+from ertis_bench import passive
+from ertis_bench.passive import agreement, times
+
+from ertis_numba.errors import DataError
+
+SCRIPT = """
+import json, warnings
+warnings.simplefilter("ignore")
+from acoular.tfastfuncs import nb
+from ertis_bench.passive import agreement
+
+nb.set_num_threads(1)  # hundreds of short loops are faster on one thread of a busy machine
+agreement._DIRECTIONS = "3d:60"
+agreement._CLEAN_STEP = 30
+print(json.dumps(agreement.compare(seed=1, say=lambda text: None)))
+"""
+
+
+def test_maps_equal_those_of_acoular():
+    if importlib.util.find_spec("acoular") is None:
+        pytest.skip("acoular is not installed; it belongs to the extra 'peers'")
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT],
+        env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    rows = {row["name"]: row for row in json.loads(done.stdout.splitlines()[-1])}
+    assert list(rows) == list(agreement.CASES)
+    for row in rows.values():
+        assert row["largest_db"] < row["limit_db"]
+        assert row["levels"] >= 10
+
+
+def test_different_map_is_refused(monkeypatch):
+    different = {"largest_db": 0.2, "median_db": 0.0, "levels": 1}
+    monkeypatch.setattr(agreement, "_compared", lambda *_: different)
+    with pytest.raises(DataError, match=r"delay_and_sum differs from Acoular by 0\.20 dB, more than 0\.1 dB"):
+        agreement.compare(seed=0, say=lambda _: None)
+
+
+def test_report_without_acoular_has_times_of_this_package(monkeypatch):
+    monkeypatch.setattr("ertis_bench.passive.table.PACKAGE", "no_such_package")
+    monkeypatch.setattr(times, "DIRECTIONS", "90")
+    monkeypatch.setattr(times, "_OURS", 2)
+    report = passive.run(count=1, seed=0, say=lambda _: None)
+    assert report["differences"] == []
+    assert [row["name"] for row in report["times"]] == list(agreement.CASES)
+    assert all(row["ours"]["processor_ms"] > 0 and "acoular" not in row for row in report["times"])
+    text = passive.form(report)
+    assert "Acoular is not installed" in text
+    assert "| signals to cross-spectral matrices |" in text
