@@ -12,6 +12,7 @@ from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.fusion.rig import sensor_poses
 from ertis_numba.motion.echoes import EchoExtractor
 from ertis_numba.motion.flow import fit_flow
+from ertis_numba.motion.odometry import PlanarPose, _Errors
 
 MOUNTINGS = {"sensor": ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))}
 TIME_NS = 100_000_000
@@ -123,6 +124,31 @@ def test_odometry_integrates_a_circle():
     )
     assert path.covariance[-1][np.ix_([0, 1, 5], [0, 1, 5])] == pytest.approx(pose.covariance)
     assert not path.covariance[:, 2:5].any()
+
+
+@pytest.mark.parametrize("systematic", range(3))
+def test_effect_of_systematic_errors_is_that_of_wrong_steps(systematic):
+    """Steps whose distance, yaw per metre or turn is slightly wrong lead to another pose."""
+    draws, small = np.random.default_rng(7), 1e-7
+    pose = wrong = PlanarPose(0, 0.0, 0.0, 0.3, np.zeros((3, 3)))
+    errors = _Errors(np.zeros((3, 3)), np.zeros((3, 3)))
+    for _ in range(30):
+        step = draws.uniform(-0.2, 0.2, 3)
+        change = np.array([[*step[:2], 0.0], [0.0, 0.0, np.hypot(*step[:2])], [0.0, 0.0, step[2]]])[systematic]
+        errors = errors.moved(pose, step, np.zeros((3, 3)))
+        pose = pose.moved(step, np.zeros((3, 3)), 0, is_measured=True)
+        wrong = wrong.moved(step + small * change, np.zeros((3, 3)), 0, is_measured=True)
+    difference = np.array(wrong[1:4]) - np.array(pose[1:4])
+    assert difference / small == pytest.approx(errors.effect[:, systematic], rel=1e-4, abs=1e-4)
+
+
+def test_covariance_of_systematic_errors_grows_with_the_square_of_the_distance():
+    odometry = ertis.Odometry(MOUNTINGS)
+    for pulse in range(21):
+        odometry.add([seen_from((0.05 * pulse, 0, 0), places_m(2, 60), pulse, (0.5, 0.0, 0.0))])
+    half, full = (odometry.poses[pulse].covariance[0, 0] for pulse in (10, 20))
+    assert half > (0.5 * 0.003) ** 2
+    assert 2.4 < full / half < 4.0  # Independent errors alone would double it.
 
 
 def test_velocity_is_assumed_to_continue_for_at_most_a_second():

@@ -31,6 +31,14 @@ _PLANAR: Final = 0, 1, 5  # of x, y, z, and the rotations about them
 _UNKNOWN_VARIANCE: Final = np.diag([0.5, 0.5, 1.0]) ** 2  # of the assumed velocity; times time² for the pose
 
 
+# Errors of steps are correlated. Steps that share an image err in opposite directions, which matters little, but all
+# steps overestimate distances and turns by similar amounts. These are standard deviations of systematic errors: the
+# scale of distances, the yaw per metre, and the scale of turns; and of the scale that differs from step to step. They
+# were measured in simulated halls other than that of `ertis bench motion`.
+_SYSTEMATIC_SD: Final = np.array([0.004, math.radians(0.03), 0.003])
+_CHANGING_ERROR: Final = 0.008
+
+
 class PlanarPose(NamedTuple):
     """Pose of a platform in the plane, relative to its pose at the first group.
 
@@ -41,8 +49,8 @@ class PlanarPose(NamedTuple):
     covariance : (3, 3) float64
         Covariance of x, y and yaw since the start, in metres and radians.
     is_measured : bool
-        False if too few echoes matched, or if they fit another motion almost as well. The pose then assumes that the
-        last velocity continued.
+        False if no more echoes matched than those of noise, so that the last velocity is assumed to have continued, or
+        if echoes fit another motion almost as well, so that the more likely one is assumed.
 
     Examples
     --------
@@ -63,18 +71,47 @@ class PlanarPose(NamedTuple):
 
     def moved(self, displacement: Floats, covariance: Floats, timestamp_ns: int, *, is_measured: bool) -> "PlanarPose":
         """Return the pose after a displacement in the frame of this pose."""
-        c, s = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
-        x, y, turn = displacement.tolist()
-        turned = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        carried = np.array([[1.0, 0.0, -s * x - c * y], [0.0, 1.0, c * x - s * y], [0.0, 0.0, 1.0]])
+        carried, turned = _propagation(self.yaw_rad, displacement)
+        x_m, y_m, turn_rad = (turned @ displacement).tolist()
         return PlanarPose(
             timestamp_ns,
-            self.x_m + c * x - s * y,
-            self.y_m + s * x + c * y,
-            math.remainder(self.yaw_rad + turn, 2 * math.pi),
+            self.x_m + x_m,
+            self.y_m + y_m,
+            math.remainder(self.yaw_rad + turn_rad, 2 * math.pi),
             carried @ self.covariance @ carried.T + turned @ covariance @ turned.T,
             is_measured,
         )
+
+
+class _Errors(NamedTuple):
+    """Errors of a pose: independent ones of each step, and systematic ones, which add up along the path.
+
+    Attributes
+    ----------
+    independent : (3, 3) float64
+        Covariance of x, y and yaw.
+    effect : (3, 3) float64
+        Derivatives of x, y and yaw by the systematic errors.
+    """
+
+    independent: Floats
+    effect: Floats
+
+    def moved(self, origin: PlanarPose, displacement: Floats, covariance: Floats) -> "_Errors":
+        """Return the errors after a displacement from a pose with these errors."""
+        carried, turned = _propagation(origin.yaw_rad, displacement)
+        x, y, turn = displacement.tolist()
+        distance_m = math.hypot(x, y)
+        own = covariance + np.diag([_CHANGING_ERROR * distance_m] * 2 + [0.0]) ** 2
+        effect = np.array([[x, 0.0, 0.0], [y, 0.0, 0.0], [0.0, distance_m, turn]])
+        return _Errors(
+            carried @ self.independent @ carried.T + turned @ own @ turned.T, carried @ self.effect + turned @ effect
+        )
+
+    @property
+    def covariance(self) -> Floats:
+        """Covariance of all errors: (3, 3) float64."""
+        return np.asarray(self.independent + (self.effect * _SYSTEMATIC_SD**2) @ self.effect.T)
 
 
 class _View(NamedTuple):
@@ -82,6 +119,7 @@ class _View(NamedTuple):
 
     echoes: GroupEchoes
     pose: PlanarPose
+    errors: _Errors
     twist: Floats | None
 
 
@@ -120,6 +158,7 @@ class Odometry:
         self._keyframe: _View | None = None
         self._twist = np.zeros(3)
         self._path: list[PlanarPose] = []
+        self._errors = _Errors(np.zeros((3, 3)), np.zeros((3, 3)))  # of the last pose
 
     @property
     def poses(self) -> tuple[PlanarPose, ...]:
@@ -196,7 +235,7 @@ class Odometry:
         EgoVelocity or None
             None for the first group, after more than a second without images, if no more echoes match than those of
             noise, and if another motion explains almost as many. The pose then assumes that the last velocity continued
-            for at most a second.
+            for at most a second, or in the last case, the more likely motion.
 
         Raises
         ------
@@ -222,17 +261,16 @@ class Odometry:
         if found is None:
             unknown = _UNKNOWN_VARIANCE * time_s**2
             assumed = _displacement(self._twist, min(time_s, MAX_TIME_S))
-            self._path.append(self._path[-1].moved(assumed, unknown, timestamp_ns, is_measured=False))
+            self._move(self._path[-1], self._errors, assumed, unknown, timestamp_ns, is_measured=False)
             self._begin(echoes)
             return None
-        velocity = velocity_of(found, timestamp_ns, time_s)
         self._twist = twist_of(found.displacement, time_s)
-        self._path.append(self._located(echoes, found, self._twist, timestamp_ns))
-        self._last = _View(echoes, self._path[-1], self._twist)
-        return velocity
+        self._locate(echoes, found, self._twist, timestamp_ns)
+        self._last = _View(echoes, self._path[-1], self._errors, self._twist)
+        return velocity_of(found, timestamp_ns, time_s) if found.is_certain else None
 
     def _begin(self, echoes: GroupEchoes | None) -> None:
-        self._last = None if echoes is None else _View(echoes, self._path[-1], None)
+        self._last = None if echoes is None else _View(echoes, self._path[-1], self._errors, None)
         self._keyframe = None
 
     def _since_last(self, echoes: GroupEchoes, time_s: float) -> FlowFit | None:
@@ -240,7 +278,7 @@ class Odometry:
         if last is None:
             return None
         if last.twist is None:
-            return _trusted(fit_flow(last.echoes, echoes, self._sensors, time_s))
+            return _significant(fit_flow(last.echoes, echoes, self._sensors, time_s))
         start = _displacement(last.twist, time_s)
         near = fit_flow(
             last.echoes,
@@ -251,17 +289,32 @@ class Odometry:
             reach=_MAX_CHANGE * time_s,
             first_twist=last.twist,
         )
-        found = _trusted(near)
-        if found is not None and found.n_matches > _FEW_MATCHES and found.share > _DOUBTFUL_SHARE:
+        found = _significant(near)
+        if found is not None and found.is_certain and found.n_matches > _FEW_MATCHES and found.share > _DOUBTFUL_SHARE:
             return found
         # The expectation may be wrong, so that all displacements are compared.
         other = fit_flow(last.echoes, echoes, self._sensors, time_s)
         fits = [each for each in (near, other) if each is not None]
-        return _trusted(max(fits, key=lambda each: each.score, default=None))
+        return _significant(max(fits, key=lambda each: each.score, default=None))
 
-    def _located(self, echoes: GroupEchoes, found: FlowFit, twist: Floats, timestamp_ns: int) -> PlanarPose:
-        """Return the pose relative to the keyframe, or to the last group if the keyframe is out of reach."""
-        step = self._path[-1].moved(found.displacement, found.covariance, timestamp_ns, is_measured=True)
+    def _move(
+        self,
+        origin: PlanarPose,
+        errors: _Errors,
+        displacement: Floats,
+        covariance: Floats,
+        timestamp_ns: int,
+        *,
+        is_measured: bool,
+    ) -> None:
+        """Add the pose after a displacement from a pose with some errors."""
+        pose = origin.moved(displacement, covariance, timestamp_ns, is_measured=is_measured)
+        self._errors = errors.moved(origin, displacement, covariance)
+        self._path.append(pose._replace(covariance=self._errors.covariance))
+
+    def _locate(self, echoes: GroupEchoes, found: FlowFit, twist: Floats, timestamp_ns: int) -> None:
+        """Add the pose relative to the keyframe, or to the last group if the keyframe is out of reach."""
+        step = self._path[-1].moved(found.displacement, found.covariance, timestamp_ns, is_measured=found.is_certain)
         keyframe = self._keyframe
         if keyframe is not None:
             expected = _relative(keyframe.pose, step)
@@ -278,14 +331,38 @@ class Odometry:
                     second_twist=twist,
                 )
                 if fit is not None and _confirms(fit, found, expected):
-                    return keyframe.pose.moved(fit.displacement, fit.covariance, timestamp_ns, is_measured=True)
+                    covariance = fit.covariance if found.is_certain else fit.covariance + found.covariance
+                    self._move(
+                        keyframe.pose,
+                        keyframe.errors,
+                        fit.displacement,
+                        covariance,
+                        timestamp_ns,
+                        is_measured=found.is_certain,
+                    )
+                    return
         self._keyframe = self._last
-        return step
+        self._move(
+            self._path[-1],
+            self._errors,
+            found.displacement,
+            found.covariance,
+            timestamp_ns,
+            is_measured=found.is_certain,
+        )
 
 
-def _trusted(fit: FlowFit | None) -> FlowFit | None:
-    """Return a fit if neither accident nor another displacement explains the echoes almost as well."""
-    return fit if fit is not None and fit.is_significant and fit.is_certain else None
+def _propagation(yaw_rad: float, displacement: Floats) -> tuple[Floats, Floats]:
+    """Return derivatives of a moved pose by the pose at a yaw, and by the displacement: two (3, 3) float64."""
+    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+    turned = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    x_m, y_m, _ = (turned @ displacement).tolist()
+    return np.array([[1.0, 0.0, -y_m], [0.0, 1.0, x_m], [0.0, 0.0, 1.0]]), turned
+
+
+def _significant(fit: FlowFit | None) -> FlowFit | None:
+    """Return a fit if unrelated echoes do not match as well by accident."""
+    return fit if fit is not None and fit.is_significant else None
 
 
 def _confirms(fit: FlowFit, found: FlowFit, expected: Floats) -> bool:
